@@ -1,0 +1,212 @@
+"""Every setting, with its unit, its range and the paper's value (Table I) as its default.
+
+Sections are the stages of the chain. Standard deviations end in ``_std`` and are squared once,
+where a covariance is built; levels end in ``_db``. A setting that the paper does not report says
+so. This module needs pydantic alone, so that the command line can show its help at once.
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Count = Annotated[int, Field(ge=1)]
+Probability = Annotated[float, Field(gt=0, le=1)]
+
+Strategy = Literal["active", "fused", "passive"]
+STRATEGIES: tuple[Strategy, ...] = ("active", "fused", "passive")
+
+
+class InputError(ValueError):
+    """A user's mistake: says where it is, what was found, what was expected and the fix."""
+
+
+class Section(BaseModel):
+    """A frozen group of settings: unknown keys and non-finite numbers are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class ScenarioConfig(Section):
+    """The true world: a noisy circular drive among random landmarks."""
+
+    steps: Count = 1500
+    """Control steps."""
+    step: Positive = 0.125
+    """Length of a control step [s]."""
+    steps_per_frame: Count = 4
+    """Control steps between two emissions."""
+    speed: float = 0.75
+    """Nominal speed [m/s]."""
+    steering: float = 0.027
+    """Nominal steering angle [rad]."""
+    start: tuple[float, float, float] = (0.0, -7.408, 0.0)
+    """True start: x, y [m], heading [rad]; unreported: the noise-free path circles the centre."""
+    landmarks: Annotated[int, Field(ge=0)] = 50
+    """Number of landmarks, without the beacon."""
+    radius: Positive = 25.0
+    """Largest distance of a landmark from the centre [m]."""
+    spacing: NonNegative = 3.0
+    """Smallest distance between two landmarks [m]."""
+    clearance: NonNegative = 0.5
+    """Smallest distance of landmarks and beacon from the path and from each other [m]."""
+    beacon_distance: Positive = 15.0
+    """Distance of the beacon from the centre [m]."""
+
+
+class AirConfig(Section):
+    """The medium. Humidity is unreported in the paper."""
+
+    speed_of_sound: Positive = 343.0
+    """[m/s]"""
+    temperature_c: Annotated[float, Field(gt=-50, lt=60)] = 20.0
+    """[degrees Celsius]"""
+    relative_humidity: Annotated[float, Field(ge=0, le=1)] = 0.5
+    """[0 to 1]"""
+    pressure_kpa: Positive = 101.325
+    """[kPa]"""
+    spreading: Literal["paper", "bistatic"] = "paper"
+    """Passive echoes: 20 log10(d1 + d2), the paper's mirror law, or 20 log10(d1 d2), a scatterer."""
+
+
+class TargetConfig(Section):
+    """What a landmark reflects (radius and shape in practice unreported)."""
+
+    shape: Literal["cylinder", "sphere"] = "cylinder"
+    """Short-wave rigid cylinder (the paper's formula, mended) or sphere."""
+    radius: Positive = 0.025
+    """[m]"""
+
+
+class EmitterConfig(Section):
+    """The vehicle's back-baffled piston and its call."""
+
+    frequency: Positive = 35e3
+    """[Hz]"""
+    radius: Positive = 0.0088
+    """Radius of the piston [m]; 8.8 mm makes a half-power beamwidth of 33 degrees."""
+    level_db: float = 53.0
+    """Source level on the axis at 1 m [dB]; unreported, fitted."""
+    pulse: Positive = 2.8e-3
+    """Length of the call, of the beacon's too [s]; unreported."""
+
+
+class BeaconConfig(Section):
+    """The omnidirectional beacon's call."""
+
+    frequency: Positive = 30e3
+    """[Hz]"""
+    level_db: float = 53.0
+    """Source level at 1 m [dB]; unreported, fitted."""
+
+
+class ReceiverConfig(Section):
+    """Four line arrays in a square, their sampling and their noise."""
+
+    elements: Annotated[int, Field(ge=2, le=64)] = 10
+    """Microphones of one array."""
+    spacing: Positive = 0.0049
+    """Distance between two microphones [m]: half a wavelength at 35 kHz."""
+    sample_rate: Positive = 200e3
+    """[Hz]"""
+    noise_level_db: float = 0.0
+    """Noise of one complex sample [dB], on the scale of the source levels."""
+    engine: Literal["block", "dense"] = "block"
+    """Sums over 0.2 ms blocks (exact, fast) or every sample at the full rate (the reference)."""
+
+
+class DetectionConfig(Section):
+    """From samples to bearings and ranges. All unreported."""
+
+    false_alarm: Annotated[float, Field(gt=0, lt=0.1)] = 1e-6
+    """Probability that noise alone passes one test of one tone."""
+    leakage_db: float = -28.0
+    """A tone counts only above this level relative to the other tone's maximum nearby [dB]."""
+    peak_db: Annotated[float, Field(le=0)] = -8.0
+    """Peaks of a scan count down to this level under the strongest [dB]."""
+    scan_limit_deg: Annotated[float, Field(gt=0, lt=90)] = 80.0
+    """Largest steering angle [deg]."""
+    angle_limit_deg: Annotated[float, Field(gt=0, lt=90)] = 75.0
+    """Largest angle off a face's normal that is kept [deg]."""
+    averaging: Literal["plain", "weighted"] = "plain"
+    """Mean over the faces: plain (the paper's) or by inverse variance at the array's angle."""
+
+
+class AssociationConfig(Section):
+    """Known association: how near the truth a detection must be to bear its label."""
+
+    delay_gate: Positive = 0.25
+    """Largest error of the delay, as a share of the pulse."""
+    bearing_gate: Positive = 0.1
+    """Largest error of the bearing [rad]."""
+    margin_db: NonNegative = 6.0
+    """Arrivals expected further than this under the threshold cannot be matched [dB]."""
+
+
+class MotionConfig(Section):
+    """The front wheel of a bicycle, and the noise of its controls."""
+
+    wheelbase: Positive = 0.2
+    """[m]"""
+    speed_std: NonNegative = 0.1
+    """[m/s]"""
+    steering_std: NonNegative = 0.03
+    """[rad]"""
+
+
+class FilterConfig(Section):
+    """What both filters assume."""
+
+    range_std: Positive = 0.2
+    """[m]"""
+    bearing_std: Positive = 0.15
+    """[rad]"""
+    initial_pose_std: tuple[NonNegative, NonNegative, NonNegative] = (0.05, 0.05, 0.0436)
+    """x, y [m], heading [rad]"""
+    gate: Probability = 1.0
+    """Measurements outside this share of their predicted distribution are dropped; 1: none."""
+
+
+class RayConfig(Section):
+    """Passive landmarks as a ray of Gaussians (Table I; pruning and power unreported)."""
+
+    ratio: Annotated[float, Field(gt=0, lt=1)] = 0.3
+    """Standard deviation of a member as a share of its range (alpha)."""
+    density: Annotated[float, Field(gt=1)] = 3.0
+    """Ratio of two successive ranges (beta)."""
+    range_bounds: tuple[Positive, Positive] = (0.5, 20.0)
+    """Nearest and farthest range covered [m]."""
+    prune: Annotated[float, Field(ge=0, lt=1)] = 1e-3
+    """Members whose aggregated likelihood falls below this over their number are pruned (tau)."""
+    power: Positive = 1.0
+    """Sharpening of the weights that share a measurement (n)."""
+    weights: Literal["instantaneous", "aggregated"] = "instantaneous"
+    """Share by this measurement's likelihoods (the paper's text) or by all so far (Sola's code)."""
+    partial: Literal["reinitialise", "heaviest"] = "reinitialise"
+    """A range for a partial landmark: place it anew, or move its heaviest member."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "RayConfig":
+        near, far = self.range_bounds
+        if near >= far:
+            raise ValueError(f"range_bounds must rise, found [{near}, {far}]")
+        return self
+
+
+class Config(Section):
+    """A whole mission. Each section is described in its own class."""
+
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 7
+    """Seed of every random stream."""
+    scenario: ScenarioConfig = ScenarioConfig()
+    air: AirConfig = AirConfig()
+    target: TargetConfig = TargetConfig()
+    emitter: EmitterConfig = EmitterConfig()
+    beacon: BeaconConfig = BeaconConfig()
+    receiver: ReceiverConfig = ReceiverConfig()
+    detection: DetectionConfig = DetectionConfig()
+    association: AssociationConfig = AssociationConfig()
+    motion: MotionConfig = MotionConfig()
+    filter: FilterConfig = FilterConfig()
+    rays: RayConfig = RayConfig()

@@ -1,0 +1,261 @@
+"""Motion and measurement models with their Jacobians, and the records that beliefs are made of.
+
+The kernels return plain numbers, so that the filters can inline them; the functions beside them
+say the same in arrays. In the kernels a motion model is a number: 0 bicycle, 1 unicycle.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+from numba import njit
+
+from pipistrelle.geometry import wrap_angle
+
+MOTION_MODELS = ("bicycle", "unicycle")
+NEAREST = 1e-3
+"""A measurement of a point nearer than this [m] says nothing that can be linearised."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gaussian:
+    """A mean and its covariance; leading axes, if any, count instances.
+
+    Attributes
+    ----------
+    mean : (*n, d)
+    covariance : (*n, d, d)
+    """
+
+    mean: Float[np.ndarray, "*n d"]
+    covariance: Float[np.ndarray, "*n d d"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Landmarks:
+    """The map: one row per hypothesis; a landmark with a single row is fully initialised.
+
+    Attributes
+    ----------
+    landmark : (h)
+        Label.
+    mean : (h, 2) [m]
+    covariance : (h, 2, 2) [m^2]
+    weight : (h)
+        Aggregated likelihood; sums to 1 over the rows of a landmark.
+    """
+
+    landmark: Int[np.ndarray, " h"]
+    mean: Float[np.ndarray, "h 2"]
+    covariance: Float[np.ndarray, "h 2 2"]
+    weight: Float[np.ndarray, " h"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Motion:
+    """A motion model and the noise of its controls.
+
+    Attributes
+    ----------
+    model : "bicycle" or "unicycle"
+        Controls are speed [m/s] and steering angle [rad], or speed [m/s] and angular rate [rad/s].
+    control_std : (speed [m/s], steering [rad] or angular rate [rad/s])
+        Noise of one control step.
+    wheelbase : [m]
+        Bicycle only.
+    noise_at_rest : bool
+        False: a step whose two controls are zero is exact.
+    """
+
+    model: Literal["bicycle", "unicycle"]
+    control_std: tuple[float, float]
+    wheelbase: float = 1.0
+    noise_at_rest: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Track:
+    """What a filter made of one mission: the start, then one row per control step.
+
+    Attributes
+    ----------
+    time : (k) [s]
+    pose : Gaussian of (k, 3) and (k, 3, 3)
+        x, y [m], heading [rad]; at the steps that hold a scan, after its update.
+    landmarks : Landmarks
+        The final map.
+    gated : int
+        Measurements that the gate rejected.
+    """
+
+    time: Float[np.ndarray, " k"]
+    pose: Gaussian
+    landmarks: Landmarks
+    gated: int
+
+
+@njit(cache=True)
+def advance(
+    model: int, wheelbase: float, heading: float, speed: float, turn: float, dt: float
+) -> tuple[float, float, float, float, float, float, float, float, float]:
+    """One noise-free control step, for kernels.
+
+    Returns dx, dy, dheading; dx/dheading, dy/dheading are -dy, dx; then the six entries of the
+    Jacobian U by speed (x, y, heading) and by turn (x, y, heading).
+    """
+    if model == 0:
+        c, s = math.cos(heading + turn), math.sin(heading + turn)
+        dx, dy = speed * dt * c, speed * dt * s
+        yaw = dt / wheelbase
+        return (
+            dx, dy, speed * yaw * math.sin(turn),
+            dt * c, dt * s, yaw * math.sin(turn),
+            -dy, dx, speed * yaw * math.cos(turn),
+        )  # fmt: skip
+    half = 0.5 * turn * dt
+    if abs(half) < 1e-4:
+        sinc, slope = 1.0 - half * half / 6.0, -half / 3.0
+    else:
+        sinc = math.sin(half) / half
+        slope = (math.cos(half) - sinc) / half
+    c, s = math.cos(heading + half), math.sin(heading + half)
+    chord = dt * sinc
+    dx, dy = speed * chord * c, speed * chord * s
+    bend = 0.5 * dt * dt * speed
+    return (
+        dx, dy, turn * dt,
+        chord * c, chord * s, 0.0,
+        bend * (slope * c - sinc * s), bend * (slope * s + sinc * c), dt,
+    )  # fmt: skip
+
+
+def motion_step(
+    motion: Motion, pose: Float[np.ndarray, "3"], control: Float[np.ndarray, "2"], dt: float
+) -> Float[np.ndarray, "3"]:
+    r"""The pose after one noise-free control step.
+
+    .. math:: x_k = x_{k-1} + V\Delta_t \cos(\theta_{k-1} + \gamma), \quad
+              y_k = y_{k-1} + V\Delta_t \sin(\theta_{k-1} + \gamma), \quad
+              \theta_k = \theta_{k-1} + \tfrac{V\Delta_t}{B}\sin\gamma
+
+    for the bicycle's front wheel; for the unicycle the exact arc of speed V and angular rate
+    omega, written by its chord :math:`V\Delta_t \operatorname{sinc}(\omega\Delta_t/2)`.
+
+    Parameters
+    ----------
+    motion : Motion
+    pose : (3) [m, m, rad]
+    control : (2) [m/s, rad or rad/s]
+    dt : [s]
+
+    Returns
+    -------
+    (3) [m, m, rad]
+        Heading wrapped.
+
+    Notes
+    -----
+    Bradley & Abaid, Eq. (5).
+
+    Examples
+    --------
+    >>> motion = Motion(model="unicycle", control_std=(0.1, 0.1))
+    >>> motion_step(motion, np.zeros(3), np.array([np.pi, np.pi]), 0.5).round(12)
+    array([1.        , 1.        , 1.57079633])
+    """
+    moved = advance(
+        MOTION_MODELS.index(motion.model), motion.wheelbase, pose[2], control[0], control[1], dt
+    )
+    return np.array([pose[0] + moved[0], pose[1] + moved[1], wrap_angle(pose[2] + moved[2])])
+
+
+def motion_jacobians(
+    motion: Motion, pose: Float[np.ndarray, "3"], control: Float[np.ndarray, "2"], dt: float
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 2"]]:
+    """Derivatives F and U of `motion_step` by the pose and by the control.
+
+    Parameters
+    ----------
+    motion : Motion
+    pose : (3) [m, m, rad]
+    control : (2) [m/s, rad or rad/s]
+    dt : [s]
+
+    Returns
+    -------
+    F : (3, 3)
+    U : (3, 2)
+
+    Notes
+    -----
+    Bradley & Abaid, with Eq. (10).
+
+    Examples
+    --------
+    >>> motion = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
+    >>> F, U = motion_jacobians(motion, np.zeros(3), np.array([2.0, 0.0]), 0.5)
+    >>> F[1, 2], U[2, 1]
+    (np.float64(1.0), np.float64(5.0))
+    """
+    moved = advance(
+        MOTION_MODELS.index(motion.model), motion.wheelbase, pose[2], control[0], control[1], dt
+    )
+    F = np.eye(3)
+    F[0, 2], F[1, 2] = -moved[1], moved[0]
+    return F, np.array(moved[3:]).reshape(2, 3).T.copy()
+
+
+@njit(cache=True)
+def sight(
+    x: float, y: float, heading: float, px: float, py: float
+) -> tuple[float, float, float, float, float]:
+    """Range, bearing, direction cosines and range of a point, for kernels.
+
+    Returns range [m], bearing [rad], cos and sin of the direction in the world, range guarded by
+    `NEAREST` for use as a divisor. The Jacobians follow: d range = (-c, -s, 0; c, s) and
+    d bearing = (s, -c, -range; -s, c) / range by pose and point.
+    """
+    dx, dy = px - x, py - y
+    distance = math.sqrt(dx * dx + dy * dy)
+    divisor = max(distance, NEAREST)
+    return distance, wrap_angle(math.atan2(dy, dx) - heading), dx / divisor, dy / divisor, divisor
+
+
+def measurement_jacobians(
+    pose: Float[np.ndarray, "3"], point: Float[np.ndarray, "2"]
+) -> tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "2 2"]]:
+    r"""Derivatives of range and bearing by the pose and by the landmark's position.
+
+    .. math:: H_x = \begin{bmatrix} -c & -s & 0 \\ s/d & -c/d & -1 \end{bmatrix}, \qquad
+              H_m = \begin{bmatrix} c & s \\ -s/d & c/d \end{bmatrix}
+
+    with (c, s) the unit vector from the vehicle to the landmark and d their distance. A passive
+    measurement has the second rows alone.
+
+    Parameters
+    ----------
+    pose : (3) [m, m, rad]
+    point : (2) [m]
+
+    Returns
+    -------
+    H_x : (2, 3)
+    H_m : (2, 2)
+
+    Notes
+    -----
+    Bradley & Abaid, with Eqs. (6), (7) and (11).
+
+    Examples
+    --------
+    >>> measurement_jacobians(np.zeros(3), np.array([2.0, 0.0]))[1]
+    array([[ 1. ,  0. ],
+           [-0. ,  0.5]])
+    """
+    _, _, c, s, d = sight(pose[0], pose[1], pose[2], point[0], point[1])
+    return (
+        np.array([[-c, -s, 0.0], [s / d, -c / d, -1.0]]),
+        np.array([[c, s], [-s / d, c / d]]),
+    )

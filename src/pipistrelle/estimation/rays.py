@@ -1,0 +1,157 @@
+r"""Passive landmarks as a ray of Gaussians.
+
+A bearing alone does not say how far away a landmark is. Instead of waiting for parallax, the
+landmark enters the map at once as a *ray*: :math:`N_g` Gaussian members along the bearing, at
+ranges that grow by the factor :math:`\beta`, each as long as its range allows,
+
+.. math:: s_1 = \frac{s_{min}}{1-\alpha}, \quad s_j = \beta s_{j-1}, \quad
+          \sigma_j = \alpha s_j, \quad
+          N_g = 1 + \left\lceil \log_\beta\left(\frac{1-\alpha}{1+\alpha}
+          \frac{s_{max}}{s_{min}}\right) \right\rceil .
+
+Seen from the vehicle the members differ in range only, so one bearing cannot tell them apart; a
+few bearings from different places can. Each new bearing does three things to a ray:
+
+1. **Weigh.** The likelihood of member j is :math:`\lambda_j = N(\nu_j; 0, S_j)`. Its aggregated
+   likelihood, :math:`\Lambda_j \leftarrow \Lambda_j \lambda_j`, normalised over the ray, is its
+   probability given all bearings so far.
+2. **Share.** The measurement is one; the members are several. Were each corrected with the full
+   measurement, its information would be counted :math:`N_g` times. Federated information sharing
+   gives member j the share :math:`\rho_j`, that is the noise :math:`R/\rho_j`; the shares sum to
+   one, so the information does too (the principle of measurement reproduction). The shares are
+   :math:`\rho_j \propto \lambda_j^n` (``weights = "instantaneous"``, the paper's text) or
+   :math:`\rho_j \propto \Lambda_j^n` with shares under 0.05 skipped and not handed on
+   (``"aggregated"``, as in Sola's own implementation).
+3. **Prune.** Members with :math:`\Lambda_j < \tau/N`, N the number before this prune, are dropped.
+   The heaviest always stays. A ray of one member is a landmark: *fully initialised*.
+
+Which to take? ``paper`` settings reproduce the paper; ``aggregated`` weights, or a power n of 3
+to 8, make the filter far more consistent: members that are certainly wrong then no longer pull
+the vehicle.
+
+Departures from the printed page: the paper prints :math:`\sigma_j = \alpha s_{j-1}`, which
+contradicts its own :math:`\alpha = \sigma/s` and leaves gaps between the members. Members of one
+ray are correlated through the pose; the cross-covariance of the bearing noise that they share is
+left out, as in Sola's implementation.
+
+Sources: Bradley & Abaid, Eqs. (17) to (21); Sola, Monin, Devy & Lemaire (2005).
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+from numba import njit
+
+from pipistrelle.config import RayConfig
+
+SMALLEST_AGGREGATED_SHARE = 0.05
+SMALLEST_SHARE = 1e-12
+
+
+def ray_members(
+    rays: RayConfig,
+) -> tuple[Float[np.ndarray, " h"], Float[np.ndarray, " h"]]:
+    """Ranges of a new ray's members and their standard deviations.
+
+    Parameters
+    ----------
+    rays : RayConfig
+
+    Returns
+    -------
+    range : (h) [m]
+        s_j, rising.
+    range_std : (h) [m]
+        sigma_j = alpha s_j.
+
+    Notes
+    -----
+    Bradley & Abaid, Eq. (17), with sigma_j mended (see the module's head).
+
+    Examples
+    --------
+    >>> range, range_std = ray_members(RayConfig())
+    >>> range.round(2)
+    array([ 0.71,  2.14,  6.43, 19.29])
+    """
+    near, far = rays.range_bounds
+    first = near / (1.0 - rays.ratio)
+    span = (1.0 - rays.ratio) / (1.0 + rays.ratio) * far / near
+    members = 1 + max(0, math.ceil(math.log(span) / math.log(rays.density)))
+    ranges = first * rays.density ** np.arange(members)
+    return ranges, rays.ratio * ranges
+
+
+@njit(cache=True)
+def log_likelihood(innovation: float, variance: float) -> float:
+    """Log of N(innovation; 0, variance) without its constant.
+
+    Bradley & Abaid, Eq. (19), in logs: a product of many likelihoods underflows.
+    """
+    return -0.5 * (innovation * innovation / variance + math.log(variance))
+
+
+@njit(cache=True)
+def normalise_logs(log_weights: np.ndarray, weights: np.ndarray, count: int) -> None:
+    """Write exp(log_weights) / sum into weights, without underflow of the whole."""
+    largest = -np.inf
+    for j in range(count):
+        largest = max(largest, log_weights[j])
+    total = 0.0
+    for j in range(count):
+        weights[j] = math.exp(log_weights[j] - largest)
+        total += weights[j]
+    for j in range(count):
+        weights[j] /= total
+
+
+@njit(cache=True)
+def weigh_and_share(
+    log_likelihoods: np.ndarray,
+    weights: np.ndarray,
+    count: int,
+    power: float,
+    aggregated: bool,
+    share: np.ndarray,
+) -> None:
+    """Multiply the members' weights by their likelihoods and divide the measurement among them.
+
+    ``weights`` (Lambda) and ``share`` (rho) are written; a share of zero means: skip the member.
+    Bradley & Abaid, Eqs. (18) and (19).
+    """
+    log_weights = np.empty(count)
+    for j in range(count):
+        prior = math.log(weights[j]) if weights[j] > 0.0 else -np.inf
+        log_weights[j] = prior + log_likelihoods[j]
+    normalise_logs(log_weights, weights, count)
+    for j in range(count):
+        log_weights[j] = power * (log_weights[j] if aggregated else log_likelihoods[j])
+    normalise_logs(log_weights, share, count)
+    smallest = SMALLEST_AGGREGATED_SHARE if aggregated else SMALLEST_SHARE
+    for j in range(count):
+        if share[j] < smallest:
+            share[j] = 0.0
+
+
+@njit(cache=True)
+def survivors(weights: np.ndarray, count: int, prune: float, keep: np.ndarray) -> int:
+    """Mark the members that stay, renormalise their weights in place and return their number.
+
+    A member goes when its weight is under prune / count; the heaviest (the first of equals)
+    always stays. Bradley & Abaid, Eq. (21).
+    """
+    heaviest = 0
+    for j in range(1, count):
+        if weights[j] > weights[heaviest]:
+            heaviest = j
+    kept, total = 0, 0.0
+    for j in range(count):
+        keep[j] = j == heaviest or weights[j] >= prune / count
+        if keep[j]:
+            kept += 1
+            total += weights[j]
+    for j in range(count):
+        if keep[j]:
+            weights[j] /= total
+    return kept

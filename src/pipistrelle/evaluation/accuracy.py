@@ -1,0 +1,279 @@
+"""Accuracy: how far an estimated path and map are from the true ones."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from pipistrelle.estimation.models import Landmarks
+from pipistrelle.geometry import wrap
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapEstimate:
+    """A map with one row per landmark, in the order in which the landmarks entered it.
+
+    Attributes
+    ----------
+    landmark : (n)
+        Label.
+    mean : (n, 2) [m]
+    covariance : (n, 2, 2) [m^2]
+    full : (n)
+        Whether the landmark is fully initialised.
+    """
+
+    landmark: Int[np.ndarray, " n"]
+    mean: Float[np.ndarray, "n 2"]
+    covariance: Float[np.ndarray, "n 2 2"]
+    full: Bool[np.ndarray, " n"]
+
+
+def heaviest(landmarks: Landmarks) -> MapEstimate:
+    """Represent each landmark by its heaviest hypothesis, the first of equals.
+
+    A landmark with a single hypothesis is fully initialised, one with several partially.
+
+    Parameters
+    ----------
+    landmarks : Landmarks of h hypotheses
+
+    Returns
+    -------
+    MapEstimate of n landmarks
+
+    Notes
+    -----
+    Bradley & Abaid, Sec. V-A, "fully and partially initialize".
+
+    Examples
+    --------
+    >>> landmarks = Landmarks(
+    ...     landmark=np.array([7, 3, 3]),
+    ...     mean=np.array([[1.0, 0.0], [2.0, 0.0], [6.0, 0.0]]),
+    ...     covariance=np.tile(np.eye(2), (3, 1, 1)),
+    ...     weight=np.array([1.0, 0.2, 0.8]),
+    ... )
+    >>> heaviest(landmarks).mean[:, 0], heaviest(landmarks).full
+    (array([1., 6.]), array([ True, False]))
+    """
+    ordered = np.lexsort((-landmarks.weight, landmarks.landmark))
+    _, start, count = np.unique(landmarks.landmark[ordered], return_index=True, return_counts=True)
+    _, first = np.unique(landmarks.landmark, return_index=True)
+    entered = np.argsort(first)
+    row = ordered[start][entered]
+    return MapEstimate(
+        landmark=landmarks.landmark[row],
+        mean=landmarks.mean[row],
+        covariance=landmarks.covariance[row],
+        full=count[entered] == 1,
+    )
+
+
+def scored_landmarks(
+    estimate: MapEstimate,
+    true_landmark: Int[np.ndarray, " n"],
+    true_position: Float[np.ndarray, "n 2"],
+) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]]:
+    """Pair the fully initialised landmarks with their true positions.
+
+    A landmark whose true position is not known is left out.
+
+    Parameters
+    ----------
+    estimate : MapEstimate
+    true_landmark : (n)
+        Labels, each once.
+    true_position : (n, 2) [m]
+
+    Returns
+    -------
+    estimated : (m, 2) [m]
+    true : (m, 2) [m]
+
+    Notes
+    -----
+    Bradley & Abaid, the sums of Eq. (27).
+
+    Examples
+    --------
+    >>> estimate = MapEstimate(
+    ...     landmark=np.array([7, 3, 9]),
+    ...     mean=np.array([[1.0, 0.0], [2.0, 0.0], [6.0, 0.0]]),
+    ...     covariance=np.tile(np.eye(2), (3, 1, 1)),
+    ...     full=np.array([True, False, True]),
+    ... )
+    >>> scored_landmarks(estimate, np.array([3, 7]), np.array([[5.0, 5.0], [1.5, 0.0]]))
+    (array([[1., 0.]]), array([[1.5, 0. ]]))
+    """
+    row = {int(label): i for i, label in enumerate(true_landmark)}
+    pairs = [
+        (i, row[label])
+        for i, label in enumerate(estimate.landmark.tolist())
+        if estimate.full[i] and label in row
+    ]
+    mapped, true = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
+    return estimate.mean[mapped], true_position[true]
+
+
+def pose_error(
+    path: Float[np.ndarray, "k 3"], true_path: Float[np.ndarray, "k 3"]
+) -> Float[np.ndarray, "k 3"]:
+    r"""Estimated minus true poses, the heading wrapped.
+
+    .. math:: e_k = \hat x_k - x_k
+
+    Parameters
+    ----------
+    path, true_path : (k, 3) [m, m, rad]
+
+    Returns
+    -------
+    (k, 3) [m, m, rad]
+
+    Notes
+    -----
+    Bradley & Abaid, the differences of Eqs. (23) and (26).
+
+    Examples
+    --------
+    >>> pose_error(np.array([[1.0, 2.0, 3.1]]), np.array([[0.0, 2.0, 3.1 - 2 * np.pi]])).round(9)
+    array([[1., 0., 0.]])
+    """
+    error = path - true_path
+    error[:, 2] = wrap(error[:, 2])
+    return error
+
+
+def position_error(
+    points: Float[np.ndarray, "n d"], true_points: Float[np.ndarray, "n d"]
+) -> Float[np.ndarray, " n"]:
+    r"""Distances between estimated and true positions.
+
+    .. math:: d_i = \sqrt{(\hat x_i - x_i)^2 + (\hat y_i - y_i)^2}
+
+    Parameters
+    ----------
+    points, true_points : (n, 2 or more)
+        x, y [m]; further columns (a heading) are ignored.
+
+    Returns
+    -------
+    (n) [m]
+
+    Notes
+    -----
+    Bradley & Abaid, the terms of Eqs. (26) and (27).
+
+    Examples
+    --------
+    >>> position_error(np.array([[3.0, 4.0, 0.1]]), np.zeros((1, 3)))
+    array([5.])
+    """
+    offset = points[:, :2] - true_points[:, :2]
+    return np.hypot(offset[:, 0], offset[:, 1])
+
+
+def rmse(error: Float[np.ndarray, " n"]) -> float:
+    r"""Root mean square of errors, in their unit.
+
+    .. math:: \mathrm{RMSE} = \sqrt{\frac{1}{N} \sum_{i=1}^{N} e_i^2}
+
+    Parameters
+    ----------
+    error : (n)
+        Position errors of a path or of a map [m], heading errors [rad]; at least one. An error
+        that is not finite makes the result not finite.
+
+    Returns
+    -------
+    In the unit of the errors.
+
+    Raises
+    ------
+    ValueError
+        Without errors.
+
+    Notes
+    -----
+    Bradley & Abaid, Eqs. (26) and (27).
+
+    Examples
+    --------
+    >>> rmse(np.array([1.0, -7.0]))
+    5.0
+    """
+    if len(error) == 0:
+        raise ValueError("rmse needs at least one error, found none")
+    return float(np.sqrt(np.mean(np.square(error))))
+
+
+def alignment(
+    points: Float[np.ndarray, "n 2"], reference: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "3"]:
+    r"""Rigid motion, without scale, that brings points closest to a reference.
+
+    .. math:: \min_{\theta, t} \sum_i \lVert R(\theta) p_i + t - q_i \rVert^2: \quad
+              \theta = \operatorname{atan2}\Bigl(\sum_i p'_i \times q'_i,
+              \sum_i p'_i \cdot q'_i\Bigr), \quad t = \bar q - R(\theta) \bar p
+
+    with p' and q' the offsets from the means.
+
+    Parameters
+    ----------
+    points : (n, 2) [m]
+        At least one; the rotation is 0 where the points do not determine it.
+    reference : (n, 2) [m]
+
+    Returns
+    -------
+    (3) [m, m, rad]
+        t and theta: the pose that the origin of the points has in the reference.
+
+    Notes
+    -----
+    The planar case of Umeyama (1991). In the plane a reflection cannot occur.
+
+    Examples
+    --------
+    >>> square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+    >>> (alignment(square, np.array([[5.0, 0.0], [5.0, 1.0], [4.0, 1.0]])) / [1, 1, np.pi]).round(9)
+    array([5. , 0. , 0.5])
+    """
+    mean, target = points.mean(axis=0), reference.mean(axis=0)
+    p, q = points - mean, reference - target
+    theta = np.arctan2(np.sum(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]), np.sum(p * q))
+    return np.append(target - moved(mean[None], np.array([0.0, 0.0, theta]))[0], theta)
+
+
+def moved(
+    points: Float[np.ndarray, "n 2"], motion: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "n 2"]:
+    r"""Move points rigidly.
+
+    .. math:: q_i = R(\theta) p_i + t
+
+    Parameters
+    ----------
+    points : (n, 2) [m]
+    motion : (3) [m, m, rad]
+        t and theta, as `alignment` gives them.
+
+    Returns
+    -------
+    (n, 2) [m]
+
+    Notes
+    -----
+    The action of SE(2) on the plane.
+
+    Examples
+    --------
+    >>> moved(np.array([[1.0, 0.0]]), np.array([0.0, 2.0, np.pi / 2])).round(9)
+    array([[0., 3.]])
+    """
+    x, y, theta = motion
+    cos, sin = np.cos(theta), np.sin(theta)
+    return np.column_stack(
+        [cos * points[:, 0] - sin * points[:, 1] + x, sin * points[:, 0] + cos * points[:, 1] + y]
+    )

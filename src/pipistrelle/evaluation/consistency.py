@@ -1,0 +1,150 @@
+"""Consistency: whether a filter's covariance tells how far it is from the truth."""
+
+import numpy as np
+from jaxtyping import Float
+
+EKF_LIMIT = 50.0
+"""A NEES above this means that EKF-SLAM has diverged (Bradley & Abaid, Sec. V-A)."""
+FASTSLAM_LIMIT = 2750.0
+"""A NEES above this means that FastSLAM 2.0 has diverged (Bradley & Abaid, Sec. V-A)."""
+
+
+@np.errstate(all="ignore")
+def nees(
+    error: Float[np.ndarray, "*n d"], covariance: Float[np.ndarray, "*n d d"]
+) -> Float[np.ndarray, "*n"]:
+    r"""Normalised estimation error squared.
+
+    .. math:: \epsilon_k = (\hat x_k - x_k)^T P_k^{-1} (\hat x_k - x_k)
+
+    Solved by elimination: the sum of the squared residuals over the pivots.
+
+    Parameters
+    ----------
+    error : (*n, d)
+        Estimated minus true state, angles wrapped.
+    covariance : (*n, d, d)
+        Symmetric; in the units of the error, squared.
+
+    Returns
+    -------
+    (*n)
+        Chi-square with d degrees of freedom where the filter is consistent. Infinite, and never
+        NaN, where the covariance is not positive definite to working precision or where an entry
+        is not finite: divergence is a result, not an error.
+
+    Notes
+    -----
+    Bradley & Abaid, Eq. (23).
+
+    Examples
+    --------
+    >>> nees(np.array([2.0, 1.0]), np.diag([4.0, 0.5]))
+    array(3.)
+    >>> nees(np.array([2.0, 1.0]), np.diag([4.0, 0.0]))
+    array(inf)
+    """
+    r = np.array(error, dtype=np.float64)
+    P = np.array(covariance, dtype=np.float64)
+    d = r.shape[-1]
+    smallest = d * np.finfo(np.float64).eps * np.diagonal(P, axis1=-2, axis2=-1)
+    epsilon = np.zeros(r.shape[:-1])
+    definite = np.ones(r.shape[:-1], dtype=bool)
+    for i in range(d):
+        pivot = P[..., i, i].copy()
+        definite &= pivot > smallest[..., i]
+        epsilon += r[..., i] ** 2 / pivot
+        factor = P[..., i, :] / pivot[..., None]
+        r -= factor * r[..., i, None]
+        P -= P[..., :, i, None] * factor[..., None, :]
+    return np.where(definite & np.isfinite(epsilon), epsilon, np.inf)
+
+
+def anees(nees: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " k"]:
+    r"""Average NEES over runs, step by step.
+
+    .. math:: \bar\epsilon_k = \frac{1}{N} \sum_{i=1}^{N} \epsilon_{i_k}
+
+    Parameters
+    ----------
+    nees : (n, k)
+        One row per run; at least one. An infinite NEES makes its step infinite.
+
+    Returns
+    -------
+    (k)
+
+    Notes
+    -----
+    Bradley & Abaid, Eq. (24).
+
+    Examples
+    --------
+    >>> anees(np.array([[2.0, 3.0], [4.0, 3.0]]))
+    array([3., 3.])
+    """
+    return np.mean(nees, axis=0)
+
+
+def anees_bounds(runs: int, confidence: float = 0.95, states: int = 3) -> tuple[float, float]:
+    r"""Interval that holds the ANEES of a consistent filter with a given probability.
+
+    .. math:: \epsilon_1 = \chi^2_{N N_x}(C / 2) / N, \qquad
+              \epsilon_2 = \chi^2_{N N_x}(1 - C / 2) / N, \qquad C = 1 - \mathrm{confidence}
+
+    Below it the filter is under-confident, above it over-confident.
+
+    Parameters
+    ----------
+    runs : N, at least 1
+        Independent runs in the average.
+    confidence : between 0 and 1
+    states : N_x, at least 1
+        Length of the error.
+
+    Returns
+    -------
+    low, high
+
+    Notes
+    -----
+    Bradley & Abaid, Eq. (25).
+
+    Examples
+    --------
+    >>> low, high = anees_bounds(107)
+    >>> round(low, 2), round(high, 2)
+    (2.55, 3.48)
+    """
+    from scipy.stats import chi2
+
+    tail = (1.0 - confidence) / 2.0
+    low, high = chi2.ppf([tail, 1.0 - tail], runs * states) / runs
+    return float(low), float(high)
+
+
+def diverged(nees: Float[np.ndarray, " k"], limit: float) -> bool:
+    r"""Tell whether a run has diverged: any NEES is above the limit or not finite.
+
+    .. math:: \max_k \epsilon_k > \epsilon_{max}
+
+    Parameters
+    ----------
+    nees : (k)
+    limit : float
+        `EKF_LIMIT` or `FASTSLAM_LIMIT`.
+
+    Returns
+    -------
+    bool
+
+    Notes
+    -----
+    Bradley & Abaid, Sec. V-A.
+
+    Examples
+    --------
+    >>> diverged(np.array([3.0, 49.0]), EKF_LIMIT), diverged(np.array([3.0, np.nan]), EKF_LIMIT)
+    (False, True)
+    """
+    return not bool(np.all(np.isfinite(nees) & (nees <= limit)))

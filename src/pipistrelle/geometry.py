@@ -1,0 +1,96 @@
+"""Angles and poses in the plane.
+
+A pose is x, y [m] and heading [rad], counter-clockwise from +x. A bearing is relative to the
+heading, counter-clockwise. Angles are wrapped to [-pi, pi).
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+from numba import njit
+
+
+@njit(cache=True, inline="always")
+def wrap_angle(angle: float) -> float:
+    """Wrap one angle to [-pi, pi) [rad]; for kernels (see `wrap`)."""
+    wrapped = angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+    return wrapped - 2.0 * math.pi if wrapped >= math.pi else wrapped
+
+
+def wrap(angle: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
+    """Wrap angles to [-pi, pi).
+
+    Parameters
+    ----------
+    angle : (*n) [rad]
+
+    Returns
+    -------
+    (*n) [rad]
+
+    Examples
+    --------
+    >>> wrap(np.array([0.0, np.pi, 3.5 * np.pi])) / np.pi
+    array([ 0. , -1. , -0.5])
+    """
+    wrapped = angle - 2.0 * np.pi * np.floor((np.asarray(angle) + np.pi) / (2.0 * np.pi))
+    return np.where(wrapped >= np.pi, wrapped - 2.0 * np.pi, wrapped)
+
+
+def range_and_bearing(
+    pose: Float[np.ndarray, "3"], points: Float[np.ndarray, "n 2"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    r"""Distance and bearing of points as seen from a pose.
+
+    .. math:: d_i = \lVert m_i - x_v \rVert, \qquad
+              \phi_i = \operatorname{atan2}(y_i - y_v, x_i - x_v) - \theta_v
+
+    Parameters
+    ----------
+    pose : (3) [m, m, rad]
+    points : (n, 2) [m]
+
+    Returns
+    -------
+    range : (n) [m]
+    bearing : (n) [rad]
+
+    Notes
+    -----
+    Bradley & Abaid, Eq. (6), without its noise.
+
+    Examples
+    --------
+    >>> pose = np.array([1.0, 0.0, np.pi / 2])
+    >>> range_and_bearing(pose, np.array([[1.0, 2.0]]))
+    (array([2.]), array([0.]))
+    """
+    offset = points - pose[:2]
+    return np.hypot(offset[:, 0], offset[:, 1]), wrap(
+        np.arctan2(offset[:, 1], offset[:, 0]) - pose[2]
+    )
+
+
+def circular_mean(
+    angle: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"] | None = None
+) -> float:
+    """Weighted mean direction of angles.
+
+    Parameters
+    ----------
+    angle : (n) [rad]
+    weight : (n), optional
+        Non-negative; equal weights by default.
+
+    Returns
+    -------
+    [rad], in [-pi, pi)
+
+    Examples
+    --------
+    >>> round(circular_mean(np.array([np.pi - 0.1, -np.pi + 0.3])) - (-np.pi + 0.1), 12)
+    0.0
+    """
+    weight = np.ones_like(angle) if weight is None else weight
+    return float(wrap(np.arctan2(weight @ np.sin(angle), weight @ np.cos(angle))))

@@ -1,0 +1,375 @@
+"""EKF-SLAM with rays of Gaussians, slowly: written from the equations alone, for comparison.
+
+Every Jacobian is a dense matrix over the whole state, every member of a ray is a named block, and
+nothing is shared with the package. Equation numbers are those of Bradley & Abaid; the ray is that
+of Sola (2005). The state is the pose, then the members in the order of their initialisation, then
+(only with `carry_correspondence`) one correspondence per landmark.
+"""
+
+import math
+
+import numpy as np
+from scipy.stats import chi2
+
+POSE = ("pose",)
+NEAREST = 1e-3
+LEAST_SHARE = 1e-12
+LEAST_AGGREGATED = 0.05
+CORRESPONDENCE_STD = 1.0
+
+
+def wrapped(angle):
+    """Angle in [-pi, pi)."""
+    angle = math.remainder(angle, 2 * math.pi)
+    return -math.pi if angle == math.pi else angle
+
+
+def moved(motion, pose, control, dt):
+    """Pose after one step, and the Jacobians by pose F (3, 3) and by control U (3, 2)."""
+    return {"bicycle": bicycle, "unicycle": unicycle}[motion.model](motion, pose, control, dt)
+
+
+def bicycle(motion, pose, control, dt):
+    """Eq. (5): the front wheel at speed v, steered by g."""
+    (x, y, th), (v, g), b = pose, control, motion.wheelbase
+    c, s = math.cos(th + g), math.sin(th + g)
+    after = [x + v * dt * c, y + v * dt * s, wrapped(th + v * dt / b * math.sin(g))]
+    F = [[1, 0, -v * dt * s], [0, 1, v * dt * c], [0, 0, 1]]
+    U = [[dt * c, -v * dt * s], [dt * s, v * dt * c], [dt / b * math.sin(g), v * dt / b * math.cos(g)]]
+    return np.array(after), np.array(F), np.array(U)
+
+
+def unicycle(_, pose, control, dt):
+    """An exact arc: the chord has length v dt sin(a)/a and direction th + a, with a = w dt / 2."""
+    (x, y, th), (v, w) = pose, control
+    a = w * dt / 2
+    if abs(a) < 1e-4:
+        sinc, slope = 1 - a**2 / 6, -a / 3
+    else:
+        sinc, slope = math.sin(a) / a, (math.cos(a) - math.sin(a) / a) / a
+    c, s = math.cos(th + a), math.sin(th + a)
+    after = [x + v * dt * sinc * c, y + v * dt * sinc * s, wrapped(th + w * dt)]
+    F = [[1, 0, -v * dt * sinc * s], [0, 1, v * dt * sinc * c], [0, 0, 1]]
+    by_rate = [v * dt * (slope * c - sinc * s) * dt / 2, v * dt * (slope * s + sinc * c) * dt / 2]
+    U = [[dt * sinc * c, by_rate[0]], [dt * sinc * s, by_rate[1]], [0, dt]]
+    return np.array(after), np.array(F), np.array(U)
+
+
+def ray_ranges(rays):
+    """Ranges of the members of a new ray, Eq. (17)."""
+    alpha, beta, (near, far) = rays.ratio, rays.density, rays.range_bounds
+    count = 1 + math.ceil(math.log((1 - alpha) / (1 + alpha) * far / near, beta))
+    ranges = [near / (1 - alpha)]
+    while len(ranges) < count:
+        ranges.append(beta * ranges[-1])
+    return ranges
+
+
+def normalised(logs):
+    """Weights that sum to 1, from unnormalised logarithms."""
+    weights = [math.exp(value - max(logs)) for value in logs]
+    return [weight / sum(weights) for weight in weights]
+
+
+def logarithm(weight):
+    return math.log(weight) if weight > 0 else -math.inf
+
+
+class SlowEkfSlam:
+    """The filter and its belief in one object that changes in place.
+
+    `carry_correspondence` keeps each landmark's number in the state, as Eq. (8) does;
+    `common_bearing_noise` correlates the members of a new ray through the bearing they share;
+    `joseph` updates the covariance by Joseph's form.
+    """
+
+    def __init__(
+        self,
+        motion,
+        range_std,
+        bearing_std,
+        rays,
+        gate=1.0,
+        *,
+        carry_correspondence=False,
+        common_bearing_noise=False,
+        joseph=False,
+    ):
+        self.motion, self.rays, self.gate = motion, rays, gate
+        self.range_variance, self.bearing_variance = range_std**2, bearing_std**2
+        self.carry_correspondence = carry_correspondence
+        self.common_bearing_noise = common_bearing_noise
+        self.joseph = joseph
+
+    def start(self, mean, covariance):
+        self.blocks, self.aggregated, self.gated = [POSE], {}, 0
+        self.X, self.P = np.array(mean, float), np.array(covariance, float)
+        return self
+
+    # The state as named blocks
+
+    def at(self, block):
+        """Where a block lies in the state."""
+        sizes = {"pose": 3, "member": 2, "correspondence": 1}
+        start = 0
+        for other in self.blocks:
+            if other == block:
+                return slice(start, start + sizes[block[0]])
+            start += sizes[other[0]]
+        raise KeyError(block)
+
+    def members(self, label):
+        """Members of a landmark, near to far."""
+        return [block for block in self.blocks if block[:2] == ("member", label)]
+
+    def all_members(self):
+        return [block for block in self.blocks if block[0] == "member"]
+
+    @property
+    def order(self):
+        """Indices of pose and members, without correspondences."""
+        kept = [POSE, *self.all_members()]
+        return np.concatenate([np.arange(self.X.size)[self.at(block)] for block in kept])
+
+    @property
+    def mean(self):
+        return self.X[self.order]
+
+    @property
+    def covariance(self):
+        return self.P[np.ix_(self.order, self.order)]
+
+    @property
+    def landmark(self):
+        return np.array([block[1] for block in self.all_members()], dtype=int)
+
+    @property
+    def weight(self):
+        return np.array([self.aggregated[block] for block in self.all_members()])
+
+    def drop(self, blocks):
+        """Marginalise blocks out."""
+        for block in blocks:
+            gone = self.at(block)
+            self.X = np.delete(self.X, gone)
+            self.P = np.delete(np.delete(self.P, gone, axis=0), gone, axis=1)
+            self.blocks.remove(block)
+            self.aggregated.pop(block, None)
+
+    def insert(self, position, block, value, G, noise):
+        """Augment the state by a function of it with Jacobian G and independent noise."""
+        before = sum(self.at(other).stop - self.at(other).start for other in self.blocks[:position])
+        X = np.concatenate([self.X, value])
+        P = np.block([[self.P, self.P @ G.T], [G @ self.P, G @ self.P @ G.T + noise]])
+        old, new = np.arange(self.X.size), np.arange(self.X.size, X.size)
+        order = np.concatenate([old[:before], new, old[before:]])
+        self.X, self.P = X[order], P[np.ix_(order, order)]
+        self.blocks.insert(position, block)
+
+    # Prediction, Eqs. (5) and (10)
+
+    def predict(self, controls, dt):
+        """Advance by the nominal controls; mean and covariance of the pose after each step."""
+        means, covariances = [], []
+        for control, step in zip(controls, dt, strict=True):
+            self.X[:3], F, U = moved(self.motion, self.X[:3], control, step)
+            Q = np.diag(np.square(self.motion.control_std))
+            if not self.motion.noise_at_rest and control[0] == 0 and control[1] == 0:
+                Q = np.zeros((2, 2))
+            P = self.P.copy()
+            P[:3, :3] = F @ self.P[:3, :3] @ F.T + U @ Q @ U.T
+            P[:3, 3:] = F @ self.P[:3, 3:]
+            P[3:, :3] = P[:3, 3:].T
+            self.P = P
+            means.append(self.X[:3].copy())
+            covariances.append(P[:3, :3].copy())
+        return np.array(means), np.array(covariances)
+
+    # Measurement, Eqs. (6), (7) and (11)
+
+    def predicted(self, block):
+        """Range and bearing of a member, and their Jacobian (2, n) by the whole state."""
+        (x, y, th), (mx, my) = self.X[self.at(POSE)], self.X[self.at(block)]
+        dx, dy = mx - x, my - y
+        d = max(math.hypot(dx, dy), NEAREST)
+        H = np.zeros((2, self.X.size))
+        H[:, self.at(POSE)] = [[-dx / d, -dy / d, 0], [dy / d**2, -dx / d**2, -1]]
+        H[:, self.at(block)] = [[dx / d, dy / d], [-dy / d**2, dx / d**2]]
+        return d, wrapped(math.atan2(dy, dx) - th), H
+
+    def too_near(self, block):
+        return math.dist(self.X[:2], self.X[self.at(block)]) < NEAREST
+
+    def innovation(self, block, distance, bearing, inflation=1.0):
+        """Innovation, Jacobian and noise covariance; bearing alone where the distance is NaN."""
+        d, phi, H = self.predicted(block)
+        nu = np.array([distance - d, wrapped(bearing - phi)])
+        R = np.diag([self.range_variance, self.bearing_variance]) * inflation
+        if math.isnan(distance):
+            nu, H, R = nu[1:], H[1:], R[1:, 1:]
+        return nu, H, R
+
+    def correct(self, block, nu, H, R, inflation=1.0):
+        """Eq. (11); the correspondence, if carried, is measured without error."""
+        if self.carry_correspondence:
+            row = np.zeros((1, self.X.size))
+            row[0, self.at(("correspondence", block[1]))] = 1
+            error = block[1] - self.X[self.at(("correspondence", block[1]))]
+            noise = np.array([[CORRESPONDENCE_STD**2 * inflation]])
+            nu, H = np.concatenate([nu, error]), np.vstack([H, row])
+            R = np.block([[R, np.zeros((len(R), 1))], [np.zeros((1, len(R))), noise]])
+        S = H @ self.P @ H.T + R
+        K = self.P @ H.T @ np.linalg.inv(S)
+        self.X = self.X + K @ nu
+        if self.joseph:
+            A = np.eye(self.X.size) - K @ H
+            self.P = A @ self.P @ A.T + K @ R @ K.T
+        else:
+            self.P = self.P - K @ S @ K.T
+            self.P = (self.P + self.P.T) / 2
+
+    def distance_squared(self, nu, H, R):
+        """Mahalanobis distance of an innovation, squared, and the covariance S."""
+        S = H @ self.P @ H.T + R
+        return float(nu @ np.linalg.solve(S, nu)), S
+
+    def outside(self, squared, freedom):
+        return self.gate < 1 and squared > chi2.ppf(self.gate, freedom)
+
+    # One frame
+
+    def update(self, scan):
+        rows = list(zip(scan.landmark.tolist(), scan.range, scan.bearing, strict=True))
+        known = set(self.landmark.tolist())
+        for label, distance, bearing in rows:
+            if label in known:
+                self.measure(label, distance, bearing)
+        for label, distance, bearing in rows:
+            if label not in known:
+                self.initialise(label, distance, bearing)
+        self.X[2] = wrapped(self.X[2])
+
+    def measure(self, label, distance, bearing):
+        if len(self.members(label)) == 1:
+            self.measure_full(label, distance, bearing)
+        elif math.isnan(distance):
+            self.measure_ray(label, bearing)
+        elif self.rays.partial == "reinitialise":
+            self.reinitialise(label, distance, bearing)
+        else:
+            self.move_heaviest(label, distance, bearing)
+
+    def measure_full(self, label, distance, bearing):
+        (block,) = self.members(label)
+        if self.too_near(block):
+            return
+        nu, H, R = self.innovation(block, distance, bearing)
+        if self.outside(self.distance_squared(nu, H, R)[0], len(nu)):
+            self.gated += 1
+        else:
+            self.correct(block, nu, H, R)
+
+    def measure_ray(self, label, bearing):
+        """Weigh every member, share the measurement among them, prune: Eqs. (19) to (21)."""
+        members = self.members(label)
+        squared, log_likelihood = [], []
+        for block in members:
+            nu, H, R = self.innovation(block, math.nan, bearing)
+            distance_squared, S = self.distance_squared(nu, H, R)
+            squared.append(distance_squared)
+            log_likelihood.append(-distance_squared / 2 - math.log(2 * math.pi * S[0, 0]) / 2)
+        if all(self.outside(value, 1) for value in squared):
+            self.gated += 1
+            return
+        aggregated = normalised(
+            [
+                logarithm(self.aggregated[block]) + value
+                for block, value in zip(members, log_likelihood, strict=True)
+            ]
+        )
+        self.aggregated.update(zip(members, aggregated, strict=True))
+        for block, share in zip(members, self.shares(members, log_likelihood), strict=True):
+            if share > 0 and not self.too_near(block):
+                nu, H, R = self.innovation(block, math.nan, bearing, 1 / share)
+                self.correct(block, nu, H, R, 1 / share)
+        self.prune(label)
+
+    def shares(self, members, log_likelihood):
+        """How much of a measurement each member takes; 0 for those that are skipped."""
+        n = self.rays.power
+        if self.rays.weights == "instantaneous":
+            shares = normalised([n * value for value in log_likelihood])
+            return [share if share > LEAST_SHARE else 0 for share in shares]
+        shares = normalised([n * logarithm(self.aggregated[block]) for block in members])
+        return [share if share >= LEAST_AGGREGATED else 0 for share in shares]
+
+    def prune(self, label):
+        members = self.members(label)
+        heaviest = max(members, key=self.aggregated.__getitem__)
+        least = self.rays.prune / len(members)
+        self.drop([b for b in members if self.aggregated[b] < least and b != heaviest])
+        left = self.members(label)
+        total = sum(self.aggregated[block] for block in left)
+        self.aggregated.update({block: self.aggregated[block] / total for block in left})
+
+    def reinitialise(self, label, distance, bearing):
+        """Place a partial landmark anew, where its first member stood in the state."""
+        position = self.blocks.index(self.members(label)[0])
+        self.drop(self.members(label))
+        self.place(position, label, distance, bearing)
+
+    def move_heaviest(self, label, distance, bearing):
+        """Keep the heaviest member at the measured range, then measure its bearing."""
+        members = self.members(label)
+        heaviest = max(members, key=self.aggregated.__getitem__)
+        self.drop([b for b in members if b != heaviest])
+        self.aggregated[heaviest] = 1.0
+        offset = self.X[self.at(heaviest)] - self.X[:2]
+        self.X[self.at(heaviest)] = self.X[:2] + distance * offset / np.linalg.norm(offset)
+        if not self.too_near(heaviest):
+            self.correct(heaviest, *self.innovation(heaviest, math.nan, bearing))
+
+    # Initialisation, Eqs. (16) and (17)
+
+    def initialise(self, label, distance, bearing):
+        end = 1 + len(self.all_members())
+        if self.carry_correspondence:
+            G, noise = np.zeros((1, self.X.size)), np.array([[CORRESPONDENCE_STD**2]])
+            self.insert(end, ("correspondence", label), [label], G, noise)
+        if math.isnan(distance):
+            self.cast_ray(end, label, bearing)
+        else:
+            self.place(end, label, distance, bearing)
+
+    def point(self, distance, bearing):
+        """Position at a range and bearing, its Jacobians by the state and by (range, bearing)."""
+        x, y, th = self.X[:3]
+        c, s = math.cos(th + bearing), math.sin(th + bearing)
+        G = np.zeros((2, self.X.size))
+        G[:, :3] = [[1, 0, -distance * s], [0, 1, distance * c]]
+        by_measurement = np.array([[c, -distance * s], [s, distance * c]])
+        return np.array([x + distance * c, y + distance * s]), G, by_measurement
+
+    def place(self, position, label, distance, bearing):
+        m, G, Gz = self.point(distance, bearing)
+        R = np.diag([self.range_variance, self.bearing_variance])
+        block = ("member", label, 0)
+        self.insert(position, block, m, G, Gz @ R @ Gz.T)
+        self.aggregated[block] = 1.0
+
+    def cast_ray(self, position, label, bearing):
+        ranges = ray_ranges(self.rays)
+        by_bearing = {}
+        for j, s in enumerate(ranges):
+            m, G, Gz = self.point(s, bearing)
+            R = np.diag([(self.rays.ratio * s) ** 2, self.bearing_variance])
+            block = ("member", label, j)
+            self.insert(position + j, block, m, G, Gz @ R @ Gz.T)
+            self.aggregated[block] = 1 / len(ranges)
+            by_bearing[block] = Gz[:, 1]
+        if self.common_bearing_noise:
+            for one in by_bearing:
+                for other in by_bearing.keys() - {one}:
+                    common = self.bearing_variance * np.outer(by_bearing[one], by_bearing[other])
+                    self.P[self.at(one), self.at(other)] += common
+
