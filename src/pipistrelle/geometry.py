@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numba import njit
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, error_model="numpy", inline="always")
 def wrap_angle(angle: float) -> float:
     """Wrap one angle to [-pi, pi) [rad]; for kernels (see `wrap`)."""
     wrapped = angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))

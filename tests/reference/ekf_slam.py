@@ -35,7 +35,11 @@ def bicycle(motion, pose, control, dt):
     c, s = math.cos(th + g), math.sin(th + g)
     after = [x + v * dt * c, y + v * dt * s, wrapped(th + v * dt / b * math.sin(g))]
     F = [[1, 0, -v * dt * s], [0, 1, v * dt * c], [0, 0, 1]]
-    U = [[dt * c, -v * dt * s], [dt * s, v * dt * c], [dt / b * math.sin(g), v * dt / b * math.cos(g)]]
+    U = [
+        [dt * c, -v * dt * s],
+        [dt * s, v * dt * c],
+        [dt / b * math.sin(g), v * dt / b * math.cos(g)],
+    ]
     return np.array(after), np.array(F), np.array(U)
 
 
@@ -372,4 +376,3 @@ class SlowEkfSlam:
                 for other in by_bearing.keys() - {one}:
                     common = self.bearing_variance * np.outer(by_bearing[one], by_bearing[other])
                     self.P[self.at(one), self.at(other)] += common
-

@@ -1,92 +1,97 @@
 """Made-up missions: a noisy drive among landmarks, measured with Gaussian noise."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from pipistrelle.detection.scans import Scan
-from reference.ekf_slam import moved, wrapped
+from pipistrelle.estimation.models import Gaussian, Motion, motion_step
+from pipistrelle.geometry import range_and_bearing, wrap
 
-DT = 0.125
+STEP = 0.125
 STEPS_PER_FRAME = 4
+BICYCLE = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
+START = Gaussian(
+    mean=np.array([0.0, -7.408, 0.0]), covariance=np.diag([0.05**2, 0.05**2, 0.0436**2])
+)
+CIRCLE = (0.75, 0.027)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mission:
-    """Truth, controls and scans: `controls` and `dt` hold one row of steps per frame."""
+    """Truth and what a filter is given; landmark i (from 0) bears the label i + 1.
+
+    `path` holds the start, then the pose at each frame; `controls` (frames, 4, 2) are nominal.
+    """
 
     path: np.ndarray
     controls: np.ndarray
     dt: np.ndarray
     landmarks: np.ndarray
-    scans: list
+    scans: list[Scan]
 
 
 def draw_mission(
     rng,
     motion,
-    *,
     start,
-    control,
-    frames,
     landmarks,
+    controls,
+    *,
     beamwidth,
     hearing=0.0,
     reach=14.0,
     range_std=0.2,
     bearing_std=0.05,
+    outliers=0.0,
 ):
-    """Draw a mission.
+    """Draw a mission from a Gaussian start.
 
-    Landmarks nearer than `reach` and inside the beam give range and bearing; others nearer than
-    `hearing` give a bearing only. `landmarks` are positions (n, 2); labels count from 1. Each
-    frame holds its measurements in a random order. A start of (mean, covariance) is drawn from.
+    Landmarks nearer than `reach` and inside the beam give range and bearing, others nearer than
+    `hearing` a bearing only, in a random order; a share of `outliers` has a random bearing.
     """
-    pose = np.array(rng.multivariate_normal(*start), float)
-    path, scans = [pose], []
-    for frame in range(frames):
-        for _ in range(STEPS_PER_FRAME):
-            noisy = np.asarray(control) + rng.normal(size=2) * motion.control_std
-            path.append(moved(motion, path[-1], noisy, DT)[0])
-        rows = []
-        for label, (x, y) in enumerate(landmarks, start=1):
-            dx, dy = x - path[-1][0], y - path[-1][1]
-            distance = math.hypot(dx, dy)
-            bearing = wrapped(math.atan2(dy, dx) - path[-1][2])
-            noise = rng.normal(size=2) * [range_std, bearing_std]
-            measured = wrapped(bearing + noise[1])
-            if distance < reach and abs(bearing) < beamwidth / 2:
-                rows.append((label, max(distance + noise[0], 0.01), measured))
-            elif distance < hearing:
-                rows.append((label, math.nan, measured))
-        rows = [rows[i] for i in rng.permutation(len(rows))]
-        scans.append(scan_of(rows, time=(frame + 1) * STEPS_PER_FRAME * DT))
-    controls = np.tile(np.asarray(control, float), (frames, STEPS_PER_FRAME, 1))
-    return Mission(
-        path=np.array(path),
-        controls=controls,
-        dt=np.full((frames, STEPS_PER_FRAME), DT),
-        landmarks=np.asarray(landmarks, float),
-        scans=scans,
-    )
+    path, scans = [rng.multivariate_normal(start.mean, start.covariance)], []
+    for frame, nominal in enumerate(controls, start=1):
+        pose = path[-1]
+        for control in nominal:
+            moving = motion.noise_at_rest or np.any(control)
+            noise = rng.normal(size=2) * motion.control_std * moving
+            pose = motion_step(motion, pose, control + noise, STEP)
+        path.append(pose)
+        distance, bearing = range_and_bearing(pose, landmarks)
+        active = (distance < reach) & (np.abs(bearing) < beamwidth / 2)
+        measured = np.where(active, distance + rng.normal(0, range_std, distance.size), np.nan)
+        turned = wrap(bearing + rng.normal(0, bearing_std, distance.size))
+        wrong = rng.random(distance.size) < outliers
+        turned = np.where(wrong, rng.uniform(-np.pi, np.pi, distance.size), turned)
+        seen = rng.permutation(np.flatnonzero(active | (distance < hearing)))
+        time = frame * STEPS_PER_FRAME * STEP
+        scans.append(Scan(time=time, landmark=seen + 1, range=measured[seen], bearing=turned[seen]))
+    dt = np.full(np.shape(controls)[:2], STEP)
+    return Mission(path=np.array(path), controls=controls, dt=dt, landmarks=landmarks, scans=scans)
 
 
-def scan_of(rows, time=0.0):
-    """Scan of rows (label, range or NaN, bearing)."""
-    return Scan(
-        time=time,
-        landmark=np.array([row[0] for row in rows], dtype=np.int64),
-        range=np.array([row[1] for row in rows], dtype=float),
-        bearing=np.array([row[2] for row in rows], dtype=float),
-    )
+def steady(control, frames):
+    """Return the same control at every step."""
+    return np.tile(np.asarray(control, float), (frames, STEPS_PER_FRAME, 1))
 
 
 def scattered(rng, count, radius=25.0, spacing=3.0):
-    """Positions in a disc, at least `spacing` apart."""
+    """Return positions in a disc, at least `spacing` apart."""
     points = []
     while len(points) < count:
         point = rng.uniform(-radius, radius, size=2)
         if np.hypot(*point) < radius and all(np.hypot(*(point - p)) > spacing for p in points):
             points.append(point)
     return np.array(points)
+
+
+def scan_of(*rows, time=0.0):
+    """Return a scan of rows (label, range or NaN, bearing)."""
+    label, distance, bearing = zip(*rows, strict=True) if rows else ((), (), ())
+    return Scan(
+        time=time,
+        landmark=np.array(label, dtype=np.int64),
+        range=np.array(distance, dtype=float),
+        bearing=np.array(bearing, dtype=float),
+    )

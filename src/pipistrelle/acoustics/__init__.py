@@ -18,7 +18,10 @@ _DOOR = {
     "target_strength_db": "target",
     "through_piston": "arrivals",
 }
-__all__ = list(_DOOR)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_DOOR])
 
 
 def __getattr__(name: str) -> object:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float, Int, Int8
+from jaxtyping import Bool, Float, Int, Int8
 
 from pipistrelle.acoustics.emitter import in_front, piston_directivity
 from pipistrelle.acoustics.propagation import (
@@ -103,35 +103,175 @@ def arrivals_of_emission(
 
     Examples
     --------
-    >>> east, ahead, behind = np.zeros(3), [5.0, 0.0], [-5.0, 0.0]
-    >>> heard = arrivals_of_emission(
-    ...     east, np.zeros(2), np.array([ahead, behind]), np.array([0.0, 9.0]), Config()
-    ... )
+    The second landmark is behind the baffle: only the beacon's call shows it.
+
+    >>> east, still = np.zeros(3), np.zeros(2)
+    >>> landmarks, beacon = np.array([[5.0, 0.0], [-5.0, 0.0]]), np.array([0.0, 9.0])
+    >>> heard = arrivals_of_emission(east, still, landmarks, beacon, Config())
     >>> heard.source, heard.landmark
     (array([0, 0, 1, 1, 1], dtype=int8), array([1, 3, 1, 2, 3]))
     """
+    air = config.air
     targets = np.concatenate((landmarks, beacon[np.newaxis]))
     homeward, bearing = range_and_bearing(pose, targets)
     offset, incoming = targets - pose[:2], targets - beacon
     outward = np.hypot(incoming[:, 0], incoming[:, 1])
-    _refuse_impossible(pose, homeward, outward[:-1])
-    closing = (offset[:, 0] * velocity[0] + offset[:, 1] * velocity[1]) / homeward
+    _refuse_impossible(pose, homeward, outward)
     ahead = np.flatnonzero(in_front(bearing))
-    label = np.arange(1, len(targets) + 1)
-    path = np.concatenate((2.0 * homeward[ahead], outward + homeward))
-    source = np.full(len(path), PASSIVE, dtype=np.int8)
-    source[: len(ahead)] = ACTIVE
+    loss_db = _loss_db(homeward, outward, ahead, _turn(incoming, offset), config)
+    row = np.concatenate((ahead, np.arange(len(targets))))
+    own = np.arange(len(row)) < len(ahead)
+    path = homeward[row] + np.where(own, homeward[row], outward[row])
+    sent_db = np.where(own, config.emitter.level_db, config.beacon.level_db)
+    absorption = np.where(
+        own, _absorption(air, config.emitter.frequency), _absorption(air, config.beacon.frequency)
+    )
+    closing = ((offset[:, 0] * velocity[0] + offset[:, 1] * velocity[1]) / homeward)[row]
+    frequency = doppler_frequency(
+        np.where(own, config.emitter.frequency, config.beacon.frequency),
+        receiver_speed=closing,
+        source_speed=np.where(own, closing, 0.0),
+        speed_of_sound=air.speed_of_sound,
+    )
     return Arrivals(
-        delay=path / config.air.speed_of_sound,
-        level_db=np.concatenate(
-            (
-                _active_levels_db(homeward[ahead], config),
-                _passive_levels_db(outward[:-1], homeward[:-1], _turn(incoming, offset), config),
-                _direct_level_db(homeward[-1:], config),
-            )
-        ),
-        bearing=np.concatenate((bearing[ahead], bearing)),
-        frequency=_frequencies(closing, ahead, config),
-        source=source,
-        landmark=np.concatenate((label[ahead], label)),
+        delay=path / air.speed_of_sound,
+        level_db=sent_db - loss_db - absorption * path,
+        bearing=bearing[row],
+        frequency=frequency,
+        source=np.where(own, np.int8(ACTIVE), np.int8(PASSIVE)),
+        landmark=row + 1,
+    )
+
+
+def through_piston(
+    arrivals: Arrivals, *, radius: float, frequency: float, speed_of_sound: float
+) -> Arrivals:
+    r"""What arrives when a piston sends the vehicle's call.
+
+    .. math:: L_\text{active} \leftarrow L_\text{active} + 20 \log_{10} p(\phi)
+
+    An echo left in the direction that it comes from, and the piston only sends, so its pressure p
+    counts once. In its nulls p is taken as 1e-12 (-240 dB): levels stay finite.
+
+    Parameters
+    ----------
+    arrivals : Arrivals
+        Of `arrivals_of_emission`.
+    radius : [m]
+        Of the piston.
+    frequency : [Hz]
+        Of the vehicle's call.
+    speed_of_sound : [m/s]
+
+    Returns
+    -------
+    Arrivals
+        The same rows in the same order; passive ones as they were.
+
+    Notes
+    -----
+    Bradley & Abaid, Eq. (1). One world is heard through twelve pistons; all else they share.
+
+    Examples
+    --------
+    >>> one, beam = np.ones(2), np.array([0.0, 1.5])
+    >>> level = through_piston(
+    ...     Arrivals(delay=one, level_db=0 * one, bearing=beam, frequency=35e3 * one,
+    ...              source=np.zeros(2, dtype=np.int8), landmark=np.array([1, 2])),
+    ...     radius=0.0088, frequency=35e3, speed_of_sound=343.0,
+    ... ).level_db
+    >>> level.round(1)
+    array([  0. , -18.6])
+    """
+    own = arrivals.source == ACTIVE
+    pressure = piston_directivity(
+        arrivals.bearing[own], frequency=frequency, radius=radius, speed_of_sound=speed_of_sound
+    )
+    level_db = arrivals.level_db.copy()
+    level_db[own] += 20.0 * np.log10(np.maximum(pressure, _DEEPEST_NULL))
+    return replace(arrivals, level_db=level_db)
+
+
+def rows_of(arrivals: Arrivals, rows: Bool[np.ndarray, " a"]) -> Arrivals:
+    """Take some of the arrivals.
+
+    Parameters
+    ----------
+    arrivals : Arrivals
+    rows : (a) bool
+
+    Returns
+    -------
+    Arrivals
+    """
+    return Arrivals(
+        delay=arrivals.delay[rows],
+        level_db=arrivals.level_db[rows],
+        bearing=arrivals.bearing[rows],
+        frequency=arrivals.frequency[rows],
+        source=arrivals.source[rows],
+        landmark=arrivals.landmark[rows],
+    )
+
+
+def _loss_db(
+    homeward: Float[np.ndarray, " t"],
+    outward: Float[np.ndarray, " t"],
+    ahead: Int[np.ndarray, " b"],
+    turn: Float[np.ndarray, " t"],
+    config: Config,
+) -> Float[np.ndarray, " a"]:
+    """Spreading less target strength of active echoes, passive echoes and the direct call."""
+    air, target = config.air, config.target
+    strength_db = target_strength_db(
+        turn[:-1],
+        radius=target.radius,
+        frequency=config.beacon.frequency,
+        shape=target.shape,
+        speed_of_sound=air.speed_of_sound,
+    )
+    active = spreading_loss_db(2.0 * homeward[ahead], ways=2)
+    passive = passive_spreading_loss_db(outward[:-1], homeward[:-1], law=air.spreading)
+    direct = spreading_loss_db(homeward[-1:])
+    return np.concatenate((active, passive - strength_db, direct))
+
+
+def _turn(
+    incoming: Float[np.ndarray, "t 2"], offset: Float[np.ndarray, "t 2"]
+) -> Float[np.ndarray, " t"]:
+    """Angle from the way in to the way on to the vehicle, which is -offset: pi is back [rad]."""
+    x, y = incoming.T
+    u, v = -offset.T
+    return np.arctan2(x * v - y * u, x * u + y * v)
+
+
+@lru_cache(maxsize=64)
+def _absorption(air: AirConfig, frequency: float) -> float:
+    """Absorption of one tone in this air [dB/m], computed once."""
+    return float(
+        absorption_db_per_m(
+            frequency,
+            temperature_c=air.temperature_c,
+            relative_humidity=air.relative_humidity,
+            pressure_kpa=air.pressure_kpa,
+        )
+    )
+
+
+def _refuse_impossible(
+    pose: Float[np.ndarray, "3"],
+    homeward: Float[np.ndarray, " t"],
+    outward: Float[np.ndarray, " t"],
+) -> None:
+    """Refuse points that coincide and coordinates that are not finite."""
+    paths = np.concatenate((homeward, outward[:-1]))
+    if paths.min() > 0.0 and paths.max() < math.inf and math.isfinite(pose[2]):
+        return
+    names = [f"landmark {i}" for i in range(1, len(homeward))]
+    ends = [f"vehicle to {name}" for name in [*names, "beacon"]] + [f"beacon to {n}" for n in names]
+    found = [f"{e}: {d} m" for e, d in zip(ends, paths, strict=True) if not 0.0 < d < math.inf]
+    raise InputError(
+        f"world around the pose {pose}: found {', '.join(found) or 'no finite heading'}; expected "
+        "vehicle, beacon and landmarks at distinct, finite points; move them apart "
+        "(scenario.clearance keeps them so)"
     )

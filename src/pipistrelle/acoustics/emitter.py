@@ -31,8 +31,8 @@ def jinc(x: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
 
     Examples
     --------
-    >>> float(jinc(0.0)), round(float(jinc(3.8317)), 4)
-    (1.0, -0.0)
+    >>> jinc(np.array([0.0, 1.0, 5.1356])).round(3)
+    array([ 1.   ,  0.88 , -0.132])
     """
     on_axis = np.abs(x) < 1e-8  # where 1 - x^2 / 8 is 1 in double precision
     x = np.where(on_axis, 1.0, x)
@@ -59,7 +59,7 @@ def in_front(bearing: Float[np.ndarray, "*n"] | float) -> Bool[np.ndarray, "*n"]
     >>> in_front(np.radians([0.0, -90.0, 91.0, 270.5]))
     array([ True,  True, False,  True])
     """
-    return np.cos(bearing) >= 0.0
+    return np.asarray(np.cos(bearing) >= 0.0)
 
 
 def piston_directivity(
@@ -135,13 +135,14 @@ def beamwidth(
 
     Examples
     --------
-    >>> np.degrees(beamwidth(np.array([0.0025, 0.0088]), frequency=35e3, speed_of_sound=343)).round(1)
+    >>> radius = np.array([0.0025, 0.0088])
+    >>> np.degrees(beamwidth(radius, frequency=35e3, speed_of_sound=343.0)).round(1)
     array([180. ,  33.3])
     """
     if not np.all((np.asarray(radius) > 0) & np.isfinite(radius)):
         raise InputError(f"radius: found {radius}, expected metres above 0; give a piston a size")
     k = 2.0 * np.pi * frequency / speed_of_sound
-    return 2.0 * np.arcsin(np.minimum(HALF_POWER / (k * np.asarray(radius)), 1.0))
+    return np.asarray(2.0 * np.arcsin(np.minimum(HALF_POWER / (k * np.asarray(radius)), 1.0)))
 
 
 def piston_radius(
@@ -185,4 +186,4 @@ def piston_radius(
             "180 is the widest beam of a back-baffled piston"
         )
     k = 2.0 * np.pi * frequency / speed_of_sound
-    return HALF_POWER / (k * np.sin(width / 2.0))
+    return np.asarray(HALF_POWER / (k * np.sin(width / 2.0)))

@@ -41,7 +41,7 @@ def spreading_loss_db(
     >>> float(spreading_loss_db(20.0, ways=2))
     40.0
     """
-    return ways * 20.0 * np.log10(path / ways)
+    return np.asarray(ways * 20.0 * np.log10(path / ways))
 
 
 def passive_spreading_loss_db(
@@ -147,11 +147,12 @@ def absorption_db_per_m(
     frN = pi * tau**-0.5 * (9.0 + 280.0 * h * np.exp(-4.170 * (tau ** (-1.0 / 3.0) - 1.0)))
     oxygen = 0.01275 * np.exp(-2239.1 / T) * frO / (frO**2 + f2)
     nitrogen = 0.1068 * np.exp(-3352.0 / T) * frN / (frN**2 + f2)
-    return 8.686 * f2 * (1.84e-11 * tau**0.5 / pi + tau**-2.5 * (oxygen + nitrogen))
+    classical = 1.84e-11 * tau**0.5 / pi
+    return np.asarray(8.686 * f2 * (classical + tau**-2.5 * (oxygen + nitrogen)))
 
 
 def doppler_frequency(
-    frequency: float,
+    frequency: Float[np.ndarray, "*n"] | float,
     *,
     receiver_speed: Float[np.ndarray, "*n"] | float,
     source_speed: Float[np.ndarray, "*n"] | float = 0.0,
@@ -166,7 +167,7 @@ def doppler_frequency(
 
     Parameters
     ----------
-    frequency : [Hz]
+    frequency : (*n) [Hz]
         As emitted.
     receiver_speed : (*n) [m/s]
         Towards the sound.
@@ -194,10 +195,11 @@ def doppler_frequency(
     >>> round(float(echo) - 35e3)
     153
     """
-    for speed in (receiver_speed, source_speed):
-        if not np.all(np.abs(speed) < speed_of_sound):
-            raise InputError(
-                f"velocity: found {speed} m/s along the sound, expected less than the speed of "
-                f"sound, {speed_of_sound} m/s; slow down"
-            )
-    return frequency * (speed_of_sound + receiver_speed) / (speed_of_sound - source_speed)
+    fastest = np.maximum(np.abs(receiver_speed), np.abs(source_speed))
+    if not np.all(fastest < speed_of_sound):
+        raise InputError(
+            f"velocity: found {np.max(fastest)} m/s along the sound, expected less than the speed "
+            f"of sound, {speed_of_sound} m/s; slow down"
+        )
+    ratio = (speed_of_sound + receiver_speed) / (speed_of_sound - source_speed)
+    return np.asarray(frequency * ratio)

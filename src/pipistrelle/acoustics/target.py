@@ -62,7 +62,7 @@ def target_strength_db(
     --------
     >>> tin = dict(radius=0.025, frequency=30e3, shape="cylinder", speed_of_sound=343.0)
     >>> target_strength_db(np.radians([180.0, 90.0, 0.0]), **tin).round(2)
-    array([ 0.  , -1.5 , 12.43])
+    array([ 0.  , -1.39, 12.43])
     """
     kr = 2.0 * np.pi * frequency / speed_of_sound * radius
     lit = np.abs(np.sin(np.asarray(angle) / 2.0))
@@ -73,4 +73,4 @@ def target_strength_db(
         intensity = 1.0 + (kr * shadow * jinc(kr * np.sin(angle))) ** 2
     else:
         raise InputError(f"target.shape: found {shape!r}, expected 'cylinder' or 'sphere'; choose")
-    return 10.0 * np.log10(intensity)
+    return np.asarray(10.0 * np.log10(intensity))

@@ -229,7 +229,7 @@ def gate_bounds(gate: float) -> tuple[float, float]:
     return NormalDist().inv_cdf(0.5 * (1.0 + gate)) ** 2, -2.0 * math.log(1.0 - gate)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _predict(
     mean, covariance, controls, dt, model, wheelbase, first_variance, second_variance,
     noise_at_rest, pose_means, pose_covariances,
@@ -270,7 +270,7 @@ def _predict(
     covariance[:3, :3] = P
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _subtract_outer(covariance, size, w, columns):
     """Covariance minus the outer product of the columns of w, in place."""
     if columns == 1:
@@ -287,7 +287,7 @@ def _subtract_outer(covariance, size, w, columns):
                 row[b] -= wa * w0[b] + va * w1[b]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _bearing_variance(covariance, i, c, s, d):
     """Innovation variance H P H^T of the bearing of the member at state index i, without R."""
     h0, h1 = s / d, -c / d  # by pose: (h0, h1, -1); by member: (-h0, -h1)
@@ -302,7 +302,7 @@ def _bearing_variance(covariance, i, c, s, d):
     )  # fmt: skip
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _correct_bearing(mean, covariance, size, i, bearing, variance, bound, w):
     """Correct the state with the bearing of the member at index i; GATED when beyond bound."""
     distance, expected, c, s, d = sight(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
@@ -326,7 +326,7 @@ def _correct_bearing(mean, covariance, size, i, bearing, variance, bound, w):
     return APPLIED
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _correct_active(
     mean, covariance, size, i, distance, bearing, range_variance, bearing_variance, bound, w
 ):
@@ -361,7 +361,7 @@ def _correct_active(
     return APPLIED
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _place(mean, covariance, size, i, distance, bearing, range_variance, bearing_variance):
     """Put a member at state index i, at a range and bearing from the pose (Eq. 16).
 
@@ -389,7 +389,7 @@ def _place(mean, covariance, size, i, distance, bearing, range_variance, bearing
     covariance[i, i + 1] = covariance[i + 1, i] = cross
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _drop_members(mean, covariance, landmark, weight, members, first, count, keep):
     """Close the gaps that dropped members of one landmark leave; returns the members left."""
     target = first
@@ -406,7 +406,7 @@ def _drop_members(mean, covariance, landmark, weight, members, first, count, kee
     return target
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _correct_ray(
     mean, covariance, weight, members, first, count, bearing, variance, bound, power, aggregated, w
 ):
@@ -436,7 +436,7 @@ def _correct_ray(
     return APPLIED
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _range_for_ray(
     mean, covariance, landmark, weight, members, first, count, distance, bearing,
     range_variance, bearing_variance, reinitialise, w,
@@ -461,7 +461,7 @@ def _range_for_ray(
     return members
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _members_of(landmark, members, label):
     """Index of a landmark's first member and how many it has (0: not mapped)."""
     for first in range(members):
@@ -473,7 +473,7 @@ def _members_of(landmark, members, label):
     return members, 0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _update(
     old_mean, old_covariance, old_landmark, old_weight, labels, bearings, ranges,
     range_variance, bearing_variance, gate_passive, gate_active,

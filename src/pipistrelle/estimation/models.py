@@ -96,7 +96,7 @@ class Track:
     gated: int
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def advance(
     model: int, wheelbase: float, heading: float, speed: float, turn: float, dt: float
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
@@ -207,7 +207,7 @@ def motion_jacobians(
     return F, np.array(moved[3:]).reshape(2, 3).T.copy()
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def sight(
     x: float, y: float, heading: float, px: float, py: float
 ) -> tuple[float, float, float, float, float]:

@@ -83,7 +83,7 @@ def ray_members(
     return ranges, rays.ratio * ranges
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def log_likelihood(innovation: float, variance: float) -> float:
     """Log of N(innovation; 0, variance) without its constant.
 
@@ -92,7 +92,7 @@ def log_likelihood(innovation: float, variance: float) -> float:
     return -0.5 * (innovation * innovation / variance + math.log(variance))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def normalise_logs(log_weights: np.ndarray, weights: np.ndarray, count: int) -> None:
     """Write exp(log_weights) / sum into weights, without underflow of the whole."""
     largest = -np.inf
@@ -106,7 +106,7 @@ def normalise_logs(log_weights: np.ndarray, weights: np.ndarray, count: int) -> 
         weights[j] /= total
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def weigh_and_share(
     log_likelihoods: np.ndarray,
     weights: np.ndarray,
@@ -134,7 +134,7 @@ def weigh_and_share(
             share[j] = 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def survivors(weights: np.ndarray, count: int, prune: float, keep: np.ndarray) -> int:
     """Mark the members that stay, renormalise their weights in place and return their number.
 

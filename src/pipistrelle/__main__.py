@@ -1,0 +1,110 @@
+"""The command line: verbs, errors and exit statuses.
+
+0: done. 1: done, with failed trials. 2: bad input, said in a line. 130: interrupted; what is done
+is kept. A traceback is always a bug of ours.
+"""
+
+import os
+import sys
+from collections.abc import Sequence
+from itertools import zip_longest
+
+from cyclopts import App, CycloptsError
+
+from pipistrelle import __version__
+
+app = App(
+    name="pipistrelle",
+    help="Sonar SLAM with one's own calls, someone else's, or both: from waveform to verdict.",
+    version=__version__,
+    help_format="plaintext",
+    exit_on_error=False,
+    print_error=False,
+    result_action="return_value",
+    suppress_keyboard_interrupt=False,
+)
+app.command(
+    "pipistrelle.verbs.run:run",
+    name="run",
+    help="Drive through one random world, by sound; the three strategies side by side.",
+)
+app.command(
+    "pipistrelle.verbs.slam:slam",
+    name="slam",
+    help="Solve a recorded log: a log folder, or a UTIAS MRCLAM folder as it is.",
+)
+config = App(name="config", help="Show the settings, or what a file of settings may hold.")
+config.command(
+    "pipistrelle.verbs.config:show",
+    name="show",
+    help="Print the settings as TOML: defaults < file < environment < flags.",
+)
+config.command(
+    "pipistrelle.verbs.config:schema", name="schema", help="Print the settings' JSON schema."
+)
+app.command(config)
+app.command(
+    "pipistrelle.verbs.doctor:doctor",
+    name="doctor",
+    help="Say what is installed here, and how to fix what is missing.",
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Obey a command line.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Those of this process if none are given.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    Examples
+    --------
+    >>> main(["--version"])
+    0.1.0
+    0
+    """
+    try:
+        status = app(_completed(sys.argv[1:] if arguments is None else arguments)) or 0
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        print("pipistrelle: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader of our output has left
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except (CycloptsError, OSError, ValueError) as error:
+        message = _explained(error)
+        if message is None:
+            raise
+        for line in message.splitlines():
+            print(f"pipistrelle: error: {line}", file=sys.stderr)
+        return 2
+    return status
+
+
+def _completed(arguments: Sequence[str]) -> list[str]:
+    """Give a bare ``--animate`` its format."""
+    formats = ("gif", "mp4")
+    return [
+        "--animate=gif" if word == "--animate" and after not in formats else word
+        for word, after in zip_longest(arguments, arguments[1:])
+    ]
+
+
+def _explained(error: Exception) -> str | None:
+    """Word a user's mistake; None for a bug."""
+    from pipistrelle.config import InputError
+
+    if isinstance(error, OSError):
+        return f"{error.filename}: {error.strerror}" if error.filename else None
+    return str(error) if isinstance(error, (CycloptsError, InputError)) else None
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,403 @@
+r"""Samples -> detections: matched filter, snapshots, tones present, beamscan, time of arrival.
+
+The matched filter's outputs y_e, normalised to unit noise variance, are tested per face and tone
+by their energy :math:`E = \sum_e |y_e|^2`, which is Gamma(N) distributed in noise. A *snapshot*
+is a lag whose energy passes the test and is the largest within half a call to either side. A tone
+counts there only if its energy is not explained by the leakage of the other, stronger one: the
+edges of a rectangular call leak -33 dB into the other tone. The ten outputs at that lag are
+scanned with a conventional beam, whose power needs only the sums over element pairs of each lag,
+
+.. math:: P(u) = r_0 + 2 \operatorname{Re} \sum_{l=1}^{N-1} r_l e^{-i l u}, \qquad
+          u = \frac{2\pi f d}{c} \sin\theta .
+
+Each peak near the strongest's height is refined by a parabola, the beamformer is steered to it,
+and the time of arrival is where a triangle, the matched filter's answer to the call, fits best.
+Bradley & Abaid, Sec. II-D; what the paper leaves open is settled in the settings' defaults.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Complex, Float, Int
+from numba import njit
+
+from pipistrelle.arrays.layout import Layout
+from pipistrelle.config import Config
+from pipistrelle.geometry import wrap
+
+SCAN_STEP = 0.05
+"""Distance of the scan's beams in u [rad]: the parabola's bias stays under 2 % of a beam step."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Detections:
+    """What one frame's samples hold; one row per face, tone, snapshot and peak.
+
+    Attributes
+    ----------
+    face : (m)
+    tone : (m)
+        0 the vehicle's, 1 the beacon's.
+    angle : (m) [rad]
+        Off the face's normal.
+    bearing : (m) [rad]
+        Relative to the heading.
+    delay : (m) [s]
+        Since the emission. Of the beacon's tone it is nobody's to use but the label's.
+    power : (m)
+        Of the steered beam, divided by the elements: their number times the SNR of one.
+    """
+
+    face: Int[np.ndarray, " m"]
+    tone: Int[np.ndarray, " m"]
+    angle: Float[np.ndarray, " m"]
+    bearing: Float[np.ndarray, " m"]
+    delay: Float[np.ndarray, " m"]
+    power: Float[np.ndarray, " m"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Detector:
+    """Settled thresholds and tables of the detection stage; see `detector`.
+
+    Attributes
+    ----------
+    threshold : float
+        Of the energy of one face and tone, in units of the noise of one output.
+    leakage, peak : float
+        Power ratios.
+    angle_limit : [rad]
+    normal : (f) [rad]
+    wave : (2) [rad]
+        Phase between neighbours at 90 degrees, 2 pi f d / c, per tone.
+    scan : (2, n) [rad]
+        Scanned u, per tone.
+    table : (2, e - 1, n) complex
+        exp(-i l u), l = 1 ... e - 1.
+    """
+
+    threshold: float
+    leakage: float
+    peak: float
+    angle_limit: float
+    normal: Float[np.ndarray, " f"]
+    wave: Float[np.ndarray, "2"]
+    scan: Float[np.ndarray, "2 n"]
+    table: Complex[np.ndarray, "2 l n"]
+
+
+def detector(config: Config, layout: Layout) -> Detector:
+    """Settle the thresholds and tables of the detection stage.
+
+    Parameters
+    ----------
+    config : Config
+    layout : Layout
+
+    Returns
+    -------
+    Detector
+
+    Examples
+    --------
+    >>> from pipistrelle.arrays.layout import square_of_four
+    >>> config = Config()
+    >>> round(detector(config, square_of_four(config.receiver)).threshold, 1)
+    32.7
+    """
+    from scipy.special import gammainccinv
+
+    settings, receiver = config.detection, config.receiver
+    tones = np.array([config.emitter.frequency, config.beacon.frequency])
+    wave = 2.0 * np.pi * tones * receiver.spacing / config.air.speed_of_sound
+    edge = wave * math.sin(math.radians(settings.scan_limit_deg))
+    count = 2 * math.ceil(edge.max() / SCAN_STEP) + 1
+    scan = np.linspace(-1.0, 1.0, count) * edge[:, None]
+    lags = np.arange(1, receiver.elements)
+    return Detector(
+        threshold=float(gammainccinv(receiver.elements, settings.false_alarm)),
+        leakage=10.0 ** (settings.leakage_db / 10.0),
+        peak=10.0 ** (settings.peak_db / 10.0),
+        angle_limit=math.radians(settings.angle_limit_deg),
+        normal=layout.normal,
+        wave=wave,
+        scan=scan,
+        table=np.exp(-1j * lags[None, :, None] * scan[:, None, :]),
+    )
+
+
+def filter_blocks(
+    blocks: Complex[np.ndarray, "b f 2 e"], *, pulse: int, block: int, noise_std: float
+) -> Complex[np.ndarray, "l f 2 e"]:
+    """Matched filter on block sums: a boxcar as long as the call.
+
+    Parameters
+    ----------
+    blocks : (blocks, faces, tones, elements) complex
+    pulse : int
+        Blocks per call.
+    block : int
+        Samples per block.
+    noise_std : float
+        Of one complex sample.
+
+    Returns
+    -------
+    (lags, faces, tones, elements) complex
+        Lag i is a call that starts with block i; noise has unit variance.
+    """
+    rows = blocks.reshape(blocks.shape[0], -1).view(np.float64)
+    scale = 1.0 / (noise_std * math.sqrt(pulse * block))
+    matched = _boxcar(rows, pulse, scale)
+    return matched.view(np.complex128).reshape(-1, *blocks.shape[1:])
+
+
+def filter_samples(
+    samples: Complex[np.ndarray, "t f e"],
+    *,
+    tones: Float[np.ndarray, "2"],
+    rate: float,
+    length: int,
+    noise_std: float,
+) -> Complex[np.ndarray, "l f 2 e"]:
+    """Matched filter at the full rate, one per tone, by fast convolution.
+
+    Parameters
+    ----------
+    samples : (samples, faces, elements) complex
+    tones : (2) [Hz]
+    rate : [Hz]
+    length : int
+        Samples per call.
+    noise_std : float
+        Of one complex sample.
+
+    Returns
+    -------
+    (samples - length + 1, faces, tones, elements) complex
+        Lag i is a call that starts with sample i; noise has unit variance.
+    """
+    from scipy.signal import oaconvolve
+
+    n = np.arange(length)
+    matched = [
+        oaconvolve(
+            samples,
+            np.exp(2j * np.pi * tone * n / rate)[::-1, None, None].conj(),
+            mode="valid",
+            axes=0,
+        )
+        for tone in tones
+    ]
+    return np.stack(matched, axis=2) / (noise_std * math.sqrt(length))
+
+
+def detect(
+    matched: Complex[np.ndarray, "l f 2 e"],
+    detector: Detector,
+    *,
+    start: float,
+    interval: float,
+    pulse: int,
+) -> Detections:
+    """Bearings and delays of everything that stands out of the noise.
+
+    Parameters
+    ----------
+    matched : (lags, faces, tones, elements) complex
+        Of unit noise variance.
+    detector : Detector
+    start : [s]
+        Delay of lag 0.
+    interval : [s]
+        Between two lags.
+    pulse : int
+        Lags per call.
+
+    Returns
+    -------
+    Detections
+    """
+    lags, faces, tones, elements = matched.shape
+    energy = _energy(matched.reshape(lags, -1).view(np.float64), elements)
+    count, face, tone, lag, peak_u, power = _find_peaks(
+        matched, energy.reshape(lags, faces, tones), pulse, detector.threshold,
+        detector.leakage, detector.peak, detector.scan, detector.table, start, interval,
+    )  # fmt: skip
+    face, tone, u = face[:count], tone[:count], peak_u[:count]
+    angle = np.arcsin(np.clip(u / detector.wave[tone], -1.0, 1.0))
+    kept = np.abs(angle) <= detector.angle_limit
+    return Detections(
+        face=face[kept],
+        tone=tone[kept],
+        angle=angle[kept],
+        bearing=wrap(angle[kept] + detector.normal[face[kept]]),
+        delay=lag[:count][kept],
+        power=power[:count][kept],
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _boxcar(rows, width, scale):
+    """Running sums of width rows, scaled."""
+    lags, columns = rows.shape[0] - width + 1, rows.shape[1]
+    sums = np.empty((max(lags, 0), columns))
+    total = np.zeros(columns)
+    for b in range(rows.shape[0]):
+        row = rows[b]
+        for i in range(columns):
+            total[i] += scale * row[i]
+        if b >= width - 1:
+            done, old = sums[b - width + 1], rows[b - width + 1]
+            for i in range(columns):
+                done[i] = total[i]
+                total[i] -= scale * old[i]
+    return sums
+
+
+@njit(cache=True, error_model="numpy")
+def _energy(rows, elements):
+    """Sum of squares over the elements of each face and tone."""
+    lags, groups = rows.shape[0], rows.shape[1] // (2 * elements)
+    energy = np.empty((lags, groups))
+    for b in range(lags):
+        for g in range(groups):
+            total = 0.0
+            for i in range(2 * elements * g, 2 * elements * (g + 1)):
+                total += rows[b, i] * rows[b, i]
+            energy[b, g] = total
+    return energy
+
+
+@njit(cache=True, error_model="numpy")
+def _is_snapshot(energy, b, f, p, pulse, threshold, leakage):
+    """Whether lag b is a snapshot of face f in which tone p is present."""
+    level = energy[b, f, p]
+    if level <= threshold:
+        return False
+    for near in range(max(b - pulse // 2, 0), min(b + pulse // 2 + 1, energy.shape[0])):
+        other = energy[near, f, p]
+        if other > level or (other == level and near < b):
+            return False
+    strongest = 0.0
+    for near in range(max(b - pulse, 0), min(b + pulse + 1, energy.shape[0])):
+        strongest = max(strongest, energy[near, f, 1 - p])
+    return level > leakage * strongest
+
+
+@njit(cache=True, error_model="numpy")
+def _scan_power(x, table, power):
+    """Power of the conventional beam over the scan, from the lag sums."""
+    elements, beams = x.size, power.size
+    r0 = 0.0
+    for e in range(elements):
+        r0 += x[e].real * x[e].real + x[e].imag * x[e].imag
+    for i in range(beams):
+        power[i] = r0
+    for lag in range(1, elements):
+        r = 0.0 + 0.0j
+        for e in range(elements - lag):
+            r += x[e + lag] * x[e].conjugate()
+        re, im, row = 2.0 * r.real, 2.0 * r.imag, table[lag - 1]
+        for i in range(beams):
+            power[i] += re * row[i].real - im * row[i].imag
+
+
+@njit(cache=True, error_model="numpy")
+def _steer(x, u):
+    """Output of the phase-shift beamformer steered to u."""
+    turn, phase = complex(math.cos(u), -math.sin(u)), 1.0 + 0.0j
+    total = 0.0 + 0.0j
+    for e in range(x.size):
+        total += x[e] * phase
+        phase *= turn
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def _best_fraction(z0, z1, pulse):
+    """Where between two lags the call starts most likely, and how well it fits there.
+
+    A call that starts the fraction q into block 0 weighs the blocks 1 - q, 1, ..., 1, q; its
+    likelihood grows with abs((1 - q) z0 + q z1)^2 / (pulse - 2 q + 2 q^2), whose stationary
+    points are the roots of a quadratic.
+    """
+    a = z0.real * z0.real + z0.imag * z0.imag
+    h = z0.real * z1.real + z0.imag * z1.imag
+    b = z1.real * z1.real + z1.imag * z1.imag
+    beta, gamma = 2.0 * (h - a), a + b - 2.0 * h
+    A, B, C = -2.0 * (beta + gamma), 2.0 * gamma * pulse - 4.0 * a, beta * pulse + 2.0 * a
+    best, fit = 0.0, a / pulse
+    if b / pulse > fit:
+        best, fit = 1.0, b / pulse
+    discriminant = B * B - 4.0 * A * C
+    if discriminant >= 0.0:
+        root = -0.5 * (B + math.copysign(math.sqrt(discriminant), B))
+        for k in range(2):
+            numerator, divisor = (root, A) if k == 0 else (C, root)
+            if divisor != 0.0 and 0.0 < numerator / divisor < 1.0:
+                q = numerator / divisor
+                score = (a + q * (beta + gamma * q)) / (pulse - 2.0 * q + 2.0 * q * q)
+                if score > fit:
+                    best, fit = q, score
+    return best, fit
+
+
+@njit(cache=True, error_model="numpy")
+def _arrival_lag(matched, b, f, p, u, pulse):
+    """Lag at which the call starts in the beam steered to u, near lag b, to a fraction."""
+    low, high = max(b - 2, 0), min(b + 2, matched.shape[0] - 1)
+    centre, largest = b, -1.0
+    for near in range(low, high + 1):
+        z = abs(_steer(matched[near, f, p], u))
+        if z > largest:
+            centre, largest = near, z
+    best, fit = float(centre), -1.0
+    for left in range(max(centre - 1, 0), min(centre, matched.shape[0] - 2) + 1):
+        q, score = _best_fraction(
+            _steer(matched[left, f, p], u), _steer(matched[left + 1, f, p], u), pulse
+        )
+        if score > fit:
+            best, fit = left + q, score
+    return best
+
+
+@njit(cache=True, error_model="numpy")
+def _grown(column):
+    """Copy of a column with twice the room."""
+    wide = np.empty(2 * column.size, dtype=column.dtype)
+    wide[: column.size] = column
+    return wide
+
+
+@njit(cache=True, error_model="numpy")
+def _find_peaks(
+    matched, energy, pulse, threshold, leakage, peak_ratio, scan, table, start, interval
+):
+    """Every peak of every snapshot: count, face, tone, delay, u and power."""
+    lags, faces, tones, elements = matched.shape
+    face, tone = np.empty(128, dtype=np.int64), np.empty(128, dtype=np.int64)
+    delay, peak_u, peak_power = np.empty(128), np.empty(128), np.empty(128)
+    power, count = np.empty(scan.shape[1]), 0
+    for b in range(lags):
+        for f in range(faces):
+            for p in range(tones):
+                if not _is_snapshot(energy, b, f, p, pulse, threshold, leakage):
+                    continue
+                _scan_power(matched[b, f, p], table[p], power)
+                floor, step = peak_ratio * power.max(), scan[p, 1] - scan[p, 0]
+                for i in range(1, power.size - 1):
+                    if power[i] < floor or power[i] <= power[i - 1] or power[i] < power[i + 1]:
+                        continue
+                    slope = power[i + 1] - power[i - 1]
+                    bend = 2.0 * power[i] - power[i + 1] - power[i - 1]
+                    u = scan[p, i] + 0.5 * step * slope / bend
+                    if count == face.size:
+                        face, tone, delay = _grown(face), _grown(tone), _grown(delay)
+                        peak_u, peak_power = _grown(peak_u), _grown(peak_power)
+                    face[count], tone[count], peak_u[count] = f, p, u
+                    delay[count] = start + interval * _arrival_lag(matched, b, f, p, u, pulse)
+                    peak_power[count] = (power[i] + 0.125 * slope * slope / bend) / elements
+                    count += 1
+    return count, face, tone, delay, peak_u, peak_power

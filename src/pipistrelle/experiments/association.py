@@ -1,0 +1,116 @@
+"""Known association: the one place where the truth labels a detection.
+
+The paper assumes that a measurement's landmark is known. A label is therefore attached from the
+true arrivals, after detection: by delay and bearing both, because a gate in bearing alone lets
+clutter match something most of the time. The delay of the beacon's tone is used here and nowhere
+else. To lift the assumption, replace `label_detections`.
+"""
+
+import numpy as np
+from jaxtyping import Int
+from numba import njit
+
+from pipistrelle.acoustics.arrivals import Arrivals
+from pipistrelle.arrays.layout import Layout
+from pipistrelle.config import AssociationConfig
+from pipistrelle.detection.scans import UNLABELLED
+from pipistrelle.detection.snapshots import Detections
+from pipistrelle.geometry import wrap_angle
+
+
+def label_detections(
+    detections: Detections,
+    arrivals: Arrivals,
+    layout: Layout,
+    gates: AssociationConfig,
+    *,
+    pulse: float,
+    faintest_db: float,
+) -> Int[np.ndarray, " d"]:
+    """Label each detection with the landmark that caused it.
+
+    A true arrival of the same face and tone is a candidate if its delay and its bearing are
+    within the gates and its level is not hopeless. The strongest detection chooses first, the
+    nearest candidate in units of the gates; each arrival is given once per face.
+
+    Parameters
+    ----------
+    detections : Detections
+        (d) rows.
+    arrivals : Arrivals
+    layout : Layout
+    gates : AssociationConfig
+    pulse : [s]
+    faintest_db : [dB]
+        Arrivals below this level cannot be matched.
+
+    Returns
+    -------
+    (d)
+        Labels; UNLABELLED where nothing matches: clutter.
+
+    Notes
+    -----
+    Bradley & Abaid, Sec. III-C ("we assumed known data association").
+    """
+    order = np.argsort(-detections.power, kind="stable")
+    return _label(
+        order, detections.face, detections.tone, detections.delay, detections.bearing,
+        arrivals.source, arrivals.delay, arrivals.bearing, arrivals.level_db, arrivals.landmark,
+        layout.normal, gates.delay_gate * pulse, gates.bearing_gate, faintest_db,
+    )  # fmt: skip
+
+
+def faintest_level_db(
+    threshold: float, *, elements: int, samples: int, noise_std: float, margin_db: float
+) -> float:
+    """Level of an arrival that is expected a margin under the detection threshold.
+
+    Parameters
+    ----------
+    threshold : float
+        Of the energy over a face's elements, each of unit noise variance.
+    elements : int
+    samples : int
+        Per call.
+    noise_std : float
+        Of one sample.
+    margin_db : [dB]
+
+    Returns
+    -------
+    [dB]
+
+    Examples
+    --------
+    >>> settled = {"elements": 10, "samples": 560, "noise_std": 1.0}
+    >>> round(faintest_level_db(32.7, margin_db=6.0, **settled), 1)
+    -29.9
+    """
+    per_sample = (threshold - elements) / elements / samples * noise_std**2
+    return float(10.0 * np.log10(per_sample) - margin_db)
+
+
+@njit(cache=True, error_model="numpy")
+def _label(
+    order, face, tone, delay, bearing, source, true_delay, true_bearing, level_db, landmark,
+    normal, delay_gate, bearing_gate, faintest_db,
+):  # fmt: skip
+    """Greedy one-to-one matching, the strongest detection first."""
+    label = np.full(face.size, UNLABELLED, dtype=np.int64)
+    taken = np.zeros((normal.size, true_delay.size), dtype=np.bool_)
+    for d in order:
+        nearest, best = -1, np.inf
+        for a in range(true_delay.size):
+            if source[a] != tone[d] or level_db[a] < faintest_db or taken[face[d], a]:
+                continue
+            if abs(wrap_angle(true_bearing[a] - normal[face[d]])) > 0.5 * np.pi:
+                continue
+            late = abs(delay[d] - true_delay[a]) / delay_gate
+            off = abs(wrap_angle(bearing[d] - true_bearing[a])) / bearing_gate
+            if late <= 1.0 and off <= 1.0 and late * late + off * off < best:
+                nearest, best = a, late * late + off * off
+        if nearest >= 0:
+            label[d] = landmark[nearest]
+            taken[face[d], nearest] = True
+    return label

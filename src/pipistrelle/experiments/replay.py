@@ -1,0 +1,250 @@
+"""Recorded logs on trial: the log, the truth beside it, and what a strategy may hear of it."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.config import Strategy
+from pipistrelle.detection.columns import check_unique, read_table, refusal, write_table
+from pipistrelle.detection.logs import Log, read_log
+from pipistrelle.detection.mrclam import read_mrclam
+from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.models import Gaussian, Motion
+from pipistrelle.experiments.tables import LabelledPoints
+
+_PATH = ("time", "x", "y", "heading")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Truth:
+    """What is known of the truth of a recorded log, for scoring alone.
+
+    Attributes
+    ----------
+    time : (k) [s]
+        Times of the track: the start, then the end of each step.
+    path : (k, 3) [m, m, rad] or None
+        True poses, linear between the recorded ones, the heading unwrapped; NaN before the first
+        and after the last of them.
+    landmarks : labels (n) and positions (n, 2) [m], or None
+    """
+
+    time: Float[np.ndarray, " k"]
+    path: Float[np.ndarray, "k 3"] | None
+    landmarks: LabelledPoints | None
+
+
+def is_mrclam(folder: Path) -> bool:
+    """Tell whether a folder is a MRCLAM set, by its files; ``log.toml`` makes it a log.
+
+    Examples
+    --------
+    >>> is_mrclam(Path("/nowhere"))
+    False
+    """
+    if (folder / "log.toml").exists():
+        return False
+    return (folder / "Barcodes.dat").exists() or any(folder.glob("Robot*_Odometry.dat"))
+
+
+def load(folder: Path, robot: int | None = None) -> tuple[Log, Truth | None]:
+    """Read a log folder or one robot's log of a MRCLAM set, and the truth where it is given.
+
+    A MRCLAM track starts at the true pose and ends where the truth ends.
+
+    Parameters
+    ----------
+    folder : Path
+    robot : 1 to 5
+        For a MRCLAM set, and only there.
+
+    Returns
+    -------
+    Log
+    Truth or None
+
+    Raises
+    ------
+    InputError
+        With the file and the line or key, what was found, what was expected and the fix.
+    """
+    if not folder.is_dir():
+        raise refusal(folder, "no such folder", "a log folder or a MRCLAM set", "check the path")
+    if is_mrclam(folder):
+        return _load_mrclam(folder, robot)
+    if robot is not None:
+        found = f"a log of one vehicle, but robot {robot} was asked for"
+        raise refusal(folder, found, "a MRCLAM set", "leave out --robot")
+    log = read_log(folder)
+    return log, read_truth(folder, log.time)
+
+
+def read_truth(folder: Path, time: Float[np.ndarray, " k"]) -> Truth | None:
+    """Read ``truth.csv`` and ``landmarks.csv`` of a log folder, where they are.
+
+    Parameters
+    ----------
+    folder : Path
+    time : (k) [s]
+        Times of the track.
+
+    Returns
+    -------
+    Truth, or None without either file
+
+    Raises
+    ------
+    InputError
+        With the file and the line; also where no true pose lies within the track.
+    """
+    path_file, landmark_file = folder / "truth.csv", folder / "landmarks.csv"
+    path = landmarks = None
+    if path_file.exists():
+        path = _at(time, *_read_path(path_file, ","))
+        if np.isnan(path).all():
+            expected = f"poses between the log's times {time[0].item()!r} and {time[-1].item()!r}"
+            raise refusal(path_file, "none", expected, "use the log's clock or remove the file")
+    if landmark_file.exists():
+        landmarks = _read_landmarks(landmark_file, ("landmark", "x", "y"), ",")
+    if path is None and landmarks is None:
+        return None
+    return Truth(time=time, path=path, landmarks=landmarks)
+
+
+def write_truth(folder: Path, truth: Truth) -> None:
+    """Write ``truth.csv`` and ``landmarks.csv`` beside a log, exactly.
+
+    Parameters
+    ----------
+    folder : Path
+        The log's folder.
+    truth : Truth
+        Rows of the path that are NaN are left out.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> posts = (np.array([4]), np.array([[1.0, -2.5]]))
+    >>> truth = Truth(time=np.array([0.0]), path=np.array([[0.0, 1.0, 0.5]]), landmarks=posts)
+    >>> with TemporaryDirectory() as place:
+    ...     write_truth(Path(place), truth)
+    ...     print((Path(place) / "landmarks.csv").read_text())
+    landmark,x,y
+    4,1.0,-2.5
+    """
+    if truth.path is not None:
+        rows = np.column_stack((truth.time, truth.path))[np.isfinite(truth.path).all(axis=1)]
+        write_table(folder / "truth.csv", _PATH, *rows.T)
+    if truth.landmarks is not None:
+        labels, positions = truth.landmarks
+        write_table(folder / "landmarks.csv", ("landmark", "x", "y"), labels, *positions.T)
+
+
+def hide(
+    scans: Sequence[Scan], strategy: Strategy, beamwidth: float | None = None
+) -> tuple[Scan, ...]:
+    """Leave what a strategy would have heard of recorded scans.
+
+    Inside the beam, where the absolute bearing is at most half its width, range and bearing are
+    heard actively. Outside it only the bearing is heard, passively. Fused takes both, active what
+    has a range, passive all bearings and no range. Without a beam nothing is outside it.
+
+    Parameters
+    ----------
+    scans : sequence of Scan
+    strategy : "active", "fused" or "passive"
+    beamwidth : [rad], optional
+        Full width of the beam about the heading.
+
+    Returns
+    -------
+    tuple of Scan
+        As many; some may be empty.
+
+    Examples
+    --------
+    >>> angle = {"bearing": np.array([0.1, 0.4]), "landmark": np.array([3, 8])}
+    >>> scan = Scan(time=0.0, range=np.array([2.0, 5.0]), **angle)
+    >>> hide([scan], "fused", 0.5)[0].range
+    array([ 2., nan])
+    >>> hide([scan], "active", 0.5)[0].landmark
+    array([3])
+    """
+    limit = math.inf if beamwidth is None else beamwidth / 2.0
+    heard = []
+    for scan in scans:
+        hidden = (np.abs(scan.bearing) > limit) | (strategy == "passive")
+        distance = np.where(hidden, np.nan, scan.range)
+        kept = np.isfinite(distance) | (strategy != "active")
+        heard.append(
+            Scan(
+                time=scan.time,
+                landmark=scan.landmark[kept],
+                bearing=scan.bearing[kept],
+                range=distance[kept],
+            )
+        )
+    return tuple(heard)
+
+
+def motion_of(log: Log) -> Motion:
+    """Return the motion model of a log, as the filters take it."""
+    return Motion(
+        model=log.motion,
+        control_std=log.control_std,
+        wheelbase=log.wheelbase,
+        noise_at_rest=log.noise_at_rest,
+    )
+
+
+def start_of(log: Log) -> Gaussian:
+    """Return the pose at which a log starts, (3) and (3, 3), as the filters take it."""
+    variance = np.square(np.array(log.initial_pose_std, dtype=float))
+    return Gaussian(mean=np.array(log.initial_pose, dtype=float), covariance=np.diag(variance))
+
+
+def _load_mrclam(folder: Path, robot: int | None) -> tuple[Log, Truth]:
+    """Read one robot's log from where the truth begins to where it ends, and the truth."""
+    files = sorted(path.name for path in folder.glob("Robot*_Odometry.dat"))
+    robots = [name.removeprefix("Robot").removesuffix("_Odometry.dat") for name in files]
+    if robot is None or str(robot) not in robots:
+        found = "no robot" if robot is None else f"robot {robot}"
+        expected = f"one whose odometry is there ({', '.join(robots) or 'none is'})"
+        raise refusal(f"{folder}, option --robot", found, expected, "name another")
+    time, path = _read_path(folder / f"Robot{robot}_Groundtruth.dat", None)
+    columns = ("subject", "x", "y", "x_std", "y_std")
+    landmarks = _read_landmarks(folder / "Landmark_Groundtruth.dat", columns, None)
+    log = read_mrclam(folder, robot, span=(time[0].item(), time[-1].item()))
+    path = _at(log.time, time, path)
+    x, y, heading = path[0].tolist()
+    truth = Truth(time=log.time, path=path, landmarks=landmarks)
+    return replace(log, initial_pose=(x, y, heading)), truth
+
+
+def _read_path(
+    path: Path, separator: str | None
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    """Times and poses, the heading unwrapped; of two rows with one time the later wins."""
+    column = read_table(path, _PATH, separator=separator).column
+    last = np.append(np.diff(column["time"]) > 0, True)
+    heading = np.unwrap(column["heading"][last])
+    return column["time"][last], np.column_stack((column["x"][last], column["y"][last], heading))
+
+
+def _read_landmarks(path: Path, columns: tuple[str, ...], separator: str | None) -> LabelledPoints:
+    """Labels and positions; each label once."""
+    table = read_table(path, columns, separator=separator)
+    check_unique(table, columns[0])
+    return table.column[columns[0]], np.column_stack((table.column["x"], table.column["y"]))
+
+
+def _at(
+    time: Float[np.ndarray, " k"], known: Float[np.ndarray, " n"], path: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "k 3"]:
+    """Poses at other times, linear in between, NaN outside."""
+    columns = [np.interp(time, known, column, left=np.nan, right=np.nan) for column in path.T]
+    return np.column_stack(columns)

@@ -1,0 +1,324 @@
+"""One mission at a glance: what each strategy made of the same world, and how far it was off."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
+from pipistrelle.evaluation.consistency import anees_bounds, nees
+from pipistrelle.experiments.results import LabelledPoints, TimedPath, TrialResult
+from pipistrelle.figures.maps import (
+    PLACED,
+    RAY,
+    beam,
+    draw_truth,
+    ellipses,
+    placed,
+    shades,
+    span,
+    vehicle,
+)
+from pipistrelle.figures.style import INK, STYLE, TRUTH, strategy_colour
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLUMNS = 3
+"""Most panels beside each other; further ones start a new row."""
+LEFT, RIGHT, TOP, GAP, LEGEND = 0.76, 0.16, 0.58, 0.2, 0.56
+"""Margins, the space between panels and the height of two rows of legend [inch]."""
+ERRORS = (0.95, 0.95, 0.7)
+"""Heights of the error rows: position, heading, NEES [inch]."""
+
+
+def draw_mission(
+    trials: Sequence[TrialResult],
+    *,
+    true_path: TimedPath | None = None,
+    true_landmarks: LabelledPoints | None = None,
+    beacon: np.ndarray | None = None,
+    beamwidth: float | None = None,
+) -> "Figure":
+    """Draw the final maps of one world side by side, and below each its errors over time.
+
+    A map shows the true and the estimated path, true landmarks (open circles) tied to their
+    estimates (dots in their 95 % ellipses), the rays that are still unresolved (members at one
+    standard deviation, the heavier the darker), the beacon, and the vehicle at the end with its
+    beam. Below, position and heading errors stand against three standard deviations of the
+    filter's own (in position, of the root of the trace) and the NEES against the 95 % band of one
+    run. All panels share their scales.
+
+    Parameters
+    ----------
+    trials : sequence of TrialResult, at least one
+        In the frame of the truth.
+    true_path : times (k) [s] and poses (k, 3) [m, m, rad], optional
+        At the times of the tracks; without it there are no errors to show.
+    true_landmarks : labels (n) and positions (n, 2) [m], optional
+        The beacon may be one of them.
+    beacon : (2) [m], optional
+    beamwidth : [rad], optional
+        Of the vehicle's call, for the strategies that use it; without it no beam is drawn.
+
+    Returns
+    -------
+    Figure
+        Not known to pyplot: it is freed when it is let go.
+
+    Raises
+    ------
+    ValueError
+        Without trials.
+
+    Notes
+    -----
+    Bradley & Abaid, Eqs. (23) and (26), over the time of one run.
+
+    Examples
+    --------
+    >>> draw_mission([])
+    Traceback (most recent call last):
+    ValueError: a mission's figure needs at least one trial
+    """
+    import matplotlib
+
+    if not trials:
+        raise ValueError("a mission's figure needs at least one trial")
+    limits = _limits(trials, true_path, true_landmarks, beacon)
+    with matplotlib.rc_context(STYLE):
+        figure, panels = _panels(len(trials), limits, errors=true_path is not None)
+        filters = {trial.filter for trial in trials}
+        for trial, (axes, *rows) in zip(trials, panels, strict=True):
+            draw_truth(axes, true_landmarks, beacon)
+            if true_path is not None:
+                axes.plot(*true_path[1][:, :2].T, color=TRUTH, lw=3.2, alpha=0.45, zorder=2)
+                _draw_errors(rows, trial, true_path[1])
+            _draw_estimate(axes, trial, true_landmarks)
+            _draw_vehicle(axes, trial, beamwidth)
+            _title(axes, trial, several_filters=len(filters) > 1)
+        if true_path is not None:
+            _scale_errors([rows for _, *rows in panels])
+        handles = _legend(true_path, true_landmarks, beacon, beamwidth)
+        _place_legend(figure, handles)
+    return figure
+
+
+def _limits(
+    trials: Sequence[TrialResult],
+    true_path: TimedPath | None,
+    true_landmarks: LabelledPoints | None,
+    beacon: np.ndarray | None,
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return limits that show the truth; where there is none, the estimates."""
+    points = [] if true_path is None else [true_path[1][:, :2]]
+    if true_landmarks is None or true_path is None:
+        points += [trial.track.pose.mean[:, :2] for trial in trials]
+    if true_landmarks is None:
+        maps = [heaviest(trial.track.landmarks) for trial in trials]
+        points += [estimate.mean[estimate.full] for estimate in maps]
+    else:
+        points.append(true_landmarks[1])
+    return span(np.concatenate(points if beacon is None else [*points, beacon[None]]))
+
+
+def _panels(
+    count: int, limits: tuple[tuple[float, float], tuple[float, float]], *, errors: bool
+) -> tuple["Figure", list[list["Axes"]]]:
+    """Lay out one map per trial, with its error rows below, in inches."""
+    from matplotlib.figure import Figure
+
+    (left, right), (bottom, top) = limits
+    columns, blocks = min(count, COLUMNS), -(-count // COLUMNS)
+    total = {1: 6.4, 2: 9.0}.get(columns, 12.0)
+    width = (total - LEFT - RIGHT - (columns - 1) * GAP) / columns
+    height = width * (top - bottom) / (right - left)
+    heights = (height, *ERRORS) if errors else (height,)
+    gaps = [0.0, 0.5, 0.12, 0.12][: len(heights)]
+    block = TOP + sum(heights) + sum(gaps) + 0.42
+    page = blocks * block + LEGEND * (1 if total > 8.0 else 2)
+    figure = Figure(figsize=(total, page))
+    panels: list[list[Axes]] = []
+    for i in range(count):
+        row, column = divmod(i, columns)
+        x, y = LEFT + column * (width + GAP), page - row * block - TOP
+        panel: list[Axes] = []
+        for tall, gap in zip(heights, gaps, strict=True):
+            y -= gap + tall
+            box = (x / total, y / page, width / total, tall / page)
+            panel.append(_axes(figure, box, panel, panels))
+        panel[0].set(xlim=limits[0], ylim=limits[1], xlabel="x [m]", aspect="equal")
+        panels.append(panel)
+    for panel in panels[::columns]:
+        labels = ("y [m]", "position error\nand 3σ [m]", "heading error\nand 3σ [°]", "NEES\nand 95 %")
+        for axes, label in zip(panel, labels, strict=False):
+            axes.set_ylabel(label, multialignment="center")
+            axes.yaxis.set_label_coords(-0.42 / width, 0.5)
+    return figure, panels
+
+
+def _axes(
+    figure: "Figure",
+    box: tuple[float, float, float, float],
+    panel: list["Axes"],
+    panels: list[list["Axes"]],
+) -> "Axes":
+    """Add a row of a panel: error rows share their time, and each row its scale with the first."""
+    first = panels[0][len(panel)] if panels else None
+    time = panel[1] if len(panel) > 1 else first
+    axes = figure.add_axes(box, sharex=time, sharey=first)
+    axes.tick_params(labelleft=len(panels) % COLUMNS == 0)
+    axes.grid(True)
+    axes.set_axisbelow(True)
+    return axes
+
+
+def _draw_estimate(
+    axes: "Axes", trial: TrialResult, true_landmarks: LabelledPoints | None
+) -> None:
+    """Draw the estimated path and the map as it stands at the end."""
+    from matplotlib.collections import LineCollection, PolyCollection
+
+    colour, track = strategy_colour(trial.strategy), trial.track
+    axes.plot(*track.pose.mean[:, :2].T, color=colour, lw=1.2, zorder=6)
+    rows, full = track.landmarks, placed(track.landmarks)
+    x, y = rows.mean[full].T
+    axes.plot(x, y, "o", ms=2.6, mfc=colour, mec="none", zorder=5)
+    outline = ellipses(rows.mean[full], rows.covariance[full], PLACED)
+    face, edge = shades(colour, np.full(len(outline), 0.2)), colour
+    axes.add_collection(PolyCollection(outline, facecolors=face, edgecolors=edge, lw=0.8, zorder=4))
+    ties = _ties(trial, true_landmarks)
+    axes.add_collection(LineCollection(ties, colors=INK, lw=0.7, zorder=4.5))
+    outline = ellipses(rows.mean[~full], rows.covariance[~full], RAY)
+    face = shades(colour, rows.weight[~full])
+    axes.add_collection(PolyCollection(outline, facecolors=face, edgecolors="none", zorder=1))
+    labels = np.unique(rows.landmark[~full])
+    rays = [rows.mean[rows.landmark == label] for label in labels]
+    axes.add_collection(LineCollection(rays, colors=colour, lw=0.6, alpha=0.45, zorder=1.5))
+
+
+def _ties(trial: TrialResult, true_landmarks: LabelledPoints | None) -> list[np.ndarray]:
+    """Return a line from each landmark that is fully initialised to where it truly is."""
+    if true_landmarks is None:
+        return []
+    true = dict(zip(true_landmarks[0].tolist(), true_landmarks[1], strict=True))
+    estimate = heaviest(trial.track.landmarks)
+    return [
+        np.stack([mean, true[label]])
+        for label, mean, full in zip(
+            estimate.landmark.tolist(), estimate.mean, estimate.full, strict=True
+        )
+        if full and label in true
+    ]
+
+
+def _draw_vehicle(axes: "Axes", trial: TrialResult, beamwidth: float | None) -> None:
+    """Draw the vehicle where it believes to be at the end, and the beam of its call."""
+    from matplotlib.patches import Polygon
+
+    pose = trial.track.pose.mean[-1]
+    if not np.all(np.isfinite(pose)):
+        return
+    size = axes.get_xlim()[1] - axes.get_xlim()[0]
+    if beamwidth is not None and trial.strategy != "passive":
+        wedge = beam(pose, beamwidth, 0.25 * size)
+        axes.add_patch(Polygon(wedge, fc=INK, alpha=0.13, lw=0, zorder=1.8))
+    shape = vehicle(pose, 0.045 * size)
+    axes.add_patch(Polygon(shape, fc=INK, ec="white", lw=0.8, zorder=8))
+
+
+def _title(axes: "Axes", trial: TrialResult, *, several_filters: bool) -> None:
+    """Say what the panel is and what came out."""
+    scores = trial.scores
+    name = f"{trial.strategy} · {trial.filter}" if several_filters else trial.strategy
+    parts = [f"{scores.landmarks_full} of {scores.landmarks_total} landmarks placed"]
+    if scores.position_rmse_m is not None:
+        parts.insert(0, f"{scores.position_rmse_m:.2f} m")
+    if scores.diverged:
+        parts.append("diverged")
+    style = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "baseline"}
+    colour = strategy_colour(trial.strategy)
+    axes.annotate(name, (0, 1), (0, 21), color=colour, fontsize=13, weight="bold", **style)
+    axes.annotate(" · ".join(parts), (0, 1), (0, 7), fontsize=9.5, **style)
+
+
+def _draw_errors(rows: Sequence["Axes"], trial: TrialResult, true_path: np.ndarray) -> None:
+    """Draw position error, heading error and NEES over time, with the bounds that should hold."""
+    colour, track = strategy_colour(trial.strategy), trial.track
+    covariance = track.pose.covariance
+    error = pose_error(track.pose.mean, true_path)
+    variance = np.stack([covariance[:, 0, 0] + covariance[:, 1, 1], covariance[:, 2, 2]])
+    bounds = 3.0 * np.sqrt(np.maximum(variance, 0.0))
+    position, heading, consistency = rows
+    distance = position_error(track.pose.mean, true_path)
+    position.fill_between(track.time, bounds[0], color=colour, alpha=0.16, lw=0)
+    position.plot(track.time, distance, color=colour, lw=1.1)
+    turn, bound = np.rad2deg(error[:, 2]), np.rad2deg(bounds[1])
+    heading.fill_between(track.time, -bound, bound, color=colour, alpha=0.16, lw=0)
+    heading.plot(track.time, turn, color=colour, lw=1.1)
+    consistency.axhspan(*anees_bounds(1), color="#d9d9d9", alpha=0.6, lw=0)
+    consistency.plot(track.time, nees(error, covariance), color=colour, lw=0.9)
+    consistency.set(yscale="log", xlabel="time [s]", xlim=(track.time[0], track.time[-1]))
+    for axes in (position, heading):
+        axes.tick_params(labelbottom=False)
+
+
+def _scale_errors(panels: Sequence[Sequence["Axes"]]) -> None:
+    """Scale the error rows, common to all panels, to their lines; a bound far above is cut."""
+    from matplotlib.ticker import LogLocator
+
+    def largest(row: int) -> float:
+        values = np.concatenate([panel[row].lines[0].get_ydata() for panel in panels])
+        return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
+
+    panels[0][0].set_ylim(0.0, max(1.6 * largest(0), 1e-3))
+    heading = max(1.6 * largest(1), 1e-3)
+    panels[0][1].set_ylim(-heading, heading)
+    panels[0][2].set_ylim(0.05, max(100.0, 2.0 * largest(2)))
+    panels[0][2].yaxis.set_major_locator(LogLocator(subs=(1.0,), numticks=5))
+    panels[0][2].yaxis.set_major_formatter("{x:g}")
+
+
+def _legend(
+    true_path: TimedPath | None,
+    true_landmarks: LabelledPoints | None,
+    beacon: np.ndarray | None,
+    beamwidth: float | None,
+) -> list["Artist"]:
+    """Return one entry for each kind of thing on the maps, in neutral ink."""
+    from matplotlib.lines import Line2D
+    from matplotlib.path import Path
+
+    def mark(label: str, marker: object, size: float, face: str, edge: str) -> Line2D:
+        return Line2D([], [], label=label, marker=marker, ms=size, mfc=face, mec=edge, lw=0)
+
+    dart, sector = Path(vehicle(np.zeros(3), 1.0)), Path(beam(np.array([-0.5, 0, 0]), 0.8, 1.0))
+    member = Path(ellipses(np.zeros((1, 2)), np.array([[[1.0, 0.4], [0.4, 0.4]]]), RAY)[0])
+    entries: list[tuple[object, Artist]] = [
+        (true_path, Line2D([], [], color=TRUTH, lw=3.2, alpha=0.45, label="true path")),
+        (True, Line2D([], [], color=INK, lw=1.2, label="estimated path")),
+        (true_landmarks, mark("true landmark", "o", 5.0, "none", TRUTH)),
+        (True, mark("placed landmark, 95 %", "o", 7.5, "#33333330", INK)),
+        (True, mark("unresolved ray, 1σ, darker: likelier", member, 14.0, "#33333350", "none")),
+        (beacon, mark("beacon", "*", 11.0, INK, "white")),
+        (True, mark("vehicle at the end", dart, 10.0, INK, "none")),
+        (beamwidth, mark("its beam", sector, 14.0, "#33333338", "none")),
+    ]
+    return [artist for shown, artist in entries if shown is not None]
+
+
+def _place_legend(figure: "Figure", handles: list["Artist"]) -> None:
+    """Set the legend under the panels, from their left edge on."""
+    width, height = figure.get_size_inches()
+    columns = 4 if width > 8.0 else 2
+    figure.legend(
+        handles=handles,
+        loc="lower left",
+        bbox_to_anchor=(LEFT / width, 0.06 / height, 1.0 - (LEFT + RIGHT) / width, 0.0),
+        mode="expand",
+        ncols=columns,
+        borderaxespad=0.0,
+        borderpad=0.0,
+    )

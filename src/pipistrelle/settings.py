@@ -1,0 +1,287 @@
+"""Settings laid over each other: defaults < file < environment < flags.
+
+Each place gives a `Layer`: its settings by their key, each with the words that say where it
+stands. Layers merge as dictionaries do, the right one wins, and whatever `resolve` refuses is
+still reported where its user wrote it:
+
+    config = resolve(from_file(path) | from_environment(os.environ) | from_flags(flags))
+
+The spelling of one setting is ``power`` under ``[rays]`` in a file, ``PIPISTRELLE_RAYS__POWER``
+in the environment and ``--rays.power`` as a flag.
+"""
+
+import json
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from difflib import get_close_matches
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple, get_args
+
+from pydantic import ValidationError
+from pydantic.fields import FieldInfo
+
+from pipistrelle.config import Config, InputError, Section
+
+PREFIX = "PIPISTRELLE_"
+NOT_SETTINGS = frozenset({"PIPISTRELLE_DATA"})
+"""Variables of the environment that share the prefix and set nothing."""
+
+Key = tuple[str, ...]
+
+
+class Given(NamedTuple):
+    """A value and where it was given, in words."""
+
+    value: Any
+    where: str
+
+
+Layer = dict[Key, Given]
+
+
+@cache
+def known_settings() -> dict[Key, FieldInfo]:
+    """Every setting by its key, in the order of `Config`.
+
+    Returns
+    -------
+    dict of the section's and the field's name to pydantic's description of the field
+
+    Examples
+    --------
+    >>> known_settings()["rays", "power"].default
+    1.0
+    """
+    found = {}
+    for name, field in Config.model_fields.items():
+        if isinstance(field.default, Section):
+            found |= {(name, leaf): info for leaf, info in type(field.default).model_fields.items()}
+        else:
+            found[name,] = field
+    return found
+
+
+def from_file(path: Path) -> Layer:
+    """Read the settings of a TOML file.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    Layer
+
+    Raises
+    ------
+    InputError
+        Not TOML, or a key that is no setting.
+    OSError
+        The file cannot be read.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "sharp.toml"
+    ...     _ = file.write_text("[rays]\\npower = 3.0\\n")
+    ...     from_file(file)["rays", "power"].value
+    3.0
+    """
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not TOML: {error}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not TOML: byte {error.start} is not UTF-8 text") from error
+    return _layer(_leaves(values), ".".join, f"{path}: ")
+
+
+def from_environment(environment: Mapping[str, str]) -> Layer:
+    """Read the settings among the variables of the environment.
+
+    Parameters
+    ----------
+    environment : mapping of str to str
+        ``PIPISTRELLE_SECTION__FIELD`` is spelled as in a file, save that text needs no quotes.
+
+    Returns
+    -------
+    Layer
+
+    Raises
+    ------
+    InputError
+        A variable with the prefix ``PIPISTRELLE_`` that is no setting.
+
+    Examples
+    --------
+    >>> layer = from_environment({"PIPISTRELLE_RAYS__RANGE_BOUNDS": "[1, 15]", "HOME": "/root"})
+    >>> layer["rays", "range_bounds"].value
+    [1, 15]
+    """
+    leaves = (
+        (tuple(name.removeprefix(PREFIX).lower().split("__")), _from_text(environment[name]))
+        for name in sorted(environment)
+        if name.startswith(PREFIX) and name not in NOT_SETTINGS
+    )
+    return _layer(leaves, lambda key: PREFIX + "__".join(key).upper())
+
+
+def from_flags(values: Mapping[str, Any]) -> Layer:
+    """Name the settings that were given as flags.
+
+    Parameters
+    ----------
+    values : mapping
+        Settings, and sections of settings.
+
+    Returns
+    -------
+    Layer
+
+    Examples
+    --------
+    >>> from_flags({"air": {"relative_humidity": 0.3}})
+    {('air', 'relative_humidity'): Given(value=0.3, where='--air.relative-humidity')}
+    """
+    return _layer(_leaves(values), lambda key: "--" + ".".join(key).replace("_", "-"))
+
+
+def resolve(layer: Layer) -> Config:
+    """Check the settings and complete them with the defaults.
+
+    Parameters
+    ----------
+    layer : Layer
+
+    Returns
+    -------
+    Config
+
+    Raises
+    ------
+    InputError
+        A value that its setting does not take: where it stands, what was found and expected.
+
+    Examples
+    --------
+    >>> resolve(from_flags({"seed": 3})).seed
+    3
+    >>> resolve(from_flags({"air": {"pressure_kpa": -1.0}}))
+    Traceback (most recent call last):
+    pipistrelle.config.InputError: --air.pressure-kpa: found -1.0, expected greater than 0
+    """
+    nested: dict[str, Any] = {}
+    for (*sections, leaf), given in layer.items():
+        table = nested
+        for section in sections:
+            table = table.setdefault(section, {})
+        table[leaf] = given.value
+    try:
+        # JSON is strict where TOML is (text is no number) and lenient where TOML must be (a
+        # list makes a tuple).
+        return Config.model_validate_json(json.dumps(nested, default=str), strict=True)
+    except ValidationError as refused:
+        problems = [_problem(error, layer) for error in refused.errors(include_url=False)]
+        raise InputError("\n".join(problems)) from None
+
+
+def to_toml(config: Config) -> str:
+    """Write all settings as a TOML file, each with its meaning and unit.
+
+    Parameters
+    ----------
+    config : Config
+
+    Returns
+    -------
+    str
+        Reads back as the same settings.
+
+    Examples
+    --------
+    >>> tomllib.loads(to_toml(Config(seed=3)))["seed"]
+    3
+    """
+    lines: list[str] = []
+    for key in known_settings():
+        *sections, leaf = key
+        table: Any = config
+        for section in sections:
+            table = getattr(table, section)
+            if leaf == next(iter(type(table).model_fields)):
+                lines += ["", f"# {' '.join((type(table).__doc__ or '').split())}", f"[{section}]"]
+        assignment = f"{leaf} = {json.dumps(getattr(table, leaf))}"
+        meaning = known_settings()[key].description
+        lines.append(f"{assignment:<39} # {' '.join(meaning.split())}" if meaning else assignment)
+    return "\n".join(lines) + "\n"
+
+
+def _layer(
+    leaves: Iterable[tuple[Key, Any]], spell: Callable[[Key], str], prefix: str = ""
+) -> Layer:
+    """Say of each value where it was given; refuse what is no setting."""
+    layer = {}
+    for key, value in leaves:
+        where = prefix + spell(key)
+        if key in known_settings():
+            layer[key] = Given(value, where)
+        elif any(key == known[: len(key)] for known in known_settings()):
+            if value != {}:
+                raise InputError(f"{where}: found {value!r}, expected a section of settings")
+        else:
+            meant = _nearest(key)
+            hint = f"did you mean {spell(meant)}?" if meant else "see `pipistrelle config show`"
+            raise InputError(f"{where}: no such setting; {hint}")
+    return layer
+
+
+def _leaves(values: Mapping[str, Any], above: Key = ()) -> Iterator[tuple[Key, Any]]:
+    """Walk a nested mapping down to what is no mapping, or an empty one."""
+    for name, value in values.items():
+        key = (*above, name)
+        if isinstance(value, Mapping) and value and key not in known_settings():
+            yield from _leaves(value, key)
+        else:
+            yield key, value
+
+
+def _nearest(key: Key) -> Key | None:
+    """Find the setting that was probably meant."""
+    names = {".".join(known): known for known in known_settings()}
+    close = get_close_matches(".".join(key), names, n=1)
+    close += [name for name, known in names.items() if known[-1] == key[-1]]
+    return names[close[0]] if close else None
+
+
+def _from_text(text: str) -> Any:
+    """Read a TOML value, or a number that TOML spells otherwise; anything else is text."""
+    try:
+        read = tomllib.loads(f"value = {text}")
+        if read.keys() == {"value"}:
+            return read["value"]
+    except tomllib.TOMLDecodeError:
+        pass
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _problem(error: Any, layer: Layer) -> str:
+    """Say where a refused value stands, what was found and what was expected."""
+    key = tuple(part for part in error["loc"] if isinstance(part, str))
+    message = error["msg"].removeprefix("Value error, ")
+    if key not in layer:  # a rule between settings: its message holds what was found
+        within = {known: given.where for known, given in layer.items() if known[: len(key)] == key}
+        named = [where for known, where in within.items() if known[-1] in message]
+        return f"{', '.join(named or within.values())}: {message}"
+    value, where = layer[key]
+    expected = message.removeprefix("Input should be ")
+    if error["type"] in ("missing", "too_long"):
+        expected = f"{len(get_args(known_settings()[key].annotation))} values"
+    elif key != error["loc"]:
+        expected += f" as value {error['loc'][-1] + 1}"
+    return f"{where}: found {value!r}, expected {expected}"

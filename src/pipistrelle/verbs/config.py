@@ -1,0 +1,23 @@
+"""`pipistrelle config`: the settings as a file, and what such a file may hold."""
+
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from pipistrelle.verbs.options import MissionOptions, mission_config
+
+
+def show(*, mission: Annotated[MissionOptions | None, Parameter(name="*")] = None) -> None:
+    """Print the settings as TOML, file, environment and flags applied."""
+    from pipistrelle.settings import to_toml
+
+    print(to_toml(mission_config(mission or MissionOptions())), end="")
+
+
+def schema() -> None:
+    """Print the JSON schema of the settings, for editors that check TOML."""
+    import json
+
+    from pipistrelle.config import Config
+
+    print(json.dumps(Config.model_json_schema(), indent=2))

@@ -1,0 +1,170 @@
+"""What a person reads while a verb works and when it is done; results go to standard output."""
+
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from threading import Timer
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pipistrelle.experiments.results import Scores, TrialResult
+
+Progress = Callable[[str, int, int], None]
+"""Called with a stage's name, the frames done and their number."""
+
+
+def say(message: str) -> None:
+    """Write a line to standard error at once.
+
+    Parameters
+    ----------
+    message : str
+
+    Examples
+    --------
+    >>> say("Compiling kernels (once) ...")
+    """
+    print(message, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def announced(message: str, after: float = 1.0) -> Iterator[None]:
+    """Say what is being waited for, if it takes long.
+
+    Parameters
+    ----------
+    message : str
+    after : float
+        Wait this long first [s].
+
+    Examples
+    --------
+    >>> with announced("Compiling kernels (once) ..."):
+    ...     pass
+    """
+    timer = Timer(after, say, (message,))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+@contextmanager
+def progress(quiet: bool) -> Iterator[Progress]:
+    """Show one line per stage, with its frames per second.
+
+    On a terminal the line moves; elsewhere it is printed when the stage is done.
+
+    Parameters
+    ----------
+    quiet : bool
+        Show nothing.
+
+    Yields
+    ------
+    function of a stage's name, the frames done and their number
+
+    Examples
+    --------
+    >>> with progress(quiet=True) as show:
+    ...     show("fused ekf", 375, 375)
+    """
+    if quiet:
+        yield lambda stage, done, total: None
+    elif sys.stderr.isatty():
+        with _bars() as show:
+            yield show
+    else:
+        yield _lines()
+
+
+def _lines() -> Progress:
+    """Print a stage when it is done."""
+    started: dict[str, float] = {}
+
+    def show(stage: str, done: int, total: int) -> None:
+        begin = started.setdefault(stage, perf_counter())
+        if done == total:
+            say(f"{stage:<14}{_rate(done, perf_counter() - begin)}")
+
+    return show
+
+
+@contextmanager
+def _bars() -> Iterator[Progress]:
+    """Draw a moving bar per stage."""
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn
+    from rich.progress import Progress as Bars
+
+    started: dict[str, float] = {}
+    tasks = {}
+    columns = (TextColumn("{task.description:<14}"), BarColumn(), TextColumn("{task.fields[rate]}"))
+    with Bars(*columns, console=Console(stderr=True)) as bars:
+
+        def show(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                started[stage] = perf_counter()
+                tasks[stage] = bars.add_task(stage, total=total, rate="")
+            rate = _rate(done, perf_counter() - started[stage])
+            bars.update(tasks[stage], completed=done, rate=rate)
+
+        yield show
+
+
+def _rate(frames: int, elapsed: float) -> str:
+    """Word how many frames are done, and how fast."""
+    speed = f", {frames / elapsed:.0f} frames/s" if elapsed > 0 and frames else ""
+    return f"{frames:>5} frames{speed}"
+
+
+def closing_table(trials: "Sequence[TrialResult]", aligned: bool) -> str:
+    """Compare the estimates of one world, a column each; what no estimate has is left out.
+
+    Parameters
+    ----------
+    trials : sequence of TrialResult, at least one
+    aligned : bool
+        Show the errors after alignment too.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    See `pipistrelle run`.
+    """
+    rows: list[tuple[str, Callable[[Scores], str]]] = [
+        ("position RMSE [m]", lambda s: _number(s.position_rmse_m, 3)),
+        ("heading RMSE [rad]", lambda s: _number(s.heading_rmse_rad, 4)),
+        ("map RMSE [m]", lambda s: _number(s.map_rmse_m, 3)),
+    ]
+    if aligned:
+        rows += [
+            ("position RMSE, aligned [m]", lambda s: _number(s.position_rmse_aligned_m, 3)),
+            ("map RMSE, aligned [m]", lambda s: _number(s.map_rmse_aligned_m, 3)),
+        ]
+    rows += [
+        ("NEES, mean", lambda s: _number(s.nees_mean, 2)),
+        ("NEES, largest", lambda s: _number(s.nees_max, 1)),
+        ("landmarks, fully placed / all", lambda s: f"{s.landmarks_full} / {s.landmarks_total}"),
+        ("measurements per frame", lambda s: _number(s.measurements_per_frame, 2)),
+        ("rejected by the gate", lambda s: str(s.gated or "")),
+        ("diverged", lambda s: "yes" if s.diverged else ""),
+    ]
+    names = [f"{trial.strategy} {trial.filter}" for trial in trials]
+    lines = [(" " * 30, *names)]
+    for title, cell in rows:
+        cells = [cell(trial.scores) for trial in trials]
+        if any(cells):
+            lines.append((title, *(text or "-" for text in cells)))
+    return "\n".join(f"{line[0]:<30}" + "".join(f"{c:>16}" for c in line[1:]) for line in lines)
+
+
+def _number(value: float | None, digits: int) -> str:
+    """Print a number; nothing of none."""
+    return "" if value is None else f"{value:.{digits}f}"

@@ -1,0 +1,73 @@
+"""`pipistrelle doctor`: what is installed here, and how to fix what is missing."""
+
+import os
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+
+import pipistrelle
+
+
+def doctor() -> None:
+    """Print versions, folders and tools, one line each, with the fix of each problem."""
+    for name, state in _findings():
+        print(f"{name:<18}{state}")
+
+
+def _findings() -> Iterator[tuple[str, str]]:
+    """Look at each thing in turn."""
+    yield "python", f"{sys.version.split()[0]} ({sys.executable})"
+    yield "pipistrelle", f"{pipistrelle.__version__} ({Path(pipistrelle.__file__).parent})"
+    yield from _libraries()
+    yield "cores", str(_cores())
+    yield "kernel cache", _kernel_cache()
+    yield "ffmpeg", shutil.which("ffmpeg") or "not found; --animate mp4 needs it, gif does not"
+    yield "PIPISTRELLE_DATA", _data(os.environ.get("PIPISTRELLE_DATA"))
+
+
+def _libraries() -> Iterator[tuple[str, str]]:
+    """Read the versions of what the package requires."""
+    try:
+        required = requires("pipistrelle") or []
+    except PackageNotFoundError:
+        yield "libraries", "not known: pipistrelle is not installed; python -m pip install ."
+        return
+    for requirement in required:
+        if "extra ==" in requirement:
+            continue
+        name = re.split(r"[^\w.-]", requirement, maxsplit=1)[0]
+        try:
+            yield name, version(name)
+        except PackageNotFoundError:
+            yield name, f"not found; python -m pip install '{requirement}'"
+
+
+def _cores() -> int:
+    """Count the cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _kernel_cache() -> str:
+    """Find where Numba keeps compiled kernels."""
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    folder = Path(chosen or pipistrelle.__file__)
+    place = chosen or f"beside each source under {folder.parent}"
+    while not folder.exists():
+        folder = folder.parent
+    if os.access(folder if folder.is_dir() else folder.parent, os.W_OK):
+        return place
+    return f"{place}: cannot be written; set NUMBA_CACHE_DIR to a folder that can"
+
+
+def _data(place: str | None) -> str:
+    """Look for recorded logs."""
+    if place is None:
+        return "not set; only tests and timings on recorded logs need it"
+    if not (Path(place) / "mrclam").is_dir():
+        return f"{place}: holds no folder mrclam; set it to the folder that does"
+    return place

@@ -1,0 +1,213 @@
+"""Options that verbs share: every setting as a flag, and the short names of a mission."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import radians
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
+
+from cyclopts import Group, Parameter
+
+from pipistrelle.config import STRATEGIES, Config, InputError, Strategy
+from pipistrelle.settings import (
+    Given,
+    Key,
+    Layer,
+    from_environment,
+    from_file,
+    from_flags,
+    known_settings,
+    resolve,
+)
+
+Chosen = Literal["active", "fused", "passive", "all"]
+Filter = Literal["ekf"]
+Format = Literal["gif", "mp4"]
+
+
+def setting_flags(shown: Callable[[Key], bool] = lambda _: True) -> Any:
+    """Make the type from which the command line builds a flag for every setting.
+
+    Parameters
+    ----------
+    shown : function of a setting's key
+        Whether the help names the setting; its flag works either way.
+
+    Returns
+    -------
+    type
+        Nested typed dictionary without required keys: what a flag does not give, is not there.
+
+    Examples
+    --------
+    >>> sorted(setting_flags().__annotations__)[:3]
+    ['air', 'association', 'beacon']
+    """
+    sections: dict[str, dict[str, Any]] = {}
+    top: dict[str, Any] = {}
+    for key, field in known_settings().items():
+        default = field.default if isinstance(field.default, tuple) else (field.default,)
+        words = f"{field.description or ''} [default: {' '.join(map(str, default))}]"
+        parameter = Parameter(
+            help=" ".join(words.split()),
+            show=shown(key),
+            negative=(),
+            converter=whole if field.annotation is int else None,
+            **({"group": _section_group(key[0])} if len(key) > 1 else {}),
+        )
+        table = sections.setdefault(key[0], {}) if len(key) > 1 else top
+        table[key[-1]] = Annotated[field.annotation, parameter]
+    nested = {name: TypedDict(name, table, total=False) for name, table in sections.items()}
+    return TypedDict("Settings", top | nested, total=False)
+
+
+def _section_group(section: str) -> Group:
+    """Title a section of settings in the help, in the order of `Config`."""
+    order = list(Config.model_fields).index(section)
+    meaning = type(getattr(Config(), section)).__doc__ or ""
+    return Group(f"Settings: {section}", help=" ".join(meaning.split()), sort_key=order)
+
+
+if TYPE_CHECKING:
+    SettingFlags = dict[str, Any]
+else:
+    SettingFlags = setting_flags()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MissionOptions:
+    """What a simulated mission is made of."""
+
+    config: Annotated[
+        Path | None,
+        Parameter(metavar="FILE.toml", help="Settings as `pipistrelle config show` prints them."),
+    ] = None
+    beamwidth: Annotated[
+        float | None,
+        Parameter(
+            metavar="DEG",
+            help="Half-power beamwidth of the vehicle's call [deg], up to 180; sets "
+            "emitter.radius. [default: 33.3]",
+        ),
+    ] = None
+    landmarks: Annotated[
+        int | None,
+        Parameter(metavar="N", help="Number of landmarks; sets scenario.landmarks. [default: 50]"),
+    ] = None
+    duration: Annotated[
+        float | None,
+        Parameter(
+            metavar="SECONDS",
+            help="Length of the drive [s]; sets scenario.steps. [default: 187.5]",
+        ),
+    ] = None
+    engine: Annotated[
+        Literal["block", "dense"] | None,
+        Parameter(help="Receiver: fast or literal; sets receiver.engine. [default: block]"),
+    ] = None
+    settings: Annotated[SettingFlags | None, Parameter(name="*")] = None
+
+
+def mission_config(options: MissionOptions) -> Config:
+    """Resolve the settings of a mission: defaults < file < environment < flags.
+
+    Parameters
+    ----------
+    options : MissionOptions
+
+    Returns
+    -------
+    Config
+
+    Raises
+    ------
+    InputError
+        An unknown setting or a refused value, a setting given twice, less than one frame.
+
+    Examples
+    --------
+    >>> mission_config(MissionOptions(duration=60.0)).scenario.steps
+    480
+    """
+    layer = layers(options.config, options.settings)
+    given = {} if options.settings is None else from_flags(options.settings)
+    short: Layer = {}
+    if options.landmarks is not None:
+        short["scenario", "landmarks"] = Given(options.landmarks, "--landmarks")
+    if options.engine is not None:
+        short["receiver", "engine"] = Given(options.engine, "--engine")
+    base = resolve(layer | short)
+    if options.duration is not None:
+        steps = _steps(options.duration, base)
+        short["scenario", "steps"] = Given(steps, f"--duration {options.duration:g}")
+    if options.beamwidth is not None:
+        short["emitter", "radius"] = Given(_radius(options.beamwidth, base), "--beamwidth")
+    for key, (_, where) in short.items():
+        if key in given:
+            raise InputError(f"{where} and {given[key].where} are one setting; give one of them")
+    return resolve(layer | short)
+
+
+def layers(config: Path | None, settings: SettingFlags | None) -> Layer:
+    """Lay file, environment and flags over each other.
+
+    Parameters
+    ----------
+    config : Path, optional
+    settings : nested dict, optional
+
+    Returns
+    -------
+    Layer
+
+    Examples
+    --------
+    >>> layers(None, {"seed": 3})["seed",].value
+    3
+    """
+    file = {} if config is None else from_file(config)
+    return file | from_environment(os.environ) | from_flags(settings or {})
+
+
+def strategies(chosen: Chosen) -> tuple[Strategy, ...]:
+    """Name the strategies of a choice.
+
+    Parameters
+    ----------
+    chosen : one strategy, or "all"
+
+    Returns
+    -------
+    tuple of str
+
+    Examples
+    --------
+    >>> strategies("all"), strategies("fused")
+    (('active', 'fused', 'passive'), ('fused',))
+    """
+    return STRATEGIES if chosen == "all" else (chosen,)
+
+
+def _steps(duration: float, config: Config) -> int:
+    """Count the control steps of a drive; at least one frame."""
+    scenario = config.scenario
+    frame = scenario.step * scenario.steps_per_frame
+    if not frame <= duration < float("inf"):
+        raise InputError(
+            f"--duration: found {duration:g}, expected at least one frame ({frame:g} s)"
+        )
+    return round(duration / scenario.step)
+
+
+def _radius(beamwidth: float, config: Config) -> float:
+    """Find the piston that makes a beamwidth [deg]."""
+    from pipistrelle.acoustics.emitter import piston_radius
+
+    return float(
+        piston_radius(
+            radians(beamwidth),
+            frequency=config.emitter.frequency,
+            speed_of_sound=config.air.speed_of_sound,
+        )
+    )

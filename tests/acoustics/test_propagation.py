@@ -1,0 +1,180 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipistrelle.acoustics.propagation import (
+    absorption_db_per_m,
+    doppler_frequency,
+    passive_spreading_loss_db,
+    spreading_loss_db,
+)
+from pipistrelle.config import InputError
+
+law = settings(deadline=None)
+DISTANCES = st.floats(0.01, 1e3)
+SPEEDS = st.floats(-30.0, 30.0)
+STANDARD = {"temperature_c": 20.0, "relative_humidity": 0.5, "pressure_kpa": 101.325}
+
+
+@given(path=DISTANCES)
+@law
+def test_ten_times_as_far_loses_20_db_one_way_and_40_db_both(path):
+    for ways in (1, 2):
+        step = spreading_loss_db(10 * path, ways=ways) - spreading_loss_db(path, ways=ways)
+        assert step == pytest.approx(20.0 * ways, abs=1e-12)
+
+
+@given(distance=DISTANCES)
+@law
+def test_an_active_echo_is_a_bistatic_one_whose_source_is_the_vehicle(distance):
+    active = spreading_loss_db(2 * distance, ways=2)
+    bistatic = passive_spreading_loss_db(distance, distance, law="bistatic")
+    mirror = passive_spreading_loss_db(distance, distance, law="paper")
+    assert active == pytest.approx(bistatic, abs=1e-12)
+    assert active - mirror == pytest.approx(20 * math.log10(distance / 2), abs=1e-12)
+
+
+@given(outward=DISTANCES, homeward=DISTANCES, name=st.sampled_from(["paper", "bistatic"]))
+@law
+def test_sound_may_go_either_way_round(outward, homeward, name):
+    there = passive_spreading_loss_db(outward, homeward, law=name)
+    assert there == passive_spreading_loss_db(homeward, outward, law=name)
+
+
+@given(outward=DISTANCES, homeward=DISTANCES)
+@law
+def test_a_scatterer_loses_more_than_a_mirror_where_the_legs_shorten_it_by_over_1_m(
+    outward, homeward
+):
+    mirror = passive_spreading_loss_db(outward, homeward, law="paper")
+    bistatic = passive_spreading_loss_db(outward, homeward, law="bistatic")
+    apart = outward * homeward / (outward + homeward)
+    assert bistatic - mirror == pytest.approx(20 * math.log10(apart), abs=1e-11)
+
+
+def test_an_unknown_law_is_refused():
+    with pytest.raises(InputError, match=r"air\.spreading: found 'mirror'"):
+        passive_spreading_loss_db(1.0, 1.0, law="mirror")
+
+
+@pytest.mark.parametrize("humidity", [0.1, 0.3, 0.5, 0.7, 0.9])
+@pytest.mark.parametrize("temperature", [0.0, 10.0, 20.0, 30.0, 40.0])
+@pytest.mark.parametrize("pressure", [80.0, 101.325])
+def test_absorption_agrees_with_pyfar_to_four_digits(temperature, humidity, pressure):
+    from pyfar.constants import air_attenuation
+
+    tones = np.array([1e3, 20e3, 30e3, 35e3, 50e3])
+    theirs = air_attenuation(temperature, tones, humidity, 1e3 * pressure)[0]
+    ours = absorption_db_per_m(
+        tones, temperature_c=temperature, relative_humidity=humidity, pressure_kpa=pressure
+    )
+    # Half a unit of the fourth digit is at least 5e-5 of the number.
+    np.testing.assert_allclose(ours, np.ravel(theirs), rtol=5e-5)
+
+
+@pytest.mark.parametrize(
+    ("temperature", "humidity", "printed"),
+    [
+        (10.0, 0.7, [0.1, 0.4, 1.0, 1.9, 3.7, 9.7, 32.8, 117]),
+        (20.0, 0.7, [0.1, 0.3, 1.1, 2.8, 5.0, 9.0, 22.9, 76.6]),
+        (30.0, 0.7, [0.1, 0.3, 1.0, 3.1, 7.4, 12.7, 23.1, 59.3]),
+        (15.0, 0.2, [0.3, 0.6, 1.2, 2.7, 8.2, 28.2, 88.8, 202]),
+        (15.0, 0.5, [0.1, 0.5, 1.2, 2.2, 4.2, 10.8, 36.2, 129]),
+        (15.0, 0.8, [0.1, 0.3, 1.1, 2.4, 4.1, 8.3, 23.7, 82.8]),
+    ],
+)
+def test_absorption_is_that_of_the_octave_table_of_iso_9613_2(temperature, humidity, printed):
+    octaves = 1e3 * 10 ** (0.3 * np.arange(-4, 4))
+    db_per_km = 1e3 * absorption_db_per_m(
+        octaves, temperature_c=temperature, relative_humidity=humidity, pressure_kpa=101.325
+    )
+    last_digit = np.where(np.array(printed) > 100, 1.0, 0.1)
+    assert np.all(np.abs(db_per_km - printed) <= 0.5 * last_digit + 1e-9)
+
+
+@given(
+    frequency=st.floats(100.0, 2e5),
+    temperature=st.floats(-20.0, 50.0),
+    humidity=st.floats(0.0, 1.0),
+    pressure=st.floats(50.0, 150.0),
+)
+@law
+def test_absorption_is_positive_and_rises_with_frequency(
+    frequency, temperature, humidity, pressure
+):
+    low, high = absorption_db_per_m(
+        frequency * np.array([1.0, 1.01]),
+        temperature_c=temperature,
+        relative_humidity=humidity,
+        pressure_kpa=pressure,
+    )
+    assert 0.0 < low < high < math.inf
+
+
+@given(frequency=st.floats(1e3, 1e5), humidity=st.floats(0.05, 0.5), scale=st.floats(0.5, 2.0))
+@law
+def test_absorption_scales_with_pressure_at_the_same_molar_humidity(frequency, humidity, scale):
+    thin = absorption_db_per_m(
+        frequency, temperature_c=20.0, relative_humidity=humidity, pressure_kpa=101.325
+    )
+    dense = absorption_db_per_m(
+        frequency * scale,
+        temperature_c=20.0,
+        relative_humidity=humidity * scale,
+        pressure_kpa=101.325 * scale,
+    )
+    assert dense == pytest.approx(scale * thin, rel=1e-12)
+
+
+def test_humidity_decides_what_a_target_at_20_m_loses():
+    loss = [
+        40 * float(absorption_db_per_m(35e3, **{**STANDARD, "relative_humidity": rh}))
+        for rh in (0.1, 0.5)
+    ]
+    assert round(loss[1] - loss[0]) == 29
+
+
+@given(speed=SPEEDS)
+@law
+def test_doppler_of_approach_and_of_retreat_undo_each_other(speed):
+    shift = {"source_speed": speed, "receiver_speed": speed, "speed_of_sound": 343.0}
+    back = {"source_speed": -speed, "receiver_speed": -speed, "speed_of_sound": 343.0}
+    twice = doppler_frequency(doppler_frequency(35e3, **shift), **back)
+    assert twice == pytest.approx(35e3, rel=1e-14)
+
+
+@given(speed=SPEEDS, distance=st.floats(1.0, 50.0))
+@law
+def test_doppler_is_the_rate_at_which_crests_arrive(speed, distance):
+    c, period = 343.0, 1e-3
+
+    def echo(start):  # a crest sent towards a fixed target that the vehicle approaches
+        hit = start + (distance - speed * start) / c
+        return hit + (distance - speed * hit) / (c + speed)
+
+    def call(start):  # a crest sent by a fixed beacon that the vehicle approaches
+        return (distance + c * start) / (c + speed)
+
+    active = doppler_frequency(1.0, receiver_speed=speed, source_speed=speed, speed_of_sound=c)
+    passive = doppler_frequency(1.0, receiver_speed=speed, speed_of_sound=c)
+    assert period / (echo(period) - echo(0.0)) == pytest.approx(float(active), rel=1e-10)
+    assert period / (call(period) - call(0.0)) == pytest.approx(float(passive), rel=1e-10)
+
+
+def test_at_rest_the_tone_is_exactly_the_one_sent():
+    assert doppler_frequency(35e3, receiver_speed=0.0, speed_of_sound=343.0) == 35e3
+
+
+def test_the_vehicles_speed_shifts_its_echo_by_153_hz_and_the_beacons_call_by_66_hz():
+    active = doppler_frequency(35e3, receiver_speed=0.75, source_speed=0.75, speed_of_sound=343.0)
+    passive = doppler_frequency(30e3, receiver_speed=0.75, speed_of_sound=343.0)
+    assert (round(float(active) - 35e3), round(float(passive) - 30e3)) == (153, 66)
+
+
+@pytest.mark.parametrize("speed", [343.0, -400.0, math.nan])
+def test_a_vehicle_as_fast_as_sound_is_refused(speed):
+    with pytest.raises(InputError, match=r"velocity: found .* expected less than the speed of"):
+        doppler_frequency(35e3, receiver_speed=speed, source_speed=speed, speed_of_sound=343.0)

@@ -1,0 +1,127 @@
+"""NEES and its bounds: closed forms, laws, statistics with a control that must fail."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipistrelle.evaluation.consistency import (
+    EKF_LIMIT,
+    FASTSLAM_LIMIT,
+    anees,
+    anees_bounds,
+    diverged,
+    nees,
+)
+
+SEED = st.integers(0, 2**32 - 1)
+
+
+def covariances(rng, n):
+    """Draw covariances of pose errors: centimetres to metres, correlated."""
+    factor = rng.normal(size=(n, 3, 3)) + 2.0 * np.eye(3)
+    factor *= 10.0 ** rng.uniform(-2.0, 0.0, (n, 3, 1))
+    return factor @ np.swapaxes(factor, 1, 2)
+
+
+def draws(rng, covariance):
+    factor = np.linalg.cholesky(covariance)
+    return (factor @ rng.normal(size=(len(covariance), 3, 1)))[..., 0]
+
+
+@given(SEED)
+def test_nees_is_the_quadratic_form_of_the_inverse_covariance(seed):
+    rng = np.random.default_rng(seed)
+    P = covariances(rng, 20)
+    error = draws(rng, P)
+    expected = np.sum(error * np.linalg.solve(P, error[..., None])[..., 0], axis=1)
+    worst = np.linalg.cond(P).max()
+    assert nees(error, P) == pytest.approx(expected, rel=20 * np.finfo(float).eps * worst)
+
+
+@given(SEED)
+def test_nees_does_not_depend_on_the_units(seed):
+    rng = np.random.default_rng(seed)
+    P, unit = covariances(rng, 5), np.array([2.0**10, 2.0**-7, 2.0])
+    error = draws(rng, P)
+    assert (nees(error * unit, P * unit[:, None] * unit) == nees(error, P)).all()
+
+
+def test_nees_leaves_its_arguments_alone():
+    error, P = np.ones((4, 3)), covariances(np.random.default_rng(1), 4)
+    kept = P.copy()
+    nees(error, P)
+    assert (error == 1.0).all()
+    assert (P == kept).all()
+
+
+def test_nees_of_independent_errors_is_their_sum_of_squared_ratios():
+    assert nees(np.array([[0.3, 0.4, 0.1]]), np.diag([0.09, 0.04, 0.01])[None]) == pytest.approx(
+        [1.0 + 4.0 + 1.0], rel=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    "covariance",
+    [
+        np.zeros((3, 3)),
+        np.diag([1.0, 1.0, 0.0]),
+        np.diag([1.0, -1.0, 1.0]),
+        np.array([[0.1, 0.3, 0.0], [0.3, 0.9, 0.0], [0.0, 0.0, 1.0]]),
+        np.full((3, 3), 1.0),
+        np.diag([1.0, np.nan, 1.0]),
+        np.diag([1.0, np.inf, 1.0]),
+    ],
+)
+def test_nees_is_infinite_where_the_covariance_cannot_be_inverted(covariance):
+    both = nees(np.ones((2, 3)), np.stack([covariance, np.eye(3)]))
+    assert both.tolist() == [np.inf, 3.0]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e200])
+def test_nees_is_infinite_where_the_error_is_too_large_or_no_number(value):
+    assert nees(np.array([[value, 0.0, 0.0]]), np.eye(3)[None]).tolist() == [np.inf]
+
+
+def test_the_nees_of_a_consistent_filter_averages_to_three_and_of_an_overconfident_one_to_more():
+    rng = np.random.default_rng(11)
+    runs = 20_000
+    P = covariances(rng, runs)
+    error = draws(rng, P)
+    low, high = anees_bounds(runs, confidence=1 - 1e-6)
+    assert low < nees(error, P).mean() < high
+    assert nees(error, 0.95 * P).mean() > high
+    assert nees(error, 1.05 * P).mean() < low
+
+
+def test_the_bounds_hold_the_anees_as_often_as_they_promise():
+    rng = np.random.default_rng(5)
+    steps, runs = 4000, 10
+    average = anees(rng.chisquare(3, (runs, steps)))
+    low, high = anees_bounds(runs, confidence=0.9)
+    spread = np.sqrt(0.9 * 0.1 / steps)
+    assert np.mean((low < average) & (average < high)) == pytest.approx(0.9, abs=4 * spread)
+    low, high = anees_bounds(runs + 5, confidence=0.9)
+    assert np.mean((low < average) & (average < high)) < 0.9 - 4 * spread
+
+
+def test_the_bounds_close_around_the_number_of_states():
+    for states in (2, 3):
+        low, high = anees_bounds(10**6, states=states)
+        width = 1.959964 * np.sqrt(2 * states / 10**6)
+        assert (low, high) == pytest.approx((states - width, states + width), abs=1e-5)
+
+
+def test_anees_averages_over_runs_step_by_step():
+    assert anees(np.array([[1.0, 2.0, np.inf], [3.0, 4.0, 5.0]])).tolist() == [2.0, 3.0, np.inf]
+
+
+@pytest.mark.parametrize("limit", [EKF_LIMIT, FASTSLAM_LIMIT])
+def test_a_run_diverges_by_one_nees_above_the_limit_and_not_by_one_at_it(limit):
+    assert not diverged(np.array([0.0, limit]), limit)
+    assert diverged(np.array([0.0, np.nextafter(limit, np.inf), 0.0]), limit)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_run_diverges_by_one_nees_that_is_no_number(value):
+    assert diverged(np.array([0.0, value]), EKF_LIMIT)

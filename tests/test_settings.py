@@ -1,0 +1,198 @@
+import tomllib
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipistrelle.config import AirConfig, Config, InputError, RayConfig, ScenarioConfig
+from pipistrelle.settings import (
+    from_environment,
+    from_file,
+    from_flags,
+    known_settings,
+    resolve,
+    to_toml,
+)
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "mission.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def refusal(folder: Path, text: str) -> str:
+    """What is said of a file, without its place."""
+    path = written(folder, text)
+    with pytest.raises(InputError) as refused:
+        resolve(from_file(path))
+    lines = str(refused.value).splitlines()
+    assert all(line.startswith(f"{path}: ") for line in lines)
+    return "\n".join(line.removeprefix(f"{path}: ") for line in lines)
+
+
+def test_every_setting_of_the_configuration_is_known_and_says_what_it_means():
+    leaves = {
+        (section, leaf)
+        for section, values in Config().model_dump().items()
+        if isinstance(values, dict)
+        for leaf in values
+    }
+    assert set(known_settings()) == leaves | {("seed",)}
+    silent = [".".join(key) for key, field in known_settings().items() if not field.description]
+    assert silent == []
+
+
+@pytest.mark.parametrize(
+    ("file", "environment", "flags", "power"),
+    [
+        ("", {}, {}, 1.0),
+        ("rays.power = 2", {}, {}, 2.0),
+        ("rays.power = 2", {"PIPISTRELLE_RAYS__POWER": "3"}, {}, 3.0),
+        ("rays.power = 2", {"PIPISTRELLE_RAYS__POWER": "3"}, {"rays": {"power": 4.0}}, 4.0),
+        ("rays.power = 2", {}, {"rays": {"power": 4.0}}, 4.0),
+        ("", {"PIPISTRELLE_RAYS__POWER": "3"}, {"rays": {"power": 4.0}}, 4.0),
+    ],
+)
+def test_flags_go_over_the_environment_over_the_file_over_the_defaults(
+    tmp_path, file, environment, flags, power
+):
+    layer = from_file(written(tmp_path, file)) | from_environment(environment) | from_flags(flags)
+    assert resolve(layer).rays.power == power
+
+
+def test_layers_leave_alone_what_they_do_not_name(tmp_path):
+    file = from_file(written(tmp_path, "[rays]\nratio = 0.4\nweights = 'aggregated'\n"))
+    environment = from_environment({"PIPISTRELLE_RAYS__POWER": "3"})
+    flags = from_flags({"air": {"relative_humidity": 0.3}, "seed": 9})
+    assert resolve(file | environment | flags) == Config(
+        seed=9,
+        air=AirConfig(relative_humidity=0.3),
+        rays=RayConfig(ratio=0.4, weights="aggregated", power=3.0),
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("rays.powr = 3", "rays.powr: no such setting; did you mean rays.power?"),
+        ("power = 3", "power: no such setting; did you mean rays.power?"),
+        ("[rays.powr]\nx = 3", "rays.powr.x: no such setting; did you mean rays.power?"),
+        ("qqq = 3", "qqq: no such setting; see `pipistrelle config show`"),
+        ("[qqq]", "qqq: no such setting; see `pipistrelle config show`"),
+        ("rays = 3", "rays: found 3, expected a section of settings"),
+        ("rays.power = -3", "rays.power: found -3, expected greater than 0"),
+        ("rays.power = nan", "rays.power: found nan, expected a finite number"),
+        ("rays.power = inf", "rays.power: found inf, expected a finite number"),
+        ("rays.power = '3'", "rays.power: found '3', expected a valid number"),
+        ("rays.power = true", "rays.power: found True, expected a valid number"),
+        ("rays.power.x = 3", "rays.power: found {'x': 3}, expected a valid number"),
+        ("scenario.steps = 3.0", "scenario.steps: found 3.0, expected a valid integer"),
+        ("target.shape = 'cube'", "target.shape: found 'cube', expected 'cylinder' or 'sphere'"),
+        ("rays.range_bounds = [1]", "rays.range_bounds: found [1], expected 2 values"),
+        ("rays.range_bounds = [1, 2, 3]", "rays.range_bounds: found [1, 2, 3], expected 2 values"),
+        (
+            "rays.range_bounds = [1, -2]",
+            "rays.range_bounds: found [1, -2], expected greater than 0 as value 2",
+        ),
+        (
+            "rays.power = 2\nrays.range_bounds = [3, 2]",
+            "rays.range_bounds: range_bounds must rise, found [3.0, 2.0]",
+        ),
+    ],
+)
+def test_a_mistake_in_a_file_is_said_with_its_key_what_was_found_and_expected(tmp_path, text, said):
+    assert refusal(tmp_path, text) == said
+
+
+def test_all_refused_values_are_said_at_once(tmp_path):
+    assert len(refusal(tmp_path, "rays.power = 0\nair.pressure_kpa = 'high'").splitlines()) == 2
+
+
+def test_a_file_that_is_not_toml_is_refused_with_its_line(tmp_path):
+    assert "(at line 2," in refusal(tmp_path, "seed = 3\nrays.power 3\n")
+    path = tmp_path / "mission.toml"
+    path.write_bytes(b"seed = 3 # \xff")
+    with pytest.raises(InputError, match="byte 11 is not UTF-8"):
+        from_file(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("2", 2.0), (".5", 0.5), ("1e-3", 1e-3), (" 4 ", 4.0)],
+)
+def test_a_number_in_the_environment_may_be_spelled_in_any_usual_way(text, value):
+    assert resolve(from_environment({"PIPISTRELLE_RAYS__POWER": text})).rays.power == value
+
+
+def test_text_and_lists_in_the_environment_are_spelled_as_in_a_file():
+    config = resolve(
+        from_environment(
+            {
+                "PIPISTRELLE_RAYS__WEIGHTS": "aggregated",
+                "PIPISTRELLE_RAYS__PARTIAL": '"heaviest"',
+                "PIPISTRELLE_RAYS__RANGE_BOUNDS": "[1, 15.5]",
+                "PIPISTRELLE_SEED": "11",
+                "PIPISTRELLE_DATA": "/somewhere",
+                "HOME": "/root",
+            }
+        )
+    )
+    assert config.rays == RayConfig(weights="aggregated", partial="heaviest", range_bounds=(1, 15.5))
+    assert config.seed == 11
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("PIPISTRELLE_RAYS__POWER", "x", "found 'x', expected a valid number"),
+        ("PIPISTRELLE_RAYS__POWER", "nan", "found nan, expected a finite number"),
+        ("PIPISTRELLE_SEED", "", "found '', expected a valid integer"),
+        ("PIPISTRELLE_SEED", "3\nrays = 4", r"found '3\nrays = 4', expected a valid integer"),
+        ("PIPISTRELLE_RAYS", "3", "found 3, expected a section of settings"),
+        (
+            "PIPISTRELLE_RAYS__POWR",
+            "3",
+            "no such setting; did you mean PIPISTRELLE_RAYS__POWER?",
+        ),
+    ],
+)
+def test_a_mistake_in_the_environment_is_said_with_its_variable(name, text, said):
+    with pytest.raises(InputError) as refused:
+        resolve(from_environment({name: text}))
+    assert str(refused.value) == f"{name}: {said}"
+
+
+def test_a_mistake_in_a_flag_is_said_with_the_flag():
+    with pytest.raises(InputError) as refused:
+        resolve(from_flags({"air": {"relative_humidity": 3.0}}))
+    found = "--air.relative-humidity: found 3.0, expected less than or equal to 1"
+    assert str(refused.value) == found
+
+
+finite = st.floats(min_value=1e-300, max_value=1e300)
+
+
+@given(
+    seed=st.integers(0, 2**63 - 1),
+    bounds=st.tuples(finite, finite).filter(lambda pair: pair[0] < pair[1]),
+    start=st.tuples(finite, finite.map(float.__neg__), finite),
+)
+def test_settings_written_as_toml_read_back_bit_for_bit(tmp_path_factory, seed, bounds, start):
+    config = Config(
+        seed=seed,
+        scenario=ScenarioConfig(start=start, speed=-start[0]),
+        rays=RayConfig(range_bounds=bounds, weights="aggregated"),
+    )
+    path = written(tmp_path_factory.getbasetemp(), to_toml(config))
+    assert resolve(from_file(path)) == config
+
+
+def test_written_settings_name_each_setting_once_with_its_meaning():
+    text = to_toml(Config())
+    values = tomllib.loads(text)
+    assert len(known_settings()) == sum(
+        len(value) if isinstance(value, dict) else 1 for value in values.values()
+    )
+    assert all(" # " in line for line in text.splitlines() if " = " in line)
