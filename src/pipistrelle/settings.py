@@ -85,7 +85,7 @@ def from_file(path: Path) -> Layer:
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     file = Path(folder) / "sharp.toml"
-    ...     _ = file.write_text("[rays]\\npower = 3.0\\n")
+    ...     _ = file.write_text("rays.power = 3.0")
     ...     from_file(file)["rays", "power"].value
     3.0
     """

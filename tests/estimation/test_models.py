@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from reference.ekf_slam import moved
 
 from pipistrelle.estimation.models import (
     NEAREST,
@@ -12,6 +11,7 @@ from pipistrelle.estimation.models import (
     motion_step,
 )
 from pipistrelle.geometry import range_and_bearing, wrap
+from reference.ekf_slam import moved
 
 BICYCLE = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
 UNICYCLE = Motion(model="unicycle", control_std=(0.1, 0.15))

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from reference.ekf_slam import ray_ranges
 
 from pipistrelle.config import RayConfig
 from pipistrelle.estimation.rays import ray_members, survivors, weigh_and_share
+from reference.ekf_slam import ray_ranges
 
 configs = st.builds(
     RayConfig,

@@ -80,8 +80,8 @@ def test_the_rmse_of_positions_does_not_depend_on_the_frame(points, motion):
 
 
 def test_the_rmse_of_a_constant_offset_is_the_offset():
-    path = loop(100)
-    assert rmse(position_error(path + [0.3, -0.4, 0.0], path)) == pytest.approx(0.5, rel=1e-12)
+    path, offset = loop(100), np.array([0.3, -0.4, 0.0])
+    assert rmse(position_error(path + offset, path)) == pytest.approx(0.5, rel=1e-12)
 
 
 def test_rmse_weighs_large_errors_more_than_the_mean_does():

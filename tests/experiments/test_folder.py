@@ -64,7 +64,7 @@ def test_a_folder_of_the_users_called_latest_is_left_alone(tmp_path, monkeypatch
 
 def test_a_folder_with_results_is_refused_unless_overwriting(earlier):
     before = names(earlier)
-    with pytest.raises(InputError, match="not empty.*--overwrite") as refusal:
+    with pytest.raises(InputError, match=r"not empty.*--overwrite") as refusal:
         prepare_folder(earlier, "run", overwrite=False)
     assert str(earlier) in str(refusal.value)
     assert names(earlier) == before
@@ -104,7 +104,7 @@ def test_a_file_in_the_way_is_refused_by_name(tmp_path):
 def test_runs_that_is_a_file_is_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs").write_text("mine")
-    with pytest.raises(InputError, match="^runs: cannot be used"):
+    with pytest.raises(InputError, match=r"^runs: cannot be used"):
         prepare_folder(None, "run", overwrite=False)
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -26,6 +27,7 @@ from pipistrelle.experiments.results import (
 )
 
 STEPS = 400
+EVO_APE = shutil.which("evo_ape", path=Path(sys.executable).parent)
 KEYS = [
     "strategy",
     "filter",
@@ -306,14 +308,15 @@ def test_the_summary_is_written_last(tmp_path):
 def test_evo_reads_the_files_untouched_and_finds_our_errors(tmp_path):
     track = drifting_track()
     write(tmp_path, trial(track))
-    command = [sys.executable, "-m", "evo.main_ape"]
-    evo = Path(sys.executable).with_name("evo_ape")
-    command = [str(evo)] if evo.exists() else command
-    environment = os.environ | {"HOME": str(tmp_path), "MPLBACKEND": "Agg"}
+    environment = os.environ | {
+        "HOME": str(tmp_path),
+        "MPLBACKEND": "Agg",
+        "PYTHONWARNINGS": "error",
+    }
 
     def ape(*options):
         told = subprocess.run(
-            [*command, "tum", "truth.tum", "track_fused_ekf.tum", *options],
+            [EVO_APE, "tum", "truth.tum", "track_fused_ekf.tum", *options],
             cwd=tmp_path,
             env=environment,
             capture_output=True,

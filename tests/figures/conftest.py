@@ -85,7 +85,6 @@ def sightings(path, points, strategy, rng) -> list[tuple]:
     """First frame, frame of full initialisation and final estimate of each landmark seen."""
     rows = []
     for label, point in enumerate(points, start=1):
-        distance, bearing = range_and_bearing(path[10], point[None])
         away = np.hypot(*(path[::PER_FRAME, :2] - point).T)
         lit = np.flatnonzero(away < REACH[strategy] * rng.uniform(0.75, 1.0))
         if len(lit) == 0:

@@ -106,7 +106,8 @@ class SlowEkfSlam:
         self.joseph = joseph
 
     def start(self, mean, covariance):
-        self.blocks, self.aggregated, self.gated = [POSE], {}, 0
+        self.blocks: list[tuple] = [POSE]
+        self.aggregated, self.gated = {}, 0
         self.X, self.P = np.array(mean, float), np.array(covariance, float)
         return self
 

@@ -1,10 +1,12 @@
 """Made-up missions: a noisy drive among landmarks, measured with Gaussian noise."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.ekf import EkfSlam
 from pipistrelle.estimation.models import Gaussian, Motion, motion_step
 from pipistrelle.geometry import range_and_bearing, wrap
 
@@ -15,6 +17,11 @@ START = Gaussian(
     mean=np.array([0.0, -7.408, 0.0]), covariance=np.diag([0.05**2, 0.05**2, 0.0436**2])
 )
 CIRCLE = (0.75, 0.027)
+SENSING = {
+    "active": {"beamwidth": np.pi},
+    "fused": {"beamwidth": np.radians(33), "hearing": 18.0},
+    "passive": {"beamwidth": 0.0, "hearing": 18.0},
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,3 +102,26 @@ def scan_of(*rows, time=0.0):
         range=np.array(distance, dtype=float),
         bearing=np.array(bearing, dtype=float),
     )
+
+
+def paper_filter(**changes):
+    """Return the filter with the paper's settings, but for the changes."""
+    slam = EkfSlam(motion=BICYCLE, range_std=0.2, bearing_std=0.15, rays=RayConfig())
+    return replace(slam, **changes)
+
+
+def paper_mission(strategy, frames=375, seed=3, **changes):
+    """Draw the paper's drive among 50 landmarks."""
+    rng = np.random.default_rng(seed)
+    field = scattered(rng, 50)
+    known = SENSING[strategy] | changes
+    return draw_mission(rng, BICYCLE, START, field, steady(CIRCLE, frames), **known)
+
+
+def followed(slam, mission, start=START):
+    """Yield belief and poses, frame by frame."""
+    belief = slam.init(start)
+    for controls, dt, scan in zip(mission.controls, mission.dt, mission.scans, strict=True):
+        belief, poses = slam.predict(belief, controls, dt)
+        belief = slam.update(belief, scan)
+        yield belief, poses

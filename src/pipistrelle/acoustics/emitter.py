@@ -10,7 +10,7 @@ from scipy.special import j1
 
 from pipistrelle.config import InputError
 
-HALF_POWER = 1.616339948310703
+HALF_POWER = 1.6163399483107033
 """Root x of (2 J1(x) / x)^2 = 1/2: ka sin(angle) where the beam has fallen to half its power."""
 
 

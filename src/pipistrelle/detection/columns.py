@@ -1,6 +1,6 @@
 """Text files of columns of numbers, read so that whatever is wrong has a line.
 
-One plain pass over the lines: 60,000 rows take a tenth of a second.
+A sound file is read at once, 60,000 rows in some hundredths of a second; any other, row by row.
 """
 
 import math
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from pipistrelle.config import InputError
 
@@ -64,15 +64,19 @@ def read_table(
     content = [(i, line) for i, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]
     if content and separator:
         line, header = content.pop(0)
-        found = [name.strip().strip('"') for name in header.split(separator)]
-        if found != list(columns):
+        names = [name.strip().strip('"') for name in header.split(separator)]
+        if names != list(columns):
             expected = f"the header {separator.join(columns)!r}"
-            raise refusal(f"{path}, line {line}", repr(header[:80]), expected, "name the columns so")
+            where, found = f"{path}, line {line}", repr(header[:80])
+            raise refusal(where, found, expected, "name the columns so")
     if not content:
         expected = f"rows of {', '.join(columns)}"
-        raise refusal(path, "no rows", expected, "record the log anew or remove the file")
-    rows = [_read_row(path, columns, separator, optional, *item) for item in content]
-    column = dict(zip(columns, np.array(rows).T.copy(), strict=True))
+        raise refusal(path, "no rows", expected, "add them")
+    values = _read_at_once([text for _, text in content], len(columns), separator)
+    if values is None:
+        rows = [_read_row(path, columns, separator, optional, *item) for item in content]
+        values = np.array(rows)
+    column = dict(zip(columns, values.T.copy(), strict=True))
     table = Table(path=path, line=np.array([line for line, _ in content]), column=column)
     _check_columns(table)
     return table
@@ -136,6 +140,17 @@ def read_text(path: Path) -> str:
         raise refusal(path, str(error.strerror), "a readable text file", fix) from None
 
 
+def _read_at_once(
+    lines: list[str], columns: int, separator: str | None
+) -> Float[np.ndarray, "n c"] | None:
+    """Return all rows, or None where one of them is not plainly as many finite numbers."""
+    try:
+        values = np.loadtxt(lines, delimiter=separator, comments=None, ndmin=2)
+    except ValueError:
+        return None
+    return values if values.shape[1] == columns and np.isfinite(values).all() else None
+
+
 def _read_row(
     path: Path,
     columns: tuple[str, ...],
@@ -144,15 +159,8 @@ def _read_row(
     line: int,
     text: str,
 ) -> list[float]:
-    """Return the numbers of one row; the common case first, since there are many."""
-    fields = text.split(separator)
-    try:
-        row = [float(field) for field in fields]
-        if len(row) == len(columns) and math.isfinite(sum(row)) and "_" not in text:
-            return row
-    except ValueError:
-        pass
-    where = f"{path}, line {line}"
+    """Return the numbers of one row, or refuse it."""
+    where, fields = f"{path}, line {line}", text.split(separator)
     if len(fields) != len(columns):
         expected = f"{len(columns)}: {', '.join(columns)}"
         raise refusal(where, f"{len(fields)} fields in {text[:80]!r}", expected, "correct the row")

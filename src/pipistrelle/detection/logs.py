@@ -312,10 +312,8 @@ def _read_settings(path: Path) -> _Settings:
     except ValidationError as error:
         faults = error.errors(include_url=False)
     rank = {"format": 0, "motion": 1}
-    fault = min(
-        faults,
-        key=lambda f: rank.get(str(f["loc"][:1]), 2 if f["type"] == "extra_forbidden" else 3),
-    )
+    other = {"extra_forbidden": 2}
+    fault = min(faults, key=lambda f: rank.get(str(f["loc"][0]), other.get(f["type"], 3)))
     raise _key_refusal(path, fault, list(model.model_fields))
 
 
@@ -338,10 +336,10 @@ def _cut(
     start, end = max(time[0], span[0]), min(time[-1], span[1])
     if start >= end:
         found = f"times from {time[0].item()!r} to {time[-1].item()!r}"
-        expected = "two different times at least"
-        if np.isfinite(span).any():
-            expected += f" between {span[0]!r} and {span[1]!r}"
-        raise refusal(path, found, expected, "record the log anew")
+        if time[0] == time[-1]:
+            raise refusal(path, found, "two times or more", "add the row that ends the log")
+        expected = f"some between {span[0]!r} and {span[1]!r}"
+        raise refusal(path, found, expected, "use odometry and truth of one drive")
     cut = np.concatenate(([start], time[(time > start) & (time < end)], [end]))
     return cut, controls[np.searchsorted(time, cut[:-1], side="right") - 1]
 

@@ -146,7 +146,7 @@ def pose_error(
 
 
 def position_error(
-    points: Float[np.ndarray, "n d"], true_points: Float[np.ndarray, "n d"]
+    points: Float[np.ndarray, "n _"], true_points: Float[np.ndarray, "n _"]
 ) -> Float[np.ndarray, " n"]:
     r"""Distances between estimated and true positions.
 

@@ -103,9 +103,7 @@ def _drive(
     return path
 
 
-def _distance(
-    points: Float[np.ndarray, "n 2"], place: Float[np.ndarray, "2"]
-) -> float:
+def _distance(points: Float[np.ndarray, "n 2"], place: Float[np.ndarray, "2"]) -> float:
     """Distance of the nearest of the points; infinite where there is none."""
     offset = points - place
     return math.sqrt(np.min(np.sum(offset * offset, axis=1), initial=math.inf))

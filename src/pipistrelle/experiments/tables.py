@@ -22,6 +22,7 @@ LabelledPoints = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]
 """Labels and positions [m] of landmarks."""
 
 
+@np.errstate(invalid="ignore")
 def tum_text(time: Float[np.ndarray, " k"], path: Float[np.ndarray, "k 3"]) -> str:
     r"""Write a path as lines of time, x, y, z and a unit quaternion, the TUM format.
 

@@ -5,39 +5,52 @@ once, and on it, picture by picture, what does: the beam, the bearings of the fr
 measurements, rays being born and thinned out, landmarks as they turn full, the path so far.
 """
 
-import shutil
-import subprocess
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
-from pipistrelle.config import InputError
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.models import Gaussian, Landmarks
 from pipistrelle.experiments.results import LabelledPoints, TimedPath
+from pipistrelle.figures.film import film_writer
 from pipistrelle.figures.maps import (
     PLACED,
     RAY,
     beam,
     draw_truth,
     ellipses,
+    head,
+    legend,
     placed,
     shades,
-    span,
     vehicle,
+    view,
 )
-from pipistrelle.figures.style import INK, STYLE, TRUTH, strategy_colour
+from pipistrelle.figures.style import COLUMNS, INK, STYLE, TRUTH, strategy_colour
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.text import Annotation
 
-RATE = 12.5
-"""Pictures per second: a GIF counts in hundredths of a second."""
+WIDTH, LEFT, RIGHT, TOP, BOTTOM, GAP, LINE = 3.66, 0.58, 0.12, 0.58, 0.54, 0.16, 0.19
+"""Of a panel; margins, the space between panels and a line of the legend [inch]."""
+DPI = 100
+"""Pixels per inch."""
+SYMBOLS = (
+    "range and bearing",
+    "bearing alone",
+    "ray, 1σ, darker: likelier",
+    "just pruned",
+    "placed landmark, 95 %",
+    "beacon",
+)
+"""The legend."""
 FLASH = 4
 """Pictures during which a landmark that has turned full is ringed."""
 
@@ -99,6 +112,7 @@ class MissionRecorder:
         self.snapshots: dict[tuple[str, str], list[Snapshot]] = {}
 
     def __call__(self, strategy: str, estimator: str, scan: Scan, belief: Belief) -> None:
+        """Keep a snapshot."""
         snapshot = Snapshot(scan=scan, pose=belief.pose().mean, landmarks=belief.landmarks())
         self.snapshots.setdefault((strategy, estimator), []).append(snapshot)
 
@@ -153,9 +167,201 @@ def animate_mission(
     """
     import matplotlib
 
-    write = _writer(path)
+    write = film_writer(path)
     if not any(snapshots.values()):
         raise ValueError("an animation needs at least one frame")
     with matplotlib.rc_context(STYLE):
         figure, panels = _stage(snapshots, true_path, true_landmarks, beacon, beamwidth)
         write(_play(figure, panels, _times(snapshots, pictures)), path)
+
+
+def _times(
+    snapshots: Mapping[tuple[str, str], Sequence[Snapshot]], pictures: int
+) -> Float[np.ndarray, " p"]:
+    """Choose the frames to show from the longest recording, evenly, the last one included."""
+    frames = max(snapshots.values(), key=len)
+    chosen = np.linspace(len(frames) - 1, 0, min(pictures, len(frames))).round().astype(int)[::-1]
+    return np.array([frames[i].scan.time for i in chosen])
+
+
+def _stage(
+    snapshots: Mapping[tuple[str, str], Sequence[Snapshot]],
+    true_path: TimedPath | None,
+    true_landmarks: LabelledPoints | None,
+    beacon: Float[np.ndarray, "2"] | None,
+    beamwidth: float | None,
+) -> tuple["Figure", list["_Panel"]]:
+    """Draw what never moves and set up what does."""
+    from matplotlib.figure import Figure
+
+    paths = [np.array([frame.pose for frame in frames]) for frames in snapshots.values()]
+    maps = [frames[-1].landmarks for frames in snapshots.values()]
+    limits = view(true_path, true_landmarks, beacon, paths, maps)
+    (left, right), (bottom, top) = limits
+    columns, rows = min(len(snapshots), COLUMNS), -(-len(snapshots) // COLUMNS)
+    foot = LINE * -(-len(SYMBOLS) // (2 * columns))
+    high = TOP + WIDTH * (top - bottom) / (right - left) + BOTTOM
+    size = np.array([LEFT + RIGHT + columns * (WIDTH + GAP) - GAP, rows * high + foot])
+    width, height = 2.0 * np.ceil(size * DPI / 2.0) / DPI
+    figure = Figure(figsize=(width, height), dpi=DPI)
+    several_filters, panels = len({estimator for _, estimator in snapshots}) > 1, []
+    for i, ((strategy, estimator), frames) in enumerate(snapshots.items()):
+        row, column = divmod(i, columns)
+        x, y = LEFT + column * (WIDTH + GAP), height - (row + 1) * high + BOTTOM
+        box = (x / width, y / height, WIDTH / width, (high - TOP - BOTTOM) / height)
+        axes = figure.add_axes(box)
+        axes.set(xlim=limits[0], ylim=limits[1], aspect="equal", xlabel="x [m]")
+        axes.set_ylabel("" if column else "y [m]")
+        axes.tick_params(labelleft=column == 0)
+        axes.grid(True)
+        axes.set_axisbelow(True)
+        draw_truth(axes, true_landmarks, beacon)
+        line = head(axes, strategy, estimator if several_filters else None)
+        panels.append(_Panel(axes, line, frames, strategy, true_path, beamwidth))
+    names = [name for name in SYMBOLS if name != "beacon" or beacon is not None]
+    legend(figure, names, 2 * columns, LEFT, RIGHT)
+    return figure, panels
+
+
+def _play(
+    figure: "Figure", panels: Sequence["_Panel"], times: Float[np.ndarray, " p"]
+) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    """Yield the pictures: the background is drawn once, what moves on a copy of it."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas = FigureCanvasAgg(figure)
+    place = (1.0 - RIGHT / figure.get_figwidth(), 1.0 - 0.14 / figure.get_figheight())
+    clock = figure.text(*place, "", ha="right", va="top", fontsize=12, animated=True)
+    canvas.draw()
+    background = canvas.copy_from_bbox(figure.bbox)
+    for picture, time in enumerate(times):
+        canvas.restore_region(background)
+        for panel in panels:
+            panel.show(time, picture)
+        clock.set_text(f"{time:.1f} s")
+        figure.draw_artist(clock)
+        yield np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
+
+
+class _Panel:
+    """The things that move on one map, and what has to be remembered of them."""
+
+    def __init__(
+        self,
+        axes: "Axes",
+        line: "Annotation",
+        frames: Sequence[Snapshot],
+        strategy: str,
+        true_path: TimedPath | None,
+        beamwidth: float | None,
+    ) -> None:
+        self.axes, self.line, self.frames, self.true_path = axes, line, frames, true_path
+        self.times = np.array([frame.scan.time for frame in frames])
+        self.path = np.array([frame.pose for frame in frames])
+        self.size = axes.get_xlim()[1] - axes.get_xlim()[0]
+        self.colour = strategy_colour(strategy)
+        self.beamwidth = None if strategy == "passive" else beamwidth
+        self.rows, self.turned_full = frames[0].landmarks, {}
+        self.artists: list[Artist] = []
+        self._add_artists()
+
+    def _add_artists(self) -> None:
+        """Add every artist, empty; in the order in which they are drawn."""
+        from matplotlib.collections import LineCollection, PolyCollection
+        from matplotlib.lines import Line2D
+
+        def keep(artist: Any) -> Any:
+            artist.set_animated(True)
+            self.artists.append(artist)
+            return artist
+
+        def areas(**style: Any) -> PolyCollection:
+            return keep(self.axes.add_collection(PolyCollection([], **style)))
+
+        def lines(**style: Any) -> LineCollection:
+            return keep(self.axes.add_collection(LineCollection([], **style)))
+
+        def points(*form: str, **style: Any) -> Line2D:
+            return keep(self.axes.plot([], [], *form, **style)[0])
+
+        colour = self.colour
+        self.beam = areas(fc=INK, alpha=0.13, lw=0)
+        self.members = areas(ec="none")
+        self.pruned = areas(fc="none", ec=INK, lw=0.8, ls=":")
+        self.true = points(color=TRUTH, lw=3.2, alpha=0.45)
+        self.bearings = lines(colors=colour, lw=0.7, ls=(0, (4, 3)), alpha=0.6)
+        self.ranges = lines(colors=colour, lw=1.4)
+        self.full = areas(fc=shades(colour, np.full(1, 0.2)), ec=colour, lw=0.8)
+        self.dots = points("o", ms=2.6, mfc=colour, mec="none")
+        self.rings = areas(fc="none", lw=1.6)
+        self.estimated = points(color=colour, lw=1.2)
+        self.vehicle = areas(fc=INK, ec="white", lw=0.8)
+        keep(self.line)
+
+    def show(self, time: float, picture: int) -> None:
+        """Set every artist to the latest frame at a time and draw it."""
+        now = max(int(np.searchsorted(self.times, time, side="right")) - 1, 0)
+        frame = self.frames[now]
+        self._show_vehicle(frame.pose, time, now)
+        self._show_scan(frame)
+        self._show_map(frame.landmarks, picture)
+        for artist in self.artists:
+            self.axes.draw_artist(artist)
+
+    def _show_vehicle(self, pose: Float[np.ndarray, "3"], time: float, now: int) -> None:
+        """Move the vehicle, its beam and both paths."""
+        self.estimated.set_data(*self.path[: now + 1, :2].T)
+        self.vehicle.set_verts([vehicle(pose, 0.055 * self.size)])
+        if self.beamwidth is not None:
+            self.beam.set_verts([beam(pose, self.beamwidth, 0.25 * self.size)])
+        if self.true_path is not None:
+            past = self.true_path[0] <= time + 1e-9
+            self.true.set_data(*self.true_path[1][past, :2].T)
+
+    def _show_scan(self, frame: Snapshot) -> None:
+        """Point to what was heard: as far as its range, or out of the map without one."""
+        scan, origin = frame.scan, frame.pose[:2]
+        angle, ranged = frame.pose[2] + scan.bearing, np.isfinite(scan.range)
+        reach = np.where(ranged, scan.range, self.size)
+        tip = origin + reach[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+        self.ranges.set_segments([np.stack([origin, end]) for end in tip[ranged]])
+        self.bearings.set_segments([np.stack([origin, end]) for end in tip[~ranged]])
+
+    def _show_map(self, rows: Landmarks, picture: int) -> None:
+        """Show rays, what was pruned from them since the last picture, and full landmarks."""
+        full = placed(rows)
+        self.members.set(
+            verts=ellipses(rows.mean[~full], rows.covariance[~full], RAY),
+            facecolor=shades(self.colour, rows.weight[~full]),
+        )
+        self.full.set(verts=ellipses(rows.mean[full], rows.covariance[full], PLACED))
+        self.dots.set_data(*rows.mean[full].T)
+        gone = _pruned(self.rows, rows)
+        outlines = ellipses(self.rows.mean[gone], self.rows.covariance[gone], RAY)
+        self.pruned.set(verts=outlines)
+        age = np.array(
+            [
+                picture - self.turned_full.setdefault(i, picture)
+                for i in rows.landmark[full].tolist()
+            ]
+        )
+        young = age < FLASH
+        radius = 0.016 * self.size * (1.0 + 0.6 * age[young])
+        circles = radius[:, None, None] ** 2 * np.eye(2)
+        self.rings.set(
+            verts=ellipses(rows.mean[full][young], circles, RAY),
+            edgecolor=shades(self.colour, 1.0 - age[young] / FLASH, most=1.0),
+        )
+        rays = len(np.unique(rows.landmark[~full]))
+        self.line.set_text(f"{np.sum(full)} placed · {rays} unresolved")
+        self.rows = rows
+
+
+def _pruned(before: Landmarks, after: Landmarks) -> Bool[np.ndarray, " h"]:
+    """Tell which rows of a map have no successor: none of the same landmark is nearest to them."""
+    gone = np.ones(len(before.landmark), dtype=bool)
+    if len(gone):
+        away = np.linalg.norm(before.mean[:, None] - after.mean, axis=2)
+        away[before.landmark[:, None] != after.landmark] = np.inf
+        gone[np.argmin(away, axis=0)[np.isfinite(away.min(axis=0))]] = False
+    return gone

@@ -1,16 +1,20 @@
 """The pieces of a map: uncertainty ellipses, the beam, the vehicle, the true world around them."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from pipistrelle.estimation.models import Landmarks
-from pipistrelle.experiments.results import LabelledPoints
-from pipistrelle.figures.style import INK, TRUTH
+from pipistrelle.experiments.results import LabelledPoints, TimedPath
+from pipistrelle.figures.style import INK, TRUTH, strategy_colour
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.text import Annotation
 
 PLACED = 0.95
 """Probability inside the ellipse of a landmark that is fully initialised."""
@@ -58,9 +62,7 @@ def ellipses(
     return mean[:, None, :] + np.swapaxes(root @ circle, 1, 2)
 
 
-def beam(
-    pose: Float[np.ndarray, "3"], beamwidth: float, length: float
-) -> Float[np.ndarray, "n 2"]:
+def beam(pose: Float[np.ndarray, "3"], beamwidth: float, length: float) -> Float[np.ndarray, "n 2"]:
     """Outline of the sector that the vehicle's call lights up, half the beamwidth to each side.
 
     Parameters
@@ -164,26 +166,42 @@ def shades(
     return rgba
 
 
-def span(points: Float[np.ndarray, "n 2"]) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Limits of a map that shows all points with a margin, at most twice as wide as high.
+def view(
+    true_path: TimedPath | None,
+    true_landmarks: LabelledPoints | None,
+    beacon: Float[np.ndarray, "2"] | None,
+    paths: Sequence[Float[np.ndarray, "k 3"]],
+    maps: Sequence[Landmarks],
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Limits of a map that shows what is true and, where the truth is not known, what is estimated.
 
     Parameters
     ----------
-    points : (n, 2) [m]
-        Rows that are not finite do not count.
+    true_path : times (k) [s] and poses (k, 3) [m, m, rad], or None
+    true_landmarks : labels (n) and positions (n, 2) [m], or None
+    beacon : (2) [m], or None
+    paths : estimated poses (k, 3) [m, m, rad]
+    maps : Landmarks
+        Only fully initialised ones count.
 
     Returns
     -------
     (left, right), (bottom, top) [m]
+        At most twice as wide as high, at most 1.2 times as high as wide.
 
     Examples
     --------
-    >>> span(np.array([[0.0, 0.0], [10.0, 10.0]]))
-    ((-0.6, 10.6), (-0.6, 10.6))
+    >>> view(None, None, np.ones(2), [np.array([[0.0, 9.0, 0.0], [10.0, 0.0, 0.0]])], [])
+    ((-0.6, 10.6), (-0.54, 9.54))
     """
-    points = points[np.isfinite(points).all(axis=1)]
-    points = points if len(points) else np.zeros((1, 2))
-    low, high = points.min(axis=0), points.max(axis=0)
+    points = paths if true_path is None else [true_path[1]]
+    marks = [rows.mean[placed(rows)] for rows in maps]
+    marks = marks if true_landmarks is None else [true_landmarks[1]]
+    marks += [] if beacon is None else [beacon[None]]
+    shown = np.concatenate([*(poses[:, :2] for poses in points), *marks])
+    shown = shown[np.isfinite(shown).all(axis=1)]
+    shown = shown if len(shown) else np.zeros((1, 2))
+    low, high = shown.min(axis=0), shown.max(axis=0)
     centre, half = (low + high) / 2.0, np.maximum((high - low) / 2.0, 0.5)
     half = 1.12 * np.maximum(half, half[::-1] / np.array([1.2, 2.0]))
     (left, bottom), (right, top) = (centre - half).tolist(), (centre + half).tolist()
@@ -217,3 +235,99 @@ def draw_truth(
         axes.plot(x, y, "o", ms=5.0, mfc="none", mec=TRUTH, mew=0.8, zorder=3)
     if beacon is not None:
         axes.plot(*beacon, "*", ms=12, mfc=INK, mec="white", mew=0.8, zorder=3.5)
+
+
+def head(axes: "Axes", strategy: str, estimator: str | None = None) -> "Annotation":
+    """Write a panel's name above it, and leave a line below the name for what is to be said.
+
+    Parameters
+    ----------
+    axes : Axes
+    strategy : str
+    estimator : str, optional
+        The filter's name, where there are several.
+
+    Returns
+    -------
+    Annotation
+        The line below, still empty.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> head(Figure().add_subplot(), "fused").get_text()
+    ''
+    """
+    name = strategy if estimator is None else f"{strategy} · {estimator}"
+    place = {"xy": (0, 1), "xycoords": "axes fraction", "textcoords": "offset points"}
+    colour = strategy_colour(strategy)
+    axes.annotate(name, xytext=(0, 21), color=colour, fontsize=13, weight="bold", **place)
+    return axes.annotate("", xytext=(0, 7), fontsize=9.5, **place)
+
+
+def legend(figure: "Figure", names: Iterable[str], columns: int, left: float, right: float) -> None:
+    """Explain symbols once for all panels, in neutral ink, at the bottom of a figure.
+
+    Parameters
+    ----------
+    figure : Figure
+    names : iterable of str
+        As they are to be read.
+    columns : int
+    left, right : [inch]
+        Margins.
+
+    Raises
+    ------
+    KeyError
+        A name without a symbol.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> figure = Figure()
+    >>> legend(figure, ["true path", "beacon"], 2, 0.1, 0.1)
+    >>> [text.get_text() for text in figure.legends[0].texts]
+    ['true path', 'beacon']
+    """
+    width, height = figure.get_size_inches()
+    symbols = _symbols()
+    figure.legend(
+        handles=[symbols[name] for name in names],
+        labels=list(names),
+        loc="lower left",
+        bbox_to_anchor=(left / width, 0.07 / height, 1.0 - (left + right) / width, 0.0),
+        mode="expand",
+        ncols=columns,
+        borderaxespad=0.0,
+        borderpad=0.0,
+    )
+
+
+def _symbols() -> dict[str, "Artist"]:
+    """Return what each name in a legend stands for."""
+    from matplotlib.lines import Line2D
+    from matplotlib.path import Path
+
+    def line(colour: str = INK, **style: Any) -> Line2D:
+        return Line2D([], [], color=colour, **style)
+
+    def mark(marker: Any, size: float, face: str, edge: str = "none", **style: Any) -> Line2D:
+        return Line2D([], [], lw=0, marker=marker, ms=size, mfc=face, mec=edge, **style)
+
+    dart, sector = Path(vehicle(np.zeros(3), 1.0)), Path(beam(np.array([-0.5, 0, 0]), 0.8, 1.0))
+    member = Path(ellipses(np.zeros((1, 2)), np.array([[[1.0, 0.4], [0.4, 0.4]]]), RAY)[0])
+    return {
+        "true path": line(TRUTH, lw=3.2, alpha=0.45),
+        "estimated path": line(lw=1.2),
+        "true landmark": mark("o", 5.0, "none", TRUTH),
+        "placed landmark, 95 %": mark("o", 7.5, "#33333330", INK),
+        "unresolved ray, 1σ, darker: likelier": mark(member, 14.0, "#33333350"),
+        "beacon": mark("*", 11.0, INK, "white"),
+        "vehicle at the end": mark(dart, 10.0, INK),
+        "its beam": mark(sector, 14.0, "#33333338"),
+        "range and bearing": line(lw=1.4),
+        "bearing alone": line(lw=0.7, ls=(0, (4, 3))),
+        "ray, 1σ, darker: likelier": mark(member, 14.0, "#33333350"),
+        "just pruned": line(lw=1.0, ls=":"),
+    }

@@ -14,24 +14,36 @@ from pipistrelle.figures.maps import (
     beam,
     draw_truth,
     ellipses,
+    head,
+    legend,
     placed,
     shades,
-    span,
     vehicle,
+    view,
 )
-from pipistrelle.figures.style import INK, STYLE, TRUTH, strategy_colour
+from pipistrelle.figures.style import COLUMNS, INK, STYLE, TRUTH, strategy_colour
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLUMNS = 3
-"""Most panels beside each other; further ones start a new row."""
 LEFT, RIGHT, TOP, GAP, LEGEND = 0.76, 0.16, 0.58, 0.2, 0.56
 """Margins, the space between panels and the height of two rows of legend [inch]."""
 ERRORS = (0.95, 0.95, 0.7)
 """Heights of the error rows: position, heading, NEES [inch]."""
+LABELS = ("y [m]", "position error\nand 3σ [m]", "heading error\nand 3σ [°]", "NEES\nand 95 %")
+"""Of the rows' vertical axes."""
+SYMBOLS = (
+    ("true path", 0),
+    ("estimated path", None),
+    ("true landmark", 1),
+    ("placed landmark, 95 %", None),
+    ("unresolved ray, 1σ, darker: likelier", None),
+    ("beacon", 2),
+    ("vehicle at the end", None),
+    ("its beam", 3),
+)
+"""The legend, and which of true path, true landmarks, beacon and beamwidth an entry needs."""
 
 
 def draw_mission(
@@ -87,7 +99,9 @@ def draw_mission(
 
     if not trials:
         raise ValueError("a mission's figure needs at least one trial")
-    limits = _limits(trials, true_path, true_landmarks, beacon)
+    paths = [trial.track.pose.mean for trial in trials]
+    maps = [trial.track.landmarks for trial in trials]
+    limits = view(true_path, true_landmarks, beacon, paths, maps)
     with matplotlib.rc_context(STYLE):
         figure, panels = _panels(len(trials), limits, errors=true_path is not None)
         filters = {trial.filter for trial in trials}
@@ -101,27 +115,10 @@ def draw_mission(
             _title(axes, trial, several_filters=len(filters) > 1)
         if true_path is not None:
             _scale_errors([rows for _, *rows in panels])
-        handles = _legend(true_path, true_landmarks, beacon, beamwidth)
-        _place_legend(figure, handles)
+        given = (true_path, true_landmarks, beacon, beamwidth)
+        names = [name for name, of in SYMBOLS if of is None or given[of] is not None]
+        legend(figure, names, 4 if figure.get_figwidth() > 8.0 else 2, LEFT, RIGHT)
     return figure
-
-
-def _limits(
-    trials: Sequence[TrialResult],
-    true_path: TimedPath | None,
-    true_landmarks: LabelledPoints | None,
-    beacon: np.ndarray | None,
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return limits that show the truth; where there is none, the estimates."""
-    points = [] if true_path is None else [true_path[1][:, :2]]
-    if true_landmarks is None or true_path is None:
-        points += [trial.track.pose.mean[:, :2] for trial in trials]
-    if true_landmarks is None:
-        maps = [heaviest(trial.track.landmarks) for trial in trials]
-        points += [estimate.mean[estimate.full] for estimate in maps]
-    else:
-        points.append(true_landmarks[1])
-    return span(np.concatenate(points if beacon is None else [*points, beacon[None]]))
 
 
 def _panels(
@@ -152,7 +149,12 @@ def _panels(
         panel[0].set(xlim=limits[0], ylim=limits[1], xlabel="x [m]", aspect="equal")
         panels.append(panel)
     for panel in panels[::columns]:
-        labels = ("y [m]", "position error\nand 3σ [m]", "heading error\nand 3σ [°]", "NEES\nand 95 %")
+        labels = (
+            "y [m]",
+            "position error\nand 3σ [m]",
+            "heading error\nand 3σ [°]",
+            "NEES\nand 95 %",
+        )
         for axes, label in zip(panel, labels, strict=False):
             axes.set_ylabel(label, multialignment="center")
             axes.yaxis.set_label_coords(-0.42 / width, 0.5)
@@ -175,9 +177,7 @@ def _axes(
     return axes
 
 
-def _draw_estimate(
-    axes: "Axes", trial: TrialResult, true_landmarks: LabelledPoints | None
-) -> None:
+def _draw_estimate(axes: "Axes", trial: TrialResult, true_landmarks: LabelledPoints | None) -> None:
     """Draw the estimated path and the map as it stands at the end."""
     from matplotlib.collections import LineCollection, PolyCollection
 
@@ -187,13 +187,13 @@ def _draw_estimate(
     x, y = rows.mean[full].T
     axes.plot(x, y, "o", ms=2.6, mfc=colour, mec="none", zorder=5)
     outline = ellipses(rows.mean[full], rows.covariance[full], PLACED)
-    face, edge = shades(colour, np.full(len(outline), 0.2)), colour
-    axes.add_collection(PolyCollection(outline, facecolors=face, edgecolors=edge, lw=0.8, zorder=4))
+    style = {"fc": shades(colour, np.full(len(outline), 0.2)), "ec": colour, "lw": 0.8}
+    axes.add_collection(PolyCollection(list(outline), **style, zorder=4))
     ties = _ties(trial, true_landmarks)
     axes.add_collection(LineCollection(ties, colors=INK, lw=0.7, zorder=4.5))
     outline = ellipses(rows.mean[~full], rows.covariance[~full], RAY)
-    face = shades(colour, rows.weight[~full])
-    axes.add_collection(PolyCollection(outline, facecolors=face, edgecolors="none", zorder=1))
+    style = {"fc": shades(colour, rows.weight[~full]), "ec": "none"}
+    axes.add_collection(PolyCollection(list(outline), **style, zorder=1))
     labels = np.unique(rows.landmark[~full])
     rays = [rows.mean[rows.landmark == label] for label in labels]
     axes.add_collection(LineCollection(rays, colors=colour, lw=0.6, alpha=0.45, zorder=1.5))
@@ -232,16 +232,13 @@ def _draw_vehicle(axes: "Axes", trial: TrialResult, beamwidth: float | None) -> 
 def _title(axes: "Axes", trial: TrialResult, *, several_filters: bool) -> None:
     """Say what the panel is and what came out."""
     scores = trial.scores
-    name = f"{trial.strategy} · {trial.filter}" if several_filters else trial.strategy
     parts = [f"{scores.landmarks_full} of {scores.landmarks_total} landmarks placed"]
-    if scores.position_rmse_m is not None:
-        parts.insert(0, f"{scores.position_rmse_m:.2f} m")
+    if (rmse := scores.position_rmse_m) is not None:
+        parts.insert(0, f"RMSE {rmse:.2f} m" if rmse < 100.0 else f"RMSE {rmse:.3g} m")
     if scores.diverged:
-        parts.append("diverged")
-    style = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "baseline"}
-    colour = strategy_colour(trial.strategy)
-    axes.annotate(name, (0, 1), (0, 21), color=colour, fontsize=13, weight="bold", **style)
-    axes.annotate(" · ".join(parts), (0, 1), (0, 7), fontsize=9.5, **style)
+        parts = ["diverged", *parts[:-1]]
+    line = head(axes, trial.strategy, trial.filter if several_filters else None)
+    line.set_text(" · ".join(parts))
 
 
 def _draw_errors(rows: Sequence["Axes"], trial: TrialResult, true_path: np.ndarray) -> None:
@@ -266,59 +263,19 @@ def _draw_errors(rows: Sequence["Axes"], trial: TrialResult, true_path: np.ndarr
 
 
 def _scale_errors(panels: Sequence[Sequence["Axes"]]) -> None:
-    """Scale the error rows, common to all panels, to their lines; a bound far above is cut."""
+    """Scale the error rows, common to all panels; a bound far above the errors is cut."""
     from matplotlib.ticker import LogLocator
 
-    def largest(row: int) -> float:
-        values = np.concatenate([panel[row].lines[0].get_ydata() for panel in panels])
-        return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
+    def highest(row: int) -> float:
+        errors = np.concatenate([np.abs(panel[row].lines[0].get_ydata()) for panel in panels])
+        error = errors[np.isfinite(errors)].max(initial=1e-3)
+        bound = max(panel[row].dataLim.ymax for panel in panels)
+        return float(np.clip(1.05 * bound, 1.2 * error, 3.0 * error))
 
-    panels[0][0].set_ylim(0.0, max(1.6 * largest(0), 1e-3))
-    heading = max(1.6 * largest(1), 1e-3)
-    panels[0][1].set_ylim(-heading, heading)
-    panels[0][2].set_ylim(0.05, max(100.0, 2.0 * largest(2)))
-    panels[0][2].yaxis.set_major_locator(LogLocator(subs=(1.0,), numticks=5))
-    panels[0][2].yaxis.set_major_formatter("{x:g}")
-
-
-def _legend(
-    true_path: TimedPath | None,
-    true_landmarks: LabelledPoints | None,
-    beacon: np.ndarray | None,
-    beamwidth: float | None,
-) -> list["Artist"]:
-    """Return one entry for each kind of thing on the maps, in neutral ink."""
-    from matplotlib.lines import Line2D
-    from matplotlib.path import Path
-
-    def mark(label: str, marker: object, size: float, face: str, edge: str) -> Line2D:
-        return Line2D([], [], label=label, marker=marker, ms=size, mfc=face, mec=edge, lw=0)
-
-    dart, sector = Path(vehicle(np.zeros(3), 1.0)), Path(beam(np.array([-0.5, 0, 0]), 0.8, 1.0))
-    member = Path(ellipses(np.zeros((1, 2)), np.array([[[1.0, 0.4], [0.4, 0.4]]]), RAY)[0])
-    entries: list[tuple[object, Artist]] = [
-        (true_path, Line2D([], [], color=TRUTH, lw=3.2, alpha=0.45, label="true path")),
-        (True, Line2D([], [], color=INK, lw=1.2, label="estimated path")),
-        (true_landmarks, mark("true landmark", "o", 5.0, "none", TRUTH)),
-        (True, mark("placed landmark, 95 %", "o", 7.5, "#33333330", INK)),
-        (True, mark("unresolved ray, 1σ, darker: likelier", member, 14.0, "#33333350", "none")),
-        (beacon, mark("beacon", "*", 11.0, INK, "white")),
-        (True, mark("vehicle at the end", dart, 10.0, INK, "none")),
-        (beamwidth, mark("its beam", sector, 14.0, "#33333338", "none")),
-    ]
-    return [artist for shown, artist in entries if shown is not None]
-
-
-def _place_legend(figure: "Figure", handles: list["Artist"]) -> None:
-    """Set the legend under the panels, from their left edge on."""
-    width, height = figure.get_size_inches()
-    columns = 4 if width > 8.0 else 2
-    figure.legend(
-        handles=handles,
-        loc="lower left",
-        bbox_to_anchor=(LEFT / width, 0.06 / height, 1.0 - (LEFT + RIGHT) / width, 0.0),
-        mode="expand",
-        ncols=columns,
-        borderaxespad=0.0,
-        borderpad=0.0,
-    )
+    position, heading, consistency = panels[0]
+    position.set_ylim(0.0, highest(0))
+    heading.set_ylim(-highest(1), highest(1))
+    largest = max(panel[2].dataLim.ymax for panel in panels)
+    consistency.set_ylim(0.05, max(100.0, 2.0 * largest))
+    consistency.yaxis.set_major_locator(LogLocator(subs=(1.0,), numticks=5))
+    consistency.yaxis.set_major_formatter("{x:g}")

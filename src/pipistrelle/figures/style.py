@@ -12,6 +12,8 @@ INK = "#333333"
 """Text, the beacon, and any strategy without a colour of its own."""
 TRUTH = "#8a8a8a"
 """What is true: the path and the landmarks."""
+COLUMNS = 3
+"""Most panels beside each other; further ones start a new row."""
 
 STYLE = {
     "font.family": "DejaVu Sans",

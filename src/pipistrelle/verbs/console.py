@@ -1,17 +1,15 @@
 """What a person reads while a verb works and when it is done; results go to standard output."""
 
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from threading import Timer
 from time import perf_counter
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pipistrelle.experiments.results import Scores, TrialResult
-
-Progress = Callable[[str, int, int], None]
-"""Called with a stage's name, the frames done and their number."""
+    from pipistrelle.experiments.trial import Progress
 
 
 def say(message: str) -> None:
@@ -53,7 +51,7 @@ def announced(message: str, after: float = 1.0) -> Iterator[None]:
 
 
 @contextmanager
-def progress(quiet: bool) -> Iterator[Progress]:
+def progress(quiet: bool) -> "Iterator[Progress]":
     """Show one line per stage, with its frames per second.
 
     On a terminal the line moves; elsewhere it is printed when the stage is done.
@@ -81,7 +79,7 @@ def progress(quiet: bool) -> Iterator[Progress]:
         yield _lines()
 
 
-def _lines() -> Progress:
+def _lines() -> "Progress":
     """Print a stage when it is done."""
     started: dict[str, float] = {}
 
@@ -94,7 +92,7 @@ def _lines() -> Progress:
 
 
 @contextmanager
-def _bars() -> Iterator[Progress]:
+def _bars() -> "Iterator[Progress]":
     """Draw a moving bar per stage."""
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn
@@ -157,11 +155,11 @@ def closing_table(trials: "Sequence[TrialResult]", aligned: bool) -> str:
         ("diverged", lambda s: "yes" if s.diverged else ""),
     ]
     names = [f"{trial.strategy} {trial.filter}" for trial in trials]
-    lines = [(" " * 30, *names)]
+    lines = [["", *names]]
     for title, cell in rows:
         cells = [cell(trial.scores) for trial in trials]
         if any(cells):
-            lines.append((title, *(text or "-" for text in cells)))
+            lines.append([title, *(text or "-" for text in cells)])
     return "\n".join(f"{line[0]:<30}" + "".join(f"{c:>16}" for c in line[1:]) for line in lines)
 
 

@@ -1,7 +1,7 @@
 """Options that verbs share: every setting as a flag, and the short names of a mission."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import radians
 from pathlib import Path
@@ -23,7 +23,17 @@ from pipistrelle.settings import (
 
 Chosen = Literal["active", "fused", "passive", "all"]
 Filter = Literal["ekf"]
-Format = Literal["gif", "mp4"]
+
+
+def _whole(_: Any, tokens: Sequence[Any]) -> int:
+    """Read a whole number; the command line's own reader rounds 2.5 off."""
+    try:
+        return int(tokens[0].value)
+    except ValueError:
+        raise ValueError(f"found {tokens[0].value!r}, expected a whole number") from None
+
+
+Whole = Annotated[int, Parameter(converter=_whole)]
 
 
 def setting_flags(shown: Callable[[Key], bool] = lambda _: True) -> Any:
@@ -49,17 +59,16 @@ def setting_flags(shown: Callable[[Key], bool] = lambda _: True) -> Any:
     for key, field in known_settings().items():
         default = field.default if isinstance(field.default, tuple) else (field.default,)
         words = f"{field.description or ''} [default: {' '.join(map(str, default))}]"
-        parameter = Parameter(
-            help=" ".join(words.split()),
-            show=shown(key),
-            negative=(),
-            converter=whole if field.annotation is int else None,
-            **({"group": _section_group(key[0])} if len(key) > 1 else {}),
-        )
-        table = sections.setdefault(key[0], {}) if len(key) > 1 else top
-        table[key[-1]] = Annotated[field.annotation, parameter]
-    nested = {name: TypedDict(name, table, total=False) for name, table in sections.items()}
-    return TypedDict("Settings", top | nested, total=False)
+        flag = Parameter(help=" ".join(words.split()), show=shown(key), negative=())
+        kind: Any = Whole if field.annotation is int else field.annotation
+        if len(key) == 1:
+            top[key[0]] = Annotated[kind, flag]
+        else:
+            group = Parameter(group=_section_group(key[0]))
+            sections.setdefault(key[0], {})[key[1]] = Annotated[kind, flag, group]
+    record: Any = TypedDict
+    nested = {name: record(name, table, total=False) for name, table in sections.items()}
+    return record("Settings", top | nested, total=False)
 
 
 def _section_group(section: str) -> Group:
@@ -73,6 +82,30 @@ if TYPE_CHECKING:
     SettingFlags = dict[str, Any]
 else:
     SettingFlags = setting_flags()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutputOptions:
+    """Where the results go, and what else is made of them."""
+
+    output: Annotated[
+        Path | None,
+        Parameter(
+            name=("--output", "-o"),
+            metavar="DIR",
+            help="The result folder itself. [default: runs/TIME-NAME]",
+        ),
+    ] = None
+    overwrite: Annotated[
+        bool, Parameter(negative=(), help="Replace earlier results in DIR. [default: no]")
+    ] = False
+    animate: Annotated[
+        Literal["gif", "mp4"] | None,
+        Parameter(help="Film the mission; gif unless said otherwise. [default: no]"),
+    ] = None
+    quiet: Annotated[
+        bool, Parameter(negative=(), help="Print the result folder alone. [default: no]")
+    ] = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,7 +125,7 @@ class MissionOptions:
         ),
     ] = None
     landmarks: Annotated[
-        int | None,
+        Whole | None,
         Parameter(metavar="N", help="Number of landmarks; sets scenario.landmarks. [default: 50]"),
     ] = None
     duration: Annotated[

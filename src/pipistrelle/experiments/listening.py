@@ -1,0 +1,214 @@
+"""Listening: a path through a world -> what is heard at each frame, by either engine.
+
+The noise and the beacon's sound are those of the world and shared by all beamwidths, drawn once
+and keyed by the frame alone.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from pipistrelle.acoustics.arrivals import (
+    ACTIVE,
+    Arrivals,
+    arrivals_of_emission,
+    rows_of,
+    through_piston,
+)
+from pipistrelle.arrays.layout import Layout, square_of_four
+from pipistrelle.arrays.noise import stream_key
+from pipistrelle.arrays.receiver import (
+    BLOCK,
+    Sampling,
+    add_echo_blocks,
+    blocks_to_hear,
+    noise_blocks,
+    record_samples,
+    sampling,
+)
+from pipistrelle.config import Config
+from pipistrelle.detection.scans import Heard, average_faces
+from pipistrelle.detection.snapshots import (
+    Detections,
+    Detector,
+    detect,
+    detector,
+    filter_blocks,
+    filter_samples,
+)
+from pipistrelle.experiments.association import faintest_level_db, label_detections
+from pipistrelle.experiments.scenario import Scenario
+
+Progress = Callable[[str, int, int], None]
+"""Called with a stage's name, the frames done and their number."""
+
+
+def listen(
+    scenario: Scenario,
+    config: Config,
+    radii: Sequence[float],
+    *,
+    iteration: int = 0,
+    progress: Progress | None = None,
+) -> tuple[tuple[Heard, ...], ...]:
+    """Hear every frame of a path, once for all beamwidths.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    config : Config
+    radii : sequence of [m]
+        Radii of the vehicle's piston; ``config.emitter.radius`` is not used.
+    iteration : int
+        Number of the world, part of the noise's key.
+    progress : callable, optional
+
+    Returns
+    -------
+    tuple, one per radius, of tuples of Heard, one per frame
+
+    Raises
+    ------
+    InputError
+        When the sampling does not fit the tones, or points of the world coincide.
+
+    Notes
+    -----
+    Bradley & Abaid, Sec. II.
+
+    Examples
+    --------
+    >>> from pipistrelle.config import ScenarioConfig
+    >>> from pipistrelle.experiments.scenario import draw_scenario
+    >>> config = Config(scenario=ScenarioConfig(steps=8))
+    >>> world = draw_scenario(config, np.random.default_rng(7))
+    >>> wide, narrow = listen(world, config, (0.0025, 0.025))
+    >>> len(wide), wide[1].time
+    (2, 1.0)
+    """
+    layout, settled = square_of_four(config.receiver), sampling(config)
+    finder = detector(config, layout)
+    engine = _dense if config.receiver.engine == "dense" else _blocks
+    beams: tuple[list[Heard], ...] = tuple([] for _ in radii)
+    setup = config.scenario
+    frames = range(setup.steps_per_frame, len(scenario.path), setup.steps_per_frame)
+    for number, k in enumerate(frames, start=1):
+        emission = _emission(scenario, k, config)
+        key = stream_key(config.seed, iteration, "noise", number)
+        recorded = engine(emission, radii, layout, settled, finder, config, key)
+        for beam, (arrivals, detections) in zip(beams, recorded, strict=True):
+            beam.append(
+                _heard(
+                    float(scenario.time[k]), detections, arrivals, layout, settled, finder, config
+                )
+            )
+        if progress:
+            progress("listening", number, len(frames))
+    return tuple(tuple(beam) for beam in beams)
+
+
+def _emission(scenario: Scenario, k: int, config: Config) -> Arrivals:
+    """Return the arrivals of an emission at the end of step k, before the vehicle's beam."""
+    velocity = (scenario.path[k, :2] - scenario.path[k - 1, :2]) / config.scenario.step
+    return arrivals_of_emission(
+        scenario.path[k], velocity, scenario.landmarks, scenario.beacon, config
+    )
+
+
+def _heard(
+    time: float,
+    detections: Detections,
+    arrivals: Arrivals,
+    layout: Layout,
+    settled: Sampling,
+    finder: Detector,
+    config: Config,
+) -> Heard:
+    """Label a frame's detections by the truth and average them over the faces."""
+    faintest_db = faintest_level_db(
+        finder.threshold,
+        elements=layout.position.size,
+        samples=settled.pulse * settled.block,
+        noise_std=settled.noise_std,
+        margin_db=config.association.margin_db,
+    )
+    label = label_detections(
+        detections,
+        arrivals,
+        layout,
+        config.association,
+        pulse=config.emitter.pulse,
+        faintest_db=faintest_db,
+    )
+    return average_faces(
+        time,
+        detections,
+        label,
+        averaging=config.detection.averaging,
+        speed_of_sound=config.air.speed_of_sound,
+    )
+
+
+def _blocks(
+    emission: Arrivals,
+    radii: Sequence[float],
+    layout: Layout,
+    settled: Sampling,
+    finder: Detector,
+    config: Config,
+    key: int,
+) -> Iterator[tuple[Arrivals, Detections]]:
+    """Yield, per beam, the true arrivals and what is detected of them from block sums."""
+    own = emission.source == ACTIVE
+    shared = noise_blocks(blocks_to_hear(emission, settled), layout, settled, key)
+    add_echo_blocks(shared, rows_of(emission, ~own), layout, settled)
+    for radius in radii:
+        arrivals = _aimed(emission, radius, config)
+        signal = shared.copy()
+        add_echo_blocks(signal, rows_of(arrivals, own), layout, settled)
+        matched = filter_blocks(
+            signal, pulse=settled.pulse, block=settled.block, noise_std=settled.noise_std
+        )
+        yield (
+            arrivals,
+            detect(
+                matched, finder, start=settled.pulse * BLOCK, interval=BLOCK, pulse=settled.pulse
+            ),
+        )
+
+
+def _dense(
+    emission: Arrivals,
+    radii: Sequence[float],
+    layout: Layout,
+    settled: Sampling,
+    finder: Detector,
+    config: Config,
+    key: int,
+) -> Iterator[tuple[Arrivals, Detections]]:
+    """Yield the same from every sample."""
+    length = settled.pulse * settled.block
+    for radius in radii:
+        arrivals = _aimed(emission, radius, config)
+        samples = record_samples(
+            blocks_to_hear(emission, settled), arrivals, layout, settled, np.random.default_rng(key)
+        )
+        matched = filter_samples(
+            samples,
+            tones=settled.tones,
+            rate=settled.rate,
+            length=length,
+            noise_std=settled.noise_std,
+        )
+        start, interval = settled.pulse * BLOCK, 1.0 / settled.rate
+        yield arrivals, detect(matched, finder, start=start, interval=interval, pulse=length)
+
+
+def _aimed(emission: Arrivals, radius: float, config: Config) -> Arrivals:
+    """Return the arrivals of an emission through the vehicle's piston."""
+    return through_piston(
+        emission,
+        radius=radius,
+        frequency=config.emitter.frequency,
+        speed_of_sound=config.air.speed_of_sound,
+    )

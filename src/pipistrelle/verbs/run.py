@@ -1,0 +1,134 @@
+"""`pipistrelle run`: one random world, by sound, to a map."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from pipistrelle.config import InputError
+from pipistrelle.verbs.options import (
+    Chosen,
+    Filter,
+    MissionOptions,
+    OutputOptions,
+    mission_config,
+    strategies,
+)
+
+if TYPE_CHECKING:
+    from pipistrelle.detection.logs import Log
+    from pipistrelle.detection.scans import Scan
+    from pipistrelle.experiments.replay import Truth
+    from pipistrelle.experiments.trial import Mission
+
+
+def run(
+    *,
+    strategy: Annotated[Chosen, Parameter(help="What the vehicle listens to.")] = "all",
+    filters: Annotated[Filter, Parameter(name="--filter", help="What draws the map.")] = "ekf",
+    mission: Annotated[MissionOptions | None, Parameter(name="*")] = None,
+    output: Annotated[OutputOptions | None, Parameter(name="*")] = None,
+    save_log: Annotated[
+        Path | None,
+        Parameter(
+            metavar="DIR",
+            help="Write what was heard (of all strategies: fused) as a log for `pipistrelle slam`. "
+            "[default: no]",
+        ),
+    ] = None,
+) -> int:
+    """Drive through one random world and map it, the three strategies side by side."""
+    config, output = mission_config(mission or MissionOptions()), output or OutputOptions()
+    if save_log is not None:
+        _check_vacant(save_log, output)
+    from pipistrelle.experiments.trial import run_mission
+    from pipistrelle.verbs import outcome
+    from pipistrelle.verbs.console import progress
+
+    with outcome.result_folder(output, "run") as folder:
+        outcome.compile_once(output)
+        watch = outcome.recorder(output)
+        with progress(output.quiet) as show:
+            done = run_mission(config, strategies(strategy), (filters,), progress=show, watch=watch)
+        truth = _truth(done)
+        if save_log is not None:
+            heard = {trial.strategy: trial.scans for trial in done.trials}
+            _save_log(save_log, done, heard.get("fused", done.trials[0].scans), truth)
+        return outcome.deliver(
+            folder,
+            done.trials,
+            truth,
+            config=config,
+            seed=config.seed,
+            options=output,
+            beacon=done.scenario.beacon,
+            beamwidth=_beamwidth(done),
+            watch=watch,
+        )
+
+
+def _check_vacant(folder: Path, output: OutputOptions) -> None:
+    """Refuse to write a log over anything else."""
+    if output.output is not None and folder.resolve() == output.output.resolve():
+        raise InputError(f"--save-log: {folder} is the result folder; name another")
+    if folder.exists() and any(folder.iterdir()) and not output.overwrite:
+        raise InputError(f"--save-log: {folder} is not empty; name a new folder or add --overwrite")
+
+
+def _truth(mission: "Mission") -> "Truth":
+    """Return the true path and places; the beacon is the last landmark."""
+    import numpy as np
+
+    from pipistrelle.experiments.replay import Truth
+
+    scenario = mission.scenario
+    places = np.vstack((scenario.landmarks, scenario.beacon))
+    labels = np.arange(1, len(places) + 1)
+    return Truth(time=scenario.time, path=scenario.path, landmarks=(labels, places))
+
+
+def _beamwidth(mission: "Mission") -> float:
+    """Return the half-power beamwidth of the vehicle's call [rad]."""
+    from pipistrelle.acoustics.emitter import beamwidth
+
+    emitter, air = mission.config.emitter, mission.config.air
+    return float(
+        beamwidth(emitter.radius, frequency=emitter.frequency, speed_of_sound=air.speed_of_sound)
+    )
+
+
+def _save_log(folder: Path, mission: "Mission", scans: "Sequence[Scan]", truth: "Truth") -> None:
+    """Write what was heard as a log, and the truth beside it."""
+    from pipistrelle.detection.logs import write_log
+    from pipistrelle.experiments.replay import write_truth
+
+    write_log(folder, _log(mission, scans))
+    write_truth(folder, truth)
+
+
+def _log(mission: "Mission", scans: "Sequence[Scan]") -> "Log":
+    """Return a mission as its recorder would have seen it."""
+    import numpy as np
+
+    from pipistrelle.detection.logs import Log
+
+    config, scenario = mission.config, mission.scenario
+    x, y, heading = scenario.path[0].tolist()
+    return Log(
+        name=f"run-{config.seed}",
+        time=scenario.time,
+        controls=scenario.controls,
+        dt=np.diff(scenario.time),
+        scans=tuple(scans),
+        motion="bicycle",
+        wheelbase=config.motion.wheelbase,
+        control_std=(config.motion.speed_std, config.motion.steering_std),
+        initial_pose=(x, y, heading),
+        initial_pose_std=config.filter.initial_pose_std,
+        range_std=config.filter.range_std,
+        bearing_std=config.filter.bearing_std,
+        range_bounds=config.rays.range_bounds,
+        gate=config.filter.gate,
+        ignored_rows={},
+    )
