@@ -103,17 +103,18 @@ def absorption_db_per_m(
 ) -> Float[np.ndarray, "*n"]:
     r"""Absorption of a pure tone by moist air.
 
-    .. math:: \alpha = 8.686 f^2 \left[ 1.84 \cdot 10^{-11} \frac{\tau^{1/2}}{\pi}
+    .. math:: \alpha = 8.686 f^2 \left[ 1.84 \cdot 10^{-11} \frac{\tau^{1/2}}{p}
               + \tau^{-5/2} \left( 0.01275 e^{-2239.1/T} \frac{f_{rO}}{f_{rO}^2 + f^2}
               + 0.1068 e^{-3352/T} \frac{f_{rN}}{f_{rN}^2 + f^2} \right) \right]
 
-    with :math:`\tau = T / 293.15` K, :math:`\pi = p / 101.325` kPa, and the relaxation frequencies
-    of oxygen and nitrogen
+    with the temperature :math:`\tau = T / 293.15` K and the pressure p in units of 101.325 kPa, the
+    relaxation frequencies of oxygen and nitrogen
 
-    .. math:: f_{rO} = \pi \left( 24 + 4.04 \cdot 10^4 h \frac{0.02 + h}{0.391 + h} \right), \quad
-              f_{rN} = \pi \tau^{-1/2} \left( 9 + 280 h e^{-4.17 (\tau^{-1/3} - 1)} \right)
+    .. math:: f_{rO} = p \left( 24 + 4.04 \cdot 10^4 h \frac{0.02 + h}{0.391 + h} \right), \quad
+              f_{rN} = p \tau^{-1/2} \left( 9 + 280 h e^{-4.17 (\tau^{-1/3} - 1)} \right)
 
-    at the molar concentration of water vapour :math:`h` [%].
+    and the molar concentration of water vapour :math:`h` [%], relative humidity times saturation
+    pressure over p.
 
     Parameters
     ----------
@@ -139,15 +140,15 @@ def absorption_db_per_m(
     array([0.937, 1.133])
     """
     T = temperature_c + 273.15
-    tau, pi = T / 293.15, pressure_kpa / 101.325
+    tau, p = T / 293.15, pressure_kpa / 101.325
     saturation = 10.0 ** (4.6151 - 6.8346 * (273.16 / T) ** 1.261)  # of water vapour [101.325 kPa]
-    h = 100.0 * relative_humidity * saturation / pi
+    h = 100.0 * relative_humidity * saturation / p
     f2 = np.square(frequency)
-    frO = pi * (24.0 + 4.04e4 * h * (0.02 + h) / (0.391 + h))
-    frN = pi * tau**-0.5 * (9.0 + 280.0 * h * np.exp(-4.170 * (tau ** (-1.0 / 3.0) - 1.0)))
+    frO = p * (24.0 + 4.04e4 * h * (0.02 + h) / (0.391 + h))
+    frN = p * tau**-0.5 * (9.0 + 280.0 * h * np.exp(-4.170 * (tau ** (-1.0 / 3.0) - 1.0)))
     oxygen = 0.01275 * np.exp(-2239.1 / T) * frO / (frO**2 + f2)
     nitrogen = 0.1068 * np.exp(-3352.0 / T) * frN / (frN**2 + f2)
-    classical = 1.84e-11 * tau**0.5 / pi
+    classical = 1.84e-11 * tau**0.5 / p
     return np.asarray(8.686 * f2 * (classical + tau**-2.5 * (oxygen + nitrogen)))
 
 

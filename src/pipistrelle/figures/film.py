@@ -146,9 +146,9 @@ def _palette() -> "Image":
 
     white, ink = np.ones(3), np.array(to_rgb(INK))
     inks = [np.array(to_rgb(colour)) for colour in STRATEGY_COLOURS.values()]
-    ramps = [(white, end, 25) for end in (ink, *inks)]
-    ramps += [(start, ink, 16) for colour in inks for start in (colour, (white + colour) / 2.0)]
-    ramps += [(one, other, 16) for one, other in itertools.pairwise(inks)]
+    ramps = [(white, end, 16) for end in (ink, *inks)]
+    ramps += [(colour, ink, 6) for colour in inks]
+    ramps += [(one, other, 6) for one, other in itertools.pairwise(inks)]
     steps = [a + (b - a) * np.linspace(0.0, 1.0, n)[:, None] for a, b, n in ramps]
     colours = np.rint(255.0 * np.concatenate(steps)).astype(np.uint8)
     image = Image.new("P", (1, 1))

@@ -27,7 +27,7 @@ def say(message: str) -> None:
 
 
 @contextmanager
-def announced(message: str, after: float = 1.0) -> Iterator[None]:
+def announced(message: str, after: float = 3.0) -> Iterator[None]:
     """Say what is being waited for, if it takes long.
 
     Parameters

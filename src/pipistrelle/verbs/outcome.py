@@ -152,5 +152,5 @@ def _film(
 
 
 def _waiting(message: str, options: OutputOptions) -> AbstractContextManager[None]:
-    """Say what is being waited for, unless quiet."""
+    """Say what takes long, unless quiet."""
     return contextlib.nullcontext() if options.quiet else announced(message)

@@ -1,0 +1,99 @@
+"""Settings of the documentation; `./dev docs` builds it, warnings as errors."""
+
+import re
+import sys
+from importlib import import_module
+from pkgutil import walk_packages
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+from sphinx_gallery.scrapers import figure_rst
+
+import pipistrelle
+
+mpl.use("Agg")
+
+project = "Pipistrelle"
+author = "The Pipistrelle developers"
+copyright = author
+version = release = pipistrelle.__version__
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.napoleon",
+    "sphinx_gallery.gen_gallery",
+]
+exclude_patterns = ["_build"]
+default_role = "literal"
+myst_enable_extensions = ["dollarmath", "deflist"]
+myst_heading_anchors = 3
+
+html_theme = "furo"
+html_title = f"Pipistrelle {release}"
+html_static_path = ["_static"]
+html_css_files = ["pages.css"]
+html_copy_source = False
+html_show_copyright = False
+
+autodoc_typehints = "none"  # shapes and units stand in the docstrings
+autodoc_member_order = "bysource"
+autodoc_class_signature = "separated"
+autodoc_default_options = {"members": True}
+napoleon_google_docstring = False
+napoleon_use_ivar = True
+napoleon_use_rtype = False
+
+
+def figures_of_block(block, block_vars, gallery_conf):
+    """Keep the figures that a block of an example made without pyplot, as the package does."""
+    paths = []
+    for value in list(block_vars["example_globals"].values()):
+        if isinstance(value, Figure) and not hasattr(value, "shown_in_gallery"):
+            value.shown_in_gallery = True
+            path = next(block_vars["image_path_iterator"])
+            value.savefig(path, dpi=110)
+            paths.append(path)
+    return figure_rst(paths, gallery_conf["src_dir"])
+
+
+sphinx_gallery_conf = {
+    "examples_dirs": "../examples",
+    "gallery_dirs": "gallery",
+    "filename_pattern": r"/\d\d_",
+    "ignore_pattern": r"__init__\.py",
+    "image_scrapers": (figures_of_block,),
+    "download_all_examples": False,
+    "show_memory": False,
+    "show_signature": False,
+    "min_reported_time": 3600,
+    "remove_config_comments": True,
+    "plot_gallery": "True",
+    "abort_on_example_error": True,
+}
+
+
+def show_kernels(app):
+    """Let autodoc see the plain functions under public kernels.
+
+    The gallery has run by now: what follows reads the modules and calls nothing.
+    """
+    for module in walk_packages(pipistrelle.__path__, "pipistrelle."):
+        if not module.name.endswith("__main__"):
+            import_module(module.name)
+    for name, module in list(sys.modules.items()):
+        if name.startswith("pipistrelle"):
+            for key, value in list(vars(module).items()):
+                if hasattr(value, "py_func") and not key.startswith("_"):
+                    setattr(module, key, value.py_func)
+
+
+def escape_shapes(app, what, name, obj, options, lines):
+    """Keep the star of a shape such as (*n) from opening an emphasis."""
+    lines[:] = [re.sub(r"\(\*(?=\w+[,)])", r"(\\*", line) for line in lines]
+
+
+def setup(app):
+    app.connect("builder-inited", show_kernels, priority=900)
+    app.connect("autodoc-process-docstring", escape_shapes, priority=100)

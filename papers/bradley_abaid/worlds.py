@@ -1,0 +1,88 @@
+"""What the settings give over a number of worlds, beside the paper's Table II.
+
+    python papers/bradley_abaid/worlds.py [--worlds 20] [--first-seed 0]
+
+Each world is heard once through the paper's beams of 180, 33 and 11 degrees (pistons of 2.5, 8.8
+and 25 mm), and mapped by EKF-SLAM. Errors of the measurements are those of the scans, after the
+averaging over faces. The levels were fitted on other worlds (seeds from 1000 on), see README.md.
+"""
+
+import argparse
+from collections.abc import Sequence
+from statistics import fmean
+
+import numpy as np
+
+from pipistrelle.arrays.noise import stream_key
+from pipistrelle.config import Config, Strategy
+from pipistrelle.detection.scans import Heard, Scan, scan_of
+from pipistrelle.experiments.listening import listen
+from pipistrelle.experiments.scenario import Scenario, draw_scenario
+from pipistrelle.experiments.trial import Case, drive_of, run_trial
+from pipistrelle.geometry import range_and_bearing, wrap
+
+RADII = {"180": 0.0025, "33": 0.0088, "11": 0.025}
+PAPER_TOTAL = {"fused 180": 43.7, "fused 33": 40.8, "fused 11": 40.1, "passive": 39.5}
+PAPER_FULL = {"fused 180": 37.7, "fused 33": 31.9, "fused 11": 30.0, "passive": 26.6}
+COLUMNS = (
+    "total", "paper", "full", "paper", "position_m", "heading_rad", "nees", "over_50",
+    "bearing_rad", "range_m", "per_frame",
+)  # fmt: skip
+
+
+def measurement_errors(scans: Sequence[Scan], scenario: Scenario) -> tuple[float, float]:
+    """Return the RMS errors of bearing [rad] and range [m] against the true geometry."""
+    places = np.vstack((scenario.landmarks, scenario.beacon))
+    bearing, distance = [], []
+    for scan in scans:
+        k = int(np.searchsorted(scenario.time, scan.time))
+        true_range, true_bearing = range_and_bearing(scenario.path[k], places[scan.landmark - 1])
+        bearing.append(wrap(scan.bearing - true_bearing))
+        distance.append(scan.range - true_range)
+    ranges = np.concatenate(distance)
+    ranged = ranges[np.isfinite(ranges)]
+    spread = float(np.sqrt(np.mean(ranged**2))) if ranged.size else float("nan")
+    return float(np.sqrt(np.mean(np.concatenate(bearing) ** 2))), spread
+
+
+def world_rows(seed: int, config: Config) -> tuple[dict[str, list[float]], dict[str, float]]:
+    """Return one row of numbers per case, and the clutter per frame of each beam."""
+    config = config.model_copy(update={"seed": seed})
+    scenario = draw_scenario(config, np.random.default_rng(stream_key(seed, 0, "scenario")))
+    drive = drive_of(scenario, config)
+    beams = dict(zip(RADII, listen(scenario, config, tuple(RADII.values())), strict=True))
+    cases: list[tuple[str, Strategy, tuple[Heard, ...]]] = [("passive", "passive", beams["11"])]
+    for name, heard in beams.items():
+        cases += [(f"fused {name}", "fused", heard), (f"active {name}", "active", heard)]
+    rows = {}
+    for name, strategy, heard in cases:
+        scans = tuple(scan_of(frame, strategy) for frame in heard)
+        case = Case(strategy=strategy, filter="ekf")
+        scores = run_trial(case, drive, scans, config).scores
+        rows[name] = [
+            scores.landmarks_total, scores.landmarks_full, scores.position_rmse_m,
+            scores.heading_rmse_rad, scores.nees_mean, scores.diverged,
+            *measurement_errors(scans, scenario), scores.measurements_per_frame,
+        ]  # fmt: skip
+    return rows, {name: fmean(f.clutter for f in heard) for name, heard in beams.items()}
+
+
+def main() -> None:
+    """Print the table."""
+    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    options.add_argument("--worlds", type=int, default=20)
+    options.add_argument("--first-seed", type=int, default=0)
+    chosen = options.parse_args()
+    worlds = [world_rows(chosen.first_seed + i, Config()) for i in range(chosen.worlds)]
+    print(f"{'case':<12}" + "".join(f"{name:>13}" for name in COLUMNS))
+    for name in worlds[0][0]:
+        mean = [fmean(float(rows[name][i]) for rows, _ in worlds) for i in range(9)]
+        total, full = PAPER_TOTAL.get(name, np.nan), PAPER_FULL.get(name, np.nan)
+        cells = [mean[0], total, mean[1], full, *mean[2:]]
+        print(f"{name:<12}" + "".join(f"{cell:13.3f}" for cell in cells))
+    for name in RADII:
+        print(f"clutter per frame, {name} degrees: {fmean(c[name] for _, c in worlds):.2f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,164 @@
+"""`pipistrelle slam`: a recorded log to a map."""
+
+from math import radians
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from pipistrelle.config import Config, FilterConfig, InputError, RayConfig, Section
+from pipistrelle.settings import Given, Key, Layer, from_flags, resolve
+from pipistrelle.verbs.console import progress, say
+from pipistrelle.verbs.options import (
+    Chosen,
+    Filter,
+    OutputOptions,
+    Whole,
+    layers,
+    setting_flags,
+    strategies,
+)
+
+if TYPE_CHECKING:
+    from pipistrelle.detection.logs import Log
+
+GATE = 0.999
+"""Share of a measurement's predicted distribution that is accepted of real logs."""
+GATE_KEY = ("filter", "gate")
+LOGGED = frozenset(
+    {
+        ("filter", "range_std"),
+        ("filter", "bearing_std"),
+        ("filter", "initial_pose_std"),
+        ("rays", "range_bounds"),
+    }
+)
+"""Settings of the filter that a log decides."""
+
+
+class SlamConfig(Section):
+    """What a log's replay depends on, beside the log; a file for ``--config``."""
+
+    seed: int
+    filter: FilterConfig
+    rays: RayConfig
+
+
+def _is_open(key: Key) -> bool:
+    """Whether a log leaves a setting open."""
+    return key[0] in SlamConfig.model_fields and key not in LOGGED
+
+
+if TYPE_CHECKING:
+    SlamFlags = dict[str, Any]
+else:
+    SlamFlags = setting_flags(shown=_is_open)
+
+
+def slam(
+    log: Annotated[Path, Parameter(help="A log folder, or a UTIAS MRCLAM folder.")],
+    /,
+    *,
+    robot: Annotated[
+        Whole | None, Parameter(metavar="N", help="Whose log of a MRCLAM folder, 1 to 5.")
+    ] = None,
+    strategy: Annotated[
+        Chosen,
+        Parameter(help="What is kept: all as it is, only what has a range, or only bearings."),
+    ] = "fused",
+    filters: Annotated[Filter, Parameter(name="--filter", help="What draws the map.")] = "ekf",
+    beamwidth: Annotated[
+        float | None,
+        Parameter(
+            metavar="DEG",
+            help="Hide the ranges outside a beam of this width [deg] about the heading. "
+            "[default: hide nothing]",
+        ),
+    ] = None,
+    gate: Annotated[
+        float | None,
+        Parameter(
+            metavar="P",
+            help="Drop measurements outside this share of their predicted distribution; sets "
+            f"filter.gate. [default: the log's own, else {GATE}]",
+        ),
+    ] = None,
+    config: Annotated[
+        Path | None,
+        Parameter(metavar="FILE.toml", help="Settings as `pipistrelle config show` prints them."),
+    ] = None,
+    settings: Annotated[SlamFlags | None, Parameter(name="*")] = None,
+    output: Annotated[OutputOptions | None, Parameter(name="*")] = None,
+) -> int:
+    """Solve a recorded log; where it has the truth, say how far off the map is."""
+    output = output or OutputOptions()
+    layer = _layer(log, config, settings or {}, gate)
+    resolve(layer)
+    if beamwidth is not None and not 0 < beamwidth <= 360:
+        raise InputError(f"--beamwidth: found {beamwidth:g}, expected above 0 and up to 360 [deg]")
+    from pipistrelle.experiments.replay import load, replay
+    from pipistrelle.verbs import outcome
+
+    recorded, truth = load(log, robot)
+    settled = _with_log(layer, recorded, log)
+    _warn_of_ignored_rows(recorded, log)
+    with outcome.result_folder(output, "slam") as folder:
+        outcome.compile_once(output)
+        watch = outcome.recorder(output)
+        beam = None if beamwidth is None else radians(beamwidth)
+        with progress(output.quiet) as show:
+            trials = replay(
+                recorded,
+                truth,
+                strategies(strategy),
+                (filters,),
+                beam,
+                settled,
+                progress=show,
+                watch=watch,
+            )
+        return outcome.deliver(
+            folder,
+            trials,
+            truth,
+            config=SlamConfig(seed=settled.seed, filter=settled.filter, rays=settled.rays),
+            seed=settled.seed,
+            options=output,
+            beamwidth=beam,
+            ignored_rows=recorded.ignored_rows,
+            watch=watch,
+        )
+
+
+def _layer(log: Path, config: Path | None, settings: SlamFlags, gate: float | None) -> Layer:
+    """Lay file, environment and flags over each other; refuse flags for what the log decides."""
+    flags = from_flags(settings)
+    for key, given in flags.items():
+        if not _is_open(key):
+            raise InputError(f"{given.where}: the log decides this; leave the flag out")
+    if gate is not None and GATE_KEY in flags:
+        raise InputError("--gate and --filter.gate are one setting; give one of them")
+    short = {} if gate is None else {GATE_KEY: Given(gate, "--gate")}
+    return layers(config, settings) | short
+
+
+def _with_log(layer: Layer, recorded: "Log", log: Path) -> Config:
+    """Settle what the log decides; say so where a file or the environment says otherwise."""
+    gate = GATE if recorded.gate is None else recorded.gate
+    decided = {key: Given(getattr(recorded, key[1]), f"{log}: {key[1]}") for key in LOGGED}
+    wished, settled = resolve(layer), resolve({GATE_KEY: Given(gate, str(log))} | layer | decided)
+    for section, name in sorted(LOGGED & layer.keys()):
+        value = getattr(getattr(settled, section), name)
+        if getattr(getattr(wished, section), name) != value:
+            where = layer[section, name].where
+            say(f"pipistrelle: warning: {where}: the log decides this, and says {value}")
+    return settled
+
+
+def _warn_of_ignored_rows(recorded: "Log", log: Path) -> None:
+    """Name what the reader dropped, in a line."""
+    if recorded.ignored_rows:
+        reasons = (
+            f"{count} {reason.replace('_', ' ')}" for reason, count in recorded.ignored_rows.items()
+        )
+        say(f"pipistrelle: warning: {log}: rows left out: {', '.join(reasons)}")
