@@ -198,6 +198,15 @@ def test_a_measurement_at_the_end_of_a_merged_step_belongs_to_it(tmp_path, start
     assert used == list(range(1, 15))
 
 
+def test_times_and_the_ends_of_merged_steps_are_compared_to_a_microsecond(tmp_path):
+    odometry = "time,velocity,angular_rate\n0,1,0\n0.30000000000000004,1,0\n"
+    rows = measured("0.1000001,1,0,1", "0.100002,2,0,1", "0.2,3,0,1")
+    log = merged(tmp_path, 0.1, odometry, rows)
+    assert len(log.dt) == 3
+    used = [np.flatnonzero(log.time == scan.time).item() for scan in log.scans]
+    assert used == [1, 2, 2]
+
+
 def test_a_measurement_at_the_first_rows_time_is_used_at_the_start_of_merged_steps(tmp_path):
     log = merged(tmp_path, 0.2, measurements=measured("0.0,1,0,1", "0.01,1,0,1"))
     assert [scan.time for scan in log.scans] == [0.0, 0.2]
@@ -281,6 +290,14 @@ def test_a_bad_measurement_is_refused_by_its_line(tmp_path, row, parts):
 def test_a_landmark_twice_at_one_time_is_found_among_others(tmp_path):
     rows = ["0.1,1,0,1", "0.1,2,0,1", "0.1,3,0,1", "0.1,2,0.3,", "0.2,2,0,1"]
     refused(recorded(tmp_path, measurements=measured(*rows)), "line 5", "landmark 2", "line 3")
+    rows = ["0.1,9,0,1", "0.1,9,0,1", "0.1,1,0,1", "0.1,1,0,1"]
+    refused(recorded(tmp_path, measurements=measured(*rows)), "line 3", "landmark 9", "line 2")
+
+
+@pytest.mark.parametrize("row", ["0.1,7,0.5", "0.1,7,0.5,1,0"])
+def test_a_file_of_wrong_rows_alone_is_refused_too(tmp_path, row):
+    folder = recorded(tmp_path, measurements=measured(row, row.replace("7", "8")))
+    refused(folder, "line 2", f"{row.count(',') + 1} fields")
 
 
 @pytest.mark.parametrize(

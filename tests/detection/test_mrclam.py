@@ -125,8 +125,8 @@ def test_a_bad_row_is_refused_by_its_line(folder):
 def test_a_landmark_twice_at_one_time_is_refused(folder):
     path = folder / "Robot1_Measurement.dat"
     lines = path.read_text().splitlines()
-    path.write_text("\n".join([*lines[:10], lines[9], *lines[10:]]))
-    refused(folder, "Robot1_Measurement.dat, line 11", "landmark", "again", "line 10")
+    path.write_text("\n".join([*lines[:70], lines[69], *lines[70:]]))
+    refused(folder, "Robot1_Measurement.dat, line 71", "landmark", "again", "line 70")
 
 
 def test_one_barcode_on_two_subjects_is_refused(folder):

@@ -30,9 +30,9 @@ class Scenario:
     beacon : (2) [m]
     """
 
-    time: Float[np.ndarray, " k+1"]
-    path: Float[np.ndarray, "k+1 3"]
-    controls: Float[np.ndarray, "k 2"]
+    time: Float[np.ndarray, " t"]
+    path: Float[np.ndarray, "t 3"]
+    controls: Float[np.ndarray, "t-1 2"]
     landmarks: Float[np.ndarray, "n 2"]
     beacon: Float[np.ndarray, "2"]
 
@@ -92,7 +92,7 @@ def _drive(
     dt: float,
     motion: MotionConfig,
     rng: np.random.Generator,
-) -> Float[np.ndarray, "k+1 3"]:
+) -> Float[np.ndarray, "t 3"]:
     """Drive with noise on both controls (Bradley & Abaid, Eq. 5)."""
     model = bicycle(motion)
     noisy = controls + rng.standard_normal(controls.shape) * model.control_std

@@ -62,9 +62,9 @@ class Drive:
 
     motion: Motion
     start: Gaussian
-    time: Float[np.ndarray, " k+1"]
-    controls: Float[np.ndarray, "k 2"]
-    true_path: Float[np.ndarray, "k+1 3"] | None
+    time: Float[np.ndarray, " t"]
+    controls: Float[np.ndarray, "t-1 2"]
+    true_path: Float[np.ndarray, "t 3"] | None
     true_landmarks: LabelledPoints | None
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from pipistrelle.config import InputError
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.models import Gaussian, Landmarks
 from pipistrelle.experiments.results import LabelledPoints, TimedPath
@@ -151,7 +152,7 @@ def animate_mission(
     Raises
     ------
     InputError
-        Where the path ends otherwise, or ffmpeg is missing or fails.
+        Where the path ends otherwise or cannot be written, or ffmpeg is missing or fails.
     ValueError
         Without a single frame.
 
@@ -172,7 +173,13 @@ def animate_mission(
         raise ValueError("an animation needs at least one frame")
     with matplotlib.rc_context(STYLE):
         figure, panels = _stage(snapshots, true_path, true_landmarks, beacon, beamwidth)
-        write(_play(figure, panels, _times(snapshots, pictures)), path)
+        try:
+            write(_play(figure, panels, _times(snapshots, pictures)), path)
+        except OSError as error:
+            reason = error.strerror or error
+            raise InputError(
+                f"{path}: cannot be written ({reason}); choose another place"
+            ) from None
 
 
 def _times(

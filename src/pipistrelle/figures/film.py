@@ -119,7 +119,7 @@ def write_mp4(pictures: Pictures, path: Path) -> None:
         with contextlib.suppress(BrokenPipeError):
             for picture in itertools.chain([first], pictures):
                 ffmpeg.stdin.write(picture.tobytes())
-        reason = ffmpeg.communicate()[1].decode(errors="replace").strip().splitlines()[-1:]
+        reason = ffmpeg.communicate()[1].decode(errors="replace").strip().splitlines()[:1]
     if ffmpeg.returncode:
         raise InputError(
             f"{path}: ffmpeg ended with status {ffmpeg.returncode} "

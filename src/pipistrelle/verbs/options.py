@@ -96,16 +96,14 @@ class OutputOptions:
             help="The result folder itself. [default: runs/TIME-NAME]",
         ),
     ] = None
-    overwrite: Annotated[
-        bool, Parameter(negative=(), help="Replace earlier results in DIR. [default: no]")
-    ] = False
+    overwrite: Annotated[bool, Parameter(negative=(), help="Replace earlier results in DIR.")] = (
+        False
+    )
     animate: Annotated[
         Literal["gif", "mp4"] | None,
         Parameter(help="Film the mission; gif unless said otherwise. [default: no]"),
     ] = None
-    quiet: Annotated[
-        bool, Parameter(negative=(), help="Print the result folder alone. [default: no]")
-    ] = False
+    quiet: Annotated[bool, Parameter(negative=(), help="Print the result folder alone.")] = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -42,6 +42,7 @@ def run(
     config, output = mission_config(mission or MissionOptions()), output or OutputOptions()
     if save_log is not None:
         _check_vacant(save_log, output)
+    from pipistrelle.experiments.replay import Truth
     from pipistrelle.experiments.trial import run_mission
     from pipistrelle.verbs import outcome
     from pipistrelle.verbs.console import progress
@@ -51,7 +52,8 @@ def run(
         watch = outcome.recorder(output)
         with progress(output.quiet) as show:
             done = run_mission(config, strategies(strategy), (filters,), progress=show, watch=watch)
-        truth = _truth(done)
+        drive = done.drive
+        truth = Truth(time=drive.time, path=drive.true_path, landmarks=drive.true_landmarks)
         if save_log is not None:
             heard = {trial.strategy: trial.scans for trial in done.trials}
             _save_log(save_log, done, heard.get("fused", done.trials[0].scans), truth)
@@ -74,18 +76,6 @@ def _check_vacant(folder: Path, output: OutputOptions) -> None:
         raise InputError(f"--save-log: {folder} is the result folder; name another")
     if folder.exists() and any(folder.iterdir()) and not output.overwrite:
         raise InputError(f"--save-log: {folder} is not empty; name a new folder or add --overwrite")
-
-
-def _truth(mission: "Mission") -> "Truth":
-    """Return the true path and places; the beacon is the last landmark."""
-    import numpy as np
-
-    from pipistrelle.experiments.replay import Truth
-
-    scenario = mission.scenario
-    places = np.vstack((scenario.landmarks, scenario.beacon))
-    labels = np.arange(1, len(places) + 1)
-    return Truth(time=scenario.time, path=scenario.path, landmarks=(labels, places))
 
 
 def _beamwidth(mission: "Mission") -> float:
@@ -113,17 +103,17 @@ def _log(mission: "Mission", scans: "Sequence[Scan]") -> "Log":
 
     from pipistrelle.detection.logs import Log
 
-    config, scenario = mission.config, mission.scenario
-    x, y, heading = scenario.path[0].tolist()
+    config, drive = mission.config, mission.drive
+    x, y, heading = drive.start.mean.tolist()
     return Log(
         name=f"run-{config.seed}",
-        time=scenario.time,
-        controls=scenario.controls,
-        dt=np.diff(scenario.time),
+        time=drive.time,
+        controls=drive.controls,
+        dt=np.diff(drive.time),
         scans=tuple(scans),
         motion="bicycle",
-        wheelbase=config.motion.wheelbase,
-        control_std=(config.motion.speed_std, config.motion.steering_std),
+        wheelbase=drive.motion.wheelbase,
+        control_std=drive.motion.control_std,
         initial_pose=(x, y, heading),
         initial_pose_std=config.filter.initial_pose_std,
         range_std=config.filter.range_std,

@@ -52,7 +52,7 @@ def _is_open(key: Key) -> bool:
 if TYPE_CHECKING:
     SlamFlags = dict[str, Any]
 else:
-    SlamFlags = setting_flags(shown=_is_open)
+    SlamFlags = setting_flags(shown=lambda key: _is_open(key) and key != GATE_KEY)
 
 
 def slam(
@@ -107,15 +107,9 @@ def slam(
         watch = outcome.recorder(output)
         beam = None if beamwidth is None else radians(beamwidth)
         with progress(output.quiet) as show:
+            chosen, ways = strategies(strategy), (filters,)
             trials = replay(
-                recorded,
-                truth,
-                strategies(strategy),
-                (filters,),
-                beam,
-                settled,
-                progress=show,
-                watch=watch,
+                recorded, truth, chosen, ways, beam, settled, progress=show, watch=watch
             )
         return outcome.deliver(
             folder,

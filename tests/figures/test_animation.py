@@ -1,0 +1,130 @@
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipistrelle.config import InputError
+from pipistrelle.estimation.models import Landmarks
+from pipistrelle.figures.animation import MissionRecorder, _pruned, _stage, animate_mission
+from pipistrelle.figures.maps import placed
+from pipistrelle.geometry import range_and_bearing
+
+
+@pytest.fixture(scope="module")
+def recorder(mission) -> MissionRecorder:
+    watch = MissionRecorder()
+    for strategy, frames in mission.watched.items():
+        for scan, belief in frames:
+            watch(strategy, "ekf", scan, belief)
+    return watch
+
+
+def rows_of(labels: list[int], x: list[float]) -> Landmarks:
+    return Landmarks(
+        landmark=np.array(labels, dtype=int),
+        mean=np.column_stack([x, np.zeros(len(x))]),
+        covariance=np.tile(np.eye(2), (len(x), 1, 1)),
+        weight=np.ones(len(x)),
+    )
+
+
+def test_a_recorder_keeps_every_frame_of_every_strategy(recorder, mission):
+    assert list(recorder.snapshots) == [(s, "ekf") for s in ("active", "fused", "passive")]
+    assert {len(frames) for frames in recorder.snapshots.values()} == {375}
+    scan, belief = mission.watched["passive"][200]
+    kept = recorder.snapshots["passive", "ekf"][200]
+    assert kept.scan is scan
+    assert np.array_equal(kept.pose, belief.pose().mean)
+
+
+def test_a_gif_has_the_pictures_asked_for_and_rests_on_the_last(recorder, mission, tmp_path):
+    path = tmp_path / "new" / "mission.gif"
+    animate_mission(recorder.snapshots, path, **mission.truth, pictures=6)
+    with Image.open(path) as film:
+        assert film.n_frames == 6
+        assert film.info["loop"] == 0
+        assert film.width == 1200
+        assert film.width % 2 == film.height % 2 == 0, "as MP4 needs it"
+        durations = []
+        for picture in range(6):
+            film.seek(picture)
+            durations.append(film.info["duration"])
+    assert durations == [80] * 5 + [2000]
+
+
+def test_white_stays_white_in_a_gif(recorder, tmp_path):
+    path = tmp_path / "mission.gif"
+    animate_mission({("fused", "ekf"): recorder.snapshots["fused", "ekf"]}, path, pictures=2)
+    with Image.open(path) as film:
+        film.seek(1)
+        assert film.convert("RGB").getpixel((0, 0)) == (255, 255, 255)
+
+
+def test_a_short_mission_is_shown_frame_by_frame(recorder, tmp_path):
+    path = tmp_path / "mission.gif"
+    frames = recorder.snapshots["passive", "ekf"][:4]
+    animate_mission({("passive", "ekf"): frames}, path)
+    with Image.open(path) as film:
+        assert film.n_frames == 4
+
+
+def test_a_panel_shows_each_measurement_along_its_bearing_and_as_far_as_its_range(
+    recorder, mission
+):
+    _, panels = _stage(recorder.snapshots, **mission.truth)
+    frame = recorder.snapshots["fused", "ekf"][100]
+    panels[1]._show_scan(frame)
+    ranged = np.isfinite(frame.scan.range)
+    assert 0 < ranged.sum() < len(ranged), "the frame has both kinds"
+    tips = np.array([segment[1] for segment in panels[1].ranges.get_segments()])
+    distance, bearing = range_and_bearing(frame.pose, tips)
+    assert distance == pytest.approx(frame.scan.range[ranged])
+    assert bearing == pytest.approx(frame.scan.bearing[ranged])
+    tips = np.array([segment[1] for segment in panels[1].bearings.get_segments()])
+    assert range_and_bearing(frame.pose, tips)[1] == pytest.approx(frame.scan.bearing[~ranged])
+
+
+def test_a_panel_shows_the_map_of_its_frame_and_rings_what_has_just_turned_full(recorder, mission):
+    _, panels = _stage(recorder.snapshots, **mission.truth)
+    frames = recorder.snapshots["fused", "ekf"]
+    sets = [set(f.landmarks.landmark[placed(f.landmarks)].tolist()) for f in frames]
+    step = next(i for i in range(50, 374) if sets[i + 1] > sets[i])
+    for picture in range(9):
+        panels[1]._show_map(frames[step].landmarks, picture)
+    assert len(panels[1].rings.get_paths()) == 0
+    panels[1]._show_map(frames[step + 1].landmarks, 9)
+    assert len(panels[1].rings.get_paths()) == len(sets[step + 1] - sets[step])
+    rows = frames[step + 1].landmarks
+    assert len(panels[1].members.get_paths()) == int(np.sum(~placed(rows)))
+    assert len(panels[1].full.get_paths()) == len(sets[step + 1])
+
+
+def test_pruned_are_the_members_that_no_member_of_the_same_landmark_follows():
+    before = rows_of([1, 1, 1, 2, 2], [0.7, 2.1, 6.4, 0.0, 5.0])
+    after = rows_of([1, 1, 2, 3], [2.3, 6.0, 4.0, 0.7])
+    assert _pruned(before, after).tolist() == [True, False, False, True, False]
+    nothing = rows_of([], [])
+    assert _pruned(before, nothing).all()
+    assert len(_pruned(nothing, after)) == 0
+
+
+def test_an_mp4_without_ffmpeg_is_refused_with_the_fix(recorder, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(InputError, match=r"no ffmpeg on the PATH.*install ffmpeg or choose .*gif"):
+        animate_mission(recorder.snapshots, tmp_path / "mission.mp4")
+
+
+def test_an_ending_that_is_no_films_is_refused(recorder, tmp_path):
+    with pytest.raises(InputError, match=r"'\.avi', expected \.gif or \.mp4"):
+        animate_mission(recorder.snapshots, tmp_path / "mission.avi")
+
+
+def test_a_place_that_cannot_be_written_is_refused(recorder, tmp_path):
+    (tmp_path / "file").touch()
+    frames = {("fused", "ekf"): recorder.snapshots["fused", "ekf"][:2]}
+    with pytest.raises(InputError, match="cannot be written"):
+        animate_mission(frames, tmp_path / "file" / "mission.gif")
+
+
+def test_a_film_of_nothing_is_an_error(tmp_path):
+    with pytest.raises(ValueError, match="at least one frame"):
+        animate_mission({}, tmp_path / "mission.gif")

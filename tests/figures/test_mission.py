@@ -1,0 +1,162 @@
+import subprocess
+import sys
+from dataclasses import replace
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.collections import LineCollection, PolyCollection
+from PIL import Image
+
+from pipistrelle.estimation.models import Gaussian
+from pipistrelle.evaluation.accuracy import position_error
+from pipistrelle.evaluation.consistency import nees
+from pipistrelle.figures.maps import placed
+from pipistrelle.figures.mission import draw_mission
+from pipistrelle.figures.style import save_figure
+
+STRATEGIES = ("active", "fused", "passive")
+
+
+def maps(figure) -> list:
+    return [axes for axes in figure.axes if axes.get_aspect() == 1.0]
+
+
+def words(axes) -> list[str]:
+    return [text.get_text() for text in axes.texts]
+
+
+def marks(axes, marker: str, size: float) -> int:
+    lines = [ln for ln in axes.lines if (ln.get_marker(), ln.get_markersize()) == (marker, size)]
+    return sum(len(line.get_xdata()) for line in lines)
+
+
+@pytest.fixture(scope="module")
+def three(mission):
+    return draw_mission(list(mission.trials.values()), **mission.truth)
+
+
+def test_each_strategy_has_a_map_and_three_rows_of_errors(three):
+    assert len(maps(three)) == 3
+    assert len(three.axes) == 3 * 4
+
+
+def test_titles_say_the_result(three, mission):
+    for axes, strategy in zip(maps(three), STRATEGIES, strict=True):
+        scores = mission.trials[strategy].scores
+        counts = f"{scores.landmarks_full} of {scores.landmarks_total} landmarks placed"
+        assert words(axes) == [strategy, f"RMSE {scores.position_rmse_m:.2f} m · {counts}"]
+
+
+def test_all_panels_have_the_same_scales(three):
+    for row in range(4):
+        limits = {(axes.get_xlim(), axes.get_ylim()) for axes in three.axes[row::4]}
+        assert len(limits) == 1
+
+
+def test_every_landmark_is_drawn(three, mission):
+    for axes, strategy in zip(maps(three), STRATEGIES, strict=True):
+        rows = mission.trials[strategy].track.landmarks
+        full = int(placed(rows).sum())
+        areas = [c for c in axes.collections if isinstance(c, PolyCollection)]
+        assert marks(axes, "o", 5.0) == 51, "true landmarks"
+        assert marks(axes, "o", 2.6) == full
+        assert [len(area.get_paths()) for area in areas] == [full, len(rows.landmark) - full]
+
+
+def test_each_estimate_is_tied_to_the_landmark_it_is_of(three, mission):
+    rows = mission.trials["passive"].track.landmarks
+    ties = next(c for c in maps(three)[2].collections if isinstance(c, LineCollection))
+    true = mission.truth["true_landmarks"][1][rows.landmark[placed(rows)] - 1]
+    assert np.allclose([path.vertices[1] for path in ties.get_paths()], true)
+    assert np.allclose([path.vertices[0] for path in ties.get_paths()], rows.mean[placed(rows)])
+
+
+def test_members_of_a_ray_are_as_opaque_as_they_are_heavy(three, mission):
+    rows = mission.trials["passive"].track.landmarks
+    weight = rows.weight[~placed(rows)]
+    members = [c for c in maps(three)[2].collections if isinstance(c, PolyCollection)][1]
+    opacity = members.get_facecolor()[:, 3]
+    assert np.array_equal(np.argsort(opacity), np.argsort(weight))
+
+
+def test_only_strategies_that_call_have_a_beam(three):
+    patches = [len(axes.patches) for axes in maps(three)]
+    assert patches == [2, 2, 1], "beam and vehicle, beam and vehicle, vehicle"
+
+
+def test_error_rows_show_what_evaluation_computes(three, mission):
+    track, path = mission.trials["active"].track, mission.truth["true_path"][1]
+    _, position, _, consistency = three.axes[:4]
+    assert np.array_equal(position.lines[0].get_ydata(), position_error(track.pose.mean, path))
+    first = nees(track.pose.mean - path, track.pose.covariance)[:100]
+    assert np.allclose(consistency.lines[0].get_ydata()[:100], first)
+
+
+def test_without_truth_there_are_maps_alone(mission):
+    trial = mission.trials["fused"]
+    scores = replace(trial.scores, position_rmse_m=None)
+    figure = draw_mission([replace(trial, scores=scores)])
+    assert len(figure.axes) == 1
+    assert "RMSE" not in words(figure.axes[0])[1]
+    names = {text.get_text() for text in figure.legends[0].texts}
+    assert not names & {"true path", "true landmark", "beacon", "its beam"}
+
+
+def test_the_legend_stands_once_and_names_everything(three):
+    (legend,) = three.legends
+    assert len(legend.texts) == 8
+    assert all(axes.get_legend() is None for axes in three.axes)
+
+
+def test_several_filters_are_named_and_a_fourth_panel_starts_a_row(mission):
+    trials = [*mission.trials.values(), replace(mission.trials["fused"], filter="fastslam")]
+    panels = maps(draw_mission(trials, **mission.truth))
+    assert words(panels[1])[0] == "fused · ekf"
+    assert words(panels[3])[0] == "fused · fastslam"
+    assert panels[3].get_position().y1 < panels[0].get_position().y0
+
+
+def test_a_trial_that_has_gone_to_infinity_is_drawn_and_said_to_have_diverged(mission, tmp_path):
+    trial = mission.trials["active"]
+    mean, covariance = trial.track.pose.mean.copy(), trial.track.pose.covariance.copy()
+    mean[700:], covariance[700:] = np.nan, np.inf
+    track = replace(trial.track, pose=Gaussian(mean=mean, covariance=covariance))
+    scores = replace(trial.scores, diverged=True, position_rmse_m=float("inf"))
+    figure = draw_mission([replace(trial, track=track, scores=scores)], **mission.truth)
+    save_figure(figure, tmp_path, "lost")
+    assert words(maps(figure)[0])[1] == "diverged · RMSE inf m"
+
+
+def test_a_saved_figure_is_wide_enough_for_a_page(three, tmp_path):
+    png, _ = save_figure(three, tmp_path, "mission")
+    with Image.open(png) as image:
+        assert image.width >= 1200
+    assert png.stat().st_size < 1_000_000
+
+
+def test_without_trials_there_is_nothing_to_draw():
+    with pytest.raises(ValueError, match="at least one trial"):
+        draw_mission([])
+
+
+def test_the_callers_matplotlib_settings_are_left_alone(mission):
+    before = dict(matplotlib.rcParams)
+    draw_mission([mission.trials["active"]], **mission.truth)
+    assert dict(matplotlib.rcParams) == before
+
+
+def test_importing_loads_no_matplotlib_and_drawing_no_pyplot():
+    program = """
+import sys
+import pipistrelle.figures.animation, pipistrelle.figures.mission
+print("matplotlib" in sys.modules)
+from matplotlib.figure import Figure
+from pipistrelle.figures.maps import legend
+legend(Figure(), ["beacon"], 1, 0.0, 0.0)
+print("matplotlib.pyplot" in sys.modules)
+"""
+    run = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert run.stdout.split() == ["False", "False"]
