@@ -25,7 +25,7 @@ figure, axes = plt.subplots(figsize=(6.0, 4.6), subplot_kw={"projection": "polar
 for radius in (2.5e-3, 8.8e-3, 25e-3):
     width = np.degrees(beamwidth(radius, **call))
     power = piston_directivity(angle, radius=radius, **call) ** 2
-    axes.plot(angle, power, label=f"{1e3 * radius:.1f} mm: {width:.0f}°")
+    axes.plot(angle, power, label=f"{1e3 * radius:.1f} mm: {width:.1f}°")
 axes.plot(angle, np.full_like(angle, 0.5), ":", color="grey", lw=1.0)
 axes.set_theta_zero_location("N")
 axes.set_yticks([0.5, 1.0], ["½", "1"])

@@ -62,7 +62,8 @@ found = detect(matched, finder, start=start, interval=1.0 / settled.rate, pulse=
 
 # %%
 # The front face. Above, what one microphone hears; most echoes are below its noise. Below, the
-# energy of both tones after the matched filter; dots are detections.
+# energy of both tones after the matched filter; dots are detections. Where a call of one tone begins
+# and ends it leaks into the other, 33 dB weaker but above the threshold: the detector must know.
 
 front = found.face == 0
 names, colours = ("own, 35 kHz", "beacon's, 30 kHz"), ("#1f4e96", "#d99a00")
@@ -78,7 +79,7 @@ for tone in (0, 1):
     below.plot(1e3 * found.delay[here], found.power[here], "o", color=colours[tone])
 below.axhline(finder.threshold, color="black", ls=":", lw=1.0, label="threshold")
 below.set(xlabel="time since the calls [ms]", ylabel="energy of ten", ylim=(1.0, None))
-below.legend(loc="upper right", ncols=3)
+figure.legend(loc="outside upper center", ncols=3)
 plt.show()
 
 # %%

@@ -13,6 +13,11 @@ from cyclopts import App, CycloptsError
 
 from pipistrelle import __version__
 
+SPELLINGS = (
+    "A setting is --rays.power 3 as a flag, PIPISTRELLE_RAYS__POWER=3 in the environment and "
+    "power = 3 under [rays] in FILE.toml; flags go before the environment, that before the file."
+)
+
 app = App(
     name="pipistrelle",
     help="Sonar SLAM with one's own calls, someone else's, or both: from waveform to verdict.",
@@ -27,17 +32,20 @@ app.command(
     "pipistrelle.verbs.run:run",
     name="run",
     help="Drive through one random world, by sound; the three strategies side by side.",
+    help_epilogue=SPELLINGS,
 )
 app.command(
     "pipistrelle.verbs.slam:slam",
     name="slam",
     help="Solve a recorded log: a log folder, or a UTIAS MRCLAM folder as it is.",
+    help_epilogue=SPELLINGS,
 )
 config = App(name="config", help="Show the settings, or what a file of settings may hold.")
 config.command(
     "pipistrelle.verbs.config:show",
     name="show",
     help="Print the settings as TOML: defaults < file < environment < flags.",
+    help_epilogue=SPELLINGS,
 )
 config.command(
     "pipistrelle.verbs.config:schema", name="schema", help="Print the settings' JSON schema."

@@ -384,6 +384,17 @@ def test_steps_without_number_are_refused_before_they_fill_the_memory(tmp_path):
 # What is written
 
 
+def test_the_log_on_the_pages_of_the_documentation_is_sound(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "log_format.md").read_text()
+    files = re.findall(r"^`([a-z]+\.[a-z]+)`\n\n```[a-z]+\n(.+?)^```", page, re.M | re.S)
+    assert [name for name, _ in files] == ["log.toml", "odometry.csv", "measurements.csv"]
+    for name, text in files:
+        (tmp_path / name).write_text(text)
+    log = read_log(tmp_path)
+    assert len(log.dt) == 3
+    assert [scan.landmark.tolist() for scan in log.scans] == [[7, 3], [7]]
+
+
 @pytest.mark.parametrize("name", ["unicycle_log", "bicycle_log"])
 def test_a_log_survives_being_written(tmp_path, name):
     log = read_log(DATA / name)

@@ -67,9 +67,7 @@ def test_a_short_mission_is_shown_frame_by_frame(recorder, tmp_path):
         assert film.n_frames == 4
 
 
-def test_a_panel_shows_each_measurement_along_its_bearing_and_as_far_as_its_range(
-    recorder, mission
-):
+def test_a_panel_shows_measurements_along_their_bearings_as_far_as_their_ranges(recorder, mission):
     _, panels = _stage(recorder.snapshots, **mission.truth)
     frame = recorder.snapshots["fused", "ekf"][100]
     panels[1]._show_scan(frame)

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 from matplotlib.path import Path
 
 from pipistrelle.estimation.models import Landmarks
@@ -108,7 +109,5 @@ def test_a_view_without_truth_shows_the_estimates_that_are_finite():
 
 
 def test_a_legend_knows_only_symbols_that_exist():
-    from matplotlib.figure import Figure
-
     with pytest.raises(KeyError, match="unicorn"):
         legend(Figure(), ["unicorn"], 1, 0.0, 0.0)

@@ -1,10 +1,13 @@
+import gc
 import subprocess
 import sys
+import weakref
 from dataclasses import replace
 
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib import pyplot
 from matplotlib.collections import LineCollection, PolyCollection
 from PIL import Image
 
@@ -144,6 +147,13 @@ def test_the_callers_matplotlib_settings_are_left_alone(mission):
     before = dict(matplotlib.rcParams)
     draw_mission([mission.trials["active"]], **mission.truth)
     assert dict(matplotlib.rcParams) == before
+
+
+def test_a_figure_is_freed_when_it_is_let_go(mission):
+    figure = weakref.ref(draw_mission([mission.trials["active"]], **mission.truth))
+    gc.collect()
+    assert figure() is None
+    assert pyplot.get_fignums() == []
 
 
 def test_importing_loads_no_matplotlib_and_drawing_no_pyplot():

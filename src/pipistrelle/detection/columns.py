@@ -59,6 +59,16 @@ def read_table(
     ------
     InputError
         With the file and the line.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as place:
+    ...     path = Path(place) / "posts.csv"
+    ...     write_table(path, ("landmark", "x"), np.array([4, 7]), np.array([1.5, -2.0]))
+    ...     table = read_table(path, ("landmark", "x"))
+    >>> table.column["landmark"], table.column["x"], table.line
+    (array([4, 7]), array([ 1.5, -2. ]), array([2, 3]))
     """
     lines = read_text(path).splitlines()
     content = [(i, line) for i, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]
@@ -83,13 +93,22 @@ def read_table(
 
 
 def write_table(path: Path, columns: tuple[str, ...], *values: np.ndarray) -> None:
-    """Write columns with a header: floats exactly, NaN as an empty field.
+    r"""Write columns with a header: floats exactly, NaN as an empty field.
 
     Parameters
     ----------
     path : Path
     columns : names
     values : one (n) for each name
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as place:
+    ...     path = Path(place) / "ranges.csv"
+    ...     write_table(path, ("landmark", "range"), np.array([4, 7]), np.array([0.1, np.nan]))
+    ...     path.read_text()
+    'landmark,range\n4,0.1\n7,\n'
     """
     rows = zip(*(column.tolist() for column in values), strict=True)
     lines = [",".join("" if x != x else repr(x) for x in row) for row in rows]
@@ -108,6 +127,14 @@ def check_unique(table: Table, *names: str) -> None:
     ------
     InputError
         With both lines.
+
+    Examples
+    --------
+    >>> column = {"landmark": np.array([4, 7, 4])}
+    >>> check_unique(Table(path=Path("x.csv"), line=np.array([2, 3, 4]), column=column), "landmark")
+    Traceback (most recent call last):
+    pipistrelle.config.InputError: x.csv, line 4: found landmark 4 again, expected it once, as in
+    line 2; remove one of the rows
     """
     key = np.column_stack([table.column[name] for name in names])
     order = np.lexsort(key.T[::-1])

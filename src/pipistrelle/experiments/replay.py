@@ -8,13 +8,16 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.config import Strategy
+from pipistrelle.config import Config, Strategy
 from pipistrelle.detection.columns import check_unique, read_table, refusal, write_table
 from pipistrelle.detection.logs import Log, read_log
 from pipistrelle.detection.mrclam import read_mrclam
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.models import Gaussian, Motion
+from pipistrelle.experiments.listening import Progress
+from pipistrelle.experiments.results import TrialResult
 from pipistrelle.experiments.tables import LabelledPoints
+from pipistrelle.experiments.trial import Case, Drive, Watch, run_trial
 
 _PATH = ("time", "x", "y", "heading")
 
@@ -205,6 +208,57 @@ def start_of(log: Log) -> Gaussian:
     """Return the pose at which a log starts, (3) and (3, 3), as the filters take it."""
     variance = np.square(np.array(log.initial_pose_std, dtype=float))
     return Gaussian(mean=np.array(log.initial_pose, dtype=float), covariance=np.diag(variance))
+
+
+def replay(
+    log: Log,
+    truth: Truth | None,
+    strategies: Sequence[Strategy],
+    filters: Sequence[str],
+    beamwidth: float | None,
+    config: Config,
+    *,
+    progress: Progress | None = None,
+    watch: Watch | None = None,
+) -> tuple[TrialResult, ...]:
+    """Let each filter map a recorded log by each strategy.
+
+    Parameters
+    ----------
+    log : Log
+    truth : Truth or None
+    strategies : sequence of "active", "fused", "passive"
+    filters : sequence of "ekf"
+    beamwidth : [rad], optional
+        See `hide`.
+    config : Config
+        Its sections filter and rays, which must agree with the log.
+    progress, watch : callable, optional
+
+    Returns
+    -------
+    tuple of TrialResult
+
+    Raises
+    ------
+    InputError
+        For an unknown filter.
+    """
+    drive = Drive(
+        motion=motion_of(log),
+        start=start_of(log),
+        time=log.time,
+        controls=log.controls,
+        true_path=None if truth is None else truth.path,
+        true_landmarks=None if truth is None else truth.landmarks,
+    )
+    trials = []
+    for strategy in strategies:
+        scans = hide(log.scans, strategy, beamwidth)
+        for name in filters:
+            case = Case(strategy=strategy, filter=name)
+            trials.append(run_trial(case, drive, scans, config, progress=progress, watch=watch))
+    return tuple(trials)
 
 
 def _load_mrclam(folder: Path, robot: int | None) -> tuple[Log, Truth]:

@@ -149,7 +149,7 @@ def score(
     ----------
     track : Track of k poses, the start first
     true_path : (k, 3) [m, m, rad], optional
-        At the times of the track.
+        At the times of the track; NaN where it is not known, which is not scored.
     true_landmarks : labels (n) and positions (n, 2) [m], optional
     scans : sequence of Scan
         What the filter was given: one per frame, empty ones included.
@@ -184,10 +184,10 @@ def score(
     >>> scores.position_rmse_m, scores.nees_max, scores.map_rmse_m
     (5.0, 25.0, None)
     """
-    truth = track.pose.mean[:0] if true_path is None else true_path
-    if true_path is not None and len(true_path) != len(track.pose.mean):
-        raise ValueError(f"{len(track.pose.mean)} poses, but {len(true_path)} true ones")
-    rows = slice(1, max(1, len(truth)))
+    truth = np.full_like(track.pose.mean, np.nan) if true_path is None else true_path
+    if len(truth) != len(track.pose.mean):
+        raise ValueError(f"{len(track.pose.mean)} poses, but {len(truth)} true ones")
+    rows = np.isfinite(truth).all(axis=1) & (np.arange(len(truth)) > 0)
     path, truth = track.pose.mean[rows], truth[rows]
     error = pose_error(path, truth)
     epsilon = nees(error, track.pose.covariance[rows])
@@ -248,7 +248,7 @@ def write_results(
     trials : sequence of TrialResult
         Each strategy and filter once.
     truth_path : times (k) [s] and true poses (k, 3) [m, m, rad], optional
-        At the times of the tracks.
+        At the times of the tracks; NaN where not known, which ``truth.tum`` leaves out.
     true_landmarks : labels (n) and positions (n, 2) [m], optional
     ignored_rows : dict
         Number of dropped log rows by reason.
@@ -281,7 +281,8 @@ def write_results(
         write_file(folder / f"track_{name}.tum", tum_text(track.time, track.pose.mean))
         write_file(folder / f"map_{name}.csv", map_text(track.landmarks))
     if truth_path is not None:
-        write_file(folder / "truth.tum", tum_text(*truth_path))
+        known = np.isfinite(truth_path[1]).all(axis=1)
+        write_file(folder / "truth.tum", tum_text(truth_path[0][known], truth_path[1][known]))
     _write_tables(folder, trials, None if truth_path is None else truth_path[1], true_landmarks)
     summary = {
         "format": FORMAT,

@@ -16,7 +16,8 @@ from jaxtyping import Bool, Float, UInt8
 from pipistrelle.config import InputError
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.models import Gaussian, Landmarks
-from pipistrelle.experiments.results import LabelledPoints, TimedPath
+from pipistrelle.experiments.results import TimedPath
+from pipistrelle.experiments.tables import LabelledPoints
 from pipistrelle.figures.film import film_writer
 from pipistrelle.figures.maps import (
     PLACED,
@@ -162,9 +163,9 @@ def animate_mission(
 
     Examples
     --------
-    >>> animate_mission({}, Path("mission.avi"))
+    >>> animate_mission({}, Path("mission.gif"))
     Traceback (most recent call last):
-    pipistrelle.config.InputError: mission.avi: found the ending '.avi', expected .gif or .mp4
+    ValueError: an animation needs at least one frame
     """
     import matplotlib
 
@@ -172,9 +173,11 @@ def animate_mission(
     if not any(snapshots.values()):
         raise ValueError("an animation needs at least one frame")
     with matplotlib.rc_context(STYLE):
+        times = _times(snapshots, pictures)
+        start = times[0] if true_path is None else true_path[0][0]
         figure, panels = _stage(snapshots, true_path, true_landmarks, beacon, beamwidth)
         try:
-            write(_play(figure, panels, _times(snapshots, pictures)), path)
+            write(_play(figure, panels, times, start), path)
         except OSError as error:
             reason = error.strerror or error
             raise InputError(
@@ -231,7 +234,7 @@ def _stage(
 
 
 def _play(
-    figure: "Figure", panels: Sequence["_Panel"], times: Float[np.ndarray, " p"]
+    figure: "Figure", panels: Sequence["_Panel"], times: Float[np.ndarray, " p"], start: float
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """Yield the pictures: the background is drawn once, what moves on a copy of it."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -245,7 +248,7 @@ def _play(
         canvas.restore_region(background)
         for panel in panels:
             panel.show(time, picture)
-        clock.set_text(f"{time:.1f} s")
+        clock.set_text(f"{time - start:.1f} s")
         figure.draw_artist(clock)
         yield np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
 

@@ -105,14 +105,20 @@ def write_mp4(pictures: Pictures, path: Path) -> None:
     ------
     InputError
         Where ffmpeg fails; in its own words.
+    ValueError
+        Without pictures.
 
     Examples
     --------
-    `animate_mission` writes one wherever its path ends in .mp4.
+    >>> write_mp4([], Path("mission.mp4"))
+    Traceback (most recent call last):
+    ValueError: a film needs at least one picture
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     pictures = iter(pictures)
-    first = next(pictures)
+    first = next(pictures, None)
+    if first is None:
+        raise ValueError("a film needs at least one picture")
+    path.parent.mkdir(parents=True, exist_ok=True)
     command = _ffmpeg(first.shape[1], first.shape[0], path)
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
         assert ffmpeg.stdin

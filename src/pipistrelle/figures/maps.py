@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipistrelle.estimation.models import Landmarks
-from pipistrelle.experiments.results import LabelledPoints, TimedPath
+from pipistrelle.experiments.results import TimedPath
+from pipistrelle.experiments.tables import LabelledPoints
 from pipistrelle.figures.style import INK, TRUTH, strategy_colour
 
 if TYPE_CHECKING:
@@ -191,8 +192,10 @@ def view(
 
     Examples
     --------
-    >>> view(None, None, np.ones(2), [np.array([[0.0, 9.0, 0.0], [10.0, 0.0, 0.0]])], [])
-    ((-0.6, 10.6), (-0.54, 9.54))
+    >>> path = np.array([[0.0, 9.0, 0.0], [10.0, 0.0, 0.0]])
+    >>> np.round(view(None, None, np.ones(2), [path], []), 9)
+    array([[-0.6 , 10.6 ],
+           [-0.54,  9.54]])
     """
     points = paths if true_path is None else [true_path[1]]
     marks = [rows.mean[placed(rows)] for rows in maps]

@@ -7,7 +7,8 @@ import numpy as np
 
 from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
 from pipistrelle.evaluation.consistency import anees_bounds, nees
-from pipistrelle.experiments.results import LabelledPoints, TimedPath, TrialResult
+from pipistrelle.experiments.results import TimedPath, TrialResult
+from pipistrelle.experiments.tables import LabelledPoints
 from pipistrelle.figures.maps import (
     PLACED,
     RAY,
@@ -249,15 +250,16 @@ def _draw_errors(rows: Sequence["Axes"], trial: TrialResult, true_path: np.ndarr
     variance = np.stack([covariance[:, 0, 0] + covariance[:, 1, 1], covariance[:, 2, 2]])
     bounds = 3.0 * np.sqrt(np.maximum(variance, 0.0))
     position, heading, consistency = rows
+    elapsed = track.time - track.time[0]
     distance = position_error(track.pose.mean, true_path)
-    position.fill_between(track.time, bounds[0], color=colour, alpha=0.16, lw=0)
-    position.plot(track.time, distance, color=colour, lw=1.1)
+    position.fill_between(elapsed, bounds[0], color=colour, alpha=0.16, lw=0)
+    position.plot(elapsed, distance, color=colour, lw=1.1)
     turn, bound = np.rad2deg(error[:, 2]), np.rad2deg(bounds[1])
-    heading.fill_between(track.time, -bound, bound, color=colour, alpha=0.16, lw=0)
-    heading.plot(track.time, turn, color=colour, lw=1.1)
+    heading.fill_between(elapsed, -bound, bound, color=colour, alpha=0.16, lw=0)
+    heading.plot(elapsed, turn, color=colour, lw=1.1)
     consistency.axhspan(*anees_bounds(1), color="#d9d9d9", alpha=0.6, lw=0)
-    consistency.plot(track.time, nees(error, covariance), color=colour, lw=0.9)
-    consistency.set(yscale="log", xlabel="time [s]", xlim=(track.time[0], track.time[-1]))
+    consistency.plot(elapsed, nees(error, covariance), color=colour, lw=0.9)
+    consistency.set(yscale="log", xlabel="time [s]", xlim=(0.0, elapsed[-1]))
     for axes in (position, heading):
         axes.tick_params(labelbottom=False)
 

@@ -81,12 +81,12 @@ def progress(quiet: bool) -> "Iterator[Progress]":
 
 def _lines() -> "Progress":
     """Print a stage when it is done."""
-    started: dict[str, float] = {}
+    elapsed = _stopwatch()
 
     def show(stage: str, done: int, total: int) -> None:
-        begin = started.setdefault(stage, perf_counter())
+        rate = _rate(done, elapsed(stage))
         if done == total:
-            say(f"{stage:<14}{_rate(done, perf_counter() - begin)}")
+            say(f"{stage:<14}{rate}")
 
     return show
 
@@ -98,19 +98,30 @@ def _bars() -> "Iterator[Progress]":
     from rich.progress import BarColumn, TextColumn
     from rich.progress import Progress as Bars
 
-    started: dict[str, float] = {}
-    tasks = {}
+    elapsed, tasks = _stopwatch(), {}
     columns = (TextColumn("{task.description:<14}"), BarColumn(), TextColumn("{task.fields[rate]}"))
     with Bars(*columns, console=Console(stderr=True)) as bars:
 
         def show(stage: str, done: int, total: int) -> None:
+            rate = _rate(done, elapsed(stage))
             if stage not in tasks:
-                started[stage] = perf_counter()
                 tasks[stage] = bars.add_task(stage, total=total, rate="")
-            rate = _rate(done, perf_counter() - started[stage])
             bars.update(tasks[stage], completed=done, rate=rate)
 
         yield show
+
+
+def _stopwatch() -> Callable[[str], float]:
+    """Return what times stages [s]: each from the last word of the one before it."""
+    began, latest = {}, perf_counter()
+
+    def elapsed(stage: str) -> float:
+        nonlocal latest
+        begin = began.setdefault(stage, latest)
+        latest = perf_counter()
+        return latest - begin
+
+    return elapsed
 
 
 def _rate(frames: int, elapsed: float) -> str:
