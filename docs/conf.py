@@ -18,6 +18,7 @@ author = "The Pipistrelle developers"
 copyright = author
 version = release = pipistrelle.__version__
 
+suppress_warnings = ["config.cache"]  # the gallery is given a function
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
@@ -71,6 +72,7 @@ sphinx_gallery_conf = {
     "remove_config_comments": True,
     "plot_gallery": "True",
     "abort_on_example_error": True,
+    "run_stale_examples": True,  # an example shows the package as it is now
 }
 
 

@@ -24,6 +24,7 @@ from reference.missions import (
     followed,
     paper_filter,
     paper_mission,
+    ray_config,
     scan_of,
     scattered,
     steady,
@@ -67,7 +68,7 @@ def assert_equal_to_reference(slam, mission, start=START):
 
 
 def assert_equal_whole_run(strategy, weights, partial, power, gate):
-    slam = paper_filter(rays=RayConfig(weights=weights, partial=partial, power=power), gate=gate)
+    slam = paper_filter(rays=ray_config(weights=weights, partial=partial, power=power), gate=gate)
     mission = paper_mission(strategy, outliers=0.02)
     belief = assert_equal_to_reference(slam, mission)
     assert np.unique(belief.landmark).size > 30
@@ -124,7 +125,7 @@ def test_unicycle_that_stops_turns_and_reverses_equals_the_slow_reference():
 def test_reference_is_the_same_in_josephs_form():
     mission = paper_mission("fused", frames=30)
     short, joseph = (
-        SlowEkfSlam(BICYCLE, 0.2, 0.15, RayConfig(), joseph=form).start(
+        SlowEkfSlam(BICYCLE, 0.2, 0.15, ray_config(), joseph=form).start(
             START.mean, START.covariance
         )
         for form in (False, True)
@@ -142,7 +143,7 @@ def test_reference_is_the_same_in_josephs_form():
 def test_correspondence_carried_in_the_state_changes_nothing():
     mission = paper_mission("fused", frames=100)
     without, carried = (
-        SlowEkfSlam(BICYCLE, 0.2, 0.15, RayConfig(), carry_correspondence=carry).start(
+        SlowEkfSlam(BICYCLE, 0.2, 0.15, ray_config(), carry_correspondence=carry).start(
             START.mean, START.covariance
         )
         for carry in (False, True)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from pipistrelle.config import RayConfig
 from pipistrelle.estimation.models import Gaussian
 from pipistrelle.geometry import wrap
 from reference.ekf_slam import SlowEkfSlam
@@ -15,6 +14,7 @@ from reference.missions import (
     STEP,
     draw_mission,
     paper_filter,
+    ray_config,
     scan_of,
     scattered,
     steady,
@@ -72,7 +72,7 @@ def test_bearings_from_one_known_place_never_tell_the_members_apart():
 @pytest.mark.parametrize("weights", ["instantaneous", "aggregated"])
 @pytest.mark.parametrize("power", [1.0, 3.0])
 def test_parallax_finds_the_member_that_holds_the_landmark(weights, power):
-    slam = paper_filter(bearing_std=0.05, rays=RayConfig(weights=weights, power=power))
+    slam = paper_filter(bearing_std=0.05, rays=ray_config(weights=weights, power=power))
     *_, belief = seen_along_a_line(slam, frames=16)
     rows = belief.landmarks()
     heaviest = np.argmax(np.where(rows.landmark == 7, rows.weight, 0))
@@ -85,7 +85,7 @@ def test_pruning_removes_rows_and_changes_nothing_else():
     """Before and after a prune: the same numbers, to the last bit, without the pruned rows."""
     pruning, keeping = (
         paper_filter(bearing_std=0.05),
-        paper_filter(bearing_std=0.05, rays=RayConfig(prune=0.0)),
+        paper_filter(bearing_std=0.05, rays=ray_config(prune=0.0)),
     )
     belief = pruning.update(pruning.init(START), scan_of((1, 3.0, -1.0), (7, np.nan, 1.2)))
     belief = pruning.update(belief, scan_of((8, np.nan, -2.0), (9, 6.0, 2.0)))
@@ -122,7 +122,7 @@ def test_range_places_a_partial_landmark_anew():
 
 
 def test_range_moves_the_heaviest_member_where_settings_say_so():
-    slam = paper_filter(rays=RayConfig(partial="heaviest"))
+    slam = paper_filter(rays=ray_config(partial="heaviest"))
     *_, before = seen_along_a_line(slam, frames=2)
     heaviest = np.argmax(np.where(before.landmark == 7, before.weight, 0))
     offset = before.mean[3:].reshape(-1, 2)[heaviest] - before.mean[:2]
@@ -162,7 +162,7 @@ def test_keeping_the_common_bearing_noise_makes_the_filter_surer_and_not_more_ri
         field, drive = scattered(rng, 50), steady(CIRCLE, 60)
         mission = draw_mission(rng, BICYCLE, START, field, drive, beamwidth=0, hearing=14.0)
         without, keeping = (
-            SlowEkfSlam(BICYCLE, 0.2, 0.15, RayConfig(), common_bearing_noise=common).start(
+            SlowEkfSlam(BICYCLE, 0.2, 0.15, ray_config(), common_bearing_noise=common).start(
                 START.mean, START.covariance
             )
             for common in (False, True)

@@ -104,9 +104,14 @@ def scan_of(*rows, time=0.0):
     )
 
 
+def ray_config(**changes):
+    """Return the rays of Table I, with tau and n fixed, whatever value is being fitted."""
+    return RayConfig(**({"prune": 1e-3, "power": 1.0} | changes))
+
+
 def paper_filter(**changes):
     """Return the filter with the paper's settings, but for the changes."""
-    slam = EkfSlam(motion=BICYCLE, range_std=0.2, bearing_std=0.15, rays=RayConfig())
+    slam = EkfSlam(motion=BICYCLE, range_std=0.2, bearing_std=0.15, rays=ray_config())
     return replace(slam, **changes)
 
 

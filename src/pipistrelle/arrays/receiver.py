@@ -255,7 +255,7 @@ def _add_echo_blocks(
 ):  # fmt: skip
     """Add each arrival's envelope, block by block, times its steering vector."""
     blocks, faces, _, elements = signal.shape
-    sums, steering = np.empty(blank + 4, dtype=np.complex128), np.empty(elements, np.complex128)
+    sums, steering = np.empty(blocks, dtype=np.complex128), np.empty(elements, np.complex128)
     for a in range(delay.size):
         start = max(math.ceil(delay[a] * rate), blank * block)
         stop = min(math.ceil((delay[a] + duration[a]) * rate), (blank + blocks) * block)

@@ -85,9 +85,9 @@ class Log:
     """
 
     name: str
-    time: Float[np.ndarray, " k+1"]
-    controls: Float[np.ndarray, "k 2"]
-    dt: Float[np.ndarray, " k"]
+    time: Float[np.ndarray, " t"]
+    controls: Float[np.ndarray, "t-1 2"]
+    dt: Float[np.ndarray, " t-1"]
     scans: tuple[Scan, ...]
     motion: Literal["unicycle", "bicycle"]
     wheelbase: float = 1.0

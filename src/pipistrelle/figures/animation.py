@@ -8,7 +8,7 @@ measurements, rays being born and thinned out, landmarks as they turn full, the 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -57,6 +57,7 @@ FLASH = 4
 """Pictures during which a landmark that has turned full is ringed."""
 
 
+@runtime_checkable
 class Belief(Protocol):
     """What every filter's belief answers."""
 
@@ -296,7 +297,7 @@ class _Panel:
 
         colour = self.colour
         self.beam = areas(fc=INK, alpha=0.13, lw=0)
-        self.members = areas(ec="none")
+        self.members = areas(lw=0.8)
         self.pruned = areas(fc="none", ec=INK, lw=0.8, ls=":")
         self.true = points(color=TRUTH, lw=3.2, alpha=0.45)
         self.bearings = lines(colors=colour, lw=0.7, ls=(0, (4, 3)), alpha=0.6)
@@ -343,6 +344,7 @@ class _Panel:
         self.members.set(
             verts=ellipses(rows.mean[~full], rows.covariance[~full], RAY),
             facecolor=shades(self.colour, rows.weight[~full]),
+            edgecolor=shades(self.colour, rows.weight[~full], most=1.0),
         )
         self.full.set(verts=ellipses(rows.mean[full], rows.covariance[full], PLACED))
         self.dots.set_data(*rows.mean[full].T)

@@ -171,7 +171,7 @@ def view(
     true_path: TimedPath | None,
     true_landmarks: LabelledPoints | None,
     beacon: Float[np.ndarray, "2"] | None,
-    paths: Sequence[Float[np.ndarray, "k 3"]],
+    paths: Sequence[Float[np.ndarray, "_ 3"]],
     maps: Sequence[Landmarks],
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Limits of a map that shows what is true and, where the truth is not known, what is estimated.

@@ -193,7 +193,8 @@ def _draw_estimate(axes: "Axes", trial: TrialResult, true_landmarks: LabelledPoi
     ties = _ties(trial, true_landmarks)
     axes.add_collection(LineCollection(ties, colors=INK, lw=0.7, zorder=4.5))
     outline = ellipses(rows.mean[~full], rows.covariance[~full], RAY)
-    style = {"fc": shades(colour, rows.weight[~full]), "ec": "none"}
+    weight = rows.weight[~full]
+    style = {"fc": shades(colour, weight), "ec": shades(colour, weight, most=1.0), "lw": 0.8}
     axes.add_collection(PolyCollection(list(outline), **style, zorder=1))
     labels = np.unique(rows.landmark[~full])
     rays = [rows.mean[rows.landmark == label] for label in labels]

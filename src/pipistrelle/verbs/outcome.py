@@ -51,6 +51,8 @@ def result_folder(options: OutputOptions, name: str) -> Iterator[Path]:
     except BaseException:
         with contextlib.suppress(OSError):
             folder.rmdir()
+            if not (latest := folder.parent / "latest").exists():
+                latest.unlink()
         raise
 
 

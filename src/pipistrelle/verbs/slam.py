@@ -129,7 +129,8 @@ def _layer(log: Path, config: Path | None, settings: SlamFlags, gate: float | No
     flags = from_flags(settings)
     for key, given in flags.items():
         if not _is_open(key):
-            raise InputError(f"{given.where}: the log decides this; leave the flag out")
+            why = "the log decides this" if key in LOGGED else "means nothing to a recorded log"
+            raise InputError(f"{given.where}: {why}; leave the flag out")
     if gate is not None and GATE_KEY in flags:
         raise InputError("--gate and --filter.gate are one setting; give one of them")
     short = {} if gate is None else {GATE_KEY: Given(gate, "--gate")}

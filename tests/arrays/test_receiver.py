@@ -1,0 +1,206 @@
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from pipistrelle.acoustics.arrivals import ACTIVE, PASSIVE, Arrivals, arrivals_of_emission
+from pipistrelle.arrays.layout import square_of_four
+from pipistrelle.arrays.receiver import (
+    BLOCK,
+    add_echo_blocks,
+    blocks_to_hear,
+    noise_blocks,
+    record_samples,
+    sampling,
+)
+from pipistrelle.config import BeaconConfig, Config, EmitterConfig, InputError, ReceiverConfig
+
+law = settings(deadline=None, max_examples=40)
+CONFIG = Config()
+LAYOUT, SETTLED = square_of_four(CONFIG.receiver), sampling(CONFIG)
+SIGMAS = 4.9  # chance: one in a million
+
+
+def one(delay, bearing=0.3, shift=1.0, source=PASSIVE, level_db=0.0):
+    """Return a single arrival, its frequency shifted by a factor."""
+    return Arrivals(
+        delay=np.array([delay]),
+        level_db=np.array([level_db]),
+        bearing=np.array([bearing]),
+        frequency=np.array([SETTLED.tones[source] * shift]),
+        source=np.array([source], dtype=np.int8),
+        landmark=np.array([1]),
+    )
+
+
+def block_sums(samples, settled=SETTLED):
+    """Return the dense record's sums over blocks, per tone: the definition."""
+    n = settled.pulse * settled.block + np.arange(samples.shape[0])
+    turned = [
+        samples * np.exp(-2j * np.pi * tone * n / settled.rate)[:, None, None]
+        for tone in settled.tones
+    ]
+    blocks = samples.shape[0] // settled.block
+    shape = (blocks, settled.block, *samples.shape[1:])
+    return np.stack([each.reshape(shape).sum(axis=1) for each in turned], axis=2)
+
+
+def both(arrivals, blocks, layout=LAYOUT, settled=SETTLED):
+    dense = block_sums(record_samples(blocks, arrivals, layout, settled, None), settled)
+    fast = np.zeros_like(dense)
+    add_echo_blocks(fast, arrivals, layout, settled)
+    return fast, dense
+
+
+@given(
+    delay=st.floats(0.0, 12e-3),
+    bearing=st.floats(-np.pi, np.pi),
+    shift=st.floats(0.7, 1.4),
+    source=st.sampled_from([ACTIVE, PASSIVE]),
+)
+@example(delay=0.0, bearing=0.0, shift=1.0, source=ACTIVE)  # over before the first block
+@example(delay=2.8e-3, bearing=0.0, shift=1.0, source=ACTIVE)  # whole blocks
+@example(delay=2.8e-3 + 5e-6, bearing=0.0, shift=1.0, source=PASSIVE)  # a sample off
+@example(delay=8.4e-3 - 5e-6, bearing=0.0, shift=1.0, source=PASSIVE)  # one sample, at the end
+@example(delay=2.8e-3, bearing=np.pi / 2, shift=0.7, source=PASSIVE)  # long, along two faces
+@law
+def test_block_sums_of_an_arrival_are_those_of_its_samples(delay, bearing, shift, source):
+    fast, dense = both(one(delay, bearing, shift, source), 28)
+    assert np.abs(fast - dense).max() <= 1e-10 * SETTLED.block  # a whole block of amplitude 1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_block_sums_of_a_whole_world_are_those_of_its_samples(seed):
+    rng = np.random.default_rng(seed)
+    pose = np.array([*rng.uniform(-9.0, 9.0, 2), rng.uniform(-np.pi, np.pi)])
+    landmarks, beacon = rng.uniform(-18.0, 18.0, (50, 2)), rng.uniform(-10.0, 10.0, 2)
+    emission = arrivals_of_emission(pose, rng.uniform(-1.0, 1.0, 2), landmarks, beacon, CONFIG)
+    fast, dense = both(emission, blocks_to_hear(emission, SETTLED))
+    assert np.abs(fast - dense).max() <= 1e-10 * np.abs(dense).max()
+
+
+def test_without_the_doppler_shift_the_sums_would_differ():
+    fast, _ = both(one(9e-3, shift=1.0), 40)
+    _, dense = both(one(9e-3, shift=1.0 + 2 * 0.75 / 343.0), 40)
+    assert np.abs(fast - dense).max() > 0.1 * SETTLED.block
+
+
+def test_other_settings_keep_the_engines_equal():
+    config = Config(
+        emitter=EmitterConfig(frequency=40e3, pulse=1e-3),
+        beacon=BeaconConfig(frequency=25e3),
+        receiver=ReceiverConfig(elements=5, sample_rate=125e3),
+    )
+    settled = sampling(config)
+    fast, dense = both(one(3.217e-3), 20, square_of_four(config.receiver), settled)
+    assert (settled.block, settled.pulse) == (25, 5)
+    assert np.abs(fast - dense).max() <= 1e-10 * settled.block
+
+
+@given(bearing=st.floats(-np.pi, np.pi))
+@law
+def test_a_face_hears_what_lies_within_90_degrees_of_its_normal_and_nothing_else(bearing):
+    fast, _ = both(one(5e-3, bearing), 28)
+    hears = np.abs(fast).max(axis=(0, 2, 3)) > 0.0
+    assert hears.tolist() == (np.cos(bearing - LAYOUT.normal) >= 0.0).tolist()
+    assert hears.sum() == 2
+
+
+def test_nothing_is_heard_while_the_vehicle_calls():
+    early, late = one(1e-3), one(2.8e-3)
+    first, second = both(early, 28)[0], both(late, 28)[0]
+    assert not first[5:].any()  # 1 ms of the call is left after the blanking
+    np.testing.assert_allclose(np.abs(first[:5, 0, 1]), 40.0, rtol=1e-12)
+    np.testing.assert_allclose(np.abs(second[:14, 0, 1]), 40.0, rtol=1e-12)
+
+
+@given(delay=st.floats(2.8e-3, 0.3), shift=st.floats(0.995, 1.005))
+@law
+def test_the_recording_ends_with_the_last_arrival(delay, shift):
+    heard = one(delay, shift=shift)
+    blocks = blocks_to_hear(heard, SETTLED)
+    longer = np.zeros((blocks + 5, 4, 2, 10), dtype=complex)
+    add_echo_blocks(longer, heard, LAYOUT, SETTLED)
+    assert not longer[blocks:].any()
+    assert longer[blocks - 3 :].any() or blocks == 2 * SETTLED.pulse
+
+
+def test_an_empty_or_near_world_is_heard_for_two_calls():
+    nothing = one(0.0)
+    assert blocks_to_hear(nothing, SETTLED) == 28
+
+
+def test_levels_are_amplitudes_in_decibels_and_arrivals_add():
+    loud, soft = both(one(5e-3, level_db=20.0), 28)[0], both(one(5e-3), 28)[0]
+    np.testing.assert_allclose(loud, 10.0 * soft, rtol=1e-12)
+    signal = loud.copy()
+    add_echo_blocks(signal, one(5e-3), LAYOUT, SETTLED)
+    np.testing.assert_allclose(signal, 11.0 * soft, rtol=1e-12)
+
+
+def test_block_noise_has_forty_times_the_variance_of_a_sample_in_each_tone():
+    config = Config(receiver=ReceiverConfig(noise_level_db=6.0))
+    settled = sampling(config)
+    noise = noise_blocks(5000, LAYOUT, settled, key=3)
+    variance = np.mean(np.abs(noise) ** 2, axis=(0, 3)) / (40.0 * 10.0**0.6)
+    assert np.abs(variance - 1.0).max() < SIGMAS / np.sqrt(5000 * 10)
+    samples = record_samples(2000, one(0.0), LAYOUT, settled, np.random.default_rng(3))
+    sums = block_sums(samples, settled)
+    variance = np.mean(np.abs(sums) ** 2, axis=(0, 3)) / (40.0 * 10.0**0.6)
+    assert np.abs(variance - 1.0).max() < SIGMAS / np.sqrt(2000 * 10)
+
+
+def test_block_sums_of_sampled_noise_are_as_independent_as_those_drawn():
+    face = square_of_four(CONFIG.receiver)
+    sampled = block_sums(record_samples(1500, one(0.0), face, SETTLED, np.random.default_rng(5)))
+    for noise in (sampled, noise_blocks(1500, face, SETTLED, key=5)):
+        flat = noise.reshape(1500, -1) / np.sqrt(40.0)
+        for lag in (0, 1, 2):
+            product = flat[lag:].T @ flat[: 1500 - lag].conj() / np.sqrt(1500)
+            if lag == 0:
+                np.fill_diagonal(product, 0.0)
+            assert np.abs(product).max() < np.sqrt(SIGMAS**2 / 2 + np.log(product.size))
+
+
+def test_neighbouring_bins_alone_are_uncorrelated():
+    # 32 kHz is no whole bin of a block: its sums would carry part of 30 kHz's noise.
+    samples = record_samples(1500, one(0.0), LAYOUT, SETTLED, np.random.default_rng(5))
+    n = np.arange(samples.shape[0])
+    parts = [
+        (samples[:, 0, 0] * np.exp(-2j * np.pi * f * n / 200e3)).reshape(-1, 40).sum(axis=1)
+        for f in (30e3, 35e3, 32e3)
+    ]
+    whole = abs(np.mean(parts[0] * parts[1].conj())) / 40.0
+    broken = abs(np.mean(parts[0] * parts[2].conj() * np.exp(-2j * np.pi * 2e3 * n[::40] / 200e3)))
+    assert whole < SIGMAS / np.sqrt(1500)
+    assert broken / 40.0 > 3 * SIGMAS / np.sqrt(1500)
+
+
+@given(short=st.integers(1, 30), more=st.integers(0, 30))
+@law
+def test_a_blocks_noise_does_not_depend_on_how_many_are_drawn(short, more):
+    one_, two = (noise_blocks(n, LAYOUT, SETTLED, key=9) for n in (short, short + more))
+    assert one_.tobytes() == two[:short].tobytes()
+
+
+def test_blocks_are_a_fifth_of_a_millisecond_and_the_call_fourteen_of_them():
+    assert (BLOCK, SETTLED.block, SETTLED.pulse) == (2e-4, 40, 14)
+    assert SETTLED.tones.tolist() == [35e3, 30e3]
+    assert SETTLED.noise_std == 1.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "key"),
+    [
+        ({"emitter": {"frequency": 36e3}}, "emitter.frequency"),
+        ({"beacon": {"frequency": 31e3}}, "beacon.frequency"),
+        ({"beacon": {"frequency": 35e3}}, "beacon.frequency"),
+        ({"emitter": {"pulse": 2.9e-3}}, "emitter.pulse"),
+        ({"emitter": {"pulse": 1e-5}}, "emitter.pulse"),
+        ({"receiver": {"sample_rate": 192001.0}}, "receiver.sample_rate"),
+        ({"receiver": {"sample_rate": 1.0}}, "receiver.sample_rate"),
+    ],
+)
+def test_settings_that_blocks_cannot_hold_are_refused_by_name(settings, key):
+    with pytest.raises(InputError, match=f"^{key}: found .*expected"):
+        sampling(Config.model_validate(settings))

@@ -1,0 +1,66 @@
+"""Every equation of the paper is cited by the docstring that implements it."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+SOURCES = sorted((Path(__file__).resolve().parents[1] / "src").rglob("*.py"))
+OF_THE_PAPER = set(range(1, 28))
+NOT_BUILT = {12, 13, 14, 15, 22}
+"""FastSLAM 2.0's. To build one, cite it and take it out of here."""
+
+CITATION = re.compile(r"\bEqs?\. ((?:\(\d+\)(?:, | and | to )?)+)")
+OTHER_WORK = re.compile(r"\bSource: .*")
+LOOSE = re.compile(r"\b(?:[Ee]qs?\.?|[Ee]quations?) ?\d|\bEqs?\.? ?\(\d+[^)\d]|\bEqs? \(\d")
+
+
+def docstrings(path: Path) -> Iterator[str]:
+    """Yield a module's docstrings, each paragraph on one line, other works' equations left out."""
+    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        text = ast.get_docstring(node) if isinstance(node, kinds) else None
+        for paragraph in (text or "").split("\n\n"):
+            yield OTHER_WORK.sub("", " ".join(paragraph.split()))
+
+
+def cited(text: str) -> set[int]:
+    """Return the numbers that a text cites: "Eq. (3)", "Eqs. (2), (5) and (6)", "Eqs. (2) to (4)".
+
+    A range cites what lies between its ends.
+    """
+    numbers: set[int] = set()
+    for listed in CITATION.findall(text):
+        for part in re.split(r", | and ", listed):
+            ends = [int(number) for number in re.findall(r"\d+", part)]
+            numbers |= set(range(min(ends), max(ends) + 1)) if ends else set()
+    return numbers
+
+
+def test_citations_are_read_as_they_are_written():
+    assert cited("Bradley & Abaid, Eqs. (2), (4) to (6) and (9), and Eq. (11).") == {
+        2, 4, 5, 6, 9, 11
+    }  # fmt: skip
+    assert cited("Sec. III, Table 4, (5), Eq. 6, f(7)") == set()
+
+
+def test_every_equation_of_the_paper_is_cited_by_a_docstring():
+    everywhere = set().union(*(cited(text) for path in SOURCES for text in docstrings(path)))
+    assert sorted(OF_THE_PAPER - NOT_BUILT - everywhere) == []
+    assert sorted(everywhere - OF_THE_PAPER) == [], "the paper has 27 equations"
+
+
+def test_equations_that_are_not_built_are_not_cited():
+    for path in SOURCES:
+        for text in docstrings(path):
+            assert cited(text).isdisjoint(NOT_BUILT), f"{path}: {text}"
+
+
+def test_citations_have_one_form():
+    loose = [
+        f"{path.name}:{number}: {line.strip()}"
+        for path in SOURCES
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1)
+        if LOOSE.search(line)
+    ]
+    assert loose == []

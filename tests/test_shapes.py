@@ -1,0 +1,36 @@
+"""Every array has the shape and the type that its annotation says.
+
+    NUMBA_DISABLE_JIT=1 pytest -m shapes --jaxtyping-packages=pipistrelle,beartype.beartype
+"""
+
+from pathlib import Path
+
+import pytest
+
+from pipistrelle.config import STRATEGIES, Config, ReceiverConfig, ScenarioConfig
+from pipistrelle.experiments.replay import load, replay
+from pipistrelle.experiments.trial import run_mission
+
+pytestmark = [
+    pytest.mark.shapes,
+    # uncompiled, the noise's hash, which wraps on purpose, warns of it
+    pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning"),
+]
+LOGS = Path(__file__).parent / "data"
+
+
+@pytest.mark.parametrize("engine", ["block", "dense"])
+def test_a_short_mission_keeps_to_its_annotations(engine):
+    config = Config(
+        scenario=ScenarioConfig(steps=8, landmarks=12, radius=12.0),
+        receiver=ReceiverConfig(engine=engine),
+    )
+    mission = run_mission(config, STRATEGIES)
+    assert [trial.strategy for trial in mission.trials] == list(STRATEGIES)
+
+
+@pytest.mark.parametrize("name", ["unicycle_log", "bicycle_log"])
+def test_a_recorded_log_keeps_to_its_annotations(name):
+    log, truth = load(LOGS / name)
+    trials = replay(log, truth, STRATEGIES, ("ekf",), 0.6, Config())
+    assert len(trials) == 3
