@@ -15,7 +15,6 @@ mpl.use("Agg")
 
 project = "Pipistrelle"
 author = "The Pipistrelle developers"
-copyright = author
 version = release = pipistrelle.__version__
 
 suppress_warnings = ["config.cache"]  # the gallery is given a function
@@ -38,6 +37,7 @@ html_css_files = ["pages.css"]
 html_copy_source = False
 html_show_copyright = False
 
+add_module_names = False
 autodoc_typehints = "none"  # shapes and units stand in the docstrings
 autodoc_member_order = "bysource"
 autodoc_class_signature = "separated"
@@ -45,6 +45,9 @@ autodoc_default_options = {"members": True}
 napoleon_google_docstring = False
 napoleon_use_ivar = True
 napoleon_use_rtype = False
+
+
+HIDDEN_COLON = "\ue000"
 
 
 def figures_of_block(block, block_vars, gallery_conf):
@@ -64,6 +67,7 @@ sphinx_gallery_conf = {
     "gallery_dirs": "gallery",
     "filename_pattern": r"/\d\d_",
     "ignore_pattern": r"__init__\.py",
+    "within_subsection_order": "FileNameSortKey",
     "image_scrapers": (figures_of_block,),
     "download_all_examples": False,
     "show_memory": False,
@@ -91,11 +95,23 @@ def show_kernels(app):
                     setattr(module, key, value.py_func)
 
 
-def escape_shapes(app, what, name, obj, options, lines):
-    """Keep the star of a shape such as (*n) from opening an emphasis."""
+def protect(app, what, name, obj, options, lines):
+    """Hide from napoleon what it would take for markup.
+
+    The star of a shape such as (*n) opens no emphasis, and what stands before the colon in the
+    sentence about a constant is not its type.
+    """
     lines[:] = [re.sub(r"\(\*(?=\w+[,)])", r"(\\*", line) for line in lines]
+    if what in ("attribute", "data"):
+        lines[:] = [line.replace(":", HIDDEN_COLON) for line in lines]
+
+
+def unprotect(app, what, name, obj, options, lines):
+    """Show again what was hidden."""
+    lines[:] = [line.replace(HIDDEN_COLON, ":") for line in lines]
 
 
 def setup(app):
     app.connect("builder-inited", show_kernels, priority=900)
-    app.connect("autodoc-process-docstring", escape_shapes, priority=100)
+    app.connect("autodoc-process-docstring", protect, priority=100)
+    app.connect("autodoc-process-docstring", unprotect, priority=900)

@@ -62,8 +62,9 @@ found = detect(matched, finder, start=start, interval=1.0 / settled.rate, pulse=
 
 # %%
 # The front face. Above, what one microphone hears; most echoes are below its noise. Below, the
-# energy of both tones after the matched filter; dots are detections. Where a call of one tone begins
-# and ends it leaks into the other, 33 dB weaker but above the threshold: the detector must know.
+# energy of both tones after the matched filter; dots are detections. Where a call of one tone
+# begins and ends it leaks into the other, 33 dB weaker but above the threshold: the detector must
+# know.
 
 front = found.face == 0
 names, colours = ("own, 35 kHz", "beacon's, 30 kHz"), ("#1f4e96", "#d99a00")

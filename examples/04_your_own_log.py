@@ -79,9 +79,7 @@ with TemporaryDirectory() as place:
 # On the command line the rest is ``pipistrelle slam posts``.
 
 (trial,) = replay(log, truth, ["fused"], ["ekf"], None, Config())
-figure = draw_mission(
-    [trial], true_path=(truth.time, truth.path), true_landmarks=truth.landmarks
-)
+figure = draw_mission([trial], true_path=(truth.time, truth.path), true_landmarks=truth.landmarks)
 
 # %%
 # How far off are the posts on the map?

@@ -1,11 +1,15 @@
-"""Every equation of the paper is cited by the docstring that implements it."""
+"""Every equation of the paper is cited by a docstring, and has its row in the documentation."""
 
 import ast
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from pkgutil import resolve_name
 
-SOURCES = sorted((Path(__file__).resolve().parents[1] / "src").rglob("*.py"))
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCES = sorted((ROOT / "src").rglob("*.py"))
 OF_THE_PAPER = set(range(1, 28))
 NOT_BUILT = {12, 13, 14, 15, 22}
 """FastSLAM 2.0's. To build one, cite it and take it out of here."""
@@ -13,6 +17,12 @@ NOT_BUILT = {12, 13, 14, 15, 22}
 CITATION = re.compile(r"\bEqs?\. ((?:\(\d+\)(?:, | and | to )?)+)")
 OTHER_WORK = re.compile(r"\bSource: .*")
 LOOSE = re.compile(r"\b(?:[Ee]qs?\.?|[Ee]quations?) ?\d|\bEqs?\.? ?\(\d+[^)\d]|\bEqs? \(\d")
+
+ROW = re.compile(r"^\| \((\d+)\) \| .*? \| (.*?) \| (.*?) ?\|$", re.MULTILINE)
+ROWS = {
+    int(number): (implemented, proved)
+    for number, implemented, proved in ROW.findall((ROOT / "docs" / "equations.md").read_text())
+}
 
 
 def docstrings(path: Path) -> Iterator[str]:
@@ -64,3 +74,19 @@ def test_citations_have_one_form():
         if LOOSE.search(line)
     ]
     assert loose == []
+
+
+def test_the_page_of_equations_has_a_row_for_each():
+    assert set(ROWS) == OF_THE_PAPER
+    assert {number for number, row in ROWS.items() if row[0] == "not built yet"} == NOT_BUILT
+
+
+@pytest.mark.parametrize("number", sorted(OF_THE_PAPER - NOT_BUILT))
+def test_the_function_of_a_row_cites_its_equation_and_its_tests_exist(number):
+    implemented, proved = ROWS[number]
+    (name,) = re.findall(r"`~([\w.]+)`", implemented)
+    assert number in cited(" ".join((resolve_name(name).__doc__ or "").split())), name
+    tests = re.findall(r"`(test_\w+)`", proved)
+    everywhere = "\n".join(path.read_text() for path in (ROOT / "tests").rglob("test_*.py"))
+    assert tests
+    assert [test for test in tests if f"def {test}(" not in everywhere] == []

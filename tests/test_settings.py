@@ -45,21 +45,21 @@ def test_every_setting_of_the_configuration_is_known_and_says_what_it_means():
 
 
 @pytest.mark.parametrize(
-    ("file", "environment", "flags", "power"),
+    ("file", "environment", "flags", "ratio"),
     [
-        ("", {}, {}, 1.0),
-        ("rays.power = 2", {}, {}, 2.0),
-        ("rays.power = 2", {"PIPISTRELLE_RAYS__POWER": "3"}, {}, 3.0),
-        ("rays.power = 2", {"PIPISTRELLE_RAYS__POWER": "3"}, {"rays": {"power": 4.0}}, 4.0),
-        ("rays.power = 2", {}, {"rays": {"power": 4.0}}, 4.0),
-        ("", {"PIPISTRELLE_RAYS__POWER": "3"}, {"rays": {"power": 4.0}}, 4.0),
+        ("", {}, {}, RayConfig().ratio),
+        ("rays.ratio = 0.2", {}, {}, 0.2),
+        ("rays.ratio = 0.2", {"PIPISTRELLE_RAYS__RATIO": "0.3"}, {}, 0.3),
+        ("rays.ratio = 0.2", {"PIPISTRELLE_RAYS__RATIO": "0.3"}, {"rays": {"ratio": 0.4}}, 0.4),
+        ("rays.ratio = 0.2", {}, {"rays": {"ratio": 0.4}}, 0.4),
+        ("", {"PIPISTRELLE_RAYS__RATIO": "0.3"}, {"rays": {"ratio": 0.4}}, 0.4),
     ],
 )
 def test_flags_go_over_the_environment_over_the_file_over_the_defaults(
-    tmp_path, file, environment, flags, power
+    tmp_path, file, environment, flags, ratio
 ):
     layer = from_file(written(tmp_path, file)) | from_environment(environment) | from_flags(flags)
-    assert resolve(layer).rays.power == power
+    assert resolve(layer).rays.ratio == ratio
 
 
 def test_layers_leave_alone_what_they_do_not_name(tmp_path):

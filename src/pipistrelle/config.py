@@ -67,7 +67,7 @@ class AirConfig(Section):
     pressure_kpa: Positive = 101.325
     """[kPa]"""
     spreading: Literal["paper", "bistatic"] = "paper"
-    """Passive echoes: 20 log10(d1 + d2), the paper's mirror law, or 20 log10(d1 d2), a scatterer."""
+    """Passive echoes lose 20 log10(d1 + d2), the paper's mirror law, or 20 log10(d1 d2) [dB]."""
 
 
 class TargetConfig(Section):
@@ -194,6 +194,17 @@ class RayConfig(Section):
         return self
 
 
+class FastSlamConfig(Section):
+    """The second filter: particles instead of one Gaussian (Table I)."""
+
+    particles: Count = 100
+    """Number of particles."""
+    resample_below: Annotated[float, Field(ge=0, le=1)] = 0.75
+    """Resample when fewer effective particles than this share are left."""
+    mixture: Literal["federated", "exact"] = "federated"
+    """Bearings shared among a ray's members (the paper's) or an exact Gaussian mixture."""
+
+
 class Config(Section):
     """A whole mission. Each section is described in its own class."""
 
@@ -210,3 +221,4 @@ class Config(Section):
     motion: MotionConfig = MotionConfig()
     filter: FilterConfig = FilterConfig()
     rays: RayConfig = RayConfig()
+    fastslam: FastSlamConfig = FastSlamConfig()

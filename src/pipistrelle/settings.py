@@ -50,8 +50,8 @@ def known_settings() -> dict[Key, FieldInfo]:
 
     Examples
     --------
-    >>> known_settings()["rays", "power"].default
-    1.0
+    >>> known_settings()["air", "relative_humidity"].default
+    0.5
     """
     found = {}
     for name, field in Config.model_fields.items():

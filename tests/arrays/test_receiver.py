@@ -103,7 +103,7 @@ def test_a_face_hears_what_lies_within_90_degrees_of_its_normal_and_nothing_else
     fast, _ = both(one(5e-3, bearing), 28)
     hears = np.abs(fast).max(axis=(0, 2, 3)) > 0.0
     assert hears.tolist() == (np.cos(bearing - LAYOUT.normal) >= 0.0).tolist()
-    assert hears.sum() == 2
+    assert hears.sum() in (2, 3)  # 3 where it comes from straight before a face
 
 
 def test_nothing_is_heard_while_the_vehicle_calls():
@@ -159,7 +159,7 @@ def test_block_sums_of_sampled_noise_are_as_independent_as_those_drawn():
             product = flat[lag:].T @ flat[: 1500 - lag].conj() / np.sqrt(1500)
             if lag == 0:
                 np.fill_diagonal(product, 0.0)
-            assert np.abs(product).max() < np.sqrt(SIGMAS**2 / 2 + np.log(product.size))
+            assert np.abs(product).max() < np.sqrt(np.log(product.size / 1e-6))
 
 
 def test_neighbouring_bins_alone_are_uncorrelated():

@@ -28,7 +28,7 @@ from reference.missions import (
     scan_of,
     scattered,
     steady,
-)  # fmt: skip
+)
 
 FIELDS = ("mean", "covariance", "landmark", "weight")
 

@@ -17,7 +17,7 @@ from reference.missions import (
     paper_filter,
     paper_mission,
     scan_of,
-)  # fmt: skip
+)
 
 FIELDS = ("mean", "covariance", "landmark", "weight")
 TURNING = Motion(model="unicycle", control_std=(0.1, 0.5))

@@ -18,7 +18,7 @@ from reference.missions import (
     scan_of,
     scattered,
     steady,
-)  # fmt: skip
+)
 
 KNOWN_POSE = Gaussian(mean=np.zeros(3), covariance=np.zeros((3, 3)))
 TRUTH = np.array([1.0, -4.9])

@@ -34,8 +34,8 @@ def steering_vector(
 
     Examples
     --------
-    >>> half_wave = np.array([0.0, 0.0049])
-    >>> steering_vector(np.pi / 2, position=half_wave, frequency=35e3, speed_of_sound=343.0).round(9)
+    >>> half_wave = {"position": np.array([0.0, 0.0049]), "frequency": 35e3}
+    >>> steering_vector(np.pi / 2, **half_wave, speed_of_sound=343.0).round(9)
     array([ 1.+0.j, -1.+0.j])
     """
     wavenumber = 2.0 * np.pi * frequency / speed_of_sound

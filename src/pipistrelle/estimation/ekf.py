@@ -7,10 +7,7 @@ of the scan, then the new ones are placed from the corrected pose.
 """
 
 import math
-from dataclasses import dataclass
-from functools import lru_cache
-from statistics import NormalDist
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -28,34 +25,15 @@ from pipistrelle.estimation.joint import (
     drop_members,
     place,
 )
-from pipistrelle.estimation.models import MOTION_MODELS, Gaussian, Landmarks, Motion, sight
-from pipistrelle.estimation.rays import log_likelihood, ray_members, survivors, weigh_and_share
+from pipistrelle.estimation.models import Gaussian, Landmarks, Motion, motion_numbers, sight
+from pipistrelle.estimation.rays import (
+    heaviest,
+    log_likelihood,
+    sensing_of,
+    survivors,
+    weigh_and_share,
+)
 from pipistrelle.geometry import wrap_angle
-
-
-class Sensing(NamedTuple):
-    """What the kernels need to know of measurements and rays.
-
-    Attributes
-    ----------
-    range_variance, bearing_variance : [m^2], [rad^2]
-    passive_bound, active_bound : float
-        Largest squared Mahalanobis distances.
-    ray_ranges, ray_stds : (h) [m]
-    power, prune : float
-    aggregated, reinitialise : bool
-    """
-
-    range_variance: float
-    bearing_variance: float
-    passive_bound: float
-    active_bound: float
-    ray_ranges: Float[np.ndarray, " h"]
-    ray_stds: Float[np.ndarray, " h"]
-    power: float
-    prune: float
-    aggregated: bool
-    reinitialise: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,22 +146,11 @@ class EkfSlam:
         -----
         Bradley & Abaid, Eq. (10).
         """
-        motion = self.motion
         mean, covariance = belief.mean.copy(), belief.covariance.copy()
-        poses = Gaussian(mean=np.empty((len(controls), 3)), covariance=np.empty((len(dt), 3, 3)))
-        carry(
-            mean, covariance, controls, dt, MOTION_MODELS.index(motion.model), motion.wheelbase,
-            motion.control_std[0] ** 2, motion.control_std[1] ** 2, motion.noise_at_rest,
-            poses.mean, poses.covariance,
-        )  # fmt: skip
-        moved = EkfBelief(
-            mean=mean,
-            covariance=covariance,
-            landmark=belief.landmark,
-            weight=belief.weight,
-            gated=belief.gated,
-        )
-        return moved, poses
+        poses = Gaussian(mean=np.empty((len(dt), 3)), covariance=np.empty((len(dt), 3, 3)))
+        numbers = motion_numbers(self.motion)
+        carry(mean, covariance, controls, dt, numbers, poses.mean, poses.covariance)
+        return replace(belief, mean=mean, covariance=covariance), poses
 
     def update(
         self, belief: EkfBelief, scan: Scan, rng: np.random.Generator | None = None
@@ -215,7 +182,7 @@ class EkfSlam:
             scan.landmark,
             scan.bearing,
             scan.range,
-            _sensing(self),
+            sensing_of(self.range_std, self.bearing_std, self.rays, self.gate),
         )
         return EkfBelief(
             mean=mean,
@@ -224,47 +191,6 @@ class EkfSlam:
             weight=weight,
             gated=belief.gated + gated,
         )
-
-
-@lru_cache(maxsize=16)
-def gate_bounds(gate: float) -> tuple[float, float]:
-    """Chi-square quantiles of one and of two degrees of freedom; infinite for a gate of 1.
-
-    Parameters
-    ----------
-    gate : (0, 1]
-
-    Returns
-    -------
-    one, two : squared Mahalanobis distances
-
-    Examples
-    --------
-    >>> [round(bound, 2) for bound in gate_bounds(0.999)]
-    [10.83, 13.82]
-    """
-    if gate >= 1.0:
-        return math.inf, math.inf
-    return NormalDist().inv_cdf(0.5 * (1.0 + gate)) ** 2, -2.0 * math.log(1.0 - gate)
-
-
-@lru_cache(maxsize=16)
-def _sensing(slam: EkfSlam) -> Sensing:
-    """Gather what the kernels need, once per filter."""
-    passive_bound, active_bound = gate_bounds(slam.gate)
-    ray_ranges, ray_stds = ray_members(slam.rays)
-    return Sensing(
-        range_variance=slam.range_std**2,
-        bearing_variance=slam.bearing_std**2,
-        passive_bound=passive_bound,
-        active_bound=active_bound,
-        ray_ranges=ray_ranges,
-        ray_stds=ray_stds,
-        power=slam.rays.power,
-        prune=slam.rays.prune,
-        aggregated=slam.rays.weights == "aggregated",
-        reinitialise=slam.rays.partial == "reinitialise",
-    )
 
 
 @njit(cache=True, error_model="numpy")
@@ -310,12 +236,7 @@ def _range_for_ray(
 ):
     """Give a partial landmark its range: one member is left. Returns the members left."""
     keep = np.zeros(count, dtype=np.bool_)
-    heaviest = 0
-    if not sensing.reinitialise:
-        for j in range(1, count):
-            if weight[first + j] > weight[first + heaviest]:
-                heaviest = j
-    keep[heaviest] = True
+    keep[0 if sensing.reinitialise else heaviest(weight[first:], count)] = True
     members = drop_members(mean, covariance, landmark, weight, members, first, count, keep)
     weight[first] = 1.0
     size, i = 3 + 2 * members, 3 + 2 * first

@@ -10,44 +10,22 @@ import math
 
 from numba import njit
 
-from pipistrelle.estimation.models import NEAREST, advance, sight
+from pipistrelle.estimation.models import NEAREST, carry_pose, sight
 from pipistrelle.geometry import wrap_angle
 
 GATED, APPLIED = 1, 0
 
 
 @njit(cache=True, error_model="numpy")
-def carry(
-    mean, covariance, controls, dt, model, wheelbase, first_variance, second_variance,
-    noise_at_rest, pose_means, pose_covariances,
-):  # fmt: skip
+def carry(mean, covariance, controls, dt, motion, pose_means, pose_covariances):
     """Advance mean and covariance in place; cross-covariances once, by the product of the F."""
-    P = covariance[:3, :3].copy()
+    pose, P = mean[:3], covariance[:3, :3].copy()
     shift_x = shift_y = 0.0  # entries (0, 2) and (1, 2) of the product of the F
     for k in range(controls.shape[0]):
-        speed, turn = controls[k, 0], controls[k, 1]
-        dx, dy, dheading, u00, u10, u20, u01, u11, u21 = advance(
-            model, wheelbase, mean[2], speed, turn, dt[k]
-        )
-        mean[0] += dx
-        mean[1] += dy
-        mean[2] = wrap_angle(mean[2] + dheading)
+        dx, dy = carry_pose(pose, P, controls[k, 0], controls[k, 1], dt[k], motion)
         shift_x -= dy
         shift_y += dx
-        noisy = 1.0 if noise_at_rest or speed != 0.0 or turn != 0.0 else 0.0
-        q0, q1 = noisy * first_variance, noisy * second_variance
-        xx = P[0, 0] - 2.0 * dy * P[0, 2] + dy * dy * P[2, 2]
-        xy = P[0, 1] + dx * P[0, 2] - dy * P[1, 2] - dx * dy * P[2, 2]
-        yy = P[1, 1] + 2.0 * dx * P[1, 2] + dx * dx * P[2, 2]
-        xh = P[0, 2] - dy * P[2, 2]
-        yh = P[1, 2] + dx * P[2, 2]
-        P[0, 0] = xx + q0 * u00 * u00 + q1 * u01 * u01
-        P[0, 1] = P[1, 0] = xy + q0 * u00 * u10 + q1 * u01 * u11
-        P[1, 1] = yy + q0 * u10 * u10 + q1 * u11 * u11
-        P[0, 2] = P[2, 0] = xh + q0 * u00 * u20 + q1 * u01 * u21
-        P[1, 2] = P[2, 1] = yh + q0 * u10 * u20 + q1 * u11 * u21
-        P[2, 2] += q0 * u20 * u20 + q1 * u21 * u21
-        pose_means[k] = mean[:3]
+        pose_means[k] = pose
         pose_covariances[k] = P
     for j in range(3, mean.size):
         covariance[0, j] += shift_x * covariance[2, j]

@@ -6,7 +6,8 @@ say the same in arrays. In the kernels a motion model is a number: 0 bicycle, 1 
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from functools import lru_cache
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -96,6 +97,28 @@ class Track:
     gated: int
 
 
+class MotionNumbers(NamedTuple):
+    """A motion model as the kernels take it; variances are those of one control step."""
+
+    model: int
+    wheelbase: float
+    speed_variance: float
+    turn_variance: float
+    noise_at_rest: bool
+
+
+@lru_cache(maxsize=16)
+def motion_numbers(motion: Motion) -> MotionNumbers:
+    """Turn a motion model into numbers for the kernels, once."""
+    return MotionNumbers(
+        model=MOTION_MODELS.index(motion.model),
+        wheelbase=float(motion.wheelbase),
+        speed_variance=float(motion.control_std[0]) ** 2,
+        turn_variance=float(motion.control_std[1]) ** 2,
+        noise_at_rest=motion.noise_at_rest,
+    )
+
+
 @njit(cache=True, error_model="numpy")
 def advance(
     model: int, wheelbase: float, heading: float, speed: float, turn: float, dt: float
@@ -129,6 +152,36 @@ def advance(
         chord * c, chord * s, 0.0,
         bend * (slope * c - sinc * s), bend * (slope * s + sinc * c), dt,
     )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def carry_pose(
+    pose: np.ndarray, P: np.ndarray, speed: float, turn: float, dt: float, motion: MotionNumbers
+) -> tuple[float, float]:
+    """Carry a pose (3) and its covariance (3, 3) through a control step, in place.
+
+    F P F^T + U Q U^T (Bradley & Abaid, Eq. (10)); Q alone has rank 2. Returns dx and dy [m].
+    """
+    dx, dy, dheading, u00, u10, u20, u01, u11, u21 = advance(
+        motion.model, motion.wheelbase, pose[2], speed, turn, dt
+    )
+    pose[0] += dx
+    pose[1] += dy
+    pose[2] = wrap_angle(pose[2] + dheading)
+    noisy = 1.0 if motion.noise_at_rest or speed != 0.0 or turn != 0.0 else 0.0
+    q0, q1 = noisy * motion.speed_variance, noisy * motion.turn_variance
+    xx = P[0, 0] - 2.0 * dy * P[0, 2] + dy * dy * P[2, 2]
+    xy = P[0, 1] + dx * P[0, 2] - dy * P[1, 2] - dx * dy * P[2, 2]
+    yy = P[1, 1] + 2.0 * dx * P[1, 2] + dx * dx * P[2, 2]
+    xh = P[0, 2] - dy * P[2, 2]
+    yh = P[1, 2] + dx * P[2, 2]
+    P[0, 0] = xx + q0 * u00 * u00 + q1 * u01 * u01
+    P[0, 1] = P[1, 0] = xy + q0 * u00 * u10 + q1 * u01 * u11
+    P[1, 1] = yy + q0 * u10 * u10 + q1 * u11 * u11
+    P[0, 2] = P[2, 0] = xh + q0 * u00 * u20 + q1 * u01 * u21
+    P[1, 2] = P[2, 1] = yh + q0 * u10 * u20 + q1 * u11 * u21
+    P[2, 2] += q0 * u20 * u20 + q1 * u21 * u21
+    return dx, dy
 
 
 def motion_step(
@@ -165,9 +218,8 @@ def motion_step(
     >>> motion_step(motion, np.zeros(3), np.array([np.pi, np.pi]), 0.5).round(12)
     array([1.        , 1.        , 1.57079633])
     """
-    moved = advance(
-        MOTION_MODELS.index(motion.model), motion.wheelbase, pose[2], control[0], control[1], dt
-    )
+    numbers = motion_numbers(motion)
+    moved = advance(numbers.model, numbers.wheelbase, pose[2], control[0], control[1], dt)
     return np.array([pose[0] + moved[0], pose[1] + moved[1], wrap_angle(pose[2] + moved[2])])
 
 
@@ -199,9 +251,8 @@ def motion_jacobians(
     >>> F[1, 2], U[2, 1]
     (np.float64(1.0), np.float64(5.0))
     """
-    moved = advance(
-        MOTION_MODELS.index(motion.model), motion.wheelbase, pose[2], control[0], control[1], dt
-    )
+    numbers = motion_numbers(motion)
+    moved = advance(numbers.model, numbers.wheelbase, pose[2], control[0], control[1], dt)
     F = np.eye(3)
     F[0, 2], F[1, 2] = -moved[1], moved[0]
     return F, np.array(moved[3:]).reshape(2, 3).T.copy()

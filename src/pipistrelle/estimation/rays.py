@@ -38,6 +38,9 @@ Sources: Bradley & Abaid, Eqs. (17) to (21); Sola, Monin, Devy & Lemaire (2005).
 """
 
 import math
+from functools import lru_cache
+from statistics import NormalDist
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -81,6 +84,83 @@ def ray_members(
     members = 1 + max(0, math.ceil(math.log(span) / math.log(rays.density)))
     ranges = first * rays.density ** np.arange(members)
     return ranges, rays.ratio * ranges
+
+
+class Sensing(NamedTuple):
+    """What the kernels need to know of measurements and rays.
+
+    Attributes
+    ----------
+    range_variance, bearing_variance : [m^2], [rad^2]
+    passive_bound, active_bound : float
+        Largest squared Mahalanobis distances.
+    ray_ranges, ray_stds : (h) [m]
+    power, prune : float
+    aggregated, reinitialise : bool
+    """
+
+    range_variance: float
+    bearing_variance: float
+    passive_bound: float
+    active_bound: float
+    ray_ranges: Float[np.ndarray, " h"]
+    ray_stds: Float[np.ndarray, " h"]
+    power: float
+    prune: float
+    aggregated: bool
+    reinitialise: bool
+
+
+@lru_cache(maxsize=16)
+def gate_bounds(gate: float) -> tuple[float, float]:
+    """Chi-square quantiles of one and of two degrees of freedom; infinite for a gate of 1.
+
+    Parameters
+    ----------
+    gate : (0, 1]
+
+    Returns
+    -------
+    one, two : squared Mahalanobis distances
+
+    Examples
+    --------
+    >>> [round(bound, 2) for bound in gate_bounds(0.999)]
+    [10.83, 13.82]
+    """
+    if gate >= 1.0:
+        return math.inf, math.inf
+    return NormalDist().inv_cdf(0.5 * (1.0 + gate)) ** 2, -2.0 * math.log(1.0 - gate)
+
+
+@lru_cache(maxsize=16)
+def sensing_of(range_std: float, bearing_std: float, rays: RayConfig, gate: float) -> Sensing:
+    """Gather what the kernels need to know of measurements and rays, once per filter.
+
+    Parameters
+    ----------
+    range_std, bearing_std : [m], [rad]
+    rays : RayConfig
+    gate : (0, 1]
+
+    Returns
+    -------
+    Sensing
+    """
+    passive_bound, active_bound = gate_bounds(gate)
+    ray_ranges, ray_stds = ray_members(rays)
+    return Sensing(
+        range_variance=range_std**2,
+        bearing_variance=bearing_std**2,
+        passive_bound=passive_bound,
+        active_bound=active_bound,
+        ray_ranges=ray_ranges,
+        ray_stds=ray_stds,
+        power=rays.power,
+        prune=rays.prune,
+        aggregated=rays.weights == "aggregated",
+        reinitialise=rays.partial == "reinitialise",
+    )
 
 
 @njit(cache=True, error_model="numpy")
@@ -135,19 +215,26 @@ def weigh_and_share(
 
 
 @njit(cache=True, error_model="numpy")
+def heaviest(weights: np.ndarray, count: int) -> int:
+    """Return the index of the largest of the first weights, the first of equals."""
+    best = 0
+    for j in range(1, count):
+        if weights[j] > weights[best]:
+            best = j
+    return best
+
+
+@njit(cache=True, error_model="numpy")
 def survivors(weights: np.ndarray, count: int, prune: float, keep: np.ndarray) -> int:
     """Mark the members that stay, renormalise their weights in place and return their number.
 
     A member goes when its weight is under prune / count; the heaviest (the first of equals)
     always stays. Bradley & Abaid, Eq. (21).
     """
-    heaviest = 0
-    for j in range(1, count):
-        if weights[j] > weights[heaviest]:
-            heaviest = j
+    strongest = heaviest(weights, count)
     kept, total = 0, 0.0
     for j in range(count):
-        keep[j] = j == heaviest or weights[j] >= prune / count
+        keep[j] = j == strongest or weights[j] >= prune / count
         if keep[j]:
             kept += 1
             total += weights[j]

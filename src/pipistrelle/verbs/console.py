@@ -142,10 +142,6 @@ def closing_table(trials: "Sequence[TrialResult]", aligned: bool) -> str:
     Returns
     -------
     str
-
-    Examples
-    --------
-    See `pipistrelle run`.
     """
     rows: list[tuple[str, Callable[[Scores], str]]] = [
         ("position RMSE [m]", lambda s: _number(s.position_rmse_m, 3)),

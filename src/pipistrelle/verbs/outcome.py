@@ -51,7 +51,8 @@ def result_folder(options: OutputOptions, name: str) -> Iterator[Path]:
     except BaseException:
         with contextlib.suppress(OSError):
             folder.rmdir()
-            if not (latest := folder.parent / "latest").exists():
+            latest = folder.parent / "latest"
+            if options.output is None and not latest.exists():
                 latest.unlink()
         raise
 

@@ -92,7 +92,7 @@ def slam(
 ) -> int:
     """Solve a recorded log; where it has the truth, say how far off the map is."""
     output = output or OutputOptions()
-    layer = _layer(log, config, settings or {}, gate)
+    layer = _layer(config, settings or {}, gate)
     resolve(layer)
     if beamwidth is not None and not 0 < beamwidth <= 360:
         raise InputError(f"--beamwidth: found {beamwidth:g}, expected above 0 and up to 360 [deg]")
@@ -124,7 +124,7 @@ def slam(
         )
 
 
-def _layer(log: Path, config: Path | None, settings: SlamFlags, gate: float | None) -> Layer:
+def _layer(config: Path | None, settings: SlamFlags, gate: float | None) -> Layer:
     """Lay file, environment and flags over each other; refuse flags for what the log decides."""
     flags = from_flags(settings)
     for key, given in flags.items():

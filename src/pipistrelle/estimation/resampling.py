@@ -1,0 +1,100 @@
+r"""Resampling: from weighted particles to equally weighted ones.
+
+Both steps of FastSLAM 2.0 that forget live here. The weights tell how many particles still count,
+
+.. math:: N_\mathrm{eff} = \Big( \sum_j w_j^2 \Big)^{-1}
+
+(Eq. 15); below a threshold the particles are drawn anew, each as often as its weight says. The
+draw is *stratified*: one uniform number in each of N equal strata of [0, 1), so particle j gets
+:math:`N w_j` copies on average and differs from it by less than two. Weights are kept in logs: a
+frame's likelihoods, multiplied, underflow.
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Float, Int
+from numba import njit
+
+
+@njit(cache=True, error_model="numpy")
+def normalised(log_weight: np.ndarray) -> np.ndarray:
+    """Weights that sum to one, from their logs.
+
+    Where no log weight is finite the weights are equal: such a filter has lost the vehicle, which
+    is a result and not an error.
+    """
+    largest = -np.inf
+    for j in range(log_weight.size):
+        if log_weight[j] > largest:
+            largest = log_weight[j]
+    weight = np.full(log_weight.size, 1.0 / log_weight.size)
+    if not math.isfinite(largest):
+        return weight
+    total = 0.0
+    for j in range(log_weight.size):
+        finite = math.isfinite(log_weight[j])
+        weight[j] = math.exp(log_weight[j] - largest) if finite else 0.0
+        total += weight[j]
+    for j in range(log_weight.size):
+        weight[j] /= total
+    return weight
+
+
+def effective_particles(weight: Float[np.ndarray, " p"]) -> float:
+    r"""Return how many equally weighted particles would be worth as much.
+
+    .. math:: N_\mathrm{eff} = 1 / \sum_j w_j^2
+
+    Parameters
+    ----------
+    weight : (p)
+        Sums to 1.
+
+    Returns
+    -------
+    float
+        In [1, p].
+
+    Notes
+    -----
+    Bradley & Abaid, Eq. (15).
+
+    Examples
+    --------
+    >>> effective_particles(np.array([0.5, 0.5, 0.0, 0.0]))
+    2.0
+    """
+    return 1.0 / float(np.sum(weight * weight))
+
+
+def stratified(
+    weight: Float[np.ndarray, " p"], uniform: Float[np.ndarray, " p"]
+) -> Int[np.ndarray, " p"]:
+    """Draw each particle's ancestor, one from each stratum of the cumulated weights.
+
+    Parameters
+    ----------
+    weight : (p)
+        Sums to 1.
+    uniform : (p)
+        Uniform in [0, 1).
+
+    Returns
+    -------
+    (p)
+        Indices, rising.
+
+    Notes
+    -----
+    Bradley & Abaid, Sec. III-B; Douc, Cappe & Moulines (2005).
+
+    Examples
+    --------
+    >>> stratified(np.array([0.1, 0.6, 0.3]), np.array([0.2, 0.9, 0.5])).tolist()
+    [0, 1, 2]
+    """
+    points = (np.arange(weight.size) + uniform) / weight.size
+    bounds = np.cumsum(weight)
+    bounds /= bounds[-1]
+    return np.minimum(np.searchsorted(bounds, points, side="right"), weight.size - 1)

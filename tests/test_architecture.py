@@ -1,0 +1,104 @@
+"""The house keeps its own laws: contracts, room map, sizes, doors, what no file may hold."""
+
+import ast
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "src" / "pipistrelle"
+SOURCES = sorted(PACKAGE.rglob("*.py"))
+ROOMS = sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py"))
+
+# Written so that this file does not hold what it looks for.
+REGISTRIES = re.compile(
+    r"[p]y[p]i\.(?:org|io)|[p]ython[h]osted|[n]pm[j]s\.|[c]rates\.io|[d]ocker\.io|[d]ebian\.org"
+    r"|[c]onda\.anaconda|[a]naconda\.org|proxy\.[g]olang",
+    re.IGNORECASE,
+)
+MACHINES = re.compile(r"(?<![\w.~])/(?:[w]ork|[r]oot|[t]mp|[h]ome|[U]sers|[m]nt)/\w|\b[C]:\\\\?\w")
+
+
+def tracked() -> list[Path]:
+    """List the files of the repository, those included that are not committed yet."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    listed = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True)
+    return [ROOT / name for name in listed.stdout.splitlines() if (ROOT / name).is_file()]
+
+
+def functions(path: Path) -> Iterator[ast.FunctionDef]:
+    """Yield the functions and methods of a module."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.FunctionDef):
+            yield node
+
+
+def body_lines(function: ast.FunctionDef) -> int:
+    """Count the lines of a function without its signature and docstring."""
+    body = function.body[1:] if ast.get_docstring(function) is not None else function.body
+    return (body[-1].end_lineno or 0) - body[0].lineno + 1 if body else 0
+
+
+def test_the_import_contracts_are_kept():
+    linter = Path(sys.executable).with_name("lint-imports")
+    done = subprocess.run([linter], cwd=ROOT, check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_rooms_of_the_readme_are_those_of_the_package_in_their_own_words():
+    rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", (ROOT / "README.md").read_text(), re.MULTILINE)
+    doors = {room: import_module(f"pipistrelle.{room}").__doc__ or "" for room in ROOMS}
+    assert rows == [(room, doc.splitlines()[0] if doc else "") for room, doc in doors.items()]
+    assert all(doors.values()), "every room says what it is"
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_door_is_narrow(room):
+    door = import_module(f"pipistrelle.{room}")
+    offered = [
+        name
+        for name in dir(door)
+        if not name.startswith("_")
+        and name != "import_module"
+        and not isinstance(getattr(door, name), ModuleType)
+    ]
+    assert len(offered) <= 8
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_a_module_fits_in_four_hundred_lines_and_a_body_in_forty(path):
+    assert len(path.read_text(encoding="utf-8").splitlines()) < 400
+    assert {f.name: body_lines(f) for f in functions(path) if body_lines(f) > 40} == {}
+
+
+def test_no_module_is_a_drawer():
+    drawers = {"utils", "util", "common", "helpers", "helper", "manager", "misc"}
+    assert [path for path in SOURCES if path.stem in drawers] == []
+
+
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="not a clone")
+def test_no_file_names_a_registry_or_a_machine():
+    found = []
+    for path in tracked():
+        try:
+            text = path.read_text(encoding="utf-8")
+        except UnicodeDecodeError:
+            continue
+        for number, line in enumerate(text.splitlines(), start=1):
+            if REGISTRIES.search(line) or MACHINES.search(line):
+                found.append(f"{path.relative_to(ROOT)}:{number}: {line.strip()[:80]}")
+    assert found == []
+
+
+@pytest.mark.parametrize("text", ["https://{}/simple", "index = {}"])
+def test_registries_and_machines_would_be_seen(text):
+    assert REGISTRIES.search(text.format("py" + "pi.org"))
+    assert MACHINES.search(text.format("/ho" + "me/someone"))
+    assert not REGISTRIES.search(text.format("example.org"))
+    assert not MACHINES.search(text.format("docs/home/page"))

@@ -1,0 +1,128 @@
+"""What the documentation says is there, is there; what it shows, happens."""
+
+import re
+from pathlib import Path
+from pkgutil import resolve_name
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PAGES = [*sorted(DOCS.glob("*.md")), DOCS / "api" / "index.md"]
+TEXTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
+
+
+def blocks(language: str, page: Path) -> list[str]:
+    """Return the fenced blocks of a page in one language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_names_in_the_pages_exist(page):
+    for name in re.findall(r"{py:\w+}`~?([\w.]+)`", page.read_text()):
+        resolve_name(name)
+
+
+@pytest.mark.parametrize("page", [*PAGES, *TEXTS], ids=lambda page: page.name)
+def test_links_between_files_lead_somewhere(page):
+    links = re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text())
+    near = [link for link in links if "://" not in link and link != "gallery/index"]
+    assert [link for link in near if not (page.parent / link).exists()] == []
+
+
+def test_every_module_has_its_place_in_the_api_pages():
+    shown = set()
+    for page in (DOCS / "api").glob("*.rst"):
+        shown |= set(re.findall(r"automodule:: (\S+)", page.read_text()))
+    package = ROOT / "src" / "pipistrelle"
+    there = {
+        ".".join(path.relative_to(package.parent).with_suffix("").parts).removesuffix(".__init__")
+        for path in package.rglob("*.py")
+        if "verbs" not in path.parts
+    }
+    assert shown == there - {"pipistrelle", "pipistrelle.__main__"}
+
+
+def test_the_settings_named_by_the_pages_exist():
+    from pipistrelle.config import Config
+
+    fields = {
+        section: set(type(getattr(Config(), section)).model_fields)
+        for section, field in Config.model_fields.items()
+        if section != "seed"
+    }
+    classes = {
+        type(getattr(Config(), section)).__name__: names for section, names in fields.items()
+    }
+    for page in (DOCS / "conventions.md", ROOT / "papers" / "bradley_abaid" / "README.md"):
+        for section, name in re.findall(r"`([a-z]+)\.([a-z_]+)(?: =|`)", page.read_text()):
+            assert name in fields[section], f"{page.name}: {section}.{name}"
+    rows = re.findall(r"^\|.*\|$", (DOCS / "conventions.md").read_text(), re.MULTILINE)
+    for row in rows:
+        held = [classes[name] for name in re.findall(r"`(\w+Config)`", row)]
+        words = re.findall(r"`(\w+)`", row.split("|")[2]) if held else []
+        assert [word for word in words if not any(word in names for names in held)] == [], row
+
+
+@pytest.fixture(scope="module")
+def guide():
+    """Run the code of the page on extending, block by block, and return its names."""
+    names = vars(ModuleType("guide"))
+    for block in re.findall(
+        r"^```python\n(.*?)^```", (DOCS / "extending.md").read_text(), re.M | re.S
+    ):
+        exec(compile(block, "extending.md", "exec"), names)
+    return names
+
+
+def test_the_guides_beam_changes_active_arrivals_outside_it_alone(guide):
+    from pipistrelle.acoustics.arrivals import arrivals_of_emission
+    from pipistrelle.config import Config
+
+    posts, beacon = np.array([[5.0, 0.5], [2.0, 5.0]]), np.array([0.0, 9.0])
+    before = arrivals_of_emission(np.zeros(3), np.zeros(2), posts, beacon, Config())
+    after = guide["through_window"](before, 0.3)
+    outside = (before.source == 0) & (np.abs(before.bearing) > 0.3)
+    assert 0 < outside.sum() < outside.size
+    np.testing.assert_array_equal(after.level_db - before.level_db, np.where(outside, -40.0, 0.0))
+
+
+def test_the_guides_array_finds_a_bearing(guide):
+    from pipistrelle.arrays.beamforming import beamscan, steering_vector
+
+    ears = {"position": guide["hexagon"].position, "frequency": 35e3, "speed_of_sound": 343.0}
+    angles = np.radians(np.arange(-60, 61))
+    power = beamscan(steering_vector(angles[75], **ears), angles, **ears)
+    assert np.argmax(power) == 75
+    assert guide["hexagon"].normal.size == 6
+
+
+def test_the_guides_filter_drives_a_mission(guide):
+    from pipistrelle.config import Config, ScenarioConfig
+    from pipistrelle.experiments.scenario import bicycle, draw_scenario
+    from pipistrelle.experiments.trial import drive_of, estimator, run_filter
+
+    config = Config(scenario=ScenarioConfig(steps=40, landmarks=3))
+    world = draw_scenario(config, np.random.default_rng(7))
+    lost = guide["DeadReckoning"](motion=bicycle(config.motion))
+    track = run_filter(lost, drive_of(world, config), (), np.random.default_rng(7))
+    ekf = estimator("ekf", lost.motion, config)
+    same = run_filter(ekf, drive_of(world, config), (), np.random.default_rng(7))
+    np.testing.assert_allclose(track.pose.mean, same.pose.mean, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(track.pose.covariance, same.pose.covariance, rtol=0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_the_readme_shows_what_the_command_prints(tmp_path, capsys):
+    from pipistrelle.__main__ import main
+
+    (shown,) = blocks("text", ROOT / "README.md")
+    assert main(["run", "--seed", "7", "-o", str(tmp_path / "seen")]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    for line, other in zip(shown.splitlines(), printed, strict=False):
+        numbers = [re.findall(r"\d+(?:\.\d+)?", text) for text in (line, other)]
+        assert re.sub(r"[\d.]+", "#", line).split() == re.sub(r"[\d.]+", "#", other).split()
+        # Another machine's mathematics may move a detection or two across the threshold.
+        np.testing.assert_allclose(*np.array(numbers, dtype=float), rtol=0.1)
