@@ -3,6 +3,7 @@
 import re
 import sys
 from importlib import import_module
+from pathlib import Path
 from pkgutil import walk_packages
 
 import matplotlib as mpl
@@ -80,6 +81,16 @@ sphinx_gallery_conf = {
 }
 
 
+def add_modules(app, docname, content):
+    """Put a room's modules, whichever there are, on the room's page."""
+    folder, _, room = docname.partition("/")
+    path = Path(pipistrelle.__path__[0]) / room
+    if folder == "api" and path.is_dir():
+        for name in sorted(p.stem for p in path.glob("[a-z]*.py")):
+            module = f".. automodule:: pipistrelle.{room}.{name}"
+            content[0] += f"\n{name}\n{'-' * len(name)}\n\n{module}\n"
+
+
 def show_kernels(app):
     """Let autodoc see the plain functions under public kernels.
 
@@ -112,6 +123,7 @@ def unprotect(app, what, name, obj, options, lines):
 
 
 def setup(app):
+    app.connect("source-read", add_modules)
     app.connect("builder-inited", show_kernels, priority=900)
     app.connect("autodoc-process-docstring", protect, priority=100)
     app.connect("autodoc-process-docstring", unprotect, priority=900)

@@ -1,6 +1,6 @@
 """Every array has the shape and the type that its annotation says.
 
-    NUMBA_DISABLE_JIT=1 pytest -m shapes --jaxtyping-packages=pipistrelle,beartype.beartype
+NUMBA_DISABLE_JIT=1 pytest -m shapes --jaxtyping-packages=pipistrelle,beartype.beartype
 """
 
 from pathlib import Path

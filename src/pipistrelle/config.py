@@ -25,7 +25,9 @@ class InputError(ValueError):
 class Section(BaseModel):
     """A frozen group of settings: unknown keys and non-finite numbers are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
 
 class ScenarioConfig(Section):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pipistrelle.config import InputError
-from pipistrelle.experiments.folder import prepare_folder, write_file
+from pipistrelle.experiments.folder import clear_results, prepare_folder, write_file
 
 OURS = json.dumps({"format": 1, "config_hash": "0" * 16, "runs": []})
 
@@ -69,6 +69,8 @@ def test_a_folder_with_results_is_refused_unless_overwriting(earlier):
     assert str(earlier) in str(refusal.value)
     assert names(earlier) == before
     assert prepare_folder(earlier, "run", overwrite=True) == earlier
+    assert names(earlier) == before, "the old results stay until there are new ones"
+    clear_results(earlier)
     assert names(earlier) == []
 
 
@@ -76,7 +78,7 @@ def test_overwriting_removes_nothing_that_is_not_a_result(earlier):
     (earlier / "notes.txt").write_text("mine")
     (earlier / "mission.d").mkdir()
     (earlier / "mission.d" / "track_fused_ekf.tum").write_text("mine")
-    prepare_folder(earlier, "run", overwrite=True)
+    clear_results(prepare_folder(earlier, "run", overwrite=True))
     assert names(earlier) == ["mission.d", "notes.txt"]
     assert names(earlier / "mission.d") == ["track_fused_ekf.tum"]
 

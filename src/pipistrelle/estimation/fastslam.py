@@ -92,6 +92,10 @@ class FastSlamBelief:
         """Return the heaviest particle's map, one row per member."""
         return self.best
 
+    def cloud(self) -> Float[np.ndarray, "p 3"]:
+        """Return the particles' poses, (p, 3)."""
+        return self.mean.copy()
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FastSlam:

@@ -7,12 +7,13 @@ say the same in arrays. In the kernels a motion model is a number: 0 bicycle, 1 
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
 
+from pipistrelle.detection.scans import Scan
 from pipistrelle.geometry import wrap_angle
 
 MOTION_MODELS = ("bicycle", "unicycle")
@@ -89,12 +90,75 @@ class Track:
         The final map.
     gated : int
         Measurements that the gate rejected.
+    cloud : (p, 3) [m, m, rad] or None
+        The particles' last poses, where the filter has particles.
+    full : float or None
+        Their weighted mean number of fully initialised landmarks.
     """
 
     time: Float[np.ndarray, " k"]
     pose: Gaussian
     landmarks: Landmarks
     gated: int
+    cloud: Float[np.ndarray, "p 3"] | None = None
+    full: float | None = None
+
+
+@runtime_checkable
+class Belief(Protocol):
+    """What an estimator knows; never changed once it is made."""
+
+    @property
+    def gated(self) -> int:
+        """Measurements rejected so far."""
+        ...
+
+    def pose(self) -> Gaussian:
+        """Return the vehicle's pose, (3) and (3, 3)."""
+        ...
+
+    def landmarks(self) -> Landmarks:
+        """Return the map."""
+        ...
+
+
+@runtime_checkable
+class Swarm(Protocol):
+    """A belief that is made of particles."""
+
+    @property
+    def full(self) -> float:
+        """Weighted mean number of fully initialised landmarks."""
+        ...
+
+    def cloud(self) -> Float[np.ndarray, "p 3"]:
+        """Return the particles' poses, (p, 3) [m, m, rad]."""
+        ...
+
+
+B = TypeVar("B", bound=Belief)
+
+
+class Estimator(Protocol[B]):
+    """A SLAM filter: a frozen record of its settings, with beliefs going in and coming out."""
+
+    def init(self, pose: Gaussian) -> B:
+        """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
+        ...
+
+    def predict(
+        self,
+        belief: B,
+        controls: Float[np.ndarray, "k 2"],
+        dt: Float[np.ndarray, " k"],
+        rng: np.random.Generator,
+    ) -> tuple[B, Gaussian]:
+        """Carry a belief through control steps; the poses are those after each step."""
+        ...
+
+    def update(self, belief: B, scan: Scan, rng: np.random.Generator) -> B:
+        """Correct a belief with a frame's measurements."""
+        ...
 
 
 class MotionNumbers(NamedTuple):

@@ -25,7 +25,7 @@ CONTENTS = (
 
 
 def prepare_folder(path: Path | None, name: str, overwrite: bool) -> Path:
-    """Make the empty folder that the results go to.
+    """Make the folder that the results go to, and see that it can be written.
 
     Without a path it is ``runs/<time>-<name>``, and ``runs/latest`` comes to point at it where
     the file system has symbolic links.
@@ -37,8 +37,8 @@ def prepare_folder(path: Path | None, name: str, overwrite: bool) -> Path:
     name : str
         What ran.
     overwrite : bool
-        Empty an earlier result folder first. Only `CONTENTS` are removed, and only from a folder
-        that holds the ``summary.json`` of such results.
+        Accept a folder of earlier results: one that holds the ``summary.json`` of such. They stay
+        until `clear_results` makes way for the new ones.
 
     Returns
     -------
@@ -90,7 +90,7 @@ def _new_folder(name: str) -> Path:
 
 
 def _chosen_folder(folder: Path, overwrite: bool) -> Path:
-    """Make a folder, or empty it of earlier results."""
+    """Make a folder, or accept one of earlier results."""
     folder.mkdir(parents=True, exist_ok=True)
     if not any(folder.iterdir()):
         return folder
@@ -104,11 +104,31 @@ def _chosen_folder(folder: Path, overwrite: bool) -> Path:
             f"{folder}: is not empty and holds no summary.json of Pipistrelle, so nothing in it "
             "was overwritten; name another folder with -o DIR"
         )
+    return folder
+
+
+def clear_results(folder: Path) -> None:
+    """Remove earlier results from a folder: `CONTENTS` and nothing else.
+
+    Parameters
+    ----------
+    folder : Path
+
+    Raises
+    ------
+    InputError
+        Where a file cannot be removed.
+    """
     for pattern in CONTENTS:
         for old in sorted(folder.glob(pattern)):
-            if old.is_file():
-                old.unlink()
-    return folder
+            try:
+                if old.is_file():
+                    old.unlink()
+            except OSError as error:
+                raise InputError(
+                    f"{old}: could not be replaced ({error.strerror}); "
+                    "choose another folder with -o DIR"
+                ) from error
 
 
 def _holds_results(folder: Path) -> bool:

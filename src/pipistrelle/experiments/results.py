@@ -28,7 +28,7 @@ from pipistrelle.evaluation.accuracy import (
     scored_landmarks,
 )
 from pipistrelle.evaluation.consistency import diverged, nees
-from pipistrelle.experiments.folder import write_file
+from pipistrelle.experiments.folder import clear_results, write_file
 from pipistrelle.experiments.tables import (
     LabelledPoints,
     landmark_table,
@@ -234,7 +234,7 @@ def write_results(
     true_landmarks: LabelledPoints | None,
     ignored_rows: dict[str, int],
 ) -> None:
-    """Write everything but the figures into a result folder.
+    """Write everything but the figures into a result folder, in place of earlier results.
 
     Parameters
     ----------
@@ -272,6 +272,7 @@ def write_results(
     """
     import tomli_w
 
+    clear_results(folder)
     settings = config.model_dump(mode="json", exclude_none=True)
     write_file(folder / "config.toml", tomli_w.dumps(settings))
     readme = README.format(command=command, version=__version__, seed=seed)

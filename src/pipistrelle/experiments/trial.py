@@ -13,17 +13,18 @@ from jaxtyping import Float
 from pipistrelle.arrays.noise import stream_key
 from pipistrelle.config import Config, InputError, ScenarioConfig, Strategy
 from pipistrelle.detection.scans import Heard, Scan, scan_of
-from pipistrelle.estimation.ekf import EkfBelief, EkfSlam
-from pipistrelle.estimation.models import Gaussian, Motion, Track
-from pipistrelle.evaluation.consistency import EKF_LIMIT
+from pipistrelle.estimation.ekf import EkfSlam
+from pipistrelle.estimation.fastslam import FastSlam
+from pipistrelle.estimation.models import B, Belief, Estimator, Gaussian, Motion, Swarm, Track
+from pipistrelle.evaluation.consistency import EKF_LIMIT, FASTSLAM_LIMIT
 from pipistrelle.experiments.listening import Progress, listen
 from pipistrelle.experiments.results import TrialResult, score
 from pipistrelle.experiments.scenario import Scenario, bicycle, draw_scenario
 from pipistrelle.experiments.tables import LabelledPoints
 
-Watch = Callable[[str, str, Scan, EkfBelief], None]
+Watch = Callable[[str, str, Scan, Belief], None]
 """Called with strategy, filter, scan and the belief after it."""
-LIMITS = {"ekf": EKF_LIMIT}
+LIMITS = {"ekf": EKF_LIMIT, "fastslam": FASTSLAM_LIMIT}
 """The filters by name, with the NEES above which each counts as diverged."""
 
 
@@ -34,7 +35,7 @@ class Case:
     Attributes
     ----------
     strategy : "active", "fused" or "passive"
-    filter : "ekf"
+    filter : "ekf" or "fastslam"
     iteration : int
         Number of the world.
     """
@@ -93,7 +94,7 @@ def run_mission(
     ----------
     config : Config
     strategies : sequence of "active", "fused", "passive"
-    filters : sequence of "ekf"
+    filters : sequence of "ekf", "fastslam"
     progress, watch : callable, optional
 
     Returns
@@ -174,14 +175,23 @@ def run_trial(
     TrialResult
     """
     strategy, name = case.strategy, case.filter
+
+    def report(done: int, total: int) -> None:
+        if progress:
+            progress(f"{strategy} {name}", done, total)
+
+    def look(scan: Scan, belief: Belief) -> None:
+        if watch:
+            watch(strategy, name, scan, belief)
+
     began = clock.perf_counter()
     track = run_filter(
         estimator(name, drive.motion, config),
         drive,
         scans,
         _generator(config.seed, case.iteration, name),
-        progress=progress and (lambda done, total: progress(f"{strategy} {name}", done, total)),
-        watch=watch and (lambda scan, belief: watch(strategy, name, scan, belief)),
+        progress=report,
+        watch=look,
     )
     wall_s = clock.perf_counter() - began
     return TrialResult(
@@ -194,18 +204,18 @@ def run_trial(
     )
 
 
-def estimator(name: str, motion: Motion, config: Config) -> EkfSlam:
+def estimator(name: str, motion: Motion, config: Config) -> Estimator:
     """Build a filter from the settings.
 
     Parameters
     ----------
-    name : "ekf"
+    name : "ekf" or "fastslam"
     motion : Motion
     config : Config
 
     Returns
     -------
-    EkfSlam
+    Estimator
 
     Raises
     ------
@@ -214,29 +224,30 @@ def estimator(name: str, motion: Motion, config: Config) -> EkfSlam:
 
     Examples
     --------
-    >>> estimator("ekf", bicycle(Config().motion), Config()).bearing_std
-    0.15
+    >>> type(estimator("ekf", bicycle(Config().motion), Config())).__name__
+    'EkfSlam'
     """
     if name not in LIMITS:
         raise InputError(f"filter: found {name!r}, expected one of {', '.join(LIMITS)}")
     settings = config.filter
-    return EkfSlam(
-        motion=motion,
-        range_std=settings.range_std,
-        bearing_std=settings.bearing_std,
-        rays=config.rays,
-        gate=settings.gate,
-    )
+    assumed = {
+        "motion": motion,
+        "range_std": settings.range_std,
+        "bearing_std": settings.bearing_std,
+        "rays": config.rays,
+        "gate": settings.gate,
+    }
+    return EkfSlam(**assumed) if name == "ekf" else FastSlam(**assumed, swarm=config.fastslam)
 
 
 def run_filter(
-    estimator: EkfSlam,
+    estimator: Estimator[B],
     drive: Drive,
     scans: Sequence[Scan],
     rng: np.random.Generator,
     *,
     progress: Callable[[int, int], None] | None = None,
-    watch: Callable[[Scan, EkfBelief], None] | None = None,
+    watch: Callable[[Scan, B], None] | None = None,
 ) -> Track:
     """Predict to each scan, update with it, and keep the pose of every step.
 
@@ -276,18 +287,21 @@ def run_filter(
     if done < len(controls):
         belief, poses = estimator.predict(belief, controls[done:], dt[done:], rng)
         mean[done + 1 :], covariance[done + 1 :] = poses.mean, poses.covariance
+    swarm = belief if isinstance(belief, Swarm) else None
     return Track(
         time=time,
         pose=Gaussian(mean=mean, covariance=covariance),
         landmarks=belief.landmarks(),
         gated=belief.gated,
+        cloud=swarm.cloud() if swarm else None,
+        full=swarm.full if swarm else None,
     )
 
 
 def compile_kernels() -> None:
     """Compile every kernel, or load it from the cache, by a mission of two frames."""
     tiny = Config(scenario=ScenarioConfig(steps=8, landmarks=4, radius=10.0))
-    run_mission(tiny, ("active", "fused", "passive"))
+    run_mission(tiny, ("active", "fused", "passive"), tuple(LIMITS))
 
 
 def _generator(seed: int, iteration: int, purpose: str) -> np.random.Generator:

@@ -8,14 +8,14 @@ measurements, rays being born and thinned out, landmarks as they turn full, the 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from pipistrelle.config import InputError
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.models import Gaussian, Landmarks
+from pipistrelle.estimation.models import Belief, Landmarks
 from pipistrelle.experiments.results import TimedPath
 from pipistrelle.experiments.tables import LabelledPoints
 from pipistrelle.figures.film import film_writer
@@ -57,19 +57,6 @@ FLASH = 4
 """Pictures during which a landmark that has turned full is ringed."""
 
 
-@runtime_checkable
-class Belief(Protocol):
-    """What every filter's belief answers."""
-
-    def pose(self) -> Gaussian:
-        """Mean (3) and covariance (3, 3) of the pose."""
-        ...
-
-    def landmarks(self) -> Landmarks:
-        """Return the map as it stands."""
-        ...
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Snapshot:
     """One frame as a filter saw it.
@@ -96,7 +83,10 @@ class MissionRecorder:
 
     Examples
     --------
+    >>> from pipistrelle.estimation.models import Gaussian
     >>> class Lost:
+    ...     gated = 0
+    ...
     ...     def pose(self):
     ...         return Gaussian(mean=np.zeros(3), covariance=np.eye(3))
     ...
