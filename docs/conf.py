@@ -4,7 +4,7 @@ import re
 import sys
 from importlib import import_module
 from pathlib import Path
-from pkgutil import walk_packages
+from pkgutil import resolve_name, walk_packages
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
@@ -42,7 +42,7 @@ add_module_names = False
 autodoc_typehints = "none"  # shapes and units stand in the docstrings
 autodoc_member_order = "bysource"
 autodoc_class_signature = "separated"
-autodoc_default_options = {"members": True}
+autodoc_default_options = {"members": True, "exclude-members": "__init__, model_config"}
 napoleon_google_docstring = False
 napoleon_use_ivar = True
 napoleon_use_rtype = False
@@ -109,12 +109,17 @@ def show_kernels(app):
 def protect(app, what, name, obj, options, lines):
     """Hide from napoleon what it would take for markup.
 
-    The star of a shape such as (*n) opens no emphasis, and what stands before the colon in the
-    sentence about a constant is not its type.
+    A shape such as (*n) opens no emphasis and (k) no list; two attributes that share a line are
+    no name and its type; what stands before the colon in a sentence about a constant is no type.
     """
-    lines[:] = [re.sub(r"\(\*(?=\w+[,)])", r"(\\*", line) for line in lines]
-    if what in ("attribute", "data"):
-        lines[:] = [line.replace(":", HIDDEN_COLON) for line in lines]
+    for i, line in enumerate(lines):
+        line = re.sub(r"\(\*(?=\w+[,)])", r"(\\*", line)
+        line = re.sub(r"^(\s*\w[\w, ]* : )\((?=\w+\))", r"\1\\(", line)
+        if what == "class":
+            line = re.sub(r"^(\w+(?:, \w+)+)(?= : )", lambda m: m[1].replace(" ", ""), line)
+        if what in ("attribute", "data"):
+            line = line.replace(":", HIDDEN_COLON)
+        lines[i] = line
 
 
 def unprotect(app, what, name, obj, options, lines):
@@ -122,8 +127,17 @@ def unprotect(app, what, name, obj, options, lines):
     lines[:] = [line.replace(HIDDEN_COLON, ":") for line in lines]
 
 
+def add_default(app, what, name, obj, options, lines):
+    """Say the default of a setting."""
+    owner, _, field = name.rpartition(".")
+    settings = getattr(resolve_name(owner), "model_fields", {}) if what == "attribute" else {}
+    if field in settings:
+        lines += ["", f"Default: ``{settings[field].default!r}``."]
+
+
 def setup(app):
     app.connect("source-read", add_modules)
     app.connect("builder-inited", show_kernels, priority=900)
     app.connect("autodoc-process-docstring", protect, priority=100)
     app.connect("autodoc-process-docstring", unprotect, priority=900)
+    app.connect("autodoc-process-docstring", add_default, priority=910)

@@ -14,6 +14,8 @@ from numba import njit
 @njit(cache=True, error_model="numpy", inline="always")
 def wrap_angle(angle: float) -> float:
     """Wrap one angle to [-pi, pi) [rad]; for kernels (see `wrap`)."""
+    if -math.pi <= angle < math.pi:
+        return angle
     wrapped = angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
     return wrapped - 2.0 * math.pi if wrapped >= math.pi else wrapped
 

@@ -161,8 +161,8 @@ def test_the_block_engine_detects_as_the_dense_one_does_on_the_same_grid(snr_db)
 @pytest.mark.slow
 @pytest.mark.parametrize("tone", [0, 1])
 @pytest.mark.parametrize("snr_db", [2.0, 3.5, 5.0, 8.0, 13.0])
-@pytest.mark.parametrize("shift", [1.0, 1.0 - 2.0 * 0.75 / 343.0])
-def test_the_block_engine_detects_as_the_dense_one_does_whatever_the_echo(snr_db, tone, shift):
+def test_the_block_engine_detects_as_the_dense_one_does_whatever_the_echo(snr_db, tone):
+    shift = 1.0 - (2 - tone) * 0.75 / 343.0  # from a vehicle that leaves: both ways, or one
     table = heard(snr_db, 4000, tone, shift)
     assert agree(table[FAST], table[COMMON])
 

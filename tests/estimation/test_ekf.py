@@ -123,7 +123,7 @@ def test_unicycle_that_stops_turns_and_reverses_equals_the_slow_reference():
 
 
 def test_reference_is_the_same_in_josephs_form():
-    mission = paper_mission("fused", frames=30)
+    mission = paper_mission("fused", frames=8)
     short, joseph = (
         SlowEkfSlam(BICYCLE, 0.2, 0.15, ray_config(), joseph=form).start(
             START.mean, START.covariance

@@ -128,16 +128,24 @@ def sample_pose(pose, P, draw):
 
 
 @njit(cache=True, error_model="numpy")
-def correct_by_bearing(pose, member, bearing, variance):
-    """Correct a member by its bearing from a certain pose."""
+def expect_from(pose, member, bearing):
+    """Innovation of a member's bearing from a certain pose, and its slopes by x and y.
+
+    The slopes are zero, and teach nothing, when the member is too near.
+    """
     distance, expected, c, s, d = sight(pose[0], pose[1], pose[2], member[X], member[Y])
     if distance < NEAREST:
-        return
-    g0, g1 = -s / d, c / d
+        return 0.0, 0.0, 0.0
+    return wrap_angle(bearing - expected), -s / d, c / d
+
+
+@njit(cache=True, error_model="numpy")
+def correct_by_bearing(member, innovation, g0, g1, variance):
+    """Correct a member by its bearing from a certain pose, as `expect_from` gives it."""
     a0 = g0 * member[XX] + g1 * member[XY]
     a1 = g0 * member[XY] + g1 * member[YY]
     S = g0 * a0 + g1 * a1 + variance
-    gain = wrap_angle(bearing - expected) / S
+    gain = innovation / S
     member[X] += a0 * gain
     member[Y] += a1 * gain
     member[XX] -= a0 * a0 / S

@@ -174,7 +174,7 @@ def log_likelihood(innovation: float, variance: float) -> float:
 
 @njit(cache=True, error_model="numpy")
 def normalise_logs(log_weights: np.ndarray, weights: np.ndarray, count: int) -> None:
-    """Write exp(log_weights) / sum into weights, without underflow of the whole."""
+    """Write exp(log_weights) / sum into weights, which may be the same array."""
     largest = -np.inf
     for j in range(count):
         largest = max(largest, log_weights[j])
@@ -200,14 +200,13 @@ def weigh_and_share(
     ``weights`` (Lambda) and ``share`` (rho) are written; a share of zero means: skip the member.
     Bradley & Abaid, Eqs. (18) and (19).
     """
-    log_weights = np.empty(count)
     for j in range(count):
         prior = math.log(weights[j]) if weights[j] > 0.0 else -np.inf
-        log_weights[j] = prior + log_likelihoods[j]
-    normalise_logs(log_weights, weights, count)
+        share[j] = prior + log_likelihoods[j]
+    normalise_logs(share, weights, count)
     for j in range(count):
-        log_weights[j] = power * (log_weights[j] if aggregated else log_likelihoods[j])
-    normalise_logs(log_weights, share, count)
+        share[j] = power * (share[j] if aggregated else log_likelihoods[j])
+    normalise_logs(share, share, count)
     smallest = SMALLEST_AGGREGATED_SHARE if aggregated else SMALLEST_SHARE
     for j in range(count):
         if share[j] < smallest:

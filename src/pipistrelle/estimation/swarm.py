@@ -13,10 +13,12 @@ from pipistrelle.estimation.models import carry_pose
 from pipistrelle.estimation.particle import (
     LOG_TAU,
     WEIGHT,
+    bearing_spread,
     correct_by_active,
     correct_by_bearing,
     expect_active,
     expect_bearing,
+    expect_from,
     place_member,
     refine_by_active,
     refine_by_bearing,
@@ -98,10 +100,10 @@ def gated_by_all(
 
 
 @njit(cache=True, error_model="numpy")
-def _refine_by_ray(pose, P, rows, bearing, sensing, exact):
+def _refine_by_ray(pose, P, rows, bearing, sensing, exact, scratch):
     """Correct pose and P by the bearing of a partial landmark; returns the log likelihood."""
     members, variance = rows.shape[0], sensing.bearing_variance
-    logs, weight, share = np.empty(members), np.empty(members), np.empty(members)
+    logs, weight, share = scratch[0], scratch[1], scratch[2]
     largest = -np.inf
     for j in range(members):
         innovation, S = expect_bearing(pose, P, rows[j], bearing, variance)
@@ -147,23 +149,26 @@ def _refine_to_mixture(pose, P, rows, weight, bearing, variance):
 
 
 @njit(cache=True, error_model="numpy")
-def _correct_ray(pose, rows, bearing, sensing, exact):
+def _correct_ray(pose, rows, bearing, sensing, exact, scratch, keep):
     """Weigh, correct and prune a ray from a certain pose, in place; returns the members left."""
     members, variance = rows.shape[0], sensing.bearing_variance
-    logs, weight, share = np.empty(members), np.empty(members), np.empty(members)
-    keep, certain = np.ones(members, dtype=np.bool_), np.zeros((3, 3))
+    logs, weight, share = scratch[0], scratch[1], scratch[2]
+    off, g0, g1 = scratch[3], scratch[4], scratch[5]
+    hopeful = False
     for j in range(members):
-        innovation, S = expect_bearing(pose, certain, rows[j], bearing, variance)
-        logs[j] = log_likelihood(innovation, S) if math.isfinite(S) else -np.inf
+        off[j], g0[j], g1[j] = expect_from(pose, rows[j], bearing)
+        S = bearing_spread(rows[j], g0[j], g1[j]) + variance
+        near = g0[j] == 0.0 and g1[j] == 0.0
+        logs[j] = -np.inf if near else log_likelihood(off[j], S)
         weight[j] = rows[j, WEIGHT]
-    if not math.isfinite(logs.max()):
+        hopeful = hopeful or not near
+    if not hopeful:
         return members
     weigh_and_share(logs, weight, members, sensing.power, sensing.aggregated, share)
     for j in range(members):
-        if exact:
-            correct_by_bearing(pose, rows[j], bearing, variance)
-        elif share[j] > 0.0:
-            correct_by_bearing(pose, rows[j], bearing, variance / share[j])
+        if exact or share[j] > 0.0:
+            part = variance if exact else variance / share[j]
+            correct_by_bearing(rows[j], off[j], g0[j], g1[j], part)
     survivors(weight, members, sensing.prune, keep)
     left = 0
     for j in range(members):
@@ -186,11 +191,12 @@ def _range_for_ray(pose, rows, distance, bearing, sensing):
     dx, dy = rows[0, 0] - pose[0], rows[0, 1] - pose[1]
     scale = distance / max(math.sqrt(dx * dx + dy * dy), 1e-12)
     rows[0, 0], rows[0, 1], rows[0, WEIGHT] = pose[0] + dx * scale, pose[1] + dy * scale, 1.0
-    correct_by_bearing(pose, rows[0], bearing, sensing.bearing_variance)
+    off, g0, g1 = expect_from(pose, rows[0], bearing)
+    correct_by_bearing(rows[0], off, g0, g1, sensing.bearing_variance)
 
 
 @njit(cache=True, error_model="numpy")
-def _refine(pose, P, first, count, member, slot, bearings, ranges, sensing, exact):
+def _refine(pose, P, first, count, member, slot, bearings, ranges, sensing, exact, scratch):
     """Refine one particle's pose by all measurements of its landmarks; returns the log weight."""
     gained = 0.0
     for m in range(slot.size):
@@ -202,7 +208,7 @@ def _refine(pose, P, first, count, member, slot, bearings, ranges, sensing, exac
             if count[n] == 1:
                 gained += refine_by_bearing(pose, P, rows[0], bearings[m], sensing.bearing_variance)
             else:
-                gained += _refine_by_ray(pose, P, rows, bearings[m], sensing, exact)
+                gained += _refine_by_ray(pose, P, rows, bearings[m], sensing, exact, scratch)
         elif count[n] == 1:
             gained += refine_by_active(
                 pose, P, rows[0], ranges[m], bearings[m],
@@ -212,7 +218,7 @@ def _refine(pose, P, first, count, member, slot, bearings, ranges, sensing, exac
 
 
 @njit(cache=True, error_model="numpy")
-def _correct(pose, first, count, member, slot, bearings, ranges, sensing, exact):
+def _correct(pose, first, count, member, slot, bearings, ranges, sensing, exact, scratch, keep):
     """Correct one particle's measured landmarks from its sampled pose, in place."""
     for m in range(slot.size):
         n = slot[m]
@@ -221,9 +227,10 @@ def _correct(pose, first, count, member, slot, bearings, ranges, sensing, exact)
         rows = member[first[n] : first[n] + count[n]]
         if math.isnan(ranges[m]):
             if count[n] == 1:
-                correct_by_bearing(pose, rows[0], bearings[m], sensing.bearing_variance)
+                off, g0, g1 = expect_from(pose, rows[0], bearings[m])
+                correct_by_bearing(rows[0], off, g0, g1, sensing.bearing_variance)
             else:
-                count[n] = _correct_ray(pose, rows, bearings[m], sensing, exact)
+                count[n] = _correct_ray(pose, rows, bearings[m], sensing, exact, scratch, keep)
         elif count[n] == 1:
             correct_by_active(
                 pose, rows[0], ranges[m], bearings[m],
@@ -289,6 +296,8 @@ def correct_swarm(
     )
     count = np.zeros((particles, landmark.size), dtype=np.int64)
     member = np.zeros((particles, first[-1], 6))
+    scratch = np.empty((6, sensing.ray_ranges.size))
+    keep = np.empty(sensing.ray_ranges.size, dtype=np.bool_)
     for i in range(particles):
         for n in range(known):
             count[i, n] = old_count[i, n]
@@ -296,10 +305,13 @@ def correct_swarm(
                 member[i, first[n] + j] = old_member[i, old_first[n] + j]
         log_weight[i] += _refine(
             mean[i], covariance[i], first, count[i], member[i], slot, bearings, ranges,
-            sensing, exact,
+            sensing, exact, scratch,
         )  # fmt: skip
         sample_pose(mean[i], covariance[i], normal[i])
-        _correct(mean[i], first, count[i], member[i], slot, bearings, ranges, sensing, exact)
+        _correct(
+            mean[i], first, count[i], member[i], slot, bearings, ranges, sensing, exact,
+            scratch, keep,
+        )  # fmt: skip
         n = known
         for m in range(labels.size):
             if slot[m] < 0:
