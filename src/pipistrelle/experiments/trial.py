@@ -266,8 +266,14 @@ def run_filter(
     Returns
     -------
     Track
+
+    Raises
+    ------
+    InputError
+        For a bearing or range that is no number, or a time that is not one of the drive's.
     """
     time, controls = drive.time, drive.controls
+    _check(scans, time)
     mean, covariance = np.empty((time.size, 3)), np.empty((time.size, 3, 3))
     mean[0], covariance[0] = drive.start.mean, drive.start.covariance
     dt, belief, done = np.diff(time), estimator.init(drive.start), 0
@@ -296,6 +302,22 @@ def run_filter(
         cloud=swarm.cloud() if swarm else None,
         full=swarm.full if swarm else None,
     )
+
+
+def _check(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> None:
+    """Refuse scans that a filter could not use."""
+    for scan in scans:
+        k = np.searchsorted(time, scan.time)
+        if k == time.size or time[k] != scan.time:
+            raise InputError(f"scan at {scan.time} s: expected the time of the end of a step")
+        usable = np.isnan(scan.range) | (np.isfinite(scan.range) & (scan.range > 0.0))
+        usable &= np.isfinite(scan.bearing)
+        if not usable.all():
+            raise InputError(
+                f"scan at {scan.time} s: found numbers that no filter can use, for the landmarks "
+                f"{scan.landmark[~usable].tolist()}; expected finite bearings [rad] and ranges "
+                "above 0 [m], NaN where passive"
+            )
 
 
 def compile_kernels() -> None:

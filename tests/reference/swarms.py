@@ -1,0 +1,79 @@
+"""Swarms to test: FastSLAM 2.0 as the paper sets it, small enough for its slow reference."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from pipistrelle.config import FastSlamConfig
+from pipistrelle.estimation.fastslam import FastSlam
+from reference.fastslam import SlowFastSlam
+from reference.missions import (
+    BICYCLE,
+    CIRCLE,
+    SENSING,
+    START,
+    draw_mission,
+    ray_config,
+    scattered,
+    steady,
+)
+
+
+class Drawn:
+    """A generator that draws what it is told."""
+
+    def __init__(self, normal, uniform):
+        self.normal, self.uniform = np.array(normal), np.array(uniform)
+
+    def standard_normal(self, size):
+        assert self.normal.shape == size
+        return self.normal
+
+    def random(self, size):
+        assert self.uniform.shape == (size,)
+        return self.uniform
+
+
+def swarm_filter(particles=20, mixture="federated", resample_below=0.75, **changes):
+    """Return the filter with the paper's settings, but for the changes."""
+    swarm = FastSlamConfig(particles=particles, mixture=mixture, resample_below=resample_below)
+    slam = FastSlam(
+        motion=BICYCLE, range_std=0.2, bearing_std=0.15, rays=ray_config(), swarm=swarm
+    )
+    return replace(slam, **changes)
+
+
+def never_resampling(slam):
+    """Return the same filter without its last step."""
+    return replace(slam, swarm=slam.swarm.model_copy(update={"resample_below": 0.0}))
+
+
+def slow_twin(slam, start=START, **changes):
+    """Return the slow reference with a filter's settings, started."""
+    slow = SlowFastSlam(
+        slam.motion, slam.range_std, slam.bearing_std, slam.rays, slam.gate, slam.swarm, **changes
+    )
+    return slow.start(start.mean, start.covariance)
+
+
+def small_mission(strategy, frames=100, seed=3, landmarks=16, **changes):
+    """Draw the paper's drive among few landmarks."""
+    rng = np.random.default_rng(seed)
+    field, drive = scattered(rng, landmarks, radius=14.0), steady(CIRCLE, frames)
+    return draw_mission(rng, BICYCLE, START, field, drive, **(SENSING[strategy] | changes))
+
+
+def followed(slam, mission, rng, start=START):
+    """Yield belief and poses, frame by frame."""
+    belief = slam.init(start)
+    for controls, dt, scan in zip(mission.controls, mission.dt, mission.scans, strict=True):
+        belief, poses = slam.predict(belief, controls, dt, rng)
+        belief = slam.update(belief, scan, rng)
+        yield belief, poses
+
+
+def members(belief, particle, label):
+    """Return one particle's members of a landmark, (h, 6): x, y, xx, xy, yy, weight."""
+    n = belief.landmark.tolist().index(label)
+    first = belief.first[n]
+    return belief.member[particle, first : first + belief.count[particle, n]]
