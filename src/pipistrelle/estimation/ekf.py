@@ -38,7 +38,7 @@ from pipistrelle.geometry import wrap_angle
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EkfBelief:
-    """A joint Gaussian over pose and members.
+    """A joint Gaussian over pose and members (Bradley & Abaid, Eqs. (8) and (9)).
 
     Attributes
     ----------

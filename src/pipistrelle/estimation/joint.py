@@ -128,7 +128,7 @@ def correct_active(
 
 @njit(cache=True, error_model="numpy")
 def place(mean, covariance, size, i, distance, bearing, range_variance, bearing_variance):
-    """Put a member at state index i, at a range and bearing from the pose (Eq. 16).
+    """Put a member at state index i, at a range and bearing from the pose (Eq. (16)).
 
     The first ``size`` rows but the member's own are the rest of the state, with which it is
     correlated through the pose.

@@ -4,7 +4,7 @@ Both steps of FastSLAM 2.0 that forget live here. The weights tell how many part
 
 .. math:: N_\mathrm{eff} = \Big( \sum_j w_j^2 \Big)^{-1}
 
-(Eq. 15); below a threshold the particles are drawn anew, each as often as its weight says. The
+(Eq. (15)); below a threshold the particles are drawn anew, each as often as its weight says. The
 draw is *stratified*: one uniform number in each of N equal strata of [0, 1), so particle j gets
 :math:`N w_j` copies on average and differs from it by less than two. Weights are kept in logs: a
 frame's likelihoods, multiplied, underflow.

@@ -93,7 +93,7 @@ def _drive(
     motion: MotionConfig,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "t 3"]:
-    """Drive with noise on both controls (Bradley & Abaid, Eq. 5)."""
+    """Drive with noise on both controls (Bradley & Abaid, Eq. (5))."""
     model = bicycle(motion)
     noisy = controls + rng.standard_normal(controls.shape) * model.control_std
     path = np.empty((len(controls) + 1, 3))
