@@ -220,7 +220,8 @@ def detect(
     Detections
     """
     lags, faces, tones, elements = matched.shape
-    energy = _energy(matched.reshape(lags, -1).view(np.float64), elements)
+    rows = matched.reshape(lags, faces * tones * elements).view(np.float64)
+    energy = _energy(rows, elements)
     count, face, tone, lag, peak_u, power = _find_peaks(
         matched, energy.reshape(lags, faces, tones), pulse, detector.threshold,
         detector.leakage, detector.peak, detector.scan, detector.table, start, interval,

@@ -284,6 +284,17 @@ def _columns(landmark, count, slot, labels, ranges, rays):
 
 
 @njit(cache=True, error_model="numpy")
+def _copy_members(old_first, old_count, old_member, first, count, member):
+    """Copy one particle's members into their new columns."""
+    for n in range(old_count.size):
+        count[n] = old_count[n]
+        for j in range(count[n]):
+            source, target = old_member[old_first[n] + j], member[first[n] + j]
+            for k in range(6):
+                target[k] = source[k]
+
+
+@njit(cache=True, error_model="numpy")
 def correct_swarm(
     old_mean, old_covariance, old_log_weight, old_landmark, old_first, old_count, old_member,
     labels, bearings, ranges, normal, sensing, exact,
@@ -295,14 +306,11 @@ def correct_swarm(
         old_landmark, old_count, slot, labels, ranges, sensing.ray_ranges.size
     )
     count = np.zeros((particles, landmark.size), dtype=np.int64)
-    member = np.zeros((particles, first[-1], 6))
+    member = np.empty((particles, first[-1], 6))
     scratch = np.empty((6, sensing.ray_ranges.size))
     keep = np.empty(sensing.ray_ranges.size, dtype=np.bool_)
     for i in range(particles):
-        for n in range(known):
-            count[i, n] = old_count[i, n]
-            for j in range(count[i, n]):
-                member[i, first[n] + j] = old_member[i, old_first[n] + j]
+        _copy_members(old_first, old_count[i], old_member[i], first, count[i], member[i])
         log_weight[i] += _refine(
             mean[i], covariance[i], first, count[i], member[i], slot, bearings, ranges,
             sensing, exact, scratch,

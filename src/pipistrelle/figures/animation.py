@@ -15,14 +15,16 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipistrelle.config import InputError
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.models import Belief, Landmarks
+from pipistrelle.estimation.models import Belief, Landmarks, Swarm
 from pipistrelle.experiments.results import TimedPath
 from pipistrelle.experiments.tables import LabelledPoints
+from pipistrelle.figures.closeup import Closeup, add_closeups
 from pipistrelle.figures.film import film_writer
 from pipistrelle.figures.maps import (
     PLACED,
     RAY,
     beam,
+    cells,
     draw_truth,
     ellipses,
     head,
@@ -32,7 +34,7 @@ from pipistrelle.figures.maps import (
     vehicle,
     view,
 )
-from pipistrelle.figures.style import COLUMNS, INK, STYLE, TRUTH, strategy_colour
+from pipistrelle.figures.style import INK, STYLE, TRUTH, strategy_colour
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -68,11 +70,14 @@ class Snapshot:
         After the update.
     landmarks : Landmarks
         After the update.
+    cloud : (p, 3) [m, m, rad] or None
+        The poses of the particles, where there are any.
     """
 
     scan: Scan
     pose: Float[np.ndarray, "3"]
     landmarks: Landmarks
+    cloud: Float[np.ndarray, "p 3"] | None = None
 
 
 class MissionRecorder:
@@ -106,7 +111,12 @@ class MissionRecorder:
 
     def __call__(self, strategy: str, estimator: str, scan: Scan, belief: Belief) -> None:
         """Keep a snapshot."""
-        snapshot = Snapshot(scan=scan, pose=belief.pose().mean, landmarks=belief.landmarks())
+        snapshot = Snapshot(
+            scan=scan,
+            pose=belief.pose().mean,
+            landmarks=belief.landmarks(),
+            cloud=belief.cloud() if isinstance(belief, Swarm) else None,
+        )
         self.snapshots.setdefault((strategy, estimator), []).append(snapshot)
 
 
@@ -120,13 +130,13 @@ def animate_mission(
     beamwidth: float | None = None,
     pictures: int = 125,
 ) -> None:
-    """Write the film of a mission, one panel per strategy, as GIF or MP4.
+    """Write the film of a mission, one panel per strategy and filter, as GIF or MP4.
 
     A panel shows the path so far (true: grey), the vehicle with its beam, the frame's
     measurements (a range: solid to where it ends; a bearing alone: dashed), the rays (each member
     at one standard deviation, the heavier the darker; just pruned ones as dotted outlines) and the
     landmarks that are fully initialised in their 95 % ellipses, ringed when they have just become
-    so.
+    so. Particles, if there are any, are enlarged in a corner that follows the vehicle.
 
     Parameters
     ----------
@@ -199,29 +209,44 @@ def _stage(
     maps = [frames[-1].landmarks for frames in snapshots.values()]
     limits = view(true_path, true_landmarks, beacon, paths, maps)
     (left, right), (bottom, top) = limits
-    columns, rows = min(len(snapshots), COLUMNS), -(-len(snapshots) // COLUMNS)
+    places = cells(list(snapshots))
+    rows, columns = (1 + max(indices) for indices in zip(*places, strict=True))
     foot = LINE * -(-len(SYMBOLS) // (2 * columns))
     high = TOP + WIDTH * (top - bottom) / (right - left) + BOTTOM
     size = np.array([LEFT + RIGHT + columns * (WIDTH + GAP) - GAP, rows * high + foot])
     width, height = 2.0 * np.ceil(size * DPI / 2.0) / DPI
     figure = Figure(figsize=(width, height), dpi=DPI)
-    several_filters, panels = len({estimator for _, estimator in snapshots}) > 1, []
-    for i, ((strategy, estimator), frames) in enumerate(snapshots.items()):
-        row, column = divmod(i, columns)
+    panels = []
+    for (row, column), ((strategy, name), frames) in zip(places, snapshots.items(), strict=True):
         x, y = LEFT + column * (WIDTH + GAP), height - (row + 1) * high + BOTTOM
         box = (x / width, y / height, WIDTH / width, (high - TOP - BOTTOM) / height)
         axes = figure.add_axes(box)
         axes.set(xlim=limits[0], ylim=limits[1], aspect="equal", xlabel="x [m]")
-        axes.set_ylabel("" if column else "y [m]")
-        axes.tick_params(labelleft=column == 0)
+        leftmost = (row, column - 1) not in places
+        axes.set_ylabel("y [m]" if leftmost else "")
+        axes.tick_params(labelleft=leftmost)
         axes.grid(True)
         axes.set_axisbelow(True)
         draw_truth(axes, true_landmarks, beacon)
-        line = head(axes, strategy, estimator if several_filters else None)
+        line = head(axes, strategy, name)
         panels.append(_Panel(axes, line, frames, strategy, true_path, beamwidth))
+    _enlarge(panels, true_landmarks)
     names = [name for name in SYMBOLS if name != "beacon" or beacon is not None]
     legend(figure, names, 2 * columns, LEFT, RIGHT)
     return figure, panels
+
+
+def _enlarge(panels: Sequence["_Panel"], true_landmarks: LabelledPoints | None) -> None:
+    """Give each swarm its window, on top of everything else."""
+    clouds = [[f.cloud for f in panel.frames if f.cloud is not None] for panel in panels]
+    marks = [panel.frames[-1].landmarks.mean for panel in panels]
+    marks += [] if true_landmarks is None else [true_landmarks[1]]
+    maps, colours, paths = zip(*((p.axes, p.colour, p.path) for p in panels), strict=True)
+    closeups = add_closeups(maps, colours, clouds, paths, marks)
+    for panel, panel.closeup in zip(panels, closeups, strict=True):
+        for artist in panel.closeup.artists if panel.closeup else ():
+            artist.set_animated(True)
+            panel.artists.append(artist)
 
 
 def _play(
@@ -264,6 +289,7 @@ class _Panel:
         self.beamwidth = None if strategy == "passive" else beamwidth
         self.rows, self.turned_full = frames[0].landmarks, {}
         self.artists: list[Artist] = []
+        self.closeup: Closeup | None = None
         self._add_artists()
 
     def _add_artists(self) -> None:
@@ -315,9 +341,13 @@ class _Panel:
         self.vehicle.set_verts([vehicle(pose, 0.055 * self.size)])
         if self.beamwidth is not None:
             self.beam.set_verts([beam(pose, self.beamwidth, 0.25 * self.size)])
+        true = None
         if self.true_path is not None:
-            past = self.true_path[0] <= time + 1e-9
-            self.true.set_data(*self.true_path[1][past, :2].T)
+            true = self.true_path[1][self.true_path[0] <= time + 1e-9]
+            self.true.set_data(*true[:, :2].T)
+        cloud = self.frames[now].cloud
+        if self.closeup and cloud is not None:
+            self.closeup.show(cloud, self.path[: now + 1], true)
 
     def _show_scan(self, frame: Snapshot) -> None:
         """Point to what was heard: as far as its range, or out of the map without one."""

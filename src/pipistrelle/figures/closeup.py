@@ -1,6 +1,7 @@
 """A swarm of particles: dots at the map's scale, and a window in a corner that enlarges them."""
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,78 +14,12 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
-Limits = tuple[tuple[float, float], tuple[float, float]]
-"""(left, right), (bottom, top) [m]"""
 SIDE, MARGIN = 0.25, 0.015
 """Of the window, and its distance from the corner, as shares of the map's width."""
 NARROWEST = 0.05
 """Least reach of a window [m]: particles may coincide."""
 TAIL = 60
 """Poses of a path that a window shows."""
-
-
-def reach_of(clouds: Sequence[Float[np.ndarray, "p 3"]]) -> float | None:
-    """How far a window reaches around its centre, so that a typical cloud fills half of it.
-
-    Twice the median, over the clouds, of the distance along an axis from a cloud's mean that
-    19 of 20 particles keep.
-
-    Parameters
-    ----------
-    clouds : of (p, 3) [m, m, rad]
-        Those that are not finite do not count.
-
-    Returns
-    -------
-    [m], at least `NARROWEST`; None where there is no cloud to show
-
-    Examples
-    --------
-    >>> ring = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
-    >>> reach_of([ring, 3 * ring, np.full((4, 3), np.nan)]), reach_of([])
-    (4.0, None)
-    """
-    points = [cloud[:, :2] for cloud in clouds if cloud.size and np.isfinite(cloud).all()]
-    if not points:
-        return None
-    extent = [np.quantile(np.abs(p - p.mean(axis=0)).max(axis=1), 0.95) for p in points]
-    return max(2.0 * float(np.median(extent)), NARROWEST)
-
-
-def free_corner(
-    limits: Limits, *covered: Sequence[Float[np.ndarray, "_ d"]]
-) -> tuple[float, float, float, float]:
-    """Choose the corner of a map where a window hides least.
-
-    Parameters
-    ----------
-    limits : (left, right), (bottom, top) [m]
-    covered : of (n, 2 or more) [m]
-        Points that had better stay visible; the first kind counts before the second.
-
-    Returns
-    -------
-    left, bottom, width, height, as shares of the map's
-
-    Examples
-    --------
-    >>> free_corner(((0, 10), (0, 5)), [np.array([[9.0, 4.0]])], [np.array([[1.0, 1.0]])])
-    (0.015, 0.47, 0.25, 0.5)
-    """
-    (left, right), (bottom, top) = limits
-    ratio = (right - left) / (top - bottom)
-    size = np.array([SIDE, SIDE * ratio])
-    low, high = np.array([MARGIN, MARGIN * ratio]), 1.0 - size - [MARGIN, MARGIN * ratio]
-    span = np.array([right - left, top - bottom])
-    kinds = [(np.concatenate([p[:, :2] for p in kind]) - [left, bottom]) / span for kind in covered]
-
-    def hidden(corner: np.ndarray) -> list[int]:
-        inside = [(points > corner) & (points < corner + size) for points in kinds]
-        return [int(np.sum(within.all(axis=1))) for within in inside]
-
-    corners = [np.array([x, y]) for y in (high[1], low[1]) for x in (high[0], low[0])]
-    x, y = min(corners, key=hidden).tolist()
-    return x, y, SIDE, SIDE * ratio
 
 
 class Closeup:
@@ -168,3 +103,75 @@ class Closeup:
         self._window.plot([0.06, 0.06 + share], [0.07, 0.07], color=INK, lw=1.4, **style)
         self._window.text(0.06, 0.1, f"{bar:g} m", fontsize=7, va="bottom", **style)
         self._window.text(0.06, 0.95, title, fontsize=7, va="top", **style)
+
+
+def add_closeups(
+    maps: "Sequence[Axes]",
+    colours: Sequence[str],
+    clouds: Sequence[Sequence[Float[np.ndarray, "p 3"]]],
+    paths: Sequence[Float[np.ndarray, "_ 3"]],
+    marks: Sequence[Float[np.ndarray, "_ 2"]],
+) -> list[Closeup | None]:
+    """Give every map whose vehicle has particles a window, all of one scale and in one corner.
+
+    Parameters
+    ----------
+    maps : sequence of Axes
+        Of common limits.
+    colours, clouds, paths : one for each map
+        Of the clouds, (p, 3) [m, m, rad], those that the window is to show in turn, or none;
+        where a path (k, 3) [m, m, rad] ends is not covered.
+    marks : of (n, 2) [m]
+        Points that had better not be covered; nor had the paths.
+
+    Returns
+    -------
+    list of Closeup or None
+        Still empty; None where there is no cloud.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> maps, nothing = Figure().subplots(1, 2), np.empty((0, 2))
+    >>> pair = add_closeups(maps, ["k", "k"], [[np.eye(3)], []], [np.eye(3)] * 2, [nothing])
+    >>> [closeup is not None for closeup in pair]
+    [True, False]
+    """
+    reach = _reach(list(chain.from_iterable(clouds)))
+    box = _free_corner(maps[0], [path[-1:] for path in paths], marks, paths)
+    return [
+        Closeup(axes, colour, box, reach, len(shown[-1])) if shown else None
+        for axes, colour, shown in zip(maps, colours, clouds, strict=True)
+    ]
+
+
+def _reach(clouds: Sequence[Float[np.ndarray, "p 3"]]) -> float:
+    """How far [m] a window reaches from its centre: a typical finite cloud fills half of it.
+
+    Typical: the median, over the clouds, of what 19 of 20 particles keep from their mean.
+    """
+    points = [cloud[:, :2] for cloud in clouds if np.isfinite(cloud).all()]
+    extents = [np.quantile(np.abs(p - p.mean(axis=0)).max(axis=1), 0.95) for p in points]
+    return max(2.0 * float(np.median(extents)), NARROWEST) if extents else NARROWEST
+
+
+def _free_corner(
+    axes: "Axes", *covered: Sequence[Float[np.ndarray, "_ d"]]
+) -> tuple[float, float, float, float]:
+    """Box, in shares of the map, in the corner that hides the fewest points.
+
+    The first kind of points counts before the second, that before the third.
+    """
+    low = np.array([axes.get_xlim()[0], axes.get_ylim()[0]])
+    span = np.array([axes.get_xlim()[1], axes.get_ylim()[1]]) - low
+    size, margin = (share * np.array([1.0, span[0] / span[1]]) for share in (SIDE, MARGIN))
+    kinds = [(np.concatenate([p[:, :2] for p in kind]) - low) / span for kind in covered]
+
+    def hidden(corner: tuple[float, float]) -> list[int]:
+        inside = [(points > corner) & (points < corner + size) for points in kinds]
+        return [int(np.sum(within.all(axis=1))) for within in inside]
+
+    left, bottom = margin.tolist()
+    right, top = (1.0 - margin - size).tolist()
+    corners = [(right, top), (left, top), (right, bottom), (left, bottom)]
+    return *min(corners, key=hidden), *size.tolist()

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from pipistrelle.estimation.models import Landmarks
 from pipistrelle.experiments.results import TimedPath
 from pipistrelle.experiments.tables import LabelledPoints
-from pipistrelle.figures.style import INK, TRUTH, strategy_colour
+from pipistrelle.figures.style import COLUMNS, FILTER_NAMES, INK, TRUTH, strategy_colour
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -240,15 +240,41 @@ def draw_truth(
         axes.plot(*beacon, "*", ms=12, mfc=INK, mec="white", mew=0.8, zorder=3.5)
 
 
-def head(axes: "Axes", strategy: str, estimator: str | None = None) -> "Annotation":
+def cells(cases: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
+    """Place panels: a column for each strategy and a row for each filter, or line by line.
+
+    Parameters
+    ----------
+    cases : strategy and filter of each panel, no two alike
+
+    Returns
+    -------
+    row and column of each, from the top left
+        Line by line where there is one strategy or one filter, or where there are more
+        strategies than `COLUMNS`.
+
+    Examples
+    --------
+    >>> cells([("active", "ekf"), ("active", "fastslam"), ("fused", "fastslam")])
+    [(0, 0), (1, 0), (1, 1)]
+    >>> cells([("fused", "ekf"), ("fused", "fastslam")])
+    [(0, 0), (0, 1)]
+    """
+    strategies, filters = (list(dict.fromkeys(names)) for names in zip(*cases, strict=True))
+    if 1 < len(strategies) <= COLUMNS and len(filters) > 1:
+        return [(filters.index(name), strategies.index(strategy)) for strategy, name in cases]
+    return [divmod(i, COLUMNS) for i in range(len(cases))]
+
+
+def head(axes: "Axes", strategy: str, estimator: str) -> "Annotation":
     """Write a panel's name above it, and leave a line below the name for what is to be said.
 
     Parameters
     ----------
     axes : Axes
     strategy : str
-    estimator : str, optional
-        The filter's name, where there are several.
+    estimator : str
+        The filter.
 
     Returns
     -------
@@ -258,13 +284,18 @@ def head(axes: "Axes", strategy: str, estimator: str | None = None) -> "Annotati
     Examples
     --------
     >>> from matplotlib.figure import Figure
-    >>> head(Figure().add_subplot(), "fused").get_text()
+    >>> head(Figure().add_subplot(), "fused", "ekf").get_text()
     ''
     """
-    name = strategy if estimator is None else f"{strategy} · {estimator}"
-    place = {"xy": (0, 1), "xycoords": "axes fraction", "textcoords": "offset points"}
-    colour = strategy_colour(strategy)
-    axes.annotate(name, xytext=(0, 21), color=colour, fontsize=13, weight="bold", **place)
+    place: dict[str, Any] = {
+        "xy": (0, 1),
+        "xycoords": "axes fraction",
+        "textcoords": "offset points",
+    }
+    style = {"color": strategy_colour(strategy), "fontsize": 13, "weight": "bold"}
+    name = axes.annotate(strategy, xytext=(0, 21), **style, **place)
+    beside = place | {"xy": (1, 0), "xycoords": name, "xytext": (6, 0), "va": "bottom"}
+    axes.annotate(FILTER_NAMES.get(estimator, estimator), fontsize=13, **beside)
     return axes.annotate("", xytext=(0, 7), fontsize=9.5, **place)
 
 

@@ -9,10 +9,12 @@ from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
 from pipistrelle.evaluation.consistency import anees_bounds, nees
 from pipistrelle.experiments.results import TimedPath, TrialResult
 from pipistrelle.experiments.tables import LabelledPoints
+from pipistrelle.figures.closeup import add_closeups
 from pipistrelle.figures.maps import (
     PLACED,
     RAY,
     beam,
+    cells,
     draw_truth,
     ellipses,
     head,
@@ -22,7 +24,7 @@ from pipistrelle.figures.maps import (
     vehicle,
     view,
 )
-from pipistrelle.figures.style import COLUMNS, INK, STYLE, TRUTH, strategy_colour
+from pipistrelle.figures.style import INK, STYLE, TRUTH, strategy_colour
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,14 +62,15 @@ def draw_mission(
     A map shows the true and the estimated path, true landmarks (open circles) tied to their
     estimates (dots in their 95 % ellipses), the rays that are still unresolved (members at one
     standard deviation, the heavier the darker), the beacon, and the vehicle at the end with its
-    beam. Below, position and heading errors stand against three standard deviations of the
-    filter's own (in position, of the root of the trace) and the NEES against the 95 % band of one
-    run. All panels share their scales.
+    beam and, enlarged in a corner, its particles if it has any. Below, position and heading
+    errors stand against three standard deviations of the filter's own (in position, of the root
+    of the trace) and the NEES against the 95 % band of one run. All panels share their scales.
 
     Parameters
     ----------
     trials : sequence of TrialResult, at least one
-        In the frame of the truth.
+        In the frame of the truth; each strategy and filter once. Several of both make a column
+        for each strategy and a row for each filter.
     true_path : times (k) [s] and poses (k, 3) [m, m, rad], optional
         At the times of the tracks; without it there are no errors to show.
     true_landmarks : labels (n) and positions (n, 2) [m], optional
@@ -103,9 +106,9 @@ def draw_mission(
     paths = [trial.track.pose.mean for trial in trials]
     maps = [trial.track.landmarks for trial in trials]
     limits = view(true_path, true_landmarks, beacon, paths, maps)
+    places = cells([(trial.strategy, trial.filter) for trial in trials])
     with matplotlib.rc_context(STYLE):
-        figure, panels = _panels(len(trials), limits, errors=true_path is not None)
-        filters = {trial.filter for trial in trials}
+        figure, panels = _panels(places, limits, errors=true_path is not None)
         for trial, (axes, *rows) in zip(trials, panels, strict=True):
             draw_truth(axes, true_landmarks, beacon)
             if true_path is not None:
@@ -113,7 +116,8 @@ def draw_mission(
                 _draw_errors(rows, trial, true_path[1])
             _draw_estimate(axes, trial, true_landmarks)
             _draw_vehicle(axes, trial, beamwidth)
-            _title(axes, trial, several_filters=len(filters) > 1)
+            _title(axes, trial)
+        _draw_clouds([axes for axes, *_ in panels], trials, true_path, true_landmarks)
         if true_path is not None:
             _scale_errors([rows for _, *rows in panels])
         given = (true_path, true_landmarks, beacon, beamwidth)
@@ -123,13 +127,16 @@ def draw_mission(
 
 
 def _panels(
-    count: int, limits: tuple[tuple[float, float], tuple[float, float]], *, errors: bool
+    places: Sequence[tuple[int, int]],
+    limits: tuple[tuple[float, float], tuple[float, float]],
+    *,
+    errors: bool,
 ) -> tuple["Figure", list[list["Axes"]]]:
     """Lay out one map per trial, with its error rows below, in inches."""
     from matplotlib.figure import Figure
 
     (left, right), (bottom, top) = limits
-    columns, blocks = min(count, COLUMNS), -(-count // COLUMNS)
+    blocks, columns = (1 + max(indices) for indices in zip(*places, strict=True))
     total = {1: 6.4, 2: 9.0}.get(columns, 12.0)
     width = (total - LEFT - RIGHT - (columns - 1) * GAP) / columns
     height = width * (top - bottom) / (right - left)
@@ -139,26 +146,21 @@ def _panels(
     page = blocks * block + LEGEND * (1 if total > 8.0 else 2)
     figure = Figure(figsize=(total, page))
     panels: list[list[Axes]] = []
-    for i in range(count):
-        row, column = divmod(i, columns)
+    for row, column in places:
         x, y = LEFT + column * (width + GAP), page - row * block - TOP
         panel: list[Axes] = []
-        for tall, gap in zip(heights, gaps, strict=True):
+        for tall, gap, label in zip(heights, gaps, LABELS, strict=False):
             y -= gap + tall
             box = (x / total, y / page, width / total, tall / page)
-            panel.append(_axes(figure, box, panel, panels))
+            axes = _axes(figure, box, panel, panels)
+            if (row, column - 1) in places:
+                axes.tick_params(labelleft=False)
+            else:
+                axes.set_ylabel(label, multialignment="center")
+                axes.yaxis.set_label_coords(-0.42 / width, 0.5)
+            panel.append(axes)
         panel[0].set(xlim=limits[0], ylim=limits[1], xlabel="x [m]", aspect="equal")
         panels.append(panel)
-    for panel in panels[::columns]:
-        labels = (
-            "y [m]",
-            "position error\nand 3σ [m]",
-            "heading error\nand 3σ [°]",
-            "NEES\nand 95 %",
-        )
-        for axes, label in zip(panel, labels, strict=False):
-            axes.set_ylabel(label, multialignment="center")
-            axes.yaxis.set_label_coords(-0.42 / width, 0.5)
     return figure, panels
 
 
@@ -172,7 +174,6 @@ def _axes(
     first = panels[0][len(panel)] if panels else None
     time = panel[1] if len(panel) > 1 else first
     axes = figure.add_axes(box, sharex=time, sharey=first)
-    axes.tick_params(labelleft=len(panels) % COLUMNS == 0)
     axes.grid(True)
     axes.set_axisbelow(True)
     return axes
@@ -231,7 +232,26 @@ def _draw_vehicle(axes: "Axes", trial: TrialResult, beamwidth: float | None) -> 
     axes.add_patch(Polygon(shape, fc=INK, ec="white", lw=0.8, zorder=8))
 
 
-def _title(axes: "Axes", trial: TrialResult, *, several_filters: bool) -> None:
+def _draw_clouds(
+    maps: Sequence["Axes"],
+    trials: Sequence[TrialResult],
+    true_path: TimedPath | None,
+    true_landmarks: LabelledPoints | None,
+) -> None:
+    """Draw the particles at the end, where there are any."""
+    tracks = [trial.track for trial in trials]
+    clouds = [[] if track.cloud is None else [track.cloud] for track in tracks]
+    marks = [track.landmarks.mean for track in tracks]
+    marks += [] if true_landmarks is None else [true_landmarks[1]]
+    paths = [track.pose.mean for track in tracks]
+    colours = [strategy_colour(trial.strategy) for trial in trials]
+    closeups = add_closeups(maps, colours, clouds, paths, marks)
+    for closeup, cloud, path in zip(closeups, clouds, paths, strict=True):
+        if closeup:
+            closeup.show(cloud[0], path, None if true_path is None else true_path[1])
+
+
+def _title(axes: "Axes", trial: TrialResult) -> None:
     """Say what the panel is and what came out."""
     scores = trial.scores
     parts = [f"{scores.landmarks_full} of {scores.landmarks_total} landmarks placed"]
@@ -239,7 +259,7 @@ def _title(axes: "Axes", trial: TrialResult, *, several_filters: bool) -> None:
         parts.insert(0, f"RMSE {rmse:.2f} m" if rmse < 100.0 else f"RMSE {rmse:.3g} m")
     if scores.diverged:
         parts = ["diverged", *parts[:-1]]
-    line = head(axes, trial.strategy, trial.filter if several_filters else None)
+    line = head(axes, trial.strategy, trial.filter)
     line.set_text(" · ".join(parts))
 
 

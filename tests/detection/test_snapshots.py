@@ -1,0 +1,364 @@
+"""Snapshots, tones, peaks and times of arrival, alone and against a slow second version."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import find_peaks
+from scipy.stats import binom, gamma
+
+from pipistrelle.acoustics.arrivals import Arrivals, arrivals_of_emission, through_piston
+from pipistrelle.arrays.beamforming import beamscan
+from pipistrelle.arrays.layout import Layout, square_of_four
+from pipistrelle.arrays.noise import complex_noise, stream_key
+from pipistrelle.arrays.receiver import (
+    BLOCK,
+    add_echo_blocks,
+    blocks_to_hear,
+    noise_blocks,
+    record_samples,
+    sampling,
+)
+from pipistrelle.config import Config, DetectionConfig
+from pipistrelle.detection.snapshots import (
+    Detections,
+    _scan_power,
+    detect,
+    detector,
+    filter_blocks,
+    filter_samples,
+)
+from pipistrelle.geometry import wrap
+
+law = settings(deadline=None, max_examples=40)
+CONFIG = Config()
+LAYOUT, SETTLED = square_of_four(CONFIG.receiver), sampling(CONFIG)
+FINDER = detector(CONFIG, LAYOUT)
+SAMPLES = SETTLED.pulse * SETTLED.block
+START = SETTLED.pulse * BLOCK
+CHANCE, SIGMAS = 1e-6, 4.9
+OWN, BEACON = 0, 1
+
+
+def finder_of(layout=LAYOUT, **changes):
+    return detector(Config(detection=DetectionConfig(**changes)), layout)
+
+
+def echoes(*rows):
+    """Return arrivals of rows (delay, bearing [deg], source, SNR of one element [dB], shift)."""
+    delay, bearing, source, snr_db, shift = map(np.array, zip(*rows, strict=True))
+    return Arrivals(
+        delay=delay.astype(float),
+        level_db=snr_db - 10.0 * np.log10(SAMPLES),
+        bearing=np.radians(bearing),
+        frequency=SETTLED.tones[source] * shift,
+        source=source.astype(np.int8),
+        landmark=np.arange(1, len(rows) + 1),
+    )
+
+
+def matched_of(arrivals, blocks=60, key=None):
+    """Return the matched filter's outputs of the block engine, with noise if there is a key."""
+    if key is None:
+        sums = np.zeros((blocks, 4, 2, 10), dtype=complex)
+    else:
+        sums = noise_blocks(blocks, LAYOUT, SETTLED, key)
+    add_echo_blocks(sums, arrivals, LAYOUT, SETTLED)
+    return filter_blocks(sums, pulse=SETTLED.pulse, block=SETTLED.block, noise_std=1.0)
+
+
+def found_in(matched, finder=FINDER):
+    return detect(matched, finder, start=START, interval=BLOCK, pulse=SETTLED.pulse)
+
+
+def snapshots(found, tone):
+    """Return how many snapshots hold the tone's detections: each face's, half a call apart."""
+    count = 0
+    for face in np.unique(found.face):
+        delay = np.sort(found.delay[(found.face == face) & (found.tone == tone)])
+        count += bool(delay.size) + np.count_nonzero(np.diff(delay) > 0.35 * SETTLED.pulse * BLOCK)
+    return count
+
+
+def mission_frame(seed=7, frame=60, config=CONFIG):
+    """Return arrivals and noise of one emission somewhere among 50 landmarks."""
+    rng = np.random.default_rng(seed)
+    turn = 2.0 * np.pi * frame / 124.0
+    pose = np.array([7.4 * np.sin(turn), -7.4 * np.cos(turn), turn])
+    radius, direction = 25.0 * np.sqrt(rng.uniform(size=50)), rng.uniform(-np.pi, np.pi, 51)
+    places = np.append(radius, 15.0) * np.array([np.cos(direction), np.sin(direction)])
+    velocity = 0.75 * np.array([np.cos(turn), np.sin(turn)])
+    emission = arrivals_of_emission(pose, velocity, places[:, :50].T, places[:, 50], config)
+    heard = through_piston(
+        emission, radius=config.emitter.radius, frequency=35e3, speed_of_sound=343.0
+    )
+    return heard, blocks_to_hear(emission, SETTLED), stream_key(seed, frame, "mission frame")
+
+
+def arrival_lag(beam, lag, pulse):
+    """Search the call's start near a lag by brute force."""
+    near = np.arange(max(lag - 2, 0), min(lag + 3, beam.size))
+    centre = near[np.abs(beam[near]).argmax()]
+    part, best, lag = np.linspace(0.0, 1.0, 10001), -1.0, float(lag)
+    for left in range(max(centre - 1, 0), min(centre, beam.size - 2) + 1):
+        matched = np.abs((1.0 - part) * beam[left] + part * beam[left + 1]) ** 2
+        fit = matched / ((1.0 - part) ** 2 + pulse - 1 + part**2)
+        if fit.max() > best:
+            best, lag = fit.max(), left + part[fit.argmax()]
+    return lag
+
+
+def slow_detect(matched, config, *, start, interval, pulse):
+    """Detect as the room's docstring says, one definition after the other."""
+    settings_, rows = config.detection, []
+    tones = np.array([config.emitter.frequency, config.beacon.frequency])
+    threshold = gamma(10).isf(settings_.false_alarm)
+    energy = np.sum(np.abs(matched) ** 2, axis=-1)
+    for b, f, p in np.argwhere(energy > threshold):
+        half = energy[max(b - pulse // 2, 0) : b + pulse // 2 + 1, f, p]
+        around = energy[max(b - pulse, 0) : b + pulse + 1, f, 1 - p]
+        leak = 10.0 ** (settings_.leakage_db / 10.0) * around.max()
+        if energy[b, f, p] < half.max() or energy[b, f, p] <= leak:
+            continue
+        wave = 2.0 * np.pi * tones[p] * 0.0049 / 343.0
+        u = np.linspace(-1.0, 1.0, FINDER.scan.shape[1]) * wave * np.sin(np.radians(80.0))
+        position = np.arange(10) * 0.0049
+        ears = {"position": position, "frequency": tones[p], "speed_of_sound": 343.0}
+        power = beamscan(matched[b, f, p], np.arcsin(u / wave), **ears)
+        for i in find_peaks(power, height=power.max() * 10.0 ** (settings_.peak_db / 10.0))[0]:
+            offset = u[i - 1 : i + 2] - u[i]
+            bend, slope, top = np.polyfit(offset, power[i - 1 : i + 2], 2)
+            peak = u[i] - slope / (2.0 * bend)
+            angle = np.arcsin(np.clip(peak / wave, -1.0, 1.0))
+            if abs(angle) > np.radians(settings_.angle_limit_deg):
+                continue
+            beam = matched[:, f, p] @ np.exp(-1j * np.arange(10) * peak)
+            delay = start + interval * arrival_lag(beam, b, pulse)
+            rows.append((f, p, angle, delay, (top - slope**2 / (4.0 * bend)) / 10.0))
+    return rows
+
+
+def assert_same(found, rows, interval):
+    assert found.face.size == len(rows)
+    face, tone, angle, delay, power = map(np.array, zip(*rows, strict=True))
+    assert found.face.tolist() == face.tolist()
+    assert found.tone.tolist() == tone.tolist()
+    np.testing.assert_allclose(found.angle, angle, atol=1e-9)
+    np.testing.assert_allclose(found.power, power, rtol=1e-9)
+    np.testing.assert_allclose(found.delay, delay, atol=2e-4 * interval)
+    np.testing.assert_allclose(found.bearing, wrap(angle + LAYOUT.normal[face]), atol=1e-9)
+
+
+@pytest.mark.parametrize("frame", [10, 60])
+@pytest.mark.parametrize("changes", [{}, {"false_alarm": 1e-2, "leakage_db": -60.0, "peak_db": -3}])
+def test_detections_are_those_of_a_slow_second_version(frame, changes):
+    config = Config(detection=DetectionConfig(**changes))
+    heard, blocks, key = mission_frame(frame=frame)
+    matched = matched_of(heard, blocks, key)
+    timing = {"start": START, "interval": BLOCK, "pulse": SETTLED.pulse}
+    found = detect(matched, detector(config, LAYOUT), **timing)
+    assert found.face.size > 20
+    assert_same(found, slow_detect(matched, config, **timing), BLOCK)
+
+
+def test_detections_at_the_full_rate_are_those_of_a_slow_second_version():
+    heard = echoes((5.01e-3, 20, OWN, 9, 1.0), (6.8e-3, -30, BEACON, 6, 1.0))
+    samples = record_samples(44, heard, LAYOUT, SETTLED, np.random.default_rng(7))
+    matched = filter_samples(samples, tones=SETTLED.tones, rate=200e3, length=SAMPLES, noise_std=1)
+    timing = {"start": START, "interval": 5e-6, "pulse": SAMPLES}
+    found = detect(matched, FINDER, **timing)
+    assert set(zip(found.face.tolist(), found.tone.tolist(), strict=True)) >= {(0, 0), (0, 1)}
+    assert_same(found, slow_detect(matched, CONFIG, **timing), 5e-6)
+
+
+@given(key=st.integers(0, 2**64 - 1), tone=st.sampled_from([OWN, BEACON]))
+@law
+def test_the_scan_by_lag_sums_is_the_conventional_beamscan_to_rounding(key, tone):
+    snapshot, power = complex_noise((10,), 1.0, key), np.empty(FINDER.scan.shape[1])
+    _scan_power(snapshot, FINDER.table[tone], power)
+    ears = {"position": LAYOUT.position, "frequency": SETTLED.tones[tone], "speed_of_sound": 343.0}
+    exact = beamscan(snapshot, np.arcsin(FINDER.scan[tone] / FINDER.wave[tone]), **ears)
+    np.testing.assert_allclose(power, exact, atol=1e-12 * exact.max())
+
+
+def test_the_threshold_is_the_quantile_of_ten_outputs_energy_in_noise():
+    assert FINDER.threshold == pytest.approx(32.7, abs=0.05)  # the physics' printed digits
+    for alarm in (1e-2, 1e-6, 1e-9):
+        assert gamma(10).sf(finder_of(false_alarm=alarm).threshold) == pytest.approx(alarm)
+
+
+def test_noise_alone_passes_one_test_as_often_as_asked():
+    # Many faces and a single lag: every face and tone is one independent test.
+    faces, batches, alarm = 2000, 50, 1e-3
+    wide = Layout(normal=np.zeros(faces), position=LAYOUT.position)
+    finder, passed, shown = finder_of(wide, false_alarm=alarm), 0, 0
+    for batch in range(batches):
+        sums = noise_blocks(SETTLED.pulse, wide, SETTLED, stream_key(7, batch, "false alarms"))
+        matched = filter_blocks(sums, pulse=SETTLED.pulse, block=SETTLED.block, noise_std=1.0)
+        passed += np.count_nonzero(np.sum(np.abs(matched) ** 2, axis=-1) > finder.threshold)
+        found = found_in(matched, finder)
+        shown += len(set(zip(found.face.tolist(), found.tone.tolist(), strict=True)))
+    low, high = binom.interval(1.0 - CHANCE, batches * faces * 2, alarm)
+    assert low <= passed <= high
+    assert not low <= 2 * passed <= high  # the sample would show a rate twice as high
+    assert 0.97 * passed <= shown <= passed  # few snapshots of noise have all peaks past the cut
+
+
+def test_noise_alone_is_detected_in_hardly_any_frame():
+    # Each lag, face and tone is a test; a passed one shows a handful of peaks.
+    frames, blocks = 200, 700
+    tests = frames * (blocks - SETTLED.pulse + 1) * 8
+    silence = echoes((0.0, 0, OWN, -400, 1.0))
+    seen = 0
+    for frame in range(frames):
+        found = found_in(matched_of(silence, blocks, stream_key(7, frame, "silence")))
+        seen += snapshots(found, OWN) + snapshots(found, BEACON)
+    assert seen <= binom.isf(CHANCE, tests, 1e-6)
+
+
+@given(
+    late=st.floats(0.0, 30.0),
+    angle=st.floats(-70.0, 70.0),
+    source=st.sampled_from([OWN, BEACON]),
+)
+@law
+def test_without_noise_an_echo_is_placed_where_it_starts(late, angle, source):
+    # The call is heard from the first sample after its arrival on; the parabola's bias is
+    # within 2 % of a beam's step of 0.05 in u.
+    delay = START + late * BLOCK
+    found = found_in(matched_of(echoes((delay, angle, source, 30, 1.0))))
+    main = np.flatnonzero((found.face == 0) & (found.tone == source))
+    assert main.size == 1
+    first = np.ceil(delay * SETTLED.rate) / SETTLED.rate
+    assert found.delay[main[0]] == pytest.approx(first, abs=1e-9)
+    sine = np.sin(found.angle[main[0]]) - np.sin(np.radians(angle))
+    assert abs(sine) * FINDER.wave[source] < 0.02 * 0.05
+
+
+@pytest.mark.parametrize("speed", [-0.75, 0.75])
+def test_the_vehicles_doppler_shift_costs_three_decibels_and_a_centimetre_at_most(speed):
+    # Dead ahead at full speed: the matched filter's triangle is blunter than the one fitted.
+    shift = 2.0 * speed / 343.0
+    still = found_in(matched_of(echoes((6e-3, 0, OWN, 30, 1.0))))
+    moved = found_in(matched_of(echoes((6e-3, 0, OWN, 30, 1.0 + shift))))
+    loss_db = 10.0 * np.log10(still.power.max() / moved.power.max())
+    assert loss_db == pytest.approx(-20.0 * np.log10(np.sinc(shift * 35e3 * 2.8e-3)), abs=0.1)
+    late = [
+        found_in(matched_of(echoes((delay, 0, OWN, 30, 1.0 + shift)))).delay[0] - delay
+        for delay in 6e-3 + np.linspace(0.0, BLOCK, 40, endpoint=False)
+    ]
+    assert 100.0 * 343.0 / 2.0 * np.abs(late).max() < 1.2
+
+
+def test_a_turn_by_a_quarter_moves_an_echo_to_the_next_face():
+    for face in range(4):
+        bearing = 23.0 + np.degrees(LAYOUT.normal[face])
+        found = found_in(matched_of(echoes((6e-3, bearing, BEACON, 20, 1.0))))
+        row = found.face == face
+        assert found.angle[row][0] == pytest.approx(np.radians(23.0), abs=1e-3)
+        assert wrap(found.bearing[row][0] - np.radians(bearing)) == pytest.approx(0.0, abs=1e-3)
+        assert set(found.face) == {face, (face + 1) % 4}  # the next one hears it at -67 degrees
+
+
+def test_two_echoes_of_one_direction_half_a_call_apart_are_two_snapshots_and_nearer_ones_one():
+    for gap, count in ((8, 2), (6, 1)):  # blocks; half a call is 7
+        second = 4e-3 + gap * BLOCK + 0.25 / 35e3  # in quadrature: the energies add
+        heard = echoes((4e-3, 0, OWN, 20, 1.0), (second, 0, OWN, 21, 1.0))
+        found = found_in(matched_of(heard))
+        assert np.count_nonzero((found.face == 0) & (found.tone == OWN)) == count
+
+
+def test_two_directions_at_one_time_are_two_peaks_down_to_eight_decibels():
+    for weaker, count in ((-6.0, 2), (-10.0, 1)):
+        heard = echoes((6e-3, -25, OWN, 30, 1.0), (6e-3, 20, OWN, 30 + weaker, 1.0))
+        found = found_in(matched_of(heard))
+        assert np.count_nonzero(found.face == 0) == count
+
+
+def test_side_lobes_of_a_clear_echo_make_no_detection_and_a_deeper_limit_lets_them_in():
+    count = {}
+    for peak_db in (-8.0, -14.0):
+        finder = finder_of(peak_db=peak_db)
+        seen = [
+            np.count_nonzero(
+                found_in(matched_of(echoes((6e-3, 5, OWN, 30, 1.0)), key=key), finder).face == 0
+            )
+            for key in range(100)
+        ]
+        count[peak_db] = np.mean(seen)
+    assert count[-8.0] == 1.0
+    assert count[-14.0] > 2.0
+
+
+@pytest.mark.parametrize("angle", [-88.0, -78.0, 78.0, 85.0])
+def test_echoes_along_a_face_are_left_to_its_neighbour(angle):
+    found = found_in(matched_of(echoes((6e-3, angle, OWN, 30, 1.0))))
+    assert 0 not in found.face
+    assert wrap(found.bearing - np.radians(angle)) == pytest.approx(0.0, abs=1e-3)
+    assert np.all(np.abs(found.angle) <= np.radians(75.0))
+
+
+LOUD = [25.0, 40.0, 50.0, 60.0, 80.0]  # SNR of one element [dB]; the direct call's 30 to 60
+
+
+def calls_alone(tone, snr_db, leakage_db, count=60):
+    """Count snapshots of the other tone that one call alone makes, over phases and delays."""
+    finder, seen = finder_of(leakage_db=leakage_db), 0
+    rng = np.random.default_rng(7)
+    for key in range(count):
+        delay = START + rng.uniform(0.0, 30.0) * BLOCK
+        shift = 1.0 + rng.uniform(-1.0, 1.0) * 0.75 / 343.0
+        heard = echoes((delay, rng.uniform(-180.0, 180.0), tone, snr_db, shift))
+        seen += snapshots(found_in(matched_of(heard, key=key), finder), 1 - tone)
+    return seen
+
+
+@pytest.mark.parametrize("tone", [OWN, BEACON])
+@pytest.mark.parametrize("snr_db", LOUD)
+def test_a_strong_call_alone_makes_no_detection_in_the_other_tone(tone, snr_db):
+    assert calls_alone(tone, snr_db, -28.0) == 0
+
+
+@pytest.mark.parametrize("tone", [OWN, BEACON])
+def test_without_the_guard_it_would_make_one_at_each_edge(tone):
+    assert calls_alone(tone, 60.0, -60.0) > 60 * 2  # two faces hear it
+
+
+@pytest.mark.slow
+def test_a_call_of_35_db_leaks_just_under_the_guard_and_lifts_noise_over_the_threshold():
+    # There the guard stands at the threshold and the leak is as strong as the noise.
+    seen = {snr: calls_alone(BEACON, snr, -28.0, 3000) / 3000 for snr in (25.0, 35.0, 45.0)}
+    assert 0.003 < seen[35.0] < 0.1
+    assert seen[25.0] < 0.002
+    assert seen[45.0] < 0.002
+
+
+def test_a_weak_echo_beside_a_loud_call_of_the_other_tone_is_given_up():
+    for snr_db, heard in ((25.0, True), (15.0, False)):  # 45 dB under the call less 28: 17
+        both = echoes((6e-3, 10, BEACON, 45, 1.0), (7e-3, -20, OWN, snr_db, 1.0))
+        found = found_in(matched_of(both))
+        assert np.any((found.tone == OWN) & (found.face == 0)) == heard
+
+
+def test_matched_filters_give_an_echo_the_gain_of_its_samples():
+    heard = replace(echoes((START + 5 * BLOCK, 0, OWN, 0, 1.0)), level_db=np.array([3.0]))
+    energy = np.sum(np.abs(matched_of(heard)[:, 0, OWN]) ** 2, axis=-1)
+    assert energy.argmax() == 5
+    assert energy.max() == pytest.approx(10.0 * SAMPLES * 10.0**0.3, rel=1e-9)
+    off = replace(heard, delay=heard.delay + 0.5 * BLOCK)  # between two lags: 0.32 dB less
+    energy_off = np.sum(np.abs(matched_of(off)[:, 0, OWN]) ** 2, axis=-1)
+    assert energy_off.max() == pytest.approx((1.0 - 0.5 / 14.0) ** 2 * energy.max(), rel=1e-9)
+
+
+def test_a_record_shorter_than_the_call_holds_nothing():
+    found = found_in(matched_of(echoes((6e-3, 0, OWN, 30, 1.0)), blocks=SETTLED.pulse - 1))
+    assert all(getattr(found, f.name).size == 0 for f in fields(Detections))
+
+
+def test_a_crowd_of_detections_finds_room():
+    rng = np.random.default_rng(7)
+    crowd = [(START + 9 * k * BLOCK, rng.uniform(-180, 180), k % 2, 12.0, 1.0) for k in range(300)]
+    found = found_in(matched_of(echoes(*crowd), blocks=2800, key=1))
+    assert found.face.size > 256  # twice the room's first size
