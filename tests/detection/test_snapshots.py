@@ -265,7 +265,7 @@ def test_a_turn_by_a_quarter_moves_an_echo_to_the_next_face():
 def test_two_echoes_of_one_direction_half_a_call_apart_are_two_snapshots_and_nearer_ones_one():
     for gap, count in ((8, 2), (6, 1)):  # blocks; half a call is 7
         second = 4e-3 + gap * BLOCK + 0.25 / 35e3  # in quadrature: the energies add
-        heard = echoes((4e-3, 0, OWN, 20, 1.0), (second, 0, OWN, 21, 1.0))
+        heard = echoes((4e-3, 0, OWN, 20, 1.0), (second, 0, OWN, 20, 1.0))
         found = found_in(matched_of(heard))
         assert np.count_nonzero((found.face == 0) & (found.tone == OWN)) == count
 

@@ -1,6 +1,6 @@
 """A made-up mission that looks like one: what a filter might believe, frame by frame."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -28,6 +28,17 @@ class Believed:
 
     def landmarks(self) -> Landmarks:
         return self.map
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Swarming(Believed):
+    """A belief made of particles."""
+
+    particles: np.ndarray
+    full: float = 0.0
+
+    def cloud(self) -> np.ndarray:
+        return self.particles
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,6 +174,35 @@ def trial_of(strategy, time, path, points, rng) -> tuple[TrialResult, list]:
         strategy=strategy, filter="ekf", track=track, scans=scans, scores=scores, wall_s=0.05
     )
     return result, watched
+
+
+def cloud_of(pose: Gaussian, count: int = 40) -> np.ndarray:
+    return np.random.default_rng(5).multivariate_normal(pose.mean, pose.covariance, count)
+
+
+def swarming(trial: TrialResult) -> TrialResult:
+    """The same trial as if its filter had particles."""
+    pose = trial.track.pose
+    cloud = cloud_of(Gaussian(mean=pose.mean[-1], covariance=pose.covariance[-1]))
+    return replace(trial, filter="fastslam", track=replace(trial.track, cloud=cloud, full=3.5))
+
+
+@pytest.fixture(scope="session")
+def swarms(mission) -> dict:
+    """For each strategy, the trial of a filter with particles."""
+    return {strategy: swarming(trial) for strategy, trial in mission.trials.items()}
+
+
+@pytest.fixture(scope="session")
+def watched_swarms(mission) -> dict:
+    """For each strategy, what a filter with particles shows to whoever watches."""
+    return {
+        strategy: [
+            (scan, Swarming(at=seen.at, map=seen.map, particles=cloud_of(seen.at)))
+            for scan, seen in frames
+        ]
+        for strategy, frames in mission.watched.items()
+    }
 
 
 @pytest.fixture(scope="session")

@@ -18,6 +18,14 @@ def recorder(mission) -> MissionRecorder:
     return watch
 
 
+@pytest.fixture(scope="module")
+def swarm_recorder(watched_swarms) -> MissionRecorder:
+    watch = MissionRecorder()
+    for scan, belief in watched_swarms["fused"]:
+        watch("fused", "fastslam", scan, belief)
+    return watch
+
+
 def rows_of(labels: list[int], x: list[float]) -> Landmarks:
     return Landmarks(
         landmark=np.array(labels, dtype=int),
@@ -34,6 +42,42 @@ def test_a_recorder_keeps_every_frame_of_every_strategy(recorder, mission):
     kept = recorder.snapshots["passive", "ekf"][200]
     assert kept.scan is scan
     assert np.array_equal(kept.pose, belief.pose().mean)
+
+
+def test_a_recorder_keeps_particles_where_there_are_any(recorder, swarm_recorder, watched_swarms):
+    assert recorder.snapshots["fused", "ekf"][0].cloud is None
+    kept = [frame.cloud for frame in swarm_recorder.snapshots["fused", "fastslam"]]
+    assert np.array_equal(kept, [belief.cloud() for _, belief in watched_swarms["fused"]])
+
+
+def test_a_panel_shows_the_particles_of_its_frame_enlarged(recorder, swarm_recorder, mission):
+    _, panels = _stage(recorder.snapshots | swarm_recorder.snapshots, **mission.truth)
+    assert [panel.closeup is not None for panel in panels] == [False, False, False, True]
+    frame = swarm_recorder.snapshots["fused", "fastslam"][100]
+    panels[3]._show_vehicle(frame.pose, frame.scan.time, 100)
+    dots, _, window = panels[3].closeup.artists
+    assert np.array_equal(dots.get_xydata(), frame.cloud[:, :2])
+    assert np.mean(window.get_xlim()) == pytest.approx(frame.pose[0])
+    assert panels[3].artists[-1] is window, "nothing is drawn over it"
+
+
+def test_a_film_draws_the_window_anew_in_every_picture(swarm_recorder, mission, tmp_path):
+    path = tmp_path / "mission.gif"
+    animate_mission(swarm_recorder.snapshots, path, **mission.truth, pictures=3)
+    _, (panel,) = _stage(swarm_recorder.snapshots, **mission.truth)
+    window = panel.closeup.artists[2]
+    pictures = []
+    with Image.open(path) as film:
+        x0, y0, x1, y1 = window.get_window_extent().extents.round().astype(int)
+        for picture in range(3):
+            film.seek(picture)
+            whole = np.asarray(film.convert("L"))[::-1]
+            pictures.append(whole[y0 + 2 : y1 - 2, x0 + 2 : x1 - 2])
+    for one, other in zip(pictures, pictures[1:], strict=False):
+        assert np.mean(one != other) > 0.01
+    for picture in pictures:
+        assert np.mean(picture > 250) > 0.5, "the map below is covered"
+        assert np.mean(picture < 250) > 0.03, "particles, vehicle, bar and words"
 
 
 def test_a_gif_has_the_pictures_asked_for_and_rests_on_the_last(recorder, mission, tmp_path):

@@ -10,7 +10,9 @@ from pipistrelle.figures.maps import (
     PLACED,
     RAY,
     beam,
+    cells,
     ellipses,
+    head,
     legend,
     placed,
     shades,
@@ -111,3 +113,25 @@ def test_a_view_without_truth_shows_the_estimates_that_are_finite():
 def test_a_legend_knows_only_symbols_that_exist():
     with pytest.raises(KeyError, match="unicorn"):
         legend(Figure(), ["unicorn"], 1, 0.0, 0.0)
+
+
+def test_panels_go_line_by_line_unless_strategies_and_filters_make_a_table():
+    strategies, filters = ("active", "fused", "passive"), ("ekf", "fastslam")
+    both = [(strategy, name) for strategy in strategies for name in filters]
+    assert cells(both) == [(0, 0), (1, 0), (0, 1), (1, 1), (0, 2), (1, 2)]
+    assert cells(both[::2]) == [(0, 0), (0, 1), (0, 2)]
+    assert cells([("fused", str(i)) for i in range(4)]) == [(0, 0), (0, 1), (0, 2), (1, 0)]
+    many = [(str(i), name) for i in range(4) for name in filters]
+    assert cells(many) == [divmod(i, 3) for i in range(8)]
+
+
+def test_a_head_names_strategy_and_filter_side_by_side_a_strangers_too():
+    figure = Figure()
+    axes = figure.add_subplot()
+    head(axes, "fused", "own")
+    figure.canvas.draw()
+    strategy, estimator, _ = axes.texts
+    assert (strategy.get_text(), estimator.get_text()) == ("fused", "own")
+    left, right = strategy.get_window_extent(), estimator.get_window_extent()
+    assert left.x1 < right.x0
+    assert left.y0 == pytest.approx(right.y0, abs=1.0)

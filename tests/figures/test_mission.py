@@ -39,6 +39,12 @@ def three(mission):
     return draw_mission(list(mission.trials.values()), **mission.truth)
 
 
+@pytest.fixture(scope="module")
+def six(mission, swarms):
+    trials = [trial for s in STRATEGIES for trial in (mission.trials[s], swarms[s])]
+    return draw_mission(trials, **mission.truth)
+
+
 def test_each_strategy_has_a_map_and_three_rows_of_errors(three):
     assert len(maps(three)) == 3
     assert len(three.axes) == 3 * 4
@@ -48,7 +54,7 @@ def test_titles_say_the_result(three, mission):
     for axes, strategy in zip(maps(three), STRATEGIES, strict=True):
         scores = mission.trials[strategy].scores
         counts = f"{scores.landmarks_full} of {scores.landmarks_total} landmarks placed"
-        assert words(axes) == [strategy, f"RMSE {scores.position_rmse_m:.2f} m · {counts}"]
+        assert words(axes) == [strategy, "EKF", f"RMSE {scores.position_rmse_m:.2f} m · {counts}"]
 
 
 def test_all_panels_have_the_same_scales(three):
@@ -101,7 +107,7 @@ def test_without_truth_there_are_maps_alone(mission):
     scores = replace(trial.scores, position_rmse_m=None)
     figure = draw_mission([replace(trial, scores=scores)])
     assert len(figure.axes) == 1
-    assert "RMSE" not in words(figure.axes[0])[1]
+    assert "RMSE" not in words(figure.axes[0])[2]
     names = {text.get_text() for text in figure.legends[0].texts}
     assert not names & {"true path", "true landmark", "beacon", "its beam"}
 
@@ -112,12 +118,54 @@ def test_the_legend_stands_once_and_names_everything(three):
     assert all(axes.get_legend() is None for axes in three.axes)
 
 
-def test_several_filters_are_named_and_a_fourth_panel_starts_a_row(mission):
-    trials = [*mission.trials.values(), replace(mission.trials["fused"], filter="fastslam")]
-    panels = maps(draw_mission(trials, **mission.truth))
-    assert words(panels[1])[0] == "fused · ekf"
-    assert words(panels[3])[0] == "fused · fastslam"
-    assert panels[3].get_position().y1 < panels[0].get_position().y0
+def test_each_filter_has_a_row_and_each_strategy_a_column(six):
+    names = [words(axes)[:2] for axes in maps(six)]
+    assert names == [[s, f] for s in STRATEGIES for f in ("EKF", "FastSLAM 2.0")]
+    boxes = np.array([axes.get_position().extents for axes in maps(six)]).reshape(3, 2, 4)
+    left, _, right, top = np.moveaxis(boxes, 2, 0)
+    assert np.all(left[:, 0] == left[:, 1])
+    assert np.all(left[1:] > right[:-1])
+    assert np.ptp(top, axis=0) == pytest.approx([0.0, 0.0], abs=1e-12)
+    below = six.axes[7].get_position()
+    assert np.all(top[:, 1] < six.axes[3].get_position().y0), "errors of the first row included"
+    assert below.y0 > 0.0
+
+
+def test_scales_are_written_left_of_each_row_and_nowhere_else(six):
+    labelled = [axes.get_ylabel() != "" for axes in maps(six)]
+    assert labelled == [True, True, False, False, False, False]
+    ticks = [axes.yaxis.get_tick_params()["labelleft"] for axes in maps(six)]
+    assert ticks == labelled
+
+
+def test_two_filters_of_one_strategy_stand_side_by_side(mission, swarms):
+    left, right = maps(draw_mission([mission.trials["fused"], swarms["fused"]], **mission.truth))
+    assert left.get_position().y0 == right.get_position().y0
+    assert left.get_position().x1 < right.get_position().x0
+
+
+def test_particles_are_drawn_and_enlarged_where_there_are_any(six, swarms):
+    for axes, particles in zip(maps(six), [0, 40] * 3, strict=True):
+        assert marks(axes, "o", 1.6) == particles
+        assert len(axes.child_axes) == (particles > 0)
+    window = maps(six)[5].child_axes[0]
+    pose = swarms["passive"].track.pose.mean[-1]
+    assert np.mean(window.get_xlim()) == pytest.approx(pose[0])
+    assert np.mean(window.get_ylim()) == pytest.approx(pose[1])
+
+
+def test_without_particles_there_is_no_window(three):
+    assert [axes.child_axes for axes in maps(three)] == [[], [], []]
+
+
+def test_a_nees_of_many_digits_is_written_as_a_power(mission):
+    trial = mission.trials["active"]
+    pose = replace(trial.track.pose, covariance=1e-8 * trial.track.pose.covariance)
+    lost = replace(trial, track=replace(trial.track, pose=pose))
+    figure = draw_mission([lost], **mission.truth)
+    figure.canvas.draw()
+    labels = [label.get_text() for label in figure.axes[3].get_yticklabels()]
+    assert max(len(label.strip("$").replace("10^", "")) for label in labels) <= 4
 
 
 def test_a_trial_that_has_gone_to_infinity_is_drawn_and_said_to_have_diverged(mission, tmp_path):
@@ -128,7 +176,7 @@ def test_a_trial_that_has_gone_to_infinity_is_drawn_and_said_to_have_diverged(mi
     scores = replace(trial.scores, diverged=True, position_rmse_m=float("inf"))
     figure = draw_mission([replace(trial, track=track, scores=scores)], **mission.truth)
     save_figure(figure, tmp_path, "lost")
-    assert words(maps(figure)[0])[1] == "diverged · RMSE inf m"
+    assert words(maps(figure)[0])[2] == "diverged · RMSE inf m"
 
 
 def test_a_saved_figure_is_wide_enough_for_a_page(three, tmp_path):

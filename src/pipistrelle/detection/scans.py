@@ -13,7 +13,7 @@ from numba import njit
 
 from pipistrelle.config import Strategy
 from pipistrelle.detection.snapshots import Detections
-from pipistrelle.geometry import wrap
+from pipistrelle.geometry import wrap, wrap_angle
 
 UNLABELLED = -1
 """Label of a detection that belongs to no landmark."""
@@ -185,7 +185,7 @@ def _average(labels, label, face, tone, angle, bearing, delay, power, weighted):
                     north += weight * math.sin(bearing[d])
                     late += weight * delay[d]
             if total > 0.0:
-                mean_bearing[i, p] = math.atan2(north, east)
+                mean_bearing[i, p] = wrap_angle(math.atan2(north, east))
                 if p == 0:
                     mean_delay[i] = late / total
     return mean_bearing, mean_delay

@@ -134,8 +134,10 @@ def _place_landmarks(
     """Draw landmarks one by one, uniformly over the disc, until each keeps its distances."""
     half = 0.5 * setup.spacing
     most = DENSEST * ((setup.radius + half) / half) ** 2 if half > 0.0 else math.inf
+    if setup.landmarks > max(most, 1.0):
+        raise _too_many(setup, f"at most {max(int(most), 1)} fit")
     placed = np.empty((setup.landmarks, 2))
-    for i in range(setup.landmarks if setup.landmarks <= most else 0):
+    for i in range(setup.landmarks):
         for _ in range(TRIES):
             distance = setup.radius * math.sqrt(rng.uniform())
             direction = rng.uniform(-math.pi, math.pi)
@@ -149,8 +151,6 @@ def _place_landmarks(
                 break
         else:
             raise _too_many(setup, f"room was found for {i}")
-    if setup.landmarks > most:
-        raise _too_many(setup, f"at most {int(most)} fit")
     return placed
 
 

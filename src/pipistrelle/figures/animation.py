@@ -228,8 +228,8 @@ def _stage(
         axes.grid(True)
         axes.set_axisbelow(True)
         draw_truth(axes, true_landmarks, beacon)
-        line = head(axes, strategy, name)
-        panels.append(_Panel(axes, line, frames, strategy, true_path, beamwidth))
+        panels.append(_Panel(axes, head(axes, strategy, name), frames, strategy, true_path))
+        panels[-1].beamwidth = None if strategy == "passive" else beamwidth
     _enlarge(panels, true_landmarks)
     names = [name for name in SYMBOLS if name != "beacon" or beacon is not None]
     legend(figure, names, 2 * columns, LEFT, RIGHT)
@@ -243,10 +243,12 @@ def _enlarge(panels: Sequence["_Panel"], true_landmarks: LabelledPoints | None) 
     marks += [] if true_landmarks is None else [true_landmarks[1]]
     maps, colours, paths = zip(*((p.axes, p.colour, p.path) for p in panels), strict=True)
     closeups = add_closeups(maps, colours, clouds, paths, marks)
-    for panel, panel.closeup in zip(panels, closeups, strict=True):
-        for artist in panel.closeup.artists if panel.closeup else ():
-            artist.set_animated(True)
-            panel.artists.append(artist)
+    for panel, closeup in zip(panels, closeups, strict=True):
+        if closeup:
+            panel.closeup = closeup
+            panel.artists += closeup.artists
+            for artist in closeup.artists:
+                artist.set_animated(True)
 
 
 def _play(
@@ -279,14 +281,13 @@ class _Panel:
         frames: Sequence[Snapshot],
         strategy: str,
         true_path: TimedPath | None,
-        beamwidth: float | None,
     ) -> None:
         self.axes, self.line, self.frames, self.true_path = axes, line, frames, true_path
         self.times = np.array([frame.scan.time for frame in frames])
         self.path = np.array([frame.pose for frame in frames])
         self.size = axes.get_xlim()[1] - axes.get_xlim()[0]
         self.colour = strategy_colour(strategy)
-        self.beamwidth = None if strategy == "passive" else beamwidth
+        self.beamwidth: float | None = None
         self.rows, self.turned_full = frames[0].landmarks, {}
         self.artists: list[Artist] = []
         self.closeup: Closeup | None = None

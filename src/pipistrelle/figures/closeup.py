@@ -88,11 +88,10 @@ class Closeup:
             self._window.set(**{f"{axis}lim": (middle - self._reach, middle + self._reach)})
         self._path.set_data(*path[-TAIL:, :2].T)
         self._swarm.set_verts([vehicle(particle, 0.24 * self._reach) for particle in cloud])
-        seen = [pose]
-        if true_path is not None and np.isfinite(true_path[-1]).all():
-            self._true.set_data(*true_path[-TAIL:, :2].T)
-            seen.append(true_path[-1])
-        self._vehicles.set_verts([vehicle(pose, 0.34 * self._reach) for pose in seen])
+        true = path[:0] if true_path is None else true_path[-TAIL:]
+        self._true.set_data(*true[:, :2].T)
+        seen = [pose, *(last for last in true[-1:] if np.isfinite(last).all())]
+        self._vehicles.set_verts([vehicle(dart, 0.34 * self._reach) for dart in seen])
 
     def _label(self, title: str) -> None:
         """Say what the window holds, and how large it is by a bar of a round length."""

@@ -287,16 +287,13 @@ def head(axes: "Axes", strategy: str, estimator: str) -> "Annotation":
     >>> head(Figure().add_subplot(), "fused", "ekf").get_text()
     ''
     """
-    place: dict[str, Any] = {
-        "xy": (0, 1),
-        "xycoords": "axes fraction",
-        "textcoords": "offset points",
-    }
+    above: dict[str, Any] = {"xy": (0, 1), "xycoords": "axes fraction"}
+    above["textcoords"] = "offset points"
     style = {"color": strategy_colour(strategy), "fontsize": 13, "weight": "bold"}
-    name = axes.annotate(strategy, xytext=(0, 21), **style, **place)
-    beside = place | {"xy": (1, 0), "xycoords": name, "xytext": (6, 0), "va": "bottom"}
-    axes.annotate(FILTER_NAMES.get(estimator, estimator), fontsize=13, **beside)
-    return axes.annotate("", xytext=(0, 7), fontsize=9.5, **place)
+    name = axes.annotate(strategy, xytext=(0, 21), **style, **above)
+    beside = above | {"xy": (1, 0), "xycoords": name, "va": "bottom"}
+    axes.annotate(FILTER_NAMES.get(estimator, estimator), xytext=(6, 0), fontsize=13, **beside)
+    return axes.annotate("", xytext=(0, 7), fontsize=9.5, **above)
 
 
 def legend(figure: "Figure", names: Iterable[str], columns: int, left: float, right: float) -> None:

@@ -301,4 +301,6 @@ def _scale_errors(panels: Sequence[Sequence["Axes"]]) -> None:
     largest = max(panel[2].dataLim.ymax for panel in panels)
     consistency.set_ylim(0.05, max(100.0, 2.0 * largest))
     consistency.yaxis.set_major_locator(LogLocator(subs=(1.0,), numticks=5))
-    consistency.yaxis.set_major_formatter("{x:g}")
+    consistency.yaxis.set_major_formatter(
+        lambda x, _: f"{x:g}" if x < 1e4 else f"$10^{{{np.log10(x):.0f}}}$"
+    )

@@ -8,7 +8,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pipistrelle.experiments.results import Scores, TrialResult
+    from pipistrelle.experiments.results import TrialResult
     from pipistrelle.experiments.trial import Progress
 
 
@@ -86,7 +86,7 @@ def _lines() -> "Progress":
     def show(stage: str, done: int, total: int) -> None:
         rate = _rate(done, elapsed(stage))
         if done == total:
-            say(f"{stage:<14}{rate}")
+            say(f"{stage:<17}{rate}")
 
     return show
 
@@ -99,7 +99,7 @@ def _bars() -> "Iterator[Progress]":
     from rich.progress import Progress as Bars
 
     elapsed, tasks = _stopwatch(), {}
-    columns = (TextColumn("{task.description:<14}"), BarColumn(), TextColumn("{task.fields[rate]}"))
+    columns = (TextColumn("{task.description:<17}"), BarColumn(), TextColumn("{task.fields[rate]}"))
     with Bars(*columns, console=Console(stderr=True)) as bars:
 
         def show(stage: str, done: int, total: int) -> None:
@@ -133,6 +133,8 @@ def _rate(frames: int, elapsed: float) -> str:
 def closing_table(trials: "Sequence[TrialResult]", aligned: bool) -> str:
     """Compare the estimates of one world, a column each; what no estimate has is left out.
 
+    Six columns fit into 100 characters. Of a swarm, landmarks are those of the heaviest particle.
+
     Parameters
     ----------
     trials : sequence of TrialResult, at least one
@@ -143,33 +145,35 @@ def closing_table(trials: "Sequence[TrialResult]", aligned: bool) -> str:
     -------
     str
     """
-    rows: list[tuple[str, Callable[[Scores], str]]] = [
-        ("position RMSE [m]", lambda s: _number(s.position_rmse_m, 3)),
-        ("heading RMSE [rad]", lambda s: _number(s.heading_rmse_rad, 4)),
-        ("map RMSE [m]", lambda s: _number(s.map_rmse_m, 3)),
-    ]
-    if aligned:
-        rows += [
-            ("position RMSE, aligned [m]", lambda s: _number(s.position_rmse_aligned_m, 3)),
-            ("map RMSE, aligned [m]", lambda s: _number(s.map_rmse_aligned_m, 3)),
-        ]
-    rows += [
-        ("NEES, mean", lambda s: _number(s.nees_mean, 2)),
-        ("NEES, largest", lambda s: _number(s.nees_max, 1)),
-        ("landmarks, fully placed / all", lambda s: f"{s.landmarks_full} / {s.landmarks_total}"),
-        ("measurements per frame", lambda s: _number(s.measurements_per_frame, 2)),
-        ("rejected by the gate", lambda s: str(s.gated or "")),
-        ("diverged", lambda s: "yes" if s.diverged else ""),
-    ]
-    names = [f"{trial.strategy} {trial.filter}" for trial in trials]
-    lines = [["", *names]]
-    for title, cell in rows:
-        cells = [cell(trial.scores) for trial in trials]
+    columns = [dict(_cells(trial, aligned)) for trial in trials]
+    lines = [("", *(trial.strategy for trial in trials)), ("", *(trial.filter for trial in trials))]
+    for title in columns[0]:
+        cells = [column[title] for column in columns]
         if any(cells):
-            lines.append([title, *(text or "-" for text in cells)])
-    return "\n".join(f"{line[0]:<30}" + "".join(f"{c:>16}" for c in line[1:]) for line in lines)
+            lines.append((title, *(text or "-" for text in cells)))
+    return "\n".join(f"{line[0]:<30}" + "".join(f"{c:>11}" for c in line[1:]) for line in lines)
+
+
+def _cells(trial: "TrialResult", aligned: bool) -> Iterator[tuple[str, str]]:
+    """Word what there is to say of an estimate, with titles; nothing of what it lacks."""
+    s = trial.scores
+    yield "position RMSE [m]", _number(s.position_rmse_m, 3)
+    yield "heading RMSE [rad]", _number(s.heading_rmse_rad, 4)
+    yield "map RMSE [m]", _number(s.map_rmse_m, 3)
+    if aligned:
+        yield "position RMSE, aligned [m]", _number(s.position_rmse_aligned_m, 3)
+        yield "map RMSE, aligned [m]", _number(s.map_rmse_aligned_m, 3)
+    yield "NEES, mean", _number(s.nees_mean, 2)
+    yield "NEES, largest", _number(s.nees_max, 1)
+    yield "landmarks, fully placed / all", f"{s.landmarks_full} / {s.landmarks_total}"
+    yield "fully placed, particles' mean", _number(trial.track.full, 1)
+    yield "measurements per frame", _number(s.measurements_per_frame, 2)
+    yield "rejected by the gate", str(s.gated or "")
+    yield "diverged", "yes" if s.diverged else ""
 
 
 def _number(value: float | None, digits: int) -> str:
-    """Print a number; nothing of none."""
-    return "" if value is None else f"{value:.{digits}f}"
+    """Print a number, a huge one in few digits; nothing of none."""
+    if value is None:
+        return ""
+    return f"{value:.{digits}f}" if abs(value) < 1e5 else f"{value:.3g}"

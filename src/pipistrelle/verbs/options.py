@@ -22,7 +22,8 @@ from pipistrelle.settings import (
 )
 
 Chosen = Literal["active", "fused", "passive", "all"]
-Filter = Literal["ekf"]
+ChosenFilter = Literal["ekf", "fastslam", "both"]
+FILTERS = ("ekf", "fastslam")
 
 
 def _whole(_: Any, tokens: Sequence[Any]) -> int:
@@ -34,6 +35,10 @@ def _whole(_: Any, tokens: Sequence[Any]) -> int:
 
 
 Whole = Annotated[int, Parameter(converter=_whole)]
+Particles = Annotated[
+    Whole | None,
+    Parameter(metavar="N", help="Particles of FastSLAM; sets fastslam.particles. [default: 100]"),
+]
 
 
 def setting_flags(shown: Callable[[Key], bool] = lambda _: True) -> Any:
@@ -137,6 +142,7 @@ class MissionOptions:
         Literal["block", "dense"] | None,
         Parameter(help="Receiver: fast or literal; sets receiver.engine. [default: block]"),
     ] = None
+    particles: Particles = None
     settings: Annotated[SettingFlags | None, Parameter(name="*")] = None
 
 
@@ -162,22 +168,18 @@ def mission_config(options: MissionOptions) -> Config:
     480
     """
     layer = layers(options.config, options.settings)
-    given = {} if options.settings is None else from_flags(options.settings)
-    short: Layer = {}
-    if options.landmarks is not None:
-        short["scenario", "landmarks"] = Given(options.landmarks, "--landmarks")
-    if options.engine is not None:
-        short["receiver", "engine"] = Given(options.engine, "--engine")
-    base = resolve(layer | short)
+    short: Layer = {
+        ("scenario", "landmarks"): Given(options.landmarks, "--landmarks"),
+        ("receiver", "engine"): Given(options.engine, "--engine"),
+        ("fastslam", "particles"): Given(options.particles, "--particles"),
+    }
+    base = resolve(layer | short_names(short, options.settings))
     if options.duration is not None:
         steps = _steps(options.duration, base)
         short["scenario", "steps"] = Given(steps, f"--duration {options.duration:g}")
     if options.beamwidth is not None:
         short["emitter", "radius"] = Given(_radius(options.beamwidth, base), "--beamwidth")
-    for key, (_, where) in short.items():
-        if key in given:
-            raise InputError(f"{where} and {given[key].where} are one setting; give one of them")
-    return resolve(layer | short)
+    return resolve(layer | short_names(short, options.settings))
 
 
 def layers(config: Path | None, settings: SettingFlags | None) -> Layer:
@@ -201,6 +203,38 @@ def layers(config: Path | None, settings: SettingFlags | None) -> Layer:
     return file | from_environment(os.environ) | from_flags(settings or {})
 
 
+def short_names(short: Layer, settings: SettingFlags | None) -> Layer:
+    """Keep the short names that were given.
+
+    Parameters
+    ----------
+    short : Layer
+        Of the value None where the name was not given.
+    settings : nested dict, optional
+
+    Returns
+    -------
+    Layer
+
+    Raises
+    ------
+    InputError
+        Where the setting was given by its own flag too.
+
+    Examples
+    --------
+    >>> short_names({("seed",): Given(3, "-s")}, {"seed": 4})
+    Traceback (most recent call last):
+    pipistrelle.config.InputError: -s and --seed are one setting; give one of them
+    """
+    flags = from_flags(settings or {})
+    short = {key: given for key, given in short.items() if given.value is not None}
+    for key in short.keys() & flags.keys():
+        both = f"{short[key].where} and {flags[key].where}"
+        raise InputError(f"{both} are one setting; give one of them")
+    return short
+
+
 def strategies(chosen: Chosen) -> tuple[Strategy, ...]:
     """Name the strategies of a choice.
 
@@ -218,6 +252,37 @@ def strategies(chosen: Chosen) -> tuple[Strategy, ...]:
     (('active', 'fused', 'passive'), ('fused',))
     """
     return STRATEGIES if chosen == "all" else (chosen,)
+
+
+def filters(chosen: ChosenFilter, particles: int | None) -> tuple[str, ...]:
+    """Name the filters of a choice.
+
+    Parameters
+    ----------
+    chosen : one filter, or "both"
+    particles : int, optional
+        As asked for by the short name.
+
+    Returns
+    -------
+    tuple of str
+
+    Raises
+    ------
+    InputError
+        Particles for a filter that has none.
+
+    Examples
+    --------
+    >>> filters("both", 300), filters("ekf", None)
+    (('ekf', 'fastslam'), ('ekf',))
+    """
+    if chosen == "ekf" and particles is not None:
+        raise InputError(
+            f"--particles: found {particles}, but --filter is ekf, which has none; "
+            "add --filter fastslam or --filter both"
+        )
+    return FILTERS if chosen == "both" else (chosen,)
 
 
 def _steps(duration: float, config: Config) -> int:

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 def result_folder(options: OutputOptions, name: str) -> Iterator[Path]:
     """Make the result folder at once, and remove it if nothing comes to stand in it.
 
+    Earlier results that may be overwritten stay in it until `deliver`.
+
     Parameters
     ----------
     options : OutputOptions
@@ -87,7 +89,7 @@ def deliver(
     ignored_rows: dict[str, int] | None = None,
     watch: "MissionRecorder | None" = None,
 ) -> int:
-    """Write results, figure and film, print the table, and the folder last.
+    """Write results, figure and film in place of earlier ones, print the table, the folder last.
 
     Parameters
     ----------
@@ -116,6 +118,13 @@ def deliver(
 
     path = (truth.time, truth.path) if truth is not None and truth.path is not None else None
     landmarks = None if truth is None else truth.landmarks
+    scene: dict[str, Any] = {
+        "true_path": path,
+        "true_landmarks": landmarks,
+        "beacon": beacon,
+        "beamwidth": beamwidth,
+    }
+    figure = draw_mission(trials, **scene)
     write_results(
         folder,
         config=config,
@@ -126,13 +135,7 @@ def deliver(
         true_landmarks=landmarks,
         ignored_rows=ignored_rows or {},
     )
-    scene: dict[str, Any] = {
-        "true_path": path,
-        "true_landmarks": landmarks,
-        "beacon": beacon,
-        "beamwidth": beamwidth,
-    }
-    save_figure(draw_mission(trials, **scene), folder, "mission")
+    save_figure(figure, folder, "mission")
     if watch is not None:
         _film(watch, folder / f"mission.{options.animate}", scene, options)
     if not options.quiet:

@@ -9,9 +9,10 @@ from cyclopts import Parameter
 from pipistrelle.config import InputError
 from pipistrelle.verbs.options import (
     Chosen,
-    Filter,
+    ChosenFilter,
     MissionOptions,
     OutputOptions,
+    filters,
     mission_config,
     strategies,
 )
@@ -26,7 +27,9 @@ if TYPE_CHECKING:
 def run(
     *,
     strategy: Annotated[Chosen, Parameter(help="What the vehicle listens to.")] = "all",
-    filters: Annotated[Filter, Parameter(name="--filter", help="What draws the map.")] = "ekf",
+    estimator: Annotated[
+        ChosenFilter, Parameter(name="--filter", help="What draws the map.")
+    ] = "ekf",
     mission: Annotated[MissionOptions | None, Parameter(name="*")] = None,
     output: Annotated[OutputOptions | None, Parameter(name="*")] = None,
     save_log: Annotated[
@@ -39,7 +42,8 @@ def run(
     ] = None,
 ) -> int:
     """Drive through one random world and map it, the three strategies side by side."""
-    config, output = mission_config(mission or MissionOptions()), output or OutputOptions()
+    mission, output = mission or MissionOptions(), output or OutputOptions()
+    config, ways = mission_config(mission), filters(estimator, mission.particles)
     if save_log is not None:
         _check_vacant(save_log, output)
     from pipistrelle.experiments.replay import Truth
@@ -51,7 +55,7 @@ def run(
         outcome.compile_once(output)
         watch = outcome.recorder(output)
         with progress(output.quiet) as show:
-            done = run_mission(config, strategies(strategy), (filters,), progress=show, watch=watch)
+            done = run_mission(config, strategies(strategy), ways, progress=show, watch=watch)
         drive = done.drive
         truth = Truth(time=drive.time, path=drive.true_path, landmarks=drive.true_landmarks)
         if save_log is not None:

@@ -6,16 +6,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from pipistrelle.config import Config, FilterConfig, InputError, RayConfig, Section
+from pipistrelle.config import Config, FastSlamConfig, FilterConfig, InputError, RayConfig, Section
 from pipistrelle.settings import Given, Key, Layer, from_flags, resolve
 from pipistrelle.verbs.console import progress, say
 from pipistrelle.verbs.options import (
     Chosen,
-    Filter,
+    ChosenFilter,
     OutputOptions,
+    Particles,
     Whole,
+    filters,
     layers,
     setting_flags,
+    short_names,
     strategies,
 )
 
@@ -24,7 +27,7 @@ if TYPE_CHECKING:
 
 GATE = 0.999
 """Share of a measurement's predicted distribution that is accepted of real logs."""
-GATE_KEY = ("filter", "gate")
+GATE_KEY: Key = ("filter", "gate")
 LOGGED = frozenset(
     {
         ("filter", "range_std"),
@@ -42,6 +45,7 @@ class SlamConfig(Section):
     seed: int
     filter: FilterConfig
     rays: RayConfig
+    fastslam: FastSlamConfig
 
 
 def _is_open(key: Key) -> bool:
@@ -66,7 +70,10 @@ def slam(
         Chosen,
         Parameter(help="What is kept: all as it is, only what has a range, or only bearings."),
     ] = "fused",
-    filters: Annotated[Filter, Parameter(name="--filter", help="What draws the map.")] = "ekf",
+    estimator: Annotated[
+        ChosenFilter, Parameter(name="--filter", help="What draws the map.")
+    ] = "ekf",
+    particles: Particles = None,
     beamwidth: Annotated[
         float | None,
         Parameter(
@@ -92,8 +99,9 @@ def slam(
 ) -> int:
     """Solve a recorded log; where it has the truth, say how far off the map is."""
     output = output or OutputOptions()
-    layer = _layer(config, settings or {}, gate)
+    layer = _layer(config, settings or {}, gate, particles)
     resolve(layer)
+    chosen, ways = strategies(strategy), filters(estimator, particles)
     if beamwidth is not None and not 0 < beamwidth <= 360:
         raise InputError(f"--beamwidth: found {beamwidth:g}, expected above 0 and up to 360 [deg]")
     from pipistrelle.experiments.replay import load, replay
@@ -107,7 +115,6 @@ def slam(
         watch = outcome.recorder(output)
         beam = None if beamwidth is None else radians(beamwidth)
         with progress(output.quiet) as show:
-            chosen, ways = strategies(strategy), (filters,)
             trials = replay(
                 recorded, truth, chosen, ways, beam, settled, progress=show, watch=watch
             )
@@ -115,7 +122,7 @@ def slam(
             folder,
             trials,
             truth,
-            config=SlamConfig(seed=settled.seed, filter=settled.filter, rays=settled.rays),
+            config=SlamConfig(**{name: getattr(settled, name) for name in SlamConfig.model_fields}),
             seed=settled.seed,
             options=output,
             beamwidth=beam,
@@ -124,17 +131,20 @@ def slam(
         )
 
 
-def _layer(config: Path | None, settings: SlamFlags, gate: float | None) -> Layer:
+def _layer(
+    config: Path | None, settings: SlamFlags, gate: float | None, particles: int | None
+) -> Layer:
     """Lay file, environment and flags over each other; refuse flags for what the log decides."""
     flags = from_flags(settings)
     for key, given in flags.items():
         if not _is_open(key):
             why = "the log decides this" if key in LOGGED else "means nothing to a recorded log"
             raise InputError(f"{given.where}: {why}; leave the flag out")
-    if gate is not None and GATE_KEY in flags:
-        raise InputError("--gate and --filter.gate are one setting; give one of them")
-    short = {} if gate is None else {GATE_KEY: Given(gate, "--gate")}
-    return layers(config, settings) | short
+    short: Layer = {
+        GATE_KEY: Given(gate, "--gate"),
+        ("fastslam", "particles"): Given(particles, "--particles"),
+    }
+    return layers(config, settings) | short_names(short, settings)
 
 
 def _with_log(layer: Layer, recorded: "Log", log: Path) -> Config:

@@ -1,0 +1,207 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipistrelle.detection.scans import UNLABELLED, Heard, average_faces, scan_of
+from pipistrelle.detection.snapshots import Detections
+from pipistrelle.geometry import circular_mean, wrap
+
+law = settings(deadline=None, max_examples=100)
+SEEDS = st.integers(0, 2**32 - 1)
+AVERAGING = st.sampled_from(["plain", "weighted"])
+NORMAL = np.array([0.0, 0.5, -1.0, -0.5]) * np.pi
+
+
+def detections(*rows):
+    """Return detections of rows (face, tone, angle off it [deg], delay [s], power)."""
+    face, tone, angle, delay, power = (np.array(c) for c in zip(*rows, strict=True))
+    angle = np.radians(angle.astype(float))
+    return Detections(
+        face=face,
+        tone=tone,
+        angle=angle,
+        bearing=wrap(angle + NORMAL[face]),
+        delay=delay.astype(float),
+        power=power.astype(float),
+    )
+
+
+def crowd(rng, count=40, labels=8):
+    """Return made-up detections with labels; some landmarks repeat on a face and tone."""
+    rows = zip(
+        rng.integers(0, 4, count),
+        rng.integers(0, 2, count),
+        rng.uniform(-75.0, 75.0, count),
+        rng.uniform(3e-3, 0.2, count),
+        rng.exponential(50.0, count),
+        strict=True,
+    )
+    label = rng.integers(0, labels, count)
+    return detections(*rows), np.where(label == 0, UNLABELLED, label)
+
+
+def heard_of(found, label, averaging="plain"):
+    return average_faces(1.5, found, np.asarray(label), averaging=averaging, speed_of_sound=343.0)
+
+
+def strongest(found, label, landmark, tone):
+    """Return the rows to average, by the definition."""
+    rows = []
+    for face in range(4):
+        here = np.flatnonzero((label == landmark) & (found.tone == tone) & (found.face == face))
+        if here.size:
+            rows.append(here[found.power[here].argmax()])
+    return rows
+
+
+@given(seed=SEEDS, averaging=AVERAGING)
+@law
+def test_each_landmark_gets_the_mean_of_its_strongest_estimate_of_each_face(seed, averaging):
+    found, label = crowd(np.random.default_rng(seed))
+    heard = heard_of(found, label, averaging)
+    assert heard.landmark.tolist() == sorted(set(label.tolist()) - {UNLABELLED})
+    for landmark, bearing, distance in zip(heard.landmark, heard.bearing, heard.range, strict=True):
+        for tone in range(2):
+            rows = strongest(found, label, landmark, tone)
+            weight = np.ones(len(rows))
+            if averaging == "weighted":
+                weight = np.cos(found.angle[rows]) ** 2
+            if not rows:
+                assert np.isnan(bearing[tone])
+            else:
+                mean = circular_mean(found.bearing[rows], weight)
+                assert abs(wrap(bearing[tone] - mean)) < 1e-12
+            if tone == 0 and not rows:
+                assert np.isnan(distance)
+            elif tone == 0:
+                late = np.average(found.delay[rows], weights=weight)
+                assert distance == pytest.approx(0.5 * 343.0 * late, rel=1e-12)
+
+
+@given(seed=SEEDS, averaging=AVERAGING)
+@law
+def test_the_order_of_the_detections_does_not_matter(seed, averaging):
+    rng = np.random.default_rng(seed)
+    found, label = crowd(rng)
+    order = rng.permutation(label.size)
+    columns = {name: getattr(found, name)[order] for name in Detections.__slots__}
+    one = heard_of(found, label, averaging)
+    two = heard_of(Detections(**columns), label[order], averaging)
+    assert one.landmark.tolist() == two.landmark.tolist()
+    assert one.bearing.tobytes() == two.bearing.tobytes()
+    assert one.range.tobytes() == two.range.tobytes()
+    assert one.clutter == two.clutter
+
+
+def test_directions_either_side_of_straight_back_average_straight_back():
+    for spread in (0.1, 1e-6, 30.0):  # of the left face and the right one, looking back
+        found = detections((1, 1, 90.0 - spread, 0.02, 9), (3, 1, spread - 90.0, 0.02, 8))
+        for averaging in ("plain", "weighted"):
+            bearing = heard_of(found, [4, 4], averaging).bearing[0, 1]
+            assert -np.pi <= bearing < np.pi
+            assert abs(wrap(bearing - np.pi)) < 1e-12
+
+
+@given(seed=SEEDS, averaging=AVERAGING)
+@law
+def test_averaged_bearings_lie_from_minus_pi_to_below_pi(seed, averaging):
+    found, label = crowd(np.random.default_rng(seed))
+    bearing = heard_of(found, label, averaging).bearing
+    known = bearing[~np.isnan(bearing)]
+    assert np.all((known >= -np.pi) & (known < np.pi))
+
+
+def test_unlabelled_detections_are_counted_and_change_nothing_else():
+    found = detections((0, 0, 40, 0.02, 9), (1, 0, -50, 0.02, 7), (0, 0, 10, 0.02, 99))
+    heard = heard_of(found, [3, 3, UNLABELLED])
+    assert heard.clutter == 1
+    assert heard.landmark.tolist() == [3]
+    assert heard.bearing[0, 0] == pytest.approx(np.radians(40.0), abs=1e-12)
+
+
+def test_silence_is_heard_as_nothing():
+    nothing = np.zeros(0)
+    found = Detections(
+        face=nothing.astype(int), tone=nothing.astype(int), angle=nothing, bearing=nothing,
+        delay=nothing, power=nothing,
+    )  # fmt: skip
+    heard = heard_of(found, nothing.astype(int))
+    assert (heard.landmark.size, heard.bearing.shape, heard.range.size) == (0, (0, 2), 0)
+    for strategy in ("active", "fused", "passive"):
+        assert scan_of(heard, strategy).landmark.size == 0
+
+
+def test_weights_make_two_faces_as_good_as_one_looked_straight_at_whatever_the_direction():
+    # A face's error goes with 1 / cos, the next one's with 1 / sin; their weighted mean's is 1.
+    rng, count, error = np.random.default_rng(7), 4000, 1e-3
+    for off in (16.0, 30.0, 45.0):
+        spread = error / np.cos(np.radians([off, 90.0 - off]))
+        noise = np.degrees(rng.standard_normal((count, 2)) * spread)
+        rms = {}
+        for averaging in ("plain", "weighted"):
+            bearing = [
+                heard_of(
+                    detections((0, 0, off + one, 0.02, 2), (1, 0, off - 90.0 + two, 0.02, 1)),
+                    [5, 5],
+                    averaging,
+                ).bearing[0, 0]
+                for one, two in noise
+            ]
+            rms[averaging] = np.std(np.array(bearing) - np.radians(off)) / error
+        sampling = 4.9 / np.sqrt(2.0 * count)
+        assert rms["weighted"] == pytest.approx(1.0, rel=sampling)
+        assert rms["plain"] == pytest.approx(0.5 * np.hypot(*spread) / error, rel=sampling)
+
+
+def heard_rows(*rows):
+    """Return what was heard: rows (landmark, own bearing, beacon's bearing, range)."""
+    landmark, own, other, distance = (np.array(c) for c in zip(*rows, strict=True))
+    return Heard(
+        time=2.0,
+        landmark=landmark,
+        bearing=np.column_stack((own, other)).astype(float),
+        range=distance.astype(float),
+        clutter=0,
+    )
+
+
+NAN = np.nan
+BOTH = heard_rows((1, 0.1, NAN, 3.0), (2, NAN, 0.2, NAN), (7, 3.1, -3.1, 9.0), (9, -0.4, 0.2, 5.0))
+
+
+def test_active_takes_the_vehicles_tone_alone():
+    scan = scan_of(BOTH, "active")
+    assert (scan.time, scan.landmark.tolist()) == (2.0, [1, 7, 9])
+    assert scan.bearing.tolist() == [0.1, 3.1, -0.4]
+    assert scan.range.tolist() == [3.0, 9.0, 5.0]
+
+
+def test_passive_takes_the_beacons_tone_alone_and_never_a_range():
+    scan = scan_of(BOTH, "passive")
+    assert scan.landmark.tolist() == [2, 7, 9]
+    assert scan.bearing.tolist() == [0.2, -3.1, 0.2]
+    assert np.isnan(scan.range).all()
+
+
+def test_fused_takes_both_and_the_mean_direction_where_both_are_there():
+    scan = scan_of(BOTH, "fused")
+    assert scan.landmark.tolist() == [1, 2, 7, 9]
+    np.testing.assert_allclose(scan.bearing, [0.1, 0.2, -np.pi, -0.1], atol=1e-12)
+    np.testing.assert_array_equal(scan.range, [3.0, NAN, 9.0, 5.0])
+
+
+@given(seed=SEEDS, averaging=AVERAGING)
+@law
+def test_fused_sees_what_active_or_passive_see_and_measures_what_they_measure(seed, averaging):
+    found, label = crowd(np.random.default_rng(seed), labels=14)
+    heard = heard_of(found, label, averaging)
+    active, fused, passive = (scan_of(heard, s) for s in ("active", "fused", "passive"))
+    assert set(fused.landmark) == set(active.landmark) | set(passive.landmark)
+    ranged = ~np.isnan(fused.range)
+    assert fused.landmark[ranged].tolist() == active.landmark.tolist()
+    assert fused.range[ranged].tolist() == active.range.tolist()
+    for landmark, bearing in zip(fused.landmark, fused.bearing, strict=True):
+        parts = np.concatenate([s.bearing[s.landmark == landmark] for s in (active, passive)])
+        assert np.cos(bearing - circular_mean(parts)) == pytest.approx(1.0, abs=1e-12)
+        assert -np.pi <= bearing < np.pi
