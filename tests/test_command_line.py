@@ -15,6 +15,7 @@ from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config
 from pipistrelle.experiments import replay, trial
 from pipistrelle.settings import known_settings
+from pipistrelle.verbs.options import FILTERS
 
 SHORT = ("--duration", "4", "--landmarks", "10")
 """A world of eight frames."""
@@ -72,7 +73,17 @@ def summary(folder):
 
 
 def track(folder, name):
-    return np.loadtxt(Path(folder) / f"track_{name}_ekf.tum")
+    return np.loadtxt(Path(folder) / f"track_{name}.tum")
+
+
+def table(printed):
+    """Rows of the closing table: title and cells, eleven characters each."""
+    lines = printed.splitlines()[:-1]
+    return {line[:30].strip(): re.findall(r".{11}", line[30:]) for line in lines[2:]}
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir())}
 
 
 # Help
@@ -108,9 +119,9 @@ def test_every_setting_is_in_the_help_with_its_default(obey, verb):
 
 def test_the_help_of_slam_leaves_out_what_a_log_decides(obey):
     found = set(re.findall(r"--[a-z]+\.[a-z-]+", obey("slam", "--help")[1]))
-    assert found == {
-        f"--rays.{name}" for name in ("ratio", "density", "prune", "power", "weights", "partial")
-    }
+    rays = ("ratio", "density", "prune", "power", "weights", "partial")
+    swarm = ("particles", "resample-below", "mixture")
+    assert found == {f"--rays.{name}" for name in rays} | {f"--fastslam.{name}" for name in swarm}
 
 
 def test_the_defaults_that_the_help_names_are_those_of_the_settings(obey):
@@ -126,6 +137,15 @@ def test_the_defaults_that_the_help_names_are_those_of_the_settings(obey):
     assert told["landmarks"] == str(config.scenario.landmarks)
     assert told["duration"] == f"{config.scenario.steps * config.scenario.step:g}"
     assert told["engine"] == config.receiver.engine
+    assert told["particles"] == str(config.fastslam.particles)
+
+
+@pytest.mark.parametrize("verb", ["run", "slam"])
+def test_the_help_names_the_filters_there_are(obey, verb):
+    assert tuple(trial.LIMITS) == FILTERS
+    words = " ".join(re.sub("[│╭╮╰╯─]", " ", obey(verb, "--help")[1]).split())
+    assert "[choices: ekf, fastslam, both] [default: ekf]" in words
+    assert "sets fastslam.particles" in words
 
 
 # Settings
@@ -142,7 +162,7 @@ def test_settings_as_shown_are_a_file_of_the_same_settings(settings, obey):
 def test_the_short_names_of_a_mission_set_what_they_say(settings):
     config = settings(
         *("--beamwidth", "60", "--landmarks", "3", "--duration", "10", "--engine", "dense"),
-        *("--scenario.step", "0.25", "--air.speed-of-sound", "340"),
+        *("--scenario.step", "0.25", "--air.speed-of-sound", "340", "--particles", "30"),
     )
     width = beamwidth(
         config.emitter.radius, frequency=config.emitter.frequency, speed_of_sound=340.0
@@ -151,6 +171,7 @@ def test_the_short_names_of_a_mission_set_what_they_say(settings):
     assert config.scenario.landmarks == 3
     assert config.scenario.steps == 40
     assert config.receiver.engine == "dense"
+    assert config.fastslam.particles == 30
 
 
 def test_flags_go_over_the_environment_over_the_file(settings, monkeypatch):
@@ -185,7 +206,14 @@ def test_the_schema_says_what_every_setting_means(obey):
         ("run --scenario.steps 9.5", "--scenario.steps: found '9.5', expected a whole number"),
         ("run --landmarks -1", "--landmarks: found -1, expected greater than or equal to 0"),
         ("run --seed -1", "--seed: found -1, expected greater than or equal to 0"),
-        ("run --filter ukf", 'Invalid value "ukf" for --filter. Choose from: "ekf"'),
+        ("run --filter ukf", 'Invalid value "ukf" for --filter. Choose from: "ekf", "fastslam",'),
+        ("run --filter fastslam --particles 0", "--particles: found 0, expected greater than or"),
+        ("run --filter fastslam --particles 9.5", "--particles: found '9.5', expected a whole"),
+        ("run --particles 9", "--particles: found 9, but --filter is ekf, which has none; add --f"),
+        (
+            "run --filter both --particles 3 --fastslam.particles 3",
+            "--particles and --fastslam.particles are one setting; give one of them",
+        ),
         ("run --strategy loud", 'Invalid value "loud" for --strategy'),
         ("run --duration 0.4", "--duration: found 0.4, expected at least one frame (0.5 s)"),
         ("run --duration nan", "--duration: found nan, expected at least one frame"),
@@ -206,6 +234,12 @@ def test_the_schema_says_what_every_setting_means(obey):
         ("slam . --filter.range-std 3", "--filter.range-std: the log decides this"),
         ("slam . --gate 2", "--gate: found 2.0, expected less than or equal to 1"),
         ("slam . --gate 0.9 --filter.gate 0.9", "--gate and --filter.gate are one setting"),
+        ("slam . --particles 9", "--particles: found 9, but --filter is ekf, which has none; add"),
+        ("slam . --filter both --particles 0", "--particles: found 0, expected greater than or"),
+        (
+            "slam . --filter both --particles 3 --fastslam.particles 3",
+            "--particles and --fastslam.particles are one setting; give one of them",
+        ),
         ("slam . --beamwidth 0", "--beamwidth: found 0, expected above 0 and up to 360"),
         ("slam . --beamwidth nan", "--beamwidth: found nan, expected above 0"),
         ("slam . --robot one", "--robot: found 'one', expected a whole number"),
@@ -268,15 +302,60 @@ def test_a_run_tells_its_stages_its_scores_and_last_its_folder(obey):
     assert printed.splitlines()[-1] == "one"
     stages = ["listening", "active ekf", "fused ekf", "passive ekf"]
     lines = [line for line in said.splitlines() if line != COMPILING]
-    assert [line[:14].strip() for line in lines] == stages
-    assert all(re.fullmatch(r".{14} +8 frames, \d+ frames/s", line) for line in lines)
+    assert [line[:17].strip() for line in lines] == stages
+    assert all(re.fullmatch(r".{17} +8 frames, \d+ frames/s", line) for line in lines)
     runs = summary("one")["runs"]
     assert [run["strategy"] for run in runs] == ["active", "fused", "passive"]
-    rows = {line[:30].strip(): line[30:].split() for line in printed.splitlines()[:-1]}
+    rows = {title: [cell.strip() for cell in cells] for title, cells in table(printed).items()}
     assert rows["position RMSE [m]"] == [f"{run['position_rmse_m']:.3f}" for run in runs]
     assert rows["measurements per frame"] == [f"{r['measurements_per_frame']:.2f}" for r in runs]
-    assert rows["landmarks, fully placed / all"][::3] == [str(r["landmarks_full"]) for r in runs]
+    counts = [f"{run['landmarks_full']} / {run['landmarks_total']}" for run in runs]
+    assert rows["landmarks, fully placed / all"] == counts
+    assert "fully placed, particles' mean" not in rows
     assert {"mission.png", "mission.pdf", "config.toml"} <= {p.name for p in Path("one").iterdir()}
+
+
+def test_both_filters_are_told_compared_and_drawn_in_100_columns(obey, monkeypatch):
+    run_mission, seen = trial.run_mission, []
+
+    def seeing(*words, **named):
+        seen.append(run_mission(*words, **named))
+        return seen[-1]
+
+    monkeypatch.setattr(trial, "run_mission", seeing)
+    status, printed, said = obey("run", *SHORT, "--filter", "both", "--particles", "7", "-o", "one")
+    assert status == 0
+    names = [(s, f) for s in ("active", "fused", "passive") for f in FILTERS]
+    lines = [line for line in said.splitlines() if line != COMPILING]
+    assert [line[:17].strip() for line in lines] == ["listening", *map(" ".join, names)]
+    assert [(run["strategy"], run["filter"]) for run in summary("one")["runs"]] == names
+    strategies, filters = (line.split() for line in printed.splitlines()[:2])
+    assert list(zip(strategies, filters, strict=True)) == names
+    assert max(map(len, printed.splitlines())) <= 100
+    rows = table(printed)
+    assert all(len(cells) == 6 for cells in rows.values())
+    tracks = [result.track for result in seen[-1].trials]
+    assert [len(track.cloud) for track in tracks[1::2]] == [7, 7, 7]
+    mean = ["-" if track.full is None else f"{track.full:.1f}" for track in tracks]
+    assert [cell.strip() for cell in rows["fully placed, particles' mean"]] == mean
+    assert mean[::2] == ["-", "-", "-"] != mean[1::2]
+    assert tomllib.loads(Path("one/config.toml").read_text())["fastslam"]["particles"] == 7
+
+
+def test_the_closing_table_keeps_its_columns_however_large_its_numbers(obey, monkeypatch):
+    run_mission = trial.run_mission
+
+    def wild(*words, **named):
+        mission = run_mission(*words, **named)
+        first, *others = mission.trials
+        scores = replace(first.scores, position_rmse_m=-1.234e300, nees_max=float("inf"))
+        return replace(mission, trials=(replace(first, scores=scores), *others))
+
+    monkeypatch.setattr(trial, "run_mission", wild)
+    rows = table(obey("run", *SHORT, "-o", "one")[1])
+    assert rows["position RMSE [m]"][0] == " -1.23e+300"
+    assert rows["NEES, largest"][0].strip() == "inf"
+    assert {len(cells) for cells in rows.values()} == {3}
 
 
 def test_a_quiet_run_prints_its_folder_alone(obey):
@@ -289,7 +368,7 @@ def test_the_settings_of_a_run_are_a_file_that_repeats_it(obey):
     obey("run", *SHORT, "--seed", "5", "--rays.power", "3", *words, "-o", "one")
     obey("run", "--config", "one/config.toml", *words, "-o", "two")
     assert summary("one")["config_hash"] == summary("two")["config_hash"]
-    np.testing.assert_array_equal(track("one", "fused"), track("two", "fused"))
+    np.testing.assert_array_equal(track("one", "fused_ekf"), track("two", "fused_ekf"))
 
 
 def test_results_are_replaced_only_when_asked(obey, refused):
@@ -297,6 +376,31 @@ def test_results_are_replaced_only_when_asked(obey, refused):
     obey(*words)
     assert "one: is not empty" in refused(*words)
     assert obey(*words, "--overwrite")[0] == 0
+
+
+@pytest.mark.parametrize("trouble", [KeyboardInterrupt, MemoryError])
+@pytest.mark.parametrize("place", ["trial.run_mission", "mission.draw_mission"])
+def test_earlier_results_and_logs_outlive_a_mission_that_comes_to_nothing(
+    obey, monkeypatch, trouble, place
+):
+    def interrupted(*_, **__):
+        raise trouble
+
+    words = ("run", *SHORT, "--strategy", "active", "--quiet", "-o", "one")
+    obey(*words, "--save-log", "log")
+    results, log = contents("one"), contents("log")
+    room = "experiments" if place.startswith("trial") else "figures"
+    monkeypatch.setattr(f"pipistrelle.{room}.{place}", interrupted)
+    again = (*words, "--seed", "9", "--overwrite")
+    if room == "experiments":
+        again += ("--save-log", "log")
+    if trouble is KeyboardInterrupt:
+        assert obey(*again)[0] == 130
+    else:
+        with pytest.raises(trouble):
+            obey(*again)
+    assert contents("one") == results
+    assert contents("log") == log
 
 
 def test_an_estimate_that_is_not_finite_is_a_failed_trial(obey, monkeypatch):
@@ -315,13 +419,15 @@ def test_an_estimate_that_is_not_finite_is_a_failed_trial(obey, monkeypatch):
     assert "warning: active ekf failed" in said
 
 
+@pytest.mark.parametrize("estimator", FILTERS)
 @pytest.mark.parametrize("strategy", ["all", "active", "passive"])
-def test_a_run_and_its_log_give_one_track(obey, strategy):
-    words = ("--seed", "3", "--filter.gate", "0.99", "--quiet")
-    obey("run", *SHORT, *words[:4], "--strategy", strategy, "--save-log", "log", "-o", "one")
-    assert obey("slam", "log", "--quiet", "-o", "two") == (0, "two\n", "")
+def test_a_run_and_its_log_give_one_track(obey, strategy, estimator):
+    words = ("--seed", "3", "--filter", estimator)
+    gate, choice = ("--filter.gate", "0.99"), ("--strategy", strategy)
+    obey("run", *SHORT, *words, *gate, *choice, "--save-log", "log", "-o", "one")
+    assert obey("slam", "log", *words, "--quiet", "-o", "two") == (0, "two\n", "")
     heard = "fused" if strategy == "all" else strategy
-    ran, replayed = track("one", heard), track("two", "fused")
+    ran, replayed = track("one", f"{heard}_{estimator}"), track("two", f"fused_{estimator}")
     assert len(ran) == 33
     np.testing.assert_allclose(replayed, ran, rtol=0, atol=1e-9)
     (run,) = [run for run in summary("one")["runs"] if run["strategy"] == heard]
@@ -346,7 +452,7 @@ def log(obey):
 def test_slam_hides_ranges_by_strategy_and_beam(obey, log):
     status, printed, said = obey("slam", log, "--strategy", "all", "--beamwidth", "40", "-o", "two")
     assert (status, printed.splitlines()[-1]) == (0, "two")
-    stages = [line[:14].strip() for line in said.splitlines() if "frames/s" in line]
+    stages = [line[:17].strip() for line in said.splitlines() if "frames/s" in line]
     assert stages == ["active ekf", "fused ekf", "passive ekf"]
     active, fused, passive = (run["measurements_per_frame"] for run in summary("two")["runs"])
     assert active < fused == passive
@@ -366,6 +472,21 @@ def test_the_gate_of_a_log_is_the_one_asked_for_else_its_own_else_nearly_all(obe
     Path("mission.toml").write_text("filter.gate = 0.9\n")
     assert gate("--config", "mission.toml") == 0.9
     assert gate("--config", "mission.toml", "--gate", "0.8") == 0.8
+
+
+def test_slam_takes_the_settings_of_fastslam_from_flags_and_files_and_keeps_them(obey, log):
+    Path("mission.toml").write_text("fastslam.mixture = 'exact'\nfastslam.particles = 5\n")
+    words = ("--filter", "both", "--config", "mission.toml", "--particles", "9")
+    status, printed, said = obey("slam", log, *words, "--fastslam.resample-below", "0.5", "-o", "2")
+    assert (status, printed.splitlines()[-1]) == (0, "2")
+    stages = [line[:17].strip() for line in said.splitlines() if "frames/s" in line]
+    assert stages == ["fused ekf", "fused fastslam"]
+    kept = tomllib.loads(Path("2/config.toml").read_text())
+    assert list(kept) == ["seed", "filter", "rays", "fastslam"]
+    assert kept["fastslam"] == {"particles": 9, "resample_below": 0.5, "mixture": "exact"}
+    words = ("--filter", "both", "--config", "2/config.toml", "--quiet")
+    obey("slam", log, *words, "-o", "again")
+    np.testing.assert_array_equal(track("2", "fused_fastslam"), track("again", "fused_fastslam"))
 
 
 def test_slam_takes_from_the_log_what_the_log_decides_and_says_so(obey, log):
@@ -406,8 +527,9 @@ def test_a_log_whose_truth_ends_early_is_scored_where_it_is_known(obey, log):
     assert run["diverged"] is False
 
 
-def test_a_film_is_drawn_as_gif_unless_said_otherwise(obey):
-    words = ("--strategy", "passive", "--quiet", "--animate")
+@pytest.mark.parametrize("estimator", FILTERS)
+def test_a_film_is_drawn_as_gif_unless_said_otherwise(obey, estimator):
+    words = ("--strategy", "passive", "--filter", estimator, "--quiet", "--animate")
     assert obey("run", "--duration", "1", "--landmarks", "5", *words, "-o", "one")[0] == 0
     assert Path("one/mission.gif").read_bytes().startswith(b"GIF8")
 

@@ -102,9 +102,7 @@ def plane_toy(seed):
     start = Gaussian(mean=np.zeros(3), covariance=SMALL**2 * np.diag([0.05**2, 0.05**2, 0.04**2]))
     noise = {"range_std": 0.1 * SMALL, "bearing_std": 0.05 * SMALL}
     field, drive = scattered(rng, 4, radius=8.0), steady((1.5, 0.1), 3)
-    mission = draw_mission(
-        rng, motion, start, field, drive, beamwidth=7.0, reach=20.0, **noise
-    )
+    mission = draw_mission(rng, motion, start, field, drive, beamwidth=7.0, reach=20.0, **noise)
     for scan in mission.scans[1:]:
         scan.range[::2] = np.nan
     slam = swarm_filter(motion=motion, **noise)

@@ -74,7 +74,7 @@ def test_an_unknown_filter_is_refused_by_name():
         run_mission(SHORT, ("fused",), ("ukf",))
 
 
-class Dead:
+class Ledger:
     """A filter that adds up what it is given and writes down when: x counts steps, y scans."""
 
     def __init__(self):
@@ -93,7 +93,7 @@ class Dead:
     def update(self, belief, scan, rng):
         rng.random()
         self.log.append(scan.time)
-        return Count(belief.mean + [0.0, 1.0, 0.0])
+        return Count(belief.mean + np.array([0.0, 1.0, 0.0]))
 
 
 class Count:
@@ -137,16 +137,16 @@ def scan_at(time, landmark=(), bearing=(), distance=()):
 
 
 def test_steps_and_scans_reach_the_filter_in_the_order_of_time():
-    dead, seen, told = Dead(), [], []
+    ledger, seen, told = Ledger(), [], []
     track = run_filter(
-        dead,
+        ledger,
         drive(5),
         [scan_at(0.0), scan_at(1.5), scan_at(1.5), scan_at(2.0)],
         RNG(7),
         progress=lambda *done: told.append(done),
         watch=lambda scan, belief: seen.append((scan.time, belief.mean[0], belief.mean[1])),
     )
-    assert dead.log == [
+    assert ledger.log == [
         "init", 0.0, (2, 1.5, [0.0, 1.0]), 1.5, 1.5, (1, 0.5, [2.0]), 2.0, (2, 2.5, [3.0, 4.0])
     ]  # fmt: skip
     assert seen == [(0.0, 0, 1), (1.5, 2, 2), (1.5, 2, 3), (2.0, 3, 4)]
@@ -158,11 +158,11 @@ def test_steps_and_scans_reach_the_filter_in_the_order_of_time():
 
 
 def test_a_drive_without_scans_and_scans_without_a_drive_are_tracked():
-    dead = Dead()
-    track = run_filter(dead, drive(5), [], RNG(7))
-    assert dead.log == ["init", (5, 4.5, [0.0, 1.0, 2.0, 3.0, 4.0])]
+    ledger = Ledger()
+    track = run_filter(ledger, drive(5), [], RNG(7))
+    assert ledger.log == ["init", (5, 4.5, [0.0, 1.0, 2.0, 3.0, 4.0])]
     assert track.pose.mean[:, 0].tolist() == [0, 1, 2, 3, 4, 5]
-    still = run_filter(Dead(), drive(0), [scan_at(0.0)], RNG(7))
+    still = run_filter(Ledger(), drive(0), [scan_at(0.0)], RNG(7))
     assert still.pose.mean.tolist() == [[0.0, 1.0, 0.0]]
 
 
@@ -190,7 +190,7 @@ def test_a_filter_told_at_the_start_and_left_alone_at_the_end_keeps_what_it_know
 )
 def test_scans_that_no_filter_can_use_are_refused(scan, message):
     with pytest.raises(InputError, match=message):
-        run_filter(Dead(), drive(5), [scan], RNG(7))
+        run_filter(Ledger(), drive(5), [scan], RNG(7))
 
 
 def test_a_trial_is_scored_against_the_path_and_all_landmarks_the_beacon_last():

@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -73,7 +75,7 @@ def test_a_film_draws_the_window_anew_in_every_picture(swarm_recorder, mission, 
             film.seek(picture)
             whole = np.asarray(film.convert("L"))[::-1]
             pictures.append(whole[y0 + 2 : y1 - 2, x0 + 2 : x1 - 2])
-    for one, other in zip(pictures, pictures[1:], strict=False):
+    for one, other in pairwise(pictures):
         assert np.mean(one != other) > 0.01
     for picture in pictures:
         assert np.mean(picture > 250) > 0.5, "the map below is covered"

@@ -126,9 +126,8 @@ def test_each_filter_has_a_row_and_each_strategy_a_column(six):
     assert np.all(left[:, 0] == left[:, 1])
     assert np.all(left[1:] > right[:-1])
     assert np.ptp(top, axis=0) == pytest.approx([0.0, 0.0], abs=1e-12)
-    below = six.axes[7].get_position()
-    assert np.all(top[:, 1] < six.axes[3].get_position().y0), "errors of the first row included"
-    assert below.y0 > 0.0
+    assert np.all(top[:, 1] < six.axes[3].get_position().y0), "below the errors of the first row"
+    assert six.axes[7].get_position().y0 > 0.0
 
 
 def test_scales_are_written_left_of_each_row_and_nowhere_else(six):

@@ -37,9 +37,7 @@ class Drawn:
 def swarm_filter(particles=20, mixture="federated", resample_below=0.75, **changes):
     """Return the filter with the paper's settings, but for the changes."""
     swarm = FastSlamConfig(particles=particles, mixture=mixture, resample_below=resample_below)
-    slam = FastSlam(
-        motion=BICYCLE, range_std=0.2, bearing_std=0.15, rays=ray_config(), swarm=swarm
-    )
+    slam = FastSlam(motion=BICYCLE, range_std=0.2, bearing_std=0.15, rays=ray_config(), swarm=swarm)
     return replace(slam, **changes)
 
 
@@ -70,6 +68,13 @@ def followed(slam, mission, rng, start=START):
         belief, poses = slam.predict(belief, controls, dt, rng)
         belief = slam.update(belief, scan, rng)
         yield belief, poses
+
+
+def all_members(belief):
+    """Return (p, c, 6) members, with zeros in the columns that a particle does not use."""
+    offset = np.arange(belief.member.shape[1]) - np.repeat(belief.first[:-1], np.diff(belief.first))
+    used = offset < np.repeat(belief.count, np.diff(belief.first), axis=1)
+    return np.where(used[:, :, None], belief.member, 0.0)
 
 
 def members(belief, particle, label):

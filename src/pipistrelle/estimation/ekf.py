@@ -213,9 +213,9 @@ def _correct_ray(mean, covariance, weight, members, first, count, bearing, sensi
     outcome = GATED
     for j in range(count):
         i = 3 + 2 * (first + j)
-        _, expected, c, s, d = sight(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
+        _, expected, c, s, k = sight(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
         innovation = wrap_angle(bearing - expected)
-        S = bearing_variance(covariance, i, c, s, d) + variance
+        S = bearing_variance(covariance, i, c, s, k) + variance
         likelihoods[j] = log_likelihood(innovation, S)
         if innovation * innovation <= sensing.passive_bound * S:
             outcome = APPLIED

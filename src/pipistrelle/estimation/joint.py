@@ -53,9 +53,9 @@ def _subtract_outer(covariance, size, w, columns):
 
 
 @njit(cache=True, error_model="numpy")
-def bearing_variance(covariance, i, c, s, d):
+def bearing_variance(covariance, i, c, s, k):
     """Innovation variance H P H^T of the bearing of the member at state index i, without R."""
-    h0, h1 = s / d, -c / d  # by pose: (h0, h1, -1); by member: (-h0, -h1)
+    h0, h1 = s * k, -c * k  # by pose: (h0, h1, -1); by member: (-h0, -h1)
     pxx = covariance[0, 0] - 2.0 * covariance[0, i] + covariance[i, i]
     pxy = covariance[0, 1] - covariance[0, i + 1] - covariance[1, i] + covariance[i, i + 1]
     pyy = covariance[1, 1] - 2.0 * covariance[1, i + 1] + covariance[i + 1, i + 1]
@@ -70,11 +70,11 @@ def bearing_variance(covariance, i, c, s, d):
 @njit(cache=True, error_model="numpy")
 def correct_bearing(mean, covariance, size, i, bearing, variance, bound, w):
     """Correct the state with the bearing of the member at index i; GATED when beyond bound."""
-    distance, expected, c, s, d = sight(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
+    distance, expected, c, s, k = sight(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     if distance < NEAREST:
         return APPLIED
     innovation = wrap_angle(bearing - expected)
-    h0, h1 = s / d, -c / d
+    h0, h1 = s * k, -c * k
     p0, p1, p2 = covariance[0], covariance[1], covariance[2]
     pi, pj = covariance[i], covariance[i + 1]
     w0 = w[0]
@@ -96,11 +96,11 @@ def correct_active(
     mean, covariance, size, i, distance, bearing, range_variance, bearing_variance, bound, w
 ):
     """Correct the state with range and bearing of the member at index i; GATED beyond bound."""
-    near, expected, c, s, d = sight(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
+    near, expected, c, s, k = sight(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     if near < NEAREST:
         return APPLIED
     nu0, nu1 = distance - near, wrap_angle(bearing - expected)
-    h0, h1 = s / d, -c / d
+    h0, h1 = s * k, -c * k
     p0, p1, p2 = covariance[0], covariance[1], covariance[2]
     pi, pj = covariance[i], covariance[i + 1]
     w0, w1 = w[0], w[1]

@@ -326,16 +326,17 @@ def motion_jacobians(
 def sight(
     x: float, y: float, heading: float, px: float, py: float
 ) -> tuple[float, float, float, float, float]:
-    """Range, bearing, direction cosines and range of a point, for kernels.
+    """Range, bearing, direction cosines and inverse range of a point, for kernels.
 
-    Returns range [m], bearing [rad], cos and sin of the direction in the world, range guarded by
-    `NEAREST` for use as a divisor. The Jacobians follow: d range = (-c, -s, 0; c, s) and
-    d bearing = (s, -c, -range; -s, c) / range by pose and point.
+    Returns range [m], bearing [rad], cos and sin of the direction in the world, and k, the inverse
+    of the range, which `NEAREST` bounds. The Jacobians follow: d range = (-c, -s, 0; c, s) and
+    d bearing = (s k, -c k, -1; -s k, c k) by pose and point.
     """
     dx, dy = px - x, py - y
     distance = math.sqrt(dx * dx + dy * dy)
-    divisor = max(distance, NEAREST)
-    return distance, wrap_angle(math.atan2(dy, dx) - heading), dx / divisor, dy / divisor, divisor
+    inverse = 1.0 / max(distance, NEAREST)
+    bearing = wrap_angle(math.atan2(dy, dx) - heading)
+    return distance, bearing, dx * inverse, dy * inverse, inverse
 
 
 def measurement_jacobians(
@@ -369,8 +370,8 @@ def measurement_jacobians(
     array([[ 1. ,  0. ],
            [-0. ,  0.5]])
     """
-    _, _, c, s, d = sight(pose[0], pose[1], pose[2], point[0], point[1])
+    _, _, c, s, k = sight(pose[0], pose[1], pose[2], point[0], point[1])
     return (
-        np.array([[-c, -s, 0.0], [s / d, -c / d, -1.0]]),
-        np.array([[c, s], [-s / d, c / d]]),
+        np.array([[-c, -s, 0.0], [s * k, -c * k, -1.0]]),
+        np.array([[c, s], [-s * k, c * k]]),
     )

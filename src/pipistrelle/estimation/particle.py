@@ -27,11 +27,11 @@ def bearing_spread(member, h0, h1):
 @njit(cache=True, error_model="numpy")
 def expect_bearing(pose, P, member, bearing, variance):
     """Innovation and its variance of a member's bearing; the variance is infinite when too near."""
-    distance, expected, c, s, d = sight(pose[0], pose[1], pose[2], member[X], member[Y])
+    distance, expected, c, s, k = sight(pose[0], pose[1], pose[2], member[X], member[Y])
     innovation = wrap_angle(bearing - expected)
     if distance < NEAREST:
         return innovation, np.inf
-    h0, h1 = s / d, -c / d
+    h0, h1 = s * k, -c * k
     a0 = h0 * P[0, 0] + h1 * P[0, 1] - P[0, 2]
     a1 = h0 * P[0, 1] + h1 * P[1, 1] - P[1, 2]
     a2 = h0 * P[0, 2] + h1 * P[1, 2] - P[2, 2]
@@ -41,35 +41,35 @@ def expect_bearing(pose, P, member, bearing, variance):
 @njit(cache=True, error_model="numpy")
 def refine_by_bearing(pose, P, member, bearing, variance):
     """Correct pose and P by a member's bearing; returns the log of its marginal likelihood."""
-    distance, expected, c, s, d = sight(pose[0], pose[1], pose[2], member[X], member[Y])
+    distance, expected, c, s, k = sight(pose[0], pose[1], pose[2], member[X], member[Y])
     if distance < NEAREST:
         return 0.0
     innovation = wrap_angle(bearing - expected)
-    h0, h1 = s / d, -c / d
+    h0, h1 = s * k, -c * k
     a0 = h0 * P[0, 0] + h1 * P[0, 1] - P[0, 2]
     a1 = h0 * P[0, 1] + h1 * P[1, 1] - P[1, 2]
     a2 = h0 * P[0, 2] + h1 * P[1, 2] - P[2, 2]
     S = h0 * a0 + h1 * a1 - a2 + bearing_spread(member, h0, h1) + variance
-    gain = innovation / S
-    pose[0] += a0 * gain
-    pose[1] += a1 * gain
-    pose[2] += a2 * gain
-    P[0, 0] -= a0 * a0 / S
-    P[1, 1] -= a1 * a1 / S
-    P[2, 2] -= a2 * a2 / S
-    P[0, 1] = P[1, 0] = P[0, 1] - a0 * a1 / S
-    P[0, 2] = P[2, 0] = P[0, 2] - a0 * a2 / S
-    P[1, 2] = P[2, 1] = P[1, 2] - a1 * a2 / S
+    k0, k1, k2 = a0 / S, a1 / S, a2 / S
+    pose[0] += k0 * innovation
+    pose[1] += k1 * innovation
+    pose[2] += k2 * innovation
+    P[0, 0] -= a0 * k0
+    P[1, 1] -= a1 * k1
+    P[2, 2] -= a2 * k2
+    P[0, 1] = P[1, 0] = P[0, 1] - a0 * k1
+    P[0, 2] = P[2, 0] = P[0, 2] - a0 * k2
+    P[1, 2] = P[2, 1] = P[1, 2] - a1 * k2
     return -0.5 * (innovation * innovation / S + math.log(S) + LOG_TAU)
 
 
 @njit(cache=True, error_model="numpy")
 def expect_active(pose, P, member, distance, bearing, range_variance, bearing_variance):
     """Squared Mahalanobis distance of range and bearing from what a member makes expect."""
-    near, expected, c, s, d = sight(pose[0], pose[1], pose[2], member[X], member[Y])
+    near, expected, c, s, k = sight(pose[0], pose[1], pose[2], member[X], member[Y])
     if near < NEAREST:
         return 0.0
-    h0, h1 = s / d, -c / d
+    h0, h1 = s * k, -c * k
     pxx, pxy, pyy = P[0, 0] + member[XX], P[0, 1] + member[XY], P[1, 1] + member[YY]
     S00 = c * c * pxx + 2.0 * c * s * pxy + s * s * pyy + range_variance
     S01 = -c * (h0 * pxx + h1 * pxy) - s * (h0 * pxy + h1 * pyy) + c * P[0, 2] + s * P[1, 2]
@@ -82,10 +82,10 @@ def expect_active(pose, P, member, distance, bearing, range_variance, bearing_va
 @njit(cache=True, error_model="numpy")
 def refine_by_active(pose, P, member, distance, bearing, range_variance, bearing_variance):
     """Correct pose and P by range and bearing; returns the log of the marginal likelihood."""
-    near, expected, c, s, d = sight(pose[0], pose[1], pose[2], member[X], member[Y])
+    near, expected, c, s, k = sight(pose[0], pose[1], pose[2], member[X], member[Y])
     if near < NEAREST:
         return 0.0
-    h0, h1 = s / d, -c / d
+    h0, h1 = s * k, -c * k
     a0, b0 = -c * P[0, 0] - s * P[0, 1], h0 * P[0, 0] + h1 * P[0, 1] - P[0, 2]
     a1, b1 = -c * P[0, 1] - s * P[1, 1], h0 * P[0, 1] + h1 * P[1, 1] - P[1, 2]
     a2, b2 = -c * P[0, 2] - s * P[1, 2], h0 * P[0, 2] + h1 * P[1, 2] - P[2, 2]
@@ -98,8 +98,9 @@ def refine_by_active(pose, P, member, distance, bearing, range_variance, bearing
     L11 = math.sqrt(S11 - L10 * L10)
     e0 = (distance - near) / L00
     e1 = (wrap_angle(bearing - expected) - L10 * e0) / L11
-    a0, a1, a2 = a0 / L00, a1 / L00, a2 / L00
-    b0, b1, b2 = (b0 - L10 * a0) / L11, (b1 - L10 * a1) / L11, (b2 - L10 * a2) / L11
+    i0, i1 = 1.0 / L00, 1.0 / L11
+    a0, a1, a2 = a0 * i0, a1 * i0, a2 * i0
+    b0, b1, b2 = (b0 - L10 * a0) * i1, (b1 - L10 * a1) * i1, (b2 - L10 * a2) * i1
     pose[0] += a0 * e0 + b0 * e1
     pose[1] += a1 * e0 + b1 * e1
     pose[2] += a2 * e0 + b2 * e1
@@ -133,10 +134,10 @@ def expect_from(pose, member, bearing):
 
     The slopes are zero, and teach nothing, when the member is too near.
     """
-    distance, expected, c, s, d = sight(pose[0], pose[1], pose[2], member[X], member[Y])
+    distance, expected, c, s, k = sight(pose[0], pose[1], pose[2], member[X], member[Y])
     if distance < NEAREST:
         return 0.0, 0.0, 0.0
-    return wrap_angle(bearing - expected), -s / d, c / d
+    return wrap_angle(bearing - expected), -s * k, c * k
 
 
 @njit(cache=True, error_model="numpy")
@@ -145,21 +146,21 @@ def correct_by_bearing(member, innovation, g0, g1, variance):
     a0 = g0 * member[XX] + g1 * member[XY]
     a1 = g0 * member[XY] + g1 * member[YY]
     S = g0 * a0 + g1 * a1 + variance
-    gain = innovation / S
-    member[X] += a0 * gain
-    member[Y] += a1 * gain
-    member[XX] -= a0 * a0 / S
-    member[XY] -= a0 * a1 / S
-    member[YY] -= a1 * a1 / S
+    k0, k1 = a0 / S, a1 / S
+    member[X] += k0 * innovation
+    member[Y] += k1 * innovation
+    member[XX] -= a0 * k0
+    member[XY] -= a0 * k1
+    member[YY] -= a1 * k1
 
 
 @njit(cache=True, error_model="numpy")
 def correct_by_active(pose, member, distance, bearing, range_variance, bearing_variance):
     """Correct a member by its range and bearing from a certain pose."""
-    near, expected, c, s, d = sight(pose[0], pose[1], pose[2], member[X], member[Y])
+    near, expected, c, s, k = sight(pose[0], pose[1], pose[2], member[X], member[Y])
     if near < NEAREST:
         return
-    g0, g1 = -s / d, c / d
+    g0, g1 = -s * k, c * k
     a0, b0 = c * member[XX] + s * member[XY], g0 * member[XX] + g1 * member[XY]
     a1, b1 = c * member[XY] + s * member[YY], g0 * member[XY] + g1 * member[YY]
     S00 = c * a0 + s * a1 + range_variance
@@ -170,8 +171,9 @@ def correct_by_active(pose, member, distance, bearing, range_variance, bearing_v
     L11 = math.sqrt(S11 - L10 * L10)
     e0 = (distance - near) / L00
     e1 = (wrap_angle(bearing - expected) - L10 * e0) / L11
-    a0, a1 = a0 / L00, a1 / L00
-    b0, b1 = (b0 - L10 * a0) / L11, (b1 - L10 * a1) / L11
+    i0, i1 = 1.0 / L00, 1.0 / L11
+    a0, a1 = a0 * i0, a1 * i0
+    b0, b1 = (b0 - L10 * a0) * i1, (b1 - L10 * a1) * i1
     member[X] += a0 * e0 + b0 * e1
     member[Y] += a1 * e0 + b1 * e1
     member[XX] -= a0 * a0 + b0 * b0

@@ -50,6 +50,7 @@ from pipistrelle.config import RayConfig
 
 SMALLEST_AGGREGATED_SHARE = 0.05
 SMALLEST_SHARE = 1e-12
+UNDERFLOW = 1e-200
 
 
 def ray_members(
@@ -173,17 +174,19 @@ def log_likelihood(innovation: float, variance: float) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def normalise_logs(log_weights: np.ndarray, weights: np.ndarray, count: int) -> None:
-    """Write exp(log_weights) / sum into weights, which may be the same array."""
-    largest = -np.inf
+def _weigh_in_logs(log_likelihoods, weights, count):
+    """Multiply weights by likelihoods whose products underflow; returns the log of their sum."""
+    logs, largest = np.empty(count), -np.inf
     for j in range(count):
-        largest = max(largest, log_weights[j])
+        logs[j] = log_likelihoods[j] + (math.log(weights[j]) if weights[j] > 0.0 else -np.inf)
+        largest = max(largest, logs[j])
     total = 0.0
     for j in range(count):
-        weights[j] = math.exp(log_weights[j] - largest)
+        weights[j] = math.exp(logs[j] - largest)
         total += weights[j]
     for j in range(count):
         weights[j] /= total
+    return largest + math.log(total)
 
 
 @njit(cache=True, error_model="numpy")
@@ -194,23 +197,39 @@ def weigh_and_share(
     power: float,
     aggregated: bool,
     share: np.ndarray,
-) -> None:
+) -> float:
     """Multiply the members' weights by their likelihoods and divide the measurement among them.
 
     ``weights`` (Lambda) and ``share`` (rho) are written; a share of zero means: skip the member.
+    Returns the log of the ray's likelihood, the sum of Lambda lambda, without its constant.
     Bradley & Abaid, Eqs. (18) and (19).
     """
+    largest = log_likelihoods[0]
+    for j in range(1, count):
+        largest = max(largest, log_likelihoods[j])
+    total = 0.0
     for j in range(count):
-        prior = math.log(weights[j]) if weights[j] > 0.0 else -np.inf
-        share[j] = prior + log_likelihoods[j]
-    normalise_logs(share, weights, count)
+        share[j] = math.exp(log_likelihoods[j] - largest)
+        total += weights[j] * share[j]
+    if total > UNDERFLOW:
+        log_total = largest + math.log(total)
+        for j in range(count):
+            weights[j] *= share[j] / total
+    else:
+        log_total = _weigh_in_logs(log_likelihoods, weights, count)
+    total = 0.0
     for j in range(count):
-        share[j] = power * (share[j] if aggregated else log_likelihoods[j])
-    normalise_logs(share, share, count)
+        if aggregated:
+            share[j] = weights[j] ** power
+        elif power != 1.0:
+            share[j] = math.exp(power * (log_likelihoods[j] - largest))
+        total += share[j]
     smallest = SMALLEST_AGGREGATED_SHARE if aggregated else SMALLEST_SHARE
     for j in range(count):
+        share[j] /= total
         if share[j] < smallest:
             share[j] = 0.0
+    return log_total
 
 
 @njit(cache=True, error_model="numpy")

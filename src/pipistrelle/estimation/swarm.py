@@ -100,30 +100,33 @@ def gated_by_all(
 
 
 @njit(cache=True, error_model="numpy")
+def _copy_row(source, target):
+    """Copy one member, number by number: a copy of slices would first see whether they overlap."""
+    for k in range(6):
+        target[k] = source[k]
+
+
+@njit(cache=True, error_model="numpy")
 def _refine_by_ray(pose, P, rows, bearing, sensing, exact, scratch):
     """Correct pose and P by the bearing of a partial landmark; returns the log likelihood."""
     members, variance = rows.shape[0], sensing.bearing_variance
     logs, weight, share = scratch[0], scratch[1], scratch[2]
-    largest = -np.inf
+    hopeful = False
     for j in range(members):
         innovation, S = expect_bearing(pose, P, rows[j], bearing, variance)
         logs[j] = log_likelihood(innovation, S) if math.isfinite(S) else -np.inf
         weight[j] = rows[j, WEIGHT]
-        if weight[j] > 0.0:
-            largest = max(largest, logs[j] + math.log(weight[j]))
-    if largest == -np.inf:
+        hopeful = hopeful or (math.isfinite(S) and weight[j] > 0.0)
+    if not hopeful:
         return 0.0
-    total = 0.0
-    for j in range(members):
-        total += weight[j] * math.exp(logs[j] - largest)
-    weigh_and_share(logs, weight, members, sensing.power, sensing.aggregated, share)
+    gained = weigh_and_share(logs, weight, members, sensing.power, sensing.aggregated, share)
     if exact:
         _refine_to_mixture(pose, P, rows, weight, bearing, variance)
     else:
         for j in range(members):
             if share[j] > 0.0:
                 refine_by_bearing(pose, P, rows[j], bearing, variance / share[j])
-    return largest + math.log(total) - 0.5 * LOG_TAU
+    return gained - 0.5 * LOG_TAU
 
 
 @njit(cache=True, error_model="numpy")
@@ -173,7 +176,7 @@ def _correct_ray(pose, rows, bearing, sensing, exact, scratch, keep):
     left = 0
     for j in range(members):
         if keep[j]:
-            rows[left] = rows[j]
+            _copy_row(rows[j], rows[left])
             rows[left, WEIGHT] = weight[j]
             left += 1
     return left
@@ -187,7 +190,7 @@ def _range_for_ray(pose, rows, distance, bearing, sensing):
             pose, rows[0], distance, bearing, sensing.range_variance, sensing.bearing_variance, 1.0
         )
         return
-    rows[0] = rows[heaviest(rows[:, WEIGHT], rows.shape[0])]
+    _copy_row(rows[heaviest(rows[:, WEIGHT], rows.shape[0])], rows[0])
     dx, dy = rows[0, 0] - pose[0], rows[0, 1] - pose[1]
     scale = distance / max(math.sqrt(dx * dx + dy * dy), 1e-12)
     rows[0, 0], rows[0, 1], rows[0, WEIGHT] = pose[0] + dx * scale, pose[1] + dy * scale, 1.0
@@ -289,9 +292,7 @@ def _copy_members(old_first, old_count, old_member, first, count, member):
     for n in range(old_count.size):
         count[n] = old_count[n]
         for j in range(count[n]):
-            source, target = old_member[old_first[n] + j], member[first[n] + j]
-            for k in range(6):
-                target[k] = source[k]
+            _copy_row(old_member[old_first[n] + j], member[first[n] + j])
 
 
 @njit(cache=True, error_model="numpy")
