@@ -12,10 +12,12 @@ from pipistrelle.config import Config, DetectionConfig
 from pipistrelle.detection.snapshots import detect, detector, filter_blocks
 from pipistrelle.geometry import wrap
 
-CONFIG = Config(detection=DetectionConfig(angle_limit_deg=89.0))
+CONFIG = Config()
+UNCUT = Config(detection=DetectionConfig(angle_limit_deg=89.0))
 SETTLED, SQUARE = sampling(CONFIG), square_of_four(CONFIG.receiver)
 BLOCKS, LATE = 28, 7
-COUNT = 5000  # an rms of so many is good to 1 %: 10 % is 6 standard errors off the largest, 1.04
+COUNT = 5000  # an rms of so many is good to 1 %: a tenth is 6 such off the largest ratio, 1.04
+FAR = 6.0  # bounds: beyond it a side lobe, not noise, decides
 
 
 def echo(face, angle, tone, snr_db):
@@ -64,8 +66,14 @@ def bound(angle, tone, snr_db):
 
 
 def ratio(off, angle, tone, snr_db):
-    """Return the rms error over the bound."""
-    return np.sqrt(np.nanmean(off**2)) / bound(angle, tone, snr_db)
+    """Return the rms error over the bound, side lobes apart."""
+    off = off[np.abs(off) < FAR * bound(angle, tone, snr_db)]
+    return np.sqrt(np.mean(off**2)) / bound(angle, tone, snr_db)
+
+
+def astray(off, angle, tone, snr_db):
+    """Return the share of echoes placed where a side lobe is."""
+    return np.mean(np.abs(off) > FAR * bound(angle, tone, snr_db))
 
 
 @pytest.mark.parametrize(
@@ -75,8 +83,9 @@ def ratio(off, angle, tone, snr_db):
 def test_an_isolated_echos_bearing_meets_the_bound_within_a_tenth(face, angle_deg, tone, snr_db):
     angle = np.radians(angle_deg)
     off = errors(face, angle, tone, snr_db)
-    assert np.mean(np.isnan(off)) < 2e-3
     assert ratio(off, angle, tone, snr_db) == pytest.approx(1.0, abs=0.1)
+    assert astray(off, angle, tone, snr_db) <= (2e-3 if abs(angle_deg) == 70 else 0.0)
+    assert np.mean(np.isnan(off)) <= (0.02 if abs(angle_deg) == 70 else 0.0)
 
 
 def test_an_array_mis_spaced_by_a_twentieth_fails_the_same_test():
@@ -95,6 +104,7 @@ def test_every_face_meets_the_bound_at_every_angle_tone_and_level(face, angle_de
     angle = np.radians(angle_deg)
     off = errors(face, angle, tone, snr_db)
     assert ratio(off, angle, tone, snr_db) == pytest.approx(1.0, abs=0.1)
+    assert astray(off, angle, tone, snr_db) <= (2e-3 if snr_db < 13.0 else 0.0)
 
 
 @pytest.mark.slow
@@ -107,18 +117,23 @@ def test_the_bound_is_exceeded_as_the_arcsine_bends_and_approached_as_echoes_gro
     for snr_db in (8.0, 10.0, 13.0, 20.0):
         spread = bound(angle, 0, snr_db) * c
         bent = np.sqrt(1.0 + spread**2 * c**2 * (3.0 * b**2 + 6.0 * d / c))
-        off = errors(0, angle, 0, snr_db, 20000)
-        # Noise that also moves the parabola's peak adds 2 % at most.
+        off = errors(0, angle, 0, snr_db, 20000, config=UNCUT)
+        # The likelihood's own curvature adds some 2 %; an rms of 20000 is good to half of one.
         assert bent - 0.02 < ratio(off, angle, 0, snr_db) < bent + 0.04
 
 
 @pytest.mark.slow
-def test_the_cut_at_75_degrees_loses_few_echoes_at_70_and_leaves_a_side_lobe_of_some():
-    # Where noise carries the main peak over the cut, a side lobe within 8 dB can be left alone:
-    # some four in ten thousand at 8 dB, each wrong by a radian, which outweigh all the others.
+def test_a_main_peak_past_the_cut_leaves_a_side_lobe_to_be_taken_for_the_echo():
+    # At 70 degrees and 8 dB noise carries the main peak past 75 degrees in one echo of a hundred.
+    # Mostly nothing is left; in some four of ten thousand a side lobe within 8 dB is, wrong by a
+    # radian, and those few outweigh all the others in the rms.
+    angle = np.radians(70.0)
     for tone in (0, 1):
-        off = errors(0, np.radians(70.0), tone, 8.0, 20000, config=Config())
-        far = np.abs(off) > 5.0 * bound(np.radians(70.0), tone, 8.0)
-        assert np.mean(np.isnan(off)) < 0.02
-        assert 0 < np.mean(far) < 1e-3
-        assert ratio(off[~far], np.radians(70.0), tone, 8.0) == pytest.approx(1.0, abs=0.1)
+        cut = errors(0, angle, tone, 8.0, 20000)
+        uncut = errors(0, angle, tone, 8.0, 20000, config=UNCUT)
+        assert 1e-3 < np.mean(np.isnan(cut)) < 0.02
+        assert 1e-4 < astray(cut, angle, tone, 8.0) < 1e-3
+        assert astray(uncut, angle, tone, 8.0) < 2e-4
+        assert np.sqrt(np.nanmean(cut**2)) > 1.08 * ratio(cut, angle, tone, 8.0) * bound(
+            angle, tone, 8.0
+        )

@@ -16,6 +16,7 @@ from reference.missions import (
     SENSING,
     START,
     STEP,
+    STEPS_PER_FRAME,
     Mission,
     draw_mission,
     ray_config,
@@ -34,9 +35,6 @@ from reference.swarms import (
 )
 
 CLOSE = {"rtol": 0, "atol": 1e-9}
-# Where a pose has no noise in some direction its last pivot is rounding, up to 2^-52 of a variance
-# of (0.05 m)^2, and sqrt makes 1e-9 m of it, of either sign; a few frames make a few of them.
-CLOSE_WITHOUT_RANK = {"rtol": 0, "atol": 1e-7}
 OPTIONS = list(
     itertools.product(
         SENSING,
@@ -56,57 +54,57 @@ FEW = [
 ]
 
 
-def assert_same_particles(belief, particles, close):
+def assert_same_particles(belief, particles):
     """Poses, covariances, log weights and every member of every landmark."""
-    np.testing.assert_allclose(belief.mean, [p.pose for p in particles], **close)
-    np.testing.assert_allclose(belief.covariance, [p.P for p in particles], **close)
+    np.testing.assert_allclose(belief.mean, [p.pose for p in particles], **CLOSE)
+    np.testing.assert_allclose(belief.covariance, [p.P for p in particles], **CLOSE)
     log_weight = [p.log_weight for p in particles]
-    np.testing.assert_allclose(np.exp(belief.log_weight), np.exp(log_weight), **close)
+    np.testing.assert_allclose(np.exp(belief.log_weight), np.exp(log_weight), **CLOSE)
     # Far in the tail a log weight is a sum of large terms: compare it by its own size.
-    np.testing.assert_allclose(belief.log_weight, log_weight, rtol=1e-9, atol=close["atol"])
+    np.testing.assert_allclose(belief.log_weight, log_weight, rtol=1e-9, atol=1e-9)
     for number, p in enumerate(particles):
         assert list(p.map) == belief.landmark.tolist()
         for label, expected in p.map.items():
             rows = [(*m.mean, *m.covariance[[0, 0, 1], [0, 1, 1]], m.weight) for m in expected]
             found = members(belief, number, label)
             assert len(found) == len(rows)
-            np.testing.assert_allclose(found, rows, **close)
+            np.testing.assert_allclose(found, rows, **CLOSE)
 
 
-def assert_best_is_a_heaviest(belief, particles, close):
+def assert_best_is_a_heaviest(belief, particles):
     """The best map is that of a particle that no other outweighs, but for rounding."""
     heaviest = max(p.log_weight for p in particles)
     rows = np.column_stack([belief.best.mean, belief.best.weight])
     assert any(
-        rows.shape == expected.shape and np.allclose(rows, expected, **close)
+        rows.shape == expected.shape and np.allclose(rows, expected, **CLOSE)
         for p in particles
         if p.log_weight > heaviest - 1e-9
         for expected in [np.array([(*m.mean, m.weight) for ms in p.map.values() for m in ms])]
     )
 
 
-def assert_equal_to_reference(slam, mission, start=START, close=CLOSE):
+def assert_equal_to_reference(slam, mission, start=START):
     """Every frame of the two filters agrees, before resampling and after."""
     slow, belief = slow_twin(slam, start), slam.init(start)
     rng, other = np.random.default_rng(1), np.random.default_rng(1)
     for controls, dt, scan in zip(mission.controls, mission.dt, mission.scans, strict=True):
         belief, poses = slam.predict(belief, controls, dt, rng)
         means, covariances = slow.predict(controls, dt)
-        np.testing.assert_allclose(poses.mean, means, **close)
-        np.testing.assert_allclose(poses.covariance, covariances, **close)
+        np.testing.assert_allclose(poses.mean, means, **CLOSE)
+        np.testing.assert_allclose(poses.covariance, covariances, **CLOSE)
         before = never_resampling(slam).update(belief, scan, copy.deepcopy(rng))
         belief = slam.update(belief, scan, rng)
         slow.update(scan, other)
         assert belief.gated == slow.gated
         if scan.landmark.size:
-            assert_same_particles(before, slow.before, close)
-            assert_best_is_a_heaviest(belief, slow.before, close)
-            np.testing.assert_allclose(belief.pose().mean, slow.estimated[0], **close)
-            np.testing.assert_allclose(belief.pose().covariance, slow.estimated[1], **close)
+            assert_same_particles(before, slow.before)
+            assert_best_is_a_heaviest(belief, slow.before)
+            np.testing.assert_allclose(belief.pose().mean, slow.estimated[0], **CLOSE)
+            np.testing.assert_allclose(belief.pose().covariance, slow.estimated[1], **CLOSE)
             full = [sum(len(ms) == 1 for ms in p.map.values()) for p in slow.before]
             weights = np.exp([p.log_weight for p in slow.before])
-            np.testing.assert_allclose(belief.full, weights @ full, **close)
-        assert_same_particles(belief, slow.particles, close)
+            np.testing.assert_allclose(belief.full, weights @ full, **CLOSE)
+        assert_same_particles(belief, slow.particles)
     return belief, slow
 
 
@@ -172,19 +170,20 @@ def test_unicycle_that_stops_turns_and_reverses_equals_the_slow_reference():
     controls[rng.random(controls.shape[0]) < 0.3] = 0
     field = scattered(rng, 10, radius=10.0)
     mission = draw_mission(rng, motion, START, field, controls, beamwidth=2.0, hearing=10.0)
-    assert_equal_to_reference(swarm_filter(5, motion=motion), mission, close=CLOSE_WITHOUT_RANK)
+    assert_equal_to_reference(swarm_filter(5, motion=motion), mission)
 
 
 def test_one_control_step_per_measurement_equals_the_slow_reference():
+    """The covariance of the pose has rank 2, and its last pivot is rounding: no noise."""
     mission = small_mission("fused", frames=20)
     single = Mission(
         path=mission.path,
         controls=np.tile(CIRCLE, (20, 1, 1)),
-        dt=np.full((20, 1), STEP),
+        dt=np.full((20, 1), STEPS_PER_FRAME * STEP),
         landmarks=mission.landmarks,
         scans=mission.scans,
     )
-    assert_equal_to_reference(swarm_filter(5), single, close=CLOSE_WITHOUT_RANK)
+    assert_equal_to_reference(swarm_filter(5), single)
 
 
 def test_frames_without_measurements_equal_the_slow_reference():

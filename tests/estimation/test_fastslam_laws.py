@@ -303,8 +303,7 @@ def test_noise_of_one_step_is_sampled_in_the_two_directions_it_has():
     noise = U * BICYCLE.control_std
     offset = (sampled.mean - belief.mean).T
     coordinates = np.linalg.lstsq(noise, offset, rcond=None)[0]
-    # A pivot that rounds to 2^-52 of a variance of (0.01 m)^2 has the root 2e-10 m.
-    np.testing.assert_allclose(noise @ coordinates, offset, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(noise @ coordinates, offset, rtol=0, atol=1e-12)
     assert np.abs(np.cov(coordinates) - np.eye(2)).max() < 4.5 * np.sqrt(2 / 200)
 
 

@@ -141,7 +141,7 @@ def test_a_line_leads_from_the_vehicle_into_the_window():
 def test_windows_of_one_figure_share_their_scale_and_their_corner():
     maps = [a_map() for _ in range(3)]
     clouds, path = [[CLOUD], [], [3.0 * CLOUD]], CLOUD[:1]
-    first, none, last = add_closeups(maps, ["r", "g", "b"], clouds, [path] * 3, [NOWHERE])
+    first, none, last = add_closeups(maps, ["r", "g", "b"], clouds, [path] * 3, [NOWHERE], None)
     assert none is None
     boxes = []
     for closeup, axes, cloud in ((first, maps[0], CLOUD), (last, maps[2], 3.0 * CLOUD)):

@@ -62,10 +62,10 @@ def kalman(mean, P, nu, H, S):
 
 
 def semidefinite_cholesky(P):
-    """Lower factor of a covariance of any rank: a pivot that is not positive has a zero column."""
+    """Lower factor of a covariance of any rank: a pivot that is rounding has a zero column."""
     A, L = np.array(P, float), np.zeros_like(P)
     for k in range(len(A)):
-        if A[k, k] > 0:
+        if A[k, k] > 1e-12 * P[k, k]:
             L[k:, k] = A[k:, k] / math.sqrt(A[k, k])
             A -= np.outer(L[:, k], L[:, k])
     return L

@@ -15,6 +15,8 @@ from pipistrelle.estimation.models import NEAREST, sight
 from pipistrelle.geometry import wrap_angle
 
 LOG_TAU = math.log(2.0 * math.pi)
+ROUNDING = 1e-12
+"""A pivot under this share of its variance is rounding: one control step has noise of rank 2."""
 X, Y, XX, XY, YY, WEIGHT = range(6)
 
 
@@ -119,9 +121,11 @@ def sample_pose(pose, P, draw):
     L00 = math.sqrt(max(P[0, 0], 0.0))
     L10 = P[0, 1] / L00 if L00 > 0.0 else 0.0
     L20 = P[0, 2] / L00 if L00 > 0.0 else 0.0
-    L11 = math.sqrt(max(P[1, 1] - L10 * L10, 0.0))
+    left = P[1, 1] - L10 * L10
+    L11 = math.sqrt(left) if left > ROUNDING * P[1, 1] else 0.0
     L21 = (P[1, 2] - L20 * L10) / L11 if L11 > 0.0 else 0.0
-    L22 = math.sqrt(max(P[2, 2] - L20 * L20 - L21 * L21, 0.0))
+    left = P[2, 2] - L20 * L20 - L21 * L21
+    L22 = math.sqrt(left) if left > ROUNDING * P[2, 2] else 0.0
     pose[0] += L00 * draw[0]
     pose[1] += L10 * draw[0] + L11 * draw[1]
     pose[2] = wrap_angle(pose[2] + L20 * draw[0] + L21 * draw[1] + L22 * draw[2])

@@ -17,27 +17,41 @@ from jaxtyping import Float, Int
 from numba import njit
 
 
-@njit(cache=True, error_model="numpy")
-def normalised(log_weight: np.ndarray) -> np.ndarray:
+def normalised(log_weight: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
     """Weights that sum to one, from their logs.
 
-    Where no log weight is finite the weights are equal: such a filter has lost the vehicle, which
-    is a result and not an error.
+    The sum is rounded once, so the order of the particles does not matter, to the last bit. Where
+    no log weight is finite the weights are equal: such a filter has lost the vehicle, which is a
+    result and not an error.
+
+    Parameters
+    ----------
+    log_weight : (p)
+
+    Returns
+    -------
+    (p)
+
+    Examples
+    --------
+    >>> normalised(np.array([-1000.0, -1000.0 + np.log(3.0)])).round(12)
+    array([0.25, 0.75])
     """
-    largest = -np.inf
+    weight = _shifted(log_weight)
+    total = math.fsum(weight)
+    return weight / total if total > 0.0 else np.full(weight.size, 1.0 / weight.size)
+
+
+@njit(cache=True, error_model="numpy")
+def _shifted(log_weight):
+    """Exponentials relative to the largest; zero where the log is not finite."""
+    weight, largest = np.zeros(log_weight.size), -np.inf
     for j in range(log_weight.size):
-        if log_weight[j] > largest:
-            largest = log_weight[j]
-    weight = np.full(log_weight.size, 1.0 / log_weight.size)
-    if not math.isfinite(largest):
-        return weight
-    total = 0.0
+        if math.isfinite(log_weight[j]):
+            largest = max(largest, log_weight[j])
     for j in range(log_weight.size):
-        finite = math.isfinite(log_weight[j])
-        weight[j] = math.exp(log_weight[j] - largest) if finite else 0.0
-        total += weight[j]
-    for j in range(log_weight.size):
-        weight[j] /= total
+        if math.isfinite(log_weight[j]):
+            weight[j] = math.exp(log_weight[j] - largest)
     return weight
 
 

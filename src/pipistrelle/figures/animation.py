@@ -239,10 +239,9 @@ def _stage(
 def _enlarge(panels: Sequence["_Panel"], true_landmarks: LabelledPoints | None) -> None:
     """Give each swarm its window, on top of everything else."""
     clouds = [[f.cloud for f in panel.frames if f.cloud is not None] for panel in panels]
-    marks = [panel.frames[-1].landmarks.mean for panel in panels]
-    marks += [] if true_landmarks is None else [true_landmarks[1]]
+    ends = [panel.frames[-1].landmarks.mean for panel in panels]
     maps, colours, paths = zip(*((p.axes, p.colour, p.path) for p in panels), strict=True)
-    closeups = add_closeups(maps, colours, clouds, paths, marks)
+    closeups = add_closeups(maps, colours, clouds, paths, ends, true_landmarks)
     for panel, closeup in zip(panels, closeups, strict=True):
         if closeup:
             panel.closeup = closeup

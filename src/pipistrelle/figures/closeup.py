@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from pipistrelle.experiments.tables import LabelledPoints
 from pipistrelle.figures.maps import vehicle
 from pipistrelle.figures.style import INK, TRUTH
 
@@ -109,7 +110,8 @@ def add_closeups(
     colours: Sequence[str],
     clouds: Sequence[Sequence[Float[np.ndarray, "p 3"]]],
     paths: Sequence[Float[np.ndarray, "_ 3"]],
-    marks: Sequence[Float[np.ndarray, "_ 2"]],
+    landmarks: Sequence[Float[np.ndarray, "_ 2"]],
+    true_landmarks: LabelledPoints | None,
 ) -> list[Closeup | None]:
     """Give every map whose vehicle has particles a window, all of one scale and in one corner.
 
@@ -120,8 +122,10 @@ def add_closeups(
     colours, clouds, paths : one for each map
         Of the clouds, (p, 3) [m, m, rad], those that the window is to show in turn, or none;
         where a path (k, 3) [m, m, rad] ends is not covered.
-    marks : of (n, 2) [m]
-        Points that had better not be covered; nor had the paths.
+    landmarks : of (n, 2) [m]
+        Had better not be covered; nor had the paths.
+    true_landmarks : labels (n) and positions (n, 2) [m], or None
+        The same.
 
     Returns
     -------
@@ -132,10 +136,11 @@ def add_closeups(
     --------
     >>> from matplotlib.figure import Figure
     >>> maps, nothing = Figure().subplots(1, 2), np.empty((0, 2))
-    >>> pair = add_closeups(maps, ["k", "k"], [[np.eye(3)], []], [np.eye(3)] * 2, [nothing])
+    >>> pair = add_closeups(maps, ["k", "k"], [[np.eye(3)], []], [np.eye(3)] * 2, [nothing], None)
     >>> [closeup is not None for closeup in pair]
     [True, False]
     """
+    marks = [*landmarks, *([] if true_landmarks is None else [true_landmarks[1]])]
     reach = _reach(list(chain.from_iterable(clouds)))
     box = _free_corner(maps[0], [path[-1:] for path in paths], marks, paths)
     return [

@@ -241,11 +241,9 @@ def _draw_clouds(
     """Draw the particles at the end, where there are any."""
     tracks = [trial.track for trial in trials]
     clouds = [[] if track.cloud is None else [track.cloud] for track in tracks]
-    marks = [track.landmarks.mean for track in tracks]
-    marks += [] if true_landmarks is None else [true_landmarks[1]]
-    paths = [track.pose.mean for track in tracks]
+    landmarks, paths = [t.landmarks.mean for t in tracks], [t.pose.mean for t in tracks]
     colours = [strategy_colour(trial.strategy) for trial in trials]
-    closeups = add_closeups(maps, colours, clouds, paths, marks)
+    closeups = add_closeups(maps, colours, clouds, paths, landmarks, true_landmarks)
     for closeup, cloud, path in zip(closeups, clouds, paths, strict=True):
         if closeup:
             closeup.show(cloud[0], path, None if true_path is None else true_path[1])
