@@ -1,0 +1,320 @@
+"""What every estimator promises: one class of tests, met by each filter.
+
+A new filter joins with four lines: a subclass of `EstimatorContract` whose fixture returns it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from pipistrelle.config import Config, FastSlamConfig
+from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.ekf import EkfSlam
+from pipistrelle.estimation.fastslam import FastSlam
+from pipistrelle.estimation.models import (
+    Gaussian,
+    Landmarks,
+    Motion,
+    motion_jacobians,
+    motion_step,
+)
+from pipistrelle.experiments.trial import Drive, estimator, run_filter
+from reference.missions import (
+    BICYCLE,
+    CIRCLE,
+    SENSING,
+    START,
+    STEP,
+    STEPS_PER_FRAME,
+    draw_mission,
+    ray_config,
+    scan_of,
+    scattered,
+    steady,
+)
+
+CONTROLS, DT = np.tile(CIRCLE, (STEPS_PER_FRAME, 1)), np.full(STEPS_PER_FRAME, STEP)
+FIRST = scan_of((3, 5.0, 0.3), (8, np.nan, 1.0), (1, 2.0, -3.1))
+SECOND = scan_of((8, np.nan, 1.1), (3, 4.8, 0.35), (5, np.nan, -0.5), (1, np.nan, 3.1))
+THIRD = scan_of((5, 6.0, -0.6), (1, 2.2, 3.0))
+
+
+def rng():
+    return np.random.default_rng(11)
+
+
+def small_world(seed, strategy="fused", frames=60):
+    """A drive and its scans as a filter is given them, and the true poses at the scans."""
+    generator = np.random.default_rng(seed)
+    field = scattered(generator, 16, radius=12.0)
+    clear = field[np.abs(np.hypot(*field.T) - np.hypot(*START.mean[:2])) > 1.0]
+    mission = draw_mission(
+        generator, BICYCLE, START, clear, steady(CIRCLE, frames), **SENSING[strategy]
+    )
+    drive = Drive(
+        motion=BICYCLE,
+        start=START,
+        time=STEP * np.arange(1 + frames * STEPS_PER_FRAME),
+        controls=mission.controls.reshape(-1, 2),
+        true_path=None,
+        true_landmarks=None,
+    )
+    return drive, mission.scans, mission.path
+
+
+def seen_from_outside(belief):
+    """Everything that a belief answers, copied."""
+    rows, pose = belief.landmarks(), belief.pose()
+    arrays = (pose.mean, pose.covariance, rows.landmark, rows.mean, rows.covariance, rows.weight)
+    return [np.copy(array) for array in arrays] + [np.array(belief.gated)]
+
+
+def assert_same(belief, answers):
+    for now, before in zip(seen_from_outside(belief), answers, strict=True):
+        np.testing.assert_array_equal(now, before)
+
+
+def assert_gaussian(gaussian, shape):
+    """Finite float64 of a shape, heading wrapped, covariance symmetric and positive."""
+    assert gaussian.mean.shape == shape
+    assert gaussian.covariance.shape == (*shape, shape[-1])
+    assert gaussian.mean.dtype == gaussian.covariance.dtype == np.float64
+    assert np.isfinite(gaussian.mean).all()
+    assert np.isfinite(gaussian.covariance).all()
+    if shape[-1] == 3:
+        assert ((gaussian.mean[..., 2] >= -np.pi) & (gaussian.mean[..., 2] < np.pi)).all()
+    swapped = np.swapaxes(gaussian.covariance, -1, -2)
+    np.testing.assert_array_equal(gaussian.covariance, swapped)
+    least = np.linalg.eigvalsh(gaussian.covariance)[..., 0]
+    assert (least >= -1e-14).all()
+
+
+def assert_map(rows, known):
+    """One row per hypothesis of landmarks that were heard, weights summing to one over each."""
+    assert rows.landmark.dtype == np.int64
+    assert rows.weight.dtype == np.float64
+    assert set(rows.landmark.tolist()) <= set(known)
+    assert rows.weight.shape == rows.landmark.shape
+    assert_gaussian(Gaussian(mean=rows.mean, covariance=rows.covariance), (*rows.weight.shape, 2))
+    assert (rows.weight >= 0).all()
+    for label in set(rows.landmark.tolist()):
+        assert rows.weight[rows.landmark == label].sum() == pytest.approx(1, abs=1e-12)
+
+
+class EstimatorContract:
+    """Subclass it with a fixture `slam` that returns the filter to test."""
+
+    def heard(self, slam, *scans):
+        """The belief after some frames, each a drive and a scan."""
+        belief, generator = slam.update(slam.init(START), FIRST, rng()), rng()
+        for scan in scans:
+            belief, _ = slam.predict(belief, CONTROLS, DT, generator)
+            belief = slam.update(belief, scan, generator)
+        return belief
+
+    def test_init_knows_the_pose_and_no_landmark(self, slam):
+        belief = slam.init(START)
+        np.testing.assert_allclose(belief.pose().mean, START.mean, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(belief.pose().covariance, START.covariance, rtol=0, atol=1e-9)
+        assert belief.landmarks().landmark.size == belief.gated == 0
+        assert_map(belief.landmarks(), ())
+
+    def test_poses_have_a_row_per_step_and_the_last_is_the_beliefs(self, slam):
+        belief, poses = slam.predict(self.heard(slam, SECOND), CONTROLS, DT, rng())
+        assert_gaussian(poses, (STEPS_PER_FRAME, 3))
+        assert_gaussian(belief.pose(), (3,))
+        np.testing.assert_array_equal(poses.mean[-1], belief.pose().mean)
+        np.testing.assert_array_equal(poses.covariance[-1], belief.pose().covariance)
+
+    def test_map_has_rows_of_what_was_heard(self, slam):
+        for scans, known in (
+            ((), (3, 8, 1)),
+            ((SECOND,), (3, 8, 1, 5)),
+            ((SECOND, THIRD), (3, 8, 1, 5)),
+        ):
+            belief = self.heard(slam, *scans)
+            assert_map(belief.landmarks(), known)
+            assert_gaussian(belief.pose(), (3,))
+            assert belief.gated >= 0
+
+    def test_steps_of_a_frame_are_the_steps_one_by_one(self, slam):
+        belief, generator = self.heard(slam, SECOND), rng()
+        together, poses = slam.predict(belief, CONTROLS, DT, rng())
+        for k in range(STEPS_PER_FRAME):
+            belief, pose = slam.predict(belief, CONTROLS[k : k + 1], DT[k : k + 1], generator)
+            np.testing.assert_allclose(pose.mean[0], poses.mean[k], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(belief.pose().mean, together.pose().mean, rtol=0, atol=1e-9)
+
+    def test_no_controls_move_nothing(self, slam):
+        before = self.heard(slam, SECOND)
+        belief, poses = slam.predict(before, np.empty((0, 2)), np.empty(0), rng())
+        assert_gaussian(poses, (0, 3))
+        assert_same(belief, seen_from_outside(before))
+
+    def test_scan_that_heard_nothing_says_nothing(self, slam):
+        for before in (slam.init(START), self.heard(slam, SECOND)):
+            assert_same(slam.update(before, scan_of(), rng()), seen_from_outside(before))
+
+    def test_nothing_that_is_given_is_changed(self, slam):
+        start = Gaussian(mean=START.mean.copy(), covariance=START.covariance.copy())
+        controls, dt, scan = CONTROLS.copy(), DT.copy(), replace(SECOND, range=SECOND.range.copy())
+        for before in (slam.init(start), self.heard(slam), self.heard(slam, SECOND, THIRD)):
+            answers = seen_from_outside(before)
+            moved, _ = slam.predict(before, controls, dt, rng())
+            assert_same(before, answers)
+            moved_answers = seen_from_outside(moved)
+            slam.update(moved, scan, rng())
+            assert_same(moved, moved_answers)
+        np.testing.assert_array_equal(start.mean, START.mean)
+        np.testing.assert_array_equal(start.covariance, START.covariance)
+        np.testing.assert_array_equal(controls, CONTROLS)
+        np.testing.assert_array_equal(dt, DT)
+        np.testing.assert_array_equal(scan.range, SECOND.range)
+
+    def test_belief_kept_aside_goes_on_to_the_same_bits(self, slam):
+        kept = self.heard(slam, SECOND)
+        once = slam.update(slam.predict(kept, CONTROLS, DT, rng())[0], THIRD, rng())
+        slam.update(slam.predict(once, CONTROLS, DT, rng())[0], SECOND, rng())
+        again = slam.update(slam.predict(kept, CONTROLS, DT, rng())[0], THIRD, rng())
+        assert_same(again, seen_from_outside(once))
+
+    @pytest.mark.parametrize("strategy", SENSING)
+    def test_track_of_a_mission_is_finite_and_equal_for_equal_generators(self, slam, strategy):
+        drive, scans, _ = small_world(seed=5, strategy=strategy)
+        track, same = (run_filter(slam, drive, scans, rng()) for _ in range(2))
+        assert_gaussian(track.pose, (len(drive.time), 3))
+        assert_map(track.landmarks, {label for scan in scans for label in scan.landmark.tolist()})
+        np.testing.assert_array_equal(track.pose.mean, same.pose.mean)
+        np.testing.assert_array_equal(track.pose.covariance, same.pose.covariance)
+        np.testing.assert_array_equal(track.landmarks.mean, same.landmarks.mean)
+
+    def test_first_scan_may_come_before_any_step_and_steps_after_the_last_scan(self, slam):
+        drive, scans, _ = small_world(seed=5, frames=4)
+        first = replace(scans[0], time=0.0)
+        track = run_filter(slam, drive, [first, *scans[:2]], rng())
+        assert_gaussian(track.pose, (len(drive.time), 3))
+
+
+# A filter written from docs/extending.md: a reckoning of the controls, with landmarks noted where
+# they were first heard at a range.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Noted:
+    at: Gaussian
+    noted: tuple[tuple[int, np.ndarray, np.ndarray], ...] = ()
+    gated: int = 0
+
+    def pose(self) -> Gaussian:
+        return self.at
+
+    def landmarks(self) -> Landmarks:
+        return Landmarks(
+            landmark=np.array([label for label, _, _ in self.noted], dtype=np.int64),
+            mean=np.array([mean for _, mean, _ in self.noted]).reshape(-1, 2),
+            covariance=np.array([P for _, _, P in self.noted]).reshape(-1, 2, 2),
+            weight=np.ones(len(self.noted)),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeadReckoning:
+    motion: Motion
+    range_std: float
+    bearing_std: float
+
+    def init(self, pose: Gaussian) -> Noted:
+        return Noted(at=pose)
+
+    def predict(self, belief: Noted, controls, dt, rng) -> tuple[Noted, Gaussian]:
+        mean, covariance = belief.at.mean, belief.at.covariance
+        means, covariances = [], []
+        for control, step in zip(controls, dt, strict=True):
+            F, U = motion_jacobians(self.motion, mean, control, step)
+            Q = np.diag(np.square(self.motion.control_std))
+            mean = motion_step(self.motion, mean, control, step)
+            covariance = F @ covariance @ F.T + U @ Q @ U.T
+            covariance = (covariance + covariance.T) / 2
+            means.append(mean)
+            covariances.append(covariance)
+        poses = Gaussian(
+            mean=np.array(means).reshape(-1, 3), covariance=np.array(covariances).reshape(-1, 3, 3)
+        )
+        return replace(belief, at=Gaussian(mean=mean, covariance=covariance)), poses
+
+    def update(self, belief: Noted, scan: Scan, rng) -> Noted:
+        known = {label for label, _, _ in belief.noted}
+        new = tuple(
+            (label, *self.place(belief.at, distance, bearing))
+            for label, distance, bearing in zip(
+                scan.landmark.tolist(), scan.range, scan.bearing, strict=True
+            )
+            if label not in known and not np.isnan(distance)
+        )
+        return replace(belief, noted=belief.noted + new)
+
+    def place(self, pose, distance, bearing):
+        x, y, heading = pose.mean
+        c, s = np.cos(heading + bearing), np.sin(heading + bearing)
+        G = np.array([[1, 0, -distance * s], [0, 1, distance * c]])
+        Gz = np.array([[c, -distance * s], [s, distance * c]])
+        R = np.diag([self.range_std**2, self.bearing_std**2])
+        P = G @ pose.covariance @ G.T + Gz @ R @ Gz.T
+        return np.array([x + distance * c, y + distance * s]), (P + P.T) / 2
+
+
+ASSUMED = {"motion": BICYCLE, "range_std": 0.2, "bearing_std": 0.15}
+RECKONING = DeadReckoning(**ASSUMED)
+
+
+class TestEkfSlam(EstimatorContract):
+    @pytest.fixture
+    def slam(self):
+        return EkfSlam(**ASSUMED, rays=ray_config())
+
+
+class TestFastSlam(EstimatorContract):
+    @pytest.fixture(params=["federated", "exact"])
+    def slam(self, request):
+        swarm = FastSlamConfig(particles=30, mixture=request.param)
+        return FastSlam(**ASSUMED, rays=ray_config(), swarm=swarm)
+
+
+class TestDeadReckoning(EstimatorContract):
+    @pytest.fixture
+    def slam(self):
+        return RECKONING
+
+
+# Worth having
+
+
+def log_ratios(slam, *, deceived=False, worlds=20):
+    """Log of a filter's position RMSE over that of dead reckoning, one per world.
+
+    Deceived, it is given the scans of another world.
+    """
+    values = []
+    for seed in range(worlds):
+        drive, scans, path = small_world(seed, strategy="active", frames=75)
+        if deceived:
+            scans = small_world(seed + worlds, strategy="active", frames=75)[1]
+        squares = [
+            np.square(run_filter(f, drive, scans, rng()).pose.mean[::STEPS_PER_FRAME] - path)
+            for f in (slam, RECKONING)
+        ]
+        values.append(np.log(squares[0][:, :2].mean() / squares[1][:, :2].mean()) / 2)
+    return np.array(values)
+
+
+def is_better(ratios):
+    """By three standard errors of the mean."""
+    return ratios.mean() < -3 * ratios.std(ddof=1) / np.sqrt(ratios.size)
+
+
+@pytest.mark.parametrize("name", ["ekf", "fastslam"])
+def test_filter_beats_dead_reckoning_and_not_with_the_scans_of_another_world(name):
+    slam = estimator(name, BICYCLE, Config(rays=ray_config()))
+    assert is_better(log_ratios(slam))
+    assert not is_better(log_ratios(slam, deceived=True))
