@@ -8,13 +8,17 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.ekf import EkfSlam
 from pipistrelle.estimation.fastslam import SMALLEST_STD, FastSlam
 from pipistrelle.estimation.models import Gaussian, Motion
 from pipistrelle.estimation.resampling import effective_particles, normalised
+from pipistrelle.geometry import wrap
 from reference.missions import (
+    CIRCLE,
+    START,
     STEP,
     STEPS_PER_FRAME,
     draw_mission,
@@ -23,7 +27,7 @@ from reference.missions import (
     scattered,
     steady,
 )
-from reference.swarms import never_resampling, slow_twin, swarm_filter
+from reference.swarms import followed, never_resampling, slow_twin, swarm_filter
 
 SIZES = np.array([30, 100, 300, 1000, 3000])
 FAR = np.array([1e5, 1.3e5, -1e5])
@@ -208,3 +212,36 @@ def test_weight_by_the_marginal_likelihood_is_right_and_by_the_sampled_pose_is_n
     wrong = slow_excesses("sampled")
     assert not is_unbiased(wrong)
     assert wrong.mean() == pytest.approx(-0.4, abs=0.1)
+
+
+# Consistency
+
+
+def final_nees(assumed, particles, runs=100):
+    """Mean NEES of the pose after ten seconds of active sensing."""
+    motion = Motion(model="bicycle", control_std=(0.05, 0.005), wheelbase=0.2)
+    start = Gaussian(mean=START.mean, covariance=np.diag([0.02**2, 0.02**2, 0.01**2]))
+    true = {"range_std": 0.05, "bearing_std": 0.01}
+    slam = swarm_filter(
+        particles, motion=motion, **{name: assumed * std for name, std in true.items()}
+    )
+    values = []
+    for run in range(runs):
+        rng = np.random.default_rng([11, run])
+        mission = draw_mission(
+            rng, motion, start, scattered(rng, 10, radius=12.0), steady(CIRCLE, 20),
+            beamwidth=7.0, reach=40.0, **true,
+        )  # fmt: skip
+        *_, (belief, _) = followed(slam, mission, rng, start)
+        error = belief.pose().mean - mission.path[-1]
+        error[2] = wrap(error[2])
+        values.append(error @ np.linalg.solve(belief.pose().covariance, error))
+    return np.mean(values)
+
+
+@pytest.mark.slow
+def test_large_swarm_is_consistent_and_a_small_one_or_half_the_noise_is_not():
+    low, high = chi2.ppf([0.005, 0.995], 3 * 100) / 100
+    assert low < final_nees(assumed=1.0, particles=3000) < high
+    assert final_nees(assumed=1.0, particles=100) > high
+    assert final_nees(assumed=0.5, particles=3000) > high

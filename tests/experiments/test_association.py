@@ -145,6 +145,7 @@ def test_gates_hold_in_delay_and_in_bearing_both():
 def test_tones_and_faces_do_not_mix():
     assert labels(detections((10.0, 0.2, 0, 0, 9)), ONE) == [UNLABELLED]
     assert labels(detections((10.0, 0.2, 1, 2, 9)), ONE) == [UNLABELLED]  # it looks back
+    assert labels(detections((10.0, 0.2, 1, 3, 9)), ONE) == [UNLABELLED]  # 101 degrees off it
     on_both = detections((10.0, 0.2, 1, 0, 9), (10.0, 0.2, 1, 1, 5))
     assert labels(on_both, ONE) == [7, 7]
 

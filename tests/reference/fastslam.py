@@ -163,11 +163,11 @@ class SlowFastSlam:
     # One frame
 
     def update(self, scan, rng):
-        normal = rng.standard_normal((len(self.particles), 3))
-        uniform = rng.random(len(self.particles))
         rows = list(zip(scan.landmark.tolist(), scan.range, scan.bearing, strict=True))
         if not rows:
             return
+        normal = rng.standard_normal((len(self.particles), 3))
+        uniform = rng.random(len(self.particles))
         kept = [row for row in rows if self.inside_any(*row)]
         self.gated += len(rows) - len(kept)
         for p, draw in zip(self.particles, normal, strict=True):

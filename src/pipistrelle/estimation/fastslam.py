@@ -199,7 +199,8 @@ class FastSlam:
         belief : FastSlamBelief
         scan : Scan
         rng : Generator
-            Draws three normals per particle, then one uniform number per particle.
+            Draws three normals per particle, then one uniform number per particle; nothing for a
+            scan without measurements, which a recorded log cannot hold.
 
         Returns
         -------
@@ -209,10 +210,10 @@ class FastSlam:
         -----
         Bradley & Abaid, Eqs. (12) to (22).
         """
-        particles = self.swarm.particles
-        normal, uniform = rng.standard_normal((particles, 3)), rng.random(particles)
         if scan.landmark.size == 0:
             return belief
+        particles = self.swarm.particles
+        normal, uniform = rng.standard_normal((particles, 3)), rng.random(particles)
         sensing = sensing_of(self.range_std, self.bearing_std, self.rays, self.gate)
         dropped = self._dropped(belief, scan, sensing)
         if dropped.any():

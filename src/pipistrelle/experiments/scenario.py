@@ -159,5 +159,5 @@ def _too_many(setup: ScenarioConfig, limit: str) -> InputError:
     return InputError(
         f"scenario.landmarks: found {setup.landmarks}, but {limit} at {setup.spacing:g} m from "
         f"each other within {setup.radius:g} m of the centre; expected fewer landmarks, a smaller "
-        "scenario.spacing or a larger scenario.radius"
+        "scenario.spacing or scenario.clearance, or a larger scenario.radius"
     )

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.evaluation.comparison import Relation, Statement, pooled_std, pseudovalues
+from pipistrelle.report.published import beam_name
 from pipistrelle.report.tables import Rule, Study, kept, samples
 
 STATES = 3.0
@@ -60,7 +61,7 @@ def differences(
         pair = samples(study, rule, score, [(*first, i), (*second, i)])
         statements.append(
             Statement(
-                label=name if blind else f"{name}, {width:.0f}°",
+                label=name if blind else f"{name}, {beam_name(width)}",
                 sample=pair[0] - pair[1],
                 relation=relation,
                 margin=pooled_std(*pair) if sigma and len(pair[0]) > 1 else 0.0,

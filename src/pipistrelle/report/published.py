@@ -37,6 +37,8 @@ TABLE_II = (
     Printed(filter="fastslam", beamwidth=0.0, full=(22.1, 4.9), total=(39.4, 3.3)),
 )
 """Bradley & Abaid, Table II."""
+BEAMWIDTHS = (11.4, 14.2, 17.6, 21.8, 26.8, 33.2, 41.6, 51.4, 64.8, 83.0, 108.6, 180.0)
+"""Bradley & Abaid, Appendix B [deg]."""
 EXCLUDED = {"ekf": 8, "fastslam": 15}
 """Worlds of 115 that the paper dropped (Bradley & Abaid, Sec. V-A)."""
 CROSSING = 41.0
@@ -56,15 +58,35 @@ def cell_of(study: Study, printed: Printed) -> Cell | None:
     Returns
     -------
     Cell or None
-        None where the study has no such case within half a degree.
+        None where the study has no such case within a quarter of a degree.
     """
     strategy = "fused" if printed.beamwidth else "passive"
     if (printed.filter, strategy) not in study.outcomes:
         return None
     if strategy == "passive":
         return printed.filter, strategy, 0
-    near = np.flatnonzero(np.abs(study.beamwidth - printed.beamwidth) < 0.5)
+    near = np.flatnonzero(np.abs(study.beamwidth - printed.beamwidth) < 0.25)
     return (printed.filter, strategy, int(near[0])) if len(near) else None
+
+
+def beam_name(beamwidth: float) -> str:
+    """Name a beamwidth: as the paper does where it is one of the paper's, within 0.2 degrees.
+
+    Parameters
+    ----------
+    beamwidth : [deg]
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> beam_name(11.575), beam_name(12.5)
+    ('11°', '12°')
+    """
+    near = min(BEAMWIDTHS, key=lambda printed: abs(printed - beamwidth))
+    return f"{near if abs(near - beamwidth) < 0.2 else beamwidth:.0f}°"
 
 
 def row_name(printed: Printed) -> str:
@@ -83,4 +105,4 @@ def row_name(printed: Printed) -> str:
     >>> row_name(TABLE_II[1]), row_name(TABLE_II[3])
     ('33°', 'passive (0°)')
     """
-    return f"{printed.beamwidth:.0f}°" if printed.beamwidth else "passive (0°)"
+    return beam_name(printed.beamwidth) if printed.beamwidth else "passive (0°)"
