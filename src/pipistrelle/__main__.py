@@ -40,6 +40,12 @@ app.command(
     help="Solve a recorded log: a log folder, or a UTIAS MRCLAM folder as it is.",
     help_epilogue=SPELLINGS,
 )
+app.command(
+    "pipistrelle.verbs.study:study",
+    name="study",
+    help="Run many worlds, and all that a plan varies in each; again on one folder: go on.",
+    help_epilogue=SPELLINGS,
+)
 config = App(name="config", help="Show the settings, or what a file of settings may hold.")
 config.command(
     "pipistrelle.verbs.config:show",

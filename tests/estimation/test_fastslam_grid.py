@@ -15,7 +15,7 @@ from reference.grid import Posterior, drive
 from reference.missions import ray_config, scan_of
 from reference.swarms import swarm_filter
 
-PARTICLES = 200_000
+PARTICLES = 100_000
 LINEARISATION = 0.01
 KNOWN = np.array([0.3, -0.2, 0.4])
 CONTROLS, DT, WHEELBASE = np.array([[0.75, 0.03], [0.75, -0.02]]), 1.0, 0.2
@@ -64,12 +64,19 @@ def swarm_moments(rows, rays, mixture):
     return mean, second - np.outer(mean, mean), effective_particles(particle), np.array(chances)
 
 
-def departures(rows, rays, mixture, placings=None):
-    """Errors in deviations: of the mean, of the covariance; of the members' chances; bounds."""
-    mean, covariance, chances = Posterior(
+def grid_moments(rows, placings=None):
+    return Posterior(
         KNOWN, CONTROLS, DT, CONTROL_STD, WHEELBASE, rows, RANGE_STD, BEARING_STD
     ).moments(placings)
-    found_mean, found_covariance, effective, found = swarm_moments(rows, rays, mixture)
+
+
+def departures(swarm, grid):
+    """Largest errors over their bounds: of the mean, of the covariance, of the members' chances.
+
+    The first two in deviations of the exact posterior; the bounds are 4.5 standard errors of
+    sampling beside the cost of linearisation.
+    """
+    (found_mean, found_covariance, effective, found), (mean, covariance, chances) = swarm, grid
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
     sampling = 4.5 / np.sqrt(effective)
     return (
@@ -80,21 +87,30 @@ def departures(rows, rays, mixture, placings=None):
     )
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize(
     "passive", [(False, False, False), (False, True, True), (False, True, False)]
 )
-def test_posterior_of_pose_and_landmark_matches_a_brute_force_grid(passive, seed):
-    values = departures(heard_on_a_drive(seed, passive), ray_config(), "federated")
-    print(values)
-    assert max(values) < 1
+def test_posterior_of_pose_and_landmark_matches_a_brute_force_grid(passive):
+    rows = heard_on_a_drive(1, passive)
+    swarm = swarm_moments(rows, ray_config(), "federated")
+    assert max(departures(swarm, grid_moments(rows))) < 1
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_exact_mixture_matches_the_grid_while_a_landmark_is_partial_and_federated_does_not(seed):
+def assert_only_the_exact_mixture_matches(seed):
     rows = heard_on_a_drive(seed, (True, True, True))
-    placings = [(s, SHORT.ratio * s) for s in ray_ranges(SHORT)]
-    print(departures(rows, SHORT, "exact", placings))
-    assert max(departures(rows, SHORT, "exact", placings)) < 1
-    print(departures(rows, SHORT, "federated", placings))
-    assert max(departures(rows, SHORT, "federated", placings)) > 5
+    grid = grid_moments(rows, [(s, SHORT.ratio * s) for s in ray_ranges(SHORT)])
+    assert np.sort(grid[2])[-2] > 0.05  # At least two members could be it.
+    assert max(departures(swarm_moments(rows, SHORT, "exact"), grid)) < 1
+    mean, covariance, _ = departures(swarm_moments(rows, SHORT, "federated"), grid)
+    assert mean > 1
+    assert covariance > 5
+
+
+def test_exact_mixture_matches_the_grid_while_a_landmark_is_partial_and_federated_does_not():
+    assert_only_the_exact_mixture_matches(seed=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2, 10))
+def test_exact_mixture_matches_the_grid_in_other_drives_too(seed):
+    assert_only_the_exact_mixture_matches(seed)

@@ -5,7 +5,6 @@ which is known, and the noise of each control. The posterior of these is integra
 along its own axes: for a smooth bell a lattice one deviation apart is exact to 1e-8.
 """
 
-import itertools
 import math
 
 import numpy as np
@@ -67,7 +66,7 @@ class Posterior:
         """Evidence, mean (5) and second moment (5, 5) for one placing."""
         centre, axes = self.centre(placed)
         nodes = np.arange(-HALF_WIDTH, HALF_WIDTH + 1.0)
-        inner = np.array(list(itertools.product(nodes, repeat=self.unknown - 1))).T
+        inner = np.array(np.meshgrid(*[nodes] * (self.unknown - 1))).reshape(self.unknown - 1, -1)
         total, mean, second = 0.0, np.zeros(5), np.zeros((5, 5))
         for node in nodes:
             lattice = np.vstack([np.full((1, inner.shape[1]), node), inner])

@@ -3,9 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from pipistrelle.config import FastSlamConfig
 from pipistrelle.estimation.fastslam import FastSlam
+from pipistrelle.estimation.resampling import normalised
 from reference.fastslam import SlowFastSlam
 from reference.missions import (
     BICYCLE,
@@ -14,9 +16,12 @@ from reference.missions import (
     START,
     draw_mission,
     ray_config,
+    scan_of,
     scattered,
     steady,
 )
+
+ARRAYS = ("mean", "covariance", "log_weight", "landmark", "first", "count")
 
 
 class Drawn:
@@ -82,3 +87,42 @@ def members(belief, particle, label):
     n = belief.landmark.tolist().index(label)
     first = belief.first[n]
     return belief.member[particle, first : first + belief.count[particle, n]]
+
+
+def arrays_of(belief):
+    shown = belief.landmarks()
+    poses = (belief.pose().mean, belief.pose().covariance)
+    rows = (shown.landmark, shown.mean, shown.covariance, shown.weight)
+    return [*(getattr(belief, name) for name in ARRAYS), all_members(belief), *poses, *rows]
+
+
+def assert_same(belief, other):
+    """Two beliefs are equal to the last bit."""
+    for mine, yours in zip(arrays_of(belief), arrays_of(other), strict=True):
+        np.testing.assert_array_equal(mine, yours)
+    assert (belief.full, belief.gated) == (other.full, other.gated)
+
+
+def assert_sound(belief):
+    """Finite numbers, weights that sum to one, covariances that are covariances."""
+    rows = belief.landmarks()
+    for values in (belief.mean, belief.pose().mean, belief.pose().covariance, rows.mean):
+        assert np.isfinite(values).all()
+    assert normalised(belief.log_weight).sum() == pytest.approx(1, abs=1e-12)
+    np.testing.assert_array_equal(belief.pose().covariance, belief.pose().covariance.T)
+    assert np.linalg.eigvalsh(belief.pose().covariance)[0] > 0
+    for particle in range(len(belief.mean)):
+        for label in belief.landmark:
+            _, _, xx, xy, yy, weight = members(belief, particle, label).T
+            assert (xx > 0).all()
+            assert (xx * yy - xy**2 > 0).all()
+            assert weight.sum() == pytest.approx(1, abs=1e-12)
+
+
+def drawing(seed=1):
+    return np.random.default_rng(seed)
+
+
+def began(slam, *rows, start=START, seed=1):
+    """The belief after a first scan."""
+    return slam.update(slam.init(start), scan_of(*rows), drawing(seed))

@@ -11,9 +11,9 @@ import os
 import signal
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -38,6 +38,7 @@ AHEAD = 1000
 
 Task = Callable[[int], list[Outcome]]
 Ended = tuple[int, "Future[list[Outcome]]"]
+Results = Generator[list[Outcome], None, None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -134,6 +135,7 @@ def run_study(
     show = progress or (lambda _: None)
     show(standing)
     task, give_up = partial(_work, folder, plan), partial(_give_up, folder, plan)
+    found: Results
     if executor is not None:
         found = (future.result() for _, future in _ended(executor, task, waiting, AHEAD))
     elif scheduler is not None:
@@ -141,10 +143,11 @@ def run_study(
     elif workers > 1:
         found = _in_processes(task, give_up, waiting, workers)
     else:
-        found = map(task, waiting)
-    for outcomes in found if waiting else ():
-        standing = _advanced(standing, outcomes)
-        show(standing)
+        found = (task(iteration) for iteration in waiting)
+    with closing(found):
+        for outcomes in found if waiting else ():
+            standing = _advanced(standing, outcomes)
+            show(standing)
     return standing
 
 
@@ -204,9 +207,7 @@ def _ended(executor: Executor, task: Task, waiting: deque[int], ahead: int) -> I
             yield running.pop(future), future
 
 
-def _in_processes(
-    task: Task, give_up: Task, waiting: deque[int], workers: int
-) -> Iterator[list[Outcome]]:
+def _in_processes(task: Task, give_up: Task, waiting: deque[int], workers: int) -> Results:
     """Run worlds in processes; each world that was in one that died is tried again, alone."""
     alive = False
     while waiting:
@@ -271,7 +272,7 @@ def _become_worker() -> None:
 
 def _on_cluster(
     task: Task, give_up: Task, waiting: deque[int], workers: int, address: str
-) -> Iterator[list[Outcome]]:
+) -> Results:
     """Run worlds on Dask's workers; Dask itself tries again what a dead worker leaves."""
     with _client(address, workers) as client:
         from distributed import KilledWorker

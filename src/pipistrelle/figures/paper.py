@@ -144,8 +144,6 @@ def _draw_series(axes: "Axes", series: Series, top: float, order: float) -> None
 
 def _handles(chart: Chart) -> list[Any]:
     """Return one legend entry per name; many alike are told by the caption instead."""
-    from matplotlib.lines import Line2D
-
     named = {
         series.name: series
         for panel in chart.panels
@@ -154,12 +152,24 @@ def _handles(chart: Chart) -> list[Any]:
     }
     if len(named) > 6:
         return []
-    marker = {"dots": "o", "points": "o", "stars": "*"}
-    return [
-        Line2D(
-            [], [], color=_colour(s.role), ls="--" if s.dashed else "-",
-            lw=0 if s.style == "stars" else 1.4, marker=marker.get(s.style, ""),
-            ms=9 if s.style == "stars" else 5, label=textwrap.shorten(name, 60),
-        )
-        for name, s in named.items()
-    ]  # fmt: skip
+    return [_handle(name, series) for name, series in named.items()]
+
+
+def _handle(name: str, series: Series) -> Any:
+    """Return one legend entry."""
+    from matplotlib.lines import Line2D
+
+    colour = _colour(series.role)
+    hollow = series.filled is not None and not series.filled.any()
+    line = series.style in ("line", "dots") or series.low is not None
+    return Line2D(
+        [],
+        [],
+        color=colour,
+        ls="--" if series.dashed else "-",
+        lw=1.4 if line else 0.0,
+        marker={"dots": "o", "points": "o", "stars": "*"}.get(series.style, ""),
+        ms=10 if series.style == "stars" else 5,
+        mfc="none" if hollow else colour,
+        label=textwrap.shorten(name, 60),
+    )

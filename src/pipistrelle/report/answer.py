@@ -1,0 +1,142 @@
+"""The answer in plain words: what listening to the beacon does to map and vehicle, and how surely."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipistrelle.evaluation.comparison import Finding, judge
+from pipistrelle.figures.style import FILTER_NAMES
+from pipistrelle.report.claims import Claim
+from pipistrelle.report.contrasts import differences
+from pipistrelle.report.published import beam_name
+from pipistrelle.report.tables import COMMON, Study, samples
+
+NUMBERS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight")
+
+
+def answer(study: Study, claims: Sequence[Claim]) -> list[str]:
+    """Answer the question, then say what of the paper's claims is left.
+
+    Parameters
+    ----------
+    study : Study
+    claims : sequence of Claim
+
+    Returns
+    -------
+    list of str
+        A line that stands alone, then sentences.
+    """
+    placed = {name: _findings(study, COMMON, name) for name in FILTER_NAMES}
+    located = {name: _findings(study, "position_rmse_m", name) for name in FILTER_NAMES}
+    sentences = [_counted(study), _compared("Landmarks that every strategy places are", placed),
+                 _compared("The vehicle is", located), _tally(claims)]  # fmt: skip
+    return [_headline(study, placed), *(sentence for sentence in sentences if sentence)]
+
+
+def _findings(study: Study, score: str, name: str) -> list[Finding]:
+    """Judge active minus fused at each beamwidth, as a family of its own."""
+    pair = (name, "active"), (name, "fused")
+    return list(judge(differences(study, "world", score, *pair, name=name)))
+
+
+def _headline(study: Study, placed: dict[str, list[Finding]]) -> str:
+    """Answer in a line."""
+    decided = [finding for mine in placed.values() for finding in mine if finding.n > 1]
+    if not decided:
+        return "Not decided yet: there are too few worlds, or no pair of active and fused."
+    better = sum(finding.holds is True for finding in decided)
+    worse = sum(finding.holds is False for finding in decided)
+    fuller = "a fuller map" if _fuller(study) else "not a fuller map"
+    if better and not worse:
+        narrow = all(_leading(mine) for mine in placed.values())
+        where = "where the beam is narrow" if narrow else "at some beamwidths"
+        where = "at every beamwidth" if better == len(decided) else where
+        return f"Yes: {fuller}, and a more accurate one {where}."
+    if worse and not better:
+        return f"It builds {fuller}, and a less accurate one."
+    if better:
+        return f"It depends: {fuller}, at some beamwidths more accurate, at others less."
+    return f"It builds {fuller}; that it is more accurate, or less, is not seen."
+
+
+def _leading(findings: Sequence[Finding]) -> bool:
+    """Tell whether what is better, if anything, is so from the narrowest beam on."""
+    better = [finding.holds is True for finding in findings]
+    return better == sorted(better, reverse=True)
+
+
+def _fuller(study: Study) -> bool:
+    """Tell whether fused places more landmarks than active on average at every beamwidth."""
+    pairs = [
+        samples(study, "world", "landmarks_full", [(name, "fused", i), (name, "active", i)])
+        for name in FILTER_NAMES
+        if {(name, "fused"), (name, "active")} <= study.outcomes.keys()
+        for i in range(len(study.beamwidth))
+    ]
+    return all(len(a) and np.mean(a) > np.mean(b) for a, b in pairs)
+
+
+def _counted(study: Study) -> str:
+    """Say how many landmarks fused and active place, at the narrowest and at the widest beam."""
+    for name, label in FILTER_NAMES.items():
+        if not {(name, "fused"), (name, "active")} <= study.outcomes.keys():
+            continue
+        said = []
+        for i in dict.fromkeys((0, len(study.beamwidth) - 1)):
+            cells = [(name, "fused", i), (name, "active", i)]
+            fused, active = samples(study, "world", "landmarks_full", cells)
+            if len(fused):
+                beam = beam_name(study.beamwidth[i])
+                said.append(f"{np.mean(fused):.0f} instead of {np.mean(active):.0f} at {beam}")
+        if said:
+            return (
+                f"With {label}, hearing the beacon as well as its own calls, the vehicle places "
+                f"{' and '.join(said)} of its landmarks."
+            )
+    return ""
+
+
+def _compared(subject: str, found: dict[str, list[Finding]]) -> str:
+    """Say where fused is better than active, and where worse, with each filter."""
+    verb = {"Landmarks that every strategy places are": "placed", "The vehicle is": "located"}
+    said = []
+    for name, findings in found.items():
+        if not findings:
+            continue
+        parts = [
+            f"{word} at {_beams(findings, outcome)}"
+            for word, outcome in (("better", True), ("worse", False))
+            if any(finding.holds is outcome for finding in findings)
+        ]
+        words = " and ".join(parts) or "neither better nor worse at any beamwidth"
+        said.append(f"{words} with {FILTER_NAMES[name]}")
+    return f"{subject} {verb[subject]} {'; '.join(said)}." if said else ""
+
+
+def _beams(findings: Sequence[Finding], outcome: bool) -> str:
+    """Name the beamwidths of an outcome: how many, and which, in runs."""
+    names = [finding.label.split(", ")[-1] for finding in findings]
+    runs: list[list[str]] = []
+    for i, finding in enumerate(findings):
+        if finding.holds is outcome:
+            if runs and i and findings[i - 1].holds is outcome:
+                runs[-1].append(names[i])
+            else:
+                runs.append([names[i]])
+    count = sum(map(len, runs))
+    which = ", ".join(run[0] if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs)
+    every = "every beamwidth" if count == len(findings) else f"{count} of {len(findings)} beamwidths"
+    return f"{every} ({which})"
+
+
+def _tally(claims: Sequence[Claim]) -> str:
+    """Count the verdicts."""
+    verdicts = [claim.verdict for claim in claims]
+    words = [
+        f"{NUMBERS[verdicts.count(verdict)]} {'is' if verdicts.count(verdict) == 1 else 'are'} {said}"
+        for verdict, said in (
+            ("reproduced", "reproduced"), ("not-reproduced", "not reproduced"), ("open", "open"),
+        )
+    ]  # fmt: skip
+    return f"Of the paper's eight claims, {words[0]}, {words[1]} and {words[2]}."

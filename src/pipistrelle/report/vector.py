@@ -1,0 +1,331 @@
+"""Charts as vectors for the page: coloured by its style sheet, read out point by point.
+
+What can be read out is a ``tip``: an element with a title, which the page's script shows on
+hover, tap or by the arrow keys, and which a browser shows by itself where scripts are off.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from markupsafe import Markup
+
+from pipistrelle.figures.chart import Axis, Panel, Series
+
+WIDTH, HEIGHT = 460.0, 300.0
+"""Of a panel, in its own units, which are pixels on a small screen."""
+LEFT, RIGHT, TOP, BOTTOM = 48.0, 10.0, 10.0, 42.0
+"""Margins."""
+READINGS = 80
+"""Most places along a panel where its numbers are read out."""
+
+
+def panel_svg(panel: Panel) -> Markup:
+    """Draw a panel.
+
+    Parameters
+    ----------
+    panel : Panel
+
+    Returns
+    -------
+    Markup
+        An ``svg`` element, its texts escaped.
+
+    Examples
+    --------
+    >>> axis = Axis(label="<x>", limits=(0.0, 1.0), ticks=())
+    >>> str(panel_svg(Panel(title="", x=axis, y=axis, series=()))).count("&lt;x&gt;")
+    2
+    """
+    frame = _Frame(panel)
+    parts = [*_grid(panel, frame)]
+    for series in panel.series:
+        parts += _series(series, frame)
+    if not panel.equal:
+        parts += [
+            _tip("rect", text, f'x="{x0:.1f}" y="{TOP:g}" width="{x1 - x0:.1f}" '
+                 f'height="{frame.bottom - TOP:.1f}"')
+            for text, x0, x1 in _columns(panel, frame)
+        ]  # fmt: skip
+    return Markup(
+        '<svg class="panel" viewBox="0 0 {} {}" role="img" tabindex="0" '
+        'aria-label="{}. Arrow keys read the numbers.">{}</svg>'
+    ).format(f"{WIDTH:g}", f"{frame.height:g}", panel.title or panel.y.label or "chart",
+             Markup("").join(parts))  # fmt: skip
+
+
+def readings(panel: Panel) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Say what a panel shows at each place along it.
+
+    Parameters
+    ----------
+    panel : Panel
+
+    Returns
+    -------
+    list of the place's name and, per series, its name and its number
+
+    Examples
+    --------
+    >>> axis = Axis(label="", limits=(0.0, 90.0), ticks=((33.0, "33"),))
+    >>> one, tenth = np.ones(1), np.full(1, 0.1)
+    >>> dot = Series(name="fused", role="fused", x=33 * one, y=one, low=one - tenth, high=one + tenth)
+    >>> readings(Panel(title="", x=axis, y=axis, series=(dot,)))
+    [('33', [('fused', '1 ± 0.1')])]
+    """
+    named = [s for s in panel.series if s.listed and s.style not in ("marks", "text") and len(s.x)]
+    if not named or panel.equal:
+        return []
+    span = panel.x.limits[1] - panel.x.limits[0]
+    ticks = np.array([value for value, _ in panel.x.ticks])
+    every = np.unique(np.concatenate([s.x for s in named]))
+    near = np.abs(every[:, None] - ticks).min(axis=1, initial=math.inf) if len(ticks) else every + 1
+    at_ticks = bool(np.all(near <= 0.03 * span)) and len(every) > 0
+    places = ticks if at_ticks else every[:: -(-len(every) // READINGS)]
+    names = [t for _, t in panel.x.ticks] if at_ticks else [f"{value:g}" for value in places]
+    found = []
+    for place, name in zip(places, names, strict=True):
+        said = []
+        for series in named:
+            i = int(np.argmin(np.abs(series.x - place)))
+            if abs(series.x[i] - place) <= 0.03 * span and math.isfinite(series.y[i]):
+                said.append((series.name, _number(series, i)))
+        found.append((name, said))
+    return found
+
+
+def figure(value: float) -> str:
+    """Write a number in three digits.
+
+    Parameters
+    ----------
+    value : float
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> figure(0.12345), figure(43.71), figure(-1234.5), figure(float("inf"))
+    ('0.123', '43.7', '−1234', '∞')
+    """
+    if not math.isfinite(value):
+        return "∞" if value > 0 else ("−∞" if value < 0 else "no number")
+    digits = max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0
+    text = f"{value:.{min(digits, 4)}f}" if abs(value) < 1e5 else f"{value:.2e}"
+    text = text.rstrip("0").rstrip(".") if "." in text and "e" not in text else text
+    return text.replace("-", "−") if float(text) else "0"
+
+
+class _Frame:
+    """Where a panel's numbers come to stand."""
+
+    def __init__(self, panel: Panel) -> None:
+        self.panel = panel
+        x, y = panel.x.limits, panel.y.limits
+        if panel.equal:
+            self.left, self.right, self.top = 0.0, WIDTH, 0.0
+            self.bottom = WIDTH * (y[1] - y[0]) / (x[1] - x[0])
+            self.height = self.bottom
+        else:
+            self.left, self.right, self.top = LEFT, WIDTH - RIGHT, TOP
+            self.bottom, self.height = HEIGHT - BOTTOM, HEIGHT
+
+    def across(self, values: Float[np.ndarray, " n"] | float) -> Float[np.ndarray, " n"]:
+        return self.left + _share(self.panel.x, values) * (self.right - self.left)
+
+    def down(self, values: Float[np.ndarray, " n"] | float) -> Float[np.ndarray, " n"]:
+        share = np.clip(_share(self.panel.y, values), 0.0, 1.0)
+        return self.bottom - share * (self.bottom - self.top)
+
+
+def _share(axis: Axis, values: Float[np.ndarray, " n"] | float) -> Float[np.ndarray, " n"]:
+    """Return how far along an axis values stand; NaN stays NaN."""
+    low, high = axis.limits
+    numbers = np.asarray(values, dtype=np.float64)
+    if axis.log:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.log(numbers / low) / math.log(high / low)
+    return (numbers - low) / (high - low)
+
+
+def _grid(panel: Panel, frame: _Frame) -> list[Markup]:
+    """Draw the ground: span, grid, ticks, labels, rules and posts."""
+    if panel.equal:
+        return []
+    right, bottom, parts = WIDTH - RIGHT, frame.bottom, []
+    if panel.span:
+        low, high, name = panel.span
+        top = float(frame.down(high))
+        shape = 'class="span" x="{}" y="{:.1f}" width="{:.1f}" height="{:.1f}"'
+        shape = shape.format(LEFT, top, right - LEFT, float(frame.down(low)) - top)
+        parts.append(Markup("<rect {}><title>{}</title></rect>").format(Markup(shape), name))
+    for value, text in panel.y.ticks:
+        y = float(frame.down(value))
+        parts.append(Markup(f'<path class="grid" d="M{LEFT:g} {y:.1f}H{right:g}"/>'))
+        parts.append(_text(text, LEFT - 6, y + 4, "end"))
+    for value, text in panel.x.ticks:
+        x = float(frame.across(value))
+        parts.append(Markup(f'<path class="grid" d="M{x:.1f} {TOP:g}V{bottom:g}"/>'))
+        parts.append(_text(text, x, bottom + 16, "middle"))
+    for value in panel.rules:
+        y = float(frame.down(value))
+        parts.append(Markup(f'<path class="rule" d="M{LEFT:g} {y:.1f}H{right:g}"/>'))
+    for value in panel.posts:
+        x = float(frame.across(value))
+        parts.append(Markup(f'<path class="post" d="M{x:.1f} {TOP:g}V{bottom:g}"/>'))
+    parts.append(_text(panel.x.label, (LEFT + right) / 2.0, HEIGHT - 6, "middle"))
+    middle = (TOP + bottom) / 2.0
+    parts.append(
+        Markup('<text class="label" text-anchor="middle" transform="translate(12 {:.1f}) '
+               'rotate(-90)">{}</text>').format(middle, panel.y.label)
+    )  # fmt: skip
+    return parts
+
+
+def _series(series: Series, frame: _Frame) -> list[Markup]:
+    """Draw one series in its style."""
+    x, y = frame.across(series.x), frame.down(series.y)
+    role = Markup('class="{} c-{}"').format
+    faint = Markup(f' style="opacity:{series.strength:.2f}"' if series.strength < 1.0 else "")
+    known = np.isfinite(x) & np.isfinite(y)
+    if series.style == "text":
+        return [_text(t, *at, "middle") for t, *at in zip(series.tips, x, y + 4, strict=True)]
+    if series.style == "marks":
+        above = known & (series.y > frame.panel.y.limits[1])
+        dots = "".join(f"M{a:.1f} {b:.1f}h0" for a, b in zip(*_rows(x, y, known & ~above)))
+        tops = "".join(f"M{a:.1f} {b + 1:.1f}l2.6 5h-5.2z" for a, b in zip(*_rows(x, y, above)))
+        if series.tips:
+            return [_point(series, i, x[i], y[i], 3.0) for i in np.flatnonzero(known)]
+        return [
+            Markup('<path {}{} d="{}"/>').format(role(kind, series.role), faint, Markup(d))
+            for kind, d in (("marks", dots), ("tops", tops))
+            if d
+        ]
+    parts = []
+    if series.low is not None and series.high is not None:
+        low, high = frame.down(series.low), frame.down(series.high)
+        parts.append(_band(series, x, low, high, role))
+    if series.style in ("line", "dots"):
+        kind = "line dashed" if series.dashed else "line"
+        d = Markup(_path(x, y))
+        parts.append(Markup('<path {}{} d="{}"/>').format(role(kind, series.role), faint, d))
+    if series.style != "line":
+        radius = 3.2 if series.style == "dots" else 4.2
+        parts += [_point(series, i, x[i], y[i], radius) for i in np.flatnonzero(known)]
+    return parts
+
+
+def _band(series: Series, x: np.ndarray, low: np.ndarray, high: np.ndarray, role: object) -> Markup:
+    """Draw the band of a line, or the bars of points."""
+    both = np.isfinite(low) & np.isfinite(high)
+    if series.style == "points":
+        kind = "bars"
+        d = "".join(f"M{a:.1f} {b:.1f}V{c:.1f}" for a, b, c in zip(x[both], low[both], high[both]))
+    else:
+        kind = "band"
+        edge = [*zip(x[both], high[both]), *zip(x[both][::-1], low[both][::-1])]
+        d = "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in edge) + "z" if edge else ""
+    return Markup('<path class="{} c-{}" d="{}"/>').format(kind, series.role, Markup(d))
+
+
+def _path(x: np.ndarray, y: np.ndarray) -> str:
+    """Write a line, broken where a point has no place."""
+    text, pen = [], "M"
+    for a, b in zip(x.tolist(), y.tolist(), strict=True):
+        if math.isfinite(a) and math.isfinite(b):
+            text.append(f"{pen}{a:.1f} {b:.1f}")
+            pen = "L"
+        else:
+            pen = "M"
+    return "".join(text)
+
+
+def _rows(x: np.ndarray, y: np.ndarray, rows: np.ndarray) -> tuple[list[float], list[float]]:
+    return x[rows].tolist(), y[rows].tolist()
+
+
+def _point(series: Series, i: int, x: float, y: float, radius: float) -> Markup:
+    """Draw one marker; a tip where there is something to say of it."""
+    filled = series.filled is None or bool(series.filled[i])
+    kind = f"dot c-{series.role}{'' if filled else ' hollow'}"
+    shape = f'cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}"'
+    name = "circle"
+    if series.style == "stars":
+        turn = np.pi * (np.arange(10) / 5.0 - 0.5)
+        reach = np.where(np.arange(10) % 2, 3.6, 9.0)
+        corners = zip(x + reach * np.cos(turn), y + reach * np.sin(turn), strict=True)
+        name, shape = "path", 'd="M' + "L".join(f"{a:.1f} {b:.1f}" for a, b in corners) + 'z"'
+    if series.tips:
+        return _tip(name, series.tips[i], shape, kind)
+    return Markup('<{} class="{}" {}/>').format(name, kind, Markup(shape))
+
+
+def _tip(name: str, text: str, shape: str, kind: str = "column") -> Markup:
+    """Draw an element that says something."""
+    return Markup('<{} class="tip {}" {}><title>{}</title></{}>').format(
+        name, kind, Markup(shape), text, name
+    )
+
+
+def _text(text: str, x: float, y: float, anchor: str) -> Markup:
+    return Markup('<text x="{:.1f}" y="{:.1f}" text-anchor="{}">{}</text>').format(
+        x, y, anchor, text
+    )
+
+
+def _columns(panel: Panel, frame: _Frame) -> list[tuple[str, float, float]]:
+    """Cut a panel into columns around the places where it is read out."""
+    said = readings(panel)
+    if not said:
+        return []
+    ticks = {text: value for value, text in panel.x.ticks}
+    unit = "°" if "[°]" in panel.x.label else (" s" if "[s]" in panel.x.label else "")
+    at = [float(frame.across(ticks.get(name, _value(name)))) for name, _ in said]
+    edges = [LEFT, *((a + b) / 2.0 for a, b in zip(at, at[1:], strict=False)), WIDTH - RIGHT]
+    texts = [
+        "\n".join([f"{name}{unit}", *(f"{series}: {number}" for series, number in rows)])
+        for name, rows in said
+    ]
+    return list(zip(texts, edges[:-1], edges[1:], strict=True))
+
+
+def _value(name: str) -> float:
+    return float(name)
+
+
+def _number(series: Series, i: int) -> str:
+    """Word a point, with what lies about it."""
+    value = series.y[i]
+    if series.low is None or series.high is None or not math.isfinite(series.low[i]):
+        return figure(value)
+    below, above = value - series.low[i], series.high[i] - value
+    if abs(below - above) <= 1e-9 * max(abs(below), abs(above), 1e-300):
+        return f"{figure(value)} ± {figure(above)}"
+    return f"{figure(value)} ({figure(series.low[i])} to {figure(series.high[i])})"
+
+
+def legend(panels: Sequence[Panel]) -> list[tuple[str, str, str]]:
+    """List what the panels' legend explains.
+
+    Parameters
+    ----------
+    panels : sequence of Panel
+
+    Returns
+    -------
+    list of name, role, and "line", "dashed", "dot", "hollow" or "star"
+        Empty where the names are many: there the caption tells.
+    """
+    found: dict[str, tuple[str, str, str]] = {}
+    for series in (s for panel in panels for s in panel.series):
+        if not series.listed or series.style in ("marks", "text"):
+            continue
+        kind = {"points": "dot", "stars": "star"}.get(series.style, "line")
+        if series.filled is not None and not series.filled.any():
+            kind = "hollow"
+        found[series.name] = (series.name, series.role, "dashed" if series.dashed else kind)
+    return list(found.values()) if len(found) <= 6 else []

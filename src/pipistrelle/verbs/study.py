@@ -1,0 +1,268 @@
+"""`pipistrelle study`: many worlds, and in each all that a plan varies."""
+
+import os
+import shlex
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from pipistrelle.config import InputError
+from pipistrelle.settings import Layer
+from pipistrelle.verbs.console import announced, say
+from pipistrelle.verbs.options import SettingFlags, Whole, layers
+
+if TYPE_CHECKING:
+    from pipistrelle.experiments.plan import Plan
+    from pipistrelle.experiments.study import Standing
+
+Show = Callable[["Standing"], None]
+EVERY = 10.0
+"""Least time between two lines of progress [s]."""
+SHARDS = 16
+SLURM = """\
+#!/bin/sh
+#SBATCH --job-name=pipistrelle-{name}
+#SBATCH --array=0-{last}
+#SBATCH --cpus-per-task={workers}
+# Each task does its share of the worlds. Sent again, it goes on with what is missing.
+exec {command} --workers {workers} --shard "$SLURM_ARRAY_TASK_ID/{shards}" -o {folder}
+"""
+
+
+def study(
+    plan: Annotated[
+        str, Parameter(metavar="PLAN", help="paper, or a FILE.toml such as the study's plan.toml.")
+    ] = "paper",
+    /,
+    *,
+    iterations: Annotated[
+        Whole | None, Parameter(metavar="N", help="Number of worlds. [default: the plan's]")
+    ] = None,
+    workers: Annotated[
+        Whole | None, Parameter(metavar="N", help="Processes. [default: one per core]")
+    ] = None,
+    shard: Annotated[
+        str | None,
+        Parameter(metavar="I/N", help="Do only the I-th of N shares, from 0 on. [default: all]"),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        Parameter(
+            name=("--output", "-o"),
+            metavar="DIR",
+            help="The study's folder; what is done in it is kept. [default: runs/NAME]",
+        ),
+    ] = None,
+    retry_failed: Annotated[
+        bool, Parameter(negative=(), help="Do worlds again that hold failed trials.")
+    ] = False,
+    scheduler: Annotated[
+        str | None,
+        Parameter(
+            metavar="ADDRESS",
+            help="Work on a Dask cluster: local, or that of a scheduler (tcp://HOST:PORT). "
+            "[default: none]",
+        ),
+    ] = None,
+    emit: Annotated[
+        Literal["slurm"] | None,
+        Parameter(help="Print a job script of shards (N of --shard, else 16) and do nothing else."),
+    ] = None,
+    quiet: Annotated[bool, Parameter(negative=(), help="Print the study's folder alone.")] = False,
+    settings: Annotated[SettingFlags | None, Parameter(name="*")] = None,
+) -> int:
+    """Try all cases of a plan in many worlds; continue where an earlier run stopped."""
+    from pipistrelle.experiments.plan import find_plan, read_plan
+
+    for flag, number in (("--iterations", iterations), ("--workers", workers)):
+        if number is not None and number < 1:
+            raise InputError(f"{flag}: found {number}, expected at least 1")
+    if workers is not None and scheduler not in (None, "local"):
+        raise InputError(f"--workers: the cluster at {scheduler} has its own; leave it out")
+    share, layer = _share(shard), layers(None, settings)
+    tried = read_plan(find_plan(plan), layer, iterations)
+    folder = output or Path("runs") / tried.name
+    if emit:
+        shards = share[1] if shard else min(SHARDS, tried.iterations)
+        command = _command(plan, tried, layer)
+        print(_slurm(tried.name, command, folder, shards, workers or 1), end="")
+        return 0
+    from pipistrelle.experiments.study import run_study
+
+    try:
+        with _progress(quiet) as show:
+            standing = run_study(
+                tried,
+                folder,
+                workers=workers or _cores(),
+                shard=share,
+                scheduler=scheduler,
+                retry_failed=retry_failed,
+                progress=show if scheduler else _compiled_first(show, quiet),
+            )
+    except KeyboardInterrupt:
+        say(f"{folder}: worlds that are done are kept; the same command goes on with the rest")
+        raise
+    return _close(standing, folder, quiet)
+
+
+def _close(standing: "Standing", folder: Path, quiet: bool) -> int:
+    """Say how the study ended, and where it is; return the exit status."""
+    ended, failed = sum(standing.ended.values()), sum(standing.failed.values())
+    if not quiet:
+        print(f"{standing.done} worlds, {ended} trials, {failed} failed")
+    if failed:
+        say(
+            f"pipistrelle: warning: {failed} of {ended} trials failed, the first with: "
+            f"{standing.first_error}; see the column error in {folder / 'trials'}; "
+            "--retry-failed does their worlds again"
+        )
+    print(folder)
+    return 1 if failed else 0
+
+
+def _share(text: str | None) -> tuple[int, int]:
+    """Read which share of the worlds to do."""
+    i, slash, n = (text or "0/1").partition("/")
+    if slash and i.isdecimal() and n.isdecimal() and int(i) < int(n):
+        return int(i), int(n)
+    raise InputError(f"--shard: found {text!r}, expected I/N with I from 0 to N - 1, as in 0/4")
+
+
+def _cores() -> int:
+    """Count the cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _command(word: str, plan: "Plan", layer: Layer) -> str:
+    """Return the command line of a plan and of the settings laid over it."""
+    place = word if word == "paper" else str(Path(word).absolute())
+    words = ["pipistrelle", "study", place, "--iterations", str(plan.iterations)]
+    for key, given in layer.items():
+        values = given.value if isinstance(given.value, (list, tuple)) else [given.value]
+        words += ["--" + ".".join(key).replace("_", "-"), *map(str, values)]
+    return shlex.join(words)
+
+
+def _slurm(name: str, command: str, folder: Path, shards: int, workers: int) -> str:
+    """Write a job script in which each task of an array does a share."""
+    return SLURM.format(
+        name=name,
+        last=shards - 1,
+        shards=shards,
+        workers=workers,
+        command=command,
+        folder=shlex.quote(str(folder.absolute())),
+    )
+
+
+def _compiled_first(show: Show, quiet: bool) -> Show:
+    """Compile kernels before the first world, so that not every worker has to."""
+    ready = False
+
+    def prepare(standing: "Standing") -> None:
+        nonlocal ready
+        if not ready and standing.done < standing.worlds:
+            from pipistrelle.experiments.trial import compile_kernels
+
+            with announced("Compiling kernels (once) ...", 1e9 if quiet else 3.0):
+                compile_kernels()
+        ready = True
+        show(standing)
+
+    return prepare
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator[Show]:
+    """Show how far the study is: bars on a terminal, elsewhere a line now and then."""
+    if quiet:
+        yield lambda _: None
+    elif sys.stderr.isatty():
+        with _bars() as show:
+            yield show
+    else:
+        yield _lines()
+
+
+def _lines() -> Show:
+    """Print a line first, last and every few seconds."""
+    pace, due = _pace(), 0.0
+
+    def show(standing: "Standing") -> None:
+        nonlocal due
+        left = pace(standing)
+        if perf_counter() >= due or standing.done == standing.worlds:
+            due = perf_counter() + EVERY
+            told = [
+                f"{name} {ended}/{standing.trials[name]}{_failures(standing.failed[name])}"
+                for name, ended in standing.ended.items()
+            ]
+            worlds = f"{standing.done}/{standing.worlds} worlds"
+            say(", ".join([worlds, *([left] if left else [])]) + "; trials: " + ", ".join(told))
+
+    return show
+
+
+@contextmanager
+def _bars() -> Iterator[Show]:
+    """Draw a bar for the worlds and one per strategy."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    columns = (
+        TextColumn("{task.description:<8}"),
+        BarColumn(),
+        TextColumn("{task.completed}/{task.total}{task.fields[words]}"),
+    )
+    pace, tasks = _pace(), {}
+    with Progress(*columns, console=Console(stderr=True)) as bars:
+
+        def draw(name: str, done: int, total: int, words: str) -> None:
+            if name not in tasks:
+                tasks[name] = bars.add_task(name, total=total, words="")
+            bars.update(tasks[name], completed=done, words=words)
+
+        def show(standing: "Standing") -> None:
+            left = pace(standing)
+            draw("worlds", standing.done, standing.worlds, f", {left}" if left else "")
+            for name, ended in standing.ended.items():
+                draw(name, ended, standing.trials[name], _failures(standing.failed[name]))
+
+        yield show
+
+
+def _failures(number: int) -> str:
+    """Word how many trials failed, if any did."""
+    return f" ({number} failed)" if number else ""
+
+
+def _pace() -> Callable[["Standing"], str]:
+    """Return what words the speed since the first call, and the time left."""
+    began: tuple[float, int] | None = None
+
+    def pace(standing: "Standing") -> str:
+        nonlocal began
+        ended, total = sum(standing.ended.values()), sum(standing.trials.values())
+        began = began or (perf_counter(), ended)
+        elapsed, since = perf_counter() - began[0], ended - began[1]
+        if not since or elapsed <= 0.0:
+            return ""
+        return f"{since / elapsed:.1f} trials/s, {_span((total - ended) * elapsed / since)} left"
+
+    return pace
+
+
+def _span(seconds: float) -> str:
+    """Word a length of time."""
+    minutes = round(seconds / 60.0)
+    if seconds < 100.0:
+        return f"{seconds:.0f} s"
+    return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min"
