@@ -99,7 +99,8 @@ def mission_frame(seed=7, frame=60, config=CONFIG):
 
 def arrival_lag(beam, lag, pulse):
     """Search the call's start near a lag by brute force."""
-    near = np.arange(max(lag - 2, 0), min(lag + 3, beam.size))
+    reach = max(pulse // 7, 1)
+    near = np.arange(max(lag - reach, 0), min(lag + reach + 1, beam.size))
     centre = near[np.abs(beam[near]).argmax()]
     part, best, lag = np.linspace(0.0, 1.0, 10001), -1.0, float(lag)
     for left in range(max(centre - 1, 0), min(centre, beam.size - 2) + 1):

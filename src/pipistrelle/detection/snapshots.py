@@ -24,6 +24,7 @@ from numba import njit
 
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config
+from pipistrelle.detection.onset import arrival_lag
 from pipistrelle.geometry import wrap
 
 SCAN_STEP = 0.05
@@ -306,65 +307,6 @@ def _scan_power(x, table, power):
 
 
 @njit(cache=True, error_model="numpy")
-def _steer(x, u):
-    """Output of the phase-shift beamformer steered to u."""
-    turn, phase = complex(math.cos(u), -math.sin(u)), 1.0 + 0.0j
-    total = 0.0 + 0.0j
-    for e in range(x.size):
-        total += x[e] * phase
-        phase *= turn
-    return total
-
-
-@njit(cache=True, error_model="numpy")
-def _best_fraction(z0, z1, pulse):
-    """Where between two lags the call starts most likely, and how well it fits there.
-
-    A call that starts the fraction q into block 0 weighs the blocks 1 - q, 1, ..., 1, q; its
-    likelihood grows with abs((1 - q) z0 + q z1)^2 / (pulse - 2 q + 2 q^2), whose stationary
-    points are the roots of a quadratic.
-    """
-    a = z0.real * z0.real + z0.imag * z0.imag
-    h = z0.real * z1.real + z0.imag * z1.imag
-    b = z1.real * z1.real + z1.imag * z1.imag
-    beta, gamma = 2.0 * (h - a), a + b - 2.0 * h
-    A, B, C = -2.0 * (beta + gamma), 2.0 * gamma * pulse - 4.0 * a, beta * pulse + 2.0 * a
-    best, fit = 0.0, a / pulse
-    if b / pulse > fit:
-        best, fit = 1.0, b / pulse
-    discriminant = B * B - 4.0 * A * C
-    if discriminant >= 0.0:
-        root = -0.5 * (B + math.copysign(math.sqrt(discriminant), B))
-        for k in range(2):
-            numerator, divisor = (root, A) if k == 0 else (C, root)
-            if divisor != 0.0 and 0.0 < numerator / divisor < 1.0:
-                q = numerator / divisor
-                score = (a + q * (beta + gamma * q)) / (pulse - 2.0 * q + 2.0 * q * q)
-                if score > fit:
-                    best, fit = q, score
-    return best, fit
-
-
-@njit(cache=True, error_model="numpy")
-def _arrival_lag(matched, b, f, p, u, pulse):
-    """Lag at which the call starts in the beam steered to u, near lag b, to a fraction."""
-    low, high = max(b - 2, 0), min(b + 2, matched.shape[0] - 1)
-    centre, largest = b, -1.0
-    for near in range(low, high + 1):
-        z = abs(_steer(matched[near, f, p], u))
-        if z > largest:
-            centre, largest = near, z
-    best, fit = float(centre), -1.0
-    for left in range(max(centre - 1, 0), min(centre, matched.shape[0] - 2) + 1):
-        q, score = _best_fraction(
-            _steer(matched[left, f, p], u), _steer(matched[left + 1, f, p], u), pulse
-        )
-        if score > fit:
-            best, fit = left + q, score
-    return best
-
-
-@njit(cache=True, error_model="numpy")
 def _grown(column):
     """Copy of a column with twice the room."""
     wide = np.empty(2 * column.size, dtype=column.dtype)
@@ -398,7 +340,7 @@ def _find_peaks(
                         face, tone, delay = _grown(face), _grown(tone), _grown(delay)
                         peak_u, peak_power = _grown(peak_u), _grown(peak_power)
                     face[count], tone[count], peak_u[count] = f, p, u
-                    delay[count] = start + interval * _arrival_lag(matched, b, f, p, u, pulse)
+                    delay[count] = start + interval * arrival_lag(matched, b, f, p, u, pulse)
                     peak_power[count] = (power[i] + 0.125 * slope * slope / bend) / elements
                     count += 1
     return count, face, tone, delay, peak_u, peak_power

@@ -51,7 +51,7 @@ def label_detections(
 
     Notes
     -----
-    Bradley & Abaid, Sec. III-C ("we assumed known data association").
+    Bradley & Abaid, Sec. III-B ("we assumed known data association").
     """
     order = np.argsort(-detections.power, kind="stable")
     return _label(

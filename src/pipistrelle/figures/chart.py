@@ -209,7 +209,7 @@ def log_axis(label: str, values: Iterable[float]) -> Axis:
 
 
 def csv_rows(chart: Chart, **constant: str) -> list[list[str]]:
-    """Lay the numbers of a chart out, one row per point, to full precision.
+    """Lay the numbers of a chart out, one row per point, to nine digits.
 
     Parameters
     ----------
@@ -228,7 +228,7 @@ def csv_rows(chart: Chart, **constant: str) -> list[list[str]]:
     >>> panel = Panel(title="EKF", x=axis, y=axis, series=(dot,))
     >>> chart = Chart(name="", title="", caption="", panels=(panel,), columns=("deg", "m"))
     >>> csv_rows(chart)[1]
-    ['EKF', 'fused', 'line', '33.0', '0.25', '', '']
+    ['EKF', 'fused', 'line', '33', '0.25', '', '']
     """
     x, y = chart.columns
     rows = [[*constant, "panel", "series", "kind", x, y, f"{y}_low", f"{y}_high"]]
@@ -241,7 +241,7 @@ def csv_rows(chart: Chart, **constant: str) -> list[list[str]]:
             high = nothing if series.high is None else series.high
             head = [*constant.values(), panel.title, series.name, series.style]
             for point in zip(series.x, series.y, low, high, strict=True):
-                rows.append([*head, *("" if math.isnan(v) else repr(float(v)) for v in point)])
+                rows.append([*head, *("" if math.isnan(v) else f"{v:.9g}" for v in point)])
     return rows
 
 

@@ -56,7 +56,7 @@ def panel_svg(panel: Panel) -> Markup:
              Markup("").join(parts))  # fmt: skip
 
 
-def readings(panel: Panel) -> list[tuple[str, list[tuple[str, str]]]]:
+def readings(panel: Panel) -> list[tuple[float, str, list[tuple[str, str]]]]:
     """Say what a panel shows at each place along it.
 
     Parameters
@@ -65,7 +65,7 @@ def readings(panel: Panel) -> list[tuple[str, list[tuple[str, str]]]]:
 
     Returns
     -------
-    list of the place's name and, per series, its name and its number
+    list of the place, its name and, per series, its name and its number
 
     Examples
     --------
@@ -73,7 +73,7 @@ def readings(panel: Panel) -> list[tuple[str, list[tuple[str, str]]]]:
     >>> one, tenth = np.ones(1), np.full(1, 0.1)
     >>> dot = Series(name="fused", role="fused", x=33 * one, y=one, low=one - tenth, high=one + tenth)
     >>> readings(Panel(title="", x=axis, y=axis, series=(dot,)))
-    [('33', [('fused', '1 ± 0.1')])]
+    [(33.0, '33', [('fused', '1 ± 0.1')])]
     """
     named = [s for s in panel.series if s.listed and s.style not in ("marks", "text") and len(s.x)]
     if not named or panel.equal:
@@ -92,7 +92,7 @@ def readings(panel: Panel) -> list[tuple[str, list[tuple[str, str]]]]:
             i = int(np.argmin(np.abs(series.x - place)))
             if abs(series.x[i] - place) <= 0.03 * span and math.isfinite(series.y[i]):
                 said.append((series.name, _number(series, i)))
-        found.append((name, said))
+        found.append((float(place), name, said))
     return found
 
 
@@ -282,19 +282,14 @@ def _columns(panel: Panel, frame: _Frame) -> list[tuple[str, float, float]]:
     said = readings(panel)
     if not said:
         return []
-    ticks = {text: value for value, text in panel.x.ticks}
     unit = "°" if "[°]" in panel.x.label else (" s" if "[s]" in panel.x.label else "")
-    at = [float(frame.across(ticks.get(name, _value(name)))) for name, _ in said]
+    at = [float(frame.across(place)) for place, _, _ in said]
     edges = [LEFT, *((a + b) / 2.0 for a, b in zip(at, at[1:], strict=False)), WIDTH - RIGHT]
     texts = [
         "\n".join([f"{name}{unit}", *(f"{series}: {number}" for series, number in rows)])
-        for name, rows in said
+        for _, name, rows in said
     ]
     return list(zip(texts, edges[:-1], edges[1:], strict=True))
-
-
-def _value(name: str) -> float:
-    return float(name)
 
 
 def _number(series: Series, i: int) -> str:
