@@ -91,8 +91,8 @@ def circular_mean(
 
     Examples
     --------
-    >>> round(circular_mean(np.array([np.pi - 0.1, -np.pi + 0.3])) - (-np.pi + 0.1), 12)
-    0.0
+    >>> round(circular_mean(np.array([np.pi - 0.1, -np.pi + 0.3])) + np.pi, 12)
+    0.1
     """
     weight = np.ones_like(angle) if weight is None else weight
     return float(wrap(np.arctan2(weight @ np.sin(angle), weight @ np.cos(angle))))

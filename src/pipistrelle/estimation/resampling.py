@@ -111,4 +111,5 @@ def stratified(
     points = (np.arange(weight.size) + uniform) / weight.size
     bounds = np.cumsum(weight)
     bounds /= bounds[-1]
-    return np.minimum(np.searchsorted(bounds, points, side="right"), weight.size - 1)
+    last = np.flatnonzero(weight)[-1]  # a point can round to 1
+    return np.minimum(np.searchsorted(bounds, points, side="right"), last)

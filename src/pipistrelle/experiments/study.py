@@ -310,8 +310,20 @@ def _client(address: str, workers: int) -> Iterator[Any]:
         with client:
             yield client
         return
-    with (
-        LocalCluster(workers, threads_per_worker=1, dashboard_address=None) as cluster,
-        Client(cluster) as client,
-    ):
+    with _started_deaf():
+        cluster = LocalCluster(workers, threads_per_worker=1, dashboard_address=None)
+    with cluster, Client(cluster) as client:
         yield client
+
+
+@contextmanager
+def _started_deaf() -> Iterator[None]:
+    """Start processes that leave Ctrl-C to this one."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -29,8 +29,12 @@ def answer(study: Study, claims: Sequence[Claim]) -> list[str]:
     """
     placed = {name: _findings(study, COMMON, name) for name in FILTER_NAMES}
     located = {name: _findings(study, "position_rmse_m", name) for name in FILTER_NAMES}
-    sentences = [_counted(study), _compared("Landmarks that every strategy places are", placed),
-                 _compared("The vehicle is", located), _tally(claims)]  # fmt: skip
+    sentences = (
+        _counted(study),
+        _compared("The landmarks that every strategy places are placed", placed),
+        _compared("The vehicle is located", located),
+        _tally(claims),
+    )
     return [_headline(study, placed), *(sentence for sentence in sentences if sentence)]
 
 
@@ -49,7 +53,7 @@ def _headline(study: Study, placed: dict[str, list[Finding]]) -> str:
     worse = sum(finding.holds is False for finding in decided)
     fuller = "a fuller map" if _fuller(study) else "not a fuller map"
     if better and not worse:
-        narrow = all(_leading(mine) for mine in placed.values())
+        narrow = all(_narrow(mine) for mine in placed.values())
         where = "where the beam is narrow" if narrow else "at some beamwidths"
         where = "at every beamwidth" if better == len(decided) else where
         return f"Yes: {fuller}, and a more accurate one {where}."
@@ -60,10 +64,9 @@ def _headline(study: Study, placed: dict[str, list[Finding]]) -> str:
     return f"It builds {fuller}; that it is more accurate, or less, is not seen."
 
 
-def _leading(findings: Sequence[Finding]) -> bool:
-    """Tell whether what is better, if anything, is so from the narrowest beam on."""
-    better = [finding.holds is True for finding in findings]
-    return better == sorted(better, reverse=True)
+def _narrow(findings: Sequence[Finding]) -> bool:
+    """Tell whether what is better, if anything, is so in the narrower half of the beams alone."""
+    return all(finding.holds is not True for finding in findings[len(findings) // 2 :])
 
 
 def _fuller(study: Study) -> bool:
@@ -91,15 +94,14 @@ def _counted(study: Study) -> str:
                 said.append(f"{np.mean(fused):.0f} instead of {np.mean(active):.0f} at {beam}")
         if said:
             return (
-                f"With {label}, hearing the beacon as well as its own calls, the vehicle places "
-                f"{' and '.join(said)} of its landmarks."
+                "Hearing the beacon as well as its own calls, the vehicle fully places, of "
+                f"{study.config.scenario.landmarks + 1} landmarks, {' and '.join(said)} ({label})."
             )
     return ""
 
 
 def _compared(subject: str, found: dict[str, list[Finding]]) -> str:
     """Say where fused is better than active, and where worse, with each filter."""
-    verb = {"Landmarks that every strategy places are": "placed", "The vehicle is": "located"}
     said = []
     for name, findings in found.items():
         if not findings:
@@ -109,9 +111,9 @@ def _compared(subject: str, found: dict[str, list[Finding]]) -> str:
             for word, outcome in (("better", True), ("worse", False))
             if any(finding.holds is outcome for finding in findings)
         ]
-        words = " and ".join(parts) or "neither better nor worse at any beamwidth"
-        said.append(f"{words} with {FILTER_NAMES[name]}")
-    return f"{subject} {verb[subject]} {'; '.join(said)}." if said else ""
+        words = " and ".join(parts) or "no better and no worse at any beamwidth"
+        said.append(f"with {FILTER_NAMES[name]} {words}")
+    return f"{subject} {'; '.join(said)}." if said else ""
 
 
 def _beams(findings: Sequence[Finding], outcome: bool) -> str:
@@ -125,9 +127,10 @@ def _beams(findings: Sequence[Finding], outcome: bool) -> str:
             else:
                 runs.append([names[i]])
     count = sum(map(len, runs))
+    if count == len(findings):
+        return "every beamwidth"
     which = ", ".join(run[0] if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs)
-    every = "every beamwidth" if count == len(findings) else f"{count} of {len(findings)} beamwidths"
-    return f"{every} ({which})"
+    return f"{count} of {len(findings)} beamwidths ({which})"
 
 
 def _tally(claims: Sequence[Claim]) -> str:

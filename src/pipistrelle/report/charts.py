@@ -360,7 +360,9 @@ def example_map(study: Study) -> Chart:
     places, (x, y) = world.landmarks, world.beacon
     circle = np.linspace(0.0, 2.0 * np.pi, 181)
     radius = config.scenario.radius
-    reach = 1.04 * max(radius, float(np.abs(world.path[:, :2]).max()), config.scenario.beacon_distance)
+    reach = 1.04 * max(
+        radius, float(np.abs(world.path[:, :2]).max()), config.scenario.beacon_distance
+    )
     told = tuple(f"landmark {i}: {x:.1f} m, {y:.1f} m" for i, (x, y) in enumerate(places, start=1))
     start = f"start: {world.path[0, 0]:.1f} m, {world.path[0, 1]:.1f} m"
     series = (

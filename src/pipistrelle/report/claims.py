@@ -28,6 +28,12 @@ SENTENCES = (
     "Passive sees more landmarks than active at every beamwidth, by more than σ below 65°.",
 )
 """The claims of Bradley & Abaid, Sec. V, in its order."""
+WITHOUT: dict[Rule, str] = {
+    "world": "without diverged worlds",
+    "case": "without diverged cases",
+    "none": "with everything",
+}
+"""The exclusion rules, for use in a sentence."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -237,7 +243,10 @@ def _reason(by_rule: dict[Rule, Judgement], agreed: bool) -> str:
     if all(not part.findings for part in headline.parts):
         return "The study has no cases for this claim."
     if not agreed:
-        words = ", ".join(f"{_spoken(j.verdict)} ({rule})" for rule, j in by_rule.items())
+        words = ", ".join(
+            f"{judgement.verdict.replace('-', ' ')} {WITHOUT[rule]}"
+            for rule, judgement in by_rule.items()
+        )
         return f"The verdict depends on what is left out: {words}."
     missing = [part for part in headline.parts if not part.findings]
     if missing and headline.verdict == "open":
@@ -247,10 +256,6 @@ def _reason(by_rule: dict[Rule, Judgement], agreed: bool) -> str:
         "not-reproduced": "The opposite of a part is significant, whatever is left out.",
         "open": "Not every part holds, and the opposite of none is significant.",
     }[headline.verdict]
-
-
-def _spoken(verdict: str) -> str:
-    return verdict.replace("-", " ")
 
 
 def _statistic(judgement: Judgement) -> dict[str, Any]:

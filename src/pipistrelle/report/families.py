@@ -195,9 +195,7 @@ def maps(study: Study, rule: Rule) -> list[Part]:
     for name, label in FILTER_NAMES.items():
         pair = (name, "active"), (name, "fused")
         never += differences(study, rule, COMMON, *pair, name=label, relation="not above")
-        within += differences(
-            study, rule, COMMON, *pair, name=label, relation="within", sigma=True
-        )
+        within += differences(study, rule, COMMON, *pair, name=label, relation="within", sigma=True)
     return [
         Part(
             sentence="Map RMSE: active minus fused is not significantly above 0",

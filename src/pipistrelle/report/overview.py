@@ -39,7 +39,9 @@ def exclusions(study: Study) -> list[dict[str, Any]]:
                 "excluded": int(np.sum(lost(study, name))),
                 "paper": EXCLUDED[name],
                 "paper_worlds": 115,
-                "diverged": {way[1]: int(np.sum(o.diverged & ~o.failed)) for way, o in mine.items()},
+                "diverged": {
+                    way[1]: int(np.sum(o.diverged & ~o.failed)) for way, o in mine.items()
+                },
                 "trials": {way[1]: int(o.failed.size) for way, o in mine.items()},
                 "failed": int(sum(np.sum(o.failed) for o in mine.values())),
             }
@@ -147,8 +149,6 @@ def by_strategy(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         | {key: float(np.mean([row[key] for row in mine])) for key in keys}
         for (name, strategy), mine in groups.items()
     ]
-
-
 
 
 def _std(sample: Any) -> float:

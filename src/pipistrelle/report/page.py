@@ -18,11 +18,11 @@ from markupsafe import Markup
 from pipistrelle import __version__
 from pipistrelle.evaluation.comparison import Finding
 from pipistrelle.experiments.folder import write_file
-from pipistrelle.figures.chart import Chart, csv_rows, csv_text
+from pipistrelle.figures.chart import Chart, Panel, csv_rows, csv_text
 from pipistrelle.figures.style import FILTER_NAMES, STRATEGY_COLOURS
 from pipistrelle.report import charts, overview
 from pipistrelle.report.answer import answer
-from pipistrelle.report.claims import Claim, judge_claims, record, tally
+from pipistrelle.report.claims import WITHOUT, Claim, judge_claims, record, tally
 from pipistrelle.report.tables import RULES, Rule, Study
 from pipistrelle.report.vector import figure, legend, panel_svg, readings
 from pipistrelle.settings import to_toml
@@ -120,6 +120,7 @@ def page(
         colours=STRATEGY_COLOURS,
         filters=FILTER_NAMES,
         rules=RULES,
+        without=WITHOUT,
         spoken=SPOKEN,
         units=UNITS,
         tally=tally,
@@ -134,13 +135,17 @@ def _figure(name: str, found: dict[Rule, list[Chart]]) -> dict[str, Any]:
     for rule, mine in found.items():
         for chart in mine:
             if chart.name == name:
-                panels = [
-                    {"panel": panel, "svg": panel_svg(panel), "readings": readings(panel)}
-                    for panel in chart.panels
-                ]
+                panels = [_panel(panel) for panel in chart.panels]
                 by_rule[rule] = {"chart": chart, "panels": panels, "legend": legend(chart.panels)}
     first = next(iter(by_rule.values()))["chart"]
     return {"name": name, "title": first.title, "by_rule": by_rule, "count": len(first.panels)}
+
+
+def _panel(panel: Panel) -> dict[str, Any]:
+    """Gather a panel: its drawing, its numbers and their names."""
+    said = readings(panel)
+    names = list(dict.fromkeys(name for _, _, numbers in said for name, _ in numbers))
+    return {"panel": panel, "svg": panel_svg(panel), "readings": said, "names": names}
 
 
 def _write_figure(chart: Chart, folder: Path) -> None:
@@ -151,9 +156,7 @@ def _write_figure(chart: Chart, folder: Path) -> None:
     save_figure(draw_chart(chart), folder, chart.name)
 
 
-def _numbers(
-    study: Study, found: dict[Rule, list[Chart]], models: list[Chart]
-) -> dict[str, str]:
+def _numbers(study: Study, found: dict[Rule, list[Chart]], models: list[Chart]) -> dict[str, str]:
     """Write the numbers behind each figure, under all exclusion rules."""
     texts = {chart.name: csv_text(csv_rows(chart)) for chart in models}
     for chart in found["world"]:
@@ -224,9 +227,11 @@ def _versions() -> dict[str, str]:
     return found
 
 
-def _p(p: float) -> str:
-    """Write a p value."""
-    return "< 0.0001" if p < 1e-4 else f"{p:.2g}" if p < 0.1 else f"{p:.2f}"
+def _p(p: float, sentence: bool = False) -> str:
+    """Write a p value, in a sentence with its sign."""
+    if p < 1e-4:
+        return "< 0.0001"
+    return ("= " if sentence else "") + (f"{p:.2g}" if p < 0.1 else f"{p:.2f}")
 
 
 def _shown(finding: Finding, unit: str) -> dict[str, str]:

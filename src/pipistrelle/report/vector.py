@@ -13,9 +13,9 @@ from markupsafe import Markup
 
 from pipistrelle.figures.chart import Axis, Panel, Series
 
-WIDTH, HEIGHT = 460.0, 300.0
+WIDTH, HEIGHT = 400.0, 280.0
 """Of a panel, in its own units, which are pixels on a small screen."""
-LEFT, RIGHT, TOP, BOTTOM = 48.0, 10.0, 10.0, 42.0
+LEFT, RIGHT, TOP, BOTTOM = 46.0, 8.0, 10.0, 42.0
 """Margins."""
 READINGS = 80
 """Most places along a panel where its numbers are read out."""
