@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipistrelle.config import RayConfig
-from pipistrelle.estimation.models import Motion
+from pipistrelle.estimation.models import Gaussian, Motion
 from reference.missions import (
     CIRCLE,
     START,
@@ -163,15 +163,17 @@ def test_short_runs_equal_the_slow_reference_with_any_ray(
     assert_equal_to_reference(slam, mission)
 
 
-def test_unicycle_that_stops_turns_and_reverses_equals_the_slow_reference():
+def test_unicycle_that_stops_reverses_and_turns_past_pi_equals_the_slow_reference():
     rng = np.random.default_rng(8)
     motion = Motion(model="unicycle", control_std=(0.1, 0.15), noise_at_rest=False)
     controls = rng.uniform([-0.5, -1], [1, 1], size=(30, 4, 2))
     controls[rng.random(controls.shape[:2]) < 0.3] = 0
     controls[rng.random(controls.shape[0]) < 0.3] = 0
+    controls[0] = 0
+    start = Gaussian(mean=np.array([0, 0, np.pi - 0.01]), covariance=START.covariance)
     field = scattered(rng, 10, radius=10.0)
-    mission = draw_mission(rng, motion, START, field, controls, beamwidth=2.0, hearing=10.0)
-    assert_equal_to_reference(swarm_filter(5, motion=motion), mission)
+    mission = draw_mission(rng, motion, start, field, controls, beamwidth=2.0, hearing=10.0)
+    assert_equal_to_reference(swarm_filter(5, motion=motion), mission, start)
 
 
 def test_one_control_step_per_measurement_equals_the_slow_reference():

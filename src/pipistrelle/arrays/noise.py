@@ -52,7 +52,9 @@ def stream_key(seed: int, iteration: int, purpose: str, frame: int = 0) -> int:
     return int(state[0])
 
 
-def complex_noise(shape: tuple[int, ...], std: float, key: int) -> Complex[np.ndarray, "..."]:
+def complex_noise(
+    shape: tuple[int, ...], std: float, key: int, out: Complex[np.ndarray, "..."] | None = None
+) -> Complex[np.ndarray, "..."]:
     """Circular complex normal noise.
 
     Parameters
@@ -63,6 +65,8 @@ def complex_noise(shape: tuple[int, ...], std: float, key: int) -> Complex[np.nd
         Root of the mean of abs(noise)**2.
     key : int
         From `stream_key`.
+    out : (*shape) complex, contiguous, optional
+        Written and returned instead of a new array.
 
     Returns
     -------
@@ -74,7 +78,7 @@ def complex_noise(shape: tuple[int, ...], std: float, key: int) -> Complex[np.nd
     >>> bool(abs(np.mean(abs(noise) ** 2) - 4.0) < 5 * 4.0 / np.sqrt(noise.size))
     True
     """
-    noise = np.empty(shape, dtype=np.complex128)
+    noise = np.empty(shape, dtype=np.complex128) if out is None else out
     _fill(noise.reshape(-1).view(np.float64), _F(std * std), np.uint64(key))
     return noise
 

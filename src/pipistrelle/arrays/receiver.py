@@ -127,8 +127,17 @@ def blocks_to_hear(arrivals: Arrivals, sampling: Sampling) -> int:
     return max(math.ceil(last) + 1 - sampling.pulse, 2 * sampling.pulse)
 
 
+def block_shape(blocks: int, layout: Layout) -> tuple[int, int, int, int]:
+    """Shape of a recording in block sums: (blocks, faces, tones, elements)."""
+    return (blocks, layout.normal.size, 2, layout.position.size)
+
+
 def noise_blocks(
-    blocks: int, layout: Layout, sampling: Sampling, key: int
+    blocks: int,
+    layout: Layout,
+    sampling: Sampling,
+    key: int,
+    out: Complex[np.ndarray, "b f 2 e"] | None = None,
 ) -> Complex[np.ndarray, "b f 2 e"]:
     """Block sums of the microphones' noise.
 
@@ -139,14 +148,16 @@ def noise_blocks(
     sampling : Sampling
     key : int
         Of the random stream; a block's noise does not depend on how many are drawn.
+    out : (blocks, faces, tones, elements) complex, optional
+        Written and returned instead of a new array.
 
     Returns
     -------
     (blocks, faces, tones, elements) complex
         Independent, of variance 40 sigma^2.
     """
-    shape = (blocks, layout.normal.size, 2, layout.position.size)
-    return complex_noise(shape, math.sqrt(sampling.block) * sampling.noise_std, key)
+    std = math.sqrt(sampling.block) * sampling.noise_std
+    return complex_noise(block_shape(blocks, layout), std, key, out)
 
 
 def add_echo_blocks(

@@ -129,7 +129,12 @@ def detector(config: Config, layout: Layout) -> Detector:
 
 
 def filter_blocks(
-    blocks: Complex[np.ndarray, "b f 2 e"], *, pulse: int, block: int, noise_std: float
+    blocks: Complex[np.ndarray, "b f 2 e"],
+    *,
+    pulse: int,
+    block: int,
+    noise_std: float,
+    out: Complex[np.ndarray, "l f 2 e"] | None = None,
 ) -> Complex[np.ndarray, "l f 2 e"]:
     """Matched filter on block sums: a boxcar as long as the call.
 
@@ -142,16 +147,25 @@ def filter_blocks(
         Samples per block.
     noise_std : float
         Of one complex sample.
+    out : (blocks - pulse + 1, faces, tones, elements) complex, optional
+        Written and returned instead of a new array.
 
     Returns
     -------
     (lags, faces, tones, elements) complex
         Lag i is a call that starts with block i; noise has unit variance.
     """
-    rows = blocks.reshape(blocks.shape[0], -1).view(np.float64)
+    lags = max(blocks.shape[0] - pulse + 1, 0)
+    matched = np.empty((lags, *blocks.shape[1:]), dtype=np.complex128) if out is None else out
     scale = 1.0 / (noise_std * math.sqrt(pulse * block))
-    matched = _boxcar(rows, pulse, scale)
-    return matched.view(np.complex128).reshape(-1, *blocks.shape[1:])
+    columns = 2 * math.prod(blocks.shape[1:])
+    _boxcar(
+        blocks.reshape(-1).view(np.float64).reshape(-1, columns),
+        pulse,
+        scale,
+        matched.reshape(-1).view(np.float64).reshape(-1, columns),
+    )
+    return matched
 
 
 def filter_samples(
@@ -241,10 +255,9 @@ def detect(
 
 
 @njit(cache=True, error_model="numpy")
-def _boxcar(rows, width, scale):
-    """Running sums of width rows, scaled."""
-    lags, columns = rows.shape[0] - width + 1, rows.shape[1]
-    sums = np.empty((max(lags, 0), columns))
+def _boxcar(rows, width, scale, sums):
+    """Write the running sums of width rows, scaled."""
+    columns = rows.shape[1]
     total = np.zeros(columns)
     for b in range(rows.shape[0]):
         row = rows[b]
@@ -255,7 +268,6 @@ def _boxcar(rows, width, scale):
             for i in range(columns):
                 done[i] = total[i]
                 total[i] -= scale * old[i]
-    return sums
 
 
 @njit(cache=True, error_model="numpy")

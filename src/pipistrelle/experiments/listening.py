@@ -4,9 +4,12 @@ The noise and the beacon's sound are those of the world and shared by all beamwi
 and keyed by the frame alone.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Complex
 
 from pipistrelle.acoustics.arrivals import (
     ACTIVE,
@@ -21,6 +24,7 @@ from pipistrelle.arrays.receiver import (
     BLOCK,
     Sampling,
     add_echo_blocks,
+    block_shape,
     blocks_to_hear,
     noise_blocks,
     record_samples,
@@ -86,25 +90,65 @@ def listen(
     >>> len(wide), wide[1].time
     (2, 1.0)
     """
-    layout, settled = square_of_four(config.receiver), sampling(config)
-    finder = detector(config, layout)
+    station, setup = _station(config), config.scenario
     engine = _dense if config.receiver.engine == "dense" else _blocks
     beams: tuple[list[Heard], ...] = tuple([] for _ in radii)
-    setup = config.scenario
     frames = range(setup.steps_per_frame, len(scenario.path), setup.steps_per_frame)
     for number, k in enumerate(frames, start=1):
         emission = _emission(scenario, k, config)
         key = stream_key(config.seed, iteration, "noise", number)
-        recorded = engine(emission, radii, layout, settled, finder, config, key)
+        recorded = engine(emission, radii, station, key)
         for beam, (arrivals, detections) in zip(beams, recorded, strict=True):
-            beam.append(
-                _heard(
-                    float(scenario.time[k]), detections, arrivals, layout, settled, finder, config
-                )
-            )
+            beam.append(_heard(float(scenario.time[k]), detections, arrivals, station))
         if progress:
             progress("listening", number, len(frames))
     return tuple(tuple(beam) for beam in beams)
+
+
+class Workspace:
+    """Arrays that every frame uses anew: fresh memory costs more than the arithmetic on it."""
+
+    def __init__(self) -> None:
+        self._flat: dict[str, np.ndarray] = {}
+
+    def array(self, name: str, shape: tuple[int, ...]) -> Complex[np.ndarray, "..."]:
+        """Return the array of a name, in a shape; what it held is anybody's guess."""
+        size = math.prod(shape)
+        if name not in self._flat or self._flat[name].size < size:
+            self._flat[name] = np.empty(size + size // 4, dtype=np.complex128)
+        return self._flat[name][:size].reshape(shape)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Station:
+    """What every frame of a path is heard with."""
+
+    config: Config
+    layout: Layout
+    sampling: Sampling
+    detector: Detector
+    faintest_db: float
+    workspace: Workspace
+
+
+def _station(config: Config) -> _Station:
+    """Settle what every frame of a path is heard with."""
+    layout, settled = square_of_four(config.receiver), sampling(config)
+    finder = detector(config, layout)
+    return _Station(
+        config=config,
+        layout=layout,
+        sampling=settled,
+        detector=finder,
+        faintest_db=faintest_level_db(
+            finder.threshold,
+            elements=layout.position.size,
+            samples=settled.pulse * settled.block,
+            noise_std=settled.noise_std,
+            margin_db=config.association.margin_db,
+        ),
+        workspace=Workspace(),
+    )
 
 
 def _emission(scenario: Scenario, k: int, config: Config) -> Arrivals:
@@ -115,30 +159,16 @@ def _emission(scenario: Scenario, k: int, config: Config) -> Arrivals:
     )
 
 
-def _heard(
-    time: float,
-    detections: Detections,
-    arrivals: Arrivals,
-    layout: Layout,
-    settled: Sampling,
-    finder: Detector,
-    config: Config,
-) -> Heard:
+def _heard(time: float, detections: Detections, arrivals: Arrivals, station: _Station) -> Heard:
     """Label a frame's detections by the truth and average them over the faces."""
-    faintest_db = faintest_level_db(
-        finder.threshold,
-        elements=layout.position.size,
-        samples=settled.pulse * settled.block,
-        noise_std=settled.noise_std,
-        margin_db=config.association.margin_db,
-    )
+    config = station.config
     label = label_detections(
         detections,
         arrivals,
-        layout,
+        station.layout,
         config.association,
         pulse=config.emitter.pulse,
-        faintest_db=faintest_db,
+        faintest_db=station.faintest_db,
     )
     return average_faces(
         time,
@@ -150,48 +180,47 @@ def _heard(
 
 
 def _blocks(
-    emission: Arrivals,
-    radii: Sequence[float],
-    layout: Layout,
-    settled: Sampling,
-    finder: Detector,
-    config: Config,
-    key: int,
+    emission: Arrivals, radii: Sequence[float], station: _Station, key: int
 ) -> Iterator[tuple[Arrivals, Detections]]:
     """Yield, per beam, the true arrivals and what is detected of them from block sums."""
-    own = emission.source == ACTIVE
-    shared = noise_blocks(blocks_to_hear(emission, settled), layout, settled, key)
+    layout, settled, space = station.layout, station.sampling, station.workspace
+    pulse, own = settled.pulse, emission.source == ACTIVE
+    shape = block_shape(blocks_to_hear(emission, settled), layout)
+    shared = noise_blocks(shape[0], layout, settled, key, out=space.array("shared", shape))
     add_echo_blocks(shared, rows_of(emission, ~own), layout, settled)
+    lags = (shape[0] - pulse + 1, *shape[1:])
     for radius in radii:
-        arrivals = _aimed(emission, radius, config)
-        signal = shared.copy()
+        arrivals = _aimed(emission, radius, station.config)
+        signal = space.array("signal", shape)
+        np.copyto(signal, shared)
         add_echo_blocks(signal, rows_of(arrivals, own), layout, settled)
         matched = filter_blocks(
-            signal, pulse=settled.pulse, block=settled.block, noise_std=settled.noise_std
+            signal,
+            pulse=pulse,
+            block=settled.block,
+            noise_std=settled.noise_std,
+            out=space.array("matched", lags),
         )
-        yield (
-            arrivals,
-            detect(
-                matched, finder, start=settled.pulse * BLOCK, interval=BLOCK, pulse=settled.pulse
-            ),
+        detections = detect(
+            matched, station.detector, start=pulse * BLOCK, interval=BLOCK, pulse=pulse
         )
+        yield arrivals, detections
 
 
 def _dense(
-    emission: Arrivals,
-    radii: Sequence[float],
-    layout: Layout,
-    settled: Sampling,
-    finder: Detector,
-    config: Config,
-    key: int,
+    emission: Arrivals, radii: Sequence[float], station: _Station, key: int
 ) -> Iterator[tuple[Arrivals, Detections]]:
     """Yield the same from every sample."""
+    settled = station.sampling
     length = settled.pulse * settled.block
     for radius in radii:
-        arrivals = _aimed(emission, radius, config)
+        arrivals = _aimed(emission, radius, station.config)
         samples = record_samples(
-            blocks_to_hear(emission, settled), arrivals, layout, settled, np.random.default_rng(key)
+            blocks_to_hear(emission, settled),
+            arrivals,
+            station.layout,
+            settled,
+            np.random.default_rng(key),
         )
         matched = filter_samples(
             samples,
@@ -201,7 +230,8 @@ def _dense(
             noise_std=settled.noise_std,
         )
         start, interval = settled.pulse * BLOCK, 1.0 / settled.rate
-        yield arrivals, detect(matched, finder, start=start, interval=interval, pulse=length)
+        detections = detect(matched, station.detector, start=start, interval=interval, pulse=length)
+        yield arrivals, detections
 
 
 def _aimed(emission: Arrivals, radius: float, config: Config) -> Arrivals:

@@ -208,6 +208,31 @@ def log_axis(label: str, values: Iterable[float]) -> Axis:
     return Axis(label=label, limits=limits, log=True, ticks=ticks(*limits, log=True))
 
 
+def ends(found: Iterable[Series]) -> list[float]:
+    """Numbers that an axis has to hold to show some series.
+
+    Parameters
+    ----------
+    found : iterable of Series
+
+    Returns
+    -------
+    list of float
+
+    Examples
+    --------
+    >>> ends([Series(name="", role="ink", x=np.zeros(1), y=np.ones(1), high=np.full(1, 2.0))])
+    [1.0, 2.0]
+    """
+    return [
+        float(value)
+        for series in found
+        for part in (series.y, series.low, series.high)
+        if part is not None
+        for value in part
+    ]
+
+
 def csv_rows(chart: Chart, **constant: str) -> list[list[str]]:
     """Lay the numbers of a chart out, one row per point, to nine digits.
 
@@ -246,7 +271,7 @@ def csv_rows(chart: Chart, **constant: str) -> list[list[str]]:
 
 
 def csv_text(rows: Sequence[Sequence[str]]) -> str:
-    """Write rows as CSV.
+    r"""Write rows as CSV.
 
     Parameters
     ----------
@@ -260,7 +285,7 @@ def csv_text(rows: Sequence[Sequence[str]]) -> str:
     Examples
     --------
     >>> csv_text([["a", "b"], ["1,5", "2"]])
-    'a,b\\n"1,5",2\\n'
+    'a,b\n"1,5",2\n'
     """
     import csv
     import io

@@ -59,9 +59,9 @@ def draw_chart(chart: Chart) -> "Figure":
         height = WIDTH[columns] / columns * (high - low) / (right - left)
     size = (WIDTH[columns], rows * height + REST)
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=size, layout="constrained")
+        figure = Figure(figsize=size)
+        figure.set_layout_engine("constrained", w_pad=0.1, h_pad=0.06)
         figure.suptitle(chart.title, x=0.01, ha="left", fontsize=12, weight="bold")
-        figure.get_layout_engine().set(w_pad=0.1, h_pad=0.06)
         for i, panel in enumerate(chart.panels):
             axes = figure.add_subplot(rows, columns, i + 1)
             _draw_panel(axes, panel)
@@ -120,7 +120,7 @@ def _draw_series(axes: "Axes", series: Series, top: float, order: float) -> None
         inside = y <= top
         given |= {"lw": 0, "mec": "none"}
         axes.plot(x[inside], y[inside], "o", ms=2.4, **given)
-        axes.plot(x[~inside], np.full(np.sum(~inside), 0.985 * top), "^", ms=3.4, **given)
+        axes.plot(x[~inside], np.full(x[~inside].shape, 0.985 * top), "^", ms=3.4, **given)
         return
     if series.style == "stars":
         axes.plot(x, y, "*", ms=13, color=colour, mec="white", mew=0.8, zorder=order)

@@ -1,4 +1,4 @@
-"""The answer in plain words: what listening to the beacon does to map and vehicle, and how surely."""
+"""The answer in plain words: what listening to the beacon does to the map, and how surely."""
 
 from collections.abc import Sequence
 
@@ -8,8 +8,8 @@ from pipistrelle.evaluation.comparison import Finding, judge
 from pipistrelle.figures.style import FILTER_NAMES
 from pipistrelle.report.claims import Claim
 from pipistrelle.report.contrasts import differences
+from pipistrelle.report.outcomes import COMMON, Study, samples
 from pipistrelle.report.published import beam_name
-from pipistrelle.report.tables import COMMON, Study, samples
 
 NUMBERS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight")
 
@@ -136,10 +136,9 @@ def _beams(findings: Sequence[Finding], outcome: bool) -> str:
 def _tally(claims: Sequence[Claim]) -> str:
     """Count the verdicts."""
     verdicts = [claim.verdict for claim in claims]
-    words = [
-        f"{NUMBERS[verdicts.count(verdict)]} {'is' if verdicts.count(verdict) == 1 else 'are'} {said}"
-        for verdict, said in (
-            ("reproduced", "reproduced"), ("not-reproduced", "not reproduced"), ("open", "open"),
-        )
-    ]  # fmt: skip
+    words = []
+    for verdict in ("reproduced", "not-reproduced", "open"):
+        count = verdicts.count(verdict)
+        verb = "is" if count == 1 else "are"
+        words.append(f"{NUMBERS[count]} {verb} {verdict.replace('-', ' ')}")
     return f"Of the paper's eight claims, {words[0]}, {words[1]} and {words[2]}."

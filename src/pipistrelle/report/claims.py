@@ -1,7 +1,7 @@
 """The paper's eight claims, each with a verdict by one rule.
 
 *Reproduced*: every part of the claim holds. *Not reproduced*: of some part, the opposite is
-significant. *Open*: neither, or the verdict changes with what is left out (`tables.RULES`). Of a
+significant. *Open*: neither, or the verdict changes with what is left out (`outcomes.RULES`). Of a
 part that must hold everywhere, one statement whose opposite is significant is enough; of a part
 that must hold at most beamwidths, it takes more than half.
 """
@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from pipistrelle.evaluation.comparison import Finding, judge
 from pipistrelle.report.families import FAMILIES, Part
-from pipistrelle.report.tables import RULES, Rule, Study
+from pipistrelle.report.outcomes import RULES, Rule, Study
 
 Verdict = Literal["reproduced", "not-reproduced", "open"]
 SENTENCES = (
@@ -86,7 +86,7 @@ class Claim:
     reason : str
         In a sentence.
     by_rule : dict of Judgement
-        By the names of `tables.RULES`.
+        By the names of `outcomes.RULES`.
     """
 
     number: int

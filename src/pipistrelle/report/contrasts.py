@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.evaluation.comparison import Relation, Statement, pooled_std, pseudovalues
+from pipistrelle.report.outcomes import Rule, Study, kept, samples
 from pipistrelle.report.published import beam_name
-from pipistrelle.report.tables import Rule, Study, kept, samples
 
 STATES = 3.0
 """Expected NEES of a consistent filter of the pose (Bradley & Abaid, Sec. V-A)."""
@@ -33,8 +33,8 @@ def differences(
     Parameters
     ----------
     study : Study
-    rule : one of `tables.RULES`
-    score : one of `tables.SCORES`, or `tables.COMMON`
+    rule : one of `outcomes.RULES`
+    score : one of `outcomes.SCORES`, or `outcomes.COMMON`
     first, second : filter and strategy
         Both passive: there is one beamwidth, that of none.
     name : str
@@ -81,8 +81,8 @@ def approach(study: Study, rule: Rule, score: str, name: str) -> Float[np.ndarra
     Parameters
     ----------
     study : Study
-    rule : one of `tables.RULES`
-    score : one of `tables.SCORES`
+    rule : one of `outcomes.RULES`
+    score : one of `outcomes.SCORES`
     name : str
         The filter.
 
@@ -111,7 +111,7 @@ def curves(
     Parameters
     ----------
     study : Study
-    rule : one of `tables.RULES`
+    rule : one of `outcomes.RULES`
     ways : sequence of filter and strategy
 
     Returns

@@ -14,8 +14,8 @@ import numpy as np
 from pipistrelle.evaluation.comparison import Statement
 from pipistrelle.figures.style import FILTER_NAMES
 from pipistrelle.report.contrasts import approach, curves, departure, differences, lap_fit
+from pipistrelle.report.outcomes import COMMON, Rule, Study, samples
 from pipistrelle.report.published import CROSSING, NARROW, TABLE_II, cell_of, row_name
-from pipistrelle.report.tables import COMMON, Rule, Study, samples
 
 STRATEGIES = ("active", "fused", "passive")
 POSITION, HEADING = "position_rmse_m", "heading_rmse_rad"

@@ -7,8 +7,8 @@ import numpy as np
 from pipistrelle.evaluation.consistency import EKF_LIMIT, FASTSLAM_LIMIT, anees, anees_bounds
 from pipistrelle.figures.style import FILTER_NAMES
 from pipistrelle.report.contrasts import STATES
+from pipistrelle.report.outcomes import Rule, Study, kept, lost, samples
 from pipistrelle.report.published import EXCLUDED, TABLE_II, beam_name, cell_of, row_name
-from pipistrelle.report.tables import Rule, Study, kept, lost, samples
 
 LIMITS = {"ekf": EKF_LIMIT, "fastslam": FASTSLAM_LIMIT}
 
@@ -55,7 +55,7 @@ def table_ii(study: Study, rule: Rule = "world") -> list[dict[str, Any]]:
     Parameters
     ----------
     study : Study
-    rule : one of `tables.RULES`
+    rule : one of `outcomes.RULES`
 
     Returns
     -------
@@ -92,7 +92,7 @@ def consistency(study: Study, rule: Rule = "world") -> list[dict[str, Any]]:
     Parameters
     ----------
     study : Study
-    rule : one of `tables.RULES`
+    rule : one of `outcomes.RULES`
 
     Returns
     -------

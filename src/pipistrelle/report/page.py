@@ -20,10 +20,12 @@ from pipistrelle.evaluation.comparison import Finding
 from pipistrelle.experiments.folder import write_file
 from pipistrelle.figures.chart import Chart, Panel, csv_rows, csv_text
 from pipistrelle.figures.style import FILTER_NAMES, STRATEGY_COLOURS
-from pipistrelle.report import charts, overview
+from pipistrelle.report import overview
 from pipistrelle.report.answer import answer
+from pipistrelle.report.charts import study_charts
 from pipistrelle.report.claims import WITHOUT, Claim, judge_claims, record, tally
-from pipistrelle.report.tables import RULES, Rule, Study
+from pipistrelle.report.models import model_charts
+from pipistrelle.report.outcomes import RULES, Rule, Study
 from pipistrelle.report.vector import figure, legend, panel_svg, readings
 from pipistrelle.settings import to_toml
 
@@ -63,8 +65,8 @@ def write_report(
     """
     judged = [judge_claims(study) for study in studies]
     study, claims = studies[0], judged[0]
-    found = {rule: charts.study_charts(study, rule) for rule in RULES}
-    models = [charts.piston(study), charts.example_map(study)]
+    found = {rule: study_charts(study, rule) for rule in RULES}
+    models = model_charts(study)
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     for chart in [*found["world"], *models]:
         progress(chart.name)
@@ -131,13 +133,16 @@ def page(
 
 def _figure(name: str, found: dict[Rule, list[Chart]]) -> dict[str, Any]:
     """Gather one figure under all exclusion rules."""
-    by_rule = {}
-    for rule, mine in found.items():
-        for chart in mine:
-            if chart.name == name:
-                panels = [_panel(panel) for panel in chart.panels]
-                by_rule[rule] = {"chart": chart, "panels": panels, "legend": legend(chart.panels)}
-    first = next(iter(by_rule.values()))["chart"]
+    named = {rule: chart for rule, mine in found.items() for chart in mine if chart.name == name}
+    by_rule = {
+        rule: {
+            "chart": chart,
+            "panels": [_panel(panel) for panel in chart.panels],
+            "legend": legend(chart.panels),
+        }
+        for rule, chart in named.items()
+    }
+    first = next(iter(named.values()))
     return {"name": name, "title": first.title, "by_rule": by_rule, "count": len(first.panels)}
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipistrelle.report.tables import Cell, Study
+from pipistrelle.report.outcomes import Cell, Study
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""A study's folder as arrays: worlds in rows, beamwidths in columns, a record per way of sensing.
+"""A study's folder as arrays.
 
 A study over further settings falls apart into one `Study` for each combination of them. Only
 worlds that are whole are read: those whose file of trials stands.
@@ -6,101 +6,21 @@ worlds that are whole are read: those whose file of trials stands.
 
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import Config, InputError
+from pipistrelle.report.outcomes import COMMON, SCORES, Outcome, Study
 from pipistrelle.settings import from_file, from_flags, resolve
 
 if TYPE_CHECKING:
     import polars as pl
 
-Rule = Literal["world", "case", "none"]
-RULES: dict[Rule, str] = {
-    "world": "a world is dropped for a filter where any of the filter's cases diverged",
-    "case": "a world is dropped where a case at hand diverged",
-    "none": "nothing is dropped but what has no number",
-}
-"""What is left out of a mean, the paper's rule first."""
-Cell = tuple[str, str, int]
-"""Filter, strategy and number of the beamwidth (of no meaning for passive)."""
-SCORES = (
-    "position_rmse_m",
-    "heading_rmse_rad",
-    "nees_mean",
-    "nees_max",
-    "landmarks_full",
-    "landmarks_total",
-    "landmarks_full_mean",
-)
-COMMON = "common_map_rmse_m"
-"""Map RMSE over the landmarks that every strategy has placed."""
 AXIS = "emitter.radius"
 """The setting that makes the beamwidth, and the columns."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome:
-    """What one filter made of one strategy, in n worlds at b beamwidths (passive: at one).
-
-    Attributes
-    ----------
-    failed : (n, b)
-        The trial raised an error, or is not there.
-    diverged : (n, b)
-        Its NEES is not finite or passes the filter's limit.
-    scores : dict of (n, b)
-        By the names of `SCORES` and `COMMON`; NaN where there is no number. `COMMON` has all
-        beamwidths for passive too, for the landmarks in common change with them.
-    nees : (n, b, k)
-        At each frame.
-    """
-
-    failed: Bool[np.ndarray, "n b"]
-    diverged: Bool[np.ndarray, "n b"]
-    scores: dict[str, Float[np.ndarray, "n _"]]
-    nees: Float[np.ndarray, "n b k"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Study:
-    """One combination of a study's settings, as far as it is done.
-
-    Attributes
-    ----------
-    name : str
-        The plan's; not to be trusted.
-    settings : dict
-        The combination: dotted setting to value; empty where only the beamwidth varies.
-    planned : int
-        Worlds asked for.
-    worlds : (n)
-        Numbers of those done.
-    config : Config
-        With the combination applied.
-    beamwidth : (b) [deg]
-        Rising.
-    outcomes : dict
-        By filter and strategy.
-    errors : tuple of world, strategy, filter, beamwidth [deg] or None, text
-        Of the trials that failed.
-    cpu_s : [s]
-        Of all filters.
-    """
-
-    name: str
-    settings: dict[str, Any]
-    planned: int
-    worlds: Int[np.ndarray, " n"]
-    config: Config
-    beamwidth: Float[np.ndarray, " b"]
-    outcomes: dict[tuple[str, str], Outcome]
-    errors: tuple[tuple[int, str, str, float | None, str], ...]
-    cpu_s: float
 
 
 def read_study(folder: Path) -> tuple[Study, ...]:
@@ -121,12 +41,9 @@ def read_study(folder: Path) -> tuple[Study, ...]:
     InputError
         No study, no world done, or a file that cannot be read.
 
-    Examples
-    --------
-    >>> read_study(Path("nowhere"))
-    Traceback (most recent call last):
-    pipistrelle.config.InputError: nowhere: holds no plan.toml, so it is no study's folder; ...
     """
+    import polars as pl
+
     plan = _plan(folder)
     config = resolve(from_file(folder / "config.toml"))
     names = sorted(path.name for path in (folder / "trials").glob("iteration_*.parquet"))
@@ -137,95 +54,17 @@ def read_study(folder: Path) -> tuple[Study, ...]:
     trials = _table(folder / "trials", names)
     steps, landmarks = _table(folder / "steps", names), _table(folder / "landmarks", names)
     others = [key for key in plan["grid"] if key != AXIS]
-    combinations = trials.sort("case").select(others).unique(maintain_order=True)
-    studies = []
-    for values in combinations.rows(named=True) if others else [{}]:
-        rows = trials.filter(**values) if values else trials
-        studies.append(_study(plan, _applied(config, values), values, rows, steps, landmarks))
+    try:
+        studies = []
+        for settings, rows in _combinations(trials, others):
+            applied = _applied(config, settings)
+            studies.append(_study(plan, applied, settings, rows, steps, landmarks))
+    except pl.exceptions.PolarsError as error:
+        raise InputError(
+            f"{folder}: its tables are not those of a study ({str(error).splitlines()[0]}); "
+            "run the study in a new folder"
+        ) from error
     return tuple(studies)
-
-
-def kept(study: Study, rule: Rule, cells: Sequence[Cell]) -> Bool[np.ndarray, " n"]:
-    """Tell which worlds count where these cells are compared.
-
-    Parameters
-    ----------
-    study : Study
-    rule : one of `RULES`
-        A failed trial counts as a diverged one, and where nothing is dropped it has no number.
-    cells : sequence of Cell
-
-    Returns
-    -------
-    (n)
-    """
-    counts = np.ones(len(study.worlds), dtype=bool)
-    for name, strategy, column in cells:
-        outcome = study.outcomes[name, strategy]
-        column = 0 if strategy == "passive" else column
-        counts &= ~outcome.failed[:, column]
-        if rule == "case":
-            counts &= ~outcome.diverged[:, column]
-    if rule == "world":
-        for name in {name for name, _, _ in cells}:
-            counts &= ~lost(study, name)
-    return counts
-
-
-def lost(study: Study, name: str) -> Bool[np.ndarray, " n"]:
-    """Tell in which worlds any of a filter's cases diverged or failed.
-
-    Parameters
-    ----------
-    study : Study
-    name : str
-        The filter.
-
-    Returns
-    -------
-    (n)
-    """
-    mine = [outcome for (other, _), outcome in study.outcomes.items() if other == name]
-    return np.any([np.any(o.failed | o.diverged, axis=1) for o in mine], axis=0)
-
-
-def values(study: Study, score: str, cell: Cell) -> Float[np.ndarray, " n"]:
-    """Return a score of a cell in all worlds; NaN where there is none.
-
-    Parameters
-    ----------
-    study : Study
-    score : one of `SCORES`, or `COMMON`
-    cell : Cell
-
-    Returns
-    -------
-    (n)
-    """
-    name, strategy, column = cell
-    table = study.outcomes[name, strategy].scores[score]
-    return table[:, column if table.shape[1] > 1 else 0]
-
-
-def samples(
-    study: Study, rule: Rule, score: str, cells: Sequence[Cell]
-) -> list[Float[np.ndarray, " m"]]:
-    """Return a score of several cells in the worlds where all of them count and have a number.
-
-    Parameters
-    ----------
-    study : Study
-    rule : one of `RULES`
-    score : one of `SCORES`, or `COMMON`
-    cells : sequence of Cell
-
-    Returns
-    -------
-    list of (m), one per cell, the same worlds in each
-    """
-    columns = np.array([values(study, score, cell) for cell in cells])
-    both = kept(study, rule, cells) & np.all(np.isfinite(columns), axis=0)
-    return list(columns[:, both])
 
 
 def _plan(folder: Path) -> dict[str, Any]:
@@ -247,6 +86,16 @@ def _plan(folder: Path) -> dict[str, Any]:
                 f"{path}: {key}: found {plan[key]!r}, expected what `pipistrelle study` writes"
             )
     return plan
+
+
+def _combinations(
+    trials: "pl.DataFrame", keys: Sequence[str]
+) -> list[tuple[dict[str, Any], "pl.DataFrame"]]:
+    """Part the trials by the values of some settings, in the order of their cases."""
+    if not keys:
+        return [({}, trials)]
+    parts = trials.sort("case").partition_by(keys, as_dict=True, maintain_order=True)
+    return [(dict(zip(keys, values, strict=True)), rows) for values, rows in parts.items()]
 
 
 def _applied(config: Config, settings: dict[str, Any]) -> Config:
@@ -289,36 +138,10 @@ def _study(
     import polars as pl
 
     worlds = np.unique(trials["iteration"].to_numpy())
-    cases = (
-        trials.select("case", "filter", "strategy", "beamwidth_deg")
-        .unique()
-        .sort("beamwidth_deg", "case")
-    )
+    key = ["case", "filter", "strategy", "beamwidth_deg"]
+    cases = trials.select(key).unique().sort("beamwidth_deg", "case")
     number = {case: i for i, case in enumerate(cases["case"].to_list())}
-    shape = (len(worlds), len(number))
-    at = _places(trials, worlds, number)
-    failed = np.ones(shape, dtype=bool)
-    failed[at] = (trials["status"] != "done").to_numpy()
-    diverged = np.zeros(shape, dtype=bool)
-    diverged[at] = trials["diverged"].fill_null(False).to_numpy()
-    scores = {}
-    for score in SCORES:
-        scores[score] = np.full(shape, np.nan)
-        scores[score][at] = trials[score].cast(pl.Float64).fill_null(np.nan).to_numpy()
-    nees = _nees(steps.filter(pl.col("case").is_in(list(number))), worlds, number)
-    columns = {
-        key: np.array([number[case] for case in group["case"].to_list()])
-        for key, group in cases.partition_by("filter", "strategy", as_dict=True).items()
-    }
-    mine = landmarks.filter(pl.col("case").is_in(list(number)))
-    common = _common(columns, *_maps(mine, worlds, number))
-    outcomes: dict[tuple[str, str], Outcome] = {}
-    for (name, strategy), c in sorted(columns.items()):
-        mine = {score: table[:, c] for score, table in scores.items()}
-        mine[COMMON] = common[name, strategy]
-        outcomes[name, strategy] = Outcome(
-            failed=failed[:, c], diverged=diverged[:, c], scores=mine, nees=nees[:, c]
-        )
+    mine = pl.col("case").is_in(list(number))
     broken = trials.filter(pl.col("status") != "done").sort("iteration", "case")
     told = broken.select("iteration", "strategy", "filter", "beamwidth_deg", "error")
     return Study(
@@ -328,10 +151,57 @@ def _study(
         worlds=worlds,
         config=config,
         beamwidth=cases["beamwidth_deg"].drop_nulls().unique().sort().to_numpy(),
-        outcomes=outcomes,
+        outcomes=_outcomes(
+            {
+                key: np.array([number[case] for case in group["case"].to_list()])
+                for key, group in cases.partition_by("filter", "strategy", as_dict=True).items()
+            },
+            _scores(trials, worlds, number),
+            _nees(steps.filter(mine), worlds, number),
+            _maps(landmarks.filter(mine), worlds, number),
+        ),
         errors=tuple((i, s, f, b, text or "") for i, s, f, b, text in told.rows()),
         cpu_s=float(trials["cpu_s"].sum()),
     )
+
+
+def _outcomes(
+    columns: dict[tuple[str, ...], Int[np.ndarray, " b"]],
+    scores: dict[str, np.ndarray],
+    nees: Float[np.ndarray, "n c k"],
+    maps: tuple[Bool[np.ndarray, "n c l"], Float[np.ndarray, "n c l"]],
+) -> dict[tuple[str, str], Outcome]:
+    """Give each filter and strategy its columns."""
+    common = _common(columns, *maps)
+    return {
+        (name, strategy): Outcome(
+            failed=scores["failed"][:, c],
+            diverged=scores["diverged"][:, c],
+            scores={score: scores[score][:, c] for score in SCORES}
+            | {COMMON: common[name, strategy]},
+            nees=nees[:, c],
+        )
+        for (name, strategy), c in sorted(columns.items())
+    }
+
+
+def _scores(
+    trials: "pl.DataFrame", worlds: Int[np.ndarray, " n"], number: dict[int, int]
+) -> dict[str, np.ndarray]:
+    """Lay the trials out by world and case; one that is not there has failed."""
+    import polars as pl
+
+    shape, at = (len(worlds), len(number)), _places(trials, worlds, number)
+    found: dict[str, np.ndarray] = {
+        "failed": np.ones(shape, bool),
+        "diverged": np.zeros(shape, bool),
+    }
+    found["failed"][at] = (trials["status"] != "done").to_numpy()
+    found["diverged"][at] = trials["diverged"].fill_null(value=False).to_numpy()
+    for score in SCORES:
+        found[score] = np.full(shape, np.nan)
+        found[score][at] = trials[score].cast(pl.Float64).fill_null(np.nan).to_numpy()
+    return found
 
 
 def _places(
@@ -348,7 +218,7 @@ def _nees(
     steps: "pl.DataFrame", worlds: Int[np.ndarray, " n"], number: dict[int, int]
 ) -> Float[np.ndarray, "n c k"]:
     """Lay out the NEES by world, case and frame."""
-    last = int(steps["frame"].max() or 0) if len(steps) else 0
+    last = max(steps["frame"].to_list(), default=0)
     nees = np.full((len(worlds), len(number), last), np.nan)
     frame = steps["frame"].to_numpy().astype(np.intp) - 1
     nees[(*_places(steps, worlds, number), frame)] = steps["nees"].to_numpy()
@@ -359,7 +229,7 @@ def _maps(
     landmarks: "pl.DataFrame", worlds: Int[np.ndarray, " n"], number: dict[int, int]
 ) -> tuple[Bool[np.ndarray, "n c l"], Float[np.ndarray, "n c l"]]:
     """Lay out which landmarks are fully initialised, and how far off each is."""
-    last = int(landmarks["landmark"].max() or 0) if len(landmarks) else 0
+    last = max(landmarks["landmark"].to_list(), default=0)
     shape = (len(worlds), len(number), last + 1)
     full, error = np.zeros(shape, dtype=bool), np.zeros(shape)
     label = landmarks["landmark"].to_numpy().astype(np.intp)

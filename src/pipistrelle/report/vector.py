@@ -6,6 +6,8 @@ hover, tap or by the arrow keys, and which a browser shows by itself where scrip
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -35,11 +37,13 @@ def panel_svg(panel: Panel) -> Markup:
 
     Examples
     --------
-    >>> axis = Axis(label="<x>", limits=(0.0, 1.0), ticks=())
-    >>> str(panel_svg(Panel(title="", x=axis, y=axis, series=()))).count("&lt;x&gt;")
-    2
+    >>> axis = Axis(label="", limits=(0.0, 1.0), ticks=())
+    >>> str(panel_svg(Panel(title="<EKF>", x=axis, y=axis, series=())))[:77]
+    '<svg class="panel" viewBox="0 0 400 280" role="img" tabindex="0" aria-label="'
+    >>> "<EKF>" in panel_svg(Panel(title="<EKF>", x=axis, y=axis, series=()))
+    False
     """
-    frame = _Frame(panel)
+    frame = _frame(panel)
     parts = [*_grid(panel, frame)]
     for series in panel.series:
         parts += _series(series, frame)
@@ -71,7 +75,8 @@ def readings(panel: Panel) -> list[tuple[float, str, list[tuple[str, str]]]]:
     --------
     >>> axis = Axis(label="", limits=(0.0, 90.0), ticks=((33.0, "33"),))
     >>> one, tenth = np.ones(1), np.full(1, 0.1)
-    >>> dot = Series(name="fused", role="fused", x=33 * one, y=one, low=one - tenth, high=one + tenth)
+    >>> about = {"low": one - tenth, "high": one + tenth}
+    >>> dot = Series(name="fused", role="fused", x=33 * one, y=one, **about)
     >>> readings(Panel(title="", x=axis, y=axis, series=(dot,)))
     [(33.0, '33', [('fused', '1 ± 0.1')])]
     """
@@ -120,26 +125,33 @@ def figure(value: float) -> str:
     return text.replace("-", "−") if float(text) else "0"
 
 
-class _Frame:
+class _Frame(NamedTuple):
     """Where a panel's numbers come to stand."""
 
-    def __init__(self, panel: Panel) -> None:
-        self.panel = panel
-        x, y = panel.x.limits, panel.y.limits
-        if panel.equal:
-            self.left, self.right, self.top = 0.0, WIDTH, 0.0
-            self.bottom = WIDTH * (y[1] - y[0]) / (x[1] - x[0])
-            self.height = self.bottom
-        else:
-            self.left, self.right, self.top = LEFT, WIDTH - RIGHT, TOP
-            self.bottom, self.height = HEIGHT - BOTTOM, HEIGHT
+    panel: Panel
+    left: float
+    right: float
+    top: float
+    bottom: float
+    height: float
 
-    def across(self, values: Float[np.ndarray, " n"] | float) -> Float[np.ndarray, " n"]:
-        return self.left + _share(self.panel.x, values) * (self.right - self.left)
 
-    def down(self, values: Float[np.ndarray, " n"] | float) -> Float[np.ndarray, " n"]:
-        share = np.clip(_share(self.panel.y, values), 0.0, 1.0)
-        return self.bottom - share * (self.bottom - self.top)
+def _frame(panel: Panel) -> _Frame:
+    """Lay a panel out; one of equal axes fills its width and has no margins."""
+    if not panel.equal:
+        return _Frame(panel, LEFT, WIDTH - RIGHT, TOP, HEIGHT - BOTTOM, HEIGHT)
+    (left, right), (low, high) = panel.x.limits, panel.y.limits
+    height = WIDTH * (high - low) / (right - left)
+    return _Frame(panel, 0.0, WIDTH, 0.0, height, height)
+
+
+def _across(frame: _Frame, values: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
+    return frame.left + _share(frame.panel.x, values) * (frame.right - frame.left)
+
+
+def _down(frame: _Frame, values: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
+    share = np.clip(_share(frame.panel.y, values), 0.0, 1.0)
+    return frame.bottom - share * (frame.bottom - frame.top)
 
 
 def _share(axis: Axis, values: Float[np.ndarray, " n"] | float) -> Float[np.ndarray, " n"]:
@@ -159,23 +171,23 @@ def _grid(panel: Panel, frame: _Frame) -> list[Markup]:
     right, bottom, parts = WIDTH - RIGHT, frame.bottom, []
     if panel.span:
         low, high, name = panel.span
-        top = float(frame.down(high))
+        top = float(_down(frame, high))
         shape = 'class="span" x="{}" y="{:.1f}" width="{:.1f}" height="{:.1f}"'
-        shape = shape.format(LEFT, top, right - LEFT, float(frame.down(low)) - top)
+        shape = shape.format(LEFT, top, right - LEFT, float(_down(frame, low)) - top)
         parts.append(Markup("<rect {}><title>{}</title></rect>").format(Markup(shape), name))
     for value, text in panel.y.ticks:
-        y = float(frame.down(value))
+        y = float(_down(frame, value))
         parts.append(Markup(f'<path class="grid" d="M{LEFT:g} {y:.1f}H{right:g}"/>'))
         parts.append(_text(text, LEFT - 6, y + 4, "end"))
     for value, text in panel.x.ticks:
-        x = float(frame.across(value))
+        x = float(_across(frame, value))
         parts.append(Markup(f'<path class="grid" d="M{x:.1f} {TOP:g}V{bottom:g}"/>'))
         parts.append(_text(text, x, bottom + 16, "middle"))
     for value in panel.rules:
-        y = float(frame.down(value))
+        y = float(_down(frame, value))
         parts.append(Markup(f'<path class="rule" d="M{LEFT:g} {y:.1f}H{right:g}"/>'))
     for value in panel.posts:
-        x = float(frame.across(value))
+        x = float(_across(frame, value))
         parts.append(Markup(f'<path class="post" d="M{x:.1f} {TOP:g}V{bottom:g}"/>'))
     parts.append(_text(panel.x.label, (LEFT + right) / 2.0, HEIGHT - 6, "middle"))
     middle = (TOP + bottom) / 2.0
@@ -188,48 +200,49 @@ def _grid(panel: Panel, frame: _Frame) -> list[Markup]:
 
 def _series(series: Series, frame: _Frame) -> list[Markup]:
     """Draw one series in its style."""
-    x, y = frame.across(series.x), frame.down(series.y)
-    role = Markup('class="{} c-{}"').format
-    faint = Markup(f' style="opacity:{series.strength:.2f}"' if series.strength < 1.0 else "")
-    known = np.isfinite(x) & np.isfinite(y)
+    x, y = _across(frame, series.x), _down(frame, series.y)
+    known = np.flatnonzero(np.isfinite(x) & np.isfinite(y)).tolist()
     if series.style == "text":
-        return [_text(t, *at, "middle") for t, *at in zip(series.tips, x, y + 4, strict=True)]
-    if series.style == "marks":
-        above = known & (series.y > frame.panel.y.limits[1])
-        dots = "".join(f"M{a:.1f} {b:.1f}h0" for a, b in zip(*_rows(x, y, known & ~above)))
-        tops = "".join(f"M{a:.1f} {b + 1:.1f}l2.6 5h-5.2z" for a, b in zip(*_rows(x, y, above)))
-        if series.tips:
-            return [_point(series, i, x[i], y[i], 3.0) for i in np.flatnonzero(known)]
-        return [
-            Markup('<path {}{} d="{}"/>').format(role(kind, series.role), faint, Markup(d))
-            for kind, d in (("marks", dots), ("tops", tops))
-            if d
-        ]
+        return [_text(series.tips[i], x[i], y[i] + 4.0, "middle") for i in known]
+    if series.style == "marks" and not series.tips:
+        return _marks(series, x, y, frame.panel.y.limits[1])
     parts = []
     if series.low is not None and series.high is not None:
-        low, high = frame.down(series.low), frame.down(series.high)
-        parts.append(_band(series, x, low, high, role))
+        parts.append(_spread(series, x, _down(frame, series.low), _down(frame, series.high)))
     if series.style in ("line", "dots"):
-        kind = "line dashed" if series.dashed else "line"
-        d = Markup(_path(x, y))
-        parts.append(Markup('<path {}{} d="{}"/>').format(role(kind, series.role), faint, d))
+        parts.append(_stroke("line dashed" if series.dashed else "line", series, _path(x, y)))
     if series.style != "line":
-        radius = 3.2 if series.style == "dots" else 4.2
-        parts += [_point(series, i, x[i], y[i], radius) for i in np.flatnonzero(known)]
+        radius = {"points": 4.2, "marks": 3.0}.get(series.style, 3.2)
+        parts += [_point(series, i, float(x[i]), float(y[i]), radius) for i in known]
     return parts
 
 
-def _band(series: Series, x: np.ndarray, low: np.ndarray, high: np.ndarray, role: object) -> Markup:
+def _stroke(kind: str, series: Series, d: str) -> Markup:
+    """Draw a path in a series' colour."""
+    faint = f' style="opacity:{series.strength:.2f}"' if series.strength < 1.0 else ""
+    return Markup('<path class="{} c-{}"{} d="{}"/>').format(kind, series.role, Markup(faint), d)
+
+
+def _marks(series: Series, x: np.ndarray, y: np.ndarray, top: float) -> list[Markup]:
+    """Draw single worlds as dots, and those beyond the panel as triangles at its top."""
+    above = series.y > top
+    points = list(zip(x.tolist(), y.tolist(), above.tolist(), strict=True))
+    dots = "".join(f"M{a:.1f} {b:.1f}h0" for a, b, over in points if not over)
+    tops = "".join(f"M{a:.1f} {b + 1.0:.1f}l2.6 5h-5.2z" for a, b, over in points if over)
+    return [_stroke(kind, series, d) for kind, d in (("marks", dots), ("tops", tops)) if d]
+
+
+def _spread(series: Series, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> Markup:
     """Draw the band of a line, or the bars of points."""
     both = np.isfinite(low) & np.isfinite(high)
+    ends = list(zip(x[both].tolist(), low[both].tolist(), high[both].tolist(), strict=True))
     if series.style == "points":
-        kind = "bars"
-        d = "".join(f"M{a:.1f} {b:.1f}V{c:.1f}" for a, b, c in zip(x[both], low[both], high[both]))
+        kind, d = "bars", "".join(f"M{a:.1f} {b:.1f}V{c:.1f}" for a, b, c in ends)
     else:
-        kind = "band"
-        edge = [*zip(x[both], high[both]), *zip(x[both][::-1], low[both][::-1])]
-        d = "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in edge) + "z" if edge else ""
-    return Markup('<path class="{} c-{}" d="{}"/>').format(kind, series.role, Markup(d))
+        edge = [f"{a:.1f} {c:.1f}" for a, _, c in ends]
+        edge += [f"{a:.1f} {b:.1f}" for a, b, _ in reversed(ends)]
+        kind, d = "band", "M" + "L".join(edge) + "z" if edge else ""
+    return Markup('<path class="{} c-{}" d="{}"/>').format(kind, series.role, d)
 
 
 def _path(x: np.ndarray, y: np.ndarray) -> str:
@@ -242,10 +255,6 @@ def _path(x: np.ndarray, y: np.ndarray) -> str:
         else:
             pen = "M"
     return "".join(text)
-
-
-def _rows(x: np.ndarray, y: np.ndarray, rows: np.ndarray) -> tuple[list[float], list[float]]:
-    return x[rows].tolist(), y[rows].tolist()
 
 
 def _point(series: Series, i: int, x: float, y: float, radius: float) -> Markup:
@@ -283,8 +292,8 @@ def _columns(panel: Panel, frame: _Frame) -> list[tuple[str, float, float]]:
     if not said:
         return []
     unit = "°" if "[°]" in panel.x.label else (" s" if "[s]" in panel.x.label else "")
-    at = [float(frame.across(place)) for place, _, _ in said]
-    edges = [LEFT, *((a + b) / 2.0 for a, b in zip(at, at[1:], strict=False)), WIDTH - RIGHT]
+    at = [float(_across(frame, place)) for place, _, _ in said]
+    edges = [LEFT, *((a + b) / 2.0 for a, b in pairwise(at)), WIDTH - RIGHT]
     texts = [
         "\n".join([f"{name}{unit}", *(f"{series}: {number}" for series, number in rows)])
         for _, name, rows in said

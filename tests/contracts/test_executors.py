@@ -1,0 +1,338 @@
+"""What every way of running a study promises: the same results, to the last bit.
+
+A new executor joins with a subclass of `ExecutorContract` that runs the study its own way.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import partial
+from multiprocessing import active_children
+
+import pytest
+
+from pipistrelle.config import InputError
+from pipistrelle.experiments import study
+from pipistrelle.experiments.store import done_worlds
+from pipistrelle.experiments.study import run_study
+from reference.studies import assert_same, fatal, leftovers, lost, plan_of, results
+
+UNTIL_KILLED = """\
+import os, signal, sys
+from pathlib import Path
+from pipistrelle.experiments import store
+from pipistrelle.experiments.plan import read_plan
+from pipistrelle.experiments.study import run_study
+
+left = int(sys.argv[3])
+
+def mortal(act, before):
+    def once(path, what):
+        global left
+        left -= 1
+        if left == 0:
+            before(path, what)
+            os.kill(os.getpid(), signal.SIGKILL)
+        act(path, what)
+    return once
+
+write = store._write
+store._write = mortal(write, lambda path, data: write(path, data[: len(data) // 2]))
+store._rename = mortal(store._rename, lambda partial, path: None)
+if __name__ == "__main__":
+    run_study(read_plan(Path(sys.argv[1])), Path(sys.argv[2]))
+"""
+"""Runs a study until its n-th operation on the disk, which is cut off by SIGKILL."""
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory):
+    return plan_of(tmp_path_factory.mktemp("plan"), iterations=5)
+
+
+@pytest.fixture(scope="module")
+def expected(plan, tmp_path_factory):
+    """The results of a study run in this process, without interruption."""
+    folder = tmp_path_factory.mktemp("inline")
+    run_study(plan, folder)
+    return results(folder)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "study"
+
+
+def after_first(act):
+    """Do something once, when the first world is done."""
+    waiting = [act]
+
+    def progress(standing):
+        if standing.done and waiting:
+            waiting.pop()()
+
+    return progress
+
+
+def kill_workers():
+    for child in active_children():
+        os.kill(child.pid, signal.SIGKILL)
+
+
+class ExecutorContract:
+    """Subclasses run a study; whatever happens to it, its results are those of one process."""
+
+    def run(self, plan, folder):
+        raise NotImplementedError
+
+    def test_results_are_those_of_one_process(self, plan, folder, expected):
+        self.run(plan, folder)
+        assert done_worlds(folder) == set(range(plan.iterations))
+        assert_same(results(folder), expected)
+        assert leftovers(folder) == []
+
+
+class TestInline(ExecutorContract):
+    def run(self, plan, folder):
+        assert run_study(plan, folder, workers=1).done == 5
+
+
+class TestThreads(ExecutorContract):
+    def run(self, plan, folder):
+        with ThreadPoolExecutor(2) as executor:
+            assert run_study(plan, folder, executor=executor).done == 5
+
+
+class TestTwoProcesses(ExecutorContract):
+    def run(self, plan, folder):
+        assert run_study(plan, folder, workers=2).done == 5
+        assert active_children() == []
+
+
+class TestSharesSideBySide(ExecutorContract):
+    def run(self, plan, folder):
+        with ThreadPoolExecutor(2) as both:
+            for standing in both.map(lambda i: run_study(plan, folder, shard=(i, 2)), range(2)):
+                assert standing.done == standing.worlds
+
+
+class TestTwoAtOnceOnTheSameWorlds(ExecutorContract):
+    def run(self, plan, folder):
+        with ThreadPoolExecutor(2) as both:
+            assert [s.done for s in both.map(lambda _: run_study(plan, folder), "ab")] == [5, 5]
+
+
+class TestTwoProcessesKilledOnce(ExecutorContract):
+    def run(self, plan, folder):
+        standing = run_study(plan, folder, workers=2, progress=after_first(kill_workers))
+        assert standing.done == 5
+        assert set(standing.failed.values()) == {0}
+
+
+class TestKilledInTheMiddleOfAFileAndContinued(ExecutorContract):
+    operations = (5, 9)
+
+    def run(self, plan, folder):
+        (folder.parent / "mortal.py").write_text(UNTIL_KILLED)
+        (folder.parent / "plan.toml").write_text(study_text(plan))
+        for operation in self.operations:
+            words = (folder.parent / "mortal.py", folder.parent / "plan.toml", folder, operation)
+            killed = subprocess.run([sys.executable, *map(str, words)], check=False)
+            assert killed.returncode in (-signal.SIGKILL, 0)
+        assert run_study(plan, folder).done == 5
+
+
+@pytest.mark.slow
+class TestKilledAtEveryOperation(TestKilledInTheMiddleOfAFileAndContinued):
+    operations = tuple(range(1, 19))
+
+
+class TestWorkersEndWithTheProcessThatIsKilled(ExecutorContract):
+    def run(self, plan, folder):
+        script = folder.parent / "two.py"
+        script.write_text(
+            "import os, signal, sys\n"
+            "from pathlib import Path\n"
+            "from multiprocessing import active_children\n"
+            "from pipistrelle.experiments.plan import read_plan\n"
+            "from pipistrelle.experiments.study import run_study\n"
+            "def progress(standing):\n"
+            "    if standing.done:\n"
+            "        print(*(child.pid for child in active_children()), flush=True)\n"
+            "        os.kill(os.getpid(), signal.SIGKILL)\n"
+            "if __name__ == '__main__':\n"
+            "    plan = read_plan(Path(sys.argv[1]))\n"
+            "    run_study(plan, Path(sys.argv[2]), workers=2, progress=progress)\n"
+        )
+        path = folder.parent / "plan.toml"
+        path.write_text(study_text(plan))
+        killed = subprocess.run(
+            [sys.executable, script, path, folder],
+            check=False,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+        )
+        assert killed.returncode == -signal.SIGKILL
+        workers = [int(word) for word in killed.stdout.split()]
+        assert len(workers) == 2
+        assert gone(workers)
+        assert done_worlds(folder)
+        assert run_study(plan, folder).done == 5
+
+
+def study_text(plan):
+    from pipistrelle.experiments.plan import plan_text
+
+    return plan_text(plan)
+
+
+def gone(processes, patience=30.0):
+    """Wait until processes have ended."""
+
+    def alive(process):
+        try:
+            os.kill(process, 0)
+        except ProcessLookupError:
+            return False
+        return True
+
+    end = time.monotonic() + patience
+    while any(map(alive, processes)) and time.monotonic() < end:
+        time.sleep(0.05)
+    return not any(map(alive, processes))
+
+
+# Processes that die of a world
+
+
+def test_a_world_that_kills_its_process_twice_is_recorded_and_the_others_are_not():
+    from collections import deque
+
+    worlds = deque(range(5))
+    found = study._in_processes(partial(fatal, {3}), lost, worlds, 2)
+    assert sorted(found) == [
+        [("world 0", None)],
+        [("world 1", None)],
+        [("world 2", None)],
+        [("world 3", "lost")],
+        [("world 4", None)],
+    ]
+
+
+def test_processes_that_never_get_anywhere_are_an_error():
+    from collections import deque
+
+    with pytest.raises(InputError, match="their processes end before a world is done"):
+        list(study._in_processes(partial(fatal, {0, 1}), lost, deque([0, 1]), 2))
+
+
+def test_a_world_that_was_given_up_is_a_failed_world(plan, folder):
+    study.open_store(folder, plan)
+    study._give_up(folder, plan, 3)
+    standing = run_study(plan, folder, shard=(3, 5))
+    assert standing.failed == standing.trials
+    assert standing.first_error == study.KILLED.strip()
+
+
+def test_an_interrupt_stops_the_workers_and_keeps_what_is_done(plan, folder):
+    def interrupt(standing):
+        if standing.done:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_study(plan, folder, workers=2, progress=interrupt)
+    assert active_children() == []
+    assert done_worlds(folder)
+
+
+def test_results_that_cannot_be_written_by_a_worker_end_the_study(plan, folder):
+    def spoil():
+        for table in ("steps", "landmarks", "trials"):
+            for path in (folder / table).iterdir():
+                path.unlink()
+            (folder / table).rmdir()
+            (folder / table).write_text("no folder")
+
+    with pytest.raises(InputError, match=r"could not be written \(Not a directory\)"):
+        run_study(plan, folder, workers=2, progress=after_first(spoil))
+    assert active_children() == []
+
+
+# Dask
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """A scheduler and two workers on the loopback interface, each a process."""
+    pytest.importorskip("distributed", reason="Dask is not installed: the extra [cluster]")
+    with _cluster(tmp_path) as found:
+        yield found
+
+
+@contextmanager
+def _cluster(folder):
+    """Start a scheduler and two workers; yield the address and the workers."""
+    import json
+
+    contact = folder / "scheduler.json"
+    log = (folder / "dask.log").open("w")
+
+    def start(module, *words):
+        command = [sys.executable, "-m", f"distributed.cli.{module}", "--no-dashboard", *words]
+        place = ["--scheduler-file", str(contact)]
+        return subprocess.Popen([*command, *place], stdout=log, stderr=log)
+
+    started = [start("dask_scheduler", "--host", "127.0.0.1", "--port", "0")]
+    try:
+        workers = ["--host", "127.0.0.1", "--nthreads", "1", "--no-nanny"]
+        started += [start("dask_worker", *workers) for _ in range(2)]
+        end = time.monotonic() + 60.0
+        while not contact.exists() and time.monotonic() < end:
+            time.sleep(0.1)
+        yield json.loads(contact.read_text())["address"], started[1:]
+    finally:
+        for process in reversed(started):
+            process.kill()
+            process.wait()
+        log.close()
+
+
+class TestDask(ExecutorContract):
+    @pytest.fixture(autouse=True)
+    def found(self, cluster):
+        self.address, self.workers = cluster
+
+    def run(self, plan, folder):
+        standing = run_study(plan, folder, scheduler=self.address)
+        assert (standing.done, set(standing.failed.values())) == (5, {0})
+
+
+class TestDaskWithAWorkerKilled(TestDask):
+    def run(self, plan, folder):
+        kill = after_first(self.workers[1].kill)
+        standing = run_study(plan, folder, scheduler=self.address, progress=kill)
+        assert (standing.done, set(standing.failed.values())) == (5, {0})
+        assert self.workers[1].wait(10) == -signal.SIGKILL
+
+
+class TestDaskOnThisMachine(ExecutorContract):
+    def run(self, plan, folder):
+        pytest.importorskip("distributed", reason="Dask is not installed: the extra [cluster]")
+        assert run_study(plan, folder, workers=2, scheduler="local").done == 5
+
+
+def test_no_scheduler_at_the_address_is_an_error(plan, folder):
+    pytest.importorskip("distributed", reason="Dask is not installed: the extra [cluster]")
+    with pytest.raises(InputError, match="--scheduler: found 'nowhere', but no scheduler answers"):
+        run_study(plan, folder, scheduler="nowhere")
+
+
+def test_a_missing_dask_is_named_with_its_fix(plan, folder, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"python -m pip install 'pipistrelle\[cluster\]'"):
+        run_study(plan, folder, scheduler="local")
