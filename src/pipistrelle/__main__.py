@@ -46,6 +46,11 @@ app.command(
     help="Run many worlds, and all that a plan varies in each; again on one folder: go on.",
     help_epilogue=SPELLINGS,
 )
+app.command(
+    "pipistrelle.verbs.report:report",
+    name="report",
+    help="Put a study on one page: the paper's claims judged, every figure, the numbers.",
+)
 config = App(name="config", help="Show the settings, or what a file of settings may hold.")
 config.command(
     "pipistrelle.verbs.config:show",

@@ -3,11 +3,13 @@
 A new executor joins with a subclass of `ExecutorContract` that runs the study its own way.
 """
 
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
@@ -17,6 +19,7 @@ import pytest
 
 from pipistrelle.config import InputError
 from pipistrelle.experiments import study
+from pipistrelle.experiments.plan import plan_text
 from pipistrelle.experiments.store import done_worlds
 from pipistrelle.experiments.study import run_study
 from reference.studies import assert_same, fatal, leftovers, lost, plan_of, results
@@ -138,7 +141,7 @@ class TestKilledInTheMiddleOfAFileAndContinued(ExecutorContract):
 
     def run(self, plan, folder):
         (folder.parent / "mortal.py").write_text(UNTIL_KILLED)
-        (folder.parent / "plan.toml").write_text(study_text(plan))
+        (folder.parent / "plan.toml").write_text(plan_text(plan))
         for operation in self.operations:
             words = (folder.parent / "mortal.py", folder.parent / "plan.toml", folder, operation)
             killed = subprocess.run([sys.executable, *map(str, words)], check=False)
@@ -169,7 +172,7 @@ class TestWorkersEndWithTheProcessThatIsKilled(ExecutorContract):
             "    run_study(plan, Path(sys.argv[2]), workers=2, progress=progress)\n"
         )
         path = folder.parent / "plan.toml"
-        path.write_text(study_text(plan))
+        path.write_text(plan_text(plan))
         killed = subprocess.run(
             [sys.executable, script, path, folder],
             check=False,
@@ -183,12 +186,6 @@ class TestWorkersEndWithTheProcessThatIsKilled(ExecutorContract):
         assert gone(workers)
         assert done_worlds(folder)
         assert run_study(plan, folder).done == 5
-
-
-def study_text(plan):
-    from pipistrelle.experiments.plan import plan_text
-
-    return plan_text(plan)
 
 
 def gone(processes, patience=30.0):
@@ -211,8 +208,6 @@ def gone(processes, patience=30.0):
 
 
 def test_a_world_that_kills_its_process_twice_is_recorded_and_the_others_are_not():
-    from collections import deque
-
     worlds = deque(range(5))
     found = study._in_processes(partial(fatal, {3}), lost, worlds, 2)
     assert sorted(found) == [
@@ -225,8 +220,6 @@ def test_a_world_that_kills_its_process_twice_is_recorded_and_the_others_are_not
 
 
 def test_processes_that_never_get_anywhere_are_an_error():
-    from collections import deque
-
     with pytest.raises(InputError, match="their processes end before a world is done"):
         list(study._in_processes(partial(fatal, {0, 1}), lost, deque([0, 1]), 2))
 
@@ -277,8 +270,6 @@ def cluster(tmp_path):
 @contextmanager
 def _cluster(folder):
     """Start a scheduler and two workers; yield the address and the workers."""
-    import json
-
     contact = folder / "scheduler.json"
     log = (folder / "dask.log").open("w")
 

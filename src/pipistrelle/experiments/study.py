@@ -208,25 +208,13 @@ def _ended(executor: Executor, task: Task, waiting: deque[int], ahead: int) -> I
 
 
 def _in_processes(task: Task, give_up: Task, waiting: deque[int], workers: int) -> Results:
-    """Run worlds in processes; each world that was in one that died is tried again, alone."""
+    """Run worlds in processes; those in processes that die are tried again, one at a time."""
     alive = False
     while waiting:
-        suspects = []
-        with _pool(min(workers, len(waiting))) as pool:
-            for iteration, future in _ended(pool, task, waiting, workers):
-                try:
-                    yield future.result()
-                    alive = True
-                except BrokenExecutor:
-                    suspects.append(iteration)
-        lost = []
-        for iteration in suspects:
-            with _pool(1) as pool:
-                try:
-                    yield pool.submit(task, iteration).result()
-                    alive = True
-                except BrokenExecutor:
-                    lost.append(iteration)
+        suspects, lost = deque[int](), deque[int]()
+        alive |= yield from _in_pool(task, waiting, workers, suspects)
+        while suspects:
+            alive |= yield from _in_pool(task, suspects, 1, lost)
         if lost and not alive:
             raise InputError(
                 "workers: their processes end before a world is done: killed, out of memory, or "
@@ -234,6 +222,21 @@ def _in_processes(task: Task, give_up: Task, waiting: deque[int], workers: int) 
                 "process"
             )
         yield from map(give_up, lost)
+
+
+def _in_pool(
+    task: Task, waiting: deque[int], workers: int, broken: deque[int]
+) -> Generator[list[Outcome], None, bool]:
+    """Run worlds until a process dies, and tell which were running then; return if any ended."""
+    alive = False
+    with _pool(min(workers, len(waiting))) as pool:
+        for iteration, future in _ended(pool, task, waiting, workers):
+            try:
+                yield future.result()
+                alive = True
+            except BrokenExecutor:
+                broken.append(iteration)
+    return alive
 
 
 @contextmanager

@@ -1,9 +1,9 @@
 """A study as one readable page: the answer, the paper's claims judged, its figures, its numbers.
 
-`tables` reads a study's folder into the arrays of `outcomes`; `families` words the paper's claims as statements
-about means over worlds, from the `contrasts` of cases, and `claims` judges them; `charts` lays
-the paper's figures out, `vector` draws them for the page and `pipistrelle.figures.paper` for
-print; `page` writes it all.
+`tables` reads a study's folder into the arrays of `outcomes`; `families` words the paper's claims
+as statements about means over worlds, from the `contrasts` of cases, and `claims` judges them;
+`charts`, `timelines` and `models` lay figures out, `vector` draws them for the page and
+`pipistrelle.figures.paper` for print; `page` writes it all.
 """
 
 from importlib import import_module

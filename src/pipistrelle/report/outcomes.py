@@ -67,6 +67,8 @@ class Study:
         The plan's; not to be trusted.
     settings : dict
         The combination: dotted setting to value; empty where only the beamwidth varies.
+    grid : dict
+        All dotted settings that the study varies, with their values.
     planned : int
         Worlds asked for.
     worlds : (n)
@@ -85,6 +87,7 @@ class Study:
 
     name: str
     settings: dict[str, Any]
+    grid: dict[str, tuple[Any, ...]]
     planned: int
     worlds: Int[np.ndarray, " n"]
     config: Config

@@ -4,8 +4,6 @@ A study over further settings falls apart into one `Study` for each combination 
 worlds that are whole are read: those whose file of trials stands.
 """
 
-import tomllib
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,14 +11,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import Config, InputError
+from pipistrelle.experiments.plan import RADIUS, Plan, cases_of
+from pipistrelle.experiments.store import load_study
 from pipistrelle.report.outcomes import COMMON, SCORES, Outcome, Study
-from pipistrelle.settings import from_file, from_flags, resolve
 
 if TYPE_CHECKING:
     import polars as pl
-
-AXIS = "emitter.radius"
-"""The setting that makes the beamwidth, and the columns."""
 
 
 def read_study(folder: Path) -> tuple[Study, ...]:
@@ -40,94 +36,45 @@ def read_study(folder: Path) -> tuple[Study, ...]:
     ------
     InputError
         No study, no world done, or a file that cannot be read.
-
     """
     import polars as pl
 
-    plan = _plan(folder)
-    config = resolve(from_file(folder / "config.toml"))
-    names = sorted(path.name for path in (folder / "trials").glob("iteration_*.parquet"))
-    if not names:
-        raise InputError(
-            f"{folder}: no world is done yet; `pipistrelle study -o {folder}` goes on with it"
-        )
-    trials = _table(folder / "trials", names)
-    steps, landmarks = _table(folder / "steps", names), _table(folder / "landmarks", names)
-    others = [key for key in plan["grid"] if key != AXIS]
+    stored = load_study(folder)
     try:
+        trials = stored.trials.collect()
+        if trials.is_empty():
+            raise InputError(
+                f"{folder}: no world is done yet; `pipistrelle study` with -o {folder} goes on"
+            )
+        steps, landmarks = stored.steps.collect(), stored.landmarks.collect()
         studies = []
-        for settings, rows in _combinations(trials, others):
-            applied = _applied(config, settings)
-            studies.append(_study(plan, applied, settings, rows, steps, landmarks))
-    except pl.exceptions.PolarsError as error:
+        for settings, config, numbers in _combinations(stored.plan):
+            mine = pl.col("case").is_in(numbers)
+            tables = [table.filter(mine) for table in (trials, steps, landmarks)]
+            studies.append(_study(stored.plan, config, settings, *tables))
+    except (OSError, pl.exceptions.PolarsError) as error:
         raise InputError(
-            f"{folder}: its tables are not those of a study ({str(error).splitlines()[0]}); "
-            "run the study in a new folder"
+            f"{folder}: could not be read ({str(error).splitlines()[0]}); remove the world's file "
+            "from trials/ and run the study again to have it anew"
         ) from error
     return tuple(studies)
 
 
-def _plan(folder: Path) -> dict[str, Any]:
-    """Read the plan, as far as a report needs it."""
-    path = folder / "plan.toml"
-    if not path.is_file():
-        raise InputError(
-            f"{folder}: holds no plan.toml, so it is no study's folder; name the folder that "
-            "`pipistrelle study` printed last"
-        )
-    try:
-        plan = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not TOML: {error}") from error
-    expected = {"name": str, "iterations": int, "grid": dict}
-    for key, kind in expected.items():
-        if not isinstance(plan.setdefault(key, {} if kind is dict else None), kind):
-            raise InputError(
-                f"{path}: {key}: found {plan[key]!r}, expected what `pipistrelle study` writes"
-            )
-    return plan
-
-
-def _combinations(
-    trials: "pl.DataFrame", keys: Sequence[str]
-) -> list[tuple[dict[str, Any], "pl.DataFrame"]]:
-    """Part the trials by the values of some settings, in the order of their cases."""
-    if not keys:
-        return [({}, trials)]
-    parts = trials.sort("case").partition_by(keys, as_dict=True, maintain_order=True)
-    return [(dict(zip(keys, values, strict=True)), rows) for values, rows in parts.items()]
-
-
-def _applied(config: Config, settings: dict[str, Any]) -> Config:
-    """Apply a combination of dotted settings."""
-    nested: dict[str, Any] = config.model_dump()
-    for dotted, value in settings.items():
-        *sections, leaf = dotted.split(".")
-        table = nested
-        for section in sections:
-            table = table[section]
-        table[leaf] = value
-    return resolve(from_flags(nested))
-
-
-def _table(folder: Path, names: Sequence[str]) -> "pl.DataFrame":
-    """Read the worlds' files of one kind."""
-    import polars as pl
-
-    parts = []
-    for name in names:
-        try:
-            parts.append(pl.read_parquet(folder / name))
-        except (OSError, pl.exceptions.PolarsError) as error:
-            raise InputError(
-                f"{folder / name}: cannot be read ({str(error).splitlines()[0]}); remove "
-                f"trials/{name} and run the study again: it does that world anew"
-            ) from error
-    return pl.concat(parts)
+def _combinations(plan: Plan) -> list[tuple[dict[str, Any], Config, list[int]]]:
+    """Part the cases by the settings that are not the beamwidth's."""
+    found: dict[str, tuple[dict[str, Any], Config, list[int]]] = {}
+    for case in cases_of(plan):
+        settings = {name: value for name, value in case.values.items() if name != RADIUS}
+        radius = {"radius": plan.config.emitter.radius}
+        emitter = case.config.emitter.model_copy(update=radius)
+        config = case.config.model_copy(update={"emitter": emitter})
+        _, _, numbers = found.setdefault(repr(settings), (settings, config, []))
+        numbers.append(case.number)
+    return list(found.values())
 
 
 def _study(
-    plan: dict[str, Any],
+    plan: Plan,
     config: Config,
     settings: dict[str, Any],
     trials: "pl.DataFrame",
@@ -141,13 +88,13 @@ def _study(
     key = ["case", "filter", "strategy", "beamwidth_deg"]
     cases = trials.select(key).unique().sort("beamwidth_deg", "case")
     number = {case: i for i, case in enumerate(cases["case"].to_list())}
-    mine = pl.col("case").is_in(list(number))
     broken = trials.filter(pl.col("status") != "done").sort("iteration", "case")
     told = broken.select("iteration", "strategy", "filter", "beamwidth_deg", "error")
     return Study(
-        name=plan["name"],
+        name=plan.name,
         settings=settings,
-        planned=plan["iterations"],
+        grid=dict(plan.grid),
+        planned=plan.iterations,
         worlds=worlds,
         config=config,
         beamwidth=cases["beamwidth_deg"].drop_nulls().unique().sort().to_numpy(),
@@ -157,8 +104,8 @@ def _study(
                 for key, group in cases.partition_by("filter", "strategy", as_dict=True).items()
             },
             _scores(trials, worlds, number),
-            _nees(steps.filter(mine), worlds, number),
-            _maps(landmarks.filter(mine), worlds, number),
+            _nees(steps, worlds, number),
+            _maps(landmarks, worlds, number),
         ),
         errors=tuple((i, s, f, b, text or "") for i, s, f, b, text in told.rows()),
         cpu_s=float(trials["cpu_s"].sum()),

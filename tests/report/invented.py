@@ -1,0 +1,178 @@
+"""A study that never ran: worlds in which the paper is right, to the last claim."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from pipistrelle.config import Config
+from pipistrelle.experiments.plan import cases_of, read_plan
+from pipistrelle.experiments.store import open_store, world_file
+from pipistrelle.experiments.world import world_schemas
+from pipistrelle.report.outcomes import COMMON, Outcome, Study
+
+BEAMWIDTH = np.array(
+    [11.575, 14.268, 17.685, 21.853, 26.998, 33.295, 41.596, 51.527, 64.877, 83.124, 108.827, 180.0]
+)
+"""Of the paper's radii, narrowest first [deg]."""
+FRAMES = 375
+LANDMARKS = 51
+FILTERS, STRATEGIES = ("ekf", "fastslam"), ("active", "fused", "passive")
+PLAN = """\
+format = 1
+name = "invented"
+iterations = {iterations}
+[config]
+seed = 2022
+[grid]
+"emitter.radius" = [
+  0.0025, 0.0031, 0.0038, 0.0047, 0.0058, 0.0071, 0.0088, 0.0108, 0.0133, 0.0164, 0.0203, 0.025,
+]
+"""
+
+
+def noise(rng, worlds, *shape):
+    """Draws over worlds whose means are 0 and whose standard deviations are 1, exactly."""
+    draws = rng.normal(size=(worlds, *shape))
+    if worlds < 2:
+        return np.zeros_like(draws)
+    draws -= draws.mean(axis=0)
+    return draws / draws.std(axis=0, ddof=1)
+
+
+def position(name, strategy):
+    """Mean position RMSE over the beamwidth as the paper tells it [m]."""
+    narrow = np.log2(180.0 / BEAMWIDTH) / 4.0
+    active = 0.40 + 0.20 * narrow
+    gain = {"ekf": np.where(BEAMWIDTH < 42.0, 0.01, -0.02), "fastslam": -0.1}[name]
+    passive = {"ekf": 0.70, "fastslam": 1.0}[name]
+    means = {"active": active, "fused": np.maximum(active - gain, (passive - 0.06) * narrow)}
+    if name == "fastslam":
+        means = {way: mean + 0.2 for way, mean in means.items()}
+    elif strategy == "fused":
+        return active - gain
+    return means[strategy] if strategy != "passive" else np.array([passive])
+
+
+def nees_of(rng, worlds, beams, name):
+    """NEES that swings with the laps and rises, EKF's nearer to 3."""
+    tau = 0.5 * np.arange(1, FRAMES + 1) / 62.06
+    size = {"ekf": 1.0, "fastslam": 15.0}[name]
+    curve = 2.5 + size * (0.8 * tau + 0.5 * (1.0 - np.cos(2.0 * np.pi * tau)))
+    factor = 1.0 + 0.2 * noise(rng, worlds, beams, 1)
+    return np.float32(curve * factor).astype(np.float64)
+
+
+def outcome_of(rng, world, name, strategy):
+    """Scores of one filter and strategy, with the worlds' own hardness in the errors."""
+    worlds, beams = len(world), 1 if strategy == "passive" else len(BEAMWIDTH)
+
+    def about(mean, own, shared=0.0):
+        return mean + shared * world[:, None] + own * noise(rng, worlds, beams)
+
+    where = position(name, strategy)
+    turned = {"active": 0.06, "fused": 0.05, "passive": 0.055}[strategy]
+    seen = np.linspace(20.0, 36.0, beams) if strategy == "active" else np.full(beams, 40.0)
+    full = {"active": seen, "fused": seen - 6.0, "passive": seen - 13.0}[strategy]
+    if strategy == "fused":
+        seen = np.interp(BEAMWIDTH, [11.6, 33.3, 180.0], [40.1, 40.8, 43.7])
+        full = np.interp(BEAMWIDTH, [11.6, 33.3, 180.0], [30.0, 31.9, 37.7])
+    if name == "fastslam":
+        full = full + {"active": 0.0, "fused": 1.0, "passive": -4.9}[strategy]
+    nees = nees_of(rng, worlds, beams, name)
+    scores = {
+        "position_rmse_m": about(where, 0.03, 0.1),
+        "heading_rmse_rad": about(turned, 0.004, 0.01),
+        "landmarks_full": about(full, 2.0),
+        "landmarks_total": about(seen, 2.0),
+        "nees_mean": nees.mean(axis=2),
+        "nees_max": nees.max(axis=2),
+    }
+    scores["landmarks_full_mean"] = scores["landmarks_full"] + 0.1
+    placed = {"active": 0.5, "fused": 0.52, "passive": 0.6}[strategy]
+    scores[COMMON] = placed + 0.2 * world[:, None] + 0.05 * noise(rng, worlds, len(BEAMWIDTH))
+    no = np.zeros((worlds, beams), dtype=bool)
+    return Outcome(failed=no, diverged=no.copy(), scores=scores, nees=nees)
+
+
+def invent(worlds=60, seed=1, planned=None):
+    """A study whose every claim is the paper's."""
+    rng = np.random.default_rng(seed)
+    world = noise(rng, worlds)
+    return Study(
+        name="invented",
+        settings={},
+        grid={"emitter.radius": (0.0025, 0.025)},
+        planned=worlds if planned is None else planned,
+        worlds=np.arange(worlds),
+        config=Config(seed=2022),
+        beamwidth=BEAMWIDTH,
+        outcomes={
+            (name, strategy): outcome_of(rng, world, name, strategy)
+            for name in FILTERS
+            for strategy in STRATEGIES
+        },
+        errors=(),
+        cpu_s=60.0,
+    )
+
+
+def changed(study, way, score, change):
+    """The same study with one score of one way changed by a function."""
+    outcome = study.outcomes[way]
+    scores = outcome.scores | {score: change(outcome.scores[score])}
+    return replace(study, outcomes=study.outcomes | {way: replace(outcome, scores=scores)})
+
+
+def only(study, ways):
+    """The same study with some ways alone."""
+    return replace(study, outcomes={way: study.outcomes[way] for way in ways})
+
+
+def write_store(folder: Path, study: Study, *, iterations=None, seed=3, failed=()):
+    """Write a study into a folder as `pipistrelle study` does.
+
+    `failed` holds pairs of a world's row and a case's number. Returns the plan and, by world and
+    case, which landmarks are fully initialised and how far off each is (NaN: not in the map).
+    """
+    rng = np.random.default_rng(seed)
+    text = folder.parent / f"{folder.name}.toml"
+    text.write_text(PLAN.format(iterations=iterations or len(study.worlds)))
+    plan = read_plan(text)
+    open_store(folder, plan)
+    schemas, cases = world_schemas(plan), cases_of(plan)
+    shape = (len(study.worlds), len(cases), LANDMARKS)
+    full = rng.uniform(size=shape) < 0.7
+    error = np.where(rng.uniform(size=shape) < 0.9, rng.rayleigh(0.4, shape), np.nan)
+    error = np.float32(error).astype(np.float64)
+    full &= np.isfinite(error)
+    for row, iteration in enumerate(study.worlds.tolist()):
+        broken = {number for world, number in failed if world == row}
+        tables = world_tables_of(study, row, cases, broken, full[row], error[row])
+        for name in ("steps", "landmarks", "trials"):
+            rows = [{"iteration": iteration} | line for line in tables[name]]
+            pl.DataFrame(rows, schema=schemas[name]).write_parquet(
+                world_file(folder, name, iteration)
+            )
+    for row, number in failed:
+        full[row, number], error[row, number] = False, np.nan
+    return plan, full, error
+
+
+def column_of(case):
+    """Column of a planned case in a study's arrays; radii fall as beamwidths rise."""
+    radius = case.values["emitter.radius"]
+    return 0 if radius is None else int(np.argmin(np.abs(BEAMWIDTH - width_of(radius))))
+
+
+def width_of(radius):
+    return float(np.degrees(2 * np.arcsin(min(1.61634 * 343 / (2 * np.pi * 35e3 * radius), 1.0))))
+
+
+def world_tables_of(study, row, cases, broken, full, error):
+    """Rows of one world's three tables."""
+    trials, steps, landmarks = [], [], []
+    for case in cases:
+        outcome, column = study.outcomes[case.strategy, case.filter][0:0] or None, column_of(case)
+    return {"trials": trials, "steps": steps, "landmarks": landmarks}
