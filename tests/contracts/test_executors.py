@@ -269,7 +269,7 @@ def cluster(tmp_path):
 
 @contextmanager
 def _cluster(folder):
-    """Start a scheduler and two workers; yield the address and the workers."""
+    """Start a scheduler and two workers; yield the address and the processes."""
     contact = folder / "scheduler.json"
     log = (folder / "dask.log").open("w")
 
@@ -285,7 +285,7 @@ def _cluster(folder):
         end = time.monotonic() + 60.0
         while not contact.exists() and time.monotonic() < end:
             time.sleep(0.1)
-        yield json.loads(contact.read_text())["address"], started[1:]
+        yield json.loads(contact.read_text())["address"], *started
     finally:
         for process in reversed(started):
             process.kill()
@@ -296,7 +296,7 @@ def _cluster(folder):
 class TestDask(ExecutorContract):
     @pytest.fixture(autouse=True)
     def found(self, cluster):
-        self.address, self.workers = cluster
+        self.address, self.scheduler, *self.workers = cluster
 
     def run(self, plan, folder):
         standing = run_study(plan, folder, scheduler=self.address)
@@ -327,3 +327,18 @@ def test_a_missing_dask_is_named_with_its_fix(plan, folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"python -m pip install 'pipistrelle\[cluster\]'"):
         run_study(plan, folder, scheduler="local")
+
+
+@pytest.mark.slow
+def test_a_world_that_kills_every_worker_of_a_cluster_is_recorded_and_the_others_are_not():
+    pytest.importorskip("distributed", reason="Dask is not installed: the extra [cluster]")
+    found = study._on_cluster(partial(fatal, {1}), lost, deque(range(3)), 2, "local")
+    assert sorted(found) == [[("world 0", None)], [("world 1", "lost")], [("world 2", None)]]
+
+
+class TestDaskLosesItsScheduler(TestDask):
+    def run(self, plan, folder):
+        kill = after_first(self.scheduler.kill)
+        with pytest.raises(InputError, match="the cluster is gone"):
+            run_study(plan, folder, scheduler=self.address, progress=kill)
+        assert run_study(plan, folder).done == 5

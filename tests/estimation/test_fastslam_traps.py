@@ -1,5 +1,7 @@
 """What breaks the printed filter, and the traps of angles, distances and small numbers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -140,3 +142,17 @@ def test_few_particles_have_a_pose_with_an_inverse_covariance(particles):
     for belief, poses in followed(slam, small_mission("fused", frames=20), drawing()):
         assert_sound(belief)
         assert (np.linalg.eigvalsh(poses.covariance)[:, 0] > 0).all()
+
+
+def test_a_bearing_neither_prunes_a_member_too_near_to_foresee_it_nor_loses_the_ray():
+    rays = ray_config(prune=0.0)
+    slam = swarm_filter(1, rays=rays)
+    belief = slam.update(slam.init(START), scan_of((1, np.nan, 0.3)), np.random.default_rng(1))
+    member = belief.member.copy()
+    member[0, 0, :2] = belief.mean[0, :2]
+    member[0, :, 5] = [1.0, 0.0, 0.0, 0.0]
+    crafted = replace(belief, member=member, covariance=np.zeros((1, 3, 3)))
+    after = slam.update(crafted, scan_of((1, np.nan, 0.3)), np.random.default_rng(1))
+    weight = after.member[0, : after.count[0, 0], 5]
+    assert np.isfinite(after.member).all()
+    np.testing.assert_allclose(weight, [1.0, 0.0, 0.0, 0.0], atol=1e-12)

@@ -6,17 +6,20 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config
 from pipistrelle.experiments.plan import cases_of, read_plan
 from pipistrelle.experiments.store import open_store, world_file
 from pipistrelle.experiments.world import world_schemas
-from pipistrelle.report.outcomes import COMMON, Outcome, Study
+from pipistrelle.report.outcomes import COMMON, SCORES, Outcome, Study
 
-BEAMWIDTH = np.array(
-    [11.575, 14.268, 17.685, 21.853, 26.998, 33.295, 41.596, 51.527, 64.877, 83.124, 108.827, 180.0]
-)
+RADII = (
+    0.0025, 0.0031, 0.0038, 0.0047, 0.0058, 0.0071, 0.0088, 0.0108, 0.0133, 0.0164, 0.0203, 0.025,
+)  # fmt: skip
+BEAMWIDTH = np.degrees(beamwidth(np.array(RADII[::-1]), frequency=35e3, speed_of_sound=343.0))
 """Of the paper's radii, narrowest first [deg]."""
 FRAMES = 375
+ERROR = "Traceback\nValueError: <script>alert(1)</script>"
 LANDMARKS = 51
 FILTERS, STRATEGIES = ("ekf", "fastslam"), ("active", "fused", "passive")
 PLAN = """\
@@ -26,9 +29,7 @@ iterations = {iterations}
 [config]
 seed = 2022
 [grid]
-"emitter.radius" = [
-  0.0025, 0.0031, 0.0038, 0.0047, 0.0058, 0.0071, 0.0088, 0.0108, 0.0133, 0.0164, 0.0203, 0.025,
-]
+"emitter.radius" = {radii}
 """
 
 
@@ -43,16 +44,12 @@ def noise(rng, worlds, *shape):
 
 def position(name, strategy):
     """Mean position RMSE over the beamwidth as the paper tells it [m]."""
-    narrow = np.log2(180.0 / BEAMWIDTH) / 4.0
-    active = 0.40 + 0.20 * narrow
-    gain = {"ekf": np.where(BEAMWIDTH < 42.0, 0.01, -0.02), "fastslam": -0.1}[name]
-    passive = {"ekf": 0.70, "fastslam": 1.0}[name]
-    means = {"active": active, "fused": np.maximum(active - gain, (passive - 0.06) * narrow)}
-    if name == "fastslam":
-        means = {way: mean + 0.2 for way, mean in means.items()}
-    elif strategy == "fused":
-        return active - gain
-    return means[strategy] if strategy != "passive" else np.array([passive])
+    passive = {"ekf": 0.7, "fastslam": 1.0}[name]
+    if strategy == "passive":
+        return np.array([passive])
+    fused = passive - 0.05 - 0.05 * np.log2(BEAMWIDTH / BEAMWIDTH[0])
+    gain = {"ekf": np.where(BEAMWIDTH < 42.0, 0.004, -0.02), "fastslam": -0.1}[name]
+    return fused if strategy == "fused" else fused + gain
 
 
 def nees_of(rng, worlds, beams, name):
@@ -138,7 +135,7 @@ def write_store(folder: Path, study: Study, *, iterations=None, seed=3, failed=(
     """
     rng = np.random.default_rng(seed)
     text = folder.parent / f"{folder.name}.toml"
-    text.write_text(PLAN.format(iterations=iterations or len(study.worlds)))
+    text.write_text(PLAN.format(iterations=iterations or len(study.worlds), radii=list(RADII)))
     plan = read_plan(text)
     open_store(folder, plan)
     schemas, cases = world_schemas(plan), cases_of(plan)
@@ -160,19 +157,37 @@ def write_store(folder: Path, study: Study, *, iterations=None, seed=3, failed=(
     return plan, full, error
 
 
-def column_of(case):
-    """Column of a planned case in a study's arrays; radii fall as beamwidths rise."""
-    radius = case.values["emitter.radius"]
-    return 0 if radius is None else int(np.argmin(np.abs(BEAMWIDTH - width_of(radius))))
-
-
-def width_of(radius):
-    return float(np.degrees(2 * np.arcsin(min(1.61634 * 343 / (2 * np.pi * 35e3 * radius), 1.0))))
-
-
 def world_tables_of(study, row, cases, broken, full, error):
     """Rows of one world's three tables."""
-    trials, steps, landmarks = [], [], []
+    tables = {"trials": [], "steps": [], "landmarks": []}
     for case in cases:
-        outcome, column = study.outcomes[case.strategy, case.filter][0:0] or None, column_of(case)
-    return {"trials": trials, "steps": steps, "landmarks": landmarks}
+        head = {"case": case.number}
+        radius = case.values["emitter.radius"]
+        column = 0 if radius is None else RADII[::-1].index(radius)
+        outcome = study.outcomes[case.filter, case.strategy]
+        trial = head | {
+            "strategy": case.strategy,
+            "filter": case.filter,
+            "emitter.radius": radius,
+            "beamwidth_deg": None if radius is None else float(BEAMWIDTH[column]),
+            "seed": study.config.seed,
+            "status": "done",
+            "wall_s": 1.0,
+            "cpu_s": 0.5,
+        }
+        if case.number in broken:
+            tables["trials"].append(trial | {"status": "failed", "error": ERROR})
+            continue
+        for score in SCORES:
+            value = float(outcome.scores[score][row, column])
+            whole = score in ("landmarks_full", "landmarks_total")
+            trial[score] = round(value) if whole else value
+        tables["trials"].append(trial | {"diverged": bool(outcome.diverged[row, column])})
+        nees = outcome.nees[row, column]
+        tables["steps"] += [head | {"frame": k, "nees": v} for k, v in enumerate(nees, start=1)]
+        tables["landmarks"] += [
+            head | {"landmark": k + 1, "full": bool(full[case.number, k]), "error_m": off}
+            for k, off in enumerate(error[case.number].tolist())
+            if np.isfinite(off)
+        ]
+    return tables

@@ -17,6 +17,9 @@ from pipistrelle.geometry import wrap_angle
 LOG_TAU = math.log(2.0 * math.pi)
 ROUNDING = 1e-12
 """A pivot under this share of its variance is rounding: one control step has noise of rank 2."""
+UNFORESEEN = -0.5 * LOG_TAU
+"""Log likelihood, as `log_likelihood` counts, of the bearing of a member too near to foresee it:
+uniform over the circle."""
 X, Y, XX, XY, YY, WEIGHT = range(6)
 
 

@@ -12,6 +12,7 @@ from numba import njit
 from pipistrelle.estimation.models import carry_pose
 from pipistrelle.estimation.particle import (
     LOG_TAU,
+    UNFORESEEN,
     WEIGHT,
     bearing_spread,
     correct_by_active,
@@ -111,14 +112,10 @@ def _refine_by_ray(pose, P, rows, bearing, sensing, exact, scratch):
     """Correct pose and P by the bearing of a partial landmark; returns the log likelihood."""
     members, variance = rows.shape[0], sensing.bearing_variance
     logs, weight, share = scratch[0], scratch[1], scratch[2]
-    hopeful = False
     for j in range(members):
         innovation, S = expect_bearing(pose, P, rows[j], bearing, variance)
-        logs[j] = log_likelihood(innovation, S) if math.isfinite(S) else -np.inf
+        logs[j] = log_likelihood(innovation, S) if math.isfinite(S) else UNFORESEEN
         weight[j] = rows[j, WEIGHT]
-        hopeful = hopeful or (math.isfinite(S) and weight[j] > 0.0)
-    if not hopeful:
-        return 0.0
     gained = weigh_and_share(logs, weight, members, sensing.power, sensing.aggregated, share)
     if exact:
         _refine_to_mixture(pose, P, rows, weight, bearing, variance)
@@ -157,16 +154,12 @@ def _correct_ray(pose, rows, bearing, sensing, exact, scratch, keep):
     members, variance = rows.shape[0], sensing.bearing_variance
     logs, weight, share = scratch[0], scratch[1], scratch[2]
     off, g0, g1 = scratch[3], scratch[4], scratch[5]
-    hopeful = False
     for j in range(members):
         off[j], g0[j], g1[j] = expect_from(pose, rows[j], bearing)
         S = bearing_spread(rows[j], g0[j], g1[j]) + variance
         near = g0[j] == 0.0 and g1[j] == 0.0
-        logs[j] = -np.inf if near else log_likelihood(off[j], S)
+        logs[j] = UNFORESEEN if near else log_likelihood(off[j], S)
         weight[j] = rows[j, WEIGHT]
-        hopeful = hopeful or not near
-    if not hopeful:
-        return members
     weigh_and_share(logs, weight, members, sensing.power, sensing.aggregated, share)
     for j in range(members):
         if exact or share[j] > 0.0:
@@ -307,7 +300,7 @@ def correct_swarm(
         old_landmark, old_count, slot, labels, ranges, sensing.ray_ranges.size
     )
     count = np.zeros((particles, landmark.size), dtype=np.int64)
-    member = np.empty((particles, first[-1], 6))
+    member = np.zeros((particles, first[-1], 6))
     scratch = np.empty((6, sensing.ray_ranges.size))
     keep = np.empty(sensing.ray_ranges.size, dtype=np.bool_)
     for i in range(particles):

@@ -12,7 +12,14 @@ import signal
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    wait,
+)
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -287,6 +294,11 @@ def _on_cluster(
                     outcomes = future.result()
                 except KilledWorker:
                     outcomes = give_up(iteration)
+                except CancelledError as error:
+                    raise InputError(
+                        f"--scheduler {address}: the cluster is gone; worlds that are done are "
+                        "kept, and the same command goes on with the rest"
+                    ) from error
                 yield outcomes
         finally:
             executor.shutdown(wait=False)

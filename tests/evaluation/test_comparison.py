@@ -1,0 +1,226 @@
+"""Families of statements: against closed forms and SciPy, and by simulation with controls."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from pipistrelle.evaluation.comparison import (
+    Statement,
+    holm,
+    judge,
+    pooled_std,
+    pseudovalues,
+)
+
+SEED = st.integers(0, 2**32 - 1)
+P_VALUES = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12).map(np.array)
+
+
+def statements(samples, relation="above", margin=0.0):
+    return [
+        Statement(label=str(i), sample=sample, relation=relation, margin=margin)
+        for i, sample in enumerate(samples)
+    ]
+
+
+def drawn(rng, means, n):
+    """Samples of a family, correlated as differences of one world are."""
+    return np.asarray(means)[:, None] + rng.normal(size=(len(means), n)) + rng.normal(size=n)
+
+
+@given(SEED, st.integers(3, 60))
+def test_a_mean_alone_has_the_t_interval(seed, n):
+    sample = np.random.default_rng(seed).normal(1.0, 2.0, n)
+    (finding,) = judge(statements([sample]))
+    known = stats.ttest_1samp(sample, 0.0).confidence_interval(0.95)
+    assert finding.alone == pytest.approx((known.low, known.high), rel=1e-9, abs=1e-9)
+    assert finding.p == pytest.approx(stats.ttest_1samp(sample, 0.0).pvalue, rel=1e-9)
+    assert finding.mean == pytest.approx(sample.mean(), rel=1e-12)
+
+
+def test_holms_adjustment_is_that_of_a_hand_worked_family():
+    assert holm(np.array([0.01, 0.04, 0.03, 0.005])) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+
+
+@given(P_VALUES)
+def test_holm_keeps_the_order_and_lies_between_no_correction_and_bonferronis(p):
+    adjusted = holm(p)
+    assert (adjusted >= p).all()
+    assert (adjusted <= np.minimum(len(p) * p, 1.0)).all()
+    assert (np.diff(adjusted[np.argsort(p, kind="stable")]) >= 0.0).all()
+
+
+@given(P_VALUES, st.floats(0.001, 0.2))
+def test_holm_rejects_what_the_closed_test_of_bonferroni_rejects(p, alpha):
+    """Each hypothesis falls when every intersection that holds it does: Holm's shortcut."""
+    p = p[:6]
+    closed = np.ones(len(p), dtype=bool)
+    for subset in range(1, 2 ** len(p)):
+        inside = np.array([bool(subset >> i & 1) for i in range(len(p))])
+        falls = inside.sum() * p[inside].min() <= alpha
+        closed[inside] &= falls
+    assert ((holm(p) <= alpha) == closed).all()
+
+
+@given(SEED, st.integers(1, 8), st.integers(3, 20))
+def test_a_bound_passes_its_edge_exactly_where_p_is_small(seed, m, n):
+    rng = np.random.default_rng(seed)
+    for finding in judge(statements(drawn(rng, rng.normal(0.0, 1.5, m), n))):
+        low, high = finding.interval
+        assert low <= finding.mean <= high
+        assert (low >= 0.0 or high <= 0.0) == (finding.p <= 0.05)
+        assert finding.holds == (True if low >= 0.0 else (False if high <= 0.0 else None))
+
+
+@given(SEED, st.integers(2, 8))
+def test_the_order_of_a_family_does_not_matter(seed, m):
+    rng = np.random.default_rng(seed)
+    samples = drawn(rng, rng.normal(0.0, 1.0, m), 12)
+    order = rng.permutation(m)
+    there = judge(statements(samples))
+    here = {finding.label: finding for finding in judge([statements(samples)[i] for i in order])}
+    for finding in there:
+        assert here[finding.label].interval == pytest.approx(finding.interval)
+        assert here[finding.label].p == pytest.approx(finding.p)
+
+
+@given(SEED, st.floats(1e-3, 1e3))
+def test_the_unit_of_the_sample_does_not_matter(seed, unit):
+    rng = np.random.default_rng(seed)
+    samples = drawn(rng, [0.0, 0.4, 2.0], 15)
+    for relation in ("above", "not above", "within"):
+        ours = judge(statements(samples, relation, 0.5))
+        theirs = judge(statements(samples * unit, relation, 0.5 * unit))
+        for one, other in zip(ours, theirs, strict=True):
+            assert other.holds is one.holds
+            assert np.array(other.interval) / unit == pytest.approx(one.interval, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "means",
+    [np.zeros(8), np.full(8, 5.0), [0.0, 0.0, 0.0, 0.0, 3.0, 3.0, 0.6, -0.6]],
+    ids=["nothing", "all large", "some"],
+)
+def test_all_intervals_of_a_family_hold_at_once_and_intervals_alone_do_not(means):
+    rng = np.random.default_rng(11)
+    runs, together, alone = 2000, 0, 0
+    for _ in range(runs):
+        findings = judge(statements(drawn(rng, means, 20)))
+        pairs = list(zip(findings, means, strict=True))
+        together += all(f.interval[0] <= mean <= f.interval[1] for f, mean in pairs)
+        alone += all(f.alone[0] <= mean <= f.alone[1] for f, mean in pairs)
+    error = math.sqrt(0.95 * 0.05 / runs)
+    assert together / runs >= 0.95 - 3.0 * error
+    assert alone / runs < 0.95 - 6.0 * error, "the control: without correction they fail"
+
+
+def test_holm_finds_what_bonferroni_misses():
+    rng = np.random.default_rng(5)
+    strong = list(drawn(rng, np.full(7, 4.0), 20))
+    weak = rng.normal(size=20)
+    weak = (weak - weak.mean()) / weak.std(ddof=1)
+    weak = weak + stats.t.ppf(1 - 0.025 / 3, 19) / math.sqrt(20)  # enough at 1/3, not at 1/8
+    *_, finding = judge(statements([*strong, weak]))
+    assert finding.holds is True
+    bonferroni = stats.t.ppf(1 - 0.025 / 8, 19) / math.sqrt(20)
+    assert weak.mean() - bonferroni < 0.0
+
+
+@given(SEED)
+def test_a_single_statement_of_nearness_is_two_one_sided_tests(seed):
+    rng = np.random.default_rng(seed)
+    sample = rng.normal(rng.uniform(-1.5, 1.5), 1.0, 12)
+    (finding,) = judge(statements([sample], "within", 1.0))
+    # In the family stand both opposites: beyond either margin.
+    inside = [
+        stats.ttest_1samp(sample, -1.0, alternative="greater").pvalue,
+        stats.ttest_1samp(sample, 1.0, alternative="less").pvalue,
+    ]
+    below = [inside[0], stats.ttest_1samp(sample, 1.0, alternative="greater").pvalue]
+    above = [inside[1], stats.ttest_1samp(sample, -1.0, alternative="less").pvalue]
+    rejected = [holm(np.array(pair)) <= 0.025 for pair in (below, above)]
+    near = bool(rejected[0][0] and rejected[1][0])
+    far = bool(rejected[0][1] or rejected[1][1])
+    assert finding.holds is (False if far else (True if near else None))
+
+
+def test_nearness_and_its_opposite_are_seen():
+    shape = np.linspace(-1.0, 1.0, 60)
+    near, far, between = judge(
+        [
+            *statements([shape + 0.2, shape + 3.0], "within", 1.0),
+            Statement(label="", sample=shape + 1.0, relation="within", margin=1.0),
+        ]
+    )
+    assert (near.holds, far.holds, between.holds) == (True, False, None)
+    assert -1.0 <= near.interval[0] < near.interval[1] <= 1.0
+    assert far.interval[0] >= 1.0
+
+
+def test_absence_is_claimed_only_where_presence_would_have_been_seen():
+    few, many = np.array([-1.0, 0.0, 1.0, 0.5]), np.linspace(-1.0, 1.0, 60)
+    assert [f.holds for f in judge(statements([few], "not above"))] == [None]
+    assert [f.holds for f in judge(statements([many], "not above"))] == [True]
+    assert [f.holds for f in judge(statements([many + 1.0], "not above"))] == [False]
+    # t(0.975 ** (1/1), 3) / 2 = 1.59 deviations could hide in four worlds.
+    assert stats.t.ppf(0.975, 3) / 2.0 > 1.0
+
+
+@pytest.mark.parametrize(
+    ("shift", "holds"), [(0.05, True), (-0.05, None), (1.0, False), (-1.0, False)]
+)
+def test_slightly_above_is_above_in_the_sample_and_not_significant(shift, holds):
+    sample = np.linspace(-1.0, 1.0, 60) + shift
+    assert judge(statements([sample], "slightly above"))[0].holds is holds
+
+
+@pytest.mark.parametrize("sample", [[], [1.0], [2.0, 2.0], [0.1 + 0.2] * 30])
+@pytest.mark.parametrize("relation", ["above", "not above", "slightly above", "within"])
+def test_what_has_no_spread_decides_nothing(sample, relation):
+    (finding,) = judge(statements([np.array(sample)], relation, 0.5))
+    assert finding.holds is None
+    assert finding.interval == (-math.inf, math.inf)
+    assert finding.alone == (-math.inf, math.inf)
+    assert finding.p == 1.0
+    assert finding.n == len(sample)
+
+
+def test_no_statements_no_findings():
+    assert judge([]) == ()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_number_that_is_not_finite_is_refused_by_name(bad):
+    with pytest.raises(ValueError, match="gain at 33°"):
+        judge([Statement(label="gain at 33°", sample=np.array([1.0, bad]))])
+
+
+def test_the_common_deviation_is_the_root_of_the_mean_variance():
+    rng = np.random.default_rng(2)
+    first, second = rng.normal(0, 3.0, 40), rng.normal(9, 4.0, 40)
+    expected = math.sqrt((first.var(ddof=1) + second.var(ddof=1)) / 2)
+    assert pooled_std(first, second) == pytest.approx(expected)
+    assert pooled_std(second, first) == pooled_std(first, second)
+
+
+@given(SEED)
+def test_pseudovalues_of_a_linear_statistic_are_its_values(seed):
+    rng = np.random.default_rng(seed)
+    curves, weights = rng.normal(size=(7, 5)), rng.normal(size=5)
+    values = pseudovalues(curves, lambda mean: mean @ weights)
+    assert values == pytest.approx(curves @ weights, abs=1e-12)
+
+
+def test_pseudovalues_free_a_square_of_its_bias_and_know_its_error():
+    """The square of a mean of n draws is too large by s^2/n: the jackknife takes off just that."""
+    sample = np.random.default_rng(4).normal(3.0, 1.0, (500, 1))
+    values = pseudovalues(sample, lambda mean: mean[:, 0] ** 2)
+    mean, variance = sample.mean(), sample.var(ddof=1)
+    assert values.mean() == pytest.approx(mean**2 - variance / 500, rel=1e-12)
+    # By the delta method the error is 2 |mean| s / sqrt(n), to relative order 1 / sqrt(n).
+    error = values.std(ddof=1) / math.sqrt(500)
+    assert error == pytest.approx(2 * mean * math.sqrt(variance / 500), rel=3 / math.sqrt(500))

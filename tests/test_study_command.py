@@ -1,0 +1,270 @@
+"""`pipistrelle study` as a person calls it: what it prints, what it refuses, how it ends."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipistrelle.__main__ import main
+from pipistrelle.experiments import study, world
+from pipistrelle.experiments.plan import read_plan
+from pipistrelle.experiments.store import done_worlds
+from pipistrelle.verbs import study as verb
+from reference.studies import SMALL, assert_same, results
+
+COMPILING = "Compiling kernels (once) ..."
+"""Said on a slow machine, or the first time."""
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("small.toml").write_text(SMALL)
+
+
+@pytest.fixture
+def obey(capsys):
+    """Run a command line in one process; return its status, what it printed and what it said."""
+
+    def obey(*words):
+        alone = () if {"--workers", "--scheduler"} & set(words) else ("--workers", "1")
+        status = main(["study", *map(str, words), *alone])
+        printed, said = capsys.readouterr()
+        lines = [line for line in said.splitlines(keepends=True) if line != COMPILING + "\n"]
+        return status, printed, "".join(lines)
+
+    return obey
+
+
+@pytest.fixture
+def failing(monkeypatch):
+    """Make each passive FastSLAM trial fail."""
+    run_trial = world.run_trial
+
+    def moody(case, drive, scans, config):
+        if (case.strategy, case.filter) == ("passive", "fastslam"):
+            raise FloatingPointError("weights: all zero")
+        return run_trial(case, drive, scans, config)
+
+    monkeypatch.setattr(world, "run_trial", moody)
+
+
+def test_a_study_tells_how_far_it_is_what_came_of_it_and_last_its_folder(obey):
+    status, printed, said = obey("small.toml", "-o", "one")
+    assert (status, printed) == (0, "3 worlds, 30 trials, 0 failed\none\n")
+    first, last = said.splitlines()
+    assert first == "0/3 worlds; trials: active 0/12, fused 0/12, passive 0/6"
+    assert re.fullmatch(
+        r"3/3 worlds, \d+\.\d trials/s, 0 s left; trials: active 12/12, fused 12/12, passive 6/6",
+        last,
+    )
+
+
+def test_the_same_command_again_goes_on_and_repeats_nothing(obey, monkeypatch):
+    obey("small.toml", "--iterations", "2", "-o", "one")
+    worlds = []
+    run_world = study.run_world
+    noted = lambda plan, iteration: (worlds.append(iteration), run_world(plan, iteration))[1]  # noqa: E731
+    monkeypatch.setattr(study, "run_world", noted)
+    assert obey("small.toml", "-o", "one")[1].startswith("3 worlds, 30 trials")
+    assert worlds == [2]
+
+
+def test_a_quiet_study_prints_its_folder_alone(obey):
+    assert obey("small.toml", "--iterations", "1", "--quiet", "-o", "one") == (0, "one\n", "")
+
+
+def test_without_a_name_the_folder_is_the_plans_so_that_the_same_command_goes_on(obey):
+    for _ in range(2):
+        assert obey("small.toml", "--iterations", "1", "--quiet") == (0, "runs/small\n", "")
+    assert done_worlds(Path("runs/small")) == {0}
+
+
+def test_two_workers_find_what_one_finds(obey):
+    obey("small.toml", "--quiet", "-o", "one")
+    assert obey("small.toml", "--quiet", "--workers", "2", "-o", "two") == (0, "two\n", "")
+    assert_same(results("one"), results("two"))
+
+
+def test_settings_are_laid_over_the_plan_and_kept_in_the_folder(obey, monkeypatch):
+    monkeypatch.setenv("PIPISTRELLE_RAYS__POWER", "4")
+    words = ("--iterations", "1", "--seed", "9", "--filter.gate", "0.99", "--quiet")
+    assert obey("small.toml", *words, "-o", "one")[0] == 0
+    config = read_plan(Path("one/plan.toml")).config
+    assert (config.seed, config.filter.gate, config.rays.power) == (9, 0.99, 4.0)
+    monkeypatch.delenv("PIPISTRELLE_RAYS__POWER")
+    assert obey("one/plan.toml", "--quiet", "-o", "one")[0] == 0
+    assert obey("one/plan.toml", "--quiet", "-o", "two")[0] == 0
+    assert_same(results("one"), results("two"))
+
+
+def test_failed_trials_are_counted_told_and_make_the_status_one(obey, failing, monkeypatch):
+    status, printed, said = obey("small.toml", "-o", "one")
+    assert (status, printed) == (1, "3 worlds, 30 trials, 3 failed\none\n")
+    assert "passive 6/6 (3 failed)" in said
+    assert said.splitlines()[-1] == (
+        "pipistrelle: warning: 3 of 30 trials failed, the first with: FloatingPointError: weights: "
+        "all zero; see the column error in one/trials; --retry-failed does their worlds again"
+    )
+    monkeypatch.undo()
+    monkeypatch.chdir(Path("one").absolute().parent) if Path("one").exists() else None
+
+
+def test_failed_trials_of_an_earlier_run_count_until_they_are_run_again(obey, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(world, "run_trial", None)
+        assert obey("small.toml", "--iterations", "1", "--quiet", "-o", "one")[0] == 1
+    assert obey("small.toml", "--iterations", "1", "--quiet", "-o", "one")[0] == 1
+    words = ("--iterations", "1", "--retry-failed", "-o", "one")
+    assert obey("small.toml", *words)[:2] == (0, "1 worlds, 10 trials, 0 failed\none\n")
+
+
+def test_on_a_terminal_bars_move(obey, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    status, _, said = obey("small.toml", "-o", "one")
+    assert status == 0
+    assert [word for word in ("worlds", "active", "fused", "passive") if word not in said] == []
+    assert "30 trials" not in said
+    assert "3/3, " in said
+
+
+def test_lines_are_seconds_apart_but_for_the_first_and_the_last(capsys, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(verb, "perf_counter", lambda: now[0])
+    show = verb._lines()
+    for done in range(101):
+        show(standing(done, 100))
+        now[0] += 1.0
+    told = re.findall(r"^(\d+)/100", capsys.readouterr().err, re.M)
+    assert [int(word) for word in told] == [*range(0, 100, 10), 100]
+
+
+def standing(done, worlds):
+    return study.Standing(
+        worlds=worlds,
+        done=done,
+        trials={"fused": 2 * worlds},
+        ended={"fused": 2 * done},
+        failed={"fused": 0},
+        first_error=None,
+    )
+
+
+def test_speed_and_time_left_are_those_since_the_study_went_on(monkeypatch):
+    now = [50.0]
+    monkeypatch.setattr(verb, "perf_counter", lambda: now[0])
+    pace = verb._pace()
+    assert pace(standing(40, 100)) == ""
+    now[0] += 10.0
+    assert pace(standing(50, 100)) == "2.0 trials/s, 50 s left"
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"), [(0.4, "0 s"), (99.0, "99 s"), (300.0, "5 min"), (7260.0, "2 h 1 min")]
+)
+def test_a_length_of_time_is_worded_in_the_unit_that_fits(seconds, words):
+    assert verb._span(seconds) == words
+
+
+# Mistakes
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("none.toml", "none.toml: found no such file; expected paper, or the path of a plan"),
+        ("small.toml --iterations 0", "--iterations: found 0, expected at least 1"),
+        ("small.toml --iterations 2.5", "--iterations: found '2.5', expected a whole number"),
+        ("small.toml --workers 0", "--workers: found 0, expected at least 1"),
+        ("small.toml --shard 4/4", "--shard: found '4/4', expected I/N with I from 0 to N - 1"),
+        ("small.toml --shard 1", "--shard: found '1', expected I/N"),
+        ("small.toml --shard -1/4", "--shard: found '-1/4', expected I/N"),
+        ("small.toml --shard 0/0", "--shard: found '0/0', expected I/N"),
+        ("small.toml --sharp 0/4", "Unknown option: --sharp. Did you mean --shard?"),
+        ("small.toml --emit pbs", 'Invalid value "pbs" for --emit'),
+        ("small.toml --emitter.radius 0.01", "--emitter.radius: the plan varies this setting"),
+        ("small.toml --rays.power 0", "--rays.power: found 0.0, expected greater than 0"),
+        ("small.toml --workers 2 --scheduler tcp://here:1", "--workers: the cluster at tcp://here"),
+        ("small.toml -o small.toml", "small.toml: could not be written (File exists)"),
+        ("small.toml -o .", "holds small.toml and no plan.toml"),
+    ],
+)
+def test_mistakes_are_said_in_a_line(obey, words, said):
+    status, printed, told = obey(*words.split())
+    assert (status, printed) == (2, "")
+    assert told.startswith("pipistrelle: error: ")
+    assert said in told
+    assert "Traceback" not in told
+
+
+def test_another_plan_is_refused_with_a_line_for_each_difference(obey):
+    obey("small.toml", "--iterations", "1", "--quiet", "-o", "one")
+    status, printed, said = obey("small.toml", "--seed", "8", "--rays.power", "3", "-o", "one")
+    assert (status, printed) == (2, "")
+    assert said.splitlines() == [
+        "pipistrelle: error: one/plan.toml: is the plan of another study; name a new folder with "
+        "-o DIR",
+        "pipistrelle: error:   config.seed: 7 there, 8 asked for",
+        "pipistrelle: error:   config.rays.power: 2.0 there, 3.0 asked for",
+    ]
+
+
+# Interrupts
+
+
+def test_an_interrupt_ends_with_130_and_keeps_what_is_done(obey, monkeypatch):
+    run_world = study.run_world
+
+    def interrupted(plan, iteration):
+        if iteration == 1:
+            raise KeyboardInterrupt
+        return run_world(plan, iteration)
+
+    monkeypatch.setattr(study, "run_world", interrupted)
+    status, printed, said = obey("small.toml", "-o", "one")
+    assert (status, printed) == (130, "")
+    assert said.splitlines()[-2:] == [
+        "one: worlds that are done are kept; the same command goes on with the rest",
+        "pipistrelle: interrupted",
+    ]
+    assert done_worlds(Path("one")) == {0}
+
+
+# Clusters
+
+
+def test_a_job_script_does_each_share_in_a_task_of_its_array(obey, monkeypatch):
+    monkeypatch.setenv("PIPISTRELLE_RAYS__RANGE_BOUNDS", "[0.5, 15]")
+    words = ("--seed", "4", "--iterations", "8", "--shard", "0/3", "--emit", "slurm")
+    status, printed, said = obey("small.toml", *words, "-o", "my study", "--workers", "2")
+    assert (status, said) == (0, "")
+    assert not Path("my study").exists()
+    lines = printed.splitlines()
+    assert lines[0] == "#!/bin/sh"
+    assert {"#SBATCH --array=0-2", "#SBATCH --cpus-per-task=2"} <= set(lines)
+    assert lines[-1].startswith("exec pipistrelle study ")
+
+
+def test_the_tasks_of_a_job_script_together_do_the_study(obey, monkeypatch):
+    words = ("small.toml", "--seed", "4", "--rays.range-bounds", "0.5", "15")
+    printed = obey(*words, "--shard", "0/2", "--emit", "slurm", "-o", "my study")[1]
+    Path("job.sh").write_text(printed)
+    Path("bin").mkdir()
+    name = Path("bin/pipistrelle")
+    name.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m pipistrelle "$@"\n')
+    name.chmod(0o755)
+    for task in range(2):
+        found = f"{Path('bin').absolute()}{os.pathsep}{os.environ['PATH']}"
+        environment = os.environ | {"SLURM_ARRAY_TASK_ID": str(task), "PATH": found}
+        subprocess.run(["sh", "job.sh"], check=True, env=environment, capture_output=True)
+    obey(*words, "--quiet", "-o", "whole")
+    assert_same(results("my study"), results("whole"))
+
+
+def test_a_job_script_of_the_papers_study_has_sixteen_tasks_unless_told_otherwise(obey):
+    printed = obey("--emit", "slurm")[1]
+    assert "#SBATCH --array=0-15\n" in printed
+    assert "exec pipistrelle study paper --iterations 115 " in printed
