@@ -67,7 +67,11 @@ def test_the_same_command_again_goes_on_and_repeats_nothing(obey, monkeypatch):
     obey("small.toml", "--iterations", "2", "-o", "one")
     worlds = []
     run_world = study.run_world
-    noted = lambda plan, iteration: (worlds.append(iteration), run_world(plan, iteration))[1]  # noqa: E731
+
+    def noted(plan, iteration):
+        worlds.append(iteration)
+        return run_world(plan, iteration)
+
     monkeypatch.setattr(study, "run_world", noted)
     assert obey("small.toml", "-o", "one")[1].startswith("3 worlds, 30 trials")
     assert worlds == [2]
@@ -101,7 +105,7 @@ def test_settings_are_laid_over_the_plan_and_kept_in_the_folder(obey, monkeypatc
     assert_same(results("one"), results("two"))
 
 
-def test_failed_trials_are_counted_told_and_make_the_status_one(obey, failing, monkeypatch):
+def test_failed_trials_are_counted_told_and_make_the_status_one(obey, failing):
     status, printed, said = obey("small.toml", "-o", "one")
     assert (status, printed) == (1, "3 worlds, 30 trials, 3 failed\none\n")
     assert "passive 6/6 (3 failed)" in said
@@ -109,8 +113,6 @@ def test_failed_trials_are_counted_told_and_make_the_status_one(obey, failing, m
         "pipistrelle: warning: 3 of 30 trials failed, the first with: FloatingPointError: weights: "
         "all zero; see the column error in one/trials; --retry-failed does their worlds again"
     )
-    monkeypatch.undo()
-    monkeypatch.chdir(Path("one").absolute().parent) if Path("one").exists() else None
 
 
 def test_failed_trials_of_an_earlier_run_count_until_they_are_run_again(obey, monkeypatch):
@@ -181,7 +183,7 @@ def test_a_length_of_time_is_worded_in_the_unit_that_fits(seconds, words):
         ("small.toml --workers 0", "--workers: found 0, expected at least 1"),
         ("small.toml --shard 4/4", "--shard: found '4/4', expected I/N with I from 0 to N - 1"),
         ("small.toml --shard 1", "--shard: found '1', expected I/N"),
-        ("small.toml --shard -1/4", "--shard: found '-1/4', expected I/N"),
+        ("small.toml --shard a/4", "--shard: found 'a/4', expected I/N"),
         ("small.toml --shard 0/0", "--shard: found '0/0', expected I/N"),
         ("small.toml --sharp 0/4", "Unknown option: --sharp. Did you mean --shard?"),
         ("small.toml --emit pbs", 'Invalid value "pbs" for --emit'),

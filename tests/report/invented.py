@@ -127,15 +127,18 @@ def only(study, ways):
     return replace(study, outcomes={way: study.outcomes[way] for way in ways})
 
 
-def write_store(folder: Path, study: Study, *, iterations=None, seed=3, failed=()):
+def write_store(folder: Path, study: Study, *, iterations=None, seed=3, failed=(), grid=""):
     """Write a study into a folder as `pipistrelle study` does.
 
-    `failed` holds pairs of a world's row and a case's number. Returns the plan and, by world and
+    `failed` holds pairs of a world's row and a case's number, `grid` further lines of the plan's
+    grid, each combination of which then holds the same results. Returns the plan and, by world and
     case, which landmarks are fully initialised and how far off each is (NaN: not in the map).
     """
     rng = np.random.default_rng(seed)
     text = folder.parent / f"{folder.name}.toml"
-    text.write_text(PLAN.format(iterations=iterations or len(study.worlds), radii=list(RADII)))
+    text.write_text(
+        PLAN.format(iterations=iterations or len(study.worlds), radii=list(RADII)) + grid
+    )
     plan = read_plan(text)
     open_store(folder, plan)
     schemas, cases = world_schemas(plan), cases_of(plan)
@@ -165,10 +168,10 @@ def world_tables_of(study, row, cases, broken, full, error):
         radius = case.values["emitter.radius"]
         column = 0 if radius is None else RADII[::-1].index(radius)
         outcome = study.outcomes[case.filter, case.strategy]
-        trial = head | {
+        trial = head | dict(case.values)
+        trial |= {
             "strategy": case.strategy,
             "filter": case.filter,
-            "emitter.radius": radius,
             "beamwidth_deg": None if radius is None else float(BEAMWIDTH[column]),
             "seed": study.config.seed,
             "status": "done",

@@ -126,7 +126,6 @@ def run_study(
     >>> standing.done, standing.ended
     (2, {'fused': 2})
     """
-    folder = folder.absolute()
     open_store(folder, plan)
     worlds = range(shard[0], plan.iterations, shard[1])
     done = done_worlds(folder).intersection(worlds)
@@ -141,7 +140,8 @@ def run_study(
             standing = _advanced(standing, outcomes)
     show = progress or (lambda _: None)
     show(standing)
-    task, give_up = partial(_work, folder, plan), partial(_give_up, folder, plan)
+    place = folder.absolute()
+    task, give_up = partial(_work, place, plan), partial(_give_up, place, plan)
     found: Results
     if executor is not None:
         found = (future.result() for _, future in _ended(executor, task, waiting, AHEAD))

@@ -131,7 +131,7 @@ def curves(
 def departure(nees: Float[np.ndarray, "m b k"]) -> Float[np.ndarray, " m"]:
     r"""How far ANEES is from that of a consistent filter, averaged over the beamwidths.
 
-    .. math:: T = \frac{1}{K} \sum_k \left| \ln(\bar\epsilon_k / 3) \right|
+    .. math:: T = \frac{1}{K} \sum_k \ln^2(\bar\epsilon_k / 3)
 
     Parameters
     ----------
@@ -140,7 +140,8 @@ def departure(nees: Float[np.ndarray, "m b k"]) -> Float[np.ndarray, " m"]:
     Returns
     -------
     (m)
-        Jackknife pseudo-values of T; of a single world, T itself.
+        Jackknife pseudo-values of T, which is smooth where the jackknife has to be; of a single
+        world, T itself.
 
     Notes
     -----
@@ -148,7 +149,7 @@ def departure(nees: Float[np.ndarray, "m b k"]) -> Float[np.ndarray, " m"]:
     """
 
     def statistic(mean: Float[np.ndarray, "j k"]) -> Float[np.ndarray, " j"]:
-        return np.mean(np.abs(np.log(mean / STATES)), axis=1)
+        return np.mean(np.square(np.log(mean / STATES)), axis=1)
 
     beams = range(nees.shape[1])
     if len(nees) < 2:

@@ -85,7 +85,7 @@ def consistency(study: Study, rule: Rule) -> list[Part]:
             if (name, strategy) != ("fastslam", "fused"):
                 swing.append(Statement(label=label, sample=mean @ fit[1]))
     titles = (
-        "EKF's ANEES is nearer to 3 than FastSLAM's: mean |ln(ANEES/3)|, the latter minus the "
+        "EKF's ANEES is nearer to 3 than FastSLAM's: mean ln²(ANEES/3), the latter minus the "
         "former, is above 0",
         "ANEES swings with the laps, low at each return to the start: its swing is above 0",
         "ANEES rises: its slope per lap is above 0",

@@ -98,7 +98,7 @@ def consistency(study: Study, rule: Rule = "world") -> list[dict[str, Any]]:
     -------
     list of dict
         Per case: worlds, time mean of ANEES, shares of time inside and above its 95 % bounds, and
-        the mean of abs(ln(ANEES / 3)).
+        the mean of ln(ANEES / 3) squared.
 
     Notes
     -----
@@ -123,7 +123,7 @@ def consistency(study: Study, rule: Rule = "world") -> list[dict[str, Any]]:
                     "bounds": [low, high],
                     "inside": float(np.mean((mean >= low) & (mean <= high))),
                     "above": float(np.mean(mean > high)),
-                    "departure": float(np.mean(np.abs(np.log(mean / STATES)))),
+                    "departure": float(np.mean(np.square(np.log(mean / STATES)))),
                 }
             )
     return rows
