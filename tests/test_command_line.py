@@ -104,7 +104,8 @@ def test_help_and_version_load_neither_numpy_nor_pydantic():
 def test_help_names_the_verbs(obey):
     status, printed, _ = obey("--help")
     assert status == 0
-    assert re.findall(r"^│ (\w+) ", printed, re.M) == ["config", "doctor", "run", "slam"]
+    verbs = ["config", "doctor", "report", "run", "slam", "study"]
+    assert re.findall(r"^│ (\w+) ", printed, re.M) == verbs
     assert obey()[1] == printed
 
 

@@ -12,6 +12,7 @@ import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from multiprocessing import active_children
 
@@ -245,15 +246,29 @@ def test_an_interrupt_stops_the_workers_and_keeps_what_is_done(plan, folder):
 
 def test_results_that_cannot_be_written_by_a_worker_end_the_study(plan, folder):
     def spoil():
-        for table in ("steps", "landmarks", "trials"):
-            for path in (folder / table).iterdir():
-                path.unlink()
-            (folder / table).rmdir()
-            (folder / table).write_text("no folder")
+        (folder / "steps").rename(folder / "taken")
+        (folder / "steps").write_text("no folder")
 
-    with pytest.raises(InputError, match=r"could not be written \(Not a directory\)"):
+    said = r"could not be written \((Not a directory|No such file or directory)\)"
+    with pytest.raises(InputError, match=said):
         run_study(plan, folder, workers=2, progress=after_first(spoil))
     assert active_children() == []
+
+
+class Elsewhere(ThreadPoolExecutor):
+    """Does all that is asked of it, on a disk of its own."""
+
+    def submit(self, task, iteration):
+        return super().submit(lost, iteration)
+
+
+def test_results_that_went_to_another_disk_are_missed(plan, folder, monkeypatch):
+    monkeypatch.setattr(study, "_advanced", lambda standing, _: replace(standing, done=1))
+    with (
+        Elsewhere(1) as executor,
+        pytest.raises(InputError, match="lacks worlds that are done; expected one folder for all"),
+    ):
+        run_study(plan, folder, executor=executor)
 
 
 # Dask

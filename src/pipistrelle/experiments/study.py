@@ -155,6 +155,10 @@ def run_study(
         for outcomes in found if waiting else ():
             standing = _advanced(standing, outcomes)
             show(standing)
+    if len(done_worlds(folder).intersection(worlds)) < standing.done:
+        raise InputError(
+            f"{folder}: lacks worlds that are done; expected one folder for all workers"
+        )
     return standing
 
 
@@ -203,15 +207,19 @@ def _give_up(folder: Path, plan: Plan, iteration: int) -> list[Outcome]:
 def _ended(executor: Executor, task: Task, waiting: deque[int], ahead: int) -> Iterator[Ended]:
     """Keep an executor busy; yield each world when it ended, and its future."""
     running: dict[Future[list[Outcome]], int] = {}
-    while running or (waiting and ahead):
-        try:
-            while waiting and len(running) < ahead:
-                running[executor.submit(task, waiting[0])] = waiting[0]
-                waiting.popleft()
-        except BrokenExecutor:
-            ahead = 0  # nothing more can be started; what runs is reported
-        for future in wait(running, return_when=FIRST_COMPLETED).done:
-            yield running.pop(future), future
+    try:
+        while running or (waiting and ahead):
+            try:
+                while waiting and len(running) < ahead:
+                    running[executor.submit(task, waiting[0])] = waiting[0]
+                    waiting.popleft()
+            except BrokenExecutor:
+                ahead = 0  # nothing more can be started; what runs is reported
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                yield running.pop(future), future
+    finally:
+        for future in running:
+            future.cancel()
 
 
 def _in_processes(task: Task, give_up: Task, waiting: deque[int], workers: int) -> Results:

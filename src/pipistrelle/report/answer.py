@@ -6,9 +6,9 @@ import numpy as np
 
 from pipistrelle.evaluation.comparison import Finding, judge
 from pipistrelle.figures.style import FILTER_NAMES
-from pipistrelle.report.claims import Claim
+from pipistrelle.report.claims import WITHOUT, Claim
 from pipistrelle.report.contrasts import differences
-from pipistrelle.report.outcomes import COMMON, Study, samples
+from pipistrelle.report.outcomes import COMMON, RULES, Rule, Study, samples
 from pipistrelle.report.published import beam_name
 
 NUMBERS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight")
@@ -16,6 +16,9 @@ NUMBERS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight
 
 def answer(study: Study, claims: Sequence[Claim]) -> list[str]:
     """Answer the question, then say what of the paper's claims is left.
+
+    Numbers leave diverged worlds out, as the paper does; where that bears on the answer, it is
+    given under every exclusion rule.
 
     Parameters
     ----------
@@ -27,31 +30,44 @@ def answer(study: Study, claims: Sequence[Claim]) -> list[str]:
     list of str
         A line that stands alone, then sentences.
     """
-    placed = {name: _findings(study, COMMON, name) for name in FILTER_NAMES}
-    located = {name: _findings(study, "position_rmse_m", name) for name in FILTER_NAMES}
+    placed, located = (_findings(study, "world", score) for score in (COMMON, "position_rmse_m"))
+    by_rule = {rule: _headline(study, rule) for rule in RULES}
     sentences = (
+        *_otherwise(by_rule),
         _counted(study),
         _compared("The landmarks that every strategy places are placed", placed),
         _compared("The vehicle is located", located),
+        _diverged(study),
         _tally(claims),
     )
-    return [_headline(study, placed), *(sentence for sentence in sentences if sentence)]
+    headline = by_rule["world"]
+    if len(set(by_rule.values())) > 1:
+        fuller = all(_fuller(study, rule) for rule in RULES)
+        headline = "It depends on which worlds are counted."
+        if fuller:
+            headline = "A fuller map, yes; a more accurate one depends on which worlds are counted."
+    return [headline, *(sentence for sentence in sentences if sentence)]
 
 
-def _findings(study: Study, score: str, name: str) -> list[Finding]:
-    """Judge active minus fused at each beamwidth, as a family of its own."""
-    pair = (name, "active"), (name, "fused")
-    return list(judge(differences(study, "world", score, *pair, name=name)))
+def _findings(study: Study, rule: Rule, score: str) -> dict[str, list[Finding]]:
+    """Judge active minus fused at each beamwidth, per filter, as a family of its own."""
+    return {
+        name: list(
+            judge(differences(study, rule, score, (name, "active"), (name, "fused"), name=name))
+        )
+        for name in FILTER_NAMES
+    }
 
 
-def _headline(study: Study, placed: dict[str, list[Finding]]) -> str:
+def _headline(study: Study, rule: Rule) -> str:
     """Answer in a line."""
+    placed = _findings(study, rule, COMMON)
     decided = [finding for mine in placed.values() for finding in mine if finding.n > 1]
     if not decided:
         return "Not decided yet: there are too few worlds, or no pair of active and fused."
     better = sum(finding.holds is True for finding in decided)
     worse = sum(finding.holds is False for finding in decided)
-    fuller = "a fuller map" if _fuller(study) else "not a fuller map"
+    fuller = "a fuller map" if _fuller(study, rule) else "not a fuller map"
     if better and not worse:
         narrow = all(_narrow(mine) for mine in placed.values())
         where = "where the beam is narrow" if narrow else "at some beamwidths"
@@ -69,15 +85,41 @@ def _narrow(findings: Sequence[Finding]) -> bool:
     return all(finding.holds is not True for finding in findings[len(findings) // 2 :])
 
 
-def _fuller(study: Study) -> bool:
+def _fuller(study: Study, rule: Rule) -> bool:
     """Tell whether fused places more landmarks than active on average at every beamwidth."""
     pairs = [
-        samples(study, "world", "landmarks_full", [(name, "fused", i), (name, "active", i)])
+        samples(study, rule, "landmarks_full", [(name, "fused", i), (name, "active", i)])
         for name in FILTER_NAMES
         if {(name, "fused"), (name, "active")} <= study.outcomes.keys()
         for i in range(len(study.beamwidth))
     ]
     return all(len(a) and np.mean(a) > np.mean(b) for a, b in pairs)
+
+
+def _otherwise(by_rule: dict[Rule, str]) -> list[str]:
+    """Give the answers under all exclusion rules, where they are not one."""
+    answers: dict[str, list[str]] = {}
+    for rule, answer in by_rule.items():
+        answers.setdefault(answer, []).append(WITHOUT[rule])
+    if len(answers) == 1:
+        return []
+    said = (" and ".join(rules) + f": {answer}" for answer, rules in answers.items())
+    return [line[0].upper() + line[1:] for line in said]
+
+
+def _diverged(study: Study) -> str:
+    """Say which strategies diverged how often."""
+    said = []
+    for name, label in FILTER_NAMES.items():
+        shares = {
+            way[1]: float(np.mean(outcome.diverged))
+            for way, outcome in study.outcomes.items()
+            if way[0] == name and outcome.diverged.any()
+        }
+        if shares:
+            parts = ", ".join(f"{way} in {100.0 * share:.1f} %" for way, share in shares.items())
+            said.append(f"with {label} {parts}")
+    return f"The filter diverged, of the trials, {'; '.join(said)}." if said else ""
 
 
 def _counted(study: Study) -> str:

@@ -155,7 +155,7 @@ def landmarks(study: Study, rule: Rule) -> Chart:
             name=f"{way[1]}, total", role=way[1], x=study.beamwidth, y=np.array(total), dashed=True
         )
         found.setdefault(way[0], []).extend([_moment_line(study, way, "full", full), line])
-    vertical = linear_axis("landmarks", ends(s for mine in found.values() for s in mine), floor=0)
+    vertical = linear_axis("landmarks", ends(s for mine in found.values() for s in mine), floor=0.0)
     return Chart(
         name="landmarks",
         title="Landmarks initialised",

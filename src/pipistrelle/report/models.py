@@ -1,5 +1,7 @@
 """Charts of what a study is made of: the emitter's beams and one of the worlds."""
 
+import math
+
 import numpy as np
 from jaxtyping import Float
 
@@ -122,7 +124,7 @@ def _protractor() -> list[Series]:
     """Return the rings of a beam pattern, its spokes and their names."""
     angle = np.radians(np.linspace(-90.0, 90.0, 181))
     spokes = np.radians(np.linspace(-90.0, 90.0, 7))
-    rings = (0.5, np.sqrt(0.5), 1.0)
+    rings = (0.5, math.sqrt(0.5), 1.0)
     arcs = [(ring * np.sin(angle), ring * np.cos(angle), ring < 1.0) for ring in rings]
     lines = [(np.array([0.0, np.sin(s)]), np.array([0.0, np.cos(s)]), False) for s in spokes]
     names = [f"{abs(degrees):.0f}°" for degrees in np.degrees(spokes)]

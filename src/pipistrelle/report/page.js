@@ -8,14 +8,11 @@
     lit = null;
     readout.hidden = true;
   };
-  const show = (tip) => {
-    if (lit === tip) return;
-    hide();
-    lit = tip;
-    tip.classList.add("on");
-    readout.textContent = tip.dataset.tip;
-    readout.hidden = false;
-    const at = tip.getBoundingClientRect(), box = readout.getBoundingClientRect();
+  const place = () => {
+    if (!lit) return;
+    const at = lit.getBoundingClientRect();
+    readout.hidden = at.bottom < 0 || at.top > innerHeight;
+    const box = readout.getBoundingClientRect();
     const wide = document.documentElement.clientWidth, room = 8;
     let left = at.right + room;
     if (left + box.width > wide - room) left = at.left - box.width - room;
@@ -23,6 +20,14 @@
     const top = Math.max(room, Math.min(at.top, innerHeight - box.height - room));
     readout.style.left = `${left}px`;
     readout.style.top = `${top}px`;
+  };
+  const show = (tip) => {
+    if (lit === tip) return;
+    hide();
+    lit = tip;
+    tip.classList.add("on");
+    readout.textContent = tip.dataset.tip;
+    place();
   };
   for (const svg of document.querySelectorAll("svg.panel")) {
     const tips = [...svg.querySelectorAll(".tip")];
@@ -48,5 +53,5 @@
       show(tips[from < 0 ? (step > 0 ? 0 : tips.length - 1) : (from + step + tips.length) % tips.length]);
     });
   }
-  addEventListener("scroll", hide, { passive: true });
+  addEventListener("scroll", place, { passive: true });
 })();

@@ -16,6 +16,7 @@ from typing import Any
 from markupsafe import Markup
 
 from pipistrelle import __version__
+from pipistrelle.config import InputError
 from pipistrelle.evaluation.comparison import Finding
 from pipistrelle.experiments.folder import write_file
 from pipistrelle.figures.chart import Chart, Panel, csv_rows, csv_text
@@ -67,10 +68,16 @@ def write_report(
     study, claims = studies[0], judged[0]
     found = {rule: study_charts(study, rule) for rule in RULES}
     models = model_charts(study)
-    (folder / "figures").mkdir(parents=True, exist_ok=True)
-    for chart in [*found["world"], *models]:
-        progress(chart.name)
-        _write_figure(chart, folder / "figures")
+    try:
+        (folder / "figures").mkdir(parents=True, exist_ok=True)
+        for chart in [*found["world"], *models]:
+            progress(chart.name)
+            _write_figure(chart, folder / "figures")
+    except OSError as error:
+        raise InputError(
+            f"{error.filename or folder}: could not be written ({error.strerror}); "
+            "make room or choose another folder with -o DIR"
+        ) from error
     for name, text in _numbers(study, found, models).items():
         write_file(folder / "figures" / f"{name}.csv", text)
     summary = _summary(studies, judged)
@@ -243,11 +250,15 @@ def _shown(finding: Finding, unit: str) -> dict[str, str]:
     """Word a finding in the unit that a reader expects."""
     factor, sign = UNITS[unit]
     end = f" {sign}" if sign not in ("", "°") else sign
-    low, high = (figure(factor * bound) for bound in finding.interval)
+    edges = {finding.margin, -finding.margin} if finding.relation == "within" else {finding.margin}
+    low, high = finding.interval
+    words = (
+        ("above " if low in edges else "") + figure(factor * low),
+        ("below " if high in edges else "") + figure(factor * high),
+    )
+    margin = figure(factor * finding.margin) + (end if finding.margin else "")
     return {
         "mean": figure(factor * finding.mean) + end if finding.n else "none",
-        "interval": f"{low} to {high}",
-        "margin": f"± {figure(factor * finding.margin)}{end}"
-        if finding.relation == "within"
-        else (figure(factor * finding.margin) + end if finding.margin else "0"),
+        "interval": " to ".join(words),
+        "margin": f"± {margin}" if finding.relation == "within" else margin,
     }

@@ -146,22 +146,22 @@ def _frame(panel: Panel) -> _Frame:
 
 
 def _across(frame: _Frame, values: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-    return frame.left + _share(frame.panel.x, values) * (frame.right - frame.left)
+    return np.asarray(frame.left + _share(frame.panel.x, values) * (frame.right - frame.left))
 
 
 def _down(frame: _Frame, values: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
     share = np.clip(_share(frame.panel.y, values), 0.0, 1.0)
-    return frame.bottom - share * (frame.bottom - frame.top)
+    return np.asarray(frame.bottom - share * (frame.bottom - frame.top))
 
 
-def _share(axis: Axis, values: Float[np.ndarray, " n"] | float) -> Float[np.ndarray, " n"]:
+def _share(axis: Axis, values: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
     """Return how far along an axis values stand; NaN stays NaN."""
     low, high = axis.limits
     numbers = np.asarray(values, dtype=np.float64)
     if axis.log:
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.log(numbers / low) / math.log(high / low)
-    return (numbers - low) / (high - low)
+            return np.asarray(np.log(numbers / low) / math.log(high / low))
+    return np.asarray((numbers - low) / (high - low))
 
 
 def _grid(panel: Panel, frame: _Frame) -> list[Markup]:

@@ -1,0 +1,83 @@
+"""The answer in words follows the numbers."""
+
+import numpy as np
+
+from pipistrelle.report.answer import answer
+from pipistrelle.report.claims import judge_claims
+from pipistrelle.report.outcomes import COMMON
+from report.invented import BEAMWIDTH, changed, invent, only
+
+
+def told(study):
+    return answer(study, judge_claims(study))
+
+
+def with_map(study, change):
+    for name in ("ekf", "fastslam"):
+        active = study.outcomes[name, "active"].scores[COMMON]
+        study = changed(study, (name, "fused"), COMMON, lambda _, now=active: now + change)
+    return study
+
+
+def jitter(size):
+    return size * np.linspace(-1.0, 1.0, 60)[:, None]
+
+
+def test_a_more_accurate_map_at_narrow_beams_is_said_so():
+    gain = np.where(BEAMWIDTH < 30.0, -0.3, 0.0)
+    headline, counted, placed, located, tally = told(with_map(invent(60), gain + jitter(0.1)))
+    assert headline == "Yes: a fuller map, and a more accurate one where the beam is narrow."
+    assert "30 instead of 20 at 11° and 38 instead of 36 at 180°" in counted
+    assert "with EKF better at 5 of 12 beamwidths (11° to 27°)" in placed
+    assert located.startswith("The vehicle is located")
+    assert tally.startswith("Of the paper's eight claims,")
+
+
+def test_the_other_answers():
+    study = invent(60)
+    cases = {
+        "Yes: a fuller map, and a more accurate one at every beamwidth.": np.full(12, -0.3),
+        "It builds a fuller map, and a less accurate one.": np.full(12, 0.3),
+        "Yes: a fuller map, and a more accurate one at some beamwidths.": -0.3
+        * (BEAMWIDTH > 100.0),
+        "It depends: a fuller map, at some beamwidths more accurate, at others less.": 0.3
+        * np.sign(BEAMWIDTH - 50.0),
+        "It builds a fuller map; that it is more accurate, or less, is not seen.": np.zeros(12),
+    }
+    for headline, change in cases.items():
+        assert told(with_map(study, change + jitter(0.1)))[0] == headline
+
+
+def test_runs_of_beamwidths_are_named_by_their_ends():
+    change = np.where(np.isin(np.arange(12), [0, 1, 2, 5]), -0.3, 0.0)
+    placed = told(with_map(invent(60), change + jitter(0.1)))[2]
+    assert "better at 4 of 12 beamwidths (11° to 18°, 33°)" in placed
+
+
+def test_a_map_that_is_not_fuller_is_not_called_so():
+    study = changed(invent(60), ("ekf", "active"), "landmarks_full", lambda count: count + 30.0)
+    assert told(study)[0].startswith("It builds not a fuller map")
+
+
+def test_nothing_is_answered_before_there_are_worlds_or_cases():
+    assert told(invent(1))[0].startswith("Not decided yet")
+    assert told(only(invent(5), [("ekf", "passive")]))[0].startswith("Not decided yet")
+
+
+def test_an_answer_that_hangs_on_what_is_left_out_is_given_both_ways():
+    study = with_map(invent(60), np.full(12, -0.3) + jitter(0.1))
+    for name in ("ekf", "fastslam"):
+        spoilt = np.where(np.arange(60) < 20, 3.0, 0.0)[:, None]
+        study = changed(study, (name, "fused"), COMMON, lambda error, more=spoilt: error + more)
+        study.outcomes[name, "fused"].diverged[:20] = True
+    headline, without, within, _, _, _, diverged, _ = told(study)
+    assert headline == "A fuller map, yes; a more accurate one depends on which worlds are counted."
+    assert without == (
+        "Without diverged worlds and without diverged cases: "
+        "Yes: a fuller map, and a more accurate one at every beamwidth."
+    )
+    assert within == "With everything: It builds a fuller map, and a less accurate one."
+    assert diverged == (
+        "The filter diverged, of the trials, with EKF fused in 33.3 %; "
+        "with FastSLAM 2.0 fused in 33.3 %."
+    )
