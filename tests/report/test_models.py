@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -38,3 +40,10 @@ def test_the_map_is_the_world_that_the_study_heard(charts):
     np.testing.assert_array_equal(series["true path"].y, world.path[:, 1])
     assert (series["beacon"].x[0], series["beacon"].y[0]) == tuple(world.beacon)
     assert len(series["landmark"].tips) == 50
+
+
+def test_a_world_that_cannot_be_drawn_is_left_out():
+    study = invent(2)
+    setup = study.config.scenario.model_copy(update={"landmarks": 50_000})
+    crowded = replace(study, config=study.config.model_copy(update={"scenario": setup}))
+    assert [chart.name for chart in model_charts(crowded)] == ["piston"]

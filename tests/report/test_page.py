@@ -193,6 +193,16 @@ def test_the_summary_is_plain_json_even_of_a_study_that_diverged(tmp_path, undra
     read(tmp_path)
 
 
+def test_a_rule_that_leaves_no_world_says_so_and_the_others_are_shown(tmp_path, undrawn):
+    study = invent(3)
+    for way, outcome in study.outcomes.items():
+        outcome.diverged[:] = way[0] == "ekf"
+    write_report((study,), tmp_path)
+    text = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert text.count("No world is left under this rule.") == 2
+    assert (tmp_path / "figures" / "anees_ekf.csv").read_text().count("none,") > 0
+
+
 def test_table_ii_as_csv_has_the_papers_rows_under_each_rule(reported):
     with (reported / "figures" / "table_ii.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))

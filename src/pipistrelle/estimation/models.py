@@ -139,6 +139,7 @@ class Swarm(Protocol):
 B = TypeVar("B", bound=Belief)
 
 
+@runtime_checkable
 class Estimator(Protocol[B]):
     """A SLAM filter: a frozen record of its settings, with beliefs going in and coming out."""
 

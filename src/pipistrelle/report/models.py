@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from pipistrelle.acoustics.emitter import HALF_POWER, piston_directivity, piston_radius
 from pipistrelle.arrays.noise import stream_key
+from pipistrelle.config import InputError
 from pipistrelle.experiments.scenario import Scenario, draw_scenario
 from pipistrelle.figures.chart import Axis, Chart, Panel, Series
 from pipistrelle.report.outcomes import Study
@@ -23,8 +24,12 @@ def model_charts(study: Study) -> list[Chart]:
     Returns
     -------
     list of Chart
+        Without the map where the world cannot be drawn.
     """
-    return [piston(study), example_map(study)]
+    try:
+        return [piston(study), example_map(study)]
+    except InputError:
+        return [piston(study)]
 
 
 def piston(study: Study) -> Chart:

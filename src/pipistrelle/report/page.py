@@ -7,7 +7,7 @@ through the template's escaping. The same folder gives the same bytes.
 import json
 import math
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 from pathlib import Path
@@ -70,7 +70,7 @@ def write_report(
     models = model_charts(study)
     try:
         (folder / "figures").mkdir(parents=True, exist_ok=True)
-        for chart in [*found["world"], *models]:
+        for chart in [*_distinct(found), *models]:
             progress(chart.name)
             _write_figure(chart, folder / "figures")
     except OSError as error:
@@ -117,13 +117,12 @@ def page(
     )
     environment.filters |= {"number": figure, "p": _p, "finding": _shown}
     template = environment.from_string((here / "page.html").read_text(encoding="utf-8"))
-    names = [chart.name for chart in found["world"]]
     return template.render(
         study=study,
         claims=claims,
         summary=summary,
-        figures=[_figure(name, found) for name in names],
-        models=[_figure(chart.name, {"world": [chart]}) for chart in models],
+        figures=[_figure(chart.name, found) for chart in _distinct(found)],
+        models=[_figure(chart.name, {"always": [chart]}) for chart in models],
         style=Markup((here / "page.css").read_text(encoding="utf-8")),
         script=Markup((here / "page.js").read_text(encoding="utf-8")),
         colours=STRATEGY_COLOURS,
@@ -138,17 +137,22 @@ def page(
     )
 
 
-def _figure(name: str, found: dict[Rule, list[Chart]]) -> dict[str, Any]:
-    """Gather one figure under all exclusion rules."""
+def _distinct(found: Mapping[Any, list[Chart]]) -> list[Chart]:
+    """Return each figure once: under the first rule under which there is one."""
+    charts: dict[str, Chart] = {}
+    for mine in found.values():
+        for chart in mine:
+            charts.setdefault(chart.name, chart)
+    return list(charts.values())
+
+
+def _figure(name: str, found: Mapping[Any, list[Chart]]) -> dict[str, Any]:
+    """Gather one figure under all exclusion rules; None under those that leave nothing."""
     named = {rule: chart for rule, mine in found.items() for chart in mine if chart.name == name}
-    by_rule = {
-        rule: {
-            "chart": chart,
-            "panels": [_panel(panel) for panel in chart.panels],
-            "legend": legend(chart.panels),
-        }
-        for rule, chart in named.items()
-    }
+    by_rule: dict[str, dict[str, Any] | None] = dict.fromkeys(found)
+    for rule, chart in named.items():
+        panels = [_panel(panel) for panel in chart.panels]
+        by_rule[rule] = {"chart": chart, "panels": panels, "legend": legend(chart.panels)}
     first = next(iter(named.values()))
     return {"name": name, "title": first.title, "by_rule": by_rule, "count": len(first.panels)}
 
@@ -171,7 +175,7 @@ def _write_figure(chart: Chart, folder: Path) -> None:
 def _numbers(study: Study, found: dict[Rule, list[Chart]], models: list[Chart]) -> dict[str, str]:
     """Write the numbers behind each figure, under all exclusion rules."""
     texts = {chart.name: csv_text(csv_rows(chart)) for chart in models}
-    for chart in found["world"]:
+    for chart in _distinct(found):
         rows: list[list[str]] = []
         for rule, mine in found.items():
             for other in mine:
