@@ -1,5 +1,6 @@
 import json
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -395,11 +396,7 @@ def test_earlier_results_and_logs_outlive_a_mission_that_comes_to_nothing(
     again = (*words, "--seed", "9", "--overwrite")
     if room == "experiments":
         again += ("--save-log", "log")
-    if trouble is KeyboardInterrupt:
-        assert obey(*again)[0] == 130
-    else:
-        with pytest.raises(trouble):
-            obey(*again)
+    assert obey(*again)[0] == (130 if trouble is KeyboardInterrupt else 2)
     assert contents("one") == results
     assert contents("log") == log
 
@@ -561,3 +558,29 @@ def test_the_doctor_names_a_missing_library_with_its_fix(obey, monkeypatch):
     printed = obey("doctor")[1]
     assert "nosuchthing       not found; python -m pip install 'nosuchthing>=2; x'" in printed
     assert "PIPISTRELLE_DATA  not set" in printed
+
+
+def test_a_drive_that_no_memory_holds_is_refused_in_a_line(refused, tmp_path):
+    assert "not enough memory" in refused("run", "--duration", "1e12", "-o", tmp_path / "results")
+    assert not (tmp_path / "results").exists()
+
+
+def test_a_full_disk_behind_the_output_is_said_in_a_line():
+    if not Path("/dev/full").exists():
+        pytest.skip("needs /dev/full")
+    with Path("/dev/full").open("w") as full:
+        command = [sys.executable, "-m", "pipistrelle", "config", "show"]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("pipistrelle: error: the output could not be written")
+    assert "Traceback" not in done.stderr
+
+
+def test_a_truth_that_covers_part_of_the_path_is_said_in_a_line(obey, tmp_path):
+    log = tmp_path / "log"
+    shutil.copytree(Path(__file__).parent / "data" / "unicycle_log", log)
+    rows = (log / "truth.csv").read_text().splitlines()
+    (log / "truth.csv").write_text("\n".join(rows[:12]))
+    status, _, said = obey("slam", log, "-o", tmp_path / "results")
+    assert status == 0
+    assert "the truth covers 5 of 20 steps" in said

@@ -7,6 +7,7 @@ is kept. A traceback is always a bug of ours.
 import os
 import sys
 from collections.abc import Sequence
+from errno import ENOSPC
 from itertools import zip_longest
 
 from cyclopts import App, CycloptsError
@@ -90,14 +91,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     try:
         status = app(_completed(sys.argv[1:] if arguments is None else arguments)) or 0
-        sys.stdout.flush()
+        if sys.stdout is not None:
+            sys.stdout.flush()
     except KeyboardInterrupt:
         print("pipistrelle: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of our output has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except (CycloptsError, OSError, ValueError) as error:
+    except (CycloptsError, OSError, ValueError, MemoryError) as error:
         message = _explained(error)
         if message is None:
             raise
@@ -120,8 +122,13 @@ def _explained(error: Exception) -> str | None:
     """Word a user's mistake; None for a bug."""
     from pipistrelle.config import InputError
 
-    if isinstance(error, OSError):
-        return f"{error.filename}: {error.strerror}" if error.filename else None
+    if isinstance(error, MemoryError):
+        return f"not enough memory ({error}); ask for fewer steps, landmarks or particles"
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    if isinstance(error, OSError) and error.errno == ENOSPC:  # a full disk behind our output
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return f"the output could not be written: {error.strerror}"
     return str(error) if isinstance(error, (CycloptsError, InputError)) else None
 
 

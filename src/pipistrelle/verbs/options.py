@@ -291,7 +291,8 @@ def _steps(duration: float, config: Config) -> int:
     frame = scenario.step * scenario.steps_per_frame
     if not frame <= duration < float("inf"):
         raise InputError(
-            f"--duration: found {duration:g}, expected at least one frame ({frame:g} s)"
+            f"--duration: found {duration:g}, expected at least one frame ({frame:g} s), "
+            "in finite time"
         )
     return round(duration / scenario.step)
 

@@ -24,6 +24,7 @@ from pipistrelle.verbs.options import (
 
 if TYPE_CHECKING:
     from pipistrelle.detection.logs import Log
+    from pipistrelle.experiments.replay import Truth
 
 GATE = 0.999
 """Share of a measurement's predicted distribution that is accepted of real logs."""
@@ -110,6 +111,7 @@ def slam(
     recorded, truth = load(log, robot)
     settled = _with_log(layer, recorded, log)
     _warn_of_ignored_rows(recorded, log)
+    _warn_of_partial_truth(truth, log)
     with outcome.result_folder(output, "slam") as folder:
         outcome.compile_once(output)
         watch = outcome.recorder(output)
@@ -158,6 +160,19 @@ def _with_log(layer: Layer, recorded: "Log", log: Path) -> Config:
             where = layer[section, name].where
             say(f"pipistrelle: warning: {where}: the log decides this, and says {value}")
     return settled
+
+
+def _warn_of_partial_truth(truth: "Truth | None", log: Path) -> None:
+    """Say how much of the path can be scored, where it is not all of it."""
+    if truth is None or truth.path is None:
+        return
+    steps = len(truth.time) - 1
+    known = sum(1 for pose in truth.path[1:] if pose[0] == pose[0])
+    if known < steps:
+        say(
+            f"pipistrelle: warning: {log}: the truth covers {known} of {steps} steps; only these "
+            "are scored"
+        )
 
 
 def _warn_of_ignored_rows(recorded: "Log", log: Path) -> None:
