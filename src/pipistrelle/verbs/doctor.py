@@ -22,7 +22,7 @@ def _findings() -> Iterator[tuple[str, str]]:
     yield "python", f"{sys.version.split()[0]} ({sys.executable})"
     yield "pipistrelle", f"{pipistrelle.__version__} ({Path(pipistrelle.__file__).parent})"
     yield from _libraries()
-    yield "cores", str(_cores())
+    yield "cores", str(cores())
     yield "kernel cache", _kernel_cache()
     yield "ffmpeg", shutil.which("ffmpeg") or "not found; --animate mp4 needs it, gif does not"
     yield "PIPISTRELLE_DATA", _data(os.environ.get("PIPISTRELLE_DATA"))
@@ -45,7 +45,7 @@ def _libraries() -> Iterator[tuple[str, str]]:
             yield name, f"not found; python -m pip install '{requirement}'"
 
 
-def _cores() -> int:
+def cores() -> int:
     """Count the cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))

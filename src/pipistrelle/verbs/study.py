@@ -1,6 +1,5 @@
 """`pipistrelle study`: many worlds, and in each all that a plan varies."""
 
-import os
 import shlex
 import sys
 from collections.abc import Callable, Iterator
@@ -14,6 +13,7 @@ from cyclopts import Parameter
 from pipistrelle.config import InputError
 from pipistrelle.settings import Layer
 from pipistrelle.verbs.console import announced, say
+from pipistrelle.verbs.doctor import cores
 from pipistrelle.verbs.options import SettingFlags, Whole, layers
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def study(
             standing = run_study(
                 tried,
                 folder,
-                workers=workers or _cores(),
+                workers=workers or cores(),
                 shard=share,
                 scheduler=scheduler,
                 retry_failed=retry_failed,
@@ -132,13 +132,6 @@ def _share(text: str | None) -> tuple[int, int]:
     if slash and i.isdecimal() and n.isdecimal() and int(i) < int(n):
         return int(i), int(n)
     raise InputError(f"--shard: found {text!r}, expected I/N with I from 0 to N - 1, as in 0/4")
-
-
-def _cores() -> int:
-    """Count the cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _command(word: str, plan: "Plan", layer: Layer) -> str:
