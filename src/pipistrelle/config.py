@@ -88,7 +88,7 @@ class EmitterConfig(Section):
     """[Hz]"""
     radius: Positive = 0.0088
     """Radius of the piston [m]; 8.8 mm makes a half-power beamwidth of 33 degrees."""
-    level_db: float = 49.0
+    level_db: float = 49.7
     """Source level on the axis at 1 m [dB]; unreported, fitted."""
     pulse: Positive = 2.8e-3
     """Length of the call, of the beacon's too [s]; unreported."""
@@ -99,7 +99,7 @@ class BeaconConfig(Section):
 
     frequency: Positive = 30e3
     """[Hz]"""
-    level_db: float = 43.5
+    level_db: float = 42.8
     """Source level at 1 m [dB]; unreported, fitted."""
 
 
@@ -179,7 +179,7 @@ class RayConfig(Section):
     """Ratio of two successive ranges (beta)."""
     range_bounds: tuple[Positive, Positive] = (0.5, 20.0)
     """Nearest and farthest range covered [m]."""
-    prune: Annotated[float, Field(ge=0, lt=1)] = 5e-6
+    prune: Annotated[float, Field(ge=0, lt=1)] = 1e-5
     """Members whose aggregated likelihood falls below this over their number are pruned (tau)."""
     power: Positive = 2.0
     """Sharpening of the weights that share a measurement (n)."""

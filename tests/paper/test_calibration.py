@@ -1,0 +1,81 @@
+"""What was fitted is what is used, and was fitted to what may be fitted, on worlds of its own."""
+
+import importlib.util
+import tomllib
+from importlib.resources import files
+from pathlib import Path
+from statistics import fmean
+
+import pytest
+
+from pipistrelle.config import Config
+from pipistrelle.experiments.plan import find_plan, read_plan
+from pipistrelle.report.published import TABLE_II
+
+SCRIPT = Path(__file__).parents[2] / "papers/bradley_abaid/calibration.py"
+PAPER = {(row.filter, round(row.beamwidth)): row for row in TABLE_II}
+
+
+@pytest.fixture(scope="module")
+def found() -> dict:
+    text = files("pipistrelle.experiments").joinpath("paper_calibration.toml").read_text()
+    return tomllib.loads(text)
+
+
+def value(config: Config, name: str) -> float:
+    section, field = name.split(".")
+    return getattr(getattr(config, section), field)
+
+
+def test_the_fitted_values_are_those_of_the_papers_study_and_the_defaults(found):
+    assert len(found["fitted"]) == 4
+    for name, fitted in found["fitted"].items():
+        assert value(read_plan(find_plan("paper")).config, name) == fitted
+        assert value(Config(), name) == fitted
+
+
+def test_the_worlds_of_the_fit_are_not_those_of_the_study(found):
+    assert found["worlds"]["seed"] != read_plan(find_plan("paper")).config.seed
+
+
+def test_only_three_numbers_of_table_ii_were_fitted_to(found):
+    assert {name: fit["paper"] for name, fit in found["fitted_to"].items()} == {
+        "fused 180": PAPER["ekf", 180].total[0],
+        "passive": PAPER["ekf", 0].total[0],
+        "passive, fully initialised": PAPER["ekf", 0].full[0],
+    }
+
+
+def test_the_fit_meets_them_within_two_standard_errors(found):
+    for fit in found["fitted_to"].values():
+        assert abs(fit["ours"] - fit["paper"]) < 2 * fit["standard_error"]
+
+
+def test_active_sensing_sees_no_more_than_the_papers_claims_allow(found):
+    assert round(found["landmarks_seen_predicted"]["active 180"]["ours"]) <= 36
+
+
+def test_the_power_is_the_least_above_one_that_reaches_the_papers_count(found):
+    grid = found["prunes_tried"]
+    assert grid == sorted(grid)
+    for row in found["rays_tried"]:
+        counts = row["landmarks_full_at_every_prune"]
+        nearest = min(counts, key=lambda count: abs(count - PAPER["ekf", 0].full[0]))
+        assert row["prune"] == grid[counts.index(nearest)]
+    least = min(row["power"] for row in found["rays_tried"] if row["power"] > 1)
+    assert found["fitted"]["rays.power"] == least
+
+
+@pytest.mark.slow
+def test_some_of_its_worlds_heard_again_see_as_many_landmarks(found):
+    spec = importlib.util.spec_from_file_location("calibration", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    calibration = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(calibration)
+    worlds, config = 12, Config(seed=found["worlds"]["seed"])
+    seen = [calibration.landmarks_seen(config, ("180", "11"), world) for world in range(worlds)]
+    for name in ("fused 180", "passive"):
+        fit = found["fitted_to"][name]
+        error = fit["standard_error"] * (found["worlds"]["count"] / worlds) ** 0.5
+        assert abs(fmean(row[name] for row in seen) - fit["ours"]) < 4 * error
