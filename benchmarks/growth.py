@@ -1,0 +1,87 @@
+"""How cost grows: frames with echoes, filters with landmarks, memory with worlds.
+
+python -m benchmarks.growth     # CPU time at several sizes as JSON
+"""
+
+import json
+import time
+from statistics import median
+
+import numpy as np
+
+from benchmarks.machine import answer
+from benchmarks.promises import row
+from benchmarks.study import command_slice
+from benchmarks.table import Row
+
+LANDMARKS = (10, 25, 50, 100, 200)
+WORLDS = (2, 6)
+COMMAND = "./dev bench --only growth --scaling"
+ROWS = {
+    "frame_exponent_in_echoes": ("echoes", "frame_s", "ms a frame"),
+    "ekf_exponent_in_landmarks": ("size", "ekf_s", "ms a mission"),
+    "fastslam_exponent_in_landmarks": ("landmarks", "fastslam_s", "ms a mission"),
+}
+"""What is drawn against what."""
+
+
+def measure() -> tuple[list[Row], list[float]]:
+    """Time growing worlds in a process of their own: the rows."""
+    points = answer("-m", "benchmarks.growth")["points"]
+    rows = [_exponent(name, points) for name in ROWS]
+    few, many = (command_slice(worlds, 1).peak / 1e6 for worlds in WORLDS)
+    note = f"peak of {WORLDS[1]} worlds ({many:.0f} MB) less that of {WORLDS[0]} ({few:.0f} MB)"
+    return [*rows, row("memory_growth_mb", many - few, COMMAND, note=note)], []
+
+
+def _exponent(name: str, points: list[dict[str, float]]) -> Row:
+    """Fit a power of the three largest sizes; name all points."""
+    abscissa, ordinate, unit = ROWS[name]
+    x, y = (np.array([point[key] for point in points]) for key in (abscissa, ordinate))
+    slope = float(np.polyfit(np.log(x[-3:]), np.log(y[-3:]), 1)[0])
+    told = ", ".join(f"{a:.0f}: {1e3 * b:.3g}" for a, b in zip(x, y, strict=True))
+    note = f"slope of the logarithms over the three largest; {unit} by {abscissa}: {told}"
+    return row(name, slope, COMMAND, ratio=slope, note=note)
+
+
+def points() -> list[dict[str, float]]:
+    """Time a frame and both filters' missions in worlds of more and more landmarks."""
+    from benchmarks.worlds import scans_of, some_frames, world_of
+    from pipistrelle.config import Config, ScenarioConfig
+    from pipistrelle.experiments.listening import listen
+    from pipistrelle.experiments.trial import Case, compile_kernels, drive_of, run_trial
+
+    compile_kernels()
+    found = []
+    for landmarks in LANDMARKS:
+        config = Config(scenario=ScenarioConfig(landmarks=landmarks, spacing=0.5))
+        world = world_of(config)
+        few, drive = some_frames(world, 25), drive_of(world, config)
+        frames = len(few.controls) // 4
+        point = {
+            "landmarks": landmarks,
+            "echoes": 2.0 * landmarks + 1.0,
+            "frame_s": _cpu(lambda: listen(few, config, (config.emitter.radius,)), 15) / frames,
+        }
+        scans = scans_of(config, "fused")
+        for name in ("ekf", "fastslam"):
+            case = Case(strategy="fused", filter=name)
+            point[f"{name}_s"] = _cpu(lambda: run_trial(case, drive, scans, config), 5)
+        final = run_trial(Case(strategy="fused", filter="ekf"), drive, scans, config)
+        point["size"] = 3.0 + 2.0 * final.track.landmarks.landmark.size
+        found.append(point)
+    return found
+
+
+def _cpu(task, rounds: int) -> float:
+    """Time a task: the median of some rounds [s]."""
+    took = []
+    for _ in range(rounds + 1):
+        began = time.process_time()
+        task()
+        took.append(time.process_time() - began)
+    return median(took[1:])
+
+
+if __name__ == "__main__":
+    print(json.dumps({"points": points()}))
