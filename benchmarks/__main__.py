@@ -12,7 +12,7 @@ from cyclopts import App, Parameter
 from benchmarks import peer, programs, stages, study
 from benchmarks.machine import ROOT, facts
 from benchmarks.promises import PROMISES
-from benchmarks.table import Row, grown, plain, read, rows_of, show, write
+from benchmarks.table import Row, grown, read, rows_of, show, write
 
 LATEST, HISTORY = ROOT / "benchmarks" / "latest.json", ROOT / "benchmarks" / "history"
 WORSE = 1.25
@@ -47,7 +47,7 @@ def bench(
     k
         Time the stages whose names match this expression of pytest's, and do nothing else.
     quick
-        Fewer rounds and two worlds, to try the bench itself; writes nothing.
+        Fewer rounds and three worlds, to try the bench itself; writes nothing.
     worlds
         How many worlds of the study to run.
     scaling
@@ -116,4 +116,5 @@ def compare(rows: list[Row], path: Path | None) -> None:
         print(f"No row is worse than {WORSE} times what it was in {path.name}.")
 
 
-app()
+if __name__ == "__main__":
+    app()

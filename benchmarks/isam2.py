@@ -82,7 +82,7 @@ def odometry(motion: Motion, drive: Drive, steps: int) -> Odometry:
 def smooth(
     config: Config, drive: Drive, frames: Odometry, scans: tuple[Scan, ...]
 ) -> tuple[np.ndarray, Graph]:
-    """Run a mission with GTSAM's own defaults: each pose as it was known at its frame, the graph."""
+    """Run a mission with GTSAM's defaults: each pose as known at its frame, and the graph."""
     graph = Graph(config=config, isam=gtsam.ISAM2(gtsam.ISAM2Params()))
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     start = gtsam.noiseModel.Gaussian.Covariance(drive.start.covariance)

@@ -1,6 +1,7 @@
 """The EKF beside its peer, where that is installed."""
 
 from importlib.util import find_spec
+from subprocess import CalledProcessError
 
 from benchmarks.machine import answer
 from benchmarks.promises import row
@@ -18,7 +19,11 @@ def measure(rounds: int) -> tuple[list[Row], list[float]]:
     if find_spec("gtsam") is None:
         print(MISSING)
         return [], []
-    told = answer("-m", "benchmarks.isam2", str(rounds))
+    try:
+        told = answer("-m", "benchmarks.isam2", str(rounds))
+    except CalledProcessError:
+        print("gtsam_isam2_ms: left out, for gtsam fails here as said above")
+        return [], []
     isam2, ekf, unit = told["isam2_s"], told["ekf_s"], told["calibration_s"]
     rows = [
         row(
