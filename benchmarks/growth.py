@@ -38,7 +38,7 @@ def measure() -> tuple[list[Row], list[float]]:
 def _exponent(name: str, sizes: list[dict[str, float]]) -> Row:
     """Fit a power of the three largest sizes; name all points."""
     abscissa, ordinate, each = ROWS[name]
-    x, y = (np.array([point[key] for point in points]) for key in (abscissa, ordinate))
+    x, y = (np.array([point[key] for point in sizes]) for key in (abscissa, ordinate))
     slope = float(np.polyfit(np.log(x[-3:]), np.log(y[-3:]), 1)[0])
     told = ", ".join(f"{a:.0f}: {1e6 * b:.3g}" for a, b in zip(x, y, strict=True))
     note = f"slope over the three largest; us a {each} by {abscissa}: {told}"
