@@ -8,6 +8,7 @@ from statistics import median
 from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
+from cyclopts.validators import Number
 
 from benchmarks import peer, programs, stages, study
 from benchmarks.machine import ROOT, facts
@@ -33,7 +34,7 @@ def bench(
     only: Annotated[tuple[Part, ...], Parameter(consume_multiple=True)] = (),
     k: Annotated[str | None, Parameter(name="-k")] = None,
     quick: bool = False,
-    worlds: int = 8,
+    worlds: Annotated[int, Parameter(validator=Number(gt=2))] = 8,
     scaling: bool = False,
     save: bool = False,
     against: Path | None = None,
@@ -49,7 +50,7 @@ def bench(
     quick
         Fewer rounds and three worlds, to try the bench itself; writes nothing.
     worlds
-        How many worlds of the study to run.
+        How many worlds of the study to run, at least 3.
     scaling
         How cost grows, too.
     save
@@ -60,13 +61,16 @@ def bench(
     if k is not None:
         print(stages.timed(Path(devnull), "-k", k))
         return
+    path = against or newest(HISTORY)
+    before = None if path is None else rows_of(read(path))
     machine = facts()
     rows, yardsticks = measured(only, 3 if quick else worlds, 1 if quick else 5, scaling)
     machine["calibration_ms"] = round(1e3 * median(yardsticks), 4) if yardsticks else None
     rows.sort(key=lambda row: list(PROMISES).index(row.name))
     print(", ".join(f"{key} {value}" for key, value in machine.items()))
     show(rows)
-    compare(rows, against or newest(HISTORY))
+    if path is not None and before is not None:
+        compare(rows, before, path.name)
     if only or quick:
         print("Nothing written: this was not the whole bench.")
         return
@@ -105,15 +109,13 @@ def newest(folder: Path) -> Path | None:
     return max(folder.glob("*.json"), default=None)
 
 
-def compare(rows: list[Row], path: Path | None) -> None:
-    """Say which rows grew since another run; a report, not a verdict."""
-    if path is None:
-        return
-    worse = grown(rows, rows_of(read(path)), WORSE)
-    for name, factor in worse:
-        print(f"{name}: {factor:.2f} times as much as in {path.name}")
+def compare(rows: list[Row], before: list[Row], name: str) -> None:
+    """Say which rows became worse than in another run; a report, not a verdict."""
+    worse = grown(rows, before, WORSE)
+    for row, factor in worse:
+        print(f"{row}: {factor:.2f} times as much as in {name}")
     if not worse:
-        print(f"No row is worse than {WORSE} times what it was in {path.name}.")
+        print(f"No row is worse than {WORSE} times what it was in {name}.")
 
 
 if __name__ == "__main__":

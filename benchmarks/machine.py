@@ -24,7 +24,7 @@ def facts() -> dict[str, Any]:
         else os.cpu_count(),
         "memory_gb": round(_memory() / 1e9, 1),
         "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
-        "os": f"{platform.system()} {platform.release()}",
+        "os": f"{platform.system()} {'.'.join(platform.release().split('.')[:2])}",
         "python": platform.python_version(),
         **{name: _version(name) for name in ("numpy", "numba", "scipy", "polars", "gtsam")},
         "commit": _commit(),

@@ -100,6 +100,18 @@ def test_a_part_of_the_bench_writes_nothing(measured_nothing):
     assert list(measured_nothing.iterdir()) == []
 
 
+def test_a_run_is_compared_with_the_newest_one_kept_or_a_named_one(measured_nothing, capsys):
+    bench.bench(save=True)
+    bench.bench()
+    assert "No row is worse" in capsys.readouterr().out
+    report = read(measured_nothing / "latest.json")
+    for found in report["rows"]:
+        found["ratio"] = found["ratio"] and found["ratio"] / 2.0
+    (measured_nothing / "faster.json").write_text(json.dumps(report))
+    bench.bench(against=measured_nothing / "faster.json")
+    assert "frame_alone_ms: 2.00 times as much as in faster.json" in capsys.readouterr().out
+
+
 def test_the_rate_of_a_study_is_told_from_the_worlds_after_the_first_of_each_worker():
     start_up, world = 3.0, 4.0
     for workers, done in ((1, [7.0, 11.0, 15.0]), (2, [7.0, 7.0, 11.0, 11.0, 15.0, 15.0])):
