@@ -19,9 +19,9 @@ LANDMARKS = (10, 25, 50, 100, 200)
 WORLDS = (2, 6)
 COMMAND = "./dev bench --only growth --scaling"
 ROWS = {
-    "frame_exponent_in_arrivals": ("arrivals", "frame_s", "frame"),
-    "ekf_exponent_in_states": ("states", "ekf_s", "measurement"),
-    "fastslam_exponent_in_landmarks": ("landmarks", "fastslam_s", "measurement"),
+    "frame_growth": ("arrivals", "frame_s", "frame"),
+    "ekf_growth": ("states", "ekf_s", "measurement"),
+    "fastslam_growth": ("landmarks", "fastslam_s", "measurement"),
 }
 """What is drawn against what."""
 

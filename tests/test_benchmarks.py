@@ -177,9 +177,9 @@ def test_growth_is_the_power_of_the_larger_sizes(monkeypatch):
     )
     rows, _ = growth.measure()
     found = {part.name: part.value for part in rows}
-    assert found["frame_exponent_in_arrivals"] == pytest.approx(1.0, abs=1e-3)
-    assert found["ekf_exponent_in_states"] == pytest.approx(2.0)
-    assert found["fastslam_exponent_in_landmarks"] == pytest.approx(0.0, abs=1e-9)
+    assert found["frame_growth"] == pytest.approx(1.0, abs=1e-3)
+    assert found["ekf_growth"] == pytest.approx(2.0)
+    assert found["fastslam_growth"] == pytest.approx(0.0, abs=1e-9)
     assert found["memory_growth_mb"] == pytest.approx(3.0)
 
 
