@@ -1,108 +1,85 @@
-"""Timings of the chain's stages, one core each: `./dev bench`.
+"""Timings of the chain's stages, one core each: `./dev bench` reads them into its table.
 
-Compare rows of one run; the machine is part of every absolute number.
+CPU time, which on an idle core is the time on the clock. Each stage is timed between two
+timings of the yardstick; what one round consists of is kept beside it.
 """
 
-import subprocess
-import sys
+import time
 
 import numpy as np
 import pytest
 
-from pipistrelle.acoustics.arrivals import arrivals_of_emission, through_piston
-from pipistrelle.arrays.noise import stream_key
+from benchmarks.calibration import ELEMENTS, calibrate
+from benchmarks.worlds import RADII, scans_of, some_frames, world_of
 from pipistrelle.config import Config, ReceiverConfig
-from pipistrelle.detection.scans import scan_of
+from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.ekf import EkfBelief
 from pipistrelle.experiments.listening import listen
-from pipistrelle.experiments.scenario import Scenario, draw_scenario
 from pipistrelle.experiments.trial import Case, drive_of, run_trial
 
-BARE_PROGRAM = """
-from cyclopts import App
-from pydantic import BaseModel
+CONFIG = Config()
+WORLD = world_of(CONFIG)
+FEW = some_frames(WORLD, 75)
+ONE = (CONFIG.emitter.radius,)
+
+pytestmark = pytest.mark.benchmark(timer=time.process_time)
 
 
-class Settings(BaseModel):
-    number: float = 1.0
+@pytest.fixture(autouse=True)
+def _yardstick(benchmark):
+    """Keep the yardstick's time around a stage [s], and how many frames a round has."""
+    before = calibrate(time.process_time)
+    yield
+    after = calibrate(time.process_time)
+    benchmark.extra_info["calibration_s"] = 0.5 * (before + after)
 
 
-app = App(name="bare", help="A bare program.")
+def test_listening_through_one_beam(benchmark):
+    benchmark.extra_info["frames"] = 375
+    benchmark.pedantic(listen, (WORLD, CONFIG, ONE), rounds=9, warmup_rounds=1)
 
 
-@app.command
-def run(*, settings: Settings = Settings()):
-    "Run."
+def test_listening_through_twelve_beams(benchmark):
+    benchmark.extra_info["frames"] = 375 * len(RADII)
+    benchmark.pedantic(listen, (WORLD, CONFIG, RADII), rounds=5, warmup_rounds=1)
 
 
-app(["--help"])
-"""
+def test_listening_to_few_frames_by_blocks(benchmark):
+    benchmark.extra_info["frames"] = 5
+    benchmark.pedantic(listen, (FEW, CONFIG, ONE), rounds=51, warmup_rounds=3)
 
 
-@pytest.fixture(scope="module")
-def config() -> Config:
-    return Config()
-
-
-@pytest.fixture(scope="module")
-def world(config: Config) -> Scenario:
-    return draw_scenario(config, np.random.default_rng(stream_key(config.seed, 0, "scenario")))
-
-
-def frames_of(world: Scenario, count: int) -> Scenario:
-    """The start of a world: as many frames of four steps."""
-    steps = 4 * count
-    return Scenario(
-        time=world.time[: steps + 1],
-        path=world.path[: steps + 1],
-        controls=world.controls[:steps],
-        landmarks=world.landmarks,
-        beacon=world.beacon,
-    )
-
-
-def test_front_end_ten_block_frames(benchmark, config, world):
-    listen(world, config, (config.emitter.radius,))
-    benchmark(listen, frames_of(world, 10), config, (config.emitter.radius,))
-
-
-def test_front_end_ten_block_frames_through_twelve_beams(benchmark, config, world):
-    radii = tuple(np.geomspace(2.5e-3, 25e-3, 12).round(4))
-    benchmark(listen, frames_of(world, 10), config, radii)
-
-
-def test_front_end_one_dense_frame(benchmark, config, world):
-    dense = config.model_copy(update={"receiver": ReceiverConfig(engine="dense")})
-    benchmark.pedantic(
-        listen, (frames_of(world, 1), dense, (dense.emitter.radius,)), rounds=5, warmup_rounds=1
-    )
-
-
-def test_arrivals_of_one_emission(benchmark, config, world):
-    def once():
-        emission = arrivals_of_emission(
-            world.path[4], np.array([0.75, 0.0]), world.landmarks, world.beacon, config
-        )
-        return through_piston(emission, radius=0.0088, frequency=35e3, speed_of_sound=343.0)
-
-    benchmark(once)
+def test_listening_to_few_frames_by_samples(benchmark):
+    benchmark.extra_info["frames"] = 5
+    dense = CONFIG.model_copy(update={"receiver": ReceiverConfig(engine="dense")})
+    benchmark.pedantic(listen, (FEW, dense, ONE), rounds=3, warmup_rounds=1)
 
 
 @pytest.mark.parametrize("strategy", ["active", "fused", "passive"])
-def test_ekf_mission(benchmark, config, world, strategy):
-    (heard,) = listen(world, config, (config.emitter.radius,))
-    scans = tuple(scan_of(frame, strategy) for frame in heard)
-    drive = drive_of(world, config)
-    benchmark(run_trial, Case(strategy=strategy, filter="ekf"), drive, scans, config)
+@pytest.mark.parametrize("name", ["ekf", "fastslam"])
+def test_mission(benchmark, name, strategy):
+    scans, drive = scans_of(CONFIG, strategy), drive_of(WORLD, CONFIG)
+    case = Case(strategy=strategy, filter=name)
+    if name == "ekf":
+        seconds = _updates(case, drive, scans) / ELEMENTS * calibrate(time.process_time)
+        benchmark.extra_info["floor_s"] = seconds
+    benchmark.pedantic(run_trial, (case, drive, scans, CONFIG), rounds=15, warmup_rounds=1)
 
 
-@pytest.mark.parametrize(
-    "program", [["-m", "pipistrelle", "--help"], ["-c", BARE_PROGRAM]], ids=["ours", "bare"]
-)
-def test_help(benchmark, program):
-    benchmark.pedantic(
-        subprocess.run,
-        ([sys.executable, *program],),
-        {"check": True, "stdout": subprocess.DEVNULL},
-        rounds=11,
-        warmup_rounds=1,
-    )
+def _updates(case, drive, scans):
+    """Count the elements that the corrections of an EKF mission must change.
+
+    Half a symmetric matrix, once for a bearing of each member and twice for a bearing with range.
+    """
+    count, before = 0, np.empty(0, dtype=int)
+
+    def add(strategy: str, name: str, scan: Scan, belief: EkfBelief) -> None:
+        nonlocal count, before
+        size = 3 + 2 * before.size
+        members = np.array([np.count_nonzero(before == label) for label in scan.landmark], int)
+        outer = np.where(np.isnan(scan.range), members, 2 * (members > 0))
+        count += int(outer.sum()) * size * (size + 1) // 2
+        before = belief.landmark
+
+    run_trial(case, drive, scans, CONFIG, watch=add)
+    return count

@@ -12,6 +12,10 @@ from sphinx_gallery.scrapers import figure_rst
 
 import pipistrelle
 
+ROOT = Path(__file__).resolve().parents[1]
+BENCHMARKS = ROOT / "benchmarks" / "latest.json"
+sys.path.insert(0, str(ROOT))
+
 mpl.use("Agg")
 
 project = "Pipistrelle"
@@ -91,6 +95,15 @@ def add_modules(app, docname, content):
             content[0] += f"\n{name}\n{'-' * len(name)}\n\n{module}\n"
 
 
+def add_benchmarks(app, docname, content):
+    """Put the last run's timings where a page asks for them."""
+    from benchmarks.table import markdown, read
+
+    if docname == "performance":
+        app.env.note_dependency(str(BENCHMARKS))
+        content[0] = content[0].replace("<!-- benchmarks -->", markdown(read(BENCHMARKS)))
+
+
 def show_kernels(app):
     """Let autodoc see the plain functions under public kernels.
 
@@ -137,6 +150,7 @@ def add_default(app, what, name, obj, options, lines):
 
 def setup(app):
     app.connect("source-read", add_modules)
+    app.connect("source-read", add_benchmarks)
     app.connect("builder-inited", show_kernels, priority=900)
     app.connect("autodoc-process-docstring", protect, priority=100)
     app.connect("autodoc-process-docstring", unprotect, priority=900)

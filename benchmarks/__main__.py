@@ -1,0 +1,122 @@
+"""Measure everything that was promised, and say what holds: `./dev bench`."""
+
+import sys
+from datetime import UTC, datetime
+from os import devnull
+from pathlib import Path
+from statistics import median
+from typing import Annotated, Literal
+
+from cyclopts import App, Parameter
+from cyclopts.validators import Number
+
+from benchmarks import peer, programs, stages, study
+from benchmarks.machine import ROOT, facts
+from benchmarks.promises import PROMISES
+from benchmarks.table import Row, grown, read, rows_of, show, write
+
+LATEST, HISTORY = ROOT / "benchmarks" / "latest.json", ROOT / "benchmarks" / "history"
+WORSE = 1.25
+"""A row is named when it grew by more than this factor."""
+
+Part = Literal["stages", "study", "programs", "peer", "growth"]
+app = App(
+    name="./dev bench",
+    help="Time what was promised; targets, ratios, floors.",
+    version_flags=(),
+    default_parameter=Parameter(negative=()),
+)
+
+
+@app.default
+def bench(
+    *,
+    only: Annotated[tuple[Part, ...], Parameter(consume_multiple=True)] = (),
+    k: Annotated[str | None, Parameter(name="-k")] = None,
+    quick: bool = False,
+    worlds: Annotated[int, Parameter(validator=Number(gt=2))] = 8,
+    scaling: bool = False,
+    save: bool = False,
+    against: Path | None = None,
+) -> None:
+    """Measure, print the table, write benchmarks/latest.json.
+
+    Parameters
+    ----------
+    only
+        Measure these parts alone, and write nothing.
+    k
+        Time the stages whose names match this expression of pytest's, and do nothing else.
+    quick
+        Fewer rounds and three worlds, to try the bench itself; writes nothing.
+    worlds
+        How many worlds of the study to run, at least 3.
+    scaling
+        How cost grows, too.
+    save
+        Keep a dated copy under benchmarks/history.
+    against
+        The file to compare with; without it, the newest one kept.
+    """
+    if k is not None:
+        print(stages.timed(Path(devnull), "-k", k))
+        return
+    path = against or newest(HISTORY)
+    before = None if path is None else rows_of(read(path))
+    machine = facts()
+    rows, yardsticks = measured(only, 3 if quick else worlds, 1 if quick else 5, scaling)
+    machine["calibration_ms"] = round(1e3 * median(yardsticks), 4) if yardsticks else None
+    rows.sort(key=lambda row: list(PROMISES).index(row.name))
+    print(", ".join(f"{key} {value}" for key, value in machine.items()))
+    show(rows)
+    if path is not None and before is not None:
+        compare(rows, before, path.name)
+    if only or quick:
+        print("Nothing written: this was not the whole bench.")
+        return
+    kept = [HISTORY / f"{datetime.now(UTC):%Y-%m-%d_%H%M}.json"] if save else []
+    for path in (LATEST, *kept):
+        write(path, machine, rows)
+        print(path.relative_to(ROOT))
+
+
+def measured(
+    only: tuple[Part, ...], worlds: int, rounds: int, scaling: bool
+) -> tuple[list[Row], list[float]]:
+    """Measure the chosen parts, one after the other."""
+    parts = {
+        "stages": stages.measure,
+        "study": lambda: study.measure(worlds),
+        "programs": lambda: programs.measure(rounds),
+        "peer": lambda: peer.measure(rounds),
+    }
+    if scaling or "growth" in only:
+        from benchmarks import growth
+
+        parts["growth"] = growth.measure
+    rows, yardsticks = [], []
+    for name, part in parts.items():
+        if not only or name in only:
+            print(f"Measuring {name} ...", file=sys.stderr, flush=True)
+            found, took = part()
+            rows += found
+            yardsticks += took
+    return rows, yardsticks
+
+
+def newest(folder: Path) -> Path | None:
+    """Return the file last kept, if any."""
+    return max(folder.glob("*.json"), default=None)
+
+
+def compare(rows: list[Row], before: list[Row], name: str) -> None:
+    """Say which rows became worse than in another run; a report, not a verdict."""
+    worse = grown(rows, before, WORSE)
+    for row, factor in worse:
+        print(f"{row}: {factor:.2f} times as much as in {name}")
+    if not worse:
+        print(f"No row is worse than {WORSE} times what it was in {name}.")
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,198 @@
+"""The peer of the EKF: GTSAM's iSAM2 on the same fused mission, frame by frame.
+
+    python -m benchmarks.isam2 ROUNDS     # CPU seconds and errors as JSON; needs gtsam
+
+Both are told the same: controls and their noise, labels, bearings with and without range, and how
+uncertain each is. A frame's four steps become one odometry factor, composed beforehand, outside
+the timing. Each measurement is a factor, each frame one incremental update, after which the new
+pose is read. A landmark enters the graph with its first range; a passive one when two of its
+bearings cross at `PARALLAX` or more, where they cross, with all its bearings so far. The peer's
+time is what it spends in its own calls, not in the Python around them, and it is not asked for
+covariances; the EKF's time is that of the whole trial, which has them.
+"""
+
+import json
+import math
+import sys
+import time
+from dataclasses import dataclass, field
+from statistics import median
+
+import gtsam
+import numpy as np
+
+from benchmarks.calibration import calibrate
+from benchmarks.worlds import scans_of, world_of
+from pipistrelle.config import Config
+from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.models import Motion, motion_jacobians, motion_step
+from pipistrelle.evaluation.accuracy import position_error, rmse
+from pipistrelle.experiments.trial import Case, Drive, drive_of, run_trial
+
+PARALLAX = 0.5
+"""Least angle between two bearings that place a landmark [rad]."""
+
+Odometry = list[tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass
+class Graph:
+    """An incremental smoother, and what of a mission has not entered it yet."""
+
+    config: Config
+    isam: "gtsam.ISAM2"
+    mapped: set[int] = field(default_factory=set)
+    waiting: dict[int, list[tuple[int, float]]] = field(default_factory=dict)
+    seconds: float = 0.0
+
+    def update(self, factors: "gtsam.NonlinearFactorGraph", values: "gtsam.Values") -> None:
+        """Give the smoother new factors and values, and count the time it takes."""
+        began = time.process_time()
+        self.isam.update(factors, values)
+        self.seconds += time.process_time() - began
+
+    def pose(self, k: int) -> np.ndarray:
+        """Read the present estimate of a frame's pose, and count the time it takes."""
+        began = time.process_time()
+        pose = self.isam.calculateEstimatePose2(k)
+        self.seconds += time.process_time() - began
+        return np.array([pose.x(), pose.y(), pose.theta()])
+
+
+def landmark_key(label: int) -> int:
+    """Name a landmark in the graph; poses are their frames' numbers."""
+    return gtsam.symbol("l", label)
+
+
+def odometry(motion: Motion, drive: Drive, steps: int) -> Odometry:
+    """Compose the steps of each frame: the relative pose, and its covariance in its end's axes."""
+    Q, frames = np.diag(np.square(motion.control_std)), []
+    dt = np.diff(drive.time)
+    for first in range(0, len(drive.controls), steps):
+        pose, P = np.zeros(3), np.zeros((3, 3))
+        for k in range(first, first + steps):
+            F, U = motion_jacobians(motion, pose, drive.controls[k], dt[k])
+            pose, P = motion_step(motion, pose, drive.controls[k], dt[k]), F @ P @ F.T + U @ Q @ U.T
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        axes = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        frames.append((pose, axes @ P @ axes.T))
+    return frames
+
+
+def smooth(
+    config: Config, drive: Drive, frames: Odometry, scans: tuple[Scan, ...]
+) -> tuple[np.ndarray, Graph]:
+    """Run a mission with GTSAM's defaults: each pose as known at its frame, and the graph."""
+    graph = Graph(config=config, isam=gtsam.ISAM2(gtsam.ISAM2Params()))
+    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    start = gtsam.noiseModel.Gaussian.Covariance(drive.start.covariance)
+    factors.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*drive.start.mean), start))
+    values.insert(0, gtsam.Pose2(*drive.start.mean))
+    graph.update(factors, values)
+    online = [drive.start.mean]
+    for k, ((step, covariance), scan) in enumerate(zip(frames, scans, strict=True), start=1):
+        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        factors.add(gtsam.BetweenFactorPose2(k - 1, k, gtsam.Pose2(*step), noise))
+        guess = gtsam.Pose2(*online[-1]).compose(gtsam.Pose2(*step))
+        values.insert(k, guess)
+        here = np.array([guess.x(), guess.y(), guess.theta()])
+        poses = np.vstack((*online, here))
+        for label, bearing, distance in zip(scan.landmark, scan.bearing, scan.range, strict=True):
+            measure(graph, factors, values, poses, int(label), float(bearing), float(distance))
+        graph.update(factors, values)
+        online.append(graph.pose(k))
+    return np.array(online), graph
+
+
+def measure(graph: Graph, factors, values, poses, label: int, bearing: float, distance: float):
+    """Add a measurement's factor, or keep it until its landmark can be placed."""
+    k, passive, key = len(poses) - 1, math.isnan(distance), landmark_key(label)
+    if label not in graph.mapped:
+        place = None if passive else along(poses[k], bearing, distance)
+        if passive:
+            graph.waiting.setdefault(label, []).append((k, bearing))
+            place = crossing(poses, graph.waiting[label])
+        if place is None:
+            return
+        graph.mapped.add(label)
+        values.insert(key, place)
+        for frame, earlier in graph.waiting.pop(label, []):
+            add_bearing(graph, factors, frame, key, earlier)
+        if passive:
+            return
+    if passive:
+        add_bearing(graph, factors, k, key, bearing)
+    else:
+        stds = np.array([graph.config.filter.bearing_std, graph.config.filter.range_std])
+        noise = gtsam.noiseModel.Diagonal.Sigmas(stds)
+        turn = gtsam.Rot2(bearing)
+        factors.add(gtsam.BearingRangeFactor2D(k, key, turn, distance, noise))
+
+
+def add_bearing(graph: Graph, factors, frame: int, key: int, bearing: float) -> None:
+    """Add the factor of a bearing without range."""
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, graph.config.filter.bearing_std)
+    factors.add(gtsam.BearingFactor2D(frame, key, gtsam.Rot2(bearing), noise))
+
+
+def along(pose: np.ndarray, bearing: float, distance: float) -> np.ndarray:
+    """Return the point at a bearing and a range."""
+    angle = pose[2] + bearing
+    return pose[:2] + distance * np.array([math.cos(angle), math.sin(angle)])
+
+
+def crossing(poses: np.ndarray, bearings: list[tuple[int, float]]) -> np.ndarray | None:
+    """Where the newest bearing of a landmark crosses an earlier one, if it does so clearly.
+
+    Of the earlier bearings, the one that crosses the most squarely, ahead of both poses.
+    """
+    (k, last), best, place = bearings[-1], math.sin(PARALLAX), None
+    angle = poses[k, 2] + last
+    for frame, bearing in bearings[:-1]:
+        other = poses[frame, 2] + bearing
+        sine = math.sin(other - angle)
+        dx, dy = poses[frame, :2] - poses[k, :2]
+        if abs(sine) < best:
+            continue
+        near = (dx * math.sin(other) - dy * math.cos(other)) / sine
+        far = (dx * math.sin(angle) - dy * math.cos(angle)) / sine
+        if near > 0.0 and far > 0.0:
+            best, place = abs(sine), along(poses[k], last, near)
+    return place
+
+
+def compare(rounds: int) -> dict[str, float]:
+    """Time both on one mission, in turns; errors over the frames [m], CPU time [s]."""
+    config = Config()
+    world, scans = world_of(config), scans_of(config, "fused")
+    drive, every = drive_of(world, config), config.scenario.steps_per_frame
+    frames, case = odometry(drive.motion, drive, every), Case(strategy="fused", filter="ekf")
+    ours, peer, around = [], [], []
+    for _ in range(rounds + 1):
+        began = time.process_time()
+        trial = run_trial(case, drive, scans, config)
+        ours.append(time.process_time() - began)
+        began = time.process_time()
+        online, graph = smooth(config, drive, frames, scans)
+        around.append(time.process_time() - began)
+        peer.append(graph.seconds)
+    known = np.array([graph.pose(k) for k in range(1, len(online))])
+    true, found = world.path[every::every], trial.track.pose.mean[every::every]
+    return {
+        "isam2_s": median(peer[1:]),
+        "isam2_with_python_s": median(around[1:]),
+        "ekf_s": median(ours[1:]),
+        "calibration_s": calibrate(time.process_time),
+        "ekf_m": rmse(position_error(found, true)),
+        "isam2_m": rmse(position_error(online[1:], true)),
+        "isam2_smoothed_m": rmse(position_error(known, true)),
+        "ekf_last_m": float(position_error(found, true)[-1]),
+        "isam2_last_m": float(position_error(online[1:], true)[-1]),
+        "mapped": len(graph.mapped),
+        "waiting": len(graph.waiting),
+    }
+
+
+if __name__ == "__main__":
+    print(json.dumps(compare(int(sys.argv[1]))))

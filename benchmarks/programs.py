@@ -1,0 +1,103 @@
+"""What a person waits for: the warm run, the help, the first compilation."""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+
+from benchmarks.machine import ROOT, Calibrated, python
+from benchmarks.promises import row
+from benchmarks.table import Row
+
+BARE = """
+from cyclopts import App
+from pydantic import BaseModel
+
+
+class Settings(BaseModel):
+    number: float = 1.0
+
+
+app = App(name="bare", help="A bare program.")
+
+
+@app.command
+def run(*, settings: Settings = Settings()):
+    "Run."
+
+
+app(["--help"])
+"""
+COMPILE = "from pipistrelle.experiments.trial import compile_kernels; compile_kernels()"
+LIBRARIES = "import pipistrelle.experiments.trial, pipistrelle.figures.mission, polars"
+COMMAND = "./dev bench --only programs"
+
+
+def measure(rounds: int) -> tuple[list[Row], list[float]]:
+    """Time the programs by the clock: the rows, and what the yardstick took [s]."""
+    with Calibrated() as around_run:
+        run, imports = _run(rounds), median(_wall("-c", LIBRARIES) for _ in range(rounds))
+    ours, bare = _helps(2 * rounds + 1)
+    with Calibrated() as around_compile:
+        compiled = _cold_compile()
+    rows = [
+        row(
+            "run_warm_s",
+            run,
+            COMMAND,
+            ratio=run / around_run.seconds,
+            floor=imports,
+            note="three strategies with the figure; the floor is the import of the libraries",
+        ),
+        row(
+            "help_ratio",
+            ours / bare,
+            COMMAND,
+            ratio=ours / bare,
+            note=f"{1e3 * ours:.0f} ms over the {1e3 * bare:.0f} ms of a bare cyclopts and "
+            "pydantic program, in turns",
+        ),
+        row(
+            "cold_compile_s",
+            compiled,
+            COMMAND,
+            ratio=compiled / around_compile.seconds,
+            note="the whole process, with an empty kernel cache",
+        ),
+    ]
+    return rows, [around_run.seconds, around_compile.seconds]
+
+
+def _wall(*arguments: str, **changes: str) -> float:
+    """Time an interpreter by the clock [s]."""
+    began = time.perf_counter()
+    python(*arguments, **changes)
+    return time.perf_counter() - began
+
+
+def _run(rounds: int) -> float:
+    """Time `./dev run` when everything is set up and compiled [s]."""
+    took = []
+    for _ in range(rounds + 1):
+        with TemporaryDirectory() as name:
+            folder = str(Path(name) / "run")
+            command = [sys.executable, str(ROOT / "dev"), "run", "-o", folder]
+            began = time.perf_counter()
+            subprocess.run(command, check=True, capture_output=True)
+            took.append(time.perf_counter() - began)
+    return median(took[1:])
+
+
+def _helps(rounds: int) -> tuple[float, float]:
+    """Time our help and a bare program's, in turns [s]."""
+    pairs = [(_wall("-m", "pipistrelle", "--help"), _wall("-c", BARE)) for _ in range(rounds)]
+    ours, bare = zip(*pairs, strict=True)
+    return median(ours), median(bare)
+
+
+def _cold_compile() -> float:
+    """Time the compilation of every kernel [s]."""
+    with TemporaryDirectory() as folder:
+        return _wall("-c", COMPILE, NUMBA_CACHE_DIR=folder)

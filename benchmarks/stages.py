@@ -1,0 +1,58 @@
+"""The stages' rows, from what pytest-benchmark wrote."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from benchmarks.machine import python
+from benchmarks.promises import row
+from benchmarks.table import Row
+
+FILE = "benchmarks/test_stages.py"
+ROWS = {
+    "frame_alone_ms": "test_listening_through_one_beam",
+    "frame_amortised_ms": "test_listening_through_twelve_beams",
+    "ekf_mission_ms": "test_mission[ekf-fused]",
+    "fastslam_mission_ms": "test_mission[fastslam-fused]",
+}
+"""The stage behind each row."""
+
+
+def measure() -> tuple[list[Row], list[float]]:
+    """Time the stages in a process of their own: their rows, and what the yardstick took [s]."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "stages.json"
+        print(timed(path))
+        stages = {stage["name"]: stage for stage in json.loads(path.read_text())["benchmarks"]}
+    return list(rows(stages)), [s["extra_info"]["calibration_s"] for s in stages.values()]
+
+
+def timed(path: Path, *options: str) -> str:
+    """Time the stages, write their records to a file, and return pytest-benchmark's own table."""
+    columns = "--benchmark-columns=min,median,max,rounds"
+    only = ["--benchmark-only", columns, f"--benchmark-json={path}", "-m", ""]
+    return python("-m", "pytest", FILE, *only, *options)
+
+
+def rows(stages: dict[str, Any]) -> Iterator[Row]:
+    """Read the rows out of pytest-benchmark's records, by name."""
+    for name, test in ROWS.items():
+        stage, extra = stages[test], stages[test]["extra_info"]
+        seconds, floor = stage["stats"]["median"], extra.get("floor_s")
+        yield row(
+            name,
+            1e3 * seconds / extra.get("frames", 1),
+            _command(test),
+            ratio=seconds / extra.get("frames", 1) / extra["calibration_s"],
+            floor=None if floor is None else 1e3 * floor,
+        )
+    tests = [f"test_listening_to_few_frames_by_{engine}" for engine in ("samples", "blocks")]
+    dense, block = (stages[test]["stats"]["median"] for test in tests)
+    yield row("dense_over_block", dense / block, _command("few_frames"), ratio=dense / block)
+
+
+def _command(test: str) -> str:
+    """Say what measures a stage again."""
+    return f"./dev bench -k '{test.replace('[', ' and ').replace('-', ' and ').rstrip(']')}'"

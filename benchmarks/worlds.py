@@ -1,0 +1,41 @@
+"""What the stages are timed on: the paper's world and short versions of it."""
+
+from functools import lru_cache
+
+import numpy as np
+
+from pipistrelle.arrays.noise import stream_key
+from pipistrelle.config import Config
+from pipistrelle.detection.scans import Scan, scan_of
+from pipistrelle.experiments.listening import listen
+from pipistrelle.experiments.plan import find_plan, read_plan
+from pipistrelle.experiments.scenario import Scenario, draw_scenario
+
+RADII = tuple(read_plan(find_plan("paper")).grid["emitter.radius"])
+"""The paper's twelve pistons [m]."""
+
+
+def world_of(config: Config) -> Scenario:
+    """Draw the settings' first world."""
+    return draw_scenario(config, np.random.default_rng(stream_key(config.seed, 0, "scenario")))
+
+
+def some_frames(world: Scenario, every: int) -> Scenario:
+    """Keep each n-th frame of a world, with the four steps that lead to it."""
+    frames = np.arange(every, len(world.controls) // 4 + 1, every)
+    steps = (4 * frames[:, None] + np.arange(-3, 1)).ravel()
+    kept = np.concatenate(([0], steps))
+    return Scenario(
+        time=world.time[kept],
+        path=world.path[kept],
+        controls=world.controls[steps - 1],
+        landmarks=world.landmarks,
+        beacon=world.beacon,
+    )
+
+
+@lru_cache
+def scans_of(config: Config, strategy: str) -> tuple[Scan, ...]:
+    """Listen through a whole world and take a strategy's measurements."""
+    (heard,) = listen(world_of(config), config, (config.emitter.radius,))
+    return tuple(scan_of(frame, strategy) for frame in heard)
