@@ -138,9 +138,9 @@ def nearest(function: Callable[[int], float], target: float, start: int, step: i
     """Return the whole number at which a rising function comes nearest to a target."""
     low = high = start
     while function(low) > target:
-        low, high = low - step, low
+        low, high, step = low - step, low, 2 * step
     while function(high) <= target:
-        low, high = high, high + step
+        low, high, step = high, high + step, 2 * step
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (middle, high) if function(middle) <= target else (low, middle)

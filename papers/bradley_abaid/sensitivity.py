@@ -55,6 +55,7 @@ FILTER: dict[str, dict[str, Any]] = {
     "R: 0.1 m": {"filter.range_std": 0.1},
     "gate of 99.9 %": {"filter.gate": 0.999},
 }
+OUTPUT = Path(__file__).with_name("sensitivity.csv")
 Trials = dict[tuple[str, str], Scores]
 """Scores by strategy and beam."""
 
@@ -66,17 +67,20 @@ def main() -> None:
     options.add_argument("--workers", type=int, default=2)
     chosen = options.parse_args()
     base, rows = Config(seed=SEED), []
+
+    def keep(*more: dict[str, Any]) -> None:
+        rows.extend(more)
+        pl.DataFrame(rows).write_csv(OUTPUT, float_precision=3)
+
     with in_worlds(chosen.worlds, chosen.workers) as run:
         settings = [changed(base, change) for change in FILTER.values()]
         tried = run(partial(trials_in, settings))
-        rows += [row(name, base, [w[i] for w in tried]) for i, name in enumerate(FILTER)]
+        keep(*(row(name, base, [w[i] for w in tried]) for i, name in enumerate(FILTER)))
         for name, change in (EARS | AIR).items():
-            rows.append(heard_anew(name, changed(base, change), run))
+            keep(heard_anew(name, changed(base, change), run))
         for name, change in AIR.items():
             config, _ = fit_levels(changed(base, change), run)
-            rows.append(heard_anew(f"{name}, refitted", config, run))
-    table = pl.DataFrame(rows)
-    table.write_csv(Path(__file__).with_name("sensitivity.csv"), float_precision=3)
+            keep(heard_anew(f"{name}, refitted", config, run))
     print(markdown(rows))
 
 
