@@ -174,7 +174,7 @@ def add_echo_blocks(
     sampling : Sampling
     """
     _add_echo_blocks(
-        signal, arrivals.delay, 10.0 ** (arrivals.level_db / 20.0), arrivals.bearing,
+        signal.view(np.float64), arrivals.delay, 10.0 ** (arrivals.level_db / 20.0), arrivals.bearing,
         arrivals.frequency, _durations(arrivals, sampling), layout.normal, layout.position,
         sampling.tones, sampling.rate, sampling.block, sampling.pulse, sampling.speed_of_sound,
     )  # fmt: skip
@@ -260,32 +260,54 @@ def _envelope(sums, omega, start, stop, block):
 
 
 @njit(cache=True, error_model="numpy")
+def _steer(direct, turned, phasor, wave, position):
+    """Write a phasor times each element's phase, and i times that, parts interleaved."""
+    elements = position.size
+    for e in range(elements):
+        mirror = elements - 1 - e
+        if mirror < e and position[e] == -position[mirror]:
+            cosine, sine = direct[2 * mirror], -direct[2 * mirror + 1]
+        else:
+            phase = wave * position[e]
+            cosine, sine = math.cos(phase), math.sin(phase)
+        direct[2 * e], direct[2 * e + 1] = cosine, sine
+    for e in range(elements):
+        phase = phasor * complex(direct[2 * e], direct[2 * e + 1])
+        direct[2 * e], direct[2 * e + 1] = phase.real, phase.imag
+        turned[2 * e], turned[2 * e + 1] = -phase.imag, phase.real
+
+
+@njit(cache=True, error_model="numpy")
 def _add_echo_blocks(
     signal, delay, amplitude, bearing, frequency, duration, normal, position,
     tones, rate, block, blank, speed_of_sound,
 ):  # fmt: skip
-    """Add each arrival's envelope, block by block, times its steering vector."""
-    blocks, faces, _, elements = signal.shape
-    sums, steering = np.empty(blocks, dtype=np.complex128), np.empty(elements, np.complex128)
+    """Add each arrival's envelope, block by block, times its steering vector.
+
+    Of the signal each element's real and imaginary part are neighbours.
+    """
+    blocks, faces = signal.shape[0], signal.shape[1]
+    sums = np.empty((2, blocks), dtype=np.complex128)
+    direct, turned = np.empty(signal.shape[3]), np.empty(signal.shape[3])
     for a in range(delay.size):
         start = max(math.ceil(delay[a] * rate), blank * block)
         stop = min(math.ceil((delay[a] + duration[a]) * rate), (blank + blocks) * block)
         if stop <= start:
             continue
-        first = start // block - blank
+        first, count = start // block - blank, 0
         turns = -2.0 * math.pi * frequency[a] * delay[a]
         phasor = amplitude[a] * complex(math.cos(turns), math.sin(turns))
         for p in range(2):
             omega = 2.0 * math.pi * (frequency[a] - tones[p]) / rate
-            count = _envelope(sums, omega, start, stop, block)
-            for f in range(faces):
-                angle = bearing[a] - normal[f]
-                if math.cos(angle) < 0.0:
-                    continue
-                wave = 2.0 * math.pi * frequency[a] * math.sin(angle) / speed_of_sound
-                for e in range(elements):
-                    phase = wave * position[e]
-                    steering[e] = phasor * complex(math.cos(phase), math.sin(phase))
-                for b in range(count):
-                    for e in range(elements):
-                        signal[first + b, f, p, e] += sums[b] * steering[e]
+            count = _envelope(sums[p], omega, start, stop, block)
+        for f in range(faces):
+            angle = bearing[a] - normal[f]
+            if math.cos(angle) < 0.0:
+                continue
+            wave = 2.0 * math.pi * frequency[a] * math.sin(angle) / speed_of_sound
+            _steer(direct, turned, phasor, wave, position)
+            for b in range(count):
+                for p in range(2):
+                    re, im, heard = sums[p, b].real, sums[p, b].imag, signal[first + b, f, p]
+                    for i in range(heard.size):
+                        heard[i] += re * direct[i] + im * turned[i]

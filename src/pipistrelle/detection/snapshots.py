@@ -259,37 +259,37 @@ def _boxcar(rows, width, scale, sums):
     """Write the running sums of width rows, scaled."""
     columns = rows.shape[1]
     total = np.zeros(columns)
-    for b in range(rows.shape[0]):
-        row = rows[b]
+    for b in range(min(width - 1, rows.shape[0])):
         for i in range(columns):
-            total[i] += scale * row[i]
-        if b >= width - 1:
-            done, old = sums[b - width + 1], rows[b - width + 1]
-            for i in range(columns):
-                done[i] = total[i]
-                total[i] -= scale * old[i]
+            total[i] += scale * rows[b, i]
+    for b in range(width - 1, rows.shape[0]):
+        new, old, done = rows[b], rows[b - width + 1], sums[b - width + 1]
+        for i in range(columns):
+            done[i] = total[i] + scale * new[i]
+            total[i] = done[i] - scale * old[i]
 
 
 @njit(cache=True, error_model="numpy")
 def _energy(rows, elements):
     """Sum of squares over the elements of each face and tone."""
     lags, groups = rows.shape[0], rows.shape[1] // (2 * elements)
-    energy = np.empty((lags, groups))
+    energy, square = np.empty((lags, groups)), np.empty(groups * elements)
     for b in range(lags):
+        row = rows[b]
+        for i in range(square.size):
+            square[i] = row[2 * i] * row[2 * i] + row[2 * i + 1] * row[2 * i + 1]
         for g in range(groups):
             total = 0.0
-            for i in range(2 * elements * g, 2 * elements * (g + 1)):
-                total += rows[b, i] * rows[b, i]
+            for i in range(elements * g, elements * (g + 1)):
+                total += square[i]
             energy[b, g] = total
     return energy
 
 
 @njit(cache=True, error_model="numpy")
-def _is_snapshot(energy, b, f, p, pulse, threshold, leakage):
-    """Whether lag b is a snapshot of face f in which tone p is present."""
+def _is_snapshot(energy, b, f, p, pulse, leakage):
+    """Whether lag b of face f is the largest near, and tone p is no leakage of the other."""
     level = energy[b, f, p]
-    if level <= threshold:
-        return False
     for near in range(max(b - pulse // 2, 0), min(b + pulse // 2 + 1, energy.shape[0])):
         other = energy[near, f, p]
         if other > level or (other == level and near < b):
@@ -338,7 +338,9 @@ def _find_peaks(
     for b in range(lags):
         for f in range(faces):
             for p in range(tones):
-                if not _is_snapshot(energy, b, f, p, pulse, threshold, leakage):
+                if energy[b, f, p] <= threshold or not _is_snapshot(
+                    energy, b, f, p, pulse, leakage
+                ):
                     continue
                 _scan_power(matched[b, f, p], table[p], power)
                 floor, step = peak_ratio * power.max(), scan[p, 1] - scan[p, 0]
