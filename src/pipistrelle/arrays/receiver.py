@@ -186,6 +186,8 @@ def record_samples(
     layout: Layout,
     sampling: Sampling,
     rng: np.random.Generator | None,
+    *,
+    single: bool = False,
 ) -> Complex[np.ndarray, "t f e"]:
     """Every sample of a frame at the full rate: the reference engine.
 
@@ -198,6 +200,8 @@ def record_samples(
     sampling : Sampling
     rng : Generator or None
         Source of the noise; None records without.
+    single : bool
+        In single precision, as a recording would be kept.
 
     Returns
     -------
@@ -205,11 +209,12 @@ def record_samples(
     """
     first = sampling.pulse * sampling.block
     shape = (blocks * sampling.block, layout.normal.size, layout.position.size)
+    real, whole = (np.float32, np.complex64) if single else (np.float64, np.complex128)
     if rng is None:
-        signal = np.zeros(shape, dtype=np.complex128)
+        signal = np.zeros(shape, dtype=whole)
     else:
-        parts = rng.standard_normal((*shape, 2))
-        signal = parts.view(np.complex128)[..., 0] * (sampling.noise_std / math.sqrt(2.0))
+        signal = rng.standard_normal((*shape, 2), dtype=real).view(whole)[..., 0]
+        signal *= real(sampling.noise_std / math.sqrt(2.0))
     duration = _durations(arrivals, sampling)
     for a in range(arrivals.delay.size):
         frequency, delay = arrivals.frequency[a], arrivals.delay[a]

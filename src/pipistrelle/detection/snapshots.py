@@ -191,21 +191,19 @@ def filter_samples(
     Returns
     -------
     (samples - length + 1, faces, tones, elements) complex
-        Lag i is a call that starts with sample i; noise has unit variance.
+        Lag i is a call that starts with sample i; noise has unit variance. As precise as the
+        samples.
     """
     from scipy.signal import oaconvolve
 
-    n = np.arange(length)
-    matched = [
-        oaconvolve(
-            samples,
-            np.exp(2j * np.pi * tone * n / rate)[::-1, None, None].conj(),
-            mode="valid",
-            axes=0,
-        )
-        for tone in tones
-    ]
-    return np.stack(matched, axis=2) / (noise_std * math.sqrt(length))
+    n = np.arange(length)[::-1, None]
+    replica = np.exp(-2j * np.pi * tones * n / rate) / (noise_std * math.sqrt(length))
+    return oaconvolve(
+        samples[:, :, None, :],
+        replica.astype(samples.dtype)[:, None, :, None],
+        mode="valid",
+        axes=0,
+    )
 
 
 def detect(
@@ -235,7 +233,7 @@ def detect(
     Detections
     """
     lags, faces, tones, elements = matched.shape
-    rows = matched.reshape(lags, faces * tones * elements).view(np.float64)
+    rows = matched.reshape(lags, faces * tones * elements).view(matched.real.dtype)
     energy = _energy(rows, elements)
     count, face, tone, lag, peak_u, power = _find_peaks(
         matched, energy.reshape(lags, faces, tones), pulse, detector.threshold,

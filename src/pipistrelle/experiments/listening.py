@@ -2,6 +2,11 @@
 
 The noise and the beacon's sound are those of the world and shared by all beamwidths, drawn once
 and keyed by the frame alone.
+
+The dense engine records until the vehicle calls again, 100,000 samples of 40 channels in the
+paper's half a second less the blanked call. The block engine stops after the last arrival. What
+follows is noise alone: no label could be given to anything in it, so the scans follow the same law,
+and only the count of clutter lacks the false alarms of the silence (about 0.01 a frame).
 """
 
 import math
@@ -224,16 +229,18 @@ def _blocks(aimed: Sequence[Arrivals], station: _Station, key: int) -> Iterator[
 
 
 def _dense(aimed: Sequence[Arrivals], station: _Station, key: int) -> Iterator[Detections]:
-    """Yield the same from every sample."""
-    settled = station.sampling
+    """Yield the same from every sample until the next call, in single precision."""
+    settled, setup = station.sampling, station.config.scenario
     length = settled.pulse * settled.block
+    period = math.floor(setup.steps_per_frame * setup.step / BLOCK) - settled.pulse
     for arrivals in aimed:
         samples = record_samples(
-            blocks_to_hear(arrivals, settled),
+            max(period, blocks_to_hear(arrivals, settled)),
             arrivals,
             station.layout,
             settled,
             np.random.default_rng(key),
+            single=True,
         )
         matched = filter_samples(
             samples,
