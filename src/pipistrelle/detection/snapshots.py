@@ -30,6 +30,8 @@ from pipistrelle.geometry import wrap
 SCAN_STEP = 0.05
 """Distance of the scan's beams in u [rad]: the parabola's bias stays under 2 % of a beam step."""
 
+_CHUNK = 256
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Detections:
@@ -233,8 +235,7 @@ def detect(
     Detections
     """
     lags, faces, tones, elements = matched.shape
-    rows = matched.reshape(lags, faces * tones * elements).view(matched.real.dtype)
-    energy = _energy(rows, elements)
+    energy = _energy(matched.reshape(-1).view(matched.real.dtype), elements)
     count, face, tone, lag, peak_u, power = _find_peaks(
         matched, energy.reshape(lags, faces, tones), pulse, detector.threshold,
         detector.leakage, detector.peak, detector.scan, detector.table, start, interval,
@@ -268,32 +269,34 @@ def _boxcar(rows, width, scale, sums):
 
 
 @njit(cache=True, error_model="numpy")
-def _energy(rows, elements):
-    """Sum of squares over the elements of each face and tone."""
-    lags, groups = rows.shape[0], rows.shape[1] // (2 * elements)
-    energy, square = np.empty((lags, groups)), np.empty(groups * elements)
-    for b in range(lags):
-        row = rows[b]
-        for i in range(square.size):
-            square[i] = row[2 * i] * row[2 * i] + row[2 * i + 1] * row[2 * i + 1]
-        for g in range(groups):
+def _energy(parts, elements):
+    """Sums of squares over the elements, real and imaginary parts neighbours, of every output."""
+    energy = np.empty(parts.size // (2 * elements))
+    square = np.empty(_CHUNK * elements)  # stays in the cache
+    for start in range(0, energy.size, _CHUNK):
+        done = energy[start : start + _CHUNK]
+        part = parts[2 * elements * start :]
+        for i in range(done.size * elements):
+            square[i] = part[2 * i] * part[2 * i] + part[2 * i + 1] * part[2 * i + 1]
+        for g in range(done.size):
             total = 0.0
             for i in range(elements * g, elements * (g + 1)):
                 total += square[i]
-            energy[b, g] = total
+            done[g] = total
     return energy
 
 
 @njit(cache=True, error_model="numpy")
 def _is_snapshot(energy, b, f, p, pulse, leakage):
     """Whether lag b of face f is the largest near, and tone p is no leakage of the other."""
-    level = energy[b, f, p]
-    for near in range(max(b - pulse // 2, 0), min(b + pulse // 2 + 1, energy.shape[0])):
-        other = energy[near, f, p]
-        if other > level or (other == level and near < b):
+    level, lags = energy[b, f, p], energy.shape[0]
+    for away in range(1, pulse // 2 + 1):
+        if b >= away and energy[b - away, f, p] >= level:
+            return False
+        if b + away < lags and energy[b + away, f, p] > level:
             return False
     strongest = 0.0
-    for near in range(max(b - pulse, 0), min(b + pulse + 1, energy.shape[0])):
+    for near in range(max(b - pulse, 0), min(b + pulse + 1, lags)):
         strongest = max(strongest, energy[near, f, 1 - p])
     return level > leakage * strongest
 
@@ -329,30 +332,30 @@ def _find_peaks(
     matched, energy, pulse, threshold, leakage, peak_ratio, scan, table, start, interval
 ):
     """Every peak of every snapshot: count, face, tone, delay, u and power."""
-    lags, faces, tones, elements = matched.shape
+    elements = matched.shape[3]
     face, tone = np.empty(128, dtype=np.int64), np.empty(128, dtype=np.int64)
     delay, peak_u, peak_power = np.empty(128), np.empty(128), np.empty(128)
-    power, count = np.empty(scan.shape[1]), 0
-    for b in range(lags):
-        for f in range(faces):
-            for p in range(tones):
-                if energy[b, f, p] <= threshold or not _is_snapshot(
-                    energy, b, f, p, pulse, leakage
-                ):
-                    continue
-                _scan_power(matched[b, f, p], table[p], power)
-                floor, step = peak_ratio * power.max(), scan[p, 1] - scan[p, 0]
-                for i in range(1, power.size - 1):
-                    if power[i] < floor or power[i] <= power[i - 1] or power[i] < power[i + 1]:
-                        continue
-                    slope = power[i + 1] - power[i - 1]
-                    bend = 2.0 * power[i] - power[i + 1] - power[i - 1]
-                    u = scan[p, i] + 0.5 * step * slope / bend
-                    if count == face.size:
-                        face, tone, delay = _grown(face), _grown(tone), _grown(delay)
-                        peak_u, peak_power = _grown(peak_u), _grown(peak_power)
-                    face[count], tone[count], peak_u[count] = f, p, u
-                    delay[count] = start + interval * arrival_lag(matched, b, f, p, u, pulse)
-                    peak_power[count] = (power[i] + 0.125 * slope * slope / bend) / elements
-                    count += 1
+    power, count, levels = np.empty(scan.shape[1]), 0, energy.reshape(-1)
+    for test in range(levels.size):
+        if levels[test] <= threshold:
+            continue
+        b, p = test // (energy.shape[1] * energy.shape[2]), test % energy.shape[2]
+        f = test // energy.shape[2] % energy.shape[1]
+        if not _is_snapshot(energy, b, f, p, pulse, leakage):
+            continue
+        _scan_power(matched[b, f, p], table[p], power)
+        floor, step = peak_ratio * power.max(), scan[p, 1] - scan[p, 0]
+        for i in range(1, power.size - 1):
+            if power[i] < floor or power[i] <= power[i - 1] or power[i] < power[i + 1]:
+                continue
+            slope = power[i + 1] - power[i - 1]
+            bend = 2.0 * power[i] - power[i + 1] - power[i - 1]
+            u = scan[p, i] + 0.5 * step * slope / bend
+            if count == face.size:
+                face, tone, delay = _grown(face), _grown(tone), _grown(delay)
+                peak_u, peak_power = _grown(peak_u), _grown(peak_power)
+            face[count], tone[count], peak_u[count] = f, p, u
+            delay[count] = start + interval * arrival_lag(matched, b, f, p, u, pulse)
+            peak_power[count] = (power[i] + 0.125 * slope * slope / bend) / elements
+            count += 1
     return count, face, tone, delay, peak_u, peak_power
