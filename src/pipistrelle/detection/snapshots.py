@@ -280,8 +280,8 @@ def _energy(parts, elements):
             square[i] = part[2 * i] * part[2 * i] + part[2 * i + 1] * part[2 * i + 1]
         for g in range(done.size):
             total = 0.0
-            for i in range(elements * g, elements * (g + 1)):
-                total += square[i]
+            for e in range(elements):
+                total += square[g * elements + e]
             done[g] = total
     return energy
 
