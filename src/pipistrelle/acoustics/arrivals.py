@@ -111,7 +111,8 @@ def arrivals_of_emission(
     >>> heard.source, heard.landmark
     (array([0, 0, 1, 1, 1], dtype=int8), array([1, 3, 1, 2, 3]))
     """
-    return arrivals_of_emissions(pose[np.newaxis], velocity[np.newaxis], landmarks, beacon, config)[0]
+    poses, velocities = pose[np.newaxis], velocity[np.newaxis]
+    return arrivals_of_emissions(poses, velocities, landmarks, beacon, config)[0]
 
 
 def arrivals_of_emissions(
@@ -145,8 +146,11 @@ def arrivals_of_emissions(
 
     Examples
     --------
-    >>> poses, landmark = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, np.pi]]), np.array([[5.0, 0.0]])
-    >>> heard, count = arrivals_of_emissions(poses, 0 * poses[:, :2], landmark, -landmark[0], Config())
+    The vehicle turns round, and its next call meets the beacon instead of the landmark.
+
+    >>> poses, still = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, np.pi]]), np.zeros((2, 2))
+    >>> landmarks, beacon = np.array([[5.0, 0.0]]), np.array([-9.0, 0.0])
+    >>> heard, count = arrivals_of_emissions(poses, still, landmarks, beacon, Config())
     >>> count, heard.landmark
     (array([3, 3]), array([1, 1, 2, 2, 1, 2]))
     """

@@ -174,9 +174,10 @@ def add_echo_blocks(
     sampling : Sampling
     """
     _add_echo_blocks(
-        signal.view(np.float64), arrivals.delay, 10.0 ** (arrivals.level_db / 20.0), arrivals.bearing,
-        arrivals.frequency, _durations(arrivals, sampling), layout.normal, layout.position,
-        sampling.tones, sampling.rate, sampling.block, sampling.pulse, sampling.speed_of_sound,
+        signal.view(np.float64), arrivals.delay, 10.0 ** (arrivals.level_db / 20.0),
+        arrivals.bearing, arrivals.frequency, _durations(arrivals, sampling), layout.normal,
+        layout.position, sampling.tones, sampling.rate, sampling.block, sampling.pulse,
+        sampling.speed_of_sound,
     )  # fmt: skip
 
 

@@ -234,11 +234,10 @@ def detect(
     -------
     Detections
     """
-    lags, faces, tones, elements = matched.shape
-    energy = _energy(matched.reshape(-1).view(matched.real.dtype), elements)
+    energy = _energy(matched.reshape(-1).view(matched.real.dtype), matched.shape[3])
     count, face, tone, lag, peak_u, power = _find_peaks(
-        matched, energy.reshape(lags, faces, tones), pulse, detector.threshold,
-        detector.leakage, detector.peak, detector.scan, detector.table, start, interval,
+        matched, energy, pulse, detector.threshold, detector.leakage, detector.peak,
+        detector.scan, detector.table, start, interval,
     )  # fmt: skip
     face, tone, u = face[:count], tone[:count], peak_u[:count]
     angle = np.arcsin(np.clip(u / detector.wave[tone], -1.0, 1.0))
@@ -287,23 +286,27 @@ def _energy(parts, elements):
 
 
 @njit(cache=True, error_model="numpy")
-def _is_snapshot(energy, b, f, p, pulse, leakage):
-    """Whether lag b of face f is the largest near, and tone p is no leakage of the other."""
-    level, lags = energy[b, f, p], energy.shape[0]
-    for away in range(1, pulse // 2 + 1):
-        if b >= away and energy[b - away, f, p] >= level:
+def _is_snapshot(energy, test, row, pulse, leakage):
+    """Whether a test's lag is the largest near, and its tone no leakage of the other.
+
+    A row of tests is a lag's: its neighbour in time is a row away, its other tone next to it.
+    """
+    level, size = energy[test], energy.size
+    for away in range(row, (pulse // 2 + 1) * row, row):
+        if test >= away and energy[test - away] >= level:
             return False
-        if b + away < lags and energy[b + away, f, p] > level:
+        if test + away < size and energy[test + away] > level:
             return False
-    strongest = 0.0
-    for near in range(max(b - pulse, 0), min(b + pulse + 1, lags)):
-        strongest = max(strongest, energy[near, f, 1 - p])
+    other, strongest = test + 1 - 2 * (test % 2), 0.0
+    for away in range(-pulse * row, (pulse + 1) * row, row):
+        if 0 <= other + away < size:
+            strongest = max(strongest, energy[other + away])
     return level > leakage * strongest
 
 
 @njit(cache=True, error_model="numpy")
 def _scan_power(x, table, power):
-    """Power of the conventional beam over the scan, from the lag sums."""
+    """Write the power of the conventional beam over the scan, from the lag sums."""
     elements, beams = x.size, power.size
     r0 = 0.0
     for e in range(elements):
@@ -323,7 +326,8 @@ def _scan_power(x, table, power):
 def _grown(column):
     """Copy of a column with twice the room."""
     wide = np.empty(2 * column.size, dtype=column.dtype)
-    wide[: column.size] = column
+    for i in range(column.size):
+        wide[i] = column[i]
     return wide
 
 
@@ -332,19 +336,20 @@ def _find_peaks(
     matched, energy, pulse, threshold, leakage, peak_ratio, scan, table, start, interval
 ):
     """Every peak of every snapshot: count, face, tone, delay, u and power."""
-    elements = matched.shape[3]
+    _, faces, tones, elements = matched.shape
     face, tone = np.empty(128, dtype=np.int64), np.empty(128, dtype=np.int64)
     delay, peak_u, peak_power = np.empty(128), np.empty(128), np.empty(128)
-    power, count, levels = np.empty(scan.shape[1]), 0, energy.reshape(-1)
-    for test in range(levels.size):
-        if levels[test] <= threshold:
+    power, count = np.empty(scan.shape[1]), 0
+    for test in range(energy.size):
+        if energy[test] <= threshold or not _is_snapshot(
+            energy, test, faces * tones, pulse, leakage
+        ):
             continue
-        b, p = test // (energy.shape[1] * energy.shape[2]), test % energy.shape[2]
-        f = test // energy.shape[2] % energy.shape[1]
-        if not _is_snapshot(energy, b, f, p, pulse, leakage):
-            continue
+        b, f, p = test // (faces * tones), test // tones % faces, test % tones
         _scan_power(matched[b, f, p], table[p], power)
-        floor, step = peak_ratio * power.max(), scan[p, 1] - scan[p, 0]
+        step, floor = scan[p, 1] - scan[p, 0], 0.0
+        for i in range(power.size):
+            floor = max(floor, peak_ratio * power[i])
         for i in range(1, power.size - 1):
             if power[i] < floor or power[i] <= power[i - 1] or power[i] < power[i + 1]:
                 continue
