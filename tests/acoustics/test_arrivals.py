@@ -12,6 +12,8 @@ from pipistrelle.acoustics.arrivals import (
     PASSIVE,
     Arrivals,
     arrivals_of_emission,
+    arrivals_of_emissions,
+    rows_of,
     through_piston,
 )
 from pipistrelle.acoustics.emitter import piston_directivity
@@ -257,3 +259,26 @@ def test_a_null_of_the_piston_is_deep_but_finite():
     gain = through_piston(heard, **{**PISTON, "radius": radius}).level_db - heard.level_db
     assert -240.0 - 1e-9 <= gain[own[0]] < -200.0
     assert gain[own[1]] == pytest.approx(-240.0, abs=1e-9)
+
+
+@given(seed=SEEDS, spreading=LAWS, count=st.integers(1, 6))
+@law
+def test_many_emissions_bring_bit_for_bit_what_each_brings_alone(seed, spreading, count):
+    config = Config(air=AirConfig(spreading=spreading))
+    _, _, landmarks, beacon = world(seed)
+    rng = np.random.default_rng(seed)
+    poses, velocities = rng.uniform(-9.0, 9.0, (count, 3)), rng.uniform(-1.0, 1.0, (count, 2))
+    heard, size = arrivals_of_emissions(poses, velocities, landmarks, beacon, config)
+    end = np.cumsum(size)
+    assert end[-1] == heard.delay.size
+    for pose, velocity, first, last in zip(poses, velocities, end - size, end, strict=True):
+        alone = arrivals_of_emission(pose, velocity, landmarks, beacon, config)
+        among = rows_of(heard, slice(first, last))
+        for name in Arrivals.__slots__:
+            assert getattr(among, name).tobytes() == getattr(alone, name).tobytes()
+
+
+def test_of_many_emissions_the_impossible_one_is_named():
+    poses = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.5]])
+    with pytest.raises(InputError, match=r"pose \[1\. +1\. +0\.5\]: found vehicle to landmark 1"):
+        arrivals_of_emissions(poses, 0 * poses[:, :2], poses[1:, :2], np.array([5.0, 0.0]), CONFIG)

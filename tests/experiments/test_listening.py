@@ -18,7 +18,7 @@ from pipistrelle.arrays.receiver import (
 )
 from pipistrelle.config import Config, EmitterConfig, ReceiverConfig, ScenarioConfig
 from pipistrelle.detection.scans import UNLABELLED, Heard
-from pipistrelle.detection.snapshots import detect, detector, filter_blocks
+from pipistrelle.detection.snapshots import detect, detector, filter_blocks, filter_samples
 from pipistrelle.experiments import listening
 from pipistrelle.experiments.association import faintest_level_db, label_detections
 from pipistrelle.experiments.listening import listen
@@ -73,6 +73,19 @@ def test_the_dense_engine_too_hears_each_beam_alone_and_each_world_with_its_own_
     assert bits(listen(world, config, [0.025])[0]) == bits(narrow)
     assert bits(listen(world, config, [0.025], iteration=1)[0]) != bits(narrow)
     assert bits(wide) != bits(narrow)
+
+
+def test_the_dense_engine_records_until_the_next_call(monkeypatch):
+    world, config = short(4, receiver=ReceiverConfig(engine="dense"))
+    shapes = []
+
+    def watched(samples, **settings):
+        shapes.append((samples.shape, samples.dtype))
+        return filter_samples(samples, **settings)
+
+    monkeypatch.setattr(listening, "filter_samples", watched)
+    listen(world, config, [0.0088])
+    assert shapes == [((100_000 - 560, 4, 10), np.complex64)]
 
 
 def test_a_narrower_beam_ranges_fewer_landmarks():

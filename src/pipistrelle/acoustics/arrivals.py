@@ -5,7 +5,7 @@ stood still until the last echo; of its motion only the Doppler shift is kept.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -20,7 +20,7 @@ from pipistrelle.acoustics.propagation import (
 )
 from pipistrelle.acoustics.target import target_strength_db
 from pipistrelle.config import AirConfig, Config, InputError
-from pipistrelle.geometry import range_and_bearing
+from pipistrelle.geometry import wrap
 
 ACTIVE, PASSIVE = 0, 1
 """Whose call it is: the vehicle's own, or the beacon's."""
@@ -111,36 +111,82 @@ def arrivals_of_emission(
     >>> heard.source, heard.landmark
     (array([0, 0, 1, 1, 1], dtype=int8), array([1, 3, 1, 2, 3]))
     """
-    air = config.air
-    targets = np.concatenate((landmarks, beacon[np.newaxis]))
-    homeward, bearing = range_and_bearing(pose, targets)
-    offset, incoming = targets - pose[:2], targets - beacon
+    poses, velocities = pose[np.newaxis], velocity[np.newaxis]
+    return arrivals_of_emissions(poses, velocities, landmarks, beacon, config)[0]
+
+
+def arrivals_of_emissions(
+    poses: Float[np.ndarray, "k 3"],
+    velocities: Float[np.ndarray, "k 2"],
+    landmarks: Float[np.ndarray, "n 2"],
+    beacon: Float[np.ndarray, "2"],
+    config: Config,
+) -> tuple[Arrivals, Int[np.ndarray, " k"]]:
+    """Arrivals of several emissions in one world, emission after emission (`arrivals_of_emission`).
+
+    Parameters
+    ----------
+    poses : (k, 3) [m, m, rad]
+    velocities : (k, 2) [m/s]
+    landmarks : (n, 2) [m]
+    beacon : (2) [m]
+    config : Config
+
+    Returns
+    -------
+    Arrivals
+        Those of the first emission, then those of the second, and so on.
+    count : (k)
+        How many belong to each emission.
+
+    Raises
+    ------
+    InputError
+        As for one emission.
+
+    Examples
+    --------
+    The vehicle turns round, and its next call meets the beacon instead of the landmark.
+
+    >>> poses, still = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, np.pi]]), np.zeros((2, 2))
+    >>> landmarks, beacon = np.array([[5.0, 0.0]]), np.array([-9.0, 0.0])
+    >>> heard, count = arrivals_of_emissions(poses, still, landmarks, beacon, Config())
+    >>> count, heard.landmark
+    (array([3, 3]), array([1, 1, 2, 2, 1, 2]))
+    """
+    air, targets = config.air, np.concatenate((landmarks, beacon[np.newaxis]))
+    offset, incoming = targets - poses[:, np.newaxis, :2], targets - beacon
+    homeward = np.hypot(offset[..., 0], offset[..., 1])
     outward = np.hypot(incoming[:, 0], incoming[:, 1])
-    _refuse_impossible(pose, homeward, outward)
+    _refuse_impossible(poses, homeward, outward)
+    bearing = wrap(np.arctan2(offset[..., 1], offset[..., 0]) - poses[:, 2:])
+    east, north = velocities[:, :1], velocities[:, 1:]
+    closing = (offset[..., 0] * east + offset[..., 1] * north) / homeward
     ahead = np.flatnonzero(in_front(bearing))
-    loss_db = _loss_db(homeward, outward, ahead, _turn(incoming, offset), config)
-    row = np.concatenate((ahead, np.arange(len(targets))))
-    own = np.arange(len(row)) < len(ahead)
-    path = homeward[row] + np.where(own, homeward[row], outward[row])
-    sent_db = np.where(own, config.emitter.level_db, config.beacon.level_db)
-    absorption = np.where(
-        own, _absorption(air, config.emitter.frequency), _absorption(air, config.beacon.frequency)
-    )
-    closing = ((offset[:, 0] * velocity[0] + offset[:, 1] * velocity[1]) / homeward)[row]
-    frequency = doppler_frequency(
-        np.where(own, config.emitter.frequency, config.beacon.frequency),
-        receiver_speed=closing,
-        source_speed=np.where(own, closing, 0.0),
-        speed_of_sound=air.speed_of_sound,
-    )
-    return Arrivals(
+    pair = np.concatenate((ahead, np.arange(homeward.size)))  # of an emission and a target
+    order = np.argsort(pair // len(targets), kind="stable")
+    pair, own = pair[order], order < len(ahead)
+    target, source = pair % len(targets), np.where(own, np.int8(ACTIVE), np.int8(PASSIVE))
+    back, closing = homeward.ravel()[pair], closing.ravel()[pair]
+    path = back + np.where(own, back, outward[target])
+    loss_db = _loss_db(homeward, outward, ahead, _turn(incoming, offset), config)[order]
+    tones = (config.emitter.frequency, config.beacon.frequency)
+    absorption = np.array([_absorption(air, tone) for tone in tones])[source]
+    sent_db = np.array([config.emitter.level_db, config.beacon.level_db])[source]
+    heard = Arrivals(
         delay=path / air.speed_of_sound,
         level_db=sent_db - loss_db - absorption * path,
-        bearing=bearing[row],
-        frequency=frequency,
-        source=np.where(own, np.int8(ACTIVE), np.int8(PASSIVE)),
-        landmark=row + 1,
+        bearing=bearing.ravel()[pair],
+        frequency=doppler_frequency(
+            np.array(tones)[source],
+            receiver_speed=closing,
+            source_speed=np.where(own, closing, 0.0),
+            speed_of_sound=air.speed_of_sound,
+        ),
+        source=source,
+        landmark=target + 1,
     )
+    return heard, np.bincount(pair // len(targets))
 
 
 def through_piston(
@@ -183,22 +229,29 @@ def through_piston(
     >>> level.round(1)
     array([  0. , -18.6])
     """
-    own = arrivals.source == ACTIVE
+    own = np.flatnonzero(arrivals.source == ACTIVE)
     pressure = piston_directivity(
         arrivals.bearing[own], frequency=frequency, radius=radius, speed_of_sound=speed_of_sound
     )
     level_db = arrivals.level_db.copy()
     level_db[own] += 20.0 * np.log10(np.maximum(pressure, _DEEPEST_NULL))
-    return replace(arrivals, level_db=level_db)
+    return Arrivals(
+        delay=arrivals.delay,
+        level_db=level_db,
+        bearing=arrivals.bearing,
+        frequency=arrivals.frequency,
+        source=arrivals.source,
+        landmark=arrivals.landmark,
+    )
 
 
-def rows_of(arrivals: Arrivals, rows: Bool[np.ndarray, " a"]) -> Arrivals:
+def rows_of(arrivals: Arrivals, rows: Bool[np.ndarray, " a"] | slice) -> Arrivals:
     """Take some of the arrivals.
 
     Parameters
     ----------
     arrivals : Arrivals
-    rows : (a) bool
+    rows : (a) bool or slice
 
     Returns
     -------
@@ -215,33 +268,33 @@ def rows_of(arrivals: Arrivals, rows: Bool[np.ndarray, " a"]) -> Arrivals:
 
 
 def _loss_db(
-    homeward: Float[np.ndarray, " t"],
+    homeward: Float[np.ndarray, "k t"],
     outward: Float[np.ndarray, " t"],
     ahead: Int[np.ndarray, " b"],
-    turn: Float[np.ndarray, " t"],
+    turn: Float[np.ndarray, "k t"],
     config: Config,
 ) -> Float[np.ndarray, " a"]:
-    """Spreading less target strength of active echoes, passive echoes and the direct call."""
+    """Spreading less target strength of the echoes ahead, then of each passive echo and call."""
     air, target = config.air, config.target
     strength_db = target_strength_db(
-        turn[:-1],
+        turn[:, :-1],
         radius=target.radius,
         frequency=config.beacon.frequency,
         shape=target.shape,
         speed_of_sound=air.speed_of_sound,
     )
-    active = spreading_loss_db(2.0 * homeward[ahead], ways=2)
-    passive = passive_spreading_loss_db(outward[:-1], homeward[:-1], law=air.spreading)
-    direct = spreading_loss_db(homeward[-1:])
-    return np.concatenate((active, passive - strength_db, direct))
+    active = spreading_loss_db(2.0 * homeward.ravel()[ahead], ways=2)
+    passive = passive_spreading_loss_db(outward[:-1], homeward[:, :-1], law=air.spreading)
+    direct = spreading_loss_db(homeward[:, -1:])
+    return np.concatenate((active, np.hstack((passive - strength_db, direct)).ravel()))
 
 
 def _turn(
-    incoming: Float[np.ndarray, "t 2"], offset: Float[np.ndarray, "t 2"]
-) -> Float[np.ndarray, " t"]:
+    incoming: Float[np.ndarray, "t 2"], offset: Float[np.ndarray, "k t 2"]
+) -> Float[np.ndarray, "k t"]:
     """Angle from the way in to the way on to the vehicle, which is -offset: pi is back [rad]."""
-    x, y = incoming.T
-    u, v = -offset.T
+    x, y = incoming[:, 0], incoming[:, 1]
+    u, v = -offset[..., 0], -offset[..., 1]
     return np.arctan2(x * v - y * u, x * u + y * v)
 
 
@@ -259,19 +312,21 @@ def _absorption(air: AirConfig, frequency: float) -> float:
 
 
 def _refuse_impossible(
-    pose: Float[np.ndarray, "3"],
-    homeward: Float[np.ndarray, " t"],
+    poses: Float[np.ndarray, "k 3"],
+    homeward: Float[np.ndarray, "k t"],
     outward: Float[np.ndarray, " t"],
 ) -> None:
     """Refuse points that coincide and coordinates that are not finite."""
-    paths = np.concatenate((homeward, outward[:-1]))
-    if paths.min() > 0.0 and paths.max() < math.inf and math.isfinite(pose[2]):
+    paths = np.hstack((homeward, np.broadcast_to(outward[:-1], (len(poses), len(outward) - 1))))
+    good = (paths.min(axis=1) > 0.0) & (paths.max(axis=1) < math.inf) & np.isfinite(poses[:, 2])
+    if good.all():
         return
-    names = [f"landmark {i}" for i in range(1, len(homeward))]
+    bad = int(np.argmin(good))
+    names = [f"landmark {i}" for i in range(1, len(outward))]
     ends = [f"vehicle to {name}" for name in [*names, "beacon"]] + [f"beacon to {n}" for n in names]
-    found = [f"{e}: {d} m" for e, d in zip(ends, paths, strict=True) if not 0.0 < d < math.inf]
+    found = [f"{e}: {d} m" for e, d in zip(ends, paths[bad], strict=True) if not 0.0 < d < math.inf]
     raise InputError(
-        f"world around the pose {pose}: found {', '.join(found) or 'no finite heading'}; expected "
-        "vehicle, beacon and landmarks at distinct, finite points; move them apart "
+        f"world around the pose {poses[bad]}: found {', '.join(found) or 'no finite heading'}; "
+        "expected vehicle, beacon and landmarks at distinct, finite points; move them apart "
         "(scenario.clearance keeps them so)"
     )

@@ -174,9 +174,10 @@ def add_echo_blocks(
     sampling : Sampling
     """
     _add_echo_blocks(
-        signal, arrivals.delay, 10.0 ** (arrivals.level_db / 20.0), arrivals.bearing,
-        arrivals.frequency, _durations(arrivals, sampling), layout.normal, layout.position,
-        sampling.tones, sampling.rate, sampling.block, sampling.pulse, sampling.speed_of_sound,
+        signal.view(np.float64), arrivals.delay, 10.0 ** (arrivals.level_db / 20.0),
+        arrivals.bearing, arrivals.frequency, _durations(arrivals, sampling), layout.normal,
+        layout.position, sampling.tones, sampling.rate, sampling.block, sampling.pulse,
+        sampling.speed_of_sound,
     )  # fmt: skip
 
 
@@ -186,6 +187,8 @@ def record_samples(
     layout: Layout,
     sampling: Sampling,
     rng: np.random.Generator | None,
+    *,
+    single: bool = False,
 ) -> Complex[np.ndarray, "t f e"]:
     """Every sample of a frame at the full rate: the reference engine.
 
@@ -198,6 +201,8 @@ def record_samples(
     sampling : Sampling
     rng : Generator or None
         Source of the noise; None records without.
+    single : bool
+        In single precision, as a recording would be kept.
 
     Returns
     -------
@@ -205,11 +210,12 @@ def record_samples(
     """
     first = sampling.pulse * sampling.block
     shape = (blocks * sampling.block, layout.normal.size, layout.position.size)
+    real, whole = (np.float32, np.complex64) if single else (np.float64, np.complex128)
     if rng is None:
-        signal = np.zeros(shape, dtype=np.complex128)
+        signal = np.zeros(shape, dtype=whole)
     else:
-        parts = rng.standard_normal((*shape, 2))
-        signal = parts.view(np.complex128)[..., 0] * (sampling.noise_std / math.sqrt(2.0))
+        signal = rng.standard_normal((*shape, 2), dtype=real).view(whole)[..., 0]
+        signal *= real(sampling.noise_std / math.sqrt(2.0))
     duration = _durations(arrivals, sampling)
     for a in range(arrivals.delay.size):
         frequency, delay = arrivals.frequency[a], arrivals.delay[a]
@@ -260,32 +266,54 @@ def _envelope(sums, omega, start, stop, block):
 
 
 @njit(cache=True, error_model="numpy")
+def _steer(direct, turned, phasor, wave, position):
+    """Write a phasor times each element's phase, and i times that, parts interleaved."""
+    elements = position.size
+    for e in range(elements):
+        mirror = elements - 1 - e
+        if mirror < e and position[e] == -position[mirror]:
+            cosine, sine = direct[2 * mirror], -direct[2 * mirror + 1]
+        else:
+            phase = wave * position[e]
+            cosine, sine = math.cos(phase), math.sin(phase)
+        direct[2 * e], direct[2 * e + 1] = cosine, sine
+    for e in range(elements):
+        phase = phasor * complex(direct[2 * e], direct[2 * e + 1])
+        direct[2 * e], direct[2 * e + 1] = phase.real, phase.imag
+        turned[2 * e], turned[2 * e + 1] = -phase.imag, phase.real
+
+
+@njit(cache=True, error_model="numpy")
 def _add_echo_blocks(
     signal, delay, amplitude, bearing, frequency, duration, normal, position,
     tones, rate, block, blank, speed_of_sound,
 ):  # fmt: skip
-    """Add each arrival's envelope, block by block, times its steering vector."""
-    blocks, faces, _, elements = signal.shape
-    sums, steering = np.empty(blocks, dtype=np.complex128), np.empty(elements, np.complex128)
+    """Add each arrival's envelope, block by block, times its steering vector.
+
+    Of the signal each element's real and imaginary part are neighbours.
+    """
+    blocks, faces = signal.shape[0], signal.shape[1]
+    sums = np.empty((2, blocks), dtype=np.complex128)
+    direct, turned = np.empty(signal.shape[3]), np.empty(signal.shape[3])
     for a in range(delay.size):
         start = max(math.ceil(delay[a] * rate), blank * block)
         stop = min(math.ceil((delay[a] + duration[a]) * rate), (blank + blocks) * block)
         if stop <= start:
             continue
-        first = start // block - blank
+        first, count = start // block - blank, 0
         turns = -2.0 * math.pi * frequency[a] * delay[a]
         phasor = amplitude[a] * complex(math.cos(turns), math.sin(turns))
         for p in range(2):
             omega = 2.0 * math.pi * (frequency[a] - tones[p]) / rate
-            count = _envelope(sums, omega, start, stop, block)
-            for f in range(faces):
-                angle = bearing[a] - normal[f]
-                if math.cos(angle) < 0.0:
-                    continue
-                wave = 2.0 * math.pi * frequency[a] * math.sin(angle) / speed_of_sound
-                for e in range(elements):
-                    phase = wave * position[e]
-                    steering[e] = phasor * complex(math.cos(phase), math.sin(phase))
-                for b in range(count):
-                    for e in range(elements):
-                        signal[first + b, f, p, e] += sums[b] * steering[e]
+            count = _envelope(sums[p], omega, start, stop, block)
+        for f in range(faces):
+            angle = bearing[a] - normal[f]
+            if math.cos(angle) < 0.0:
+                continue
+            wave = 2.0 * math.pi * frequency[a] * math.sin(angle) / speed_of_sound
+            _steer(direct, turned, phasor, wave, position)
+            for b in range(count):
+                for p in range(2):
+                    re, im, heard = sums[p, b].real, sums[p, b].imag, signal[first + b, f, p]
+                    for i in range(heard.size):
+                        heard[i] += re * direct[i] + im * turned[i]

@@ -2,18 +2,20 @@
 
 import math
 
+import numpy as np
 from numba import njit
 
 
 @njit(cache=True, error_model="numpy")
-def steer(x, u):
-    """Output of the phase-shift beamformer steered to u."""
-    turn, phase = complex(math.cos(u), -math.sin(u)), 1.0 + 0.0j
-    total = 0.0 + 0.0j
-    for e in range(x.size):
-        total += x[e] * phase
-        phase *= turn
-    return total
+def _steer(matched, low, f, p, u, beam):
+    """Write the output of the phase-shift beamformer steered to u, from lag low on."""
+    turn = complex(math.cos(u), -math.sin(u))
+    for k in range(beam.size):
+        x, phase, total = matched[low + k, f, p], 1.0 + 0.0j, 0.0 + 0.0j
+        for e in range(x.size):
+            total += x[e] * phase
+            phase *= turn
+        beam[k] = total
 
 
 @njit(cache=True, error_model="numpy")
@@ -48,18 +50,19 @@ def _best_fraction(z0, z1, pulse):
 @njit(cache=True, error_model="numpy")
 def arrival_lag(matched, b, f, p, u, pulse):
     """Lag at which the call starts in the beam steered to u, near lag b, to a fraction."""
-    reach = max(pulse // 7, 1)
-    low, high = max(b - reach, 0), min(b + reach, matched.shape[0] - 1)
+    reach, last = max(pulse // 7, 1), matched.shape[0] - 1
+    low, high = max(b - reach, 0), min(b + reach, last)
+    first = max(low - 1, 0)
+    beam = np.empty(min(high + 1, last) - first + 1, dtype=np.complex128)
+    _steer(matched, first, f, p, u, beam)
     centre, largest = b, -1.0
     for near in range(low, high + 1):
-        z = abs(steer(matched[near, f, p], u))
+        z = abs(beam[near - first])
         if z > largest:
             centre, largest = near, z
     best, fit = float(centre), -1.0
-    for left in range(max(centre - 1, 0), min(centre, matched.shape[0] - 2) + 1):
-        q, score = _best_fraction(
-            steer(matched[left, f, p], u), steer(matched[left + 1, f, p], u), pulse
-        )
+    for left in range(max(centre - 1, 0), min(centre, last - 1) + 1):
+        q, score = _best_fraction(beam[left - first], beam[left + 1 - first], pulse)
         if score > fit:
             best, fit = left + q, score
     return best

@@ -30,6 +30,8 @@ from pipistrelle.geometry import wrap
 SCAN_STEP = 0.05
 """Distance of the scan's beams in u [rad]: the parabola's bias stays under 2 % of a beam step."""
 
+_CHUNK = 256
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Detections:
@@ -191,21 +193,19 @@ def filter_samples(
     Returns
     -------
     (samples - length + 1, faces, tones, elements) complex
-        Lag i is a call that starts with sample i; noise has unit variance.
+        Lag i is a call that starts with sample i; noise has unit variance. As precise as the
+        samples.
     """
     from scipy.signal import oaconvolve
 
-    n = np.arange(length)
-    matched = [
-        oaconvolve(
-            samples,
-            np.exp(2j * np.pi * tone * n / rate)[::-1, None, None].conj(),
-            mode="valid",
-            axes=0,
-        )
-        for tone in tones
-    ]
-    return np.stack(matched, axis=2) / (noise_std * math.sqrt(length))
+    n = np.arange(length)[::-1, None]
+    replica = np.exp(-2j * np.pi * tones * n / rate) / (noise_std * math.sqrt(length))
+    return oaconvolve(
+        samples[:, :, None, :],
+        replica.astype(samples.dtype)[:, None, :, None],
+        mode="valid",
+        axes=0,
+    )
 
 
 def detect(
@@ -234,12 +234,10 @@ def detect(
     -------
     Detections
     """
-    lags, faces, tones, elements = matched.shape
-    rows = matched.reshape(lags, faces * tones * elements).view(np.float64)
-    energy = _energy(rows, elements)
+    energy = _energy(matched.reshape(-1).view(matched.real.dtype), matched.shape[3])
     count, face, tone, lag, peak_u, power = _find_peaks(
-        matched, energy.reshape(lags, faces, tones), pulse, detector.threshold,
-        detector.leakage, detector.peak, detector.scan, detector.table, start, interval,
+        matched, energy, pulse, detector.threshold, detector.leakage, detector.peak,
+        detector.scan, detector.table, start, interval,
     )  # fmt: skip
     face, tone, u = face[:count], tone[:count], peak_u[:count]
     angle = np.arcsin(np.clip(u / detector.wave[tone], -1.0, 1.0))
@@ -259,50 +257,56 @@ def _boxcar(rows, width, scale, sums):
     """Write the running sums of width rows, scaled."""
     columns = rows.shape[1]
     total = np.zeros(columns)
-    for b in range(rows.shape[0]):
-        row = rows[b]
+    for b in range(min(width - 1, rows.shape[0])):
         for i in range(columns):
-            total[i] += scale * row[i]
-        if b >= width - 1:
-            done, old = sums[b - width + 1], rows[b - width + 1]
-            for i in range(columns):
-                done[i] = total[i]
-                total[i] -= scale * old[i]
+            total[i] += scale * rows[b, i]
+    for b in range(width - 1, rows.shape[0]):
+        new, old, done = rows[b], rows[b - width + 1], sums[b - width + 1]
+        for i in range(columns):
+            done[i] = total[i] + scale * new[i]
+            total[i] = done[i] - scale * old[i]
 
 
 @njit(cache=True, error_model="numpy")
-def _energy(rows, elements):
-    """Sum of squares over the elements of each face and tone."""
-    lags, groups = rows.shape[0], rows.shape[1] // (2 * elements)
-    energy = np.empty((lags, groups))
-    for b in range(lags):
-        for g in range(groups):
+def _energy(parts, elements):
+    """Sums of squares over the elements, real and imaginary parts neighbours, of every output."""
+    energy = np.empty(parts.size // (2 * elements))
+    square = np.empty(_CHUNK * elements)  # stays in the cache
+    for start in range(0, energy.size, _CHUNK):
+        done = energy[start : start + _CHUNK]
+        part = parts[2 * elements * start :]
+        for i in range(done.size * elements):
+            square[i] = part[2 * i] * part[2 * i] + part[2 * i + 1] * part[2 * i + 1]
+        for g in range(done.size):
             total = 0.0
-            for i in range(2 * elements * g, 2 * elements * (g + 1)):
-                total += rows[b, i] * rows[b, i]
-            energy[b, g] = total
+            for e in range(elements):
+                total += square[g * elements + e]
+            done[g] = total
     return energy
 
 
 @njit(cache=True, error_model="numpy")
-def _is_snapshot(energy, b, f, p, pulse, threshold, leakage):
-    """Whether lag b is a snapshot of face f in which tone p is present."""
-    level = energy[b, f, p]
-    if level <= threshold:
-        return False
-    for near in range(max(b - pulse // 2, 0), min(b + pulse // 2 + 1, energy.shape[0])):
-        other = energy[near, f, p]
-        if other > level or (other == level and near < b):
+def _is_snapshot(energy, test, row, pulse, leakage):
+    """Whether a test's lag is the largest near, and its tone no leakage of the other.
+
+    A row of tests is a lag's: its neighbour in time is a row away, its other tone next to it.
+    """
+    level, size = energy[test], energy.size
+    for away in range(row, (pulse // 2 + 1) * row, row):
+        if test >= away and energy[test - away] >= level:
             return False
-    strongest = 0.0
-    for near in range(max(b - pulse, 0), min(b + pulse + 1, energy.shape[0])):
-        strongest = max(strongest, energy[near, f, 1 - p])
+        if test + away < size and energy[test + away] > level:
+            return False
+    other, strongest = test + 1 - 2 * (test % 2), 0.0
+    for away in range(-pulse * row, (pulse + 1) * row, row):
+        if 0 <= other + away < size:
+            strongest = max(strongest, energy[other + away])
     return level > leakage * strongest
 
 
 @njit(cache=True, error_model="numpy")
 def _scan_power(x, table, power):
-    """Power of the conventional beam over the scan, from the lag sums."""
+    """Write the power of the conventional beam over the scan, from the lag sums."""
     elements, beams = x.size, power.size
     r0 = 0.0
     for e in range(elements):
@@ -322,7 +326,8 @@ def _scan_power(x, table, power):
 def _grown(column):
     """Copy of a column with twice the room."""
     wide = np.empty(2 * column.size, dtype=column.dtype)
-    wide[: column.size] = column
+    for i in range(column.size):
+        wide[i] = column[i]
     return wide
 
 
@@ -331,28 +336,31 @@ def _find_peaks(
     matched, energy, pulse, threshold, leakage, peak_ratio, scan, table, start, interval
 ):
     """Every peak of every snapshot: count, face, tone, delay, u and power."""
-    lags, faces, tones, elements = matched.shape
+    _, faces, tones, elements = matched.shape
     face, tone = np.empty(128, dtype=np.int64), np.empty(128, dtype=np.int64)
     delay, peak_u, peak_power = np.empty(128), np.empty(128), np.empty(128)
     power, count = np.empty(scan.shape[1]), 0
-    for b in range(lags):
-        for f in range(faces):
-            for p in range(tones):
-                if not _is_snapshot(energy, b, f, p, pulse, threshold, leakage):
-                    continue
-                _scan_power(matched[b, f, p], table[p], power)
-                floor, step = peak_ratio * power.max(), scan[p, 1] - scan[p, 0]
-                for i in range(1, power.size - 1):
-                    if power[i] < floor or power[i] <= power[i - 1] or power[i] < power[i + 1]:
-                        continue
-                    slope = power[i + 1] - power[i - 1]
-                    bend = 2.0 * power[i] - power[i + 1] - power[i - 1]
-                    u = scan[p, i] + 0.5 * step * slope / bend
-                    if count == face.size:
-                        face, tone, delay = _grown(face), _grown(tone), _grown(delay)
-                        peak_u, peak_power = _grown(peak_u), _grown(peak_power)
-                    face[count], tone[count], peak_u[count] = f, p, u
-                    delay[count] = start + interval * arrival_lag(matched, b, f, p, u, pulse)
-                    peak_power[count] = (power[i] + 0.125 * slope * slope / bend) / elements
-                    count += 1
+    for test in range(energy.size):
+        if energy[test] <= threshold or not _is_snapshot(
+            energy, test, faces * tones, pulse, leakage
+        ):
+            continue
+        b, f, p = test // (faces * tones), test // tones % faces, test % tones
+        _scan_power(matched[b, f, p], table[p], power)
+        step, floor = scan[p, 1] - scan[p, 0], 0.0
+        for i in range(power.size):
+            floor = max(floor, peak_ratio * power[i])
+        for i in range(1, power.size - 1):
+            if power[i] < floor or power[i] <= power[i - 1] or power[i] < power[i + 1]:
+                continue
+            slope = power[i + 1] - power[i - 1]
+            bend = 2.0 * power[i] - power[i + 1] - power[i - 1]
+            u = scan[p, i] + 0.5 * step * slope / bend
+            if count == face.size:
+                face, tone, delay = _grown(face), _grown(tone), _grown(delay)
+                peak_u, peak_power = _grown(peak_u), _grown(peak_power)
+            face[count], tone[count], peak_u[count] = f, p, u
+            delay[count] = start + interval * arrival_lag(matched, b, f, p, u, pulse)
+            peak_power[count] = (power[i] + 0.125 * slope * slope / bend) / elements
+            count += 1
     return count, face, tone, delay, peak_u, peak_power

@@ -2,6 +2,11 @@
 
 The noise and the beacon's sound are those of the world and shared by all beamwidths, drawn once
 and keyed by the frame alone.
+
+The dense engine records until the vehicle calls again, 100,000 samples of 40 channels in the
+paper's half a second less the blanked call. The block engine stops after the last arrival. What
+follows is noise alone: no label could be given to anything in it, so the scans follow the same law,
+and only the count of clutter lacks the false alarms of the silence (about 0.01 a frame).
 """
 
 import math
@@ -14,7 +19,7 @@ from jaxtyping import Complex
 from pipistrelle.acoustics.arrivals import (
     ACTIVE,
     Arrivals,
-    arrivals_of_emission,
+    arrivals_of_emissions,
     rows_of,
     through_piston,
 )
@@ -42,6 +47,9 @@ from pipistrelle.detection.snapshots import (
 )
 from pipistrelle.experiments.association import faintest_level_db, label_detections
 from pipistrelle.experiments.scenario import Scenario
+
+TOGETHER = 25
+"""Frames whose arrivals are computed at a time: arrays of a few thousand keep NumPy busy."""
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, the frames done and their number."""
@@ -94,11 +102,11 @@ def listen(
     engine = _dense if config.receiver.engine == "dense" else _blocks
     beams: tuple[list[Heard], ...] = tuple([] for _ in radii)
     frames = range(setup.steps_per_frame, len(scenario.path), setup.steps_per_frame)
-    for number, k in enumerate(frames, start=1):
-        emission = _emission(scenario, k, config)
+    emissions = _emissions(scenario, frames, radii, config)
+    for number, (k, aimed) in enumerate(zip(frames, emissions, strict=True), start=1):
         key = stream_key(config.seed, iteration, "noise", number)
-        recorded = engine(emission, radii, station, key)
-        for beam, (arrivals, detections) in zip(beams, recorded, strict=True):
+        recorded = engine(aimed, station, key)
+        for beam, arrivals, detections in zip(beams, aimed, recorded, strict=True):
             beam.append(_heard(float(scenario.time[k]), detections, arrivals, station))
         if progress:
             progress("listening", number, len(frames))
@@ -151,12 +159,29 @@ def _station(config: Config) -> _Station:
     )
 
 
-def _emission(scenario: Scenario, k: int, config: Config) -> Arrivals:
-    """Return the arrivals of an emission at the end of step k, before the vehicle's beam."""
-    velocity = (scenario.path[k, :2] - scenario.path[k - 1, :2]) / config.scenario.step
-    return arrivals_of_emission(
-        scenario.path[k], velocity, scenario.landmarks, scenario.beacon, config
-    )
+def _emissions(
+    scenario: Scenario, frames: Sequence[int], radii: Sequence[float], config: Config
+) -> Iterator[list[Arrivals]]:
+    """Yield each frame's arrivals, one per piston; many frames are computed at a time."""
+    for first in range(0, len(frames), TOGETHER):
+        steps = np.array(frames[first : first + TOGETHER])
+        poses = scenario.path[steps]
+        velocities = (poses[:, :2] - scenario.path[steps - 1, :2]) / config.scenario.step
+        emission, count = arrivals_of_emissions(
+            poses, velocities, scenario.landmarks, scenario.beacon, config
+        )
+        aimed = [
+            through_piston(
+                emission,
+                radius=radius,
+                frequency=config.emitter.frequency,
+                speed_of_sound=config.air.speed_of_sound,
+            )
+            for radius in radii
+        ]
+        end = np.cumsum(count)
+        for rows in map(slice, end - count, end):
+            yield [rows_of(arrivals, rows) for arrivals in aimed]
 
 
 def _heard(time: float, detections: Detections, arrivals: Arrivals, station: _Station) -> Heard:
@@ -179,20 +204,19 @@ def _heard(time: float, detections: Detections, arrivals: Arrivals, station: _St
     )
 
 
-def _blocks(
-    emission: Arrivals, radii: Sequence[float], station: _Station, key: int
-) -> Iterator[tuple[Arrivals, Detections]]:
-    """Yield, per beam, the true arrivals and what is detected of them from block sums."""
+def _blocks(aimed: Sequence[Arrivals], station: _Station, key: int) -> Iterator[Detections]:
+    """Yield, per beam, what is detected of its arrivals from block sums."""
     layout, settled, space = station.layout, station.sampling, station.workspace
-    pulse, own = settled.pulse, emission.source == ACTIVE
-    shape = block_shape(blocks_to_hear(emission, settled), layout)
+    pulse, own = settled.pulse, aimed[0].source == ACTIVE
+    shape = block_shape(blocks_to_hear(aimed[0], settled), layout)
     shared = noise_blocks(shape[0], layout, settled, key, out=space.array("shared", shape))
-    add_echo_blocks(shared, rows_of(emission, ~own), layout, settled)
+    add_echo_blocks(shared, rows_of(aimed[0], ~own), layout, settled)
     lags = (shape[0] - pulse + 1, *shape[1:])
-    for radius in radii:
-        arrivals = _aimed(emission, radius, station.config)
-        signal = space.array("signal", shape)
-        np.copyto(signal, shared)
+    for left, arrivals in zip(range(len(aimed) - 1, -1, -1), aimed, strict=True):
+        signal = shared
+        if left:  # the last beam may write on what it shares
+            signal = space.array("signal", shape)
+            np.copyto(signal, shared)
         add_echo_blocks(signal, rows_of(arrivals, own), layout, settled)
         matched = filter_blocks(
             signal,
@@ -201,26 +225,22 @@ def _blocks(
             noise_std=settled.noise_std,
             out=space.array("matched", lags),
         )
-        detections = detect(
-            matched, station.detector, start=pulse * BLOCK, interval=BLOCK, pulse=pulse
-        )
-        yield arrivals, detections
+        yield detect(matched, station.detector, start=pulse * BLOCK, interval=BLOCK, pulse=pulse)
 
 
-def _dense(
-    emission: Arrivals, radii: Sequence[float], station: _Station, key: int
-) -> Iterator[tuple[Arrivals, Detections]]:
-    """Yield the same from every sample."""
-    settled = station.sampling
+def _dense(aimed: Sequence[Arrivals], station: _Station, key: int) -> Iterator[Detections]:
+    """Yield the same from every sample until the next call, in single precision."""
+    settled, setup = station.sampling, station.config.scenario
     length = settled.pulse * settled.block
-    for radius in radii:
-        arrivals = _aimed(emission, radius, station.config)
+    period = math.floor(setup.steps_per_frame * setup.step / BLOCK) - settled.pulse
+    for arrivals in aimed:
         samples = record_samples(
-            blocks_to_hear(emission, settled),
+            max(period, blocks_to_hear(arrivals, settled)),
             arrivals,
             station.layout,
             settled,
             np.random.default_rng(key),
+            single=True,
         )
         matched = filter_samples(
             samples,
@@ -230,15 +250,4 @@ def _dense(
             noise_std=settled.noise_std,
         )
         start, interval = settled.pulse * BLOCK, 1.0 / settled.rate
-        detections = detect(matched, station.detector, start=start, interval=interval, pulse=length)
-        yield arrivals, detections
-
-
-def _aimed(emission: Arrivals, radius: float, config: Config) -> Arrivals:
-    """Return the arrivals of an emission through the vehicle's piston."""
-    return through_piston(
-        emission,
-        radius=radius,
-        frequency=config.emitter.frequency,
-        speed_of_sound=config.air.speed_of_sound,
-    )
+        yield detect(matched, station.detector, start=start, interval=interval, pulse=length)
