@@ -56,6 +56,22 @@ FILTER: dict[str, dict[str, Any]] = {
     "gate of 99.9 %": {"filter.gate": 0.999},
 }
 OUTPUT = Path(__file__).with_name("sensitivity.csv")
+COLUMNS = {
+    "change": "changed",
+    "vehicle_db": "vehicle dB",
+    "beacon_db": "beacon dB",
+    "seen_active_180": "seen, active 180°",
+    "seen_fused_180": "seen, fused 180°",
+    "seen_passive": "seen, passive",
+    "full_fused_180": "full, fused 180°",
+    "full_passive": "full, passive",
+    "gain_position_33": "gain at 33° [m]",
+    "gain_position_11": "gain at 11° [m]",
+    "nees_fused_33": "NEES, fused 33°",
+    "nees_passive": "NEES, passive",
+    "worlds_diverged": "diverged",
+}
+"""What is printed, of all that is written."""
 Trials = dict[tuple[str, str], Scores]
 """Scores by strategy and beam."""
 
@@ -172,17 +188,15 @@ def gain(worlds: Sequence[Trials], beam: str, score: str) -> dict[str, float]:
 
 
 def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Lay the rows out as a table, each gain with its standard error."""
+    """Lay the main columns out as a table, each gain with its standard error."""
 
     def cell(row: Mapping[str, Any], name: str) -> str:
-        if isinstance(row[name], str):
-            return row[name]
-        digits = {"seen": 1, "full": 1, "vehicle": 1, "beacon": 1, "nees": 1, "worlds": 0}
-        text = f"{row[name]:.{digits.get(name.split('_')[0], 3)}f}"
-        return f"{text} ± {row[f'{name}_se']:.3f}" if f"{name}_se" in row else text
+        if name.startswith("gain"):
+            return f"{row[name]:+.2f} ± {row[f'{name}_se']:.2f}"
+        return f"{row[name]:.1f}" if isinstance(row[name], float) else str(row[name])
 
-    names = [name for name in rows[0] if not name.endswith("_se")]
-    lines = [names, ["---"] * len(names), *([cell(row, n) for n in names] for row in rows)]
+    lines = [list(COLUMNS.values()), ["---"] * len(COLUMNS)]
+    lines += [[cell(row, name) for name in COLUMNS] for row in rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
