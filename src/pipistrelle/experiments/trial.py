@@ -306,18 +306,23 @@ def run_filter(
 
 def _check(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> None:
     """Refuse scans that a filter could not use."""
-    for scan in scans:
-        k = np.searchsorted(time, scan.time)
-        if k == time.size or time[k] != scan.time:
-            raise InputError(f"scan at {scan.time} s: expected the time of the end of a step")
-        usable = np.isnan(scan.range) | (np.isfinite(scan.range) & (scan.range > 0.0))
-        usable &= np.isfinite(scan.bearing)
-        if not usable.all():
-            raise InputError(
-                f"scan at {scan.time} s: found numbers that no filter can use, for the landmarks "
-                f"{scan.landmark[~usable].tolist()}; expected finite bearings [rad] and ranges "
-                "above 0 [m], NaN where passive"
-            )
+    known = np.isin([scan.time for scan in scans], time)
+    if not known.all():
+        stray = scans[int(np.argmin(known))]
+        raise InputError(f"scan at {stray.time} s: expected the time of the end of a step")
+    nothing = np.empty(0)
+    bearing = np.concatenate([nothing, *(scan.bearing for scan in scans)])
+    distance = np.concatenate([nothing, *(scan.range for scan in scans)])
+    usable = np.isfinite(bearing) & (np.isnan(distance) | (distance > 0.0) & (distance < np.inf))
+    if not usable.all():
+        owner = np.repeat(np.arange(len(scans)), [scan.landmark.size for scan in scans])
+        first = owner[~usable][0]
+        labels = scans[first].landmark[~usable[owner == first]].tolist()
+        raise InputError(
+            f"scan at {scans[first].time} s: found numbers that no filter can use, for the "
+            f"landmarks {labels}; expected finite bearings [rad] and ranges above 0 [m], NaN "
+            "where passive"
+        )
 
 
 def compile_kernels() -> None:
