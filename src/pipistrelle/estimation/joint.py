@@ -116,9 +116,12 @@ def _point_rows(joint, size, i):
 @njit(cache=True, error_model="numpy")
 def settle(joint, size):
     """Let every row catch up: afterwards nothing waits."""
+    covariance = joint.covariance
     for i in range(3, size, 2):
-        _point_rows(joint, size, i)
+        pi, pj = _point_rows(joint, i + 2, i)
         joint.taken[i] = 0
+        for b in range(i):
+            covariance[b, i], covariance[b, i + 1] = pi[b], pj[b]
     joint.waiting[0] = 0
 
 

@@ -273,12 +273,11 @@ def run_filter(
         For a bearing or range that is no number, or a time that is not one of the drive's.
     """
     time, controls = drive.time, drive.controls
-    _check(scans, time)
+    steps = _steps_of(scans, time)
     mean, covariance = np.empty((time.size, 3)), np.empty((time.size, 3, 3))
     mean[0], covariance[0] = drive.start.mean, drive.start.covariance
     dt, belief, done = np.diff(time), estimator.init(drive.start), 0
-    for number, scan in enumerate(scans, start=1):
-        k = int(np.searchsorted(time, scan.time))
+    for number, (k, scan) in enumerate(zip(steps, scans, strict=True), start=1):
         if k > done:
             belief, poses = estimator.predict(belief, controls[done:k], dt[done:k], rng)
             mean[done + 1 : k + 1], covariance[done + 1 : k + 1] = poses.mean, poses.covariance
@@ -304,9 +303,11 @@ def run_filter(
     )
 
 
-def _check(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> None:
-    """Refuse scans that a filter could not use."""
-    known = np.isin([scan.time for scan in scans], time)
+def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]:
+    """Find the step that ends at each scan; refuse scans that a filter could not use."""
+    heard = np.array([scan.time for scan in scans], dtype=float)
+    steps = np.searchsorted(time, heard)
+    known = time[np.minimum(steps, time.size - 1)] == heard
     if not known.all():
         stray = scans[int(np.argmin(known))]
         raise InputError(f"scan at {stray.time} s: expected the time of the end of a step")
@@ -323,6 +324,7 @@ def _check(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> None:
             f"landmarks {labels}; expected finite bearings [rad] and ranges above 0 [m], NaN "
             "where passive"
         )
+    return steps.tolist()
 
 
 def compile_kernels() -> None:
