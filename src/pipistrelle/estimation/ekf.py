@@ -316,7 +316,8 @@ def _update(old_mean, old_covariance, old_landmark, old_weight, labels, bearings
             most += sensing.ray_ranges.size if math.isnan(ranges[m]) else 1
     joint = joint_of(old_mean, old_covariance, 3 + 2 * most)
     landmark, weight, gated = np.empty(most, dtype=np.int64), np.empty(most), 0
-    landmark[:members], weight[:members] = old_landmark, old_weight
+    for member in range(members):
+        landmark[member], weight[member] = old_landmark[member], old_weight[member]
     for m in range(labels.size):
         if known[m]:
             members, outcome = _correct_known(

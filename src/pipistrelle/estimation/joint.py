@@ -74,8 +74,10 @@ def joint_of(mean, covariance, room):
         for b in range(size):
             wider[a, b] = covariance[a, b]
     for b in range(size, width):
-        wider[:size, b] = 0.0
-        W[:, b] = 0.0
+        for a in range(size):
+            wider[a, b] = 0.0
+        for k in range(MOST_WAITING):
+            W[k, b] = 0.0
     return Joint(longer, wider, W, np.zeros(room, np.int64), np.zeros(1, np.int64))
 
 
@@ -94,17 +96,17 @@ def gaussian_of(joint, size):
 def _point_rows(joint, size, i):
     """Rows i and i + 1 of the covariance, with all that waits subtracted from them."""
     pi, pj, W = joint.covariance[i], joint.covariance[i + 1], joint.W
-    k, last, width = joint.taken[i], joint.waiting[0], _lanes(size)
+    first, last, width = joint.taken[i], joint.waiting[0], _lanes(size)
     joint.taken[i] = last
-    while k + 4 <= last:
+    fours = first + (last - first) // 4 * 4
+    for k in range(first, fours, 4):
         w0, w1, w2, w3 = W[k], W[k + 1], W[k + 2], W[k + 3]
         x0, x1, x2, x3 = w0[i], w1[i], w2[i], w3[i]
         y0, y1, y2, y3 = w0[i + 1], w1[i + 1], w2[i + 1], w3[i + 1]
         for b in range(width):
             pi[b] = pi[b] - x0 * w0[b] - x1 * w1[b] - x2 * w2[b] - x3 * w3[b]
             pj[b] = pj[b] - y0 * w0[b] - y1 * w1[b] - y2 * w2[b] - y3 * w3[b]
-        k += 4
-    for k in range(k, last):
+    for k in range(fours, last):
         w0 = W[k]
         x0, y0 = w0[i], w0[i + 1]
         for b in range(width):
@@ -147,14 +149,18 @@ def carry(mean, covariance, controls, dt, motion, pose_means, pose_covariances):
         dx, dy = carry_pose(pose, P, controls[k, 0], controls[k, 1], dt[k], motion)
         shift_x -= dy
         shift_y += dx
-        pose_means[k] = pose
-        pose_covariances[k] = P
+        for a in range(3):  # an assignment of slices would compile for a second longer
+            pose_means[k, a] = pose[a]
+            for b in range(3):
+                pose_covariances[k, a, b] = P[a, b]
     for j in range(3, mean.size):
         covariance[0, j] += shift_x * covariance[2, j]
         covariance[1, j] += shift_y * covariance[2, j]
         covariance[j, 0] = covariance[0, j]
         covariance[j, 1] = covariance[1, j]
-    covariance[:3, :3] = P
+    for a in range(3):
+        for b in range(3):
+            covariance[a, b] = P[a, b]
 
 
 @njit(cache=True, error_model="numpy")
