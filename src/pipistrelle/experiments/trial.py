@@ -18,6 +18,7 @@ from pipistrelle.estimation.fastslam import FastSlam
 from pipistrelle.estimation.models import B, Belief, Estimator, Gaussian, Motion, Swarm, Track
 from pipistrelle.evaluation.consistency import EKF_LIMIT, FASTSLAM_LIMIT
 from pipistrelle.experiments.listening import Progress, listen
+from pipistrelle.experiments.memory import check_memory
 from pipistrelle.experiments.results import TrialResult, score
 from pipistrelle.experiments.scenario import Scenario, bicycle, draw_scenario
 from pipistrelle.experiments.tables import LabelledPoints
@@ -104,7 +105,7 @@ def run_mission(
     Raises
     ------
     InputError
-        When the world, the sampling or a filter cannot be had.
+        When the world, the sampling or a filter cannot be had, or memory for it.
 
     Examples
     --------
@@ -113,6 +114,13 @@ def run_mission(
     (10, 41)
     """
     scenario = draw_scenario(config, _generator(config.seed, 0, "scenario"))
+    check_memory(
+        filters,
+        len(scenario.landmarks) + 1,
+        config.fastslam.particles,
+        config.rays,
+        passive=any(strategy != "active" for strategy in strategies),
+    )
     (heard,) = listen(scenario, config, (config.emitter.radius,), progress=progress)
     drive = drive_of(scenario, config)
     trials = []

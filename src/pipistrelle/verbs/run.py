@@ -50,11 +50,7 @@ def run(
     from pipistrelle.experiments.trial import run_mission
     from pipistrelle.verbs import outcome
     from pipistrelle.verbs.console import progress
-    from pipistrelle.verbs.memory import check_memory
 
-    there, particles = config.scenario.landmarks + 1, config.fastslam.particles
-    passive = strategies(strategy) != ("active",)
-    check_memory(ways, there, particles, config.rays, passive=passive)
     with outcome.result_folder(output, "run") as folder:
         outcome.compile_once(output)
         watch = outcome.recorder(output)

@@ -105,9 +105,9 @@ def slam(
     chosen, ways = strategies(strategy), filters(estimator, particles)
     if beamwidth is not None and not 0 < beamwidth <= 360:
         raise InputError(f"--beamwidth: found {beamwidth:g}, expected above 0 and up to 360 [deg]")
+    from pipistrelle.experiments.memory import check_memory
     from pipistrelle.experiments.replay import load, replay
     from pipistrelle.verbs import outcome
-    from pipistrelle.verbs.memory import check_memory
 
     recorded, truth = load(log, robot)
     settled = _with_log(layer, recorded, log)

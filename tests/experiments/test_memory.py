@@ -4,8 +4,8 @@ import pytest
 
 from pipistrelle.__main__ import main
 from pipistrelle.config import InputError, RayConfig
-from pipistrelle.verbs import memory
-from pipistrelle.verbs.memory import check_memory
+from pipistrelle.experiments import memory
+from pipistrelle.experiments.memory import check_memory
 
 GB = 1e9
 
