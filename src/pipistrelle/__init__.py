@@ -1,3 +1,75 @@
-"""Sonar SLAM with one's own calls, someone else's, or both: from waveform to verdict."""
+"""Sonar SLAM with one's own calls, someone else's, or both: from waveform to verdict.
+
+Importing the package chooses where compiled kernels are kept, by setting ``NUMBA_CACHE_DIR``
+where it is not set: a folder of the user's cache, one per state of the sources. (Beside each
+source, Numba's own choice, an update of one file would leave the kernels of another as they were.)
+Where that folder cannot be written, a temporary one takes its place, and a line says so.
+"""
+
+import os
+import sys
+import tempfile
+from hashlib import sha256
+from pathlib import Path
 
 __version__ = "0.1.0"
+
+
+def _key() -> str:
+    """Hash the interpreter's version and every source that compiles a kernel."""
+    digest = sha256(sys.version.encode())
+    for source in sorted(Path(__file__).parent.rglob("*.py")):
+        text = source.read_bytes()
+        if b"njit" in text:
+            digest.update(source.name.encode() + text)
+    return digest.hexdigest()[:16]
+
+
+def _writable(folder: Path) -> bool:
+    """Make a folder and see whether a file can be written there."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
+
+
+def _temporary() -> Path:
+    """Return a temporary folder that nobody else can write: what lies there is run."""
+    user = os.getuid() if hasattr(os, "getuid") else ""
+    folder = Path(tempfile.gettempdir()) / f"pipistrelle-{user}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        state = folder.lstat()
+        own = user in ("", state.st_uid) and not state.st_mode & 0o022
+    except OSError:
+        own = False
+    return folder if own and not folder.is_symlink() else Path(tempfile.mkdtemp())
+
+
+def _wanted() -> Path:
+    """Return where compiled kernels should be kept."""
+    if chosen := os.environ.get("NUMBA_CACHE_DIR"):
+        return Path(chosen)
+    try:
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
+    except RuntimeError:  # a user without a home
+        cache = Path(os.devnull)
+    return cache / "pipistrelle" / _key()
+
+
+def _place_kernels() -> None:
+    """Tell Numba where to keep compiled kernels."""
+    folder = wanted = _wanted()
+    if not _writable(wanted):
+        folder = _temporary() / _key()
+        print(
+            f"pipistrelle: {wanted} cannot be written: compiled kernels are kept in {folder}; set "
+            "NUMBA_CACHE_DIR to a folder that lasts",
+            file=sys.stderr,
+        )
+    os.environ["NUMBA_CACHE_DIR"] = str(folder)
+
+
+_place_kernels()

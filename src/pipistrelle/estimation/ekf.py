@@ -7,7 +7,7 @@ of the scan, then the new ones are placed from the corrected pose.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -23,7 +23,10 @@ from pipistrelle.estimation.joint import (
     correct_active,
     correct_bearing,
     drop_members,
+    gaussian_of,
+    joint_of,
     place,
+    settle,
 )
 from pipistrelle.estimation.models import Gaussian, Landmarks, Motion, motion_numbers, sight
 from pipistrelle.estimation.rays import (
@@ -150,7 +153,14 @@ class EkfSlam:
         poses = Gaussian(mean=np.empty((len(dt), 3)), covariance=np.empty((len(dt), 3, 3)))
         numbers = motion_numbers(self.motion)
         carry(mean, covariance, controls, dt, numbers, poses.mean, poses.covariance)
-        return replace(belief, mean=mean, covariance=covariance), poses
+        moved = EkfBelief(
+            mean=mean,
+            covariance=covariance,
+            landmark=belief.landmark,
+            weight=belief.weight,
+            gated=belief.gated,
+        )
+        return moved, poses
 
     def update(
         self, belief: EkfBelief, scan: Scan, rng: np.random.Generator | None = None
@@ -206,16 +216,16 @@ def _members_of(landmark, members, label):
 
 
 @njit(cache=True, error_model="numpy")
-def _correct_ray(mean, covariance, weight, members, first, count, bearing, sensing, w):
+def _correct_ray(joint, weight, members, first, count, bearing, sensing):
     """Weigh a ray's members by a bearing and share it among them; GATED when none expected it."""
-    size, variance = 3 + 2 * members, sensing.bearing_variance
+    mean, size, variance = joint.mean, 3 + 2 * members, sensing.bearing_variance
     likelihoods, share = np.empty(count), np.empty(count)
     outcome = GATED
     for j in range(count):
         i = 3 + 2 * (first + j)
         _, expected, c, s, k = sight(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
         innovation = wrap_angle(bearing - expected)
-        S = bearing_variance(covariance, i, c, s, k) + variance
+        S = bearing_variance(joint, size, i, c, s, k) + variance
         likelihoods[j] = log_likelihood(innovation, S)
         if innovation * innovation <= sensing.passive_bound * S:
             outcome = APPLIED
@@ -226,64 +236,59 @@ def _correct_ray(mean, covariance, weight, members, first, count, bearing, sensi
     for j in range(count):
         if share[j] > 0.0:
             i = 3 + 2 * (first + j)
-            correct_bearing(mean, covariance, size, i, bearing, variance / share[j], np.inf, w)
+            correct_bearing(joint, size, i, bearing, variance / share[j], np.inf)
     return APPLIED
 
 
 @njit(cache=True, error_model="numpy")
-def _range_for_ray(
-    mean, covariance, landmark, weight, members, first, count, distance, bearing, sensing, w
-):
+def _range_for_ray(joint, landmark, weight, members, first, count, distance, bearing, sensing):
     """Give a partial landmark its range: one member is left. Returns the members left."""
     keep = np.zeros(count, dtype=np.bool_)
     keep[0 if sensing.reinitialise else heaviest(weight[first:], count)] = True
-    members = drop_members(mean, covariance, landmark, weight, members, first, count, keep)
+    members = drop_members(joint, landmark, weight, members, first, count, keep)
     weight[first] = 1.0
-    size, i = 3 + 2 * members, 3 + 2 * first
+    mean, size, i = joint.mean, 3 + 2 * members, 3 + 2 * first
     if sensing.reinitialise:
         place(
-            mean, covariance, size, i, distance, bearing,
+            mean, joint.covariance, size, i, distance, bearing,
             sensing.range_variance, sensing.bearing_variance,
         )  # fmt: skip
     else:
         _, _, c, s, _ = sight(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
         mean[i], mean[i + 1] = mean[0] + distance * c, mean[1] + distance * s
-        correct_bearing(mean, covariance, size, i, bearing, sensing.bearing_variance, np.inf, w)
+        correct_bearing(joint, size, i, bearing, sensing.bearing_variance, np.inf)
     return members
 
 
 @njit(cache=True, error_model="numpy")
-def _correct_known(
-    mean, covariance, landmark, weight, members, label, bearing, distance, sensing, w
-):
+def _correct_known(joint, landmark, weight, members, label, bearing, distance, sensing):
     """Correct with one measurement of a mapped landmark: the members left, and whether gated."""
     first, count = _members_of(landmark, members, label)
     size, i, passive = 3 + 2 * members, 3 + 2 * first, math.isnan(distance)
     if count == 1 and passive:
         outcome = correct_bearing(
-            mean, covariance, size, i, bearing, sensing.bearing_variance, sensing.passive_bound, w
+            joint, size, i, bearing, sensing.bearing_variance, sensing.passive_bound
         )
     elif count == 1:
         outcome = correct_active(
-            mean, covariance, size, i, distance, bearing,
-            sensing.range_variance, sensing.bearing_variance, sensing.active_bound, w,
+            joint, size, i, distance, bearing,
+            sensing.range_variance, sensing.bearing_variance, sensing.active_bound,
         )  # fmt: skip
     elif passive:
-        outcome = _correct_ray(mean, covariance, weight, members, first, count, bearing, sensing, w)
+        outcome = _correct_ray(joint, weight, members, first, count, bearing, sensing)
         keep = np.ones(count, dtype=np.bool_)
         if outcome == APPLIED and survivors(weight[first:], count, sensing.prune, keep) < count:
-            members = drop_members(mean, covariance, landmark, weight, members, first, count, keep)
+            members = drop_members(joint, landmark, weight, members, first, count, keep)
     else:
         outcome = APPLIED
         members = _range_for_ray(
-            mean, covariance, landmark, weight, members, first, count, distance, bearing,
-            sensing, w,
-        )  # fmt: skip
+            joint, landmark, weight, members, first, count, distance, bearing, sensing
+        )
     return members, outcome
 
 
 @njit(cache=True, error_model="numpy")
-def _place_new(mean, covariance, landmark, weight, members, label, bearing, distance, sensing):
+def _place_new(joint, landmark, weight, members, label, bearing, distance, sensing):
     """Append a landmark, one member or a ray of them (Eqs. (16) to (18)); the members there are."""
     passive = math.isnan(distance)
     count = sensing.ray_ranges.size if passive else 1
@@ -291,7 +296,10 @@ def _place_new(mean, covariance, landmark, weight, members, label, bearing, dist
         far = sensing.ray_ranges[j] if passive else distance
         spread = sensing.ray_stds[j] ** 2 if passive else sensing.range_variance
         size = 3 + 2 * members
-        place(mean, covariance, size, size, far, bearing, spread, sensing.bearing_variance)
+        place(
+            joint.mean, joint.covariance, size, size, far, bearing, spread,
+            sensing.bearing_variance,
+        )  # fmt: skip
         landmark[members], weight[members] = label, 1.0 / count
         members += 1
     return members
@@ -306,26 +314,23 @@ def _update(old_mean, old_covariance, old_landmark, old_weight, labels, bearings
         known[m] = _members_of(old_landmark, members, labels[m])[1] > 0
         if not known[m]:
             most += sensing.ray_ranges.size if math.isnan(ranges[m]) else 1
-    capacity = 3 + 2 * most
-    mean, covariance = np.empty(capacity), np.empty((capacity, capacity))
-    landmark, weight = np.empty(most, dtype=np.int64), np.empty(most)
-    mean[: old_mean.size], landmark[:members], weight[:members] = old_mean, old_landmark, old_weight
-    covariance[: old_mean.size, : old_mean.size] = old_covariance
-    w, gated = np.empty((2, capacity)), 0
+    joint = joint_of(old_mean, old_covariance, 3 + 2 * most)
+    landmark, weight, gated = np.empty(most, dtype=np.int64), np.empty(most), 0
+    for member in range(members):
+        landmark[member], weight[member] = old_landmark[member], old_weight[member]
     for m in range(labels.size):
         if known[m]:
             members, outcome = _correct_known(
-                mean, covariance, landmark, weight, members, labels[m], bearings[m], ranges[m],
-                sensing, w,
-            )  # fmt: skip
+                joint, landmark, weight, members, labels[m], bearings[m], ranges[m], sensing
+            )
             gated += outcome
+    settle(joint, 3 + 2 * members)
     for m in range(labels.size):
         if not known[m]:
             members = _place_new(
-                mean, covariance, landmark, weight, members, labels[m], bearings[m], ranges[m],
-                sensing,
-            )  # fmt: skip
-    mean[2] = wrap_angle(mean[2])
+                joint, landmark, weight, members, labels[m], bearings[m], ranges[m], sensing
+            )
+    joint.mean[2] = wrap_angle(joint.mean[2])
     size = 3 + 2 * members
-    covariance = covariance[:size, :size].copy()
-    return mean[:size].copy(), covariance, landmark[:members].copy(), weight[:members].copy(), gated
+    mean, covariance = gaussian_of(joint, size)
+    return mean, covariance, landmark[:members].copy(), weight[:members].copy(), gated

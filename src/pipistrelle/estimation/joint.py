@@ -2,18 +2,142 @@ r"""Kernels on one Gaussian over a pose and points: carry, correct, place and dr
 
 The state is x, y, heading, then two numbers per point. A correction subtracts :math:`W W^T` with
 :math:`W = \bar P H^T L^{-T}, L L^T = S`: the two halves of the covariance get the same products
-in the same order, so it stays symmetric to the last bit. ``size`` is the length of the state in
-arrays that may be longer, ``i`` the state index of a point.
+in the same order, so it stays symmetric to the last bit.
+
+A correction reads five rows of the covariance, the pose's and the point's, and changes all of
+them. So the columns of W wait: a point's rows have them subtracted when they are read, and the
+others catch up together, many columns in one pass over memory. Every number is subtracted in the
+order of the measurements, as if each had been taken off at once. ``size`` is the length of the
+state in arrays that may be longer, ``i`` the state index of a point.
 """
 
 import math
+from typing import NamedTuple
 
+import numpy as np
+from jaxtyping import Float, Int
 from numba import njit
 
 from pipistrelle.estimation.models import NEAREST, carry_pose, sight
 from pipistrelle.geometry import wrap_angle
 
 GATED, APPLIED = 1, 0
+LANE = 8
+"""Doubles in a cache line: rows of a multiple of it all begin on one."""
+MOST_WAITING = 32
+
+
+class Joint(NamedTuple):
+    """A Gaussian that is being corrected, in arrays with room for what a frame adds.
+
+    Attributes
+    ----------
+    mean : (n)
+    covariance : (n, m)
+        Columns beyond n fill the last cache line. Rows i and i + 1 of a point lack the columns of
+        W from ``taken[i]`` to ``waiting[0]``, those of the pose none.
+    W : (w, m)
+        The columns that wait, a row each.
+    taken : (n)
+    waiting : (1)
+    """
+
+    mean: Float[np.ndarray, " n"]
+    covariance: Float[np.ndarray, "n m"]
+    W: Float[np.ndarray, "w m"]
+    taken: Int[np.ndarray, " n"]
+    waiting: Int[np.ndarray, "1"]
+
+
+@njit(cache=True, error_model="numpy")
+def _lanes(size):
+    """Least multiple of a cache line's numbers that holds so many."""
+    return (size + LANE - 1) // LANE * LANE
+
+
+@njit(cache=True, error_model="numpy")
+def _on_cache_lines(rows, width):
+    """Make an array (rows, width) that begins on a cache line."""
+    buffer = np.empty(rows * width + LANE)
+    start = -(buffer.ctypes.data // 8) % LANE
+    return buffer[start : start + rows * width].reshape(rows, width)
+
+
+@njit(cache=True, error_model="numpy")
+def joint_of(mean, covariance, room):
+    """Copy a mean (d) and a covariance (d, d) into a `Joint` with room for so many numbers."""
+    size, width = mean.size, _lanes(mean.size)
+    longer, wider = np.empty(room), _on_cache_lines(room, _lanes(room))
+    W = _on_cache_lines(MOST_WAITING, _lanes(room))
+    for a in range(size):
+        longer[a] = mean[a]
+        for b in range(size):
+            wider[a, b] = covariance[a, b]
+    for b in range(size, width):
+        for a in range(size):
+            wider[a, b] = 0.0
+        for k in range(MOST_WAITING):
+            W[k, b] = 0.0
+    return Joint(longer, wider, W, np.zeros(room, np.int64), np.zeros(1, np.int64))
+
+
+@njit(cache=True, error_model="numpy")
+def gaussian_of(joint, size):
+    """Copy the mean (d) and the covariance (d, d) out of a settled `Joint`."""
+    mean, covariance = np.empty(size), np.empty((size, size))
+    for a in range(size):
+        mean[a] = joint.mean[a]
+        for b in range(size):
+            covariance[a, b] = joint.covariance[a, b]
+    return mean, covariance
+
+
+@njit(cache=True, error_model="numpy")
+def _point_rows(joint, size, i):
+    """Rows i and i + 1 of the covariance, with all that waits subtracted from them."""
+    pi, pj, W = joint.covariance[i], joint.covariance[i + 1], joint.W
+    first, last, width = joint.taken[i], joint.waiting[0], _lanes(size)
+    joint.taken[i] = last
+    fours = first + (last - first) // 4 * 4
+    for k in range(first, fours, 4):
+        w0, w1, w2, w3 = W[k], W[k + 1], W[k + 2], W[k + 3]
+        x0, x1, x2, x3 = w0[i], w1[i], w2[i], w3[i]
+        y0, y1, y2, y3 = w0[i + 1], w1[i + 1], w2[i + 1], w3[i + 1]
+        for b in range(width):
+            pi[b] = pi[b] - x0 * w0[b] - x1 * w1[b] - x2 * w2[b] - x3 * w3[b]
+            pj[b] = pj[b] - y0 * w0[b] - y1 * w1[b] - y2 * w2[b] - y3 * w3[b]
+    for k in range(fours, last):
+        w0 = W[k]
+        x0, y0 = w0[i], w0[i + 1]
+        for b in range(width):
+            pi[b] -= x0 * w0[b]
+            pj[b] -= y0 * w0[b]
+    return pi, pj
+
+
+@njit(cache=True, error_model="numpy")
+def settle(joint, size):
+    """Let every row catch up: afterwards nothing waits."""
+    covariance = joint.covariance
+    for i in range(3, size, 2):
+        pi, pj = _point_rows(joint, i + 2, i)
+        joint.taken[i] = 0
+        for b in range(i):
+            covariance[b, i], covariance[b, i + 1] = pi[b], pj[b]
+    joint.waiting[0] = 0
+
+
+@njit(cache=True, error_model="numpy")
+def _wait(joint, size, w, step):
+    """Add step w to the mean, subtract w w^T from the pose's rows, and let the points' wait."""
+    mean, p0, p1, p2 = joint.mean, joint.covariance[0], joint.covariance[1], joint.covariance[2]
+    x, y, h = w[0], w[1], w[2]
+    for a in range(size):
+        mean[a] += w[a] * step
+        p0[a] -= x * w[a]
+        p1[a] -= y * w[a]
+        p2[a] -= h * w[a]
+    joint.waiting[0] += 1
 
 
 @njit(cache=True, error_model="numpy")
@@ -25,59 +149,51 @@ def carry(mean, covariance, controls, dt, motion, pose_means, pose_covariances):
         dx, dy = carry_pose(pose, P, controls[k, 0], controls[k, 1], dt[k], motion)
         shift_x -= dy
         shift_y += dx
-        pose_means[k] = pose
-        pose_covariances[k] = P
+        for a in range(3):  # an assignment of slices would compile for a second longer
+            pose_means[k, a] = pose[a]
+            for b in range(3):
+                pose_covariances[k, a, b] = P[a, b]
     for j in range(3, mean.size):
         covariance[0, j] += shift_x * covariance[2, j]
         covariance[1, j] += shift_y * covariance[2, j]
         covariance[j, 0] = covariance[0, j]
         covariance[j, 1] = covariance[1, j]
-    covariance[:3, :3] = P
+    for a in range(3):
+        for b in range(3):
+            covariance[a, b] = P[a, b]
 
 
 @njit(cache=True, error_model="numpy")
-def _subtract_outer(covariance, size, w, columns):
-    """Covariance minus the outer product of the columns of w, in place."""
-    if columns == 1:
-        w0 = w[0]
-        for a in range(size):
-            row, wa = covariance[a], w0[a]
-            for b in range(size):
-                row[b] -= wa * w0[b]
-    else:
-        w0, w1 = w[0], w[1]
-        for a in range(size):
-            row, wa, va = covariance[a], w0[a], w1[a]
-            for b in range(size):
-                row[b] -= wa * w0[b] + va * w1[b]
-
-
-@njit(cache=True, error_model="numpy")
-def bearing_variance(covariance, i, c, s, k):
+def bearing_variance(joint, size, i, c, s, k):
     """Innovation variance H P H^T of the bearing of the member at state index i, without R."""
     h0, h1 = s * k, -c * k  # by pose: (h0, h1, -1); by member: (-h0, -h1)
-    pxx = covariance[0, 0] - 2.0 * covariance[0, i] + covariance[i, i]
-    pxy = covariance[0, 1] - covariance[0, i + 1] - covariance[1, i] + covariance[i, i + 1]
-    pyy = covariance[1, 1] - 2.0 * covariance[1, i + 1] + covariance[i + 1, i + 1]
-    pxh = covariance[0, 2] - covariance[2, i]
-    pyh = covariance[1, 2] - covariance[2, i + 1]
+    p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
+    pi, pj = _point_rows(joint, size, i)
+    pxx = p0[0] - 2.0 * p0[i] + pi[i]
+    pxy = p0[1] - p0[i + 1] - p1[i] + pi[i + 1]
+    pyy = p1[1] - 2.0 * p1[i + 1] + pj[i + 1]
+    pxh = p0[2] - p2[i]
+    pyh = p1[2] - p2[i + 1]
     return (
         h0 * h0 * pxx + 2.0 * h0 * h1 * pxy + h1 * h1 * pyy
-        - 2.0 * (h0 * pxh + h1 * pyh) + covariance[2, 2]
+        - 2.0 * (h0 * pxh + h1 * pyh) + p2[2]
     )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy")
-def correct_bearing(mean, covariance, size, i, bearing, variance, bound, w):
+def correct_bearing(joint, size, i, bearing, variance, bound):
     """Correct the state with the bearing of the member at index i; GATED when beyond bound."""
+    mean = joint.mean
     distance, expected, c, s, k = sight(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     if distance < NEAREST:
         return APPLIED
+    if joint.waiting[0] == MOST_WAITING:
+        settle(joint, size)
     innovation = wrap_angle(bearing - expected)
     h0, h1 = s * k, -c * k
-    p0, p1, p2 = covariance[0], covariance[1], covariance[2]
-    pi, pj = covariance[i], covariance[i + 1]
-    w0 = w[0]
+    p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
+    pi, pj = _point_rows(joint, size, i)
+    w0 = joint.W[joint.waiting[0]]
     for a in range(size):
         w0[a] = h0 * (p0[a] - pi[a]) + h1 * (p1[a] - pj[a]) - p2[a]
     S = h0 * (w0[0] - w0[i]) + h1 * (w0[1] - w0[i + 1]) - w0[2] + variance
@@ -86,24 +202,24 @@ def correct_bearing(mean, covariance, size, i, bearing, variance, bound, w):
     root = 1.0 / math.sqrt(S)
     for a in range(size):
         w0[a] *= root
-        mean[a] += w0[a] * (root * innovation)
-    _subtract_outer(covariance, size, w, 1)
+    _wait(joint, size, w0, root * innovation)
     return APPLIED
 
 
 @njit(cache=True, error_model="numpy")
-def correct_active(
-    mean, covariance, size, i, distance, bearing, range_variance, bearing_variance, bound, w
-):
+def correct_active(joint, size, i, distance, bearing, range_variance, bearing_variance, bound):
     """Correct the state with range and bearing of the member at index i; GATED beyond bound."""
+    mean = joint.mean
     near, expected, c, s, k = sight(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     if near < NEAREST:
         return APPLIED
+    if joint.waiting[0] + 2 > MOST_WAITING:
+        settle(joint, size)
     nu0, nu1 = distance - near, wrap_angle(bearing - expected)
     h0, h1 = s * k, -c * k
-    p0, p1, p2 = covariance[0], covariance[1], covariance[2]
-    pi, pj = covariance[i], covariance[i + 1]
-    w0, w1 = w[0], w[1]
+    p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
+    pi, pj = _point_rows(joint, size, i)
+    w0, w1 = joint.W[joint.waiting[0]], joint.W[joint.waiting[0] + 1]
     for a in range(size):
         east, north = p0[a] - pi[a], p1[a] - pj[a]
         w0[a] = -c * east - s * north
@@ -121,8 +237,8 @@ def correct_active(
     for a in range(size):
         w0[a] /= L00
         w1[a] = (w1[a] - L10 * w0[a]) / L11
-        mean[a] += w0[a] * e0 + w1[a] * e1
-    _subtract_outer(covariance, size, w, 2)
+    _wait(joint, size, w0, e0)
+    _wait(joint, size, w1, e1)
     return APPLIED
 
 
@@ -155,17 +271,20 @@ def place(mean, covariance, size, i, distance, bearing, range_variance, bearing_
 
 
 @njit(cache=True, error_model="numpy")
-def drop_members(mean, covariance, landmark, weight, members, first, count, keep):
+def drop_members(joint, landmark, weight, members, first, count, keep):
     """Close the gaps that dropped members of one landmark leave; returns the members left."""
-    target = first
-    for source in range(first, members):
-        if source < first + count and not keep[source - first]:
-            continue
-        if target != source:
-            landmark[target], weight[target] = landmark[source], weight[source]
-            i, j = 3 + 2 * target, 3 + 2 * source
-            mean[i], mean[i + 1] = mean[j], mean[j + 1]
-            covariance[i : i + 2, :] = covariance[j : j + 2, :]
-            covariance[:, i : i + 2] = covariance[:, j : j + 2]
-        target += 1
-    return target
+    size = 3 + 2 * members
+    settle(joint, size)
+    sources, left = np.arange(size), first
+    for member in range(first, members):
+        if member >= first + count or keep[member - first]:
+            landmark[left], weight[left] = landmark[member], weight[member]
+            i, j = 3 + 2 * left, 3 + 2 * member
+            sources[i], sources[i + 1] = j, j + 1
+            left += 1
+    for a in range(3 + 2 * left):
+        source, target = joint.covariance[sources[a]], joint.covariance[a]
+        joint.mean[a] = joint.mean[sources[a]]
+        for b in range(3 + 2 * left):
+            target[b] = source[sources[b]]
+    return left

@@ -18,6 +18,7 @@ from pipistrelle.estimation.fastslam import FastSlam
 from pipistrelle.estimation.models import B, Belief, Estimator, Gaussian, Motion, Swarm, Track
 from pipistrelle.evaluation.consistency import EKF_LIMIT, FASTSLAM_LIMIT
 from pipistrelle.experiments.listening import Progress, listen
+from pipistrelle.experiments.memory import check_memory
 from pipistrelle.experiments.results import TrialResult, score
 from pipistrelle.experiments.scenario import Scenario, bicycle, draw_scenario
 from pipistrelle.experiments.tables import LabelledPoints
@@ -104,7 +105,7 @@ def run_mission(
     Raises
     ------
     InputError
-        When the world, the sampling or a filter cannot be had.
+        When the world, the sampling or a filter cannot be had, or memory for it.
 
     Examples
     --------
@@ -113,6 +114,13 @@ def run_mission(
     (10, 41)
     """
     scenario = draw_scenario(config, _generator(config.seed, 0, "scenario"))
+    check_memory(
+        filters,
+        len(scenario.landmarks) + 1,
+        config.fastslam.particles,
+        config.rays,
+        passive=any(strategy != "active" for strategy in strategies),
+    )
     (heard,) = listen(scenario, config, (config.emitter.radius,), progress=progress)
     drive = drive_of(scenario, config)
     trials = []
@@ -273,12 +281,11 @@ def run_filter(
         For a bearing or range that is no number, or a time that is not one of the drive's.
     """
     time, controls = drive.time, drive.controls
-    _check(scans, time)
+    steps = _steps_of(scans, time)
     mean, covariance = np.empty((time.size, 3)), np.empty((time.size, 3, 3))
     mean[0], covariance[0] = drive.start.mean, drive.start.covariance
     dt, belief, done = np.diff(time), estimator.init(drive.start), 0
-    for number, scan in enumerate(scans, start=1):
-        k = int(np.searchsorted(time, scan.time))
+    for number, (k, scan) in enumerate(zip(steps, scans, strict=True), start=1):
         if k > done:
             belief, poses = estimator.predict(belief, controls[done:k], dt[done:k], rng)
             mean[done + 1 : k + 1], covariance[done + 1 : k + 1] = poses.mean, poses.covariance
@@ -304,20 +311,28 @@ def run_filter(
     )
 
 
-def _check(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> None:
-    """Refuse scans that a filter could not use."""
-    for scan in scans:
-        k = np.searchsorted(time, scan.time)
-        if k == time.size or time[k] != scan.time:
-            raise InputError(f"scan at {scan.time} s: expected the time of the end of a step")
-        usable = np.isnan(scan.range) | (np.isfinite(scan.range) & (scan.range > 0.0))
-        usable &= np.isfinite(scan.bearing)
-        if not usable.all():
-            raise InputError(
-                f"scan at {scan.time} s: found numbers that no filter can use, for the landmarks "
-                f"{scan.landmark[~usable].tolist()}; expected finite bearings [rad] and ranges "
-                "above 0 [m], NaN where passive"
-            )
+def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]:
+    """Find the step that ends at each scan; refuse scans that a filter could not use."""
+    heard = np.array([scan.time for scan in scans], dtype=float)
+    steps = np.searchsorted(time, heard)
+    known = time[np.minimum(steps, time.size - 1)] == heard
+    if not known.all():
+        stray = scans[int(np.argmin(known))]
+        raise InputError(f"scan at {stray.time} s: expected the time of the end of a step")
+    nothing = np.empty(0)
+    bearing = np.concatenate([nothing, *(scan.bearing for scan in scans)])
+    distance = np.concatenate([nothing, *(scan.range for scan in scans)])
+    usable = np.isfinite(bearing) & (np.isnan(distance) | (distance > 0.0) & (distance < np.inf))
+    if not usable.all():
+        owner = np.repeat(np.arange(len(scans)), [scan.landmark.size for scan in scans])
+        first = owner[~usable][0]
+        labels = scans[first].landmark[~usable[owner == first]].tolist()
+        raise InputError(
+            f"scan at {scans[first].time} s: found numbers that no filter can use, for the "
+            f"landmarks {labels}; expected finite bearings [rad] and ranges above 0 [m], NaN "
+            "where passive"
+        )
+    return steps.tolist()
 
 
 def compile_kernels() -> None:

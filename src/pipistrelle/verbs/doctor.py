@@ -23,7 +23,7 @@ def _findings() -> Iterator[tuple[str, str]]:
     yield "pipistrelle", f"{pipistrelle.__version__} ({Path(pipistrelle.__file__).parent})"
     yield from _libraries()
     yield "cores", str(cores())
-    yield "kernel cache", _kernel_cache()
+    yield "kernel cache", os.environ["NUMBA_CACHE_DIR"]
     yield "ffmpeg", shutil.which("ffmpeg") or "not found; --animate mp4 needs it, gif does not"
     yield "PIPISTRELLE_DATA", _data(os.environ.get("PIPISTRELLE_DATA"))
 
@@ -50,18 +50,6 @@ def cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def _kernel_cache() -> str:
-    """Find where Numba keeps compiled kernels."""
-    chosen = os.environ.get("NUMBA_CACHE_DIR")
-    folder = Path(chosen or pipistrelle.__file__)
-    place = chosen or f"beside each source under {folder.parent}"
-    while not folder.exists():
-        folder = folder.parent
-    if os.access(folder if folder.is_dir() else folder.parent, os.W_OK):
-        return place
-    return f"{place}: cannot be written; set NUMBA_CACHE_DIR to a folder that can"
 
 
 def _data(place: str | None) -> str:

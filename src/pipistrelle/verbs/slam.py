@@ -105,6 +105,7 @@ def slam(
     chosen, ways = strategies(strategy), filters(estimator, particles)
     if beamwidth is not None and not 0 < beamwidth <= 360:
         raise InputError(f"--beamwidth: found {beamwidth:g}, expected above 0 and up to 360 [deg]")
+    from pipistrelle.experiments.memory import check_memory
     from pipistrelle.experiments.replay import load, replay
     from pipistrelle.verbs import outcome
 
@@ -112,6 +113,8 @@ def slam(
     settled = _with_log(layer, recorded, log)
     _warn_of_ignored_rows(recorded, log)
     _warn_of_partial_truth(truth, log)
+    there = len({label for scan in recorded.scans for label in scan.landmark.tolist()})
+    check_memory(ways, there, settled.fastslam.particles, settled.rays, passive=True)
     with outcome.result_folder(output, "slam") as folder:
         outcome.compile_once(output)
         watch = outcome.recorder(output)

@@ -1,0 +1,58 @@
+"""What the filters may need of memory, told before they start and not when it has run out."""
+
+import os
+from collections.abc import Sequence
+
+from pipistrelle.config import InputError, RayConfig
+from pipistrelle.estimation.rays import ray_members
+
+DOUBLE = 8
+"""Bytes of a number."""
+
+
+def check_memory(
+    ways: Sequence[str], landmarks: int, particles: int, rays: RayConfig, *, passive: bool
+) -> None:
+    """Refuse what may need more memory than this machine has.
+
+    Parameters
+    ----------
+    ways : sequence of "ekf", "fastslam"
+    landmarks, particles : int
+    rays : RayConfig
+    passive : bool
+        Whether a landmark may be heard by its bearing alone: it is a whole ray then.
+
+    Raises
+    ------
+    InputError
+        With the estimate.
+
+    Examples
+    --------
+    >>> check_memory(["ekf", "fastslam"], 51, 100, RayConfig(), passive=True)
+    """
+    members = landmarks * (ray_members(rays)[0].size if passive else 1)
+    for way in ways:
+        need, have = _bytes(way, landmarks, members, particles), installed()
+        if need > have:
+            swarm = f" and {particles} particles" if way == "fastslam" else ""
+            raise InputError(
+                f"{way}: {landmarks} landmarks{swarm} may need {need / 1e9:.1f} GB of memory, "
+                f"but this machine has {have / 1e9:.1f} GB; ask for fewer"
+            )
+
+
+def _bytes(way: str, landmarks: int, members: int, particles: int) -> float:
+    """Most that a filter holds at once: all landmarks are there, and all of them still rays."""
+    if way == "ekf":  # covariances: the one before, the one at work, the one after
+        return 3.0 * DOUBLE * (3 + 2 * members) ** 2
+    return 2.0 * DOUBLE * particles * (6 * members + landmarks)  # before and after
+
+
+def installed() -> float:
+    """Return this machine's memory [bytes]; infinite where it does not say."""
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, ValueError, OSError):
+        return float("inf")

@@ -1,0 +1,42 @@
+"""A run that may not fit into memory is refused before it starts, with what it would need."""
+
+import pytest
+
+from pipistrelle.__main__ import main
+from pipistrelle.config import InputError, RayConfig
+from pipistrelle.experiments import memory
+from pipistrelle.experiments.memory import check_memory
+
+GB = 1e9
+
+
+def test_large_worlds_that_fit_are_let_through(monkeypatch):
+    monkeypatch.setattr(memory, "installed", lambda: 4.0 * GB)
+    check_memory(["ekf", "fastslam"], 501, 1000, RayConfig(), passive=True)
+
+
+@pytest.mark.parametrize(
+    ("way", "landmarks", "particles", "need"),
+    [
+        ("ekf", 10_001, 100, 3 * 8 * (3 + 2 * 4 * 10_001) ** 2 / GB),
+        ("fastslam", 51, 1_000_000, 2 * 8 * 1_000_000 * (6 * 4 * 51 + 51) / GB),
+    ],
+)
+def test_refusal_says_what_would_be_needed(monkeypatch, way, landmarks, particles, need):
+    monkeypatch.setattr(memory, "installed", lambda: 4.0 * GB)
+    with pytest.raises(InputError, match=f"{way}: .* may need {need:.1f} GB .* has 4.0 GB"):
+        check_memory([way], landmarks, particles, RayConfig(), passive=True)
+
+
+def test_active_landmarks_need_one_member_each(monkeypatch):
+    monkeypatch.setattr(memory, "installed", lambda: 4.0 * GB)
+    check_memory(["ekf"], 5_001, 100, RayConfig(), passive=False)
+    with pytest.raises(InputError):
+        check_memory(["ekf"], 5_001, 100, RayConfig(), passive=True)
+
+
+def test_command_refuses_and_leaves_nothing(tmp_path, capsys):
+    words = ["run", "--filter", "fastslam", "--particles", "1000000000", "-o", str(tmp_path / "o")]
+    assert main(words) == 2
+    assert "may need" in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()

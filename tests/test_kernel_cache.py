@@ -1,0 +1,70 @@
+"""Where compiled kernels are kept, in an install that cannot be written to as in any other."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import pipistrelle
+
+SHOW = "import os, pipistrelle; print(os.environ['NUMBA_CACHE_DIR'])"
+COMPILE = SHOW + "; from pipistrelle.geometry import wrap_angle; wrap_angle(4.0)"
+NOWHERE = os.devnull + "/home"  # no folder can be made in a file, not even by root
+
+
+def place(tmp_path: Path, code: str = SHOW, **environment: str) -> tuple[Path, list[str]]:
+    """The folder that a fresh process chooses, and what it says about it."""
+    (tmp_path / "tmp").mkdir(exist_ok=True)
+    unset = ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")
+    inherited = {name: value for name, value in os.environ.items() if name not in unset}
+    inherited |= {"HOME": str(tmp_path), "TMPDIR": str(tmp_path / "tmp")} | environment
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=inherited, capture_output=True, text=True, check=True
+    )
+    return Path(done.stdout.strip()), done.stderr.splitlines()
+
+
+def test_kernels_are_kept_in_the_users_cache_by_the_state_of_the_sources(tmp_path):
+    folder, said = place(tmp_path)
+    assert folder == tmp_path / ".cache" / "pipistrelle" / pipistrelle._key()
+    assert said == []
+
+
+def test_folder_that_the_user_names_is_taken(tmp_path):
+    folder, said = place(tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "mine"))
+    assert (folder, said) == (tmp_path / "mine", [])
+
+
+@pytest.mark.parametrize("variable", ["HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR"])
+def test_kernels_are_kept_in_a_temporary_folder_where_nothing_else_can_be_written(
+    tmp_path, variable
+):
+    folder, said = place(tmp_path, COMPILE, **{variable: NOWHERE})
+    assert folder == tmp_path / "tmp" / f"pipistrelle-{os.getuid()}" / pipistrelle._key()
+    assert len(said) == 1
+    assert NOWHERE in said[0]
+    assert str(folder) in said[0]
+    assert list(folder.rglob("*.nbc"))
+    assert place(tmp_path, **{variable: NOWHERE})[0] == folder
+
+
+def test_temporary_folder_that_others_can_write_is_not_trusted(tmp_path):
+    others = tmp_path / "tmp" / f"pipistrelle-{os.getuid()}"
+    others.mkdir(parents=True)
+    others.chmod(0o777)
+    folder, _ = place(tmp_path, HOME=NOWHERE)
+    assert others not in folder.parents
+    assert folder.parent.stat().st_mode & 0o077 == 0
+
+
+def test_key_changes_with_a_kernel_and_not_with_what_compiles_none(tmp_path, monkeypatch):
+    monkeypatch.setattr(pipistrelle, "__file__", str(tmp_path / "__init__.py"))
+    (tmp_path / "kernel.py").write_text("from numba import njit\n")
+    (tmp_path / "plain.py").write_text("")
+    before = pipistrelle._key()
+    (tmp_path / "plain.py").write_text("one = 1\n")
+    assert pipistrelle._key() == before
+    (tmp_path / "kernel.py").write_text("from numba import njit  # changed\n")
+    assert pipistrelle._key() != before
