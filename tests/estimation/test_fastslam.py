@@ -2,7 +2,6 @@
 
 import copy
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,13 +23,15 @@ from reference.missions import (
 )
 from reference.swarms import (
     Drawn,
-    all_members,
+    arrays_of,
     followed,
     members,
     never_resampling,
+    particles_of,
     slow_twin,
     small_mission,
     swarm_filter,
+    with_particles,
 )
 
 CLOSE = {"rtol": 0, "atol": 1e-9}
@@ -55,8 +56,8 @@ FEW = [
 
 def assert_same_particles(belief, particles):
     """Poses, covariances, log weights and every member of every landmark."""
-    np.testing.assert_allclose(belief.mean, [p.pose for p in particles], **CLOSE)
-    np.testing.assert_allclose(belief.covariance, [p.P for p in particles], **CLOSE)
+    np.testing.assert_allclose(belief.cloud(), [p.pose for p in particles], **CLOSE)
+    np.testing.assert_allclose(particles_of(belief).covariance, [p.P for p in particles], **CLOSE)
     log_weight = [p.log_weight for p in particles]
     np.testing.assert_allclose(np.exp(belief.log_weight), np.exp(log_weight), **CLOSE)
     # Far in the tail a log weight is a sum of large terms: compare it by its own size.
@@ -73,7 +74,7 @@ def assert_same_particles(belief, particles):
 def assert_best_is_a_heaviest(belief, particles):
     """The best map is that of a particle that no other outweighs, but for rounding."""
     heaviest = max(p.log_weight for p in particles)
-    rows = np.column_stack([belief.best.mean, belief.best.weight])
+    rows = np.column_stack([belief.landmarks().mean, belief.landmarks().weight])
     assert any(
         rows.shape == expected.shape and np.allclose(rows, expected, **CLOSE)
         for p in particles
@@ -200,14 +201,9 @@ def test_frames_without_measurements_equal_the_slow_reference():
 
 
 def permuted(belief, order):
-    return replace(
-        belief,
-        mean=belief.mean[order],
-        covariance=belief.covariance[order],
-        log_weight=belief.log_weight[order],
-        count=belief.count[order],
-        member=belief.member[order],
-    )
+    particles = particles_of(belief)
+    names = ("mean", "covariance", "log_weight", "count", "member")
+    return with_particles(belief, **{name: getattr(particles, name)[order] for name in names})
 
 
 @pytest.mark.parametrize("mixture", ["federated", "exact"])
@@ -224,9 +220,8 @@ def test_permuting_particles_with_their_draws_permutes_the_weights_exactly(mixtu
         belief = slam.update(belief, mission.scans[frame], Drawn(normal, uniform))
         other = slam.update(other, mission.scans[frame], Drawn(normal[order], uniform[order]))
         expected = permuted(belief, order)
-        for name in ("log_weight", "mean", "covariance", "landmark", "first", "count"):
-            np.testing.assert_array_equal(getattr(other, name), getattr(expected, name), name)
-        np.testing.assert_array_equal(all_members(other), all_members(expected))
+        for mine, yours in zip(arrays_of(other)[:7], arrays_of(expected)[:7], strict=True):
+            np.testing.assert_array_equal(mine, yours)
     assert np.ptp(belief.log_weight) > 1
 
 

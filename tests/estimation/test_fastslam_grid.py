@@ -13,7 +13,7 @@ from pipistrelle.estimation.resampling import effective_particles, normalised
 from reference.ekf_slam import ray_ranges
 from reference.grid import Posterior, drive
 from reference.missions import ray_config, scan_of
-from reference.swarms import swarm_filter
+from reference.swarms import particles_of, swarm_filter, weighted
 
 PARTICLES = 100_000
 LINEARISATION = 0.01
@@ -54,9 +54,9 @@ def swarm_moments(rows, rays, mixture):
         belief = slam.update(belief, scan_of((1, *row)), rng)
     particle = normalised(belief.log_weight)
     mean, second, chances = np.zeros(5), np.zeros((5, 5)), []
-    for member in np.moveaxis(belief.member, 1, 0):
+    for member in np.moveaxis(weighted(particles_of(belief).member), 1, 0):
         weight = particle * member[:, 5]
-        state = np.column_stack([belief.mean, member[:, :2]])
+        state = np.column_stack([belief.cloud(), member[:, :2]])
         mean += weight @ state
         second += (state * weight[:, None]).T @ state
         second[3:, 3:] += (weight @ member[:, [2, 3, 3, 4]]).reshape(2, 2)

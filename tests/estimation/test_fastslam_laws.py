@@ -19,8 +19,10 @@ from reference.swarms import (
     drawing,
     followed,
     never_resampling,
+    particles_of,
     small_mission,
     swarm_filter,
+    with_particles,
 )
 
 KNOWN_POSE = Gaussian(mean=np.zeros(3), covariance=np.zeros((3, 3)))
@@ -32,7 +34,7 @@ def test_equal_generators_make_equal_missions_and_others_do_not():
     *_, (same, _) = followed(slam, mission, drawing(1))
     *_, (other, _) = followed(slam, mission, drawing(2))
     assert_same(one, same)
-    assert not np.array_equal(one.mean, other.mean)
+    assert not np.array_equal(one.cloud(), other.cloud())
 
 
 def test_beliefs_given_are_never_changed():
@@ -63,10 +65,10 @@ def test_half_a_turn_of_the_world_turns_the_swarm():
         here = slam.update(here, scan, Drawn(normal, uniform))
         there = slam.update(there, scan, Drawn(normal * [-1, -1, 1], uniform))
     np.testing.assert_allclose(there.log_weight, here.log_weight, atol=1e-9)
-    np.testing.assert_allclose(there.mean[:, :2], shift - here.mean[:, :2], atol=1e-9)
-    assert np.abs(wrap(there.mean[:, 2] - here.mean[:, 2] - np.pi)).max() < 1e-9
+    np.testing.assert_allclose(there.cloud()[:, :2], shift - here.cloud()[:, :2], atol=1e-9)
+    assert np.abs(wrap(there.cloud()[:, 2] - here.cloud()[:, 2] - np.pi)).max() < 1e-9
     np.testing.assert_allclose(all_members(there)[:, :, 2:], all_members(here)[:, :, 2:], atol=1e-9)
-    np.testing.assert_allclose(there.best.mean, shift - here.best.mean, atol=1e-9)
+    np.testing.assert_allclose(there.landmarks().mean, shift - here.landmarks().mean, atol=1e-9)
     turn = np.diag([-1, -1, 1])
     expected = turn @ here.pose().covariance @ turn
     np.testing.assert_allclose(there.pose().covariance, expected, atol=1e-9)
@@ -110,9 +112,9 @@ def test_estimate_is_the_weighted_mean_and_covariance_of_the_swarm_regularised()
     belief, _ = slam.predict(belief, np.tile([0.75, 0.027], (4, 1)), np.full(4, STEP))
     weight = normalised(belief.log_weight)
     assert weight.max() > 3 * weight.min()
-    mean = weight @ belief.mean  # No heading is near pi here.
-    spread = (belief.mean - mean).T @ (weight[:, None] * (belief.mean - mean))
-    own = np.tensordot(weight, belief.covariance, 1)
+    mean = weight @ belief.cloud()  # No heading is near pi here.
+    spread = (belief.cloud() - mean).T @ (weight[:, None] * (belief.cloud() - mean))
+    own = np.tensordot(weight, particles_of(belief).covariance, 1)
     # The mean direction and the mean heading part by the third power of the spread.
     np.testing.assert_allclose(belief.pose().mean, mean, atol=0.1**3)
     expected = spread + own + SMALLEST_STD**2 * np.eye(3)
@@ -122,13 +124,15 @@ def test_estimate_is_the_weighted_mean_and_covariance_of_the_swarm_regularised()
 def test_best_map_is_the_heaviest_particles_and_the_first_of_equals():
     slam = never_resampling(swarm_filter(10))
     belief = began(slam, (1, 5.0, 0.3), (2, np.nan, 1.0))
-    np.testing.assert_array_equal(belief.best.mean, belief.member[0, :, :2])
+    np.testing.assert_array_equal(belief.landmarks().mean, particles_of(belief).member[0, :, :2])
     belief, _ = slam.predict(belief, np.tile([0.75, 0.2], (4, 1)), np.full(4, STEP))
     belief = slam.update(belief, scan_of((1, 4.7, 0.3)), drawing(2))
     best = np.argmax(belief.log_weight)
     assert best > 0
-    np.testing.assert_array_equal(belief.best.mean, belief.member[best, :, :2])
-    np.testing.assert_array_equal(belief.best.weight, belief.member[best, :, 5])
+    np.testing.assert_array_equal(belief.landmarks().mean, particles_of(belief).member[best, :, :2])
+    np.testing.assert_array_equal(
+        np.log(belief.landmarks().weight), particles_of(belief).member[best, :, 5]
+    )
 
 
 def test_mean_number_of_full_landmarks_is_weighted():
@@ -137,7 +141,9 @@ def test_mean_number_of_full_landmarks_is_weighted():
     fractional = 0
     for belief, _ in followed(slam, mission, drawing()):
         weight = normalised(belief.log_weight)
-        assert belief.full == pytest.approx(weight @ (belief.count == 1).sum(axis=1), abs=1e-12)
+        assert belief.full == pytest.approx(
+            weight @ (particles_of(belief).count == 1).sum(axis=1), abs=1e-12
+        )
         fractional += abs(belief.full - round(belief.full)) > 0.01
     assert fractional > 3
 
@@ -150,10 +156,10 @@ def test_resampling_happens_below_the_threshold_and_keeps_what_the_swarm_said():
         normal, uniform = rng.standard_normal((50, 3)), rng.random(50)
         kept = never_resampling(slam).update(belief, scan, Drawn(normal, uniform))
         belief = slam.update(belief, scan, Drawn(normal, uniform))
-    assert len(np.unique(belief.mean[:, 0])) < len(np.unique(kept.mean[:, 0])) == 50
+    assert len(np.unique(belief.cloud()[:, 0])) < len(np.unique(kept.cloud()[:, 0])) == 50
     assert np.ptp(belief.log_weight) == 0 < np.ptp(kept.log_weight)
     np.testing.assert_array_equal(belief.pose().mean, kept.pose().mean)
-    np.testing.assert_array_equal(belief.best.mean, kept.best.mean)
+    np.testing.assert_array_equal(belief.landmarks().mean, kept.landmarks().mean)
     assert belief.full == kept.full
 
 
@@ -163,9 +169,9 @@ def test_resampling_happens_below_the_threshold_and_keeps_what_the_swarm_said():
 def looking_apart(slam):
     """A belief of two particles, one turned by half a radian, which know landmark 1 ahead."""
     belief = began(slam, (1, 4.0, 0.0), start=KNOWN_POSE)
-    mean = belief.mean.copy()
+    mean = belief.cloud().copy()
     mean[1, 2] = 0.5
-    return replace(belief, mean=mean)
+    return with_particles(belief, mean=mean)
 
 
 @pytest.mark.parametrize(("bearing", "gated"), [(0.0, 0), (-0.5, 0), (-0.25, 1), (1.0, 1)])
@@ -176,7 +182,7 @@ def test_gate_drops_what_no_particle_expected_and_keeps_what_one_did(bearing, ga
     after = slam.update(belief, scan_of((1, distance, bearing)), drawing())
     assert after.gated == gated
     if gated:
-        np.testing.assert_array_equal(after.member, belief.member)
+        np.testing.assert_array_equal(particles_of(after).member, particles_of(belief).member)
     else:
         assert normalised(after.log_weight)[0 if bearing == 0.0 else 1] > 0.999
 

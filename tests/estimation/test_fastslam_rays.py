@@ -12,6 +12,7 @@ from reference.swarms import (
     drawing,
     members,
     never_resampling,
+    particles_of,
     swarm_filter,
 )
 
@@ -24,13 +25,15 @@ def test_frames_with_only_new_landmarks_sample_place_and_weigh_nothing():
     scan = scan_of((1, 5.0, 0.3), (2, np.nan, 1.0))
     belief = slam.update(slam.init(START), scan, Drawn(normal, np.full(30, 0.5)))
     np.testing.assert_allclose(
-        belief.mean, START.mean + normal * np.sqrt(np.diag(START.covariance)), rtol=1e-15
+        belief.cloud(),
+        START.mean + normal * np.sqrt(np.diag(START.covariance)),
+        rtol=1e-15,
     )
     assert np.ptp(belief.log_weight) == 0
-    assert not belief.covariance.any()
-    direction = belief.mean[:, 2] + 0.3
-    place = belief.mean[:, :2] + 5.0 * np.column_stack([np.cos(direction), np.sin(direction)])
-    np.testing.assert_allclose(belief.member[:, 0, :2], place, rtol=0, atol=1e-14)
+    assert not particles_of(belief).covariance.any()
+    direction = belief.cloud()[:, 2] + 0.3
+    place = belief.cloud()[:, :2] + 5.0 * np.column_stack([np.cos(direction), np.sin(direction)])
+    np.testing.assert_allclose(particles_of(belief).member[:, 0, :2], place, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("partial", ["reinitialise", "heaviest"])
@@ -40,8 +43,8 @@ def test_range_of_a_partial_landmark_adds_no_weight_and_makes_it_full(partial):
     belief, _ = slam.predict(belief, np.tile([0.75, 0.2], (4, 1)), np.full(4, STEP))
     after = slam.update(belief, scan_of((2, 3.0, 1.2)), drawing(3))
     np.testing.assert_array_equal(after.log_weight, belief.log_weight)
-    np.testing.assert_array_equal(after.count, 1)
-    distance = np.hypot(*(after.member[:, 1, :2] - after.mean[:, :2]).T)
+    np.testing.assert_array_equal(particles_of(after).count, 1)
+    distance = np.hypot(*(particles_of(after).member[:, 1, :2] - after.cloud()[:, :2]).T)
     # The bearing that follows the range moves the heaviest member along its own ellipse.
     np.testing.assert_allclose(distance, 3.0, atol=1e-12 if partial == "reinitialise" else 0.3)
 
@@ -74,8 +77,8 @@ def test_pruning_removes_rows_of_some_particles_and_changes_nothing_else():
     uneven = 0
     for belief, scan in drive_past(pruning, frames=20):
         pruned, kept = (slam.update(belief, scan, drawing(9)) for slam in (pruning, keeping))
-        counts = belief.count[:, 1]
-        uneven += len(set(pruned.count[:, 1])) > 1
+        counts = particles_of(belief).count[:, 1]
+        uneven += len(set(particles_of(pruned).count[:, 1])) > 1
         assert pruned.member.shape[1] == 1 + counts.max()
         for particle, before in enumerate(counts):
             rows = members(kept, particle, 7)

@@ -1,12 +1,13 @@
 """Swarms to test: FastSLAM 2.0 as the paper sets it, small enough for its slow reference."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 from pipistrelle.config import FastSlamConfig
 from pipistrelle.estimation.fastslam import FastSlam
+from pipistrelle.estimation.particle import LANES
 from pipistrelle.estimation.resampling import normalised
 from reference.fastslam import SlowFastSlam
 from reference.missions import (
@@ -22,6 +23,62 @@ from reference.missions import (
 )
 
 ARRAYS = ("mean", "covariance", "log_weight", "landmark", "first", "count")
+PACKED = ([0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Particles:
+    """A belief's particles one by one: what their blocks hold, in the usual arrays.
+
+    Poses (p, 3) and (p, 3, 3), counts (p, n), members (p, c, 6): x, y, xx, xy, yy, log weight.
+    """
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    log_weight: np.ndarray
+    landmark: np.ndarray
+    first: np.ndarray
+    count: np.ndarray
+    member: np.ndarray
+
+
+def particles_of(belief):
+    """Take a belief's blocks apart."""
+    number, blocks = belief.log_weight.size, len(belief.poses)
+    poses = belief.poses.reshape(blocks, 9, LANES).swapaxes(1, 2).reshape(-1, 9)[:number]
+    covariance = np.empty((number, 3, 3))
+    for k, (a, b) in enumerate(zip(*PACKED, strict=True)):
+        covariance[:, a, b] = covariance[:, b, a] = poses[:, 3 + k]
+    count = belief.count.swapaxes(1, 2).reshape(blocks * LANES, -1)
+    columns = belief.member.shape[1]
+    member = belief.member.reshape(blocks, columns, 6, LANES).transpose(0, 3, 1, 2)
+    member = member.reshape(blocks * LANES, columns, 6)[:number]
+    return Particles(
+        mean=poses[:, :3],
+        covariance=covariance,
+        log_weight=belief.log_weight,
+        landmark=belief.landmark,
+        first=belief.first,
+        count=count[:number],
+        member=member,
+    )
+
+
+def with_particles(belief, **changes):
+    """Put particles back into their blocks, some of their arrays changed."""
+    particles, blocks = replace(particles_of(belief), **changes), len(belief.poses)
+    lanes = np.minimum(np.arange(blocks * LANES), particles.log_weight.size - 1)
+    poses = np.column_stack([particles.mean, particles.covariance[:, *PACKED]])[lanes]
+    member = particles.member[lanes].reshape(blocks, LANES, -1, 6).transpose(0, 2, 3, 1)
+    return replace(
+        belief,
+        poses=poses.reshape(blocks, LANES, 9).swapaxes(1, 2).reshape(blocks, -1),
+        log_weight=particles.log_weight,
+        landmark=particles.landmark,
+        first=particles.first,
+        count=particles.count[lanes].reshape(blocks, LANES, -1).swapaxes(1, 2).copy(),
+        member=member.reshape(blocks, -1, 6 * LANES),
+    )
 
 
 class Drawn:
@@ -76,24 +133,31 @@ def followed(slam, mission, rng, start=START):
 
 
 def all_members(belief):
-    """Return (p, c, 6) members, with zeros in the columns that a particle does not use."""
-    offset = np.arange(belief.member.shape[1]) - np.repeat(belief.first[:-1], np.diff(belief.first))
-    used = offset < np.repeat(belief.count, np.diff(belief.first), axis=1)
-    return np.where(used[:, :, None], belief.member, 0.0)
+    """Return (p, c, 6) members, log weights last, with zeros in the columns that are not used."""
+    particles = particles_of(belief)
+    width = np.diff(belief.first)
+    offset = np.arange(belief.member.shape[1]) - np.repeat(belief.first[:-1], width)
+    used = offset < np.repeat(particles.count, width, axis=1)
+    return np.where(used[:, :, None], particles.member, 0.0)
+
+
+def weighted(member):
+    """Return members with their weights in place of the logs."""
+    return np.concatenate([member[..., :5], np.exp(member[..., 5:])], axis=-1)
 
 
 def members(belief, particle, label):
     """Return one particle's members of a landmark, (h, 6): x, y, xx, xy, yy, weight."""
-    n = belief.landmark.tolist().index(label)
+    particles, n = particles_of(belief), belief.landmark.tolist().index(label)
     first = belief.first[n]
-    return belief.member[particle, first : first + belief.count[particle, n]]
+    return weighted(particles.member[particle, first : first + particles.count[particle, n]])
 
 
 def arrays_of(belief):
-    shown = belief.landmarks()
+    shown, particles = belief.landmarks(), particles_of(belief)
     poses = (belief.pose().mean, belief.pose().covariance)
     rows = (shown.landmark, shown.mean, shown.covariance, shown.weight)
-    return [*(getattr(belief, name) for name in ARRAYS), all_members(belief), *poses, *rows]
+    return [*(getattr(particles, name) for name in ARRAYS), all_members(belief), *poses, *rows]
 
 
 def assert_same(belief, other):
@@ -106,12 +170,12 @@ def assert_same(belief, other):
 def assert_sound(belief):
     """Finite numbers, weights that sum to one, covariances that are covariances."""
     rows = belief.landmarks()
-    for values in (belief.mean, belief.pose().mean, belief.pose().covariance, rows.mean):
+    for values in (belief.cloud(), belief.pose().mean, belief.pose().covariance, rows.mean):
         assert np.isfinite(values).all()
     assert normalised(belief.log_weight).sum() == pytest.approx(1, abs=1e-12)
     np.testing.assert_array_equal(belief.pose().covariance, belief.pose().covariance.T)
     assert np.linalg.eigvalsh(belief.pose().covariance)[0] > 0
-    for particle in range(len(belief.mean)):
+    for particle in range(belief.log_weight.size):
         for label in belief.landmark:
             _, _, xx, xy, yy, weight = members(belief, particle, label).T
             assert (xx > 0).all()

@@ -24,6 +24,7 @@ A frame without measurements is not sampled: its motion goes on accumulating, wh
 The start is not sampled either: its covariance P0 is the first that accumulates.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,39 +33,50 @@ from jaxtyping import Float, Int
 from pipistrelle.config import FastSlamConfig, RayConfig
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.models import Gaussian, Landmarks, Motion, motion_numbers
-from pipistrelle.estimation.particle import WEIGHT, XX, XY, YY
+from pipistrelle.estimation.particle import LANES, MEMBER
 from pipistrelle.estimation.rays import Sensing, sensing_of
 from pipistrelle.estimation.resampling import effective_particles, normalised, stratified
-from pipistrelle.estimation.swarm import advance_swarm, correct_swarm, gated_by_all, summarise
+from pipistrelle.estimation.swarm import (
+    SMALLEST_STD,
+    advance_swarm,
+    correct_swarm,
+    descend,
+    gated_by_all,
+    mean_full,
+    particle_map,
+    summarise,
+)
 
 _PAPER = FastSlamConfig()
-SMALLEST_STD = 1e-6
-"""Added in quadrature to the pose estimate's x, y [m] and heading [rad]: a swarm that stands still
-or has one ancestor may have no spread, and its covariance no inverse."""
+_PACKED = ([0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2])
+"""Where in a pose's covariance the rows xx, xy, yy, xh, yh and hh of a block come from."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FastSlamBelief:
     """Particles, and what they amount to.
 
+    Particles are kept in b blocks of L = `particle.LANES`, number by number: a row of L numbers is
+    one number of each of a block's particles. Spare lanes of the last block repeat the last
+    particle.
+
     Attributes
     ----------
-    mean : (p, 3) [m, m, rad]
-        Of each particle's pose.
-    covariance : (p, 3, 3)
-        Of each particle's pose since its last sample.
+    poses : (b, 9 L)
+        Rows x, y [m], heading [rad], and xx, xy, yy, xh, yh, hh of the covariance since the last
+        sample.
     log_weight : (p)
     landmark : (n)
         Labels, in order of entry.
     first : (n + 1)
-        First column of each landmark in ``member``, then their number.
-    count : (p, n)
+        First row of each landmark in ``member``, then their number.
+    count : (b, n, L)
         Members of each particle's landmark.
-    member : (p, c, 6)
-        x, y [m], xx, xy, yy [m^2] and weight of each hypothesis.
+    member : (b, c, 6 L)
+        Rows x, y [m], xx, xy, yy [m^2] and log weight of each hypothesis.
     estimate : Gaussian of (3) and (3, 3)
         The swarm's pose, before any resampling.
-    best : Landmarks
+    best_count, best_member : (n), (c, 6)
         The map of the heaviest particle, before any resampling; the first of equals.
     full : float
         Weighted mean number of fully initialised landmarks.
@@ -72,15 +84,15 @@ class FastSlamBelief:
         Measurements rejected so far.
     """
 
-    mean: Float[np.ndarray, "p 3"]
-    covariance: Float[np.ndarray, "p 3 3"]
+    poses: Float[np.ndarray, "b rows"]
     log_weight: Float[np.ndarray, " p"]
     landmark: Int[np.ndarray, " n"]
     first: Int[np.ndarray, " n+1"]
-    count: Int[np.ndarray, "p n"]
-    member: Float[np.ndarray, "p c 6"]
+    count: Int[np.ndarray, "b n lanes"]
+    member: Float[np.ndarray, "b c numbers"]
     estimate: Gaussian
-    best: Landmarks
+    best_count: Int[np.ndarray, " n"]
+    best_member: Float[np.ndarray, "c 6"]
     full: float
     gated: int
 
@@ -90,11 +102,12 @@ class FastSlamBelief:
 
     def landmarks(self) -> Landmarks:
         """Return the heaviest particle's map, one row per member."""
-        return self.best
+        return _rows(self.landmark, self.first, self.best_count, self.best_member)
 
     def cloud(self) -> Float[np.ndarray, "p 3"]:
         """Return the particles' poses, (p, 3)."""
-        return self.mean.copy()
+        rows = self.poses.reshape(len(self.poses), -1, LANES).swapaxes(1, 2)
+        return rows[:, :, :3].reshape(-1, 3)[: self.log_weight.size]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,16 +148,21 @@ class FastSlam:
     def init(self, pose: Gaussian) -> FastSlamBelief:
         """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
         particles = self.swarm.particles
+        blocks = -(-particles // LANES)
+        numbers = np.concatenate([pose.mean, pose.covariance[*_PACKED]])
         return FastSlamBelief(
-            mean=np.tile(pose.mean.astype(float), (particles, 1)),
-            covariance=np.tile(pose.covariance.astype(float), (particles, 1, 1)),
+            poses=np.tile(np.repeat(numbers.astype(float), LANES), (blocks, 1)),
             log_weight=np.zeros(particles),
             landmark=np.empty(0, dtype=np.int64),
             first=np.zeros(1, dtype=np.int64),
-            count=np.empty((particles, 0), dtype=np.int64),
-            member=np.empty((particles, 0, 6)),
-            estimate=_regular(pose.mean.astype(float), pose.covariance.astype(float)),
-            best=_rows(np.empty(0, np.int64), np.zeros(1, np.int64), None, np.empty((0, 6))),
+            count=np.empty((blocks, 0, LANES), dtype=np.int64),
+            member=np.empty((blocks, 0, MEMBER)),
+            estimate=Gaussian(
+                mean=pose.mean.astype(float),
+                covariance=pose.covariance + SMALLEST_STD**2 * np.eye(3),
+            ),
+            best_count=np.empty(0, dtype=np.int64),
+            best_member=np.empty((0, 6)),
             full=0.0,
             gated=0,
         )
@@ -176,18 +194,15 @@ class FastSlam:
         -----
         Bradley & Abaid, Eq. (10), per particle.
         """
-        mean, covariance = belief.mean.copy(), belief.covariance.copy()
-        poses = Gaussian(mean=np.empty((len(dt), 3)), covariance=np.empty((len(dt), 3, 3)))
+        carried, steps = belief.poses.copy(), len(dt)
+        poses = Gaussian(mean=np.empty((steps, 3)), covariance=np.empty((steps, 3, 3)))
         weight = normalised(belief.log_weight)
         numbers = motion_numbers(self.motion)
-        advance_swarm(mean, covariance, weight, controls, dt, numbers, poses.mean, poses.covariance)
-        poses = _regular(poses.mean, poses.covariance)
-        estimate = (
-            Gaussian(mean=poses.mean[-1], covariance=poses.covariance[-1])
-            if len(dt)
-            else belief.estimate
-        )
-        return replace(belief, mean=mean, covariance=covariance, estimate=estimate), poses
+        advance_swarm(carried, weight, controls, dt, numbers, poses.mean, poses.covariance)
+        if not steps:
+            return belief, poses
+        estimate = Gaussian(mean=poses.mean[-1], covariance=poses.covariance[-1])
+        return replace(belief, poses=carried, estimate=estimate), poses
 
     def update(
         self, belief: FastSlamBelief, scan: Scan, rng: np.random.Generator
@@ -215,77 +230,69 @@ class FastSlam:
         particles = self.swarm.particles
         normal, uniform = rng.standard_normal((particles, 3)), rng.random(particles)
         sensing = sensing_of(self.range_std, self.bearing_std, self.rays, self.gate)
-        dropped = self._dropped(belief, scan, sensing)
-        if dropped.any():
-            scan = Scan(
-                time=scan.time,
-                landmark=scan.landmark[~dropped],
-                bearing=scan.bearing[~dropped],
-                range=scan.range[~dropped],
-            )
-        mean, covariance, log_weight, landmark, first, count, member = correct_swarm(
-            belief.mean, belief.covariance, belief.log_weight, belief.landmark, belief.first,
-            belief.count, belief.member, scan.landmark, scan.bearing, scan.range, normal,
-            sensing, self.swarm.mixture == "exact",
+        scan, gated = self._inside(belief, scan, sensing)
+        poses, gained, landmark, first, count, member = correct_swarm(
+            belief.poses, belief.landmark, belief.first, belief.count, belief.member,
+            scan.landmark, scan.bearing, scan.range, normal, sensing,
+            self.swarm.mixture == "exact",
         )  # fmt: skip
-        weight = normalised(log_weight)
-        best = int(np.argmax(weight))
+        weight = normalised(belief.log_weight + gained)
+        best_count, best_member = particle_map(count, member, np.argmax(weight))
+        mean, covariance = summarise(poses, weight)
         corrected = FastSlamBelief(
-            mean=mean,
-            covariance=covariance,
+            poses=poses,
             log_weight=np.log(weight, where=weight > 0.0, out=np.full(particles, -np.inf)),
             landmark=landmark,
             first=first,
             count=count,
             member=member,
-            estimate=_regular(*summarise(mean, covariance, weight)),
-            best=_rows(landmark, first, count[best], member[best]),
-            full=float(weight @ np.count_nonzero(count == 1, axis=1)),
-            gated=belief.gated + int(np.count_nonzero(dropped)),
+            estimate=Gaussian(mean=mean, covariance=covariance),
+            best_count=best_count,
+            best_member=best_member,
+            full=mean_full(count, weight),
+            gated=belief.gated + gated,
         )
         if effective_particles(weight) >= self.swarm.resample_below * particles:
             return corrected
         return _descend(corrected, stratified(weight, uniform))
 
-    def _dropped(self, belief: FastSlamBelief, scan: Scan, sensing: Sensing) -> np.ndarray:
-        """Tell which measurements no particle expected."""
+    def _inside(self, belief: FastSlamBelief, scan: Scan, sensing: Sensing) -> tuple[Scan, int]:
+        """Drop the measurements that no particle expected; tell how many."""
         if self.gate >= 1.0:
-            return np.zeros(scan.landmark.size, dtype=np.bool_)
-        return gated_by_all(
-            belief.mean, belief.covariance, belief.landmark, belief.first, belief.count,
-            belief.member, scan.landmark, scan.bearing, scan.range, sensing,
+            return scan, 0
+        dropped = gated_by_all(
+            belief.poses, belief.landmark, belief.first, belief.count, belief.member,
+            scan.landmark, scan.bearing, scan.range, sensing,
         )  # fmt: skip
+        kept = Scan(
+            time=scan.time,
+            landmark=scan.landmark[~dropped],
+            bearing=scan.bearing[~dropped],
+            range=scan.range[~dropped],
+        )
+        return kept, int(np.count_nonzero(dropped))
 
 
 def _descend(belief: FastSlamBelief, ancestor: Int[np.ndarray, " p"]) -> FastSlamBelief:
     """Put copies of the ancestors in the particles' places, all of one weight."""
-    return replace(
-        belief,
-        mean=belief.mean[ancestor],
-        covariance=belief.covariance[ancestor],
-        log_weight=np.full(ancestor.size, -np.log(ancestor.size)),
-        count=belief.count[ancestor],
-        member=belief.member[ancestor],
-    )
-
-
-def _regular(mean: Float[np.ndarray, "*k 3"], covariance: Float[np.ndarray, "*k 3 3"]) -> Gaussian:
-    """Return an estimate whose covariance has an inverse."""
-    return Gaussian(mean=mean, covariance=covariance + SMALLEST_STD**2 * np.eye(3))
+    poses, count, member = descend(belief.poses, belief.count, belief.member, ancestor)
+    log_weight = np.full(ancestor.size, -math.log(ancestor.size))
+    return replace(belief, poses=poses, log_weight=log_weight, count=count, member=member)
 
 
 def _rows(
     landmark: Int[np.ndarray, " n"],
     first: Int[np.ndarray, " n+1"],
-    count: Int[np.ndarray, " n"] | None,
+    count: Int[np.ndarray, " n"],
     member: Float[np.ndarray, "c 6"],
 ) -> Landmarks:
     """Lay out one particle's map, one row per member."""
-    count = np.zeros(landmark.size, dtype=np.int64) if count is None else count
     label = np.repeat(landmark, count)
     offset = np.arange(label.size) - np.repeat(np.cumsum(count) - count, count)
     rows = member[np.repeat(first[:-1], count) + offset]
-    covariance = rows[:, [XX, XY, XY, YY]].reshape(-1, 2, 2)
     return Landmarks(
-        landmark=label, mean=rows[:, :2].copy(), covariance=covariance, weight=rows[:, WEIGHT]
+        landmark=label,
+        mean=rows[:, :2].copy(),
+        covariance=rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2),
+        weight=np.exp(rows[:, 5]),
     )

@@ -38,7 +38,7 @@ def normalised(log_weight: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
     array([0.25, 0.75])
     """
     weight = _shifted(log_weight)
-    total = math.fsum(weight)
+    total = math.fsum(weight.tolist())
     return weight / total if total > 0.0 else np.full(weight.size, 1.0 / weight.size)
 
 

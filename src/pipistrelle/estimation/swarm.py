@@ -1,7 +1,7 @@
-"""Kernels on all particles: advance, gate, correct, summarise. One particle's steps: `particle`.
+"""Kernels on all particles: advance, gate, correct, summarise. A block's steps: `particle`.
 
-Landmark n of a particle has ``count[p, n]`` members, in the columns of ``member[p]`` from
-``first[n]`` on: the particles share the columns, not the members.
+Landmark n of a block has its members in the rows ``member[b, first[n] : first[n + 1]]``, of which
+lane i has the first ``count[b, n, i]``: the particles share the rows, not the members.
 """
 
 import math
@@ -9,58 +9,127 @@ import math
 import numpy as np
 from numba import njit
 
-from pipistrelle.estimation.models import carry_pose
+from pipistrelle.estimation.bundle import correct_ray, refine_by_ray, room
+from pipistrelle.estimation.elementary import cosine_and_sine, wrapped
+from pipistrelle.estimation.models import advance
 from pipistrelle.estimation.particle import (
-    LOG_TAU,
-    UNFORESEEN,
-    WEIGHT,
-    bearing_spread,
+    HEADING,
+    LANES,
+    LOG_WEIGHT,
+    MEMBER,
+    PHH,
+    POSE,
+    PXH,
+    PXX,
+    PXY,
+    PYH,
+    PYY,
+    X,
+    Y,
+    active_beyond,
+    bearing_beyond,
     correct_by_active,
     correct_by_bearing,
-    expect_active,
-    expect_bearing,
-    expect_from,
     place_member,
     refine_by_active,
-    refine_by_bearing,
     sample_pose,
 )
-from pipistrelle.estimation.rays import (
-    heaviest,
-    log_likelihood,
-    survivors,
-    weigh_and_share,
-)
-from pipistrelle.geometry import wrap_angle
+
+SMALLEST_STD = 1e-6
+"""Added in quadrature to the pose estimate's x, y [m] and heading [rad]: a swarm that stands still
+or has one ancestor may have no spread, and its covariance no inverse."""
+LEAST = SMALLEST_STD**2
 
 
 @njit(cache=True, error_model="numpy")
-def summarise(mean, covariance, weight):
+def _add_moments(pose, weight, sums):
+    """Add a block's weighted positions and directions, lane by lane."""
+    for i in range(LANES):
+        c, s = cosine_and_sine(pose[HEADING + i])
+        sums[X + i] += weight[i] * pose[X + i]
+        sums[Y + i] += weight[i] * pose[Y + i]
+        sums[PXX + i] += weight[i] * c
+        sums[PXY + i] += weight[i] * s
+
+
+@njit(cache=True, error_model="numpy")
+def _add_spread(pose, weight, x, y, heading, sums):
+    """Add a block's weighted covariances and squared distances from the mean, lane by lane."""
+    for i in range(LANES):
+        dx, dy, turn = pose[X + i] - x, pose[Y + i] - y, wrapped(pose[HEADING + i] - heading)
+        sums[PXX + i] += weight[i] * (dx * dx + pose[PXX + i])
+        sums[PXY + i] += weight[i] * (dx * dy + pose[PXY + i])
+        sums[PYY + i] += weight[i] * (dy * dy + pose[PYY + i])
+        sums[PXH + i] += weight[i] * (dx * turn + pose[PXH + i])
+        sums[PYH + i] += weight[i] * (dy * turn + pose[PYH + i])
+        sums[PHH + i] += weight[i] * (turn * turn + pose[PHH + i])
+
+
+@njit(cache=True, error_model="numpy")
+def _add_lanes(sums, row):
+    """Sum of a row over its lanes."""
+    total = 0.0
+    for i in range(LANES):
+        total += sums[row + i]
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def summarise(pose, weight):
     """Mean (circular in the heading) and covariance of a swarm's pose, its particles' included."""
-    x = y = east = north = 0.0
-    for i in range(weight.size):
-        x += weight[i] * mean[i, 0]
-        y += weight[i] * mean[i, 1]
-        east += weight[i] * math.cos(mean[i, 2])
-        north += weight[i] * math.sin(mean[i, 2])
-    centre = np.array([x, y, wrap_angle(math.atan2(north, east))])
-    total, off = np.zeros((3, 3)), np.empty(3)
-    for i in range(weight.size):
-        off[0], off[1] = mean[i, 0] - centre[0], mean[i, 1] - centre[1]
-        off[2] = wrap_angle(mean[i, 2] - centre[2])
-        for a in range(3):
-            for b in range(3):
-                total[a, b] += weight[i] * (off[a] * off[b] + covariance[i, a, b])
-    return centre, total
+    blocks = pose.shape[0]
+    lanes, sums = np.zeros((blocks, LANES)), np.zeros(POSE)
+    lanes.ravel()[: weight.size] = weight
+    for b in range(blocks):
+        _add_moments(pose[b], lanes[b], sums)
+    x, y = _add_lanes(sums, X), _add_lanes(sums, Y)
+    heading = math.atan2(_add_lanes(sums, PXY), _add_lanes(sums, PXX))
+    sums[:] = 0.0
+    for b in range(blocks):
+        _add_spread(pose[b], lanes[b], x, y, heading, sums)
+    covariance = np.empty((3, 3))
+    covariance[0, 0] = _add_lanes(sums, PXX) + LEAST
+    covariance[0, 1] = covariance[1, 0] = _add_lanes(sums, PXY)
+    covariance[1, 1] = _add_lanes(sums, PYY) + LEAST
+    covariance[0, 2] = covariance[2, 0] = _add_lanes(sums, PXH)
+    covariance[1, 2] = covariance[2, 1] = _add_lanes(sums, PYH)
+    covariance[2, 2] = _add_lanes(sums, PHH) + LEAST
+    return np.array([x, y, wrapped(heading)]), covariance
 
 
 @njit(cache=True, error_model="numpy")
-def advance_swarm(mean, covariance, weight, controls, dt, motion, pose_means, pose_covariances):
+def _advance_block(pose, step, q0, q1):
+    """Carry a block's poses through a control step, known in the vehicle's frame (Eq. (10))."""
+    ahead, aside, turn, u00, u10, u20, u01, u11, u21 = step
+    for i in range(LANES):
+        c, s = cosine_and_sine(pose[HEADING + i])
+        dx, dy = c * ahead - s * aside, s * ahead + c * aside
+        v00, v10 = c * u00 - s * u10, s * u00 + c * u10
+        v01, v11 = c * u01 - s * u11, s * u01 + c * u11
+        xh, yh, hh = pose[PXH + i], pose[PYH + i], pose[PHH + i]
+        pose[X + i] += dx
+        pose[Y + i] += dy
+        pose[HEADING + i] = wrapped(pose[HEADING + i] + turn)
+        pose[PXX + i] += dy * dy * hh - 2.0 * dy * xh + q0 * v00 * v00 + q1 * v01 * v01
+        pose[PXY + i] += dx * xh - dy * yh - dx * dy * hh + q0 * v00 * v10 + q1 * v01 * v11
+        pose[PYY + i] += 2.0 * dx * yh + dx * dx * hh + q0 * v10 * v10 + q1 * v11 * v11
+        pose[PXH + i] = xh - dy * hh + q0 * v00 * u20 + q1 * v01 * u21
+        pose[PYH + i] = yh + dx * hh + q0 * v10 * u20 + q1 * v11 * u21
+        pose[PHH + i] = hh + q0 * u20 * u20 + q1 * u21 * u21
+
+
+@njit(cache=True, error_model="numpy")
+def advance_swarm(pose, weight, controls, dt, motion, pose_means, pose_covariances):
     """Carry every particle through control steps, in place, and summarise after each."""
     for k in range(dt.size):
-        for i in range(weight.size):
-            carry_pose(mean[i], covariance[i], controls[k, 0], controls[k, 1], dt[k], motion)
-        pose_means[k], pose_covariances[k] = summarise(mean, covariance, weight)
+        speed, turn = controls[k, 0], controls[k, 1]
+        step = advance(motion.model, motion.wheelbase, 0.0, speed, turn, dt[k])
+        noisy = 1.0 if motion.noise_at_rest or speed != 0.0 or turn != 0.0 else 0.0
+        for b in range(pose.shape[0]):
+            _advance_block(
+                pose[b], step, noisy * motion.speed_variance, noisy * motion.turn_variance
+            )
+        pose_means[k], pose_covariances[k] = summarise(pose, weight)
 
 
 @njit(cache=True, error_model="numpy")
@@ -75,191 +144,133 @@ def _slots(landmark, labels):
 
 
 @njit(cache=True, error_model="numpy")
-def gated_by_all(
-    mean, covariance, landmark, first, count, member, labels, bearings, ranges, sensing
-):
+def _most(count):
+    """Members of the lane that has most."""
+    most = 1
+    for i in range(LANES):
+        most = max(most, count[i])
+    return most
+
+
+@njit(cache=True, error_model="numpy")
+def gated_by_all(pose, landmark, first, count, member, labels, bearings, ranges, sensing):
     """Whether each measurement is beyond the gate of every particle that could use it."""
     slot, gated = _slots(landmark, labels), np.zeros(labels.size, dtype=np.bool_)
     for m in range(labels.size):
         n = slot[m]
         gated[m] = n >= 0
-        passive = math.isnan(ranges[m])
-        for i in range(mean.shape[0] if n >= 0 else 0):
-            rows = member[i, first[n] : first[n] + count[i, n]]
-            if not passive:
-                far = count[i, n] == 1 and sensing.active_bound < expect_active(
-                    mean[i], covariance[i], rows[0], ranges[m], bearings[m],
-                    sensing.range_variance, sensing.bearing_variance,
+        for b in range(pose.shape[0] if n >= 0 else 0):
+            rows, counts = member[b, first[n] : first[n + 1]], count[b, n]
+            if not math.isnan(ranges[m]):
+                gated[m] = gated[m] and active_beyond(
+                    pose[b], rows[0], ranges[m], bearings[m],
+                    sensing.range_variance, sensing.bearing_variance, counts, sensing.active_bound,
                 )  # fmt: skip
-                gated[m] = gated[m] and far
-            for row in rows if passive else rows[:0]:
-                innovation, S = expect_bearing(
-                    mean[i], covariance[i], row, bearings[m], sensing.bearing_variance
-                )
-                gated[m] = gated[m] and innovation * innovation > sensing.passive_bound * S
+                continue
+            for j in range(_most(counts)):
+                gated[m] = gated[m] and bearing_beyond(
+                    pose[b], rows[j], bearings[m], sensing.bearing_variance, counts, j,
+                    sensing.passive_bound,
+                )  # fmt: skip
     return gated
 
 
 @njit(cache=True, error_model="numpy")
-def _copy_row(source, target):
-    """Copy one member, number by number: a copy of slices would first see whether they overlap."""
-    for k in range(6):
-        target[k] = source[k]
-
-
-@njit(cache=True, error_model="numpy")
-def _refine_by_ray(pose, P, rows, bearing, sensing, exact, scratch):
-    """Correct pose and P by the bearing of a partial landmark; returns the log likelihood."""
-    members, variance = rows.shape[0], sensing.bearing_variance
-    logs, weight, share = scratch[0], scratch[1], scratch[2]
-    for j in range(members):
-        innovation, S = expect_bearing(pose, P, rows[j], bearing, variance)
-        logs[j] = log_likelihood(innovation, S) if math.isfinite(S) else UNFORESEEN
-        weight[j] = rows[j, WEIGHT]
-    gained = weigh_and_share(logs, weight, members, sensing.power, sensing.aggregated, share)
-    if exact:
-        _refine_to_mixture(pose, P, rows, weight, bearing, variance)
-    else:
-        for j in range(members):
-            if share[j] > 0.0:
-                refine_by_bearing(pose, P, rows[j], bearing, variance / share[j])
-    return gained - 0.5 * LOG_TAU
-
-
-@njit(cache=True, error_model="numpy")
-def _refine_to_mixture(pose, P, rows, weight, bearing, variance):
-    """Set pose and P to mean and covariance of the mixture of the members' refinements."""
-    members = rows.shape[0]
-    means, covariances = np.empty((members, 3)), np.empty((members, 3, 3))
-    for j in range(members):
-        means[j], covariances[j] = pose, P
-        refine_by_bearing(means[j], covariances[j], rows[j], bearing, variance)
-    start, shift = pose.copy(), np.zeros(3)
-    for j in range(members):
-        for a in range(3):
-            shift[a] += weight[j] * (means[j, a] - start[a])
-    P[:, :] = 0.0
-    for j in range(members):
-        for a in range(3):
-            for b in range(3):
-                off = (means[j, a] - start[a] - shift[a]) * (means[j, b] - start[b] - shift[b])
-                P[a, b] += weight[j] * (covariances[j, a, b] + off)
-    for a in range(3):
-        pose[a] = start[a] + shift[a]
-
-
-@njit(cache=True, error_model="numpy")
-def _correct_ray(pose, rows, bearing, sensing, exact, scratch, keep):
-    """Weigh, correct and prune a ray from a certain pose, in place; returns the members left."""
-    members, variance = rows.shape[0], sensing.bearing_variance
-    logs, weight, share = scratch[0], scratch[1], scratch[2]
-    off, g0, g1 = scratch[3], scratch[4], scratch[5]
-    for j in range(members):
-        off[j], g0[j], g1[j] = expect_from(pose, rows[j], bearing)
-        S = bearing_spread(rows[j], g0[j], g1[j]) + variance
-        near = g0[j] == 0.0 and g1[j] == 0.0
-        logs[j] = UNFORESEEN if near else log_likelihood(off[j], S)
-        weight[j] = rows[j, WEIGHT]
-    weigh_and_share(logs, weight, members, sensing.power, sensing.aggregated, share)
-    for j in range(members):
-        if exact or share[j] > 0.0:
-            part = variance if exact else variance / share[j]
-            correct_by_bearing(rows[j], off[j], g0[j], g1[j], part)
-    survivors(weight, members, sensing.prune, keep)
-    left = 0
-    for j in range(members):
-        if keep[j]:
-            _copy_row(rows[j], rows[left])
-            rows[left, WEIGHT] = weight[j]
-            left += 1
-    return left
-
-
-@njit(cache=True, error_model="numpy")
-def _range_for_ray(pose, rows, distance, bearing, sensing):
-    """Give a partial landmark its range, in place: one member is left, the first row."""
+def _range_for_ray(pose, rows, count, distance, bearing, sensing):
+    """Give partial landmarks their range: of each one member is left, the first."""
     if sensing.reinitialise:
         place_member(
-            pose, rows[0], distance, bearing, sensing.range_variance, sensing.bearing_variance, 1.0
-        )
+            pose, rows[0], distance, bearing,
+            sensing.range_variance, sensing.bearing_variance, 0.0, count,
+        )  # fmt: skip
         return
-    _copy_row(rows[heaviest(rows[:, WEIGHT], rows.shape[0])], rows[0])
-    dx, dy = rows[0, 0] - pose[0], rows[0, 1] - pose[1]
-    scale = distance / max(math.sqrt(dx * dx + dy * dy), 1e-12)
-    rows[0, 0], rows[0, 1], rows[0, WEIGHT] = pose[0] + dx * scale, pose[1] + dy * scale, 1.0
-    off, g0, g1 = expect_from(pose, rows[0], bearing)
-    correct_by_bearing(rows[0], off, g0, g1, sensing.bearing_variance)
+    partial = np.zeros(LANES)
+    for i in range(LANES):
+        if count[i] == 1:
+            continue
+        partial[i], best = 1.0, 0
+        for j in range(1, count[i]):
+            best = j if rows[j, LOG_WEIGHT + i] > rows[best, LOG_WEIGHT + i] else best
+        for k in range(i, MEMBER, LANES):
+            rows[0, k] = rows[best, k]
+        dx, dy = rows[0, X + i] - pose[X + i], rows[0, Y + i] - pose[Y + i]
+        scale = distance / max(math.sqrt(dx * dx + dy * dy), 1e-12)
+        rows[0, X + i], rows[0, Y + i] = pose[X + i] + dx * scale, pose[Y + i] + dy * scale
+        rows[0, LOG_WEIGHT + i] = 0.0
+    correct_by_bearing(pose, rows[0], bearing, sensing.bearing_variance, partial)
 
 
 @njit(cache=True, error_model="numpy")
-def _refine(pose, P, first, count, member, slot, bearings, ranges, sensing, exact, scratch):
-    """Refine one particle's pose by all measurements of its landmarks; returns the log weight."""
-    gained = 0.0
+def _refine(
+    pose, log_weight, first, count, member, slot, bearings, ranges, sensing, exact, scratch
+):
+    """Refine a block's poses, and weigh them, by all measurements of their landmarks."""
     for m in range(slot.size):
         n = slot[m]
         if n < 0:
             continue
-        rows = member[first[n] : first[n] + count[n]]
+        rows = member[first[n] : first[n + 1]]
         if math.isnan(ranges[m]):
-            if count[n] == 1:
-                gained += refine_by_bearing(pose, P, rows[0], bearings[m], sensing.bearing_variance)
-            else:
-                gained += _refine_by_ray(pose, P, rows, bearings[m], sensing, exact, scratch)
-        elif count[n] == 1:
-            gained += refine_by_active(
-                pose, P, rows[0], ranges[m], bearings[m],
-                sensing.range_variance, sensing.bearing_variance,
-            )  # fmt: skip
-    return gained
-
-
-@njit(cache=True, error_model="numpy")
-def _correct(pose, first, count, member, slot, bearings, ranges, sensing, exact, scratch, keep):
-    """Correct one particle's measured landmarks from its sampled pose, in place."""
-    for m in range(slot.size):
-        n = slot[m]
-        if n < 0:
-            continue
-        rows = member[first[n] : first[n] + count[n]]
-        if math.isnan(ranges[m]):
-            if count[n] == 1:
-                off, g0, g1 = expect_from(pose, rows[0], bearings[m])
-                correct_by_bearing(rows[0], off, g0, g1, sensing.bearing_variance)
-            else:
-                count[n] = _correct_ray(pose, rows, bearings[m], sensing, exact, scratch, keep)
-        elif count[n] == 1:
-            correct_by_active(
-                pose, rows[0], ranges[m], bearings[m],
-                sensing.range_variance, sensing.bearing_variance,
+            refine_by_ray(
+                pose, rows, count[n], _most(count[n]), bearings[m], sensing, exact, scratch,
+                log_weight,
             )  # fmt: skip
         else:
-            _range_for_ray(pose, rows, ranges[m], bearings[m], sensing)
+            refine_by_active(
+                pose, rows[0], ranges[m], bearings[m],
+                sensing.range_variance, sensing.bearing_variance, count[n], log_weight,
+            )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def _correct(pose, first, count, member, slot, bearings, ranges, sensing, exact, scratch):
+    """Correct a block's measured landmarks from its sampled poses, in place."""
+    for m in range(slot.size):
+        n = slot[m]
+        if n < 0:
+            continue
+        rows = member[first[n] : first[n + 1]]
+        most = _most(count[n])
+        if math.isnan(ranges[m]):
+            if most == 1:
+                correct_by_bearing(
+                    pose, rows[0], bearings[m], sensing.bearing_variance, scratch.whole
+                )
+            else:
+                correct_ray(pose, rows, count[n], most, bearings[m], sensing, exact, scratch)
+            continue
+        correct_by_active(
+            pose, rows[0], ranges[m], bearings[m],
+            sensing.range_variance, sensing.bearing_variance, count[n],
+        )  # fmt: skip
+        if most > 1:
+            _range_for_ray(pose, rows, count[n], ranges[m], bearings[m], sensing)
             count[n] = 1
 
 
 @njit(cache=True, error_model="numpy")
-def _place(pose, first, count, member, n, bearing, distance, sensing):
-    """Place a new landmark of one particle, one member or a ray of them (Eqs. (16) to (18))."""
+def _place(pose, rows, count, bearing, distance, sensing):
+    """Place a block's new landmark, one member or a ray of them (Eqs. (16) to (18))."""
     if not math.isnan(distance):
         place_member(
-            pose, member[first[n]], distance, bearing,
-            sensing.range_variance, sensing.bearing_variance, 1.0,
+            pose, rows[0], distance, bearing,
+            sensing.range_variance, sensing.bearing_variance, 0.0, count,
         )  # fmt: skip
-        count[n] = 1
+        count[:] = 1
         return
     members = sensing.ray_ranges.size
     for j in range(members):
         place_member(
-            pose, member[first[n] + j], sensing.ray_ranges[j], bearing,
-            sensing.ray_stds[j] ** 2, sensing.bearing_variance, 1.0 / members,
+            pose, rows[j], sensing.ray_ranges[j], bearing,
+            sensing.ray_stds[j] ** 2, sensing.bearing_variance, -math.log(members), count,
         )  # fmt: skip
-    count[n] = members
+    count[:] = members
 
 
 @njit(cache=True, error_model="numpy")
-def _columns(landmark, count, slot, labels, ranges, rays):
-    """Labels with the new ones, and each landmark's first column: no more than its members need."""
-    known, particles = landmark.size, count.shape[0]
+def _rows(landmark, count, slot, labels, ranges, rays):
+    """Labels with the new ones, and each landmark's first row: no more than its members need."""
+    known = landmark.size
     fresh = 0
     for m in range(slot.size):
         fresh += slot[m] < 0
@@ -268,8 +279,8 @@ def _columns(landmark, count, slot, labels, ranges, rays):
     all_labels[:known] = landmark
     for n in range(known):
         most = 1
-        for i in range(particles):
-            most = max(most, count[i, n])
+        for b in range(count.shape[0]):
+            most = max(most, _most(count[b, n]))
         first[n + 1] = first[n] + most
     for m in range(slot.size):
         if slot[m] < 0:
@@ -281,42 +292,91 @@ def _columns(landmark, count, slot, labels, ranges, rays):
 
 @njit(cache=True, error_model="numpy")
 def _copy_members(old_first, old_count, old_member, first, count, member):
-    """Copy one particle's members into their new columns."""
-    for n in range(old_count.size):
-        count[n] = old_count[n]
-        for j in range(count[n]):
-            _copy_row(old_member[old_first[n] + j], member[first[n] + j])
+    """Copy a block's members into their new rows."""
+    for n in range(old_count.shape[0]):
+        for j in range(first[n + 1] - first[n]):
+            source, target = old_member[old_first[n] + j], member[first[n] + j]
+            for k in range(MEMBER):
+                target[k] = source[k]
+        for i in range(LANES):
+            count[n, i] = old_count[n, i]
 
 
 @njit(cache=True, error_model="numpy")
 def correct_swarm(
-    old_mean, old_covariance, old_log_weight, old_landmark, old_first, old_count, old_member,
+    old_pose, old_landmark, old_first, old_count, old_member,
     labels, bearings, ranges, normal, sensing, exact,
 ):  # fmt: skip
     """Refine, sample, correct and place in copies of all particles; returns the belief's arrays."""
-    mean, covariance, log_weight = old_mean.copy(), old_covariance.copy(), old_log_weight.copy()
-    slot, known, particles = _slots(old_landmark, labels), old_landmark.size, old_mean.shape[0]
-    landmark, first = _columns(
-        old_landmark, old_count, slot, labels, ranges, sensing.ray_ranges.size
-    )
-    count = np.zeros((particles, landmark.size), dtype=np.int64)
-    member = np.zeros((particles, first[-1], 6))
-    scratch = np.empty((6, sensing.ray_ranges.size))
-    keep = np.empty(sensing.ray_ranges.size, dtype=np.bool_)
-    for i in range(particles):
-        _copy_members(old_first, old_count[i], old_member[i], first, count[i], member[i])
-        log_weight[i] += _refine(
-            mean[i], covariance[i], first, count[i], member[i], slot, bearings, ranges,
+    pose, gained = old_pose.copy(), np.zeros((old_pose.shape[0], LANES))
+    draw = np.empty(3 * LANES)
+    slot, known, blocks = _slots(old_landmark, labels), old_landmark.size, old_pose.shape[0]
+    landmark, first = _rows(old_landmark, old_count, slot, labels, ranges, sensing.ray_ranges.size)
+    count = np.zeros((blocks, landmark.size, LANES), dtype=np.int64)
+    member = np.empty((blocks, first[-1], MEMBER))
+    scratch = room(sensing.ray_ranges.size)
+    for b in range(blocks):
+        _copy_members(old_first, old_count[b], old_member[b], first, count[b], member[b])
+        _refine(
+            pose[b], gained[b], first, count[b], member[b], slot, bearings, ranges,
             sensing, exact, scratch,
         )  # fmt: skip
-        sample_pose(mean[i], covariance[i], normal[i])
+        for k in range(draw.size):
+            particle = min(b * LANES + k % LANES, normal.shape[0] - 1)
+            draw[k] = normal[particle, k // LANES]
+        sample_pose(pose[b], draw)
         _correct(
-            mean[i], first, count[i], member[i], slot, bearings, ranges, sensing, exact,
-            scratch, keep,
-        )  # fmt: skip
+            pose[b], first, count[b], member[b], slot, bearings, ranges, sensing, exact, scratch
+        )
         n = known
         for m in range(labels.size):
             if slot[m] < 0:
-                _place(mean[i], first, count[i], member[i], n, bearings[m], ranges[m], sensing)
+                rows = member[b, first[n] : first[n + 1]]
+                _place(pose[b], rows, count[b, n], bearings[m], ranges[m], sensing)
                 n += 1
-    return mean, covariance, log_weight, landmark, first, count, member
+    return pose, gained.ravel()[: normal.shape[0]], landmark, first, count, member
+
+
+@njit(cache=True, error_model="numpy")
+def particle_map(count, member, particle):
+    """One particle's members, row by row: the number of each landmark's, and (c, 6) numbers."""
+    b, i = particle // LANES, particle % LANES
+    rows = np.empty((member.shape[1], MEMBER // LANES))
+    for j in range(rows.shape[0]):
+        for k in range(rows.shape[1]):
+            rows[j, k] = member[b, j, k * LANES + i]
+    return count[b, :, i].copy(), rows
+
+
+@njit(cache=True, error_model="numpy")
+def mean_full(count, weight):
+    """Weighted mean number of landmarks of one member."""
+    total = 0.0
+    for p in range(weight.size):
+        full = 0
+        for n in range(count.shape[1]):
+            full += count[p // LANES, n, p % LANES] == 1
+        total += weight[p] * full
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def descend(old_pose, old_count, old_member, ancestor):
+    """Put copies of the ancestors in the particles' places; spare lanes follow the last."""
+    pose, count = np.empty_like(old_pose), np.empty_like(old_count)
+    member = np.empty_like(old_member)
+    source = np.empty(LANES, dtype=np.int64)
+    for b in range(pose.shape[0]):
+        for i in range(LANES):
+            source[i] = ancestor[min(b * LANES + i, ancestor.size - 1)]
+        for k in range(POSE):
+            a = source[k % LANES]
+            pose[b, k] = old_pose[a // LANES, k - k % LANES + a % LANES]
+        for n in range(count.shape[1]):
+            for i in range(LANES):
+                count[b, n, i] = old_count[source[i] // LANES, n, source[i] % LANES]
+        for j in range(member.shape[1]):
+            for k in range(0, MEMBER, LANES):
+                for i in range(LANES):
+                    member[b, j, k + i] = old_member[source[i] // LANES, j, k + source[i] % LANES]
+    return pose, count, member
