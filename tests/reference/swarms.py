@@ -148,9 +148,10 @@ def weighted(member):
 
 def members(belief, particle, label):
     """Return one particle's members of a landmark, (h, 6): x, y, xx, xy, yy, weight."""
-    particles, n = particles_of(belief), belief.landmark.tolist().index(label)
+    (block, lane), n = divmod(particle, LANES), belief.landmark.tolist().index(label)
     first = belief.first[n]
-    return weighted(particles.member[particle, first : first + particles.count[particle, n]])
+    rows = belief.member[block, first : first + belief.count[block, n, lane]]
+    return weighted(rows.reshape(-1, 6, LANES)[:, :, lane])
 
 
 def arrays_of(belief):
