@@ -1,5 +1,9 @@
 """A run that may not fit into memory is refused before it starts, with what it would need."""
 
+import platform
+import subprocess
+import sys
+
 import pytest
 
 from pipistrelle.__main__ import main
@@ -40,3 +44,35 @@ def test_command_refuses_and_leaves_nothing(tmp_path, capsys):
     assert main(words) == 2
     assert "may need" in capsys.readouterr().err
     assert not (tmp_path / "o").exists()
+
+
+FAULTS = """
+import sys
+from resource import RUSAGE_SELF, getrusage
+
+import numpy as np
+
+from pipistrelle.experiments.memory import keep_freed_memory
+
+if sys.argv[1] == "kept":
+    keep_freed_memory()
+frame = [np.ones(200_000) for _ in range(4)]
+del frame
+before = getrusage(RUSAGE_SELF).ru_minflt
+for _ in range(100):
+    frame = [np.ones(200_000) for _ in range(4)]
+    del frame
+print(getrusage(RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only the GNU C library can be told")
+def test_memory_that_is_kept_is_not_asked_for_again():
+    faults = {
+        way: int(subprocess.run([sys.executable, "-c", FAULTS, way], capture_output=True,
+                                check=True, text=True).stdout)
+        for way in ("kept", "given back")
+    }  # fmt: skip
+    pages = 4 * 200_000 * 8 // 4096
+    assert faults["kept"] < 2 * pages
+    assert faults["given back"] > 50 * pages

@@ -1,13 +1,16 @@
-"""What the filters may need of memory, told before they start and not when it has run out."""
+"""What the filters may need of memory, told before they start, and freed memory kept for them."""
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 
 from pipistrelle.config import InputError, RayConfig
 from pipistrelle.estimation.rays import ray_members
 
 DOUBLE = 8
 """Bytes of a number."""
+MALLOPT = ((-3, 32 << 20), (-1, 256 << 20))
+"""Of the GNU C library: arrays up to 32 MB come from the heap; it shrinks when 256 MB are free."""
 
 
 def check_memory(
@@ -56,3 +59,17 @@ def installed() -> float:
         return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     except (AttributeError, ValueError, OSError):
         return float("inf")
+
+
+def keep_freed_memory() -> None:
+    """Let this process keep what it frees, where the C library can be told to.
+
+    A filter makes its arrays anew in every frame. Those above a megabyte, such as the covariance
+    of 200 landmarks, would be given back to the system and asked for again each time, and cleared
+    page by page: several times the cost of the arithmetic on them.
+    """
+    from ctypes import CDLL
+
+    with suppress(AttributeError, OSError, TypeError):
+        for parameter, value in MALLOPT:
+            CDLL(None).mallopt(parameter, value)

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from pipistrelle.config import InputError
+from pipistrelle.experiments.memory import keep_freed_memory
 from pipistrelle.experiments.plan import Plan, cases_of
 from pipistrelle.experiments.store import (
     Outcome,
@@ -276,6 +277,7 @@ def _become_worker() -> None:
     """Leave Ctrl-C to the process that started this one, and end when that is gone."""
     from multiprocessing import parent_process
 
+    keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ.setdefault("POLARS_MAX_THREADS", "1")
     parent = parent_process()

@@ -68,10 +68,12 @@ def recorder(options: OutputOptions) -> "MissionRecorder | None":
     return MissionRecorder()
 
 
-def compile_once(options: OutputOptions) -> None:
-    """Compile all kernels, or load them; say so if it takes long."""
+def get_ready(options: OutputOptions) -> None:
+    """Compile all kernels, or load them, and say so if it takes long; keep memory for them."""
+    from pipistrelle.experiments.memory import keep_freed_memory
     from pipistrelle.experiments.trial import compile_kernels
 
+    keep_freed_memory()
     with _waiting("Compiling kernels (once) ...", options):
         compile_kernels()
 

@@ -52,7 +52,7 @@ def run(
     from pipistrelle.verbs.console import progress
 
     with outcome.result_folder(output, "run") as folder:
-        outcome.compile_once(output)
+        outcome.get_ready(output)
         watch = outcome.recorder(output)
         with progress(output.quiet) as show:
             done = run_mission(config, strategies(strategy), ways, progress=show, watch=watch)

@@ -116,7 +116,7 @@ def slam(
     there = len({label for scan in recorded.scans for label in scan.landmark.tolist()})
     check_memory(ways, there, settled.fastslam.particles, settled.rays, passive=True)
     with outcome.result_folder(output, "slam") as folder:
-        outcome.compile_once(output)
+        outcome.get_ready(output)
         watch = outcome.recorder(output)
         beam = None if beamwidth is None else radians(beamwidth)
         with progress(output.quiet) as show:
