@@ -166,7 +166,9 @@ def _average(labels, label, face, tone, angle, bearing, delay, power, weighted):
     """Mean direction and delay of each landmark and tone over its strongest rows per face."""
     mean_bearing = np.full((labels.size, 2), np.nan)
     mean_delay = np.full(labels.size, np.nan)
-    faces = face.max() + 1 if face.size else 0
+    faces = 0
+    for d in range(face.size):
+        faces = max(faces, face[d] + 1)
     strongest = np.empty(faces, dtype=np.int64)
     for i in range(labels.size):
         for p in range(2):

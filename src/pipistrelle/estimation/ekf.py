@@ -276,7 +276,7 @@ def _correct_known(joint, landmark, weight, members, label, bearing, distance, s
         )  # fmt: skip
     elif passive:
         outcome = _correct_ray(joint, weight, members, first, count, bearing, sensing)
-        keep = np.ones(count, dtype=np.bool_)
+        keep = np.empty(count, dtype=np.bool_)
         if outcome == APPLIED and survivors(weight[first:], count, sensing.prune, keep) < count:
             members = drop_members(joint, landmark, weight, members, first, count, keep)
     else:

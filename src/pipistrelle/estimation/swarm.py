@@ -66,11 +66,14 @@ def _add_spread(pose, weight, x, y, heading, sums):
 
 
 @njit(cache=True, error_model="numpy")
-def _add_lanes(sums, row):
-    """Sum of a row over its lanes."""
-    total = 0.0
-    for i in range(LANES):
-        total += sums[row + i]
+def _add_lanes(sums):
+    """Sum of each row over its lanes."""
+    total = np.empty(POSE // LANES)
+    for row in range(total.size):
+        so_far = 0.0
+        for i in range(row * LANES, (row + 1) * LANES):
+            so_far += sums[i]
+        total[row] = so_far
     return total
 
 
@@ -79,22 +82,24 @@ def summarise(pose, weight):
     """Mean (circular in the heading) and covariance of a swarm's pose, its particles' included."""
     blocks = pose.shape[0]
     lanes, sums = np.zeros((blocks, LANES)), np.zeros(POSE)
-    lanes.ravel()[: weight.size] = weight
+    for p in range(weight.size):
+        lanes[p // LANES, p % LANES] = weight[p]
     for b in range(blocks):
         _add_moments(pose[b], lanes[b], sums)
-    x, y = _add_lanes(sums, X), _add_lanes(sums, Y)
-    heading = math.atan2(_add_lanes(sums, PXY), _add_lanes(sums, PXX))
+    mean = _add_lanes(sums)
+    mean[2] = math.atan2(mean[4], mean[3])
     sums[:] = 0.0
     for b in range(blocks):
-        _add_spread(pose[b], lanes[b], x, y, heading, sums)
-    covariance = np.empty((3, 3))
-    covariance[0, 0] = _add_lanes(sums, PXX) + LEAST
-    covariance[0, 1] = covariance[1, 0] = _add_lanes(sums, PXY)
-    covariance[1, 1] = _add_lanes(sums, PYY) + LEAST
-    covariance[0, 2] = covariance[2, 0] = _add_lanes(sums, PXH)
-    covariance[1, 2] = covariance[2, 1] = _add_lanes(sums, PYH)
-    covariance[2, 2] = _add_lanes(sums, PHH) + LEAST
-    return np.array([x, y, wrapped(heading)]), covariance
+        _add_spread(pose[b], lanes[b], mean[0], mean[1], mean[2], sums)
+    spread, covariance = _add_lanes(sums), np.empty((3, 3))
+    covariance[0, 0] = spread[3] + LEAST
+    covariance[0, 1] = covariance[1, 0] = spread[4]
+    covariance[1, 1] = spread[5] + LEAST
+    covariance[0, 2] = covariance[2, 0] = spread[6]
+    covariance[1, 2] = covariance[2, 1] = spread[7]
+    covariance[2, 2] = spread[8] + LEAST
+    mean[2] = wrapped(mean[2])
+    return mean[:3].copy(), covariance
 
 
 @njit(cache=True, error_model="numpy")
@@ -129,14 +134,19 @@ def advance_swarm(pose, weight, controls, dt, motion, pose_means, pose_covarianc
             _advance_block(
                 pose[b], step, noisy * motion.speed_variance, noisy * motion.turn_variance
             )
-        pose_means[k], pose_covariances[k] = summarise(pose, weight)
+        mean, covariance = summarise(pose, weight)
+        for a in range(3):
+            pose_means[k, a] = mean[a]
+            for b in range(3):
+                pose_covariances[k, a, b] = covariance[a, b]
 
 
 @njit(cache=True, error_model="numpy")
 def _slots(landmark, labels):
     """Index of each label among the landmarks; -1 for a new one."""
-    slot = np.full(labels.size, -1, dtype=np.int64)
+    slot = np.empty(labels.size, dtype=np.int64)
     for m in range(labels.size):
+        slot[m] = -1
         for n in range(landmark.size):
             if landmark[n] == labels[m]:
                 slot[m] = n
@@ -276,12 +286,11 @@ def _rows(landmark, count, slot, labels, ranges, rays):
         fresh += slot[m] < 0
     all_labels = np.empty(known + fresh, dtype=np.int64)
     first = np.zeros(known + fresh + 1, dtype=np.int64)
-    all_labels[:known] = landmark
     for n in range(known):
         most = 1
         for b in range(count.shape[0]):
             most = max(most, _most(count[b, n]))
-        first[n + 1] = first[n] + most
+        all_labels[n], first[n + 1] = landmark[n], first[n] + most
     for m in range(slot.size):
         if slot[m] < 0:
             all_labels[known] = labels[m]
