@@ -74,8 +74,8 @@ def room(members):
 @njit(cache=True, error_model="numpy")
 def _largest(logs, members, largest):
     """Largest of each lane's logs."""
-    largest[:] = logs[0]
-    for j in range(1, members):
+    largest[:] = -np.inf
+    for j in range(members):
         row = logs[j]
         for i in range(LANES):
             largest[i] = max(largest[i], row[i])
@@ -159,7 +159,8 @@ def _refine_to_mixture(pose, rows, members, bearing, variance, scratch):
     """Set the poses to mean and covariance of the mixture of the members' refinements."""
     for j in range(members):
         refined, weight = scratch.refined[j], scratch.posterior[j]
-        refined[:] = pose
+        for k in range(POSE):
+            refined[k] = pose[k]
         refine_by_bearing(refined, rows[j], bearing, variance, scratch.whole)
         for i in range(LANES):
             weight[i] = exponential(weight[i])
