@@ -8,6 +8,7 @@ one landmark; lane i has the first ``count[i]`` of them.
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 from numba import njit
 
 from pipistrelle.estimation.elementary import exponential, logarithm
@@ -34,15 +35,26 @@ from pipistrelle.estimation.rays import SMALLEST_AGGREGATED_SHARE, SMALLEST_SHAR
 
 
 class Scratch(NamedTuple):
-    """Room to work: a row of lanes per member, a row of lanes, and poses per member."""
+    """Room to work.
 
-    likelihood: np.ndarray
-    posterior: np.ndarray
-    share: np.ndarray
-    largest: np.ndarray
-    total: np.ndarray
-    whole: np.ndarray
-    refined: np.ndarray
+    Attributes
+    ----------
+    likelihood, posterior, share : (h, `LANES`)
+        Of each member; the first two are logs.
+    largest, total : (`LANES`)
+    whole : (`LANES`)
+        Shares of one.
+    refined : (h, `POSE`)
+        Poses as each member alone would have them.
+    """
+
+    likelihood: Float[np.ndarray, "h lanes"]
+    posterior: Float[np.ndarray, "h lanes"]
+    share: Float[np.ndarray, "h lanes"]
+    largest: Float[np.ndarray, " lanes"]
+    total: Float[np.ndarray, " lanes"]
+    whole: Float[np.ndarray, " lanes"]
+    refined: Float[np.ndarray, "h rows"]
 
 
 @njit(cache=True, error_model="numpy")
@@ -63,8 +75,8 @@ def room(members):
 def _largest(logs, members, largest):
     """Largest of each lane's logs."""
     for i in range(LANES):
-        largest[i] = logs[0, i]
-    for j in range(1, members):
+        largest[i] = -np.inf
+    for j in range(members):
         row = logs[j]
         for i in range(LANES):
             largest[i] = max(largest[i], row[i])

@@ -1,4 +1,4 @@
-r"""Elementary functions for lanes: a loop over particles that calls these runs eight at a time.
+r"""Elementary functions for lanes: a loop over particles that calls these runs several at a time.
 
 The C library's functions take one number and branch on it, so a loop that calls them stays a loop
 over single numbers. These have no branches and no tables: each brings its argument near zero,
@@ -6,8 +6,8 @@ sums the first terms of the Taylor series there, as many as double precision can
 back what it took away. The compiler then computes as many arguments at once as the processor has
 lanes, with the same result, to the last bit, as one by one.
 
-They are exact to about two units in the last place on the domains they state. Outside, and for
-what is not a number, they promise nothing.
+They are exact to three units in the last place on the domains they state. Outside, and for what
+is not a number, they promise nothing.
 """
 
 import math
@@ -31,6 +31,7 @@ _SINE = tuple((-1) ** n / math.factorial(2 * n + 1) for n in reversed(range(9)))
 _COSINE = tuple((-1) ** n / math.factorial(2 * n) for n in reversed(range(10)))
 _ARCTANGENT = tuple((-1) ** n / (2 * n + 1) for n in reversed(range(10)))
 _LOGARITHM = tuple(2.0 / (2 * n + 1) for n in reversed(range(12)))
+_KNOWN = tuple(math.atan(slope) for slope in (0.25, 0.5, 0.75, 1.0))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -97,9 +98,6 @@ def arctangent(y, x):
     angle = 0.5 * math.pi - angle if across > along else angle
     angle = math.pi - angle if x < 0.0 else angle
     return -angle if y < 0.0 else angle
-
-
-_KNOWN = tuple(math.atan(slope) for slope in (0.25, 0.5, 0.75, 1.0))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)

@@ -21,6 +21,8 @@ from pipistrelle.estimation.elementary import arctangent, cosine_and_sine, logar
 from pipistrelle.estimation.models import NEAREST
 
 LANES = 32
+"""Particles in a block. With half as many the compiler unrolls the loops instead of widening them;
+with more, small swarms fill no block."""
 X, Y, HEADING, PXX, PXY, PYY, PXH, PYH, PHH = range(0, 9 * LANES, LANES)
 XX, XY, YY, LOG_WEIGHT = range(2 * LANES, 6 * LANES, LANES)
 POSE, MEMBER = 9 * LANES, 6 * LANES

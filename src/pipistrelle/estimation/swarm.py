@@ -359,14 +359,15 @@ def particle_map(count, member, particle):
 
 @njit(cache=True, error_model="numpy")
 def mean_full(count, weight):
-    """Weighted mean number of landmarks of one member."""
-    total = 0.0
+    """Weighted mean number of landmarks of one member: exact where all particles agree."""
+    first, more = 0, 0.0
     for p in range(weight.size):
         full = 0
         for n in range(count.shape[1]):
             full += count[p // LANES, n, p % LANES] == 1
-        total += weight[p] * full
-    return total
+        first = full if p == 0 else first
+        more += weight[p] * (full - first)
+    return first + more
 
 
 @njit(cache=True, error_model="numpy")
