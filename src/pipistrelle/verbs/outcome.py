@@ -70,7 +70,7 @@ def recorder(options: OutputOptions) -> "MissionRecorder | None":
 
 def compile_once(options: OutputOptions) -> None:
     """Compile all kernels, or load them; say so if it takes long."""
-    from pipistrelle.experiments.trial import compile_kernels
+    from pipistrelle.experiments.kernels import compile_kernels
 
     with _waiting("Compiling kernels (once) ...", options):
         compile_kernels()
