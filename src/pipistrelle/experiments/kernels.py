@@ -44,9 +44,9 @@ def compile_fastslam() -> None:
 @contextmanager
 def _second_process(statement: str) -> Iterator[None]:
     """Run a statement in a process of its own, if one can be had, and wait for its end."""
-    silent = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+    command, nowhere = [sys.executable or "", "-P", "-c", statement], subprocess.DEVNULL
     try:
-        second = subprocess.Popen([sys.executable or "", "-P", "-c", statement], **silent)
+        second = subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere)
     except OSError:
         yield
         return
