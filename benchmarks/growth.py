@@ -49,9 +49,10 @@ def points() -> list[dict[str, float]]:
     """Time a frame, and a measurement in both filters, in worlds of more and more landmarks."""
     from benchmarks.worlds import scans_of, some_frames, world_of
     from pipistrelle.config import Config, ScenarioConfig
+    from pipistrelle.experiments.kernels import compile_kernels
     from pipistrelle.experiments.listening import listen
     from pipistrelle.experiments.memory import keep_freed_memory
-    from pipistrelle.experiments.trial import Case, compile_kernels, drive_of, run_trial
+    from pipistrelle.experiments.trial import Case, drive_of, run_trial
 
     keep_freed_memory()  # as the command does
     compile_kernels()

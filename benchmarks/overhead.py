@@ -10,10 +10,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from pipistrelle.experiments import world
+from pipistrelle.experiments.kernels import compile_kernels
 from pipistrelle.experiments.plan import find_plan, read_plan
 from pipistrelle.experiments.store import load_study
 from pipistrelle.experiments.study import run_study
-from pipistrelle.experiments.trial import compile_kernels
 
 
 def shares(worlds: int) -> dict[str, float]:

@@ -30,7 +30,7 @@ def run(*, settings: Settings = Settings()):
 
 app(["--help"])
 """
-COMPILE = "from pipistrelle.experiments.trial import compile_kernels; compile_kernels()"
+COMPILE = "from pipistrelle.experiments.kernels import compile_kernels; compile_kernels()"
 LIBRARIES = "import pipistrelle.experiments.trial, pipistrelle.figures.mission, polars"
 COMMAND = "./dev bench --only programs"
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.arrays.noise import stream_key
-from pipistrelle.config import Config, InputError, ScenarioConfig, Strategy
+from pipistrelle.config import Config, InputError, Strategy
 from pipistrelle.detection.scans import Heard, Scan, scan_of
 from pipistrelle.estimation.ekf import EkfSlam
 from pipistrelle.estimation.fastslam import FastSlam
@@ -109,6 +109,7 @@ def run_mission(
 
     Examples
     --------
+    >>> from pipistrelle.config import ScenarioConfig
     >>> mission = run_mission(Config(scenario=ScenarioConfig(steps=40)), ["fused"])
     >>> len(mission.heard), len(mission.trials[0].track.time)
     (10, 41)
@@ -333,12 +334,6 @@ def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]
             "where passive"
         )
     return steps.tolist()
-
-
-def compile_kernels() -> None:
-    """Compile every kernel, or load it from the cache, by a mission of two frames."""
-    tiny = Config(scenario=ScenarioConfig(steps=8, landmarks=4, radius=10.0))
-    run_mission(tiny, ("active", "fused", "passive"), tuple(LIMITS))
 
 
 def _generator(seed: int, iteration: int, purpose: str) -> np.random.Generator:

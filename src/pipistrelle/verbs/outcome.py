@@ -70,8 +70,8 @@ def recorder(options: OutputOptions) -> "MissionRecorder | None":
 
 def get_ready(options: OutputOptions) -> None:
     """Compile all kernels, or load them, and say so if it takes long; keep memory for them."""
+    from pipistrelle.experiments.kernels import compile_kernels
     from pipistrelle.experiments.memory import keep_freed_memory
-    from pipistrelle.experiments.trial import compile_kernels
 
     keep_freed_memory()
     with _waiting("Compiling kernels (once) ...", options):

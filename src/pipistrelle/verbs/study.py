@@ -163,7 +163,7 @@ def _compiled_first(show: Show, quiet: bool) -> Show:
     def prepare(standing: "Standing") -> None:
         nonlocal ready
         if not ready and standing.done < standing.worlds:
-            from pipistrelle.experiments.trial import compile_kernels
+            from pipistrelle.experiments.kernels import compile_kernels
 
             with announced("Compiling kernels (once) ...", 1e9 if quiet else 3.0):
                 compile_kernels()
