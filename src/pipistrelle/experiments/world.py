@@ -7,8 +7,9 @@ seen or heard (filters, rays and the vehicle's piston aside) share the drawing a
 import json
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from functools import cache
 from math import degrees
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +18,8 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.arrays.noise import stream_key
-from pipistrelle.config import Config
-from pipistrelle.detection.scans import Heard, scan_of
+from pipistrelle.config import Config, Strategy
+from pipistrelle.detection.scans import Heard, Scan, scan_of
 from pipistrelle.estimation.models import Track
 from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
 from pipistrelle.evaluation.consistency import nees
@@ -228,18 +229,25 @@ def _run_cases(cases: Sequence[PlannedCase], iteration: int) -> list[TrialRecord
         error = traceback.format_exc()
         return [_failed(case, error) for case in cases]
     beams = dict(zip(radii, heard, strict=True))
-    return [
-        _try_case(case, scenario, beams[case.config.emitter.radius], iteration) for case in cases
-    ]
+
+    @cache
+    def scans_of(radius: float, strategy: Strategy) -> tuple[Scan, ...]:
+        return tuple(scan_of(frame, strategy) for frame in beams[radius])
+
+    return [_try_case(case, scenario, beams, scans_of, iteration) for case in cases]
 
 
 def _try_case(
-    case: PlannedCase, scenario: Scenario, heard: Sequence[Heard], iteration: int
+    case: PlannedCase,
+    scenario: Scenario,
+    beams: Mapping[float, Sequence[Heard]],
+    scans_of: Callable[[float, Strategy], Sequence[Scan]],
+    iteration: int,
 ) -> TrialRecord:
-    """Run a trial, whatever comes of it."""
+    """Run a trial, whatever comes of it; filters share the scans of a beam and a strategy."""
     try:
-        drive = drive_of(scenario, case.config)
-        scans = [scan_of(frame, case.strategy) for frame in heard]
+        drive, radius = drive_of(scenario, case.config), case.config.emitter.radius
+        heard, scans = beams[radius], scans_of(radius, case.strategy)
         way = Case(strategy=case.strategy, filter=case.filter, iteration=iteration)
         began = time.thread_time()
         result = run_trial(way, drive, scans, case.config)
