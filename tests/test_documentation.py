@@ -52,7 +52,8 @@ def test_the_settings_named_by_the_pages_exist():
         type(getattr(Config(), section)).__name__: names for section, names in fields.items()
     }
     for page in (DOCS / "conventions.md", ROOT / "papers" / "bradley_abaid" / "README.md"):
-        for section, name in re.findall(r"`([a-z]+)\.(?!py\b|csv\b)([a-z_]+)(?: =|`)", page.read_text()):
+        named = re.findall(r"`([a-z]+)\.(?!py\b|csv\b)([a-z_]+)(?: =|`)", page.read_text())
+        for section, name in named:
             assert name in fields[section], f"{page.name}: {section}.{name}"
     rows = re.findall(r"^\|.*\|$", (DOCS / "conventions.md").read_text(), re.MULTILINE)
     for row in rows:
