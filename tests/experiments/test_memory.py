@@ -75,4 +75,4 @@ def test_memory_that_is_kept_is_not_asked_for_again():
     }  # fmt: skip
     pages = 4 * 200_000 * 8 // 4096
     assert faults["kept"] < 2 * pages
-    assert faults["given back"] > 50 * pages
+    assert faults["given back"] > 5 * pages
