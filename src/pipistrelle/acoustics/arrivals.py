@@ -284,7 +284,8 @@ def _loss_db(
         speed_of_sound=air.speed_of_sound,
     )
     active = spreading_loss_db(2.0 * homeward.ravel()[ahead], ways=2)
-    passive = passive_spreading_loss_db(outward[:-1], homeward[:, :-1], law=air.spreading)
+    sent, back = np.broadcast_to(outward[:-1], strength_db.shape), homeward[:, :-1]
+    passive = passive_spreading_loss_db(sent, back, law=air.spreading)
     direct = spreading_loss_db(homeward[:, -1:])
     return np.concatenate((active, np.hstack((passive - strength_db, direct)).ravel()))
 
