@@ -4,20 +4,14 @@ from functools import lru_cache
 
 import numpy as np
 
-from pipistrelle.arrays.noise import stream_key
 from pipistrelle.config import Config
 from pipistrelle.detection.scans import Scan, scan_of
 from pipistrelle.experiments.listening import listen
 from pipistrelle.experiments.plan import find_plan, read_plan
-from pipistrelle.experiments.scenario import Scenario, draw_scenario
+from pipistrelle.experiments.scenario import Scenario, world_of
 
 RADII = tuple(read_plan(find_plan("paper")).grid["emitter.radius"])
 """The paper's twelve pistons [m]."""
-
-
-def world_of(config: Config) -> Scenario:
-    """Draw the settings' first world."""
-    return draw_scenario(config, np.random.default_rng(stream_key(config.seed, 0, "scenario")))
 
 
 def some_frames(world: Scenario, every: int) -> Scenario:

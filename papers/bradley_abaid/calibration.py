@@ -30,11 +30,10 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from pipistrelle.arrays.noise import stream_key
 from pipistrelle.config import Config
 from pipistrelle.detection.scans import scan_of
 from pipistrelle.experiments.listening import listen
-from pipistrelle.experiments.scenario import Scenario, draw_scenario
+from pipistrelle.experiments.scenario import world_of
 from pipistrelle.experiments.trial import Case, drive_of, run_trial
 
 SEED = 1000
@@ -75,21 +74,18 @@ def in_worlds(worlds: int, workers: int) -> Iterator[Run]:
         yield lambda function: list(pool.map(function, range(worlds), chunksize=2))
 
 
-def drawn(config: Config, world: int) -> Scenario:
-    """Draw a world."""
-    return draw_scenario(config, np.random.default_rng(stream_key(config.seed, world, "scenario")))
-
-
-def with_levels(config: Config, vehicle_db: float, beacon_db: float) -> Config:
-    """Return settings with other source levels."""
-    emitter = config.emitter.model_copy(update={"level_db": vehicle_db})
-    beacon = config.beacon.model_copy(update={"level_db": beacon_db})
-    return config.model_copy(update={"emitter": emitter, "beacon": beacon})
+def changed(config: Config, change: Mapping[str, Any]) -> Config:
+    """Return settings with some changed, each by its dotted name."""
+    for key, value in change.items():
+        section, field = key.split(".")
+        part = getattr(config, section).model_copy(update={field: value})
+        config = config.model_copy(update={section: part})
+    return config
 
 
 def landmarks_seen(config: Config, beams: Sequence[str], world: int) -> dict[str, int]:
     """Count the landmarks that each strategy sees; passive is heard beside the last beam."""
-    heard = listen(drawn(config, world), config, [BEAMS[b] for b in beams], iteration=world)
+    heard = listen(world_of(config, world), config, [BEAMS[b] for b in beams], iteration=world)
     cases = {"passive": ("passive", heard[-1])}
     for beam, frames in zip(beams, heard, strict=True):
         cases |= {f"{strategy} {beam}": (strategy, frames) for strategy in ("fused", "active")}
@@ -106,9 +102,12 @@ def fit_levels(config: Config, run: Run) -> tuple[Config, dict[str, list[int]]]:
     changes what passive sensing sees, but the beacon's does change what fused sensing sees.
     """
 
+    def at(vehicle: int, beacon: int) -> Config:
+        return changed(config, {"emitter.level_db": vehicle / 10, "beacon.level_db": beacon / 10})
+
     @cache
     def seen(vehicle: int, beacon: int, *beams: str) -> dict[str, list[int]]:
-        settings = with_levels(config, vehicle / 10, beacon / 10)
+        settings = at(vehicle, beacon)
         rows = run(partial(landmarks_seen, settings, beams))
         counts = {name: [row[name] for row in rows] for name in rows[0]}
         means = (f"{name} {fmean(count):.2f}" for name, count in counts.items())
@@ -132,7 +131,7 @@ def fit_levels(config: Config, run: Run) -> tuple[Config, dict[str, list[int]]]:
         vehicle = nearest(fused, PAPER["fused 180"], vehicle)
         while active(vehicle) > MOST_ACTIVE:
             vehicle -= 1
-    return with_levels(config, vehicle / 10, beacon / 10), seen(vehicle, beacon, *BEAMS)
+    return at(vehicle, beacon), seen(vehicle, beacon, *BEAMS)
 
 
 def nearest(function: Callable[[int], float], target: float, start: int, step: int = 8) -> int:
@@ -150,14 +149,13 @@ def nearest(function: Callable[[int], float], target: float, start: int, step: i
 
 def rays_tried(config: Config, world: int) -> list[tuple[int, float, bool]]:
     """Map a world by passive EKF-SLAM with each n and tau: full landmarks, mean NEES, diverged."""
-    scenario = drawn(config, world)
+    scenario = world_of(config, world)
     (heard,) = listen(scenario, config, (BEAMS["11"],), iteration=world)
     scans = tuple(scan_of(frame, "passive") for frame in heard)
     case, drive, rows = Case(strategy="passive", filter="ekf"), drive_of(scenario, config), []
     for power in POWERS:
         for prune in PRUNES:
-            rays = config.rays.model_copy(update={"power": power, "prune": prune})
-            settings = config.model_copy(update={"rays": rays})
+            settings = changed(config, {"rays.power": power, "rays.prune": prune})
             scores = run_trial(case, drive, scans, settings).scores
             rows.append((scores.landmarks_full, scores.nees_mean, scores.diverged))
     return rows

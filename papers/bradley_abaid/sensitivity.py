@@ -19,12 +19,13 @@ from statistics import fmean, stdev
 from typing import Any, cast
 
 import polars as pl
-from calibration import BEAMS, SEED, Run, drawn, fit_levels, in_worlds
+from calibration import BEAMS, SEED, Run, changed, fit_levels, in_worlds
 
 from pipistrelle.config import STRATEGIES, Config
 from pipistrelle.detection.scans import scan_of
 from pipistrelle.experiments.listening import listen
 from pipistrelle.experiments.results import Scores
+from pipistrelle.experiments.scenario import world_of
 from pipistrelle.experiments.trial import Case, drive_of, run_trial
 
 AIR: dict[str, dict[str, Any]] = {
@@ -43,8 +44,8 @@ EARS: dict[str, dict[str, Any]] = {
 }
 FILTER: dict[str, dict[str, Any]] = {
     "as frozen": {},
-    "tau / 100": {"rays.prune": 0.01},
-    "tau x 100": {"rays.prune": 100.0},
+    "tau / 100": {"rays.prune": 1e-7},
+    "tau x 100": {"rays.prune": 1e-3},
     "n = 1": {"rays.power": 1.0},
     "n = 3": {"rays.power": 3.0},
     "n = 8": {"rays.power": 8.0},
@@ -100,19 +101,9 @@ def main() -> None:
     print(markdown(rows))
 
 
-def changed(config: Config, change: Mapping[str, Any]) -> Config:
-    """Return settings with some changed; tau is given as a factor."""
-    for key, value in change.items():
-        section, field = key.split(".")
-        old = getattr(config, section)
-        new = value * old.prune if field == "prune" else value
-        config = config.model_copy(update={section: old.model_copy(update={field: new})})
-    return config
-
-
 def trials_in(settings: Sequence[Config], world: int) -> list[Trials]:
     """Listen once in a world, and map it by each strategy and beam under each setting."""
-    scenario = drawn(settings[0], world)
+    scenario = world_of(settings[0], world)
     beams = listen(scenario, settings[0], list(BEAMS.values()), iteration=world)
     heard = dict(zip(BEAMS, beams, strict=True))
     cases = [(s, beam) for s in STRATEGIES for beam in BEAMS if s != "passive" or beam == "11"]

@@ -16,11 +16,10 @@ from statistics import fmean
 
 import numpy as np
 
-from pipistrelle.arrays.noise import stream_key
 from pipistrelle.config import Config, FastSlamConfig, Strategy
 from pipistrelle.detection.scans import Heard, Scan, scan_of
 from pipistrelle.experiments.listening import listen
-from pipistrelle.experiments.scenario import Scenario, draw_scenario
+from pipistrelle.experiments.scenario import Scenario, world_of
 from pipistrelle.experiments.trial import Case, drive_of, run_trial
 from pipistrelle.geometry import range_and_bearing, wrap
 
@@ -58,7 +57,7 @@ def world_rows(
 ) -> tuple[dict[tuple[str, str], list[float]], dict[str, float]]:
     """Return one row of numbers per case, and the clutter per frame of each beam."""
     config = config.model_copy(update={"seed": seed})
-    scenario = draw_scenario(config, np.random.default_rng(stream_key(seed, 0, "scenario")))
+    scenario = world_of(config)
     drive = drive_of(scenario, config)
     beams = dict(zip(RADII, listen(scenario, config, tuple(RADII.values())), strict=True))
     cases: list[tuple[str, Strategy, tuple[Heard, ...]]] = [("passive", "passive", beams["11"])]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from pipistrelle.arrays.noise import stream_key
 from pipistrelle.config import Config, InputError, MotionConfig, ScenarioConfig
 from pipistrelle.estimation.models import Motion, motion_step
 
@@ -35,6 +36,34 @@ class Scenario:
     controls: Float[np.ndarray, "t-1 2"]
     landmarks: Float[np.ndarray, "n 2"]
     beacon: Float[np.ndarray, "2"]
+
+
+def world_of(config: Config, iteration: int = 0) -> Scenario:
+    """Draw one of the worlds that the settings' seed stands for.
+
+    Parameters
+    ----------
+    config : Config
+    iteration : int
+        Number of the world.
+
+    Returns
+    -------
+    Scenario
+
+    Raises
+    ------
+    InputError
+        As `draw_scenario`.
+
+    Examples
+    --------
+    >>> one, again, other = world_of(Config()), world_of(Config()), world_of(Config(), 1)
+    >>> bool((one.beacon == again.beacon).all()), bool((one.beacon == other.beacon).all())
+    (True, False)
+    """
+    key = stream_key(config.seed, iteration, "scenario")
+    return draw_scenario(config, np.random.default_rng(key))
 
 
 def draw_scenario(config: Config, rng: np.random.Generator) -> Scenario:

@@ -20,7 +20,7 @@ from pipistrelle.evaluation.consistency import EKF_LIMIT, FASTSLAM_LIMIT
 from pipistrelle.experiments.listening import Progress, listen
 from pipistrelle.experiments.memory import check_memory
 from pipistrelle.experiments.results import TrialResult, score
-from pipistrelle.experiments.scenario import Scenario, bicycle, draw_scenario
+from pipistrelle.experiments.scenario import Scenario, bicycle, world_of
 from pipistrelle.experiments.tables import LabelledPoints
 
 Watch = Callable[[str, str, Scan, Belief], None]
@@ -114,7 +114,7 @@ def run_mission(
     >>> len(mission.heard), len(mission.trials[0].track.time)
     (10, 41)
     """
-    scenario = draw_scenario(config, _generator(config.seed, 0, "scenario"))
+    scenario = world_of(config)
     check_memory(
         filters,
         len(scenario.landmarks) + 1,

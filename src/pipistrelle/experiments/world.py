@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipistrelle.acoustics.emitter import beamwidth
-from pipistrelle.arrays.noise import stream_key
 from pipistrelle.config import Config, Strategy
 from pipistrelle.detection.scans import Heard, Scan, scan_of
 from pipistrelle.estimation.models import Track
@@ -26,7 +25,7 @@ from pipistrelle.evaluation.consistency import nees
 from pipistrelle.experiments.listening import listen
 from pipistrelle.experiments.plan import Plan, PlannedCase, cases_of
 from pipistrelle.experiments.results import Scores
-from pipistrelle.experiments.scenario import Scenario, draw_scenario
+from pipistrelle.experiments.scenario import Scenario, world_of
 from pipistrelle.experiments.trial import Case, drive_of, run_trial
 
 if TYPE_CHECKING:
@@ -222,8 +221,7 @@ def _run_cases(cases: Sequence[PlannedCase], iteration: int) -> list[TrialRecord
     config = cases[0].config
     radii = sorted({case.config.emitter.radius for case in cases})
     try:
-        rng = np.random.default_rng(stream_key(config.seed, iteration, "scenario"))
-        scenario = draw_scenario(config, rng)
+        scenario = world_of(config, iteration)
         heard = listen(scenario, config, radii, iteration=iteration)
     except Exception:
         error = traceback.format_exc()

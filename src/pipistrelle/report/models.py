@@ -6,9 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.acoustics.emitter import HALF_POWER, piston_directivity, piston_radius
-from pipistrelle.arrays.noise import stream_key
 from pipistrelle.config import InputError
-from pipistrelle.experiments.scenario import Scenario, draw_scenario
+from pipistrelle.experiments.scenario import Scenario, world_of
 from pipistrelle.figures.chart import Axis, Chart, Panel, Series
 from pipistrelle.report.outcomes import Study
 from pipistrelle.report.published import beam_name
@@ -85,8 +84,7 @@ def example_map(study: Study) -> Chart:
     Bradley & Abaid, Sec. IV.
     """
     config, number = study.config, int(study.worlds[0])
-    key = stream_key(config.seed, number, "scenario")
-    world = draw_scenario(config, np.random.default_rng(key))
+    world = world_of(config, number)
     setup = config.scenario
     reach = 1.04 * max(setup.radius, setup.beacon_distance, float(np.abs(world.path[:, :2]).max()))
     axis = Axis(label="", limits=(-reach, reach), ticks=())
