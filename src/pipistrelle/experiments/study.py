@@ -192,7 +192,8 @@ def _advanced(standing: Standing, outcomes: Sequence[Outcome]) -> Standing:
 
 
 def _work(folder: Path, plan: Plan, iteration: int) -> list[Outcome]:
-    """Run a world and write its results; done by a worker."""
+    """Run a world and write its results; done by a worker, whatever it is."""
+    keep_freed_memory()
     records = run_world(plan, iteration)
     write_world(folder, plan, iteration, records)
     return [(record.case.strategy, record.error) for record in records]
@@ -277,7 +278,6 @@ def _become_worker() -> None:
     """Leave Ctrl-C to the process that started this one, and end when that is gone."""
     from multiprocessing import parent_process
 
-    keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ.setdefault("POLARS_MAX_THREADS", "1")
     parent = parent_process()
