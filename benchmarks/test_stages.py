@@ -19,7 +19,7 @@ from pipistrelle.experiments.trial import Case, drive_of, run_trial
 
 CONFIG = Config()
 WORLD = world_of(CONFIG)
-FEW = some_frames(WORLD, 75)
+FEW = some_frames(WORLD, 25)
 ONE = (CONFIG.emitter.radius,)
 
 pytestmark = pytest.mark.benchmark(timer=time.process_time)
@@ -45,12 +45,12 @@ def test_listening_through_twelve_beams(benchmark):
 
 
 def test_listening_to_few_frames_by_blocks(benchmark):
-    benchmark.extra_info["frames"] = 5
-    benchmark.pedantic(listen, (FEW, CONFIG, ONE), rounds=51, warmup_rounds=3)
+    benchmark.extra_info["frames"] = 15
+    benchmark.pedantic(listen, (FEW, CONFIG, ONE), rounds=25, warmup_rounds=3)
 
 
 def test_listening_to_few_frames_by_samples(benchmark):
-    benchmark.extra_info["frames"] = 5
+    benchmark.extra_info["frames"] = 15
     dense = CONFIG.model_copy(update={"receiver": ReceiverConfig(engine="dense")})
     benchmark.pedantic(listen, (FEW, dense, ONE), rounds=3, warmup_rounds=1)
 

@@ -164,6 +164,16 @@ def test_detections_are_those_of_a_slow_second_version(frame, changes):
     assert_same(found, slow_detect(matched, config, **timing), BLOCK)
 
 
+@pytest.mark.parametrize("pulse", [1, 2, 3])
+def test_detections_of_very_short_calls_are_those_of_a_slow_second_version(pulse):
+    noise = complex_noise((400, 4, 2, 10), 1.0, stream_key(7, pulse, "short calls"))
+    config = Config(detection=DetectionConfig(false_alarm=0.02, leakage_db=-60.0))
+    timing = {"start": START, "interval": BLOCK, "pulse": pulse}
+    found = detect(noise, detector(config, LAYOUT), **timing)
+    assert found.face.size > 50
+    assert_same(found, slow_detect(noise, config, **timing), BLOCK)
+
+
 def test_detections_at_the_full_rate_are_those_of_a_slow_second_version():
     heard = echoes((5.01e-3, 20, OWN, 9, 1.0), (6.8e-3, -30, BEACON, 6, 1.0))
     samples = record_samples(44, heard, LAYOUT, SETTLED, np.random.default_rng(7))

@@ -9,13 +9,12 @@ from numba import njit
 @njit(cache=True, error_model="numpy")
 def _steer(matched, low, f, p, u, beam):
     """Write the output of the phase-shift beamformer steered to u, from lag low on."""
-    turn = complex(math.cos(u), -math.sin(u))
-    for k in range(beam.size):
-        x, phase, total = matched[low + k, f, p], 1.0 + 0.0j, 0.0 + 0.0j
-        for e in range(x.size):
-            total += x[e] * phase
-            phase *= turn
-        beam[k] = total
+    turn, phase = complex(math.cos(u), -math.sin(u)), 1.0 + 0.0j
+    beam[:] = 0.0
+    for e in range(matched.shape[3]):
+        for k in range(beam.size):
+            beam[k] += matched[low + k, f, p, e] * phase
+        phase *= turn
 
 
 @njit(cache=True, error_model="numpy")

@@ -105,7 +105,7 @@ def average_faces(
     >>> np.degrees(heard.bearing[0, 0]).round(6), heard.range.round(6)
     (np.float64(41.0), array([3.43]))
     """
-    labels = np.unique(label[label != UNLABELLED])
+    labels, clutter = _distinct(label)
     bearing, delay = _average(
         labels, label, detections.face, detections.tone, detections.angle, detections.bearing,
         detections.delay, detections.power, averaging == "weighted",
@@ -115,7 +115,7 @@ def average_faces(
         landmark=labels,
         bearing=bearing,
         range=0.5 * speed_of_sound * delay,
-        clutter=int(np.count_nonzero(label == UNLABELLED)),
+        clutter=clutter,
     )
 
 
@@ -159,6 +159,26 @@ def scan_of(heard: Heard, strategy: Strategy) -> Scan:
         bearing=bearing[kept],
         range=distance[kept],
     )
+
+
+@njit(cache=True, error_model="numpy")
+def _distinct(label):
+    """Labels that occur, rising, and how often none was given."""
+    labels, count, clutter = np.empty_like(label), 0, 0
+    for d in range(label.size):
+        if label[d] == UNLABELLED:
+            clutter += 1
+            continue
+        place = count
+        while place > 0 and labels[place - 1] > label[d]:
+            place -= 1
+        if place > 0 and labels[place - 1] == label[d]:
+            continue
+        for i in range(count, place, -1):
+            labels[i] = labels[i - 1]
+        labels[place] = label[d]
+        count += 1
+    return labels[:count].copy(), clutter
 
 
 @njit(cache=True, error_model="numpy")

@@ -70,24 +70,25 @@ class Detector:
         Of the energy of one face and tone, in units of the noise of one output.
     leakage, peak : float
         Power ratios.
-    angle_limit : [rad]
+    sine_limit : float
+        Sine of the largest angle off the normal that counts.
     normal : (f) [rad]
     wave : (2) [rad]
         Phase between neighbours at 90 degrees, 2 pi f d / c, per tone.
     scan : (2, n) [rad]
         Scanned u, per tone.
-    table : (2, e - 1, n) complex
-        exp(-i l u), l = 1 ... e - 1.
+    table : (2, 2, e - 1, n)
+        Real and imaginary part of exp(-i l u), l = 1 ... e - 1, per tone.
     """
 
     threshold: float
     leakage: float
     peak: float
-    angle_limit: float
+    sine_limit: float
     normal: Float[np.ndarray, " f"]
     wave: Float[np.ndarray, "2"]
     scan: Float[np.ndarray, "2 n"]
-    table: Complex[np.ndarray, "2 l n"]
+    table: Float[np.ndarray, "2 2 l n"]
 
 
 def detector(config: Config, layout: Layout) -> Detector:
@@ -117,16 +118,16 @@ def detector(config: Config, layout: Layout) -> Detector:
     edge = wave * math.sin(math.radians(settings.scan_limit_deg))
     count = 2 * math.ceil(edge.max() / SCAN_STEP) + 1
     scan = np.linspace(-1.0, 1.0, count) * edge[:, None]
-    lags = np.arange(1, receiver.elements)
+    turns = np.exp(-1j * np.arange(1, receiver.elements)[None, :, None] * scan[:, None, :])
     return Detector(
         threshold=float(gammainccinv(receiver.elements, settings.false_alarm)),
         leakage=10.0 ** (settings.leakage_db / 10.0),
         peak=10.0 ** (settings.peak_db / 10.0),
-        angle_limit=math.radians(settings.angle_limit_deg),
+        sine_limit=math.sin(math.radians(settings.angle_limit_deg)),
         normal=layout.normal,
         wave=wave,
         scan=scan,
-        table=np.exp(-1j * lags[None, :, None] * scan[:, None, :]),
+        table=np.stack((turns.real, turns.imag), axis=1),
     )
 
 
@@ -235,20 +236,18 @@ def detect(
     Detections
     """
     energy = _energy(matched.reshape(-1).view(matched.real.dtype), matched.shape[3])
-    count, face, tone, lag, peak_u, power = _find_peaks(
+    face, tone, delay, sine, power = _find_peaks(
         matched, energy, pulse, detector.threshold, detector.leakage, detector.peak,
-        detector.scan, detector.table, start, interval,
+        detector.sine_limit, detector.wave, detector.scan, detector.table, start, interval,
     )  # fmt: skip
-    face, tone, u = face[:count], tone[:count], peak_u[:count]
-    angle = np.arcsin(np.clip(u / detector.wave[tone], -1.0, 1.0))
-    kept = np.abs(angle) <= detector.angle_limit
+    angle = np.arcsin(sine)
     return Detections(
-        face=face[kept],
-        tone=tone[kept],
-        angle=angle[kept],
-        bearing=wrap(angle[kept] + detector.normal[face[kept]]),
-        delay=lag[:count][kept],
-        power=power[:count][kept],
+        face=face,
+        tone=tone,
+        angle=angle,
+        bearing=wrap(angle + detector.normal[face]),
+        delay=delay,
+        power=power,
     )
 
 
@@ -286,6 +285,25 @@ def _energy(parts, elements):
 
 
 @njit(cache=True, error_model="numpy")
+def _candidates(energy, threshold, row):
+    """Tests over the threshold that beat both their neighbours a row away.
+
+    Chosen without branches, which could not be predicted: every test is written, few are kept.
+    """
+    test, count, kept = np.empty(energy.size + 1, dtype=np.int64), 0, 0
+    for t in range(energy.size):
+        test[count] = t
+        count += energy[t] > threshold
+    for k in range(count):
+        t = test[k]
+        before = energy[t - row] if t >= row else -1.0
+        after = energy[t + row] if t + row < energy.size else -1.0
+        test[kept] = t
+        kept += (energy[t] > before) & (energy[t] >= after)
+    return test[:kept]
+
+
+@njit(cache=True, error_model="numpy")
 def _is_snapshot(energy, test, row, pulse, leakage):
     """Whether a test's lag is the largest near, and its tone no leakage of the other.
 
@@ -314,12 +332,34 @@ def _scan_power(x, table, power):
     for i in range(beams):
         power[i] = r0
     for lag in range(1, elements):
-        r = 0.0 + 0.0j
+        re, im, cosine, sine = 0.0, 0.0, table[0, lag - 1], table[1, lag - 1]
         for e in range(elements - lag):
-            r += x[e + lag] * x[e].conjugate()
-        re, im, row = 2.0 * r.real, 2.0 * r.imag, table[lag - 1]
+            later, former = x[e + lag], x[e]
+            re += later.real * former.real + later.imag * former.imag
+            im += later.imag * former.real - later.real * former.imag
+        re, im = 2.0 * re, 2.0 * im
         for i in range(beams):
-            power[i] += re * row[i].real - im * row[i].imag
+            power[i] += re * cosine[i] - im * sine[i]
+
+
+@njit(cache=True, error_model="numpy")
+def _peaks(power, ratio, place):
+    """Write where the power peaks, not far under its highest; return the number of peaks.
+
+    Chosen without branches, as the candidates are.
+    """
+    count, kept, last = 0, 0, power.size - 1
+    for i in range(1, last):
+        place[count] = i
+        count += (power[i] > power[i - 1]) & (power[i] >= power[i + 1])
+    highest = max(power[0], power[last])
+    for k in range(count):
+        highest = max(highest, power[place[k]])
+    for k in range(count):
+        if power[place[k]] >= ratio * highest:
+            place[kept] = place[k]
+            kept += 1
+    return kept
 
 
 @njit(cache=True, error_model="numpy")
@@ -333,34 +373,32 @@ def _grown(column):
 
 @njit(cache=True, error_model="numpy")
 def _find_peaks(
-    matched, energy, pulse, threshold, leakage, peak_ratio, scan, table, start, interval
-):
-    """Every peak of every snapshot: count, face, tone, delay, u and power."""
+    matched, energy, pulse, threshold, leakage, peak_ratio, sine_limit, wave, scan, table, start,
+    interval,
+):  # fmt: skip
+    """Every peak of every snapshot: face, tone, delay, sine of the angle and power."""
     _, faces, tones, elements = matched.shape
     face, tone = np.empty(128, dtype=np.int64), np.empty(128, dtype=np.int64)
-    delay, peak_u, peak_power = np.empty(128), np.empty(128), np.empty(128)
-    power, count = np.empty(scan.shape[1]), 0
-    for test in range(energy.size):
-        if energy[test] <= threshold or not _is_snapshot(
-            energy, test, faces * tones, pulse, leakage
-        ):
+    delay, sine, peak_power = np.empty(128), np.empty(128), np.empty(128)
+    power, place = np.empty(scan.shape[1]), np.empty(scan.shape[1], dtype=np.int64)
+    row, count = faces * tones, 0
+    for test in _candidates(energy, threshold, row if pulse > 1 else energy.size):
+        if not _is_snapshot(energy, test, row, pulse, leakage):
             continue
-        b, f, p = test // (faces * tones), test // tones % faces, test % tones
+        b, f, p = test // row, test // tones % faces, test % tones
         _scan_power(matched[b, f, p], table[p], power)
-        step, floor = scan[p, 1] - scan[p, 0], 0.0
-        for i in range(power.size):
-            floor = max(floor, peak_ratio * power[i])
-        for i in range(1, power.size - 1):
-            if power[i] < floor or power[i] <= power[i - 1] or power[i] < power[i + 1]:
-                continue
+        step = scan[p, 1] - scan[p, 0]
+        for i in place[: _peaks(power, peak_ratio, place)]:
             slope = power[i + 1] - power[i - 1]
             bend = 2.0 * power[i] - power[i + 1] - power[i - 1]
             u = scan[p, i] + 0.5 * step * slope / bend
+            if abs(u / wave[p]) > sine_limit:
+                continue
             if count == face.size:
                 face, tone, delay = _grown(face), _grown(tone), _grown(delay)
-                peak_u, peak_power = _grown(peak_u), _grown(peak_power)
-            face[count], tone[count], peak_u[count] = f, p, u
+                sine, peak_power = _grown(sine), _grown(peak_power)
+            face[count], tone[count], sine[count] = f, p, u / wave[p]
             delay[count] = start + interval * arrival_lag(matched, b, f, p, u, pulse)
             peak_power[count] = (power[i] + 0.125 * slope * slope / bend) / elements
             count += 1
-    return count, face, tone, delay, peak_u, peak_power
+    return face[:count], tone[:count], delay[:count], sine[:count], peak_power[:count]

@@ -207,17 +207,17 @@ def _heard(time: float, detections: Detections, arrivals: Arrivals, station: _St
 def _blocks(aimed: Sequence[Arrivals], station: _Station, key: int) -> Iterator[Detections]:
     """Yield, per beam, what is detected of its arrivals from block sums."""
     layout, settled, space = station.layout, station.sampling, station.workspace
-    pulse, own = settled.pulse, aimed[0].source == ACTIVE
+    pulse, own = settled.pulse, np.count_nonzero(aimed[0].source == ACTIVE)  # they come first
     shape = block_shape(blocks_to_hear(aimed[0], settled), layout)
     shared = noise_blocks(shape[0], layout, settled, key, out=space.array("shared", shape))
-    add_echo_blocks(shared, rows_of(aimed[0], ~own), layout, settled)
+    add_echo_blocks(shared, rows_of(aimed[0], slice(own, None)), layout, settled)
     lags = (shape[0] - pulse + 1, *shape[1:])
     for left, arrivals in zip(range(len(aimed) - 1, -1, -1), aimed, strict=True):
         signal = shared
         if left:  # the last beam may write on what it shares
             signal = space.array("signal", shape)
             np.copyto(signal, shared)
-        add_echo_blocks(signal, rows_of(arrivals, own), layout, settled)
+        add_echo_blocks(signal, rows_of(arrivals, slice(own)), layout, settled)
         matched = filter_blocks(
             signal,
             pulse=pulse,
