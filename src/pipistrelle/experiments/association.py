@@ -102,13 +102,15 @@ def _label(
     for d in order:
         nearest, best = -1, np.inf
         for a in range(true_delay.size):
-            if source[a] != tone[d] or level_db[a] < faintest_db or taken[face[d], a]:
+            late = abs(delay[d] - true_delay[a]) / delay_gate
+            if late > 1.0 or source[a] != tone[d]:
+                continue
+            if level_db[a] < faintest_db or taken[face[d], a]:
                 continue
             if abs(wrap_angle(true_bearing[a] - normal[face[d]])) > 0.5 * np.pi:
                 continue
-            late = abs(delay[d] - true_delay[a]) / delay_gate
             off = abs(wrap_angle(bearing[d] - true_bearing[a])) / bearing_gate
-            if late <= 1.0 and off <= 1.0 and late * late + off * off < best:
+            if off <= 1.0 and late * late + off * off < best:
                 nearest, best = a, late * late + off * off
         if nearest >= 0:
             label[d] = landmark[nearest]
