@@ -203,22 +203,25 @@ def correct_ray(pose, rows, count, members, bearing, sensing, exact, scratch):
 @njit(cache=True, error_model="numpy")
 def _prune(rows, count, members, prune, scratch):
     """Drop members whose aggregated likelihood is too small; the heaviest stays (Eq. (21))."""
-    largest, total = scratch.largest, scratch.total
-    _largest(scratch.posterior, members, largest)
-    total[:] = 0.0
+    least, total = scratch.largest, scratch.total
+    _largest(scratch.posterior, members, least)
+    for i in range(LANES):
+        least[i] = min(prune / count[i], exponential(least[i]))
+        total[i] = 0.0
     dropped = 0
     for j in range(members):
         posterior, keep = scratch.posterior[j], scratch.share[j]
         for i in range(LANES):
             weight = exponential(posterior[i])
-            least = min(prune / count[i], exponential(largest[i]))
-            keep[i] = 1.0 if weight >= least and j < count[i] else 0.0
+            keep[i] = 1.0 if weight >= least[i] and j < count[i] else 0.0
             total[i] += keep[i] * weight
-            dropped += 1 if weight < least and j < count[i] else 0
+            dropped += 1 if weight < least[i] and j < count[i] else 0
+    for i in range(LANES):
+        total[i] = logarithm(total[i])
     for j in range(members):
         row, posterior = rows[j], scratch.posterior[j]
         for i in range(LANES):
-            row[LOG_WEIGHT + i] = posterior[i] - logarithm(total[i])
+            row[LOG_WEIGHT + i] = posterior[i] - total[i]
     if dropped > 0:
         _close_up(rows, count, scratch.share)
 
