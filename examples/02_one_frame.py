@@ -14,7 +14,8 @@ from pipistrelle.acoustics.arrivals import arrivals_of_emission, through_piston
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import BLOCK, blocks_to_hear, record_samples, sampling
 from pipistrelle.config import Config
-from pipistrelle.detection.snapshots import detect, detector, filter_samples
+from pipistrelle.detection.matched import filter_samples
+from pipistrelle.detection.snapshots import detect, detector
 
 config = Config()
 speed_of_sound = config.air.speed_of_sound

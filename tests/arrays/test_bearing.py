@@ -9,7 +9,8 @@ from pipistrelle.arrays.layout import Layout, square_of_four
 from pipistrelle.arrays.noise import stream_key
 from pipistrelle.arrays.receiver import BLOCK, add_echo_blocks, noise_blocks, sampling
 from pipistrelle.config import Config, DetectionConfig
-from pipistrelle.detection.snapshots import detect, detector, filter_blocks
+from pipistrelle.detection.matched import filter_blocks
+from pipistrelle.detection.snapshots import detect, detector
 from pipistrelle.geometry import wrap
 
 CONFIG = Config()

@@ -18,7 +18,8 @@ from pipistrelle.arrays.receiver import (
     sampling,
 )
 from pipistrelle.config import Config, DetectionConfig
-from pipistrelle.detection.snapshots import detect, detector, filter_blocks, filter_samples
+from pipistrelle.detection.matched import filter_blocks, filter_samples
+from pipistrelle.detection.snapshots import detect, detector
 
 CONFIG = Config()
 SQUARE, SETTLED = square_of_four(CONFIG.receiver), sampling(CONFIG)

@@ -22,14 +22,8 @@ from pipistrelle.arrays.receiver import (
     sampling,
 )
 from pipistrelle.config import Config, DetectionConfig
-from pipistrelle.detection.snapshots import (
-    Detections,
-    _scan_power,
-    detect,
-    detector,
-    filter_blocks,
-    filter_samples,
-)
+from pipistrelle.detection.matched import filter_blocks, filter_samples
+from pipistrelle.detection.snapshots import Detections, _scan_power, detect, detector
 from pipistrelle.geometry import wrap
 
 law = settings(deadline=None, max_examples=40)

@@ -9,8 +9,9 @@ from pipistrelle.acoustics.arrivals import Arrivals
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, sampling
 from pipistrelle.config import AssociationConfig, Config
+from pipistrelle.detection.matched import filter_blocks
 from pipistrelle.detection.scans import UNLABELLED
-from pipistrelle.detection.snapshots import Detections, detector, filter_blocks
+from pipistrelle.detection.snapshots import Detections, detector
 from pipistrelle.experiments.association import faintest_level_db, label_detections
 from pipistrelle.geometry import wrap
 

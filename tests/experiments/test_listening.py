@@ -17,8 +17,9 @@ from pipistrelle.arrays.receiver import (
     sampling,
 )
 from pipistrelle.config import Config, EmitterConfig, ReceiverConfig, ScenarioConfig
+from pipistrelle.detection.matched import filter_blocks, filter_samples
 from pipistrelle.detection.scans import UNLABELLED, Heard
-from pipistrelle.detection.snapshots import detect, detector, filter_blocks, filter_samples
+from pipistrelle.detection.snapshots import detect, detector
 from pipistrelle.experiments import listening
 from pipistrelle.experiments.association import faintest_level_db, label_detections
 from pipistrelle.experiments.listening import listen

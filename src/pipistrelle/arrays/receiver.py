@@ -249,23 +249,23 @@ def _geometric_sum(omega, start, stop):
     return complex(gain * math.cos(phase), gain * math.sin(phase))
 
 
-@njit(cache=True, error_model="numpy")
-def _envelope(sums, omega, start, stop, block):
-    """Block sums of exp(i omega n) over start <= n < stop, from the first block touched on."""
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _envelope(sums, p, omega, start, stop, block):
+    """Write a tone's block sums of exp(i omega n), start <= n < stop; return the blocks touched."""
     first, last = start // block, (stop - 1) // block
-    sums[0] = _geometric_sum(omega, start, min(stop, (first + 1) * block))
+    sums[p, 0] = _geometric_sum(omega, start, min(stop, (first + 1) * block))
     if last == first:
         return 1
     turn = complex(math.cos(omega * block), math.sin(omega * block))
     whole = _geometric_sum(omega, (first + 1) * block, (first + 2) * block)
     for b in range(first + 1, last):
-        sums[b - first] = whole
+        sums[p, b - first] = whole
         whole *= turn
-    sums[last - first] = _geometric_sum(omega, last * block, stop)
+    sums[p, last - first] = _geometric_sum(omega, last * block, stop)
     return last - first + 1
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _steer(direct, turned, phasor, wave, position):
     """Write a phasor times each element's phase, and i times that, parts interleaved."""
     elements = position.size
@@ -283,16 +283,32 @@ def _steer(direct, turned, phasor, wave, position):
         turned[2 * e], turned[2 * e + 1] = -phase.imag, phase.real
 
 
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _add_echo(
+    signal, first, sums, count, phasor, bearing, frequency, normal, position, speed_of_sound,
+    direct, turned,
+):  # fmt: skip
+    """Add an arrival's envelope, block by block, times its steering vector."""
+    for f in range(normal.size):
+        angle = bearing - normal[f]
+        if math.cos(angle) < 0.0:
+            continue
+        wave = 2.0 * math.pi * frequency * math.sin(angle) / speed_of_sound
+        _steer(direct, turned, phasor, wave, position)
+        for b in range(count):
+            for p in range(2):
+                re, im, heard = sums[p, b].real, sums[p, b].imag, signal[first + b, f, p]
+                for i in range(heard.size):
+                    heard[i] += re * direct[i] + im * turned[i]
+
+
 @njit(cache=True, error_model="numpy")
 def _add_echo_blocks(
     signal, delay, amplitude, bearing, frequency, duration, normal, position,
     tones, rate, block, blank, speed_of_sound,
 ):  # fmt: skip
-    """Add each arrival's envelope, block by block, times its steering vector.
-
-    Of the signal each element's real and imaginary part are neighbours.
-    """
-    blocks, faces = signal.shape[0], signal.shape[1]
+    """Add every arrival; of the signal each element's real and imaginary part are neighbours."""
+    blocks = signal.shape[0]
     sums = np.empty((2, blocks), dtype=np.complex128)
     direct, turned = np.empty(signal.shape[3]), np.empty(signal.shape[3])
     for a in range(delay.size):
@@ -300,20 +316,13 @@ def _add_echo_blocks(
         stop = min(math.ceil((delay[a] + duration[a]) * rate), (blank + blocks) * block)
         if stop <= start:
             continue
-        first, count = start // block - blank, 0
-        turns = -2.0 * math.pi * frequency[a] * delay[a]
-        phasor = amplitude[a] * complex(math.cos(turns), math.sin(turns))
+        count = 0
         for p in range(2):
             omega = 2.0 * math.pi * (frequency[a] - tones[p]) / rate
-            count = _envelope(sums[p], omega, start, stop, block)
-        for f in range(faces):
-            angle = bearing[a] - normal[f]
-            if math.cos(angle) < 0.0:
-                continue
-            wave = 2.0 * math.pi * frequency[a] * math.sin(angle) / speed_of_sound
-            _steer(direct, turned, phasor, wave, position)
-            for b in range(count):
-                for p in range(2):
-                    re, im, heard = sums[p, b].real, sums[p, b].imag, signal[first + b, f, p]
-                    for i in range(heard.size):
-                        heard[i] += re * direct[i] + im * turned[i]
+            count = _envelope(sums, p, omega, start, stop, block)
+        turns = -2.0 * math.pi * frequency[a] * delay[a]
+        _add_echo(
+            signal, start // block - blank, sums, count,
+            amplitude[a] * complex(math.cos(turns), math.sin(turns)),
+            bearing[a], frequency[a], normal, position, speed_of_sound, direct, turned,
+        )  # fmt: skip

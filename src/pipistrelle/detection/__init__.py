@@ -1,9 +1,9 @@
 """Samples, or a recorded log, to scans; the truth is never seen.
 
-`snapshots` finds calls in a recording, with their bearings and times of arrival, and `scans` makes
-of them what a sensing strategy hands to a filter (Bradley & Abaid, Sec. II-D). Recorded drives take
-the place of both: `logs` reads this project's own folders and `mrclam` those of UTIAS MRCLAM, their
-tables by way of `columns`.
+`matched` filters a recording for calls, `snapshots` finds them with their bearings and times of
+arrival (`onset`), and `scans` makes of them what a sensing strategy hands to a filter (Bradley &
+Abaid, Sec. II-D). Recorded drives take the place of all: `logs` reads this project's own folders
+and `mrclam` those of UTIAS MRCLAM, their tables by way of `columns`.
 """
 
 from importlib import import_module
@@ -13,7 +13,7 @@ _DOOR = {
     "average_faces": "scans",
     "detect": "snapshots",
     "detector": "snapshots",
-    "filter_blocks": "snapshots",
+    "filter_blocks": "matched",
     "read_log": "logs",
     "scan_of": "scans",
     "write_log": "logs",

@@ -2,17 +2,17 @@
 
 import math
 
-import numpy as np
 from numba import njit
 
 
-@njit(cache=True, error_model="numpy")
-def _steer(matched, low, f, p, u, beam):
-    """Write the output of the phase-shift beamformer steered to u, from lag low on."""
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _steer(matched, low, lags, f, p, u, beam):
+    """Write the output of the phase-shift beamformer steered to u, so many lags from low on."""
     turn, phase = complex(math.cos(u), -math.sin(u)), 1.0 + 0.0j
-    beam[:] = 0.0
+    for k in range(lags):
+        beam[k] = 0.0
     for e in range(matched.shape[3]):
-        for k in range(beam.size):
+        for k in range(lags):
             beam[k] += matched[low + k, f, p, e] * phase
         phase *= turn
 
@@ -47,13 +47,21 @@ def _best_fraction(z0, z1, pulse):
 
 
 @njit(cache=True, error_model="numpy")
-def arrival_lag(matched, b, f, p, u, pulse):
-    """Lag at which the call starts in the beam steered to u, near lag b, to a fraction."""
-    reach, last = max(pulse // 7, 1), matched.shape[0] - 1
+def reach_of(pulse):
+    """How many lags around a snapshot's the call may start."""
+    return max(pulse // 7, 1)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def arrival_lag(matched, b, f, p, u, pulse, beam):
+    """Lag at which the call starts in the beam steered to u, near lag b, to a fraction.
+
+    ``beam`` is room for the beam: the lags within reach and one to either side.
+    """
+    reach, last = reach_of(pulse), matched.shape[0] - 1
     low, high = max(b - reach, 0), min(b + reach, last)
     first = max(low - 1, 0)
-    beam = np.empty(min(high + 1, last) - first + 1, dtype=np.complex128)
-    _steer(matched, first, f, p, u, beam)
+    _steer(matched, first, min(high + 1, last) - first + 1, f, p, u, beam)
     centre, largest = b, -1.0
     for near in range(low, high + 1):
         z = abs(beam[near - first])

@@ -1,4 +1,4 @@
-r"""Samples -> detections: matched filter, snapshots, tones present, beamscan, time of arrival.
+r"""Matched outputs -> detections: snapshots, tones present, beamscan, time of arrival.
 
 The matched filter's outputs y_e, normalised to unit noise variance, are tested per face and tone
 by their energy :math:`E = \sum_e |y_e|^2`, which is Gamma(N) distributed in noise. A *snapshot*
@@ -24,7 +24,7 @@ from numba import njit
 
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config
-from pipistrelle.detection.onset import arrival_lag
+from pipistrelle.detection.onset import arrival_lag, reach_of
 from pipistrelle.geometry import wrap
 
 SCAN_STEP = 0.05
@@ -131,84 +131,6 @@ def detector(config: Config, layout: Layout) -> Detector:
     )
 
 
-def filter_blocks(
-    blocks: Complex[np.ndarray, "b f 2 e"],
-    *,
-    pulse: int,
-    block: int,
-    noise_std: float,
-    out: Complex[np.ndarray, "l f 2 e"] | None = None,
-) -> Complex[np.ndarray, "l f 2 e"]:
-    """Matched filter on block sums: a boxcar as long as the call.
-
-    Parameters
-    ----------
-    blocks : (blocks, faces, tones, elements) complex
-    pulse : int
-        Blocks per call.
-    block : int
-        Samples per block.
-    noise_std : float
-        Of one complex sample.
-    out : (blocks - pulse + 1, faces, tones, elements) complex, optional
-        Written and returned instead of a new array.
-
-    Returns
-    -------
-    (lags, faces, tones, elements) complex
-        Lag i is a call that starts with block i; noise has unit variance.
-    """
-    lags = max(blocks.shape[0] - pulse + 1, 0)
-    matched = np.empty((lags, *blocks.shape[1:]), dtype=np.complex128) if out is None else out
-    scale = 1.0 / (noise_std * math.sqrt(pulse * block))
-    columns = 2 * math.prod(blocks.shape[1:])
-    _boxcar(
-        blocks.reshape(-1).view(np.float64).reshape(-1, columns),
-        pulse,
-        scale,
-        matched.reshape(-1).view(np.float64).reshape(-1, columns),
-    )
-    return matched
-
-
-def filter_samples(
-    samples: Complex[np.ndarray, "t f e"],
-    *,
-    tones: Float[np.ndarray, "2"],
-    rate: float,
-    length: int,
-    noise_std: float,
-) -> Complex[np.ndarray, "l f 2 e"]:
-    """Matched filter at the full rate, one per tone, by fast convolution.
-
-    Parameters
-    ----------
-    samples : (samples, faces, elements) complex
-    tones : (2) [Hz]
-    rate : [Hz]
-    length : int
-        Samples per call.
-    noise_std : float
-        Of one complex sample.
-
-    Returns
-    -------
-    (samples - length + 1, faces, tones, elements) complex
-        Lag i is a call that starts with sample i; noise has unit variance. As precise as the
-        samples.
-    """
-    from scipy.signal import oaconvolve
-
-    n = np.arange(length)[::-1, None]
-    replica = np.exp(-2j * np.pi * tones * n / rate) / (noise_std * math.sqrt(length))
-    return oaconvolve(
-        samples[:, :, None, :],
-        replica.astype(samples.dtype)[:, None, :, None],
-        mode="valid",
-        axes=0,
-    )
-
-
 def detect(
     matched: Complex[np.ndarray, "l f 2 e"],
     detector: Detector,
@@ -252,21 +174,6 @@ def detect(
 
 
 @njit(cache=True, error_model="numpy")
-def _boxcar(rows, width, scale, sums):
-    """Write the running sums of width rows, scaled."""
-    columns = rows.shape[1]
-    total = np.zeros(columns)
-    for b in range(min(width - 1, rows.shape[0])):
-        for i in range(columns):
-            total[i] += scale * rows[b, i]
-    for b in range(width - 1, rows.shape[0]):
-        new, old, done = rows[b], rows[b - width + 1], sums[b - width + 1]
-        for i in range(columns):
-            done[i] = total[i] + scale * new[i]
-            total[i] = done[i] - scale * old[i]
-
-
-@njit(cache=True, error_model="numpy")
 def _energy(parts, elements):
     """Sums of squares over the elements, real and imaginary parts neighbours, of every output."""
     energy = np.empty(parts.size // (2 * elements))
@@ -303,7 +210,7 @@ def _candidates(energy, threshold, row):
     return test[:kept]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _is_snapshot(energy, test, row, pulse, leakage):
     """Whether a test's lag is the largest near, and its tone no leakage of the other.
 
@@ -322,7 +229,7 @@ def _is_snapshot(energy, test, row, pulse, leakage):
     return level > leakage * strongest
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _scan_power(x, table, power):
     """Write the power of the conventional beam over the scan, from the lag sums."""
     elements, beams = x.size, power.size
@@ -342,7 +249,7 @@ def _scan_power(x, table, power):
             power[i] += re * cosine[i] - im * sine[i]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _peaks(power, ratio, place):
     """Write where the power peaks, not far under its highest; return the number of peaks.
 
@@ -381,6 +288,7 @@ def _find_peaks(
     face, tone = np.empty(128, dtype=np.int64), np.empty(128, dtype=np.int64)
     delay, sine, peak_power = np.empty(128), np.empty(128), np.empty(128)
     power, place = np.empty(scan.shape[1]), np.empty(scan.shape[1], dtype=np.int64)
+    beam = np.empty(2 * reach_of(pulse) + 3, dtype=np.complex128)
     row, count = faces * tones, 0
     for test in _candidates(energy, threshold, row if pulse > 1 else energy.size):
         if not _is_snapshot(energy, test, row, pulse, leakage):
@@ -398,7 +306,7 @@ def _find_peaks(
                 face, tone, delay = _grown(face), _grown(tone), _grown(delay)
                 sine, peak_power = _grown(sine), _grown(peak_power)
             face[count], tone[count], sine[count] = f, p, u / wave[p]
-            delay[count] = start + interval * arrival_lag(matched, b, f, p, u, pulse)
+            delay[count] = start + interval * arrival_lag(matched, b, f, p, u, pulse, beam)
             peak_power[count] = (power[i] + 0.125 * slope * slope / bend) / elements
             count += 1
     return face[:count], tone[:count], delay[:count], sine[:count], peak_power[:count]

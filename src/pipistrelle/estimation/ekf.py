@@ -203,7 +203,7 @@ class EkfSlam:
         )
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _members_of(landmark, members, label):
     """Index of a landmark's first member and how many it has (0: not mapped)."""
     for first in range(members):
@@ -287,7 +287,7 @@ def _correct_known(joint, landmark, weight, members, label, bearing, distance, s
     return members, outcome
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _place_new(joint, landmark, weight, members, label, bearing, distance, sensing):
     """Append a landmark, one member or a ray of them (Eqs. (16) to (18)); the members there are."""
     passive = math.isnan(distance)

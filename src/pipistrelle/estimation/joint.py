@@ -92,7 +92,7 @@ def gaussian_of(joint, size):
     return mean, covariance
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _point_rows(joint, size, i):
     """Rows i and i + 1 of the covariance, with all that waits subtracted from them."""
     pi, pj, W = joint.covariance[i], joint.covariance[i + 1], joint.W
@@ -115,7 +115,7 @@ def _point_rows(joint, size, i):
     return pi, pj
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def settle(joint, size):
     """Let every row catch up: afterwards nothing waits."""
     covariance = joint.covariance
@@ -127,7 +127,7 @@ def settle(joint, size):
     joint.waiting[0] = 0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _wait(joint, size, w, step):
     """Add step w to the mean, subtract w w^T from the pose's rows, and let the points' wait."""
     mean, p0, p1, p2 = joint.mean, joint.covariance[0], joint.covariance[1], joint.covariance[2]
@@ -163,7 +163,7 @@ def carry(mean, covariance, controls, dt, motion, pose_means, pose_covariances):
             covariance[a, b] = P[a, b]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def bearing_variance(joint, size, i, c, s, k):
     """Innovation variance H P H^T of the bearing of the member at state index i, without R."""
     h0, h1 = s * k, -c * k  # by pose: (h0, h1, -1); by member: (-h0, -h1)
@@ -180,7 +180,7 @@ def bearing_variance(joint, size, i, c, s, k):
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def correct_bearing(joint, size, i, bearing, variance, bound):
     """Correct the state with the bearing of the member at index i; GATED when beyond bound."""
     mean = joint.mean
@@ -206,7 +206,7 @@ def correct_bearing(joint, size, i, bearing, variance, bound):
     return APPLIED
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def correct_active(joint, size, i, distance, bearing, range_variance, bearing_variance, bound):
     """Correct the state with range and bearing of the member at index i; GATED beyond bound."""
     mean = joint.mean
@@ -242,7 +242,7 @@ def correct_active(joint, size, i, distance, bearing, range_variance, bearing_va
     return APPLIED
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def place(mean, covariance, size, i, distance, bearing, range_variance, bearing_variance):
     """Put a member at state index i, at a range and bearing from the pose (Eq. (16)).
 

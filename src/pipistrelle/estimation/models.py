@@ -219,7 +219,7 @@ def advance(
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def carry_pose(
     pose: np.ndarray, P: np.ndarray, speed: float, turn: float, dt: float, motion: MotionNumbers
 ) -> tuple[float, float]:

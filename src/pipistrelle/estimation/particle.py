@@ -59,7 +59,7 @@ def _spread(member, h0, h1, i):
     return h0 * h0 * member[XX + i] + cross + h1 * h1 * member[YY + i]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def expect_bearing(pose, member, bearing, variance, count, j, log_likelihood):
     """Log likelihood, without its constant, of the bearing of each lane's member j (Eq. (19)).
 
@@ -76,7 +76,7 @@ def expect_bearing(pose, member, bearing, variance, count, j, log_likelihood):
         log_likelihood[i] = value if j < count[i] else -np.inf
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def bearing_beyond(pose, member, bearing, variance, count, j, bound):
     """Whether the bearing is beyond the bound for member j of every lane that has one."""
     beyond = 0
@@ -89,7 +89,7 @@ def bearing_beyond(pose, member, bearing, variance, count, j, bound):
     return beyond == LANES
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def refine_by_bearing(pose, member, bearing, variance, share):
     """Correct the poses by the bearing of a member, of whose information each has a share."""
     for i in range(LANES):
@@ -110,7 +110,7 @@ def refine_by_bearing(pose, member, bearing, variance, share):
         pose[PHH + i] -= a2 * k2
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def correct_by_bearing(pose, member, bearing, variance, share):
     """Correct a member by its bearing from certain poses, of whose information each has a share."""
     for i in range(LANES):
@@ -163,7 +163,7 @@ def _active_spread(pose, member, c, s, k, range_variance, bearing_variance, i):
     return a0, a1, a2, b0, b1, b2, S00, S01, S11
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def active_beyond(pose, member, distance, bearing, range_variance, bearing_variance, count, bound):
     """Whether range and bearing are beyond the bound for every lane, each of one member."""
     beyond = 0
@@ -178,7 +178,7 @@ def active_beyond(pose, member, distance, bearing, range_variance, bearing_varia
     return beyond == LANES
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def refine_by_active(
     pose, member, distance, bearing, range_variance, bearing_variance, count, log_weight
 ):
@@ -206,7 +206,7 @@ def refine_by_active(
         pose[PHH + i] -= a2 * a2 + b2 * b2
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def correct_by_active(pose, member, distance, bearing, range_variance, bearing_variance, count):
     """Correct, where it is its landmark's only one, a member by range and bearing."""
     for i in range(LANES):
@@ -230,7 +230,7 @@ def correct_by_active(pose, member, distance, bearing, range_variance, bearing_v
         member[YY + i] -= a1 * a1 + b1 * b1
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def place_member(
     pose, member, distance, bearing, range_variance, bearing_variance, log_weight, count
 ):
@@ -251,7 +251,7 @@ def place_member(
         member[LOG_WEIGHT + i] = log_weight if here else member[LOG_WEIGHT + i]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def sample_pose(pose, normal):
     """Draw the poses from their Gaussians with three standard normals each; no spread is left."""
     for i in range(LANES):

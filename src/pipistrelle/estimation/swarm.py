@@ -41,7 +41,7 @@ or has one ancestor may have no spread, and its covariance no inverse."""
 LEAST = SMALLEST_STD**2
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _add_moments(pose, weight, sums):
     """Add a block's weighted positions and directions, lane by lane."""
     for i in range(LANES):
@@ -52,7 +52,7 @@ def _add_moments(pose, weight, sums):
         sums[PXY + i] += weight[i] * s
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _add_spread(pose, weight, x, y, heading, sums):
     """Add a block's weighted covariances and squared distances from the mean, lane by lane."""
     for i in range(LANES):
@@ -102,7 +102,7 @@ def summarise(pose, weight):
     return mean[:3].copy(), covariance
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _advance_block(pose, step, q0, q1):
     """Carry a block's poses through a control step, known in the vehicle's frame (Eq. (10))."""
     ahead, aside, turn, u00, u10, u20, u01, u11, u21 = step
@@ -153,7 +153,7 @@ def _slots(landmark, labels):
     return slot
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _most(count):
     """Members of the lane that has most."""
     most = 1
@@ -185,8 +185,8 @@ def gated_by_all(pose, landmark, first, count, member, labels, bearings, ranges,
     return gated
 
 
-@njit(cache=True, error_model="numpy")
-def _range_for_ray(pose, rows, count, distance, bearing, sensing):
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _range_for_ray(pose, rows, count, distance, bearing, sensing, partial):
     """Give partial landmarks their range: of each one member is left, the first."""
     if sensing.reinitialise:
         place_member(
@@ -194,8 +194,8 @@ def _range_for_ray(pose, rows, count, distance, bearing, sensing):
             sensing.range_variance, sensing.bearing_variance, 0.0, count,
         )  # fmt: skip
         return
-    partial = np.zeros(LANES)
     for i in range(LANES):
+        partial[i] = 0.0
         if count[i] == 1:
             continue
         partial[i], best = 1.0, 0
@@ -210,7 +210,7 @@ def _range_for_ray(pose, rows, count, distance, bearing, sensing):
     correct_by_bearing(pose, rows[0], bearing, sensing.bearing_variance, partial)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _refine(
     pose, log_weight, first, count, member, slot, bearings, ranges, sensing, exact, scratch
 ):
@@ -232,7 +232,7 @@ def _refine(
             )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _correct(pose, first, count, member, slot, bearings, ranges, sensing, exact, scratch):
     """Correct a block's measured landmarks from its sampled poses, in place."""
     for m in range(slot.size):
@@ -254,11 +254,11 @@ def _correct(pose, first, count, member, slot, bearings, ranges, sensing, exact,
             sensing.range_variance, sensing.bearing_variance, count[n],
         )  # fmt: skip
         if most > 1:
-            _range_for_ray(pose, rows, count[n], ranges[m], bearings[m], sensing)
+            _range_for_ray(pose, rows, count[n], ranges[m], bearings[m], sensing, scratch.total)
             count[n] = 1
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _place(pose, rows, count, bearing, distance, sensing):
     """Place a block's new landmark, one member or a ray of them (Eqs. (16) to (18))."""
     if not math.isnan(distance):
@@ -299,7 +299,7 @@ def _rows(landmark, count, slot, labels, ranges, rays):
     return all_labels, first
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _copy_members(old_first, old_count, old_member, first, count, member):
     """Copy a block's members into their new rows."""
     for n in range(old_count.shape[0]):

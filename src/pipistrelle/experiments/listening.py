@@ -36,15 +36,9 @@ from pipistrelle.arrays.receiver import (
     sampling,
 )
 from pipistrelle.config import Config
+from pipistrelle.detection.matched import filter_blocks, filter_samples
 from pipistrelle.detection.scans import Heard, average_faces
-from pipistrelle.detection.snapshots import (
-    Detections,
-    Detector,
-    detect,
-    detector,
-    filter_blocks,
-    filter_samples,
-)
+from pipistrelle.detection.snapshots import Detections, Detector, detect, detector
 from pipistrelle.experiments.association import faintest_level_db, label_detections
 from pipistrelle.experiments.scenario import Scenario
 

@@ -1,0 +1,100 @@
+"""Matched filter: what a call would leave of each lag's samples, in units of the noise."""
+
+import math
+
+import numpy as np
+from jaxtyping import Complex, Float
+from numba import njit
+
+
+def filter_blocks(
+    blocks: Complex[np.ndarray, "b f 2 e"],
+    *,
+    pulse: int,
+    block: int,
+    noise_std: float,
+    out: Complex[np.ndarray, "l f 2 e"] | None = None,
+) -> Complex[np.ndarray, "l f 2 e"]:
+    """Matched filter on block sums: a boxcar as long as the call.
+
+    Parameters
+    ----------
+    blocks : (blocks, faces, tones, elements) complex
+    pulse : int
+        Blocks per call.
+    block : int
+        Samples per block.
+    noise_std : float
+        Of one complex sample.
+    out : (blocks - pulse + 1, faces, tones, elements) complex, optional
+        Written and returned instead of a new array.
+
+    Returns
+    -------
+    (lags, faces, tones, elements) complex
+        Lag i is a call that starts with block i; noise has unit variance.
+    """
+    lags = max(blocks.shape[0] - pulse + 1, 0)
+    matched = np.empty((lags, *blocks.shape[1:]), dtype=np.complex128) if out is None else out
+    scale = 1.0 / (noise_std * math.sqrt(pulse * block))
+    columns = 2 * math.prod(blocks.shape[1:])
+    _boxcar(
+        blocks.reshape(-1).view(np.float64).reshape(-1, columns),
+        pulse,
+        scale,
+        matched.reshape(-1).view(np.float64).reshape(-1, columns),
+    )
+    return matched
+
+
+def filter_samples(
+    samples: Complex[np.ndarray, "t f e"],
+    *,
+    tones: Float[np.ndarray, "2"],
+    rate: float,
+    length: int,
+    noise_std: float,
+) -> Complex[np.ndarray, "l f 2 e"]:
+    """Matched filter at the full rate, one per tone, by fast convolution.
+
+    Parameters
+    ----------
+    samples : (samples, faces, elements) complex
+    tones : (2) [Hz]
+    rate : [Hz]
+    length : int
+        Samples per call.
+    noise_std : float
+        Of one complex sample.
+
+    Returns
+    -------
+    (samples - length + 1, faces, tones, elements) complex
+        Lag i is a call that starts with sample i; noise has unit variance. As precise as the
+        samples.
+    """
+    from scipy.signal import oaconvolve
+
+    n = np.arange(length)[::-1, None]
+    replica = np.exp(-2j * np.pi * tones * n / rate) / (noise_std * math.sqrt(length))
+    return oaconvolve(
+        samples[:, :, None, :],
+        replica.astype(samples.dtype)[:, None, :, None],
+        mode="valid",
+        axes=0,
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _boxcar(rows, width, scale, sums):
+    """Write the running sums of width rows, scaled."""
+    columns = rows.shape[1]
+    total = np.zeros(columns)
+    for b in range(min(width - 1, rows.shape[0])):
+        for i in range(columns):
+            total[i] += scale * rows[b, i]
+    for b in range(width - 1, rows.shape[0]):
+        new, old, done = rows[b], rows[b - width + 1], sums[b - width + 1]
+        for i in range(columns):
+            done[i] = total[i] + scale * new[i]
+            total[i] = done[i] - scale * old[i]
