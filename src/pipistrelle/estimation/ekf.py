@@ -8,9 +8,10 @@ of the scan, then the new ones are placed from the corrected pose.
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numba import njit
 
 from pipistrelle.config import RayConfig
@@ -203,6 +204,26 @@ class EkfSlam:
         )
 
 
+class _Room(NamedTuple):
+    """Room to work on the members of one landmark, and on the order of the state's numbers."""
+
+    likelihood: Float[np.ndarray, " m"]
+    share: Float[np.ndarray, " m"]
+    keep: Bool[np.ndarray, " m"]
+    source: Int[np.ndarray, " n"]
+
+
+@njit(cache=True, error_model="numpy")
+def _room(members):
+    """Make room for so many members."""
+    return _Room(
+        np.empty(members),
+        np.empty(members),
+        np.empty(members, np.bool_),
+        np.empty(3 + 2 * members, np.int64),
+    )
+
+
 @njit(cache=True, error_model="numpy", _nrt=False)
 def _members_of(landmark, members, label):
     """Index of a landmark's first member and how many it has (0: not mapped)."""
@@ -215,37 +236,40 @@ def _members_of(landmark, members, label):
     return members, 0
 
 
-@njit(cache=True, error_model="numpy")
-def _correct_ray(joint, weight, members, first, count, bearing, sensing):
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _correct_ray(joint, weight, members, first, count, bearing, sensing, room):
     """Weigh a ray's members by a bearing and share it among them; GATED when none expected it."""
     mean, size, variance = joint.mean, 3 + 2 * members, sensing.bearing_variance
-    likelihoods, share = np.empty(count), np.empty(count)
     outcome = GATED
     for j in range(count):
         i = 3 + 2 * (first + j)
         _, expected, c, s, k = sight(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
         innovation = wrap_angle(bearing - expected)
         S = bearing_variance(joint, size, i, c, s, k) + variance
-        likelihoods[j] = log_likelihood(innovation, S)
+        room.likelihood[j] = log_likelihood(innovation, S)
         if innovation * innovation <= sensing.passive_bound * S:
             outcome = APPLIED
     if outcome == GATED:
         return GATED
-    weights = weight[first : first + count]
-    weigh_and_share(likelihoods, weights, count, sensing.power, sensing.aggregated, share)
+    weigh_and_share(
+        room.likelihood, weight[first:], count, sensing.power, sensing.aggregated, room.share
+    )
     for j in range(count):
-        if share[j] > 0.0:
+        if room.share[j] > 0.0:
             i = 3 + 2 * (first + j)
-            correct_bearing(joint, size, i, bearing, variance / share[j], np.inf)
+            correct_bearing(joint, size, i, bearing, variance / room.share[j], np.inf)
     return APPLIED
 
 
-@njit(cache=True, error_model="numpy")
-def _range_for_ray(joint, landmark, weight, members, first, count, distance, bearing, sensing):
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _range_for_ray(
+    joint, landmark, weight, members, first, count, distance, bearing, sensing, room
+):
     """Give a partial landmark its range: one member is left. Returns the members left."""
-    keep = np.zeros(count, dtype=np.bool_)
-    keep[0 if sensing.reinitialise else heaviest(weight[first:], count)] = True
-    members = drop_members(joint, landmark, weight, members, first, count, keep)
+    left = 0 if sensing.reinitialise else heaviest(weight[first:], count)
+    for j in range(count):
+        room.keep[j] = j == left
+    members = drop_members(joint, landmark, weight, members, first, count, room.keep, room.source)
     weight[first] = 1.0
     mean, size, i = joint.mean, 3 + 2 * members, 3 + 2 * first
     if sensing.reinitialise:
@@ -260,8 +284,8 @@ def _range_for_ray(joint, landmark, weight, members, first, count, distance, bea
     return members
 
 
-@njit(cache=True, error_model="numpy")
-def _correct_known(joint, landmark, weight, members, label, bearing, distance, sensing):
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _correct_known(joint, landmark, weight, members, label, bearing, distance, sensing, room):
     """Correct with one measurement of a mapped landmark: the members left, and whether gated."""
     first, count = _members_of(landmark, members, label)
     size, i, passive = 3 + 2 * members, 3 + 2 * first, math.isnan(distance)
@@ -275,14 +299,18 @@ def _correct_known(joint, landmark, weight, members, label, bearing, distance, s
             sensing.range_variance, sensing.bearing_variance, sensing.active_bound,
         )  # fmt: skip
     elif passive:
-        outcome = _correct_ray(joint, weight, members, first, count, bearing, sensing)
-        keep = np.empty(count, dtype=np.bool_)
-        if outcome == APPLIED and survivors(weight[first:], count, sensing.prune, keep) < count:
-            members = drop_members(joint, landmark, weight, members, first, count, keep)
+        outcome = _correct_ray(joint, weight, members, first, count, bearing, sensing, room)
+        if (
+            outcome == APPLIED
+            and survivors(weight[first:], count, sensing.prune, room.keep) < count
+        ):
+            members = drop_members(
+                joint, landmark, weight, members, first, count, room.keep, room.source
+            )
     else:
         outcome = APPLIED
         members = _range_for_ray(
-            joint, landmark, weight, members, first, count, distance, bearing, sensing
+            joint, landmark, weight, members, first, count, distance, bearing, sensing, room
         )
     return members, outcome
 
@@ -314,15 +342,16 @@ def _update(old_mean, old_covariance, old_landmark, old_weight, labels, bearings
         known[m] = _members_of(old_landmark, members, labels[m])[1] > 0
         if not known[m]:
             most += sensing.ray_ranges.size if math.isnan(ranges[m]) else 1
-    joint = joint_of(old_mean, old_covariance, 3 + 2 * most)
+    joint, room = joint_of(old_mean, old_covariance, 3 + 2 * most), _room(most)
     landmark, weight, gated = np.empty(most, dtype=np.int64), np.empty(most), 0
     for member in range(members):
         landmark[member], weight[member] = old_landmark[member], old_weight[member]
     for m in range(labels.size):
         if known[m]:
             members, outcome = _correct_known(
-                joint, landmark, weight, members, labels[m], bearings[m], ranges[m], sensing
-            )
+                joint, landmark, weight, members, labels[m], bearings[m], ranges[m], sensing,
+                room,
+            )  # fmt: skip
             gated += outcome
     settle(joint, 3 + 2 * members)
     for m in range(labels.size):

@@ -270,21 +270,26 @@ def place(mean, covariance, size, i, distance, bearing, range_variance, bearing_
     covariance[i, i + 1] = covariance[i + 1, i] = cross
 
 
-@njit(cache=True, error_model="numpy")
-def drop_members(joint, landmark, weight, members, first, count, keep):
-    """Close the gaps that dropped members of one landmark leave; returns the members left."""
+@njit(cache=True, error_model="numpy", _nrt=False)
+def drop_members(joint, landmark, weight, members, first, count, keep, source):
+    """Close the gaps that dropped members of one landmark leave; returns the members left.
+
+    ``source`` is room for as many indices as the state has numbers.
+    """
     size = 3 + 2 * members
     settle(joint, size)
-    sources, left = np.arange(size), first
+    left = first
+    for a in range(size):
+        source[a] = a
     for member in range(first, members):
         if member >= first + count or keep[member - first]:
             landmark[left], weight[left] = landmark[member], weight[member]
             i, j = 3 + 2 * left, 3 + 2 * member
-            sources[i], sources[i + 1] = j, j + 1
+            source[i], source[i + 1] = j, j + 1
             left += 1
     for a in range(3 + 2 * left):
-        source, target = joint.covariance[sources[a]], joint.covariance[a]
-        joint.mean[a] = joint.mean[sources[a]]
+        old, new = joint.covariance[source[a]], joint.covariance[a]
+        joint.mean[a] = joint.mean[source[a]]
         for b in range(3 + 2 * left):
-            target[b] = source[sources[b]]
+            new[b] = old[source[b]]
     return left

@@ -173,23 +173,23 @@ def log_likelihood(innovation: float, variance: float) -> float:
     return -0.5 * (innovation * innovation / variance + math.log(variance))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _weigh_in_logs(log_likelihoods, weights, count):
     """Multiply weights by likelihoods whose products underflow; returns the log of their sum."""
-    logs, largest = np.empty(count), -np.inf
+    largest, total = -np.inf, 0.0
     for j in range(count):
-        logs[j] = log_likelihoods[j] + (math.log(weights[j]) if weights[j] > 0.0 else -np.inf)
-        largest = max(largest, logs[j])
-    total = 0.0
+        log_weight = math.log(weights[j]) if weights[j] > 0.0 else -np.inf
+        weights[j] = log_likelihoods[j] + log_weight
+        largest = max(largest, weights[j])
     for j in range(count):
-        weights[j] = math.exp(logs[j] - largest)
+        weights[j] = math.exp(weights[j] - largest)
         total += weights[j]
     for j in range(count):
         weights[j] /= total
     return largest + math.log(total)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def weigh_and_share(
     log_likelihoods: np.ndarray,
     weights: np.ndarray,
@@ -232,7 +232,7 @@ def weigh_and_share(
     return log_total
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def heaviest(weights: np.ndarray, count: int) -> int:
     """Return the index of the largest of the first weights, the first of equals."""
     best = 0
@@ -242,7 +242,7 @@ def heaviest(weights: np.ndarray, count: int) -> int:
     return best
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def survivors(weights: np.ndarray, count: int, prune: float, keep: np.ndarray) -> int:
     """Mark the members that stay, renormalise their weights in place and return their number.
 
