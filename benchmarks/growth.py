@@ -51,7 +51,7 @@ def points() -> list[dict[str, float]]:
     from pipistrelle.config import Config, ScenarioConfig
     from pipistrelle.experiments.kernels import compile_kernels
     from pipistrelle.experiments.listening import listen
-    from pipistrelle.experiments.memory import keep_freed_memory
+    from pipistrelle.experiments.machine import keep_freed_memory
     from pipistrelle.experiments.trial import Case, drive_of, run_trial
 
     keep_freed_memory()  # as the command does

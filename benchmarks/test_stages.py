@@ -15,7 +15,7 @@ from pipistrelle.config import Config, ReceiverConfig
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.ekf import EkfBelief
 from pipistrelle.experiments.listening import listen
-from pipistrelle.experiments.memory import keep_freed_memory
+from pipistrelle.experiments.machine import keep_freed_memory
 from pipistrelle.experiments.trial import Case, drive_of, run_trial
 
 keep_freed_memory()  # as the commands do

@@ -56,7 +56,7 @@ def test_second_process_is_asked_only_to_fill_an_empty_cache_beside_a_free_core(
     tmp_path, monkeypatch, started, cores, files, processes
 ):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr("os.cpu_count", lambda: cores)
+    monkeypatch.setattr(kernels, "cores", lambda: cores)
     monkeypatch.setattr(kernels, "run_mission", lambda *_: None)
     monkeypatch.setattr(kernels, "_SECOND", "pass")
     for name in range(files):

@@ -12,6 +12,7 @@ import numpy as np
 from pipistrelle.config import Config, ScenarioConfig
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.models import Gaussian
+from pipistrelle.experiments.machine import cores
 from pipistrelle.experiments.scenario import bicycle
 from pipistrelle.experiments.trial import LIMITS, estimator, run_mission
 
@@ -26,7 +27,7 @@ def compile_kernels() -> None:
     """
     tiny = Config(scenario=ScenarioConfig(steps=8, landmarks=4, radius=10.0))
     cached = any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbc"))
-    if not cached and (os.cpu_count() or 1) > 1:
+    if not cached and cores() > 1:
         with _second_process(_SECOND):
             run_mission(tiny, ("fused",), ("ekf",))
     run_mission(tiny, ("active", "fused", "passive"), tuple(LIMITS))

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from pipistrelle.config import InputError
-from pipistrelle.experiments.memory import keep_freed_memory
+from pipistrelle.experiments.machine import check_memory, keep_freed_memory
 from pipistrelle.experiments.plan import Plan, cases_of
 from pipistrelle.experiments.store import (
     Outcome,
@@ -113,7 +113,8 @@ def run_study(
     Raises
     ------
     InputError
-        Where the folder holds another plan, results cannot be written, or workers cannot be had.
+        Where the folder holds another plan, results cannot be written, or workers, or memory for
+        them on this machine, cannot be had.
 
     Examples
     --------
@@ -127,6 +128,8 @@ def run_study(
     >>> standing.done, standing.ended
     (2, {'fused': 2})
     """
+    if executor is None and scheduler in (None, "local"):
+        _refuse_too_large(plan, workers)
     open_store(folder, plan)
     worlds = range(shard[0], plan.iterations, shard[1])
     done = done_worlds(folder).intersection(worlds)
@@ -161,6 +164,19 @@ def run_study(
             f"{folder}: lacks worlds that are done; expected one folder for all workers"
         )
     return standing
+
+
+def _refuse_too_large(plan: Plan, workers: int) -> None:
+    """Refuse a plan of which so many worlds at once may need more memory than there is."""
+    for case in cases_of(plan):
+        check_memory(
+            [case.filter],
+            case.config.scenario.landmarks + 1,
+            case.config.fastslam.particles,
+            case.config.rays,
+            passive=case.strategy != "active",
+            workers=workers,
+        )
 
 
 def _nothing_done(plan: Plan, worlds: int) -> Standing:

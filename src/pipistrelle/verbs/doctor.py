@@ -19,6 +19,8 @@ def doctor() -> None:
 
 def _findings() -> Iterator[tuple[str, str]]:
     """Look at each thing in turn."""
+    from pipistrelle.experiments.machine import cores
+
     yield "python", f"{sys.version.split()[0]} ({sys.executable})"
     yield "pipistrelle", f"{pipistrelle.__version__} ({Path(pipistrelle.__file__).parent})"
     yield from _libraries()
@@ -43,13 +45,6 @@ def _libraries() -> Iterator[tuple[str, str]]:
             yield name, version(name)
         except PackageNotFoundError:
             yield name, f"not found; python -m pip install '{requirement}'"
-
-
-def cores() -> int:
-    """Count the cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _data(place: str | None) -> str:

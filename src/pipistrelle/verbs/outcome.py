@@ -71,7 +71,7 @@ def recorder(options: OutputOptions) -> "MissionRecorder | None":
 def get_ready(options: OutputOptions) -> None:
     """Compile all kernels, or load them, and say so if it takes long; keep memory for them."""
     from pipistrelle.experiments.kernels import compile_kernels
-    from pipistrelle.experiments.memory import keep_freed_memory
+    from pipistrelle.experiments.machine import keep_freed_memory
 
     keep_freed_memory()
     with _waiting("Compiling kernels (once) ...", options):

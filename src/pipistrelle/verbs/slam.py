@@ -105,7 +105,7 @@ def slam(
     chosen, ways = strategies(strategy), filters(estimator, particles)
     if beamwidth is not None and not 0 < beamwidth <= 360:
         raise InputError(f"--beamwidth: found {beamwidth:g}, expected above 0 and up to 360 [deg]")
-    from pipistrelle.experiments.memory import check_memory
+    from pipistrelle.experiments.machine import check_memory
     from pipistrelle.experiments.replay import load, replay
     from pipistrelle.verbs import outcome
 

@@ -13,7 +13,6 @@ from cyclopts import Parameter
 from pipistrelle.config import InputError
 from pipistrelle.settings import Layer
 from pipistrelle.verbs.console import announced, say
-from pipistrelle.verbs.doctor import cores
 from pipistrelle.verbs.options import SettingFlags, Whole, layers
 
 if TYPE_CHECKING:
@@ -92,6 +91,7 @@ def study(
         command = _command(plan, tried, layer)
         print(_slurm(tried.name, command, folder, shards, workers or 1), end="")
         return 0
+    from pipistrelle.experiments.machine import cores
     from pipistrelle.experiments.study import run_study
 
     try:

@@ -1,4 +1,4 @@
-"""What the filters may need of memory, told before they start, and freed memory kept for them."""
+"""What this machine has: cores, and memory, which filters ask for before they start."""
 
 import os
 from collections.abc import Sequence
@@ -13,8 +13,21 @@ MALLOPT = ((-3, 32 << 20), (-1, 256 << 20))
 """Of the GNU C library: arrays up to 32 MB come from the heap; it shrinks when 256 MB are free."""
 
 
+def cores() -> int:
+    """Count the cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def check_memory(
-    ways: Sequence[str], landmarks: int, particles: int, rays: RayConfig, *, passive: bool
+    ways: Sequence[str],
+    landmarks: int,
+    particles: int,
+    rays: RayConfig,
+    *,
+    passive: bool,
+    workers: int = 1,
 ) -> None:
     """Refuse what may need more memory than this machine has.
 
@@ -25,6 +38,8 @@ def check_memory(
     rays : RayConfig
     passive : bool
         Whether a landmark may be heard by its bearing alone: it is a whole ray then.
+    workers : int
+        Processes that each need as much, at the same time.
 
     Raises
     ------
@@ -38,11 +53,12 @@ def check_memory(
     members = landmarks * (ray_members(rays)[0].size if passive else 1)
     for way in ways:
         need, have = _bytes(way, landmarks, members, particles), installed()
-        if need > have:
+        if need * workers > have:
             swarm = f" and {particles} particles" if way == "fastslam" else ""
+            each = f" in each of {workers} workers" if workers > 1 else ""
             raise InputError(
-                f"{way}: {landmarks} landmarks{swarm} may need {need / 1e9:.1f} GB of memory, "
-                f"but this machine has {have / 1e9:.1f} GB; ask for fewer"
+                f"{way}: {landmarks} landmarks{swarm} may need {need / 1e9:.1f} GB of memory"
+                f"{each}, but this machine has {have / 1e9:.1f} GB; ask for fewer"
             )
 
 

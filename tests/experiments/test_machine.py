@@ -7,15 +7,17 @@ import sys
 import pytest
 
 from pipistrelle.__main__ import main
-from pipistrelle.config import InputError, RayConfig
-from pipistrelle.experiments import memory
-from pipistrelle.experiments.memory import check_memory
+from pipistrelle.config import Config, FastSlamConfig, InputError, RayConfig
+from pipistrelle.experiments import machine
+from pipistrelle.experiments.machine import check_memory
+from pipistrelle.experiments.plan import Plan
+from pipistrelle.experiments.study import run_study
 
 GB = 1e9
 
 
 def test_large_worlds_that_fit_are_let_through(monkeypatch):
-    monkeypatch.setattr(memory, "installed", lambda: 4.0 * GB)
+    monkeypatch.setattr(machine, "installed", lambda: 4.0 * GB)
     check_memory(["ekf", "fastslam"], 501, 1000, RayConfig(), passive=True)
 
 
@@ -27,13 +29,13 @@ def test_large_worlds_that_fit_are_let_through(monkeypatch):
     ],
 )
 def test_refusal_says_what_would_be_needed(monkeypatch, way, landmarks, particles, need):
-    monkeypatch.setattr(memory, "installed", lambda: 4.0 * GB)
+    monkeypatch.setattr(machine, "installed", lambda: 4.0 * GB)
     with pytest.raises(InputError, match=f"{way}: .* may need {need:.1f} GB .* has 4.0 GB"):
         check_memory([way], landmarks, particles, RayConfig(), passive=True)
 
 
 def test_active_landmarks_need_one_member_each(monkeypatch):
-    monkeypatch.setattr(memory, "installed", lambda: 4.0 * GB)
+    monkeypatch.setattr(machine, "installed", lambda: 4.0 * GB)
     check_memory(["ekf"], 5_001, 100, RayConfig(), passive=False)
     with pytest.raises(InputError):
         check_memory(["ekf"], 5_001, 100, RayConfig(), passive=True)
@@ -46,13 +48,24 @@ def test_command_refuses_and_leaves_nothing(tmp_path, capsys):
     assert not (tmp_path / "o").exists()
 
 
+def test_study_refuses_what_its_workers_need_together_and_leaves_nothing(tmp_path, monkeypatch):
+    config = Config(fastslam=FastSlamConfig(particles=100_000))
+    ways = {"strategies": ("passive",), "filters": ("fastslam",)}
+    plan = Plan(name="many", iterations=1, config=config, grid={}, **ways)
+    need = 2 * 8 * 100_000 * (6 * 4 * 51 + 51)
+    monkeypatch.setattr(machine, "installed", lambda: 2.5 * need)
+    with pytest.raises(InputError, match=f"need {need / GB:.1f} GB .* in each of 3 workers"):
+        run_study(plan, tmp_path / "many", workers=3)
+    assert not (tmp_path / "many").exists()
+
+
 FAULTS = """
 import sys
 from resource import RUSAGE_SELF, getrusage
 
 import numpy as np
 
-from pipistrelle.experiments.memory import keep_freed_memory
+from pipistrelle.experiments.machine import keep_freed_memory
 
 if sys.argv[1] == "kept":
     keep_freed_memory()
