@@ -20,7 +20,7 @@ def _key() -> str:
     digest = sha256(sys.version.encode())
     for source in sorted(Path(__file__).parent.rglob("*.py")):
         text = source.read_bytes()
-        if b"njit" in text:
+        if b"jit" in text:
             digest.update(source.name.encode() + text)
     return digest.hexdigest()[:16]
 

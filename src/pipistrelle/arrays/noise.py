@@ -12,7 +12,8 @@ import math
 
 import numpy as np
 from jaxtyping import Complex
-from numba import njit
+
+from pipistrelle.jit import kernel
 
 _CHUNK = 512
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
@@ -83,7 +84,7 @@ def complex_noise(
     return noise
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _fill(out, variance, key):
     """Fill interleaved real and imaginary parts with the stream's first numbers.
 
@@ -112,7 +113,7 @@ def _fill(out, variance, key):
             parts[2 * i], parts[2 * i + 1] = real[i], imaginary[i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _split(bits, mantissa, exponent, length):
     """Split floats, given by their bits, into a mantissa in [1, 2), as bits, and an exponent."""
     for i in range(length):
@@ -120,7 +121,7 @@ def _split(bits, mantissa, exponent, length):
         mantissa[i] = (bits[i] & np.uint32(0x7FFFFF)) | np.uint32(0x3F800000)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _modulus(mantissa, exponent, length, variance, modulus):
     """Write sqrt(-variance ln w), w = 2^(e - 127) m / 2^32 in (0, 1]."""
     for i in range(length):
@@ -135,7 +136,7 @@ def _modulus(mantissa, exponent, length, variance, modulus):
         modulus[i] = math.sqrt(max(variance * (halvings * _LN2 - log_m), _F(0.0)))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _turn(modulus, angular, length, real, imaginary):
     """Turn moduli by angles of 32 bits: a half turn, a quarter turn, 30 bits of a quarter turn."""
     for i in range(length):

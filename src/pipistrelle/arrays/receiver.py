@@ -25,12 +25,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Complex, Float
-from numba import njit
 
 from pipistrelle.acoustics.arrivals import Arrivals
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.arrays.noise import complex_noise
 from pipistrelle.config import Config, InputError
+from pipistrelle.jit import kernel, lean
 
 BLOCK = 2e-4
 """Length of a block [s]."""
@@ -239,7 +239,7 @@ def _durations(arrivals: Arrivals, sampling: Sampling) -> Float[np.ndarray, " a"
     return sampling.pulse * BLOCK * nominal / arrivals.frequency
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _geometric_sum(omega, start, stop):
     """Sum of exp(i omega n) over start <= n < stop."""
     count = stop - start
@@ -249,7 +249,7 @@ def _geometric_sum(omega, start, stop):
     return complex(gain * math.cos(phase), gain * math.sin(phase))
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _envelope(sums, p, omega, start, stop, block):
     """Write a tone's block sums of exp(i omega n), start <= n < stop; return the blocks touched."""
     first, last = start // block, (stop - 1) // block
@@ -265,7 +265,7 @@ def _envelope(sums, p, omega, start, stop, block):
     return last - first + 1
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _steer(direct, turned, phasor, wave, position):
     """Write a phasor times each element's phase, and i times that, parts interleaved."""
     elements = position.size
@@ -283,7 +283,7 @@ def _steer(direct, turned, phasor, wave, position):
         turned[2 * e], turned[2 * e + 1] = -phase.imag, phase.real
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _add_echo(
     signal, first, sums, count, phasor, bearing, frequency, normal, position, speed_of_sound,
     direct, turned,
@@ -302,7 +302,7 @@ def _add_echo(
                     heard[i] += re * direct[i] + im * turned[i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _add_echo_blocks(
     signal, delay, amplitude, bearing, frequency, duration, normal, position,
     tones, rate, block, blank, speed_of_sound,

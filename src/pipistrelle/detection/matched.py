@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 from jaxtyping import Complex, Float
-from numba import njit
+
+from pipistrelle.jit import kernel
 
 
 def filter_blocks(
@@ -85,7 +86,7 @@ def filter_samples(
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _boxcar(rows, width, scale, sums):
     """Write the running sums of width rows, scaled."""
     columns = rows.shape[1]

@@ -2,10 +2,10 @@
 
 import math
 
-from numba import njit
+from pipistrelle.jit import kernel, lean
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _steer(matched, low, lags, f, p, u, beam):
     """Write the output of the phase-shift beamformer steered to u, so many lags from low on."""
     turn, phase = complex(math.cos(u), -math.sin(u)), 1.0 + 0.0j
@@ -17,7 +17,7 @@ def _steer(matched, low, lags, f, p, u, beam):
         phase *= turn
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _best_fraction(z0, z1, pulse):
     """Where between two lags the call starts most likely, and how well it fits there.
 
@@ -46,13 +46,13 @@ def _best_fraction(z0, z1, pulse):
     return best, fit
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def reach_of(pulse):
     """How many lags around a snapshot's the call may start."""
     return max(pulse // 7, 1)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def arrival_lag(matched, b, f, p, u, pulse, beam):
     """Lag at which the call starts in the beam steered to u, near lag b, to a fraction.
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit
 
 from pipistrelle.config import Strategy
 from pipistrelle.detection.snapshots import Detections
 from pipistrelle.geometry import wrap, wrap_angle
+from pipistrelle.jit import kernel
 
 UNLABELLED = -1
 """Label of a detection that belongs to no landmark."""
@@ -161,7 +161,7 @@ def scan_of(heard: Heard, strategy: Strategy) -> Scan:
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _distinct(label):
     """Labels that occur, rising, and how often none was given."""
     labels, count, clutter = np.empty_like(label), 0, 0
@@ -181,7 +181,7 @@ def _distinct(label):
     return labels[:count].copy(), clutter
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _average(labels, label, face, tone, angle, bearing, delay, power, weighted):
     """Mean direction and delay of each landmark and tone over its strongest rows per face."""
     mean_bearing = np.full((labels.size, 2), np.nan)

@@ -20,12 +20,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
-from numba import njit
 
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config
 from pipistrelle.detection.onset import arrival_lag, reach_of
 from pipistrelle.geometry import wrap
+from pipistrelle.jit import kernel, lean
 
 SCAN_STEP = 0.05
 """Distance of the scan's beams in u [rad]: the parabola's bias stays under 2 % of a beam step."""
@@ -173,7 +173,7 @@ def detect(
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _energy(parts, elements):
     """Sums of squares over the elements, real and imaginary parts neighbours, of every output."""
     energy = np.empty(parts.size // (2 * elements))
@@ -191,7 +191,7 @@ def _energy(parts, elements):
     return energy
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _candidates(energy, threshold, row):
     """Tests over the threshold that beat both their neighbours a row away.
 
@@ -210,7 +210,7 @@ def _candidates(energy, threshold, row):
     return test[:kept]
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _is_snapshot(energy, test, row, pulse, leakage):
     """Whether a test's lag is the largest near, and its tone no leakage of the other.
 
@@ -229,7 +229,7 @@ def _is_snapshot(energy, test, row, pulse, leakage):
     return level > leakage * strongest
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _scan_power(x, table, power):
     """Write the power of the conventional beam over the scan, from the lag sums."""
     elements, beams = x.size, power.size
@@ -249,7 +249,7 @@ def _scan_power(x, table, power):
             power[i] += re * cosine[i] - im * sine[i]
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _peaks(power, ratio, place):
     """Write where the power peaks, not far under its highest; return the number of peaks.
 
@@ -269,7 +269,7 @@ def _peaks(power, ratio, place):
     return kept
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _grown(column):
     """Copy of a column with twice the room."""
     wide = np.empty(2 * column.size, dtype=column.dtype)
@@ -278,7 +278,7 @@ def _grown(column):
     return wide
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _find_peaks(
     matched, energy, pulse, threshold, leakage, peak_ratio, sine_limit, wave, scan, table, start,
     interval,

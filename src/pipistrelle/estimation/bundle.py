@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit
 
 from pipistrelle.estimation.elementary import exponential, logarithm
 from pipistrelle.estimation.particle import (
@@ -32,6 +31,7 @@ from pipistrelle.estimation.particle import (
     refine_by_bearing,
 )
 from pipistrelle.estimation.rays import SMALLEST_AGGREGATED_SHARE, SMALLEST_SHARE
+from pipistrelle.jit import kernel, lean
 
 
 class Scratch(NamedTuple):
@@ -57,7 +57,7 @@ class Scratch(NamedTuple):
     refined: Float[np.ndarray, "h rows"]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def room(members):
     """Return room to work with rays of so many members."""
     return Scratch(
@@ -71,7 +71,7 @@ def room(members):
     )
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _largest(logs, members, largest):
     """Largest of each lane's logs."""
     for i in range(LANES):
@@ -82,7 +82,7 @@ def _largest(logs, members, largest):
             largest[i] = max(largest[i], row[i])
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _weigh(rows, members, scratch):
     """Aggregated likelihoods, in logs and normalised, into ``posterior`` (Eq. (18)).
 
@@ -107,7 +107,7 @@ def _weigh(rows, members, scratch):
             posterior[i] -= total[i]
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _share(members, sensing, scratch):
     """Divide the measurement: shares go with a power of the likelihoods, now or aggregated."""
     logs = scratch.posterior if sensing.aggregated else scratch.likelihood
@@ -127,14 +127,14 @@ def _share(members, sensing, scratch):
             share[i] = part if part >= smallest else 0.0
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _add(log_likelihood, log_weight):
     """Add log likelihoods, and their constant, to log weights."""
     for i in range(LANES):
         log_weight[i] += log_likelihood[i] - HALF_LOG_TAU
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def refine_by_ray(pose, rows, count, members, bearing, sensing, exact, scratch, log_weight):
     """Correct the poses by the bearing of a landmark, and weigh them by its likelihood."""
     for j in range(members):
@@ -155,7 +155,7 @@ def refine_by_ray(pose, rows, count, members, bearing, sensing, exact, scratch, 
         refine_by_bearing(pose, rows[j], bearing, sensing.bearing_variance, scratch.share[j])
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _refine_to_mixture(pose, rows, members, bearing, variance, scratch):
     """Set the poses to mean and covariance of the mixture of the members' refinements."""
     for j in range(members):
@@ -184,7 +184,7 @@ def _refine_to_mixture(pose, rows, members, bearing, variance, scratch):
             pose[PHH + i] += weight[i] * turn * turn
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def correct_ray(pose, rows, count, members, bearing, sensing, exact, scratch):
     """Weigh, correct and prune a landmark's members from certain poses, in place."""
     for j in range(members):
@@ -200,7 +200,7 @@ def correct_ray(pose, rows, count, members, bearing, sensing, exact, scratch):
     _prune(rows, count, members, sensing.prune, scratch)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _prune(rows, count, members, prune, scratch):
     """Drop members whose aggregated likelihood is too small; the heaviest stays (Eq. (21))."""
     least, total = scratch.largest, scratch.total
@@ -226,7 +226,7 @@ def _prune(rows, count, members, prune, scratch):
         _close_up(rows, count, scratch.share)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _close_up(rows, count, keep):
     """Move the members that are kept to the front, lane by lane."""
     for i in range(LANES):

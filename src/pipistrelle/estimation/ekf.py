@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
 
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
@@ -38,6 +37,7 @@ from pipistrelle.estimation.rays import (
     weigh_and_share,
 )
 from pipistrelle.geometry import wrap_angle
+from pipistrelle.jit import kernel, lean
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,7 +213,7 @@ class _Room(NamedTuple):
     source: Int[np.ndarray, " n"]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _room(members):
     """Make room for so many members."""
     return _Room(
@@ -224,7 +224,7 @@ def _room(members):
     )
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _members_of(landmark, members, label):
     """Index of a landmark's first member and how many it has (0: not mapped)."""
     for first in range(members):
@@ -236,7 +236,7 @@ def _members_of(landmark, members, label):
     return members, 0
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _correct_ray(joint, weight, members, first, count, bearing, sensing, room):
     """Weigh a ray's members by a bearing and share it among them; GATED when none expected it."""
     mean, size, variance = joint.mean, 3 + 2 * members, sensing.bearing_variance
@@ -261,7 +261,7 @@ def _correct_ray(joint, weight, members, first, count, bearing, sensing, room):
     return APPLIED
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _range_for_ray(
     joint, landmark, weight, members, first, count, distance, bearing, sensing, room
 ):
@@ -284,7 +284,7 @@ def _range_for_ray(
     return members
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _correct_known(joint, landmark, weight, members, label, bearing, distance, sensing, room):
     """Correct with one measurement of a mapped landmark: the members left, and whether gated."""
     first, count = _members_of(landmark, members, label)
@@ -315,7 +315,7 @@ def _correct_known(joint, landmark, weight, members, label, bearing, distance, s
     return members, outcome
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _place_new(joint, landmark, weight, members, label, bearing, distance, sensing):
     """Append a landmark, one member or a ray of them (Eqs. (16) to (18)); the members there are."""
     passive = math.isnan(distance)
@@ -333,7 +333,7 @@ def _place_new(joint, landmark, weight, members, label, bearing, distance, sensi
     return members
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _update(old_mean, old_covariance, old_landmark, old_weight, labels, bearings, ranges, sensing):
     """Correct, prune and extend a copy of the belief; returns its arrays and the gated count."""
     members, most = old_landmark.size, old_landmark.size

@@ -13,7 +13,8 @@ is not a number, they promise nothing.
 import math
 
 import numpy as np
-from numba import njit
+
+from pipistrelle.jit import inlined
 
 _INTEGER = 1.5 * 2.0**52
 """Added to a number it rounds it to an integer, which the last bits of the sum hold."""
@@ -34,7 +35,7 @@ _LOGARITHM = tuple(2.0 / (2 * n + 1) for n in reversed(range(12)))
 _KNOWN = tuple(math.atan(slope) for slope in (0.25, 0.5, 0.75, 1.0))
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@inlined
 def _series(coefficients, x):
     """Sum of coefficients times powers of x, the highest first."""
     total = 0.0
@@ -43,7 +44,7 @@ def _series(coefficients, x):
     return total
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@inlined
 def exponential(x):
     """Return e to the power of x, for x below 700; zero below -708."""
     bounded = max(x, -708.0)
@@ -56,7 +57,7 @@ def exponential(x):
     return power if x >= -708.0 else 0.0
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@inlined
 def logarithm(x):
     """Return the natural logarithm of a normal positive number."""
     bits = np.float64(x).view(np.int64)
@@ -66,7 +67,7 @@ def logarithm(x):
     return twos * _LN2_HEAD + (ratio * _series(_LOGARITHM, ratio * ratio) + twos * _LN2_TAIL)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@inlined
 def cosine_and_sine(angle):
     """Return cosine and sine of an angle of a few turns [rad]."""
     shifted = angle * (2.0 / math.pi) + _INTEGER
@@ -79,7 +80,7 @@ def cosine_and_sine(angle):
     return -c if (quadrant + 1) & 2 else c, -s if quadrant & 2 else s
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@inlined
 def arctangent(y, x):
     """Return the direction of the point (x, y) in [-pi, pi] [rad]; zero for the origin.
 
@@ -100,7 +101,7 @@ def arctangent(y, x):
     return -angle if y < 0.0 else angle
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@inlined
 def wrapped(angle):
     """Wrap an angle to [-pi, pi) as `pipistrelle.geometry.wrap_angle` does, without a branch."""
     inside = angle - 2.0 * math.pi * np.floor((angle + math.pi) / (2.0 * math.pi))

@@ -16,10 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit
 
 from pipistrelle.estimation.models import NEAREST, carry_pose, sight
 from pipistrelle.geometry import wrap_angle
+from pipistrelle.jit import kernel, lean
 
 GATED, APPLIED = 1, 0
 LANE = 8
@@ -49,13 +49,13 @@ class Joint(NamedTuple):
     waiting: Int[np.ndarray, "1"]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _lanes(size):
     """Least multiple of a cache line's numbers that holds so many."""
     return (size + LANE - 1) // LANE * LANE
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _on_cache_lines(rows, width):
     """Make an array (rows, width) that begins on a cache line."""
     buffer = np.empty(rows * width + LANE)
@@ -63,7 +63,7 @@ def _on_cache_lines(rows, width):
     return buffer[start : start + rows * width].reshape(rows, width)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def joint_of(mean, covariance, room):
     """Copy a mean (d) and a covariance (d, d) into a `Joint` with room for so many numbers."""
     size, width = mean.size, _lanes(mean.size)
@@ -81,7 +81,7 @@ def joint_of(mean, covariance, room):
     return Joint(longer, wider, W, np.zeros(room, np.int64), np.zeros(1, np.int64))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def gaussian_of(joint, size):
     """Copy the mean (d) and the covariance (d, d) out of a settled `Joint`."""
     mean, covariance = np.empty(size), np.empty((size, size))
@@ -92,7 +92,7 @@ def gaussian_of(joint, size):
     return mean, covariance
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _point_rows(joint, size, i):
     """Rows i and i + 1 of the covariance, with all that waits subtracted from them."""
     pi, pj, W = joint.covariance[i], joint.covariance[i + 1], joint.W
@@ -115,7 +115,7 @@ def _point_rows(joint, size, i):
     return pi, pj
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def settle(joint, size):
     """Let every row catch up: afterwards nothing waits."""
     covariance = joint.covariance
@@ -127,7 +127,7 @@ def settle(joint, size):
     joint.waiting[0] = 0
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _wait(joint, size, w, step):
     """Add step w to the mean, subtract w w^T from the pose's rows, and let the points' wait."""
     mean, p0, p1, p2 = joint.mean, joint.covariance[0], joint.covariance[1], joint.covariance[2]
@@ -140,7 +140,7 @@ def _wait(joint, size, w, step):
     joint.waiting[0] += 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def carry(mean, covariance, controls, dt, motion, pose_means, pose_covariances):
     """Advance mean and covariance in place; cross-covariances once, by the product of the F."""
     pose, P = mean[:3], covariance[:3, :3].copy()
@@ -163,7 +163,7 @@ def carry(mean, covariance, controls, dt, motion, pose_means, pose_covariances):
             covariance[a, b] = P[a, b]
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def bearing_variance(joint, size, i, c, s, k):
     """Innovation variance H P H^T of the bearing of the member at state index i, without R."""
     h0, h1 = s * k, -c * k  # by pose: (h0, h1, -1); by member: (-h0, -h1)
@@ -180,7 +180,7 @@ def bearing_variance(joint, size, i, c, s, k):
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def correct_bearing(joint, size, i, bearing, variance, bound):
     """Correct the state with the bearing of the member at index i; GATED when beyond bound."""
     mean = joint.mean
@@ -206,7 +206,7 @@ def correct_bearing(joint, size, i, bearing, variance, bound):
     return APPLIED
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def correct_active(joint, size, i, distance, bearing, range_variance, bearing_variance, bound):
     """Correct the state with range and bearing of the member at index i; GATED beyond bound."""
     mean = joint.mean
@@ -242,7 +242,7 @@ def correct_active(joint, size, i, distance, bearing, range_variance, bearing_va
     return APPLIED
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def place(mean, covariance, size, i, distance, bearing, range_variance, bearing_variance):
     """Put a member at state index i, at a range and bearing from the pose (Eq. (16)).
 
@@ -270,7 +270,7 @@ def place(mean, covariance, size, i, distance, bearing, range_variance, bearing_
     covariance[i, i + 1] = covariance[i + 1, i] = cross
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def drop_members(joint, landmark, weight, members, first, count, keep, source):
     """Close the gaps that dropped members of one landmark leave; returns the members left.
 

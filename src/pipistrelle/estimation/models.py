@@ -11,10 +11,10 @@ from typing import Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit
 
 from pipistrelle.detection.scans import Scan
 from pipistrelle.geometry import wrap_angle
+from pipistrelle.jit import kernel, lean
 
 MOTION_MODELS = ("bicycle", "unicycle")
 NEAREST = 1e-3
@@ -184,7 +184,7 @@ def motion_numbers(motion: Motion) -> MotionNumbers:
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def advance(
     model: int, wheelbase: float, heading: float, speed: float, turn: float, dt: float
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
@@ -219,7 +219,7 @@ def advance(
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def carry_pose(
     pose: np.ndarray, P: np.ndarray, speed: float, turn: float, dt: float, motion: MotionNumbers
 ) -> tuple[float, float]:
@@ -323,7 +323,7 @@ def motion_jacobians(
     return F, np.array(moved[3:]).reshape(2, 3).T.copy()
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def sight(
     x: float, y: float, heading: float, px: float, py: float
 ) -> tuple[float, float, float, float, float]:

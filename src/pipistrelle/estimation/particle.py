@@ -15,10 +15,10 @@ likelihood. Given the pose, members are independent of each other.
 import math
 
 import numpy as np
-from numba import njit
 
 from pipistrelle.estimation.elementary import arctangent, cosine_and_sine, logarithm, wrapped
 from pipistrelle.estimation.models import NEAREST
+from pipistrelle.jit import inlined, lean
 
 LANES = 32
 """Particles in a block. With half as many the compiler unrolls the loops instead of widening them;
@@ -32,7 +32,7 @@ ROUNDING = 1e-12
 """A pivot under this share of its variance is rounding: one control step has noise of rank 2."""
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@inlined
 def _bearing(pose, member, bearing, i):
     """Innovation of a member's bearing; its slopes by x and y of the pose; whether it has any."""
     dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
@@ -42,7 +42,7 @@ def _bearing(pose, member, bearing, i):
     return innovation, dy * inverse, -dx * inverse, squared >= NEAREST * NEAREST
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@inlined
 def _bearing_gain(pose, h0, h1, i):
     """Covariance of x, y and heading with the bearing, whose slopes are (h0, h1, -1)."""
     return (
@@ -52,14 +52,14 @@ def _bearing_gain(pose, h0, h1, i):
     )
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@inlined
 def _spread(member, h0, h1, i):
     """Variance of the bearing that a member's own uncertainty causes."""
     cross = 2.0 * h0 * h1 * member[XY + i]
     return h0 * h0 * member[XX + i] + cross + h1 * h1 * member[YY + i]
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def expect_bearing(pose, member, bearing, variance, count, j, log_likelihood):
     """Log likelihood, without its constant, of the bearing of each lane's member j (Eq. (19)).
 
@@ -76,7 +76,7 @@ def expect_bearing(pose, member, bearing, variance, count, j, log_likelihood):
         log_likelihood[i] = value if j < count[i] else -np.inf
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def bearing_beyond(pose, member, bearing, variance, count, j, bound):
     """Whether the bearing is beyond the bound for member j of every lane that has one."""
     beyond = 0
@@ -89,7 +89,7 @@ def bearing_beyond(pose, member, bearing, variance, count, j, bound):
     return beyond == LANES
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def refine_by_bearing(pose, member, bearing, variance, share):
     """Correct the poses by the bearing of a member, of whose information each has a share."""
     for i in range(LANES):
@@ -110,7 +110,7 @@ def refine_by_bearing(pose, member, bearing, variance, share):
         pose[PHH + i] -= a2 * k2
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def correct_by_bearing(pose, member, bearing, variance, share):
     """Correct a member by its bearing from certain poses, of whose information each has a share."""
     for i in range(LANES):
@@ -127,7 +127,7 @@ def correct_by_bearing(pose, member, bearing, variance, share):
         member[YY + i] -= a1 * k1
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@inlined
 def _active(pose, member, distance, bearing, i):
     """Innovations of range and bearing, direction (c, s), inverse range, whether it is far."""
     dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
@@ -137,7 +137,7 @@ def _active(pose, member, distance, bearing, i):
     return distance - near, turn, dx * k, dy * k, k, near >= NEAREST
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@inlined
 def _whitened(nu0, nu1, S00, S01, S11):
     """Innovations made independent and of variance one: they, and what makes them so."""
     i0 = 1.0 / math.sqrt(S00)
@@ -147,7 +147,7 @@ def _whitened(nu0, nu1, S00, S01, S11):
     return e0, (nu1 - L10 * e0) * i1, i0, i1, L10
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@inlined
 def _active_spread(pose, member, c, s, k, range_variance, bearing_variance, i):
     """Covariance of range and bearing with x, y, heading, and of their innovations."""
     h0, h1 = s * k, -c * k
@@ -163,7 +163,7 @@ def _active_spread(pose, member, c, s, k, range_variance, bearing_variance, i):
     return a0, a1, a2, b0, b1, b2, S00, S01, S11
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def active_beyond(pose, member, distance, bearing, range_variance, bearing_variance, count, bound):
     """Whether range and bearing are beyond the bound for every lane, each of one member."""
     beyond = 0
@@ -178,7 +178,7 @@ def active_beyond(pose, member, distance, bearing, range_variance, bearing_varia
     return beyond == LANES
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def refine_by_active(
     pose, member, distance, bearing, range_variance, bearing_variance, count, log_weight
 ):
@@ -206,7 +206,7 @@ def refine_by_active(
         pose[PHH + i] -= a2 * a2 + b2 * b2
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def correct_by_active(pose, member, distance, bearing, range_variance, bearing_variance, count):
     """Correct, where it is its landmark's only one, a member by range and bearing."""
     for i in range(LANES):
@@ -230,7 +230,7 @@ def correct_by_active(pose, member, distance, bearing, range_variance, bearing_v
         member[YY + i] -= a1 * a1 + b1 * b1
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def place_member(
     pose, member, distance, bearing, range_variance, bearing_variance, log_weight, count
 ):
@@ -251,7 +251,7 @@ def place_member(
         member[LOG_WEIGHT + i] = log_weight if here else member[LOG_WEIGHT + i]
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def sample_pose(pose, normal):
     """Draw the poses from their Gaussians with three standard normals each; no spread is left."""
     for i in range(LANES):

@@ -44,9 +44,9 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit
 
 from pipistrelle.config import RayConfig
+from pipistrelle.jit import kernel, lean
 
 SMALLEST_AGGREGATED_SHARE = 0.05
 SMALLEST_SHARE = 1e-12
@@ -164,7 +164,7 @@ def sensing_of(range_std: float, bearing_std: float, rays: RayConfig, gate: floa
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def log_likelihood(innovation: float, variance: float) -> float:
     """Log of N(innovation; 0, variance) without its constant.
 
@@ -173,7 +173,7 @@ def log_likelihood(innovation: float, variance: float) -> float:
     return -0.5 * (innovation * innovation / variance + math.log(variance))
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _weigh_in_logs(log_likelihoods, weights, count):
     """Multiply weights by likelihoods whose products underflow; returns the log of their sum."""
     largest, total = -np.inf, 0.0
@@ -189,7 +189,7 @@ def _weigh_in_logs(log_likelihoods, weights, count):
     return largest + math.log(total)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def weigh_and_share(
     log_likelihoods: np.ndarray,
     weights: np.ndarray,
@@ -232,7 +232,7 @@ def weigh_and_share(
     return log_total
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def heaviest(weights: np.ndarray, count: int) -> int:
     """Return the index of the largest of the first weights, the first of equals."""
     best = 0
@@ -242,7 +242,7 @@ def heaviest(weights: np.ndarray, count: int) -> int:
     return best
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def survivors(weights: np.ndarray, count: int, prune: float, keep: np.ndarray) -> int:
     """Mark the members that stay, renormalise their weights in place and return their number.
 

@@ -14,7 +14,8 @@ import math
 
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit
+
+from pipistrelle.jit import kernel
 
 
 def normalised(log_weight: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
@@ -42,7 +43,7 @@ def normalised(log_weight: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
     return weight / total if total > 0.0 else np.full(weight.size, 1.0 / weight.size)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _shifted(log_weight):
     """Exponentials relative to the largest; zero where the log is not finite."""
     weight, largest = np.zeros(log_weight.size), -np.inf

@@ -7,7 +7,6 @@ lane i has the first ``count[b, n, i]``: the particles share the rows, not the m
 import math
 
 import numpy as np
-from numba import njit
 
 from pipistrelle.estimation.bundle import correct_ray, refine_by_ray, room
 from pipistrelle.estimation.elementary import cosine_and_sine, wrapped
@@ -34,6 +33,7 @@ from pipistrelle.estimation.particle import (
     refine_by_active,
     sample_pose,
 )
+from pipistrelle.jit import kernel, lean
 
 SMALLEST_STD = 1e-6
 """Added in quadrature to the pose estimate's x, y [m] and heading [rad]: a swarm that stands still
@@ -41,7 +41,7 @@ or has one ancestor may have no spread, and its covariance no inverse."""
 LEAST = SMALLEST_STD**2
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _add_moments(pose, weight, sums):
     """Add a block's weighted positions and directions, lane by lane."""
     for i in range(LANES):
@@ -52,7 +52,7 @@ def _add_moments(pose, weight, sums):
         sums[PXY + i] += weight[i] * s
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _add_spread(pose, weight, x, y, heading, sums):
     """Add a block's weighted covariances and squared distances from the mean, lane by lane."""
     for i in range(LANES):
@@ -65,7 +65,7 @@ def _add_spread(pose, weight, x, y, heading, sums):
         sums[PHH + i] += weight[i] * (turn * turn + pose[PHH + i])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _add_lanes(sums):
     """Sum of each row over its lanes."""
     total = np.empty(POSE // LANES)
@@ -77,7 +77,7 @@ def _add_lanes(sums):
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def summarise(pose, weight):
     """Mean (circular in the heading) and covariance of a swarm's pose, its particles' included."""
     blocks = pose.shape[0]
@@ -102,7 +102,7 @@ def summarise(pose, weight):
     return mean[:3].copy(), covariance
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _advance_block(pose, step, q0, q1):
     """Carry a block's poses through a control step, known in the vehicle's frame (Eq. (10))."""
     ahead, aside, turn, u00, u10, u20, u01, u11, u21 = step
@@ -123,7 +123,7 @@ def _advance_block(pose, step, q0, q1):
         pose[PHH + i] = hh + q0 * u20 * u20 + q1 * u21 * u21
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def advance_swarm(pose, weight, controls, dt, motion, pose_means, pose_covariances):
     """Carry every particle through control steps, in place, and summarise after each."""
     for k in range(dt.size):
@@ -141,7 +141,7 @@ def advance_swarm(pose, weight, controls, dt, motion, pose_means, pose_covarianc
                 pose_covariances[k, a, b] = covariance[a, b]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _slots(landmark, labels):
     """Index of each label among the landmarks; -1 for a new one."""
     slot = np.empty(labels.size, dtype=np.int64)
@@ -153,7 +153,7 @@ def _slots(landmark, labels):
     return slot
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _most(count):
     """Members of the lane that has most."""
     most = 1
@@ -162,7 +162,7 @@ def _most(count):
     return most
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def gated_by_all(pose, landmark, first, count, member, labels, bearings, ranges, sensing):
     """Whether each measurement is beyond the gate of every particle that could use it."""
     slot, gated = _slots(landmark, labels), np.zeros(labels.size, dtype=np.bool_)
@@ -185,7 +185,7 @@ def gated_by_all(pose, landmark, first, count, member, labels, bearings, ranges,
     return gated
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _range_for_ray(pose, rows, count, distance, bearing, sensing, partial):
     """Give partial landmarks their range: of each one member is left, the first."""
     if sensing.reinitialise:
@@ -210,7 +210,7 @@ def _range_for_ray(pose, rows, count, distance, bearing, sensing, partial):
     correct_by_bearing(pose, rows[0], bearing, sensing.bearing_variance, partial)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _refine(
     pose, log_weight, first, count, member, slot, bearings, ranges, sensing, exact, scratch
 ):
@@ -232,7 +232,7 @@ def _refine(
             )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _correct(pose, first, count, member, slot, bearings, ranges, sensing, exact, scratch):
     """Correct a block's measured landmarks from its sampled poses, in place."""
     for m in range(slot.size):
@@ -258,7 +258,7 @@ def _correct(pose, first, count, member, slot, bearings, ranges, sensing, exact,
             count[n] = 1
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _place(pose, rows, count, bearing, distance, sensing):
     """Place a block's new landmark, one member or a ray of them (Eqs. (16) to (18))."""
     if not math.isnan(distance):
@@ -277,7 +277,7 @@ def _place(pose, rows, count, bearing, distance, sensing):
     count[:] = members
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _rows(landmark, count, slot, labels, ranges, rays):
     """Labels with the new ones, and each landmark's first row: no more than its members need."""
     known = landmark.size
@@ -299,7 +299,7 @@ def _rows(landmark, count, slot, labels, ranges, rays):
     return all_labels, first
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@lean
 def _copy_members(old_first, old_count, old_member, first, count, member):
     """Copy a block's members into their new rows."""
     for n in range(old_count.shape[0]):
@@ -311,7 +311,7 @@ def _copy_members(old_first, old_count, old_member, first, count, member):
             count[n, i] = old_count[n, i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def correct_swarm(
     old_pose, old_landmark, old_first, old_count, old_member,
     labels, bearings, ranges, normal, sensing, exact,
@@ -346,7 +346,7 @@ def correct_swarm(
     return pose, gained.ravel()[: normal.shape[0]], landmark, first, count, member
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def particle_map(count, member, particle):
     """One particle's members, row by row: the number of each landmark's, and (c, 6) numbers."""
     b, i = particle // LANES, particle % LANES
@@ -357,7 +357,7 @@ def particle_map(count, member, particle):
     return count[b, :, i].copy(), rows
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def mean_full(count, weight):
     """Weighted mean number of landmarks of one member: exact where all particles agree."""
     first, more = 0, 0.0
@@ -370,7 +370,7 @@ def mean_full(count, weight):
     return first + more
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def descend(old_pose, old_count, old_member, ancestor):
     """Put copies of the ancestors in the particles' places; spare lanes follow the last."""
     pose, count = np.empty_like(old_pose), np.empty_like(old_count)

@@ -8,7 +8,6 @@ else. To lift the assumption, replace `label_detections`.
 
 import numpy as np
 from jaxtyping import Int
-from numba import njit
 
 from pipistrelle.acoustics.arrivals import Arrivals
 from pipistrelle.arrays.layout import Layout
@@ -16,6 +15,7 @@ from pipistrelle.config import AssociationConfig
 from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.detection.snapshots import Detections
 from pipistrelle.geometry import wrap_angle
+from pipistrelle.jit import kernel
 
 
 def label_detections(
@@ -91,7 +91,7 @@ def faintest_level_db(
     return float(10.0 * np.log10(per_sample) - margin_db)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _label(
     order, face, tone, delay, bearing, source, true_delay, true_bearing, level_db, landmark,
     normal, delay_gate, bearing_gate, faintest_db,

@@ -1,0 +1,21 @@
+"""How kernels, loops over arrays, are compiled: serially, kept in the cache, IEEE arithmetic.
+
+A division by zero makes infinity, as in NumPy, and no exception. Nothing is reordered or fused
+(no ``fastmath``): a result does not depend on how many numbers the processor takes at a time.
+"""
+
+from numba import njit
+
+kernel = njit(cache=True, error_model="numpy")
+"""Compile a kernel."""
+
+lean = njit(cache=True, error_model="numpy", _nrt=False)  # pyrefly: ignore[no-matching-overload]
+"""Compile a kernel that makes no array, calls none that does, and returns none to one that does.
+
+It borrows the arrays that it is given, and does not count references to them and to parts of them.
+Counting is atomic, some 5 ns each time, for every array of a record at every call: a fifth of a
+filter's time.
+"""
+
+inlined = njit(cache=True, error_model="numpy", forceinline=True)
+"""Compile a piece of a loop's body, without which the loop would not be vectorised."""
