@@ -6,14 +6,13 @@ timings of the yardstick; what one round consists of is kept beside it.
 
 import time
 
-import numpy as np
 import pytest
 
-from benchmarks.calibration import ELEMENTS, calibrate
+from benchmarks.calibration import calibrate
+from benchmarks.counts import covariance_updates, elementary_functions
+from benchmarks.limits import elementary_function, multiply_add
 from benchmarks.worlds import RADII, scans_of, some_frames, world_of
 from pipistrelle.config import Config, ReceiverConfig
-from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.ekf import EkfBelief
 from pipistrelle.experiments.listening import listen
 from pipistrelle.experiments.machine import keep_freed_memory
 from pipistrelle.experiments.trial import Case, drive_of, run_trial
@@ -63,25 +62,8 @@ def test_mission(benchmark, name, strategy):
     scans, drive = scans_of(CONFIG, strategy), drive_of(WORLD, CONFIG)
     case = Case(strategy=strategy, filter=name)
     if name == "ekf":
-        seconds = _updates(case, drive, scans) / ELEMENTS * calibrate(time.process_time)
-        benchmark.extra_info["floor_s"] = seconds
+        seconds = covariance_updates(case, drive, scans, CONFIG) * multiply_add()
+    else:
+        seconds = elementary_functions(case, drive, scans, CONFIG) * elementary_function()
+    benchmark.extra_info["floor_s"] = seconds
     benchmark.pedantic(run_trial, (case, drive, scans, CONFIG), rounds=15, warmup_rounds=1)
-
-
-def _updates(case, drive, scans):
-    """Count the elements that the corrections of an EKF mission must change.
-
-    Half a symmetric matrix, once for a bearing of each member and twice for a bearing with range.
-    """
-    count, before = 0, np.empty(0, dtype=int)
-
-    def add(strategy: str, name: str, scan: Scan, belief: EkfBelief) -> None:
-        nonlocal count, before
-        size = 3 + 2 * before.size
-        members = np.array([np.count_nonzero(before == label) for label in scan.landmark], int)
-        outer = np.where(np.isnan(scan.range), members, 2 * (members > 0))
-        count += int(outer.sum()) * size * (size + 1) // 2
-        before = belief.landmark
-
-    run_trial(case, drive, scans, CONFIG, watch=add)
-    return count
