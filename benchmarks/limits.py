@@ -1,6 +1,11 @@
-"""What the filters' arithmetic costs at best: the rates that floors are counted with."""
+"""What this machine does at best, in the loops that the stages consist of: rates for floors.
 
+python -m benchmarks.limits     # a line for each
+"""
+
+import math
 import time
+from collections.abc import Callable
 from statistics import median
 
 import numpy as np
@@ -12,26 +17,67 @@ from pipistrelle.estimation.elementary import arctangent, exponential, logarithm
 NUMBERS, ROUNDS = 4096, 41
 
 
-@njit(cache=True, error_model="numpy")
-def _functions(x, y):
-    """Take the three functions of every number, lane by lane."""
-    for i in range(x.size):
-        y[i] = arctangent(x[i], 1.0) + exponential(x[i]) + logarithm(x[i])
+def multiply_add() -> float:
+    """Time one multiply-add within the second-level cache, at the yardstick's rate [s]."""
+    return calibrate(time.process_time) / ELEMENTS
 
 
 def elementary_function() -> float:
     """Time one of a filter's own elementary functions, the mean of three, in a loop of them [s]."""
-    x, took = np.linspace(0.1, 3.0, NUMBERS), []
-    y = np.empty_like(x)
-    _functions(x, y)
+    x = np.linspace(0.1, 3.0, NUMBERS)
+    return _timed(lambda: _functions(x, np.empty_like(x), 100)) / (3 * 100 * NUMBERS)
+
+
+def library_function() -> float:
+    """Time one cosine of the C library, in a loop of them [s]."""
+    x = np.linspace(0.1, 3.0, NUMBERS)
+    return _timed(lambda: _cosines(x, np.empty_like(x), 10)) / (10 * NUMBERS)
+
+
+def copied_byte(size: int) -> float:
+    """Time a byte of an array of some bytes, read and written by a copy [s]."""
+    source = np.ones(size // 8)
+    target, copies = np.empty_like(source), max(20_000_000 // size, 1)
+
+    def copy() -> None:
+        for _ in range(copies):
+            np.copyto(target, source)
+
+    return _timed(copy) / (2 * copies * size)
+
+
+@njit(cache=True, error_model="numpy")
+def _functions(x, y, times):
+    """Take the three functions of every number, lane by lane, some times."""
+    for _ in range(times):
+        for i in range(x.size):
+            y[i] = arctangent(x[i], 1.0) + exponential(x[i]) + logarithm(x[i])
+
+
+@njit(cache=True, error_model="numpy")
+def _cosines(x, y, times):
+    """Take the cosine of every number, some times."""
+    for _ in range(times):
+        for i in range(x.size):
+            y[i] = math.cos(x[i])
+
+
+def _timed(task: Callable[[], None]) -> float:
+    """Time a task: the median of some rounds, after a first one [s]."""
+    task()
+    took = []
     for _ in range(ROUNDS):
         began = time.process_time()
-        for _ in range(100):
-            _functions(x, y)
+        task()
         took.append(time.process_time() - began)
-    return median(took) / (100 * 3 * NUMBERS)
+    return median(took)
 
 
-def multiply_add() -> float:
-    """Time one multiply-add within the second-level cache, at the yardstick's rate [s]."""
-    return calibrate(time.process_time) / ELEMENTS
+if __name__ == "__main__":
+    print(f"{1e-9 / multiply_add():.3g} multiply-adds a nanosecond, within the second-level cache")
+    print(
+        f"{1e9 * elementary_function():.3g} ns for an elementary function of the filters', by lanes"
+    )
+    print(f"{1e9 * library_function():.3g} ns for a cosine of the C library")
+    for size, name in ((1_240_000, "a frame's sums"), (200_000_000, "200 MB")):
+        print(f"{1e-9 / copied_byte(size):.3g} GB/s, read and written, copying {name}")
