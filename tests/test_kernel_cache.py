@@ -37,6 +37,12 @@ def test_folder_that_the_user_names_is_taken(tmp_path):
     assert (folder, said) == (tmp_path / "mine", [])
 
 
+def test_numba_imported_before_keeps_them_there_too(tmp_path):
+    folder, _ = place(tmp_path, "import numba; " + COMPILE)
+    assert folder == tmp_path / ".cache" / "pipistrelle" / pipistrelle._key()
+    assert list(folder.rglob("*.nbc"))
+
+
 @pytest.mark.parametrize("variable", ["HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR"])
 def test_kernels_are_kept_in_a_temporary_folder_where_nothing_else_can_be_written(
     tmp_path, variable

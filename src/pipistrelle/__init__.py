@@ -70,6 +70,8 @@ def _place_kernels() -> None:
             file=sys.stderr,
         )
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
+    if "numba" in sys.modules:  # it looked when it was imported
+        sys.modules["numba"].core.config.reload_config()
 
 
 _place_kernels()

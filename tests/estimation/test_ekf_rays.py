@@ -195,3 +195,13 @@ def compared(without, keeping, truth):
         error[2] = wrap(error[2])
         nees.append(error @ np.linalg.solve(slow.P[:3, :3], error))
     return np.sqrt(np.mean(shift**2 / variances)), volumes[1] / volumes[0], *nees
+
+
+def test_filter_of_short_rays_goes_on_with_a_belief_of_long_ones():
+    long, short = paper_filter(), paper_filter(rays=ray_config(range_bounds=(5.0, 6.0)))
+    belief = long.update(long.init(START), scan_of((1, np.nan, 0.3), (2, np.nan, -1.0)))
+    assert belief.landmark.tolist() == [1] * 4 + [2] * 4
+    again = scan_of((1, np.nan, 0.31), (2, np.nan, -0.99))
+    mine, other = short.update(belief, again), long.update(belief, again)
+    np.testing.assert_array_equal(mine.mean, other.mean)
+    np.testing.assert_array_equal(mine.covariance, other.covariance)

@@ -158,3 +158,12 @@ def test_a_bearing_neither_prunes_a_member_too_near_to_foresee_it_nor_loses_the_
     assert np.isfinite(particles_of(after).member[:, :, :5]).all()
     weight = members(after, 0, 1)[:, 5]
     np.testing.assert_allclose(weight, [1.0, 0.0, 0.0, 0.0], atol=1e-12)
+
+
+def test_filter_of_short_rays_goes_on_with_a_belief_of_long_ones():
+    long = swarm_filter(40)
+    short = swarm_filter(40, rays=ray_config(range_bounds=(5.0, 6.0)))
+    belief = began(long, (1, np.nan, 0.3), (2, np.nan, -1.0))
+    assert (belief.count == 4).all()
+    again = scan_of((1, np.nan, 0.31), (2, np.nan, -0.99))
+    assert_same(short.update(belief, again, drawing()), long.update(belief, again, drawing()))

@@ -1,5 +1,6 @@
 """A run that may not fit into memory is refused before it starts, with what it would need."""
 
+import os
 import platform
 import subprocess
 import sys
@@ -25,7 +26,7 @@ def test_large_worlds_that_fit_are_let_through(monkeypatch):
     ("way", "landmarks", "particles", "need"),
     [
         ("ekf", 10_001, 100, 3 * 8 * (3 + 2 * 4 * 10_001) ** 2 / GB),
-        ("fastslam", 51, 1_000_000, 2 * 8 * 1_000_000 * (6 * 4 * 51 + 51) / GB),
+        ("fastslam", 51, 1_000_000, 3 * 8 * 1_000_000 * (6 * 4 * 51 + 51) / GB),
     ],
 )
 def test_refusal_says_what_would_be_needed(monkeypatch, way, landmarks, particles, need):
@@ -41,6 +42,15 @@ def test_active_landmarks_need_one_member_each(monkeypatch):
         check_memory(["ekf"], 5_001, 100, RayConfig(), passive=True)
 
 
+@pytest.mark.parametrize(("limit", "have"), [("1000000\n", 1e6), ("max\n", None), (None, None)])
+def test_a_containers_share_of_the_memory_counts(tmp_path, monkeypatch, limit, have):
+    file = tmp_path / "memory.max"
+    if limit is not None:
+        file.write_text(limit)
+    monkeypatch.setattr(machine, "LIMIT", file)
+    assert machine.installed() == (have or os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+
+
 def test_command_refuses_and_leaves_nothing(tmp_path, capsys):
     words = ["run", "--filter", "fastslam", "--particles", "1000000000", "-o", str(tmp_path / "o")]
     assert main(words) == 2
@@ -52,7 +62,7 @@ def test_study_refuses_what_its_workers_need_together_and_leaves_nothing(tmp_pat
     config = Config(fastslam=FastSlamConfig(particles=100_000))
     ways = {"strategies": ("passive",), "filters": ("fastslam",)}
     plan = Plan(name="many", iterations=1, config=config, grid={}, **ways)
-    need = 2 * 8 * 100_000 * (6 * 4 * 51 + 51)
+    need = 3 * 8 * 100_000 * (6 * 4 * 51 + 51)
     monkeypatch.setattr(machine, "installed", lambda: 2.5 * need)
     with pytest.raises(InputError, match=f"need {need / GB:.1f} GB .* in each of 3 workers"):
         run_study(plan, tmp_path / "many", workers=3)

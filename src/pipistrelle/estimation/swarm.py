@@ -186,8 +186,11 @@ def gated_by_all(pose, landmark, first, count, member, labels, bearings, ranges,
 
 
 @lean
-def _range_for_ray(pose, rows, count, distance, bearing, sensing, partial):
-    """Give partial landmarks their range: of each one member is left, the first."""
+def _range_for_ray(pose, rows, count, distance, bearing, sensing, share):
+    """Give partial landmarks their range: of each one member is left, the first.
+
+    ``share`` is room for what each lane takes of the bearing: one where it had a ray, else zero.
+    """
     if sensing.reinitialise:
         place_member(
             pose, rows[0], distance, bearing,
@@ -195,10 +198,10 @@ def _range_for_ray(pose, rows, count, distance, bearing, sensing, partial):
         )  # fmt: skip
         return
     for i in range(LANES):
-        partial[i] = 0.0
+        share[i] = 0.0
         if count[i] == 1:
             continue
-        partial[i], best = 1.0, 0
+        share[i], best = 1.0, 0
         for j in range(1, count[i]):
             best = j if rows[j, LOG_WEIGHT + i] > rows[best, LOG_WEIGHT + i] else best
         for k in range(i, MEMBER, LANES):
@@ -207,7 +210,7 @@ def _range_for_ray(pose, rows, count, distance, bearing, sensing, partial):
         scale = distance / max(math.sqrt(dx * dx + dy * dy), 1e-12)
         rows[0, X + i], rows[0, Y + i] = pose[X + i] + dx * scale, pose[Y + i] + dy * scale
         rows[0, LOG_WEIGHT + i] = 0.0
-    correct_by_bearing(pose, rows[0], bearing, sensing.bearing_variance, partial)
+    correct_by_bearing(pose, rows[0], bearing, sensing.bearing_variance, share)
 
 
 @lean
@@ -279,8 +282,8 @@ def _place(pose, rows, count, bearing, distance, sensing):
 
 @kernel
 def _rows(landmark, count, slot, labels, ranges, rays):
-    """Labels with the new ones, and each landmark's first row: no more than its members need."""
-    known = landmark.size
+    """Labels with the new ones, each landmark's first row, and the most rows that one needs."""
+    known, widest = landmark.size, 1
     fresh = 0
     for m in range(slot.size):
         fresh += slot[m] < 0
@@ -291,12 +294,15 @@ def _rows(landmark, count, slot, labels, ranges, rays):
         for b in range(count.shape[0]):
             most = max(most, _most(count[b, n]))
         all_labels[n], first[n + 1] = landmark[n], first[n] + most
+        widest = max(widest, most)
     for m in range(slot.size):
         if slot[m] < 0:
             all_labels[known] = labels[m]
-            first[known + 1] = first[known] + (rays if math.isnan(ranges[m]) else 1)
+            most = rays if math.isnan(ranges[m]) else 1
+            first[known + 1] = first[known] + most
+            widest = max(widest, most)
             known += 1
-    return all_labels, first
+    return all_labels, first, widest
 
 
 @lean
@@ -320,10 +326,11 @@ def correct_swarm(
     pose, gained = old_pose.copy(), np.zeros((old_pose.shape[0], LANES))
     draw = np.empty(3 * LANES)
     slot, known, blocks = _slots(old_landmark, labels), old_landmark.size, old_pose.shape[0]
-    landmark, first = _rows(old_landmark, old_count, slot, labels, ranges, sensing.ray_ranges.size)
+    rays = sensing.ray_ranges.size
+    landmark, first, widest = _rows(old_landmark, old_count, slot, labels, ranges, rays)
     count = np.zeros((blocks, landmark.size, LANES), dtype=np.int64)
     member = np.empty((blocks, first[-1], MEMBER))
-    scratch = room(sensing.ray_ranges.size)
+    scratch = room(widest)
     for b in range(blocks):
         _copy_members(old_first, old_count[b], old_member[b], first, count[b], member[b])
         _refine(

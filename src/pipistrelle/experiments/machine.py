@@ -3,12 +3,15 @@
 import os
 from collections.abc import Sequence
 from contextlib import suppress
+from pathlib import Path
 
 from pipistrelle.config import InputError, RayConfig
 from pipistrelle.estimation.rays import ray_members
 
 DOUBLE = 8
 """Bytes of a number."""
+LIMIT = Path("/sys/fs/cgroup/memory.max")
+"""What a container may have: a number of bytes, or a word."""
 MALLOPT = ((-3, 32 << 20), (-1, 256 << 20))
 """Of the GNU C library: arrays up to 32 MB come from the heap; it shrinks when 256 MB are free."""
 
@@ -66,15 +69,18 @@ def _bytes(way: str, landmarks: int, members: int, particles: int) -> float:
     """Most that a filter holds at once: all landmarks are there, and all of them still rays."""
     if way == "ekf":  # covariances: the one before, the one at work, the one after
         return 3.0 * DOUBLE * (3 + 2 * members) ** 2
-    return 2.0 * DOUBLE * particles * (6 * members + landmarks)  # before and after
+    # Swarms: the one before, the corrected one, the resampled one.
+    return 3.0 * DOUBLE * particles * (6 * members + landmarks)
 
 
 def installed() -> float:
-    """Return this machine's memory [bytes]; infinite where it does not say."""
-    try:
-        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    except (AttributeError, ValueError, OSError):
-        return float("inf")
+    """Return the memory of this machine, or of its share in a container [bytes]; else infinity."""
+    have = float("inf")
+    with suppress(AttributeError, ValueError, OSError):
+        have = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    with suppress(ValueError, OSError):
+        have = min(have, float(LIMIT.read_text()))
+    return have
 
 
 def keep_freed_memory() -> None:
