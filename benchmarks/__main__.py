@@ -2,12 +2,13 @@
 
 import sys
 from datetime import UTC, datetime
-from os import devnull
+from math import inf
 from pathlib import Path
 from statistics import median
 from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
+from cyclopts.types import ExistingFile
 from cyclopts.validators import Number
 
 from benchmarks import peer, programs, stages, study
@@ -37,7 +38,7 @@ def bench(
     worlds: Annotated[int, Parameter(validator=Number(gt=2))] = 8,
     scaling: bool = False,
     save: bool = False,
-    against: Path | None = None,
+    against: ExistingFile | None = None,
 ) -> None:
     """Measure, print the table, write benchmarks/latest.json.
 
@@ -48,7 +49,7 @@ def bench(
     k
         Time the stages whose names match this expression of pytest's, and do nothing else.
     quick
-        Fewer rounds and three worlds, to try the bench itself; writes nothing.
+        Three worlds, and each program once, to try the bench itself; writes nothing.
     worlds
         How many worlds of the study to run, at least 3.
     scaling
@@ -59,7 +60,7 @@ def bench(
         The file to compare with; without it, the newest one kept.
     """
     if k is not None:
-        print(stages.timed(Path(devnull), "-k", k))
+        show(list(stages.rows(stages.timed_stages("-k", k))))
         return
     path = against or newest(HISTORY)
     before = None if path is None else rows_of(read(path))
@@ -113,7 +114,8 @@ def compare(rows: list[Row], before: list[Row], name: str) -> None:
     """Say which rows became worse than in another run; a report, not a verdict."""
     worse = grown(rows, before, WORSE)
     for row, factor in worse:
-        print(f"{row}: {factor:.2f} times as much as in {name}")
+        told = "kept its promise" if factor == inf else f"was {factor:.2f} times better"
+        print(f"{row}: {told} in {name}")
     if not worse:
         print(f"No row is worse than {WORSE} times what it was in {name}.")
 

@@ -16,12 +16,15 @@ from benchmarks.study import command_slice
 from benchmarks.table import Row
 
 LANDMARKS = (10, 25, 50, 100, 200)
+MAPPED = (25, 50, 100, 200, 400)
+BEARINGS = 20
+"""Landmarks of the worlds that are heard, and of the EKF's maps; bearings in a frame of the EKF."""
 WORLDS = (2, 6)
 COMMAND = "./dev bench --only growth --scaling"
 ROWS = {
-    "frame_growth": ("arrivals", "frame_s", "frame"),
-    "ekf_growth": ("states", "ekf_s", "measurement"),
-    "fastslam_growth": ("landmarks", "fastslam_s", "measurement"),
+    "frame_growth": ("arrivals", "frame_s", "a frame"),
+    "ekf_growth": ("states", "ekf_s", f"a frame of {BEARINGS} bearings"),
+    "fastslam_growth": ("landmarks", "fastslam_s", "a measurement"),
 }
 """What is drawn against what."""
 
@@ -29,49 +32,82 @@ ROWS = {
 def measure() -> tuple[list[Row], list[float]]:
     """Time growing worlds in a process of their own: the rows."""
     sizes = answer("-m", "benchmarks.growth")["points"]
-    rows = [_exponent(name, sizes) for name in ROWS]
+    rows = [_power(name, sizes) for name in ROWS]
     few, many = (command_slice(worlds, 1).peak / 1e6 for worlds in WORLDS)
     note = f"peak of {WORLDS[1]} worlds ({many:.0f} MB) less that of {WORLDS[0]} ({few:.0f} MB)"
     return [*rows, row("memory_growth_mb", many - few, COMMAND, note=note)], []
 
 
-def _exponent(name: str, sizes: list[dict[str, float]]) -> Row:
-    """Fit a power of the three largest sizes; name all points."""
+def _power(name: str, points: list[dict[str, float]]) -> Row:
+    """Fit a power of the size to what the three largest cost more than the smallest; name all.
+
+    What every size costs alike would hide the growth. Where the cost falls, the power of it all.
+    """
     abscissa, ordinate, each = ROWS[name]
-    x, y = (np.array([point[key] for point in sizes]) for key in (abscissa, ordinate))
-    slope = float(np.polyfit(np.log(x[-3:]), np.log(y[-3:]), 1)[0])
+    x, y = np.array([(p[abscissa], p[ordinate]) for p in points if ordinate in p]).T
+    rising = (y[-3:] > y[0]).all()
+    size, cost = (x[-3:] - x[0], y[-3:] - y[0]) if rising else (x[-3:], y[-3:])
+    power = float(np.polyfit(np.log(size), np.log(cost), 1)[0])
     told = ", ".join(f"{a:.0f}: {1e6 * b:.3g}" for a, b in zip(x, y, strict=True))
-    note = f"slope over the three largest; us a {each} by {abscissa}: {told}"
-    return row(name, slope, COMMAND, ratio=slope, note=note)
+    fitted = (
+        "of what the three largest cost above the smallest" if rising else "of the three largest"
+    )
+    return row(name, power, COMMAND, ratio=power, note=f"{fitted}; us {each} by {abscissa}: {told}")
 
 
 def points() -> list[dict[str, float]]:
-    """Time a frame, and a measurement in both filters, in worlds of more and more landmarks."""
-    from benchmarks.worlds import scans_of, some_frames, world_of
-    from pipistrelle.config import Config, ScenarioConfig
+    """Time frames, the EKF and FastSLAM in worlds and maps of more and more landmarks."""
     from pipistrelle.experiments.kernels import compile_kernels
-    from pipistrelle.experiments.listening import listen
     from pipistrelle.experiments.machine import keep_freed_memory
-    from pipistrelle.experiments.trial import Case, drive_of, run_trial
 
     keep_freed_memory()  # as the command does
     compile_kernels()
-    found = []
-    for landmarks in LANDMARKS:
-        config = Config(scenario=ScenarioConfig(landmarks=landmarks, spacing=0.5))
-        world, radii = world_of(config), (config.emitter.radius,)
-        few, drive = some_frames(world, 25), drive_of(world, config)
-        scans = scans_of(config, "fused")
-        measurements = sum(scan.landmark.size for scan in scans)
-        point = {"landmarks": landmarks, "arrivals": 2.0 * landmarks + 1.0}
-        point["frame_s"] = _cpu(15, listen, few, config, radii) / (len(few.controls) // 4)
-        for name in ("ekf", "fastslam"):
-            case = Case(strategy="fused", filter=name)
-            point[f"{name}_s"] = _cpu(5, run_trial, case, drive, scans, config) / measurements
-        final = run_trial(Case(strategy="fused", filter="ekf"), drive, scans, config)
-        point["states"] = 3.0 + 2.0 * final.track.landmarks.landmark.size
-        found.append(point)
-    return found
+    return [*map(_heard, LANDMARKS), *map(_mapped, MAPPED)]
+
+
+def _heard(landmarks: int) -> dict[str, float]:
+    """Time a frame, and a measurement in FastSLAM, in a world of so many landmarks."""
+    from benchmarks.worlds import scans_of, some_frames, world_of
+    from pipistrelle.config import Config, ScenarioConfig
+    from pipistrelle.experiments.listening import listen
+    from pipistrelle.experiments.trial import Case, drive_of, run_trial
+
+    config = Config(scenario=ScenarioConfig(landmarks=landmarks, spacing=0.5))
+    world, radii = world_of(config), (config.emitter.radius,)
+    few, scans = some_frames(world, 25), scans_of(config, "fused")
+    frame_s = _cpu(15, listen, few, config, radii) / (len(few.controls) // 4)
+    case, drive = Case(strategy="fused", filter="fastslam"), drive_of(world, config)
+    measurements = sum(scan.landmark.size for scan in scans)
+    return {
+        "landmarks": landmarks,
+        "arrivals": 2 * landmarks + 1,
+        "frame_s": frame_s,
+        "fastslam_s": _cpu(5, run_trial, case, drive, scans, config) / measurements,
+    }
+
+
+def _mapped(landmarks: int) -> dict[str, float]:
+    """Time a frame of bearings to some of the landmarks of a map, four control steps included."""
+    from pipistrelle.config import Config
+    from pipistrelle.detection.scans import Scan
+    from pipistrelle.estimation.models import Gaussian
+    from pipistrelle.experiments.scenario import bicycle
+    from pipistrelle.experiments.trial import estimator
+
+    rng, label = np.random.default_rng(landmarks), np.arange(landmarks)
+    slam = estimator("ekf", bicycle(Config().motion), Config())
+    start = slam.init(Gaussian(mean=np.zeros(3), covariance=np.eye(3)))
+    bearing, distance = rng.uniform(-3.0, 3.0, landmarks), rng.uniform(2.0, 20.0, landmarks)
+    known = slam.update(start, Scan(time=0.0, landmark=label, bearing=bearing, range=distance), rng)
+    some = label[:: landmarks // BEARINGS][:BEARINGS]
+    nothing = np.full(BEARINGS, np.nan)
+    scan = Scan(time=1.0, landmark=some, bearing=bearing[some], range=nothing)
+
+    def frame() -> None:
+        carried, _ = slam.predict(known, np.zeros((4, 2)), np.full(4, 0.25))
+        slam.update(carried, scan, rng)
+
+    return {"states": 3 + 2 * landmarks, "ekf_s": _cpu(101, frame)}
 
 
 def _cpu(rounds: int, task: Callable[..., object], *arguments: object) -> float:

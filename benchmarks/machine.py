@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import shlex
 import subprocess
 import sys
 from datetime import UTC, datetime
@@ -32,15 +33,19 @@ def facts() -> dict[str, Any]:
 
 
 def python(*arguments: str, **changes: str) -> str:
-    """Run this interpreter from the repository's root, and return what it prints."""
+    """Run this interpreter from the repository's root, and return what it prints.
+
+    Where it fails, what it printed is told, and the bench ends.
+    """
     done = subprocess.run(
         [sys.executable, *arguments],
         cwd=ROOT,
         env=os.environ | changes,
         stdout=subprocess.PIPE,
         text=True,
-        check=True,
     )
+    if done.returncode:
+        sys.exit(f"{done.stdout}\nbench: {shlex.join(arguments)} ended with {done.returncode}")
     return done.stdout
 
 

@@ -7,6 +7,7 @@ stays small (a child is charged with its parent's memory) and the documentation 
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from math import inf
 from pathlib import Path
 from typing import Any, Literal
 
@@ -143,7 +144,8 @@ def grown(now: Sequence[Row], before: Sequence[Row], factor: float) -> list[tupl
     """Rows that became worse by more than a factor, and by how much.
 
     Ratios are compared where both runs have one, so that a slower or a busier machine is no
-    regression; else the values. Where more is better, the factor is the other way up.
+    regression; else the values. Where more is better, the factor is the other way up. Nothing can
+    be some times worse than zero: such a row is infinitely worse when it breaks its promise.
     """
     known = {row.name: row for row in before}
     worse = []
@@ -157,4 +159,6 @@ def grown(now: Sequence[Row], before: Sequence[Row], factor: float) -> list[tupl
             new, past = past, new
         if past > 0.0 and new / past > factor:
             worse.append((row.name, new / past))
+        elif past <= 0.0 and met(old) and not met(row):
+            worse.append((row.name, inf))
     return worse

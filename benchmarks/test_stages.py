@@ -5,6 +5,7 @@ timings of the yardstick; what one round consists of is kept beside it.
 """
 
 import time
+from statistics import median
 
 import pytest
 
@@ -45,15 +46,23 @@ def test_listening_through_twelve_beams(benchmark):
     benchmark.pedantic(listen, (WORLD, CONFIG, RADII), rounds=5, warmup_rounds=1)
 
 
-def test_listening_to_few_frames_by_blocks(benchmark):
-    benchmark.extra_info["frames"] = 15
-    benchmark.pedantic(listen, (FEW, CONFIG, ONE), rounds=25, warmup_rounds=3)
-
-
-def test_listening_to_few_frames_by_samples(benchmark):
-    benchmark.extra_info["frames"] = 15
+def test_listening_to_few_frames_by_samples_and_by_blocks(benchmark):
+    """Time the dense engine and, before each of its rounds, the block engine."""
+    blocks, rounds = [], 5
     dense = CONFIG.model_copy(update={"receiver": ReceiverConfig(engine="dense")})
-    benchmark.pedantic(listen, (FEW, dense, ONE), rounds=3, warmup_rounds=1)
+
+    def by_blocks():
+        took = []
+        for _ in range(15):
+            began = time.process_time()
+            listen(FEW, CONFIG, ONE)
+            took.append(time.process_time() - began)
+        blocks.append(median(took))
+
+    benchmark.extra_info["frames"] = 15
+    benchmark.pedantic(listen, (FEW, dense, ONE), setup=by_blocks, rounds=rounds, warmup_rounds=1)
+    pairs = zip(benchmark.stats.stats.data, blocks[-rounds:], strict=True)
+    benchmark.extra_info["over_blocks"] = median(samples / block for samples, block in pairs)
 
 
 @pytest.mark.parametrize("strategy", ["active", "fused", "passive"])

@@ -32,6 +32,10 @@ def test_kernels_are_kept_in_the_users_cache_by_the_state_of_the_sources(tmp_pat
     assert said == []
 
 
+def test_relative_cache_folder_of_the_desktop_is_not_taken(tmp_path):
+    assert place(tmp_path, XDG_CACHE_HOME="here") == place(tmp_path)
+
+
 def test_folder_that_the_user_names_is_taken(tmp_path):
     folder, said = place(tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "mine"))
     assert (folder, said) == (tmp_path / "mine", [])

@@ -52,10 +52,12 @@ def _wanted() -> Path:
     """Return where compiled kernels should be kept."""
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
         return Path(chosen)
-    try:
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
-    except RuntimeError:  # a user without a home
-        cache = Path(os.devnull)
+    cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    if not cache.is_absolute():  # as the specification wants it
+        try:
+            cache = Path("~/.cache").expanduser()
+        except RuntimeError:  # a user without a home
+            cache = Path(os.devnull)
     return cache / "pipistrelle" / _key()
 
 

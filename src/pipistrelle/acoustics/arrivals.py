@@ -135,7 +135,8 @@ def arrivals_of_emissions(
     Returns
     -------
     Arrivals
-        Those of the first emission, then those of the second, and so on.
+        Those of the first emission, then those of the second, and so on, each in the order of
+        `arrivals_of_emission`.
     count : (k)
         How many belong to each emission.
 

@@ -195,7 +195,7 @@ def _energy(parts, elements):
 def _candidates(energy, threshold, row):
     """Tests over the threshold that beat both their neighbours a row away.
 
-    Chosen without branches, which could not be predicted: every test is written, few are kept.
+    Every test is written and few are kept: a branch on each could not be predicted.
     """
     test, count, kept = np.empty(energy.size + 1, dtype=np.int64), 0, 0
     for t in range(energy.size):
@@ -253,7 +253,7 @@ def _scan_power(x, table, power):
 def _peaks(power, ratio, place):
     """Write where the power peaks, not far under its highest; return the number of peaks.
 
-    Chosen without branches, as the candidates are.
+    Chosen as the candidates are.
     """
     count, kept, last = 0, 0, power.size - 1
     for i in range(1, last):

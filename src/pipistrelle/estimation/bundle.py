@@ -203,10 +203,11 @@ def correct_ray(pose, rows, count, members, bearing, sensing, exact, scratch):
 @lean
 def _prune(rows, count, members, prune, scratch):
     """Drop members whose aggregated likelihood is too small; the heaviest stays (Eq. (21))."""
-    least, total = scratch.largest, scratch.total
-    _largest(scratch.posterior, members, least)
+    largest, total = scratch.largest, scratch.total
+    _largest(scratch.posterior, members, largest)
+    least = largest  # which is not needed any more
     for i in range(LANES):
-        least[i] = min(prune / count[i], exponential(least[i]))
+        least[i] = min(prune / count[i], exponential(largest[i]))
         total[i] = 0.0
     dropped = 0
     for j in range(members):

@@ -204,7 +204,7 @@ class EkfSlam:
         )
 
 
-class _Room(NamedTuple):
+class _Scratch(NamedTuple):
     """Room to work on the members of one landmark, and on the order of the state's numbers."""
 
     likelihood: Float[np.ndarray, " m"]
@@ -214,9 +214,9 @@ class _Room(NamedTuple):
 
 
 @kernel
-def _room(members):
+def _scratch(members):
     """Make room for so many members."""
-    return _Room(
+    return _Scratch(
         np.empty(members),
         np.empty(members),
         np.empty(members, np.bool_),
@@ -237,7 +237,7 @@ def _members_of(landmark, members, label):
 
 
 @lean
-def _correct_ray(joint, weight, members, first, count, bearing, sensing, room):
+def _correct_ray(joint, weight, members, first, count, bearing, sensing, scratch):
     """Weigh a ray's members by a bearing and share it among them; GATED when none expected it."""
     mean, size, variance = joint.mean, 3 + 2 * members, sensing.bearing_variance
     outcome = GATED
@@ -246,30 +246,32 @@ def _correct_ray(joint, weight, members, first, count, bearing, sensing, room):
         _, expected, c, s, k = sight(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
         innovation = wrap_angle(bearing - expected)
         S = bearing_variance(joint, size, i, c, s, k) + variance
-        room.likelihood[j] = log_likelihood(innovation, S)
+        scratch.likelihood[j] = log_likelihood(innovation, S)
         if innovation * innovation <= sensing.passive_bound * S:
             outcome = APPLIED
     if outcome == GATED:
         return GATED
     weigh_and_share(
-        room.likelihood, weight[first:], count, sensing.power, sensing.aggregated, room.share
+        scratch.likelihood, weight[first:], count, sensing.power, sensing.aggregated, scratch.share
     )
     for j in range(count):
-        if room.share[j] > 0.0:
+        if scratch.share[j] > 0.0:
             i = 3 + 2 * (first + j)
-            correct_bearing(joint, size, i, bearing, variance / room.share[j], np.inf)
+            correct_bearing(joint, size, i, bearing, variance / scratch.share[j], np.inf)
     return APPLIED
 
 
 @lean
 def _range_for_ray(
-    joint, landmark, weight, members, first, count, distance, bearing, sensing, room
+    joint, landmark, weight, members, first, count, distance, bearing, sensing, scratch
 ):
     """Give a partial landmark its range: one member is left. Returns the members left."""
     left = 0 if sensing.reinitialise else heaviest(weight[first:], count)
     for j in range(count):
-        room.keep[j] = j == left
-    members = drop_members(joint, landmark, weight, members, first, count, room.keep, room.source)
+        scratch.keep[j] = j == left
+    members = drop_members(
+        joint, landmark, weight, members, first, count, scratch.keep, scratch.source
+    )
     weight[first] = 1.0
     mean, size, i = joint.mean, 3 + 2 * members, 3 + 2 * first
     if sensing.reinitialise:
@@ -285,7 +287,7 @@ def _range_for_ray(
 
 
 @lean
-def _correct_known(joint, landmark, weight, members, label, bearing, distance, sensing, room):
+def _correct_known(joint, landmark, weight, members, label, bearing, distance, sensing, scratch):
     """Correct with one measurement of a mapped landmark: the members left, and whether gated."""
     first, count = _members_of(landmark, members, label)
     size, i, passive = 3 + 2 * members, 3 + 2 * first, math.isnan(distance)
@@ -299,18 +301,18 @@ def _correct_known(joint, landmark, weight, members, label, bearing, distance, s
             sensing.range_variance, sensing.bearing_variance, sensing.active_bound,
         )  # fmt: skip
     elif passive:
-        outcome = _correct_ray(joint, weight, members, first, count, bearing, sensing, room)
-        if (
-            outcome == APPLIED
-            and survivors(weight[first:], count, sensing.prune, room.keep) < count
-        ):
+        outcome = _correct_ray(joint, weight, members, first, count, bearing, sensing, scratch)
+        keep, kept = scratch.keep, count
+        if outcome == APPLIED:
+            kept = survivors(weight[first:], count, sensing.prune, keep)
+        if kept < count:
             members = drop_members(
-                joint, landmark, weight, members, first, count, room.keep, room.source
+                joint, landmark, weight, members, first, count, keep, scratch.source
             )
     else:
         outcome = APPLIED
         members = _range_for_ray(
-            joint, landmark, weight, members, first, count, distance, bearing, sensing, room
+            joint, landmark, weight, members, first, count, distance, bearing, sensing, scratch
         )
     return members, outcome
 
@@ -342,7 +344,7 @@ def _update(old_mean, old_covariance, old_landmark, old_weight, labels, bearings
         known[m] = _members_of(old_landmark, members, labels[m])[1] > 0
         if not known[m]:
             most += sensing.ray_ranges.size if math.isnan(ranges[m]) else 1
-    joint, room = joint_of(old_mean, old_covariance, 3 + 2 * most), _room(most)
+    joint, scratch = joint_of(old_mean, old_covariance, 3 + 2 * most), _scratch(most)
     landmark, weight, gated = np.empty(most, dtype=np.int64), np.empty(most), 0
     for member in range(members):
         landmark[member], weight[member] = old_landmark[member], old_weight[member]
@@ -350,7 +352,7 @@ def _update(old_mean, old_covariance, old_landmark, old_weight, labels, bearings
         if known[m]:
             members, outcome = _correct_known(
                 joint, landmark, weight, members, labels[m], bearings[m], ranges[m], sensing,
-                room,
+                scratch,
             )  # fmt: skip
             gated += outcome
     settle(joint, 3 + 2 * members)
