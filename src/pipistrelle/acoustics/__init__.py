@@ -6,25 +6,14 @@ throws in each direction. `arrivals` puts the three together: every echo and cal
 of vehicle and beacon brings to the vehicle, as plain arrays for the ears of `arrays`.
 """
 
-from importlib import import_module
+from lazy_loader import attach
 
-_DOOR = {
-    "Arrivals": "arrivals",
-    "absorption_db_per_m": "propagation",
-    "arrivals_of_emission": "arrivals",
-    "beamwidth": "emitter",
-    "piston_directivity": "emitter",
-    "piston_radius": "emitter",
-    "target_strength_db": "target",
-    "through_piston": "arrivals",
-}
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *_DOOR])
-
-
-def __getattr__(name: str) -> object:
-    if name not in _DOOR:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_DOOR[name]}"), name)
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    submod_attrs={
+        "arrivals": ["Arrivals", "arrivals_of_emission", "through_piston"],
+        "emitter": ["beamwidth", "piston_directivity", "piston_radius"],
+        "propagation": ["absorption_db_per_m"],
+        "target": ["target_strength_db"],
+    },
+)

@@ -7,25 +7,13 @@ sums over 0.2 ms blocks, in the noise of `noise`, any sample of which is known b
 smallest error of a bearing.
 """
 
-from importlib import import_module
+from lazy_loader import attach
 
-_DOOR = {
-    "add_echo_blocks": "receiver",
-    "beampattern": "beamforming",
-    "beamscan": "beamforming",
-    "bearing_bound": "beamforming",
-    "noise_blocks": "receiver",
-    "record_samples": "receiver",
-    "sampling": "receiver",
-    "square_of_four": "layout",
-}
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *_DOOR])
-
-
-def __getattr__(name: str) -> object:
-    if name not in _DOOR:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_DOOR[name]}"), name)
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    submod_attrs={
+        "beamforming": ["beampattern", "beamscan", "bearing_bound"],
+        "layout": ["square_of_four"],
+        "receiver": ["add_echo_blocks", "noise_blocks", "record_samples", "sampling"],
+    },
+)

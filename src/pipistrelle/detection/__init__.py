@@ -6,25 +6,14 @@ Abaid, Sec. II-D). Recorded drives take the place of all: `logs` reads this proj
 and `mrclam` those of UTIAS MRCLAM, their tables by way of `columns`.
 """
 
-from importlib import import_module
+from lazy_loader import attach
 
-_DOOR = {
-    "Scan": "scans",
-    "average_faces": "scans",
-    "detect": "snapshots",
-    "detector": "snapshots",
-    "filter_blocks": "matched",
-    "read_log": "logs",
-    "scan_of": "scans",
-    "write_log": "logs",
-}
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *_DOOR])
-
-
-def __getattr__(name: str) -> object:
-    if name not in _DOOR:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_DOOR[name]}"), name)
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    submod_attrs={
+        "logs": ["read_log", "write_log"],
+        "matched": ["filter_blocks"],
+        "scans": ["Scan", "average_faces", "scan_of"],
+        "snapshots": ["detect", "detector"],
+    },
+)

@@ -6,25 +6,14 @@ swarm of sampled paths with a map each (Sec. III-B); both place a landmark of wh
 is known as one of `rays` (Sec. III-C). The other modules are their kernels.
 """
 
-from importlib import import_module
+from lazy_loader import attach
 
-_DOOR = {
-    "EkfSlam": "ekf",
-    "FastSlam": "fastslam",
-    "Gaussian": "models",
-    "Landmarks": "models",
-    "Motion": "models",
-    "Track": "models",
-    "motion_step": "models",
-    "ray_members": "rays",
-}
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *_DOOR])
-
-
-def __getattr__(name: str) -> object:
-    if name not in _DOOR:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_DOOR[name]}"), name)
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    submod_attrs={
+        "ekf": ["EkfSlam"],
+        "fastslam": ["FastSlam"],
+        "models": ["Gaussian", "Landmarks", "Motion", "Track", "motion_step"],
+        "rays": ["ray_members"],
+    },
+)

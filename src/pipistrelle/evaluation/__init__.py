@@ -5,25 +5,12 @@ best; `consistency` asks by the NEES whether they are as large as the filter bel
 or over many (Bradley & Abaid, Sec. V-A).
 """
 
-from importlib import import_module
+from lazy_loader import attach
 
-_DOOR = {
-    "alignment": "accuracy",
-    "anees": "consistency",
-    "anees_bounds": "consistency",
-    "diverged": "consistency",
-    "heaviest": "accuracy",
-    "nees": "consistency",
-    "pose_error": "accuracy",
-    "rmse": "accuracy",
-}
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *_DOOR])
-
-
-def __getattr__(name: str) -> object:
-    if name not in _DOOR:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_DOOR[name]}"), name)
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    submod_attrs={
+        "accuracy": ["alignment", "heaviest", "pose_error", "rmse"],
+        "consistency": ["anees", "anees_bounds", "diverged", "nees"],
+    },
+)

@@ -6,25 +6,16 @@ the truth does so. `replay` puts a recorded log to the same filters; `results`, 
 `folder`, scores and keeps what came of either.
 """
 
-from importlib import import_module
+from lazy_loader import attach
 
-_DOOR = {
-    "draw_scenario": "scenario",
-    "label_detections": "association",
-    "listen": "listening",
-    "load": "replay",
-    "run_filter": "trial",
-    "run_mission": "trial",
-    "run_trial": "trial",
-    "write_results": "results",
-}
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *_DOOR])
-
-
-def __getattr__(name: str) -> object:
-    if name not in _DOOR:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_DOOR[name]}"), name)
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    submod_attrs={
+        "association": ["label_detections"],
+        "listening": ["listen"],
+        "replay": ["load"],
+        "results": ["write_results"],
+        "scenario": ["draw_scenario"],
+        "trial": ["run_filter", "run_mission", "run_trial"],
+    },
+)

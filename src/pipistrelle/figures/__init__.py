@@ -5,18 +5,13 @@ a filter believes while it runs and plays it back. Both put together the pieces 
 one look of `style`.
 """
 
-from importlib import import_module
+from lazy_loader import attach
 
-_DOOR = {
-    "MissionRecorder": "animation",
-    "animate_mission": "animation",
-    "draw_mission": "mission",
-    "save_figure": "style",
-}
-__all__ = list(_DOOR)
-
-
-def __getattr__(name: str) -> object:
-    if name not in _DOOR:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_DOOR[name]}"), name)
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    submod_attrs={
+        "animation": ["MissionRecorder", "animate_mission"],
+        "mission": ["draw_mission"],
+        "style": ["save_figure"],
+    },
+)

@@ -6,18 +6,14 @@ as statements about means over worlds, from the `contrasts` of cases, and `claim
 `pipistrelle.figures.paper` for print; `page` writes it all.
 """
 
-from importlib import import_module
+from lazy_loader import attach
 
-_DOOR = {
-    "Study": "outcomes",
-    "judge_claims": "claims",
-    "read_study": "tables",
-    "write_report": "page",
-}
-__all__ = list(_DOOR)
-
-
-def __getattr__(name: str) -> object:
-    if name not in _DOOR:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_DOOR[name]}"), name)
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    submod_attrs={
+        "claims": ["judge_claims"],
+        "outcomes": ["Study"],
+        "page": ["write_report"],
+        "tables": ["read_study"],
+    },
+)
