@@ -78,3 +78,25 @@ def test_key_changes_with_a_kernel_and_not_with_what_compiles_none(tmp_path, mon
     assert pipistrelle._key() == before
     (tmp_path / "kernel.py").write_text("from numba import njit  # changed\n")
     assert pipistrelle._key() != before
+
+
+def test_kernels_of_the_states_used_last_are_kept_and_nothing_else_is_touched(tmp_path):
+    home = tmp_path / ".cache" / "pipistrelle"
+    states = [home / f"{n:016x}" for n in range(6)]
+    for age, state in enumerate(states):
+        (state / "kernel.nbc").mkdir(parents=True)
+        os.utime(state, (1e9 - age, 1e9 - age))
+    (home / "notes").mkdir()
+    folder, said = place(tmp_path)
+    assert {path.name for path in home.iterdir()} == {
+        folder.name, "notes", *(state.name for state in states[:3])
+    }  # fmt: skip
+    assert said == []
+
+
+def test_folder_that_the_user_names_is_not_cleared(tmp_path):
+    states = [tmp_path / "mine" / f"{n:016x}" for n in range(6)]
+    for state in states:
+        state.mkdir(parents=True)
+    place(tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "mine" / f"{0:016x}"))
+    assert all(state.is_dir() for state in states)

@@ -3,16 +3,21 @@
 Importing the package chooses where compiled kernels are kept, by setting ``NUMBA_CACHE_DIR``
 where it is not set: a folder of the user's cache, one per state of the sources. (Beside each
 source, Numba's own choice, an update of one file would leave the kernels of another as they were.)
-Where that folder cannot be written, a temporary one takes its place, and a line says so.
+Where that folder cannot be written, a temporary one takes its place, and a line says so. Of other
+states, the kernels that were used last are kept and the rest are removed.
 """
 
 import os
+import re
 import sys
 import tempfile
 from hashlib import sha256
 from pathlib import Path
 
 __version__ = "0.1.0"
+
+_STATES = 4
+"""How many states of the sources keep their kernels."""
 
 
 def _key() -> str:
@@ -61,8 +66,25 @@ def _wanted() -> Path:
     return cache / "pipistrelle" / _key()
 
 
+def _drop_old(folder: Path) -> None:
+    """Mark a state's kernels as used, and remove those of the states used longest ago."""
+    try:
+        os.utime(folder)
+        states = [
+            other for other in folder.parent.iterdir() if re.fullmatch("[0-9a-f]{16}", other.name)
+        ]
+        states.sort(key=lambda state: state.stat().st_mtime)
+    except OSError:  # another process removes them just now
+        return
+    for old in states[:-_STATES]:
+        import shutil
+
+        shutil.rmtree(old, ignore_errors=True)
+
+
 def _place_kernels() -> None:
     """Tell Numba where to keep compiled kernels."""
+    chosen = bool(os.environ.get("NUMBA_CACHE_DIR"))
     folder = wanted = _wanted()
     if not _writable(wanted):
         folder = _temporary() / _key()
@@ -72,6 +94,8 @@ def _place_kernels() -> None:
             file=sys.stderr,
         )
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
+    if not chosen:
+        _drop_old(folder)
     if "numba" in sys.modules:  # it looked when it was imported
         sys.modules["numba"].core.config.reload_config()
 
