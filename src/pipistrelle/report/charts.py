@@ -22,6 +22,7 @@ HEADING = ("heading_rmse_rad", "Vehicle heading RMSE", "heading RMSE [°]", 180.
 MAP = (COMMON, "Map RMSE of the landmarks that every strategy has placed", "map RMSE [m]", 1.0)
 ERRORS = {"position_rmse_m": POSITION, "heading_rmse_deg": HEADING, "map_rmse_m": MAP}
 """Score, title, axis and scale from the score to the axis, by the column of the CSV."""
+DIFFERENCE = "active minus fused; open: not significant"
 
 
 def study_charts(study: Study, rule: Rule) -> list[Chart]:
@@ -70,7 +71,7 @@ def gains(study: Study, rule: Rule) -> Chart:
             mean = np.array([finding.mean for finding in findings])
             alone = np.array([finding.alone for finding in findings])
             alone[~np.isfinite(alone)] = np.nan
-            found[name] = _about("active minus fused", "fused", study.beamwidth, mean, alone,
+            found[name] = _about(DIFFERENCE, "fused", study.beamwidth, mean, alone,
                                  [finding.holds is not None for finding in findings])  # fmt: skip
         axis = linear_axis(f"{what} gain [m]", [0.0, *ends(found.values())])
         panels += [
