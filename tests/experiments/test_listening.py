@@ -1,12 +1,18 @@
 """What a path hears: beams, engines, the truth's one place, and what the beacon's own call does."""
 
 from collections import Counter
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
-from pipistrelle.acoustics.arrivals import PASSIVE, arrivals_of_emission, rows_of, through_piston
+from pipistrelle.acoustics.arrivals import (
+    ACTIVE,
+    PASSIVE,
+    arrivals_of_emission,
+    rows_of,
+    through_piston,
+)
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.noise import stream_key
 from pipistrelle.arrays.receiver import (
@@ -16,10 +22,10 @@ from pipistrelle.arrays.receiver import (
     noise_blocks,
     sampling,
 )
-from pipistrelle.config import Config, EmitterConfig, ReceiverConfig, ScenarioConfig
+from pipistrelle.config import Config, EmitterConfig, InputError, ReceiverConfig, ScenarioConfig
 from pipistrelle.detection.matched import filter_blocks, filter_samples
 from pipistrelle.detection.scans import UNLABELLED, Heard
-from pipistrelle.detection.snapshots import detect, detector
+from pipistrelle.detection.snapshots import Detections, detect, detector
 from pipistrelle.experiments import listening
 from pipistrelle.experiments.association import faintest_level_db, label_detections
 from pipistrelle.experiments.listening import listen
@@ -217,6 +223,45 @@ def test_the_beacons_own_call_makes_hardly_a_false_detection_and_hides_few_echoe
     assert rate["active hidden"] < 0.03 * rate["active without the call"]
     assert 0.0 < rate["passive hidden"] < 0.06 * rate["passive without the call"]
     assert rate["active given up"] < 0.03 * rate["active without leakage"]
+
+
+@pytest.mark.parametrize(("elements", "spacing"), [(8, 0.0049), (16, 0.0049), (10, 0.0030)])
+def test_a_layout_of_ones_own_hears_as_the_settings_own_of_that_size_do(elements, spacing):
+    world, config = short(40)
+    place = (np.arange(elements) - 0.5 * (elements - 1)) * spacing
+    given = listen(world, config, (0.0088,), layout=replace(LAYOUT, position=place))
+    receiver = ReceiverConfig(elements=elements, spacing=spacing)
+    settled = listen(world, config.model_copy(update={"receiver": receiver}), (0.0088,))
+    assert bits(given[0]) == bits(settled[0])
+    assert sum(heard.landmark.size for heard in given[0]) > 100
+
+
+def test_unequal_elements_are_refused():
+    world, config = short(8)
+    uneven = replace(LAYOUT, position=np.array([-0.01, 0.0, 0.004]))
+    with pytest.raises(InputError, match="equally spaced"):
+        listen(world, config, (0.0088,), layout=uneven)
+
+
+def test_beam_and_finder_of_ones_own_are_used():
+    world, config = short(40)
+
+    def deaf(arrivals, **piston):
+        own = arrivals.source == ACTIVE
+        return replace(arrivals, level_db=np.where(own, -300.0, arrivals.level_db))
+
+    def first_face(matched, detector, **timing):
+        found = detect(matched, detector, **timing)
+        return Detections(**{
+            field.name: getattr(found, field.name)[found.face == 0] for field in fields(found)
+        })  # fmt: skip
+
+    (silent,) = listen(world, config, (0.0088,), beam=deaf)
+    assert all(np.isnan(heard.range).all() for heard in silent)
+    (ahead,) = listen(world, config, (0.0088,), find=first_face)
+    bearings = np.concatenate([heard.bearing.ravel() for heard in ahead])
+    assert np.nanmax(np.abs(bearings)) <= np.radians(75.0) + 1e-9
+    assert sum(heard.landmark.size for heard in ahead) > 20
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from pipistrelle.arrays.layout import Layout
-from pipistrelle.config import Config
+from pipistrelle.config import Config, InputError
 from pipistrelle.detection.onset import arrival_lag, reach_of
 from pipistrelle.geometry import wrap
 from pipistrelle.jit import kernel, lean
@@ -98,10 +98,16 @@ def detector(config: Config, layout: Layout) -> Detector:
     ----------
     config : Config
     layout : Layout
+        Two equally spaced elements or more.
 
     Returns
     -------
     Detector
+
+    Raises
+    ------
+    InputError
+        When the elements are not equally spaced.
 
     Examples
     --------
@@ -112,15 +118,15 @@ def detector(config: Config, layout: Layout) -> Detector:
     """
     from scipy.special import gammainccinv
 
-    settings, receiver = config.detection, config.receiver
+    settings, elements = config.detection, layout.position.size
     tones = np.array([config.emitter.frequency, config.beacon.frequency])
-    wave = 2.0 * np.pi * tones * receiver.spacing / config.air.speed_of_sound
+    wave = 2.0 * np.pi * tones * _spacing(layout) / config.air.speed_of_sound
     edge = wave * math.sin(math.radians(settings.scan_limit_deg))
     count = 2 * math.ceil(edge.max() / SCAN_STEP) + 1
     scan = np.linspace(-1.0, 1.0, count) * edge[:, None]
-    turns = np.exp(-1j * np.arange(1, receiver.elements)[None, :, None] * scan[:, None, :])
+    turns = np.exp(-1j * np.arange(1, elements)[None, :, None] * scan[:, None, :])
     return Detector(
-        threshold=float(gammainccinv(receiver.elements, settings.false_alarm)),
+        threshold=float(gammainccinv(elements, settings.false_alarm)),
         leakage=10.0 ** (settings.leakage_db / 10.0),
         peak=10.0 ** (settings.peak_db / 10.0),
         sine_limit=math.sin(math.radians(settings.angle_limit_deg)),
@@ -129,6 +135,18 @@ def detector(config: Config, layout: Layout) -> Detector:
         scan=scan,
         table=np.stack((turns.real, turns.imag), axis=1),
     )
+
+
+def _spacing(layout: Layout) -> float:
+    """Distance of two neighbours [m], which must be that of all."""
+    place = layout.position
+    spacing = float(place[-1] - place[0]) / (place.size - 1) if place.size > 1 else 0.0
+    if spacing <= 0.0 or not np.allclose(np.diff(place), spacing, rtol=1e-6, atol=0.0):
+        raise InputError(
+            f"layout: found elements at {place.tolist()} m, expected two or more, equally spaced "
+            "and rising: the detector scans a uniform line array"
+        )
+    return spacing
 
 
 def detect(

@@ -55,6 +55,9 @@ def listen(
     radii: Sequence[float],
     *,
     iteration: int = 0,
+    beam: Callable[..., Arrivals] = through_piston,
+    layout: Layout | None = None,
+    find: Callable[..., Detections] = detect,
     progress: Progress | None = None,
 ) -> tuple[tuple[Heard, ...], ...]:
     """Hear every frame of a path, once for all beamwidths.
@@ -67,6 +70,12 @@ def listen(
         Radii of the vehicle's piston; ``config.emitter.radius`` is not used.
     iteration : int
         Number of the world, part of the noise's key.
+    beam : callable
+        Gives the vehicle's call its directivity, as `through_piston` does.
+    layout : Layout, optional
+        The arrays; those of the settings by default.
+    find : callable
+        Finds calls in the matched filter's output, as `detect` does.
     progress : callable, optional
 
     Returns
@@ -92,19 +101,20 @@ def listen(
     >>> len(wide), wide[1].time
     (2, 1.0)
     """
-    station, setup = _station(config), config.scenario
+    setup = config.scenario
+    station = _station(config, layout or square_of_four(config.receiver), find)
     engine = _dense if config.receiver.engine == "dense" else _blocks
     beams: tuple[list[Heard], ...] = tuple([] for _ in radii)
     frames = range(setup.steps_per_frame, len(scenario.path), setup.steps_per_frame)
-    emissions = _emissions(scenario, frames, radii, config)
+    emissions = _emissions(scenario, frames, radii, config, beam)
     for number, (k, aimed) in enumerate(zip(frames, emissions, strict=True), start=1):
         key = stream_key(config.seed, iteration, "noise", number)
         recorded = engine(aimed, station, key)
-        for beam, arrivals, detections in zip(beams, aimed, recorded, strict=True):
-            beam.append(_heard(float(scenario.time[k]), detections, arrivals, station))
+        for heard, arrivals, detections in zip(beams, aimed, recorded, strict=True):
+            heard.append(_heard(float(scenario.time[k]), detections, arrivals, station))
         if progress:
             progress("listening", number, len(frames))
-    return tuple(tuple(beam) for beam in beams)
+    return tuple(tuple(heard) for heard in beams)
 
 
 class Workspace:
@@ -129,19 +139,20 @@ class _Station:
     layout: Layout
     sampling: Sampling
     detector: Detector
+    find: Callable[..., Detections]
     faintest_db: float
     workspace: Workspace
 
 
-def _station(config: Config) -> _Station:
+def _station(config: Config, layout: Layout, find: Callable[..., Detections]) -> _Station:
     """Settle what every frame of a path is heard with."""
-    layout, settled = square_of_four(config.receiver), sampling(config)
-    finder = detector(config, layout)
+    settled, finder = sampling(config), detector(config, layout)
     return _Station(
         config=config,
         layout=layout,
         sampling=settled,
         detector=finder,
+        find=find,
         faintest_db=faintest_level_db(
             finder.threshold,
             elements=layout.position.size,
@@ -154,7 +165,11 @@ def _station(config: Config) -> _Station:
 
 
 def _emissions(
-    scenario: Scenario, frames: Sequence[int], radii: Sequence[float], config: Config
+    scenario: Scenario,
+    frames: Sequence[int],
+    radii: Sequence[float],
+    config: Config,
+    beam: Callable[..., Arrivals],
 ) -> Iterator[list[Arrivals]]:
     """Yield each frame's arrivals, one per piston; many frames are computed at a time."""
     for first in range(0, len(frames), TOGETHER):
@@ -165,7 +180,7 @@ def _emissions(
             poses, velocities, scenario.landmarks, scenario.beacon, config
         )
         aimed = [
-            through_piston(
+            beam(
                 emission,
                 radius=radius,
                 frequency=config.emitter.frequency,
@@ -219,7 +234,9 @@ def _blocks(aimed: Sequence[Arrivals], station: _Station, key: int) -> Iterator[
             noise_std=settled.noise_std,
             out=space.array("matched", lags),
         )
-        yield detect(matched, station.detector, start=pulse * BLOCK, interval=BLOCK, pulse=pulse)
+        yield station.find(
+            matched, station.detector, start=pulse * BLOCK, interval=BLOCK, pulse=pulse
+        )
 
 
 def _dense(aimed: Sequence[Arrivals], station: _Station, key: int) -> Iterator[Detections]:
@@ -244,4 +261,4 @@ def _dense(aimed: Sequence[Arrivals], station: _Station, key: int) -> Iterator[D
             noise_std=settled.noise_std,
         )
         start, interval = settled.pulse * BLOCK, 1.0 / settled.rate
-        yield detect(matched, station.detector, start=start, interval=interval, pulse=length)
+        yield station.find(matched, station.detector, start=start, interval=interval, pulse=length)
