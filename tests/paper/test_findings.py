@@ -1,5 +1,6 @@
 """The pages say what the study at full size found, as its report's summary has it."""
 
+import csv
 import json
 import re
 from pathlib import Path
@@ -44,3 +45,23 @@ def test_what_was_left_out_is_told():
     ekf, fastslam = FOUND["exclusions"]
     words = f"{ekf['excluded']} worlds for EKF-SLAM and {fastslam['excluded']} for FastSLAM 2.0"
     assert words in page
+
+
+def test_every_variant_of_the_study_stands_with_its_numbers():
+    page = (ROOT / "docs/findings.md").read_text(encoding="utf-8")
+    table = page.split("| verdicts 1 to 8 |")[1].split("\n\n")[0].splitlines()[2:]
+    path = ROOT / "papers/bradley_abaid/variants.csv"
+    with path.open(encoding="utf-8") as file:
+        variants = list(csv.DictReader(file))
+    told = {tuple(cell.strip() for cell in line.split("|")[2:5]) for line in table}
+    assert told == {
+        (
+            row["placed_passive_ekf"],
+            f"{row['left_out_ekf']} / {row['left_out_fastslam']}",
+            f"{float(row['gain_ekf_m']):.2f} / {float(row['gain_fastslam_m']):.2f} m",
+        )
+        for row in variants
+    }
+    assert len(table) == len(variants)
+    changed = [row["variant"] for row in variants if row["verdicts"] != variants[0]["verdicts"]]
+    assert changed == ["particles1000"], "the page says that no other changes a verdict"
