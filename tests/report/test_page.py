@@ -137,6 +137,14 @@ def test_a_partial_study_says_so_and_a_whole_one_does_not(reported, tmp_path, un
     assert "worlds are done" not in (tmp_path / "index.html").read_text(encoding="utf-8")
 
 
+def test_one_world_is_not_many(tmp_path, undrawn):
+    for worlds, words in ((1, "1 world · 50 trials"), (2, "2 worlds · 100 trials")):
+        write_report((invent(worlds),), tmp_path)
+        text = (tmp_path / "index.html").read_text(encoding="utf-8")
+        assert words in text
+        assert not re.search(r"\b1 worlds", text)
+
+
 def test_all_rules_can_be_looked_at(reported):
     reader = read(reported)
     shown = [set(attrs.get("class", "").split()) for attrs in reader.of("div")]
