@@ -7,7 +7,7 @@ import pytest
 
 from pipistrelle.report import page as module
 from pipistrelle.report.page import write_report
-from report.invented import invent
+from report.invented import invent, only
 
 CHROMIUM = Path("/usr/bin/chromium")
 WIDTHS = {"phone": 390, "desk": 1280}
@@ -86,6 +86,19 @@ def test_every_figure_and_every_panel_is_visible(opened):
             box = panels.nth(i).bounding_box()
             assert box["width"] >= 250
             assert box["height"] >= 150
+
+
+def test_a_panel_alone_is_about_half_as_wide_as_the_page(browser, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "_write_figure", lambda *_: None)
+    ways = [("ekf", way) for way in ("active", "fused", "passive")]
+    write_report((only(invent(3), ways),), tmp_path)
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page.goto((tmp_path / "index.html").as_uri())
+    whole = page.locator("figure#position_rmse").bounding_box()["width"]
+    alone = page.locator("figure#position_rmse svg.panel:visible")
+    assert alone.count() == 1
+    assert 0.4 * whole < alone.bounding_box()["width"] < 0.6 * whole
+    page.close()
 
 
 def test_the_eight_verdicts_are_visible(opened):

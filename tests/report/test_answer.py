@@ -42,7 +42,9 @@ def test_the_other_answers():
         * (BEAMWIDTH > 100.0),
         "It depends: a fuller map, at some beamwidths more accurate, at others less.": 0.3
         * np.sign(BEAMWIDTH - 50.0),
-        "It builds a fuller map; that it is more accurate, or less, is not seen.": np.zeros(12),
+        "It builds a fuller map; no difference in its accuracy is significant at any beamwidth.": (
+            np.zeros(12)
+        ),
     }
     for headline, change in cases.items():
         assert told(with_map(study, change + jitter(0.1)))[0] == headline
@@ -56,12 +58,47 @@ def test_runs_of_beamwidths_are_named_by_their_ends():
 
 def test_a_map_that_is_not_fuller_is_not_called_so():
     study = changed(invent(60), ("ekf", "active"), "landmarks_full", lambda count: count + 30.0)
-    assert told(study)[0].startswith("It builds not a fuller map")
+    begun = "It does not build a fuller map"
+    cases = {
+        f"{begun}, but a more accurate one at every beamwidth.": np.full(12, -0.3),
+        f"{begun}, but a less accurate one.": np.full(12, 0.3),
+        f"{begun}; it is at some beamwidths more accurate, at others less.": 0.3
+        * np.sign(BEAMWIDTH - 50.0),
+        f"{begun}; no difference in its accuracy is significant at any beamwidth.": np.zeros(12),
+    }
+    for headline, change in cases.items():
+        assert told(with_map(study, change + jitter(0.1)))[0] == headline
 
 
 def test_nothing_is_answered_before_there_are_worlds_or_cases():
-    assert told(invent(1))[0].startswith("Not decided yet")
-    assert told(only(invent(5), [("ekf", "passive")]))[0].startswith("Not decided yet")
+    headline, *rest = told(invent(1))
+    assert headline == "Not decided: a single world is left."
+    assert "Whether the vehicle is located better or worse with EKF is not decided" in rest[2]
+    alone = told(only(invent(5), [("ekf", "passive")]))
+    assert alone[0] == "Not decided: the study has no pair of active and fused."
+
+
+def test_what_is_not_significant_is_not_called_equal():
+    study = with_map(invent(2), jitter(0.1)[[0, -1]])
+    assert told(study)[2] == (
+        "The landmarks that every strategy places are placed with EKF not significantly better or "
+        "worse at any beamwidth; with FastSLAM 2.0 not significantly better or worse at any "
+        "beamwidth."
+    )
+
+
+def test_a_filter_without_a_world_left_is_undecided_and_the_other_answers():
+    study = with_map(invent(60), np.full(12, -0.3) + jitter(0.1))
+    study.outcomes["ekf", "passive"].diverged[:] = True
+    lines = told(study)
+    assert lines[0] == "Yes: a fuller map, and a more accurate one at every beamwidth."
+    placed = next(line for line in lines if line.startswith("The landmarks that"))
+    assert "with FastSLAM 2.0 better at every beamwidth. Whether the landmarks that" in placed
+    assert placed.endswith("placed better or worse with EKF is not decided: no world is left.")
+    study.outcomes["fastslam", "passive"].diverged[:] = True
+    headline, without, *_ = told(study)
+    assert headline == "It depends on which worlds are counted."
+    assert without == "Without diverged worlds: Not decided: no world is left."
 
 
 def test_an_answer_that_hangs_on_what_is_left_out_is_given_both_ways():

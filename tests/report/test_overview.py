@@ -1,9 +1,51 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pipistrelle.evaluation.consistency import anees_bounds
-from pipistrelle.report.overview import by_strategy, consistency, exclusions, table_ii
-from report.invented import invent, only
+from pipistrelle.experiments.plan import find_plan, read_plan
+from pipistrelle.report.overview import (
+    by_strategy,
+    consistency,
+    departures,
+    departures_line,
+    exclusions,
+    table_ii,
+)
+from pipistrelle.settings import from_flags
+from report.invented import RADII, invent, only
+
+
+def as_the_paper(study, **flags):
+    """The same study under the settings of the plan `paper`, but for those given."""
+    plan = read_plan(find_plan("paper"), from_flags(flags), iterations=2)
+    return replace(study, config=plan.config, grid=plan.grid)
+
+
+def test_the_papers_own_settings_are_not_said_to_differ():
+    study = as_the_paper(invent(2, planned=7), seed=5)
+    assert study.grid["emitter.radius"] == RADII
+    assert departures(study) == []
+    assert departures_line([]) == ""
+
+
+def test_settings_that_are_not_the_papers_are_named_with_both_values():
+    study = as_the_paper(invent(2), scenario={"steps": 200}, beacon={"level_db": 45.0})
+    assert departures_line(departures(study)) == (
+        "Not the paper's study: scenario.steps 200 (paper 1500), beacon.level_db 45 (paper 42.8)"
+    )
+
+
+def test_fewer_beams_or_ways_are_not_the_papers_study():
+    study = replace(as_the_paper(invent(2)), grid={"emitter.radius": (0.025, 0.0025)})
+    line = departures_line(departures(only(study, [("ekf", "active"), ("ekf", "fused")])))
+    assert line == (
+        "Not the paper's study: "
+        "emitter.radius 0.0025 and 0.025 (paper 12 values from 0.0025 to 0.025), "
+        "strategies active and fused (paper active, fused and passive), "
+        "filters ekf (paper ekf and fastslam)"
+    )
 
 
 def test_exclusions_count_worlds_and_trials_and_stand_beside_the_papers():

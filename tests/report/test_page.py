@@ -11,11 +11,13 @@ import pytest
 
 from pipistrelle.__main__ import main
 from pipistrelle.config import InputError
+from pipistrelle.experiments.plan import cases_of, find_plan, read_plan
 from pipistrelle.report import page as module
 from pipistrelle.report.outcomes import RULES
 from pipistrelle.report.page import write_report
 from pipistrelle.report.published import TABLE_II
 from pipistrelle.report.tables import read_study
+from pipistrelle.settings import from_flags
 from report.invented import invent, write_store
 
 FIGURES = [
@@ -137,6 +139,14 @@ def test_a_partial_study_says_so_and_a_whole_one_does_not(reported, tmp_path, un
     assert "worlds are done" not in (tmp_path / "index.html").read_text(encoding="utf-8")
 
 
+def test_one_world_is_not_many(tmp_path, undrawn):
+    for worlds, words in ((1, "1 world · 50 trials"), (2, "2 worlds · 100 trials")):
+        write_report((invent(worlds),), tmp_path)
+        text = (tmp_path / "index.html").read_text(encoding="utf-8")
+        assert words in text
+        assert not re.search(r"\b1 worlds", text)
+
+
 def test_all_rules_can_be_looked_at(reported):
     reader = read(reported)
     shown = [set(attrs.get("class", "").split()) for attrs in reader.of("div")]
@@ -178,6 +188,36 @@ def test_further_settings_have_their_verdicts_in_a_table(tmp_path, undrawn):
     assert "Verdicts by setting" in text
     assert "air.relative_humidity = 0.7" in text
     assert len(json.loads((tmp_path / "summary.json").read_text())["variants"]) == 2
+
+
+def test_failed_trials_of_all_settings_are_counted(tmp_path, capsys, undrawn):
+    grid = '"air.relative_humidity" = [0.3, 0.7]\n'
+    plan, _, _ = write_store(tmp_path / "store", invent(2), grid=grid)
+    moist = [c.number for c in cases_of(plan) if c.values["air.relative_humidity"] == 0.7]
+    failed = [(0, moist[0]), (1, moist[5]), (1, moist[-1])]
+    again = tmp_path / "again"
+    write_store(again, invent(2), grid=grid, failed=failed)
+    assert main(["report", str(again)]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0] == "failed: 3 trials; see the page"
+    assert printed[1] == "Not the paper's study: air.relative_humidity 0.3 (paper 0.5)"
+    summary = json.loads((again / "report" / "summary.json").read_text())
+    assert summary["trials_failed"] == 3
+    assert [variant["trials_failed"] for variant in summary["variants"]] == [0, 3]
+    assert [item["settings"] for item in summary["failed"]] == [{"air.relative_humidity": 0.7}] * 3
+    text = (again / "report" / "index.html").read_text(encoding="utf-8")
+    assert "over all settings, 3 trials failed" in text
+    assert text.count(", air.relative_humidity = 0.7</h4>") == 3
+
+
+def test_the_page_says_near_its_top_what_is_not_the_papers(tmp_path, undrawn):
+    for flags, there in (({"beacon": {"level_db": 45.0}}, True), ({}, False)):
+        plan = read_plan(find_plan("paper"), from_flags(flags))
+        write_report((replace(invent(2), config=plan.config, grid=plan.grid),), tmp_path)
+        ids = [attrs.get("id") for _, attrs in read(tmp_path).found]
+        assert ("departures" in ids) is there
+        if there:
+            assert ids.index("departures") < ids.index("claims")
 
 
 def test_the_summary_is_plain_json_even_of_a_study_that_diverged(tmp_path, undrawn):
@@ -222,7 +262,8 @@ def test_the_command_prints_the_verdicts_and_the_page_last(store, tmp_path, caps
     assert main(["report", str(store), "-o", str(tmp_path / "out")]) == 0
     printed = capsys.readouterr().out.splitlines()
     assert printed[0] == "partial: 6 of 115 worlds"
-    assert [line[0] for line in printed[1:9]] == list("12345678")
+    assert printed[1] == "failed: 1 trial; see the page"
+    assert [line[0] for line in printed[2:10]] == list("12345678")
     assert printed[-1] == str(tmp_path / "out" / "index.html")
 
 

@@ -126,8 +126,24 @@ def test_a_damaged_file_is_refused_with_what_to_do(tmp_path, table):
     write_store(folder, invent(2))
     path = folder / table / "iteration_00001.parquet"
     path.write_bytes(path.read_bytes()[:100])
-    with pytest.raises(InputError, match="run the study again"):
+    with pytest.raises(InputError) as refused:
         read_study(folder)
+    said = str(refused.value)
+    assert said.startswith(f"{path}: could not be read")
+    assert "remove trials/iteration_00001.parquet" in said
+    assert "its world is done anew" in said
+    assert said.isprintable()
+
+
+@pytest.mark.parametrize("table", ["steps", "landmarks"])
+def test_a_table_that_is_gone_is_named(tmp_path, table):
+    folder = tmp_path / "store"
+    write_store(folder, invent(2))
+    path = folder / table / "iteration_00000.parquet"
+    path.unlink()
+    with pytest.raises(InputError, match="is missing; remove trials/iteration_00000") as refused:
+        read_study(folder)
+    assert str(refused.value).startswith(f"{path}:")
 
 
 def test_a_table_of_another_shape_is_refused(tmp_path):
@@ -135,5 +151,5 @@ def test_a_table_of_another_shape_is_refused(tmp_path):
     write_store(folder, invent(1))
     path = folder / "trials" / "iteration_00000.parquet"
     pl.read_parquet(path).drop("nees_max").write_parquet(path)
-    with pytest.raises(InputError, match="could not be read"):
+    with pytest.raises(InputError, match=r"iteration_00000\.parquet: has not the columns"):
         read_study(folder)

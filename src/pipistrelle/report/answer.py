@@ -63,21 +63,32 @@ def _headline(study: Study, rule: Rule) -> str:
     """Answer in a line."""
     placed = _findings(study, rule, COMMON)
     decided = [finding for mine in placed.values() for finding in mine if finding.n > 1]
+    if not any(placed.values()):
+        return "Not decided: the study has no pair of active and fused."
     if not decided:
-        return "Not decided yet: there are too few worlds, or no pair of active and fused."
+        return f"Not decided: {_left([finding for mine in placed.values() for finding in mine])}."
     better = sum(finding.holds is True for finding in decided)
     worse = sum(finding.holds is False for finding in decided)
-    fuller = "a fuller map" if _fuller(study, rule) else "not a fuller map"
+    fuller = _fuller(study, rule)
+    built = "It builds a fuller map" if fuller else "It does not build a fuller map"
     if better and not worse:
         narrow = all(_narrow(mine) for mine in placed.values())
         where = "where the beam is narrow" if narrow else "at some beamwidths"
         where = "at every beamwidth" if better == len(decided) else where
-        return f"Yes: {fuller}, and a more accurate one {where}."
+        begun = "Yes: a fuller map, and" if fuller else f"{built}, but"
+        return f"{begun} a more accurate one {where}."
     if worse and not better:
-        return f"It builds {fuller}, and a less accurate one."
+        return f"{built}, {'and' if fuller else 'but'} a less accurate one."
     if better:
-        return f"It depends: {fuller}, at some beamwidths more accurate, at others less."
-    return f"It builds {fuller}; that it is more accurate, or less, is not seen."
+        begun = "It depends: a fuller map," if fuller else f"{built}; it is"
+        return f"{begun} at some beamwidths more accurate, at others less."
+    return f"{built}; no difference in its accuracy is significant at any beamwidth."
+
+
+def _left(findings: Sequence[Finding]) -> str:
+    """Say how few worlds there are, where too few for any of these."""
+    one = max(finding.n for finding in findings) == 1
+    return "a single world is left" if one else "no world is left"
 
 
 def _narrow(findings: Sequence[Finding]) -> bool:
@@ -86,14 +97,15 @@ def _narrow(findings: Sequence[Finding]) -> bool:
 
 
 def _fuller(study: Study, rule: Rule) -> bool:
-    """Tell whether fused places more landmarks than active on average at every beamwidth."""
+    """Tell whether fused places more landmarks than active on average wherever worlds are left."""
     pairs = [
         samples(study, rule, "landmarks_full", [(name, "fused", i), (name, "active", i)])
         for name in FILTER_NAMES
         if {(name, "fused"), (name, "active")} <= study.outcomes.keys()
         for i in range(len(study.beamwidth))
     ]
-    return all(len(a) and np.mean(a) > np.mean(b) for a, b in pairs)
+    more = [np.mean(a) > np.mean(b) for a, b in pairs if len(a) > 1]
+    return bool(more) and all(more)
 
 
 def _otherwise(by_rule: dict[Rule, str]) -> list[str]:
@@ -144,18 +156,23 @@ def _counted(study: Study) -> str:
 
 def _compared(subject: str, found: dict[str, list[Finding]]) -> str:
     """Say where fused is better than active, and where worse, with each filter."""
-    said = []
+    said, undecided = [], []
     for name, findings in found.items():
-        if not findings:
-            continue
-        parts = [
-            f"{word} at {_beams(findings, outcome)}"
-            for word, outcome in (("better", True), ("worse", False))
-            if any(finding.holds is outcome for finding in findings)
-        ]
-        words = " and ".join(parts) or "no better and no worse at any beamwidth"
-        said.append(f"with {FILTER_NAMES[name]} {words}")
-    return f"{subject} {'; '.join(said)}." if said else ""
+        label = FILTER_NAMES[name]
+        if findings and max(finding.n for finding in findings) < 2:
+            what = subject[0].lower() + subject[1:]
+            undecided.append(
+                f"Whether {what} better or worse with {label} is not decided: {_left(findings)}."
+            )
+        elif findings:
+            parts = [
+                f"{word} at {_beams(findings, outcome)}"
+                for word, outcome in (("better", True), ("worse", False))
+                if any(finding.holds is outcome for finding in findings)
+            ]
+            words = " and ".join(parts) or "not significantly better or worse at any beamwidth"
+            said.append(f"with {label} {words}")
+    return " ".join([f"{subject} {'; '.join(said)}."] * bool(said) + undecided)
 
 
 def _beams(findings: Sequence[Finding], outcome: bool) -> str:

@@ -1,14 +1,18 @@
-"""Tables of a study: what was left out, Table II beside the paper's, consistency in numbers."""
+"""Tables of a study: what was left out, what is not as in the paper, Table II, consistency."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from pipistrelle.config import Config
 from pipistrelle.evaluation.consistency import EKF_LIMIT, FASTSLAM_LIMIT, anees, anees_bounds
+from pipistrelle.experiments.plan import RADIUS, find_plan, read_plan
 from pipistrelle.figures.style import FILTER_NAMES
 from pipistrelle.report.contrasts import STATES
 from pipistrelle.report.outcomes import Rule, Study, kept, lost, samples
 from pipistrelle.report.published import EXCLUDED, TABLE_II, beam_name, cell_of, row_name
+from pipistrelle.settings import known_settings
 
 LIMITS = {"ekf": EKF_LIMIT, "fastslam": FASTSLAM_LIMIT}
 
@@ -47,6 +51,70 @@ def exclusions(study: Study) -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def failed(study: Study) -> int:
+    """Count the trials that failed.
+
+    Parameters
+    ----------
+    study : Study
+
+    Returns
+    -------
+    int
+    """
+    return int(sum(np.sum(outcome.failed) for outcome in study.outcomes.values()))
+
+
+def departures(study: Study) -> list[dict[str, Any]]:
+    """Name the settings that are not those of the plan `paper`.
+
+    Parameters
+    ----------
+    study : Study
+
+    Returns
+    -------
+    list of dict
+        Per setting, strategies and filters among them: its name, its value here and the paper's.
+        Seed and number of worlds are none.
+    """
+    paper = read_plan(find_plan("paper"))
+    theirs = _asked(paper.config, paper.grid) | {
+        "strategies": sorted(paper.strategies),
+        "filters": sorted(paper.filters),
+    }
+    ours = _asked(study.config, study.grid) | {
+        "strategies": sorted({strategy for _, strategy in study.outcomes}),
+        "filters": sorted({name for name, _ in study.outcomes}),
+    }
+    return [
+        {"setting": name, "here": ours[name], "paper": value}
+        for name, value in theirs.items()
+        if ours[name] != value
+    ]
+
+
+def departures_line(rows: list[dict[str, Any]]) -> str:
+    """Say in a line what `departures` found.
+
+    Parameters
+    ----------
+    rows : list of dict
+
+    Returns
+    -------
+    str
+        Empty where there is nothing to say.
+
+    Examples
+    --------
+    >>> departures_line([{"setting": "scenario.steps", "here": 200, "paper": 1500}])
+    "Not the paper's study: scenario.steps 200 (paper 1500)"
+    """
+    said = [f"{r['setting']} {_worded(r['here'])} (paper {_worded(r['paper'])})" for r in rows]
+    return f"Not the paper's study: {', '.join(said)}" if said else ""
 
 
 def table_ii(study: Study, rule: Rule = "world") -> list[dict[str, Any]]:
@@ -153,3 +221,26 @@ def by_strategy(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _std(sample: Any) -> float:
     return float(np.std(sample, ddof=1)) if len(sample) > 1 else 0.0
+
+
+def _asked(config: Config, grid: Mapping[str, Sequence[Any]]) -> dict[str, Any]:
+    """Return every setting but the seed by its dotted name; of the radius, all its values."""
+    found: dict[str, Any] = {}
+    table = config.model_dump(mode="json")
+    for key in known_settings():
+        value: Any = table
+        for part in key:
+            value = value[part]
+        found[".".join(key)] = value
+    del found["seed"]
+    return found | {RADIUS: sorted(grid.get(RADIUS, [found[RADIUS]]))}
+
+
+def _worded(value: Any) -> str:
+    """Write a setting's value, of many the ends."""
+    if isinstance(value, list):
+        if len(value) > 3:
+            return f"{len(value)} values from {_worded(value[0])} to {_worded(value[-1])}"
+        *first, last = map(_worded, value)
+        return f"{', '.join(first)} and {last}" if first else last
+    return f"{value:.12g}" if isinstance(value, float) else str(value)

@@ -132,6 +132,7 @@ def page(
         spoken=SPOKEN,
         units=UNITS,
         tally=tally,
+        departures=overview.departures_line(summary["not_the_papers"]),
         consistency=overview.by_strategy(summary["consistency"]),
         config=to_toml(study.config),
     )
@@ -211,20 +212,25 @@ def _summary(studies: tuple[Study, ...], judged: list[tuple[Claim, ...]]) -> dic
         "trials": sum(outcome.failed.size for outcome in study.outcomes.values()),
         "filters_cpu_s": study.cpu_s,
         "settings": study.settings,
+        "not_the_papers": overview.departures(study),
         "answer": answer(study, claims),
         "claims": [record(claim) for claim in claims],
         "exclusion_rules": dict(RULES),
         "exclusions": overview.exclusions(study),
+        "trials_failed": sum(overview.failed(other) for other in studies),
         "table_ii": overview.table_ii(study),
         "consistency": overview.consistency(study),
         "failed": [
             {"iteration": i, "strategy": s, "filter": f, "beamwidth_deg": b, "error": text}
-            for i, s, f, b, text in study.errors
+            | {"settings": other.settings}
+            for other in studies
+            for i, s, f, b, text in other.errors
         ],
         "variants": [
             {
                 "settings": other.settings,
                 "worlds_done": len(other.worlds),
+                "trials_failed": overview.failed(other),
                 "verdicts": [claim.verdict for claim in mine],
             }
             for other, mine in zip(studies, judged, strict=True)

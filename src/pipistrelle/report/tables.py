@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import Config, InputError
 from pipistrelle.experiments.plan import RADIUS, Plan, cases_of
-from pipistrelle.experiments.store import load_study
+from pipistrelle.experiments.store import done_worlds, load_study, world_file
+from pipistrelle.experiments.world import world_schemas
 from pipistrelle.report.outcomes import COMMON, SCORES, Outcome, Study
 
 if TYPE_CHECKING:
@@ -53,11 +54,33 @@ def read_study(folder: Path) -> tuple[Study, ...]:
             tables = [table.filter(mine) for table in (trials, steps, landmarks)]
             studies.append(_study(stored.plan, config, settings, *tables))
     except (OSError, pl.exceptions.PolarsError) as error:
-        raise InputError(
-            f"{folder}: could not be read ({str(error).splitlines()[0]}); remove the world's file "
-            "from trials/ and run the study again to have it anew"
-        ) from error
+        raise _unreadable(folder, stored.plan) from error
     return tuple(studies)
+
+
+def _unreadable(folder: Path, plan: Plan) -> InputError:
+    """Find the file that cannot be read, and say how to have its world anew."""
+    import polars as pl
+
+    for world in sorted(done_worlds(folder)):
+        for table, schema in world_schemas(plan).items():
+            path = world_file(folder, table, world)
+            try:
+                whole = pl.read_parquet(path).schema == pl.Schema(schema)
+                found = "" if whole else "has not the columns of this study"
+            except FileNotFoundError:
+                found = "is missing"
+            except OSError as error:
+                found = f"could not be read ({error.strerror or 'no whole file'})"
+            except pl.exceptions.PolarsError:
+                found = "could not be read: it is no whole Parquet file"
+            if found:
+                done = world_file(folder, "trials", world).relative_to(folder)
+                return InputError(
+                    f"{path}: {found}; remove {done} from {folder} and run the study again: "
+                    "its world is done anew"
+                )
+    return InputError(f"{folder}: could not be read, though each file can; run the report again")
 
 
 def _combinations(plan: Plan) -> list[tuple[dict[str, Any], Config, list[int]]]:

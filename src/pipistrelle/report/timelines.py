@@ -55,7 +55,8 @@ def consistency(study: Study, rule: Rule, name: str) -> Chart:
         name=f"anees_{name}",
         title=f"Consistency of {FILTER_NAMES[name]}: average NEES over time",
         caption="The stronger a line, the narrower the beam; grey: where a consistent filter's "
-        f"ANEES over {runs} worlds lies with 95 %; dotted: the vehicle is back at its start",
+        f"ANEES over {runs} world{'' if runs == 1 else 's'} lies with 95 %; dotted: "
+        "the vehicle is back at its start",
         panels=tuple(panels),
         columns=("time_s", "anees"),
     )
