@@ -12,6 +12,7 @@ from pipistrelle.evaluation.consistency import (
     anees_bounds,
     diverged,
     nees,
+    track_nees,
 )
 
 SEED = st.integers(0, 2**32 - 1)
@@ -81,6 +82,55 @@ def test_nees_is_infinite_where_the_covariance_cannot_be_inverted(covariance):
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e200])
 def test_nees_is_infinite_where_the_error_is_too_large_or_no_number(value):
     assert nees(np.array([[value, 0.0, 0.0]]), np.eye(3)[None]).tolist() == [np.inf]
+
+
+EXACT = np.zeros((3, 3))
+ONE_STEP = np.array([[1.0, 2.0, 0.0], [2.0, 4.0, 0.0], [0.0, 0.0, 1.0]])
+"""After a step along the heading from an exact start: of rank 2."""
+BROKEN = np.diag([1.0, np.nan, 1.0])
+
+
+def of_ones(*covariances):
+    """Return the NEES of a track that is off by one in all states."""
+    k = len(covariances)
+    return track_nees(np.ones((k, 3)), np.stack(covariances), np.zeros((k, 3)))
+
+
+def test_after_an_exact_start_there_is_no_nees_until_the_covariance_is_positive_definite():
+    np.testing.assert_array_equal(
+        of_ones(EXACT, ONE_STEP, np.eye(3), 2.0 * np.eye(3)), [np.nan, np.nan, 3.0, 1.5]
+    )
+
+
+def test_a_covariance_that_becomes_singular_later_is_a_divergence():
+    np.testing.assert_array_equal(
+        of_ones(EXACT, np.eye(3), ONE_STEP, np.eye(3)), [np.nan, 3.0, np.inf, 3.0]
+    )
+
+
+@pytest.mark.parametrize("track", [(EXACT,), (EXACT, ONE_STEP), (EXACT, BROKEN)])
+def test_a_covariance_that_is_never_positive_definite_is_a_divergence(track):
+    assert (of_ones(*track) == np.inf).all()
+
+
+def test_a_covariance_that_is_not_finite_is_a_divergence_before_the_first_definite_one_too():
+    np.testing.assert_array_equal(of_ones(EXACT, BROKEN, np.eye(3)), [np.nan, np.inf, 3.0])
+
+
+def test_an_uncertain_start_has_the_nees_of_its_poses_bit_for_bit():
+    rng = np.random.default_rng(4)
+    P = covariances(rng, 50)
+    error = draws(rng, P) * [1.0, 1.0, 0.01]
+    P[30] = ONE_STEP
+    assert (track_nees(error, P, np.zeros_like(error)) == nees(error, P)).all()
+
+
+def test_there_is_no_nees_without_truth_and_an_infinite_one_of_a_lost_estimate():
+    mean, true = np.ones((4, 3)), np.zeros((4, 3))
+    true[1:3] = np.nan
+    mean[2:] = np.nan
+    P = np.tile(np.eye(3), (4, 1, 1))
+    np.testing.assert_array_equal(track_nees(mean, P, true), [3.0, np.nan, np.nan, np.inf])
 
 
 def test_the_nees_of_a_consistent_filter_averages_to_three_and_of_an_overconfident_one_to_more():

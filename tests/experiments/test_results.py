@@ -6,7 +6,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -125,6 +125,21 @@ def test_the_start_is_not_scored():
     moved_end = track.pose.mean.copy()
     moved_end[-1] += 100.0
     assert score(with_pose(track, moved_end), loop(), TRUE_LANDMARKS, SCANS, EKF_LIMIT) != first
+
+
+def test_an_exact_start_is_scored_once_the_covariance_is_positive_definite():
+    track = drifting_track()
+    covariance = track.pose.covariance.copy()
+    covariance[:3] = np.diag([0.01, 0.0, 0.01])
+    exact = replace(track, pose=replace(track.pose, covariance=covariance))
+    scores = score(exact, loop(), TRUE_LANDMARKS, SCANS, EKF_LIMIT)
+    error = track.pose.mean[3:] - loop()[3:]
+    epsilon = np.sum(error**2, axis=1) / 0.01
+    assert (scores.nees_mean, scores.nees_max) == pytest.approx((epsilon.mean(), epsilon.max()))
+    assert scores.diverged is bool(epsilon.max() > EKF_LIMIT)
+    covariance[50] = covariance[0]
+    later = score(exact, loop(), TRUE_LANDMARKS, SCANS, EKF_LIMIT)
+    assert (later.nees_max, later.diverged) == (np.inf, True)
 
 
 def test_a_rigid_motion_of_everything_estimated_changes_only_the_raw_errors():

@@ -85,6 +85,15 @@ def test_the_step_table_is_the_track_with_its_errors(track):
     assert table["true_heading_rad"].to_list() == true[:, 2].tolist()
 
 
+def test_where_the_truth_has_ended_the_step_table_has_neither_errors_nor_nees(track):
+    true = track.pose.mean + 0.1
+    true[3:] = np.nan
+    scored = ["position_error_m", "heading_error_rad", "nees"]
+    values = step_table(track, true).select(scored).to_numpy()
+    assert np.isfinite(values[:3]).all()
+    assert np.isnan(values[3:]).all()
+
+
 def test_without_truth_the_step_table_has_the_same_columns_and_nulls(track):
     table, scored = step_table(track, None), step_table(track, track.pose.mean)
     assert table.schema == scored.schema

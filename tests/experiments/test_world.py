@@ -173,6 +173,19 @@ def test_a_filter_that_runs_away_leaves_infinite_errors(alone):
     assert np.all(np.isinf(steps[:, [0, 2]]))
 
 
+def test_an_exact_start_leaves_frames_unscored_until_the_covariance_is_positive_definite(alone):
+    mission = alone[0]
+    track = mission.trials[0].track
+    covariance = track.pose.covariance.copy()
+    covariance[:7] = np.diag([0.01, 0.0, 0.01])
+    exact = replace(track, pose=replace(track.pose, covariance=covariance))
+    steps = world._frame_errors(exact, mission.scenario, mission.config)
+    assert np.isnan(steps[:, 2]).tolist() == [True] + 9 * [False]
+    covariance[2] = np.eye(3)  # between frames: at the first it is singular again
+    steps = world._frame_errors(exact, mission.scenario, mission.config)
+    assert np.isinf(steps[:, 2]).tolist() == [True] + 9 * [False]
+
+
 def test_columns_bear_the_names_of_what_varies(plan, records):
     tables = world_tables(plan, 0, records)
     for row, case in zip(as_rows(tables["trials"]), cases_of(plan), strict=True):

@@ -110,6 +110,42 @@ def test_a_view_without_truth_shows_the_estimates_that_are_finite():
     assert bottom < 0.0 < 4.0 < top
 
 
+DRIVE = np.array([[-5.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
+PLACE = (np.array([1]), np.array([[5.0, 0.0]]))
+
+
+def frame(std: float, *, x: float = 5.0, rows: int = 1) -> np.ndarray:
+    """Return the limits of a drive of ten metres to a landmark believed at x, in as many rows."""
+    landmarks = Landmarks(
+        landmark=np.ones(rows, int),
+        mean=np.tile([x, 0.0], (rows, 1)),
+        covariance=np.tile(std**2 * np.eye(2), (rows, 1, 1)),
+        weight=np.full(rows, 1.0 / rows),
+    )
+    return np.array(view((np.zeros(2), DRIVE), PLACE, None, [], [landmarks]))
+
+
+def test_a_view_grows_until_it_holds_the_ellipse_of_a_placed_landmark():
+    radius = np.sqrt(-2.0 * np.log(0.05))  # of 95 %, in standard deviations
+    (left, right), (bottom, top) = frame(0.8)
+    assert (left, right) == pytest.approx((-5.6, 5.0 + 0.8 * radius))
+    assert top - bottom == pytest.approx((right - left) / 2.0)
+    assert (frame(0.6 / radius) == frame(0.0)).all(), "it fits into the margin"
+
+
+@pytest.mark.parametrize("std", [3.0, 1e3, 1e60])
+def test_a_view_grows_by_no_more_than_half(std):
+    least, most = frame(0.0), frame(std)
+    assert np.ptp(most[0]) > np.ptp(least[0])
+    assert np.all(np.ptp(most, axis=1) <= 1.5 * np.ptp(least, axis=1) + 1e-9)
+
+
+def test_a_view_does_not_grow_for_a_ray_nor_for_what_it_could_not_reach():
+    assert (frame(0.8, rows=2) == frame(0.0)).all()
+    assert (frame(3.0, x=9.0) == frame(0.0)).all()
+    assert (frame(3.0, x=np.nan) == frame(0.0)).all()
+
+
 def test_a_legend_knows_only_symbols_that_exist():
     with pytest.raises(KeyError, match="unicorn"):
         legend(Figure(), ["unicorn"], 1, 0.0, 0.0)

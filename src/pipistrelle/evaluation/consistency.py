@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
+from pipistrelle.evaluation.accuracy import pose_error
+
 EKF_LIMIT = 50.0
 """A NEES above this means that EKF-SLAM has diverged (Bradley & Abaid, Sec. V-A)."""
 FASTSLAM_LIMIT = 2750.0
@@ -58,6 +60,48 @@ def nees(
         r -= factor * r[..., i, None]
         P -= P[..., :, i, None] * factor[..., None, :]
     return np.where(definite & np.isfinite(epsilon), epsilon, np.inf)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def track_nees(
+    mean: Float[np.ndarray, "k 3"],
+    covariance: Float[np.ndarray, "k 3 3"],
+    true: Float[np.ndarray, "k 3"],
+) -> Float[np.ndarray, " k"]:
+    """NEES of each pose of a track, NaN where there is none to speak of.
+
+    After an exact start the noise of the first control step, of rank 2, leaves the covariance
+    singular. That is no divergence: the NEES begins where the covariance is positive definite.
+
+    Parameters
+    ----------
+    mean : (k, 3) [m, m, rad]
+    covariance : (k, 3, 3) [m, rad, squared]
+    true : (k, 3) [m, m, rad]
+        NaN where it is not known.
+
+    Returns
+    -------
+    (k)
+        NaN where the truth is not known and before the first positive definite covariance;
+        elsewhere as `nees` says. Infinite also where a covariance is not finite, becomes singular
+        later, or is singular in a track that has none that is positive definite.
+
+    Notes
+    -----
+    Bradley & Abaid, Eq. (23).
+
+    Examples
+    --------
+    >>> exact_start = np.stack([np.zeros((3, 3)), np.diag([1.0, 0.0, 1.0]), np.eye(3)])
+    >>> track_nees(np.ones((3, 3)), exact_start, np.zeros((3, 3)))
+    array([nan, nan,  3.])
+    """
+    definite = np.isfinite(nees(np.zeros_like(mean), covariance))
+    begun = np.logical_or.accumulate(definite)
+    exact = ~begun & definite.any() & np.isfinite(covariance).all(axis=(1, 2))
+    epsilon = nees(pose_error(mean, true), covariance)
+    return np.where(exact | ~np.isfinite(true).all(axis=1), np.nan, epsilon)
 
 
 def anees(nees: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " k"]:

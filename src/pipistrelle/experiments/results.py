@@ -27,7 +27,7 @@ from pipistrelle.evaluation.accuracy import (
     rmse,
     scored_landmarks,
 )
-from pipistrelle.evaluation.consistency import diverged, nees
+from pipistrelle.evaluation.consistency import diverged, track_nees
 from pipistrelle.experiments.folder import clear_results, write_file
 from pipistrelle.experiments.tables import (
     LabelledPoints,
@@ -61,7 +61,8 @@ bearings counter-clockwise from the heading. S is the sensing strategy, F the fi
 | measurements.parquet | what each strategy measured; no range where it was passive |
 | mission.* | pictures |
 
-RMSE and NEES leave out the start. "aligned": path and map, each after the rigid motion without
+RMSE and NEES leave out the start; after an exact one the NEES begins where the covariance is
+positive definite. "aligned": path and map, each after the rigid motion without
 scale that fits it best to the truth. Map errors are those of the fully initialised landmarks
 whose true positions are known. measurements_per_frame counts before the gate, gated what the
 gate rejected, ignored_rows what was dropped from a recorded log.
@@ -184,13 +185,14 @@ def score(
     >>> scores.position_rmse_m, scores.nees_max, scores.map_rmse_m
     (5.0, 25.0, None)
     """
-    truth = np.full_like(track.pose.mean, np.nan) if true_path is None else true_path
-    if len(truth) != len(track.pose.mean):
-        raise ValueError(f"{len(track.pose.mean)} poses, but {len(truth)} true ones")
-    rows = np.isfinite(truth).all(axis=1) & (np.arange(len(truth)) > 0)
-    path, truth = track.pose.mean[rows], truth[rows]
+    known = np.full_like(track.pose.mean, np.nan) if true_path is None else true_path
+    if len(known) != len(track.pose.mean):
+        raise ValueError(f"{len(track.pose.mean)} poses, but {len(known)} true ones")
+    rows = np.isfinite(known).all(axis=1) & (np.arange(len(known)) > 0)
+    path, truth = track.pose.mean[rows], known[rows]
     error = pose_error(path, truth)
-    epsilon = nees(error, track.pose.covariance[rows])
+    epsilon = track_nees(track.pose.mean, track.pose.covariance, known)[1:]
+    epsilon = epsilon[~np.isnan(epsilon)]
     estimate = heaviest(track.landmarks)
     labels, positions = true_landmarks or (np.empty(0, int), np.empty((0, 2)))
     mapped, true = scored_landmarks(estimate, labels, positions)

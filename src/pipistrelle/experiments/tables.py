@@ -1,7 +1,8 @@
 """What the files of a result folder hold: tracks and maps as text, the rest as tables.
 
 Columns bear their units. In the tables null means that there is none (no truth, a passive range);
-what a diverged filter left not finite stays so.
+what a diverged filter left not finite stays so. NaN is an error where the truth is not known, and a
+NEES before an exact start has become uncertain.
 """
 
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ from jaxtyping import Float, Int
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.models import Landmarks, Track
 from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
-from pipistrelle.evaluation.consistency import nees
+from pipistrelle.evaluation.consistency import track_nees
 
 if TYPE_CHECKING:
     import polars as pl
@@ -131,7 +132,7 @@ def step_table(track: Track, true_path: Float[np.ndarray, "k 3"] | None) -> "pl.
         **_pose_columns("true_{}", true),
         "position_error_m": position_error(mean, true),
         "heading_error_rad": error[:, 2],
-        "nees": nees(error, covariance),
+        "nees": track_nees(mean, covariance, true),
     }
     truth = pl.DataFrame(scored)
     return pl.DataFrame(known).hstack(truth if true_path is not None else truth.clear(len(mean)))

@@ -21,7 +21,7 @@ from pipistrelle.config import Config, Strategy
 from pipistrelle.detection.scans import Heard, Scan, scan_of
 from pipistrelle.estimation.models import Track
 from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
-from pipistrelle.evaluation.consistency import nees
+from pipistrelle.evaluation.consistency import track_nees
 from pipistrelle.experiments.listening import listen
 from pipistrelle.experiments.plan import Plan, PlannedCase, cases_of
 from pipistrelle.experiments.results import Scores
@@ -275,11 +275,10 @@ def _frame_errors(track: Track, scenario: Scenario, config: Config) -> Float[np.
     """Return position error [m], heading error [rad] and NEES at each frame."""
     every = config.scenario.steps_per_frame
     frames = slice(every, None, every)
-    mean, covariance = track.pose.mean[frames], track.pose.covariance[frames]
-    true = scenario.path[frames]
-    error = pose_error(mean, true)
-    columns = (position_error(mean, true), error[:, 2], nees(error, covariance))
-    return np.column_stack(columns).astype(np.float32)
+    mean, true = track.pose.mean, scenario.path
+    epsilon = track_nees(mean, track.pose.covariance, true)
+    columns = (position_error(mean, true), pose_error(mean, true)[:, 2], epsilon)
+    return np.column_stack(columns)[frames].astype(np.float32)
 
 
 def _failed(case: PlannedCase, error: str) -> TrialRecord:

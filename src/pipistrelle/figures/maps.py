@@ -174,7 +174,9 @@ def view(
     paths: Sequence[Float[np.ndarray, "_ 3"]],
     maps: Sequence[Landmarks],
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Limits of a map that shows what is true and, where the truth is not known, what is estimated.
+    """Limits of a map that shows what is true or, without truth, what is estimated, and ellipses.
+
+    The ellipses of placed landmarks widen it by at most half, a quarter to each side.
 
     Parameters
     ----------
@@ -206,9 +208,30 @@ def view(
     shown = shown if len(shown) else np.zeros((1, 2))
     low, high = shown.min(axis=0), shown.max(axis=0)
     centre, half = (low + high) / 2.0, np.maximum((high - low) / 2.0, 0.5)
-    half = 1.12 * np.maximum(half, half[::-1] / np.array([1.2, 2.0]))
+    half = 1.12 * _readable(half)
+    low, high = _around_ellipses(maps, centre, half)
+    centre, half = (low + high) / 2.0, _readable((high - low) / 2.0)
     (left, bottom), (right, top) = (centre - half).tolist(), (centre + half).tolist()
     return (left, right), (bottom, top)
+
+
+def _readable(half: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
+    """Grow half a width and half a height until neither is too small for the other."""
+    return np.maximum(half, half[::-1] / np.array([1.2, 2.0]))
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def _around_ellipses(
+    maps: Sequence[Landmarks], centre: Float[np.ndarray, "2"], half: Float[np.ndarray, "2"]
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """Return the lowest and highest corner of a frame that grows for ellipses in its reach."""
+    corners = [centre - half, centre + half]
+    for rows in maps:
+        full = placed(rows) & np.all(np.abs(rows.mean - centre) < 1.5 * half, axis=1)
+        outlines = ellipses(rows.mean[full], rows.covariance[full], PLACED).reshape(-1, 2)
+        outlines = outlines[np.isfinite(outlines).all(axis=1)]
+        corners.extend(np.clip(outlines, centre - 1.5 * half, centre + 1.5 * half))
+    return np.min(corners, axis=0), np.max(corners, axis=0)
 
 
 def draw_truth(

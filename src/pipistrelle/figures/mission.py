@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
-from pipistrelle.evaluation.consistency import anees_bounds, nees
+from pipistrelle.evaluation.consistency import anees_bounds, track_nees
 from pipistrelle.experiments.results import TimedPath, TrialResult
 from pipistrelle.experiments.tables import LabelledPoints
 from pipistrelle.figures.closeup import add_closeups
@@ -277,7 +277,8 @@ def _draw_errors(rows: Sequence["Axes"], trial: TrialResult, true_path: np.ndarr
     heading.fill_between(elapsed, -bound, bound, color=colour, alpha=0.16, lw=0)
     heading.plot(elapsed, turn, color=colour, lw=1.1)
     consistency.axhspan(*anees_bounds(1), color="#d9d9d9", alpha=0.6, lw=0)
-    consistency.plot(elapsed, nees(error, covariance), color=colour, lw=0.9)
+    epsilon = track_nees(track.pose.mean, covariance, true_path)
+    consistency.plot(elapsed, epsilon, color=colour, lw=0.9)
     consistency.set(yscale="log", xlabel="time [s]", xlim=(0.0, elapsed[-1]))
     for axes in (position, heading):
         axes.tick_params(labelbottom=False)
