@@ -220,6 +220,10 @@ def test_the_schema_says_what_every_setting_means(obey):
         ("run --duration 0.4", "--duration: found 0.4, expected at least one frame (0.5 s)"),
         ("run --duration nan", "--duration: found nan, expected at least one frame"),
         ("run --duration inf", "--duration: found inf, expected at least one frame"),
+        ("run --duration 1e308", "--duration: found 1e+308, expected at least one frame"),
+        ("run --duration 1e30", "--duration 1e+30: found 8000000000000000"),
+        ("run --duration 1e12", "8,000,000,000,000 steps may need"),
+        ("run --scenario.steps 200000000", "200,000,000 steps may need"),
         ("run --beamwidth 190", "found 190.0 degrees, expected above 0 and up to 180"),
         ("run --beamwidth nan", "found nan degrees, expected above 0 and up to 180"),
         (
@@ -570,8 +574,12 @@ def test_the_doctor_names_a_missing_library_with_its_fix(obey, monkeypatch):
     assert "PIPISTRELLE_DATA  not set" in printed
 
 
-def test_a_drive_that_no_memory_holds_is_refused_in_a_line(refused, tmp_path):
-    assert "not enough memory" in refused("run", "--duration", "1e12", "-o", tmp_path / "results")
+def test_memory_that_ends_is_said_in_a_line(refused, tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise MemoryError("unable to allocate")
+
+    monkeypatch.setattr("pipistrelle.experiments.trial.run_mission", full)
+    assert "not enough memory" in refused("run", "-o", tmp_path / "results")
     assert not (tmp_path / "results").exists()
 
 
