@@ -158,10 +158,12 @@ def read_plan(path: Path, over: Layer | None = None, iterations: int | None = No
         name: _values(path, name, key, values, layer)
         for key, name, values in _settings(path, "grid", within["grid"])
     }
-    for key in (key for key in over if ".".join(key) in grid):
-        raise InputError(
-            f"{over[key].where}: the plan varies this setting; take it out of [grid] in {path}"
-        )
+    for key in (key for key in layer if ".".join(key) in grid):
+        # The plan in a study's folder names every setting; a default there says nothing.
+        if key in over or resolve({key: layer[key]}) != Config():
+            raise InputError(
+                f"{layer[key].where}: the plan varies this setting; take it out of [grid] in {path}"
+            )
     plan = Plan(
         name=head.name,
         iterations=head.iterations,
@@ -272,14 +274,16 @@ def _worded(table: Mapping[str, Any], name: str) -> str:
 
 
 def _as_table(plan: Plan) -> dict[str, Any]:
-    """Return a plan as nested tables and lists."""
+    """Return a plan as nested tables and lists; what the grid varies has its default beside it."""
+    settled = from_flags(plan.config.model_dump(mode="json"))
+    kept = {key: given for key, given in settled.items() if ".".join(key) not in plan.grid}
     return {
         "format": FORMAT,
         "name": plan.name,
         "iterations": plan.iterations,
         "strategies": list(plan.strategies),
         "filters": list(plan.filters),
-        "config": plan.config.model_dump(mode="json"),
+        "config": resolve(kept).model_dump(mode="json"),
         "grid": {name: list(values) for name, values in plan.grid.items()},
     }
 
