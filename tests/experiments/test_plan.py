@@ -112,6 +112,14 @@ def test_settings_may_vary_that_are_no_numbers(tmp_path):
     assert {case.config.rays.range_bounds for case in cases_of(plan)} == {(0.5, 20.0), (0.5, 10.0)}
 
 
+@pytest.mark.parametrize("values", ["[0.01]", '["loud"]', '["loud", "soft"]'])
+def test_refused_items_are_not_said_to_be_missing_too(refused, values):
+    said = refused(BARE + f"strategies = {values}\n").splitlines()
+    assert [line.partition(": found")[0] for line in said] == [
+        f"PLAN: strategies.{i}" for i in range(1 + values.count(","))
+    ]
+
+
 def test_a_plan_as_written_reads_as_the_same_plan(tmp_path):
     plan = plan_of(tmp_path, SMALL, over=from_flags({"rays": {"power": 3.0}}))
     written = plan_text(plan)
