@@ -431,6 +431,14 @@ def test_an_estimate_that_is_not_finite_is_a_failed_trial(obey, monkeypatch):
     assert "warning: active ekf failed" in said
 
 
+def test_a_saved_log_is_the_six_files_that_the_readme_promises(obey):
+    obey("run", *SHORT, "--save-log", "log", "-o", "one")
+    tables = ("landmarks.csv", "measurements.csv", "odometry.csv", "truth.csv")
+    assert {path.name for path in Path("log").iterdir()} == {"README.md", "log.toml", *tables}
+    page = Path(__file__).parents[1] / "README.md"
+    assert "six text files" in page.read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("estimator", FILTERS)
 @pytest.mark.parametrize("strategy", ["all", "active", "passive"])
 def test_a_run_and_its_log_give_one_track(obey, strategy, estimator):
