@@ -220,6 +220,10 @@ def test_the_schema_says_what_every_setting_means(obey):
         ("run --duration 0.4", "--duration: found 0.4, expected at least one frame (0.5 s)"),
         ("run --duration nan", "--duration: found nan, expected at least one frame"),
         ("run --duration inf", "--duration: found inf, expected at least one frame"),
+        ("run --duration 1e308", "--duration: found 1e+308, expected at least one frame"),
+        ("run --duration 1e30", "--duration 1e+30: found 8000000000000000"),
+        ("run --duration 1e12", "8,000,000,000,000 steps may need"),
+        ("run --scenario.steps 200000000", "200,000,000 steps may need"),
         ("run --beamwidth 190", "found 190.0 degrees, expected above 0 and up to 180"),
         ("run --beamwidth nan", "found nan degrees, expected above 0 and up to 180"),
         (
@@ -230,7 +234,17 @@ def test_the_schema_says_what_every_setting_means(obey):
         ("run --config .", ".: Is a directory"),
         ("run --landmarks 9999", "scenario.landmarks: found 9999"),
         ("run --animate=avi", 'Invalid value "avi" for --animate'),
+        ("run --animate avi", "--animate: found 'avi', expected gif or mp4"),
+        ("slam none --animate avi", "--animate: found 'avi', expected gif or mp4"),
+        ("run --animate gif extra", "run: found 'extra', but run takes no arguments"),
+        ("run extra", "run: found 'extra', but run takes no arguments"),
+        ("slam one two", "slam: found 'two', but slam takes one argument"),
+        ("config show extra", "config show: found 'extra', but config show takes no arguments"),
+        ("run --scenario.start 0 0", "--scenario.start: found 2 values, expected 3"),
         ("slam", "LOG requires an argument"),
+        ("slam --animate none", "none: found no such folder"),
+        ("slam none -x", "Unknown option: -x."),
+        ("slam none -xo", "Unknown option: -x"),
         ("slam none", "none: found no such folder"),
         ("slam . --emitter.level-db 3", "--emitter.level-db: means nothing to a recorded log"),
         ("slam . --filter.range-std 3", "--filter.range-std: the log decides this"),
@@ -417,6 +431,14 @@ def test_an_estimate_that_is_not_finite_is_a_failed_trial(obey, monkeypatch):
     assert "warning: active ekf failed" in said
 
 
+def test_a_saved_log_is_the_six_files_that_the_readme_promises(obey):
+    obey("run", *SHORT, "--save-log", "log", "-o", "one")
+    tables = ("landmarks.csv", "measurements.csv", "odometry.csv", "truth.csv")
+    assert {path.name for path in Path("log").iterdir()} == {"README.md", "log.toml", *tables}
+    page = Path(__file__).parents[1] / "README.md"
+    assert "six text files" in page.read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("estimator", FILTERS)
 @pytest.mark.parametrize("strategy", ["all", "active", "passive"])
 def test_a_run_and_its_log_give_one_track(obey, strategy, estimator):
@@ -560,8 +582,12 @@ def test_the_doctor_names_a_missing_library_with_its_fix(obey, monkeypatch):
     assert "PIPISTRELLE_DATA  not set" in printed
 
 
-def test_a_drive_that_no_memory_holds_is_refused_in_a_line(refused, tmp_path):
-    assert "not enough memory" in refused("run", "--duration", "1e12", "-o", tmp_path / "results")
+def test_memory_that_ends_is_said_in_a_line(refused, tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise MemoryError("unable to allocate")
+
+    monkeypatch.setattr("pipistrelle.experiments.trial.run_mission", full)
+    assert "not enough memory" in refused("run", "-o", tmp_path / "results")
     assert not (tmp_path / "results").exists()
 
 

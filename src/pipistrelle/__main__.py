@@ -8,9 +8,10 @@ import os
 import sys
 from collections.abc import Sequence
 from errno import ENOSPC
-from itertools import zip_longest
+from inspect import Parameter, signature
+from itertools import pairwise, zip_longest
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, MissingArgumentError, UnusedCliTokensError
 
 from pipistrelle import __version__
 
@@ -18,6 +19,8 @@ SPELLINGS = (
     "A setting is --rays.power 3 as a flag, PIPISTRELLE_RAYS__POWER=3 in the environment and "
     "power = 3 under [rays] in FILE.toml; flags go before the environment, that before the file."
 )
+
+FILMS = ("gif", "mp4")
 
 app = App(
     name="pipistrelle",
@@ -89,8 +92,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0.1.0
     0
     """
+    words = sys.argv[1:] if arguments is None else arguments
     try:
-        status = app(_completed(sys.argv[1:] if arguments is None else arguments)) or 0
+        status = app(_completed(words)) or 0
         if sys.stdout is not None:
             sys.stdout.flush()
     except KeyboardInterrupt:
@@ -100,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except (CycloptsError, OSError, ValueError, MemoryError) as error:
-        message = _explained(error)
+        message = _explained(error, words)
         if message is None:
             raise
         for line in message.splitlines():
@@ -109,16 +113,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return status
 
 
-def _completed(arguments: Sequence[str]) -> list[str]:
+def _completed(words: Sequence[str]) -> list[str]:
     """Give a bare ``--animate`` its format."""
-    formats = ("gif", "mp4")
     return [
-        "--animate=gif" if word == "--animate" and after not in formats else word
-        for word, after in zip_longest(arguments, arguments[1:])
+        "--animate=gif" if word == "--animate" and after not in FILMS else word
+        for word, after in zip_longest(words, words[1:])
     ]
 
 
-def _explained(error: Exception) -> str | None:
+def _explained(error: Exception, words: Sequence[str]) -> str | None:
     """Word a user's mistake; None for a bug."""
     from pipistrelle.config import InputError
 
@@ -129,7 +132,24 @@ def _explained(error: Exception) -> str | None:
     if isinstance(error, OSError) and error.errno == ENOSPC:  # a full disk behind our output
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return f"the output could not be written: {error.strerror}"
+    if isinstance(error, UnusedCliTokensError) and error.unused_tokens and error.target:
+        return _too_many(error, error.unused_tokens[0], words)
+    if isinstance(error, MissingArgumentError) and error.keyword and error.argument:
+        expected = error.argument.token_count()[0]
+        if expected > 1:
+            found = len(error.tokens_so_far) % expected
+            return f"{error.keyword}: found {found} values, expected {expected}"
     return str(error) if isinstance(error, (CycloptsError, InputError)) else None
+
+
+def _too_many(error: UnusedCliTokensError, word: str, words: Sequence[str]) -> str:
+    """Say of a word that is left over where it stands."""
+    if ("--animate", word) in pairwise(words):
+        return f"--animate: found {word!r}, expected {' or '.join(FILMS)}"
+    verb, kinds = " ".join(error.command_chain or ()), signature(error.target or main).parameters
+    takes = sum(kind.kind is Parameter.POSITIONAL_ONLY for kind in kinds.values())
+    most = "no arguments" if not takes else "one argument" if takes == 1 else f"{takes} arguments"
+    return f"{verb}: found {word!r}, but {verb} takes {most}; options begin with --"
 
 
 if __name__ == "__main__":

@@ -11,7 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
-Count = Annotated[int, Field(ge=1)]
+Count = Annotated[int, Field(ge=1, lt=2**63)]
+Level = Annotated[float, Field(ge=-300, le=300)]
 Probability = Annotated[float, Field(gt=0, le=1)]
 
 Strategy = Literal["active", "fused", "passive"]
@@ -88,7 +89,7 @@ class EmitterConfig(Section):
     """[Hz]"""
     radius: Positive = 0.0088
     """Radius of the piston [m]; 8.8 mm makes a half-power beamwidth of 33 degrees."""
-    level_db: float = 49.7
+    level_db: Level = 49.7
     """Source level on the axis at 1 m [dB]; unreported, fitted."""
     pulse: Positive = 2.8e-3
     """Length of the call, of the beacon's too [s]; unreported."""
@@ -99,7 +100,7 @@ class BeaconConfig(Section):
 
     frequency: Positive = 30e3
     """[Hz]"""
-    level_db: float = 42.8
+    level_db: Level = 42.8
     """Source level at 1 m [dB]; unreported, fitted."""
 
 
@@ -112,7 +113,7 @@ class ReceiverConfig(Section):
     """Distance between two microphones [m]: half a wavelength at 35 kHz."""
     sample_rate: Positive = 200e3
     """[Hz]"""
-    noise_level_db: float = 0.0
+    noise_level_db: Level = 0.0
     """Noise of one complex sample [dB], on the scale of the source levels."""
     engine: Literal["block", "dense"] = "block"
     """Sums over 0.2 ms blocks (exact, fast) or every sample at the full rate (the reference)."""

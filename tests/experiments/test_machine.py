@@ -4,15 +4,17 @@ import os
 import platform
 import subprocess
 import sys
+import tracemalloc
 
 import pytest
 
 from pipistrelle.__main__ import main
-from pipistrelle.config import Config, FastSlamConfig, InputError, RayConfig
-from pipistrelle.experiments import machine
-from pipistrelle.experiments.machine import check_memory
+from pipistrelle.config import Config, FastSlamConfig, InputError, RayConfig, ScenarioConfig
+from pipistrelle.experiments import machine, trial
+from pipistrelle.experiments.machine import check_length, check_memory
 from pipistrelle.experiments.plan import Plan
 from pipistrelle.experiments.study import run_study
+from pipistrelle.experiments.trial import run_mission
 
 GB = 1e9
 
@@ -42,6 +44,48 @@ def test_active_landmarks_need_one_member_each(monkeypatch):
         check_memory(["ekf"], 5_001, 100, RayConfig(), passive=True)
 
 
+def test_a_refusal_of_dense_rays_names_their_members(monkeypatch):
+    monkeypatch.setattr(machine, "installed", lambda: 4.0 * GB)
+    with pytest.raises(InputError, match=r"51 landmarks of \d\d,\d{3} members each may need"):
+        check_memory(["ekf"], 51, 100, RayConfig(density=1.0001), passive=True)
+    with pytest.raises(InputError, match="20000 landmarks may need"):
+        check_memory(["ekf"], 20_000, 100, RayConfig(), passive=False)
+
+
+def test_too_many_steps_are_refused_before_a_path_is_drawn(monkeypatch):
+    monkeypatch.setattr(machine, "installed", lambda: 4.0 * GB)
+    monkeypatch.setattr(trial, "world_of", lambda _: pytest.fail("drawn"))
+    config = Config(scenario=ScenarioConfig(steps=200_000_000))
+    with pytest.raises(InputError, match=r"200,000,000 steps may need .* GB .* has 4.0 GB"):
+        run_mission(config, ["fused"])
+
+
+def test_steps_count_for_every_trial_frame_and_worker(monkeypatch):
+    setup = ScenarioConfig(steps=1000)
+    need = 1000 * (430 + 96 * 6) + 250 * (900 + 600 * 3)
+    monkeypatch.setattr(machine, "installed", lambda: need)
+    check_length(setup, strategies=3, filters=2)
+    for more in ({"strategies": 4, "filters": 2}, {"strategies": 3, "filters": 3}):
+        with pytest.raises(InputError):
+            check_length(setup, **more)
+    with pytest.raises(InputError, match="in each of 2 workers"):
+        check_length(setup, strategies=3, filters=2, workers=2)
+
+
+def test_what_a_step_is_said_to_need_is_what_it_needs():
+    def peak(steps):
+        setup = ScenarioConfig(steps=steps, steps_per_frame=steps, landmarks=12)
+        tracemalloc.start()
+        run_mission(Config(scenario=setup), ["active"])
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return most
+
+    peak(8)
+    step = (peak(20_000) - peak(10_000)) / 10_000
+    assert step == pytest.approx(machine.DRAWN + machine.TRACKED, rel=0.2)
+
+
 @pytest.mark.parametrize(("limit", "have"), [("1000000\n", 1e6), ("max\n", None), (None, None)])
 def test_a_containers_share_of_the_memory_counts(tmp_path, monkeypatch, limit, have):
     file = tmp_path / "memory.max"
@@ -67,6 +111,16 @@ def test_study_refuses_what_its_workers_need_together_and_leaves_nothing(tmp_pat
     with pytest.raises(InputError, match=f"need {need / GB:.1f} GB .* in each of 3 workers"):
         run_study(plan, tmp_path / "many", workers=3)
     assert not (tmp_path / "many").exists()
+
+
+def test_study_refuses_a_drive_too_long_for_its_workers(tmp_path, monkeypatch):
+    config = Config(scenario=ScenarioConfig(steps=10_000_000))
+    ways = {"strategies": ("active",), "filters": ("ekf",)}
+    plan = Plan(name="long", iterations=1, config=config, grid={}, **ways)
+    monkeypatch.setattr(machine, "installed", lambda: 20.0 * GB)
+    with pytest.raises(InputError, match=r"10,000,000 steps may need .* in each of 3 workers"):
+        run_study(plan, tmp_path / "long", workers=3)
+    assert not (tmp_path / "long").exists()
 
 
 FAULTS = """

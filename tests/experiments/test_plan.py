@@ -7,9 +7,10 @@ from typing import get_args
 
 import pytest
 
-from pipistrelle.config import Config, EmitterConfig, InputError
+from pipistrelle.config import Config, EmitterConfig, InputError, RayConfig
 from pipistrelle.experiments.plan import (
     Filter,
+    Plan,
     cases_of,
     differences,
     find_plan,
@@ -111,11 +112,28 @@ def test_settings_may_vary_that_are_no_numbers(tmp_path):
     assert {case.config.rays.range_bounds for case in cases_of(plan)} == {(0.5, 20.0), (0.5, 10.0)}
 
 
+@pytest.mark.parametrize("values", ["[0.01]", '["loud"]', '["loud", "soft"]'])
+def test_refused_items_are_not_said_to_be_missing_too(refused, values):
+    said = refused(BARE + f"strategies = {values}\n").splitlines()
+    assert [line.partition(": found")[0] for line in said] == [
+        f"PLAN: strategies.{i}" for i in range(1 + values.count(","))
+    ]
+
+
 def test_a_plan_as_written_reads_as_the_same_plan(tmp_path):
     plan = plan_of(tmp_path, SMALL, over=from_flags({"rays": {"power": 3.0}}))
     written = plan_text(plan)
     assert plan_of(tmp_path, written) == plan
     assert set(tomllib.loads(written)["config"]) == set(Config.model_fields)
+
+
+def test_a_plan_made_of_both_a_setting_and_its_values_can_be_read_again(tmp_path):
+    ways = {"strategies": ("active",), "filters": ("ekf",)}
+    config, grid = Config(seed=3, rays=RayConfig(power=5.0)), {"rays.power": (1.0, 2.0)}
+    plan = Plan(name="small", iterations=1, config=config, grid=grid, **ways)
+    there = plan_of(tmp_path, plan_text(plan))
+    assert cases_of(there) == cases_of(plan)
+    assert differences(there, plan) == []
 
 
 def test_settings_laid_over_a_plan_go_before_its_own(tmp_path):
@@ -195,6 +213,18 @@ def test_more_cases_than_the_tables_can_number_are_refused(refused):
     values = str([1.0 + i / 1000 for i in range(100)])
     text = BARE + f'[grid]\n"rays.power" = {values}\n"air.pressure_kpa" = {values}\n'
     assert refused(text) == "PLAN: grid: found 60000 cases, expected at most 32767"
+
+
+def test_a_setting_both_set_and_varied_by_a_plan_is_refused(refused):
+    varied = BARE + '[grid]\n"rays.power" = [1.0, 2.0]\n[config.rays]\n'
+    said = "PLAN: config.rays.power: the plan varies this setting; take it out of [grid] in PLAN"
+    assert refused(varied + "power = 3.0\n") == said
+
+
+def test_a_default_beside_the_values_of_a_grid_says_nothing(tmp_path):
+    path = tmp_path / "plan.toml"
+    path.write_text(BARE + '[grid]\n"rays.power" = [1.0, 3.0]\n[config.rays]\npower = 2.0\n')
+    assert read_plan(path).grid == {"rays.power": (1.0, 3.0)}
 
 
 def test_a_flag_for_what_the_plan_varies_is_refused(refused):

@@ -16,7 +16,8 @@ from reference.studies import SMALL, as_rows, plan_of
 
 @pytest.fixture(scope="module")
 def plan(tmp_path_factory):
-    text = SMALL + '"rays.power" = [2.0, 4.0]\n"scenario.landmarks" = [10, 12]\n'
+    varied = '"rays.power" = [2.0, 4.0]\n"scenario.landmarks" = [10, 12]\n'
+    text = SMALL.replace("landmarks = 12\n", "") + varied
     return plan_of(tmp_path_factory.mktemp("plan"), text)
 
 

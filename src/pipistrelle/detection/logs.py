@@ -12,7 +12,7 @@ import tomllib
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -314,10 +314,14 @@ def _read_settings(path: Path) -> _Settings:
     rank = {"format": 0, "motion": 1}
     other = {"extra_forbidden": 2}
     fault = min(faults, key=lambda f: rank.get(str(f["loc"][0]), other.get(f["type"], 3)))
-    raise _key_refusal(path, fault, list(model.model_fields))
+    raise _key_refusal(path, fault, model)
 
 
-def _key_refusal(path: Path, fault: Any, known: list[str]) -> InputError:
+def _key_refusal(path: Path, fault: Any, model: type[_Settings]) -> InputError:
+    known, (name, *place) = list(model.model_fields), fault["loc"]
+    if fault["type"] == "too_long" or (fault["type"] == "missing" and place):
+        count, expected = len(fault["input"]), len(get_args(model.model_fields[name].annotation))
+        return refusal(f"{path}, key {name!r}", f"{count} values", f"{expected}", "mend the list")
     key = "".join(f"[{p}]" if isinstance(p, int) else str(p) for p in fault["loc"])
     if fault["type"] == "missing":
         return refusal(path, f"no key {key!r}", f"the keys {', '.join(known)}", f"add {key!r}")

@@ -1,15 +1,19 @@
-"""What this machine has: cores, and memory, which filters ask for before they start."""
+"""What this machine has: cores, and memory, asked for before a drive or a filter starts."""
 
 import os
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from pipistrelle.config import InputError, RayConfig
+from pipistrelle.config import InputError, RayConfig, ScenarioConfig
 from pipistrelle.estimation.rays import ray_members
 
 DOUBLE = 8
 """Bytes of a number."""
+DRAWN, TRACKED = 430, 96
+"""Bytes of a step, as measured: of the path and of the work on it, and of each track."""
+HEARD, SCANNED = 900, 600
+"""Bytes of a frame, as measured among 12 landmarks: what is heard, and each strategy's scan."""
 LIMIT = Path("/sys/fs/cgroup/memory.max")
 """What a container may have: a number of bytes, or a word."""
 MALLOPT = ((-3, 32 << 20), (-1, 256 << 20))
@@ -53,16 +57,52 @@ def check_memory(
     --------
     >>> check_memory(["ekf", "fastslam"], 51, 100, RayConfig(), passive=True)
     """
-    members = landmarks * (ray_members(rays)[0].size if passive else 1)
+    each_ray = ray_members(rays)[0].size if passive else 1
+    members = landmarks * each_ray
     for way in ways:
         need, have = _bytes(way, landmarks, members, particles), installed()
         if need * workers > have:
+            ray = f" of {each_ray:,} members each" if passive else ""
             swarm = f" and {particles} particles" if way == "fastslam" else ""
-            each = f" in each of {workers} workers" if workers > 1 else ""
-            raise InputError(
-                f"{way}: {landmarks} landmarks{swarm} may need {need / 1e9:.1f} GB of memory"
-                f"{each}, but this machine has {have / 1e9:.1f} GB; ask for fewer"
-            )
+            raise _too_large(f"{way}: {landmarks} landmarks{ray}{swarm}", need, have, workers)
+
+
+def check_length(
+    setup: ScenarioConfig, *, strategies: int = 1, filters: int = 1, workers: int = 1
+) -> None:
+    """Refuse a drive whose steps and frames may need more memory than this machine has.
+
+    Parameters
+    ----------
+    setup : ScenarioConfig
+    strategies, filters : int
+        Number of each; the scans of every strategy and the tracks of all trials are kept.
+    workers : int
+        Processes that each need as much, at the same time.
+
+    Raises
+    ------
+    InputError
+        With the estimate.
+
+    Examples
+    --------
+    >>> check_length(ScenarioConfig(), strategies=3, filters=2)
+    """
+    need = float(setup.steps) * (DRAWN + TRACKED * strategies * filters)
+    need += float(setup.steps // setup.steps_per_frame) * (HEARD + SCANNED * strategies)
+    have = installed()
+    if need * workers > have:
+        raise _too_large(f"scenario.steps: {setup.steps:,} steps", need, have, workers)
+
+
+def _too_large(what: str, need: float, have: float, workers: int) -> InputError:
+    """Say what would be needed, and what is there."""
+    each = f" in each of {workers} workers" if workers > 1 else ""
+    return InputError(
+        f"{what} may need {need / 1e9:.1f} GB of memory{each}, but this machine has "
+        f"{have / 1e9:.1f} GB; ask for fewer"
+    )
 
 
 def _bytes(way: str, landmarks: int, members: int, particles: int) -> float:

@@ -1,8 +1,7 @@
 """A study's plan: what to vary, as a file, and the cases that it stands for.
 
-The cases are the product of the grid, the strategies and the filters. What the vehicle's beam is,
-is not the business of a passive case: there is one for all radii of the grid, heard beside the
-narrowest beam.
+The cases are the product of the grid, the strategies and the filters. A passive case does not
+depend on the vehicle's beam: there is one for all radii, heard beside the narrowest beam.
 """
 
 import json
@@ -158,10 +157,11 @@ def read_plan(path: Path, over: Layer | None = None, iterations: int | None = No
         name: _values(path, name, key, values, layer)
         for key, name, values in _settings(path, "grid", within["grid"])
     }
-    for key in (key for key in over if ".".join(key) in grid):
-        raise InputError(
-            f"{over[key].where}: the plan varies this setting; take it out of [grid] in {path}"
-        )
+    for key in (key for key in layer if ".".join(key) in grid):
+        # The plan in a study's folder names every setting; a default there says nothing.
+        if key in over or resolve({key: layer[key]}) != Config():
+            why = f"the plan varies this setting; take it out of [grid] in {path}"
+            raise InputError(f"{layer[key].where}: {why}")
     plan = Plan(
         name=head.name,
         iterations=head.iterations,
@@ -272,14 +272,16 @@ def _worded(table: Mapping[str, Any], name: str) -> str:
 
 
 def _as_table(plan: Plan) -> dict[str, Any]:
-    """Return a plan as nested tables and lists."""
+    """Return a plan as nested tables and lists; what the grid varies has its default beside it."""
+    layer = from_flags(plan.config.model_dump(mode="json"))
+    kept = {key: layer[key] for key in layer if ".".join(key) not in plan.grid}
     return {
         "format": FORMAT,
         "name": plan.name,
         "iterations": plan.iterations,
         "strategies": list(plan.strategies),
         "filters": list(plan.filters),
-        "config": plan.config.model_dump(mode="json"),
+        "config": resolve(kept).model_dump(mode="json"),
         "grid": {name: list(values) for name, values in plan.grid.items()},
     }
 
@@ -306,7 +308,9 @@ def _head(path: Path, table: Mapping[str, Any], iterations: int | None) -> _Head
     try:
         head = _Head.model_validate_json(json.dumps(given, default=str), strict=True)
     except ValidationError as refused:
-        problems = [_problem(path, error) for error in refused.errors(include_url=False)]
+        wrong = refused.errors(include_url=False)  # a list of refused items counts as too short
+        wrong = [error for error in wrong if error["type"] != "too_short" or error["input"] == []]
+        problems = [_problem(path, error) for error in wrong]
         raise InputError("\n".join(problems)) from None
     for name in ("strategies", "filters"):
         _check_distinct(f"{path}: {name}", getattr(head, name))

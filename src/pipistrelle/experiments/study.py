@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from pipistrelle.config import InputError
-from pipistrelle.experiments.machine import check_memory, keep_freed_memory
+from pipistrelle.experiments.machine import check_length, check_memory, keep_freed_memory
 from pipistrelle.experiments.plan import Plan, cases_of
 from pipistrelle.experiments.store import (
     Outcome,
@@ -169,6 +169,7 @@ def run_study(
 def _refuse_too_large(plan: Plan, workers: int) -> None:
     """Refuse a plan of which so many worlds at once may need more memory than there is."""
     for case in cases_of(plan):
+        check_length(case.config.scenario, workers=workers)
         check_memory(
             [case.filter],
             case.config.scenario.landmarks + 1,

@@ -18,7 +18,7 @@ from pipistrelle.estimation.fastslam import FastSlam
 from pipistrelle.estimation.models import B, Belief, Estimator, Gaussian, Motion, Swarm, Track
 from pipistrelle.evaluation.consistency import EKF_LIMIT, FASTSLAM_LIMIT
 from pipistrelle.experiments.listening import Progress, listen
-from pipistrelle.experiments.machine import check_memory
+from pipistrelle.experiments.machine import check_length, check_memory
 from pipistrelle.experiments.results import TrialResult, score
 from pipistrelle.experiments.scenario import Scenario, bicycle, world_of
 from pipistrelle.experiments.tables import LabelledPoints
@@ -114,6 +114,7 @@ def run_mission(
     >>> len(mission.heard), len(mission.trials[0].track.time)
     (10, 41)
     """
+    check_length(config.scenario, strategies=len(strategies), filters=len(filters))
     scenario = world_of(config)
     check_memory(
         filters,

@@ -289,7 +289,7 @@ def _steps(duration: float, config: Config) -> int:
     """Count the control steps of a drive; at least one frame."""
     scenario = config.scenario
     frame = scenario.step * scenario.steps_per_frame
-    if not frame <= duration < float("inf"):
+    if not frame <= duration or duration / scenario.step == float("inf"):
         raise InputError(
             f"--duration: found {duration:g}, expected at least one frame ({frame:g} s), "
             "in finite time"
