@@ -1,7 +1,7 @@
 """Consistency: whether a filter's covariance tells how far it is from the truth."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from pipistrelle.evaluation.accuracy import pose_error
 
@@ -11,7 +11,6 @@ FASTSLAM_LIMIT = 2750.0
 """A NEES above this means that FastSLAM 2.0 has diverged (Bradley & Abaid, Sec. V-A)."""
 
 
-@np.errstate(all="ignore")
 def nees(
     error: Float[np.ndarray, "*n d"], covariance: Float[np.ndarray, "*n d d"]
 ) -> Float[np.ndarray, "*n"]:
@@ -46,6 +45,14 @@ def nees(
     >>> nees(np.array([2.0, 1.0]), np.diag([4.0, 0.0]))
     array(inf)
     """
+    return _eliminated(error, covariance)[0]
+
+
+@np.errstate(all="ignore")
+def _eliminated(
+    error: Float[np.ndarray, "*n d"], covariance: Float[np.ndarray, "*n d d"]
+) -> tuple[Float[np.ndarray, "*n"], Bool[np.ndarray, "*n"]]:
+    """Solve for the NEES; tell which covariances are positive definite."""
     r = np.array(error, dtype=np.float64)
     P = np.array(covariance, dtype=np.float64)
     d = r.shape[-1]
@@ -59,7 +66,7 @@ def nees(
         factor = P[..., i, :] / pivot[..., None]
         r -= factor * r[..., i, None]
         P -= P[..., :, i, None] * factor[..., None, :]
-    return np.where(definite & np.isfinite(epsilon), epsilon, np.inf)
+    return np.where(definite & np.isfinite(epsilon), epsilon, np.inf), definite
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -97,10 +104,9 @@ def track_nees(
     >>> track_nees(np.ones((3, 3)), exact_start, np.zeros((3, 3)))
     array([nan, nan,  3.])
     """
-    definite = np.isfinite(nees(np.zeros_like(mean), covariance))
+    epsilon, definite = _eliminated(pose_error(mean, true), covariance)
     begun = np.logical_or.accumulate(definite)
     exact = ~begun & definite.any() & np.isfinite(covariance).all(axis=(1, 2))
-    epsilon = nees(pose_error(mean, true), covariance)
     return np.where(exact | ~np.isfinite(true).all(axis=1), np.nan, epsilon)
 
 
