@@ -6,9 +6,10 @@ import numpy as np
 
 from pipistrelle.config import Config
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.ekf import EkfBelief
-from pipistrelle.estimation.fastslam import FastSlamBelief
-from pipistrelle.experiments.trial import Case, Drive, run_trial
+from pipistrelle.estimation.ekf.filter import EkfBelief
+from pipistrelle.estimation.fastslam.filter import FastSlamBelief
+from pipistrelle.experiments.drives import Drive
+from pipistrelle.experiments.runs.trial import Case, run_trial
 
 
 def covariance_updates(case: Case, drive: Drive, scans: Sequence[Scan], config: Config) -> int:

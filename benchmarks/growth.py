@@ -56,8 +56,8 @@ def _power(name: str, points: list[dict[str, float]]) -> Row:
 
 def points() -> list[dict[str, float]]:
     """Time frames, the EKF and FastSLAM in worlds and maps of more and more landmarks."""
-    from pipistrelle.experiments.kernels import compile_kernels
     from pipistrelle.experiments.machine import keep_freed_memory
+    from pipistrelle.experiments.runs.compiling import compile_kernels
 
     keep_freed_memory()  # as the command does
     compile_kernels()
@@ -68,8 +68,8 @@ def _heard(landmarks: int) -> dict[str, float]:
     """Time a frame, and a measurement in FastSLAM, in a world of so many landmarks."""
     from benchmarks.worlds import scans_of, some_frames, world_of
     from pipistrelle.config import Config, ScenarioConfig
-    from pipistrelle.experiments.listening import listen
-    from pipistrelle.experiments.trial import Case, drive_of, run_trial
+    from pipistrelle.experiments.hearing.listening import listen
+    from pipistrelle.experiments.runs.trial import Case, drive_of, run_trial
 
     config = Config(scenario=ScenarioConfig(landmarks=landmarks, spacing=0.5))
     world, radii = world_of(config), (config.emitter.radius,)
@@ -89,9 +89,9 @@ def _mapped(landmarks: int) -> dict[str, float]:
     """Time a frame of bearings to some of the landmarks of a map, four control steps included."""
     from pipistrelle.config import Config
     from pipistrelle.detection.scans import Scan
-    from pipistrelle.estimation.models import Gaussian
-    from pipistrelle.experiments.scenario import bicycle
-    from pipistrelle.experiments.trial import estimator
+    from pipistrelle.estimation.beliefs import Gaussian
+    from pipistrelle.experiments.hearing.scenario import bicycle
+    from pipistrelle.experiments.runs.trial import estimator
 
     rng, label = np.random.default_rng(landmarks), np.arange(landmarks)
     slam = estimator("ekf", bicycle(Config().motion), Config())

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from benchmarks.calibration import ELEMENTS, calibrate
-from pipistrelle.estimation.elementary import arctangent, exponential, logarithm
+from pipistrelle.arithmetic.elementary import arctangent, exponential, logarithm
 
 NUMBERS, ROUNDS = 4096, 41
 

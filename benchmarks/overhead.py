@@ -9,11 +9,11 @@ import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from pipistrelle.experiments import world
-from pipistrelle.experiments.kernels import compile_kernels
-from pipistrelle.experiments.plan import find_plan, read_plan
-from pipistrelle.experiments.store import load_study
-from pipistrelle.experiments.study import run_study
+from pipistrelle.experiments.runs.compiling import compile_kernels
+from pipistrelle.experiments.studies import world
+from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
+from pipistrelle.experiments.studies.store import load_study
+from pipistrelle.experiments.studies.study import run_study
 
 
 def shares(worlds: int) -> dict[str, float]:

@@ -30,8 +30,8 @@ def run(*, settings: Settings = Settings()):
 
 app(["--help"])
 """
-COMPILE = "from pipistrelle.experiments.kernels import compile_kernels; compile_kernels()"
-LIBRARIES = "import pipistrelle.experiments.trial, pipistrelle.figures.mission, polars"
+COMPILE = "from pipistrelle.experiments.runs.compiling import compile_kernels; compile_kernels()"
+LIBRARIES = "import pipistrelle.experiments.runs.trial, pipistrelle.figures.mission, polars"
 COMMAND = "./dev bench --only programs"
 
 

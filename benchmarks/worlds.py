@@ -5,10 +5,11 @@ from functools import lru_cache
 import numpy as np
 
 from pipistrelle.config import Config
-from pipistrelle.detection.scans import Scan, scan_of
-from pipistrelle.experiments.listening import listen
-from pipistrelle.experiments.plan import find_plan, read_plan
-from pipistrelle.experiments.scenario import Scenario, world_of
+from pipistrelle.detection.merging import scan_of
+from pipistrelle.detection.scans import Scan
+from pipistrelle.experiments.hearing.listening import listen
+from pipistrelle.experiments.hearing.scenario import Scenario, world_of
+from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
 
 RADII = tuple(read_plan(find_plan("paper")).grid["emitter.radius"])
 """The paper's twelve pistons [m]."""

@@ -90,9 +90,10 @@ def add_modules(app, docname, content):
     folder, _, room = docname.partition("/")
     path = Path(pipistrelle.__path__[0]) / room
     if folder == "api" and path.is_dir():
-        for name in sorted(p.stem for p in path.glob("[a-z]*.py")):
-            module = f".. automodule:: pipistrelle.{room}.{name}"
-            content[0] += f"\n{name}\n{'-' * len(name)}\n\n{module}\n"
+        for module in sorted(path.rglob("[a-z]*.py")):
+            name = ".".join(module.relative_to(path).with_suffix("").parts)
+            heading, line = name.replace(".", " / "), f".. automodule:: pipistrelle.{room}.{name}"
+            content[0] += f"\n{heading}\n{'-' * len(heading)}\n\n{line}\n"
 
 
 def add_benchmarks(app, docname, content):

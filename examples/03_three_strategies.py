@@ -9,7 +9,7 @@ beacon's calls and their echoes from all around, bearings alone. *Fused* sensing
 
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import STRATEGIES, Config, ScenarioConfig
-from pipistrelle.experiments.trial import run_mission
+from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.figures.mission import draw_mission
 
 # %%

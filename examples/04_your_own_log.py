@@ -14,10 +14,12 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from pipistrelle.config import Config
-from pipistrelle.detection.logs import Log, write_log
+from pipistrelle.detection.logs.folder import write_log
+from pipistrelle.detection.logs.recording import Log
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.models import Motion, motion_step
-from pipistrelle.experiments.replay import Truth, load, replay, write_truth
+from pipistrelle.estimation.motion import Motion, motion_step
+from pipistrelle.experiments.runs.replay import load, replay
+from pipistrelle.experiments.runs.truth_files import Truth, write_truth
 from pipistrelle.figures.mission import draw_mission
 from pipistrelle.geometry import range_and_bearing
 

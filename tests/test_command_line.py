@@ -14,7 +14,7 @@ import pytest
 from pipistrelle.__main__ import main
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config
-from pipistrelle.experiments import replay, trial
+from pipistrelle.experiments.runs import replay, trial
 from pipistrelle.settings import known_settings
 from pipistrelle.verbs.options import FILTERS
 
@@ -395,7 +395,9 @@ def test_results_are_replaced_only_when_asked(obey, refused):
 
 
 @pytest.mark.parametrize("trouble", [KeyboardInterrupt, MemoryError])
-@pytest.mark.parametrize("place", ["trial.run_mission", "mission.draw_mission"])
+@pytest.mark.parametrize(
+    "place", ["experiments.runs.trial.run_mission", "figures.mission.draw_mission"]
+)
 def test_earlier_results_and_logs_outlive_a_mission_that_comes_to_nothing(
     obey, monkeypatch, trouble, place
 ):
@@ -405,10 +407,9 @@ def test_earlier_results_and_logs_outlive_a_mission_that_comes_to_nothing(
     words = ("run", *SHORT, "--strategy", "active", "--quiet", "-o", "one")
     obey(*words, "--save-log", "log")
     results, log = contents("one"), contents("log")
-    room = "experiments" if place.startswith("trial") else "figures"
-    monkeypatch.setattr(f"pipistrelle.{room}.{place}", interrupted)
+    monkeypatch.setattr(f"pipistrelle.{place}", interrupted)
     again = (*words, "--seed", "9", "--overwrite")
-    if room == "experiments":
+    if place.startswith("experiments"):
         again += ("--save-log", "log")
     assert obey(*again)[0] == (130 if trouble is KeyboardInterrupt else 2)
     assert contents("one") == results
@@ -586,7 +587,7 @@ def test_memory_that_ends_is_said_in_a_line(refused, tmp_path, monkeypatch):
     def full(*_, **__):
         raise MemoryError("unable to allocate")
 
-    monkeypatch.setattr("pipistrelle.experiments.trial.run_mission", full)
+    monkeypatch.setattr("pipistrelle.experiments.runs.trial.run_mission", full)
     assert "not enough memory" in refused("run", "-o", tmp_path / "results")
     assert not (tmp_path / "results").exists()
 

@@ -97,8 +97,8 @@ def test_the_guides_array_finds_a_bearing(guide):
 
 def test_the_guides_filter_drives_a_mission(guide):
     from pipistrelle.config import Config, ScenarioConfig
-    from pipistrelle.experiments.scenario import bicycle, draw_scenario
-    from pipistrelle.experiments.trial import drive_of, estimator, run_filter
+    from pipistrelle.experiments.hearing.scenario import bicycle, draw_scenario
+    from pipistrelle.experiments.runs.trial import drive_of, estimator, run_filter
 
     config = Config(scenario=ScenarioConfig(steps=40, landmarks=3))
     world = draw_scenario(config, np.random.default_rng(7))

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from pipistrelle.report import page as module
-from pipistrelle.report.page import write_report
+from pipistrelle.report.page import page as module
+from pipistrelle.report.page.page import write_report
 from report.invented import invent, only
 
 CHROMIUM = Path("/usr/bin/chromium")

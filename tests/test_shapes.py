@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from pipistrelle.config import STRATEGIES, Config, ReceiverConfig, ScenarioConfig
-from pipistrelle.experiments.replay import load, replay
-from pipistrelle.experiments.trial import run_mission
+from pipistrelle.experiments.runs.replay import load, replay
+from pipistrelle.experiments.runs.trial import run_mission
 
 pytestmark = [
     pytest.mark.shapes,

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from pipistrelle.__main__ import main
-from pipistrelle.experiments import study, world
-from pipistrelle.experiments.plan import read_plan
-from pipistrelle.experiments.store import done_worlds
+from pipistrelle.experiments.studies import study, world
+from pipistrelle.experiments.studies.plan_file import read_plan
+from pipistrelle.experiments.studies.store import done_worlds
 from pipistrelle.verbs import study as verb
 from reference.studies import SMALL, assert_same, results
 

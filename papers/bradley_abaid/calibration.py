@@ -31,10 +31,10 @@ import numpy as np
 import tomli_w
 
 from pipistrelle.config import Config
-from pipistrelle.detection.scans import scan_of
-from pipistrelle.experiments.listening import listen
-from pipistrelle.experiments.scenario import world_of
-from pipistrelle.experiments.trial import Case, drive_of, run_trial
+from pipistrelle.detection.merging import scan_of
+from pipistrelle.experiments.hearing.listening import listen
+from pipistrelle.experiments.hearing.scenario import world_of
+from pipistrelle.experiments.runs.trial import Case, drive_of, run_trial
 
 SEED = 1000
 BEAMS = {"180": 0.0025, "33": 0.0088, "11": 0.025}
@@ -47,7 +47,7 @@ PAPER_FULL = 26.6
 """Fully initialised by passive EKF-SLAM: Table II."""
 POWERS = (1.0, 2.0, 3.0, 4.0)
 PRUNES = tuple(float(f"{digit}e-{decade}") for decade in range(12, 1, -1) for digit in (1, 2, 5))
-OUTPUT = Path(__file__).parents[2] / "src/pipistrelle/experiments/paper_calibration.toml"
+OUTPUT = Path(__file__).parents[2] / "src/pipistrelle/experiments/studies/paper_calibration.toml"
 Run = Callable[[Callable[[int], Any]], list[Any]]
 """Calls a function with the number of each world; lists what it returns."""
 

@@ -22,11 +22,11 @@ import polars as pl
 from calibration import BEAMS, SEED, Run, changed, fit_levels, in_worlds
 
 from pipistrelle.config import STRATEGIES, Config
-from pipistrelle.detection.scans import scan_of
-from pipistrelle.experiments.listening import listen
-from pipistrelle.experiments.results import Scores
-from pipistrelle.experiments.scenario import world_of
-from pipistrelle.experiments.trial import Case, drive_of, run_trial
+from pipistrelle.detection.merging import scan_of
+from pipistrelle.experiments.hearing.listening import listen
+from pipistrelle.experiments.hearing.scenario import world_of
+from pipistrelle.experiments.results.scores import Scores
+from pipistrelle.experiments.runs.trial import Case, drive_of, run_trial
 
 AIR: dict[str, dict[str, Any]] = {
     "humidity 20 %": {"air.relative_humidity": 0.2},

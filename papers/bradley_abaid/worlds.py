@@ -17,10 +17,11 @@ from statistics import fmean
 import numpy as np
 
 from pipistrelle.config import Config, FastSlamConfig, Strategy
-from pipistrelle.detection.scans import Heard, Scan, scan_of
-from pipistrelle.experiments.listening import listen
-from pipistrelle.experiments.scenario import Scenario, world_of
-from pipistrelle.experiments.trial import Case, drive_of, run_trial
+from pipistrelle.detection.merging import Heard, scan_of
+from pipistrelle.detection.scans import Scan
+from pipistrelle.experiments.hearing.listening import listen
+from pipistrelle.experiments.hearing.scenario import Scenario, world_of
+from pipistrelle.experiments.runs.trial import Case, drive_of, run_trial
 from pipistrelle.geometry import range_and_bearing, wrap
 
 RADII = {"180": 0.0025, "33": 0.0088, "11": 0.025}

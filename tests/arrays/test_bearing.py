@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from pipistrelle.acoustics.arrivals import Arrivals
+from pipistrelle.arithmetic.noise import stream_key
 from pipistrelle.arrays.beamforming import bearing_bound
 from pipistrelle.arrays.layout import Layout, square_of_four
-from pipistrelle.arrays.noise import stream_key
 from pipistrelle.arrays.receiver import BLOCK, add_echo_blocks, noise_blocks, sampling
 from pipistrelle.config import Config, DetectionConfig
 from pipistrelle.detection.matched import filter_blocks

@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import ks_2samp
 
 from pipistrelle.acoustics.arrivals import Arrivals, arrivals_of_emission
+from pipistrelle.arithmetic.noise import stream_key
 from pipistrelle.arrays.layout import Layout, square_of_four
-from pipistrelle.arrays.noise import stream_key
 from pipistrelle.arrays.receiver import (
     BLOCK,
     add_echo_blocks,

@@ -10,16 +10,12 @@ import pytest
 
 from pipistrelle.config import Config, FastSlamConfig, FilterConfig
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.ekf import EkfSlam
-from pipistrelle.estimation.fastslam import FastSlam
-from pipistrelle.estimation.models import (
-    Gaussian,
-    Landmarks,
-    Motion,
-    motion_jacobians,
-    motion_step,
-)
-from pipistrelle.experiments.trial import Drive, estimator, run_filter
+from pipistrelle.estimation.beliefs import Gaussian, Landmarks
+from pipistrelle.estimation.ekf.filter import EkfSlam
+from pipistrelle.estimation.fastslam.filter import FastSlam
+from pipistrelle.estimation.motion import Motion, motion_jacobians, motion_step
+from pipistrelle.experiments.drives import Drive
+from pipistrelle.experiments.runs.trial import estimator, run_filter
 from reference.missions import (
     BICYCLE,
     CIRCLE,

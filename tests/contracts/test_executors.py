@@ -19,18 +19,18 @@ from multiprocessing import active_children
 import pytest
 
 from pipistrelle.config import InputError
-from pipistrelle.experiments import study
-from pipistrelle.experiments.plan import plan_text
-from pipistrelle.experiments.store import done_worlds
-from pipistrelle.experiments.study import run_study
+from pipistrelle.experiments.studies import executors, study
+from pipistrelle.experiments.studies.plan_file import plan_text
+from pipistrelle.experiments.studies.store import done_worlds
+from pipistrelle.experiments.studies.study import run_study
 from reference.studies import assert_same, fatal, leftovers, lost, plan_of, results
 
 UNTIL_KILLED = """\
 import os, signal, sys
 from pathlib import Path
-from pipistrelle.experiments import store
-from pipistrelle.experiments.plan import read_plan
-from pipistrelle.experiments.study import run_study
+from pipistrelle.experiments.studies import store
+from pipistrelle.experiments.studies.plan_file import read_plan
+from pipistrelle.experiments.studies.study import run_study
 
 left = int(sys.argv[3])
 
@@ -162,8 +162,8 @@ class TestWorkersEndWithTheProcessThatIsKilled(ExecutorContract):
             "import os, signal, sys\n"
             "from pathlib import Path\n"
             "from multiprocessing import active_children\n"
-            "from pipistrelle.experiments.plan import read_plan\n"
-            "from pipistrelle.experiments.study import run_study\n"
+            "from pipistrelle.experiments.studies.plan_file import read_plan\n"
+            "from pipistrelle.experiments.studies.study import run_study\n"
             "def progress(standing):\n"
             "    if standing.done:\n"
             "        print(*(child.pid for child in active_children()), flush=True)\n"
@@ -210,7 +210,7 @@ def gone(processes, patience=30.0):
 
 def test_a_world_that_kills_its_process_twice_is_recorded_and_the_others_are_not():
     worlds = deque(range(5))
-    found = study._in_processes(partial(fatal, {3}), lost, worlds, 2)
+    found = executors.in_processes(partial(fatal, {3}), lost, worlds, 2)
     assert sorted(found) == [
         [("world 0", None)],
         [("world 1", None)],
@@ -222,7 +222,7 @@ def test_a_world_that_kills_its_process_twice_is_recorded_and_the_others_are_not
 
 def test_processes_that_never_get_anywhere_are_an_error():
     with pytest.raises(InputError, match="their processes end before a world is done"):
-        list(study._in_processes(partial(fatal, {0, 1}), lost, deque([0, 1]), 2))
+        list(executors.in_processes(partial(fatal, {0, 1}), lost, deque([0, 1]), 2))
 
 
 def test_a_world_that_was_given_up_is_a_failed_world(plan, folder):
@@ -347,7 +347,7 @@ def test_a_missing_dask_is_named_with_its_fix(plan, folder, monkeypatch):
 @pytest.mark.slow
 def test_a_world_that_kills_every_worker_of_a_cluster_is_recorded_and_the_others_are_not():
     pytest.importorskip("distributed", reason="Dask is not installed: the extra [cluster]")
-    found = study._on_cluster(partial(fatal, {1}), lost, deque(range(3)), 2, "local")
+    found = executors.on_cluster(partial(fatal, {1}), lost, deque(range(3)), 2, "local")
     assert sorted(found) == [[("world 0", None)], [("world 1", "lost")], [("world 2", None)]]
 
 

@@ -3,7 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipistrelle.detection.scans import UNLABELLED, Heard, average_faces, scan_of
+from pipistrelle.detection.merging import Heard, average_faces, scan_of
+from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.detection.snapshots import Detections
 from pipistrelle.geometry import circular_mean, wrap
 

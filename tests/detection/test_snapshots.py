@@ -10,9 +10,9 @@ from scipy.signal import find_peaks
 from scipy.stats import binom, gamma
 
 from pipistrelle.acoustics.arrivals import Arrivals, arrivals_of_emission, through_piston
+from pipistrelle.arithmetic.noise import complex_noise, stream_key
 from pipistrelle.arrays.beamforming import beamscan
 from pipistrelle.arrays.layout import Layout, square_of_four
-from pipistrelle.arrays.noise import complex_noise, stream_key
 from pipistrelle.arrays.receiver import (
     BLOCK,
     add_echo_blocks,

@@ -3,13 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipistrelle.estimation.models import (
-    NEAREST,
-    Motion,
-    measurement_jacobians,
-    motion_jacobians,
-    motion_step,
-)
+from pipistrelle.estimation.measurement import NEAREST, measurement_jacobians
+from pipistrelle.estimation.motion import Motion, motion_jacobians, motion_step
 from pipistrelle.geometry import range_and_bearing, wrap
 from reference.ekf_slam import moved
 

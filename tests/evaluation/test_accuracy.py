@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from pipistrelle.estimation.models import Landmarks
+from pipistrelle.estimation.beliefs import Landmarks
 from pipistrelle.evaluation.accuracy import (
     MapEstimate,
     alignment,

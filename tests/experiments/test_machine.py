@@ -10,11 +10,12 @@ import pytest
 
 from pipistrelle.__main__ import main
 from pipistrelle.config import Config, FastSlamConfig, InputError, RayConfig, ScenarioConfig
-from pipistrelle.experiments import machine, trial
+from pipistrelle.experiments import machine
 from pipistrelle.experiments.machine import check_length, check_memory
-from pipistrelle.experiments.plan import Plan
-from pipistrelle.experiments.study import run_study
-from pipistrelle.experiments.trial import run_mission
+from pipistrelle.experiments.runs import trial
+from pipistrelle.experiments.runs.trial import run_mission
+from pipistrelle.experiments.studies.plan import Plan
+from pipistrelle.experiments.studies.study import run_study
 
 GB = 1e9
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.models import Gaussian, Landmarks, Track
-from pipistrelle.experiments.results import Scores, TrialResult
+from pipistrelle.estimation.beliefs import Gaussian, Landmarks, Track
+from pipistrelle.experiments.results.scores import Scores, TrialResult
 from pipistrelle.geometry import range_and_bearing, wrap
 
 STEPS, PER_FRAME, STEP = 1500, 4, 0.125

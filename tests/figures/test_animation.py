@@ -5,9 +5,10 @@ import pytest
 from PIL import Image
 
 from pipistrelle.config import InputError
-from pipistrelle.estimation.models import Landmarks
-from pipistrelle.figures.animation import MissionRecorder, _pruned, _stage, animate_mission
+from pipistrelle.estimation.beliefs import Landmarks
+from pipistrelle.figures.animation import _pruned, _stage, animate_mission
 from pipistrelle.figures.maps import placed
+from pipistrelle.figures.recorder import MissionRecorder
 from pipistrelle.geometry import range_and_bearing
 
 

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from matplotlib.path import Path
 
-from pipistrelle.estimation.models import Landmarks
+from pipistrelle.estimation.beliefs import Landmarks
 from pipistrelle.figures.maps import (
     PLACED,
     RAY,

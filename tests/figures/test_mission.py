@@ -11,7 +11,7 @@ from matplotlib import pyplot
 from matplotlib.collections import LineCollection, PolyCollection
 from PIL import Image
 
-from pipistrelle.estimation.models import Gaussian
+from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.evaluation.accuracy import position_error
 from pipistrelle.evaluation.consistency import nees
 from pipistrelle.figures.maps import placed

@@ -9,8 +9,8 @@ from statistics import fmean
 import pytest
 
 from pipistrelle.config import Config
-from pipistrelle.experiments.plan import find_plan, read_plan
-from pipistrelle.report.published import TABLE_II
+from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
+from pipistrelle.report.claims.published import TABLE_II
 
 SCRIPT = Path(__file__).parents[2] / "papers/bradley_abaid/calibration.py"
 PAPER = {(row.filter, round(row.beamwidth)): row for row in TABLE_II}
@@ -18,7 +18,7 @@ PAPER = {(row.filter, round(row.beamwidth)): row for row in TABLE_II}
 
 @pytest.fixture(scope="module")
 def found() -> dict:
-    text = files("pipistrelle.experiments").joinpath("paper_calibration.toml").read_text()
+    text = files("pipistrelle.experiments.studies").joinpath("paper_calibration.toml").read_text()
     return tomllib.loads(text)
 
 

@@ -6,8 +6,9 @@ import numpy as np
 
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.ekf import EkfSlam
-from pipistrelle.estimation.models import Gaussian, Motion, motion_step
+from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.ekf.filter import EkfSlam
+from pipistrelle.estimation.motion import Motion, motion_step
 from pipistrelle.geometry import range_and_bearing, wrap
 
 STEP = 0.125

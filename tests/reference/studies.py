@@ -6,8 +6,8 @@ from pathlib import Path
 
 import polars as pl
 
-from pipistrelle.experiments.plan import read_plan
-from pipistrelle.experiments.store import TABLES, load_study
+from pipistrelle.experiments.studies.plan_file import read_plan
+from pipistrelle.experiments.studies.store import TABLES, load_study
 
 SMALL = """\
 format = 1

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pipistrelle.config import FastSlamConfig
-from pipistrelle.estimation.fastslam import FastSlam
-from pipistrelle.estimation.particle import LANES
-from pipistrelle.estimation.resampling import normalised
+from pipistrelle.estimation.fastslam.block import LANES
+from pipistrelle.estimation.fastslam.filter import FastSlam
+from pipistrelle.estimation.fastslam.resampling import normalised
 from reference.fastslam import SlowFastSlam
 from reference.missions import (
     BICYCLE,

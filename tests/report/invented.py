@@ -8,10 +8,11 @@ import polars as pl
 
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config
-from pipistrelle.experiments.plan import cases_of, read_plan
-from pipistrelle.experiments.store import open_store, world_file
-from pipistrelle.experiments.world import world_schemas
-from pipistrelle.report.outcomes import COMMON, SCORES, Outcome, Study
+from pipistrelle.experiments.studies.plan import cases_of
+from pipistrelle.experiments.studies.plan_file import read_plan
+from pipistrelle.experiments.studies.store import open_store, world_file
+from pipistrelle.experiments.studies.world import world_schemas
+from pipistrelle.report.studied import COMMON, SCORES, Outcome, Study
 
 RADII = (
     0.0025, 0.0031, 0.0038, 0.0047, 0.0058, 0.0071, 0.0088, 0.0108, 0.0133, 0.0164, 0.0203, 0.025,

@@ -2,9 +2,8 @@
 
 `layout` puts the microphones on the faces of a square and `receiver` lets them hear (Bradley &
 Abaid, Sec. II-C): arrivals become a recording, sample by sample or, with the same statistics, as
-sums over 0.2 ms blocks, in the noise of `noise`, any sample of which is known by its number alone.
-`beamforming` says what such an array can tell of a direction: its scan, its beampattern and the
-smallest error of a bearing.
+sums over 0.2 ms blocks. `beamforming` says what such an array can tell of a direction: its scan,
+its beampattern and the smallest error of a bearing.
 """
 
 from lazy_loader import attach

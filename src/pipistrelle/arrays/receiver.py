@@ -27,8 +27,8 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from pipistrelle.acoustics.arrivals import Arrivals
+from pipistrelle.arithmetic.noise import complex_noise
 from pipistrelle.arrays.layout import Layout
-from pipistrelle.arrays.noise import complex_noise
 from pipistrelle.config import Config, InputError
 from pipistrelle.jit import kernel, lean
 

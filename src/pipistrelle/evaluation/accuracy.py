@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipistrelle.estimation.models import Landmarks
+from pipistrelle.estimation.beliefs import Landmarks
 from pipistrelle.geometry import wrap
 
 

@@ -1,9 +1,9 @@
 """Missions and logs on trial: worlds drawn, heard, mapped, scored and kept.
 
-`trial` is the file to read first: a mission on one screen (Bradley & Abaid, Sec. IV). `scenario`
-draws its world, `listening` hears it, and `association` labels what was heard, the one place where
-the truth does so. `replay` puts a recorded log to the same filters; `results`, with `tables` and
-`folder`, scores and keeps what came of either.
+`runs.trial` is the file to read first: a mission on one screen (Bradley & Abaid, Sec. IV).
+`hearing` draws its world and hears it; a drive (`drives`) is what a filter is told; `runs` puts
+it, or a recorded log, to the filters; `results` scores and keeps what came of it; `studies` does
+so in many worlds.
 """
 
 from lazy_loader import attach
@@ -11,11 +11,11 @@ from lazy_loader import attach
 __getattr__, __dir__, __all__ = attach(
     __name__,
     submod_attrs={
-        "association": ["label_detections"],
-        "listening": ["listen"],
-        "replay": ["load"],
-        "results": ["write_results"],
-        "scenario": ["draw_scenario"],
-        "trial": ["run_filter", "run_mission", "run_trial"],
+        "hearing.listening": ["listen"],
+        "hearing.oracle": ["label_detections"],
+        "hearing.scenario": ["draw_scenario"],
+        "results.writing": ["write_results"],
+        "runs.replay": ["load"],
+        "runs.trial": ["run_filter", "run_mission", "run_trial"],
     },
 )

@@ -6,7 +6,6 @@ measurements, rays being born and thinned out, landmarks as they turn full, the 
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,10 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from pipistrelle.config import InputError
-from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.models import Belief, Landmarks, Swarm
-from pipistrelle.experiments.results import TimedPath
-from pipistrelle.experiments.tables import LabelledPoints
+from pipistrelle.estimation.beliefs import Landmarks
+from pipistrelle.experiments.drives import LabelledPoints
+from pipistrelle.experiments.results.writing import TimedPath
 from pipistrelle.figures.closeup import Closeup, add_closeups
 from pipistrelle.figures.film import film_writer
 from pipistrelle.figures.maps import (
@@ -34,6 +32,7 @@ from pipistrelle.figures.maps import (
     vehicle,
     view,
 )
+from pipistrelle.figures.recorder import Snapshot
 from pipistrelle.figures.style import INK, STYLE, TRUTH, strategy_colour
 
 if TYPE_CHECKING:
@@ -57,67 +56,6 @@ SYMBOLS = (
 """The legend."""
 FLASH = 4
 """Pictures during which a landmark that has turned full is ringed."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Snapshot:
-    """One frame as a filter saw it.
-
-    Attributes
-    ----------
-    scan : Scan
-    pose : (3) [m, m, rad]
-        After the update.
-    landmarks : Landmarks
-        After the update.
-    cloud : (p, 3) [m, m, rad] or None
-        The poses of the particles, where there are any.
-    """
-
-    scan: Scan
-    pose: Float[np.ndarray, "3"]
-    landmarks: Landmarks
-    cloud: Float[np.ndarray, "p 3"] | None = None
-
-
-class MissionRecorder:
-    """Watch filters and keep a snapshot of each frame, a few kilobytes, in `snapshots`.
-
-    An instance is called after each update, as the ``watch`` of a trial; ``snapshots`` holds a
-    list for each (strategy, filter), in the order of their first frames.
-
-    Examples
-    --------
-    >>> from pipistrelle.estimation.models import Gaussian
-    >>> class Lost:
-    ...     gated = 0
-    ...
-    ...     def pose(self):
-    ...         return Gaussian(mean=np.zeros(3), covariance=np.eye(3))
-    ...
-    ...     def landmarks(self):
-    ...         none = np.empty(0)
-    ...         mean, covariance = np.empty((0, 2)), np.empty((0, 2, 2))
-    ...         return Landmarks(landmark=none, mean=mean, covariance=covariance, weight=none)
-    >>> none = np.empty(0)
-    >>> watch = MissionRecorder()
-    >>> watch("fused", "ekf", Scan(time=0.5, landmark=none, bearing=none, range=none), Lost())
-    >>> [(key, len(frames)) for key, frames in watch.snapshots.items()]
-    [(('fused', 'ekf'), 1)]
-    """
-
-    def __init__(self) -> None:
-        self.snapshots: dict[tuple[str, str], list[Snapshot]] = {}
-
-    def __call__(self, strategy: str, estimator: str, scan: Scan, belief: Belief) -> None:
-        """Keep a snapshot."""
-        snapshot = Snapshot(
-            scan=scan,
-            pose=belief.pose().mean,
-            landmarks=belief.landmarks(),
-            cloud=belief.cloud() if isinstance(belief, Swarm) else None,
-        )
-        self.snapshots.setdefault((strategy, estimator), []).append(snapshot)
 
 
 def animate_mission(

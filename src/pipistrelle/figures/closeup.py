@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.experiments.tables import LabelledPoints
+from pipistrelle.experiments.drives import LabelledPoints
 from pipistrelle.figures.maps import vehicle
 from pipistrelle.figures.style import INK, TRUTH
 

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipistrelle.estimation.models import Landmarks
-from pipistrelle.experiments.results import TimedPath
-from pipistrelle.experiments.tables import LabelledPoints
+from pipistrelle.estimation.beliefs import Landmarks
+from pipistrelle.experiments.drives import LabelledPoints
+from pipistrelle.experiments.results.writing import TimedPath
 from pipistrelle.figures.style import COLUMNS, FILTER_NAMES, INK, TRUTH, strategy_colour
 
 if TYPE_CHECKING:

@@ -7,8 +7,9 @@ import numpy as np
 
 from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
 from pipistrelle.evaluation.consistency import anees_bounds, track_nees
-from pipistrelle.experiments.results import TimedPath, TrialResult
-from pipistrelle.experiments.tables import LabelledPoints
+from pipistrelle.experiments.drives import LabelledPoints
+from pipistrelle.experiments.results.scores import TrialResult
+from pipistrelle.experiments.results.writing import TimedPath
 from pipistrelle.figures.closeup import add_closeups
 from pipistrelle.figures.maps import (
     PLACED,

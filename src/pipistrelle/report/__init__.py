@@ -1,9 +1,7 @@
 """A study as one readable page: the answer, the paper's claims judged, its figures, its numbers.
 
-`tables` reads a study's folder into the arrays of `outcomes`; `families` words the paper's claims
-as statements about means over worlds, from the `contrasts` of cases, and `claims` judges them;
-`charts`, `timelines` and `models` lay figures out, `vector` draws them for the page and
-`pipistrelle.figures.paper` for print; `page` writes it all.
+`reading` lays a study's folder out as the arrays of `studied`; `claims` words and judges what the
+paper found; `charts` lays figures out; `page` writes it all.
 """
 
 from lazy_loader import attach
@@ -11,9 +9,9 @@ from lazy_loader import attach
 __getattr__, __dir__, __all__ = attach(
     __name__,
     submod_attrs={
-        "claims": ["judge_claims"],
-        "outcomes": ["Study"],
-        "page": ["write_report"],
-        "tables": ["read_study"],
+        "claims.verdicts": ["judge_claims"],
+        "page.page": ["write_report"],
+        "reading": ["read_study"],
+        "studied": ["Study"],
     },
 )

@@ -8,8 +8,8 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pipistrelle.experiments.results import TrialResult
-    from pipistrelle.experiments.trial import Progress
+    from pipistrelle.experiments.results.scores import TrialResult
+    from pipistrelle.experiments.runs.trial import Progress
 
 
 def say(message: str) -> None:

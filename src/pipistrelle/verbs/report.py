@@ -20,9 +20,9 @@ def report(
     quiet: Annotated[bool, Parameter(negative=(), help="Print the page's path alone.")] = False,
 ) -> None:
     """Judge the paper's claims by a study, and put it on one page with its figures."""
-    from pipistrelle.report.overview import departures, departures_line, failed
-    from pipistrelle.report.page import write_report
-    from pipistrelle.report.tables import read_study
+    from pipistrelle.report.page.overview import departures, departures_line, failed
+    from pipistrelle.report.page.page import write_report
+    from pipistrelle.report.reading import read_study
     from pipistrelle.verbs.console import say
 
     target = folder / "report" if output is None else output

@@ -18,10 +18,10 @@ from pipistrelle.verbs.options import (
 )
 
 if TYPE_CHECKING:
-    from pipistrelle.detection.logs import Log
+    from pipistrelle.detection.logs.recording import Log
     from pipistrelle.detection.scans import Scan
-    from pipistrelle.experiments.replay import Truth
-    from pipistrelle.experiments.trial import Mission
+    from pipistrelle.experiments.runs.trial import Mission
+    from pipistrelle.experiments.runs.truth_files import Truth
 
 
 def run(
@@ -46,14 +46,14 @@ def run(
     config, ways = mission_config(mission), filters(estimator, mission.particles)
     if save_log is not None:
         _check_vacant(save_log, output)
-    from pipistrelle.experiments.replay import Truth
-    from pipistrelle.experiments.trial import run_mission
-    from pipistrelle.verbs import outcome
+    from pipistrelle.experiments.runs.trial import run_mission
+    from pipistrelle.experiments.runs.truth_files import Truth
+    from pipistrelle.verbs import delivery
     from pipistrelle.verbs.console import progress
 
-    with outcome.result_folder(output, "run") as folder:
-        outcome.get_ready(output)
-        watch = outcome.recorder(output)
+    with delivery.result_folder(output, "run") as folder:
+        delivery.get_ready(output)
+        watch = delivery.recorder(output)
         with progress(output.quiet) as show:
             done = run_mission(config, strategies(strategy), ways, progress=show, watch=watch)
         drive = done.drive
@@ -61,7 +61,7 @@ def run(
         if save_log is not None:
             heard = {trial.strategy: trial.scans for trial in done.trials}
             _save_log(save_log, done, heard.get("fused", done.trials[0].scans), truth)
-        return outcome.deliver(
+        return delivery.deliver(
             folder,
             done.trials,
             truth,
@@ -94,8 +94,8 @@ def _beamwidth(mission: "Mission") -> float:
 
 def _save_log(folder: Path, mission: "Mission", scans: "Sequence[Scan]", truth: "Truth") -> None:
     """Write what was heard as a log, and the truth beside it."""
-    from pipistrelle.detection.logs import write_log
-    from pipistrelle.experiments.replay import write_truth
+    from pipistrelle.detection.logs.folder import write_log
+    from pipistrelle.experiments.runs.truth_files import write_truth
 
     write_log(folder, _log(mission, scans))
     write_truth(folder, truth)
@@ -105,7 +105,7 @@ def _log(mission: "Mission", scans: "Sequence[Scan]") -> "Log":
     """Return a mission as its recorder would have seen it."""
     import numpy as np
 
-    from pipistrelle.detection.logs import Log
+    from pipistrelle.detection.logs.recording import Log
 
     config, drive = mission.config, mission.drive
     x, y, heading = drive.start.mean.tolist()

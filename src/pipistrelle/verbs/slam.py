@@ -23,8 +23,8 @@ from pipistrelle.verbs.options import (
 )
 
 if TYPE_CHECKING:
-    from pipistrelle.detection.logs import Log
-    from pipistrelle.experiments.replay import Truth
+    from pipistrelle.detection.logs.recording import Log
+    from pipistrelle.experiments.runs.truth_files import Truth
 
 GATE = 0.999
 """Share of a measurement's predicted distribution that is accepted of real logs."""
@@ -106,8 +106,8 @@ def slam(
     if beamwidth is not None and not 0 < beamwidth <= 360:
         raise InputError(f"--beamwidth: found {beamwidth:g}, expected above 0 and up to 360 [deg]")
     from pipistrelle.experiments.machine import check_memory
-    from pipistrelle.experiments.replay import load, replay
-    from pipistrelle.verbs import outcome
+    from pipistrelle.experiments.runs.replay import load, replay
+    from pipistrelle.verbs import delivery
 
     recorded, truth = load(log, robot)
     settled = _with_log(layer, recorded, log)
@@ -115,15 +115,15 @@ def slam(
     _warn_of_partial_truth(truth, log)
     there = len({label for scan in recorded.scans for label in scan.landmark.tolist()})
     check_memory(ways, there, settled.fastslam.particles, settled.rays, passive=True)
-    with outcome.result_folder(output, "slam") as folder:
-        outcome.get_ready(output)
-        watch = outcome.recorder(output)
+    with delivery.result_folder(output, "slam") as folder:
+        delivery.get_ready(output)
+        watch = delivery.recorder(output)
         beam = None if beamwidth is None else radians(beamwidth)
         with progress(output.quiet) as show:
             trials = replay(
                 recorded, truth, chosen, ways, beam, settled, progress=show, watch=watch
             )
-        return outcome.deliver(
+        return delivery.deliver(
             folder,
             trials,
             truth,

@@ -16,8 +16,8 @@ from pipistrelle.verbs.console import announced, say
 from pipistrelle.verbs.options import SettingFlags, Whole, layers
 
 if TYPE_CHECKING:
-    from pipistrelle.experiments.plan import Plan
-    from pipistrelle.experiments.study import Standing
+    from pipistrelle.experiments.studies.plan import Plan
+    from pipistrelle.experiments.studies.study import Standing
 
 Show = Callable[["Standing"], None]
 EVERY = 10.0
@@ -76,7 +76,7 @@ def study(
     settings: Annotated[SettingFlags | None, Parameter(name="*")] = None,
 ) -> int:
     """Try all cases of a plan in many worlds; continue where an earlier run stopped."""
-    from pipistrelle.experiments.plan import find_plan, read_plan
+    from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
 
     for flag, number in (("--iterations", iterations), ("--workers", workers)):
         if number is not None and number < 1:
@@ -92,7 +92,7 @@ def study(
         print(_slurm(tried.name, command, folder, shards, workers or 1), end="")
         return 0
     from pipistrelle.experiments.machine import cores
-    from pipistrelle.experiments.study import run_study
+    from pipistrelle.experiments.studies.study import run_study
 
     try:
         with _progress(quiet) as show:
@@ -163,7 +163,7 @@ def _compiled_first(show: Show, quiet: bool) -> Show:
     def prepare(standing: "Standing") -> None:
         nonlocal ready
         if not ready and standing.done < standing.worlds:
-            from pipistrelle.experiments.kernels import compile_kernels
+            from pipistrelle.experiments.runs.compiling import compile_kernels
 
             with announced("Compiling kernels (once) ...", 1e9 if quiet else 3.0):
                 compile_kernels()

@@ -1,0 +1,231 @@
+"""Recorded logs: a folder of plain text files becomes controls and scans, the truth unseen.
+
+A row of odometry holds from its time to the next row's; the last row only ends the log. A
+measurement is used at the end of the step (t[i-1], t[i]] that holds it, at the start when its time
+is the first row's. Whatever is wrong with a file is refused by line or key; the few oddities that
+sound logs contain are dropped and counted.
+"""
+
+import difflib
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import numpy as np
+from pydantic import ConfigDict, Field, ValidationError, field_validator
+
+from pipistrelle.config import InputError, NonNegative, Positive, Probability, Section
+from pipistrelle.detection.logs.recording import MEASUREMENT, Log, assemble
+from pipistrelle.detection.logs.text_tables import (
+    read_table,
+    read_text,
+    refusal,
+    write_table,
+)
+
+_Triple = Annotated[tuple[float, float, float], Field(strict=False)]
+_Triple_std = Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(strict=False)]
+_Bounds = Annotated[tuple[Positive, Positive], Field(strict=False)]
+
+_CONTROLS = {"unicycle": ("velocity", "angular_rate"), "bicycle": ("speed", "steering")}
+
+_README = """A recorded log of Pipistrelle. Replay it with: pipistrelle slam FOLDER
+
+log.toml          motion model, start and noise; m, s, rad; _std are standard deviations
+odometry.csv      {odometry}; a row holds until the next one's time, the last only ends the log
+measurements.csv  time,landmark,bearing,range; an empty range is passive
+truth.csv         time,x,y,heading; optional, for scoring only
+landmarks.csv     landmark,x,y; optional, for scoring only
+
+Bearings are relative to the heading, counter-clockwise.
+"""
+
+
+class _Settings(Section):
+    model_config = ConfigDict(strict=True)
+
+    format: Literal[1]
+    motion: Literal["unicycle", "bicycle"]
+    initial_pose: _Triple
+    initial_pose_std: _Triple_std
+    range_std: Positive
+    bearing_std: Positive
+    range_bounds: _Bounds
+    step: Positive | None = None
+    gate: Probability | None = None
+    noise_at_rest: bool = True
+
+    @field_validator("range_bounds")
+    @classmethod
+    def _rising(cls, bounds: tuple[float, float]) -> tuple[float, float]:
+        if bounds[0] >= bounds[1]:
+            raise ValueError("a near range below a far one")
+        return bounds
+
+
+class _UnicycleSettings(_Settings):
+    velocity_std: NonNegative
+    angular_rate_std: NonNegative
+
+
+class _BicycleSettings(_Settings):
+    speed_std: NonNegative
+    steering_std: NonNegative
+    wheelbase: Positive
+
+
+_SETTINGS: dict[str, type[_Settings]] = {"unicycle": _UnicycleSettings, "bicycle": _BicycleSettings}
+_SHARED = tuple(name for name in _Settings.model_fields if name not in ("format", "step"))
+
+
+def read_log(folder: Path) -> Log:
+    r"""Read a log folder: ``log.toml``, ``odometry.csv`` and ``measurements.csv``.
+
+    With a ``step``, the rows of odometry are merged into steps of that length (the last may be
+    shorter), each with the time-weighted mean of its controls. Times are compared to 1e-6 s then,
+    and exactly otherwise.
+
+    Parameters
+    ----------
+    folder : Path
+
+    Returns
+    -------
+    Log
+
+    Raises
+    ------
+    InputError
+        With the file and the line or key, what was found, what was expected and the fix.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> settings = '''
+    ... format = 1
+    ... motion = "unicycle"
+    ... initial_pose = [0.0, 0.0, 0.0]
+    ... initial_pose_std = [0.05, 0.05, 0.0436]
+    ... velocity_std = 0.1
+    ... angular_rate_std = 0.15
+    ... range_std = 0.2
+    ... bearing_std = 0.06
+    ... range_bounds = [0.5, 20.0]
+    ... step = 0.5
+    ... '''
+    >>> odometry = "time,velocity,angular_rate\n0,1,0\n0.2,2,0\n0.6,0,0"
+    >>> with TemporaryDirectory() as place:
+    ...     folder = Path(place)
+    ...     _ = (folder / "log.toml").write_text(settings)
+    ...     _ = (folder / "odometry.csv").write_text(odometry)
+    ...     _ = (folder / "measurements.csv").write_text("time,landmark,bearing,range\n0.3,7,1,")
+    ...     log = read_log(folder)
+    >>> log.time, log.controls[:, 0].round(12)
+    (array([0. , 0.5, 0.6]), array([1.6, 2. ]))
+    >>> log.scans[0].time, log.scans[0].landmark, log.scans[0].range
+    (0.5, array([7]), array([nan]))
+    """
+    settings = _read_settings(folder / "log.toml")
+    first, second = _CONTROLS[settings.motion]
+    return assemble(
+        read_table(folder / "odometry.csv", ("time", first, second)),
+        read_table(folder / "measurements.csv", MEASUREMENT, optional="range"),
+        step=settings.step,
+        name=folder.resolve().name,
+        wheelbase=getattr(settings, "wheelbase", 1.0),
+        control_std=(getattr(settings, f"{first}_std"), getattr(settings, f"{second}_std")),
+        **{name: getattr(settings, name) for name in _SHARED},
+    )
+
+
+def write_log(folder: Path, log: Log) -> None:
+    """Write a log folder that `read_log` reads back exactly.
+
+    Steps become rows, at the precision of the numbers. Scans that share a step are spread over it
+    in their order; empty scans leave no row. Existing files are overwritten.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if need be.
+    log : Log
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> log = Log(
+    ...     name="short", time=np.array([0.0, 0.1]), controls=np.array([[1.0, 0.2]]),
+    ...     dt=np.array([0.1]), scans=(), motion="unicycle", control_std=(0.1, 0.15),
+    ...     initial_pose=(0.0, 0.0, 0.0), initial_pose_std=(0.05, 0.05, 0.04), range_std=0.2,
+    ...     bearing_std=0.06, range_bounds=(0.5, 20.0), ignored_rows={},
+    ... )
+    >>> with TemporaryDirectory() as place:
+    ...     write_log(Path(place), log)
+    ...     print((Path(place) / "odometry.csv").read_text())
+    time,velocity,angular_rate
+    0.0,1.0,0.2
+    0.1,0.0,0.0
+    """
+    import tomli_w
+
+    folder.mkdir(parents=True, exist_ok=True)
+    first, second = _CONTROLS[log.motion]
+    settings = {"format": 1} | {name: getattr(log, name) for name in _SHARED}
+    settings |= {f"{first}_std": log.control_std[0], f"{second}_std": log.control_std[1]}
+    if log.motion == "bicycle":
+        settings["wheelbase"] = log.wheelbase
+    model = _SETTINGS[log.motion].model_validate(settings)
+    text = tomli_w.dumps(model.model_dump(mode="json", exclude_defaults=True))
+    (folder / "log.toml").write_text(text, encoding="utf-8")
+    controls = np.vstack((log.controls, np.zeros(2)))
+    write_table(folder / "odometry.csv", ("time", first, second), log.time, *controls.T)
+    write_table(folder / "measurements.csv", MEASUREMENT, *_measurement_columns(log))
+    readme = _README.format(odometry=f"time,{first},{second}")
+    (folder / "README.md").write_text(readme, encoding="utf-8")
+
+
+def _read_settings(path: Path) -> _Settings:
+    """Settings of ``log.toml``; the first error, unknown keys before missing ones."""
+    try:
+        raw = tomllib.loads(read_text(path))
+    except tomllib.TOMLDecodeError as error:
+        raise refusal(path, str(error), "TOML", "correct the line") from None
+    model = _SETTINGS["bicycle" if raw.get("motion") == "bicycle" else "unicycle"]
+    try:
+        return model.model_validate(raw)
+    except ValidationError as error:
+        faults = error.errors(include_url=False)
+    rank = {"format": 0, "motion": 1}
+    other = {"extra_forbidden": 2}
+    fault = min(faults, key=lambda f: rank.get(str(f["loc"][0]), other.get(f["type"], 3)))
+    raise _key_refusal(path, fault, model)
+
+
+def _key_refusal(path: Path, fault: Any, model: type[_Settings]) -> InputError:
+    known, (name, *place) = list(model.model_fields), fault["loc"]
+    if fault["type"] == "too_long" or (fault["type"] == "missing" and place):
+        count, expected = len(fault["input"]), len(get_args(model.model_fields[name].annotation))
+        return refusal(f"{path}, key {name!r}", f"{count} values", f"{expected}", "mend the list")
+    key = "".join(f"[{p}]" if isinstance(p, int) else str(p) for p in fault["loc"])
+    if fault["type"] == "missing":
+        return refusal(path, f"no key {key!r}", f"the keys {', '.join(known)}", f"add {key!r}")
+    if fault["type"] == "extra_forbidden":
+        near = difflib.get_close_matches(key, known, 1)
+        fix = f"did you mean {near[0]!r}?" if near else "remove it"
+        return refusal(path, f"the unknown key {key!r}", f"one of {', '.join(known)}", fix)
+    expected = fault["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    return refusal(f"{path}, key {key!r}", repr(fault["input"]), expected, "correct the value")
+
+
+def _measurement_columns(log: Log) -> tuple[np.ndarray, ...]:
+    """Columns of ``measurements.csv``; scans of one step lie spread over it, in their order."""
+    used = np.array([scan.time for scan in log.scans])
+    index = np.searchsorted(log.time, used)
+    start = log.time[np.maximum(index - 1, 0)]
+    rank = np.arange(len(used)) - np.searchsorted(used, used)
+    count = np.searchsorted(used, used, side="right") - np.searchsorted(used, used)
+    stamp = np.where(rank + 1 == count, used, start + (used - start) * (rank + 1) / count)
+    sizes = [len(scan.landmark) for scan in log.scans]
+    fields = [[getattr(scan, name) for scan in log.scans] for name in MEASUREMENT[1:]]
+    columns = [np.concatenate(field) if field else np.empty(0) for field in fields]
+    return (np.repeat(stamp, sizes), *columns)

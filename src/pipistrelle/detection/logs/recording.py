@@ -1,0 +1,178 @@
+"""A recorded drive: rows of odometry become steps, measurements become scans."""
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.detection.logs.text_tables import Table, check_unique, refusal
+from pipistrelle.detection.scans import Scan
+from pipistrelle.geometry import wrap
+
+MEASUREMENT = ("time", "landmark", "bearing", "range")
+_RESOLUTION = 1e-6  # [s], of the boundaries of merged steps
+
+
+_STEPS_MAX = 10_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Log:
+    """A recorded drive: what the vehicle did and heard, and how far to trust it.
+
+    Attributes
+    ----------
+    name : str
+    time : (k + 1) [s]
+        The start, then the end of each step.
+    controls : (k, 2)
+        Velocity [m/s] and angular rate [rad/s] (bicycle: speed and steering angle [rad]).
+    dt : (k) [s]
+        Length of each step.
+    scans : tuple of Scan
+        In order; each bears exactly the ``time`` entry at which it is used.
+    motion : "unicycle" or "bicycle"
+    wheelbase : [m]
+        Bicycle only.
+    control_std : (2)
+        Noise of the two controls in one step, constant over it.
+    noise_at_rest : bool
+        False: a step whose two controls are zero is exact.
+    initial_pose, initial_pose_std : (3) [m, m, rad]
+    range_std : [m]
+    bearing_std : [rad]
+    range_bounds : (2) [m]
+        Nearest and farthest range of a passive landmark.
+    gate : float or None
+        Share of a measurement's predicted distribution that is accepted; None: not said.
+    ignored_rows : dict of str to int
+        Rows that were dropped, by reason.
+    """
+
+    name: str
+    time: Float[np.ndarray, " t"]
+    controls: Float[np.ndarray, "t-1 2"]
+    dt: Float[np.ndarray, " t-1"]
+    scans: tuple[Scan, ...]
+    motion: Literal["unicycle", "bicycle"]
+    wheelbase: float = 1.0
+    control_std: tuple[float, float]
+    noise_at_rest: bool = True
+    initial_pose: tuple[float, float, float]
+    initial_pose_std: tuple[float, float, float]
+    range_std: float
+    bearing_std: float
+    range_bounds: tuple[float, float]
+    gate: float | None = None
+    ignored_rows: dict[str, int]
+
+
+def assemble(
+    odometry: Table,
+    measurements: Table,
+    *,
+    step: float | None = None,
+    span: tuple[float, float] = (-math.inf, math.inf),
+    ignored_rows: dict[str, int] | None = None,
+    **settings: Any,
+) -> Log:
+    """Make a log of two tables: rows become steps, measurements become scans.
+
+    Parameters
+    ----------
+    odometry : Table of ``time`` and two controls
+    measurements : Table of ``time``, ``landmark``, ``bearing`` and ``range``
+    step : [s]
+        Length of the steps into which rows are merged; None: one step each.
+    span : (start, end) [s]
+        The log is cut to it.
+    ignored_rows : dict of str to int
+        Rows dropped so far, by reason.
+    settings
+        The other fields of `Log`.
+
+    Returns
+    -------
+    Log
+
+    Raises
+    ------
+    InputError
+        If nothing of the odometry is left, or a landmark is measured twice at one time.
+    """
+    stamp, *columns = odometry.column.values()
+    last = np.append(np.diff(stamp) > 0, True)
+    time, controls = _cut(odometry.path, stamp[last], np.column_stack(columns)[last], span)
+    if step is not None:
+        time, controls = _merge(odometry.path, time, controls, step)
+    check_unique(measurements, "time", "landmark")
+    stamp = measurements.column["time"]
+    inside = (stamp >= time[0]) & (stamp <= time[-1])
+    ignored = Counter(ignored_rows or {})
+    ignored["same_time_odometry"] += int(np.sum(~last))
+    ignored["outside_odometry"] += int(np.sum(~inside))
+    rows = [measurements.column[name][inside] for name in MEASUREMENT]
+    return Log(
+        time=time,
+        controls=controls,
+        dt=np.diff(time),
+        scans=_scans(time, *rows, resolution=0.0 if step is None else _RESOLUTION),
+        ignored_rows={reason: count for reason, count in ignored.items() if count},
+        **settings,
+    )
+
+
+def _cut(
+    path: Path, time: np.ndarray, controls: np.ndarray, span: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times (k + 1) and controls (k) of the rows within a span."""
+    start, end = max(time[0], span[0]), min(time[-1], span[1])
+    if start >= end:
+        found = f"times from {time[0].item()!r} to {time[-1].item()!r}"
+        if time[0] == time[-1]:
+            raise refusal(path, found, "two times or more", "add the row that ends the log")
+        expected = f"some between {span[0]!r} and {span[1]!r}"
+        raise refusal(path, found, expected, "use odometry and truth of one drive")
+    cut = np.concatenate(([start], time[(time > start) & (time < end)], [end]))
+    return cut, controls[np.searchsorted(time, cut[:-1], side="right") - 1]
+
+
+def _merge(
+    path: Path, time: np.ndarray, controls: np.ndarray, step: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Steps of one length, each with the time-weighted mean of the controls that it spans."""
+    count = max(1.0, np.ceil((time[-1] - time[0] - _RESOLUTION) / step))
+    if count > _STEPS_MAX:
+        found = f"{time[-1] - time[0]:g} s in steps of {step:g} s"
+        raise refusal(path, found, f"at most {_STEPS_MAX} steps", "correct the times or the step")
+    merged = np.append(time[0] + step * np.arange(count), time[-1])
+    edges = np.union1d(time, merged)
+    row = np.searchsorted(time, edges[:-1], side="right") - 1
+    driven = np.diff(edges)[:, None] * controls[row]
+    total = np.add.reduceat(driven, np.searchsorted(edges, merged[:-1]))
+    return merged, total / np.diff(merged)[:, None]
+
+
+def _scans(
+    time: np.ndarray,
+    stamp: np.ndarray,
+    landmark: np.ndarray,
+    bearing: np.ndarray,
+    range: np.ndarray,  # noqa: A002
+    *,
+    resolution: float,
+) -> tuple[Scan, ...]:
+    """One scan for each time of measurement, at the end of the step that holds it."""
+    used = time[np.searchsorted(time, stamp - resolution)]
+    bearing = np.where(np.abs(bearing) < np.pi, bearing, wrap(bearing))
+    cuts = np.flatnonzero(np.diff(stamp)) + 1
+    parts = zip(*(np.split(x, cuts) for x in (used, landmark, bearing, range)), strict=True)
+    return tuple(
+        Scan(time=float(t[0]), landmark=label, bearing=angle, range=distance)
+        for t, label, angle, distance in parts
+        if len(t)
+    )

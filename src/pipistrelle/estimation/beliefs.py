@@ -1,0 +1,132 @@
+"""Motion and measurement models with their Jacobians, and the records that beliefs are made of.
+
+The kernels return plain numbers, so that the filters can inline them; the functions beside them
+say the same in arrays. In the kernels a motion model is a number: 0 bicycle, 1 unicycle.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipistrelle.detection.scans import Scan
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gaussian:
+    """A mean and its covariance; leading axes, if any, count instances.
+
+    Attributes
+    ----------
+    mean : (*n, d)
+    covariance : (*n, d, d)
+    """
+
+    mean: Float[np.ndarray, "*n d"]
+    covariance: Float[np.ndarray, "*n d d"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Landmarks:
+    """The map: one row per hypothesis; a landmark with a single row is fully initialised.
+
+    Attributes
+    ----------
+    landmark : (h)
+        Label.
+    mean : (h, 2) [m]
+    covariance : (h, 2, 2) [m^2]
+    weight : (h)
+        Aggregated likelihood; sums to 1 over the rows of a landmark.
+    """
+
+    landmark: Int[np.ndarray, " h"]
+    mean: Float[np.ndarray, "h 2"]
+    covariance: Float[np.ndarray, "h 2 2"]
+    weight: Float[np.ndarray, " h"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Track:
+    """What a filter made of one mission: the start, then one row per control step.
+
+    Attributes
+    ----------
+    time : (k) [s]
+    pose : Gaussian of (k, 3) and (k, 3, 3)
+        x, y [m], heading [rad]; at the steps that hold a scan, after its update.
+    landmarks : Landmarks
+        The final map.
+    gated : int
+        Measurements that the gate rejected.
+    cloud : (p, 3) [m, m, rad] or None
+        The particles' last poses, where the filter has particles.
+    full : float or None
+        Their weighted mean number of fully initialised landmarks.
+    """
+
+    time: Float[np.ndarray, " k"]
+    pose: Gaussian
+    landmarks: Landmarks
+    gated: int
+    cloud: Float[np.ndarray, "p 3"] | None = None
+    full: float | None = None
+
+
+@runtime_checkable
+class Belief(Protocol):
+    """What an estimator knows; never changed once it is made."""
+
+    @property
+    def gated(self) -> int:
+        """Measurements rejected so far."""
+        ...
+
+    def pose(self) -> Gaussian:
+        """Return the vehicle's pose, (3) and (3, 3)."""
+        ...
+
+    def landmarks(self) -> Landmarks:
+        """Return the map."""
+        ...
+
+
+@runtime_checkable
+class Swarm(Protocol):
+    """A belief that is made of particles."""
+
+    @property
+    def full(self) -> float:
+        """Weighted mean number of fully initialised landmarks."""
+        ...
+
+    def cloud(self) -> Float[np.ndarray, "p 3"]:
+        """Return the particles' poses, (p, 3) [m, m, rad]."""
+        ...
+
+
+B = TypeVar("B", bound=Belief)
+
+
+@runtime_checkable
+class Estimator(Protocol[B]):
+    """A SLAM filter: a frozen record of its settings, with beliefs going in and coming out."""
+
+    def init(self, pose: Gaussian) -> B:
+        """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
+        ...
+
+    def predict(
+        self,
+        belief: B,
+        controls: Float[np.ndarray, "k 2"],
+        dt: Float[np.ndarray, " k"],
+        rng: np.random.Generator,
+    ) -> tuple[B, Gaussian]:
+        """Carry a belief through control steps; the poses are those after each step."""
+        ...
+
+    def update(self, belief: B, scan: Scan, rng: np.random.Generator) -> B:
+        """Correct a belief with a frame's measurements."""
+        ...

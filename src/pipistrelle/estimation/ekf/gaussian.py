@@ -1,0 +1,296 @@
+r"""Kernels on one Gaussian over a pose and points: carry, correct, place and drop.
+
+The state is x, y, heading, then two numbers per point. A correction subtracts :math:`W W^T` with
+:math:`W = \bar P H^T L^{-T}, L L^T = S`: the two halves of the covariance get the same products
+in the same order, so it stays symmetric to the last bit.
+
+A correction reads five rows of the covariance, the pose's and the point's, and changes all of
+them. So the columns of W wait: a point's rows have them subtracted when they are read, and the
+others catch up together, many columns in one pass over memory. Every number is subtracted in the
+order of the measurements, as if each had been taken off at once. ``size`` is the length of the
+state in arrays that may be longer, ``i`` the state index of a point.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipistrelle.estimation.measurement import NEAREST, sight
+from pipistrelle.estimation.motion import carry_pose
+from pipistrelle.geometry import wrap_angle
+from pipistrelle.jit import kernel, lean
+
+GATED, APPLIED = 1, 0
+LANE = 8
+"""Doubles in a cache line: rows of a multiple of it all begin on one."""
+MOST_WAITING = 32
+
+
+class Joint(NamedTuple):
+    """A Gaussian that is being corrected, in arrays with room for what a frame adds.
+
+    Attributes
+    ----------
+    mean : (n)
+    covariance : (n, m)
+        Columns beyond n fill the last cache line. Rows i and i + 1 of a point lack the columns of
+        W from ``taken[i]`` to ``waiting[0]``, those of the pose none.
+    W : (w, m)
+        The columns that wait, a row each.
+    taken : (n)
+    waiting : (1)
+    """
+
+    mean: Float[np.ndarray, " n"]
+    covariance: Float[np.ndarray, "n m"]
+    W: Float[np.ndarray, "w m"]
+    taken: Int[np.ndarray, " n"]
+    waiting: Int[np.ndarray, "1"]
+
+
+@kernel
+def _lanes(size):
+    """Least multiple of a cache line's numbers that holds so many."""
+    return (size + LANE - 1) // LANE * LANE
+
+
+@kernel
+def _on_cache_lines(rows, width):
+    """Make an array (rows, width) that begins on a cache line."""
+    buffer = np.empty(rows * width + LANE)
+    start = -(buffer.ctypes.data // 8) % LANE
+    return buffer[start : start + rows * width].reshape(rows, width)
+
+
+@kernel
+def joint_of(mean, covariance, room):
+    """Copy a mean (d) and a covariance (d, d) into a `Joint` with room for so many numbers."""
+    size, width = mean.size, _lanes(mean.size)
+    longer, wider = np.empty(room), _on_cache_lines(room, _lanes(room))
+    W = _on_cache_lines(MOST_WAITING, _lanes(room))
+    for a in range(size):
+        longer[a] = mean[a]
+        for b in range(size):
+            wider[a, b] = covariance[a, b]
+    for b in range(size, width):
+        for a in range(size):
+            wider[a, b] = 0.0
+        for k in range(MOST_WAITING):
+            W[k, b] = 0.0
+    return Joint(longer, wider, W, np.zeros(room, np.int64), np.zeros(1, np.int64))
+
+
+@kernel
+def gaussian_of(joint, size):
+    """Copy the mean (d) and the covariance (d, d) out of a settled `Joint`."""
+    mean, covariance = np.empty(size), np.empty((size, size))
+    for a in range(size):
+        mean[a] = joint.mean[a]
+        for b in range(size):
+            covariance[a, b] = joint.covariance[a, b]
+    return mean, covariance
+
+
+@lean
+def _point_rows(joint, size, i):
+    """Rows i and i + 1 of the covariance, with all that waits subtracted from them."""
+    pi, pj, W = joint.covariance[i], joint.covariance[i + 1], joint.W
+    first, last, width = joint.taken[i], joint.waiting[0], _lanes(size)
+    joint.taken[i] = last
+    fours = first + (last - first) // 4 * 4
+    for k in range(first, fours, 4):
+        w0, w1, w2, w3 = W[k], W[k + 1], W[k + 2], W[k + 3]
+        x0, x1, x2, x3 = w0[i], w1[i], w2[i], w3[i]
+        y0, y1, y2, y3 = w0[i + 1], w1[i + 1], w2[i + 1], w3[i + 1]
+        for b in range(width):
+            pi[b] = pi[b] - x0 * w0[b] - x1 * w1[b] - x2 * w2[b] - x3 * w3[b]
+            pj[b] = pj[b] - y0 * w0[b] - y1 * w1[b] - y2 * w2[b] - y3 * w3[b]
+    for k in range(fours, last):
+        w0 = W[k]
+        x0, y0 = w0[i], w0[i + 1]
+        for b in range(width):
+            pi[b] -= x0 * w0[b]
+            pj[b] -= y0 * w0[b]
+    return pi, pj
+
+
+@lean
+def settle(joint, size):
+    """Let every row catch up: afterwards nothing waits."""
+    covariance = joint.covariance
+    for i in range(3, size, 2):
+        pi, pj = _point_rows(joint, i + 2, i)
+        joint.taken[i] = 0
+        for b in range(i):
+            covariance[b, i], covariance[b, i + 1] = pi[b], pj[b]
+    joint.waiting[0] = 0
+
+
+@lean
+def _wait(joint, size, w, step):
+    """Add step w to the mean, subtract w w^T from the pose's rows, and let the points' wait."""
+    mean, p0, p1, p2 = joint.mean, joint.covariance[0], joint.covariance[1], joint.covariance[2]
+    x, y, h = w[0], w[1], w[2]
+    for a in range(size):
+        mean[a] += w[a] * step
+        p0[a] -= x * w[a]
+        p1[a] -= y * w[a]
+        p2[a] -= h * w[a]
+    joint.waiting[0] += 1
+
+
+@kernel
+def carry(mean, covariance, controls, dt, motion, pose_means, pose_covariances):
+    """Advance mean and covariance in place; cross-covariances once, by the product of the F."""
+    pose, P = mean[:3], covariance[:3, :3].copy()
+    shift_x = shift_y = 0.0  # entries (0, 2) and (1, 2) of the product of the F
+    for k in range(controls.shape[0]):
+        dx, dy = carry_pose(pose, P, controls[k, 0], controls[k, 1], dt[k], motion)
+        shift_x -= dy
+        shift_y += dx
+        for a in range(3):  # an assignment of slices would compile for a second longer
+            pose_means[k, a] = pose[a]
+            for b in range(3):
+                pose_covariances[k, a, b] = P[a, b]
+    for j in range(3, mean.size):
+        covariance[0, j] += shift_x * covariance[2, j]
+        covariance[1, j] += shift_y * covariance[2, j]
+        covariance[j, 0] = covariance[0, j]
+        covariance[j, 1] = covariance[1, j]
+    for a in range(3):
+        for b in range(3):
+            covariance[a, b] = P[a, b]
+
+
+@lean
+def bearing_variance(joint, size, i, c, s, k):
+    """Innovation variance H P H^T of the bearing of the member at state index i, without R."""
+    h0, h1 = s * k, -c * k  # by pose: (h0, h1, -1); by member: (-h0, -h1)
+    p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
+    pi, pj = _point_rows(joint, size, i)
+    pxx = p0[0] - 2.0 * p0[i] + pi[i]
+    pxy = p0[1] - p0[i + 1] - p1[i] + pi[i + 1]
+    pyy = p1[1] - 2.0 * p1[i + 1] + pj[i + 1]
+    pxh = p0[2] - p2[i]
+    pyh = p1[2] - p2[i + 1]
+    return (
+        h0 * h0 * pxx + 2.0 * h0 * h1 * pxy + h1 * h1 * pyy
+        - 2.0 * (h0 * pxh + h1 * pyh) + p2[2]
+    )  # fmt: skip
+
+
+@lean
+def correct_bearing(joint, size, i, bearing, variance, bound):
+    """Correct the state with the bearing of the member at index i; GATED when beyond bound."""
+    mean = joint.mean
+    distance, expected, c, s, k = sight(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
+    if distance < NEAREST:
+        return APPLIED
+    if joint.waiting[0] == MOST_WAITING:
+        settle(joint, size)
+    innovation = wrap_angle(bearing - expected)
+    h0, h1 = s * k, -c * k
+    p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
+    pi, pj = _point_rows(joint, size, i)
+    w0 = joint.W[joint.waiting[0]]
+    for a in range(size):
+        w0[a] = h0 * (p0[a] - pi[a]) + h1 * (p1[a] - pj[a]) - p2[a]
+    S = h0 * (w0[0] - w0[i]) + h1 * (w0[1] - w0[i + 1]) - w0[2] + variance
+    if innovation * innovation > bound * S:
+        return GATED
+    root = 1.0 / math.sqrt(S)
+    for a in range(size):
+        w0[a] *= root
+    _wait(joint, size, w0, root * innovation)
+    return APPLIED
+
+
+@lean
+def correct_active(joint, size, i, distance, bearing, range_variance, bearing_variance, bound):
+    """Correct the state with range and bearing of the member at index i; GATED beyond bound."""
+    mean = joint.mean
+    near, expected, c, s, k = sight(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
+    if near < NEAREST:
+        return APPLIED
+    if joint.waiting[0] + 2 > MOST_WAITING:
+        settle(joint, size)
+    nu0, nu1 = distance - near, wrap_angle(bearing - expected)
+    h0, h1 = s * k, -c * k
+    p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
+    pi, pj = _point_rows(joint, size, i)
+    w0, w1 = joint.W[joint.waiting[0]], joint.W[joint.waiting[0] + 1]
+    for a in range(size):
+        east, north = p0[a] - pi[a], p1[a] - pj[a]
+        w0[a] = -c * east - s * north
+        w1[a] = h0 * east + h1 * north - p2[a]
+    S00 = -c * (w0[0] - w0[i]) - s * (w0[1] - w0[i + 1]) + range_variance
+    S01 = h0 * (w0[0] - w0[i]) + h1 * (w0[1] - w0[i + 1]) - w0[2]
+    S11 = h0 * (w1[0] - w1[i]) + h1 * (w1[1] - w1[i + 1]) - w1[2] + bearing_variance
+    L00 = math.sqrt(S00)
+    L10 = S01 / L00
+    L11 = math.sqrt(S11 - L10 * L10)
+    e0 = nu0 / L00
+    e1 = (nu1 - L10 * e0) / L11
+    if e0 * e0 + e1 * e1 > bound:
+        return GATED
+    for a in range(size):
+        w0[a] /= L00
+        w1[a] = (w1[a] - L10 * w0[a]) / L11
+    _wait(joint, size, w0, e0)
+    _wait(joint, size, w1, e1)
+    return APPLIED
+
+
+@lean
+def place(mean, covariance, size, i, distance, bearing, range_variance, bearing_variance):
+    """Put a member at state index i, at a range and bearing from the pose (Eq. (16)).
+
+    The first ``size`` rows but the member's own are the rest of the state, with which it is
+    correlated through the pose.
+    """
+    direction = mean[2] + bearing
+    c, s = math.cos(direction), math.sin(direction)
+    gx, gy = -distance * s, distance * c
+    mean[i], mean[i + 1] = mean[0] + distance * c, mean[1] + distance * s
+    for a in range(size):
+        if a != i and a != i + 1:
+            east = covariance[0, a] + gx * covariance[2, a]
+            north = covariance[1, a] + gy * covariance[2, a]
+            covariance[i, a] = covariance[a, i] = east
+            covariance[i + 1, a] = covariance[a, i + 1] = north
+    across = bearing_variance * distance * distance
+    P02, P12, P22 = covariance[0, 2], covariance[1, 2], covariance[2, 2]
+    xx = covariance[0, 0] + 2.0 * gx * P02 + gx * gx * P22
+    xy = covariance[0, 1] + gy * P02 + gx * P12 + gx * gy * P22
+    yy = covariance[1, 1] + 2.0 * gy * P12 + gy * gy * P22
+    covariance[i, i] = xx + range_variance * c * c + across * s * s
+    covariance[i + 1, i + 1] = yy + range_variance * s * s + across * c * c
+    cross = xy + (range_variance - across) * c * s
+    covariance[i, i + 1] = covariance[i + 1, i] = cross
+
+
+@lean
+def drop_members(joint, landmark, weight, members, first, count, keep, source):
+    """Close the gaps that dropped members of one landmark leave; returns the members left.
+
+    ``source`` is room for as many indices as the state has numbers.
+    """
+    size = 3 + 2 * members
+    settle(joint, size)
+    left = first
+    for a in range(size):
+        source[a] = a
+    for member in range(first, members):
+        if member >= first + count or keep[member - first]:
+            landmark[left], weight[left] = landmark[member], weight[member]
+            i, j = 3 + 2 * left, 3 + 2 * member
+            source[i], source[i + 1] = j, j + 1
+            left += 1
+    for a in range(3 + 2 * left):
+        old, new = joint.covariance[source[a]], joint.covariance[a]
+        joint.mean[a] = joint.mean[source[a]]
+        for b in range(3 + 2 * left):
+            new[b] = old[source[b]]
+    return left

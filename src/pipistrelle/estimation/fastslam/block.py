@@ -1,0 +1,271 @@
+"""Kernels on a block of particles: sampled poses with a Gaussian around each, and their members.
+
+Particles travel in blocks of `LANES`, and every loop here runs over the lanes of one block, which
+the processor takes several at a time: a row (x of all lanes, then y of all lanes, and so on) lies
+at a fixed place of a flat array, so ``pose[PXY + i]`` is the covariance of x and y in lane i. A
+lane whose turn it is not, because its landmark has fewer members or another kind of measurement,
+takes part with an information of zero, which changes nothing to the last bit.
+
+``pose`` (9 rows) is a sampled pose and its uncertainty since the last sample; refinements are in
+Kalman form, which needs no inverse of the motion noise: that of one control step has rank 2 and
+none. ``member`` (6 rows) is a position [m] with its covariance [m^2] and the log of the aggregated
+likelihood. Given the pose, members are independent of each other.
+"""
+
+import math
+
+import numpy as np
+
+from pipistrelle.arithmetic.elementary import arctangent, cosine_and_sine, logarithm, wrapped
+from pipistrelle.estimation.measurement import NEAREST
+from pipistrelle.jit import inlined, lean
+
+LANES = 32
+"""Particles in a block. With half as many the compiler unrolls the loops instead of widening them;
+with more, small swarms fill no block."""
+X, Y, HEADING, PXX, PXY, PYY, PXH, PYH, PHH = range(0, 9 * LANES, LANES)
+XX, XY, YY, LOG_WEIGHT = range(2 * LANES, 6 * LANES, LANES)
+POSE, MEMBER = 9 * LANES, 6 * LANES
+"""Numbers of a block's poses, and of one member of each of its particles."""
+HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
+ROUNDING = 1e-12
+"""A pivot under this share of its variance is rounding: one control step has noise of rank 2."""
+
+
+@inlined
+def _bearing(pose, member, bearing, i):
+    """Innovation of a member's bearing; its slopes by x and y of the pose; whether it has any."""
+    dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
+    squared = dx * dx + dy * dy
+    inverse = 1.0 / max(squared, NEAREST * NEAREST)
+    innovation = wrapped(pose[HEADING + i] + bearing - arctangent(dy, dx))
+    return innovation, dy * inverse, -dx * inverse, squared >= NEAREST * NEAREST
+
+
+@inlined
+def _bearing_gain(pose, h0, h1, i):
+    """Covariance of x, y and heading with the bearing, whose slopes are (h0, h1, -1)."""
+    return (
+        h0 * pose[PXX + i] + h1 * pose[PXY + i] - pose[PXH + i],
+        h0 * pose[PXY + i] + h1 * pose[PYY + i] - pose[PYH + i],
+        h0 * pose[PXH + i] + h1 * pose[PYH + i] - pose[PHH + i],
+    )
+
+
+@inlined
+def _spread(member, h0, h1, i):
+    """Variance of the bearing that a member's own uncertainty causes."""
+    cross = 2.0 * h0 * h1 * member[XY + i]
+    return h0 * h0 * member[XX + i] + cross + h1 * h1 * member[YY + i]
+
+
+@lean
+def expect_bearing(pose, member, bearing, variance, count, j, log_likelihood):
+    """Log likelihood, without its constant, of the bearing of each lane's member j (Eq. (19)).
+
+    Minus infinity where a lane has no member j. A member too near to foresee its bearing makes it
+    uniform over the circle; alone, it says nothing.
+    """
+    for i in range(LANES):
+        innovation, h0, h1, far = _bearing(pose, member, bearing, i)
+        a0, a1, a2 = _bearing_gain(pose, h0, h1, i)
+        S = (h0 * a0 + h1 * a1 - a2 + _spread(member, h0, h1, i)) + variance
+        value = -0.5 * (innovation * innovation / S + logarithm(S))
+        unforeseen = -HALF_LOG_TAU if count[i] > 1 else HALF_LOG_TAU
+        value = value if far else unforeseen
+        log_likelihood[i] = value if j < count[i] else -np.inf
+
+
+@lean
+def bearing_beyond(pose, member, bearing, variance, count, j, bound):
+    """Whether the bearing is beyond the bound for member j of every lane that has one."""
+    beyond = 0
+    for i in range(LANES):
+        innovation, h0, h1, far = _bearing(pose, member, bearing, i)
+        a0, a1, a2 = _bearing_gain(pose, h0, h1, i)
+        S = (h0 * a0 + h1 * a1 - a2 + _spread(member, h0, h1, i)) + variance
+        within = not far or innovation * innovation <= bound * S
+        beyond += 0 if within and j < count[i] else 1
+    return beyond == LANES
+
+
+@lean
+def refine_by_bearing(pose, member, bearing, variance, share):
+    """Correct the poses by the bearing of a member, of whose information each has a share."""
+    for i in range(LANES):
+        innovation, h0, h1, far = _bearing(pose, member, bearing, i)
+        a0, a1, a2 = _bearing_gain(pose, h0, h1, i)
+        spread = h0 * a0 + h1 * a1 - a2 + _spread(member, h0, h1, i)
+        part = share[i] if far else 0.0
+        information = part / (part * spread + variance)  # of the innovation, noise variance / part
+        k0, k1, k2 = a0 * information, a1 * information, a2 * information
+        pose[X + i] += k0 * innovation
+        pose[Y + i] += k1 * innovation
+        pose[HEADING + i] += k2 * innovation
+        pose[PXX + i] -= a0 * k0
+        pose[PXY + i] -= a0 * k1
+        pose[PYY + i] -= a1 * k1
+        pose[PXH + i] -= a0 * k2
+        pose[PYH + i] -= a1 * k2
+        pose[PHH + i] -= a2 * k2
+
+
+@lean
+def correct_by_bearing(pose, member, bearing, variance, share):
+    """Correct a member by its bearing from certain poses, of whose information each has a share."""
+    for i in range(LANES):
+        innovation, h0, h1, far = _bearing(pose, member, bearing, i)
+        a0 = -h0 * member[XX + i] - h1 * member[XY + i]
+        a1 = -h0 * member[XY + i] - h1 * member[YY + i]
+        part = share[i] if far else 0.0
+        information = part / (part * (-h0 * a0 - h1 * a1) + variance)
+        k0, k1 = a0 * information, a1 * information
+        member[X + i] += k0 * innovation
+        member[Y + i] += k1 * innovation
+        member[XX + i] -= a0 * k0
+        member[XY + i] -= a0 * k1
+        member[YY + i] -= a1 * k1
+
+
+@inlined
+def _active(pose, member, distance, bearing, i):
+    """Innovations of range and bearing, direction (c, s), inverse range, whether it is far."""
+    dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
+    near = math.sqrt(dx * dx + dy * dy)
+    k = 1.0 / max(near, NEAREST)
+    turn = wrapped(pose[HEADING + i] + bearing - arctangent(dy, dx))
+    return distance - near, turn, dx * k, dy * k, k, near >= NEAREST
+
+
+@inlined
+def _whitened(nu0, nu1, S00, S01, S11):
+    """Innovations made independent and of variance one: they, and what makes them so."""
+    i0 = 1.0 / math.sqrt(S00)
+    L10 = S01 * i0
+    i1 = 1.0 / math.sqrt(S11 - L10 * L10)
+    e0 = nu0 * i0
+    return e0, (nu1 - L10 * e0) * i1, i0, i1, L10
+
+
+@inlined
+def _active_spread(pose, member, c, s, k, range_variance, bearing_variance, i):
+    """Covariance of range and bearing with x, y, heading, and of their innovations."""
+    h0, h1 = s * k, -c * k
+    a0 = -c * pose[PXX + i] - s * pose[PXY + i]
+    a1 = -c * pose[PXY + i] - s * pose[PYY + i]
+    a2 = -c * pose[PXH + i] - s * pose[PYH + i]
+    b0, b1, b2 = _bearing_gain(pose, h0, h1, i)
+    u0 = c * member[XX + i] + s * member[XY + i]
+    u1 = c * member[XY + i] + s * member[YY + i]
+    S00 = -c * a0 - s * a1 + c * u0 + s * u1 + range_variance
+    S01 = h0 * a0 + h1 * a1 - a2 - h0 * u0 - h1 * u1
+    S11 = h0 * b0 + h1 * b1 - b2 + _spread(member, h0, h1, i) + bearing_variance
+    return a0, a1, a2, b0, b1, b2, S00, S01, S11
+
+
+@lean
+def active_beyond(pose, member, distance, bearing, range_variance, bearing_variance, count, bound):
+    """Whether range and bearing are beyond the bound for every lane, each of one member."""
+    beyond = 0
+    for i in range(LANES):
+        nu0, nu1, c, s, k, far = _active(pose, member, distance, bearing, i)
+        _, _, _, _, _, _, S00, S01, S11 = _active_spread(
+            pose, member, c, s, k, range_variance, bearing_variance, i
+        )
+        e0, e1, _, _, _ = _whitened(nu0, nu1, S00, S01, S11)
+        within = not far or e0 * e0 + e1 * e1 <= bound
+        beyond += 0 if within or count[i] > 1 else 1
+    return beyond == LANES
+
+
+@lean
+def refine_by_active(
+    pose, member, distance, bearing, range_variance, bearing_variance, count, log_weight
+):
+    """Correct the poses whose landmark has one member by range and bearing, and weigh them."""
+    for i in range(LANES):
+        nu0, nu1, c, s, k, far = _active(pose, member, distance, bearing, i)
+        a0, a1, a2, b0, b1, b2, S00, S01, S11 = _active_spread(
+            pose, member, c, s, k, range_variance, bearing_variance, i
+        )
+        e0, e1, i0, i1, L10 = _whitened(nu0, nu1, S00, S01, S11)
+        part = 1.0 if far and count[i] == 1 else 0.0
+        value = -0.5 * (e0 * e0 + e1 * e1) + logarithm(i0 * i1) - 2.0 * HALF_LOG_TAU
+        log_weight[i] += part * value
+        i0, i1 = part * i0, part * i1
+        a0, a1, a2 = a0 * i0, a1 * i0, a2 * i0
+        b0, b1, b2 = (b0 - L10 * a0) * i1, (b1 - L10 * a1) * i1, (b2 - L10 * a2) * i1
+        pose[X + i] += a0 * e0 + b0 * e1
+        pose[Y + i] += a1 * e0 + b1 * e1
+        pose[HEADING + i] += a2 * e0 + b2 * e1
+        pose[PXX + i] -= a0 * a0 + b0 * b0
+        pose[PXY + i] -= a0 * a1 + b0 * b1
+        pose[PYY + i] -= a1 * a1 + b1 * b1
+        pose[PXH + i] -= a0 * a2 + b0 * b2
+        pose[PYH + i] -= a1 * a2 + b1 * b2
+        pose[PHH + i] -= a2 * a2 + b2 * b2
+
+
+@lean
+def correct_by_active(pose, member, distance, bearing, range_variance, bearing_variance, count):
+    """Correct, where it is its landmark's only one, a member by range and bearing."""
+    for i in range(LANES):
+        nu0, nu1, c, s, k, far = _active(pose, member, distance, bearing, i)
+        g0, g1 = -s * k, c * k
+        a0 = c * member[XX + i] + s * member[XY + i]
+        a1 = c * member[XY + i] + s * member[YY + i]
+        b0 = g0 * member[XX + i] + g1 * member[XY + i]
+        b1 = g0 * member[XY + i] + g1 * member[YY + i]
+        S00, S01 = c * a0 + s * a1 + range_variance, g0 * a0 + g1 * a1
+        S11 = g0 * b0 + g1 * b1 + bearing_variance
+        e0, e1, i0, i1, L10 = _whitened(nu0, nu1, S00, S01, S11)
+        part = 1.0 if far and count[i] == 1 else 0.0
+        i0, i1 = part * i0, part * i1
+        a0, a1 = a0 * i0, a1 * i0
+        b0, b1 = (b0 - L10 * a0) * i1, (b1 - L10 * a1) * i1
+        member[X + i] += a0 * e0 + b0 * e1
+        member[Y + i] += a1 * e0 + b1 * e1
+        member[XX + i] -= a0 * a0 + b0 * b0
+        member[XY + i] -= a0 * a1 + b0 * b1
+        member[YY + i] -= a1 * a1 + b1 * b1
+
+
+@lean
+def place_member(
+    pose, member, distance, bearing, range_variance, bearing_variance, log_weight, count
+):
+    """Put a member at a range and bearing, where a landmark has not one member (Eq. (16))."""
+    across = bearing_variance * distance * distance
+    for i in range(LANES):
+        c, s = cosine_and_sine(pose[HEADING + i] + bearing)
+        x, y = pose[X + i] + distance * c, pose[Y + i] + distance * s
+        xx = range_variance * c * c + across * s * s
+        xy = (range_variance - across) * c * s
+        yy = range_variance * s * s + across * c * c
+        here = count[i] != 1
+        member[X + i] = x if here else member[X + i]
+        member[Y + i] = y if here else member[Y + i]
+        member[XX + i] = xx if here else member[XX + i]
+        member[XY + i] = xy if here else member[XY + i]
+        member[YY + i] = yy if here else member[YY + i]
+        member[LOG_WEIGHT + i] = log_weight if here else member[LOG_WEIGHT + i]
+
+
+@lean
+def sample_pose(pose, normal):
+    """Draw the poses from their Gaussians with three standard normals each; no spread is left."""
+    for i in range(LANES):
+        L00 = math.sqrt(max(pose[PXX + i], 0.0))
+        i0 = 1.0 / L00 if L00 > 0.0 else 0.0
+        L10, L20 = pose[PXY + i] * i0, pose[PXH + i] * i0
+        left = pose[PYY + i] - L10 * L10
+        L11 = math.sqrt(max(left, 0.0)) if left > ROUNDING * pose[PYY + i] else 0.0
+        i1 = 1.0 / L11 if L11 > 0.0 else 0.0
+        L21 = (pose[PYH + i] - L20 * L10) * i1
+        left = pose[PHH + i] - L20 * L20 - L21 * L21
+        L22 = math.sqrt(max(left, 0.0)) if left > ROUNDING * pose[PHH + i] else 0.0
+        n0, n1, n2 = normal[X + i], normal[Y + i], normal[HEADING + i]
+        pose[X + i] += L00 * n0
+        pose[Y + i] += L10 * n0 + L11 * n1
+        pose[HEADING + i] = wrapped(pose[HEADING + i] + L20 * n0 + L21 * n1 + L22 * n2)
+    pose[PXX:] = 0.0

@@ -1,0 +1,242 @@
+"""Kernels on a block's rays: weigh, share, refine, correct and prune (`rays` tells the method).
+
+A landmark of one member is a ray of one: its share is all, and it is never pruned. The weights
+stay logs, so that no product of likelihoods underflows. ``rows`` (h, 6 `LANES`) are the members of
+one landmark; lane i has the first ``count[i]`` of them.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.arithmetic.elementary import exponential, logarithm
+from pipistrelle.estimation.fastslam.block import (
+    HALF_LOG_TAU,
+    HEADING,
+    LANES,
+    LOG_WEIGHT,
+    MEMBER,
+    PHH,
+    POSE,
+    PXH,
+    PXX,
+    PXY,
+    PYH,
+    PYY,
+    X,
+    Y,
+    correct_by_bearing,
+    expect_bearing,
+    refine_by_bearing,
+)
+from pipistrelle.estimation.rays import SMALLEST_AGGREGATED_SHARE, SMALLEST_SHARE
+from pipistrelle.jit import kernel, lean
+
+
+class Scratch(NamedTuple):
+    """Room to work.
+
+    Attributes
+    ----------
+    likelihood, posterior, share : (h, `LANES`)
+        Of each member; the first two are logs.
+    largest, total : (`LANES`)
+    whole : (`LANES`)
+        Shares of one.
+    refined : (h, `POSE`)
+        Poses as each member alone would have them.
+    """
+
+    likelihood: Float[np.ndarray, "h lanes"]
+    posterior: Float[np.ndarray, "h lanes"]
+    share: Float[np.ndarray, "h lanes"]
+    largest: Float[np.ndarray, " lanes"]
+    total: Float[np.ndarray, " lanes"]
+    whole: Float[np.ndarray, " lanes"]
+    refined: Float[np.ndarray, "h rows"]
+
+
+@kernel
+def room(members):
+    """Return room to work with rays of so many members."""
+    return Scratch(
+        np.empty((members, LANES)),
+        np.empty((members, LANES)),
+        np.empty((members, LANES)),
+        np.empty(LANES),
+        np.empty(LANES),
+        np.ones(LANES),
+        np.empty((members, POSE)),
+    )
+
+
+@lean
+def _largest(logs, members, largest):
+    """Largest of each lane's logs."""
+    for i in range(LANES):
+        largest[i] = -np.inf
+    for j in range(members):
+        row = logs[j]
+        for i in range(LANES):
+            largest[i] = max(largest[i], row[i])
+
+
+@lean
+def _weigh(rows, members, scratch):
+    """Aggregated likelihoods, in logs and normalised, into ``posterior`` (Eq. (18)).
+
+    Their sum before, in logs, goes to ``total``.
+    """
+    largest, total = scratch.largest, scratch.total
+    for j in range(members):
+        row, likelihood, posterior = rows[j], scratch.likelihood[j], scratch.posterior[j]
+        for i in range(LANES):
+            posterior[i] = row[LOG_WEIGHT + i] + likelihood[i]
+    _largest(scratch.posterior, members, largest)
+    total[:] = 0.0
+    for j in range(members):
+        posterior = scratch.posterior[j]
+        for i in range(LANES):
+            total[i] += exponential(posterior[i] - largest[i])
+    for i in range(LANES):
+        total[i] = largest[i] + logarithm(total[i])
+    for j in range(members):
+        posterior = scratch.posterior[j]
+        for i in range(LANES):
+            posterior[i] -= total[i]
+
+
+@lean
+def _share(members, sensing, scratch):
+    """Divide the measurement: shares go with a power of the likelihoods, now or aggregated."""
+    logs = scratch.posterior if sensing.aggregated else scratch.likelihood
+    smallest = SMALLEST_AGGREGATED_SHARE if sensing.aggregated else SMALLEST_SHARE
+    largest, total = scratch.largest, scratch.total
+    _largest(logs, members, largest)
+    total[:] = 0.0
+    for j in range(members):
+        row, share = logs[j], scratch.share[j]
+        for i in range(LANES):
+            share[i] = exponential(sensing.power * (row[i] - largest[i]))
+            total[i] += share[i]
+    for j in range(members):
+        share = scratch.share[j]
+        for i in range(LANES):
+            part = share[i] / total[i]
+            share[i] = part if part >= smallest else 0.0
+
+
+@lean
+def _add(log_likelihood, log_weight):
+    """Add log likelihoods, and their constant, to log weights."""
+    for i in range(LANES):
+        log_weight[i] += log_likelihood[i] - HALF_LOG_TAU
+
+
+@lean
+def refine_by_ray(pose, rows, count, members, bearing, sensing, exact, scratch, log_weight):
+    """Correct the poses by the bearing of a landmark, and weigh them by its likelihood."""
+    for j in range(members):
+        expect_bearing(
+            pose, rows[j], bearing, sensing.bearing_variance, count, j, scratch.likelihood[j]
+        )
+    if members == 1:
+        _add(scratch.likelihood[0], log_weight)
+        refine_by_bearing(pose, rows[0], bearing, sensing.bearing_variance, scratch.whole)
+        return
+    _weigh(rows, members, scratch)
+    _add(scratch.total, log_weight)
+    if exact:
+        _refine_to_mixture(pose, rows, members, bearing, sensing.bearing_variance, scratch)
+        return
+    _share(members, sensing, scratch)
+    for j in range(members):
+        refine_by_bearing(pose, rows[j], bearing, sensing.bearing_variance, scratch.share[j])
+
+
+@lean
+def _refine_to_mixture(pose, rows, members, bearing, variance, scratch):
+    """Set the poses to mean and covariance of the mixture of the members' refinements."""
+    for j in range(members):
+        refined, weight = scratch.refined[j], scratch.posterior[j]
+        for k in range(POSE):
+            refined[k] = pose[k]
+        refine_by_bearing(refined, rows[j], bearing, variance, scratch.whole)
+        for i in range(LANES):
+            weight[i] = exponential(weight[i])
+    pose[:] = 0.0
+    for j in range(members):
+        refined, weight = scratch.refined[j], scratch.posterior[j]
+        for row in range(0, POSE, LANES):
+            for i in range(LANES):
+                pose[row + i] += weight[i] * refined[row + i]
+    for j in range(members):
+        refined, weight = scratch.refined[j], scratch.posterior[j]
+        for i in range(LANES):
+            x, y = refined[X + i] - pose[X + i], refined[Y + i] - pose[Y + i]
+            turn = refined[HEADING + i] - pose[HEADING + i]
+            pose[PXX + i] += weight[i] * x * x
+            pose[PXY + i] += weight[i] * x * y
+            pose[PYY + i] += weight[i] * y * y
+            pose[PXH + i] += weight[i] * x * turn
+            pose[PYH + i] += weight[i] * y * turn
+            pose[PHH + i] += weight[i] * turn * turn
+
+
+@lean
+def correct_ray(pose, rows, count, members, bearing, sensing, exact, scratch):
+    """Weigh, correct and prune a landmark's members from certain poses, in place."""
+    for j in range(members):
+        expect_bearing(
+            pose, rows[j], bearing, sensing.bearing_variance, count, j, scratch.likelihood[j]
+        )
+    _weigh(rows, members, scratch)
+    if not exact:
+        _share(members, sensing, scratch)
+    for j in range(members):
+        share = scratch.whole if exact else scratch.share[j]
+        correct_by_bearing(pose, rows[j], bearing, sensing.bearing_variance, share)
+    _prune(rows, count, members, sensing.prune, scratch)
+
+
+@lean
+def _prune(rows, count, members, prune, scratch):
+    """Drop members whose aggregated likelihood is too small; the heaviest stays (Eq. (21))."""
+    largest, total = scratch.largest, scratch.total
+    _largest(scratch.posterior, members, largest)
+    least = largest  # which is not needed any more
+    for i in range(LANES):
+        least[i] = min(prune / count[i], exponential(largest[i]))
+        total[i] = 0.0
+    dropped = 0
+    for j in range(members):
+        posterior, keep = scratch.posterior[j], scratch.share[j]
+        for i in range(LANES):
+            weight = exponential(posterior[i])
+            keep[i] = 1.0 if weight >= least[i] and j < count[i] else 0.0
+            total[i] += keep[i] * weight
+            dropped += 1 if weight < least[i] and j < count[i] else 0
+    for i in range(LANES):
+        total[i] = logarithm(total[i])
+    for j in range(members):
+        row, posterior = rows[j], scratch.posterior[j]
+        for i in range(LANES):
+            row[LOG_WEIGHT + i] = posterior[i] - total[i]
+    if dropped > 0:
+        _close_up(rows, count, scratch.share)
+
+
+@lean
+def _close_up(rows, count, keep):
+    """Move the members that are kept to the front, lane by lane."""
+    for i in range(LANES):
+        left = 0
+        for j in range(count[i]):
+            if keep[j, i] > 0.0:
+                for k in range(i, MEMBER, LANES):
+                    rows[left, k] = rows[j, k]
+                left += 1
+        count[i] = left
+        if left == 1:
+            rows[0, LOG_WEIGHT + i] = 0.0

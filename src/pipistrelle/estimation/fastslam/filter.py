@@ -1,0 +1,299 @@
+r"""FastSLAM 2.0 with rays: each particle a sampled path with its own map.
+
+Given a path, landmarks are independent: a particle (Eqs. (12) and (22)) needs one small Gaussian
+per hypothesis and no joint covariance. A frame goes through five steps.
+
+1. **Propose.** Mean and covariance of the pose accumulate over the control steps since the last
+   sample, then each measurement of a mapped landmark refines them (Eqs. (13) and (14), in Kalman
+   form, each at the refined mean). A particle's weight grows by each measurement's marginal
+   likelihood :math:`N(\nu_i; 0, H_x P_{i-1} H_x^T + H_m P_m H_m^T + R)`, the product of which is
+   the likelihood of the frame given the particle's past. A bearing of a partial landmark has
+   :math:`\log \sum_j \Lambda_j N(\nu_j; 0, S_j)`; a range for a partial landmark and a new
+   landmark add no weight.
+2. **Sample** the pose, once.
+3. **Correct** the landmarks, weigh, share and prune the rays (`rays`), from the sampled pose.
+4. **Place** new landmarks from the sampled pose.
+5. **Resample** when too few particles count (`resampling`).
+
+``mixture`` says how a bearing treats a ray. ``federated``, the paper's way, corrects every member
+with the noise R / share. ``exact`` uses that members are independent given the pose: each is
+corrected with R itself and only the weights tell them apart, as in a Gaussian sum filter; the
+proposal is refined to the mean and covariance of the mixture of its members' refinements.
+
+A frame without measurements is not sampled: its motion goes on accumulating, which loses nothing.
+The start is not sampled either: its covariance P0 is the first that accumulates.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipistrelle.config import FastSlamConfig, RayConfig
+from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.beliefs import Gaussian, Landmarks
+from pipistrelle.estimation.fastslam.block import LANES, MEMBER
+from pipistrelle.estimation.fastslam.particles import (
+    SMALLEST_STD,
+    advance_swarm,
+    correct_swarm,
+    descend,
+    gated_by_all,
+    mean_full,
+    particle_map,
+    summarise,
+)
+from pipistrelle.estimation.fastslam.resampling import effective_particles, normalised, stratified
+from pipistrelle.estimation.motion import Motion, motion_numbers
+from pipistrelle.estimation.rays import Sensing, sensing_of
+
+_PAPER = FastSlamConfig()
+_PACKED = ([0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2])
+"""Where in a pose's covariance the rows xx, xy, yy, xh, yh and hh of a block come from."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FastSlamBelief:
+    """Particles, and what they amount to.
+
+    Particles are kept in b blocks of L = `particle.LANES`, number by number: a row of L numbers is
+    one number of each of a block's particles. Spare lanes of the last block repeat the last
+    particle.
+
+    Attributes
+    ----------
+    poses : (b, 9 L)
+        Rows x, y [m], heading [rad], and xx, xy, yy, xh, yh, hh of the covariance since the last
+        sample.
+    log_weight : (p)
+    landmark : (n)
+        Labels, in order of entry.
+    first : (n + 1)
+        First row of each landmark in ``member``, then their number.
+    count : (b, n, L)
+        Members of each particle's landmark.
+    member : (b, c, 6 L)
+        Rows x, y [m], xx, xy, yy [m^2] and log weight of each hypothesis.
+    estimate : Gaussian of (3) and (3, 3)
+        The swarm's pose, before any resampling.
+    best_count, best_member : (n), (c, 6)
+        The map of the heaviest particle, before any resampling; the first of equals.
+    full : float
+        Weighted mean number of fully initialised landmarks.
+    gated : int
+        Measurements rejected so far.
+    """
+
+    poses: Float[np.ndarray, "b rows"]
+    log_weight: Float[np.ndarray, " p"]
+    landmark: Int[np.ndarray, " n"]
+    first: Int[np.ndarray, " n+1"]
+    count: Int[np.ndarray, "b n lanes"]
+    member: Float[np.ndarray, "b c numbers"]
+    estimate: Gaussian
+    best_count: Int[np.ndarray, " n"]
+    best_member: Float[np.ndarray, "c 6"]
+    full: float
+    gated: int
+
+    def pose(self) -> Gaussian:
+        """Return the vehicle's pose, (3) and (3, 3): weighted mean and covariance of the swarm."""
+        return self.estimate
+
+    def landmarks(self) -> Landmarks:
+        """Return the heaviest particle's map, one row per member."""
+        return _rows(self.landmark, self.first, self.best_count, self.best_member)
+
+    def cloud(self) -> Float[np.ndarray, "p 3"]:
+        """Return the particles' poses, (p, 3)."""
+        rows = self.poses.reshape(len(self.poses), -1, LANES).swapaxes(1, 2)
+        return rows[:, :, :3].reshape(-1, 3)[: self.log_weight.size]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FastSlam:
+    """FastSLAM 2.0 (Bradley & Abaid, Sec. III-B) with rays (Sec. III-C).
+
+    Attributes
+    ----------
+    motion : Motion
+    range_std, bearing_std : [m], [rad]
+        What the filter assumes of a measurement (R, squared).
+    rays : RayConfig
+    gate : float
+        A measurement that is outside this share of every particle's predicted distribution is
+        dropped; 1 drops none.
+    swarm : FastSlamConfig
+        Number of particles, when to resample, how to treat rays.
+
+    Examples
+    --------
+    >>> motion = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
+    >>> slam = FastSlam(motion=motion, range_std=0.2, bearing_std=0.15, rays=RayConfig())
+    >>> belief = slam.init(Gaussian(mean=np.zeros(3), covariance=np.eye(3) * 1e-4))
+    >>> heard = {"landmark": np.array([4, 9]), "bearing": np.array([0.1, 0.2])}
+    >>> scan = Scan(time=0.0, range=np.array([2.0, np.nan]), **heard)
+    >>> belief = slam.update(belief, scan, np.random.default_rng(1))
+    >>> belief.landmarks().landmark.tolist(), belief.full
+    ([4, 9, 9, 9, 9], 1.0)
+    """
+
+    motion: Motion
+    range_std: float
+    bearing_std: float
+    rays: RayConfig
+    gate: float = 1.0
+    swarm: FastSlamConfig = _PAPER
+
+    def init(self, pose: Gaussian) -> FastSlamBelief:
+        """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
+        particles = self.swarm.particles
+        blocks = -(-particles // LANES)
+        numbers = np.concatenate([pose.mean, pose.covariance[*_PACKED]])
+        return FastSlamBelief(
+            poses=np.tile(np.repeat(numbers.astype(float), LANES), (blocks, 1)),
+            log_weight=np.zeros(particles),
+            landmark=np.empty(0, dtype=np.int64),
+            first=np.zeros(1, dtype=np.int64),
+            count=np.empty((blocks, 0, LANES), dtype=np.int64),
+            member=np.empty((blocks, 0, MEMBER)),
+            estimate=Gaussian(
+                mean=pose.mean.astype(float),
+                covariance=pose.covariance + SMALLEST_STD**2 * np.eye(3),
+            ),
+            best_count=np.empty(0, dtype=np.int64),
+            best_member=np.empty((0, 6)),
+            full=0.0,
+            gated=0,
+        )
+
+    def predict(
+        self,
+        belief: FastSlamBelief,
+        controls: Float[np.ndarray, "k 2"],
+        dt: Float[np.ndarray, " k"],
+        rng: np.random.Generator | None = None,
+    ) -> tuple[FastSlamBelief, Gaussian]:
+        """Carry every particle's pose and its covariance through the control steps of a frame.
+
+        Parameters
+        ----------
+        belief : FastSlamBelief
+        controls : (k, 2) [m/s, rad or rad/s]
+        dt : (k) [s]
+        rng : Generator, optional
+            Not used: poses are drawn once a frame, by `update`.
+
+        Returns
+        -------
+        belief : FastSlamBelief
+        poses : Gaussian of (k, 3) and (k, 3, 3)
+            After each step.
+
+        Notes
+        -----
+        Bradley & Abaid, Eq. (10), per particle.
+        """
+        carried, steps = belief.poses.copy(), len(dt)
+        poses = Gaussian(mean=np.empty((steps, 3)), covariance=np.empty((steps, 3, 3)))
+        weight = normalised(belief.log_weight)
+        numbers = motion_numbers(self.motion)
+        advance_swarm(carried, weight, controls, dt, numbers, poses.mean, poses.covariance)
+        if not steps:
+            return belief, poses
+        estimate = Gaussian(mean=poses.mean[-1], covariance=poses.covariance[-1])
+        return replace(belief, poses=carried, estimate=estimate), poses
+
+    def update(
+        self, belief: FastSlamBelief, scan: Scan, rng: np.random.Generator
+    ) -> FastSlamBelief:
+        """Refine, sample, correct, place and resample with a frame's measurements.
+
+        Parameters
+        ----------
+        belief : FastSlamBelief
+        scan : Scan
+        rng : Generator
+            Draws three normals per particle, then one uniform number per particle; nothing for a
+            scan without measurements, which a recorded log cannot hold.
+
+        Returns
+        -------
+        FastSlamBelief
+
+        Notes
+        -----
+        Bradley & Abaid, Eqs. (12) to (22).
+        """
+        if scan.landmark.size == 0:
+            return belief
+        particles = self.swarm.particles
+        normal, uniform = rng.standard_normal((particles, 3)), rng.random(particles)
+        sensing = sensing_of(self.range_std, self.bearing_std, self.rays, self.gate)
+        scan, gated = self._inside(belief, scan, sensing)
+        poses, gained, landmark, first, count, member = correct_swarm(
+            belief.poses, belief.landmark, belief.first, belief.count, belief.member,
+            scan.landmark, scan.bearing, scan.range, normal, sensing,
+            self.swarm.mixture == "exact",
+        )  # fmt: skip
+        weight = normalised(belief.log_weight + gained)
+        best_count, best_member = particle_map(count, member, np.argmax(weight))
+        mean, covariance = summarise(poses, weight)
+        corrected = FastSlamBelief(
+            poses=poses,
+            log_weight=np.log(weight, where=weight > 0.0, out=np.full(particles, -np.inf)),
+            landmark=landmark,
+            first=first,
+            count=count,
+            member=member,
+            estimate=Gaussian(mean=mean, covariance=covariance),
+            best_count=best_count,
+            best_member=best_member,
+            full=mean_full(count, weight),
+            gated=belief.gated + gated,
+        )
+        if effective_particles(weight) >= self.swarm.resample_below * particles:
+            return corrected
+        return _descend(corrected, stratified(weight, uniform))
+
+    def _inside(self, belief: FastSlamBelief, scan: Scan, sensing: Sensing) -> tuple[Scan, int]:
+        """Drop the measurements that no particle expected; tell how many."""
+        if self.gate >= 1.0:
+            return scan, 0
+        dropped = gated_by_all(
+            belief.poses, belief.landmark, belief.first, belief.count, belief.member,
+            scan.landmark, scan.bearing, scan.range, sensing,
+        )  # fmt: skip
+        kept = Scan(
+            time=scan.time,
+            landmark=scan.landmark[~dropped],
+            bearing=scan.bearing[~dropped],
+            range=scan.range[~dropped],
+        )
+        return kept, int(np.count_nonzero(dropped))
+
+
+def _descend(belief: FastSlamBelief, ancestor: Int[np.ndarray, " p"]) -> FastSlamBelief:
+    """Put copies of the ancestors in the particles' places, all of one weight."""
+    poses, count, member = descend(belief.poses, belief.count, belief.member, ancestor)
+    log_weight = np.full(ancestor.size, -math.log(ancestor.size))
+    return replace(belief, poses=poses, log_weight=log_weight, count=count, member=member)
+
+
+def _rows(
+    landmark: Int[np.ndarray, " n"],
+    first: Int[np.ndarray, " n+1"],
+    count: Int[np.ndarray, " n"],
+    member: Float[np.ndarray, "c 6"],
+) -> Landmarks:
+    """Lay out one particle's map, one row per member."""
+    label = np.repeat(landmark, count)
+    offset = np.arange(label.size) - np.repeat(np.cumsum(count) - count, count)
+    rows = member[np.repeat(first[:-1], count) + offset]
+    return Landmarks(
+        landmark=label,
+        mean=rows[:, :2].copy(),
+        covariance=rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2),
+        weight=np.exp(rows[:, 5]),
+    )

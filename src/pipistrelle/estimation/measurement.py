@@ -1,0 +1,67 @@
+"""The measurement model with its Jacobians: range and bearing of a point."""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.geometry import wrap_angle
+from pipistrelle.jit import kernel
+
+NEAREST = 1e-3
+"""A measurement of a point nearer than this [m] says nothing that can be linearised."""
+
+
+@kernel
+def sight(
+    x: float, y: float, heading: float, px: float, py: float
+) -> tuple[float, float, float, float, float]:
+    """Range, bearing, direction cosines and inverse range of a point, for kernels.
+
+    Returns range [m], bearing [rad], cos and sin of the direction in the world, and k, the inverse
+    of the range, which `NEAREST` bounds. The Jacobians follow: d range = (-c, -s, 0; c, s) and
+    d bearing = (s k, -c k, -1; -s k, c k) by pose and point.
+    """
+    dx, dy = px - x, py - y
+    distance = math.sqrt(dx * dx + dy * dy)
+    inverse = 1.0 / max(distance, NEAREST)
+    bearing = wrap_angle(math.atan2(dy, dx) - heading)
+    return distance, bearing, dx * inverse, dy * inverse, inverse
+
+
+def measurement_jacobians(
+    pose: Float[np.ndarray, "3"], point: Float[np.ndarray, "2"]
+) -> tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "2 2"]]:
+    r"""Derivatives of range and bearing by the pose and by the landmark's position.
+
+    .. math:: H_x = \begin{bmatrix} -c & -s & 0 \\ s/d & -c/d & -1 \end{bmatrix}, \qquad
+              H_m = \begin{bmatrix} c & s \\ -s/d & c/d \end{bmatrix}
+
+    with (c, s) the unit vector from the vehicle to the landmark and d their distance. A passive
+    measurement has the second rows alone.
+
+    Parameters
+    ----------
+    pose : (3) [m, m, rad]
+    point : (2) [m]
+
+    Returns
+    -------
+    H_x : (2, 3)
+    H_m : (2, 2)
+
+    Notes
+    -----
+    Bradley & Abaid, with Eqs. (6), (7) and (11).
+
+    Examples
+    --------
+    >>> measurement_jacobians(np.zeros(3), np.array([2.0, 0.0]))[1]
+    array([[ 1. ,  0. ],
+           [-0. ,  0.5]])
+    """
+    _, _, c, s, k = sight(pose[0], pose[1], pose[2], point[0], point[1])
+    return (
+        np.array([[-c, -s, 0.0], [s * k, -c * k, -1.0]]),
+        np.array([[c, s], [-s * k, c * k]]),
+    )

@@ -1,0 +1,264 @@
+"""Listening: a path through a world -> what is heard at each frame, by either engine.
+
+The noise and the beacon's sound are those of the world and shared by all beamwidths, drawn once
+and keyed by the frame alone.
+
+The dense engine records until the vehicle calls again, 100,000 samples of 40 channels in the
+paper's half a second less the blanked call. The block engine stops after the last arrival. What
+follows is noise alone: no label could be given to anything in it, so the scans follow the same law,
+and only the count of clutter lacks the false alarms of the silence (about 0.01 a frame).
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Complex
+
+from pipistrelle.acoustics.arrivals import (
+    ACTIVE,
+    Arrivals,
+    arrivals_of_emissions,
+    rows_of,
+    through_piston,
+)
+from pipistrelle.arithmetic.noise import stream_key
+from pipistrelle.arrays.layout import Layout, square_of_four
+from pipistrelle.arrays.receiver import (
+    BLOCK,
+    Sampling,
+    add_echo_blocks,
+    block_shape,
+    blocks_to_hear,
+    noise_blocks,
+    record_samples,
+    sampling,
+)
+from pipistrelle.config import Config
+from pipistrelle.detection.matched import filter_blocks, filter_samples
+from pipistrelle.detection.merging import Heard, average_faces
+from pipistrelle.detection.snapshots import Detections, Detector, detect, detector
+from pipistrelle.experiments.hearing.oracle import faintest_level_db, label_detections
+from pipistrelle.experiments.hearing.scenario import Scenario
+
+TOGETHER = 25
+"""Frames whose arrivals are computed at a time: arrays of a few thousand keep NumPy busy."""
+
+Progress = Callable[[str, int, int], None]
+"""Called with a stage's name, the frames done and their number."""
+
+
+def listen(
+    scenario: Scenario,
+    config: Config,
+    radii: Sequence[float],
+    *,
+    iteration: int = 0,
+    beam: Callable[..., Arrivals] = through_piston,
+    layout: Layout | None = None,
+    find: Callable[..., Detections] = detect,
+    progress: Progress | None = None,
+) -> tuple[tuple[Heard, ...], ...]:
+    """Hear every frame of a path, once for all beamwidths.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    config : Config
+    radii : sequence of [m]
+        Radii of the vehicle's piston; ``config.emitter.radius`` is not used.
+    iteration : int
+        Number of the world, part of the noise's key.
+    beam : callable
+        Gives the vehicle's call its directivity, as `through_piston` does.
+    layout : Layout, optional
+        The arrays; those of the settings by default.
+    find : callable
+        Finds calls in the matched filter's output, as `detect` does.
+    progress : callable, optional
+
+    Returns
+    -------
+    tuple, one per radius, of tuples of Heard, one per frame
+
+    Raises
+    ------
+    InputError
+        When the sampling does not fit the tones, or points of the world coincide.
+
+    Notes
+    -----
+    Bradley & Abaid, Sec. II.
+
+    Examples
+    --------
+    >>> from pipistrelle.config import ScenarioConfig
+    >>> from pipistrelle.experiments.hearing.scenario import draw_scenario
+    >>> config = Config(scenario=ScenarioConfig(steps=8))
+    >>> world = draw_scenario(config, np.random.default_rng(7))
+    >>> wide, narrow = listen(world, config, (0.0025, 0.025))
+    >>> len(wide), wide[1].time
+    (2, 1.0)
+    """
+    setup = config.scenario
+    station = _station(config, layout or square_of_four(config.receiver), find)
+    engine = _dense if config.receiver.engine == "dense" else _blocks
+    beams: tuple[list[Heard], ...] = tuple([] for _ in radii)
+    frames = range(setup.steps_per_frame, len(scenario.path), setup.steps_per_frame)
+    emissions = _emissions(scenario, frames, radii, config, beam)
+    for number, (k, aimed) in enumerate(zip(frames, emissions, strict=True), start=1):
+        key = stream_key(config.seed, iteration, "noise", number)
+        recorded = engine(aimed, station, key)
+        for heard, arrivals, detections in zip(beams, aimed, recorded, strict=True):
+            heard.append(_heard(float(scenario.time[k]), detections, arrivals, station))
+        if progress:
+            progress("listening", number, len(frames))
+    return tuple(tuple(heard) for heard in beams)
+
+
+class Workspace:
+    """Arrays that every frame uses anew: fresh memory costs more than the arithmetic on it."""
+
+    def __init__(self) -> None:
+        self._flat: dict[str, np.ndarray] = {}
+
+    def array(self, name: str, shape: tuple[int, ...]) -> Complex[np.ndarray, "..."]:
+        """Return the array of a name, in a shape; what it held is anybody's guess."""
+        size = math.prod(shape)
+        if name not in self._flat or self._flat[name].size < size:
+            self._flat[name] = np.empty(size + size // 4, dtype=np.complex128)
+        return self._flat[name][:size].reshape(shape)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Station:
+    """What every frame of a path is heard with."""
+
+    config: Config
+    layout: Layout
+    sampling: Sampling
+    detector: Detector
+    find: Callable[..., Detections]
+    faintest_db: float
+    workspace: Workspace
+
+
+def _station(config: Config, layout: Layout, find: Callable[..., Detections]) -> _Station:
+    """Settle what every frame of a path is heard with."""
+    settled, finder = sampling(config), detector(config, layout)
+    return _Station(
+        config=config,
+        layout=layout,
+        sampling=settled,
+        detector=finder,
+        find=find,
+        faintest_db=faintest_level_db(
+            finder.threshold,
+            elements=layout.position.size,
+            samples=settled.pulse * settled.block,
+            noise_std=settled.noise_std,
+            margin_db=config.association.margin_db,
+        ),
+        workspace=Workspace(),
+    )
+
+
+def _emissions(
+    scenario: Scenario,
+    frames: Sequence[int],
+    radii: Sequence[float],
+    config: Config,
+    beam: Callable[..., Arrivals],
+) -> Iterator[list[Arrivals]]:
+    """Yield each frame's arrivals, one per piston; many frames are computed at a time."""
+    for first in range(0, len(frames), TOGETHER):
+        steps = np.array(frames[first : first + TOGETHER])
+        poses = scenario.path[steps]
+        velocities = (poses[:, :2] - scenario.path[steps - 1, :2]) / config.scenario.step
+        emission, count = arrivals_of_emissions(
+            poses, velocities, scenario.landmarks, scenario.beacon, config
+        )
+        aimed = [
+            beam(
+                emission,
+                radius=radius,
+                frequency=config.emitter.frequency,
+                speed_of_sound=config.air.speed_of_sound,
+            )
+            for radius in radii
+        ]
+        end = np.cumsum(count)
+        for rows in map(slice, end - count, end):
+            yield [rows_of(arrivals, rows) for arrivals in aimed]
+
+
+def _heard(time: float, detections: Detections, arrivals: Arrivals, station: _Station) -> Heard:
+    """Label a frame's detections by the truth and average them over the faces."""
+    config = station.config
+    label = label_detections(
+        detections,
+        arrivals,
+        station.layout,
+        config.association,
+        pulse=config.emitter.pulse,
+        faintest_db=station.faintest_db,
+    )
+    return average_faces(
+        time,
+        detections,
+        label,
+        averaging=config.detection.averaging,
+        speed_of_sound=config.air.speed_of_sound,
+    )
+
+
+def _blocks(aimed: Sequence[Arrivals], station: _Station, key: int) -> Iterator[Detections]:
+    """Yield, per beam, what is detected of its arrivals from block sums."""
+    layout, settled, space = station.layout, station.sampling, station.workspace
+    pulse, own = settled.pulse, np.count_nonzero(aimed[0].source == ACTIVE)  # they come first
+    shape = block_shape(blocks_to_hear(aimed[0], settled), layout)
+    shared = noise_blocks(shape[0], layout, settled, key, out=space.array("shared", shape))
+    add_echo_blocks(shared, rows_of(aimed[0], slice(own, None)), layout, settled)
+    lags = (shape[0] - pulse + 1, *shape[1:])
+    for left, arrivals in zip(range(len(aimed) - 1, -1, -1), aimed, strict=True):
+        signal = shared
+        if left:  # the last beam may write on what it shares
+            signal = space.array("signal", shape)
+            np.copyto(signal, shared)
+        add_echo_blocks(signal, rows_of(arrivals, slice(own)), layout, settled)
+        matched = filter_blocks(
+            signal,
+            pulse=pulse,
+            block=settled.block,
+            noise_std=settled.noise_std,
+            out=space.array("matched", lags),
+        )
+        yield station.find(
+            matched, station.detector, start=pulse * BLOCK, interval=BLOCK, pulse=pulse
+        )
+
+
+def _dense(aimed: Sequence[Arrivals], station: _Station, key: int) -> Iterator[Detections]:
+    """Yield the same from every sample until the next call, in single precision."""
+    settled, setup = station.sampling, station.config.scenario
+    length = settled.pulse * settled.block
+    period = math.floor(setup.steps_per_frame * setup.step / BLOCK) - settled.pulse
+    for arrivals in aimed:
+        samples = record_samples(
+            max(period, blocks_to_hear(arrivals, settled)),
+            arrivals,
+            station.layout,
+            settled,
+            np.random.default_rng(key),
+            single=True,
+        )
+        matched = filter_samples(
+            samples,
+            tones=settled.tones,
+            rate=settled.rate,
+            length=length,
+            noise_std=settled.noise_std,
+        )
+        start, interval = settled.pulse * BLOCK, 1.0 / settled.rate
+        yield station.find(matched, station.detector, start=start, interval=interval, pulse=length)

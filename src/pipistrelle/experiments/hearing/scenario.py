@@ -1,0 +1,192 @@
+"""The true world: a noisy drive, landmarks around it, a beacon that calls."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.arithmetic.noise import stream_key
+from pipistrelle.config import Config, InputError, MotionConfig, ScenarioConfig
+from pipistrelle.estimation.motion import Motion, motion_step
+
+TRIES = 2000
+"""Draws of one landmark before the request counts as impossible."""
+DENSEST = math.pi / math.sqrt(12.0)
+"""Largest share of the plane that equal discs can cover."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scenario:
+    """A true world. Landmark i (from 0) bears the label i + 1, the beacon the label n + 1.
+
+    Attributes
+    ----------
+    time : (k + 1) [s]
+    path : (k + 1, 3) [m, m, rad]
+        True poses, the start first.
+    controls : (k, 2)
+        Nominal speed [m/s] and steering angle [rad] of each step, as the filters know them.
+    landmarks : (n, 2) [m]
+    beacon : (2) [m]
+    """
+
+    time: Float[np.ndarray, " t"]
+    path: Float[np.ndarray, "t 3"]
+    controls: Float[np.ndarray, "t-1 2"]
+    landmarks: Float[np.ndarray, "n 2"]
+    beacon: Float[np.ndarray, "2"]
+
+
+def world_of(config: Config, iteration: int = 0) -> Scenario:
+    """Draw one of the worlds that the settings' seed stands for.
+
+    Parameters
+    ----------
+    config : Config
+    iteration : int
+        Number of the world.
+
+    Returns
+    -------
+    Scenario
+
+    Raises
+    ------
+    InputError
+        As `draw_scenario`.
+
+    Examples
+    --------
+    >>> one, again, other = world_of(Config()), world_of(Config()), world_of(Config(), 1)
+    >>> bool((one.beacon == again.beacon).all()), bool((one.beacon == other.beacon).all())
+    (True, False)
+    """
+    key = stream_key(config.seed, iteration, "scenario")
+    return draw_scenario(config, np.random.default_rng(key))
+
+
+def draw_scenario(config: Config, rng: np.random.Generator) -> Scenario:
+    """Draw a world: the path first, then the beacon and the landmarks clear of it.
+
+    Parameters
+    ----------
+    config : Config
+    rng : Generator
+
+    Returns
+    -------
+    Scenario
+
+    Raises
+    ------
+    InputError
+        When the landmarks or the beacon find no place.
+
+    Notes
+    -----
+    Bradley & Abaid, Sec. IV.
+
+    Examples
+    --------
+    >>> world = draw_scenario(Config(), np.random.default_rng(7))
+    >>> world.path.shape, world.landmarks.shape
+    ((1501, 3), (50, 2))
+    """
+    setup = config.scenario
+    controls = np.tile([setup.speed, setup.steering], (setup.steps, 1))
+    path = _drive(np.array(setup.start), controls, setup.step, config.motion, rng)
+    beacon = _place_beacon(setup, path[:, :2], rng)
+    return Scenario(
+        time=np.arange(setup.steps + 1) * setup.step,
+        path=path,
+        controls=controls,
+        landmarks=_place_landmarks(setup, path[:, :2], beacon, rng),
+        beacon=beacon,
+    )
+
+
+def bicycle(motion: MotionConfig) -> Motion:
+    """Return the settings' motion model."""
+    return Motion(
+        model="bicycle",
+        control_std=(motion.speed_std, motion.steering_std),
+        wheelbase=motion.wheelbase,
+    )
+
+
+def _drive(
+    start: Float[np.ndarray, "3"],
+    controls: Float[np.ndarray, "k 2"],
+    dt: float,
+    motion: MotionConfig,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "t 3"]:
+    """Drive with noise on both controls (Bradley & Abaid, Eq. (5))."""
+    model = bicycle(motion)
+    noisy = controls + rng.standard_normal(controls.shape) * model.control_std
+    path = np.empty((len(controls) + 1, 3))
+    path[0] = start
+    for k, control in enumerate(noisy):
+        path[k + 1] = motion_step(model, path[k], control, dt)
+    return path
+
+
+def _distance(points: Float[np.ndarray, "n 2"], place: Float[np.ndarray, "2"]) -> float:
+    """Distance of the nearest of the points; infinite where there is none."""
+    offset = points - place
+    return math.sqrt(np.min(np.sum(offset * offset, axis=1), initial=math.inf))
+
+
+def _place_beacon(
+    setup: ScenarioConfig, path: Float[np.ndarray, "k 2"], rng: np.random.Generator
+) -> Float[np.ndarray, "2"]:
+    """Put the beacon at a random bearing, clear of the path."""
+    for _ in range(TRIES):
+        direction = rng.uniform(-math.pi, math.pi)
+        beacon = setup.beacon_distance * np.array([math.cos(direction), math.sin(direction)])
+        if _distance(path, beacon) >= setup.clearance:
+            return beacon
+    raise InputError(
+        f"scenario.beacon_distance: found {setup.beacon_distance:g} m, but no bearing there is "
+        f"{setup.clearance:g} m clear of the path; expected a distance away from the path, or a "
+        "smaller scenario.clearance"
+    )
+
+
+def _place_landmarks(
+    setup: ScenarioConfig,
+    path: Float[np.ndarray, "k 2"],
+    beacon: Float[np.ndarray, "2"],
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "n 2"]:
+    """Draw landmarks one by one, uniformly over the disc, until each keeps its distances."""
+    half = 0.5 * setup.spacing
+    most = DENSEST * ((setup.radius + half) / half) ** 2 if half > 0.0 else math.inf
+    if setup.landmarks > max(most, 1.0):
+        raise _too_many(setup, f"at most {max(int(most), 1)} fit")
+    placed = np.empty((setup.landmarks, 2))
+    for i in range(setup.landmarks):
+        for _ in range(TRIES):
+            distance = setup.radius * math.sqrt(rng.uniform())
+            direction = rng.uniform(-math.pi, math.pi)
+            place = distance * np.array([math.cos(direction), math.sin(direction)])
+            if (
+                _distance(placed[:i], place) >= setup.spacing
+                and _distance(path, place) >= setup.clearance
+                and _distance(beacon[None], place) >= setup.clearance
+            ):
+                placed[i] = place
+                break
+        else:
+            raise _too_many(setup, f"room was found for {i}")
+    return placed
+
+
+def _too_many(setup: ScenarioConfig, limit: str) -> InputError:
+    """Say that the landmarks do not fit, and what to change."""
+    return InputError(
+        f"scenario.landmarks: found {setup.landmarks}, but {limit} at {setup.spacing:g} m from "
+        f"each other within {setup.radius:g} m of the centre; expected fewer landmarks, a smaller "
+        "scenario.spacing or scenario.clearance, or a larger scenario.radius"
+    )

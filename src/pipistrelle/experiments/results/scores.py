@@ -1,0 +1,175 @@
+"""Scores: how good an estimate is, by the truth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.beliefs import Track
+from pipistrelle.evaluation.accuracy import (
+    alignment,
+    heaviest,
+    moved,
+    pose_error,
+    position_error,
+    rmse,
+    scored_landmarks,
+)
+from pipistrelle.evaluation.consistency import diverged, track_nees
+from pipistrelle.experiments.drives import LabelledPoints
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scores:
+    """How one trial did, under the names of ``summary.json``.
+
+    None where there is no truth or nothing to score; infinite or NaN where the trial diverged.
+    Errors and NEES are over the control steps, the start excluded.
+
+    Attributes
+    ----------
+    position_rmse_m, heading_rmse_rad : float or None
+        Of the path.
+    map_rmse_m : float or None
+        Of the fully initialised landmarks whose true positions are known.
+    position_rmse_aligned_m, map_rmse_aligned_m : float or None
+        The same, path and map each after its own rigid motion; at least two points.
+    nees_mean, nees_max : float or None
+    diverged : bool or None
+        Whether any NEES is not finite or above the limit; without truth, True where the path is
+        not finite, else None.
+    landmarks_full, landmarks_total : int
+        Fully initialised; fully and partially.
+    measurements_per_frame : float or None
+        Mean over the scans.
+    gated : int
+        Measurements that the gate rejected.
+    """
+
+    position_rmse_m: float | None
+    heading_rmse_rad: float | None
+    map_rmse_m: float | None
+    position_rmse_aligned_m: float | None
+    map_rmse_aligned_m: float | None
+    nees_mean: float | None
+    nees_max: float | None
+    diverged: bool | None
+    landmarks_full: int
+    landmarks_total: int
+    measurements_per_frame: float | None
+    gated: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrialResult:
+    """One estimate: a strategy's scans, what a filter made of them, and how good it is.
+
+    Attributes
+    ----------
+    strategy : "active", "fused" or "passive"
+    filter : "ekf" or "fastslam"
+    track : Track
+    scans : tuple of Scan
+        One per frame, empty ones included.
+    scores : Scores
+    wall_s : [s]
+        Time that the estimate took.
+    """
+
+    strategy: str
+    filter: str
+    track: Track
+    scans: tuple[Scan, ...]
+    scores: Scores
+    wall_s: float
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def score(
+    track: Track,
+    true_path: Float[np.ndarray, "k 3"] | None,
+    true_landmarks: LabelledPoints | None,
+    scans: Sequence[Scan],
+    limit: float,
+) -> Scores:
+    """Score a track and its map against the truth.
+
+    Parameters
+    ----------
+    track : Track of k poses, the start first
+    true_path : (k, 3) [m, m, rad], optional
+        At the times of the track; NaN where it is not known, which is not scored.
+    true_landmarks : labels (n) and positions (n, 2) [m], optional
+    scans : sequence of Scan
+        What the filter was given: one per frame, empty ones included.
+    limit : float
+        A NEES above it means divergence.
+
+    Returns
+    -------
+    Scores
+
+    Raises
+    ------
+    ValueError
+        Where track and truth differ in length.
+
+    Notes
+    -----
+    Bradley & Abaid, Eqs. (23), (26) and (27) and Sec. V-A.
+
+    Examples
+    --------
+    >>> from pipistrelle.estimation.beliefs import Gaussian, Landmarks
+    >>> nothing = Landmarks(
+    ...     landmark=np.empty(0, int),
+    ...     mean=np.empty((0, 2)),
+    ...     covariance=np.empty((0, 2, 2)),
+    ...     weight=np.empty(0),
+    ... )
+    >>> pose = Gaussian(mean=np.zeros((2, 3)), covariance=np.tile(np.eye(3), (2, 1, 1)))
+    >>> still = Track(time=np.arange(2.0), pose=pose, landmarks=nothing, gated=0)
+    >>> scores = score(still, np.array([[0.0, 0, 0], [3, 4, 0]]), None, (), 50.0)
+    >>> scores.position_rmse_m, scores.nees_max, scores.map_rmse_m
+    (5.0, 25.0, None)
+    """
+    known = np.full_like(track.pose.mean, np.nan) if true_path is None else true_path
+    if len(known) != len(track.pose.mean):
+        raise ValueError(f"{len(track.pose.mean)} poses, but {len(known)} true ones")
+    rows = np.isfinite(known).all(axis=1) & (np.arange(len(known)) > 0)
+    path, truth = track.pose.mean[rows], known[rows]
+    error = pose_error(path, truth)
+    epsilon = track_nees(track.pose.mean, track.pose.covariance, known)[1:]
+    epsilon = epsilon[~np.isnan(epsilon)]
+    estimate = heaviest(track.landmarks)
+    labels, positions = true_landmarks or (np.empty(0, int), np.empty((0, 2)))
+    mapped, true = scored_landmarks(estimate, labels, positions)
+    finite = bool(np.all(np.isfinite(track.pose.mean)))
+    return Scores(
+        position_rmse_m=_rmse(position_error(path, truth)),
+        heading_rmse_rad=_rmse(error[:, 2]),
+        map_rmse_m=_rmse(position_error(mapped, true)),
+        position_rmse_aligned_m=_aligned_rmse(path[:, :2], truth[:, :2]),
+        map_rmse_aligned_m=_aligned_rmse(mapped, true),
+        nees_mean=float(np.mean(epsilon)) if len(epsilon) else None,
+        nees_max=float(np.max(epsilon)) if len(epsilon) else None,
+        diverged=diverged(epsilon, limit) if len(epsilon) else (None if finite else True),
+        landmarks_full=int(np.sum(estimate.full)),
+        landmarks_total=len(estimate.landmark),
+        measurements_per_frame=sum(len(s.landmark) for s in scans) / len(scans) if scans else None,
+        gated=track.gated,
+    )
+
+
+def _rmse(error: Float[np.ndarray, " n"]) -> float | None:
+    """Return the RMSE, None of no errors."""
+    return rmse(error) if len(error) else None
+
+
+def _aligned_rmse(points: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "n 2"]) -> float | None:
+    """Return the RMSE after the best rigid motion, None of fewer than two points."""
+    if len(points) < 2:
+        return None
+    return rmse(position_error(moved(points, alignment(points, true)), true))

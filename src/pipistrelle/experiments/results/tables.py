@@ -1,0 +1,237 @@
+"""What the files of a result folder hold: tracks and maps as text, the rest as tables.
+
+Columns bear their units. In the tables null means that there is none (no truth, a passive range);
+what a diverged filter left not finite stays so. NaN is an error where the truth is not known, and a
+NEES before an exact start has become uncertain.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.beliefs import Landmarks, Track
+from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
+from pipistrelle.evaluation.consistency import track_nees
+from pipistrelle.experiments.drives import LabelledPoints
+
+if TYPE_CHECKING:
+    import polars as pl
+
+
+@np.errstate(invalid="ignore")
+def tum_text(time: Float[np.ndarray, " k"], path: Float[np.ndarray, "k 3"]) -> str:
+    r"""Write a path as lines of time, x, y, z and a unit quaternion, the TUM format.
+
+    .. math:: q = (0, 0, \sin(\theta / 2), \cos(\theta / 2))
+
+    Parameters
+    ----------
+    time : (k) [s]
+        Kept to 1e-6 s.
+    path : (k, 3) [m, m, rad]
+        Kept to 1e-12.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> print(tum_text(np.array([0.125]), np.array([[1.0, 2.0, -np.pi]])), end="")
+    0.125000 1.000000000000 2.000000000000 0 0 0 -1.000000000000 0.000000000000
+    """
+    half = path[:, 2] / 2.0
+    rows = np.column_stack([time, path[:, :2], np.sin(half), np.cos(half)])
+    return "".join(
+        f"{t:.6f} {x:.12f} {y:.12f} 0 0 0 {qz:.12f} {qw:.12f}\n" for t, x, y, qz, qw in rows
+    )
+
+
+def map_text(landmarks: Landmarks) -> str:
+    """Write a map as one line per landmark: mean, covariance and status.
+
+    Parameters
+    ----------
+    landmarks : Landmarks
+        A partially initialised landmark is represented by its heaviest hypothesis.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> covariance = np.array([[[0.04, 0.01], [0.01, 0.09]]])
+    >>> landmarks = Landmarks(
+    ...     landmark=np.array([7]),
+    ...     mean=np.array([[1.0, 2.0]]),
+    ...     covariance=covariance,
+    ...     weight=np.array([1.0]),
+    ... )
+    >>> print(map_text(landmarks), end="")
+    landmark,x,y,xx,xy,yy,status
+    7,1,2,0.04,0.01,0.09,full
+    """
+    estimate = heaviest(landmarks)
+    lines = ["landmark,x,y,xx,xy,yy,status"]
+    for label, mean, P, full in zip(
+        estimate.landmark, estimate.mean, estimate.covariance, estimate.full, strict=True
+    ):
+        numbers = ",".join(f"{value:.15g}" for value in (*mean, P[0, 0], P[0, 1], P[1, 1]))
+        lines.append(f"{label},{numbers},{'full' if full else 'partial'}")
+    return "\n".join(lines) + "\n"
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def step_table(track: Track, true_path: Float[np.ndarray, "k 3"] | None) -> "pl.DataFrame":
+    """Lay out a track, its errors and its NEES, one row per pose.
+
+    Parameters
+    ----------
+    track : Track of k poses
+    true_path : (k, 3) [m, m, rad], optional
+        Without it the columns that need it are null.
+
+    Returns
+    -------
+    DataFrame of k rows
+        Estimate, its standard deviations, truth, errors and NEES.
+
+    Notes
+    -----
+    Bradley & Abaid, the terms of Eqs. (23) and (26).
+
+    Examples
+    --------
+    >>> from pipistrelle.estimation.beliefs import Gaussian
+    >>> nowhere = Landmarks(
+    ...     landmark=np.empty(0, int),
+    ...     mean=np.empty((0, 2)),
+    ...     covariance=np.empty((0, 2, 2)),
+    ...     weight=np.empty(0),
+    ... )
+    >>> pose = Gaussian(mean=np.zeros((1, 3)), covariance=4 * np.eye(3)[None])
+    >>> track = Track(time=np.zeros(1), pose=pose, landmarks=nowhere, gated=0)
+    >>> table = step_table(track, np.array([[3.0, 4.0, 0.0]]))
+    >>> table["x_std_m"].item(), table["position_error_m"].item(), table["nees"].item()
+    (2.0, 5.0, 6.25)
+    """
+    import polars as pl
+
+    mean, covariance = track.pose.mean, track.pose.covariance
+    std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    known = {"time_s": track.time, **_pose_columns("{}", mean), **_pose_columns("{}_std", std)}
+    true = np.full_like(mean, np.nan) if true_path is None else true_path
+    error = pose_error(mean, true)
+    scored = {
+        **_pose_columns("true_{}", true),
+        "position_error_m": position_error(mean, true),
+        "heading_error_rad": error[:, 2],
+        "nees": track_nees(mean, covariance, true),
+    }
+    truth = pl.DataFrame(scored)
+    return pl.DataFrame(known).hstack(truth if true_path is not None else truth.clear(len(mean)))
+
+
+def _pose_columns(name: str, poses: Float[np.ndarray, "k 3"]) -> dict[str, np.ndarray]:
+    """Name the columns of poses, or of their standard deviations."""
+    units = (("x", "m"), ("y", "m"), ("heading", "rad"))
+    return {f"{name.format(part)}_{unit}": poses[:, i] for i, (part, unit) in enumerate(units)}
+
+
+def landmark_table(landmarks: Landmarks, true_landmarks: LabelledPoints | None) -> "pl.DataFrame":
+    """Lay out a map, one row per hypothesis, and beside it where the landmarks are.
+
+    Parameters
+    ----------
+    landmarks : Landmarks
+    true_landmarks : labels (n) and positions (n, 2) [m], optional
+
+    Returns
+    -------
+    DataFrame
+        ``status`` is full, partial or, for a true landmark that is not in the map, unseen.
+
+    Notes
+    -----
+    Bradley & Abaid, the terms of Eq. (27).
+
+    Examples
+    --------
+    >>> landmarks = Landmarks(
+    ...     landmark=np.array([7]),
+    ...     mean=np.array([[3.0, 4.0]]),
+    ...     covariance=np.eye(2)[None],
+    ...     weight=np.array([1.0]),
+    ... )
+    >>> table = landmark_table(landmarks, (np.array([7, 8]), np.zeros((2, 2))))
+    >>> table.select("landmark", "status", "error_m").rows()
+    [(7, 'full', 5.0), (8, 'unseen', None)]
+    """
+    import polars as pl
+
+    label, mean, P = landmarks.landmark, landmarks.mean, landmarks.covariance
+    _, row, hypotheses = np.unique(label, return_inverse=True, return_counts=True)
+    found = pl.DataFrame(
+        {
+            "landmark": label.astype(np.int64),
+            "status": np.where(hypotheses[row] == 1, "full", "partial").astype(str).tolist(),
+            "weight": landmarks.weight,
+            "x_m": mean[:, 0],
+            "y_m": mean[:, 1],
+            "xx_m2": P[:, 0, 0],
+            "xy_m2": P[:, 0, 1],
+            "yy_m2": P[:, 1, 1],
+        },
+        schema_overrides={"status": pl.String},
+    )
+    labels, positions = true_landmarks or (np.empty(0, np.int64), np.empty((0, 2)))
+    truth = pl.DataFrame(
+        {
+            "landmark": labels.astype(np.int64),
+            "true_x_m": positions[:, 0],
+            "true_y_m": positions[:, 1],
+        }
+    )
+    table = found.join(truth, on="landmark", how="full", coalesce=True, maintain_order="left_right")
+    across, along = pl.col("x_m") - pl.col("true_x_m"), pl.col("y_m") - pl.col("true_y_m")
+    return table.with_columns(
+        pl.col("status").fill_null("unseen"), error_m=(across**2 + along**2).sqrt()
+    )
+
+
+def measurement_table(scans: Sequence[Scan]) -> "pl.DataFrame":
+    """Lay out scans, one row per measurement.
+
+    Parameters
+    ----------
+    scans : sequence of Scan
+
+    Returns
+    -------
+    DataFrame
+        ``range_m`` is null where the measurement is passive.
+
+    Examples
+    --------
+    >>> bearing, reach = np.array([0.5]), np.array([np.nan])
+    >>> scan = Scan(time=1.0, landmark=np.array([7]), bearing=bearing, range=reach)
+    >>> measurement_table([scan]).rows()
+    [(1.0, 7, 0.5, None)]
+    """
+    import polars as pl
+
+    def joined(parts: list[np.ndarray], dtype: type) -> np.ndarray:
+        return np.concatenate([np.empty(0, dtype), *parts]).astype(dtype)
+
+    return pl.DataFrame(
+        {
+            "time_s": joined([np.full(len(s.landmark), s.time) for s in scans], np.float64),
+            "landmark": joined([s.landmark for s in scans], np.int64),
+            "bearing_rad": joined([s.bearing for s in scans], np.float64),
+            "range_m": joined([s.range for s in scans], np.float64),
+        }
+    ).with_columns(pl.col("range_m").fill_nan(None))

@@ -1,0 +1,199 @@
+"""Results: how good each estimate is, and the folder that keeps them for other tools.
+
+``summary.json`` is written last: its presence means that the folder is complete.
+"""
+
+import hashlib
+import io
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import BaseModel
+
+from pipistrelle import __version__
+from pipistrelle.experiments.drives import LabelledPoints
+from pipistrelle.experiments.results.folder import clear_results, write_file
+from pipistrelle.experiments.results.scores import TrialResult
+from pipistrelle.experiments.results.tables import (
+    landmark_table,
+    map_text,
+    measurement_table,
+    step_table,
+    tum_text,
+)
+
+FORMAT = 1
+TimedPath = tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k 3"]]
+"""Times [s] and poses [m, m, rad]."""
+README = """\
+# Results
+
+    {command}
+
+Pipistrelle {version}, seed {seed}. SI units and radians; headings are counter-clockwise from +x,
+bearings counter-clockwise from the heading. S is the sensing strategy, F the filter.
+
+| file | what it holds |
+|---|---|
+| summary.json | the scores of each estimate; null: no truth, or not a finite number |
+| config.toml | every setting |
+| track_S_F.tum | estimated path, the start and every control step: time x y z qx qy qz qw |
+| truth.tum | true path at the same times, where it is known |
+| map_S_F.csv | final map with covariances; a partial landmark by its heaviest hypothesis |
+| steps.parquet | estimated and true poses, standard deviations, errors, NEES |
+| landmarks.parquet | every hypothesis of every landmark, beside the true positions |
+| measurements.parquet | what each strategy measured; no range where it was passive |
+| mission.* | pictures |
+
+RMSE and NEES leave out the start; after an exact one the NEES begins where the covariance is
+positive definite. "aligned": path and map, each after the rigid motion without
+scale that fits it best to the truth. Map errors are those of the fully initialised landmarks
+whose true positions are known. measurements_per_frame counts before the gate, gated what the
+gate rejected, ignored_rows what was dropped from a recorded log.
+
+    evo_ape tum truth.tum track_S_F.tum --align
+"""
+
+
+def write_results(
+    folder: Path,
+    *,
+    config: BaseModel,
+    command: str,
+    seed: int,
+    trials: Sequence[TrialResult],
+    truth_path: TimedPath | None,
+    true_landmarks: LabelledPoints | None,
+    ignored_rows: dict[str, int],
+) -> None:
+    """Write everything but the figures into a result folder, in place of earlier results.
+
+    Parameters
+    ----------
+    folder : Path
+        As `prepare_folder` gives it.
+    config : pydantic model
+        All settings; those that are None are left out of ``config.toml``.
+    command : str
+        The command line, for the reader.
+    seed : int
+    trials : sequence of TrialResult
+        Each strategy and filter once.
+    truth_path : times (k) [s] and true poses (k, 3) [m, m, rad], optional
+        At the times of the tracks; NaN where not known, which ``truth.tum`` leaves out.
+    true_landmarks : labels (n) and positions (n, 2) [m], optional
+    ignored_rows : dict
+        Number of dropped log rows by reason.
+
+    Raises
+    ------
+    InputError
+        Where a file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pipistrelle.config import Config
+    >>> with tempfile.TemporaryDirectory() as name:
+    ...     world = {"truth_path": None, "true_landmarks": None, "ignored_rows": {}}
+    ...     write_results(
+    ...         Path(name), config=Config(), command="pipistrelle", seed=7, trials=(), **world
+    ...     )
+    ...     sorted(path.name for path in Path(name).iterdir())
+    ['README.md', 'config.toml', 'summary.json']
+    """
+    import tomli_w
+
+    clear_results(folder)
+    settings = config.model_dump(mode="json", exclude_none=True)
+    write_file(folder / "config.toml", tomli_w.dumps(settings))
+    readme = README.format(command=command, version=__version__, seed=seed)
+    write_file(folder / "README.md", readme)
+    for trial in trials:
+        name, track = f"{trial.strategy}_{trial.filter}", trial.track
+        write_file(folder / f"track_{name}.tum", tum_text(track.time, track.pose.mean))
+        write_file(folder / f"map_{name}.csv", map_text(track.landmarks))
+    if truth_path is not None:
+        known = np.isfinite(truth_path[1]).all(axis=1)
+        write_file(folder / "truth.tum", tum_text(truth_path[0][known], truth_path[1][known]))
+    _write_tables(folder, trials, None if truth_path is None else truth_path[1], true_landmarks)
+    summary = {
+        "format": FORMAT,
+        "version": __version__,
+        "config_hash": config_hash(config),
+        "seed": seed,
+        "runs": [_run(trial, ignored_rows) for trial in trials],
+    }
+    write_file(folder / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
+
+
+def _write_tables(
+    folder: Path,
+    trials: Sequence[TrialResult],
+    true_path: Float[np.ndarray, "k 3"] | None,
+    true_landmarks: LabelledPoints | None,
+) -> None:
+    """Write the tables of all trials; those of one strategy share their measurements."""
+    import polars as pl
+
+    def named(table: pl.DataFrame, **names: str) -> pl.DataFrame:
+        return table.select(*(pl.lit(name).alias(key) for key, name in names.items()), pl.all())
+
+    both = [(trial, {"strategy": trial.strategy, "filter": trial.filter}) for trial in trials]
+    heard = {trial.strategy: trial.scans for trial in trials}
+    tables = {
+        "steps": [named(step_table(t.track, true_path), **names) for t, names in both],
+        "landmarks": [
+            named(landmark_table(t.track.landmarks, true_landmarks), **names) for t, names in both
+        ],
+        "measurements": [named(measurement_table(s), strategy=name) for name, s in heard.items()],
+    }
+    for name, parts in tables.items():
+        if parts:
+            buffer = io.BytesIO()
+            pl.concat(parts).write_parquet(buffer)
+            write_file(folder / f"{name}.parquet", buffer.getvalue())
+
+
+def config_hash(config: BaseModel) -> str:
+    """Sixteen hexadecimal digits that stand for a configuration.
+
+    The head of the SHA-256 of its JSON with sorted keys and no spaces.
+
+    Parameters
+    ----------
+    config : pydantic model
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> from pipistrelle.config import Config
+    >>> config_hash(Config(seed=7)) == config_hash(Config()), len(config_hash(Config()))
+    (True, 16)
+    """
+    settings = config.model_dump(mode="json", exclude_none=True)
+    text = json.dumps(settings, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _run(trial: TrialResult, ignored_rows: dict[str, int]) -> dict[str, object]:
+    """Return a trial's entry of the summary; what is not finite becomes null."""
+    run = {
+        "strategy": trial.strategy,
+        "filter": trial.filter,
+        **asdict(trial.scores),
+        "ignored_rows": dict(ignored_rows),
+        "wall_s": trial.wall_s,
+    }
+    return {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value
+        for key, value in run.items()
+    }

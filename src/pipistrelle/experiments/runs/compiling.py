@@ -1,0 +1,59 @@
+"""Compile the kernels before the work begins: they are kept, so this takes long only once."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from pipistrelle.config import Config, ScenarioConfig
+from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.experiments.hearing.scenario import bicycle
+from pipistrelle.experiments.machine import cores
+from pipistrelle.experiments.runs.trial import LIMITS, estimator, run_mission
+
+_SECOND = "from pipistrelle.experiments.runs.compiling import compile_fastslam; compile_fastslam()"
+
+
+def compile_kernels() -> None:
+    """Compile every kernel, or load it from the cache, by a mission of two frames.
+
+    Where the cache is empty a second process compiles FastSLAM's meanwhile. Nothing depends on
+    it: what it leaves undone is done here.
+    """
+    tiny = Config(scenario=ScenarioConfig(steps=8, landmarks=4, radius=10.0))
+    cached = any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbc"))
+    if not cached and cores() > 1:
+        with _second_process(_SECOND):
+            run_mission(tiny, ("fused",), ("ekf",))
+    run_mission(tiny, ("active", "fused", "passive"), tuple(LIMITS))
+
+
+def compile_fastslam() -> None:
+    """Compile FastSLAM's kernels by one frame, made up, so that no other kernel is needed."""
+    slam, rng = estimator("fastslam", bicycle(Config().motion), Config()), np.random.default_rng(0)
+    belief = slam.init(Gaussian(mean=np.zeros(3), covariance=np.eye(3)))
+    belief, _ = slam.predict(belief, np.ones((1, 2)), np.ones(1), rng)
+    heard = {"landmark": np.arange(2), "bearing": np.zeros(2), "range": np.array([1.0, np.nan])}
+    slam.update(belief, Scan(time=1.0, **heard), rng)
+
+
+@contextmanager
+def _second_process(statement: str) -> Iterator[None]:
+    """Run a statement in a process of its own, if one can be had, and wait for its end."""
+    command, nowhere = [sys.executable or "", "-P", "-c", statement], subprocess.DEVNULL
+    try:
+        second = subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere)
+    except OSError:
+        yield
+        return
+    try:
+        yield
+        second.wait()
+    finally:
+        second.kill()
+        second.wait()

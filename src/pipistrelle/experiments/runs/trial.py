@@ -1,0 +1,320 @@
+"""A mission on one screen: draw a world, listen along the path, estimate, score.
+
+Read this file first: each call is a box of the paper's workflow.
+"""
+
+import time as clock
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.arithmetic.noise import stream_key
+from pipistrelle.config import Config, InputError, Strategy
+from pipistrelle.detection.merging import Heard, scan_of
+from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.beliefs import B, Belief, Estimator, Gaussian, Swarm, Track
+from pipistrelle.estimation.ekf.filter import EkfSlam
+from pipistrelle.estimation.fastslam.filter import FastSlam
+from pipistrelle.estimation.motion import Motion
+from pipistrelle.evaluation.consistency import EKF_LIMIT, FASTSLAM_LIMIT
+from pipistrelle.experiments.drives import Drive
+from pipistrelle.experiments.hearing.listening import Progress, listen
+from pipistrelle.experiments.hearing.scenario import Scenario, bicycle, world_of
+from pipistrelle.experiments.machine import check_length, check_memory
+from pipistrelle.experiments.results.scores import TrialResult, score
+
+Watch = Callable[[str, str, Scan, Belief], None]
+"""Called with strategy, filter, scan and the belief after it."""
+LIMITS = {"ekf": EKF_LIMIT, "fastslam": FASTSLAM_LIMIT}
+"""The filters by name, with the NEES above which each counts as diverged."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Case:
+    """One combination to try: a sensing strategy and a filter, in one world.
+
+    Attributes
+    ----------
+    strategy : "active", "fused" or "passive"
+    filter : "ekf" or "fastslam"
+    iteration : int
+        Number of the world.
+    """
+
+    strategy: Strategy
+    filter: str
+    iteration: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mission:
+    """One world, what was heard in it, and what each strategy and filter made of it."""
+
+    config: Config
+    scenario: Scenario
+    drive: Drive
+    heard: tuple[Heard, ...]
+    trials: tuple[TrialResult, ...]
+
+
+def run_mission(
+    config: Config,
+    strategies: Sequence[Strategy],
+    filters: Sequence[str] = ("ekf",),
+    *,
+    progress: Progress | None = None,
+    watch: Watch | None = None,
+) -> Mission:
+    """Draw a world, listen along its path once, and let each filter map it by each strategy.
+
+    Parameters
+    ----------
+    config : Config
+    strategies : sequence of "active", "fused", "passive"
+    filters : sequence of "ekf", "fastslam"
+    progress, watch : callable, optional
+
+    Returns
+    -------
+    Mission
+
+    Raises
+    ------
+    InputError
+        When the world, the sampling or a filter cannot be had, or memory for it.
+
+    Examples
+    --------
+    >>> from pipistrelle.config import ScenarioConfig
+    >>> mission = run_mission(Config(scenario=ScenarioConfig(steps=40)), ["fused"])
+    >>> len(mission.heard), len(mission.trials[0].track.time)
+    (10, 41)
+    """
+    check_length(config.scenario, strategies=len(strategies), filters=len(filters))
+    scenario = world_of(config)
+    check_memory(
+        filters,
+        len(scenario.landmarks) + 1,
+        config.fastslam.particles,
+        config.rays,
+        passive=any(strategy != "active" for strategy in strategies),
+    )
+    (heard,) = listen(scenario, config, (config.emitter.radius,), progress=progress)
+    drive = drive_of(scenario, config)
+    trials = []
+    for strategy in strategies:
+        scans = tuple(scan_of(frame, strategy) for frame in heard)
+        for name in filters:
+            case = Case(strategy=strategy, filter=name)
+            trials.append(run_trial(case, drive, scans, config, progress=progress, watch=watch))
+    return Mission(config=config, scenario=scenario, drive=drive, heard=heard, trials=tuple(trials))
+
+
+def drive_of(scenario: Scenario, config: Config) -> Drive:
+    """Tell what a filter may know of a world, and the truth to score it by.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    config : Config
+
+    Returns
+    -------
+    Drive
+        The beacon is the last of the true landmarks.
+    """
+    places = np.vstack((scenario.landmarks, scenario.beacon))
+    return Drive(
+        motion=bicycle(config.motion),
+        start=Gaussian(
+            mean=scenario.path[0],
+            covariance=np.diag(np.square(config.filter.initial_pose_std)),
+        ),
+        time=scenario.time,
+        controls=scenario.controls,
+        true_path=scenario.path,
+        true_landmarks=(np.arange(1, len(places) + 1), places),
+    )
+
+
+def run_trial(
+    case: Case,
+    drive: Drive,
+    scans: Sequence[Scan],
+    config: Config,
+    *,
+    progress: Progress | None = None,
+    watch: Watch | None = None,
+) -> TrialResult:
+    """Estimate path and map from one strategy's scans, and score them.
+
+    Parameters
+    ----------
+    case : Case
+    drive : Drive
+    scans : sequence of Scan
+    config : Config
+    progress, watch : callable, optional
+
+    Returns
+    -------
+    TrialResult
+    """
+    strategy, name = case.strategy, case.filter
+
+    def report(done: int, total: int) -> None:
+        if progress:
+            progress(f"{strategy} {name}", done, total)
+
+    def look(scan: Scan, belief: Belief) -> None:
+        if watch:
+            watch(strategy, name, scan, belief)
+
+    began = clock.perf_counter()
+    track = run_filter(
+        estimator(name, drive.motion, config),
+        drive,
+        scans,
+        _generator(config.seed, case.iteration, name),
+        progress=report,
+        watch=look,
+    )
+    wall_s = clock.perf_counter() - began
+    return TrialResult(
+        strategy=strategy,
+        filter=name,
+        track=track,
+        scans=tuple(scans),
+        scores=score(track, drive.true_path, drive.true_landmarks, scans, LIMITS[name]),
+        wall_s=wall_s,
+    )
+
+
+def estimator(name: str, motion: Motion, config: Config) -> Estimator:
+    """Build a filter from the settings.
+
+    Parameters
+    ----------
+    name : "ekf" or "fastslam"
+    motion : Motion
+    config : Config
+
+    Returns
+    -------
+    Estimator
+
+    Raises
+    ------
+    InputError
+        For an unknown name.
+
+    Examples
+    --------
+    >>> type(estimator("ekf", bicycle(Config().motion), Config())).__name__
+    'EkfSlam'
+    """
+    if name not in LIMITS:
+        raise InputError(f"filter: found {name!r}, expected one of {', '.join(LIMITS)}")
+    settings = config.filter
+    assumed = {
+        "motion": motion,
+        "range_std": settings.range_std,
+        "bearing_std": settings.bearing_std,
+        "rays": config.rays,
+        "gate": settings.gate,
+    }
+    return EkfSlam(**assumed) if name == "ekf" else FastSlam(**assumed, swarm=config.fastslam)
+
+
+def run_filter(
+    estimator: Estimator[B],
+    drive: Drive,
+    scans: Sequence[Scan],
+    rng: np.random.Generator,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+    watch: Callable[[Scan, B], None] | None = None,
+) -> Track:
+    """Predict to each scan, update with it, and keep the pose of every step.
+
+    Parameters
+    ----------
+    estimator : Estimator
+    drive : Drive
+    scans : sequence of Scan
+        In order; the time of each is one of the drive's.
+    rng : Generator
+    progress : callable, optional
+        Given the scans done and their number.
+    watch : callable, optional
+        Given each scan and the belief after it.
+
+    Returns
+    -------
+    Track
+
+    Raises
+    ------
+    InputError
+        For a bearing or range that is no number, or a time that is not one of the drive's.
+    """
+    time, controls = drive.time, drive.controls
+    steps = _steps_of(scans, time)
+    mean, covariance = np.empty((time.size, 3)), np.empty((time.size, 3, 3))
+    mean[0], covariance[0] = drive.start.mean, drive.start.covariance
+    dt, belief, done = np.diff(time), estimator.init(drive.start), 0
+    for number, (k, scan) in enumerate(zip(steps, scans, strict=True), start=1):
+        if k > done:
+            belief, poses = estimator.predict(belief, controls[done:k], dt[done:k], rng)
+            mean[done + 1 : k + 1], covariance[done + 1 : k + 1] = poses.mean, poses.covariance
+            done = k
+        belief = estimator.update(belief, scan, rng)
+        pose = belief.pose()
+        mean[k], covariance[k] = pose.mean, pose.covariance
+        if watch:
+            watch(scan, belief)
+        if progress:
+            progress(number, len(scans))
+    if done < len(controls):
+        belief, poses = estimator.predict(belief, controls[done:], dt[done:], rng)
+        mean[done + 1 :], covariance[done + 1 :] = poses.mean, poses.covariance
+    swarm = belief if isinstance(belief, Swarm) else None
+    return Track(
+        time=time,
+        pose=Gaussian(mean=mean, covariance=covariance),
+        landmarks=belief.landmarks(),
+        gated=belief.gated,
+        cloud=swarm.cloud() if swarm else None,
+        full=swarm.full if swarm else None,
+    )
+
+
+def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]:
+    """Find the step that ends at each scan; refuse scans that a filter could not use."""
+    heard = np.array([scan.time for scan in scans], dtype=float)
+    steps = np.searchsorted(time, heard)
+    known = time[np.minimum(steps, time.size - 1)] == heard
+    if not known.all():
+        stray = scans[int(np.argmin(known))]
+        raise InputError(f"scan at {stray.time} s: expected the time of the end of a step")
+    nothing = np.empty(0)
+    bearing = np.concatenate([nothing, *(scan.bearing for scan in scans)])
+    distance = np.concatenate([nothing, *(scan.range for scan in scans)])
+    usable = np.isfinite(bearing) & (np.isnan(distance) | (distance > 0.0) & (distance < np.inf))
+    if not usable.all():
+        owner = np.repeat(np.arange(len(scans)), [scan.landmark.size for scan in scans])
+        first = owner[~usable][0]
+        labels = scans[first].landmark[~usable[owner == first]].tolist()
+        raise InputError(
+            f"scan at {scans[first].time} s: found numbers that no filter can use, for the "
+            f"landmarks {labels}; expected finite bearings [rad] and ranges above 0 [m], NaN "
+            "where passive"
+        )
+    return steps.tolist()
+
+
+def _generator(seed: int, iteration: int, purpose: str) -> np.random.Generator:
+    """Return the generator of a purpose in a world."""
+    return np.random.default_rng(stream_key(seed, iteration, purpose))

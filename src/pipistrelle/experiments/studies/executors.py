@@ -1,0 +1,182 @@
+"""Executors: worlds in this machine's processes, or on a Dask cluster."""
+
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    wait,
+)
+from contextlib import contextmanager
+from typing import Any
+
+from pipistrelle.config import InputError
+from pipistrelle.experiments.studies.store import (
+    Outcome,
+)
+
+AHEAD = 1000
+"""Worlds handed to a cluster before the first of them is done."""
+
+
+Task = Callable[[int], list[Outcome]]
+
+
+Ended = tuple[int, "Future[list[Outcome]]"]
+
+
+Results = Generator[list[Outcome], None, None]
+
+
+def ended(executor: Executor, task: Task, waiting: deque[int], ahead: int) -> Iterator[Ended]:
+    """Keep an executor busy; yield each world when it ended, and its future."""
+    running: dict[Future[list[Outcome]], int] = {}
+    try:
+        while running or (waiting and ahead):
+            try:
+                while waiting and len(running) < ahead:
+                    running[executor.submit(task, waiting[0])] = waiting[0]
+                    waiting.popleft()
+            except BrokenExecutor:
+                ahead = 0  # nothing more can be started; what runs is reported
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                yield running.pop(future), future
+    finally:
+        for future in running:
+            future.cancel()
+
+
+def in_processes(task: Task, give_up: Task, waiting: deque[int], workers: int) -> Results:
+    """Run worlds in processes; those in processes that die are tried again, one at a time."""
+    alive = False
+    while waiting:
+        suspects, lost = deque[int](), deque[int]()
+        alive |= yield from _in_pool(task, waiting, workers, suspects)
+        while suspects:
+            alive |= yield from _in_pool(task, suspects, 1, lost)
+        if lost and not alive:
+            raise InputError(
+                "workers: their processes end before a world is done: killed, out of memory, or "
+                'started by a script without if __name__ == "__main__"; one worker needs no other '
+                "process"
+            )
+        yield from map(give_up, lost)
+
+
+def _in_pool(
+    task: Task, waiting: deque[int], workers: int, broken: deque[int]
+) -> Generator[list[Outcome], None, bool]:
+    """Run worlds until a process dies, and tell which were running then; return if any ended."""
+    alive = False
+    with _pool(min(workers, len(waiting))) as pool:
+        for iteration, future in ended(pool, task, waiting, workers):
+            try:
+                yield future.result()
+                alive = True
+            except BrokenExecutor:
+                broken.append(iteration)
+    return alive
+
+
+@contextmanager
+def _pool(workers: int) -> Iterator[Executor]:
+    """Spawn worker processes; kill them when they are no longer wanted."""
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import active_children, get_context
+
+    others = set(active_children())
+    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_become_worker)
+    try:
+        yield pool
+    except BaseException:
+        for child in set(active_children()) - others:
+            child.kill()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _become_worker() -> None:
+    """Leave Ctrl-C to the process that started this one, and end when that is gone."""
+    from multiprocessing import parent_process
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ.setdefault("POLARS_MAX_THREADS", "1")
+    parent = parent_process()
+
+    def follow() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()
+
+
+def on_cluster(
+    task: Task, give_up: Task, waiting: deque[int], workers: int, address: str
+) -> Results:
+    """Run worlds on Dask's workers; Dask itself tries again what a dead worker leaves."""
+    with _client(address, workers) as client:
+        from distributed import KilledWorker
+
+        executor = client.get_executor(pure=False)
+        try:
+            for iteration, future in ended(executor, task, waiting, AHEAD):
+                try:
+                    outcomes = future.result()
+                except KilledWorker:
+                    outcomes = give_up(iteration)
+                except CancelledError as error:
+                    raise InputError(
+                        f"--scheduler {address}: the cluster is gone; worlds that are done are "
+                        "kept, and the same command goes on with the rest"
+                    ) from error
+                yield outcomes
+        finally:
+            executor.shutdown(wait=False)
+
+
+@contextmanager
+def _client(address: str, workers: int) -> Iterator[Any]:
+    """Connect to a cluster, one on this machine if none is named."""
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise InputError(
+            f"--scheduler {address}: needs Dask, which is not installed; "
+            "python -m pip install 'pipistrelle[cluster]'"
+        ) from error
+    if address != "local":
+        try:
+            client = Client(address, timeout="10s")
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"--scheduler: found {address!r}, but no scheduler answers there ({error}); "
+                "expected local, or an address such as tcp://127.0.0.1:8786"
+            ) from error
+        with client:
+            yield client
+        return
+    with _started_deaf():
+        cluster = LocalCluster(workers, threads_per_worker=1, dashboard_address=None)
+    with cluster, Client(cluster) as client:
+        yield client
+
+
+@contextmanager
+def _started_deaf() -> Iterator[None]:
+    """Start processes that leave Ctrl-C to this one."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

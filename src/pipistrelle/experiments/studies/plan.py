@@ -1,0 +1,116 @@
+"""A study's plan: what to vary, as a file, and the cases that it stands for.
+
+The cases are the product of the grid, the strategies and the filters. A passive case does not
+depend on the vehicle's beam: there is one for all radii, heard beside the narrowest beam.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, Literal, cast
+
+from pipistrelle.config import Config, Strategy
+from pipistrelle.settings import Given, Key, Layer, from_flags, resolve
+
+RADIUS = "emitter.radius"
+MOST_CASES = 2**15 - 1
+"""What their numbers have room for in the tables."""
+
+Filter = Literal["ekf", "fastslam"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """What a study tries, in how many worlds.
+
+    Attributes
+    ----------
+    name : str
+    iterations : int
+        Number of worlds.
+    strategies, filters : tuple of str
+    config : Config
+        What holds where the grid says nothing else.
+    grid : dict
+        Settings by their dotted name, with the values that each takes.
+    """
+
+    name: str
+    iterations: int
+    strategies: tuple[Strategy, ...]
+    filters: tuple[Filter, ...]
+    config: Config
+    grid: Mapping[str, tuple[Any, ...]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedCase:
+    """One combination of a plan.
+
+    Attributes
+    ----------
+    number : int
+        From 0, in the order of the plan.
+    strategy, filter : str
+    values : dict
+        Of the grid's settings; None for the radius of a passive case.
+    config : Config
+        With these values.
+    """
+
+    number: int
+    strategy: Strategy
+    filter: Filter
+    values: Mapping[str, Any]
+    config: Config
+
+
+def cases_of(plan: Plan) -> tuple[PlannedCase, ...]:
+    """Lay out the cases of a plan, in the order of their numbers.
+
+    Parameters
+    ----------
+    plan : Plan
+
+    Returns
+    -------
+    tuple of PlannedCase
+
+    Examples
+    --------
+    >>> grid = {"emitter.radius": (0.0025, 0.025)}
+    >>> ways = {"strategies": ("active", "passive"), "filters": ("ekf",)}
+    >>> plan = Plan(name="two", iterations=1, config=Config(), grid=grid, **ways)
+    >>> [(case.strategy, case.values["emitter.radius"]) for case in cases_of(plan)]
+    [('active', 0.0025), ('active', 0.025), ('passive', None)]
+    """
+    settled = from_flags(plan.config.model_dump(mode="json"))
+    narrowest = max(plan.grid.get(RADIUS, (plan.config.emitter.radius,)))
+    cases: list[PlannedCase] = []
+    for values, config in combinations(settled, plan.grid, "grid."):
+        for strategy, name in product(plan.strategies, plan.filters):
+            passive = strategy == "passive" and RADIUS in values
+            if passive and config.emitter.radius != narrowest:
+                continue
+            case = PlannedCase(
+                number=len(cases),
+                strategy=strategy,
+                filter=name,
+                values=values | {RADIUS: None} if passive else values,
+                config=config,
+            )
+            cases.append(case)
+    return tuple(cases)
+
+
+def combinations(
+    layer: Layer, grid: Mapping[str, tuple[Any, ...]], prefix: str
+) -> Iterator[tuple[dict[str, Any], Config]]:
+    """Walk through the product of a grid: the values by their names, and the settings."""
+    for values in product(*grid.values()):
+        named = dict(zip(grid, values, strict=True))
+        varied = {
+            cast(Key, tuple(name.split("."))): Given(value, prefix + name)
+            for name, value in named.items()
+        }
+        yield named, resolve(layer | varied)

@@ -1,0 +1,293 @@
+"""A plan as a file: read, checked, written, compared."""
+
+import json
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from importlib.resources import files
+from math import prod
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError
+
+from pipistrelle.config import STRATEGIES, Config, Count, InputError, Section, Strategy
+from pipistrelle.experiments.studies.plan import MOST_CASES, Filter, Plan, combinations
+from pipistrelle.settings import Given, Key, Layer, from_flags, known_settings, resolve
+
+FORMAT = 1
+
+
+class _Head(Section):
+    """A plan without settings and grid, as its file holds it."""
+
+    format: Literal[1]
+    name: Annotated[str, Field(pattern=r"^\w[\w.-]*$")]
+    iterations: Count
+    strategies: Annotated[tuple[Strategy, ...], Field(min_length=1)] = STRATEGIES
+    filters: Annotated[tuple[Filter, ...], Field(min_length=1)] = ("ekf", "fastslam")
+
+
+def find_plan(word: str) -> Path:
+    """Find a plan by the word that names it.
+
+    Parameters
+    ----------
+    word : str
+        "paper", or the path of a file.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    InputError
+        Where there is none.
+
+    Examples
+    --------
+    >>> find_plan("paper").name
+    'paper.toml'
+    """
+    path = Path(word)
+    if word == "paper":
+        return Path(str(files("pipistrelle.experiments.studies") / "paper.toml"))
+    if not path.is_file():
+        raise InputError(f"{word}: found no such file; expected paper, or the path of a plan")
+    return path
+
+
+def read_plan(path: Path, over: Layer | None = None, iterations: int | None = None) -> Plan:
+    """Read a plan, lay settings over its own, and check every combination.
+
+    Parameters
+    ----------
+    path : Path
+    over : Layer, optional
+        Settings from the environment and from flags.
+    iterations : int, optional
+        Number of worlds, in place of the plan's.
+
+    Returns
+    -------
+    Plan
+
+    Raises
+    ------
+    InputError
+        Where the file is no plan: the key, what was found, what was expected.
+    OSError
+        Where it cannot be read.
+
+    Examples
+    --------
+    >>> from pipistrelle.experiments.studies.plan import cases_of
+    >>> plan = read_plan(find_plan("paper"))
+    >>> plan.iterations, len(cases_of(plan))
+    (115, 50)
+    """
+    over, table = over or {}, _table(path)
+    head = _head(path, table, iterations)
+    within = {"config": table.get("config", {}), "grid": table.get("grid", {})}
+    for name, settings in within.items():
+        if not isinstance(settings, dict):
+            raise InputError(f"{path}: {name}: found {settings!r}, expected a table of settings")
+    layer: Layer = {
+        key: Given(value, f"{path}: config.{name}")
+        for key, name, value in _settings(path, "config", within["config"])
+    }
+    layer |= over
+    grid = {
+        name: _values(path, name, key, values, layer)
+        for key, name, values in _settings(path, "grid", within["grid"])
+    }
+    for key in (key for key in layer if ".".join(key) in grid):
+        # The plan in a study's folder names every setting; a default there says nothing.
+        if key in over or resolve({key: layer[key]}) != Config():
+            why = f"the plan varies this setting; take it out of [grid] in {path}"
+            raise InputError(f"{layer[key].where}: {why}")
+    plan = Plan(
+        name=head.name,
+        iterations=head.iterations,
+        strategies=head.strategies,
+        filters=head.filters,
+        config=resolve(layer),
+        grid=grid,
+    )
+    most = prod(len(values) for values in grid.values()) * len(plan.strategies) * len(plan.filters)
+    if most > MOST_CASES:
+        raise InputError(f"{path}: grid: found {most} cases, expected at most {MOST_CASES}")
+    for _ in combinations(layer, grid, f"{path}: grid."):
+        pass
+    return plan
+
+
+def plan_text(plan: Plan) -> str:
+    """Write a plan as a file that names every setting.
+
+    Parameters
+    ----------
+    plan : Plan
+
+    Returns
+    -------
+    str
+        TOML; reads back as the same plan.
+
+    Examples
+    --------
+    >>> print(plan_text(read_plan(find_plan("paper"), iterations=3)).splitlines()[2])
+    iterations = 3
+    """
+    import tomli_w
+
+    return tomli_w.dumps(_as_table(plan))
+
+
+def differences(there: Plan, asked: Plan) -> list[str]:
+    """Name what differs between two plans, but for the number of worlds.
+
+    Parameters
+    ----------
+    there, asked : Plan
+        Those of a folder and of a command.
+
+    Returns
+    -------
+    list of str
+
+    Examples
+    --------
+    >>> plans = [
+    ...     read_plan(find_plan("paper"), from_flags({"seed": seed}), seed) for seed in (1, 2)
+    ... ]
+    >>> differences(*plans)
+    ['config.seed: 1 there, 2 asked for']
+    """
+    old, new = (dict(_flat(_as_table(plan))) for plan in (there, asked))
+    return [
+        f"{name}: {_worded(old, name)} there, {_worded(new, name)} asked for"
+        for name in dict.fromkeys((*old, *new))
+        if name != "iterations" and (name not in old or name not in new or old[name] != new[name])
+    ]
+
+
+def _worded(table: Mapping[str, Any], name: str) -> str:
+    """Word a plan's value."""
+    return json.dumps(table[name]) if name in table else "nothing"
+
+
+def _as_table(plan: Plan) -> dict[str, Any]:
+    """Return a plan as nested tables and lists; what the grid varies has its default beside it."""
+    layer = from_flags(plan.config.model_dump(mode="json"))
+    kept = {key: layer[key] for key in layer if ".".join(key) not in plan.grid}
+    return {
+        "format": FORMAT,
+        "name": plan.name,
+        "iterations": plan.iterations,
+        "strategies": list(plan.strategies),
+        "filters": list(plan.filters),
+        "config": resolve(kept).model_dump(mode="json"),
+        "grid": {name: list(values) for name, values in plan.grid.items()},
+    }
+
+
+def _table(path: Path) -> dict[str, Any]:
+    """Read a TOML file."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not TOML: {error}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not TOML: byte {error.start} is not UTF-8 text") from error
+
+
+def _head(path: Path, table: Mapping[str, Any], iterations: int | None) -> _Head:
+    """Check what a plan holds beside settings and grid."""
+    known = (*_Head.model_fields, "config", "grid")
+    for name in table:
+        if name not in known:
+            raise InputError(f"{path}: {name}: no such key of a plan; {_meant(name, known)}")
+    given = {"name": path.stem} | {k: v for k, v in table.items() if k in _Head.model_fields}
+    if iterations is not None:
+        given["iterations"] = iterations
+    try:
+        head = _Head.model_validate_json(json.dumps(given, default=str), strict=True)
+    except ValidationError as refused:
+        wrong = refused.errors(include_url=False)  # a list of refused items counts as too short
+        wrong = [error for error in wrong if error["type"] != "too_short" or error["input"] == []]
+        problems = [_problem(path, error) for error in wrong]
+        raise InputError("\n".join(problems)) from None
+    for name in ("strategies", "filters"):
+        _check_distinct(f"{path}: {name}", getattr(head, name))
+    return head
+
+
+def _problem(path: Path, error: Any) -> str:
+    """Say which key of a plan was refused, what was found and what was expected."""
+    name = ".".join(map(str, error["loc"]))
+    if error["type"] == "missing":
+        return f"{path}: {name}: missing; see paper.toml in pipistrelle/experiments/studies"
+    expected = error["msg"].removeprefix("Input should be ").removeprefix("Value should ")
+    if error["type"] == "string_pattern_mismatch":
+        expected = "letters, digits, _ . and -, for it names a folder"
+    return f"{path}: {name}: found {error['input']!r}, expected {expected}"
+
+
+def _settings(
+    path: Path, table: str, settings: Mapping[str, Any]
+) -> Iterator[tuple[Key, str, Any]]:
+    """Walk through a table's settings: key, dotted name and value of each."""
+    known = {".".join(key): key for key in known_settings()}
+    for name, value in _flat(settings):
+        if name in known:
+            yield known[name], name, value
+        elif value != {} or not any(other.startswith(f"{name}.") for other in known):
+            raise InputError(f"{path}: {table}.{name}: no such setting; {_meant(name, known)}")
+
+
+def _values(path: Path, name: str, key: Key, values: Any, layer: Layer) -> tuple[Any, ...]:
+    """Check the values that a grid gives a setting."""
+    where = f"{path}: grid.{name}"
+    if key == ("seed",):
+        raise InputError(f"{where}: every iteration is another world already; raise iterations")
+    if not isinstance(values, list) or not values:
+        raise InputError(f"{where}: found {values!r}, expected a list of values")
+    checked = []
+    for value in values:
+        table: Any = resolve(layer | {key: Given(value, where)}).model_dump(mode="json")
+        for part in key:
+            table = table[part]
+        checked.append(table)
+    _check_distinct(where, checked)
+    return tuple(checked)
+
+
+def _check_distinct(where: str, values: Sequence[Any]) -> None:
+    """Refuse what is named twice."""
+    for i, value in enumerate(values):
+        if value in values[:i]:
+            raise InputError(f"{where}: found {value!r} twice, expected each value once")
+
+
+def _flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    """Walk through nested tables: dotted names and values; an empty table is a value."""
+    for name, value in table.items():
+        if isinstance(value, Mapping) and value:
+            yield from _flat(value, f"{above}{name}.")
+        else:
+            yield above + name, value
+
+
+def _meant(name: str, known: Iterable[str]) -> str:
+    """Suggest the name that was probably meant."""
+    known = list(known)
+    close = get_close_matches(name, known, n=1)
+    close += [other for other in known if other.split(".")[-1] == name.split(".")[-1]]
+    return f"did you mean {close[0]}?" if close else f"expected one of {_some(known)}"
+
+
+def _some(names: Sequence[str]) -> str:
+    """List names, or say where they are listed when they are many."""
+    return ", ".join(names) if len(names) < 10 else "those of `pipistrelle config show`"

@@ -1,0 +1,214 @@
+"""A study: a plan's worlds, wherever there is room to compute them.
+
+The unit of work is a world. Whoever computes it writes its results (`studies.store`) and reports
+back how its trials ended, so that a study needs little memory, loses nothing that is done, and may
+run in this process, in several, or on a Dask cluster (`studies.executors`): on whatever has a
+``submit`` as the executors of ``concurrent.futures`` have. The results are the same.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import (
+    Executor,
+)
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from pipistrelle.config import InputError
+from pipistrelle.experiments.machine import check_length, check_memory, keep_freed_memory
+from pipistrelle.experiments.studies.executors import (
+    AHEAD,
+    Results,
+    ended,
+    in_processes,
+    on_cluster,
+)
+from pipistrelle.experiments.studies.plan import Plan, cases_of
+from pipistrelle.experiments.studies.store import (
+    Outcome,
+    done_worlds,
+    open_store,
+    read_outcomes,
+    sweep,
+    write_world,
+)
+from pipistrelle.experiments.studies.world import failed_records, run_world
+
+KILLED = "its process ended without a word, twice: killed, or out of memory\n"
+"""Recorded for every trial of a world that takes its process with it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Standing:
+    """How far a study is.
+
+    Attributes
+    ----------
+    worlds, done : int
+        Asked for, and done, those of earlier runs included.
+    trials : dict
+        Number asked for, by strategy.
+    ended, failed : dict
+        Number that ended and, of these, failed; by strategy.
+    first_error : str or None
+        What the first failure seen says of itself.
+    """
+
+    worlds: int
+    done: int
+    trials: dict[str, int]
+    ended: dict[str, int]
+    failed: dict[str, int]
+    first_error: str | None
+
+
+def run_study(
+    plan: Plan,
+    folder: Path,
+    *,
+    workers: int = 1,
+    shard: tuple[int, int] = (0, 1),
+    scheduler: str | None = None,
+    executor: Executor | None = None,
+    retry_failed: bool = False,
+    progress: Callable[[Standing], None] | None = None,
+) -> Standing:
+    """Run the worlds of a plan that are not done yet.
+
+    Parameters
+    ----------
+    plan : Plan
+    folder : Path
+        As `open_store` makes it, or makes of it; it must be the same folder for all workers.
+    workers : int
+        Processes; 1: this one. More are spawned, so a script that calls this function must be
+        guarded by ``if __name__ == "__main__"``.
+    shard : i, n
+        Run only each n-th world, from world i on.
+    scheduler : str, optional
+        "local", or the address of a Dask scheduler, whose workers then do the work.
+    executor : Executor, optional
+        Whatever else has a ``submit``; it must be able to import this package.
+    retry_failed : bool
+        Run the worlds again that hold failed trials.
+    progress : callable, optional
+        Given the standing, first as it is found, then whenever a world is done.
+
+    Returns
+    -------
+    Standing
+        Of the shard.
+
+    Raises
+    ------
+    InputError
+        Where the folder holds another plan, results cannot be written, or workers, or memory for
+        them on this machine, cannot be had.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pipistrelle.config import Config, ScenarioConfig
+    >>> ways = {"strategies": ("fused",), "filters": ("ekf",)}
+    >>> config = Config(scenario=ScenarioConfig(steps=8, landmarks=12))
+    >>> plan = Plan(name="one", iterations=2, config=config, grid={}, **ways)
+    >>> with tempfile.TemporaryDirectory() as name:
+    ...     standing = run_study(plan, Path(name))
+    >>> standing.done, standing.ended
+    (2, {'fused': 2})
+    """
+    if executor is None and scheduler in (None, "local"):
+        _refuse_too_large(plan, workers)
+    open_store(folder, plan)
+    worlds = range(shard[0], plan.iterations, shard[1])
+    done = done_worlds(folder).intersection(worlds)
+    sweep(folder, done)
+    standing = _nothing_done(plan, len(worlds))
+    waiting: deque[int] = deque()
+    for iteration in worlds:
+        outcomes = read_outcomes(folder, iteration) if iteration in done else None
+        if outcomes is None or (retry_failed and any(error for _, error in outcomes)):
+            waiting.append(iteration)
+        else:
+            standing = _advanced(standing, outcomes)
+    show = progress or (lambda _: None)
+    show(standing)
+    place = folder.absolute()
+    task, give_up = partial(_work, place, plan), partial(_give_up, place, plan)
+    found: Results
+    if executor is not None:
+        found = (future.result() for _, future in ended(executor, task, waiting, AHEAD))
+    elif scheduler is not None:
+        found = on_cluster(task, give_up, waiting, workers, scheduler)
+    elif workers > 1:
+        found = in_processes(task, give_up, waiting, workers)
+    else:
+        found = (task(iteration) for iteration in waiting)
+    with closing(found):
+        for outcomes in found if waiting else ():
+            standing = _advanced(standing, outcomes)
+            show(standing)
+    if len(done_worlds(folder).intersection(worlds)) < standing.done:
+        raise InputError(
+            f"{folder}: lacks worlds that are done; expected one folder for all workers"
+        )
+    return standing
+
+
+def _refuse_too_large(plan: Plan, workers: int) -> None:
+    """Refuse a plan of which so many worlds at once may need more memory than there is."""
+    for case in cases_of(plan):
+        check_length(case.config.scenario, workers=workers)
+        check_memory(
+            [case.filter],
+            case.config.scenario.landmarks + 1,
+            case.config.fastslam.particles,
+            case.config.rays,
+            passive=case.strategy != "active",
+            workers=workers,
+        )
+
+
+def _nothing_done(plan: Plan, worlds: int) -> Standing:
+    """Return the standing at the very start."""
+    cases = Counter[str](case.strategy for case in cases_of(plan))
+    return Standing(
+        worlds=worlds,
+        done=0,
+        trials={strategy: number * worlds for strategy, number in cases.items()},
+        ended=dict.fromkeys(cases, 0),
+        failed=dict.fromkeys(cases, 0),
+        first_error=None,
+    )
+
+
+def _advanced(standing: Standing, outcomes: Sequence[Outcome]) -> Standing:
+    """Return the standing with one more world done."""
+    errors = [error for _, error in outcomes if error is not None]
+    ended = Counter(strategy for strategy, _ in outcomes)
+    failed = Counter(strategy for strategy, error in outcomes if error is not None)
+    told = errors[0].strip().splitlines()[-1] if errors else None
+    return replace(
+        standing,
+        done=standing.done + 1,
+        ended={strategy: n + ended[strategy] for strategy, n in standing.ended.items()},
+        failed={strategy: n + failed[strategy] for strategy, n in standing.failed.items()},
+        first_error=standing.first_error or told,
+    )
+
+
+def _work(folder: Path, plan: Plan, iteration: int) -> list[Outcome]:
+    """Run a world and write its results; done by a worker, whatever it is."""
+    keep_freed_memory()
+    records = run_world(plan, iteration)
+    write_world(folder, plan, iteration, records)
+    return [(record.case.strategy, record.error) for record in records]
+
+
+def _give_up(folder: Path, plan: Plan, iteration: int) -> list[Outcome]:
+    """Record a world that cannot be had as failed."""
+    records = failed_records(plan, KILLED)
+    write_world(folder, plan, iteration, records)
+    return [(record.case.strategy, record.error) for record in records]

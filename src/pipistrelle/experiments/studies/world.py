@@ -1,0 +1,330 @@
+"""One world of a study: drawn once, heard once for all beamwidths, tried in every case.
+
+What a case is: `studies.plan`. Cases whose settings differ in nothing that is seen or heard
+(filters, rays and the vehicle's piston aside) share the drawing and the recording.
+"""
+
+import json
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from functools import cache
+from math import degrees
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from pipistrelle.acoustics.emitter import beamwidth
+from pipistrelle.config import Config, Strategy
+from pipistrelle.detection.merging import Heard, scan_of
+from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.beliefs import Track
+from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
+from pipistrelle.evaluation.consistency import track_nees
+from pipistrelle.experiments.hearing.listening import listen
+from pipistrelle.experiments.hearing.scenario import Scenario, world_of
+from pipistrelle.experiments.results.scores import Scores
+from pipistrelle.experiments.runs.trial import Case, drive_of, run_trial
+from pipistrelle.experiments.studies.plan import Plan, PlannedCase, cases_of
+
+if TYPE_CHECKING:
+    import polars as pl
+
+UNHEARD = ("filter", "rays", "fastslam")
+"""Sections that change neither the world nor what is heard in it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrialRecord:
+    """What is kept of a trial.
+
+    Attributes
+    ----------
+    case : PlannedCase
+    beamwidth_deg : float or None
+        Of the vehicle's call; None for passive.
+    error : str or None
+        The traceback, if it failed; then there are neither scores nor rows of the other tables.
+    scores : Scores or None
+    landmarks_full_mean : float or None
+        Over the particles, where the filter has some.
+    clutter_per_frame : float or None
+        Detections without a label.
+    wall_s, cpu_s : [s]
+        Time that the filter took.
+    steps : (k, 3) [m, rad, 1]
+        Position error, heading error and NEES at each frame.
+    landmark : (n)
+        Labels.
+    full : (n)
+        Whether each is fully initialised.
+    landmark_error : (n) [m]
+    """
+
+    case: PlannedCase
+    beamwidth_deg: float | None
+    error: str | None = None
+    scores: Scores | None = None
+    landmarks_full_mean: float | None = None
+    clutter_per_frame: float | None = None
+    wall_s: float = 0.0
+    cpu_s: float = 0.0
+    steps: Float[np.ndarray, "k 3"]
+    landmark: Int[np.ndarray, " n"]
+    full: Bool[np.ndarray, " n"]
+    landmark_error: Float[np.ndarray, " n"]
+
+
+def run_world(plan: Plan, iteration: int) -> tuple[TrialRecord, ...]:
+    """Draw a world, listen once for all beamwidths, and try every case of a plan in it.
+
+    A trial that raises an exception, and every trial of a world that does, is a failed record.
+
+    Parameters
+    ----------
+    plan : Plan
+    iteration : int
+        Number of the world.
+
+    Returns
+    -------
+    tuple of TrialRecord, one per case, in their order
+
+    Examples
+    --------
+    >>> from pipistrelle.config import ScenarioConfig
+    >>> ways = {"strategies": ("fused",), "filters": ("ekf",)}
+    >>> config = Config(scenario=ScenarioConfig(steps=8, landmarks=12))
+    >>> plan = Plan(name="one", iterations=1, config=config, grid={}, **ways)
+    >>> [record.steps.shape for record in run_world(plan, 0)]
+    [(2, 3)]
+    """
+    together: dict[str, list[PlannedCase]] = {}
+    for case in cases_of(plan):
+        together.setdefault(_heard_settings(case), []).append(case)
+    records = [r for cases in together.values() for r in _run_cases(cases, iteration)]
+    return tuple(sorted(records, key=lambda record: record.case.number))
+
+
+def failed_records(plan: Plan, error: str) -> tuple[TrialRecord, ...]:
+    """Record that a world could not be tried.
+
+    Parameters
+    ----------
+    plan : Plan
+    error : str
+
+    Returns
+    -------
+    tuple of TrialRecord, one per case
+    """
+    return tuple(_failed(case, error) for case in cases_of(plan))
+
+
+def world_tables(
+    plan: Plan, iteration: int, records: Sequence[TrialRecord]
+) -> "dict[str, pl.DataFrame]":
+    """Lay out a world's tables.
+
+    Parameters
+    ----------
+    plan : Plan
+    iteration : int
+    records : sequence of TrialRecord
+
+    Returns
+    -------
+    dict of DataFrame
+        By the names of `world_schemas`.
+    """
+    import polars as pl
+
+    schemas = world_schemas(plan)
+    rows = [_row(iteration, record) for record in records]
+
+    def joined(name: str, columns: dict[str, list[np.ndarray]]) -> pl.DataFrame:
+        lengths = [len(part) for part in next(iter(columns.values()))]
+        case = np.repeat([record.case.number for record in records], lengths)
+        world = {"iteration": np.full(len(case), iteration), "case": case}
+        data = {column: np.concatenate(parts) for column, parts in columns.items()}
+        kinds = schemas[name].items()
+        return pl.DataFrame(world | data).select(pl.col(c).cast(kind) for c, kind in kinds)
+
+    steps = {"frame": [np.arange(1, len(record.steps) + 1) for record in records]}
+    for i, column in enumerate(("position_error_m", "heading_error_rad", "nees")):
+        steps[column] = [record.steps[:, i] for record in records]
+    landmarks = {
+        "landmark": [record.landmark for record in records],
+        "full": [record.full for record in records],
+        "error_m": [record.landmark_error for record in records],
+    }
+    return {
+        "trials": pl.DataFrame(rows, schema=schemas["trials"]),
+        "steps": joined("steps", steps),
+        "landmarks": joined("landmarks", landmarks),
+    }
+
+
+def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
+    """Name the columns of each table and what they hold.
+
+    Parameters
+    ----------
+    plan : Plan
+
+    Returns
+    -------
+    dict of table to dict of column to polars type
+    """
+    import polars as pl
+
+    world = {"iteration": pl.Int32, "case": pl.Int16}
+    grid = {
+        name: pl.Float64 if isinstance(_cell(values[0]), (int, float)) else pl.String
+        for name, values in plan.grid.items()
+    }
+    scores = dict.fromkeys((field.name for field in fields(Scores)), pl.Float64)
+    counts = dict.fromkeys(("landmarks_full", "landmarks_total", "gated"), pl.Int32)
+    last = ("landmarks_full_mean", "clutter_per_frame", "wall_s", "cpu_s")
+    return {
+        "trials": {
+            **world,
+            "strategy": pl.String,
+            "filter": pl.String,
+            **grid,
+            "beamwidth_deg": pl.Float64,
+            "seed": pl.Int64,
+            "status": pl.String,
+            "error": pl.String,
+            **(scores | counts | {"diverged": pl.Boolean}),
+            **dict.fromkeys(last, pl.Float64),
+        },
+        "steps": {
+            **world,
+            "frame": pl.UInt16,
+            **dict.fromkeys(("position_error_m", "heading_error_rad", "nees"), pl.Float32),
+        },
+        "landmarks": {**world, "landmark": pl.Int16, "full": pl.Boolean, "error_m": pl.Float32},
+    }
+
+
+def _heard_settings(case: PlannedCase) -> str:
+    """Return as text all settings that bear on a case's world and on what is heard in it."""
+    settings = case.config.model_dump(mode="json", exclude=set(UNHEARD))
+    del settings["emitter"]["radius"]
+    return json.dumps(settings)
+
+
+def _run_cases(cases: Sequence[PlannedCase], iteration: int) -> list[TrialRecord]:
+    """Draw and hear a world for cases that share it, and try each."""
+    config = cases[0].config
+    radii = sorted({case.config.emitter.radius for case in cases})
+    try:
+        scenario = world_of(config, iteration)
+        heard = listen(scenario, config, radii, iteration=iteration)
+    except Exception:
+        error = traceback.format_exc()
+        return [_failed(case, error) for case in cases]
+    beams = dict(zip(radii, heard, strict=True))
+
+    @cache
+    def scans_of(radius: float, strategy: Strategy) -> tuple[Scan, ...]:
+        return tuple(scan_of(frame, strategy) for frame in beams[radius])
+
+    return [_try_case(case, scenario, beams, scans_of, iteration) for case in cases]
+
+
+def _try_case(
+    case: PlannedCase,
+    scenario: Scenario,
+    beams: Mapping[float, Sequence[Heard]],
+    scans_of: Callable[[float, Strategy], Sequence[Scan]],
+    iteration: int,
+) -> TrialRecord:
+    """Run a trial, whatever comes of it; filters share the scans of a beam and a strategy."""
+    try:
+        drive, radius = drive_of(scenario, case.config), case.config.emitter.radius
+        heard, scans = beams[radius], scans_of(radius, case.strategy)
+        way = Case(strategy=case.strategy, filter=case.filter, iteration=iteration)
+        began = time.thread_time()
+        result = run_trial(way, drive, scans, case.config)
+        cpu_s = time.thread_time() - began
+        estimate = heaviest(result.track.landmarks)
+        places = np.vstack((scenario.landmarks, scenario.beacon))
+        full = result.track.full
+        return TrialRecord(
+            case=case,
+            beamwidth_deg=_beamwidth_deg(case),
+            scores=result.scores,
+            landmarks_full_mean=float(result.scores.landmarks_full if full is None else full),
+            clutter_per_frame=sum(h.clutter for h in heard) / len(heard) if heard else None,
+            wall_s=result.wall_s,
+            cpu_s=cpu_s,
+            steps=_frame_errors(result.track, scenario, case.config),
+            landmark=estimate.landmark,
+            full=estimate.full,
+            landmark_error=position_error(estimate.mean, places[estimate.landmark - 1]),
+        )
+    except Exception:
+        return _failed(case, traceback.format_exc())
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def _frame_errors(track: Track, scenario: Scenario, config: Config) -> Float[np.ndarray, "k 3"]:
+    """Return position error [m], heading error [rad] and NEES at each frame."""
+    every = config.scenario.steps_per_frame
+    frames = slice(every, None, every)
+    epsilon = track_nees(track.pose.mean, track.pose.covariance, scenario.path)[frames]
+    mean, true = track.pose.mean[frames], scenario.path[frames]
+    columns = (position_error(mean, true), pose_error(mean, true)[:, 2], epsilon)
+    return np.column_stack(columns).astype(np.float32)
+
+
+def _failed(case: PlannedCase, error: str) -> TrialRecord:
+    """Record that a trial failed."""
+    return TrialRecord(
+        case=case,
+        beamwidth_deg=_beamwidth_deg(case),
+        error=error,
+        steps=np.empty((0, 3), np.float32),
+        landmark=np.empty(0, int),
+        full=np.empty(0, bool),
+        landmark_error=np.empty(0),
+    )
+
+
+def _beamwidth_deg(case: PlannedCase) -> float | None:
+    """Return the half-power beamwidth of the vehicle's call, where it matters."""
+    if case.strategy == "passive":
+        return None
+    emitter, c = case.config.emitter, case.config.air.speed_of_sound
+    return degrees(beamwidth(emitter.radius, frequency=emitter.frequency, speed_of_sound=c))
+
+
+def _row(iteration: int, record: TrialRecord) -> dict[str, Any]:
+    """Lay out a trial's row."""
+    case, scores = record.case, record.scores
+    nothing = dict.fromkeys(field.name for field in fields(Scores))
+    return {
+        "iteration": iteration,
+        "case": case.number,
+        "strategy": case.strategy,
+        "filter": case.filter,
+        **{name: _cell(value) for name, value in case.values.items()},
+        "beamwidth_deg": record.beamwidth_deg,
+        "seed": case.config.seed,
+        "status": "done" if record.error is None else "failed",
+        "error": record.error,
+        **(nothing if scores is None else asdict(scores)),
+        "landmarks_full_mean": record.landmarks_full_mean,
+        "clutter_per_frame": record.clutter_per_frame,
+        "wall_s": record.wall_s,
+        "cpu_s": record.cpu_s,
+    }
+
+
+def _cell(value: Any) -> Any:
+    """Return a grid's value as a table holds it: a number, or text."""
+    return value if value is None or isinstance(value, (int, float, str)) else json.dumps(value)

@@ -1,0 +1,1 @@
+"""A study's figures as data: its `setting`, its `results`, its `timelines`."""

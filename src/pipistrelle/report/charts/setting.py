@@ -1,0 +1,198 @@
+"""Charts of what a study is made of: the emitter's beams and one of the worlds."""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.acoustics.emitter import HALF_POWER, piston_directivity, piston_radius
+from pipistrelle.config import InputError
+from pipistrelle.experiments.hearing.scenario import Scenario, world_of
+from pipistrelle.figures.chart import Axis, Chart, Panel, Series
+from pipistrelle.report.claims.published import beam_name
+from pipistrelle.report.studied import Study
+
+
+def model_charts(study: Study) -> list[Chart]:
+    """Charts that no result changes.
+
+    Parameters
+    ----------
+    study : Study
+
+    Returns
+    -------
+    list of Chart
+        Without the map where the world cannot be drawn.
+    """
+    try:
+        return [piston(study), example_map(study)]
+    except InputError:
+        return [piston(study)]
+
+
+def piston(study: Study) -> Chart:
+    """Chart the beam patterns of the study's emitters.
+
+    Parameters
+    ----------
+    study : Study
+
+    Returns
+    -------
+    Chart
+
+    Notes
+    -----
+    Bradley & Abaid, Eq. (1) and Appendix B.
+    """
+    series = _protractor()
+    last = max(len(study.beamwidth) - 1, 1)
+    for i in reversed(range(len(study.beamwidth))):
+        series += _beam(study, float(study.beamwidth[i]), 1.0 - 0.75 * i / last)
+    panel = Panel(
+        title="",
+        x=Axis(label="", limits=(-1.15, 1.15), ticks=()),
+        y=Axis(label="", limits=(-0.12, 1.15), ticks=()),
+        series=tuple(series),
+        equal=True,
+    )
+    return Chart(
+        name="piston",
+        title="Beams of the vehicle's emitter",
+        caption="Pressure of a back-baffled piston over the angle off its axis, relative to the "
+        "axis (up); rings at 0.5, 0.71 (half power, the dots) and 1; the stronger a line, the "
+        "narrower",
+        panels=(panel,),
+        columns=("across", "along"),
+    )
+
+
+def example_map(study: Study) -> Chart:
+    """Chart the first world of the study, drawn anew from its seed.
+
+    Parameters
+    ----------
+    study : Study
+
+    Returns
+    -------
+    Chart
+
+    Notes
+    -----
+    Bradley & Abaid, Sec. IV.
+    """
+    config, number = study.config, int(study.worlds[0])
+    world = world_of(config, number)
+    setup = config.scenario
+    reach = 1.04 * max(setup.radius, setup.beacon_distance, float(np.abs(world.path[:, :2]).max()))
+    axis = Axis(label="", limits=(-reach, reach), ticks=())
+    panel = Panel(title="", x=axis, y=axis, series=_world(world, setup.radius), equal=True)
+    return Chart(
+        name="example_map",
+        title="A world of the study",
+        caption=f"World {number}: {len(world.landmarks)} landmarks, the beacon and the vehicle's "
+        f"true path of {world.time[-1]:g} s; the dashed circle has a radius of {setup.radius:g} m",
+        panels=(panel,),
+        columns=("x_m", "y_m"),
+    )
+
+
+def _beam(study: Study, width: float, strength: float) -> list[Series]:
+    """Return a beam's outline and, where it has half its power, a dot that tells its numbers."""
+    config = study.config
+    tone = {"frequency": config.emitter.frequency, "speed_of_sound": config.air.speed_of_sound}
+    half = np.radians(np.array([width])) / 2.0
+    radius = float(piston_radius(np.radians(width), **tone))
+    name, angle = beam_name(width), np.radians(np.linspace(-90.0, 90.0, 361))
+    pressure, edge = (piston_directivity(at, radius=radius, **tone) for at in (angle, half))
+    ka = HALF_POWER / float(np.sin(half[0]))
+    told = f"{name}\nradius: {1e3 * radius:.1f} mm\nka: {ka:.1f}"
+    look = {"name": name, "role": "active", "strength": strength}
+    return [
+        Series(x=pressure * np.sin(angle), y=pressure * np.cos(angle), **look),
+        Series(
+            x=edge * np.sin(half),
+            y=edge * np.cos(half),
+            style="marks",
+            tips=(told,),
+            listed=False,
+            **look,
+        ),
+    ]
+
+
+def _protractor() -> list[Series]:
+    """Return the rings of a beam pattern, its spokes and their names."""
+    angle = np.radians(np.linspace(-90.0, 90.0, 181))
+    spokes = np.radians(np.linspace(-90.0, 90.0, 7))
+    rings = (0.5, math.sqrt(0.5), 1.0)
+    arcs = [(ring * np.sin(angle), ring * np.cos(angle), ring < 1.0) for ring in rings]
+    lines = [(np.array([0.0, np.sin(s)]), np.array([0.0, np.cos(s)]), False) for s in spokes]
+    names = [f"{abs(degrees):.0f}°" for degrees in np.degrees(spokes)]
+    text = Series(
+        name="scale",
+        role="grid",
+        x=np.append(1.08 * np.sin(spokes), rings),
+        y=np.append(1.08 * np.cos(spokes), np.full(len(rings), -0.06)),
+        style="text",
+        tips=(*names, *(f"{ring:.2g}" for ring in rings)),
+        listed=False,
+    )
+    return [
+        *(
+            Series(name="scale", role="grid", x=x, y=y, dashed=dashed, listed=False)
+            for x, y, dashed in arcs + lines
+        ),
+        text,
+    ]
+
+
+def _world(world: Scenario, radius: float) -> tuple[Series, ...]:
+    """Return path, landmarks and beacon within the circle that holds them."""
+    circle = np.linspace(0.0, 2.0 * np.pi, 181)
+    beacon, start = world.beacon[None], world.path[:1, :2]
+    labels = [f"landmark {i}" for i in range(1, len(world.landmarks) + 1)]
+    return (
+        Series(
+            name="edge",
+            role="grid",
+            x=radius * np.cos(circle),
+            y=radius * np.sin(circle),
+            dashed=True,
+            listed=False,
+        ),
+        Series(name="true path", role="truth", x=world.path[:, 0], y=world.path[:, 1]),
+        Series(
+            name="start",
+            role="truth",
+            x=start[:, 0],
+            y=start[:, 1],
+            style="points",
+            tips=_places(["start"], start),
+        ),
+        Series(
+            name="landmark",
+            role="ink",
+            x=world.landmarks[:, 0],
+            y=world.landmarks[:, 1],
+            style="points",
+            filled=np.zeros(len(world.landmarks), bool),
+            tips=_places(labels, world.landmarks),
+        ),
+        Series(
+            name="beacon",
+            role="fused",
+            x=beacon[:, 0],
+            y=beacon[:, 1],
+            style="stars",
+            tips=_places(["beacon"], beacon),
+        ),
+    )
+
+
+def _places(names: list[str], points: Float[np.ndarray, "n 2"]) -> tuple[str, ...]:
+    return tuple(
+        f"{name}\nx: {x:.1f} m\ny: {y:.1f} m" for name, (x, y) in zip(names, points, strict=True)
+    )

@@ -1,0 +1,83 @@
+"""ANEES over time as a chart."""
+
+import numpy as np
+
+from pipistrelle.config import STRATEGIES
+from pipistrelle.evaluation.consistency import anees, anees_bounds
+from pipistrelle.figures.chart import Chart, Panel, Series, ends, linear_axis, log_axis
+from pipistrelle.figures.style import FILTER_NAMES
+from pipistrelle.report.claims.contrasts import frame_time, lap_time
+from pipistrelle.report.claims.published import beam_name
+from pipistrelle.report.studied import Rule, Study, kept
+
+
+def consistency(study: Study, rule: Rule, name: str) -> Chart:
+    """Chart a filter's ANEES over time, a panel per strategy, a line per beamwidth.
+
+    Parameters
+    ----------
+    study : Study
+    rule : one of `outcomes.RULES`
+    name : str
+        The filter.
+
+    Returns
+    -------
+    Chart
+
+    Notes
+    -----
+    Bradley & Abaid, Sec. V-B and Eqs. (24) and (25).
+    """
+    ways = [way for way in STRATEGIES if (name, way) in study.outcomes]
+    lines = {way: _anees_lines(study, rule, (name, way)) for way in ways}
+    lines = {way: series for way, series in lines.items() if series}
+    runs = min(
+        (int(np.sum(kept(study, rule, [(name, way, i)])))
+         for way, series in lines.items() for i in range(len(series))), default=0,
+    )  # fmt: skip
+    span = anees_bounds(runs) if runs else (1.0, 9.0)
+    vertical = log_axis("ANEES", [*span, *ends(s for mine in lines.values() for s in mine)])
+    lap = lap_time(study)
+    panels = [
+        Panel(
+            title=way,
+            role=way,
+            x=linear_axis("time [s]", [series[0].x[-1] / 1.05], floor=0.0),
+            y=vertical,
+            series=tuple(series),
+            span=(*span, "95 % of a consistent filter"),
+            posts=tuple(lap * k for k in range(1, int(series[0].x[-1] / lap) + 1)),
+        )
+        for way, series in lines.items()
+    ]
+    return Chart(
+        name=f"anees_{name}",
+        title=f"Consistency of {FILTER_NAMES[name]}: average NEES over time",
+        caption="The stronger a line, the narrower the beam; grey: where a consistent filter's "
+        f"ANEES over {runs} world{'' if runs == 1 else 's'} lies with 95 %; dotted: "
+        "the vehicle is back at its start",
+        panels=tuple(panels),
+        columns=("time_s", "anees"),
+    )
+
+
+def _anees_lines(study: Study, rule: Rule, way: tuple[str, str]) -> list[Series]:
+    """Return ANEES over time, the widest beam first and faintest."""
+    nees = study.outcomes[way].nees
+    time = frame_time(study, nees.shape[2])
+    found = []
+    for i in reversed(range(nees.shape[1] if len(time) else 0)):
+        counts = kept(study, rule, [(*way, i)])
+        single = way[1] == "passive"
+        if counts.any():
+            found.append(
+                Series(
+                    name="passive" if single else beam_name(study.beamwidth[i]),
+                    role=way[1],
+                    x=time,
+                    y=anees(nees[counts, i]),
+                    strength=1.0 if single else 1.0 - 0.75 * i / max(nees.shape[1] - 1, 1),
+                )
+            )
+    return found

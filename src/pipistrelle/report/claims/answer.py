@@ -1,0 +1,203 @@
+"""The answer in plain words: what listening to the beacon does to the map, and how surely."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipistrelle.evaluation.comparison import Finding, judge
+from pipistrelle.figures.style import FILTER_NAMES
+from pipistrelle.report.claims.contrasts import differences
+from pipistrelle.report.claims.published import beam_name
+from pipistrelle.report.claims.verdicts import WITHOUT, Claim
+from pipistrelle.report.studied import COMMON, RULES, Rule, Study, samples
+
+NUMBERS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight")
+
+
+def answer(study: Study, claims: Sequence[Claim]) -> list[str]:
+    """Answer the question, then say what of the paper's claims is left.
+
+    Numbers leave diverged worlds out, as the paper does; where that bears on the answer, it is
+    given under every exclusion rule.
+
+    Parameters
+    ----------
+    study : Study
+    claims : sequence of Claim
+
+    Returns
+    -------
+    list of str
+        A line that stands alone, then sentences.
+    """
+    placed, located = (_findings(study, "world", score) for score in (COMMON, "position_rmse_m"))
+    by_rule = {rule: _headline(study, rule) for rule in RULES}
+    sentences = (
+        *_otherwise(by_rule),
+        _counted(study),
+        _compared("The landmarks that every strategy places are placed", placed),
+        _compared("The vehicle is located", located),
+        _diverged(study),
+        _tally(claims),
+    )
+    headline = by_rule["world"]
+    if len(set(by_rule.values())) > 1:
+        fuller = all(_fuller(study, rule) for rule in RULES)
+        headline = "It depends on which worlds are counted."
+        if fuller:
+            headline = "A fuller map, yes; a more accurate one depends on which worlds are counted."
+    return [headline, *(sentence for sentence in sentences if sentence)]
+
+
+def _findings(study: Study, rule: Rule, score: str) -> dict[str, list[Finding]]:
+    """Judge active minus fused at each beamwidth, per filter, as a family of its own."""
+    return {
+        name: list(
+            judge(differences(study, rule, score, (name, "active"), (name, "fused"), name=name))
+        )
+        for name in FILTER_NAMES
+    }
+
+
+def _headline(study: Study, rule: Rule) -> str:
+    """Answer in a line."""
+    placed = _findings(study, rule, COMMON)
+    decided = [finding for mine in placed.values() for finding in mine if finding.n > 1]
+    if not any(placed.values()):
+        return "Not decided: the study has no pair of active and fused."
+    if not decided:
+        return f"Not decided: {_left([finding for mine in placed.values() for finding in mine])}."
+    better = sum(finding.holds is True for finding in decided)
+    worse = sum(finding.holds is False for finding in decided)
+    fuller = _fuller(study, rule)
+    built = "It builds a fuller map" if fuller else "It does not build a fuller map"
+    if better and not worse:
+        narrow = all(_narrow(mine) for mine in placed.values())
+        where = "where the beam is narrow" if narrow else "at some beamwidths"
+        where = "at every beamwidth" if better == len(decided) else where
+        begun = "Yes: a fuller map, and" if fuller else f"{built}, but"
+        return f"{begun} a more accurate one {where}."
+    if worse and not better:
+        return f"{built}, {'and' if fuller else 'but'} a less accurate one."
+    if better:
+        begun = "It depends: a fuller map," if fuller else f"{built}; it is"
+        return f"{begun} at some beamwidths more accurate, at others less."
+    return f"{built}; no difference in its accuracy is significant at any beamwidth."
+
+
+def _left(findings: Sequence[Finding]) -> str:
+    """Say how few worlds there are, where too few for any of these."""
+    one = max(finding.n for finding in findings) == 1
+    return "a single world is left" if one else "no world is left"
+
+
+def _narrow(findings: Sequence[Finding]) -> bool:
+    """Tell whether what is better, if anything, is so in the narrower half of the beams alone."""
+    return all(finding.holds is not True for finding in findings[len(findings) // 2 :])
+
+
+def _fuller(study: Study, rule: Rule) -> bool:
+    """Tell whether fused places more landmarks than active on average wherever worlds are left."""
+    pairs = [
+        samples(study, rule, "landmarks_full", [(name, "fused", i), (name, "active", i)])
+        for name in FILTER_NAMES
+        if {(name, "fused"), (name, "active")} <= study.outcomes.keys()
+        for i in range(len(study.beamwidth))
+    ]
+    more = [np.mean(a) > np.mean(b) for a, b in pairs if len(a) > 1]
+    return bool(more) and all(more)
+
+
+def _otherwise(by_rule: dict[Rule, str]) -> list[str]:
+    """Give the answers under all exclusion rules, where they are not one."""
+    answers: dict[str, list[str]] = {}
+    for rule, answer in by_rule.items():
+        answers.setdefault(answer, []).append(WITHOUT[rule])
+    if len(answers) == 1:
+        return []
+    said = (" and ".join(rules) + f": {answer}" for answer, rules in answers.items())
+    return [line[0].upper() + line[1:] for line in said]
+
+
+def _diverged(study: Study) -> str:
+    """Say which strategies diverged how often."""
+    said = []
+    for name, label in FILTER_NAMES.items():
+        shares = {
+            way[1]: float(np.mean(outcome.diverged))
+            for way, outcome in study.outcomes.items()
+            if way[0] == name and outcome.diverged.any()
+        }
+        if shares:
+            parts = ", ".join(f"{way} in {100.0 * share:.1f} %" for way, share in shares.items())
+            said.append(f"with {label} {parts}")
+    return f"The filter diverged, of the trials, {'; '.join(said)}." if said else ""
+
+
+def _counted(study: Study) -> str:
+    """Say how many landmarks fused and active place, at the narrowest and at the widest beam."""
+    for name, label in FILTER_NAMES.items():
+        if not {(name, "fused"), (name, "active")} <= study.outcomes.keys():
+            continue
+        said = []
+        for i in dict.fromkeys((0, len(study.beamwidth) - 1)):
+            cells = [(name, "fused", i), (name, "active", i)]
+            fused, active = samples(study, "world", "landmarks_full", cells)
+            if len(fused):
+                beam = beam_name(study.beamwidth[i])
+                said.append(f"{np.mean(fused):.0f} instead of {np.mean(active):.0f} at {beam}")
+        if said:
+            return (
+                "Hearing the beacon as well as its own calls, the vehicle fully places, of "
+                f"{study.config.scenario.landmarks + 1} landmarks, {' and '.join(said)} ({label})."
+            )
+    return ""
+
+
+def _compared(subject: str, found: dict[str, list[Finding]]) -> str:
+    """Say where fused is better than active, and where worse, with each filter."""
+    said, undecided = [], []
+    for name, findings in found.items():
+        label = FILTER_NAMES[name]
+        if findings and max(finding.n for finding in findings) < 2:
+            what = subject[0].lower() + subject[1:]
+            undecided.append(
+                f"Whether {what} better or worse with {label} is not decided: {_left(findings)}."
+            )
+        elif findings:
+            parts = [
+                f"{word} at {_beams(findings, outcome)}"
+                for word, outcome in (("better", True), ("worse", False))
+                if any(finding.holds is outcome for finding in findings)
+            ]
+            words = " and ".join(parts) or "not significantly better or worse at any beamwidth"
+            said.append(f"with {label} {words}")
+    return " ".join([f"{subject} {'; '.join(said)}."] * bool(said) + undecided)
+
+
+def _beams(findings: Sequence[Finding], outcome: bool) -> str:
+    """Name the beamwidths of an outcome: how many, and which, in runs."""
+    names = [finding.label.split(", ")[-1] for finding in findings]
+    runs: list[list[str]] = []
+    for i, finding in enumerate(findings):
+        if finding.holds is outcome:
+            if runs and i and findings[i - 1].holds is outcome:
+                runs[-1].append(names[i])
+            else:
+                runs.append([names[i]])
+    count = sum(map(len, runs))
+    if count == len(findings):
+        return "every beamwidth"
+    which = ", ".join(run[0] if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs)
+    return f"{count} of {len(findings)} beamwidths ({which})"
+
+
+def _tally(claims: Sequence[Claim]) -> str:
+    """Count the verdicts."""
+    verdicts = [claim.verdict for claim in claims]
+    words = []
+    for verdict in ("reproduced", "not-reproduced", "open"):
+        count = verdicts.count(verdict)
+        verb = "is" if count == 1 else "are"
+        words.append(f"{NUMBERS[count]} {verb} {verdict.replace('-', ' ')}")
+    return f"Of the paper's eight claims, {words[0]}, {words[1]} and {words[2]}."

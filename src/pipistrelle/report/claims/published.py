@@ -1,0 +1,108 @@
+"""What the paper printed: the numbers of its Table II and the beamwidths that it speaks of."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipistrelle.report.studied import Cell, Study
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Printed:
+    """One row of Table II, for one filter: mean and standard deviation of landmarks.
+
+    Attributes
+    ----------
+    filter : "ekf" or "fastslam"
+    beamwidth : [deg]
+        0: passive sensing; else fused.
+    full, total : mean, standard deviation
+        Fully initialised; fully and partially.
+    """
+
+    filter: str
+    beamwidth: float
+    full: tuple[float, float]
+    total: tuple[float, float]
+
+
+TABLE_II = (
+    Printed(filter="ekf", beamwidth=180.0, full=(37.7, 2.9), total=(43.7, 2.6)),
+    Printed(filter="ekf", beamwidth=33.2, full=(31.9, 3.3), total=(40.8, 3.2)),
+    Printed(filter="ekf", beamwidth=11.4, full=(30.0, 3.3), total=(40.1, 3.2)),
+    Printed(filter="ekf", beamwidth=0.0, full=(26.6, 3.3), total=(39.5, 3.4)),
+    Printed(filter="fastslam", beamwidth=180.0, full=(39.3, 2.8), total=(43.7, 2.4)),
+    Printed(filter="fastslam", beamwidth=33.2, full=(32.6, 3.3), total=(40.7, 3.1)),
+    Printed(filter="fastslam", beamwidth=11.4, full=(30.5, 3.2), total=(40.2, 3.1)),
+    Printed(filter="fastslam", beamwidth=0.0, full=(22.1, 4.9), total=(39.4, 3.3)),
+)
+"""Bradley & Abaid, Table II."""
+BEAMWIDTHS = (11.4, 14.2, 17.6, 21.8, 26.8, 33.2, 41.6, 51.4, 64.8, 83.0, 108.6, 180.0)
+"""Bradley & Abaid, Appendix B [deg]."""
+EXCLUDED = {"ekf": 8, "fastslam": 15}
+"""Worlds of 115 that the paper dropped (Bradley & Abaid, Sec. V-A)."""
+CROSSING = 41.0
+"""Below the case that the paper rounds to 42 degrees, where it sees fused overtake active [deg]."""
+NARROW = 64.0
+"""Below the case that the paper rounds to 65 degrees, where its gap passes one sigma [deg]."""
+
+
+def cell_of(study: Study, printed: Printed) -> Cell | None:
+    """Find the cell of a study that a row of Table II speaks of.
+
+    Parameters
+    ----------
+    study : Study
+    printed : Printed
+
+    Returns
+    -------
+    Cell or None
+        None where the study has no such case within a quarter of a degree.
+    """
+    strategy = "fused" if printed.beamwidth else "passive"
+    if (printed.filter, strategy) not in study.outcomes:
+        return None
+    if strategy == "passive":
+        return printed.filter, strategy, 0
+    near = np.flatnonzero(np.abs(study.beamwidth - printed.beamwidth) < 0.25)
+    return (printed.filter, strategy, int(near[0])) if len(near) else None
+
+
+def beam_name(beamwidth: float) -> str:
+    """Name a beamwidth: as the paper does where it is one of the paper's, within 0.2 degrees.
+
+    Parameters
+    ----------
+    beamwidth : [deg]
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> beam_name(11.575), beam_name(12.5)
+    ('11°', '12°')
+    """
+    near = min(BEAMWIDTHS, key=lambda printed: abs(printed - beamwidth))
+    return f"{near if abs(near - beamwidth) < 0.2 else beamwidth:.0f}°"
+
+
+def row_name(printed: Printed) -> str:
+    """Word a row as the table does.
+
+    Parameters
+    ----------
+    printed : Printed
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> row_name(TABLE_II[1]), row_name(TABLE_II[3])
+    ('33°', 'passive (0°)')
+    """
+    return beam_name(printed.beamwidth) if printed.beamwidth else "passive (0°)"

@@ -1,0 +1,274 @@
+"""The page: one file that holds everything, and beside it the figures and the numbers.
+
+Nothing in it asks for anything outside: style, script and drawings are inside. Every text goes
+through the template's escaping. The same folder gives the same bytes.
+"""
+
+import json
+import math
+import platform
+from collections.abc import Callable, Mapping
+from importlib.metadata import PackageNotFoundError, version
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from pipistrelle import __version__
+from pipistrelle.config import InputError
+from pipistrelle.evaluation.comparison import Finding
+from pipistrelle.experiments.results.folder import write_file
+from pipistrelle.figures.chart import Chart, Panel, csv_rows, csv_text
+from pipistrelle.figures.style import FILTER_NAMES, STRATEGY_COLOURS
+from pipistrelle.report.charts.results import study_charts
+from pipistrelle.report.charts.setting import model_charts
+from pipistrelle.report.claims.answer import answer
+from pipistrelle.report.claims.verdicts import WITHOUT, Claim, judge_claims, record, tally
+from pipistrelle.report.page import overview
+from pipistrelle.report.page.svg import figure, legend, panel_svg, readings
+from pipistrelle.report.studied import RULES, Rule, Study
+from pipistrelle.settings import to_toml
+
+FORMAT = 1
+UNITS = {"rad": (180.0 / math.pi, "°"), "m": (1.0, "m"), "landmarks": (1.0, ""), "": (1.0, "")}
+"""How a number is shown: its factor and its sign."""
+SPOKEN = {"reproduced": "Reproduced", "not-reproduced": "Not reproduced", "open": "Open"}
+LIBRARIES = ("numpy", "scipy", "numba", "polars", "pydantic", "matplotlib", "jinja2")
+
+
+def write_report(
+    studies: tuple[Study, ...],
+    folder: Path,
+    *,
+    progress: Callable[[str], None] = lambda _: None,
+) -> tuple[Claim, ...]:
+    """Judge a study and write its page, its figures and its summary.
+
+    Parameters
+    ----------
+    studies : tuple of Study
+        As `tables.read_study` gives them; the first is shown, of further ones the verdicts.
+    folder : Path
+        Made where it is missing; ``index.html``, ``summary.json`` and ``figures``.
+    progress : callable, optional
+        Given the name of each figure before it is drawn.
+
+    Returns
+    -------
+    tuple of Claim
+        Of the first study.
+
+    Raises
+    ------
+    InputError
+        Where a file cannot be written.
+    """
+    judged = [judge_claims(study) for study in studies]
+    study, claims = studies[0], judged[0]
+    found = {rule: study_charts(study, rule) for rule in RULES}
+    models = model_charts(study)
+    try:
+        (folder / "figures").mkdir(parents=True, exist_ok=True)
+        for chart in [*_distinct(found), *models]:
+            progress(chart.name)
+            _write_figure(chart, folder / "figures")
+    except OSError as error:
+        raise InputError(
+            f"{error.filename or folder}: could not be written ({error.strerror}); "
+            "make room or choose another folder with -o DIR"
+        ) from error
+    for name, text in _numbers(study, found, models).items():
+        write_file(folder / "figures" / f"{name}.csv", text)
+    summary = _summary(studies, judged)
+    write_file(folder / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
+    write_file(folder / "index.html", page(study, claims, found, models, summary))
+    return claims
+
+
+def page(
+    study: Study,
+    claims: tuple[Claim, ...],
+    found: dict[Rule, list[Chart]],
+    models: list[Chart],
+    summary: dict[str, Any],
+) -> str:
+    """Write the page.
+
+    Parameters
+    ----------
+    study : Study
+    claims : tuple of Claim
+    found : charts by exclusion rule
+    models : charts that no exclusion changes
+    summary : dict
+        As ``summary.json`` holds it.
+
+    Returns
+    -------
+    str
+        HTML.
+    """
+    from jinja2 import Environment, StrictUndefined
+
+    here = files("pipistrelle.report.page")
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters |= {"number": figure, "p": _p, "finding": _shown}
+    template = environment.from_string((here / "page.html").read_text(encoding="utf-8"))
+    return template.render(
+        study=study,
+        claims=claims,
+        summary=summary,
+        figures=[_figure(chart.name, found) for chart in _distinct(found)],
+        models=[_figure(chart.name, {"always": [chart]}) for chart in models],
+        style=Markup((here / "page.css").read_text(encoding="utf-8")),
+        script=Markup((here / "page.js").read_text(encoding="utf-8")),
+        colours=STRATEGY_COLOURS,
+        filters=FILTER_NAMES,
+        rules=RULES,
+        without=WITHOUT,
+        spoken=SPOKEN,
+        units=UNITS,
+        tally=tally,
+        departures=overview.departures_line(summary["not_the_papers"]),
+        consistency=overview.by_strategy(summary["consistency"]),
+        config=to_toml(study.config),
+    )
+
+
+def _distinct(found: Mapping[Any, list[Chart]]) -> list[Chart]:
+    """Return each figure once: under the first rule under which there is one."""
+    charts: dict[str, Chart] = {}
+    for mine in found.values():
+        for chart in mine:
+            charts.setdefault(chart.name, chart)
+    return list(charts.values())
+
+
+def _figure(name: str, found: Mapping[Any, list[Chart]]) -> dict[str, Any]:
+    """Gather one figure under all exclusion rules; None under those that leave nothing."""
+    named = {rule: chart for rule, mine in found.items() for chart in mine if chart.name == name}
+    by_rule: dict[str, dict[str, Any] | None] = dict.fromkeys(found)
+    for rule, chart in named.items():
+        panels = [_panel(panel) for panel in chart.panels]
+        by_rule[rule] = {"chart": chart, "panels": panels, "legend": legend(chart.panels)}
+    first = next(iter(named.values()))
+    return {"name": name, "title": first.title, "by_rule": by_rule, "count": len(first.panels)}
+
+
+def _panel(panel: Panel) -> dict[str, Any]:
+    """Gather a panel: its drawing, its numbers and their names."""
+    said = readings(panel)
+    names = list(dict.fromkeys(name for _, _, numbers in said for name, _ in numbers))
+    return {"panel": panel, "svg": panel_svg(panel), "readings": said, "names": names}
+
+
+def _write_figure(chart: Chart, folder: Path) -> None:
+    """Draw a chart for paper."""
+    from pipistrelle.figures.chart_plot import draw_chart
+    from pipistrelle.figures.style import save_figure
+
+    save_figure(draw_chart(chart), folder, chart.name)
+
+
+def _numbers(study: Study, found: dict[Rule, list[Chart]], models: list[Chart]) -> dict[str, str]:
+    """Write the numbers behind each figure, under all exclusion rules."""
+    texts = {chart.name: csv_text(csv_rows(chart)) for chart in models}
+    for chart in _distinct(found):
+        rows: list[list[str]] = []
+        for rule, mine in found.items():
+            for other in mine:
+                if other.name == chart.name:
+                    new = csv_rows(other, exclusion=rule)
+                    rows += new[1:] if rows else new
+        texts[chart.name] = csv_text(rows)
+    table = []
+    for rule in RULES:
+        for row in overview.table_ii(study, rule):
+            flat = {"exclusion": rule}
+            for key, value in row.items():
+                pair = isinstance(value, list)
+                flat |= {key: value[0], f"{key}_std": value[1]} if pair else {key: value}
+            table.append(flat)
+    header = list(dict.fromkeys(key for row in table for key in row))
+    cells = [["" if row.get(key) is None else str(row[key]) for key in header] for row in table]
+    return texts | {"table_ii": csv_text([header, *cells])}
+
+
+def _summary(studies: tuple[Study, ...], judged: list[tuple[Claim, ...]]) -> dict[str, Any]:
+    """Lay out everything that the page says, for programs."""
+    study, claims = studies[0], judged[0]
+    return {
+        "format": FORMAT,
+        "version": __version__,
+        "versions": {"python": platform.python_version()} | _versions(),
+        "study": study.name,
+        "seed": study.config.seed,
+        "worlds_planned": study.planned,
+        "worlds_done": len(study.worlds),
+        "partial": len(study.worlds) < study.planned,
+        "trials": sum(outcome.failed.size for outcome in study.outcomes.values()),
+        "filters_cpu_s": study.cpu_s,
+        "settings": study.settings,
+        "not_the_papers": overview.departures(study),
+        "answer": answer(study, claims),
+        "claims": [record(claim) for claim in claims],
+        "exclusion_rules": dict(RULES),
+        "exclusions": overview.exclusions(study),
+        "trials_failed": sum(overview.failed(other) for other in studies),
+        "table_ii": overview.table_ii(study),
+        "consistency": overview.consistency(study),
+        "failed": [
+            {"iteration": i, "strategy": s, "filter": f, "beamwidth_deg": b, "error": text}
+            | {"settings": other.settings}
+            for other in studies
+            for i, s, f, b, text in other.errors
+        ],
+        "variants": [
+            {
+                "settings": other.settings,
+                "worlds_done": len(other.worlds),
+                "trials_failed": overview.failed(other),
+                "verdicts": [claim.verdict for claim in mine],
+            }
+            for other, mine in zip(studies, judged, strict=True)
+        ],
+    }
+
+
+def _versions() -> dict[str, str]:
+    """Read the versions of the libraries that numbers and pictures depend on."""
+    found = {}
+    for name in LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "unknown"
+    return found
+
+
+def _p(p: float, sentence: bool = False) -> str:
+    """Write a p value, in a sentence with its sign."""
+    if p < 1e-4:
+        return "< 0.0001"
+    return ("= " if sentence else "") + (f"{p:.2g}" if p < 0.1 else f"{p:.2f}")
+
+
+def _shown(finding: Finding, unit: str) -> dict[str, str]:
+    """Word a finding in the unit that a reader expects."""
+    factor, sign = UNITS[unit]
+    end = f" {sign}" if sign not in ("", "°") else sign
+    edges = {finding.margin, -finding.margin} if finding.relation == "within" else {finding.margin}
+    low, high = finding.interval
+    words = (
+        ("above " if low in edges else "") + figure(factor * low),
+        ("below " if high in edges else "") + figure(factor * high),
+    )
+    margin = figure(factor * finding.margin) + (end if finding.margin else "")
+    return {
+        "mean": figure(factor * finding.mean) + end if finding.n else "none",
+        "interval": " to ".join(words),
+        "margin": f"± {margin}" if finding.relation == "within" else margin,
+    }

@@ -1,0 +1,465 @@
+"""The log format, rule by rule: what is read, what is dropped, what is refused and how."""
+
+import re
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipistrelle.config import InputError
+from pipistrelle.detection.logs.folder import read_log, write_log
+from pipistrelle.detection.logs.recording import Log
+from pipistrelle.detection.scans import Scan
+
+DATA = Path(__file__).parents[2] / "data"
+UNICYCLE = """\
+format = 1
+motion = "unicycle"
+initial_pose = [1.0, -2.0, 0.5]
+initial_pose_std = [0.05, 0.06, 0.04]
+velocity_std = 0.1
+angular_rate_std = 0.15
+range_std = 0.2
+bearing_std = 0.06
+range_bounds = [0.5, 20.0]
+"""
+BICYCLE = UNICYCLE.replace("unicycle", "bicycle").replace("velocity", "speed")
+BICYCLE = BICYCLE.replace("angular_rate", "steering") + "wheelbase = 0.3\n"
+ODOMETRY = "time,velocity,angular_rate\n0.0,1.0,0.1\n0.1,2.0,0.2\n0.3,3.0,0.3\n0.4,9.0,9.0\n"
+MEASUREMENTS = "time,landmark,bearing,range\n0.1,7,0.5,4.0\n0.1,3,-0.5,\n0.25,7,0.4,3.5\n"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return recorded(tmp_path / "drive")
+
+
+def recorded(folder, settings=UNICYCLE, odometry=ODOMETRY, measurements=MEASUREMENTS):
+    folder.mkdir(exist_ok=True)
+    (folder / "log.toml").write_text(settings)
+    (folder / "odometry.csv").write_text(odometry)
+    (folder / "measurements.csv").write_text(measurements)
+    return folder
+
+
+def measured(*rows):
+    return "\n".join(["time,landmark,bearing,range", *rows, ""])
+
+
+def same(first, second):
+    """Whether two records agree bit for bit, NaN with NaN."""
+    if type(first) is not type(second):
+        return False
+    if isinstance(first, Log | Scan):
+        return all(same(getattr(first, f.name), getattr(second, f.name)) for f in fields(first))
+    if isinstance(first, tuple):
+        return len(first) == len(second) and all(map(same, first, second))
+    if isinstance(first, np.ndarray):
+        return first.dtype == second.dtype and np.array_equal(
+            first, second, equal_nan=first.dtype.kind == "f"
+        )
+    return first == second
+
+
+def refused(folder, *parts):
+    with pytest.raises(InputError) as error:
+        read_log(folder)
+    message = str(error.value)
+    assert "\n" not in message
+    assert re.search(r": found .+, expected .+; .+", message)
+    for part in parts:
+        assert part in message
+    return message
+
+
+# What is read
+
+
+def test_a_row_holds_until_the_next_and_the_last_only_ends_the_log(folder):
+    log = read_log(folder)
+    assert log.time.tolist() == [0.0, 0.1, 0.3, 0.4]
+    assert log.controls.tolist() == [[1.0, 0.1], [2.0, 0.2], [3.0, 0.3]]
+    assert log.dt.tolist() == [0.1, 0.3 - 0.1, 0.4 - 0.3]
+
+
+def test_the_settings_are_those_of_the_file_and_the_name_is_the_folders(folder):
+    log = read_log(folder)
+    assert (log.name, log.motion, log.control_std) == ("drive", "unicycle", (0.1, 0.15))
+    assert (log.initial_pose, log.initial_pose_std) == ((1.0, -2.0, 0.5), (0.05, 0.06, 0.04))
+    assert (log.range_std, log.bearing_std, log.range_bounds) == (0.2, 0.06, (0.5, 20.0))
+    assert (log.gate, log.noise_at_rest, log.ignored_rows) == (None, True, {})
+
+
+def test_a_bicycle_has_a_wheelbase_and_its_own_columns(tmp_path):
+    header = ODOMETRY.replace("velocity,angular_rate", "speed,steering")
+    log = read_log(recorded(tmp_path, BICYCLE, header))
+    assert (log.motion, log.wheelbase, log.control_std) == ("bicycle", 0.3, (0.1, 0.15))
+    assert log.controls[0].tolist() == [1.0, 0.1]
+
+
+def test_optional_settings_are_read(tmp_path):
+    log = read_log(recorded(tmp_path, UNICYCLE + "gate = 0.99\nnoise_at_rest = false\n"))
+    assert (log.gate, log.noise_at_rest) == (0.99, False)
+
+
+def test_whole_numbers_are_numbers(tmp_path):
+    log = read_log(recorded(tmp_path, UNICYCLE.replace("range_std = 0.2", "range_std = 2")))
+    assert log.range_std == 2.0
+
+
+def test_rows_of_one_time_are_one_scan_and_an_empty_range_is_passive(folder):
+    first, second = read_log(folder).scans
+    assert first.landmark.tolist() == [7, 3]
+    assert first.bearing.tolist() == [0.5, -0.5]
+    assert first.range[0] == 4.0
+    assert np.isnan(first.range[1])
+    assert (first.time, second.time) == (0.1, 0.3)
+    assert first.landmark.dtype.kind == "i"
+
+
+def test_a_measurement_is_used_at_the_end_of_the_step_that_holds_it(tmp_path):
+    after = np.nextafter(0.1, 1.0).item()
+    rows = ["0.0,1,0,1", "1e-300,2,0,1", "0.1,3,0,1", f"{after!r},4,0,1", "0.3,5,0,1", "0.4,6,0,1"]
+    scans = read_log(recorded(tmp_path, measurements=measured(*rows))).scans
+    used = {int(scan.landmark[0]): scan.time for scan in scans}
+    assert used == {1: 0.0, 2: 0.1, 3: 0.1, 4: 0.3, 5: 0.3, 6: 0.4}
+
+
+def test_several_times_in_one_step_are_several_scans_in_order(tmp_path):
+    scans = read_log(recorded(tmp_path, measurements=measured("0.12,8,0,2", "0.2,8,0,1"))).scans
+    assert [scan.time for scan in scans] == [0.3, 0.3]
+    assert [scan.range.tolist() for scan in scans] == [[2.0], [1.0]]
+
+
+def test_bearings_are_wrapped_below_pi(tmp_path):
+    rows = [f"0.1,1,{np.pi!r},1", f"0.1,2,{-np.pi!r},1", "0.1,3,4.0,1", "0.1,4,-9.0,1"]
+    bearing = read_log(recorded(tmp_path, measurements=measured(*rows))).scans[0].bearing
+    assert bearing[:2].tolist() == [-np.pi, -np.pi]
+    np.testing.assert_allclose(bearing[2:], [4.0 - 2 * np.pi, -9.0 + 2 * np.pi], rtol=1e-15)
+
+
+def test_blank_lines_comments_spaces_and_foreign_line_ends_do_no_harm(folder):
+    plain = read_log(folder)
+    for name in ("odometry.csv", "measurements.csv"):
+        lines = (folder / name).read_text().splitlines()
+        lines[0] = ", ".join(f'"{column}"' for column in lines[0].split(","))
+        text = "\r\n".join(["# by hand", lines[0], "", *(f" {line}" for line in lines[1:]), " "])
+        (folder / name).write_bytes(b"\xef\xbb\xbf" + text.encode())
+    assert same(read_log(folder), plain)
+
+
+# Merged steps
+
+
+def merged(tmp_path, step, odometry=ODOMETRY, measurements=MEASUREMENTS):
+    return read_log(recorded(tmp_path, UNICYCLE + f"step = {step}\n", odometry, measurements))
+
+
+def test_merged_controls_are_time_weighted_means_and_the_last_step_may_be_short(tmp_path):
+    log = merged(tmp_path, 0.25)
+    np.testing.assert_allclose(log.time, [0.0, 0.25, 0.4], rtol=1e-15)
+    by_hand = [(0.1 * 1 + 0.15 * 2) / 0.25, (0.05 * 2 + 0.1 * 3) / 0.15]
+    np.testing.assert_allclose(log.controls[:, 0], by_hand, rtol=1e-14)
+    np.testing.assert_allclose(log.controls[:, 1], np.array(by_hand) / 10, rtol=1e-14)
+
+
+def test_merging_keeps_what_was_driven(tmp_path):
+    log = merged(tmp_path, 0.07)
+    driven = log.dt @ log.controls
+    np.testing.assert_allclose(driven, [0.1 * 1 + 0.2 * 2 + 0.1 * 3, 0.08], rtol=1e-14)
+
+
+def test_merged_steps_start_at_the_first_row_and_are_whole_where_the_log_is(tmp_path):
+    rows = "".join(f"{100 + i / 50!r},1,0\n" for i in range(151))
+    log = merged(tmp_path, 0.3, "time,velocity,angular_rate\n" + rows, measured("101,1,0,1"))
+    assert len(log.dt) == 10
+    np.testing.assert_allclose(log.dt, 0.3, rtol=1e-12)
+    assert log.time[-1] == 103.0
+
+
+def test_a_merged_step_of_standing_rows_stands_exactly(tmp_path):
+    rows = "".join(f"{1e9 + 0.017 * i:.3f},{0.0 if i < 40 else 0.3},0\n" for i in range(80))
+    measurements = measured("1000000000.5,1,0,1")
+    log = merged(tmp_path, 0.1, "time,velocity,angular_rate\n" + rows, measurements)
+    assert np.all(log.controls[:6] == 0.0)
+    assert np.all(log.controls[7:, 0] > 0.0)
+
+
+@pytest.mark.parametrize("start", [0.0, 100.0, 1248444187.156])
+@pytest.mark.parametrize("step", [0.1, 0.3, 0.7])
+def test_a_measurement_at_the_end_of_a_merged_step_belongs_to_it(tmp_path, start, step):
+    times = [round(start + k * step, 3) for k in range(1, 15)]
+    rows = "".join(f"{start + i * 0.05:.3f},1,0\n" for i in range(300))
+    ends = [f"{t},{k},0,1" for k, t in enumerate(times, 1)]
+    log = merged(tmp_path, step, "time,velocity,angular_rate\n" + rows, measured(*ends))
+    used = [np.flatnonzero(log.time == scan.time).item() for scan in log.scans]
+    assert used == list(range(1, 15))
+
+
+def test_times_and_the_ends_of_merged_steps_are_compared_to_a_microsecond(tmp_path):
+    odometry = "time,velocity,angular_rate\n0,1,0\n0.30000000000000004,1,0\n"
+    rows = measured("0.1000001,1,0,1", "0.100002,2,0,1", "0.2,3,0,1")
+    log = merged(tmp_path, 0.1, odometry, rows)
+    assert len(log.dt) == 3
+    used = [np.flatnonzero(log.time == scan.time).item() for scan in log.scans]
+    assert used == [1, 2, 2]
+
+
+def test_a_measurement_at_the_first_rows_time_is_used_at_the_start_of_merged_steps(tmp_path):
+    log = merged(tmp_path, 0.2, measurements=measured("0.0,1,0,1", "0.01,1,0,1"))
+    assert [scan.time for scan in log.scans] == [0.0, 0.2]
+
+
+# What is dropped, with a count
+
+
+def test_measurements_outside_the_odometry_are_dropped_and_counted(tmp_path):
+    odometry = "time,velocity,angular_rate\n0,1,0\n1,1,0\n"
+    rows = ["-0.1,1,0,1", "-0.1,2,0,1", "0,1,0,1", "1,1,0,1", "1.01,1,0,1"]
+    log = read_log(recorded(tmp_path, odometry=odometry, measurements=measured(*rows)))
+    assert log.ignored_rows == {"outside_odometry": 3}
+    assert [scan.time for scan in log.scans] == [0.0, 1.0]
+
+
+def test_of_odometry_rows_with_one_time_the_last_wins_and_the_others_are_counted(tmp_path):
+    odometry = "time,velocity,angular_rate\n0,1,0\n0,2,0\n1,3,0\n1,4,0\n1,5,0\n2,0,0\n"
+    log = read_log(recorded(tmp_path, odometry=odometry))
+    assert log.controls[:, 0].tolist() == [2.0, 5.0]
+    assert log.ignored_rows == {"same_time_odometry": 3}
+
+
+# What is refused
+
+
+@pytest.mark.parametrize("name", ["log.toml", "odometry.csv", "measurements.csv"])
+def test_a_missing_file_is_named(folder, name):
+    (folder / name).unlink()
+    refused(folder, name, "no such file")
+
+
+@pytest.mark.parametrize("name", ["odometry.csv", "measurements.csv"])
+@pytest.mark.parametrize("header_only", [True, False])
+def test_an_empty_file_is_named(folder, name, header_only):
+    header = (folder / name).read_text().splitlines()[0]
+    (folder / name).write_text(header if header_only else "")
+    refused(folder, name, "no rows", header.split(",")[1])
+
+
+def test_an_empty_settings_file_lacks_its_format(folder):
+    (folder / "log.toml").write_text("")
+    refused(folder, "log.toml", "no key 'format'")
+
+
+def test_a_file_that_is_no_text_is_named(folder):
+    (folder / "odometry.csv").write_bytes(b"\xff\xfe\x00t")
+    refused(folder, "odometry.csv", "UTF-8")
+    (folder / "odometry.csv").unlink()
+    (folder / "odometry.csv").mkdir()
+    refused(folder, "odometry.csv", "text file")
+
+
+ROWS = {
+    "missing field": ("0.1,7,0.5", "line 3", "3 fields", "4: time, landmark, bearing, range"),
+    "extra field": ("0.1,7,0.5,1,2", "line 3", "5 fields", "4"),
+    "text": ("0.1,7,left,1", "line 3", "bearing 'left'", "a finite number"),
+    "underscore": ("0.1,7,0.5,1_0", "line 3", "range '1_0'", "a finite number"),
+    "empty": ("0.1,7,,1", "line 3", "bearing ''", "a finite number"),
+    "nan": ("nan,7,0.5,1", "line 3", "time 'nan'", "a finite number"),
+    "nan range": ("0.1,7,0.5,NaN", "line 3", "range 'NaN'", "leave it empty"),
+    "infinite": ("0.1,7,-inf,1", "line 3", "bearing '-inf'", "a finite number"),
+    "overflow": ("0.1,7,1e999,1", "line 3", "bearing '1e999'", "a finite number"),
+    "no range": ("0.1,7,0.5,0", "line 3", "range 0.0", "above 0 m"),
+    "negative range": ("0.1,7,0.5,-2", "line 3", "range -2.0", "above 0 m"),
+    "label": ("0.1,7.5,0.5,1", "line 3", "landmark 7.5", "an integer"),
+    "name": ("0.1,tree,0.5,1", "line 3", "landmark 'tree'", "a finite number"),
+    "backwards": ("0.05,7,0.5,1", "line 3", "time 0.05 after 0.06", "backwards"),
+    "twice": ("0.06,1,0.5,1", "line 3", "time 0.06, landmark 1 again", "line 2"),
+    "outside but wrong": ("99,7,0.5,-2", "line 3", "range -2.0", "above 0 m"),
+}
+
+
+@pytest.mark.parametrize(("row", "parts"), [(r, p) for r, *p in ROWS.values()], ids=ROWS)
+def test_a_bad_measurement_is_refused_by_its_line(tmp_path, row, parts):
+    refused(
+        recorded(tmp_path, measurements=measured("0.06,1,0,1", row)), "measurements.csv", *parts
+    )
+
+
+def test_a_landmark_twice_at_one_time_is_found_among_others(tmp_path):
+    rows = ["0.1,1,0,1", "0.1,2,0,1", "0.1,3,0,1", "0.1,2,0.3,", "0.2,2,0,1"]
+    refused(recorded(tmp_path, measurements=measured(*rows)), "line 5", "landmark 2", "line 3")
+    rows = ["0.1,9,0,1", "0.1,9,0,1", "0.1,1,0,1", "0.1,1,0,1"]
+    refused(recorded(tmp_path, measurements=measured(*rows)), "line 3", "landmark 9", "line 2")
+
+
+@pytest.mark.parametrize("row", ["0.1,7,0.5", "0.1,7,0.5,1,0"])
+def test_a_file_of_wrong_rows_alone_is_refused_too(tmp_path, row):
+    folder = recorded(tmp_path, measurements=measured(row, row.replace("7", "8")))
+    refused(folder, "line 2", f"{row.count(',') + 1} fields")
+
+
+@pytest.mark.parametrize(
+    ("row", "parts"),
+    [
+        ("0.5,1", ("line 6", "2 fields", "3: time, velocity, angular_rate")),
+        ("0.5,1,fast", ("line 6", "angular_rate 'fast'")),
+        ("0.5,,0", ("line 6", "velocity ''")),
+        ("0.5,nan,0", ("line 6", "velocity 'nan'")),
+        ("0.35,1,0", ("line 6", "time 0.35 after 0.4", "backwards")),
+    ],
+)
+def test_a_bad_odometry_row_is_refused_by_its_line(tmp_path, row, parts):
+    refused(recorded(tmp_path, odometry=ODOMETRY + row + "\n"), "odometry.csv", *parts)
+
+
+def test_lines_are_counted_in_the_file_blank_ones_included(tmp_path):
+    odometry = ODOMETRY.replace("\n0.1", "\n\n# turn\n0.1") + "0.5,x,0\n"
+    refused(recorded(tmp_path, odometry=odometry), "line 8", "velocity 'x'")
+
+
+def test_one_row_of_odometry_is_no_log(tmp_path):
+    odometry = "time,velocity,angular_rate\n0,1,0\n"
+    refused(recorded(tmp_path, odometry=odometry), "odometry.csv", "two times", "ends the log")
+
+
+@pytest.mark.parametrize(
+    ("name", "header"),
+    [
+        ("odometry.csv", "time,speed,steering"),
+        ("odometry.csv", "0.0,1.0,0.1"),
+        ("measurements.csv", "time;landmark;bearing;range"),
+        ("measurements.csv", "time,landmark,range,bearing"),
+    ],
+)
+def test_a_wrong_header_is_refused(folder, name, header):
+    lines = (folder / name).read_text().splitlines()
+    (folder / name).write_text("\n".join([header, *lines[1:]]))
+    refused(folder, name, "line 1", repr(header), repr(lines[0]))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "parts"),
+    [
+        ("range_std = 0.2", "", ("no key 'range_std'", "add 'range_std'")),
+        ("velocity_std", "velocity_sdt", ("unknown key 'velocity_sdt'", "mean 'velocity_std'?")),
+        ("range_std = 0.2", "range_std = 0.2\ncolour = 3", ("unknown key 'colour'", "remove it")),
+        ("format = 1", "format = 2", ("key 'format': found 2", "expected 1")),
+        ('"unicycle"', '"tricycle"', ("'tricycle'", "expected 'unicycle' or 'bicycle'")),
+        ("range_std = 0.2", "range_std = -0.2", ("'range_std': found -0.2", "greater than 0")),
+        ("range_std = 0.2", "range_std = nan", ("'range_std': found nan", "finite number")),
+        ("range_std = 0.2", 'range_std = "0.2"', ("'range_std': found '0.2'", "valid number")),
+        ("range_std = 0.2", "range_std = true", ("'range_std': found True", "valid number")),
+        ("velocity_std = 0.1", "velocity_std = -1", ("'velocity_std': found -1", "or equal to 0")),
+        ("-2.0, 0.5]", "-2.0]", ("key 'initial_pose': found 2 values, expected 3",)),
+        ("-2.0, 0.5]", "-2.0, 0.5, 1.0]", ("key 'initial_pose': found 4 values, expected 3",)),
+        ("-2.0, 0.5]", 'inf, "x"]', ("'initial_pose[1]': found inf", "finite")),
+        ("[0.05, 0.06", "[-0.05, 0.06", ("'initial_pose_std[0]': found -0.05",)),
+        ("[0.5, 20.0]", "[20.0, 0.5]", ("'range_bounds': found [20.0, 0.5]", "below a far one")),
+        ("[0.5, 20.0]", "[0.0, 20.0]", ("'range_bounds[0]': found 0.0", "greater than 0")),
+        ("range_std = 0.2", "range_std = 0.2\nstep = 0", ("'step': found 0", "greater than 0")),
+        ("range_std = 0.2", "range_std = 0.2\ngate = 1.5", ("'gate': found 1.5", "equal to 1")),
+        ("range_std = 0.2", "range_std = ", ("TOML", "line 7")),
+    ],
+)
+def test_a_bad_setting_is_refused_by_its_key(tmp_path, old, new, parts):
+    assert old in UNICYCLE
+    folder = recorded(tmp_path, UNICYCLE.replace(old, new, 1))
+    refused(folder, "log.toml", *parts)
+
+
+def test_the_settings_of_the_other_vehicle_are_refused(tmp_path):
+    refused(recorded(tmp_path, UNICYCLE + "wheelbase = 0.2\n"), "unknown key 'wheelbase'")
+    settings = UNICYCLE.replace('"unicycle"', '"bicycle"')
+    message = refused(recorded(tmp_path, settings), "unknown key 'velocity_std'", "speed_std")
+    assert "angular" not in message
+
+
+def test_steps_without_number_are_refused_before_they_fill_the_memory(tmp_path):
+    settings = UNICYCLE + "step = 0.1\n"
+    odometry = ODOMETRY + "1700000000.0,1,0\n"
+    refused(recorded(tmp_path, settings, odometry), "odometry.csv", "1.7e+09 s", "steps")
+
+
+# What is written
+
+
+def test_the_log_on_the_pages_of_the_documentation_is_sound(tmp_path):
+    page = (Path(__file__).parents[3] / "docs" / "log_format.md").read_text()
+    files = re.findall(r"^`([a-z]+\.[a-z]+)`\n\n```[a-z]+\n(.+?)^```", page, re.M | re.S)
+    assert [name for name, _ in files] == ["log.toml", "odometry.csv", "measurements.csv"]
+    for name, text in files:
+        (tmp_path / name).write_text(text)
+    log = read_log(tmp_path)
+    assert len(log.dt) == 3
+    assert [scan.landmark.tolist() for scan in log.scans] == [[7, 3], [7]]
+
+
+@pytest.mark.parametrize("name", ["unicycle_log", "bicycle_log"])
+def test_a_log_survives_being_written(tmp_path, name):
+    log = read_log(DATA / name)
+    write_log(tmp_path / name, log)
+    assert same(read_log(tmp_path / name), log)
+
+
+def test_every_setting_survives_being_written(tmp_path, folder):
+    log = replace(read_log(folder), gate=0.97, noise_at_rest=False, initial_pose=(0.1, 1e-7, 3.0))
+    write_log(tmp_path / "drive", log)
+    assert same(read_log(tmp_path / "drive"), log)
+
+
+def test_scans_that_share_a_step_survive_being_written(tmp_path):
+    rows = [f"{t},8,0.1,{r}" for t, r in ((0.0, 5), (0.11, 4), (0.12, ""), (0.13, 2), (0.35, 1))]
+    log = read_log(recorded(tmp_path / "drive", measurements=measured(*rows)))
+    assert [scan.time for scan in log.scans] == [0.0, 0.3, 0.3, 0.3, 0.4]
+    write_log(tmp_path / "again" / "drive", log)
+    assert same(read_log(tmp_path / "again" / "drive"), log)
+
+
+def test_a_written_folder_says_what_it_holds(tmp_path):
+    write_log(tmp_path, read_log(DATA / "bicycle_log"))
+    readme = (tmp_path / "README.md").read_text()
+    assert "time,speed,steering" in readme
+    assert "time,landmark,bearing,range" in readme
+
+
+NUMBER = st.floats(-1e6, 1e6)
+ANGLE = st.floats(-np.pi, np.pi, exclude_max=True)
+RANGE = st.floats(0, 1e6, exclude_min=True) | st.just(np.nan)
+
+
+@st.composite
+def drives(draw):
+    steps = draw(st.integers(1, 6))
+    start = draw(st.floats(-1e9, 1e9))
+    time = start + np.cumsum(
+        [0.0, *draw(st.lists(st.floats(1e-3, 10), min_size=steps, max_size=steps))]
+    )
+    controls = np.array(draw(st.lists(st.tuples(NUMBER, NUMBER), min_size=steps, max_size=steps)))
+    scans = []
+    for k in sorted(draw(st.sets(st.integers(0, steps), min_size=1))):
+        for _ in range(draw(st.integers(1, 1 if k == 0 else 3))):
+            rows = draw(st.dictionaries(st.integers(-99, 99), st.tuples(ANGLE, RANGE), min_size=1))
+            bearing, distance = np.array(list(rows.values())).T
+            label = np.array(list(rows), dtype=np.int64)
+            at = time[k].item()
+            scans.append(
+                Scan(time=at, landmark=label, bearing=bearing.copy(), range=distance.copy())
+            )
+    return replace(
+        read_log(DATA / "unicycle_log"),
+        time=time,
+        controls=controls,
+        dt=np.diff(time),
+        scans=tuple(scans),
+    )
+
+
+@given(log=drives())
+@settings(max_examples=50, deadline=None)
+def test_any_log_survives_being_written(tmp_path_factory, log):
+    folder = tmp_path_factory.mktemp("logs") / log.name
+    write_log(folder, log)
+    assert same(read_log(folder), log)

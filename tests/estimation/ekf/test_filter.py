@@ -1,0 +1,261 @@
+"""The filter against its slow reference, closed forms and statistics."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import chi2
+
+from pipistrelle.config import RayConfig
+from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.motion import Motion
+from pipistrelle.geometry import range_and_bearing, wrap
+from reference.ekf_slam import SlowEkfSlam
+from reference.missions import (
+    BICYCLE,
+    CIRCLE,
+    SENSING,
+    START,
+    STEP,
+    STEPS_PER_FRAME,
+    draw_mission,
+    followed,
+    paper_filter,
+    paper_mission,
+    ray_config,
+    scan_of,
+    scattered,
+    steady,
+)
+
+FIELDS = ("mean", "covariance", "landmark", "weight")
+
+OPTIONS = list(
+    itertools.product(
+        ("fused", "passive"),
+        ("instantaneous", "aggregated"),
+        ("reinitialise", "heaviest"),
+        (1.0, 3.0),
+        (1.0, 0.999),
+    )
+)
+FEW = [
+    ("active", "instantaneous", "reinitialise", 1.0, 0.999),
+    ("fused", "instantaneous", "reinitialise", 1.0, 1.0),
+    ("fused", "aggregated", "heaviest", 3.0, 0.999),
+    ("passive", "instantaneous", "reinitialise", 3.0, 0.999),
+]
+FIELDS = ("mean", "covariance", "landmark", "weight")
+
+
+def assert_equal_to_reference(slam, mission, start=START):
+    """Every frame of the two filters agrees to 1e-9; returns the last belief."""
+    slow = SlowEkfSlam(slam.motion, slam.range_std, slam.bearing_std, slam.rays, slam.gate)
+    slow.start(start.mean, start.covariance)
+    for frame, (belief, poses) in enumerate(followed(slam, mission, start)):
+        means, covariances = slow.predict(mission.controls[frame], mission.dt[frame])
+        slow.update(mission.scans[frame])
+        np.testing.assert_allclose(poses.mean, means, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(poses.covariance, covariances, rtol=0, atol=1e-9)
+        for field in FIELDS:
+            np.testing.assert_allclose(
+                getattr(belief, field), getattr(slow, field), rtol=0, atol=1e-9, err_msg=field
+            )
+        assert belief.gated == slow.gated
+    return belief
+
+
+def assert_equal_whole_run(strategy, weights, partial, power, gate):
+    slam = paper_filter(rays=ray_config(weights=weights, partial=partial, power=power), gate=gate)
+    mission = paper_mission(strategy, outliers=0.02)
+    belief = assert_equal_to_reference(slam, mission)
+    assert np.unique(belief.landmark).size > 30
+    assert (belief.gated > 0) == (gate < 1)
+
+
+@pytest.mark.parametrize(("strategy", "weights", "partial", "power", "gate"), FEW)
+def test_whole_run_equals_the_slow_reference(strategy, weights, partial, power, gate):
+    assert_equal_whole_run(strategy, weights, partial, power, gate)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("strategy", "weights", "partial", "power", "gate"), OPTIONS)
+def test_whole_run_equals_the_slow_reference_with_every_option(
+    strategy, weights, partial, power, gate
+):
+    assert_equal_whole_run(strategy, weights, partial, power, gate)
+
+
+rays = st.builds(
+    RayConfig,
+    ratio=st.floats(0.1, 0.5),
+    density=st.floats(1.5, 4),
+    range_bounds=st.tuples(st.floats(0.2, 2), st.floats(3, 40)),
+    prune=st.floats(0, 0.3),
+    power=st.floats(0.5, 8),
+    weights=st.sampled_from(["instantaneous", "aggregated"]),
+    partial=st.sampled_from(["reinitialise", "heaviest"]),
+)
+
+
+@settings(max_examples=20)
+@given(rays, st.integers(0, 2**32), st.sampled_from([0.9, 1.0]))
+def test_short_runs_equal_the_slow_reference_with_any_ray(rays, seed, gate):
+    rng = np.random.default_rng(seed)
+    field, drive = scattered(rng, 8, radius=10.0), steady(CIRCLE, 12)
+    mission = draw_mission(
+        rng, BICYCLE, START, field, drive, beamwidth=0.5, hearing=10.0, bearing_std=0.15
+    )
+    assert_equal_to_reference(paper_filter(rays=rays, gate=gate), mission)
+
+
+def test_unicycle_that_stops_turns_and_reverses_equals_the_slow_reference():
+    rng = np.random.default_rng(8)
+    motion = Motion(model="unicycle", control_std=(0.1, 0.15), noise_at_rest=False)
+    controls = rng.uniform([-0.5, -1], [1, 1], size=(60, STEPS_PER_FRAME, 2))
+    controls[rng.random(controls.shape[:2]) < 0.3] = 0
+    controls[rng.random(controls.shape[:2]) < 0.2, 1] = 0
+    field = scattered(rng, 20, radius=10.0)
+    mission = draw_mission(rng, motion, START, field, controls, beamwidth=2.0, hearing=10.0)
+    assert_equal_to_reference(paper_filter(motion=motion), mission)
+
+
+def test_reference_is_the_same_in_josephs_form():
+    mission = paper_mission("fused", frames=8)
+    short, joseph = (
+        SlowEkfSlam(BICYCLE, 0.2, 0.15, ray_config(), joseph=form).start(
+            START.mean, START.covariance
+        )
+        for form in (False, True)
+    )
+    for controls, dt, scan in zip(mission.controls, mission.dt, mission.scans, strict=True):
+        for slow in (short, joseph):
+            slow.predict(controls, dt)
+            slow.update(scan)
+        for field in FIELDS:
+            np.testing.assert_allclose(
+                getattr(joseph, field), getattr(short, field), rtol=0, atol=1e-9
+            )
+
+
+def test_correspondence_carried_in_the_state_changes_nothing():
+    mission = paper_mission("fused", frames=100)
+    without, carried = (
+        SlowEkfSlam(BICYCLE, 0.2, 0.15, ray_config(), carry_correspondence=carry).start(
+            START.mean, START.covariance
+        )
+        for carry in (False, True)
+    )
+    for controls, dt, scan in zip(mission.controls, mission.dt, mission.scans, strict=True):
+        for slow in (without, carried):
+            slow.predict(controls, dt)
+            slow.update(scan)
+        for field in FIELDS:
+            np.testing.assert_allclose(
+                getattr(carried, field), getattr(without, field), rtol=0, atol=1e-9
+            )
+    assert carried.X.size == without.X.size + np.unique(carried.landmark).size
+
+
+# Covariance
+
+
+@pytest.mark.parametrize("strategy", SENSING)
+def test_covariance_is_symmetric_and_positive_through_a_whole_mission(strategy):
+    for frame, (belief, _) in enumerate(followed(paper_filter(), paper_mission(strategy))):
+        np.testing.assert_array_equal(belief.covariance, belief.covariance.T)
+        if frame % 5 == 0:
+            assert np.linalg.eigvalsh(belief.covariance)[0] > 0
+
+
+def test_covariance_is_symmetric_and_positive_after_a_hundred_thousand_updates():
+    """Without process noise nothing lifts a covariance that rounding has pushed down."""
+    rng = np.random.default_rng(2)
+    motion = Motion(model="unicycle", control_std=(0.1, 0.1), noise_at_rest=False)
+    slam = paper_filter(motion=motion)
+    points = scattered(rng, 20, radius=12.0)
+    distance, bearing = range_and_bearing(START.mean, points)
+    labels = np.arange(20)
+    belief = slam.init(START)
+    for frame in range(5000):
+        belief, _ = slam.predict(belief, np.zeros((4, 2)), np.full(4, STEP))
+        hidden = (rng.random(20) < 0.5) & (frame > 0)
+        belief = slam.update(
+            belief,
+            Scan(
+                time=0.0,
+                landmark=labels,
+                range=np.where(hidden, np.nan, distance + rng.normal(0, 0.2, 20)),
+                bearing=wrap(bearing + rng.normal(0, 0.15, 20)),
+            ),
+        )
+    np.testing.assert_array_equal(belief.covariance, belief.covariance.T)
+    assert np.linalg.eigvalsh(belief.covariance)[0] > 0
+
+
+def test_standing_vehicle_divides_the_measurement_noise_by_the_number_of_scans():
+    """Closed form: P = G P_pose G^T + G_z R G_z^T / n, and the pose gains nothing."""
+    d, scans = 5.0, 100_000
+    slam = paper_filter()
+    belief = slam.init(Gaussian(mean=np.zeros(3), covariance=START.covariance))
+    seen = scan_of((1, d, 0.0))
+    for _ in range(scans):
+        belief = slam.update(belief, seen)
+    np.testing.assert_allclose(belief.mean, [0, 0, 0, d, 0], rtol=0, atol=1e-12)
+    G = np.array([[1, 0, 0], [0, 1, d]])
+    R = np.diag([0.2**2, (d * 0.15) ** 2])
+    expected = np.block(
+        [
+            [START.covariance, START.covariance @ G.T],
+            [G @ START.covariance, G @ START.covariance @ G.T + R / scans],
+        ]
+    )
+    # Each update rounds entries of at most 0.05 by 2^-53: 1e5 updates drift by 6e-13 at worst.
+    np.testing.assert_allclose(belief.covariance, expected, rtol=0, atol=1e-12)
+
+
+# Statistics
+
+
+def final_nees(assumed, runs=100):
+    """NEES of the pose and of the whole state after ten seconds of active sensing, (runs, 2)."""
+    motion = Motion(model="bicycle", control_std=(0.05, 0.005), wheelbase=0.2)
+    start = Gaussian(mean=START.mean, covariance=np.diag([0.02**2, 0.02**2, 0.01**2]))
+    true = {"range_std": 0.05, "bearing_std": 0.01}
+    slam = paper_filter(motion=motion, **{name: assumed * std for name, std in true.items()})
+    values = []
+    for run in range(runs):
+        rng = np.random.default_rng([11, run])
+        mission = draw_mission(
+            rng, motion, start, scattered(rng, 10, radius=12.0), steady(CIRCLE, 20),
+            beamwidth=7.0, reach=40.0, **true,
+        )  # fmt: skip
+        *_, (belief, _) = followed(slam, mission, start)
+        truth = np.concatenate([mission.path[-1], mission.landmarks[belief.landmark - 1].ravel()])
+        error = belief.mean - truth
+        error[2] = wrap(error[2])
+        values.append(
+            [
+                part @ np.linalg.solve(belief.covariance[: part.size, : part.size], part)
+                for part in (error[:3], error)
+            ]
+        )
+    return np.array(values)
+
+
+def within_chi_square_bounds(nees, freedom, confidence=0.99):
+    tails = (1 - confidence) / 2, (1 + confidence) / 2
+    low, high = chi2.ppf(tails, freedom * nees.size) / nees.size
+    return low < nees.mean() < high
+
+
+def test_filter_is_consistent_with_the_noise_it_assumes_and_not_with_a_quarter_of_it():
+    nees = final_nees(assumed=1.0)
+    assert within_chi_square_bounds(nees[:, 0], 3)
+    assert within_chi_square_bounds(nees[:, 1], 23)
+    overconfident = final_nees(assumed=0.5)
+    assert not within_chi_square_bounds(overconfident[:, 0], 3)
+    assert not within_chi_square_bounds(overconfident[:, 1], 23)

@@ -1,0 +1,286 @@
+"""What must hold of the filter whatever it is told, and the traps of angles and distances."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import chi2
+
+from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.measurement import NEAREST
+from pipistrelle.estimation.motion import Motion
+from pipistrelle.geometry import wrap
+from reference.missions import (
+    START,
+    STEP,
+    STEPS_PER_FRAME,
+    followed,
+    paper_filter,
+    paper_mission,
+    scan_of,
+)
+
+FIELDS = ("mean", "covariance", "landmark", "weight")
+TURNING = Motion(model="unicycle", control_std=(0.1, 0.5))
+KNOWN_POSE = Gaussian(mean=np.zeros(3), covariance=np.zeros((3, 3)))
+
+
+def assert_same(belief, other):
+    """Two beliefs are equal to the last bit."""
+    for field in FIELDS:
+        np.testing.assert_array_equal(getattr(belief, field), getattr(other, field))
+
+
+@settings(max_examples=25)
+@given(st.floats(-np.pi, np.pi), st.tuples(st.floats(-50, 50), st.floats(-50, 50)))
+def test_estimate_turns_and_moves_with_the_start(angle, shift):
+    """Bearings and ranges do not know where north is; headings pass through pi on the way."""
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array([[c, -s], [s, c]])
+    T = np.eye(3)
+    T[:2, :2] = turn
+    moved = Gaussian(
+        mean=np.array([*(turn @ START.mean[:2] + shift), wrap(START.mean[2] + angle)]),
+        covariance=T @ START.covariance @ T.T,
+    )
+    slam, mission = paper_filter(), paper_mission("fused", frames=12)
+    (*_, (here, _)), (*_, (there, _)) = followed(slam, mission), followed(slam, mission, moved)
+    np.testing.assert_array_equal(there.landmark, here.landmark)
+    np.testing.assert_allclose(there.weight, here.weight, atol=1e-9)
+    points = here.mean[3:].reshape(-1, 2) @ turn.T + shift
+    np.testing.assert_allclose(there.mean[3:].reshape(-1, 2), points, atol=1e-9)
+    np.testing.assert_allclose(there.mean[:2], turn @ here.mean[:2] + shift, atol=1e-9)
+    assert abs(wrap(there.mean[2] - here.mean[2] - angle)) < 1e-9
+    assert -np.pi <= there.mean[2] < np.pi
+    G = np.kron(np.eye(1 + here.landmark.size), turn)
+    G = np.insert(np.insert(G, 2, 0, axis=0), 2, 0, axis=1)
+    G[2, 2] = 1
+    np.testing.assert_allclose(there.covariance, G @ here.covariance @ G.T, atol=1e-9)
+
+
+def test_labels_are_only_names():
+    mission, slam = paper_mission("fused", frames=30), paper_filter()
+    belief, renamed = slam.init(START), slam.init(START)
+    for controls, dt, scan in zip(mission.controls, mission.dt, mission.scans, strict=True):
+        other = Scan(
+            time=scan.time, landmark=1000 - scan.landmark, range=scan.range, bearing=scan.bearing
+        )
+        belief = slam.update(slam.predict(belief, controls, dt)[0], scan)
+        renamed = slam.update(slam.predict(renamed, controls, dt)[0], other)
+    np.testing.assert_array_equal(renamed.landmark, 1000 - belief.landmark)
+    np.testing.assert_array_equal(renamed.mean, belief.mean)
+    np.testing.assert_array_equal(renamed.covariance, belief.covariance)
+
+
+def test_beliefs_given_are_never_changed():
+    seen = []
+    for belief, poses in followed(paper_filter(), paper_mission("fused", frames=60)):
+        arrays = [getattr(belief, field) for field in FIELDS] + [poses.mean, poses.covariance]
+        seen.append((arrays, [array.copy() for array in arrays]))
+        belief.pose().mean[:] = np.nan
+        belief.landmarks().mean[:] = np.nan
+        belief.landmarks().weight[:] = np.nan
+    for arrays, copies in seen:
+        for array, copy in zip(arrays, copies, strict=True):
+            np.testing.assert_array_equal(array, copy)
+    assert START.mean.tolist() == [0.0, -7.408, 0.0]
+
+
+def test_a_belief_kept_aside_continues_to_the_same_bits():
+    mission, slam = paper_mission("fused", frames=40), paper_filter()
+    beliefs = [belief for belief, _ in followed(slam, mission)]
+    for frame in (25, 10):
+        belief = beliefs[frame]
+        for later in range(frame + 1, 40):
+            belief, _ = slam.predict(belief, mission.controls[later], mission.dt[later])
+            belief = slam.update(belief, mission.scans[later])
+        for field in FIELDS:
+            np.testing.assert_array_equal(getattr(belief, field), getattr(beliefs[-1], field))
+
+
+def test_order_of_frames_matters_and_each_frame_is_corrected_where_it_was_heard():
+    mission, slam = paper_mission("active", frames=30), paper_filter()
+    *_, (straight, _) = followed(slam, mission)
+    error = np.hypot(*(straight.mean[:2] - mission.path[-1, :2]))
+    mission.scans.reverse()
+    *_, (reversed_, _) = followed(slam, mission)
+    assert error < 3 * np.sqrt(np.trace(straight.covariance[:2, :2]))
+    assert np.hypot(*(reversed_.mean[:2] - mission.path[-1, :2])) > 5 * error
+
+
+def test_steps_of_a_frame_are_the_steps_one_by_one():
+    slam, mission = paper_filter(), paper_mission("fused", frames=20)
+    *_, (belief, _) = followed(slam, mission)
+    together, poses = slam.predict(belief, mission.controls[0], mission.dt[0])
+    for k in range(STEPS_PER_FRAME):
+        belief, pose = slam.predict(
+            belief, mission.controls[0, k : k + 1], mission.dt[0, k : k + 1]
+        )
+        np.testing.assert_allclose(pose.mean[0], poses.mean[k], atol=1e-14)
+        np.testing.assert_allclose(pose.covariance[0], poses.covariance[k], atol=1e-15)
+    np.testing.assert_allclose(belief.covariance, together.covariance, atol=1e-14)
+
+
+# Traps
+
+
+def test_bearing_behind_the_vehicle_is_compared_the_short_way_round():
+    slam = paper_filter(motion=TURNING)
+    belief = slam.update(slam.init(START), scan_of((1, 5.0, np.pi - 0.01)))
+    belief, _ = slam.predict(belief, np.zeros((1, 2)), np.ones(1))
+    across = slam.update(belief, scan_of((1, np.nan, -np.pi + 0.01)))
+    turned = wrap(across.mean[2] - belief.mean[2])
+    # Heard 0.02 rad too far to the left: the vehicle has turned to the right, by most of that.
+    assert -0.02 < turned < -0.01
+    assert np.hypot(*(across.mean[3:] - belief.mean[3:])) < 5 * 0.02
+
+
+@pytest.mark.parametrize("turn", [-0.02, 0.02])
+def test_heading_passes_through_pi_without_a_jump(turn):
+    slam = paper_filter(motion=TURNING)
+    heading = np.copysign(np.pi - 0.01, turn)
+    start = Gaussian(mean=np.array([0, 0, heading]), covariance=START.covariance)
+    belief = slam.update(slam.init(start), scan_of((1, 5.0, 0.1), (2, 3.0, -1.0)))
+    belief, poses = slam.predict(belief, np.array([[0.0, turn]]), np.array([1.0]))
+    assert poses.mean[0, 2] == pytest.approx(wrap(heading + turn), abs=1e-15)
+    after = slam.update(belief, scan_of((1, 5.0, 0.1 - turn), (2, 3.0, -1.0 - turn)))
+    np.testing.assert_allclose(after.mean, belief.mean, rtol=0, atol=1e-14)
+
+
+def test_second_look_from_the_same_place_says_nothing_about_the_pose():
+    slam = paper_filter()
+    belief = slam.update(slam.init(START), scan_of((1, 5.0, 0.3)))
+    after = slam.update(belief, scan_of((1, 5.4, 0.1)))
+    np.testing.assert_allclose(after.mean[:3], belief.mean[:3], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        after.covariance[:3, :3], belief.covariance[:3, :3], rtol=0, atol=1e-17
+    )
+
+
+def test_correction_that_carries_the_heading_past_pi_is_wrapped():
+    slam = paper_filter(motion=TURNING)
+    start = Gaussian(mean=np.array([0, 0, np.pi - 1e-3]), covariance=START.covariance)
+    belief = slam.update(slam.init(start), scan_of((1, 5.0, 0.0)))
+    belief, _ = slam.predict(belief, np.zeros((1, 2)), np.ones(1))
+    after = slam.update(belief, scan_of((1, np.nan, -0.1)))
+    assert -np.pi <= after.mean[2] < -np.pi + 0.1
+
+
+def test_empty_scan_leaves_the_belief_as_it_was():
+    slam = paper_filter()
+    *_, (belief, _) = followed(slam, paper_mission("fused", frames=5))
+    assert_same(slam.update(belief, scan_of()), belief)
+    blank = slam.init(START)
+    assert_same(slam.update(blank, scan_of()), blank)
+
+
+def test_known_landmarks_of_a_scan_are_corrected_one_after_another():
+    slam = paper_filter()
+    belief = slam.update(slam.init(START), scan_of((1, 5.0, 0.3), (2, 4.0, -1.0), (3, np.nan, 2.0)))
+    rows = (2, 4.1, -1.1), (3, np.nan, 2.1), (1, 5.2, 0.2)
+    together = slam.update(belief, scan_of(*rows))
+    for row in rows:
+        belief = slam.update(belief, scan_of(row))
+    for field in FIELDS:
+        np.testing.assert_allclose(
+            getattr(together, field), getattr(belief, field), rtol=0, atol=1e-14
+        )
+
+
+def test_new_landmarks_are_placed_from_the_corrected_pose_wherever_they_stand_in_the_scan():
+    slam = paper_filter()
+    belief = slam.update(slam.init(START), scan_of((1, 5.0, 0.3)))
+    known, new, ray = (1, 5.3, 0.2), (2, 4.0, -1.0), (3, np.nan, 2.0)
+    first = slam.update(belief, scan_of(new, ray, known))
+    last = slam.update(belief, scan_of(known, new, ray))
+    assert_same(first, last)
+    x, y, heading = first.mean[:3]
+    place = [x + 4 * np.cos(heading - 1), y + 4 * np.sin(heading - 1)]
+    np.testing.assert_allclose(first.mean[5:7], place, rtol=1e-15)
+    assert first.landmark.tolist() == [1, 2, 3, 3, 3, 3]
+
+
+@pytest.mark.parametrize("row", [(1, 0.01, 0.5), (1, np.nan, 0.5)])
+def test_landmark_that_the_vehicle_stands_on_corrects_nothing(row):
+    slam = paper_filter()
+    belief = slam.update(slam.init(START), scan_of((1, NEAREST / 2, 0.0), (2, 4.0, 1.0)))
+    assert_same(slam.update(belief, scan_of(row)), belief)
+
+
+@pytest.mark.parametrize("row", [(1, 0.01, 0.5), (1, np.nan, 0.5)])
+def test_landmark_a_little_farther_corrects_and_all_stays_finite(row):
+    slam = paper_filter()
+    belief = slam.update(slam.init(START), scan_of((1, NEAREST * 2, 0.0), (2, 4.0, 1.0)))
+    after = slam.update(belief, scan_of(row))
+    assert np.isfinite(after.mean).all()
+    assert np.linalg.eigvalsh(after.covariance)[0] > -1e-15
+    assert not np.array_equal(after.mean, belief.mean)
+
+
+def test_stopped_vehicle_without_noise_at_rest_forgets_nothing():
+    exact = Motion(model="unicycle", control_std=(0.1, 0.15), noise_at_rest=False)
+    slam = paper_filter(motion=exact)
+    belief = slam.update(slam.init(START), scan_of((1, 5.0, 0.3), (2, np.nan, 1.0)))
+    rested, poses = slam.predict(belief, np.zeros((8, 2)), np.full(8, STEP))
+    assert_same(rested, belief)
+    np.testing.assert_array_equal(poses.covariance, [belief.covariance[:3, :3]] * 8)
+
+
+def test_stopped_vehicle_with_noise_at_rest_grows_uncertain_along_its_heading_and_in_it():
+    motion = Motion(model="unicycle", control_std=(0.1, 0.15))
+    slam = paper_filter(motion=motion)
+    rested, _ = slam.predict(slam.init(KNOWN_POSE), np.zeros((8, 2)), np.full(8, STEP))
+    expected = np.diag([8 * (0.1 * STEP) ** 2, 0, 8 * (0.15 * STEP) ** 2])
+    np.testing.assert_allclose(rested.covariance, expected, rtol=1e-12, atol=0)
+
+
+def test_one_control_alone_at_zero_is_not_rest():
+    motion = Motion(model="unicycle", control_std=(0.1, 0.15), noise_at_rest=False)
+    slam = paper_filter(motion=motion)
+    turning, _ = slam.predict(slam.init(KNOWN_POSE), np.array([[0.0, 0.1]]), np.array([STEP]))
+    assert turning.covariance[0, 0] == pytest.approx((0.1 * STEP) ** 2, rel=1e-3)
+
+
+# Gate
+
+
+def gated_bearing(slam, factor):
+    """A belief, and the belief after a bearing whose innovation is factor of the gate's edge."""
+    belief = slam.update(slam.init(KNOWN_POSE), scan_of((1, 4.0, 0.0), (2, 3.0, 1.0)))
+    edge = np.sqrt(chi2.ppf(0.999, 1) * 2 * 0.15**2)  # S = 2 R
+    return belief, slam.update(belief, scan_of((1, np.nan, factor * edge)))
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_gate_drops_and_counts_a_bearing_beyond_its_quantile_and_no_other(sign):
+    slam = paper_filter(gate=0.999)
+    belief, inside = gated_bearing(slam, sign * (1 - 1e-6))
+    assert inside.gated == 0
+    assert inside.mean[4] * sign > 0.1
+    belief, outside = gated_bearing(slam, sign * (1 + 1e-6))
+    assert outside.gated == 1
+    assert_same(outside, belief)
+
+
+def test_gate_of_one_drops_nothing():
+    belief, after = gated_bearing(paper_filter(gate=1.0), 2.0)
+    assert after.gated == 0
+    assert not np.array_equal(after.mean, belief.mean)
+
+
+@pytest.mark.parametrize(("factor", "gated"), [(1 - 1e-6, 0), (1 + 1e-6, 1)])
+def test_gate_on_range_and_bearing_has_two_degrees_of_freedom(factor, gated):
+    slam = paper_filter(gate=0.99)
+    belief = slam.update(slam.init(KNOWN_POSE), scan_of((1, 9.0, 0.0)))
+    edge = np.sqrt(chi2.ppf(0.99, 2) * 2 * 0.2**2) * factor
+    assert slam.update(belief, scan_of((1, 9.0 + edge, 0.0))).gated == gated
+
+
+def test_gate_counts_over_the_whole_mission():
+    slam = paper_filter(gate=0.99)
+    mission = paper_mission("fused", frames=60, outliers=0.1)
+    counts = [belief.gated for belief, _ in followed(slam, mission)]
+    assert np.all(np.diff(counts) >= 0)
+    assert counts[-1] > 20
+    assert [b.gated for b, _ in followed(paper_filter(), mission)][-1] == 0

@@ -1,0 +1,279 @@
+"""What a path hears: beams, engines, the truth's one place, and what the beacon's own call does."""
+
+from collections import Counter
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from pipistrelle.acoustics.arrivals import (
+    ACTIVE,
+    PASSIVE,
+    arrivals_of_emission,
+    rows_of,
+    through_piston,
+)
+from pipistrelle.arithmetic.noise import stream_key
+from pipistrelle.arrays.layout import square_of_four
+from pipistrelle.arrays.receiver import (
+    BLOCK,
+    add_echo_blocks,
+    blocks_to_hear,
+    noise_blocks,
+    sampling,
+)
+from pipistrelle.config import Config, EmitterConfig, InputError, ReceiverConfig, ScenarioConfig
+from pipistrelle.detection.matched import filter_blocks, filter_samples
+from pipistrelle.detection.merging import Heard
+from pipistrelle.detection.scans import UNLABELLED
+from pipistrelle.detection.snapshots import Detections, detect, detector
+from pipistrelle.experiments.hearing import listening
+from pipistrelle.experiments.hearing.listening import listen
+from pipistrelle.experiments.hearing.oracle import faintest_level_db, label_detections
+from pipistrelle.experiments.hearing.scenario import draw_scenario
+from pipistrelle.geometry import range_and_bearing, wrap
+
+CONFIG = Config()
+LAYOUT, SETTLED = square_of_four(CONFIG.receiver), sampling(CONFIG)
+FINDER = detector(CONFIG, LAYOUT)
+FAINTEST = faintest_level_db(
+    FINDER.threshold,
+    elements=10,
+    samples=SETTLED.pulse * SETTLED.block,
+    noise_std=SETTLED.noise_std,
+    margin_db=CONFIG.association.margin_db,
+)
+RADII = (2.5, 3.1, 3.8, 4.7, 5.8, 7.1, 8.8, 10.8, 13.3, 16.4, 20.3, 25.0)  # [mm]
+BEACON = 51
+
+
+def short(steps, **changes):
+    config = Config(scenario=ScenarioConfig(steps=steps), **changes)
+    return draw_scenario(config, np.random.default_rng(7)), config
+
+
+def bits(beam):
+    return [
+        [np.asarray(getattr(heard, name)).tobytes() for name in Heard.__slots__] for heard in beam
+    ]
+
+
+def test_one_beam_sounds_the_same_alone_and_among_twelve_in_any_order():
+    world, config = short(40)
+    radii = [1e-3 * radius for radius in RADII]
+    twelve = listen(world, config, radii)
+    turned = listen(world, config, radii[::-1])
+    assert [bits(beam) for beam in twelve] == [bits(beam) for beam in turned[::-1]]
+    for k in (0, 6, 11):
+        assert bits(listen(world, config, radii[k : k + 1])[0]) == bits(twelve[k])
+    assert len({str(bits(beam)) for beam in twelve}) > 8  # and beams do differ
+
+
+def test_the_settings_own_radius_is_not_used():
+    world, config = short(8)
+    other = config.model_copy(update={"emitter": EmitterConfig(radius=0.02)})
+    assert bits(listen(world, config, [0.0088])[0]) == bits(listen(world, other, [0.0088])[0])
+
+
+def test_the_dense_engine_too_hears_each_beam_alone_and_each_world_with_its_own_noise():
+    world, config = short(8, receiver=ReceiverConfig(engine="dense"))
+    wide, narrow = listen(world, config, [0.0025, 0.025])
+    assert bits(listen(world, config, [0.025])[0]) == bits(narrow)
+    assert bits(listen(world, config, [0.025], iteration=1)[0]) != bits(narrow)
+    assert bits(wide) != bits(narrow)
+
+
+def test_the_dense_engine_records_until_the_next_call(monkeypatch):
+    world, config = short(4, receiver=ReceiverConfig(engine="dense"))
+    shapes = []
+
+    def watched(samples, **settings):
+        shapes.append((samples.shape, samples.dtype))
+        return filter_samples(samples, **settings)
+
+    monkeypatch.setattr(listening, "filter_samples", watched)
+    listen(world, config, [0.0088])
+    assert shapes == [((100_000 - 560, 4, 10), np.complex64)]
+
+
+def test_a_narrower_beam_ranges_fewer_landmarks():
+    world, config = short(200)
+    count = [
+        sum(np.count_nonzero(~np.isnan(heard.range)) for heard in beam)
+        for beam in listen(world, config, [0.0025, 0.0088, 0.025])
+    ]
+    assert count[0] > 1.5 * count[1] > 1.5 * 1.5 * count[2] > 0
+
+
+def test_the_truth_labels_detections_and_enters_nowhere_else(monkeypatch):
+    world, config = short(40)
+    as_is = listen(world, config, [0.0088])[0]
+
+    def off_by_a_little(found, arrivals, *args, **settings):
+        moved = replace(
+            arrivals, delay=arrivals.delay + 1e-9, bearing=wrap(arrivals.bearing + 1e-7)
+        )
+        return label_detections(found, moved, *args, **settings)
+
+    monkeypatch.setattr(listening, "label_detections", off_by_a_little)
+    assert bits(listen(world, config, [0.0088])[0]) == bits(as_is)
+
+    def to_none(found, *_, **__):
+        return np.full(found.face.size, UNLABELLED)
+
+    monkeypatch.setattr(listening, "label_detections", to_none)
+    deaf = listen(world, config, [0.0088])[0]
+    assert all(heard.landmark.size == 0 for heard in deaf)
+    assert sum(heard.clutter for heard in deaf) > sum(heard.clutter for heard in as_is)
+
+
+def errors_of(config, worlds):
+    """Return the bearing errors of both tones and the range errors of whole missions."""
+    own, other, late = [], [], []
+    for seed in range(worlds):
+        world = draw_scenario(config, np.random.default_rng(seed))
+        (beam,) = listen(world, config, [0.0088], iteration=seed)
+        places = np.vstack((world.landmarks, world.beacon))
+        for heard in beam:
+            pose = world.path[np.searchsorted(world.time, heard.time)]
+            distance, bearing = range_and_bearing(pose, places[heard.landmark - 1])
+            off = wrap(heard.bearing - bearing[:, None])
+            own.append(off[:, 0])
+            other.append(off[:, 1])
+            late.append(heard.range - distance)
+    columns = (np.concatenate(column) for column in (own, other, late))
+    return [column[~np.isnan(column)] for column in columns]
+
+
+def test_errors_of_what_is_heard_are_a_few_hundredths_of_a_radian_and_a_few_centimetres():
+    own, other, late = errors_of(CONFIG, 1)
+    rms = [np.sqrt(np.mean(error**2)) for error in (own, other, late)]
+    assert 0.005 < rms[0] < 0.03
+    assert 0.01 < rms[1] < 0.05
+    assert 0.005 < rms[2] < 0.04
+    assert all(abs(np.mean(error)) < 0.2 * np.std(error) for error in (own, other))
+
+
+def frames(seed, every):
+    """Yield the arrivals of a mission's emissions and the blocks of their noise."""
+    world = draw_scenario(CONFIG, np.random.default_rng(seed))
+    for k in range(4 * every, len(world.path), 4 * every):
+        velocity = (world.path[k, :2] - world.path[k - 1, :2]) / CONFIG.scenario.step
+        emission = arrivals_of_emission(
+            world.path[k], velocity, world.landmarks, world.beacon, CONFIG
+        )
+        heard = through_piston(emission, radius=0.0088, frequency=35e3, speed_of_sound=343.0)
+        key = stream_key(seed, 0, "what the call hides", k)
+        yield heard, noise_blocks(blocks_to_hear(emission, SETTLED), LAYOUT, SETTLED, key)
+
+
+def detected(blocks, finder=FINDER):
+    matched = filter_blocks(blocks, pulse=SETTLED.pulse, block=SETTLED.block, noise_std=1.0)
+    return detect(matched, finder, start=SETTLED.pulse * BLOCK, interval=BLOCK, pulse=SETTLED.pulse)
+
+
+def landmarks(blocks, arrivals, tone, finder=FINDER):
+    """Return the landmarks that a tone shows in a recording, the beacon apart."""
+    found = detected(blocks, finder)
+    label = label_detections(
+        found, arrivals, LAYOUT, CONFIG.association, pulse=2.8e-3, faintest_db=FAINTEST
+    )
+    return set(label[(found.tone == tone) & (label != UNLABELLED)].tolist()) - {BEACON}
+
+
+def with_echoes(blocks, arrivals, rows):
+    heard = blocks.copy()
+    add_echo_blocks(heard, rows_of(arrivals, rows), LAYOUT, SETTLED)
+    return heard
+
+
+def census(worlds, every):
+    """Count per frame what the beacon's direct call and the guard against leakage do."""
+    count, deaf = Counter(), replace(FINDER, leakage=0.0)
+    for seed in range(worlds):
+        for arrivals, noise in frames(seed, every):
+            call = (arrivals.source == PASSIVE) & (arrivals.landmark == BEACON)
+            alone = with_echoes(noise, arrivals, call)
+            count["frames"] += 1
+            for name, blocks, finder in (
+                ("false in noise", noise, FINDER),
+                ("false beside the call", alone, FINDER),
+                ("false without the guard", alone, deaf),
+            ):
+                count[name] += 0 in detected(blocks, finder).tone
+            quiet = with_echoes(noise, arrivals, ~call)
+            full = with_echoes(quiet, arrivals, call)
+            for tone, name in enumerate(("active", "passive")):
+                without, with_ = (landmarks(b, arrivals, tone) for b in (quiet, full))
+                count[f"{name} without the call"] += len(without)
+                count[f"{name} hidden"] += len(without - with_)
+            # Each source in its own tone alone: a world without leakage.
+            clean = noise.copy()
+            for tone in range(2):
+                part = with_echoes(np.zeros_like(noise), arrivals, arrivals.source == tone)
+                clean[:, :, tone] += part[:, :, tone]
+            guarded, open_ = (landmarks(clean, arrivals, 0, f) for f in (FINDER, deaf))
+            count["active without leakage"] += len(open_)
+            count["active given up"] += len(open_ - guarded)
+    return {name: number / count["frames"] for name, number in count.items()}
+
+
+def test_the_beacons_own_call_makes_hardly_a_false_detection_and_hides_few_echoes():
+    rate = census(worlds=2, every=6)
+    assert rate["false beside the call"] < 0.06 < 0.1 < rate["false without the guard"]
+    assert rate["active hidden"] < 0.03 * rate["active without the call"]
+    assert 0.0 < rate["passive hidden"] < 0.06 * rate["passive without the call"]
+    assert rate["active given up"] < 0.03 * rate["active without leakage"]
+
+
+@pytest.mark.parametrize(("elements", "spacing"), [(8, 0.0049), (16, 0.0049), (10, 0.0030)])
+def test_a_layout_of_ones_own_hears_as_the_settings_own_of_that_size_do(elements, spacing):
+    world, config = short(40)
+    place = (np.arange(elements) - 0.5 * (elements - 1)) * spacing
+    given = listen(world, config, (0.0088,), layout=replace(LAYOUT, position=place))
+    receiver = ReceiverConfig(elements=elements, spacing=spacing)
+    settled = listen(world, config.model_copy(update={"receiver": receiver}), (0.0088,))
+    assert bits(given[0]) == bits(settled[0])
+    assert sum(heard.landmark.size for heard in given[0]) > 100
+
+
+def test_unequal_elements_are_refused():
+    world, config = short(8)
+    uneven = replace(LAYOUT, position=np.array([-0.01, 0.0, 0.004]))
+    with pytest.raises(InputError, match="equally spaced"):
+        listen(world, config, (0.0088,), layout=uneven)
+
+
+def test_beam_and_finder_of_ones_own_are_used():
+    world, config = short(40)
+
+    def deaf(arrivals, **piston):
+        own = arrivals.source == ACTIVE
+        return replace(arrivals, level_db=np.where(own, -300.0, arrivals.level_db))
+
+    def first_face(matched, detector, **timing):
+        found = detect(matched, detector, **timing)
+        return Detections(**{
+            field.name: getattr(found, field.name)[found.face == 0] for field in fields(found)
+        })  # fmt: skip
+
+    (silent,) = listen(world, config, (0.0088,), beam=deaf)
+    assert all(np.isnan(heard.range).all() for heard in silent)
+    (ahead,) = listen(world, config, (0.0088,), find=first_face)
+    bearings = np.concatenate([heard.bearing.ravel() for heard in ahead])
+    assert np.nanmax(np.abs(bearings)) <= np.radians(75.0) + 1e-9
+    assert sum(heard.landmark.size for heard in ahead) > 20
+
+
+@pytest.mark.slow
+def test_over_whole_missions_the_call_costs_a_fortieth_of_the_passive_echoes_at_most():
+    # Of 2.9 active landmarks a frame it hides 0.01 to 0.02 and the guard gives up 0.04; of 21
+    # passive ones it hides 0.4 to 0.5. Where it leaks just under the guard, its leak lifts the
+    # noise over the threshold: in one frame in a hundred, against one in two hundred by noise.
+    rate = census(worlds=6, every=1)
+    assert rate["false in noise"] < 0.01
+    assert rate["false beside the call"] < 0.03
+    assert rate["false without the guard"] > 0.1
+    assert rate["active hidden"] < 0.01 * rate["active without the call"]
+    assert rate["passive hidden"] < 0.025 * rate["passive without the call"]
+    assert rate["active given up"] < 0.02 * rate["active without leakage"]

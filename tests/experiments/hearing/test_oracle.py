@@ -1,0 +1,206 @@
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipistrelle.acoustics.arrivals import Arrivals
+from pipistrelle.arrays.layout import square_of_four
+from pipistrelle.arrays.receiver import add_echo_blocks, sampling
+from pipistrelle.config import AssociationConfig, Config
+from pipistrelle.detection.matched import filter_blocks
+from pipistrelle.detection.scans import UNLABELLED
+from pipistrelle.detection.snapshots import Detections, detector
+from pipistrelle.experiments.hearing.oracle import faintest_level_db, label_detections
+from pipistrelle.geometry import wrap
+
+law = settings(deadline=None, max_examples=100)
+SEEDS = st.integers(0, 2**32 - 1)
+LAYOUT = square_of_four(Config().receiver)
+GATES = AssociationConfig()
+PULSE = 2.8e-3
+FAINTEST = -30.0
+
+
+def true_arrivals(*rows):
+    """Return arrivals of rows (delay [ms], bearing [rad], source, landmark, level [dB])."""
+    delay, bearing, source, landmark, level_db = (np.array(c) for c in zip(*rows, strict=True))
+    return Arrivals(
+        delay=1e-3 * delay,
+        level_db=level_db.astype(float),
+        bearing=bearing.astype(float),
+        frequency=np.full(delay.size, 30e3),
+        source=source.astype(np.int8),
+        landmark=landmark,
+    )
+
+
+def detections(*rows):
+    """Return detections of rows (delay [ms], bearing [rad], tone, face, power)."""
+    delay, bearing, tone, face, power = (np.array(c) for c in zip(*rows, strict=True))
+    return Detections(
+        face=face,
+        tone=tone,
+        angle=wrap(bearing - LAYOUT.normal[face]),
+        bearing=bearing.astype(float),
+        delay=1e-3 * delay,
+        power=power.astype(float),
+    )
+
+
+def labels(found, arrivals, gates=GATES):
+    return label_detections(
+        found, arrivals, LAYOUT, gates, pulse=PULSE, faintest_db=FAINTEST
+    ).tolist()
+
+
+def crowd(seed):
+    """Return arrivals of 12 landmarks and detections, some near them and some anywhere."""
+    rng = np.random.default_rng(seed)
+    bearing, delay = rng.uniform(-np.pi, np.pi, 24), rng.uniform(5.0, 12.0, 24)
+    source, landmark = np.repeat([0, 1], 12), np.tile(np.arange(1, 13), 2)
+    level_db = rng.uniform(-36.0, 0.0, 24)
+    arrivals = true_arrivals(*zip(delay, bearing, source, landmark, level_db, strict=True))
+    near = rng.integers(0, 24, 60)
+    seen = wrap(bearing[near] + rng.normal(0.0, 0.08, 60))
+    face = np.argmax(np.cos(seen[:, None] - LAYOUT.normal) + rng.uniform(0, 1.0, (60, 4)), axis=1)
+    rows = (
+        delay[near] + rng.normal(0.0, 0.5, 60),
+        seen,
+        source[near],
+        face,
+        rng.exponential(9, 60),
+    )
+    return detections(*zip(*rows, strict=True)), arrivals
+
+
+def slow_labels(found, arrivals):
+    """Match one by one, the strongest first, in plain words."""
+    label, taken = [UNLABELLED] * found.face.size, set()
+    for d in sorted(range(found.face.size), key=lambda d: -found.power[d]):
+        nearest = None
+        for a in range(arrivals.delay.size):
+            off_face = wrap(arrivals.bearing[a] - LAYOUT.normal[found.face[d]])
+            late = abs(found.delay[d] - arrivals.delay[a]) / (PULSE / 4)
+            off = abs(wrap(found.bearing[d] - arrivals.bearing[a])) / 0.1
+            possible = (
+                arrivals.source[a] == found.tone[d]
+                and abs(off_face) <= np.pi / 2
+                and arrivals.level_db[a] >= FAINTEST
+                and (found.face[d], a) not in taken
+            )
+            if possible and max(late, off) <= 1.0:
+                nearest = min(nearest or (np.inf, -1), (late**2 + off**2, a))
+        if nearest:
+            label[d] = int(arrivals.landmark[nearest[1]])
+            taken.add((found.face[d], nearest[1]))
+    return label
+
+
+@given(seed=SEEDS)
+@law
+def test_labels_are_those_of_a_slow_second_version(seed):
+    found, arrivals = crowd(seed)
+    label = labels(found, arrivals)
+    assert label == slow_labels(found, arrivals)
+
+
+@given(seed=SEEDS)
+@law
+def test_an_arrival_labels_one_detection_of_each_face_at_most(seed):
+    found, arrivals = crowd(seed)
+    given_ = [
+        key
+        for key in zip(found.face, found.tone, labels(found, arrivals), strict=True)
+        if key[2] != UNLABELLED
+    ]
+    assert len(given_) == len(set(given_)) > 0
+
+
+@given(seed=SEEDS)
+@law
+def test_labels_follow_their_rows_in_any_order(seed):
+    found, arrivals = crowd(seed)
+    rng = np.random.default_rng(seed)
+    rows, truth = rng.permutation(found.face.size), rng.permutation(arrivals.delay.size)
+    turned = Detections(**{f.name: getattr(found, f.name)[rows] for f in fields(found)})
+    other = Arrivals(**{f.name: getattr(arrivals, f.name)[truth] for f in fields(arrivals)})
+    assert labels(turned, other) == np.array(labels(found, arrivals))[rows].tolist()
+
+
+ONE = true_arrivals((10.0, 0.2, 1, 7, 0.0))
+
+
+def test_gates_hold_in_delay_and_in_bearing_both():
+    for late, off, label in (
+        (0.69, 0.099, 7), (-0.69, -0.099, 7),
+        (0.71, 0.0, UNLABELLED), (-0.71, 0.0, UNLABELLED),
+        (0.0, 0.101, UNLABELLED), (0.0, -0.101, UNLABELLED),
+    ):  # fmt: skip
+        assert labels(detections((10.0 + late, 0.2 + off, 1, 0, 9)), ONE) == [label]
+    wide = AssociationConfig(delay_gate=0.5, bearing_gate=0.2)
+    assert labels(detections((11.3, 0.39, 1, 0, 9)), ONE, wide) == [7]
+
+
+def test_tones_and_faces_do_not_mix():
+    assert labels(detections((10.0, 0.2, 0, 0, 9)), ONE) == [UNLABELLED]
+    assert labels(detections((10.0, 0.2, 1, 2, 9)), ONE) == [UNLABELLED]  # it looks back
+    assert labels(detections((10.0, 0.2, 1, 3, 9)), ONE) == [UNLABELLED]  # 101 degrees off it
+    on_both = detections((10.0, 0.2, 1, 0, 9), (10.0, 0.2, 1, 1, 5))
+    assert labels(on_both, ONE) == [7, 7]
+
+
+def test_the_strongest_detection_chooses_first_and_the_rest_is_clutter():
+    nearer_but_weaker = detections((10.0, 0.2, 1, 0, 5), (10.5, 0.25, 1, 0, 9))
+    assert labels(nearer_but_weaker, ONE) == [UNLABELLED, 7]
+
+
+def test_a_detection_takes_the_nearest_arrival_in_units_of_the_gates():
+    pair = true_arrivals((10.0, 0.2, 1, 7, 0.0), (10.3, 0.2, 1, 8, 0.0))
+    assert labels(detections((10.1, 0.2, 1, 0, 9)), pair) == [7]
+    assert labels(detections((10.2, 0.2, 1, 0, 9)), pair) == [8]
+    # Once the nearest is taken, the next within the gates is free.
+    assert labels(detections((10.1, 0.2, 1, 0, 9), (10.05, 0.2, 1, 0, 5)), pair) == [7, 8]
+
+
+def test_bearings_are_compared_across_straight_back():
+    behind = true_arrivals((10.0, np.pi - 0.01, 1, 7, 0.0))
+    assert labels(detections((10.0, -np.pi + 0.02, 1, 2, 9)), behind) == [7]
+
+
+def test_an_arrival_too_faint_to_be_heard_labels_nothing():
+    for level_db, label in ((FAINTEST, 7), (FAINTEST - 0.01, UNLABELLED)):
+        arrivals = replace(ONE, level_db=np.array([level_db]))
+        assert labels(detections((10.0, 0.2, 1, 0, 9)), arrivals) == [label]
+
+
+def test_nothing_detected_is_nothing_labelled():
+    none = Detections(
+        **{f.name: getattr(detections((1, 0, 0, 0, 1)), f.name)[:0] for f in fields(Detections)}
+    )
+    assert labels(none, ONE) == []
+
+
+@pytest.mark.parametrize("margin_db", [0.0, 6.0])
+@pytest.mark.parametrize("alarm", [1e-3, 1e-6])
+def test_the_faintest_level_is_the_margin_under_an_echo_expected_at_the_threshold(margin_db, alarm):
+    config = Config.model_validate(
+        {"detection": {"false_alarm": alarm}, "receiver": {"noise_level_db": 4.0}}
+    )
+    settled, finder = sampling(config), detector(config, LAYOUT)
+    level_db = faintest_level_db(
+        finder.threshold,
+        elements=10,
+        samples=settled.pulse * settled.block,
+        noise_std=settled.noise_std,
+        margin_db=margin_db,
+    )
+    sums = np.zeros((40, 4, 2, 10), dtype=complex)
+    echo = true_arrivals((5.0, 0.2, 1, 7, level_db + margin_db))
+    add_echo_blocks(sums, echo, LAYOUT, settled)
+    matched = filter_blocks(
+        sums, pulse=settled.pulse, block=settled.block, noise_std=settled.noise_std
+    )
+    energy = np.sum(np.abs(matched[:, 0, 1]) ** 2, axis=-1).max()
+    assert energy + 10.0 == pytest.approx(finder.threshold, rel=1e-9)  # the noise's mean is 10

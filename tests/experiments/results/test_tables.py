@@ -1,0 +1,147 @@
+"""The files' contents: numbers survive them, and what is missing is null."""
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.beliefs import Gaussian, Landmarks, Track
+from pipistrelle.evaluation.accuracy import pose_error, position_error
+from pipistrelle.evaluation.consistency import nees
+from pipistrelle.experiments.results.tables import (
+    landmark_table,
+    map_text,
+    measurement_table,
+    step_table,
+    tum_text,
+)
+from pipistrelle.geometry import wrap
+
+
+@pytest.fixture
+def landmarks():
+    rng = np.random.default_rng(2)
+    factor = rng.normal(0.0, 0.3, (5, 2, 2))
+    return Landmarks(
+        landmark=np.array([51, 4, 4, 4, 17]),
+        mean=rng.normal(0.0, 20.0, (5, 2)),
+        covariance=factor @ np.swapaxes(factor, 1, 2),
+        weight=np.array([1.0, 0.2, 0.5, 0.3, 1.0]),
+    )
+
+
+@pytest.fixture
+def track(landmarks):
+    rng = np.random.default_rng(1)
+    covariance = np.diag([0.04, 0.09, 0.01]) * np.arange(1, 6)[:, None, None]
+    return Track(
+        time=1.2e9 + 0.125 * np.arange(5),
+        pose=Gaussian(mean=rng.normal(0.0, 2.0, (5, 3)), covariance=covariance),
+        landmarks=landmarks,
+        gated=0,
+    )
+
+
+@given(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3), st.floats(-10.0, 10.0), st.integers(0, 2**41))
+def test_a_pose_survives_the_tum_format(x, y, heading, microseconds):
+    text = tum_text(np.array([microseconds * 1e-6]), np.array([[x, y, heading]]))
+    fields = text.split(" ")
+    time, *pose = map(float, fields)
+    assert len(fields) == 8
+    assert time == pytest.approx(microseconds * 1e-6, abs=0.6e-6)
+    assert pose[:3] == pytest.approx([x, y, 0.0], abs=1e-12)
+    assert np.linalg.norm(pose[3:]) == pytest.approx(1.0, abs=1e-11)
+    # Each half-angle part is rounded to 0.5e-12.
+    assert wrap(2.0 * np.arctan2(pose[5], pose[6]) - heading) == pytest.approx(0.0, abs=4e-12)
+
+
+def test_a_map_survives_its_text(landmarks):
+    header, *lines = map_text(landmarks).splitlines()
+    assert header == "landmark,x,y,xx,xy,yy,status"
+    rows = [line.split(",") for line in lines]
+    assert [(row[0], row[-1]) for row in rows] == [
+        ("51", "full"),
+        ("4", "partial"),
+        ("17", "full"),
+    ]
+    chosen = [0, 2, 4]
+    P = landmarks.covariance[chosen]
+    expected = np.column_stack([landmarks.mean[chosen], P[:, 0, 0], P[:, 0, 1], P[:, 1, 1]])
+    numbers = np.array([row[1:-1] for row in rows], dtype=float)
+    assert numbers == pytest.approx(expected, rel=1e-14)
+
+
+def test_the_step_table_is_the_track_with_its_errors(track):
+    true = track.pose.mean + 0.1
+    table = step_table(track, true)
+    assert table["time_s"].to_list() == track.time.tolist()
+    error = pose_error(track.pose.mean, true)
+    assert (table["position_error_m"].to_numpy() == position_error(track.pose.mean, true)).all()
+    assert (table["heading_error_rad"].to_numpy() == error[:, 2]).all()
+    assert (table["nees"].to_numpy() == nees(error, track.pose.covariance)).all()
+    assert table["heading_std_rad"].to_numpy() == pytest.approx(0.1 * np.sqrt(np.arange(1, 6)))
+    assert table["true_heading_rad"].to_list() == true[:, 2].tolist()
+
+
+def test_where_the_truth_has_ended_the_step_table_has_neither_errors_nor_nees(track):
+    true = track.pose.mean + 0.1
+    true[3:] = np.nan
+    scored = ["position_error_m", "heading_error_rad", "nees"]
+    values = step_table(track, true).select(scored).to_numpy()
+    assert np.isfinite(values[:3]).all()
+    assert np.isnan(values[3:]).all()
+
+
+def test_without_truth_the_step_table_has_the_same_columns_and_nulls(track):
+    table, scored = step_table(track, None), step_table(track, track.pose.mean)
+    assert table.schema == scored.schema
+    unknown = [name for name in table.columns if table[name].null_count() == len(table)]
+    assert unknown == [
+        "true_x_m",
+        "true_y_m",
+        "true_heading_rad",
+        "position_error_m",
+        "heading_error_rad",
+        "nees",
+    ]
+    assert sum(table.null_count().row(0)) == len(unknown) * len(table)
+
+
+def test_the_landmark_table_holds_every_hypothesis_and_every_true_landmark(landmarks):
+    labels, positions = np.array([4, 8, 51]), np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
+    table = landmark_table(landmarks, (labels, positions))
+    assert table["landmark"].to_list() == [51, 4, 4, 4, 17, 8]
+    assert table["status"].to_list() == ["full", *["partial"] * 3, "full", "unseen"]
+    assert table["error_m"][0] == pytest.approx(np.hypot(*(landmarks.mean[0] - [5.0, 6.0])))
+    assert table["error_m"].is_null().to_list() == [False, False, False, False, True, True]
+    assert table["true_x_m"].to_list() == [5.0, 1.0, 1.0, 1.0, None, 3.0]
+
+
+def test_the_tables_of_nothing_have_the_columns_of_something(landmarks):
+    nothing = Landmarks(
+        landmark=landmarks.landmark[:0],
+        mean=landmarks.mean[:0],
+        covariance=landmarks.covariance[:0],
+        weight=landmarks.weight[:0],
+    )
+    assert landmark_table(nothing, None).schema == landmark_table(landmarks, None).schema
+    scan = Scan(time=0.0, landmark=np.array([1]), bearing=np.zeros(1), range=np.ones(1))
+    assert measurement_table([]).schema == measurement_table([scan]).schema
+
+
+def test_a_passive_measurement_has_no_range_in_the_table():
+    scans = [
+        Scan(
+            time=0.5,
+            landmark=np.array([3, 9]),
+            bearing=np.array([0.1, -0.2]),
+            range=np.array([7.0, np.nan]),
+        ),
+        Scan(time=1.0, landmark=np.empty(0, int), bearing=np.empty(0), range=np.empty(0)),
+        Scan(time=1.5, landmark=np.array([9]), bearing=np.array([0.4]), range=np.array([2.0])),
+    ]
+    table = measurement_table(scans)
+    assert table.rows() == [(0.5, 3, 0.1, 7.0), (0.5, 9, -0.2, None), (1.5, 9, 0.4, 2.0)]
+    assert table.schema["landmark"] == pl.Int64

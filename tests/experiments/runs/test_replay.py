@@ -1,0 +1,243 @@
+"""Recorded logs on trial: the truth beside them, and what each strategy may hear."""
+
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipistrelle.config import InputError
+from pipistrelle.detection.logs.folder import read_log, write_log
+from pipistrelle.detection.scans import Scan
+from pipistrelle.experiments.runs.replay import hide, is_mrclam, load, motion_of, start_of
+from pipistrelle.experiments.runs.truth_files import Truth, read_truth, write_truth
+
+DATA = Path(__file__).parents[2] / "data"
+MADE_UP = DATA / "mrclam_made_up"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return Path(shutil.copytree(DATA / "unicycle_log", tmp_path / "drive"))
+
+
+@pytest.fixture
+def made_up(tmp_path):
+    return Path(shutil.copytree(MADE_UP, tmp_path / "set"))
+
+
+@pytest.fixture
+def real():
+    place = os.environ.get("PIPISTRELLE_DATA")
+    if not place or not (Path(place) / "mrclam" / "MRCLAM_Dataset6").is_dir():
+        pytest.skip("PIPISTRELLE_DATA names no folder that holds mrclam/MRCLAM_Dataset6")
+    return Path(place) / "mrclam" / "MRCLAM_Dataset6"
+
+
+def refused(call, *parts):
+    with pytest.raises(InputError) as error:
+        call()
+    for part in parts:
+        assert part in str(error.value)
+
+
+# The truth
+
+
+def test_truth_is_linear_between_its_rows_and_unknown_outside_them(folder):
+    rows = "time,x,y,heading\n0.0,0,0,0\n1.0,2,-4,1\n1.0,2,-4,3\n2.0,2,0,-3\n"
+    (folder / "truth.csv").write_text(rows)
+    truth = read_truth(folder, np.array([0.0, 0.25, 1.0, 1.5, 2.0, 2.1]))
+    wrapped = 2 * np.pi - 3
+    by_hand = [[0, 0, 0], [0.5, -1, 0.75], [2, -4, 3], [2, -2, (3 + wrapped) / 2], [2, 0, wrapped]]
+    np.testing.assert_allclose(truth.path[:5], by_hand, atol=1e-15)
+    assert np.isnan(truth.path[5]).all()
+
+
+def test_truth_at_its_own_times_is_exact(folder):
+    rows = np.loadtxt(folder / "truth.csv", delimiter=",", skiprows=1)
+    truth = read_truth(folder, rows[:, 0])
+    np.testing.assert_array_equal(truth.path[:, :2], rows[:, 1:3])
+
+
+def test_truth_is_optional_file_by_file(folder):
+    log, truth = load(folder)
+    assert truth.path.shape == (len(log.time), 3)
+    assert truth.landmarks[0].tolist() == [3, 4, 8]
+    (folder / "truth.csv").unlink()
+    assert load(folder)[1].path is None
+    (folder / "landmarks.csv").unlink()
+    assert load(folder)[1] is None
+    assert load(DATA / "bicycle_log")[1] is None
+
+
+def test_a_measured_landmark_need_not_be_among_the_true_ones(folder):
+    log, truth = load(folder)
+    measured = set(np.concatenate([scan.landmark for scan in log.scans]).tolist())
+    assert measured - set(truth.landmarks[0].tolist()) == {12}
+
+
+def test_truth_survives_being_written(tmp_path):
+    log, truth = load(DATA / "unicycle_log")
+    partial = truth.path.copy()
+    partial[-3:] = np.nan
+    truth = replace(truth, path=partial)
+    write_log(tmp_path, log)
+    write_truth(tmp_path, truth)
+    again = read_truth(tmp_path, log.time)
+    np.testing.assert_array_equal(again.path, truth.path)
+    np.testing.assert_array_equal(again.landmarks[0], truth.landmarks[0])
+    np.testing.assert_array_equal(again.landmarks[1], truth.landmarks[1])
+
+
+def test_what_is_not_known_is_not_written(tmp_path):
+    write_truth(tmp_path, Truth(time=np.zeros(1), path=None, landmarks=None))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "parts"),
+    [
+        ("truth.csv", "", ("truth.csv", "no rows")),
+        ("truth.csv", "time,x,y\n0,0,0\n", ("line 1", "'time,x,y,heading'")),
+        ("truth.csv", "time,x,y,heading\n0,0,0,0\n-1,0,0,0\n", ("line 3", "backwards")),
+        ("truth.csv", "time,x,y,heading\n0,0,inf,0\n", ("line 2", "y 'inf'")),
+        ("truth.csv", "time,x,y,heading\n9,0,0,0\n", ("truth.csv", "0.0 and 4.0", "clock")),
+        ("landmarks.csv", "landmark,x,y\n3,0,0\n4,1,1\n3,0,0\n", ("line 4", "landmark 3 again")),
+        ("landmarks.csv", "landmark,x,y\n3,0,\n", ("line 2", "y ''")),
+        ("landmarks.csv", "landmark,x,y\n3.2,0,1\n", ("line 2", "landmark 3.2")),
+    ],
+)
+def test_a_wrong_truth_is_refused(folder, name, text, parts):
+    (folder / name).write_text(text)
+    refused(lambda: load(folder), *parts)
+
+
+# Which kind of folder
+
+
+def test_a_folder_is_known_by_its_files(folder, made_up, tmp_path):
+    assert is_mrclam(made_up)
+    assert not is_mrclam(folder)
+    assert not is_mrclam(tmp_path)
+    (made_up / "Barcodes.dat").unlink()
+    assert is_mrclam(made_up)
+    (made_up / "log.toml").touch()
+    assert not is_mrclam(made_up)
+
+
+def test_a_folder_that_is_not_there_is_refused(tmp_path):
+    refused(lambda: load(tmp_path / "gone"), "gone", "no such folder")
+    refused(lambda: load(tmp_path), "log.toml", "no such file")
+
+
+def test_a_robot_is_named_for_a_mrclam_set_and_only_there(folder):
+    refused(lambda: load(MADE_UP), "--robot", "found no robot", "(1)")
+    refused(lambda: load(MADE_UP, 4), "--robot", "found robot 4", "(1)")
+    refused(lambda: load(folder, 1), "robot 1", "--robot")
+
+
+# MRCLAM
+
+
+def test_a_mrclam_track_starts_at_the_true_pose_and_ends_where_the_truth_ends():
+    log, truth = load(MADE_UP, 1)
+    assert log.time[0] == 1248440000.123
+    assert log.time[-1] == 1248440005.5
+    assert log.initial_pose == (1.0, -1.0, 3.0)
+    assert np.isfinite(truth.path).all()
+    assert truth.path[-1, 2] > np.pi
+    assert truth.landmarks[0].tolist() == list(range(6, 21))
+    np.testing.assert_array_equal(truth.time, log.time)
+
+
+def test_a_mrclam_track_starts_no_earlier_than_the_truth(made_up):
+    path = made_up / "Robot1_Groundtruth.dat"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:4], *lines[154:]]))
+    log, truth = load(made_up, 1)
+    assert log.time[0] == float(lines[154].split()[0]) == 1248440002.0
+    np.testing.assert_allclose(log.initial_pose[:2], np.fromstring(lines[154], sep=" ")[1:3])
+    assert np.isfinite(truth.path).all()
+
+
+@pytest.mark.parametrize("name", ["Robot1_Groundtruth.dat", "Landmark_Groundtruth.dat"])
+def test_a_mrclam_set_is_whole(made_up, name):
+    (made_up / name).unlink()
+    refused(lambda: load(made_up, 1), name, "no such file")
+
+
+@pytest.mark.parametrize("robot", range(1, 6))
+def test_set_6_starts_at_the_truth_and_ends_with_the_shorter(real, robot):
+    log, truth = load(real, robot)
+    rows = np.loadtxt(real / f"Robot{robot}_Groundtruth.dat")
+    odometry = np.loadtxt(real / f"Robot{robot}_Odometry.dat")[:, 0]
+    start = [np.interp(odometry[0], rows[:, 0], column) for column in rows[:, 1:3].T]
+    np.testing.assert_allclose(log.initial_pose[:2], start, rtol=1e-12)
+    assert log.time[-1] == min(rows[-1, 0], odometry[-1])
+    assert np.isfinite(truth.path).all()
+    assert np.abs(np.diff(truth.path[:, 2])).max() < 0.5
+
+
+# What a strategy hears
+
+SCAN = Scan(
+    time=2.0,
+    landmark=np.array([1, 2, 3, 4, 5]),
+    bearing=np.array([0.0, 0.25, -0.25, 0.26, -2.0]),
+    range=np.array([1.0, np.nan, 3.0, 4.0, 5.0]),
+)
+
+
+@pytest.mark.parametrize(
+    ("strategy", "beamwidth", "landmark", "distance"),
+    [
+        ("fused", None, [1, 2, 3, 4, 5], [1, np.nan, 3, 4, 5]),
+        ("fused", 0.5, [1, 2, 3, 4, 5], [1, np.nan, 3, np.nan, np.nan]),
+        ("active", None, [1, 3, 4, 5], [1, 3, 4, 5]),
+        ("active", 0.5, [1, 3], [1, 3]),
+        ("passive", None, [1, 2, 3, 4, 5], [np.nan] * 5),
+        ("passive", 0.5, [1, 2, 3, 4, 5], [np.nan] * 5),
+    ],
+)
+def test_a_strategy_hears_its_part(strategy, beamwidth, landmark, distance):
+    (heard,) = hide([SCAN], strategy, beamwidth)
+    assert heard.time == 2.0
+    assert heard.landmark.tolist() == landmark
+    np.testing.assert_array_equal(heard.range, np.array(distance, dtype=float))
+    np.testing.assert_array_equal(heard.bearing, SCAN.bearing[np.isin(SCAN.landmark, landmark)])
+
+
+def test_hiding_changes_no_scan_and_keeps_empty_ones():
+    before = SCAN.range.copy()
+    heard = hide([SCAN, SCAN], "active", 1e-9)
+    np.testing.assert_array_equal(SCAN.range, before)
+    assert [scan.landmark.tolist() for scan in heard] == [[1], [1]]
+    behind = replace(SCAN, bearing=np.full(5, 3.0))
+    assert [scan.landmark.size for scan in hide([behind], "active", 1.0)] == [0]
+
+
+def test_fused_hears_what_active_and_passive_hear_together():
+    scans = read_log(DATA / "unicycle_log").scans
+    for fused, active, passive in zip(
+        *(hide(scans, strategy, 1.0) for strategy in ("fused", "active", "passive")), strict=True
+    ):
+        assert fused.landmark.tolist() == passive.landmark.tolist()
+        known = np.isfinite(fused.range)
+        assert fused.landmark[known].tolist() == active.landmark.tolist()
+        assert fused.range[known].tolist() == active.range.tolist()
+
+
+# What a filter takes
+
+
+def test_the_filters_take_the_logs_motion_and_start():
+    log = read_log(DATA / "bicycle_log")
+    motion, start = motion_of(log), start_of(log)
+    assert (motion.model, motion.control_std, motion.wheelbase) == ("bicycle", (0.1, 0.03), 0.2)
+    assert motion.noise_at_rest
+    assert start.mean.tolist() == [0.0, -1.0, 0.0]
+    assert start.covariance.tolist() == np.diag([0.05**2, 0.05**2, 0.0436**2]).tolist()
+    assert not motion_of(load(MADE_UP, 1)[0]).noise_at_rest

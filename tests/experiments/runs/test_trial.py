@@ -1,0 +1,233 @@
+from dataclasses import fields, is_dataclass, replace
+
+import numpy as np
+import pytest
+
+from pipistrelle.config import STRATEGIES, Config, InputError, ReceiverConfig, ScenarioConfig
+from pipistrelle.detection.merging import scan_of
+from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.beliefs import Gaussian, Landmarks
+from pipistrelle.estimation.motion import Motion
+from pipistrelle.experiments.drives import Drive
+from pipistrelle.experiments.hearing.scenario import bicycle, draw_scenario
+from pipistrelle.experiments.runs.trial import (
+    Case,
+    drive_of,
+    estimator,
+    run_filter,
+    run_mission,
+    run_trial,
+)
+
+SHORT = Config(scenario=ScenarioConfig(steps=80))
+RNG = np.random.default_rng
+
+
+def contents(value):
+    """Return everything that a record holds, to the bit, but for how long it took."""
+    if is_dataclass(value):
+        kept = [f.name for f in fields(value) if f.name != "wall_s"]
+        return {name: contents(getattr(value, name)) for name in kept}
+    if isinstance(value, tuple):
+        return tuple(contents(each) for each in value)
+    return (value.dtype.str, value.shape, value.tobytes()) if hasattr(value, "dtype") else value
+
+
+def test_two_runs_of_a_mission_are_the_same_to_the_bit():
+    one, two = (run_mission(SHORT, STRATEGIES, ("ekf", "fastslam")) for _ in range(2))
+    assert contents(one) == contents(two)
+    other = run_mission(SHORT.model_copy(update={"seed": 8}), STRATEGIES)
+    assert contents(one.heard) != contents(other.heard)
+
+
+def test_a_mission_tries_every_strategy_with_every_filter():
+    told = []
+    mission = run_mission(
+        SHORT, STRATEGIES, ("ekf", "fastslam"), progress=lambda *stage: told.append(stage)
+    )
+    tried = [(trial.strategy, trial.filter) for trial in mission.trials]
+    assert tried == [(s, f) for s in STRATEGIES for f in ("ekf", "fastslam")]
+    assert [stage for stage in told if stage[1] == stage[2]] == [
+        ("listening", 20, 20),
+        *[(f"{s} {f}", 20, 20) for s, f in tried],
+    ]
+    assert len(mission.heard) == 20
+    assert all(len(trial.track.time) == 81 for trial in mission.trials)
+
+
+def test_strategies_do_not_disturb_each_other():
+    alone = run_mission(SHORT, ("passive",)).trials[0]
+    among = run_mission(SHORT, STRATEGIES).trials[2]
+    assert contents(alone) == contents(among)
+
+
+def test_fused_hears_what_active_or_passive_hear_in_every_frame_of_a_mission():
+    mission = run_mission(Config(scenario=ScenarioConfig(steps=400)), STRATEGIES)
+    active, fused, passive = (trial.scans for trial in mission.trials)
+    for a, f, p in zip(active, fused, passive, strict=True):
+        assert set(f.landmark) == set(a.landmark) | set(p.landmark)
+        assert np.isnan(p.range).all()
+        assert not np.isnan(a.range).any()
+    assert sum(scan.landmark.size for scan in active) > 100
+
+
+def test_an_unknown_filter_is_refused_by_name():
+    with pytest.raises(InputError, match="found 'ukf', expected one of ekf, fastslam"):
+        run_mission(SHORT, ("fused",), ("ukf",))
+
+
+class Ledger:
+    """A filter that adds up what it is given and writes down when: x counts steps, y scans."""
+
+    def __init__(self):
+        self.log = []
+
+    def init(self, pose):
+        self.log.append("init")
+        return Count(pose.mean)
+
+    def predict(self, belief, controls, dt, rng):
+        rng.random()
+        self.log.append((dt.tolist(), controls[:, 0].tolist()))
+        x = belief.mean + np.arange(1, len(dt) + 1)[:, None] * [1.0, 0.0, 0.0]
+        return Count(x[-1]), Gaussian(mean=x, covariance=np.tile(np.eye(3), (len(dt), 1, 1)))
+
+    def update(self, belief, scan, rng):
+        rng.random()
+        self.log.append(scan.time)
+        return Count(belief.mean + np.array([0.0, 1.0, 0.0]))
+
+
+class Count:
+    gated = 0
+
+    def __init__(self, mean):
+        self.mean = mean
+
+    def pose(self):
+        return Gaussian(mean=self.mean, covariance=2.0 * np.eye(3))
+
+    def landmarks(self):
+        none = np.zeros(0)
+        return Landmarks(
+            landmark=none.astype(int),
+            mean=none.reshape(0, 2),
+            covariance=none.reshape(0, 2, 2),
+            weight=none,
+        )
+
+
+def drive(steps, at_rest=False):
+    time = np.array([0.0, 0.5, 1.5, 2.0, 4.0, 4.5])[: steps + 1]
+    return Drive(
+        motion=Motion(model="unicycle", control_std=(0.1, 0.1), noise_at_rest=not at_rest),
+        start=Gaussian(mean=np.zeros(3), covariance=np.zeros((3, 3))),
+        time=time,
+        controls=np.column_stack((np.arange(steps), np.zeros(steps))).astype(float),
+        true_path=None,
+        true_landmarks=None,
+    )
+
+
+def scan_at(time, landmark=(), bearing=(), distance=()):
+    return Scan(
+        time=time,
+        landmark=np.array(landmark, dtype=np.int64),
+        bearing=np.array(bearing, dtype=float),
+        range=np.array(distance, dtype=float),
+    )
+
+
+def test_steps_and_scans_reach_the_filter_in_the_order_of_time():
+    ledger, seen, told = Ledger(), [], []
+    track = run_filter(
+        ledger,
+        drive(5),
+        [scan_at(0.0), scan_at(1.5), scan_at(1.5), scan_at(2.0)],
+        RNG(7),
+        progress=lambda *done: told.append(done),
+        watch=lambda scan, belief: seen.append((scan.time, belief.mean[0], belief.mean[1])),
+    )
+    assert ledger.log == [
+        "init", 0.0, ([0.5, 1.0], [0.0, 1.0]), 1.5, 1.5,
+        ([0.5], [2.0]), 2.0, ([2.0, 0.5], [3.0, 4.0]),
+    ]  # fmt: skip
+    assert seen == [(0.0, 0, 1), (1.5, 2, 2), (1.5, 2, 3), (2.0, 3, 4)]
+    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    # A step that holds a scan shows the pose after it.
+    assert track.pose.mean[:, 0].tolist() == [0, 1, 2, 3, 4, 5]
+    assert track.pose.mean[:, 1].tolist() == [1, 1, 3, 4, 4, 4]
+    assert track.pose.covariance[:, 0, 0].tolist() == [2, 1, 2, 2, 1, 1]
+
+
+def test_a_drive_without_scans_and_scans_without_a_drive_are_tracked():
+    ledger = Ledger()
+    track = run_filter(ledger, drive(5), [], RNG(7))
+    assert ledger.log == ["init", ([0.5, 1.0, 0.5, 2.0, 0.5], [0.0, 1.0, 2.0, 3.0, 4.0])]
+    assert track.pose.mean[:, 0].tolist() == [0, 1, 2, 3, 4, 5]
+    still = run_filter(Ledger(), drive(0), [scan_at(0.0)], RNG(7))
+    assert still.pose.mean.tolist() == [[0.0, 1.0, 0.0]]
+
+
+@pytest.mark.parametrize("name", ["ekf", "fastslam"])
+def test_a_filter_told_at_the_start_and_left_alone_at_the_end_keeps_what_it_knows(name):
+    motion = bicycle(Config().motion)
+    known = replace(drive(5), motion=motion)
+    first = scan_at(0.0, [3, 4], [0.1, -0.2], [2.0, np.nan])
+    track = run_filter(estimator(name, motion, Config()), known, [first], RNG(7))
+    assert set(track.landmarks.landmark) == {3, 4}
+    spread = track.pose.covariance[:, 0, 0] + track.pose.covariance[:, 1, 1]
+    assert np.all(np.diff(spread) > 0.0)
+    assert np.isfinite(track.pose.mean).all()
+
+
+@pytest.mark.parametrize(
+    ("scan", "message"),
+    [
+        (scan_at(0.7), "scan at 0.7 s: expected the time"),
+        (scan_at(9.0), "scan at 9.0 s: expected the time"),
+        (scan_at(0.5, [3], [np.nan], [2.0]), r"landmarks \[3\]"),
+        (scan_at(0.5, [3, 4], [0.1, 0.1], [2.0, -1.0]), r"landmarks \[4\]"),
+        (scan_at(0.5, [3], [0.1], [np.inf]), r"landmarks \[3\]"),
+    ],
+)
+def test_scans_that_no_filter_can_use_are_refused(scan, message):
+    with pytest.raises(InputError, match=message):
+        run_filter(Ledger(), drive(5), [scan], RNG(7))
+
+
+def test_a_trial_is_scored_against_the_path_and_all_landmarks_the_beacon_last():
+    mission = run_mission(SHORT, ("fused",))
+    (trial,) = mission.trials
+    error = np.hypot(*(trial.track.pose.mean - mission.scenario.path)[1:, :2].T)
+    assert trial.scores.position_rmse_m == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-12)
+    labels, places = mission.drive.true_landmarks
+    assert labels.tolist() == list(range(1, 52))
+    assert places[-1].tolist() == mission.scenario.beacon.tolist()
+    assert mission.drive.start.mean.tolist() == mission.scenario.path[0].tolist()
+    assert np.sqrt(np.diag(mission.drive.start.covariance)) == pytest.approx([0.05, 0.05, 0.0436])
+
+
+def test_trials_of_one_world_do_not_depend_on_their_order():
+    scenario = draw_scenario(SHORT, RNG(3))
+    mission = run_mission(SHORT, ("fused",))
+    told = drive_of(scenario, SHORT)
+    scans = tuple(scan_of(heard, "fused") for heard in mission.heard)
+    case = Case(strategy="fused", filter="fastslam", iteration=4)
+    one = run_trial(case, told, scans, SHORT)
+    run_trial(replace(case, iteration=5), told, scans, SHORT)
+    assert contents(run_trial(case, told, scans, SHORT)) == contents(one)
+    other = run_trial(replace(case, iteration=5), told, scans, SHORT)
+    assert contents(other.track) != contents(one.track)
+
+
+def test_the_dense_engine_finds_about_the_same_landmarks():
+    scenario = ScenarioConfig(steps=24)
+    block, dense = (
+        run_mission(Config(scenario=scenario, receiver=ReceiverConfig(engine=engine)), STRATEGIES)
+        for engine in ("block", "dense")
+    )
+    for one, two in zip(block.trials, dense.trials, strict=True):
+        first, second = (set().union(*(s.landmark for s in t.scans)) for t in (one, two))
+        assert len(first & second) >= 0.8 * max(len(first), len(second))
+        assert max(len(first), len(second)) >= 5

@@ -1,0 +1,256 @@
+"""A study's plan: what it stands for, what it refuses, how two differ."""
+
+import tomllib
+from collections import Counter
+from importlib.resources import files
+from typing import get_args
+
+import pytest
+
+from pipistrelle.config import Config, EmitterConfig, InputError, RayConfig
+from pipistrelle.experiments.runs.trial import LIMITS
+from pipistrelle.experiments.studies.plan import Filter, Plan, cases_of
+from pipistrelle.experiments.studies.plan_file import differences, find_plan, plan_text, read_plan
+from pipistrelle.settings import from_flags
+from reference.studies import SMALL, plan_of
+
+BARE = "format = 1\niterations = 2\n"
+
+
+@pytest.fixture
+def refused(tmp_path):
+    """Read a text that is no plan; return what is said of it after the path."""
+
+    def refused(text, **given):
+        with pytest.raises(InputError) as error:
+            plan_of(tmp_path, text, **given)
+        return str(error.value).replace(f"{tmp_path / 'small.toml'}", "PLAN")
+
+    return refused
+
+
+def test_the_papers_plan_is_fifty_cases_in_115_worlds():
+    plan = read_plan(find_plan("paper"))
+    cases = cases_of(plan)
+    assert plan.iterations * len(cases) == 5750
+    assert Counter((case.strategy, case.filter) for case in cases) == {
+        **dict.fromkeys([(s, f) for s in ("active", "fused") for f in ("ekf", "fastslam")], 12),
+        **dict.fromkeys([("passive", f) for f in ("ekf", "fastslam")], 1),
+    }
+    assert [case.number for case in cases] == list(range(50))
+
+
+def test_the_papers_plan_ships_with_the_package_and_names_what_was_fitted():
+    text = files("pipistrelle.experiments.studies").joinpath("paper.toml").read_text()
+    config = tomllib.loads(text)["config"]
+    assert {name: list(table) for name, table in config.items() if name != "seed"} == {
+        "emitter": ["level_db"],
+        "beacon": ["level_db"],
+        "rays": ["prune", "power"],
+    }
+    assert "seed" in config
+
+
+def test_the_papers_radii_are_those_that_its_appendix_lists_beamwidths_for():
+    radii = read_plan(find_plan("paper")).grid["emitter.radius"]
+    spaced = [2.5e-3 * 10 ** (i / 11) for i in range(12)]
+    assert list(radii) == [round(radius, 4) for radius in spaced]
+
+
+def test_the_filters_of_a_plan_are_those_that_there_are():
+    assert set(get_args(Filter)) == set(LIMITS)
+
+
+def test_a_plan_without_strategies_filters_and_name_has_them_all_and_is_named_after_its_file(
+    tmp_path,
+):
+    plan = plan_of(tmp_path, BARE)
+    assert (plan.name, plan.strategies) == ("small", ("active", "fused", "passive"))
+    assert plan.filters == ("ekf", "fastslam")
+    assert plan.config == Config()
+    assert [case.config for case in cases_of(plan)] == [Config()] * 6
+
+
+def test_the_cases_are_the_product_of_grid_strategies_and_filters(tmp_path):
+    text = BARE + (
+        'strategies = ["fused", "active"]\n'
+        'grid = {"rays.power" = [1, 3], "air.spreading" = ["paper", "bistatic"]}\n'
+    )
+    cases = cases_of(plan_of(tmp_path, text))
+    assert len(cases) == 2 * 2 * 2 * 2
+    for case in cases:
+        assert case.config.rays.power == case.values["rays.power"]
+        assert case.config.air.spreading == case.values["air.spreading"]
+    assert len({(c.strategy, c.filter, *c.values.values()) for c in cases}) == 16
+
+
+def test_a_passive_case_stands_once_for_all_radii_and_is_heard_beside_the_narrowest_beam(tmp_path):
+    text = SMALL.replace("[0.0025, 0.025]", "[0.025, 0.0025]") + '"rays.power" = [1.0, 2.0, 3.0]\n'
+    passive = [case for case in cases_of(plan_of(tmp_path, text)) if case.strategy == "passive"]
+    assert len(passive) == 3 * 2
+    assert {case.values["emitter.radius"] for case in passive} == {None}
+    assert {case.config.emitter.radius for case in passive} == {0.025}
+
+
+def test_a_grid_may_be_written_as_tables(tmp_path):
+    quoted = plan_of(tmp_path, SMALL)
+    nested = SMALL.replace('[grid]\n"emitter.radius"', "[grid.emitter]\nradius")
+    assert plan_of(tmp_path, nested) == quoted
+
+
+def test_settings_may_vary_that_are_no_numbers(tmp_path):
+    text = BARE + 'grid = {"rays.range_bounds" = [[0.5, 20], [0.5, 10.0]]}\n'
+    plan = plan_of(tmp_path, text)
+    assert plan.grid["rays.range_bounds"] == ([0.5, 20.0], [0.5, 10.0])
+    assert {case.config.rays.range_bounds for case in cases_of(plan)} == {(0.5, 20.0), (0.5, 10.0)}
+
+
+@pytest.mark.parametrize("values", ["[0.01]", '["loud"]', '["loud", "soft"]'])
+def test_refused_items_are_not_said_to_be_missing_too(refused, values):
+    said = refused(BARE + f"strategies = {values}\n").splitlines()
+    assert [line.partition(": found")[0] for line in said] == [
+        f"PLAN: strategies.{i}" for i in range(1 + values.count(","))
+    ]
+
+
+def test_a_plan_as_written_reads_as_the_same_plan(tmp_path):
+    plan = plan_of(tmp_path, SMALL, over=from_flags({"rays": {"power": 3.0}}))
+    written = plan_text(plan)
+    assert plan_of(tmp_path, written) == plan
+    assert set(tomllib.loads(written)["config"]) == set(Config.model_fields)
+
+
+def test_a_plan_made_of_both_a_setting_and_its_values_can_be_read_again(tmp_path):
+    ways = {"strategies": ("active",), "filters": ("ekf",)}
+    config, grid = Config(seed=3, rays=RayConfig(power=5.0)), {"rays.power": (1.0, 2.0)}
+    plan = Plan(name="small", iterations=1, config=config, grid=grid, **ways)
+    there = plan_of(tmp_path, plan_text(plan))
+    assert cases_of(there) == cases_of(plan)
+    assert differences(there, plan) == []
+
+
+def test_settings_laid_over_a_plan_go_before_its_own(tmp_path):
+    plan = plan_of(tmp_path, SMALL, over=from_flags({"scenario": {"steps": 8}}), iterations=9)
+    assert (plan.config.scenario.steps, plan.config.scenario.landmarks) == (8, 12)
+    assert plan.iterations == 9
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("format = 1\n", "PLAN: iterations: missing"),
+        ("iterations = 3\n", "PLAN: format: missing"),
+        ("iterations = = 3\n", "PLAN: not TOML: "),
+        ("format = 2\niterations = 3\n", "PLAN: format: found 2, expected 1"),
+        ("format = 1\niterations = 0\n", "PLAN: iterations: found 0, expected greater than"),
+        ("format = 1\niterations = 2.0\n", "PLAN: iterations: found 2.0, expected a valid integer"),
+        ("format = 1\niterations = true\n", "PLAN: iterations: found True, expected"),
+        (BARE + "iteration = 3\n", "PLAN: iteration: no such key of a plan; did you mean itera"),
+        (BARE + 'name = "../up"\n', "PLAN: name: found '../up', expected letters, digits"),
+        (BARE + 'strategies = ["loud"]\n', "PLAN: strategies.0: found 'loud', expected 'active',"),
+        (BARE + "strategies = []\n", "PLAN: strategies: found [], expected "),
+        (BARE + 'filters = ["ekf", "ekf"]\n', "PLAN: filters: found 'ekf' twice"),
+        (BARE + "config = 3\n", "PLAN: config: found 3, expected a table of settings"),
+        (BARE + "grid = [1]\n", "PLAN: grid: found [1], expected a table of settings"),
+        (
+            BARE + "[config.rays]\npowr = 1\n",
+            "PLAN: config.rays.powr: no such setting; did you mean rays.power?",
+        ),
+        (BARE + "[config.sonar]\n", "PLAN: config.sonar: no such setting"),
+        (
+            BARE + "[config]\nrays = 3\n",
+            "PLAN: config.rays: no such setting",
+        ),
+        (
+            BARE + "[config.rays]\npower = 0\n",
+            "PLAN: config.rays.power: found 0, expected greater than 0",
+        ),
+        (
+            BARE + '[grid]\n"radius" = [1]\n',
+            "PLAN: grid.radius: no such setting; did you mean",
+        ),
+        (
+            BARE + '[grid]\n"emitter.radius" = [0.01, -1.0]\n',
+            "PLAN: grid.emitter.radius: found -1.0, expected greater than 0",
+        ),
+        (
+            BARE + '[grid]\n"emitter.radius" = [nan]\n',
+            "PLAN: grid.emitter.radius: found nan, expected a finite number",
+        ),
+        (
+            BARE + '[grid]\n"emitter.radius" = ["wide"]\n',
+            "PLAN: grid.emitter.radius: found 'wide', expected a valid number",
+        ),
+        (
+            BARE + '[grid]\n"rays.power" = 2.0\n',
+            "PLAN: grid.rays.power: found 2.0, expected a list",
+        ),
+        (BARE + '[grid]\n"rays.power" = []\n', "PLAN: grid.rays.power: found [], expected a list"),
+        (
+            BARE + '[grid]\n"rays.power" = [2, 2.0]\n',
+            "PLAN: grid.rays.power: found 2.0 twice, expected each value once",
+        ),
+        (BARE + "[grid]\nseed = [1, 2]\n", "PLAN: grid.seed: every iteration is another world"),
+    ],
+)
+def test_a_mistake_is_named_with_its_file_its_key_and_what_was_expected(refused, text, said):
+    assert refused(text).startswith(said)
+
+
+def test_values_that_are_right_alone_and_wrong_together_are_refused(refused):
+    text = BARE + ('[grid]\n"rays.range_bounds" = [[0.5, 20.0], [20.0, 30.0], [9.0, 3.0]]\n')
+    assert "range_bounds must rise, found [9.0, 3.0]" in refused(text)
+
+
+def test_more_cases_than_the_tables_can_number_are_refused(refused):
+    values = str([1.0 + i / 1000 for i in range(100)])
+    text = BARE + f'[grid]\n"rays.power" = {values}\n"air.pressure_kpa" = {values}\n'
+    assert refused(text) == "PLAN: grid: found 60000 cases, expected at most 32767"
+
+
+def test_a_setting_both_set_and_varied_by_a_plan_is_refused(refused):
+    varied = BARE + '[grid]\n"rays.power" = [1.0, 2.0]\n[config.rays]\n'
+    said = "PLAN: config.rays.power: the plan varies this setting; take it out of [grid] in PLAN"
+    assert refused(varied + "power = 3.0\n") == said
+
+
+def test_a_default_beside_the_values_of_a_grid_says_nothing(tmp_path):
+    path = tmp_path / "plan.toml"
+    path.write_text(BARE + '[grid]\n"rays.power" = [1.0, 3.0]\n[config.rays]\npower = 2.0\n')
+    assert read_plan(path).grid == {"rays.power": (1.0, 3.0)}
+
+
+def test_a_flag_for_what_the_plan_varies_is_refused(refused):
+    over = from_flags({"emitter": {"radius": 0.01}})
+    said = refused(SMALL, over=over)
+    assert said.startswith("--emitter.radius: the plan varies this setting; take it out of [grid]")
+
+
+def test_a_flag_with_a_refused_value_is_named(refused):
+    assert refused(SMALL, over=from_flags({"rays": {"power": -1}})).startswith("--rays.power: ")
+
+
+def test_a_plan_that_is_not_there_is_refused():
+    with pytest.raises(InputError, match=r"^none\.toml: found no such file; expected paper"):
+        find_plan("none.toml")
+
+
+def test_all_that_differs_is_named_but_for_the_number_of_worlds(tmp_path):
+    there = plan_of(tmp_path, SMALL)
+    assert differences(there, plan_of(tmp_path, SMALL, iterations=30)) == []
+    text = SMALL.replace("landmarks = 12", "landmarks = 13").replace("0.025]", "0.02]")
+    text = text.replace("[config", 'filters = ["ekf"]\n[config') + '"rays.power" = [1.0]\n'
+    assert differences(there, plan_of(tmp_path, text)) == [
+        'filters: ["ekf", "fastslam"] there, ["ekf"] asked for',
+        "config.scenario.landmarks: 12 there, 13 asked for",
+        "grid.emitter.radius: [0.0025, 0.025] there, [0.0025, 0.02] asked for",
+        "grid.rays.power: nothing there, [1.0] asked for",
+    ]
+
+
+def test_the_settings_that_are_not_varied_are_those_of_the_plan(tmp_path):
+    text = SMALL + '"emitter.level_db" = [40.0]\n'
+    for case in cases_of(plan_of(tmp_path, text)):
+        expected = EmitterConfig(radius=case.config.emitter.radius, level_db=40.0)
+        assert case.config.emitter == expected
+        assert case.config.scenario.steps == 40

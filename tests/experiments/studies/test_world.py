@@ -1,0 +1,203 @@
+"""A study's world: each case is the trial that it would be alone, though heard together."""
+
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from pipistrelle.acoustics.emitter import beamwidth
+from pipistrelle.evaluation.consistency import nees
+from pipistrelle.experiments.runs.trial import run_mission
+from pipistrelle.experiments.studies import world
+from pipistrelle.experiments.studies.plan import cases_of
+from pipistrelle.experiments.studies.world import failed_records, run_world, world_tables
+from reference.studies import SMALL, as_rows, plan_of
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory):
+    varied = '"rays.power" = [2.0, 4.0]\n"scenario.landmarks" = [10, 12]\n'
+    text = SMALL.replace("landmarks = 12\n", "") + varied
+    return plan_of(tmp_path_factory.mktemp("plan"), text)
+
+
+@pytest.fixture(scope="module")
+def records(plan):
+    return run_world(plan, 0)
+
+
+@pytest.fixture(scope="module")
+def alone(plan):
+    """The same cases one by one, as `pipistrelle run` would try them."""
+    return [run_mission(c.config, (c.strategy,), (c.filter,)) for c in cases_of(plan)]
+
+
+def test_each_case_of_a_world_scores_as_it_does_alone(records, alone):
+    assert len(records) == 2 * 2 * (2 * 2 * 2 + 2)
+    for record, mission in zip(records, alone, strict=True):
+        (trial,) = mission.trials
+        assert asdict(record.scores) == asdict(trial.scores)
+
+
+def test_steps_are_the_errors_and_the_nees_at_the_frames(records, alone):
+    for record, mission in zip(records, alone, strict=True):
+        track, truth = mission.trials[0].track, mission.scenario.path
+        assert record.steps.shape == (10, 3)
+        for frame in range(10):
+            k = 4 * (frame + 1)
+            error = track.pose.mean[k] - truth[k]
+            error[2] = (error[2] + np.pi) % (2 * np.pi) - np.pi
+            expected = [np.hypot(*error[:2]), error[2], nees(error, track.pose.covariance[k])]
+            # single precision, after wrapping to 1e-15 of a turn
+            np.testing.assert_allclose(record.steps[frame], expected, rtol=1.2e-7, atol=1e-14)
+
+
+def test_the_map_is_kept_with_the_distance_of_each_landmark_from_its_place(records, alone):
+    rows = 0
+    for record, mission in zip(records, alone, strict=True):
+        hypotheses = mission.trials[0].track.landmarks
+        places = dict(zip(*mission.drive.true_landmarks, strict=True))
+        assert set(record.landmark) == set(hypotheses.landmark)
+        kept = zip(record.landmark, record.full, record.landmark_error, strict=True)
+        for label, full, error in kept:
+            mine = np.flatnonzero(hypotheses.landmark == label)
+            assert full == (len(mine) == 1)
+            best = mine[np.argmax(hypotheses.weight[mine])]
+            assert error == pytest.approx(np.hypot(*(hypotheses.mean[best] - places[label])))
+            rows += 1
+    assert rows > len(records)
+
+
+def test_particles_tell_their_mean_number_of_full_landmarks(records, alone):
+    for record, mission in zip(records, alone, strict=True):
+        full = mission.trials[0].track.full
+        expected = record.scores.landmarks_full if full is None else full
+        assert record.landmarks_full_mean == expected
+        assert (full is None) == (record.case.filter == "ekf")
+
+
+def test_a_passive_case_has_no_beamwidth_and_the_others_that_of_their_piston(records):
+    for record in records:
+        if record.case.strategy == "passive":
+            assert record.beamwidth_deg is None
+        else:
+            width = beamwidth(record.case.config.emitter.radius, frequency=35e3, speed_of_sound=343)
+            assert record.beamwidth_deg == pytest.approx(np.degrees(width), rel=1e-12)
+
+
+def test_cases_that_hear_the_same_world_listen_once(plan, monkeypatch):
+    heard = []
+    listen = world.listen
+
+    def counted(scenario, config, radii, **named):
+        heard.append((config.scenario.landmarks, config.rays.power, *radii))
+        return listen(scenario, config, radii, **named)
+
+    monkeypatch.setattr(world, "listen", counted)
+    run_world(plan, 1)
+    assert [(landmarks, *radii) for landmarks, _, *radii in heard] == [
+        (10, 0.0025, 0.025),
+        (12, 0.0025, 0.025),
+    ]
+
+
+def test_worlds_differ(plan, records):
+    again, other = run_world(plan, 0), run_world(plan, 1)
+    assert [r.scores for r in again] == [r.scores for r in records]
+    pairs = zip(other, records, strict=True)
+    assert all(a.scores.position_rmse_m != b.scores.position_rmse_m for a, b in pairs)
+
+
+def test_a_trial_that_raises_is_recorded_and_the_others_go_on(plan, records, monkeypatch):
+    run_trial = world.run_trial
+
+    def moody(case, drive, scans, config):
+        if case.filter == "fastslam" and case.strategy == "fused":
+            raise ZeroDivisionError("no particles left")
+        return run_trial(case, drive, scans, config)
+
+    monkeypatch.setattr(world, "run_trial", moody)
+    for record, whole in zip(run_world(plan, 0), records, strict=True):
+        case = record.case
+        if (case.strategy, case.filter) == ("fused", "fastslam"):
+            assert record.error.startswith("Traceback")
+            assert record.error.endswith("ZeroDivisionError: no particles left\n")
+            assert record.scores is None
+            assert len(record.steps) == len(record.landmark) == 0
+        else:
+            assert record.error is None
+            assert record.scores == whole.scores
+
+
+def test_a_world_that_cannot_be_drawn_is_a_failure_of_its_cases_alone(tmp_path):
+    text = SMALL.replace("landmarks = 12", "radius = 12.0") + '"scenario.landmarks" = [5, 900]\n'
+    plan = plan_of(tmp_path, text)
+    for record in run_world(plan, 0):
+        crowded = record.case.config.scenario.landmarks == 900
+        assert (record.error is not None) == crowded
+        if crowded:
+            assert "InputError: scenario.landmarks: found 900" in record.error
+
+
+def test_a_failed_trial_keeps_its_case_its_seed_and_its_error(plan):
+    tables = world_tables(plan, 7, failed_records(plan, "gone\n"))
+    rows = as_rows(tables["trials"])
+    assert [row["case"] for row in rows] == [case.number for case in cases_of(plan)]
+    assert {(r["iteration"], r["seed"], r["status"], r["error"]) for r in rows} == {
+        (7, 7, "failed", "gone\n")
+    }
+    assert {row["position_rmse_m"] for row in rows} == {None}
+    assert len(tables["steps"]) == len(tables["landmarks"]) == 0
+
+
+def test_what_is_not_finite_stays_so_and_what_is_not_there_is_null(plan, records):
+    scores = replace(
+        records[0].scores, nees_max=np.inf, position_rmse_m=np.nan, map_rmse_m=None, diverged=True
+    )
+    steps = np.array([[np.nan, np.inf, np.inf]], dtype=np.float32)
+    tables = world_tables(plan, 0, [replace(records[0], scores=scores, steps=steps)])
+    (row,) = as_rows(tables["trials"])
+    assert row["nees_max"] == np.inf
+    assert np.isnan(row["position_rmse_m"])
+    assert row["map_rmse_m"] is None
+    (step,) = as_rows(tables["steps"])
+    assert step["frame"] == 1
+    assert np.isnan(step["position_error_m"])
+    assert (step["heading_error_rad"], step["nees"]) == (np.inf, np.inf)
+
+
+def test_a_filter_that_runs_away_leaves_infinite_errors(alone):
+    mission = alone[0]
+    track = mission.trials[0].track
+    far = replace(track, pose=replace(track.pose, mean=np.full_like(track.pose.mean, 1e200)))
+    steps = world._frame_errors(far, mission.scenario, mission.config)
+    assert np.all(np.isinf(steps[:, [0, 2]]))
+
+
+def test_an_exact_start_leaves_frames_unscored_until_the_covariance_is_positive_definite(alone):
+    mission = alone[0]
+    track = mission.trials[0].track
+    covariance = track.pose.covariance.copy()
+    covariance[:7] = np.diag([0.01, 0.0, 0.01])
+    exact = replace(track, pose=replace(track.pose, covariance=covariance))
+    steps = world._frame_errors(exact, mission.scenario, mission.config)
+    assert np.isnan(steps[:, 2]).tolist() == [True] + 9 * [False]
+    covariance[2] = np.eye(3)  # between frames: at the first it is singular again
+    steps = world._frame_errors(exact, mission.scenario, mission.config)
+    assert np.isinf(steps[:, 2]).tolist() == [True] + 9 * [False]
+
+
+def test_columns_bear_the_names_of_what_varies(plan, records):
+    tables = world_tables(plan, 0, records)
+    for row, case in zip(as_rows(tables["trials"]), cases_of(plan), strict=True):
+        assert (row["strategy"], row["filter"]) == (case.strategy, case.filter)
+        assert {name: row[name] for name in case.values} == case.values
+    kinds = {name: str(kind) for name, kind in tables["steps"].schema.items()}
+    assert kinds == {
+        "iteration": "Int32",
+        "case": "Int16",
+        "frame": "UInt16",
+        "position_error_m": "Float32",
+        "heading_error_rad": "Float32",
+        "nees": "Float32",
+    }

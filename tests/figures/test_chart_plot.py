@@ -1,0 +1,97 @@
+"""Charts on paper: what matplotlib draws is what the chart holds."""
+
+import numpy as np
+import pytest
+
+from pipistrelle.figures.chart import Axis, Chart, Panel, Series, linear_axis
+from pipistrelle.figures.chart_plot import draw_chart
+from pipistrelle.figures.style import save_figure, strategy_colour
+
+X = np.array([11.0, 33.0, 180.0])
+
+
+def panel_of(*series, title="EKF", **given):
+    beams = Axis(label="beamwidth [°]", limits=(10.0, 200.0), log=True, ticks=((33.0, "33"),))
+    vertical = linear_axis("RMSE [m]", [0.0, 2.0], floor=0.0)
+    return Panel(**({"title": title, "x": beams, "y": vertical, "series": series} | given))
+
+
+def chart_of(*panels):
+    return Chart(name="c", title="Title", caption="", panels=panels, columns=("x", "y"))
+
+
+def fused(**given):
+    y = np.array([0.5, 0.6, 0.7])
+    plain = {"name": "fused", "role": "fused", "x": X, "y": y}
+    return Series(**(plain | given))
+
+
+def test_a_chart_without_panels_is_refused():
+    with pytest.raises(ValueError, match="at least one panel"):
+        draw_chart(chart_of())
+
+
+def test_lines_and_bands_are_those_of_the_series():
+    series = fused(low=np.full(3, 0.1), high=np.full(3, 0.9), style="dots")
+    (axes,) = draw_chart(chart_of(panel_of(series))).axes
+    line = axes.lines[0]
+    np.testing.assert_array_equal(line.get_xdata(), X)
+    np.testing.assert_array_equal(line.get_ydata(), series.y)
+    assert line.get_color() == strategy_colour("fused")
+    box = axes.collections[0].get_datalim(axes.transData)
+    assert (box.ymin, box.ymax) == pytest.approx((0.1, 0.9))
+
+
+def test_axes_have_the_charts_scales_limits_and_ticks():
+    (axes,) = draw_chart(chart_of(panel_of(fused()))).axes
+    assert (axes.get_xscale(), axes.get_yscale()) == ("log", "linear")
+    assert axes.get_xlim() == pytest.approx((10.0, 200.0))
+    assert [text.get_text() for text in axes.get_xticklabels()] == ["33"]
+    assert axes.get_title(loc="left") == "EKF"
+
+
+def test_single_worlds_beyond_the_panel_are_pinned_at_its_top():
+    marks = fused(style="marks", y=np.array([1.0, 1.5, 40.0]))
+    (axes,) = draw_chart(chart_of(panel_of(marks))).axes
+    inside, above = axes.lines
+    assert inside.get_ydata().tolist() == [1.0, 1.5]
+    assert axes.get_ylim()[0] < above.get_ydata()[0] < axes.get_ylim()[1]
+
+
+def test_points_that_are_not_filled_are_open():
+    series = fused(style="points", filled=np.array([True, False, True]), low=X * 0, high=X * 0 + 1)
+    (axes,) = draw_chart(chart_of(panel_of(series))).axes
+    full, hollow = axes.lines
+    assert (len(full.get_xdata()), len(hollow.get_xdata())) == (2, 1)
+    assert hollow.get_markerfacecolor() == "white"
+
+
+def test_names_are_told_once_for_all_panels_and_not_at_all_when_many():
+    figure = draw_chart(chart_of(panel_of(fused()), panel_of(fused(), title="FastSLAM 2.0")))
+    assert [text.get_text() for text in figure.legends[0].texts] == ["fused"]
+    many = [fused(name=f"{i}°") for i in range(12)]
+    assert draw_chart(chart_of(panel_of(*many))).legends == []
+
+
+@pytest.mark.parametrize(("count", "grid"), [(1, (1, 1)), (2, (1, 2)), (3, (1, 3)), (4, (2, 2))])
+def test_panels_stand_side_by_side(count, grid):
+    figure = draw_chart(chart_of(*[panel_of(fused())] * count))
+    spec = figure.axes[0].get_subplotspec().get_gridspec()
+    assert (spec.nrows, spec.ncols) == grid
+
+
+def test_every_style_can_be_saved_twice_to_the_same_bytes(tmp_path):
+    styles = [
+        fused(style=style, tips=("a", "b", "c"), dashed=style == "line")
+        for style in ("line", "dots", "points", "marks", "stars", "text")
+    ]
+    plane = Axis(label="", limits=(0.0, 200.0), ticks=())
+    panels = [
+        panel_of(*styles, span=(0.2, 0.4, "band"), rules=(0.0,), posts=(33.0,)),
+        panel_of(*styles, x=plane, y=plane, equal=True),
+    ]
+    for folder in ("one", "two"):
+        save_figure(draw_chart(chart_of(*panels)), tmp_path / folder, "c")
+    for kind in ("png", "pdf"):
+        one, two = (tmp_path / folder / f"c.{kind}" for folder in ("one", "two"))
+        assert one.read_bytes() == two.read_bytes()

@@ -1,0 +1,120 @@
+"""The answer in words follows the numbers."""
+
+import numpy as np
+
+from pipistrelle.report.claims.answer import answer
+from pipistrelle.report.claims.verdicts import judge_claims
+from pipistrelle.report.studied import COMMON
+from report.invented import BEAMWIDTH, changed, invent, only
+
+
+def told(study):
+    return answer(study, judge_claims(study))
+
+
+def with_map(study, change):
+    for name in ("ekf", "fastslam"):
+        active = study.outcomes[name, "active"].scores[COMMON]
+        study = changed(study, (name, "fused"), COMMON, lambda _, now=active: now + change)
+    return study
+
+
+def jitter(size):
+    return size * np.linspace(-1.0, 1.0, 60)[:, None]
+
+
+def test_a_more_accurate_map_at_narrow_beams_is_said_so():
+    gain = np.where(BEAMWIDTH < 30.0, -0.3, 0.0)
+    headline, counted, placed, located, tally = told(with_map(invent(60), gain + jitter(0.1)))
+    assert headline == "Yes: a fuller map, and a more accurate one where the beam is narrow."
+    assert "30 instead of 20 at 11° and 38 instead of 36 at 180°" in counted
+    assert "with EKF better at 5 of 12 beamwidths (11° to 27°)" in placed
+    assert located.startswith("The vehicle is located")
+    assert tally.startswith("Of the paper's eight claims,")
+
+
+def test_the_other_answers():
+    study = invent(60)
+    cases = {
+        "Yes: a fuller map, and a more accurate one at every beamwidth.": np.full(12, -0.3),
+        "It builds a fuller map, and a less accurate one.": np.full(12, 0.3),
+        "Yes: a fuller map, and a more accurate one at some beamwidths.": -0.3
+        * (BEAMWIDTH > 100.0),
+        "It depends: a fuller map, at some beamwidths more accurate, at others less.": 0.3
+        * np.sign(BEAMWIDTH - 50.0),
+        "It builds a fuller map; no difference in its accuracy is significant at any beamwidth.": (
+            np.zeros(12)
+        ),
+    }
+    for headline, change in cases.items():
+        assert told(with_map(study, change + jitter(0.1)))[0] == headline
+
+
+def test_runs_of_beamwidths_are_named_by_their_ends():
+    change = np.where(np.isin(np.arange(12), [0, 1, 2, 5]), -0.3, 0.0)
+    placed = told(with_map(invent(60), change + jitter(0.1)))[2]
+    assert "better at 4 of 12 beamwidths (11° to 18°, 33°)" in placed
+
+
+def test_a_map_that_is_not_fuller_is_not_called_so():
+    study = changed(invent(60), ("ekf", "active"), "landmarks_full", lambda count: count + 30.0)
+    begun = "It does not build a fuller map"
+    cases = {
+        f"{begun}, but a more accurate one at every beamwidth.": np.full(12, -0.3),
+        f"{begun}, but a less accurate one.": np.full(12, 0.3),
+        f"{begun}; it is at some beamwidths more accurate, at others less.": 0.3
+        * np.sign(BEAMWIDTH - 50.0),
+        f"{begun}; no difference in its accuracy is significant at any beamwidth.": np.zeros(12),
+    }
+    for headline, change in cases.items():
+        assert told(with_map(study, change + jitter(0.1)))[0] == headline
+
+
+def test_nothing_is_answered_before_there_are_worlds_or_cases():
+    headline, *rest = told(invent(1))
+    assert headline == "Not decided: a single world is left."
+    assert "Whether the vehicle is located better or worse with EKF is not decided" in rest[2]
+    alone = told(only(invent(5), [("ekf", "passive")]))
+    assert alone[0] == "Not decided: the study has no pair of active and fused."
+
+
+def test_what_is_not_significant_is_not_called_equal():
+    study = with_map(invent(2), jitter(0.1)[[0, -1]])
+    assert told(study)[2] == (
+        "The landmarks that every strategy places are placed with EKF not significantly better or "
+        "worse at any beamwidth; with FastSLAM 2.0 not significantly better or worse at any "
+        "beamwidth."
+    )
+
+
+def test_a_filter_without_a_world_left_is_undecided_and_the_other_answers():
+    study = with_map(invent(60), np.full(12, -0.3) + jitter(0.1))
+    study.outcomes["ekf", "passive"].diverged[:] = True
+    lines = told(study)
+    assert lines[0] == "Yes: a fuller map, and a more accurate one at every beamwidth."
+    placed = next(line for line in lines if line.startswith("The landmarks that"))
+    assert "with FastSLAM 2.0 better at every beamwidth. Whether the landmarks that" in placed
+    assert placed.endswith("placed better or worse with EKF is not decided: no world is left.")
+    study.outcomes["fastslam", "passive"].diverged[:] = True
+    headline, without, *_ = told(study)
+    assert headline == "It depends on which worlds are counted."
+    assert without == "Without diverged worlds: Not decided: no world is left."
+
+
+def test_an_answer_that_hangs_on_what_is_left_out_is_given_both_ways():
+    study = with_map(invent(60), np.full(12, -0.3) + jitter(0.1))
+    for name in ("ekf", "fastslam"):
+        spoilt = np.where(np.arange(60) < 20, 3.0, 0.0)[:, None]
+        study = changed(study, (name, "fused"), COMMON, lambda error, more=spoilt: error + more)
+        study.outcomes[name, "fused"].diverged[:20] = True
+    headline, without, within, _, _, _, diverged, _ = told(study)
+    assert headline == "A fuller map, yes; a more accurate one depends on which worlds are counted."
+    assert without == (
+        "Without diverged worlds and without diverged cases: "
+        "Yes: a fuller map, and a more accurate one at every beamwidth."
+    )
+    assert within == "With everything: It builds a fuller map, and a less accurate one."
+    assert diverged == (
+        "The filter diverged, of the trials, with EKF fused in 33.3 %; "
+        "with FastSLAM 2.0 fused in 33.3 %."
+    )

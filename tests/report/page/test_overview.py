@@ -1,0 +1,95 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipistrelle.evaluation.consistency import anees_bounds
+from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
+from pipistrelle.report.page.overview import (
+    by_strategy,
+    consistency,
+    departures,
+    departures_line,
+    exclusions,
+    table_ii,
+)
+from pipistrelle.settings import from_flags
+from report.invented import RADII, invent, only
+
+
+def as_the_paper(study, **flags):
+    """The same study under the settings of the plan `paper`, but for those given."""
+    plan = read_plan(find_plan("paper"), from_flags(flags), iterations=2)
+    return replace(study, config=plan.config, grid=plan.grid)
+
+
+def test_the_papers_own_settings_are_not_said_to_differ():
+    study = as_the_paper(invent(2, planned=7), seed=5)
+    assert study.grid["emitter.radius"] == RADII
+    assert departures(study) == []
+    assert departures_line([]) == ""
+
+
+def test_settings_that_are_not_the_papers_are_named_with_both_values():
+    study = as_the_paper(invent(2), scenario={"steps": 200}, beacon={"level_db": 45.0})
+    assert departures_line(departures(study)) == (
+        "Not the paper's study: scenario.steps 200 (paper 1500), beacon.level_db 45 (paper 42.8)"
+    )
+
+
+def test_fewer_beams_or_ways_are_not_the_papers_study():
+    study = replace(as_the_paper(invent(2)), grid={"emitter.radius": (0.025, 0.0025)})
+    line = departures_line(departures(only(study, [("ekf", "active"), ("ekf", "fused")])))
+    assert line == (
+        "Not the paper's study: "
+        "emitter.radius 0.0025 and 0.025 (paper 12 values from 0.0025 to 0.025), "
+        "strategies active and fused (paper active, fused and passive), "
+        "filters ekf (paper ekf and fastslam)"
+    )
+
+
+def test_exclusions_count_worlds_and_trials_and_stand_beside_the_papers():
+    study = invent(6)
+    study.outcomes["ekf", "fused"].diverged[0, 2:5] = True
+    study.outcomes["ekf", "active"].diverged[0, 0] = True
+    study.outcomes["fastslam", "passive"].failed[3, 0] = True
+    ekf, fastslam = exclusions(study)
+    assert (ekf["excluded"], ekf["worlds"], ekf["paper"], ekf["limit"]) == (1, 6, 8, 50.0)
+    assert ekf["diverged"] == {"active": 1, "fused": 3, "passive": 0}
+    assert ekf["trials"] == {"active": 72, "fused": 72, "passive": 6}
+    assert (fastslam["excluded"], fastslam["failed"], fastslam["paper"]) == (1, 1, 15)
+
+
+def test_table_ii_has_the_means_of_the_worlds_that_count():
+    study = invent(6)
+    study.outcomes["ekf", "passive"].diverged[2, 0] = True
+    rows = table_ii(study)
+    count = np.delete(study.outcomes["ekf", "fused"].scores["landmarks_full"][:, 11], 2)
+    assert rows[0]["full"] == pytest.approx([count.mean(), count.std(ddof=1)])
+    assert [row["n"] for row in rows] == [5] * 4 + [6] * 4
+    assert rows[4]["full_mean"][0] == pytest.approx(rows[4]["full"][0] + 0.1)
+    assert table_ii(only(study, [("ekf", "fused")]))[7]["full"] is None
+
+
+def test_consistency_is_told_in_shares_of_time():
+    study = invent(20)
+    low, high = anees_bounds(20)
+    nees = study.outcomes["ekf", "passive"].nees
+    nees[:, :, :75] = 3.0
+    nees[:, :, 75:300] = high + 1.0
+    nees[:, :, 300:] = low - 1.0
+    (row,) = [r for r in consistency(study) if (r["filter"], r["strategy"]) == ("ekf", "passive")]
+    assert (row["inside"], row["above"]) == pytest.approx((75 / 375, 225 / 375))
+    assert row["bounds"] == pytest.approx([low, high])
+    squares = [0.0, np.log((high + 1) / 3) ** 2, np.log((low - 1) / 3) ** 2]
+    assert row["departure"] == pytest.approx(np.dot(squares, [75, 225, 75]) / 375)
+    assert row["beamwidth"] is None
+
+
+def test_strategies_are_averages_over_beamwidths():
+    rows = consistency(invent(5))
+    assert len(rows) == 50
+    mine = [r["anees"] for r in rows if (r["filter"], r["strategy"]) == ("fastslam", "active")]
+    found = {(r["filter"], r["strategy"]): r for r in by_strategy(rows)}
+    assert found["fastslam", "active"]["anees"] == pytest.approx(np.mean(mine))
+    assert len(found) == 6

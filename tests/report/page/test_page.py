@@ -1,0 +1,279 @@
+"""The report as files: the same bytes, whole, closed, and harmless whatever a study holds."""
+
+import csv
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from pipistrelle.__main__ import main
+from pipistrelle.config import InputError
+from pipistrelle.experiments.studies.plan import cases_of
+from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
+from pipistrelle.report.claims.published import TABLE_II
+from pipistrelle.report.page import page as module
+from pipistrelle.report.page.page import write_report
+from pipistrelle.report.reading import read_study
+from pipistrelle.report.studied import RULES
+from pipistrelle.settings import from_flags
+from report.invented import invent, write_store
+
+FIGURES = [
+    "anees_ekf", "anees_fastslam", "example_map", "gain", "heading_rmse", "landmarks", "map_rmse",
+    "piston", "position_rmse", "table_ii",
+]  # fmt: skip
+BAD = "<script>alert('a')</script>\"'&"
+
+
+class Reader(HTMLParser):
+    """Collect elements and check that they close in order."""
+
+    VOID = frozenset({"meta", "link", "input", "br", "img"})
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.found = [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, dict(attrs)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.found.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def of(self, tag):
+        return [attrs for found, attrs in self.found if found == tag]
+
+
+def read(folder):
+    reader = Reader()
+    reader.feed((folder / "index.html").read_text(encoding="utf-8"))
+    assert reader.open == []
+    return reader
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report") / "store"
+    write_store(folder, invent(6), iterations=115, failed=((1, 4),))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def reported(store):
+    """What `pipistrelle report` writes of a partial study with a failed trial."""
+    assert main(["report", str(store), "--quiet"]) == 0
+    return store / "report"
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    monkeypatch.setattr(module, "_write_figure", lambda *_: None)
+
+
+def test_everything_is_there(reported):
+    assert sorted(path.name for path in reported.iterdir()) == [
+        "figures", "index.html", "summary.json",
+    ]  # fmt: skip
+    names = sorted(path.name for path in (reported / "figures").iterdir())
+    assert names == sorted(f"{name}.{kind}" for name in FIGURES for kind in ("csv", "pdf", "png"))
+
+
+def test_the_same_folder_gives_the_same_bytes(store, reported, tmp_path):
+    write_report(read_study(store), tmp_path)
+    for path in sorted(reported.rglob("*")):
+        if path.is_file():
+            there = tmp_path / path.relative_to(reported)
+            assert path.read_bytes() == there.read_bytes(), path.name
+
+
+def test_the_page_asks_for_nothing_outside(reported):
+    reader = read(reported)
+    for tag in ("script", "img", "link", "iframe", "use", "image"):
+        for attrs in reader.of(tag):
+            for name in ("src", "href", "xlink:href", "srcset"):
+                assert attrs.get(name, "data:,").startswith("data:")
+    text = (reported / "index.html").read_text(encoding="utf-8")
+    assert re.findall(r"url\(|@import|https?://", text) == []
+
+
+def test_links_lead_to_files_that_are_there_and_to_places_on_the_page(reported):
+    reader = read(reported)
+    places = {attrs.get("id") for _, attrs in reader.found}
+    for attrs in reader.of("a"):
+        target = attrs["href"]
+        if target.startswith("#"):
+            assert target[1:] in places
+        else:
+            assert (reported / target).is_file()
+
+
+def test_identities_are_given_once(reported):
+    given = [attrs["id"] for _, attrs in read(reported).found if "id" in attrs]
+    assert len(given) == len(set(given))
+
+
+def test_the_eight_verdicts_stand_on_the_page_and_in_the_summary(reported):
+    summary = json.loads((reported / "summary.json").read_text())
+    sections = [attrs for attrs in read(reported).of("section") if "data-claim" in attrs]
+    assert [int(attrs["data-claim"]) for attrs in sections] == list(range(1, 9))
+    assert [attrs["data-verdict"] for attrs in sections] == [
+        claim["verdict"] for claim in summary["claims"]
+    ]
+    for claim in summary["claims"]:
+        assert claim["verdict"] in ("reproduced", "not-reproduced", "open")
+        assert {"statistic", "interval", "p", "n", "by_exclusion"} <= claim.keys()
+
+
+def test_a_partial_study_says_so_and_a_whole_one_does_not(reported, tmp_path, undrawn):
+    text = (reported / "index.html").read_text(encoding="utf-8")
+    assert "6 of 115 worlds are done" in text
+    assert json.loads((reported / "summary.json").read_text())["partial"] is True
+    write_report((invent(6),), tmp_path)
+    assert "worlds are done" not in (tmp_path / "index.html").read_text(encoding="utf-8")
+
+
+def test_one_world_is_not_many(tmp_path, undrawn):
+    for worlds, words in ((1, "1 world · 50 trials"), (2, "2 worlds · 100 trials")):
+        write_report((invent(worlds),), tmp_path)
+        text = (tmp_path / "index.html").read_text(encoding="utf-8")
+        assert words in text
+        assert not re.search(r"\b1 worlds", text)
+
+
+def test_all_rules_can_be_looked_at(reported):
+    reader = read(reported)
+    shown = [set(attrs.get("class", "").split()) for attrs in reader.of("div")]
+    for rule in RULES:
+        assert sum({"by-rule", rule} <= names for names in shown) >= 8
+
+
+def test_failed_trials_are_told_with_their_world(reported):
+    text = (reported / "index.html").read_text(encoding="utf-8")
+    assert "1 failed trials" not in text
+    assert "1 failed trial" in text
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
+    (failed,) = json.loads((reported / "summary.json").read_text())["failed"]
+    assert failed["iteration"] == 1
+
+
+def test_no_text_of_a_study_becomes_markup(tmp_path, undrawn):
+    study = invent(3)
+    bad = replace(
+        study,
+        name=BAD,
+        settings={BAD: BAD},
+        grid={BAD: (BAD,)},
+        errors=((0, BAD, BAD, 33.0, BAD),),
+    )
+    write_report((bad, bad), tmp_path)
+    reader = read(tmp_path)
+    assert len(reader.of("script")) == 1
+    text = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert text.count("<script>") == 1
+    assert text.count("alert(&#39;a&#39;)") >= 6
+    assert not [a for _, attrs in reader.found for a in attrs if a.startswith("on")]
+
+
+def test_further_settings_have_their_verdicts_in_a_table(tmp_path, undrawn):
+    studies = tuple(replace(invent(3), settings={"air.relative_humidity": h}) for h in (0.3, 0.7))
+    write_report(studies, tmp_path)
+    text = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert "Verdicts by setting" in text
+    assert "air.relative_humidity = 0.7" in text
+    assert len(json.loads((tmp_path / "summary.json").read_text())["variants"]) == 2
+
+
+def test_failed_trials_of_all_settings_are_counted(tmp_path, capsys, undrawn):
+    grid = '"air.relative_humidity" = [0.3, 0.7]\n'
+    plan, _, _ = write_store(tmp_path / "store", invent(2), grid=grid)
+    moist = [c.number for c in cases_of(plan) if c.values["air.relative_humidity"] == 0.7]
+    failed = [(0, moist[0]), (1, moist[5]), (1, moist[-1])]
+    again = tmp_path / "again"
+    write_store(again, invent(2), grid=grid, failed=failed)
+    assert main(["report", str(again)]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0] == "failed: 3 trials; see the page"
+    assert printed[1] == "Not the paper's study: air.relative_humidity 0.3 (paper 0.5)"
+    summary = json.loads((again / "report" / "summary.json").read_text())
+    assert summary["trials_failed"] == 3
+    assert [variant["trials_failed"] for variant in summary["variants"]] == [0, 3]
+    assert [item["settings"] for item in summary["failed"]] == [{"air.relative_humidity": 0.7}] * 3
+    text = (again / "report" / "index.html").read_text(encoding="utf-8")
+    assert "over all settings, 3 trials failed" in text
+    assert text.count(", air.relative_humidity = 0.7</h4>") == 3
+
+
+def test_the_page_says_near_its_top_what_is_not_the_papers(tmp_path, undrawn):
+    for flags, there in (({"beacon": {"level_db": 45.0}}, True), ({}, False)):
+        plan = read_plan(find_plan("paper"), from_flags(flags))
+        write_report((replace(invent(2), config=plan.config, grid=plan.grid),), tmp_path)
+        ids = [attrs.get("id") for _, attrs in read(tmp_path).found]
+        assert ("departures" in ids) is there
+        if there:
+            assert ids.index("departures") < ids.index("claims")
+
+
+def test_the_summary_is_plain_json_even_of_a_study_that_diverged(tmp_path, undrawn):
+    study = invent(3)
+    for outcome in study.outcomes.values():
+        outcome.scores["position_rmse_m"][:] = np.inf
+        outcome.nees[0] = np.inf
+        outcome.diverged[:] = True
+    write_report((study,), tmp_path)
+    text = (tmp_path / "summary.json").read_text()
+    assert "Infinity" not in text
+    assert "NaN" not in text
+    read(tmp_path)
+
+
+def test_a_rule_that_leaves_no_world_says_so_and_the_others_are_shown(tmp_path, undrawn):
+    study = invent(3)
+    for way, outcome in study.outcomes.items():
+        outcome.diverged[:] = way[0] == "ekf"
+    write_report((study,), tmp_path)
+    text = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert text.count("No world is left under this rule.") == 2
+    assert (tmp_path / "figures" / "anees_ekf.csv").read_text().count("none,") > 0
+
+
+def test_table_ii_as_csv_has_the_papers_rows_under_each_rule(reported):
+    with (reported / "figures" / "table_ii.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(RULES) * len(TABLE_II)
+    assert [float(row["paper_full"]) for row in rows[:8]] == [row.full[0] for row in TABLE_II]
+    assert rows[0]["exclusion"] == "world"
+    assert float(rows[0]["full_std"]) > 0.0
+
+
+def test_figures_have_their_numbers_under_each_rule(reported):
+    for name in ("position_rmse", "anees_fastslam"):
+        with (reported / "figures" / f"{name}.csv").open(newline="") as file:
+            assert {row["exclusion"] for row in csv.DictReader(file)} == set(RULES)
+
+
+def test_the_command_prints_the_verdicts_and_the_page_last(store, tmp_path, capsys, undrawn):
+    assert main(["report", str(store), "-o", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0] == "partial: 6 of 115 worlds"
+    assert printed[1] == "failed: 1 trial; see the page"
+    assert [line[0] for line in printed[2:10]] == list("12345678")
+    assert printed[-1] == str(tmp_path / "out" / "index.html")
+
+
+def test_a_folder_that_is_no_study_ends_in_a_line(tmp_path, capsys):
+    assert main(["report", str(tmp_path)]) == 2
+    assert "plan.toml" in capsys.readouterr().err
+
+
+def test_a_place_that_cannot_be_written_is_refused(tmp_path, undrawn):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="file"):
+        write_report((invent(2),), tmp_path / "file" / "deep")
