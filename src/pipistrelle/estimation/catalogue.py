@@ -81,8 +81,6 @@ def _ekf(config: Config, motion: "Motion") -> "Estimator":
     settings = config.filter
     return EkfSlam(
         motion=motion,
-        range_std=settings.range_std,
-        bearing_std=settings.bearing_std,
         rays=config.rays,
         gate=settings.gate,
     )
@@ -100,8 +98,6 @@ def _fastslam(config: Config, motion: "Motion") -> "Estimator":
     settings = config.filter
     return FastSlam(
         motion=motion,
-        range_std=settings.range_std,
-        bearing_std=settings.bearing_std,
         rays=config.rays,
         gate=settings.gate,
         swarm=config.fastslam,

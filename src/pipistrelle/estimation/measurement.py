@@ -1,10 +1,16 @@
-"""The measurement model with its Jacobians: range and bearing of a point."""
+"""The measurement model with its Jacobians: range and bearing of a point.
+
+`Measurements` are the rows of a scan as the filters' kernels take them. A filter that weighs what
+else a scan may hold (its detours, its levels) adds a field here.
+"""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from pipistrelle.detection.scans import Scan
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel
 
@@ -12,8 +18,56 @@ NEAREST = 1e-3
 """A measurement of a point nearer than this [m] says nothing that can be linearised."""
 
 
+class Measurements(NamedTuple):
+    """Rows of a scan, each of a landmark of its own, as the kernels take them.
+
+    Attributes
+    ----------
+    landmark : (m)
+        Label.
+    bearing : (m) [rad]
+    range : (m) [m]
+        NaN where passive.
+    bearing_variance, range_variance : (m) [rad^2], [m^2]
+        R, row by row.
+    """
+
+    landmark: Int[np.ndarray, " m"]
+    bearing: Float[np.ndarray, " m"]
+    range: Float[np.ndarray, " m"]
+    bearing_variance: Float[np.ndarray, " m"]
+    range_variance: Float[np.ndarray, " m"]
+
+
+def measurements_of(scan: Scan) -> Measurements:
+    """Return a scan's rows as the kernels take them: standard deviations are squared here.
+
+    Parameters
+    ----------
+    scan : Scan
+
+    Returns
+    -------
+    Measurements
+
+    Examples
+    --------
+    >>> from pipistrelle.detection.scans import make_scan
+    >>> scan = make_scan(0.0, np.array([4]), np.zeros(1), range=2.0, bearing_std=0.5)
+    >>> measurements_of(scan).bearing_variance
+    array([0.25])
+    """
+    return Measurements(
+        landmark=scan.landmark,
+        bearing=scan.bearing,
+        range=scan.range,
+        bearing_variance=scan.bearing_std * scan.bearing_std,
+        range_variance=scan.range_std * scan.range_std,
+    )
+
+
 @kernel
-def sight(
+def observe(
     x: float, y: float, heading: float, px: float, py: float
 ) -> tuple[float, float, float, float, float]:
     """Range, bearing, direction cosines and inverse range of a point, for kernels.
@@ -60,7 +114,7 @@ def measurement_jacobians(
     array([[ 1. ,  0. ],
            [-0. ,  0.5]])
     """
-    _, _, c, s, k = sight(pose[0], pose[1], pose[2], point[0], point[1])
+    _, _, c, s, k = observe(pose[0], pose[1], pose[2], point[0], point[1])
     return (
         np.array([[-c, -s, 0.0], [s * k, -c * k, -1.0]]),
         np.array([[c, s], [-s * k, c * k]]),

@@ -63,7 +63,7 @@ def motion_numbers(motion: Motion) -> MotionNumbers:
 
 
 @kernel
-def advance(
+def motion_increment(
     model: int, wheelbase: float, heading: float, speed: float, turn: float, dt: float
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
     """One noise-free control step, for kernels.
@@ -98,14 +98,14 @@ def advance(
 
 
 @lean
-def carry_pose(
+def propagate_pose(
     pose: np.ndarray, P: np.ndarray, speed: float, turn: float, dt: float, motion: MotionNumbers
 ) -> tuple[float, float]:
     """Carry a pose (3) and its covariance (3, 3) through a control step, in place.
 
     F P F^T + U Q U^T (Bradley & Abaid, Eq. (10)); Q alone has rank 2. Returns dx and dy [m].
     """
-    dx, dy, dheading, u00, u10, u20, u01, u11, u21 = advance(
+    dx, dy, dheading, u00, u10, u20, u01, u11, u21 = motion_increment(
         motion.model, motion.wheelbase, pose[2], speed, turn, dt
     )
     pose[0] += dx
@@ -162,7 +162,7 @@ def motion_step(
     array([1.        , 1.        , 1.57079633])
     """
     numbers = motion_numbers(motion)
-    moved = advance(numbers.model, numbers.wheelbase, pose[2], control[0], control[1], dt)
+    moved = motion_increment(numbers.model, numbers.wheelbase, pose[2], control[0], control[1], dt)
     return np.array([pose[0] + moved[0], pose[1] + moved[1], wrap_angle(pose[2] + moved[2])])
 
 
@@ -195,7 +195,7 @@ def motion_jacobians(
     (np.float64(1.0), np.float64(5.0))
     """
     numbers = motion_numbers(motion)
-    moved = advance(numbers.model, numbers.wheelbase, pose[2], control[0], control[1], dt)
+    moved = motion_increment(numbers.model, numbers.wheelbase, pose[2], control[0], control[1], dt)
     F = np.eye(3)
     F[0, 2], F[1, 2] = -moved[1], moved[0]
     return F, np.array(moved[3:]).reshape(2, 3).T.copy()

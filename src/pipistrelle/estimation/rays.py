@@ -88,20 +88,17 @@ def ray_members(
 
 
 class Sensing(NamedTuple):
-    """What the kernels need to know of measurements and rays.
+    """What the kernels need to know of gates and rays.
 
     Attributes
     ----------
-    range_variance, bearing_variance : [m^2], [rad^2]
     passive_bound, active_bound : float
         Largest squared Mahalanobis distances.
     ray_ranges, ray_stds : (h) [m]
     power, prune : float
-    aggregated, reinitialise : bool
+    aggregated, reinitialise, exact : bool
     """
 
-    range_variance: float
-    bearing_variance: float
     passive_bound: float
     active_bound: float
     ray_ranges: Float[np.ndarray, " h"]
@@ -110,6 +107,7 @@ class Sensing(NamedTuple):
     prune: float
     aggregated: bool
     reinitialise: bool
+    exact: bool
 
 
 @lru_cache(maxsize=16)
@@ -135,14 +133,15 @@ def gate_bounds(gate: float) -> tuple[float, float]:
 
 
 @lru_cache(maxsize=16)
-def sensing_of(range_std: float, bearing_std: float, rays: RayConfig, gate: float) -> Sensing:
-    """Gather what the kernels need to know of measurements and rays, once per filter.
+def sensing_of(rays: RayConfig, gate: float, exact: bool = False) -> Sensing:
+    """Gather what the kernels need to know of gates and rays, once per filter.
 
     Parameters
     ----------
-    range_std, bearing_std : [m], [rad]
     rays : RayConfig
     gate : (0, 1]
+    exact : bool
+        Whether a bearing corrects every member by R itself, as in a Gaussian mixture (FastSLAM).
 
     Returns
     -------
@@ -151,8 +150,6 @@ def sensing_of(range_std: float, bearing_std: float, rays: RayConfig, gate: floa
     passive_bound, active_bound = gate_bounds(gate)
     ray_ranges, ray_stds = ray_members(rays)
     return Sensing(
-        range_variance=range_std**2,
-        bearing_variance=bearing_std**2,
         passive_bound=passive_bound,
         active_bound=active_bound,
         ray_ranges=ray_ranges,
@@ -161,6 +158,7 @@ def sensing_of(range_std: float, bearing_std: float, rays: RayConfig, gate: floa
         prune=rays.prune,
         aggregated=rays.weights == "aggregated",
         reinitialise=rays.partial == "reinitialise",
+        exact=exact,
     )
 
 
@@ -174,7 +172,9 @@ def log_likelihood(innovation: float, variance: float) -> float:
 
 
 @lean
-def _weigh_in_logs(log_likelihoods, weights, count):
+def _weigh_in_logs(
+    log_likelihoods: Float[np.ndarray, " h"], weights: Float[np.ndarray, " h"], count: int
+) -> float:
     """Multiply weights by likelihoods whose products underflow; returns the log of their sum."""
     largest, total = -np.inf, 0.0
     for j in range(count):

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.detection.logs.text_tables import Table, check_unique, refusal
-from pipistrelle.detection.scans import Scan
+from pipistrelle.detection.scans import Scan, make_scan
 from pipistrelle.geometry import wrap
 
 MEASUREMENT = ("time", "landmark", "bearing", "range")
@@ -172,7 +172,7 @@ def _scans(
     cuts = np.flatnonzero(np.diff(stamp)) + 1
     parts = zip(*(np.split(x, cuts) for x in (used, landmark, bearing, range)), strict=True)
     return tuple(
-        Scan(time=float(t[0]), landmark=label, bearing=angle, range=distance)
+        make_scan(float(t[0]), label, angle, range=distance)
         for t, label, angle, distance in parts
         if len(t)
     )

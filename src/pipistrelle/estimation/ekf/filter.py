@@ -19,19 +19,21 @@ from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.ekf.gaussian import (
     APPLIED,
     GATED,
+    State,
     bearing_variance,
-    carry,
     correct_active,
     correct_bearing,
     drop_members,
+    flush,
     gaussian_of,
+    initialise,
     joint_of,
-    place,
-    settle,
+    propagate,
 )
-from pipistrelle.estimation.measurement import sight
+from pipistrelle.estimation.measurement import Measurements, measurements_of, observe
 from pipistrelle.estimation.motion import Motion, motion_numbers
 from pipistrelle.estimation.rays import (
+    Sensing,
     heaviest,
     log_likelihood,
     sensing_of,
@@ -89,8 +91,6 @@ class EkfSlam:
     Attributes
     ----------
     motion : Motion
-    range_std, bearing_std : [m], [rad]
-        What the filter assumes of a measurement (R, squared).
     rays : RayConfig
     gate : float
         A measurement outside this share of its predicted distribution (chi-square) is dropped;
@@ -99,19 +99,17 @@ class EkfSlam:
     Examples
     --------
     >>> from pipistrelle.config import RayConfig
-    >>> from pipistrelle.detection.scans import Scan
+    >>> from pipistrelle.detection.scans import make_scan
     >>> motion = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
-    >>> slam = EkfSlam(motion=motion, range_std=0.2, bearing_std=0.15, rays=RayConfig())
+    >>> slam = EkfSlam(motion=motion, rays=RayConfig())
     >>> belief = slam.init(Gaussian(mean=np.zeros(3), covariance=np.eye(3) * 1e-4))
-    >>> heard = {"landmark": np.array([4, 9]), "bearing": np.array([0.1, 0.2])}
-    >>> scan = Scan(time=0.0, range=np.array([2.0, np.nan]), **heard)
+    >>> known = {"range": np.array([2.0, np.nan]), "range_std": 0.2, "bearing_std": 0.15}
+    >>> scan = make_scan(0.0, np.array([4, 9]), np.array([0.1, 0.2]), **known)
     >>> slam.update(belief, scan).landmarks().landmark.tolist()
     [4, 9, 9, 9, 9]
     """
 
     motion: Motion
-    range_std: float
-    bearing_std: float
     rays: RayConfig
     gate: float = 1.0
 
@@ -155,7 +153,7 @@ class EkfSlam:
         mean, covariance = belief.mean.copy(), belief.covariance.copy()
         poses = Gaussian(mean=np.empty((len(dt), 3)), covariance=np.empty((len(dt), 3, 3)))
         numbers = motion_numbers(self.motion)
-        carry(mean, covariance, controls, dt, numbers, poses.mean, poses.covariance)
+        propagate(mean, covariance, controls, dt, numbers, poses.mean, poses.covariance)
         moved = EkfBelief(
             mean=mean,
             covariance=covariance,
@@ -192,10 +190,8 @@ class EkfSlam:
             belief.covariance,
             belief.landmark,
             belief.weight,
-            scan.landmark,
-            scan.bearing,
-            scan.range,
-            sensing_of(self.range_std, self.bearing_std, self.rays, self.gate),
+            measurements_of(scan),
+            sensing_of(self.rays, self.gate),
         )
         return EkfBelief(
             mean=mean,
@@ -216,7 +212,7 @@ class _Scratch(NamedTuple):
 
 
 @kernel
-def _scratch(members):
+def _scratch(members: int) -> _Scratch:
     """Make room for so many members."""
     return _Scratch(
         np.empty(members),
@@ -227,7 +223,7 @@ def _scratch(members):
 
 
 @lean
-def _members_of(landmark, members, label):
+def _members_of(landmark: Int[np.ndarray, " h"], members: int, label: int) -> tuple[int, int]:
     """Index of a landmark's first member and how many it has (0: not mapped)."""
     for first in range(members):
         if landmark[first] == label:
@@ -239,13 +235,21 @@ def _members_of(landmark, members, label):
 
 
 @lean
-def _correct_ray(joint, weight, members, first, count, bearing, sensing, scratch):
+def _correct_ray(
+    state: State,
+    first: int,
+    count: int,
+    bearing: float,
+    variance: float,
+    sensing: Sensing,
+    scratch: _Scratch,
+) -> int:
     """Weigh a ray's members by a bearing and share it among them; GATED when none expected it."""
-    mean, size, variance = joint.mean, 3 + 2 * members, sensing.bearing_variance
-    outcome = GATED
+    joint, mean, size = state.joint, state.joint.mean, 3 + 2 * state.members[0]
+    weight, outcome = state.weight[first:], GATED
     for j in range(count):
         i = 3 + 2 * (first + j)
-        _, expected, c, s, k = sight(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
+        _, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
         innovation = wrap_angle(bearing - expected)
         S = bearing_variance(joint, size, i, c, s, k) + variance
         scratch.likelihood[j] = log_likelihood(innovation, S)
@@ -254,7 +258,7 @@ def _correct_ray(joint, weight, members, first, count, bearing, sensing, scratch
     if outcome == GATED:
         return GATED
     weigh_and_share(
-        scratch.likelihood, weight[first:], count, sensing.power, sensing.aggregated, scratch.share
+        scratch.likelihood, weight, count, sensing.power, sensing.aggregated, scratch.share
     )
     for j in range(count):
         if scratch.share[j] > 0.0:
@@ -265,105 +269,104 @@ def _correct_ray(joint, weight, members, first, count, bearing, sensing, scratch
 
 @lean
 def _range_for_ray(
-    joint, landmark, weight, members, first, count, distance, bearing, sensing, scratch
-):
-    """Give a partial landmark its range: one member is left. Returns the members left."""
-    left = 0 if sensing.reinitialise else heaviest(weight[first:], count)
+    state: State,
+    first: int,
+    count: int,
+    heard: Measurements,
+    m: int,
+    sensing: Sensing,
+    scratch: _Scratch,
+) -> None:
+    """Give a partial landmark the range of measurement m: one member is left."""
+    left = 0 if sensing.reinitialise else heaviest(state.weight[first:], count)
     for j in range(count):
         scratch.keep[j] = j == left
-    members = drop_members(
-        joint, landmark, weight, members, first, count, scratch.keep, scratch.source
-    )
-    weight[first] = 1.0
-    mean, size, i = joint.mean, 3 + 2 * members, 3 + 2 * first
+    drop_members(state, first, count, scratch.keep, scratch.source)
+    state.weight[first] = 1.0
+    distance, bearing, variance = heard.range[m], heard.bearing[m], heard.bearing_variance[m]
+    joint, mean = state.joint, state.joint.mean
+    size, i = 3 + 2 * state.members[0], 3 + 2 * first
     if sensing.reinitialise:
-        place(
-            mean, joint.covariance, size, i, distance, bearing,
-            sensing.range_variance, sensing.bearing_variance,
-        )  # fmt: skip
+        initialise(
+            mean, joint.covariance, size, i, distance, bearing, heard.range_variance[m], variance
+        )
     else:
-        _, _, c, s, _ = sight(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
+        _, _, c, s, _ = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
         mean[i], mean[i + 1] = mean[0] + distance * c, mean[1] + distance * s
-        correct_bearing(joint, size, i, bearing, sensing.bearing_variance, np.inf)
-    return members
+        correct_bearing(joint, size, i, bearing, variance, np.inf)
 
 
 @lean
-def _correct_known(joint, landmark, weight, members, label, bearing, distance, sensing, scratch):
-    """Correct with one measurement of a mapped landmark: the members left, and whether gated."""
-    first, count = _members_of(landmark, members, label)
-    size, i, passive = 3 + 2 * members, 3 + 2 * first, math.isnan(distance)
-    if count == 1 and passive:
-        outcome = correct_bearing(
-            joint, size, i, bearing, sensing.bearing_variance, sensing.passive_bound
-        )
-    elif count == 1:
-        outcome = correct_active(
-            joint, size, i, distance, bearing,
-            sensing.range_variance, sensing.bearing_variance, sensing.active_bound,
-        )  # fmt: skip
-    elif passive:
-        outcome = _correct_ray(joint, weight, members, first, count, bearing, sensing, scratch)
-        keep, kept = scratch.keep, count
-        if outcome == APPLIED:
-            kept = survivors(weight[first:], count, sensing.prune, keep)
-        if kept < count:
-            members = drop_members(
-                joint, landmark, weight, members, first, count, keep, scratch.source
-            )
-    else:
-        outcome = APPLIED
-        members = _range_for_ray(
-            joint, landmark, weight, members, first, count, distance, bearing, sensing, scratch
-        )
-    return members, outcome
-
-
-@lean
-def _place_new(joint, landmark, weight, members, label, bearing, distance, sensing):
-    """Append a landmark, one member or a ray of them (Eqs. (16) to (18)); the members there are."""
+def _correct_known(
+    state: State, heard: Measurements, m: int, sensing: Sensing, scratch: _Scratch
+) -> int:
+    """Correct with measurement m, of a mapped landmark; tell whether it was gated."""
+    first, count = _members_of(state.landmark, state.members[0], heard.landmark[m])
+    distance, bearing, variance = heard.range[m], heard.bearing[m], heard.bearing_variance[m]
+    joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
     passive = math.isnan(distance)
+    if count == 1 and passive:
+        return correct_bearing(joint, size, i, bearing, variance, sensing.passive_bound)
+    if count == 1:
+        spread, bound = heard.range_variance[m], sensing.active_bound
+        return correct_active(joint, size, i, distance, bearing, spread, variance, bound)
+    if not passive:
+        _range_for_ray(state, first, count, heard, m, sensing, scratch)
+        return APPLIED
+    if _correct_ray(state, first, count, bearing, variance, sensing, scratch) == GATED:
+        return GATED
+    if survivors(state.weight[first:], count, sensing.prune, scratch.keep) < count:
+        drop_members(state, first, count, scratch.keep, scratch.source)
+    return APPLIED
+
+
+@lean
+def _add_new(state: State, heard: Measurements, m: int, sensing: Sensing) -> None:
+    """Append the landmark of measurement m, one member or a ray of them (Eqs. (16) to (18))."""
+    joint, passive = state.joint, math.isnan(heard.range[m])
     count = sensing.ray_ranges.size if passive else 1
     for j in range(count):
-        far = sensing.ray_ranges[j] if passive else distance
-        spread = sensing.ray_stds[j] ** 2 if passive else sensing.range_variance
-        size = 3 + 2 * members
-        place(
-            joint.mean, joint.covariance, size, size, far, bearing, spread,
-            sensing.bearing_variance,
+        far = sensing.ray_ranges[j] if passive else heard.range[m]
+        spread = sensing.ray_stds[j] ** 2 if passive else heard.range_variance[m]
+        member = state.members[0]
+        size = 3 + 2 * member
+        initialise(
+            joint.mean, joint.covariance, size, size, far, heard.bearing[m], spread,
+            heard.bearing_variance[m],
         )  # fmt: skip
-        landmark[members], weight[members] = label, 1.0 / count
-        members += 1
-    return members
+        state.landmark[member], state.weight[member] = heard.landmark[m], 1.0 / count
+        state.members[0] += 1
 
 
 @kernel
-def _update(old_mean, old_covariance, old_landmark, old_weight, labels, bearings, ranges, sensing):
+def _update(
+    old_mean: Float[np.ndarray, " d"],
+    old_covariance: Float[np.ndarray, "d d"],
+    old_landmark: Int[np.ndarray, " h"],
+    old_weight: Float[np.ndarray, " h"],
+    heard: Measurements,
+    sensing: Sensing,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
     """Correct, prune and extend a copy of the belief; returns its arrays and the gated count."""
-    members, most = old_landmark.size, old_landmark.size
-    known = np.empty(labels.size, dtype=np.bool_)
-    for m in range(labels.size):
-        known[m] = _members_of(old_landmark, members, labels[m])[1] > 0
+    members, rows = old_landmark.size, heard.landmark.size
+    most, known = members, np.empty(rows, dtype=np.bool_)
+    for m in range(rows):
+        known[m] = _members_of(old_landmark, members, heard.landmark[m])[1] > 0
         if not known[m]:
-            most += sensing.ray_ranges.size if math.isnan(ranges[m]) else 1
+            most += sensing.ray_ranges.size if math.isnan(heard.range[m]) else 1
     joint, scratch = joint_of(old_mean, old_covariance, 3 + 2 * most), _scratch(most)
-    landmark, weight, gated = np.empty(most, dtype=np.int64), np.empty(most), 0
+    landmark, weight = np.empty(most, dtype=np.int64), np.empty(most)
+    state, gated = State(joint, landmark, weight, np.full(1, members)), 0
     for member in range(members):
         landmark[member], weight[member] = old_landmark[member], old_weight[member]
-    for m in range(labels.size):
+    for m in range(rows):
         if known[m]:
-            members, outcome = _correct_known(
-                joint, landmark, weight, members, labels[m], bearings[m], ranges[m], sensing,
-                scratch,
-            )  # fmt: skip
-            gated += outcome
-    settle(joint, 3 + 2 * members)
-    for m in range(labels.size):
+            gated += _correct_known(state, heard, m, sensing, scratch)
+    flush(joint, 3 + 2 * state.members[0])
+    for m in range(rows):
         if not known[m]:
-            members = _place_new(
-                joint, landmark, weight, members, labels[m], bearings[m], ranges[m], sensing
-            )
+            _add_new(state, heard, m, sensing)
     joint.mean[2] = wrap_angle(joint.mean[2])
-    size = 3 + 2 * members
-    mean, covariance = gaussian_of(joint, size)
+    members = state.members[0]
+    mean, covariance = gaussian_of(joint, 3 + 2 * members)
     return mean, covariance, landmark[:members].copy(), weight[:members].copy(), gated

@@ -1,4 +1,4 @@
-r"""Kernels on one Gaussian over a pose and points: carry, correct, place and drop.
+r"""Kernels on one Gaussian over a pose and points: propagate, correct, initialise and drop.
 
 The state is x, y, heading, then two numbers per point. A correction subtracts :math:`W W^T` with
 :math:`W = \bar P H^T L^{-T}, L L^T = S`: the two halves of the covariance get the same products
@@ -15,10 +15,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from pipistrelle.estimation.measurement import NEAREST, sight
-from pipistrelle.estimation.motion import carry_pose
+from pipistrelle.estimation.measurement import NEAREST, observe
+from pipistrelle.estimation.motion import MotionNumbers, propagate_pose
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel, lean
 
@@ -50,14 +50,34 @@ class Joint(NamedTuple):
     waiting: Int[np.ndarray, "1"]
 
 
+class State(NamedTuple):
+    """What EKF-SLAM corrects: the Gaussian, and whose its points are.
+
+    Attributes
+    ----------
+    joint : Joint
+    landmark : (h)
+        Label of each member; the members of a ray stand together, near to far.
+    weight : (h)
+        Aggregated likelihood of each member within its landmark.
+    members : (1)
+        How many there are; the arrays have room for more.
+    """
+
+    joint: Joint
+    landmark: Int[np.ndarray, " h"]
+    weight: Float[np.ndarray, " h"]
+    members: Int[np.ndarray, "1"]
+
+
 @kernel
-def _lanes(size):
+def _lanes(size: int) -> int:
     """Least multiple of a cache line's numbers that holds so many."""
     return (size + LANE - 1) // LANE * LANE
 
 
 @kernel
-def _on_cache_lines(rows, width):
+def _on_cache_lines(rows: int, width: int) -> Float[np.ndarray, "rows width"]:
     """Make an array (rows, width) that begins on a cache line."""
     buffer = np.empty(rows * width + LANE)
     start = -(buffer.ctypes.data // 8) % LANE
@@ -65,7 +85,9 @@ def _on_cache_lines(rows, width):
 
 
 @kernel
-def joint_of(mean, covariance, room):
+def joint_of(
+    mean: Float[np.ndarray, " d"], covariance: Float[np.ndarray, "d d"], room: int
+) -> Joint:
     """Copy a mean (d) and a covariance (d, d) into a `Joint` with room for so many numbers."""
     size, width = mean.size, _lanes(mean.size)
     longer, wider = np.empty(room), _on_cache_lines(room, _lanes(room))
@@ -83,7 +105,9 @@ def joint_of(mean, covariance, room):
 
 
 @kernel
-def gaussian_of(joint, size):
+def gaussian_of(
+    joint: Joint, size: int
+) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
     """Copy the mean (d) and the covariance (d, d) out of a settled `Joint`."""
     mean, covariance = np.empty(size), np.empty((size, size))
     for a in range(size):
@@ -94,7 +118,9 @@ def gaussian_of(joint, size):
 
 
 @lean
-def _point_rows(joint, size, i):
+def _point_rows(
+    joint: Joint, size: int, i: int
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Rows i and i + 1 of the covariance, with all that waits subtracted from them."""
     pi, pj, W = joint.covariance[i], joint.covariance[i + 1], joint.W
     first, last, width = joint.taken[i], joint.waiting[0], _lanes(size)
@@ -117,7 +143,7 @@ def _point_rows(joint, size, i):
 
 
 @lean
-def settle(joint, size):
+def flush(joint: Joint, size: int) -> None:
     """Let every row catch up: afterwards nothing waits."""
     covariance = joint.covariance
     for i in range(3, size, 2):
@@ -129,7 +155,7 @@ def settle(joint, size):
 
 
 @lean
-def _wait(joint, size, w, step):
+def _defer(joint: Joint, size: int, w: Float[np.ndarray, " m"], step: float) -> None:
     """Add step w to the mean, subtract w w^T from the pose's rows, and let the points' wait."""
     mean, p0, p1, p2 = joint.mean, joint.covariance[0], joint.covariance[1], joint.covariance[2]
     x, y, h = w[0], w[1], w[2]
@@ -142,12 +168,20 @@ def _wait(joint, size, w, step):
 
 
 @kernel
-def carry(mean, covariance, controls, dt, motion, pose_means, pose_covariances):
+def propagate(
+    mean: Float[np.ndarray, " d"],
+    covariance: Float[np.ndarray, "d d"],
+    controls: Float[np.ndarray, "k 2"],
+    dt: Float[np.ndarray, " k"],
+    motion: MotionNumbers,
+    pose_means: Float[np.ndarray, "k 3"],
+    pose_covariances: Float[np.ndarray, "k 3 3"],
+) -> None:
     """Advance mean and covariance in place; cross-covariances once, by the product of the F."""
     pose, P = mean[:3], covariance[:3, :3].copy()
     shift_x = shift_y = 0.0  # entries (0, 2) and (1, 2) of the product of the F
     for k in range(controls.shape[0]):
-        dx, dy = carry_pose(pose, P, controls[k, 0], controls[k, 1], dt[k], motion)
+        dx, dy = propagate_pose(pose, P, controls[k, 0], controls[k, 1], dt[k], motion)
         shift_x -= dy
         shift_y += dx
         for a in range(3):  # an assignment of slices would compile for a second longer
@@ -165,7 +199,7 @@ def carry(mean, covariance, controls, dt, motion, pose_means, pose_covariances):
 
 
 @lean
-def bearing_variance(joint, size, i, c, s, k):
+def bearing_variance(joint: Joint, size: int, i: int, c: float, s: float, k: float) -> float:
     """Innovation variance H P H^T of the bearing of the member at state index i, without R."""
     h0, h1 = s * k, -c * k  # by pose: (h0, h1, -1); by member: (-h0, -h1)
     p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
@@ -182,14 +216,16 @@ def bearing_variance(joint, size, i, c, s, k):
 
 
 @lean
-def correct_bearing(joint, size, i, bearing, variance, bound):
+def correct_bearing(
+    joint: Joint, size: int, i: int, bearing: float, variance: float, bound: float
+) -> int:
     """Correct the state with the bearing of the member at index i; GATED when beyond bound."""
     mean = joint.mean
-    distance, expected, c, s, k = sight(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
+    distance, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     if distance < NEAREST:
         return APPLIED
     if joint.waiting[0] == MOST_WAITING:
-        settle(joint, size)
+        flush(joint, size)
     innovation = wrap_angle(bearing - expected)
     h0, h1 = s * k, -c * k
     p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
@@ -203,19 +239,28 @@ def correct_bearing(joint, size, i, bearing, variance, bound):
     root = 1.0 / math.sqrt(S)
     for a in range(size):
         w0[a] *= root
-    _wait(joint, size, w0, root * innovation)
+    _defer(joint, size, w0, root * innovation)
     return APPLIED
 
 
 @lean
-def correct_active(joint, size, i, distance, bearing, range_variance, bearing_variance, bound):
+def correct_active(
+    joint: Joint,
+    size: int,
+    i: int,
+    distance: float,
+    bearing: float,
+    range_variance: float,
+    bearing_variance: float,
+    bound: float,
+) -> int:
     """Correct the state with range and bearing of the member at index i; GATED beyond bound."""
     mean = joint.mean
-    near, expected, c, s, k = sight(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
+    near, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     if near < NEAREST:
         return APPLIED
     if joint.waiting[0] + 2 > MOST_WAITING:
-        settle(joint, size)
+        flush(joint, size)
     nu0, nu1 = distance - near, wrap_angle(bearing - expected)
     h0, h1 = s * k, -c * k
     p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
@@ -238,13 +283,22 @@ def correct_active(joint, size, i, distance, bearing, range_variance, bearing_va
     for a in range(size):
         w0[a] /= L00
         w1[a] = (w1[a] - L10 * w0[a]) / L11
-    _wait(joint, size, w0, e0)
-    _wait(joint, size, w1, e1)
+    _defer(joint, size, w0, e0)
+    _defer(joint, size, w1, e1)
     return APPLIED
 
 
 @lean
-def place(mean, covariance, size, i, distance, bearing, range_variance, bearing_variance):
+def initialise(
+    mean: Float[np.ndarray, " n"],
+    covariance: Float[np.ndarray, "n m"],
+    size: int,
+    i: int,
+    distance: float,
+    bearing: float,
+    range_variance: float,
+    bearing_variance: float,
+) -> None:
     """Put a member at state index i, at a range and bearing from the pose (Eq. (16)).
 
     The first ``size`` rows but the member's own are the rest of the state, with which it is
@@ -272,13 +326,20 @@ def place(mean, covariance, size, i, distance, bearing, range_variance, bearing_
 
 
 @lean
-def drop_members(joint, landmark, weight, members, first, count, keep, source):
-    """Close the gaps that dropped members of one landmark leave; returns the members left.
+def drop_members(
+    state: State,
+    first: int,
+    count: int,
+    keep: Bool[np.ndarray, " h"],
+    source: Int[np.ndarray, " n"],
+) -> None:
+    """Close the gaps that dropped members of one landmark leave.
 
     ``source`` is room for as many indices as the state has numbers.
     """
+    joint, landmark, weight, members = state.joint, state.landmark, state.weight, state.members[0]
     size = 3 + 2 * members
-    settle(joint, size)
+    flush(joint, size)
     left = first
     for a in range(size):
         source[a] = a
@@ -293,4 +354,4 @@ def drop_members(joint, landmark, weight, members, first, count, keep, source):
         joint.mean[a] = joint.mean[source[a]]
         for b in range(3 + 2 * left):
             new[b] = old[source[b]]
-    return left
+    state.members[0] = left

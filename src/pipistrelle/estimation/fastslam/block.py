@@ -15,6 +15,7 @@ likelihood. Given the pose, members are independent of each other.
 import math
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from pipistrelle.arithmetic.elementary import arctangent, cosine_and_sine, logarithm, wrapped
 from pipistrelle.estimation.measurement import NEAREST
@@ -27,13 +28,20 @@ X, Y, HEADING, PXX, PXY, PYY, PXH, PYH, PHH = range(0, 9 * LANES, LANES)
 XX, XY, YY, LOG_WEIGHT = range(2 * LANES, 6 * LANES, LANES)
 POSE, MEMBER = 9 * LANES, 6 * LANES
 """Numbers of a block's poses, and of one member of each of its particles."""
+Poses = Float[np.ndarray, " rows"]
+Member = Float[np.ndarray, " numbers"]
+Lanes = Float[np.ndarray, " lanes"]
+Counts = Int[np.ndarray, " lanes"]
+"""Of a block: its poses, one member of each of its particles, a number of each, a count of each."""
 HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
 ROUNDING = 1e-12
 """A pivot under this share of its variance is rounding: one control step has noise of rank 2."""
 
 
 @inlined
-def _bearing(pose, member, bearing, i):
+def _bearing(
+    pose: Poses, member: Member, bearing: float, i: int
+) -> tuple[float, float, float, bool]:
     """Innovation of a member's bearing; its slopes by x and y of the pose; whether it has any."""
     dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
     squared = dx * dx + dy * dy
@@ -43,7 +51,7 @@ def _bearing(pose, member, bearing, i):
 
 
 @inlined
-def _bearing_gain(pose, h0, h1, i):
+def _bearing_gain(pose: Poses, h0: float, h1: float, i: int) -> tuple[float, float, float]:
     """Covariance of x, y and heading with the bearing, whose slopes are (h0, h1, -1)."""
     return (
         h0 * pose[PXX + i] + h1 * pose[PXY + i] - pose[PXH + i],
@@ -53,14 +61,22 @@ def _bearing_gain(pose, h0, h1, i):
 
 
 @inlined
-def _spread(member, h0, h1, i):
+def _spread(member: Member, h0: float, h1: float, i: int) -> float:
     """Variance of the bearing that a member's own uncertainty causes."""
     cross = 2.0 * h0 * h1 * member[XY + i]
     return h0 * h0 * member[XX + i] + cross + h1 * h1 * member[YY + i]
 
 
 @lean
-def expect_bearing(pose, member, bearing, variance, count, j, log_likelihood):
+def expect_bearing(
+    pose: Poses,
+    member: Member,
+    bearing: float,
+    variance: float,
+    count: Counts,
+    j: int,
+    log_likelihood: Lanes,
+) -> None:
     """Log likelihood, without its constant, of the bearing of each lane's member j (Eq. (19)).
 
     Minus infinity where a lane has no member j. A member too near to foresee its bearing makes it
@@ -77,7 +93,15 @@ def expect_bearing(pose, member, bearing, variance, count, j, log_likelihood):
 
 
 @lean
-def bearing_beyond(pose, member, bearing, variance, count, j, bound):
+def bearing_beyond(
+    pose: Poses,
+    member: Member,
+    bearing: float,
+    variance: float,
+    count: Counts,
+    j: int,
+    bound: float,
+) -> bool:
     """Whether the bearing is beyond the bound for member j of every lane that has one."""
     beyond = 0
     for i in range(LANES):
@@ -90,7 +114,9 @@ def bearing_beyond(pose, member, bearing, variance, count, j, bound):
 
 
 @lean
-def refine_by_bearing(pose, member, bearing, variance, share):
+def refine_by_bearing(
+    pose: Poses, member: Member, bearing: float, variance: float, share: Lanes
+) -> None:
     """Correct the poses by the bearing of a member, of whose information each has a share."""
     for i in range(LANES):
         innovation, h0, h1, far = _bearing(pose, member, bearing, i)
@@ -111,7 +137,9 @@ def refine_by_bearing(pose, member, bearing, variance, share):
 
 
 @lean
-def correct_by_bearing(pose, member, bearing, variance, share):
+def correct_by_bearing(
+    pose: Poses, member: Member, bearing: float, variance: float, share: Lanes
+) -> None:
     """Correct a member by its bearing from certain poses, of whose information each has a share."""
     for i in range(LANES):
         innovation, h0, h1, far = _bearing(pose, member, bearing, i)
@@ -128,7 +156,9 @@ def correct_by_bearing(pose, member, bearing, variance, share):
 
 
 @inlined
-def _active(pose, member, distance, bearing, i):
+def _active(
+    pose: Poses, member: Member, distance: float, bearing: float, i: int
+) -> tuple[float, float, float, float, float, bool]:
     """Innovations of range and bearing, direction (c, s), inverse range, whether it is far."""
     dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
     near = math.sqrt(dx * dx + dy * dy)
@@ -138,7 +168,9 @@ def _active(pose, member, distance, bearing, i):
 
 
 @inlined
-def _whitened(nu0, nu1, S00, S01, S11):
+def _whitened(
+    nu0: float, nu1: float, S00: float, S01: float, S11: float
+) -> tuple[float, float, float, float, float]:
     """Innovations made independent and of variance one: they, and what makes them so."""
     i0 = 1.0 / math.sqrt(S00)
     L10 = S01 * i0
@@ -148,7 +180,16 @@ def _whitened(nu0, nu1, S00, S01, S11):
 
 
 @inlined
-def _active_spread(pose, member, c, s, k, range_variance, bearing_variance, i):
+def _active_spread(
+    pose: Poses,
+    member: Member,
+    c: float,
+    s: float,
+    k: float,
+    range_variance: float,
+    bearing_variance: float,
+    i: int,
+) -> tuple[float, float, float, float, float, float, float, float, float]:
     """Covariance of range and bearing with x, y, heading, and of their innovations."""
     h0, h1 = s * k, -c * k
     a0 = -c * pose[PXX + i] - s * pose[PXY + i]
@@ -164,7 +205,16 @@ def _active_spread(pose, member, c, s, k, range_variance, bearing_variance, i):
 
 
 @lean
-def active_beyond(pose, member, distance, bearing, range_variance, bearing_variance, count, bound):
+def active_beyond(
+    pose: Poses,
+    member: Member,
+    distance: float,
+    bearing: float,
+    range_variance: float,
+    bearing_variance: float,
+    count: Counts,
+    bound: float,
+) -> bool:
     """Whether range and bearing are beyond the bound for every lane, each of one member."""
     beyond = 0
     for i in range(LANES):
@@ -180,8 +230,15 @@ def active_beyond(pose, member, distance, bearing, range_variance, bearing_varia
 
 @lean
 def refine_by_active(
-    pose, member, distance, bearing, range_variance, bearing_variance, count, log_weight
-):
+    pose: Poses,
+    member: Member,
+    distance: float,
+    bearing: float,
+    range_variance: float,
+    bearing_variance: float,
+    count: Counts,
+    log_weight: Lanes,
+) -> None:
     """Correct the poses whose landmark has one member by range and bearing, and weigh them."""
     for i in range(LANES):
         nu0, nu1, c, s, k, far = _active(pose, member, distance, bearing, i)
@@ -207,7 +264,15 @@ def refine_by_active(
 
 
 @lean
-def correct_by_active(pose, member, distance, bearing, range_variance, bearing_variance, count):
+def correct_by_active(
+    pose: Poses,
+    member: Member,
+    distance: float,
+    bearing: float,
+    range_variance: float,
+    bearing_variance: float,
+    count: Counts,
+) -> None:
     """Correct, where it is its landmark's only one, a member by range and bearing."""
     for i in range(LANES):
         nu0, nu1, c, s, k, far = _active(pose, member, distance, bearing, i)
@@ -231,9 +296,16 @@ def correct_by_active(pose, member, distance, bearing, range_variance, bearing_v
 
 
 @lean
-def place_member(
-    pose, member, distance, bearing, range_variance, bearing_variance, log_weight, count
-):
+def initialise_member(
+    pose: Poses,
+    member: Member,
+    distance: float,
+    bearing: float,
+    range_variance: float,
+    bearing_variance: float,
+    log_weight: float,
+    count: Counts,
+) -> None:
     """Put a member at a range and bearing, where a landmark has not one member (Eq. (16))."""
     across = bearing_variance * distance * distance
     for i in range(LANES):
@@ -252,7 +324,7 @@ def place_member(
 
 
 @lean
-def sample_pose(pose, normal):
+def sample_pose(pose: Poses, normal: Lanes) -> None:
     """Draw the poses from their Gaussians with three standard normals each; no spread is left."""
     for i in range(LANES):
         L00 = math.sqrt(max(pose[PXX + i], 0.0))

@@ -24,14 +24,20 @@ from pipistrelle.estimation.fastslam.block import (
     PXY,
     PYH,
     PYY,
+    Counts,
+    Lanes,
+    Poses,
     X,
     Y,
     correct_by_bearing,
     expect_bearing,
     refine_by_bearing,
 )
-from pipistrelle.estimation.rays import SMALLEST_AGGREGATED_SHARE, SMALLEST_SHARE
+from pipistrelle.estimation.rays import SMALLEST_AGGREGATED_SHARE, SMALLEST_SHARE, Sensing
 from pipistrelle.jit import kernel, lean
+
+Rows = Float[np.ndarray, "h numbers"]
+"""The members of one landmark."""
 
 
 class Scratch(NamedTuple):
@@ -51,14 +57,14 @@ class Scratch(NamedTuple):
     likelihood: Float[np.ndarray, "h lanes"]
     posterior: Float[np.ndarray, "h lanes"]
     share: Float[np.ndarray, "h lanes"]
-    largest: Float[np.ndarray, " lanes"]
-    total: Float[np.ndarray, " lanes"]
-    whole: Float[np.ndarray, " lanes"]
+    largest: Lanes
+    total: Lanes
+    whole: Lanes
     refined: Float[np.ndarray, "h rows"]
 
 
 @kernel
-def room(members):
+def scratch_for(members: int) -> Scratch:
     """Return room to work with rays of so many members."""
     return Scratch(
         np.empty((members, LANES)),
@@ -72,7 +78,7 @@ def room(members):
 
 
 @lean
-def _largest(logs, members, largest):
+def _largest(logs: Float[np.ndarray, "h lanes"], members: int, largest: Lanes) -> None:
     """Largest of each lane's logs."""
     for i in range(LANES):
         largest[i] = -np.inf
@@ -83,7 +89,7 @@ def _largest(logs, members, largest):
 
 
 @lean
-def _weigh(rows, members, scratch):
+def _weigh(rows: Rows, members: int, scratch: Scratch) -> None:
     """Aggregated likelihoods, in logs and normalised, into ``posterior`` (Eq. (18)).
 
     Their sum before, in logs, goes to ``total``.
@@ -108,7 +114,7 @@ def _weigh(rows, members, scratch):
 
 
 @lean
-def _share(members, sensing, scratch):
+def _share(members: int, sensing: Sensing, scratch: Scratch) -> None:
     """Divide the measurement: shares go with a power of the likelihoods, now or aggregated."""
     logs = scratch.posterior if sensing.aggregated else scratch.likelihood
     smallest = SMALLEST_AGGREGATED_SHARE if sensing.aggregated else SMALLEST_SHARE
@@ -128,35 +134,54 @@ def _share(members, sensing, scratch):
 
 
 @lean
-def _add(log_likelihood, log_weight):
+def _add(log_likelihood: Lanes, log_weight: Lanes) -> None:
     """Add log likelihoods, and their constant, to log weights."""
     for i in range(LANES):
         log_weight[i] += log_likelihood[i] - HALF_LOG_TAU
 
 
 @lean
-def refine_by_ray(pose, rows, count, members, bearing, sensing, exact, scratch, log_weight):
-    """Correct the poses by the bearing of a landmark, and weigh them by its likelihood."""
-    for j in range(members):
-        expect_bearing(
-            pose, rows[j], bearing, sensing.bearing_variance, count, j, scratch.likelihood[j]
-        )
-    if members == 1:
-        _add(scratch.likelihood[0], log_weight)
-        refine_by_bearing(pose, rows[0], bearing, sensing.bearing_variance, scratch.whole)
-        return
-    _weigh(rows, members, scratch)
-    _add(scratch.total, log_weight)
-    if exact:
-        _refine_to_mixture(pose, rows, members, bearing, sensing.bearing_variance, scratch)
-        return
-    _share(members, sensing, scratch)
-    for j in range(members):
-        refine_by_bearing(pose, rows[j], bearing, sensing.bearing_variance, scratch.share[j])
+def most(count: Counts) -> int:
+    """Members of the lane that has most."""
+    largest = 1
+    for i in range(LANES):
+        largest = max(largest, count[i])
+    return largest
 
 
 @lean
-def _refine_to_mixture(pose, rows, members, bearing, variance, scratch):
+def refine_by_ray(
+    pose: Poses,
+    rows: Rows,
+    count: Counts,
+    bearing: float,
+    variance: float,
+    sensing: Sensing,
+    scratch: Scratch,
+    log_weight: Lanes,
+) -> None:
+    """Correct the poses by the bearing of a landmark, and weigh them by its likelihood."""
+    members = most(count)
+    for j in range(members):
+        expect_bearing(pose, rows[j], bearing, variance, count, j, scratch.likelihood[j])
+    if members == 1:
+        _add(scratch.likelihood[0], log_weight)
+        refine_by_bearing(pose, rows[0], bearing, variance, scratch.whole)
+        return
+    _weigh(rows, members, scratch)
+    _add(scratch.total, log_weight)
+    if sensing.exact:
+        _refine_to_mixture(pose, rows, members, bearing, variance, scratch)
+        return
+    _share(members, sensing, scratch)
+    for j in range(members):
+        refine_by_bearing(pose, rows[j], bearing, variance, scratch.share[j])
+
+
+@lean
+def _refine_to_mixture(
+    pose: Poses, rows: Rows, members: int, bearing: float, variance: float, scratch: Scratch
+) -> None:
     """Set the poses to mean and covariance of the mixture of the members' refinements."""
     for j in range(members):
         refined, weight = scratch.refined[j], scratch.posterior[j]
@@ -185,23 +210,33 @@ def _refine_to_mixture(pose, rows, members, bearing, variance, scratch):
 
 
 @lean
-def correct_ray(pose, rows, count, members, bearing, sensing, exact, scratch):
+def correct_ray(
+    pose: Poses,
+    rows: Rows,
+    count: Counts,
+    bearing: float,
+    variance: float,
+    sensing: Sensing,
+    scratch: Scratch,
+) -> None:
     """Weigh, correct and prune a landmark's members from certain poses, in place."""
+    members = most(count)
+    if members == 1:
+        correct_by_bearing(pose, rows[0], bearing, variance, scratch.whole)
+        return
     for j in range(members):
-        expect_bearing(
-            pose, rows[j], bearing, sensing.bearing_variance, count, j, scratch.likelihood[j]
-        )
+        expect_bearing(pose, rows[j], bearing, variance, count, j, scratch.likelihood[j])
     _weigh(rows, members, scratch)
-    if not exact:
+    if not sensing.exact:
         _share(members, sensing, scratch)
     for j in range(members):
-        share = scratch.whole if exact else scratch.share[j]
-        correct_by_bearing(pose, rows[j], bearing, sensing.bearing_variance, share)
+        share = scratch.whole if sensing.exact else scratch.share[j]
+        correct_by_bearing(pose, rows[j], bearing, variance, share)
     _prune(rows, count, members, sensing.prune, scratch)
 
 
 @lean
-def _prune(rows, count, members, prune, scratch):
+def _prune(rows: Rows, count: Counts, members: int, prune: float, scratch: Scratch) -> None:
     """Drop members whose aggregated likelihood is too small; the heaviest stays (Eq. (21))."""
     largest, total = scratch.largest, scratch.total
     _largest(scratch.posterior, members, largest)
@@ -228,7 +263,7 @@ def _prune(rows, count, members, prune, scratch):
 
 
 @lean
-def _close_up(rows, count, keep):
+def _close_up(rows: Rows, count: Counts, keep: Float[np.ndarray, "h lanes"]) -> None:
     """Move the members that are kept to the front, lane by lane."""
     for i in range(LANES):
         left = 0

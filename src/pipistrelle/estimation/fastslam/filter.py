@@ -35,16 +35,16 @@ from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.fastslam.block import LANES, MEMBER
 from pipistrelle.estimation.fastslam.particles import (
-    SMALLEST_STD,
-    advance_swarm,
-    correct_swarm,
-    descend,
+    Particles,
+    correct_particles,
     gated_by_all,
     mean_full,
     particle_map,
-    summarise,
+    resample_into,
 )
+from pipistrelle.estimation.fastslam.poses import SMALLEST_STD, propagate, summarise
 from pipistrelle.estimation.fastslam.resampling import effective_particles, normalised, stratified
+from pipistrelle.estimation.measurement import Measurements, measurements_of
 from pipistrelle.estimation.motion import Motion, motion_numbers
 from pipistrelle.estimation.rays import Sensing, sensing_of
 
@@ -118,8 +118,6 @@ class FastSlam:
     Attributes
     ----------
     motion : Motion
-    range_std, bearing_std : [m], [rad]
-        What the filter assumes of a measurement (R, squared).
     rays : RayConfig
     gate : float
         A measurement that is outside this share of every particle's predicted distribution is
@@ -129,19 +127,18 @@ class FastSlam:
 
     Examples
     --------
+    >>> from pipistrelle.detection.scans import make_scan
     >>> motion = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
-    >>> slam = FastSlam(motion=motion, range_std=0.2, bearing_std=0.15, rays=RayConfig())
+    >>> slam = FastSlam(motion=motion, rays=RayConfig())
     >>> belief = slam.init(Gaussian(mean=np.zeros(3), covariance=np.eye(3) * 1e-4))
-    >>> heard = {"landmark": np.array([4, 9]), "bearing": np.array([0.1, 0.2])}
-    >>> scan = Scan(time=0.0, range=np.array([2.0, np.nan]), **heard)
+    >>> known = {"range": np.array([2.0, np.nan]), "range_std": 0.2, "bearing_std": 0.15}
+    >>> scan = make_scan(0.0, np.array([4, 9]), np.array([0.1, 0.2]), **known)
     >>> belief = slam.update(belief, scan, np.random.default_rng(1))
     >>> belief.landmarks().landmark.tolist(), belief.full
     ([4, 9, 9, 9, 9], 1.0)
     """
 
     motion: Motion
-    range_std: float
-    bearing_std: float
     rays: RayConfig
     gate: float = 1.0
     swarm: FastSlamConfig = _PAPER
@@ -199,7 +196,7 @@ class FastSlam:
         poses = Gaussian(mean=np.empty((steps, 3)), covariance=np.empty((steps, 3, 3)))
         weight = normalised(belief.log_weight)
         numbers = motion_numbers(self.motion)
-        advance_swarm(carried, weight, controls, dt, numbers, poses.mean, poses.covariance)
+        propagate(carried, weight, controls, dt, numbers, poses.mean, poses.covariance)
         if not steps:
             return belief, poses
         estimate = Gaussian(mean=poses.mean[-1], covariance=poses.covariance[-1])
@@ -230,17 +227,14 @@ class FastSlam:
             return belief
         particles = self.swarm.particles
         normal, uniform = rng.standard_normal((particles, 3)), rng.random(particles)
-        sensing = sensing_of(self.range_std, self.bearing_std, self.rays, self.gate)
-        scan, gated = self._inside(belief, scan, sensing)
-        poses, gained, landmark, first, count, member = correct_swarm(
-            belief.poses, belief.landmark, belief.first, belief.count, belief.member,
-            scan.landmark, scan.bearing, scan.range, normal, sensing,
-            self.swarm.mixture == "exact",
-        )  # fmt: skip
+        sensing = sensing_of(self.rays, self.gate, self.swarm.mixture == "exact")
+        heard, gated = self._inside(belief, measurements_of(scan), sensing)
+        corrected, gained = correct_particles(_particles(belief), heard, normal, sensing)
+        poses, landmark, first, count, member = corrected
         weight = normalised(belief.log_weight + gained)
-        best_count, best_member = particle_map(count, member, np.argmax(weight))
+        best_count, best_member = particle_map(count, member, int(np.argmax(weight)))
         mean, covariance = summarise(poses, weight)
-        corrected = FastSlamBelief(
+        after = FastSlamBelief(
             poses=poses,
             log_weight=np.log(weight, where=weight > 0.0, out=np.full(particles, -np.inf)),
             landmark=landmark,
@@ -254,29 +248,28 @@ class FastSlam:
             gated=belief.gated + gated,
         )
         if effective_particles(weight) >= self.swarm.resample_below * particles:
-            return corrected
-        return _descend(corrected, stratified(weight, uniform))
+            return after
+        return _resampled(after, stratified(weight, uniform))
 
-    def _inside(self, belief: FastSlamBelief, scan: Scan, sensing: Sensing) -> tuple[Scan, int]:
+    def _inside(
+        self, belief: FastSlamBelief, heard: Measurements, sensing: Sensing
+    ) -> tuple[Measurements, int]:
         """Drop the measurements that no particle expected; tell how many."""
         if self.gate >= 1.0:
-            return scan, 0
-        dropped = gated_by_all(
-            belief.poses, belief.landmark, belief.first, belief.count, belief.member,
-            scan.landmark, scan.bearing, scan.range, sensing,
-        )  # fmt: skip
-        kept = Scan(
-            time=scan.time,
-            landmark=scan.landmark[~dropped],
-            bearing=scan.bearing[~dropped],
-            range=scan.range[~dropped],
-        )
+            return heard, 0
+        dropped = gated_by_all(_particles(belief), heard, sensing)
+        kept = Measurements(*(column[~dropped] for column in heard))
         return kept, int(np.count_nonzero(dropped))
 
 
-def _descend(belief: FastSlamBelief, ancestor: Int[np.ndarray, " p"]) -> FastSlamBelief:
+def _particles(belief: FastSlamBelief) -> Particles:
+    """Return a belief's particles as the kernels take them."""
+    return Particles(belief.poses, belief.landmark, belief.first, belief.count, belief.member)
+
+
+def _resampled(belief: FastSlamBelief, ancestor: Int[np.ndarray, " p"]) -> FastSlamBelief:
     """Put copies of the ancestors in the particles' places, all of one weight."""
-    poses, count, member = descend(belief.poses, belief.count, belief.member, ancestor)
+    poses, count, member = resample_into(_particles(belief), ancestor)
     log_weight = np.full(ancestor.size, -math.log(ancestor.size))
     return replace(belief, poses=poses, log_weight=log_weight, count=count, member=member)
 

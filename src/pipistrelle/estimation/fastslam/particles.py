@@ -1,148 +1,78 @@
-"""Kernels on all particles: advance, gate, correct, summarise. A block's steps: `particle`.
+"""Kernels on all particles: gate, correct, resample. A block's steps: `block`, `block_rays`.
 
 Landmark n of a block has its members in the rows ``member[b, first[n] : first[n + 1]]``, of which
 lane i has the first ``count[b, n, i]``: the particles share the rows, not the members.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
-from pipistrelle.arithmetic.elementary import cosine_and_sine, wrapped
 from pipistrelle.estimation.fastslam.block import (
-    HEADING,
     LANES,
     LOG_WEIGHT,
     MEMBER,
-    PHH,
     POSE,
-    PXH,
-    PXX,
-    PXY,
-    PYH,
-    PYY,
+    Counts,
+    Lanes,
+    Member,
+    Poses,
     X,
     Y,
     active_beyond,
     bearing_beyond,
     correct_by_active,
     correct_by_bearing,
-    place_member,
+    initialise_member,
     refine_by_active,
     sample_pose,
 )
-from pipistrelle.estimation.fastslam.block_rays import correct_ray, refine_by_ray, room
-from pipistrelle.estimation.motion import advance
+from pipistrelle.estimation.fastslam.block_rays import (
+    Rows,
+    Scratch,
+    correct_ray,
+    most,
+    refine_by_ray,
+    scratch_for,
+)
+from pipistrelle.estimation.measurement import Measurements
+from pipistrelle.estimation.rays import Sensing
 from pipistrelle.jit import kernel, lean
 
-SMALLEST_STD = 1e-6
-"""Added in quadrature to the pose estimate's x, y [m] and heading [rad]: a swarm that stands still
-or has one ancestor may have no spread, and its covariance no inverse."""
-LEAST = SMALLEST_STD**2
+
+class Particles(NamedTuple):
+    """All particles, as the kernels take them; the arrays of a `FastSlamBelief`.
+
+    Attributes
+    ----------
+    pose : (b, 9 L)
+    landmark : (n)
+    first : (n + 1)
+    count : (b, n, L)
+    member : (b, c, 6 L)
+    """
+
+    pose: Float[np.ndarray, "b rows"]
+    landmark: Int[np.ndarray, " n"]
+    first: Int[np.ndarray, " n+1"]
+    count: Int[np.ndarray, "b n lanes"]
+    member: Float[np.ndarray, "b c numbers"]
 
 
-@lean
-def _add_moments(pose, weight, sums):
-    """Add a block's weighted positions and directions, lane by lane."""
-    for i in range(LANES):
-        c, s = cosine_and_sine(pose[HEADING + i])
-        sums[X + i] += weight[i] * pose[X + i]
-        sums[Y + i] += weight[i] * pose[Y + i]
-        sums[PXX + i] += weight[i] * c
-        sums[PXY + i] += weight[i] * s
+class Block(NamedTuple):
+    """One block: poses, what their weights gain, the maps."""
 
-
-@lean
-def _add_spread(pose, weight, x, y, heading, sums):
-    """Add a block's weighted covariances and squared distances from the mean, lane by lane."""
-    for i in range(LANES):
-        dx, dy, turn = pose[X + i] - x, pose[Y + i] - y, wrapped(pose[HEADING + i] - heading)
-        sums[PXX + i] += weight[i] * (dx * dx + pose[PXX + i])
-        sums[PXY + i] += weight[i] * (dx * dy + pose[PXY + i])
-        sums[PYY + i] += weight[i] * (dy * dy + pose[PYY + i])
-        sums[PXH + i] += weight[i] * (dx * turn + pose[PXH + i])
-        sums[PYH + i] += weight[i] * (dy * turn + pose[PYH + i])
-        sums[PHH + i] += weight[i] * (turn * turn + pose[PHH + i])
-
-
-@kernel
-def _add_lanes(sums):
-    """Sum of each row over its lanes."""
-    total = np.empty(POSE // LANES)
-    for row in range(total.size):
-        so_far = 0.0
-        for i in range(row * LANES, (row + 1) * LANES):
-            so_far += sums[i]
-        total[row] = so_far
-    return total
+    pose: Poses
+    gained: Lanes
+    first: Int[np.ndarray, " n+1"]
+    count: Int[np.ndarray, "n lanes"]
+    member: Float[np.ndarray, "c numbers"]
 
 
 @kernel
-def summarise(pose, weight):
-    """Mean (circular in the heading) and covariance of a swarm's pose, its particles' included."""
-    blocks = pose.shape[0]
-    lanes, sums = np.zeros((blocks, LANES)), np.zeros(POSE)
-    for p in range(weight.size):
-        lanes[p // LANES, p % LANES] = weight[p]
-    for b in range(blocks):
-        _add_moments(pose[b], lanes[b], sums)
-    mean = _add_lanes(sums)
-    mean[2] = math.atan2(mean[4], mean[3])
-    sums[:] = 0.0
-    for b in range(blocks):
-        _add_spread(pose[b], lanes[b], mean[0], mean[1], mean[2], sums)
-    spread, covariance = _add_lanes(sums), np.empty((3, 3))
-    covariance[0, 0] = spread[3] + LEAST
-    covariance[0, 1] = covariance[1, 0] = spread[4]
-    covariance[1, 1] = spread[5] + LEAST
-    covariance[0, 2] = covariance[2, 0] = spread[6]
-    covariance[1, 2] = covariance[2, 1] = spread[7]
-    covariance[2, 2] = spread[8] + LEAST
-    mean[2] = wrapped(mean[2])
-    return mean[:3].copy(), covariance
-
-
-@lean
-def _advance_block(pose, step, q0, q1):
-    """Carry a block's poses through a control step, known in the vehicle's frame (Eq. (10))."""
-    ahead, aside, turn, u00, u10, u20, u01, u11, u21 = step
-    for i in range(LANES):
-        c, s = cosine_and_sine(pose[HEADING + i])
-        dx, dy = c * ahead - s * aside, s * ahead + c * aside
-        v00, v10 = c * u00 - s * u10, s * u00 + c * u10
-        v01, v11 = c * u01 - s * u11, s * u01 + c * u11
-        xh, yh, hh = pose[PXH + i], pose[PYH + i], pose[PHH + i]
-        pose[X + i] += dx
-        pose[Y + i] += dy
-        pose[HEADING + i] = wrapped(pose[HEADING + i] + turn)
-        pose[PXX + i] += dy * dy * hh - 2.0 * dy * xh + q0 * v00 * v00 + q1 * v01 * v01
-        pose[PXY + i] += dx * xh - dy * yh - dx * dy * hh + q0 * v00 * v10 + q1 * v01 * v11
-        pose[PYY + i] += 2.0 * dx * yh + dx * dx * hh + q0 * v10 * v10 + q1 * v11 * v11
-        pose[PXH + i] = xh - dy * hh + q0 * v00 * u20 + q1 * v01 * u21
-        pose[PYH + i] = yh + dx * hh + q0 * v10 * u20 + q1 * v11 * u21
-        pose[PHH + i] = hh + q0 * u20 * u20 + q1 * u21 * u21
-
-
-@kernel
-def advance_swarm(pose, weight, controls, dt, motion, pose_means, pose_covariances):
-    """Carry every particle through control steps, in place, and summarise after each."""
-    for k in range(dt.size):
-        speed, turn = controls[k, 0], controls[k, 1]
-        step = advance(motion.model, motion.wheelbase, 0.0, speed, turn, dt[k])
-        noisy = 1.0 if motion.noise_at_rest or speed != 0.0 or turn != 0.0 else 0.0
-        for b in range(pose.shape[0]):
-            _advance_block(
-                pose[b], step, noisy * motion.speed_variance, noisy * motion.turn_variance
-            )
-        mean, covariance = summarise(pose, weight)
-        for a in range(3):
-            pose_means[k, a] = mean[a]
-            for b in range(3):
-                pose_covariances[k, a, b] = covariance[a, b]
-
-
-@kernel
-def _slots(landmark, labels):
+def _slots(landmark: Int[np.ndarray, " n"], labels: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
     """Index of each label among the landmarks; -1 for a new one."""
     slot = np.empty(labels.size, dtype=np.int64)
     for m in range(labels.size):
@@ -154,48 +84,69 @@ def _slots(landmark, labels):
 
 
 @lean
-def _most(count):
-    """Members of the lane that has most."""
-    most = 1
-    for i in range(LANES):
-        most = max(most, count[i])
-    return most
+def _active_gated(
+    pose: Poses, member: Member, heard: Measurements, m: int, count: Counts, bound: float
+) -> bool:
+    """Whether range and bearing of measurement m are beyond the bound for every lane."""
+    return active_beyond(
+        pose, member, heard.range[m], heard.bearing[m], heard.range_variance[m],
+        heard.bearing_variance[m], count, bound,
+    )  # fmt: skip
 
 
 @kernel
-def gated_by_all(pose, landmark, first, count, member, labels, bearings, ranges, sensing):
+def gated_by_all(
+    particles: Particles, heard: Measurements, sensing: Sensing
+) -> Bool[np.ndarray, " m"]:
     """Whether each measurement is beyond the gate of every particle that could use it."""
-    slot, gated = _slots(landmark, labels), np.zeros(labels.size, dtype=np.bool_)
-    for m in range(labels.size):
+    slot = _slots(particles.landmark, heard.landmark)
+    gated, blocks = np.zeros(slot.size, dtype=np.bool_), particles.pose.shape[0]
+    for m in range(slot.size):
         n = slot[m]
         gated[m] = n >= 0
-        for b in range(pose.shape[0] if n >= 0 else 0):
-            rows, counts = member[b, first[n] : first[n + 1]], count[b, n]
-            if not math.isnan(ranges[m]):
-                gated[m] = gated[m] and active_beyond(
-                    pose[b], rows[0], ranges[m], bearings[m],
-                    sensing.range_variance, sensing.bearing_variance, counts, sensing.active_bound,
-                )  # fmt: skip
+        for b in range(blocks if n >= 0 else 0):
+            pose, count = particles.pose[b], particles.count[b, n]
+            rows = particles.member[b, particles.first[n] : particles.first[n + 1]]
+            if not math.isnan(heard.range[m]):
+                gated[m] = gated[m] and _active_gated(
+                    pose, rows[0], heard, m, count, sensing.active_bound
+                )
                 continue
-            for j in range(_most(counts)):
+            bearing, variance = heard.bearing[m], heard.bearing_variance[m]
+            for j in range(most(count)):
                 gated[m] = gated[m] and bearing_beyond(
-                    pose[b], rows[j], bearings[m], sensing.bearing_variance, counts, j,
-                    sensing.passive_bound,
-                )  # fmt: skip
+                    pose, rows[j], bearing, variance, count, j, sensing.passive_bound
+                )
     return gated
 
 
 @lean
-def _range_for_ray(pose, rows, count, distance, bearing, sensing, share):
-    """Give partial landmarks their range: of each one member is left, the first.
+def _initialise_active(
+    pose: Poses, member: Member, heard: Measurements, m: int, count: Counts
+) -> None:
+    """Put a member at range and bearing of measurement m, where a landmark has not one member."""
+    initialise_member(
+        pose, member, heard.range[m], heard.bearing[m], heard.range_variance[m],
+        heard.bearing_variance[m], 0.0, count,
+    )  # fmt: skip
+
+
+@lean
+def _range_for_ray(
+    pose: Poses,
+    rows: Rows,
+    count: Counts,
+    heard: Measurements,
+    m: int,
+    sensing: Sensing,
+    share: Lanes,
+) -> None:
+    """Give partial landmarks the range of measurement m: of each one member is left, the first.
 
     ``share`` is room for what each lane takes of the bearing: one where it had a ray, else zero.
     """
     if sensing.reinitialise:
-        place_member(
-            pose, rows[0], distance, bearing,
-            sensing.range_variance, sensing.bearing_variance, 0.0, count,
-        )  # fmt: skip
+        _initialise_active(pose, rows[0], heard, m, count)
         return
     for i in range(LANES):
         share[i] = 0.0
@@ -207,154 +158,154 @@ def _range_for_ray(pose, rows, count, distance, bearing, sensing, share):
         for k in range(i, MEMBER, LANES):
             rows[0, k] = rows[best, k]
         dx, dy = rows[0, X + i] - pose[X + i], rows[0, Y + i] - pose[Y + i]
-        scale = distance / max(math.sqrt(dx * dx + dy * dy), 1e-12)
+        scale = heard.range[m] / max(math.sqrt(dx * dx + dy * dy), 1e-12)
         rows[0, X + i], rows[0, Y + i] = pose[X + i] + dx * scale, pose[Y + i] + dy * scale
         rows[0, LOG_WEIGHT + i] = 0.0
-    correct_by_bearing(pose, rows[0], bearing, sensing.bearing_variance, share)
+    correct_by_bearing(pose, rows[0], heard.bearing[m], heard.bearing_variance[m], share)
 
 
 @lean
 def _refine(
-    pose, log_weight, first, count, member, slot, bearings, ranges, sensing, exact, scratch
-):
+    block: Block,
+    slot: Int[np.ndarray, " m"],
+    heard: Measurements,
+    sensing: Sensing,
+    scratch: Scratch,
+) -> None:
     """Refine a block's poses, and weigh them, by all measurements of their landmarks."""
     for m in range(slot.size):
         n = slot[m]
         if n < 0:
             continue
-        rows = member[first[n] : first[n + 1]]
-        if math.isnan(ranges[m]):
+        rows, bearing = block.member[block.first[n] : block.first[n + 1]], heard.bearing[m]
+        variance, count = heard.bearing_variance[m], block.count[n]
+        if math.isnan(heard.range[m]):
             refine_by_ray(
-                pose, rows, count[n], _most(count[n]), bearings[m], sensing, exact, scratch,
-                log_weight,
-            )  # fmt: skip
+                block.pose, rows, count, bearing, variance, sensing, scratch, block.gained
+            )
         else:
             refine_by_active(
-                pose, rows[0], ranges[m], bearings[m],
-                sensing.range_variance, sensing.bearing_variance, count[n], log_weight,
+                block.pose, rows[0], heard.range[m], bearing, heard.range_variance[m], variance,
+                count, block.gained,
             )  # fmt: skip
 
 
 @lean
-def _correct(pose, first, count, member, slot, bearings, ranges, sensing, exact, scratch):
+def _correct(
+    block: Block,
+    slot: Int[np.ndarray, " m"],
+    heard: Measurements,
+    sensing: Sensing,
+    scratch: Scratch,
+) -> None:
     """Correct a block's measured landmarks from its sampled poses, in place."""
     for m in range(slot.size):
         n = slot[m]
         if n < 0:
             continue
-        rows = member[first[n] : first[n + 1]]
-        most = _most(count[n])
-        if math.isnan(ranges[m]):
-            if most == 1:
-                correct_by_bearing(
-                    pose, rows[0], bearings[m], sensing.bearing_variance, scratch.whole
-                )
-            else:
-                correct_ray(pose, rows, count[n], most, bearings[m], sensing, exact, scratch)
+        rows, bearing = block.member[block.first[n] : block.first[n + 1]], heard.bearing[m]
+        pose, variance, count = block.pose, heard.bearing_variance[m], block.count[n]
+        if math.isnan(heard.range[m]):
+            correct_ray(pose, rows, count, bearing, variance, sensing, scratch)
             continue
         correct_by_active(
-            pose, rows[0], ranges[m], bearings[m],
-            sensing.range_variance, sensing.bearing_variance, count[n],
-        )  # fmt: skip
-        if most > 1:
-            _range_for_ray(pose, rows, count[n], ranges[m], bearings[m], sensing, scratch.total)
-            count[n] = 1
+            pose, rows[0], heard.range[m], bearing, heard.range_variance[m], variance, count
+        )
+        if most(count) > 1:
+            _range_for_ray(pose, rows, count, heard, m, sensing, scratch.total)
+            count[:] = 1
 
 
 @lean
-def _place(pose, rows, count, bearing, distance, sensing):
+def _add_new(
+    pose: Poses, rows: Rows, count: Counts, heard: Measurements, m: int, sensing: Sensing
+) -> None:
     """Place a block's new landmark, one member or a ray of them (Eqs. (16) to (18))."""
-    if not math.isnan(distance):
-        place_member(
-            pose, rows[0], distance, bearing,
-            sensing.range_variance, sensing.bearing_variance, 0.0, count,
-        )  # fmt: skip
+    if not math.isnan(heard.range[m]):
+        _initialise_active(pose, rows[0], heard, m, count)
         count[:] = 1
         return
     members = sensing.ray_ranges.size
     for j in range(members):
-        place_member(
-            pose, rows[j], sensing.ray_ranges[j], bearing,
-            sensing.ray_stds[j] ** 2, sensing.bearing_variance, -math.log(members), count,
+        initialise_member(
+            pose, rows[j], sensing.ray_ranges[j], heard.bearing[m], sensing.ray_stds[j] ** 2,
+            heard.bearing_variance[m], -math.log(members), count,
         )  # fmt: skip
     count[:] = members
 
 
 @kernel
-def _rows(landmark, count, slot, labels, ranges, rays):
+def _rows(
+    particles: Particles, slot: Int[np.ndarray, " m"], heard: Measurements, rays: int
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n+1"], int]:
     """Labels with the new ones, each landmark's first row, and the most rows that one needs."""
-    known, widest = landmark.size, 1
-    fresh = 0
+    known, fresh, widest = particles.landmark.size, 0, 1
     for m in range(slot.size):
         fresh += slot[m] < 0
-    all_labels = np.empty(known + fresh, dtype=np.int64)
+    labels = np.empty(known + fresh, dtype=np.int64)
     first = np.zeros(known + fresh + 1, dtype=np.int64)
     for n in range(known):
-        most = 1
-        for b in range(count.shape[0]):
-            most = max(most, _most(count[b, n]))
-        all_labels[n], first[n + 1] = landmark[n], first[n] + most
-        widest = max(widest, most)
+        wide = 1
+        for b in range(particles.count.shape[0]):
+            wide = max(wide, most(particles.count[b, n]))
+        labels[n], first[n + 1] = particles.landmark[n], first[n] + wide
+        widest = max(widest, wide)
     for m in range(slot.size):
         if slot[m] < 0:
-            all_labels[known] = labels[m]
-            most = rays if math.isnan(ranges[m]) else 1
-            first[known + 1] = first[known] + most
-            widest = max(widest, most)
+            labels[known] = heard.landmark[m]
+            wide = rays if math.isnan(heard.range[m]) else 1
+            first[known + 1] = first[known] + wide
+            widest = max(widest, wide)
             known += 1
-    return all_labels, first, widest
+    return labels, first, widest
 
 
 @lean
-def _copy_members(old_first, old_count, old_member, first, count, member):
-    """Copy a block's members into their new rows."""
-    for n in range(old_count.shape[0]):
-        for j in range(first[n + 1] - first[n]):
-            source, target = old_member[old_first[n] + j], member[first[n] + j]
+def _copy_members(particles: Particles, b: int, block: Block) -> None:
+    """Copy the members of a block into the rows that they now have."""
+    for n in range(particles.landmark.size):
+        for j in range(block.first[n + 1] - block.first[n]):
+            source = particles.member[b, particles.first[n] + j]
+            target = block.member[block.first[n] + j]
             for k in range(MEMBER):
                 target[k] = source[k]
         for i in range(LANES):
-            count[n, i] = old_count[n, i]
+            block.count[n, i] = particles.count[b, n, i]
 
 
 @kernel
-def correct_swarm(
-    old_pose, old_landmark, old_first, old_count, old_member,
-    labels, bearings, ranges, normal, sensing, exact,
-):  # fmt: skip
-    """Refine, sample, correct and place in copies of all particles; returns the belief's arrays."""
-    pose, gained = old_pose.copy(), np.zeros((old_pose.shape[0], LANES))
-    draw = np.empty(3 * LANES)
-    slot, known, blocks = _slots(old_landmark, labels), old_landmark.size, old_pose.shape[0]
-    rays = sensing.ray_ranges.size
-    landmark, first, widest = _rows(old_landmark, old_count, slot, labels, ranges, rays)
+def correct_particles(
+    old: Particles, heard: Measurements, normal: Float[np.ndarray, "p 3"], sensing: Sensing
+) -> tuple[Particles, Float[np.ndarray, " p"]]:
+    """Refine, sample, correct and extend a copy of all particles; returns it and log weights."""
+    blocks, known, total = old.pose.shape[0], old.landmark.size, normal.shape[0]
+    slot = _slots(old.landmark, heard.landmark)
+    landmark, first, widest = _rows(old, slot, heard, sensing.ray_ranges.size)
+    pose, gained = old.pose.copy(), np.zeros((blocks, LANES))
     count = np.zeros((blocks, landmark.size, LANES), dtype=np.int64)
     member = np.empty((blocks, first[-1], MEMBER))
-    scratch = room(widest)
+    scratch, draw = scratch_for(widest), np.empty(3 * LANES)
     for b in range(blocks):
-        _copy_members(old_first, old_count[b], old_member[b], first, count[b], member[b])
-        _refine(
-            pose[b], gained[b], first, count[b], member[b], slot, bearings, ranges,
-            sensing, exact, scratch,
-        )  # fmt: skip
+        block = Block(pose[b], gained[b], first, count[b], member[b])
+        _copy_members(old, b, block)
+        _refine(block, slot, heard, sensing, scratch)
         for k in range(draw.size):
-            particle = min(b * LANES + k % LANES, normal.shape[0] - 1)
-            draw[k] = normal[particle, k // LANES]
-        sample_pose(pose[b], draw)
-        _correct(
-            pose[b], first, count[b], member[b], slot, bearings, ranges, sensing, exact, scratch
-        )
+            draw[k] = normal[min(b * LANES + k % LANES, total - 1), k // LANES]
+        sample_pose(block.pose, draw)
+        _correct(block, slot, heard, sensing, scratch)
         n = known
-        for m in range(labels.size):
+        for m in range(slot.size):
             if slot[m] < 0:
-                rows = member[b, first[n] : first[n + 1]]
-                _place(pose[b], rows, count[b, n], bearings[m], ranges[m], sensing)
+                rows = block.member[first[n] : first[n + 1]]
+                _add_new(block.pose, rows, block.count[n], heard, m, sensing)
                 n += 1
-    return pose, gained.ravel()[: normal.shape[0]], landmark, first, count, member
+    return Particles(pose, landmark, first, count, member), gained.ravel()[:total]
 
 
 @kernel
-def particle_map(count, member, particle):
+def particle_map(
+    count: Int[np.ndarray, "b n lanes"], member: Float[np.ndarray, "b c numbers"], particle: int
+) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "c 6"]]:
     """One particle's members, row by row: the number of each landmark's, and (c, 6) numbers."""
     b, i = particle // LANES, particle % LANES
     rows = np.empty((member.shape[1], MEMBER // LANES))
@@ -365,7 +316,7 @@ def particle_map(count, member, particle):
 
 
 @kernel
-def mean_full(count, weight):
+def mean_full(count: Int[np.ndarray, "b n lanes"], weight: Float[np.ndarray, " p"]) -> float:
     """Weighted mean number of landmarks of one member: exact where all particles agree."""
     first, more = 0, 0.0
     for p in range(weight.size):
@@ -378,22 +329,25 @@ def mean_full(count, weight):
 
 
 @kernel
-def descend(old_pose, old_count, old_member, ancestor):
+def resample_into(
+    old: Particles, ancestor: Int[np.ndarray, " p"]
+) -> tuple[
+    Float[np.ndarray, "b rows"], Int[np.ndarray, "b n lanes"], Float[np.ndarray, "b c numbers"]
+]:
     """Put copies of the ancestors in the particles' places; spare lanes follow the last."""
-    pose, count = np.empty_like(old_pose), np.empty_like(old_count)
-    member = np.empty_like(old_member)
-    source = np.empty(LANES, dtype=np.int64)
+    pose, count = np.empty_like(old.pose), np.empty_like(old.count)
+    member, source = np.empty_like(old.member), np.empty(LANES, dtype=np.int64)
     for b in range(pose.shape[0]):
         for i in range(LANES):
             source[i] = ancestor[min(b * LANES + i, ancestor.size - 1)]
         for k in range(POSE):
             a = source[k % LANES]
-            pose[b, k] = old_pose[a // LANES, k - k % LANES + a % LANES]
+            pose[b, k] = old.pose[a // LANES, k - k % LANES + a % LANES]
         for n in range(count.shape[1]):
             for i in range(LANES):
-                count[b, n, i] = old_count[source[i] // LANES, n, source[i] % LANES]
+                count[b, n, i] = old.count[source[i] // LANES, n, source[i] % LANES]
         for j in range(member.shape[1]):
             for k in range(0, MEMBER, LANES):
                 for i in range(LANES):
-                    member[b, j, k + i] = old_member[source[i] // LANES, j, k + source[i] % LANES]
+                    member[b, j, k + i] = old.member[source[i] // LANES, j, k + source[i] % LANES]
     return pose, count, member

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Complex
+from jaxtyping import Complex, Int
 
 from pipistrelle.acoustics.arrivals import (
     ACTIVE,
@@ -37,7 +37,7 @@ from pipistrelle.arrays.receiver import (
 )
 from pipistrelle.config import Config
 from pipistrelle.detection.matched import filter_blocks, filter_samples
-from pipistrelle.detection.merging import Heard, average_faces
+from pipistrelle.detection.merging import Heard, average_faces, same_echo, unlabelled
 from pipistrelle.detection.snapshots import Detections, Detector, detect, detector
 from pipistrelle.experiments.hearing.oracle import faintest_level_db, label_detections
 from pipistrelle.experiments.hearing.scenario import Scenario
@@ -58,6 +58,7 @@ def listen(
     beam: Callable[..., Arrivals] = through_piston,
     layout: Layout | None = None,
     find: Callable[..., Detections] = detect,
+    oracle: Callable[..., Int[np.ndarray, " d"]] | None = label_detections,
     progress: Progress | None = None,
 ) -> tuple[tuple[Heard, ...], ...]:
     """Hear every frame of a path, once for all beamwidths.
@@ -76,6 +77,10 @@ def listen(
         The arrays; those of the settings by default.
     find : callable
         Finds calls in the matched filter's output, as `detect` does.
+    oracle : callable, optional
+        Tells whose echo each detection is, as `label_detections` does, by the truth. None: nobody
+        tells, rows bear no label, and a stage of association has to find one
+        (`pipistrelle.estimation.association`).
     progress : callable, optional
 
     Returns
@@ -102,7 +107,7 @@ def listen(
     (2, 1.0)
     """
     setup = config.scenario
-    station = _station(config, layout or square_of_four(config.receiver), find)
+    station = _station(config, layout or square_of_four(config.receiver), find, oracle)
     engine = _dense if config.receiver.engine == "dense" else _blocks
     beams: tuple[list[Heard], ...] = tuple([] for _ in radii)
     frames = range(setup.steps_per_frame, len(scenario.path), setup.steps_per_frame)
@@ -140,11 +145,17 @@ class _Station:
     sampling: Sampling
     detector: Detector
     find: Callable[..., Detections]
+    oracle: Callable[..., Int[np.ndarray, " d"]] | None
     faintest_db: float
     workspace: Workspace
 
 
-def _station(config: Config, layout: Layout, find: Callable[..., Detections]) -> _Station:
+def _station(
+    config: Config,
+    layout: Layout,
+    find: Callable[..., Detections],
+    oracle: Callable[..., Int[np.ndarray, " d"]] | None,
+) -> _Station:
     """Settle what every frame of a path is heard with."""
     settled, finder = sampling(config), detector(config, layout)
     return _Station(
@@ -153,6 +164,7 @@ def _station(config: Config, layout: Layout, find: Callable[..., Detections]) ->
         sampling=settled,
         detector=finder,
         find=find,
+        oracle=oracle,
         faintest_db=faintest_level_db(
             finder.threshold,
             elements=layout.position.size,
@@ -194,23 +206,28 @@ def _emissions(
 
 
 def _heard(time: float, detections: Detections, arrivals: Arrivals, station: _Station) -> Heard:
-    """Label a frame's detections by the truth and average them over the faces."""
-    config = station.config
-    label = label_detections(
-        detections,
-        arrivals,
-        station.layout,
-        config.association,
-        pulse=config.emitter.pulse,
-        faintest_db=station.faintest_db,
-    )
-    return average_faces(
+    """Average a frame's detections over the faces, by the truth's labels where it tells them."""
+    config, gates = station.config, station.config.association
+    if station.oracle is None:
+        delay_gate = gates.delay_gate * config.emitter.pulse
+        label = same_echo(detections, delay_gate=delay_gate, bearing_gate=gates.bearing_gate)
+    else:
+        label = station.oracle(
+            detections,
+            arrivals,
+            station.layout,
+            gates,
+            pulse=config.emitter.pulse,
+            faintest_db=station.faintest_db,
+        )
+    heard = average_faces(
         time,
         detections,
         label,
         averaging=config.detection.averaging,
         speed_of_sound=config.air.speed_of_sound,
     )
+    return unlabelled(heard) if station.oracle is None else heard
 
 
 def _blocks(aimed: Sequence[Arrivals], station: _Station, key: int) -> Iterator[Detections]:

@@ -1,9 +1,10 @@
-"""Known association: the one place where the truth labels a detection.
+"""The oracle: known association, the one place where the truth labels a detection.
 
 The paper assumes that a measurement's landmark is known. A label is therefore attached from the
 true arrivals, after detection: by delay and bearing both, because a gate in bearing alone lets
-clutter match something most of the time. The delay of the beacon's tone is used here and nowhere
-else. To lift the assumption, replace `label_detections`.
+clutter match something most of the time. Without the oracle rows have no label, and who is who is
+for the stage between prediction and correction to say (`pipistrelle.estimation.association`), which
+sees beliefs and scans, never the truth.
 """
 
 import numpy as np

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pipistrelle.config import Config, ScenarioConfig
-from pipistrelle.detection.scans import Scan
+from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.experiments.hearing.scenario import bicycle
 from pipistrelle.experiments.machine import cores
@@ -38,8 +38,8 @@ def compile_fastslam() -> None:
     slam, rng = estimator("fastslam", bicycle(Config().motion), Config()), np.random.default_rng(0)
     belief = slam.init(Gaussian(mean=np.zeros(3), covariance=np.eye(3)))
     belief, _ = slam.predict(belief, np.ones((1, 2)), np.ones(1), rng)
-    heard = {"landmark": np.arange(2), "bearing": np.zeros(2), "range": np.array([1.0, np.nan])}
-    slam.update(belief, Scan(time=1.0, **heard), rng)
+    known = {"range": np.array([1.0, np.nan]), "range_std": 0.1, "bearing_std": 0.1}
+    slam.update(belief, make_scan(1.0, np.arange(2), np.zeros(2), **known), rng)
 
 
 @contextmanager

@@ -12,7 +12,8 @@ from pipistrelle.detection.logs.folder import read_log
 from pipistrelle.detection.logs.mrclam import read_mrclam
 from pipistrelle.detection.logs.recording import Log
 from pipistrelle.detection.logs.text_tables import refusal
-from pipistrelle.detection.scans import Scan
+from pipistrelle.detection.noise import noise_of
+from pipistrelle.detection.scans import Scan, rows_of
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.drives import Drive
@@ -96,8 +97,8 @@ def hide(
 
     Examples
     --------
-    >>> angle = {"bearing": np.array([0.1, 0.4]), "landmark": np.array([3, 8])}
-    >>> scan = Scan(time=0.0, range=np.array([2.0, 5.0]), **angle)
+    >>> from pipistrelle.detection.scans import make_scan
+    >>> scan = make_scan(0.0, np.array([3, 8]), np.array([0.1, 0.4]), range=np.array([2.0, 5.0]))
     >>> hide([scan], "fused", 0.5)[0].range
     array([ 2., nan])
     >>> hide([scan], "active", 0.5)[0].landmark
@@ -109,14 +110,7 @@ def hide(
         hidden = (np.abs(scan.bearing) > limit) | (strategy == "passive")
         distance = np.where(hidden, np.nan, scan.range)
         kept = np.isfinite(distance) | (strategy != "active")
-        heard.append(
-            Scan(
-                time=scan.time,
-                landmark=scan.landmark[kept],
-                bearing=scan.bearing[kept],
-                range=distance[kept],
-            )
-        )
+        heard.append(rows_of(replace(scan, range=distance), kept))
     return tuple(heard)
 
 
@@ -178,9 +172,9 @@ def replay(
         true_path=None if truth is None else truth.path,
         true_landmarks=None if truth is None else truth.landmarks,
     )
-    trials = []
+    noise, trials = noise_of(config.filter), []
     for strategy in strategies:
-        scans = hide(log.scans, strategy, beamwidth)
+        scans = tuple(map(noise, hide(log.scans, strategy, beamwidth)))
         for name in filters:
             case = Case(strategy=strategy, filter=name)
             trials.append(run_trial(case, drive, scans, config, progress=progress, watch=watch))

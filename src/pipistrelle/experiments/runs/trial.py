@@ -12,8 +12,10 @@ from jaxtyping import Float
 
 from pipistrelle.arithmetic.noise import stream_key
 from pipistrelle.config import Config, InputError, Strategy
-from pipistrelle.detection.merging import Heard, scan_of
+from pipistrelle.detection.merging import Heard, labelled, scan_of
+from pipistrelle.detection.noise import noise_of
 from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.association import Associate, told
 from pipistrelle.estimation.beliefs import B, Belief, Estimator, Gaussian, Swarm, Track
 from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.fastslam.filter import FastSlam
@@ -105,11 +107,29 @@ def run_mission(
     drive = drive_of(scenario, config)
     trials = []
     for strategy in strategies:
-        scans = tuple(scan_of(frame, strategy) for frame in heard)
+        scans = scans_of(heard, strategy, config)
         for name in filters:
             case = Case(strategy=strategy, filter=name)
             trials.append(run_trial(case, drive, scans, config, progress=progress, watch=watch))
     return Mission(config=config, scenario=scenario, drive=drive, heard=heard, trials=tuple(trials))
+
+
+def scans_of(heard: Sequence[Heard], strategy: Strategy, config: Config) -> tuple[Scan, ...]:
+    """Tell what a strategy takes of each frame, and how surely the settings say it was measured.
+
+    Parameters
+    ----------
+    heard : sequence of Heard
+    strategy : "active", "fused" or "passive"
+    config : Config
+
+    Returns
+    -------
+    tuple of Scan
+        As many.
+    """
+    noise = noise_of(config.filter)
+    return tuple(noise(scan_of(frame, strategy)) for frame in heard)
 
 
 def drive_of(scenario: Scenario, config: Config) -> Drive:
@@ -145,6 +165,7 @@ def run_trial(
     scans: Sequence[Scan],
     config: Config,
     *,
+    associate: Associate = told,
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> TrialResult:
@@ -155,7 +176,10 @@ def run_trial(
     case : Case
     drive : Drive
     scans : sequence of Scan
+        As `scans_of` gives them.
     config : Config
+    associate : Associate
+        Says who is who, between prediction and correction.
     progress, watch : callable, optional
 
     Returns
@@ -178,6 +202,7 @@ def run_trial(
         drive,
         scans,
         _generator(config.seed, case.iteration, name),
+        associate=associate,
         progress=report,
         watch=look,
     )
@@ -220,8 +245,6 @@ def estimator(name: str, motion: Motion, config: Config) -> Estimator:
     settings = config.filter
     assumed = {
         "motion": motion,
-        "range_std": settings.range_std,
-        "bearing_std": settings.bearing_std,
         "rays": config.rays,
         "gate": settings.gate,
     }
@@ -234,10 +257,11 @@ def run_filter(
     scans: Sequence[Scan],
     rng: np.random.Generator,
     *,
+    associate: Associate = told,
     progress: Callable[[int, int], None] | None = None,
     watch: Callable[[Scan, B], None] | None = None,
 ) -> Track:
-    """Predict to each scan, update with it, and keep the pose of every step.
+    """Predict to each scan, say who is who in it, update with it, and keep the pose of every step.
 
     Parameters
     ----------
@@ -246,6 +270,7 @@ def run_filter(
     scans : sequence of Scan
         In order; the time of each is one of the drive's.
     rng : Generator
+    associate : Associate
     progress : callable, optional
         Given the scans done and their number.
     watch : callable, optional
@@ -270,6 +295,7 @@ def run_filter(
             belief, poses = estimator.predict(belief, controls[done:k], dt[done:k], rng)
             mean[done + 1 : k + 1], covariance[done + 1 : k + 1] = poses.mean, poses.covariance
             done = k
+        scan = labelled(scan, associate(belief, scan))
         belief = estimator.update(belief, scan, rng)
         pose = belief.pose()
         mean[k], covariance[k] = pose.mean, pose.covariance

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config, Strategy
 from pipistrelle.detection.merging import Heard, scan_of
+from pipistrelle.detection.noise import Noise, noise_of
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Track
 from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
@@ -230,23 +231,24 @@ def _run_cases(cases: Sequence[PlannedCase], iteration: int) -> list[TrialRecord
     beams = dict(zip(radii, heard, strict=True))
 
     @cache
-    def scans_of(radius: float, strategy: Strategy) -> tuple[Scan, ...]:
-        return tuple(scan_of(frame, strategy) for frame in beams[radius])
+    def scans(radius: float, strategy: Strategy, noise: Noise) -> tuple[Scan, ...]:
+        return tuple(noise(scan_of(frame, strategy)) for frame in beams[radius])
 
-    return [_try_case(case, scenario, beams, scans_of, iteration) for case in cases]
+    return [_try_case(case, scenario, beams, scans, iteration) for case in cases]
 
 
 def _try_case(
     case: PlannedCase,
     scenario: Scenario,
     beams: Mapping[float, Sequence[Heard]],
-    scans_of: Callable[[float, Strategy], Sequence[Scan]],
+    scans_of: Callable[[float, Strategy, Noise], Sequence[Scan]],
     iteration: int,
 ) -> TrialRecord:
     """Run a trial, whatever comes of it; filters share the scans of a beam and a strategy."""
     try:
         drive, radius = drive_of(scenario, case.config), case.config.emitter.radius
-        heard, scans = beams[radius], scans_of(radius, case.strategy)
+        heard, noise = beams[radius], noise_of(case.config.filter)
+        scans = scans_of(radius, case.strategy, noise)
         way = Case(strategy=case.strategy, filter=case.filter, iteration=iteration)
         began = time.thread_time()
         result = run_trial(way, drive, scans, case.config)

@@ -1,0 +1,68 @@
+"""Association: who is who, between prediction and correction.
+
+An association is a function of the predicted belief and of a scan, and returns a label for each
+row: that of a landmark in the map, a new number for one that is not, or UNLABELLED for clutter. Rows
+of one label are merged, those without one are dropped (`pipistrelle.detection.merging.labelled`),
+and the filter is corrected with the rest.
+"""
+
+from collections.abc import Callable, Collection
+
+import numpy as np
+from jaxtyping import Int
+
+from pipistrelle.detection.scans import UNLABELLED, Scan
+from pipistrelle.estimation.beliefs import Belief
+
+Associate = Callable[[Belief, Scan], Int[np.ndarray, " m"]]
+"""Takes the predicted belief and a scan of m rows; returns m labels. It must not change either."""
+
+
+def told(belief: Belief, scan: Scan) -> Int[np.ndarray, " m"]:
+    """Take the labels that whoever recorded the scan gave it: known association.
+
+    Parameters
+    ----------
+    belief : Belief
+        Not used.
+    scan : Scan
+
+    Returns
+    -------
+    (m)
+
+    Notes
+    -----
+    Bradley & Abaid, Sec. III-B ("we assumed known data association").
+    """
+    return scan.landmark
+
+
+def told_but(ignored: Collection[int]) -> Associate:
+    """Take the labels that came with the scan, but for some, whose rows are dropped.
+
+    A landmark that moves is none for a filter whose landmarks stand still.
+
+    Parameters
+    ----------
+    ignored : labels
+
+    Returns
+    -------
+    Associate
+
+    Examples
+    --------
+    >>> from pipistrelle.detection.scans import make_scan
+    >>> scan = make_scan(0.5, np.array([3, 8]), np.zeros(2))
+    >>> told_but([8])(None, scan)
+    array([ 3, -1])
+    """
+    labels = np.array(sorted(ignored), dtype=np.int64)
+    if not labels.size:
+        return told
+
+    def associate(belief: Belief, scan: Scan) -> Int[np.ndarray, " m"]:
+        return np.where(np.isin(scan.landmark, labels), UNLABELLED, scan.landmark)
+
+    return associate

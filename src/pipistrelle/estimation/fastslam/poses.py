@@ -1,0 +1,144 @@
+"""Kernels on all particles' poses: propagate, and summarise to a mean and a covariance."""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.arithmetic.elementary import cosine_and_sine, wrapped
+from pipistrelle.estimation.fastslam.block import (
+    HEADING,
+    LANES,
+    PHH,
+    POSE,
+    PXH,
+    PXX,
+    PXY,
+    PYH,
+    PYY,
+    Lanes,
+    Poses,
+    X,
+    Y,
+)
+from pipistrelle.estimation.motion import MotionNumbers, motion_increment
+from pipistrelle.jit import kernel, lean
+
+SMALLEST_STD = 1e-6
+"""Added in quadrature to the pose estimate's x, y [m] and heading [rad]: particles that stand still
+or has one ancestor may have no spread, and its covariance no inverse."""
+
+
+LEAST = SMALLEST_STD**2
+
+
+@lean
+def _add_moments(pose: Poses, weight: Lanes, sums: Poses) -> None:
+    """Add a block's weighted positions and directions, lane by lane."""
+    for i in range(LANES):
+        c, s = cosine_and_sine(pose[HEADING + i])
+        sums[X + i] += weight[i] * pose[X + i]
+        sums[Y + i] += weight[i] * pose[Y + i]
+        sums[PXX + i] += weight[i] * c
+        sums[PXY + i] += weight[i] * s
+
+
+@lean
+def _add_spread(
+    pose: Poses, weight: Lanes, x: float, y: float, heading: float, sums: Poses
+) -> None:
+    """Add a block's weighted covariances and squared distances from the mean, lane by lane."""
+    for i in range(LANES):
+        dx, dy, turn = pose[X + i] - x, pose[Y + i] - y, wrapped(pose[HEADING + i] - heading)
+        sums[PXX + i] += weight[i] * (dx * dx + pose[PXX + i])
+        sums[PXY + i] += weight[i] * (dx * dy + pose[PXY + i])
+        sums[PYY + i] += weight[i] * (dy * dy + pose[PYY + i])
+        sums[PXH + i] += weight[i] * (dx * turn + pose[PXH + i])
+        sums[PYH + i] += weight[i] * (dy * turn + pose[PYH + i])
+        sums[PHH + i] += weight[i] * (turn * turn + pose[PHH + i])
+
+
+@kernel
+def _add_lanes(sums: Poses) -> Float[np.ndarray, "9"]:
+    """Sum of each row over its lanes."""
+    total = np.empty(POSE // LANES)
+    for row in range(total.size):
+        so_far = 0.0
+        for i in range(row * LANES, (row + 1) * LANES):
+            so_far += sums[i]
+        total[row] = so_far
+    return total
+
+
+@kernel
+def summarise(
+    pose: Float[np.ndarray, "b rows"], weight: Float[np.ndarray, " p"]
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """Mean (circular in the heading) and covariance of all particles, their own included."""
+    blocks = pose.shape[0]
+    lanes, sums = np.zeros((blocks, LANES)), np.zeros(POSE)
+    for p in range(weight.size):
+        lanes[p // LANES, p % LANES] = weight[p]
+    for b in range(blocks):
+        _add_moments(pose[b], lanes[b], sums)
+    mean = _add_lanes(sums)
+    mean[2] = math.atan2(mean[4], mean[3])
+    sums[:] = 0.0
+    for b in range(blocks):
+        _add_spread(pose[b], lanes[b], mean[0], mean[1], mean[2], sums)
+    spread, covariance = _add_lanes(sums), np.empty((3, 3))
+    covariance[0, 0] = spread[3] + LEAST
+    covariance[0, 1] = covariance[1, 0] = spread[4]
+    covariance[1, 1] = spread[5] + LEAST
+    covariance[0, 2] = covariance[2, 0] = spread[6]
+    covariance[1, 2] = covariance[2, 1] = spread[7]
+    covariance[2, 2] = spread[8] + LEAST
+    mean[2] = wrapped(mean[2])
+    return mean[:3].copy(), covariance
+
+
+@lean
+def _propagate_block(pose: Poses, step: tuple[float, ...], q0: float, q1: float) -> None:
+    """Move a block's poses through a control step, known in the vehicle's frame (Eq. (10))."""
+    ahead, aside, turn, u00, u10, u20, u01, u11, u21 = step
+    for i in range(LANES):
+        c, s = cosine_and_sine(pose[HEADING + i])
+        dx, dy = c * ahead - s * aside, s * ahead + c * aside
+        v00, v10 = c * u00 - s * u10, s * u00 + c * u10
+        v01, v11 = c * u01 - s * u11, s * u01 + c * u11
+        xh, yh, hh = pose[PXH + i], pose[PYH + i], pose[PHH + i]
+        pose[X + i] += dx
+        pose[Y + i] += dy
+        pose[HEADING + i] = wrapped(pose[HEADING + i] + turn)
+        pose[PXX + i] += dy * dy * hh - 2.0 * dy * xh + q0 * v00 * v00 + q1 * v01 * v01
+        pose[PXY + i] += dx * xh - dy * yh - dx * dy * hh + q0 * v00 * v10 + q1 * v01 * v11
+        pose[PYY + i] += 2.0 * dx * yh + dx * dx * hh + q0 * v10 * v10 + q1 * v11 * v11
+        pose[PXH + i] = xh - dy * hh + q0 * v00 * u20 + q1 * v01 * u21
+        pose[PYH + i] = yh + dx * hh + q0 * v10 * u20 + q1 * v11 * u21
+        pose[PHH + i] = hh + q0 * u20 * u20 + q1 * u21 * u21
+
+
+@kernel
+def propagate(
+    pose: Float[np.ndarray, "b rows"],
+    weight: Float[np.ndarray, " p"],
+    controls: Float[np.ndarray, "k 2"],
+    dt: Float[np.ndarray, " k"],
+    motion: MotionNumbers,
+    pose_means: Float[np.ndarray, "k 3"],
+    pose_covariances: Float[np.ndarray, "k 3 3"],
+) -> None:
+    """Move every particle through control steps, in place, and summarise after each."""
+    for k in range(dt.size):
+        speed, turn = controls[k, 0], controls[k, 1]
+        step = motion_increment(motion.model, motion.wheelbase, 0.0, speed, turn, dt[k])
+        noisy = 1.0 if motion.noise_at_rest or speed != 0.0 or turn != 0.0 else 0.0
+        for b in range(pose.shape[0]):
+            _propagate_block(
+                pose[b], step, noisy * motion.speed_variance, noisy * motion.turn_variance
+            )
+        mean, covariance = summarise(pose, weight)
+        for a in range(3):
+            pose_means[k, a] = mean[a]
+            for b in range(3):
+                pose_covariances[k, a, b] = covariance[a, b]
