@@ -1,4 +1,4 @@
-"""The house keeps its own laws: contracts, room map, short functions, doors, what no file may hold."""
+"""The house keeps its own laws: contracts, rooms, short functions, doors, what no file may hold."""
 
 import ast
 import re
@@ -79,6 +79,17 @@ def test_the_body_of_a_function_fits_on_a_screen(path):
 def test_no_module_is_a_drawer():
     drawers = {"utils", "util", "common", "helpers", "helper", "manager", "misc"}
     assert [path for path in SOURCES if path.stem in drawers] == []
+
+
+@pytest.mark.parametrize("record", ["Scan", "Landmarks"])
+def test_tests_make_their_scans_and_maps_in_one_place(record):
+    makers = {
+        path
+        for path in sorted((ROOT / "tests").rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and getattr(node.func, "id", None) == record
+    }
+    assert makers == {ROOT / "tests" / "reference" / "missions.py"}
 
 
 @pytest.mark.skipif(not (ROOT / ".git").exists(), reason="not a clone")

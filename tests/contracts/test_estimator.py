@@ -24,6 +24,7 @@ from reference.missions import (
     STEP,
     STEPS_PER_FRAME,
     draw_mission,
+    map_with,
     ray_config,
     scan_of,
     scattered,
@@ -207,12 +208,8 @@ class Noted:
         return self.at
 
     def landmarks(self) -> Landmarks:
-        return Landmarks(
-            landmark=np.array([label for label, _, _ in self.noted], dtype=np.int64),
-            mean=np.array([mean for _, mean, _ in self.noted]).reshape(-1, 2),
-            covariance=np.array([P for _, _, P in self.noted]).reshape(-1, 2, 2),
-            weight=np.ones(len(self.noted)),
-        )
+        label, mean, covariance = zip(*self.noted, strict=True) if self.noted else ((), (), ())
+        return map_with(label, mean, covariance)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from pipistrelle.estimation.beliefs import Landmarks
 from pipistrelle.evaluation.accuracy import (
     MapEstimate,
     alignment,
@@ -19,6 +18,7 @@ from pipistrelle.evaluation.accuracy import (
     rmse,
     scored_landmarks,
 )
+from reference.missions import map_with
 
 COORDINATE = st.floats(-100.0, 100.0)
 POINTS = st.integers(2, 30).flatmap(lambda n: arrays(np.float64, (n, 2), elements=COORDINATE))
@@ -29,12 +29,8 @@ ROUNDING = 1e-11
 
 def hypotheses(labels, weights):
     h = len(labels)
-    return Landmarks(
-        landmark=np.array(labels, dtype=np.int64),
-        mean=np.column_stack([np.arange(h), np.zeros(h)]).astype(float),
-        covariance=np.arange(h)[:, None, None] * np.eye(2),
-        weight=np.array(weights, dtype=float),
-    )
+    mean = np.column_stack([np.arange(h), np.zeros(h)])
+    return map_with(labels, mean, np.arange(h)[:, None, None] * np.eye(2), weights)
 
 
 def loop(n):

@@ -9,6 +9,7 @@ from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks, Track
 from pipistrelle.experiments.results.scores import Scores, TrialResult
 from pipistrelle.geometry import range_and_bearing, wrap
+from reference.missions import map_with, scan_with
 
 STEPS, PER_FRAME, STEP = 1500, 4, 0.125
 REACH = {"active": 14.0, "fused": 20.0, "passive": 20.0}
@@ -126,7 +127,7 @@ def map_at(frame: int, path, points, rows) -> Landmarks:
     if not parts:
         parts = [(np.empty(0, int), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))]
     label, mean, covariance, weight = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return Landmarks(landmark=label, mean=mean, covariance=covariance, weight=weight)
+    return map_with(label, mean, covariance, weight)
 
 
 def scan_at(time, pose, points, strategy, rng) -> Scan:
@@ -135,11 +136,11 @@ def scan_at(time, pose, points, strategy, rng) -> Scan:
     lit = (np.abs(bearing) < HALF_BEAM) & (distance < REACH["active"])
     heard = {"active": lit, "fused": lit | heard, "passive": heard}[strategy]
     ranged = lit & (strategy != "passive")
-    return Scan(
+    return scan_with(
+        np.flatnonzero(heard) + 1,
+        wrap(bearing + rng.normal(0.0, 0.04, len(points)))[heard],
+        np.where(ranged, distance, np.nan)[heard],
         time=float(time),
-        landmark=np.flatnonzero(heard) + 1,
-        bearing=wrap(bearing + rng.normal(0.0, 0.04, len(points)))[heard],
-        range=np.where(ranged, distance, np.nan)[heard],
     )
 
 

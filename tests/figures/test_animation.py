@@ -10,6 +10,7 @@ from pipistrelle.figures.animation import _pruned, _stage, animate_mission
 from pipistrelle.figures.maps import placed
 from pipistrelle.figures.recorder import MissionRecorder
 from pipistrelle.geometry import range_and_bearing
+from reference.missions import map_with
 
 
 @pytest.fixture(scope="module")
@@ -30,12 +31,8 @@ def swarm_recorder(watched_swarms) -> MissionRecorder:
 
 
 def rows_of(labels: list[int], x: list[float]) -> Landmarks:
-    return Landmarks(
-        landmark=np.array(labels, dtype=int),
-        mean=np.column_stack([x, np.zeros(len(x))]),
-        covariance=np.tile(np.eye(2), (len(x), 1, 1)),
-        weight=np.ones(len(x)),
-    )
+    mean = np.column_stack([x, np.zeros(len(x))])
+    return map_with(labels, mean, np.tile(np.eye(2), (len(x), 1, 1)))
 
 
 def test_a_recorder_keeps_every_frame_of_every_strategy(recorder, mission):

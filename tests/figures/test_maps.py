@@ -5,7 +5,6 @@ from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from matplotlib.path import Path
 
-from pipistrelle.estimation.beliefs import Landmarks
 from pipistrelle.figures.maps import (
     PLACED,
     RAY,
@@ -20,6 +19,7 @@ from pipistrelle.figures.maps import (
     view,
 )
 from pipistrelle.geometry import range_and_bearing
+from reference.missions import map_with
 
 POSE = np.array([3.0, -2.0, 2.5])
 lengths = st.floats(1e-3, 1e3)
@@ -76,13 +76,7 @@ def test_the_vehicle_points_along_its_heading():
 
 
 def test_a_landmark_is_placed_when_it_has_a_single_row():
-    rows = Landmarks(
-        landmark=np.array([5, 2, 5, 9]),
-        mean=np.zeros((4, 2)),
-        covariance=np.zeros((4, 2, 2)),
-        weight=np.ones(4),
-    )
-    assert placed(rows).tolist() == [False, True, False, True]
+    assert placed(map_with([5, 2, 5, 9])).tolist() == [False, True, False, True]
 
 
 def test_the_heavier_hypothesis_is_the_more_opaque():
@@ -116,11 +110,11 @@ PLACE = (np.array([1]), np.array([[5.0, 0.0]]))
 
 def frame(std: float, *, x: float = 5.0, rows: int = 1) -> np.ndarray:
     """Return the limits of a drive of ten metres to a landmark believed at x, in as many rows."""
-    landmarks = Landmarks(
-        landmark=np.ones(rows, int),
-        mean=np.tile([x, 0.0], (rows, 1)),
-        covariance=np.tile(std**2 * np.eye(2), (rows, 1, 1)),
-        weight=np.full(rows, 1.0 / rows),
+    landmarks = map_with(
+        np.ones(rows),
+        np.tile([x, 0.0], (rows, 1)),
+        np.tile(std**2 * np.eye(2), (rows, 1, 1)),
+        np.full(rows, 1.0 / rows),
     )
     return np.array(view((np.zeros(2), DRIVE), PLACE, None, [], [landmarks]))
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.motion import Motion, motion_step
 from pipistrelle.geometry import range_and_bearing, wrap
@@ -74,7 +74,7 @@ def draw_mission(
         turned = np.where(wrong, rng.uniform(-np.pi, np.pi, distance.size), turned)
         seen = rng.permutation(np.flatnonzero(active | (distance < hearing)))
         time = frame * STEPS_PER_FRAME * STEP
-        scans.append(Scan(time=time, landmark=seen + 1, range=measured[seen], bearing=turned[seen]))
+        scans.append(scan_with(seen + 1, turned[seen], measured[seen], time=time))
     dt = np.full(np.shape(controls)[:2], STEP)
     return Mission(path=np.array(path), controls=controls, dt=dt, landmarks=landmarks, scans=scans)
 
@@ -97,11 +97,29 @@ def scattered(rng, count, radius=25.0, spacing=3.0):
 def scan_of(*rows, time=0.0):
     """Return a scan of rows (label, range or NaN, bearing)."""
     label, distance, bearing = zip(*rows, strict=True) if rows else ((), (), ())
+    return scan_with(label, bearing, distance, time=time)
+
+
+def scan_with(label=(), bearing=(), distance=None, *, time=0.0):
+    """Return a scan of columns; without ranges it is passive."""
     return Scan(
         time=time,
         landmark=np.array(label, dtype=np.int64),
-        range=np.array(distance, dtype=float),
         bearing=np.array(bearing, dtype=float),
+        range=np.full(len(bearing), np.nan) if distance is None else np.array(distance, float),
+    )
+
+
+def map_with(label=(), mean=None, covariance=None, weight=None):
+    """Return a map of columns; unless given, every row is certain to be at the origin."""
+    h = len(label)
+    return Landmarks(
+        landmark=np.array(label, dtype=np.int64),
+        mean=np.zeros((h, 2)) if mean is None else np.array(mean, float).reshape(h, 2),
+        covariance=np.zeros((h, 2, 2))
+        if covariance is None
+        else np.array(covariance, float).reshape(h, 2, 2),
+        weight=np.ones(h) if weight is None else np.array(weight, dtype=float),
     )
 
 

@@ -13,6 +13,7 @@ from pipistrelle.config import InputError
 from pipistrelle.detection.logs.folder import read_log, write_log
 from pipistrelle.detection.logs.recording import Log
 from pipistrelle.detection.scans import Scan
+from reference.missions import scan_with
 
 DATA = Path(__file__).parents[2] / "data"
 UNICYCLE = """\
@@ -443,11 +444,7 @@ def drives(draw):
         for _ in range(draw(st.integers(1, 1 if k == 0 else 3))):
             rows = draw(st.dictionaries(st.integers(-99, 99), st.tuples(ANGLE, RANGE), min_size=1))
             bearing, distance = np.array(list(rows.values())).T
-            label = np.array(list(rows), dtype=np.int64)
-            at = time[k].item()
-            scans.append(
-                Scan(time=at, landmark=label, bearing=bearing.copy(), range=distance.copy())
-            )
+            scans.append(scan_with(list(rows), bearing, distance, time=time[k].item()))
     return replace(
         read_log(DATA / "unicycle_log"),
         time=time,

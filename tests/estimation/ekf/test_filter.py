@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from pipistrelle.config import RayConfig
-from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.geometry import range_and_bearing, wrap
@@ -27,6 +26,7 @@ from reference.missions import (
     paper_mission,
     ray_config,
     scan_of,
+    scan_with,
     scattered,
     steady,
 )
@@ -185,10 +185,9 @@ def test_covariance_is_symmetric_and_positive_after_a_hundred_thousand_updates()
         hidden = (rng.random(20) < 0.5) & (frame > 0)
         belief = slam.update(
             belief,
-            Scan(
-                time=0.0,
-                landmark=labels,
-                range=np.where(hidden, np.nan, distance + rng.normal(0, 0.2, 20)),
+            scan_with(
+                labels,
+                distance=np.where(hidden, np.nan, distance + rng.normal(0, 0.2, 20)),
                 bearing=wrap(bearing + rng.normal(0, 0.15, 20)),
             ),
         )

@@ -1,12 +1,13 @@
 """What must hold of the filter whatever it is told, and the traps of angles and distances."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.measurement import NEAREST
 from pipistrelle.estimation.motion import Motion
@@ -63,9 +64,7 @@ def test_labels_are_only_names():
     mission, slam = paper_mission("fused", frames=30), paper_filter()
     belief, renamed = slam.init(START), slam.init(START)
     for controls, dt, scan in zip(mission.controls, mission.dt, mission.scans, strict=True):
-        other = Scan(
-            time=scan.time, landmark=1000 - scan.landmark, range=scan.range, bearing=scan.bearing
-        )
+        other = replace(scan, landmark=1000 - scan.landmark)
         belief = slam.update(slam.predict(belief, controls, dt)[0], scan)
         renamed = slam.update(slam.predict(renamed, controls, dt)[0], other)
     np.testing.assert_array_equal(renamed.landmark, 1000 - belief.landmark)

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.measurement import NEAREST
 from pipistrelle.estimation.motion import Motion, motion_jacobians
 from pipistrelle.geometry import wrap
-from reference.missions import BICYCLE, START, STEP, ray_config, scan_of
+from reference.missions import BICYCLE, START, STEP, ray_config, scan_of, scan_with
 from reference.swarms import (
     Drawn,
     assert_same,
@@ -60,10 +59,9 @@ def test_landmark_covariances_stay_positive_after_a_hundred_thousand_updates():
     belief = slam.init(START)
     labels, bearing = np.arange(20), rng.uniform(-3, 3, 20)
     for frame in range(5000):
-        scan = Scan(
-            time=0.0,
-            landmark=labels,
-            range=np.where((rng.random(20) < 0.5) & (frame > 0), np.nan, 6 + rng.normal(0, 0.2)),
+        scan = scan_with(
+            labels,
+            distance=np.where((rng.random(20) < 0.5) & (frame > 0), np.nan, 6 + rng.normal(0, 0.2)),
             bearing=bearing + rng.normal(0, 0.15, 20),
         )
         belief = slam.update(belief, scan, rng)

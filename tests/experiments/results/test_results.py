@@ -14,12 +14,12 @@ import polars as pl
 import pytest
 
 from pipistrelle.config import Config, InputError, Section
-from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.beliefs import Gaussian, Landmarks, Track
+from pipistrelle.estimation.beliefs import Gaussian, Track
 from pipistrelle.evaluation.accuracy import alignment, moved, position_error, rmse
 from pipistrelle.evaluation.consistency import EKF_LIMIT
 from pipistrelle.experiments.results.scores import Scores, TrialResult, score
 from pipistrelle.experiments.results.writing import config_hash, write_results
+from reference.missions import map_with, scan_with
 
 STEPS = 400
 EVO_APE = shutil.which("evo_ape", path=Path(sys.executable).parent)
@@ -51,14 +51,9 @@ def loop():
 TIME = 1.2e9 + 0.125 * np.arange(STEPS + 1)
 TRUE_LANDMARKS = (np.array([1, 2, 3, 4]), np.array([[1.0, 1], [5, 2], [-4, 3], [0, 9]]))
 SCANS = (
-    Scan(
-        time=TIME[0],
-        landmark=np.array([1, 2]),
-        bearing=np.array([0.1, 0.2]),
-        range=np.array([4.0, np.nan]),
-    ),
-    Scan(time=TIME[4], landmark=np.empty(0, int), bearing=np.empty(0), range=np.empty(0)),
-    Scan(time=TIME[8], landmark=np.array([3]), bearing=np.array([-1.0]), range=np.array([2.0])),
+    scan_with([1, 2], [0.1, 0.2], [4.0, np.nan], time=TIME[0]),
+    scan_with(time=TIME[4]),
+    scan_with([3], [-1.0], [2.0], time=TIME[8]),
 )
 
 
@@ -71,11 +66,11 @@ def drifting_track(seed=0, landmarks=(2, 1, 1, 3, 77)):
     return Track(
         time=TIME,
         pose=Gaussian(mean=pose, covariance=np.tile(0.01 * np.eye(3), (STEPS + 1, 1, 1))),
-        landmarks=Landmarks(
-            landmark=labels,
-            mean=rng.normal(0.0, 5.0, (h, 2)),
-            covariance=np.tile(0.04 * np.eye(2), (h, 1, 1)),
-            weight=np.where(labels == 1, 0.5, 1.0),
+        landmarks=map_with(
+            labels,
+            rng.normal(0.0, 5.0, (h, 2)),
+            np.tile(0.04 * np.eye(2), (h, 1, 1)),
+            np.where(labels == 1, 0.5, 1.0),
         ),
         gated=6,
     )
@@ -143,12 +138,7 @@ def test_a_rigid_motion_of_everything_estimated_changes_only_the_raw_errors():
     turned = Track(
         time=track.time,
         pose=Gaussian(mean=mean, covariance=track.pose.covariance),
-        landmarks=Landmarks(
-            landmark=track.landmarks.landmark,
-            mean=moved(track.landmarks.mean, motion),
-            covariance=track.landmarks.covariance,
-            weight=track.landmarks.weight,
-        ),
+        landmarks=replace(track.landmarks, mean=moved(track.landmarks.mean, motion)),
         gated=0,
     )
     here = score(track, loop(), TRUE_LANDMARKS, SCANS, EKF_LIMIT)

@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.beliefs import Gaussian, Landmarks, Track
+from pipistrelle.estimation.beliefs import Gaussian, Track
 from pipistrelle.evaluation.accuracy import pose_error, position_error
 from pipistrelle.evaluation.consistency import nees
 from pipistrelle.experiments.results.tables import (
@@ -18,17 +17,18 @@ from pipistrelle.experiments.results.tables import (
     tum_text,
 )
 from pipistrelle.geometry import wrap
+from reference.missions import map_with, scan_with
 
 
 @pytest.fixture
 def landmarks():
     rng = np.random.default_rng(2)
     factor = rng.normal(0.0, 0.3, (5, 2, 2))
-    return Landmarks(
-        landmark=np.array([51, 4, 4, 4, 17]),
-        mean=rng.normal(0.0, 20.0, (5, 2)),
-        covariance=factor @ np.swapaxes(factor, 1, 2),
-        weight=np.array([1.0, 0.2, 0.5, 0.3, 1.0]),
+    return map_with(
+        [51, 4, 4, 4, 17],
+        rng.normal(0.0, 20.0, (5, 2)),
+        factor @ np.swapaxes(factor, 1, 2),
+        [1.0, 0.2, 0.5, 0.3, 1.0],
     )
 
 
@@ -120,27 +120,16 @@ def test_the_landmark_table_holds_every_hypothesis_and_every_true_landmark(landm
 
 
 def test_the_tables_of_nothing_have_the_columns_of_something(landmarks):
-    nothing = Landmarks(
-        landmark=landmarks.landmark[:0],
-        mean=landmarks.mean[:0],
-        covariance=landmarks.covariance[:0],
-        weight=landmarks.weight[:0],
-    )
-    assert landmark_table(nothing, None).schema == landmark_table(landmarks, None).schema
-    scan = Scan(time=0.0, landmark=np.array([1]), bearing=np.zeros(1), range=np.ones(1))
+    assert landmark_table(map_with(), None).schema == landmark_table(landmarks, None).schema
+    scan = scan_with([1], [0.0], [1.0])
     assert measurement_table([]).schema == measurement_table([scan]).schema
 
 
 def test_a_passive_measurement_has_no_range_in_the_table():
     scans = [
-        Scan(
-            time=0.5,
-            landmark=np.array([3, 9]),
-            bearing=np.array([0.1, -0.2]),
-            range=np.array([7.0, np.nan]),
-        ),
-        Scan(time=1.0, landmark=np.empty(0, int), bearing=np.empty(0), range=np.empty(0)),
-        Scan(time=1.5, landmark=np.array([9]), bearing=np.array([0.4]), range=np.array([2.0])),
+        scan_with([3, 9], [0.1, -0.2], [7.0, np.nan], time=0.5),
+        scan_with(time=1.0),
+        scan_with([9], [0.4], [2.0], time=1.5),
     ]
     table = measurement_table(scans)
     assert table.rows() == [(0.5, 3, 0.1, 7.0), (0.5, 9, -0.2, None), (1.5, 9, 0.4, 2.0)]

@@ -10,9 +10,9 @@ import pytest
 
 from pipistrelle.config import InputError
 from pipistrelle.detection.logs.folder import read_log, write_log
-from pipistrelle.detection.scans import Scan
 from pipistrelle.experiments.runs.replay import hide, is_mrclam, load, motion_of, start_of
 from pipistrelle.experiments.runs.truth_files import Truth, read_truth, write_truth
+from reference.missions import scan_with
 
 DATA = Path(__file__).parents[2] / "data"
 MADE_UP = DATA / "mrclam_made_up"
@@ -183,11 +183,8 @@ def test_set_6_starts_at_the_truth_and_ends_with_the_shorter(real, robot):
 
 # What a strategy hears
 
-SCAN = Scan(
-    time=2.0,
-    landmark=np.array([1, 2, 3, 4, 5]),
-    bearing=np.array([0.0, 0.25, -0.25, 0.26, -2.0]),
-    range=np.array([1.0, np.nan, 3.0, 4.0, 5.0]),
+SCAN = scan_with(
+    [1, 2, 3, 4, 5], [0.0, 0.25, -0.25, 0.26, -2.0], [1.0, np.nan, 3.0, 4.0, 5.0], time=2.0
 )
 
 

@@ -5,8 +5,7 @@ import pytest
 
 from pipistrelle.config import STRATEGIES, Config, InputError, ReceiverConfig, ScenarioConfig
 from pipistrelle.detection.merging import scan_of
-from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.beliefs import Gaussian, Landmarks
+from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.hearing.scenario import bicycle, draw_scenario
@@ -18,6 +17,7 @@ from pipistrelle.experiments.runs.trial import (
     run_mission,
     run_trial,
 )
+from reference.missions import map_with, scan_with
 
 SHORT = Config(scenario=ScenarioConfig(steps=80))
 RNG = np.random.default_rng
@@ -108,13 +108,7 @@ class Count:
         return Gaussian(mean=self.mean, covariance=2.0 * np.eye(3))
 
     def landmarks(self):
-        none = np.zeros(0)
-        return Landmarks(
-            landmark=none.astype(int),
-            mean=none.reshape(0, 2),
-            covariance=none.reshape(0, 2, 2),
-            weight=none,
-        )
+        return map_with()
 
 
 def drive(steps, at_rest=False):
@@ -129,21 +123,12 @@ def drive(steps, at_rest=False):
     )
 
 
-def scan_at(time, landmark=(), bearing=(), distance=()):
-    return Scan(
-        time=time,
-        landmark=np.array(landmark, dtype=np.int64),
-        bearing=np.array(bearing, dtype=float),
-        range=np.array(distance, dtype=float),
-    )
-
-
 def test_steps_and_scans_reach_the_filter_in_the_order_of_time():
     ledger, seen, told = Ledger(), [], []
     track = run_filter(
         ledger,
         drive(5),
-        [scan_at(0.0), scan_at(1.5), scan_at(1.5), scan_at(2.0)],
+        [scan_with(time=0.0), scan_with(time=1.5), scan_with(time=1.5), scan_with(time=2.0)],
         RNG(7),
         progress=lambda *done: told.append(done),
         watch=lambda scan, belief: seen.append((scan.time, belief.mean[0], belief.mean[1])),
@@ -165,7 +150,7 @@ def test_a_drive_without_scans_and_scans_without_a_drive_are_tracked():
     track = run_filter(ledger, drive(5), [], RNG(7))
     assert ledger.log == ["init", ([0.5, 1.0, 0.5, 2.0, 0.5], [0.0, 1.0, 2.0, 3.0, 4.0])]
     assert track.pose.mean[:, 0].tolist() == [0, 1, 2, 3, 4, 5]
-    still = run_filter(Ledger(), drive(0), [scan_at(0.0)], RNG(7))
+    still = run_filter(Ledger(), drive(0), [scan_with(time=0.0)], RNG(7))
     assert still.pose.mean.tolist() == [[0.0, 1.0, 0.0]]
 
 
@@ -173,7 +158,7 @@ def test_a_drive_without_scans_and_scans_without_a_drive_are_tracked():
 def test_a_filter_told_at_the_start_and_left_alone_at_the_end_keeps_what_it_knows(name):
     motion = bicycle(Config().motion)
     known = replace(drive(5), motion=motion)
-    first = scan_at(0.0, [3, 4], [0.1, -0.2], [2.0, np.nan])
+    first = scan_with([3, 4], [0.1, -0.2], [2.0, np.nan], time=0.0)
     track = run_filter(estimator(name, motion, Config()), known, [first], RNG(7))
     assert set(track.landmarks.landmark) == {3, 4}
     spread = track.pose.covariance[:, 0, 0] + track.pose.covariance[:, 1, 1]
@@ -184,11 +169,11 @@ def test_a_filter_told_at_the_start_and_left_alone_at_the_end_keeps_what_it_know
 @pytest.mark.parametrize(
     ("scan", "message"),
     [
-        (scan_at(0.7), "scan at 0.7 s: expected the time"),
-        (scan_at(9.0), "scan at 9.0 s: expected the time"),
-        (scan_at(0.5, [3], [np.nan], [2.0]), r"landmarks \[3\]"),
-        (scan_at(0.5, [3, 4], [0.1, 0.1], [2.0, -1.0]), r"landmarks \[4\]"),
-        (scan_at(0.5, [3], [0.1], [np.inf]), r"landmarks \[3\]"),
+        (scan_with(time=0.7), "scan at 0.7 s: expected the time"),
+        (scan_with(time=9.0), "scan at 9.0 s: expected the time"),
+        (scan_with([3], [np.nan], [2.0], time=0.5), r"landmarks \[3\]"),
+        (scan_with([3, 4], [0.1, 0.1], [2.0, -1.0], time=0.5), r"landmarks \[4\]"),
+        (scan_with([3], [0.1], [np.inf], time=0.5), r"landmarks \[3\]"),
     ],
 )
 def test_scans_that_no_filter_can_use_are_refused(scan, message):
