@@ -436,7 +436,7 @@ def test_a_saved_log_is_the_six_files_that_the_readme_promises(obey):
     obey("run", *SHORT, "--save-log", "log", "-o", "one")
     tables = ("landmarks.csv", "measurements.csv", "odometry.csv", "truth.csv")
     assert {path.name for path in Path("log").iterdir()} == {"README.md", "log.toml", *tables}
-    page = Path(__file__).parents[1] / "README.md"
+    page = Path(__file__).parents[2] / "README.md"
     assert "six text files" in page.read_text(encoding="utf-8")
 
 
@@ -605,7 +605,7 @@ def test_a_full_disk_behind_the_output_is_said_in_a_line():
 
 def test_a_truth_that_covers_part_of_the_path_is_said_in_a_line(obey, tmp_path):
     log = tmp_path / "log"
-    shutil.copytree(Path(__file__).parent / "data" / "unicycle_log", log)
+    shutil.copytree(Path(__file__).parents[1] / "data" / "unicycle_log", log)
     rows = (log / "truth.csv").read_text().splitlines()
     (log / "truth.csv").write_text("\n".join(rows[:12]))
     status, _, said = obey("slam", log, "-o", tmp_path / "results")
