@@ -4,9 +4,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipistrelle.detection.merging import Heard, average_faces, scan_of
-from pipistrelle.detection.scans import UNLABELLED
+from pipistrelle.detection.scans import COLUMNS, OWN, UNLABELLED
 from pipistrelle.detection.snapshots import Detections
 from pipistrelle.geometry import circular_mean, wrap
+from reference.missions import scan_with
 
 law = settings(deadline=None, max_examples=100)
 SEEDS = st.integers(0, 2**32 - 1)
@@ -61,23 +62,21 @@ def strongest(found, label, landmark, tone):
 def test_each_landmark_gets_the_mean_of_its_strongest_estimate_of_each_face(seed, averaging):
     found, label = crowd(np.random.default_rng(seed))
     heard = heard_of(found, label, averaging)
-    assert heard.landmark.tolist() == sorted(set(label.tolist()) - {UNLABELLED})
-    for landmark, bearing, distance in zip(heard.landmark, heard.bearing, heard.range, strict=True):
-        for tone in range(2):
-            rows = strongest(found, label, landmark, tone)
-            weight = np.ones(len(rows))
-            if averaging == "weighted":
-                weight = np.cos(found.angle[rows]) ** 2
-            if not rows:
-                assert np.isnan(bearing[tone])
-            else:
-                mean = circular_mean(found.bearing[rows], weight)
-                assert abs(wrap(bearing[tone] - mean)) < 1e-12
-            if tone == 0 and not rows:
-                assert np.isnan(distance)
-            elif tone == 0:
-                late = np.average(found.delay[rows], weights=weight)
-                assert distance == pytest.approx(0.5 * 343.0 * late, rel=1e-12)
+    pairs = np.unique(np.column_stack((label, found.tone))[label >= 0], axis=0)
+    rows = np.column_stack((heard.rows.landmark, heard.rows.caller))
+    np.testing.assert_array_equal(rows, pairs)
+    for i, (landmark, tone) in enumerate(pairs):
+        rows = strongest(found, label, landmark, tone)
+        weight = np.cos(found.angle[rows]) ** 2 if averaging == "weighted" else np.ones(len(rows))
+        mean = circular_mean(found.bearing[rows], weight)
+        assert abs(wrap(heard.rows.bearing[i] - mean)) < 1e-12
+        loudest = 10.0 * np.log10(found.power[rows].max())
+        assert heard.rows.level_db[i] == pytest.approx(loudest, abs=1e-9)
+        if tone == OWN:
+            late = np.average(found.delay[rows], weights=weight)
+            assert heard.rows.range[i] == pytest.approx(0.5 * 343.0 * late, rel=1e-12)
+        else:
+            assert np.isnan(heard.rows.range[i])
 
 
 @given(seed=SEEDS, averaging=AVERAGING)
@@ -89,9 +88,8 @@ def test_the_order_of_the_detections_does_not_matter(seed, averaging):
     columns = {name: getattr(found, name)[order] for name in Detections.__slots__}
     one = heard_of(found, label, averaging)
     two = heard_of(Detections(**columns), label[order], averaging)
-    assert one.landmark.tolist() == two.landmark.tolist()
-    assert one.bearing.tobytes() == two.bearing.tobytes()
-    assert one.range.tobytes() == two.range.tobytes()
+    for name in COLUMNS:
+        assert getattr(one.rows, name).tobytes() == getattr(two.rows, name).tobytes()
     assert one.clutter == two.clutter
 
 
@@ -99,7 +97,7 @@ def test_directions_either_side_of_straight_back_average_straight_back():
     for spread in (0.1, 1e-6, 30.0):  # of the left face and the right one, looking back
         found = detections((1, 1, 90.0 - spread, 0.02, 9), (3, 1, spread - 90.0, 0.02, 8))
         for averaging in ("plain", "weighted"):
-            bearing = heard_of(found, [4, 4], averaging).bearing[0, 1]
+            (bearing,) = heard_of(found, [4, 4], averaging).rows.bearing
             assert -np.pi <= bearing < np.pi
             assert abs(wrap(bearing - np.pi)) < 1e-12
 
@@ -108,17 +106,16 @@ def test_directions_either_side_of_straight_back_average_straight_back():
 @law
 def test_averaged_bearings_lie_from_minus_pi_to_below_pi(seed, averaging):
     found, label = crowd(np.random.default_rng(seed))
-    bearing = heard_of(found, label, averaging).bearing
-    known = bearing[~np.isnan(bearing)]
-    assert np.all((known >= -np.pi) & (known < np.pi))
+    bearing = heard_of(found, label, averaging).rows.bearing
+    assert np.all((bearing >= -np.pi) & (bearing < np.pi))
 
 
 def test_unlabelled_detections_are_counted_and_change_nothing_else():
     found = detections((0, 0, 40, 0.02, 9), (1, 0, -50, 0.02, 7), (0, 0, 10, 0.02, 99))
     heard = heard_of(found, [3, 3, UNLABELLED])
     assert heard.clutter == 1
-    assert heard.landmark.tolist() == [3]
-    assert heard.bearing[0, 0] == pytest.approx(np.radians(40.0), abs=1e-12)
+    assert heard.rows.landmark.tolist() == [3]
+    assert heard.rows.bearing[0] == pytest.approx(np.radians(40.0), abs=1e-12)
 
 
 def test_silence_is_heard_as_nothing():
@@ -128,7 +125,7 @@ def test_silence_is_heard_as_nothing():
         delay=nothing, power=nothing,
     )  # fmt: skip
     heard = heard_of(found, nothing.astype(int))
-    assert (heard.landmark.size, heard.bearing.shape, heard.range.size) == (0, (0, 2), 0)
+    assert (heard.rows.landmark.size, heard.rows.bearing.size, heard.clutter) == (0, 0, 0)
     for strategy in ("active", "fused", "passive"):
         assert scan_of(heard, strategy).landmark.size == 0
 
@@ -146,7 +143,7 @@ def test_weights_make_two_faces_as_good_as_one_looked_straight_at_whatever_the_d
                     detections((0, 0, off + one, 0.02, 2), (1, 0, off - 90.0 + two, 0.02, 1)),
                     [5, 5],
                     averaging,
-                ).bearing[0, 0]
+                ).rows.bearing[0]
                 for one, two in noise
             ]
             rms[averaging] = np.std(np.array(bearing) - np.radians(off)) / error
@@ -155,19 +152,22 @@ def test_weights_make_two_faces_as_good_as_one_looked_straight_at_whatever_the_d
         assert rms["plain"] == pytest.approx(0.5 * np.hypot(*spread) / error, rel=sampling)
 
 
+NAN = np.nan
+
+
 def heard_rows(*rows):
     """Return what was heard: rows (landmark, own bearing, beacon's bearing, range)."""
-    landmark, own, other, distance = (np.array(c) for c in zip(*rows, strict=True))
-    return Heard(
-        time=2.0,
-        landmark=landmark,
-        bearing=np.column_stack((own, other)).astype(float),
-        range=distance.astype(float),
-        clutter=0,
-    )
+    parts = [
+        (landmark, caller, bearing, NAN if caller else distance)
+        for landmark, own, other, distance in rows
+        for caller, bearing in enumerate((own, other))
+        if not np.isnan(bearing)
+    ]
+    landmark, caller, bearing, distance = zip(*parts, strict=True)
+    scan = scan_with(landmark, bearing, distance, time=2.0, caller=np.array(caller))
+    return Heard(rows=scan, clutter=0)
 
 
-NAN = np.nan
 BOTH = heard_rows((1, 0.1, NAN, 3.0), (2, NAN, 0.2, NAN), (7, 3.1, -3.1, 9.0), (9, -0.4, 0.2, 5.0))
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipistrelle.config import RayConfig
-from pipistrelle.detection.scans import Scan
+from pipistrelle.detection.scans import Scan, make_scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.motion import Motion, motion_step
@@ -100,14 +100,18 @@ def scan_of(*rows, time=0.0):
     return scan_with(label, bearing, distance, time=time)
 
 
-def scan_with(label=(), bearing=(), distance=None, *, time=0.0):
-    """Return a scan of columns; without ranges it is passive."""
-    return Scan(
-        time=time,
-        landmark=np.array(label, dtype=np.int64),
-        bearing=np.array(bearing, dtype=float),
-        range=np.full(len(bearing), np.nan) if distance is None else np.array(distance, float),
-    )
+def scan_with(label=(), bearing=(), distance=None, *, time=0.0, **columns):
+    """Return a scan of columns, of the paper's noise; without ranges it is passive."""
+    known = {"range_std": 0.2, "bearing_std": 0.15} | columns
+    if distance is not None:
+        known["range"] = np.array(distance, float)
+    return make_scan(time, np.array(label, dtype=np.int64), np.array(bearing, dtype=float), **known)
+
+
+def measured_to(scan, range_std, bearing_std):
+    """Return the scan, measured with this noise whatever it says itself."""
+    rows = np.ones(scan.landmark.size)
+    return replace(scan, range_std=range_std * rows, bearing_std=bearing_std * rows)
 
 
 def map_with(label=(), mean=None, covariance=None, weight=None):
@@ -128,10 +132,21 @@ def ray_config(**changes):
     return RayConfig(**({"prune": 1e-3, "power": 1.0} | changes))
 
 
+@dataclass(frozen=True, kw_only=True)
+class AssumingEkf(EkfSlam):
+    """The filter for tests that try other noise: whatever a scan says, it was measured so."""
+
+    range_std: float = 0.2
+    bearing_std: float = 0.15
+
+    def update(self, belief, scan, rng=None):
+        assumed = measured_to(scan, self.range_std, self.bearing_std)
+        return EkfSlam.update(self, belief, assumed, rng)
+
+
 def paper_filter(**changes):
     """Return the filter with the paper's settings, but for the changes."""
-    slam = EkfSlam(motion=BICYCLE, range_std=0.2, bearing_std=0.15, rays=ray_config())
-    return replace(slam, **changes)
+    return replace(AssumingEkf(motion=BICYCLE, rays=ray_config()), **changes)
 
 
 def paper_mission(strategy, frames=375, seed=3, **changes):

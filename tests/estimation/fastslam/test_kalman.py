@@ -12,7 +12,6 @@ from scipy.stats import chi2
 
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian
-from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.fastslam.filter import SMALLEST_STD, FastSlam
 from pipistrelle.estimation.fastslam.resampling import effective_particles, normalised
 from pipistrelle.estimation.motion import Motion
@@ -23,7 +22,7 @@ from reference.missions import (
     STEP,
     STEPS_PER_FRAME,
     draw_mission,
-    ray_config,
+    paper_filter,
     scan_of,
     scattered,
     steady,
@@ -111,7 +110,7 @@ def plane_toy(seed):
     for scan in mission.scans[1:]:
         scan.range[::2] = np.nan
     slam = swarm_filter(motion=motion, **noise)
-    joint = EkfSlam(motion=motion, rays=ray_config(), **noise)
+    joint = paper_filter(motion=motion, **noise)
     belief = joint.init(start)
     for control, dt, scan in zip(mission.controls, mission.dt, mission.scans, strict=True):
         belief = joint.update(joint.predict(belief, control, dt)[0], scan)
