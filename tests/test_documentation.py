@@ -110,6 +110,52 @@ def test_the_guides_filter_drives_a_mission(guide):
     np.testing.assert_allclose(track.pose.covariance, same.pose.covariance, rtol=0, atol=1e-12)
 
 
+def heard_and_drive(steps=120):
+    """What active sensing hears of a short drive, as the oracle labels it, and the drive."""
+    from pipistrelle.config import Config, ScenarioConfig
+    from pipistrelle.experiments.hearing.listening import listen
+    from pipistrelle.experiments.hearing.scenario import world_of
+    from pipistrelle.experiments.runs.trial import drive_of
+
+    config = Config(scenario=ScenarioConfig(steps=steps))
+    world = world_of(config)
+    (heard,) = listen(world, config, (0.0025,))
+    return config, heard, drive_of(world, config)
+
+
+def test_the_guides_association_finds_again_what_the_oracle_knew(guide):
+    from pipistrelle.detection.merging import unlabelled
+    from pipistrelle.experiments.runs.trial import Case, run_trial, scans_of
+
+    config, heard, drive = heard_and_drive()
+    case = Case(strategy="active", filter="ekf")
+    told = run_trial(case, drive, scans_of(heard, "active", config), config).track
+    hidden = scans_of([unlabelled(frame) for frame in heard], "active", config)
+    found = run_trial(case, drive, hidden, config, associate=guide["nearest"]).track
+    np.testing.assert_array_equal(found.pose.mean, told.pose.mean)
+    np.testing.assert_array_equal(found.landmarks.mean, told.landmarks.mean)
+    assert found.landmarks.landmark.tolist() == list(range(1, 1 + len(told.landmarks.landmark)))
+    anyone = run_trial(
+        case, drive, hidden, config, associate=lambda _, scan: np.ones(scan.landmark.size, int)
+    )
+    assert not np.allclose(anyone.track.pose.mean, told.pose.mean, atol=0.1)
+
+
+def test_the_guides_noise_reaches_the_filter_row_by_row(guide):
+    from pipistrelle.detection.merging import scan_of
+    from pipistrelle.experiments.runs.trial import Case, run_trial, scans_of
+
+    config, heard, drive = heard_and_drive(40)
+    scans = [guide["by_level"](scan_of(frame, "active")) for frame in heard]
+    said = np.concatenate([scan.bearing_std for scan in scans])
+    assert said.min() == 0.1
+    assert 0.1 < said.max() <= 0.3
+    case = Case(strategy="active", filter="ekf")
+    constant = run_trial(case, drive, scans_of(heard, "active", config), config).track
+    by_level = run_trial(case, drive, scans, config).track
+    assert not np.array_equal(by_level.pose.covariance, constant.pose.covariance)
+
+
 @pytest.mark.slow
 def test_the_readme_shows_what_the_command_prints(tmp_path, capsys):
     from pipistrelle.__main__ import main

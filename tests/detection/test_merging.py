@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipistrelle.detection.merging import Heard, average_faces, scan_of
+from pipistrelle.detection.merging import Heard, average_faces, same_echo, scan_of, unlabelled
 from pipistrelle.detection.scans import COLUMNS, OWN, UNLABELLED
 from pipistrelle.detection.snapshots import Detections
 from pipistrelle.geometry import circular_mean, wrap
@@ -206,3 +206,43 @@ def test_fused_sees_what_active_or_passive_see_and_measures_what_they_measure(se
         parts = np.concatenate([s.bearing[s.landmark == landmark] for s in (active, passive)])
         assert np.cos(bearing - circular_mean(parts)) == pytest.approx(1.0, abs=1e-12)
         assert -np.pi <= bearing < np.pi
+
+
+@given(seed=SEEDS)
+@law
+def test_an_echo_is_of_one_call_at_one_time_from_one_side_and_once_on_a_face(seed):
+    found, _ = crowd(np.random.default_rng(seed), count=60)
+    number = same_echo(found, delay_gate=0.03, bearing_gate=0.8)
+    assert set(number.tolist()) == set(range(number.max() + 1)), "every detection is of some echo"
+    for echo in range(number.max() + 1):
+        rows = np.flatnonzero(number == echo)
+        loudest = rows[found.power[rows].argmax()]
+        assert np.unique(found.tone[rows]).size == 1
+        assert np.unique(found.face[rows]).size == rows.size
+        assert np.all(np.abs(found.delay[rows] - found.delay[loudest]) <= 0.03)
+        assert np.all(np.abs(wrap(found.bearing[rows] - found.bearing[loudest])) <= 0.8)
+
+
+def test_detections_that_could_be_of_one_echo_are():
+    found = detections((0, 0, 40, 0.0200, 9), (1, 0, -50, 0.0201, 7), (1, 1, -50, 0.0201, 8))
+    assert same_echo(found, delay_gate=7e-4, bearing_gate=0.1).tolist() == [0, 0, 1]
+    assert same_echo(found, delay_gate=5e-5, bearing_gate=0.1).tolist() == [0, 2, 1]
+
+
+def test_without_labels_rows_are_what_they_were_and_nobodys():
+    found, label = crowd(np.random.default_rng(3))
+    heard = heard_of(found, label)
+    nobodys = unlabelled(heard)
+    assert set(nobodys.rows.landmark.tolist()) == {UNLABELLED}
+    for name in set(COLUMNS) - {"landmark"}:
+        np.testing.assert_array_equal(getattr(nobodys.rows, name), getattr(heard.rows, name))
+    fused = scan_of(nobodys, "fused")
+    assert fused.landmark.size == nobodys.rows.landmark.size, "nothing is merged without a label"
+
+
+def test_three_callers_of_one_landmark_are_averaged_as_directions():
+    rows = scan_with([4, 4, 4], [3.1, -3.1, -3.0], [5.0, NAN, NAN], caller=np.arange(3))
+    (bearing,) = scan_of(Heard(rows=rows, clutter=0), "fused").bearing
+    assert bearing == pytest.approx(wrap(3.1 + np.mean(wrap(rows.bearing - 3.1))), abs=1e-12)
+    (bearing,) = scan_of(Heard(rows=rows, clutter=0), "passive").bearing
+    assert bearing == pytest.approx(-3.05, abs=1e-12)

@@ -1,9 +1,9 @@
 """Association: who is who, between prediction and correction.
 
 An association is a function of the predicted belief and of a scan, and returns a label for each
-row: that of a landmark in the map, a new number for one that is not, or UNLABELLED for clutter. Rows
-of one label are merged, those without one are dropped (`pipistrelle.detection.merging.labelled`),
-and the filter is corrected with the rest.
+row: that of a landmark in the map, a new number for one that is not, or UNLABELLED for clutter.
+Rows of one label are merged, those without one are dropped
+(`pipistrelle.detection.merging.labelled`), and the filter is corrected with the rest.
 """
 
 from collections.abc import Callable, Collection

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from pipistrelle.config import STRATEGIES, Config, InputError, ReceiverConfig, ScenarioConfig
-from pipistrelle.detection.merging import scan_of
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.drives import Drive
@@ -16,6 +15,7 @@ from pipistrelle.experiments.runs.trial import (
     run_filter,
     run_mission,
     run_trial,
+    scans_of,
 )
 from reference.missions import map_with, scan_with
 
@@ -174,6 +174,9 @@ def test_a_filter_told_at_the_start_and_left_alone_at_the_end_keeps_what_it_know
         (scan_with([3], [np.nan], [2.0], time=0.5), r"landmarks \[3\]"),
         (scan_with([3, 4], [0.1, 0.1], [2.0, -1.0], time=0.5), r"landmarks \[4\]"),
         (scan_with([3], [0.1], [np.inf], time=0.5), r"landmarks \[3\]"),
+        (scan_with([3], [0.1], time=0.5, bearing_std=np.nan), r"no standard deviations .* \[3\]"),
+        (scan_with([3], [0.1], time=0.5, bearing_std=0.0), r"no standard deviations .* \[3\]"),
+        (scan_with([3], [0.1], [2.0], time=0.5, range_std=np.inf), r"no standard deviations"),
     ],
 )
 def test_scans_that_no_filter_can_use_are_refused(scan, message):
@@ -197,7 +200,7 @@ def test_trials_of_one_world_do_not_depend_on_their_order():
     scenario = draw_scenario(SHORT, RNG(3))
     mission = run_mission(SHORT, ("fused",))
     told = drive_of(scenario, SHORT)
-    scans = tuple(scan_of(heard, "fused") for heard in mission.heard)
+    scans = scans_of(mission.heard, "fused", SHORT)
     case = Case(strategy="fused", filter="fastslam", iteration=4)
     one = run_trial(case, told, scans, SHORT)
     run_trial(replace(case, iteration=5), told, scans, SHORT)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from pipistrelle.arithmetic.noise import stream_key
 from pipistrelle.config import Config, InputError, Strategy
@@ -325,20 +325,37 @@ def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]
     if not known.all():
         stray = scans[int(np.argmin(known))]
         raise InputError(f"scan at {stray.time} s: expected the time of the end of a step")
-    nothing = np.empty(0)
-    bearing = np.concatenate([nothing, *(scan.bearing for scan in scans)])
-    distance = np.concatenate([nothing, *(scan.range for scan in scans)])
-    usable = np.isfinite(bearing) & (np.isnan(distance) | (distance > 0.0) & (distance < np.inf))
-    if not usable.all():
-        owner = np.repeat(np.arange(len(scans)), [scan.landmark.size for scan in scans])
-        first = owner[~usable][0]
-        labels = scans[first].landmark[~usable[owner == first]].tolist()
-        raise InputError(
-            f"scan at {scans[first].time} s: found numbers that no filter can use, for the "
-            f"landmarks {labels}; expected finite bearings [rad] and ranges above 0 [m], NaN "
-            "where passive"
-        )
+    bearing, distance, bearing_std, range_std = (
+        np.concatenate([np.empty(0), *(getattr(scan, name) for scan in scans)])
+        for name in ("bearing", "range", "bearing_std", "range_std")
+    )
+    passive = np.isnan(distance)
+    usable = np.isfinite(bearing) & (passive | (distance > 0.0) & (distance < np.inf))
+    _refuse(
+        scans,
+        usable,
+        "numbers that no filter can use, for the landmarks {}; expected finite bearings [rad] and "
+        "ranges above 0 [m], NaN where passive",
+    )
+    stated = (bearing_std > 0.0) & (bearing_std < np.inf)
+    stated &= passive | ((range_std > 0.0) & (range_std < np.inf))
+    _refuse(
+        scans,
+        stated,
+        "no standard deviations above 0 for the landmarks {}; expected bearing_std [rad], and "
+        "range_std [m] where there is a range, as pipistrelle.detection.noise states them",
+    )
     return steps.tolist()
+
+
+def _refuse(scans: Sequence[Scan], good: Bool[np.ndarray, " m"], found: str) -> None:
+    """Refuse scans of which not all rows are good; those of all scans follow one another."""
+    if good.all():
+        return
+    owner = np.repeat(np.arange(len(scans)), [scan.landmark.size for scan in scans])
+    first = owner[~good][0]
+    labels = scans[first].landmark[~good[owner == first]].tolist()
+    raise InputError(f"scan at {scans[first].time} s: found {found.format(labels)}")
 
 
 def _generator(seed: int, iteration: int, purpose: str) -> np.random.Generator:

@@ -1,0 +1,64 @@
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from pipistrelle.detection.merging import labelled
+from pipistrelle.detection.scans import UNLABELLED, make_scan
+from pipistrelle.estimation.association import told, told_but
+from reference.missions import scan_of, scan_with
+
+NAN = np.nan
+
+
+def test_what_was_told_is_taken_as_it_is_and_costs_no_copy():
+    scan = scan_of((3, 5.0, 0.3), (8, NAN, 1.0))
+    assert labelled(scan, told(None, scan)) is scan
+
+
+def test_a_row_that_nobody_labelled_never_reaches_a_filter():
+    scan = scan_of((3, 5.0, 0.3), (UNLABELLED, NAN, 1.0), (UNLABELLED, 2.0, 2.0))
+    assert labelled(scan, told(None, scan)).landmark.tolist() == [3]
+
+
+def test_labels_that_are_left_out_take_their_rows_with_them():
+    scan = scan_of((3, 5.0, 0.3), (8, NAN, 1.0), (9, NAN, 2.0))
+    kept = labelled(scan, told_but({8, 11})(None, scan))
+    assert kept.landmark.tolist() == [3, 9]
+    assert kept.bearing.tolist() == [0.3, 2.0]
+    assert told_but(()) is told
+
+
+def test_rows_of_one_label_become_one_whatever_their_order():
+    rows = [(7, 4.0, 0.2), (7, NAN, 0.5), (7, NAN, -0.1), (2, 3.0, 1.0)]
+    for order in permutations(rows):
+        label, distance, bearing = zip(*order, strict=True)
+        one = labelled(scan_with(np.full(4, UNLABELLED), bearing, distance), np.array(label))
+        assert sorted(one.landmark.tolist()) == [2, 7]
+        at = one.landmark.tolist().index(7)
+        assert one.bearing[at] == pytest.approx(0.2, abs=1e-12)
+        assert one.range[at] == 4.0
+
+
+def test_the_mean_of_directions_is_taken_across_the_cut_behind():
+    scan = scan_with([5, 5], [np.pi - 0.1, -np.pi + 0.3], [NAN, NAN])
+    (bearing,) = labelled(scan, scan.landmark).bearing
+    assert bearing == pytest.approx(-np.pi + 0.1, abs=1e-12)
+
+
+def test_merged_rows_are_as_sure_as_the_mean_of_independent_ones():
+    rng, stds = np.random.default_rng(5), np.array([0.01, 0.03, 0.02])
+    drawn = rng.normal(0.0, stds, (4000, 3))
+    scans = [make_scan(0.0, np.full(3, 4), row, bearing_std=stds) for row in drawn]
+    merged = [labelled(scan, scan.landmark) for scan in scans]
+    error = np.array([scan.bearing[0] for scan in merged])
+    claimed = merged[0].bearing_std[0]
+    assert claimed == pytest.approx(np.sqrt(np.sum(stds**2)) / 3, rel=1e-12)
+    assert np.std(error) == pytest.approx(claimed, rel=4.9 / np.sqrt(2 * error.size))
+
+
+def test_a_scan_of_nothing_stays_one():
+    empty = scan_of()
+    assert labelled(empty, told(None, empty)).landmark.size == 0
+    nobody = scan_of((UNLABELLED, 2.0, 0.1))
+    assert labelled(nobody, told(None, nobody)).landmark.size == 0
