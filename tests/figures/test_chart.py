@@ -32,14 +32,25 @@ def test_ticks_are_round_even_and_inside(low, share):
     assert all(float(text) == pytest.approx(value, abs=1e-9 * width) for value, text in found)
 
 
-@given(st.floats(1e-3, 1e3), st.floats(3.5, 1e6))
+@given(st.floats(1e-3, 1e3), st.floats(10.0, 1e6))
 def test_ticks_of_a_logarithmic_axis_are_powers_of_ten_or_three_times_that(low, ratio):
     found = [value for value, _ in ticks(low, low * ratio, log=True)]
-    assert found
+    assert len(found) >= 2
     assert all(low <= value <= low * ratio for value in found)
     for value in found:
         digit = value / 10.0 ** math.floor(math.log10(value) + 1e-9)
         assert digit == pytest.approx(1.0) or digit == pytest.approx(3.0)
+
+
+@given(st.floats(1e-3, 1e3), st.floats(1.2, 10.0))
+def test_less_than_a_decade_has_ticks_too(low, ratio):
+    found = [value for value, _ in ticks(low, low * ratio, log=True)]
+    assert len(found) >= 2
+    assert all(0.999999 * low <= value <= 1.000001 * low * ratio for value in found)
+
+
+def test_many_decades_have_few_ticks():
+    assert 3 <= len(ticks(1.0, 1e200, log=True)) <= 10
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1))

@@ -1,11 +1,23 @@
 """Charts on paper: what matplotlib draws is what the chart holds."""
 
+import xml.etree.ElementTree as ElementTree
+
 import numpy as np
 import pytest
 
-from pipistrelle.figures.chart import Axis, Chart, Panel, Series, linear_axis
+from pipistrelle.figures.chart import (
+    MARKS,
+    Axis,
+    Chart,
+    Mark,
+    Panel,
+    Series,
+    csv_rows,
+    linear_axis,
+)
 from pipistrelle.figures.chart_plot import draw_chart
 from pipistrelle.figures.style import save_figure, strategy_colour
+from pipistrelle.report.page.svg import legend, panel_svg
 
 X = np.array([11.0, 33.0, 180.0])
 
@@ -95,3 +107,17 @@ def test_every_style_can_be_saved_twice_to_the_same_bytes(tmp_path):
     for kind in ("png", "pdf"):
         one, two = (tmp_path / folder / f"c.{kind}" for folder in ("one", "two"))
         assert one.read_bytes() == two.read_bytes()
+
+
+def test_a_mark_is_one_row_for_paper_and_page(monkeypatch):
+    corners = ((0.0, -4.0), (4.0, 0.0), (0.0, 4.0), (-4.0, 0.0))
+    monkeypatch.setitem(MARKS, "diamonds", Mark(symbol="D", corners=corners, swatch="dot"))
+    panel = panel_of(fused(style="diamonds"))
+    (axes,) = draw_chart(chart_of(panel)).axes
+    assert [line.get_marker() for line in axes.lines] == ["D", "D"]
+    drawn = ElementTree.fromstring(str(panel_svg(panel)))
+    shapes = [e.get("d") for e in drawn.iter("path") if "dot" in e.get("class").split()]
+    assert len(shapes) == len(X)
+    assert [shape.count("L") for shape in shapes] == [3, 3, 3]
+    assert legend([panel]) == [("fused", "fused", "dot")]
+    assert csv_rows(chart_of(panel))[1][2] == "diamonds"

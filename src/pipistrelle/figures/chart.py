@@ -1,16 +1,78 @@
 """A chart as data: what is drawn, without how. The printed figure, the page and the CSV agree.
 
-A `Chart` holds panels, a `Panel` holds series over common axes. `paper` draws charts with
+A `Chart` holds panels, a `Panel` holds series over common axes. `chart_plot` draws charts with
 matplotlib, `report` draws the same ones as vectors on its page, `csv_text` writes their numbers.
+What a series can look like stands in `MARKS`, for both; another look is another row there.
 """
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import Float
+
+if TYPE_CHECKING:
+    from matplotlib.ticker import Locator
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mark:
+    """How the points of a series are shown.
+
+    Attributes
+    ----------
+    joined : bool
+        By a line.
+    spread : "band" or "bars"
+        What `low` and `high` are drawn as.
+    symbol : str
+        At each point, as matplotlib names it; none if empty.
+    size : of the symbol on paper [pt]
+    edge : of the white edge of the symbol on paper [pt]
+        0: it has none.
+    corners : tuple of x, y
+        Of the symbol on the page, about the point, y down; if there are none, it is a circle.
+    radius : of that circle
+    pinned : bool
+        Small and many, for single worlds: those above the panel stand at its edge.
+    written : bool
+        No symbol: what `tips` say stands at the points.
+    swatch : "line", "dot" or "star"
+        Its sign in the page's legend.
+    """
+
+    joined: bool = False
+    spread: Literal["band", "bars"] = "band"
+    symbol: str = ""
+    size: float = 5.0
+    edge: float = 0.0
+    corners: tuple[tuple[float, float], ...] = ()
+    radius: float = 3.2
+    pinned: bool = False
+    written: bool = False
+    swatch: Literal["line", "dot", "star"] = "line"
+
+
+def _star(outer: float, inner: float) -> tuple[tuple[float, float], ...]:
+    """Return the corners of a star of five points, one of them up."""
+    turn = np.pi * (np.arange(10) / 5.0 - 0.5)
+    reach = np.where(np.arange(10) % 2, inner, outer)
+    return tuple(zip((reach * np.cos(turn)).tolist(), (reach * np.sin(turn)).tolist(), strict=True))
+
+
+MARKS = {
+    "line": Mark(joined=True),
+    "dots": Mark(joined=True, symbol="o"),
+    "points": Mark(spread="bars", symbol="o", radius=4.2, swatch="dot"),
+    "marks": Mark(symbol="o", size=2.4, radius=3.0, pinned=True),
+    "stars": Mark(symbol="*", size=13.0, edge=0.8, corners=_star(9.0, 3.6), swatch="star"),
+    "text": Mark(written=True),
+}
+"""What a series can look like, by the name that the CSV gives it."""
+MOST_NAMES = 6
+"""Most names of a legend."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,8 +88,7 @@ class Series:
         Not finite: a gap.
     low, high : (n), optional
         Ends of a band, or of bars, about y.
-    style : "line", "dots" (a line with markers), "points" (with bars), "marks" (small, for single
-        worlds), "stars" or "text" (what `tips` say)
+    style : one of `MARKS`
     filled : (n), optional
         Which points are full; all of them if not said.
     strength : 0 to 1
@@ -45,7 +106,7 @@ class Series:
     y: Float[np.ndarray, " n"]
     low: Float[np.ndarray, " n"] | None = None
     high: Float[np.ndarray, " n"] | None = None
-    style: Literal["line", "dots", "points", "marks", "stars", "text"] = "line"
+    style: str = "line"
     filled: np.ndarray | None = None
     strength: float = 1.0
     dashed: bool = False
@@ -131,7 +192,8 @@ def ticks(low: float, high: float, log: bool = False) -> tuple[tuple[float, str]
     low, high : float
         low below high; above 0 where the axis is logarithmic.
     log : bool
-        Powers of ten, with 3 in between where there are fewer than three.
+        Powers of ten, with 3 in between where there are fewer than three; numbers as along a
+        linear axis where that would leave one or none.
 
     Returns
     -------
@@ -142,18 +204,19 @@ def ticks(low: float, high: float, log: bool = False) -> tuple[tuple[float, str]
     >>> [text for _, text in ticks(0.0, 0.93)], [text for _, text in ticks(0.8, 250.0, log=True)]
     (['0', '0.2', '0.4', '0.6', '0.8'], ['1', '10', '100'])
     """
-    if log:
-        powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-        found = [10.0**k for k in powers]
-        if len([value for value in found if low <= value <= high]) < 3:
-            found = sorted([*found, *(3.0 * value for value in found)])
-        return tuple((value, f"{value:g}") for value in found if low <= value <= high)
-    rough = (high - low) / 5.0
-    power = 10.0 ** math.floor(math.log10(rough))
-    step = next(power * m for m in (1.0, 2.0, 5.0, 10.0) if power * m >= 0.999 * rough)
-    first = math.ceil(low / step - 1e-9)
-    last = math.floor(high / step + 1e-9)
-    return tuple((k * step, f"{k * step:.10g}") for k in range(first, last + 1))
+    from matplotlib.ticker import LogLocator, MaxNLocator
+
+    def inside(locator: "Locator", room: float = 0.0) -> list[float]:
+        found = map(float, locator.tick_values(low, high))
+        return [value for value in found if low - room <= value <= high + room]
+
+    found = inside(LogLocator(subs=[1.0])) if log else []
+    if log and len(found) < 3:
+        found = inside(LogLocator(subs=[1.0, 3.0]))
+    if len(found) >= 2:
+        return tuple((value, f"{value:g}") for value in found)
+    found = inside(MaxNLocator(nbins=5, steps=[1, 2, 5, 10]), 1e-9 * (high - low))
+    return tuple((value, f"{value:.10g}") for value in found)
 
 
 def linear_axis(label: str, values: Iterable[float], *, floor: float | None = None) -> Axis:
@@ -231,6 +294,45 @@ def ends(found: Iterable[Series]) -> list[float]:
         if part is not None
         for value in part
     ]
+
+
+def legend_series(panels: Iterable[Panel]) -> dict[str, Series]:
+    """List what a legend over some panels explains.
+
+    Parameters
+    ----------
+    panels : iterable of Panel
+
+    Returns
+    -------
+    dict of Series
+        By name, the last of each; empty where the names are many: there the caption tells.
+
+    Examples
+    --------
+    >>> axis = Axis(label="", limits=(0.0, 1.0), ticks=())
+    >>> dot = Series(name="fused", role="fused", x=np.ones(1), y=np.ones(1), style="points")
+    >>> list(legend_series([Panel(title="", x=axis, y=axis, series=(dot,))] * 2))
+    ['fused']
+    """
+    named = {s.name: s for panel in panels for s in panel.series if s.listed and explained(s)}
+    return named if len(named) <= MOST_NAMES else {}
+
+
+def explained(series: Series) -> bool:
+    """Tell whether a series has a sign in the legend, and is read out by its name.
+
+    Parameters
+    ----------
+    series : Series
+
+    Returns
+    -------
+    bool
+        Not of single worlds, nor of what is written out.
+    """
+    mark = MARKS[series.style]
+    return not (mark.pinned or mark.written)
 
 
 def csv_rows(chart: Chart, **constant: str) -> list[list[str]]:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipistrelle.figures.chart import Axis, Chart, Panel, Series
+from pipistrelle.figures.chart import MARKS, Axis, Chart, Panel, Series, legend_series
 from pipistrelle.figures.style import COLUMNS, INK, STYLE, TRUTH, strategy_colour
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def draw_chart(chart: Chart) -> "Figure":
         for i, panel in enumerate(chart.panels):
             axes = figure.add_subplot(rows, columns, i + 1)
             _draw_panel(axes, panel)
-        if handles := _handles(chart):
+        if handles := [_handle(*named) for named in legend_series(chart.panels).items()]:
             figure.legend(handles=handles, loc="outside lower left", ncols=min(len(handles), 6))
     return figure
 
@@ -107,69 +107,54 @@ def _scale(axis: Axis) -> str:
 
 
 def _draw_series(axes: "Axes", series: Series, top: float, order: float) -> None:
-    """Draw one series in its style; single worlds above the panel are pinned to its edge."""
+    """Draw one series as its mark says."""
+    mark = MARKS[series.style]
     colour, alpha = _colour(series.role), series.strength
     given: dict[str, Any] = {"color": colour, "alpha": alpha, "zorder": order}
     x, y = series.x, series.y
-    if series.style == "text":
+    if mark.written:
         for at, up, text in zip(x, y, series.tips, strict=True):
             axes.text(at, up, text, color=TEXT.get(series.role, colour), ha="center", va="center",
                       fontsize=8, zorder=order)  # fmt: skip
         return
-    if series.style == "marks":
+    if mark.pinned:
         inside = y <= top
         given |= {"lw": 0, "mec": "none"}
-        axes.plot(x[inside], y[inside], "o", ms=2.4, **given)
+        axes.plot(x[inside], y[inside], mark.symbol, ms=mark.size, **given)
         axes.plot(x[~inside], np.full(x[~inside].shape, 0.985 * top), "^", ms=3.4, **given)
         return
-    if series.style == "stars":
-        axes.plot(x, y, "*", ms=13, color=colour, mec="white", mew=0.8, zorder=order)
-        return
     if series.low is not None and series.high is not None:
-        if series.style == "points":
+        if mark.spread == "bars":
             axes.vlines(x, series.low, series.high, lw=1.6, **given)
         else:
             axes.fill_between(
                 x, series.low, series.high, color=colour, alpha=BAND, lw=0, zorder=order
             )
-    style = (0, (4, 3)) if series.dashed else "-"
-    if series.style != "points":
-        axes.plot(x, y, lw=1.4, ls=style, **given)
-    if series.style in ("dots", "points"):
+    if mark.joined:
+        axes.plot(x, y, lw=1.4, ls=(0, (4, 3)) if series.dashed else "-", **given)
+    if mark.symbol:
         filled = np.ones(len(x), bool) if series.filled is None else series.filled
-        mark = {"ms": 5.0, "lw": 0, "mec": colour, "zorder": order + 0.005}
-        axes.plot(x[filled], y[filled], "o", mfc=colour, **mark)
-        axes.plot(x[~filled], y[~filled], "o", mfc="white", **mark)
-
-
-def _handles(chart: Chart) -> list[Any]:
-    """Return one legend entry per name; many alike are told by the caption instead."""
-    named = {
-        series.name: series
-        for panel in chart.panels
-        for series in panel.series
-        if series.listed and series.style not in ("marks", "text")
-    }
-    if len(named) > 6:
-        return []
-    return [_handle(name, series) for name, series in named.items()]
+        look: dict[str, Any] = {"ms": mark.size, "lw": 0, "mec": colour, "zorder": order + 0.005}
+        if mark.edge:
+            look |= {"mec": "white", "mew": mark.edge}
+        axes.plot(x[filled], y[filled], mark.symbol, mfc=colour, **look)
+        axes.plot(x[~filled], y[~filled], mark.symbol, mfc="white", **look)
 
 
 def _handle(name: str, series: Series) -> Any:
     """Return one legend entry."""
     from matplotlib.lines import Line2D
 
-    colour = _colour(series.role)
+    mark, colour = MARKS[series.style], _colour(series.role)
     hollow = series.filled is not None and not series.filled.any()
-    line = series.style in ("line", "dots") or series.low is not None
     return Line2D(
         [],
         [],
         color=colour,
         ls="--" if series.dashed else "-",
-        lw=1.4 if line else 0.0,
-        marker={"dots": "o", "points": "o", "stars": "*"}.get(series.style, ""),
-        ms=10 if series.style == "stars" else 5,
+        lw=1.4 if mark.joined or series.low is not None else 0.0,
+        marker=mark.symbol,
+        ms=min(mark.size, 10.0),
         mfc="none" if hollow else colour,
         label=textwrap.shorten(name, 60),
     )

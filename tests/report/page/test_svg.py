@@ -105,7 +105,7 @@ def test_spreads_are_told_with_their_means():
 
 
 @given(st.floats(-1e300, 1e300))
-def test_three_digits_are_near_the_number(value):
+def test_figure_are_near_the_number(value):
     text = figure(value).replace("−", "-")
     assert float(text) == pytest.approx(value, rel=0.006, abs=6e-5)
 

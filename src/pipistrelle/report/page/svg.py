@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from markupsafe import Markup
 
-from pipistrelle.figures.chart import Axis, Panel, Series
+from pipistrelle.figures.chart import MARKS, Axis, Panel, Series, explained, legend_series
 
 WIDTH, HEIGHT = 400.0, 280.0
 """Of a panel, in its own units, which are pixels on a small screen."""
@@ -80,7 +80,7 @@ def readings(panel: Panel) -> list[tuple[float, str, list[tuple[str, str]]]]:
     >>> readings(Panel(title="", x=axis, y=axis, series=(dot,)))
     [(33.0, '33', [('fused', '1 ± 0.1')])]
     """
-    named = [s for s in panel.series if s.listed and s.style not in ("marks", "text") and len(s.x)]
+    named = [s for s in panel.series if s.listed and explained(s) and len(s.x)]
     if not named or panel.equal:
         return []
     span = panel.x.limits[1] - panel.x.limits[0]
@@ -114,8 +114,8 @@ def figure(value: float) -> str:
 
     Examples
     --------
-    >>> figure(0.12345), figure(43.71), figure(-1234.5), figure(float("inf"))
-    ('0.123', '43.7', '−1234', '∞')
+    >>> [figure(value) for value in (0.12345, 43.71, -1234.5, float("inf"))]
+    ['0.123', '43.7', '−1234', '∞']
     """
     if not math.isfinite(value):
         return "∞" if value > 0 else ("−∞" if value < 0 else "no number")
@@ -199,21 +199,21 @@ def _grid(panel: Panel, frame: _Frame) -> list[Markup]:
 
 
 def _series(series: Series, frame: _Frame) -> list[Markup]:
-    """Draw one series in its style."""
+    """Draw one series as its mark says."""
+    mark = MARKS[series.style]
     x, y = _across(frame, series.x), _down(frame, series.y)
     known = np.flatnonzero(np.isfinite(x) & np.isfinite(y)).tolist()
-    if series.style == "text":
+    if mark.written:
         return [_text(series.tips[i], x[i], y[i] + 4.0, "middle") for i in known]
-    if series.style == "marks" and not series.tips:
-        return _marks(series, x, y, frame.panel.y.limits[1])
+    if mark.pinned and not series.tips:
+        return _pinned(series, x, y, frame.panel.y.limits[1])
     parts = []
     if series.low is not None and series.high is not None:
         parts.append(_spread(series, x, _down(frame, series.low), _down(frame, series.high)))
-    if series.style in ("line", "dots"):
+    if mark.joined:
         parts.append(_stroke("line dashed" if series.dashed else "line", series, _path(x, y)))
-    if series.style != "line":
-        radius = {"points": 4.2, "marks": 3.0}.get(series.style, 3.2)
-        parts += [_point(series, i, float(x[i]), float(y[i]), radius) for i in known]
+    if mark.symbol:
+        parts += [_point(series, i, float(x[i]), float(y[i])) for i in known]
     return parts
 
 
@@ -223,7 +223,7 @@ def _stroke(kind: str, series: Series, d: str) -> Markup:
     return Markup('<path class="{} c-{}"{} d="{}"/>').format(kind, series.role, Markup(faint), d)
 
 
-def _marks(series: Series, x: np.ndarray, y: np.ndarray, top: float) -> list[Markup]:
+def _pinned(series: Series, x: np.ndarray, y: np.ndarray, top: float) -> list[Markup]:
     """Draw single worlds as dots, and those beyond the panel as triangles at its top."""
     above = series.y > top
     points = list(zip(x.tolist(), y.tolist(), above.tolist(), strict=True))
@@ -236,7 +236,7 @@ def _spread(series: Series, x: np.ndarray, low: np.ndarray, high: np.ndarray) ->
     """Draw the band of a line, or the bars of points."""
     both = np.isfinite(low) & np.isfinite(high)
     ends = list(zip(x[both].tolist(), low[both].tolist(), high[both].tolist(), strict=True))
-    if series.style == "points":
+    if MARKS[series.style].spread == "bars":
         kind, d = "bars", "".join(f"M{a:.1f} {b:.1f}V{c:.1f}" for a, b, c in ends)
     else:
         edge = [f"{a:.1f} {c:.1f}" for a, _, c in ends]
@@ -257,17 +257,15 @@ def _path(x: np.ndarray, y: np.ndarray) -> str:
     return "".join(text)
 
 
-def _point(series: Series, i: int, x: float, y: float, radius: float) -> Markup:
-    """Draw one marker; a tip where there is something to say of it."""
+def _point(series: Series, i: int, x: float, y: float) -> Markup:
+    """Draw one symbol; a tip where there is something to say of it."""
+    mark = MARKS[series.style]
     filled = series.filled is None or bool(series.filled[i])
     kind = f"dot c-{series.role}{'' if filled else ' hollow'}"
-    shape = f'cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}"'
-    name = "circle"
-    if series.style == "stars":
-        turn = np.pi * (np.arange(10) / 5.0 - 0.5)
-        reach = np.where(np.arange(10) % 2, 3.6, 9.0)
-        corners = zip(x + reach * np.cos(turn), y + reach * np.sin(turn), strict=True)
-        name, shape = "path", 'd="M' + "L".join(f"{a:.1f} {b:.1f}" for a, b in corners) + 'z"'
+    name, shape = "circle", f'cx="{x:.1f}" cy="{y:.1f}" r="{mark.radius:g}"'
+    if mark.corners:
+        corners = "L".join(f"{x + right:.1f} {y + down:.1f}" for right, down in mark.corners)
+        name, shape = "path", f'd="M{corners}z"'
     if series.tips:
         return _tip(name, series.tips[i], shape, kind)
     return Markup('<{} class="{}" {}/>').format(name, kind, Markup(shape))
@@ -324,12 +322,10 @@ def legend(panels: Sequence[Panel]) -> list[tuple[str, str, str]]:
     list of name, role, and "line", "dashed", "dot", "hollow" or "star"
         Empty where the names are many: there the caption tells.
     """
-    found: dict[str, tuple[str, str, str]] = {}
-    for series in (s for panel in panels for s in panel.series):
-        if not series.listed or series.style in ("marks", "text"):
-            continue
-        kind = {"points": "dot", "stars": "star"}.get(series.style, "line")
-        if series.filled is not None and not series.filled.any():
+    found = []
+    for name, series in legend_series(panels).items():
+        kind = "dashed" if series.dashed else MARKS[series.style].swatch
+        if series.filled is not None and not series.filled.any() and not series.dashed:
             kind = "hollow"
-        found[series.name] = (series.name, series.role, "dashed" if series.dashed else kind)
-    return list(found.values()) if len(found) <= 6 else []
+        found.append((name, series.role, kind))
+    return found
