@@ -12,7 +12,7 @@ from pipistrelle.experiments.studies.plan import cases_of
 from pipistrelle.experiments.studies.plan_file import read_plan
 from pipistrelle.experiments.studies.store import open_store, world_file
 from pipistrelle.experiments.studies.world import world_schemas
-from pipistrelle.report.studied import COMMON, SCORES, Outcome, Study
+from pipistrelle.report.studied import COMMON, SCORES, Study, Trials
 
 RADII = (
     0.0025, 0.0031, 0.0038, 0.0047, 0.0058, 0.0071, 0.0088, 0.0108, 0.0133, 0.0164, 0.0203, 0.025,
@@ -62,7 +62,7 @@ def nees_of(rng, worlds, beams, name):
     return np.float32(curve * factor).astype(np.float64)
 
 
-def outcome_of(rng, world, name, strategy):
+def trials_of(rng, world, name, strategy):
     """Scores of one filter and strategy, with the worlds' own hardness in the errors."""
     worlds, beams = len(world), 1 if strategy == "passive" else len(BEAMWIDTH)
 
@@ -91,7 +91,7 @@ def outcome_of(rng, world, name, strategy):
     placed = {"active": 0.5, "fused": 0.52, "passive": 0.6}[strategy]
     scores[COMMON] = placed + 0.2 * world[:, None] + 0.05 * noise(rng, worlds, len(BEAMWIDTH))
     no = np.zeros((worlds, beams), dtype=bool)
-    return Outcome(failed=no, diverged=no.copy(), scores=scores, nees=nees)
+    return Trials(failed=no, diverged=no.copy(), scores=scores, nees=nees)
 
 
 def invent(worlds=60, seed=1, planned=None):
@@ -106,8 +106,8 @@ def invent(worlds=60, seed=1, planned=None):
         worlds=np.arange(worlds),
         config=Config(seed=2022),
         beamwidth=BEAMWIDTH,
-        outcomes={
-            (name, strategy): outcome_of(rng, world, name, strategy)
+        trials={
+            (name, strategy): trials_of(rng, world, name, strategy)
             for name in FILTERS
             for strategy in STRATEGIES
         },
@@ -118,14 +118,14 @@ def invent(worlds=60, seed=1, planned=None):
 
 def changed(study, way, score, change):
     """The same study with one score of one way changed by a function."""
-    outcome = study.outcomes[way]
-    scores = outcome.scores | {score: change(outcome.scores[score])}
-    return replace(study, outcomes=study.outcomes | {way: replace(outcome, scores=scores)})
+    trials = study.trials[way]
+    scores = trials.scores | {score: change(trials.scores[score])}
+    return replace(study, trials=study.trials | {way: replace(trials, scores=scores)})
 
 
 def only(study, ways):
     """The same study with some ways alone."""
-    return replace(study, outcomes={way: study.outcomes[way] for way in ways})
+    return replace(study, trials={way: study.trials[way] for way in ways})
 
 
 def write_store(folder: Path, study: Study, *, iterations=None, seed=3, failed=(), grid=""):
@@ -168,7 +168,7 @@ def world_tables_of(study, row, cases, broken, full, error):
         head = {"case": case.number}
         radius = case.values["emitter.radius"]
         column = 0 if radius is None else RADII[::-1].index(radius)
-        outcome = study.outcomes[case.filter, case.strategy]
+        trials = study.trials[case.filter, case.strategy]
         trial = head | dict(case.values)
         trial |= {
             "strategy": case.strategy,
@@ -183,11 +183,11 @@ def world_tables_of(study, row, cases, broken, full, error):
             tables["trials"].append(trial | {"status": "failed", "error": ERROR})
             continue
         for score in SCORES:
-            value = float(outcome.scores[score][row, column])
+            value = float(trials.scores[score][row, column])
             whole = score in ("landmarks_full", "landmarks_total")
             trial[score] = round(value) if whole else value
-        tables["trials"].append(trial | {"diverged": bool(outcome.diverged[row, column])})
-        nees = outcome.nees[row, column]
+        tables["trials"].append(trial | {"diverged": bool(trials.diverged[row, column])})
+        nees = trials.nees[row, column]
         tables["steps"] += [head | {"frame": k, "nees": v} for k, v in enumerate(nees, start=1)]
         tables["landmarks"] += [
             head | {"landmark": k + 1, "full": bool(full[case.number, k]), "error_m": off}

@@ -30,31 +30,31 @@ def test_what_was_written_is_read(written):
     (read,) = read_study(folder)
     assert (read.name, read.planned, read.worlds.tolist()) == ("invented", 9, list(range(5)))
     assert read.beamwidth == pytest.approx(BEAMWIDTH, rel=1e-12)
-    assert set(read.outcomes) == {(f, s) for f in FILTERS for s in STRATEGIES}
+    assert set(read.trials) == {(f, s) for f in FILTERS for s in STRATEGIES}
     assert read.config.seed == 2022
     assert read.settings == {}
     assert list(read.grid) == ["emitter.radius"]
-    for way, outcome in read.outcomes.items():
-        there = study.outcomes[way]
-        good = ~outcome.failed
+    for way, trials in read.trials.items():
+        there = study.trials[way]
+        good = ~trials.failed
         for score in SCORES:
             expected = there.scores[score]
             if score in ("landmarks_full", "landmarks_total"):
                 expected = expected.round()
-            np.testing.assert_array_equal(outcome.scores[score][good], expected[good])
-        np.testing.assert_array_equal(outcome.nees[good], there.nees[good])
+            np.testing.assert_array_equal(trials.scores[score][good], expected[good])
+        np.testing.assert_array_equal(trials.nees[good], there.nees[good])
 
 
 def test_failed_trials_are_known_and_have_no_numbers(written):
     folder, _, plan, _, _, failed = written
     (read,) = read_study(folder)
-    assert sum(int(outcome.failed.sum()) for outcome in read.outcomes.values()) == len(failed)
+    assert sum(int(trials.failed.sum()) for trials in read.trials.values()) == len(failed)
     for world, number in failed:
         name, strategy, column = cell_of(cases_of(plan)[number])
-        outcome = read.outcomes[name, strategy]
-        assert outcome.failed[world, column]
-        assert np.isnan(outcome.scores["position_rmse_m"][world, column])
-        assert np.isnan(outcome.nees[world, column]).all()
+        trials = read.trials[name, strategy]
+        assert trials.failed[world, column]
+        assert np.isnan(trials.scores["position_rmse_m"][world, column])
+        assert np.isnan(trials.nees[world, column]).all()
     assert [(world, text) for world, _, _, _, text in read.errors] == [(1, ERROR), (3, ERROR)]
 
 
@@ -68,7 +68,7 @@ def test_the_map_error_is_that_of_the_landmarks_every_strategy_has_placed(writte
                 trio = [number[name, s, 0 if s == "passive" else column] for s in STRATEGIES]
                 shared = [k for k in range(full.shape[2]) if all(full[world, c, k] for c in trio)]
                 for strategy, case in zip(STRATEGIES, trio, strict=True):
-                    found = read.outcomes[name, strategy].scores[COMMON][world, column]
+                    found = read.trials[name, strategy].scores[COMMON][world, column]
                     if not shared:
                         assert np.isnan(found)
                         continue
@@ -82,18 +82,18 @@ def test_worlds_without_their_file_of_trials_are_left_out(written, tmp_path):
     (folder / "trials" / "iteration_00002.parquet").unlink()
     (read,) = read_study(folder)
     assert read.worlds.tolist() == [0, 1, 3, 4]
-    expected = study.outcomes["ekf", "fused"].scores["position_rmse_m"][[0, 1, 3, 4]]
-    np.testing.assert_array_equal(read.outcomes["ekf", "fused"].scores["position_rmse_m"], expected)
+    expected = study.trials["ekf", "fused"].scores["position_rmse_m"][[0, 1, 3, 4]]
+    np.testing.assert_array_equal(read.trials["ekf", "fused"].scores["position_rmse_m"], expected)
 
 
 def test_what_is_not_finite_stays_so(written, tmp_path):
     folder, study = tmp_path / "store", invent(2)
-    study.outcomes["ekf", "fused"].scores["position_rmse_m"][0, 3] = np.inf
-    study.outcomes["ekf", "fused"].nees[1, 3, 7] = np.inf
+    study.trials["ekf", "fused"].scores["position_rmse_m"][0, 3] = np.inf
+    study.trials["ekf", "fused"].nees[1, 3, 7] = np.inf
     write_store(folder, study)
     (read,) = read_study(folder)
-    assert np.isposinf(read.outcomes["ekf", "fused"].scores["position_rmse_m"][0, 3])
-    assert np.isposinf(read.outcomes["ekf", "fused"].nees[1, 3, 7])
+    assert np.isposinf(read.trials["ekf", "fused"].scores["position_rmse_m"][0, 3])
+    assert np.isposinf(read.trials["ekf", "fused"].nees[1, 3, 7])
 
 
 def test_further_settings_make_studies_of_their_own(tmp_path):

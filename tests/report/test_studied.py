@@ -3,50 +3,51 @@
 import numpy as np
 import pytest
 
-from pipistrelle.report.studied import COMMON, kept, lost, samples, values
+from pipistrelle.report.claims.contrasts import select
+from pipistrelle.report.studied import COMMON, kept, lost_worlds, samples, values
 from report.invented import invent
 
 
 @pytest.fixture
 def study():
     study = invent(6)
-    study.outcomes["ekf", "fused"].diverged[0, 3] = True
-    study.outcomes["ekf", "passive"].diverged[1, 0] = True
-    study.outcomes["fastslam", "active"].failed[2, 5] = True
+    study.trials["ekf", "fused"].diverged[0, 3] = True
+    study.trials["ekf", "passive"].diverged[1, 0] = True
+    study.trials["fastslam", "active"].failed[2, 5] = True
     return study
 
 
 def test_the_paper_drops_a_world_where_any_case_of_the_filter_diverged_or_failed(study):
-    assert lost(study, "ekf").tolist() == [True, True, False, False, False, False]
-    assert lost(study, "fastslam").tolist() == [False, False, True, False, False, False]
-    assert np.flatnonzero(~kept(study, "world", [("ekf", "active", 8)])).tolist() == [0, 1]
+    assert lost_worlds(study, "ekf").tolist() == [True, True, False, False, False, False]
+    assert lost_worlds(study, "fastslam").tolist() == [False, False, True, False, False, False]
+    assert np.flatnonzero(~kept(select(study, "world"), [("ekf", "active", 8)])).tolist() == [0, 1]
     pair = [("ekf", "active", 8), ("fastslam", "active", 8)]
-    assert np.flatnonzero(~kept(study, "world", pair)).tolist() == [0, 1, 2]
+    assert np.flatnonzero(~kept(select(study, "world"), pair)).tolist() == [0, 1, 2]
 
 
 def test_by_case_only_the_cases_at_hand_count(study):
-    assert kept(study, "case", [("ekf", "fused", 2)]).all()
-    assert np.flatnonzero(~kept(study, "case", [("ekf", "fused", 3)])).tolist() == [0]
+    assert kept(select(study, "case"), [("ekf", "fused", 2)]).all()
+    assert np.flatnonzero(~kept(select(study, "case"), [("ekf", "fused", 3)])).tolist() == [0]
     pair = [("ekf", "fused", 3), ("ekf", "passive", 3)]
-    assert np.flatnonzero(~kept(study, "case", pair)).tolist() == [0, 1]
+    assert np.flatnonzero(~kept(select(study, "case"), pair)).tolist() == [0, 1]
 
 
 def test_without_a_rule_only_failed_trials_are_left_out(study):
-    assert kept(study, "none", [("ekf", "fused", 3)]).all()
-    assert np.flatnonzero(~kept(study, "none", [("fastslam", "active", 5)])).tolist() == [2]
+    assert kept(select(study, "none"), [("ekf", "fused", 3)]).all()
+    assert np.flatnonzero(~kept(select(study, "none"), [("fastslam", "active", 5)])).tolist() == [2]
 
 
 def test_samples_are_of_the_same_worlds_and_finite(study):
-    study.outcomes["ekf", "active"].scores["position_rmse_m"][4, 3] = np.inf
-    study.outcomes["ekf", "fused"].scores["position_rmse_m"][5, 3] = np.nan
+    study.trials["ekf", "active"].scores["position_rmse_m"][4, 3] = np.inf
+    study.trials["ekf", "fused"].scores["position_rmse_m"][5, 3] = np.nan
     cells = [("ekf", "active", 3), ("ekf", "fused", 3)]
-    first, second = samples(study, "none", "position_rmse_m", cells)
+    first, second = samples(select(study, "none"), "position_rmse_m", cells)
     assert first.tolist() == values(study, "position_rmse_m", cells[0])[:4].tolist()
     assert second.tolist() == values(study, "position_rmse_m", cells[1])[:4].tolist()
 
 
 def test_passive_has_one_column_but_for_the_landmarks_in_common(study):
-    there = study.outcomes["ekf", "passive"].scores
+    there = study.trials["ekf", "passive"].scores
     assert values(study, "position_rmse_m", ("ekf", "passive", 7)) is not None
     np.testing.assert_array_equal(
         values(study, "position_rmse_m", ("ekf", "passive", 7)), there["position_rmse_m"][:, 0]

@@ -14,7 +14,7 @@ from pipistrelle.config import Config, InputError
 from pipistrelle.experiments.studies.plan import RADIUS, Plan, cases_of
 from pipistrelle.experiments.studies.store import done_worlds, load_study, world_file
 from pipistrelle.experiments.studies.world import world_schemas
-from pipistrelle.report.studied import COMMON, SCORES, Outcome, Study
+from pipistrelle.report.studied import COMMON, SCORES, Study, Trials
 
 if TYPE_CHECKING:
     import polars as pl
@@ -121,7 +121,7 @@ def _study(
         worlds=worlds,
         config=config,
         beamwidth=cases["beamwidth_deg"].drop_nulls().unique().sort().to_numpy(),
-        outcomes=_outcomes(
+        trials=_trials(
             {
                 key: np.array([number[case] for case in group["case"].to_list()])
                 for key, group in cases.partition_by("filter", "strategy", as_dict=True).items()
@@ -135,16 +135,16 @@ def _study(
     )
 
 
-def _outcomes(
+def _trials(
     columns: dict[tuple[str, ...], Int[np.ndarray, " b"]],
     scores: dict[str, np.ndarray],
     nees: Float[np.ndarray, "n c k"],
     maps: tuple[Bool[np.ndarray, "n c l"], Float[np.ndarray, "n c l"]],
-) -> dict[tuple[str, str], Outcome]:
+) -> dict[tuple[str, str], Trials]:
     """Give each filter and strategy its columns."""
     common = _common(columns, *maps)
     return {
-        (name, strategy): Outcome(
+        (name, strategy): Trials(
             failed=scores["failed"][:, c],
             diverged=scores["diverged"][:, c],
             scores={score: scores[score][:, c] for score in SCORES}

@@ -1,9 +1,11 @@
-"""What a study found: worlds in rows, beamwidths in columns, a record per way of sensing.
+"""What a study found: worlds in rows, beamwidths in columns, a record per filter and strategy.
 
-And what counts: which worlds are left out where cases are compared.
+And what of it counts: a `Selection` is a study under one exclusion rule, and everything that is
+claimed, charted or told is taken from one.
 """
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -11,6 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import Config
+from pipistrelle.estimation.catalogue import CATALOGUE
+from pipistrelle.evaluation.comparison import Finding
 
 Rule = Literal["world", "case", "none"]
 RULES: dict[Rule, str] = {
@@ -19,11 +23,14 @@ RULES: dict[Rule, str] = {
     "none": "nothing is dropped but what has no number",
 }
 """What is left out of a mean, the paper's rule first."""
+Way = tuple[str, str]
+"""Filter and strategy."""
 Cell = tuple[str, str, int]
 """Filter, strategy and number of the beamwidth (of no meaning for passive)."""
+POSITION, HEADING = "position_rmse_m", "heading_rmse_rad"
 SCORES = (
-    "position_rmse_m",
-    "heading_rmse_rad",
+    POSITION,
+    HEADING,
     "nees_mean",
     "nees_max",
     "landmarks_full",
@@ -35,8 +42,8 @@ COMMON = "common_map_rmse_m"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome:
-    """What one filter made of one strategy, in n worlds at b beamwidths (passive: at one).
+class Trials:
+    """One filter's trials with one strategy, in n worlds at b beamwidths (passive: at one).
 
     Attributes
     ----------
@@ -77,7 +84,7 @@ class Study:
         With the combination applied.
     beamwidth : (b) [deg]
         Rising.
-    outcomes : dict
+    trials : dict
         By filter and strategy.
     errors : tuple of world, strategy, filter, beamwidth [deg] or None, text
         Of the trials that failed.
@@ -92,39 +99,55 @@ class Study:
     worlds: Int[np.ndarray, " n"]
     config: Config
     beamwidth: Float[np.ndarray, " b"]
-    outcomes: dict[tuple[str, str], Outcome]
+    trials: dict[Way, Trials]
     errors: tuple[tuple[int, str, str, float | None, str], ...]
     cpu_s: float
 
 
-def kept(study: Study, rule: Rule, cells: Sequence[Cell]) -> Bool[np.ndarray, " n"]:
-    """Tell which worlds count where these cells are compared.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Selection:
+    """A study under one exclusion rule, as `claims.contrasts.select` makes it.
+
+    Attributes
+    ----------
+    study : Study
+    rule : one of `RULES`
+    lost : dict of (n)
+        Per filter, the worlds in which any of its cases diverged or failed.
+    gains : dict of tuple of Finding
+        Active minus fused at each beamwidth, judged as a family of its own, by filter and score:
+        `POSITION` and `COMMON`. Empty where the study lacks one of the two.
+    """
+
+    study: Study
+    rule: Rule
+    lost: Mapping[str, Bool[np.ndarray, " n"]]
+    gains: Mapping[tuple[str, str], tuple[Finding, ...]]
+
+
+def filter_titles(study: Study) -> dict[str, str]:
+    """Titles of the filters that a study has, in the order in which they are shown.
 
     Parameters
     ----------
     study : Study
-    rule : one of `RULES`
-        A failed trial counts as a diverged one, and where nothing is dropped it has no number.
-    cells : sequence of Cell
 
     Returns
     -------
-    (n)
+    dict of str
+        Title by name. Those of the catalogue come first, in its order. Others (``module:Class``)
+        follow by name and bear their class's, or where two would be alike their whole name: to
+        read a study it takes none of the code that made it.
     """
-    counts = np.ones(len(study.worlds), dtype=bool)
-    for name, strategy, column in cells:
-        outcome = study.outcomes[name, strategy]
-        column = 0 if strategy == "passive" else column
-        counts &= ~outcome.failed[:, column]
-        if rule == "case":
-            counts &= ~outcome.diverged[:, column]
-    if rule == "world":
-        for name in {name for name, _, _ in cells}:
-            counts &= ~lost(study, name)
-    return counts
+    there = {name for name, _ in study.trials}
+    outside = sorted(there - CATALOGUE.keys())
+    plain = {name: name.rpartition(":")[2] for name in outside}
+    used = Counter([*plain.values(), *(known.title for known in CATALOGUE.values())])
+    titles = {name: known.title for name, known in CATALOGUE.items() if name in there}
+    return titles | {name: name if used[plain[name]] > 1 else plain[name] for name in outside}
 
 
-def lost(study: Study, name: str) -> Bool[np.ndarray, " n"]:
+def lost_worlds(study: Study, name: str) -> Bool[np.ndarray, " n"]:
     """Tell in which worlds any of a filter's cases diverged or failed.
 
     Parameters
@@ -137,8 +160,34 @@ def lost(study: Study, name: str) -> Bool[np.ndarray, " n"]:
     -------
     (n)
     """
-    mine = [outcome for (other, _), outcome in study.outcomes.items() if other == name]
-    return np.any([np.any(o.failed | o.diverged, axis=1) for o in mine], axis=0)
+    mine = [trials for (other, _), trials in study.trials.items() if other == name]
+    return np.any([np.any(t.failed | t.diverged, axis=1) for t in mine], axis=0)
+
+
+def kept(selection: Selection, cells: Sequence[Cell]) -> Bool[np.ndarray, " n"]:
+    """Tell which worlds count where these cells are compared.
+
+    Parameters
+    ----------
+    selection : Selection
+    cells : sequence of Cell
+
+    Returns
+    -------
+    (n)
+        A failed trial counts as a diverged one, and where nothing is dropped it has no number.
+    """
+    counts = np.ones(len(selection.study.worlds), dtype=bool)
+    for name, strategy, column in cells:
+        trials = selection.study.trials[name, strategy]
+        column = 0 if strategy == "passive" else column
+        counts &= ~trials.failed[:, column]
+        if selection.rule == "case":
+            counts &= ~trials.diverged[:, column]
+    if selection.rule == "world":
+        for name in {name for name, _, _ in cells}:
+            counts &= ~selection.lost[name]
+    return counts
 
 
 def values(study: Study, score: str, cell: Cell) -> Float[np.ndarray, " n"]:
@@ -155,19 +204,18 @@ def values(study: Study, score: str, cell: Cell) -> Float[np.ndarray, " n"]:
     (n)
     """
     name, strategy, column = cell
-    table = study.outcomes[name, strategy].scores[score]
+    table = study.trials[name, strategy].scores[score]
     return table[:, column if table.shape[1] > 1 else 0]
 
 
 def samples(
-    study: Study, rule: Rule, score: str, cells: Sequence[Cell]
+    selection: Selection, score: str, cells: Sequence[Cell]
 ) -> list[Float[np.ndarray, " m"]]:
     """Return a score of several cells in the worlds where all of them count and have a number.
 
     Parameters
     ----------
-    study : Study
-    rule : one of `RULES`
+    selection : Selection
     score : one of `SCORES`, or `COMMON`
     cells : sequence of Cell
 
@@ -175,6 +223,28 @@ def samples(
     -------
     list of (m), one per cell, the same worlds in each
     """
-    columns = np.array([values(study, score, cell) for cell in cells])
-    both = kept(study, rule, cells) & np.all(np.isfinite(columns), axis=0)
+    columns = np.array([values(selection.study, score, cell) for cell in cells])
+    both = kept(selection, cells) & np.all(np.isfinite(columns), axis=0)
     return list(columns[:, both])
+
+
+def mean_std(sample: Float[np.ndarray, " m"]) -> tuple[float, float]:
+    """Mean and standard deviation over worlds.
+
+    Parameters
+    ----------
+    sample : (m)
+
+    Returns
+    -------
+    float, float
+        Of no world, NaN; the standard deviation of a single one is 0.
+
+    Examples
+    --------
+    >>> mean_std(np.array([1.0, 3.0, 5.0])), mean_std(np.array([7.0]))
+    ((3.0, 2.0), (7.0, 0.0))
+    """
+    if len(sample) == 0:
+        return np.nan, np.nan
+    return float(np.mean(sample)), float(np.std(sample, ddof=1)) if len(sample) > 1 else 0.0

@@ -20,7 +20,7 @@ def report(
     quiet: Annotated[bool, Parameter(negative=(), help="Print the page's path alone.")] = False,
 ) -> None:
     """Judge the paper's claims by a study, and put it on one page with its figures."""
-    from pipistrelle.report.page.overview import departures, departures_line, failed
+    from pipistrelle.report.page.overview import failed_trials, not_the_papers, not_the_papers_line
     from pipistrelle.report.page.page import write_report
     from pipistrelle.report.reading import read_study
     from pipistrelle.verbs.console import say
@@ -34,9 +34,9 @@ def report(
         done, planned = len(studies[0].worlds), studies[0].planned
         if done < planned:
             print(f"partial: {done} of {planned} worlds")
-        if count := sum(map(failed, studies)):
+        if count := sum(map(failed_trials, studies)):
             print(f"failed: {count} trial{'' if count == 1 else 's'}; see the page")
-        if line := departures_line(departures(studies[0])):
+        if line := not_the_papers_line(not_the_papers(studies[0])):
             print(line)
         for claim in claims:
             print(f"{claim.number}  {claim.verdict.replace('-', ' '):<15} {claim.sentence}")

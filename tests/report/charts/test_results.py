@@ -6,7 +6,7 @@ import pytest
 from pipistrelle.evaluation.consistency import anees_bounds
 from pipistrelle.figures.chart import csv_rows
 from pipistrelle.report.charts.results import study_charts
-from pipistrelle.report.claims.contrasts import lap_time
+from pipistrelle.report.claims.contrasts import lap_time, select
 from pipistrelle.report.claims.published import TABLE_II
 from pipistrelle.report.studied import COMMON, RULES
 from report.invented import BEAMWIDTH, invent, only
@@ -20,13 +20,13 @@ NAMES = [
 @pytest.fixture(scope="module")
 def study():
     study = invent(20)
-    study.outcomes["ekf", "active"].diverged[4, 2] = True
+    study.trials["ekf", "active"].diverged[4, 2] = True
     return study
 
 
 @pytest.fixture(scope="module")
 def charts(study):
-    return {chart.name: chart for chart in study_charts(study, "world")}
+    return {chart.name: chart for chart in study_charts(select(study, "world"))}
 
 
 def series_of(chart, panel, name):
@@ -57,7 +57,7 @@ def test_a_line_is_the_mean_and_its_band_one_deviation(study, charts, chart, sco
     keep = np.arange(20) != 4
     for way in ("active", "fused", "passive"):
         line = series_of(charts[chart], "EKF", way)
-        sample = scale * study.outcomes["ekf", way].scores[score][keep]
+        sample = scale * study.trials["ekf", way].scores[score][keep]
         np.testing.assert_allclose(line.y, np.broadcast_to(sample.mean(axis=0), 12), rtol=1e-12)
         spread = np.broadcast_to(sample.std(axis=0, ddof=1), 12)
         np.testing.assert_allclose(line.high - line.y, spread, rtol=1e-9)
@@ -69,7 +69,7 @@ def test_single_worlds_are_those_above_the_band(study, charts):
         s for s in charts["position_rmse"].panels[0].series if s.name == "active, worlds above σ"
     ]
     line = series_of(charts["position_rmse"], "EKF", "active")
-    sample = np.delete(study.outcomes["ekf", "active"].scores["position_rmse_m"], 4, axis=0)
+    sample = np.delete(study.trials["ekf", "active"].scores["position_rmse_m"], 4, axis=0)
     expected = [
         v for column, top in zip(sample.T, line.high, strict=True) for v in column[column > top]
     ]
@@ -81,7 +81,7 @@ def test_single_worlds_are_those_above_the_band(study, charts):
 def test_anees_is_the_mean_over_the_worlds_that_count_within_its_bounds(study, charts):
     active, _, passive = charts["anees_ekf"].panels
     assert [s.name for s in active.series][::11] == ["180°", "11°"]
-    nees = np.delete(study.outcomes["ekf", "active"].nees, 4, axis=0)
+    nees = np.delete(study.trials["ekf", "active"].nees, 4, axis=0)
     np.testing.assert_allclose(active.series[-1].y, nees[:, 0].mean(axis=0), rtol=1e-12)
     assert active.span[:2] == pytest.approx(anees_bounds(19))
     assert active.posts == pytest.approx([lap_time(study) * k for k in (1, 2, 3)])
@@ -91,7 +91,7 @@ def test_anees_is_the_mean_over_the_worlds_that_count_within_its_bounds(study, c
 
 def test_gains_are_paired_and_full_where_significant(study, charts):
     (series,) = charts["gain"].panels[0].series
-    scores = [study.outcomes["ekf", way].scores["position_rmse_m"] for way in ("active", "fused")]
+    scores = [study.trials["ekf", way].scores["position_rmse_m"] for way in ("active", "fused")]
     difference = np.delete(scores[0] - scores[1], 4, axis=0)
     np.testing.assert_allclose(series.y, difference.mean(axis=0), rtol=1e-9)
     excludes = (series.low > 0) | (series.high < 0)
@@ -109,7 +109,7 @@ def test_table_ii_stands_beside_ours(charts):
 
 def test_what_a_study_has_not_is_not_drawn(study):
     ekf = only(study, [("ekf", "active"), ("ekf", "fused")])
-    charts = {chart.name: chart for chart in study_charts(ekf, "world")}
+    charts = {chart.name: chart for chart in study_charts(select(ekf, "world"))}
     assert "anees_fastslam" not in charts
     assert [panel.title for panel in charts["position_rmse"].panels] == ["EKF"]
     assert [panel.title for panel in charts["anees_ekf"].panels] == ["active", "fused"]
@@ -118,10 +118,10 @@ def test_what_a_study_has_not_is_not_drawn(study):
 @pytest.mark.parametrize("rule", RULES)
 def test_charts_can_be_had_where_no_world_counts_or_one(rule):
     lonely = invent(1)
-    assert [chart.name for chart in study_charts(lonely, rule)] == NAMES
-    for outcome in lonely.outcomes.values():
-        outcome.diverged[:] = True
-    charts = study_charts(lonely, rule)
+    assert [chart.name for chart in study_charts(select(lonely, rule))] == NAMES
+    for trials in lonely.trials.values():
+        trials.diverged[:] = True
+    charts = study_charts(select(lonely, rule))
     assert ("anees_ekf" in [chart.name for chart in charts]) == (rule == "none")
 
 

@@ -3,18 +3,20 @@
 import numpy as np
 
 from pipistrelle.report.claims.answer import answer
+from pipistrelle.report.claims.contrasts import selections
 from pipistrelle.report.claims.verdicts import judge_claims
 from pipistrelle.report.studied import COMMON
 from report.invented import BEAMWIDTH, changed, invent, only
 
 
 def told(study):
-    return answer(study, judge_claims(study))
+    by_rule = selections(study)
+    return answer(by_rule, judge_claims(by_rule))
 
 
 def with_map(study, change):
     for name in ("ekf", "fastslam"):
-        active = study.outcomes[name, "active"].scores[COMMON]
+        active = study.trials[name, "active"].scores[COMMON]
         study = changed(study, (name, "fused"), COMMON, lambda _, now=active: now + change)
     return study
 
@@ -89,13 +91,13 @@ def test_what_is_not_significant_is_not_called_equal():
 
 def test_a_filter_without_a_world_left_is_undecided_and_the_other_answers():
     study = with_map(invent(60), np.full(12, -0.3) + jitter(0.1))
-    study.outcomes["ekf", "passive"].diverged[:] = True
+    study.trials["ekf", "passive"].diverged[:] = True
     lines = told(study)
     assert lines[0] == "Yes: a fuller map, and a more accurate one at every beamwidth."
     placed = next(line for line in lines if line.startswith("The landmarks that"))
     assert "with FastSLAM 2.0 better at every beamwidth. Whether the landmarks that" in placed
     assert placed.endswith("placed better or worse with EKF is not decided: no world is left.")
-    study.outcomes["fastslam", "passive"].diverged[:] = True
+    study.trials["fastslam", "passive"].diverged[:] = True
     headline, without, *_ = told(study)
     assert headline == "It depends on which worlds are counted."
     assert without == "Without diverged worlds: Not decided: no world is left."
@@ -106,7 +108,7 @@ def test_an_answer_that_hangs_on_what_is_left_out_is_given_both_ways():
     for name in ("ekf", "fastslam"):
         spoilt = np.where(np.arange(60) < 20, 3.0, 0.0)[:, None]
         study = changed(study, (name, "fused"), COMMON, lambda error, more=spoilt: error + more)
-        study.outcomes[name, "fused"].diverged[:20] = True
+        study.trials[name, "fused"].diverged[:20] = True
     headline, without, within, _, _, _, diverged, _ = told(study)
     assert headline == "A fuller map, yes; a more accurate one depends on which worlds are counted."
     assert without == (

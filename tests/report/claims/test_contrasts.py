@@ -15,6 +15,7 @@ from pipistrelle.report.claims.contrasts import (
     frame_time,
     lap_fit,
     lap_time,
+    select,
 )
 from report.invented import BEAMWIDTH, changed, invent
 
@@ -92,34 +93,36 @@ def test_the_departure_is_that_of_the_mean_over_worlds():
 
 
 def test_curves_leave_out_worlds_without_a_number(study):
-    nees = study.outcomes["ekf", "active"].nees.copy()
+    nees = study.trials["ekf", "active"].nees.copy()
     nees[2, 4, 100] = np.inf
     spoilt = replace(
         study,
-        outcomes=study.outcomes
-        | {("ekf", "active"): replace(study.outcomes["ekf", "active"], nees=nees)},
+        trials=study.trials
+        | {("ekf", "active"): replace(study.trials["ekf", "active"], nees=nees)},
     )
-    (found,) = curves(spoilt, "none", [("ekf", "active")])
+    (found,) = curves(select(spoilt, "none"), [("ekf", "active")])
     np.testing.assert_array_equal(found, np.delete(nees, 2, axis=0))
-    assert curves(study, "none", [("ekf", "unheard")]) is None
+    assert curves(select(study, "none"), [("ekf", "unheard")]) is None
 
 
 def test_fused_leaves_passive_by_the_slope_over_octaves(study):
-    passive = study.outcomes["ekf", "passive"].scores["position_rmse_m"]
+    passive = study.trials["ekf", "passive"].scores["position_rmse_m"]
     gap = 0.25 * np.log2(BEAMWIDTH / 5.0)
     for sign in (1.0, -1.0):
         fused = passive + sign * gap
         made = changed(study, ("ekf", "fused"), "position_rmse_m", lambda _, now=fused: now)
-        slope = approach(made, "none", "position_rmse_m", "ekf")
+        slope = approach(select(made, "none"), "position_rmse_m", "ekf")
         assert slope == pytest.approx(np.full(8, 0.25), rel=1e-9)
 
 
 def test_differences_are_paired_and_named(study):
     pair = ("ekf", "active"), ("ekf", "fused")
-    found = differences(study, "none", "position_rmse_m", *pair, name="EKF", below=41.0)
+    found = differences(select(study, "none"), "position_rmse_m", *pair, name="EKF", below=41.0)
     assert [s.label for s in found] == [f"EKF, {b}°" for b in (11, 14, 18, 22, 27, 33)]
-    scores = [study.outcomes[way].scores["position_rmse_m"] for way in pair]
+    scores = [study.trials[way].scores["position_rmse_m"] for way in pair]
     np.testing.assert_array_equal(found[2].sample, scores[0][:, 2] - scores[1][:, 2])
     blind = ("fastslam", "passive"), ("ekf", "passive")
-    assert [s.label for s in differences(study, "none", "nees_mean", *blind, name="p")] == ["p"]
-    assert differences(study, "none", "nees_mean", ("ekf", "deaf"), pair[0], name="x") == []
+    assert [s.label for s in differences(select(study, "none"), "nees_mean", *blind, name="p")] == [
+        "p"
+    ]
+    assert differences(select(study, "none"), "nees_mean", ("ekf", "deaf"), pair[0], name="x") == []

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipistrelle.report.claims.contrasts import selections
 from pipistrelle.report.claims.published import TABLE_II
 from pipistrelle.report.claims.verdicts import judge_claims, record, tally
 from pipistrelle.report.studied import COMMON, RULES
@@ -21,7 +22,7 @@ def study():
 
 
 def verdicts(study):
-    return {claim.number: claim.verdict for claim in judge_claims(study)}
+    return {claim.number: claim.verdict for claim in judge_claims(selections(study))}
 
 
 def test_where_the_paper_is_right_every_claim_is_reproduced(study):
@@ -45,19 +46,19 @@ def test_where_the_paper_is_wrong_the_claim_is_not_reproduced(study, number):
 
 
 def reversed_in_time(study, way):
-    outcome = study.outcomes[way]
-    turned = replace(outcome, nees=outcome.nees[:, :, ::-1])
-    return replace(study, outcomes=study.outcomes | {way: turned})
+    trials = study.trials[way]
+    turned = replace(trials, nees=trials.nees[:, :, ::-1])
+    return replace(study, trials=study.trials | {way: turned})
 
 
 def test_nees_that_falls_or_a_less_consistent_ekf_refutes_the_second_claim(study):
     assert verdicts(reversed_in_time(study, ("ekf", "active")))[2] == "not-reproduced"
-    swapped = dict(study.outcomes)
+    swapped = dict(study.trials)
     for strategy in ("active", "fused", "passive"):
-        first, second = (study.outcomes[name, strategy] for name in FILTERS)
+        first, second = (study.trials[name, strategy] for name in FILTERS)
         swapped["ekf", strategy] = replace(first, nees=second.nees)
         swapped["fastslam", strategy] = replace(second, nees=first.nees)
-    assert verdicts(replace(study, outcomes=swapped))[2] == "not-reproduced"
+    assert verdicts(replace(study, trials=swapped))[2] == "not-reproduced"
 
 
 def test_fused_better_than_active_and_significantly_so_is_not_what_the_paper_found(study):
@@ -73,7 +74,7 @@ def test_fused_worse_than_active_in_this_sample_leaves_the_fourth_claim_open(stu
 def test_noise_as_large_as_the_effects_leaves_claims_open(study):
     rng = np.random.default_rng(8)
     loud = study
-    for way in study.outcomes:
+    for way in study.trials:
         loud = changed(loud, way, POSITION, lambda error: error + noise(rng, *error.shape))
     found = verdicts(loud)
     assert (found[3], found[6]) == ("open", "open")
@@ -88,7 +89,7 @@ def test_where_fused_and_active_are_the_same_fused_is_not_seen_to_beat_it():
         one = only(invent(30), [("fastslam", "active"), ("fastslam", "fused")])
         for strategy, errors in zip(("active", "fused"), plain, strict=True):
             one = changed(one, ("fastslam", strategy), POSITION, lambda _, now=errors: now)
-        wrong += judge_claims(one)[4].verdict == "not-reproduced"
+        wrong += judge_claims(selections(one))[4].verdict == "not-reproduced"
     assert wrong / runs <= 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / runs)
 
 
@@ -100,11 +101,11 @@ def test_a_verdict_that_hangs_on_what_is_left_out_is_open(study):
         POSITION,
         lambda error: error + np.where(np.arange(60) < 12, 5.0, 0.0)[:, None],
     )
-    outlying.outcomes["fastslam", "active"].diverged[:12] = True
+    outlying.trials["fastslam", "active"].diverged[:12] = True
     try:
-        claim = judge_claims(outlying)[4]
+        claim = judge_claims(selections(outlying))[4]
     finally:
-        outlying.outcomes["fastslam", "active"].diverged[:12] = False
+        outlying.trials["fastslam", "active"].diverged[:12] = False
     assert [claim.by_rule[rule].verdict for rule in RULES] == [
         "reproduced", "reproduced", "not-reproduced",
     ]  # fmt: skip
@@ -114,7 +115,7 @@ def test_a_verdict_that_hangs_on_what_is_left_out_is_open(study):
 
 def test_too_few_worlds_prove_no_absence():
     few = invent(4)
-    found = {claim.number: claim for claim in judge_claims(few)}
+    found = {claim.number: claim for claim in judge_claims(selections(few))}
     for number in (5, 7):
         assert found[number].verdict == "open"
         assert not any(tally(part)[2] for part in found[number].by_rule["world"].parts)
@@ -126,8 +127,8 @@ def test_a_study_that_has_hardly_begun_can_be_judged(worlds):
 
 
 def test_a_study_without_the_other_filter_leaves_open_what_needs_it(study):
-    ekf = only(study, [way for way in study.outcomes if way[0] == "ekf"])
-    found = {claim.number: claim for claim in judge_claims(ekf)}
+    ekf = only(study, [way for way in study.trials if way[0] == "ekf"])
+    found = {claim.number: claim for claim in judge_claims(selections(ekf))}
     assert [found[number].verdict for number in (2, 5)] == ["open", "open"]
     assert found[5].reason == "The study has no cases for this claim."
     assert "for a part of this claim" in found[2].reason
@@ -135,7 +136,7 @@ def test_a_study_without_the_other_filter_leaves_open_what_needs_it(study):
 
 
 def test_the_record_is_what_the_summary_promises(study):
-    for claim in judge_claims(study):
+    for claim in judge_claims(selections(study)):
         kept = json.loads(json.dumps(record(claim), allow_nan=False))
         assert {"claim", "sentence", "verdict", "statistic", "interval", "p", "n"} <= kept.keys()
         assert set(kept["by_exclusion"]) == set(RULES)
@@ -149,7 +150,7 @@ def test_the_record_is_what_the_summary_promises(study):
 
 def test_what_decides_is_the_statement_farthest_from_holding(study):
     worse = changed(study, ("ekf", "fused"), COMMON, lambda error: error - 0.3 * (BEAMWIDTH < 12))
-    claim = judge_claims(worse)[6]
+    claim = judge_claims(selections(worse))[6]
     assert claim.by_rule["world"].decisive.label == "EKF, 11°"
     assert record(claim)["statistic"] == pytest.approx(0.28, abs=1e-9)
 
@@ -157,7 +158,7 @@ def test_what_decides_is_the_statement_farthest_from_holding(study):
 def test_the_families_have_a_statement_for_every_case_the_paper_speaks_of(study):
     sizes = [
         [len(part.findings) for part in claim.by_rule["world"].parts]
-        for claim in judge_claims(study)
+        for claim in judge_claims(selections(study))
     ]
     beams, narrow = len(BEAMWIDTH), int(NARROW.sum())
     assert sizes == [

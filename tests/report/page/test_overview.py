@@ -5,13 +5,14 @@ import pytest
 
 from pipistrelle.evaluation.consistency import anees_bounds
 from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
+from pipistrelle.report.claims.contrasts import select
 from pipistrelle.report.page.overview import (
     by_strategy,
-    consistency,
-    departures,
-    departures_line,
-    exclusions,
-    table_ii,
+    consistency_rows,
+    exclusion_rows,
+    not_the_papers,
+    not_the_papers_line,
+    table_ii_rows,
 )
 from pipistrelle.settings import from_flags
 from report.invented import RADII, invent, only
@@ -26,20 +27,20 @@ def as_the_paper(study, **flags):
 def test_the_papers_own_settings_are_not_said_to_differ():
     study = as_the_paper(invent(2, planned=7), seed=5)
     assert study.grid["emitter.radius"] == RADII
-    assert departures(study) == []
-    assert departures_line([]) == ""
+    assert not_the_papers(study) == []
+    assert not_the_papers_line([]) == ""
 
 
 def test_settings_that_are_not_the_papers_are_named_with_both_values():
     study = as_the_paper(invent(2), scenario={"steps": 200}, beacon={"level_db": 45.0})
-    assert departures_line(departures(study)) == (
+    assert not_the_papers_line(not_the_papers(study)) == (
         "Not the paper's study: scenario.steps 200 (paper 1500), beacon.level_db 45 (paper 42.8)"
     )
 
 
 def test_fewer_beams_or_ways_are_not_the_papers_study():
     study = replace(as_the_paper(invent(2)), grid={"emitter.radius": (0.025, 0.0025)})
-    line = departures_line(departures(only(study, [("ekf", "active"), ("ekf", "fused")])))
+    line = not_the_papers_line(not_the_papers(only(study, [("ekf", "active"), ("ekf", "fused")])))
     assert line == (
         "Not the paper's study: "
         "emitter.radius 0.0025 and 0.025 (paper 12 values from 0.0025 to 0.025), "
@@ -50,10 +51,10 @@ def test_fewer_beams_or_ways_are_not_the_papers_study():
 
 def test_exclusions_count_worlds_and_trials_and_stand_beside_the_papers():
     study = invent(6)
-    study.outcomes["ekf", "fused"].diverged[0, 2:5] = True
-    study.outcomes["ekf", "active"].diverged[0, 0] = True
-    study.outcomes["fastslam", "passive"].failed[3, 0] = True
-    ekf, fastslam = exclusions(study)
+    study.trials["ekf", "fused"].diverged[0, 2:5] = True
+    study.trials["ekf", "active"].diverged[0, 0] = True
+    study.trials["fastslam", "passive"].failed[3, 0] = True
+    ekf, fastslam = exclusion_rows(study)
     assert (ekf["excluded"], ekf["worlds"], ekf["paper"], ekf["limit"]) == (1, 6, 8, 50.0)
     assert ekf["diverged"] == {"active": 1, "fused": 3, "passive": 0}
     assert ekf["trials"] == {"active": 72, "fused": 72, "passive": 6}
@@ -62,23 +63,28 @@ def test_exclusions_count_worlds_and_trials_and_stand_beside_the_papers():
 
 def test_table_ii_has_the_means_of_the_worlds_that_count():
     study = invent(6)
-    study.outcomes["ekf", "passive"].diverged[2, 0] = True
-    rows = table_ii(study)
-    count = np.delete(study.outcomes["ekf", "fused"].scores["landmarks_full"][:, 11], 2)
+    study.trials["ekf", "passive"].diverged[2, 0] = True
+    rows = table_ii_rows(select(study, "world"))
+    count = np.delete(study.trials["ekf", "fused"].scores["landmarks_full"][:, 11], 2)
     assert rows[0]["full"] == pytest.approx([count.mean(), count.std(ddof=1)])
     assert [row["n"] for row in rows] == [5] * 4 + [6] * 4
     assert rows[4]["full_mean"][0] == pytest.approx(rows[4]["full"][0] + 0.1)
-    assert table_ii(only(study, [("ekf", "fused")]))[7]["full"] is None
+    fused = only(study, [("ekf", "fused")])
+    assert table_ii_rows(select(fused, "world"))[7]["full"] is None
 
 
 def test_consistency_is_told_in_shares_of_time():
     study = invent(20)
     low, high = anees_bounds(20)
-    nees = study.outcomes["ekf", "passive"].nees
+    nees = study.trials["ekf", "passive"].nees
     nees[:, :, :75] = 3.0
     nees[:, :, 75:300] = high + 1.0
     nees[:, :, 300:] = low - 1.0
-    (row,) = [r for r in consistency(study) if (r["filter"], r["strategy"]) == ("ekf", "passive")]
+    (row,) = [
+        r
+        for r in consistency_rows(select(study, "world"))
+        if (r["filter"], r["strategy"]) == ("ekf", "passive")
+    ]
     assert (row["inside"], row["above"]) == pytest.approx((75 / 375, 225 / 375))
     assert row["bounds"] == pytest.approx([low, high])
     squares = [0.0, np.log((high + 1) / 3) ** 2, np.log((low - 1) / 3) ** 2]
@@ -87,7 +93,7 @@ def test_consistency_is_told_in_shares_of_time():
 
 
 def test_strategies_are_averages_over_beamwidths():
-    rows = consistency(invent(5))
+    rows = consistency_rows(select(invent(5), "world"))
     assert len(rows) == 50
     mine = [r["anees"] for r in rows if (r["filter"], r["strategy"]) == ("fastslam", "active")]
     found = {(r["filter"], r["strategy"]): r for r in by_strategy(rows)}

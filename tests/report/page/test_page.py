@@ -223,10 +223,10 @@ def test_the_page_says_near_its_top_what_is_not_the_papers(tmp_path, undrawn):
 
 def test_the_summary_is_plain_json_even_of_a_study_that_diverged(tmp_path, undrawn):
     study = invent(3)
-    for outcome in study.outcomes.values():
-        outcome.scores["position_rmse_m"][:] = np.inf
-        outcome.nees[0] = np.inf
-        outcome.diverged[:] = True
+    for trials in study.trials.values():
+        trials.scores["position_rmse_m"][:] = np.inf
+        trials.nees[0] = np.inf
+        trials.diverged[:] = True
     write_report((study,), tmp_path)
     text = (tmp_path / "summary.json").read_text()
     assert "Infinity" not in text
@@ -236,8 +236,8 @@ def test_the_summary_is_plain_json_even_of_a_study_that_diverged(tmp_path, undra
 
 def test_a_rule_that_leaves_no_world_says_so_and_the_others_are_shown(tmp_path, undrawn):
     study = invent(3)
-    for way, outcome in study.outcomes.items():
-        outcome.diverged[:] = way[0] == "ekf"
+    for way, trials in study.trials.items():
+        trials.diverged[:] = way[0] == "ekf"
     write_report((study,), tmp_path)
     text = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert text.count("No world is left under this rule.") == 2

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipistrelle.figures.chart import Axis, Panel, Series
-from pipistrelle.report.page.svg import figure, legend, panel_svg, readings
+from pipistrelle.report.page.svg import legend, panel_svg, readings, three_digits
 
 
 def panel_of(*series, log=False, limits=(0.0, 10.0), ticks=(), **given):
@@ -105,13 +105,13 @@ def test_spreads_are_told_with_their_means():
 
 
 @given(st.floats(-1e300, 1e300))
-def test_figure_are_near_the_number(value):
-    text = figure(value).replace("−", "-")
+def test_three_digits_are_near_the_number(value):
+    text = three_digits(value).replace("−", "-")
     assert float(text) == pytest.approx(value, rel=0.006, abs=6e-5)
 
 
 def test_what_is_no_number_is_told():
-    assert [figure(v) for v in (math.inf, -math.inf, math.nan, 0.0, -0.0, 1e-9)] == [
+    assert [three_digits(v) for v in (math.inf, -math.inf, math.nan, 0.0, -0.0, 1e-9)] == [
         "∞", "−∞", "no number", "0", "0", "0",
     ]  # fmt: skip
 

@@ -1,90 +1,101 @@
-"""The paper's figures of results as charts, under one exclusion rule."""
+"""The paper's figures of results as charts of a selection of worlds.
 
-from collections.abc import Sequence
+`CHARTS`, at the end, is the only list of them. To add a figure, write a function from a selection
+to its charts and name it there: page, PNG, PDF and CSV follow.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.evaluation.comparison import judge
-from pipistrelle.figures.chart import Axis, Chart, Panel, Series, ends, linear_axis
-from pipistrelle.figures.style import FILTER_NAMES
-from pipistrelle.report.charts.timelines import consistency
-from pipistrelle.report.claims.contrasts import differences
-from pipistrelle.report.claims.published import TABLE_II, beam_name, cell_of, row_name
-from pipistrelle.report.studied import COMMON, Cell, Rule, Study, samples
+from pipistrelle.figures.chart import MARKS, Axis, Chart, Panel, Series, ends, linear_axis
+from pipistrelle.report.charts.timelines import anees_charts
+from pipistrelle.report.claims.published import FILTERS, TABLE_II, beam_name, cell_of, row_name
+from pipistrelle.report.studied import (
+    COMMON,
+    HEADING,
+    POSITION,
+    Cell,
+    Selection,
+    Study,
+    Way,
+    filter_titles,
+    mean_std,
+    samples,
+)
 
 ASIDE = {"active": 0.985, "fused": 1.015, "passive": 1.0}
 """Where the single worlds of a strategy stand beside their beamwidth, as a share of it."""
 EDGE = 1.08
 """Where those of passive sensing stand, as a share of the widest beam."""
-POSITION = ("position_rmse_m", "Vehicle position RMSE", "position RMSE [m]", 1.0)
-HEADING = ("heading_rmse_rad", "Vehicle heading RMSE", "heading RMSE [°]", 180.0 / np.pi)
-MAP = (COMMON, "Map RMSE of the landmarks that every strategy has placed", "map RMSE [m]", 1.0)
-ERRORS = {"position_rmse_m": POSITION, "heading_rmse_deg": HEADING, "map_rmse_m": MAP}
-"""Score, title, axis and scale from the score to the axis, by the column of the CSV."""
+DEGREES = 180.0 / np.pi
 DIFFERENCE = "active minus fused; open: not significant"
 
 
-def study_charts(study: Study, rule: Rule) -> list[Chart]:
-    """Charts of what the study found.
+class ErrorChart(NamedTuple):
+    """What a chart of an RMSE is made of, and how it is called."""
 
-    Parameters
-    ----------
-    study : Study
-    rule : one of `outcomes.RULES`
-
-    Returns
-    -------
-    list of Chart
-        Without those that the study has nothing for.
-    """
-    charts = [
-        gains(study, rule),
-        *(consistency(study, rule, name) for name in FILTER_NAMES),
-        *(errors(study, rule, column) for column in ERRORS),
-        landmarks(study, rule),
-        counts(study, rule),
-    ]
-    return [chart for chart in charts if chart.panels]
+    name: str
+    title: str
+    score: str
+    label: str
+    column: str
+    scale: float = 1.0
 
 
-def gains(study: Study, rule: Rule) -> Chart:
+ERRORS = (
+    ErrorChart(
+        "position_rmse", "Vehicle position RMSE", POSITION, "position RMSE [m]", "position_rmse_m"
+    ),
+    ErrorChart(
+        "heading_rmse", "Vehicle heading RMSE", HEADING, "heading RMSE [°]", "heading_rmse_deg",
+        DEGREES,
+    ),
+    ErrorChart(
+        "map_rmse", "Map RMSE of the landmarks that every strategy has placed", COMMON,
+        "map RMSE [m]", "map_rmse_m",
+    ),
+)  # fmt: skip
+
+
+def gain_charts(selection: Selection) -> list[Chart]:
     """Chart how much better fused is than active, paired over worlds.
 
     Parameters
     ----------
-    study : Study
-    rule : one of `outcomes.RULES`
+    selection : Selection
 
     Returns
     -------
-    Chart
+    list of Chart
     """
+    study = selection.study
     panels = []
-    for what, score in (("position", "position_rmse_m"), ("map", COMMON)):
+    for what, score in (("position", POSITION), ("map", COMMON)):
         found = {}
-        for name in FILTER_NAMES:
-            pair = (name, "active"), (name, "fused")
-            findings = judge(differences(study, rule, score, *pair, name=name))
+        for name, title in filter_titles(study).items():
+            findings = selection.gains[name, score]
             if not findings:
                 continue
             mean = np.array([finding.mean for finding in findings])
             alone = np.array([finding.alone for finding in findings])
             alone[~np.isfinite(alone)] = np.nan
-            found[name] = _about(DIFFERENCE, "fused", study.beamwidth, mean, alone,
-                                 [finding.holds is not None for finding in findings])  # fmt: skip
+            found[title] = _about(DIFFERENCE, "fused", study.beamwidth, mean, alone,
+                                  [finding.holds is not None for finding in findings])  # fmt: skip
         axis = linear_axis(f"{what} gain [m]", [0.0, *ends(found.values())])
         panels += [
             Panel(
-                title=f"{what}, {FILTER_NAMES[name]}",
+                title=f"{what}, {title}",
                 x=_beam_axis(study),
                 y=axis,
                 series=(series,),
                 rules=(0.0,),
             )
-            for name, series in found.items()
+            for title, series in found.items()
         ]
-    return Chart(
+    chart = Chart(
         name="gain",
         title="What listening to the beacon adds to one's own calls",
         caption="RMSE of active minus that of fused in the same world, mean and its 95 % interval; "
@@ -93,71 +104,56 @@ def gains(study: Study, rule: Rule) -> Chart:
         panels=tuple(panels),
         columns=("beamwidth_deg", "gain_m"),
     )
+    return [chart]
 
 
-def errors(study: Study, rule: Rule, column: str) -> Chart:
-    """Chart an RMSE over the beamwidth, a panel per filter, a colour per strategy.
+def error_charts(selection: Selection) -> list[Chart]:
+    """Chart each RMSE over the beamwidth, a panel per filter, a colour per strategy.
 
     Parameters
     ----------
-    study : Study
-    rule : one of `outcomes.RULES`
-    column : str
-        Of `ERRORS`.
+    selection : Selection
 
     Returns
     -------
-    Chart
+    list of Chart
         Worlds more than σ above the mean as single marks.
 
     Notes
     -----
     Bradley & Abaid, Secs. V-C and V-D and Appendix A.
     """
-    score, title, label, scale = ERRORS[column]
-    found: dict[str, list[Series]] = {}
-    for way in study.outcomes:
-        per_beam = [scale * sample for sample in _per_beam(study, rule, way, score)]
-        line = _moment_line(study, way, score, per_beam)
-        found.setdefault(way[0], []).extend([line, _outliers(study, way, line, per_beam)])
-    lines = [series for mine in found.values() for series in mine if series.style != "marks"]
-    vertical = linear_axis(label, [1.07 * end for end in ends(lines)], floor=0.0)
-    return Chart(
-        name=column.rsplit("_", 1)[0],
-        title=title,
-        caption="Mean ± σ over worlds; dots: single worlds above that (passive's at the right "
-        "edge, where they do not depend on the beam), triangles: those beyond the panel",
-        panels=_by_filter(study, found, vertical),
-        columns=("beamwidth_deg", column),
-    )
+    return [_error_chart(selection, what) for what in ERRORS]
 
 
-def landmarks(study: Study, rule: Rule) -> Chart:
+def landmark_charts(selection: Selection) -> list[Chart]:
     """Chart how many landmarks are initialised, over the beamwidth.
 
     Parameters
     ----------
-    study : Study
-    rule : one of `outcomes.RULES`
+    selection : Selection
 
     Returns
     -------
-    Chart
+    list of Chart
 
     Notes
     -----
     Bradley & Abaid, Sec. V-E.
     """
+    study = selection.study
     found: dict[str, list[Series]] = {}
-    for way in study.outcomes:
-        full = _per_beam(study, rule, way, "landmarks_full")
-        total = [_moments(s)[0] for s in _per_beam(study, rule, way, "landmarks_total")]
+    for way in study.trials:
+        full = _per_beam(selection, way, "landmarks_full")
+        total = [mean_std(s)[0] for s in _per_beam(selection, way, "landmarks_total")]
         line = Series(
             name=f"{way[1]}, total", role=way[1], x=study.beamwidth, y=np.array(total), dashed=True
         )
-        found.setdefault(way[0], []).extend([_moment_line(study, way, "full", full), line])
+        found.setdefault(way[0], []).extend(
+            [_mean_line(study, way, full, flat=way[1] == "passive"), line]
+        )
     vertical = linear_axis("landmarks", ends(s for mine in found.values() for s in mine), floor=0.0)
-    return Chart(
+    chart = Chart(
         name="landmarks",
         title="Landmarks initialised",
         caption="Fully initialised landmarks at the end, mean ± σ over worlds; dashed: fully and "
@@ -165,19 +161,19 @@ def landmarks(study: Study, rule: Rule) -> Chart:
         panels=_by_filter(study, found, vertical),
         columns=("beamwidth_deg", "landmarks"),
     )
+    return [chart]
 
 
-def counts(study: Study, rule: Rule) -> Chart:
+def table_ii_charts(selection: Selection) -> list[Chart]:
     """Chart Table II, ours beside the paper's.
 
     Parameters
     ----------
-    study : Study
-    rule : one of `outcomes.RULES`
+    selection : Selection
 
     Returns
     -------
-    Chart
+    list of Chart
 
     Notes
     -----
@@ -185,42 +181,88 @@ def counts(study: Study, rule: Rule) -> Chart:
     """
     panels = []
     for kind, score in (("fully initialised", "landmarks_full"), ("total", "landmarks_total")):
-        found = {name: _beside(study, rule, name, score) for name in FILTER_NAMES}
+        found = {title: _beside(selection, name, score) for name, title in FILTERS.items()}
         axis = linear_axis("landmarks", ends(s for _, mine in found.values() for s in mine))
-        for name, (rows, series) in found.items():
+        for title, (rows, series) in found.items():
             names = tuple((float(i), text) for i, text in enumerate(rows))
             limits = (-0.6, len(rows) - 0.4)
             if rows:
                 panels.append(
                     Panel(
-                        title=f"{kind}, {FILTER_NAMES[name]}",
+                        title=f"{kind}, {title}",
                         x=Axis(label="", limits=limits, ticks=names),
                         y=axis,
                         series=series,
                     )
                 )
-    return Chart(
+    chart = Chart(
         name="table_ii",
         title="Landmarks as in Table II",
         caption="Mean ± σ over worlds; fused sensing at three beamwidths, and passive",
         panels=tuple(panels),
         columns=("row", "landmarks"),
     )
+    return [chart]
 
 
-def _per_beam(
-    study: Study, rule: Rule, way: tuple[str, str], score: str
-) -> list[Float[np.ndarray, " m"]]:
+CHARTS: tuple[Callable[[Selection], list[Chart]], ...] = (
+    gain_charts, anees_charts, error_charts, landmark_charts, table_ii_charts,
+)  # fmt: skip
+"""What is charted of a selection, in the page's order."""
+
+
+def study_charts(
+    selection: Selection, charts: Sequence[Callable[[Selection], list[Chart]]] = CHARTS
+) -> list[Chart]:
+    """Charts of what the study found.
+
+    Parameters
+    ----------
+    selection : Selection
+    charts : sequence of functions of a Selection
+        Each gives the charts of a figure.
+
+    Returns
+    -------
+    list of Chart
+        Without those that the study has nothing for.
+    """
+    return [chart for drawn in charts for chart in drawn(selection) if chart.panels]
+
+
+def _error_chart(selection: Selection, what: ErrorChart) -> Chart:
+    """Chart one RMSE; of passive sensing, what does not change with the beam is a flat line."""
+    study = selection.study
+    found: dict[str, list[Series]] = {}
+    for way in study.trials:
+        flat = way[1] == "passive" and what.score != COMMON
+        per_beam = [what.scale * sample for sample in _per_beam(selection, way, what.score)]
+        line = _mean_line(study, way, per_beam, flat=flat)
+        worlds = _worlds_above(study, way, line, per_beam, flat=flat)
+        found.setdefault(way[0], []).extend([line, worlds])
+    lines = [s for mine in found.values() for s in mine if not MARKS[s.style].pinned]
+    vertical = linear_axis(what.label, [1.07 * end for end in ends(lines)], floor=0.0)
+    return Chart(
+        name=what.name,
+        title=what.title,
+        caption="Mean ± σ over worlds; dots: single worlds above that (passive's at the right "
+        "edge, where they do not depend on the beam), triangles: those beyond the panel",
+        panels=_by_filter(study, found, vertical),
+        columns=("beamwidth_deg", what.column),
+    )
+
+
+def _per_beam(selection: Selection, way: Way, score: str) -> list[Float[np.ndarray, " m"]]:
     """Return a score's values over the worlds, at each beamwidth."""
-    cells: list[Cell] = [(*way, i) for i in range(len(study.beamwidth))]
-    return [samples(study, rule, score, [cell])[0] for cell in cells]
+    cells: list[Cell] = [(*way, i) for i in range(len(selection.study.beamwidth))]
+    return [samples(selection, score, [cell])[0] for cell in cells]
 
 
-def _moment_line(
-    study: Study, way: tuple[str, str], score: str, per_beam: Sequence[Float[np.ndarray, " m"]]
+def _mean_line(
+    study: Study, way: Way, per_beam: Sequence[Float[np.ndarray, " m"]], *, flat: bool
 ) -> Series:
     """Return mean ± σ over the beamwidth; with dots where it depends on it."""
-    mean, std = np.array([_moments(sample) for sample in per_beam]).T
+    mean, std = np.array([mean_std(sample) for sample in per_beam]).T
     return Series(
         name=way[1],
         role=way[1],
@@ -228,21 +270,23 @@ def _moment_line(
         y=mean,
         low=mean - std,
         high=mean + std,
-        style="line" if way[1] == "passive" and score != COMMON else "dots",
+        style="line" if flat else "dots",
     )
 
 
-def _outliers(
+def _worlds_above(
     study: Study,
-    way: tuple[str, str],
+    way: Way,
     line: Series,
     per_beam: Sequence[Float[np.ndarray, " m"]],
+    *,
+    flat: bool,
 ) -> Series:
     """Return the worlds above the band of a line."""
     top = np.array([np.nan]) if line.high is None else line.high
     above = [sample[sample > end] for sample, end in zip(per_beam, top, strict=True)]
     at = study.beamwidth * ASIDE[way[1]]
-    if line.style == "line":
+    if flat:
         above, at = above[:1], EDGE * study.beamwidth[-1:]
     return Series(
         name=f"{way[1]}, worlds above σ",
@@ -257,23 +301,20 @@ def _outliers(
 def _by_filter(study: Study, found: dict[str, list[Series]], vertical: Axis) -> tuple[Panel, ...]:
     """Return a panel per filter, all with the same axes."""
     return tuple(
-        Panel(title=label, x=_beam_axis(study), y=vertical, series=tuple(found[name]))
-        for name, label in FILTER_NAMES.items()
-        if name in found
+        Panel(title=title, x=_beam_axis(study), y=vertical, series=tuple(found[name]))
+        for name, title in filter_titles(study).items()
     )
 
 
-def _beside(
-    study: Study, rule: Rule, name: str, score: str
-) -> tuple[list[str], tuple[Series, Series]]:
+def _beside(selection: Selection, name: str, score: str) -> tuple[list[str], tuple[Series, Series]]:
     """Return the names of Table II's rows, the paper's counts and ours."""
     rows, printed, ours = [], [], []
     for row in TABLE_II:
-        cell = cell_of(study, row) if row.filter == name else None
+        cell = cell_of(selection.study, row) if row.filter == name else None
         if cell is not None:
             rows.append(row_name(row).split()[0])
             printed.append(row.full if score == "landmarks_full" else row.total)
-            ours.append(_moments(samples(study, rule, score, [cell])[0]))
+            ours.append(mean_std(samples(selection, score, [cell])[0]))
     at = np.arange(len(rows), dtype=np.float64)
     series = []
     for title, role, aside, pairs in (
@@ -304,13 +345,6 @@ def _about(
         style="points",
         filled=np.array(filled, dtype=bool),
     )
-
-
-def _moments(sample: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """Return mean and standard deviation; NaN where there is none."""
-    if len(sample) == 0:
-        return np.nan, np.nan
-    return float(np.mean(sample)), float(np.std(sample, ddof=1)) if len(sample) > 1 else 0.0
 
 
 def _beam_axis(study: Study) -> Axis:

@@ -1,39 +1,44 @@
-"""ANEES over time as a chart."""
+"""ANEES over time as charts, one per filter."""
+
+import re
 
 import numpy as np
 
 from pipistrelle.config import STRATEGIES
 from pipistrelle.evaluation.consistency import anees, anees_bounds
 from pipistrelle.figures.chart import Chart, Panel, Series, ends, linear_axis, log_axis
-from pipistrelle.figures.style import FILTER_NAMES
 from pipistrelle.report.claims.contrasts import frame_time, lap_time
 from pipistrelle.report.claims.published import beam_name
-from pipistrelle.report.studied import Rule, Study, kept
+from pipistrelle.report.studied import Selection, Way, filter_titles, kept
 
 
-def consistency(study: Study, rule: Rule, name: str) -> Chart:
-    """Chart a filter's ANEES over time, a panel per strategy, a line per beamwidth.
+def anees_charts(selection: Selection) -> list[Chart]:
+    """Chart each filter's ANEES over time, a panel per strategy, a line per beamwidth.
 
     Parameters
     ----------
-    study : Study
-    rule : one of `outcomes.RULES`
-    name : str
-        The filter.
+    selection : Selection
 
     Returns
     -------
-    Chart
+    list of Chart
 
     Notes
     -----
     Bradley & Abaid, Sec. V-B and Eqs. (24) and (25).
     """
-    ways = [way for way in STRATEGIES if (name, way) in study.outcomes]
-    lines = {way: _anees_lines(study, rule, (name, way)) for way in ways}
+    titles = filter_titles(selection.study)
+    return [_anees_chart(selection, name, title) for name, title in titles.items()]
+
+
+def _anees_chart(selection: Selection, name: str, title: str) -> Chart:
+    """Chart one filter's ANEES over time."""
+    study = selection.study
+    ways = [way for way in STRATEGIES if (name, way) in study.trials]
+    lines = {way: _anees_lines(selection, (name, way)) for way in ways}
     lines = {way: series for way, series in lines.items() if series}
     runs = min(
-        (int(np.sum(kept(study, rule, [(name, way, i)])))
+        (int(np.sum(kept(selection, [(name, way, i)])))
          for way, series in lines.items() for i in range(len(series))), default=0,
     )  # fmt: skip
     span = anees_bounds(runs) if runs else (1.0, 9.0)
@@ -52,8 +57,8 @@ def consistency(study: Study, rule: Rule, name: str) -> Chart:
         for way, series in lines.items()
     ]
     return Chart(
-        name=f"anees_{name}",
-        title=f"Consistency of {FILTER_NAMES[name]}: average NEES over time",
+        name="anees_" + re.sub(r"\W+", "_", name),
+        title=f"Consistency of {title}: average NEES over time",
         caption="The stronger a line, the narrower the beam; grey: where a consistent filter's "
         f"ANEES over {runs} world{'' if runs == 1 else 's'} lies with 95 %; dotted: "
         "the vehicle is back at its start",
@@ -62,13 +67,14 @@ def consistency(study: Study, rule: Rule, name: str) -> Chart:
     )
 
 
-def _anees_lines(study: Study, rule: Rule, way: tuple[str, str]) -> list[Series]:
+def _anees_lines(selection: Selection, way: Way) -> list[Series]:
     """Return ANEES over time, the widest beam first and faintest."""
-    nees = study.outcomes[way].nees
+    study = selection.study
+    nees = study.trials[way].nees
     time = frame_time(study, nees.shape[2])
     found = []
     for i in reversed(range(nees.shape[1] if len(time) else 0)):
-        counts = kept(study, rule, [(*way, i)])
+        counts = kept(selection, [(*way, i)])
         single = way[1] == "passive"
         if counts.any():
             found.append(

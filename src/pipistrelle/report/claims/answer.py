@@ -1,20 +1,29 @@
 """The answer in plain words: what listening to the beacon does to the map, and how surely."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pipistrelle.evaluation.comparison import Finding, judge
-from pipistrelle.figures.style import FILTER_NAMES
-from pipistrelle.report.claims.contrasts import differences
+from pipistrelle.evaluation.comparison import Finding
 from pipistrelle.report.claims.published import beam_name
-from pipistrelle.report.claims.verdicts import WITHOUT, Claim
-from pipistrelle.report.studied import COMMON, RULES, Rule, Study, samples
+from pipistrelle.report.claims.verdicts import WITHOUT, JudgedClaim
+from pipistrelle.report.studied import (
+    COMMON,
+    POSITION,
+    Rule,
+    Selection,
+    Study,
+    filter_titles,
+    samples,
+)
 
-NUMBERS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight")
+NUMBERS = (
+    "none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten",
+    "eleven", "twelve",
+)  # fmt: skip
 
 
-def answer(study: Study, claims: Sequence[Claim]) -> list[str]:
+def answer(selections: Mapping[Rule, Selection], claims: Sequence[JudgedClaim]) -> list[str]:
     """Answer the question, then say what of the paper's claims is left.
 
     Numbers leave diverged worlds out, as the paper does; where that bears on the answer, it is
@@ -22,58 +31,68 @@ def answer(study: Study, claims: Sequence[Claim]) -> list[str]:
 
     Parameters
     ----------
-    study : Study
-    claims : sequence of Claim
+    selections : dict of Selection
+        Under each exclusion rule.
+    claims : sequence of JudgedClaim
 
     Returns
     -------
     list of str
         A line that stands alone, then sentences.
     """
-    placed, located = (_findings(study, "world", score) for score in (COMMON, "position_rmse_m"))
-    by_rule = {rule: _headline(study, rule) for rule in RULES}
+    papers = selections["world"]
+    by_rule = {rule: _headline(selection) for rule, selection in selections.items()}
     sentences = (
         *_otherwise(by_rule),
-        _counted(study),
-        _compared("The landmarks that every strategy places are placed", placed),
-        _compared("The vehicle is located", located),
-        _diverged(study),
+        _counted(papers),
+        _compared("The landmarks that every strategy places are placed", papers, COMMON),
+        _compared("The vehicle is located", papers, POSITION),
+        _diverged(papers.study),
         _tally(claims),
     )
     headline = by_rule["world"]
     if len(set(by_rule.values())) > 1:
-        fuller = all(_fuller(study, rule) for rule in RULES)
+        fuller = all(map(_fuller, selections.values()))
         headline = "It depends on which worlds are counted."
         if fuller:
             headline = "A fuller map, yes; a more accurate one depends on which worlds are counted."
     return [headline, *(sentence for sentence in sentences if sentence)]
 
 
-def _findings(study: Study, rule: Rule, score: str) -> dict[str, list[Finding]]:
-    """Judge active minus fused at each beamwidth, per filter, as a family of its own."""
-    return {
-        name: list(
-            judge(differences(study, rule, score, (name, "active"), (name, "fused"), name=name))
-        )
-        for name in FILTER_NAMES
-    }
+def number_word(count: int) -> str:
+    """Write a count as a word, where it has one that is short.
+
+    Parameters
+    ----------
+    count : int
+        Not negative.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> number_word(0), number_word(8), number_word(30)
+    ('none', 'eight', '30')
+    """
+    return NUMBERS[count] if count < len(NUMBERS) else str(count)
 
 
-def _headline(study: Study, rule: Rule) -> str:
+def _headline(selection: Selection) -> str:
     """Answer in a line."""
-    placed = _findings(study, rule, COMMON)
-    decided = [finding for mine in placed.values() for finding in mine if finding.n > 1]
-    if not any(placed.values()):
+    placed = [mine for (_, score), mine in selection.gains.items() if score == COMMON]
+    decided = [finding for mine in placed for finding in mine if finding.n > 1]
+    if not any(placed):
         return "Not decided: the study has no pair of active and fused."
     if not decided:
-        return f"Not decided: {_left([finding for mine in placed.values() for finding in mine])}."
+        return f"Not decided: {_left([finding for mine in placed for finding in mine])}."
     better = sum(finding.holds is True for finding in decided)
     worse = sum(finding.holds is False for finding in decided)
-    fuller = _fuller(study, rule)
+    fuller = _fuller(selection)
     built = "It builds a fuller map" if fuller else "It does not build a fuller map"
     if better and not worse:
-        narrow = all(_narrow(mine) for mine in placed.values())
-        where = "where the beam is narrow" if narrow else "at some beamwidths"
+        where = "where the beam is narrow" if all(map(_narrow, placed)) else "at some beamwidths"
         where = "at every beamwidth" if better == len(decided) else where
         begun = "Yes: a fuller map, and" if fuller else f"{built}, but"
         return f"{begun} a more accurate one {where}."
@@ -96,12 +115,13 @@ def _narrow(findings: Sequence[Finding]) -> bool:
     return all(finding.holds is not True for finding in findings[len(findings) // 2 :])
 
 
-def _fuller(study: Study, rule: Rule) -> bool:
+def _fuller(selection: Selection) -> bool:
     """Tell whether fused places more landmarks than active on average wherever worlds are left."""
+    study = selection.study
     pairs = [
-        samples(study, rule, "landmarks_full", [(name, "fused", i), (name, "active", i)])
-        for name in FILTER_NAMES
-        if {(name, "fused"), (name, "active")} <= study.outcomes.keys()
+        samples(selection, "landmarks_full", [(name, "fused", i), (name, "active", i)])
+        for name in filter_titles(study)
+        if {(name, "fused"), (name, "active")} <= study.trials.keys()
         for i in range(len(study.beamwidth))
     ]
     more = [np.mean(a) > np.mean(b) for a, b in pairs if len(a) > 1]
@@ -122,66 +142,67 @@ def _otherwise(by_rule: dict[Rule, str]) -> list[str]:
 def _diverged(study: Study) -> str:
     """Say which strategies diverged how often."""
     said = []
-    for name, label in FILTER_NAMES.items():
+    for name, title in filter_titles(study).items():
         shares = {
-            way[1]: float(np.mean(outcome.diverged))
-            for way, outcome in study.outcomes.items()
-            if way[0] == name and outcome.diverged.any()
+            way[1]: float(np.mean(trials.diverged))
+            for way, trials in study.trials.items()
+            if way[0] == name and trials.diverged.any()
         }
         if shares:
             parts = ", ".join(f"{way} in {100.0 * share:.1f} %" for way, share in shares.items())
-            said.append(f"with {label} {parts}")
+            said.append(f"with {title} {parts}")
     return f"The filter diverged, of the trials, {'; '.join(said)}." if said else ""
 
 
-def _counted(study: Study) -> str:
+def _counted(selection: Selection) -> str:
     """Say how many landmarks fused and active place, at the narrowest and at the widest beam."""
-    for name, label in FILTER_NAMES.items():
-        if not {(name, "fused"), (name, "active")} <= study.outcomes.keys():
+    study = selection.study
+    for name, title in filter_titles(study).items():
+        if not {(name, "fused"), (name, "active")} <= study.trials.keys():
             continue
         said = []
         for i in dict.fromkeys((0, len(study.beamwidth) - 1)):
             cells = [(name, "fused", i), (name, "active", i)]
-            fused, active = samples(study, "world", "landmarks_full", cells)
+            fused, active = samples(selection, "landmarks_full", cells)
             if len(fused):
                 beam = beam_name(study.beamwidth[i])
                 said.append(f"{np.mean(fused):.0f} instead of {np.mean(active):.0f} at {beam}")
         if said:
             return (
                 "Hearing the beacon as well as its own calls, the vehicle fully places, of "
-                f"{study.config.scenario.landmarks + 1} landmarks, {' and '.join(said)} ({label})."
+                f"{study.config.scenario.landmarks + 1} landmarks, {' and '.join(said)} ({title})."
             )
     return ""
 
 
-def _compared(subject: str, found: dict[str, list[Finding]]) -> str:
+def _compared(subject: str, selection: Selection, score: str) -> str:
     """Say where fused is better than active, and where worse, with each filter."""
     said, undecided = [], []
-    for name, findings in found.items():
-        label = FILTER_NAMES[name]
+    for name, title in filter_titles(selection.study).items():
+        findings = selection.gains[name, score]
         if findings and max(finding.n for finding in findings) < 2:
             what = subject[0].lower() + subject[1:]
             undecided.append(
-                f"Whether {what} better or worse with {label} is not decided: {_left(findings)}."
+                f"Whether {what} better or worse with {title} is not decided: {_left(findings)}."
             )
         elif findings:
             parts = [
-                f"{word} at {_beams(findings, outcome)}"
-                for word, outcome in (("better", True), ("worse", False))
-                if any(finding.holds is outcome for finding in findings)
+                f"{word} at {_beams(findings, holds)}"
+                for word, holds in (("better", True), ("worse", False))
+                if any(finding.holds is holds for finding in findings)
             ]
             words = " and ".join(parts) or "not significantly better or worse at any beamwidth"
-            said.append(f"with {label} {words}")
+            said.append(f"with {title} {words}")
     return " ".join([f"{subject} {'; '.join(said)}."] * bool(said) + undecided)
 
 
-def _beams(findings: Sequence[Finding], outcome: bool) -> str:
-    """Name the beamwidths of an outcome: how many, and which, in runs."""
+def _beams(findings: Sequence[Finding], holds: bool) -> str:
+    """Name the beamwidths at which a statement holds, or is refuted: how many, and which."""
     names = [finding.label.split(", ")[-1] for finding in findings]
     runs: list[list[str]] = []
     for i, finding in enumerate(findings):
-        if finding.holds is outcome:
-            if runs and i and findings[i - 1].holds is outcome:
+        if finding.holds is holds:
+            if runs and i and findings[i - 1].holds is holds:
                 runs[-1].append(names[i])
             else:
                 runs.append([names[i]])
@@ -192,12 +213,14 @@ def _beams(findings: Sequence[Finding], outcome: bool) -> str:
     return f"{count} of {len(findings)} beamwidths ({which})"
 
 
-def _tally(claims: Sequence[Claim]) -> str:
+def _tally(claims: Sequence[JudgedClaim]) -> str:
     """Count the verdicts."""
     verdicts = [claim.verdict for claim in claims]
     words = []
     for verdict in ("reproduced", "not-reproduced", "open"):
         count = verdicts.count(verdict)
         verb = "is" if count == 1 else "are"
-        words.append(f"{NUMBERS[count]} {verb} {verdict.replace('-', ' ')}")
-    return f"Of the paper's eight claims, {words[0]}, {words[1]} and {words[2]}."
+        words.append(f"{number_word(count)} {verb} {verdict.replace('-', ' ')}")
+    return (
+        f"Of the paper's {number_word(len(claims))} claims, {words[0]}, {words[1]} and {words[2]}."
+    )

@@ -1,24 +1,82 @@
-"""Contrasts: one number per world, from two cases side by side or from a curve over time."""
+"""Contrasts: one number per world, from two cases side by side or from a curve over time.
+
+`select` lays a study out under an exclusion rule, with the contrast that the whole package is
+about: active minus fused.
+"""
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.evaluation.comparison import Relation, Statement, pooled_std, pseudovalues
+from pipistrelle.evaluation.comparison import (
+    Relation,
+    Statement,
+    judge,
+    pooled_std,
+    pseudovalues,
+)
 from pipistrelle.report.claims.published import beam_name
-from pipistrelle.report.studied import Rule, Study, kept, samples
+from pipistrelle.report.studied import (
+    COMMON,
+    POSITION,
+    RULES,
+    Rule,
+    Selection,
+    Study,
+    Way,
+    filter_titles,
+    kept,
+    lost_worlds,
+    samples,
+)
 
 STATES = 3.0
 """Expected NEES of a consistent filter of the pose (Bradley & Abaid, Sec. V-A)."""
-Way = tuple[str, str]
-"""Filter and strategy."""
+
+
+def selections(study: Study) -> dict[Rule, Selection]:
+    """Lay a study out under each exclusion rule.
+
+    Parameters
+    ----------
+    study : Study
+
+    Returns
+    -------
+    dict of Selection
+        By the names of `studied.RULES`.
+    """
+    return {rule: select(study, rule) for rule in RULES}
+
+
+def select(study: Study, rule: Rule) -> Selection:
+    """Lay a study out under an exclusion rule: the worlds lost, and the gains of fused sensing.
+
+    Parameters
+    ----------
+    study : Study
+    rule : one of `studied.RULES`
+
+    Returns
+    -------
+    Selection
+    """
+    names = filter_titles(study)
+    lost = {name: lost_worlds(study, name) for name in names}
+    bare = Selection(study=study, rule=rule, lost=lost, gains={})
+    gains = {
+        (name, score): judge(differences(bare, score, *_gain(name), name=name))
+        for name in names
+        for score in (POSITION, COMMON)
+    }
+    return replace(bare, gains=gains)
 
 
 def differences(
-    study: Study,
-    rule: Rule,
+    selection: Selection,
     score: str,
     first: Way,
     second: Way,
@@ -32,9 +90,8 @@ def differences(
 
     Parameters
     ----------
-    study : Study
-    rule : one of `outcomes.RULES`
-    score : one of `outcomes.SCORES`, or `outcomes.COMMON`
+    selection : Selection
+    score : one of `studied.SCORES`, or `studied.COMMON`
     first, second : filter and strategy
         Both passive: there is one beamwidth, that of none.
     name : str
@@ -51,14 +108,15 @@ def differences(
     list of Statement
         Empty where the study lacks one of the two.
     """
-    if not {first, second} <= study.outcomes.keys():
+    study = selection.study
+    if not {first, second} <= study.trials.keys():
         return []
     blind = first[1] == second[1] == "passive"
     statements = []
     for i, width in enumerate(study.beamwidth[:1] if blind else study.beamwidth):
         if width >= below:
             continue
-        pair = samples(study, rule, score, [(*first, i), (*second, i)])
+        pair = samples(selection, score, [(*first, i), (*second, i)])
         statements.append(
             Statement(
                 label=name if blind else f"{name}, {beam_name(width)}",
@@ -70,7 +128,7 @@ def differences(
     return statements
 
 
-def approach(study: Study, rule: Rule, score: str, name: str) -> Float[np.ndarray, " m"] | None:
+def approach(selection: Selection, score: str, name: str) -> Float[np.ndarray, " m"] | None:
     r"""How fast fused leaves passive as the beam widens.
 
     In each world, the distance of the two scores fitted by a line over the octaves of the
@@ -80,9 +138,8 @@ def approach(study: Study, rule: Rule, score: str, name: str) -> Float[np.ndarra
 
     Parameters
     ----------
-    study : Study
-    rule : one of `outcomes.RULES`
-    score : one of `outcomes.SCORES`
+    selection : Selection
+    score : one of `studied.SCORES`
     name : str
         The filter.
 
@@ -93,45 +150,42 @@ def approach(study: Study, rule: Rule, score: str, name: str) -> Float[np.ndarra
         two or has a single beamwidth.
     """
     fused, passive = (name, "fused"), (name, "passive")
+    study = selection.study
     beams = len(study.beamwidth)
-    if not {fused, passive} <= study.outcomes.keys() or beams < 2:
+    if not {fused, passive} <= study.trials.keys() or beams < 2:
         return None
     cells = [(*fused, i) for i in range(beams)]
-    *wide, alone = samples(study, rule, score, [*cells, (*passive, 0)])
+    *wide, alone = samples(selection, score, [*cells, (*passive, 0)])
     octave = np.log2(study.beamwidth)
     octave = octave - octave.mean()
     return np.abs(np.array(wide).T - alone[:, None]) @ octave / (octave @ octave)
 
 
-def curves(
-    study: Study, rule: Rule, ways: Sequence[Way]
-) -> list[Float[np.ndarray, "m b k"]] | None:
+def curves(selection: Selection, ways: Sequence[Way]) -> list[Float[np.ndarray, "m b k"]] | None:
     """NEES over time, in the worlds where every case of these ways counts and has a number.
 
     Parameters
     ----------
-    study : Study
-    rule : one of `outcomes.RULES`
+    selection : Selection
     ways : sequence of filter and strategy
 
     Returns
     -------
     list of (m, b, k), one per way, or None where the study lacks one
     """
-    if not set(ways) <= study.outcomes.keys():
+    trials = selection.study.trials
+    if not set(ways) <= trials.keys():
         return None
-    nees = [study.outcomes[way].nees for way in ways]
+    nees = [trials[way].nees for way in ways]
     cells = [(*way, i) for way, mine in zip(ways, nees, strict=True) for i in range(mine.shape[1])]
-    counts = kept(study, rule, cells)
+    counts = kept(selection, cells)
     for mine in nees:
         counts &= np.all(np.isfinite(mine), axis=(1, 2))
     return [mine[counts] for mine in nees]
 
 
 def departure(nees: Float[np.ndarray, "m b k"]) -> Float[np.ndarray, " m"]:
-    r"""How far ANEES is from that of a consistent filter, averaged over the beamwidths.
-
-    .. math:: T = \frac{1}{K} \sum_k \ln^2(\bar\epsilon_k / 3)
+    """How far ANEES is from that of a consistent filter, averaged over the beamwidths.
 
     Parameters
     ----------
@@ -140,21 +194,38 @@ def departure(nees: Float[np.ndarray, "m b k"]) -> Float[np.ndarray, " m"]:
     Returns
     -------
     (m)
-        Jackknife pseudo-values of T, which is smooth where the jackknife has to be; of a single
-        world, T itself.
+        Jackknife pseudo-values of `anees_departure`, which is smooth where the jackknife has to
+        be; of a single world, its own.
+    """
+    beams = range(nees.shape[1])
+    if len(nees) < 2:
+        return np.mean([anees_departure(nees[:, i]) for i in beams], axis=0)
+    return np.mean([pseudovalues(nees[:, i], anees_departure) for i in beams], axis=0)
+
+
+def anees_departure(anees: Float[np.ndarray, "*j k"]) -> Float[np.ndarray, "*j"]:
+    r"""How far ANEES is from that of a consistent filter, over all frames.
+
+    .. math:: T = \frac{1}{K} \sum_k \ln^2(\bar\epsilon_k / 3)
+
+    Parameters
+    ----------
+    anees : (*j, k)
+
+    Returns
+    -------
+    (*j)
 
     Notes
     -----
     Bradley & Abaid, Eq. (24) and Sec. V-B: over-confident above 3, under-confident below.
+
+    Examples
+    --------
+    >>> anees_departure(np.array([[3.0, 3.0], [3.0 * np.e, 3.0 / np.e]]))
+    array([0., 1.])
     """
-
-    def statistic(mean: Float[np.ndarray, "j k"]) -> Float[np.ndarray, " j"]:
-        return np.mean(np.square(np.log(mean / STATES)), axis=1)
-
-    beams = range(nees.shape[1])
-    if len(nees) < 2:
-        return np.mean([statistic(nees[:, i]) for i in beams], axis=0)
-    return np.mean([pseudovalues(nees[:, i], statistic) for i in beams], axis=0)
+    return np.mean(np.square(np.log(anees / STATES)), axis=-1)
 
 
 def lap_fit(study: Study) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]] | None:
@@ -180,7 +251,7 @@ def lap_fit(study: Study) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " 
     -----
     Bradley & Abaid, Sec. V-B.
     """
-    frames = next(iter(study.outcomes.values())).nees.shape[2]
+    frames = next(iter(study.trials.values())).nees.shape[2]
     tau = frame_time(study, frames) / lap_time(study)
     if frames == 0 or tau[-1] < 2.0:
         return None
@@ -227,3 +298,8 @@ def lap_time(study: Study) -> float:
     config = study.config
     rate = config.scenario.speed * abs(math.sin(config.scenario.steering)) / config.motion.wheelbase
     return 2.0 * math.pi / rate if rate > 0.0 else math.inf
+
+
+def _gain(name: str) -> tuple[Way, Way]:
+    """Name the two ways whose difference is what fused sensing gains with a filter."""
+    return (name, "active"), (name, "fused")

@@ -1,10 +1,14 @@
-"""What the paper printed: the numbers of its Table II and the beamwidths that it speaks of."""
+"""What the paper printed: its Table II, and the filters and beamwidths that it speaks of."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from pipistrelle.estimation.catalogue import PAPERS, entry
 from pipistrelle.report.studied import Cell, Study
+
+FILTERS = {name: entry(name).title for name in PAPERS}
+"""The paper's two filters: of these its claims speak, whatever others a study has."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,7 +44,8 @@ TABLE_II = (
 BEAMWIDTHS = (11.4, 14.2, 17.6, 21.8, 26.8, 33.2, 41.6, 51.4, 64.8, 83.0, 108.6, 180.0)
 """Bradley & Abaid, Appendix B [deg]."""
 EXCLUDED = {"ekf": 8, "fastslam": 15}
-"""Worlds of 115 that the paper dropped (Bradley & Abaid, Sec. V-A)."""
+"""Worlds that the paper dropped, of `WORLDS` (Bradley & Abaid, Sec. V-A)."""
+WORLDS = 115
 CROSSING = 41.0
 """Below the case that the paper rounds to 42 degrees, where it sees fused overtake active [deg]."""
 NARROW = 64.0
@@ -61,7 +66,7 @@ def cell_of(study: Study, printed: Printed) -> Cell | None:
         None where the study has no such case within a quarter of a degree.
     """
     strategy = "fused" if printed.beamwidth else "passive"
-    if (printed.filter, strategy) not in study.outcomes:
+    if (printed.filter, strategy) not in study.trials:
         return None
     if strategy == "passive":
         return printed.filter, strategy, 0

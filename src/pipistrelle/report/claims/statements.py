@@ -1,8 +1,10 @@
-"""The paper's eight claims as families of statements about means over worlds.
+"""The paper's claims, each a sentence and what it states about means over worlds.
 
-Each claim falls into parts, each part into statements, and all statements of a claim are judged
-as one family (`pipistrelle.evaluation.comparison`). What a study has no cases for, it says
-nothing of: such a part is empty. Each function takes a study and an exclusion rule.
+A claim falls into parts, each part into statements, and all statements of a claim are judged as
+one family (`pipistrelle.evaluation.comparison`). So a claim speaks of the paper's two filters and
+of no other that a study has: each further statement would make the paper's own harder to prove.
+What a study has no cases for, it says nothing of: such a part is empty. `CLAIMS`, at the end, is
+the only list of them; to add a claim, write its parts and give it its sentence there.
 """
 
 from collections.abc import Callable
@@ -11,14 +13,18 @@ from typing import Literal
 
 import numpy as np
 
+from pipistrelle.config import STRATEGIES
 from pipistrelle.evaluation.comparison import Statement
-from pipistrelle.figures.style import FILTER_NAMES
 from pipistrelle.report.claims.contrasts import approach, curves, departure, differences, lap_fit
-from pipistrelle.report.claims.published import CROSSING, NARROW, TABLE_II, cell_of, row_name
-from pipistrelle.report.studied import COMMON, Rule, Study, samples
-
-STRATEGIES = ("active", "fused", "passive")
-POSITION, HEADING = "position_rmse_m", "heading_rmse_rad"
+from pipistrelle.report.claims.published import (
+    CROSSING,
+    FILTERS,
+    NARROW,
+    TABLE_II,
+    cell_of,
+    row_name,
+)
+from pipistrelle.report.studied import COMMON, HEADING, POSITION, Selection, samples
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,7 +46,22 @@ class Part:
     statements: tuple[Statement, ...]
 
 
-def table_ii(study: Study, rule: Rule) -> list[Part]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Claim:
+    """What is claimed, before a study has been asked.
+
+    Attributes
+    ----------
+    sentence : str
+    parts : function of a Selection
+        Gives the parts of the claim, of the worlds that the selection counts.
+    """
+
+    sentence: str
+    parts: Callable[[Selection], list[Part]]
+
+
+def counts_as_printed(selection: Selection) -> list[Part]:
     """Claim 1: our mean counts lie within the paper's standard deviation of the paper's.
 
     Bradley & Abaid, Table II.
@@ -49,11 +70,11 @@ def table_ii(study: Study, rule: Rule) -> list[Part]:
     for kind, score in (("Fully initialised", "landmarks_full"), ("Total", "landmarks_total")):
         statements = []
         for row in TABLE_II:
-            if (cell := cell_of(study, row)) is None:
+            if (cell := cell_of(selection.study, row)) is None:
                 continue
             printed, sigma = row.full if score == "landmarks_full" else row.total
-            (count,) = samples(study, rule, score, [cell])
-            label = f"{FILTER_NAMES[row.filter]}, {row_name(row)}"
+            (count,) = samples(selection, score, [cell])
+            label = f"{FILTERS[row.filter]}, {row_name(row)}"
             statements.append(
                 Statement(label=label, sample=count - printed, relation="within", margin=sigma)
             )
@@ -62,25 +83,25 @@ def table_ii(study: Study, rule: Rule) -> list[Part]:
     return parts
 
 
-def consistency(study: Study, rule: Rule) -> list[Part]:
+def ekf_more_consistent(selection: Selection) -> list[Part]:
     """Claim 2: which filter's ANEES is nearer to 3, how it swings with the laps, how it rises.
 
     Per strategy, averaged over the beamwidths; the paper calls FastSLAM's fused ANEES anomalous
     and does not count it among the periodic ones. Bradley & Abaid, Sec. V-B.
     """
     nearer, swing, rise = [], [], []
-    fit = lap_fit(study)
+    fit = lap_fit(selection.study)
     for strategy in STRATEGIES:
-        pair = curves(study, rule, [("fastslam", strategy), ("ekf", strategy)])
+        pair = curves(selection, [("fastslam", strategy), ("ekf", strategy)])
         if pair is not None:
             gap = departure(pair[0]) - departure(pair[1])
             nearer.append(Statement(label=strategy, sample=gap))
-        for name in FILTER_NAMES:
-            single = curves(study, rule, [(name, strategy)])
+        for name in FILTERS:
+            single = curves(selection, [(name, strategy)])
             if single is None or fit is None:
                 continue
             mean = np.mean(single[0], axis=1)
-            label = f"{FILTER_NAMES[name]}, {strategy}"
+            label = f"{FILTERS[name]}, {strategy}"
             rise.append(Statement(label=label, sample=mean @ fit[0]))
             if (name, strategy) != ("fastslam", "fused"):
                 swing.append(Statement(label=label, sample=mean @ fit[1]))
@@ -96,7 +117,7 @@ def consistency(study: Study, rule: Rule) -> list[Part]:
     ]
 
 
-def filters(study: Study, rule: Rule) -> list[Part]:
+def ekf_more_accurate(selection: Selection) -> list[Part]:
     """Claim 3: EKF's position RMSE is lower than FastSLAM's everywhere, and passive is worst.
 
     Bradley & Abaid, Sec. V-C.
@@ -104,11 +125,11 @@ def filters(study: Study, rule: Rule) -> list[Part]:
     lower, worst = [], []
     for way in STRATEGIES:
         pair = ("fastslam", way), ("ekf", way)
-        lower += differences(study, rule, POSITION, *pair, name=way)
-    for name in FILTER_NAMES:
-        for way in STRATEGIES[:2]:
-            label = f"{FILTER_NAMES[name]}, {way}"
-            worst += differences(study, rule, POSITION, (name, "passive"), (name, way), name=label)
+        lower += differences(selection, POSITION, *pair, name=way)
+    for name in FILTERS:
+        for way in ("active", "fused"):
+            label = f"{FILTERS[name]}, {way}"
+            worst += differences(selection, POSITION, (name, "passive"), (name, way), name=label)
     return [
         Part(
             sentence="Position RMSE: FastSLAM 2.0 minus EKF is above 0",
@@ -123,16 +144,16 @@ def filters(study: Study, rule: Rule) -> list[Part]:
     ]
 
 
-def ekf_gain(study: Study, rule: Rule) -> list[Part]:
+def ekf_gains_by_fusing(selection: Selection) -> list[Part]:
     """Claim 4: with the EKF, fused beats active at narrow beams on average, in heading always.
 
     Bradley & Abaid, Sec. V-C and Appendix A.
     """
     pair, name = (("ekf", "active"), ("ekf", "fused")), "EKF"
     position = differences(
-        study, rule, POSITION, *pair, name=name, relation="slightly above", below=CROSSING
+        selection, POSITION, *pair, name=name, relation="slightly above", below=CROSSING
     )
-    heading = differences(study, rule, HEADING, *pair, name=name)
+    heading = differences(selection, HEADING, *pair, name=name)
     return [
         Part(
             sentence="Position RMSE below 42°: active minus fused is above 0, not significantly",
@@ -147,30 +168,30 @@ def ekf_gain(study: Study, rule: Rule) -> list[Part]:
     ]
 
 
-def fastslam_gain(study: Study, rule: Rule) -> list[Part]:
+def fastslam_never_gains(selection: Selection) -> list[Part]:
     """Claim 5: with FastSLAM 2.0, fused never beats active in position.
 
     Bradley & Abaid, Sec. V-C.
     """
-    pair, name = (("fastslam", "active"), ("fastslam", "fused")), FILTER_NAMES["fastslam"]
-    never = differences(study, rule, POSITION, *pair, name=name, relation="not above")
+    pair, name = (("fastslam", "active"), ("fastslam", "fused")), FILTERS["fastslam"]
+    never = differences(selection, POSITION, *pair, name=name, relation="not above")
     sentence = "Position RMSE: active minus fused is not significantly above 0"
     return [Part(sentence=sentence, unit="m", statements=tuple(never))]
 
 
-def narrow_limit(study: Study, rule: Rule) -> list[Part]:
+def fused_tends_to_passive(selection: Selection) -> list[Part]:
     """Claim 6: the narrower the beam, the nearer fused comes to passive.
 
     Bradley & Abaid, Sec. V-C.
     """
     slopes, ends = [], []
-    for name, label in FILTER_NAMES.items():
-        if (slope := approach(study, rule, POSITION, name)) is not None:
+    for name, label in FILTERS.items():
+        if (slope := approach(selection, POSITION, name)) is not None:
             slopes.append(Statement(label=label, sample=slope))
         pair = (name, "passive"), (name, "fused")
-        ends += differences(
-            study, rule, POSITION, *pair, name=label, relation="within", sigma=True
-        )[:1]
+        ends += differences(selection, POSITION, *pair, name=label, relation="within", sigma=True)[
+            :1
+        ]
     return [
         Part(
             sentence="Position RMSE: the distance between fused and passive grows with the "
@@ -186,16 +207,16 @@ def narrow_limit(study: Study, rule: Rule) -> list[Part]:
     ]
 
 
-def maps(study: Study, rule: Rule) -> list[Part]:
+def maps_never_gain(selection: Selection) -> list[Part]:
     """Claim 7: fused never beats active in map RMSE, and is within about one sigma.
 
     Over the landmarks seen by all strategies, "most of the time". Bradley & Abaid, Sec. V-D.
     """
     never, within = [], []
-    for name, label in FILTER_NAMES.items():
+    for name, label in FILTERS.items():
         pair = (name, "active"), (name, "fused")
-        never += differences(study, rule, COMMON, *pair, name=label, relation="not above")
-        within += differences(study, rule, COMMON, *pair, name=label, relation="within", sigma=True)
+        never += differences(selection, COMMON, *pair, name=label, relation="not above")
+        within += differences(selection, COMMON, *pair, name=label, relation="within", sigma=True)
     return [
         Part(
             sentence="Map RMSE: active minus fused is not significantly above 0",
@@ -211,16 +232,16 @@ def maps(study: Study, rule: Rule) -> list[Part]:
     ]
 
 
-def counts(study: Study, rule: Rule) -> list[Part]:
+def passive_sees_more(selection: Selection) -> list[Part]:
     """Claim 8: passive sees more landmarks than active, by more than one sigma below 65 degrees.
 
     Bradley & Abaid, Sec. V-E.
     """
     more, far, score = [], [], "landmarks_total"
-    for name, label in FILTER_NAMES.items():
+    for name, label in FILTERS.items():
         pair = (name, "passive"), (name, "active")
-        more += differences(study, rule, score, *pair, name=label)
-        far += differences(study, rule, score, *pair, name=label, below=NARROW, sigma=True)
+        more += differences(selection, score, *pair, name=label)
+        far += differences(selection, score, *pair, name=label, below=NARROW, sigma=True)
     return [
         Part(
             sentence="Landmarks seen: passive minus active is above 0",
@@ -235,7 +256,42 @@ def counts(study: Study, rule: Rule) -> list[Part]:
     ]
 
 
-FAMILIES: tuple[Callable[[Study, Rule], list[Part]], ...] = (
-    table_ii, consistency, filters, ekf_gain, fastslam_gain, narrow_limit, maps, counts,
-)  # fmt: skip
-"""The claims, in the order of `claims.SENTENCES`."""
+CLAIMS = (
+    Claim(
+        sentence="Landmarks, in total and fully initialised, number as in Table II, within its σ.",
+        parts=counts_as_printed,
+    ),
+    Claim(
+        sentence="EKF-SLAM is more consistent than FastSLAM 2.0; ANEES swings with the laps and "
+        "rises.",
+        parts=ekf_more_consistent,
+    ),
+    Claim(
+        sentence="EKF-SLAM has the lower position RMSE everywhere; passive sensing has the "
+        "highest.",
+        parts=ekf_more_accurate,
+    ),
+    Claim(
+        sentence="With EKF-SLAM, fused beats active in position below about 42°, on average but "
+        "not significantly, and in heading at every beamwidth.",
+        parts=ekf_gains_by_fusing,
+    ),
+    Claim(
+        sentence="With FastSLAM 2.0, fused never beats active in position.",
+        parts=fastslam_never_gains,
+    ),
+    Claim(
+        sentence="Fused tends to passive as the beam narrows.",
+        parts=fused_tends_to_passive,
+    ),
+    Claim(
+        sentence="In map RMSE, fused never beats active, and is within about one σ.",
+        parts=maps_never_gain,
+    ),
+    Claim(
+        sentence="Passive sees more landmarks than active at every beamwidth, by more than σ "
+        "below 65°.",
+        parts=passive_sees_more,
+    ),
+)
+"""Those of Bradley & Abaid, Sec. V, in its order, which numbers them."""

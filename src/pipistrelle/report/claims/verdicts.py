@@ -1,33 +1,21 @@
-"""The paper's eight claims, each with a verdict by one rule.
+"""The paper's claims, each with a verdict by one rule.
 
 *Reproduced*: every part of the claim holds. *Not reproduced*: of some part, the opposite is
-significant. *Open*: neither, or the verdict changes with what is left out (`outcomes.RULES`). Of a
+significant. *Open*: neither, or the verdict changes with what is left out (`studied.RULES`). Of a
 part that must hold everywhere, one statement whose opposite is significant is enough; of a part
 that must hold at most beamwidths, it takes more than half.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from pipistrelle.evaluation.comparison import Finding, judge
-from pipistrelle.report.claims.statements import FAMILIES, Part
-from pipistrelle.report.studied import RULES, Rule, Study
+from pipistrelle.report.claims.statements import CLAIMS, Claim, Part
+from pipistrelle.report.studied import Rule, Selection
 
 Verdict = Literal["reproduced", "not-reproduced", "open"]
-SENTENCES = (
-    "Landmarks, in total and fully initialised, number as in Table II, within its σ.",
-    "EKF-SLAM is more consistent than FastSLAM 2.0; ANEES swings with the laps and rises.",
-    "EKF-SLAM has the lower position RMSE everywhere; passive sensing has the highest.",
-    "With EKF-SLAM, fused beats active in position below about 42°, on average but not "
-    "significantly, and in heading at every beamwidth.",
-    "With FastSLAM 2.0, fused never beats active in position.",
-    "Fused tends to passive as the beam narrows.",
-    "In map RMSE, fused never beats active, and is within about one σ.",
-    "Passive sees more landmarks than active at every beamwidth, by more than σ below 65°.",
-)
-"""The claims of Bradley & Abaid, Sec. V, in its order."""
 WITHOUT: dict[Rule, str] = {
     "world": "without diverged worlds",
     "case": "without diverged cases",
@@ -75,18 +63,19 @@ class Judgement:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Claim:
-    """A claim and its verdict.
+class JudgedClaim:
+    """A claim, what each exclusion rule makes of it, and its verdict.
 
     Attributes
     ----------
-    number : 1 to 8
+    number : int
+        Its place in the list of claims, from 1.
     sentence : str
     verdict : str
     reason : str
         In a sentence.
     by_rule : dict of Judgement
-        By the names of `outcomes.RULES`.
+        By the names of `studied.RULES`.
     """
 
     number: int
@@ -96,42 +85,51 @@ class Claim:
     by_rule: dict[Rule, Judgement]
 
 
-def judge_claims(study: Study, confidence: float = 0.95) -> tuple[Claim, ...]:
-    """Judge the eight claims, each as one family, under every exclusion rule.
+def judge_claims(
+    selections: Mapping[Rule, Selection],
+    claims: Sequence[Claim] = CLAIMS,
+    confidence: float = 0.95,
+) -> tuple[JudgedClaim, ...]:
+    """Judge claims, each as one family, under every exclusion rule.
 
     Parameters
     ----------
-    study : Study
+    selections : dict of Selection
+        As `claims.contrasts.selections` gives them.
+    claims : sequence of Claim
     confidence : between 0 and 1
         That all intervals of a claim hold.
 
     Returns
     -------
-    tuple of 8 Claim
+    tuple of JudgedClaim, one per claim
     """
-    claims = []
-    for number, (sentence, family) in enumerate(zip(SENTENCES, FAMILIES, strict=True), start=1):
-        by_rule = {rule: _judged(family(study, rule), confidence) for rule in RULES}
+    judged = []
+    for number, claim in enumerate(claims, start=1):
+        by_rule = {
+            rule: _judged(claim.parts(selection), confidence)
+            for rule, selection in selections.items()
+        }
         verdicts = {rule: judgement.verdict for rule, judgement in by_rule.items()}
         agreed = len(set(verdicts.values())) == 1
-        claims.append(
-            Claim(
+        judged.append(
+            JudgedClaim(
                 number=number,
-                sentence=sentence,
+                sentence=claim.sentence,
                 verdict=by_rule["world"].verdict if agreed else "open",
                 reason=_reason(by_rule, agreed),
                 by_rule=by_rule,
             )
         )
-    return tuple(claims)
+    return tuple(judged)
 
 
-def record(claim: Claim) -> dict[str, Any]:
+def record(claim: JudgedClaim) -> dict[str, Any]:
     """Lay a claim out for ``summary.json``; what is not finite becomes None.
 
     Parameters
     ----------
-    claim : Claim
+    claim : JudgedClaim
 
     Returns
     -------

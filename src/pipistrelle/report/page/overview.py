@@ -6,19 +6,32 @@ from typing import Any
 import numpy as np
 
 from pipistrelle.config import Config
-from pipistrelle.evaluation.consistency import EKF_LIMIT, FASTSLAM_LIMIT, anees, anees_bounds
+from pipistrelle.estimation.catalogue import CATALOGUE
+from pipistrelle.evaluation.consistency import anees, anees_bounds
 from pipistrelle.experiments.studies.plan import RADIUS
 from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
-from pipistrelle.figures.style import FILTER_NAMES
-from pipistrelle.report.claims.contrasts import STATES
-from pipistrelle.report.claims.published import EXCLUDED, TABLE_II, beam_name, cell_of, row_name
-from pipistrelle.report.studied import Rule, Study, kept, lost, samples
+from pipistrelle.report.claims.contrasts import anees_departure
+from pipistrelle.report.claims.published import (
+    EXCLUDED,
+    TABLE_II,
+    WORLDS,
+    beam_name,
+    cell_of,
+    row_name,
+)
+from pipistrelle.report.studied import (
+    Selection,
+    Study,
+    filter_titles,
+    kept,
+    lost_worlds,
+    mean_std,
+    samples,
+)
 from pipistrelle.settings import known_settings
 
-LIMITS = {"ekf": EKF_LIMIT, "fastslam": FASTSLAM_LIMIT}
 
-
-def exclusions(study: Study) -> list[dict[str, Any]]:
+def exclusion_rows(study: Study) -> list[dict[str, Any]]:
     """Count what each filter lost.
 
     Parameters
@@ -29,32 +42,29 @@ def exclusions(study: Study) -> list[dict[str, Any]]:
     -------
     list of dict
         Per filter: worlds done, those with a diverged or failed case, the paper's count of such
-        among 115, trials that diverged per strategy, trials that failed, and the NEES limit.
+        among its worlds, trials that diverged per strategy, trials that failed, and the NEES limit.
+        What diverged is what was stored; None for a limit or a count that is not known here.
     """
     rows = []
-    for name in FILTER_NAMES:
-        mine = {way: o for way, o in study.outcomes.items() if way[0] == name}
-        if not mine:
-            continue
+    for name in filter_titles(study):
+        mine = {strategy: t for (other, strategy), t in study.trials.items() if other == name}
         rows.append(
             {
                 "filter": name,
-                "limit": LIMITS[name],
+                "limit": CATALOGUE[name].nees_limit if name in CATALOGUE else None,
                 "worlds": len(study.worlds),
-                "excluded": int(np.sum(lost(study, name))),
-                "paper": EXCLUDED[name],
-                "paper_worlds": 115,
-                "diverged": {
-                    way[1]: int(np.sum(o.diverged & ~o.failed)) for way, o in mine.items()
-                },
-                "trials": {way[1]: int(o.failed.size) for way, o in mine.items()},
-                "failed": int(sum(np.sum(o.failed) for o in mine.values())),
+                "excluded": int(np.sum(lost_worlds(study, name))),
+                "paper": EXCLUDED.get(name),
+                "paper_worlds": WORLDS,
+                "diverged": {way: int(np.sum(t.diverged & ~t.failed)) for way, t in mine.items()},
+                "trials": {way: int(t.failed.size) for way, t in mine.items()},
+                "failed": int(sum(np.sum(t.failed) for t in mine.values())),
             }
         )
     return rows
 
 
-def failed(study: Study) -> int:
+def failed_trials(study: Study) -> int:
     """Count the trials that failed.
 
     Parameters
@@ -65,10 +75,10 @@ def failed(study: Study) -> int:
     -------
     int
     """
-    return int(sum(np.sum(outcome.failed) for outcome in study.outcomes.values()))
+    return int(sum(np.sum(trials.failed) for trials in study.trials.values()))
 
 
-def departures(study: Study) -> list[dict[str, Any]]:
+def not_the_papers(study: Study) -> list[dict[str, Any]]:
     """Name the settings that are not those of the plan `paper`.
 
     Parameters
@@ -87,8 +97,8 @@ def departures(study: Study) -> list[dict[str, Any]]:
         "filters": sorted(paper.filters),
     }
     ours = _asked(study.config, study.grid) | {
-        "strategies": sorted({strategy for _, strategy in study.outcomes}),
-        "filters": sorted({name for name, _ in study.outcomes}),
+        "strategies": sorted({strategy for _, strategy in study.trials}),
+        "filters": sorted({name for name, _ in study.trials}),
     }
     return [
         {"setting": name, "here": ours[name], "paper": value}
@@ -97,8 +107,8 @@ def departures(study: Study) -> list[dict[str, Any]]:
     ]
 
 
-def departures_line(rows: list[dict[str, Any]]) -> str:
-    """Say in a line what `departures` found.
+def not_the_papers_line(rows: list[dict[str, Any]]) -> str:
+    """Say in a line what `not_the_papers` found.
 
     Parameters
     ----------
@@ -111,20 +121,19 @@ def departures_line(rows: list[dict[str, Any]]) -> str:
 
     Examples
     --------
-    >>> departures_line([{"setting": "scenario.steps", "here": 200, "paper": 1500}])
+    >>> not_the_papers_line([{"setting": "scenario.steps", "here": 200, "paper": 1500}])
     "Not the paper's study: scenario.steps 200 (paper 1500)"
     """
     said = [f"{r['setting']} {_worded(r['here'])} (paper {_worded(r['paper'])})" for r in rows]
     return f"Not the paper's study: {', '.join(said)}" if said else ""
 
 
-def table_ii(study: Study, rule: Rule = "world") -> list[dict[str, Any]]:
+def table_ii_rows(selection: Selection) -> list[dict[str, Any]]:
     """Lay Table II out, ours beside the paper's.
 
     Parameters
     ----------
-    study : Study
-    rule : one of `outcomes.RULES`
+    selection : Selection
 
     Returns
     -------
@@ -140,7 +149,7 @@ def table_ii(study: Study, rule: Rule = "world") -> list[dict[str, Any]]:
     """
     rows = []
     for printed in TABLE_II:
-        cell = cell_of(study, printed)
+        cell = cell_of(selection.study, printed)
         row: dict[str, Any] = {
             "filter": printed.filter,
             "beamwidth": row_name(printed),
@@ -148,39 +157,39 @@ def table_ii(study: Study, rule: Rule = "world") -> list[dict[str, Any]]:
             "paper_total": list(printed.total),
         }
         for kind in ("full", "total", "full_mean"):
-            sample = [] if cell is None else samples(study, rule, f"landmarks_{kind}", [cell])[0]
+            count = f"landmarks_{kind}"
+            sample = np.empty(0) if cell is None else samples(selection, count, [cell])[0]
             row["n"] = len(sample)
-            row[kind] = [float(np.mean(sample)), _std(sample)] if len(sample) else None
+            row[kind] = list(mean_std(sample)) if len(sample) else None
         rows.append(row)
     return rows
 
 
-def consistency(study: Study, rule: Rule = "world") -> list[dict[str, Any]]:
+def consistency_rows(selection: Selection) -> list[dict[str, Any]]:
     """Say how consistent each case is.
 
     Parameters
     ----------
-    study : Study
-    rule : one of `outcomes.RULES`
+    selection : Selection
 
     Returns
     -------
     list of dict
         Per case: worlds, time mean of ANEES, shares of time inside and above its 95 % bounds, and
-        the mean of ln(ANEES / 3) squared.
+        its `anees_departure`.
 
     Notes
     -----
     Bradley & Abaid, Eqs. (24) and (25).
     """
-    rows = []
-    for (name, strategy), outcome in study.outcomes.items():
-        for i in range(outcome.nees.shape[1]):
-            counts = kept(study, rule, [(name, strategy, i)])
-            counts &= np.all(np.isfinite(outcome.nees[:, i]), axis=1)
-            if not counts.any() or not outcome.nees.shape[2]:
+    rows, study = [], selection.study
+    for (name, strategy), trials in study.trials.items():
+        for i in range(trials.nees.shape[1]):
+            counts = kept(selection, [(name, strategy, i)])
+            counts &= np.all(np.isfinite(trials.nees[:, i]), axis=1)
+            if not counts.any() or not trials.nees.shape[2]:
                 continue
-            mean = anees(outcome.nees[counts, i])
+            mean = anees(trials.nees[counts, i])
             low, high = anees_bounds(int(counts.sum()))
             rows.append(
                 {
@@ -192,14 +201,14 @@ def consistency(study: Study, rule: Rule = "world") -> list[dict[str, Any]]:
                     "bounds": [low, high],
                     "inside": float(np.mean((mean >= low) & (mean <= high))),
                     "above": float(np.mean(mean > high)),
-                    "departure": float(np.mean(np.square(np.log(mean / STATES)))),
+                    "departure": float(anees_departure(mean)),
                 }
             )
     return rows
 
 
 def by_strategy(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Average rows of `consistency` over the beamwidths.
+    """Average `consistency_rows` over the beamwidths.
 
     Parameters
     ----------
@@ -218,10 +227,6 @@ def by_strategy(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         | {key: float(np.mean([row[key] for row in mine])) for key in keys}
         for (name, strategy), mine in groups.items()
     ]
-
-
-def _std(sample: Any) -> float:
-    return float(np.std(sample, ddof=1)) if len(sample) > 1 else 0.0
 
 
 def _asked(config: Config, grid: Mapping[str, Sequence[Any]]) -> dict[str, Any]:

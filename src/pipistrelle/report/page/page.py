@@ -7,7 +7,7 @@ through the template's escaping. The same folder gives the same bytes.
 import json
 import math
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 from pathlib import Path
@@ -20,14 +20,17 @@ from pipistrelle.config import InputError
 from pipistrelle.evaluation.comparison import Finding
 from pipistrelle.experiments.results.folder import write_file
 from pipistrelle.figures.chart import Chart, Panel, csv_rows, csv_text
-from pipistrelle.figures.style import FILTER_NAMES, STRATEGY_COLOURS
-from pipistrelle.report.charts.results import study_charts
+from pipistrelle.figures.style import STRATEGY_COLOURS
+from pipistrelle.report.charts.results import CHARTS, study_charts
 from pipistrelle.report.charts.setting import model_charts
-from pipistrelle.report.claims.answer import answer
-from pipistrelle.report.claims.verdicts import WITHOUT, Claim, judge_claims, record, tally
+from pipistrelle.report.claims.answer import answer, number_word
+from pipistrelle.report.claims.contrasts import selections
+from pipistrelle.report.claims.published import FILTERS
+from pipistrelle.report.claims.statements import CLAIMS, Claim
+from pipistrelle.report.claims.verdicts import WITHOUT, JudgedClaim, judge_claims, record, tally
 from pipistrelle.report.page import overview
-from pipistrelle.report.page.svg import figure, legend, panel_svg, readings
-from pipistrelle.report.studied import RULES, Rule, Study
+from pipistrelle.report.page.svg import legend, panel_svg, readings, three_digits
+from pipistrelle.report.studied import RULES, Rule, Selection, Study, filter_titles
 from pipistrelle.settings import to_toml
 
 FORMAT = 1
@@ -41,22 +44,27 @@ def write_report(
     studies: tuple[Study, ...],
     folder: Path,
     *,
+    claims: Sequence[Claim] = CLAIMS,
+    charts: Sequence[Callable[[Selection], list[Chart]]] = CHARTS,
     progress: Callable[[str], None] = lambda _: None,
-) -> tuple[Claim, ...]:
+) -> tuple[JudgedClaim, ...]:
     """Judge a study and write its page, its figures and its summary.
 
     Parameters
     ----------
     studies : tuple of Study
-        As `tables.read_study` gives them; the first is shown, of further ones the verdicts.
+        As `reading.read_study` gives them; the first is shown, of further ones the verdicts.
     folder : Path
         Made where it is missing; ``index.html``, ``summary.json`` and ``figures``.
+    claims : sequence of Claim
+    charts : sequence of functions of a Selection
+        Each gives the charts of a figure; they have names of their own.
     progress : callable, optional
         Given the name of each figure before it is drawn.
 
     Returns
     -------
-    tuple of Claim
+    tuple of JudgedClaim
         Of the first study.
 
     Raises
@@ -64,10 +72,10 @@ def write_report(
     InputError
         Where a file cannot be written.
     """
-    judged = [judge_claims(study) for study in studies]
-    study, claims = studies[0], judged[0]
-    found = {rule: study_charts(study, rule) for rule in RULES}
-    models = model_charts(study)
+    selected = [selections(study) for study in studies]
+    judged = [judge_claims(by_rule, claims) for by_rule in selected]
+    found = {rule: study_charts(selection, charts) for rule, selection in selected[0].items()}
+    models = model_charts(studies[0])
     try:
         (folder / "figures").mkdir(parents=True, exist_ok=True)
         for chart in [*_distinct(found), *models]:
@@ -78,17 +86,17 @@ def write_report(
             f"{error.filename or folder}: could not be written ({error.strerror}); "
             "make room or choose another folder with -o DIR"
         ) from error
-    for name, text in _numbers(study, found, models).items():
+    for name, text in _csv_texts(selected[0], found, models).items():
         write_file(folder / "figures" / f"{name}.csv", text)
-    summary = _summary(studies, judged)
+    summary = _summary(studies, selected[0], judged)
     write_file(folder / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    write_file(folder / "index.html", page(study, claims, found, models, summary))
-    return claims
+    write_file(folder / "index.html", page(studies[0], judged[0], found, models, summary))
+    return judged[0]
 
 
 def page(
     study: Study,
-    claims: tuple[Claim, ...],
+    claims: tuple[JudgedClaim, ...],
     found: dict[Rule, list[Chart]],
     models: list[Chart],
     summary: dict[str, Any],
@@ -98,7 +106,7 @@ def page(
     Parameters
     ----------
     study : Study
-    claims : tuple of Claim
+    claims : tuple of JudgedClaim
     found : charts by exclusion rule
     models : charts that no exclusion changes
     summary : dict
@@ -115,7 +123,7 @@ def page(
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {"number": figure, "p": _p, "finding": _shown}
+    environment.filters |= {"number": three_digits, "p": _p, "finding": _shown}
     template = environment.from_string((here / "page.html").read_text(encoding="utf-8"))
     return template.render(
         study=study,
@@ -126,13 +134,15 @@ def page(
         style=Markup((here / "page.css").read_text(encoding="utf-8")),
         script=Markup((here / "page.js").read_text(encoding="utf-8")),
         colours=STRATEGY_COLOURS,
-        filters=FILTER_NAMES,
+        filters=filter_titles(study),
+        papers=FILTERS,
+        number_word=number_word,
         rules=RULES,
         without=WITHOUT,
         spoken=SPOKEN,
         units=UNITS,
         tally=tally,
-        departures=overview.departures_line(summary["not_the_papers"]),
+        departures=overview.not_the_papers_line(summary["not_the_papers"]),
         consistency=overview.by_strategy(summary["consistency"]),
         config=to_toml(study.config),
     )
@@ -173,7 +183,9 @@ def _write_figure(chart: Chart, folder: Path) -> None:
     save_figure(draw_chart(chart), folder, chart.name)
 
 
-def _numbers(study: Study, found: dict[Rule, list[Chart]], models: list[Chart]) -> dict[str, str]:
+def _csv_texts(
+    by_rule: Mapping[Rule, Selection], found: dict[Rule, list[Chart]], models: list[Chart]
+) -> dict[str, str]:
     """Write the numbers behind each figure, under all exclusion rules."""
     texts = {chart.name: csv_text(csv_rows(chart)) for chart in models}
     for chart in _distinct(found):
@@ -185,8 +197,8 @@ def _numbers(study: Study, found: dict[Rule, list[Chart]], models: list[Chart]) 
                     rows += new[1:] if rows else new
         texts[chart.name] = csv_text(rows)
     table = []
-    for rule in RULES:
-        for row in overview.table_ii(study, rule):
+    for rule, selection in by_rule.items():
+        for row in overview.table_ii_rows(selection):
             flat = {"exclusion": rule}
             for key, value in row.items():
                 pair = isinstance(value, list)
@@ -197,7 +209,11 @@ def _numbers(study: Study, found: dict[Rule, list[Chart]], models: list[Chart]) 
     return texts | {"table_ii": csv_text([header, *cells])}
 
 
-def _summary(studies: tuple[Study, ...], judged: list[tuple[Claim, ...]]) -> dict[str, Any]:
+def _summary(
+    studies: tuple[Study, ...],
+    by_rule: Mapping[Rule, Selection],
+    judged: list[tuple[JudgedClaim, ...]],
+) -> dict[str, Any]:
     """Lay out everything that the page says, for programs."""
     study, claims = studies[0], judged[0]
     return {
@@ -209,17 +225,17 @@ def _summary(studies: tuple[Study, ...], judged: list[tuple[Claim, ...]]) -> dic
         "worlds_planned": study.planned,
         "worlds_done": len(study.worlds),
         "partial": len(study.worlds) < study.planned,
-        "trials": sum(outcome.failed.size for outcome in study.outcomes.values()),
+        "trials": sum(trials.failed.size for trials in study.trials.values()),
         "filters_cpu_s": study.cpu_s,
         "settings": study.settings,
-        "not_the_papers": overview.departures(study),
-        "answer": answer(study, claims),
+        "not_the_papers": overview.not_the_papers(study),
+        "answer": answer(by_rule, claims),
         "claims": [record(claim) for claim in claims],
         "exclusion_rules": dict(RULES),
-        "exclusions": overview.exclusions(study),
-        "trials_failed": sum(overview.failed(other) for other in studies),
-        "table_ii": overview.table_ii(study),
-        "consistency": overview.consistency(study),
+        "exclusions": overview.exclusion_rows(study),
+        "trials_failed": sum(overview.failed_trials(other) for other in studies),
+        "table_ii": overview.table_ii_rows(by_rule["world"]),
+        "consistency": overview.consistency_rows(by_rule["world"]),
         "failed": [
             {"iteration": i, "strategy": s, "filter": f, "beamwidth_deg": b, "error": text}
             | {"settings": other.settings}
@@ -230,7 +246,7 @@ def _summary(studies: tuple[Study, ...], judged: list[tuple[Claim, ...]]) -> dic
             {
                 "settings": other.settings,
                 "worlds_done": len(other.worlds),
-                "trials_failed": overview.failed(other),
+                "trials_failed": overview.failed_trials(other),
                 "verdicts": [claim.verdict for claim in mine],
             }
             for other, mine in zip(studies, judged, strict=True)
@@ -263,12 +279,12 @@ def _shown(finding: Finding, unit: str) -> dict[str, str]:
     edges = {finding.margin, -finding.margin} if finding.relation == "within" else {finding.margin}
     low, high = finding.interval
     words = (
-        ("above " if low in edges else "") + figure(factor * low),
-        ("below " if high in edges else "") + figure(factor * high),
+        ("above " if low in edges else "") + three_digits(factor * low),
+        ("below " if high in edges else "") + three_digits(factor * high),
     )
-    margin = figure(factor * finding.margin) + (end if finding.margin else "")
+    margin = three_digits(factor * finding.margin) + (end if finding.margin else "")
     return {
-        "mean": figure(factor * finding.mean) + end if finding.n else "none",
+        "mean": three_digits(factor * finding.mean) + end if finding.n else "none",
         "interval": " to ".join(words),
         "margin": f"± {margin}" if finding.relation == "within" else margin,
     }

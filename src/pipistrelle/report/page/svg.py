@@ -101,7 +101,7 @@ def readings(panel: Panel) -> list[tuple[float, str, list[tuple[str, str]]]]:
     return found
 
 
-def figure(value: float) -> str:
+def three_digits(value: float) -> str:
     """Write a number in three digits.
 
     Parameters
@@ -114,7 +114,7 @@ def figure(value: float) -> str:
 
     Examples
     --------
-    >>> [figure(value) for value in (0.12345, 43.71, -1234.5, float("inf"))]
+    >>> [three_digits(value) for value in (0.12345, 43.71, -1234.5, float("inf"))]
     ['0.123', '43.7', '−1234', '∞']
     """
     if not math.isfinite(value):
@@ -303,11 +303,13 @@ def _number(series: Series, i: int) -> str:
     """Word a point, with what lies about it."""
     value = series.y[i]
     if series.low is None or series.high is None or not math.isfinite(series.low[i]):
-        return figure(value)
+        return three_digits(value)
     below, above = value - series.low[i], series.high[i] - value
     if abs(below - above) <= 1e-9 * max(abs(below), abs(above), 1e-300):
-        return f"{figure(value)} ± {figure(above)}"
-    return f"{figure(value)} ({figure(series.low[i])} to {figure(series.high[i])})"
+        return f"{three_digits(value)} ± {three_digits(above)}"
+    return (
+        f"{three_digits(value)} ({three_digits(series.low[i])} to {three_digits(series.high[i])})"
+    )
 
 
 def legend(panels: Sequence[Panel]) -> list[tuple[str, str, str]]:
