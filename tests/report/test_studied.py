@@ -4,8 +4,16 @@ import numpy as np
 import pytest
 
 from pipistrelle.report.claims.contrasts import select
-from pipistrelle.report.studied import COMMON, kept, lost_worlds, samples, values
-from report.invented import invent
+from pipistrelle.report.studied import (
+    COMMON,
+    filter_titles,
+    kept,
+    lost_worlds,
+    mean_std,
+    samples,
+    values,
+)
+from report.invented import invent, with_third
 
 
 @pytest.fixture
@@ -53,3 +61,21 @@ def test_passive_has_one_column_but_for_the_landmarks_in_common(study):
         values(study, "position_rmse_m", ("ekf", "passive", 7)), there["position_rmse_m"][:, 0]
     )
     np.testing.assert_array_equal(values(study, COMMON, ("ekf", "passive", 7)), there[COMMON][:, 7])
+
+
+def test_filters_stand_in_the_catalogues_order_and_others_after_it_by_name(study):
+    assert filter_titles(study) == {"ekf": "EKF", "fastslam": "FastSLAM 2.0"}
+    for name in ("zoo.slam:Graph", "a.slam:Graph", "a.slam:Rays", "a:EKF"):
+        study = with_third(study, name)
+    assert list(filter_titles(study).items()) == [
+        ("ekf", "EKF"),
+        ("fastslam", "FastSLAM 2.0"),
+        ("a.slam:Graph", "a.slam:Graph"),
+        ("a.slam:Rays", "Rays"),
+        ("a:EKF", "a:EKF"),
+        ("zoo.slam:Graph", "zoo.slam:Graph"),
+    ]
+
+
+def test_of_no_world_there_is_no_mean():
+    assert np.isnan(mean_std(np.empty(0))).all()

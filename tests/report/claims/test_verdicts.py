@@ -10,7 +10,7 @@ from pipistrelle.report.claims.contrasts import selections
 from pipistrelle.report.claims.published import TABLE_II
 from pipistrelle.report.claims.verdicts import judge_claims, record, tally
 from pipistrelle.report.studied import COMMON, RULES
-from report.invented import BEAMWIDTH, FILTERS, changed, invent, noise, only
+from report.invented import BEAMWIDTH, FILTERS, changed, invent, noise, only, with_third
 
 POSITION, HEADING = "position_rmse_m", "heading_rmse_rad"
 NARROW = BEAMWIDTH < 41.0
@@ -171,3 +171,19 @@ def test_the_families_have_a_statement_for_every_case_the_paper_speaks_of(study)
         [2 * beams, 2 * beams],
         [2 * beams, 2 * int(np.sum(BEAMWIDTH < 64.0))],
     ]
+
+
+@pytest.mark.parametrize("name", ["aekf", "toy_slam.filters:Smoother"])
+def test_a_third_filter_changes_no_byte_of_the_papers_claims(study, name):
+    alone, beside = (
+        json.dumps([record(claim) for claim in judge_claims(selections(there))])
+        for there in (study, with_third(study, name))
+    )
+    assert alone == beside
+
+
+def test_a_study_of_another_filter_alone_says_nothing_of_the_papers_claims(study):
+    third = with_third(study, "toy:Slam")
+    lonely = only(third, [way for way in third.trials if way[0] == "toy:Slam"])
+    for claim in judge_claims(selections(lonely)):
+        assert claim.reason == "The study has no cases for this claim."

@@ -15,7 +15,7 @@ from pipistrelle.report.page.overview import (
     table_ii_rows,
 )
 from pipistrelle.settings import from_flags
-from report.invented import RADII, invent, only
+from report.invented import RADII, invent, only, with_third
 
 
 def as_the_paper(study, **flags):
@@ -99,3 +99,11 @@ def test_strategies_are_averages_over_beamwidths():
     found = {(r["filter"], r["strategy"]): r for r in by_strategy(rows)}
     assert found["fastslam", "active"]["anees"] == pytest.approx(np.mean(mine))
     assert len(found) == 6
+
+
+def test_a_filter_that_the_catalogue_does_not_know_is_counted_by_what_was_stored():
+    *papers, third = exclusion_rows(with_third(invent(6), "toy_slam:Slam"))
+    assert papers == exclusion_rows(invent(6))
+    assert (third["filter"], third["excluded"], third["worlds"]) == ("toy_slam:Slam", 2, 6)
+    assert (third["limit"], third["paper"]) == (None, None)
+    assert third["diverged"] == {"active": 24, "fused": 24, "passive": 2}

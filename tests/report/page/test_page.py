@@ -3,10 +3,12 @@
 import csv
 import json
 import re
+import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
+import polars as pl
 import pytest
 
 from pipistrelle.__main__ import main
@@ -19,7 +21,7 @@ from pipistrelle.report.page.page import write_report
 from pipistrelle.report.reading import read_study
 from pipistrelle.report.studied import RULES
 from pipistrelle.settings import from_flags
-from report.invented import invent, write_store
+from report.invented import STRATEGIES, invent, with_third, write_store
 
 FIGURES = [
     "anees_ekf", "anees_fastslam", "example_map", "gain", "heading_rmse", "landmarks", "map_rmse",
@@ -277,3 +279,37 @@ def test_a_place_that_cannot_be_written_is_refused(tmp_path, undrawn):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="file"):
         write_report((invent(2),), tmp_path / "file" / "deep")
+
+
+def panels_of(folder, figure):
+    text = (folder / "index.html").read_text(encoding="utf-8")
+    start = text.index(f'<figure id="{figure}">')
+    drawn = text[start : text.index("</figure>", start)]
+    return list(dict.fromkeys(re.findall(r'<h4 class="c-\w+">(.*?)</h4>', drawn)))
+
+
+def test_a_third_filter_has_its_panels_rows_and_files(tmp_path):
+    write_report((with_third(invent(4), "toy_slam.filters:Smoother"),), tmp_path)
+    read(tmp_path)
+    titles = ["EKF", "FastSLAM 2.0", "Smoother"]
+    assert panels_of(tmp_path, "position_rmse") == titles
+    assert panels_of(tmp_path, "landmarks") == titles
+    assert panels_of(tmp_path, "gain") == [f"{w}, {t}" for w in ("position", "map") for t in titles]
+    assert panels_of(tmp_path, "anees_toy_slam_filters_Smoother") == list(STRATEGIES)
+    assert len(panels_of(tmp_path, "table_ii")) == 4, "the paper's table is of its two"
+    for kind in ("png", "pdf", "csv"):
+        assert (tmp_path / "figures" / f"anees_toy_slam_filters_Smoother.{kind}").is_file()
+    text = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert "<td></td><td>2 of 4</td><td></td>" in text, "no limit and no count of the paper's"
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert "with Smoother active in 50.0 %" in " ".join(summary["answer"])
+    assert [row["filter"] for row in summary["exclusions"]][2] == "toy_slam.filters:Smoother"
+
+
+def test_a_stored_study_of_a_filter_that_is_not_installed_can_be_read(store, tmp_path, undrawn):
+    folder = shutil.copytree(store, tmp_path / "store")
+    for path in (folder / "trials").iterdir():
+        name = pl.col("filter").replace("fastslam", "no_such_module:Slam")
+        pl.read_parquet(path).with_columns(name).write_parquet(path)
+    write_report(read_study(folder), tmp_path)
+    assert panels_of(tmp_path, "map_rmse") == ["EKF", "Slam"]

@@ -1,0 +1,102 @@
+"""A figure and a claim of one's own, as the documentation writes them, without a file changed."""
+
+import csv
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from pipistrelle.report.charts.results import CHARTS
+from pipistrelle.report.claims.contrasts import selections
+from pipistrelle.report.claims.statements import CLAIMS
+from pipistrelle.report.claims.verdicts import judge_claims, record
+from pipistrelle.report.page import page as module
+from pipistrelle.report.page.page import write_report
+from pipistrelle.report.studied import HEADING, RULES
+from report.invented import BEAMWIDTH, changed, invent
+
+GUIDE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"
+
+
+@pytest.fixture(scope="module")
+def guide():
+    """Names of the two sections' code."""
+    names = vars(ModuleType("guide"))
+    text = GUIDE.read_text()
+    text = text[text.index("## A figure of the report") :]
+    for block in re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
+        exec(compile(block, GUIDE.name, "exec"), names)
+    return names
+
+
+@pytest.fixture(scope="module")
+def extended(guide, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("extended")
+    study = invent(8)
+    study.trials["ekf", "fused"].diverged[3] = True
+    write_report(
+        (study,),
+        folder,
+        claims=(*CLAIMS, guide["headings"]),
+        charts=(*CHARTS, guide["world_charts"]),
+    )
+    return study, folder
+
+
+class Sections(HTMLParser):
+    """Collect the figures and the claims of a page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.figures, self.claims = [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        given = dict(attrs)
+        if tag == "figure":
+            self.figures.append(given["id"])
+        if "data-claim" in given:
+            self.claims.append((given["data-claim"], given["data-verdict"]))
+
+
+def test_a_figure_given_to_the_report_is_on_the_page_and_in_three_files(extended):
+    study, folder = extended
+    assert "worlds" in Sections((folder / "index.html").read_text(encoding="utf-8")).figures
+    assert all((folder / "figures" / f"worlds.{kind}").stat().st_size for kind in ("png", "pdf"))
+    with (folder / "figures" / "worlds.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["panel"] == "EKF"]
+    found = {rule: [float(r["fused_m"]) for r in rows if r["exclusion"] == rule] for rule in RULES}
+    score = study.trials["ekf", "fused"].scores["position_rmse_m"][:, 0]
+    assert found["none"] == pytest.approx(score, rel=1e-8)
+    assert found["world"] == pytest.approx(np.delete(score, 3), rel=1e-8)
+
+
+def test_a_claim_given_to_the_report_is_judged_and_words_count_it(extended):
+    _, folder = extended
+    text = (folder / "index.html").read_text(encoding="utf-8")
+    assert Sections(text).claims[-1] == ("9", "reproduced")
+    assert 'aria-label="The nine claims"' in text
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["claims"][-1]["sentence"] == "With either filter, fused has the better heading."
+    assert summary["answer"][-1].startswith("Of the paper's nine claims, ")
+
+
+def test_a_claim_of_ones_own_can_be_refuted_and_leaves_the_others_as_they_are(guide):
+    worse = changed(invent(60), ("ekf", "fused"), HEADING, lambda error: error + 0.02)
+    *others, mine = judge_claims(selections(worse), (*CLAIMS, guide["headings"]))
+    assert mine.verdict == "not-reproduced"
+    assert len(mine.by_rule["world"].parts[0].findings) == 2 * len(BEAMWIDTH)
+    alone = judge_claims(selections(worse))
+    assert [record(claim) for claim in others] == [record(claim) for claim in alone]
+
+
+def test_what_is_added_to_the_list_needs_no_other_place(guide, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "_write_figure", lambda *_: None)
+    write_report((invent(2),), tmp_path, claims=(guide["headings"],), charts=())
+    page = Sections((tmp_path / "index.html").read_text(encoding="utf-8"))
+    assert [number for number, _ in page.claims] == ["1"]
+    assert page.figures == ["piston", "example_map"]
