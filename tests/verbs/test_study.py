@@ -13,15 +13,12 @@ from pipistrelle.experiments.studies import study, world
 from pipistrelle.experiments.studies.plan_file import read_plan
 from pipistrelle.experiments.studies.store import done_worlds
 from pipistrelle.verbs import study as verb
+from reference.command_line import COMPILING
 from reference.studies import SMALL, assert_same, results
-
-COMPILING = "Compiling kernels (once) ..."
-"""Said on a slow machine, or the first time."""
 
 
 @pytest.fixture(autouse=True)
-def in_a_folder_of_its_own(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def small(in_a_folder_of_its_own):
     Path("small.toml").write_text(SMALL)
 
 

@@ -1,0 +1,30 @@
+"""What a command line leaves behind: its folder, its table, its tracks."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+
+SHORT = ("--duration", "4", "--landmarks", "10")
+"""A world of eight frames."""
+COMPILING = "Compiling kernels (once) ..."
+"""Said on a slow machine, or the first time."""
+
+
+def summary(folder):
+    return json.loads((Path(folder) / "summary.json").read_text())
+
+
+def track(folder, name):
+    return np.loadtxt(Path(folder) / f"track_{name}.tum")
+
+
+def table(printed):
+    """Rows of the closing table: title and cells, eleven characters each."""
+    lines = printed.splitlines()[:-1]
+    return {line[:30].strip(): re.findall(r".{11}", line[30:]) for line in lines[2:]}
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir())}

@@ -1,0 +1,29 @@
+"""`pipistrelle doctor`: what is there, and what to mend."""
+
+import re
+import sys
+
+import numpy as np
+
+
+def test_the_doctor_names_versions_and_folders_and_what_to_mend(obey, monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setenv("PIPISTRELLE_DATA", "nowhere")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "kernels")
+    status, printed, said = obey("doctor")
+    found = dict(re.findall(r"^(\S+(?: \S+)?) {2,}(.+)$", printed, re.M))
+    assert (status, said) == (0, "")
+    assert found["python"].startswith(sys.version.split()[0])
+    assert found["numpy"] == np.__version__
+    assert found["kernel cache"] == "kernels"
+    assert found["ffmpeg"].startswith("not found")
+    assert found["PIPISTRELLE_DATA"].startswith("nowhere: holds no folder mrclam")
+    assert int(found["cores"]) >= 1
+
+
+def test_the_doctor_names_a_missing_library_with_its_fix(obey, monkeypatch):
+    monkeypatch.setattr("pipistrelle.verbs.doctor.requires", lambda _: ["nosuchthing>=2; x"])
+    monkeypatch.delenv("PIPISTRELLE_DATA", raising=False)
+    printed = obey("doctor")[1]
+    assert "nosuchthing       not found; python -m pip install 'nosuchthing>=2; x'" in printed
+    assert "PIPISTRELLE_DATA  not set" in printed

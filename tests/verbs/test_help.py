@@ -1,0 +1,74 @@
+"""What `--help` tells: the verbs, every setting with its default, the filters there are."""
+
+import re
+import subprocess
+import sys
+from math import degrees
+
+import pytest
+
+from pipistrelle.acoustics.emitter import beamwidth
+from pipistrelle.config import Config
+from pipistrelle.experiments.runs import trial
+from pipistrelle.settings import known_settings
+from pipistrelle.verbs.options import FILTERS
+
+
+def test_help_and_version_load_neither_numpy_nor_pydantic():
+    code = (
+        "import sys; from pipistrelle.__main__ import main; main(sys.argv[1:]); "
+        "print({'numpy', 'pydantic', 'numba', 'matplotlib'} & set(sys.modules))"
+    )
+    for word in ("--help", "--version"):
+        printed = subprocess.run(
+            [sys.executable, "-c", code, word], capture_output=True, text=True, check=True
+        ).stdout
+        assert printed.splitlines()[-1] == "set()"
+
+
+def test_help_names_the_verbs(obey):
+    status, printed, _ = obey("--help")
+    assert status == 0
+    verbs = ["config", "doctor", "report", "run", "slam", "study"]
+    assert re.findall(r"^│ (\w+) ", printed, re.M) == verbs
+    assert obey()[1] == printed
+
+
+@pytest.mark.parametrize("verb", [("run",), ("config", "show")])
+def test_every_setting_is_in_the_help_with_its_default(obey, verb):
+    status, printed, _ = obey(*verb, "--help")
+    assert status == 0
+    flags = {"--" + ".".join(key).replace("_", "-") for key in known_settings()}
+    assert flags <= set(re.findall(r"--[a-z0-9.-]+", printed))
+    assert printed.count("[default:") >= len(flags)
+
+
+def test_the_help_of_slam_leaves_out_what_a_log_decides(obey):
+    found = set(re.findall(r"--[a-z]+\.[a-z-]+", obey("slam", "--help")[1]))
+    rays = ("ratio", "density", "prune", "power", "weights", "partial")
+    swarm = ("particles", "resample-below", "mixture")
+    assert found == {f"--rays.{name}" for name in rays} | {f"--fastslam.{name}" for name in swarm}
+
+
+def test_the_defaults_that_the_help_names_are_those_of_the_settings(obey):
+    words = " ".join(re.sub("[│╭╮╰╯─]", " ", obey("run", "--help")[1]).split())
+    told = dict(re.findall(r"--([a-z]+) [A-Z]+ (?:(?! --).)*?\[default: ([^]]+)\]", words))
+    config = Config()
+    width = beamwidth(
+        config.emitter.radius,
+        frequency=config.emitter.frequency,
+        speed_of_sound=config.air.speed_of_sound,
+    )
+    assert told["beamwidth"] == f"{degrees(width):.1f}"
+    assert told["landmarks"] == str(config.scenario.landmarks)
+    assert told["duration"] == f"{config.scenario.steps * config.scenario.step:g}"
+    assert told["engine"] == config.receiver.engine
+    assert told["particles"] == str(config.fastslam.particles)
+
+
+@pytest.mark.parametrize("verb", ["run", "slam"])
+def test_the_help_names_the_filters_there_are(obey, verb):
+    assert tuple(trial.LIMITS) == FILTERS
+    words = " ".join(re.sub("[│╭╮╰╯─]", " ", obey(verb, "--help")[1]).split())
+    assert "[choices: ekf, fastslam, both] [default: ekf]" in words
+    assert "sets fastslam.particles" in words

@@ -1,0 +1,93 @@
+"""What a person may get wrong is said in a line, with its place, and nothing is made."""
+
+from pathlib import Path
+
+import pytest
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("rn", 'Unknown command "rn". Did you mean "run"?'),
+        ("run --bemwidth 3", "Unknown option: --bemwidth. Did you mean --beamwidth?"),
+        ("run --rays.powr 3", "Unknown option: --rays.powr. Did you mean --rays.power?"),
+        ("run --rays.power x", '--rays.power: unable to convert "x" into float'),
+        ("run --rays.power nan", "--rays.power: found nan, expected a finite number"),
+        ("run --rays.power", "--rays.power requires an argument"),
+        ("run --landmarks 2.5", "--landmarks: found '2.5', expected a whole number"),
+        ("run --scenario.steps 9.5", "--scenario.steps: found '9.5', expected a whole number"),
+        ("run --landmarks -1", "--landmarks: found -1, expected greater than or equal to 0"),
+        ("run --seed -1", "--seed: found -1, expected greater than or equal to 0"),
+        ("run --filter ukf", 'Invalid value "ukf" for --filter. Choose from: "ekf", "fastslam",'),
+        ("run --filter fastslam --particles 0", "--particles: found 0, expected greater than or"),
+        ("run --filter fastslam --particles 9.5", "--particles: found '9.5', expected a whole"),
+        ("run --particles 9", "--particles: found 9, but --filter is ekf, which has none; add --f"),
+        (
+            "run --filter both --particles 3 --fastslam.particles 3",
+            "--particles and --fastslam.particles are one setting; give one of them",
+        ),
+        ("run --strategy loud", 'Invalid value "loud" for --strategy'),
+        ("run --duration 0.4", "--duration: found 0.4, expected at least one frame (0.5 s)"),
+        ("run --duration nan", "--duration: found nan, expected at least one frame"),
+        ("run --duration inf", "--duration: found inf, expected at least one frame"),
+        ("run --duration 1e308", "--duration: found 1e+308, expected at least one frame"),
+        ("run --duration 1e30", "--duration 1e+30: found 8000000000000000"),
+        ("run --duration 1e12", "8,000,000,000,000 steps may need"),
+        ("run --scenario.steps 200000000", "200,000,000 steps may need"),
+        ("run --beamwidth 190", "found 190.0 degrees, expected above 0 and up to 180"),
+        ("run --beamwidth nan", "found nan degrees, expected above 0 and up to 180"),
+        (
+            "run --landmarks 3 --scenario.landmarks 3",
+            "--landmarks and --scenario.landmarks are one setting; give one of them",
+        ),
+        ("run --config none.toml", "none.toml: No such file or directory"),
+        ("run --config .", ".: Is a directory"),
+        ("run --landmarks 9999", "scenario.landmarks: found 9999"),
+        ("run --animate=avi", 'Invalid value "avi" for --animate'),
+        ("run --animate avi", "--animate: found 'avi', expected gif or mp4"),
+        ("slam none --animate avi", "--animate: found 'avi', expected gif or mp4"),
+        ("run --animate gif extra", "run: found 'extra', but run takes no arguments"),
+        ("run extra", "run: found 'extra', but run takes no arguments"),
+        ("slam one two", "slam: found 'two', but slam takes one argument"),
+        ("config show extra", "config show: found 'extra', but config show takes no arguments"),
+        ("run --scenario.start 0 0", "--scenario.start: found 2 values, expected 3"),
+        ("slam", "LOG requires an argument"),
+        ("slam --animate none", "none: found no such folder"),
+        ("slam none -x", "Unknown option: -x."),
+        ("slam none -xo", "Unknown option: -x"),
+        ("slam none", "none: found no such folder"),
+        ("slam . --emitter.level-db 3", "--emitter.level-db: means nothing to a recorded log"),
+        ("slam . --filter.range-std 3", "--filter.range-std: the log decides this"),
+        ("slam . --gate 2", "--gate: found 2.0, expected less than or equal to 1"),
+        ("slam . --gate 0.9 --filter.gate 0.9", "--gate and --filter.gate are one setting"),
+        ("slam . --particles 9", "--particles: found 9, but --filter is ekf, which has none; add"),
+        ("slam . --filter both --particles 0", "--particles: found 0, expected greater than or"),
+        (
+            "slam . --filter both --particles 3 --fastslam.particles 3",
+            "--particles and --fastslam.particles are one setting; give one of them",
+        ),
+        ("slam . --beamwidth 0", "--beamwidth: found 0, expected above 0 and up to 360"),
+        ("slam . --beamwidth nan", "--beamwidth: found nan, expected above 0"),
+        ("slam . --robot one", "--robot: found 'one', expected a whole number"),
+    ],
+)
+def test_a_mistake_is_said_in_a_line_and_nothing_is_made(refused, words, said):
+    assert said in refused(*words.split())
+    assert [path.name for path in Path().iterdir() if path.name != "runs"] == []
+    assert not any(Path().glob("runs/*"))
+
+
+def test_a_mistake_in_a_file_or_the_environment_is_said_with_its_place(refused, monkeypatch):
+    Path("mission.toml").write_text("[rays]\npowr = 3\n")
+    found = refused("run", "--config", "mission.toml")
+    assert found == "mission.toml: rays.powr: no such setting; did you mean rays.power?"
+    Path("mission.toml").write_text("[rays]\npower 3\n")
+    assert "mission.toml: not TOML: " in refused("run", "--config", "mission.toml")
+    monkeypatch.setenv("PIPISTRELLE_RAYS__POWER", "0")
+    assert refused("run") == "PIPISTRELLE_RAYS__POWER: found 0, expected greater than 0"
+
+
+def test_a_film_that_needs_what_is_missing_is_refused_before_anything_is_made(refused, monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    assert "found no ffmpeg" in refused("run", "--animate", "mp4")
+    assert not Path("runs").exists()

@@ -1,0 +1,142 @@
+"""`pipistrelle slam`: the log of a run gives the run's track, and decides what a log decides."""
+
+import re
+import shutil
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipistrelle.__main__ import main
+from pipistrelle.config import Config
+from pipistrelle.experiments.runs import replay
+from pipistrelle.verbs.options import FILTERS
+from reference.command_line import SHORT, summary, track
+
+
+@pytest.mark.parametrize("estimator", FILTERS)
+@pytest.mark.parametrize("strategy", ["all", "active", "passive"])
+def test_a_run_and_its_log_give_one_track(obey, strategy, estimator, undrawn):
+    words = ("--seed", "9", "--filter", estimator)
+    gate, choice = ("--filter.gate", "0.99"), ("--strategy", strategy)
+    obey("run", *SHORT, *words, *gate, *choice, "--save-log", "log", "-o", "one")
+    times = np.unique(np.loadtxt("log/measurements.csv", delimiter=",", skiprows=1, usecols=0))
+    assert (len(times) < 8) == (strategy == "active"), "a frame without measurements leaves no row"
+    assert obey("slam", "log", *words, "--quiet", "-o", "two") == (0, "two\n", "")
+    heard = "fused" if strategy == "all" else strategy
+    ran, replayed = track("one", f"{heard}_{estimator}"), track("two", f"fused_{estimator}")
+    assert len(ran) == 33
+    np.testing.assert_allclose(replayed, ran, rtol=0, atol=1e-9)
+    (run,) = [run for run in summary("one")["runs"] if run["strategy"] == heard]
+    (again,) = summary("two")["runs"]
+    for score in ("position_rmse_m", "heading_rmse_rad", "nees_mean", "gated", "landmarks_full"):
+        assert again[score] == pytest.approx(run[score], rel=1e-9)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """The log of a run."""
+    folder = tmp_path_factory.mktemp("saved")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["pipistrelle"])
+        words = ("--save-log", str(folder / "log"), "--quiet", "-o", str(folder / "one"))
+        assert main(["run", *SHORT, *words]) == 0
+    return folder / "log"
+
+
+@pytest.fixture
+def log(saved):
+    """That log in the test's own folder, to be changed."""
+    return shutil.copytree(saved, Path("log"))
+
+
+def test_slam_hides_ranges_by_strategy_and_beam(obey, log, undrawn):
+    status, printed, said = obey("slam", log, "--strategy", "all", "--beamwidth", "40", "-o", "two")
+    assert (status, printed.splitlines()[-1]) == (0, "two")
+    stages = [line[:17].strip() for line in said.splitlines() if "frames/s" in line]
+    assert stages == ["active ekf", "fused ekf", "passive ekf"]
+    active, fused, passive = (run["measurements_per_frame"] for run in summary("two")["runs"])
+    assert active < fused == passive
+    assert "position RMSE, aligned [m]" in printed
+
+
+def test_the_gate_of_a_log_is_the_one_asked_for_else_its_own_else_nearly_all(obey, log, undrawn):
+    def gate(*words):
+        assert obey("slam", log, "--quiet", "--overwrite", "-o", "two", *words)[0] == 0
+        return tomllib.loads(Path("two/config.toml").read_text())["filter"]["gate"]
+
+    text = re.sub(r"gate = .*\n", "", (log / "log.toml").read_text())
+    (log / "log.toml").write_text(text)
+    assert gate() == 0.999
+    (log / "log.toml").write_text("gate = 0.95\n" + text)
+    assert gate() == 0.95
+    Path("mission.toml").write_text("filter.gate = 0.9\n")
+    assert gate("--config", "mission.toml") == 0.9
+    assert gate("--config", "mission.toml", "--gate", "0.8") == 0.8
+
+
+def test_slam_takes_the_settings_of_fastslam_from_flags_and_files_and_keeps_them(
+    obey, log, undrawn
+):
+    Path("mission.toml").write_text("fastslam.mixture = 'exact'\nfastslam.particles = 5\n")
+    words = ("--filter", "both", "--config", "mission.toml", "--particles", "9")
+    status, printed, said = obey("slam", log, *words, "--fastslam.resample-below", "0.5", "-o", "2")
+    assert (status, printed.splitlines()[-1]) == (0, "2")
+    stages = [line[:17].strip() for line in said.splitlines() if "frames/s" in line]
+    assert stages == ["fused ekf", "fused fastslam"]
+    kept = tomllib.loads(Path("2/config.toml").read_text())
+    assert list(kept) == ["seed", "filter", "rays", "fastslam"]
+    assert kept["fastslam"] == {"particles": 9, "resample_below": 0.5, "mixture": "exact"}
+    words = ("--filter", "both", "--config", "2/config.toml", "--quiet")
+    obey("slam", log, *words, "-o", "again")
+    np.testing.assert_array_equal(track("2", "fused_fastslam"), track("again", "fused_fastslam"))
+
+
+def test_slam_takes_from_the_log_what_the_log_decides_and_says_so(obey, log, undrawn):
+    own = Config().filter.range_std
+    Path("mission.toml").write_text("[filter]\nrange_std = 0.7\n")
+    _, _, said = obey("slam", log, "--config", "mission.toml", "-o", "two", "--quiet")
+    where = "mission.toml: filter.range_std"
+    assert said == f"pipistrelle: warning: {where}: the log decides this, and says {own}\n"
+    settled = tomllib.loads(Path("two/config.toml").read_text())
+    assert settled["filter"]["range_std"] == own
+
+
+def test_rows_that_are_left_out_are_named_in_a_line(obey, log, undrawn):
+    with (log / "measurements.csv").open("a") as file:
+        file.write("99.0,3,0.1,4.0\n")
+    _, _, said = obey("slam", log, "-o", "two", "--quiet")
+    assert said == "pipistrelle: warning: log: rows left out: 1 outside odometry\n"
+    assert summary("two")["runs"][0]["ignored_rows"] == {"outside_odometry": 1}
+
+
+def test_a_log_without_truth_is_mapped_and_not_scored(obey, log):
+    (log / "truth.csv").unlink()
+    (log / "landmarks.csv").unlink()
+    status, printed, _ = obey("slam", log, "-o", "two")
+    assert status == 0
+    assert "RMSE" not in printed
+    assert "landmarks, fully placed / all" in printed
+    assert replay.load(log)[1] is None
+
+
+def test_a_log_whose_truth_ends_early_is_scored_where_it_is_known(obey, log, undrawn):
+    rows = (log / "truth.csv").read_text().splitlines()
+    (log / "truth.csv").write_text("\n".join(rows[:20]))
+    status, _, _ = obey("slam", log, "-o", "two")
+    assert status == 0
+    (run,) = summary("two")["runs"]
+    assert 0 < run["position_rmse_m"] < 5
+    assert run["diverged"] is False
+
+
+def test_a_truth_that_covers_part_of_the_path_is_said_in_a_line(obey, tmp_path, undrawn):
+    log = tmp_path / "log"
+    shutil.copytree(Path(__file__).parents[1] / "data" / "unicycle_log", log)
+    rows = (log / "truth.csv").read_text().splitlines()
+    (log / "truth.csv").write_text("\n".join(rows[:12]))
+    status, _, said = obey("slam", log, "-o", tmp_path / "results")
+    assert status == 0
+    assert "the truth covers 5 of 20 steps" in said
