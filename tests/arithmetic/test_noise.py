@@ -60,11 +60,19 @@ def test_noise_cannot_be_told_from_independent_complex_normals():
 @pytest.mark.parametrize(
     ("flaw", "spoilt"),
     [
-        ("power", lambda z: 1.0075 * z),
-        ("power of the real part", lambda z: 1.015 * z.real + 0.985j * z.imag),
-        ("real with imaginary", lambda z: z + 0.015j * z.real),
+        pytest.param("power", lambda z: 1.0075 * z, marks=pytest.mark.slow),
+        pytest.param(
+            "power of the real part",
+            lambda z: 1.015 * z.real + 0.985j * z.imag,
+            marks=pytest.mark.slow,
+        ),
+        pytest.param("real with imaginary", lambda z: z + 0.015j * z.real, marks=pytest.mark.slow),
         ("mean", lambda z: z + 0.015),
-        ("neighbours", lambda z: (z[:-1] + 0.015 * z[1:]) / math.hypot(1.0, 0.015)),
+        pytest.param(
+            "neighbours",
+            lambda z: (z[:-1] + 0.015 * z[1:]) / math.hypot(1.0, 0.015),
+            marks=pytest.mark.slow,
+        ),
         ("phase's law", lambda z: np.abs(z) * np.exp(1j * np.round(10.0 * np.angle(z)) / 10.0)),
     ],
 )

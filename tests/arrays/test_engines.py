@@ -152,6 +152,23 @@ def agree(one, two):
     return min(laws) > CHANCE
 
 
+@pytest.mark.parametrize("delay", [0.0, 0.3, 0.9])
+@pytest.mark.parametrize("tone", [0, 1])
+def test_without_noise_both_engines_find_an_echo_in_the_same_place(tone, delay):
+    arrival = echo((2 * SETTLED.pulse + delay) * BLOCK, tone, 10.0)
+    samples = record_samples(BLOCKS, arrival, FACE, SETTLED, None)
+    sums = np.zeros((BLOCKS - SETTLED.pulse, 1, 2, 10), dtype=complex)
+    add_echo_blocks(sums, arrival, FACE, SETTLED)
+    dense = np.ascontiguousarray(matched_samples(samples)[:: SETTLED.block])
+    common, fast = (
+        errors(matched, engine, tone, arrival.delay[0], FINDER)
+        for matched, engine in ((dense, COMMON), (matched_blocks(sums), FAST))
+    )
+    assert np.isfinite(common).all()
+    np.testing.assert_allclose(fast, common, rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("snr_db", [3.5, 10.0])
 def test_the_block_engine_detects_as_the_dense_one_does_on_the_same_grid(snr_db):
     table = heard(snr_db, 1200)
@@ -168,6 +185,7 @@ def test_the_block_engine_detects_as_the_dense_one_does_whatever_the_echo(snr_db
     assert agree(table[FAST], table[COMMON])
 
 
+@pytest.mark.slow
 def test_the_full_grid_would_find_some_more_echoes_near_the_threshold():
     # Twice 0.01 of sampling about the 0.06 to 0.09 of longer runs.
     full, common, _ = found(heard(3.5, 1200)).mean(axis=1)
@@ -185,6 +203,7 @@ def test_the_full_grid_gains_at_most_a_tenth_in_detection_probability():
     assert 0.0 <= gain[8.0] < 0.005
 
 
+@pytest.mark.slow
 def test_the_full_grid_would_refine_a_clear_echos_range_by_a_fifth():
     full, common, _ = range_rms(heard(10.0, 1200))
     assert full / common == pytest.approx(0.8, abs=0.1)  # an rms of 1200 is good to 4 %

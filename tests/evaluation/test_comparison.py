@@ -100,6 +100,7 @@ def test_the_unit_of_the_sample_does_not_matter(seed, unit):
             assert np.array(other.interval) / unit == pytest.approx(one.interval, rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "means",
     [np.zeros(8), np.full(8, 5.0), [0.0, 0.0, 0.0, 0.0, 3.0, 3.0, 0.6, -0.6]],

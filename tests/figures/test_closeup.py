@@ -2,7 +2,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
@@ -75,6 +75,7 @@ def test_the_window_is_in_the_corner_where_no_vehicle_ends(size, free):
     assert gap == pytest.approx(MARGIN * size[0])
 
 
+@settings(max_examples=20)
 @given(pose=st.tuples(*[st.floats(-9.0, 9.0)] * 3))
 def test_the_window_looks_at_the_vehicle(pose):
     path = np.array([[0.0, 0.0, 0.0], pose])

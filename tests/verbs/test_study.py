@@ -84,6 +84,21 @@ def test_without_a_name_the_folder_is_the_plans_so_that_the_same_command_goes_on
     assert done_worlds(Path("runs/small")) == {0}
 
 
+def test_as_many_workers_as_asked_for_do_the_study(obey, monkeypatch):
+    asked = []
+
+    def noted(plan, folder, *, workers, **others):
+        asked.append(workers)
+        return study_alone(plan, folder, **others)
+
+    study_alone = study.run_study
+    monkeypatch.setattr(study, "run_study", noted)
+    words = ("small.toml", "--iterations", "1", "--quiet", "-o", "one")
+    assert obey(*words, "--workers", "7") == (0, "one\n", "")
+    assert asked == [7]
+
+
+@pytest.mark.slow
 def test_two_workers_find_what_one_finds(obey):
     obey("small.toml", "--quiet", "-o", "one")
     assert obey("small.toml", "--quiet", "--workers", "2", "-o", "two") == (0, "two\n", "")
@@ -253,12 +268,17 @@ def test_the_tasks_of_a_job_script_together_do_the_study(obey, monkeypatch):
     Path("job.sh").write_text(printed)
     Path("bin").mkdir()
     name = Path("bin/pipistrelle")
-    name.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m pipistrelle "$@"\n')
+    name.write_text("#!/bin/sh\nprintf '%s\\n' \"$@\"\n")  # says what it is called with
     name.chmod(0o755)
     for task in range(2):
         found = f"{Path('bin').absolute()}{os.pathsep}{os.environ['PATH']}"
         environment = os.environ | {"SLURM_ARRAY_TASK_ID": str(task), "PATH": found}
-        subprocess.run(["sh", "job.sh"], check=True, env=environment, capture_output=True)
+        done = subprocess.run(
+            ["sh", "job.sh"], check=True, env=environment, capture_output=True, text=True
+        )
+        verb, *called = done.stdout.splitlines()
+        assert verb == "study"
+        assert obey(*called)[0] == 0
     obey(*words, "--quiet", "-o", "whole")
     assert_same(results("my study"), results("whole"))
 

@@ -75,8 +75,9 @@ def test_the_settings_own_radius_is_not_used():
     assert bits(listen(world, config, [0.0088])[0]) == bits(listen(world, other, [0.0088])[0])
 
 
-def test_the_dense_engine_too_hears_each_beam_alone_and_each_world_with_its_own_noise():
-    world, config = short(8, receiver=ReceiverConfig(engine="dense"))
+@pytest.mark.parametrize("steps", [4, pytest.param(8, marks=pytest.mark.slow)])
+def test_the_dense_engine_too_hears_each_beam_alone_and_each_world_with_its_own_noise(steps):
+    world, config = short(steps, receiver=ReceiverConfig(engine="dense"))
     wide, narrow = listen(world, config, [0.0025, 0.025])
     assert bits(listen(world, config, [0.025])[0]) == bits(narrow)
     assert bits(listen(world, config, [0.025], iteration=1)[0]) != bits(narrow)

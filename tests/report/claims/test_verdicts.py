@@ -80,6 +80,13 @@ def test_noise_as_large_as_the_effects_leaves_claims_open(study):
     assert (found[3], found[6]) == ("open", "open")
 
 
+def test_where_fused_is_active_to_the_bit_nothing_is_decided(study):
+    active = study.outcomes["fastslam", "active"].scores[POSITION]
+    same = changed(study, ("fastslam", "fused"), POSITION, lambda _: active)
+    assert verdicts(same)[5] == "open"
+
+
+@pytest.mark.slow
 def test_where_fused_and_active_are_the_same_fused_is_not_seen_to_beat_it():
     """Over many studies without any difference, the family's error is at most 5 %."""
     wrong, runs = 0, 200

@@ -41,8 +41,18 @@ def written(tmp_path_factory) -> Path:
     return folder / "index.html"
 
 
-@pytest.fixture(scope="module", params=[(s, c) for s in WIDTHS for c in ("light", "dark")],
-                ids="-".join)  # fmt: skip
+SCREENS = [
+    pytest.param((screen, scheme), id=f"{screen}-{scheme}", marks=marks)
+    for screen, scheme, marks in (
+        ("phone", "dark", ()),
+        ("desk", "light", ()),
+        ("phone", "light", pytest.mark.slow),
+        ("desk", "dark", pytest.mark.slow),
+    )
+]
+
+
+@pytest.fixture(scope="module", params=SCREENS)
 def opened(browser, written, request):
     """The page, and everything that it complained about or asked for."""
     screen, scheme = request.param
