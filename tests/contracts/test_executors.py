@@ -138,7 +138,7 @@ class TestTwoProcessesKilledOnce(ExecutorContract):
 
 
 class TestKilledInTheMiddleOfAFileAndContinued(ExecutorContract):
-    operations = (5, 9)
+    operations = (5,)
 
     def run(self, plan, folder):
         (folder.parent / "mortal.py").write_text(UNTIL_KILLED)
@@ -274,11 +274,14 @@ def test_results_that_went_to_another_disk_are_missed(plan, folder, monkeypatch)
 # Dask
 
 
-@pytest.fixture
-def cluster(tmp_path):
-    """A scheduler and two workers on the loopback interface, each a process."""
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
+    """A scheduler and two workers on the loopback interface, each a process.
+
+    The tests of Dask share it, and kill it bit by bit: first a worker, last the scheduler.
+    """
     pytest.importorskip("distributed", reason="Dask is not installed: the extra [cluster]")
-    with _cluster(tmp_path) as found:
+    with _cluster(tmp_path_factory.mktemp("cluster")) as found:
         yield found
 
 
@@ -326,10 +329,31 @@ class TestDaskWithAWorkerKilled(TestDask):
         assert self.workers[1].wait(10) == -signal.SIGKILL
 
 
-class TestDaskOnThisMachine(ExecutorContract):
+class TestDaskLosesItsScheduler(TestDask):
     def run(self, plan, folder):
-        pytest.importorskip("distributed", reason="Dask is not installed: the extra [cluster]")
+        kill = after_first(self.scheduler.kill)
+        with pytest.raises(InputError, match="the cluster is gone"):
+            run_study(plan, folder, scheduler=self.address, progress=kill)
+        assert run_study(plan, folder).done == 5
+
+
+class TestDaskOnThisMachine(ExecutorContract):
+    """In threads, which start at once."""
+
+    @pytest.fixture(autouse=True)
+    def threads(self, monkeypatch):
+        dask = pytest.importorskip("distributed", reason="no Dask: the extra [cluster]")
+        monkeypatch.setattr(dask, "LocalCluster", partial(dask.LocalCluster, processes=False))
+
+    def run(self, plan, folder):
         assert run_study(plan, folder, workers=2, scheduler="local").done == 5
+
+
+@pytest.mark.slow
+class TestDaskInProcessesOfThisMachine(TestDaskOnThisMachine):
+    @pytest.fixture(autouse=True)
+    def threads(self):
+        pytest.importorskip("distributed", reason="no Dask: the extra [cluster]")
 
 
 def test_no_scheduler_at_the_address_is_an_error(plan, folder):
@@ -349,11 +373,3 @@ def test_a_world_that_kills_every_worker_of_a_cluster_is_recorded_and_the_others
     pytest.importorskip("distributed", reason="Dask is not installed: the extra [cluster]")
     found = executors.on_cluster(partial(fatal, {1}), lost, deque(range(3)), 2, "local")
     assert sorted(found) == [[("world 0", None)], [("world 1", "lost")], [("world 2", None)]]
-
-
-class TestDaskLosesItsScheduler(TestDask):
-    def run(self, plan, folder):
-        kill = after_first(self.scheduler.kill)
-        with pytest.raises(InputError, match="the cluster is gone"):
-            run_study(plan, folder, scheduler=self.address, progress=kill)
-        assert run_study(plan, folder).done == 5
