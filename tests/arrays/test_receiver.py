@@ -79,6 +79,16 @@ def test_block_sums_of_a_whole_world_are_those_of_its_samples(seed):
     assert np.abs(fast - dense).max() <= 1e-10 * np.abs(dense).max()
 
 
+@pytest.mark.parametrize("source", [ACTIVE, PASSIVE])
+@pytest.mark.parametrize("shift", [0.8, 1.0, 1.25])
+def test_a_call_that_is_heard_higher_is_over_sooner(shift, source):
+    heard = one(4e-3, bearing=0.0, shift=shift, source=source)
+    samples = record_samples(28, heard, LAYOUT, SETTLED, None)
+    count = np.count_nonzero(samples[:, 0, 0])
+    called = CONFIG.emitter.pulse * SETTLED.tones[source] / heard.frequency[0]  # T f / f'
+    assert count == pytest.approx(called * SETTLED.rate, abs=1.0)
+
+
 def test_without_the_doppler_shift_the_sums_would_differ():
     fast, _ = both(one(9e-3, shift=1.0), 40)
     _, dense = both(one(9e-3, shift=1.0 + 2 * 0.75 / 343.0), 40)

@@ -171,6 +171,26 @@ def test_absence_is_claimed_only_where_presence_would_have_been_seen():
     assert stats.t.ppf(0.975, 3) / 2.0 > 1.0
 
 
+@pytest.mark.parametrize(("worlds", "family", "holds"), [(6, 1, None), (7, 1, True), (7, 2, None)])
+def test_absence_is_claimed_from_the_first_world_that_resolves_a_deviation(worlds, family, holds):
+    half_width = stats.t.ppf(1.0 - 0.025 / family, worlds - 1) / math.sqrt(worlds)
+    assert (half_width <= 1.0) == (holds is True)
+    samples = [np.linspace(-1.0, 1.0, worlds)] * family
+    assert {f.holds for f in judge(statements(samples, "not above"))} == {holds}
+
+
+@pytest.mark.parametrize("standing", [1, 2, 3])
+def test_the_interval_of_what_stands_shares_alpha_among_those_that_stand_alone(standing):
+    shape, n = np.linspace(-1.0, 1.0, 20), 20
+    weak = [shape + 0.01 * i for i in range(standing)]
+    findings = judge(statements([*weak, *(shape + 9.0 for _ in range(8 - standing))]))
+    assert [f.holds for f in findings] == [None] * standing + [True] * (8 - standing)
+    low = stats.t.ppf(1.0 - 0.025 / standing, n - 1) * shape.std(ddof=1) / math.sqrt(n)
+    high = stats.t.ppf(1.0 - 0.025 / 8, n - 1) * shape.std(ddof=1) / math.sqrt(n)  # none is below
+    for finding in findings[:standing]:
+        assert finding.interval == pytest.approx((finding.mean - low, finding.mean + high))
+
+
 @pytest.mark.parametrize(
     ("shift", "holds"), [(0.05, True), (-0.05, None), (1.0, False), (-1.0, False)]
 )

@@ -81,6 +81,21 @@ def test_parallax_finds_the_member_that_holds_the_landmark(weights, power):
     assert error @ np.linalg.solve(rows.covariance[heaviest], error) < chi2.ppf(0.99, 2)
 
 
+def test_a_bearing_that_is_gated_prunes_nothing():
+    *_, belief = seen_along_a_line(paper_filter(bearing_std=0.05, rays=ray_config(prune=0.0)))
+    light = belief.weight[belief.landmark == 7] < 0.9 / 4
+    assert 0 < light.sum() < light.size == 4
+    strict = paper_filter(bearing_std=0.05, rays=ray_config(prune=0.9), gate=0.9)
+    pose = belief.pose().mean
+    expected = np.arctan2(TRUTH[1] - pose[1], TRUTH[0] - pose[0]) - pose[2]
+    gated = strict.update(belief, scan_of((7, np.nan, wrap(expected + np.pi))))
+    assert gated.gated == belief.gated + 1
+    for field in ("mean", "covariance", "landmark", "weight"):
+        np.testing.assert_array_equal(getattr(gated, field), getattr(belief, field))
+    heard = strict.update(belief, scan_of((7, np.nan, wrap(expected))))
+    assert heard.landmark.size < belief.landmark.size, "a bearing that is not prunes"
+
+
 def test_pruning_removes_rows_and_changes_nothing_else():
     """Before and after a prune: the same numbers, to the last bit, without the pruned rows."""
     pruning, keeping = (

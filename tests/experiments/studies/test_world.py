@@ -1,16 +1,18 @@
 """A study's world: each case is the trial that it would be alone, though heard together."""
 
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 
 import numpy as np
 import pytest
 
 from pipistrelle.acoustics.emitter import beamwidth
+from pipistrelle.config import Config
 from pipistrelle.evaluation.consistency import nees
 from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.experiments.studies import world
-from pipistrelle.experiments.studies.plan import cases_of
+from pipistrelle.experiments.studies.plan import Plan, cases_of
 from pipistrelle.experiments.studies.world import failed_records, run_world, world_tables
+from pipistrelle.settings import Given, from_flags, known_settings, resolve
 from reference.studies import SMALL, as_rows, plan_of
 
 
@@ -99,6 +101,115 @@ def test_cases_that_hear_the_same_world_listen_once(plan, monkeypatch):
         (10, 0.0025, 0.025),
         (12, 0.0025, 0.025),
     ]
+
+
+OTHERS = {
+    "seed": 8,
+    "scenario.steps": 24,
+    "scenario.step": 0.1,
+    "scenario.steps_per_frame": 5,
+    "scenario.speed": 0.8,
+    "scenario.steering": 0.03,
+    "scenario.start": [0.0, -7.0, 0.1],
+    "scenario.landmarks": 10,
+    "scenario.radius": 20.0,
+    "scenario.spacing": 6.0,
+    "scenario.clearance": 3.0,
+    "scenario.beacon_distance": 12.0,
+    "air.speed_of_sound": 340.0,
+    "air.temperature_c": 0.0,
+    "air.relative_humidity": 0.1,
+    "air.pressure_kpa": 80.0,
+    "air.spreading": "bistatic",
+    "target.shape": "sphere",
+    "target.radius": 0.05,
+    "emitter.frequency": 40e3,
+    "emitter.radius": 0.02,
+    "emitter.level_db": 60.0,
+    "emitter.pulse": 2.0e-3,
+    "beacon.frequency": 25e3,
+    "beacon.level_db": 55.0,
+    "receiver.elements": 8,
+    "receiver.spacing": 0.004,
+    "receiver.sample_rate": 250e3,
+    "receiver.noise_level_db": 6.0,
+    "receiver.engine": "dense",
+    "detection.false_alarm": 1e-2,
+    "detection.leakage_db": -10.0,
+    "detection.peak_db": -0.5,
+    "detection.scan_limit_deg": 76.0,
+    "detection.angle_limit_deg": 40.0,
+    "detection.averaging": "weighted",
+    "association.delay_gate": 0.01,
+    "association.bearing_gate": 0.01,
+    "association.margin_db": 0.0,
+    "motion.wheelbase": 0.3,
+    "motion.speed_std": 0.2,
+    "motion.steering_std": 0.06,
+    "filter.range_std": 0.4,
+    "filter.bearing_std": 0.05,
+    "filter.initial_pose_std": [0.1, 0.1, 0.1],
+    "filter.gate": 0.05,
+    "rays.ratio": 0.2,
+    "rays.density": 2.0,
+    "rays.range_bounds": [1.0, 15.0],
+    "rays.prune": 0.3,
+    "rays.power": 4.0,
+    "rays.weights": "aggregated",
+    "rays.partial": "heaviest",
+    "fastslam.particles": 30,
+    "fastslam.resample_below": 1.0,
+    "fastslam.mixture": "exact",
+}
+"""Another value of every setting, far enough from its default to be heard or believed."""
+FEW = ("air.spreading", "target.shape", "emitter.radius", "beacon.level_db", "receiver.elements",
+       "detection.peak_db", "association.bearing_gate", "motion.speed_std", "scenario.landmarks",
+       "filter.range_std", "rays.power", "fastslam.particles", "seed")  # fmt: skip
+"""One of each section."""
+
+
+def test_the_settings_that_are_varied_here_are_all_there_are():
+    assert set(OTHERS) == {".".join(key) for key in known_settings()}
+    assert {name.split(".")[0] for name in FEW} == set(Config.model_fields)
+
+
+def plan_with(config, setting="", values=()):
+    """A plan of one world, in which a setting may vary."""
+    grid, ways = (
+        {setting: values} if setting else {},
+        {"strategies": ("fused",), "filters": ("ekf", "fastslam")},
+    )
+    return Plan(name="one", iterations=1, config=config, grid=grid, **ways)
+
+
+def found_in(plan):
+    """All that is found in a plan's first world but for the times that it took, to the bit."""
+    skipped = ("case", "wall_s", "cpu_s")
+    return [
+        {
+            field.name: value.tobytes() if isinstance(value, np.ndarray) else repr(value)
+            for field in fields(record)
+            if field.name not in skipped
+            for value in [getattr(record, field.name)]
+        }
+        for record in run_world(plan, 0)
+    ]
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [name if name in FEW else pytest.param(name, marks=pytest.mark.slow) for name in OTHERS],
+)
+def test_values_of_a_grid_are_heard_and_tried_as_they_are_alone(setting):
+    short = from_flags({"scenario": {"steps": 40, "landmarks": 20, "radius": 15.0}})
+    key = tuple(setting.split("."))
+    usual = resolve(short).model_dump(mode="json")
+    for name in key:
+        usual = usual[name]
+    values = (usual, OTHERS[setting])
+    alone = [found_in(plan_with(resolve(short | {key: Given(value, setting)}))) for value in values]
+    assert found_in(plan_with(resolve(short), setting, values)) == alone[0] + alone[1]
+    assert alone[0] != alone[1], "or nothing is proved"
 
 
 def test_worlds_differ(plan, records):
