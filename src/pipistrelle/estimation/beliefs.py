@@ -47,6 +47,22 @@ class Landmarks:
     weight: Float[np.ndarray, " h"]
 
 
+def no_landmarks() -> Landmarks:
+    """Return the map that knows no landmark.
+
+    Examples
+    --------
+    >>> no_landmarks().mean.shape
+    (0, 2)
+    """
+    return Landmarks(
+        landmark=np.empty(0, np.int64),
+        mean=np.empty((0, 2)),
+        covariance=np.empty((0, 2, 2)),
+        weight=np.empty(0),
+    )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
     """What a filter made of one mission: the start, then one row per control step.

@@ -38,7 +38,7 @@ class MissionRecorder:
 
     Examples
     --------
-    >>> from pipistrelle.estimation.beliefs import Gaussian
+    >>> from pipistrelle.estimation.beliefs import Gaussian, no_landmarks
     >>> class Lost:
     ...     gated = 0
     ...
@@ -46,9 +46,7 @@ class MissionRecorder:
     ...         return Gaussian(mean=np.zeros(3), covariance=np.eye(3))
     ...
     ...     def landmarks(self):
-    ...         none = np.empty(0)
-    ...         mean, covariance = np.empty((0, 2)), np.empty((0, 2, 2))
-    ...         return Landmarks(landmark=none, mean=mean, covariance=covariance, weight=none)
+    ...         return no_landmarks()
     >>> none = np.empty(0)
     >>> watch = MissionRecorder()
     >>> watch("fused", "ekf", Scan(time=0.5, landmark=none, bearing=none, range=none), Lost())

@@ -1,9 +1,7 @@
-"""Recorded logs: a folder of plain text files becomes controls and scans, the truth unseen.
+"""Log folders, the format of this project: plain text, read and written, the truth unseen.
 
-A row of odometry holds from its time to the next row's; the last row only ends the log. A
-measurement is used at the end of the step (t[i-1], t[i]] that holds it, at the start when its time
-is the first row's. Whatever is wrong with a file is refused by line or key; the few oddities that
-sound logs contain are dropped and counted.
+Whatever is wrong with a file is refused by line or key. `recording` says how rows become steps and
+measurements scans.
 """
 
 import difflib

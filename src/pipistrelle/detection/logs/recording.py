@@ -1,4 +1,10 @@
-"""A recorded drive: rows of odometry become steps, measurements become scans."""
+"""A recorded drive: rows of odometry become steps, measurements become scans.
+
+A row of odometry holds from its time to the next row's; the last row only ends the log. A
+measurement is used at the end of the step (t[i-1], t[i]] that holds it, at the start when its time
+is the first row's. Oddities that sound logs contain are dropped and counted. This is the same for
+all formats, and here alone do recorded measurements become scans.
+"""
 
 import math
 from collections import Counter
@@ -14,9 +20,9 @@ from pipistrelle.detection.scans import Scan, make_scan
 from pipistrelle.geometry import wrap
 
 MEASUREMENT = ("time", "landmark", "bearing", "range")
+"""What is said of a measurement: when it was made, and the columns of its scan."""
+
 _RESOLUTION = 1e-6  # [s], of the boundaries of merged steps
-
-
 _STEPS_MAX = 10_000_000
 
 
@@ -115,12 +121,12 @@ def assemble(
     ignored = Counter(ignored_rows or {})
     ignored["same_time_odometry"] += int(np.sum(~last))
     ignored["outside_odometry"] += int(np.sum(~inside))
-    rows = [measurements.column[name][inside] for name in MEASUREMENT]
+    measured = {name: measurements.column[name][inside] for name in MEASUREMENT}
     return Log(
         time=time,
         controls=controls,
         dt=np.diff(time),
-        scans=_scans(time, *rows, resolution=0.0 if step is None else _RESOLUTION),
+        scans=_scans(time, measured, 0.0 if step is None else _RESOLUTION),
         ignored_rows={reason: count for reason, count in ignored.items() if count},
         **settings,
     )
@@ -158,21 +164,17 @@ def _merge(
 
 
 def _scans(
-    time: np.ndarray,
-    stamp: np.ndarray,
-    landmark: np.ndarray,
-    bearing: np.ndarray,
-    range: np.ndarray,  # noqa: A002
-    *,
-    resolution: float,
+    time: np.ndarray, measured: dict[str, np.ndarray], resolution: float
 ) -> tuple[Scan, ...]:
     """One scan for each time of measurement, at the end of the step that holds it."""
-    used = time[np.searchsorted(time, stamp - resolution)]
-    bearing = np.where(np.abs(bearing) < np.pi, bearing, wrap(bearing))
+    stamp, bearing = measured["time"], measured["bearing"]
+    said = measured | {
+        "time": time[np.searchsorted(time, stamp - resolution)],
+        "bearing": np.where(np.abs(bearing) < np.pi, bearing, wrap(bearing)),
+    }
     cuts = np.flatnonzero(np.diff(stamp)) + 1
-    parts = zip(*(np.split(x, cuts) for x in (used, landmark, bearing, range)), strict=True)
+    parts = zip(*(np.split(column, cuts) for column in said.values()), strict=True)
+    rows = (dict(zip(said, part, strict=True)) for part in parts)
     return tuple(
-        make_scan(float(t[0]), label, angle, range=distance)
-        for t, label, angle, distance in parts
-        if len(t)
+        make_scan(**row | {"time": float(row["time"][0])}) for row in rows if row["time"].size
     )

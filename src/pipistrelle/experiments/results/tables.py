@@ -106,15 +106,9 @@ def step_table(track: Track, true_path: Float[np.ndarray, "k 3"] | None) -> "pl.
 
     Examples
     --------
-    >>> from pipistrelle.estimation.beliefs import Gaussian
-    >>> nowhere = Landmarks(
-    ...     landmark=np.empty(0, int),
-    ...     mean=np.empty((0, 2)),
-    ...     covariance=np.empty((0, 2, 2)),
-    ...     weight=np.empty(0),
-    ... )
+    >>> from pipistrelle.estimation.beliefs import Gaussian, no_landmarks
     >>> pose = Gaussian(mean=np.zeros((1, 3)), covariance=4 * np.eye(3)[None])
-    >>> track = Track(time=np.zeros(1), pose=pose, landmarks=nowhere, gated=0)
+    >>> track = Track(time=np.zeros(1), pose=pose, landmarks=no_landmarks(), gated=0)
     >>> table = step_table(track, np.array([[3.0, 4.0, 0.0]]))
     >>> table["x_std_m"].item(), table["position_error_m"].item(), table["nees"].item()
     (2.0, 5.0, 6.25)
