@@ -23,7 +23,6 @@ mission = run_mission(config, STRATEGIES)
 # A landmark that was only ever heard passively is a ray, drawn as the row of Gaussians that it is,
 # until the vehicle has moved far enough to tell how far away it stands.
 
-world, drive = mission.scenario, mission.drive
 width = beamwidth(
     config.emitter.radius,
     frequency=config.emitter.frequency,
@@ -31,9 +30,8 @@ width = beamwidth(
 )
 figure = draw_mission(
     mission.trials,
-    true_path=(world.time, world.path),
-    true_landmarks=drive.true_landmarks,
-    beacon=world.beacon,
+    truth=mission.drive.truth,
+    beacon=mission.scenario.beacon,
     beamwidth=float(width),
 )
 

@@ -16,10 +16,11 @@ import numpy as np
 from pipistrelle.config import Config
 from pipistrelle.detection.logs.folder import write_log
 from pipistrelle.detection.logs.recording import Log
-from pipistrelle.detection.scans import Scan
+from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.motion import Motion, motion_step
+from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.runs.replay import load, replay
-from pipistrelle.experiments.runs.truth_files import Truth, write_truth
+from pipistrelle.experiments.runs.truth_files import write_truth
 from pipistrelle.figures.mission import draw_mission
 from pipistrelle.geometry import range_and_bearing
 
@@ -45,7 +46,7 @@ for k in range(5, 601, 5):
     distance, bearing = distance + rng.normal(0.0, 0.1, 6), bearing + rng.normal(0.0, 0.03, 6)
     distance = np.where(distance < 4.0, distance, np.nan)
     scans.append(
-        Scan(time=time[k], landmark=labels[seen], bearing=bearing[seen], range=distance[seen])
+        make_scan(time[k], labels[seen], bearing[seen], range=distance[seen])
     )
 
 # %%
@@ -81,7 +82,7 @@ with TemporaryDirectory() as place:
 # On the command line the rest is ``pipistrelle slam posts``.
 
 (trial,) = replay(log, truth, ["fused"], ["ekf"], None, Config())
-figure = draw_mission([trial], true_path=(truth.time, truth.path), true_landmarks=truth.landmarks)
+figure = draw_mission([trial], truth=truth)
 
 # %%
 # How far off are the posts on the map?

@@ -156,6 +156,41 @@ def test_the_guides_noise_reaches_the_filter_row_by_row(guide):
     assert not np.array_equal(by_level.pose.covariance, constant.pose.covariance)
 
 
+@pytest.fixture
+def boats_log(tmp_path):
+    """A boat that sails along x past three buoys, as the guide's format has it."""
+    time = np.arange(0.0, 20.0, 0.25)
+    buoys = {4: (8.0, 3.0), 5: (12.0, -4.0), 9: (20.0, 6.0)}
+    rows = [
+        f"{t} {label} {-np.degrees(np.arctan2(y, x - t))} {np.hypot(x - t, y)}"
+        for t in time[:60:4]
+        for label, (x, y) in buoys.items()
+    ]
+    (tmp_path / "sonar.txt").write_text("\n".join(rows))
+    (tmp_path / "rudder.txt").write_text("\n".join(f"{t} 1.0 0.0" for t in time))
+    chart = (f"{label} {x} {y}" for label, (x, y) in buoys.items())
+    (tmp_path / "chart.txt").write_text("\n".join(chart))
+    return tmp_path
+
+
+def test_the_guides_reader_maps_a_log_of_another_format_and_its_truth_scores_it(guide, boats_log):
+    trials = {trial.strategy: trial for trial in guide["solve"](boats_log)}
+    assert len(trials["fused"].scans) == 15
+    assert [trials[strategy].scores.landmarks_total for strategy in ("active", "fused")] == [3, 3]
+    assert trials["fused"].scores.map_rmse_m < 0.1
+    assert trials["fused"].scores.position_rmse_m is None
+    wide = sum(len(scan.landmark) for scan in trials["fused"].scans)
+    assert sum(len(scan.landmark) for scan in trials["active"].scans) < wide == 45
+
+
+def test_the_guides_reader_refuses_by_the_line(guide, boats_log):
+    from pipistrelle.config import InputError
+
+    (boats_log / "sonar.txt").write_text("0.0 4 0.0 1.0\n0.0 4 0.0 x\n")
+    with pytest.raises(InputError, match=r"sonar\.txt, line 2: found range 'x'"):
+        guide["solve"](boats_log)
+
+
 @pytest.mark.slow
 def test_the_readme_shows_what_the_command_prints(tmp_path, capsys):
     from pipistrelle.__main__ import main

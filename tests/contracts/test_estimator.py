@@ -56,8 +56,6 @@ def small_world(seed, strategy="fused", frames=60, start=START):
         start=start,
         time=STEP * np.arange(1 + frames * STEPS_PER_FRAME),
         controls=mission.controls.reshape(-1, 2),
-        true_path=None,
-        true_landmarks=None,
     )
     return drive, mission.scans, mission.path
 

@@ -7,6 +7,7 @@ import pytest
 
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks, Track
+from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.results.scores import Scores, TrialResult
 from pipistrelle.geometry import range_and_bearing, wrap
 from reference.missions import map_with, scan_with
@@ -46,7 +47,7 @@ class Swarming(Believed):
 class Mission:
     """The true world and, for each strategy, its result and what was watched."""
 
-    truth: dict
+    scene: dict
     trials: dict
     watched: dict
 
@@ -213,9 +214,8 @@ def mission() -> Mission:
     points = scatter(rng)
     made = {s: trial_of(s, time, path, points, rng) for s in ("active", "fused", "passive")}
     return Mission(
-        truth={
-            "true_path": (time, path),
-            "true_landmarks": (np.arange(1, len(points) + 1), points),
+        scene={
+            "truth": Truth(time=time, path=path, landmarks=(np.arange(1, len(points) + 1), points)),
             "beacon": points[-1],
             "beamwidth": 2.0 * HALF_BEAM,
         },

@@ -51,7 +51,7 @@ def test_a_recorder_keeps_particles_where_there_are_any(recorder, swarm_recorder
 
 
 def test_a_panel_shows_the_particles_of_its_frame_enlarged(recorder, swarm_recorder, mission):
-    _, panels = _stage(recorder.snapshots | swarm_recorder.snapshots, **mission.truth)
+    _, panels = _stage(recorder.snapshots | swarm_recorder.snapshots, **mission.scene)
     assert [panel.closeup is not None for panel in panels] == [False, False, False, True]
     frame = swarm_recorder.snapshots["fused", "fastslam"][100]
     panels[3]._show_vehicle(frame.pose, frame.scan.time, 100)
@@ -63,8 +63,8 @@ def test_a_panel_shows_the_particles_of_its_frame_enlarged(recorder, swarm_recor
 
 def test_a_film_draws_the_window_anew_in_every_picture(swarm_recorder, mission, tmp_path):
     path = tmp_path / "mission.gif"
-    animate_mission(swarm_recorder.snapshots, path, **mission.truth, pictures=3)
-    _, (panel,) = _stage(swarm_recorder.snapshots, **mission.truth)
+    animate_mission(swarm_recorder.snapshots, path, **mission.scene, pictures=3)
+    _, (panel,) = _stage(swarm_recorder.snapshots, **mission.scene)
     window = panel.closeup.artists[2]
     pictures = []
     with Image.open(path) as film:
@@ -82,7 +82,7 @@ def test_a_film_draws_the_window_anew_in_every_picture(swarm_recorder, mission, 
 
 def test_a_gif_has_the_pictures_asked_for_and_rests_on_the_last(recorder, mission, tmp_path):
     path = tmp_path / "new" / "mission.gif"
-    animate_mission(recorder.snapshots, path, **mission.truth, pictures=6)
+    animate_mission(recorder.snapshots, path, **mission.scene, pictures=6)
     with Image.open(path) as film:
         assert film.n_frames == 6
         assert film.info["loop"] == 0
@@ -112,7 +112,7 @@ def test_a_short_mission_is_shown_frame_by_frame(recorder, tmp_path):
 
 
 def test_a_panel_shows_measurements_along_their_bearings_as_far_as_their_ranges(recorder, mission):
-    _, panels = _stage(recorder.snapshots, **mission.truth)
+    _, panels = _stage(recorder.snapshots, **mission.scene)
     frame = recorder.snapshots["fused", "ekf"][100]
     panels[1]._show_scan(frame)
     ranged = np.isfinite(frame.scan.range)
@@ -126,7 +126,7 @@ def test_a_panel_shows_measurements_along_their_bearings_as_far_as_their_ranges(
 
 
 def test_a_panel_shows_the_map_of_its_frame_and_rings_what_has_just_turned_full(recorder, mission):
-    _, panels = _stage(recorder.snapshots, **mission.truth)
+    _, panels = _stage(recorder.snapshots, **mission.scene)
     frames = recorder.snapshots["fused", "ekf"]
     sets = [set(f.landmarks.landmark[placed(f.landmarks)].tolist()) for f in frames]
     step = next(i for i in range(50, 374) if sets[i + 1] > sets[i])

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from matplotlib.path import Path
 
+from pipistrelle.experiments.drives import NO_TRUTH, Truth
 from pipistrelle.figures.maps import (
     PLACED,
     RAY,
@@ -88,9 +89,10 @@ def test_the_heavier_hypothesis_is_the_more_opaque():
 def test_a_view_shows_every_true_point_with_a_margin_and_stays_readable(points):
     places = np.array(points)
     lost = np.full((1, 3), 1e6)
-    (left, right), (bottom, top) = view(
-        (np.zeros(1), np.zeros((1, 3))), (np.arange(len(places)), places), None, [lost], []
+    truth = Truth(
+        time=np.zeros(1), path=np.zeros((1, 3)), landmarks=(np.arange(len(places)), places)
     )
+    (left, right), (bottom, top) = view(truth, None, [lost], [])
     shown = np.vstack([places, [0.0, 0.0]])
     assert np.all((shown > [left, bottom]) & (shown < [right, top]))
     ratio = (top - bottom) / (right - left)
@@ -99,13 +101,16 @@ def test_a_view_shows_every_true_point_with_a_margin_and_stays_readable(points):
 
 def test_a_view_without_truth_shows_the_estimates_that_are_finite():
     path = np.array([[0.0, 0.0, 0.0], [8.0, 4.0, 0.0], [np.nan, 0.0, 0.0]])
-    (left, right), (bottom, top) = view(None, None, None, [path], [])
+    (left, right), (bottom, top) = view(NO_TRUTH, None, [path], [])
     assert left < 0.0 < 8.0 < right < 9.0
     assert bottom < 0.0 < 4.0 < top
 
 
-DRIVE = np.array([[-5.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
-PLACE = (np.array([1]), np.array([[5.0, 0.0]]))
+DRIVEN = Truth(
+    time=np.zeros(2),
+    path=np.array([[-5.0, 0.0, 0.0], [5.0, 0.0, 0.0]]),
+    landmarks=(np.array([1]), np.array([[5.0, 0.0]])),
+)
 
 
 def frame(std: float, *, x: float = 5.0, rows: int = 1) -> np.ndarray:
@@ -116,7 +121,7 @@ def frame(std: float, *, x: float = 5.0, rows: int = 1) -> np.ndarray:
         np.tile(std**2 * np.eye(2), (rows, 1, 1)),
         np.full(rows, 1.0 / rows),
     )
-    return np.array(view((np.zeros(2), DRIVE), PLACE, None, [], [landmarks]))
+    return np.array(view(DRIVEN, None, [], [landmarks]))
 
 
 def test_a_view_grows_until_it_holds_the_ellipse_of_a_placed_landmark():

@@ -36,13 +36,13 @@ def marks(axes, marker: str, size: float) -> int:
 
 @pytest.fixture(scope="module")
 def three(mission):
-    return draw_mission(list(mission.trials.values()), **mission.truth)
+    return draw_mission(list(mission.trials.values()), **mission.scene)
 
 
 @pytest.fixture(scope="module")
 def six(mission, swarms):
     trials = [trial for s in STRATEGIES for trial in (mission.trials[s], swarms[s])]
-    return draw_mission(trials, **mission.truth)
+    return draw_mission(trials, **mission.scene)
 
 
 def test_each_strategy_has_a_map_and_three_rows_of_errors(three):
@@ -76,7 +76,7 @@ def test_every_landmark_is_drawn(three, mission):
 def test_each_estimate_is_tied_to_the_landmark_it_is_of(three, mission):
     rows = mission.trials["passive"].track.landmarks
     ties = next(c for c in maps(three)[2].collections if isinstance(c, LineCollection))
-    true = mission.truth["true_landmarks"][1][rows.landmark[placed(rows)] - 1]
+    true = mission.scene["truth"].landmarks[1][rows.landmark[placed(rows)] - 1]
     assert np.allclose([path.vertices[1] for path in ties.get_paths()], true)
     assert np.allclose([path.vertices[0] for path in ties.get_paths()], rows.mean[placed(rows)])
 
@@ -95,7 +95,7 @@ def test_only_strategies_that_call_have_a_beam(three):
 
 
 def test_error_rows_show_what_evaluation_computes(three, mission):
-    track, path = mission.trials["active"].track, mission.truth["true_path"][1]
+    track, path = mission.trials["active"].track, mission.scene["truth"].path
     _, position, _, consistency = three.axes[:4]
     assert np.array_equal(position.lines[0].get_ydata(), position_error(track.pose.mean, path))
     first = nees(track.pose.mean - path, track.pose.covariance)[:100]
@@ -138,7 +138,7 @@ def test_scales_are_written_left_of_each_row_and_nowhere_else(six):
 
 
 def test_two_filters_of_one_strategy_stand_side_by_side(mission, swarms):
-    left, right = maps(draw_mission([mission.trials["fused"], swarms["fused"]], **mission.truth))
+    left, right = maps(draw_mission([mission.trials["fused"], swarms["fused"]], **mission.scene))
     assert left.get_position().y0 == right.get_position().y0
     assert left.get_position().x1 < right.get_position().x0
 
@@ -161,7 +161,7 @@ def test_a_nees_of_many_digits_is_written_as_a_power(mission):
     trial = mission.trials["active"]
     pose = replace(trial.track.pose, covariance=1e-8 * trial.track.pose.covariance)
     lost = replace(trial, track=replace(trial.track, pose=pose))
-    figure = draw_mission([lost], **mission.truth)
+    figure = draw_mission([lost], **mission.scene)
     figure.canvas.draw()
     labels = [label.get_text() for label in figure.axes[3].get_yticklabels()]
     assert max(len(label.strip("$").replace("10^", "")) for label in labels) <= 4
@@ -173,7 +173,7 @@ def test_a_trial_that_has_gone_to_infinity_is_drawn_and_said_to_have_diverged(mi
     mean[700:], covariance[700:] = np.nan, np.inf
     track = replace(trial.track, pose=Gaussian(mean=mean, covariance=covariance))
     scores = replace(trial.scores, diverged=True, position_rmse_m=float("inf"))
-    figure = draw_mission([replace(trial, track=track, scores=scores)], **mission.truth)
+    figure = draw_mission([replace(trial, track=track, scores=scores)], **mission.scene)
     save_figure(figure, tmp_path, "lost")
     assert words(maps(figure)[0])[2] == "diverged · RMSE inf m"
 
@@ -192,12 +192,12 @@ def test_without_trials_there_is_nothing_to_draw():
 
 def test_the_callers_matplotlib_settings_are_left_alone(mission):
     before = dict(matplotlib.rcParams)
-    draw_mission([mission.trials["active"]], **mission.truth)
+    draw_mission([mission.trials["active"]], **mission.scene)
     assert dict(matplotlib.rcParams) == before
 
 
 def test_a_figure_is_freed_when_it_is_let_go(mission):
-    figure = weakref.ref(draw_mission([mission.trials["active"]], **mission.truth))
+    figure = weakref.ref(draw_mission([mission.trials["active"]], **mission.scene))
     gc.collect()
     assert figure() is None
     assert pyplot.get_fignums() == []

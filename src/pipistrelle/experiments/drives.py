@@ -1,4 +1,7 @@
-"""A drive: what a filter is told of it, simulated or recorded, and the truth to score it by."""
+"""A drive: what a filter is told of it, simulated or recorded, and the truth to score it by.
+
+No filter is handed a `Truth`: a trial takes it from the drive when the estimate is made.
+"""
 
 from dataclasses import dataclass
 
@@ -13,6 +16,28 @@ LabelledPoints = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Truth:
+    """What is known of the truth of a drive, for scoring and drawing alone.
+
+    Attributes
+    ----------
+    time : (k) [s]
+        Times of the track: the start, then the end of each step.
+    path : (k, 3) [m, m, rad] or None
+        True poses; NaN where they are not known.
+    landmarks : labels (n) and positions (n, 2) [m], or None
+    """
+
+    time: Float[np.ndarray, " k"]
+    path: Float[np.ndarray, "k 3"] | None = None
+    landmarks: LabelledPoints | None = None
+
+
+NO_TRUTH = Truth(time=np.empty(0))
+"""Nothing is known of the truth."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Drive:
     """What a filter is told of a drive, simulated or recorded, and the truth to score it by.
 
@@ -24,13 +49,12 @@ class Drive:
         Of the start and of the end of each step.
     controls : (k, 2)
         Of each step.
-    true_path : (k + 1, 3) [m, m, rad] or None
-    true_landmarks : labels (n) and positions (n, 2) [m], or None
+    truth : Truth
+        At the same times; nothing of it, by default.
     """
 
     motion: Motion
     start: Gaussian
     time: Float[np.ndarray, " t"]
     controls: Float[np.ndarray, "t-1 2"]
-    true_path: Float[np.ndarray, "t 3"] | None
-    true_landmarks: LabelledPoints | None
+    truth: Truth = NO_TRUTH

@@ -14,8 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipistrelle.config import InputError
 from pipistrelle.estimation.beliefs import Landmarks
-from pipistrelle.experiments.drives import LabelledPoints
-from pipistrelle.experiments.results.writing import TimedPath
+from pipistrelle.experiments.drives import NO_TRUTH, LabelledPoints, Truth
 from pipistrelle.figures.closeup import Closeup, add_closeups
 from pipistrelle.figures.film import film_writer
 from pipistrelle.figures.maps import (
@@ -62,8 +61,7 @@ def animate_mission(
     snapshots: Mapping[tuple[str, str], Sequence[Snapshot]],
     path: Path,
     *,
-    true_path: TimedPath | None = None,
-    true_landmarks: LabelledPoints | None = None,
+    truth: Truth = NO_TRUTH,
     beacon: Float[np.ndarray, "2"] | None = None,
     beamwidth: float | None = None,
     pictures: int = 125,
@@ -82,8 +80,7 @@ def animate_mission(
         As a `MissionRecorder` keeps them.
     path : Path
         Ends in .gif, or in .mp4, which needs ffmpeg.
-    true_path : times (k) [s] and poses (k, 3) [m, m, rad], optional
-    true_landmarks : labels (n) and positions (n, 2) [m], optional
+    truth : Truth
     beacon : (2) [m], optional
     beamwidth : [rad], optional
     pictures : int, at least 1
@@ -113,8 +110,8 @@ def animate_mission(
         raise ValueError("an animation needs at least one frame")
     with matplotlib.rc_context(STYLE):
         times = _times(snapshots, pictures)
-        start = times[0] if true_path is None else true_path[0][0]
-        figure, panels = _stage(snapshots, true_path, true_landmarks, beacon, beamwidth)
+        start = times[0] if truth.path is None else truth.time[0]
+        figure, panels = _stage(snapshots, truth, beacon, beamwidth)
         try:
             write(_play(figure, panels, times, start), path)
         except OSError as error:
@@ -135,8 +132,7 @@ def _times(
 
 def _stage(
     snapshots: Mapping[tuple[str, str], Sequence[Snapshot]],
-    true_path: TimedPath | None,
-    true_landmarks: LabelledPoints | None,
+    truth: Truth,
     beacon: Float[np.ndarray, "2"] | None,
     beamwidth: float | None,
 ) -> tuple["Figure", list["_Panel"]]:
@@ -145,7 +141,7 @@ def _stage(
 
     paths = [np.array([frame.pose for frame in frames]) for frames in snapshots.values()]
     maps = [frames[-1].landmarks for frames in snapshots.values()]
-    limits = view(true_path, true_landmarks, beacon, paths, maps)
+    limits = view(truth, beacon, paths, maps)
     (left, right), (bottom, top) = limits
     places = cells(list(snapshots))
     rows, columns = (1 + max(indices) for indices in zip(*places, strict=True))
@@ -165,10 +161,10 @@ def _stage(
         axes.tick_params(labelleft=leftmost)
         axes.grid(True)
         axes.set_axisbelow(True)
-        draw_truth(axes, true_landmarks, beacon)
-        panels.append(_Panel(axes, head(axes, strategy, name), frames, strategy, true_path))
+        draw_truth(axes, truth.landmarks, beacon)
+        panels.append(_Panel(axes, head(axes, strategy, name), frames, strategy, truth))
         panels[-1].beamwidth = None if strategy == "passive" else beamwidth
-    _enlarge(panels, true_landmarks)
+    _enlarge(panels, truth.landmarks)
     names = [name for name in SYMBOLS if name != "beacon" or beacon is not None]
     legend(figure, names, 2 * columns, LEFT, RIGHT)
     return figure, panels
@@ -217,9 +213,9 @@ class _Panel:
         line: "Annotation",
         frames: Sequence[Snapshot],
         strategy: str,
-        true_path: TimedPath | None,
+        truth: Truth,
     ) -> None:
-        self.axes, self.line, self.frames, self.true_path = axes, line, frames, true_path
+        self.axes, self.line, self.frames, self.truth = axes, line, frames, truth
         self.times = np.array([frame.scan.time for frame in frames])
         self.path = np.array([frame.pose for frame in frames])
         self.size = axes.get_xlim()[1] - axes.get_xlim()[0]
@@ -280,8 +276,8 @@ class _Panel:
         if self.beamwidth is not None:
             self.beam.set_verts([beam(pose, self.beamwidth, 0.25 * self.size)])
         true = None
-        if self.true_path is not None:
-            true = self.true_path[1][self.true_path[0] <= time + 1e-9]
+        if self.truth.path is not None:
+            true = self.truth.path[self.truth.time <= time + 1e-9]
             self.true.set_data(*true[:, :2].T)
         cloud = self.frames[now].cloud
         if self.closeup and cloud is not None:

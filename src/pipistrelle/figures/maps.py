@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipistrelle.estimation.beliefs import Landmarks
-from pipistrelle.experiments.drives import LabelledPoints
-from pipistrelle.experiments.results.writing import TimedPath
+from pipistrelle.experiments.drives import LabelledPoints, Truth
 from pipistrelle.figures.style import COLUMNS, FILTER_NAMES, INK, TRUTH, strategy_colour
 
 if TYPE_CHECKING:
@@ -168,8 +167,7 @@ def shades(
 
 
 def view(
-    true_path: TimedPath | None,
-    true_landmarks: LabelledPoints | None,
+    truth: Truth,
     beacon: Float[np.ndarray, "2"] | None,
     paths: Sequence[Float[np.ndarray, "_ 3"]],
     maps: Sequence[Landmarks],
@@ -180,8 +178,7 @@ def view(
 
     Parameters
     ----------
-    true_path : times (k) [s] and poses (k, 3) [m, m, rad], or None
-    true_landmarks : labels (n) and positions (n, 2) [m], or None
+    truth : Truth
     beacon : (2) [m], or None
     paths : estimated poses (k, 3) [m, m, rad]
     maps : Landmarks
@@ -194,14 +191,15 @@ def view(
 
     Examples
     --------
+    >>> from pipistrelle.experiments.drives import NO_TRUTH
     >>> path = np.array([[0.0, 9.0, 0.0], [10.0, 0.0, 0.0]])
-    >>> np.round(view(None, None, np.ones(2), [path], []), 9)
+    >>> np.round(view(NO_TRUTH, np.ones(2), [path], []), 9)
     array([[-0.6 , 10.6 ],
            [-0.54,  9.54]])
     """
-    points = paths if true_path is None else [true_path[1]]
+    points = paths if truth.path is None else [truth.path]
     marks = [rows.mean[placed(rows)] for rows in maps]
-    marks = marks if true_landmarks is None else [true_landmarks[1]]
+    marks = marks if truth.landmarks is None else [truth.landmarks[1]]
     marks += [] if beacon is None else [beacon[None]]
     shown = np.concatenate([*(poses[:, :2] for poses in points), *marks])
     shown = shown[np.isfinite(shown).all(axis=1)]

@@ -7,9 +7,8 @@ import numpy as np
 
 from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
 from pipistrelle.evaluation.consistency import anees_bounds, track_nees
-from pipistrelle.experiments.drives import LabelledPoints
+from pipistrelle.experiments.drives import NO_TRUTH, LabelledPoints, Truth
 from pipistrelle.experiments.results.scores import TrialResult
-from pipistrelle.experiments.results.writing import TimedPath
 from pipistrelle.figures.closeup import add_closeups
 from pipistrelle.figures.maps import (
     PLACED,
@@ -53,8 +52,7 @@ SYMBOLS = (
 def draw_mission(
     trials: Sequence[TrialResult],
     *,
-    true_path: TimedPath | None = None,
-    true_landmarks: LabelledPoints | None = None,
+    truth: Truth = NO_TRUTH,
     beacon: np.ndarray | None = None,
     beamwidth: float | None = None,
 ) -> "Figure":
@@ -72,10 +70,9 @@ def draw_mission(
     trials : sequence of TrialResult, at least one
         In the frame of the truth; each strategy and filter once. Several of both make a column
         for each strategy and a row for each filter.
-    true_path : times (k) [s] and poses (k, 3) [m, m, rad], optional
-        At the times of the tracks; without it there are no errors to show.
-    true_landmarks : labels (n) and positions (n, 2) [m], optional
-        The beacon may be one of them.
+    truth : Truth
+        At the times of the tracks; without a path there are no errors to show. The beacon may be
+        one of the landmarks.
     beacon : (2) [m], optional
     beamwidth : [rad], optional
         Of the vehicle's call, for the strategies that use it; without it no beam is drawn.
@@ -106,22 +103,22 @@ def draw_mission(
         raise ValueError("a mission's figure needs at least one trial")
     paths = [trial.track.pose.mean for trial in trials]
     maps = [trial.track.landmarks for trial in trials]
-    limits = view(true_path, true_landmarks, beacon, paths, maps)
+    limits = view(truth, beacon, paths, maps)
     places = cells([(trial.strategy, trial.filter) for trial in trials])
     with matplotlib.rc_context(STYLE):
-        figure, panels = _panels(places, limits, errors=true_path is not None)
+        figure, panels = _panels(places, limits, errors=truth.path is not None)
         for trial, (axes, *rows) in zip(trials, panels, strict=True):
-            draw_truth(axes, true_landmarks, beacon)
-            if true_path is not None:
-                axes.plot(*true_path[1][:, :2].T, color=TRUTH, lw=3.2, alpha=0.45, zorder=2)
-                _draw_errors(rows, trial, true_path[1])
-            _draw_estimate(axes, trial, true_landmarks)
+            draw_truth(axes, truth.landmarks, beacon)
+            if truth.path is not None:
+                axes.plot(*truth.path[:, :2].T, color=TRUTH, lw=3.2, alpha=0.45, zorder=2)
+                _draw_errors(rows, trial, truth.path)
+            _draw_estimate(axes, trial, truth.landmarks)
             _draw_vehicle(axes, trial, beamwidth)
             _title(axes, trial)
-        _draw_clouds([axes for axes, *_ in panels], trials, true_path, true_landmarks)
-        if true_path is not None:
+        _draw_clouds([axes for axes, *_ in panels], trials, truth)
+        if truth.path is not None:
             _scale_errors([rows for _, *rows in panels])
-        given = (true_path, true_landmarks, beacon, beamwidth)
+        given = (truth.path, truth.landmarks, beacon, beamwidth)
         names = [name for name, of in SYMBOLS if of is None or given[of] is not None]
         legend(figure, names, 4 if figure.get_figwidth() > 8.0 else 2, LEFT, RIGHT)
     return figure
@@ -233,21 +230,16 @@ def _draw_vehicle(axes: "Axes", trial: TrialResult, beamwidth: float | None) -> 
     axes.add_patch(Polygon(shape, fc=INK, ec="white", lw=0.8, zorder=8))
 
 
-def _draw_clouds(
-    maps: Sequence["Axes"],
-    trials: Sequence[TrialResult],
-    true_path: TimedPath | None,
-    true_landmarks: LabelledPoints | None,
-) -> None:
+def _draw_clouds(maps: Sequence["Axes"], trials: Sequence[TrialResult], truth: Truth) -> None:
     """Draw the particles at the end, where there are any."""
     tracks = [trial.track for trial in trials]
     clouds = [[] if track.cloud is None else [track.cloud] for track in tracks]
     landmarks, paths = [t.landmarks.mean for t in tracks], [t.pose.mean for t in tracks]
     colours = [strategy_colour(trial.strategy) for trial in trials]
-    closeups = add_closeups(maps, colours, clouds, paths, landmarks, true_landmarks)
+    closeups = add_closeups(maps, colours, clouds, paths, landmarks, truth.landmarks)
     for closeup, cloud, path in zip(closeups, clouds, paths, strict=True):
         if closeup:
-            closeup.show(cloud[0], path, None if true_path is None else true_path[1])
+            closeup.show(cloud[0], path, truth.path)
 
 
 def _title(axes: "Axes", trial: TrialResult) -> None:

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import BaseModel
 
+from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.results.folder import prepare_folder
 from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.results.writing import write_results
-from pipistrelle.experiments.runs.truth_files import Truth
 from pipistrelle.verbs.console import announced, closing_table, say
 from pipistrelle.verbs.options import OutputOptions
 
@@ -82,7 +82,7 @@ def get_ready(options: OutputOptions) -> None:
 def deliver(
     folder: Path,
     trials: Sequence[TrialResult],
-    truth: Truth | None,
+    truth: Truth,
     *,
     config: BaseModel,
     seed: int,
@@ -98,7 +98,7 @@ def deliver(
     ----------
     folder : Path
     trials : sequence of TrialResult, at least one
-    truth : Truth, optional
+    truth : Truth
     config : pydantic model
         All settings.
     seed : int
@@ -119,14 +119,7 @@ def deliver(
     from pipistrelle.figures.mission import draw_mission
     from pipistrelle.figures.style import save_figure
 
-    path = (truth.time, truth.path) if truth is not None and truth.path is not None else None
-    landmarks = None if truth is None else truth.landmarks
-    scene: dict[str, Any] = {
-        "true_path": path,
-        "true_landmarks": landmarks,
-        "beacon": beacon,
-        "beamwidth": beamwidth,
-    }
+    scene: dict[str, Any] = {"truth": truth, "beacon": beacon, "beamwidth": beamwidth}
     figure = draw_mission(trials, **scene)
     write_results(
         folder,
@@ -134,8 +127,7 @@ def deliver(
         command=shlex.join(["pipistrelle", *sys.argv[1:]]),
         seed=seed,
         trials=trials,
-        truth_path=path,
-        true_landmarks=landmarks,
+        truth=truth,
         ignored_rows=ignored_rows or {},
     )
     save_figure(figure, folder, "mission")

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from pipistrelle.detection.logs.recording import Log
     from pipistrelle.detection.scans import Scan
     from pipistrelle.experiments.runs.trial import Mission
-    from pipistrelle.experiments.runs.truth_files import Truth
 
 
 def run(
@@ -47,7 +46,6 @@ def run(
     if save_log is not None:
         _check_vacant(save_log, output)
     from pipistrelle.experiments.runs.trial import run_mission
-    from pipistrelle.experiments.runs.truth_files import Truth
     from pipistrelle.verbs import delivery
     from pipistrelle.verbs.console import progress
 
@@ -56,15 +54,13 @@ def run(
         watch = delivery.recorder(output)
         with progress(output.quiet) as show:
             done = run_mission(config, strategies(strategy), ways, progress=show, watch=watch)
-        drive = done.drive
-        truth = Truth(time=drive.time, path=drive.true_path, landmarks=drive.true_landmarks)
         if save_log is not None:
             heard = {trial.strategy: trial.scans for trial in done.trials}
-            _save_log(save_log, done, heard.get("fused", done.trials[0].scans), truth)
+            _save_log(save_log, done, heard.get("fused", done.trials[0].scans))
         return delivery.deliver(
             folder,
             done.trials,
-            truth,
+            done.drive.truth,
             config=config,
             seed=config.seed,
             options=output,
@@ -92,13 +88,13 @@ def _beamwidth(mission: "Mission") -> float:
     )
 
 
-def _save_log(folder: Path, mission: "Mission", scans: "Sequence[Scan]", truth: "Truth") -> None:
+def _save_log(folder: Path, mission: "Mission", scans: "Sequence[Scan]") -> None:
     """Write what was heard as a log, and the truth beside it."""
     from pipistrelle.detection.logs.folder import write_log
     from pipistrelle.experiments.runs.truth_files import write_truth
 
     write_log(folder, _log(mission, scans))
-    write_truth(folder, truth)
+    write_truth(folder, mission.drive.truth)
 
 
 def _log(mission: "Mission", scans: "Sequence[Scan]") -> "Log":

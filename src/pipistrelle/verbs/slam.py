@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from pipistrelle.config import Config, FastSlamConfig, FilterConfig, InputError, RayConfig, Section
+from pipistrelle.detection.logs.readers import READERS
 from pipistrelle.settings import Given, Key, Layer, from_flags, resolve
 from pipistrelle.verbs.console import progress, say
 from pipistrelle.verbs.options import (
@@ -24,7 +25,7 @@ from pipistrelle.verbs.options import (
 
 if TYPE_CHECKING:
     from pipistrelle.detection.logs.recording import Log
-    from pipistrelle.experiments.runs.truth_files import Truth
+    from pipistrelle.experiments.drives import Truth
 
 GATE = 0.999
 """Share of a measurement's predicted distribution that is accepted of real logs."""
@@ -38,6 +39,12 @@ LOGGED = frozenset(
     }
 )
 """Settings of the filter that a log decides."""
+
+
+_FOLDERS = ", or ".join(reader.help for reader in READERS)
+FOLDERS = f"{_FOLDERS[0].upper()}{_FOLDERS[1:]}."
+ROBOTS = f"Whose log of {', or of '.join(r.robot_help for r in READERS if r.robots)}."
+"""What the help says of the formats of logs."""
 
 
 class SlamConfig(Section):
@@ -61,12 +68,10 @@ else:
 
 
 def slam(
-    log: Annotated[Path, Parameter(help="A log folder, or a UTIAS MRCLAM folder.")],
+    log: Annotated[Path, Parameter(help=FOLDERS)],
     /,
     *,
-    robot: Annotated[
-        Whole | None, Parameter(metavar="N", help="Whose log of a MRCLAM folder, 1 to 5.")
-    ] = None,
+    robot: Annotated[Whole | None, Parameter(metavar="N", help=ROBOTS)] = None,
     strategy: Annotated[
         Chosen,
         Parameter(help="What is kept: all as it is, only what has a range, or only bearings."),
@@ -165,9 +170,9 @@ def _with_log(layer: Layer, recorded: "Log", log: Path) -> Config:
     return settled
 
 
-def _warn_of_partial_truth(truth: "Truth | None", log: Path) -> None:
+def _warn_of_partial_truth(truth: "Truth", log: Path) -> None:
     """Say how much of the path can be scored, where it is not all of it."""
-    if truth is None or truth.path is None:
+    if truth.path is None:
         return
     steps = len(truth.time) - 1
     known = sum(1 for pose in truth.path[1:] if pose[0] == pose[0])

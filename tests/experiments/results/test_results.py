@@ -17,6 +17,7 @@ from pipistrelle.config import Config, InputError, Section
 from pipistrelle.estimation.beliefs import Gaussian, Track
 from pipistrelle.evaluation.accuracy import alignment, moved, position_error, rmse
 from pipistrelle.evaluation.consistency import EKF_LIMIT
+from pipistrelle.experiments.drives import NO_TRUTH, Truth
 from pipistrelle.experiments.results.scores import Scores, TrialResult, score
 from pipistrelle.experiments.results.writing import config_hash, write_results
 from reference.missions import map_with, scan_with
@@ -50,6 +51,7 @@ def loop():
 
 TIME = 1.2e9 + 0.125 * np.arange(STEPS + 1)
 TRUE_LANDMARKS = (np.array([1, 2, 3, 4]), np.array([[1.0, 1], [5, 2], [-4, 3], [0, 9]]))
+TRUTH = Truth(time=TIME, path=loop(), landmarks=TRUE_LANDMARKS)
 SCANS = (
     scan_with([1, 2], [0.1, 0.2], [4.0, np.nan], time=TIME[0]),
     scan_with(time=TIME[4]),
@@ -82,19 +84,18 @@ def trial(track, strategy="fused", name="ekf"):
         filter=name,
         track=track,
         scans=SCANS,
-        scores=score(track, loop(), TRUE_LANDMARKS, SCANS, EKF_LIMIT),
+        scores=score(track, TRUTH, SCANS, EKF_LIMIT),
         wall_s=0.25,
     )
 
 
-def write(folder, *trials, truth=True, **changes):
+def write(folder, *trials, truth=TRUTH, **changes):
     arguments = {
         "config": Config(),
         "command": "pipistrelle run --seed 7",
         "seed": 7,
         "trials": trials,
-        "truth_path": (TIME, loop()) if truth else None,
-        "true_landmarks": TRUE_LANDMARKS if truth else None,
+        "truth": truth,
         "ignored_rows": {},
     }
     write_results(folder, **(arguments | changes))
@@ -110,11 +111,11 @@ def test_the_start_is_not_scored():
     track = drifting_track()
     moved_start = track.pose.mean.copy()
     moved_start[0] += 100.0
-    first = score(track, loop(), TRUE_LANDMARKS, SCANS, EKF_LIMIT)
-    assert score(with_pose(track, moved_start), loop(), TRUE_LANDMARKS, SCANS, EKF_LIMIT) == first
+    first = score(track, TRUTH, SCANS, EKF_LIMIT)
+    assert score(with_pose(track, moved_start), TRUTH, SCANS, EKF_LIMIT) == first
     moved_end = track.pose.mean.copy()
     moved_end[-1] += 100.0
-    assert score(with_pose(track, moved_end), loop(), TRUE_LANDMARKS, SCANS, EKF_LIMIT) != first
+    assert score(with_pose(track, moved_end), TRUTH, SCANS, EKF_LIMIT) != first
 
 
 def test_an_exact_start_is_scored_once_the_covariance_is_positive_definite():
@@ -122,13 +123,13 @@ def test_an_exact_start_is_scored_once_the_covariance_is_positive_definite():
     covariance = track.pose.covariance.copy()
     covariance[:3] = np.diag([0.01, 0.0, 0.01])
     exact = replace(track, pose=replace(track.pose, covariance=covariance))
-    scores = score(exact, loop(), TRUE_LANDMARKS, SCANS, EKF_LIMIT)
+    scores = score(exact, TRUTH, SCANS, EKF_LIMIT)
     error = track.pose.mean[3:] - loop()[3:]
     epsilon = np.sum(error**2, axis=1) / 0.01
     assert (scores.nees_mean, scores.nees_max) == pytest.approx((epsilon.mean(), epsilon.max()))
     assert scores.diverged is bool(epsilon.max() > EKF_LIMIT)
     covariance[50] = covariance[0]
-    later = score(exact, loop(), TRUE_LANDMARKS, SCANS, EKF_LIMIT)
+    later = score(exact, TRUTH, SCANS, EKF_LIMIT)
     assert (later.nees_max, later.diverged) == (np.inf, True)
 
 
@@ -141,8 +142,8 @@ def test_a_rigid_motion_of_everything_estimated_changes_only_the_raw_errors():
         landmarks=replace(track.landmarks, mean=moved(track.landmarks.mean, motion)),
         gated=0,
     )
-    here = score(track, loop(), TRUE_LANDMARKS, SCANS, EKF_LIMIT)
-    there = score(turned, loop(), TRUE_LANDMARKS, SCANS, EKF_LIMIT)
+    here = score(track, TRUTH, SCANS, EKF_LIMIT)
+    there = score(turned, TRUTH, SCANS, EKF_LIMIT)
     assert there.position_rmse_aligned_m == pytest.approx(here.position_rmse_aligned_m, rel=1e-9)
     assert there.map_rmse_aligned_m == pytest.approx(here.map_rmse_aligned_m, rel=1e-9)
     assert there.position_rmse_m > 10 * here.position_rmse_m
@@ -150,7 +151,7 @@ def test_a_rigid_motion_of_everything_estimated_changes_only_the_raw_errors():
 
 
 def test_scores_count_full_and_partial_landmarks_and_measurements_per_frame():
-    scores = score(drifting_track(), loop(), TRUE_LANDMARKS, SCANS, EKF_LIMIT)
+    scores = score(drifting_track(), TRUTH, SCANS, EKF_LIMIT)
     assert (scores.landmarks_full, scores.landmarks_total) == (3, 4)
     assert scores.measurements_per_frame == 1.0
     assert scores.gated == 6
@@ -160,7 +161,7 @@ def test_the_map_error_is_that_of_full_landmarks_with_known_positions():
     track = drifting_track()
     mapped = track.landmarks.mean[[0, 3]]
     true = TRUE_LANDMARKS[1][[1, 2]]
-    scores = score(track, loop(), TRUE_LANDMARKS, SCANS, EKF_LIMIT)
+    scores = score(track, TRUTH, SCANS, EKF_LIMIT)
     assert scores.map_rmse_m == rmse(position_error(mapped, true))
     assert scores.map_rmse_aligned_m == rmse(
         position_error(moved(mapped, alignment(mapped, true)), true)
@@ -168,24 +169,24 @@ def test_the_map_error_is_that_of_full_landmarks_with_known_positions():
 
 
 def test_without_truth_only_the_counts_are_scored():
-    scores = score(drifting_track(), None, None, SCANS, EKF_LIMIT)
+    scores = score(drifting_track(), NO_TRUTH, SCANS, EKF_LIMIT)
     known = [f.name for f in fields(Scores) if getattr(scores, f.name) is not None]
     assert known == ["landmarks_full", "landmarks_total", "measurements_per_frame", "gated"]
 
 
 def test_what_there_is_nothing_of_is_not_scored():
-    empty = score(drifting_track(landmarks=()), loop(), TRUE_LANDMARKS, (), EKF_LIMIT)
+    empty = score(drifting_track(landmarks=()), TRUTH, (), EKF_LIMIT)
     assert empty.map_rmse_m is None
     assert empty.measurements_per_frame is None
     assert empty.landmarks_total == 0
-    single = score(drifting_track(landmarks=(2,)), loop(), TRUE_LANDMARKS, SCANS, EKF_LIMIT)
+    single = score(drifting_track(landmarks=(2,)), TRUTH, SCANS, EKF_LIMIT)
     assert single.map_rmse_m is not None
     assert single.map_rmse_aligned_m is None
 
 
 def test_a_truth_of_another_length_is_refused():
     with pytest.raises(ValueError, match="401 poses, but 400 true ones"):
-        score(drifting_track(), loop()[1:], None, SCANS, EKF_LIMIT)
+        score(drifting_track(), Truth(time=TIME[1:], path=loop()[1:]), SCANS, EKF_LIMIT)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e200])
@@ -200,7 +201,7 @@ def test_a_track_that_is_lost_is_diverged_and_null_in_the_summary(tmp_path, valu
     assert run["position_rmse_m"] is None
     assert run["map_rmse_m"] > 0.0
     if not np.isfinite(value):
-        assert score(with_pose(track, lost), None, None, SCANS, EKF_LIMIT).diverged is True
+        assert score(with_pose(track, lost), NO_TRUTH, SCANS, EKF_LIMIT).diverged is True
 
 
 def test_the_summary_has_the_promised_keys_in_their_order(tmp_path):
@@ -241,7 +242,7 @@ def test_the_folder_holds_exactly_the_promised_files(tmp_path):
 
 
 def test_without_truth_there_is_no_truth_file(tmp_path):
-    write(tmp_path, trial(drifting_track()), truth=False)
+    write(tmp_path, trial(drifting_track()), truth=NO_TRUTH)
     assert not (tmp_path / "truth.tum").exists()
 
 

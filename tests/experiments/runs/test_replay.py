@@ -10,8 +10,10 @@ import pytest
 
 from pipistrelle.config import InputError
 from pipistrelle.detection.logs.folder import read_log, write_log
-from pipistrelle.experiments.runs.replay import hide, is_mrclam, load, motion_of, start_of
-from pipistrelle.experiments.runs.truth_files import Truth, read_truth, write_truth
+from pipistrelle.detection.logs.readers import Reader
+from pipistrelle.experiments.drives import NO_TRUTH
+from pipistrelle.experiments.runs.replay import as_heard_by, load, motion_of, start_of
+from pipistrelle.experiments.runs.truth_files import read_truth, write_truth
 from reference.missions import scan_with
 
 DATA = Path(__file__).parents[2] / "data"
@@ -69,8 +71,10 @@ def test_truth_is_optional_file_by_file(folder):
     (folder / "truth.csv").unlink()
     assert load(folder)[1].path is None
     (folder / "landmarks.csv").unlink()
-    assert load(folder)[1] is None
-    assert load(DATA / "bicycle_log")[1] is None
+    for place in (folder, DATA / "bicycle_log"):
+        log, truth = load(place)
+        assert (truth.path, truth.landmarks) == (None, None)
+        assert truth.time is log.time
 
 
 def test_a_measured_landmark_need_not_be_among_the_true_ones(folder):
@@ -93,7 +97,7 @@ def test_truth_survives_being_written(tmp_path):
 
 
 def test_what_is_not_known_is_not_written(tmp_path):
-    write_truth(tmp_path, Truth(time=np.zeros(1), path=None, landmarks=None))
+    write_truth(tmp_path, NO_TRUTH)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -115,17 +119,7 @@ def test_a_wrong_truth_is_refused(folder, name, text, parts):
     refused(lambda: load(folder), *parts)
 
 
-# Which kind of folder
-
-
-def test_a_folder_is_known_by_its_files(folder, made_up, tmp_path):
-    assert is_mrclam(made_up)
-    assert not is_mrclam(folder)
-    assert not is_mrclam(tmp_path)
-    (made_up / "Barcodes.dat").unlink()
-    assert is_mrclam(made_up)
-    (made_up / "log.toml").touch()
-    assert not is_mrclam(made_up)
+# Whose log
 
 
 def test_a_folder_that_is_not_there_is_refused(tmp_path):
@@ -137,6 +131,43 @@ def test_a_robot_is_named_for_a_mrclam_set_and_only_there(folder):
     refused(lambda: load(MADE_UP), "--robot", "found no robot", "(1)")
     refused(lambda: load(MADE_UP, 4), "--robot", "found robot 4", "(1)")
     refused(lambda: load(folder, 1), "robot 1", "--robot")
+
+
+# A format from elsewhere
+
+
+def test_a_reader_of_ones_own_is_asked_and_finds_files_of_truth_beside_its_log(folder):
+    log, truth = load(folder)
+    (folder / "log.toml").rename(folder / "other.toml")
+    tape = Reader(
+        name="tape",
+        title="a tape",
+        recognises=lambda folder: (folder / "other.toml").exists(),
+        read=lambda _: replace(log, name="from a tape"),
+    )
+    again, beside = load(folder, readers=[tape])
+    assert again.name == "from a tape"
+    np.testing.assert_array_equal(beside.path, truth.path)
+
+
+def test_the_truth_of_ones_own_format_may_say_how_the_log_begins(folder):
+    tape = Reader(
+        name="tape",
+        title="a tape",
+        recognises=lambda folder: True,
+        read=lambda _, robot, at: replace(read_log(folder), initial_pose=at, name=f"{robot}"),
+        robots=lambda folder: ["7"],
+    )
+
+    def with_truth(read, folder, robot):
+        return read(folder, robot, at=(1.0, 2.0, 3.0)), NO_TRUTH
+
+    known = {"readers": [tape], "truths": {"tape": with_truth}}
+    log, truth = load(folder, 7, **known)
+    assert (log.initial_pose, log.name) == ((1.0, 2.0, 3.0), "7")
+    assert truth is NO_TRUTH
+    refused(lambda: load(folder, **known), "found no robot", "(7)")
+    refused(lambda: load(folder / "gone", **known), "a tape or a log folder or a MRCLAM set;")
 
 
 # MRCLAM
@@ -200,7 +231,7 @@ SCAN = scan_with(
     ],
 )
 def test_a_strategy_hears_its_part(strategy, beamwidth, landmark, distance):
-    (heard,) = hide([SCAN], strategy, beamwidth)
+    (heard,) = as_heard_by([SCAN], strategy, beamwidth)
     assert heard.time == 2.0
     assert heard.landmark.tolist() == landmark
     np.testing.assert_array_equal(heard.range, np.array(distance, dtype=float))
@@ -209,17 +240,18 @@ def test_a_strategy_hears_its_part(strategy, beamwidth, landmark, distance):
 
 def test_hiding_changes_no_scan_and_keeps_empty_ones():
     before = SCAN.range.copy()
-    heard = hide([SCAN, SCAN], "active", 1e-9)
+    heard = as_heard_by([SCAN, SCAN], "active", 1e-9)
     np.testing.assert_array_equal(SCAN.range, before)
     assert [scan.landmark.tolist() for scan in heard] == [[1], [1]]
     behind = replace(SCAN, bearing=np.full(5, 3.0))
-    assert [scan.landmark.size for scan in hide([behind], "active", 1.0)] == [0]
+    assert [scan.landmark.size for scan in as_heard_by([behind], "active", 1.0)] == [0]
 
 
 def test_fused_hears_what_active_and_passive_hear_together():
     scans = read_log(DATA / "unicycle_log").scans
     for fused, active, passive in zip(
-        *(hide(scans, strategy, 1.0) for strategy in ("fused", "active", "passive")), strict=True
+        *(as_heard_by(scans, strategy, 1.0) for strategy in ("fused", "active", "passive")),
+        strict=True,
     ):
         assert fused.landmark.tolist() == passive.landmark.tolist()
         known = np.isfinite(fused.range)

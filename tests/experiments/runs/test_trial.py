@@ -118,8 +118,6 @@ def drive(steps, at_rest=False):
         start=Gaussian(mean=np.zeros(3), covariance=np.zeros((3, 3))),
         time=time,
         controls=np.column_stack((np.arange(steps), np.zeros(steps))).astype(float),
-        true_path=None,
-        true_landmarks=None,
     )
 
 
@@ -189,7 +187,7 @@ def test_a_trial_is_scored_against_the_path_and_all_landmarks_the_beacon_last():
     (trial,) = mission.trials
     error = np.hypot(*(trial.track.pose.mean - mission.scenario.path)[1:, :2].T)
     assert trial.scores.position_rmse_m == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-12)
-    labels, places = mission.drive.true_landmarks
+    labels, places = mission.drive.truth.landmarks
     assert labels.tolist() == list(range(1, 52))
     assert places[-1].tolist() == mission.scenario.beacon.tolist()
     assert mission.drive.start.mean.tolist() == mission.scenario.path[0].tolist()

@@ -58,7 +58,7 @@ def test_the_map_is_kept_with_the_distance_of_each_landmark_from_its_place(recor
     rows = 0
     for record, mission in zip(records, alone, strict=True):
         hypotheses = mission.trials[0].track.landmarks
-        places = dict(zip(*mission.drive.true_landmarks, strict=True))
+        places = dict(zip(*mission.drive.truth.landmarks, strict=True))
         assert set(record.landmark) == set(hypotheses.landmark)
         kept = zip(record.landmark, record.full, record.landmark_error, strict=True)
         for label, full, error in kept:

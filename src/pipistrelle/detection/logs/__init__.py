@@ -1,5 +1,6 @@
 """Recorded logs: a drive as files, whatever wrote them.
 
-`folder` reads and writes this project's own folders, `mrclam` reads those of UTIAS MRCLAM, both by
-way of `text_tables`; a `recording` is what either comes to.
+A `recording` is what every format comes to: controls and scans. `text_tables` reads columns of
+numbers, `folder` this project's own folders, `mrclam` those of UTIAS MRCLAM; `readers` finds, of
+all formats, the one of a folder.
 """

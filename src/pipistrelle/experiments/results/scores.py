@@ -18,7 +18,7 @@ from pipistrelle.evaluation.accuracy import (
     scored_landmarks,
 )
 from pipistrelle.evaluation.consistency import diverged, track_nees
-from pipistrelle.experiments.drives import LabelledPoints
+from pipistrelle.experiments.drives import Truth
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,21 +87,14 @@ class TrialResult:
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def score(
-    track: Track,
-    true_path: Float[np.ndarray, "k 3"] | None,
-    true_landmarks: LabelledPoints | None,
-    scans: Sequence[Scan],
-    limit: float,
-) -> Scores:
+def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Scores:
     """Score a track and its map against the truth.
 
     Parameters
     ----------
     track : Track of k poses, the start first
-    true_path : (k, 3) [m, m, rad], optional
-        At the times of the track; NaN where it is not known, which is not scored.
-    true_landmarks : labels (n) and positions (n, 2) [m], optional
+    truth : Truth
+        At the times of the track; what is not known is not scored.
     scans : sequence of Scan
         What the filter was given: one per frame, empty ones included.
     limit : float
@@ -122,36 +115,31 @@ def score(
 
     Examples
     --------
-    >>> from pipistrelle.estimation.beliefs import Gaussian, Landmarks
-    >>> nothing = Landmarks(
-    ...     landmark=np.empty(0, int),
-    ...     mean=np.empty((0, 2)),
-    ...     covariance=np.empty((0, 2, 2)),
-    ...     weight=np.empty(0),
-    ... )
+    >>> from pipistrelle.estimation.beliefs import Gaussian, no_landmarks
     >>> pose = Gaussian(mean=np.zeros((2, 3)), covariance=np.tile(np.eye(3), (2, 1, 1)))
-    >>> still = Track(time=np.arange(2.0), pose=pose, landmarks=nothing, gated=0)
-    >>> scores = score(still, np.array([[0.0, 0, 0], [3, 4, 0]]), None, (), 50.0)
+    >>> still = Track(time=np.arange(2.0), pose=pose, landmarks=no_landmarks(), gated=0)
+    >>> truth = Truth(time=still.time, path=np.array([[0.0, 0, 0], [3, 4, 0]]))
+    >>> scores = score(still, truth, (), 50.0)
     >>> scores.position_rmse_m, scores.nees_max, scores.map_rmse_m
     (5.0, 25.0, None)
     """
-    known = np.full_like(track.pose.mean, np.nan) if true_path is None else true_path
+    known = np.full_like(track.pose.mean, np.nan) if truth.path is None else truth.path
     if len(known) != len(track.pose.mean):
         raise ValueError(f"{len(track.pose.mean)} poses, but {len(known)} true ones")
     rows = np.isfinite(known).all(axis=1) & (np.arange(len(known)) > 0)
-    path, truth = track.pose.mean[rows], known[rows]
-    error = pose_error(path, truth)
+    path, true_path = track.pose.mean[rows], known[rows]
+    error = pose_error(path, true_path)
     epsilon = track_nees(track.pose.mean, track.pose.covariance, known)[1:]
     epsilon = epsilon[~np.isnan(epsilon)]
     estimate = heaviest(track.landmarks)
-    labels, positions = true_landmarks or (np.empty(0, int), np.empty((0, 2)))
+    labels, positions = truth.landmarks or (np.empty(0, int), np.empty((0, 2)))
     mapped, true = scored_landmarks(estimate, labels, positions)
     finite = bool(np.all(np.isfinite(track.pose.mean)))
     return Scores(
-        position_rmse_m=_rmse(position_error(path, truth)),
+        position_rmse_m=_rmse(position_error(path, true_path)),
         heading_rmse_rad=_rmse(error[:, 2]),
         map_rmse_m=_rmse(position_error(mapped, true)),
-        position_rmse_aligned_m=_aligned_rmse(path[:, :2], truth[:, :2]),
+        position_rmse_aligned_m=_aligned_rmse(path[:, :2], true_path[:, :2]),
         map_rmse_aligned_m=_aligned_rmse(mapped, true),
         nees_mean=float(np.mean(epsilon)) if len(epsilon) else None,
         nees_max=float(np.max(epsilon)) if len(epsilon) else None,

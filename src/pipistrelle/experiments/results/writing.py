@@ -12,11 +12,10 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 from pydantic import BaseModel
 
 from pipistrelle import __version__
-from pipistrelle.experiments.drives import LabelledPoints
+from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.results.folder import clear_results, write_file
 from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.results.tables import (
@@ -28,8 +27,6 @@ from pipistrelle.experiments.results.tables import (
 )
 
 FORMAT = 1
-TimedPath = tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k 3"]]
-"""Times [s] and poses [m, m, rad]."""
 README = """\
 # Results
 
@@ -67,8 +64,7 @@ def write_results(
     command: str,
     seed: int,
     trials: Sequence[TrialResult],
-    truth_path: TimedPath | None,
-    true_landmarks: LabelledPoints | None,
+    truth: Truth,
     ignored_rows: dict[str, int],
 ) -> None:
     """Write everything but the figures into a result folder, in place of earlier results.
@@ -84,9 +80,8 @@ def write_results(
     seed : int
     trials : sequence of TrialResult
         Each strategy and filter once.
-    truth_path : times (k) [s] and true poses (k, 3) [m, m, rad], optional
-        At the times of the tracks; NaN where not known, which ``truth.tum`` leaves out.
-    true_landmarks : labels (n) and positions (n, 2) [m], optional
+    truth : Truth
+        At the times of the tracks; ``truth.tum`` leaves out what is not known.
     ignored_rows : dict
         Number of dropped log rows by reason.
 
@@ -99,11 +94,10 @@ def write_results(
     --------
     >>> import tempfile
     >>> from pipistrelle.config import Config
+    >>> from pipistrelle.experiments.drives import NO_TRUTH
     >>> with tempfile.TemporaryDirectory() as name:
-    ...     world = {"truth_path": None, "true_landmarks": None, "ignored_rows": {}}
-    ...     write_results(
-    ...         Path(name), config=Config(), command="pipistrelle", seed=7, trials=(), **world
-    ...     )
+    ...     run = {"command": "pipistrelle", "seed": 7, "trials": (), "ignored_rows": {}}
+    ...     write_results(Path(name), config=Config(), truth=NO_TRUTH, **run)
     ...     sorted(path.name for path in Path(name).iterdir())
     ['README.md', 'config.toml', 'summary.json']
     """
@@ -118,10 +112,10 @@ def write_results(
         name, track = f"{trial.strategy}_{trial.filter}", trial.track
         write_file(folder / f"track_{name}.tum", tum_text(track.time, track.pose.mean))
         write_file(folder / f"map_{name}.csv", map_text(track.landmarks))
-    if truth_path is not None:
-        known = np.isfinite(truth_path[1]).all(axis=1)
-        write_file(folder / "truth.tum", tum_text(truth_path[0][known], truth_path[1][known]))
-    _write_tables(folder, trials, None if truth_path is None else truth_path[1], true_landmarks)
+    if truth.path is not None:
+        known = np.isfinite(truth.path).all(axis=1)
+        write_file(folder / "truth.tum", tum_text(truth.time[known], truth.path[known]))
+    _write_tables(folder, trials, truth)
     summary = {
         "format": FORMAT,
         "version": __version__,
@@ -132,12 +126,7 @@ def write_results(
     write_file(folder / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
 
 
-def _write_tables(
-    folder: Path,
-    trials: Sequence[TrialResult],
-    true_path: Float[np.ndarray, "k 3"] | None,
-    true_landmarks: LabelledPoints | None,
-) -> None:
+def _write_tables(folder: Path, trials: Sequence[TrialResult], truth: Truth) -> None:
     """Write the tables of all trials; those of one strategy share their measurements."""
     import polars as pl
 
@@ -147,9 +136,9 @@ def _write_tables(
     both = [(trial, {"strategy": trial.strategy, "filter": trial.filter}) for trial in trials]
     heard = {trial.strategy: trial.scans for trial in trials}
     tables = {
-        "steps": [named(step_table(t.track, true_path), **names) for t, names in both],
+        "steps": [named(step_table(t.track, truth.path), **names) for t, names in both],
         "landmarks": [
-            named(landmark_table(t.track.landmarks, true_landmarks), **names) for t, names in both
+            named(landmark_table(t.track.landmarks, truth.landmarks), **names) for t, names in both
         ],
         "measurements": [named(measurement_table(s), strategy=name) for name, s in heard.items()],
     }

@@ -1,83 +1,70 @@
 """Recorded logs on trial: the log, the truth beside it, and what a strategy may hear of it."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from pipistrelle.config import Config, Strategy
-from pipistrelle.detection.logs.folder import read_log
-from pipistrelle.detection.logs.mrclam import read_mrclam
+from pipistrelle.detection.logs.readers import READERS, Reader, reader_of
 from pipistrelle.detection.logs.recording import Log
 from pipistrelle.detection.logs.text_tables import refusal
 from pipistrelle.detection.noise import noise_of
 from pipistrelle.detection.scans import Scan, rows_of
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import Motion
-from pipistrelle.experiments.drives import Drive
+from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.runs.trial import Case, Watch, run_trial
-from pipistrelle.experiments.runs.truth_files import (
-    Truth,
-    poses_at,
-    read_landmarks,
-    read_path,
-    read_truth,
-)
+from pipistrelle.experiments.runs.truth_files import TRUTHS, WithTruth, with_files_beside
 
 
-def is_mrclam(folder: Path) -> bool:
-    """Tell whether a folder is a MRCLAM set, by its files; ``log.toml`` makes it a log.
-
-    Examples
-    --------
-    >>> is_mrclam(Path("/nowhere"))
-    False
-    """
-    if (folder / "log.toml").exists():
-        return False
-    return (folder / "Barcodes.dat").exists() or any(folder.glob("Robot*_Odometry.dat"))
-
-
-def load(folder: Path, robot: int | None = None) -> tuple[Log, Truth | None]:
-    """Read a log folder or one robot's log of a MRCLAM set, and the truth where it is given.
-
-    A MRCLAM track starts at the true pose and ends where the truth ends.
+def load(
+    folder: Path,
+    robot: int | None = None,
+    *,
+    readers: Sequence[Reader] = (),
+    truths: Mapping[str, WithTruth] = TRUTHS,
+) -> tuple[Log, Truth]:
+    """Read a recorded log, and what is known of its truth.
 
     Parameters
     ----------
     folder : Path
-    robot : 1 to 5
-        For a MRCLAM set, and only there.
+    robot : int
+        Where the format holds the logs of several, as a MRCLAM set does, and only there.
+    readers : sequence of Reader
+        Of formats that the package does not know; they are asked before its own.
+    truths : mapping of a reader's name to the function that reads its log with the truth
+        Without one, the truth is ``truth.csv`` and ``landmarks.csv`` beside the log.
 
     Returns
     -------
     Log
-    Truth or None
+    Truth
 
     Raises
     ------
     InputError
         With the file and the line or key, what was found, what was expected and the fix.
     """
+    known = (*readers, *READERS)
     if not folder.is_dir():
-        raise refusal(folder, "no such folder", "a log folder or a MRCLAM set", "check the path")
-    if is_mrclam(folder):
-        return _load_mrclam(folder, robot)
-    if robot is not None:
-        found = f"a log of one vehicle, but robot {robot} was asked for"
-        raise refusal(folder, found, "a MRCLAM set", "leave out --robot")
-    log = read_log(folder)
-    return log, read_truth(folder, log.time)
+        titles = " or ".join(reader.title for reader in known)
+        raise refusal(folder, "no such folder", titles, "check the path")
+    reader = reader_of(folder, readers)
+    whose = _whose(reader, folder, robot, known)
+    with_truth = {**TRUTHS, **truths}.get(reader.name, with_files_beside)
+    return with_truth(reader.read, folder, *whose)
 
 
-def hide(
+def as_heard_by(
     scans: Sequence[Scan], strategy: Strategy, beamwidth: float | None = None
 ) -> tuple[Scan, ...]:
-    """Leave what a strategy would have heard of recorded scans.
+    """Leave of recorded scans what a strategy would have heard.
 
     Inside the beam, where the absolute bearing is at most half its width, range and bearing are
     heard actively. Outside it only the bearing is heard, passively. Fused takes both, active what
@@ -99,9 +86,9 @@ def hide(
     --------
     >>> from pipistrelle.detection.scans import make_scan
     >>> scan = make_scan(0.0, np.array([3, 8]), np.array([0.1, 0.4]), range=np.array([2.0, 5.0]))
-    >>> hide([scan], "fused", 0.5)[0].range
+    >>> as_heard_by([scan], "fused", 0.5)[0].range
     array([ 2., nan])
-    >>> hide([scan], "active", 0.5)[0].landmark
+    >>> as_heard_by([scan], "active", 0.5)[0].landmark
     array([3])
     """
     limit = math.inf if beamwidth is None else beamwidth / 2.0
@@ -132,7 +119,7 @@ def start_of(log: Log) -> Gaussian:
 
 def replay(
     log: Log,
-    truth: Truth | None,
+    truth: Truth,
     strategies: Sequence[Strategy],
     filters: Sequence[str],
     beamwidth: float | None,
@@ -146,11 +133,11 @@ def replay(
     Parameters
     ----------
     log : Log
-    truth : Truth or None
+    truth : Truth
     strategies : sequence of "active", "fused", "passive"
-    filters : sequence of "ekf"
+    filters : sequence of "ekf", "fastslam"
     beamwidth : [rad], optional
-        See `hide`.
+        See `as_heard_by`.
     config : Config
         Its sections filter and rays, which must agree with the log.
     progress, watch : callable, optional
@@ -169,31 +156,30 @@ def replay(
         start=start_of(log),
         time=log.time,
         controls=log.controls,
-        true_path=None if truth is None else truth.path,
-        true_landmarks=None if truth is None else truth.landmarks,
+        truth=truth,
     )
     noise, trials = noise_of(config.filter), []
     for strategy in strategies:
-        scans = tuple(map(noise, hide(log.scans, strategy, beamwidth)))
+        scans = tuple(map(noise, as_heard_by(log.scans, strategy, beamwidth)))
         for name in filters:
             case = Case(strategy=strategy, filter=name)
             trials.append(run_trial(case, drive, scans, config, progress=progress, watch=watch))
     return tuple(trials)
 
 
-def _load_mrclam(folder: Path, robot: int | None) -> tuple[Log, Truth]:
-    """Read one robot's log from where the truth begins to where it ends, and the truth."""
-    files = sorted(path.name for path in folder.glob("Robot*_Odometry.dat"))
-    robots = [name.removeprefix("Robot").removesuffix("_Odometry.dat") for name in files]
+def _whose(
+    reader: Reader, folder: Path, robot: int | None, known: Sequence[Reader]
+) -> tuple[int, ...]:
+    """Return the robot for a reader that must be told, and nothing for one that must not."""
+    if reader.robots is None:
+        if robot is None:
+            return ()
+        found = f"a log of one vehicle, but robot {robot} was asked for"
+        expected = " or ".join(other.title for other in known if other.robots is not None)
+        raise refusal(folder, found, expected, "leave out --robot")
+    robots = reader.robots(folder)
     if robot is None or str(robot) not in robots:
         found = "no robot" if robot is None else f"robot {robot}"
         expected = f"one whose odometry is there ({', '.join(robots) or 'none is'})"
         raise refusal(f"{folder}, option --robot", found, expected, "name another")
-    time, path = read_path(folder / f"Robot{robot}_Groundtruth.dat", None)
-    columns = ("subject", "x", "y", "x_std", "y_std")
-    landmarks = read_landmarks(folder / "Landmark_Groundtruth.dat", columns, None)
-    log = read_mrclam(folder, robot, span=(time[0].item(), time[-1].item()))
-    path = poses_at(log.time, time, path)
-    x, y, heading = path[0].tolist()
-    truth = Truth(time=log.time, path=path, landmarks=landmarks)
-    return replace(log, initial_pose=(x, y, heading)), truth
+    return (robot,)

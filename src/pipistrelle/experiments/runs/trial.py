@@ -21,7 +21,7 @@ from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.fastslam.filter import FastSlam
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.evaluation.consistency import EKF_LIMIT, FASTSLAM_LIMIT
-from pipistrelle.experiments.drives import Drive
+from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.experiments.hearing.listening import Progress, listen
 from pipistrelle.experiments.hearing.scenario import Scenario, bicycle, world_of
 from pipistrelle.experiments.machine import check_length, check_memory
@@ -154,8 +154,11 @@ def drive_of(scenario: Scenario, config: Config) -> Drive:
         ),
         time=scenario.time,
         controls=scenario.controls,
-        true_path=scenario.path,
-        true_landmarks=(np.arange(1, len(places) + 1), places),
+        truth=Truth(
+            time=scenario.time,
+            path=scenario.path,
+            landmarks=(np.arange(1, len(places) + 1), places),
+        ),
     )
 
 
@@ -212,7 +215,7 @@ def run_trial(
         filter=name,
         track=track,
         scans=tuple(scans),
-        scores=score(track, drive.true_path, drive.true_landmarks, scans, LIMITS[name]),
+        scores=score(track, drive.truth, scans, LIMITS[name]),
         wall_s=wall_s,
     )
 

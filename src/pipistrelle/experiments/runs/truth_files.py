@@ -1,37 +1,88 @@
-"""The truth beside a recorded log, for scoring alone."""
+"""The truth of a recorded log, for scoring alone: beside it, or as its format has it.
 
-from dataclasses import dataclass
+A format's reader (`pipistrelle.detection.logs.readers`) never sees the truth. Its other half is a
+function here, found by the same name: it is given the reader, and what tells it which log to read,
+and returns the log with its truth. So it may tell the reader what files that hold a log alone do
+not say, when a drive began and where.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
+from pipistrelle.detection.logs.recording import Log
 from pipistrelle.detection.logs.text_tables import check_unique, read_table, refusal, write_table
-from pipistrelle.experiments.drives import LabelledPoints
+from pipistrelle.experiments.drives import LabelledPoints, Truth
 
 _PATH = ("time", "x", "y", "heading")
 
+Read = Callable[..., Log]
+"""Reads a log of a folder, and of the robot where there are several."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Truth:
-    """What is known of the truth of a recorded log, for scoring alone.
 
-    Attributes
+def with_files_beside(read: Read, folder: Path, *robot: int) -> tuple[Log, Truth]:
+    """Read a log, and ``truth.csv`` and ``landmarks.csv`` of its folder.
+
+    Parameters
     ----------
-    time : (k) [s]
-        Times of the track: the start, then the end of each step.
-    path : (k, 3) [m, m, rad] or None
-        True poses, linear between the recorded ones, the heading unwrapped; NaN before the first
-        and after the last of them.
-    landmarks : labels (n) and positions (n, 2) [m], or None
+    read : callable
+    folder : Path
+    robot : int, where the folder holds several
+
+    Returns
+    -------
+    Log
+    Truth
+
+    Raises
+    ------
+    InputError
+        As `read_truth`, and what the reader refuses.
     """
-
-    time: Float[np.ndarray, " k"]
-    path: Float[np.ndarray, "k 3"] | None
-    landmarks: LabelledPoints | None
+    log = read(folder, *robot)
+    return log, read_truth(folder, log.time)
 
 
-def read_truth(folder: Path, time: Float[np.ndarray, " k"]) -> Truth | None:
+def with_mrclam_truth(read: Read, folder: Path, robot: int) -> tuple[Log, Truth]:
+    """Read one robot's log from where the truth begins to where it ends, and the truth.
+
+    Parameters
+    ----------
+    read : callable
+        Takes ``span``, too.
+    folder : Path
+    robot : 1 to 5
+
+    Returns
+    -------
+    Log
+        It starts at the true pose.
+    Truth
+
+    Raises
+    ------
+    InputError
+        With the file and the line.
+    """
+    time, path = read_path(folder / f"Robot{robot}_Groundtruth.dat", None)
+    columns = ("subject", "x", "y", "x_std", "y_std")
+    landmarks = read_landmarks(folder / "Landmark_Groundtruth.dat", columns, None)
+    log = read(folder, robot, span=(time[0].item(), time[-1].item()))
+    path = poses_at(log.time, time, path)
+    x, y, heading = path[0].tolist()
+    truth = Truth(time=log.time, path=path, landmarks=landmarks)
+    return replace(log, initial_pose=(x, y, heading)), truth
+
+
+WithTruth = Callable[..., tuple[Log, Truth]]
+TRUTHS: Mapping[str, WithTruth] = {"mrclam": with_mrclam_truth}
+"""By the reader's name; of all other formats the truth lies in files beside the log."""
+
+
+def read_truth(folder: Path, time: Float[np.ndarray, " k"]) -> Truth:
     """Read ``truth.csv`` and ``landmarks.csv`` of a log folder, where they are.
 
     Parameters
@@ -42,7 +93,9 @@ def read_truth(folder: Path, time: Float[np.ndarray, " k"]) -> Truth | None:
 
     Returns
     -------
-    Truth, or None without either file
+    Truth
+        Its path is linear between the recorded poses, the heading unwrapped, and NaN before the
+        first and after the last of them; None of what has no file.
 
     Raises
     ------
@@ -58,8 +111,6 @@ def read_truth(folder: Path, time: Float[np.ndarray, " k"]) -> Truth | None:
             raise refusal(path_file, "none", expected, "use the log's clock or remove the file")
     if landmark_file.exists():
         landmarks = read_landmarks(landmark_file, ("landmark", "x", "y"), ",")
-    if path is None and landmarks is None:
-        return None
     return Truth(time=time, path=path, landmarks=landmarks)
 
 
@@ -77,7 +128,7 @@ def write_truth(folder: Path, truth: Truth) -> None:
     --------
     >>> from tempfile import TemporaryDirectory
     >>> posts = (np.array([4]), np.array([[1.0, -2.5]]))
-    >>> truth = Truth(time=np.array([0.0]), path=np.array([[0.0, 1.0, 0.5]]), landmarks=posts)
+    >>> truth = Truth(time=np.array([0.0]), landmarks=posts)
     >>> with TemporaryDirectory() as place:
     ...     write_truth(Path(place), truth)
     ...     print((Path(place) / "landmarks.csv").read_text())

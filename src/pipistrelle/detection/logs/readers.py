@@ -1,0 +1,114 @@
+"""The formats of recorded logs: one entry each, found by what a folder holds.
+
+To add one, write what reads it in a file of its own beside this one, and give it an entry here. An
+entry's reader is imported when a log is read: the command line names the formats at once. The
+truth of a log is none of this room's business; whoever may see it finds it by the entry's name.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pipistrelle.detection.logs.recording import Log
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reader:
+    """What the rest of the package knows of a format.
+
+    Attributes
+    ----------
+    name : str
+    title : str
+        As refusals have it.
+    recognises : function of a folder
+        Tells by its files whether it holds such a log.
+    read : function of a folder and, where it may hold several robots' logs, the robot
+        Returns a `Log`.
+    robots : function of a folder, optional
+        Names the robots whose logs it holds; without it there is one, and it needs no name.
+    help, robot_help : str
+        What the command line says of the folder, and of whom ``--robot`` chooses from.
+    """
+
+    name: str
+    title: str
+    recognises: Callable[[Path], bool]
+    read: "Callable[..., Log]"
+    robots: Callable[[Path], list[str]] | None = None
+    help: str = ""
+    robot_help: str = ""
+
+
+def reader_of(folder: Path, readers: Sequence[Reader] = ()) -> Reader:
+    """Find the reader of a folder: the first that recognises it.
+
+    Parameters
+    ----------
+    folder : Path
+    readers : sequence of Reader
+        Asked before the package's own.
+
+    Returns
+    -------
+    Reader
+        Of a folder that none recognises that of the package's log folders, who will say what is
+        missing.
+
+    Examples
+    --------
+    >>> reader_of(Path("/nowhere")).name
+    'folder'
+    >>> tape = Reader(name="tape", title="a tape", recognises=lambda folder: True, read=print)
+    >>> reader_of(Path("/nowhere"), [tape]).name
+    'tape'
+    """
+    known = (*readers, *READERS)
+    return next((reader for reader in known if reader.recognises(folder)), LOG_FOLDER)
+
+
+def _read_log_folder(folder: Path) -> "Log":
+    """Read a log folder."""
+    from pipistrelle.detection.logs.folder import read_log
+
+    return read_log(folder)
+
+
+def _is_mrclam(folder: Path) -> bool:
+    """Tell a MRCLAM set by its barcodes, or by anybody's odometry."""
+    return (folder / "Barcodes.dat").exists() or any(folder.glob("Robot*_Odometry.dat"))
+
+
+def _mrclam_robots(folder: Path) -> list[str]:
+    """Name the robots whose odometry is there."""
+    files = sorted(path.name for path in folder.glob("Robot*_Odometry.dat"))
+    return [name.removeprefix("Robot").removesuffix("_Odometry.dat") for name in files]
+
+
+def _read_mrclam(folder: Path, robot: int, **framed: Any) -> "Log":
+    """Read one robot's log of a MRCLAM set."""
+    from pipistrelle.detection.logs.mrclam import read_mrclam
+
+    return read_mrclam(folder, robot, **framed)
+
+
+LOG_FOLDER = Reader(
+    name="folder",
+    title="a log folder",
+    help="a log folder",
+    recognises=lambda folder: (folder / "log.toml").exists(),
+    read=_read_log_folder,
+)
+MRCLAM = Reader(
+    name="mrclam",
+    title="a MRCLAM set",
+    help="a UTIAS MRCLAM folder",
+    robot_help="a MRCLAM folder, 1 to 5",
+    recognises=_is_mrclam,
+    read=_read_mrclam,
+    robots=_mrclam_robots,
+)
+READERS = (LOG_FOLDER, MRCLAM)
+"""All formats, in the order in which they are asked."""
