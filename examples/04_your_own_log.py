@@ -45,9 +45,7 @@ for k in range(5, 601, 5):
     seen = np.abs(bearing) < np.radians(60.0)
     distance, bearing = distance + rng.normal(0.0, 0.1, 6), bearing + rng.normal(0.0, 0.03, 6)
     distance = np.where(distance < 4.0, distance, np.nan)
-    scans.append(
-        make_scan(time[k], labels[seen], bearing[seen], range=distance[seen])
-    )
+    scans.append(make_scan(time[k], labels[seen], bearing[seen], range=distance[seen]))
 
 # %%
 # Written as a log, it is a folder of plain text files. The truth lies beside it, for scoring: no

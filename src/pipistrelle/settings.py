@@ -12,16 +12,16 @@ in the environment and ``--rays.power`` as a flag.
 
 import json
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from difflib import get_close_matches
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
 from pipistrelle.config import Config, InputError, Section
+from pipistrelle.refusals import expectation, meant, values_expected
 
 PREFIX = "PIPISTRELLE_"
 NOT_SETTINGS = frozenset({"PIPISTRELLE_DATA"})
@@ -89,13 +89,7 @@ def from_file(path: Path) -> Layer:
     ...     from_file(file)["rays", "power"].value
     3.0
     """
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not TOML: {error}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not TOML: byte {error.start} is not UTF-8 text") from error
-    return _layer(_leaves(values), ".".join, f"{path}: ")
+    return _layer(leaves(read_toml(path), known_settings()), ".".join, f"{path}: ")
 
 
 def from_environment(environment: Mapping[str, str]) -> Layer:
@@ -121,12 +115,12 @@ def from_environment(environment: Mapping[str, str]) -> Layer:
     >>> layer["rays", "range_bounds"].value
     [1, 15]
     """
-    leaves = (
+    given = (
         (tuple(name.removeprefix(PREFIX).lower().split("__")), _from_text(environment[name]))
         for name in sorted(environment)
         if name.startswith(PREFIX) and name not in NOT_SETTINGS
     )
-    return _layer(leaves, lambda key: PREFIX + "__".join(key).upper())
+    return _layer(given, lambda key: PREFIX + "__".join(key).upper())
 
 
 def from_flags(values: Mapping[str, Any]) -> Layer:
@@ -146,7 +140,8 @@ def from_flags(values: Mapping[str, Any]) -> Layer:
     >>> from_flags({"air": {"relative_humidity": 0.3}})
     {('air', 'relative_humidity'): Given(value=0.3, where='--air.relative-humidity')}
     """
-    return _layer(_leaves(values), lambda key: "--" + ".".join(key).replace("_", "-"))
+    given = leaves(values, known_settings())
+    return _layer(given, lambda key: "--" + ".".join(key).replace("_", "-"))
 
 
 def resolve(layer: Layer) -> Config:
@@ -219,12 +214,68 @@ def to_toml(config: Config) -> str:
     return "\n".join(lines) + "\n"
 
 
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file, or refuse it.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    dict
+
+    Raises
+    ------
+    InputError
+        Not TOML.
+    OSError
+        The file cannot be read.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not TOML: {error}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not TOML: byte {error.start} is not UTF-8 text") from error
+
+
+def leaves(
+    values: Mapping[str, Any], whole: Container[Key] = (), above: Key = ()
+) -> Iterator[tuple[Key, Any]]:
+    """Walk through nested tables, down to what is no table, or an empty one.
+
+    Parameters
+    ----------
+    values : mapping
+    whole : container of keys
+        Values of these are taken as they are.
+    above : key
+        Of the table itself.
+
+    Yields
+    ------
+    key, value
+
+    Examples
+    --------
+    >>> list(leaves({"seed": 3, "air": {"pressure_kpa": 90.0}, "rays": {}}))
+    [(('seed',), 3), (('air', 'pressure_kpa'), 90.0), (('rays',), {})]
+    """
+    for name, value in values.items():
+        key = (*above, name)
+        if isinstance(value, Mapping) and value and key not in whole:
+            yield from leaves(value, whole, key)
+        else:
+            yield key, value
+
+
 def _layer(
-    leaves: Iterable[tuple[Key, Any]], spell: Callable[[Key], str], prefix: str = ""
+    given: Iterable[tuple[Key, Any]], spell: Callable[[Key], str], prefix: str = ""
 ) -> Layer:
     """Say of each value where it was given; refuse what is no setting."""
     layer = {}
-    for key, value in leaves:
+    for key, value in given:
         where = prefix + spell(key)
         if key in known_settings():
             layer[key] = Given(value, where)
@@ -232,28 +283,11 @@ def _layer(
             if value != {}:
                 raise InputError(f"{where}: found {value!r}, expected a section of settings")
         else:
-            meant = _nearest(key)
-            hint = f"did you mean {spell(meant)}?" if meant else "see `pipistrelle config show`"
-            raise InputError(f"{where}: no such setting; {hint}")
+            names = {".".join(known): known for known in known_settings()}
+            near = meant(".".join(key), names)
+            fix = f"did you mean {spell(names[near])}?" if near else "see `pipistrelle config show`"
+            raise InputError(f"{where}: no such setting; {fix}")
     return layer
-
-
-def _leaves(values: Mapping[str, Any], above: Key = ()) -> Iterator[tuple[Key, Any]]:
-    """Walk a nested mapping down to what is no mapping, or an empty one."""
-    for name, value in values.items():
-        key = (*above, name)
-        if isinstance(value, Mapping) and value and key not in known_settings():
-            yield from _leaves(value, key)
-        else:
-            yield key, value
-
-
-def _nearest(key: Key) -> Key | None:
-    """Find the setting that was probably meant."""
-    names = {".".join(known): known for known in known_settings()}
-    close = get_close_matches(".".join(key), names, n=1)
-    close += [name for name, known in names.items() if known[-1] == key[-1]]
-    return names[close[0]] if close else None
 
 
 def _from_text(text: str) -> Any:
@@ -273,15 +307,14 @@ def _from_text(text: str) -> Any:
 def _problem(error: Any, layer: Layer) -> str:
     """Say where a refused value stands, what was found and what was expected."""
     key = tuple(part for part in error["loc"] if isinstance(part, str))
-    message = error["msg"].removeprefix("Value error, ")
+    expected = expectation(error)
     if key not in layer:  # a rule between settings: its message holds what was found
         within = {known: given.where for known, given in layer.items() if known[: len(key)] == key}
-        named = [where for known, where in within.items() if known[-1] in message]
-        return f"{', '.join(named or within.values())}: {message}"
+        named = [where for known, where in within.items() if known[-1] in expected]
+        return f"{', '.join(named or within.values())}: {expected}"
     value, where = layer[key]
-    expected = message.removeprefix("Input should be ")
-    if error["type"] in ("missing", "too_long"):
-        expected = f"{len(get_args(known_settings()[key].annotation))} values"
+    if (count := values_expected(error, known_settings()[key])) is not None:
+        expected = f"{count} values"
     elif key != error["loc"]:
         expected += f" as value {error['loc'][-1] + 1}"
     return f"{where}: found {value!r}, expected {expected}"

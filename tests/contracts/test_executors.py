@@ -28,6 +28,7 @@ from reference.studies import assert_same, fatal, leftovers, lost, plan_of, resu
 UNTIL_KILLED = """\
 import os, signal, sys
 from pathlib import Path
+from pipistrelle.experiments.results import folder
 from pipistrelle.experiments.studies import store
 from pipistrelle.experiments.studies.plan_file import read_plan
 from pipistrelle.experiments.studies.study import run_study
@@ -44,9 +45,10 @@ def mortal(act, before):
         act(path, what)
     return once
 
-write = store._write
-store._write = mortal(write, lambda path, data: write(path, data[: len(data) // 2]))
-store._rename = mortal(store._rename, lambda partial, path: None)
+write = folder.write_down
+for place in (folder, store):
+    place.write_down = mortal(write, lambda path, data: write(path, data[: len(data) // 2]))
+    place.put_in_place = mortal(place.put_in_place, lambda partial, path: None)
 if __name__ == "__main__":
     run_study(read_plan(Path(sys.argv[1])), Path(sys.argv[2]))
 """

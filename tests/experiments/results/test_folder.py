@@ -8,7 +8,13 @@ from pathlib import Path
 import pytest
 
 from pipistrelle.config import InputError
-from pipistrelle.experiments.results.folder import clear_results, prepare_folder, write_file
+from pipistrelle.experiments.results.folder import (
+    clear_results,
+    prepare_folder,
+    put_in_place,
+    write_file,
+    write_whole,
+)
 
 OURS = json.dumps({"format": 1, "config_hash": "0" * 16, "runs": []})
 
@@ -136,3 +142,26 @@ def test_a_full_disk_keeps_the_old_file_and_says_which(tmp_path, monkeypatch):
         write_file(path, "second")
     assert path.read_text() == "first"
     assert names(tmp_path) == ["one.txt"]
+
+
+def test_whatever_stops_the_writing_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
+    path = tmp_path / "one.txt"
+    write_whole(path, b"first")
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", stop)
+    with pytest.raises(KeyboardInterrupt):
+        write_whole(path, b"second", writer=".7")
+    assert path.read_bytes() == b"first"
+    assert names(tmp_path) == ["one.txt"]
+
+
+def test_who_was_overtaken_is_content_and_who_lost_a_file_is_not(tmp_path):
+    path, partial = tmp_path / "one.txt", tmp_path / "one.txt.partial"
+    with pytest.raises(FileNotFoundError):
+        put_in_place(partial, path)
+    path.write_text("by another")
+    put_in_place(partial, path)
+    assert path.read_text() == "by another"

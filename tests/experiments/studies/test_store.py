@@ -111,8 +111,10 @@ def test_a_world_is_done_when_its_trials_are_there(folder, plan, records):
 
 def test_the_trials_go_last(folder, plan, records, monkeypatch):
     order = []
-    rename = store._rename
-    monkeypatch.setattr(store, "_rename", lambda a, b: (order.append(b.parent.name), rename(a, b)))
+    rename = store.put_in_place
+    monkeypatch.setattr(
+        store, "put_in_place", lambda a, b: (order.append(b.parent.name), rename(a, b))
+    )
     write_world(folder, plan, 0, records)
     assert order == ["steps", "landmarks", "trials"]
 
@@ -148,7 +150,7 @@ def test_a_rename_that_fails_leaves_no_half_a_world_that_counts(
             raise OSError(5, "Input/output error", str(path))
         partial.replace(path)
 
-    monkeypatch.setattr(store, "_rename", failing)
+    monkeypatch.setattr(store, "put_in_place", failing)
     with pytest.raises(InputError, match="Input/output error"):
         write_world(folder, plan, 0, records)
     assert done_worlds(folder) == set()
@@ -195,15 +197,15 @@ def test_what_a_killed_writer_left_is_no_result_and_goes_when_its_world_is_done(
 
 
 def test_a_writer_that_was_overtaken_is_content(folder, plan, records, monkeypatch):
-    write = store._write
+    write = store.write_down
 
     def overtaken(path, data):
         write(path, data)
         if path.parent.name == "trials" and len(leftovers(folder)) == 3:
-            monkeypatch.setattr(store, "_write", write)
+            monkeypatch.setattr(store, "write_down", write)
             write_world(folder, plan, 0, records)  # which sweeps ours away
 
-    monkeypatch.setattr(store, "_write", overtaken)
+    monkeypatch.setattr(store, "write_down", overtaken)
     write_world(folder, plan, 0, records)
     assert done_worlds(folder) == {0}
     assert leftovers(folder) == []

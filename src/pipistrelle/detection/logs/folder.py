@@ -4,22 +4,17 @@ Whatever is wrong with a file is refused by line or key. `recording` says how ro
 measurements scans.
 """
 
-import difflib
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field, ValidationError, field_validator
 
 from pipistrelle.config import InputError, NonNegative, Positive, Probability, Section
 from pipistrelle.detection.logs.recording import MEASUREMENT, Log, assemble
-from pipistrelle.detection.logs.text_tables import (
-    read_table,
-    read_text,
-    refusal,
-    write_table,
-)
+from pipistrelle.detection.logs.text_tables import read_table, read_text, write_table
+from pipistrelle.refusals import expectation, meant, refusal, values_expected
 
 _Triple = Annotated[tuple[float, float, float], Field(strict=False)]
 _Triple_std = Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(strict=False)]
@@ -200,19 +195,19 @@ def _read_settings(path: Path) -> _Settings:
 
 
 def _key_refusal(path: Path, fault: Any, model: type[_Settings]) -> InputError:
-    known, (name, *place) = list(model.model_fields), fault["loc"]
-    if fault["type"] == "too_long" or (fault["type"] == "missing" and place):
-        count, expected = len(fault["input"]), len(get_args(model.model_fields[name].annotation))
-        return refusal(f"{path}, key {name!r}", f"{count} values", f"{expected}", "mend the list")
+    known, name = model.model_fields, fault["loc"][0]
+    if name in known and (count := values_expected(fault, known[name])) is not None:
+        found = f"{len(fault['input'])} values"
+        return refusal(f"{path}, key {name!r}", found, f"{count}", "mend the list")
     key = "".join(f"[{p}]" if isinstance(p, int) else str(p) for p in fault["loc"])
     if fault["type"] == "missing":
         return refusal(path, f"no key {key!r}", f"the keys {', '.join(known)}", f"add {key!r}")
     if fault["type"] == "extra_forbidden":
-        near = difflib.get_close_matches(key, known, 1)
-        fix = f"did you mean {near[0]!r}?" if near else "remove it"
+        near = meant(key, known)
+        fix = f"did you mean {near!r}?" if near else "remove it"
         return refusal(path, f"the unknown key {key!r}", f"one of {', '.join(known)}", fix)
-    expected = fault["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
-    return refusal(f"{path}, key {key!r}", repr(fault["input"]), expected, "correct the value")
+    found = repr(fault["input"])
+    return refusal(f"{path}, key {key!r}", found, expectation(fault), "correct the value")
 
 
 def _measurement_columns(log: Log) -> tuple[np.ndarray, ...]:

@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Int
 
 from pipistrelle.detection.logs.recording import Log, assemble
-from pipistrelle.detection.logs.text_tables import Table, check_unique, read_table, refusal
+from pipistrelle.detection.logs.text_tables import Table, check_unique, read_table
+from pipistrelle.refusals import refusal
 
 ROBOTS = range(1, 6)
 LANDMARKS = range(6, 21)

@@ -15,9 +15,10 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.detection.logs.text_tables import Table, check_unique, refusal
+from pipistrelle.detection.logs.text_tables import Table, check_unique
 from pipistrelle.detection.scans import Scan, make_scan
 from pipistrelle.geometry import wrap
+from pipistrelle.refusals import refusal
 
 MEASUREMENT = ("time", "landmark", "bearing", "range")
 """What is said of a measurement: when it was made, and the columns of its scan."""

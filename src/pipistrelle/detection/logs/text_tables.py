@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.config import InputError
+from pipistrelle.refusals import refusal
 
 _LABELS = ("landmark", "subject", "barcode")
 
@@ -146,11 +146,6 @@ def check_unique(table: Table, *names: str) -> None:
         where = f"{table.path}, line {table.line[later]}"
         expected = f"it once, as in line {table.line[earlier]}"
         raise refusal(where, f"{', '.join(values)} again", expected, "remove one of the rows")
-
-
-def refusal(where: object, found: str, expected: str, fix: str) -> InputError:
-    """Return the error that says where it is, what was found, what was expected and the fix."""
-    return InputError(f"{where}: found {found}, expected {expected}; {fix}")
 
 
 def read_text(path: Path) -> str:

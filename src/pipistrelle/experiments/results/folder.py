@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 from datetime import datetime
 from itertools import count
 from pathlib import Path
@@ -162,15 +163,61 @@ def write_file(path: Path, content: str | bytes) -> None:
     ...     [path.name for path in Path(parent).iterdir()]
     ['one.txt']
     """
-    data = content.encode() if isinstance(content, str) else content
-    partial = path.with_name(f"{path.name}.partial")
     try:
-        partial.write_bytes(data)
-        partial.replace(path)
+        write_whole(path, content.encode() if isinstance(content, str) else content)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
         raise InputError(
             f"{path}: could not be written ({error.strerror}); "
             "make room or choose another folder with -o DIR"
         ) from error
+
+
+def write_whole(path: Path, data: bytes, writer: str = "") -> None:
+    """Write a file that is whole or not there, whatever stops the writing.
+
+    Parameters
+    ----------
+    path : Path
+        What stood there is replaced.
+    data : bytes
+    writer : str
+        Tells those apart who may write the same file at the same time.
+
+    Raises
+    ------
+    OSError
+        Where it cannot be written; what stood there is then as it was.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as parent:
+    ...     write_whole(Path(parent) / "one.txt", b"word", writer=".7")
+    ...     [path.name for path in Path(parent).iterdir()]
+    ['one.txt']
+    """
+    partial = path.with_name(f"{path.name}{writer}.partial")
+    try:
+        write_down(partial, data)
+        put_in_place(partial, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+        raise
+
+
+def write_down(path: Path, data: bytes) -> None:
+    """Write a file down to the disk, so that a rename cannot outlive its content."""
+    with path.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def put_in_place(partial: Path, path: Path) -> None:
+    """Rename a file that is whole, unless another process did so, and swept ours away."""
+    try:
+        partial.replace(path)
+    except FileNotFoundError:
+        if not path.exists():
+            raise

@@ -10,7 +10,6 @@ import numpy as np
 from pipistrelle.config import Config, Strategy
 from pipistrelle.detection.logs.readers import READERS, Reader, reader_of
 from pipistrelle.detection.logs.recording import Log
-from pipistrelle.detection.logs.text_tables import refusal
 from pipistrelle.detection.noise import noise_of
 from pipistrelle.detection.scans import Scan, rows_of
 from pipistrelle.estimation.beliefs import Gaussian
@@ -20,6 +19,7 @@ from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.runs.trial import Case, Watch, run_trial
 from pipistrelle.experiments.runs.truth_files import TRUTHS, WithTruth, with_files_beside
+from pipistrelle.refusals import refusal
 
 
 def load(

@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.detection.logs.recording import Log
-from pipistrelle.detection.logs.text_tables import check_unique, read_table, refusal, write_table
+from pipistrelle.detection.logs.text_tables import check_unique, read_table, write_table
 from pipistrelle.experiments.drives import LabelledPoints, Truth
+from pipistrelle.refusals import refusal
 
 _PATH = ("time", "x", "y", "heading")
 

@@ -1,9 +1,7 @@
 """A plan as a file: read, checked, written, compared."""
 
 import json
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from difflib import get_close_matches
 from importlib.resources import files
 from math import prod
 from pathlib import Path
@@ -13,7 +11,17 @@ from pydantic import Field, ValidationError
 
 from pipistrelle.config import STRATEGIES, Config, Count, InputError, Section, Strategy
 from pipistrelle.experiments.studies.plan import MOST_CASES, Filter, Plan, combinations
-from pipistrelle.settings import Given, Key, Layer, from_flags, known_settings, resolve
+from pipistrelle.refusals import expectation, meant
+from pipistrelle.settings import (
+    Given,
+    Key,
+    Layer,
+    from_flags,
+    known_settings,
+    leaves,
+    read_toml,
+    resolve,
+)
 
 FORMAT = 1
 
@@ -87,7 +95,7 @@ def read_plan(path: Path, over: Layer | None = None, iterations: int | None = No
     >>> plan.iterations, len(cases_of(plan))
     (115, 50)
     """
-    over, table = over or {}, _table(path)
+    over, table = over or {}, read_toml(path)
     head = _head(path, table, iterations)
     within = {"config": table.get("config", {}), "grid": table.get("grid", {})}
     for name, settings in within.items():
@@ -165,7 +173,9 @@ def differences(there: Plan, asked: Plan) -> list[str]:
     >>> differences(*plans)
     ['config.seed: 1 there, 2 asked for']
     """
-    old, new = (dict(_flat(_as_table(plan))) for plan in (there, asked))
+    old, new = (
+        {".".join(key): value for key, value in leaves(_as_table(plan))} for plan in (there, asked)
+    )
     return [
         f"{name}: {_worded(old, name)} there, {_worded(new, name)} asked for"
         for name in dict.fromkeys((*old, *new))
@@ -191,16 +201,6 @@ def _as_table(plan: Plan) -> dict[str, Any]:
         "config": resolve(kept).model_dump(mode="json"),
         "grid": {name: list(values) for name, values in plan.grid.items()},
     }
-
-
-def _table(path: Path) -> dict[str, Any]:
-    """Read a TOML file."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not TOML: {error}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not TOML: byte {error.start} is not UTF-8 text") from error
 
 
 def _head(path: Path, table: Mapping[str, Any], iterations: int | None) -> _Head:
@@ -229,7 +229,7 @@ def _problem(path: Path, error: Any) -> str:
     name = ".".join(map(str, error["loc"]))
     if error["type"] == "missing":
         return f"{path}: {name}: missing; see paper.toml in pipistrelle/experiments/studies"
-    expected = error["msg"].removeprefix("Input should be ").removeprefix("Value should ")
+    expected = expectation(error)
     if error["type"] == "string_pattern_mismatch":
         expected = "letters, digits, _ . and -, for it names a folder"
     return f"{path}: {name}: found {error['input']!r}, expected {expected}"
@@ -240,7 +240,8 @@ def _settings(
 ) -> Iterator[tuple[Key, str, Any]]:
     """Walk through a table's settings: key, dotted name and value of each."""
     known = {".".join(key): key for key in known_settings()}
-    for name, value in _flat(settings):
+    for key, value in leaves(settings):
+        name = ".".join(key)
         if name in known:
             yield known[name], name, value
         elif value != {} or not any(other.startswith(f"{name}.") for other in known):
@@ -271,21 +272,11 @@ def _check_distinct(where: str, values: Sequence[Any]) -> None:
             raise InputError(f"{where}: found {value!r} twice, expected each value once")
 
 
-def _flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    """Walk through nested tables: dotted names and values; an empty table is a value."""
-    for name, value in table.items():
-        if isinstance(value, Mapping) and value:
-            yield from _flat(value, f"{above}{name}.")
-        else:
-            yield above + name, value
-
-
 def _meant(name: str, known: Iterable[str]) -> str:
     """Suggest the name that was probably meant."""
     known = list(known)
-    close = get_close_matches(name, known, n=1)
-    close += [other for other in known if other.split(".")[-1] == name.split(".")[-1]]
-    return f"did you mean {close[0]}?" if close else f"expected one of {_some(known)}"
+    near = meant(name, known)
+    return f"did you mean {near}?" if near else f"expected one of {_some(known)}"
 
 
 def _some(names: Sequence[str]) -> str:

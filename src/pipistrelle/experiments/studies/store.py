@@ -7,7 +7,6 @@ study can be killed anywhere, continued, and written to by many processes at onc
 
 import contextlib
 import io
-import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -18,6 +17,7 @@ from uuid import uuid4
 
 from pipistrelle import __version__
 from pipistrelle.config import InputError
+from pipistrelle.experiments.results.folder import put_in_place, write_down, write_whole
 from pipistrelle.experiments.studies.plan import Plan
 from pipistrelle.experiments.studies.plan_file import differences, plan_text, read_plan
 from pipistrelle.experiments.studies.world import TrialRecord, world_schemas, world_tables
@@ -211,9 +211,9 @@ def write_world(folder: Path, plan: Plan, iteration: int, records: Sequence[Tria
         for path in paths:
             buffer = io.BytesIO()
             tables[path.parent.name].write_parquet(buffer)
-            _write(path.with_name(path.name + partial), buffer.getvalue())
+            write_down(path.with_name(path.name + partial), buffer.getvalue())
         for path in paths:
-            _rename(path.with_name(path.name + partial), path)
+            put_in_place(path.with_name(path.name + partial), path)
     except OSError as error:
         raise _unusable(folder, error) from error
     finally:
@@ -267,30 +267,8 @@ def load_study(folder: Path) -> StoredStudy:
 
 
 def _put(path: Path, text: str) -> None:
-    """Write a file that is whole or not there."""
-    partial = path.with_name(f"{path.name}.{uuid4().hex[:8]}.partial")
-    try:
-        _write(partial, text.encode())
-        _rename(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-def _write(path: Path, data: bytes) -> None:
-    """Write a file down to the disk, so that a rename cannot outlive its content."""
-    with path.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def _rename(partial: Path, path: Path) -> None:
-    """Put a file in place, unless another process did so, and swept ours away."""
-    try:
-        partial.replace(path)
-    except FileNotFoundError:
-        if not path.exists():
-            raise
+    """Write a file that many processes may write at once."""
+    write_whole(path, text.encode(), writer=f".{uuid4().hex[:8]}")
 
 
 def _unusable(folder: Path, error: OSError) -> InputError:

@@ -1,0 +1,109 @@
+"""What a refusal says: where it is, what was found, what was expected, and the fix.
+
+Settings, plans and logs are all written by hand, and refused in the same words. Most are checked
+by pydantic first; here its faults become words, and a misspelt name the one that was meant.
+"""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+from typing import Any, get_args
+
+from pydantic.fields import FieldInfo
+
+from pipistrelle.config import InputError
+
+_PREFIXES = ("Value error, ", "Input should be ", "Value should ")
+
+
+def refusal(where: object, found: str, expected: str, fix: str) -> InputError:
+    """Return the error that says where it is, what was found, what was expected and the fix.
+
+    Parameters
+    ----------
+    where : object
+        A path, perhaps with a line or a key, as text.
+    found, expected, fix : str
+
+    Returns
+    -------
+    InputError
+
+    Examples
+    --------
+    >>> str(refusal("posts.csv, line 3", "x 'left'", "a finite number", "correct the field"))
+    "posts.csv, line 3: found x 'left', expected a finite number; correct the field"
+    """
+    return InputError(f"{where}: found {found}, expected {expected}; {fix}")
+
+
+def expectation(fault: Any) -> str:
+    """Say what a setting should have been.
+
+    Parameters
+    ----------
+    fault : ErrorDetails
+        One of the errors of pydantic's ValidationError.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> expectation({"msg": "Input should be greater than 0"})
+    'greater than 0'
+    """
+    message = fault["msg"]
+    for prefix in _PREFIXES:
+        message = message.removeprefix(prefix)
+    return message
+
+
+def values_expected(fault: Any, field: FieldInfo) -> int | None:
+    """Count the values that a tuple should have had, where the fault is their number.
+
+    Parameters
+    ----------
+    fault : ErrorDetails
+    field : FieldInfo
+        The setting that was refused.
+
+    Returns
+    -------
+    int or None
+
+    Examples
+    --------
+    >>> from pipistrelle.config import FilterConfig
+    >>> field = FilterConfig.model_fields["initial_pose_std"]
+    >>> values_expected({"type": "missing", "loc": ("filter", "initial_pose_std", 2)}, field)
+    3
+    """
+    few = fault["type"] == "missing" and isinstance(fault["loc"][-1], int)
+    return len(get_args(field.annotation)) if few or fault["type"] == "too_long" else None
+
+
+def meant(name: str, known: Iterable[str]) -> str | None:
+    """Find the name that was probably meant: one spelt alike, or one that ends in the same part.
+
+    Parameters
+    ----------
+    name : str
+        Its parts are parted by dots.
+    known : iterable of str
+
+    Returns
+    -------
+    str or None
+
+    Examples
+    --------
+    >>> meant("ray.powr", ["rays.power", "air.pressure_kpa"])
+    'rays.power'
+    >>> meant("filter.prune", ["rays.prune", "seed"])
+    'rays.prune'
+    """
+    known = list(known)
+    close = get_close_matches(name, known, n=1)
+    close += [other for other in known if other.split(".")[-1] == name.split(".")[-1]]
+    return close[0] if close else None

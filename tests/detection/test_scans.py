@@ -1,0 +1,20 @@
+import numpy as np
+
+from pipistrelle.detection.scans import COLUMNS, OWN, Scan, make_scan, rows_of
+
+
+def test_rows_of_a_scan_keep_all_their_columns_and_the_time():
+    scan = Scan(time=0.5, **{name: np.arange(4) + 10 * i for i, name in enumerate(COLUMNS)})
+    some = rows_of(scan, np.array([True, False, True, False]))
+    assert some.time == 0.5
+    for i, name in enumerate(COLUMNS):
+        assert getattr(some, name).tolist() == [10 * i, 10 * i + 2]
+    assert rows_of(scan, np.zeros(4, dtype=bool)).landmark.size == 0
+
+
+def test_what_is_not_said_of_a_scan_says_nothing():
+    scan = make_scan(0.5, np.array([3, 4]), np.array([0.1, 0.2]), range=2.0)
+    assert scan.range.tolist() == [2.0, 2.0]
+    assert scan.caller.tolist() == [OWN, OWN]
+    for name in set(COLUMNS) - {"landmark", "caller", "bearing", "range"}:
+        assert np.isnan(getattr(scan, name)).all(), name
