@@ -71,7 +71,8 @@ class Track:
     ----------
     time : (k) [s]
     pose : Gaussian of (k, 3) and (k, 3, 3)
-        x, y [m], heading [rad]; at the steps that hold a scan, after its update.
+        x, y [m], heading [rad]; at the steps that hold a scan, after its update. Of a filter that
+        revises its path, all as it believes them at the end.
     landmarks : Landmarks
         The final map.
     gated : int
@@ -80,6 +81,8 @@ class Track:
         The particles' last poses, where the filter has particles.
     full : float or None
         Their weighted mean number of fully initialised landmarks.
+    online : Gaussian of (k, 3) and (k, 3, 3), or None
+        Of a filter that revises its path: each pose as it was believed at its time.
     """
 
     time: Float[np.ndarray, " k"]
@@ -88,6 +91,7 @@ class Track:
     gated: int
     cloud: Float[np.ndarray, "p 3"] | None = None
     full: float | None = None
+    online: Gaussian | None = None
 
 
 @runtime_checkable
@@ -119,6 +123,15 @@ class Swarm(Protocol):
 
     def cloud(self) -> Float[np.ndarray, "p 3"]:
         """Return the particles' poses, (p, 3) [m, m, rad]."""
+        ...
+
+
+@runtime_checkable
+class Trajectory(Protocol):
+    """A belief that may revise its path: what is heard later changes where it was before."""
+
+    def path(self) -> Gaussian:
+        """Return the start and every control step so far, (k + 1, 3) and (k + 1, 3, 3)."""
         ...
 
 
