@@ -90,11 +90,11 @@ def _mapped(landmarks: int) -> dict[str, float]:
     from pipistrelle.config import Config
     from pipistrelle.detection.scans import Scan
     from pipistrelle.estimation.beliefs import Gaussian
+    from pipistrelle.estimation.catalogue import entry
     from pipistrelle.experiments.hearing.scenario import bicycle
-    from pipistrelle.experiments.runs.trial import estimator
 
     rng, label = np.random.default_rng(landmarks), np.arange(landmarks)
-    slam = estimator("ekf", bicycle(Config().motion), Config())
+    slam = entry("ekf").build(Config(), bicycle(Config().motion))
     start = slam.init(Gaussian(mean=np.zeros(3), covariance=np.eye(3)))
     bearing, distance = rng.uniform(-3.0, 3.0, landmarks), rng.uniform(2.0, 20.0, landmarks)
     known = slam.update(start, Scan(time=0.0, landmark=label, bearing=bearing, range=distance), rng)

@@ -1,6 +1,7 @@
 """What the documentation says is there, is there; what it shows, happens."""
 
 import re
+import sys
 from pathlib import Path
 from pkgutil import resolve_name
 from types import ModuleType
@@ -97,14 +98,15 @@ def test_the_guides_array_finds_a_bearing(guide):
 
 def test_the_guides_filter_drives_a_mission(guide):
     from pipistrelle.config import Config, ScenarioConfig
+    from pipistrelle.estimation.catalogue import entry
     from pipistrelle.experiments.hearing.scenario import bicycle, draw_scenario
-    from pipistrelle.experiments.runs.trial import drive_of, estimator, run_filter
+    from pipistrelle.experiments.runs.trial import drive_of, run_filter
 
     config = Config(scenario=ScenarioConfig(steps=40, landmarks=3))
     world = draw_scenario(config, np.random.default_rng(7))
     lost = guide["DeadReckoning"](motion=bicycle(config.motion))
     track = run_filter(lost, drive_of(world, config), (), np.random.default_rng(7))
-    ekf = estimator("ekf", lost.motion, config)
+    ekf = entry("ekf").build(config, lost.motion)
     same = run_filter(ekf, drive_of(world, config), (), np.random.default_rng(7))
     np.testing.assert_allclose(track.pose.mean, same.pose.mean, rtol=0, atol=1e-12)
     np.testing.assert_allclose(track.pose.covariance, same.pose.covariance, rtol=0, atol=1e-12)
@@ -189,6 +191,26 @@ def test_the_guides_reader_refuses_by_the_line(guide, boats_log):
     (boats_log / "sonar.txt").write_text("0.0 4 0.0 1.0\n0.0 4 0.0 x\n")
     with pytest.raises(InputError, match=r"sonar\.txt, line 2: found range 'x'"):
         guide["solve"](boats_log)
+
+
+def test_the_guides_filter_goes_by_its_name(tmp_path, monkeypatch):
+    from pipistrelle.config import Config
+    from pipistrelle.estimation.beliefs import Gaussian
+    from pipistrelle.estimation.catalogue import entry
+    from pipistrelle.experiments.hearing.scenario import bicycle
+
+    texts = [text for text in blocks("python", DOCS / "extending.md") if "Reckoning" in text]
+    (tmp_path / "guided.py").write_text("".join(texts))
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.chdir(tmp_path)
+    config, sure = Config(), Gaussian(mean=np.zeros(3), covariance=np.zeros((3, 3)))
+    spread = []
+    for name in ("DeadReckoning", "WarierReckoning"):
+        slam = entry(f"guided:{name}").build(config, bicycle(config.motion))
+        spread.append(slam.predict(slam.init(sure), np.ones((1, 2)), np.ones(1), None)[1])
+    np.testing.assert_allclose(4.0 * spread[0].covariance, spread[1].covariance, rtol=1e-12)
+    assert entry("guided:WarierReckoning").title == "Dead reckoning, warier"
+    assert entry("guided:WarierReckoning").nees_limit == 50.0
 
 
 @pytest.mark.slow

@@ -11,11 +11,12 @@ import pytest
 from pipistrelle.config import Config, FastSlamConfig
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
+from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.fastslam.filter import FastSlam
 from pipistrelle.estimation.motion import Motion, motion_jacobians, motion_step
 from pipistrelle.experiments.drives import Drive
-from pipistrelle.experiments.runs.trial import estimator, run_filter
+from pipistrelle.experiments.runs.trial import run_filter
 from reference.missions import (
     BICYCLE,
     CIRCLE,
@@ -309,6 +310,6 @@ def is_better(ratios):
 
 @pytest.mark.parametrize("name", ["ekf", "fastslam"])
 def test_filter_beats_dead_reckoning_and_not_with_the_scans_of_another_world(name):
-    slam = estimator(name, BICYCLE, Config(rays=ray_config()))
+    slam = entry(name).build(Config(rays=ray_config()), BICYCLE)
     assert is_better(log_ratios(slam))
     assert not is_better(log_ratios(slam, deceived=True))

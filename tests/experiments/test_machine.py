@@ -22,7 +22,8 @@ GB = 1e9
 
 def test_large_worlds_that_fit_are_let_through(monkeypatch):
     monkeypatch.setattr(machine, "installed", lambda: 4.0 * GB)
-    check_memory(["ekf", "fastslam"], 501, 1000, RayConfig(), passive=True)
+    many = Config(fastslam=FastSlamConfig(particles=1000))
+    check_memory(["ekf", "fastslam"], 501, many, passive=True)
 
 
 @pytest.mark.parametrize(
@@ -34,23 +35,24 @@ def test_large_worlds_that_fit_are_let_through(monkeypatch):
 )
 def test_refusal_says_what_would_be_needed(monkeypatch, way, landmarks, particles, need):
     monkeypatch.setattr(machine, "installed", lambda: 4.0 * GB)
+    config = Config(fastslam=FastSlamConfig(particles=particles))
     with pytest.raises(InputError, match=f"{way}: .* may need {need:.1f} GB .* has 4.0 GB"):
-        check_memory([way], landmarks, particles, RayConfig(), passive=True)
+        check_memory([way], landmarks, config, passive=True)
 
 
 def test_active_landmarks_need_one_member_each(monkeypatch):
     monkeypatch.setattr(machine, "installed", lambda: 4.0 * GB)
-    check_memory(["ekf"], 5_001, 100, RayConfig(), passive=False)
+    check_memory(["ekf"], 5_001, Config(), passive=False)
     with pytest.raises(InputError):
-        check_memory(["ekf"], 5_001, 100, RayConfig(), passive=True)
+        check_memory(["ekf"], 5_001, Config(), passive=True)
 
 
 def test_a_refusal_of_dense_rays_names_their_members(monkeypatch):
     monkeypatch.setattr(machine, "installed", lambda: 4.0 * GB)
     with pytest.raises(InputError, match=r"51 landmarks of \d\d,\d{3} members each may need"):
-        check_memory(["ekf"], 51, 100, RayConfig(density=1.0001), passive=True)
+        check_memory(["ekf"], 51, Config(rays=RayConfig(density=1.0001)), passive=True)
     with pytest.raises(InputError, match="20000 landmarks may need"):
-        check_memory(["ekf"], 20_000, 100, RayConfig(), passive=False)
+        check_memory(["ekf"], 20_000, Config(), passive=False)
 
 
 def test_too_many_steps_are_refused_before_a_path_is_drawn(monkeypatch):

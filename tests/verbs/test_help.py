@@ -9,9 +9,7 @@ import pytest
 
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config
-from pipistrelle.experiments.runs import trial
 from pipistrelle.settings import known_settings
-from pipistrelle.verbs.options import FILTERS
 
 
 def test_help_and_version_load_neither_numpy_nor_pydantic():
@@ -68,7 +66,6 @@ def test_the_defaults_that_the_help_names_are_those_of_the_settings(obey):
 
 @pytest.mark.parametrize("verb", ["run", "slam"])
 def test_the_help_names_the_filters_there_are(obey, verb):
-    assert tuple(trial.LIMITS) == FILTERS
     words = " ".join(re.sub("[│╭╮╰╯─]", " ", obey(verb, "--help")[1]).split())
     assert "[choices: ekf, fastslam, both] [default: ekf]" in words
     assert "sets fastslam.particles" in words

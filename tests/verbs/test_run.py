@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipistrelle.estimation.catalogue import PAPERS
 from pipistrelle.experiments.runs import trial
-from pipistrelle.verbs.options import FILTERS
 from reference.command_line import COMPILING, SHORT, contents, summary, table, track
 
 
@@ -42,7 +42,7 @@ def test_both_filters_are_told_compared_and_drawn_in_100_columns(obey, monkeypat
     monkeypatch.setattr(trial, "run_mission", seeing)
     status, printed, said = obey("run", *SHORT, "--filter", "both", "--particles", "7", "-o", "one")
     assert status == 0
-    names = [(s, f) for s in ("active", "fused", "passive") for f in FILTERS]
+    names = [(s, f) for s in ("active", "fused", "passive") for f in PAPERS]
     lines = [line for line in said.splitlines() if line != COMPILING]
     assert [line[:17].strip() for line in lines] == ["listening", *map(" ".join, names)]
     assert [(run["strategy"], run["filter"]) for run in summary("one")["runs"]] == names
@@ -148,7 +148,7 @@ def test_a_log_is_saved_to_a_folder_of_its_own(obey, refused, undrawn):
     assert "is the result folder" in refused("run", "--save-log", "new", "-o", "./new")
 
 
-@pytest.mark.parametrize("estimator", FILTERS)
+@pytest.mark.parametrize("estimator", PAPERS)
 def test_a_film_is_drawn_as_gif_unless_said_otherwise(obey, estimator):
     words = ("--strategy", "passive", "--filter", estimator, "--quiet", "--animate")
     assert obey("run", "--duration", "1", "--landmarks", "5", *words, "-o", "one")[0] == 0

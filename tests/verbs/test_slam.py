@@ -11,12 +11,12 @@ import pytest
 
 from pipistrelle.__main__ import main
 from pipistrelle.config import Config
+from pipistrelle.estimation.catalogue import PAPERS
 from pipistrelle.experiments.runs import replay
-from pipistrelle.verbs.options import FILTERS
 from reference.command_line import SHORT, summary, track
 
 
-@pytest.mark.parametrize("estimator", FILTERS)
+@pytest.mark.parametrize("estimator", PAPERS)
 @pytest.mark.parametrize("strategy", ["all", "active", "passive"])
 def test_a_run_and_its_log_give_one_track(obey, strategy, estimator, undrawn):
     words = ("--seed", "9", "--filter", estimator)

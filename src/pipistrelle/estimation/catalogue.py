@@ -3,12 +3,17 @@
 Verbs, plans, memory checks, figures and reports take from here what they need to know of an
 estimator. To add one, write it (`pipistrelle.estimation.beliefs.Estimator`) and give it an entry.
 The estimators themselves are imported when one is built: the command line shows their names at
-once.
+once. One that is not listed here goes by ``module:Class`` (`entry`).
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+import math
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import partial
+from importlib import import_module, invalidate_caches
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from pipistrelle.config import Config, InputError
 
@@ -18,6 +23,8 @@ if TYPE_CHECKING:
 
 DOUBLE = 8
 """Bytes of a number."""
+PARTS = ("init", "predict", "update")
+"""What every estimator does."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,7 +56,20 @@ class Entry:
 
 
 def entry(name: str) -> Entry:
-    """Look an estimator up.
+    """Look an estimator up, by its name here, or as a class from outside, ``module:Class``.
+
+    The module is one that is installed, or one in the current folder, which goes first, as it
+    does for ``python -m``. The class is an `Estimator`. Its classmethod
+    ``from_config(config, motion)`` builds it, where it has one; else it is a dataclass and is
+    given, by keyword, those of its fields that are called
+
+    - ``motion``: the `Motion` of the vehicle,
+    - ``rays``, ``gate``: these settings,
+    - ``config``: all settings.
+
+    Its other fields need defaults. It may have the attributes ``title``, as a reader is to know
+    it (else its name), and ``nees_limit`` (else infinity: only a NEES that is not finite means
+    that it diverged). What memory it needs is not known, and not checked.
 
     Parameters
     ----------
@@ -62,16 +82,210 @@ def entry(name: str) -> Entry:
     Raises
     ------
     InputError
-        For an unknown name.
+        For an unknown name, a module that is not there or cannot be imported, a class that is
+        not there or is no estimator.
 
     Examples
     --------
     >>> entry("fastslam").title
     'FastSLAM 2.0'
+    >>> entry("pipistrelle.estimation.ekf.filter:EkfSlam").title
+    'EkfSlam'
     """
-    if name not in CATALOGUE:
-        raise InputError(f"filter: found {name!r}, expected one of {', '.join(CATALOGUE)}")
-    return CATALOGUE[name]
+    if name in CATALOGUE:
+        return CATALOGUE[name]
+    kind: Any = _class_of(check_name(name))
+    title, limit = getattr(kind, "title", kind.__name__), getattr(kind, "nees_limit", math.inf)
+    if not isinstance(title, str):
+        raise InputError(f"filter {name}: title: found {title!r}, expected text")
+    if not isinstance(limit, (int, float)) or not limit > 0.0:
+        raise InputError(f"filter {name}: nees_limit: found {limit!r}, expected a number above 0")
+    return Entry(
+        name=name,
+        title=title,
+        build=partial(_outsider, name, kind),
+        sections=("filter", "rays"),
+        nees_limit=float(limit),
+        memory=lambda landmarks, members, config: 0.0,
+    )
+
+
+def check_name(name: str) -> str:
+    """Refuse what names no estimator, whether or not it is there.
+
+    Parameters
+    ----------
+    name : str
+
+    Returns
+    -------
+    str
+        The same.
+
+    Raises
+    ------
+    InputError
+        Where it is neither listed here nor of the form ``module:Class``.
+
+    Examples
+    --------
+    >>> check_name("ukf")
+    Traceback (most recent call last):
+    pipistrelle.config.InputError: filter: found 'ukf', expected one of ekf, fastslam, module:Class
+    """
+    module, colon, kind = name.partition(":")
+    dotted = all(part.isidentifier() for part in module.split("."))
+    if name not in CATALOGUE and not (colon and dotted and kind.isidentifier()):
+        known = ", ".join(CATALOGUE)
+        raise InputError(f"filter: found {name!r}, expected one of {known}, module:Class")
+    return name
+
+
+def short_name(name: str) -> str:
+    """Return an estimator's name as files bear it: the class, of one from outside.
+
+    Parameters
+    ----------
+    name : str
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> short_name("ekf"), short_name("mine.filters:DeadReckoning")
+    ('ekf', 'DeadReckoning')
+    """
+    return name.rpartition(":")[2]
+
+
+def title_of(name: str) -> str:
+    """Return an estimator's name as a reader knows it, whether or not it can be loaded here.
+
+    Parameters
+    ----------
+    name : str
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> title_of("ekf"), title_of("not.installed:Here")
+    ('EKF', 'Here')
+    """
+    try:
+        return entry(name).title
+    except InputError:
+        return short_name(name)
+
+
+def check_distinct(names: Iterable[str], where: str = "filter") -> None:
+    """Refuse estimators whose files would have one name.
+
+    Parameters
+    ----------
+    names : iterable of str
+    where : str
+        Where they are named.
+
+    Raises
+    ------
+    InputError
+        Where two have the same class name.
+
+    Examples
+    --------
+    >>> check_distinct(["ekf", "a:Own", "b:Own"])
+    Traceback (most recent call last):
+    pipistrelle.config.InputError: filter: a:Own and b:Own would write the same files; rename one
+    """
+    seen: dict[str, str] = {}
+    for name in names:
+        first = seen.setdefault(short_name(name), name)
+        if first != name:
+            raise InputError(f"{where}: {first} and {name} would write the same files; rename one")
+
+
+def look_in(folder: Path) -> None:
+    """Have modules in a folder found, before installed ones, as ``python -m`` does with its own.
+
+    Parameters
+    ----------
+    folder : Path
+    """
+    if str(folder) not in sys.path:
+        sys.path.insert(0, str(folder))
+    invalidate_caches()  # a module may be younger than the last look
+
+
+def _class_of(name: str) -> type:
+    """Import a class from outside, and see that it has what an estimator must have."""
+    module, _, wanted = name.partition(":")
+    look_in(Path.cwd())
+    try:
+        kind = getattr(import_module(module), wanted, None)
+    except (Exception, SystemExit) as error:
+        if isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}."):
+            place = f"neither installed nor in {Path.cwd()}"
+            raise InputError(f"filter {name}: found no module {error.name}, {place}") from None
+        raise InputError(f"filter {name}: importing {module} fails: {worded(error)}") from error
+    if not isinstance(kind, type):
+        found = f"no class {wanted}" if kind is None else f"{wanted}, which is no class,"
+        raise InputError(f"filter {name}: found {found} in {module}; expected an estimator")
+    if lacking := [part for part in PARTS if not callable(getattr(kind, part, None))]:
+        raise InputError(
+            f"filter {name}: lacks {', '.join(lacking)}; an estimator has {', '.join(PARTS)}"
+        )
+    return kind
+
+
+def _outsider(name: str, kind: Any, config: Config, motion: "Motion") -> "Estimator":
+    """Build an estimator from outside."""
+    try:
+        if hasattr(kind, "from_config"):
+            return kind.from_config(config, motion)
+        return kind(**_arguments(kind, config, motion))
+    except Exception as error:
+        raise InputError(f"filter {name}: cannot be built: {worded(error)}") from error
+
+
+def _arguments(kind: Any, config: Config, motion: "Motion") -> dict[str, Any]:
+    """Return what is known of the fields of a dataclass."""
+    if not is_dataclass(kind):
+        raise InputError("it is no dataclass; make it one, or write from_config(config, motion)")
+    known = {"motion": motion, "rays": config.rays, "gate": config.filter.gate, "config": config}
+    asked = [field for field in fields(kind) if field.init]
+    needed = [f.name for f in asked if f.default is MISSING and f.default_factory is MISSING]
+    if unknown := [name for name in needed if name not in known]:
+        raise InputError(
+            f"found no value for {', '.join(unknown)}, expected fields among {', '.join(known)}; "
+            "add defaults, or write from_config(config, motion)"
+        )
+    return {field.name: known[field.name] for field in asked if field.name in known}
+
+
+def worded(error: BaseException) -> str:
+    """Word an error that an estimator from outside raised.
+
+    Parameters
+    ----------
+    error : BaseException
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> worded(ZeroDivisionError("division by zero"))
+    'ZeroDivisionError: division by zero'
+    """
+    if isinstance(error, InputError):
+        return str(error)
+    return f"{type(error).__name__}: {error}".removesuffix(": ")
 
 
 def _ekf(config: Config, motion: "Motion") -> "Estimator":
@@ -134,3 +348,5 @@ CATALOGUE = {
 """All estimators; the limits are those of Bradley & Abaid, Sec. V-A."""
 PAPERS = ("ekf", "fastslam")
 """The two of Bradley & Abaid, of which its claims speak."""
+SECTIONS = tuple(dict.fromkeys(name for known in CATALOGUE.values() for name in known.sections))
+"""All sections of the settings that estimators read; none of them changes what is heard."""

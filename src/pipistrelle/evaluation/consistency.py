@@ -5,11 +5,6 @@ from jaxtyping import Bool, Float
 
 from pipistrelle.evaluation.accuracy import pose_error
 
-EKF_LIMIT = 50.0
-"""A NEES above this means that EKF-SLAM has diverged (Bradley & Abaid, Sec. V-A)."""
-FASTSLAM_LIMIT = 2750.0
-"""A NEES above this means that FastSLAM 2.0 has diverged (Bradley & Abaid, Sec. V-A)."""
-
 
 def nees(
     error: Float[np.ndarray, "*n d"], covariance: Float[np.ndarray, "*n d d"]
@@ -182,7 +177,7 @@ def diverged(nees: Float[np.ndarray, " k"], limit: float) -> bool:
     ----------
     nees : (k)
     limit : float
-        `EKF_LIMIT` or `FASTSLAM_LIMIT`.
+        The estimator's, as `estimation.catalogue` has it.
 
     Returns
     -------
@@ -194,7 +189,7 @@ def diverged(nees: Float[np.ndarray, " k"], limit: float) -> bool:
 
     Examples
     --------
-    >>> diverged(np.array([3.0, 49.0]), EKF_LIMIT), diverged(np.array([3.0, np.nan]), EKF_LIMIT)
+    >>> diverged(np.array([3.0, 49.0]), 50.0), diverged(np.array([3.0, np.nan]), 50.0)
     (False, True)
     """
     return not bool(np.all(np.isfinite(nees) & (nees <= limit)))

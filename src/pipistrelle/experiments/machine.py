@@ -5,11 +5,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from pipistrelle.config import InputError, RayConfig, ScenarioConfig
+from pipistrelle.config import Config, InputError, ScenarioConfig
+from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.rays import ray_members
 
-DOUBLE = 8
-"""Bytes of a number."""
 DRAWN, TRACKED = 430, 96
 """Bytes of a step, as measured: of the path and of the work on it, and of each track."""
 HEARD, SCANNED = 900, 600
@@ -30,8 +29,7 @@ def cores() -> int:
 def check_memory(
     ways: Sequence[str],
     landmarks: int,
-    particles: int,
-    rays: RayConfig,
+    config: Config,
     *,
     passive: bool,
     workers: int = 1,
@@ -40,9 +38,11 @@ def check_memory(
 
     Parameters
     ----------
-    ways : sequence of "ekf", "fastslam"
-    landmarks, particles : int
-    rays : RayConfig
+    ways : sequence of str
+        The names of estimators.
+    landmarks : int
+    config : Config
+        Its sections that they read.
     passive : bool
         Whether a landmark may be heard by its bearing alone: it is a whole ray then.
     workers : int
@@ -55,15 +55,16 @@ def check_memory(
 
     Examples
     --------
-    >>> check_memory(["ekf", "fastslam"], 51, 100, RayConfig(), passive=True)
+    >>> check_memory(["ekf", "fastslam"], 51, Config(), passive=True)
     """
-    each_ray = ray_members(rays)[0].size if passive else 1
-    members = landmarks * each_ray
+    each_ray = ray_members(config.rays)[0].size if passive else 1
     for way in ways:
-        need, have = _bytes(way, landmarks, members, particles), installed()
+        known = entry(way)
+        need, have = known.memory(landmarks, each_ray, config), installed()
         if need * workers > have:
             ray = f" of {each_ray:,} members each" if passive else ""
-            swarm = f" and {particles} particles" if way == "fastslam" else ""
+            particles = f" and {config.fastslam.particles} particles"
+            swarm = particles if "fastslam" in known.sections else ""
             raise _too_large(f"{way}: {landmarks} landmarks{ray}{swarm}", need, have, workers)
 
 
@@ -103,14 +104,6 @@ def _too_large(what: str, need: float, have: float, workers: int) -> InputError:
         f"{what} may need {need / 1e9:.1f} GB of memory{each}, but this machine has "
         f"{have / 1e9:.1f} GB; ask for fewer"
     )
-
-
-def _bytes(way: str, landmarks: int, members: int, particles: int) -> float:
-    """Most that a filter holds at once: all landmarks are there, and all of them still rays."""
-    if way == "ekf":  # covariances: the one before, the one at work, the one after
-        return 3.0 * DOUBLE * (3 + 2 * members) ** 2
-    # Swarms: the one before, the corrected one, the resampled one.
-    return 3.0 * DOUBLE * particles * (6 * members + landmarks)
 
 
 def installed() -> float:

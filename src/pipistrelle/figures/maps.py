@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipistrelle.estimation.beliefs import Landmarks
+from pipistrelle.estimation.catalogue import title_of
 from pipistrelle.experiments.drives import LabelledPoints, Truth
-from pipistrelle.figures.style import COLUMNS, FILTER_NAMES, INK, TRUTH, strategy_colour
+from pipistrelle.figures.style import COLUMNS, INK, TRUTH, strategy_colour
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -313,7 +314,7 @@ def head(axes: "Axes", strategy: str, estimator: str) -> "Annotation":
     style = {"color": strategy_colour(strategy), "fontsize": 13, "weight": "bold"}
     name = axes.annotate(strategy, xytext=(0, 21), **style, **above)
     beside = above | {"xy": (1, 0), "xycoords": name, "va": "bottom"}
-    axes.annotate(FILTER_NAMES.get(estimator, estimator), xytext=(6, 0), fontsize=13, **beside)
+    axes.annotate(title_of(estimator), xytext=(6, 0), fontsize=13, **beside)
     return axes.annotate("", xytext=(0, 7), fontsize=9.5, **above)
 
 

@@ -8,8 +8,6 @@ if TYPE_CHECKING:
 
 STRATEGY_COLOURS = {"active": "#1f4e96", "fused": "#d1495b", "passive": "#d99a00"}
 """Told apart by colour-blind readers and, by lightness alone (L* = 33, 51, 67), in print."""
-FILTER_NAMES = {"ekf": "EKF", "fastslam": "FastSLAM 2.0"}
-"""As a reader knows them."""
 INK = "#333333"
 """Text, the beacon, and any strategy without a colour of its own."""
 TRUTH = "#8a8a8a"

@@ -7,6 +7,8 @@ from threading import Timer
 from time import perf_counter
 from typing import TYPE_CHECKING
 
+from pipistrelle.estimation.catalogue import short_name
+
 if TYPE_CHECKING:
     from pipistrelle.experiments.results.scores import TrialResult
     from pipistrelle.experiments.runs.trial import Progress
@@ -146,12 +148,16 @@ def closing_table(trials: "Sequence[TrialResult]", aligned: bool) -> str:
     str
     """
     columns = [dict(_cells(trial, aligned)) for trial in trials]
-    lines = [("", *(trial.strategy for trial in trials)), ("", *(trial.filter for trial in trials))]
+    filters = [short_name(trial.filter) for trial in trials]
+    lines = [("", *(trial.strategy for trial in trials)), ("", *filters)]
+    width = max(11, 1 + max(map(len, filters)))
     for title in columns[0]:
         cells = [column[title] for column in columns]
         if any(cells):
             lines.append((title, *(text or "-" for text in cells)))
-    return "\n".join(f"{line[0]:<30}" + "".join(f"{c:>11}" for c in line[1:]) for line in lines)
+    return "\n".join(
+        f"{line[0]:<30}" + "".join(f"{c:>{width}}" for c in line[1:]) for line in lines
+    )
 
 
 def _cells(trial: "TrialResult", aligned: bool) -> Iterator[tuple[str, str]]:

@@ -114,7 +114,7 @@ def deliver(
     Returns
     -------
     int
-        Exit status: 1 if an estimate is not finite, else 0.
+        Exit status: 1 if an estimate is not finite or a filter failed, else 0.
     """
     from pipistrelle.figures.mission import draw_mission
     from pipistrelle.figures.style import save_figure
@@ -131,13 +131,14 @@ def deliver(
         ignored_rows=ignored_rows or {},
     )
     save_figure(figure, folder, "mission")
-    if watch is not None:
+    if watch is not None and watch.snapshots:
         _film(watch, folder / f"mission.{options.animate}", scene, options)
     if not options.quiet:
         print(closing_table(trials, aligned=ignored_rows is not None))
     failed = [t for t in trials if not np.all(np.isfinite(t.track.pose.mean))]
     for trial in failed:
-        say(f"pipistrelle: warning: {trial.strategy} {trial.filter} failed: its path is not finite")
+        why = trial.error or "its path is not finite"
+        say(f"pipistrelle: warning: {trial.strategy} {trial.filter} failed: {why}")
     print(folder)
     return 1 if failed else 0
 

@@ -7,9 +7,10 @@ from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
-from cyclopts import Group, Parameter
+from cyclopts import Group, Parameter, convert
 
 from pipistrelle.config import STRATEGIES, Config, InputError, Strategy
+from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, entry
 from pipistrelle.settings import (
     Given,
     Key,
@@ -22,8 +23,6 @@ from pipistrelle.settings import (
 )
 
 Chosen = Literal["active", "fused", "passive", "all"]
-ChosenFilter = Literal["ekf", "fastslam", "both"]
-FILTERS = ("ekf", "fastslam")
 
 
 def _whole(_: Any, tokens: Sequence[Any]) -> int:
@@ -35,6 +34,18 @@ def _whole(_: Any, tokens: Sequence[Any]) -> int:
 
 
 Whole = Annotated[int, Parameter(converter=_whole)]
+_LISTED: Any = Literal[(*CATALOGUE, "both")]
+
+
+def _filter(_: Any, tokens: Sequence[Any]) -> str:
+    """Read the name of a filter, one that is listed or one from outside."""
+    return tokens[0].value if ":" in tokens[0].value else convert(_LISTED, tokens)
+
+
+if TYPE_CHECKING:
+    ChosenFilter = str
+else:  # the help lists those that are listed
+    ChosenFilter = Annotated[_LISTED | str, Parameter(converter=_filter, metavar="CHOICE")]
 Particles = Annotated[
     Whole | None,
     Parameter(metavar="N", help="Particles of FastSLAM; sets fastslam.particles. [default: 100]"),
@@ -259,7 +270,7 @@ def filters(chosen: ChosenFilter, particles: int | None) -> tuple[str, ...]:
 
     Parameters
     ----------
-    chosen : one filter, or "both"
+    chosen : the name of an estimator, or "both", the paper's two
     particles : int, optional
         As asked for by the short name.
 
@@ -270,19 +281,24 @@ def filters(chosen: ChosenFilter, particles: int | None) -> tuple[str, ...]:
     Raises
     ------
     InputError
-        Particles for a filter that has none.
+        Particles for a filter that has none, or an estimator from outside that is not there.
 
     Examples
     --------
     >>> filters("both", 300), filters("ekf", None)
     (('ekf', 'fastslam'), ('ekf',))
     """
-    if chosen == "ekf" and particles is not None:
+    names = PAPERS if chosen == "both" else (chosen,)
+    if particles is not None and not any("fastslam" in entry(n).sections for n in names):
+        able = [known.name for known in CATALOGUE.values() if "fastslam" in known.sections]
+        others = " or ".join(f"--filter {name}" for name in (*able, "both"))
         raise InputError(
-            f"--particles: found {particles}, but --filter is ekf, which has none; "
-            "add --filter fastslam or --filter both"
+            f"--particles: found {particles}, but --filter is {chosen}, which has none; "
+            f"add {others}"
         )
-    return FILTERS if chosen == "both" else (chosen,)
+    for name in names:
+        entry(name)
+    return names
 
 
 def _steps(duration: float, config: Config) -> int:

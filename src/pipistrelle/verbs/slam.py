@@ -5,9 +5,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
+from pydantic import create_model
 
-from pipistrelle.config import Config, FastSlamConfig, FilterConfig, InputError, RayConfig, Section
+from pipistrelle.config import Config, InputError, Section
 from pipistrelle.detection.logs.readers import READERS
+from pipistrelle.estimation.catalogue import SECTIONS
 from pipistrelle.settings import Given, Key, Layer, from_flags, resolve
 from pipistrelle.verbs.console import progress, say
 from pipistrelle.verbs.options import (
@@ -47,13 +49,11 @@ ROBOTS = f"Whose log of {', or of '.join(r.robot_help for r in READERS if r.robo
 """What the help says of the formats of logs."""
 
 
-class SlamConfig(Section):
-    """What a log's replay depends on, beside the log; a file for ``--config``."""
-
-    seed: int
-    filter: FilterConfig
-    rays: RayConfig
-    fastslam: FastSlamConfig
+_REPLAYED: dict[str, Any] = {
+    name: (Config.model_fields[name].annotation, ...) for name in ("seed", *SECTIONS)
+}
+SlamConfig = create_model("SlamConfig", __base__=Section, **_REPLAYED)
+"""What a log's replay depends on, beside the log; a file for ``--config``."""
 
 
 def _is_open(key: Key) -> bool:
@@ -119,7 +119,7 @@ def slam(
     _warn_of_ignored_rows(recorded, log)
     _warn_of_partial_truth(truth, log)
     there = len({label for scan in recorded.scans for label in scan.landmark.tolist()})
-    check_memory(ways, there, settled.fastslam.particles, settled.rays, passive=True)
+    check_memory(ways, there, settled, passive=True)
     with delivery.result_folder(output, "slam") as folder:
         delivery.get_ready(output)
         watch = delivery.recorder(output)

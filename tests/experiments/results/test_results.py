@@ -15,14 +15,15 @@ import pytest
 
 from pipistrelle.config import Config, InputError, Section
 from pipistrelle.estimation.beliefs import Gaussian, Track
+from pipistrelle.estimation.catalogue import entry
 from pipistrelle.evaluation.accuracy import alignment, moved, position_error, rmse
-from pipistrelle.evaluation.consistency import EKF_LIMIT
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
 from pipistrelle.experiments.results.scores import Scores, TrialResult, score
 from pipistrelle.experiments.results.writing import config_hash, write_results
 from reference.missions import map_with, scan_with
 
 STEPS = 400
+EKF_LIMIT = entry("ekf").nees_limit
 EVO_APE = shutil.which("evo_ape", path=Path(sys.executable).parent)
 KEYS = [
     "strategy",

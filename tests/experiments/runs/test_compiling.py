@@ -65,9 +65,9 @@ def test_second_process_is_asked_only_to_fill_an_empty_cache_beside_a_free_core(
     assert len(started) == processes
 
 
-def test_second_process_leaves_fastslam_compiled():
+def test_second_process_leaves_the_filters_compiled_that_are_not_the_first():
     from pipistrelle.estimation.fastslam.particles import correct_swarm, summarise
 
-    kernels.compile_fastslam()
+    kernels.compile_others()
     assert correct_swarm.signatures
     assert summarise.signatures

@@ -1,17 +1,18 @@
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 
 import numpy as np
 import pytest
 
 from pipistrelle.config import STRATEGIES, Config, InputError, ReceiverConfig, ScenarioConfig
 from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.motion import Motion
+from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.hearing.scenario import bicycle, draw_scenario
+from pipistrelle.experiments.results.scores import score_path
 from pipistrelle.experiments.runs.trial import (
-    Case,
     drive_of,
-    estimator,
     run_filter,
     run_mission,
     run_trial,
@@ -152,12 +153,124 @@ def test_a_drive_without_scans_and_scans_without_a_drive_are_tracked():
     assert still.pose.mean.tolist() == [[0.0, 1.0, 0.0]]
 
 
+class Retraced:
+    """A Kalman filter along a line, that looks back at the end: Rauch, Tung and Striebel.
+
+    A step adds the control, with noise of variance 0.04; a scan's range is the distance to a wall
+    at x = 50, with noise of variance 0.25.
+    """
+
+    def init(self, pose):
+        return Line(at=pose.mean[0], variance=1.0, means=(pose.mean[0],), variances=(1.0,))
+
+    def predict(self, belief, controls, dt, rng):
+        x, P = belief.at, belief.variance
+        rows = []
+        for step in controls[:, 0]:
+            x, P = x + step, P + 0.04
+            rows.append((x, P))
+        along = np.array(rows)
+        belief = Line(
+            at=x,
+            variance=P,
+            means=(*belief.means, *along[:, 0]),
+            variances=(*belief.variances, *along[:, 1]),
+            controls=(*belief.controls, *controls[:, 0]),
+        )
+        return belief, flat(along[:, 0], along[:, 1])
+
+    def update(self, belief, scan, rng):
+        gain = belief.variance / (belief.variance + 0.25)
+        x = belief.at + gain * (50.0 - scan.range[0] - belief.at)
+        P = (1.0 - gain) * belief.variance
+        return replace(
+            belief,
+            at=x,
+            variance=P,
+            means=(*belief.means[:-1], x),
+            variances=(*belief.variances[:-1], P),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line(Count):
+    at: float
+    variance: float
+    means: tuple
+    variances: tuple
+    controls: tuple = ()
+
+    def pose(self):
+        line = flat([self.at], [self.variance])
+        return Gaussian(mean=line.mean[0], covariance=line.covariance[0])
+
+    def path(self):
+        means, variances = [*self.means], [*self.variances]
+        for k in range(len(self.controls) - 1, -1, -1):
+            gain = variances[k] / (variances[k] + 0.04)
+            means[k] += gain * (means[k + 1] - self.means[k] - self.controls[k])
+            variances[k] += gain**2 * (variances[k + 1] - self.variances[k] - 0.04)
+        return flat(means, variances)
+
+
+def flat(x, variance):
+    """Poses on the line y = 0."""
+    mean, covariance = np.zeros((len(x), 3)), np.zeros((len(x), 3, 3))
+    mean[:, 0], covariance[:, 0, 0] = x, variance
+    covariance[:, 1, 1] = covariance[:, 2, 2] = 1.0
+    return Gaussian(mean=mean, covariance=covariance)
+
+
+def line_drive(rng, steps=60):
+    """A drive along the line, what it hears of the wall every third step, and where it was."""
+    x = np.cumsum(np.append(rng.normal(), 0.5 + rng.normal(0.0, 0.2, steps)))
+    heard = range(3, steps + 1, 3)
+    scans = [scan_at(float(k), [1], [0.0], [50.0 - x[k] + rng.normal(0.0, 0.5)]) for k in heard]
+    line = replace(drive(1), time=np.arange(steps + 1.0), controls=np.tile([0.5, 0.0], (steps, 1)))
+    return line, scans, x
+
+
+def test_a_path_that_is_revised_is_the_batch_solution_and_the_online_one_is_beside_it():
+    line, scans, _ = line_drive(RNG(5))
+    track = run_filter(Retraced(), line, scans, RNG(7))
+    k = line.time.size
+    step = np.eye(k, k=1)[:-1] - np.eye(k)[:-1]
+    rows = [int(scan.time) for scan in scans]
+    wall = np.eye(k)[rows]
+    information = 25.0 * step.T @ step + 4.0 * wall.T @ wall
+    information[0, 0] += 1.0
+    right = 25.0 * step.T @ line.controls[:, 0]
+    right[rows] += 4.0 * np.array([50.0 - scan.range[0] for scan in scans])
+    covariance = np.linalg.inv(information)
+    np.testing.assert_allclose(track.pose.mean[:, 0], covariance @ right, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        track.pose.covariance[:, 0, 0], np.diag(covariance), rtol=0, atol=1e-9
+    )
+    gain = track.online.covariance - track.pose.covariance
+    assert np.all(gain[1:-1, 0, 0] > 0.0)
+    np.testing.assert_array_equal(track.online.mean[-1], track.pose.mean[-1])
+    assert run_filter(Ledger(), line, scans, RNG(7)).online is None
+
+
+def test_a_path_that_is_revised_is_nearer_to_the_truth():
+    squares = []
+    for seed in range(30):
+        line, scans, x = line_drive(RNG(seed))
+        track = run_filter(Retraced(), line, scans, RNG(7))
+        true = flat(x, x).mean
+        squares.append(
+            [score_path(pose, true).position_rmse_m ** 2 for pose in (track.online, track.pose)]
+        )
+    gain = -np.diff(squares, axis=1)
+    assert gain.mean() > 3.0 * gain.std(ddof=1) / np.sqrt(gain.size)
+
+
 @pytest.mark.parametrize("name", ["ekf", "fastslam"])
 def test_a_filter_told_at_the_start_and_left_alone_at_the_end_keeps_what_it_knows(name):
     motion = bicycle(Config().motion)
     known = replace(drive(5), motion=motion)
     first = scan_with([3, 4], [0.1, -0.2], [2.0, np.nan], time=0.0)
-    track = run_filter(estimator(name, motion, Config()), known, [first], RNG(7))
+    track = run_filter(entry(name).build(Config(), motion), known, [first], RNG(7))
     assert set(track.landmarks.landmark) == {3, 4}
     spread = track.pose.covariance[:, 0, 0] + track.pose.covariance[:, 1, 1]
     assert np.all(np.diff(spread) > 0.0)

@@ -3,13 +3,11 @@
 import tomllib
 from collections import Counter
 from importlib.resources import files
-from typing import get_args
 
 import pytest
 
 from pipistrelle.config import Config, EmitterConfig, InputError, RayConfig
-from pipistrelle.experiments.runs.trial import LIMITS
-from pipistrelle.experiments.studies.plan import Filter, Plan, cases_of
+from pipistrelle.experiments.studies.plan import Plan, cases_of
 from pipistrelle.experiments.studies.plan_file import differences, find_plan, plan_text, read_plan
 from pipistrelle.settings import from_flags
 from reference.studies import SMALL, plan_of
@@ -57,8 +55,24 @@ def test_the_papers_radii_are_those_that_its_appendix_lists_beamwidths_for():
     assert list(radii) == [round(radius, 4) for radius in spaced]
 
 
-def test_the_filters_of_a_plan_are_those_that_there_are():
-    assert set(get_args(Filter)) == set(LIMITS)
+@pytest.mark.parametrize(
+    ("filters", "said"),
+    [
+        ('["ukf"]', "filters.0: found 'ukf', expected 'ekf', 'fastslam' or module:Class"),
+        ("[3]", "filters.0: found 3, expected 'ekf', 'fastslam' or module:Class"),
+        ('["ekf", "a.b:"]', "filters.1: found 'a.b:', expected 'ekf', 'fastslam' or module:Class"),
+        ('["a:B", "c:B"]', "filters: a:B and c:B would write the same files"),
+        ('["a:B", "a:B"]', "filters: found 'a:B' twice"),
+    ],
+)
+def test_filters_that_there_are_not_are_refused(refused, filters, said):
+    assert refused(BARE + f"filters = {filters}\n").startswith(f"PLAN: {said}")
+
+
+def test_a_plan_is_read_and_written_where_its_estimators_are_not_installed(tmp_path):
+    plan = plan_of(tmp_path, BARE + 'filters = ["ekf", "not.installed:Here"]\n')
+    assert plan.filters == ("ekf", "not.installed:Here")
+    assert plan_of(tmp_path, plan_text(plan)) == plan
 
 
 def test_a_plan_without_strategies_filters_and_name_has_them_all_and_is_named_after_its_file(

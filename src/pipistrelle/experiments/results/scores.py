@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.beliefs import Track
+from pipistrelle.estimation.beliefs import Gaussian, Track
 from pipistrelle.evaluation.accuracy import (
     alignment,
     heaviest,
@@ -19,6 +19,22 @@ from pipistrelle.evaluation.accuracy import (
 )
 from pipistrelle.evaluation.consistency import diverged, track_nees
 from pipistrelle.experiments.drives import Truth
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PathScores:
+    """How near a path is to the truth, under the names of `Scores`.
+
+    Attributes
+    ----------
+    position_rmse_m, heading_rmse_rad, position_rmse_aligned_m, nees_mean, nees_max : float or None
+    """
+
+    position_rmse_m: float | None
+    heading_rmse_rad: float | None
+    position_rmse_aligned_m: float | None
+    nees_mean: float | None
+    nees_max: float | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,13 +85,18 @@ class TrialResult:
     Attributes
     ----------
     strategy : "active", "fused" or "passive"
-    filter : "ekf" or "fastslam"
+    filter : str
+        The estimator's name.
     track : Track
     scans : tuple of Scan
         One per frame, empty ones included.
     scores : Scores
     wall_s : [s]
         Time that the estimate took.
+    online : PathScores or None
+        Of the path as it was believed at its time, where the filter revises it.
+    error : str or None
+        What a filter from outside failed with; then its path is not a number anywhere.
     """
 
     strategy: str
@@ -84,6 +105,8 @@ class TrialResult:
     scans: tuple[Scan, ...]
     scores: Scores
     wall_s: float
+    online: PathScores | None = None
+    error: str | None = None
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -123,31 +146,72 @@ def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Sc
     >>> scores.position_rmse_m, scores.nees_max, scores.map_rmse_m
     (5.0, 25.0, None)
     """
-    known = np.full_like(track.pose.mean, np.nan) if truth.path is None else truth.path
-    if len(known) != len(track.pose.mean):
-        raise ValueError(f"{len(track.pose.mean)} poses, but {len(known)} true ones")
-    rows = np.isfinite(known).all(axis=1) & (np.arange(len(known)) > 0)
-    path, true_path = track.pose.mean[rows], known[rows]
-    error = pose_error(path, true_path)
-    epsilon = track_nees(track.pose.mean, track.pose.covariance, known)[1:]
-    epsilon = epsilon[~np.isnan(epsilon)]
+    path = score_path(track.pose, truth.path)
+    worst = path.nees_max
     estimate = heaviest(track.landmarks)
     labels, positions = truth.landmarks or (np.empty(0, int), np.empty((0, 2)))
     mapped, true = scored_landmarks(estimate, labels, positions)
     finite = bool(np.all(np.isfinite(track.pose.mean)))
     return Scores(
-        position_rmse_m=_rmse(position_error(path, true_path)),
-        heading_rmse_rad=_rmse(error[:, 2]),
+        position_rmse_m=path.position_rmse_m,
+        heading_rmse_rad=path.heading_rmse_rad,
         map_rmse_m=_rmse(position_error(mapped, true)),
-        position_rmse_aligned_m=_aligned_rmse(path[:, :2], true_path[:, :2]),
+        position_rmse_aligned_m=path.position_rmse_aligned_m,
         map_rmse_aligned_m=_aligned_rmse(mapped, true),
-        nees_mean=float(np.mean(epsilon)) if len(epsilon) else None,
-        nees_max=float(np.max(epsilon)) if len(epsilon) else None,
-        diverged=diverged(epsilon, limit) if len(epsilon) else (None if finite else True),
+        nees_mean=path.nees_mean,
+        nees_max=worst,
+        diverged=(None if finite else True) if worst is None else diverged(np.array(worst), limit),
         landmarks_full=int(np.sum(estimate.full)),
         landmarks_total=len(estimate.landmark),
         measurements_per_frame=sum(len(s.landmark) for s in scans) / len(scans) if scans else None,
         gated=track.gated,
+    )
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def score_path(pose: Gaussian, true_path: Float[np.ndarray, "k 3"] | None) -> PathScores:
+    """Score a path against the truth, its start excluded.
+
+    Parameters
+    ----------
+    pose : Gaussian of (k, 3) and (k, 3, 3)
+        The start first.
+    true_path : (k, 3) [m, m, rad], optional
+        NaN where it is not known, which is not scored.
+
+    Returns
+    -------
+    PathScores
+
+    Raises
+    ------
+    ValueError
+        Where path and truth differ in length.
+
+    Notes
+    -----
+    Bradley & Abaid, Eqs. (23) and (26).
+
+    Examples
+    --------
+    >>> pose = Gaussian(mean=np.zeros((2, 3)), covariance=np.tile(np.eye(3), (2, 1, 1)))
+    >>> score_path(pose, np.array([[0.0, 0, 0], [3, 4, 0]])).position_rmse_m
+    5.0
+    """
+    known = np.full_like(pose.mean, np.nan) if true_path is None else true_path
+    if len(known) != len(pose.mean):
+        raise ValueError(f"{len(pose.mean)} poses, but {len(known)} true ones")
+    rows = np.isfinite(known).all(axis=1) & (np.arange(len(known)) > 0)
+    path, truth = pose.mean[rows], known[rows]
+    error = pose_error(path, truth)
+    epsilon = track_nees(pose.mean, pose.covariance, known)[1:]
+    epsilon = epsilon[~np.isnan(epsilon)]
+    return PathScores(
+        position_rmse_m=_rmse(position_error(path, truth)),
+        heading_rmse_rad=_rmse(error[:, 2]),
+        position_rmse_aligned_m=_aligned_rmse(path[:, :2], truth[:, :2]),
+        nees_mean=float(np.mean(epsilon)) if len(epsilon) else None,
+        nees_max=float(np.max(epsilon)) if len(epsilon) else None,
     )
 
 

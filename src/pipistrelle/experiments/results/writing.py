@@ -7,7 +7,7 @@ import hashlib
 import io
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from pipistrelle import __version__
+from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.results.folder import clear_results, write_file
 from pipistrelle.experiments.results.scores import TrialResult
@@ -40,7 +41,7 @@ bearings counter-clockwise from the heading. S is the sensing strategy, F the fi
 | summary.json | the scores of each estimate; null: no truth, or not a finite number |
 | config.toml | every setting |
 | track_S_F.tum | estimated path, the start and every control step: time x y z qx qy qz qw |
-| truth.tum | true path at the same times, where it is known |
+{online}| truth.tum | true path at the same times, where it is known |
 | map_S_F.csv | final map with covariances; a partial landmark by its heaviest hypothesis |
 | steps.parquet | estimated and true poses, standard deviations, errors, NEES |
 | landmarks.parquet | every hypothesis of every landmark, beside the true positions |
@@ -54,6 +55,10 @@ whose true positions are known. measurements_per_frame counts before the gate, g
 gate rejected, ignored_rows what was dropped from a recorded log.
 
     evo_ape tum truth.tum track_S_F.tum --align
+"""
+
+ONLINE = """\
+| track_S_F_online.tum | the same as it was believed at each time; F revised it by what came after |
 """
 
 
@@ -106,11 +111,15 @@ def write_results(
     clear_results(folder)
     settings = config.model_dump(mode="json", exclude_none=True)
     write_file(folder / "config.toml", tomli_w.dumps(settings))
-    readme = README.format(command=command, version=__version__, seed=seed)
+    online = ONLINE if any(trial.online for trial in trials) else ""
+    readme = README.format(command=command, version=__version__, seed=seed, online=online)
     write_file(folder / "README.md", readme)
     for trial in trials:
-        name, track = f"{trial.strategy}_{trial.filter}", trial.track
+        name, track = f"{trial.strategy}_{short_name(trial.filter)}", trial.track
         write_file(folder / f"track_{name}.tum", tum_text(track.time, track.pose.mean))
+        if track.online is not None:
+            text = tum_text(track.time, track.online.mean)
+            write_file(folder / f"track_{name}_online.tum", text)
         write_file(folder / f"map_{name}.csv", map_text(track.landmarks))
     if truth.path is not None:
         known = np.isfinite(truth.path).all(axis=1)
@@ -175,14 +184,19 @@ def config_hash(config: BaseModel) -> str:
 
 def _run(trial: TrialResult, ignored_rows: dict[str, int]) -> dict[str, object]:
     """Return a trial's entry of the summary; what is not finite becomes null."""
-    run = {
+    run: dict[str, object] = {
         "strategy": trial.strategy,
         "filter": trial.filter,
-        **asdict(trial.scores),
+        **_finite(asdict(trial.scores)),
         "ignored_rows": dict(ignored_rows),
         "wall_s": trial.wall_s,
     }
+    return run if trial.online is None else run | {"online": _finite(asdict(trial.online))}
+
+
+def _finite(scores: Mapping[str, object]) -> dict[str, object]:
+    """Put null for what is not finite."""
     return {
         key: None if isinstance(value, float) and not math.isfinite(value) else value
-        for key, value in run.items()
+        for key, value in scores.items()
     }

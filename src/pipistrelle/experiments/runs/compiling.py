@@ -12,34 +12,36 @@ import numpy as np
 from pipistrelle.config import Config, ScenarioConfig
 from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.experiments.hearing.scenario import bicycle
 from pipistrelle.experiments.machine import cores
-from pipistrelle.experiments.runs.trial import LIMITS, estimator, run_mission
+from pipistrelle.experiments.runs.trial import run_mission
 
-_SECOND = "from pipistrelle.experiments.runs.compiling import compile_fastslam; compile_fastslam()"
+_SECOND = "from pipistrelle.experiments.runs.compiling import compile_others; compile_others()"
 
 
 def compile_kernels() -> None:
     """Compile every kernel, or load it from the cache, by a mission of two frames.
 
-    Where the cache is empty a second process compiles FastSLAM's meanwhile. Nothing depends on
-    it: what it leaves undone is done here.
+    Where the cache is empty a second process compiles those of all filters but the first
+    meanwhile. Nothing depends on it: what it leaves undone is done here.
     """
     tiny = Config(scenario=ScenarioConfig(steps=8, landmarks=4, radius=10.0))
     cached = any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbc"))
     if not cached and cores() > 1:
         with _second_process(_SECOND):
-            run_mission(tiny, ("fused",), ("ekf",))
-    run_mission(tiny, ("active", "fused", "passive"), tuple(LIMITS))
+            run_mission(tiny, ("fused",), tuple(CATALOGUE)[:1])
+    run_mission(tiny, ("active", "fused", "passive"), tuple(CATALOGUE))
 
 
-def compile_fastslam() -> None:
-    """Compile FastSLAM's kernels by one frame, made up, so that no other kernel is needed."""
-    slam, rng = estimator("fastslam", bicycle(Config().motion), Config()), np.random.default_rng(0)
-    belief = slam.init(Gaussian(mean=np.zeros(3), covariance=np.eye(3)))
-    belief, _ = slam.predict(belief, np.ones((1, 2)), np.ones(1), rng)
-    known = {"range": np.array([1.0, np.nan]), "range_std": 0.1, "bearing_std": 0.1}
-    slam.update(belief, make_scan(1.0, np.arange(2), np.zeros(2), **known), rng)
+def compile_others() -> None:
+    """Compile all filters' kernels but the first's, by one frame, made up: it needs no other."""
+    for known in tuple(CATALOGUE.values())[1:]:
+        slam, rng = known.build(Config(), bicycle(Config().motion)), np.random.default_rng(0)
+        belief = slam.init(Gaussian(mean=np.zeros(3), covariance=np.eye(3)))
+        belief, _ = slam.predict(belief, np.ones((1, 2)), np.ones(1), rng)
+        heard = {"range": np.array([1.0, np.nan]), "range_std": 0.1, "bearing_std": 0.1}
+        slam.update(belief, make_scan(1.0, np.arange(2), np.zeros(2), **heard), rng)
 
 
 @contextmanager

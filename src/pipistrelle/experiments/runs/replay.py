@@ -17,7 +17,8 @@ from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.results.scores import TrialResult
-from pipistrelle.experiments.runs.trial import Case, Watch, run_trial
+from pipistrelle.experiments.runs.outside import check_filters
+from pipistrelle.experiments.runs.trial import Watch, run_trials
 from pipistrelle.experiments.runs.truth_files import TRUTHS, WithTruth, with_files_beside
 from pipistrelle.refusals import refusal
 
@@ -135,7 +136,8 @@ def replay(
     log : Log
     truth : Truth
     strategies : sequence of "active", "fused", "passive"
-    filters : sequence of "ekf", "fastslam"
+    filters : sequence of str
+        The names of estimators.
     beamwidth : [rad], optional
         See `as_heard_by`.
     config : Config
@@ -149,7 +151,7 @@ def replay(
     Raises
     ------
     InputError
-        For an unknown filter.
+        For an estimator that cannot be had or built.
     """
     drive = Drive(
         motion=motion_of(log),
@@ -158,13 +160,13 @@ def replay(
         controls=log.controls,
         truth=truth,
     )
-    noise, trials = noise_of(config.filter), []
-    for strategy in strategies:
-        scans = tuple(map(noise, as_heard_by(log.scans, strategy, beamwidth)))
-        for name in filters:
-            case = Case(strategy=strategy, filter=name)
-            trials.append(run_trial(case, drive, scans, config, progress=progress, watch=watch))
-    return tuple(trials)
+    check_filters(filters, drive.motion, config)
+    noise = noise_of(config.filter)
+    heard = {
+        strategy: tuple(map(noise, as_heard_by(log.scans, strategy, beamwidth)))
+        for strategy in strategies
+    }
+    return run_trials(filters, drive, heard, config, progress=progress, watch=watch)
 
 
 def _whose(

@@ -4,7 +4,7 @@ Read this file first: each call is a box of the paper's workflow.
 """
 
 import time as clock
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,38 +16,26 @@ from pipistrelle.detection.merging import Heard, labelled, scan_of
 from pipistrelle.detection.noise import noise_of
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.association import Associate, told
-from pipistrelle.estimation.beliefs import B, Belief, Estimator, Gaussian, Swarm, Track
-from pipistrelle.estimation.ekf.filter import EkfSlam
-from pipistrelle.estimation.fastslam.filter import FastSlam
-from pipistrelle.estimation.motion import Motion
-from pipistrelle.evaluation.consistency import EKF_LIMIT, FASTSLAM_LIMIT
+from pipistrelle.estimation.beliefs import (
+    B,
+    Belief,
+    Estimator,
+    Gaussian,
+    Swarm,
+    Track,
+    Trajectory,
+)
+from pipistrelle.estimation.catalogue import CATALOGUE, entry, short_name
+from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.experiments.hearing.listening import Progress, listen
 from pipistrelle.experiments.hearing.scenario import Scenario, bicycle, world_of
 from pipistrelle.experiments.machine import check_length, check_memory
-from pipistrelle.experiments.results.scores import TrialResult, score
+from pipistrelle.experiments.results.scores import TrialResult, score, score_path
+from pipistrelle.experiments.runs.outside import check_filters, failed_trial
 
 Watch = Callable[[str, str, Scan, Belief], None]
 """Called with strategy, filter, scan and the belief after it."""
-LIMITS = {"ekf": EKF_LIMIT, "fastslam": FASTSLAM_LIMIT}
-"""The filters by name, with the NEES above which each counts as diverged."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Case:
-    """One combination to try: a sensing strategy and a filter, in one world.
-
-    Attributes
-    ----------
-    strategy : "active", "fused" or "passive"
-    filter : "ekf" or "fastslam"
-    iteration : int
-        Number of the world.
-    """
-
-    strategy: Strategy
-    filter: str
-    iteration: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,7 +63,8 @@ def run_mission(
     ----------
     config : Config
     strategies : sequence of "active", "fused", "passive"
-    filters : sequence of "ekf", "fastslam"
+    filters : sequence of str
+        The names of estimators.
     progress, watch : callable, optional
 
     Returns
@@ -99,19 +88,15 @@ def run_mission(
     check_memory(
         filters,
         len(scenario.landmarks) + 1,
-        config.fastslam.particles,
-        config.rays,
+        config,
         passive=any(strategy != "active" for strategy in strategies),
     )
-    (heard,) = listen(scenario, config, (config.emitter.radius,), progress=progress)
     drive = drive_of(scenario, config)
-    trials = []
-    for strategy in strategies:
-        scans = scans_of(heard, strategy, config)
-        for name in filters:
-            case = Case(strategy=strategy, filter=name)
-            trials.append(run_trial(case, drive, scans, config, progress=progress, watch=watch))
-    return Mission(config=config, scenario=scenario, drive=drive, heard=heard, trials=tuple(trials))
+    check_filters(filters, drive.motion, config)
+    (heard,) = listen(scenario, config, (config.emitter.radius,), progress=progress)
+    scans = {strategy: scans_of(heard, strategy, config) for strategy in strategies}
+    trials = run_trials(filters, drive, scans, config, progress=progress, watch=watch)
+    return Mission(config=config, scenario=scenario, drive=drive, heard=heard, trials=trials)
 
 
 def scans_of(heard: Sequence[Heard], strategy: Strategy, config: Config) -> tuple[Scan, ...]:
@@ -162,6 +147,50 @@ def drive_of(scenario: Scenario, config: Config) -> Drive:
     )
 
 
+def run_trials(
+    filters: Sequence[str],
+    drive: Drive,
+    heard: Mapping[Strategy, Sequence[Scan]],
+    config: Config,
+    *,
+    progress: Progress | None = None,
+    watch: Watch | None = None,
+) -> tuple[TrialResult, ...]:
+    """Let each filter map what each strategy heard.
+
+    A filter from outside may fail: its path is then not a number, and the result says why.
+
+    Parameters
+    ----------
+    filters : sequence of str
+        The names of estimators.
+    drive : Drive
+    heard : dict
+        The scans of each strategy.
+    config : Config
+    progress, watch : callable, optional
+
+    Returns
+    -------
+    tuple of TrialResult
+        For each strategy, one per filter.
+    """
+
+    def tried(case: Case, scans: Sequence[Scan]) -> TrialResult:
+        try:
+            return run_trial(case, drive, scans, config, progress=progress, watch=watch)
+        except Exception as error:
+            if case.filter in CATALOGUE:
+                raise
+            return failed_trial(case, drive, scans, error)
+
+    return tuple(
+        tried(Case(strategy=strategy, filter=name), scans)
+        for strategy, scans in heard.items()
+        for name in filters
+    )
+
+
 def run_trial(
     case: Case,
     drive: Drive,
@@ -193,15 +222,16 @@ def run_trial(
 
     def report(done: int, total: int) -> None:
         if progress:
-            progress(f"{strategy} {name}", done, total)
+            progress(f"{strategy} {short_name(name)}", done, total)
 
     def look(scan: Scan, belief: Belief) -> None:
         if watch:
             watch(strategy, name, scan, belief)
 
+    known = entry(name)
     began = clock.perf_counter()
     track = run_filter(
-        estimator(name, drive.motion, config),
+        known.build(config, drive.motion),
         drive,
         scans,
         _generator(config.seed, case.iteration, name),
@@ -215,43 +245,10 @@ def run_trial(
         filter=name,
         track=track,
         scans=tuple(scans),
-        scores=score(track, drive.truth, scans, LIMITS[name]),
+        scores=score(track, drive.truth, scans, known.nees_limit),
         wall_s=wall_s,
+        online=None if track.online is None else score_path(track.online, drive.truth.path),
     )
-
-
-def estimator(name: str, motion: Motion, config: Config) -> Estimator:
-    """Build a filter from the settings.
-
-    Parameters
-    ----------
-    name : "ekf" or "fastslam"
-    motion : Motion
-    config : Config
-
-    Returns
-    -------
-    Estimator
-
-    Raises
-    ------
-    InputError
-        For an unknown name.
-
-    Examples
-    --------
-    >>> type(estimator("ekf", bicycle(Config().motion), Config())).__name__
-    'EkfSlam'
-    """
-    if name not in LIMITS:
-        raise InputError(f"filter: found {name!r}, expected one of {', '.join(LIMITS)}")
-    settings = config.filter
-    assumed = {
-        "motion": motion,
-        "rays": config.rays,
-        "gate": settings.gate,
-    }
-    return EkfSlam(**assumed) if name == "ekf" else FastSlam(**assumed, swarm=config.fastslam)
 
 
 def run_filter(
@@ -265,6 +262,9 @@ def run_filter(
     watch: Callable[[Scan, B], None] | None = None,
 ) -> Track:
     """Predict to each scan, say who is who in it, update with it, and keep the pose of every step.
+
+    Where the belief revises its path (`Trajectory`), the track is the path as it is believed at
+    the end, and the poses that were kept are beside it.
 
     Parameters
     ----------
@@ -286,7 +286,8 @@ def run_filter(
     Raises
     ------
     InputError
-        For a bearing or range that is no number, or a time that is not one of the drive's.
+        For a bearing or range that is no number, a time that is not one of the drive's, or a
+        revised path that is not one of the drive's steps.
     """
     time, controls = drive.time, drive.controls
     steps = _steps_of(scans, time)
@@ -309,15 +310,30 @@ def run_filter(
     if done < len(controls):
         belief, poses = estimator.predict(belief, controls[done:], dt[done:], rng)
         mean[done + 1 :], covariance[done + 1 :] = poses.mean, poses.covariance
+    online = Gaussian(mean=mean, covariance=covariance)
     swarm = belief if isinstance(belief, Swarm) else None
+    revised = _whole(belief.path(), time.size) if isinstance(belief, Trajectory) else None
     return Track(
         time=time,
-        pose=Gaussian(mean=mean, covariance=covariance),
+        pose=revised or online,
         landmarks=belief.landmarks(),
         gated=belief.gated,
         cloud=swarm.cloud() if swarm else None,
         full=swarm.full if swarm else None,
+        online=online if revised else None,
     )
+
+
+def _whole(path: Gaussian, poses: int) -> Gaussian:
+    """Refuse a revised path that lacks poses, or their covariances."""
+    found = path.mean.shape, path.covariance.shape
+    expected = (poses, 3), (poses, 3, 3)
+    if found != expected:
+        raise InputError(
+            f"path: found arrays of {found[0]} and {found[1]}, expected {expected[0]} and "
+            f"{expected[1]}: the start and every control step"
+        )
+    return path
 
 
 def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]:

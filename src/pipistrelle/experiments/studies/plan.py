@@ -7,16 +7,15 @@ depend on the vehicle's beam: there is one for all radii, heard beside the narro
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 from pipistrelle.config import Config, Strategy
+from pipistrelle.experiments.cases import Case
 from pipistrelle.settings import Given, Key, Layer, from_flags, resolve
 
 RADIUS = "emitter.radius"
 MOST_CASES = 2**15 - 1
 """What their numbers have room for in the tables."""
-
-Filter = Literal["ekf", "fastslam"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,7 +27,9 @@ class Plan:
     name : str
     iterations : int
         Number of worlds.
-    strategies, filters : tuple of str
+    strategies : tuple of "active", "fused", "passive"
+    filters : tuple of str
+        The names of estimators.
     config : Config
         What holds where the grid says nothing else.
     grid : dict
@@ -38,20 +39,19 @@ class Plan:
     name: str
     iterations: int
     strategies: tuple[Strategy, ...]
-    filters: tuple[Filter, ...]
+    filters: tuple[str, ...]
     config: Config
     grid: Mapping[str, tuple[Any, ...]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PlannedCase:
-    """One combination of a plan.
+class PlannedCase(Case):
+    """One combination of a plan: a case, whatever the world, with its settings.
 
     Attributes
     ----------
     number : int
         From 0, in the order of the plan.
-    strategy, filter : str
     values : dict
         Of the grid's settings; None for the radius of a passive case.
     config : Config
@@ -59,8 +59,6 @@ class PlannedCase:
     """
 
     number: int
-    strategy: Strategy
-    filter: Filter
     values: Mapping[str, Any]
     config: Config
 

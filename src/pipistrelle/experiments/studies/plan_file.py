@@ -7,10 +7,12 @@ from math import prod
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field, PlainValidator, ValidationError
+from pydantic_core import PydanticCustomError
 
 from pipistrelle.config import STRATEGIES, Config, Count, InputError, Section, Strategy
-from pipistrelle.experiments.studies.plan import MOST_CASES, Filter, Plan, combinations
+from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, check_distinct, check_name
+from pipistrelle.experiments.studies.plan import MOST_CASES, Plan, combinations
 from pipistrelle.refusals import expectation, meant
 from pipistrelle.settings import (
     Given,
@@ -26,6 +28,17 @@ from pipistrelle.settings import (
 FORMAT = 1
 
 
+def _named(found: Any) -> str:
+    """Take the name of an estimator; one from outside need not be there to read a plan."""
+    try:
+        return check_name(str(found))
+    except InputError:
+        expected = ", ".join(f"'{name}'" for name in CATALOGUE) + " or module:Class"
+        raise PydanticCustomError(
+            "filter", "Input should be {expected}", {"expected": expected}
+        ) from None
+
+
 class _Head(Section):
     """A plan without settings and grid, as its file holds it."""
 
@@ -33,7 +46,9 @@ class _Head(Section):
     name: Annotated[str, Field(pattern=r"^\w[\w.-]*$")]
     iterations: Count
     strategies: Annotated[tuple[Strategy, ...], Field(min_length=1)] = STRATEGIES
-    filters: Annotated[tuple[Filter, ...], Field(min_length=1)] = ("ekf", "fastslam")
+    filters: Annotated[tuple[Annotated[str, PlainValidator(_named)], ...], Field(min_length=1)] = (
+        PAPERS
+    )
 
 
 def find_plan(word: str) -> Path:
@@ -221,6 +236,7 @@ def _head(path: Path, table: Mapping[str, Any], iterations: int | None) -> _Head
         raise InputError("\n".join(problems)) from None
     for name in ("strategies", "filters"):
         _check_distinct(f"{path}: {name}", getattr(head, name))
+    check_distinct(head.filters, f"{path}: filters")
     return head
 
 

@@ -260,9 +260,12 @@ def load_study(folder: Path) -> StoredStudy:
     plan = read_plan(folder / "plan.toml")
     worlds = sorted(done_worlds(folder))
     frames = {}
-    for name, schema in world_schemas(plan).items():
+    for name in TABLES:
         paths = [world_file(folder, name, world) for world in worlds]
-        frames[name] = pl.scan_parquet(paths) if paths else pl.LazyFrame(schema=schema)
+        # The files know their columns, even where an estimator from outside is not at hand.
+        frames[name] = (
+            pl.scan_parquet(paths) if paths else pl.LazyFrame(schema=world_schemas(plan)[name])
+        )
     return StoredStudy(plan=plan, **frames)
 
 

@@ -17,7 +17,10 @@ from functools import partial
 from pathlib import Path
 
 from pipistrelle.config import InputError
+from pipistrelle.estimation.catalogue import CATALOGUE, look_in
+from pipistrelle.experiments.hearing.scenario import bicycle
 from pipistrelle.experiments.machine import check_length, check_memory, keep_freed_memory
+from pipistrelle.experiments.runs.outside import check_filters
 from pipistrelle.experiments.studies.executors import (
     AHEAD,
     Results,
@@ -104,8 +107,8 @@ def run_study(
     Raises
     ------
     InputError
-        Where the folder holds another plan, results cannot be written, or workers, or memory for
-        them on this machine, cannot be had.
+        Where the folder holds another plan, results cannot be written, or workers, memory for
+        them on this machine, or an estimator, cannot be had.
 
     Examples
     --------
@@ -121,6 +124,8 @@ def run_study(
     """
     if executor is None and scheduler in (None, "local"):
         _refuse_too_large(plan, workers)
+    for case in cases_of(plan):
+        check_filters([case.filter], bicycle(case.config.motion), case.config)
     open_store(folder, plan)
     worlds = range(shard[0], plan.iterations, shard[1])
     done = done_worlds(folder).intersection(worlds)
@@ -135,8 +140,8 @@ def run_study(
             standing = _advanced(standing, outcomes)
     show = progress or (lambda _: None)
     show(standing)
-    place = folder.absolute()
-    task, give_up = partial(_work, place, plan), partial(_give_up, place, plan)
+    place, here = folder.absolute(), Path.cwd()
+    task, give_up = partial(_work, place, plan, here), partial(_give_up, place, plan)
     found: Results
     if executor is not None:
         found = (future.result() for _, future in ended(executor, task, waiting, AHEAD))
@@ -164,8 +169,7 @@ def _refuse_too_large(plan: Plan, workers: int) -> None:
         check_memory(
             [case.filter],
             case.config.scenario.landmarks + 1,
-            case.config.fastslam.particles,
-            case.config.rays,
+            case.config,
             passive=case.strategy != "active",
             workers=workers,
         )
@@ -199,9 +203,11 @@ def _advanced(standing: Standing, outcomes: Sequence[Outcome]) -> Standing:
     )
 
 
-def _work(folder: Path, plan: Plan, iteration: int) -> list[Outcome]:
-    """Run a world and write its results; done by a worker, whatever it is."""
+def _work(folder: Path, plan: Plan, here: Path, iteration: int) -> list[Outcome]:
+    """Run a world and write its results; done by a worker, whatever and wherever it is."""
     keep_freed_memory()
+    if not CATALOGUE.keys() >= set(plan.filters):
+        look_in(here)
     records = run_world(plan, iteration)
     write_world(folder, plan, iteration, records)
     return [(record.case.strategy, record.error) for record in records]

@@ -8,7 +8,7 @@ import json
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from math import degrees
 from typing import TYPE_CHECKING, Any
@@ -21,20 +21,22 @@ from pipistrelle.config import Config, Strategy
 from pipistrelle.detection.merging import Heard, scan_of
 from pipistrelle.detection.noise import Noise, noise_of
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.beliefs import Track
+from pipistrelle.estimation.beliefs import Track, Trajectory
+from pipistrelle.estimation.catalogue import SECTIONS
 from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
 from pipistrelle.evaluation.consistency import track_nees
 from pipistrelle.experiments.hearing.listening import listen
-from pipistrelle.experiments.hearing.scenario import Scenario, world_of
-from pipistrelle.experiments.results.scores import Scores
-from pipistrelle.experiments.runs.trial import Case, drive_of, run_trial
+from pipistrelle.experiments.hearing.scenario import Scenario, bicycle, world_of
+from pipistrelle.experiments.results.scores import PathScores, Scores
+from pipistrelle.experiments.runs.outside import first_belief
+from pipistrelle.experiments.runs.trial import drive_of, run_trial
 from pipistrelle.experiments.studies.plan import Plan, PlannedCase, cases_of
 
 if TYPE_CHECKING:
     import polars as pl
 
-UNHEARD = ("filter", "rays", "fastslam")
-"""Sections that change neither the world nor what is heard in it."""
+ONLINE = ("position_rmse_m", "heading_rmse_rad", "nees_mean", "nees_max")
+"""Scores that a table has of the path as it was believed at its time, too, if it was revised."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +51,8 @@ class TrialRecord:
     error : str or None
         The traceback, if it failed; then there are neither scores nor rows of the other tables.
     scores : Scores or None
+    online : PathScores or None
+        Of the path as it was believed at its time, where the filter revises it.
     landmarks_full_mean : float or None
         Over the particles, where the filter has some.
     clutter_per_frame : float or None
@@ -68,6 +72,7 @@ class TrialRecord:
     beamwidth_deg: float | None
     error: str | None = None
     scores: Scores | None = None
+    online: PathScores | None = None
     landmarks_full_mean: float | None = None
     clutter_per_frame: float | None = None
     wall_s: float = 0.0
@@ -143,7 +148,7 @@ def world_tables(
     import polars as pl
 
     schemas = world_schemas(plan)
-    rows = [_row(iteration, record) for record in records]
+    rows = [_row(iteration, record, list(schemas["trials"])) for record in records]
 
     def joined(name: str, columns: dict[str, list[np.ndarray]]) -> pl.DataFrame:
         lengths = [len(part) for part in next(iter(columns.values()))]
@@ -201,6 +206,7 @@ def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
             "error": pl.String,
             **(scores | counts | {"diverged": pl.Boolean}),
             **dict.fromkeys(last, pl.Float64),
+            **dict.fromkeys(_online_columns(plan), pl.Float64),
         },
         "steps": {
             **world,
@@ -211,9 +217,18 @@ def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
     }
 
 
+def _online_columns(plan: Plan) -> tuple[str, ...]:
+    """Name the columns that a plan has only if one of its filters revises its path."""
+    motion = bicycle(plan.config.motion)
+    for name in plan.filters:
+        if isinstance(first_belief(name, motion, plan.config), Trajectory):
+            return tuple(f"online_{score}" for score in ONLINE)
+    return ()
+
+
 def _heard_settings(case: PlannedCase) -> str:
     """Return as text all settings that bear on a case's world and on what is heard in it."""
-    settings = case.config.model_dump(mode="json", exclude=set(UNHEARD))
+    settings = case.config.model_dump(mode="json", exclude=set(SECTIONS))
     del settings["emitter"]["radius"]
     return json.dumps(settings)
 
@@ -249,9 +264,8 @@ def _try_case(
         drive, radius = drive_of(scenario, case.config), case.config.emitter.radius
         heard, noise = beams[radius], noise_of(case.config.filter)
         scans = scans_of(radius, case.strategy, noise)
-        way = Case(strategy=case.strategy, filter=case.filter, iteration=iteration)
         began = time.thread_time()
-        result = run_trial(way, drive, scans, case.config)
+        result = run_trial(replace(case, iteration=iteration), drive, scans, case.config)
         cpu_s = time.thread_time() - began
         estimate = heaviest(result.track.landmarks)
         places = np.vstack((scenario.landmarks, scenario.beacon))
@@ -260,6 +274,7 @@ def _try_case(
             case=case,
             beamwidth_deg=_beamwidth_deg(case),
             scores=result.scores,
+            online=result.online,
             landmarks_full_mean=float(result.scores.landmarks_full if full is None else full),
             clutter_per_frame=sum(h.clutter for h in heard) / len(heard) if heard else None,
             wall_s=result.wall_s,
@@ -305,11 +320,11 @@ def _beamwidth_deg(case: PlannedCase) -> float | None:
     return degrees(beamwidth(emitter.radius, frequency=emitter.frequency, speed_of_sound=c))
 
 
-def _row(iteration: int, record: TrialRecord) -> dict[str, Any]:
+def _row(iteration: int, record: TrialRecord, columns: Sequence[str]) -> dict[str, Any]:
     """Lay out a trial's row."""
-    case, scores = record.case, record.scores
+    case, scores, online = record.case, record.scores, record.online
     nothing = dict.fromkeys(field.name for field in fields(Scores))
-    return {
+    row = {
         "iteration": iteration,
         "case": case.number,
         "strategy": case.strategy,
@@ -324,7 +339,9 @@ def _row(iteration: int, record: TrialRecord) -> dict[str, Any]:
         "clutter_per_frame": record.clutter_per_frame,
         "wall_s": record.wall_s,
         "cpu_s": record.cpu_s,
+        **{f"online_{name}": online and getattr(online, name) for name in ONLINE},
     }
+    return {column: row[column] for column in columns}
 
 
 def _cell(value: Any) -> Any:

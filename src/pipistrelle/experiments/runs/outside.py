@@ -1,0 +1,115 @@
+"""Estimators from outside: asked to begin before anything is heard, recorded when they fail.
+
+An error of a filter that is ours is a mistake in this package, and is left alone.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from traceback import extract_tb
+
+import numpy as np
+
+from pipistrelle.config import Config, InputError
+from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.beliefs import Belief, Gaussian, Track, no_landmarks
+from pipistrelle.estimation.catalogue import CATALOGUE, check_distinct, entry, worded
+from pipistrelle.estimation.motion import Motion
+from pipistrelle.experiments.cases import Case
+from pipistrelle.experiments.drives import Drive
+from pipistrelle.experiments.results.scores import TrialResult, score
+
+
+def check_filters(filters: Sequence[str], motion: Motion, config: Config) -> None:
+    """Refuse estimators from outside that cannot begin, before anything is heard.
+
+    Parameters
+    ----------
+    filters : sequence of str
+        The names of estimators.
+    motion : Motion
+    config : Config
+
+    Raises
+    ------
+    InputError
+        Where one cannot be had or built, does not begin with a belief, or would have the files of
+        another.
+    """
+    check_distinct(filters)
+    for name in filters:
+        if name in CATALOGUE:
+            continue
+        try:
+            belief = first_belief(name, motion, config)
+        except InputError:
+            raise
+        except Exception as error:
+            raise InputError(f"filter {name}: init fails: {_told(error)}") from error
+        parts = ("pose", "landmarks", "gated")
+        if lacking := [part for part in parts if not hasattr(belief, part)]:
+            raise InputError(
+                f"filter {name}: init returns a belief that lacks {', '.join(lacking)}; a belief "
+                f"has {', '.join(parts)}"
+            )
+
+
+def first_belief(name: str, motion: Motion, config: Config) -> Belief:
+    """Return what an estimator believes before it has moved or heard anything.
+
+    Parameters
+    ----------
+    name : str
+    motion : Motion
+    config : Config
+
+    Returns
+    -------
+    Belief
+
+    Raises
+    ------
+    InputError
+        Where the estimator cannot be had or built.
+
+    Examples
+    --------
+    >>> still = Motion(model="unicycle", control_std=(0.1, 0.1))
+    >>> first_belief("fastslam", still, Config()).landmarks().landmark.size
+    0
+    """
+    return entry(name).build(config, motion).init(Gaussian(mean=np.zeros(3), covariance=np.eye(3)))
+
+
+def failed_trial(case: Case, drive: Drive, scans: Sequence[Scan], error: Exception) -> TrialResult:
+    """Return the estimate of a filter that failed: nowhere, and no map.
+
+    Parameters
+    ----------
+    case : Case
+    drive : Drive
+    scans : sequence of Scan
+    error : Exception
+        What it failed with.
+
+    Returns
+    -------
+    TrialResult
+    """
+    k = drive.time.size
+    nowhere = Gaussian(mean=np.full((k, 3), np.nan), covariance=np.full((k, 3, 3), np.nan))
+    track = Track(time=drive.time, pose=nowhere, landmarks=no_landmarks(), gated=0)
+    return TrialResult(
+        strategy=case.strategy,
+        filter=case.filter,
+        track=track,
+        scans=tuple(scans),
+        scores=score(track, drive.truth, scans, 0.0),
+        wall_s=0.0,
+        error=_told(error),
+    )
+
+
+def _told(error: Exception) -> str:
+    """Word an error that a filter from outside raised, and where."""
+    place = extract_tb(error.__traceback__)[-1]
+    return f"{worded(error)} ({Path(place.filename).name}, line {place.lineno})"
