@@ -23,7 +23,7 @@ from pipistrelle.experiments.studies import executors, study
 from pipistrelle.experiments.studies.plan_file import plan_text
 from pipistrelle.experiments.studies.store import done_worlds
 from pipistrelle.experiments.studies.study import run_study
-from reference.studies import assert_same, fatal, leftovers, lost, plan_of, results
+from reference.studies import SMALL, assert_same, fatal, leftovers, lost, plan_of, results
 
 UNTIL_KILLED = """\
 import os, signal, sys
@@ -321,6 +321,29 @@ class TestDask(ExecutorContract):
     def run(self, plan, folder):
         standing = run_study(plan, folder, scheduler=self.address)
         assert (standing.done, set(standing.failed.values())) == (5, {0})
+
+
+MINE = """
+from pipistrelle.estimation.ekf.filter import EkfSlam
+
+class Mine:
+    def from_config(config, motion):
+        return EkfSlam(motion=motion, range_std=0.2, bearing_std=0.15, rays=config.rays)
+    init = predict = update = EkfSlam.update
+"""
+
+
+@pytest.mark.slow
+def test_workers_of_a_cluster_find_an_estimator_where_the_study_was_started(
+    cluster, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / "mine_of_dask.py").write_text(MINE)
+    monkeypatch.chdir(tmp_path / "here")  # the cluster was started elsewhere
+    plan = plan_of(tmp_path, 'filters = ["mine_of_dask:Mine"]\n' + SMALL)
+    standing = run_study(plan, tmp_path / "study", scheduler=cluster[0])
+    assert (standing.done, set(standing.failed.values())) == (3, {0})
 
 
 class TestDaskWithAWorkerKilled(TestDask):

@@ -1,0 +1,336 @@
+"""Estimators that are not in the package: from an installed wheel, or a file in the folder."""
+
+import json
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pipistrelle.__main__ import main
+from pipistrelle.config import Config, InputError, ScenarioConfig
+from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, entry, title_of
+from pipistrelle.experiments.runs.trial import run_mission
+from pipistrelle.experiments.studies.plan_file import find_plan, plan_text, read_plan
+from pipistrelle.experiments.studies.store import load_study
+from pipistrelle.experiments.studies.study import run_study
+from reference.studies import SMALL, assert_same, plan_of, results
+
+RECKONING, SHIFTED = "toy_estimators:DeadReckoning", "toy_estimators:Shifted"
+SHORT = ("--duration", "10", "--seed", "7", "--quiet")
+ONLINE = [
+    "online_position_rmse_m",
+    "online_heading_rmse_rad",
+    "online_nees_mean",
+    "online_nees_max",
+]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """A folder of installed packages with the toys in it, from a wheel built here."""
+    source, site = tmp_path_factory.mktemp("wheel") / "source", tmp_path_factory.mktemp("site")
+    ignored = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(Path(__file__).with_name("toy_wheel"), source, ignore=ignored)
+    build = (sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", "dist")
+    subprocess.run(build, cwd=source, check=True, capture_output=True)
+    (wheel,) = (source / "dist").glob("*.whl")
+    install = (sys.executable, "-m", "pip", "install", "--no-index", "--no-deps", "--target")
+    subprocess.run([*install, str(site), str(wheel)], check=True, capture_output=True)
+    return site
+
+
+@pytest.fixture
+def toys(site, monkeypatch, tmp_path):
+    """The toys installed; the current folder is another."""
+    monkeypatch.syspath_prepend(site)
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def written(tmp_path, monkeypatch):
+    """Write a module into the current folder and return its name, a new one each time."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+
+    def written(text):
+        name = f"mine_{tmp_path.name}_{len(list(tmp_path.glob('*.py')))}".replace("-", "_")
+        Path(f"{name}.py").write_text(text)
+        return name
+
+    return written
+
+
+def summary(folder):
+    return json.loads((Path(folder) / "summary.json").read_text())["runs"]
+
+
+def test_an_installed_estimator_runs_a_mission_and_solves_its_log(toys):
+    assert main(["run", *SHORT, "--filter", RECKONING, "-o", "one", "--save-log", "log"]) == 0
+    assert main(["slam", "log", "--seed", "7", "--quiet", "--filter", RECKONING, "-o", "two"]) == 0
+    assert [(r["strategy"], r["filter"]) for r in summary("one")] == [
+        (strategy, RECKONING) for strategy in ("active", "fused", "passive")
+    ]
+    assert "online" not in summary("one")[0]
+    files = Counter(path.name for path in Path("one").glob("*_*.*"))
+    assert files == Counter(
+        f"{kind}_{strategy}_DeadReckoning.{ending}"
+        for kind, ending in (("track", "tum"), ("map", "csv"))
+        for strategy in ("active", "fused", "passive")
+    )
+    assert set(pl.read_parquet("one/steps.parquet")["filter"]) == {RECKONING}
+    assert "_online" not in Path("one/README.md").read_text()
+    tracks = [np.loadtxt(f"{name}/track_fused_DeadReckoning.tum") for name in ("one", "two")]
+    np.testing.assert_allclose(*tracks, rtol=0, atol=1e-9)
+
+
+def test_a_path_that_is_revised_is_scored_and_written_beside_the_one_believed_online(toys):
+    words = ("run", *SHORT, "--strategy", "fused")
+    for name in (RECKONING, SHIFTED):
+        assert main([*words, "--filter", name, "-o", name[15:]]) == 0
+    (plain,), (revised,) = summary("DeadReckoning"), summary("Shifted")
+    scores = ("position_rmse_m", "heading_rmse_rad", "position_rmse_aligned_m")
+    assert revised["online"] == {name: plain[name] for name in (*scores, "nees_mean", "nees_max")}
+    assert revised["position_rmse_m"] > plain["position_rmse_m"]
+    final, online, reckoned = (
+        np.loadtxt(f"{name}.tum")
+        for name in (
+            "Shifted/track_fused_Shifted",
+            "Shifted/track_fused_Shifted_online",
+            "DeadReckoning/track_fused_DeadReckoning",
+        )
+    )
+    np.testing.assert_array_equal(online, reckoned)
+    np.testing.assert_allclose(final - online, [[0, 1, 0, 0, 0, 0, 0, 0]] * 81, atol=1e-9)
+    assert "track_S_F_online.tum" in Path("Shifted/README.md").read_text()
+    drawn = pl.read_parquet("Shifted/steps.parquet")["x_m"]
+    np.testing.assert_allclose(drawn, final[:, 1], atol=1e-9)
+    assert main([*words, "--filter", "ekf", "-o", "Shifted", "--overwrite"]) == 0
+    assert not list(Path("Shifted").glob("*_online.tum"))
+
+
+def test_a_study_tries_it_beside_the_papers_two_and_leaves_their_results_as_they_are(
+    toys, tmp_path
+):
+    small = SMALL.replace("iterations = 3", "iterations = 2").replace("0.0025, 0.025", "0.0088")
+    plans = [
+        plan_of(tmp_path, f"filters = {json.dumps(names)}\n{small}")
+        for names in (PAPERS, (*PAPERS, SHIFTED))
+    ]
+    for plan, folder in zip(plans, (tmp_path / "two", tmp_path / "three"), strict=True):
+        standing = run_study(plan, folder)
+        assert (standing.done, set(standing.failed.values())) == (2, {0})
+    two, three = (load_study(tmp_path / name).trials.collect() for name in ("two", "three"))
+    assert [name for name in three.columns if name not in two.columns] == ONLINE
+    ours, theirs = three.filter(pl.col("filter") != SHIFTED), three.filter(filter=SHIFTED)
+    kept = [name for name in two.columns if name not in ("case", "wall_s", "cpu_s")]
+    assert ours.select(kept).equals(two.select(kept))
+    assert ours.select(ONLINE).null_count().row(0) == (len(ours),) * 4
+    assert theirs.select(ONLINE).null_count().row(0) == (0,) * 4
+    better = theirs["online_position_rmse_m"] < theirs["position_rmse_m"]
+    assert better.all()
+    assert theirs["diverged"].to_list() == [worst > 123.0 for worst in theirs["nees_max"]]
+
+
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_study_from_the_command_line_in_this_process_or_in_others(toys, workers):
+    small = SMALL.replace("iterations = 3", "iterations = 2").replace("0.0025, 0.025", "0.0088")
+    Path("small.toml").write_text(f'filters = ["{RECKONING}"]\n{small}')
+    words = ("study", "small.toml", "--workers", str(workers), "-o", "study", "--quiet")
+    assert main(words) == 0
+    trials = load_study(Path("study")).trials.collect()
+    assert trials["status"].to_list() == ["done"] * 6
+    assert set(trials["filter"]) == {RECKONING}
+    assert not set(ONLINE) & set(trials.columns)
+    assert read_plan(Path("study/plan.toml")).filters == (RECKONING,)
+
+
+def test_its_title_is_its_own_where_it_is_installed_and_else_its_class(toys, monkeypatch):
+    assert title_of(SHIFTED) == "shifted reckoning"
+    assert title_of(RECKONING) == "DeadReckoning"
+    assert entry(SHIFTED).nees_limit == 123.0
+    assert title_of("nowhere:Shifted") == "Shifted"
+
+
+# In the current folder
+
+RECKONS = """\
+from toy_estimators import *
+
+class Mine(DeadReckoning):
+    title = "mine"
+"""
+
+
+def test_workers_find_it_in_the_folder_in_which_the_study_was_started(toys, written, tmp_path):
+    name = f"{written(RECKONS)}:Mine"
+    small = SMALL.replace("iterations = 3", "iterations = 2").replace("0.0025, 0.025", "0.0088")
+    plan = plan_of(tmp_path, f'filters = ["ekf", "{name}"]\nstrategies = ["active"]\n{small}')
+    for workers in (1, 2):
+        standing = run_study(plan, tmp_path / f"by_{workers}", workers=workers)
+        assert (standing.done, standing.failed) == (2, {"active": 0})
+    assert_same(*(results(tmp_path / f"by_{workers}") for workers in (1, 2)))
+
+
+def test_one_in_the_current_folder_goes_before_one_that_is_installed(toys, written):
+    Path("toy_estimators.py").write_text("class DeadReckoning: pass\n")
+    sys.modules.pop("toy_estimators", None)
+    with pytest.raises(InputError, match="lacks init, predict, update"):
+        entry(RECKONING)
+    sys.modules.pop("toy_estimators")
+
+
+PARTS = """
+    def init(self, pose): return Reckoned(at=pose)
+    def predict(self, belief, controls, dt, rng): return belief, belief.pose()
+    def update(self, belief, scan, rng): return belief
+"""
+ODD = {
+    "an error": ("raise OSError('no licence')", "importing NAME fails: OSError: no licence"),
+    "no Python": ("class Mine(", "importing NAME fails: SyntaxError: "),
+    "an exit": ("raise SystemExit(3)", "importing NAME fails: SystemExit: 3"),
+    "lacking": ("import not_there_at_all", "importing NAME fails: ModuleNotFoundError: No module"),
+    "no class": ("", "found no class Mine in NAME"),
+    "a thing": ("Mine = 3", "found Mine, which is no class, in NAME"),
+    "no update": (
+        "class Mine:\n    def init(self): ...\n    def predict(self): ...",
+        "lacks update; an estimator has init, predict, update",
+    ),
+    "no record": (f"class Mine:{PARTS}", "cannot be built: it is no dataclass"),
+    "a field": (
+        f"from dataclasses import dataclass\n@dataclass\nclass Mine:\n    sonar: int{PARTS}",
+        "cannot be built: found no value for sonar, expected fields among motion, rays, gate, con",
+    ),
+    "a refusal": (
+        f"class Mine:{PARTS}\n    @classmethod\n    def from_config(cls, config, motion): 1 / 0",
+        "cannot be built: ZeroDivisionError: division by zero",
+    ),
+    "a title": (f"class Mine:{PARTS}\n    title = 3", "title: found 3, expected text"),
+    "a limit": (
+        f"class Mine:{PARTS}\n    nees_limit = 0",
+        "nees_limit: found 0, expected a",
+    ),
+    "a start": (
+        f"from dataclasses import dataclass\n@dataclass\nclass Mine:{PARTS}",
+        r"init fails: NameError: name 'Reckoned' is not defined (NAME.py, line 4)",
+    ),
+    "a belief": (
+        f"from dataclasses import dataclass\n@dataclass\nclass Mine:{PARTS}\nReckoned = dict",
+        "init returns a belief that lacks pose, landmarks, gated",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", ODD)
+def test_what_cannot_be_had_built_or_begun_is_refused_in_a_line(written, case, capsys):
+    text, said = ODD[case]
+    name = written(text)
+    assert main(["run", *SHORT, "--filter", f"{name}:Mine", "-o", "one"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"pipistrelle: error: filter {name}:Mine: {said.replace('NAME', name)}")
+    assert error.count("\n") == 1
+    assert not Path("one").exists()
+
+
+def test_a_module_that_is_nowhere_is_refused_with_where_it_was_looked_for(written, capsys):
+    for name in ("nowhere_at_all", "nowhere_at_all.deeper"):
+        assert main(["run", *SHORT, "--filter", f"{name}:Mine", "-o", "one"]) == 2
+        error = capsys.readouterr().err
+        assert f"found no module nowhere_at_all, neither installed nor in {Path.cwd()}" in error
+
+
+def test_a_study_refuses_it_before_its_folder_is_made(written, tmp_path):
+    plan = plan_of(tmp_path, f'filters = ["ekf", "{written("")}:Mine"]\n{SMALL}')
+    with pytest.raises(InputError, match="found no class Mine"):
+        run_study(plan, tmp_path / "study")
+    assert not (tmp_path / "study").exists()
+
+
+def test_two_classes_of_one_name_are_not_for_one_run(toys, written):
+    names = (RECKONING, f"{written('from toy_estimators import *')}:DeadReckoning")
+    with pytest.raises(InputError, match="would write the same files"):
+        run_mission(Config(scenario=ScenarioConfig(steps=8)), ("fused",), names)
+
+
+def test_particles_are_refused_for_one_that_has_none(toys, capsys):
+    assert main(["run", *SHORT, "--filter", RECKONING, "--particles", "9"]) == 2
+    said = f"--particles: found 9, but --filter is {RECKONING}, which has none; add --filter fas"
+    assert said in capsys.readouterr().err
+
+
+FAILING = {
+    "raises": ("update", "1 / 0", "ZeroDivisionError: division by zero"),
+    "forgets": ("update", "None", "AttributeError: 'NoneType' object has no attribute"),
+    "shortens": (
+        "predict",
+        "(belief, Gaussian(mean=np.zeros((9, 3)), covariance=np.zeros((9, 3, 3))))",
+        "ValueError: could not broadcast",
+    ),
+    "is lost": (
+        "predict",
+        "(belief, Gaussian(mean=np.full((4, 3), np.nan), covariance=np.zeros((4, 3, 3))))",
+        "its path is not finite",
+    ),
+}
+
+
+@pytest.mark.parametrize("way", FAILING)
+def test_one_that_fails_on_the_way_is_a_failed_trial_of_a_run(toys, written, way, capsys):
+    method, answer, said = FAILING[way]
+    name = written(
+        "from toy_estimators import *\nfrom toy_estimators import DeadReckoning, Gaussian, np\n"
+        f"class Mine(DeadReckoning):\n    def {method}(self, belief, *given): return {answer}\n"
+    )
+    words = ["--filter", f"{name}:Mine", "--strategy", "active", "-o", "one"]
+    words += ["--animate"] if way == "raises" else []  # there is no frame to show
+    assert main(["run", *SHORT, *words]) == 1
+    printed = capsys.readouterr()
+    assert printed.out.splitlines()[-1] == "one"
+    assert f"pipistrelle: warning: active {name}:Mine failed: {said}" in printed.err
+    (run,) = summary("one")
+    assert (run["diverged"], run["position_rmse_m"]) == (True, None)
+
+
+def test_one_that_fails_on_the_way_is_a_failed_trial_of_a_study(toys, written, tmp_path):
+    name = written(
+        "from toy_estimators import *\n"
+        "class Mine(Shifted):\n    def update(self, belief, scan, rng): return 1 / 0\n"
+    )
+    plan = plan_of(tmp_path, f'filters = ["ekf", "{name}:Mine"]\nstrategies = ["active"]\n{SMALL}')
+    standing = run_study(plan, tmp_path / "study")
+    assert standing.failed == {"active": 6}
+    assert standing.first_error == "ZeroDivisionError: division by zero"
+    trials = load_study(tmp_path / "study").trials.collect()
+    assert trials.filter(status="failed")["error"].str.contains("Traceback").all()
+    assert set(ONLINE) < set(trials.columns)
+
+
+def test_a_path_that_lacks_poses_is_said_to(toys, written, capsys):
+    name = written(
+        "from dataclasses import dataclass\nfrom toy_estimators import *\n"
+        "@dataclass(frozen=True)\nclass Short(Kept):\n    def path(self): return self.at\n"
+        "class Mine(Shifted):\n    def init(self, pose): return Short(at=pose)\n"
+    )
+    words = ("--filter", f"{name}:Mine", "--strategy", "active", "-o", "one")
+    assert main(["run", *SHORT, *words]) == 1
+    said = "path: found arrays of (3,) and (3, 3), expected (81, 3) and (81, 3, 3): the start and"
+    assert said in capsys.readouterr().err
+
+
+# A third estimator in the catalogue
+
+
+def test_a_third_estimator_changes_nothing_of_the_papers(monkeypatch):
+    plan = plan_text(read_plan(find_plan("paper")))
+    third = entry("pipistrelle.estimation.ekf.filter:EkfSlam")
+    monkeypatch.setitem(CATALOGUE, "third", third)
+    assert plan_text(read_plan(find_plan("paper"))) == plan
+    assert read_plan(find_plan("paper")).filters == PAPERS == ("ekf", "fastslam")
+    from pipistrelle.verbs.options import filters
+
+    assert filters("both", None) == PAPERS
+    assert filters("third", None) == ("third",)
