@@ -34,7 +34,6 @@ def _whole(_: Any, tokens: Sequence[Any]) -> int:
 
 
 Whole = Annotated[int, Parameter(converter=_whole)]
-_LISTED: Any = Literal[(*CATALOGUE, "both")]
 
 
 def _filter(_: Any, tokens: Sequence[Any]) -> str:
@@ -43,8 +42,10 @@ def _filter(_: Any, tokens: Sequence[Any]) -> str:
 
 
 if TYPE_CHECKING:
+    _LISTED: Any = str
     ChosenFilter = str
-else:  # the help lists those that are listed
+else:  # the help names those that are listed
+    _LISTED = Literal[(*CATALOGUE, "both")]
     ChosenFilter = Annotated[_LISTED | str, Parameter(converter=_filter, metavar="CHOICE")]
 Particles = Annotated[
     Whole | None,
