@@ -85,7 +85,9 @@ def test_names_are_told_once_for_all_panels_and_not_at_all_when_many():
     assert draw_chart(chart_of(panel_of(*many))).legends == []
 
 
-@pytest.mark.parametrize(("count", "grid"), [(1, (1, 1)), (2, (1, 2)), (3, (1, 3)), (4, (2, 2))])
+@pytest.mark.parametrize(
+    ("count", "grid"), [(1, (1, 1)), (2, (1, 2)), (3, (1, 3)), (4, (2, 2)), (6, (2, 3))]
+)
 def test_panels_stand_side_by_side(count, grid):
     figure = draw_chart(chart_of(*[panel_of(fused())] * count))
     spec = figure.axes[0].get_subplotspec().get_gridspec()

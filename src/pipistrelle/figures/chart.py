@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from jaxtyping import Float
 
+from pipistrelle.figures.style import COLUMNS
+
 if TYPE_CHECKING:
     from matplotlib.ticker import Locator
 
@@ -294,6 +296,29 @@ def ends(found: Iterable[Series]) -> list[float]:
         if part is not None
         for value in part
     ]
+
+
+def columns_of(count: int) -> int:
+    """Tell how many panels stand beside each other.
+
+    Parameters
+    ----------
+    count : int
+        Panels of the chart.
+
+    Returns
+    -------
+    int
+        All, up to `style.COLUMNS`; of more, as many as that if they fill their rows, else two.
+
+    Examples
+    --------
+    >>> [columns_of(count) for count in (1, 3, 4, 6)]
+    [1, 3, 2, 3]
+    """
+    if count <= COLUMNS:
+        return count
+    return 2 if count % COLUMNS else COLUMNS
 
 
 def legend_series(panels: Iterable[Panel]) -> dict[str, Series]:

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipistrelle.figures.chart import MARKS, Axis, Chart, Panel, Series, legend_series
-from pipistrelle.figures.style import COLUMNS, INK, STYLE, TRUTH, strategy_colour
+from pipistrelle.figures.chart import MARKS, Axis, Chart, Panel, Series, columns_of, legend_series
+from pipistrelle.figures.style import INK, STYLE, TRUTH, strategy_colour
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,7 +51,7 @@ def draw_chart(chart: Chart) -> "Figure":
     count = len(chart.panels)
     if count == 0:
         raise ValueError("a chart's figure needs at least one panel")
-    columns = count if count <= COLUMNS else 2
+    columns = columns_of(count)
     rows = -(-count // columns)
     height = ROW
     if (first := chart.panels[0]).equal:

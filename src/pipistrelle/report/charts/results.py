@@ -1,11 +1,11 @@
 """The paper's figures of results as charts of a selection of worlds.
 
-`CHARTS`, at the end, is the only list of them. To add a figure, write a function from a selection
-to its charts and name it there: page, PNG, PDF and CSV follow.
+`CHARTS` is the only list of them. To add a figure, write a function from a selection to its charts
+and name it there: page, PNG, PDF and CSV follow.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -30,12 +30,25 @@ ASIDE = {"active": 0.985, "fused": 1.015, "passive": 1.0}
 """Where the single worlds of a strategy stand beside their beamwidth, as a share of it."""
 EDGE = 1.08
 """Where those of passive sensing stand, as a share of the widest beam."""
-DEGREES = 180.0 / np.pi
 DIFFERENCE = "active minus fused; open: not significant"
 
 
-class ErrorChart(NamedTuple):
-    """What a chart of an RMSE is made of, and how it is called."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ErrorChart:
+    """What makes the chart of an RMSE.
+
+    Attributes
+    ----------
+    name, title : str
+        Of the chart.
+    score : one of `studied.SCORES`, or `studied.COMMON`
+    label : str
+        Of the axis.
+    column : str
+        Of the CSV.
+    scale : float
+        From the score to the axis.
+    """
 
     name: str
     title: str
@@ -47,17 +60,28 @@ class ErrorChart(NamedTuple):
 
 ERRORS = (
     ErrorChart(
-        "position_rmse", "Vehicle position RMSE", POSITION, "position RMSE [m]", "position_rmse_m"
+        name="position_rmse",
+        title="Vehicle position RMSE",
+        score=POSITION,
+        label="position RMSE [m]",
+        column="position_rmse_m",
     ),
     ErrorChart(
-        "heading_rmse", "Vehicle heading RMSE", HEADING, "heading RMSE [°]", "heading_rmse_deg",
-        DEGREES,
+        name="heading_rmse",
+        title="Vehicle heading RMSE",
+        score=HEADING,
+        label="heading RMSE [°]",
+        column="heading_rmse_deg",
+        scale=180.0 / np.pi,
     ),
     ErrorChart(
-        "map_rmse", "Map RMSE of the landmarks that every strategy has placed", COMMON,
-        "map RMSE [m]", "map_rmse_m",
+        name="map_rmse",
+        title="Map RMSE of the landmarks that every strategy has placed",
+        score=COMMON,
+        label="map RMSE [m]",
+        column="map_rmse_m",
     ),
-)  # fmt: skip
+)
 
 
 def gain_charts(selection: Selection) -> list[Chart]:

@@ -48,7 +48,7 @@ def answer(selections: Mapping[Rule, Selection], claims: Sequence[JudgedClaim]) 
         _compared("The landmarks that every strategy places are placed", papers, COMMON),
         _compared("The vehicle is located", papers, POSITION),
         _diverged(papers.study),
-        _tally(claims),
+        _verdicts(claims),
     )
     headline = by_rule["world"]
     if len(set(by_rule.values())) > 1:
@@ -213,7 +213,7 @@ def _beams(findings: Sequence[Finding], holds: bool) -> str:
     return f"{count} of {len(findings)} beamwidths ({which})"
 
 
-def _tally(claims: Sequence[JudgedClaim]) -> str:
+def _verdicts(claims: Sequence[JudgedClaim]) -> str:
     """Count the verdicts."""
     verdicts = [claim.verdict for claim in claims]
     words = []

@@ -19,7 +19,7 @@ from pipistrelle import __version__
 from pipistrelle.config import InputError
 from pipistrelle.evaluation.comparison import Finding
 from pipistrelle.experiments.results.folder import write_file
-from pipistrelle.figures.chart import Chart, Panel, csv_rows, csv_text
+from pipistrelle.figures.chart import Chart, Panel, columns_of, csv_rows, csv_text
 from pipistrelle.figures.style import STRATEGY_COLOURS
 from pipistrelle.report.charts.results import CHARTS, study_charts
 from pipistrelle.report.charts.setting import model_charts
@@ -165,7 +165,9 @@ def _figure(name: str, found: Mapping[Any, list[Chart]]) -> dict[str, Any]:
         panels = [_panel(panel) for panel in chart.panels]
         by_rule[rule] = {"chart": chart, "panels": panels, "legend": legend(chart.panels)}
     first = next(iter(named.values()))
-    return {"name": name, "title": first.title, "by_rule": by_rule, "count": len(first.panels)}
+    count = len(first.panels)
+    columns = count if count <= 4 else columns_of(count)  # the style sheet has four as two by two
+    return {"name": name, "title": first.title, "by_rule": by_rule, "columns": columns}
 
 
 def _panel(panel: Panel) -> dict[str, Any]:
