@@ -25,7 +25,7 @@ def some_frames(world: Scenario, every: int) -> Scenario:
         path=world.path[kept],
         controls=world.controls[steps - 1],
         landmarks=world.landmarks,
-        beacon=world.beacon,
+        callers=world.callers,
     )
 
 

@@ -11,6 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from pipistrelle.acoustics.arrivals import arrivals_of_emission, through_piston
+from pipistrelle.acoustics.callers import callers_of
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import BLOCK, blocks_to_hear, record_samples, sampling
 from pipistrelle.config import Config
@@ -28,15 +29,16 @@ speed_of_sound = config.air.speed_of_sound
 
 pose, velocity = np.zeros(3), np.array([0.75, 0.0])
 landmarks, beacon = np.array([[6.0, 1.5], [4.0, -1.0], [-5.0, 3.0]]), np.array([9.0, 10.0])
+callers = callers_of(config, beacon)
 arrivals = through_piston(
-    arrivals_of_emission(pose, velocity, landmarks, beacon, config),
+    arrivals_of_emission(pose, velocity, landmarks, callers, config),
     radius=config.emitter.radius,
     frequency=config.emitter.frequency,
     speed_of_sound=speed_of_sound,
 )
 for i in np.argsort(arrivals.delay):
     print(
-        f"{'passive' if arrivals.source[i] else 'active':<8} landmark {arrivals.landmark[i]}: "
+        f"{'passive' if arrivals.caller[i] else 'active':<8} landmark {arrivals.landmark[i]}: "
         f"{1e3 * arrivals.delay[i]:5.1f} ms, {np.degrees(arrivals.bearing[i]):6.1f}°, "
         f"{arrivals.level_db[i]:6.1f} dB"
     )
@@ -46,7 +48,7 @@ for i in np.argsort(arrivals.delay):
 # into one peak, and the energy over the ten microphones of a face is compared with a threshold
 # that noise alone passes once in a million tests.
 
-layout, settled = square_of_four(config.receiver), sampling(config)
+layout, settled = square_of_four(config.receiver), sampling(config, callers)
 rng = np.random.default_rng(config.seed)
 samples = record_samples(blocks_to_hear(arrivals, settled), arrivals, layout, settled, rng)
 length = settled.pulse * settled.block
@@ -57,7 +59,7 @@ matched = filter_samples(
     length=length,
     noise_std=settled.noise_std,
 )
-finder = detector(config, layout)
+finder = detector(config, layout, settled.tones)
 start = settled.pulse * BLOCK
 found = detect(matched, finder, start=start, interval=1.0 / settled.rate, pulse=length)
 
@@ -76,7 +78,7 @@ above.set_ylabel("one microphone")
 energy = np.sum(np.abs(matched[:, 0]) ** 2, axis=-1)
 lag = 1e3 * (start + np.arange(len(matched)) / settled.rate)
 for tone in (0, 1):
-    here = front & (found.tone == tone)
+    here = front & (found.caller == tone)
     below.semilogy(lag, energy[:, tone], color=colours[tone], lw=0.8, label=names[tone])
     below.plot(1e3 * found.delay[here], found.power[here], "o", color=colours[tone])
 below.axhline(finder.threshold, color="black", ls=":", lw=1.0, label="threshold")
@@ -88,7 +90,7 @@ plt.show()
 # Each detection has a bearing and, where the vehicle itself called, a range: half the way that
 # sound goes in its delay. Landmark 1 stands 6.18 m away. How far off is its range?
 
-own = found.tone == 0
+own = found.caller == 0
 ranges = 0.5 * speed_of_sound * found.delay[own]
 true = np.hypot(6.0, 1.5)
 answer = float(np.min(np.abs(ranges - true)))

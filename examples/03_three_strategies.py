@@ -31,7 +31,7 @@ width = beamwidth(
 figure = draw_mission(
     mission.trials,
     truth=mission.drive.truth,
-    beacon=mission.scenario.beacon,
+    callers=mission.scenario.callers[1:],
     beamwidth=float(width),
 )
 

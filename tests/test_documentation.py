@@ -76,12 +76,14 @@ def guide():
 
 def test_the_guides_beam_changes_active_arrivals_outside_it_alone(guide):
     from pipistrelle.acoustics.arrivals import arrivals_of_emission
+    from pipistrelle.acoustics.callers import callers_of
     from pipistrelle.config import Config
 
     posts, beacon = np.array([[5.0, 0.5], [2.0, 5.0]]), np.array([0.0, 9.0])
-    before = arrivals_of_emission(np.zeros(3), np.zeros(2), posts, beacon, Config())
+    callers = callers_of(Config(), beacon)
+    before = arrivals_of_emission(np.zeros(3), np.zeros(2), posts, callers, Config())
     after = guide["through_window"](before, 0.3)
-    outside = (before.source == 0) & (np.abs(before.bearing) > 0.3)
+    outside = (before.caller == 0) & (np.abs(before.bearing) > 0.3)
     assert 0 < outside.sum() < outside.size
     np.testing.assert_array_equal(after.level_db - before.level_db, np.where(outside, -40.0, 0.0))
 
@@ -94,6 +96,14 @@ def test_the_guides_array_finds_a_bearing(guide):
     power = beamscan(steering_vector(angles[75], **ears), angles, **ears)
     assert np.argmax(power) == 75
     assert guide["hexagon"].normal.size == 6
+
+
+def test_the_guides_second_caller_is_mapped_and_its_moving_one_is_not(guide):
+    two, moving = guide["two_beacons"].track.landmarks, guide["with_a_boat"].track.landmarks
+    assert {51, 52} <= set(two.landmark.tolist())
+    assert 51 in moving.landmark
+    assert 52 not in moving.landmark
+    assert any(52 in frame.landmark for frame in guide["heard"])
 
 
 def test_the_guides_filter_drives_a_mission(guide):

@@ -20,7 +20,7 @@ from pipistrelle.config import Config, FastSlamConfig, Strategy
 from pipistrelle.detection.merging import Heard, scan_of
 from pipistrelle.detection.scans import Scan
 from pipistrelle.experiments.hearing.listening import listen
-from pipistrelle.experiments.hearing.scenario import Scenario, world_of
+from pipistrelle.experiments.hearing.scenario import Scenario, standing_landmarks, world_of
 from pipistrelle.experiments.runs.trial import Case, drive_of, run_trial
 from pipistrelle.geometry import range_and_bearing, wrap
 
@@ -40,7 +40,7 @@ COLUMNS = (
 
 def measurement_errors(scans: Sequence[Scan], scenario: Scenario) -> tuple[float, float]:
     """Return the RMS errors of bearing [rad] and range [m] against the true geometry."""
-    places = np.vstack((scenario.landmarks, scenario.beacon))
+    _, places = standing_landmarks(scenario)
     bearing, distance = [], []
     for scan in scans:
         k = int(np.searchsorted(scenario.time, scan.time))

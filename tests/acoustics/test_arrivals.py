@@ -8,14 +8,13 @@ from hypothesis import strategies as st
 from scipy.special import jn_zeros
 
 from pipistrelle.acoustics.arrivals import (
-    ACTIVE,
-    PASSIVE,
     Arrivals,
     arrivals_of_emission,
     arrivals_of_emissions,
     rows_of,
     through_piston,
 )
+from pipistrelle.acoustics.callers import VEHICLE, callers_of
 from pipistrelle.acoustics.emitter import piston_directivity
 from pipistrelle.config import (
     AirConfig,
@@ -32,6 +31,7 @@ STILL = np.zeros(2)
 ORIGIN = np.zeros(3)
 SEEDS = st.integers(0, 2**32 - 1)
 LAWS = st.sampled_from(["paper", "bistatic"])
+BEACON = 1
 PISTON = {"radius": 0.0088, "frequency": 35e3, "speed_of_sound": 343.0}
 
 
@@ -54,6 +54,16 @@ def as_by_hand(spreading):
 CONFIG = as_by_hand("paper")
 
 
+def sounds_of_emission(pose, velocity, landmarks, beacon, config):
+    """Return what one emission of the paper's two callers brings."""
+    return arrivals_of_emission(pose, velocity, landmarks, callers_of(config, beacon), config)
+
+
+def sounds_of_emissions(poses, velocities, landmarks, beacon, config):
+    """Return what several emissions of the paper's two callers bring."""
+    return arrivals_of_emissions(poses, velocities, landmarks, callers_of(config, beacon), config)
+
+
 def world(seed):
     """Pose, velocity, landmarks and beacon of some world; no two points coincide."""
     rng = np.random.default_rng(seed)
@@ -71,12 +81,12 @@ def rows(arrivals, chosen):
 @pytest.mark.shapes
 def test_active_echoes_come_first_then_passive_ones_then_the_beacons_call(seed):
     pose, velocity, landmarks, beacon = world(seed)
-    heard = arrivals_of_emission(pose, velocity, landmarks, beacon, CONFIG)
-    n, active = len(landmarks), int(np.sum(heard.source == ACTIVE))
-    assert heard.source.tolist() == [ACTIVE] * active + [PASSIVE] * (n + 1)
+    heard = sounds_of_emission(pose, velocity, landmarks, beacon, CONFIG)
+    n, active = len(landmarks), int(np.sum(heard.caller == VEHICLE))
+    assert heard.caller.tolist() == [VEHICLE] * active + [BEACON] * (n + 1)
     assert np.all(np.diff(heard.landmark[:active]) > 0)
     assert heard.landmark[active:].tolist() == list(range(1, n + 2))
-    assert heard.source.dtype == np.int8
+    assert heard.caller.dtype == np.int8
     assert all(np.isfinite(column).all() for column in rows(heard, slice(None)).values())
 
 
@@ -84,13 +94,13 @@ def test_active_echoes_come_first_then_passive_ones_then_the_beacons_call(seed):
 @law
 def test_delays_and_bearings_are_those_of_the_straight_paths(seed):
     pose, velocity, landmarks, beacon = world(seed)
-    heard = arrivals_of_emission(pose, velocity, landmarks, beacon, CONFIG)
+    heard = sounds_of_emission(pose, velocity, landmarks, beacon, CONFIG)
     points = np.vstack([landmarks, beacon])
-    for delay, bearing, source, landmark in zip(
-        heard.delay, heard.bearing, heard.source, heard.landmark, strict=True
+    for delay, bearing, whose, landmark in zip(
+        heard.delay, heard.bearing, heard.caller, heard.landmark, strict=True
     ):
         point = points[landmark - 1]
-        caller = pose[:2] if source == ACTIVE else beacon
+        caller = pose[:2] if whose == VEHICLE else beacon
         path = math.dist(caller, point) + math.dist(point, pose[:2])
         seen = math.atan2(*(point - pose[:2])[::-1]) - pose[2]
         assert delay == pytest.approx(path / 343.0, rel=1e-14)
@@ -102,10 +112,10 @@ def test_delays_and_bearings_are_those_of_the_straight_paths(seed):
 @law
 def test_the_baffle_hides_what_is_behind_from_the_vehicles_call_alone(seed):
     pose, velocity, landmarks, beacon = world(seed)
-    heard = arrivals_of_emission(pose, velocity, landmarks, beacon, CONFIG)
+    heard = sounds_of_emission(pose, velocity, landmarks, beacon, CONFIG)
     _, bearing = range_and_bearing(pose, np.vstack([landmarks, beacon]))
     ahead = 1 + np.flatnonzero(np.abs(bearing) <= np.pi / 2)
-    assert heard.landmark[heard.source == ACTIVE].tolist() == ahead.tolist()
+    assert heard.landmark[heard.caller == VEHICLE].tolist() == ahead.tolist()
 
 
 def test_levels_of_one_world_are_those_worked_out_by_hand():
@@ -119,7 +129,7 @@ def test_levels_of_one_world_are_those_worked_out_by_hand():
     #   the beacon's call   50 - 20 log 13 - 0.937 x 13          = 50 - 22.279 - 12.181 =  15.540
     landmarks, beacon = np.array([[5.0, 0.0]]), np.array([5.0, 12.0])
     for spreading, echo in (("paper", 8.076), ("bistatic", -2.878)):
-        heard = arrivals_of_emission(ORIGIN, STILL, landmarks, beacon, as_by_hand(spreading))
+        heard = sounds_of_emission(ORIGIN, STILL, landmarks, beacon, as_by_hand(spreading))
         # The last digit of the absorption is worth 0.0005 x 26 m.
         expected = [13.711, -21.016, echo, 15.540]
         np.testing.assert_allclose(heard.level_db, expected, atol=0.015)
@@ -128,7 +138,7 @@ def test_levels_of_one_world_are_those_worked_out_by_hand():
 def test_a_landmark_between_beacon_and_vehicle_throws_forward():
     # Straight on, a cylinder throws 10 log(4kr / pi) re backscatter.
     landmarks, beacon = np.array([[5.0, 0.0]]), np.array([15.0, 0.0])
-    heard = arrivals_of_emission(ORIGIN, STILL, landmarks, beacon, as_by_hand("paper"))
+    heard = sounds_of_emission(ORIGIN, STILL, landmarks, beacon, as_by_hand("paper"))
     echo, call = heard.level_db[-2:]
     gain = 10 * math.log10(4 / math.pi * 2 * math.pi * 30e3 / 343.0 * 0.025)
     assert echo - call == pytest.approx(gain, abs=1e-9)  # a mirror adds no spreading
@@ -139,8 +149,8 @@ def test_a_landmark_between_beacon_and_vehicle_throws_forward():
 def test_passive_echoes_are_the_same_with_beacon_and_vehicle_exchanged(seed, spreading):
     pose, _, landmarks, beacon = world(seed)
     n, config = len(landmarks), as_by_hand(spreading)
-    there = arrivals_of_emission(pose, STILL, landmarks, beacon, config)
-    back = arrivals_of_emission(np.append(beacon, 0.3), STILL, landmarks, pose[:2], config)
+    there = sounds_of_emission(pose, STILL, landmarks, beacon, config)
+    back = sounds_of_emission(np.append(beacon, 0.3), STILL, landmarks, pose[:2], config)
     for name in ("delay", "level_db"):
         np.testing.assert_allclose(
             getattr(there, name)[-n - 1 :], getattr(back, name)[-n - 1 :], rtol=1e-12, atol=1e-11
@@ -154,8 +164,8 @@ def test_a_world_turned_and_moved_as_a_whole_sounds_the_same(seed, turn):
     c, s = math.cos(turn), math.sin(turn)
     about, shift = np.array([[c, s], [-s, c]]), np.array([3.0, -8.0])
     moved = np.append(pose[:2] @ about + shift, pose[2] + turn)
-    one = arrivals_of_emission(pose, velocity, landmarks, beacon, CONFIG)
-    two = arrivals_of_emission(
+    one = sounds_of_emission(pose, velocity, landmarks, beacon, CONFIG)
+    two = sounds_of_emission(
         moved, velocity @ about, landmarks @ about + shift, beacon @ about + shift, CONFIG
     )
     # Apart from the forward lobe's interference fringes, which magnify rounding by kr.
@@ -169,17 +179,17 @@ def test_a_world_turned_and_moved_as_a_whole_sounds_the_same(seed, turn):
 def test_landmarks_in_another_order_sound_the_same_under_other_labels(seed):
     pose, velocity, landmarks, beacon = world(seed)
     order = np.random.default_rng(seed).permutation(len(landmarks))
-    one = arrivals_of_emission(pose, velocity, landmarks, beacon, CONFIG)
-    two = arrivals_of_emission(pose, velocity, landmarks[order], beacon, CONFIG)
+    one = sounds_of_emission(pose, velocity, landmarks, beacon, CONFIG)
+    two = sounds_of_emission(pose, velocity, landmarks[order], beacon, CONFIG)
     old_label = np.append(order, len(landmarks))[two.landmark - 1] + 1
-    by_label = np.lexsort((old_label, two.source))
-    for name in ("delay", "level_db", "bearing", "frequency", "source"):
+    by_label = np.lexsort((old_label, two.caller))
+    for name in ("delay", "level_db", "bearing", "frequency", "caller"):
         np.testing.assert_allclose(getattr(one, name), getattr(two, name)[by_label], rtol=1e-12)
 
 
 def test_the_motion_shifts_each_tone_by_its_own_law():
     landmarks, beacon = np.array([[4.0, 0.0], [0.0, 4.0]]), np.array([0.0, -9.0])
-    heard = arrivals_of_emission(ORIGIN, np.array([0.75, 0.0]), landmarks, beacon, CONFIG)
+    heard = sounds_of_emission(ORIGIN, np.array([0.75, 0.0]), landmarks, beacon, CONFIG)
     ahead, abeam = 343.75 / 342.25, 1.0
     own = 35e3 * np.array([ahead, abeam, abeam])
     other = 30e3 * np.array([343.75 / 343.0, 1.0, 1.0])
@@ -188,17 +198,17 @@ def test_the_motion_shifts_each_tone_by_its_own_law():
 
 def test_motion_changes_the_frequencies_alone():
     pose, velocity, landmarks, beacon = world(5)
-    moving = arrivals_of_emission(pose, velocity, landmarks, beacon, CONFIG)
-    still = arrivals_of_emission(pose, STILL, landmarks, beacon, CONFIG)
+    moving = sounds_of_emission(pose, velocity, landmarks, beacon, CONFIG)
+    still = sounds_of_emission(pose, STILL, landmarks, beacon, CONFIG)
     assert set(still.frequency.tolist()) == {30e3, 35e3}
     assert np.all(moving.frequency != still.frequency)
-    for name in ("delay", "level_db", "bearing", "source", "landmark"):
+    for name in ("delay", "level_db", "bearing", "caller", "landmark"):
         np.testing.assert_array_equal(getattr(moving, name), getattr(still, name))
 
 
 def test_a_world_without_landmarks_still_has_its_beacon():
-    heard = arrivals_of_emission(ORIGIN, STILL, np.empty((0, 2)), np.array([3.0, 4.0]), CONFIG)
-    assert heard.source.tolist() == [ACTIVE, PASSIVE]
+    heard = sounds_of_emission(ORIGIN, STILL, np.empty((0, 2)), np.array([3.0, 4.0]), CONFIG)
+    assert heard.caller.tolist() == [VEHICLE, BEACON]
     assert heard.landmark.tolist() == [1, 1]
 
 
@@ -214,25 +224,25 @@ def test_a_world_without_landmarks_still_has_its_beacon():
 )
 def test_points_that_coincide_or_are_not_finite_are_refused(landmarks, beacon, found):
     with pytest.raises(InputError, match=rf"world .*{found}.* move them apart"):
-        arrivals_of_emission(ORIGIN, STILL, np.array(landmarks), np.array(beacon), CONFIG)
+        sounds_of_emission(ORIGIN, STILL, np.array(landmarks), np.array(beacon), CONFIG)
 
 
 def test_a_heading_or_a_velocity_that_is_not_finite_is_refused():
     landmarks, beacon = np.array([[1.0, 1.0]]), np.array([5.0, 0.0])
     with pytest.raises(InputError, match="no finite heading"):
-        arrivals_of_emission(np.array([0.0, 0.0, np.nan]), STILL, landmarks, beacon, CONFIG)
+        sounds_of_emission(np.array([0.0, 0.0, np.nan]), STILL, landmarks, beacon, CONFIG)
     with pytest.raises(InputError, match="velocity"):
-        arrivals_of_emission(ORIGIN, np.array([0.0, np.nan]), landmarks, beacon, CONFIG)
+        sounds_of_emission(ORIGIN, np.array([0.0, np.nan]), landmarks, beacon, CONFIG)
 
 
 @given(seed=SEEDS)
 @law
 @pytest.mark.shapes
 def test_a_piston_changes_the_levels_of_active_echoes_alone(seed):
-    heard = arrivals_of_emission(*world(seed), CONFIG)
+    heard = sounds_of_emission(*world(seed), CONFIG)
     before = {name: column.copy() for name, column in rows(heard, slice(None)).items()}
     beamed = through_piston(heard, **PISTON)
-    own = heard.source == ACTIVE
+    own = heard.caller == VEHICLE
     gain = 20 * np.log10(piston_directivity(heard.bearing[own], **PISTON))
     np.testing.assert_allclose((beamed.level_db - heard.level_db)[own], gain, atol=1e-11)
     np.testing.assert_array_equal(beamed.level_db[~own], heard.level_db[~own])
@@ -243,7 +253,7 @@ def test_a_piston_changes_the_levels_of_active_echoes_alone(seed):
 
 
 def test_a_piston_far_smaller_than_the_wave_sends_alike_in_all_directions():
-    heard = arrivals_of_emission(*world(5), CONFIG)
+    heard = sounds_of_emission(*world(5), CONFIG)
     beamed = through_piston(heard, **{**PISTON, "radius": 1e-6})
     np.testing.assert_allclose(beamed.level_db, heard.level_db, atol=1e-6)
 
@@ -251,8 +261,8 @@ def test_a_piston_far_smaller_than_the_wave_sends_alike_in_all_directions():
 def test_a_null_of_the_piston_is_deep_but_finite():
     radius = 0.025
     null = math.asin(jn_zeros(1, 1)[0] / (2 * math.pi * 35e3 / 343.0 * radius))
-    heard = arrivals_of_emission(*world(5), CONFIG)
-    own = np.flatnonzero(heard.source == ACTIVE)
+    heard = sounds_of_emission(*world(5), CONFIG)
+    own = np.flatnonzero(heard.caller == VEHICLE)
     bearing = heard.bearing.copy()
     bearing[own[:2]] = null, math.pi  # a null to rounding, and behind the baffle to the last bit
     heard = replace(heard, bearing=bearing)
@@ -268,11 +278,11 @@ def test_many_emissions_bring_bit_for_bit_what_each_brings_alone(seed, spreading
     _, _, landmarks, beacon = world(seed)
     rng = np.random.default_rng(seed)
     poses, velocities = rng.uniform(-9.0, 9.0, (count, 3)), rng.uniform(-1.0, 1.0, (count, 2))
-    heard, size = arrivals_of_emissions(poses, velocities, landmarks, beacon, config)
+    heard, size = sounds_of_emissions(poses, velocities, landmarks, beacon, config)
     end = np.cumsum(size)
     assert end[-1] == heard.delay.size
     for pose, velocity, first, last in zip(poses, velocities, end - size, end, strict=True):
-        alone = arrivals_of_emission(pose, velocity, landmarks, beacon, config)
+        alone = sounds_of_emission(pose, velocity, landmarks, beacon, config)
         among = rows_of(heard, slice(first, last))
         for name in Arrivals.__slots__:
             assert getattr(among, name).tobytes() == getattr(alone, name).tobytes()
@@ -281,4 +291,4 @@ def test_many_emissions_bring_bit_for_bit_what_each_brings_alone(seed, spreading
 def test_of_many_emissions_the_impossible_one_is_named():
     poses = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.5]])
     with pytest.raises(InputError, match=r"pose \[1\. +1\. +0\.5\]: found vehicle to landmark 1"):
-        arrivals_of_emissions(poses, 0 * poses[:, :2], poses[1:, :2], np.array([5.0, 0.0]), CONFIG)
+        sounds_of_emissions(poses, 0 * poses[:, :2], poses[1:, :2], np.array([5.0, 0.0]), CONFIG)

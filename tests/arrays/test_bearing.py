@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.acoustics.arrivals import Arrivals
+from pipistrelle.acoustics.callers import callers_of
 from pipistrelle.arithmetic.noise import stream_key
 from pipistrelle.arrays.beamforming import bearing_bound
 from pipistrelle.arrays.layout import Layout, square_of_four
@@ -14,8 +15,9 @@ from pipistrelle.detection.snapshots import detect, detector
 from pipistrelle.geometry import wrap
 
 CONFIG = Config()
+CALLERS = callers_of(CONFIG, np.zeros(2))
 UNCUT = Config(detection=DetectionConfig(angle_limit_deg=89.0))
-SETTLED, SQUARE = sampling(CONFIG), square_of_four(CONFIG.receiver)
+SETTLED, SQUARE = sampling(CONFIG, CALLERS), square_of_four(CONFIG.receiver)
 BLOCKS, LATE = 28, 7
 COUNT = 5000  # an rms of so many is good to 1 %: a tenth is 6 such off the largest ratio, 1.04
 FAR = 6.0  # bounds: beyond it a side lobe, not noise, decides
@@ -28,7 +30,7 @@ def echo(face, angle, tone, snr_db):
         level_db=np.array([snr_db - 10.0 * np.log10(SETTLED.pulse * SETTLED.block)]),
         bearing=wrap(np.array([angle + SQUARE.normal[face]])),
         frequency=SETTLED.tones[[tone]],
-        source=np.array([tone], dtype=np.int8),
+        caller=np.array([tone], dtype=np.int8),
         landmark=np.array([1]),
     )
 
@@ -38,7 +40,7 @@ def errors(face, angle, tone, snr_db, count=COUNT, *, config=CONFIG, ears=SQUARE
 
     The ears may differ from those that the detector believes in.
     """
-    finder = detector(config, SQUARE)
+    finder = detector(config, SQUARE, SETTLED.tones)
     clean = np.zeros((BLOCKS, SQUARE.normal.size, 2, SQUARE.position.size), dtype=complex)
     add_echo_blocks(clean, echo(face, angle, tone, snr_db), ears, SETTLED)
     off = np.full(count, np.nan)
@@ -53,7 +55,7 @@ def errors(face, angle, tone, snr_db, count=COUNT, *, config=CONFIG, ears=SQUARE
         found = detect(
             matched, finder, start=SETTLED.pulse * BLOCK, interval=BLOCK, pulse=SETTLED.pulse
         )
-        heard = np.flatnonzero((found.face == face) & (found.tone == tone))
+        heard = np.flatnonzero((found.face == face) & (found.caller == tone))
         if heard.size:
             off[i] = found.angle[heard[found.power[heard].argmax()]] - angle
     return off

@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import ks_2samp
 
 from pipistrelle.acoustics.arrivals import Arrivals, arrivals_of_emission
+from pipistrelle.acoustics.callers import callers_of
 from pipistrelle.arithmetic.noise import stream_key
 from pipistrelle.arrays.layout import Layout, square_of_four
 from pipistrelle.arrays.receiver import (
@@ -22,9 +23,10 @@ from pipistrelle.detection.matched import filter_blocks, filter_samples
 from pipistrelle.detection.snapshots import detect, detector
 
 CONFIG = Config()
-SQUARE, SETTLED = square_of_four(CONFIG.receiver), sampling(CONFIG)
+CALLERS = callers_of(CONFIG, np.zeros(2))
+SQUARE, SETTLED = square_of_four(CONFIG.receiver), sampling(CONFIG, CALLERS)
 FACE = Layout(normal=np.zeros(1), position=SQUARE.position)
-FINDER = detector(CONFIG, FACE)
+FINDER = detector(CONFIG, FACE, SETTLED.tones)
 CALL = CONFIG.emitter.pulse
 SAMPLES = SETTLED.pulse * SETTLED.block
 BLOCKS = 44
@@ -41,7 +43,7 @@ def echo(delay, tone, snr_db, shift=1.0):
         level_db=np.array([snr_db - 10.0 * np.log10(SAMPLES)]),
         bearing=np.array([ANGLE]),
         frequency=SETTLED.tones[[tone]] * shift,
-        source=np.array([tone], dtype=np.int8),
+        caller=np.array([tone], dtype=np.int8),
         landmark=np.array([1]),
     )
 
@@ -67,7 +69,7 @@ def errors(matched, engine, tone, delay, finder):
     """Return the angle's and delay's error of the echo's detection, if there is one."""
     interval, pulse = (1.0 / SETTLED.rate, SAMPLES) if engine == FULL else (BLOCK, SETTLED.pulse)
     found = detect(matched, finder, start=START, interval=interval, pulse=pulse)
-    near = np.flatnonzero((found.tone == tone) & (np.abs(found.delay - delay) < CALL / 2))
+    near = np.flatnonzero((found.caller == tone) & (np.abs(found.delay - delay) < CALL / 2))
     if near.size == 0:
         return np.nan, np.nan
     best = near[found.power[near].argmax()]
@@ -77,7 +79,9 @@ def errors(matched, engine, tone, delay, finder):
 @cache
 def heard(snr_db, count, tone=0, shift=1.0, false_alarm=1e-6, engines=(FULL, COMMON, FAST)):
     """Return errors (engines, count, angle and delay) of echoes whose delays fill a block."""
-    finder = detector(Config(detection=DetectionConfig(false_alarm=false_alarm)), FACE)
+    finder = detector(
+        Config(detection=DetectionConfig(false_alarm=false_alarm)), FACE, SETTLED.tones
+    )
     rng = np.random.default_rng(stream_key(7, count, f"engines {snr_db} {tone}"))
     table = np.full((3, count, 2), np.nan)
     for i in range(count):
@@ -107,7 +111,11 @@ def test_matched_filters_of_both_engines_agree_at_their_common_lags(noisy):
     rng = np.random.default_rng(7)
     landmarks = rng.uniform(-6.0, 6.0, (20, 2))
     emission = arrivals_of_emission(
-        np.zeros(3), np.array([0.75, 0.0]), landmarks, np.array([0.0, 5.0]), CONFIG
+        np.zeros(3),
+        np.array([0.75, 0.0]),
+        landmarks,
+        callers_of(CONFIG, np.array([0.0, 5.0])),
+        CONFIG,
     )
     blocks = blocks_to_hear(emission, SETTLED)
     samples = record_samples(blocks, emission, SQUARE, SETTLED, rng if noisy else None)

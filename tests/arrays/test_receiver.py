@@ -1,9 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from pipistrelle.acoustics.arrivals import ACTIVE, PASSIVE, Arrivals, arrivals_of_emission
+from pipistrelle.acoustics.arrivals import Arrivals, arrivals_of_emission
+from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import (
     BLOCK,
@@ -17,18 +20,20 @@ from pipistrelle.config import BeaconConfig, Config, EmitterConfig, InputError, 
 
 law = settings(deadline=None, max_examples=40)
 CONFIG = Config()
-LAYOUT, SETTLED = square_of_four(CONFIG.receiver), sampling(CONFIG)
+CALLERS = callers_of(CONFIG, np.zeros(2))
+LAYOUT, SETTLED = square_of_four(CONFIG.receiver), sampling(CONFIG, CALLERS)
+BEACON = 1
 SIGMAS = 4.9  # chance: one in a million
 
 
-def one(delay, bearing=0.3, shift=1.0, source=PASSIVE, level_db=0.0):
+def one(delay, bearing=0.3, shift=1.0, source=BEACON, level_db=0.0):
     """Return a single arrival, its frequency shifted by a factor."""
     return Arrivals(
         delay=np.array([delay]),
         level_db=np.array([level_db]),
         bearing=np.array([bearing]),
         frequency=np.array([SETTLED.tones[source] * shift]),
-        source=np.array([source], dtype=np.int8),
+        caller=np.array([source], dtype=np.int8),
         landmark=np.array([1]),
     )
 
@@ -56,13 +61,13 @@ def both(arrivals, blocks, layout=LAYOUT, settled=SETTLED):
     delay=st.floats(0.0, 12e-3),
     bearing=st.floats(-np.pi, np.pi),
     shift=st.floats(0.7, 1.4),
-    source=st.sampled_from([ACTIVE, PASSIVE]),
+    source=st.sampled_from([VEHICLE, BEACON]),
 )
-@example(delay=0.0, bearing=0.0, shift=1.0, source=ACTIVE)  # over before the first block
-@example(delay=2.8e-3, bearing=0.0, shift=1.0, source=ACTIVE)  # whole blocks
-@example(delay=2.8e-3 + 5e-6, bearing=0.0, shift=1.0, source=PASSIVE)  # a sample off
-@example(delay=8.4e-3 - 5e-6, bearing=0.0, shift=1.0, source=PASSIVE)  # one sample, at the end
-@example(delay=2.8e-3, bearing=np.pi / 2, shift=0.7, source=PASSIVE)  # long, along two faces
+@example(delay=0.0, bearing=0.0, shift=1.0, source=VEHICLE)  # over before the first block
+@example(delay=2.8e-3, bearing=0.0, shift=1.0, source=VEHICLE)  # whole blocks
+@example(delay=2.8e-3 + 5e-6, bearing=0.0, shift=1.0, source=BEACON)  # a sample off
+@example(delay=8.4e-3 - 5e-6, bearing=0.0, shift=1.0, source=BEACON)  # one sample, at the end
+@example(delay=2.8e-3, bearing=np.pi / 2, shift=0.7, source=BEACON)  # long, along two faces
 @law
 def test_block_sums_of_an_arrival_are_those_of_its_samples(delay, bearing, shift, source):
     fast, dense = both(one(delay, bearing, shift, source), 28)
@@ -74,7 +79,8 @@ def test_block_sums_of_a_whole_world_are_those_of_its_samples(seed):
     rng = np.random.default_rng(seed)
     pose = np.array([*rng.uniform(-9.0, 9.0, 2), rng.uniform(-np.pi, np.pi)])
     landmarks, beacon = rng.uniform(-18.0, 18.0, (50, 2)), rng.uniform(-10.0, 10.0, 2)
-    emission = arrivals_of_emission(pose, rng.uniform(-1.0, 1.0, 2), landmarks, beacon, CONFIG)
+    callers, velocity = callers_of(CONFIG, beacon), rng.uniform(-1.0, 1.0, 2)
+    emission = arrivals_of_emission(pose, velocity, landmarks, callers, CONFIG)
     fast, dense = both(emission, blocks_to_hear(emission, SETTLED))
     assert np.abs(fast - dense).max() <= 1e-10 * np.abs(dense).max()
 
@@ -101,7 +107,7 @@ def test_other_settings_keep_the_engines_equal():
         beacon=BeaconConfig(frequency=25e3),
         receiver=ReceiverConfig(elements=5, sample_rate=125e3),
     )
-    settled = sampling(config)
+    settled = sampling(config, callers_of(config, np.zeros(2)))
     fast, dense = both(one(3.217e-3), 20, square_of_four(config.receiver), settled)
     assert (settled.block, settled.pulse) == (25, 5)
     assert np.abs(fast - dense).max() <= 1e-10 * settled.block
@@ -150,7 +156,7 @@ def test_levels_are_amplitudes_in_decibels_and_arrivals_add():
 
 def test_block_noise_has_forty_times_the_variance_of_a_sample_in_each_tone():
     config = Config(receiver=ReceiverConfig(noise_level_db=6.0))
-    settled = sampling(config)
+    settled = sampling(config, callers_of(config, np.zeros(2)))
     noise = noise_blocks(5000, LAYOUT, settled, key=3)
     variance = np.mean(np.abs(noise) ** 2, axis=(0, 3)) / (40.0 * 10.0**0.6)
     assert np.abs(variance - 1.0).max() < SIGMAS / np.sqrt(5000 * 10)
@@ -212,5 +218,60 @@ def test_blocks_are_a_fifth_of_a_millisecond_and_the_call_fourteen_of_them():
     ],
 )
 def test_settings_that_blocks_cannot_hold_are_refused_by_name(settings, key):
+    config = Config.model_validate(settings)
     with pytest.raises(InputError, match=f"^{key}: found .*expected"):
-        sampling(Config.model_validate(settings))
+        sampling(config, callers_of(config, np.zeros(2)))
+
+
+THREE = (*CALLERS, Caller(name="whistle", frequency=25e3, level_db=40.0, place=np.ones(2)))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_block_sums_of_three_callers_one_of_them_moving_are_those_of_their_samples(seed):
+    rng = np.random.default_rng(seed)
+    landmarks = rng.uniform(-18.0, 18.0, (20, 2))
+    callers = [
+        CALLERS[VEHICLE],
+        *(replace(caller, place=rng.uniform(-10.0, 10.0, 2)) for caller in THREE[1:]),
+    ]
+    callers[2] = replace(callers[2], velocity=rng.uniform(-3.0, 3.0, 2))
+    pose = np.array([*rng.uniform(-9.0, 9.0, 2), rng.uniform(-np.pi, np.pi)])
+    settled = sampling(CONFIG, callers)
+    emission = arrivals_of_emission(pose, np.array([0.5, 0.5]), landmarks, callers, CONFIG)
+    fast, dense = both(emission, blocks_to_hear(emission, settled), settled=settled)
+    assert fast.shape[2] == 3
+    assert np.abs(fast - dense).max() <= 1e-10 * np.abs(dense).max()
+    # Callers in another order: the same sums, tone by tone, but for the order of additions.
+    turned = [callers[0], callers[2], callers[1]]
+    again = sampling(CONFIG, turned)
+    other = arrivals_of_emission(pose, np.array([0.5, 0.5]), landmarks, turned, CONFIG)
+    sums = np.zeros_like(fast)
+    add_echo_blocks(sums, other, LAYOUT, again)
+    assert np.abs(sums[:, :, [0, 2, 1]] - fast).max() <= 1e-12 * np.abs(fast).max()
+
+
+def test_noise_of_three_tones_has_the_same_variance_in_each():
+    noise = noise_blocks(5000, LAYOUT, sampling(CONFIG, THREE), key=3)
+    variance = np.mean(np.abs(noise) ** 2, axis=(0, 3)) / 40.0
+    assert variance.shape == (4, 3)
+    assert np.abs(variance - 1.0).max() < SIGMAS / np.sqrt(5000 * 10)
+
+
+@pytest.mark.parametrize(
+    ("frequency", "message"),
+    [
+        (26e3, "whistle.frequency: found 26000 Hz, expected a multiple of 5000 Hz"),
+        (35e3, "whistle.frequency: found 35000 Hz, the vehicle's own; expected another"),
+        (30e3, "whistle.frequency: found 30000 Hz, the beacon's own; expected another"),
+    ],
+)
+def test_a_third_tone_that_cannot_be_told_apart_is_refused_by_the_callers_name(frequency, message):
+    with pytest.raises(InputError, match=f"^{message}"):
+        sampling(CONFIG, (*CALLERS, replace(THREE[2], frequency=frequency)))
+
+
+def test_eight_callers_are_heard_and_a_ninth_is_refused():
+    chorus = [replace(THREE[2], frequency=5e3 * k) for k in (1, 2, 3, 4, 5, 8, 9)]
+    assert sampling(CONFIG, [*CALLERS, *chorus[:6]]).tones.size == 8
+    with pytest.raises(InputError, match="callers: found 9, expected 1 to 8"):
+        sampling(CONFIG, [*CALLERS, *chorus])

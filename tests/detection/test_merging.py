@@ -21,7 +21,7 @@ def detections(*rows):
     angle = np.radians(angle.astype(float))
     return Detections(
         face=face,
-        tone=tone,
+        caller=tone,
         angle=angle,
         bearing=wrap(angle + NORMAL[face]),
         delay=delay.astype(float),
@@ -51,7 +51,7 @@ def strongest(found, label, landmark, tone):
     """Return the rows to average, by the definition."""
     rows = []
     for face in range(4):
-        here = np.flatnonzero((label == landmark) & (found.tone == tone) & (found.face == face))
+        here = np.flatnonzero((label == landmark) & (found.caller == tone) & (found.face == face))
         if here.size:
             rows.append(here[found.power[here].argmax()])
     return rows
@@ -62,7 +62,7 @@ def strongest(found, label, landmark, tone):
 def test_each_landmark_gets_the_mean_of_its_strongest_estimate_of_each_face(seed, averaging):
     found, label = crowd(np.random.default_rng(seed))
     heard = heard_of(found, label, averaging)
-    pairs = np.unique(np.column_stack((label, found.tone))[label >= 0], axis=0)
+    pairs = np.unique(np.column_stack((label, found.caller))[label >= 0], axis=0)
     rows = np.column_stack((heard.rows.landmark, heard.rows.caller))
     np.testing.assert_array_equal(rows, pairs)
     for i, (landmark, tone) in enumerate(pairs):
@@ -121,7 +121,7 @@ def test_unlabelled_detections_are_counted_and_change_nothing_else():
 def test_silence_is_heard_as_nothing():
     nothing = np.zeros(0)
     found = Detections(
-        face=nothing.astype(int), tone=nothing.astype(int), angle=nothing, bearing=nothing,
+        face=nothing.astype(int), caller=nothing.astype(int), angle=nothing, bearing=nothing,
         delay=nothing, power=nothing,
     )  # fmt: skip
     heard = heard_of(found, nothing.astype(int))
@@ -217,7 +217,7 @@ def test_an_echo_is_of_one_call_at_one_time_from_one_side_and_once_on_a_face(see
     for echo in range(number.max() + 1):
         rows = np.flatnonzero(number == echo)
         loudest = rows[found.power[rows].argmax()]
-        assert np.unique(found.tone[rows]).size == 1
+        assert np.unique(found.caller[rows]).size == 1
         assert np.unique(found.face[rows]).size == rows.size
         assert np.all(np.abs(found.delay[rows] - found.delay[loudest]) <= 0.03)
         assert np.all(np.abs(wrap(found.bearing[rows] - found.bearing[loudest])) <= 0.8)
@@ -246,3 +246,12 @@ def test_three_callers_of_one_landmark_are_averaged_as_directions():
     assert bearing == pytest.approx(wrap(3.1 + np.mean(wrap(rows.bearing - 3.1))), abs=1e-12)
     (bearing,) = scan_of(Heard(rows=rows, clutter=0), "passive").bearing
     assert bearing == pytest.approx(-3.05, abs=1e-12)
+
+
+@given(seed=SEEDS)
+@law
+def test_two_callers_fuse_to_the_bit_as_half_the_turn_from_one_to_the_other(seed):
+    own, other = np.random.default_rng(seed).uniform(-np.pi, np.pi, (2, 9))
+    both = heard_rows(*zip(range(9), own, other, np.ones(9), strict=True))
+    halfway = wrap(own + 0.5 * wrap(other - own))
+    assert scan_of(both, "fused").bearing.tobytes() == halfway.tobytes()

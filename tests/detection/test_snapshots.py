@@ -10,6 +10,7 @@ from scipy.signal import find_peaks
 from scipy.stats import binom, gamma
 
 from pipistrelle.acoustics.arrivals import Arrivals, arrivals_of_emission, through_piston
+from pipistrelle.acoustics.callers import Caller, callers_of
 from pipistrelle.arithmetic.noise import complex_noise, stream_key
 from pipistrelle.arrays.beamforming import beamscan
 from pipistrelle.arrays.layout import Layout, square_of_four
@@ -28,8 +29,9 @@ from pipistrelle.geometry import wrap
 
 law = settings(deadline=None, max_examples=40)
 CONFIG = Config()
-LAYOUT, SETTLED = square_of_four(CONFIG.receiver), sampling(CONFIG)
-FINDER = detector(CONFIG, LAYOUT)
+CALLERS = callers_of(CONFIG, np.zeros(2))
+LAYOUT, SETTLED = square_of_four(CONFIG.receiver), sampling(CONFIG, CALLERS)
+FINDER = detector(CONFIG, LAYOUT, SETTLED.tones)
 SAMPLES = SETTLED.pulse * SETTLED.block
 START = SETTLED.pulse * BLOCK
 CHANCE, SIGMAS = 1e-6, 4.9
@@ -37,7 +39,7 @@ OWN, BEACON = 0, 1
 
 
 def finder_of(layout=LAYOUT, **changes):
-    return detector(Config(detection=DetectionConfig(**changes)), layout)
+    return detector(Config(detection=DetectionConfig(**changes)), layout, SETTLED.tones)
 
 
 def echoes(*rows):
@@ -48,7 +50,7 @@ def echoes(*rows):
         level_db=snr_db - 10.0 * np.log10(SAMPLES),
         bearing=np.radians(bearing),
         frequency=SETTLED.tones[source] * shift,
-        source=source.astype(np.int8),
+        caller=source.astype(np.int8),
         landmark=np.arange(1, len(rows) + 1),
     )
 
@@ -71,7 +73,7 @@ def snapshots(found, tone):
     """Return how many snapshots hold the tone's detections: each face's, half a call apart."""
     count = 0
     for face in np.unique(found.face):
-        delay = np.sort(found.delay[(found.face == face) & (found.tone == tone)])
+        delay = np.sort(found.delay[(found.face == face) & (found.caller == tone)])
         count += bool(delay.size) + np.count_nonzero(np.diff(delay) > 0.35 * SETTLED.pulse * BLOCK)
     return count
 
@@ -84,7 +86,9 @@ def mission_frame(seed=7, frame=60, config=CONFIG):
     radius, direction = 25.0 * np.sqrt(rng.uniform(size=50)), rng.uniform(-np.pi, np.pi, 51)
     places = np.append(radius, 15.0) * np.array([np.cos(direction), np.sin(direction)])
     velocity = 0.75 * np.array([np.cos(turn), np.sin(turn)])
-    emission = arrivals_of_emission(pose, velocity, places[:, :50].T, places[:, 50], config)
+    emission = arrivals_of_emission(
+        pose, velocity, places[:, :50].T, callers_of(config, places[:, 50]), config
+    )
     heard = through_piston(
         emission, radius=config.emitter.radius, frequency=35e3, speed_of_sound=343.0
     )
@@ -139,7 +143,7 @@ def assert_same(found, rows, interval):
     assert found.face.size == len(rows)
     face, tone, angle, delay, power = map(np.array, zip(*rows, strict=True))
     assert found.face.tolist() == face.tolist()
-    assert found.tone.tolist() == tone.tolist()
+    assert found.caller.tolist() == tone.tolist()
     np.testing.assert_allclose(found.angle, angle, atol=1e-9)
     np.testing.assert_allclose(found.power, power, rtol=1e-9)
     np.testing.assert_allclose(found.delay, delay, atol=2e-4 * interval)
@@ -153,7 +157,7 @@ def test_detections_are_those_of_a_slow_second_version(frame, changes):
     heard, blocks, key = mission_frame(frame=frame)
     matched = matched_of(heard, blocks, key)
     timing = {"start": START, "interval": BLOCK, "pulse": SETTLED.pulse}
-    found = detect(matched, detector(config, LAYOUT), **timing)
+    found = detect(matched, detector(config, LAYOUT, SETTLED.tones), **timing)
     assert found.face.size > 20
     assert_same(found, slow_detect(matched, config, **timing), BLOCK)
 
@@ -163,7 +167,7 @@ def test_detections_of_very_short_calls_are_those_of_a_slow_second_version(pulse
     noise = complex_noise((400, 4, 2, 10), 1.0, stream_key(7, pulse, "short calls"))
     config = Config(detection=DetectionConfig(false_alarm=0.02, leakage_db=-60.0))
     timing = {"start": START, "interval": BLOCK, "pulse": pulse}
-    found = detect(noise, detector(config, LAYOUT), **timing)
+    found = detect(noise, detector(config, LAYOUT, SETTLED.tones), **timing)
     assert found.face.size > 50
     assert_same(found, slow_detect(noise, config, **timing), BLOCK)
 
@@ -174,7 +178,7 @@ def test_detections_at_the_full_rate_are_those_of_a_slow_second_version():
     matched = filter_samples(samples, tones=SETTLED.tones, rate=200e3, length=SAMPLES, noise_std=1)
     timing = {"start": START, "interval": 5e-6, "pulse": SAMPLES}
     found = detect(matched, FINDER, **timing)
-    assert set(zip(found.face.tolist(), found.tone.tolist(), strict=True)) >= {(0, 0), (0, 1)}
+    assert set(zip(found.face.tolist(), found.caller.tolist(), strict=True)) >= {(0, 0), (0, 1)}
     assert_same(found, slow_detect(matched, CONFIG, **timing), 5e-6)
 
 
@@ -204,7 +208,7 @@ def test_noise_alone_passes_one_test_as_often_as_asked():
         matched = filter_blocks(sums, pulse=SETTLED.pulse, block=SETTLED.block, noise_std=1.0)
         passed += np.count_nonzero(np.sum(np.abs(matched) ** 2, axis=-1) > finder.threshold)
         found = found_in(matched, finder)
-        shown += len(set(zip(found.face.tolist(), found.tone.tolist(), strict=True)))
+        shown += len(set(zip(found.face.tolist(), found.caller.tolist(), strict=True)))
     low, high = binom.interval(1.0 - CHANCE, batches * faces * 2, alarm)
     assert low <= passed <= high
     assert not low <= 2 * passed <= high  # the sample would show a rate twice as high
@@ -234,7 +238,7 @@ def test_without_noise_an_echo_is_placed_where_it_starts(late, angle, source):
     # within 2 % of a beam's step of 0.05 in u.
     delay = START + late * BLOCK
     found = found_in(matched_of(echoes((delay, angle, source, 30, 1.0))))
-    main = np.flatnonzero((found.face == 0) & (found.tone == source))
+    main = np.flatnonzero((found.face == 0) & (found.caller == source))
     assert main.size == 1
     first = np.ceil(delay * SETTLED.rate) / SETTLED.rate
     assert found.delay[main[0]] == pytest.approx(first, abs=1e-9)
@@ -272,7 +276,7 @@ def test_two_echoes_of_one_direction_half_a_call_apart_are_two_snapshots_and_nea
         second = 4e-3 + gap * BLOCK + 0.25 / 35e3  # in quadrature: the energies add
         heard = echoes((4e-3, 0, OWN, 20, 1.0), (second, 0, OWN, 20, 1.0))
         found = found_in(matched_of(heard))
-        assert np.count_nonzero((found.face == 0) & (found.tone == OWN)) == count
+        assert np.count_nonzero((found.face == 0) & (found.caller == OWN)) == count
 
 
 def test_two_directions_at_one_time_are_two_peaks_down_to_eight_decibels():
@@ -343,7 +347,7 @@ def test_a_weak_echo_beside_a_loud_call_of_the_other_tone_is_given_up():
     for snr_db, heard in ((25.0, True), (15.0, False)):  # 45 dB under the call less 28: 17
         both = echoes((6e-3, 10, BEACON, 45, 1.0), (7e-3, -20, OWN, snr_db, 1.0))
         found = found_in(matched_of(both))
-        assert np.any((found.tone == OWN) & (found.face == 0)) == heard
+        assert np.any((found.caller == OWN) & (found.face == 0)) == heard
 
 
 def test_matched_filters_give_an_echo_the_gain_of_its_samples():
@@ -366,3 +370,50 @@ def test_a_crowd_of_detections_finds_room():
     crowd = [(START + 9 * k * BLOCK, rng.uniform(-180, 180), k % 2, 12.0, 1.0) for k in range(300)]
     found = found_in(matched_of(echoes(*crowd), blocks=2800, key=1))
     assert found.face.size > 256  # twice the room's first size
+
+
+TRIO = sampling(
+    CONFIG, (*CALLERS, Caller(name="whistle", frequency=25e3, level_db=40.0, place=np.ones(2)))
+)
+
+
+def found_of_trio(leakage_db, *rows):
+    """Return detections, with three tones, of rows (delay, bearing [deg], caller, SNR [dB])."""
+    delay, bearing, caller, snr_db = map(np.array, zip(*rows, strict=True))
+    heard = Arrivals(
+        delay=delay.astype(float),
+        level_db=snr_db - 10.0 * np.log10(SAMPLES),
+        bearing=np.radians(bearing),
+        frequency=TRIO.tones[caller],
+        caller=caller.astype(np.int8),
+        landmark=np.arange(1, len(rows) + 1),
+    )
+    sums = np.zeros((60, 4, 3, 10), dtype=complex)
+    add_echo_blocks(sums, heard, LAYOUT, TRIO)
+    matched = filter_blocks(sums, pulse=TRIO.pulse, block=TRIO.block, noise_std=1.0)
+    config = Config(detection=DetectionConfig(leakage_db=leakage_db))
+    return found_in(matched, detector(config, LAYOUT, TRIO.tones))
+
+
+@pytest.mark.parametrize("caller", [0, 1, 2])
+def test_of_three_tones_a_strong_call_makes_detections_in_its_own_alone(caller):
+    call = (6.03e-3, 20, caller, 50.0)
+    assert set(found_of_trio(-28.0, call).caller.tolist()) == {caller}
+    assert set(found_of_trio(-60.0, call).caller.tolist()) == {0, 1, 2}
+
+
+def test_of_three_tones_the_strongest_of_the_others_is_the_one_guarded_against():
+    for loud in (1, 2):
+        for snr_db, heard in ((25.0, True), (15.0, False)):  # 45 dB under the call less 28: 17
+            rows = [(7e-3, -20, 0, snr_db), (6e-3, 10, loud, 45.0), (6e-3, 10, 3 - loud, 20.0)]
+            found = found_of_trio(-28.0, *rows)
+            assert np.any((found.caller == 0) & (found.face == 0)) == heard
+
+
+def test_a_call_is_found_in_its_own_tone_alone_whichever_of_three_it_is():
+    rows = [(6e-3, 20, 0, 20.0), (6.1e-3, -30, 1, 20.0), (6.2e-3, 0, 2, 20.0)]
+    found = found_of_trio(-28.0, *rows)
+    front = found.face == 0
+    for _, bearing, caller, _ in rows:
+        (angle,) = found.angle[front & (found.caller == caller)]
+        assert angle == pytest.approx(np.radians(bearing), abs=2e-3)

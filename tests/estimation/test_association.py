@@ -5,7 +5,7 @@ import pytest
 
 from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.scans import UNLABELLED, make_scan
-from pipistrelle.estimation.association import told, told_but
+from pipistrelle.estimation.association import told
 from reference.missions import scan_of, scan_with
 
 NAN = np.nan
@@ -19,14 +19,6 @@ def test_what_was_told_is_taken_as_it_is_and_costs_no_copy():
 def test_a_row_that_nobody_labelled_never_reaches_a_filter():
     scan = scan_of((3, 5.0, 0.3), (UNLABELLED, NAN, 1.0), (UNLABELLED, 2.0, 2.0))
     assert labelled(scan, told(None, scan)).landmark.tolist() == [3]
-
-
-def test_labels_that_are_left_out_take_their_rows_with_them():
-    scan = scan_of((3, 5.0, 0.3), (8, NAN, 1.0), (9, NAN, 2.0))
-    kept = labelled(scan, told_but({8, 11})(None, scan))
-    assert kept.landmark.tolist() == [3, 9]
-    assert kept.bearing.tolist() == [0.3, 2.0]
-    assert told_but(()) is told
 
 
 def test_rows_of_one_label_become_one_whatever_their_order():

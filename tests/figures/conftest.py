@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from pipistrelle.acoustics.callers import Caller
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks, Track
 from pipistrelle.experiments.drives import Truth
@@ -15,6 +16,7 @@ from reference.missions import map_with, scan_with
 STEPS, PER_FRAME, STEP = 1500, 4, 0.125
 REACH = {"active": 14.0, "fused": 20.0, "passive": 20.0}
 DRIFT = {"active": 0.14, "fused": 0.16, "passive": 0.3}
+BEACON = Caller(name="beacon", frequency=30e3, level_db=42.8, place=np.array([10.6, 10.6]))
 HALF_BEAM = np.deg2rad(33.0) / 2.0
 
 
@@ -66,7 +68,7 @@ def scatter(rng: np.random.Generator) -> np.ndarray:
         near = np.hypot(*(points - point).T).min(initial=9.0)
         if np.hypot(*point) < 25.0 and near > 3.0 and abs(np.hypot(*point) - 7.4) > 0.5:
             points = np.vstack([points, point])
-    return np.vstack([points, [10.6, 10.6]])
+    return np.vstack([points, BEACON.place])
 
 
 def estimated_path(time, path, strategy, rng) -> Gaussian:
@@ -216,7 +218,7 @@ def mission() -> Mission:
     return Mission(
         scene={
             "truth": Truth(time=time, path=path, landmarks=(np.arange(1, len(points) + 1), points)),
-            "beacon": points[-1],
+            "callers": (BEACON,),
             "beamwidth": 2.0 * HALF_BEAM,
         },
         trials={strategy: trial for strategy, (trial, _) in made.items()},

@@ -92,7 +92,7 @@ def test_a_view_shows_every_true_point_with_a_margin_and_stays_readable(points):
     truth = Truth(
         time=np.zeros(1), path=np.zeros((1, 3)), landmarks=(np.arange(len(places)), places)
     )
-    (left, right), (bottom, top) = view(truth, None, [lost], [])
+    (left, right), (bottom, top) = view(truth, (), [lost], [])
     shown = np.vstack([places, [0.0, 0.0]])
     assert np.all((shown > [left, bottom]) & (shown < [right, top]))
     ratio = (top - bottom) / (right - left)
@@ -101,7 +101,7 @@ def test_a_view_shows_every_true_point_with_a_margin_and_stays_readable(points):
 
 def test_a_view_without_truth_shows_the_estimates_that_are_finite():
     path = np.array([[0.0, 0.0, 0.0], [8.0, 4.0, 0.0], [np.nan, 0.0, 0.0]])
-    (left, right), (bottom, top) = view(NO_TRUTH, None, [path], [])
+    (left, right), (bottom, top) = view(NO_TRUTH, (), [path], [])
     assert left < 0.0 < 8.0 < right < 9.0
     assert bottom < 0.0 < 4.0 < top
 
@@ -121,7 +121,7 @@ def frame(std: float, *, x: float = 5.0, rows: int = 1) -> np.ndarray:
         np.tile(std**2 * np.eye(2), (rows, 1, 1)),
         np.full(rows, 1.0 / rows),
     )
-    return np.array(view(DRIVEN, None, [], [landmarks]))
+    return np.array(view(DRIVEN, (), [], [landmarks]))
 
 
 def test_a_view_grows_until_it_holds_the_ellipse_of_a_placed_landmark():

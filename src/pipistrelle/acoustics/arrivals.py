@@ -1,16 +1,19 @@
-"""Everything that one emission of vehicle and beacon brings back to the vehicle.
+"""Everything that one emission of all callers brings to the vehicle.
 
 Stop-and-hop: path lengths and directions are those of the moment of emission, as if the vehicle
-stood still until the last echo; of its motion only the Doppler shift is kept.
+stood still until the last echo; of its motion, and of that of callers that move, only the Doppler
+shift is kept.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int8
 
+from pipistrelle.acoustics.callers import VEHICLE, Caller
 from pipistrelle.acoustics.emitter import in_front, piston_directivity
 from pipistrelle.acoustics.propagation import (
     absorption_db_per_m,
@@ -21,9 +24,6 @@ from pipistrelle.acoustics.propagation import (
 from pipistrelle.acoustics.target import target_strength_db
 from pipistrelle.config import AirConfig, Config, InputError
 from pipistrelle.geometry import wrap
-
-ACTIVE, PASSIVE = 0, 1
-"""Whose call it is: the vehicle's own, or the beacon's."""
 
 _DEEPEST_NULL = 1e-12
 
@@ -42,17 +42,17 @@ class Arrivals:
         Where it comes from, relative to the heading, in [-pi, pi).
     frequency : (a) [Hz]
         As received, Doppler shift included.
-    source : (a)
-        ACTIVE or PASSIVE.
+    caller : (a)
+        Whose call it is, an index into the list of callers: VEHICLE, or from 1 on.
     landmark : (a)
-        Label of what it comes from: landmark i (from 0) bears i + 1, the beacon n + 1.
+        Label of what it comes from: landmark i (from 0) bears i + 1, caller j (from 1) n + j.
     """
 
     delay: Float[np.ndarray, " a"]
     level_db: Float[np.ndarray, " a"]
     bearing: Float[np.ndarray, " a"]
     frequency: Float[np.ndarray, " a"]
-    source: Int8[np.ndarray, " a"]
+    caller: Int8[np.ndarray, " a"]
     landmark: Int[np.ndarray, " a"]
 
 
@@ -60,17 +60,20 @@ def arrivals_of_emission(
     pose: Float[np.ndarray, "3"],
     velocity: Float[np.ndarray, "2"],
     landmarks: Float[np.ndarray, "n 2"],
-    beacon: Float[np.ndarray, "2"],
+    callers: Sequence[Caller],
     config: Config,
 ) -> Arrivals:
-    r"""Echoes and calls that reach the vehicle after it and the beacon have called at once.
+    r"""Echoes and calls that reach the vehicle after all callers have called at once.
 
-    .. math:: L = L_0 - \beta - \alpha d + TS(\gamma), \qquad t = d / c
+    .. math:: L = L_0 - \beta - \alpha d + TS(\gamma), \qquad t = d / c, \qquad
+              f' = f \, \frac{c + v}{c - s}
 
     The vehicle calls in all directions within 90 degrees of its heading, with the same pressure:
     `through_piston` gives it a beam. Path lengths and directions are frozen at the emission
-    (stop-and-hop); of the motion only the Doppler shift is kept. Absorption is that of the nominal
-    frequency.
+    (stop-and-hop); of the motion only the Doppler shift is kept, with v the vehicle's speed towards
+    where the sound comes from and s the caller's along the sound that it sends. What reflects on
+    the move, at a speed r towards the one who called and q towards the vehicle, adds the factor
+    (c + r) / (c - q). Absorption is that of the nominal frequency.
 
     Parameters
     ----------
@@ -79,23 +82,24 @@ def arrivals_of_emission(
     velocity : (2) [m/s]
         In the world frame.
     landmarks : (n, 2) [m]
-    beacon : (2) [m]
-        It reflects the vehicle's call as a landmark does.
+    callers : sequence of c Caller
+        The vehicle first; the others reflect each other's calls, and the vehicle's, as landmarks
+        do.
     config : Config
-        Its sections air, target, emitter and beacon.
+        Its sections air and target.
 
     Returns
     -------
     Arrivals
         In this order: active echoes by label, those behind the baffle left out (the target
-        strength is 0 dB: all come straight back); passive echoes by label; the beacon's direct
-        call, which no target has weakened.
+        strength is 0 dB: all come straight back); then for each other caller its passive echoes
+        by label, among them, under its own label, its direct call, which no target has weakened.
 
     Raises
     ------
     InputError
-        Two of vehicle, beacon and a landmark at one point, a coordinate that is not finite, or a
-        vehicle as fast as sound.
+        Two of vehicle, callers and landmarks at one point, a coordinate that is not finite, or
+        anyone as fast as sound.
 
     Notes
     -----
@@ -105,21 +109,22 @@ def arrivals_of_emission(
     --------
     The second landmark is behind the baffle: only the beacon's call shows it.
 
+    >>> from pipistrelle.acoustics.callers import callers_of
     >>> east, still = np.zeros(3), np.zeros(2)
     >>> landmarks, beacon = np.array([[5.0, 0.0], [-5.0, 0.0]]), np.array([0.0, 9.0])
-    >>> heard = arrivals_of_emission(east, still, landmarks, beacon, Config())
-    >>> heard.source, heard.landmark
+    >>> heard = arrivals_of_emission(east, still, landmarks, callers_of(Config(), beacon), Config())
+    >>> heard.caller, heard.landmark
     (array([0, 0, 1, 1, 1], dtype=int8), array([1, 3, 1, 2, 3]))
     """
     poses, velocities = pose[np.newaxis], velocity[np.newaxis]
-    return arrivals_of_emissions(poses, velocities, landmarks, beacon, config)[0]
+    return arrivals_of_emissions(poses, velocities, landmarks, callers, config)[0]
 
 
 def arrivals_of_emissions(
     poses: Float[np.ndarray, "k 3"],
     velocities: Float[np.ndarray, "k 2"],
     landmarks: Float[np.ndarray, "n 2"],
-    beacon: Float[np.ndarray, "2"],
+    callers: Sequence[Caller],
     config: Config,
 ) -> tuple[Arrivals, Int[np.ndarray, " k"]]:
     """Arrivals of several emissions in one world, emission after emission (`arrivals_of_emission`).
@@ -129,7 +134,8 @@ def arrivals_of_emissions(
     poses : (k, 3) [m, m, rad]
     velocities : (k, 2) [m/s]
     landmarks : (n, 2) [m]
-    beacon : (2) [m]
+    callers : sequence of c Caller
+        The vehicle first; paths and velocities (k, 2), a row for each emission (`callers_at`).
     config : Config
 
     Returns
@@ -149,45 +155,28 @@ def arrivals_of_emissions(
     --------
     The vehicle turns round, and its next call meets the beacon instead of the landmark.
 
+    >>> from pipistrelle.acoustics.callers import callers_of
     >>> poses, still = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, np.pi]]), np.zeros((2, 2))
     >>> landmarks, beacon = np.array([[5.0, 0.0]]), np.array([-9.0, 0.0])
-    >>> heard, count = arrivals_of_emissions(poses, still, landmarks, beacon, Config())
+    >>> callers = callers_of(Config(), beacon)
+    >>> heard, count = arrivals_of_emissions(poses, still, landmarks, callers, Config())
     >>> count, heard.landmark
     (array([3, 3]), array([1, 1, 2, 2, 1, 2]))
     """
-    air, targets = config.air, np.concatenate((landmarks, beacon[np.newaxis]))
-    offset, incoming = targets - poses[:, np.newaxis, :2], targets - beacon
-    homeward = np.hypot(offset[..., 0], offset[..., 1])
-    outward = np.hypot(incoming[:, 0], incoming[:, 1])
-    _refuse_impossible(poses, homeward, outward)
-    bearing = wrap(np.arctan2(offset[..., 1], offset[..., 0]) - poses[:, 2:])
-    east, north = velocities[:, :1], velocities[:, 1:]
-    closing = (offset[..., 0] * east + offset[..., 1] * north) / homeward
-    ahead = np.flatnonzero(in_front(bearing))
-    pair = np.concatenate((ahead, np.arange(homeward.size)))  # of an emission and a target
-    order = np.argsort(pair // len(targets), kind="stable")
-    pair, own = pair[order], order < len(ahead)
-    target, source = pair % len(targets), np.where(own, np.int8(ACTIVE), np.int8(PASSIVE))
-    back, closing = homeward.ravel()[pair], closing.ravel()[pair]
-    path = back + np.where(own, back, outward[target])
-    loss_db = _loss_db(homeward, outward, ahead, _turn(incoming, offset), config)[order]
-    tones = (config.emitter.frequency, config.beacon.frequency)
-    absorption = np.array([_absorption(air, tone) for tone in tones])[source]
-    sent_db = np.array([config.emitter.level_db, config.beacon.level_db])[source]
-    heard = Arrivals(
-        delay=path / air.speed_of_sound,
-        level_db=sent_db - loss_db - absorption * path,
-        bearing=bearing.ravel()[pair],
-        frequency=doppler_frequency(
-            np.array(tones)[source],
-            receiver_speed=closing,
-            source_speed=np.where(own, closing, 0.0),
-            speed_of_sound=air.speed_of_sound,
-        ),
-        source=source,
-        landmark=target + 1,
-    )
-    return heard, np.bincount(pair // len(targets))
+    ways = _ways_home(poses, velocities, landmarks, callers)
+    _refuse_impossible(poses, ways, callers)
+    own, emission = _own_echoes(ways, callers[VEHICLE], config)
+    parts, emissions = [own], [emission]
+    for j in range(1, len(callers)):
+        parts.append(_sounds_of(j, ways, callers[j], config))
+        emissions.append(np.repeat(np.arange(len(poses)), ways.homeward.shape[1]))
+    emission = np.concatenate(emissions)
+    order = np.argsort(emission, kind="stable")
+    columns = {
+        name: np.concatenate([getattr(part, name) for part in parts]).take(order)
+        for name in Arrivals.__slots__
+    }
+    return Arrivals(**columns), np.bincount(emission, minlength=len(poses))
 
 
 def through_piston(
@@ -213,7 +202,7 @@ def through_piston(
     Returns
     -------
     Arrivals
-        The same rows in the same order; passive ones as they were.
+        The same rows in the same order; those of other callers as they were.
 
     Notes
     -----
@@ -224,13 +213,13 @@ def through_piston(
     >>> one, beam = np.ones(2), np.array([0.0, 1.5])
     >>> level = through_piston(
     ...     Arrivals(delay=one, level_db=0 * one, bearing=beam, frequency=35e3 * one,
-    ...              source=np.zeros(2, dtype=np.int8), landmark=np.array([1, 2])),
+    ...              caller=np.zeros(2, dtype=np.int8), landmark=np.array([1, 2])),
     ...     radius=0.0088, frequency=35e3, speed_of_sound=343.0,
     ... ).level_db
     >>> level.round(1)
     array([  0. , -18.6])
     """
-    own = np.flatnonzero(arrivals.source == ACTIVE)
+    own = np.flatnonzero(arrivals.caller == VEHICLE)
     pressure = piston_directivity(
         arrivals.bearing[own], frequency=frequency, radius=radius, speed_of_sound=speed_of_sound
     )
@@ -241,7 +230,7 @@ def through_piston(
         level_db=level_db,
         bearing=arrivals.bearing,
         frequency=arrivals.frequency,
-        source=arrivals.source,
+        caller=arrivals.caller,
         landmark=arrivals.landmark,
     )
 
@@ -263,39 +252,190 @@ def rows_of(arrivals: Arrivals, rows: Bool[np.ndarray, " a"] | slice) -> Arrival
         level_db=arrivals.level_db[rows],
         bearing=arrivals.bearing[rows],
         frequency=arrivals.frequency[rows],
-        source=arrivals.source[rows],
+        caller=arrivals.caller[rows],
         landmark=arrivals.landmark[rows],
     )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Ways:
+    """From all targets, landmarks and then callers, to the vehicle at each of k emissions.
+
+    Attributes
+    ----------
+    landmarks : int
+        How many of the targets are landmarks.
+    target : (1 or k, t, 2) [m]
+    offset : (k, t, 2) [m]
+        From the vehicle.
+    homeward : (k, t) [m]
+    bearing : (k, t) [rad]
+    closing : (k, t) [m/s]
+        The vehicle's speed towards each.
+    drift : (1 or k, t, 2) [m/s] or None
+        Velocities of the targets; None where all stand.
+    approach : (k, t) [m/s] or 0
+        The targets' speed towards the vehicle.
+    """
+
+    landmarks: int
+    target: Float[np.ndarray, "_ t 2"]
+    offset: Float[np.ndarray, "k t 2"]
+    homeward: Float[np.ndarray, "k t"]
+    bearing: Float[np.ndarray, "k t"]
+    closing: Float[np.ndarray, "k t"]
+    drift: Float[np.ndarray, "_ t 2"] | None
+    approach: Float[np.ndarray, "k t"] | float
+
+
+def _ways_home(
+    poses: Float[np.ndarray, "k 3"],
+    velocities: Float[np.ndarray, "k 2"],
+    landmarks: Float[np.ndarray, "n 2"],
+    callers: Sequence[Caller],
+) -> _Ways:
+    """Measure the ways from all targets to the vehicle."""
+    others = callers[VEHICLE + 1 :]
+    target = _joined(landmarks, [caller.place for caller in others])
+    offset = target - poses[:, np.newaxis, :2]
+    homeward = np.hypot(offset[..., 0], offset[..., 1])
+    east, north = velocities[:, :1], velocities[:, 1:]
+    drift, approach, still = None, 0.0, np.zeros(2)
+    with np.errstate(divide="ignore", invalid="ignore"):  # refused by name, later
+        closing = (offset[..., 0] * east + offset[..., 1] * north) / homeward
+        if any(caller.velocity is not None for caller in others):
+            velocity = [still if c.velocity is None else c.velocity for c in others]
+            drift = _joined(np.zeros_like(landmarks), velocity)
+            approach = -np.sum(drift * offset, axis=-1) / homeward
+    return _Ways(
+        landmarks=len(landmarks),
+        target=target,
+        offset=offset,
+        homeward=homeward,
+        bearing=wrap(np.arctan2(offset[..., 1], offset[..., 0]) - poses[:, 2:]),
+        closing=closing,
+        drift=drift,
+        approach=approach,
+    )
+
+
+def _joined(
+    landmarks: Float[np.ndarray, "n 2"], callers: Sequence[np.ndarray | None]
+) -> Float[np.ndarray, "_ t 2"]:
+    """Put the callers' rows, of one emission or of each, behind the landmarks'."""
+    rows = [np.reshape(np.asarray(caller), (-1, 1, 2)) for caller in callers]
+    parts = [landmarks[np.newaxis], *rows]
+    count = max(len(part) for part in parts)
+    return np.concatenate([np.broadcast_to(p, (count, *p.shape[1:])) for p in parts], axis=1)
+
+
+def _own_echoes(
+    ways: _Ways, caller: Caller, config: Config
+) -> tuple[Arrivals, Int[np.ndarray, " a"]]:
+    """Return the echoes of the vehicle's call from all ahead, and the emission of each."""
+    c = config.air.speed_of_sound
+    ahead = np.flatnonzero(in_front(ways.bearing))
+    back, closing = ways.homeward.ravel()[ahead], ways.closing.ravel()[ahead]
+    emission, target = np.divmod(ahead, ways.homeward.shape[1])
+    path, loss_db = back + back, spreading_loss_db(2.0 * back, ways=2)
+    frequency = doppler_frequency(
+        caller.frequency, receiver_speed=closing, source_speed=closing, speed_of_sound=c
+    )
+    if isinstance(ways.approach, np.ndarray):
+        moved = ways.approach.ravel()[ahead]
+        frequency = doppler_frequency(
+            frequency, receiver_speed=moved, source_speed=moved, speed_of_sound=c
+        )
+    heard = Arrivals(
+        delay=path / c,
+        level_db=caller.level_db - loss_db - _absorption(config.air, caller.frequency) * path,
+        bearing=ways.bearing.ravel()[ahead],
+        frequency=frequency,
+        caller=np.full(ahead.size, VEHICLE, dtype=np.int8),
+        landmark=target + 1,
+    )
+    return heard, emission
+
+
+def _sounds_of(j: int, ways: _Ways, caller: Caller, config: Config) -> Arrivals:
+    """Return another caller's sounds at all emissions, by label: its echoes and its direct call."""
+    c, (emissions, targets) = config.air.speed_of_sound, ways.homeward.shape
+    itself = ways.landmarks + j - 1
+    incoming = ways.target - ways.target[:, itself : itself + 1]
+    outward = np.hypot(incoming[..., 0], incoming[..., 1])
+    path = ways.homeward + outward
+    loss_db = _loss_db(itself, ways, incoming, outward, caller, config)
+    frequency = _shifted(itself, ways, incoming, outward, caller.frequency, c)
+    absorption = _absorption(config.air, caller.frequency)
+    return Arrivals(
+        delay=(path / c).ravel(),
+        level_db=(caller.level_db - loss_db - absorption * path).ravel(),
+        bearing=ways.bearing.ravel(),
+        frequency=frequency.ravel(),
+        caller=np.full(path.size, j, dtype=np.int8),
+        landmark=np.tile(np.arange(1, targets + 1), emissions),
+    )
+
+
+def _shifted(
+    itself: int,
+    ways: _Ways,
+    incoming: Float[np.ndarray, "_ t 2"],
+    outward: Float[np.ndarray, "_ t"],
+    frequency: float,
+    c: float,
+) -> Float[np.ndarray, "k t"]:
+    """Frequency of another caller's sounds: shifted by all who move, the vehicle last."""
+    if ways.drift is None:
+        return doppler_frequency(frequency, receiver_speed=ways.closing, speed_of_sound=c)
+    echo = np.arange(ways.closing.shape[1]) != itself
+    with np.errstate(divide="ignore", invalid="ignore"):  # the caller's way to itself is not used
+        unit = incoming / outward[..., np.newaxis]
+    sent = np.sum(ways.drift[:, itself : itself + 1] * unit, axis=-1)
+    met = -np.sum(ways.drift * unit, axis=-1)
+    heard = doppler_frequency(
+        frequency,
+        receiver_speed=ways.closing,
+        source_speed=np.where(echo, sent, ways.approach),
+        speed_of_sound=c,
+    )
+    return doppler_frequency(
+        heard,
+        receiver_speed=np.where(echo, met, 0.0),
+        source_speed=np.where(echo, ways.approach, 0.0),
+        speed_of_sound=c,
+    )
+
+
 def _loss_db(
-    homeward: Float[np.ndarray, "k t"],
-    outward: Float[np.ndarray, " t"],
-    ahead: Int[np.ndarray, " b"],
-    turn: Float[np.ndarray, "k t"],
+    itself: int,
+    ways: _Ways,
+    incoming: Float[np.ndarray, "_ t 2"],
+    outward: Float[np.ndarray, "_ t"],
+    caller: Caller,
     config: Config,
-) -> Float[np.ndarray, " a"]:
-    """Spreading less target strength of the echoes ahead, then of each passive echo and call."""
+) -> Float[np.ndarray, "k t"]:
+    """Spreading less target strength of a caller's echoes; of its direct call, spreading alone."""
     air, target = config.air, config.target
     strength_db = target_strength_db(
-        turn[:, :-1],
+        _turn(incoming, ways.offset),
         radius=target.radius,
-        frequency=config.beacon.frequency,
+        frequency=caller.frequency,
         shape=target.shape,
         speed_of_sound=air.speed_of_sound,
     )
-    active = spreading_loss_db(2.0 * homeward.ravel()[ahead], ways=2)
-    sent, back = np.broadcast_to(outward[:-1], strength_db.shape), homeward[:, :-1]
-    passive = passive_spreading_loss_db(sent, back, law=air.spreading)
-    direct = spreading_loss_db(homeward[:, -1:])
-    return np.concatenate((active, np.hstack((passive - strength_db, direct)).ravel()))
+    sent = outward.copy()
+    sent[:, itself] = 1.0  # no echo of itself: any distance will do
+    loss_db = passive_spreading_loss_db(sent, ways.homeward, law=air.spreading) - strength_db
+    loss_db[:, itself] = spreading_loss_db(ways.homeward[:, itself])
+    return loss_db
 
 
 def _turn(
-    incoming: Float[np.ndarray, "t 2"], offset: Float[np.ndarray, "k t 2"]
+    incoming: Float[np.ndarray, "_ t 2"], offset: Float[np.ndarray, "k t 2"]
 ) -> Float[np.ndarray, "k t"]:
     """Angle from the way in to the way on to the vehicle, which is -offset: pi is back [rad]."""
-    x, y = incoming[:, 0], incoming[:, 1]
+    x, y = incoming[..., 0], incoming[..., 1]
     u, v = -offset[..., 0], -offset[..., 1]
     return np.arctan2(x * v - y * u, x * u + y * v)
 
@@ -314,21 +454,27 @@ def _absorption(air: AirConfig, frequency: float) -> float:
 
 
 def _refuse_impossible(
-    poses: Float[np.ndarray, "k 3"],
-    homeward: Float[np.ndarray, "k t"],
-    outward: Float[np.ndarray, " t"],
+    poses: Float[np.ndarray, "k 3"], ways: _Ways, callers: Sequence[Caller]
 ) -> None:
     """Refuse points that coincide and coordinates that are not finite."""
-    paths = np.hstack((homeward, np.broadcast_to(outward[:-1], (len(poses), len(outward) - 1))))
-    good = (paths.min(axis=1) > 0.0) & (paths.max(axis=1) < math.inf) & np.isfinite(poses[:, 2])
+    between = [ways.homeward]
+    for itself in range(ways.landmarks, ways.homeward.shape[1]):
+        before = ways.target[:, :itself] - ways.target[:, itself : itself + 1]
+        apart = np.hypot(before[..., 0], before[..., 1])
+        between.append(np.broadcast_to(apart, (len(poses), itself)))
+    paths = np.hstack(between)
+    nearest, farthest = paths.min(axis=1, initial=math.inf), paths.max(axis=1, initial=0.0)
+    good = (nearest > 0.0) & (farthest < math.inf) & np.isfinite(poses[:, 2])
     if good.all():
         return
-    bad = int(np.argmin(good))
-    names = [f"landmark {i}" for i in range(1, len(outward))]
-    ends = [f"vehicle to {name}" for name in [*names, "beacon"]] + [f"beacon to {n}" for n in names]
+    bad, others = int(np.argmin(good)), [caller.name for caller in callers[VEHICLE + 1 :]]
+    names = [f"landmark {i}" for i in range(1, ways.landmarks + 1)] + others
+    ends = [f"vehicle to {name}" for name in names]
+    for itself, name in enumerate(others, start=ways.landmarks):
+        ends += [f"{name} to {other}" for other in names[:itself]]
     found = [f"{e}: {d} m" for e, d in zip(ends, paths[bad], strict=True) if not 0.0 < d < math.inf]
     raise InputError(
         f"world around the pose {poses[bad]}: found {', '.join(found) or 'no finite heading'}; "
-        "expected vehicle, beacon and landmarks at distinct, finite points; move them apart "
-        "(scenario.clearance keeps them so)"
+        f"expected {', '.join(['vehicle', *others])} and landmarks at distinct, finite points; "
+        "move them apart (scenario.clearance keeps them so)"
     )

@@ -164,7 +164,8 @@ def doppler_frequency(
     .. math:: f' = f \frac{c + v_r}{c - v_s}
 
     A vehicle's own echo has both speeds, the vehicle's towards the landmark. A beacon's call, or
-    its echo, has the receiver's alone, towards where the sound comes from.
+    its echo, has the receiver's alone, towards where the sound comes from. A reflector on the move
+    receives and sends in turn.
 
     Parameters
     ----------

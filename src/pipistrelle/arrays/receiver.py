@@ -15,18 +15,21 @@ tone,
 .. math:: S_{b} = \sum_{n=40b}^{40b+39} x[n] e^{-2\pi i f_p n / f_s} ,
 
 which are closed-form geometric sums for the arrivals, and for white noise exactly independent
-normals of variance 40 sigma^2, because both tones are whole bins of a 40-sample transform.
+normals of variance 40 sigma^2, because all tones are whole bins of a 40-sample transform.
 Everything later, the matched filter first, needs no more than these sums: a whole number of
 blocks makes the call.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 
 from pipistrelle.acoustics.arrivals import Arrivals
+from pipistrelle.acoustics.callers import MOST, VEHICLE, Caller
 from pipistrelle.arithmetic.noise import complex_noise
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config, InputError
@@ -47,8 +50,8 @@ class Sampling:
         Samples per block.
     pulse : int
         Blocks per call; the first block heard is the one after it.
-    tones : (2) [Hz]
-        The vehicle's and the beacon's frequency.
+    tones : (c) [Hz]
+        The callers' frequencies, the vehicle's first.
     noise_std : float
         Of one complex sample.
     speed_of_sound : [m/s]
@@ -57,17 +60,19 @@ class Sampling:
     rate: float
     block: int
     pulse: int
-    tones: Float[np.ndarray, "2"]
+    tones: Float[np.ndarray, " c"]
     noise_std: float
     speed_of_sound: float
 
 
-def sampling(config: Config) -> Sampling:
+def sampling(config: Config, callers: Sequence[Caller]) -> Sampling:
     """Settle how a frame is sampled.
 
     Parameters
     ----------
     config : Config
+    callers : sequence of c Caller, up to 8
+        The vehicle first. What they call at counts, not the settings' frequencies.
 
     Returns
     -------
@@ -76,34 +81,40 @@ def sampling(config: Config) -> Sampling:
     Raises
     ------
     InputError
-        When a tone is no whole bin of a block, or the call no whole number of blocks.
+        When a tone is no whole bin of a block or the tone of two callers, the call no whole number
+        of blocks, or there are too many callers.
 
     Examples
     --------
-    >>> settled = sampling(Config())
-    >>> settled.block, settled.pulse
-    (40, 14)
+    >>> from pipistrelle.acoustics.callers import callers_of
+    >>> settled = sampling(Config(), callers_of(Config(), np.zeros(2)))
+    >>> settled.block, settled.pulse, settled.tones
+    (40, 14, array([35000., 30000.]))
     """
-    rate = config.receiver.sample_rate
-    tones = np.array([config.emitter.frequency, config.beacon.frequency])
+    rate, pulse = config.receiver.sample_rate, config.emitter.pulse
+    keys = ["emitter.frequency", *(f"{caller.name}.frequency" for caller in callers[VEHICLE + 1 :])]
+    tones = np.array([caller.frequency for caller in callers])
     for key, value, unit, count in (
         ("receiver.sample_rate", rate, "Hz", rate * BLOCK),
-        ("emitter.frequency", tones[0], "Hz", tones[0] * BLOCK),
-        ("beacon.frequency", tones[1], "Hz", tones[1] * BLOCK),
-        ("emitter.pulse", config.emitter.pulse, "s", config.emitter.pulse / BLOCK),
+        *((key, tone, "Hz", tone * BLOCK) for key, tone in zip(keys, tones, strict=True)),
+        ("emitter.pulse", pulse, "s", pulse / BLOCK),
     ):
         if round(count) < 1 or abs(count - round(count)) > 1e-6:
             step = f"{BLOCK:g} s" if unit == "s" else f"{1 / BLOCK:g} Hz"
             raise InputError(f"{key}: found {value:g} {unit}, expected a multiple of {step}")
-    if tones[0] == tones[1]:
-        raise InputError(
-            f"beacon.frequency: found {tones[1]:g} Hz, the vehicle's own; expected another, "
-            "or the two calls cannot be told apart"
-        )
+    if not 1 <= len(callers) <= MOST:
+        raise InputError(f"callers: found {len(callers)}, expected 1 to {MOST}; leave some out")
+    for j, tone in enumerate(tones):
+        for other in callers[:j]:
+            if tone == other.frequency:
+                raise InputError(
+                    f"{keys[j]}: found {tone:g} Hz, the {other.name}'s own; expected another, "
+                    "or the two calls cannot be told apart"
+                )
     return Sampling(
         rate=rate,
         block=round(rate * BLOCK),
-        pulse=round(config.emitter.pulse / BLOCK),
+        pulse=round(pulse / BLOCK),
         tones=tones,
         noise_std=10.0 ** (config.receiver.noise_level_db / 20.0),
         speed_of_sound=config.air.speed_of_sound,
@@ -127,9 +138,9 @@ def blocks_to_hear(arrivals: Arrivals, sampling: Sampling) -> int:
     return max(math.ceil(last) + 1 - sampling.pulse, 2 * sampling.pulse)
 
 
-def block_shape(blocks: int, layout: Layout) -> tuple[int, int, int, int]:
+def block_shape(blocks: int, layout: Layout, sampling: Sampling) -> tuple[int, int, int, int]:
     """Shape of a recording in block sums: (blocks, faces, tones, elements)."""
-    return (blocks, layout.normal.size, 2, layout.position.size)
+    return (blocks, layout.normal.size, sampling.tones.size, layout.position.size)
 
 
 def noise_blocks(
@@ -137,8 +148,8 @@ def noise_blocks(
     layout: Layout,
     sampling: Sampling,
     key: int,
-    out: Complex[np.ndarray, "b f 2 e"] | None = None,
-) -> Complex[np.ndarray, "b f 2 e"]:
+    out: Complex[np.ndarray, "b f c e"] | None = None,
+) -> Complex[np.ndarray, "b f c e"]:
     """Block sums of the microphones' noise.
 
     Parameters
@@ -157,11 +168,11 @@ def noise_blocks(
         Independent, of variance 40 sigma^2.
     """
     std = math.sqrt(sampling.block) * sampling.noise_std
-    return complex_noise(block_shape(blocks, layout), std, key, out)
+    return complex_noise(block_shape(blocks, layout, sampling), std, key, out)
 
 
 def add_echo_blocks(
-    signal: Complex[np.ndarray, "b f 2 e"], arrivals: Arrivals, layout: Layout, sampling: Sampling
+    signal: Complex[np.ndarray, "b f c e"], arrivals: Arrivals, layout: Layout, sampling: Sampling
 ) -> None:
     """Add the block sums of arrivals to a recording, in place.
 
@@ -173,12 +184,13 @@ def add_echo_blocks(
     layout : Layout
     sampling : Sampling
     """
+    amplitude, duration = 10.0 ** (arrivals.level_db / 20.0), _durations(arrivals, sampling)
     _add_echo_blocks(
-        signal.view(np.float64), arrivals.delay, 10.0 ** (arrivals.level_db / 20.0),
-        arrivals.bearing, arrivals.frequency, _durations(arrivals, sampling), layout.normal,
-        layout.position, sampling.tones, sampling.rate, sampling.block, sampling.pulse,
-        sampling.speed_of_sound,
-    )  # fmt: skip
+        signal.view(np.float64),
+        (arrivals.delay, amplitude, arrivals.bearing, arrivals.frequency, duration),
+        (sampling.tones, sampling.rate, sampling.block, sampling.pulse),
+        (layout.normal, layout.position, sampling.speed_of_sound),
+    )
 
 
 def record_samples(
@@ -235,12 +247,80 @@ def record_samples(
 
 def _durations(arrivals: Arrivals, sampling: Sampling) -> Float[np.ndarray, " a"]:
     """Length of each arrival [s]: the Doppler shift compresses the call."""
-    nominal = sampling.tones[arrivals.source]
+    nominal = sampling.tones[arrivals.caller]
     return sampling.pulse * BLOCK * nominal / arrivals.frequency
 
 
+class _Sounds(NamedTuple):
+    """Arrivals as the kernels take them.
+
+    Attributes
+    ----------
+    delay, duration : (a) [s]
+    amplitude : (a)
+    bearing : (a) [rad]
+    frequency : (a) [Hz]
+    """
+
+    delay: Float[np.ndarray, " a"]
+    amplitude: Float[np.ndarray, " a"]
+    bearing: Float[np.ndarray, " a"]
+    frequency: Float[np.ndarray, " a"]
+    duration: Float[np.ndarray, " a"]
+
+
+class _Grid(NamedTuple):
+    """The blocks and tones of a recording.
+
+    Attributes
+    ----------
+    tones : (c) [Hz]
+    rate : [Hz]
+    block : int
+        Samples per block.
+    blank : int
+        Blocks before the first that is heard.
+    """
+
+    tones: Float[np.ndarray, " c"]
+    rate: float
+    block: int
+    blank: int
+
+
+class _Ears(NamedTuple):
+    """A layout in still air.
+
+    Attributes
+    ----------
+    normal : (f) [rad]
+    position : (e) [m]
+    speed_of_sound : [m/s]
+    """
+
+    normal: Float[np.ndarray, " f"]
+    position: Float[np.ndarray, " e"]
+    speed_of_sound: float
+
+
+class _Room(NamedTuple):
+    """Room for one arrival: written and used anew for each.
+
+    Attributes
+    ----------
+    sums : (c, b) complex
+        Its envelope's block sums, per tone.
+    direct, turned : (2 e)
+        Its steering vector and i times that, real and imaginary parts neighbours.
+    """
+
+    sums: Complex[np.ndarray, "c b"]
+    direct: Float[np.ndarray, " i"]
+    turned: Float[np.ndarray, " i"]
+
+
 @kernel
-def _geometric_sum(omega, start, stop):
+def _geometric_sum(omega: float, start: int, stop: int) -> complex:
     """Sum of exp(i omega n) over start <= n < stop."""
     count = stop - start
     half = 0.5 * omega
@@ -250,7 +330,9 @@ def _geometric_sum(omega, start, stop):
 
 
 @lean
-def _envelope(sums, p, omega, start, stop, block):
+def _envelope(
+    sums: Complex[np.ndarray, "c b"], p: int, omega: float, start: int, stop: int, block: int
+) -> int:
     """Write a tone's block sums of exp(i omega n), start <= n < stop; return the blocks touched."""
     first, last = start // block, (stop - 1) // block
     sums[p, 0] = _geometric_sum(omega, start, min(stop, (first + 1) * block))
@@ -266,9 +348,9 @@ def _envelope(sums, p, omega, start, stop, block):
 
 
 @lean
-def _steer(direct, turned, phasor, wave, position):
+def _steer(room: _Room, phasor: complex, wave: float, position: Float[np.ndarray, " e"]) -> None:
     """Write a phasor times each element's phase, and i times that, parts interleaved."""
-    elements = position.size
+    elements, direct, turned = position.size, room.direct, room.turned
     for e in range(elements):
         mirror = elements - 1 - e
         if mirror < e and position[e] == -position[mirror]:
@@ -285,44 +367,53 @@ def _steer(direct, turned, phasor, wave, position):
 
 @lean
 def _add_echo(
-    signal, first, sums, count, phasor, bearing, frequency, normal, position, speed_of_sound,
-    direct, turned,
-):  # fmt: skip
-    """Add an arrival's envelope, block by block, times its steering vector."""
-    for f in range(normal.size):
-        angle = bearing - normal[f]
+    heard: Float[np.ndarray, "b f c i"],
+    room: _Room,
+    phasor: complex,
+    bearing: float,
+    frequency: float,
+    ears: _Ears,
+) -> None:
+    """Add an arrival's envelope to the blocks that it touches, times its steering vector."""
+    sums, direct, turned = room.sums, room.direct, room.turned
+    for f in range(ears.normal.size):
+        angle = bearing - ears.normal[f]
         if math.cos(angle) < 0.0:
             continue
-        wave = 2.0 * math.pi * frequency * math.sin(angle) / speed_of_sound
-        _steer(direct, turned, phasor, wave, position)
-        for b in range(count):
-            for p in range(2):
-                re, im, heard = sums[p, b].real, sums[p, b].imag, signal[first + b, f, p]
-                for i in range(heard.size):
-                    heard[i] += re * direct[i] + im * turned[i]
+        wave = 2.0 * math.pi * frequency * math.sin(angle) / ears.speed_of_sound
+        _steer(room, phasor, wave, ears.position)
+        for b in range(heard.shape[0]):
+            for p in range(heard.shape[2]):
+                re, im, parts = sums[p, b].real, sums[p, b].imag, heard[b, f, p]
+                for i in range(parts.size):
+                    parts[i] += re * direct[i] + im * turned[i]
 
 
 @kernel
 def _add_echo_blocks(
-    signal, delay, amplitude, bearing, frequency, duration, normal, position,
-    tones, rate, block, blank, speed_of_sound,
-):  # fmt: skip
-    """Add every arrival; of the signal each element's real and imaginary part are neighbours."""
-    blocks = signal.shape[0]
-    sums = np.empty((2, blocks), dtype=np.complex128)
-    direct, turned = np.empty(signal.shape[3]), np.empty(signal.shape[3])
-    for a in range(delay.size):
-        start = max(math.ceil(delay[a] * rate), blank * block)
-        stop = min(math.ceil((delay[a] + duration[a]) * rate), (blank + blocks) * block)
+    signal: Float[np.ndarray, "b f c i"], sounds: tuple, grid: tuple, ears: tuple
+) -> None:
+    """Add every arrival; of the signal each element's real and imaginary part are neighbours.
+
+    The other arguments are the columns of a `_Sounds`, a `_Grid` and a `_Ears`.
+    """
+    sound, on, array = _Sounds(*sounds), _Grid(*grid), _Ears(*ears)
+    blocks, _, tones, parts = signal.shape
+    rate, block, blank = on.rate, on.block, on.blank
+    sums = np.empty((tones, blocks), dtype=np.complex128)
+    room = _Room(sums, np.empty(parts), np.empty(parts))
+    for a in range(sound.delay.size):
+        delay, frequency = sound.delay[a], sound.frequency[a]
+        start = max(math.ceil(delay * rate), blank * block)
+        stop = min(math.ceil((delay + sound.duration[a]) * rate), (blank + blocks) * block)
         if stop <= start:
             continue
         count = 0
-        for p in range(2):
-            omega = 2.0 * math.pi * (frequency[a] - tones[p]) / rate
+        for p in range(tones):
+            omega = 2.0 * math.pi * (frequency - on.tones[p]) / rate
             count = _envelope(sums, p, omega, start, stop, block)
-        turns = -2.0 * math.pi * frequency[a] * delay[a]
-        _add_echo(
-            signal, start // block - blank, sums, count,
-            amplitude[a] * complex(math.cos(turns), math.sin(turns)),
-            bearing[a], frequency[a], normal, position, speed_of_sound, direct, turned,
-        )  # fmt: skip
+        turns = -2.0 * math.pi * frequency * delay
+        phasor = sound.amplitude[a] * complex(math.cos(turns), math.sin(turns))
+        first = start // block - blank
+        touched = signal[first : first + count]
+        _add_echo(touched, room, phasor, sound.bearing[a], frequency, array)

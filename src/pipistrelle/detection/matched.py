@@ -9,13 +9,13 @@ from pipistrelle.jit import kernel
 
 
 def filter_blocks(
-    blocks: Complex[np.ndarray, "b f 2 e"],
+    blocks: Complex[np.ndarray, "b f c e"],
     *,
     pulse: int,
     block: int,
     noise_std: float,
-    out: Complex[np.ndarray, "l f 2 e"] | None = None,
-) -> Complex[np.ndarray, "l f 2 e"]:
+    out: Complex[np.ndarray, "l f c e"] | None = None,
+) -> Complex[np.ndarray, "l f c e"]:
     """Matched filter on block sums: a boxcar as long as the call.
 
     Parameters
@@ -51,17 +51,17 @@ def filter_blocks(
 def filter_samples(
     samples: Complex[np.ndarray, "t f e"],
     *,
-    tones: Float[np.ndarray, "2"],
+    tones: Float[np.ndarray, " c"],
     rate: float,
     length: int,
     noise_std: float,
-) -> Complex[np.ndarray, "l f 2 e"]:
+) -> Complex[np.ndarray, "l f c e"]:
     """Matched filter at the full rate, one per tone, by fast convolution.
 
     Parameters
     ----------
     samples : (samples, faces, elements) complex
-    tones : (2) [Hz]
+    tones : (c) [Hz]
     rate : [Hz]
     length : int
         Samples per call.
@@ -87,7 +87,9 @@ def filter_samples(
 
 
 @kernel
-def _boxcar(rows, width, scale, sums):
+def _boxcar(
+    rows: Float[np.ndarray, "b i"], width: int, scale: float, sums: Float[np.ndarray, "l i"]
+) -> None:
     """Write the running sums of width rows, scaled."""
     columns = rows.shape[1]
     total = np.zeros(columns)

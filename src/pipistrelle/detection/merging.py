@@ -73,7 +73,7 @@ def average_faces(
     Examples
     --------
     >>> detections = Detections(
-    ...     face=np.array([0, 1]), tone=np.array([0, 0]), angle=np.radians([40.0, -50.0]),
+    ...     face=np.array([0, 1]), caller=np.array([0, 0]), angle=np.radians([40.0, -50.0]),
     ...     bearing=np.radians([40.0, 42.0]), delay=np.array([0.02, 0.02]), power=np.ones(2))
     >>> rows = average_faces(
     ...     0.5, detections, np.array([3, 3]), averaging="plain", speed_of_sound=343.0).rows
@@ -82,7 +82,7 @@ def average_faces(
     """
     labels, clutter = _distinct(label)
     found = _Found(
-        detections.face, detections.tone, detections.angle, detections.bearing, detections.delay,
+        detections.face, detections.caller, detections.angle, detections.bearing, detections.delay,
         detections.power,
     )  # fmt: skip
     landmark, caller, bearing, delay, level = _average(
@@ -117,14 +117,14 @@ def same_echo(
     Examples
     --------
     >>> detections = Detections(
-    ...     face=np.array([0, 1, 1]), tone=np.zeros(3, int), angle=np.radians([40.0, -50.0, 10.0]),
+    ...     face=np.array([0, 1, 1]), caller=np.zeros(3, int), angle=np.radians([40.0, -50.0, 9.0]),
     ...     bearing=np.radians([40.0, 41.0, 99.0]), delay=np.full(3, 0.02), power=np.ones(3))
     >>> same_echo(detections, delay_gate=7e-4, bearing_gate=0.1)
     array([0, 0, 1])
     """
     order = np.argsort(-detections.power, kind="stable")
     found = _Found(
-        detections.face, detections.tone, detections.angle, detections.bearing, detections.delay,
+        detections.face, detections.caller, detections.angle, detections.bearing, detections.delay,
         detections.power,
     )  # fmt: skip
     return _number(order, found, delay_gate, bearing_gate)

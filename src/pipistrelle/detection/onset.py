@@ -2,11 +2,22 @@
 
 import math
 
+import numpy as np
+from jaxtyping import Complex
+
 from pipistrelle.jit import kernel, lean
 
 
 @lean
-def _steer(matched, low, lags, f, p, u, beam):
+def _steer(
+    matched: Complex[np.ndarray, "l f c e"],
+    low: int,
+    lags: int,
+    f: int,
+    p: int,
+    u: float,
+    beam: Complex[np.ndarray, " r"],
+) -> None:
     """Write the output of the phase-shift beamformer steered to u, so many lags from low on."""
     turn, phase = complex(math.cos(u), -math.sin(u)), 1.0 + 0.0j
     for k in range(lags):
@@ -18,7 +29,7 @@ def _steer(matched, low, lags, f, p, u, beam):
 
 
 @kernel
-def _best_fraction(z0, z1, pulse):
+def _best_fraction(z0: complex, z1: complex, pulse: int) -> tuple[float, float]:
     """Where between two lags the call starts most likely, and how well it fits there.
 
     A call that starts the fraction q into block 0 weighs the blocks 1 - q, 1, ..., 1, q; its
@@ -47,13 +58,21 @@ def _best_fraction(z0, z1, pulse):
 
 
 @kernel
-def reach_of(pulse):
+def reach_of(pulse: int) -> int:
     """How many lags around a snapshot's the call may start."""
     return max(pulse // 7, 1)
 
 
 @lean
-def arrival_lag(matched, b, f, p, u, pulse, beam):
+def arrival_lag(
+    matched: Complex[np.ndarray, "l f c e"],
+    b: int,
+    f: int,
+    p: int,
+    u: float,
+    pulse: int,
+    beam: Complex[np.ndarray, " r"],
+) -> float:
     """Lag at which the call starts in the beam steered to u, near lag b, to a fraction.
 
     ``beam`` is room for the beam: the lags within reach and one to either side.

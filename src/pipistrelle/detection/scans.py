@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 UNLABELLED = -1
 """Label of a measurement of which nobody says whose it is."""
 OWN = 0
-"""Number of the vehicle among the callers."""
+"""Number of the vehicle among the callers, as in `pipistrelle.acoustics.callers`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

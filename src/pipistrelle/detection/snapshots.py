@@ -3,8 +3,8 @@ r"""Matched outputs -> detections: snapshots, tones present, beamscan, time of a
 The matched filter's outputs y_e, normalised to unit noise variance, are tested per face and tone
 by their energy :math:`E = \sum_e |y_e|^2`, which is Gamma(N) distributed in noise. A *snapshot*
 is a lag whose energy passes the test and is the largest within half a call to either side. A tone
-counts there only if its energy is not explained by the leakage of the other, stronger one: the
-edges of a rectangular call leak -33 dB into the other tone. The ten outputs at that lag are
+counts there only if its energy is not explained by the leakage of another, stronger one: the
+edges of a rectangular call leak -33 dB into the next tone. The ten outputs at that lag are
 scanned with a conventional beam, whose power needs only the sums over element pairs of each lag,
 
 .. math:: P(u) = r_0 + 2 \operatorname{Re} \sum_{l=1}^{N-1} r_l e^{-i l u}, \qquad
@@ -17,9 +17,10 @@ Bradley & Abaid, Sec. II-D; what the paper leaves open is settled in the setting
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Complex, Float, Int, Shaped
 
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config, InputError
@@ -35,25 +36,25 @@ _CHUNK = 256
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Detections:
-    """What one frame's samples hold; one row per face, tone, snapshot and peak.
+    """What one frame's samples hold; one row per face, caller, snapshot and peak.
 
     Attributes
     ----------
     face : (m)
-    tone : (m)
-        0 the vehicle's, 1 the beacon's.
+    caller : (m)
+        Whose tone it is: 0 the vehicle's.
     angle : (m) [rad]
         Off the face's normal.
     bearing : (m) [rad]
         Relative to the heading.
     delay : (m) [s]
-        Since the emission. Of the beacon's tone it is nobody's to use but the label's.
+        Since the emission. Of another caller's tone it is nobody's to use but the label's.
     power : (m)
         Of the steered beam, divided by the elements: their number times the SNR of one.
     """
 
     face: Int[np.ndarray, " m"]
-    tone: Int[np.ndarray, " m"]
+    caller: Int[np.ndarray, " m"]
     angle: Float[np.ndarray, " m"]
     bearing: Float[np.ndarray, " m"]
     delay: Float[np.ndarray, " m"]
@@ -73,11 +74,11 @@ class Detector:
     sine_limit : float
         Sine of the largest angle off the normal that counts.
     normal : (f) [rad]
-    wave : (2) [rad]
+    wave : (c) [rad]
         Phase between neighbours at 90 degrees, 2 pi f d / c, per tone.
-    scan : (2, n) [rad]
+    scan : (c, n) [rad]
         Scanned u, per tone.
-    table : (2, 2, e - 1, n)
+    table : (c, 2, e - 1, n)
         Real and imaginary part of exp(-i l u), l = 1 ... e - 1, per tone.
     """
 
@@ -86,12 +87,12 @@ class Detector:
     peak: float
     sine_limit: float
     normal: Float[np.ndarray, " f"]
-    wave: Float[np.ndarray, "2"]
-    scan: Float[np.ndarray, "2 n"]
-    table: Float[np.ndarray, "2 2 l n"]
+    wave: Float[np.ndarray, " c"]
+    scan: Float[np.ndarray, "c n"]
+    table: Float[np.ndarray, "c 2 l n"]
 
 
-def detector(config: Config, layout: Layout) -> Detector:
+def detector(config: Config, layout: Layout, tones: Float[np.ndarray, " c"]) -> Detector:
     """Settle the thresholds and tables of the detection stage.
 
     Parameters
@@ -99,6 +100,8 @@ def detector(config: Config, layout: Layout) -> Detector:
     config : Config
     layout : Layout
         Two equally spaced elements or more.
+    tones : (c) [Hz]
+        Of the calls.
 
     Returns
     -------
@@ -112,14 +115,13 @@ def detector(config: Config, layout: Layout) -> Detector:
     Examples
     --------
     >>> from pipistrelle.arrays.layout import square_of_four
-    >>> config = Config()
-    >>> round(detector(config, square_of_four(config.receiver)).threshold, 1)
+    >>> layout, tones = square_of_four(Config().receiver), np.array([35e3, 30e3])
+    >>> round(detector(Config(), layout, tones).threshold, 1)
     32.7
     """
     from scipy.special import gammainccinv
 
     settings, elements = config.detection, layout.position.size
-    tones = np.array([config.emitter.frequency, config.beacon.frequency])
     wave = 2.0 * np.pi * tones * _spacing(layout) / config.air.speed_of_sound
     edge = wave * math.sin(math.radians(settings.scan_limit_deg))
     count = 2 * math.ceil(edge.max() / SCAN_STEP) + 1
@@ -150,7 +152,7 @@ def _spacing(layout: Layout) -> float:
 
 
 def detect(
-    matched: Complex[np.ndarray, "l f 2 e"],
+    matched: Complex[np.ndarray, "l f c e"],
     detector: Detector,
     *,
     start: float,
@@ -176,14 +178,21 @@ def detect(
     Detections
     """
     energy = _energy(matched.reshape(-1).view(matched.real.dtype), matched.shape[3])
-    face, tone, delay, sine, power = _find_peaks(
-        matched, energy, pulse, detector.threshold, detector.leakage, detector.peak,
-        detector.sine_limit, detector.wave, detector.scan, detector.table, start, interval,
-    )  # fmt: skip
+    rules = (
+        detector.threshold,
+        detector.leakage,
+        detector.peak,
+        detector.sine_limit,
+        detector.wave,
+        detector.scan,
+        detector.table,
+    )
+    lags = (start, interval, pulse)
+    face, caller, delay, sine, power = _find_peaks(matched, energy, rules, lags)
     angle = np.arcsin(sine)
     return Detections(
         face=face,
-        tone=tone,
+        caller=caller,
         angle=angle,
         bearing=wrap(angle + detector.normal[face]),
         delay=delay,
@@ -191,8 +200,28 @@ def detect(
     )
 
 
+class _Rules(NamedTuple):
+    """What the kernels need to know of a detector: its columns of these names."""
+
+    threshold: float
+    leakage: float
+    peak: float
+    sine_limit: float
+    wave: Float[np.ndarray, " c"]
+    scan: Float[np.ndarray, "c n"]
+    table: Float[np.ndarray, "c 2 l n"]
+
+
+class _Lags(NamedTuple):
+    """Delay of lag 0 [s], distance of two lags [s], lags per call."""
+
+    start: float
+    interval: float
+    pulse: int
+
+
 @kernel
-def _energy(parts, elements):
+def _energy(parts: Float[np.ndarray, " i"], elements: int) -> Float[np.ndarray, " t"]:
     """Sums of squares over the elements, real and imaginary parts neighbours, of every output."""
     energy = np.empty(parts.size // (2 * elements))
     square = np.empty(_CHUNK * elements)  # stays in the cache
@@ -210,7 +239,9 @@ def _energy(parts, elements):
 
 
 @kernel
-def _candidates(energy, threshold, row):
+def _candidates(
+    energy: Float[np.ndarray, " t"], threshold: float, row: int
+) -> Int[np.ndarray, " k"]:
     """Tests over the threshold that beat both their neighbours a row away.
 
     Every test is written and few are kept: a branch on each could not be predicted.
@@ -229,10 +260,12 @@ def _candidates(energy, threshold, row):
 
 
 @lean
-def _is_snapshot(energy, test, row, pulse, leakage):
-    """Whether a test's lag is the largest near, and its tone no leakage of the other.
+def _is_snapshot(
+    energy: Float[np.ndarray, " t"], test: int, row: int, tones: int, pulse: int, leakage: float
+) -> bool:
+    """Whether a test's lag is the largest near, and its tone no leakage of another.
 
-    A row of tests is a lag's: its neighbour in time is a row away, its other tone next to it.
+    A row of tests is a lag's: its neighbour in time is a row away, its other tones next to it.
     """
     level, size = energy[test], energy.size
     for away in range(row, (pulse // 2 + 1) * row, row):
@@ -240,15 +273,20 @@ def _is_snapshot(energy, test, row, pulse, leakage):
             return False
         if test + away < size and energy[test + away] > level:
             return False
-    other, strongest = test + 1 - 2 * (test % 2), 0.0
-    for away in range(-pulse * row, (pulse + 1) * row, row):
-        if 0 <= other + away < size:
-            strongest = max(strongest, energy[other + away])
+    own, strongest = test % tones, 0.0
+    for p in range(tones):
+        if p != own:
+            other = test - own + p
+            for away in range(-pulse * row, (pulse + 1) * row, row):
+                if 0 <= other + away < size:
+                    strongest = max(strongest, energy[other + away])
     return level > leakage * strongest
 
 
 @lean
-def _scan_power(x, table, power):
+def _scan_power(
+    x: Complex[np.ndarray, " e"], table: Float[np.ndarray, "2 l n"], power: Float[np.ndarray, " n"]
+) -> None:
     """Write the power of the conventional beam over the scan, from the lag sums."""
     elements, beams = x.size, power.size
     r0 = 0.0
@@ -268,7 +306,7 @@ def _scan_power(x, table, power):
 
 
 @lean
-def _peaks(power, ratio, place):
+def _peaks(power: Float[np.ndarray, " n"], ratio: float, place: Int[np.ndarray, " n"]) -> int:
     """Write where the power peaks, not far under its highest; return the number of peaks.
 
     Chosen as the candidates are.
@@ -288,7 +326,7 @@ def _peaks(power, ratio, place):
 
 
 @kernel
-def _grown(column):
+def _grown(column: Shaped[np.ndarray, " m"]) -> Shaped[np.ndarray, " 2*m"]:
     """Copy of a column with twice the room."""
     wide = np.empty(2 * column.size, dtype=column.dtype)
     for i in range(column.size):
@@ -298,33 +336,47 @@ def _grown(column):
 
 @kernel
 def _find_peaks(
-    matched, energy, pulse, threshold, leakage, peak_ratio, sine_limit, wave, scan, table, start,
-    interval,
-):  # fmt: skip
-    """Every peak of every snapshot: face, tone, delay, sine of the angle and power."""
+    matched: Complex[np.ndarray, "l f c e"],
+    energy: Float[np.ndarray, " t"],
+    rules: tuple,
+    lags: tuple,
+) -> tuple[
+    Int[np.ndarray, " m"],
+    Int[np.ndarray, " m"],
+    Float[np.ndarray, " m"],
+    Float[np.ndarray, " m"],
+    Float[np.ndarray, " m"],
+]:
+    """Every peak of every snapshot: face, caller, delay, sine of the angle and power.
+
+    The last arguments are the columns of a `_Rules` and a `_Lags`.
+    """
+    rule, lag = _Rules(*rules), _Lags(*lags)
     _, faces, tones, elements = matched.shape
+    scan, wave, pulse = rule.scan, rule.wave, lag.pulse
     face, tone = np.empty(128, dtype=np.int64), np.empty(128, dtype=np.int64)
     delay, sine, peak_power = np.empty(128), np.empty(128), np.empty(128)
     power, place = np.empty(scan.shape[1]), np.empty(scan.shape[1], dtype=np.int64)
     beam = np.empty(2 * reach_of(pulse) + 3, dtype=np.complex128)
     row, count = faces * tones, 0
-    for test in _candidates(energy, threshold, row if pulse > 1 else energy.size):
-        if not _is_snapshot(energy, test, row, pulse, leakage):
+    for test in _candidates(energy, rule.threshold, row if pulse > 1 else energy.size):
+        if not _is_snapshot(energy, test, row, tones, pulse, rule.leakage):
             continue
         b, f, p = test // row, test // tones % faces, test % tones
-        _scan_power(matched[b, f, p], table[p], power)
+        _scan_power(matched[b, f, p], rule.table[p], power)
         step = scan[p, 1] - scan[p, 0]
-        for i in place[: _peaks(power, peak_ratio, place)]:
+        for i in place[: _peaks(power, rule.peak, place)]:
             slope = power[i + 1] - power[i - 1]
             bend = 2.0 * power[i] - power[i + 1] - power[i - 1]
             u = scan[p, i] + 0.5 * step * slope / bend
-            if abs(u / wave[p]) > sine_limit:
+            if abs(u / wave[p]) > rule.sine_limit:
                 continue
             if count == face.size:
                 face, tone, delay = _grown(face), _grown(tone), _grown(delay)
                 sine, peak_power = _grown(sine), _grown(peak_power)
             face[count], tone[count], sine[count] = f, p, u / wave[p]
-            delay[count] = start + interval * arrival_lag(matched, b, f, p, u, pulse, beam)
+            late = arrival_lag(matched, b, f, p, u, pulse, beam)
+            delay[count] = lag.start + lag.interval * late
             peak_power[count] = (power[i] + 0.125 * slope * slope / bend) / elements
             count += 1
     return face[:count], tone[:count], delay[:count], sine[:count], peak_power[:count]

@@ -6,12 +6,12 @@ Rows of one label are merged, those without one are dropped
 (`pipistrelle.detection.merging.labelled`), and the filter is corrected with the rest.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Int
 
-from pipistrelle.detection.scans import UNLABELLED, Scan
+from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Belief
 
 Associate = Callable[[Belief, Scan], Int[np.ndarray, " m"]]
@@ -36,33 +36,3 @@ def told(belief: Belief, scan: Scan) -> Int[np.ndarray, " m"]:
     Bradley & Abaid, Sec. III-B ("we assumed known data association").
     """
     return scan.landmark
-
-
-def told_but(ignored: Collection[int]) -> Associate:
-    """Take the labels that came with the scan, but for some, whose rows are dropped.
-
-    A landmark that moves is none for a filter whose landmarks stand still.
-
-    Parameters
-    ----------
-    ignored : labels
-
-    Returns
-    -------
-    Associate
-
-    Examples
-    --------
-    >>> from pipistrelle.detection.scans import make_scan
-    >>> scan = make_scan(0.5, np.array([3, 8]), np.zeros(2))
-    >>> told_but([8])(None, scan)
-    array([ 3, -1])
-    """
-    labels = np.array(sorted(ignored), dtype=np.int64)
-    if not labels.size:
-        return told
-
-    def associate(belief: Belief, scan: Scan) -> Int[np.ndarray, " m"]:
-        return np.where(np.isin(scan.landmark, labels), UNLABELLED, scan.landmark)
-
-    return associate

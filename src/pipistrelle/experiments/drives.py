@@ -50,7 +50,9 @@ class Drive:
     controls : (k, 2)
         Of each step.
     truth : Truth
-        At the same times; nothing of it, by default.
+        At the same times; nothing of it, by default. Its landmarks are those that stand.
+    moving : tuple of int
+        Labels of what moves: no landmarks, though heard.
     """
 
     motion: Motion
@@ -58,3 +60,4 @@ class Drive:
     time: Float[np.ndarray, " t"]
     controls: Float[np.ndarray, "t-1 2"]
     truth: Truth = NO_TRUTH
+    moving: tuple[int, ...] = ()

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from pipistrelle.acoustics.callers import Caller
 from pipistrelle.config import InputError
 from pipistrelle.estimation.beliefs import Landmarks
 from pipistrelle.experiments.drives import NO_TRUTH, LabelledPoints, Truth
@@ -21,6 +22,7 @@ from pipistrelle.figures.maps import (
     PLACED,
     RAY,
     beam,
+    callers_shown,
     cells,
     draw_truth,
     ellipses,
@@ -50,9 +52,8 @@ SYMBOLS = (
     "ray, 1σ, darker: likelier",
     "just pruned",
     "placed landmark, 95 %",
-    "beacon",
 )
-"""The legend."""
+"""The legend, but for who calls."""
 FLASH = 4
 """Pictures during which a landmark that has turned full is ringed."""
 
@@ -62,7 +63,7 @@ def animate_mission(
     path: Path,
     *,
     truth: Truth = NO_TRUTH,
-    beacon: Float[np.ndarray, "2"] | None = None,
+    callers: Sequence[Caller] = (),
     beamwidth: float | None = None,
     pictures: int = 125,
 ) -> None:
@@ -81,7 +82,8 @@ def animate_mission(
     path : Path
         Ends in .gif, or in .mp4, which needs ffmpeg.
     truth : Truth
-    beacon : (2) [m], optional
+    callers : sequence of Caller, optional
+        Without the vehicle; one that moves is drawn as its path.
     beamwidth : [rad], optional
     pictures : int, at least 1
         At most so many frames are shown, evenly spaced, the last among them.
@@ -111,7 +113,7 @@ def animate_mission(
     with matplotlib.rc_context(STYLE):
         times = _times(snapshots, pictures)
         start = times[0] if truth.path is None else truth.time[0]
-        figure, panels = _stage(snapshots, truth, beacon, beamwidth)
+        figure, panels = _stage(snapshots, truth, callers, beamwidth)
         try:
             write(_play(figure, panels, times, start), path)
         except OSError as error:
@@ -133,7 +135,7 @@ def _times(
 def _stage(
     snapshots: Mapping[tuple[str, str], Sequence[Snapshot]],
     truth: Truth,
-    beacon: Float[np.ndarray, "2"] | None,
+    callers: Sequence[Caller],
     beamwidth: float | None,
 ) -> tuple["Figure", list["_Panel"]]:
     """Draw what never moves and set up what does."""
@@ -141,11 +143,12 @@ def _stage(
 
     paths = [np.array([frame.pose for frame in frames]) for frames in snapshots.values()]
     maps = [frames[-1].landmarks for frames in snapshots.values()]
-    limits = view(truth, beacon, paths, maps)
+    limits = view(truth, callers, paths, maps)
     (left, right), (bottom, top) = limits
     places = cells(list(snapshots))
     rows, columns = (1 + max(indices) for indices in zip(*places, strict=True))
-    foot = LINE * -(-len(SYMBOLS) // (2 * columns))
+    names = [*SYMBOLS, *sorted(callers_shown(callers))]
+    foot = LINE * -(-len(names) // (2 * columns))
     high = TOP + WIDTH * (top - bottom) / (right - left) + BOTTOM
     size = np.array([LEFT + RIGHT + columns * (WIDTH + GAP) - GAP, rows * high + foot])
     width, height = 2.0 * np.ceil(size * DPI / 2.0) / DPI
@@ -161,11 +164,10 @@ def _stage(
         axes.tick_params(labelleft=leftmost)
         axes.grid(True)
         axes.set_axisbelow(True)
-        draw_truth(axes, truth.landmarks, beacon)
+        draw_truth(axes, truth.landmarks, callers)
         panels.append(_Panel(axes, head(axes, strategy, name), frames, strategy, truth))
         panels[-1].beamwidth = None if strategy == "passive" else beamwidth
     _enlarge(panels, truth.landmarks)
-    names = [name for name in SYMBOLS if name != "beacon" or beacon is not None]
     legend(figure, names, 2 * columns, LEFT, RIGHT)
     return figure, panels
 

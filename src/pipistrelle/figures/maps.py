@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from pipistrelle.acoustics.callers import Caller, moves
 from pipistrelle.estimation.beliefs import Landmarks
 from pipistrelle.estimation.catalogue import title_of
 from pipistrelle.experiments.drives import LabelledPoints, Truth
@@ -169,7 +170,7 @@ def shades(
 
 def view(
     truth: Truth,
-    beacon: Float[np.ndarray, "2"] | None,
+    callers: Sequence[Caller],
     paths: Sequence[Float[np.ndarray, "_ 3"]],
     maps: Sequence[Landmarks],
 ) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -180,7 +181,8 @@ def view(
     Parameters
     ----------
     truth : Truth
-    beacon : (2) [m], or None
+    callers : sequence of Caller
+        Without the vehicle.
     paths : estimated poses (k, 3) [m, m, rad]
     maps : Landmarks
         Only fully initialised ones count.
@@ -194,14 +196,15 @@ def view(
     --------
     >>> from pipistrelle.experiments.drives import NO_TRUTH
     >>> path = np.array([[0.0, 9.0, 0.0], [10.0, 0.0, 0.0]])
-    >>> np.round(view(NO_TRUTH, np.ones(2), [path], []), 9)
+    >>> beacon = Caller(name="beacon", frequency=30e3, level_db=42.8, place=np.ones(2))
+    >>> np.round(view(NO_TRUTH, [beacon], [path], []), 9)
     array([[-0.6 , 10.6 ],
            [-0.54,  9.54]])
     """
     points = paths if truth.path is None else [truth.path]
     marks = [rows.mean[placed(rows)] for rows in maps]
     marks = marks if truth.landmarks is None else [truth.landmarks[1]]
-    marks += [] if beacon is None else [beacon[None]]
+    marks += [np.reshape(np.asarray(caller.place), (-1, 2)) for caller in callers]
     shown = np.concatenate([*(poses[:, :2] for poses in points), *marks])
     shown = shown[np.isfinite(shown).all(axis=1)]
     shown = shown if len(shown) else np.zeros((1, 2))
@@ -236,30 +239,57 @@ def _around_ellipses(
 def draw_truth(
     axes: "Axes",
     true_landmarks: LabelledPoints | None,
-    beacon: Float[np.ndarray, "2"] | None,
+    callers: Sequence[Caller],
 ) -> None:
-    """Draw the true landmarks as open circles and the beacon as a star.
+    """Draw the true landmarks as open circles, each caller as a star or, where it moves, its path.
 
     Parameters
     ----------
     axes : Axes
     true_landmarks : labels (n) and positions (n, 2) [m], or None
-        The beacon may be one of them.
-    beacon : (2) [m], or None
+        Callers may be among them.
+    callers : sequence of Caller
+        Without the vehicle.
 
     Examples
     --------
     >>> from matplotlib.figure import Figure
     >>> axes = Figure().add_subplot()
-    >>> draw_truth(axes, (np.array([1]), np.zeros((1, 2))), np.ones(2))
+    >>> beacon = Caller(name="beacon", frequency=30e3, level_db=42.8, place=np.ones(2))
+    >>> draw_truth(axes, (np.array([1]), np.zeros((1, 2))), [beacon])
     >>> len(axes.lines)
     2
     """
     if true_landmarks is not None:
         x, y = true_landmarks[1].T
         axes.plot(x, y, "o", ms=5.0, mfc="none", mec=TRUTH, mew=0.8, zorder=3)
-    if beacon is not None:
-        axes.plot(*beacon, "*", ms=12, mfc=INK, mec="white", mew=0.8, zorder=3.5)
+    for caller in callers:
+        place = np.asarray(caller.place)
+        if moves(caller):
+            axes.plot(*place.reshape(-1, 2).T, color=INK, lw=1.0, ls="-.", zorder=3.4)
+        else:
+            axes.plot(*place, "*", ms=12, mfc=INK, mec="white", mew=0.8, zorder=3.5)
+
+
+def callers_shown(callers: Sequence[Caller]) -> set[str]:
+    """Names in the legend that some callers need.
+
+    Parameters
+    ----------
+    callers : sequence of Caller
+        Without the vehicle.
+
+    Returns
+    -------
+    set of str
+
+    Examples
+    --------
+    >>> path = np.zeros((9, 2))
+    >>> callers_shown([Caller(name="boat", frequency=30e3, level_db=42.8, place=path)])
+    {'moving caller'}
+    """
+    return {"moving caller" if moves(caller) else "beacon" for caller in callers}
 
 
 def cells(cases: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
@@ -377,6 +407,7 @@ def _symbols() -> dict[str, "Artist"]:
         "placed landmark, 95 %": mark("o", 7.5, "#33333330", INK),
         "unresolved ray, 1σ, darker: likelier": mark(member, 14.0, "#33333350"),
         "beacon": mark("*", 11.0, INK, "white"),
+        "moving caller": line(lw=1.0, ls="-."),
         "vehicle at the end": mark(dart, 10.0, INK),
         "its beam": mark(sector, 14.0, "#33333338"),
         "range and bearing": line(lw=1.4),

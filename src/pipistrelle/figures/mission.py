@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipistrelle.acoustics.callers import Caller
 from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
 from pipistrelle.evaluation.consistency import anees_bounds, track_nees
 from pipistrelle.experiments.drives import NO_TRUTH, LabelledPoints, Truth
@@ -14,6 +15,7 @@ from pipistrelle.figures.maps import (
     PLACED,
     RAY,
     beam,
+    callers_shown,
     cells,
     draw_truth,
     ellipses,
@@ -43,25 +45,26 @@ SYMBOLS = (
     ("placed landmark, 95 %", None),
     ("unresolved ray, 1σ, darker: likelier", None),
     ("beacon", 2),
+    ("moving caller", 3),
     ("vehicle at the end", None),
-    ("its beam", 3),
+    ("its beam", 4),
 )
-"""The legend, and which of true path, true landmarks, beacon and beamwidth an entry needs."""
+"""The legend, and which of true path, true landmarks, who calls and beamwidth an entry needs."""
 
 
 def draw_mission(
     trials: Sequence[TrialResult],
     *,
     truth: Truth = NO_TRUTH,
-    beacon: np.ndarray | None = None,
+    callers: Sequence[Caller] = (),
     beamwidth: float | None = None,
 ) -> "Figure":
     """Draw the final maps of one world side by side, and below each its errors over time.
 
     A map shows the true and the estimated path, true landmarks (open circles) tied to their
     estimates (dots in their 95 % ellipses), the rays that are still unresolved (members at one
-    standard deviation, the heavier the darker), the beacon, and the vehicle at the end with its
-    beam and, enlarged in a corner, its particles if it has any. Below, position and heading
+    standard deviation, the heavier the darker), who else calls, and the vehicle at the end with
+    its beam and, enlarged in a corner, its particles if it has any. Below, position and heading
     errors stand against three standard deviations of the filter's own (in position, of the root
     of the trace) and the NEES against the 95 % band of one run. All panels share their scales.
 
@@ -71,9 +74,10 @@ def draw_mission(
         In the frame of the truth; each strategy and filter once. Several of both make a column
         for each strategy and a row for each filter.
     truth : Truth
-        At the times of the tracks; without a path there are no errors to show. The beacon may be
-        one of the landmarks.
-    beacon : (2) [m], optional
+        At the times of the tracks; without a path there are no errors to show. Callers may be
+        among the landmarks.
+    callers : sequence of Caller, optional
+        Without the vehicle: a star where one stands, a line where one moves.
     beamwidth : [rad], optional
         Of the vehicle's call, for the strategies that use it; without it no beam is drawn.
 
@@ -103,12 +107,16 @@ def draw_mission(
         raise ValueError("a mission's figure needs at least one trial")
     paths = [trial.track.pose.mean for trial in trials]
     maps = [trial.track.landmarks for trial in trials]
-    limits = view(truth, beacon, paths, maps)
+    limits = view(truth, callers, paths, maps)
     places = cells([(trial.strategy, trial.filter) for trial in trials])
+    who = ["beacon" in callers_shown(callers), "moving caller" in callers_shown(callers)]
+    known = [truth.path is not None, truth.landmarks is not None]
+    given = [*known, *who, beamwidth is not None]
+    names = [name for name, of in SYMBOLS if of is None or given[of]]
     with matplotlib.rc_context(STYLE):
-        figure, panels = _panels(places, limits, errors=truth.path is not None)
+        figure, panels = _panels(places, limits, len(names), errors=truth.path is not None)
         for trial, (axes, *rows) in zip(trials, panels, strict=True):
-            draw_truth(axes, truth.landmarks, beacon)
+            draw_truth(axes, truth.landmarks, callers)
             if truth.path is not None:
                 axes.plot(*truth.path[:, :2].T, color=TRUTH, lw=3.2, alpha=0.45, zorder=2)
                 _draw_errors(rows, trial, truth.path)
@@ -118,8 +126,6 @@ def draw_mission(
         _draw_clouds([axes for axes, *_ in panels], trials, truth)
         if truth.path is not None:
             _scale_errors([rows for _, *rows in panels])
-        given = (truth.path, truth.landmarks, beacon, beamwidth)
-        names = [name for name, of in SYMBOLS if of is None or given[of] is not None]
         legend(figure, names, 4 if figure.get_figwidth() > 8.0 else 2, LEFT, RIGHT)
     return figure
 
@@ -127,6 +133,7 @@ def draw_mission(
 def _panels(
     places: Sequence[tuple[int, int]],
     limits: tuple[tuple[float, float], tuple[float, float]],
+    names: int,
     *,
     errors: bool,
 ) -> tuple["Figure", list[list["Axes"]]]:
@@ -141,7 +148,8 @@ def _panels(
     heights = (height, *ERRORS) if errors else (height,)
     gaps = [0.0, 0.5, 0.12, 0.12][: len(heights)]
     block = TOP + sum(heights) + sum(gaps) + 0.42
-    page = blocks * block + LEGEND * (1 if total > 8.0 else 2)
+    entries = 4 if total > 8.0 else 2
+    page = blocks * block + LEGEND * max(8 // entries, -(-names // entries)) / 2
     figure = Figure(figsize=(total, page))
     panels: list[list[Axes]] = []
     for row, column in places:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 from pydantic import BaseModel
 
 from pipistrelle.experiments.drives import Truth
@@ -20,6 +19,7 @@ from pipistrelle.verbs.console import announced, closing_table, say
 from pipistrelle.verbs.options import OutputOptions
 
 if TYPE_CHECKING:
+    from pipistrelle.acoustics.callers import Caller
     from pipistrelle.figures.recorder import MissionRecorder
 
 
@@ -87,7 +87,7 @@ def deliver(
     config: BaseModel,
     seed: int,
     options: OutputOptions,
-    beacon: Float[np.ndarray, "2"] | None = None,
+    callers: Sequence["Caller"] = (),
     beamwidth: float | None = None,
     ignored_rows: dict[str, int] | None = None,
     watch: "MissionRecorder | None" = None,
@@ -103,7 +103,8 @@ def deliver(
         All settings.
     seed : int
     options : OutputOptions
-    beacon : (2) [m], optional
+    callers : sequence of Caller, optional
+        Who is heard besides the vehicle.
     beamwidth : [rad], optional
         Of the vehicle's call.
     ignored_rows : dict, optional
@@ -119,7 +120,7 @@ def deliver(
     from pipistrelle.figures.mission import draw_mission
     from pipistrelle.figures.style import save_figure
 
-    scene: dict[str, Any] = {"truth": truth, "beacon": beacon, "beamwidth": beamwidth}
+    scene: dict[str, Any] = {"truth": truth, "callers": callers, "beamwidth": beamwidth}
     figure = draw_mission(trials, **scene)
     write_results(
         folder,

@@ -64,7 +64,7 @@ def run(
             config=config,
             seed=config.seed,
             options=output,
-            beacon=done.scenario.beacon,
+            callers=done.scenario.callers[1:],
             beamwidth=_beamwidth(done),
             watch=watch,
         )

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from pipistrelle.acoustics.arrivals import (
-    ACTIVE,
-    PASSIVE,
     arrivals_of_emission,
     rows_of,
     through_piston,
 )
+from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of
 from pipistrelle.arithmetic.noise import stream_key
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import (
@@ -22,7 +21,14 @@ from pipistrelle.arrays.receiver import (
     noise_blocks,
     sampling,
 )
-from pipistrelle.config import Config, EmitterConfig, InputError, ReceiverConfig, ScenarioConfig
+from pipistrelle.config import (
+    Config,
+    EmitterConfig,
+    InputError,
+    MotionConfig,
+    ReceiverConfig,
+    ScenarioConfig,
+)
 from pipistrelle.detection.matched import filter_blocks, filter_samples
 from pipistrelle.detection.merging import Heard
 from pipistrelle.detection.scans import UNLABELLED
@@ -30,12 +36,13 @@ from pipistrelle.detection.snapshots import Detections, detect, detector
 from pipistrelle.experiments.hearing import listening
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.oracle import faintest_level_db, label_detections
-from pipistrelle.experiments.hearing.scenario import draw_scenario
+from pipistrelle.experiments.hearing.scenario import draw_scenario, standing_landmarks
 from pipistrelle.geometry import range_and_bearing, wrap
 
 CONFIG = Config()
-LAYOUT, SETTLED = square_of_four(CONFIG.receiver), sampling(CONFIG)
-FINDER = detector(CONFIG, LAYOUT)
+CALLERS = callers_of(CONFIG, np.zeros(2))
+LAYOUT, SETTLED = square_of_four(CONFIG.receiver), sampling(CONFIG, CALLERS)
+FINDER = detector(CONFIG, LAYOUT, SETTLED.tones)
 FAINTEST = faintest_level_db(
     FINDER.threshold,
     elements=10,
@@ -48,7 +55,7 @@ BEACON = 51
 
 
 def short(steps, **changes):
-    config = Config(scenario=ScenarioConfig(steps=steps), **changes)
+    config = Config(**({"scenario": ScenarioConfig(steps=steps)} | changes))
     return draw_scenario(config, np.random.default_rng(7)), config
 
 
@@ -134,7 +141,7 @@ def errors_of(config, worlds):
     for seed in range(worlds):
         world = draw_scenario(config, np.random.default_rng(seed))
         (beam,) = listen(world, config, [0.0088], iteration=seed)
-        places = np.vstack((world.landmarks, world.beacon))
+        _, places = standing_landmarks(world)
         for heard in beam:
             pose = world.path[np.searchsorted(world.time, heard.time)]
             distance, bearing = range_and_bearing(pose, places[heard.landmark - 1])
@@ -161,7 +168,7 @@ def frames(seed, every):
     for k in range(4 * every, len(world.path), 4 * every):
         velocity = (world.path[k, :2] - world.path[k - 1, :2]) / CONFIG.scenario.step
         emission = arrivals_of_emission(
-            world.path[k], velocity, world.landmarks, world.beacon, CONFIG
+            world.path[k], velocity, world.landmarks, world.callers, CONFIG
         )
         heard = through_piston(emission, radius=0.0088, frequency=35e3, speed_of_sound=343.0)
         key = stream_key(seed, 0, "what the call hides", k)
@@ -179,7 +186,7 @@ def landmarks(blocks, arrivals, tone, finder=FINDER):
     label = label_detections(
         found, arrivals, LAYOUT, CONFIG.association, pulse=2.8e-3, faintest_db=FAINTEST
     )
-    return set(label[(found.tone == tone) & (label != UNLABELLED)].tolist()) - {BEACON}
+    return set(label[(found.caller == tone) & (label != UNLABELLED)].tolist()) - {BEACON}
 
 
 def with_echoes(blocks, arrivals, rows):
@@ -193,7 +200,7 @@ def census(worlds, every):
     count, deaf = Counter(), replace(FINDER, leakage=0.0)
     for seed in range(worlds):
         for arrivals, noise in frames(seed, every):
-            call = (arrivals.source == PASSIVE) & (arrivals.landmark == BEACON)
+            call = (arrivals.caller != VEHICLE) & (arrivals.landmark == BEACON)
             alone = with_echoes(noise, arrivals, call)
             count["frames"] += 1
             for name, blocks, finder in (
@@ -201,7 +208,7 @@ def census(worlds, every):
                 ("false beside the call", alone, FINDER),
                 ("false without the guard", alone, deaf),
             ):
-                count[name] += 0 in detected(blocks, finder).tone
+                count[name] += 0 in detected(blocks, finder).caller
             quiet = with_echoes(noise, arrivals, ~call)
             full = with_echoes(quiet, arrivals, call)
             for tone, name in enumerate(("active", "passive")):
@@ -211,7 +218,7 @@ def census(worlds, every):
             # Each source in its own tone alone: a world without leakage.
             clean = noise.copy()
             for tone in range(2):
-                part = with_echoes(np.zeros_like(noise), arrivals, arrivals.source == tone)
+                part = with_echoes(np.zeros_like(noise), arrivals, arrivals.caller == tone)
                 clean[:, :, tone] += part[:, :, tone]
             guarded, open_ = (landmarks(clean, arrivals, 0, f) for f in (FINDER, deaf))
             count["active without leakage"] += len(open_)
@@ -249,7 +256,7 @@ def test_beam_and_finder_of_ones_own_are_used():
     world, config = short(40)
 
     def deaf(arrivals, **piston):
-        own = arrivals.source == ACTIVE
+        own = arrivals.caller == VEHICLE
         return replace(arrivals, level_db=np.where(own, -300.0, arrivals.level_db))
 
     def first_face(matched, detector, **timing):
@@ -278,3 +285,65 @@ def test_over_whole_missions_the_call_costs_a_fortieth_of_the_passive_echoes_at_
     assert rate["active hidden"] < 0.01 * rate["active without the call"]
     assert rate["passive hidden"] < 0.025 * rate["passive without the call"]
     assert rate["active given up"] < 0.02 * rate["active without leakage"]
+
+
+def test_a_mission_hears_the_doppler_shift_of_the_speed_that_it_drives_at():
+    straight = ScenarioConfig(steps=24, steering=0.0, speed=0.6, landmarks=9)
+    still = MotionConfig(speed_std=0.0, steering_std=0.0)
+    world, config = short(24, motion=still, scenario=straight)
+    heard = []
+
+    def watched(arrivals, **piston):
+        heard.append(arrivals)
+        return through_piston(arrivals, **piston)
+
+    listen(world, config, [0.0088], beam=watched)
+    (arrivals,) = heard  # of all six frames
+    own, c = arrivals.caller == VEHICLE, config.air.speed_of_sound
+    closing = straight.speed * np.cos(arrivals.bearing)
+    shifted = np.where(own, 35e3 * (c + closing) / (c - closing), 30e3 * (c + closing) / c)
+    np.testing.assert_allclose(arrivals.frequency, shifted, rtol=1e-12)
+    assert np.ptp(closing) > 0.5  # a speed divided by four would show
+
+
+def chorus(world, moving):
+    """Return a world with a third caller, that stands or rounds the centre."""
+    turn = 0.05 * world.time if moving else np.zeros(1)
+    path = 12.0 * np.column_stack((np.cos(turn), np.sin(turn)))
+    whistle = Caller(
+        name="whistle", frequency=25e3, level_db=42.8, place=path if moving else path[0]
+    )
+    return replace(world, callers=(*world.callers, whistle))
+
+
+@pytest.mark.parametrize("engine", ["block", "dense"])
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_third_caller_is_heard_where_it_is_by_either_engine(engine, moving):
+    alone = ScenarioConfig(steps=8, landmarks=0)  # nothing sounds into its direct call
+    world, config = short(8, receiver=ReceiverConfig(engine=engine), scenario=alone)
+    three = chorus(world, moving)
+    (beam,) = listen(three, config, [0.0088])
+    for heard in beam:
+        assert heard.bearing.shape[1] == 3
+        k = np.searchsorted(world.time, heard.time)
+        place = three.callers[2].place[k] if moving else three.callers[2].place
+        _, bearing = range_and_bearing(world.path[k], place[None])
+        (row,) = heard.bearing[heard.landmark == 2]
+        assert abs(wrap(row[2] - bearing[0])) < 0.02
+
+
+def test_a_third_caller_that_stands_is_heard_to_the_bit_as_one_on_a_constant_path():
+    world, config = short(16)
+    three = chorus(world, moving=False)
+    tied = replace(three.callers[2], place=np.tile(three.callers[2].place, (17, 1)))
+    constant = replace(three, callers=(*world.callers, tied))
+    radii = [0.0025, 0.025]
+    one, two = listen(three, config, radii), listen(constant, config, radii)
+    assert [bits(beam) for beam in one] == [bits(beam) for beam in two]
+
+
+def test_a_path_that_does_not_fit_the_scenario_is_refused():
+    world, config = short(8)
+    boat = Caller(name="boat", frequency=25e3, level_db=42.8, place=np.zeros((8, 2)))
+    with pytest.raises(InputError, match=r"caller boat: .*expected \(9, 2\)"):
+        listen(replace(world, callers=(*world.callers, boat)), config, [0.0088])

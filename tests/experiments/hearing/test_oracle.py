@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipistrelle.acoustics.arrivals import Arrivals
+from pipistrelle.acoustics.callers import callers_of
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, sampling
 from pipistrelle.config import AssociationConfig, Config
@@ -31,7 +32,7 @@ def true_arrivals(*rows):
         level_db=level_db.astype(float),
         bearing=bearing.astype(float),
         frequency=np.full(delay.size, 30e3),
-        source=source.astype(np.int8),
+        caller=source.astype(np.int8),
         landmark=landmark,
     )
 
@@ -41,7 +42,7 @@ def detections(*rows):
     delay, bearing, tone, face, power = (np.array(c) for c in zip(*rows, strict=True))
     return Detections(
         face=face,
-        tone=tone,
+        caller=tone,
         angle=wrap(bearing - LAYOUT.normal[face]),
         bearing=bearing.astype(float),
         delay=1e-3 * delay,
@@ -85,7 +86,7 @@ def slow_labels(found, arrivals):
             late = abs(found.delay[d] - arrivals.delay[a]) / (PULSE / 4)
             off = abs(wrap(found.bearing[d] - arrivals.bearing[a])) / 0.1
             possible = (
-                arrivals.source[a] == found.tone[d]
+                arrivals.caller[a] == found.caller[d]
                 and abs(off_face) <= np.pi / 2
                 and arrivals.level_db[a] >= FAINTEST
                 and (found.face[d], a) not in taken
@@ -112,7 +113,7 @@ def test_an_arrival_labels_one_detection_of_each_face_at_most(seed):
     found, arrivals = crowd(seed)
     given_ = [
         key
-        for key in zip(found.face, found.tone, labels(found, arrivals), strict=True)
+        for key in zip(found.face, found.caller, labels(found, arrivals), strict=True)
         if key[2] != UNLABELLED
     ]
     assert len(given_) == len(set(given_)) > 0
@@ -188,7 +189,8 @@ def test_the_faintest_level_is_the_margin_under_an_echo_expected_at_the_threshol
     config = Config.model_validate(
         {"detection": {"false_alarm": alarm}, "receiver": {"noise_level_db": 4.0}}
     )
-    settled, finder = sampling(config), detector(config, LAYOUT)
+    settled = sampling(config, callers_of(config, np.zeros(2)))
+    finder = detector(config, LAYOUT, settled.tones)
     level_db = faintest_level_db(
         finder.threshold,
         elements=10,

@@ -3,12 +3,14 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 import numpy as np
 import pytest
 
+from pipistrelle.acoustics.callers import Caller
 from pipistrelle.config import STRATEGIES, Config, InputError, ReceiverConfig, ScenarioConfig
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive
+from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import bicycle, draw_scenario
 from pipistrelle.experiments.results.scores import score_path
 from pipistrelle.experiments.runs.trial import (
@@ -302,9 +304,30 @@ def test_a_trial_is_scored_against_the_path_and_all_landmarks_the_beacon_last():
     assert trial.scores.position_rmse_m == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-12)
     labels, places = mission.drive.truth.landmarks
     assert labels.tolist() == list(range(1, 52))
-    assert places[-1].tolist() == mission.scenario.beacon.tolist()
+    assert places[-1].tolist() == mission.scenario.callers[1].place.tolist()
     assert mission.drive.start.mean.tolist() == mission.scenario.path[0].tolist()
     assert np.sqrt(np.diag(mission.drive.start.covariance)) == pytest.approx([0.05, 0.05, 0.0436])
+
+
+def test_a_caller_that_moves_is_heard_but_is_no_landmark():
+    world = draw_scenario(SHORT, RNG(3))
+    path = 9.0 * np.column_stack((np.cos(0.05 * world.time), np.sin(0.05 * world.time)))
+    boat = Caller(name="boat", frequency=25e3, level_db=42.8, place=path)
+    post = replace(boat, name="post", frequency=20e3, place=np.array([-12.0, 3.0]))
+    three = replace(world, callers=(*world.callers, boat, post))
+    drive = drive_of(three, SHORT)
+    labels, places = drive.true_landmarks
+    assert labels.tolist() == [*range(1, 52), 53]
+    assert (places[-1].tolist(), drive.moving) == ([-12.0, 3.0], (52,))
+    (heard,) = listen(three, SHORT, (SHORT.emitter.radius,))
+    scans = [scan_of(frame, "fused") for frame in heard]
+    assert any(52 in scan.landmark for scan in scans)
+    trial = run_trial(Case(strategy="fused", filter="ekf"), drive, scans, SHORT)
+    assert not any(52 in scan.landmark for scan in trial.scans)
+    assert {51, 53} <= set(trial.track.landmarks.landmark.tolist())
+    assert 52 not in trial.track.landmarks.landmark
+    kept = sum(scan.landmark.size for scan in trial.scans)
+    assert kept == sum(np.count_nonzero(scan.landmark != 52) for scan in scans)
 
 
 def test_trials_of_one_world_do_not_depend_on_their_order():

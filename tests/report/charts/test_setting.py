@@ -38,7 +38,7 @@ def test_the_map_is_the_world_that_the_study_heard(charts):
     series = {s.name: s for s in charts["example_map"].panels[0].series}
     np.testing.assert_array_equal(series["landmark"].x, world.landmarks[:, 0])
     np.testing.assert_array_equal(series["true path"].y, world.path[:, 1])
-    assert (series["beacon"].x[0], series["beacon"].y[0]) == tuple(world.beacon)
+    assert (series["beacon"].x[0], series["beacon"].y[0]) == tuple(world.callers[1].place)
     assert len(series["landmark"].tips) == 50
 
 

@@ -1,7 +1,7 @@
 """Listening: a path through a world -> what is heard at each frame, by either engine.
 
-The noise and the beacon's sound are those of the world and shared by all beamwidths, drawn once
-and keyed by the frame alone.
+The noise and the other callers' sound are those of the world and shared by all beamwidths, drawn
+once and keyed by the frame alone.
 
 The dense engine records until the vehicle calls again, 100,000 samples of 40 channels in the
 paper's half a second less the blanked call. The block engine stops after the last arrival. What
@@ -17,12 +17,12 @@ import numpy as np
 from jaxtyping import Complex, Int
 
 from pipistrelle.acoustics.arrivals import (
-    ACTIVE,
     Arrivals,
     arrivals_of_emissions,
     rows_of,
     through_piston,
 )
+from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_at
 from pipistrelle.arithmetic.noise import stream_key
 from pipistrelle.arrays.layout import Layout, square_of_four
 from pipistrelle.arrays.receiver import (
@@ -66,6 +66,7 @@ def listen(
     Parameters
     ----------
     scenario : Scenario
+        Its callers count, not the settings' tones and levels.
     config : Config
     radii : sequence of [m]
         Radii of the vehicle's piston; ``config.emitter.radius`` is not used.
@@ -90,7 +91,7 @@ def listen(
     Raises
     ------
     InputError
-        When the sampling does not fit the tones, or points of the world coincide.
+        When the sampling does not fit the tones, a path the times, or points of the world coincide.
 
     Notes
     -----
@@ -107,7 +108,8 @@ def listen(
     (2, 1.0)
     """
     setup = config.scenario
-    station = _station(config, layout or square_of_four(config.receiver), find, oracle)
+    ears = layout or square_of_four(config.receiver)
+    station = _station(config, scenario.callers, ears, find, oracle)
     engine = _dense if config.receiver.engine == "dense" else _blocks
     beams: tuple[list[Heard], ...] = tuple([] for _ in radii)
     frames = range(setup.steps_per_frame, len(scenario.path), setup.steps_per_frame)
@@ -152,12 +154,14 @@ class _Station:
 
 def _station(
     config: Config,
+    callers: Sequence[Caller],
     layout: Layout,
     find: Callable[..., Detections],
     oracle: Callable[..., Int[np.ndarray, " d"]] | None,
 ) -> _Station:
     """Settle what every frame of a path is heard with."""
-    settled, finder = sampling(config), detector(config, layout)
+    settled = sampling(config, callers)
+    finder = detector(config, layout, settled.tones)
     return _Station(
         config=config,
         layout=layout,
@@ -188,14 +192,15 @@ def _emissions(
         steps = np.array(frames[first : first + TOGETHER])
         poses = scenario.path[steps]
         velocities = (poses[:, :2] - scenario.path[steps - 1, :2]) / config.scenario.step
+        callers = callers_at(scenario.callers, scenario.time, steps)
         emission, count = arrivals_of_emissions(
-            poses, velocities, scenario.landmarks, scenario.beacon, config
+            poses, velocities, scenario.landmarks, callers, config
         )
         aimed = [
             beam(
                 emission,
                 radius=radius,
-                frequency=config.emitter.frequency,
+                frequency=callers[VEHICLE].frequency,
                 speed_of_sound=config.air.speed_of_sound,
             )
             for radius in radii
@@ -233,8 +238,8 @@ def _heard(time: float, detections: Detections, arrivals: Arrivals, station: _St
 def _blocks(aimed: Sequence[Arrivals], station: _Station, key: int) -> Iterator[Detections]:
     """Yield, per beam, what is detected of its arrivals from block sums."""
     layout, settled, space = station.layout, station.sampling, station.workspace
-    pulse, own = settled.pulse, np.count_nonzero(aimed[0].source == ACTIVE)  # they come first
-    shape = block_shape(blocks_to_hear(aimed[0], settled), layout)
+    pulse, own = settled.pulse, np.count_nonzero(aimed[0].caller == VEHICLE)  # they come first
+    shape = block_shape(blocks_to_hear(aimed[0], settled), layout, settled)
     shared = noise_blocks(shape[0], layout, settled, key, out=space.array("shared", shape))
     add_echo_blocks(shared, rows_of(aimed[0], slice(own, None)), layout, settled)
     lags = (shape[0] - pulse + 1, *shape[1:])

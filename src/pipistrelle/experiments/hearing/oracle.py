@@ -7,8 +7,10 @@ for the stage between prediction and correction to say (`pipistrelle.estimation.
 sees beliefs and scans, never the truth.
 """
 
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int, Int8
 
 from pipistrelle.acoustics.arrivals import Arrivals
 from pipistrelle.arrays.layout import Layout
@@ -30,7 +32,7 @@ def label_detections(
 ) -> Int[np.ndarray, " d"]:
     """Label each detection with the landmark that caused it.
 
-    A true arrival of the same face and tone is a candidate if its delay and its bearing are
+    A true arrival of the same face and caller is a candidate if its delay and its bearing are
     within the gates and its level is not hopeless. The strongest detection chooses first, the
     nearest candidate in units of the gates; each arrival is given once per face.
 
@@ -55,11 +57,10 @@ def label_detections(
     Bradley & Abaid, Sec. III-B ("we assumed known data association").
     """
     order = np.argsort(-detections.power, kind="stable")
-    return _label(
-        order, detections.face, detections.tone, detections.delay, detections.bearing,
-        arrivals.source, arrivals.delay, arrivals.bearing, arrivals.level_db, arrivals.landmark,
-        layout.normal, gates.delay_gate * pulse, gates.bearing_gate, faintest_db,
-    )  # fmt: skip
+    found = (detections.face, detections.caller, detections.delay, detections.bearing)
+    true = (arrivals.caller, arrivals.delay, arrivals.bearing, arrivals.level_db, arrivals.landmark)
+    within = (gates.delay_gate * pulse, gates.bearing_gate, faintest_db)
+    return _label(order, found, true, layout.normal, within)
 
 
 def faintest_level_db(
@@ -92,28 +93,63 @@ def faintest_level_db(
     return float(10.0 * np.log10(per_sample) - margin_db)
 
 
+class _Found(NamedTuple):
+    """Detections, (d) rows, as the kernel takes them."""
+
+    face: Int[np.ndarray, " d"]
+    caller: Int[np.ndarray, " d"]
+    delay: Float[np.ndarray, " d"]
+    bearing: Float[np.ndarray, " d"]
+
+
+class _True(NamedTuple):
+    """Arrivals, (a) rows, as the kernel takes them."""
+
+    caller: Int8[np.ndarray, " a"]
+    delay: Float[np.ndarray, " a"]
+    bearing: Float[np.ndarray, " a"]
+    level_db: Float[np.ndarray, " a"]
+    landmark: Int[np.ndarray, " a"]
+
+
+class _Gates(NamedTuple):
+    """How late [s] and how far off [rad] a detection may be, and the faintest arrival [dB]."""
+
+    delay: float
+    bearing: float
+    faintest_db: float
+
+
 @kernel
 def _label(
-    order, face, tone, delay, bearing, source, true_delay, true_bearing, level_db, landmark,
-    normal, delay_gate, bearing_gate, faintest_db,
-):  # fmt: skip
-    """Greedy one-to-one matching, the strongest detection first."""
+    order: Int[np.ndarray, " d"],
+    detections: tuple,
+    arrivals: tuple,
+    normal: Float[np.ndarray, " f"],
+    within: tuple,
+) -> Int[np.ndarray, " d"]:
+    """Greedy one-to-one matching, the strongest detection first.
+
+    The tuples are the columns of a `_Found`, a `_True` and a `_Gates`.
+    """
+    found, true, gates = _Found(*detections), _True(*arrivals), _Gates(*within)
+    face, bearing = found.face, found.bearing
     label = np.full(face.size, UNLABELLED, dtype=np.int64)
-    taken = np.zeros((normal.size, true_delay.size), dtype=np.bool_)
+    taken = np.zeros((normal.size, true.delay.size), dtype=np.bool_)
     for d in order:
         nearest, best = -1, np.inf
-        for a in range(true_delay.size):
-            late = abs(delay[d] - true_delay[a]) / delay_gate
-            if late > 1.0 or source[a] != tone[d]:
+        for a in range(true.delay.size):
+            late = abs(found.delay[d] - true.delay[a]) / gates.delay
+            if late > 1.0 or true.caller[a] != found.caller[d]:
                 continue
-            if level_db[a] < faintest_db or taken[face[d], a]:
+            if true.level_db[a] < gates.faintest_db or taken[face[d], a]:
                 continue
-            if abs(wrap_angle(true_bearing[a] - normal[face[d]])) > 0.5 * np.pi:
+            if abs(wrap_angle(true.bearing[a] - normal[face[d]])) > 0.5 * np.pi:
                 continue
-            off = abs(wrap_angle(bearing[d] - true_bearing[a])) / bearing_gate
+            off = abs(wrap_angle(bearing[d] - true.bearing[a])) / gates.bearing
             if off <= 1.0 and late * late + off * off < best:
                 nearest, best = a, late * late + off * off
         if nearest >= 0:
-            label[d] = landmark[nearest]
+            label[d] = true.landmark[nearest]
             taken[face[d], nearest] = True
     return label

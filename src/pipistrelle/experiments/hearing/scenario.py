@@ -6,9 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of, moves
 from pipistrelle.arithmetic.noise import stream_key
 from pipistrelle.config import Config, InputError, MotionConfig, ScenarioConfig
 from pipistrelle.estimation.motion import Motion, motion_step
+from pipistrelle.experiments.drives import LabelledPoints
 
 TRIES = 2000
 """Draws of one landmark before the request counts as impossible."""
@@ -18,7 +20,7 @@ DENSEST = math.pi / math.sqrt(12.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
-    """A true world. Landmark i (from 0) bears the label i + 1, the beacon the label n + 1.
+    """A true world. Landmark i (from 0) bears the label i + 1, caller j (from 1) the label n + j.
 
     Attributes
     ----------
@@ -28,14 +30,15 @@ class Scenario:
     controls : (k, 2)
         Nominal speed [m/s] and steering angle [rad] of each step, as the filters know them.
     landmarks : (n, 2) [m]
-    beacon : (2) [m]
+    callers : tuple of Caller
+        The vehicle first; paths have a place for each of the times.
     """
 
     time: Float[np.ndarray, " t"]
     path: Float[np.ndarray, "t 3"]
     controls: Float[np.ndarray, "t-1 2"]
     landmarks: Float[np.ndarray, "n 2"]
-    beacon: Float[np.ndarray, "2"]
+    callers: tuple[Caller, ...]
 
 
 def world_of(config: Config, iteration: int = 0) -> Scenario:
@@ -59,7 +62,7 @@ def world_of(config: Config, iteration: int = 0) -> Scenario:
     Examples
     --------
     >>> one, again, other = world_of(Config()), world_of(Config()), world_of(Config(), 1)
-    >>> bool((one.beacon == again.beacon).all()), bool((one.beacon == other.beacon).all())
+    >>> (one.path == again.path).all().item(), (one.path == other.path).all().item()
     (True, False)
     """
     key = stream_key(config.seed, iteration, "scenario")
@@ -102,8 +105,54 @@ def draw_scenario(config: Config, rng: np.random.Generator) -> Scenario:
         path=path,
         controls=controls,
         landmarks=_place_landmarks(setup, path[:, :2], beacon, rng),
-        beacon=beacon,
+        callers=callers_of(config, beacon),
     )
+
+
+def standing_landmarks(scenario: Scenario) -> LabelledPoints:
+    """Label what stands: the landmarks, then the callers that do not move.
+
+    Parameters
+    ----------
+    scenario : Scenario
+
+    Returns
+    -------
+    labels (m) and positions (m, 2) [m]
+        Labels rising.
+
+    Examples
+    --------
+    >>> labels, places = standing_landmarks(world_of(Config()))
+    >>> labels[[0, -1]], places.shape
+    (array([ 1, 51]), (51, 2))
+    """
+    landmarks = scenario.landmarks
+    labelled = enumerate(scenario.callers[VEHICLE + 1 :], start=len(landmarks) + 1)
+    standing = {label: np.asarray(c.place) for label, c in labelled if not moves(c)}
+    labels = np.array([*range(1, len(landmarks) + 1), *standing])
+    return labels, np.vstack((landmarks, *standing.values()))
+
+
+def moving_labels(scenario: Scenario) -> tuple[int, ...]:
+    """List the labels of the callers that move, which are no landmarks of a map.
+
+    Parameters
+    ----------
+    scenario : Scenario
+
+    Returns
+    -------
+    tuple of int
+        Rising.
+
+    Examples
+    --------
+    >>> moving_labels(world_of(Config()))
+    ()
+    """
+    labelled = enumerate(scenario.callers[VEHICLE + 1 :], start=len(scenario.landmarks) + 1)
+    return tuple(label for label, caller in labelled if moves(caller))
 
 
 def bicycle(motion: MotionConfig) -> Motion:

@@ -14,7 +14,7 @@ from pipistrelle.arithmetic.noise import stream_key
 from pipistrelle.config import Config, InputError, Strategy
 from pipistrelle.detection.merging import Heard, labelled, scan_of
 from pipistrelle.detection.noise import noise_of
-from pipistrelle.detection.scans import Scan
+from pipistrelle.detection.scans import Scan, rows_of
 from pipistrelle.estimation.association import Associate, told
 from pipistrelle.estimation.beliefs import (
     B,
@@ -29,7 +29,13 @@ from pipistrelle.estimation.catalogue import CATALOGUE, entry, short_name
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.experiments.hearing.listening import Progress, listen
-from pipistrelle.experiments.hearing.scenario import Scenario, bicycle, world_of
+from pipistrelle.experiments.hearing.scenario import (
+    Scenario,
+    bicycle,
+    moving_labels,
+    standing_landmarks,
+    world_of,
+)
 from pipistrelle.experiments.machine import check_length, check_memory
 from pipistrelle.experiments.results.scores import TrialResult, score, score_path
 from pipistrelle.experiments.runs.outside import check_filters, failed_trial
@@ -87,7 +93,7 @@ def run_mission(
     scenario = world_of(config)
     check_memory(
         filters,
-        len(scenario.landmarks) + 1,
+        len(standing_landmarks(scenario)[0]),
         config,
         passive=any(strategy != "active" for strategy in strategies),
     )
@@ -128,9 +134,8 @@ def drive_of(scenario: Scenario, config: Config) -> Drive:
     Returns
     -------
     Drive
-        The beacon is the last of the true landmarks.
+        Its true landmarks are the landmarks and then the callers that stand: the beacon is last.
     """
-    places = np.vstack((scenario.landmarks, scenario.beacon))
     return Drive(
         motion=bicycle(config.motion),
         start=Gaussian(
@@ -139,11 +144,8 @@ def drive_of(scenario: Scenario, config: Config) -> Drive:
         ),
         time=scenario.time,
         controls=scenario.controls,
-        truth=Truth(
-            time=scenario.time,
-            path=scenario.path,
-            landmarks=(np.arange(1, len(places) + 1), places),
-        ),
+        truth=Truth(time=scenario.time, path=scenario.path, landmarks=standing_landmarks(scenario)),
+        moving=moving_labels(scenario),
     )
 
 
@@ -208,7 +210,7 @@ def run_trial(
     case : Case
     drive : Drive
     scans : sequence of Scan
-        As `scans_of` gives them.
+        As `scans_of` gives them; what they hold of callers that move is left out.
     config : Config
     associate : Associate
         Says who is who, between prediction and correction.
@@ -219,6 +221,8 @@ def run_trial(
     TrialResult
     """
     strategy, name = case.strategy, case.filter
+    if drive.moving:
+        scans = [rows_of(scan, ~np.isin(scan.landmark, drive.moving)) for scan in scans]
 
     def report(done: int, total: int) -> None:
         if progress:

@@ -26,7 +26,12 @@ from pipistrelle.estimation.catalogue import SECTIONS
 from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
 from pipistrelle.evaluation.consistency import track_nees
 from pipistrelle.experiments.hearing.listening import listen
-from pipistrelle.experiments.hearing.scenario import Scenario, bicycle, world_of
+from pipistrelle.experiments.hearing.scenario import (
+    Scenario,
+    bicycle,
+    standing_landmarks,
+    world_of,
+)
 from pipistrelle.experiments.results.scores import PathScores, Scores
 from pipistrelle.experiments.runs.outside import first_belief
 from pipistrelle.experiments.runs.trial import drive_of, run_trial
@@ -268,7 +273,7 @@ def _try_case(
         result = run_trial(replace(case, iteration=iteration), drive, scans, case.config)
         cpu_s = time.thread_time() - began
         estimate = heaviest(result.track.landmarks)
-        places = np.vstack((scenario.landmarks, scenario.beacon))
+        labels, places = standing_landmarks(scenario)
         full = result.track.full
         return TrialRecord(
             case=case,
@@ -282,7 +287,9 @@ def _try_case(
             steps=_frame_errors(result.track, scenario, case.config),
             landmark=estimate.landmark,
             full=estimate.full,
-            landmark_error=position_error(estimate.mean, places[estimate.landmark - 1]),
+            landmark_error=position_error(
+                estimate.mean, places[np.searchsorted(labels, estimate.landmark)]
+            ),
         )
     except Exception:
         return _failed(case, traceback.format_exc())

@@ -5,6 +5,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from pipistrelle.acoustics.callers import VEHICLE, Caller, moves
 from pipistrelle.acoustics.emitter import HALF_POWER, piston_directivity, piston_radius
 from pipistrelle.config import InputError
 from pipistrelle.experiments.hearing.scenario import Scenario, world_of
@@ -89,10 +90,11 @@ def example_map(study: Study) -> Chart:
     reach = 1.04 * max(setup.radius, setup.beacon_distance, float(np.abs(world.path[:, :2]).max()))
     axis = Axis(label="", limits=(-reach, reach), ticks=())
     panel = Panel(title="", x=axis, y=axis, series=_world(world, setup.radius), equal=True)
+    others = "".join(f", the {caller.name}" for caller in world.callers[VEHICLE + 1 :])
     return Chart(
         name="example_map",
         title="A world of the study",
-        caption=f"World {number}: {len(world.landmarks)} landmarks, the beacon and the vehicle's "
+        caption=f"World {number}: {len(world.landmarks)} landmarks{others} and the vehicle's "
         f"true path of {world.time[-1]:g} s; the dashed circle has a radius of {setup.radius:g} m",
         panels=(panel,),
         columns=("x_m", "y_m"),
@@ -150,9 +152,9 @@ def _protractor() -> list[Series]:
 
 
 def _world(world: Scenario, radius: float) -> tuple[Series, ...]:
-    """Return path, landmarks and beacon within the circle that holds them."""
+    """Return path, landmarks and callers within the circle that holds them."""
     circle = np.linspace(0.0, 2.0 * np.pi, 181)
-    beacon, start = world.beacon[None], world.path[:1, :2]
+    start = world.path[:1, :2]
     labels = [f"landmark {i}" for i in range(1, len(world.landmarks) + 1)]
     return (
         Series(
@@ -181,15 +183,17 @@ def _world(world: Scenario, radius: float) -> tuple[Series, ...]:
             filled=np.zeros(len(world.landmarks), bool),
             tips=_places(labels, world.landmarks),
         ),
-        Series(
-            name="beacon",
-            role="fused",
-            x=beacon[:, 0],
-            y=beacon[:, 1],
-            style="stars",
-            tips=_places(["beacon"], beacon),
-        ),
+        *(_caller(caller) for caller in world.callers[VEHICLE + 1 :]),
     )
+
+
+def _caller(caller: Caller) -> Series:
+    """Return a star where a caller stands, or its path."""
+    place = np.reshape(np.asarray(caller.place), (-1, 2))
+    look = {"name": caller.name, "role": "fused", "x": place[:, 0], "y": place[:, 1]}
+    if moves(caller):
+        return Series(**look)
+    return Series(**look, style="stars", tips=_places([caller.name], place))
 
 
 def _places(names: list[str], points: Float[np.ndarray, "n 2"]) -> tuple[str, ...]:

@@ -1,0 +1,158 @@
+"""Who calls: the vehicle itself, and whoever else it listens to.
+
+Callers are a list. The first is the vehicle, the only one that moves with the ears and whose call
+is given a beam; the others call alike in all directions, from a place or along a path. All call at
+once. Each has a tone of its own, by which its call is told from the rest. The paper's list is of
+two: the vehicle and the beacon.
+
+A caller other than the vehicle is also a landmark: it reflects the calls of all but itself, and is
+heard directly in its own tone. Landmarks bear the labels 1 to n, caller j the label n + j.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipistrelle.config import Config, InputError
+
+VEHICLE = 0
+"""Where the vehicle stands in every list of callers."""
+MOST = 8
+"""Callers that one recording can tell apart."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Caller:
+    """Someone whose calls the vehicle hears.
+
+    Attributes
+    ----------
+    name : str
+        In messages and figures.
+    frequency : [Hz]
+    level_db : [dB]
+        Source level at 1 m; of the vehicle, on its axis.
+    place : (2) or (t, 2) [m], or None
+        Where it calls from: one place, or one for each time (of a scenario) or emission; None for
+        the vehicle, which calls from where it is.
+    velocity : (2) or (t, 2) [m/s], or None
+        Of a caller that moves, where it calls; None where it stands, or where `callers_at` is to
+        take it from the path.
+    """
+
+    name: str
+    frequency: float
+    level_db: float
+    place: Float[np.ndarray, "2"] | Float[np.ndarray, "t 2"] | None = None
+    velocity: Float[np.ndarray, "2"] | Float[np.ndarray, "t 2"] | None = None
+
+
+def callers_of(config: Config, beacon: Float[np.ndarray, "2"]) -> tuple[Caller, Caller]:
+    """List the paper's two callers, as the settings have them.
+
+    Parameters
+    ----------
+    config : Config
+        Its sections emitter and beacon.
+    beacon : (2) [m]
+        Where the beacon stands.
+
+    Returns
+    -------
+    The vehicle and the beacon.
+
+    Notes
+    -----
+    Bradley & Abaid, Sec. II.
+
+    Examples
+    --------
+    >>> [(caller.name, caller.frequency) for caller in callers_of(Config(), np.zeros(2))]
+    [('vehicle', 35000.0), ('beacon', 30000.0)]
+    """
+    own, other = config.emitter, config.beacon
+    return (
+        Caller(name="vehicle", frequency=own.frequency, level_db=own.level_db),
+        Caller(name="beacon", frequency=other.frequency, level_db=other.level_db, place=beacon),
+    )
+
+
+def moves(caller: Caller) -> bool:
+    """Whether a caller other than the vehicle calls along a path.
+
+    Parameters
+    ----------
+    caller : Caller
+
+    Returns
+    -------
+    bool
+
+    Examples
+    --------
+    >>> [moves(caller) for caller in callers_of(Config(), np.zeros(2))]
+    [False, False]
+    """
+    return caller.velocity is not None or (caller.place is not None and caller.place.ndim == 2)
+
+
+def callers_at(
+    callers: Sequence[Caller], time: Float[np.ndarray, " t"], steps: Int[np.ndarray, " k"]
+) -> tuple[Caller, ...]:
+    """Take the callers as they are at some times: of a path, the places and the velocities there.
+
+    Where no velocities are given, those of the steps that end there are taken, as for the vehicle.
+
+    Parameters
+    ----------
+    callers : sequence of Caller
+        The vehicle first.
+    time : (t) [s]
+        Of the paths.
+    steps : (k), from 1 on
+        Which of the times.
+
+    Returns
+    -------
+    tuple of Caller
+        Paths and velocities (k, 2); those that stand as they were.
+
+    Raises
+    ------
+    InputError
+        Where the vehicle is not the first or not alone without a place, or a path does not fit
+        the times.
+
+    Examples
+    --------
+    >>> path = np.array([[0.0, 5.0], [0.5, 5.0], [1.5, 5.0]])
+    >>> vehicle, _ = callers_of(Config(), path[0])
+    >>> boat = Caller(name="boat", frequency=30e3, level_db=42.8, place=path)
+    >>> callers_at((vehicle, boat), np.arange(3) * 0.5, np.array([2]))[1].velocity
+    array([[2., 0.]])
+    """
+    placeless = [j for j, caller in enumerate(callers) if caller.place is None]
+    if placeless != [VEHICLE]:
+        raise InputError(
+            f"callers: found {', '.join(caller.name for caller in callers) or 'none'}; expected "
+            "the vehicle first, without a place, and for each of the others a place or a path"
+        )
+    return tuple(_at(caller, time, steps) if moves(caller) else caller for caller in callers)
+
+
+def _at(caller: Caller, time: Float[np.ndarray, " t"], steps: Int[np.ndarray, " k"]) -> Caller:
+    """Take the places and velocities of a path at some of its times."""
+    path, velocity = np.asarray(caller.place), caller.velocity
+    if len(path) != len(time) or (velocity is not None and np.shape(velocity) != path.shape):
+        raise InputError(
+            f"caller {caller.name}: found a path of shape {path.shape}"
+            f"{'' if velocity is None else f' and velocities of shape {np.shape(velocity)}'}; "
+            f"expected ({len(time)}, 2), a row for each time of the scenario"
+        )
+    if velocity is None:
+        last = (path[steps] - path[steps - 1]) / (time[steps] - time[steps - 1])[:, np.newaxis]
+    else:
+        last = velocity[steps]
+    return replace(caller, place=path[steps], velocity=last)

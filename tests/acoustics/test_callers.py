@@ -1,0 +1,198 @@
+"""Callers as a list: two and more, standing and moving, and what each brings to the vehicle."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+
+from pipistrelle.acoustics.arrivals import Arrivals, arrivals_of_emission, arrivals_of_emissions
+from pipistrelle.acoustics.callers import Caller, callers_at, callers_of
+from pipistrelle.config import Config, InputError
+
+law = settings(deadline=None, max_examples=40)
+SEEDS = st.integers(0, 2**32 - 1)
+CONFIG = Config()
+C = CONFIG.air.speed_of_sound
+TONES = (30e3, 25e3, 20e3)
+
+
+def crowd(seed, others=3, moving=0, emissions=4):
+    """Return poses, velocities, landmarks and callers; the last of the others move."""
+    rng = np.random.default_rng(seed)
+    vehicle, _ = callers_of(CONFIG, np.zeros(2))
+    callers = [vehicle]
+    for j in range(others):
+        shape = (emissions, 2) if j >= others - moving else (2,)
+        velocity = rng.uniform(-3.0, 3.0, shape) if j >= others - moving else None
+        place = rng.uniform(-15.0, 15.0, shape)
+        named = {"name": f"caller {j}", "frequency": TONES[j], "level_db": 40.0 + j}
+        callers.append(Caller(**named, place=place, velocity=velocity))
+    poses = rng.uniform(-9.0, 9.0, (emissions, 3))
+    return poses, rng.uniform(-1.0, 1.0, (emissions, 2)), rng.uniform(-20, 20, (5, 2)), callers
+
+
+def bits(arrivals):
+    return [getattr(arrivals, name).tobytes() for name in Arrivals.__slots__]
+
+
+@given(seed=SEEDS)
+@law
+def test_each_caller_is_heard_directly_and_by_way_of_all_landmarks_and_all_other_callers(seed):
+    poses, velocities, landmarks, callers = crowd(seed)
+    heard = arrivals_of_emission(poses[0], velocities[0], landmarks, callers, CONFIG)
+    points = np.vstack((landmarks, [caller.place for caller in callers[1:]]))
+    others = heard.caller > 0
+    assert heard.caller[others].tolist() == [1] * 8 + [2] * 8 + [3] * 8
+    assert heard.landmark[others].tolist() == [*range(1, 9)] * 3
+    home = np.hypot(*(points - poses[0, :2]).T)
+    for j in (1, 2, 3):
+        out = np.hypot(*(points - callers[j].place).T)
+        assert out[4 + j] == 0.0  # its direct call
+        np.testing.assert_allclose(heard.delay[heard.caller == j], (out + home) / C, rtol=1e-14)
+    assert set(heard.landmark[~others].tolist()) <= set(range(1, 9))
+
+
+@given(seed=SEEDS, moving=st.integers(0, 3))
+@law
+def test_the_order_of_the_other_callers_changes_labels_and_nothing_else(seed, moving):
+    poses, velocities, landmarks, callers = crowd(seed, moving=moving)
+    order = np.random.default_rng(seed).permutation(3)
+    turned = [callers[0], *(callers[1 + j] for j in order)]
+    one, count = arrivals_of_emissions(poses, velocities, landmarks, callers, CONFIG)
+    two, same = arrivals_of_emissions(poses, velocities, landmarks, turned, CONFIG)
+    assert count.tolist() == same.tolist()
+    old_label = np.concatenate(([0, 1, 2, 3, 4, 5], 6 + order))[two.landmark]
+    old_caller = np.concatenate(([0], 1 + order))[two.caller]
+    rows = np.lexsort((old_label, old_caller, np.repeat(np.arange(4), count)))
+    assert old_label[rows].tolist() == one.landmark.tolist()
+    for name in ("delay", "level_db", "bearing", "frequency"):
+        assert getattr(two, name)[rows].tobytes() == getattr(one, name).tobytes()
+
+
+@given(seed=SEEDS)
+@law
+def test_a_caller_that_stands_sounds_to_the_bit_as_one_on_a_constant_path(seed):
+    poses, velocities, landmarks, callers = crowd(seed)
+    time, steps = 0.5 * np.arange(5), np.arange(1, 5)
+    tied = [replace(c, place=np.tile(c.place, (5, 1))) for c in callers[1:]]
+    moved = callers_at([callers[0], *tied], time, steps)
+    assert all(not caller.velocity.any() for caller in moved[1:])
+    one, _ = arrivals_of_emissions(poses, velocities, landmarks, callers, CONFIG)
+    two, _ = arrivals_of_emissions(poses, velocities, landmarks, moved, CONFIG)
+    assert bits(one) == bits(two)
+
+
+@given(seed=SEEDS)
+@law
+def test_many_emissions_of_moving_callers_bring_bit_for_bit_what_each_brings_alone(seed):
+    poses, velocities, landmarks, callers = crowd(seed, moving=2)
+    heard, count = arrivals_of_emissions(poses, velocities, landmarks, callers, CONFIG)
+    end = np.cumsum(count)
+    for k in range(len(poses)):
+        now = [
+            c if c.velocity is None else replace(c, place=c.place[k], velocity=c.velocity[k])
+            for c in callers
+        ]
+        alone = arrivals_of_emission(poses[k], velocities[k], landmarks, now, CONFIG)
+        for name in Arrivals.__slots__:
+            among = getattr(heard, name)[end[k] - count[k] : end[k]]
+            assert among.tobytes() == getattr(alone, name).tobytes()
+
+
+def arrives(left, sender, receiver):
+    """Return when sound reaches a receiver, the way at time 0 being that of both clocks at 0.
+
+    Both move on straight lines (place, velocity).
+    """
+    start, way = sender[0] + left * sender[1], np.hypot(*(receiver[0] - sender[0]))
+
+    def late(t):
+        return C * (t - left) - np.hypot(*(receiver[0] + t * receiver[1] - start)) + way
+
+    return brentq(late, left - 0.1, left + 0.1, xtol=1e-16, rtol=1e-15)
+
+
+@given(seed=SEEDS)
+@law
+def test_the_shift_of_a_tone_is_the_derivative_of_the_time_of_arrival(seed):
+    # Everyone moves on a straight line through the frozen points: the crests' times of arrival,
+    # solved from the lengths of the ways alone, know nothing of Doppler's formula.
+    poses, velocities, landmarks, callers = crowd(seed, moving=2, emissions=1)
+    heard = arrivals_of_emission(poses[0], velocities[0], landmarks, callers, CONFIG)
+    lines = [(poses[0, :2], velocities[0])]
+    lines += [(c.place.reshape(2), np.zeros(2) if c.velocity is None else c.velocity.reshape(2))
+              for c in callers[1:]]  # fmt: skip
+    targets = [(place, np.zeros(2)) for place in landmarks] + lines[1:]
+    step = 1e-4
+    for caller, label, frequency in zip(heard.caller, heard.landmark, heard.frequency, strict=True):
+        ends = []
+        for left in (-step, step):
+            if caller == 0 or label != len(landmarks) + caller:  # an echo
+                left = arrives(left, lines[caller], targets[label - 1])
+            ends.append(arrives(left, targets[label - 1], lines[0]))
+        shift = 2.0 * step / (ends[1] - ends[0])
+        assert frequency == pytest.approx(callers[caller].frequency * shift, rel=1e-8)
+
+
+def test_a_moving_callers_shifts_are_those_worked_out_by_hand():
+    # The vehicle at the origin drives east at 1 m/s, the boat on the x axis comes at 2 m/s, a
+    # landmark stands behind the boat: all along one line.
+    vehicle, _ = callers_of(CONFIG, np.zeros(2))
+    boat = Caller(name="boat", frequency=30e3, level_db=40.0, place=np.array([10.0, 0.0]),
+                  velocity=np.array([-2.0, 0.0]))  # fmt: skip
+    heard = arrivals_of_emission(
+        np.zeros(3), np.array([1.0, 0.0]), np.array([[20.0, 0.0]]), [vehicle, boat], CONFIG
+    )
+    echo = 35e3 * (C + 1.0) / (C - 1.0)
+    expected = [
+        echo,
+        echo * (C + 2.0) / (C - 2.0),
+        30e3 * (C + 1.0) / (C + 2.0),
+        30e3 * (C + 1.0) / (C - 2.0),
+    ]
+    np.testing.assert_allclose(heard.frequency, expected, rtol=1e-14)
+
+
+def test_a_path_gives_places_and_the_velocities_of_the_steps_that_end_there():
+    vehicle, beacon = callers_of(CONFIG, np.ones(2))
+    time, path = np.array([0.0, 0.5, 1.5, 2.0]), np.array([[0.0, 0], [1, 0], [1, 2], [0, 2]])
+    boat = Caller(name="boat", frequency=25e3, level_db=40.0, place=path)
+    first, second, third = callers_at((vehicle, beacon, boat), time, np.array([1, 2]))
+    assert (first, second) == (vehicle, beacon)
+    assert third.place.tolist() == [[1, 0], [1, 2]]
+    assert third.velocity.tolist() == [[2, 0], [0, 2]]
+    own = replace(boat, velocity=path + 5.0)
+    given_ = callers_at((vehicle, own), time, np.array([3]))[1]
+    assert given_.velocity.tolist() == [[5.0, 7.0]]
+
+
+def test_callers_that_make_no_list_or_no_path_are_refused():
+    vehicle, beacon = callers_of(CONFIG, np.ones(2))
+    time, steps = np.arange(4.0), np.array([1])
+    for callers in ((), (beacon,), (beacon, vehicle), (vehicle, vehicle)):
+        with pytest.raises(InputError, match=r"^callers: found .*expected the vehicle first"):
+            callers_at(callers, time, steps)
+    short = replace(beacon, name="boat", place=np.zeros((3, 2)))
+    with pytest.raises(InputError, match=r"^caller boat: found .*\(3, 2\).*expected \(4, 2\)"):
+        callers_at((vehicle, short), time, steps)
+    lame = replace(beacon, place=np.zeros((4, 2)), velocity=np.zeros((3, 2)))
+    with pytest.raises(InputError, match=r"velocities of shape \(3, 2\)"):
+        callers_at((vehicle, lame), time, steps)
+
+
+def test_callers_at_one_point_are_refused_by_their_names():
+    _, _, landmarks, callers = crowd(3)
+    callers[3] = replace(callers[3], name="boat", place=callers[1].place)
+    with pytest.raises(InputError, match=r"boat to caller 0: 0\.0 m.*expected vehicle, caller 0"):
+        arrivals_of_emission(np.zeros(3), np.zeros(2), landmarks, callers, CONFIG)
+
+
+def test_a_vehicle_alone_hears_its_own_echoes_where_there_are_any():
+    vehicle, _ = callers_of(CONFIG, np.zeros(2))
+    poses = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, np.pi]])
+    landmarks = np.array([[5.0, 0.0]])
+    heard, count = arrivals_of_emissions(poses, np.zeros((2, 2)), landmarks, [vehicle], CONFIG)
+    assert (count.tolist(), heard.landmark.tolist()) == ([1, 0], [1])
