@@ -13,7 +13,7 @@ from numba import njit
 kernel = njit(cache=True, error_model="numpy")
 """Compile a kernel."""
 
-lean = njit(cache=True, error_model="numpy", _nrt=False)  # pyrefly: ignore[no-matching-overload]
+no_alloc = njit(cache=True, error_model="numpy", _nrt=False)  # pyrefly: ignore[no-matching-overload]
 """Compile a kernel that makes no array, calls none that does, and returns none to one that does.
 
 It borrows the arrays that it is given, and does not count references to them and to parts of them.

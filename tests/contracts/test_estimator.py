@@ -270,7 +270,7 @@ class TestFastSlam(EstimatorContract):
     @pytest.fixture(params=["federated", "exact"])
     def slam(self, request):
         swarm = FastSlamConfig(particles=30, mixture=request.param)
-        return FastSlam(motion=BICYCLE, rays=ray_config(), swarm=swarm)
+        return FastSlam(motion=BICYCLE, rays=ray_config(), settings=swarm)
 
 
 class TestDeadReckoning(EstimatorContract):

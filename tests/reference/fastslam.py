@@ -86,14 +86,14 @@ class SlowFastSlam:
     def __init__(
         self, motion, range_std, bearing_std, rays, gate, swarm, *, weigh_where="proposed"
     ):
-        self.motion, self.rays, self.gate, self.swarm = motion, rays, gate, swarm
+        self.motion, self.rays, self.gate, self.settings = motion, rays, gate, swarm
         self.range_variance, self.bearing_variance = range_std**2, bearing_std**2
         self.weigh_where = weigh_where
 
     def start(self, mean, covariance):
         self.particles = [
             Particle(np.array(mean, float), np.array(covariance, float))
-            for _ in range(self.swarm.particles)
+            for _ in range(self.settings.particles)
         ]
         self.gated, self.resampled = 0, 0
         return self
@@ -229,7 +229,7 @@ class SlowFastSlam:
             p.log_weight += self.log_weight_gain(p, members, distance, bearing)
         if len(members) == 1:
             p.pose, p.P = self.refined(p, members[0], distance, bearing)
-        elif math.isnan(distance) and self.swarm.mixture == "federated":
+        elif math.isnan(distance) and self.settings.mixture == "federated":
             logs = self.log_likelihoods(p, members, bearing)
             for member, share in zip(members, self.shares(members, logs), strict=True):
                 if share > 0:
@@ -295,7 +295,7 @@ class SlowFastSlam:
         """Weigh every member, share the bearing among them or not, prune."""
         logs = self.log_likelihoods(Particle(pose, np.zeros((3, 3))), members, bearing)
         shares = self.shares(members, logs)
-        if self.swarm.mixture == "exact":
+        if self.settings.mixture == "exact":
             shares = [1] * len(members)
         weights = self.aggregated(members, logs)
         ray = []
@@ -327,7 +327,7 @@ class SlowFastSlam:
     def resample(self, uniform):
         """Stratified: one point in each of as many equal strata as there are particles."""
         weights, count = self.weights, len(self.particles)
-        if 1 / sum(weights**2) >= self.swarm.resample_below * count:
+        if 1 / sum(weights**2) >= self.settings.resample_below * count:
             return
         chosen = []
         for i, u in enumerate(uniform):

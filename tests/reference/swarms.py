@@ -112,19 +112,25 @@ class AssumingFastSlam(FastSlam):
 def swarm_filter(particles=20, mixture="federated", resample_below=0.75, **changes):
     """Return the filter with the paper's settings, but for the changes."""
     swarm = FastSlamConfig(particles=particles, mixture=mixture, resample_below=resample_below)
-    slam = AssumingFastSlam(motion=BICYCLE, rays=ray_config(), swarm=swarm)
+    slam = AssumingFastSlam(motion=BICYCLE, rays=ray_config(), settings=swarm)
     return replace(slam, **changes)
 
 
 def never_resampling(slam):
     """Return the same filter without its last step."""
-    return replace(slam, swarm=slam.swarm.model_copy(update={"resample_below": 0.0}))
+    return replace(slam, settings=slam.settings.model_copy(update={"resample_below": 0.0}))
 
 
 def slow_twin(slam, start=START, **changes):
     """Return the slow reference with a filter's settings, started."""
     slow = SlowFastSlam(
-        slam.motion, slam.range_std, slam.bearing_std, slam.rays, slam.gate, slam.swarm, **changes
+        slam.motion,
+        slam.range_std,
+        slam.bearing_std,
+        slam.rays,
+        slam.gate,
+        slam.settings,
+        **changes,
     )
     return slow.start(start.mean, start.covariance)
 

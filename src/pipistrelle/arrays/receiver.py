@@ -33,7 +33,7 @@ from pipistrelle.acoustics.callers import MOST, VEHICLE, Caller
 from pipistrelle.arithmetic.noise import complex_noise
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config, InputError
-from pipistrelle.jit import kernel, lean
+from pipistrelle.jit import kernel, no_alloc
 
 BLOCK = 2e-4
 """Length of a block [s]."""
@@ -329,7 +329,7 @@ def _geometric_sum(omega: float, start: int, stop: int) -> complex:
     return complex(gain * math.cos(phase), gain * math.sin(phase))
 
 
-@lean
+@no_alloc
 def _envelope(
     sums: Complex[np.ndarray, "c b"], p: int, omega: float, start: int, stop: int, block: int
 ) -> int:
@@ -347,7 +347,7 @@ def _envelope(
     return last - first + 1
 
 
-@lean
+@no_alloc
 def _steer(room: _Room, phasor: complex, wave: float, position: Float[np.ndarray, " e"]) -> None:
     """Write a phasor times each element's phase, and i times that, parts interleaved."""
     elements, direct, turned = position.size, room.direct, room.turned
@@ -365,7 +365,7 @@ def _steer(room: _Room, phasor: complex, wave: float, position: Float[np.ndarray
         turned[2 * e], turned[2 * e + 1] = -phase.imag, phase.real
 
 
-@lean
+@no_alloc
 def _add_echo(
     heard: Float[np.ndarray, "b f c i"],
     room: _Room,

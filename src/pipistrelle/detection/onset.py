@@ -5,10 +5,10 @@ import math
 import numpy as np
 from jaxtyping import Complex
 
-from pipistrelle.jit import kernel, lean
+from pipistrelle.jit import kernel, no_alloc
 
 
-@lean
+@no_alloc
 def _steer(
     matched: Complex[np.ndarray, "l f c e"],
     low: int,
@@ -63,7 +63,7 @@ def reach_of(pulse: int) -> int:
     return max(pulse // 7, 1)
 
 
-@lean
+@no_alloc
 def arrival_lag(
     matched: Complex[np.ndarray, "l f c e"],
     b: int,

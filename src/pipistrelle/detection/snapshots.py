@@ -26,7 +26,7 @@ from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.onset import arrival_lag, reach_of
 from pipistrelle.geometry import wrap
-from pipistrelle.jit import kernel, lean
+from pipistrelle.jit import kernel, no_alloc
 
 SCAN_STEP = 0.05
 """Distance of the scan's beams in u [rad]: the parabola's bias stays under 2 % of a beam step."""
@@ -259,7 +259,7 @@ def _candidates(
     return test[:kept]
 
 
-@lean
+@no_alloc
 def _is_snapshot(
     energy: Float[np.ndarray, " t"], test: int, row: int, tones: int, pulse: int, leakage: float
 ) -> bool:
@@ -283,7 +283,7 @@ def _is_snapshot(
     return level > leakage * strongest
 
 
-@lean
+@no_alloc
 def _scan_power(
     x: Complex[np.ndarray, " e"], table: Float[np.ndarray, "2 l n"], power: Float[np.ndarray, " n"]
 ) -> None:
@@ -305,7 +305,7 @@ def _scan_power(
             power[i] += re * cosine[i] - im * sine[i]
 
 
-@lean
+@no_alloc
 def _peaks(power: Float[np.ndarray, " n"], ratio: float, place: Int[np.ndarray, " n"]) -> int:
     """Write where the power peaks, not far under its highest; return the number of peaks.
 

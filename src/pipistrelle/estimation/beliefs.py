@@ -113,7 +113,7 @@ class Belief(Protocol):
 
 
 @runtime_checkable
-class Swarm(Protocol):
+class ParticleCloud(Protocol):
     """A belief that is made of particles."""
 
     @property

@@ -314,7 +314,7 @@ def _fastslam(config: Config, motion: "Motion") -> "Estimator":
         motion=motion,
         rays=config.rays,
         gate=settings.gate,
-        swarm=config.fastslam,
+        settings=config.fastslam,
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.geometry import wrap_angle
-from pipistrelle.jit import kernel, lean
+from pipistrelle.jit import kernel, no_alloc
 
 MOTION_MODELS = ("bicycle", "unicycle")
 
@@ -97,7 +97,7 @@ def motion_increment(
     )  # fmt: skip
 
 
-@lean
+@no_alloc
 def propagate_pose(
     pose: np.ndarray, P: np.ndarray, speed: float, turn: float, dt: float, motion: MotionNumbers
 ) -> tuple[float, float]:

@@ -46,7 +46,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.config import RayConfig
-from pipistrelle.jit import kernel, lean
+from pipistrelle.jit import kernel, no_alloc
 
 SMALLEST_AGGREGATED_SHARE = 0.05
 SMALLEST_SHARE = 1e-12
@@ -171,7 +171,7 @@ def log_likelihood(innovation: float, variance: float) -> float:
     return -0.5 * (innovation * innovation / variance + math.log(variance))
 
 
-@lean
+@no_alloc
 def _weigh_in_logs(
     log_likelihoods: Float[np.ndarray, " h"], weights: Float[np.ndarray, " h"], count: int
 ) -> float:
@@ -189,7 +189,7 @@ def _weigh_in_logs(
     return largest + math.log(total)
 
 
-@lean
+@no_alloc
 def weigh_and_share(
     log_likelihoods: np.ndarray,
     weights: np.ndarray,
@@ -232,7 +232,7 @@ def weigh_and_share(
     return log_total
 
 
-@lean
+@no_alloc
 def heaviest(weights: np.ndarray, count: int) -> int:
     """Return the index of the largest of the first weights, the first of equals."""
     best = 0
@@ -242,7 +242,7 @@ def heaviest(weights: np.ndarray, count: int) -> int:
     return best
 
 
-@lean
+@no_alloc
 def survivors(weights: np.ndarray, count: int, prune: float, keep: np.ndarray) -> int:
     """Mark the members that stay, renormalise their weights in place and return their number.
 

@@ -64,8 +64,8 @@ def check_memory(
         if need * workers > have:
             ray = f" of {each_ray:,} members each" if passive else ""
             particles = f" and {config.fastslam.particles} particles"
-            swarm = particles if "fastslam" in known.sections else ""
-            raise _too_large(f"{way}: {landmarks} landmarks{ray}{swarm}", need, have, workers)
+            held = particles if "fastslam" in known.sections else ""
+            raise _too_large(f"{way}: {landmarks} landmarks{ray}{held}", need, have, workers)
 
 
 def check_length(

@@ -173,7 +173,7 @@ def _stage(
 
 
 def _enlarge(panels: Sequence["_Panel"], true_landmarks: LabelledPoints | None) -> None:
-    """Give each swarm its window, on top of everything else."""
+    """Give each cloud of particles its window, on top of everything else."""
     clouds = [[f.cloud for f in panel.frames if f.cloud is not None] for panel in panels]
     ends = [panel.frames[-1].landmarks.mean for panel in panels]
     maps, colours, paths = zip(*((p.axes, p.colour, p.path) for p in panels), strict=True)

@@ -1,4 +1,4 @@
-"""A swarm of particles: dots at the map's scale, and a window in a corner that enlarges them."""
+"""Particles: dots at the map's scale, and a window in a corner that enlarges them."""
 
 from collections.abc import Sequence
 from itertools import chain
@@ -52,9 +52,9 @@ class Closeup:
             spine.set(visible=True, color=INK, linewidth=0.6)
         self._true = self._window.plot([], [], color=TRUTH, lw=3.2, alpha=0.45)[0]
         self._path = self._window.plot([], [], color=colour, lw=1.2)[0]
-        self._swarm = PolyCollection([], fc=colour, alpha=0.2, lw=0, zorder=3)
+        self._darts = PolyCollection([], fc=colour, alpha=0.2, lw=0, zorder=3)
         self._vehicles = PolyCollection([], fc=["none", TRUTH], ec=[INK, "white"], lw=0.8, zorder=4)
-        for darts in (self._swarm, self._vehicles):
+        for darts in (self._darts, self._vehicles):
             self._window.add_collection(darts, autolim=False)
         self._label(f"{particles} particle{'s' if particles != 1 else ''}")
 
@@ -88,7 +88,7 @@ class Closeup:
         for axis, middle in zip("xy", pose, strict=False):
             self._window.set(**{f"{axis}lim": (middle - self._reach, middle + self._reach)})
         self._path.set_data(*path[-TAIL:, :2].T)
-        self._swarm.set_verts([vehicle(particle, 0.24 * self._reach) for particle in cloud])
+        self._darts.set_verts([vehicle(particle, 0.24 * self._reach) for particle in cloud])
         true = path[:0] if true_path is None else true_path[-TAIL:]
         self._true.set_data(*true[:, :2].T)
         seen = [pose, *(last for last in true[-1:] if np.isfinite(last).all())]

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.beliefs import Belief, Landmarks, Swarm
+from pipistrelle.estimation.beliefs import Belief, Landmarks, ParticleCloud
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,6 +63,6 @@ class MissionRecorder:
             scan=scan,
             pose=belief.pose().mean,
             landmarks=belief.landmarks(),
-            cloud=belief.cloud() if isinstance(belief, Swarm) else None,
+            cloud=belief.cloud() if isinstance(belief, ParticleCloud) else None,
         )
         self.snapshots.setdefault((strategy, estimator), []).append(snapshot)

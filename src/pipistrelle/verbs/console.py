@@ -135,7 +135,7 @@ def _rate(frames: int, elapsed: float) -> str:
 def closing_table(trials: "Sequence[TrialResult]", aligned: bool) -> str:
     """Compare the estimates of one world, a column each; what no estimate has is left out.
 
-    Six columns fit into 100 characters. Of a swarm, landmarks are those of the heaviest particle.
+    Six columns fit into 100 characters. Of particles, landmarks are those of the heaviest particle.
 
     Parameters
     ----------

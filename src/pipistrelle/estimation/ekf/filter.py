@@ -41,7 +41,7 @@ from pipistrelle.estimation.rays import (
     weigh_and_share,
 )
 from pipistrelle.geometry import wrap_angle
-from pipistrelle.jit import kernel, lean
+from pipistrelle.jit import kernel, no_alloc
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -222,7 +222,7 @@ def _scratch(members: int) -> _Scratch:
     )
 
 
-@lean
+@no_alloc
 def _members_of(landmark: Int[np.ndarray, " h"], members: int, label: int) -> tuple[int, int]:
     """Index of a landmark's first member and how many it has (0: not mapped)."""
     for first in range(members):
@@ -234,7 +234,7 @@ def _members_of(landmark: Int[np.ndarray, " h"], members: int, label: int) -> tu
     return members, 0
 
 
-@lean
+@no_alloc
 def _correct_ray(
     state: State,
     first: int,
@@ -267,7 +267,7 @@ def _correct_ray(
     return APPLIED
 
 
-@lean
+@no_alloc
 def _range_for_ray(
     state: State,
     first: int,
@@ -296,7 +296,7 @@ def _range_for_ray(
         correct_bearing(joint, size, i, bearing, variance, np.inf)
 
 
-@lean
+@no_alloc
 def _correct_known(
     state: State, heard: Measurements, m: int, sensing: Sensing, scratch: _Scratch
 ) -> int:
@@ -320,7 +320,7 @@ def _correct_known(
     return APPLIED
 
 
-@lean
+@no_alloc
 def _add_new(state: State, heard: Measurements, m: int, sensing: Sensing) -> None:
     """Append the landmark of measurement m, one member or a ray of them (Eqs. (16) to (18))."""
     joint, passive = state.joint, math.isnan(heard.range[m])

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.estimation.measurement import NEAREST, observe
 from pipistrelle.estimation.motion import MotionNumbers, propagate_pose
 from pipistrelle.geometry import wrap_angle
-from pipistrelle.jit import kernel, lean
+from pipistrelle.jit import kernel, no_alloc
 
 GATED, APPLIED = 1, 0
 LANE = 8
@@ -117,7 +117,7 @@ def gaussian_of(
     return mean, covariance
 
 
-@lean
+@no_alloc
 def _point_rows(
     joint: Joint, size: int, i: int
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
@@ -142,7 +142,7 @@ def _point_rows(
     return pi, pj
 
 
-@lean
+@no_alloc
 def flush(joint: Joint, size: int) -> None:
     """Let every row catch up: afterwards nothing waits."""
     covariance = joint.covariance
@@ -154,7 +154,7 @@ def flush(joint: Joint, size: int) -> None:
     joint.waiting[0] = 0
 
 
-@lean
+@no_alloc
 def _defer(joint: Joint, size: int, w: Float[np.ndarray, " m"], step: float) -> None:
     """Add step w to the mean, subtract w w^T from the pose's rows, and let the points' wait."""
     mean, p0, p1, p2 = joint.mean, joint.covariance[0], joint.covariance[1], joint.covariance[2]
@@ -198,7 +198,7 @@ def propagate(
             covariance[a, b] = P[a, b]
 
 
-@lean
+@no_alloc
 def bearing_variance(joint: Joint, size: int, i: int, c: float, s: float, k: float) -> float:
     """Innovation variance H P H^T of the bearing of the member at state index i, without R."""
     h0, h1 = s * k, -c * k  # by pose: (h0, h1, -1); by member: (-h0, -h1)
@@ -215,7 +215,7 @@ def bearing_variance(joint: Joint, size: int, i: int, c: float, s: float, k: flo
     )  # fmt: skip
 
 
-@lean
+@no_alloc
 def correct_bearing(
     joint: Joint, size: int, i: int, bearing: float, variance: float, bound: float
 ) -> int:
@@ -243,7 +243,7 @@ def correct_bearing(
     return APPLIED
 
 
-@lean
+@no_alloc
 def correct_active(
     joint: Joint,
     size: int,
@@ -288,7 +288,7 @@ def correct_active(
     return APPLIED
 
 
-@lean
+@no_alloc
 def initialise(
     mean: Float[np.ndarray, " n"],
     covariance: Float[np.ndarray, "n m"],
@@ -325,7 +325,7 @@ def initialise(
     covariance[i, i + 1] = covariance[i + 1, i] = cross
 
 
-@lean
+@no_alloc
 def drop_members(
     state: State,
     first: int,

@@ -19,11 +19,11 @@ from jaxtyping import Float, Int
 
 from pipistrelle.arithmetic.elementary import arctangent, cosine_and_sine, logarithm, wrapped
 from pipistrelle.estimation.measurement import NEAREST
-from pipistrelle.jit import inlined, lean
+from pipistrelle.jit import inlined, no_alloc
 
 LANES = 32
 """Particles in a block. With half as many the compiler unrolls the loops instead of widening them;
-with more, small swarms fill no block."""
+with more, a few particles fill no block."""
 X, Y, HEADING, PXX, PXY, PYY, PXH, PYH, PHH = range(0, 9 * LANES, LANES)
 XX, XY, YY, LOG_WEIGHT = range(2 * LANES, 6 * LANES, LANES)
 POSE, MEMBER = 9 * LANES, 6 * LANES
@@ -67,7 +67,7 @@ def _spread(member: Member, h0: float, h1: float, i: int) -> float:
     return h0 * h0 * member[XX + i] + cross + h1 * h1 * member[YY + i]
 
 
-@lean
+@no_alloc
 def expect_bearing(
     pose: Poses,
     member: Member,
@@ -92,7 +92,7 @@ def expect_bearing(
         log_likelihood[i] = value if j < count[i] else -np.inf
 
 
-@lean
+@no_alloc
 def bearing_beyond(
     pose: Poses,
     member: Member,
@@ -113,7 +113,7 @@ def bearing_beyond(
     return beyond == LANES
 
 
-@lean
+@no_alloc
 def refine_by_bearing(
     pose: Poses, member: Member, bearing: float, variance: float, share: Lanes
 ) -> None:
@@ -136,7 +136,7 @@ def refine_by_bearing(
         pose[PHH + i] -= a2 * k2
 
 
-@lean
+@no_alloc
 def correct_by_bearing(
     pose: Poses, member: Member, bearing: float, variance: float, share: Lanes
 ) -> None:
@@ -204,7 +204,7 @@ def _active_spread(
     return a0, a1, a2, b0, b1, b2, S00, S01, S11
 
 
-@lean
+@no_alloc
 def active_beyond(
     pose: Poses,
     member: Member,
@@ -228,7 +228,7 @@ def active_beyond(
     return beyond == LANES
 
 
-@lean
+@no_alloc
 def refine_by_active(
     pose: Poses,
     member: Member,
@@ -263,7 +263,7 @@ def refine_by_active(
         pose[PHH + i] -= a2 * a2 + b2 * b2
 
 
-@lean
+@no_alloc
 def correct_by_active(
     pose: Poses,
     member: Member,
@@ -295,7 +295,7 @@ def correct_by_active(
         member[YY + i] -= a1 * a1 + b1 * b1
 
 
-@lean
+@no_alloc
 def initialise_member(
     pose: Poses,
     member: Member,
@@ -323,7 +323,7 @@ def initialise_member(
         member[LOG_WEIGHT + i] = log_weight if here else member[LOG_WEIGHT + i]
 
 
-@lean
+@no_alloc
 def sample_pose(pose: Poses, normal: Lanes) -> None:
     """Draw the poses from their Gaussians with three standard normals each; no spread is left."""
     for i in range(LANES):

@@ -34,7 +34,7 @@ from pipistrelle.estimation.fastslam.block import (
     refine_by_bearing,
 )
 from pipistrelle.estimation.rays import SMALLEST_AGGREGATED_SHARE, SMALLEST_SHARE, Sensing
-from pipistrelle.jit import kernel, lean
+from pipistrelle.jit import kernel, no_alloc
 
 Rows = Float[np.ndarray, "h numbers"]
 """The members of one landmark."""
@@ -77,7 +77,7 @@ def scratch_for(members: int) -> Scratch:
     )
 
 
-@lean
+@no_alloc
 def _largest(logs: Float[np.ndarray, "h lanes"], members: int, largest: Lanes) -> None:
     """Largest of each lane's logs."""
     for i in range(LANES):
@@ -88,7 +88,7 @@ def _largest(logs: Float[np.ndarray, "h lanes"], members: int, largest: Lanes) -
             largest[i] = max(largest[i], row[i])
 
 
-@lean
+@no_alloc
 def _weigh(rows: Rows, members: int, scratch: Scratch) -> None:
     """Aggregated likelihoods, in logs and normalised, into ``posterior`` (Eq. (18)).
 
@@ -113,7 +113,7 @@ def _weigh(rows: Rows, members: int, scratch: Scratch) -> None:
             posterior[i] -= total[i]
 
 
-@lean
+@no_alloc
 def _share(members: int, sensing: Sensing, scratch: Scratch) -> None:
     """Divide the measurement: shares go with a power of the likelihoods, now or aggregated."""
     logs = scratch.posterior if sensing.aggregated else scratch.likelihood
@@ -133,14 +133,14 @@ def _share(members: int, sensing: Sensing, scratch: Scratch) -> None:
             share[i] = part if part >= smallest else 0.0
 
 
-@lean
+@no_alloc
 def _add(log_likelihood: Lanes, log_weight: Lanes) -> None:
     """Add log likelihoods, and their constant, to log weights."""
     for i in range(LANES):
         log_weight[i] += log_likelihood[i] - HALF_LOG_TAU
 
 
-@lean
+@no_alloc
 def most(count: Counts) -> int:
     """Members of the lane that has most."""
     largest = 1
@@ -149,7 +149,7 @@ def most(count: Counts) -> int:
     return largest
 
 
-@lean
+@no_alloc
 def refine_by_ray(
     pose: Poses,
     rows: Rows,
@@ -178,7 +178,7 @@ def refine_by_ray(
         refine_by_bearing(pose, rows[j], bearing, variance, scratch.share[j])
 
 
-@lean
+@no_alloc
 def _refine_to_mixture(
     pose: Poses, rows: Rows, members: int, bearing: float, variance: float, scratch: Scratch
 ) -> None:
@@ -209,7 +209,7 @@ def _refine_to_mixture(
             pose[PHH + i] += weight[i] * turn * turn
 
 
-@lean
+@no_alloc
 def correct_ray(
     pose: Poses,
     rows: Rows,
@@ -235,7 +235,7 @@ def correct_ray(
     _prune(rows, count, members, sensing.prune, scratch)
 
 
-@lean
+@no_alloc
 def _prune(rows: Rows, count: Counts, members: int, prune: float, scratch: Scratch) -> None:
     """Drop members whose aggregated likelihood is too small; the heaviest stays (Eq. (21))."""
     largest, total = scratch.largest, scratch.total
@@ -262,7 +262,7 @@ def _prune(rows: Rows, count: Counts, members: int, prune: float, scratch: Scrat
         _close_up(rows, count, scratch.share)
 
 
-@lean
+@no_alloc
 def _close_up(rows: Rows, count: Counts, keep: Float[np.ndarray, "h lanes"]) -> None:
     """Move the members that are kept to the front, lane by lane."""
     for i in range(LANES):

@@ -76,7 +76,7 @@ class FastSlamBelief:
     member : (b, c, 6 L)
         Rows x, y [m], xx, xy, yy [m^2] and log weight of each hypothesis.
     estimate : Gaussian of (3) and (3, 3)
-        The swarm's pose, before any resampling.
+        The mean of the poses and their covariance, before any resampling.
     best_count, best_member : (n), (c, 6)
         The map of the heaviest particle, before any resampling; the first of equals.
     full : float
@@ -98,7 +98,7 @@ class FastSlamBelief:
     gated: int
 
     def pose(self) -> Gaussian:
-        """Return the vehicle's pose, (3) and (3, 3): weighted mean and covariance of the swarm."""
+        """Return the vehicle's pose, (3) and (3, 3): of all particles."""
         return self.estimate
 
     def landmarks(self) -> Landmarks:
@@ -122,7 +122,7 @@ class FastSlam:
     gate : float
         A measurement that is outside this share of every particle's predicted distribution is
         dropped; 1 drops none.
-    swarm : FastSlamConfig
+    settings : FastSlamConfig
         Number of particles, when to resample, how to treat rays.
 
     Examples
@@ -141,11 +141,11 @@ class FastSlam:
     motion: Motion
     rays: RayConfig
     gate: float = 1.0
-    swarm: FastSlamConfig = _PAPER
+    settings: FastSlamConfig = _PAPER
 
     def init(self, pose: Gaussian) -> FastSlamBelief:
         """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
-        particles = self.swarm.particles
+        particles = self.settings.particles
         blocks = -(-particles // LANES)
         numbers = np.concatenate([pose.mean, pose.covariance[*_PACKED]])
         return FastSlamBelief(
@@ -225,9 +225,9 @@ class FastSlam:
         """
         if scan.landmark.size == 0:
             return belief
-        particles = self.swarm.particles
+        particles = self.settings.particles
         normal, uniform = rng.standard_normal((particles, 3)), rng.random(particles)
-        sensing = sensing_of(self.rays, self.gate, self.swarm.mixture == "exact")
+        sensing = sensing_of(self.rays, self.gate, self.settings.mixture == "exact")
         heard, gated = self._inside(belief, measurements_of(scan), sensing)
         corrected, gained = correct_particles(_particles(belief), heard, normal, sensing)
         poses, landmark, first, count, member = corrected
@@ -247,7 +247,7 @@ class FastSlam:
             full=mean_full(count, weight),
             gated=belief.gated + gated,
         )
-        if effective_particles(weight) >= self.swarm.resample_below * particles:
+        if effective_particles(weight) >= self.settings.resample_below * particles:
             return after
         return _resampled(after, stratified(weight, uniform))
 

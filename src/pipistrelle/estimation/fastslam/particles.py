@@ -39,7 +39,7 @@ from pipistrelle.estimation.fastslam.block_rays import (
 )
 from pipistrelle.estimation.measurement import Measurements
 from pipistrelle.estimation.rays import Sensing
-from pipistrelle.jit import kernel, lean
+from pipistrelle.jit import kernel, no_alloc
 
 
 class Particles(NamedTuple):
@@ -83,7 +83,7 @@ def _slots(landmark: Int[np.ndarray, " n"], labels: Int[np.ndarray, " m"]) -> In
     return slot
 
 
-@lean
+@no_alloc
 def _active_gated(
     pose: Poses, member: Member, heard: Measurements, m: int, count: Counts, bound: float
 ) -> bool:
@@ -120,7 +120,7 @@ def gated_by_all(
     return gated
 
 
-@lean
+@no_alloc
 def _initialise_active(
     pose: Poses, member: Member, heard: Measurements, m: int, count: Counts
 ) -> None:
@@ -131,7 +131,7 @@ def _initialise_active(
     )  # fmt: skip
 
 
-@lean
+@no_alloc
 def _range_for_ray(
     pose: Poses,
     rows: Rows,
@@ -164,7 +164,7 @@ def _range_for_ray(
     correct_by_bearing(pose, rows[0], heard.bearing[m], heard.bearing_variance[m], share)
 
 
-@lean
+@no_alloc
 def _refine(
     block: Block,
     slot: Int[np.ndarray, " m"],
@@ -190,7 +190,7 @@ def _refine(
             )  # fmt: skip
 
 
-@lean
+@no_alloc
 def _correct(
     block: Block,
     slot: Int[np.ndarray, " m"],
@@ -216,7 +216,7 @@ def _correct(
             count[:] = 1
 
 
-@lean
+@no_alloc
 def _add_new(
     pose: Poses, rows: Rows, count: Counts, heard: Measurements, m: int, sensing: Sensing
 ) -> None:
@@ -260,7 +260,7 @@ def _rows(
     return labels, first, widest
 
 
-@lean
+@no_alloc
 def _copy_members(particles: Particles, b: int, block: Block) -> None:
     """Copy the members of a block into the rows that they now have."""
     for n in range(particles.landmark.size):

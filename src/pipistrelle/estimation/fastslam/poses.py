@@ -22,7 +22,7 @@ from pipistrelle.estimation.fastslam.block import (
     Y,
 )
 from pipistrelle.estimation.motion import MotionNumbers, motion_increment
-from pipistrelle.jit import kernel, lean
+from pipistrelle.jit import kernel, no_alloc
 
 SMALLEST_STD = 1e-6
 """Added in quadrature to the pose estimate's x, y [m] and heading [rad]: particles that stand still
@@ -32,7 +32,7 @@ or has one ancestor may have no spread, and its covariance no inverse."""
 LEAST = SMALLEST_STD**2
 
 
-@lean
+@no_alloc
 def _add_moments(pose: Poses, weight: Lanes, sums: Poses) -> None:
     """Add a block's weighted positions and directions, lane by lane."""
     for i in range(LANES):
@@ -43,7 +43,7 @@ def _add_moments(pose: Poses, weight: Lanes, sums: Poses) -> None:
         sums[PXY + i] += weight[i] * s
 
 
-@lean
+@no_alloc
 def _add_spread(
     pose: Poses, weight: Lanes, x: float, y: float, heading: float, sums: Poses
 ) -> None:
@@ -97,7 +97,7 @@ def summarise(
     return mean[:3].copy(), covariance
 
 
-@lean
+@no_alloc
 def _propagate_block(pose: Poses, step: tuple[float, ...], q0: float, q1: float) -> None:
     """Move a block's poses through a control step, known in the vehicle's frame (Eq. (10))."""
     ahead, aside, turn, u00, u10, u20, u01, u11, u21 = step

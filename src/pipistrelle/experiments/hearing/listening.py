@@ -109,16 +109,16 @@ def listen(
     """
     setup = config.scenario
     ears = layout or square_of_four(config.receiver)
-    station = _station(config, scenario.callers, ears, find, oracle)
+    rig = _rig(config, scenario.callers, ears, find, oracle)
     engine = _dense if config.receiver.engine == "dense" else _blocks
     beams: tuple[list[Heard], ...] = tuple([] for _ in radii)
     frames = range(setup.steps_per_frame, len(scenario.path), setup.steps_per_frame)
     emissions = _emissions(scenario, frames, radii, config, beam)
     for number, (k, aimed) in enumerate(zip(frames, emissions, strict=True), start=1):
         key = stream_key(config.seed, iteration, "noise", number)
-        recorded = engine(aimed, station, key)
+        recorded = engine(aimed, rig, key)
         for heard, arrivals, detections in zip(beams, aimed, recorded, strict=True):
-            heard.append(_heard(float(scenario.time[k]), detections, arrivals, station))
+            heard.append(_heard(float(scenario.time[k]), detections, arrivals, rig))
         if progress:
             progress("listening", number, len(frames))
     return tuple(tuple(heard) for heard in beams)
@@ -139,7 +139,7 @@ class Workspace:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Station:
+class _Rig:
     """What every frame of a path is heard with."""
 
     config: Config
@@ -152,17 +152,17 @@ class _Station:
     workspace: Workspace
 
 
-def _station(
+def _rig(
     config: Config,
     callers: Sequence[Caller],
     layout: Layout,
     find: Callable[..., Detections],
     oracle: Callable[..., Int[np.ndarray, " d"]] | None,
-) -> _Station:
+) -> _Rig:
     """Settle what every frame of a path is heard with."""
     settled = sampling(config, callers)
     finder = detector(config, layout, settled.tones)
-    return _Station(
+    return _Rig(
         config=config,
         layout=layout,
         sampling=settled,
@@ -210,20 +210,20 @@ def _emissions(
             yield [rows_of(arrivals, rows) for arrivals in aimed]
 
 
-def _heard(time: float, detections: Detections, arrivals: Arrivals, station: _Station) -> Heard:
+def _heard(time: float, detections: Detections, arrivals: Arrivals, rig: _Rig) -> Heard:
     """Average a frame's detections over the faces, by the truth's labels where it tells them."""
-    config, gates = station.config, station.config.association
-    if station.oracle is None:
+    config, gates = rig.config, rig.config.association
+    if rig.oracle is None:
         delay_gate = gates.delay_gate * config.emitter.pulse
         label = same_echo(detections, delay_gate=delay_gate, bearing_gate=gates.bearing_gate)
     else:
-        label = station.oracle(
+        label = rig.oracle(
             detections,
             arrivals,
-            station.layout,
+            rig.layout,
             gates,
             pulse=config.emitter.pulse,
-            faintest_db=station.faintest_db,
+            faintest_db=rig.faintest_db,
         )
     heard = average_faces(
         time,
@@ -232,12 +232,12 @@ def _heard(time: float, detections: Detections, arrivals: Arrivals, station: _St
         averaging=config.detection.averaging,
         speed_of_sound=config.air.speed_of_sound,
     )
-    return unlabelled(heard) if station.oracle is None else heard
+    return unlabelled(heard) if rig.oracle is None else heard
 
 
-def _blocks(aimed: Sequence[Arrivals], station: _Station, key: int) -> Iterator[Detections]:
+def _blocks(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[Detections]:
     """Yield, per beam, what is detected of its arrivals from block sums."""
-    layout, settled, space = station.layout, station.sampling, station.workspace
+    layout, settled, space = rig.layout, rig.sampling, rig.workspace
     pulse, own = settled.pulse, np.count_nonzero(aimed[0].caller == VEHICLE)  # they come first
     shape = block_shape(blocks_to_hear(aimed[0], settled), layout, settled)
     shared = noise_blocks(shape[0], layout, settled, key, out=space.array("shared", shape))
@@ -256,21 +256,19 @@ def _blocks(aimed: Sequence[Arrivals], station: _Station, key: int) -> Iterator[
             noise_std=settled.noise_std,
             out=space.array("matched", lags),
         )
-        yield station.find(
-            matched, station.detector, start=pulse * BLOCK, interval=BLOCK, pulse=pulse
-        )
+        yield rig.find(matched, rig.detector, start=pulse * BLOCK, interval=BLOCK, pulse=pulse)
 
 
-def _dense(aimed: Sequence[Arrivals], station: _Station, key: int) -> Iterator[Detections]:
+def _dense(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[Detections]:
     """Yield the same from every sample until the next call, in single precision."""
-    settled, setup = station.sampling, station.config.scenario
+    settled, setup = rig.sampling, rig.config.scenario
     length = settled.pulse * settled.block
     period = math.floor(setup.steps_per_frame * setup.step / BLOCK) - settled.pulse
     for arrivals in aimed:
         samples = record_samples(
             max(period, blocks_to_hear(arrivals, settled)),
             arrivals,
-            station.layout,
+            rig.layout,
             settled,
             np.random.default_rng(key),
             single=True,
@@ -283,4 +281,4 @@ def _dense(aimed: Sequence[Arrivals], station: _Station, key: int) -> Iterator[D
             noise_std=settled.noise_std,
         )
         start, interval = settled.pulse * BLOCK, 1.0 / settled.rate
-        yield station.find(matched, station.detector, start=start, interval=interval, pulse=length)
+        yield rig.find(matched, rig.detector, start=start, interval=interval, pulse=length)

@@ -21,7 +21,7 @@ from pipistrelle.estimation.beliefs import (
     Belief,
     Estimator,
     Gaussian,
-    Swarm,
+    ParticleCloud,
     Track,
     Trajectory,
 )
@@ -315,15 +315,15 @@ def run_filter(
         belief, poses = estimator.predict(belief, controls[done:], dt[done:], rng)
         mean[done + 1 :], covariance[done + 1 :] = poses.mean, poses.covariance
     online = Gaussian(mean=mean, covariance=covariance)
-    swarm = belief if isinstance(belief, Swarm) else None
+    cloud = belief if isinstance(belief, ParticleCloud) else None
     revised = _whole(belief.path(), time.size) if isinstance(belief, Trajectory) else None
     return Track(
         time=time,
         pose=revised or online,
         landmarks=belief.landmarks(),
         gated=belief.gated,
-        cloud=swarm.cloud() if swarm else None,
-        full=swarm.full if swarm else None,
+        cloud=cloud.cloud() if cloud else None,
+        full=cloud.full if cloud else None,
         online=online if revised else None,
     )
 
