@@ -7,15 +7,13 @@ once. One that is not listed here goes by ``module:Class`` (`entry`).
 """
 
 import math
-import sys
 from collections.abc import Callable, Iterable
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from functools import partial
-from importlib import import_module, invalidate_caches
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipistrelle.config import Config, InputError
+from pipistrelle.estimation.outside import built, class_of
 
 if TYPE_CHECKING:
     from pipistrelle.estimation.beliefs import Estimator
@@ -23,8 +21,6 @@ if TYPE_CHECKING:
 
 DOUBLE = 8
 """Bytes of a number."""
-PARTS = ("init", "predict", "update")
-"""What every estimator does."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,7 +90,7 @@ def entry(name: str) -> Entry:
     """
     if name in CATALOGUE:
         return CATALOGUE[name]
-    kind: Any = _class_of(check_name(name))
+    kind: Any = class_of(check_name(name))
     title, limit = getattr(kind, "title", kind.__name__), getattr(kind, "nees_limit", math.inf)
     if not isinstance(title, str):
         raise InputError(f"filter {name}: title: found {title!r}, expected text")
@@ -103,7 +99,7 @@ def entry(name: str) -> Entry:
     return Entry(
         name=name,
         title=title,
-        build=partial(_outsider, name, kind),
+        build=partial(built, name, kind),
         sections=("filter", "rays"),
         nees_limit=float(limit),
         memory=lambda landmarks, members, config: 0.0,
@@ -209,95 +205,11 @@ def check_distinct(names: Iterable[str], where: str = "filter") -> None:
             raise InputError(f"{where}: {first} and {name} would write the same files; rename one")
 
 
-def look_in(folder: Path) -> None:
-    """Have modules in a folder found, before installed ones, as ``python -m`` does with its own.
-
-    Parameters
-    ----------
-    folder : Path
-    """
-    if str(folder) not in sys.path:
-        sys.path.insert(0, str(folder))
-    invalidate_caches()  # a module may be younger than the last look
-
-
-def _class_of(name: str) -> type:
-    """Import a class from outside, and see that it has what an estimator must have."""
-    module, _, wanted = name.partition(":")
-    look_in(Path.cwd())
-    try:
-        kind = getattr(import_module(module), wanted, None)
-    except (Exception, SystemExit) as error:
-        if isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}."):
-            place = f"neither installed nor in {Path.cwd()}"
-            raise InputError(f"filter {name}: found no module {error.name}, {place}") from None
-        raise InputError(f"filter {name}: importing {module} fails: {worded(error)}") from error
-    if not isinstance(kind, type):
-        found = f"no class {wanted}" if kind is None else f"{wanted}, which is no class,"
-        raise InputError(f"filter {name}: found {found} in {module}; expected an estimator")
-    if lacking := [part for part in PARTS if not callable(getattr(kind, part, None))]:
-        raise InputError(
-            f"filter {name}: lacks {', '.join(lacking)}; an estimator has {', '.join(PARTS)}"
-        )
-    return kind
-
-
-def _outsider(name: str, kind: Any, config: Config, motion: "Motion") -> "Estimator":
-    """Build an estimator from outside."""
-    try:
-        if hasattr(kind, "from_config"):
-            return kind.from_config(config, motion)
-        return kind(**_arguments(kind, config, motion))
-    except Exception as error:
-        raise InputError(f"filter {name}: cannot be built: {worded(error)}") from error
-
-
-def _arguments(kind: Any, config: Config, motion: "Motion") -> dict[str, Any]:
-    """Return what is known of the fields of a dataclass."""
-    if not is_dataclass(kind):
-        raise InputError("it is no dataclass; make it one, or write from_config(config, motion)")
-    known = {"motion": motion, "rays": config.rays, "gate": config.filter.gate, "config": config}
-    asked = [field for field in fields(kind) if field.init]
-    needed = [f.name for f in asked if f.default is MISSING and f.default_factory is MISSING]
-    if unknown := [name for name in needed if name not in known]:
-        raise InputError(
-            f"found no value for {', '.join(unknown)}, expected fields among {', '.join(known)}; "
-            "add defaults, or write from_config(config, motion)"
-        )
-    return {field.name: known[field.name] for field in asked if field.name in known}
-
-
-def worded(error: BaseException) -> str:
-    """Word an error that an estimator from outside raised.
-
-    Parameters
-    ----------
-    error : BaseException
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> worded(ZeroDivisionError("division by zero"))
-    'ZeroDivisionError: division by zero'
-    """
-    if isinstance(error, InputError):
-        return str(error)
-    return f"{type(error).__name__}: {error}".removesuffix(": ")
-
-
 def _ekf(config: Config, motion: "Motion") -> "Estimator":
     """Build EKF-SLAM."""
     from pipistrelle.estimation.ekf.filter import EkfSlam
 
-    settings = config.filter
-    return EkfSlam(
-        motion=motion,
-        rays=config.rays,
-        gate=settings.gate,
-    )
+    return EkfSlam(motion=motion, rays=config.rays, gate=config.filter.gate)
 
 
 def _ekf_bytes(landmarks: int, members: int, _: Config) -> float:
@@ -309,13 +221,8 @@ def _fastslam(config: Config, motion: "Motion") -> "Estimator":
     """Build FastSLAM 2.0."""
     from pipistrelle.estimation.fastslam.filter import FastSlam
 
-    settings = config.filter
-    return FastSlam(
-        motion=motion,
-        rays=config.rays,
-        gate=settings.gate,
-        settings=config.fastslam,
-    )
+    gate = config.filter.gate
+    return FastSlam(motion=motion, rays=config.rays, gate=gate, settings=config.fastslam)
 
 
 def _fastslam_bytes(landmarks: int, members: int, config: Config) -> float:

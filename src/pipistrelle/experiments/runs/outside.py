@@ -12,8 +12,9 @@ import numpy as np
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Belief, Gaussian, Track, no_landmarks
-from pipistrelle.estimation.catalogue import CATALOGUE, check_distinct, entry, worded
+from pipistrelle.estimation.catalogue import CATALOGUE, check_distinct, entry
 from pipistrelle.estimation.motion import Motion
+from pipistrelle.estimation.outside import worded
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.results.scores import TrialResult, score

@@ -17,7 +17,8 @@ from functools import partial
 from pathlib import Path
 
 from pipistrelle.config import InputError
-from pipistrelle.estimation.catalogue import CATALOGUE, look_in
+from pipistrelle.estimation.catalogue import CATALOGUE
+from pipistrelle.estimation.outside import look_in
 from pipistrelle.experiments.hearing.scenario import bicycle
 from pipistrelle.experiments.machine import check_length, check_memory, keep_freed_memory
 from pipistrelle.experiments.runs.outside import check_filters

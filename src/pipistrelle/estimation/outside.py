@@ -1,0 +1,131 @@
+"""Estimators from outside: a class of another module, found, checked and built by its name.
+
+The module is one that is installed, or one in the current folder, which goes first, as it does for
+``python -m``. Whatever is wrong with it is said in a line.
+"""
+
+import sys
+from dataclasses import MISSING, fields, is_dataclass
+from importlib import import_module, invalidate_caches
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipistrelle.config import Config, InputError
+
+if TYPE_CHECKING:
+    from pipistrelle.estimation.beliefs import Estimator
+    from pipistrelle.estimation.motion import Motion
+
+PARTS = ("init", "predict", "update")
+"""What every estimator does."""
+
+
+def look_in(folder: Path) -> None:
+    """Have modules in a folder found, before installed ones, as ``python -m`` does with its own.
+
+    Parameters
+    ----------
+    folder : Path
+    """
+    if str(folder) not in sys.path:
+        sys.path.insert(0, str(folder))
+    invalidate_caches()  # a module may be younger than the last look
+
+
+def class_of(name: str) -> type:
+    """Import a class from outside, and see that it has what an estimator must have.
+
+    Parameters
+    ----------
+    name : str
+        ``module:Class``.
+
+    Returns
+    -------
+    type
+
+    Raises
+    ------
+    InputError
+        Where there is no such module or class, its import fails, or it is no estimator.
+    """
+    module, _, wanted = name.partition(":")
+    look_in(Path.cwd())
+    try:
+        kind = getattr(import_module(module), wanted, None)
+    except (Exception, SystemExit) as error:
+        if isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}."):
+            place = f"neither installed nor in {Path.cwd()}"
+            raise InputError(f"filter {name}: found no module {error.name}, {place}") from None
+        raise InputError(f"filter {name}: importing {module} fails: {worded(error)}") from error
+    if not isinstance(kind, type):
+        found = f"no class {wanted}" if kind is None else f"{wanted}, which is no class,"
+        raise InputError(f"filter {name}: found {found} in {module}; expected an estimator")
+    if lacking := [part for part in PARTS if not callable(getattr(kind, part, None))]:
+        raise InputError(
+            f"filter {name}: lacks {', '.join(lacking)}; an estimator has {', '.join(PARTS)}"
+        )
+    return kind
+
+
+def built(name: str, kind: Any, config: Config, motion: "Motion") -> "Estimator":
+    """Build an estimator from outside: by its ``from_config``, or from what its fields ask for.
+
+    Parameters
+    ----------
+    name : str
+    kind : type
+    config : Config
+    motion : Motion
+
+    Returns
+    -------
+    Estimator
+
+    Raises
+    ------
+    InputError
+        Where it cannot be built.
+    """
+    try:
+        if hasattr(kind, "from_config"):
+            return kind.from_config(config, motion)
+        return kind(**_arguments(kind, config, motion))
+    except Exception as error:
+        raise InputError(f"filter {name}: cannot be built: {worded(error)}") from error
+
+
+def _arguments(kind: Any, config: Config, motion: "Motion") -> dict[str, Any]:
+    """Return what is known of the fields of a dataclass."""
+    if not is_dataclass(kind):
+        raise InputError("it is no dataclass; make it one, or write from_config(config, motion)")
+    known = {"motion": motion, "rays": config.rays, "gate": config.filter.gate, "config": config}
+    asked = [field for field in fields(kind) if field.init]
+    needed = [f.name for f in asked if f.default is MISSING and f.default_factory is MISSING]
+    if unknown := [name for name in needed if name not in known]:
+        raise InputError(
+            f"found no value for {', '.join(unknown)}, expected fields among {', '.join(known)}; "
+            "add defaults, or write from_config(config, motion)"
+        )
+    return {field.name: known[field.name] for field in asked if field.name in known}
+
+
+def worded(error: BaseException) -> str:
+    """Word an error that an estimator from outside raised.
+
+    Parameters
+    ----------
+    error : BaseException
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> worded(ZeroDivisionError("division by zero"))
+    'ZeroDivisionError: division by zero'
+    """
+    if isinstance(error, InputError):
+        return str(error)
+    return f"{type(error).__name__}: {error}".removesuffix(": ")
