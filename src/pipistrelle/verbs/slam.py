@@ -41,8 +41,6 @@ LOGGED = frozenset(
     }
 )
 """Settings of the filter that a log decides."""
-
-
 _FOLDERS = ", or ".join(reader.help for reader in READERS)
 FOLDERS = f"{_FOLDERS[0].upper()}{_FOLDERS[1:]}."
 ROBOTS = f"Whose log of {', or of '.join(r.robot_help for r in READERS if r.robots)}."
