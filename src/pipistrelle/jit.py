@@ -8,8 +8,11 @@ a record costs a microsecond and a plain tuple nothing, so a kernel that is call
 is handed the columns as a tuple and makes the record of them itself, which is free.
 """
 
+import numpy as np
 from numba import njit
 
+Whole = int | np.integer
+"""A whole number in a kernel: Numba's are Python's, those of arrays NumPy's."""
 kernel = njit(cache=True, error_model="numpy")
 """Compile a kernel."""
 

@@ -424,7 +424,7 @@ def _loss_db(
         shape=target.shape,
         speed_of_sound=air.speed_of_sound,
     )
-    sent = outward.copy()
+    sent = np.broadcast_to(outward, strength_db.shape).copy()
     sent[:, itself] = 1.0  # no echo of itself: any distance will do
     loss_db = passive_spreading_loss_db(sent, ways.homeward, law=air.spreading) - strength_db
     loss_db[:, itself] = spreading_loss_db(ways.homeward[:, itself])

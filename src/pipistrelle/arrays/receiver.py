@@ -33,7 +33,7 @@ from pipistrelle.acoustics.callers import MOST, VEHICLE, Caller
 from pipistrelle.arithmetic.noise import complex_noise
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config, InputError
-from pipistrelle.jit import kernel, no_alloc
+from pipistrelle.jit import Whole, kernel, no_alloc
 
 BLOCK = 2e-4
 """Length of a block [s]."""
@@ -320,7 +320,7 @@ class _Room(NamedTuple):
 
 
 @kernel
-def _geometric_sum(omega: float, start: int, stop: int) -> complex:
+def _geometric_sum(omega: float, start: Whole, stop: Whole) -> complex:
     """Sum of exp(i omega n) over start <= n < stop."""
     count = stop - start
     half = 0.5 * omega
@@ -331,8 +331,13 @@ def _geometric_sum(omega: float, start: int, stop: int) -> complex:
 
 @no_alloc
 def _envelope(
-    sums: Complex[np.ndarray, "c b"], p: int, omega: float, start: int, stop: int, block: int
-) -> int:
+    sums: Complex[np.ndarray, "c b"],
+    p: Whole,
+    omega: float,
+    start: Whole,
+    stop: Whole,
+    block: Whole,
+) -> Whole:
     """Write a tone's block sums of exp(i omega n), start <= n < stop; return the blocks touched."""
     first, last = start // block, (stop - 1) // block
     sums[p, 0] = _geometric_sum(omega, start, min(stop, (first + 1) * block))

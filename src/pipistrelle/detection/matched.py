@@ -5,7 +5,7 @@ import math
 import numpy as np
 from jaxtyping import Complex, Float
 
-from pipistrelle.jit import kernel
+from pipistrelle.jit import Whole, kernel
 
 
 def filter_blocks(
@@ -88,7 +88,7 @@ def filter_samples(
 
 @kernel
 def _boxcar(
-    rows: Float[np.ndarray, "b i"], width: int, scale: float, sums: Float[np.ndarray, "l i"]
+    rows: Float[np.ndarray, "b i"], width: Whole, scale: float, sums: Float[np.ndarray, "l i"]
 ) -> None:
     """Write the running sums of width rows, scaled."""
     columns = rows.shape[1]

@@ -16,7 +16,7 @@ from pipistrelle.config import Strategy
 from pipistrelle.detection.scans import COLUMNS, OWN, UNLABELLED, Scan, make_scan
 from pipistrelle.detection.snapshots import Detections
 from pipistrelle.geometry import wrap_angle
-from pipistrelle.jit import kernel
+from pipistrelle.jit import Whole, kernel
 
 LISTENS_TO = {"active": (True, False), "fused": (True, True), "passive": (False, True)}
 """Whether a strategy takes what the vehicle's own call, and what the others' calls bring back."""
@@ -240,7 +240,7 @@ def _columns(scan: Scan) -> _Columns:
 
 
 @kernel
-def _distinct(label: Int[np.ndarray, " d"]) -> tuple[Int[np.ndarray, " n"], int]:
+def _distinct(label: Int[np.ndarray, " d"]) -> tuple[Int[np.ndarray, " n"], Whole]:
     """Labels that occur, rising, and how often none was given."""
     labels, count, clutter = np.empty_like(label), 0, 0
     for d in range(label.size):
@@ -378,7 +378,7 @@ def _fuse(rows: _Columns, own: bool, others: bool, labels_only: bool) -> _Column
 
 
 @kernel
-def _take(numbers: Float[np.ndarray, "7 m"], k: int, rows: _Columns, m: int) -> None:
+def _take(numbers: Float[np.ndarray, "7 m"], k: Whole, rows: _Columns, m: Whole) -> None:
     """Take of a row what its landmark does not have yet, and the level where it is higher."""
     if math.isnan(numbers[0, k]):
         numbers[0, k], numbers[3, k] = rows.bearing[m], rows.bearing_std[m]

@@ -5,16 +5,16 @@ import math
 import numpy as np
 from jaxtyping import Complex
 
-from pipistrelle.jit import kernel, no_alloc
+from pipistrelle.jit import Whole, kernel, no_alloc
 
 
 @no_alloc
 def _steer(
     matched: Complex[np.ndarray, "l f c e"],
-    low: int,
-    lags: int,
-    f: int,
-    p: int,
+    low: Whole,
+    lags: Whole,
+    f: Whole,
+    p: Whole,
     u: float,
     beam: Complex[np.ndarray, " r"],
 ) -> None:
@@ -29,7 +29,7 @@ def _steer(
 
 
 @kernel
-def _best_fraction(z0: complex, z1: complex, pulse: int) -> tuple[float, float]:
+def _best_fraction(z0: complex, z1: complex, pulse: Whole) -> tuple[float, float]:
     """Where between two lags the call starts most likely, and how well it fits there.
 
     A call that starts the fraction q into block 0 weighs the blocks 1 - q, 1, ..., 1, q; its
@@ -58,7 +58,7 @@ def _best_fraction(z0: complex, z1: complex, pulse: int) -> tuple[float, float]:
 
 
 @kernel
-def reach_of(pulse: int) -> int:
+def reach_of(pulse: Whole) -> Whole:
     """How many lags around a snapshot's the call may start."""
     return max(pulse // 7, 1)
 
@@ -66,11 +66,11 @@ def reach_of(pulse: int) -> int:
 @no_alloc
 def arrival_lag(
     matched: Complex[np.ndarray, "l f c e"],
-    b: int,
-    f: int,
-    p: int,
+    b: Whole,
+    f: Whole,
+    p: Whole,
     u: float,
-    pulse: int,
+    pulse: Whole,
     beam: Complex[np.ndarray, " r"],
 ) -> float:
     """Lag at which the call starts in the beam steered to u, near lag b, to a fraction.

@@ -26,7 +26,7 @@ from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.onset import arrival_lag, reach_of
 from pipistrelle.geometry import wrap
-from pipistrelle.jit import kernel, no_alloc
+from pipistrelle.jit import Whole, kernel, no_alloc
 
 SCAN_STEP = 0.05
 """Distance of the scan's beams in u [rad]: the parabola's bias stays under 2 % of a beam step."""
@@ -221,7 +221,7 @@ class _Lags(NamedTuple):
 
 
 @kernel
-def _energy(parts: Float[np.ndarray, " i"], elements: int) -> Float[np.ndarray, " t"]:
+def _energy(parts: Float[np.ndarray, " i"], elements: Whole) -> Float[np.ndarray, " t"]:
     """Sums of squares over the elements, real and imaginary parts neighbours, of every output."""
     energy = np.empty(parts.size // (2 * elements))
     square = np.empty(_CHUNK * elements)  # stays in the cache
@@ -240,7 +240,7 @@ def _energy(parts: Float[np.ndarray, " i"], elements: int) -> Float[np.ndarray, 
 
 @kernel
 def _candidates(
-    energy: Float[np.ndarray, " t"], threshold: float, row: int
+    energy: Float[np.ndarray, " t"], threshold: float, row: Whole
 ) -> Int[np.ndarray, " k"]:
     """Tests over the threshold that beat both their neighbours a row away.
 
@@ -261,8 +261,13 @@ def _candidates(
 
 @no_alloc
 def _is_snapshot(
-    energy: Float[np.ndarray, " t"], test: int, row: int, tones: int, pulse: int, leakage: float
-) -> bool:
+    energy: Float[np.ndarray, " t"],
+    test: Whole,
+    row: Whole,
+    tones: Whole,
+    pulse: Whole,
+    leakage: float,
+) -> bool | np.bool_:
     """Whether a test's lag is the largest near, and its tone no leakage of another.
 
     A row of tests is a lag's: its neighbour in time is a row away, its other tones next to it.
@@ -306,7 +311,7 @@ def _scan_power(
 
 
 @no_alloc
-def _peaks(power: Float[np.ndarray, " n"], ratio: float, place: Int[np.ndarray, " n"]) -> int:
+def _peaks(power: Float[np.ndarray, " n"], ratio: float, place: Int[np.ndarray, " n"]) -> Whole:
     """Write where the power peaks, not far under its highest; return the number of peaks.
 
     Chosen as the candidates are.

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.geometry import wrap_angle
-from pipistrelle.jit import kernel, no_alloc
+from pipistrelle.jit import Whole, kernel, no_alloc
 
 MOTION_MODELS = ("bicycle", "unicycle")
 
@@ -64,7 +64,7 @@ def motion_numbers(motion: Motion) -> MotionNumbers:
 
 @kernel
 def motion_increment(
-    model: int, wheelbase: float, heading: float, speed: float, turn: float, dt: float
+    model: Whole, wheelbase: float, heading: float, speed: float, turn: float, dt: float
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
     """One noise-free control step, for kernels.
 

@@ -46,7 +46,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.config import RayConfig
-from pipistrelle.jit import kernel, no_alloc
+from pipistrelle.jit import Whole, kernel, no_alloc
 
 SMALLEST_AGGREGATED_SHARE = 0.05
 SMALLEST_SHARE = 1e-12
@@ -173,7 +173,7 @@ def log_likelihood(innovation: float, variance: float) -> float:
 
 @no_alloc
 def _weigh_in_logs(
-    log_likelihoods: Float[np.ndarray, " h"], weights: Float[np.ndarray, " h"], count: int
+    log_likelihoods: Float[np.ndarray, " h"], weights: Float[np.ndarray, " h"], count: Whole
 ) -> float:
     """Multiply weights by likelihoods whose products underflow; returns the log of their sum."""
     largest, total = -np.inf, 0.0
@@ -193,7 +193,7 @@ def _weigh_in_logs(
 def weigh_and_share(
     log_likelihoods: np.ndarray,
     weights: np.ndarray,
-    count: int,
+    count: Whole,
     power: float,
     aggregated: bool,
     share: np.ndarray,
@@ -233,7 +233,7 @@ def weigh_and_share(
 
 
 @no_alloc
-def heaviest(weights: np.ndarray, count: int) -> int:
+def heaviest(weights: np.ndarray, count: Whole) -> Whole:
     """Return the index of the largest of the first weights, the first of equals."""
     best = 0
     for j in range(1, count):
@@ -243,7 +243,7 @@ def heaviest(weights: np.ndarray, count: int) -> int:
 
 
 @no_alloc
-def survivors(weights: np.ndarray, count: int, prune: float, keep: np.ndarray) -> int:
+def survivors(weights: np.ndarray, count: Whole, prune: float, keep: np.ndarray) -> Whole:
     """Mark the members that stay, renormalise their weights in place and return their number.
 
     A member goes when its weight is under prune / count; the heaviest (the first of equals)

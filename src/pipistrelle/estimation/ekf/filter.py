@@ -41,7 +41,7 @@ from pipistrelle.estimation.rays import (
     weigh_and_share,
 )
 from pipistrelle.geometry import wrap_angle
-from pipistrelle.jit import kernel, no_alloc
+from pipistrelle.jit import Whole, kernel, no_alloc
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -212,7 +212,7 @@ class _Scratch(NamedTuple):
 
 
 @kernel
-def _scratch(members: int) -> _Scratch:
+def _scratch(members: Whole) -> _Scratch:
     """Make room for so many members."""
     return _Scratch(
         np.empty(members),
@@ -223,7 +223,9 @@ def _scratch(members: int) -> _Scratch:
 
 
 @no_alloc
-def _members_of(landmark: Int[np.ndarray, " h"], members: int, label: int) -> tuple[int, int]:
+def _members_of(
+    landmark: Int[np.ndarray, " h"], members: Whole, label: Whole
+) -> tuple[Whole, Whole]:
     """Index of a landmark's first member and how many it has (0: not mapped)."""
     for first in range(members):
         if landmark[first] == label:
@@ -237,13 +239,13 @@ def _members_of(landmark: Int[np.ndarray, " h"], members: int, label: int) -> tu
 @no_alloc
 def _correct_ray(
     state: State,
-    first: int,
-    count: int,
+    first: Whole,
+    count: Whole,
     bearing: float,
     variance: float,
     sensing: Sensing,
     scratch: _Scratch,
-) -> int:
+) -> Whole:
     """Weigh a ray's members by a bearing and share it among them; GATED when none expected it."""
     joint, mean, size = state.joint, state.joint.mean, 3 + 2 * state.members[0]
     weight, outcome = state.weight[first:], GATED
@@ -270,10 +272,10 @@ def _correct_ray(
 @no_alloc
 def _range_for_ray(
     state: State,
-    first: int,
-    count: int,
+    first: Whole,
+    count: Whole,
     heard: Measurements,
-    m: int,
+    m: Whole,
     sensing: Sensing,
     scratch: _Scratch,
 ) -> None:
@@ -298,8 +300,8 @@ def _range_for_ray(
 
 @no_alloc
 def _correct_known(
-    state: State, heard: Measurements, m: int, sensing: Sensing, scratch: _Scratch
-) -> int:
+    state: State, heard: Measurements, m: Whole, sensing: Sensing, scratch: _Scratch
+) -> Whole:
     """Correct with measurement m, of a mapped landmark; tell whether it was gated."""
     first, count = _members_of(state.landmark, state.members[0], heard.landmark[m])
     distance, bearing, variance = heard.range[m], heard.bearing[m], heard.bearing_variance[m]
@@ -321,7 +323,7 @@ def _correct_known(
 
 
 @no_alloc
-def _add_new(state: State, heard: Measurements, m: int, sensing: Sensing) -> None:
+def _add_new(state: State, heard: Measurements, m: Whole, sensing: Sensing) -> None:
     """Append the landmark of measurement m, one member or a ray of them (Eqs. (16) to (18))."""
     joint, passive = state.joint, math.isnan(heard.range[m])
     count = sensing.ray_ranges.size if passive else 1
@@ -346,7 +348,7 @@ def _update(
     old_weight: Float[np.ndarray, " h"],
     heard: Measurements,
     sensing: Sensing,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Whole]:
     """Correct, prune and extend a copy of the belief; returns its arrays and the gated count."""
     members, rows = old_landmark.size, heard.landmark.size
     most, known = members, np.empty(rows, dtype=np.bool_)

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.estimation.measurement import NEAREST, observe
 from pipistrelle.estimation.motion import MotionNumbers, propagate_pose
 from pipistrelle.geometry import wrap_angle
-from pipistrelle.jit import kernel, no_alloc
+from pipistrelle.jit import Whole, kernel, no_alloc
 
 GATED, APPLIED = 1, 0
 LANE = 8
@@ -71,13 +71,13 @@ class State(NamedTuple):
 
 
 @kernel
-def _lanes(size: int) -> int:
+def _lanes(size: Whole) -> Whole:
     """Least multiple of a cache line's numbers that holds so many."""
     return (size + LANE - 1) // LANE * LANE
 
 
 @kernel
-def _on_cache_lines(rows: int, width: int) -> Float[np.ndarray, "rows width"]:
+def _on_cache_lines(rows: Whole, width: Whole) -> Float[np.ndarray, "rows width"]:
     """Make an array (rows, width) that begins on a cache line."""
     buffer = np.empty(rows * width + LANE)
     start = -(buffer.ctypes.data // 8) % LANE
@@ -86,7 +86,7 @@ def _on_cache_lines(rows: int, width: int) -> Float[np.ndarray, "rows width"]:
 
 @kernel
 def joint_of(
-    mean: Float[np.ndarray, " d"], covariance: Float[np.ndarray, "d d"], room: int
+    mean: Float[np.ndarray, " d"], covariance: Float[np.ndarray, "d d"], room: Whole
 ) -> Joint:
     """Copy a mean (d) and a covariance (d, d) into a `Joint` with room for so many numbers."""
     size, width = mean.size, _lanes(mean.size)
@@ -106,7 +106,7 @@ def joint_of(
 
 @kernel
 def gaussian_of(
-    joint: Joint, size: int
+    joint: Joint, size: Whole
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
     """Copy the mean (d) and the covariance (d, d) out of a settled `Joint`."""
     mean, covariance = np.empty(size), np.empty((size, size))
@@ -119,7 +119,7 @@ def gaussian_of(
 
 @no_alloc
 def _point_rows(
-    joint: Joint, size: int, i: int
+    joint: Joint, size: Whole, i: Whole
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Rows i and i + 1 of the covariance, with all that waits subtracted from them."""
     pi, pj, W = joint.covariance[i], joint.covariance[i + 1], joint.W
@@ -143,7 +143,7 @@ def _point_rows(
 
 
 @no_alloc
-def flush(joint: Joint, size: int) -> None:
+def flush(joint: Joint, size: Whole) -> None:
     """Let every row catch up: afterwards nothing waits."""
     covariance = joint.covariance
     for i in range(3, size, 2):
@@ -155,7 +155,7 @@ def flush(joint: Joint, size: int) -> None:
 
 
 @no_alloc
-def _defer(joint: Joint, size: int, w: Float[np.ndarray, " m"], step: float) -> None:
+def _defer(joint: Joint, size: Whole, w: Float[np.ndarray, " m"], step: float) -> None:
     """Add step w to the mean, subtract w w^T from the pose's rows, and let the points' wait."""
     mean, p0, p1, p2 = joint.mean, joint.covariance[0], joint.covariance[1], joint.covariance[2]
     x, y, h = w[0], w[1], w[2]
@@ -199,7 +199,7 @@ def propagate(
 
 
 @no_alloc
-def bearing_variance(joint: Joint, size: int, i: int, c: float, s: float, k: float) -> float:
+def bearing_variance(joint: Joint, size: Whole, i: Whole, c: float, s: float, k: float) -> float:
     """Innovation variance H P H^T of the bearing of the member at state index i, without R."""
     h0, h1 = s * k, -c * k  # by pose: (h0, h1, -1); by member: (-h0, -h1)
     p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
@@ -217,8 +217,8 @@ def bearing_variance(joint: Joint, size: int, i: int, c: float, s: float, k: flo
 
 @no_alloc
 def correct_bearing(
-    joint: Joint, size: int, i: int, bearing: float, variance: float, bound: float
-) -> int:
+    joint: Joint, size: Whole, i: Whole, bearing: float, variance: float, bound: float
+) -> Whole:
     """Correct the state with the bearing of the member at index i; GATED when beyond bound."""
     mean = joint.mean
     distance, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
@@ -246,14 +246,14 @@ def correct_bearing(
 @no_alloc
 def correct_active(
     joint: Joint,
-    size: int,
-    i: int,
+    size: Whole,
+    i: Whole,
     distance: float,
     bearing: float,
     range_variance: float,
     bearing_variance: float,
     bound: float,
-) -> int:
+) -> Whole:
     """Correct the state with range and bearing of the member at index i; GATED beyond bound."""
     mean = joint.mean
     near, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
@@ -292,8 +292,8 @@ def correct_active(
 def initialise(
     mean: Float[np.ndarray, " n"],
     covariance: Float[np.ndarray, "n m"],
-    size: int,
-    i: int,
+    size: Whole,
+    i: Whole,
     distance: float,
     bearing: float,
     range_variance: float,
@@ -328,8 +328,8 @@ def initialise(
 @no_alloc
 def drop_members(
     state: State,
-    first: int,
-    count: int,
+    first: Whole,
+    count: Whole,
     keep: Bool[np.ndarray, " h"],
     source: Int[np.ndarray, " n"],
 ) -> None:

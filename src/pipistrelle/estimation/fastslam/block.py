@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 
 from pipistrelle.arithmetic.elementary import arctangent, cosine_and_sine, logarithm, wrapped
 from pipistrelle.estimation.measurement import NEAREST
-from pipistrelle.jit import inlined, no_alloc
+from pipistrelle.jit import Whole, inlined, no_alloc
 
 LANES = 32
 """Particles in a block. With half as many the compiler unrolls the loops instead of widening them;
@@ -40,7 +40,7 @@ ROUNDING = 1e-12
 
 @inlined
 def _bearing(
-    pose: Poses, member: Member, bearing: float, i: int
+    pose: Poses, member: Member, bearing: float, i: Whole
 ) -> tuple[float, float, float, bool]:
     """Innovation of a member's bearing; its slopes by x and y of the pose; whether it has any."""
     dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
@@ -51,7 +51,7 @@ def _bearing(
 
 
 @inlined
-def _bearing_gain(pose: Poses, h0: float, h1: float, i: int) -> tuple[float, float, float]:
+def _bearing_gain(pose: Poses, h0: float, h1: float, i: Whole) -> tuple[float, float, float]:
     """Covariance of x, y and heading with the bearing, whose slopes are (h0, h1, -1)."""
     return (
         h0 * pose[PXX + i] + h1 * pose[PXY + i] - pose[PXH + i],
@@ -61,7 +61,7 @@ def _bearing_gain(pose: Poses, h0: float, h1: float, i: int) -> tuple[float, flo
 
 
 @inlined
-def _spread(member: Member, h0: float, h1: float, i: int) -> float:
+def _spread(member: Member, h0: float, h1: float, i: Whole) -> float:
     """Variance of the bearing that a member's own uncertainty causes."""
     cross = 2.0 * h0 * h1 * member[XY + i]
     return h0 * h0 * member[XX + i] + cross + h1 * h1 * member[YY + i]
@@ -74,7 +74,7 @@ def expect_bearing(
     bearing: float,
     variance: float,
     count: Counts,
-    j: int,
+    j: Whole,
     log_likelihood: Lanes,
 ) -> None:
     """Log likelihood, without its constant, of the bearing of each lane's member j (Eq. (19)).
@@ -99,7 +99,7 @@ def bearing_beyond(
     bearing: float,
     variance: float,
     count: Counts,
-    j: int,
+    j: Whole,
     bound: float,
 ) -> bool:
     """Whether the bearing is beyond the bound for member j of every lane that has one."""
@@ -157,7 +157,7 @@ def correct_by_bearing(
 
 @inlined
 def _active(
-    pose: Poses, member: Member, distance: float, bearing: float, i: int
+    pose: Poses, member: Member, distance: float, bearing: float, i: Whole
 ) -> tuple[float, float, float, float, float, bool]:
     """Innovations of range and bearing, direction (c, s), inverse range, whether it is far."""
     dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
@@ -188,7 +188,7 @@ def _active_spread(
     k: float,
     range_variance: float,
     bearing_variance: float,
-    i: int,
+    i: Whole,
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
     """Covariance of range and bearing with x, y, heading, and of their innovations."""
     h0, h1 = s * k, -c * k

@@ -34,7 +34,7 @@ from pipistrelle.estimation.fastslam.block import (
     refine_by_bearing,
 )
 from pipistrelle.estimation.rays import SMALLEST_AGGREGATED_SHARE, SMALLEST_SHARE, Sensing
-from pipistrelle.jit import kernel, no_alloc
+from pipistrelle.jit import Whole, kernel, no_alloc
 
 Rows = Float[np.ndarray, "h numbers"]
 """The members of one landmark."""
@@ -64,7 +64,7 @@ class Scratch(NamedTuple):
 
 
 @kernel
-def scratch_for(members: int) -> Scratch:
+def scratch_for(members: Whole) -> Scratch:
     """Return room to work with rays of so many members."""
     return Scratch(
         np.empty((members, LANES)),
@@ -78,7 +78,7 @@ def scratch_for(members: int) -> Scratch:
 
 
 @no_alloc
-def _largest(logs: Float[np.ndarray, "h lanes"], members: int, largest: Lanes) -> None:
+def _largest(logs: Float[np.ndarray, "h lanes"], members: Whole, largest: Lanes) -> None:
     """Largest of each lane's logs."""
     for i in range(LANES):
         largest[i] = -np.inf
@@ -89,7 +89,7 @@ def _largest(logs: Float[np.ndarray, "h lanes"], members: int, largest: Lanes) -
 
 
 @no_alloc
-def _weigh(rows: Rows, members: int, scratch: Scratch) -> None:
+def _weigh(rows: Rows, members: Whole, scratch: Scratch) -> None:
     """Aggregated likelihoods, in logs and normalised, into ``posterior`` (Eq. (18)).
 
     Their sum before, in logs, goes to ``total``.
@@ -114,7 +114,7 @@ def _weigh(rows: Rows, members: int, scratch: Scratch) -> None:
 
 
 @no_alloc
-def _share(members: int, sensing: Sensing, scratch: Scratch) -> None:
+def _share(members: Whole, sensing: Sensing, scratch: Scratch) -> None:
     """Divide the measurement: shares go with a power of the likelihoods, now or aggregated."""
     logs = scratch.posterior if sensing.aggregated else scratch.likelihood
     smallest = SMALLEST_AGGREGATED_SHARE if sensing.aggregated else SMALLEST_SHARE
@@ -141,7 +141,7 @@ def _add(log_likelihood: Lanes, log_weight: Lanes) -> None:
 
 
 @no_alloc
-def most(count: Counts) -> int:
+def most(count: Counts) -> Whole:
     """Members of the lane that has most."""
     largest = 1
     for i in range(LANES):
@@ -180,7 +180,7 @@ def refine_by_ray(
 
 @no_alloc
 def _refine_to_mixture(
-    pose: Poses, rows: Rows, members: int, bearing: float, variance: float, scratch: Scratch
+    pose: Poses, rows: Rows, members: Whole, bearing: float, variance: float, scratch: Scratch
 ) -> None:
     """Set the poses to mean and covariance of the mixture of the members' refinements."""
     for j in range(members):
@@ -236,7 +236,7 @@ def correct_ray(
 
 
 @no_alloc
-def _prune(rows: Rows, count: Counts, members: int, prune: float, scratch: Scratch) -> None:
+def _prune(rows: Rows, count: Counts, members: Whole, prune: float, scratch: Scratch) -> None:
     """Drop members whose aggregated likelihood is too small; the heaviest stays (Eq. (21))."""
     largest, total = scratch.largest, scratch.total
     _largest(scratch.posterior, members, largest)

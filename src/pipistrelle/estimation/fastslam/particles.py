@@ -39,7 +39,7 @@ from pipistrelle.estimation.fastslam.block_rays import (
 )
 from pipistrelle.estimation.measurement import Measurements
 from pipistrelle.estimation.rays import Sensing
-from pipistrelle.jit import kernel, no_alloc
+from pipistrelle.jit import Whole, kernel, no_alloc
 
 
 class Particles(NamedTuple):
@@ -85,7 +85,7 @@ def _slots(landmark: Int[np.ndarray, " n"], labels: Int[np.ndarray, " m"]) -> In
 
 @no_alloc
 def _active_gated(
-    pose: Poses, member: Member, heard: Measurements, m: int, count: Counts, bound: float
+    pose: Poses, member: Member, heard: Measurements, m: Whole, count: Counts, bound: float
 ) -> bool:
     """Whether range and bearing of measurement m are beyond the bound for every lane."""
     return active_beyond(
@@ -122,7 +122,7 @@ def gated_by_all(
 
 @no_alloc
 def _initialise_active(
-    pose: Poses, member: Member, heard: Measurements, m: int, count: Counts
+    pose: Poses, member: Member, heard: Measurements, m: Whole, count: Counts
 ) -> None:
     """Put a member at range and bearing of measurement m, where a landmark has not one member."""
     initialise_member(
@@ -137,7 +137,7 @@ def _range_for_ray(
     rows: Rows,
     count: Counts,
     heard: Measurements,
-    m: int,
+    m: Whole,
     sensing: Sensing,
     share: Lanes,
 ) -> None:
@@ -218,7 +218,7 @@ def _correct(
 
 @no_alloc
 def _add_new(
-    pose: Poses, rows: Rows, count: Counts, heard: Measurements, m: int, sensing: Sensing
+    pose: Poses, rows: Rows, count: Counts, heard: Measurements, m: Whole, sensing: Sensing
 ) -> None:
     """Place a block's new landmark, one member or a ray of them (Eqs. (16) to (18))."""
     if not math.isnan(heard.range[m]):
@@ -236,8 +236,8 @@ def _add_new(
 
 @kernel
 def _rows(
-    particles: Particles, slot: Int[np.ndarray, " m"], heard: Measurements, rays: int
-) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n+1"], int]:
+    particles: Particles, slot: Int[np.ndarray, " m"], heard: Measurements, rays: Whole
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n+1"], Whole]:
     """Labels with the new ones, each landmark's first row, and the most rows that one needs."""
     known, fresh, widest = particles.landmark.size, 0, 1
     for m in range(slot.size):
@@ -261,7 +261,7 @@ def _rows(
 
 
 @no_alloc
-def _copy_members(particles: Particles, b: int, block: Block) -> None:
+def _copy_members(particles: Particles, b: Whole, block: Block) -> None:
     """Copy the members of a block into the rows that they now have."""
     for n in range(particles.landmark.size):
         for j in range(block.first[n + 1] - block.first[n]):
@@ -304,7 +304,7 @@ def correct_particles(
 
 @kernel
 def particle_map(
-    count: Int[np.ndarray, "b n lanes"], member: Float[np.ndarray, "b c numbers"], particle: int
+    count: Int[np.ndarray, "b n lanes"], member: Float[np.ndarray, "b c numbers"], particle: Whole
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "c 6"]]:
     """One particle's members, row by row: the number of each landmark's, and (c, 6) numbers."""
     b, i = particle // LANES, particle % LANES
