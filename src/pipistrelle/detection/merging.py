@@ -90,7 +90,7 @@ def average_faces(
     )
     distance = 0.5 * speed_of_sound * np.where(caller == OWN, delay, np.nan)
     rows = make_scan(time, landmark, bearing, caller=caller, range=distance, level_db=level)
-    return Heard(rows=rows, clutter=clutter)
+    return Heard(rows=rows, clutter=int(clutter))
 
 
 def same_echo(

@@ -160,7 +160,9 @@ def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Sc
         map_rmse_aligned_m=_aligned_rmse(mapped, true),
         nees_mean=path.nees_mean,
         nees_max=worst,
-        diverged=(None if finite else True) if worst is None else diverged(np.array(worst), limit),
+        diverged=(None if finite else True)
+        if worst is None
+        else diverged(np.array([worst]), limit),
         landmarks_full=int(np.sum(estimate.full)),
         landmarks_total=len(estimate.landmark),
         measurements_per_frame=sum(len(s.landmark) for s in scans) / len(scans) if scans else None,
