@@ -68,8 +68,9 @@ def _heard(landmarks: int) -> dict[str, float]:
     """Time a frame, and a measurement in FastSLAM, in a world of so many landmarks."""
     from benchmarks.worlds import scans_of, some_frames, world_of
     from pipistrelle.config import Config, ScenarioConfig
+    from pipistrelle.experiments.cases import Case
     from pipistrelle.experiments.hearing.listening import listen
-    from pipistrelle.experiments.runs.trial import Case, drive_of, run_trial
+    from pipistrelle.experiments.runs.trial import drive_of, run_trial
 
     config = Config(scenario=ScenarioConfig(landmarks=landmarks, spacing=0.5))
     world, radii = world_of(config), (config.emitter.radius,)

@@ -27,8 +27,9 @@ from pipistrelle.config import Config
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.motion import Motion, motion_jacobians, motion_step
 from pipistrelle.evaluation.accuracy import position_error, rmse
+from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive
-from pipistrelle.experiments.runs.trial import Case, drive_of, run_trial
+from pipistrelle.experiments.runs.trial import drive_of, run_trial
 
 PARALLAX = 0.5
 """Least angle between two bearings that place a landmark [rad]."""

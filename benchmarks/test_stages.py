@@ -14,9 +14,10 @@ from benchmarks.counts import covariance_updates, elementary_functions
 from benchmarks.limits import elementary_function, multiply_add
 from benchmarks.worlds import RADII, scans_of, some_frames, world_of
 from pipistrelle.config import Config, ReceiverConfig
+from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.machine import keep_freed_memory
-from pipistrelle.experiments.runs.trial import Case, drive_of, run_trial
+from pipistrelle.experiments.runs.trial import drive_of, run_trial
 
 keep_freed_memory()  # as the commands do
 CONFIG = Config()

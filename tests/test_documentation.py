@@ -63,6 +63,21 @@ def test_the_settings_named_by_the_pages_exist():
         assert [word for word in words if not any(word in names for names in held)] == [], row
 
 
+def test_a_change_touches_three_files_at_most_and_its_proof_exists():
+    page = (DOCS / "extending.md").read_text()
+    rows = re.findall(r"^\| (an? [^|]*|measurement[^|]*) \|[^|]*\|([^|]*)\|([^|]*)\|$", page, re.M)
+    everywhere = "\n".join(path.read_text() for path in (ROOT / "tests").rglob("test_*.py"))
+    assert len(rows) == 12
+    for change, files, proofs in rows:
+        named = re.findall(r"`([\w/]+\.py)`", files)
+        assert 1 <= len(named) <= 3, change
+        for name in named:
+            assert (ROOT / "src" / "pipistrelle" / name).exists(), name
+        tests = re.findall(r"`(test_\w+)`", proofs)
+        assert tests, change
+        assert [test for test in tests if f"def {test}(" not in everywhere] == []
+
+
 @pytest.fixture(scope="module")
 def guide():
     """Run the code of the page on extending, block by block, and return its names."""
@@ -103,7 +118,7 @@ def test_the_guides_second_caller_is_mapped_and_its_moving_one_is_not(guide):
     assert {51, 52} <= set(two.landmark.tolist())
     assert 51 in moving.landmark
     assert 52 not in moving.landmark
-    assert any(52 in frame.landmark for frame in guide["heard"])
+    assert any(52 in frame.rows.landmark for frame in guide["heard"])
 
 
 def test_the_guides_filter_drives_a_mission(guide):
@@ -137,7 +152,8 @@ def heard_and_drive(steps=120):
 
 def test_the_guides_association_finds_again_what_the_oracle_knew(guide):
     from pipistrelle.detection.merging import unlabelled
-    from pipistrelle.experiments.runs.trial import Case, run_trial, scans_of
+    from pipistrelle.experiments.cases import Case
+    from pipistrelle.experiments.runs.trial import run_trial, scans_of
 
     config, heard, drive = heard_and_drive()
     case = Case(strategy="active", filter="ekf")
@@ -155,7 +171,8 @@ def test_the_guides_association_finds_again_what_the_oracle_knew(guide):
 
 def test_the_guides_noise_reaches_the_filter_row_by_row(guide):
     from pipistrelle.detection.merging import scan_of
-    from pipistrelle.experiments.runs.trial import Case, run_trial, scans_of
+    from pipistrelle.experiments.cases import Case
+    from pipistrelle.experiments.runs.trial import run_trial, scans_of
 
     config, heard, drive = heard_and_drive(40)
     scans = [guide["by_level"](scan_of(frame, "active")) for frame in heard]

@@ -32,9 +32,10 @@ import tomli_w
 
 from pipistrelle.config import Config
 from pipistrelle.detection.merging import scan_of
+from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
-from pipistrelle.experiments.runs.trial import Case, drive_of, run_trial
+from pipistrelle.experiments.runs.trial import drive_of, run_trial, scans_of
 
 SEED = 1000
 BEAMS = {"180": 0.0025, "33": 0.0088, "11": 0.025}
@@ -151,7 +152,7 @@ def rays_tried(config: Config, world: int) -> list[tuple[int, float, bool]]:
     """Map a world by passive EKF-SLAM with each n and tau: full landmarks, mean NEES, diverged."""
     scenario = world_of(config, world)
     (heard,) = listen(scenario, config, (BEAMS["11"],), iteration=world)
-    scans = tuple(scan_of(frame, "passive") for frame in heard)
+    scans = scans_of(heard, "passive", config)
     case, drive, rows = Case(strategy="passive", filter="ekf"), drive_of(scenario, config), []
     for power in POWERS:
         for prune in PRUNES:

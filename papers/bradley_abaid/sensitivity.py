@@ -22,11 +22,11 @@ import polars as pl
 from calibration import BEAMS, SEED, Run, changed, fit_levels, in_worlds
 
 from pipistrelle.config import STRATEGIES, Config
-from pipistrelle.detection.merging import scan_of
+from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
 from pipistrelle.experiments.results.scores import Scores
-from pipistrelle.experiments.runs.trial import Case, drive_of, run_trial
+from pipistrelle.experiments.runs.trial import drive_of, run_trial, scans_of
 
 AIR: dict[str, dict[str, Any]] = {
     "humidity 20 %": {"air.relative_humidity": 0.2},
@@ -107,13 +107,12 @@ def trials_in(settings: Sequence[Config], world: int) -> list[Trials]:
     beams = listen(scenario, settings[0], list(BEAMS.values()), iteration=world)
     heard = dict(zip(BEAMS, beams, strict=True))
     cases = [(s, beam) for s in STRATEGIES for beam in BEAMS if s != "passive" or beam == "11"]
-    scans = {(s, b): tuple(scan_of(frame, s) for frame in heard[b]) for s, b in cases}
     return [
         {
             (s, b): run_trial(
                 Case(strategy=s, filter="ekf", iteration=world),
                 drive_of(scenario, config),
-                scans[s, b],
+                scans_of(heard[b], s, config),
                 config,
             ).scores
             for s, b in cases

@@ -17,11 +17,12 @@ from statistics import fmean
 import numpy as np
 
 from pipistrelle.config import Config, FastSlamConfig, Strategy
-from pipistrelle.detection.merging import Heard, scan_of
+from pipistrelle.detection.merging import Heard
 from pipistrelle.detection.scans import Scan
+from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import Scenario, standing_landmarks, world_of
-from pipistrelle.experiments.runs.trial import Case, drive_of, run_trial
+from pipistrelle.experiments.runs.trial import drive_of, run_trial, scans_of
 from pipistrelle.geometry import range_and_bearing, wrap
 
 RADII = {"180": 0.0025, "33": 0.0088, "11": 0.025}
@@ -66,7 +67,7 @@ def world_rows(
         cases += [(f"fused {name}", "fused", heard), (f"active {name}", "active", heard)]
     rows = {}
     for (name, strategy, heard), way in product(cases, ways):
-        scans = tuple(scan_of(frame, strategy) for frame in heard)
+        scans = scans_of(heard, strategy, config)
         filter_name, mixture = WAYS[way]
         chosen = config.model_copy(update={"fastslam": FastSlamConfig(mixture=mixture)})
         scores = run_trial(Case(strategy=strategy, filter=filter_name), drive, scans, chosen).scores
