@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections import deque
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -210,6 +210,38 @@ def gone(processes, patience=30.0):
 # Processes that die of a world
 
 
+class Mortal(ThreadPoolExecutor):
+    """Breaks at a deadly world as a pool of processes does: nothing more can be started."""
+
+    def submit(self, task, iteration):
+        if hasattr(self, "broken"):
+            raise BrokenExecutor
+        future, (deadly,) = Future(), task.args
+        if iteration in deadly:
+            self.broken = True
+            future.set_exception(BrokenExecutor())
+        else:
+            future.set_result([(f"world {iteration}", None)])
+        return future
+
+
+@pytest.fixture
+def mortal(monkeypatch):
+    monkeypatch.setattr(executors, "_pool", Mortal)
+
+
+def test_a_world_that_kills_its_pool_twice_is_recorded_and_the_others_are_not(mortal):
+    found = executors.in_processes(partial(fatal, {3}), lost, deque(range(6)), 2)
+    names = [(f"world {i}", "lost" if i == 3 else None) for i in range(6)]
+    assert sorted(found) == [[name] for name in names]
+
+
+def test_pools_that_never_get_anywhere_are_an_error(mortal):
+    with pytest.raises(InputError, match="their processes end before a world is done"):
+        list(executors.in_processes(partial(fatal, {0, 1}), lost, deque([0, 1]), 2))
+
+
+@pytest.mark.slow
 def test_a_world_that_kills_its_process_twice_is_recorded_and_the_others_are_not():
     worlds = deque(range(5))
     found = executors.in_processes(partial(fatal, {3}), lost, worlds, 2)
@@ -222,6 +254,7 @@ def test_a_world_that_kills_its_process_twice_is_recorded_and_the_others_are_not
     ]
 
 
+@pytest.mark.slow
 def test_processes_that_never_get_anywhere_are_an_error():
     with pytest.raises(InputError, match="their processes end before a world is done"):
         list(executors.in_processes(partial(fatal, {0, 1}), lost, deque([0, 1]), 2))

@@ -5,12 +5,15 @@ from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from matplotlib.path import Path
 
+from pipistrelle.acoustics.callers import Caller
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
 from pipistrelle.figures.maps import (
     PLACED,
     RAY,
     beam,
+    callers_shown,
     cells,
+    draw_truth,
     ellipses,
     head,
     legend,
@@ -170,3 +173,18 @@ def test_a_head_names_strategy_and_filter_side_by_side_a_strangers_too():
     left, right = strategy.get_window_extent(), estimator.get_window_extent()
     assert left.x1 < right.x0
     assert left.y0 == pytest.approx(right.y0, abs=1.0)
+
+
+def test_callers_are_drawn_as_stars_where_they_stand_and_as_lines_where_they_move():
+    angle = np.linspace(0.0, 6.0, 50)
+    path = 40.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    post = Caller(name="post", frequency=30e3, level_db=42.8, place=np.array([3.0, 4.0]))
+    boat = Caller(name="boat", frequency=25e3, level_db=42.8, place=path)
+    axes = Figure().add_subplot()
+    draw_truth(axes, None, (post, boat))
+    star, line = axes.lines
+    assert (star.get_marker(), star.get_xydata().tolist()) == ("*", [[3.0, 4.0]])
+    assert (line.get_marker(), line.get_xydata().tolist()) == ("None", path.tolist())
+    assert callers_shown((post, boat)) == {"beacon", "moving caller"}
+    (left, right), _ = view(NO_TRUTH, (post, boat), [np.zeros((1, 3))], [])
+    assert left < path[:, 0].min() < 40.0 < right

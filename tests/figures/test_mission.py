@@ -112,6 +112,17 @@ def test_without_truth_there_are_maps_alone(mission):
     assert not names & {"true path", "true landmark", "beacon", "its beam"}
 
 
+def test_a_caller_that_moves_gets_its_line_in_the_legend_and_the_page_room_for_it(mission, three):
+    (beacon,) = mission.truth["callers"]
+    boat = replace(beacon, name="boat", place=np.zeros((9, 2)))
+    truth = mission.truth | {"callers": (beacon, boat)}
+    figure = draw_mission(list(mission.trials.values()), **truth)
+    names = [text.get_text() for text in figure.legends[0].texts]
+    assert len(names) == 9
+    assert names[5:7] == ["beacon", "moving caller"]
+    assert figure.get_figheight() > three.get_figheight()  # a third row of entries
+
+
 def test_the_legend_stands_once_and_names_everything(three):
     (legend,) = three.legends
     assert len(legend.texts) == 8

@@ -148,7 +148,7 @@ def test_a_log_is_saved_to_a_folder_of_its_own(obey, refused, undrawn):
     assert "is the result folder" in refused("run", "--save-log", "new", "-o", "./new")
 
 
-@pytest.mark.parametrize("estimator", PAPERS)
+@pytest.mark.parametrize("estimator", ["ekf", pytest.param("fastslam", marks=pytest.mark.slow)])
 def test_a_film_is_drawn_as_gif_unless_said_otherwise(obey, estimator):
     words = ("--strategy", "passive", "--filter", estimator, "--quiet", "--animate")
     assert obey("run", "--duration", "1", "--landmarks", "5", *words, "-o", "one")[0] == 0

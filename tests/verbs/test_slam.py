@@ -119,7 +119,8 @@ def test_a_log_without_truth_is_mapped_and_not_scored(obey, log):
     assert status == 0
     assert "RMSE" not in printed
     assert "landmarks, fully placed / all" in printed
-    assert replay.load(log)[1] is None
+    _, truth = replay.load(log)
+    assert (truth.path, truth.landmarks) == (None, None)
 
 
 def test_a_log_whose_truth_ends_early_is_scored_where_it_is_known(obey, log, undrawn):

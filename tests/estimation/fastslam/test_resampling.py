@@ -122,6 +122,7 @@ def by_independent_draws(weight, rng):
     return rng.choice(weight.size, size=weight.size, p=weight)
 
 
+@pytest.mark.slow
 def test_mean_number_of_copies_is_the_particles_share_and_without_chance_it_is_not():
     weight = np.random.default_rng(3).dirichlet(np.full(20, 1.0))
     assert 20 * weight.min() > 0.01

@@ -30,8 +30,7 @@ from pipistrelle.config import (
     ScenarioConfig,
 )
 from pipistrelle.detection.matched import filter_blocks, filter_samples
-from pipistrelle.detection.merging import Heard
-from pipistrelle.detection.scans import UNLABELLED
+from pipistrelle.detection.scans import COLUMNS, OWN, UNLABELLED
 from pipistrelle.detection.snapshots import Detections, detect, detector
 from pipistrelle.experiments.hearing import listening
 from pipistrelle.experiments.hearing.listening import listen
@@ -61,7 +60,8 @@ def short(steps, **changes):
 
 def bits(beam):
     return [
-        [np.asarray(getattr(heard, name)).tobytes() for name in Heard.__slots__] for heard in beam
+        [heard.clutter, *(np.asarray(getattr(heard.rows, name)).tobytes() for name in COLUMNS)]
+        for heard in beam
     ]
 
 
@@ -107,13 +107,13 @@ def test_the_dense_engine_records_until_the_next_call(monkeypatch):
 def test_a_narrower_beam_ranges_fewer_landmarks():
     world, config = short(200)
     count = [
-        sum(np.count_nonzero(~np.isnan(heard.range)) for heard in beam)
+        sum(np.count_nonzero(~np.isnan(heard.rows.range)) for heard in beam)
         for beam in listen(world, config, [0.0025, 0.0088, 0.025])
     ]
     assert count[0] > 1.5 * count[1] > 1.5 * 1.5 * count[2] > 0
 
 
-def test_the_truth_labels_detections_and_enters_nowhere_else(monkeypatch):
+def test_the_truth_labels_detections_and_enters_nowhere_else():
     world, config = short(40)
     as_is = listen(world, config, [0.0088])[0]
 
@@ -123,16 +123,29 @@ def test_the_truth_labels_detections_and_enters_nowhere_else(monkeypatch):
         )
         return label_detections(found, moved, *args, **settings)
 
-    monkeypatch.setattr(listening, "label_detections", off_by_a_little)
-    assert bits(listen(world, config, [0.0088])[0]) == bits(as_is)
+    assert bits(listen(world, config, [0.0088], oracle=off_by_a_little)[0]) == bits(as_is)
 
     def to_none(found, *_, **__):
         return np.full(found.face.size, UNLABELLED)
 
-    monkeypatch.setattr(listening, "label_detections", to_none)
-    deaf = listen(world, config, [0.0088])[0]
-    assert all(heard.landmark.size == 0 for heard in deaf)
+    deaf = listen(world, config, [0.0088], oracle=to_none)[0]
+    assert all(heard.rows.landmark.size == 0 for heard in deaf)
     assert sum(heard.clutter for heard in deaf) > sum(heard.clutter for heard in as_is)
+
+
+def test_without_an_oracle_as_much_is_heard_and_nothing_has_a_label():
+    world, config = short(40)
+    (told,), (untold,) = (
+        listen(world, config, [0.0088], oracle=o) for o in (label_detections, None)
+    )
+    for one, other in zip(told, untold, strict=True):
+        assert set(other.rows.landmark.tolist()) <= {UNLABELLED}
+        assert other.clutter == 0
+        # What the oracle names is among what is heard: to the bit where one face heard it alone.
+        heard = set(zip(other.rows.caller.tolist(), other.rows.bearing.tolist(), strict=True))
+        named = list(zip(one.rows.caller.tolist(), one.rows.bearing.tolist(), strict=True))
+        assert sum(row in heard for row in named) > 0.6 * len(named)
+        assert other.rows.landmark.size >= one.rows.landmark.size
 
 
 def errors_of(config, worlds):
@@ -143,12 +156,13 @@ def errors_of(config, worlds):
         (beam,) = listen(world, config, [0.0088], iteration=seed)
         _, places = standing_landmarks(world)
         for heard in beam:
-            pose = world.path[np.searchsorted(world.time, heard.time)]
-            distance, bearing = range_and_bearing(pose, places[heard.landmark - 1])
-            off = wrap(heard.bearing - bearing[:, None])
-            own.append(off[:, 0])
-            other.append(off[:, 1])
-            late.append(heard.range - distance)
+            rows = heard.rows
+            pose = world.path[np.searchsorted(world.time, rows.time)]
+            distance, bearing = range_and_bearing(pose, places[rows.landmark - 1])
+            off = wrap(rows.bearing - bearing)
+            own.append(off[rows.caller == OWN])
+            other.append(off[rows.caller != OWN])
+            late.append(rows.range - distance)
     columns = (np.concatenate(column) for column in (own, other, late))
     return [column[~np.isnan(column)] for column in columns]
 
@@ -242,7 +256,7 @@ def test_a_layout_of_ones_own_hears_as_the_settings_own_of_that_size_do(elements
     receiver = ReceiverConfig(elements=elements, spacing=spacing)
     settled = listen(world, config.model_copy(update={"receiver": receiver}), (0.0088,))
     assert bits(given[0]) == bits(settled[0])
-    assert sum(heard.landmark.size for heard in given[0]) > 100
+    assert sum(heard.rows.landmark.size for heard in given[0]) > 100
 
 
 def test_unequal_elements_are_refused():
@@ -266,11 +280,11 @@ def test_beam_and_finder_of_ones_own_are_used():
         })  # fmt: skip
 
     (silent,) = listen(world, config, (0.0088,), beam=deaf)
-    assert all(np.isnan(heard.range).all() for heard in silent)
+    assert all(np.isnan(heard.rows.range).all() for heard in silent)
     (ahead,) = listen(world, config, (0.0088,), find=first_face)
-    bearings = np.concatenate([heard.bearing.ravel() for heard in ahead])
-    assert np.nanmax(np.abs(bearings)) <= np.radians(75.0) + 1e-9
-    assert sum(heard.landmark.size for heard in ahead) > 20
+    bearings = np.concatenate([heard.rows.bearing for heard in ahead])
+    assert np.max(np.abs(bearings)) <= np.radians(75.0) + 1e-9
+    assert sum(heard.rows.landmark.size for heard in ahead) > 20
 
 
 @pytest.mark.slow
@@ -324,12 +338,12 @@ def test_a_third_caller_is_heard_where_it_is_by_either_engine(engine, moving):
     three = chorus(world, moving)
     (beam,) = listen(three, config, [0.0088])
     for heard in beam:
-        assert heard.bearing.shape[1] == 3
-        k = np.searchsorted(world.time, heard.time)
+        rows = heard.rows
+        k = np.searchsorted(world.time, rows.time)
         place = three.callers[2].place[k] if moving else three.callers[2].place
         _, bearing = range_and_bearing(world.path[k], place[None])
-        (row,) = heard.bearing[heard.landmark == 2]
-        assert abs(wrap(row[2] - bearing[0])) < 0.02
+        (found,) = rows.bearing[(rows.landmark == 2) & (rows.caller == 2)]
+        assert abs(wrap(found - bearing[0])) < 0.02
 
 
 def test_a_third_caller_that_stands_is_heard_to_the_bit_as_one_on_a_constant_path():

@@ -75,6 +75,16 @@ def reported(store):
     return store / "report"
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The page of a study of two worlds, all there are, without its figures for paper."""
+    folder = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "_write_figure", lambda *_: None)
+        write_report((invent(2),), folder)
+    return (folder / "index.html").read_text(encoding="utf-8")
+
+
 @pytest.fixture
 def undrawn(monkeypatch):
     monkeypatch.setattr(module, "_write_figure", lambda *_: None)
@@ -145,18 +155,17 @@ def test_the_eight_verdicts_stand_on_the_page_and_in_the_summary(reported):
         assert {"statistic", "interval", "p", "n", "by_exclusion"} <= claim.keys()
 
 
-def test_a_partial_study_says_so_and_a_whole_one_does_not(reported, tmp_path, undrawn):
+def test_a_partial_study_says_so_and_a_whole_one_does_not(reported, whole):
     text = (reported / "index.html").read_text(encoding="utf-8")
     assert "6 of 115 worlds are done" in text
     assert json.loads((reported / "summary.json").read_text())["partial"] is True
-    write_report((invent(6),), tmp_path)
-    assert "worlds are done" not in (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert "worlds are done" not in whole
 
 
-def test_one_world_is_not_many(tmp_path, undrawn):
-    for worlds, words in ((1, "1 world · 50 trials"), (2, "2 worlds · 100 trials")):
-        write_report((invent(worlds),), tmp_path)
-        text = (tmp_path / "index.html").read_text(encoding="utf-8")
+def test_one_world_is_not_many(tmp_path, whole, undrawn):
+    write_report((invent(1),), tmp_path)
+    one = (tmp_path / "index.html").read_text(encoding="utf-8")
+    for text, words in ((one, "1 world · 50 trials"), (whole, "2 worlds · 100 trials")):
         assert words in text
         assert not re.search(r"\b1 worlds", text)
 
