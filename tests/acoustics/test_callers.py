@@ -126,7 +126,7 @@ def test_the_shift_of_a_tone_is_the_derivative_of_the_time_of_arrival(seed):
     lines += [(c.place.reshape(2), np.zeros(2) if c.velocity is None else c.velocity.reshape(2))
               for c in callers[1:]]  # fmt: skip
     targets = [(place, np.zeros(2)) for place in landmarks] + lines[1:]
-    step = 1e-4
+    step = 1e-5
     for caller, label, frequency in zip(heard.caller, heard.landmark, heard.frequency, strict=True):
         ends = []
         for left in (-step, step):

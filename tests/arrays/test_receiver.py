@@ -85,7 +85,7 @@ def test_block_sums_of_a_whole_world_are_those_of_its_samples(seed):
     assert np.abs(fast - dense).max() <= 1e-10 * np.abs(dense).max()
 
 
-@pytest.mark.parametrize("source", [ACTIVE, PASSIVE])
+@pytest.mark.parametrize("source", [VEHICLE, BEACON])
 @pytest.mark.parametrize("shift", [0.8, 1.0, 1.25])
 def test_a_call_that_is_heard_higher_is_over_sooner(shift, source):
     heard = one(4e-3, bearing=0.0, shift=shift, source=source)

@@ -88,7 +88,7 @@ def test_every_particle_is_a_dart_along_its_heading_and_a_dot_on_the_map():
     closeup = closeup_of(CLOUD, CLOUD[:1])
     dots, _, _ = closeup.artists
     assert np.array_equal(dots.get_xydata(), CLOUD[:, :2])
-    for outline, pose in zip(darts(closeup._swarm), CLOUD, strict=True):
+    for outline, pose in zip(darts(closeup._darts), CLOUD, strict=True):
         distance, bearing = range_and_bearing(pose, outline[:1])
         assert bearing[0] == pytest.approx(0.0, abs=1e-9)
         assert distance[0] < 0.5
@@ -98,9 +98,9 @@ def test_particles_that_are_lost_are_not_drawn_and_a_lost_vehicle_changes_nothin
     cloud = CLOUD.copy()
     cloud[::4] = np.nan
     closeup = closeup_of(cloud, CLOUD[:1])
-    assert len(darts(closeup._swarm)) == 150
+    assert len(darts(closeup._darts)) == 150
     closeup.show(CLOUD, np.full((1, 3), np.nan), None)
-    assert len(darts(closeup._swarm)) == 150
+    assert len(darts(closeup._darts)) == 150
 
 
 def test_true_pose_and_path_are_shown_where_they_are_known():

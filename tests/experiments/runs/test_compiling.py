@@ -66,8 +66,9 @@ def test_second_process_is_asked_only_to_fill_an_empty_cache_beside_a_free_core(
 
 
 def test_second_process_leaves_the_filters_compiled_that_are_not_the_first():
-    from pipistrelle.estimation.fastslam.particles import correct_swarm, summarise
+    from pipistrelle.estimation.fastslam.particles import correct_particles
+    from pipistrelle.estimation.fastslam.poses import summarise
 
     kernels.compile_others()
-    assert correct_swarm.signatures
+    assert correct_particles.signatures
     assert summarise.signatures

@@ -227,7 +227,9 @@ def line_drive(rng, steps=60):
     """A drive along the line, what it hears of the wall every third step, and where it was."""
     x = np.cumsum(np.append(rng.normal(), 0.5 + rng.normal(0.0, 0.2, steps)))
     heard = range(3, steps + 1, 3)
-    scans = [scan_at(float(k), [1], [0.0], [50.0 - x[k] + rng.normal(0.0, 0.5)]) for k in heard]
+    scans = [
+        scan_with([1], [0.0], [50.0 - x[k] + rng.normal(0.0, 0.5)], time=float(k)) for k in heard
+    ]
     line = replace(drive(1), time=np.arange(steps + 1.0), controls=np.tile([0.5, 0.0], (steps, 1)))
     return line, scans, x
 
@@ -316,11 +318,11 @@ def test_a_caller_that_moves_is_heard_but_is_no_landmark():
     post = replace(boat, name="post", frequency=20e3, place=np.array([-12.0, 3.0]))
     three = replace(world, callers=(*world.callers, boat, post))
     drive = drive_of(three, SHORT)
-    labels, places = drive.true_landmarks
+    labels, places = drive.truth.landmarks
     assert labels.tolist() == [*range(1, 52), 53]
     assert (places[-1].tolist(), drive.moving) == ([-12.0, 3.0], (52,))
     (heard,) = listen(three, SHORT, (SHORT.emitter.radius,))
-    scans = [scan_of(frame, "fused") for frame in heard]
+    scans = scans_of(heard, "fused", SHORT)
     assert any(52 in scan.landmark for scan in scans)
     trial = run_trial(Case(strategy="fused", filter="ekf"), drive, scans, SHORT)
     assert not any(52 in scan.landmark for scan in trial.scans)

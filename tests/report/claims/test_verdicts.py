@@ -81,7 +81,7 @@ def test_noise_as_large_as_the_effects_leaves_claims_open(study):
 
 
 def test_where_fused_is_active_to_the_bit_nothing_is_decided(study):
-    active = study.outcomes["fastslam", "active"].scores[POSITION]
+    active = study.trials["fastslam", "active"].scores[POSITION]
     same = changed(study, ("fastslam", "fused"), POSITION, lambda _: active)
     assert verdicts(same)[5] == "open"
 
