@@ -1,10 +1,10 @@
 import numpy as np
 
-from pipistrelle.detection.scans import COLUMNS, OWN, Scan, make_scan, rows_of
+from pipistrelle.detection.scans import COLUMNS, OWN, make_scan, rows_of
 
 
 def test_rows_of_a_scan_keep_all_their_columns_and_the_time():
-    scan = Scan(time=0.5, **{name: np.arange(4) + 10 * i for i, name in enumerate(COLUMNS)})
+    scan = make_scan(0.5, **{name: np.arange(4) + 10 * i for i, name in enumerate(COLUMNS)})
     some = rows_of(scan, np.array([True, False, True, False]))
     assert some.time == 0.5
     for i, name in enumerate(COLUMNS):

@@ -113,9 +113,9 @@ def test_without_truth_there_are_maps_alone(mission):
 
 
 def test_a_caller_that_moves_gets_its_line_in_the_legend_and_the_page_room_for_it(mission, three):
-    (beacon,) = mission.truth["callers"]
+    (beacon,) = mission.scene["callers"]
     boat = replace(beacon, name="boat", place=np.zeros((9, 2)))
-    truth = mission.truth | {"callers": (beacon, boat)}
+    truth = mission.scene | {"callers": (beacon, boat)}
     figure = draw_mission(list(mission.trials.values()), **truth)
     names = [text.get_text() for text in figure.legends[0].texts]
     assert len(names) == 9

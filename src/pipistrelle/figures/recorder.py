@@ -47,9 +47,9 @@ class MissionRecorder:
     ...
     ...     def landmarks(self):
     ...         return no_landmarks()
-    >>> none = np.empty(0)
+    >>> from pipistrelle.detection.scans import make_scan
     >>> watch = MissionRecorder()
-    >>> watch("fused", "ekf", Scan(time=0.5, landmark=none, bearing=none, range=none), Lost())
+    >>> watch("fused", "ekf", make_scan(0.5, np.empty(0), np.empty(0)), Lost())
     >>> [(key, len(frames)) for key, frames in watch.snapshots.items()]
     [(('fused', 'ekf'), 1)]
     """

@@ -444,7 +444,8 @@ def drives(draw):
         for _ in range(draw(st.integers(1, 1 if k == 0 else 3))):
             rows = draw(st.dictionaries(st.integers(-99, 99), st.tuples(ANGLE, RANGE), min_size=1))
             bearing, distance = np.array(list(rows.values())).T
-            scans.append(scan_with(list(rows), bearing, distance, time=time[k].item()))
+            unsaid = {"range_std": np.nan, "bearing_std": np.nan}  # a log says it once for all
+            scans.append(scan_with(list(rows), bearing, distance, time=time[k].item(), **unsaid))
     return replace(
         read_log(DATA / "unicycle_log"),
         time=time,

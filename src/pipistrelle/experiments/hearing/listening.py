@@ -104,7 +104,7 @@ def listen(
     >>> config = Config(scenario=ScenarioConfig(steps=8))
     >>> world = draw_scenario(config, np.random.default_rng(7))
     >>> wide, narrow = listen(world, config, (0.0025, 0.025))
-    >>> len(wide), wide[1].time
+    >>> len(wide), wide[1].rows.time
     (2, 1.0)
     """
     setup = config.scenario

@@ -211,8 +211,8 @@ def measurement_table(scans: Sequence[Scan]) -> "pl.DataFrame":
 
     Examples
     --------
-    >>> bearing, reach = np.array([0.5]), np.array([np.nan])
-    >>> scan = Scan(time=1.0, landmark=np.array([7]), bearing=bearing, range=reach)
+    >>> from pipistrelle.detection.scans import make_scan
+    >>> scan = make_scan(1.0, np.array([7]), np.array([0.5]))
     >>> measurement_table([scan]).rows()
     [(1.0, 7, 0.5, None)]
     """

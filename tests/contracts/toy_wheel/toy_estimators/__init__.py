@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from pipistrelle.config import Config
-from pipistrelle.estimation.beliefs import Gaussian, Landmarks
+from pipistrelle.estimation.beliefs import Gaussian, no_landmarks
 from pipistrelle.estimation.motion import Motion, motion_jacobians, motion_step
 
 SHIFT = np.array([1.0, 0.0, 0.0])
@@ -22,12 +22,7 @@ class Reckoned:
         return self.at
 
     def landmarks(self):
-        return Landmarks(
-            landmark=np.empty(0, dtype=np.int64),
-            mean=np.empty((0, 2)),
-            covariance=np.empty((0, 2, 2)),
-            weight=np.empty(0),
-        )
+        return no_landmarks()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
