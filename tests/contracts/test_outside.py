@@ -149,7 +149,6 @@ def test_a_study_from_the_command_line_in_this_process_or_in_others(toys, worker
     assert read_plan(Path("study/plan.toml")).filters == (RECKONING,)
 
 
-@pytest.mark.xfail(reason="the page names the paper's filters alone", strict=False)
 def test_its_study_has_a_page(toys, tmp_path):
     small = SMALL.replace("iterations = 3", "iterations = 2")
     run_study(
