@@ -13,7 +13,8 @@ import numpy as np
 from pipistrelle.acoustics.arrivals import arrivals_of_emission, through_piston
 from pipistrelle.acoustics.callers import callers_of
 from pipistrelle.arrays.layout import square_of_four
-from pipistrelle.arrays.receiver import BLOCK, blocks_to_hear, record_samples, sampling
+from pipistrelle.arrays.receiver import record_samples
+from pipistrelle.arrays.sampling import BLOCK, blocks_to_hear, sampling
 from pipistrelle.config import Config
 from pipistrelle.detection.matched import filter_samples
 from pipistrelle.detection.snapshots import detect, detector

@@ -10,14 +10,8 @@ from pipistrelle.acoustics.arrivals import Arrivals, arrivals_of_emission
 from pipistrelle.acoustics.callers import callers_of
 from pipistrelle.arithmetic.noise import stream_key
 from pipistrelle.arrays.layout import Layout, square_of_four
-from pipistrelle.arrays.receiver import (
-    BLOCK,
-    add_echo_blocks,
-    blocks_to_hear,
-    noise_blocks,
-    record_samples,
-    sampling,
-)
+from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
+from pipistrelle.arrays.sampling import BLOCK, blocks_to_hear, sampling
 from pipistrelle.config import Config, DetectionConfig
 from pipistrelle.detection.matched import filter_blocks, filter_samples
 from pipistrelle.detection.snapshots import detect, detector

@@ -5,7 +5,6 @@ stood still until the last echo; of its motion, and of that of callers that move
 shift is kept.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -22,8 +21,8 @@ from pipistrelle.acoustics.propagation import (
     spreading_loss_db,
 )
 from pipistrelle.acoustics.target import target_strength_db
-from pipistrelle.config import AirConfig, Config, InputError
-from pipistrelle.geometry import wrap
+from pipistrelle.acoustics.ways import Ways, refuse_impossible, turn_of_sound, ways_home
+from pipistrelle.config import AirConfig, Config
 
 _DEEPEST_NULL = 1e-12
 
@@ -163,8 +162,8 @@ def arrivals_of_emissions(
     >>> count, heard.landmark
     (array([3, 3]), array([1, 1, 2, 2, 1, 2]))
     """
-    ways = _ways_home(poses, velocities, landmarks, callers)
-    _refuse_impossible(poses, ways, callers)
+    ways = ways_home(poses, velocities, landmarks, callers)
+    refuse_impossible(poses, ways, callers)
     own, emission = _own_echoes(ways, callers[VEHICLE], config)
     parts, emissions = [own], [emission]
     for j in range(1, len(callers)):
@@ -257,80 +256,8 @@ def rows_of(arrivals: Arrivals, rows: Bool[np.ndarray, " a"] | slice) -> Arrival
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Ways:
-    """From all targets, landmarks and then callers, to the vehicle at each of k emissions.
-
-    Attributes
-    ----------
-    landmarks : int
-        How many of the targets are landmarks.
-    target : (1 or k, t, 2) [m]
-    offset : (k, t, 2) [m]
-        From the vehicle.
-    homeward : (k, t) [m]
-    bearing : (k, t) [rad]
-    closing : (k, t) [m/s]
-        The vehicle's speed towards each.
-    drift : (1 or k, t, 2) [m/s] or None
-        Velocities of the targets; None where all stand.
-    approach : (k, t) [m/s] or 0
-        The targets' speed towards the vehicle.
-    """
-
-    landmarks: int
-    target: Float[np.ndarray, "_ t 2"]
-    offset: Float[np.ndarray, "k t 2"]
-    homeward: Float[np.ndarray, "k t"]
-    bearing: Float[np.ndarray, "k t"]
-    closing: Float[np.ndarray, "k t"]
-    drift: Float[np.ndarray, "_ t 2"] | None
-    approach: Float[np.ndarray, "k t"] | float
-
-
-def _ways_home(
-    poses: Float[np.ndarray, "k 3"],
-    velocities: Float[np.ndarray, "k 2"],
-    landmarks: Float[np.ndarray, "n 2"],
-    callers: Sequence[Caller],
-) -> _Ways:
-    """Measure the ways from all targets to the vehicle."""
-    others = callers[VEHICLE + 1 :]
-    target = _joined(landmarks, [caller.place for caller in others])
-    offset = target - poses[:, np.newaxis, :2]
-    homeward = np.hypot(offset[..., 0], offset[..., 1])
-    east, north = velocities[:, :1], velocities[:, 1:]
-    drift, approach, still = None, 0.0, np.zeros(2)
-    with np.errstate(divide="ignore", invalid="ignore"):  # refused by name, later
-        closing = (offset[..., 0] * east + offset[..., 1] * north) / homeward
-        if any(caller.velocity is not None for caller in others):
-            velocity = [still if c.velocity is None else c.velocity for c in others]
-            drift = _joined(np.zeros_like(landmarks), velocity)
-            approach = -np.sum(drift * offset, axis=-1) / homeward
-    return _Ways(
-        landmarks=len(landmarks),
-        target=target,
-        offset=offset,
-        homeward=homeward,
-        bearing=wrap(np.arctan2(offset[..., 1], offset[..., 0]) - poses[:, 2:]),
-        closing=closing,
-        drift=drift,
-        approach=approach,
-    )
-
-
-def _joined(
-    landmarks: Float[np.ndarray, "n 2"], callers: Sequence[np.ndarray | None]
-) -> Float[np.ndarray, "_ t 2"]:
-    """Put the callers' rows, of one emission or of each, behind the landmarks'."""
-    rows = [np.reshape(np.asarray(caller), (-1, 1, 2)) for caller in callers]
-    parts = [landmarks[np.newaxis], *rows]
-    count = max(len(part) for part in parts)
-    return np.concatenate([np.broadcast_to(p, (count, *p.shape[1:])) for p in parts], axis=1)
-
-
 def _own_echoes(
-    ways: _Ways, caller: Caller, config: Config
+    ways: Ways, caller: Caller, config: Config
 ) -> tuple[Arrivals, Int[np.ndarray, " a"]]:
     """Return the echoes of the vehicle's call from all ahead, and the emission of each."""
     c = config.air.speed_of_sound
@@ -357,7 +284,7 @@ def _own_echoes(
     return heard, emission
 
 
-def _sounds_of(j: int, ways: _Ways, caller: Caller, config: Config) -> Arrivals:
+def _sounds_of(j: int, ways: Ways, caller: Caller, config: Config) -> Arrivals:
     """Return another caller's sounds at all emissions, by label: its echoes and its direct call."""
     c, (emissions, targets) = config.air.speed_of_sound, ways.homeward.shape
     itself = ways.landmarks + j - 1
@@ -379,7 +306,7 @@ def _sounds_of(j: int, ways: _Ways, caller: Caller, config: Config) -> Arrivals:
 
 def _shifted(
     itself: int,
-    ways: _Ways,
+    ways: Ways,
     incoming: Float[np.ndarray, "_ t 2"],
     outward: Float[np.ndarray, "_ t"],
     frequency: float,
@@ -409,7 +336,7 @@ def _shifted(
 
 def _loss_db(
     itself: int,
-    ways: _Ways,
+    ways: Ways,
     incoming: Float[np.ndarray, "_ t 2"],
     outward: Float[np.ndarray, "_ t"],
     caller: Caller,
@@ -418,7 +345,7 @@ def _loss_db(
     """Spreading less target strength of a caller's echoes; of its direct call, spreading alone."""
     air, target = config.air, config.target
     strength_db = target_strength_db(
-        _turn(incoming, ways.offset),
+        turn_of_sound(incoming, ways.offset),
         radius=target.radius,
         frequency=caller.frequency,
         shape=target.shape,
@@ -431,15 +358,6 @@ def _loss_db(
     return loss_db
 
 
-def _turn(
-    incoming: Float[np.ndarray, "_ t 2"], offset: Float[np.ndarray, "k t 2"]
-) -> Float[np.ndarray, "k t"]:
-    """Angle from the way in to the way on to the vehicle, which is -offset: pi is back [rad]."""
-    x, y = incoming[..., 0], incoming[..., 1]
-    u, v = -offset[..., 0], -offset[..., 1]
-    return np.arctan2(x * v - y * u, x * u + y * v)
-
-
 @lru_cache(maxsize=64)
 def _absorption(air: AirConfig, frequency: float) -> float:
     """Absorption of one tone in this air [dB/m], computed once."""
@@ -450,31 +368,4 @@ def _absorption(air: AirConfig, frequency: float) -> float:
             relative_humidity=air.relative_humidity,
             pressure_kpa=air.pressure_kpa,
         )
-    )
-
-
-def _refuse_impossible(
-    poses: Float[np.ndarray, "k 3"], ways: _Ways, callers: Sequence[Caller]
-) -> None:
-    """Refuse points that coincide and coordinates that are not finite."""
-    between = [ways.homeward]
-    for itself in range(ways.landmarks, ways.homeward.shape[1]):
-        before = ways.target[:, :itself] - ways.target[:, itself : itself + 1]
-        apart = np.hypot(before[..., 0], before[..., 1])
-        between.append(np.broadcast_to(apart, (len(poses), itself)))
-    paths = np.hstack(between)
-    nearest, farthest = paths.min(axis=1, initial=math.inf), paths.max(axis=1, initial=0.0)
-    good = (nearest > 0.0) & (farthest < math.inf) & np.isfinite(poses[:, 2])
-    if good.all():
-        return
-    bad, others = int(np.argmin(good)), [caller.name for caller in callers[VEHICLE + 1 :]]
-    names = [f"landmark {i}" for i in range(1, ways.landmarks + 1)] + others
-    ends = [f"vehicle to {name}" for name in names]
-    for itself, name in enumerate(others, start=ways.landmarks):
-        ends += [f"{name} to {other}" for other in names[:itself]]
-    found = [f"{e}: {d} m" for e, d in zip(ends, paths[bad], strict=True) if not 0.0 < d < math.inf]
-    raise InputError(
-        f"world around the pose {poses[bad]}: found {', '.join(found) or 'no finite heading'}; "
-        f"expected {', '.join(['vehicle', *others])} and landmarks at distinct, finite points; "
-        "move them apart (scenario.clearance keeps them so)"
     )

@@ -21,126 +21,16 @@ blocks makes the call.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 
 from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.acoustics.callers import MOST, VEHICLE, Caller
 from pipistrelle.arithmetic.noise import complex_noise
 from pipistrelle.arrays.layout import Layout
-from pipistrelle.config import Config, InputError
+from pipistrelle.arrays.sampling import BLOCK, Sampling, block_shape
 from pipistrelle.jit import Whole, kernel, no_alloc
-
-BLOCK = 2e-4
-"""Length of a block [s]."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sampling:
-    """How a frame is sampled; the receiver is blanked while the vehicle calls.
-
-    Attributes
-    ----------
-    rate : [Hz]
-    block : int
-        Samples per block.
-    pulse : int
-        Blocks per call; the first block heard is the one after it.
-    tones : (c) [Hz]
-        The callers' frequencies, the vehicle's first.
-    noise_std : float
-        Of one complex sample.
-    speed_of_sound : [m/s]
-    """
-
-    rate: float
-    block: int
-    pulse: int
-    tones: Float[np.ndarray, " c"]
-    noise_std: float
-    speed_of_sound: float
-
-
-def sampling(config: Config, callers: Sequence[Caller]) -> Sampling:
-    """Settle how a frame is sampled.
-
-    Parameters
-    ----------
-    config : Config
-    callers : sequence of c Caller, up to 8
-        The vehicle first. What they call at counts, not the settings' frequencies.
-
-    Returns
-    -------
-    Sampling
-
-    Raises
-    ------
-    InputError
-        When a tone is no whole bin of a block or the tone of two callers, the call no whole number
-        of blocks, or there are too many callers.
-
-    Examples
-    --------
-    >>> from pipistrelle.acoustics.callers import callers_of
-    >>> settled = sampling(Config(), callers_of(Config(), np.zeros(2)))
-    >>> settled.block, settled.pulse, settled.tones
-    (40, 14, array([35000., 30000.]))
-    """
-    rate, pulse = config.receiver.sample_rate, config.emitter.pulse
-    keys = ["emitter.frequency", *(f"{caller.name}.frequency" for caller in callers[VEHICLE + 1 :])]
-    tones = np.array([caller.frequency for caller in callers])
-    for key, value, unit, count in (
-        ("receiver.sample_rate", rate, "Hz", rate * BLOCK),
-        *((key, tone, "Hz", tone * BLOCK) for key, tone in zip(keys, tones, strict=True)),
-        ("emitter.pulse", pulse, "s", pulse / BLOCK),
-    ):
-        if round(count) < 1 or abs(count - round(count)) > 1e-6:
-            step = f"{BLOCK:g} s" if unit == "s" else f"{1 / BLOCK:g} Hz"
-            raise InputError(f"{key}: found {value:g} {unit}, expected a multiple of {step}")
-    if not 1 <= len(callers) <= MOST:
-        raise InputError(f"callers: found {len(callers)}, expected 1 to {MOST}; leave some out")
-    for j, tone in enumerate(tones):
-        for other in callers[:j]:
-            if tone == other.frequency:
-                raise InputError(
-                    f"{keys[j]}: found {tone:g} Hz, the {other.name}'s own; expected another, "
-                    "or the two calls cannot be told apart"
-                )
-    return Sampling(
-        rate=rate,
-        block=round(rate * BLOCK),
-        pulse=round(pulse / BLOCK),
-        tones=tones,
-        noise_std=10.0 ** (config.receiver.noise_level_db / 20.0),
-        speed_of_sound=config.air.speed_of_sound,
-    )
-
-
-def blocks_to_hear(arrivals: Arrivals, sampling: Sampling) -> int:
-    """Blocks from the end of the vehicle's call to the end of the last arrival.
-
-    Parameters
-    ----------
-    arrivals : Arrivals
-        Of the frame, the inaudible ones too: the window must not depend on the beam.
-    sampling : Sampling
-
-    Returns
-    -------
-    int
-    """
-    last = arrivals.delay.max(initial=0.0) / BLOCK + sampling.pulse
-    return max(math.ceil(last) + 1 - sampling.pulse, 2 * sampling.pulse)
-
-
-def block_shape(blocks: int, layout: Layout, sampling: Sampling) -> tuple[int, int, int, int]:
-    """Shape of a recording in block sums: (blocks, faces, tones, elements)."""
-    return (blocks, layout.normal.size, sampling.tones.size, layout.position.size)
 
 
 def noise_blocks(

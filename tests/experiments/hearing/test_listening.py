@@ -14,13 +14,8 @@ from pipistrelle.acoustics.arrivals import (
 from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of
 from pipistrelle.arithmetic.noise import stream_key
 from pipistrelle.arrays.layout import square_of_four
-from pipistrelle.arrays.receiver import (
-    BLOCK,
-    add_echo_blocks,
-    blocks_to_hear,
-    noise_blocks,
-    sampling,
-)
+from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
+from pipistrelle.arrays.sampling import BLOCK, blocks_to_hear, sampling
 from pipistrelle.config import (
     Config,
     EmitterConfig,

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from pipistrelle.acoustics.arrivals import Arrivals
 from pipistrelle.acoustics.callers import callers_of
 from pipistrelle.arrays.layout import square_of_four
-from pipistrelle.arrays.receiver import add_echo_blocks, sampling
+from pipistrelle.arrays.receiver import add_echo_blocks
+from pipistrelle.arrays.sampling import sampling
 from pipistrelle.config import AssociationConfig, Config
 from pipistrelle.detection.matched import filter_blocks
 from pipistrelle.detection.scans import UNLABELLED

@@ -25,16 +25,8 @@ from pipistrelle.acoustics.arrivals import (
 from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_at
 from pipistrelle.arithmetic.noise import stream_key
 from pipistrelle.arrays.layout import Layout, square_of_four
-from pipistrelle.arrays.receiver import (
-    BLOCK,
-    Sampling,
-    add_echo_blocks,
-    block_shape,
-    blocks_to_hear,
-    noise_blocks,
-    record_samples,
-    sampling,
-)
+from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
+from pipistrelle.arrays.sampling import BLOCK, Sampling, block_shape, blocks_to_hear, sampling
 from pipistrelle.config import Config
 from pipistrelle.detection.matched import filter_blocks, filter_samples
 from pipistrelle.detection.merging import Heard, average_faces, same_echo, unlabelled
