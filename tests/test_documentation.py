@@ -151,7 +151,7 @@ def heard_and_drive(steps=120):
 
 
 def test_the_guides_association_finds_again_what_the_oracle_knew(guide):
-    from pipistrelle.detection.merging import unlabelled
+    from pipistrelle.detection.faces import unlabelled
     from pipistrelle.experiments.cases import Case
     from pipistrelle.experiments.runs.trial import run_trial, scans_of
 

@@ -17,7 +17,7 @@ from statistics import fmean
 import numpy as np
 
 from pipistrelle.config import Config, FastSlamConfig, Strategy
-from pipistrelle.detection.merging import Heard
+from pipistrelle.detection.faces import Heard
 from pipistrelle.detection.scans import Scan
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.listening import listen

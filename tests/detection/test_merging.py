@@ -3,7 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipistrelle.detection.merging import Heard, average_faces, same_echo, scan_of, unlabelled
+from pipistrelle.detection.faces import Heard, average_faces, same_echo, unlabelled
+from pipistrelle.detection.merging import scan_of
 from pipistrelle.detection.scans import COLUMNS, OWN, UNLABELLED
 from pipistrelle.detection.snapshots import Detections
 from pipistrelle.geometry import circular_mean, wrap
@@ -164,7 +165,9 @@ def heard_rows(*rows):
         if not np.isnan(bearing)
     ]
     landmark, caller, bearing, distance = zip(*parts, strict=True)
-    scan = scan_with(landmark, bearing, distance, time=2.0, caller=np.array(caller))
+    scan = scan_with(
+        landmark, bearing, distance, time=2.0, caller=np.array(caller), bearing_std=NAN
+    )
     return Heard(rows=scan, clutter=0)
 
 
@@ -241,7 +244,9 @@ def test_without_labels_rows_are_what_they_were_and_nobodys():
 
 
 def test_three_callers_of_one_landmark_are_averaged_as_directions():
-    rows = scan_with([4, 4, 4], [3.1, -3.1, -3.0], [5.0, NAN, NAN], caller=np.arange(3))
+    rows = scan_with(
+        [4, 4, 4], [3.1, -3.1, -3.0], [5.0, NAN, NAN], caller=np.arange(3), bearing_std=NAN
+    )
     (bearing,) = scan_of(Heard(rows=rows, clutter=0), "fused").bearing
     assert bearing == pytest.approx(wrap(3.1 + np.mean(wrap(rows.bearing - 3.1))), abs=1e-12)
     (bearing,) = scan_of(Heard(rows=rows, clutter=0), "passive").bearing

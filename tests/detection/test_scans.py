@@ -1,5 +1,7 @@
 import numpy as np
+import pytest
 
+from pipistrelle.config import InputError
 from pipistrelle.detection.scans import COLUMNS, OWN, make_scan, rows_of
 
 
@@ -10,6 +12,16 @@ def test_rows_of_a_scan_keep_all_their_columns_and_the_time():
     for i, name in enumerate(COLUMNS):
         assert getattr(some, name).tolist() == [10 * i, 10 * i + 2]
     assert rows_of(scan, np.zeros(4, dtype=bool)).landmark.size == 0
+
+
+def test_a_column_that_no_scan_has_and_columns_of_several_lengths_are_refused():
+    label, bearing = np.array([3, 4]), np.array([0.1, 0.2])
+    with pytest.raises(InputError, match="scan: no such column bearing_sd; expected one of"):
+        make_scan(0.5, label, bearing, bearing_sd=0.1)
+    for wrong in ({"bearing": bearing[:1]}, {"bearing": bearing, "range": np.ones(3)}):
+        with pytest.raises(InputError, match=r"expected \(2,\), that of landmark"):
+            make_scan(0.5, label, **wrong)
+    assert make_scan(0.5, [3, 4], [0, 1]).bearing.dtype == np.float64
 
 
 def test_what_is_not_said_of_a_scan_says_nothing():

@@ -3,6 +3,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 
+from pipistrelle.config import InputError
 from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.scans import UNLABELLED, make_scan
 from pipistrelle.estimation.association import told
@@ -38,15 +39,40 @@ def test_the_mean_of_directions_is_taken_across_the_cut_behind():
     assert bearing == pytest.approx(-np.pi + 0.1, abs=1e-12)
 
 
-def test_merged_rows_are_as_sure_as_the_mean_of_independent_ones():
+def test_rows_that_say_how_sure_they_are_merge_as_independent_estimates_do():
     rng, stds = np.random.default_rng(5), np.array([0.01, 0.03, 0.02])
     drawn = rng.normal(0.0, stds, (4000, 3))
     scans = [make_scan(0.0, np.full(3, 4), row, bearing_std=stds) for row in drawn]
     merged = [labelled(scan, scan.landmark) for scan in scans]
     error = np.array([scan.bearing[0] for scan in merged])
     claimed = merged[0].bearing_std[0]
-    assert claimed == pytest.approx(np.sqrt(np.sum(stds**2)) / 3, rel=1e-12)
+    assert claimed == pytest.approx(np.sum(stds**-2.0) ** -0.5, rel=1e-12)
     assert np.std(error) == pytest.approx(claimed, rel=4.9 / np.sqrt(2 * error.size))
+
+
+def test_one_row_that_says_nothing_of_its_noise_makes_the_mean_plain_and_unsaid():
+    scan = make_scan(0.0, np.full(2, 4), np.array([0.1, 0.3]), bearing_std=np.array([0.01, NAN]))
+    merged = labelled(scan, scan.landmark)
+    assert merged.bearing[0] == pytest.approx(0.2, abs=1e-12)
+    assert np.isnan(merged.bearing_std[0])
+
+
+@pytest.mark.parametrize(
+    "label", [[1], [1, 2, 3, 4], [1.0, 2.0, 3.0], [1, NAN, 2], [1, 2, -2], [[1], [2], [3]], "abc"]
+)
+def test_what_cannot_be_labels_is_refused_before_a_kernel_sees_it(label):
+    scan = scan_of((UNLABELLED, 5.0, 0.3), (UNLABELLED, NAN, 1.0), (UNLABELLED, NAN, 2.0))
+    with pytest.raises(
+        InputError, match=r"association at 0\.0 s: found labels .* expected 3 whole"
+    ):
+        labelled(scan, label)
+    assert labelled(scan, [4, UNLABELLED, 4]).landmark.tolist() == [4]
+
+
+def test_the_level_of_merged_rows_is_the_highest_that_is_known():
+    for level in ([20.0, NAN], [NAN, 20.0], [20.0, 3.0], [3.0, 20.0]):
+        scan = scan_with([4, 4], [0.1, 0.1], level_db=np.array(level))
+        assert labelled(scan, scan.landmark).level_db.tolist() == [20.0]
 
 
 def test_a_scan_of_nothing_stays_one():

@@ -5,6 +5,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from pipistrelle.config import InputError
+
 UNLABELLED = -1
 """Label of a measurement of which nobody says whose it is."""
 OWN = 0
@@ -50,6 +52,48 @@ class Scan:
 
 COLUMNS = tuple(field.name for field in fields(Scan) if field.name != "time")
 """Names of a scan's arrays."""
+NUMBERS = len(COLUMNS) - 2
+BEARING, RANGE, DETOUR, BEARING_STD, RANGE_STD, DETOUR_STD, LEVEL = range(NUMBERS)
+"""Where the kernels have each, in the order of the fields: label and caller stand apart."""
+
+
+def scan_from(
+    time: float,
+    landmark: Int[np.ndarray, " m"],
+    caller: Int[np.ndarray, " m"],
+    numbers: Float[np.ndarray, "7 m"],
+) -> Scan:
+    """Make a scan of what a kernel returns: labels, callers and the numbers, a row of each.
+
+    Parameters
+    ----------
+    time : [s]
+    landmark, caller : (m)
+    numbers : (7, m)
+        The other columns, in their order.
+
+    Returns
+    -------
+    Scan
+
+    Examples
+    --------
+    >>> scan_from(0.5, np.array([3]), np.array([0]), np.arange(7.0)[:, np.newaxis]).range
+    array([1.])
+    """
+    bearing, distance, detour, bearing_std, range_std, detour_std, level_db = numbers
+    return Scan(
+        time=time,
+        landmark=landmark,
+        caller=caller,
+        bearing=bearing,
+        range=distance,
+        detour=detour,
+        bearing_std=bearing_std,
+        range_std=range_std,
+        detour_std=detour_std,
+        level_db=level_db,
+    )
 
 
 def make_scan(
@@ -72,19 +116,33 @@ def make_scan(
     -------
     Scan
 
+    Raises
+    ------
+    InputError
+        For a column that no scan has, or columns of several lengths.
+
     Examples
     --------
     >>> scan = make_scan(0.5, np.array([3, 8]), np.array([0.2, 1.0]), bearing_std=0.15)
     >>> scan.range, scan.bearing_std
     (array([nan, nan]), array([0.15, 0.15]))
     """
-    rows, given = len(landmark), {"caller": OWN} | columns
+    given = {"landmark": landmark, "bearing": bearing, "caller": OWN} | columns
+    if unknown := sorted(given.keys() - set(COLUMNS)):
+        raise InputError(f"scan: no such column {unknown[0]}; expected one of {', '.join(COLUMNS)}")
+    shape = np.shape(landmark)
+    if lengths := {n: np.shape(v) for n, v in given.items() if np.shape(v) not in ((), shape)}:
+        raise InputError(
+            f"scan: found columns of the shapes {lengths}, expected {shape}, that of landmark"
+        )
     filled = {
-        name: np.full(rows, given.get(name, np.nan), dtype=int if name == "caller" else float)
+        name: np.array(
+            np.broadcast_to(given.get(name, np.nan), shape),
+            dtype=np.int64 if name in ("landmark", "caller") else np.float64,
+        )
         for name in COLUMNS
-        if name not in ("landmark", "bearing")
     }
-    return Scan(time=time, landmark=landmark, bearing=bearing, **filled)
+    return Scan(time=time, **filled)
 
 
 def rows_of(scan: Scan, rows: Bool[np.ndarray, " m"] | Int[np.ndarray, " k"]) -> Scan:

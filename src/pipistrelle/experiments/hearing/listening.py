@@ -28,8 +28,8 @@ from pipistrelle.arrays.layout import Layout, square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
 from pipistrelle.arrays.sampling import BLOCK, Sampling, block_shape, blocks_to_hear, sampling
 from pipistrelle.config import Config
+from pipistrelle.detection.faces import Heard, average_faces, same_echo, unlabelled
 from pipistrelle.detection.matched import filter_blocks, filter_samples
-from pipistrelle.detection.merging import Heard, average_faces, same_echo, unlabelled
 from pipistrelle.detection.snapshots import Detections, Detector, detect, detector
 from pipistrelle.experiments.hearing.oracle import faintest_level_db, label_detections
 from pipistrelle.experiments.hearing.scenario import Scenario

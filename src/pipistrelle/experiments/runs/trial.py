@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float
 
 from pipistrelle.arithmetic.noise import stream_key
 from pipistrelle.config import Config, InputError, Strategy
-from pipistrelle.detection.merging import Heard, labelled, scan_of
+from pipistrelle.detection.faces import Heard
+from pipistrelle.detection.merging import labelled, scan_of
 from pipistrelle.detection.noise import noise_of
 from pipistrelle.detection.scans import Scan, rows_of
 from pipistrelle.estimation.association import Associate, told

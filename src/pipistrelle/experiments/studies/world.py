@@ -18,7 +18,8 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config, Strategy
-from pipistrelle.detection.merging import Heard, scan_of
+from pipistrelle.detection.faces import Heard
+from pipistrelle.detection.merging import scan_of
 from pipistrelle.detection.noise import Noise, noise_of
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Track, Trajectory

@@ -1,0 +1,257 @@
+"""Faces: what the arrays on the vehicle's faces heard of one echo becomes one row.
+
+A face may hear an echo that its neighbour hears too. Detections are averaged per label and caller,
+whether the label is a landmark's or, where nobody tells whose an echo is, just a number for the
+echo (`same_echo`).
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipistrelle.detection.scans import (
+    BEARING,
+    LEVEL,
+    NUMBERS,
+    OWN,
+    RANGE,
+    UNLABELLED,
+    Scan,
+    scan_from,
+)
+from pipistrelle.detection.snapshots import Detections
+from pipistrelle.geometry import wrap_angle
+from pipistrelle.jit import Whole, kernel
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Heard:
+    """One frame, averaged over the faces.
+
+    Attributes
+    ----------
+    rows : Scan
+        A row per label and caller, both rising; with UNLABELLED for a label, a row per echo.
+    clutter : int or None
+        Detections without a label; None where nobody tells labels.
+    """
+
+    rows: Scan
+    clutter: int | None
+
+
+def average_faces(
+    time: float,
+    detections: Detections,
+    label: Int[np.ndarray, " d"],
+    *,
+    averaging: str,
+    speed_of_sound: float,
+) -> Heard:
+    r"""Average what the faces say of each label, per caller: the strongest detection of each face.
+
+    Bearings are averaged as directions, ``plain`` or ``weighted`` by the inverse variance at the
+    array's angle, :math:`\cos^2\theta`. The range, of the vehicle's own call alone, is c/2 times
+    the mean delay.
+
+    Parameters
+    ----------
+    time : [s]
+    detections : Detections
+        (d) rows.
+    label : (d)
+        Of each detection, or UNLABELLED.
+    averaging : "plain" or "weighted"
+    speed_of_sound : [m/s]
+
+    Returns
+    -------
+    Heard
+
+    Notes
+    -----
+    Bradley & Abaid, Sec. II-D.
+
+    Examples
+    --------
+    >>> detections = Detections(
+    ...     face=np.array([0, 1]), caller=np.array([0, 0]), angle=np.radians([40.0, -50.0]),
+    ...     bearing=np.radians([40.0, 42.0]), delay=np.array([0.02, 0.02]), power=np.ones(2))
+    >>> rows = average_faces(
+    ...     0.5, detections, np.array([3, 3]), averaging="plain", speed_of_sound=343.0).rows
+    >>> np.degrees(rows.bearing).round(6), rows.range.round(6)
+    (array([41.]), array([3.43]))
+    """
+    labels, clutter = _distinct(label)
+    found = _found(detections)
+    rows = _average(labels, label, found, averaging == "weighted", 0.5 * speed_of_sound)
+    return Heard(rows=scan_from(time, *rows), clutter=int(clutter))
+
+
+def same_echo(
+    detections: Detections, *, delay_gate: float, bearing_gate: float
+) -> Int[np.ndarray, " d"]:
+    """Number the echoes: detections of one call by different faces, at one time from one direction.
+
+    The strongest detection begins, and takes of every other face the strongest that agrees with it
+    and is not taken.
+
+    Parameters
+    ----------
+    detections : Detections
+        (d) rows.
+    delay_gate : [s]
+    bearing_gate : [rad]
+        Largest differences within an echo.
+
+    Returns
+    -------
+    (d)
+        Numbers from 0, the strongest echo first.
+
+    Examples
+    --------
+    >>> detections = Detections(
+    ...     face=np.array([0, 1, 1]), caller=np.zeros(3, int), angle=np.radians([40.0, -50.0, 9.0]),
+    ...     bearing=np.radians([40.0, 41.0, 99.0]), delay=np.full(3, 0.02), power=np.ones(3))
+    >>> same_echo(detections, delay_gate=7e-4, bearing_gate=0.1)
+    array([0, 0, 1])
+    """
+    order = np.argsort(-detections.power, kind="stable")
+    found = _found(detections)
+    return _number(order, found, delay_gate, bearing_gate)
+
+
+def unlabelled(heard: Heard) -> Heard:
+    """Forget the labels.
+
+    Parameters
+    ----------
+    heard : Heard
+
+    Returns
+    -------
+    Heard
+
+    Examples
+    --------
+    >>> from pipistrelle.detection.scans import make_scan
+    >>> heard = Heard(rows=make_scan(0.5, np.array([4]), np.array([0.2])), clutter=0)
+    >>> unlabelled(heard).rows.landmark
+    array([-1])
+    """
+    nobody = np.full_like(heard.rows.landmark, UNLABELLED)
+    return Heard(rows=replace(heard.rows, landmark=nobody), clutter=None)
+
+
+class _Found(NamedTuple):
+    """Detections, as the kernels take them."""
+
+    face: Int[np.ndarray, " d"]
+    caller: Int[np.ndarray, " d"]
+    angle: Float[np.ndarray, " d"]
+    bearing: Float[np.ndarray, " d"]
+    delay: Float[np.ndarray, " d"]
+    power: Float[np.ndarray, " d"]
+
+
+def _found(detections: Detections) -> _Found:
+    """Return detections as the kernels take them."""
+    return _Found(
+        detections.face, detections.caller, detections.angle, detections.bearing, detections.delay,
+        detections.power,
+    )  # fmt: skip
+
+
+@kernel
+def _distinct(label: Int[np.ndarray, " d"]) -> tuple[Int[np.ndarray, " n"], Whole]:
+    """Labels that occur, rising, and how often none was given."""
+    labels, count, clutter = np.empty_like(label), 0, 0
+    for d in range(label.size):
+        if label[d] == UNLABELLED:
+            clutter += 1
+            continue
+        place = count
+        while place > 0 and labels[place - 1] > label[d]:
+            place -= 1
+        if place > 0 and labels[place - 1] == label[d]:
+            continue
+        for i in range(count, place, -1):
+            labels[i] = labels[i - 1]
+        labels[place] = label[d]
+        count += 1
+    return labels[:count].copy(), clutter
+
+
+@kernel
+def _average(
+    labels: Int[np.ndarray, " n"],
+    label: Int[np.ndarray, " d"],
+    found: _Found,
+    weighted: bool,
+    metres: float,
+) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, "7 m"]]:
+    """Mean direction and delay of each label and caller over its strongest rows per face.
+
+    Returns label, caller and numbers of each pair that occurs. A second of the vehicle's own call
+    is so many metres of range.
+    """
+    faces = callers = 0
+    for d in range(label.size):
+        faces, callers = max(faces, found.face[d] + 1), max(callers, found.caller[d] + 1)
+    landmark = np.empty(labels.size * callers, dtype=np.int64)
+    caller, row = np.empty(landmark.size, dtype=np.int64), 0
+    numbers = np.full((NUMBERS, landmark.size), np.nan)
+    strongest = np.empty(faces, dtype=np.int64)
+    for i in range(labels.size):
+        for p in range(callers):
+            strongest[:] = -1
+            for d in range(label.size):
+                if label[d] == labels[i] and found.caller[d] == p:
+                    best = strongest[found.face[d]]
+                    if best < 0 or found.power[d] > found.power[best]:
+                        strongest[found.face[d]] = d
+            total = east = north = late = loudest = 0.0
+            for f in range(faces):
+                d = strongest[f]
+                if d >= 0:
+                    weight = math.cos(found.angle[d]) ** 2 if weighted else 1.0
+                    total += weight
+                    east += weight * math.cos(found.bearing[d])
+                    north += weight * math.sin(found.bearing[d])
+                    late += weight * found.delay[d]
+                    loudest = max(loudest, found.power[d])
+            if total > 0.0:
+                landmark[row], caller[row] = labels[i], p
+                numbers[BEARING, row] = wrap_angle(math.atan2(north, east))
+                if p == OWN:
+                    numbers[RANGE, row] = metres * (late / total)
+                numbers[LEVEL, row] = 10.0 * math.log10(loudest)
+                row += 1
+    return landmark[:row], caller[:row], numbers[:, :row].copy()
+
+
+@kernel
+def _number(
+    order: Int[np.ndarray, " d"], found: _Found, delay_gate: float, bearing_gate: float
+) -> Int[np.ndarray, " d"]:
+    """Number the echoes, greedily, in an order of the detections."""
+    number, count = np.full(order.size, UNLABELLED, dtype=np.int64), 0
+    for first in order:
+        if number[first] != UNLABELLED:
+            continue
+        for d in order:
+            if number[d] != UNLABELLED or found.caller[d] != found.caller[first]:
+                continue
+            late = abs(found.delay[d] - found.delay[first])
+            off = abs(wrap_angle(found.bearing[d] - found.bearing[first]))
+            taken = False
+            for other in order:
+                taken |= number[other] == count and found.face[other] == found.face[d]
+            if late <= delay_gate and off <= bearing_gate and not taken:
+                number[d] = count
+        count += 1
+    return number
