@@ -125,7 +125,8 @@ def test_the_guides_filter_drives_a_mission(guide):
     from pipistrelle.config import Config, ScenarioConfig
     from pipistrelle.estimation.catalogue import entry
     from pipistrelle.experiments.hearing.scenario import bicycle, draw_scenario
-    from pipistrelle.experiments.runs.trial import drive_of, run_filter
+    from pipistrelle.experiments.runs.filtering import run_filter
+    from pipistrelle.experiments.runs.trial import drive_of
 
     config = Config(scenario=ScenarioConfig(steps=40, landmarks=3))
     world = draw_scenario(config, np.random.default_rng(7))
@@ -152,17 +153,21 @@ def heard_and_drive(steps=120):
 
 def test_the_guides_association_finds_again_what_the_oracle_knew(guide):
     from pipistrelle.detection.faces import unlabelled
+    from pipistrelle.detection.merging import scan_of
     from pipistrelle.experiments.cases import Case
     from pipistrelle.experiments.runs.trial import run_trial, scans_of
 
     config, heard, drive = heard_and_drive()
     case = Case(strategy="active", filter="ekf")
     told = run_trial(case, drive, scans_of(heard, "active", config), config).track
-    hidden = scans_of([unlabelled(frame) for frame in heard], "active", config)
-    found = run_trial(case, drive, hidden, config, associate=guide["nearest"]).track
+    hidden = [scan_of(unlabelled(frame), "active") for frame in heard]
+    trial = run_trial(case, drive, hidden, config, associate=guide["nearest"])
+    found = trial.track
     np.testing.assert_array_equal(found.pose.mean, told.pose.mean)
     np.testing.assert_array_equal(found.landmarks.mean, told.landmarks.mean)
     assert found.landmarks.landmark.tolist() == list(range(1, 1 + len(told.landmarks.landmark)))
+    assert (trial.scores.map_rmse_m, trial.scores.map_rmse_aligned_m) == (None, None)
+    assert all((scan.landmark > 0).all() for scan in trial.scans), "as the filter had them"
     anyone = run_trial(
         case, drive, hidden, config, associate=lambda _, scan: np.ones(scan.landmark.size, int)
     )

@@ -16,7 +16,7 @@ from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.fastslam.filter import FastSlam
 from pipistrelle.estimation.motion import Motion, motion_jacobians, motion_step
 from pipistrelle.experiments.drives import Drive
-from pipistrelle.experiments.runs.trial import run_filter
+from pipistrelle.experiments.runs.filtering import run_filter
 from reference.missions import (
     BICYCLE,
     CIRCLE,

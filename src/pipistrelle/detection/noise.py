@@ -1,12 +1,18 @@
-"""Measurement noise: how surely the rows of a scan were measured. Nowhere else is R stated."""
+"""Measurement noise: how surely the rows of a scan were measured. Nowhere else is R stated.
 
+It is stated of the rows that a filter is handed, after those of one landmark were merged.
+"""
+
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 
 from pipistrelle.config import FilterConfig
 from pipistrelle.detection.scans import Scan
+from pipistrelle.jit import kernel
 
 Noise = Callable[[Scan], Scan]
 """Gives rows the standard deviations that they do not have."""
@@ -33,12 +39,35 @@ class ConstantNoise:
 
     def __call__(self, scan: Scan) -> Scan:
         """Give rows the standard deviations that they do not have."""
-        bearing_std, range_std = scan.bearing_std, scan.range_std
         return replace(
             scan,
-            bearing_std=np.where(np.isnan(bearing_std), self.bearing_std, bearing_std),
-            range_std=np.where(np.isnan(range_std), self.range_std, range_std),
+            bearing_std=_filled(scan.bearing_std, self.bearing_std),
+            range_std=_filled(scan.range_std, self.range_std),
         )
+
+
+@kernel
+def _filled(std: Float[np.ndarray, " m"], constant: float) -> Float[np.ndarray, " m"]:
+    """Copy a column with a constant where it says nothing."""
+    filled = np.empty(std.size)
+    for m in range(std.size):
+        filled[m] = constant if math.isnan(std[m]) else std[m]
+    return filled
+
+
+def as_said(scan: Scan) -> Scan:
+    """Leave it to the rows themselves.
+
+    Parameters
+    ----------
+    scan : Scan
+
+    Returns
+    -------
+    Scan
+        The same.
+    """
+    return scan
 
 
 def noise_of(settings: FilterConfig) -> Noise:

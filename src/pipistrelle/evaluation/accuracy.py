@@ -116,6 +116,43 @@ def scored_landmarks(
     return estimate.mean[mapped], true_position[true]
 
 
+def landmark_error(
+    estimate: MapEstimate,
+    true_landmark: Int[np.ndarray, " n"],
+    true_position: Float[np.ndarray, "n 2"],
+) -> Float[np.ndarray, " h"]:
+    """Distance of each estimated landmark from the true one of its label.
+
+    Parameters
+    ----------
+    estimate : MapEstimate of h landmarks
+    true_landmark : (n)
+        Labels, each once.
+    true_position : (n, 2) [m]
+
+    Returns
+    -------
+    (h) [m]
+        NaN where no true landmark has the label.
+
+    Examples
+    --------
+    >>> estimate = MapEstimate(
+    ...     landmark=np.array([7, 9]),
+    ...     mean=np.array([[4.0, 5.0], [6.0, 0.0]]),
+    ...     covariance=np.tile(np.eye(2), (2, 1, 1)),
+    ...     full=np.array([True, True]),
+    ... )
+    >>> landmark_error(estimate, np.array([3, 7]), np.array([[5.0, 5.0], [1.0, 1.0]]))
+    array([ 5., nan])
+    """
+    row, unknown = {label: i for i, label in enumerate(true_landmark.tolist())}, -1
+    index = np.array([row.get(k, unknown) for k in estimate.landmark.tolist()], dtype=np.intp)
+    true = np.full_like(estimate.mean, np.nan)
+    true[index != unknown] = true_position[index[index != unknown]]
+    return position_error(estimate.mean, true)
+
+
 def pose_error(
     path: Float[np.ndarray, "k 3"], true_path: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "k 3"]:

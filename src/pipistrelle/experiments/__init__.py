@@ -16,6 +16,7 @@ __getattr__, __dir__, __all__ = attach(
         "hearing.scenario": ["draw_scenario"],
         "results.writing": ["write_results"],
         "runs.replay": ["load"],
-        "runs.trial": ["run_filter", "run_mission", "run_trial"],
+        "runs.filtering": ["run_filter"],
+        "runs.trial": ["run_mission", "run_trial"],
     },
 )

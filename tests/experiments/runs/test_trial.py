@@ -5,6 +5,8 @@ import pytest
 
 from pipistrelle.acoustics.callers import Caller
 from pipistrelle.config import STRATEGIES, Config, InputError, ReceiverConfig, ScenarioConfig
+from pipistrelle.detection.faces import unlabelled
+from pipistrelle.detection.merging import scan_of
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.motion import Motion
@@ -13,13 +15,8 @@ from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import bicycle, draw_scenario
 from pipistrelle.experiments.results.scores import score_path
-from pipistrelle.experiments.runs.trial import (
-    drive_of,
-    run_filter,
-    run_mission,
-    run_trial,
-    scans_of,
-)
+from pipistrelle.experiments.runs.filtering import run_filter
+from pipistrelle.experiments.runs.trial import drive_of, run_mission, run_trial, scans_of
 from reference.missions import map_with, scan_with
 
 SHORT = Config(scenario=ScenarioConfig(steps=80))
@@ -355,3 +352,34 @@ def test_the_dense_engine_finds_about_the_same_landmarks():
         first, second = (set().union(*(s.landmark for s in t.scans)) for t in (one, two))
         assert len(first & second) >= 0.8 * max(len(first), len(second))
         assert max(len(first), len(second)) >= 5
+
+
+def test_an_association_that_knows_what_the_oracle_knows_maps_as_the_oracle_does():
+    world = draw_scenario(SHORT, RNG(3))
+    (heard,) = listen(world, SHORT, (SHORT.emitter.radius,))
+    case, drive = Case(strategy="fused", filter="ekf"), drive_of(world, SHORT)
+    told = run_trial(case, drive, scans_of(heard, "fused", SHORT), SHORT)
+    labels = {frame.rows.time: frame.rows.landmark for frame in heard}
+    hidden = [scan_of(unlabelled(frame), "fused") for frame in heard]
+    found = run_trial(case, drive, hidden, SHORT, associate=lambda _, scan: labels[scan.time])
+    assert contents(found.track) == contents(told.track)
+    assert contents(found.scans) == contents(told.scans)
+    assert found.scores == replace(told.scores, map_rmse_m=None, map_rmse_aligned_m=None)
+
+
+def test_scans_out_of_order_are_refused():
+    late, early = drive(5).time[[4, 2]].tolist()
+    scans = [scan_with([3], [0.1], time=time) for time in (late, early)]
+    with pytest.raises(InputError, match=f"scan at {early} s: follows one at {late} s"):
+        run_filter(Ledger(), drive(5), scans, RNG(7))
+
+
+@pytest.mark.parametrize("left", [slice(-1, None), -1])
+def test_predictions_that_are_not_one_pose_for_each_step_are_refused(left):
+    class Short(Ledger):
+        def predict(self, belief, controls, dt, rng):
+            belief, poses = super().predict(belief, controls, dt, rng)
+            return belief, Gaussian(mean=poses.mean[left], covariance=poses.covariance[left])
+
+    with pytest.raises(InputError, match=r"predict: found arrays of .* one after each step"):
+        run_filter(Short(), drive(5), [scan_with([3], [0.1], time=0.5)], RNG(7))

@@ -5,26 +5,20 @@ Read this file first: each call is a box of the paper's workflow.
 
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from pipistrelle.arithmetic.noise import stream_key
-from pipistrelle.config import Config, InputError, Strategy
+from pipistrelle.config import Config, Strategy
 from pipistrelle.detection.faces import Heard
-from pipistrelle.detection.merging import labelled, scan_of
+from pipistrelle.detection.merging import scan_of
 from pipistrelle.detection.noise import noise_of
 from pipistrelle.detection.scans import Scan, rows_of
 from pipistrelle.estimation.association import Associate, told
 from pipistrelle.estimation.beliefs import (
-    B,
     Belief,
-    Estimator,
     Gaussian,
-    ParticleCloud,
-    Track,
-    Trajectory,
 )
 from pipistrelle.estimation.catalogue import CATALOGUE, entry, short_name
 from pipistrelle.experiments.cases import Case
@@ -39,6 +33,7 @@ from pipistrelle.experiments.hearing.scenario import (
 )
 from pipistrelle.experiments.machine import check_length, check_memory
 from pipistrelle.experiments.results.scores import TrialResult, score, score_path
+from pipistrelle.experiments.runs.filtering import run_filter
 from pipistrelle.experiments.runs.outside import check_filters, failed_trial
 
 Watch = Callable[[str, str, Scan, Belief], None]
@@ -211,10 +206,11 @@ def run_trial(
     case : Case
     drive : Drive
     scans : sequence of Scan
-        As `scans_of` gives them; what they hold of callers that move is left out.
+        As `scans_of` gives them; what is labelled as a caller that moves is left out.
     config : Config
     associate : Associate
-        Says who is who, between prediction and correction.
+        Says who is who, between prediction and correction. Of rows that it merges, the settings say
+        how surely they were measured. Its labels are not the truth's, so the map is not scored.
     progress, watch : callable, optional
 
     Returns
@@ -229,7 +225,10 @@ def run_trial(
         if progress:
             progress(f"{strategy} {short_name(name)}", done, total)
 
+    had: list[Scan] = []
+
     def look(scan: Scan, belief: Belief) -> None:
+        had.append(scan)
         if watch:
             watch(strategy, name, scan, belief)
 
@@ -241,145 +240,21 @@ def run_trial(
         scans,
         _generator(config.seed, case.iteration, name),
         associate=associate,
+        noise=noise_of(config.filter),
         progress=report,
         watch=look,
     )
     wall_s = clock.perf_counter() - began
+    truth = drive.truth if associate is told else replace(drive.truth, landmarks=None)
     return TrialResult(
         strategy=strategy,
         filter=name,
         track=track,
-        scans=tuple(scans),
-        scores=score(track, drive.truth, scans, known.nees_limit),
+        scans=tuple(had),
+        scores=score(track, truth, had, known.nees_limit),
         wall_s=wall_s,
         online=None if track.online is None else score_path(track.online, drive.truth.path),
     )
-
-
-def run_filter(
-    estimator: Estimator[B],
-    drive: Drive,
-    scans: Sequence[Scan],
-    rng: np.random.Generator,
-    *,
-    associate: Associate = told,
-    progress: Callable[[int, int], None] | None = None,
-    watch: Callable[[Scan, B], None] | None = None,
-) -> Track:
-    """Predict to each scan, say who is who in it, update with it, and keep the pose of every step.
-
-    Where the belief revises its path (`Trajectory`), the track is the path as it is believed at
-    the end, and the poses that were kept are beside it.
-
-    Parameters
-    ----------
-    estimator : Estimator
-    drive : Drive
-    scans : sequence of Scan
-        In order; the time of each is one of the drive's.
-    rng : Generator
-    associate : Associate
-    progress : callable, optional
-        Given the scans done and their number.
-    watch : callable, optional
-        Given each scan and the belief after it.
-
-    Returns
-    -------
-    Track
-
-    Raises
-    ------
-    InputError
-        For a bearing or range that is no number, a time that is not one of the drive's, or a
-        revised path that is not one of the drive's steps.
-    """
-    time, controls = drive.time, drive.controls
-    steps = _steps_of(scans, time)
-    mean, covariance = np.empty((time.size, 3)), np.empty((time.size, 3, 3))
-    mean[0], covariance[0] = drive.start.mean, drive.start.covariance
-    dt, belief, done = np.diff(time), estimator.init(drive.start), 0
-    for number, (k, scan) in enumerate(zip(steps, scans, strict=True), start=1):
-        if k > done:
-            belief, poses = estimator.predict(belief, controls[done:k], dt[done:k], rng)
-            mean[done + 1 : k + 1], covariance[done + 1 : k + 1] = poses.mean, poses.covariance
-            done = k
-        scan = labelled(scan, associate(belief, scan))
-        belief = estimator.update(belief, scan, rng)
-        pose = belief.pose()
-        mean[k], covariance[k] = pose.mean, pose.covariance
-        if watch:
-            watch(scan, belief)
-        if progress:
-            progress(number, len(scans))
-    if done < len(controls):
-        belief, poses = estimator.predict(belief, controls[done:], dt[done:], rng)
-        mean[done + 1 :], covariance[done + 1 :] = poses.mean, poses.covariance
-    online = Gaussian(mean=mean, covariance=covariance)
-    cloud = belief if isinstance(belief, ParticleCloud) else None
-    revised = _whole(belief.path(), time.size) if isinstance(belief, Trajectory) else None
-    return Track(
-        time=time,
-        pose=revised or online,
-        landmarks=belief.landmarks(),
-        gated=belief.gated,
-        cloud=cloud.cloud() if cloud else None,
-        full=cloud.full if cloud else None,
-        online=online if revised else None,
-    )
-
-
-def _whole(path: Gaussian, poses: int) -> Gaussian:
-    """Refuse a revised path that lacks poses, or their covariances."""
-    found = path.mean.shape, path.covariance.shape
-    expected = (poses, 3), (poses, 3, 3)
-    if found != expected:
-        raise InputError(
-            f"path: found arrays of {found[0]} and {found[1]}, expected {expected[0]} and "
-            f"{expected[1]}: the start and every control step"
-        )
-    return path
-
-
-def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]:
-    """Find the step that ends at each scan; refuse scans that a filter could not use."""
-    heard = np.array([scan.time for scan in scans], dtype=float)
-    steps = np.searchsorted(time, heard)
-    known = time[np.minimum(steps, time.size - 1)] == heard
-    if not known.all():
-        stray = scans[int(np.argmin(known))]
-        raise InputError(f"scan at {stray.time} s: expected the time of the end of a step")
-    bearing, distance, bearing_std, range_std = (
-        np.concatenate([np.empty(0), *(getattr(scan, name) for scan in scans)])
-        for name in ("bearing", "range", "bearing_std", "range_std")
-    )
-    passive = np.isnan(distance)
-    usable = np.isfinite(bearing) & (passive | (distance > 0.0) & (distance < np.inf))
-    _refuse(
-        scans,
-        usable,
-        "numbers that no filter can use, for the landmarks {}; expected finite bearings [rad] and "
-        "ranges above 0 [m], NaN where passive",
-    )
-    stated = (bearing_std > 0.0) & (bearing_std < np.inf)
-    stated &= passive | ((range_std > 0.0) & (range_std < np.inf))
-    _refuse(
-        scans,
-        stated,
-        "no standard deviations above 0 for the landmarks {}; expected bearing_std [rad], and "
-        "range_std [m] where there is a range, as pipistrelle.detection.noise states them",
-    )
-    return steps.tolist()
-
-
-def _refuse(scans: Sequence[Scan], good: Bool[np.ndarray, " m"], found: str) -> None:
-    """Refuse scans of which not all rows are good; those of all scans follow one another."""
-    if good.all():
-        return
-    owner = np.repeat(np.arange(len(scans)), [scan.landmark.size for scan in scans])
-    first = owner[~good][0]
-    labels = scans[first].landmark[~good[owner == first]].tolist()
-    raise InputError(f"scan at {scans[first].time} s: found {found.format(labels)}")
 
 
 def _generator(seed: int, iteration: int, purpose: str) -> np.random.Generator:

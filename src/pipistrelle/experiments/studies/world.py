@@ -24,7 +24,12 @@ from pipistrelle.detection.noise import Noise, noise_of
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Track, Trajectory
 from pipistrelle.estimation.catalogue import SECTIONS
-from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
+from pipistrelle.evaluation.accuracy import (
+    heaviest,
+    landmark_error,
+    pose_error,
+    position_error,
+)
 from pipistrelle.evaluation.consistency import track_nees
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import (
@@ -274,7 +279,6 @@ def _try_case(
         result = run_trial(replace(case, iteration=iteration), drive, scans, case.config)
         cpu_s = time.thread_time() - began
         estimate = heaviest(result.track.landmarks)
-        labels, places = standing_landmarks(scenario)
         full = result.track.full
         return TrialRecord(
             case=case,
@@ -282,15 +286,13 @@ def _try_case(
             scores=result.scores,
             online=result.online,
             landmarks_full_mean=float(result.scores.landmarks_full if full is None else full),
-            clutter_per_frame=sum(h.clutter for h in heard) / len(heard) if heard else None,
+            clutter_per_frame=sum(h.clutter or 0 for h in heard) / len(heard) if heard else None,
             wall_s=result.wall_s,
             cpu_s=cpu_s,
             steps=_frame_errors(result.track, scenario, case.config),
             landmark=estimate.landmark,
             full=estimate.full,
-            landmark_error=position_error(
-                estimate.mean, places[np.searchsorted(labels, estimate.landmark)]
-            ),
+            landmark_error=landmark_error(estimate, *standing_landmarks(scenario)),
         )
     except Exception:
         return _failed(case, traceback.format_exc())

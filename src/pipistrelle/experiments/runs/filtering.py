@@ -1,0 +1,175 @@
+"""One filter driven over one drive: predict, say who is who, correct, and keep every pose.
+
+What could not be used, whoever made it, is refused here, before or after a filter has it.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipistrelle.config import InputError
+from pipistrelle.detection.merging import labelled
+from pipistrelle.detection.noise import Noise, as_said
+from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.association import Associate, told
+from pipistrelle.estimation.beliefs import (
+    B,
+    Estimator,
+    Gaussian,
+    ParticleCloud,
+    Track,
+    Trajectory,
+)
+from pipistrelle.experiments.drives import Drive
+
+
+def run_filter(
+    estimator: Estimator[B],
+    drive: Drive,
+    scans: Sequence[Scan],
+    rng: np.random.Generator,
+    *,
+    associate: Associate = told,
+    noise: Noise = as_said,
+    progress: Callable[[int, int], None] | None = None,
+    watch: Callable[[Scan, B], None] | None = None,
+) -> Track:
+    """Predict to each scan, say who is who in it, update with it, and keep the pose of every step.
+
+    Where the belief revises its path (`Trajectory`), the track is the path as it is believed at
+    the end, and the poses that were kept are beside it.
+
+    Parameters
+    ----------
+    estimator : Estimator
+    drive : Drive
+    scans : sequence of Scan
+        In order; the time of each is one of the drive's.
+    rng : Generator
+    associate : Associate
+    noise : Noise
+        States how surely the rows were measured that an association has merged.
+    progress : callable, optional
+        Given the scans done and their number.
+    watch : callable, optional
+        Given each scan, as the filter had it, and the belief after it.
+
+    Returns
+    -------
+    Track
+
+    Raises
+    ------
+    InputError
+        For a bearing or range that is no number, a row of which nobody says how sure it is, scans
+        out of order or at a time that is not one of the drive's, labels that are none, or poses
+        that are not one for each step.
+    """
+    time, controls = drive.time, drive.controls
+    steps = _steps_of(scans, time)
+    if associate is told:
+        _refuse_unstated(scans)
+    mean, covariance = np.empty((time.size, 3)), np.empty((time.size, 3, 3))
+    mean[0], covariance[0] = drive.start.mean, drive.start.covariance
+    dt, belief, done = np.diff(time), estimator.init(drive.start), 0
+    for number, (k, scan) in enumerate(zip(steps, scans, strict=True), start=1):
+        if k > done:
+            belief, poses = estimator.predict(belief, controls[done:k], dt[done:k], rng)
+            poses = _whole("predict", poses, k - done)
+            mean[done + 1 : k + 1], covariance[done + 1 : k + 1] = poses.mean, poses.covariance
+            done = k
+        named = labelled(scan, associate(belief, scan))
+        if named is not scan:
+            named = noise(named)
+            _refuse_unstated([named])
+        belief = estimator.update(belief, named, rng)
+        pose = belief.pose()
+        mean[k], covariance[k] = pose.mean, pose.covariance
+        if watch:
+            watch(named, belief)
+        if progress:
+            progress(number, len(scans))
+    if done < len(controls):
+        belief, poses = estimator.predict(belief, controls[done:], dt[done:], rng)
+        poses = _whole("predict", poses, len(controls) - done)
+        mean[done + 1 :], covariance[done + 1 :] = poses.mean, poses.covariance
+    online = Gaussian(mean=mean, covariance=covariance)
+    cloud = belief if isinstance(belief, ParticleCloud) else None
+    revised = _whole("path", belief.path(), time.size) if isinstance(belief, Trajectory) else None
+    return Track(
+        time=time,
+        pose=revised or online,
+        landmarks=belief.landmarks(),
+        gated=belief.gated,
+        cloud=cloud.cloud() if cloud else None,
+        full=cloud.full if cloud else None,
+        online=online if revised else None,
+    )
+
+
+def _whole(who: str, path: Gaussian, poses: int) -> Gaussian:
+    """Refuse poses of an estimator that are not one for each step, or lack their covariances."""
+    found = np.shape(path.mean), np.shape(path.covariance)
+    expected = (poses, 3), (poses, 3, 3)
+    if found != expected:
+        which = "the start and every control step" if who == "path" else "one after each step"
+        raise InputError(
+            f"{who}: found arrays of {found[0]} and {found[1]}, expected {expected[0]} and "
+            f"{expected[1]}: {which}"
+        )
+    return path
+
+
+def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]:
+    """Find the step that ends at each scan; refuse scans that a filter could not use."""
+    heard = np.array([scan.time for scan in scans], dtype=float)
+    steps = np.searchsorted(time, heard)
+    known = time[np.minimum(steps, time.size - 1)] == heard
+    if not known.all():
+        stray = scans[int(np.argmin(known))]
+        raise InputError(f"scan at {stray.time} s: expected the time of the end of a step")
+    if np.any(np.diff(steps) < 0):
+        late = int(np.argmax(np.diff(steps) < 0))
+        raise InputError(
+            f"scan at {scans[late + 1].time} s: follows one at {scans[late].time} s; expected "
+            "scans in the order of time"
+        )
+    bearing, distance = (_column(scans, name) for name in ("bearing", "range"))
+    usable = np.isfinite(bearing)
+    usable &= np.isnan(distance) | ((distance > 0.0) & (distance < np.inf))
+    _refuse(
+        scans,
+        usable,
+        "numbers that no filter can use, for the landmarks {}; expected finite bearings [rad] and "
+        "ranges above 0 [m], NaN where passive",
+    )
+    return steps.tolist()
+
+
+def _refuse_unstated(scans: Sequence[Scan]) -> None:
+    """Refuse rows of which nobody says how sure they are."""
+    bearing_std, range_std = (_column(scans, name) for name in ("bearing_std", "range_std"))
+    stated = (bearing_std > 0.0) & (bearing_std < np.inf)
+    stated &= np.isnan(_column(scans, "range")) | ((range_std > 0.0) & (range_std < np.inf))
+    _refuse(
+        scans,
+        stated,
+        "no standard deviations above 0 for the landmarks {}; expected bearing_std [rad], and "
+        "range_std [m] where there is a range, as pipistrelle.detection.noise states them",
+    )
+
+
+def _column(scans: Sequence[Scan], name: str) -> Float[np.ndarray, " m"]:
+    """Return a column of all scans, one after another."""
+    return np.concatenate([np.empty(0), *(getattr(scan, name) for scan in scans)])
+
+
+def _refuse(scans: Sequence[Scan], good: Bool[np.ndarray, " m"], found: str) -> None:
+    """Refuse scans of which not all rows are good; those of all scans follow one another."""
+    if good.all():
+        return
+    owner = np.repeat(np.arange(len(scans)), [scan.landmark.size for scan in scans])
+    first = owner[~good][0]
+    labels = scans[first].landmark[~good[owner == first]].tolist()
+    raise InputError(f"scan at {scans[first].time} s: found {found.format(labels)}")
