@@ -5,7 +5,7 @@ import pytest
 
 from pipistrelle.acoustics.arrivals import Arrivals
 from pipistrelle.acoustics.callers import callers_of
-from pipistrelle.arithmetic.noise import stream_key
+from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.beamforming import bearing_bound
 from pipistrelle.arrays.layout import Layout, square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks

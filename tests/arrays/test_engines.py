@@ -8,7 +8,7 @@ from scipy.stats import ks_2samp
 
 from pipistrelle.acoustics.arrivals import Arrivals, arrivals_of_emission
 from pipistrelle.acoustics.callers import callers_of
-from pipistrelle.arithmetic.noise import stream_key
+from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.layout import Layout, square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
 from pipistrelle.arrays.sampling import BLOCK, blocks_to_hear, sampling

@@ -1,7 +1,7 @@
 """Arithmetic that must give the same bits everywhere: elementary functions, counted noise.
 
 `elementary` has the logarithms, angles and roots that a processor takes many at a time, alike in
-every lane; `noise` the complex normals of which any sample is known by its number alone.
+every lane; `random_stream` the complex normals of which any sample is known by its number alone.
 """
 
 from lazy_loader import attach
@@ -9,6 +9,6 @@ from lazy_loader import attach
 __getattr__, __dir__, __all__ = attach(
     __name__,
     submod_attrs={
-        "noise": ["complex_noise", "stream_key"],
+        "random_stream": ["complex_noise", "stream_key"],
     },
 )

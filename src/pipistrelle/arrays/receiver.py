@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.arithmetic.noise import complex_noise
+from pipistrelle.arithmetic.random_stream import complex_noise
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.arrays.sampling import BLOCK, Sampling, block_shape
 from pipistrelle.jit import Whole, kernel, no_alloc

@@ -12,7 +12,7 @@ from pipistrelle.acoustics.arrivals import (
     through_piston,
 )
 from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of
-from pipistrelle.arithmetic.noise import stream_key
+from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import BLOCK, blocks_to_hear, sampling

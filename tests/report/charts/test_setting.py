@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipistrelle.arithmetic.noise import stream_key
+from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.experiments.hearing.scenario import draw_scenario
 from pipistrelle.report.charts.setting import model_charts
 from report.invented import BEAMWIDTH, invent

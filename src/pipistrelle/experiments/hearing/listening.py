@@ -23,7 +23,7 @@ from pipistrelle.acoustics.arrivals import (
     through_piston,
 )
 from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_at
-from pipistrelle.arithmetic.noise import stream_key
+from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.layout import Layout, square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
 from pipistrelle.arrays.sampling import BLOCK, Sampling, block_shape, blocks_to_hear, sampling

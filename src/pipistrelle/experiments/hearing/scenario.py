@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of, moves
-from pipistrelle.arithmetic.noise import stream_key
+from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import Config, InputError, MotionConfig, ScenarioConfig
 from pipistrelle.estimation.motion import Motion, motion_step
 from pipistrelle.experiments.drives import LabelledPoints

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipistrelle.arithmetic.noise import stream_key
+from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import Config, Strategy
 from pipistrelle.detection.faces import Heard
 from pipistrelle.detection.merging import scan_of

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import binom, chi2_contingency, gamma, kstest
 
-from pipistrelle.arithmetic.noise import complex_noise, stream_key
+from pipistrelle.arithmetic.random_stream import complex_noise, stream_key
 
 law = settings(deadline=None, max_examples=60)
 KEYS = st.integers(0, 2**64 - 1)
