@@ -39,8 +39,18 @@ class Measurements(NamedTuple):
     range_variance: Float[np.ndarray, " m"]
 
 
-def measurements_of(scan: Scan) -> Measurements:
-    """Return a scan's rows as the kernels take them: standard deviations are squared here.
+Columns = tuple[
+    Int[np.ndarray, " m"],
+    Float[np.ndarray, " m"],
+    Float[np.ndarray, " m"],
+    Float[np.ndarray, " m"],
+    Float[np.ndarray, " m"],
+]
+"""Label, bearing, range and the standard deviations of both, as a scan has them."""
+
+
+def columns_of(scan: Scan) -> Columns:
+    """Return of a scan what a filter's kernel is handed: it makes `Measurements` of it.
 
     Parameters
     ----------
@@ -48,21 +58,26 @@ def measurements_of(scan: Scan) -> Measurements:
 
     Returns
     -------
-    Measurements
+    tuple of label, bearing, range, bearing_std and range_std
+        A plain tuple: a kernel takes one in no time, and a record in microseconds.
+    """
+    return scan.landmark, scan.bearing, scan.range, scan.bearing_std, scan.range_std
+
+
+@kernel
+def measurements(columns: Columns) -> Measurements:
+    """Return the rows of a scan as the kernels take them: standard deviations are squared here.
 
     Examples
     --------
     >>> from pipistrelle.detection.scans import make_scan
     >>> scan = make_scan(0.0, np.array([4]), np.zeros(1), range=2.0, bearing_std=0.5)
-    >>> measurements_of(scan).bearing_variance
+    >>> measurements(columns_of(scan)).bearing_variance
     array([0.25])
     """
+    landmark, bearing, distance, bearing_std, range_std = columns
     return Measurements(
-        landmark=scan.landmark,
-        bearing=scan.bearing,
-        range=scan.range,
-        bearing_variance=scan.bearing_std * scan.bearing_std,
-        range_variance=scan.range_std * scan.range_std,
+        landmark, bearing, distance, bearing_std * bearing_std, range_std * range_std
     )
 
 

@@ -30,7 +30,13 @@ from pipistrelle.estimation.ekf.gaussian import (
     joint_of,
     propagate,
 )
-from pipistrelle.estimation.measurement import Measurements, measurements_of, observe
+from pipistrelle.estimation.measurement import (
+    Columns,
+    Measurements,
+    columns_of,
+    measurements,
+    observe,
+)
 from pipistrelle.estimation.motion import Motion, motion_numbers
 from pipistrelle.estimation.rays import (
     Sensing,
@@ -190,7 +196,7 @@ class EkfSlam:
             belief.covariance,
             belief.landmark,
             belief.weight,
-            measurements_of(scan),
+            columns_of(scan),
             sensing_of(self.rays, self.gate),
         )
         return EkfBelief(
@@ -346,10 +352,11 @@ def _update(
     old_covariance: Float[np.ndarray, "d d"],
     old_landmark: Int[np.ndarray, " h"],
     old_weight: Float[np.ndarray, " h"],
-    heard: Measurements,
+    columns: Columns,
     sensing: Sensing,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Whole]:
     """Correct, prune and extend a copy of the belief; returns its arrays and the gated count."""
+    heard = measurements(columns)
     members, rows = old_landmark.size, heard.landmark.size
     most, known = members, np.empty(rows, dtype=np.bool_)
     for m in range(rows):

@@ -35,7 +35,7 @@ from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.fastslam.block import LANES, MEMBER
 from pipistrelle.estimation.fastslam.particles import (
-    Particles,
+    Arrays,
     correct_particles,
     gated_by_all,
     mean_full,
@@ -44,7 +44,7 @@ from pipistrelle.estimation.fastslam.particles import (
 )
 from pipistrelle.estimation.fastslam.poses import SMALLEST_STD, propagate, summarise
 from pipistrelle.estimation.fastslam.resampling import effective_particles, normalised, stratified
-from pipistrelle.estimation.measurement import Measurements, measurements_of
+from pipistrelle.estimation.measurement import Columns, columns_of
 from pipistrelle.estimation.motion import Motion, motion_numbers
 from pipistrelle.estimation.rays import Sensing, sensing_of
 
@@ -228,8 +228,8 @@ class FastSlam:
         particles = self.settings.particles
         normal, uniform = rng.standard_normal((particles, 3)), rng.random(particles)
         sensing = sensing_of(self.rays, self.gate, self.settings.mixture == "exact")
-        heard, gated = self._inside(belief, measurements_of(scan), sensing)
-        corrected, gained = correct_particles(_particles(belief), heard, normal, sensing)
+        columns, gated = self._inside(belief, columns_of(scan), sensing)
+        corrected, gained = correct_particles(_arrays(belief), columns, normal, sensing)
         poses, landmark, first, count, member = corrected
         weight = normalised(belief.log_weight + gained)
         best_count, best_member = particle_map(count, member, int(np.argmax(weight)))
@@ -252,24 +252,24 @@ class FastSlam:
         return _resampled(after, stratified(weight, uniform))
 
     def _inside(
-        self, belief: FastSlamBelief, heard: Measurements, sensing: Sensing
-    ) -> tuple[Measurements, int]:
+        self, belief: FastSlamBelief, columns: Columns, sensing: Sensing
+    ) -> tuple[Columns, int]:
         """Drop the measurements that no particle expected; tell how many."""
         if self.gate >= 1.0:
-            return heard, 0
-        dropped = gated_by_all(_particles(belief), heard, sensing)
-        kept = Measurements(*(column[~dropped] for column in heard))
-        return kept, int(np.count_nonzero(dropped))
+            return columns, 0
+        dropped = gated_by_all(_arrays(belief), columns, sensing)
+        label, bearing, distance, bearing_std, range_std = (part[~dropped] for part in columns)
+        return (label, bearing, distance, bearing_std, range_std), int(np.count_nonzero(dropped))
 
 
-def _particles(belief: FastSlamBelief) -> Particles:
+def _arrays(belief: FastSlamBelief) -> Arrays:
     """Return a belief's particles as the kernels take them."""
-    return Particles(belief.poses, belief.landmark, belief.first, belief.count, belief.member)
+    return belief.poses, belief.landmark, belief.first, belief.count, belief.member
 
 
 def _resampled(belief: FastSlamBelief, ancestor: Int[np.ndarray, " p"]) -> FastSlamBelief:
     """Put copies of the ancestors in the particles' places, all of one weight."""
-    poses, count, member = resample_into(_particles(belief), ancestor)
+    poses, count, member = resample_into(_arrays(belief), ancestor)
     log_weight = np.full(ancestor.size, -math.log(ancestor.size))
     return replace(belief, poses=poses, log_weight=log_weight, count=count, member=member)
 

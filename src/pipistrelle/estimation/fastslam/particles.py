@@ -37,7 +37,7 @@ from pipistrelle.estimation.fastslam.block_rays import (
     refine_by_ray,
     scratch_for,
 )
-from pipistrelle.estimation.measurement import Measurements
+from pipistrelle.estimation.measurement import Columns, Measurements, measurements
 from pipistrelle.estimation.rays import Sensing
 from pipistrelle.jit import Whole, kernel, no_alloc
 
@@ -59,6 +59,16 @@ class Particles(NamedTuple):
     first: Int[np.ndarray, " n+1"]
     count: Int[np.ndarray, "b n lanes"]
     member: Float[np.ndarray, "b c numbers"]
+
+
+Arrays = tuple[
+    Float[np.ndarray, "b rows"],
+    Int[np.ndarray, " n"],
+    Int[np.ndarray, " n+1"],
+    Int[np.ndarray, "b n lanes"],
+    Float[np.ndarray, "b c numbers"],
+]
+"""The same as a plain tuple, which a kernel takes in no time."""
 
 
 class Block(NamedTuple):
@@ -95,10 +105,9 @@ def _active_gated(
 
 
 @kernel
-def gated_by_all(
-    particles: Particles, heard: Measurements, sensing: Sensing
-) -> Bool[np.ndarray, " m"]:
+def gated_by_all(arrays: Arrays, columns: Columns, sensing: Sensing) -> Bool[np.ndarray, " m"]:
     """Whether each measurement is beyond the gate of every particle that could use it."""
+    particles, heard = Particles(*arrays), measurements(columns)
     slot = _slots(particles.landmark, heard.landmark)
     gated, blocks = np.zeros(slot.size, dtype=np.bool_), particles.pose.shape[0]
     for m in range(slot.size):
@@ -275,9 +284,10 @@ def _copy_members(particles: Particles, b: Whole, block: Block) -> None:
 
 @kernel
 def correct_particles(
-    old: Particles, heard: Measurements, normal: Float[np.ndarray, "p 3"], sensing: Sensing
-) -> tuple[Particles, Float[np.ndarray, " p"]]:
+    arrays: Arrays, columns: Columns, normal: Float[np.ndarray, "p 3"], sensing: Sensing
+) -> tuple[Arrays, Float[np.ndarray, " p"]]:
     """Refine, sample, correct and extend a copy of all particles; returns it and log weights."""
+    old, heard = Particles(*arrays), measurements(columns)
     blocks, known, total = old.pose.shape[0], old.landmark.size, normal.shape[0]
     slot = _slots(old.landmark, heard.landmark)
     landmark, first, widest = _rows(old, slot, heard, sensing.ray_ranges.size)
@@ -299,7 +309,7 @@ def correct_particles(
                 rows = block.member[first[n] : first[n + 1]]
                 _add_new(block.pose, rows, block.count[n], heard, m, sensing)
                 n += 1
-    return Particles(pose, landmark, first, count, member), gained.ravel()[:total]
+    return (pose, landmark, first, count, member), gained.ravel()[:total]
 
 
 @kernel
@@ -330,11 +340,12 @@ def mean_full(count: Int[np.ndarray, "b n lanes"], weight: Float[np.ndarray, " p
 
 @kernel
 def resample_into(
-    old: Particles, ancestor: Int[np.ndarray, " p"]
+    arrays: Arrays, ancestor: Int[np.ndarray, " p"]
 ) -> tuple[
     Float[np.ndarray, "b rows"], Int[np.ndarray, "b n lanes"], Float[np.ndarray, "b c numbers"]
 ]:
     """Put copies of the ancestors in the particles' places; spare lanes follow the last."""
+    old = Particles(*arrays)
     pose, count = np.empty_like(old.pose), np.empty_like(old.count)
     member, source = np.empty_like(old.member), np.empty(LANES, dtype=np.int64)
     for b in range(pose.shape[0]):
