@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipistrelle.config import RayConfig
-from pipistrelle.estimation.rays import ray_members, survivors, weigh_and_share
+from pipistrelle.estimation.rays import ray_members, sensing_of, survivors, weigh_and_share
 from reference.ekf_slam import ray_ranges
 
 configs = st.builds(
@@ -53,6 +53,15 @@ def test_ray_reaches_from_the_nearest_to_the_farthest_range_with_no_member_to_sp
 @given(configs)
 def test_ray_is_that_of_the_slow_reference(rays):
     np.testing.assert_allclose(ray_members(rays)[0], ray_ranges(rays), rtol=1e-12)
+
+
+def test_the_ray_that_filters_share_is_changed_by_none():
+    shared_by_all = sensing_of(RayConfig(), 0.999)
+    assert shared_by_all is sensing_of(RayConfig(), 0.999)
+    for column in (shared_by_all.ray_ranges, shared_by_all.ray_stds):
+        with pytest.raises(ValueError, match="read-only"):
+            column[0] = 0.0
+    assert ray_members(RayConfig())[0].flags.writeable
 
 
 def test_neighbours_meet_within_two_deviations_and_would_not_as_printed():

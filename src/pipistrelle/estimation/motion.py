@@ -99,7 +99,12 @@ def motion_increment(
 
 @no_alloc
 def propagate_pose(
-    pose: np.ndarray, P: np.ndarray, speed: float, turn: float, dt: float, motion: MotionNumbers
+    pose: Float[np.ndarray, "3"],
+    P: Float[np.ndarray, "3 3"],
+    speed: float,
+    turn: float,
+    dt: float,
+    motion: MotionNumbers,
 ) -> tuple[float, float]:
     """Carry a pose (3) and its covariance (3, 3) through a control step, in place.
 

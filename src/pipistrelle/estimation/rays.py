@@ -43,7 +43,7 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from pipistrelle.config import RayConfig
 from pipistrelle.jit import Whole, kernel, no_alloc
@@ -95,6 +95,7 @@ class Sensing(NamedTuple):
     passive_bound, active_bound : float
         Largest squared Mahalanobis distances.
     ray_ranges, ray_stds : (h) [m]
+        Read-only.
     power, prune : float
     aggregated, reinitialise, exact : bool
     """
@@ -149,6 +150,8 @@ def sensing_of(rays: RayConfig, gate: float, exact: bool = False) -> Sensing:
     """
     passive_bound, active_bound = gate_bounds(gate)
     ray_ranges, ray_stds = ray_members(rays)
+    ray_ranges.setflags(write=False)  # they are shared by whoever asks for the same
+    ray_stds.setflags(write=False)
     return Sensing(
         passive_bound=passive_bound,
         active_bound=active_bound,
@@ -173,7 +176,7 @@ def log_likelihood(innovation: float, variance: float) -> float:
 
 @no_alloc
 def _weigh_in_logs(
-    log_likelihoods: Float[np.ndarray, " h"], weights: Float[np.ndarray, " h"], count: Whole
+    log_likelihoods: Float[np.ndarray, " m"], weights: Float[np.ndarray, " h"], count: Whole
 ) -> float:
     """Multiply weights by likelihoods whose products underflow; returns the log of their sum."""
     largest, total = -np.inf, 0.0
@@ -191,12 +194,12 @@ def _weigh_in_logs(
 
 @no_alloc
 def weigh_and_share(
-    log_likelihoods: np.ndarray,
-    weights: np.ndarray,
+    log_likelihoods: Float[np.ndarray, " m"],
+    weights: Float[np.ndarray, " h"],
     count: Whole,
     power: float,
     aggregated: bool,
-    share: np.ndarray,
+    share: Float[np.ndarray, " m"],
 ) -> float:
     """Multiply the members' weights by their likelihoods and divide the measurement among them.
 
@@ -233,7 +236,7 @@ def weigh_and_share(
 
 
 @no_alloc
-def heaviest(weights: np.ndarray, count: Whole) -> Whole:
+def heaviest_member(weights: Float[np.ndarray, " h"], count: Whole) -> Whole:
     """Return the index of the largest of the first weights, the first of equals."""
     best = 0
     for j in range(1, count):
@@ -243,13 +246,15 @@ def heaviest(weights: np.ndarray, count: Whole) -> Whole:
 
 
 @no_alloc
-def survivors(weights: np.ndarray, count: Whole, prune: float, keep: np.ndarray) -> Whole:
+def survivors(
+    weights: Float[np.ndarray, " h"], count: Whole, prune: float, keep: Bool[np.ndarray, " m"]
+) -> Whole:
     """Mark the members that stay, renormalise their weights in place and return their number.
 
     A member goes when its weight is under prune / count; the heaviest (the first of equals)
     always stays. Bradley & Abaid, Eq. (21).
     """
-    strongest = heaviest(weights, count)
+    strongest = heaviest_member(weights, count)
     kept, total = 0, 0.0
     for j in range(count):
         keep[j] = j == strongest or weights[j] >= prune / count

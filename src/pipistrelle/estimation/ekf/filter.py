@@ -40,7 +40,7 @@ from pipistrelle.estimation.measurement import (
 from pipistrelle.estimation.motion import Motion, motion_numbers
 from pipistrelle.estimation.rays import (
     Sensing,
-    heaviest,
+    heaviest_member,
     log_likelihood,
     sensing_of,
     survivors,
@@ -286,7 +286,7 @@ def _range_for_ray(
     scratch: _Scratch,
 ) -> None:
     """Give a partial landmark the range of measurement m: one member is left."""
-    left = 0 if sensing.reinitialise else heaviest(state.weight[first:], count)
+    left = 0 if sensing.reinitialise else heaviest_member(state.weight[first:], count)
     for j in range(count):
         scratch.keep[j] = j == left
     drop_members(state, first, count, scratch.keep, scratch.source)
