@@ -1,8 +1,4 @@
-"""Motion and measurement models with their Jacobians, and the records that beliefs are made of.
-
-The kernels return plain numbers, so that the filters can inline them; the functions beside them
-say the same in arrays. In the kernels a motion model is a number: 0 bicycle, 1 unicycle.
-"""
+"""Records that beliefs are made of, and what an estimator is."""
 
 from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable

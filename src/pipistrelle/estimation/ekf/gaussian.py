@@ -108,7 +108,7 @@ def joint_of(
 def gaussian_of(
     joint: Joint, size: Whole
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
-    """Copy the mean (d) and the covariance (d, d) out of a settled `Joint`."""
+    """Copy the mean (d) and the covariance (d, d) out of a `Joint` of which nothing waits."""
     mean, covariance = np.empty(size), np.empty((size, size))
     for a in range(size):
         mean[a] = joint.mean[a]

@@ -57,7 +57,7 @@ _PACKED = ([0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2])
 class FastSlamBelief:
     """Particles, and what they amount to.
 
-    Particles are kept in b blocks of L = `particle.LANES`, number by number: a row of L numbers is
+    Particles are kept in b blocks of L = `block.LANES`, number by number: a row of L numbers is
     one number of each of a block's particles. Spare lanes of the last block repeat the last
     particle.
 

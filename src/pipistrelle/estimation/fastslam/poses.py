@@ -26,7 +26,7 @@ from pipistrelle.jit import kernel, no_alloc
 
 SMALLEST_STD = 1e-6
 """Added in quadrature to the pose estimate's x, y [m] and heading [rad]: particles that stand still
-or has one ancestor may have no spread, and its covariance no inverse."""
+or have one ancestor may have no spread, and their covariance no inverse."""
 
 
 LEAST = SMALLEST_STD**2
