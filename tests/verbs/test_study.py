@@ -150,14 +150,14 @@ def test_lines_are_seconds_apart_but_for_the_first_and_the_last(capsys, monkeypa
     monkeypatch.setattr(verb, "perf_counter", lambda: now[0])
     show = verb._lines()
     for done in range(101):
-        show(standing(done, 100))
+        show(so_far(done, 100))
         now[0] += 1.0
     told = re.findall(r"^(\d+)/100", capsys.readouterr().err, re.M)
     assert [int(word) for word in told] == [*range(0, 100, 10), 100]
 
 
-def standing(done, worlds):
-    return study.Standing(
+def so_far(done, worlds):
+    return study.StudyProgress(
         worlds=worlds,
         done=done,
         trials={"fused": 2 * worlds},
@@ -171,9 +171,9 @@ def test_speed_and_time_left_are_those_since_the_study_went_on(monkeypatch):
     now = [50.0]
     monkeypatch.setattr(verb, "perf_counter", lambda: now[0])
     pace = verb._pace()
-    assert pace(standing(40, 100)) == ""
+    assert pace(so_far(40, 100)) == ""
     now[0] += 10.0
-    assert pace(standing(50, 100)) == "2.0 trials/s, 50 s left"
+    assert pace(so_far(50, 100)) == "2.0 trials/s, 50 s left"
 
 
 @pytest.mark.parametrize(

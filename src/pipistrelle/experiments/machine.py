@@ -27,7 +27,7 @@ def cores() -> int:
 
 
 def check_memory(
-    ways: Sequence[str],
+    filters: Sequence[str],
     landmarks: int,
     config: Config,
     *,
@@ -38,7 +38,7 @@ def check_memory(
 
     Parameters
     ----------
-    ways : sequence of str
+    filters : sequence of str
         The names of estimators.
     landmarks : int
     config : Config
@@ -58,14 +58,14 @@ def check_memory(
     >>> check_memory(["ekf", "fastslam"], 51, Config(), passive=True)
     """
     each_ray = ray_members(config.rays)[0].size if passive else 1
-    for way in ways:
-        known = entry(way)
+    for name in filters:
+        known = entry(name)
         need, have = known.memory(landmarks, each_ray, config), installed()
         if need * workers > have:
             ray = f" of {each_ray:,} members each" if passive else ""
             particles = f" and {config.fastslam.particles} particles"
             held = particles if "fastslam" in known.sections else ""
-            raise _too_large(f"{way}: {landmarks} landmarks{ray}{held}", need, have, workers)
+            raise _too_large(f"{name}: {landmarks} landmarks{ray}{held}", need, have, workers)
 
 
 def check_length(

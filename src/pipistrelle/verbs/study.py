@@ -17,9 +17,9 @@ from pipistrelle.verbs.options import SettingFlags, Whole, layers
 
 if TYPE_CHECKING:
     from pipistrelle.experiments.studies.plan import Plan
-    from pipistrelle.experiments.studies.study import Standing
+    from pipistrelle.experiments.studies.study import StudyProgress
 
-Show = Callable[["Standing"], None]
+Show = Callable[["StudyProgress"], None]
 EVERY = 10.0
 """Least time between two lines of progress [s]."""
 SHARDS = 16
@@ -96,7 +96,7 @@ def study(
 
     try:
         with _progress(quiet) as show:
-            standing = run_study(
+            so_far = run_study(
                 tried,
                 folder,
                 workers=workers or cores(),
@@ -108,18 +108,18 @@ def study(
     except KeyboardInterrupt:
         say(f"{folder}: worlds that are done are kept; the same command goes on with the rest")
         raise
-    return _close(standing, folder, quiet)
+    return _close(so_far, folder, quiet)
 
 
-def _close(standing: "Standing", folder: Path, quiet: bool) -> int:
+def _close(so_far: "StudyProgress", folder: Path, quiet: bool) -> int:
     """Say how the study ended, and where it is; return the exit status."""
-    ended, failed = sum(standing.ended.values()), sum(standing.failed.values())
+    ended, failed = sum(so_far.ended.values()), sum(so_far.failed.values())
     if not quiet:
-        print(f"{standing.done} worlds, {ended} trials, {failed} failed")
+        print(f"{so_far.done} worlds, {ended} trials, {failed} failed")
     if failed:
         say(
             f"pipistrelle: warning: {failed} of {ended} trials failed, the first with: "
-            f"{standing.first_error}; see the column error in {folder / 'trials'}; "
+            f"{so_far.first_error}; see the column error in {folder / 'trials'}; "
             "--retry-failed does their worlds again"
         )
     print(folder)
@@ -160,15 +160,15 @@ def _compiled_first(show: Show, quiet: bool) -> Show:
     """Compile kernels before the first world, so that not every worker has to."""
     ready = False
 
-    def prepare(standing: "Standing") -> None:
+    def prepare(so_far: "StudyProgress") -> None:
         nonlocal ready
-        if not ready and standing.done < standing.worlds:
+        if not ready and so_far.done < so_far.worlds:
             from pipistrelle.experiments.runs.compiling import compile_kernels
 
             with announced("Compiling kernels (once) ...", 1e9 if quiet else 3.0):
                 compile_kernels()
         ready = True
-        show(standing)
+        show(so_far)
 
     return prepare
 
@@ -189,16 +189,16 @@ def _lines() -> Show:
     """Print a line first, last and every few seconds."""
     pace, due = _pace(), 0.0
 
-    def show(standing: "Standing") -> None:
+    def show(so_far: "StudyProgress") -> None:
         nonlocal due
-        left = pace(standing)
-        if perf_counter() >= due or standing.done == standing.worlds:
+        left = pace(so_far)
+        if perf_counter() >= due or so_far.done == so_far.worlds:
             due = perf_counter() + EVERY
             told = [
-                f"{name} {ended}/{standing.trials[name]}{_failures(standing.failed[name])}"
-                for name, ended in standing.ended.items()
+                f"{name} {ended}/{so_far.trials[name]}{_failures(so_far.failed[name])}"
+                for name, ended in so_far.ended.items()
             ]
-            worlds = f"{standing.done}/{standing.worlds} worlds"
+            worlds = f"{so_far.done}/{so_far.worlds} worlds"
             say(", ".join([worlds, *([left] if left else [])]) + "; trials: " + ", ".join(told))
 
     return show
@@ -223,11 +223,11 @@ def _bars() -> Iterator[Show]:
                 tasks[name] = bars.add_task(name, total=total, words="")
             bars.update(tasks[name], completed=done, words=words)
 
-        def show(standing: "Standing") -> None:
-            left = pace(standing)
-            draw("worlds", standing.done, standing.worlds, f", {left}" if left else "")
-            for name, ended in standing.ended.items():
-                draw(name, ended, standing.trials[name], _failures(standing.failed[name]))
+        def show(so_far: "StudyProgress") -> None:
+            left = pace(so_far)
+            draw("worlds", so_far.done, so_far.worlds, f", {left}" if left else "")
+            for name, ended in so_far.ended.items():
+                draw(name, ended, so_far.trials[name], _failures(so_far.failed[name]))
 
         yield show
 
@@ -237,13 +237,13 @@ def _failures(number: int) -> str:
     return f" ({number} failed)" if number else ""
 
 
-def _pace() -> Callable[["Standing"], str]:
+def _pace() -> Callable[["StudyProgress"], str]:
     """Return what words the speed since the first call, and the time left."""
     began: tuple[float, int] | None = None
 
-    def pace(standing: "Standing") -> str:
+    def pace(so_far: "StudyProgress") -> str:
         nonlocal began
-        ended, total = sum(standing.ended.values()), sum(standing.trials.values())
+        ended, total = sum(so_far.ended.values()), sum(so_far.trials.values())
         began = began or (perf_counter(), ended)
         elapsed, since = perf_counter() - began[0], ended - began[1]
         if not since or elapsed <= 0.0:

@@ -5,7 +5,12 @@ import pytest
 from scipy.stats import kstest
 
 from pipistrelle.config import Config, InputError, MotionConfig, ScenarioConfig
-from pipistrelle.experiments.hearing.scenario import Scenario, draw_scenario
+from pipistrelle.experiments.hearing.scenario import (
+    Scenario,
+    draw_scenario,
+    landmark_count,
+    standing_landmarks,
+)
 
 SEEDS = range(12)
 
@@ -18,6 +23,12 @@ def beacon_of(drawn):
     """Return where the second of the paper's two callers stands."""
     _, beacon = drawn.callers
     return beacon.place
+
+
+def test_what_there_is_to_map_is_known_before_a_world_is_drawn():
+    config = Config(scenario=ScenarioConfig(landmarks=9, steps=20))
+    labels, _ = standing_landmarks(draw_scenario(config, np.random.default_rng(3)))
+    assert landmark_count(config) == len(labels) == 10
 
 
 def nearest(points, others):

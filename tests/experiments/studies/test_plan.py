@@ -8,7 +8,12 @@ import pytest
 
 from pipistrelle.config import Config, EmitterConfig, InputError, RayConfig
 from pipistrelle.experiments.studies.plan import Plan, cases_of
-from pipistrelle.experiments.studies.plan_file import differences, find_plan, plan_text, read_plan
+from pipistrelle.experiments.studies.plan_file import (
+    changed_settings,
+    find_plan,
+    plan_text,
+    read_plan,
+)
 from pipistrelle.settings import from_flags
 from reference.studies import SMALL, plan_of
 
@@ -140,7 +145,7 @@ def test_a_plan_made_of_both_a_setting_and_its_values_can_be_read_again(tmp_path
     plan = Plan(name="small", iterations=1, config=config, grid=grid, **ways)
     there = plan_of(tmp_path, plan_text(plan))
     assert cases_of(there) == cases_of(plan)
-    assert differences(there, plan) == []
+    assert changed_settings(there, plan) == []
 
 
 def test_settings_laid_over_a_plan_go_before_its_own(tmp_path):
@@ -251,10 +256,10 @@ def test_a_plan_that_is_not_there_is_refused():
 
 def test_all_that_differs_is_named_but_for_the_number_of_worlds(tmp_path):
     there = plan_of(tmp_path, SMALL)
-    assert differences(there, plan_of(tmp_path, SMALL, iterations=30)) == []
+    assert changed_settings(there, plan_of(tmp_path, SMALL, iterations=30)) == []
     text = SMALL.replace("landmarks = 12", "landmarks = 13").replace("0.025]", "0.02]")
     text = text.replace("[config", 'filters = ["ekf"]\n[config') + '"rays.power" = [1.0]\n'
-    assert differences(there, plan_of(tmp_path, text)) == [
+    assert changed_settings(there, plan_of(tmp_path, text)) == [
         'filters: ["ekf", "fastslam"] there, ["ekf"] asked for',
         "config.scenario.landmarks: 12 there, 13 asked for",
         "grid.emitter.radius: [0.0025, 0.025] there, [0.0025, 0.02] asked for",

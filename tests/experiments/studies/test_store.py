@@ -15,7 +15,7 @@ from pipistrelle.experiments.studies.store import (
     done_worlds,
     load_study,
     open_store,
-    read_outcomes,
+    read_ended_trials,
     sweep,
     world_file,
     write_world,
@@ -106,7 +106,7 @@ def test_a_world_is_done_when_its_trials_are_there(folder, plan, records):
     for table in TABLES:
         assert world_file(folder, table, 2).is_file()
     assert leftovers(folder) == []
-    assert read_outcomes(folder, 2) == [(r.case.strategy, r.error) for r in records]
+    assert read_ended_trials(folder, 2) == [(r.case.strategy, r.error) for r in records]
 
 
 def test_the_trials_go_last(folder, plan, records, monkeypatch):
@@ -214,7 +214,7 @@ def test_a_writer_that_was_overtaken_is_content(folder, plan, records, monkeypat
 def test_a_damaged_world_is_named_with_the_way_out(folder, plan):
     world_file(folder, "trials", 0).write_bytes(b"nothing of ours")
     with pytest.raises(InputError, match=r"iteration_00000\.parquet: could not be read .*; remove"):
-        read_outcomes(folder, 0)
+        read_ended_trials(folder, 0)
 
 
 def test_a_study_loads_lazily_world_after_world(folder, plan, records):

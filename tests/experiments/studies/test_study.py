@@ -43,16 +43,16 @@ def moody(monkeypatch):
 
 
 def test_a_study_runs_every_world_once_and_goes_on_where_it_stopped(plan, tmp_path, ran):
-    def enough(standing):
-        if standing.done == 2:
+    def enough(so_far):
+        if so_far.done == 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         run_study(plan, tmp_path / "study", progress=enough)
     assert (ran, done_worlds(tmp_path / "study")) == ([0, 1], {0, 1})
-    standing = run_study(plan, tmp_path / "study")
+    so_far = run_study(plan, tmp_path / "study")
     assert ran == [0, 1, 2]
-    assert (standing.done, standing.worlds) == (3, 3)
+    assert (so_far.done, so_far.worlds) == (3, 3)
     run_study(plan, tmp_path / "study")
     assert ran == [0, 1, 2]
 
@@ -63,19 +63,19 @@ def test_more_worlds_of_one_plan_are_added_to_those_done(plan, tmp_path, ran):
     assert ran == [0, 1, 2, 3, 4]
 
 
-def test_the_standing_counts_worlds_and_trials_by_strategy(plan, tmp_path):
+def test_the_progress_counts_worlds_and_trials_by_strategy(plan, tmp_path):
     seen = []
     run_study(plan, tmp_path / "study", progress=seen.append)
-    assert [standing.done for standing in seen] == [0, 1, 2, 3]
+    assert [so_far.done for so_far in seen] == [0, 1, 2, 3]
     assert seen[-1].trials == seen[-1].ended == {"active": 12, "fused": 12, "passive": 6}
     assert seen[1].ended == {"active": 4, "fused": 4, "passive": 2}
-    assert all(set(standing.failed.values()) == {0} for standing in seen)
+    assert all(set(so_far.failed.values()) == {0} for so_far in seen)
 
 
 def test_shares_are_disjoint_and_make_up_the_whole(plan, tmp_path, ran):
     for i in range(2):
-        standing = run_study(plan, tmp_path / "shares", shard=(i, 2))
-        assert standing.done == standing.worlds == (2, 1)[i]
+        so_far = run_study(plan, tmp_path / "shares", shard=(i, 2))
+        assert so_far.done == so_far.worlds == (2, 1)[i]
     assert ran == [0, 2, 1]
     run_study(plan, tmp_path / "whole")
     assert_same(results(tmp_path / "shares"), results(tmp_path / "whole"))
@@ -87,10 +87,10 @@ def test_a_share_without_worlds_is_done_at_once(plan, tmp_path, ran):
 
 
 def test_a_trial_that_raises_is_counted_and_the_study_goes_on(plan, tmp_path, moody):
-    standing = run_study(plan, tmp_path / "study")
-    assert standing.done == 3
-    assert standing.failed == {"active": 0, "fused": 0, "passive": 1}
-    assert standing.first_error == "FloatingPointError: weights: all zero"
+    so_far = run_study(plan, tmp_path / "study")
+    assert so_far.done == 3
+    assert so_far.failed == {"active": 0, "fused": 0, "passive": 1}
+    assert so_far.first_error == "FloatingPointError: weights: all zero"
     failed = [
         row for row in as_rows(results(tmp_path / "study")["trials"]) if row["status"] == "failed"
     ]
@@ -98,7 +98,7 @@ def test_a_trial_that_raises_is_counted_and_the_study_goes_on(plan, tmp_path, mo
     assert (row["iteration"], row["strategy"], row["filter"]) == (1, "passive", "fastslam")
     assert row["seed"] == plan.config.seed
     assert "weights: all zero" in row["error"]
-    assert run_study(plan, tmp_path / "study").failed == standing.failed
+    assert run_study(plan, tmp_path / "study").failed == so_far.failed
 
 
 def test_failed_trials_are_run_again_when_asked_and_only_their_worlds(plan, tmp_path, moody, ran):
@@ -109,7 +109,7 @@ def test_failed_trials_are_run_again_when_asked_and_only_their_worlds(plan, tmp_
     seen = []
     run_study(plan, tmp_path / "study", retry_failed=True, progress=seen.append)
     assert ran == [1, 1]
-    assert [standing.done for standing in seen] == [2, 3]
+    assert [so_far.done for so_far in seen] == [2, 3]
     assert seen[-1].failed == {"active": 0, "fused": 0, "passive": 0}
     run_study(plan, tmp_path / "untroubled")
     assert_same(results(tmp_path / "study"), results(tmp_path / "untroubled"))

@@ -1,4 +1,4 @@
-"""The true world: a noisy drive, landmarks around it, a beacon that calls."""
+"""The true world: a noisy drive, landmarks around it, and whoever calls there."""
 
 import math
 from dataclasses import dataclass
@@ -107,6 +107,27 @@ def draw_scenario(config: Config, rng: np.random.Generator) -> Scenario:
         landmarks=_place_landmarks(setup, path[:, :2], beacon, rng),
         callers=callers_of(config, beacon),
     )
+
+
+def landmark_count(config: Config) -> int:
+    """Count what a world of these settings has to map: the landmarks, and all callers but one.
+
+    Parameters
+    ----------
+    config : Config
+
+    Returns
+    -------
+    int
+        The vehicle is no landmark of its own map; each other caller is one.
+
+    Examples
+    --------
+    >>> landmark_count(Config(scenario=ScenarioConfig(landmarks=12)))
+    13
+    """
+    callers = callers_of(config, np.zeros(2))  # wherever the beacon stands
+    return config.scenario.landmarks + len(callers[VEHICLE + 1 :])
 
 
 def standing_landmarks(scenario: Scenario) -> LabelledPoints:

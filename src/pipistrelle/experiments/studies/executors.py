@@ -17,26 +17,24 @@ from contextlib import contextmanager
 from typing import Any
 
 from pipistrelle.config import InputError
-from pipistrelle.experiments.studies.store import (
-    Outcome,
-)
+from pipistrelle.experiments.studies.store import EndedTrial
 
 AHEAD = 1000
 """Worlds handed to a cluster before the first of them is done."""
 
 
-Task = Callable[[int], list[Outcome]]
+Task = Callable[[int], list[EndedTrial]]
 
 
-Ended = tuple[int, "Future[list[Outcome]]"]
+Ended = tuple[int, "Future[list[EndedTrial]]"]
 
 
-Results = Generator[list[Outcome], None, None]
+Results = Generator[list[EndedTrial], None, None]
 
 
 def ended(executor: Executor, task: Task, waiting: deque[int], ahead: int) -> Iterator[Ended]:
     """Keep an executor busy; yield each world when it ended, and its future."""
-    running: dict[Future[list[Outcome]], int] = {}
+    running: dict[Future[list[EndedTrial]], int] = {}
     try:
         while running or (waiting and ahead):
             try:
@@ -71,7 +69,7 @@ def in_processes(task: Task, give_up: Task, waiting: deque[int], workers: int) -
 
 def _in_pool(
     task: Task, waiting: deque[int], workers: int, broken: deque[int]
-) -> Generator[list[Outcome], None, bool]:
+) -> Generator[list[EndedTrial], None, bool]:
     """Run worlds until a process dies, and tell which were running then; return if any ended."""
     alive = False
     with _pool(min(workers, len(waiting))) as pool:
@@ -129,15 +127,15 @@ def on_cluster(
         try:
             for iteration, future in ended(executor, task, waiting, AHEAD):
                 try:
-                    outcomes = future.result()
+                    trials = future.result()
                 except KilledWorker:
-                    outcomes = give_up(iteration)
+                    trials = give_up(iteration)
                 except CancelledError as error:
                     raise InputError(
                         f"--scheduler {address}: the cluster is gone; worlds that are done are "
                         "kept, and the same command goes on with the rest"
                     ) from error
-                yield outcomes
+                yield trials
         finally:
             executor.shutdown(wait=False)
 

@@ -168,7 +168,7 @@ def plan_text(plan: Plan) -> str:
     return tomli_w.dumps(_as_table(plan))
 
 
-def differences(there: Plan, asked: Plan) -> list[str]:
+def changed_settings(there: Plan, asked: Plan) -> list[str]:
     """Name what differs between two plans, but for the number of worlds.
 
     Parameters
@@ -185,7 +185,7 @@ def differences(there: Plan, asked: Plan) -> list[str]:
     >>> plans = [
     ...     read_plan(find_plan("paper"), from_flags({"seed": seed}), seed) for seed in (1, 2)
     ... ]
-    >>> differences(*plans)
+    >>> changed_settings(*plans)
     ['config.seed: 1 there, 2 asked for']
     """
     old, new = (

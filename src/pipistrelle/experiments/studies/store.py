@@ -12,14 +12,14 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 from uuid import uuid4
 
 from pipistrelle import __version__
 from pipistrelle.config import InputError
 from pipistrelle.experiments.results.folder import put_in_place, write_down, write_whole
 from pipistrelle.experiments.studies.plan import Plan
-from pipistrelle.experiments.studies.plan_file import differences, plan_text, read_plan
+from pipistrelle.experiments.studies.plan_file import changed_settings, plan_text, read_plan
 from pipistrelle.experiments.studies.world import TrialRecord, world_schemas, world_tables
 from pipistrelle.settings import to_toml
 
@@ -53,8 +53,19 @@ Two runs of one plan differ in wall_s and cpu_s alone.
     polars.read_parquet("trials/*.parquet")
 """
 
-Outcome = tuple[str, str | None]
-"""A trial's strategy, and its error if it failed."""
+
+class EndedTrial(NamedTuple):
+    """How a trial ended, as a worker reports it.
+
+    Attributes
+    ----------
+    strategy : "active", "fused" or "passive"
+    error : str or None
+        What is recorded of a trial that failed.
+    """
+
+    strategy: str
+    error: str | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,7 +111,7 @@ def open_store(folder: Path, plan: Plan) -> None:
                 f"{folder}: holds {strange[0].name} and no plan.toml, so it is no study's folder; "
                 "name another with -o DIR"
             )
-        if there is not None and (found := differences(there, plan)):
+        if there is not None and (found := changed_settings(there, plan)):
             told = "".join(f"\n  {line}" for line in found)
             raise InputError(
                 f"{kept}: is the plan of another study; name a new folder with -o DIR{told}"
@@ -137,7 +148,7 @@ def done_worlds(folder: Path) -> set[int]:
     return {int(name) for name in names if name.isdecimal()}
 
 
-def read_outcomes(folder: Path, iteration: int) -> list[Outcome]:
+def read_ended_trials(folder: Path, iteration: int) -> list[EndedTrial]:
     """Tell how the trials of a world that is done ended.
 
     Parameters
@@ -147,7 +158,7 @@ def read_outcomes(folder: Path, iteration: int) -> list[Outcome]:
 
     Returns
     -------
-    list of Outcome
+    list of EndedTrial
 
     Raises
     ------
@@ -158,12 +169,13 @@ def read_outcomes(folder: Path, iteration: int) -> list[Outcome]:
 
     path = world_file(folder, "trials", iteration)
     try:
-        return pl.read_parquet(path, columns=["strategy", "error"]).rows()
+        table = pl.read_parquet(path, columns=list(EndedTrial._fields))
     except (OSError, pl.exceptions.PolarsError) as error:
         raise InputError(
             f"{path}: could not be read ({error}); remove it and run the study again to have this "
             "world anew"
         ) from error
+    return [EndedTrial(*row) for row in table.rows()]
 
 
 def world_file(folder: Path, table: str, iteration: int) -> Path:

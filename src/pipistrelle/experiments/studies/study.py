@@ -8,9 +8,7 @@ run in this process, in several, or on a Dask cluster (`studies.executors`): on 
 
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import (
-    Executor,
-)
+from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -19,7 +17,7 @@ from pathlib import Path
 from pipistrelle.config import InputError
 from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.estimation.outside import look_in
-from pipistrelle.experiments.hearing.scenario import bicycle
+from pipistrelle.experiments.hearing.scenario import bicycle, landmark_count
 from pipistrelle.experiments.machine import check_length, check_memory, keep_freed_memory
 from pipistrelle.experiments.runs.outside import check_filters
 from pipistrelle.experiments.studies.executors import (
@@ -31,10 +29,10 @@ from pipistrelle.experiments.studies.executors import (
 )
 from pipistrelle.experiments.studies.plan import Plan, cases_of
 from pipistrelle.experiments.studies.store import (
-    Outcome,
+    EndedTrial,
     done_worlds,
     open_store,
-    read_outcomes,
+    read_ended_trials,
     sweep,
     write_world,
 )
@@ -45,7 +43,7 @@ KILLED = "its process ended without a word, twice: killed, or out of memory\n"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Standing:
+class StudyProgress:
     """How far a study is.
 
     Attributes
@@ -77,8 +75,8 @@ def run_study(
     scheduler: str | None = None,
     executor: Executor | None = None,
     retry_failed: bool = False,
-    progress: Callable[[Standing], None] | None = None,
-) -> Standing:
+    progress: Callable[[StudyProgress], None] | None = None,
+) -> StudyProgress:
     """Run the worlds of a plan that are not done yet.
 
     Parameters
@@ -98,11 +96,11 @@ def run_study(
     retry_failed : bool
         Run the worlds again that hold failed trials.
     progress : callable, optional
-        Given the standing, first as it is found, then whenever a world is done.
+        Given how far the study is, first as it is found, then whenever a world is done.
 
     Returns
     -------
-    Standing
+    StudyProgress
         Of the shard.
 
     Raises
@@ -119,8 +117,8 @@ def run_study(
     >>> config = Config(scenario=ScenarioConfig(steps=8, landmarks=12))
     >>> plan = Plan(name="one", iterations=2, config=config, grid={}, **ways)
     >>> with tempfile.TemporaryDirectory() as name:
-    ...     standing = run_study(plan, Path(name))
-    >>> standing.done, standing.ended
+    ...     so_far = run_study(plan, Path(name))
+    >>> so_far.done, so_far.ended
     (2, {'fused': 2})
     """
     if executor is None and scheduler in (None, "local"):
@@ -131,16 +129,16 @@ def run_study(
     worlds = range(shard[0], plan.iterations, shard[1])
     done = done_worlds(folder).intersection(worlds)
     sweep(folder, done)
-    standing = _nothing_done(plan, len(worlds))
+    so_far = _nothing_done(plan, len(worlds))
     waiting: deque[int] = deque()
     for iteration in worlds:
-        outcomes = read_outcomes(folder, iteration) if iteration in done else None
-        if outcomes is None or (retry_failed and any(error for _, error in outcomes)):
+        trials = read_ended_trials(folder, iteration) if iteration in done else None
+        if trials is None or (retry_failed and any(trial.error for trial in trials)):
             waiting.append(iteration)
         else:
-            standing = _advanced(standing, outcomes)
+            so_far = _advanced(so_far, trials)
     show = progress or (lambda _: None)
-    show(standing)
+    show(so_far)
     place, here = folder.absolute(), Path.cwd()
     task, give_up = partial(_work, place, plan, here), partial(_give_up, place, plan)
     found: Results
@@ -153,14 +151,14 @@ def run_study(
     else:
         found = (task(iteration) for iteration in waiting)
     with closing(found):
-        for outcomes in found if waiting else ():
-            standing = _advanced(standing, outcomes)
-            show(standing)
-    if len(done_worlds(folder).intersection(worlds)) < standing.done:
+        for trials in found if waiting else ():
+            so_far = _advanced(so_far, trials)
+            show(so_far)
+    if len(done_worlds(folder).intersection(worlds)) < so_far.done:
         raise InputError(
             f"{folder}: lacks worlds that are done; expected one folder for all workers"
         )
-    return standing
+    return so_far
 
 
 def _refuse_too_large(plan: Plan, workers: int) -> None:
@@ -169,17 +167,17 @@ def _refuse_too_large(plan: Plan, workers: int) -> None:
         check_length(case.config.scenario, workers=workers)
         check_memory(
             [case.filter],
-            case.config.scenario.landmarks + 1,
+            landmark_count(case.config),
             case.config,
             passive=case.strategy != "active",
             workers=workers,
         )
 
 
-def _nothing_done(plan: Plan, worlds: int) -> Standing:
-    """Return the standing at the very start."""
+def _nothing_done(plan: Plan, worlds: int) -> StudyProgress:
+    """Return how far a study is at the very start."""
     cases = Counter[str](case.strategy for case in cases_of(plan))
-    return Standing(
+    return StudyProgress(
         worlds=worlds,
         done=0,
         trials={strategy: number * worlds for strategy, number in cases.items()},
@@ -189,33 +187,33 @@ def _nothing_done(plan: Plan, worlds: int) -> Standing:
     )
 
 
-def _advanced(standing: Standing, outcomes: Sequence[Outcome]) -> Standing:
-    """Return the standing with one more world done."""
-    errors = [error for _, error in outcomes if error is not None]
-    ended = Counter(strategy for strategy, _ in outcomes)
-    failed = Counter(strategy for strategy, error in outcomes if error is not None)
+def _advanced(so_far: StudyProgress, trials: Sequence[EndedTrial]) -> StudyProgress:
+    """Return how far a study is with one more world done."""
+    errors = [trial.error for trial in trials if trial.error is not None]
+    ended = Counter(trial.strategy for trial in trials)
+    failed = Counter(trial.strategy for trial in trials if trial.error is not None)
     told = errors[0].strip().splitlines()[-1] if errors else None
     return replace(
-        standing,
-        done=standing.done + 1,
-        ended={strategy: n + ended[strategy] for strategy, n in standing.ended.items()},
-        failed={strategy: n + failed[strategy] for strategy, n in standing.failed.items()},
-        first_error=standing.first_error or told,
+        so_far,
+        done=so_far.done + 1,
+        ended={strategy: n + ended[strategy] for strategy, n in so_far.ended.items()},
+        failed={strategy: n + failed[strategy] for strategy, n in so_far.failed.items()},
+        first_error=so_far.first_error or told,
     )
 
 
-def _work(folder: Path, plan: Plan, here: Path, iteration: int) -> list[Outcome]:
+def _work(folder: Path, plan: Plan, here: Path, iteration: int) -> list[EndedTrial]:
     """Run a world and write its results; done by a worker, whatever and wherever it is."""
     keep_freed_memory()
     if not CATALOGUE.keys() >= set(plan.filters):
         look_in(here)
     records = run_world(plan, iteration)
     write_world(folder, plan, iteration, records)
-    return [(record.case.strategy, record.error) for record in records]
+    return [EndedTrial(record.case.strategy, record.error) for record in records]
 
 
-def _give_up(folder: Path, plan: Plan, iteration: int) -> list[Outcome]:
+def _give_up(folder: Path, plan: Plan, iteration: int) -> list[EndedTrial]:
     """Record a world that cannot be had as failed."""
     records = failed_records(plan, KILLED)
     write_world(folder, plan, iteration, records)
-    return [(record.case.strategy, record.error) for record in records]
+    return [EndedTrial(record.case.strategy, record.error) for record in records]

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from pipistrelle.evaluation.comparison import Finding
+from pipistrelle.experiments.hearing.scenario import landmark_count
 from pipistrelle.report.claims.published import beam_name
 from pipistrelle.report.claims.verdicts import WITHOUT, JudgedClaim
 from pipistrelle.report.studied import (
@@ -170,7 +171,7 @@ def _counted(selection: Selection) -> str:
         if said:
             return (
                 "Hearing the beacon as well as its own calls, the vehicle fully places, of "
-                f"{study.config.scenario.landmarks + 1} landmarks, {' and '.join(said)} ({title})."
+                f"{landmark_count(study.config)} landmarks, {' and '.join(said)} ({title})."
             )
     return ""
 
