@@ -41,9 +41,9 @@ def test_a_given_reader_is_asked_first(made_up):
 
 
 def test_the_robots_of_a_set_are_those_whose_odometry_is_there(made_up):
-    assert MRCLAM.robots(made_up) == ["1"]
+    assert MRCLAM.robots(made_up) == [1]
     (made_up / "Robot4_Odometry.dat").touch()
-    assert MRCLAM.robots(made_up) == ["1", "4"]
+    assert MRCLAM.robots(made_up) == [1, 4]
 
 
 def test_an_entry_reads_what_its_formats_own_function_reads():

@@ -133,6 +133,11 @@ def test_a_robot_is_named_for_a_mrclam_set_and_only_there(folder):
     refused(lambda: load(folder, 1), "robot 1", "--robot")
 
 
+def test_a_robot_is_found_by_the_text_of_its_number():
+    assert load(MADE_UP, "1")[0].name == load(MADE_UP, 1)[0].name
+    refused(lambda: load(MADE_UP, "one"), "--robot", "found robot one", "(1)")
+
+
 # A format from elsewhere
 
 
@@ -168,6 +173,21 @@ def test_the_truth_of_ones_own_format_may_say_how_the_log_begins(folder):
     assert truth is NO_TRUTH
     refused(lambda: load(folder, **known), "found no robot", "(7)")
     refused(lambda: load(folder / "gone", **known), "a tape or a log folder or a MRCLAM set;")
+
+
+def test_a_robot_goes_by_its_name_where_its_format_has_names(folder):
+    herd = Reader(
+        name="herd",
+        title="walks of a herd",
+        recognises=lambda folder: True,
+        read=lambda _, robot: replace(read_log(folder), name=robot),
+        robots=lambda folder: ["ant", "bee"],
+    )
+    log, truth = load(folder, "bee", readers=[herd])
+    assert log.name == "bee"
+    assert truth.path is not None
+    refused(lambda: load(folder, "cat", readers=[herd]), "found robot cat", "(ant, bee)")
+    refused(lambda: load(folder, 1, readers=[herd]), "found robot 1", "(ant, bee)")
 
 
 # MRCLAM

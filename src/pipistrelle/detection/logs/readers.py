@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from pipistrelle.detection.logs.recording import Log
 
 
+Robot = int | str
+"""Whose log of several: by number or by name, as the format has it."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reader:
     """What the rest of the package knows of a format.
@@ -28,7 +32,8 @@ class Reader:
     read : function of a folder and, where it may hold several robots' logs, the robot
         Returns a `Log`.
     robots : function of a folder, optional
-        Names the robots whose logs it holds; without it there is one, and it needs no name.
+        Lists the robots whose logs it holds, by number or by name: ``read`` is given one of these.
+        Without it there is one, and it needs no name.
     help, robot_help : str
         What the command line says of the folder, and of whom ``--robot`` chooses from.
     """
@@ -37,7 +42,7 @@ class Reader:
     title: str
     recognises: Callable[[Path], bool]
     read: "Callable[..., Log]"
-    robots: Callable[[Path], list[str]] | None = None
+    robots: Callable[[Path], Sequence[Robot]] | None = None
     help: str = ""
     robot_help: str = ""
 
@@ -81,10 +86,12 @@ def _is_mrclam(folder: Path) -> bool:
     return (folder / "Barcodes.dat").exists() or any(folder.glob("Robot*_Odometry.dat"))
 
 
-def _mrclam_robots(folder: Path) -> list[str]:
-    """Name the robots whose odometry is there."""
+def _mrclam_robots(folder: Path) -> list[Robot]:
+    """List the robots whose odometry is there: their numbers, or what stands in their place."""
     files = sorted(path.name for path in folder.glob("Robot*_Odometry.dat"))
-    return [name.removeprefix("Robot").removesuffix("_Odometry.dat") for name in files]
+    names = [name.removeprefix("Robot").removesuffix("_Odometry.dat") for name in files]
+    numbers = {str(number): number for number in range(1, 6)}
+    return [numbers.get(name, name) for name in names]
 
 
 def _read_mrclam(folder: Path, robot: int, **framed: Any) -> "Log":

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pipistrelle.config import Config, Strategy
-from pipistrelle.detection.logs.readers import READERS, Reader, reader_of
+from pipistrelle.detection.logs.readers import READERS, Reader, Robot, reader_of
 from pipistrelle.detection.logs.recording import Log
 from pipistrelle.detection.noise import noise_of
 from pipistrelle.detection.scans import Scan, rows_of
@@ -25,22 +25,24 @@ from pipistrelle.refusals import refusal
 
 def load(
     folder: Path,
-    robot: int | None = None,
+    robot: Robot | None = None,
     *,
     readers: Sequence[Reader] = (),
-    truths: Mapping[str, WithTruth] = TRUTHS,
+    truths: Mapping[str, WithTruth] = {},
 ) -> tuple[Log, Truth]:
     """Read a recorded log, and what is known of its truth.
 
     Parameters
     ----------
     folder : Path
-    robot : int
-        Where the format holds the logs of several, as a MRCLAM set does, and only there.
+    robot : int or str
+        Where the format holds the logs of several, as a MRCLAM set does, and only there: its
+        number or its name.
     readers : sequence of Reader
         Of formats that the package does not know; they are asked before its own.
     truths : mapping of a reader's name to the function that reads its log with the truth
-        Without one, the truth is ``truth.csv`` and ``landmarks.csv`` beside the log.
+        In place of the package's own of that name. Without either, the truth is ``truth.csv`` and
+        ``landmarks.csv`` beside the log.
 
     Returns
     -------
@@ -51,6 +53,23 @@ def load(
     ------
     InputError
         With the file and the line or key, what was found, what was expected and the fix.
+
+    Examples
+    --------
+    >>> walk = Log(
+    ...     name="walk", time=np.array([0.0, 1.0]), controls=np.array([[1.0, 0.0]]),
+    ...     dt=np.array([1.0]), scans=(), motion="unicycle", control_std=(0.1, 0.1),
+    ...     initial_pose=(0.0, 0.0, 0.0), initial_pose_std=(0.0, 0.0, 0.0), range_std=0.2,
+    ...     bearing_std=0.06, range_bounds=(0.5, 20.0), ignored_rows={},
+    ... )
+    >>> herd = Reader(
+    ...     name="herd", title="walks of a herd", recognises=lambda folder: True,
+    ...     read=lambda folder, robot: replace(walk, name=robot),
+    ...     robots=lambda folder: ["ant", "bee"],
+    ... )
+    >>> log, truth = load(Path(), "bee", readers=[herd])
+    >>> log.name, truth.path
+    ('bee', None)
     """
     known = (*readers, *READERS)
     if not folder.is_dir():
@@ -103,7 +122,27 @@ def as_heard_by(
 
 
 def motion_of(log: Log) -> Motion:
-    """Return the motion model of a log, as the filters take it."""
+    """Return the motion model of a log, as the filters take it.
+
+    Parameters
+    ----------
+    log : Log
+
+    Returns
+    -------
+    Motion
+
+    Examples
+    --------
+    >>> log = Log(
+    ...     name="walk", time=np.array([0.0, 1.0]), controls=np.array([[1.0, 0.0]]),
+    ...     dt=np.array([1.0]), scans=(), motion="unicycle", control_std=(0.1, 0.15),
+    ...     initial_pose=(0.0, 0.0, 0.0), initial_pose_std=(0.0, 0.0, 0.0), range_std=0.2,
+    ...     bearing_std=0.06, range_bounds=(0.5, 20.0), ignored_rows={},
+    ... )
+    >>> motion_of(log).control_std
+    (0.1, 0.15)
+    """
     return Motion(
         model=log.motion,
         control_std=log.control_std,
@@ -113,7 +152,28 @@ def motion_of(log: Log) -> Motion:
 
 
 def start_of(log: Log) -> Gaussian:
-    """Return the pose at which a log starts, (3) and (3, 3), as the filters take it."""
+    """Return the pose at which a log starts, as the filters take it.
+
+    Parameters
+    ----------
+    log : Log
+
+    Returns
+    -------
+    Gaussian of (3) [m, m, rad] and (3, 3)
+        The errors of x, y and heading are independent.
+
+    Examples
+    --------
+    >>> log = Log(
+    ...     name="walk", time=np.array([0.0, 1.0]), controls=np.array([[1.0, 0.0]]),
+    ...     dt=np.array([1.0]), scans=(), motion="unicycle", control_std=(0.1, 0.15),
+    ...     initial_pose=(2.0, 0.0, 1.5), initial_pose_std=(0.5, 0.5, 0.25), range_std=0.2,
+    ...     bearing_std=0.06, range_bounds=(0.5, 20.0), ignored_rows={},
+    ... )
+    >>> start_of(log).mean, start_of(log).covariance.diagonal()
+    (array([2. , 0. , 1.5]), array([0.25  , 0.25  , 0.0625]))
+    """
     variance = np.square(np.array(log.initial_pose_std, dtype=float))
     return Gaussian(mean=np.array(log.initial_pose, dtype=float), covariance=np.diag(variance))
 
@@ -152,6 +212,22 @@ def replay(
     ------
     InputError
         For an estimator that cannot be had or built.
+
+    Examples
+    --------
+    A post 2 m ahead, after 1 m of walk, stands at 3 m.
+
+    >>> from pipistrelle.detection.scans import make_scan
+    >>> ahead = make_scan(1.0, np.array([7]), np.array([0.0]), range=np.array([2.0]))
+    >>> log = Log(
+    ...     name="walk", time=np.array([0.0, 1.0]), controls=np.array([[1.0, 0.0]]),
+    ...     dt=np.array([1.0]), scans=(ahead,), motion="unicycle", control_std=(0.1, 0.1),
+    ...     initial_pose=(0.0, 0.0, 0.0), initial_pose_std=(0.0, 0.0, 0.0), range_std=0.2,
+    ...     bearing_std=0.06, range_bounds=(0.5, 20.0), ignored_rows={},
+    ... )
+    >>> (trial,) = replay(log, Truth(time=log.time), ["active"], ["ekf"], None, Config())
+    >>> trial.track.landmarks.landmark, trial.track.landmarks.mean
+    (array([7]), array([[3., 0.]]))
     """
     drive = Drive(
         motion=motion_of(log),
@@ -170,8 +246,8 @@ def replay(
 
 
 def _whose(
-    reader: Reader, folder: Path, robot: int | None, known: Sequence[Reader]
-) -> tuple[int, ...]:
+    reader: Reader, folder: Path, robot: Robot | None, known: Sequence[Reader]
+) -> tuple[Robot, ...]:
     """Return the robot for a reader that must be told, and nothing for one that must not."""
     if reader.robots is None:
         if robot is None:
@@ -179,9 +255,9 @@ def _whose(
         found = f"a log of one vehicle, but robot {robot} was asked for"
         expected = " or ".join(other.title for other in known if other.robots is not None)
         raise refusal(folder, found, expected, "leave out --robot")
-    robots = reader.robots(folder)
+    robots = {str(there): there for there in reader.robots(folder)}
     if robot is None or str(robot) not in robots:
         found = "no robot" if robot is None else f"robot {robot}"
         expected = f"one whose odometry is there ({', '.join(robots) or 'none is'})"
         raise refusal(f"{folder}, option --robot", found, expected, "name another")
-    return (robot,)
+    return (robots[str(robot)],)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from pipistrelle.detection.logs.readers import Robot
 from pipistrelle.detection.logs.recording import Log
 from pipistrelle.detection.logs.text_tables import check_unique, read_table, write_table
 from pipistrelle.experiments.drives import LabelledPoints, Truth
@@ -24,14 +25,14 @@ Read = Callable[..., Log]
 """Reads a log of a folder, and of the robot where there are several."""
 
 
-def with_files_beside(read: Read, folder: Path, *robot: int) -> tuple[Log, Truth]:
+def with_files_beside(read: Read, folder: Path, *robot: Robot) -> tuple[Log, Truth]:
     """Read a log, and ``truth.csv`` and ``landmarks.csv`` of its folder.
 
     Parameters
     ----------
     read : callable
     folder : Path
-    robot : int, where the folder holds several
+    robot : int or str, where the folder holds several
 
     Returns
     -------
