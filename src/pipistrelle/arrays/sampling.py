@@ -116,5 +116,25 @@ def blocks_to_hear(arrivals: Arrivals, sampling: Sampling) -> int:
 
 
 def block_shape(blocks: int, layout: Layout, sampling: Sampling) -> tuple[int, int, int, int]:
-    """Shape of a recording in block sums: (blocks, faces, tones, elements)."""
+    """Shape of a recording in block sums.
+
+    Parameters
+    ----------
+    blocks : int
+    layout : Layout
+    sampling : Sampling
+
+    Returns
+    -------
+    blocks, faces, tones, elements : int
+
+    Examples
+    --------
+    >>> from pipistrelle.acoustics.callers import callers_of
+    >>> from pipistrelle.arrays.layout import square_of_four
+    >>> config = Config()
+    >>> settled = sampling(config, callers_of(config, np.zeros(2)))
+    >>> block_shape(300, square_of_four(config.receiver), settled)
+    (300, 4, 2, 10)
+    """
     return (blocks, layout.normal.size, sampling.tones.size, layout.position.size)

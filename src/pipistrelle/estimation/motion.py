@@ -52,7 +52,22 @@ class MotionNumbers(NamedTuple):
 
 @lru_cache(maxsize=16)
 def motion_numbers(motion: Motion) -> MotionNumbers:
-    """Turn a motion model into numbers for the kernels, once."""
+    """Turn a motion model into numbers for the kernels, once.
+
+    Parameters
+    ----------
+    motion : Motion
+
+    Returns
+    -------
+    MotionNumbers
+
+    Examples
+    --------
+    >>> numbers = motion_numbers(Motion(model="unicycle", control_std=(0.5, 0.25)))
+    >>> numbers.model, numbers.speed_variance, numbers.turn_variance
+    (1, 0.25, 0.0625)
+    """
     return MotionNumbers(
         model=MOTION_MODELS.index(motion.model),
         wheelbase=float(motion.wheelbase),

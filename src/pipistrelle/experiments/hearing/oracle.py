@@ -55,6 +55,26 @@ def label_detections(
     Notes
     -----
     Bradley & Abaid, Sec. III-B ("we assumed known data association").
+
+    Examples
+    --------
+    Heard are landmark 7, a little late and to the side, and what is an echo of nothing.
+
+    >>> from pipistrelle.arrays.layout import square_of_four
+    >>> from pipistrelle.config import Config
+    >>> echoes = Arrivals(
+    ...     delay=np.array([0.030, 0.050]), level_db=np.zeros(2), bearing=np.array([0.2, -0.3]),
+    ...     frequency=np.full(2, 35e3), caller=np.zeros(2, np.int8), landmark=np.array([7, 9]),
+    ... )
+    >>> bearing = np.array([0.25, 0.6])
+    >>> heard = Detections(
+    ...     face=np.zeros(2, int), caller=np.zeros(2, int), angle=bearing, bearing=bearing,
+    ...     delay=np.array([0.0302, 0.050]), power=np.array([90.0, 60.0]),
+    ... )
+    >>> layout = square_of_four(Config().receiver)
+    >>> gates = AssociationConfig()
+    >>> label_detections(heard, echoes, layout, gates, pulse=2.8e-3, faintest_db=-30.0)
+    array([ 7, -1])
     """
     order = np.argsort(-detections.power, kind="stable")
     found = (detections.face, detections.caller, detections.delay, detections.bearing)

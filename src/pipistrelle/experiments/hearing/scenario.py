@@ -177,7 +177,25 @@ def moving_labels(scenario: Scenario) -> tuple[int, ...]:
 
 
 def bicycle(motion: MotionConfig) -> Motion:
-    """Return the settings' motion model."""
+    """Return the settings' motion model, as the filters take it.
+
+    Parameters
+    ----------
+    motion : MotionConfig
+
+    Returns
+    -------
+    Motion
+
+    Notes
+    -----
+    Bradley & Abaid, Eq. (5).
+
+    Examples
+    --------
+    >>> bicycle(MotionConfig(speed_std=0.2)).control_std
+    (0.2, 0.03)
+    """
     return Motion(
         model="bicycle",
         control_std=(motion.speed_std, motion.steering_std),

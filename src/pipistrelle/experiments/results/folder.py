@@ -207,7 +207,27 @@ def write_whole(path: Path, data: bytes, writer: str = "") -> None:
 
 
 def write_down(path: Path, data: bytes) -> None:
-    """Write a file down to the disk, so that a rename cannot outlive its content."""
+    """Write a file down to the disk, so that a rename cannot outlive its content.
+
+    Parameters
+    ----------
+    path : Path
+        What stood there is replaced.
+    data : bytes
+
+    Raises
+    ------
+    OSError
+        Where it cannot be written.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as place:
+    ...     write_down(Path(place) / "one.partial", b"word")
+    ...     (Path(place) / "one.partial").read_bytes()
+    b'word'
+    """
     with path.open("wb") as file:
         file.write(data)
         file.flush()
@@ -215,7 +235,29 @@ def write_down(path: Path, data: bytes) -> None:
 
 
 def put_in_place(partial: Path, path: Path) -> None:
-    """Rename a file that is whole, unless another process did so, and swept ours away."""
+    """Rename a file that is whole, unless another process did so, and swept ours away.
+
+    Parameters
+    ----------
+    partial, path : Path
+        Its name so far, and the one that it is to have; what stood there is replaced.
+
+    Raises
+    ------
+    OSError
+        Where it cannot be renamed; also where neither of the two is there.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as place:
+    ...     partial, whole = Path(place) / "one.partial", Path(place) / "one"
+    ...     write_down(partial, b"word")
+    ...     put_in_place(partial, whole)
+    ...     put_in_place(partial, whole)  # by another process, after this one
+    ...     partial.exists(), whole.exists()
+    (False, True)
+    """
     try:
         partial.replace(path)
     except FileNotFoundError:

@@ -148,7 +148,36 @@ def write_truth(folder: Path, truth: Truth) -> None:
 def read_path(
     path: Path, separator: str | None
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Times and poses, the heading unwrapped; of two rows with one time the later wins."""
+    r"""Read times and poses, the heading unwrapped; of two rows with one time the later wins.
+
+    Parameters
+    ----------
+    path : Path
+        Of a table of ``time``, ``x``, ``y`` and ``heading``.
+    separator : str or None
+        Between columns; None: spaces, and no header.
+
+    Returns
+    -------
+    time : (n) [s]
+        Rising.
+    poses : (n, 3) [m, m, rad]
+
+    Raises
+    ------
+    InputError
+        With the file and the line.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as place:
+    ...     file = Path(place) / "truth.csv"
+    ...     _ = file.write_text("time,x,y,heading\n0,1,2,3.0\n1,1,2,-3.0\n")
+    ...     time, poses = read_path(file, ",")
+    >>> time, poses[:, 2].round(2)
+    (array([0., 1.]), array([3.  , 3.28]))
+    """
     column = read_table(path, _PATH, separator=separator).column
     last = np.append(np.diff(column["time"]) > 0, True)
     heading = np.unwrap(column["heading"][last])
@@ -156,7 +185,35 @@ def read_path(
 
 
 def read_landmarks(path: Path, columns: tuple[str, ...], separator: str | None) -> LabelledPoints:
-    """Labels and positions; each label once."""
+    r"""Read labels and positions; each label once.
+
+    Parameters
+    ----------
+    path : Path
+    columns : tuple of str
+        Of the table: ``landmark`` or ``subject`` first, and ``x`` and ``y`` among the others.
+    separator : str or None
+        Between columns; None: spaces, and no header.
+
+    Returns
+    -------
+    labels (n) and positions (n, 2) [m]
+
+    Raises
+    ------
+    InputError
+        With the file and the line.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as place:
+    ...     file = Path(place) / "chart.txt"
+    ...     _ = file.write_text("4 1.0 -2.5\n9 0.0 3.0\n")
+    ...     labels, places = read_landmarks(file, ("landmark", "x", "y"), None)
+    >>> labels, places[0]
+    (array([4, 9]), array([ 1. , -2.5]))
+    """
     table = read_table(path, columns, separator=separator)
     check_unique(table, columns[0])
     return table.column[columns[0]], np.column_stack((table.column["x"], table.column["y"]))
@@ -165,6 +222,26 @@ def read_landmarks(path: Path, columns: tuple[str, ...], separator: str | None) 
 def poses_at(
     time: Float[np.ndarray, " k"], known: Float[np.ndarray, " n"], path: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "k 3"]:
-    """Poses at other times, linear in between, NaN outside."""
+    """Poses at other times, linear in between, NaN outside.
+
+    Parameters
+    ----------
+    time : (k) [s]
+    known : (n) [s]
+        Times of the poses that are known, rising.
+    path : (n, 3) [m, m, rad]
+        These poses, the heading unwrapped.
+
+    Returns
+    -------
+    (k, 3) [m, m, rad]
+
+    Examples
+    --------
+    >>> path = np.array([[0.0, 0.0, 3.0], [1.0, 2.0, 4.0]])
+    >>> poses_at(np.array([0.25, 2.0]), np.array([0.0, 1.0]), path)
+    array([[0.25, 0.5 , 3.25],
+           [ nan,  nan,  nan]])
+    """
     columns = [np.interp(time, known, column, left=np.nan, right=np.nan) for column in path.T]
     return np.column_stack(columns)

@@ -24,16 +24,43 @@ AHEAD = 1000
 
 
 Task = Callable[[int], list[EndedTrial]]
-
-
+"""Computes a world, writes its results, and tells how its trials ended."""
 Ended = tuple[int, "Future[list[EndedTrial]]"]
-
-
+"""A world that is no longer running, and what came of it."""
 Results = Generator[list[EndedTrial], None, None]
+"""The trials of one world after another, in the order in which they end."""
 
 
 def ended(executor: Executor, task: Task, waiting: deque[int], ahead: int) -> Iterator[Ended]:
-    """Keep an executor busy; yield each world when it ended, and its future."""
+    """Keep an executor busy; tell of each world when it has ended.
+
+    Once the executor is broken, no more is handed to it, and what is left stays in ``waiting``.
+
+    Parameters
+    ----------
+    executor : Executor
+    task : function of a world's number
+    waiting : deque of int
+        Worlds; what is handed to the executor is taken out.
+    ahead : int
+        Worlds handed to it before the first of them has ended.
+
+    Yields
+    ------
+    int
+        The world.
+    Future
+        Of its trials, or of what ended it.
+
+    Examples
+    --------
+    >>> from concurrent.futures import ThreadPoolExecutor
+    >>> def task(world):
+    ...     return [EndedTrial("fused", None if world else "at sea")]
+    >>> with ThreadPoolExecutor() as pool:
+    ...     [(world, its.result()[0].error) for world, its in ended(pool, task, deque([3, 0]), 1)]
+    [(3, None), (0, 'at sea')]
+    """
     running: dict[Future[list[EndedTrial]], int] = {}
     try:
         while running or (waiting and ahead):
@@ -51,7 +78,29 @@ def ended(executor: Executor, task: Task, waiting: deque[int], ahead: int) -> It
 
 
 def in_processes(task: Task, give_up: Task, waiting: deque[int], workers: int) -> Results:
-    """Run worlds in processes; those in processes that die are tried again, one at a time."""
+    """Run worlds in processes; those in processes that die are tried again, one at a time.
+
+    Parameters
+    ----------
+    task : function of a world's number
+        It must survive pickling, as the processes are spawned.
+    give_up : function of a world's number
+        Called here for a world that has taken its process with it twice.
+    waiting : deque of int
+        Worlds.
+    workers : int
+        Processes at the same time.
+
+    Yields
+    ------
+    list of EndedTrial
+        Of one world after another.
+
+    Raises
+    ------
+    InputError
+        Where no process lives to the end of a world.
+    """
     alive = False
     while waiting:
         suspects, lost = deque[int](), deque[int]()
@@ -119,7 +168,31 @@ def _become_worker() -> None:
 def on_cluster(
     task: Task, give_up: Task, waiting: deque[int], workers: int, address: str
 ) -> Results:
-    """Run worlds on Dask's workers; Dask itself tries again what a dead worker leaves."""
+    """Run worlds on Dask's workers; Dask itself tries again what a dead worker leaves.
+
+    Parameters
+    ----------
+    task : function of a world's number
+        It must survive pickling.
+    give_up : function of a world's number
+        Called here for a world that Dask no longer tries.
+    waiting : deque of int
+        Worlds.
+    workers : int
+        Of a cluster that is started here; another has its own.
+    address : str
+        "local": a cluster on this machine; else that of a scheduler.
+
+    Yields
+    ------
+    list of EndedTrial
+        Of one world after another.
+
+    Raises
+    ------
+    InputError
+        Where Dask is not installed, no scheduler answers, or the cluster goes away.
+    """
     with _client(address, workers) as client:
         from distributed import KilledWorker
 

@@ -104,7 +104,35 @@ def cases_of(plan: Plan) -> tuple[PlannedCase, ...]:
 def combinations(
     layer: Layer, grid: Mapping[str, tuple[Any, ...]], prefix: str
 ) -> Iterator[tuple[dict[str, Any], Config]]:
-    """Walk through the product of a grid: the values by their names, and the settings."""
+    """Walk through the product of a grid.
+
+    Parameters
+    ----------
+    layer : Layer
+        Settings that hold where the grid says nothing else.
+    grid : dict of tuple
+        Settings by their dotted name, with the values that each takes.
+    prefix : str
+        Before such a name, where a refusal says which value is wrong.
+
+    Yields
+    ------
+    dict
+        The values of one combination, by their names; those of the last name change fastest.
+    Config
+        With these values.
+
+    Raises
+    ------
+    InputError
+        For a value that its setting does not take.
+
+    Examples
+    --------
+    >>> grid = {"seed": (1, 2), "filter.gate": (0.9,)}
+    >>> [(named["seed"], config.filter.gate) for named, config in combinations({}, grid, "grid.")]
+    [(1, 0.9), (2, 0.9)]
+    """
     for values in product(*grid.values()):
         named = dict(zip(grid, values, strict=True))
         varied = {

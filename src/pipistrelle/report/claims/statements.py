@@ -64,6 +64,18 @@ class Claim:
 def counts_as_printed(selection: Selection) -> list[Part]:
     """Claim 1: our mean counts lie within the paper's standard deviation of the paper's.
 
+    Parameters
+    ----------
+    selection : Selection
+
+    Returns
+    -------
+    list of Part
+        Fully initialised landmarks, and all; one statement per row of the table that the study has
+        a case of.
+
+    Notes
+    -----
     Bradley & Abaid, Table II.
     """
     parts = []
@@ -87,7 +99,21 @@ def ekf_more_consistent(selection: Selection) -> list[Part]:
     """Claim 2: which filter's ANEES is nearer to 3, how it swings with the laps, how it rises.
 
     Per strategy, averaged over the beamwidths; the paper calls FastSLAM's fused ANEES anomalous
-    and does not count it among the periodic ones. Bradley & Abaid, Sec. V-B.
+    and does not count it among the periodic ones.
+
+    Parameters
+    ----------
+    selection : Selection
+
+    Returns
+    -------
+    list of Part
+        Nearer to 3, a statement per strategy; swing and rise, one per filter and strategy, none
+        where a drive is less than two laps.
+
+    Notes
+    -----
+    Bradley & Abaid, Sec. V-B.
     """
     nearer, swing, rise = [], [], []
     fit = lap_fit(selection.study)
@@ -120,6 +146,17 @@ def ekf_more_consistent(selection: Selection) -> list[Part]:
 def ekf_more_accurate(selection: Selection) -> list[Part]:
     """Claim 3: EKF's position RMSE is lower than FastSLAM's everywhere, and passive is worst.
 
+    Parameters
+    ----------
+    selection : Selection
+
+    Returns
+    -------
+    list of Part
+        Each filter's beamwidths: EKF against FastSLAM by strategy, passive against the others.
+
+    Notes
+    -----
     Bradley & Abaid, Sec. V-C.
     """
     lower, worst = [], []
@@ -147,6 +184,17 @@ def ekf_more_accurate(selection: Selection) -> list[Part]:
 def ekf_gains_by_fusing(selection: Selection) -> list[Part]:
     """Claim 4: with the EKF, fused beats active at narrow beams on average, in heading always.
 
+    Parameters
+    ----------
+    selection : Selection
+
+    Returns
+    -------
+    list of Part
+        Position at the narrow beamwidths, heading at all of them.
+
+    Notes
+    -----
     Bradley & Abaid, Sec. V-C and Appendix A.
     """
     pair, name = (("ekf", "active"), ("ekf", "fused")), "EKF"
@@ -171,6 +219,17 @@ def ekf_gains_by_fusing(selection: Selection) -> list[Part]:
 def fastslam_never_gains(selection: Selection) -> list[Part]:
     """Claim 5: with FastSLAM 2.0, fused never beats active in position.
 
+    Parameters
+    ----------
+    selection : Selection
+
+    Returns
+    -------
+    list of Part
+        One, a statement per beamwidth.
+
+    Notes
+    -----
     Bradley & Abaid, Sec. V-C.
     """
     pair, name = (("fastslam", "active"), ("fastslam", "fused")), FILTERS["fastslam"]
@@ -182,6 +241,17 @@ def fastslam_never_gains(selection: Selection) -> list[Part]:
 def fused_tends_to_passive(selection: Selection) -> list[Part]:
     """Claim 6: the narrower the beam, the nearer fused comes to passive.
 
+    Parameters
+    ----------
+    selection : Selection
+
+    Returns
+    -------
+    list of Part
+        The slope, and the narrowest beam; a statement per filter in each.
+
+    Notes
+    -----
     Bradley & Abaid, Sec. V-C.
     """
     slopes, ends = [], []
@@ -210,7 +280,20 @@ def fused_tends_to_passive(selection: Selection) -> list[Part]:
 def maps_never_gain(selection: Selection) -> list[Part]:
     """Claim 7: fused never beats active in map RMSE, and is within about one sigma.
 
-    Over the landmarks seen by all strategies, "most of the time". Bradley & Abaid, Sec. V-D.
+    Over the landmarks seen by all strategies, "most of the time".
+
+    Parameters
+    ----------
+    selection : Selection
+
+    Returns
+    -------
+    list of Part
+        Never better, and mostly near; a statement per filter and beamwidth in each.
+
+    Notes
+    -----
+    Bradley & Abaid, Sec. V-D.
     """
     never, within = [], []
     for name, label in FILTERS.items():
@@ -235,6 +318,17 @@ def maps_never_gain(selection: Selection) -> list[Part]:
 def passive_sees_more(selection: Selection) -> list[Part]:
     """Claim 8: passive sees more landmarks than active, by more than one sigma below 65 degrees.
 
+    Parameters
+    ----------
+    selection : Selection
+
+    Returns
+    -------
+    list of Part
+        At all beamwidths, and at those below 65 degrees; a statement per filter and beamwidth.
+
+    Notes
+    -----
     Bradley & Abaid, Sec. V-E.
     """
     more, far, score = [], [], "landmarks_total"
