@@ -9,9 +9,9 @@ from scipy.special import jn_zeros
 
 from pipistrelle.acoustics.arrivals import (
     Arrivals,
+    arrivals_at,
     arrivals_of_emission,
     arrivals_of_emissions,
-    rows_of,
     through_piston,
 )
 from pipistrelle.acoustics.callers import VEHICLE, callers_of
@@ -283,7 +283,7 @@ def test_many_emissions_bring_bit_for_bit_what_each_brings_alone(seed, spreading
     assert end[-1] == heard.delay.size
     for pose, velocity, first, last in zip(poses, velocities, end - size, end, strict=True):
         alone = sounds_of_emission(pose, velocity, landmarks, beacon, config)
-        among = rows_of(heard, slice(first, last))
+        among = arrivals_at(heard, slice(first, last))
         for name in Arrivals.__slots__:
             assert getattr(among, name).tobytes() == getattr(alone, name).tobytes()
 

@@ -234,7 +234,7 @@ def through_piston(
     )
 
 
-def rows_of(arrivals: Arrivals, rows: Bool[np.ndarray, " a"] | slice) -> Arrivals:
+def arrivals_at(arrivals: Arrivals, rows: Bool[np.ndarray, " a"] | slice) -> Arrivals:
     """Take some of the arrivals.
 
     Parameters

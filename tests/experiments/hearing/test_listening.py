@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from pipistrelle.acoustics.arrivals import (
+    arrivals_at,
     arrivals_of_emission,
-    rows_of,
     through_piston,
 )
 from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of
@@ -199,7 +199,7 @@ def landmarks(blocks, arrivals, tone, finder=FINDER):
 
 def with_echoes(blocks, arrivals, rows):
     heard = blocks.copy()
-    add_echo_blocks(heard, rows_of(arrivals, rows), LAYOUT, SETTLED)
+    add_echo_blocks(heard, arrivals_at(arrivals, rows), LAYOUT, SETTLED)
     return heard
 
 

@@ -18,8 +18,8 @@ from jaxtyping import Complex, Int
 
 from pipistrelle.acoustics.arrivals import (
     Arrivals,
+    arrivals_at,
     arrivals_of_emissions,
-    rows_of,
     through_piston,
 )
 from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_at
@@ -199,7 +199,7 @@ def _emissions(
         ]
         end = np.cumsum(count)
         for rows in map(slice, end - count, end):
-            yield [rows_of(arrivals, rows) for arrivals in aimed]
+            yield [arrivals_at(arrivals, rows) for arrivals in aimed]
 
 
 def _heard(time: float, detections: Detections, arrivals: Arrivals, rig: _Rig) -> Heard:
@@ -233,14 +233,14 @@ def _blocks(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[Detectio
     pulse, own = settled.pulse, np.count_nonzero(aimed[0].caller == VEHICLE)  # they come first
     shape = block_shape(blocks_to_hear(aimed[0], settled), layout, settled)
     shared = noise_blocks(shape[0], layout, settled, key, out=space.array("shared", shape))
-    add_echo_blocks(shared, rows_of(aimed[0], slice(own, None)), layout, settled)
+    add_echo_blocks(shared, arrivals_at(aimed[0], slice(own, None)), layout, settled)
     lags = (shape[0] - pulse + 1, *shape[1:])
     for left, arrivals in zip(range(len(aimed) - 1, -1, -1), aimed, strict=True):
         signal = shared
         if left:  # the last beam may write on what it shares
             signal = space.array("signal", shape)
             np.copyto(signal, shared)
-        add_echo_blocks(signal, rows_of(arrivals, slice(own)), layout, settled)
+        add_echo_blocks(signal, arrivals_at(arrivals, slice(own)), layout, settled)
         matched = filter_blocks(
             signal,
             pulse=pulse,

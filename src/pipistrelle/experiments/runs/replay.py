@@ -17,7 +17,7 @@ from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.results.scores import TrialResult
-from pipistrelle.experiments.runs.outside import check_filters
+from pipistrelle.experiments.runs.checking import check_filters
 from pipistrelle.experiments.runs.trial import Watch, run_trials
 from pipistrelle.experiments.runs.truth_files import TRUTHS, WithTruth, with_files_beside
 from pipistrelle.refusals import refusal

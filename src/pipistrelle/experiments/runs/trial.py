@@ -33,8 +33,8 @@ from pipistrelle.experiments.hearing.scenario import (
 )
 from pipistrelle.experiments.machine import check_length, check_memory
 from pipistrelle.experiments.results.scores import TrialResult, score, score_path
+from pipistrelle.experiments.runs.checking import check_filters, failed_trial
 from pipistrelle.experiments.runs.filtering import run_filter
-from pipistrelle.experiments.runs.outside import check_filters, failed_trial
 
 Watch = Callable[[str, str, Scan, Belief], None]
 """Called with strategy, filter, scan and the belief after it."""

@@ -19,7 +19,7 @@ from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.estimation.outside import look_in
 from pipistrelle.experiments.hearing.scenario import bicycle, landmark_count
 from pipistrelle.experiments.machine import check_length, check_memory, keep_freed_memory
-from pipistrelle.experiments.runs.outside import check_filters
+from pipistrelle.experiments.runs.checking import check_filters
 from pipistrelle.experiments.studies.executors import (
     AHEAD,
     Results,

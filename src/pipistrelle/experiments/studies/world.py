@@ -39,7 +39,7 @@ from pipistrelle.experiments.hearing.scenario import (
     world_of,
 )
 from pipistrelle.experiments.results.scores import PathScores, Scores
-from pipistrelle.experiments.runs.outside import first_belief
+from pipistrelle.experiments.runs.checking import first_belief
 from pipistrelle.experiments.runs.trial import drive_of, run_trial
 from pipistrelle.experiments.studies.plan import Plan, PlannedCase, cases_of
 
