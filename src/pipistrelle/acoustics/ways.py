@@ -1,7 +1,8 @@
 """The ways of sound: from every target to the vehicle, how long, from where, how fast they shrink.
 
-Targets are the landmarks and then the callers but the vehicle; each may move, in a straight line
-while sound is on its way.
+Targets are the landmarks, which stand, and then the callers but the vehicle, which may move. Ways
+are those of the moment of emission, frozen while sound is on them; of motion the speeds along them
+are kept.
 """
 
 import math
