@@ -1,5 +1,6 @@
 """Callers as a list: two and more, standing and moving, and what each brings to the vehicle."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from pipistrelle.acoustics.arrivals import Arrivals, arrivals_of_emission, arrivals_of_emissions
-from pipistrelle.acoustics.callers import Caller, callers_at, callers_of
+from pipistrelle.acoustics.callers import Caller, callers_at, callers_of, check_caller, moves
 from pipistrelle.config import Config, InputError
 
 law = settings(deadline=None, max_examples=40)
@@ -181,6 +182,64 @@ def test_callers_that_make_no_list_or_no_path_are_refused():
     lame = replace(beacon, place=np.zeros((4, 2)), velocity=np.zeros((3, 2)))
     with pytest.raises(InputError, match=r"velocities of shape \(3, 2\)"):
         callers_at((vehicle, lame), time, steps)
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "said"),
+    [
+        ("frequency", np.nan, "frequency: found nan, expected one finite number [Hz]"),
+        ("frequency", None, "frequency: found nan, expected one finite number [Hz]"),
+        ("level_db", np.inf, "level_db: found inf, expected one finite number [dB]"),
+        ("level_db", "loud", "level_db: found 'loud', expected one finite number [dB]"),
+        ("level_db", [1.0, 2.0], "level_db: found an array of shape (2,), expected one finite"),
+        ("place", np.ones(3), "place: found an array of shape (3,), expected finite x and y [m]"),
+        ("place", np.ones((4, 3)), "place: found an array of shape (4, 3), expected finite x"),
+        ("place", 3.0, "place: found an array of shape (), expected finite x and y [m], or a row"),
+        ("place", np.ones((1, 4, 2)), "place: found an array of shape (1, 4, 2), expected"),
+        ("place", [[1.0, 2.0], [3.0]], "place: found [[1.0, 2.0], [3.0]], expected finite x"),
+        ("place", (3.0, np.nan), "place: found nan, expected finite x and y [m]"),
+        ("place", [[1.0, 2.0]] * 3 + [[np.inf, 0.0]], "place: found inf, expected finite x"),
+        ("velocity", np.ones(3), "velocity: found an array of shape (3,), expected finite x"),
+        ("velocity", np.full((4, 2), np.nan), "velocity: found nan, expected finite x and y [m/s]"),
+    ],
+)
+def test_a_caller_that_is_no_numbers_is_refused_wherever_it_is_asked_for(part, value, said):
+    vehicle, beacon = callers_of(CONFIG, np.ones(2))
+    odd = replace(beacon, name="boat", place=np.zeros((4, 2)), velocity=np.zeros((4, 2)))
+    odd = replace(odd, **{part: value})
+    for refuses in (
+        check_caller,
+        moves,
+        lambda caller: callers_at((vehicle, caller), np.arange(4.0), np.array([1])),
+    ):
+        with pytest.raises(InputError, match="^" + re.escape(f"caller boat: {said}")):
+            refuses(odd)
+
+
+def test_a_vehicle_with_a_velocity_and_a_velocity_without_a_path_are_refused():
+    vehicle, beacon = callers_of(CONFIG, np.ones(2))
+    time, steps = np.arange(2.0), np.array([1])
+    driven = replace(vehicle, velocity=np.zeros((2, 2)))
+    with pytest.raises(InputError, match=r"^caller vehicle: found a velocity, expected none; leav"):
+        callers_at((driven, beacon), time, steps)
+    adrift = replace(beacon, velocity=np.ones(2))
+    with pytest.raises(InputError, match=r"^caller beacon: found a path of shape \(2,\) and veloc"):
+        callers_at((vehicle, adrift), time, steps)
+
+
+def test_places_and_paths_may_be_plain_numbers():
+    vehicle, beacon = callers_of(CONFIG, np.ones(2))
+    time, steps = np.arange(3.0), np.array([1, 2])
+    plain = [[0.0, 5.0], [1.0, 5.0], [3.0, 5.0]]
+    post, boat = replace(beacon, place=(3.0, 9.0)), replace(beacon, name="boat", place=plain)
+    assert [moves(caller) for caller in (post, boat)] == [False, True]
+    assert callers_at((vehicle, post, boat), time, steps)[2].velocity.tolist() == [[1, 0], [2, 0]]
+    _, _, landmarks, _ = crowd(3)
+    one, two = (
+        arrivals_of_emission(np.zeros(3), np.zeros(2), landmarks, [vehicle, caller], CONFIG)
+        for caller in (post, replace(post, place=np.array(post.place)))
+    )
+    assert bits(one) == bits(two)
 
 
 def test_callers_at_one_point_are_refused_by_their_names():

@@ -257,11 +257,22 @@ def test_noise_of_three_tones_has_the_same_variance_in_each():
         (26e3, "whistle.frequency: found 26000 Hz, expected a multiple of 5000 Hz"),
         (35e3, "whistle.frequency: found 35000 Hz, the vehicle's own; expected another"),
         (30e3, "whistle.frequency: found 30000 Hz, the beacon's own; expected another"),
+        (235e3, "whistle.frequency: found 235000 Hz, the vehicle's own 35000 Hz once it is"),
+        (430e3, "whistle.frequency: found 430000 Hz, the beacon's own 30000 Hz once it is"),
+        (np.nan, "caller whistle: frequency: found nan, expected one finite number"),
     ],
 )
 def test_a_third_tone_that_cannot_be_told_apart_is_refused_by_the_callers_name(frequency, message):
     with pytest.raises(InputError, match=f"^{message}"):
         sampling(CONFIG, (*CALLERS, replace(THREE[2], frequency=frequency)))
+
+
+def test_tones_a_sampling_rate_apart_fall_into_one_bin_of_a_block():
+    n = np.arange(SETTLED.block)
+    low, high = (np.exp(2j * np.pi * tone * n / SETTLED.rate) for tone in (35e3, 235e3))
+    assert np.abs(low - high).max() < 1e-12
+    settled = sampling(CONFIG, (*CALLERS, replace(THREE[2], frequency=240e3)))
+    assert settled.tones.tolist() == [35e3, 30e3, 240e3]  # above the rate, but a bin of its own
 
 
 def test_eight_callers_are_heard_and_a_ninth_is_refused():

@@ -79,6 +79,55 @@ def callers_of(config: Config, beacon: Float[np.ndarray, "2"]) -> tuple[Caller, 
     )
 
 
+def check_caller(caller: Caller) -> None:
+    """Refuse a caller whose tone, level, places or velocities are no finite numbers of their shape.
+
+    Parameters
+    ----------
+    caller : Caller
+
+    Raises
+    ------
+    InputError
+        With what is wrong.
+
+    Examples
+    --------
+    >>> check_caller(Caller(name="boat", frequency=30e3, level_db=42.8, place=np.zeros(3)))
+    Traceback (most recent call last):
+    pipistrelle.config.InputError: caller boat: place: found an array of shape (3,), expected finite
+    x and y [m], or a row of them for each time of a path; correct it
+    """
+    _check(caller, "frequency", "Hz", pairs=False)
+    _check(caller, "level_db", "dB", pairs=False)
+    if caller.place is not None:
+        _check(caller, "place", "m", pairs=True)
+    if caller.velocity is not None:
+        _check(caller, "velocity", "m/s", pairs=True)
+
+
+def _check(caller: Caller, part: str, unit: str, *, pairs: bool) -> None:
+    """Refuse a part of a caller that is not one finite number, or else x and y or rows of them."""
+    value = getattr(caller, part)
+    try:
+        numbers = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):  # text, or rows of unlike lengths
+        found = f"{value!r}"
+    else:
+        found = f"an array of shape {numbers.shape}"
+        if numbers.ndim in (1, 2) and numbers.shape[-1] == 2 if pairs else numbers.ndim == 0:
+            bad = ~np.isfinite(numbers)
+            if not bad.any():
+                return
+            found = f"{numbers[bad][0]}"
+    expected = f"one finite number [{unit}]"
+    if pairs:
+        expected = f"finite x and y [{unit}], or a row of them for each time of a path"
+    raise InputError(
+        f"caller {caller.name}: {part}: found {found}, expected {expected}; correct it"
+    )
+
+
 def moves(caller: Caller) -> bool:
     """Whether a caller other than the vehicle calls along a path.
 
@@ -90,12 +139,19 @@ def moves(caller: Caller) -> bool:
     -------
     bool
 
+    Raises
+    ------
+    InputError
+        As `check_caller`.
+
     Examples
     --------
     >>> [moves(caller) for caller in callers_of(Config(), np.zeros(2))]
     [False, False]
     """
-    return caller.velocity is not None or (caller.place is not None and caller.place.ndim == 2)
+    check_caller(caller)
+    path = caller.place is not None and np.ndim(caller.place) == 2
+    return caller.velocity is not None or path
 
 
 def callers_at(
@@ -122,8 +178,8 @@ def callers_at(
     Raises
     ------
     InputError
-        Where the vehicle is not the first or not alone without a place, or a path does not fit
-        the times.
+        Where the vehicle is not the first or not alone without a place, or has a velocity, a path
+        does not fit the times, or as `check_caller`.
 
     Examples
     --------
@@ -139,13 +195,19 @@ def callers_at(
             f"callers: found {', '.join(caller.name for caller in callers) or 'none'}; expected "
             "the vehicle first, without a place, and for each of the others a place or a path"
         )
+    if callers[VEHICLE].velocity is not None:
+        raise InputError(
+            f"caller {callers[VEHICLE].name}: found a velocity, expected none; leave it out, for "
+            "the vehicle calls on its own path"
+        )
     return tuple(_at(caller, time, steps) if moves(caller) else caller for caller in callers)
 
 
 def _at(caller: Caller, time: Float[np.ndarray, " t"], steps: Int[np.ndarray, " k"]) -> Caller:
     """Take the places and velocities of a path at some of its times."""
     path, velocity = np.asarray(caller.place), caller.velocity
-    if len(path) != len(time) or (velocity is not None and np.shape(velocity) != path.shape):
+    shapes = {path.shape, path.shape if velocity is None else np.shape(velocity)}
+    if shapes != {(len(time), 2)}:
         raise InputError(
             f"caller {caller.name}: found a path of shape {path.shape}"
             f"{'' if velocity is None else f' and velocities of shape {np.shape(velocity)}'}; "
@@ -154,5 +216,5 @@ def _at(caller: Caller, time: Float[np.ndarray, " t"], steps: Int[np.ndarray, " 
     if velocity is None:
         last = (path[steps] - path[steps - 1]) / (time[steps] - time[steps - 1])[:, np.newaxis]
     else:
-        last = velocity[steps]
+        last = np.asarray(velocity)[steps]
     return replace(caller, place=path[steps], velocity=last)

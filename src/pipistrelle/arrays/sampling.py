@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.acoustics.callers import MOST, VEHICLE, Caller
+from pipistrelle.acoustics.callers import MOST, VEHICLE, Caller, check_caller
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config, InputError
 
@@ -58,8 +58,8 @@ def sampling(config: Config, callers: Sequence[Caller]) -> Sampling:
     Raises
     ------
     InputError
-        When a tone is no whole bin of a block or the tone of two callers, the call no whole number
-        of blocks, or there are too many callers.
+        When a tone is no whole bin of a block or, once it is sampled, the tone of two callers, the
+        call no whole number of blocks, there are too many callers, or as `check_caller`.
 
     Examples
     --------
@@ -69,6 +69,8 @@ def sampling(config: Config, callers: Sequence[Caller]) -> Sampling:
     (40, 14, array([35000., 30000.]))
     """
     rate, pulse = config.receiver.sample_rate, config.emitter.pulse
+    for caller in callers:
+        check_caller(caller)
     keys = ["emitter.frequency", *(f"{caller.name}.frequency" for caller in callers[VEHICLE + 1 :])]
     tones = np.array([caller.frequency for caller in callers])
     for key, value, unit, count in (
@@ -81,13 +83,7 @@ def sampling(config: Config, callers: Sequence[Caller]) -> Sampling:
             raise InputError(f"{key}: found {value:g} {unit}, expected a multiple of {step}")
     if not 1 <= len(callers) <= MOST:
         raise InputError(f"callers: found {len(callers)}, expected 1 to {MOST}; leave some out")
-    for j, tone in enumerate(tones):
-        for other in callers[:j]:
-            if tone == other.frequency:
-                raise InputError(
-                    f"{keys[j]}: found {tone:g} Hz, the {other.name}'s own; expected another, "
-                    "or the two calls cannot be told apart"
-                )
+    _refuse_alike(callers, keys, rate)
     return Sampling(
         rate=rate,
         block=round(rate * BLOCK),
@@ -96,6 +92,21 @@ def sampling(config: Config, callers: Sequence[Caller]) -> Sampling:
         noise_std=10.0 ** (config.receiver.noise_level_db / 20.0),
         speed_of_sound=config.air.speed_of_sound,
     )
+
+
+def _refuse_alike(callers: Sequence[Caller], keys: Sequence[str], rate: float) -> None:
+    """Refuse tones that are one bin of a block: equal, or the sampling rate apart."""
+    for j, (key, caller) in enumerate(zip(keys, callers, strict=True)):
+        for other in callers[:j]:
+            apart = round((caller.frequency - other.frequency) * BLOCK)
+            if apart % round(rate * BLOCK) == 0:
+                own = f"the {other.name}'s own"
+                if apart:
+                    own = f"{own} {other.frequency:g} Hz once it is sampled at {rate:g} Hz"
+                raise InputError(
+                    f"{key}: found {caller.frequency:g} Hz, {own}; expected another, or the two "
+                    "calls cannot be told apart"
+                )
 
 
 def blocks_to_hear(arrivals: Arrivals, sampling: Sampling) -> int:
