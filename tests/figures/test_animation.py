@@ -5,9 +5,8 @@ import pytest
 from PIL import Image
 
 from pipistrelle.config import InputError
-from pipistrelle.estimation.beliefs import Landmarks
+from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.figures.animation import _pruned, _stage, animate_mission
-from pipistrelle.figures.maps import placed
 from pipistrelle.figures.recorder import MissionRecorder
 from pipistrelle.geometry import range_and_bearing
 from reference.missions import map_with

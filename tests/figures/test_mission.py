@@ -11,10 +11,9 @@ from matplotlib import pyplot
 from matplotlib.collections import LineCollection, PolyCollection
 from PIL import Image
 
-from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.beliefs import Gaussian, placed
 from pipistrelle.evaluation.accuracy import position_error
 from pipistrelle.evaluation.consistency import nees
-from pipistrelle.figures.maps import placed
 from pipistrelle.figures.mission import draw_mission
 from pipistrelle.figures.style import save_figure
 

@@ -1,10 +1,10 @@
-"""Records that beliefs are made of, and what an estimator is."""
+"""What estimators believe and how they are asked: records, and the protocols of both."""
 
 from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from pipistrelle.detection.scans import Scan
 
@@ -57,6 +57,34 @@ def no_landmarks() -> Landmarks:
         covariance=np.empty((0, 2, 2)),
         weight=np.empty(0),
     )
+
+
+def placed(landmarks: Landmarks) -> Bool[np.ndarray, " h"]:
+    """Tell which rows of a map are fully initialised landmarks, not members of a ray.
+
+    A landmark with a single row is fully initialised, one with several partially.
+
+    Parameters
+    ----------
+    landmarks : Landmarks of h rows
+
+    Returns
+    -------
+    (h)
+
+    Notes
+    -----
+    Bradley & Abaid, Sec. V-A, "fully and partially initialize".
+
+    Examples
+    --------
+    >>> mean, covariance = np.zeros((3, 2)), np.zeros((3, 2, 2))
+    >>> rows = dict(landmark=np.array([4, 9, 9]), weight=np.array([1.0, 0.5, 0.5]))
+    >>> placed(Landmarks(mean=mean, covariance=covariance, **rows))
+    array([ True, False, False])
+    """
+    _, row, count = np.unique(landmarks.landmark, return_inverse=True, return_counts=True)
+    return count[row] == 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipistrelle.estimation.beliefs import Landmarks
+from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.geometry import wrap
 
 
@@ -32,8 +32,6 @@ class MapEstimate:
 def heaviest(landmarks: Landmarks) -> MapEstimate:
     """Represent each landmark by its heaviest hypothesis, the first of equals.
 
-    A landmark with a single hypothesis is fully initialised, one with several partially.
-
     Parameters
     ----------
     landmarks : Landmarks of h hypotheses
@@ -58,7 +56,7 @@ def heaviest(landmarks: Landmarks) -> MapEstimate:
     (array([1., 6.]), array([ True, False]))
     """
     ordered = np.lexsort((-landmarks.weight, landmarks.landmark))
-    _, start, count = np.unique(landmarks.landmark[ordered], return_index=True, return_counts=True)
+    _, start = np.unique(landmarks.landmark[ordered], return_index=True)
     _, first = np.unique(landmarks.landmark, return_index=True)
     entered = np.argsort(first)
     row = ordered[start][entered]
@@ -66,7 +64,7 @@ def heaviest(landmarks: Landmarks) -> MapEstimate:
         landmark=landmarks.landmark[row],
         mean=landmarks.mean[row],
         covariance=landmarks.covariance[row],
-        full=count[entered] == 1,
+        full=placed(landmarks)[row],
     )
 
 

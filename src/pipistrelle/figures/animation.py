@@ -14,25 +14,20 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipistrelle.acoustics.callers import Caller
 from pipistrelle.config import InputError
-from pipistrelle.estimation.beliefs import Landmarks
+from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.experiments.drives import NO_TRUTH, LabelledPoints, Truth
 from pipistrelle.figures.closeup import Closeup, add_closeups
 from pipistrelle.figures.film import film_writer
 from pipistrelle.figures.maps import (
-    PLACED,
-    RAY,
-    beam,
     callers_shown,
     cells,
     draw_truth,
-    ellipses,
     head,
     legend,
-    placed,
     shades,
-    vehicle,
     view,
 )
+from pipistrelle.figures.outlines import PLACED, RAY, beam, ellipses, vehicle
 from pipistrelle.figures.recorder import Snapshot
 from pipistrelle.figures.style import INK, STYLE, TRUTH, strategy_colour
 

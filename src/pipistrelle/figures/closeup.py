@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.experiments.drives import LabelledPoints
-from pipistrelle.figures.maps import vehicle
+from pipistrelle.figures.outlines import vehicle
 from pipistrelle.figures.style import INK, TRUTH
 
 if TYPE_CHECKING:

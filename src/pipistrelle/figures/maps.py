@@ -1,15 +1,16 @@
-"""The pieces of a map: uncertainty ellipses, the beam, the vehicle, the true world around them."""
+"""A map around what is estimated: its limits, the true world, the panel's name, the legend."""
 
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from pipistrelle.acoustics.callers import Caller, moves
-from pipistrelle.estimation.beliefs import Landmarks
+from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.estimation.catalogue import title_of
 from pipistrelle.experiments.drives import LabelledPoints, Truth
+from pipistrelle.figures.outlines import PLACED, RAY, beam, ellipses, vehicle
 from pipistrelle.figures.style import COLUMNS, INK, TRUTH, strategy_colour
 
 if TYPE_CHECKING:
@@ -17,126 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.text import Annotation
-
-PLACED = 0.95
-"""Probability inside the ellipse of a landmark that is fully initialised."""
-RAY = 0.3935
-"""Probability inside the ellipse of a ray's member: one standard deviation."""
-
-
-def ellipses(
-    mean: Float[np.ndarray, "h 2"], covariance: Float[np.ndarray, "h 2 2"], probability: float
-) -> Float[np.ndarray, "h 49 2"]:
-    r"""Closed outlines that hold a share of each Gaussian.
-
-    .. math:: (x - \mu)^T P^{-1} (x - \mu) = -2 \ln(1 - p)
-
-    The unit circle goes through the symmetric square root of P, which for 2 by 2 is
-    (P + s I) / sqrt(tr P + 2 s), s = sqrt(det P).
-
-    Parameters
-    ----------
-    mean : (h, 2) [m]
-    covariance : (h, 2, 2) [m^2]
-        Positive semidefinite; where it is not finite, neither is the outline.
-    probability : p, between 0 and 1
-
-    Returns
-    -------
-    (h, 49, 2) [m]
-
-    Notes
-    -----
-    The quantile of chi-square with two degrees of freedom is -2 ln(1 - p): 5.991 for 95 %.
-
-    Examples
-    --------
-    >>> outline = ellipses(np.zeros((1, 2)), np.diag([4.0, 1.0])[None], 0.95)
-    >>> (outline.max(axis=1) ** 2).round(3)
-    array([[23.966,  5.991]])
-    """
-    angle = np.linspace(0.0, 2.0 * np.pi, 49)
-    circle = np.sqrt(-2.0 * np.log1p(-probability)) * np.stack([np.cos(angle), np.sin(angle)])
-    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    s = np.sqrt(np.maximum(a * c - b * b, 0.0))
-    trace = np.maximum(a + c + 2.0 * s, np.finfo(np.float64).tiny)
-    root = (covariance + s[:, None, None] * np.eye(2)) / np.sqrt(trace)[:, None, None]
-    return mean[:, None, :] + np.swapaxes(root @ circle, 1, 2)
-
-
-def beam(pose: Float[np.ndarray, "3"], beamwidth: float, length: float) -> Float[np.ndarray, "n 2"]:
-    """Outline of the sector that the vehicle's call lights up, half the beamwidth to each side.
-
-    Parameters
-    ----------
-    pose : (3) [m, m, rad]
-    beamwidth : [rad]
-    length : [m]
-
-    Returns
-    -------
-    (n, 2) [m]
-        The vehicle first, then the arc.
-
-    Notes
-    -----
-    Half-power beamwidth of Bradley & Abaid, Eq. (1).
-
-    Examples
-    --------
-    >>> beam(np.zeros(3), np.pi, 2.0)[[0, 1, -1]].round(9) + 0.0
-    array([[ 0.,  0.],
-           [ 0., -2.],
-           [ 0.,  2.]])
-    """
-    angle = pose[2] + np.linspace(-0.5, 0.5, 41) * beamwidth
-    arc = pose[:2] + length * np.column_stack([np.cos(angle), np.sin(angle)])
-    return np.vstack([pose[:2], arc])
-
-
-def vehicle(pose: Float[np.ndarray, "3"], length: float) -> Float[np.ndarray, "4 2"]:
-    """Outline of the vehicle, a dart that points along its heading.
-
-    Parameters
-    ----------
-    pose : (3) [m, m, rad]
-    length : [m]
-
-    Returns
-    -------
-    (4, 2) [m]
-        The tip first.
-
-    Examples
-    --------
-    >>> vehicle(np.array([1.0, 0.0, np.pi / 2]), 2.0)[0].round(9)
-    array([1.  , 1.16])
-    """
-    shape = length * np.array([[0.58, 0.0], [-0.42, 0.36], [-0.2, 0.0], [-0.42, -0.36]])
-    cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    return pose[:2] + shape @ np.array([[cos, sin], [-sin, cos]])
-
-
-def placed(landmarks: Landmarks) -> Bool[np.ndarray, " h"]:
-    """Tell which rows of a map are fully initialised landmarks, not members of a ray.
-
-    Parameters
-    ----------
-    landmarks : Landmarks of h rows
-
-    Returns
-    -------
-    (h)
-
-    Examples
-    --------
-    >>> mean, covariance = np.zeros((3, 2)), np.zeros((3, 2, 2))
-    >>> rows = dict(landmark=np.array([4, 9, 9]), weight=np.array([1.0, 0.5, 0.5]))
-    >>> placed(Landmarks(mean=mean, covariance=covariance, **rows))
-    array([ True, False, False])
-    """
-    _, row, count = np.unique(landmarks.landmark, return_inverse=True, return_counts=True)
-    return count[row] == 1
 
 
 def shades(

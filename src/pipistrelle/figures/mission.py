@@ -6,26 +6,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipistrelle.acoustics.callers import Caller
+from pipistrelle.estimation.beliefs import placed
 from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
 from pipistrelle.evaluation.consistency import anees_bounds, track_nees
 from pipistrelle.experiments.drives import NO_TRUTH, LabelledPoints, Truth
 from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.figures.closeup import add_closeups
 from pipistrelle.figures.maps import (
-    PLACED,
-    RAY,
-    beam,
     callers_shown,
     cells,
     draw_truth,
-    ellipses,
     head,
     legend,
-    placed,
     shades,
-    vehicle,
     view,
 )
+from pipistrelle.figures.outlines import PLACED, RAY, beam, ellipses, vehicle
 from pipistrelle.figures.style import INK, STYLE, TRUTH, strategy_colour
 
 if TYPE_CHECKING:

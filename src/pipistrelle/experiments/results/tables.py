@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.beliefs import Landmarks, Track
+from pipistrelle.estimation.beliefs import Landmarks, Track, placed
 from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
 from pipistrelle.evaluation.consistency import track_nees
 from pipistrelle.experiments.drives import LabelledPoints
@@ -168,11 +168,10 @@ def landmark_table(landmarks: Landmarks, true_landmarks: LabelledPoints | None) 
     import polars as pl
 
     label, mean, P = landmarks.landmark, landmarks.mean, landmarks.covariance
-    _, row, hypotheses = np.unique(label, return_inverse=True, return_counts=True)
     found = pl.DataFrame(
         {
             "landmark": label.astype(np.int64),
-            "status": np.where(hypotheses[row] == 1, "full", "partial").astype(str).tolist(),
+            "status": np.where(placed(landmarks), "full", "partial").astype(str).tolist(),
             "weight": landmarks.weight,
             "x_m": mean[:, 0],
             "y_m": mean[:, 1],
