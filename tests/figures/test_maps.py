@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -120,6 +122,27 @@ def test_callers_are_drawn_as_stars_where_they_stand_and_as_lines_where_they_mov
     star, line = axes.lines
     assert (star.get_marker(), star.get_xydata().tolist()) == ("*", [[3.0, 4.0]])
     assert (line.get_marker(), line.get_xydata().tolist()) == ("None", path.tolist())
-    assert callers_shown((post, boat)) == {"beacon", "moving caller"}
+    assert callers_shown((post, boat)) == {"caller", "moving caller"}
     (left, right), _ = view(NO_TRUTH, (post, boat), [np.zeros((1, 3))], [])
     assert left < path[:, 0].min() < 40.0 < right
+
+
+def test_stars_bear_their_names_but_for_the_one_beacon():
+    beacon = Caller(name="beacon", frequency=30e3, level_db=42.8, place=np.array([3.0, 4.0]))
+    post = replace(beacon, name="a $5 post", frequency=25e3, place=np.array([-2.0, 1.0]))
+    boat = replace(beacon, name="boat", frequency=20e3, place=np.zeros((9, 2)))
+
+    def drawn(*callers):
+        figure = Figure()
+        axes = figure.add_subplot()
+        draw_truth(axes, None, callers)
+        figure.canvas.draw()
+        names = {text.get_text(): np.asarray(text.xy).tolist() for text in axes.texts}
+        return names, callers_shown(callers)
+
+    assert drawn(beacon) == ({}, {"beacon"})
+    assert drawn(beacon, boat) == ({}, {"beacon", "moving caller"})
+    assert drawn(post) == ({"a $5 post": [-2.0, 1.0]}, {"caller"})
+    both = {"beacon": [3.0, 4.0], "a $5 post": [-2.0, 1.0]}
+    assert drawn(beacon, post) == (both, {"caller"})
+    legend(Figure(), sorted(callers_shown((post, boat))), 1, 0.0, 0.0)  # each has its symbol

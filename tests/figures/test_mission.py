@@ -122,6 +122,17 @@ def test_a_caller_that_moves_gets_its_line_in_the_legend_and_the_page_room_for_i
     assert figure.get_figheight() > three.get_figheight()  # a third row of entries
 
 
+def test_several_callers_that_stand_are_one_entry_of_the_legend(mission, three):
+    (beacon,) = mission.scene["callers"]
+    whistle = replace(beacon, name="whistle", place=-beacon.place)
+    truth = mission.scene | {"callers": (beacon, whistle)}
+    figure = draw_mission(list(mission.trials.values()), **truth)
+    names = [text.get_text() for text in figure.legends[0].texts]
+    assert names[5:7] == ["caller", "vehicle at the end"]
+    assert {"beacon", "whistle"} <= set(words(maps(figure)[0]))
+    assert "beacon" not in words(maps(three)[0])
+
+
 def test_the_legend_stands_once_and_names_everything(three):
     (legend,) = three.legends
     assert len(legend.texts) == 8

@@ -124,6 +124,8 @@ def draw_truth(
 ) -> None:
     """Draw the true landmarks as open circles, each caller as a star or, where it moves, its path.
 
+    Stars bear their names, but for the paper's one beacon, which the legend names.
+
     Parameters
     ----------
     axes : Axes
@@ -144,12 +146,17 @@ def draw_truth(
     if true_landmarks is not None:
         x, y = true_landmarks[1].T
         axes.plot(x, y, "o", ms=5.0, mfc="none", mec=TRUTH, mew=0.8, zorder=3)
+    named = "caller" in callers_shown(callers)
+    style: dict[str, Any] = {"xytext": (6, 5), "textcoords": "offset points", "fontsize": 8}
     for caller in callers:
         place = np.asarray(caller.place)
         if moves(caller):
             axes.plot(*place.reshape(-1, 2).T, color=INK, lw=1.0, ls="-.", zorder=3.4)
-        else:
-            axes.plot(*place, "*", ms=12, mfc=INK, mec="white", mew=0.8, zorder=3.5)
+            continue
+        x, y = place
+        axes.plot(x, y, "*", ms=12, mfc=INK, mec="white", mew=0.8, zorder=3.5)
+        if named:
+            axes.annotate(caller.name, (x, y), parse_math=False, color=INK, zorder=7, **style)
 
 
 def callers_shown(callers: Sequence[Caller]) -> set[str]:
@@ -163,6 +170,7 @@ def callers_shown(callers: Sequence[Caller]) -> set[str]:
     Returns
     -------
     set of str
+        Of those that stand ``beacon``, where it is one of that name, else ``caller``.
 
     Examples
     --------
@@ -170,7 +178,9 @@ def callers_shown(callers: Sequence[Caller]) -> set[str]:
     >>> callers_shown([Caller(name="boat", frequency=30e3, level_db=42.8, place=path)])
     {'moving caller'}
     """
-    return {"moving caller" if moves(caller) else "beacon" for caller in callers}
+    standing = [caller.name for caller in callers if not moves(caller)]
+    star = "beacon" if standing == ["beacon"] else "caller"
+    return {"moving caller" if moves(caller) else star for caller in callers}
 
 
 def cells(cases: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
@@ -288,6 +298,7 @@ def _symbols() -> dict[str, "Artist"]:
         "placed landmark, 95 %": mark("o", 7.5, "#33333330", INK),
         "unresolved ray, 1σ, darker: likelier": mark(member, 14.0, "#33333350"),
         "beacon": mark("*", 11.0, INK, "white"),
+        "caller": mark("*", 11.0, INK, "white"),
         "moving caller": line(lw=1.0, ls="-."),
         "vehicle at the end": mark(dart, 10.0, INK),
         "its beam": mark(sector, 14.0, "#33333338"),

@@ -41,9 +41,10 @@ SYMBOLS = (
     ("placed landmark, 95 %", None),
     ("unresolved ray, 1σ, darker: likelier", None),
     ("beacon", 2),
-    ("moving caller", 3),
+    ("caller", 3),
+    ("moving caller", 4),
     ("vehicle at the end", None),
-    ("its beam", 4),
+    ("its beam", 5),
 )
 """The legend, and which of true path, true landmarks, who calls and beamwidth an entry needs."""
 
@@ -73,7 +74,8 @@ def draw_mission(
         At the times of the tracks; without a path there are no errors to show. Callers may be
         among the landmarks.
     callers : sequence of Caller, optional
-        Without the vehicle: a star where one stands, a line where one moves.
+        Without the vehicle: a star where one stands, by its name where it is not the one beacon,
+        a line where one moves.
     beamwidth : [rad], optional
         Of the vehicle's call, for the strategies that use it; without it no beam is drawn.
 
@@ -105,7 +107,8 @@ def draw_mission(
     maps = [trial.track.landmarks for trial in trials]
     limits = view(truth, callers, paths, maps)
     places = cells([(trial.strategy, trial.filter) for trial in trials])
-    who = ["beacon" in callers_shown(callers), "moving caller" in callers_shown(callers)]
+    shown = callers_shown(callers)
+    who = [name in shown for name in ("beacon", "caller", "moving caller")]
     known = [truth.path is not None, truth.landmarks is not None]
     given = [*known, *who, beamwidth is not None]
     names = [name for name, of in SYMBOLS if of is None or given[of]]
