@@ -158,11 +158,15 @@ def test_its_study_has_a_page(toys, tmp_path):
     assert "Shifted" in (tmp_path / "s" / "report" / "index.html").read_text()
 
 
-def test_its_title_is_its_own_where_it_is_installed_and_else_its_class(toys, monkeypatch):
-    assert title_of(SHIFTED) == "shifted reckoning"
-    assert title_of(RECKONING) == "DeadReckoning"
-    assert entry(SHIFTED).nees_limit == 123.0
+def test_its_title_is_its_own_once_it_has_been_looked_up_and_else_its_class(toys, monkeypatch):
+    monkeypatch.delitem(sys.modules, "toy_estimators", raising=False)
+    before = [*sys.path]
+    assert title_of(SHIFTED) == "Shifted"
     assert title_of("nowhere:Shifted") == "Shifted"
+    assert ("toy_estimators" in sys.modules, sys.path) == (False, before)
+    assert entry(SHIFTED).title == title_of(SHIFTED) == "shifted reckoning"
+    assert entry(RECKONING).title == title_of(RECKONING) == "DeadReckoning"
+    assert entry(SHIFTED).nees_limit == 123.0
 
 
 # In the current folder
@@ -193,10 +197,29 @@ def test_one_in_the_current_folder_goes_before_one_that_is_installed(toys, writt
     sys.modules.pop("toy_estimators")
 
 
+def test_the_current_folder_goes_first_wherever_it_stood(toys, written):
+    name = written("class DeadReckoning: pass\n")
+    sys.path[:] = [*sys.path, str(Path.cwd())]
+    other = Path("installed")
+    other.mkdir()
+    (other / f"{name}.py").write_text("raise OSError('of another folder')\n")
+    sys.path.insert(0, str(other.absolute()))
+    with pytest.raises(InputError, match="lacks init, predict, update"):
+        entry(f"{name}:DeadReckoning")
+    assert (sys.path[0], sys.path.count(sys.path[0])) == (str(Path.cwd()), 1)
+
+
 PARTS = """
     def init(self, pose): return Reckoned(at=pose)
     def predict(self, belief, controls, dt, rng): return belief, belief.pose()
     def update(self, belief, scan, rng): return belief
+"""
+BELIEF = """
+from dataclasses import dataclass
+class Mine(DeadReckoning):
+    def init(self, pose): return Odd(at=pose)
+@dataclass(frozen=True)
+class Odd(Kept):
 """
 ODD = {
     "an error": ("raise OSError('no licence')", "importing NAME fails: OSError: no licence"),
@@ -231,11 +254,19 @@ ODD = {
         f"from dataclasses import dataclass\n@dataclass\nclass Mine:{PARTS}\nReckoned = dict",
         "init returns a belief that lacks pose, landmarks, gated",
     ),
+    "a field for a method": (
+        f"from toy_estimators import *\n{BELIEF}    path: tuple = ()\n    cloud: tuple = ()\n",
+        "init returns a belief whose path, cloud cannot be called; of a belief pose, landmarks, ",
+    ),
+    "a map for a method": (
+        f"from toy_estimators import *\n{BELIEF}    landmarks = None\n",
+        "init returns a belief whose landmarks cannot be called; of a belief pose, landmarks, path",
+    ),
 }
 
 
 @pytest.mark.parametrize("case", ODD)
-def test_what_cannot_be_had_built_or_begun_is_refused_in_a_line(written, case, capsys):
+def test_what_cannot_be_had_built_or_begun_is_refused_in_a_line(toys, written, case, capsys):
     text, said = ODD[case]
     name = written(text)
     assert main(["run", *SHORT, "--filter", f"{name}:Mine", "-o", "one"]) == 2

@@ -13,7 +13,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from pipistrelle.config import Config, InputError
-from pipistrelle.estimation.outside import built, class_of
+from pipistrelle.estimation.outside import built, class_of, title_met
 
 if TYPE_CHECKING:
     from pipistrelle.estimation.beliefs import Estimator
@@ -157,7 +157,10 @@ def short_name(name: str) -> str:
 
 
 def title_of(name: str) -> str:
-    """Return an estimator's name as a reader knows it, whether or not it can be loaded here.
+    """Return an estimator's name as a reader knows it, without loading it.
+
+    One from outside has its own title where it has been looked up before (`entry`) in this
+    process, as after a trial; else the name of its class.
 
     Parameters
     ----------
@@ -172,10 +175,9 @@ def title_of(name: str) -> str:
     >>> title_of("ekf"), title_of("not.installed:Here")
     ('EKF', 'Here')
     """
-    try:
-        return entry(name).title
-    except InputError:
-        return short_name(name)
+    if name in CATALOGUE:
+        return CATALOGUE[name].title
+    return title_met(name) or short_name(name)
 
 
 def check_distinct(names: Iterable[str], where: str = "filter") -> None:

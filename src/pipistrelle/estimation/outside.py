@@ -21,14 +21,14 @@ PARTS = ("init", "predict", "update")
 
 
 def look_in(folder: Path) -> None:
-    """Have modules in a folder found, before installed ones, as ``python -m`` does with its own.
+    """Have modules in a folder found, before all others, as ``python -m`` does with its own.
 
     Parameters
     ----------
     folder : Path
     """
-    if str(folder) not in sys.path:
-        sys.path.insert(0, str(folder))
+    if sys.path[:1] != [str(folder)]:
+        sys.path[:] = [str(folder), *(place for place in sys.path if place != str(folder))]
     invalidate_caches()  # a module may be younger than the last look
 
 
@@ -66,6 +66,29 @@ def class_of(name: str) -> type:
             f"filter {name}: lacks {', '.join(lacking)}; an estimator has {', '.join(PARTS)}"
         )
     return kind
+
+
+def title_met(name: str) -> str | None:
+    """Return the title of a class from outside that this process has imported; import nothing.
+
+    Parameters
+    ----------
+    name : str
+        ``module:Class``.
+
+    Returns
+    -------
+    str or None
+        None where it has not been imported, or has no title.
+
+    Examples
+    --------
+    >>> title_met("never.imported:Here") is None
+    True
+    """
+    module, _, wanted = name.partition(":")
+    title = getattr(getattr(sys.modules.get(module), wanted, None), "title", None)
+    return title if isinstance(title, str) else None
 
 
 def built(name: str, kind: Any, config: Config, motion: "Motion") -> "Estimator":

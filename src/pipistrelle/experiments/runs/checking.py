@@ -33,8 +33,8 @@ def check_filters(filters: Sequence[str], motion: Motion, config: Config) -> Non
     Raises
     ------
     InputError
-        Where one cannot be had or built, does not begin with a belief, or would have the files of
-        another.
+        Where one cannot be had or built, does not begin with a belief, begins with one whose
+        methods are none, or would have the files of another.
     """
     check_distinct(filters)
     for name in filters:
@@ -52,6 +52,16 @@ def check_filters(filters: Sequence[str], motion: Motion, config: Config) -> Non
                 f"filter {name}: init returns a belief that lacks {', '.join(lacking)}; a belief "
                 f"has {', '.join(parts)}"
             )
+        methods = ("pose", "landmarks", "path", "cloud")
+        if fixed := [part for part in methods if not callable(getattr(belief, part, _nothing))]:
+            raise InputError(
+                f"filter {name}: init returns a belief whose {', '.join(fixed)} cannot be called; "
+                f"of a belief {', '.join(methods)} are methods, the last two where it has them"
+            )
+
+
+def _nothing() -> None:
+    """Stand for a method that a belief need not have."""
 
 
 def first_belief(name: str, motion: Motion, config: Config) -> Belief:
