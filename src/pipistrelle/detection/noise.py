@@ -5,7 +5,7 @@ It is stated of the rows that a filter is handed, after those of one landmark we
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -39,10 +39,17 @@ class ConstantNoise:
 
     def __call__(self, scan: Scan) -> Scan:
         """Give rows the standard deviations that they do not have."""
-        return replace(
-            scan,
+        return Scan(  # by all its fields: `replace` would take twice as long
+            time=scan.time,
+            landmark=scan.landmark,
+            caller=scan.caller,
+            bearing=scan.bearing,
+            range=scan.range,
+            detour=scan.detour,
             bearing_std=_filled(scan.bearing_std, self.bearing_std),
             range_std=_filled(scan.range_std, self.range_std),
+            detour_std=scan.detour_std,
+            level_db=scan.level_db,
         )
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from pipistrelle.detection.scans import Scan
 from pipistrelle.geometry import wrap_angle
-from pipistrelle.jit import kernel
+from pipistrelle.jit import Whole, kernel, no_alloc
 
 NEAREST = 1e-3
 """A measurement of a point nearer than this [m] says nothing that can be linearised."""
@@ -78,6 +78,28 @@ def measurements(columns: Columns) -> Measurements:
     landmark, bearing, distance, bearing_std, range_std = columns
     return Measurements(
         landmark, bearing, distance, bearing_std * bearing_std, range_std * range_std
+    )
+
+
+class Row(NamedTuple):
+    """One of `Measurements`: numbers alone, which a kernel hands on for less than the arrays."""
+
+    landmark: Whole
+    bearing: float
+    range: float
+    bearing_variance: float
+    range_variance: float
+
+
+@no_alloc
+def row_of(heard: Measurements, m: Whole) -> Row:
+    """Take measurement m."""
+    return Row(
+        heard.landmark[m],
+        heard.bearing[m],
+        heard.range[m],
+        heard.bearing_variance[m],
+        heard.range_variance[m],
     )
 
 

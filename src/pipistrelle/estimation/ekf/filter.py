@@ -32,10 +32,11 @@ from pipistrelle.estimation.ekf.gaussian import (
 )
 from pipistrelle.estimation.measurement import (
     Columns,
-    Measurements,
+    Row,
     columns_of,
     measurements,
     observe,
+    row_of,
 )
 from pipistrelle.estimation.motion import Motion, motion_numbers
 from pipistrelle.estimation.rays import (
@@ -247,14 +248,14 @@ def _correct_ray(
     state: State,
     first: Whole,
     count: Whole,
-    bearing: float,
-    variance: float,
+    row: Row,
     sensing: Sensing,
     scratch: _Scratch,
 ) -> Whole:
     """Weigh a ray's members by a bearing and share it among them; GATED when none expected it."""
     joint, mean, size = state.joint, state.joint.mean, 3 + 2 * state.members[0]
     weight, outcome = state.weight[first:], GATED
+    bearing, variance = row.bearing, row.bearing_variance
     for j in range(count):
         i = 3 + 2 * (first + j)
         _, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
@@ -280,24 +281,21 @@ def _range_for_ray(
     state: State,
     first: Whole,
     count: Whole,
-    heard: Measurements,
-    m: Whole,
+    row: Row,
     sensing: Sensing,
     scratch: _Scratch,
 ) -> None:
-    """Give a partial landmark the range of measurement m: one member is left."""
+    """Give a partial landmark its range: one member is left."""
     left = 0 if sensing.reinitialise else heaviest_member(state.weight[first:], count)
     for j in range(count):
         scratch.keep[j] = j == left
     drop_members(state, first, count, scratch.keep, scratch.source)
     state.weight[first] = 1.0
-    distance, bearing, variance = heard.range[m], heard.bearing[m], heard.bearing_variance[m]
+    distance, bearing, variance = row.range, row.bearing, row.bearing_variance
     joint, mean = state.joint, state.joint.mean
     size, i = 3 + 2 * state.members[0], 3 + 2 * first
     if sensing.reinitialise:
-        initialise(
-            mean, joint.covariance, size, i, distance, bearing, heard.range_variance[m], variance
-        )
+        initialise(mean, joint.covariance, size, i, distance, bearing, row.range_variance, variance)
     else:
         _, _, c, s, _ = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
         mean[i], mean[i + 1] = mean[0] + distance * c, mean[1] + distance * s
@@ -305,23 +303,21 @@ def _range_for_ray(
 
 
 @no_alloc
-def _correct_known(
-    state: State, heard: Measurements, m: Whole, sensing: Sensing, scratch: _Scratch
-) -> Whole:
-    """Correct with measurement m, of a mapped landmark; tell whether it was gated."""
-    first, count = _members_of(state.landmark, state.members[0], heard.landmark[m])
-    distance, bearing, variance = heard.range[m], heard.bearing[m], heard.bearing_variance[m]
+def _correct_known(state: State, row: Row, sensing: Sensing, scratch: _Scratch) -> Whole:
+    """Correct with one measurement of a mapped landmark; tell whether it was gated."""
+    first, count = _members_of(state.landmark, state.members[0], row.landmark)
+    distance, bearing, variance = row.range, row.bearing, row.bearing_variance
     joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
     passive = math.isnan(distance)
     if count == 1 and passive:
         return correct_bearing(joint, size, i, bearing, variance, sensing.passive_bound)
     if count == 1:
-        spread, bound = heard.range_variance[m], sensing.active_bound
+        spread, bound = row.range_variance, sensing.active_bound
         return correct_active(joint, size, i, distance, bearing, spread, variance, bound)
     if not passive:
-        _range_for_ray(state, first, count, heard, m, sensing, scratch)
+        _range_for_ray(state, first, count, row, sensing, scratch)
         return APPLIED
-    if _correct_ray(state, first, count, bearing, variance, sensing, scratch) == GATED:
+    if _correct_ray(state, first, count, row, sensing, scratch) == GATED:
         return GATED
     if survivors(state.weight[first:], count, sensing.prune, scratch.keep) < count:
         drop_members(state, first, count, scratch.keep, scratch.source)
@@ -329,20 +325,20 @@ def _correct_known(
 
 
 @no_alloc
-def _add_new(state: State, heard: Measurements, m: Whole, sensing: Sensing) -> None:
-    """Append the landmark of measurement m, one member or a ray of them (Eqs. (16) to (18))."""
-    joint, passive = state.joint, math.isnan(heard.range[m])
+def _add_new(state: State, row: Row, sensing: Sensing) -> None:
+    """Append a measurement's landmark, one member or a ray of them (Eqs. (16) to (18))."""
+    joint, passive = state.joint, math.isnan(row.range)
     count = sensing.ray_ranges.size if passive else 1
     for j in range(count):
-        far = sensing.ray_ranges[j] if passive else heard.range[m]
-        spread = sensing.ray_stds[j] ** 2 if passive else heard.range_variance[m]
+        far = sensing.ray_ranges[j] if passive else row.range
+        spread = sensing.ray_stds[j] ** 2 if passive else row.range_variance
         member = state.members[0]
         size = 3 + 2 * member
         initialise(
-            joint.mean, joint.covariance, size, size, far, heard.bearing[m], spread,
-            heard.bearing_variance[m],
+            joint.mean, joint.covariance, size, size, far, row.bearing, spread,
+            row.bearing_variance,
         )  # fmt: skip
-        state.landmark[member], state.weight[member] = heard.landmark[m], 1.0 / count
+        state.landmark[member], state.weight[member] = row.landmark, 1.0 / count
         state.members[0] += 1
 
 
@@ -370,11 +366,11 @@ def _update(
         landmark[member], weight[member] = old_landmark[member], old_weight[member]
     for m in range(rows):
         if known[m]:
-            gated += _correct_known(state, heard, m, sensing, scratch)
+            gated += _correct_known(state, row_of(heard, m), sensing, scratch)
     flush(joint, 3 + 2 * state.members[0])
     for m in range(rows):
         if not known[m]:
-            _add_new(state, heard, m, sensing)
+            _add_new(state, row_of(heard, m), sensing)
     joint.mean[2] = wrap_angle(joint.mean[2])
     members = state.members[0]
     mean, covariance = gaussian_of(joint, 3 + 2 * members)
