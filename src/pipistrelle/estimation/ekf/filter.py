@@ -32,6 +32,7 @@ from pipistrelle.estimation.ekf.gaussian import (
 )
 from pipistrelle.estimation.measurement import (
     Columns,
+    Measurements,
     Row,
     columns_of,
     measurements,
@@ -48,7 +49,7 @@ from pipistrelle.estimation.rays import (
     weigh_and_share,
 )
 from pipistrelle.geometry import wrap_angle
-from pipistrelle.jit import Whole, kernel, no_alloc
+from pipistrelle.jit import Whole, kernel, no_alloc, no_alloc_inlined
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -302,7 +303,7 @@ def _range_for_ray(
         correct_bearing(joint, size, i, bearing, variance, np.inf)
 
 
-@no_alloc
+@no_alloc_inlined
 def _correct_known(state: State, row: Row, sensing: Sensing, scratch: _Scratch) -> Whole:
     """Correct with one measurement of a mapped landmark; tell whether it was gated."""
     first, count = _members_of(state.landmark, state.members[0], row.landmark)
@@ -342,6 +343,28 @@ def _add_new(state: State, row: Row, sensing: Sensing) -> None:
         state.members[0] += 1
 
 
+@no_alloc
+def _take_in(
+    state: State,
+    heard: Measurements,
+    known: Bool[np.ndarray, " m"],
+    sensing: Sensing,
+    scratch: _Scratch,
+) -> Whole:
+    """Correct with what is mapped, then append what is not; returns how many were gated."""
+    gated = 0
+    for m in range(heard.landmark.size):
+        if known[m]:
+            gated += _correct_known(state, row_of(heard, m), sensing, scratch)
+    flush(state.joint, 3 + 2 * state.members[0])
+    for m in range(heard.landmark.size):
+        if not known[m]:
+            _add_new(state, row_of(heard, m), sensing)
+    mean = state.joint.mean
+    mean[2] = wrap_angle(mean[2])
+    return gated
+
+
 @kernel
 def _update(
     old_mean: Float[np.ndarray, " d"],
@@ -361,17 +384,10 @@ def _update(
             most += sensing.ray_ranges.size if math.isnan(heard.range[m]) else 1
     joint, scratch = joint_of(old_mean, old_covariance, 3 + 2 * most), _scratch(most)
     landmark, weight = np.empty(most, dtype=np.int64), np.empty(most)
-    state, gated = State(joint, landmark, weight, np.full(1, members)), 0
+    state = State(joint, landmark, weight, np.full(1, members))
     for member in range(members):
         landmark[member], weight[member] = old_landmark[member], old_weight[member]
-    for m in range(rows):
-        if known[m]:
-            gated += _correct_known(state, row_of(heard, m), sensing, scratch)
-    flush(joint, 3 + 2 * state.members[0])
-    for m in range(rows):
-        if not known[m]:
-            _add_new(state, row_of(heard, m), sensing)
-    joint.mean[2] = wrap_angle(joint.mean[2])
+    gated = _take_in(state, heard, known, sensing, scratch)
     members = state.members[0]
     mean, covariance = gaussian_of(joint, 3 + 2 * members)
     return mean, covariance, landmark[:members].copy(), weight[:members].copy(), gated
