@@ -235,7 +235,12 @@ def _client(address: str, workers: int) -> Iterator[Any]:
             yield client
         return
     with _started_deaf():
-        cluster = LocalCluster(workers, threads_per_worker=1, dashboard_address=None)
+        cluster = LocalCluster(  # no pages; its HTTP server on any port, 8787 may be taken
+            workers,
+            threads_per_worker=1,
+            dashboard_address=":0",
+            scheduler_kwargs={"dashboard": False},
+        )
     with cluster, Client(cluster) as client:
         yield client
 
