@@ -361,7 +361,7 @@ from pipistrelle.estimation.ekf.filter import EkfSlam
 
 class Mine:
     def from_config(config, motion):
-        return EkfSlam(motion=motion, range_std=0.2, bearing_std=0.15, rays=config.rays)
+        return EkfSlam(motion=motion, rays=config.rays)
     init = predict = update = EkfSlam.update
 """
 
