@@ -89,7 +89,7 @@ def _heard(landmarks: int) -> dict[str, float]:
 def _mapped(landmarks: int) -> dict[str, float]:
     """Time a frame of bearings to some of the landmarks of a map, four control steps included."""
     from pipistrelle.config import Config
-    from pipistrelle.detection.scans import Scan
+    from pipistrelle.detection.scans import make_scan
     from pipistrelle.estimation.beliefs import Gaussian
     from pipistrelle.estimation.catalogue import entry
     from pipistrelle.experiments.hearing.scenario import bicycle
@@ -97,11 +97,11 @@ def _mapped(landmarks: int) -> dict[str, float]:
     rng, label = np.random.default_rng(landmarks), np.arange(landmarks)
     slam = entry("ekf").build(Config(), bicycle(Config().motion))
     start = slam.init(Gaussian(mean=np.zeros(3), covariance=np.eye(3)))
+    noise = {"bearing_std": 0.15, "range_std": 0.2}
     bearing, distance = rng.uniform(-3.0, 3.0, landmarks), rng.uniform(2.0, 20.0, landmarks)
-    known = slam.update(start, Scan(time=0.0, landmark=label, bearing=bearing, range=distance), rng)
+    known = slam.update(start, make_scan(0.0, label, bearing, range=distance, **noise), rng)
     some = label[:: landmarks // BEARINGS][:BEARINGS]
-    nothing = np.full(BEARINGS, np.nan)
-    scan = Scan(time=1.0, landmark=some, bearing=bearing[some], range=nothing)
+    scan = make_scan(1.0, some, bearing[some], **noise)
 
     def frame() -> None:
         carried, _ = slam.predict(known, np.zeros((4, 2)), np.full(4, 0.25))

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipistrelle.detection.scans import with_columns
+
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
 
@@ -58,7 +60,7 @@ def test_the_log_is_mapped_as_well_as_the_filter_says(play):
     stated = np.sqrt(np.mean(np.trace(landmarks.covariance, axis1=1, axis2=2)))
     assert done["trial"].scores.landmarks_full == 6
     assert done["answer"] < 3.3 * stated < 1.0  # 99.9 % of one normal: the map turns as a whole
-    mirrored = tuple(replace(scan, bearing=-scan.bearing) for scan in done["log"].scans)
+    mirrored = tuple(with_columns(scan, bearing=-scan.bearing) for scan in done["log"].scans)
     wrong = replace(done["log"], scans=mirrored)
     (control,) = done["replay"](wrong, done["truth"], ["fused"], ["ekf"], None, done["Config"]())
     assert control.scores.map_rmse_m > 3.3 * stated, "bearings the wrong way round must fail"

@@ -1,8 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pipistrelle.config import InputError
-from pipistrelle.detection.scans import COLUMNS, OWN, make_scan, rows_of
+from pipistrelle.detection.merging import labelled
+from pipistrelle.detection.noise import ConstantNoise
+from pipistrelle.detection.scans import COLUMNS, OWN, make_scan, rows_of, with_columns
 
 
 def test_rows_of_a_scan_keep_all_their_columns_and_the_time():
@@ -30,3 +34,21 @@ def test_what_is_not_said_of_a_scan_says_nothing():
     assert scan.caller.tolist() == [OWN, OWN]
     for name in set(COLUMNS) - {"landmark", "caller", "bearing", "range"}:
         assert np.isnan(getattr(scan, name)).all(), name
+
+
+def test_columns_are_replaced_in_a_copy_and_checked_as_those_of_a_new_scan():
+    scan = make_scan(0.5, np.array([3, 4]), np.array([0.1, 0.2]), range=2.0)
+    other = with_columns(scan, bearing=-scan.bearing, caller=1)
+    assert (other.bearing.tolist(), other.caller.tolist()) == ([-0.1, -0.2], [1, 1])
+    assert (scan.bearing.tolist(), scan.caller.tolist()) == ([0.1, 0.2], [OWN, OWN])
+    assert (other.time, other.range.tolist()) == (0.5, [2.0, 2.0])
+    with pytest.raises(InputError, match="scan: no such column ranges"):
+        with_columns(scan, ranges=1.0)
+
+
+def test_how_the_numbers_lie_in_memory_makes_no_difference():
+    scan = make_scan(0.5, np.array([3, 4, 3]), np.array([0.1, 0.2, 0.3]), bearing_std=0.1)
+    other = replace(scan, numbers=np.asfortranarray(scan.numbers))
+    noise = ConstantNoise(range_std=0.2, bearing_std=0.15)
+    for change in (noise, lambda scan: labelled(scan, np.array([1, 2, 1]))):
+        np.testing.assert_array_equal(change(other).numbers, change(scan).numbers)

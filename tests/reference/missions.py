@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipistrelle.config import RayConfig
-from pipistrelle.detection.scans import Scan, make_scan
+from pipistrelle.detection.scans import Scan, make_scan, with_columns
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.motion import Motion, motion_step
@@ -110,8 +110,7 @@ def scan_with(label=(), bearing=(), distance=None, *, time=0.0, **columns):
 
 def measured_to(scan, range_std, bearing_std):
     """Return the scan, measured with this noise whatever it says itself."""
-    rows = np.ones(scan.landmark.size)
-    return replace(scan, range_std=range_std * rows, bearing_std=bearing_std * rows)
+    return with_columns(scan, range_std=range_std, bearing_std=bearing_std)
 
 
 def map_with(label=(), mean=None, covariance=None, weight=None):

@@ -20,7 +20,6 @@ from pipistrelle.detection.scans import (
     RANGE,
     UNLABELLED,
     Scan,
-    scan_from,
 )
 from pipistrelle.detection.snapshots import Detections
 from pipistrelle.geometry import wrap_angle
@@ -87,8 +86,11 @@ def average_faces(
     """
     labels, clutter = _distinct(label)
     found = _found(detections)
-    rows = _average(labels, label, found, averaging == "weighted", 0.5 * speed_of_sound)
-    return Heard(rows=scan_from(time, *rows), clutter=int(clutter))
+    landmark, caller, numbers = _average(
+        labels, label, found, averaging == "weighted", 0.5 * speed_of_sound
+    )
+    rows = Scan(time=time, landmark=landmark, caller=caller, numbers=numbers)
+    return Heard(rows=rows, clutter=int(clutter))
 
 
 def same_echo(
@@ -158,9 +160,9 @@ class _Found(NamedTuple):
     power: Float[np.ndarray, " d"]
 
 
-def _found(detections: Detections) -> _Found:
-    """Return detections as the kernels take them."""
-    return _Found(
+def _found(detections: Detections) -> tuple[np.ndarray, ...]:
+    """Return the columns of a `_Found`, a plain tuple, which a kernel is handed faster."""
+    return (
         detections.face, detections.caller, detections.angle, detections.bearing, detections.delay,
         detections.power,
     )  # fmt: skip
@@ -190,7 +192,7 @@ def _distinct(label: Int[np.ndarray, " d"]) -> tuple[Int[np.ndarray, " n"], Whol
 def _average(
     labels: Int[np.ndarray, " n"],
     label: Int[np.ndarray, " d"],
-    found: _Found,
+    detections: tuple,
     weighted: bool,
     metres: float,
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, "7 m"]]:
@@ -199,6 +201,7 @@ def _average(
     Returns label, caller and numbers of each pair that occurs. A second of the vehicle's own call
     is so many metres of range.
     """
+    found = _Found(*detections)
     faces = callers = 0
     for d in range(label.size):
         faces, callers = max(faces, found.face[d] + 1), max(callers, found.caller[d] + 1)
@@ -236,9 +239,10 @@ def _average(
 
 @kernel
 def _number(
-    order: Int[np.ndarray, " d"], found: _Found, delay_gate: float, bearing_gate: float
+    order: Int[np.ndarray, " d"], detections: tuple, delay_gate: float, bearing_gate: float
 ) -> Int[np.ndarray, " d"]:
     """Number the echoes, greedily, in an order of the detections."""
+    found = _Found(*detections)
     number, count = np.full(order.size, UNLABELLED, dtype=np.int64), 0
     for first in order:
         if number[first] != UNLABELLED:

@@ -15,7 +15,6 @@ from pipistrelle.detection.faces import Heard
 from pipistrelle.detection.scans import (
     BEARING,
     BEARING_STD,
-    COLUMNS,
     DETOUR,
     LEVEL,
     NUMBERS,
@@ -23,7 +22,6 @@ from pipistrelle.detection.scans import (
     RANGE,
     UNLABELLED,
     Scan,
-    scan_from,
 )
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel
@@ -59,7 +57,7 @@ def scan_of(heard: Heard, strategy: Strategy) -> Scan:
     [2]
     """
     own, others = LISTENS_TO[strategy]
-    return scan_from(heard.rows.time, *_fuse(*_columns(heard.rows), own, others, False))
+    return _fused(heard.rows, own=own, others=others, labels_only=False)
 
 
 def labelled(scan: Scan, label: Int[np.ndarray, " m"]) -> Scan:
@@ -99,7 +97,14 @@ def labelled(scan: Scan, label: Int[np.ndarray, " m"]) -> Scan:
     if label is scan.landmark and _settled(label):
         return scan
     named = replace(scan, landmark=_checked(scan, np.asarray(label)))
-    return scan_from(scan.time, *_fuse(*_columns(named), True, True, True))
+    return _fused(named, own=True, others=True, labels_only=True)
+
+
+def _fused(scan: Scan, *, own: bool, others: bool, labels_only: bool) -> Scan:
+    """Take the rows of some callers and make one row of those of each landmark."""
+    numbers = np.ascontiguousarray(scan.numbers)
+    landmark, caller, numbers = _fuse(scan.landmark, scan.caller, numbers, own, others, labels_only)
+    return Scan(time=scan.time, landmark=landmark, caller=caller, numbers=numbers)
 
 
 def _checked(scan: Scan, label: np.ndarray) -> Int[np.ndarray, " m"]:
@@ -112,16 +117,6 @@ def _checked(scan: Scan, label: np.ndarray) -> Int[np.ndarray, " m"]:
             "for clutter"
         )
     return label.astype(np.int64, copy=False)
-
-
-Columns = tuple[Float[np.ndarray, " m"], ...]
-"""A scan's numbers as the kernels take them, in the order of its fields."""
-
-
-def _columns(scan: Scan) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Columns]:
-    """Return labels, callers and numbers of a scan as the kernels take them."""
-    landmark, caller, *numbers = (np.ascontiguousarray(getattr(scan, name)) for name in COLUMNS)
-    return landmark, caller, tuple(numbers)
 
 
 @kernel
@@ -140,7 +135,7 @@ def _settled(label: Int[np.ndarray, " m"]) -> bool:
 def _fuse(
     label: Int[np.ndarray, " m"],
     whose: Int[np.ndarray, " m"],
-    columns: Columns,
+    given: Float[np.ndarray, "7 m"],
     own: bool,
     others: bool,
     labels_only: bool,
@@ -153,7 +148,7 @@ def _fuse(
     landmark, caller = np.empty(most, np.int64), np.empty(most, np.int64)
     numbers, merged = np.full((NUMBERS, most), np.nan), np.zeros(most, np.int64)
     turn, weighted, weight = np.zeros(most), np.zeros(most), np.zeros(most)
-    bearing, std, count = columns[BEARING], columns[BEARING_STD], 0
+    bearing, std, count = given[BEARING], given[BEARING_STD], 0
     for m in range(most):
         if not (own if whose[m] == OWN else others) or (labels_only and label[m] == UNLABELLED):
             continue
@@ -165,7 +160,7 @@ def _fuse(
         else:
             k, count = count, count + 1
             landmark[k], caller[k] = label[m], whose[m]
-        _take(numbers, k, columns, m)
+        _take(numbers, k, given, m)
         off = wrap_angle(bearing[m] - numbers[BEARING, k])  # from the first row's
         merged[k] += 1
         turn[k] += off
@@ -184,12 +179,14 @@ def _fuse(
 
 
 @kernel
-def _take(numbers: Float[np.ndarray, "7 k"], k: Whole, columns: Columns, m: Whole) -> None:
+def _take(
+    numbers: Float[np.ndarray, "7 k"], k: Whole, given: Float[np.ndarray, "7 m"], m: Whole
+) -> None:
     """Take of a row what its landmark does not have yet, and the level where it is higher."""
     for number in (BEARING, RANGE, DETOUR):
         if math.isnan(numbers[number, k]):
             spread = number + BEARING_STD
-            numbers[number, k], numbers[spread, k] = columns[number][m], columns[spread][m]
-    level = columns[LEVEL][m]
+            numbers[number, k], numbers[spread, k] = given[number, m], given[spread, m]
+    level = given[LEVEL, m]
     if math.isnan(numbers[LEVEL, k]) or level > numbers[LEVEL, k]:
         numbers[LEVEL, k] = level

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.config import FilterConfig
-from pipistrelle.detection.scans import Scan
+from pipistrelle.detection.scans import BEARING_STD, RANGE_STD, Scan
 from pipistrelle.jit import kernel
 
 Noise = Callable[[Scan], Scan]
@@ -39,26 +39,21 @@ class ConstantNoise:
 
     def __call__(self, scan: Scan) -> Scan:
         """Give rows the standard deviations that they do not have."""
-        return Scan(  # by all its fields: `replace` would take twice as long
-            time=scan.time,
-            landmark=scan.landmark,
-            caller=scan.caller,
-            bearing=scan.bearing,
-            range=scan.range,
-            detour=scan.detour,
-            bearing_std=_filled(scan.bearing_std, self.bearing_std),
-            range_std=_filled(scan.range_std, self.range_std),
-            detour_std=scan.detour_std,
-            level_db=scan.level_db,
-        )
+        numbers = _filled(np.ascontiguousarray(scan.numbers), self.bearing_std, self.range_std)
+        return Scan(time=scan.time, landmark=scan.landmark, caller=scan.caller, numbers=numbers)
 
 
 @kernel
-def _filled(std: Float[np.ndarray, " m"], constant: float) -> Float[np.ndarray, " m"]:
-    """Copy a column with a constant where it says nothing."""
-    filled = np.empty(std.size)
-    for m in range(std.size):
-        filled[m] = constant if math.isnan(std[m]) else std[m]
+def _filled(
+    numbers: Float[np.ndarray, "7 m"], bearing_std: float, range_std: float
+) -> Float[np.ndarray, "7 m"]:
+    """Copy numbers, with constants where they say nothing of how surely a row was measured."""
+    filled = numbers.copy()
+    for m in range(filled.shape[1]):
+        if math.isnan(filled[BEARING_STD, m]):
+            filled[BEARING_STD, m] = bearing_std
+        if math.isnan(filled[RANGE_STD, m]):
+            filled[RANGE_STD, m] = range_std
     return filled
 
 

@@ -1,6 +1,6 @@
 """Scans: what one frame measured, a row per measurement, as associations and filters see it."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -12,10 +12,29 @@ UNLABELLED = -1
 OWN = 0
 """Number of the vehicle among the callers, as in `pipistrelle.acoustics.callers`."""
 
+COLUMNS = (
+    "landmark",
+    "caller",
+    "bearing",
+    "range",
+    "detour",
+    "bearing_std",
+    "range_std",
+    "detour_std",
+    "level_db",
+)
+"""Names of a scan's columns."""
+NUMBERS = len(COLUMNS) - 2
+BEARING, RANGE, DETOUR, BEARING_STD, RANGE_STD, DETOUR_STD, LEVEL = range(NUMBERS)
+"""Where each stands among the numbers: label and caller stand apart."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scan:
     """Measurements at one time.
+
+    What is measured is one array, a row of it for each column, so that kernels are handed one;
+    each column has a name, too. Standard deviations are stated by `pipistrelle.detection.noise`.
 
     Attributes
     ----------
@@ -24,76 +43,49 @@ class Scan:
         Label, as whoever recorded it says; UNLABELLED where nobody does.
     caller : (m)
         Whose call it is: OWN, or the number of another. Of several calls, the first of theirs.
-    bearing : (m) [rad]
-        Relative to the heading, counter-clockwise, in [-pi, pi).
-    range : (m) [m]
-        NaN where passive.
-    detour : (m) [m]
-        How much longer the way from the caller over the landmark is than the direct one; NaN where
-        that was not measured.
-    bearing_std, range_std, detour_std : (m) [rad], [m], [m]
-        NaN where nobody says yet how surely it was measured (`pipistrelle.detection.noise`).
-    level_db : (m) [dB]
-        Of the strongest detection behind a row, over the noise of the steered beam; NaN where it is
-        not known.
+    numbers : (7, m)
+        The other columns, in the order of `COLUMNS`.
     """
 
     time: float
     landmark: Int[np.ndarray, " m"]
     caller: Int[np.ndarray, " m"]
-    bearing: Float[np.ndarray, " m"]
-    range: Float[np.ndarray, " m"]
-    detour: Float[np.ndarray, " m"]
-    bearing_std: Float[np.ndarray, " m"]
-    range_std: Float[np.ndarray, " m"]
-    detour_std: Float[np.ndarray, " m"]
-    level_db: Float[np.ndarray, " m"]
+    numbers: Float[np.ndarray, "7 m"]
 
+    @property
+    def bearing(self) -> Float[np.ndarray, " m"]:
+        """Relative to the heading, counter-clockwise [rad], in [-pi, pi)."""
+        return self.numbers[BEARING]
 
-COLUMNS = tuple(field.name for field in fields(Scan) if field.name != "time")
-"""Names of a scan's arrays."""
-NUMBERS = len(COLUMNS) - 2
-BEARING, RANGE, DETOUR, BEARING_STD, RANGE_STD, DETOUR_STD, LEVEL = range(NUMBERS)
-"""Where the kernels have each, in the order of the fields: label and caller stand apart."""
+    @property
+    def range(self) -> Float[np.ndarray, " m"]:
+        """To the landmark [m]; NaN where passive."""
+        return self.numbers[RANGE]
 
+    @property
+    def detour(self) -> Float[np.ndarray, " m"]:
+        """How much longer than the direct way that over the landmark is [m], or NaN."""
+        return self.numbers[DETOUR]
 
-def scan_from(
-    time: float,
-    landmark: Int[np.ndarray, " m"],
-    caller: Int[np.ndarray, " m"],
-    numbers: Float[np.ndarray, "7 m"],
-) -> Scan:
-    """Make a scan of what a kernel returns: labels, callers and the numbers, a row of each.
+    @property
+    def bearing_std(self) -> Float[np.ndarray, " m"]:
+        """Standard deviation of the bearing [rad]; NaN where nobody says yet."""
+        return self.numbers[BEARING_STD]
 
-    Parameters
-    ----------
-    time : [s]
-    landmark, caller : (m)
-    numbers : (7, m)
-        The other columns, in their order.
+    @property
+    def range_std(self) -> Float[np.ndarray, " m"]:
+        """Standard deviation of the range [m]; NaN where nobody says yet."""
+        return self.numbers[RANGE_STD]
 
-    Returns
-    -------
-    Scan
+    @property
+    def detour_std(self) -> Float[np.ndarray, " m"]:
+        """Standard deviation of the detour [m]; NaN where nobody says yet."""
+        return self.numbers[DETOUR_STD]
 
-    Examples
-    --------
-    >>> scan_from(0.5, np.array([3]), np.array([0]), np.arange(7.0)[:, np.newaxis]).range
-    array([1.])
-    """
-    bearing, distance, detour, bearing_std, range_std, detour_std, level_db = numbers
-    return Scan(
-        time=time,
-        landmark=landmark,
-        caller=caller,
-        bearing=bearing,
-        range=distance,
-        detour=detour,
-        bearing_std=bearing_std,
-        range_std=range_std,
-        detour_std=detour_std,
-        level_db=level_db,
-    )
+    @property
+    def level_db(self) -> Float[np.ndarray, " m"]:
+        """Of the strongest detection behind a row, over a steered beam's noise [dB], or NaN."""
+        return self.numbers[LEVEL]
 
 
 def make_scan(
@@ -127,22 +119,49 @@ def make_scan(
     >>> scan.range, scan.bearing_std
     (array([nan, nan]), array([0.15, 0.15]))
     """
-    given = {"landmark": landmark, "bearing": bearing, "caller": OWN} | columns
+    return _made_of(time, np.shape(landmark), {"landmark": landmark, "bearing": bearing} | columns)
+
+
+def with_columns(scan: Scan, **columns: np.ndarray | float) -> Scan:
+    """Return a scan with some of its columns replaced.
+
+    Parameters
+    ----------
+    scan : Scan
+    columns : (m), or one number for all rows
+
+    Returns
+    -------
+    Scan
+
+    Raises
+    ------
+    InputError
+        As `make_scan`.
+
+    Examples
+    --------
+    >>> scan = make_scan(0.5, np.array([3, 8]), np.array([0.2, 1.0]))
+    >>> with_columns(scan, range=2.0, bearing=-scan.bearing).bearing
+    array([-0.2, -1. ])
+    """
+    own = {name: getattr(scan, name) for name in COLUMNS}
+    return _made_of(scan.time, scan.landmark.shape, own | columns)
+
+
+def _made_of(time: float, shape: tuple[int, ...], given: dict[str, np.ndarray | float]) -> Scan:
+    """Make a scan of columns, and of what a column that is not given says."""
     if unknown := sorted(given.keys() - set(COLUMNS)):
         raise InputError(f"scan: no such column {unknown[0]}; expected one of {', '.join(COLUMNS)}")
-    shape = np.shape(landmark)
     if lengths := {n: np.shape(v) for n, v in given.items() if np.shape(v) not in ((), shape)}:
         raise InputError(
             f"scan: found columns of the shapes {lengths}, expected {shape}, that of landmark"
         )
-    filled = {
-        name: np.array(
-            np.broadcast_to(given.get(name, np.nan), shape),
-            dtype=np.int64 if name in ("landmark", "caller") else np.float64,
-        )
-        for name in COLUMNS
-    }
-    return Scan(time=time, **filled)
+    whole, numbers = np.empty((2, *shape), dtype=np.int64), np.empty((NUMBERS, *shape))
+    given = {"caller": OWN} | given
+    for row, name in zip([*whole, *numbers], COLUMNS, strict=True):
+        row[...] = given.get(name, np.nan)
+    return Scan(time=time, landmark=whole[0], caller=whole[1], numbers=numbers)
 
 
 def rows_of(scan: Scan, rows: Bool[np.ndarray, " m"] | Int[np.ndarray, " k"]) -> Scan:
@@ -163,4 +182,9 @@ def rows_of(scan: Scan, rows: Bool[np.ndarray, " m"] | Int[np.ndarray, " k"]) ->
     >>> rows_of(scan, scan.bearing > 0.5).landmark
     array([8])
     """
-    return Scan(time=scan.time, **{name: getattr(scan, name)[rows] for name in COLUMNS})
+    return Scan(
+        time=scan.time,
+        landmark=scan.landmark[rows],
+        caller=scan.caller[rows],
+        numbers=np.ascontiguousarray(scan.numbers[:, rows]),
+    )

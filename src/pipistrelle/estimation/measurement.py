@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.detection.scans import Scan
+from pipistrelle.detection.scans import BEARING, BEARING_STD, RANGE, RANGE_STD, Scan
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
@@ -39,14 +39,8 @@ class Measurements(NamedTuple):
     range_variance: Float[np.ndarray, " m"]
 
 
-Columns = tuple[
-    Int[np.ndarray, " m"],
-    Float[np.ndarray, " m"],
-    Float[np.ndarray, " m"],
-    Float[np.ndarray, " m"],
-    Float[np.ndarray, " m"],
-]
-"""Label, bearing, range and the standard deviations of both, as a scan has them."""
+Columns = tuple[Int[np.ndarray, " m"], Float[np.ndarray, "7 m"]]
+"""Labels and numbers of a scan."""
 
 
 def columns_of(scan: Scan) -> Columns:
@@ -58,10 +52,10 @@ def columns_of(scan: Scan) -> Columns:
 
     Returns
     -------
-    tuple of label, bearing, range, bearing_std and range_std
+    tuple of labels and numbers
         A plain tuple: a kernel takes one in no time, and a record in microseconds.
     """
-    return scan.landmark, scan.bearing, scan.range, scan.bearing_std, scan.range_std
+    return scan.landmark, np.ascontiguousarray(scan.numbers)
 
 
 @kernel
@@ -75,9 +69,14 @@ def measurements(columns: Columns) -> Measurements:
     >>> measurements(columns_of(scan)).bearing_variance
     array([0.25])
     """
-    landmark, bearing, distance, bearing_std, range_std = columns
+    landmark, numbers = columns
+    bearing_std, range_std = numbers[BEARING_STD], numbers[RANGE_STD]
     return Measurements(
-        landmark, bearing, distance, bearing_std * bearing_std, range_std * range_std
+        landmark,
+        numbers[BEARING],
+        numbers[RANGE],
+        bearing_std * bearing_std,
+        range_std * range_std,
     )
 
 

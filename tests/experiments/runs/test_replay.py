@@ -11,6 +11,7 @@ import pytest
 from pipistrelle.config import InputError
 from pipistrelle.detection.logs.folder import read_log, write_log
 from pipistrelle.detection.logs.readers import Reader
+from pipistrelle.detection.scans import with_columns
 from pipistrelle.experiments.drives import NO_TRUTH
 from pipistrelle.experiments.runs.replay import as_heard_by, load, motion_of, start_of
 from pipistrelle.experiments.runs.truth_files import read_truth, write_truth
@@ -263,7 +264,7 @@ def test_hiding_changes_no_scan_and_keeps_empty_ones():
     heard = as_heard_by([SCAN, SCAN], "active", 1e-9)
     np.testing.assert_array_equal(SCAN.range, before)
     assert [scan.landmark.tolist() for scan in heard] == [[1], [1]]
-    behind = replace(SCAN, bearing=np.full(5, 3.0))
+    behind = with_columns(SCAN, bearing=3.0)
     assert [scan.landmark.size for scan in as_heard_by([behind], "active", 1.0)] == [0]
 
 

@@ -31,7 +31,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.config import FastSlamConfig, RayConfig
-from pipistrelle.detection.scans import Scan
+from pipistrelle.detection.scans import Scan, rows_of
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.fastslam.block import LANES, MEMBER
 from pipistrelle.estimation.fastslam.particles import (
@@ -44,7 +44,7 @@ from pipistrelle.estimation.fastslam.particles import (
 )
 from pipistrelle.estimation.fastslam.poses import SMALLEST_STD, propagate, summarise
 from pipistrelle.estimation.fastslam.resampling import effective_particles, normalised, stratified
-from pipistrelle.estimation.measurement import Columns, columns_of
+from pipistrelle.estimation.measurement import columns_of
 from pipistrelle.estimation.motion import Motion, motion_numbers
 from pipistrelle.estimation.rays import Sensing, sensing_of
 
@@ -228,8 +228,8 @@ class FastSlam:
         particles = self.settings.particles
         normal, uniform = rng.standard_normal((particles, 3)), rng.random(particles)
         sensing = sensing_of(self.rays, self.gate, self.settings.mixture == "exact")
-        columns, gated = self._inside(belief, columns_of(scan), sensing)
-        corrected, gained = correct_particles(_arrays(belief), columns, normal, sensing)
+        inside, gated = self._inside(belief, scan, sensing)
+        corrected, gained = correct_particles(_arrays(belief), columns_of(inside), normal, sensing)
         poses, landmark, first, count, member = corrected
         weight = normalised(belief.log_weight + gained)
         best_count, best_member = particle_map(count, member, int(np.argmax(weight)))
@@ -251,15 +251,12 @@ class FastSlam:
             return after
         return _resampled(after, stratified(weight, uniform))
 
-    def _inside(
-        self, belief: FastSlamBelief, columns: Columns, sensing: Sensing
-    ) -> tuple[Columns, int]:
+    def _inside(self, belief: FastSlamBelief, scan: Scan, sensing: Sensing) -> tuple[Scan, int]:
         """Drop the measurements that no particle expected; tell how many."""
         if self.gate >= 1.0:
-            return columns, 0
-        dropped = gated_by_all(_arrays(belief), columns, sensing)
-        label, bearing, distance, bearing_std, range_std = (part[~dropped] for part in columns)
-        return (label, bearing, distance, bearing_std, range_std), int(np.count_nonzero(dropped))
+            return scan, 0
+        dropped = gated_by_all(_arrays(belief), columns_of(scan), sensing)
+        return rows_of(scan, ~dropped), int(np.count_nonzero(dropped))
 
 
 def _arrays(belief: FastSlamBelief) -> Arrays:

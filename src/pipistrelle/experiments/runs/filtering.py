@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from pipistrelle.config import InputError
 from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.noise import Noise, as_said
-from pipistrelle.detection.scans import Scan
+from pipistrelle.detection.scans import BEARING, BEARING_STD, NUMBERS, RANGE, RANGE_STD, Scan
 from pipistrelle.estimation.association import Associate, told
 from pipistrelle.estimation.beliefs import (
     B,
@@ -135,7 +135,8 @@ def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]
             f"scan at {scans[late + 1].time} s: follows one at {scans[late].time} s; expected "
             "scans in the order of time"
         )
-    bearing, distance = (_column(scans, name) for name in ("bearing", "range"))
+    numbers = _numbers(scans)
+    bearing, distance = numbers[BEARING], numbers[RANGE]
     usable = np.isfinite(bearing)
     usable &= np.isnan(distance) | ((distance > 0.0) & (distance < np.inf))
     _refuse(
@@ -149,9 +150,10 @@ def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]
 
 def _refuse_unstated(scans: Sequence[Scan]) -> None:
     """Refuse rows of which nobody says how sure they are."""
-    bearing_std, range_std = (_column(scans, name) for name in ("bearing_std", "range_std"))
+    numbers = _numbers(scans)
+    bearing_std, range_std = numbers[BEARING_STD], numbers[RANGE_STD]
     stated = (bearing_std > 0.0) & (bearing_std < np.inf)
-    stated &= np.isnan(_column(scans, "range")) | ((range_std > 0.0) & (range_std < np.inf))
+    stated &= np.isnan(numbers[RANGE]) | ((range_std > 0.0) & (range_std < np.inf))
     _refuse(
         scans,
         stated,
@@ -160,9 +162,9 @@ def _refuse_unstated(scans: Sequence[Scan]) -> None:
     )
 
 
-def _column(scans: Sequence[Scan], name: str) -> Float[np.ndarray, " m"]:
-    """Return a column of all scans, one after another."""
-    return np.concatenate([np.empty(0), *(getattr(scan, name) for scan in scans)])
+def _numbers(scans: Sequence[Scan]) -> Float[np.ndarray, "7 m"]:
+    """Return what all scans measured, one after another."""
+    return np.concatenate([np.empty((NUMBERS, 0)), *(scan.numbers for scan in scans)], axis=1)
 
 
 def _refuse(scans: Sequence[Scan], good: Bool[np.ndarray, " m"], found: str) -> None:

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from pipistrelle.config import Config, Strategy
 from pipistrelle.detection.logs.readers import READERS, Reader, Robot, reader_of
 from pipistrelle.detection.logs.recording import Log
 from pipistrelle.detection.noise import noise_of
-from pipistrelle.detection.scans import Scan, rows_of
+from pipistrelle.detection.scans import Scan, rows_of, with_columns
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.drives import Drive, Truth
@@ -56,6 +55,7 @@ def load(
 
     Examples
     --------
+    >>> from dataclasses import replace
     >>> walk = Log(
     ...     name="walk", time=np.array([0.0, 1.0]), controls=np.array([[1.0, 0.0]]),
     ...     dt=np.array([1.0]), scans=(), motion="unicycle", control_std=(0.1, 0.1),
@@ -117,7 +117,7 @@ def as_heard_by(
         hidden = (np.abs(scan.bearing) > limit) | (strategy == "passive")
         distance = np.where(hidden, np.nan, scan.range)
         kept = np.isfinite(distance) | (strategy != "active")
-        heard.append(rows_of(replace(scan, range=distance), kept))
+        heard.append(rows_of(with_columns(scan, range=distance), kept))
     return tuple(heard)
 
 
