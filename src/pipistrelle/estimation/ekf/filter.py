@@ -244,7 +244,7 @@ def _members_of(
     return members, 0
 
 
-@no_alloc
+@no_alloc_inlined
 def _correct_ray(
     state: State,
     first: Whole,
@@ -303,7 +303,7 @@ def _range_for_ray(
         correct_bearing(joint, size, i, bearing, variance, np.inf)
 
 
-@no_alloc_inlined
+@no_alloc
 def _correct_known(state: State, row: Row, sensing: Sensing, scratch: _Scratch) -> Whole:
     """Correct with one measurement of a mapped landmark; tell whether it was gated."""
     first, count = _members_of(state.landmark, state.members[0], row.landmark)
