@@ -21,15 +21,15 @@ import pytest
 from pipistrelle.config import InputError
 from pipistrelle.experiments.studies import executors, study
 from pipistrelle.experiments.studies.plan_file import plan_text
-from pipistrelle.experiments.studies.store import done_worlds
 from pipistrelle.experiments.studies.study import run_study
+from pipistrelle.experiments.studies.world_files import done_worlds
 from reference.studies import SMALL, assert_same, fatal, leftovers, lost, plan_of, results
 
 UNTIL_KILLED = """\
 import os, signal, sys
 from pathlib import Path
 from pipistrelle.experiments.results import folder
-from pipistrelle.experiments.studies import store
+from pipistrelle.experiments.studies import world_files
 from pipistrelle.experiments.studies.plan_file import read_plan
 from pipistrelle.experiments.studies.study import run_study
 
@@ -46,7 +46,7 @@ def mortal(act, before):
     return once
 
 write = folder.write_down
-for place in (folder, store):
+for place in (folder, world_files):
     place.write_down = mortal(write, lambda path, data: write(path, data[: len(data) // 2]))
     place.put_in_place = mortal(place.put_in_place, lambda partial, path: None)
 if __name__ == "__main__":

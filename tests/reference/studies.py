@@ -7,7 +7,8 @@ from pathlib import Path
 import polars as pl
 
 from pipistrelle.experiments.studies.plan_file import read_plan
-from pipistrelle.experiments.studies.store import TABLES, load_study
+from pipistrelle.experiments.studies.store import load_study
+from pipistrelle.experiments.studies.world_files import TABLES
 
 SMALL = """\
 format = 1
@@ -46,6 +47,11 @@ def assert_same(one, other):
         assert one[name].schema == other[name].schema
         assert len(one[name]) > 0
         assert one[name].equals(other[name], null_equal=True), name
+
+
+def contents(folder):
+    """Every file of a folder and what is in it."""
+    return {p.relative_to(folder): p.read_bytes() for p in Path(folder).rglob("*") if p.is_file()}
 
 
 def leftovers(folder):

@@ -10,8 +10,9 @@ from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config
 from pipistrelle.experiments.studies.plan import cases_of
 from pipistrelle.experiments.studies.plan_file import read_plan
-from pipistrelle.experiments.studies.store import open_store, world_file
+from pipistrelle.experiments.studies.store import open_store
 from pipistrelle.experiments.studies.world import world_schemas
+from pipistrelle.experiments.studies.world_files import TABLES, with_sums, world_file
 from pipistrelle.report.studied import COMMON, SCORES, Study, Trials
 
 RADII = (
@@ -163,11 +164,14 @@ def write_store(folder: Path, study: Study, *, iterations=None, seed=3, failed=(
     for row, iteration in enumerate(study.worlds.tolist()):
         broken = {number for world, number in failed if world == row}
         tables = world_tables_of(study, row, cases, broken, full[row], error[row])
-        for name in ("steps", "landmarks", "trials"):
-            rows = [{"iteration": iteration} | line for line in tables[name]]
-            pl.DataFrame(rows, schema=schemas[name]).write_parquet(
-                world_file(folder, name, iteration)
+        frames = {
+            name: pl.DataFrame(
+                [{"iteration": iteration} | line for line in tables[name]], schema=schemas[name]
             )
+            for name in TABLES
+        }
+        for name, file in with_sums(frames, iteration).items():
+            world_file(folder, name, iteration).write_bytes(file)
     for row, number in failed:
         full[row, number], error[row, number] = False, np.nan
     return plan, full, error

@@ -6,6 +6,7 @@ import pytest
 
 from pipistrelle.config import InputError
 from pipistrelle.experiments.studies.plan import cases_of
+from pipistrelle.experiments.studies.world_files import TABLES, with_sums, world_file
 from pipistrelle.report.reading import read_study
 from pipistrelle.report.studied import COMMON, SCORES
 from report.invented import BEAMWIDTH, ERROR, FILTERS, RADII, STRATEGIES, invent, write_store
@@ -129,7 +130,8 @@ def test_a_damaged_file_is_refused_with_what_to_do(tmp_path, table):
     with pytest.raises(InputError) as refused:
         read_study(folder)
     said = str(refused.value)
-    assert said.startswith(f"{path}: could not be read")
+    flaw = "could not be read" if table == "trials" else "is not as it was written"
+    assert said.startswith(f"{path}: {flaw}")
     assert "remove trials/iteration_00001.parquet" in said
     assert "its world is done anew" in said
     assert said.isprintable()
@@ -149,7 +151,8 @@ def test_a_table_that_is_gone_is_named(tmp_path, table):
 def test_a_table_of_another_shape_is_refused(tmp_path):
     folder = tmp_path / "store"
     write_store(folder, invent(1))
-    path = folder / "trials" / "iteration_00000.parquet"
-    pl.read_parquet(path).drop("nees_max").write_parquet(path)
+    tables = {name: pl.read_parquet(world_file(folder, name, 0)) for name in TABLES}
+    lacking = tables | {"trials": tables["trials"].drop("nees_max")}
+    world_file(folder, "trials", 0).write_bytes(with_sums(lacking, 0)["trials"])
     with pytest.raises(InputError, match=r"iteration_00000\.parquet: has not the columns"):
         read_study(folder)

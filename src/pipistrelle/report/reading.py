@@ -12,8 +12,14 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import Config, InputError
 from pipistrelle.experiments.studies.plan import RADIUS, Plan, cases_of
-from pipistrelle.experiments.studies.store import done_worlds, load_study, world_file
+from pipistrelle.experiments.studies.store import load_study
 from pipistrelle.experiments.studies.world import world_schemas
+from pipistrelle.experiments.studies.world_files import (
+    check_world,
+    damaged,
+    done_worlds,
+    world_file,
+)
 from pipistrelle.report.studied import COMMON, SCORES, Study, Trials
 
 if TYPE_CHECKING:
@@ -41,6 +47,8 @@ def read_study(folder: Path) -> tuple[Study, ...]:
     import polars as pl
 
     stored = load_study(folder)
+    for world in sorted(done_worlds(folder)):
+        check_world(folder, world)
     try:
         trials = stored.trials.collect()
         if trials.is_empty():
@@ -59,27 +67,14 @@ def read_study(folder: Path) -> tuple[Study, ...]:
 
 
 def _unreadable(folder: Path, plan: Plan) -> InputError:
-    """Find the file that cannot be read, and say how to have its world anew."""
+    """Find the file that is whole, but of no use, and say how to have its world anew."""
     import polars as pl
 
     for world in sorted(done_worlds(folder)):
         for table, schema in world_schemas(plan).items():
-            path = world_file(folder, table, world)
-            try:
-                whole = pl.read_parquet(path).schema == pl.Schema(schema)
-                found = "" if whole else "has not the columns of this study"
-            except FileNotFoundError:
-                found = "is missing"
-            except OSError as error:
-                found = f"could not be read ({error.strerror or 'no whole file'})"
-            except pl.exceptions.PolarsError:
-                found = "could not be read: it is no whole Parquet file"
-            if found:
-                done = world_file(folder, "trials", world).relative_to(folder)
-                return InputError(
-                    f"{path}: {found}; remove {done} from {folder} and run the study again: "
-                    "its world is done anew"
-                )
+            file = world_file(folder, table, world)
+            if pl.read_parquet(file.read_bytes()).schema != pl.Schema(schema):
+                return damaged(folder, table, world, "has not the columns of this study")
     return InputError(f"{folder}: could not be read, though each file can; run the report again")
 
 

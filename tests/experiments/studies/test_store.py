@@ -1,4 +1,4 @@
-"""A study's folder: whole or not there, whoever writes it and whatever stops it."""
+"""A study's folder: its plan, and who may write it."""
 
 import os
 import sys
@@ -8,45 +8,11 @@ import polars as pl
 import pytest
 
 from pipistrelle.config import Config, InputError
-from pipistrelle.experiments.studies import store
 from pipistrelle.experiments.studies.plan_file import read_plan
-from pipistrelle.experiments.studies.store import (
-    TABLES,
-    done_worlds,
-    load_study,
-    open_store,
-    read_ended_trials,
-    sweep,
-    world_file,
-    write_world,
-)
-from pipistrelle.experiments.studies.world import failed_records
+from pipistrelle.experiments.studies.store import load_study, open_store
+from pipistrelle.experiments.studies.world_files import TABLES, write_world
 from pipistrelle.settings import from_file, resolve
-from reference.studies import SMALL, leftovers, plan_of
-
-FULL = Path("/dev/full")
-
-
-@pytest.fixture
-def plan(tmp_path):
-    return plan_of(tmp_path)
-
-
-@pytest.fixture
-def folder(tmp_path, plan):
-    folder = tmp_path / "study"
-    open_store(folder, plan)
-    return folder
-
-
-@pytest.fixture
-def records(plan):
-    return failed_records(plan, "for want of a better\n")
-
-
-def contents(folder):
-    """Every file of a folder and what is in it."""
-    return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+from reference.studies import SMALL, contents, leftovers, plan_of
 
 
 def test_a_study_opens_with_its_plan_its_settings_and_an_explanation(folder, plan):
@@ -99,65 +65,6 @@ def test_a_damaged_plan_is_named(folder, plan):
         open_store(folder, plan)
 
 
-def test_a_world_is_done_when_its_trials_are_there(folder, plan, records):
-    assert done_worlds(folder) == set()
-    write_world(folder, plan, 2, records)
-    assert done_worlds(folder) == {2}
-    for table in TABLES:
-        assert world_file(folder, table, 2).is_file()
-    assert leftovers(folder) == []
-    assert read_ended_trials(folder, 2) == [(r.case.strategy, r.error) for r in records]
-
-
-def test_the_trials_go_last(folder, plan, records, monkeypatch):
-    order = []
-    rename = store.put_in_place
-    monkeypatch.setattr(
-        store, "put_in_place", lambda a, b: (order.append(b.parent.name), rename(a, b))
-    )
-    write_world(folder, plan, 0, records)
-    assert order == ["steps", "landmarks", "trials"]
-
-
-@pytest.mark.parametrize("table", TABLES)
-@pytest.mark.skipif(not FULL.exists(), reason="this system has no device that is always full")
-def test_a_full_disk_ends_in_a_clear_error_and_leaves_what_was_there(
-    folder, plan, records, monkeypatch, table
-):
-    write_world(folder, plan, 1, records)
-    before = contents(folder)
-    partial = f".{'0' * 8}.partial"
-    monkeypatch.setattr(store, "uuid4", lambda: type("Same", (), {"hex": "0" * 32}))
-    for iteration in (0, 1):
-        path = world_file(folder, table, iteration)
-        path.with_name(path.name + partial).symlink_to(FULL)
-        with pytest.raises(InputError, match=r"could not be written \(No space left on device\)"):
-            write_world(folder, plan, iteration, failed_records(plan, "never written\n"))
-    assert contents(folder) == before
-    assert leftovers(folder) == []
-    assert done_worlds(folder) == {1}
-
-
-@pytest.mark.parametrize("nth", [1, 2, 3])
-def test_a_rename_that_fails_leaves_no_half_a_world_that_counts(
-    folder, plan, records, monkeypatch, nth
-):
-    calls = []
-
-    def failing(partial, path):
-        calls.append(path)
-        if len(calls) == nth:
-            raise OSError(5, "Input/output error", str(path))
-        partial.replace(path)
-
-    monkeypatch.setattr(store, "put_in_place", failing)
-    with pytest.raises(InputError, match="Input/output error"):
-        write_world(folder, plan, 0, records)
-    assert done_worlds(folder) == set()
-    assert leftovers(folder) == []
-    assert len(load_study(folder).steps.collect()) == 0
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="a place where nobody may write is known there")
 def test_a_place_that_cannot_be_written_is_refused(plan):
     with pytest.raises(InputError, match=r"could not be written \(.*\); worlds that are done are"):
@@ -176,45 +83,6 @@ def test_a_file_in_place_of_the_folder_is_refused(tmp_path, plan):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="could not be written"):
         open_store(tmp_path / "file", plan)
-
-
-def test_what_a_killed_writer_left_is_no_result_and_goes_when_its_world_is_done(
-    folder, plan, records
-):
-    for table in TABLES:
-        path = world_file(folder, table, 0)
-        path.with_name(f"{path.name}.deadbeef.partial").write_bytes(b"PAR1 half a")
-    world_file(folder, "steps", 0).write_bytes(b"whole, but of a world that is not done")
-    other = world_file(folder, "steps", 1)
-    living = other.with_name(f"{other.name}.01234567.partial")
-    living.write_bytes(b"another process is writing this")
-    assert done_worlds(folder) == set()
-    assert len(load_study(folder).steps.collect()) == 0
-    write_world(folder, plan, 0, records)
-    assert leftovers(folder) == [living]
-    sweep(folder, [1])
-    assert leftovers(folder) == []
-
-
-def test_a_writer_that_was_overtaken_is_content(folder, plan, records, monkeypatch):
-    write = store.write_down
-
-    def overtaken(path, data):
-        write(path, data)
-        if path.parent.name == "trials" and len(leftovers(folder)) == 3:
-            monkeypatch.setattr(store, "write_down", write)
-            write_world(folder, plan, 0, records)  # which sweeps ours away
-
-    monkeypatch.setattr(store, "write_down", overtaken)
-    write_world(folder, plan, 0, records)
-    assert done_worlds(folder) == {0}
-    assert leftovers(folder) == []
-
-
-def test_a_damaged_world_is_named_with_the_way_out(folder, plan):
-    world_file(folder, "trials", 0).write_bytes(b"nothing of ours")
-    with pytest.raises(InputError, match=r"iteration_00000\.parquet: could not be read .*; remove"):
-        read_ended_trials(folder, 0)
 
 
 def test_a_study_loads_lazily_world_after_world(folder, plan, records):

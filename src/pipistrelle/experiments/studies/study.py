@@ -28,15 +28,15 @@ from pipistrelle.experiments.studies.executors import (
     on_cluster,
 )
 from pipistrelle.experiments.studies.plan import Plan, cases_of
-from pipistrelle.experiments.studies.store import (
+from pipistrelle.experiments.studies.store import open_store
+from pipistrelle.experiments.studies.world import failed_records, run_world
+from pipistrelle.experiments.studies.world_files import (
     EndedTrial,
     done_worlds,
-    open_store,
     read_ended_trials,
     sweep,
     write_world,
 )
-from pipistrelle.experiments.studies.world import failed_records, run_world
 
 KILLED = "its process ended without a word, twice: killed, or out of memory\n"
 """Recorded for every trial of a world that takes its process with it."""

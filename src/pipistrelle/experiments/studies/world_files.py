@@ -1,0 +1,305 @@
+"""One world's tables in a study's folder: written whole, checked by their sums, read.
+
+Results are written where they were computed, under a name of their own, and renamed when all of
+a world's tables are whole; the table of trials goes last and means that the world is done. It
+bears the sums of all three, so a file that a disk changed, that was cut, or that is of another
+world is noticed.
+"""
+
+import contextlib
+import io
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from hashlib import sha256
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+from uuid import uuid4
+
+from pipistrelle.config import InputError
+from pipistrelle.experiments.results.folder import put_in_place, write_down
+from pipistrelle.experiments.studies.plan import Plan
+from pipistrelle.experiments.studies.world import TrialRecord, world_tables
+
+if TYPE_CHECKING:
+    import polars as pl
+
+TABLES = ("steps", "landmarks", "trials")
+"""In the order in which a world's are put in place."""
+_SUM = "pipistrelle.sha256.{}"
+"""Where a table's sum stands among what the file of trials says of itself."""
+_NO_SUM = "-" * 64
+"""In place of the sum of the file of trials, when that is taken."""
+_WORLD = "pipistrelle.iteration"
+
+
+class EndedTrial(NamedTuple):
+    """How a trial ended, as a worker reports it.
+
+    Attributes
+    ----------
+    strategy : "active", "fused" or "passive"
+    error : str or None
+        What is recorded of a trial that failed.
+    """
+
+    strategy: str
+    error: str | None
+
+
+def world_file(folder: Path, table: str, iteration: int) -> Path:
+    """Return the place of one world's table.
+
+    Parameters
+    ----------
+    folder : Path
+    table : one of `TABLES`
+    iteration : int
+
+    Returns
+    -------
+    Path
+
+    Examples
+    --------
+    >>> world_file(Path("study"), "trials", 7).as_posix()
+    'study/trials/iteration_00007.parquet'
+    """
+    return folder / table / f"iteration_{iteration:05d}.parquet"
+
+
+def done_worlds(folder: Path) -> set[int]:
+    """Return the numbers of the worlds that are done.
+
+    Parameters
+    ----------
+    folder : Path
+
+    Returns
+    -------
+    set of int
+    """
+    names = (
+        path.stem.partition("_")[2] for path in (folder / "trials").glob("iteration_*.parquet")
+    )
+    return {int(name) for name in names if name.isdecimal()}
+
+
+def write_world(folder: Path, plan: Plan, iteration: int, records: Sequence[TrialRecord]) -> None:
+    """Write a world's tables, in place of earlier ones, and sweep up after killed writers.
+
+    Parameters
+    ----------
+    folder : Path
+        As `open_store` made it.
+    plan : Plan
+    iteration : int
+    records : sequence of TrialRecord
+        One per case.
+
+    Raises
+    ------
+    InputError
+        Where they cannot be written; earlier ones are then as they were.
+    """
+    files = with_sums(world_tables(plan, iteration, records), iteration)
+    partial = f".{uuid4().hex[:8]}.partial"
+    paths = [world_file(folder, name, iteration) for name in TABLES]
+    try:
+        for path in paths:
+            write_down(path.with_name(path.name + partial), files[path.parent.name])
+        _make_way(folder, iteration, files)
+        for path in paths:
+            put_in_place(path.with_name(path.name + partial), path)
+    except OSError as error:
+        raise unusable(folder, error) from error
+    finally:
+        sweep(folder, [iteration] if paths[-1].exists() else [], partial)
+
+
+def with_sums(tables: "Mapping[str, pl.DataFrame]", iteration: int) -> dict[str, bytes]:
+    """Make files of a world's tables; that of the trials bears the sums of all.
+
+    Parameters
+    ----------
+    tables : mapping of DataFrame
+        By the names in `TABLES`.
+    iteration : int
+
+    Returns
+    -------
+    dict of bytes
+    """
+    files = {name: _parquet(tables[name]) for name in TABLES[:-1]}
+    said = {_SUM.format(name): sha256(file).hexdigest() for name, file in files.items()}
+    said |= {_SUM.format("trials"): _NO_SUM, _WORLD: str(iteration)}
+    trials = _parquet(tables["trials"], said)
+    own = sha256(trials).hexdigest()
+    return files | {"trials": trials.replace(_NO_SUM.encode(), own.encode())}
+
+
+def _parquet(table: "pl.DataFrame", said: dict[str, str] | None = None) -> bytes:
+    """Return a table as a Parquet file, with what it says of itself."""
+    buffer = io.BytesIO()
+    table.write_parquet(buffer, metadata=said)
+    return buffer.getvalue()
+
+
+def _make_way(folder: Path, iteration: int, files: dict[str, bytes]) -> None:
+    """Declare a world not done whose other tables are about to change under its trials."""
+    trials = world_file(folder, "trials", iteration)
+    for name in TABLES[:-1]:
+        with contextlib.suppress(FileNotFoundError):
+            if world_file(folder, name, iteration).read_bytes() != files[name]:
+                trials.unlink(missing_ok=True)
+
+
+def sweep(folder: Path, iterations: Iterable[int], partial: str = "") -> None:
+    """Remove what killed writers left of worlds that are done.
+
+    Parameters
+    ----------
+    folder : Path
+    iterations : iterable of int
+    partial : str
+        Remove the files that end so, too.
+    """
+    stems = tuple(f"iteration_{iteration:05d}." for iteration in iterations)
+    for path in chain.from_iterable((folder / name).glob("*.partial") for name in TABLES):
+        if (partial and path.name.endswith(partial)) or path.name.startswith(stems):
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+
+
+def read_ended_trials(folder: Path, iteration: int) -> list[EndedTrial]:
+    """Tell how the trials of a world that is done ended.
+
+    Parameters
+    ----------
+    folder : Path
+    iteration : int
+
+    Returns
+    -------
+    list of EndedTrial
+
+    Raises
+    ------
+    InputError
+        Where one of the world's files is not as it was written.
+    """
+    import polars as pl
+
+    check_world(folder, iteration)
+    trials = world_file(folder, "trials", iteration).read_bytes()
+    return [
+        EndedTrial(*row) for row in pl.read_parquet(trials, columns=[*EndedTrial._fields]).rows()
+    ]
+
+
+def check_world(folder: Path, iteration: int) -> None:
+    """Refuse a world that is done, but of which a file is not as it was written.
+
+    Parameters
+    ----------
+    folder : Path
+    iteration : int
+
+    Raises
+    ------
+    InputError
+        With the file, and how to have the world anew.
+    """
+    found: dict[str, bytes] = {}
+    for name in reversed(TABLES):
+        path = world_file(folder, name, iteration)
+        try:
+            found[name] = path.read_bytes()
+            flaw = _flaw(name, found, iteration)
+        except FileNotFoundError:
+            flaw = "is missing"
+        except OSError as error:
+            flaw = f"could not be read ({error.strerror})"
+        if flaw:
+            raise damaged(folder, name, iteration, flaw)
+
+
+def damaged(folder: Path, table: str, iteration: int, flaw: str) -> InputError:
+    """Say what is wrong with a world's file, and how to have the world anew.
+
+    Parameters
+    ----------
+    folder : Path
+    table : one of `TABLES`
+    iteration : int
+    flaw : str
+
+    Returns
+    -------
+    InputError
+    """
+    return InputError(
+        f"{world_file(folder, table, iteration)}: {flaw}; remove "
+        f"{world_file(Path(), 'trials', iteration)} from {folder} and run the study again: its "
+        "world is done anew"
+    )
+
+
+def _flaw(name: str, found: dict[str, bytes], iteration: int) -> str | None:
+    """Tell what is wrong with a file, by what that of the trials says; the trials come first."""
+    import polars as pl
+
+    try:
+        said = pl.read_parquet_metadata(io.BytesIO(found["trials"]))
+    except (OSError, pl.exceptions.PolarsError):
+        return "could not be read: it is no whole Parquet file"
+    if _WORLD not in said:
+        return "bears no sums: it is of an earlier version, or not Pipistrelle's"
+    if said[_WORLD] != str(iteration):
+        return f"is the file of world {said[_WORLD]}"
+    expected, file = said.get(_SUM.format(name), _NO_SUM), found[name]
+    if name == "trials":
+        file = file.replace(expected.encode(), _NO_SUM.encode())
+    return None if sha256(file).hexdigest() == expected else "is not as it was written"
+
+
+def scan_tables(folder: Path, table: str, worlds: Sequence[int]) -> "pl.LazyFrame":
+    """Open one table of some worlds, one after another.
+
+    Parameters
+    ----------
+    folder : Path
+    table : one of `TABLES`
+    worlds : sequence of int
+        At least one.
+
+    Returns
+    -------
+    LazyFrame
+    """
+    import polars as pl
+
+    paths = [world_file(folder, table, world).absolute() for world in worlds]
+    try:
+        os.fspath(folder.absolute()).encode()
+    except UnicodeEncodeError:  # a name that Polars could not have
+        return pl.scan_parquet([path.read_bytes() for path in paths])
+    return pl.scan_parquet(paths, glob=False)
+
+
+def unusable(folder: Path, error: OSError) -> InputError:
+    """Say that a study's folder cannot be written, and that nothing is lost.
+
+    Parameters
+    ----------
+    folder : Path
+    error : OSError
+
+    Returns
+    -------
+    InputError
+    """
+    return InputError(
+        f"{error.filename or folder}: could not be written ({error.strerror}); worlds that are "
+        "done are kept: mend this, or copy the folder elsewhere, and run the same command again"
+    )
