@@ -15,6 +15,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from multiprocessing import active_children
+from urllib.error import HTTPError
+from urllib.request import urlopen
 
 import pytest
 
@@ -412,6 +414,51 @@ class TestDaskInProcessesOfThisMachine(TestDaskOnThisMachine):
     @pytest.fixture(autouse=True)
     def threads(self):
         pytest.importorskip("distributed", reason="no Dask: the extra [cluster]")
+
+
+INTRUDER = """\
+import asyncio, sys
+from distributed.core import rpc
+from distributed.security import Security
+
+async def ask(address, **held):
+    async with rpc(address, timeout=3, **held) as door:
+        return await asyncio.wait_for(door.identity(), 10)
+
+for address in sys.argv[1:]:
+    own = Security.temporary().get_connection_args("client")
+    for where, held in ((address.replace("tls:", "tcp:"), {}), (address, {"connection_args": own})):
+        try:
+            print("let in at", where, asyncio.run(ask(where, **held)))
+        except OSError:
+            print("refused")
+"""
+
+
+@pytest.mark.slow
+def test_nobody_else_on_the_machine_is_let_into_a_cluster_that_is_started_here():
+    pytest.importorskip("distributed", reason="no Dask: the extra [cluster]")
+    with executors._client("local", 1) as client:
+        known = client.scheduler_info()
+        ((worker, about),) = known["workers"].items()
+        doors = [client.scheduler.address, worker, about["nanny"]]
+        assert all(door.startswith("tls://127.0.0.1:") for door in doors)
+        asked = [sys.executable, "-c", INTRUDER, *doors]
+        answers = subprocess.run(asked, capture_output=True, text=True, check=True).stdout
+        assert answers.split() == ["refused"] * 6
+        for port in (known["services"]["dashboard"], about["services"]["dashboard"]):
+            for page in ("", "status", "info/main/workers.html", "json/counts.json"):
+                with pytest.raises(HTTPError, match="404"):
+                    urlopen(f"http://127.0.0.1:{port}/{page}")
+        assert client.submit(sum, [1, 2]).result() == 3, "whom we know is let in"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 3])
+def test_a_cluster_that_is_started_here_has_the_workers_that_were_asked_for(workers):
+    pytest.importorskip("distributed", reason="no Dask: the extra [cluster]")
+    with executors._client("local", workers) as client:
+        assert len(client.scheduler_info(n_workers=-1)["workers"]) == workers
 
 
 def test_no_scheduler_at_the_address_is_an_error(plan, folder):

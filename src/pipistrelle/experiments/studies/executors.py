@@ -22,6 +22,9 @@ from pipistrelle.experiments.studies.world_files import EndedTrial
 AHEAD = 1000
 """Worlds handed to a cluster before the first of them is done."""
 
+_NO_PAGES = {f"distributed.{who}.http.routes": [] for who in ("scheduler", "worker")}
+"""Of a cluster that is started here: Dask's servers of web pages have nothing to show."""
+
 
 Task = Callable[[int], list[EndedTrial]]
 """Computes a world, writes its results, and tells how its trials ended."""
@@ -217,6 +220,8 @@ def on_cluster(
 def _client(address: str, workers: int) -> Iterator[Any]:
     """Connect to a cluster, one on this machine if none is named."""
     try:
+        import cryptography  # noqa: F401  (Dask asks for it when it makes certificates)
+        from dask import config as dask_config
         from distributed import Client, LocalCluster
     except ImportError as error:
         raise InputError(
@@ -234,11 +239,13 @@ def _client(address: str, workers: int) -> Iterator[Any]:
         with client:
             yield client
         return
-    with _started_deaf():
-        cluster = LocalCluster(  # no pages; its HTTP server on any port, 8787 may be taken
-            workers,
+    with _started_deaf(), dask_config.set(_NO_PAGES):
+        cluster = LocalCluster(
+            n_workers=workers,
             threads_per_worker=1,
-            dashboard_address=":0",
+            security=True,  # certificates of its own: who does not hold them is not listened to
+            dashboard_address="127.0.0.1:0",  # 8787 may be taken
+            worker_dashboard_address="127.0.0.1:0",
             scheduler_kwargs={"dashboard": False},
         )
     with cluster, Client(cluster) as client:
