@@ -30,7 +30,7 @@ from reference.studies import SMALL, assert_same, fatal, leftovers, lost, plan_o
 UNTIL_KILLED = """\
 import os, signal, sys
 from pathlib import Path
-from pipistrelle.experiments.results import folder
+from pipistrelle import files
 from pipistrelle.experiments.studies import world_files
 from pipistrelle.experiments.studies.plan_file import read_plan
 from pipistrelle.experiments.studies.study import run_study
@@ -47,8 +47,8 @@ def mortal(act, before):
         act(path, what)
     return once
 
-write = folder.write_down
-for place in (folder, world_files):
+write = files.write_down
+for place in (files, world_files):
     place.write_down = mortal(write, lambda path, data: write(path, data[: len(data) // 2]))
     place.put_in_place = mortal(place.put_in_place, lambda partial, path: None)
 if __name__ == "__main__":

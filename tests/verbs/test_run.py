@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipistrelle import files
 from pipistrelle.estimation.catalogue import PAPERS
 from pipistrelle.experiments.runs import trial
 from reference.command_line import COMPILING, SHORT, contents, summary, table, track
@@ -136,7 +137,12 @@ def test_an_estimate_that_is_not_finite_is_a_failed_trial(obey, monkeypatch, und
 def test_a_saved_log_is_the_six_files_that_the_readme_promises(obey, undrawn):
     obey("run", *SHORT, "--save-log", "log", "-o", "one")
     tables = ("landmarks.csv", "measurements.csv", "odometry.csv", "truth.csv")
-    assert {path.name for path in Path("log").iterdir()} == {"README.md", "log.toml", *tables}
+    assert {path.name for path in Path("log").iterdir()} == {
+        "README.md",
+        "SHA256SUMS",
+        "log.toml",
+        *tables,
+    }
     page = Path(__file__).parents[2] / "README.md"
     assert "six text files" in page.read_text(encoding="utf-8")
 
@@ -146,6 +152,40 @@ def test_a_log_is_saved_to_a_folder_of_its_own(obey, refused, undrawn):
     Path("log/notes.txt").write_text("mine")
     assert "log is not empty" in refused("run", *SHORT, "--save-log", "log")
     assert "is the result folder" in refused("run", "--save-log", "new", "-o", "./new")
+
+
+@pytest.mark.parametrize("name", ["log.toml", "truth.csv", "README.md"])
+def test_a_log_is_saved_over_a_log_of_ours_and_over_nothing_of_the_users(
+    obey, refused, undrawn, name
+):
+    words = ("run", *SHORT, "--save-log", "log", "--overwrite", "--quiet", "-o")
+    Path("log").mkdir()
+    Path("log", name).write_text("mine")
+    assert "holds no log of Pipistrelle" in refused(*words, "one")
+    Path("log", name).unlink()
+    assert obey(*words, "two")[0] == 0
+    assert obey(*words, "three")[0] == 0
+    Path("log", name).write_text("mine")
+    assert f"{name}: was changed since Pipistrelle wrote it" in refused(*words, "four")
+    assert Path("log", name).read_text() == "mine"
+    assert not Path("four").exists()
+
+
+@pytest.mark.parametrize("room", range(6))
+def test_a_log_for_which_there_is_no_room_leaves_nothing(refused, undrawn, monkeypatch, room):
+    write, left = files.write_down, [room]
+
+    def full(path, data):
+        left[0] -= 1
+        if left[0] < 0:
+            write(path, data[:7])
+            raise OSError(28, "No space left on device", str(path))
+        write(path, data)
+
+    monkeypatch.setattr(files, "write_down", full)
+    said = refused("run", *SHORT, "--save-log", "log", "-o", "one", "--quiet")
+    assert "could not be written (No space left on device)" in said
+    assert list(Path("log").iterdir()) == []
 
 
 @pytest.mark.parametrize("estimator", ["ekf", pytest.param("fastslam", marks=pytest.mark.slow)])

@@ -122,6 +122,12 @@ def deliver(
 
     scene: dict[str, Any] = {"truth": truth, "callers": callers, "beamwidth": beamwidth}
     figure = draw_mission(trials, **scene)
+
+    def draw(room: Path) -> None:
+        save_figure(figure, room, "mission")
+        if watch is not None and watch.snapshots:
+            _film(watch, room / f"mission.{options.animate}", scene, options)
+
     write_results(
         folder,
         config=config,
@@ -130,10 +136,8 @@ def deliver(
         trials=trials,
         truth=truth,
         ignored_rows=ignored_rows or {},
+        draw=draw,
     )
-    save_figure(figure, folder, "mission")
-    if watch is not None and watch.snapshots:
-        _film(watch, folder / f"mission.{options.animate}", scene, options)
     if not options.quiet:
         print(closing_table(trials, aligned=ignored_rows is not None))
     failed = [t for t in trials if not np.all(np.isfinite(t.track.pose.mean))]
@@ -150,7 +154,7 @@ def _film(
     """Draw the film; say so, for it takes longer than the mission."""
     from pipistrelle.figures.animation import animate_mission
 
-    with _waiting(f"Drawing {path} ...", options):
+    with _waiting(f"Drawing {path.name} ...", options):
         animate_mission(watch.snapshots, path, **scene)
 
 

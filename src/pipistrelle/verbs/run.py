@@ -1,5 +1,6 @@
 """`pipistrelle run`: one random world, by sound, to a map."""
 
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -7,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from pipistrelle.config import InputError
+from pipistrelle.files import OwnFiles
 from pipistrelle.verbs.options import (
     Chosen,
     ChosenFilter,
@@ -72,10 +74,21 @@ def run(
 
 def _check_vacant(folder: Path, output: OutputOptions) -> None:
     """Refuse to write a log over anything else."""
+    from pipistrelle.detection.logs.folder import FILES
+    from pipistrelle.experiments.runs import truth_files
+
     if output.output is not None and folder.resolve() == output.output.resolve():
         raise InputError(f"--save-log: {folder} is the result folder; name another")
-    if folder.exists() and any(folder.iterdir()) and not output.overwrite:
+    if not folder.exists() or not any(folder.iterdir()):
+        return
+    if not output.overwrite:
         raise InputError(f"--save-log: {folder} is not empty; name a new folder or add --overwrite")
+    if not (own := OwnFiles(folder)):
+        raise InputError(
+            f"--save-log: {folder} is not empty and holds no log of Pipistrelle (its SHA256SUMS "
+            "would name it), so nothing in it was overwritten; name a new folder"
+        )
+    own.check((*FILES, *truth_files.FILES))
 
 
 def _beamwidth(mission: "Mission") -> float:
@@ -93,8 +106,13 @@ def _save_log(folder: Path, mission: "Mission", scans: "Sequence[Scan]") -> None
     from pipistrelle.detection.logs.folder import write_log
     from pipistrelle.experiments.runs.truth_files import write_truth
 
-    write_log(folder, _log(mission, scans))
-    write_truth(folder, mission.drive.truth)
+    try:
+        write_log(folder, _log(mission, scans))
+        write_truth(folder, mission.drive.truth)
+    except BaseException:  # half a log is none
+        with contextlib.suppress(InputError):
+            OwnFiles(folder).clear()
+        raise
 
 
 def _log(mission: "Mission", scans: "Sequence[Scan]") -> "Log":

@@ -1,29 +1,21 @@
 """The folder for results: what is made, what is refused, what overwriting may remove."""
 
-import json
 import os
-import sys
 from pathlib import Path
 
 import pytest
 
 from pipistrelle.config import InputError
-from pipistrelle.experiments.results.folder import (
-    clear_results,
-    prepare_folder,
-    put_in_place,
-    write_file,
-    write_whole,
-)
-
-OURS = json.dumps({"format": 1, "config_hash": "0" * 16, "runs": []})
+from pipistrelle.experiments.results.folder import prepare_folder
+from pipistrelle.files import SUMS, OwnFiles
 
 
 @pytest.fixture
 def earlier(tmp_path):
+    own = OwnFiles(tmp_path)
     for name in ("track_fused_ekf.tum", "map_fused_ekf.csv", "mission.png", "config.toml"):
-        (tmp_path / name).write_text("old")
-    (tmp_path / "summary.json").write_text(OURS)
+        own.write(name, "old")
+    own.write("summary.json", "{}")
     return tmp_path
 
 
@@ -76,26 +68,41 @@ def test_a_folder_with_results_is_refused_unless_overwriting(earlier):
     assert names(earlier) == before
     assert prepare_folder(earlier, "run", overwrite=True) == earlier
     assert names(earlier) == before, "the old results stay until there are new ones"
-    clear_results(earlier)
+    OwnFiles(earlier).clear()
     assert names(earlier) == []
 
 
-def test_overwriting_removes_nothing_that_is_not_a_result(earlier):
-    (earlier / "notes.txt").write_text("mine")
-    (earlier / "mission.d").mkdir()
-    (earlier / "mission.d" / "track_fused_ekf.tum").write_text("mine")
-    clear_results(prepare_folder(earlier, "run", overwrite=True))
-    assert names(earlier) == ["mission.d", "notes.txt"]
-    assert names(earlier / "mission.d") == ["track_fused_ekf.tum"]
+def test_overwriting_accepts_a_folder_with_files_of_the_users_beside_the_results(earlier):
+    mine = ("notes.txt", "mission.txt", "map_house.csv", "track_jazz.tum", "a.partial")
+    for name in mine:
+        (earlier / name).write_text("mine")
+    OwnFiles(prepare_folder(earlier, "run", overwrite=True)).clear()
+    assert names(earlier) == sorted(mine)
 
 
-@pytest.mark.parametrize("summary", [None, "{", "[]", '{"runs": []}', "\xff"])
-def test_overwriting_spares_a_folder_without_a_summary_of_ours(tmp_path, summary):
+@pytest.mark.parametrize("name", ["README.md", "mission.pdf", "track_active_ekf.tum"])
+def test_overwriting_refuses_a_users_file_in_the_place_of_a_result(earlier, name):
+    (earlier / name).write_text("mine")
+    before = names(earlier)
+    with pytest.raises(InputError, match=rf"{name}: is not Pipistrelle's, so it is not replaced"):
+        prepare_folder(earlier, "run", overwrite=True)
+    assert names(earlier) == before
+
+
+def test_overwriting_refuses_a_result_that_the_user_edited(earlier):
+    (earlier / "config.toml").write_text("old, and mine")
+    with pytest.raises(InputError, match=r"config\.toml: was changed since Pipistrelle wrote it"):
+        prepare_folder(earlier, "run", overwrite=True)
+
+
+@pytest.mark.parametrize("sums", [None, "", "\xff", "not a list of sums"])
+def test_overwriting_spares_a_folder_without_a_list_of_ours(tmp_path, sums):
     (tmp_path / "config.toml").write_text("mine")
-    if summary is not None:
-        (tmp_path / "summary.json").write_text(summary, encoding="latin-1")
+    (tmp_path / "summary.json").write_text('{"format": 1, "config_hash": "0", "runs": []}')
+    if sums is not None:
+        (tmp_path / SUMS).write_text(sums, encoding="latin-1")
     before = names(tmp_path)
-    with pytest.raises(InputError, match=r"holds no summary\.json"):
+    with pytest.raises(InputError, match=r"holds no results of Pipistrelle"):
         prepare_folder(tmp_path, "run", overwrite=True)
     assert names(tmp_path) == before
 
@@ -120,48 +127,6 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path, mo
     def refuse(*_args, **_kwargs):
         raise PermissionError(13, os.strerror(13))
 
-    monkeypatch.setattr(Path, "touch", refuse)
+    monkeypatch.setattr("pipistrelle.experiments.results.folder.TemporaryFile", refuse)
     with pytest.raises(InputError, match="Permission denied"):
         prepare_folder(tmp_path, "run", overwrite=False)
-
-
-def test_a_file_is_replaced_whole(tmp_path):
-    path = tmp_path / "one.txt"
-    write_file(path, "first")
-    write_file(path, "zweite Fassung: µ")
-    assert path.read_text(encoding="utf-8") == "zweite Fassung: µ"
-    assert names(tmp_path) == ["one.txt"]
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="needs /dev/full")
-def test_a_full_disk_keeps_the_old_file_and_says_which(tmp_path, monkeypatch):
-    path = tmp_path / "one.txt"
-    write_file(path, "first")
-    (tmp_path / "one.txt.partial").symlink_to("/dev/full")
-    with pytest.raises(InputError, match=r"one\.txt: could not be written \(No space left"):
-        write_file(path, "second")
-    assert path.read_text() == "first"
-    assert names(tmp_path) == ["one.txt"]
-
-
-def test_whatever_stops_the_writing_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
-    path = tmp_path / "one.txt"
-    write_whole(path, b"first")
-
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(os, "fsync", stop)
-    with pytest.raises(KeyboardInterrupt):
-        write_whole(path, b"second", writer=".7")
-    assert path.read_bytes() == b"first"
-    assert names(tmp_path) == ["one.txt"]
-
-
-def test_who_was_overtaken_is_content_and_who_lost_a_file_is_not(tmp_path):
-    path, partial = tmp_path / "one.txt", tmp_path / "one.txt.partial"
-    with pytest.raises(FileNotFoundError):
-        put_in_place(partial, path)
-    path.write_text("by another")
-    put_in_place(partial, path)
-    assert path.read_text() == "by another"

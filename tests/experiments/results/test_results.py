@@ -226,6 +226,7 @@ def test_the_folder_holds_exactly_the_promised_files(tmp_path):
     write(tmp_path, trial(drifting_track(), "active"), trial(drifting_track(1), "fused"))
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "README.md",
+        "SHA256SUMS",
         "config.toml",
         "landmarks.parquet",
         "map_active_ekf.csv",
@@ -295,14 +296,17 @@ def test_two_filters_of_one_strategy_share_their_measurements(tmp_path):
 
 
 def test_a_folder_that_has_gone_is_an_input_error_and_leaves_no_summary(tmp_path):
-    with pytest.raises(InputError, match=r"config\.toml: could not be written"):
-        write(tmp_path / "gone", trial(drifting_track()))
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"below: could not be written"):
+        write(tmp_path / "file" / "below", trial(drifting_track()))
 
 
 def test_the_summary_is_written_last(tmp_path):
-    (tmp_path / "measurements.parquet").mkdir()
-    with pytest.raises(InputError, match=r"measurements\.parquet: could not be written"):
-        write(tmp_path, trial(drifting_track()))
+    def draw(room):
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(InputError, match=r"could not be written \(No space left on device\)"):
+        write(tmp_path, trial(drifting_track()), draw=draw)
     assert (tmp_path / "steps.parquet").exists()
     assert not (tmp_path / "summary.json").exists()
 

@@ -2,13 +2,14 @@
 
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import polars as pl
 import pytest
 
 from pipistrelle.config import Config, InputError
-from pipistrelle.experiments.studies.plan_file import read_plan
+from pipistrelle.experiments.studies.plan_file import plan_text, read_plan
 from pipistrelle.experiments.studies.store import load_study, open_store
 from pipistrelle.experiments.studies.world_files import TABLES, write_world
 from pipistrelle.settings import from_file, resolve
@@ -57,6 +58,40 @@ def test_a_folder_of_something_else_is_refused(tmp_path, plan):
     with pytest.raises(InputError, match=r"thesis: holds chapter\.txt and no plan\.toml"):
         open_store(tmp_path / "thesis", plan)
     assert len(contents(tmp_path / "thesis")) == 1
+
+
+@pytest.mark.parametrize("name", ["movie.mkv.partial", "README.md.partial", "plan.toml.1.partial"])
+def test_a_folder_of_somebodys_partial_downloads_is_no_study(tmp_path, plan, name):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / name).write_text("mine")
+    with pytest.raises(InputError, match=f"mine: holds {name} and no plan"):
+        open_store(tmp_path / "mine", plan)
+    assert contents(tmp_path / "mine") == {Path(name): b"mine"}
+
+
+def test_what_a_killed_start_left_goes_and_what_is_somebodys_stays(folder, plan):
+    (folder / "plan.toml.deadbeef.partial").write_text("form")
+    (folder / "movie.mkv.partial").write_text("mine")
+    open_store(folder, plan)
+    assert [path.name for path in leftovers(folder)] == ["movie.mkv.partial"]
+
+
+def test_a_plan_of_the_users_own_is_not_taken_for_a_study(tmp_path, plan):
+    (tmp_path / "plans").mkdir()
+    text = "# what I think of it\n" + plan_text(plan)
+    (tmp_path / "plans" / "plan.toml").write_text(text)
+    with pytest.raises(InputError, match=r"holds a plan\.toml that is not Pipistrelle's"):
+        open_store(tmp_path / "plans", plan)
+    assert contents(tmp_path / "plans") == {Path("plan.toml"): text.encode()}
+
+
+def test_a_users_remarks_in_a_studys_plan_are_not_lost(folder, plan):
+    text = "# what I think of it\n" + plan_text(plan)
+    (folder / "plan.toml").write_text(text)
+    open_store(folder, plan)
+    with pytest.raises(InputError, match=r"so it is not replaced; set iterations = 9 in it"):
+        open_store(folder, replace(plan, iterations=9))
+    assert (folder / "plan.toml").read_text() == text
 
 
 def test_a_damaged_plan_is_named(folder, plan):

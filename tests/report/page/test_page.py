@@ -93,10 +93,33 @@ def undrawn(monkeypatch):
 
 def test_everything_is_there(reported):
     assert sorted(path.name for path in reported.iterdir()) == [
-        "figures", "index.html", "summary.json",
+        "SHA256SUMS", "figures", "index.html", "summary.json",
     ]  # fmt: skip
     names = sorted(path.name for path in (reported / "figures").iterdir())
     assert names == sorted(f"{name}.{kind}" for name in FIGURES for kind in ("csv", "pdf", "png"))
+
+
+@pytest.mark.parametrize("name", ["index.html", "summary.json", "figures/gain.png"])
+def test_a_users_file_in_the_place_of_the_reports_is_refused_by_name(
+    store, tmp_path, undrawn, name
+):
+    site = tmp_path / "site"
+    (site / name).parent.mkdir(parents=True)
+    (site / name).write_text("mine")
+    with pytest.raises(InputError, match=f"{name}: is not Pipistrelle's, so it is not replaced"):
+        write_report(read_study(store), site)
+    assert [path for path in site.rglob("*") if path.is_file()] == [site / name]
+    assert (site / name).read_text() == "mine"
+
+
+def test_a_report_is_written_anew_in_its_own_place(store, tmp_path, undrawn):
+    studies = read_study(store)
+    write_report(studies, tmp_path / "report")
+    before = sorted((tmp_path / "report").rglob("*"))
+    (tmp_path / "report" / "notes.txt").write_text("mine")
+    write_report(studies, tmp_path / "report")
+    after = sorted((tmp_path / "report").rglob("*"))
+    assert after == sorted([*before, tmp_path / "report" / "notes.txt"])
 
 
 def assert_same_bytes(reported, again, kinds):

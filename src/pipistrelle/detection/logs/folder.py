@@ -13,7 +13,8 @@ from pydantic import ConfigDict, Field, ValidationError, field_validator
 
 from pipistrelle.config import InputError, NonNegative, Positive, Probability, Section
 from pipistrelle.detection.logs.recording import MEASUREMENT, Log, assemble
-from pipistrelle.detection.logs.text_tables import read_table, read_text, write_table
+from pipistrelle.detection.logs.text_tables import read_table, read_text, table_text
+from pipistrelle.files import OwnFiles
 from pipistrelle.refusals import expectation, meant, refusal, values_expected
 
 _Triple = Annotated[tuple[float, float, float], Field(strict=False)]
@@ -22,6 +23,8 @@ _Bounds = Annotated[tuple[Positive, Positive], Field(strict=False)]
 
 _CONTROLS = {"unicycle": ("velocity", "angular_rate"), "bicycle": ("speed", "steering")}
 
+FILES = ("odometry.csv", "measurements.csv", "README.md", "log.toml")
+"""A log's, in the order in which they are written."""
 _README = """A recorded log of Pipistrelle. Replay it with: pipistrelle slam FOLDER
 
 log.toml          motion model, start and noise; m, s, rad; _std are standard deviations
@@ -29,6 +32,7 @@ odometry.csv      {odometry}; a row holds until the next one's time, the last on
 measurements.csv  time,landmark,bearing,range; an empty range is passive
 truth.csv         time,x,y,heading; optional, for scoring only
 landmarks.csv     landmark,x,y; optional, for scoring only
+SHA256SUMS        what was written here: nothing else is ever overwritten
 
 Bearings are relative to the heading, counter-clockwise.
 """
@@ -135,13 +139,19 @@ def write_log(folder: Path, log: Log) -> None:
     """Write a log folder that `read_log` reads back exactly.
 
     Steps become rows, at the precision of the numbers. Scans that share a step are spread over it
-    in their order; empty scans leave no row. Existing files are overwritten.
+    in their order; empty scans leave no row. An earlier log that we wrote is replaced, its truth
+    removed (`pipistrelle.files`); ``log.toml`` comes last.
 
     Parameters
     ----------
     folder : Path
         Made if need be.
     log : Log
+
+    Raises
+    ------
+    InputError
+        Where a file cannot be written, or one in its place is not as we wrote it.
 
     Examples
     --------
@@ -161,7 +171,9 @@ def write_log(folder: Path, log: Log) -> None:
     """
     import tomli_w
 
-    folder.mkdir(parents=True, exist_ok=True)
+    own = OwnFiles(folder)
+    own.check(FILES)
+    own.clear()
     first, second = _CONTROLS[log.motion]
     settings = {"format": 1} | {name: getattr(log, name) for name in _SHARED}
     settings |= {f"{first}_std": log.control_std[0], f"{second}_std": log.control_std[1]}
@@ -169,12 +181,12 @@ def write_log(folder: Path, log: Log) -> None:
         settings["wheelbase"] = log.wheelbase
     model = _SETTINGS[log.motion].model_validate(settings)
     text = tomli_w.dumps(model.model_dump(mode="json", exclude_defaults=True))
-    (folder / "log.toml").write_text(text, encoding="utf-8")
     controls = np.vstack((log.controls, np.zeros(2)))
-    write_table(folder / "odometry.csv", ("time", first, second), log.time, *controls.T)
-    write_table(folder / "measurements.csv", MEASUREMENT, *_measurement_columns(log))
-    readme = _README.format(odometry=f"time,{first},{second}")
-    (folder / "README.md").write_text(readme, encoding="utf-8")
+    odometry = table_text(("time", first, second), log.time, *controls.T)
+    own.write("odometry.csv", odometry)
+    own.write("measurements.csv", table_text(MEASUREMENT, *_measurement_columns(log)))
+    own.write("README.md", _README.format(odometry=f"time,{first},{second}"))
+    own.write("log.toml", text)
 
 
 def _read_settings(path: Path) -> _Settings:

@@ -36,7 +36,7 @@ class Table:
 def read_table(
     path: Path, columns: tuple[str, ...], *, separator: str | None = ",", optional: str = ""
 ) -> Table:
-    """Read rows of numbers; blank lines and lines that begin with ``#`` are skipped.
+    r"""Read rows of numbers; blank lines and lines that begin with ``#`` are skipped.
 
     Each column keeps what its name promises: ``time`` never runs back, ``range`` is positive,
     labels are integers.
@@ -65,7 +65,7 @@ def read_table(
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as place:
     ...     path = Path(place) / "posts.csv"
-    ...     write_table(path, ("landmark", "x"), np.array([4, 7]), np.array([1.5, -2.0]))
+    ...     _ = path.write_text("landmark,x\n4,1.5\n7,-2.0\n")
     ...     table = read_table(path, ("landmark", "x"))
     >>> table.column["landmark"], table.column["x"], table.line
     (array([4, 7]), array([ 1.5, -2. ]), array([2, 3]))
@@ -92,27 +92,26 @@ def read_table(
     return table
 
 
-def write_table(path: Path, columns: tuple[str, ...], *values: np.ndarray) -> None:
-    r"""Write columns with a header: floats exactly, NaN as an empty field.
+def table_text(columns: tuple[str, ...], *values: np.ndarray) -> str:
+    r"""Lay out columns with a header: floats exactly, NaN as an empty field.
 
     Parameters
     ----------
-    path : Path
     columns : names
     values : one (n) for each name
 
+    Returns
+    -------
+    str
+
     Examples
     --------
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as place:
-    ...     path = Path(place) / "ranges.csv"
-    ...     write_table(path, ("landmark", "range"), np.array([4, 7]), np.array([0.1, np.nan]))
-    ...     path.read_text()
+    >>> table_text(("landmark", "range"), np.array([4, 7]), np.array([0.1, np.nan]))
     'landmark,range\n4,0.1\n7,\n'
     """
     rows = zip(*(column.tolist() for column in values), strict=True)
     lines = [",".join("" if x != x else repr(x) for x in row) for row in rows]
-    path.write_text("\n".join([",".join(columns), *lines, ""]), encoding="utf-8")
+    return "\n".join([",".join(columns), *lines, ""])
 
 
 def check_unique(table: Table, *names: str) -> None:

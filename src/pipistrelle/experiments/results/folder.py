@@ -1,28 +1,28 @@
-"""A folder for results: made, refused or emptied; and files that are whole or not there."""
+"""A folder for results: made, or refused."""
 
 import contextlib
-import json
-import os
 from datetime import datetime
 from itertools import count
 from pathlib import Path
+from tempfile import TemporaryFile
+from typing import get_args
 
-from pipistrelle.config import InputError
+from pipistrelle.config import InputError, Strategy
+from pipistrelle.files import OwnFiles
 
-CONTENTS = (
+RESERVED = (
     "config.toml",
     "README.md",
-    "track_*.tum",
-    "map_*.csv",
+    *(f"track_{strategy}_*.tum" for strategy in get_args(Strategy)),
+    *(f"map_{strategy}_*.csv" for strategy in get_args(Strategy)),
     "truth.tum",
     "steps.parquet",
     "landmarks.parquet",
     "measurements.parquet",
-    "mission.*",
-    "*.partial",
+    *(f"mission.{ending}" for ending in ("png", "pdf", "gif", "mp4")),
     "summary.json",
 )
-"""What a result folder holds, and all that overwriting one removes, in this order."""
+"""What a result folder may hold: another's file of such a name is in the way."""
 
 
 def prepare_folder(path: Path | None, name: str, overwrite: bool) -> Path:
@@ -38,8 +38,8 @@ def prepare_folder(path: Path | None, name: str, overwrite: bool) -> Path:
     name : str
         What ran.
     overwrite : bool
-        Accept a folder of earlier results: one that holds the ``summary.json`` of such. They stay
-        until `clear_results` makes way for the new ones.
+        Accept a folder of earlier results, by their ``SHA256SUMS`` (`pipistrelle.files`). They
+        stay until `write_results` makes way for the new ones.
 
     Returns
     -------
@@ -48,7 +48,8 @@ def prepare_folder(path: Path | None, name: str, overwrite: bool) -> Path:
     Raises
     ------
     InputError
-        Where the folder is not empty, is not a folder or cannot be written.
+        Where the folder is not empty, is not a folder or cannot be written; where what would be
+        replaced is not as we wrote it.
 
     Examples
     --------
@@ -59,9 +60,7 @@ def prepare_folder(path: Path | None, name: str, overwrite: bool) -> Path:
     """
     try:
         folder = _new_folder(name) if path is None else _chosen_folder(path, overwrite)
-        probe = folder / "probe.partial"
-        probe.touch()
-        probe.unlink()
+        TemporaryFile(dir=folder).close()
     except OSError as error:
         raise InputError(
             f"{path or 'runs'}: cannot be used as a result folder ({error.strerror}); "
@@ -100,166 +99,11 @@ def _chosen_folder(folder: Path, overwrite: bool) -> Path:
             f"{folder}: is not empty; name a new folder with -o DIR, or add --overwrite "
             "to replace earlier results"
         )
-    if not _holds_results(folder):
+    own = OwnFiles(folder)
+    if not own:
         raise InputError(
-            f"{folder}: is not empty and holds no summary.json of Pipistrelle, so nothing in it "
-            "was overwritten; name another folder with -o DIR"
+            f"{folder}: is not empty and holds no results of Pipistrelle (its SHA256SUMS would "
+            "name them), so nothing in it was overwritten; name another folder with -o DIR"
         )
+    own.check(path.name for pattern in RESERVED for path in folder.glob(pattern))
     return folder
-
-
-def clear_results(folder: Path) -> None:
-    """Remove earlier results from a folder: `CONTENTS` and nothing else.
-
-    Parameters
-    ----------
-    folder : Path
-
-    Raises
-    ------
-    InputError
-        Where a file cannot be removed.
-    """
-    for pattern in CONTENTS:
-        for old in sorted(folder.glob(pattern)):
-            try:
-                if old.is_file():
-                    old.unlink()
-            except OSError as error:
-                raise InputError(
-                    f"{old}: could not be replaced ({error.strerror}); "
-                    "choose another folder with -o DIR"
-                ) from error
-
-
-def _holds_results(folder: Path) -> bool:
-    """Tell whether a folder's summary is one of ours."""
-    try:
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(summary, dict) and {"format", "config_hash", "runs"} <= summary.keys()
-
-
-def write_file(path: Path, content: str | bytes) -> None:
-    """Write a file under another name and rename it when it is whole.
-
-    Parameters
-    ----------
-    path : Path
-        What stood there is replaced.
-    content : str or bytes
-
-    Raises
-    ------
-    InputError
-        Where it cannot be written.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as parent:
-    ...     write_file(Path(parent) / "one.txt", "word")
-    ...     [path.name for path in Path(parent).iterdir()]
-    ['one.txt']
-    """
-    try:
-        write_whole(path, content.encode() if isinstance(content, str) else content)
-    except OSError as error:
-        raise InputError(
-            f"{path}: could not be written ({error.strerror}); "
-            "make room or choose another folder with -o DIR"
-        ) from error
-
-
-def write_whole(path: Path, data: bytes, writer: str = "") -> None:
-    """Write a file that is whole or not there, whatever stops the writing.
-
-    Parameters
-    ----------
-    path : Path
-        What stood there is replaced.
-    data : bytes
-    writer : str
-        Tells those apart who may write the same file at the same time.
-
-    Raises
-    ------
-    OSError
-        Where it cannot be written; what stood there is then as it was.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as parent:
-    ...     write_whole(Path(parent) / "one.txt", b"word", writer=".7")
-    ...     [path.name for path in Path(parent).iterdir()]
-    ['one.txt']
-    """
-    partial = path.with_name(f"{path.name}{writer}.partial")
-    try:
-        write_down(partial, data)
-        put_in_place(partial, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
-        raise
-
-
-def write_down(path: Path, data: bytes) -> None:
-    """Write a file down to the disk, so that a rename cannot outlive its content.
-
-    Parameters
-    ----------
-    path : Path
-        What stood there is replaced.
-    data : bytes
-
-    Raises
-    ------
-    OSError
-        Where it cannot be written.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as place:
-    ...     write_down(Path(place) / "one.partial", b"word")
-    ...     (Path(place) / "one.partial").read_bytes()
-    b'word'
-    """
-    with path.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def put_in_place(partial: Path, path: Path) -> None:
-    """Rename a file that is whole, unless another process did so, and swept ours away.
-
-    Parameters
-    ----------
-    partial, path : Path
-        Its name so far, and the one that it is to have; what stood there is replaced.
-
-    Raises
-    ------
-    OSError
-        Where it cannot be renamed; also where neither of the two is there.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as place:
-    ...     partial, whole = Path(place) / "one.partial", Path(place) / "one"
-    ...     write_down(partial, b"word")
-    ...     put_in_place(partial, whole)
-    ...     put_in_place(partial, whole)  # by another process, after this one
-    ...     partial.exists(), whole.exists()
-    (False, True)
-    """
-    try:
-        partial.replace(path)
-    except FileNotFoundError:
-        if not path.exists():
-            raise

@@ -7,7 +7,7 @@ import hashlib
 import io
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -17,7 +17,6 @@ from pydantic import BaseModel
 from pipistrelle import __version__
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.drives import Truth
-from pipistrelle.experiments.results.folder import clear_results, write_file
 from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.results.tables import (
     landmark_table,
@@ -26,6 +25,7 @@ from pipistrelle.experiments.results.tables import (
     step_table,
     tum_text,
 )
+from pipistrelle.files import OwnFiles
 
 FORMAT = 1
 README = """\
@@ -47,6 +47,7 @@ bearings counter-clockwise from the heading. S is the sensing strategy, F the fi
 | landmarks.parquet | every hypothesis of every landmark, beside the true positions |
 | measurements.parquet | what each strategy measured; no range where it was passive |
 | mission.* | pictures |
+| SHA256SUMS | what was written here: `--overwrite` touches nothing else (`sha256sum -c`) |
 
 RMSE and NEES leave out the start; after an exact one the NEES begins where the covariance is
 positive definite. "aligned": path and map, each after the rigid motion without
@@ -71,8 +72,9 @@ def write_results(
     trials: Sequence[TrialResult],
     truth: Truth,
     ignored_rows: dict[str, int],
+    draw: Callable[[Path], None] = lambda _: None,
 ) -> None:
-    """Write everything but the figures into a result folder, in place of earlier results.
+    """Write everything into a result folder, in place of earlier results.
 
     Parameters
     ----------
@@ -89,11 +91,13 @@ def write_results(
         At the times of the tracks; ``truth.tum`` leaves out what is not known.
     ignored_rows : dict
         Number of dropped log rows by reason.
+    draw : callable, optional
+        Given a folder to draw the pictures into.
 
     Raises
     ------
     InputError
-        Where a file cannot be written.
+        Where a file cannot be written, or one that would be replaced is not as we wrote it.
 
     Examples
     --------
@@ -104,27 +108,30 @@ def write_results(
     ...     run = {"command": "pipistrelle", "seed": 7, "trials": (), "ignored_rows": {}}
     ...     write_results(Path(name), config=Config(), truth=NO_TRUTH, **run)
     ...     sorted(path.name for path in Path(name).iterdir())
-    ['README.md', 'config.toml', 'summary.json']
+    ['README.md', 'SHA256SUMS', 'config.toml', 'summary.json']
     """
     import tomli_w
 
-    clear_results(folder)
+    own = OwnFiles(folder)
+    own.clear()
     settings = config.model_dump(mode="json", exclude_none=True)
-    write_file(folder / "config.toml", tomli_w.dumps(settings))
+    own.write("config.toml", tomli_w.dumps(settings))
     online = ONLINE if any(trial.online for trial in trials) else ""
     readme = README.format(command=command, version=__version__, seed=seed, online=online)
-    write_file(folder / "README.md", readme)
+    own.write("README.md", readme)
     for trial in trials:
         name, track = f"{trial.strategy}_{short_name(trial.filter)}", trial.track
-        write_file(folder / f"track_{name}.tum", tum_text(track.time, track.pose.mean))
+        own.write(f"track_{name}.tum", tum_text(track.time, track.pose.mean))
         if track.online is not None:
             text = tum_text(track.time, track.online.mean)
-            write_file(folder / f"track_{name}_online.tum", text)
-        write_file(folder / f"map_{name}.csv", map_text(track.landmarks))
+            own.write(f"track_{name}_online.tum", text)
+        own.write(f"map_{name}.csv", map_text(track.landmarks))
     if truth.path is not None:
         known = np.isfinite(truth.path).all(axis=1)
-        write_file(folder / "truth.tum", tum_text(truth.time[known], truth.path[known]))
-    _write_tables(folder, trials, truth)
+        own.write("truth.tum", tum_text(truth.time[known], truth.path[known]))
+    _write_tables(own, trials, truth)
+    with own.room() as room:
+        draw(room)
     summary = {
         "format": FORMAT,
         "version": __version__,
@@ -132,10 +139,10 @@ def write_results(
         "seed": seed,
         "runs": [_run(trial, ignored_rows) for trial in trials],
     }
-    write_file(folder / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
+    own.write("summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
 
 
-def _write_tables(folder: Path, trials: Sequence[TrialResult], truth: Truth) -> None:
+def _write_tables(own: OwnFiles, trials: Sequence[TrialResult], truth: Truth) -> None:
     """Write the tables of all trials; those of one strategy share their measurements."""
     import polars as pl
 
@@ -155,7 +162,7 @@ def _write_tables(folder: Path, trials: Sequence[TrialResult], truth: Truth) -> 
         if parts:
             buffer = io.BytesIO()
             pl.concat(parts).write_parquet(buffer)
-            write_file(folder / f"{name}.parquet", buffer.getvalue())
+            own.write(f"{name}.parquet", buffer.getvalue())
 
 
 def config_hash(config: BaseModel) -> str:

@@ -15,10 +15,12 @@ from jaxtyping import Float
 
 from pipistrelle.detection.logs.readers import Robot
 from pipistrelle.detection.logs.recording import Log
-from pipistrelle.detection.logs.text_tables import check_unique, read_table, write_table
+from pipistrelle.detection.logs.text_tables import check_unique, read_table, table_text
 from pipistrelle.experiments.drives import LabelledPoints, Truth
+from pipistrelle.files import OwnFiles
 from pipistrelle.refusals import refusal
 
+FILES = ("truth.csv", "landmarks.csv")
 _PATH = ("time", "x", "y", "heading")
 
 Read = Callable[..., Log]
@@ -126,6 +128,11 @@ def write_truth(folder: Path, truth: Truth) -> None:
     truth : Truth
         Rows of the path that are NaN are left out.
 
+    Raises
+    ------
+    InputError
+        Where a file cannot be written, or one in its place is not as we wrote it.
+
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
@@ -137,12 +144,14 @@ def write_truth(folder: Path, truth: Truth) -> None:
     landmark,x,y
     4,1.0,-2.5
     """
+    own = OwnFiles(folder)
     if truth.path is not None:
         rows = np.column_stack((truth.time, truth.path))[np.isfinite(truth.path).all(axis=1)]
-        write_table(folder / "truth.csv", _PATH, *rows.T)
+        own.write("truth.csv", table_text(_PATH, *rows.T))
     if truth.landmarks is not None:
         labels, positions = truth.landmarks
-        write_table(folder / "landmarks.csv", ("landmark", "x", "y"), labels, *positions.T)
+        text = table_text(("landmark", "x", "y"), labels, *positions.T)
+        own.write("landmarks.csv", text)
 
 
 def read_path(

@@ -4,6 +4,7 @@ So a study can be killed anywhere, continued, and written to by many processes a
 (`pipistrelle.experiments.studies.world_files`).
 """
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -12,7 +13,6 @@ from uuid import uuid4
 
 from pipistrelle import __version__
 from pipistrelle.config import InputError
-from pipistrelle.experiments.results.folder import write_whole
 from pipistrelle.experiments.studies.plan import Plan
 from pipistrelle.experiments.studies.plan_file import changed_settings, plan_text, read_plan
 from pipistrelle.experiments.studies.world import world_schemas
@@ -22,11 +22,14 @@ from pipistrelle.experiments.studies.world_files import (
     scan_tables,
     unusable,
 )
+from pipistrelle.files import write_whole
 from pipistrelle.settings import to_toml
 
 if TYPE_CHECKING:
     import polars as pl
 
+_LEFT = re.compile(r"(plan\.toml|config\.toml|README\.md)\.[0-9a-f]{8}\.partial")
+"""What a killed writer may leave beside the tables."""
 README = """\
 # A study: {name}
 
@@ -90,18 +93,19 @@ def open_store(folder: Path, plan: Plan) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         there = read_plan(kept) if kept.exists() else None
-        strange = [p for p in folder.iterdir() if p.suffix != ".partial"] if there is None else []
-        if strange:
-            raise InputError(
-                f"{folder}: holds {strange[0].name} and no plan.toml, so it is no study's folder; "
-                "name another with -o DIR"
-            )
+        left = [path for path in folder.iterdir() if _LEFT.fullmatch(path.name)]
+        _refuse_strange(folder, there, {path.name for path in left})
         if there is not None and (found := changed_settings(there, plan)):
             told = "".join(f"\n  {line}" for line in found)
             raise InputError(
                 f"{kept}: is the plan of another study; name a new folder with -o DIR{told}"
             )
         if there is None or there.iterations < plan.iterations:
+            if there is not None and not _is_ours(kept, there):
+                raise InputError(
+                    f"{kept}: was changed since Pipistrelle wrote it, so it is not replaced; "
+                    f"set iterations = {plan.iterations} in it"
+                )
             _put(kept, plan_text(plan))
         readme = README.format(name=plan.name, version=__version__)
         for name, text in (("config.toml", to_toml(plan.config)), ("README.md", readme)):
@@ -110,10 +114,31 @@ def open_store(folder: Path, plan: Plan) -> None:
         for table in TABLES:
             (folder / table).mkdir(exist_ok=True)
             TemporaryFile(dir=folder / table).close()
-        for left in folder.glob("*.partial"):
-            left.unlink(missing_ok=True)
+        for path in left:
+            path.unlink(missing_ok=True)
     except OSError as error:
         raise unusable(folder, error) from error
+
+
+def _refuse_strange(folder: Path, there: Plan | None, left: set[str]) -> None:
+    """Refuse a folder that holds something, but no plan of ours."""
+    if there is None:
+        strange = sorted({path.name for path in folder.iterdir()} - left)
+        if strange:
+            raise InputError(
+                f"{folder}: holds {strange[0]} and no plan.toml, so it is no study's folder; "
+                "name another with -o DIR"
+            )
+    elif not (_is_ours(folder / "plan.toml", there) or (folder / "trials").is_dir()):
+        raise InputError(
+            f"{folder}: holds a plan.toml that is not Pipistrelle's and no trials, so it is no "
+            "study's folder; name another with -o DIR"
+        )
+
+
+def _is_ours(kept: Path, plan: Plan) -> bool:
+    """Whether a plan stands as we write it."""
+    return kept.read_text(encoding="utf-8") == plan_text(plan)
 
 
 def load_study(folder: Path) -> StoredStudy:

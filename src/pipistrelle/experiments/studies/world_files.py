@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, NamedTuple
 from uuid import uuid4
 
 from pipistrelle.config import InputError
-from pipistrelle.experiments.results.folder import put_in_place, write_down
 from pipistrelle.experiments.studies.plan import Plan
 from pipistrelle.experiments.studies.world import TrialRecord, world_tables
+from pipistrelle.files import put_in_place, write_down
 
 if TYPE_CHECKING:
     import polars as pl

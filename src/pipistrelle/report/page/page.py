@@ -16,11 +16,10 @@ from typing import Any
 from markupsafe import Markup
 
 from pipistrelle import __version__
-from pipistrelle.config import InputError
 from pipistrelle.evaluation.comparison import Finding
-from pipistrelle.experiments.results.folder import write_file
 from pipistrelle.figures.chart import Chart, Panel, columns_of, csv_rows, csv_text
 from pipistrelle.figures.style import STRATEGY_COLOURS
+from pipistrelle.files import OwnFiles
 from pipistrelle.report.charts.results import CHARTS, study_charts
 from pipistrelle.report.charts.setting import model_charts
 from pipistrelle.report.claims.answer import answer, number_word
@@ -70,28 +69,32 @@ def write_report(
     Raises
     ------
     InputError
-        Where a file cannot be written.
+        Where a file cannot be written, or one that would be replaced is not as we wrote it.
     """
     selected = [selections(study) for study in studies]
     judged = [judge_claims(by_rule, claims) for by_rule in selected]
     found = {rule: study_charts(selection, charts) for rule, selection in selected[0].items()}
     models = model_charts(studies[0])
-    try:
-        (folder / "figures").mkdir(parents=True, exist_ok=True)
-        for chart in [*_distinct(found), *models]:
+    drawn, texts = [*_distinct(found), *models], _csv_texts(selected[0], found, models)
+    own = OwnFiles(folder)
+    own.check(["index.html", "summary.json", *_names(drawn, texts)])
+    own.clear()
+    with own.room("figures") as room:
+        for chart in drawn:
             progress(chart.name)
-            _write_figure(chart, folder / "figures")
-    except OSError as error:
-        raise InputError(
-            f"{error.filename or folder}: could not be written ({error.strerror}); "
-            "make room or choose another folder with -o DIR"
-        ) from error
-    for name, text in _csv_texts(selected[0], found, models).items():
-        write_file(folder / "figures" / f"{name}.csv", text)
+            _write_figure(chart, room)
+    for name, text in texts.items():
+        own.write(f"figures/{name}.csv", text)
     summary = _summary(studies, selected[0], judged)
-    write_file(folder / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    write_file(folder / "index.html", page(studies[0], judged[0], found, models, summary))
+    own.write("index.html", page(studies[0], judged[0], found, models, summary))
+    own.write("summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
     return judged[0]
+
+
+def _names(charts: Sequence[Chart], texts: Mapping[str, str]) -> list[str]:
+    """Name the files of the figures."""
+    pictures = [f"figures/{chart.name}.{ending}" for chart in charts for ending in ("png", "pdf")]
+    return [*pictures, *(f"figures/{name}.csv" for name in texts)]
 
 
 def page(
