@@ -405,6 +405,41 @@ def test_a_log_survives_being_written(tmp_path, name):
     assert same(read_log(tmp_path / name), log)
 
 
+@pytest.mark.parametrize("step", ["", "step = 0.1"])
+@pytest.mark.parametrize(
+    ("start", "unit", "factor"),
+    [
+        (1_700_000_000_000_000_000, 100_000_000, "1e-09"),  # as ROS stamps
+        (1_700_000_000_000_000_000, 256, "1e-09"),
+        (0, 100_000_000, "1e-09"),
+        (1_700_000_000_000_000, 100_000, "1e-06"),
+        (1_700_000_000_000_000, 1, "1e-06"),
+        (0, 20_000, "1e-06"),
+        (4_500_000_000_000_000, 1, "1e-06"),
+        (1_700_000_000_000, 100, "0.001"),
+    ],
+)
+def test_a_clock_that_counts_no_seconds_is_refused_with_the_factor_that_fits(
+    tmp_path, start, unit, factor, step
+):
+    folder = recorded(tmp_path / "drive")
+    write = (folder / "odometry.csv").write_text
+    write("time,velocity,angular_rate\n" + "".join(f"{start + k * unit},1,0\n" for k in range(9)))
+    (folder / "measurements.csv").write_text(f"time,landmark,bearing,range\n{start + unit},7,1,2\n")
+    with (folder / "log.toml").open("a") as settings:
+        settings.write(f"\n{step}\n")
+    with pytest.raises(InputError, match=rf"odometry\.csv: .*expected seconds; multiply.*{factor}"):
+        read_log(folder)
+
+
+def test_a_clock_of_this_century_in_seconds_is_welcome(tmp_path):
+    folder = recorded(tmp_path / "drive")
+    rows = "".join(f"{1_700_000_000 + 0.1 * k},1,0\n" for k in range(9))
+    (folder / "odometry.csv").write_text("time,velocity,angular_rate\n" + rows)
+    (folder / "measurements.csv").write_text("time,landmark,bearing,range\n1700000000.2,7,1,2\n")
+    assert len(read_log(folder).scans) == 1
+
+
 def test_every_setting_survives_being_written(tmp_path, folder):
     log = replace(read_log(folder), gate=0.97, noise_at_rest=False, initial_pose=(0.1, 1e-7, 3.0))
     write_log(tmp_path / "again" / "drive", log)

@@ -25,6 +25,9 @@ MEASUREMENT = ("time", "landmark", "bearing", "range")
 
 _RESOLUTION = 1e-6  # [s], of the boundaries of merged steps
 _STEPS_MAX = 10_000_000
+_LATEST = 1e11  # [s], beyond the year 5000 if counted from 1970
+_LONGEST_GAP = 1e3  # [s], typically between two rows of odometry
+_UNITS = (1e-3, 1e-6, 1e-9)  # [s], of other clocks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,8 +112,11 @@ def assemble(
     Raises
     ------
     InputError
-        If nothing of the odometry is left, or a landmark is measured twice at one time.
+        If nothing of the odometry is left, a landmark is measured twice at one time, or times can
+        be no seconds.
     """
+    _check_seconds(odometry, _LONGEST_GAP)
+    _check_seconds(measurements, math.inf)
     stamp, *columns = odometry.column.values()
     last = np.append(np.diff(stamp) > 0, True)
     time, controls = _cut(odometry.path, stamp[last], np.column_stack(columns)[last], span)
@@ -131,6 +137,22 @@ def assemble(
         ignored_rows={reason: count for reason, count in ignored.items() if count},
         **settings,
     )
+
+
+def _check_seconds(table: Table, longest_gap: float) -> None:
+    """Refuse times that can be no seconds, and say which unit they may have."""
+    time = table.column["time"]
+    gaps = np.diff(time)
+    typical = float(np.median(gaps[gaps > 0.0])) if np.any(gaps > 0.0) else 0.0
+    latest = float(np.max(np.abs(time), initial=0.0))
+    if typical <= longest_gap and latest <= _LATEST:
+        return
+    if typical > longest_gap:  # of 1 ms, 1 us and 1 ns, that which makes it likeliest 0.1 s
+        factor = min(_UNITS, key=lambda unit: abs(math.log10(typical * unit / 0.1)))
+    else:
+        factor = next((unit for unit in _UNITS if latest * unit <= _LATEST / 10.0), _UNITS[-1])
+    found = f"times from {time[0].item():g} to {time[-1].item():g}, typically {typical:g} apart"
+    raise refusal(table.path, found, "seconds", f"multiply them by {factor:g}")
 
 
 def _cut(
