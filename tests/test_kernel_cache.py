@@ -98,7 +98,7 @@ def test_kernels_of_the_states_used_last_are_kept_and_nothing_else_is_touched(tm
     (home / "notes").mkdir()
     folder, said = place(tmp_path)
     assert {path.name for path in home.iterdir()} == {
-        folder.name, "notes", *(state.name for state in states[:3])
+        folder.name, "notes", *(state.name for state in states[:2])
     }  # fmt: skip
     assert said == []
 
@@ -109,3 +109,67 @@ def test_folder_that_the_user_names_is_not_cleared(tmp_path):
         state.mkdir(parents=True)
     place(tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "mine" / f"{0:016x}"))
     assert all(state.is_dir() for state in states)
+
+
+def cut(data: bytes) -> bytes:
+    return data[: len(data) // 2]
+
+
+def flipped(data: bytes) -> bytes:
+    """Two hundred bytes in the middle are others."""
+    middle = len(data) // 2
+    return (
+        data[: middle - 100]
+        + bytes(b ^ 0x5A for b in data[middle - 100 : middle + 100])
+        + data[middle + 100 :]
+    )
+
+
+@pytest.mark.parametrize("damage", [cut, flipped, lambda _: b""], ids=["cut", "flipped", "empty"])
+@pytest.mark.parametrize("kind", ["nbi", "nbc"])
+def test_a_damaged_file_is_thrown_away_and_its_kernel_compiled_anew(tmp_path, kind, damage):
+    turned = COMPILE.replace("wrap_angle(4.0)", "print(wrap_angle(4.0), file=sys.stderr)")
+    folder, said = place(tmp_path, "import sys; " + turned)
+    kept = sorted(folder.rglob(f"*.{kind}"))
+    assert kept
+    for path in kept:
+        path.write_bytes(damage(path.read_bytes()))
+    _, again = place(tmp_path, "import sys; " + turned)
+    damaged = [line for line in again if "a compiled kernel was damaged" in line]
+    assert len(damaged) == 1
+    assert str(folder) in damaged[0]
+    assert [line for line in again if line not in damaged] == said
+    assert place(tmp_path, "import sys; " + turned)[1] == said, "it was kept anew"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions are of another kind there")
+@pytest.mark.parametrize("mode", [0o775, 0o757])
+def test_a_cache_that_others_can_write_is_not_trusted(tmp_path, mode):
+    mine, _ = place(tmp_path)
+    assert mine.stat().st_mode & 0o077 == 0
+    mine.chmod(mode)
+    folder, said = place(tmp_path)
+    assert folder.is_relative_to(tmp_path / "tmp")
+    assert f"{mine} can be written by others" in said[0]
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    theirs.chmod(mode)
+    assert "can be written by others" in place(tmp_path, NUMBA_CACHE_DIR=str(theirs))[1][0]
+
+
+def test_a_cache_without_room_is_not_taken(tmp_path):
+    full = "import shutil; shutil.disk_usage = lambda _: shutil._ntuple_diskusage(9, 9, 0); "
+    folder, said = place(tmp_path, full + SHOW)
+    assert folder.is_relative_to(tmp_path / "tmp")
+    assert "has too little room" in said[0]
+
+
+def test_what_cannot_be_kept_is_compiled_all_the_same(tmp_path):
+    full = (
+        "import numba.core.caching as c\n"
+        "def full(*_): raise OSError(28, 'No space left on device')\n"
+        "c.IndexDataCacheFile.save = full\n"
+    )
+    _, said = place(tmp_path, full + COMPILE)
+    assert len(said) == 1
+    assert "compiled kernels could not be kept (No space left on device)" in said[0]

@@ -3,12 +3,14 @@
 Importing the package chooses where compiled kernels are kept, by setting ``NUMBA_CACHE_DIR``
 where it is not set: a folder of the user's cache, one per state of the sources. (Beside each
 source, Numba's own choice, an update of one file would leave the kernels of another as they were.)
-Where that folder cannot be written, a temporary one takes its place, and a line says so. Of other
-states, the kernels that were used last are kept and the rest are removed.
+Where that folder cannot be written, has no room, or can be written by others (what lies there is
+run), a temporary one takes its place, and a line says so. Of other states, the kernels that were
+used last are kept and the rest are removed.
 """
 
 import os
 import re
+import shutil
 import sys
 import tempfile
 from hashlib import sha256
@@ -16,8 +18,10 @@ from pathlib import Path
 
 __version__ = "0.1.0"
 
-_STATES = 4
+_STATES = 3
 """How many states of the sources keep their kernels."""
+_ROOM = 64_000_000
+"""Bytes that all kernels of a state have room in, several times over."""
 
 
 def _key() -> str:
@@ -30,14 +34,27 @@ def _key() -> str:
     return digest.hexdigest()[:16]
 
 
-def _writable(folder: Path) -> bool:
-    """Make a folder and see whether a file can be written there."""
+def _unfit(folder: Path) -> str | None:
+    """Make a folder for kernels, and tell why they cannot be kept there."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
-            return True
+            pass
+        empty = not any(folder.iterdir())
+        free = shutil.disk_usage(folder).free
     except OSError:
-        return False
+        return "cannot be written"
+    if not _is_mine(folder):
+        return "can be written by others"
+    return "has too little room" if empty and free < _ROOM else None
+
+
+def _is_mine(folder: Path) -> bool:
+    """Whether nobody else can write a folder."""
+    state = folder.stat()
+    mine = not hasattr(os, "getuid") or state.st_uid == os.getuid()
+    return mine and not (os.name == "posix" and state.st_mode & 0o022)
 
 
 def _temporary() -> Path:
@@ -77,8 +94,6 @@ def _drop_old(folder: Path) -> None:
     except OSError:  # another process removes them just now
         return
     for old in states[:-_STATES]:
-        import shutil
-
         shutil.rmtree(old, ignore_errors=True)
 
 
@@ -86,11 +101,11 @@ def _place_kernels() -> None:
     """Tell Numba where to keep compiled kernels."""
     chosen = bool(os.environ.get("NUMBA_CACHE_DIR"))
     folder = wanted = _wanted()
-    if not _writable(wanted):
+    if why := _unfit(wanted):
         folder = _temporary() / _key()
         print(
-            f"pipistrelle: {wanted} cannot be written: compiled kernels are kept in {folder}; set "
-            "NUMBA_CACHE_DIR to a folder that lasts",
+            f"pipistrelle: {wanted} {why}: compiled kernels are kept in {folder}; set "
+            "NUMBA_CACHE_DIR to a folder of your own that lasts",
             file=sys.stderr,
         )
     os.environ["NUMBA_CACHE_DIR"] = str(folder)

@@ -8,10 +8,11 @@ import math
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit
+
+from pipistrelle.jit import substituted
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@substituted
 def wrap_angle(angle: float) -> float:
     """Wrap one angle to [-pi, pi) [rad]; for kernels (see `wrap`)."""
     if -math.pi <= angle < math.pi:

@@ -8,15 +8,31 @@ a record costs a microsecond and a plain tuple nothing, so a kernel that is call
 is handed the columns as a tuple and makes the record of them itself, which is free.
 """
 
+from collections.abc import Callable
+from typing import Any, TypeVar
+
 import numpy as np
 from numba import njit
 
+from pipistrelle.kernel_cache import checked
+
 Whole = int | np.integer
 """A whole number in a kernel: Numba's are Python's, those of arrays NumPy's."""
-kernel = njit(cache=True, error_model="numpy")
+
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+def _compiler(**options: bool | str) -> Callable[[_Function], _Function]:
+    """Return a decorator that compiles, and keeps what it compiled in checked files."""
+    compiled: Any = njit(cache=True, error_model="numpy", **options)  # pyrefly: ignore[no-matching-overload]
+    return lambda function: checked(compiled(function))
+
+
+kernel = _compiler()
 """Compile a kernel."""
 
-no_alloc = njit(cache=True, error_model="numpy", _nrt=False)  # pyrefly: ignore[no-matching-overload]
+no_alloc = _compiler(_nrt=False)
 """Compile a kernel that makes no array, calls none that does, and returns none to one that does.
 
 It borrows the arrays that it is given, and does not count references to them and to parts of them.
@@ -24,10 +40,13 @@ Counting is atomic, some 5 ns each time, for every array of a record at every ca
 filter's time.
 """
 
-inlined = njit(cache=True, error_model="numpy", forceinline=True)
+substituted = _compiler(inline="always")
+"""Compile a formula: it is put in place of its call before the caller is compiled."""
+
+inlined = _compiler(forceinline=True)
 """Compile a piece of a loop's body, without which the loop would not be vectorised."""
 
-no_alloc_inlined = njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)  # pyrefly: ignore[no-matching-overload]
+no_alloc_inlined = _compiler(_nrt=False, forceinline=True)
 """Compile a piece that is handed wide records: laid on the stack at every call, they would cost a
 twentieth of the filter's time. Every kernel above it is compiled with it, so it stands low down.
 """

@@ -1,0 +1,93 @@
+"""Files of compiled kernels, each with its sum: what was cut or changed is compiled anew.
+
+Numba keeps a kernel (what `pipistrelle.jit` compiles) in two files, an index and its code, and runs
+whatever it finds there. Here each ends in the SHA-256 of what stands before it, which Numba does
+not look at when it reads them.
+"""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from hashlib import sha256
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+from numba.core.caching import IndexDataCacheFile
+
+_said: set[str] = set()
+"""What was said once need not be said for every kernel."""
+
+
+class CheckedFiles(IndexDataCacheFile):
+    """A kernel's two files."""
+
+    def load(self, key: Any) -> Any:
+        """Return what is kept under a key; None where there is nothing, or nothing sound."""
+        if not self._is_sound(Path(self._index_path)):
+            return None
+        name = self._load_index().get(key)
+        if name is None or not self._is_sound(Path(self._data_path(name))):
+            return None
+        return super().load(key)
+
+    def save(self, key: Any, data: Any) -> None:
+        """Keep what was compiled, if there is room: without it, it is compiled again next time."""
+        self._is_sound(Path(self._index_path))
+        try:
+            super().save(key, data)
+        except OSError as error:
+            _say(
+                f"{self._cache_path}: compiled kernels could not be kept ({error.strerror}), so "
+                "they are compiled at every start; make room or set NUMBA_CACHE_DIR"
+            )
+
+    def _is_sound(self, path: Path) -> bool:
+        """Whether a file is as it was written, or is not there; remove it if not."""
+        try:
+            found = path.read_bytes()
+        except FileNotFoundError:
+            return True
+        except OSError:
+            return False
+        if sha256(found[:-32]).digest() == found[-32:]:
+            return True
+        _say(f"{path.parent}: a compiled kernel was damaged, and is compiled anew")
+        with suppress(OSError):
+            path.unlink()
+        return False
+
+    @contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[BytesIO]:  # pyrefly: ignore[bad-override]
+        """Write a file, and its sum after it."""
+        buffer = BytesIO()
+        yield buffer
+        content = buffer.getvalue()
+        with super()._open_for_write(filepath) as file:
+            file.write(content + sha256(content).digest())
+
+
+def checked(dispatcher: Any) -> Any:
+    """Let a compiled function keep its code in checked files.
+
+    Parameters
+    ----------
+    dispatcher : what `numba.njit` returns
+        Where compilation is switched off, the function itself.
+
+    Returns
+    -------
+    The same.
+    """
+    if cache := getattr(dispatcher, "_cache", None):
+        files = cache._cache_file
+        cache._cache_file = CheckedFiles.__new__(CheckedFiles)
+        cache._cache_file.__dict__.update(files.__dict__)
+    return dispatcher
+
+
+def _say(line: str) -> None:
+    """Say something once."""
+    if line not in _said:
+        _said.add(line)
+        print(f"pipistrelle: {line}", file=sys.stderr)
