@@ -1,0 +1,43 @@
+"""The set-up script: two who start at once make one environment."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+DEV = Path(__file__).resolve().parents[1] / "dev"
+START = """\
+import sys, time
+from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_loader
+from pathlib import Path
+
+loader = SourceFileLoader("dev", sys.argv[1])
+dev = module_from_spec(spec_from_loader("dev", loader))
+sys.dont_write_bytecode = True
+loader.exec_module(dev)
+dev.VENV = Path(sys.argv[2], ".venv")
+dev.STAMP, dev.PYTHON = dev.VENV / "stamp", dev.VENV / "python"
+
+def make(wanted):
+    if dev.VENV.exists():
+        sys.exit("somebody else is at work here")
+    dev.VENV.mkdir()
+    time.sleep(0.5)
+    dev.PYTHON.touch()
+    dev.STAMP.write_text(wanted)
+    print("made")
+
+dev.make_environment = make
+dev.set_up()
+"""
+
+
+def test_of_those_who_start_at_once_one_makes_the_environment_and_the_others_wait(tmp_path):
+    command = [sys.executable, "-c", START, str(DEV), str(tmp_path)]
+    started = [
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        for _ in range(4)
+    ]
+    ended = [process.communicate(timeout=60) for process in started]
+    assert [process.returncode for process in started] == [0] * 4
+    assert sorted(told for told, _ in ended) == ["", "", "", "made\n"]
