@@ -98,6 +98,10 @@ def test_layers_leave_alone_what_they_do_not_name(tmp_path):
         ("rays.power.x = 3", "rays.power: found {'x': 3}, expected a valid number"),
         ("scenario.steps = 3.0", "scenario.steps: found 3.0, expected a valid integer"),
         ("target.shape = 'cube'", "target.shape: found 'cube', expected 'cylinder' or 'sphere'"),
+        (
+            "detection.leakage_db = 12345",
+            "detection.leakage_db: found 12345, expected less than or equal to 300",
+        ),
         ("rays.range_bounds = [1]", "rays.range_bounds: found [1], expected 2 values"),
         ("rays.range_bounds = [1, 2, 3]", "rays.range_bounds: found [1, 2, 3], expected 2 values"),
         (

@@ -124,7 +124,7 @@ class DetectionConfig(Section):
 
     false_alarm: Annotated[float, Field(gt=0, lt=0.1)] = 1e-6
     """Probability that noise alone passes one test of one tone."""
-    leakage_db: float = -28.0
+    leakage_db: Level = -28.0
     """A tone counts only above this level relative to the other tone's maximum nearby [dB]."""
     peak_db: Annotated[float, Field(le=0)] = -8.0
     """Peaks of a scan count down to this level under the strongest [dB]."""
