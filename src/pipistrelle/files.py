@@ -64,25 +64,22 @@ class OwnFiles:
             With the file.
         """
         for name in sorted({*names, *self._sums}):
-            path, known = self.folder / name, name in self._sums
-            if not known and os.path.lexists(self._partial(name)):
-                path = self._partial(name)
-            elif not os.path.lexists(path) or self._is_ours(name):
-                continue
-            what = "was changed since Pipistrelle wrote it" if known else "is not Pipistrelle's"
-            raise InputError(
-                f"{path}: {what}, so it is not replaced; move it away, or name another folder"
-            )
+            self._refuse(name)
 
-    def clear(self) -> None:
+    def clear(self, names: Iterable[str] = ()) -> None:
         """Remove what we wrote, and nothing else.
+
+        Parameters
+        ----------
+        names : iterable of str
+            What is to be written next, checked with the rest.
 
         Raises
         ------
         InputError
             As `check`, before anything is removed; or where a file cannot be removed.
         """
-        self.check()
+        self.check(names)
         try:
             for name in (*self._sums, SUMS):
                 if not (self.folder / name).exists():  # we were stopped while we wrote it
@@ -107,7 +104,7 @@ class OwnFiles:
             As `check`, or where it cannot be written.
         """
         data = content.encode() if isinstance(content, str) else content
-        self.check([name])
+        self._refuse(name)
         path = self.folder / name
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -138,6 +135,18 @@ class OwnFiles:
         except OSError as error:
             raise _unwritable(self.folder, error) from error
 
+    def _refuse(self, name: str) -> None:
+        """Refuse to replace a file that is not as we wrote it."""
+        path, known = self.folder / name, name in self._sums
+        if not known and os.path.lexists(self._partial(name)):
+            path = self._partial(name)
+        elif not os.path.lexists(path) or self._is_ours(name):
+            return
+        what = "was changed since Pipistrelle wrote it" if known else "is not Pipistrelle's"
+        raise InputError(
+            f"{path}: {what}, so it is not replaced; move it away, or name another folder"
+        )
+
     def _is_ours(self, name: str) -> bool:
         """Whether a file is as we wrote it."""
         path = self.folder / name
@@ -153,14 +162,14 @@ class OwnFiles:
 
     def _note(self, name: str, its_sum: str) -> None:
         """Put a file on the list, before it is there: whatever ends us, it is known as ours."""
-        anew = name in self._sums
+        known = name in self._sums
         self._sums[name] = its_sum
-        lines = [f"{s}  {n}\n" for n, s in (self._sums.items() if anew else [(name, its_sum)])]
-        if anew:
+        if known:
+            lines = [f"{its}  {other}\n" for other, its in self._sums.items()]
             write_whole(self.folder / SUMS, "".join(lines).encode())
         else:
             with (self.folder / SUMS).open("a", encoding="utf-8", newline="\n") as file:
-                file.writelines(lines)
+                file.write(f"{its_sum}  {name}\n")
 
 
 def _is_inside(name: str) -> bool:

@@ -22,18 +22,8 @@ _said: set[str] = set()
 class CheckedFiles(IndexDataCacheFile):
     """A kernel's two files."""
 
-    def load(self, key: Any) -> Any:
-        """Return what is kept under a key; None where there is nothing, or nothing sound."""
-        if not self._is_sound(Path(self._index_path)):
-            return None
-        name = self._load_index().get(key)
-        if name is None or not self._is_sound(Path(self._data_path(name))):
-            return None
-        return super().load(key)
-
     def save(self, key: Any, data: Any) -> None:
         """Keep what was compiled, if there is room: without it, it is compiled again next time."""
-        self._is_sound(Path(self._index_path))
         try:
             super().save(key, data)
         except OSError as error:
@@ -41,6 +31,16 @@ class CheckedFiles(IndexDataCacheFile):
                 f"{self._cache_path}: compiled kernels could not be kept ({error.strerror}), so "
                 "they are compiled at every start; make room or set NUMBA_CACHE_DIR"
             )
+
+    def _load_index(self) -> dict[Any, str]:
+        """Return what is kept where: nothing, where the index is not sound."""
+        return super()._load_index() if self._is_sound(Path(self._index_path)) else {}
+
+    def _load_data(self, name: str) -> Any:
+        """Return a kernel's code; Numba takes an error for a file that is gone."""
+        if not self._is_sound(Path(self._data_path(name))):
+            raise FileNotFoundError(name)
+        return super()._load_data(name)
 
     def _is_sound(self, path: Path) -> bool:
         """Whether a file is as it was written, or is not there; remove it if not."""

@@ -172,8 +172,7 @@ def write_log(folder: Path, log: Log) -> None:
     import tomli_w
 
     own = OwnFiles(folder)
-    own.check(FILES)
-    own.clear()
+    own.clear(FILES)
     first, second = _CONTROLS[log.motion]
     settings = {"format": 1} | {name: getattr(log, name) for name in _SHARED}
     settings |= {f"{first}_std": log.control_std[0], f"{second}_std": log.control_std[1]}

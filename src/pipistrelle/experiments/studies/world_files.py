@@ -190,20 +190,22 @@ def read_ended_trials(folder: Path, iteration: int) -> list[EndedTrial]:
     """
     import polars as pl
 
-    check_world(folder, iteration)
-    trials = world_file(folder, "trials", iteration).read_bytes()
-    return [
-        EndedTrial(*row) for row in pl.read_parquet(trials, columns=[*EndedTrial._fields]).rows()
-    ]
+    trials = pl.read_parquet(check_world(folder, iteration), columns=[*EndedTrial._fields])
+    return [EndedTrial(*row) for row in trials.rows()]
 
 
-def check_world(folder: Path, iteration: int) -> None:
+def check_world(folder: Path, iteration: int) -> bytes:
     """Refuse a world that is done, but of which a file is not as it was written.
 
     Parameters
     ----------
     folder : Path
     iteration : int
+
+    Returns
+    -------
+    bytes
+        The file of trials.
 
     Raises
     ------
@@ -222,6 +224,7 @@ def check_world(folder: Path, iteration: int) -> None:
             flaw = f"could not be read ({error.strerror})"
         if flaw:
             raise damaged(folder, name, iteration, flaw)
+    return found["trials"]
 
 
 def damaged(folder: Path, table: str, iteration: int, flaw: str) -> InputError:

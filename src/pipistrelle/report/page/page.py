@@ -77,8 +77,7 @@ def write_report(
     models = model_charts(studies[0])
     drawn, texts = [*_distinct(found), *models], _csv_texts(selected[0], found, models)
     own = OwnFiles(folder)
-    own.check(["index.html", "summary.json", *_names(drawn, texts)])
-    own.clear()
+    own.clear(["index.html", "summary.json", *_names(drawn, texts)])
     with own.room("figures") as room:
         for chart in drawn:
             progress(chart.name)
