@@ -2,8 +2,10 @@
 
 import os
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from threading import Barrier
 
 import polars as pl
 import pytest
@@ -83,6 +85,22 @@ def test_a_plan_of_the_users_own_is_not_taken_for_a_study(tmp_path, plan):
     with pytest.raises(InputError, match=r"holds a plan\.toml that is not Pipistrelle's"):
         open_store(tmp_path / "plans", plan)
     assert contents(tmp_path / "plans") == {Path("plan.toml"): text.encode()}
+
+
+def test_those_who_open_a_new_study_at_once_do_not_take_each_other_for_strangers(tmp_path, plan):
+    rounds, together = 10, 6
+    start = Barrier(together)
+
+    def open_each(_: int) -> None:
+        for number in range(rounds):
+            start.wait(timeout=20)
+            open_store(tmp_path / str(number), plan)
+
+    with ThreadPoolExecutor(together) as pool:
+        list(pool.map(open_each, range(together)))
+    for number in range(rounds):
+        assert read_plan(tmp_path / str(number) / "plan.toml") == plan
+        assert leftovers(tmp_path / str(number)) == []
 
 
 def test_a_users_remarks_in_a_studys_plan_are_not_lost(folder, plan):

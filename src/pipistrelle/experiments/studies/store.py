@@ -5,6 +5,7 @@ So a study can be killed anywhere, continued, and written to by many processes a
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -92,9 +93,11 @@ def open_store(folder: Path, plan: Plan) -> None:
     kept = folder / "plan.toml"
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        # Looked at before the plan is sought: others who start now write their plan first.
+        seen = list(folder.iterdir())
         there = read_plan(kept) if kept.exists() else None
-        left = [path for path in folder.iterdir() if _LEFT.fullmatch(path.name)]
-        _refuse_strange(folder, there, {path.name for path in left})
+        left = [path for path in seen if _LEFT.fullmatch(path.name)]
+        _refuse_strange(folder, there, [path.name for path in seen if path not in left])
         if there is not None and (found := changed_settings(there, plan)):
             told = "".join(f"\n  {line}" for line in found)
             raise InputError(
@@ -120,16 +123,14 @@ def open_store(folder: Path, plan: Plan) -> None:
         raise unusable(folder, error) from error
 
 
-def _refuse_strange(folder: Path, there: Plan | None, left: set[str]) -> None:
+def _refuse_strange(folder: Path, there: Plan | None, strange: Sequence[str]) -> None:
     """Refuse a folder that holds something, but no plan of ours."""
-    if there is None:
-        strange = sorted({path.name for path in folder.iterdir()} - left)
-        if strange:
-            raise InputError(
-                f"{folder}: holds {strange[0]} and no plan.toml, so it is no study's folder; "
-                "name another with -o DIR"
-            )
-    elif not (_is_ours(folder / "plan.toml", there) or (folder / "trials").is_dir()):
+    if there is None and strange:
+        raise InputError(
+            f"{folder}: holds {min(strange)} and no plan.toml, so it is no study's folder; "
+            "name another with -o DIR"
+        )
+    if there and not (_is_ours(folder / "plan.toml", there) or (folder / "trials").is_dir()):
         raise InputError(
             f"{folder}: holds a plan.toml that is not Pipistrelle's and no trials, so it is no "
             "study's folder; name another with -o DIR"
