@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-import pipistrelle  # noqa: F401 - before anything imports Numba
+import pipistrelle.jit  # noqa: F401 - it chooses where kernels are kept
 
 settings.register_profile("repeatable", deadline=None, derandomize=True)
 settings.load_profile("repeatable")

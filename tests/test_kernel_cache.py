@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-import pipistrelle
+from pipistrelle import kernel_folder
+from pipistrelle.kernel_folder import sources_key
 
-SHOW = "import os, pipistrelle; print(os.environ['NUMBA_CACHE_DIR'])"
+SHOW = "import os, pipistrelle.jit; print(os.environ['NUMBA_CACHE_DIR'])"
 COMPILE = SHOW + "; from pipistrelle.geometry import wrap_angle; wrap_angle(4.0)"
 NOWHERE = os.devnull + "/home"  # no folder can be made in a file, not even by root
 
@@ -28,7 +29,7 @@ def place(tmp_path: Path, code: str = SHOW, **environment: str) -> tuple[Path, l
 
 def test_kernels_are_kept_in_the_users_cache_by_the_state_of_the_sources(tmp_path):
     folder, said = place(tmp_path)
-    assert folder == tmp_path / ".cache" / "pipistrelle" / pipistrelle._key()
+    assert folder == tmp_path / ".cache" / "pipistrelle" / sources_key()
     assert said == []
 
 
@@ -43,14 +44,14 @@ def test_folder_that_the_user_names_is_taken(tmp_path):
 
 def test_numba_imported_before_keeps_them_there_too(tmp_path):
     folder, _ = place(tmp_path, "import numba; " + COMPILE)
-    assert folder == tmp_path / ".cache" / "pipistrelle" / pipistrelle._key()
+    assert folder == tmp_path / ".cache" / "pipistrelle" / sources_key()
     assert list(folder.rglob("*.nbc"))
 
 
 @pytest.mark.parametrize("variable", ["HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR"])
 def test_a_temporary_folder_is_taken_where_nothing_else_can_be_written(tmp_path, variable):
     folder, said = place(tmp_path, **{variable: NOWHERE})
-    assert folder == tmp_path / "tmp" / f"pipistrelle-{os.getuid()}" / pipistrelle._key()
+    assert folder == tmp_path / "tmp" / f"pipistrelle-{os.getuid()}" / sources_key()
     assert len(said) == 1
     assert NOWHERE in said[0]
     assert str(folder) in said[0]
@@ -79,14 +80,14 @@ def test_temporary_folder_that_others_can_write_is_not_trusted(tmp_path):
 
 
 def test_key_changes_with_a_kernel_and_not_with_what_compiles_none(tmp_path, monkeypatch):
-    monkeypatch.setattr(pipistrelle, "__file__", str(tmp_path / "__init__.py"))
+    monkeypatch.setattr(kernel_folder, "__file__", str(tmp_path / "kernel_folder.py"))
     (tmp_path / "kernel.py").write_text("from numba import njit\n")
     (tmp_path / "plain.py").write_text("")
-    before = pipistrelle._key()
+    before = sources_key()
     (tmp_path / "plain.py").write_text("one = 1\n")
-    assert pipistrelle._key() == before
+    assert sources_key() == before
     (tmp_path / "kernel.py").write_text("from numba import njit  # changed\n")
-    assert pipistrelle._key() != before
+    assert sources_key() != before
 
 
 def test_kernels_of_the_states_used_last_are_kept_and_nothing_else_is_touched(tmp_path):

@@ -15,6 +15,9 @@ import numpy as np
 from numba import njit
 
 from pipistrelle.kernel_cache import checked
+from pipistrelle.kernel_folder import place_kernels
+
+place_kernels()
 
 Whole = int | np.integer
 """A whole number in a kernel: Numba's are Python's, those of arrays NumPy's."""

@@ -90,4 +90,5 @@ def _say(line: str) -> None:
     """Say something once."""
     if line not in _said:
         _said.add(line)
-        print(f"pipistrelle: {line}", file=sys.stderr)
+        with suppress(OSError, AttributeError):  # nobody can read it
+            print(f"pipistrelle: {line}", file=sys.stderr)
