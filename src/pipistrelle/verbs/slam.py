@@ -1,5 +1,6 @@
 """`pipistrelle slam`: a recorded log to a map."""
 
+from collections.abc import Sequence
 from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,9 +10,9 @@ from pydantic import create_model
 
 from pipistrelle.config import Config, InputError, Section
 from pipistrelle.detection.logs.readers import READERS
-from pipistrelle.estimation.catalogue import SECTIONS
+from pipistrelle.estimation.catalogue import SECTIONS, short_name
 from pipistrelle.settings import Given, Key, Layer, from_flags, resolve
-from pipistrelle.verbs.console import progress, say
+from pipistrelle.verbs.console import progress
 from pipistrelle.verbs.options import (
     Chosen,
     ChosenFilter,
@@ -24,14 +25,18 @@ from pipistrelle.verbs.options import (
     short_names,
     strategies,
 )
+from pipistrelle.verbs.streams import warn
 
 if TYPE_CHECKING:
     from pipistrelle.detection.logs.recording import Log
     from pipistrelle.experiments.drives import Truth
+    from pipistrelle.experiments.results.scores import TrialResult
 
 GATE = 0.999
 """Share of a measurement's predicted distribution that is accepted of real logs."""
 GATE_KEY: Key = ("filter", "gate")
+SUSPECT = 0.2
+"""Share of a log's rows that may not fit before its units are asked about."""
 LOGGED = frozenset(
     {
         ("filter", "range_std"),
@@ -126,6 +131,7 @@ def slam(
             trials = replay(
                 recorded, truth, chosen, ways, beam, settled, progress=show, watch=watch
             )
+        _warn_of_units(recorded, trials, log)
         return delivery.deliver(
             folder,
             trials,
@@ -164,7 +170,7 @@ def _with_log(layer: Layer, recorded: "Log", log: Path) -> Config:
         value = getattr(getattr(settled, section), name)
         if getattr(getattr(wished, section), name) != value:
             where = layer[section, name].where
-            say(f"pipistrelle: warning: {where}: the log decides this, and says {value}")
+            warn(f"{where}: the log decides this, and says {value}")
     return settled
 
 
@@ -175,9 +181,27 @@ def _warn_of_partial_truth(truth: "Truth", log: Path) -> None:
     steps = len(truth.time) - 1
     known = sum(1 for pose in truth.path[1:] if pose[0] == pose[0])
     if known < steps:
-        say(
-            f"pipistrelle: warning: {log}: the truth covers {known} of {steps} steps; only these "
-            "are scored"
+        warn(f"{log}: the truth covers {known} of {steps} steps; only these are scored")
+
+
+def _warn_of_units(recorded: "Log", trials: "Sequence[TrialResult]", log: Path) -> None:
+    """Ask whether a log has the units that are expected, where much of it does not fit."""
+    for trial in trials:
+        heard, name = sum(len(scan.landmark) for scan in trial.scans), short_name(trial.filter)
+        if not heard:
+            warn(f"{log}: nothing in it is heard by {trial.strategy} sensing, so it maps nothing")
+        elif trial.scores.gated > SUSPECT * heard:
+            warn(
+                f"{log}: {trial.scores.gated} of {heard} measurements do not fit what was expected "
+                f"({trial.strategy} {name}); are bearings in radians and ranges in metres?"
+            )
+    near, far = recorded.range_bounds
+    ranges = [r for scan in recorded.scans for r in scan.range.tolist() if r == r]
+    beyond = sum(not near <= r <= far for r in ranges)
+    if beyond > SUSPECT * len(ranges):
+        warn(
+            f"{log}: {beyond} of {len(ranges)} ranges are not within range_bounds ({near:g} to "
+            f"{far:g} m); are ranges in metres?"
         )
 
 
@@ -187,4 +211,4 @@ def _warn_of_ignored_rows(recorded: "Log", log: Path) -> None:
         reasons = (
             f"{count} {reason.replace('_', ' ')}" for reason, count in recorded.ignored_rows.items()
         )
-        say(f"pipistrelle: warning: {log}: rows left out: {', '.join(reasons)}")
+        warn(f"{log}: rows left out: {', '.join(reasons)}")

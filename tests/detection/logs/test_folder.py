@@ -463,7 +463,8 @@ def test_a_written_folder_says_what_it_holds(tmp_path):
 
 NUMBER = st.floats(-1e6, 1e6)
 ANGLE = st.floats(-np.pi, np.pi, exclude_max=True)
-RANGE = st.floats(0, 1e6, exclude_min=True) | st.just(np.nan)
+LABEL = st.integers(0, 2**53 - 1)
+RANGE = st.floats(1e-9, 1e6) | st.just(np.nan)
 
 
 @st.composite
@@ -477,7 +478,7 @@ def drives(draw):
     scans = []
     for k in sorted(draw(st.sets(st.integers(0, steps), min_size=1))):
         for _ in range(draw(st.integers(1, 1 if k == 0 else 3))):
-            rows = draw(st.dictionaries(st.integers(-99, 99), st.tuples(ANGLE, RANGE), min_size=1))
+            rows = draw(st.dictionaries(LABEL, st.tuples(ANGLE, RANGE), min_size=1))
             bearing, distance = np.array(list(rows.values())).T
             unsaid = {"range_std": np.nan, "bearing_std": np.nan}  # a log says it once for all
             scans.append(scan_with(list(rows), bearing, distance, time=time[k].item(), **unsaid))

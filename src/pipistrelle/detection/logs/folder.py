@@ -4,7 +4,6 @@ Whatever is wrong with a file is refused by line or key. `recording` says how ro
 measurements scans.
 """
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,7 +14,8 @@ from pipistrelle.config import InputError, NonNegative, Positive, Probability, S
 from pipistrelle.detection.logs.recording import MEASUREMENT, Log, assemble
 from pipistrelle.detection.logs.text_tables import read_table, read_text, table_text
 from pipistrelle.files import OwnFiles
-from pipistrelle.refusals import expectation, meant, refusal, values_expected
+from pipistrelle.refusals import expectation, meant, refusal, shown, values_expected
+from pipistrelle.settings import parse_toml
 
 _Triple = Annotated[tuple[float, float, float], Field(strict=False)]
 _Triple_std = Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(strict=False)]
@@ -190,10 +190,7 @@ def write_log(folder: Path, log: Log) -> None:
 
 def _read_settings(path: Path) -> _Settings:
     """Settings of ``log.toml``; the first error, unknown keys before missing ones."""
-    try:
-        raw = tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise refusal(path, str(error), "TOML", "correct the line") from None
+    raw = parse_toml(read_text(path), path)
     model = _SETTINGS["bicycle" if raw.get("motion") == "bicycle" else "unicycle"]
     try:
         return model.model_validate(raw)
@@ -217,7 +214,7 @@ def _key_refusal(path: Path, fault: Any, model: type[_Settings]) -> InputError:
         near = meant(key, known)
         fix = f"did you mean {near!r}?" if near else "remove it"
         return refusal(path, f"the unknown key {key!r}", f"one of {', '.join(known)}", fix)
-    found = repr(fault["input"])
+    found = shown(fault["input"])
     return refusal(f"{path}, key {key!r}", found, expectation(fault), "correct the value")
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Int
 
 from pipistrelle.detection.logs.recording import Log, assemble
-from pipistrelle.detection.logs.text_tables import Table, check_unique, read_table
+from pipistrelle.detection.logs.text_tables import Table, check_unique, read_table, rows_kept
 from pipistrelle.refusals import refusal
 
 ROBOTS = range(1, 6)
@@ -87,10 +87,9 @@ def _seen_landmarks(folder: Path, robot: int) -> tuple[Table, dict[str, int]]:
             f"at most {_UNKNOWN_MAX:.0%} that Barcodes.dat does not know",
             "use the Barcodes.dat of this set",
         )
-    column = {name: table.column[name][landmark] for name in ("time", "bearing", "range")}
-    column["landmark"] = subject[landmark]
     ignored = {"unknown_barcode": int(unknown.sum()), "robot_seen": int(seen.sum())}
-    return replace(table, line=table.line[landmark], column=column), ignored
+    named = replace(table, column=table.column | {"landmark": subject})
+    return rows_kept(named, landmark), ignored
 
 
 def _subjects(path: Path, barcode: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:

@@ -15,8 +15,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.detection.logs.text_tables import Table, check_unique
-from pipistrelle.detection.scans import Scan, make_scan
+from pipistrelle.detection.logs.text_tables import Table, check_unique, rows_kept
+from pipistrelle.detection.scans import UNLABELLED, Scan, make_scan
 from pipistrelle.geometry import wrap
 from pipistrelle.refusals import refusal
 
@@ -112,8 +112,8 @@ def assemble(
     Raises
     ------
     InputError
-        If nothing of the odometry is left, a landmark is measured twice at one time, or times can
-        be no seconds.
+        If nothing of the odometry or of the measurements is left, a landmark is measured twice at
+        one time, or times can be no seconds.
     """
     _check_seconds(odometry, _LONGEST_GAP)
     _check_seconds(measurements, math.inf)
@@ -122,12 +122,20 @@ def assemble(
     time, controls = _cut(odometry.path, stamp[last], np.column_stack(columns)[last], span)
     if step is not None:
         time, controls = _merge(odometry.path, time, controls, step)
+    clutter = measurements.column["landmark"] == UNLABELLED
+    measurements = rows_kept(measurements, ~clutter)
     check_unique(measurements, "time", "landmark")
     stamp = measurements.column["time"]
     inside = (stamp >= time[0]) & (stamp <= time[-1])
     ignored = Counter(ignored_rows or {})
     ignored["same_time_odometry"] += int(np.sum(~last))
+    ignored["clutter"] += int(np.sum(clutter))
     ignored["outside_odometry"] += int(np.sum(~inside))
+    if not inside.any():
+        reasons = ", ".join(f"{n} {why.replace('_', ' ')}" for why, n in ignored.items() if n)
+        found = f"no row to use (left out: {reasons})"
+        expected = f"some of landmarks, between {time[0].item()!r} s and {time[-1].item()!r} s"
+        raise refusal(measurements.path, found, expected, "use the odometry's clock")
     measured = {name: measurements.column[name][inside] for name in MEASUREMENT}
     return Log(
         time=time,

@@ -4,12 +4,14 @@ A sound file is read at once, 60,000 rows in some hundredths of a second; any ot
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
+from pipistrelle.config import LARGEST
+from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.refusals import refusal
 
 _LABELS = ("landmark", "subject", "barcode")
@@ -114,6 +116,22 @@ def table_text(columns: tuple[str, ...], *values: np.ndarray) -> str:
     return "\n".join([",".join(columns), *lines, ""])
 
 
+def rows_kept(table: Table, kept: Bool[np.ndarray, " n"]) -> Table:
+    """Return a table of some of its rows.
+
+    Parameters
+    ----------
+    table : Table
+    kept : (n)
+
+    Returns
+    -------
+    Table
+    """
+    column = {name: values[kept] for name, values in table.column.items()}
+    return replace(table, line=table.line[kept], column=column)
+
+
 def check_unique(table: Table, *names: str) -> None:
     """Refuse a table of which two rows agree in all of these columns.
 
@@ -149,11 +167,15 @@ def check_unique(table: Table, *names: str) -> None:
 
 def read_text(path: Path) -> str:
     """Return the text of a file, or refuse it."""
+    if path.exists() and not (path.is_file() or path.is_dir()):  # a pipe may never end
+        fix = "put the rows into a file of their own"
+        raise refusal(path, "a pipe or a device", "a readable text file", fix)
     try:
         return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
+        found = "a link to no file" if path.is_symlink() else "no such file"
         fix = "add it, or name the folder that holds it"
-        raise refusal(path, "no such file", "a readable text file", fix) from None
+        raise refusal(path, found, "a readable text file", fix) from None
     except UnicodeDecodeError:
         raise refusal(path, "bytes that are no text", "UTF-8 text", "save it as UTF-8") from None
     except OSError as error:
@@ -207,11 +229,14 @@ def _check_columns(table: Table) -> None:
             wrong = np.diff(values, prepend=-np.inf) < 0
             promise = "a time that does not run backwards"
         elif name == "range":
-            wrong, promise = values <= 0, "a range above 0 m"
+            wrong = (values < 1.0 / LARGEST) | (values > LARGEST)
+            promise = f"a range above 0 m, up to {LARGEST:g} m"
         elif name in _LABELS:
-            wrong, promise = (values != np.rint(values)) | (np.abs(values) >= 2**53), "an integer"
+            wrong = (values != np.rint(values)) | (values < UNLABELLED) | (values >= 2**53)
+            promise = f"an integer, from 0 on, or {UNLABELLED} for clutter"
         else:
-            continue
+            wrong = np.abs(values) > LARGEST
+            promise = f"a number between -{LARGEST:g} and {LARGEST:g}"
         if wrong.any():
             row = int(np.argmax(wrong))
             where = f"{table.path}, line {table.line[row]}"

@@ -8,6 +8,7 @@ not say, when a drive began and where.
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from os.path import lexists
 from pathlib import Path
 
 import numpy as np
@@ -108,12 +109,12 @@ def read_truth(folder: Path, time: Float[np.ndarray, " k"]) -> Truth:
     """
     path_file, landmark_file = folder / "truth.csv", folder / "landmarks.csv"
     path = landmarks = None
-    if path_file.exists():
+    if lexists(path_file):  # also a link that leads nowhere, which is refused
         path = poses_at(time, *read_path(path_file, ","))
         if np.isnan(path).all():
             expected = f"poses between the log's times {time[0].item()!r} and {time[-1].item()!r}"
             raise refusal(path_file, "none", expected, "use the log's clock or remove the file")
-    if landmark_file.exists():
+    if lexists(landmark_file):
         landmarks = read_landmarks(landmark_file, ("landmark", "x", "y"), ",")
     return Truth(time=time, path=path, landmarks=landmarks)
 
