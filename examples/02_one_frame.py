@@ -20,7 +20,7 @@ from pipistrelle.detection.matched import filter_samples
 from pipistrelle.detection.snapshots import detect, detector
 
 config = Config()
-speed_of_sound = config.air.speed_of_sound
+speed_of_sound = config.air.celerity
 
 # %%
 # The world: the vehicle at the origin, heading along x, three landmarks and the beacon. An

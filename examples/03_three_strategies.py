@@ -26,7 +26,7 @@ mission = run_mission(config, STRATEGIES)
 width = beamwidth(
     config.emitter.radius,
     frequency=config.emitter.frequency,
-    speed_of_sound=config.air.speed_of_sound,
+    speed_of_sound=config.air.celerity,
 )
 figure = draw_mission(
     mission.trials,

@@ -4,7 +4,6 @@
 is kept. A traceback is always a bug of ours.
 """
 
-import os
 import sys
 from collections.abc import Sequence
 from errno import ENOSPC
@@ -14,6 +13,7 @@ from itertools import pairwise, zip_longest
 from cyclopts import App, CycloptsError, MissingArgumentError, UnusedCliTokensError
 
 from pipistrelle import __version__
+from pipistrelle.verbs.streams import flush_results, hold_streams, say
 
 SPELLINGS = (
     "A setting is --rays.power 3 as a flag, PIPISTRELLE_RAYS__POWER=3 in the environment and "
@@ -88,27 +88,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Examples
     --------
-    >>> main(["--version"])
-    0.1.0
-    0
+    >>> main(["study", "nowhere.toml"])
+    2
     """
     words = sys.argv[1:] if arguments is None else arguments
+    hold_streams()
     try:
         status = app(_completed(words)) or 0
-        if sys.stdout is not None:
-            sys.stdout.flush()
+        flush_results()
     except KeyboardInterrupt:
-        print("pipistrelle: interrupted", file=sys.stderr)
+        say("pipistrelle: interrupted")
         return 130
-    except BrokenPipeError:  # the reader of our output has left
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     except (CycloptsError, OSError, ValueError, MemoryError) as error:
         message = _explained(error, words)
         if message is None:
             raise
         for line in message.splitlines():
-            print(f"pipistrelle: error: {line}", file=sys.stderr)
+            say(f"pipistrelle: error: {line}")
         return 2
     return status
 
@@ -126,11 +122,13 @@ def _explained(error: Exception, words: Sequence[str]) -> str | None:
     from pipistrelle.config import InputError
 
     if isinstance(error, MemoryError):
-        return f"not enough memory ({error}); ask for fewer steps, landmarks or particles"
+        return (
+            f"not enough memory ({error}); ask for a shorter drive (scenario.steps), fewer "
+            "landmarks (scenario.landmarks) or fewer particles (fastslam.particles)"
+        )
     if isinstance(error, OSError) and error.filename:
         return f"{error.filename}: {error.strerror}"
     if isinstance(error, OSError) and error.errno == ENOSPC:  # a full disk behind our output
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return f"the output could not be written: {error.strerror}"
     if isinstance(error, UnusedCliTokensError) and error.unused_tokens and error.target:
         return _too_many(error, error.unused_tokens[0], words)

@@ -5,12 +5,25 @@ where a covariance is built; levels end in ``_db``. A setting that the paper doe
 so. This module needs pydantic alone, so that the command line can show its help at once.
 """
 
+import math
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
+LARGEST = 1e9
+"""No setting needs more of its unit, nor its inverse less: what is squared stays a number."""
+
+
+def _not_tiny(value: float) -> float:
+    """Refuse a number that is above zero in name alone."""
+    if value < 1.0 / LARGEST:
+        raise ValueError(f"at least {1.0 / LARGEST:g}")
+    return value
+
+
+Real = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Positive = Annotated[float, Field(gt=0, le=LARGEST), AfterValidator(_not_tiny)]
+NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 Count = Annotated[int, Field(ge=1, lt=2**63)]
 Level = Annotated[float, Field(ge=-300, le=300)]
 Probability = Annotated[float, Field(gt=0, le=1)]
@@ -40,11 +53,11 @@ class ScenarioConfig(Section):
     """Length of a control step [s]."""
     steps_per_frame: Count = 4
     """Control steps between two emissions."""
-    speed: float = 0.75
+    speed: Real = 0.75
     """Nominal speed [m/s]."""
-    steering: float = 0.027
+    steering: Real = 0.027
     """Nominal steering angle [rad]."""
-    start: tuple[float, float, float] = (0.0, -7.408, 0.0)
+    start: tuple[Real, Real, Real] = (0.0, -7.408, 0.0)
     """True start: x, y [m], heading [rad]; unreported: the noise-free path circles the centre."""
     landmarks: Annotated[int, Field(ge=0)] = 50
     """Number of landmarks, without the beacon."""
@@ -61,8 +74,8 @@ class ScenarioConfig(Section):
 class AirConfig(Section):
     """The medium. Humidity is unreported in the paper."""
 
-    speed_of_sound: Positive = 343.0
-    """[m/s]"""
+    speed_of_sound: Annotated[float, Field(ge=10, le=10_000)] | None = None
+    """[m/s]; unless given, that of the temperature T: 343 sqrt(T / 293.15 K)."""
     temperature_c: Annotated[float, Field(gt=-50, lt=60)] = 20.0
     """[degrees Celsius]"""
     relative_humidity: Annotated[float, Field(ge=0, le=1)] = 0.5
@@ -71,6 +84,13 @@ class AirConfig(Section):
     """[kPa]"""
     spreading: Literal["paper", "bistatic"] = "paper"
     """Passive echoes lose 20 log10(d1 + d2), the paper's mirror law, or 20 log10(d1 d2) [dB]."""
+
+    @property
+    def celerity(self) -> float:
+        """The speed of sound [m/s]: as it was given, or that of an ideal gas at the temperature."""
+        if self.speed_of_sound is not None:
+            return self.speed_of_sound
+        return 343.0 * math.sqrt((self.temperature_c + 273.15) / 293.15)
 
 
 class TargetConfig(Section):
@@ -122,11 +142,11 @@ class ReceiverConfig(Section):
 class DetectionConfig(Section):
     """From samples to bearings and ranges. All unreported."""
 
-    false_alarm: Annotated[float, Field(gt=0, lt=0.1)] = 1e-6
+    false_alarm: Annotated[float, Field(ge=1e-100, lt=0.1)] = 1e-6
     """Probability that noise alone passes one test of one tone."""
     leakage_db: Level = -28.0
     """A tone counts only above this level relative to the other tone's maximum nearby [dB]."""
-    peak_db: Annotated[float, Field(le=0)] = -8.0
+    peak_db: Annotated[float, Field(ge=-300, le=0)] = -8.0
     """Peaks of a scan count down to this level under the strongest [dB]."""
     scan_limit_deg: Annotated[float, Field(gt=0, lt=90)] = 80.0
     """Largest steering angle [deg]."""
@@ -176,8 +196,8 @@ class RayConfig(Section):
 
     ratio: Annotated[float, Field(gt=0, lt=1)] = 0.3
     """Standard deviation of a member as a share of its range (alpha)."""
-    density: Annotated[float, Field(gt=1)] = 3.0
-    """Ratio of two successive ranges (beta)."""
+    density: Annotated[float, Field(ge=1.001, le=10)] = 3.0
+    """Ratio of two successive ranges (beta); a large one leaves gaps, and reaches too far."""
     range_bounds: tuple[Positive, Positive] = (0.5, 20.0)
     """Nearest and farthest range covered [m]."""
     prune: Annotated[float, Field(ge=0, lt=1)] = 1e-5

@@ -12,6 +12,7 @@ from pydantic.fields import FieldInfo
 
 from pipistrelle.config import InputError
 
+_LONGEST = 80
 _PREFIXES = ("Value error, ", "Input should be ", "Value should ")
 
 
@@ -34,6 +35,26 @@ def refusal(where: object, found: str, expected: str, fix: str) -> InputError:
     "posts.csv, line 3: found x 'left', expected a finite number; correct the field"
     """
     return InputError(f"{where}: found {found}, expected {expected}; {fix}")
+
+
+def shown(value: Any) -> str:
+    """Show what was found, as much of it as a line bears.
+
+    Parameters
+    ----------
+    value : object
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> shown("left"), shown([1] * 1000)[-10:]
+    ("'left'", '1, 1, 1...')
+    """
+    text = repr(value)
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
 def expectation(fault: Any) -> str:

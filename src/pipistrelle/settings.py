@@ -13,6 +13,7 @@ in the environment and ``--rays.power`` as a flag.
 import json
 import tomllib
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,13 +22,16 @@ from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
 from pipistrelle.config import Config, InputError, Section
-from pipistrelle.refusals import expectation, meant, values_expected
+from pipistrelle.refusals import expectation, meant, refusal, shown, values_expected
 
 PREFIX = "PIPISTRELLE_"
 NOT_SETTINGS = frozenset({"PIPISTRELLE_DATA"})
 """Variables of the environment that share the prefix and set nothing."""
 
 Key = tuple[str, ...]
+
+_DEEPEST = 8
+"""Levels of tables and lists that a file may have."""
 
 
 class Given(NamedTuple):
@@ -193,7 +197,8 @@ def to_toml(config: Config) -> str:
     Returns
     -------
     str
-        Reads back as the same settings.
+        Reads back as the same settings. One that is settled by others unless it is given, and is
+        not given, is a remark.
 
     Examples
     --------
@@ -208,7 +213,8 @@ def to_toml(config: Config) -> str:
             table = getattr(table, section)
             if leaf == next(iter(type(table).model_fields)):
                 lines += ["", f"# {' '.join((type(table).__doc__ or '').split())}", f"[{section}]"]
-        assignment = f"{leaf} = {json.dumps(getattr(table, leaf))}"
+        value = getattr(table, leaf)
+        assignment = f"# {leaf} =" if value is None else f"{leaf} = {json.dumps(value)}"
         meaning = known_settings()[key].description
         lines.append(f"{assignment:<39} # {' '.join(meaning.split())}" if meaning else assignment)
     return "\n".join(lines) + "\n"
@@ -228,16 +234,67 @@ def read_toml(path: Path) -> dict[str, Any]:
     Raises
     ------
     InputError
-        Not TOML.
+        As `parse_toml`, with the file.
     OSError
         The file cannot be read.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not TOML: {error}") from error
+        text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not TOML: byte {error.start} is not UTF-8 text") from error
+        found = f"byte {error.start}, which is no UTF-8 text"
+        raise refusal(path, found, "TOML", "save it as UTF-8") from None
+    return parse_toml(text, path)
+
+
+def parse_toml(text: str, where: object) -> dict[str, Any]:
+    """Read TOML of a few levels, whose integers have 64 bits, as the language says.
+
+    Parameters
+    ----------
+    text : str
+    where : object
+        What a refusal says of where the text stands, as text.
+
+    Returns
+    -------
+    dict
+
+    Raises
+    ------
+    InputError
+        For anything else, with the line or the key.
+
+    Examples
+    --------
+    >>> parse_toml("rays.power = 3", "here")
+    {'rays': {'power': 3}}
+    >>> parse_toml("seed = 0xffffffffffffffffff", "here")
+    Traceback (most recent call last):
+    pipistrelle.config.InputError: here: seed: found an integer of 72 bits, expected at most 64;
+    correct it
+    """
+    deep = (f"more than {_DEEPEST} levels", "tables of settings, or lists of them", "mend the file")
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise refusal(where, str(error), "TOML", "correct the line") from None
+    except RecursionError:
+        raise refusal(where, *deep) from None
+    except ValueError:  # Python reads no integers of thousands of digits
+        raise refusal(where, "an integer of many digits", "at most 64 bits", "correct it") from None
+    waiting: list[tuple[Key, Any]] = [((), table)]
+    while waiting:
+        key, value = waiting.pop()
+        if len(key) > _DEEPEST:
+            raise refusal(f"{where}: {'.'.join(key[:3])}", *deep)
+        if isinstance(value, dict):
+            waiting += [((*key, name), inner) for name, inner in value.items()]
+        elif isinstance(value, list):
+            waiting += [((*key, str(i)), inner) for i, inner in enumerate(value)]
+        elif isinstance(value, int) and not -(2**63) <= value < 2**64:
+            found = f"an integer of {value.bit_length()} bits"
+            raise refusal(f"{where}: {'.'.join(key)}", found, "at most 64", "correct it")
+    return table
 
 
 def leaves(
@@ -281,7 +338,7 @@ def _layer(
             layer[key] = Given(value, where)
         elif any(key == known[: len(key)] for known in known_settings()):
             if value != {}:
-                raise InputError(f"{where}: found {value!r}, expected a section of settings")
+                raise InputError(f"{where}: found {shown(value)}, expected a section of settings")
         else:
             names = {".".join(known): known for known in known_settings()}
             near = meant(".".join(key), names)
@@ -292,12 +349,10 @@ def _layer(
 
 def _from_text(text: str) -> Any:
     """Read a TOML value, or a number that TOML spells otherwise; anything else is text."""
-    try:
-        read = tomllib.loads(f"value = {text}")
+    with suppress(InputError):
+        read = parse_toml(f"value = {text}", "")
         if read.keys() == {"value"}:
             return read["value"]
-    except tomllib.TOMLDecodeError:
-        pass
     try:
         return float(text)
     except ValueError:
@@ -317,4 +372,4 @@ def _problem(error: Any, layer: Layer) -> str:
         expected = f"{count} values"
     elif key != error["loc"]:
         expected += f" as value {error['loc'][-1] + 1}"
-    return f"{where}: found {value!r}, expected {expected}"
+    return f"{where}: found {shown(value)}, expected {expected}"

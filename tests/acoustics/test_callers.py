@@ -16,7 +16,7 @@ from pipistrelle.config import Config, InputError
 law = settings(deadline=None, max_examples=40)
 SEEDS = st.integers(0, 2**32 - 1)
 CONFIG = Config()
-C = CONFIG.air.speed_of_sound
+C = CONFIG.air.celerity
 TONES = (30e3, 25e3, 20e3)
 
 

@@ -12,7 +12,7 @@ from pipistrelle.__main__ import main
 from pipistrelle.config import Config, FastSlamConfig, InputError, RayConfig, ScenarioConfig
 from pipistrelle.experiments import machine
 from pipistrelle.experiments.machine import check_length, check_memory
-from pipistrelle.experiments.runs import trial
+from pipistrelle.experiments.runs import preparing
 from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.experiments.studies.plan import Plan
 from pipistrelle.experiments.studies.study import run_study
@@ -49,15 +49,15 @@ def test_active_landmarks_need_one_member_each(monkeypatch):
 
 def test_a_refusal_of_dense_rays_names_their_members(monkeypatch):
     monkeypatch.setattr(machine, "installed", lambda: 4.0 * GB)
-    with pytest.raises(InputError, match=r"51 landmarks of \d\d,\d{3} members each may need"):
-        check_memory(["ekf"], 51, Config(rays=RayConfig(density=1.0001)), passive=True)
+    with pytest.raises(InputError, match=r"51 landmarks of \d,\d{3} members each may need"):
+        check_memory(["ekf"], 51, Config(rays=RayConfig(density=1.001)), passive=True)
     with pytest.raises(InputError, match="20000 landmarks may need"):
         check_memory(["ekf"], 20_000, Config(), passive=False)
 
 
 def test_too_many_steps_are_refused_before_a_path_is_drawn(monkeypatch):
     monkeypatch.setattr(machine, "installed", lambda: 4.0 * GB)
-    monkeypatch.setattr(trial, "world_of", lambda _: pytest.fail("drawn"))
+    monkeypatch.setattr(preparing, "world_of", lambda _: pytest.fail("drawn"))
     config = Config(scenario=ScenarioConfig(steps=200_000_000))
     with pytest.raises(InputError, match=r"200,000,000 steps may need .* GB .* has 4.0 GB"):
         run_mission(config, ["fused"])

@@ -55,7 +55,7 @@ def test_the_defaults_that_the_help_names_are_those_of_the_settings(obey):
     width = beamwidth(
         config.emitter.radius,
         frequency=config.emitter.frequency,
-        speed_of_sound=config.air.speed_of_sound,
+        speed_of_sound=config.air.celerity,
     )
     assert told["beamwidth"] == f"{degrees(width):.1f}"
     assert told["landmarks"] == str(config.scenario.landmarks)

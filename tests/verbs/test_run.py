@@ -28,7 +28,7 @@ def test_a_run_tells_its_stages_its_scores_and_last_its_folder(obey):
     assert rows["position RMSE [m]"] == [f"{run['position_rmse_m']:.3f}" for run in runs]
     assert rows["measurements per frame"] == [f"{r['measurements_per_frame']:.2f}" for r in runs]
     counts = [f"{run['landmarks_full']} / {run['landmarks_total']}" for run in runs]
-    assert rows["landmarks, fully placed / all"] == counts
+    assert rows["landmarks, placed / heard"] == counts
     assert "fully placed, particles' mean" not in rows
     assert {"mission.png", "mission.pdf", "config.toml"} <= {p.name for p in Path("one").iterdir()}
 

@@ -118,7 +118,7 @@ def test_a_log_without_truth_is_mapped_and_not_scored(obey, log):
     status, printed, _ = obey("slam", log, "-o", "two")
     assert status == 0
     assert "RMSE" not in printed
-    assert "landmarks, fully placed / all" in printed
+    assert "landmarks, placed / heard" in printed
     _, truth = replay.load(log)
     assert (truth.path, truth.landmarks) == (None, None)
 

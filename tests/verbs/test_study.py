@@ -190,9 +190,9 @@ def test_a_length_of_time_is_worded_in_the_unit_that_fits(seconds, words):
     ("words", "said"),
     [
         ("none.toml", "none.toml: found no such file; expected paper, or the path of a plan"),
-        ("small.toml --iterations 0", "--iterations: found 0, expected at least 1"),
+        ("small.toml --iterations 0", "--iterations: found 0, expected 1 to 1000000"),
         ("small.toml --iterations 2.5", "--iterations: found '2.5', expected a whole number"),
-        ("small.toml --workers 0", "--workers: found 0, expected at least 1"),
+        ("small.toml --workers 0", "--workers: found 0, expected 1 to 1000000"),
         ("small.toml --shard 4/4", "--shard: found '4/4', expected I/N with I from 0 to N - 1"),
         ("small.toml --shard 1", "--shard: found '1', expected I/N"),
         ("small.toml --shard a/4", "--shard: found 'a/4', expected I/N"),

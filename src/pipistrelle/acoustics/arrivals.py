@@ -260,7 +260,7 @@ def _own_echoes(
     ways: Ways, caller: Caller, config: Config
 ) -> tuple[Arrivals, Int[np.ndarray, " a"]]:
     """Return the echoes of the vehicle's call from all ahead, and the emission of each."""
-    c = config.air.speed_of_sound
+    c = config.air.celerity
     ahead = np.flatnonzero(in_front(ways.bearing))
     back, closing = ways.homeward.ravel()[ahead], ways.closing.ravel()[ahead]
     emission, target = np.divmod(ahead, ways.homeward.shape[1])
@@ -286,7 +286,7 @@ def _own_echoes(
 
 def _sounds_of(j: int, ways: Ways, caller: Caller, config: Config) -> Arrivals:
     """Return another caller's sounds at all emissions, by label: its echoes and its direct call."""
-    c, (emissions, targets) = config.air.speed_of_sound, ways.homeward.shape
+    c, (emissions, targets) = config.air.celerity, ways.homeward.shape
     itself = ways.landmarks + j - 1
     incoming = ways.target - ways.target[:, itself : itself + 1]
     outward = np.hypot(incoming[..., 0], incoming[..., 1])
@@ -349,7 +349,7 @@ def _loss_db(
         radius=target.radius,
         frequency=caller.frequency,
         shape=target.shape,
-        speed_of_sound=air.speed_of_sound,
+        speed_of_sound=air.celerity,
     )
     sent = np.broadcast_to(outward, strength_db.shape).copy()
     sent[:, itself] = 1.0  # no echo of itself: any distance will do

@@ -90,7 +90,7 @@ def sampling(config: Config, callers: Sequence[Caller]) -> Sampling:
         pulse=round(pulse / BLOCK),
         tones=tones,
         noise_std=10.0 ** (config.receiver.noise_level_db / 20.0),
-        speed_of_sound=config.air.speed_of_sound,
+        speed_of_sound=config.air.celerity,
     )
 
 

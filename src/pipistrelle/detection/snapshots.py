@@ -31,6 +31,9 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 SCAN_STEP = 0.05
 """Distance of the scan's beams in u [rad]: the parabola's bias stays under 2 % of a beam step."""
 
+WIDEST = 100
+"""Most waves between two elements; their bearings have long been anybody's guess."""
+
 _CHUNK = 256
 
 
@@ -110,7 +113,7 @@ def detector(config: Config, layout: Layout, tones: Float[np.ndarray, " c"]) -> 
     Raises
     ------
     InputError
-        When the elements are not equally spaced.
+        When the elements are not equally spaced, or too far apart.
 
     Examples
     --------
@@ -122,7 +125,11 @@ def detector(config: Config, layout: Layout, tones: Float[np.ndarray, " c"]) -> 
     from scipy.special import gammainccinv
 
     settings, elements = config.detection, layout.position.size
-    wave = 2.0 * np.pi * tones * _spacing(layout) / config.air.speed_of_sound
+    spacing = _spacing(layout)
+    wave = 2.0 * np.pi * tones * spacing / config.air.celerity
+    if wave.max() > 2.0 * np.pi * WIDEST:
+        found = f"receiver.spacing: found {spacing:g} m, {wave.max() / (2.0 * np.pi):g} waves"
+        raise InputError(f"{found}; expected at most {WIDEST}, half a wave for a plain beam")
     edge = wave * math.sin(math.radians(settings.scan_limit_deg))
     count = 2 * math.ceil(edge.max() / SCAN_STEP) + 1
     scan = np.linspace(-1.0, 1.0, count) * edge[:, None]

@@ -193,6 +193,16 @@ def _weigh_in_logs(
 
 
 @no_alloc
+def heaviest_member(weights: Float[np.ndarray, " h"], count: Whole) -> Whole:
+    """Return the index of the largest of the first weights, the first of equals."""
+    best = 0
+    for j in range(1, count):
+        if weights[j] > weights[best]:
+            best = j
+    return best
+
+
+@no_alloc
 def weigh_and_share(
     log_likelihoods: Float[np.ndarray, " m"],
     weights: Float[np.ndarray, " h"],
@@ -220,10 +230,10 @@ def weigh_and_share(
             weights[j] *= share[j] / total
     else:
         log_total = _weigh_in_logs(log_likelihoods, weights, count)
-    total = 0.0
+    total, most = 0.0, weights[heaviest_member(weights, count)] if aggregated else 1.0
     for j in range(count):
         if aggregated:
-            share[j] = weights[j] ** power
+            share[j] = (weights[j] / most) ** power
         elif power != 1.0:
             share[j] = math.exp(power * (log_likelihoods[j] - largest))
         total += share[j]
@@ -233,16 +243,6 @@ def weigh_and_share(
         if share[j] < smallest:
             share[j] = 0.0
     return log_total
-
-
-@no_alloc
-def heaviest_member(weights: Float[np.ndarray, " h"], count: Whole) -> Whole:
-    """Return the index of the largest of the first weights, the first of equals."""
-    best = 0
-    for j in range(1, count):
-        if weights[j] > weights[best]:
-            best = j
-    return best
 
 
 @no_alloc

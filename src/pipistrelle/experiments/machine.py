@@ -1,18 +1,29 @@
 """What this machine has: cores, and memory, asked for before a drive or a filter starts."""
 
+import math
 import os
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from pipistrelle.arrays.layout import Layout
+from pipistrelle.arrays.sampling import BLOCK, Sampling
 from pipistrelle.config import Config, InputError, ScenarioConfig
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.rays import ray_members
+from pipistrelle.experiments.hearing.scenario import Scenario
 
 DRAWN, TRACKED = 430, 96
 """Bytes of a step, as measured: of the path and of the work on it, and of each track."""
 HEARD, SCANNED = 900, 600
 """Bytes of a frame, as measured among 12 landmarks: what is heard, and each strategy's scan."""
+BLOCK_SUM = 40
+"""Bytes of a block, tone, face and element, as measured, with what beams share."""
+SAMPLE, SAMPLE_TONE = 16, 24
+"""Bytes of a sample, face and element, as measured: of itself, and of each tone's filter."""
 LIMIT = Path("/sys/fs/cgroup/memory.max")
 """What a container may have: a number of bytes, or a word."""
 MALLOPT = ((-3, 32 << 20), (-1, 256 << 20))
@@ -46,7 +57,7 @@ def check_memory(
     passive : bool
         Whether a landmark may be heard by its bearing alone: it is a whole ray then.
     workers : int
-        Processes that each need as much, at the same time.
+        Processes here that each need as much, at the same time; 0 if they are elsewhere.
 
     Raises
     ------
@@ -79,7 +90,7 @@ def check_length(
     strategies, filters : int
         Number of each; the scans of every strategy and the tracks of all trials are kept.
     workers : int
-        Processes that each need as much, at the same time.
+        Processes here that each need as much, at the same time; 0 if they are elsewhere.
 
     Raises
     ------
@@ -97,12 +108,67 @@ def check_length(
         raise _too_large(f"scenario.steps: {setup.steps:,} steps", need, have, workers)
 
 
+def check_recording(
+    scenario: Scenario, config: Config, layout: Layout, settled: Sampling, *, workers: int = 1
+) -> None:
+    """Refuse a world in which a frame's recording may need more memory than this machine has.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    config : Config
+    layout : Layout
+    settled : Sampling
+    workers : int
+        Processes here that each need as much, at the same time; 0 if they are elsewhere.
+
+    Raises
+    ------
+    InputError
+        With the setting that makes the recording long, and the estimate.
+    """
+    setup, path = config.scenario, _farthest(scenario.path[:, :2])
+    driven = "scenario.start" if math.hypot(*setup.start[:2]) > path / 2.0 else "scenario.step"
+    reach = {
+        driven: path,
+        "scenario.radius": _farthest(scenario.landmarks),
+        "scenario.beacon_distance": max(
+            _farthest(caller.place) for caller in scenario.callers if caller.place is not None
+        ),
+    }
+    key = max(reach, key=reach.__getitem__)
+    # To a landmark and home: at most twice across the circle around the centre that holds all.
+    length = {
+        key: 4.0 * reach[key] / settled.speed_of_sound,
+        "emitter.pulse": settled.pulse * BLOCK,
+    }
+    tones, each = settled.tones.size, BLOCK_SUM * settled.tones.size
+    if config.receiver.engine == "dense":
+        length |= {"scenario.step": max(length.get("scenario.step", 0.0), _period(setup))}
+        each = (SAMPLE + SAMPLE_TONE * tones) * settled.block
+    key = max(length, key=length.__getitem__)
+    each *= layout.normal.size * layout.position.size
+    need, have = length[key] / BLOCK * each, installed()
+    if need * workers > have:
+        raise _too_large(f"{key}: a recording of {length[key]:.3g} s", need, have, workers)
+
+
+def _farthest(places: Any) -> float:
+    """Return the largest distance of places from the centre [m]; 0 where there are none."""
+    return float(np.hypot(*np.reshape(places, (-1, 2)).T).max(initial=0.0))
+
+
+def _period(setup: ScenarioConfig) -> float:
+    """Return the time between two calls [s]."""
+    return setup.step * setup.steps_per_frame
+
+
 def _too_large(what: str, need: float, have: float, workers: int) -> InputError:
     """Say what would be needed, and what is there."""
     each = f" in each of {workers} workers" if workers > 1 else ""
     return InputError(
         f"{what} may need {need / 1e9:.1f} GB of memory{each}, but this machine has "
-        f"{have / 1e9:.1f} GB; ask for fewer"
+        f"{have / 1e9:.1f} GB; ask for less"
     )
 
 

@@ -121,7 +121,7 @@ def draw_mission(
                 _draw_errors(rows, trial, truth.path)
             _draw_estimate(axes, trial, truth.landmarks)
             _draw_vehicle(axes, trial, beamwidth)
-            _title(axes, trial)
+            _title(axes, trial, truth)
         _draw_clouds([axes for axes, *_ in panels], trials, truth)
         if truth.path is not None:
             _scale_errors([rows for _, *rows in panels])
@@ -249,10 +249,11 @@ def _draw_clouds(maps: Sequence["Axes"], trials: Sequence[TrialResult], truth: T
             closeup.show(cloud[0], path, truth.path)
 
 
-def _title(axes: "Axes", trial: TrialResult) -> None:
-    """Say what the panel is and what came out."""
+def _title(axes: "Axes", trial: TrialResult, truth: Truth) -> None:
+    """Say what the panel is and what came out; of how many landmarks, if that is known."""
     scores = trial.scores
-    parts = [f"{scores.landmarks_full} of {scores.landmarks_total} landmarks placed"]
+    there = scores.landmarks_total if truth.landmarks is None else len(truth.landmarks[0])
+    parts = [f"{scores.landmarks_full} of {there} landmarks placed"]
     if (rmse := scores.position_rmse_m) is not None:
         parts.insert(0, f"RMSE {rmse:.2f} m" if rmse < 100.0 else f"RMSE {rmse:.3g} m")
     if scores.diverged:

@@ -5,13 +5,14 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from pipistrelle.verbs.options import MissionOptions, mission_config
+from pipistrelle.verbs.streams import put
 
 
 def show(*, mission: Annotated[MissionOptions | None, Parameter(name="*")] = None) -> None:
     """Print the settings as TOML, file, environment and flags applied."""
     from pipistrelle.settings import to_toml
 
-    print(to_toml(mission_config(mission or MissionOptions())), end="")
+    put(to_toml(mission_config(mission or MissionOptions())), end="")
 
 
 def schema() -> None:
@@ -20,4 +21,4 @@ def schema() -> None:
 
     from pipistrelle.config import Config
 
-    print(json.dumps(Config.model_json_schema(), indent=2))
+    put(json.dumps(Config.model_json_schema(), indent=2))

@@ -8,24 +8,11 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 from pipistrelle.estimation.catalogue import short_name
+from pipistrelle.verbs.streams import say
 
 if TYPE_CHECKING:
     from pipistrelle.experiments.results.scores import TrialResult
     from pipistrelle.experiments.runs.trial import Progress
-
-
-def say(message: str) -> None:
-    """Write a line to standard error at once.
-
-    Parameters
-    ----------
-    message : str
-
-    Examples
-    --------
-    >>> say("Compiling kernels (once) ...")
-    """
-    print(message, file=sys.stderr, flush=True)
 
 
 @contextmanager
@@ -132,7 +119,7 @@ def _rate(frames: int, elapsed: float) -> str:
     return f"{frames:>5} frames{speed}"
 
 
-def closing_table(trials: "Sequence[TrialResult]", aligned: bool) -> str:
+def closing_table(trials: "Sequence[TrialResult]", aligned: bool, there: int | None = None) -> str:
     """Compare the estimates of one world, a column each; what no estimate has is left out.
 
     Six columns fit into 100 characters. Of particles, landmarks are those of the heaviest particle.
@@ -142,12 +129,14 @@ def closing_table(trials: "Sequence[TrialResult]", aligned: bool) -> str:
     trials : sequence of TrialResult, at least one
     aligned : bool
         Show the errors after alignment too.
+    there : int, optional
+        Landmarks of the world, where that is known.
 
     Returns
     -------
     str
     """
-    columns = [dict(_cells(trial, aligned)) for trial in trials]
+    columns = [dict(_cells(trial, aligned, there)) for trial in trials]
     filters = [short_name(trial.filter) for trial in trials]
     lines = [("", *(trial.strategy for trial in trials)), ("", *filters)]
     width = max(11, 1 + max(map(len, filters)))
@@ -160,7 +149,7 @@ def closing_table(trials: "Sequence[TrialResult]", aligned: bool) -> str:
     )
 
 
-def _cells(trial: "TrialResult", aligned: bool) -> Iterator[tuple[str, str]]:
+def _cells(trial: "TrialResult", aligned: bool, there: int | None) -> Iterator[tuple[str, str]]:
     """Word what there is to say of an estimate, with titles; nothing of what it lacks."""
     s = trial.scores
     yield "position RMSE [m]", _number(s.position_rmse_m, 3)
@@ -171,7 +160,8 @@ def _cells(trial: "TrialResult", aligned: bool) -> Iterator[tuple[str, str]]:
         yield "map RMSE, aligned [m]", _number(s.map_rmse_aligned_m, 3)
     yield "NEES, mean", _number(s.nees_mean, 2)
     yield "NEES, largest", _number(s.nees_max, 1)
-    yield "landmarks, fully placed / all", f"{s.landmarks_full} / {s.landmarks_total}"
+    yield "landmarks, placed / heard", f"{s.landmarks_full} / {s.landmarks_total}"
+    yield "landmarks in the world", "" if there is None else str(there)
     yield "fully placed, particles' mean", _number(trial.track.full, 1)
     yield "measurements per frame", _number(s.measurements_per_frame, 2)
     yield "rejected by the gate", str(s.gated or "")

@@ -1,6 +1,7 @@
 """What every mission ends in: a folder that is filled, a picture, a table, a place to look."""
 
 import contextlib
+import os
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
@@ -15,8 +16,9 @@ from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.results.folder import prepare_folder
 from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.results.writing import write_results
-from pipistrelle.verbs.console import announced, closing_table, say
+from pipistrelle.verbs.console import announced, closing_table
 from pipistrelle.verbs.options import OutputOptions
+from pipistrelle.verbs.streams import put, warn
 
 if TYPE_CHECKING:
     from pipistrelle.acoustics.callers import Caller
@@ -131,7 +133,7 @@ def deliver(
     write_results(
         folder,
         config=config,
-        command=shlex.join(["pipistrelle", *sys.argv[1:]]),
+        command=_command(),
         seed=seed,
         trials=trials,
         truth=truth,
@@ -139,13 +141,20 @@ def deliver(
         draw=draw,
     )
     if not options.quiet:
-        print(closing_table(trials, aligned=ignored_rows is not None))
+        there = None if truth.landmarks is None else len(truth.landmarks[0])
+        put(closing_table(trials, ignored_rows is not None, there))
     failed = [t for t in trials if not np.all(np.isfinite(t.track.pose.mean))]
     for trial in failed:
         why = trial.error or "its path is not finite"
-        say(f"pipistrelle: warning: {trial.strategy} {trial.filter} failed: {why}")
-    print(folder)
+        warn(f"{trial.strategy} {trial.filter} failed: {why}")
+    put(folder)
     return 1 if failed else 0
+
+
+def _command() -> str:
+    """Return the command line as text, names that are no text by their bytes."""
+    words = shlex.join(["pipistrelle", *sys.argv[1:]])
+    return os.fsencode(words).decode(errors="backslashreplace")
 
 
 def _film(

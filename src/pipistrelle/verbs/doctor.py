@@ -9,12 +9,13 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 
 import pipistrelle
+from pipistrelle.verbs.streams import put
 
 
 def doctor() -> None:
     """Print versions, folders and tools, one line each, with the fix of each problem."""
     for name, state in _findings():
-        print(f"{name:<18}{state}")
+        put(f"{name:<18}{state}")
 
 
 def _findings() -> Iterator[tuple[str, str]]:

@@ -5,7 +5,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import radians
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
+from types import NoneType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict, Union, get_args, get_origin
 
 from cyclopts import Group, Parameter, convert
 
@@ -75,9 +76,10 @@ def setting_flags(shown: Callable[[Key], bool] = lambda _: True) -> Any:
     top: dict[str, Any] = {}
     for key, field in known_settings().items():
         default = field.default if isinstance(field.default, tuple) else (field.default,)
-        words = f"{field.description or ''} [default: {' '.join(map(str, default))}]"
+        settled = "" if field.default is None else f"[default: {' '.join(map(str, default))}]"
+        words = f"{field.description or ''} {settled}"
         flag = Parameter(help=" ".join(words.split()), show=shown(key), negative=())
-        kind: Any = Whole if field.annotation is int else field.annotation
+        kind: Any = Whole if field.annotation is int else _unbounded(field.annotation)
         if len(key) == 1:
             top[key[0]] = Annotated[kind, flag]
         else:
@@ -86,6 +88,15 @@ def setting_flags(shown: Callable[[Key], bool] = lambda _: True) -> Any:
     record: Any = TypedDict
     nested = {name: record(name, table, total=False) for name, table in sections.items()}
     return record("Settings", top | nested, total=False)
+
+
+def _unbounded(kind: Any) -> Any:
+    """Return a type without its bounds and without None: `resolve` refuses, in the same words."""
+    parts = [_unbounded(part) for part in get_args(kind) if part is not NoneType]
+    if get_origin(kind) in (Annotated, Union):
+        return parts[0]
+    record: Any = tuple
+    return record[tuple(parts)] if get_origin(kind) is tuple else kind
 
 
 def _section_group(section: str) -> Group:
@@ -322,6 +333,6 @@ def _radius(beamwidth: float, config: Config) -> float:
         piston_radius(
             radians(beamwidth),
             frequency=config.emitter.frequency,
-            speed_of_sound=config.air.speed_of_sound,
+            speed_of_sound=config.air.celerity,
         )
     )

@@ -23,7 +23,7 @@ def report(
     from pipistrelle.report.page.overview import failed_trials, not_the_papers, not_the_papers_line
     from pipistrelle.report.page.page import write_report
     from pipistrelle.report.reading import read_study
-    from pipistrelle.verbs.console import say
+    from pipistrelle.verbs.streams import put, say
 
     target = folder / "report" if output is None else output
     studies = read_study(folder)
@@ -33,11 +33,11 @@ def report(
     if not quiet:
         done, planned = len(studies[0].worlds), studies[0].planned
         if done < planned:
-            print(f"partial: {done} of {planned} worlds")
+            put(f"partial: {done} of {planned} worlds")
         if count := sum(map(failed_trials, studies)):
-            print(f"failed: {count} trial{'' if count == 1 else 's'}; see the page")
+            put(f"failed: {count} trial{'' if count == 1 else 's'}; see the page")
         if line := not_the_papers_line(not_the_papers(studies[0])):
-            print(line)
+            put(line)
         for claim in claims:
-            print(f"{claim.number}  {claim.verdict.replace('-', ' '):<15} {claim.sentence}")
-    print(target / "index.html")
+            put(f"{claim.number}  {claim.verdict.replace('-', ' '):<15} {claim.sentence}")
+    put(target / "index.html")

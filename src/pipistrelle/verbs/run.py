@@ -47,15 +47,18 @@ def run(
     config, ways = mission_config(mission), filters(estimator, mission.particles)
     if save_log is not None:
         _check_vacant(save_log, output)
+    from pipistrelle.experiments.runs.preparing import warnings_of
     from pipistrelle.experiments.runs.trial import run_mission
     from pipistrelle.verbs import delivery
     from pipistrelle.verbs.console import progress
+    from pipistrelle.verbs.streams import warn
 
     with delivery.result_folder(output, "run") as folder:
         delivery.get_ready(output)
         watch = delivery.recorder(output)
         with progress(output.quiet) as show:
             done = run_mission(config, strategies(strategy), ways, progress=show, watch=watch)
+        warn(*warnings_of(config))
         if save_log is not None:
             heard = {trial.strategy: trial.scans for trial in done.trials}
             _save_log(save_log, done, heard.get("fused", done.trials[0].scans))
@@ -97,7 +100,7 @@ def _beamwidth(mission: "Mission") -> float:
 
     emitter, air = mission.config.emitter, mission.config.air
     return float(
-        beamwidth(emitter.radius, frequency=emitter.frequency, speed_of_sound=air.speed_of_sound)
+        beamwidth(emitter.radius, frequency=emitter.frequency, speed_of_sound=air.celerity)
     )
 
 

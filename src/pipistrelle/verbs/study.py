@@ -12,8 +12,9 @@ from cyclopts import Parameter
 
 from pipistrelle.config import InputError
 from pipistrelle.settings import Layer
-from pipistrelle.verbs.console import announced, say
+from pipistrelle.verbs.console import announced
 from pipistrelle.verbs.options import SettingFlags, Whole, layers
+from pipistrelle.verbs.streams import put, say, warn
 
 if TYPE_CHECKING:
     from pipistrelle.experiments.studies.plan import Plan
@@ -76,11 +77,12 @@ def study(
     settings: Annotated[SettingFlags | None, Parameter(name="*")] = None,
 ) -> int:
     """Try all cases of a plan in many worlds; continue where an earlier run stopped."""
+    from pipistrelle.experiments.studies.plan import MOST_WORLDS
     from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
 
     for flag, number in (("--iterations", iterations), ("--workers", workers)):
-        if number is not None and number < 1:
-            raise InputError(f"{flag}: found {number}, expected at least 1")
+        if number is not None and not 1 <= number <= MOST_WORLDS:
+            raise InputError(f"{flag}: found {number}, expected 1 to {MOST_WORLDS}")
     if workers is not None and scheduler not in (None, "local"):
         raise InputError(f"--workers: the cluster at {scheduler} has its own; leave it out")
     share, layer = _share(shard), layers(None, settings)
@@ -89,11 +91,12 @@ def study(
     if emit:
         shards = share[1] if shard else min(SHARDS, tried.iterations)
         command = _command(plan, tried, layer)
-        print(_slurm(tried.name, command, folder, shards, workers or 1), end="")
+        put(_slurm(tried.name, command, folder, shards, workers or 1), end="")
         return 0
     from pipistrelle.experiments.machine import cores
-    from pipistrelle.experiments.studies.study import run_study
+    from pipistrelle.experiments.studies.study import run_study, warnings_of_plan
 
+    warn(*warnings_of_plan(tried))
     try:
         with _progress(quiet) as show:
             so_far = run_study(
@@ -115,14 +118,14 @@ def _close(so_far: "StudyProgress", folder: Path, quiet: bool) -> int:
     """Say how the study ended, and where it is; return the exit status."""
     ended, failed = sum(so_far.ended.values()), sum(so_far.failed.values())
     if not quiet:
-        print(f"{so_far.done} worlds, {ended} trials, {failed} failed")
+        put(f"{so_far.done} worlds, {ended} trials, {failed} failed")
     if failed:
-        say(
-            f"pipistrelle: warning: {failed} of {ended} trials failed, the first with: "
+        warn(
+            f"{failed} of {ended} trials failed, the first with: "
             f"{so_far.first_error}; see the column error in {folder / 'trials'}; "
             "--retry-failed does their worlds again"
         )
-    print(folder)
+    put(folder)
     return 1 if failed else 0
 
 

@@ -193,7 +193,7 @@ def _emissions(
                 emission,
                 radius=radius,
                 frequency=callers[VEHICLE].frequency,
-                speed_of_sound=config.air.speed_of_sound,
+                speed_of_sound=config.air.celerity,
             )
             for radius in radii
         ]
@@ -222,7 +222,7 @@ def _heard(time: float, detections: Detections, arrivals: Arrivals, rig: _Rig) -
         detections,
         label,
         averaging=config.detection.averaging,
-        speed_of_sound=config.air.speed_of_sound,
+        speed_of_sound=config.air.celerity,
     )
     return unlabelled(heard) if rig.oracle is None else heard
 

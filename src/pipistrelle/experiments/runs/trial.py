@@ -29,12 +29,12 @@ from pipistrelle.experiments.hearing.scenario import (
     bicycle,
     moving_labels,
     standing_landmarks,
-    world_of,
 )
-from pipistrelle.experiments.machine import check_length, check_memory
+from pipistrelle.experiments.machine import check_memory
 from pipistrelle.experiments.results.scores import TrialResult, score, score_path
 from pipistrelle.experiments.runs.checking import check_filters, failed_trial
 from pipistrelle.experiments.runs.filtering import run_filter
+from pipistrelle.experiments.runs.preparing import prepared
 
 Watch = Callable[[str, str, Scan, Belief], None]
 """Called with strategy, filter, scan and the belief after it."""
@@ -85,8 +85,7 @@ def run_mission(
     >>> len(mission.heard), len(mission.trials[0].track.time)
     (10, 41)
     """
-    check_length(config.scenario, strategies=len(strategies), filters=len(filters))
-    scenario = world_of(config)
+    scenario = prepared(config, strategies=len(strategies), filters=len(filters))
     check_memory(
         filters,
         len(standing_landmarks(scenario)[0]),

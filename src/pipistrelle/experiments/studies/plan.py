@@ -16,6 +16,8 @@ from pipistrelle.settings import Given, Key, Layer, from_flags, resolve
 RADIUS = "emitter.radius"
 MOST_CASES = 2**15 - 1
 """What their numbers have room for in the tables."""
+MOST_WORLDS = 1_000_000
+"""Each is a file in every folder of tables."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

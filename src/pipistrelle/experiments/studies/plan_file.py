@@ -10,10 +10,10 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PlainValidator, ValidationError
 from pydantic_core import PydanticCustomError
 
-from pipistrelle.config import STRATEGIES, Config, Count, InputError, Section, Strategy
+from pipistrelle.config import STRATEGIES, Config, InputError, Section, Strategy
 from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, check_distinct, check_name
-from pipistrelle.experiments.studies.plan import MOST_CASES, Plan, combinations
-from pipistrelle.refusals import expectation, meant
+from pipistrelle.experiments.studies.plan import MOST_CASES, MOST_WORLDS, Plan, combinations
+from pipistrelle.refusals import expectation, meant, shown
 from pipistrelle.settings import (
     Given,
     Key,
@@ -44,7 +44,7 @@ class _Head(Section):
 
     format: Literal[1]
     name: Annotated[str, Field(pattern=r"^\w[\w.-]*$")]
-    iterations: Count
+    iterations: Annotated[int, Field(ge=1, le=MOST_WORLDS)]
     strategies: Annotated[tuple[Strategy, ...], Field(min_length=1)] = STRATEGIES
     filters: Annotated[tuple[Annotated[str, PlainValidator(_named)], ...], Field(min_length=1)] = (
         PAPERS
@@ -115,16 +115,20 @@ def read_plan(path: Path, over: Layer | None = None, iterations: int | None = No
     within = {"config": table.get("config", {}), "grid": table.get("grid", {})}
     for name, settings in within.items():
         if not isinstance(settings, dict):
-            raise InputError(f"{path}: {name}: found {settings!r}, expected a table of settings")
+            raise InputError(
+                f"{path}: {name}: found {shown(settings)}, expected a table of settings"
+            )
     layer: Layer = {
         key: Given(value, f"{path}: config.{name}")
         for key, name, value in _settings(path, "config", within["config"])
     }
     layer |= over
-    grid = {
-        name: _values(path, name, key, values, layer)
-        for key, name, values in _settings(path, "grid", within["grid"])
-    }
+    asked = list(_settings(path, "grid", within["grid"]))
+    lengths = [len(values) for _, _, values in asked if isinstance(values, list)]
+    most = prod(lengths) * len(head.strategies) * len(head.filters)
+    if most > MOST_CASES:
+        raise InputError(f"{path}: grid: found {most} cases, expected at most {MOST_CASES}")
+    grid = {name: _values(path, name, key, values, layer) for key, name, values in asked}
     for key in (key for key in layer if ".".join(key) in grid):
         # The plan in a study's folder names every setting; a default there says nothing.
         if key in over or resolve({key: layer[key]}) != Config():
@@ -138,9 +142,6 @@ def read_plan(path: Path, over: Layer | None = None, iterations: int | None = No
         config=resolve(layer),
         grid=grid,
     )
-    most = prod(len(values) for values in grid.values()) * len(plan.strategies) * len(plan.filters)
-    if most > MOST_CASES:
-        raise InputError(f"{path}: grid: found {most} cases, expected at most {MOST_CASES}")
     for _ in combinations(layer, grid, f"{path}: grid."):
         pass
     return plan
@@ -213,7 +214,7 @@ def _as_table(plan: Plan) -> dict[str, Any]:
         "iterations": plan.iterations,
         "strategies": list(plan.strategies),
         "filters": list(plan.filters),
-        "config": resolve(kept).model_dump(mode="json"),
+        "config": resolve(kept).model_dump(mode="json", exclude_none=True),
         "grid": {name: list(values) for name, values in plan.grid.items()},
     }
 
@@ -248,7 +249,7 @@ def _problem(path: Path, error: Any) -> str:
     expected = expectation(error)
     if error["type"] == "string_pattern_mismatch":
         expected = "letters, digits, _ . and -, for it names a folder"
-    return f"{path}: {name}: found {error['input']!r}, expected {expected}"
+    return f"{path}: {name}: found {shown(error['input'])}, expected {expected}"
 
 
 def _settings(
@@ -270,7 +271,7 @@ def _values(path: Path, name: str, key: Key, values: Any, layer: Layer) -> tuple
     if key == ("seed",):
         raise InputError(f"{where}: every iteration is another world already; raise iterations")
     if not isinstance(values, list) or not values:
-        raise InputError(f"{where}: found {values!r}, expected a list of values")
+        raise InputError(f"{where}: found {shown(values)}, expected a list of values")
     checked = []
     for value in values:
         table: Any = resolve(layer | {key: Given(value, where)}).model_dump(mode="json")
@@ -283,9 +284,12 @@ def _values(path: Path, name: str, key: Key, values: Any, layer: Layer) -> tuple
 
 def _check_distinct(where: str, values: Sequence[Any]) -> None:
     """Refuse what is named twice."""
-    for i, value in enumerate(values):
-        if value in values[:i]:
-            raise InputError(f"{where}: found {value!r} twice, expected each value once")
+    known = set()
+    for value in values:
+        before = len(known)
+        known.add(json.dumps(value))
+        if len(known) == before:
+            raise InputError(f"{where}: found {shown(value)} twice, expected each value once")
 
 
 def _meant(name: str, known: Iterable[str]) -> str:

@@ -17,9 +17,10 @@ from pathlib import Path
 from pipistrelle.config import InputError
 from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.estimation.outside import look_in
-from pipistrelle.experiments.hearing.scenario import bicycle, landmark_count
-from pipistrelle.experiments.machine import check_length, check_memory, keep_freed_memory
+from pipistrelle.experiments.hearing.scenario import bicycle, standing_landmarks
+from pipistrelle.experiments.machine import check_memory, keep_freed_memory
 from pipistrelle.experiments.runs.checking import check_filters
+from pipistrelle.experiments.runs.preparing import prepared, warnings_of
 from pipistrelle.experiments.studies.executors import (
     AHEAD,
     Results,
@@ -29,7 +30,7 @@ from pipistrelle.experiments.studies.executors import (
 )
 from pipistrelle.experiments.studies.plan import Plan, cases_of
 from pipistrelle.experiments.studies.store import open_store
-from pipistrelle.experiments.studies.world import failed_records, run_world
+from pipistrelle.experiments.studies.world import failed_records, heard_together, run_world
 from pipistrelle.experiments.studies.world_files import (
     EndedTrial,
     done_worlds,
@@ -121,10 +122,7 @@ def run_study(
     >>> so_far.done, so_far.ended
     (2, {'fused': 2})
     """
-    if executor is None and scheduler in (None, "local"):
-        _refuse_too_large(plan, workers)
-    for case in cases_of(plan):
-        check_filters([case.filter], bicycle(case.config.motion), case.config)
+    _check_cases(plan, workers if executor is None and scheduler in (None, "local") else 0)
     open_store(folder, plan)
     worlds = range(shard[0], plan.iterations, shard[1])
     done = done_worlds(folder).intersection(worlds)
@@ -161,17 +159,36 @@ def run_study(
     return so_far
 
 
-def _refuse_too_large(plan: Plan, workers: int) -> None:
-    """Refuse a plan of which so many worlds at once may need more memory than there is."""
-    for case in cases_of(plan):
-        check_length(case.config.scenario, workers=workers)
-        check_memory(
-            [case.filter],
-            landmark_count(case.config),
-            case.config,
-            passive=case.strategy != "active",
-            workers=workers,
-        )
+def warnings_of_plan(plan: Plan) -> tuple[str, ...]:
+    """Tell what the receivers of a plan confuse, as `warnings_of` does; each once.
+
+    Parameters
+    ----------
+    plan : Plan
+
+    Returns
+    -------
+    tuple of str
+    """
+    said = (line for cases in heard_together(plan) for line in warnings_of(cases[0].config))
+    return tuple(dict.fromkeys(said))
+
+
+def _check_cases(plan: Plan, workers: int) -> None:
+    """Refuse a plan of which a case would be refused, or so many worlds at once have no room."""
+    for cases in heard_together(plan):
+        case = cases[0]
+        try:
+            here = len(standing_landmarks(prepared(case.config, workers=workers))[0])
+            for case in cases:
+                heard = {"passive": case.strategy != "active", "workers": workers}
+                check_memory([case.filter], here, case.config, **heard)
+                check_filters([case.filter], bicycle(case.config.motion), case.config)
+        except InputError as error:
+            values = ", ".join(f"{name} = {value}" for name, value in case.values.items())
+            raise InputError(
+                f"{error} (where the grid has {values})" if values else str(error)
+            ) from None
 
 
 def _nothing_done(plan: Plan, worlds: int) -> StudyProgress:

@@ -118,11 +118,33 @@ def run_world(plan: Plan, iteration: int) -> tuple[TrialRecord, ...]:
     >>> [record.steps.shape for record in run_world(plan, 0)]
     [(2, 3)]
     """
+    records = [record for cases in heard_together(plan) for record in _run_cases(cases, iteration)]
+    return tuple(sorted(records, key=lambda record: record.case.number))
+
+
+def heard_together(plan: Plan) -> tuple[tuple[PlannedCase, ...], ...]:
+    """Group the cases of a plan that share the drawing and the recording of a world.
+
+    Parameters
+    ----------
+    plan : Plan
+
+    Returns
+    -------
+    tuple of tuples of PlannedCase
+
+    Examples
+    --------
+    >>> grid = {"filter.gate": (0.9, 1.0), "emitter.radius": (0.0025, 0.025)}
+    >>> ways = {"strategies": ("fused",), "filters": ("ekf",)}
+    >>> plan = Plan(name="four", iterations=1, config=Config(), grid=grid, **ways)
+    >>> [len(cases) for cases in heard_together(plan)]
+    [4]
+    """
     together: dict[str, list[PlannedCase]] = {}
     for case in cases_of(plan):
         together.setdefault(_heard_settings(case), []).append(case)
-    records = [r for cases in together.values() for r in _run_cases(cases, iteration)]
-    return tuple(sorted(records, key=lambda record: record.case.number))
+    return tuple(map(tuple, together.values()))
 
 
 def failed_records(plan: Plan, error: str) -> tuple[TrialRecord, ...]:
@@ -326,7 +348,7 @@ def _beamwidth_deg(case: PlannedCase) -> float | None:
     """Return the half-power beamwidth of the vehicle's call, where it matters."""
     if case.strategy == "passive":
         return None
-    emitter, c = case.config.emitter, case.config.air.speed_of_sound
+    emitter, c = case.config.emitter, case.config.air.celerity
     return degrees(beamwidth(emitter.radius, frequency=emitter.frequency, speed_of_sound=c))
 
 

@@ -104,7 +104,7 @@ def example_map(study: Study) -> Chart:
 def _beam(study: Study, width: float, strength: float) -> list[Series]:
     """Return a beam's outline and, where it has half its power, a dot that tells its numbers."""
     config = study.config
-    tone = {"frequency": config.emitter.frequency, "speed_of_sound": config.air.speed_of_sound}
+    tone = {"frequency": config.emitter.frequency, "speed_of_sound": config.air.celerity}
     half = np.radians(np.array([width])) / 2.0
     radius = float(piston_radius(np.radians(width), **tone))
     name, angle = beam_name(width), np.radians(np.linspace(-90.0, 90.0, 361))

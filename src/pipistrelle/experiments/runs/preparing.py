@@ -1,0 +1,121 @@
+"""What a mission by sound is refused for before anything is heard, and what a user is warned of.
+
+`run` asks for one mission, a study for every combination of its plan: through the same door.
+"""
+
+import math
+
+import numpy as np
+
+from pipistrelle.arrays.layout import square_of_four
+from pipistrelle.arrays.sampling import sampling
+from pipistrelle.config import Config, InputError
+from pipistrelle.detection.snapshots import detector
+from pipistrelle.experiments.hearing.scenario import Scenario, world_of
+from pipistrelle.experiments.machine import check_length, check_recording
+
+
+def prepared(
+    config: Config, *, strategies: int = 1, filters: int = 1, workers: int = 1
+) -> Scenario:
+    """Draw the first world of a mission's settings, when all is sound that it is heard with.
+
+    Parameters
+    ----------
+    config : Config
+    strategies, filters : int
+        Number of each that are kept in memory.
+    workers : int
+        Processes on this machine that each run such a mission; 0 if they are elsewhere.
+
+    Returns
+    -------
+    Scenario
+
+    Raises
+    ------
+    InputError
+        When it cannot be had, or memory for it; with the setting.
+
+    Examples
+    --------
+    >>> from pipistrelle.config import EmitterConfig
+    >>> len(prepared(Config()).landmarks)
+    50
+    >>> prepared(Config(emitter=EmitterConfig(frequency=36e3)))
+    Traceback (most recent call last):
+    pipistrelle.config.InputError: emitter.frequency: found 36000 Hz, expected a multiple of 5000 Hz
+    """
+    check_length(config.scenario, strategies=strategies, filters=filters, workers=workers)
+    scenario = world_of(config)
+    settled = sampling(config, scenario.callers)
+    layout = square_of_four(config.receiver)
+    detector(config, layout, settled.tones)
+    check_recording(scenario, config, layout, settled, workers=workers)
+    _refuse_supersonic(scenario, config)
+    return scenario
+
+
+def warnings_of(config: Config) -> tuple[str, ...]:
+    r"""Tell what a receiver confuses: bearings by its spacing, tones by its sampling.
+
+    Elements a distance d apart cannot tell the angle :math:`\theta` off their normal from another,
+    the grating lobe,
+
+    .. math:: \sin\theta_g = \sin\theta - \lambda / d .
+
+    Parameters
+    ----------
+    config : Config
+
+    Returns
+    -------
+    tuple of str
+        Empty, unless a lobe lies among the angles that are kept, or a tone above half the rate.
+
+    Notes
+    -----
+    Van Trees, Optimum Array Processing (2002), Sec. 2.4.
+
+    Examples
+    --------
+    >>> from pipistrelle.config import ReceiverConfig
+    >>> warnings_of(Config())
+    ()
+    >>> print(warnings_of(Config(receiver=ReceiverConfig(spacing=0.007)))[0])
+    receiver.spacing: 0.007 m is 0.71 of a wave at emitter.frequency (35000 Hz): echoes 26 degrees
+    off a face's normal or more look as if from the other side, as from -75 degrees; expected half a
+    wave (0.0049 m)
+    """
+    spacing, rate = config.receiver.spacing, config.receiver.sample_rate
+    limit = config.detection.angle_limit_deg
+    said = []
+    for section in ("emitter", "beacon"):
+        frequency = getattr(config, section).frequency
+        tone, wave = f"{section}.frequency ({frequency:g} Hz)", config.air.celerity / frequency
+        nearest = wave / spacing - math.sin(math.radians(limit))  # its lobe lies at the limit
+        if nearest < 1.0:
+            said.append(
+                f"receiver.spacing: {spacing:g} m is {spacing / wave:.2f} of a wave at {tone}: "
+                f"echoes {math.degrees(math.asin(max(nearest, 0.0))):.0f} degrees off a face's "
+                f"normal or more look as if from the other side, as from {-limit:.0f} degrees; "
+                f"expected half a wave ({wave / 2.0:.2g} m)"
+            )
+        if frequency > rate / 2.0:
+            said.append(
+                f"receiver.sample_rate: {rate:g} Hz is less than twice {tone}: real samples would "
+                f"hold it as {abs(frequency - rate * round(frequency / rate)):g} Hz; expected more"
+            )
+    return tuple(said)
+
+
+def _refuse_supersonic(scenario: Scenario, config: Config) -> None:
+    """Refuse a vehicle that outruns its own sound."""
+    moved = np.hypot(*np.diff(scenario.path[:, :2], axis=0).T)
+    speed, c = moved.max(initial=0.0) / config.scenario.step, config.air.celerity
+    if not speed < c:
+        key = "motion.speed_std" if abs(config.scenario.speed) < c else "scenario.speed"
+        raise InputError(
+            f"{key}: the vehicle reaches {speed:.3g} m/s, expected less than the speed of sound "
+            f"({c:.3g} m/s); slow it down"
+        )

@@ -1,0 +1,113 @@
+"""Standard output and error, which may be closed, full, or left by their reader.
+
+What a person reads never decides what becomes of the work: a word that cannot be said is not said,
+and the exit status tells what was done.
+"""
+
+import os
+import sys
+from contextlib import suppress
+from errno import EPIPE
+from typing import TextIO
+
+
+def hold_streams() -> None:
+    """Put something in the place of streams that are closed; let names be printed by their bytes.
+
+    A file that is opened gets the number of a stream that is closed, and what is meant for the
+    stream would be written into it.
+
+    Examples
+    --------
+    >>> hold_streams()
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # it gets the lowest number that is free: this one
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115, PTH123
+    if sys.stdout.errors == "strict" and hasattr(sys.stdout, "reconfigure"):
+        sys.stdout.reconfigure(errors="surrogateescape")
+
+
+def say(message: str) -> None:
+    """Write a line to standard error at once, if anybody can read it.
+
+    Parameters
+    ----------
+    message : str
+
+    Examples
+    --------
+    >>> say("Compiling kernels (once) ...")
+    """
+    with suppress(OSError):
+        try:
+            print(message, file=sys.stderr, flush=True)
+        except OSError:
+            _silence(sys.stderr)
+
+
+def warn(*messages: str) -> None:
+    """Say what a user should know of a result, though there is one.
+
+    Parameters
+    ----------
+    messages : str
+
+    Examples
+    --------
+    >>> warn("the beam is wider than the world")
+    """
+    for message in messages:
+        say(f"pipistrelle: warning: {message}")
+
+
+def flush_results() -> None:
+    """Write to standard output what waits there, unless its reader has left.
+
+    Raises
+    ------
+    OSError
+        Where there is no room for it.
+    """
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        _silence(sys.stdout)
+        if error.errno != EPIPE:
+            raise
+
+
+def put(*values: object, end: str = "\n") -> None:
+    """Write a result to standard output, unless its reader has left.
+
+    Parameters
+    ----------
+    values : object
+    end : str
+
+    Raises
+    ------
+    OSError
+        Where there is no room for it.
+
+    Examples
+    --------
+    >>> put("runs/one")
+    runs/one
+    """
+    try:
+        print(*values, end=end)
+    except BrokenPipeError:
+        _silence(sys.stdout)
+
+
+def _silence(stream: TextIO) -> None:
+    """Send what a stream still holds, and all that is to come, nowhere."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
