@@ -42,6 +42,12 @@ def test_columns_are_replaced_in_a_copy_and_checked_as_those_of_a_new_scan():
     assert (other.bearing.tolist(), other.caller.tolist()) == ([-0.1, -0.2], [1, 1])
     assert (scan.bearing.tolist(), scan.caller.tolist()) == ([0.1, 0.2], [OWN, OWN])
     assert (other.time, other.range.tolist()) == (0.5, [2.0, 2.0])
+    whole = make_scan(0.5, **{name: np.arange(4) + 10 * i for i, name in enumerate(COLUMNS)})
+    for i, replaced in enumerate(COLUMNS):
+        changed = with_columns(whole, **{replaced: 99})
+        for j, name in enumerate(COLUMNS):
+            expected = np.full(4, 99) if i == j else np.arange(4) + 10 * j
+            assert getattr(changed, name).tolist() == expected.tolist()
     with pytest.raises(InputError, match="scan: no such column ranges"):
         with_columns(scan, ranges=1.0)
 

@@ -69,6 +69,23 @@ def test_what_cannot_be_labels_is_refused_before_a_kernel_sees_it(label):
     assert labelled(scan, [4, UNLABELLED, 4]).landmark.tolist() == [4]
 
 
+def test_ranges_and_detours_come_with_their_own_noise_from_the_first_row_that_has_them():
+    scan = make_scan(
+        0.0, np.full(4, 4), np.full(4, 0.1), bearing_std=0.01, caller=np.array([3, 0, 1, 2]),
+        range=np.array([NAN, 5.0, 9.0, NAN]), range_std=np.array([0.9, 0.2, 0.3, 0.4]),
+        detour=np.array([NAN, NAN, 7.0, 6.0]), detour_std=np.array([0.8, 0.7, 0.5, 0.6]),
+    )  # fmt: skip
+    merged = labelled(scan, scan.landmark)
+    assert (merged.range.tolist(), merged.range_std.tolist()) == ([5.0], [0.2])
+    assert (merged.detour.tolist(), merged.detour_std.tolist()) == ([7.0], [0.5])
+
+
+def test_merged_rows_are_of_the_call_of_the_first_of_them():
+    scan = make_scan(0.0, np.array([4, 6, 4, 6]), np.zeros(4), caller=np.array([2, 1, 0, 3]))
+    merged = labelled(scan, scan.landmark)
+    assert (merged.landmark.tolist(), merged.caller.tolist()) == ([4, 6], [2, 1])
+
+
 def test_the_level_of_merged_rows_is_the_highest_that_is_known():
     for level in ([20.0, NAN], [NAN, 20.0], [20.0, 3.0], [3.0, 20.0]):
         scan = scan_with([4, 4], [0.1, 0.1], level_db=np.array(level))
