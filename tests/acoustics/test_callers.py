@@ -11,7 +11,8 @@ from scipy.optimize import brentq
 
 from pipistrelle.acoustics.arrivals import Arrivals, arrivals_of_emission, arrivals_of_emissions
 from pipistrelle.acoustics.callers import Caller, callers_at, callers_of, check_caller, moves
-from pipistrelle.config import Config, InputError
+from pipistrelle.acoustics.propagation import absorption_db_per_m
+from pipistrelle.config import BeaconConfig, Config, EmitterConfig, InputError
 
 law = settings(deadline=None, max_examples=40)
 SEEDS = st.integers(0, 2**32 - 1)
@@ -255,3 +256,36 @@ def test_a_vehicle_alone_hears_its_own_echoes_where_there_are_any():
     landmarks = np.array([[5.0, 0.0]])
     heard, count = arrivals_of_emissions(poses, np.zeros((2, 2)), landmarks, [vehicle], CONFIG)
     assert (count.tolist(), heard.landmark.tolist()) == ([1, 0], [1])
+
+
+@given(seed=SEEDS, moving=st.integers(0, 3))
+@law
+def test_what_the_callers_call_at_counts_and_not_the_tones_and_levels_of_the_settings(seed, moving):
+    poses, velocities, landmarks, callers = crowd(seed, moving=moving)
+    other = Config(
+        emitter=EmitterConfig(frequency=50e3, level_db=90.0),
+        beacon=BeaconConfig(frequency=45e3, level_db=10.0),
+    )
+    one, two = (
+        arrivals_of_emissions(poses, velocities, landmarks, callers, config)[0]
+        for config in (CONFIG, other)
+    )
+    assert bits(one) == bits(two)
+
+
+@given(seed=SEEDS)
+@law
+def test_a_call_is_spread_and_absorbed_as_a_call_of_its_own_tone_and_level(seed):
+    poses, velocities, landmarks, callers = crowd(seed)
+    heard = arrivals_of_emission(poses[0], velocities[0], landmarks, callers, CONFIG)
+    air = {"temperature_c": 20.0, "relative_humidity": 0.5, "pressure_kpa": 101.325}
+    for j, caller in enumerate(callers[1:], start=1):
+        away = np.hypot(*(caller.place - poses[0, :2]))
+        lost = 20.0 * np.log10(away) + away * absorption_db_per_m(TONES[j - 1], **air)
+        (direct,) = heard.level_db[(heard.caller == j) & (heard.landmark == 5 + j)]
+        assert direct == pytest.approx(39.0 + j - lost, abs=1e-9)
+    own = heard.caller == 0
+    points = np.vstack((landmarks, [caller.place for caller in callers[1:]]))
+    away = np.hypot(*(points[heard.landmark[own] - 1] - poses[0, :2]).T)
+    lost = 40.0 * np.log10(away) + 2.0 * away * absorption_db_per_m(35e3, **air)
+    np.testing.assert_allclose(heard.level_db[own], callers[0].level_db - lost, atol=1e-9)
