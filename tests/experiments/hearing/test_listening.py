@@ -17,7 +17,10 @@ from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import BLOCK, blocks_to_hear, sampling
 from pipistrelle.config import (
+    AssociationConfig,
+    BeaconConfig,
     Config,
+    DetectionConfig,
     EmitterConfig,
     InputError,
     MotionConfig,
@@ -140,6 +143,107 @@ def test_without_an_oracle_as_much_is_heard_and_nothing_has_a_label():
         named = list(zip(one.rows.caller.tolist(), one.rows.bearing.tolist(), strict=True))
         assert sum(row in heard for row in named) > 0.6 * len(named)
         assert other.rows.landmark.size >= one.rows.landmark.size
+
+
+def found_by_two_faces(late, off=0.0):
+    """Return a finder of one call that two faces hear, the second so much later [s] and off."""
+    angle = np.radians([20.0, -70.0]) + np.array([0.0, off])
+    return lambda matched, finder, **timing: Detections(
+        face=np.array([0, 1]), caller=np.zeros(2, dtype=np.int64), angle=angle,
+        bearing=angle + np.array([0.0, 0.5 * np.pi]), delay=np.array([0.02, 0.02 + late]),
+        power=np.array([9.0, 8.0]),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("pulse", "share"), [(2.8e-3, 0.25), (2.0e-3, 0.25), (2.8e-3, 0.1)])
+def test_without_an_oracle_two_faces_hear_one_echo_within_the_gates_share_of_a_call(pulse, share):
+    gates = AssociationConfig(delay_gate=share)
+    world, config = short(4, association=gates, emitter=EmitterConfig(pulse=pulse))
+    for late, echoes in ((0.99 * share * pulse, 1), (1.01 * share * pulse, 2)):
+        ((heard,),) = listen(world, config, [0.0088], oracle=None, find=found_by_two_faces(late))
+        assert heard.rows.landmark.size == echoes
+
+
+@pytest.mark.parametrize("averaging", ["plain", "weighted"])
+def test_faces_are_averaged_as_the_settings_ask(averaging):
+    world, config = short(4, detection=DetectionConfig(averaging=averaging))
+
+    def one_landmark(found, *_, **__):
+        return np.full(found.face.size, 7)
+
+    hears = {"oracle": one_landmark, "find": found_by_two_faces(0.0, off=0.04)}
+    ((heard,),) = listen(world, config, [0.0088], **hears)
+    # At 20 and at -67.7 degrees off the faces' normals: inverse variances go with cos^2.
+    weight = np.cos([np.radians(20.0), np.radians(-70.0) + 0.04]) ** 2
+    share = 0.5 if averaging == "plain" else weight[1] / weight.sum()
+    assert heard.rows.bearing == pytest.approx([np.radians(20.0) + share * 0.04], abs=1e-5)
+
+
+@pytest.mark.parametrize(("margin_db", "noise_db"), [(0.0, 0.0), (6.0, 4.0)])
+def test_the_oracle_is_told_the_faintest_level_of_the_settings(margin_db, noise_db):
+    settings = {
+        "association": AssociationConfig(margin_db=margin_db),
+        "receiver": ReceiverConfig(noise_level_db=noise_db),
+    }
+    (world, config), told = short(4, **settings), []
+
+    def listening(found, *_, faintest_db, **__):
+        told.append(faintest_db)
+        return np.full(found.face.size, UNLABELLED)
+
+    listen(world, config, [0.0088], oracle=listening)
+    # A call of 560 samples at 10 elements that reaches the threshold on average, less the margin.
+    expected = 10.0 * np.log10((FINDER.threshold - 10.0) / 10.0 / 560.0) + noise_db - margin_db
+    assert told == [pytest.approx(expected, abs=1e-9)]
+
+
+def test_what_the_callers_call_at_is_heard_and_not_the_settings_tones_and_levels():
+    world, config = short(8)
+    vehicle, beacon = world.callers
+    callers = (
+        replace(vehicle, frequency=45e3, level_db=55.0),
+        replace(beacon, frequency=20e3, level_db=48.0),
+    )
+    settled = {
+        "emitter": EmitterConfig(frequency=45e3, level_db=55.0),
+        "beacon": BeaconConfig(frequency=20e3, level_db=48.0),
+    }
+    other = replace(world, callers=callers)
+    radii = [0.0088, 0.025]
+    one, two = (listen(other, c, radii) for c in (config, config.model_copy(update=settled)))
+    assert [bits(beam) for beam in one] == [bits(beam) for beam in two]
+    assert [bits(beam) for beam in one] != [bits(beam) for beam in listen(world, config, radii)]
+
+
+def noise_heard(config, iteration=0):
+    """Return the matched filter's output at each frame and beam of a world in which all is mute."""
+    world = draw_scenario(config, np.random.default_rng(7))
+    mute, heard = tuple(replace(caller, level_db=-300.0) for caller in world.callers), []
+
+    def kept(matched, finder, **timing):
+        apart = matched[:: timing["pulse"]]  # calls that do not overlap
+        heard.append(apart.ravel()[:4000].copy())
+        return detect(matched, finder, **timing)
+
+    listen(replace(world, callers=mute), config, [0.0025, 0.025], iteration=iteration, find=kept)
+    return heard
+
+
+@pytest.mark.parametrize("engine", ["block", pytest.param("dense", marks=pytest.mark.slow)])
+def test_every_frame_world_and_seed_has_noise_of_its_own_that_all_beams_share(engine):
+    alone = ScenarioConfig(steps=8, landmarks=0)
+    config = Config(receiver=ReceiverConfig(engine=engine), scenario=alone)
+    drawn = [
+        noise_heard(config),
+        noise_heard(config, iteration=1),
+        noise_heard(config.model_copy(update={"seed": 8})),
+    ]
+    own = [wide for wide, _, later, _ in drawn for wide in (wide, later)]
+    for wide, narrow in ((d[2 * i], d[2 * i + 1]) for d in drawn for i in (0, 1)):
+        np.testing.assert_allclose(wide, narrow, atol=1e-9)
+    for i, one in enumerate(own):
+        for other in own[:i]:
+            assert abs(np.vdot(one, other)) < 4.9 * np.sqrt(one.size)
 
 
 def errors_of(config, worlds):
