@@ -143,6 +143,19 @@ def test_steps_and_scans_reach_the_filter_in_the_order_of_time():
     assert track.pose.covariance[:, 0, 0].tolist() == [2, 1, 2, 2, 1, 1]
 
 
+def test_an_association_is_asked_with_the_belief_that_was_predicted_to_its_scan():
+    asked = []
+
+    def noted(belief, scan):
+        asked.append((scan.time, belief.mean.tolist()))
+        return scan.landmark
+
+    scans = [scan_with(time=0.0), scan_with(time=1.5), scan_with(time=1.5), scan_with(time=4.5)]
+    run_filter(Ledger(), drive(5), scans, RNG(7), associate=noted)
+    # x counts the steps, y the scans that the filter was corrected with before.
+    assert asked == [(0.0, [0, 0, 0]), (1.5, [2, 1, 0]), (1.5, [2, 2, 0]), (4.5, [5, 3, 0])]
+
+
 def test_a_drive_without_scans_and_scans_without_a_drive_are_tracked():
     ledger = Ledger()
     track = run_filter(ledger, drive(5), [], RNG(7))
@@ -340,6 +353,18 @@ def test_trials_of_one_world_do_not_depend_on_their_order():
     assert contents(run_trial(case, told, scans, SHORT)) == contents(one)
     other = run_trial(replace(case, iteration=5), told, scans, SHORT)
     assert contents(other.track) != contents(one.track)
+
+
+def test_what_a_filter_draws_is_of_the_seed_and_one_that_draws_nothing_does_not_care():
+    scenario = draw_scenario(SHORT, RNG(3))
+    told = drive_of(scenario, SHORT)
+    scans = scans_of(run_mission(SHORT, ("fused",)).heard, "fused", SHORT)
+    for name, draws in (("ekf", False), ("fastslam", True)):
+        case = Case(strategy="fused", filter=name)
+        one, two = (
+            run_trial(case, told, scans, SHORT.model_copy(update={"seed": seed})) for seed in (7, 8)
+        )
+        assert (contents(one.track) != contents(two.track)) == draws
 
 
 def test_the_dense_engine_finds_about_the_same_landmarks():
