@@ -119,6 +119,14 @@ def test_the_landmark_table_holds_every_hypothesis_and_every_true_landmark(landm
     assert table["true_x_m"].to_list() == [5.0, 1.0, 1.0, 1.0, None, 3.0]
 
 
+def test_the_landmark_table_tells_each_hypothesis_its_covariance_term_by_term(landmarks):
+    table = landmark_table(landmarks, None)
+    terms = table.select("xx_m2", "xy_m2", "yy_m2").to_numpy()
+    np.testing.assert_array_equal(terms, landmarks.covariance.reshape(-1, 4)[:, [0, 1, 3]])
+    np.testing.assert_array_equal(table.select("x_m", "y_m").to_numpy(), landmarks.mean)
+    assert table["weight"].to_list() == landmarks.weight.tolist()
+
+
 def test_the_tables_of_nothing_have_the_columns_of_something(landmarks):
     assert landmark_table(map_with(), None).schema == landmark_table(landmarks, None).schema
     scan = scan_with([1], [0.0], [1.0])

@@ -8,7 +8,9 @@ import pytest
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config
 from pipistrelle.evaluation.consistency import nees
-from pipistrelle.experiments.runs.trial import run_mission
+from pipistrelle.experiments.hearing.listening import listen
+from pipistrelle.experiments.hearing.scenario import world_of
+from pipistrelle.experiments.runs.trial import drive_of, run_mission, run_trial, scans_of
 from pipistrelle.experiments.studies import world
 from pipistrelle.experiments.studies.plan import Plan, cases_of
 from pipistrelle.experiments.studies.world import failed_records, run_world, world_tables
@@ -85,6 +87,13 @@ def test_a_passive_case_has_no_beamwidth_and_the_others_that_of_their_piston(rec
         else:
             width = beamwidth(record.case.config.emitter.radius, frequency=35e3, speed_of_sound=343)
             assert record.beamwidth_deg == pytest.approx(np.degrees(width), rel=1e-12)
+
+
+def test_clutter_is_what_bears_no_label_in_a_frame_of_the_cases_own_beam(records, alone):
+    for record, mission in zip(records, alone, strict=True):
+        clutter = [heard.clutter for heard in mission.heard]
+        assert record.clutter_per_frame == pytest.approx(np.mean(clutter), rel=1e-12)
+    assert len({record.clutter_per_frame for record in records}) > 1
 
 
 def test_cases_that_hear_the_same_world_listen_once(plan, monkeypatch):
@@ -219,6 +228,16 @@ def test_worlds_differ(plan, records):
     assert all(a.scores.position_rmse_m != b.scores.position_rmse_m for a, b in pairs)
 
 
+def test_each_case_of_a_later_world_is_the_trial_that_it_would_be_alone(plan):
+    for record in run_world(plan, 1):
+        config, number = record.case.config, replace(record.case, iteration=1)
+        scenario = world_of(config, 1)
+        (heard,) = listen(scenario, config, [config.emitter.radius], iteration=1)
+        scans = scans_of(heard, record.case.strategy, config)
+        trial = run_trial(number, drive_of(scenario, config), scans, config)
+        assert asdict(record.scores) == asdict(trial.scores)
+
+
 def test_a_trial_that_raises_is_recorded_and_the_others_go_on(plan, records, monkeypatch):
     run_trial = world.run_trial
 
@@ -296,6 +315,22 @@ def test_an_exact_start_leaves_frames_unscored_until_the_covariance_is_positive_
     covariance[2] = np.eye(3)  # between frames: at the first it is singular again
     steps = world._frame_errors(exact, mission.scenario, mission.config)
     assert np.isinf(steps[:, 2]).tolist() == [True] + 9 * [False]
+
+
+def test_every_column_of_a_worlds_tables_holds_what_its_name_says(plan, records):
+    tables = world_tables(plan, 3, records)
+    trials, scored = as_rows(tables["trials"]), asdict(records[0].scores)
+    for row, record in zip(trials, records, strict=True):
+        assert (row["iteration"], row["case"]) == (3, record.case.number)
+        assert {name: row[name] for name in scored} == asdict(record.scores)
+        own = tables["steps"].filter(case=record.case.number)
+        assert own["frame"].to_list() == list(range(1, 11))
+        names = ["position_error_m", "heading_error_rad", "nees"]
+        np.testing.assert_array_equal(own.select(names).to_numpy(), record.steps)
+        own = tables["landmarks"].filter(case=record.case.number)
+        assert own["landmark"].to_list() == record.landmark.tolist()
+        assert own["full"].to_list() == record.full.tolist()
+        np.testing.assert_array_equal(own["error_m"], record.landmark_error.astype(np.float32))
 
 
 def test_columns_bear_the_names_of_what_varies(plan, records):
