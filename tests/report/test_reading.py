@@ -1,5 +1,7 @@
 """A study's folder, read back: what was written is what is found."""
 
+from dataclasses import replace
+
 import numpy as np
 import polars as pl
 import pytest
@@ -57,6 +59,18 @@ def test_failed_trials_are_known_and_have_no_numbers(written):
         assert np.isnan(trials.scores["position_rmse_m"][world, column])
         assert np.isnan(trials.nees[world, column]).all()
     assert [(world, text) for world, _, _, _, text in read.errors] == [(1, ERROR), (3, ERROR)]
+
+
+def test_what_diverged_and_what_it_cost_is_read_trial_by_trial(tmp_path):
+    study, rng = invent(4), np.random.default_rng(9)
+    diverged = {way: rng.random(t.diverged.shape) < 0.3 for way, t in study.trials.items()}
+    spoilt = {way: replace(t, diverged=diverged[way]) for way, t in study.trials.items()}
+    plan, _, _ = write_store(tmp_path / "store", replace(study, trials=spoilt))
+    (read,) = read_study(tmp_path / "store")
+    for way, trials in read.trials.items():
+        np.testing.assert_array_equal(trials.diverged, diverged[way])
+        assert not trials.failed.any()
+    assert read.cpu_s == pytest.approx(4 * len(cases_of(plan)) * 0.5)  # they slept as long
 
 
 def test_the_map_error_is_that_of_the_landmarks_every_strategy_has_placed(written):

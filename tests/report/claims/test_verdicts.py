@@ -61,6 +61,28 @@ def test_nees_that_falls_or_a_less_consistent_ekf_refutes_the_second_claim(study
     assert verdicts(replace(study, trials=swapped))[2] == "not-reproduced"
 
 
+@pytest.mark.parametrize(
+    ("beams", "verdict"), [(2, "reproduced"), (6, "open"), (8, "not-reproduced")]
+)
+def test_a_part_that_holds_at_most_beamwidths_needs_more_than_half_of_them(study, beams, verdict):
+    """The map of fused is far worse at some beams, so never better, and beyond sigma there."""
+    for name in FILTERS:
+        far = 3.0 * (np.arange(len(BEAMWIDTH)) < beams)
+        study = changed(study, (name, "fused"), COMMON, lambda error, far=far: error + far)
+    assert verdicts(study)[7] == verdict
+
+
+def test_more_landmarks_by_less_than_their_spread_refute_the_eighth_claim(study):
+    for name in FILTERS:
+        passive = study.trials[name, "passive"].scores["landmarks_total"]
+        few = passive - 0.8 + 0.1 * np.linspace(-1.0, 1.0, passive.size)[:, None]
+        few = np.repeat(few, len(BEAMWIDTH), axis=1)
+        study = changed(study, (name, "active"), "landmarks_total", lambda _, few=few: few)
+    claim = judge_claims(selections(study))[7]
+    more, far = claim.by_rule["world"].parts
+    assert (more.holds, far.holds, claim.verdict) == (True, False, "not-reproduced")
+
+
 def test_fused_better_than_active_and_significantly_so_is_not_what_the_paper_found(study):
     better = changed(study, ("ekf", "fused"), POSITION, lambda error: error - 0.1 * NARROW)
     assert verdicts(better)[4] == "not-reproduced"
