@@ -179,6 +179,27 @@ def test_absence_is_claimed_from_the_first_world_that_resolves_a_deviation(world
     assert {f.holds for f in judge(statements(samples, "not above"))} == {holds}
 
 
+@pytest.mark.parametrize(("worlds", "holds"), [(9, None), (10, True)])
+def test_a_statement_of_nearness_stands_twice_in_the_family_that_has_to_resolve(worlds, holds):
+    half_width = stats.t.ppf(1.0 - 0.025 / 3, worlds - 1) / math.sqrt(worlds)
+    assert (half_width <= 1.0) == (holds is True)
+    assert stats.t.ppf(1.0 - 0.025 / 2, worlds - 1) / math.sqrt(worlds) < 1.0
+    shape = np.linspace(-1.0, 1.0, worlds)
+    family = [*statements([shape], "not above"), *statements([shape], "within", 9.0)]
+    assert [finding.holds for finding in judge(family)] == [holds, True]
+
+
+@pytest.mark.parametrize("confidence", [0.5, 0.8, 0.95, 0.99, 0.9999])
+def test_the_confidence_asked_for_decides(confidence):
+    shape = np.linspace(-1.0, 1.0, 12)
+    for shift in np.linspace(0.05, 1.0, 20):
+        (finding,) = judge(statements([shape + shift]), confidence)
+        known = stats.ttest_1samp(shape + shift, 0.0)
+        assert (finding.holds is True) == (known.pvalue < 1.0 - confidence)
+        bounds = known.confidence_interval(confidence)
+        assert finding.interval[1] == pytest.approx(bounds.high, rel=1e-9)
+
+
 @pytest.mark.parametrize("standing", [1, 2, 3])
 def test_the_interval_of_what_stands_shares_alpha_among_those_that_stand_alone(standing):
     shape, n = np.linspace(-1.0, 1.0, 20), 20

@@ -123,6 +123,19 @@ def test_an_uncertain_start_has_the_nees_of_its_poses_bit_for_bit():
     assert (track_nees(error, P, np.zeros_like(error)) == nees(error, P)).all()
 
 
+@given(SEED)
+def test_the_nees_of_a_track_forgets_whole_turns_of_the_heading(seed):
+    rng = np.random.default_rng(seed)
+    P = covariances(rng, 20)
+    error = draws(rng, P) * [1.0, 1.0, 0.01]
+    turns = 2.0 * np.pi * rng.integers(-2, 3, 20)
+    true = rng.uniform(-3.0, 3.0, (20, 3))
+    wound = true + error + np.column_stack([0.0 * turns, 0.0 * turns, turns])
+    worst = np.linalg.cond(P).max()
+    expected = pytest.approx(nees(error, P), rel=1e-13 * worst, abs=1e-9)
+    assert track_nees(wound, P, true) == expected
+
+
 def test_there_is_no_nees_without_truth_and_an_infinite_one_of_a_lost_estimate():
     mean, true = np.ones((4, 3)), np.zeros((4, 3))
     true[1:3] = np.nan
