@@ -2,10 +2,11 @@
 
 import json
 import tomllib
-from math import degrees
+from math import degrees, pi, radians, sin
 from pathlib import Path
 
 import pytest
+from scipy.special import j1
 
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config
@@ -44,6 +45,14 @@ def test_the_short_names_of_a_mission_set_what_they_say(settings):
     assert config.scenario.steps == 40
     assert config.receiver.engine == "dense"
     assert config.fastslam.particles == 30
+
+
+def test_the_beamwidth_asked_for_is_that_of_the_call_in_the_air_asked_for(settings):
+    words = ("--emitter.frequency", "50000", "--air.speed-of-sound", "330")
+    radius = settings("--beamwidth", "60", *words).emitter.radius
+    ka = 2.0 * pi * 50e3 / 330.0 * radius
+    pressure = 2.0 * j1(ka * sin(radians(30.0))) / (ka * sin(radians(30.0)))
+    assert pressure**2 == pytest.approx(0.5, rel=1e-9)
 
 
 def test_flags_go_over_the_environment_over_the_file(settings, monkeypatch):

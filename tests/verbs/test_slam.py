@@ -104,6 +104,18 @@ def test_slam_takes_from_the_log_what_the_log_decides_and_says_so(obey, log, und
     assert settled["filter"]["range_std"] == own
 
 
+def test_a_log_is_refused_that_may_need_more_memory_than_there_is_for_its_rays(
+    refused, log, monkeypatch
+):
+    labels = np.loadtxt(log / "measurements.csv", delimiter=",", skiprows=1, usecols=1)
+    there = len(set(labels.tolist()))
+    bytes_of = [24.0 * (3 + 2 * there * members) ** 2 for members in (1, 4)]
+    monkeypatch.setattr("pipistrelle.experiments.machine.installed", lambda: np.mean(bytes_of))
+    said = refused("slam", log, "-o", "two")
+    assert said.startswith(f"ekf: {there} landmarks of 4 members each may need")
+    assert not Path("two").exists()
+
+
 def test_rows_that_are_left_out_are_named_in_a_line(obey, log, undrawn):
     with (log / "measurements.csv").open("a") as file:
         file.write("99.0,3,0.1,4.0\n")

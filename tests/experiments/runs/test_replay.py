@@ -11,7 +11,7 @@ import pytest
 from pipistrelle.config import InputError
 from pipistrelle.detection.logs.folder import read_log, write_log
 from pipistrelle.detection.logs.readers import Reader
-from pipistrelle.detection.scans import with_columns
+from pipistrelle.detection.scans import COLUMNS, with_columns
 from pipistrelle.experiments.drives import NO_TRUTH
 from pipistrelle.experiments.runs.replay import as_heard_by, load, motion_of, start_of
 from pipistrelle.experiments.runs.truth_files import read_truth, write_truth
@@ -57,6 +57,14 @@ def test_truth_is_linear_between_its_rows_and_unknown_outside_them(folder):
     by_hand = [[0, 0, 0], [0.5, -1, 0.75], [2, -4, 3], [2, -2, (3 + wrapped) / 2], [2, 0, wrapped]]
     np.testing.assert_allclose(truth.path[:5], by_hand, atol=1e-15)
     assert np.isnan(truth.path[5]).all()
+
+
+def test_headings_turn_the_shorter_way_between_the_rows_that_stand(folder):
+    rows = "time,x,y,heading\n0.0,0,0,0\n1.0,0,0,2\n1.0,0,0,3.5\n2.0,0,0,3\n"
+    (folder / "truth.csv").write_text(rows)
+    heading = read_truth(folder, np.array([0.0, 0.5, 1.0, 1.5])).path[:, 2]
+    there = 3.5 - 2 * np.pi
+    np.testing.assert_allclose(heading, [0.0, there / 2, there, there - 0.25], atol=1e-15)
 
 
 def test_truth_at_its_own_times_is_exact(folder):
@@ -257,6 +265,14 @@ def test_a_strategy_hears_its_part(strategy, beamwidth, landmark, distance):
     assert heard.landmark.tolist() == landmark
     np.testing.assert_array_equal(heard.range, np.array(distance, dtype=float))
     np.testing.assert_array_equal(heard.bearing, SCAN.bearing[np.isin(SCAN.landmark, landmark)])
+
+
+def test_hiding_leaves_all_but_the_range_as_it_was_recorded():
+    said = {name: np.arange(1.0, 6.0) + 10 * i for i, name in enumerate(COLUMNS)}
+    scan = with_columns(SCAN, **said | {"bearing": SCAN.bearing, "range": SCAN.range})
+    (heard,) = as_heard_by([scan], "fused", 0.5)
+    for name in set(COLUMNS) - {"range"}:
+        np.testing.assert_array_equal(getattr(heard, name), getattr(scan, name))
 
 
 def test_hiding_changes_no_scan_and_keeps_empty_ones():
