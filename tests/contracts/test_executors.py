@@ -238,6 +238,36 @@ def test_a_world_that_kills_its_pool_twice_is_recorded_and_the_others_are_not(mo
     assert sorted(found) == [[name] for name in names]
 
 
+class Together(Mortal):
+    """Ends its worlds as many at a time as it has workers; one that is deadly breaks them all."""
+
+    def __init__(self, workers):
+        super().__init__(workers)
+        self.size, self.running = workers, {}
+
+    def submit(self, task, iteration):
+        if hasattr(self, "broken"):
+            raise BrokenExecutor
+        self.running[iteration], (deadly,) = Future(), task.args
+        ended = self.running
+        if len(ended) == self.size:
+            self.running = {}
+            for world, future in ended.items():
+                if deadly & ended.keys():
+                    self.broken = True
+                    future.set_exception(BrokenExecutor())
+                else:
+                    future.set_result([(f"world {world}", None)])
+        return ended[iteration]
+
+
+def test_a_world_beside_one_that_kills_its_pool_is_tried_again_alone(monkeypatch):
+    monkeypatch.setattr(executors, "_pool", Together)
+    found = executors.in_processes(partial(fatal, {3}), lost, deque(range(6)), 2)
+    names = [(f"world {i}", "lost" if i == 3 else None) for i in range(6)]
+    assert sorted(found) == [[name] for name in names]
+
+
 def test_pools_that_never_get_anywhere_are_an_error(mortal):
     with pytest.raises(InputError, match="their processes end before a world is done"):
         list(executors.in_processes(partial(fatal, {0, 1}), lost, deque([0, 1]), 2))

@@ -12,12 +12,13 @@ import polars as pl
 import pytest
 
 from pipistrelle.__main__ import main
-from pipistrelle.config import Config, InputError, ScenarioConfig
+from pipistrelle.config import Config, FilterConfig, InputError, RayConfig, ScenarioConfig
 from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, entry, title_of
 from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.experiments.studies.plan_file import find_plan, plan_text, read_plan
 from pipistrelle.experiments.studies.store import load_study
 from pipistrelle.experiments.studies.study import run_study
+from reference.missions import BICYCLE
 from reference.studies import SMALL, assert_same, plan_of, results
 
 RECKONING, SHIFTED = "toy_estimators:DeadReckoning", "toy_estimators:Shifted"
@@ -214,6 +215,28 @@ PARTS = """
     def predict(self, belief, controls, dt, rng): return belief, belief.pose()
     def update(self, belief, scan, rng): return belief
 """
+GREEDY = f"""
+from dataclasses import dataclass
+from typing import Any
+
+@dataclass
+class Mine:
+    config: Any
+    gate: float
+    rays: Any
+    motion: Any
+    own: int = 3
+{PARTS}
+"""
+
+
+def test_its_fields_are_given_what_they_ask_for(written):
+    config = Config(filter=FilterConfig(gate=0.9), rays=RayConfig(power=5.0, density=2.0))
+    slam = entry(f"{written(GREEDY)}:Mine").build(config, BICYCLE)
+    assert (slam.gate, slam.rays, slam.config, slam.own) == (0.9, config.rays, config, 3)
+    assert slam.motion is BICYCLE
+
+
 BELIEF = """
 from dataclasses import dataclass
 class Mine(DeadReckoning):

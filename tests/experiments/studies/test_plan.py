@@ -103,6 +103,18 @@ def test_the_cases_are_the_product_of_grid_strategies_and_filters(tmp_path):
     assert len({(c.strategy, c.filter, *c.values.values()) for c in cases}) == 16
 
 
+def test_cases_are_numbered_by_the_grid_then_the_strategies_then_the_filters(tmp_path):
+    text = BARE + 'strategies = ["fused", "active"]\ngrid = {"rays.power" = [3, 1]}\n'
+    cases = cases_of(plan_of(tmp_path, text))
+    assert [(case.values["rays.power"], case.strategy, case.filter) for case in cases] == [
+        (power, strategy, name)
+        for power in (3.0, 1.0)
+        for strategy in ("fused", "active")
+        for name in ("ekf", "fastslam")
+    ]
+    assert [case.number for case in cases] == list(range(8))
+
+
 def test_a_passive_case_stands_once_for_all_radii_and_is_heard_beside_the_narrowest_beam(tmp_path):
     text = SMALL.replace("[0.0025, 0.025]", "[0.025, 0.0025]") + '"rays.power" = [1.0, 2.0, 3.0]\n'
     passive = [case for case in cases_of(plan_of(tmp_path, text)) if case.strategy == "passive"]
