@@ -17,6 +17,7 @@ from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import BLOCK, blocks_to_hear, sampling
 from pipistrelle.config import (
+    AirConfig,
     AssociationConfig,
     BeaconConfig,
     Config,
@@ -89,8 +90,10 @@ def test_the_dense_engine_too_hears_each_beam_alone_and_each_world_with_its_own_
     assert bits(wide) != bits(narrow)
 
 
-def test_the_dense_engine_records_until_the_next_call(monkeypatch):
-    world, config = short(4, receiver=ReceiverConfig(engine="dense"))
+@pytest.mark.parametrize(("step", "steps", "samples"), [(0.125, 4, 100_000), (0.1, 3, 60_000)])
+def test_the_dense_engine_records_until_the_next_call(monkeypatch, step, steps, samples):
+    setup = ScenarioConfig(steps=steps, steps_per_frame=steps, step=step)
+    world, config = short(steps, receiver=ReceiverConfig(engine="dense"), scenario=setup)
     shapes = []
 
     def watched(samples, **settings):
@@ -99,7 +102,7 @@ def test_the_dense_engine_records_until_the_next_call(monkeypatch):
 
     monkeypatch.setattr(listening, "filter_samples", watched)
     listen(world, config, [0.0088])
-    assert shapes == [((100_000 - 560, 4, 10), np.complex64)]
+    assert shapes == [((samples - 560, 4, 10), np.complex64)]
 
 
 def test_a_narrower_beam_ranges_fewer_landmarks():
@@ -164,6 +167,15 @@ def test_without_an_oracle_two_faces_hear_one_echo_within_the_gates_share_of_a_c
         assert heard.rows.landmark.size == echoes
 
 
+@pytest.mark.parametrize("gate", [0.02, 0.1, 0.3])
+def test_without_an_oracle_two_faces_hear_one_echo_within_the_gate_of_its_bearing(gate):
+    world, config = short(4, association=AssociationConfig(bearing_gate=gate))
+    for off, echoes in ((0.99 * gate, 1), (1.01 * gate, 2)):
+        finder = found_by_two_faces(0.0, off)
+        ((heard,),) = listen(world, config, [0.0088], oracle=None, find=finder)
+        assert heard.rows.landmark.size == echoes
+
+
 @pytest.mark.parametrize("averaging", ["plain", "weighted"])
 def test_faces_are_averaged_as_the_settings_ask(averaging):
     world, config = short(4, detection=DetectionConfig(averaging=averaging))
@@ -179,22 +191,27 @@ def test_faces_are_averaged_as_the_settings_ask(averaging):
     assert heard.rows.bearing == pytest.approx([np.radians(20.0) + share * 0.04], abs=1e-5)
 
 
-@pytest.mark.parametrize(("margin_db", "noise_db"), [(0.0, 0.0), (6.0, 4.0)])
-def test_the_oracle_is_told_the_faintest_level_of_the_settings(margin_db, noise_db):
+@pytest.mark.parametrize(("margin_db", "noise_db", "blocks"), [(0.0, 0.0, 14), (6.0, 4.0, 10)])
+def test_the_oracle_is_told_the_gates_the_call_and_the_faintest_level_of_the_settings(
+    margin_db, noise_db, blocks
+):
+    gates = AssociationConfig(margin_db=margin_db, delay_gate=0.2)
     settings = {
-        "association": AssociationConfig(margin_db=margin_db),
+        "association": gates,
         "receiver": ReceiverConfig(noise_level_db=noise_db),
+        "emitter": EmitterConfig(pulse=blocks * BLOCK),
     }
     (world, config), told = short(4, **settings), []
 
-    def listening(found, *_, faintest_db, **__):
-        told.append(faintest_db)
+    def listening(found, arrivals, layout, gates, *, pulse, faintest_db):
+        told.append((gates, pulse, faintest_db))
         return np.full(found.face.size, UNLABELLED)
 
     listen(world, config, [0.0088], oracle=listening)
-    # A call of 560 samples at 10 elements that reaches the threshold on average, less the margin.
-    expected = 10.0 * np.log10((FINDER.threshold - 10.0) / 10.0 / 560.0) + noise_db - margin_db
-    assert told == [pytest.approx(expected, abs=1e-9)]
+    # A call at 10 elements that reaches the threshold on average, less the margin.
+    per_sample = (FINDER.threshold - 10.0) / 10.0 / (40.0 * blocks)
+    expected = 10.0 * np.log10(per_sample) + noise_db - margin_db
+    assert told == [(gates, blocks * BLOCK, pytest.approx(expected, abs=1e-9))]
 
 
 def test_what_the_callers_call_at_is_heard_and_not_the_settings_tones_and_levels():
@@ -272,6 +289,20 @@ def test_errors_of_what_is_heard_are_a_few_hundredths_of_a_radian_and_a_few_cent
     assert 0.01 < rms[1] < 0.05
     assert 0.005 < rms[2] < 0.04
     assert all(abs(np.mean(error)) < 0.2 * np.std(error) for error in (own, other))
+
+
+def test_ranges_and_beams_are_those_of_the_air_of_the_settings():
+    config = Config(air=AirConfig(speed_of_sound=310.0), scenario=ScenarioConfig(steps=80))
+    _, _, late = errors_of(config, 1)
+    assert late.size > 20
+    assert np.sqrt(np.mean(late**2)) < 0.04
+
+    def piston(arrivals, radius, **_):
+        return through_piston(arrivals, radius=radius, frequency=35e3, speed_of_sound=310.0)
+
+    world = draw_scenario(config, np.random.default_rng(7))
+    settled, said = (listen(world, config, [0.02], **own) for own in ({}, {"beam": piston}))
+    assert bits(settled[0]) == bits(said[0])
 
 
 def frames(seed, every):
