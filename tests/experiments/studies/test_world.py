@@ -96,6 +96,18 @@ def test_clutter_is_what_bears_no_label_in_a_frame_of_the_cases_own_beam(records
     assert len({record.clutter_per_frame for record in records}) > 1
 
 
+def test_the_beamwidth_is_that_of_the_call_and_the_air_of_the_case():
+    for setting, values in (
+        ("emitter.frequency", (35e3, 50e3)),
+        ("air.speed_of_sound", (343.0, 320.0)),
+    ):
+        for record in failed_records(plan_with(Config(), setting, values), "gone\n"):
+            emitter, c = record.case.config.emitter, record.case.config.air.speed_of_sound
+            half_power = 1.6163399 / (2.0 * np.pi * emitter.frequency / c * emitter.radius)
+            width = 2.0 * np.degrees(np.arcsin(half_power))
+            assert record.beamwidth_deg == pytest.approx(width, rel=1e-6)
+
+
 def test_cases_that_hear_the_same_world_listen_once(plan, monkeypatch):
     heard = []
     listen = world.listen

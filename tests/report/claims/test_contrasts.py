@@ -105,6 +105,20 @@ def test_curves_leave_out_worlds_without_a_number(study):
     assert curves(select(study, "none"), [("ekf", "unheard")]) is None
 
 
+def test_curves_are_of_the_worlds_that_the_rule_counts(study):
+    trials = study.trials["ekf", "fused"]
+    diverged = trials.diverged.copy()
+    diverged[3, 5] = True
+    spoilt = {**study.trials, ("ekf", "fused"): replace(trials, diverged=diverged)}
+    made = replace(study, trials=spoilt)
+    for rule, fused, active in (("world", 7, 7), ("case", 7, 8), ("none", 8, 8)):
+        for strategy, left in (("fused", fused), ("active", active)):
+            nees = study.trials["ekf", strategy].nees
+            (found,) = curves(select(made, rule), [("ekf", strategy)])
+            expected = nees if left == 8 else np.delete(nees, 3, axis=0)
+            np.testing.assert_array_equal(found, expected)
+
+
 def test_fused_leaves_passive_by_the_slope_over_octaves(study):
     passive = study.trials["ekf", "passive"].scores["position_rmse_m"]
     gap = 0.25 * np.log2(BEAMWIDTH / 5.0)

@@ -142,6 +142,21 @@ def test_a_verdict_that_hangs_on_what_is_left_out_is_open(study):
     assert "depends on what is left out" in claim.reason
 
 
+def test_the_record_leaves_out_what_the_paper_left_out(study):
+    trials = study.trials["fastslam", "active"]
+    diverged = trials.diverged.copy()
+    diverged[:12, 0] = True
+    far = trials.scores[POSITION] + np.where(diverged.any(axis=1), 5.0, 0.0)[:, None]
+    spoilt = replace(trials, diverged=diverged, scores=trials.scores | {POSITION: far})
+    outlying = replace(study, trials=study.trials | {("fastslam", "active"): spoilt})
+    kept = record(judge_claims(selections(outlying))[4])
+    papers, everything = (kept["by_exclusion"][rule] for rule in ("world", "none"))
+    assert (papers["n"], everything["n"]) == (48, 60)
+    assert [kept[name] for name in ("statistic", "of", "n")] == [
+        papers[name] for name in ("statistic", "of", "n")
+    ]
+
+
 def test_too_few_worlds_prove_no_absence():
     few = invent(4)
     found = {claim.number: claim for claim in judge_claims(selections(few))}
