@@ -5,10 +5,14 @@ import pytest
 
 from pipistrelle.config import Config, FastSlamConfig, FilterConfig, RayConfig
 from pipistrelle.estimation.beliefs import Gaussian
-from pipistrelle.estimation.catalogue import CATALOGUE, entry
+from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, entry
 from reference.missions import BICYCLE, START, scan_of, scan_with
 
 RNG = np.random.default_rng
+
+
+def test_the_papers_two_diverge_at_the_papers_limits():
+    assert {name: entry(name).nees_limit for name in PAPERS} == {"ekf": 50.0, "fastslam": 2750.0}
 
 
 @pytest.mark.parametrize("name", CATALOGUE)

@@ -105,6 +105,16 @@ def test_command_refuses_and_leaves_nothing(tmp_path, capsys):
     assert not (tmp_path / "o").exists()
 
 
+def test_a_run_that_hears_passively_among_others_needs_room_for_rays(monkeypatch):
+    config = Config(scenario=ScenarioConfig(steps=8))
+    # EKF-SLAM of 51 landmarks: 24 bytes times the square of 105 numbers, or of 411 with rays.
+    monkeypatch.setattr(machine, "installed", lambda: 1e6)
+    for ways in (("active", "passive"), ("fused", "active")):
+        with pytest.raises(InputError, match="ekf: 51 landmarks of 4 members each may need"):
+            run_mission(config, ways)
+    assert len(run_mission(config, ("active",)).trials) == 1
+
+
 def test_study_refuses_what_its_workers_need_together_and_leaves_nothing(tmp_path, monkeypatch):
     config = Config(fastslam=FastSlamConfig(particles=100_000))
     ways = {"strategies": ("passive",), "filters": ("fastslam",)}

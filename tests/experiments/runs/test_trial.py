@@ -321,6 +321,20 @@ def test_a_trial_is_scored_against_the_path_and_all_landmarks_the_beacon_last():
     assert np.sqrt(np.diag(mission.drive.start.covariance)) == pytest.approx([0.05, 0.05, 0.0436])
 
 
+@pytest.mark.parametrize(
+    ("off", "ekf", "fastslam"), [(0.0, False, False), (1.0, True, False), (5.0, True, True)]
+)
+def test_whether_a_trial_diverged_is_judged_by_its_own_filters_limit(off, ekf, fastslam):
+    mission = run_mission(SHORT, ("fused",))
+    truth = mission.drive.truth
+    beside = replace(truth, path=truth.path + np.array([0.0, off, 0.0]))
+    for name, diverged in (("ekf", ekf), ("fastslam", fastslam)):
+        drive = replace(mission.drive, truth=beside)
+        scans = mission.trials[0].scans
+        trial = run_trial(Case(strategy="fused", filter=name), drive, scans, SHORT)
+        assert trial.scores.diverged is diverged
+
+
 def test_a_caller_that_moves_is_heard_but_is_no_landmark():
     world = draw_scenario(SHORT, RNG(3))
     path = 9.0 * np.column_stack((np.cos(0.05 * world.time), np.sin(0.05 * world.time)))
