@@ -206,6 +206,26 @@ def test_motion_changes_the_frequencies_alone():
         np.testing.assert_array_equal(getattr(moving, name), getattr(still, name))
 
 
+@given(seed=SEEDS, spreading=LAWS, pace=st.floats(0.5, 2.0))
+@law
+def test_where_sound_is_faster_all_comes_sooner_and_alike_if_motion_and_targets_keep_pace(
+    seed, spreading, pace
+):
+    pose, velocity, landmarks, beacon = world(seed)
+    config = as_by_hand(spreading)
+    quick = config.model_copy(
+        update={
+            "air": config.air.model_copy(update={"speed_of_sound": 343.0 * pace}),
+            "target": TargetConfig(radius=0.025 * pace),  # as many wavelengths
+        }
+    )
+    one = sounds_of_emission(pose, velocity, landmarks, beacon, config)
+    two = sounds_of_emission(pose, velocity * pace, landmarks, beacon, quick)
+    np.testing.assert_allclose(two.delay * pace, one.delay, rtol=1e-12)
+    np.testing.assert_allclose(two.level_db, one.level_db, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(two.frequency, one.frequency, rtol=1e-12)
+
+
 def test_a_world_without_landmarks_still_has_its_beacon():
     heard = sounds_of_emission(ORIGIN, STILL, np.empty((0, 2)), np.array([3.0, 4.0]), CONFIG)
     assert heard.caller.tolist() == [VEHICLE, BEACON]
