@@ -7,6 +7,7 @@ from scipy.stats import kstest
 from pipistrelle.config import Config, InputError, MotionConfig, ScenarioConfig
 from pipistrelle.experiments.hearing.scenario import (
     Scenario,
+    bicycle,
     draw_scenario,
     landmark_count,
     standing_landmarks,
@@ -62,6 +63,16 @@ def test_the_noise_free_path_circles_the_maps_centre_three_times():
     assert np.hypot(*centre) == pytest.approx(7.408 * 0.027 - 0.75 * 0.125 / 2.0, abs=1e-2)
     turned = np.unwrap(np.arctan2(path[:, 1], path[:, 0]))
     assert (turned[-1] - turned[0]) / (2.0 * np.pi) == pytest.approx(3.02, abs=0.01)
+
+
+@pytest.mark.parametrize("wheelbase", [0.2, 0.5])
+def test_a_longer_wheelbase_turns_the_vehicle_less_and_its_filters_know(wheelbase):
+    motion = MotionConfig(wheelbase=wheelbase, speed_std=0.0, steering_std=0.0)
+    config = Config(motion=motion, scenario=ScenarioConfig(steps=80, landmarks=0))
+    path = draw_scenario(config, np.random.default_rng(7)).path
+    turned = 0.75 * 0.125 * np.sin(0.027) / wheelbase
+    np.testing.assert_allclose(np.diff(path[:, 2]), turned, rtol=1e-9)
+    assert bicycle(motion).wheelbase == wheelbase
 
 
 def test_controls_are_nominal_and_the_path_is_not():

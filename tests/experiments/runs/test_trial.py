@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from pipistrelle.acoustics.callers import Caller
-from pipistrelle.config import STRATEGIES, Config, InputError, ReceiverConfig, ScenarioConfig
+from pipistrelle.config import (
+    STRATEGIES,
+    Config,
+    FilterConfig,
+    InputError,
+    ReceiverConfig,
+    ScenarioConfig,
+)
 from pipistrelle.detection.faces import unlabelled
 from pipistrelle.detection.merging import scan_of
 from pipistrelle.estimation.beliefs import Gaussian
@@ -333,6 +340,12 @@ def test_whether_a_trial_diverged_is_judged_by_its_own_filters_limit(off, ekf, f
         scans = mission.trials[0].scans
         trial = run_trial(Case(strategy="fused", filter=name), drive, scans, SHORT)
         assert trial.scores.diverged is diverged
+
+
+def test_a_filter_starts_as_sure_of_its_pose_as_the_settings_say():
+    config = Config(filter=FilterConfig(initial_pose_std=(0.1, 0.3, 0.2)), scenario=SHORT.scenario)
+    start = drive_of(draw_scenario(config, RNG(3)), config).start
+    np.testing.assert_allclose(start.covariance, np.diag([0.01, 0.09, 0.04]), rtol=1e-12)
 
 
 def test_a_caller_that_moves_is_heard_but_is_no_landmark():
