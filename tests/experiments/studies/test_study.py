@@ -73,6 +73,17 @@ def test_the_progress_counts_worlds_and_trials_by_strategy(plan, tmp_path):
     assert all(set(so_far.failed.values()) == {0} for so_far in seen)
 
 
+def test_of_several_failures_the_first_is_told(plan, tmp_path, monkeypatch):
+    def failing(case, drive, scans, config):
+        raise FloatingPointError(f"weights of world {case.iteration}")
+
+    monkeypatch.setattr(world, "run_trial", failing)
+    seen = []
+    run_study(plan, tmp_path / "study", progress=seen.append)
+    first = "FloatingPointError: weights of world 0"
+    assert [so_far.first_error for so_far in seen] == [None, first, first, first]
+
+
 def test_shares_are_disjoint_and_make_up_the_whole(plan, tmp_path, ran):
     for i in range(2):
         so_far = run_study(plan, tmp_path / "shares", shard=(i, 2))
