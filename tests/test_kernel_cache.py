@@ -33,6 +33,12 @@ def test_kernels_are_kept_in_the_users_cache_by_the_state_of_the_sources(tmp_pat
     assert said == []
 
 
+def test_importing_the_package_makes_no_folder_and_sets_no_variable(tmp_path):
+    code = "import os, pipistrelle, pipistrelle.config; print('NUMBA_CACHE_DIR' in os.environ)"
+    assert place(tmp_path, code) == (Path("False"), [])
+    assert not (tmp_path / ".cache").exists()
+
+
 def test_relative_cache_folder_of_the_desktop_is_not_taken(tmp_path):
     assert place(tmp_path, XDG_CACHE_HOME="here") == place(tmp_path)
 

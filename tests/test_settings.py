@@ -1,3 +1,4 @@
+import math
 import tomllib
 from pathlib import Path
 
@@ -6,6 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipistrelle.config import AirConfig, Config, InputError, RayConfig, ScenarioConfig
+from pipistrelle.experiments.studies.plan import cases_of
+from pipistrelle.experiments.studies.plan_file import plan_text, read_plan
 from pipistrelle.settings import (
     from_environment,
     from_file,
@@ -210,3 +213,24 @@ def test_written_settings_name_each_setting_once_with_its_meaning():
     assert len(known_settings()) == named + 1
     assert "# speed_of_sound =" in text  # it is that of the temperature
     assert all(" # " in line for line in text.splitlines() if " = " in line)
+
+
+def test_the_speed_of_sound_is_that_of_the_temperature_unless_it_is_given():
+    assert Config().air.celerity == 343.0
+    for temperature in (-40.0, 5.0, 35.0):
+        air = AirConfig(temperature_c=temperature)
+        ideal_gas = math.sqrt(1.4 * 8.314462 * (temperature + 273.15) / 28.9652e-3)
+        assert air.celerity == pytest.approx(ideal_gas, rel=1e-3)
+        assert AirConfig(temperature_c=temperature, speed_of_sound=340.0).celerity == 340.0
+
+
+def test_the_speed_of_sound_that_was_not_given_follows_a_grid_of_temperatures(tmp_path):
+    (tmp_path / "air.toml").write_text(
+        "format = 1\niterations = 1\nfilters = ['ekf']\nstrategies = ['fused']\n"
+        "[grid]\n'air.temperature_c' = [5.0, 20.0]\n"
+    )
+    plan = read_plan(tmp_path / "air.toml")
+    (tmp_path / "plan.toml").write_text(plan_text(plan))
+    for each in (plan, read_plan(tmp_path / "plan.toml")):
+        speeds = [case.config.air.celerity for case in cases_of(each)]
+        assert speeds == [pytest.approx(334.1, abs=0.05), 343.0]

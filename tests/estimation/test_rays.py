@@ -55,6 +55,16 @@ def test_ray_is_that_of_the_slow_reference(rays):
     np.testing.assert_allclose(ray_members(rays)[0], ray_ranges(rays), rtol=1e-12)
 
 
+@given(st.floats(1e-6, 0.2), st.floats(1, 1e9))
+def test_however_sharp_the_shares_of_what_is_known_so_far_are_shares(least, power):
+    weights, share = shared(
+        [0.0, 0.0, 0.0], [least, (1 - least) / 3, 2 * (1 - least) / 3], power, True
+    )
+    assert share.sum() == pytest.approx(1.0, abs=0.1)  # small ones are none
+    assert np.isfinite(weights).all()
+    assert np.argmax(share) == 2
+
+
 def test_the_ray_that_filters_share_is_changed_by_none():
     shared_by_all = sensing_of(RayConfig(), 0.999)
     assert shared_by_all is sensing_of(RayConfig(), 0.999)

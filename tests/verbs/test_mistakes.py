@@ -51,6 +51,30 @@ import pytest
         ("slam one two", "slam: found 'two', but slam takes one argument"),
         ("config show extra", "config show: found 'extra', but config show takes no arguments"),
         ("run --scenario.start 0 0", "--scenario.start: found 2 values, expected 3"),
+        (
+            "run --scenario.start -1e308 0 0",
+            "--scenario.start: found (-1e+308, 0.0, 0.0), expected",
+        ),
+        ("run --air.speed-of-sound 5e-324", "--air.speed-of-sound: found 5e-324, expected greater"),
+        ("run --air.pressure-kpa 1e300", "--air.pressure-kpa: found 1e+300, expected less than"),
+        ("run --motion.speed-std 1e308", "--motion.speed-std: found 1e+308, expected less than or"),
+        ("run --motion.wheelbase 1e-300", "--motion.wheelbase: found 1e-300, expected at least 1e"),
+        ("run --filter.bearing-std 1e300", "--filter.bearing-std: found 1e+300, expected less th"),
+        ("run --detection.leakage-db 12345", "--detection.leakage-db: found 12345.0, expected les"),
+        ("run --beacon.frequency 1e300", "--beacon.frequency: found 1e+300, expected less than"),
+        ("run --scenario.step 1e150", "--scenario.step: found 1e+150, expected less than or equal"),
+        ("run --rays.density 1e150", "--rays.density: found 1e+150, expected less than or equal"),
+        (
+            "run --receiver.spacing 3",
+            "receiver.spacing: found 3 m, 306.122 waves; expected at most",
+        ),
+        ("run --scenario.beacon-distance 1e9", "scenario.beacon_distance: a recording of 1.17e+07"),
+        ("run --scenario.radius 1e9", "scenario.radius: a recording of 1.1"),
+        ("run --scenario.steps 8 --scenario.step 1e7", "scenario.step: a recording of"),
+        ("run --scenario.start 1e9 0 0", "scenario.start: a recording of 1.17e+07 s may need"),
+        ("run --emitter.pulse 1e6", "emitter.pulse: a recording of 1e+06 s may need"),
+        ("run --scenario.speed 400", "scenario.speed: the vehicle reaches 400 m/s, expected less"),
+        ("run --motion.speed-std 400", "motion.speed_std: the vehicle reaches"),
         ("slam", "LOG requires an argument"),
         ("slam --animate none", "none: found no such folder"),
         ("slam none -x", "Unknown option: -x."),
@@ -85,6 +109,27 @@ def test_a_mistake_in_a_file_or_the_environment_is_said_with_its_place(refused, 
     assert ", expected TOML; correct the line" in refused("run", "--config", "mission.toml")
     monkeypatch.setenv("PIPISTRELLE_RAYS__POWER", "0")
     assert refused("run") == "PIPISTRELLE_RAYS__POWER: found 0, expected greater than 0"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a = " + "[" * 5000, "found more than 8 levels, expected tables of settings"),
+        ("a = " + "[" * 50 + "]" * 50, "a.0.0: found more than 8 levels, expected tables"),
+        (".".join("a" * 500) + " = 1", "a.a.a: found more than 8 levels, expected tables"),
+        ("seed = " + "1" * 5000, "found an integer of many digits, expected at most 64 bits"),
+        ("seed = 0x" + "f" * 5000, "seed: found an integer of 20000 bits, expected at most 64"),
+        ("seed = " + '"' + "x" * 5000 + '"', "x..., expected a valid integer"),
+    ],
+)
+def test_a_file_that_no_parser_was_made_for_is_refused_as_any_other(refused, text, said):
+    Path("mission.toml").write_text(text)
+    for words in (["run", "--config", "mission.toml"], ["study", "mission.toml"]):
+        found = refused(*words)
+        assert found.startswith("mission.toml: ")
+        assert len(found) < 300
+        assert said in found or (words[0] == "study" and "seed: no such key of a plan" in found)
+    assert not Path("runs").exists()
 
 
 def test_a_film_that_needs_what_is_missing_is_refused_before_anything_is_made(refused, monkeypatch):

@@ -124,6 +124,64 @@ def test_rows_that_are_left_out_are_named_in_a_line(obey, log, undrawn):
     assert summary("two")["runs"][0]["ignored_rows"] == {"outside_odometry": 1}
 
 
+def test_rows_of_clutter_are_left_out_and_counted(obey, log, undrawn):
+    text = (log / "measurements.csv").read_text()
+    (log / "measurements.csv").write_text(text + "4.0,-1,0.1,4.0\n4.0,-1,0.2,\n")
+    _, _, said = obey("slam", log, "-o", "two", "--quiet")
+    assert said == "pipistrelle: warning: log: rows left out: 2 clutter\n"
+    assert -1 not in np.loadtxt("two/map_fused_ekf.csv", delimiter=",", skiprows=1, usecols=0)
+
+
+def scaled(log, column, factor):
+    """Write one column of a log's measurements in another unit."""
+    path = log / "measurements.csv"
+    header, *rows = [line.split(",") for line in path.read_text().splitlines()]
+    for row in rows:
+        if row[column]:
+            row[column] = repr(float(row[column]) * factor)
+    path.write_text("\n".join(map(",".join, [header, *rows, []])))
+
+
+def test_bearings_in_degrees_are_asked_about(obey, log, undrawn):
+    scaled(log, 2, 180.0 / np.pi)
+    settings = (log / "log.toml").read_text()
+    (log / "log.toml").write_text(re.sub(r"gate = .*\n", "", settings))
+    status, _, said = obey("slam", log, "-o", "two", "--quiet")
+    assert status == 0
+    gated = summary("two")["runs"][0]["gated"]
+    assert re.fullmatch(
+        rf"pipistrelle: warning: log: {gated} of \d+ measurements do not fit what was expected "
+        r"\(fused ekf\); are bearings in radians and ranges in metres\?\n",
+        said,
+    )
+
+
+def test_ranges_in_millimetres_are_asked_about(obey, log, undrawn):
+    scaled(log, 3, 1000.0)
+    _, _, said = obey("slam", log, "-o", "two", "--quiet")
+    assert "ranges are not within range_bounds (0.5 to 20 m); are ranges in metres?\n" in said
+
+
+def test_a_strategy_that_hears_nothing_of_a_log_is_named(obey, log, undrawn):
+    path = log / "measurements.csv"
+    path.write_text(re.sub(r"(?m)^([^,\n]+,\d+,[^,\n]+,)\S+$", r"\1", path.read_text()))
+    _, _, said = obey("slam", log, "--strategy", "active", "-o", "two", "--quiet")
+    assert said == (
+        "pipistrelle: warning: log: nothing in it is heard by active sensing, so it maps nothing\n"
+    )
+
+
+@pytest.mark.parametrize("name", ["truth.csv", "landmarks.csv"])
+@pytest.mark.parametrize("target", ["nowhere.csv", "itself"])
+def test_a_truth_that_is_a_link_to_no_file_is_refused(obey, log, name, target):
+    (log / name).unlink()
+    (log / name).symlink_to(name if target == "itself" else target)
+    status, printed, said = obey("slam", log, "-o", "two")
+    assert (status, printed) == (2, "")
+    assert said.startswith(f"pipistrelle: error: log/{name}: found ")
+    assert not Path("two").exists()
+
+
 def test_a_log_without_truth_is_mapped_and_not_scored(obey, log):
     (log / "truth.csv").unlink()
     (log / "landmarks.csv").unlink()

@@ -198,6 +198,11 @@ def test_a_length_of_time_is_worded_in_the_unit_that_fits(seconds, words):
         ("small.toml --shard a/4", "--shard: found 'a/4', expected I/N"),
         ("small.toml --shard 0/0", "--shard: found '0/0', expected I/N"),
         ("small.toml --sharp 0/4", "Unknown option: --sharp. Did you mean --shard?"),
+        (
+            "small.toml --iterations 1000000000000",
+            "--iterations: found 1000000000000, expected 1 to",
+        ),
+        ("small.toml --emitter.frequency 3", "emitter.frequency: found 3 Hz, expected a multiple"),
         ("small.toml --emit pbs", 'Invalid value "pbs" for --emit'),
         ("small.toml --emitter.radius 0.01", "--emitter.radius: the plan varies this setting"),
         ("small.toml --rays.power 0", "--rays.power: found 0.0, expected greater than 0"),
@@ -212,6 +217,37 @@ def test_mistakes_are_said_in_a_line(obey, words, said):
     assert told.startswith("pipistrelle: error: ")
     assert said in told
     assert "Traceback" not in told
+
+
+def test_every_case_of_a_plan_is_checked_before_the_first_world(obey):
+    Path("small.toml").write_text(SMALL + '"scenario.beacon_distance" = [15.0, 1e9]\n')
+    status, printed, said = obey("small.toml", "-o", "one")
+    assert (status, printed) == (2, "")
+    assert said.startswith(
+        "pipistrelle: error: scenario.beacon_distance: a recording of 1.17e+07 s"
+    )
+    assert "scenario.beacon_distance = 1000000000.0)" in said
+    assert not Path("one").exists()
+
+
+def test_a_grid_of_thousands_of_values_is_read_at_once(obey):
+    values = ", ".join(repr(0.5 + i / 1e5) for i in range(33_000))
+    Path("small.toml").write_text(SMALL + f'"filter.gate" = [{values}]\n')
+    status, _, said = obey("small.toml", "-o", "one")
+    assert (status, said.split(": ", 2)[2]) == (
+        2,
+        "small.toml: grid: found 396000 cases, expected at most 32767\n",
+    )
+
+
+def test_what_a_receiver_confuses_is_said_once_for_all_cases(obey):
+    words = ("--iterations", "1", "--receiver.spacing", "0.007", "-o", "one", "--quiet")
+    status, printed, said = obey("small.toml", *words)
+    assert (status, printed) == (0, "one\n")
+    lines = said.splitlines()
+    assert [line[:41] for line in lines] == ["pipistrelle: warning: receiver.spacing: 0.0"] * 2 or (
+        len(lines) == 2 and all("warning: receiver.spacing: 0.007 m is" in line for line in lines)
+    )
 
 
 def test_another_plan_is_refused_with_a_line_for_each_difference(obey):

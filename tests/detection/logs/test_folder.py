@@ -1,5 +1,6 @@
 """The log format, rule by rule: what is read, what is dropped, what is refused and how."""
 
+import os
 import re
 from dataclasses import fields, replace
 from pathlib import Path
@@ -262,7 +263,43 @@ def test_a_file_that_is_no_text_is_named(folder):
     refused(folder, "odometry.csv", "text file")
 
 
+@pytest.mark.parametrize("name", ["log.toml", "odometry.csv", "measurements.csv"])
+def test_a_pipe_or_a_device_in_a_files_place_is_refused_unread(folder, name):
+    (folder / name).unlink()
+    os.mkfifo(folder / name)
+    refused(folder, name, "a pipe or a device")
+    (folder / name).unlink()
+    (folder / name).symlink_to("/dev/zero")
+    refused(folder, name, "a pipe or a device")
+
+
+def test_a_link_to_no_file_is_told_from_a_file_that_is_not_there(folder):
+    (folder / "odometry.csv").unlink()
+    refused(folder, "odometry.csv", "found no such file")
+    (folder / "odometry.csv").symlink_to("nowhere.csv")
+    refused(folder, "odometry.csv", "found a link to no file")
+
+
+@pytest.mark.parametrize(
+    ("rows", "left_out"),
+    [(["9.0,7,0.5,4.0", "9.5,3,0.5,"], "2 outside odometry"), (["0.1,-1,0.5,4.0"], "1 clutter")],
+)
+def test_measurements_of_which_no_row_is_left_are_refused(tmp_path, rows, left_out):
+    folder = recorded(tmp_path, measurements=measured(*rows))
+    refused(folder, "measurements.csv", f"left out: {left_out}", "0.0 s and 0.4 s", "clock")
+
+
+def test_rows_of_clutter_may_be_of_one_time(tmp_path):
+    rows = ["0.1,-1,0.5,4.0", "0.1,7,0.5,4.0", "0.1,-1,0.2,"]
+    log = read_log(recorded(tmp_path, measurements=measured(*rows)))
+    assert [scan.landmark.tolist() for scan in log.scans] == [[7]]
+    assert log.ignored_rows == {"clutter": 2}
+
+
 ROWS = {
+    "unsquarable": ("0.1,7,1e155,1", "line 3", "bearing 1e+155", "between -1e+09 and 1e+09"),
+    "far": ("0.1,7,0.5,1e10", "line 3", "range 10000000000.0", "up to 1e+09 m"),
+    "no clutter": ("0.1,-2,0.5,1", "line 3", "landmark -2.0", "from 0 on, or -1 for clutter"),
     "missing field": ("0.1,7,0.5", "line 3", "3 fields", "4: time, landmark, bearing, range"),
     "extra field": ("0.1,7,0.5,1,2", "line 3", "5 fields", "4"),
     "text": ("0.1,7,left,1", "line 3", "bearing 'left'", "a finite number"),
@@ -363,6 +400,11 @@ def test_a_wrong_header_is_refused(folder, name, header):
         ("range_std = 0.2", "range_std = 0.2\nstep = 0", ("'step': found 0", "greater than 0")),
         ("range_std = 0.2", "range_std = 0.2\ngate = 1.5", ("'gate': found 1.5", "equal to 1")),
         ("range_std = 0.2", "range_std = ", ("TOML", "line 7")),
+        ("range_std = 0.2", "range_std = 1e155", ("'range_std': found 1e+155", "less than")),
+        ("range_std = 0.2", "range_std = 1e-155", ("'range_std': found 1e-155", "at least 1e-09")),
+        ("[1.0, -2.0", "[1e300, -2.0", ("'initial_pose[0]': found 1e+300", "less than")),
+        ("range_std = 0.2", "range_std = " + "[" * 5000, ("more than 8 levels", "mend the file")),
+        ("range_std = 0.2", "range_std = " + "2" * 5000, ("integer of many digits", "64 bits")),
     ],
 )
 def test_a_bad_setting_is_refused_by_its_key(tmp_path, old, new, parts):

@@ -10,14 +10,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import ConfigDict, Field, ValidationError, field_validator
 
-from pipistrelle.config import InputError, NonNegative, Positive, Probability, Section
+from pipistrelle.config import InputError, NonNegative, Positive, Probability, Real, Section
 from pipistrelle.detection.logs.recording import MEASUREMENT, Log, assemble
 from pipistrelle.detection.logs.text_tables import read_table, read_text, table_text
 from pipistrelle.files import OwnFiles
 from pipistrelle.refusals import expectation, meant, refusal, shown, values_expected
 from pipistrelle.settings import parse_toml
 
-_Triple = Annotated[tuple[float, float, float], Field(strict=False)]
+_Triple = Annotated[tuple[Real, Real, Real], Field(strict=False)]
 _Triple_std = Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(strict=False)]
 _Bounds = Annotated[tuple[Positive, Positive], Field(strict=False)]
 

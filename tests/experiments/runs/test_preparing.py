@@ -1,0 +1,88 @@
+"""What a mission is refused for before it is heard, and what a receiver confuses."""
+
+import math
+import re
+
+import numpy as np
+import pytest
+
+from pipistrelle.arrays.beamforming import beampattern
+from pipistrelle.arrays.layout import square_of_four
+from pipistrelle.config import AirConfig, Config, EmitterConfig, InputError, ReceiverConfig
+from pipistrelle.experiments import machine
+from pipistrelle.experiments.runs import preparing
+from pipistrelle.experiments.runs.preparing import prepared, warnings_of
+from pipistrelle.experiments.runs.trial import run_mission
+from pipistrelle.settings import from_flags, resolve
+
+
+def settings(**values: float) -> Config:
+    return resolve(from_flags({section: dict([pair]) for section, pair in values.items()}))
+
+
+def test_the_papers_receiver_confuses_nothing():
+    assert warnings_of(Config()) == ()
+
+
+@pytest.mark.parametrize("spacing", [0.006, 0.007, 0.0098])
+def test_the_lobe_that_is_warned_of_is_where_the_array_has_one(spacing):
+    config = Config(receiver=ReceiverConfig(spacing=spacing))
+    warning = warnings_of(config)[0]
+    angle, lobe = (int(found) for found in re.findall(r"(-?\d+) degrees", warning))
+    array = {
+        "position": square_of_four(config.receiver).position,
+        "frequency": 35e3,
+        "speed_of_sound": 343.0,
+    }
+    angles = np.radians(np.arange(-75.0, 0.0, 0.1))
+    alias = beampattern(angles, steered=math.radians(angle + 1), **array)
+    assert np.degrees(angles[np.argmax(alias)]) == pytest.approx(lobe, abs=5.0)
+    assert alias.max() == pytest.approx(1.0, abs=0.01)
+    assert beampattern(angles[angles < -0.6], steered=math.radians(angle - 6), **array).max() < 0.8
+
+
+def test_cold_air_makes_half_a_wave_shorter():
+    (warning,) = warnings_of(Config(air=AirConfig(temperature_c=5.0)))
+    assert "0.51 of a wave at emitter.frequency (35000 Hz)" in warning
+
+
+def test_a_tone_that_real_samples_cannot_hold_is_named_with_what_they_hold():
+    config = Config(emitter=EmitterConfig(frequency=120e3), receiver=ReceiverConfig(spacing=0.0014))
+    (warning,) = warnings_of(config)
+    assert warning.startswith(
+        "receiver.sample_rate: 200000 Hz is less than twice emitter.frequency"
+    )
+    n = np.arange(40)
+    real, alias = np.cos(2 * np.pi * 120e3 * n / 200e3), np.cos(2 * np.pi * 80e3 * n / 200e3)
+    np.testing.assert_allclose(real, alias, atol=1e-9)
+    assert "would hold it as 80000 Hz" in warning
+
+
+def test_without_room_for_a_recording_the_setting_that_makes_it_long_is_named(monkeypatch):
+    monkeypatch.setattr(machine, "installed", lambda: 50e6)
+    prepared(Config())
+    for section, pair, key in (
+        ("scenario", ("beacon_distance", 15e3), "scenario.beacon_distance"),
+        ("scenario", ("radius", 15e3), "scenario.radius"),
+        ("scenario", ("start", (15e3, 0.0, 0.0)), "scenario.start"),
+        ("emitter", ("pulse", 60.0), "emitter.pulse"),
+    ):
+        with pytest.raises(InputError, match=rf"^{key}: a recording of \d+ s may need .* GB"):
+            prepared(settings(**{section: pair}))
+        prepared(settings(**{section: pair}), workers=0)
+    with pytest.raises(InputError, match=r"^scenario\.step: a recording of 5 s may need"):
+        prepared(resolve(from_flags({"scenario": {"step": 1.25}, "receiver": {"engine": "dense"}})))
+
+
+def test_a_mission_is_refused_at_the_same_door(monkeypatch):
+    monkeypatch.setattr(preparing, "check_recording", lambda *_, **__: pytest.fail("asked"))
+    with pytest.raises(pytest.fail.Exception, match="asked"):
+        run_mission(Config(), ["fused"])
+
+
+def test_a_vehicle_faster_than_sound_is_refused_by_what_makes_it_so():
+    with pytest.raises(InputError, match=r"^scenario\.speed: the vehicle reaches 3[45]\d m/s"):
+        prepared(settings(scenario=("speed", -345.0)))
+    with pytest.raises(InputError, match=r"^motion\.speed_std: the vehicle reaches"):
+        prepared(settings(motion=("speed_std", 300.0)))
+    prepared(settings(scenario=("speed", 30.0)))
