@@ -12,12 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fuzz import logs
+from fuzz import logs, settings
 from fuzz.judging import Tried
 from fuzz.running import load_all
 
 TARGETS: dict[str, ModuleType] = {
     "logs": logs,
+    "settings": settings,
 }
 """Each has `prepare`, for all tries, and `attempt`. A number in the order keys their randomness."""
 EVERY = 30.0

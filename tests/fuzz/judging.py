@@ -16,7 +16,7 @@ import numpy as np
 
 from fuzz.running import Ending
 
-_WARNING = re.compile(r"^(?:.*/)?([^/:]+):\d+: (\w*Warning): (.*)$", re.MULTILINE)
+_WARNING = re.compile(r"^(?:.*/)?([^/:]+):\d+: (\w*Warning): (.*)\n(?:  .*\n)?", re.MULTILINE)
 _FRAME = re.compile(r'File "[^"]*/pipistrelle/([^"]+)", line \d+,? in (\S+)')
 _NUMBER = re.compile(r"[-+]?\d[\d.,_]*(?:e[-+]?\d+)?")
 _QUOTED = re.compile(r"'[^']*'|\"[^\"]*\"")
@@ -75,7 +75,7 @@ def _faults_of(ending: Ending, names: Iterable[str], statuses: Iterable[int]) ->
 
 def _strange_words(ending: Ending, names: tuple[str, ...]) -> Iterator[str]:
     """Name what is wrong with what a command says that ended as it may."""
-    lines = [line for line in ending.said.splitlines() if not _WARNING.match(line)]
+    lines = _WARNING.sub("", ending.said).splitlines()
     errors = [line.removeprefix(ERROR) for line in lines if line.startswith(ERROR)]
     if strange := [line for line in lines if not line.startswith(OWN)]:
         yield f"says what is not its own: {kind_of(strange[0])}"
