@@ -12,13 +12,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fuzz import logs, settings
+from fuzz import kills, logs, settings, studies
 from fuzz.judging import Tried
 from fuzz.running import load_all
 
 TARGETS: dict[str, ModuleType] = {
     "logs": logs,
     "settings": settings,
+    "studies": studies,
+    "kills": kills,
 }
 """Each has `prepare`, for all tries, and `attempt`. A number in the order keys their randomness."""
 EVERY = 30.0

@@ -1,0 +1,20 @@
+"""A little of each campaign, always the same: nothing comes of it that a person must never see."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+TESTS = Path(__file__).resolve().parents[1]
+
+
+@pytest.mark.parametrize(
+    ("target", "tries"), [("logs", 80), ("settings", 60), ("studies", 15), ("kills", 2)]
+)
+def test_nothing_odd_is_answered_by_a_fault(target, tries):
+    command = [sys.executable, "-m", "fuzz", target, "--tries", str(tries), "--seed", "0"]
+    done = subprocess.run(command, cwd=TESTS, check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
