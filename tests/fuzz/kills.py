@@ -20,7 +20,7 @@ from fuzz.studies import KEPT, keep, same
 PLAN = """\
 format = 1
 name = "short"
-iterations = 8
+iterations = 5
 [config.scenario]
 steps = 40
 landmarks = 10
@@ -29,7 +29,7 @@ particles = 20
 [grid]
 "emitter.radius" = [0.0025, 0.025]
 """
-"""Eight worlds of ten frames, ten cases in each."""
+"""Five worlds of ten frames, ten cases in each."""
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 WHOM = ("group", "group", "parent", "parent", "worker")
 PATIENCE = 60.0
