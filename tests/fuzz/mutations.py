@@ -9,6 +9,7 @@ from numpy.random import Generator
 Spoiled = tuple[str, bytes]
 Mutation = Callable[[Generator, bytes], Spoiled]
 Rows = list[list[str]]
+Choice = TypeVar("Choice")
 
 HUGE = "9" * 5000
 """More digits than Python turns into a number unasked."""
@@ -35,10 +36,8 @@ VALUES = (
 )
 """What may stand behind the = of a TOML file, and what may not."""
 
-Any = TypeVar("Any")
 
-
-def one_of(rng: Generator, choices: Sequence[Any]) -> Any:
+def one_of(rng: Generator, choices: Sequence[Choice]) -> Choice:
     """Draw one of some things as it is."""
     return choices[int(rng.integers(len(choices)))]
 
@@ -213,9 +212,7 @@ def column_changed(rng: Generator, data: bytes) -> Spoiled:
     ]
     told, change = one_of(rng, changes)
     for row in there[1:]:
-        rows[row][column:] = [change(cell) for cell in rows[row][column : column + 1]] + rows[row][
-            column + 1 :
-        ]
+        rows[row][column : column + 1] = map(change, rows[row][column : column + 1])
     return f"column {column + 1}: {told}", _joined(rows, separator)
 
 
