@@ -18,6 +18,7 @@ from fuzz.running import Ending
 
 _WARNING = re.compile(r"^(?:.*/)?([^/:]+):\d+: (\w*Warning): (.*)\n(?:  .*\n)?", re.MULTILINE)
 _FRAME = re.compile(r'File "[^"]*/pipistrelle/([^"]+)", line \d+,? in (\S+)')
+_RAISED = re.compile(r"^((?:\w+\.)*\w*(?:Error|Exception|Interrupt|Exit)\b.*)", re.MULTILINE)
 _NUMBER = re.compile(r"[-+]?\d[\d.,_]*(?:e[-+]?\d+)?")
 _QUOTED = re.compile(r"'[^']*'|\"[^\"]*\"")
 ERROR, OWN = "pipistrelle: error: ", "pipistrelle: "
@@ -60,8 +61,9 @@ def _faults_of(ending: Ending, names: Iterable[str], statuses: Iterable[int]) ->
     if ending.how == "hung":
         yield f"hangs in {' < '.join(_frames(ending.said)[:1]) or 'no code of ours'}"
     elif ending.how == "raised":
-        frames, last = _frames(ending.said), ending.said.strip().splitlines()[-1]
-        yield f"{kind_of(last)} in {frames[-1] if frames else 'no code of ours'}"
+        frames, raised = _frames(ending.said), _RAISED.findall(ending.said)
+        what = kind_of(raised[-1]) if raised else "something"
+        yield f"{what} in {frames[-1] if frames else 'no code of ours'}"
     elif ending.how == "died":
         number = -ending.found
         known = number in {*signal.Signals}

@@ -50,6 +50,8 @@ OURS = (
     *("steps/iteration_00001.parquet.0123abcd.partial", "README.md.0123abcd.partial"),
 )
 """Names that a killed writer leaves."""
+FOLDER = ("study: holds", "study: lacks", "study: no world is done yet")
+"""What is said of the folder itself."""
 KEPT = "results.pickle"
 PATIENCE = 5
 """How often a refusal's advice is taken."""
@@ -274,7 +276,7 @@ def attempt(rng: Generator, place: Path, sound: Path) -> Tried:
     endings, faults = [], []
     for words in one_of(rng, [(AGAIN, REPORT), (REPORT, AGAIN, REPORT)]):
         endings.append(command(place, *words, before=undrawn, limit=SLOW))
-        faults += faults_of(endings[-1], [*named, "study: holds", "study: lacks"])
+        faults += faults_of(endings[-1], [*named, *FOLDER])
         if words == REPORT or not forged:
             faults += _untrue(endings[-1], place, sound, users)
     faults += lost({name: before[name] for name in users}, contents(place), "a user's file")
