@@ -1,6 +1,7 @@
 """Studies that are killed at any moment, and gone on with."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -109,14 +110,16 @@ def _killed(rng: Generator, place: Path, sound: Sound) -> tuple[str, Ending, lis
 def _judged(ending: Ending, reached: str, number: signal.Signals) -> list[str]:
     """Name what is wrong with the end of a study that was killed."""
     name = signal.Signals(number).name
-    right = {0} if reached == "worker" else {0, 130 if number == signal.SIGINT else -number}
+    right = {0} if reached == "worker" else {0, -number}  # the latter before and after Python
+    right |= {130} if number == signal.SIGINT else set()
     faults = []
     if ending.how == "hung":
         faults.append(f"does not end after {name} to the {reached}")
     elif ending.found not in right:
         faults.append(f"ends with status {ending.found} after {name} to the {reached}")
-    if warnings := [line for line in ending.said.splitlines() if "Warning: " in line]:
-        faults.append(f"warns after {name} to the {reached}: {kind_of(warnings[0])}")
+    warned = re.findall(r"\w*Warning: .*", ending.said)
+    if warned and number != signal.SIGKILL:  # of which nothing can be told but by others
+        faults.append(f"warns after {name} to the {reached}: {kind_of(warned[0])}")
     if "Traceback" in ending.said:
         last = ending.said.strip().splitlines()[-1]
         faults.append(f"says a traceback after {name} to the {reached}: {last[:60]}")
