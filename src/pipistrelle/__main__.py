@@ -1,9 +1,10 @@
 """The command line: verbs, errors and exit statuses.
 
-0: done. 1: done, with failed trials. 2: bad input, said in a line. 130: interrupted; what is done
-is kept. A traceback is always a bug of ours.
+0: done. 1: done, with failed trials. 2: bad input, said in a line. 130: interrupted, 143: asked to
+end; what is done is kept. A traceback is always a bug of ours.
 """
 
+import signal
 import sys
 from collections.abc import Sequence
 from errno import ENOSPC
@@ -13,6 +14,7 @@ from itertools import pairwise, zip_longest
 from cyclopts import App, CycloptsError, MissingArgumentError, UnusedCliTokensError
 
 from pipistrelle import __version__
+from pipistrelle.verbs.signals import heard_signals
 from pipistrelle.verbs.streams import flush_results, hold_streams, say
 
 SPELLINGS = (
@@ -93,15 +95,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     words = sys.argv[1:] if arguments is None else arguments
     hold_streams()
+    with heard_signals() as heard:
+        try:
+            status = _obey(words, heard)
+        except (Exception, KeyboardInterrupt) as error:
+            if not heard and isinstance(error, Exception):
+                raise
+            say("pipistrelle: interrupted")
+            status = 128 + (heard[0] if heard else signal.SIGINT)
+    if arguments is None:  # nothing is left to be interrupted
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return status
+
+
+def _obey(words: Sequence[str], heard: Sequence[int]) -> int:
+    """Obey a command line, and say what of it was a mistake, unless it was asked to end."""
     try:
         status = app(_completed(words)) or 0
         flush_results()
-    except KeyboardInterrupt:
-        say("pipistrelle: interrupted")
-        return 130
     except (CycloptsError, OSError, ValueError, MemoryError) as error:
         message = _explained(error, words)
-        if message is None:
+        if message is None or heard:
             raise
         for line in message.splitlines():
             say(f"pipistrelle: error: {line}")

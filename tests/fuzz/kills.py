@@ -111,7 +111,7 @@ def _judged(ending: Ending, reached: str, number: signal.Signals) -> list[str]:
     """Name what is wrong with the end of a study that was killed."""
     name = signal.Signals(number).name
     right = {0} if reached == "worker" else {0, -number}  # the latter before and after Python
-    right |= {130} if number == signal.SIGINT else set()
+    right |= {130} if number == signal.SIGINT else {143} if number == signal.SIGTERM else set()
     faults = []
     if ending.how == "hung":
         faults.append(f"does not end after {name} to the {reached}")

@@ -136,9 +136,11 @@ def make_strange(sound: Path) -> None:
     """Make tables of other columns, of nulls and of no rows, some with sums that are right."""
     import polars as pl
 
+    from pipistrelle.experiments.studies.plan_file import read_plan
     from pipistrelle.experiments.studies.world_files import TABLES, with_sums
 
     (sound / "strange").mkdir()
+    plan = read_plan(sound / "study" / "plan.toml")
     tables = {name: pl.read_parquet(sound / "study" / name / WORLDS[0]) for name in TABLES}
     for name, table in tables.items():
         column = table.columns[-1]
@@ -156,7 +158,7 @@ def make_strange(sound: Path) -> None:
             other.write_parquet(buffer)
             (sound / "strange" / f"{name}-{kind}").write_bytes(buffer.getvalue())
             if kind in ("few", "many", "text", "other"):
-                for table_name, file in with_sums(tables | {name: other}, 0).items():
+                for table_name, file in with_sums(tables | {name: other}, plan, 0).items():
                     place = sound / "strange" / f"{name}-{kind}-summed"
                     place.mkdir(exist_ok=True)
                     (place / table_name).write_bytes(file)

@@ -170,7 +170,7 @@ def write_store(folder: Path, study: Study, *, iterations=None, seed=3, failed=(
             )
             for name in TABLES
         }
-        for name, file in with_sums(frames, iteration).items():
+        for name, file in with_sums(frames, plan, iteration).items():
             world_file(folder, name, iteration).write_bytes(file)
     for row, number in failed:
         full[row, number], error[row, number] = False, np.nan

@@ -8,6 +8,7 @@ import pytest
 
 from pipistrelle.config import InputError
 from pipistrelle.experiments.studies.plan import cases_of
+from pipistrelle.experiments.studies.plan_file import read_plan
 from pipistrelle.experiments.studies.world_files import TABLES, with_sums, world_file
 from pipistrelle.report.reading import read_study
 from pipistrelle.report.studied import COMMON, SCORES
@@ -169,6 +170,8 @@ def test_a_table_of_another_shape_is_refused(tmp_path):
     write_store(folder, invent(1))
     tables = {name: pl.read_parquet(world_file(folder, name, 0)) for name in TABLES}
     lacking = tables | {"trials": tables["trials"].drop("nees_max")}
-    world_file(folder, "trials", 0).write_bytes(with_sums(lacking, 0)["trials"])
+    world_file(folder, "trials", 0).write_bytes(
+        with_sums(lacking, read_plan(folder / "plan.toml"), 0)["trials"]
+    )
     with pytest.raises(InputError, match=r"iteration_00000\.parquet: has not the columns"):
         read_study(folder)

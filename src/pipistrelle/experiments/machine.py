@@ -73,8 +73,8 @@ def check_memory(
         known = entry(name)
         need, have = known.memory(landmarks, each_ray, config), installed()
         if need * workers > have:
-            ray = f" of {each_ray:,} members each" if passive else ""
-            particles = f" and {config.fastslam.particles} particles"
+            ray = f" of {each_ray:,} members each (rays.density)" if passive else ""
+            particles = f" and {config.fastslam.particles} particles (fastslam.particles)"
             held = particles if "fastslam" in known.sections else ""
             raise _too_large(f"{name}: {landmarks} landmarks{ray}{held}", need, have, workers)
 

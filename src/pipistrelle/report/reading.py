@@ -48,7 +48,7 @@ def read_study(folder: Path) -> tuple[Study, ...]:
 
     stored = load_study(folder)
     for world in sorted(done_worlds(folder)):
-        check_world(folder, world)
+        check_world(folder, stored.plan, world)
     try:
         trials = stored.trials.collect()
         if trials.is_empty():

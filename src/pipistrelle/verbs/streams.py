@@ -34,7 +34,7 @@ def hold_streams() -> None:
 
 
 def say(message: str) -> None:
-    """Write a line to standard error at once, if anybody can read it.
+    """Write a line to standard error at once, if anybody can read it; no character commands.
 
     Parameters
     ----------
@@ -44,9 +44,10 @@ def say(message: str) -> None:
     --------
     >>> say("Compiling kernels (once) ...")
     """
+    text = "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in message)
     with suppress(OSError):
         try:
-            print(message, file=sys.stderr, flush=True)
+            print(text, file=sys.stderr, flush=True)
         except OSError:
             _silence(sys.stderr)
 

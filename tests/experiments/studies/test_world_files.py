@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import polars as pl
@@ -20,6 +21,7 @@ from pipistrelle.experiments.studies.world_files import (
     world_file,
     write_world,
 )
+from pipistrelle.settings import from_flags, resolve
 from reference.studies import contents, leftovers
 
 
@@ -30,7 +32,7 @@ def test_a_world_is_done_when_its_trials_are_there(folder, plan, records):
     for table in TABLES:
         assert world_file(folder, table, 2).is_file()
     assert leftovers(folder) == []
-    assert read_ended_trials(folder, 2) == [(r.case.strategy, r.error) for r in records]
+    assert read_ended_trials(folder, plan, 2) == [(r.case.strategy, r.error) for r in records]
 
 
 def test_the_trials_go_last(folder, plan, records, monkeypatch):
@@ -122,22 +124,41 @@ def test_a_damaged_world_is_named_with_the_way_out(folder, plan):
     with pytest.raises(
         InputError, match=r"0\.parquet: could not be read: it is no whole .*; remove"
     ):
-        read_ended_trials(folder, 0)
+        read_ended_trials(folder, plan, 0)
 
 
 @pytest.mark.parametrize("table", TABLES)
 @pytest.mark.parametrize("place", [0.1, 0.5, 0.8, 0.9, 0.98])
 def test_one_bit_that_a_disk_changed_is_noticed(folder, plan, records, table, place):
     write_world(folder, plan, 3, records)
-    check_world(folder, 3)
+    check_world(folder, plan, 3)
     path = world_file(folder, table, 3)
     data = bytearray(path.read_bytes())
     data[int(place * len(data))] ^= 4
     path.write_bytes(data)
     with pytest.raises(InputError) as refused:
-        read_ended_trials(folder, 3)
+        read_ended_trials(folder, plan, 3)
     assert str(refused.value).startswith(f"{path}: ")
     assert "remove trials/iteration_00003.parquet" in str(refused.value)
+
+
+def test_a_world_of_another_plan_is_noticed_and_more_worlds_are_no_other_plan(
+    folder, plan, records
+):
+    write_world(folder, plan, 0, records)
+    check_world(folder, replace(plan, iterations=99), 0)
+    other = replace(plan, config=resolve(from_flags({"rays": {"power": 3.0}})))
+    with pytest.raises(InputError, match=r"iteration_00000\.parquet: was computed by another plan"):
+        check_world(folder, other, 0)
+
+
+def test_trials_of_other_columns_are_named_though_their_sums_are_right(folder, plan, records):
+    tables = world_files.world_tables(plan, 0, records)
+    other = tables | {"trials": tables["trials"].drop("error")}
+    for name, file in world_files.with_sums(other, plan, 0).items():
+        world_file(folder, name, 0).write_bytes(file)
+    with pytest.raises(InputError, match=r"iteration_00000\.parquet: has not the columns"):
+        read_ended_trials(folder, plan, 0)
 
 
 @pytest.mark.parametrize("table", TABLES)
@@ -149,12 +170,12 @@ def test_a_file_of_another_world_or_by_another_hand_is_noticed(folder, plan, tab
     shutil.copy(there, here)
     found = "is the file of world 1" if table == "trials" else "is not as it was written"
     with pytest.raises(InputError, match=found):
-        check_world(folder, 0)
+        check_world(folder, plan, 0)
     here.write_bytes(kept)
-    check_world(folder, 0)
+    check_world(folder, plan, 0)
     pl.read_parquet(kept)[::2].write_parquet(here)
     with pytest.raises(InputError, match=r"bears no sums|is not as it was written"):
-        check_world(folder, 0)
+        check_world(folder, plan, 0)
 
 
 def test_a_writer_killed_while_it_replaces_a_world_leaves_it_undone(
@@ -189,7 +210,7 @@ def test_no_name_of_a_folder_is_a_pattern_or_a_place_elsewhere(
     for folder in {Path(name), beside}:
         world_files_of(folder, plan, records)
     for folder in {Path(name), beside}:
-        assert len(read_ended_trials(folder, 0)) == len(records)
+        assert len(read_ended_trials(folder, plan, 0)) == len(records)
         study = load_study(folder)
         assert [len(getattr(study, table).collect()) for table in TABLES] == [
             0,

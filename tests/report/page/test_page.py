@@ -352,11 +352,12 @@ def test_a_third_filter_has_its_panels_rows_and_files(tmp_path):
 
 def test_a_stored_study_of_a_filter_that_is_not_installed_can_be_read(store, tmp_path, undrawn):
     folder = shutil.copytree(store, tmp_path / "store")
+    plan = read_plan(folder / "plan.toml")
     for world in done_worlds(folder):
         paths = {name: world_file(folder, name, world) for name in TABLES}
         tables = {name: pl.read_parquet(path) for name, path in paths.items()}
         name = pl.col("filter").replace("fastslam", "no_such_module:Slam")
         changed = tables | {"trials": tables["trials"].with_columns(name)}
-        paths["trials"].write_bytes(with_sums(changed, world)["trials"])
+        paths["trials"].write_bytes(with_sums(changed, plan, world)["trials"])
     write_report(read_study(folder), tmp_path)
     assert panels_of(tmp_path, "map_rmse") == ["EKF", "Slam"]

@@ -130,7 +130,7 @@ def run_study(
     so_far = _nothing_done(plan, len(worlds))
     waiting: deque[int] = deque()
     for iteration in worlds:
-        trials = read_ended_trials(folder, iteration) if iteration in done else None
+        trials = read_ended_trials(folder, plan, iteration) if iteration in done else None
         if trials is None or (retry_failed and any(trial.error for trial in trials)):
             waiting.append(iteration)
         else:

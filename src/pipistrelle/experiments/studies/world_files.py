@@ -10,6 +10,7 @@ import contextlib
 import io
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
@@ -18,6 +19,7 @@ from uuid import uuid4
 
 from pipistrelle.config import InputError
 from pipistrelle.experiments.studies.plan import Plan
+from pipistrelle.experiments.studies.plan_file import plan_text
 from pipistrelle.experiments.studies.world import TrialRecord, world_tables
 from pipistrelle.files import put_in_place, write_down
 
@@ -30,7 +32,8 @@ _SUM = "pipistrelle.sha256.{}"
 """Where a table's sum stands among what the file of trials says of itself."""
 _NO_SUM = "-" * 64
 """In place of the sum of the file of trials, when that is taken."""
-_WORLD = "pipistrelle.iteration"
+_WORLD, _PLAN = "pipistrelle.iteration", "pipistrelle.plan"
+"""Which world it is, and the sum of the plan by which it was computed."""
 
 
 class EndedTrial(NamedTuple):
@@ -102,7 +105,7 @@ def write_world(folder: Path, plan: Plan, iteration: int, records: Sequence[Tria
     InputError
         Where they cannot be written; earlier ones are then as they were.
     """
-    files = with_sums(world_tables(plan, iteration, records), iteration)
+    files = with_sums(world_tables(plan, iteration, records), plan, iteration)
     partial = f".{uuid4().hex[:8]}.partial"
     paths = [world_file(folder, name, iteration) for name in TABLES]
     try:
@@ -117,13 +120,14 @@ def write_world(folder: Path, plan: Plan, iteration: int, records: Sequence[Tria
         sweep(folder, [iteration] if paths[-1].exists() else [], partial)
 
 
-def with_sums(tables: "Mapping[str, pl.DataFrame]", iteration: int) -> dict[str, bytes]:
-    """Make files of a world's tables; that of the trials bears the sums of all.
+def with_sums(tables: "Mapping[str, pl.DataFrame]", plan: Plan, iteration: int) -> dict[str, bytes]:
+    """Make files of a world's tables; that of the trials bears the sums of all, and of the plan.
 
     Parameters
     ----------
     tables : mapping of DataFrame
         By the names in `TABLES`.
+    plan : Plan
     iteration : int
 
     Returns
@@ -132,7 +136,7 @@ def with_sums(tables: "Mapping[str, pl.DataFrame]", iteration: int) -> dict[str,
     """
     files = {name: _parquet(tables[name]) for name in TABLES[:-1]}
     said = {_SUM.format(name): sha256(file).hexdigest() for name, file in files.items()}
-    said |= {_SUM.format("trials"): _NO_SUM, _WORLD: str(iteration)}
+    said |= {_SUM.format("trials"): _NO_SUM, _WORLD: str(iteration), _PLAN: _plan_sum(plan)}
     trials = _parquet(tables["trials"], said)
     own = sha256(trials).hexdigest()
     return files | {"trials": trials.replace(_NO_SUM.encode(), own.encode())}
@@ -171,12 +175,19 @@ def sweep(folder: Path, iterations: Iterable[int], partial: str = "") -> None:
                 path.unlink(missing_ok=True)
 
 
-def read_ended_trials(folder: Path, iteration: int) -> list[EndedTrial]:
+def _plan_sum(plan: Plan) -> str:
+    """Sum up all of a plan but the number of its worlds."""
+    return sha256(plan_text(replace(plan, iterations=1)).encode()).hexdigest()
+
+
+def read_ended_trials(folder: Path, plan: Plan, iteration: int) -> list[EndedTrial]:
     """Tell how the trials of a world that is done ended.
 
     Parameters
     ----------
     folder : Path
+    plan : Plan
+        By which it should have been computed.
     iteration : int
 
     Returns
@@ -190,16 +201,23 @@ def read_ended_trials(folder: Path, iteration: int) -> list[EndedTrial]:
     """
     import polars as pl
 
-    trials = pl.read_parquet(check_world(folder, iteration), columns=[*EndedTrial._fields])
-    return [EndedTrial(*row) for row in trials.rows()]
+    file = check_world(folder, plan, iteration)
+    try:
+        trials = pl.read_parquet(file, columns=[*EndedTrial._fields])
+        return [EndedTrial(*row) for row in trials.rows()]
+    except pl.exceptions.PolarsError:
+        flaw = "has not the columns of this study"
+        raise damaged(folder, "trials", iteration, flaw) from None
 
 
-def check_world(folder: Path, iteration: int) -> bytes:
+def check_world(folder: Path, plan: Plan, iteration: int) -> bytes:
     """Refuse a world that is done, but of which a file is not as it was written.
 
     Parameters
     ----------
     folder : Path
+    plan : Plan
+        By which it should have been computed.
     iteration : int
 
     Returns
@@ -217,7 +235,7 @@ def check_world(folder: Path, iteration: int) -> bytes:
         path = world_file(folder, name, iteration)
         try:
             found[name] = path.read_bytes()
-            flaw = _flaw(name, found, iteration)
+            flaw = _flaw(name, found, plan, iteration)
         except FileNotFoundError:
             flaw = "is missing"
         except OSError as error:
@@ -248,7 +266,7 @@ def damaged(folder: Path, table: str, iteration: int, flaw: str) -> InputError:
     )
 
 
-def _flaw(name: str, found: dict[str, bytes], iteration: int) -> str | None:
+def _flaw(name: str, found: dict[str, bytes], plan: Plan, iteration: int) -> str | None:
     """Tell what is wrong with a file, by what that of the trials says; the trials come first."""
     import polars as pl
 
@@ -260,6 +278,8 @@ def _flaw(name: str, found: dict[str, bytes], iteration: int) -> str | None:
         return "bears no sums: it is of an earlier version, or not Pipistrelle's"
     if said[_WORLD] != str(iteration):
         return f"is the file of world {said[_WORLD]}"
+    if name == "trials" and said.get(_PLAN) != _plan_sum(plan):
+        return "was computed by another plan than the plan.toml that is here now"
     expected, file = said.get(_SUM.format(name), _NO_SUM), found[name]
     if name == "trials":
         file = file.replace(expected.encode(), _NO_SUM.encode())

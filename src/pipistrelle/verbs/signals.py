@@ -1,0 +1,43 @@
+"""Signals that ask for an end: Ctrl-C, and what a scheduler of jobs sends before it kills."""
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+ENDING = (signal.SIGINT, signal.SIGTERM)
+
+
+@contextmanager
+def heard_signals() -> Iterator[list[int]]:
+    """Let signals that ask for an end interrupt what is done, so that it is ended in order.
+
+    Yields
+    ------
+    list of int
+        Those that were heard. A library may hide the interruption behind an error of its own.
+
+    Examples
+    --------
+    >>> from contextlib import suppress
+    >>> with suppress(KeyboardInterrupt), heard_signals() as heard:
+    ...     signal.raise_signal(signal.SIGTERM)
+    >>> heard
+    [15]
+    """
+    heard: list[int] = []
+
+    def interrupt(number: int, _: FrameType | None) -> None:
+        heard.append(number)
+        raise KeyboardInterrupt
+
+    try:
+        before = {ending: signal.signal(ending, interrupt) for ending in ENDING}
+    except ValueError:  # not in the main thread, which hears them
+        yield heard
+        return
+    try:
+        yield heard
+    finally:
+        for ending, handler in before.items():
+            signal.signal(ending, handler)
