@@ -112,7 +112,7 @@ def test_a_log_is_refused_that_may_need_more_memory_than_there_is_for_its_rays(
     bytes_of = [24.0 * (3 + 2 * there * members) ** 2 for members in (1, 4)]
     monkeypatch.setattr("pipistrelle.experiments.machine.installed", lambda: np.mean(bytes_of))
     said = refused("slam", log, "-o", "two")
-    assert said.startswith(f"ekf: {there} landmarks of 4 members each may need")
+    assert said.startswith(f"ekf: {there} landmarks of 4 members each (rays.density) may need")
     assert not Path("two").exists()
 
 
