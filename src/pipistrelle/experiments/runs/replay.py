@@ -201,7 +201,7 @@ def replay(
     beamwidth : [rad], optional
         See `as_heard_by`.
     config : Config
-        Its sections filter and rays, which must agree with the log.
+        Its sections that estimators read; what the log decides must agree with it.
     progress, watch : callable, optional
 
     Returns
