@@ -238,6 +238,7 @@ def _asked(config: Config, grid: Mapping[str, Sequence[Any]]) -> dict[str, Any]:
         for part in key:
             value = value[part]
         found[".".join(key)] = value
+    found["air.speed_of_sound"] = config.air.celerity
     del found["seed"]
     return found | {RADIUS: sorted(grid.get(RADIUS, [found[RADIUS]]))}
 
