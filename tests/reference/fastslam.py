@@ -154,9 +154,9 @@ class SlowFastSlam:
         nu, Hx, Hm, R = self.innovation(p.pose, member, distance, bearing, inflation)
         return nu, Hx @ p.P @ Hx.T + Hm @ member.covariance @ Hm.T + R, Hx
 
-    def log_likelihoods(self, p, members, bearing):
+    def log_likelihoods(self, p, members, bearing, distance=math.nan):
         return [
-            float(log_normal(*self.expected(p, member, math.nan, bearing)[:2]))
+            float(log_normal(*self.expected(p, member, distance, bearing)[:2]))
             for member in members
         ]
 
@@ -219,9 +219,7 @@ class SlowFastSlam:
             if self.too_near(p.pose, members[0]):
                 return 0.0
             return float(log_normal(*self.expected(p, members[0], distance, bearing)[:2]))
-        if not math.isnan(distance):
-            return 0.0
-        logs = self.log_likelihoods(p, members, bearing)
+        logs = self.log_likelihoods(p, members, bearing, distance)
         return log_sum([logarithm(m.weight) + log for m, log in zip(members, logs, strict=True)])
 
     def refine(self, p, members, distance, bearing):

@@ -8,6 +8,7 @@ import pytest
 from pipistrelle.estimation.fastslam.block import (
     HEADING,
     LANES,
+    LOG_WEIGHT,
     MEMBER,
     PHH,
     POSE,
@@ -23,6 +24,7 @@ from pipistrelle.estimation.fastslam.block import (
     refine_by_active,
     refine_by_bearing,
 )
+from pipistrelle.estimation.fastslam.block_rays import scratch_for, weigh_by_active
 from pipistrelle.estimation.measurement import NEAREST
 
 
@@ -82,3 +84,46 @@ def test_no_gate_drops_what_stands_at_the_pose_for_nothing_was_foreseen_of_it(of
     pose, member = uncertain_pair(offset * NEAREST)
     assert bearing_beyond(pose, member, 3.0, 0.01, alone, 0, 1e-9) == beyond
     assert active_beyond(pose, member, 50.0, 3.0, 0.04, 0.01, alone, 1e-9) == beyond
+
+
+def weighed(unit, distance=5.0):
+    """Log weights by a range and a bearing, lengths in a unit [1/m]: of a ray, of a full landmark.
+
+    Every other lane has three members, of which the second is as the other lanes' only one.
+    """
+    count = np.resize([3, 1], LANES).astype(np.int64)
+    (pose, _), rows = uncertain_pair(0.0), np.zeros((3, MEMBER))
+    for j, (offset, weight) in enumerate(((2.0, 0.5), (5.2, 0.3), (14.0, 0.2))):
+        rows[j] = uncertain_pair(offset)[1]
+        rows[j, LOG_WEIGHT : LOG_WEIGHT + LANES] = math.log(weight)
+    rows[0, 1:LANES:2] = rows[1, 1:LANES:2]
+    rows[0, LOG_WEIGHT + 1 : LOG_WEIGHT + LANES : 2] = 0.0
+    for places, power in ((slice(X, HEADING), 1), (slice(PXX, PYY + LANES), 2)):
+        pose[places] *= unit**power
+    rows[:, X:XX] *= unit
+    rows[:, XX:LOG_WEIGHT] *= unit**2
+    log_weight, heard = np.zeros(LANES), (distance * unit, 0.1, 0.04 * unit**2, 0.01)
+    weigh_by_active(pose, rows, heard, count, scratch_for(3), log_weight)
+    assert not log_weight[1::2].any()
+    refine_by_active(pose, rows[0], *heard, count, log_weight)
+    return log_weight[:2]
+
+
+@pytest.mark.parametrize("distance", [2.5, 5.0, 9.0])
+def test_the_weights_of_a_ray_and_of_a_full_landmark_do_not_hang_on_the_unit_of_length(distance):
+    ray, full = weighed(1.0, distance)
+    for unit in (1e3, 1e-2):
+        assert np.subtract(*weighed(unit, distance)) == pytest.approx(ray - full, rel=1e-9)
+    assert weighed(1e3, distance)[0] == pytest.approx(ray - math.log(1e3), rel=1e-9)
+
+
+def test_a_range_and_a_bearing_weigh_a_ray_by_the_mixture_of_its_members():
+    def density(offset):
+        S00, S11 = 0.01 + 0.25 + 0.04, (0.04 + 0.09) / offset**2 + 0.02 + 0.01
+        log = -0.5 * ((5.0 - offset) ** 2 / S00 + 0.1**2 / S11)
+        return math.exp(log) / (2.0 * math.pi * math.sqrt(S00 * S11))
+
+    mixture = 0.5 * density(2.0) + 0.3 * density(5.2) + 0.2 * density(14.0)
+    ray, full = weighed(1.0)
+    assert ray == pytest.approx(math.log(mixture), rel=1e-12)
+    assert full == pytest.approx(math.log(density(5.2)), rel=1e-12)

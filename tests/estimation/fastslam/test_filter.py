@@ -120,7 +120,7 @@ def assert_equal_whole_run(mission, particles, weights, partial, mixture, power,
 
 @pytest.mark.parametrize(("strategy", "weights", "partial", "mixture", "power", "gate"), FEW[::2])
 def test_run_equals_the_slow_reference(strategy, weights, partial, mixture, power, gate):
-    mission = small_mission(strategy, frames=25, outliers=0.04)
+    mission = small_mission(strategy, frames=32, outliers=0.04)
     assert_equal_whole_run(mission, 5, weights, partial, mixture, power, gate)
 
 

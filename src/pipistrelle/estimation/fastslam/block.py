@@ -205,6 +205,32 @@ def _active_spread(
 
 
 @no_alloc
+def expect_active(
+    pose: Poses,
+    member: Member,
+    distance: float,
+    bearing: float,
+    range_variance: float,
+    bearing_variance: float,
+    log_likelihood: Lanes,
+) -> None:
+    """Log likelihood, without its constant, of range and bearing of one member of a ray.
+
+    A member too near to foresee its bearing makes it uniform over the circle.
+    """
+    for i in range(LANES):
+        nu0, nu1, c, s, k, far = _active(pose, member, distance, bearing, i)
+        _, _, _, _, _, _, S00, S01, S11 = _active_spread(
+            pose, member, c, s, k, range_variance, bearing_variance, i
+        )
+        e0, e1, i0, i1, _ = _whitened(nu0, nu1, S00, S01, S11)
+        value = -0.5 * (e0 * e0 + e1 * e1) + logarithm(i0 * i1)
+        S00 = member[XX + i] + member[YY + i] + range_variance
+        unforeseen = -0.5 * (nu0 * nu0 / S00 + logarithm(S00)) - HALF_LOG_TAU
+        log_likelihood[i] = value if far else unforeseen
+
+
+@no_alloc
 def active_beyond(
     pose: Poses,
     member: Member,

@@ -30,6 +30,7 @@ from pipistrelle.estimation.fastslam.block import (
     X,
     Y,
     correct_by_bearing,
+    expect_active,
     expect_bearing,
     refine_by_bearing,
 )
@@ -176,6 +177,37 @@ def refine_by_ray(
     _share(members, sensing, scratch)
     for j in range(members):
         refine_by_bearing(pose, rows[j], bearing, variance, scratch.share[j])
+
+
+@no_alloc
+def weigh_by_active(
+    pose: Poses,
+    rows: Rows,
+    heard: tuple[float, float, float, float],
+    count: Counts,
+    scratch: Scratch,
+    log_weight: Lanes,
+) -> None:
+    """Weigh the poses whose landmark is a ray by its range and bearing: the members' mixture.
+
+    ``heard`` are the two and their variances. Where the landmark has one member,
+    `refine_by_active` weighs: by a density over the same range and bearing, so that weights do not
+    hang on the units of either.
+    """
+    members = most(count)
+    if members == 1:
+        return
+    distance, bearing, range_variance, bearing_variance = heard
+    for j in range(members):
+        likelihood = scratch.likelihood[j]
+        expect_active(
+            pose, rows[j], distance, bearing, range_variance, bearing_variance, likelihood
+        )
+        for i in range(LANES):
+            likelihood[i] = likelihood[i] if j < count[i] else -np.inf
+    _weigh(rows, members, scratch)
+    for i in range(LANES):
+        log_weight[i] += scratch.total[i] - 2.0 * HALF_LOG_TAU if count[i] > 1 else 0.0
 
 
 @no_alloc

@@ -7,9 +7,9 @@ per hypothesis and no joint covariance. A frame goes through five steps.
    sample, then each measurement of a mapped landmark refines them (Eqs. (13) and (14), in Kalman
    form, each at the refined mean). A particle's weight grows by each measurement's marginal
    likelihood :math:`N(\nu_i; 0, H_x P_{i-1} H_x^T + H_m P_m H_m^T + R)`, the product of which is
-   the likelihood of the frame given the particle's past. A bearing of a partial landmark has
-   :math:`\log \sum_j \Lambda_j N(\nu_j; 0, S_j)`; a range for a partial landmark and a new
-   landmark add no weight.
+   the likelihood of the frame given the particle's past. Of a partial landmark it
+   is the members' mixture, :math:`\sum_j \Lambda_j N(\nu_j; 0, S_j)`, for a bearing and for a
+   range with its bearing alike; a new landmark adds no weight.
 2. **Sample** the pose, once.
 3. **Correct** the landmarks, weigh, share and prune the rays (`rays`), from the sampled pose.
 4. **Place** new landmarks from the sampled pose.

@@ -36,6 +36,7 @@ from pipistrelle.estimation.fastslam.block_rays import (
     most,
     refine_by_ray,
     scratch_for,
+    weigh_by_active,
 )
 from pipistrelle.estimation.measurement import Columns, Measurements, measurements
 from pipistrelle.estimation.rays import Sensing
@@ -193,6 +194,8 @@ def _refine(
                 block.pose, rows, count, bearing, variance, sensing, scratch, block.gained
             )
         else:
+            rho_beta = (heard.range[m], bearing, heard.range_variance[m], variance)
+            weigh_by_active(block.pose, rows, rho_beta, count, scratch, block.gained)
             refine_by_active(
                 block.pose, rows[0], heard.range[m], bearing, heard.range_variance[m], variance,
                 count, block.gained,

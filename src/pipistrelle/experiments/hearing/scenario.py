@@ -250,7 +250,7 @@ def _place_landmarks(
 ) -> Float[np.ndarray, "n 2"]:
     """Draw landmarks one by one, uniformly over the disc, until each keeps its distances."""
     half = 0.5 * setup.spacing
-    most = DENSEST * ((setup.radius + half) / half) ** 2 if half > 0.0 else math.inf
+    most = DENSEST * ((setup.radius + half) / max(half, 1e-100)) ** 2
     if setup.landmarks > max(most, 1.0):
         raise _too_many(setup, f"at most {max(int(most), 1)} fit")
     placed = np.empty((setup.landmarks, 2))
