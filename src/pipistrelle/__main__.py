@@ -1,4 +1,4 @@
-"""The command line: verbs, errors and exit statuses.
+"""The command line: signals, streams and exit statuses.
 
 0: done. 1: done, with failed trials. 2: bad input, said in a line. 130: interrupted, 143: asked to
 end; what is done is kept. A traceback is always a bug of ours.
@@ -7,72 +7,9 @@ end; what is done is kept. A traceback is always a bug of ours.
 import signal
 import sys
 from collections.abc import Sequence
-from errno import ENOSPC
-from inspect import Parameter, signature
-from itertools import pairwise, zip_longest
 
-from cyclopts import App, CycloptsError, MissingArgumentError, UnusedCliTokensError
-
-from pipistrelle import __version__
 from pipistrelle.verbs.signals import heard_signals
-from pipistrelle.verbs.streams import flush_results, hold_streams, say
-
-SPELLINGS = (
-    "A setting is --rays.power 3 as a flag, PIPISTRELLE_RAYS__POWER=3 in the environment and "
-    "power = 3 under [rays] in FILE.toml; flags go before the environment, that before the file."
-)
-
-FILMS = ("gif", "mp4")
-
-app = App(
-    name="pipistrelle",
-    help="Sonar SLAM with one's own calls, someone else's, or both: from waveform to verdict.",
-    version=__version__,
-    help_format="plaintext",
-    exit_on_error=False,
-    print_error=False,
-    result_action="return_value",
-    suppress_keyboard_interrupt=False,
-)
-app.command(
-    "pipistrelle.verbs.run:run",
-    name="run",
-    help="Drive through one random world, by sound; the three strategies side by side.",
-    help_epilogue=SPELLINGS,
-)
-app.command(
-    "pipistrelle.verbs.slam:slam",
-    name="slam",
-    help="Solve a recorded log: a log folder, or a UTIAS MRCLAM folder as it is.",
-    help_epilogue=SPELLINGS,
-)
-app.command(
-    "pipistrelle.verbs.study:study",
-    name="study",
-    help="Run many worlds, and all that a plan varies in each; again on one folder: go on.",
-    help_epilogue=SPELLINGS,
-)
-app.command(
-    "pipistrelle.verbs.report:report",
-    name="report",
-    help="Put a study on one page: the paper's claims judged, every figure, the numbers.",
-)
-config = App(name="config", help="Show the settings, or what a file of settings may hold.")
-config.command(
-    "pipistrelle.verbs.config:show",
-    name="show",
-    help="Print the settings as TOML: defaults < file < environment < flags.",
-    help_epilogue=SPELLINGS,
-)
-config.command(
-    "pipistrelle.verbs.config:schema", name="schema", help="Print the settings' JSON schema."
-)
-app.command(config)
-app.command(
-    "pipistrelle.verbs.doctor:doctor",
-    name="doctor",
-    help="Say what is installed here, and how to fix what is missing.",
-)
+from pipistrelle.verbs.streams import hold_streams, say
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -97,7 +34,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     hold_streams()
     with heard_signals() as heard:
         try:
-            status = _obey(words, heard)
+            from pipistrelle.verbs.command_line import obey
+
+            status = obey(words, heard)
         except (Exception, KeyboardInterrupt) as error:
             if not heard and isinstance(error, Exception):
                 raise
@@ -106,62 +45,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:  # nothing is left to be interrupted
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     return status
-
-
-def _obey(words: Sequence[str], heard: Sequence[int]) -> int:
-    """Obey a command line, and say what of it was a mistake, unless it was asked to end."""
-    try:
-        status = app(_completed(words)) or 0
-        flush_results()
-    except (CycloptsError, OSError, ValueError, MemoryError) as error:
-        message = _explained(error, words)
-        if message is None or heard:
-            raise
-        for line in message.splitlines():
-            say(f"pipistrelle: error: {line}")
-        return 2
-    return status
-
-
-def _completed(words: Sequence[str]) -> list[str]:
-    """Give a bare ``--animate`` its format."""
-    return [
-        "--animate=gif" if word == "--animate" and after not in FILMS else word
-        for word, after in zip_longest(words, words[1:])
-    ]
-
-
-def _explained(error: Exception, words: Sequence[str]) -> str | None:
-    """Word a user's mistake; None for a bug."""
-    from pipistrelle.config import InputError
-
-    if isinstance(error, MemoryError):
-        return (
-            f"not enough memory ({error}); ask for a shorter drive (scenario.steps), fewer "
-            "landmarks (scenario.landmarks) or fewer particles (fastslam.particles)"
-        )
-    if isinstance(error, OSError) and error.filename:
-        return f"{error.filename}: {error.strerror}"
-    if isinstance(error, OSError) and error.errno == ENOSPC:  # a full disk behind our output
-        return f"the output could not be written: {error.strerror}"
-    if isinstance(error, UnusedCliTokensError) and error.unused_tokens and error.target:
-        return _too_many(error, error.unused_tokens[0], words)
-    if isinstance(error, MissingArgumentError) and error.keyword and error.argument:
-        expected = error.argument.token_count()[0]
-        if expected > 1:
-            found = len(error.tokens_so_far) % expected
-            return f"{error.keyword}: found {found} values, expected {expected}"
-    return str(error) if isinstance(error, (CycloptsError, InputError)) else None
-
-
-def _too_many(error: UnusedCliTokensError, word: str, words: Sequence[str]) -> str:
-    """Say of a word that is left over where it stands."""
-    if ("--animate", word) in pairwise(words):
-        return f"--animate: found {word!r}, expected {' or '.join(FILMS)}"
-    verb, kinds = " ".join(error.command_chain or ()), signature(error.target or main).parameters
-    takes = sum(kind.kind is Parameter.POSITIONAL_ONLY for kind in kinds.values())
-    most = "no arguments" if not takes else "one argument" if takes == 1 else f"{takes} arguments"
-    return f"{verb}: found {word!r}, but {verb} takes {most}; options begin with --"
 
 
 if __name__ == "__main__":

@@ -8,6 +8,14 @@ from types import FrameType
 ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
+class Interrupted(KeyboardInterrupt):
+    """An interruption that is caught.
+
+    Of a plain one that reaches a text run by ``exec``, as libraries do when they are imported,
+    Python remembers that nobody caught it, and ends by that signal even if somebody did.
+    """
+
+
 @contextmanager
 def heard_signals() -> Iterator[list[int]]:
     """Let signals that ask for an end interrupt what is done, so that it is ended in order.
@@ -29,7 +37,7 @@ def heard_signals() -> Iterator[list[int]]:
 
     def interrupt(number: int, _: FrameType | None) -> None:
         heard.append(number)
-        raise KeyboardInterrupt
+        raise Interrupted
 
     try:
         before = {ending: signal.signal(ending, interrupt) for ending in ENDING}
