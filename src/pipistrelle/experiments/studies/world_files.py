@@ -8,9 +8,9 @@ world is noticed.
 
 import contextlib
 import io
+import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
@@ -19,7 +19,6 @@ from uuid import uuid4
 
 from pipistrelle.config import InputError
 from pipistrelle.experiments.studies.plan import Plan
-from pipistrelle.experiments.studies.plan_file import plan_text
 from pipistrelle.experiments.studies.world import TrialRecord, world_tables
 from pipistrelle.files import put_in_place, write_down
 
@@ -176,8 +175,11 @@ def sweep(folder: Path, iterations: Iterable[int], partial: str = "") -> None:
 
 
 def _plan_sum(plan: Plan) -> str:
-    """Sum up all of a plan but the number of its worlds."""
-    return sha256(plan_text(replace(plan, iterations=1)).encode()).hexdigest()
+    """Sum up what a plan's worlds depend on; a setting that is new has its default in old plans."""
+    config = plan.config.model_dump(mode="json", exclude_defaults=True)
+    grid = {name: list(values) for name, values in plan.grid.items()}
+    said = json.dumps([plan.strategies, plan.filters, config, grid], sort_keys=True)
+    return sha256(said.encode()).hexdigest()
 
 
 def read_ended_trials(folder: Path, plan: Plan, iteration: int) -> list[EndedTrial]:
