@@ -412,3 +412,48 @@ def test_a_call_is_found_in_its_own_tone_alone_whichever_of_three_it_is():
     for _, bearing, caller, _ in rows:
         (angle,) = found.angle[front & (found.caller == caller)]
         assert angle == pytest.approx(np.radians(bearing), abs=2e-3)
+
+
+# A run above the threshold as one snapshot
+
+
+def runs_of(energy, threshold):
+    """Cut a face's lags into contiguous runs above the threshold; the loudest lag of each."""
+    above = np.concatenate(([False], energy > threshold, [False]))
+    edges = np.flatnonzero(np.diff(above.astype(int)))
+    return [a + int(np.argmax(energy[a:b])) for a, b in edges.reshape(-1, 2)]
+
+
+@pytest.mark.parametrize("frame", [10, 60, 200])
+def test_snapshots_of_runs_are_the_loudest_lag_of_each(frame):
+    finder = finder_of(snapshots="runs", leakage_db=-300.0, angle_limit_deg=89.0)
+    matched = matched_of(*mission_frame(frame=frame))
+    found = found_in(matched, finder)
+    energy, heard = np.sum(np.abs(matched) ** 2, axis=3), 0
+    for face in range(4):
+        for tone in range(2):
+            mine = (found.face == face) & (found.caller == tone)
+            loudest = runs_of(energy[:, face, tone], finder.threshold)
+            lag = (found.delay[mine] - START) / BLOCK  # refined by less than half a call
+            nearest = [np.abs(one - np.array(loudest)).min() for one in lag]
+            assert max(nearest, default=0.0) < SETTLED.pulse / 2
+            heard += len(nearest)
+    assert heard > 8
+    assert snapshots(found, BEACON) < snapshots(found_in(matched), BEACON)
+
+
+def test_echoes_that_overlap_are_one_snapshot_of_their_run_and_two_of_their_maxima():
+    apart = 0.8 * SETTLED.pulse * BLOCK
+    pair = echoes((0.02, 0.0, OWN, 20.0, 1.0), (0.02 + apart, 20.0, OWN, 17.0, 1.0))
+    matched = matched_of(pair, blocks=160, key=3)
+    assert snapshots(found_in(matched), OWN) > snapshots(
+        found_in(matched, finder_of(snapshots="runs")), OWN
+    )
+
+
+def test_echoes_far_from_each_other_are_the_same_by_runs_and_by_maxima():
+    far = echoes((0.008, 0.0, OWN, 20.0, 1.0), (0.02, 20.0, OWN, 20.0, 1.0))
+    matched = matched_of(far, blocks=160)
+    one, other = found_in(matched), found_in(matched, finder_of(snapshots="runs"))
+    for field in fields(one):
+        np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))

@@ -2,7 +2,8 @@ r"""Matched outputs -> detections: snapshots, tones present, beamscan, time of a
 
 The matched filter's outputs y_e, normalised to unit noise variance, are tested per face and tone
 by their energy :math:`E = \sum_e |y_e|^2`, which is Gamma(N) distributed in noise. A *snapshot*
-is a lag whose energy passes the test and is the largest within half a call to either side. A tone
+is a lag whose energy passes the test and is the largest within half a call to either side, or, by
+the setting ``snapshots = "runs"``, the largest of the contiguous run of lags that pass. A tone
 counts there only if its energy is not explained by the leakage of another, stronger one: the
 edges of a rectangular call leak -33 dB into the next tone. The ten outputs at that lag are
 scanned with a conventional beam, whose power needs only the sums over element pairs of each lag,
@@ -72,6 +73,8 @@ class Detector:
     ----------
     threshold : float
         Of the energy of one face and tone, in units of the noise of one output.
+    runs : bool
+        Whether a run above the threshold is one snapshot, however long.
     leakage, peak : float
         Power ratios.
     sine_limit : float
@@ -86,6 +89,7 @@ class Detector:
     """
 
     threshold: float
+    runs: bool
     leakage: float
     peak: float
     sine_limit: float
@@ -136,6 +140,7 @@ def detector(config: Config, layout: Layout, tones: Float[np.ndarray, " c"]) -> 
     turns = np.exp(-1j * np.arange(1, elements)[None, :, None] * scan[:, None, :])
     return Detector(
         threshold=float(gammainccinv(elements, settings.false_alarm)),
+        runs=settings.snapshots == "runs",
         leakage=10.0 ** (settings.leakage_db / 10.0),
         peak=10.0 ** (settings.peak_db / 10.0),
         sine_limit=math.sin(math.radians(settings.angle_limit_deg)),
@@ -187,6 +192,7 @@ def detect(
     energy = _energy(matched.reshape(-1).view(matched.real.dtype), matched.shape[3])
     rules = (
         detector.threshold,
+        detector.runs,
         detector.leakage,
         detector.peak,
         detector.sine_limit,
@@ -211,6 +217,7 @@ class _Rules(NamedTuple):
     """What the kernels need to know of a detector: its columns of these names."""
 
     threshold: float
+    runs: bool
     leakage: float
     peak: float
     sine_limit: float
@@ -267,7 +274,29 @@ def _candidates(
 
 
 @no_alloc
-def _is_snapshot(
+def _is_loudest(
+    energy: Float[np.ndarray, " t"], test: Whole, row: Whole, reach: Whole, floor: float
+) -> bool:
+    """Whether a test's lag is the largest as far as so many lags away, or until one falls so low.
+
+    A row of tests is a lag's: its neighbour in time is a row away, its other tones next to it.
+    """
+    level, size = energy[test], energy.size
+    for away in range(row, (reach + 1) * row, row):
+        if test < away or energy[test - away] <= floor:
+            break
+        if energy[test - away] >= level:
+            return False
+    for away in range(row, (reach + 1) * row, row):
+        if test + away >= size or energy[test + away] <= floor:
+            break
+        if energy[test + away] > level:
+            return False
+    return True
+
+
+@no_alloc
+def _is_leakage(
     energy: Float[np.ndarray, " t"],
     test: Whole,
     row: Whole,
@@ -275,24 +304,15 @@ def _is_snapshot(
     pulse: Whole,
     leakage: float,
 ) -> bool | np.bool_:
-    """Whether a test's lag is the largest near, and its tone no leakage of another.
-
-    A row of tests is a lag's: its neighbour in time is a row away, its other tones next to it.
-    """
-    level, size = energy[test], energy.size
-    for away in range(row, (pulse // 2 + 1) * row, row):
-        if test >= away and energy[test - away] >= level:
-            return False
-        if test + away < size and energy[test + away] > level:
-            return False
+    """Whether what is heard of a tone is no more than what leaks from another nearby."""
     own, strongest = test % tones, 0.0
     for p in range(tones):
         if p != own:
             other = test - own + p
             for away in range(-pulse * row, (pulse + 1) * row, row):
-                if 0 <= other + away < size:
+                if 0 <= other + away < energy.size:
                     strongest = max(strongest, energy[other + away])
-    return level > leakage * strongest
+    return energy[test] <= leakage * strongest
 
 
 @no_alloc
@@ -371,8 +391,11 @@ def _find_peaks(
     power, place = np.empty(scan.shape[1]), np.empty(scan.shape[1], dtype=np.int64)
     beam = np.empty(2 * reach_of(pulse) + 3, dtype=np.complex128)
     row, count = faces * tones, 0
+    reach, floor = (energy.size, rule.threshold) if rule.runs else (pulse // 2, -1.0)
     for test in _candidates(energy, rule.threshold, row if pulse > 1 else energy.size):
-        if not _is_snapshot(energy, test, row, tones, pulse, rule.leakage):
+        if not _is_loudest(energy, test, row, reach, floor) or _is_leakage(
+            energy, test, row, tones, pulse, rule.leakage
+        ):
             continue
         b, f, p = test // row, test // tones % faces, test % tones
         _scan_power(matched[b, f, p], rule.table[p], power)

@@ -156,6 +156,7 @@ OTHERS = {
     "receiver.noise_level_db": 6.0,
     "receiver.engine": "dense",
     "detection.false_alarm": 1e-2,
+    "detection.snapshots": "runs",
     "detection.leakage_db": -10.0,
     "detection.peak_db": -0.5,
     "detection.scan_limit_deg": 76.0,
