@@ -8,7 +8,7 @@ from shutil import which
 import pytest
 
 from pipistrelle.config import InputError
-from pipistrelle.files import SUMS, OwnFiles, put_in_place, write_whole
+from pipistrelle.files import REPORT, RESULTS, SUMS, OwnFiles, put_in_place, write_whole
 
 
 def names(folder):
@@ -18,21 +18,33 @@ def names(folder):
 @pytest.fixture
 def own(tmp_path):
     """A folder in which we wrote two files."""
-    own = OwnFiles(tmp_path)
+    own = OwnFiles(tmp_path, RESULTS)
     own.write("one.txt", "first")
     own.write("figures/two.png", b"\x89PNG")
     return own
 
 
+def test_one_kind_never_replaces_another(tmp_path):
+    report = OwnFiles(tmp_path, REPORT)
+    report.write("index.html", "page")
+    for change in (OwnFiles.check, OwnFiles.clear):
+        with pytest.raises(InputError, match="holds a report of Pipistrelle, which results"):
+            change(OwnFiles(tmp_path, RESULTS))
+    assert (tmp_path / "index.html").read_text() == "page"
+    again = OwnFiles(tmp_path, REPORT)
+    again.clear()
+    OwnFiles(tmp_path, RESULTS).write("index.html", "other")
+
+
 def test_what_we_wrote_is_known_again_replaced_and_removed(own, tmp_path):
-    again = OwnFiles(tmp_path)
+    again = OwnFiles(tmp_path, RESULTS)
     again.check(["one.txt"])
     again.write("one.txt", "zweite Fassung: µ")
     assert (tmp_path / "one.txt").read_text(encoding="utf-8") == "zweite Fassung: µ"
-    OwnFiles(tmp_path).clear()
+    OwnFiles(tmp_path, RESULTS).clear()
     assert names(tmp_path) == ["figures"]
     assert names(tmp_path / "figures") == []
-    assert not OwnFiles(tmp_path)
+    assert not OwnFiles(tmp_path, RESULTS)
 
 
 @pytest.mark.skipif(which("sha256sum") is None, reason="this system has no sha256sum")
@@ -80,18 +92,18 @@ def test_a_file_of_ours_that_is_gone_is_no_hindrance(own, tmp_path):
 def test_a_list_that_is_not_ours_names_nothing(tmp_path):
     (tmp_path / SUMS).write_bytes(b"\xff\xfe nothing of the kind")
     (tmp_path / "one.txt").write_text("mine")
-    assert not OwnFiles(tmp_path)
+    assert not OwnFiles(tmp_path, RESULTS)
     with pytest.raises(InputError, match="is not Pipistrelle's"):
-        OwnFiles(tmp_path).write("one.txt", "ours")
+        OwnFiles(tmp_path, RESULTS).write("one.txt", "ours")
 
 
 def test_a_list_that_points_outside_removes_nothing_there(tmp_path):
     outside, folder = tmp_path / "precious.txt", tmp_path / "results"
-    OwnFiles(tmp_path).write("precious.txt", "of another folder")
+    OwnFiles(tmp_path, RESULTS).write("precious.txt", "of another folder")
     folder.mkdir()
     line = (tmp_path / SUMS).read_text().replace("precious", "../precious")
     (folder / SUMS).write_text(line + line.replace("../precious.txt", str(outside)))
-    OwnFiles(folder).clear()
+    OwnFiles(folder, RESULTS).clear()
     assert outside.exists()
 
 
@@ -104,8 +116,8 @@ def test_what_was_stopped_in_the_middle_is_known_as_ours(own, tmp_path, monkeypa
         with pytest.raises(SystemExit):
             own.write("three.txt", "ours")
     (tmp_path / "three.txt.partial").write_text("ou")  # as a kill would leave it
-    OwnFiles(tmp_path).check(["three.txt"])
-    OwnFiles(tmp_path).clear()
+    OwnFiles(tmp_path, RESULTS).check(["three.txt"])
+    OwnFiles(tmp_path, RESULTS).clear()
     assert names(tmp_path) == ["figures"]
 
 

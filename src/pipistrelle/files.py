@@ -1,7 +1,8 @@
 """Files that are whole or not there, and a list of those in a folder that are ours.
 
-The list is ``SHA256SUMS``, as ``sha256sum -c`` reads it. Only what it names, and what still has the
-sum that stands there, is ever replaced or removed: everything else is somebody's.
+The list is ``SHA256SUMS``, as ``sha256sum -c`` reads it; its first line says what of ours is there.
+Only what it names, and what still has the sum that stands there, is ever replaced or removed, and
+only by its like: everything else is somebody's.
 """
 
 import contextlib
@@ -16,6 +17,8 @@ from tempfile import TemporaryDirectory
 from pipistrelle.config import InputError
 
 SUMS = "SHA256SUMS"
+RESULTS, REPORT, LOG = KINDS = ("results", "a report", "a log")
+_KIND = "# Of Pipistrelle: {}\n"
 _LINE = re.compile(r"([0-9a-f]{64}) [ *](.+)")
 
 
@@ -25,11 +28,13 @@ class OwnFiles:
     Parameters
     ----------
     folder : Path
+    kind : str
+        What they are together: results, a report, a log. One kind never replaces another.
 
     Examples
     --------
     >>> with TemporaryDirectory() as name:
-    ...     own, notes = OwnFiles(Path(name)), Path(name) / "notes.txt"
+    ...     own, notes = OwnFiles(Path(name), "a log"), Path(name) / "notes.txt"
     ...     own.write("one.txt", "word")
     ...     _ = notes.write_text("a user's")
     ...     own.clear()
@@ -37,12 +42,14 @@ class OwnFiles:
     ['notes.txt']
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, kind: str) -> None:
+        self.folder, self.kind = folder, kind
         try:
             lines = (folder / SUMS).read_text(encoding="utf-8").splitlines()
         except (OSError, UnicodeDecodeError):
             lines = []
+        heads = {line: told for told in KINDS for line in [_KIND.format(told).strip()]}
+        self._there = next((heads[line] for line in lines if line in heads), kind)
         found = [match.groups() for line in lines if (match := _LINE.fullmatch(line))]
         self._sums = {name: its_sum for its_sum, name in found if _is_inside(name)}
 
@@ -63,6 +70,11 @@ class OwnFiles:
         InputError
             With the file.
         """
+        if self._sums and self._there != self.kind:
+            raise InputError(
+                f"{self.folder}: holds {self._there} of Pipistrelle, which {self.kind} does not "
+                "replace; name another folder"
+            )
         for name in sorted({*names, *self._sums}):
             self._refuse(name)
 
@@ -166,10 +178,12 @@ class OwnFiles:
         self._sums[name] = its_sum
         if known:
             lines = [f"{its}  {other}\n" for other, its in self._sums.items()]
-            write_whole(self.folder / SUMS, "".join(lines).encode())
+            head = _KIND.format(self.kind)
+            write_whole(self.folder / SUMS, "".join([head, *lines]).encode())
         else:
             with (self.folder / SUMS).open("a", encoding="utf-8", newline="\n") as file:
-                file.write(f"{its_sum}  {name}\n")
+                head = "" if file.tell() else _KIND.format(self.kind)
+                file.write(f"{head}{its_sum}  {name}\n")
 
 
 def _is_inside(name: str) -> bool:

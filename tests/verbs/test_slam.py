@@ -142,11 +142,8 @@ def scaled(log, column, factor):
     path.write_text("\n".join(map(",".join, [header, *rows, []])))
 
 
-def test_bearings_in_degrees_are_asked_about(obey, log, undrawn):
-    scaled(log, 2, 180.0 / np.pi)
-    settings = (log / "log.toml").read_text()
-    (log / "log.toml").write_text(re.sub(r"gate = .*\n", "", settings))
-    status, _, said = obey("slam", log, "-o", "two", "--quiet")
+def test_measurements_that_do_not_fit_are_asked_about(obey, log, undrawn):
+    status, _, said = obey("slam", log, "-o", "two", "--quiet", "--gate", "0.01")
     assert status == 0
     gated = summary("two")["runs"][0]["gated"]
     assert re.fullmatch(
@@ -154,6 +151,21 @@ def test_bearings_in_degrees_are_asked_about(obey, log, undrawn):
         r"\(fused ekf\); are bearings in radians and ranges in metres\?\n",
         said,
     )
+
+
+def test_bearings_beyond_a_turn_are_asked_about_whatever_the_gate(obey, log, undrawn):
+    scaled(log, 2, 180.0 / np.pi)
+    _, _, said = obey("slam", log, "-o", "two", "--quiet")
+    assert re.fullmatch(r".*: \d+ of \d+ bearings are beyond a turn; are they in radians\?\n", said)
+
+
+def test_a_truth_of_another_clock_is_refused(obey, log):
+    lines = [line.split(",") for line in (log / "truth.csv").read_text().splitlines()]
+    rows = [[repr(1e6 * float(time)), *rest] for time, *rest in lines[1:]]
+    (log / "truth.csv").write_text("\n".join(map(",".join, [lines[0], *rows])))
+    status, printed, said = obey("slam", log, "-o", "two")
+    assert (status, printed) == (2, "")
+    assert said.endswith("expected seconds; multiply them by 1e-06\n")
 
 
 def test_ranges_in_millimetres_are_asked_about(obey, log, undrawn):

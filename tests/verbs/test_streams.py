@@ -86,6 +86,13 @@ def test_a_file_is_never_given_the_number_of_a_closed_stream():
     assert (status, printed, Path("notes").read_text()) == (0, "", "")
 
 
+def test_what_a_stream_has_no_letters_for_is_printed_by_its_number():
+    code = "import pipistrelle.verbs.streams as s; s.hold_streams(); s.put('\\u03c3', '\\udcff')"
+    line = f'PYTHONIOENCODING=latin-1 "{sys.executable}" -c "{code}" > word'
+    assert shell(line) == (0, "")
+    assert Path("word").read_bytes() == b"\\u03c3 \xff\n"
+
+
 def test_a_name_that_is_no_text_is_printed_by_its_bytes():
     log = os.fsdecode(b"log\xff")
     assert (

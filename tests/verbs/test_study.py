@@ -230,6 +230,19 @@ def test_every_case_of_a_plan_is_checked_before_the_first_world(obey):
     assert not Path("one").exists()
 
 
+def test_no_job_script_is_written_for_a_plan_that_every_job_would_refuse(obey):
+    status, printed, said = obey("small.toml", "--emit", "slurm", "--emitter.frequency", "3")
+    assert (status, printed) == (2, "")
+    assert "emitter.frequency: found 3 Hz" in said
+
+
+def test_a_speed_of_sound_that_is_given_as_it_is_makes_no_other_plan(obey):
+    words = ("small.toml", "--iterations", "1", "--quiet", "-o", "one")
+    assert obey(*words)[0] == 0
+    assert obey(*words, "--air.speed-of-sound", "343")[0] == 0
+    assert obey(*words, "--air.speed-of-sound", "340")[0] == 2
+
+
 def test_a_grid_of_thousands_of_values_is_read_at_once(obey):
     values = ", ".join(repr(0.5 + i / 1e5) for i in range(33_000))
     Path("small.toml").write_text(SMALL + f'"filter.gate" = [{values}]\n')

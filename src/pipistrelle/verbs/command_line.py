@@ -85,6 +85,8 @@ def obey(words: Sequence[str], heard: Sequence[int] = ()) -> int:
     try:
         status = app(_completed(words)) or 0
         flush_results()
+    except SystemExit:  # help, whose reader has left
+        return 0
     except (CycloptsError, OSError, ValueError, MemoryError) as error:
         message = _explained(error, words)
         if message is None or heard:

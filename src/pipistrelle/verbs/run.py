@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from pipistrelle.config import InputError
-from pipistrelle.files import OwnFiles
+from pipistrelle.files import LOG, OwnFiles
 from pipistrelle.verbs.options import (
     Chosen,
     ChosenFilter,
@@ -86,7 +86,7 @@ def _check_vacant(folder: Path, output: OutputOptions) -> None:
         return
     if not output.overwrite:
         raise InputError(f"--save-log: {folder} is not empty; name a new folder or add --overwrite")
-    if not (own := OwnFiles(folder)):
+    if not (own := OwnFiles(folder, LOG)):
         raise InputError(
             f"--save-log: {folder} is not empty and holds no log of Pipistrelle (its SHA256SUMS "
             "would name it), so nothing in it was overwritten; name a new folder"
@@ -114,7 +114,7 @@ def _save_log(folder: Path, mission: "Mission", scans: "Sequence[Scan]") -> None
         write_truth(folder, mission.drive.truth)
     except BaseException:  # half a log is none
         with contextlib.suppress(InputError):
-            OwnFiles(folder).clear()
+            OwnFiles(folder, LOG).clear()
         raise
 
 

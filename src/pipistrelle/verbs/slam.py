@@ -186,15 +186,20 @@ def _warn_of_partial_truth(truth: "Truth", log: Path) -> None:
 
 def _warn_of_units(recorded: "Log", trials: "Sequence[TrialResult]", log: Path) -> None:
     """Ask whether a log has the units that are expected, where much of it does not fit."""
+    rows, turned = sum(len(scan.landmark) for scan in recorded.scans), recorded.turned
     for trial in trials:
         heard, name = sum(len(scan.landmark) for scan in trial.scans), short_name(trial.filter)
         if not heard:
             warn(f"{log}: nothing in it is heard by {trial.strategy} sensing, so it maps nothing")
-        elif trial.scores.gated > SUSPECT * heard:
+        elif (
+            turned <= SUSPECT * rows and SUSPECT * heard < trial.scores.gated and _is_finite(trial)
+        ):
             warn(
                 f"{log}: {trial.scores.gated} of {heard} measurements do not fit what was expected "
                 f"({trial.strategy} {name}); are bearings in radians and ranges in metres?"
             )
+    if turned > SUSPECT * rows:
+        warn(f"{log}: {turned} of {rows} bearings are beyond a turn; are they in radians?")
     near, far = recorded.range_bounds
     ranges = [r for scan in recorded.scans for r in scan.range.tolist() if r == r]
     beyond = sum(not near <= r <= far for r in ranges)
@@ -203,6 +208,11 @@ def _warn_of_units(recorded: "Log", trials: "Sequence[TrialResult]", log: Path) 
             f"{log}: {beyond} of {len(ranges)} ranges are not within range_bounds ({near:g} to "
             f"{far:g} m); are ranges in metres?"
         )
+
+
+def _is_finite(trial: "TrialResult") -> bool:
+    """Tell whether a trial's path is somewhere: else its failure says enough."""
+    return all(number == number for pose in trial.track.pose.mean.tolist() for number in pose)
 
 
 def _warn_of_ignored_rows(recorded: "Log", log: Path) -> None:

@@ -4,6 +4,7 @@ What a person reads never decides what becomes of the work: a word that cannot b
 and the exit status tells what was done.
 """
 
+import codecs
 import os
 import sys
 from contextlib import suppress
@@ -29,8 +30,17 @@ def hold_streams() -> None:
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115, PTH123
-    if sys.stdout.errors == "strict" and hasattr(sys.stdout, "reconfigure"):
-        sys.stdout.reconfigure(errors="surrogateescape")
+    if sys.stdout.errors in ("strict", "surrogateescape") and hasattr(sys.stdout, "reconfigure"):
+        codecs.register_error("pipistrelle.bytes", _as_bytes)
+        sys.stdout.reconfigure(errors="pipistrelle.bytes")
+
+
+def _as_bytes(error: UnicodeError) -> tuple[str | bytes, int]:
+    """Print a name by its bytes, and a character that the stream has not by its number."""
+    try:
+        return codecs.lookup_error("surrogateescape")(error)
+    except UnicodeError:
+        return codecs.lookup_error("backslashreplace")(error)
 
 
 def say(message: str) -> None:

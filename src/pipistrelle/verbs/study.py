@@ -88,14 +88,16 @@ def study(
     share, layer = _share(shard), layers(None, settings)
     tried = read_plan(find_plan(plan), layer, iterations)
     folder = output or Path("runs") / tried.name
+    from pipistrelle.experiments.machine import cores
+    from pipistrelle.experiments.studies.study import check_cases, run_study, warnings_of_plan
+
     if emit:
+        check_cases(tried, 0)
+        warn(*warnings_of_plan(tried))
         shards = share[1] if shard else min(SHARDS, tried.iterations)
         command = _command(plan, tried, layer)
         put(_slurm(tried.name, command, folder, shards, workers or 1), end="")
         return 0
-    from pipistrelle.experiments.machine import cores
-    from pipistrelle.experiments.studies.study import run_study, warnings_of_plan
-
     warn(*warnings_of_plan(tried))
     try:
         with _progress(quiet) as show:

@@ -7,12 +7,12 @@ import pytest
 
 from pipistrelle.config import InputError
 from pipistrelle.experiments.results.folder import prepare_folder
-from pipistrelle.files import SUMS, OwnFiles
+from pipistrelle.files import RESULTS, SUMS, OwnFiles
 
 
 @pytest.fixture
 def earlier(tmp_path):
-    own = OwnFiles(tmp_path)
+    own = OwnFiles(tmp_path, RESULTS)
     for name in ("track_fused_ekf.tum", "map_fused_ekf.csv", "mission.png", "config.toml"):
         own.write(name, "old")
     own.write("summary.json", "{}")
@@ -68,7 +68,7 @@ def test_a_folder_with_results_is_refused_unless_overwriting(earlier):
     assert names(earlier) == before
     assert prepare_folder(earlier, "run", overwrite=True) == earlier
     assert names(earlier) == before, "the old results stay until there are new ones"
-    OwnFiles(earlier).clear()
+    OwnFiles(earlier, RESULTS).clear()
     assert names(earlier) == []
 
 
@@ -76,7 +76,7 @@ def test_overwriting_accepts_a_folder_with_files_of_the_users_beside_the_results
     mine = ("notes.txt", "mission.txt", "map_house.csv", "track_jazz.tum", "a.partial")
     for name in mine:
         (earlier / name).write_text("mine")
-    OwnFiles(prepare_folder(earlier, "run", overwrite=True)).clear()
+    OwnFiles(prepare_folder(earlier, "run", overwrite=True), RESULTS).clear()
     assert names(earlier) == sorted(mine)
 
 

@@ -8,7 +8,14 @@ import pytest
 
 from pipistrelle.arrays.beamforming import beampattern
 from pipistrelle.arrays.layout import square_of_four
-from pipistrelle.config import AirConfig, Config, EmitterConfig, InputError, ReceiverConfig
+from pipistrelle.config import (
+    AirConfig,
+    Config,
+    DetectionConfig,
+    EmitterConfig,
+    InputError,
+    ReceiverConfig,
+)
 from pipistrelle.experiments import machine
 from pipistrelle.experiments.runs import preparing
 from pipistrelle.experiments.runs.preparing import prepared, warnings_of
@@ -39,6 +46,13 @@ def test_the_lobe_that_is_warned_of_is_where_the_array_has_one(spacing):
     assert np.degrees(angles[np.argmax(alias)]) == pytest.approx(lobe, abs=5.0)
     assert alias.max() == pytest.approx(1.0, abs=0.01)
     assert beampattern(angles[angles < -0.6], steered=math.radians(angle - 6), **array).max() < 0.8
+
+
+def test_a_lobe_beyond_what_is_scanned_confuses_nobody():
+    receiver, detection = ReceiverConfig(spacing=0.007), DetectionConfig(scan_limit_deg=30.0)
+    (warning,) = warnings_of(Config(receiver=receiver, detection=detection))
+    assert "echoes 64 degrees off" in warning
+    assert "as from -30 degrees" in warning
 
 
 def test_cold_air_makes_half_a_wave_shorter():

@@ -16,6 +16,7 @@ from pipistrelle.config import InputError
 from pipistrelle.experiments.studies.plan import cases_of
 from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
 from pipistrelle.experiments.studies.world_files import TABLES, done_worlds, with_sums, world_file
+from pipistrelle.files import LOG, RESULTS, OwnFiles
 from pipistrelle.report.claims.published import TABLE_II
 from pipistrelle.report.page import page as module
 from pipistrelle.report.page.page import write_report
@@ -361,3 +362,13 @@ def test_a_stored_study_of_a_filter_that_is_not_installed_can_be_read(store, tmp
         paths["trials"].write_bytes(with_sums(changed, plan, world)["trials"])
     write_report(read_study(folder), tmp_path)
     assert panels_of(tmp_path, "map_rmse") == ["EKF", "Slam"]
+
+
+def test_a_report_never_takes_the_place_of_results_or_of_a_log(store, tmp_path, undrawn):
+    for kind in (RESULTS, LOG):
+        folder = tmp_path / kind
+        folder.mkdir()
+        OwnFiles(folder, kind).write("summary.json", "precious")
+        with pytest.raises(InputError, match=f"holds {kind} of Pipistrelle, which a"):
+            write_report(read_study(store), folder)
+        assert (folder / "summary.json").read_text() == "precious"

@@ -13,7 +13,7 @@ from pydantic import ConfigDict, Field, ValidationError, field_validator
 from pipistrelle.config import InputError, NonNegative, Positive, Probability, Real, Section
 from pipistrelle.detection.logs.recording import MEASUREMENT, Log, assemble
 from pipistrelle.detection.logs.text_tables import read_table, read_text, table_text
-from pipistrelle.files import OwnFiles
+from pipistrelle.files import LOG, OwnFiles
 from pipistrelle.refusals import expectation, meant, refusal, shown, values_expected
 from pipistrelle.settings import parse_toml
 
@@ -171,7 +171,7 @@ def write_log(folder: Path, log: Log) -> None:
     """
     import tomli_w
 
-    own = OwnFiles(folder)
+    own = OwnFiles(folder, LOG)
     own.clear(FILES)
     first, second = _CONTROLS[log.motion]
     settings = {"format": 1} | {name: getattr(log, name) for name in _SHARED}

@@ -26,7 +26,7 @@ MEASUREMENT = ("time", "landmark", "bearing", "range")
 _RESOLUTION = 1e-6  # [s], of the boundaries of merged steps
 _STEPS_MAX = 10_000_000
 _LATEST = 1e11  # [s], beyond the year 5000 if counted from 1970
-_LONGEST_GAP = 1e3  # [s], typically between two rows of odometry
+_LONGEST_GAP = 10.0  # [s], typically between two rows of odometry, or of the truth
 _UNITS = (1e-3, 1e-6, 1e-9)  # [s], of other clocks
 
 
@@ -61,6 +61,8 @@ class Log:
         Share of a measurement's predicted distribution that is accepted; None: not said.
     ignored_rows : dict of str to int
         Rows that were dropped, by reason.
+    turned : int
+        Bearings beyond a whole turn, which are wrapped as any.
     """
 
     name: str
@@ -79,6 +81,7 @@ class Log:
     range_bounds: tuple[float, float]
     gate: float | None = None
     ignored_rows: dict[str, int]
+    turned: int = 0
 
 
 def assemble(
@@ -115,8 +118,8 @@ def assemble(
         If nothing of the odometry or of the measurements is left, a landmark is measured twice at
         one time, or times can be no seconds.
     """
-    _check_seconds(odometry, _LONGEST_GAP)
-    _check_seconds(measurements, math.inf)
+    check_seconds(odometry)
+    check_seconds(measurements, math.inf)
     stamp, *columns = odometry.column.values()
     last = np.append(np.diff(stamp) > 0, True)
     time, controls = _cut(odometry.path, stamp[last], np.column_stack(columns)[last], span)
@@ -135,7 +138,8 @@ def assemble(
         reasons = ", ".join(f"{n} {why.replace('_', ' ')}" for why, n in ignored.items() if n)
         found = f"no row to use (left out: {reasons})"
         expected = f"some of landmarks, between {time[0].item()!r} s and {time[-1].item()!r} s"
-        raise refusal(measurements.path, found, expected, "use the odometry's clock")
+        fix = "use the odometry's clock" if len(stamp) else "label rows of landmarks"
+        raise refusal(measurements.path, found, expected, fix)
     measured = {name: measurements.column[name][inside] for name in MEASUREMENT}
     return Log(
         time=time,
@@ -143,22 +147,36 @@ def assemble(
         dt=np.diff(time),
         scans=_scans(time, measured, 0.0 if step is None else _RESOLUTION),
         ignored_rows={reason: count for reason, count in ignored.items() if count},
+        turned=int(np.sum(np.abs(measured["bearing"]) > 2.0 * np.pi)),
         **settings,
     )
 
 
-def _check_seconds(table: Table, longest_gap: float) -> None:
-    """Refuse times that can be no seconds, and say which unit they may have."""
+def check_seconds(table: Table, longest_gap: float = _LONGEST_GAP) -> None:
+    """Refuse times that can be no seconds, and say which unit they may have.
+
+    Parameters
+    ----------
+    table : Table
+        With a column ``time``.
+    longest_gap : [s]
+        Typically between two rows.
+
+    Raises
+    ------
+    InputError
+        With the factor that fits.
+    """
     time = table.column["time"]
     gaps = np.diff(time)
     typical = float(np.median(gaps[gaps > 0.0])) if np.any(gaps > 0.0) else 0.0
     latest = float(np.max(np.abs(time), initial=0.0))
     if typical <= longest_gap and latest <= _LATEST:
         return
-    if typical > longest_gap:  # of 1 ms, 1 us and 1 ns, that which makes it likeliest 0.1 s
-        factor = min(_UNITS, key=lambda unit: abs(math.log10(typical * unit / 0.1)))
-    else:
+    if latest > _LATEST:
         factor = next((unit for unit in _UNITS if latest * unit <= _LATEST / 10.0), _UNITS[-1])
+    else:  # of 1 ms, 1 us and 1 ns, that which makes it likeliest 0.1 s
+        factor = min(_UNITS, key=lambda unit: abs(math.log10(typical * unit / 0.1)))
     found = f"times from {time[0].item():g} to {time[-1].item():g}, typically {typical:g} apart"
     raise refusal(table.path, found, "seconds", f"multiply them by {factor:g}")
 

@@ -8,7 +8,7 @@ from tempfile import TemporaryFile
 from typing import get_args
 
 from pipistrelle.config import InputError, Strategy
-from pipistrelle.files import OwnFiles
+from pipistrelle.files import RESULTS, OwnFiles
 
 RESERVED = (
     "config.toml",
@@ -99,7 +99,7 @@ def _chosen_folder(folder: Path, overwrite: bool) -> Path:
             f"{folder}: is not empty; name a new folder with -o DIR, or add --overwrite "
             "to replace earlier results"
         )
-    own = OwnFiles(folder)
+    own = OwnFiles(folder, RESULTS)
     if not own:
         raise InputError(
             f"{folder}: is not empty and holds no results of Pipistrelle (its SHA256SUMS would "

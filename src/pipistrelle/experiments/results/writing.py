@@ -25,7 +25,7 @@ from pipistrelle.experiments.results.tables import (
     step_table,
     tum_text,
 )
-from pipistrelle.files import OwnFiles
+from pipistrelle.files import RESULTS, OwnFiles
 
 FORMAT = 1
 README = """\
@@ -112,7 +112,7 @@ def write_results(
     """
     import tomli_w
 
-    own = OwnFiles(folder)
+    own = OwnFiles(folder, RESULTS)
     own.clear()
     settings = config.model_dump(mode="json", exclude_none=True)
     own.write("config.toml", tomli_w.dumps(settings))

@@ -88,7 +88,7 @@ def warnings_of(config: Config) -> tuple[str, ...]:
     wave (0.0049 m)
     """
     spacing, rate = config.receiver.spacing, config.receiver.sample_rate
-    limit = config.detection.angle_limit_deg
+    limit = min(config.detection.angle_limit_deg, config.detection.scan_limit_deg)
     said = []
     for section in ("emitter", "beacon"):
         frequency = getattr(config, section).frequency

@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.detection.logs.readers import Robot
-from pipistrelle.detection.logs.recording import Log
+from pipistrelle.detection.logs.recording import Log, check_seconds
 from pipistrelle.detection.logs.text_tables import check_unique, read_table, table_text
 from pipistrelle.experiments.drives import LabelledPoints, Truth
-from pipistrelle.files import OwnFiles
+from pipistrelle.files import LOG, OwnFiles
 from pipistrelle.refusals import refusal
 
 FILES = ("truth.csv", "landmarks.csv")
@@ -145,7 +145,7 @@ def write_truth(folder: Path, truth: Truth) -> None:
     landmark,x,y
     4,1.0,-2.5
     """
-    own = OwnFiles(folder)
+    own = OwnFiles(folder, LOG)
     if truth.path is not None:
         rows = np.column_stack((truth.time, truth.path))[np.isfinite(truth.path).all(axis=1)]
         own.write("truth.csv", table_text(_PATH, *rows.T))
@@ -188,7 +188,9 @@ def read_path(
     >>> time, poses[:, 2].round(2)
     (array([0., 1.]), array([3.  , 3.28]))
     """
-    column = read_table(path, _PATH, separator=separator).column
+    table = read_table(path, _PATH, separator=separator)
+    check_seconds(table)
+    column = table.column
     last = np.append(np.diff(column["time"]) > 0, True)
     heading = np.unwrap(column["heading"][last])
     return column["time"][last], np.column_stack((column["x"][last], column["y"][last], heading))

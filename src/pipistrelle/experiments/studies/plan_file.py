@@ -190,7 +190,9 @@ def changed_settings(there: Plan, asked: Plan) -> list[str]:
     ['config.seed: 1 there, 2 asked for']
     """
     old, new = (
-        {".".join(key): value for key, value in leaves(_as_table(plan))} for plan in (there, asked)
+        {".".join(key): value for key, value in leaves(_as_table(plan))}
+        | {"config.air.speed_of_sound": plan.config.air.celerity}  # given or not
+        for plan in (there, asked)
     )
     return [
         f"{name}: {_worded(old, name)} there, {_worded(new, name)} asked for"
@@ -287,7 +289,7 @@ def _check_distinct(where: str, values: Sequence[Any]) -> None:
     known = set()
     for value in values:
         before = len(known)
-        known.add(json.dumps(value))
+        known.add(tuple(value) if isinstance(value, list) else value)
         if len(known) == before:
             raise InputError(f"{where}: found {shown(value)} twice, expected each value once")
 

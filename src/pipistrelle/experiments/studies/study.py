@@ -122,7 +122,7 @@ def run_study(
     >>> so_far.done, so_far.ended
     (2, {'fused': 2})
     """
-    _check_cases(plan, workers if executor is None and scheduler in (None, "local") else 0)
+    check_cases(plan, workers if executor is None and scheduler in (None, "local") else 0)
     open_store(folder, plan)
     worlds = range(shard[0], plan.iterations, shard[1])
     done = done_worlds(folder).intersection(worlds)
@@ -174,8 +174,20 @@ def warnings_of_plan(plan: Plan) -> tuple[str, ...]:
     return tuple(dict.fromkeys(said))
 
 
-def _check_cases(plan: Plan, workers: int) -> None:
-    """Refuse a plan of which a case would be refused, or so many worlds at once have no room."""
+def check_cases(plan: Plan, workers: int) -> None:
+    """Refuse a plan of which a case would be refused, or so many worlds at once have no room.
+
+    Parameters
+    ----------
+    plan : Plan
+    workers : int
+        On this machine; 0 if they are elsewhere.
+
+    Raises
+    ------
+    InputError
+        With the setting, and the values of the grid.
+    """
     for cases in heard_together(plan):
         case = cases[0]
         try:

@@ -177,8 +177,10 @@ def sweep(folder: Path, iterations: Iterable[int], partial: str = "") -> None:
 def _plan_sum(plan: Plan) -> str:
     """Sum up what a plan's worlds depend on; a setting that is new has its default in old plans."""
     config = plan.config.model_dump(mode="json", exclude_defaults=True)
+    air = config.pop("air", {})
+    air["speed_of_sound"] = plan.config.air.celerity  # given or not
     grid = {name: list(values) for name, values in plan.grid.items()}
-    said = json.dumps([plan.strategies, plan.filters, config, grid], sort_keys=True)
+    said = json.dumps([plan.strategies, plan.filters, config, air, grid], sort_keys=True)
     return sha256(said.encode()).hexdigest()
 
 
@@ -280,7 +282,7 @@ def _flaw(name: str, found: dict[str, bytes], plan: Plan, iteration: int) -> str
         return "bears no sums: it is of an earlier version, or not Pipistrelle's"
     if said[_WORLD] != str(iteration):
         return f"is the file of world {said[_WORLD]}"
-    if name == "trials" and said.get(_PLAN) != _plan_sum(plan):
+    if name == "trials" and said.get(_PLAN, _plan_sum(plan)) != _plan_sum(plan):
         return "was computed by another plan than the plan.toml that is here now"
     expected, file = said.get(_SUM.format(name), _NO_SUM), found[name]
     if name == "trials":

@@ -19,7 +19,7 @@ from pipistrelle import __version__
 from pipistrelle.evaluation.comparison import Finding
 from pipistrelle.figures.chart import Chart, Panel, columns_of, csv_rows, csv_text
 from pipistrelle.figures.style import STRATEGY_COLOURS
-from pipistrelle.files import OwnFiles
+from pipistrelle.files import REPORT, OwnFiles
 from pipistrelle.report.charts.results import CHARTS, study_charts
 from pipistrelle.report.charts.setting import model_charts
 from pipistrelle.report.claims.answer import answer, number_word
@@ -76,7 +76,7 @@ def write_report(
     found = {rule: study_charts(selection, charts) for rule, selection in selected[0].items()}
     models = model_charts(studies[0])
     drawn, texts = [*_distinct(found), *models], _csv_texts(selected[0], found, models)
-    own = OwnFiles(folder)
+    own = OwnFiles(folder, REPORT)
     own.clear(["index.html", "summary.json", *_names(drawn, texts)])
     with own.room("figures") as room:
         for chart in drawn:
