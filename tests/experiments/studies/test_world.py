@@ -360,3 +360,16 @@ def test_columns_bear_the_names_of_what_varies(plan, records):
         "heading_error_rad": "Float32",
         "nees": "Float32",
     }
+
+
+@pytest.mark.parametrize("stage", ["listen", "run_trial"])
+def test_an_interruption_that_a_library_hides_is_no_failed_trial(plan, monkeypatch, stage):
+    def hidden(*_, **__):
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as error:
+            raise SystemError("returned a result with an exception set") from error
+
+    monkeypatch.setattr(world, stage, hidden)
+    with pytest.raises(KeyboardInterrupt):
+        run_world(plan, 0)

@@ -273,7 +273,8 @@ def _run_cases(cases: Sequence[PlannedCase], iteration: int) -> list[TrialRecord
     try:
         scenario = world_of(config, iteration)
         heard = listen(scenario, config, radii, iteration=iteration)
-    except Exception:
+    except Exception as failure:
+        _let_interruptions_pass(failure)
         error = traceback.format_exc()
         return [_failed(case, error) for case in cases]
     beams = dict(zip(radii, heard, strict=True))
@@ -316,8 +317,18 @@ def _try_case(
             full=estimate.full,
             landmark_error=landmark_error(estimate, *standing_landmarks(scenario)),
         )
-    except Exception:
+    except Exception as failure:
+        _let_interruptions_pass(failure)
         return _failed(case, traceback.format_exc())
+
+
+def _let_interruptions_pass(failure: Exception) -> None:
+    """Raise the interruption that a library hid behind an error of its own: no trial failed."""
+    behind: BaseException | None = failure
+    while behind is not None:
+        if isinstance(behind, KeyboardInterrupt):
+            raise behind
+        behind = behind.__cause__ or behind.__context__
 
 
 @np.errstate(over="ignore", invalid="ignore")
