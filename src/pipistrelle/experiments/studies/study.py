@@ -7,9 +7,9 @@ run in this process, in several, or on a Dask cluster (`studies.executors`): on 
 """
 
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -28,7 +28,7 @@ from pipistrelle.experiments.studies.executors import (
     in_processes,
     on_cluster,
 )
-from pipistrelle.experiments.studies.plan import Plan, cases_of
+from pipistrelle.experiments.studies.plan import Plan, PlannedCase, cases_of
 from pipistrelle.experiments.studies.store import open_store
 from pipistrelle.experiments.studies.world import failed_records, heard_together, run_world
 from pipistrelle.experiments.studies.world_files import (
@@ -189,18 +189,25 @@ def check_cases(plan: Plan, workers: int) -> None:
         With the setting, and the values of the grid.
     """
     for cases in heard_together(plan):
-        case = cases[0]
-        try:
-            here = len(standing_landmarks(prepared(case.config, workers=workers))[0])
-            for case in cases:
-                heard = {"passive": case.strategy != "active", "workers": workers}
+        with _named(cases[0]):
+            here = len(standing_landmarks(prepared(cases[0].config, workers=workers))[0])
+        for case in cases:
+            heard = {"passive": case.strategy != "active", "workers": workers}
+            with _named(case):
                 check_memory([case.filter], here, case.config, **heard)
                 check_filters([case.filter], bicycle(case.config.motion), case.config)
-        except InputError as error:
-            values = ", ".join(f"{name} = {value}" for name, value in case.values.items())
-            raise InputError(
-                f"{error} (where the grid has {values})" if values else str(error)
-            ) from None
+
+
+@contextmanager
+def _named(case: PlannedCase) -> Iterator[None]:
+    """Say in a refusal which values of the grid it is about."""
+    try:
+        yield
+    except InputError as error:
+        values = ", ".join(f"{name} = {value}" for name, value in case.values.items())
+        raise InputError(
+            f"{error} (where the grid has {values})" if values else f"{error}"
+        ) from None
 
 
 def _nothing_done(plan: Plan, worlds: int) -> StudyProgress:
