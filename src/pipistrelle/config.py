@@ -145,7 +145,7 @@ class DetectionConfig(Section):
     false_alarm: Annotated[float, Field(ge=1e-100, lt=0.1)] = 1e-6
     """Probability that noise alone passes one test of one tone."""
     snapshots: Literal["maxima", "runs"] = "maxima"
-    """A snapshot: the loudest lag within half a call, or of a whole run above the threshold."""
+    """A snapshot: the loudest lag within half a call, or a whole run above the threshold."""
     leakage_db: Level = -28.0
     """A tone counts only above this level relative to the other tone's maximum nearby [dB]."""
     peak_db: Annotated[float, Field(ge=-300, le=0)] = -8.0

@@ -3,16 +3,17 @@ r"""Matched outputs -> detections: snapshots, tones present, beamscan, time of a
 The matched filter's outputs y_e, normalised to unit noise variance, are tested per face and tone
 by their energy :math:`E = \sum_e |y_e|^2`, which is Gamma(N) distributed in noise. A *snapshot*
 is a lag whose energy passes the test and is the largest within half a call to either side, or, by
-the setting ``snapshots = "runs"``, the largest of the contiguous run of lags that pass. A tone
-counts there only if its energy is not explained by the leakage of another, stronger one: the
-edges of a rectangular call leak -33 dB into the next tone. The ten outputs at that lag are
-scanned with a conventional beam, whose power needs only the sums over element pairs of each lag,
+the setting ``snapshots = "runs"``, a whole contiguous run of lags that pass. A tone counts at a lag
+only if its energy is not explained by the leakage of another, stronger one: the edges of a
+rectangular call leak -33 dB into the next tone. The ten outputs of a snapshot are scanned with a
+conventional beam, whose power, summed over a run's lags, needs only the sums over element pairs,
 
 .. math:: P(u) = r_0 + 2 \operatorname{Re} \sum_{l=1}^{N-1} r_l e^{-i l u}, \qquad
           u = \frac{2\pi f d}{c} \sin\theta .
 
 Each peak near the strongest's height is refined by a parabola, the beamformer is steered to it,
-and the time of arrival is where a triangle, the matched filter's answer to the call, fits best.
+and the time of arrival is where a triangle, the matched filter's answer to the call, fits best; in
+a run, near the lag at which that beam is loudest.
 Bradley & Abaid, Sec. II-D; what the paper leaves open is settled in the settings' defaults.
 """
 
@@ -74,7 +75,7 @@ class Detector:
     threshold : float
         Of the energy of one face and tone, in units of the noise of one output.
     runs : bool
-        Whether a run above the threshold is one snapshot, however long.
+        Whether a run above the threshold is one snapshot, however long it is.
     leakage, peak : float
         Power ratios.
     sine_limit : float
@@ -277,7 +278,7 @@ def _candidates(
 def _is_loudest(
     energy: Float[np.ndarray, " t"], test: Whole, row: Whole, reach: Whole, floor: float
 ) -> bool:
-    """Whether a test's lag is the largest as far as so many lags away, or until one falls so low.
+    """Whether a test's lag is the loudest as far as so many lags away, or until one falls so low.
 
     A row of tests is a lag's: its neighbour in time is a row away, its other tones next to it.
     """
@@ -316,25 +317,80 @@ def _is_leakage(
 
 
 @no_alloc
+def _run_of(
+    energy: Float[np.ndarray, " t"], test: Whole, row: Whole, floor: float
+) -> tuple[Whole, Whole]:
+    """First lag, and the one after the last, of the run above a level that a test lies in."""
+    first = last = test
+    while first >= row and energy[first - row] > floor:
+        first -= row
+    while last + row < energy.size and energy[last + row] > floor:
+        last += row
+    return first // row, last // row + 1
+
+
+@no_alloc
+def _snapshot(
+    energy: Float[np.ndarray, " t"],
+    test: Whole,
+    row: Whole,
+    tones: Whole,
+    pulse: Whole,
+    rule: _Rules,
+) -> tuple[Whole, Whole]:
+    """First lag, and the one after the last, of the snapshot whose loudest is a test's; or none.
+
+    A run may hold other echoes beside what leaks into it: each of its peaks is asked, at its lag.
+    """
+    if rule.runs:
+        if _is_loudest(energy, test, row, energy.size, rule.threshold):
+            return _run_of(energy, test, row, rule.threshold)
+    elif _is_loudest(energy, test, row, pulse // 2, -1.0) and not _is_leakage(
+        energy, test, row, tones, pulse, rule.leakage
+    ):
+        return test // row, test // row + 1
+    return 0, 0
+
+
+@no_alloc
 def _scan_power(
-    x: Complex[np.ndarray, " e"], table: Float[np.ndarray, "2 l n"], power: Float[np.ndarray, " n"]
+    x: Complex[np.ndarray, "k e"],
+    table: Float[np.ndarray, "2 l n"],
+    power: Float[np.ndarray, " n"],
 ) -> None:
-    """Write the power of the conventional beam over the scan, from the lag sums."""
-    elements, beams = x.size, power.size
+    """Write the power of the conventional beam over the scan, of all rows, from the lag sums."""
+    elements, beams = x.shape[1], power.size
     r0 = 0.0
-    for e in range(elements):
-        r0 += x[e].real * x[e].real + x[e].imag * x[e].imag
+    for k in range(x.shape[0]):
+        for e in range(elements):
+            r0 += x[k, e].real * x[k, e].real + x[k, e].imag * x[k, e].imag
     for i in range(beams):
         power[i] = r0
     for lag in range(1, elements):
         re, im, cosine, sine = 0.0, 0.0, table[0, lag - 1], table[1, lag - 1]
-        for e in range(elements - lag):
-            later, former = x[e + lag], x[e]
-            re += later.real * former.real + later.imag * former.imag
-            im += later.imag * former.real - later.real * former.imag
+        for k in range(x.shape[0]):
+            for e in range(elements - lag):
+                later, former = x[k, e + lag], x[k, e]
+                re += later.real * former.real + later.imag * former.imag
+                im += later.imag * former.real - later.real * former.imag
         re, im = 2.0 * re, 2.0 * im
         for i in range(beams):
             power[i] += re * cosine[i] - im * sine[i]
+
+
+@no_alloc
+def _loudest_row(x: Complex[np.ndarray, "k e"], u: float) -> tuple[Whole, float]:
+    """Row at which the beam steered to u is loudest, and its power there."""
+    turn, loudest, highest = complex(math.cos(u), -math.sin(u)), 0, -1.0
+    for k in range(x.shape[0]):
+        beam, phase = 0.0 + 0.0j, 1.0 + 0.0j
+        for e in range(x.shape[1]):
+            beam += x[k, e] * phase
+            phase *= turn
+        power = beam.real * beam.real + beam.imag * beam.imag
+        if power > highest:
+            loudest, highest = k, power
+    return loudest, highest
 
 
 @no_alloc
@@ -391,14 +447,13 @@ def _find_peaks(
     power, place = np.empty(scan.shape[1]), np.empty(scan.shape[1], dtype=np.int64)
     beam = np.empty(2 * reach_of(pulse) + 3, dtype=np.complex128)
     row, count = faces * tones, 0
-    reach, floor = (energy.size, rule.threshold) if rule.runs else (pulse // 2, -1.0)
     for test in _candidates(energy, rule.threshold, row if pulse > 1 else energy.size):
-        if not _is_loudest(energy, test, row, reach, floor) or _is_leakage(
-            energy, test, row, tones, pulse, rule.leakage
-        ):
+        first, end = _snapshot(energy, test, row, tones, pulse, rule)
+        if first == end:
             continue
-        b, f, p = test // row, test // tones % faces, test % tones
-        _scan_power(matched[b, f, p], rule.table[p], power)
+        f, p = test // tones % faces, test % tones
+        snapshot = matched[first:end, f, p]
+        _scan_power(snapshot, rule.table[p], power)
         step = scan[p, 1] - scan[p, 0]
         for i in place[: _peaks(power, rule.peak, place)]:
             slope = power[i + 1] - power[i - 1]
@@ -406,12 +461,18 @@ def _find_peaks(
             u = scan[p, i] + 0.5 * step * slope / bend
             if abs(u / wave[p]) > rule.sine_limit:
                 continue
+            b, top = first, power[i] + 0.125 * slope * slope / bend
+            if rule.runs:
+                later, top = _loudest_row(snapshot, u)
+                b += later
+                if _is_leakage(energy, b * row + test % row, row, tones, pulse, rule.leakage):
+                    continue
             if count == face.size:
                 face, tone, delay = _grown(face), _grown(tone), _grown(delay)
                 sine, peak_power = _grown(sine), _grown(peak_power)
             face[count], tone[count], sine[count] = f, p, u / wave[p]
             late = arrival_lag(matched, b, f, p, u, pulse, beam)
             delay[count] = lag.start + lag.interval * late
-            peak_power[count] = (power[i] + 0.125 * slope * slope / bend) / elements
+            peak_power[count] = top / elements
             count += 1
     return face[:count], tone[:count], delay[:count], sine[:count], peak_power[:count]
