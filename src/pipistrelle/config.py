@@ -111,6 +111,8 @@ class EmitterConfig(Section):
     """Radius of the piston [m]; 8.8 mm makes a half-power beamwidth of 33 degrees."""
     level_db: Level = 49.7
     """Source level on the axis at 1 m [dB]; unreported, fitted."""
+    off_axis: Literal["pressure", "power"] = "pressure"
+    """Off the axis the call loses 20 log10 p, p the piston's pressure, or 10 log10 p [dB]."""
     pulse: Positive = 2.8e-3
     """Length of the call, of the beacon's too [s]; unreported."""
 
@@ -208,6 +210,8 @@ class RayConfig(Section):
     """Sharpening of the weights that share a measurement (n)."""
     weights: Literal["instantaneous", "aggregated"] = "instantaneous"
     """Share by this measurement's likelihoods (the paper's text) or by all so far (Sola's code)."""
+    likelihood: Literal["normal", "printed"] = "normal"
+    """Of a member: the normal density, or 1/sqrt(2 pi S) inside the exponent, as Eq. (19) reads."""
     partial: Literal["reinitialise", "heaviest"] = "reinitialise"
     """A range for a partial landmark: place it anew, or move its heaviest member."""
 
@@ -228,6 +232,8 @@ class FastSlamConfig(Section):
     """Resample when fewer effective particles than this share are left."""
     mixture: Literal["federated", "exact"] = "federated"
     """Bearings shared among a ray's members (the paper's) or an exact Gaussian mixture."""
+    weights: Literal["marginal", "sampled"] = "marginal"
+    """Weigh by the likelihood before the sample, or at it by prior x likelihood / proposal."""
 
 
 class Config(Section):

@@ -272,6 +272,16 @@ def test_a_piston_changes_the_levels_of_active_echoes_alone(seed):
             np.testing.assert_array_equal(getattr(beamed, name), column)
 
 
+def test_taken_for_a_power_the_pistons_pressure_costs_half_the_decibels_and_none_of_anothers():
+    heard = sounds_of_emission(*world(5), CONFIG)
+    whole, half = (
+        through_piston(heard, **PISTON, off_axis=way).level_db - heard.level_db
+        for way in ("pressure", "power")
+    )
+    np.testing.assert_allclose(half, 0.5 * whole, atol=1e-11)
+    assert whole.min() < -3.0
+
+
 def test_a_piston_far_smaller_than_the_wave_sends_alike_in_all_directions():
     heard = sounds_of_emission(*world(5), CONFIG)
     beamed = through_piston(heard, **{**PISTON, "radius": 1e-6})

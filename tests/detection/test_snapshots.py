@@ -207,11 +207,11 @@ def test_detections_at_the_full_rate_are_those_of_a_slow_second_version():
 @given(key=st.integers(0, 2**64 - 1), tone=st.sampled_from([OWN, BEACON]))
 @law
 def test_the_scan_by_lag_sums_is_the_conventional_beamscan_to_rounding(key, tone):
-    snapshot, power = complex_noise((3, 10), 1.0, key), np.empty(FINDER.scan.shape[1])
-    _scan_power(snapshot, FINDER.table[tone], power)
+    matched, power = complex_noise((5, 4, 2, 10), 1.0, key), np.empty(FINDER.scan.shape[1])
+    _scan_power(matched, (1, 4), 3, tone, FINDER.table[tone], power)
     ears = {"position": LAYOUT.position, "frequency": SETTLED.tones[tone], "speed_of_sound": 343.0}
     angle = np.arcsin(FINDER.scan[tone] / FINDER.wave[tone])
-    exact = np.sum([beamscan(row, angle, **ears) for row in snapshot], axis=0)
+    exact = np.sum([beamscan(row, angle, **ears) for row in matched[1:4, 3, tone]], axis=0)
     np.testing.assert_allclose(power, exact, atol=1e-12 * exact.max())
 
 

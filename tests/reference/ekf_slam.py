@@ -282,7 +282,10 @@ class SlowEkfSlam:
             nu, H, R = self.innovation(block, math.nan, bearing)
             distance_squared, S = self.distance_squared(nu, H, R)
             squared.append(distance_squared)
-            log_likelihood.append(-distance_squared / 2 - math.log(2 * math.pi * S[0, 0]) / 2)
+            if self.rays.likelihood == "printed":
+                log_likelihood.append(-distance_squared / 2 / math.sqrt(2 * math.pi * S[0, 0]))
+            else:
+                log_likelihood.append(-distance_squared / 2 - math.log(2 * math.pi * S[0, 0]) / 2)
         if all(self.outside(value, 1) for value in squared):
             self.gated += 1
             return

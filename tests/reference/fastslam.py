@@ -71,6 +71,17 @@ def semidefinite_cholesky(P):
     return L
 
 
+def log_density(pose, mean, P):
+    """Log of a Gaussian's density, over the directions in which it has a spread."""
+    L = semidefinite_cholesky(P)
+    spread = np.flatnonzero(np.diag(L))
+    error = np.array(pose) - mean
+    error[2] = wrapped(error[2])
+    L, error = L[np.ix_(spread, spread)], error[spread]
+    white = np.linalg.solve(L, error)
+    return -(white @ white) / 2 - sum(np.log(math.sqrt(2 * math.pi) * np.diag(L)))
+
+
 def heaviest(members):
     return max(range(len(members)), key=lambda j: members[j].weight)
 
@@ -78,17 +89,15 @@ def heaviest(members):
 class SlowFastSlam:
     """The filter and its swarm in one object that changes in place.
 
-    `swarm` holds particles, resample_below and mixture. With `weigh_where` = "sampled" the weights
-    are wrong on purpose: the likelihood at the sampled pose alone, whose proposal has already used
-    the measurements.
+    `swarm` holds particles, resample_below, mixture and weights. With `forget_proposal` weights at
+    the sample are wrong on purpose: the likelihood alone, whose proposal has already used the
+    measurements.
     """
 
-    def __init__(
-        self, motion, range_std, bearing_std, rays, gate, swarm, *, weigh_where="proposed"
-    ):
+    def __init__(self, motion, range_std, bearing_std, rays, gate, swarm, *, forget_proposal=False):
         self.motion, self.rays, self.gate, self.settings = motion, rays, gate, swarm
         self.range_variance, self.bearing_variance = range_std**2, bearing_std**2
-        self.weigh_where = weigh_where
+        self.forget_proposal = forget_proposal
 
     def start(self, mean, covariance):
         self.particles = [
@@ -160,6 +169,16 @@ class SlowFastSlam:
             for member in members
         ]
 
+    def log_lambdas(self, p, members, bearing):
+        """Likelihoods as they weigh and share a ray: Eq. (19), or as it is printed."""
+        if self.rays.likelihood == "normal" or self.settings.mixture == "exact":
+            return self.log_likelihoods(p, members, bearing)
+        logs = []
+        for member in members:
+            nu, S, _ = self.expected(p, member, math.nan, bearing)
+            logs.append(-(nu[0] ** 2) / S[0, 0] / math.sqrt(2 * math.pi * S[0, 0]) / 2)
+        return logs
+
     # One frame
 
     def update(self, scan, rng):
@@ -180,13 +199,17 @@ class SlowFastSlam:
 
     def one_frame(self, p, rows, draw):
         known = [row for row in rows if row[0] in p.map]
+        prior = p.pose, p.P
         for label, distance, bearing in known:
             self.refine(p, p.map[label], distance, bearing)
+        proposal = p.pose, p.P
         p.pose = p.pose + semidefinite_cholesky(p.P) @ draw
         p.pose[2] = wrapped(p.pose[2])
         p.P = np.zeros((3, 3))
+        if self.settings.weights == "sampled" and not self.forget_proposal:
+            p.log_weight += log_density(p.pose, *prior) - log_density(p.pose, *proposal)
         for label, distance, bearing in known:
-            if self.weigh_where == "sampled":
+            if self.settings.weights == "sampled":
                 p.log_weight += self.log_weight_gain(p, p.map[label], distance, bearing)
             p.map[label] = self.correct(p.pose, p.map[label], distance, bearing)
         for label, distance, bearing in rows:
@@ -223,12 +246,12 @@ class SlowFastSlam:
         return log_sum([logarithm(m.weight) + log for m, log in zip(members, logs, strict=True)])
 
     def refine(self, p, members, distance, bearing):
-        if self.weigh_where == "proposed":
+        if self.settings.weights == "marginal":
             p.log_weight += self.log_weight_gain(p, members, distance, bearing)
         if len(members) == 1:
             p.pose, p.P = self.refined(p, members[0], distance, bearing)
         elif math.isnan(distance) and self.settings.mixture == "federated":
-            logs = self.log_likelihoods(p, members, bearing)
+            logs = self.log_lambdas(p, members, bearing)
             for member, share in zip(members, self.shares(members, logs), strict=True):
                 if share > 0:
                     p.pose, p.P = self.refined(p, member, distance, bearing, 1 / share)
@@ -291,7 +314,7 @@ class SlowFastSlam:
 
     def correct_ray(self, pose, members, bearing):
         """Weigh every member, share the bearing among them or not, prune."""
-        logs = self.log_likelihoods(Particle(pose, np.zeros((3, 3))), members, bearing)
+        logs = self.log_lambdas(Particle(pose, np.zeros((3, 3))), members, bearing)
         shares = self.shares(members, logs)
         if self.settings.mixture == "exact":
             shares = [1] * len(members)

@@ -109,9 +109,13 @@ class AssumingFastSlam(FastSlam):
         return FastSlam.update(self, belief, assumed, rng)
 
 
-def swarm_filter(particles=20, mixture="federated", resample_below=0.75, **changes):
+def swarm_filter(
+    particles=20, mixture="federated", resample_below=0.75, weights="marginal", **changes
+):
     """Return the filter with the paper's settings, but for the changes."""
-    swarm = FastSlamConfig(particles=particles, mixture=mixture, resample_below=resample_below)
+    swarm = FastSlamConfig(
+        particles=particles, mixture=mixture, resample_below=resample_below, weights=weights
+    )
     slam = AssumingFastSlam(motion=BICYCLE, rays=ray_config(), settings=swarm)
     return replace(slam, **changes)
 

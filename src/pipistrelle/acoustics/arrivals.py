@@ -179,7 +179,12 @@ def arrivals_of_emissions(
 
 
 def through_piston(
-    arrivals: Arrivals, *, radius: float, frequency: float, speed_of_sound: float
+    arrivals: Arrivals,
+    *,
+    radius: float,
+    frequency: float,
+    speed_of_sound: float,
+    off_axis: str = "pressure",
 ) -> Arrivals:
     r"""What arrives when a piston sends the vehicle's call.
 
@@ -187,6 +192,10 @@ def through_piston(
 
     An echo left in the direction that it comes from, and the piston only sends, so its pressure p
     counts once. In its nulls p is taken as 1e-12 (-240 dB): levels stay finite.
+
+    With ``off_axis = "power"`` the factor is 10, as if p were a ratio of powers. That is no
+    physics, but a slip that a program can hold unseen: the half-power beamwidths of the paper's
+    Appendix B are those of a pressure, and its fitted level hides the rest.
 
     Parameters
     ----------
@@ -197,6 +206,7 @@ def through_piston(
     frequency : [Hz]
         Of the vehicle's call.
     speed_of_sound : [m/s]
+    off_axis : "pressure" or "power"
 
     Returns
     -------
@@ -223,7 +233,8 @@ def through_piston(
         arrivals.bearing[own], frequency=frequency, radius=radius, speed_of_sound=speed_of_sound
     )
     level_db = arrivals.level_db.copy()
-    level_db[own] += 20.0 * np.log10(np.maximum(pressure, _DEEPEST_NULL))
+    decibels = 20.0 if off_axis == "pressure" else 10.0
+    level_db[own] += decibels * np.log10(np.maximum(pressure, _DEEPEST_NULL))
     return Arrivals(
         delay=arrivals.delay,
         level_db=level_db,

@@ -97,7 +97,7 @@ class Detector:
     normal: Float[np.ndarray, " f"]
     wave: Float[np.ndarray, " c"]
     scan: Float[np.ndarray, "c n"]
-    table: Float[np.ndarray, "c 2 l n"]
+    table: Float[np.ndarray, "c 2 k n"]
 
 
 def detector(config: Config, layout: Layout, tones: Float[np.ndarray, " c"]) -> Detector:
@@ -224,7 +224,7 @@ class _Rules(NamedTuple):
     sine_limit: float
     wave: Float[np.ndarray, " c"]
     scan: Float[np.ndarray, "c n"]
-    table: Float[np.ndarray, "c 2 l n"]
+    table: Float[np.ndarray, "c 2 k n"]
 
 
 class _Lags(NamedTuple):
@@ -336,17 +336,19 @@ def _snapshot(
     row: Whole,
     tones: Whole,
     pulse: Whole,
-    rule: _Rules,
+    runs: bool,
+    threshold: float,
+    leakage: float,
 ) -> tuple[Whole, Whole]:
     """First lag, and the one after the last, of the snapshot whose loudest is a test's; or none.
 
     A run may hold other echoes beside what leaks into it: each of its peaks is asked, at its lag.
     """
-    if rule.runs:
-        if _is_loudest(energy, test, row, energy.size, rule.threshold):
-            return _run_of(energy, test, row, rule.threshold)
+    if runs:
+        if _is_loudest(energy, test, row, energy.size, threshold):
+            return _run_of(energy, test, row, threshold)
     elif _is_loudest(energy, test, row, pulse // 2, -1.0) and not _is_leakage(
-        energy, test, row, tones, pulse, rule.leakage
+        energy, test, row, tones, pulse, leakage
     ):
         return test // row, test // row + 1
     return 0, 0
@@ -354,23 +356,31 @@ def _snapshot(
 
 @no_alloc
 def _scan_power(
-    x: Complex[np.ndarray, "k e"],
-    table: Float[np.ndarray, "2 l n"],
+    matched: Complex[np.ndarray, "l f c e"],
+    lags: tuple[Whole, Whole],
+    f: Whole,
+    p: Whole,
+    table: Float[np.ndarray, "2 k n"],
     power: Float[np.ndarray, " n"],
 ) -> None:
-    """Write the power of the conventional beam over the scan, of all rows, from the lag sums."""
-    elements, beams = x.shape[1], power.size
+    """Write the power of the conventional beam over the scan, from the sums over element pairs.
+
+    That of the lags from the first to before the last is summed.
+    """
+    elements, beams = matched.shape[3], power.size
     r0 = 0.0
-    for k in range(x.shape[0]):
+    for b in range(lags[0], lags[1]):
+        x = matched[b, f, p]
         for e in range(elements):
-            r0 += x[k, e].real * x[k, e].real + x[k, e].imag * x[k, e].imag
+            r0 += x[e].real * x[e].real + x[e].imag * x[e].imag
     for i in range(beams):
         power[i] = r0
     for lag in range(1, elements):
         re, im, cosine, sine = 0.0, 0.0, table[0, lag - 1], table[1, lag - 1]
-        for k in range(x.shape[0]):
+        for b in range(lags[0], lags[1]):
+            x = matched[b, f, p]
             for e in range(elements - lag):
-                later, former = x[k, e + lag], x[k, e]
+                later, former = x[e + lag], x[e]
                 re += later.real * former.real + later.imag * former.imag
                 im += later.imag * former.real - later.real * former.imag
         re, im = 2.0 * re, 2.0 * im
@@ -379,17 +389,23 @@ def _scan_power(
 
 
 @no_alloc
-def _loudest_row(x: Complex[np.ndarray, "k e"], u: float) -> tuple[Whole, float]:
-    """Row at which the beam steered to u is loudest, and its power there."""
-    turn, loudest, highest = complex(math.cos(u), -math.sin(u)), 0, -1.0
-    for k in range(x.shape[0]):
-        beam, phase = 0.0 + 0.0j, 1.0 + 0.0j
-        for e in range(x.shape[1]):
-            beam += x[k, e] * phase
+def _loudest_lag(
+    matched: Complex[np.ndarray, "l f c e"],
+    lags: tuple[Whole, Whole],
+    f: Whole,
+    p: Whole,
+    u: float,
+) -> tuple[Whole, float]:
+    """Lag, of those from the first to before the last, loudest in the beam steered to u; power."""
+    turn, loudest, highest = complex(math.cos(u), -math.sin(u)), lags[0], -1.0
+    for b in range(lags[0], lags[1]):
+        x, beam, phase = matched[b, f, p], 0.0 + 0.0j, 1.0 + 0.0j
+        for e in range(x.size):
+            beam += x[e] * phase
             phase *= turn
         power = beam.real * beam.real + beam.imag * beam.imag
         if power > highest:
-            loudest, highest = k, power
+            loudest, highest = b, power
     return loudest, highest
 
 
@@ -448,12 +464,11 @@ def _find_peaks(
     beam = np.empty(2 * reach_of(pulse) + 3, dtype=np.complex128)
     row, count = faces * tones, 0
     for test in _candidates(energy, rule.threshold, row if pulse > 1 else energy.size):
-        first, end = _snapshot(energy, test, row, tones, pulse, rule)
-        if first == end:
+        within = _snapshot(energy, test, row, tones, pulse, rule.runs, rule.threshold, rule.leakage)
+        if within[0] == within[1]:
             continue
         f, p = test // tones % faces, test % tones
-        snapshot = matched[first:end, f, p]
-        _scan_power(snapshot, rule.table[p], power)
+        _scan_power(matched, within, f, p, rule.table[p], power)
         step = scan[p, 1] - scan[p, 0]
         for i in place[: _peaks(power, rule.peak, place)]:
             slope = power[i + 1] - power[i - 1]
@@ -461,10 +476,9 @@ def _find_peaks(
             u = scan[p, i] + 0.5 * step * slope / bend
             if abs(u / wave[p]) > rule.sine_limit:
                 continue
-            b, top = first, power[i] + 0.125 * slope * slope / bend
+            b, top = within[0], power[i] + 0.125 * slope * slope / bend
             if rule.runs:
-                later, top = _loudest_row(snapshot, u)
-                b += later
+                b, top = _loudest_lag(matched, within, f, p, u)
                 if _is_leakage(energy, b * row + test % row, row, tones, pulse, rule.leakage):
                     continue
             if count == face.size:

@@ -14,7 +14,9 @@ few bearings from different places can. Each new bearing does three things to a 
 
 1. **Weigh.** The likelihood of member j is :math:`\lambda_j = N(\nu_j; 0, S_j)`. Its aggregated
    likelihood, :math:`\Lambda_j \leftarrow \Lambda_j \lambda_j`, normalised over the ray, is its
-   probability given all bearings so far.
+   probability given all bearings so far. With ``likelihood = "printed"`` the likelihood is
+   :math:`\exp(-\tfrac12 \nu_j^2 S_j^{-1} / \sqrt{2\pi S_j})`, as the unbalanced bracket of the
+   printed formula may be read: no density, and sharper where S is below 1/(2 pi).
 2. **Share.** The measurement is one; the members are several. Were each corrected with the full
    measurement, its information would be counted :math:`N_g` times. Federated information sharing
    gives member j the share :math:`\rho_j`, that is the noise :math:`R/\rho_j`; the shares sum to
@@ -51,6 +53,7 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 SMALLEST_AGGREGATED_SHARE = 0.05
 SMALLEST_SHARE = 1e-12
 UNDERFLOW = 1e-200
+FEDERATED, AS_PRINTED, EXACT = range(3)
 
 
 def ray_members(
@@ -97,7 +100,11 @@ class Sensing(NamedTuple):
     ray_ranges, ray_stds : (h) [m]
         Read-only.
     power, prune : float
-    aggregated, reinitialise, exact : bool
+    aggregated, reinitialise : bool
+    sharing : int
+        How members take a bearing: FEDERATED, AS_PRINTED (federated, by the other reading of the
+        likelihood) or EXACT (all of it each, as in a Gaussian mixture). One number, for the
+        filter's speed hangs on how many there are in this record.
     """
 
     passive_bound: float
@@ -108,7 +115,7 @@ class Sensing(NamedTuple):
     prune: float
     aggregated: bool
     reinitialise: bool
-    exact: bool
+    sharing: int
 
 
 @lru_cache(maxsize=16)
@@ -142,7 +149,8 @@ def sensing_of(rays: RayConfig, gate: float, exact: bool = False) -> Sensing:
     rays : RayConfig
     gate : (0, 1]
     exact : bool
-        Whether a bearing corrects every member by R itself, as in a Gaussian mixture (FastSLAM).
+        Whether a bearing corrects every member by R itself, as in a Gaussian mixture (FastSLAM):
+        its weights are densities.
 
     Returns
     -------
@@ -161,17 +169,20 @@ def sensing_of(rays: RayConfig, gate: float, exact: bool = False) -> Sensing:
         prune=rays.prune,
         aggregated=rays.weights == "aggregated",
         reinitialise=rays.partial == "reinitialise",
-        exact=exact,
+        sharing=EXACT if exact else AS_PRINTED if rays.likelihood == "printed" else FEDERATED,
     )
 
 
 @kernel
-def log_likelihood(innovation: float, variance: float) -> float:
-    """Log of N(innovation; 0, variance) without its constant.
+def log_likelihood(innovation: float, variance: float, printed: bool) -> float:
+    """Log of N(innovation; 0, variance) without its constant, or of Eq. (19) as printed.
 
-    Bradley & Abaid, Eq. (19), in logs: a product of many likelihoods underflows.
+    In logs, for a product of many likelihoods underflows.
     """
-    return -0.5 * (innovation * innovation / variance + math.log(variance))
+    squared = innovation * innovation / variance
+    if printed:
+        return -0.5 * squared / math.sqrt(2.0 * math.pi * variance)
+    return -0.5 * (squared + math.log(variance))
 
 
 @no_alloc

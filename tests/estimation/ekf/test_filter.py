@@ -101,7 +101,15 @@ rays = st.builds(
     power=st.floats(0.5, 8),
     weights=st.sampled_from(["instantaneous", "aggregated"]),
     partial=st.sampled_from(["reinitialise", "heaviest"]),
+    likelihood=st.sampled_from(["normal", "printed"]),
 )
+
+
+@pytest.mark.parametrize("weights", ["instantaneous", "aggregated"])
+def test_rays_weighed_by_the_printed_likelihood_equal_the_slow_reference(weights):
+    rays = ray_config(weights=weights, power=2.0, likelihood="printed")
+    mission = paper_mission("fused", frames=60)
+    assert_equal_to_reference(paper_filter(rays=rays), mission)
 
 
 @settings(max_examples=20)

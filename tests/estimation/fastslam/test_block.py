@@ -41,7 +41,7 @@ def uncertain_pair(offset):
 def expected(offset, count, j=0):
     """Log likelihood, with its constant, of a bearing of 0.3 to a member ahead, lane by lane."""
     (pose, member), said = uncertain_pair(offset), np.empty(LANES)
-    expect_bearing(pose, member, 0.3, 0.01, np.asarray(count, dtype=np.int64), j, said)
+    expect_bearing(pose, member, 0.3, 0.01, np.asarray(count, dtype=np.int64), j, False, said)
     return said - 0.5 * math.log(2.0 * math.pi)
 
 
@@ -103,7 +103,7 @@ def weighed(unit, distance=5.0):
     rows[:, X:XX] *= unit
     rows[:, XX:LOG_WEIGHT] *= unit**2
     log_weight, heard = np.zeros(LANES), (distance * unit, 0.1, 0.04 * unit**2, 0.01)
-    weigh_by_active(pose, rows, heard, count, scratch_for(3), log_weight)
+    weigh_by_active(pose, rows, heard, count, 2, scratch_for(3), log_weight)
     assert not log_weight[1::2].any()
     refine_by_active(pose, rows[0], *heard, count, log_weight)
     return log_weight[:2]

@@ -135,6 +135,15 @@ def test_whole_run_equals_the_slow_reference_with_every_option(
     assert_equal_whole_run(mission, 20, weights, partial, mixture, power, gate)
 
 
+@pytest.mark.parametrize("mixture", ["federated", "exact"])
+@pytest.mark.parametrize("weights", ["marginal", "sampled"])
+@pytest.mark.parametrize("likelihood", ["normal", "printed"])
+def test_every_weight_with_every_likelihood_equals_the_slow_reference(likelihood, weights, mixture):
+    rays = ray_config(power=2.0, likelihood=likelihood)
+    slam = swarm_filter(5, mixture, weights=weights, rays=rays)
+    assert_equal_to_reference(slam, small_mission("fused", frames=32))
+
+
 rays = st.builds(
     RayConfig,
     ratio=st.floats(0.1, 0.5),
@@ -144,6 +153,7 @@ rays = st.builds(
     power=st.floats(0.5, 8),
     weights=st.sampled_from(["instantaneous", "aggregated"]),
     partial=st.sampled_from(["reinitialise", "heaviest"]),
+    likelihood=st.sampled_from(["normal", "printed"]),
 )
 
 
@@ -178,7 +188,8 @@ def test_unicycle_that_stops_reverses_and_turns_past_pi_equals_the_slow_referenc
     assert_equal_to_reference(swarm_filter(5, motion=motion), mission, start)
 
 
-def test_one_control_step_per_measurement_equals_the_slow_reference():
+@pytest.mark.parametrize("weights", ["marginal", "sampled"])
+def test_one_control_step_per_measurement_equals_the_slow_reference(weights):
     """The covariance of the pose has rank 2, and its last pivot is rounding: no noise."""
     mission = small_mission("fused", frames=20)
     single = Mission(
@@ -188,7 +199,7 @@ def test_one_control_step_per_measurement_equals_the_slow_reference():
         landmarks=mission.landmarks,
         scans=mission.scans,
     )
-    assert_equal_to_reference(swarm_filter(5), single)
+    assert_equal_to_reference(swarm_filter(5, weights=weights), single)
 
 
 def test_frames_without_measurements_equal_the_slow_reference():

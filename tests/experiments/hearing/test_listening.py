@@ -306,6 +306,19 @@ def test_ranges_bearings_and_beams_are_those_of_the_air_of_the_settings():
     assert bits(settled[0]) == bits(said[0])
 
 
+def test_the_off_axis_loss_is_that_of_the_settings():
+    config = Config(scenario=ScenarioConfig(steps=80))
+    mild = config.model_copy(update={"emitter": EmitterConfig(off_axis="power")})
+    world = draw_scenario(config, np.random.default_rng(7))
+
+    def forgiving(arrivals, **piston):
+        return through_piston(arrivals, **piston, off_axis="power")
+
+    settled, said = listen(world, mild, [0.02]), listen(world, config, [0.02], beam=forgiving)
+    assert bits(settled[0]) == bits(said[0])
+    assert bits(settled[0]) != bits(listen(world, config, [0.02])[0])
+
+
 def frames(seed, every):
     """Yield the arrivals of a mission's emissions and the blocks of their noise."""
     world = draw_scenario(CONFIG, np.random.default_rng(seed))

@@ -41,6 +41,7 @@ from pipistrelle.estimation.measurement import (
 )
 from pipistrelle.estimation.motion import Motion, motion_numbers
 from pipistrelle.estimation.rays import (
+    AS_PRINTED,
     Sensing,
     heaviest_member,
     log_likelihood,
@@ -262,7 +263,7 @@ def _correct_ray(
         _, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
         innovation = wrap_angle(bearing - expected)
         S = bearing_variance(joint, size, i, c, s, k) + variance
-        scratch.likelihood[j] = log_likelihood(innovation, S)
+        scratch.likelihood[j] = log_likelihood(innovation, S, sensing.sharing == AS_PRINTED)
         if innovation * innovation <= sensing.passive_bound * S:
             outcome = APPLIED
     if outcome == GATED:

@@ -67,6 +67,16 @@ def _spread(member: Member, h0: float, h1: float, i: Whole) -> float:
     return h0 * h0 * member[XX + i] + cross + h1 * h1 * member[YY + i]
 
 
+@inlined
+def _foreseen(
+    pose: Poses, member: Member, bearing: float, variance: float, i: Whole
+) -> tuple[float, float, bool]:
+    """Innovation of a member's bearing, its variance, and whether it was foreseen at all."""
+    innovation, h0, h1, far = _bearing(pose, member, bearing, i)
+    a0, a1, a2 = _bearing_gain(pose, h0, h1, i)
+    return innovation, (h0 * a0 + h1 * a1 - a2 + _spread(member, h0, h1, i)) + variance, far
+
+
 @no_alloc
 def expect_bearing(
     pose: Poses,
@@ -75,20 +85,40 @@ def expect_bearing(
     variance: float,
     count: Counts,
     j: Whole,
+    printed: bool,
     log_likelihood: Lanes,
 ) -> None:
     """Log likelihood, without its constant, of the bearing of each lane's member j (Eq. (19)).
 
     Minus infinity where a lane has no member j. A member too near to foresee its bearing makes it
-    uniform over the circle; alone, it says nothing.
+    uniform over the circle; alone, it says nothing. ``printed`` is the formula's other reading.
     """
+    if printed:
+        _expect_as_printed(pose, member, bearing, variance, count, j, log_likelihood)
+        return
     for i in range(LANES):
-        innovation, h0, h1, far = _bearing(pose, member, bearing, i)
-        a0, a1, a2 = _bearing_gain(pose, h0, h1, i)
-        S = (h0 * a0 + h1 * a1 - a2 + _spread(member, h0, h1, i)) + variance
+        innovation, S, far = _foreseen(pose, member, bearing, variance, i)
         value = -0.5 * (innovation * innovation / S + logarithm(S))
         unforeseen = -HALF_LOG_TAU if count[i] > 1 else HALF_LOG_TAU
         value = value if far else unforeseen
+        log_likelihood[i] = value if j < count[i] else -np.inf
+
+
+@no_alloc
+def _expect_as_printed(
+    pose: Poses,
+    member: Member,
+    bearing: float,
+    variance: float,
+    count: Counts,
+    j: Whole,
+    log_likelihood: Lanes,
+) -> None:
+    """Log of Eq. (19) with all of its root inside the exponent; zero for what is too near."""
+    for i in range(LANES):
+        innovation, S, far = _foreseen(pose, member, bearing, variance, i)
+        value = -0.5 * (innovation * innovation / S) / math.sqrt(2.0 * math.pi * S)
+        value = value if far else 0.0
         log_likelihood[i] = value if j < count[i] else -np.inf
 
 
@@ -105,9 +135,7 @@ def bearing_beyond(
     """Whether the bearing is beyond the bound for member j of every lane that has one."""
     beyond = 0
     for i in range(LANES):
-        innovation, h0, h1, far = _bearing(pose, member, bearing, i)
-        a0, a1, a2 = _bearing_gain(pose, h0, h1, i)
-        S = (h0 * a0 + h1 * a1 - a2 + _spread(member, h0, h1, i)) + variance
+        innovation, S, far = _foreseen(pose, member, bearing, variance, i)
         within = not far or innovation * innovation <= bound * S
         beyond += 0 if within and j < count[i] else 1
     return beyond == LANES
@@ -212,11 +240,14 @@ def expect_active(
     bearing: float,
     range_variance: float,
     bearing_variance: float,
+    count: Counts,
+    j: Whole,
     log_likelihood: Lanes,
 ) -> None:
-    """Log likelihood, without its constant, of range and bearing of one member of a ray.
+    """Log likelihood, without its constant, of range and bearing of each lane's member j.
 
-    A member too near to foresee its bearing makes it uniform over the circle.
+    Minus infinity where a lane has no member j. A member too near to foresee its bearing makes it
+    uniform over the circle; alone, it says nothing.
     """
     for i in range(LANES):
         nu0, nu1, c, s, k, far = _active(pose, member, distance, bearing, i)
@@ -227,7 +258,9 @@ def expect_active(
         value = -0.5 * (e0 * e0 + e1 * e1) + logarithm(i0 * i1)
         S00 = member[XX + i] + member[YY + i] + range_variance
         unforeseen = -0.5 * (nu0 * nu0 / S00 + logarithm(S00)) - HALF_LOG_TAU
-        log_likelihood[i] = value if far else unforeseen
+        unforeseen = unforeseen if count[i] > 1 else 2.0 * HALF_LOG_TAU
+        value = value if far else unforeseen
+        log_likelihood[i] = value if j < count[i] else -np.inf
 
 
 @no_alloc
@@ -349,19 +382,47 @@ def initialise_member(
         member[LOG_WEIGHT + i] = log_weight if here else member[LOG_WEIGHT + i]
 
 
+@inlined
+def _lower(pose: Poses, i: Whole) -> tuple[float, float, float, float, float, float]:
+    """Lower factor of a pose's covariance of any rank, row by row: a flat pivot is zero."""
+    L00 = math.sqrt(max(pose[PXX + i], 0.0))
+    i0 = 1.0 / L00 if L00 > 0.0 else 0.0
+    L10, L20 = pose[PXY + i] * i0, pose[PXH + i] * i0
+    left = pose[PYY + i] - L10 * L10
+    L11 = math.sqrt(max(left, 0.0)) if left > ROUNDING * pose[PYY + i] else 0.0
+    i1 = 1.0 / L11 if L11 > 0.0 else 0.0
+    L21 = (pose[PYH + i] - L20 * L10) * i1
+    left = pose[PHH + i] - L20 * L20 - L21 * L21
+    L22 = math.sqrt(max(left, 0.0)) if left > ROUNDING * pose[PHH + i] else 0.0
+    return L00, L10, L11, L20, L21, L22
+
+
+@inlined
+def _log_density(gaussian: Poses, pose: Poses, i: Whole) -> float:
+    """Log of a Gaussian's density at a pose, without its constant and its flat directions."""
+    L00, L10, L11, L20, L21, L22 = _lower(gaussian, i)
+    i0 = 1.0 / L00 if L00 > 0.0 else 0.0
+    i1 = 1.0 / L11 if L11 > 0.0 else 0.0
+    i2 = 1.0 / L22 if L22 > 0.0 else 0.0
+    e0 = (pose[X + i] - gaussian[X + i]) * i0
+    e1 = (pose[Y + i] - gaussian[Y + i] - L10 * e0) * i1
+    e2 = (wrapped(pose[HEADING + i] - gaussian[HEADING + i]) - L20 * e0 - L21 * e1) * i2
+    volume = (i0 if i0 > 0.0 else 1.0) * (i1 if i1 > 0.0 else 1.0) * (i2 if i2 > 0.0 else 1.0)
+    return -0.5 * (e0 * e0 + e1 * e1 + e2 * e2) + logarithm(volume)
+
+
+@no_alloc
+def weigh_sample(prior: Poses, proposal: Poses, pose: Poses, log_weight: Lanes) -> None:
+    """Weigh sampled poses by the density of the prior over that which they were drawn from."""
+    for i in range(LANES):
+        log_weight[i] += _log_density(prior, pose, i) - _log_density(proposal, pose, i)
+
+
 @no_alloc
 def sample_pose(pose: Poses, normal: Lanes) -> None:
     """Draw the poses from their Gaussians with three standard normals each; no spread is left."""
     for i in range(LANES):
-        L00 = math.sqrt(max(pose[PXX + i], 0.0))
-        i0 = 1.0 / L00 if L00 > 0.0 else 0.0
-        L10, L20 = pose[PXY + i] * i0, pose[PXH + i] * i0
-        left = pose[PYY + i] - L10 * L10
-        L11 = math.sqrt(max(left, 0.0)) if left > ROUNDING * pose[PYY + i] else 0.0
-        i1 = 1.0 / L11 if L11 > 0.0 else 0.0
-        L21 = (pose[PYH + i] - L20 * L10) * i1
-        left = pose[PHH + i] - L20 * L20 - L21 * L21
-        L22 = math.sqrt(max(left, 0.0)) if left > ROUNDING * pose[PHH + i] else 0.0
+        L00, L10, L11, L20, L21, L22 = _lower(pose, i)
         n0, n1, n2 = normal[X + i], normal[Y + i], normal[HEADING + i]
         pose[X + i] += L00 * n0
         pose[Y + i] += L10 * n0 + L11 * n1

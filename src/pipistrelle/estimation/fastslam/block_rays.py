@@ -34,7 +34,13 @@ from pipistrelle.estimation.fastslam.block import (
     expect_bearing,
     refine_by_bearing,
 )
-from pipistrelle.estimation.rays import SMALLEST_AGGREGATED_SHARE, SMALLEST_SHARE, Sensing
+from pipistrelle.estimation.rays import (
+    AS_PRINTED,
+    EXACT,
+    SMALLEST_AGGREGATED_SHARE,
+    SMALLEST_SHARE,
+    Sensing,
+)
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 Rows = Float[np.ndarray, "h numbers"]
@@ -151,6 +157,41 @@ def most(count: Counts) -> Whole:
 
 
 @no_alloc
+def _expect_ray(
+    pose: Poses,
+    rows: Rows,
+    count: Counts,
+    bearing: float,
+    variance: float,
+    printed: bool,
+    scratch: Scratch,
+) -> None:
+    """Log likelihoods of a bearing of all members, into ``likelihood``."""
+    for j in range(most(count)):
+        likelihood = scratch.likelihood[j]
+        expect_bearing(pose, rows[j], bearing, variance, count, j, printed, likelihood)
+
+
+@no_alloc
+def weigh_by_bearing(
+    pose: Poses,
+    rows: Rows,
+    count: Counts,
+    bearing: float,
+    variance: float,
+    scratch: Scratch,
+    log_weight: Lanes,
+) -> None:
+    """Weigh the poses by the bearing of a landmark: the density of its members' mixture."""
+    _expect_ray(pose, rows, count, bearing, variance, False, scratch)
+    if most(count) == 1:
+        _add(scratch.likelihood[0], log_weight)
+        return
+    _weigh(rows, most(count), scratch)
+    _add(scratch.total, log_weight)
+
+
+@no_alloc
 def refine_by_ray(
     pose: Poses,
     rows: Rows,
@@ -163,17 +204,16 @@ def refine_by_ray(
 ) -> None:
     """Correct the poses by the bearing of a landmark, and weigh them by its likelihood."""
     members = most(count)
-    for j in range(members):
-        expect_bearing(pose, rows[j], bearing, variance, count, j, scratch.likelihood[j])
+    weigh_by_bearing(pose, rows, count, bearing, variance, scratch, log_weight)
     if members == 1:
-        _add(scratch.likelihood[0], log_weight)
         refine_by_bearing(pose, rows[0], bearing, variance, scratch.whole)
         return
-    _weigh(rows, members, scratch)
-    _add(scratch.total, log_weight)
-    if sensing.exact:
+    if sensing.sharing == EXACT:
         _refine_to_mixture(pose, rows, members, bearing, variance, scratch)
         return
+    if sensing.sharing == AS_PRINTED:
+        _expect_ray(pose, rows, count, bearing, variance, True, scratch)
+        _weigh(rows, members, scratch)
     _share(members, sensing, scratch)
     for j in range(members):
         refine_by_bearing(pose, rows[j], bearing, variance, scratch.share[j])
@@ -185,29 +225,28 @@ def weigh_by_active(
     rows: Rows,
     heard: tuple[float, float, float, float],
     count: Counts,
+    least: Whole,
     scratch: Scratch,
     log_weight: Lanes,
 ) -> None:
-    """Weigh the poses whose landmark is a ray by its range and bearing: the members' mixture.
+    """Weigh the poses whose landmark has so many members at least by its range and bearing.
 
-    ``heard`` are the two and their variances. Where the landmark has one member,
-    `refine_by_active` weighs: by a density over the same range and bearing, so that weights do not
-    hang on the units of either.
+    By the members' mixture, of which one member is a case: a density over range and bearing for
+    all, so that weights do not hang on the units of either. ``heard`` are the two and their
+    variances.
     """
     members = most(count)
-    if members == 1:
+    if members < least:
         return
     distance, bearing, range_variance, bearing_variance = heard
     for j in range(members):
-        likelihood = scratch.likelihood[j]
         expect_active(
-            pose, rows[j], distance, bearing, range_variance, bearing_variance, likelihood
-        )
-        for i in range(LANES):
-            likelihood[i] = likelihood[i] if j < count[i] else -np.inf
+            pose, rows[j], distance, bearing, range_variance, bearing_variance, count, j,
+            scratch.likelihood[j],
+        )  # fmt: skip
     _weigh(rows, members, scratch)
     for i in range(LANES):
-        log_weight[i] += scratch.total[i] - 2.0 * HALF_LOG_TAU if count[i] > 1 else 0.0
+        log_weight[i] += scratch.total[i] - 2.0 * HALF_LOG_TAU if count[i] >= least else 0.0
 
 
 @no_alloc
@@ -256,13 +295,12 @@ def correct_ray(
     if members == 1:
         correct_by_bearing(pose, rows[0], bearing, variance, scratch.whole)
         return
-    for j in range(members):
-        expect_bearing(pose, rows[j], bearing, variance, count, j, scratch.likelihood[j])
+    _expect_ray(pose, rows, count, bearing, variance, sensing.sharing == AS_PRINTED, scratch)
     _weigh(rows, members, scratch)
-    if not sensing.exact:
+    if sensing.sharing != EXACT:
         _share(members, sensing, scratch)
     for j in range(members):
-        share = scratch.whole if sensing.exact else scratch.share[j]
+        share = scratch.whole if sensing.sharing == EXACT else scratch.share[j]
         correct_by_bearing(pose, rows[j], bearing, variance, share)
     _prune(rows, count, members, sensing.prune, scratch)
 

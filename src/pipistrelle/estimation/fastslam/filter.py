@@ -228,8 +228,11 @@ class FastSlam:
         particles = self.settings.particles
         normal, uniform = rng.standard_normal((particles, 3)), rng.random(particles)
         sensing = sensing_of(self.rays, self.gate, self.settings.mixture == "exact")
+        sampled = self.settings.weights == "sampled"
         inside, gated = self._inside(belief, scan, sensing)
-        corrected, gained = correct_particles(_arrays(belief), columns_of(inside), normal, sensing)
+        corrected, gained = correct_particles(
+            _arrays(belief), columns_of(inside), normal, sensing, sampled
+        )
         poses, landmark, first, count, member = corrected
         weight = normalised(belief.log_weight + gained)
         best_count, best_member = particle_map(count, member, int(np.argmax(weight)))

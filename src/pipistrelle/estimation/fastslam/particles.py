@@ -28,6 +28,7 @@ from pipistrelle.estimation.fastslam.block import (
     initialise_member,
     refine_by_active,
     sample_pose,
+    weigh_sample,
 )
 from pipistrelle.estimation.fastslam.block_rays import (
     Rows,
@@ -37,6 +38,7 @@ from pipistrelle.estimation.fastslam.block_rays import (
     refine_by_ray,
     scratch_for,
     weigh_by_active,
+    weigh_by_bearing,
 )
 from pipistrelle.estimation.measurement import Columns, Measurements, measurements
 from pipistrelle.estimation.rays import Sensing
@@ -195,11 +197,39 @@ def _refine(
             )
         else:
             rho_beta = (heard.range[m], bearing, heard.range_variance[m], variance)
-            weigh_by_active(block.pose, rows, rho_beta, count, scratch, block.gained)
+            weigh_by_active(block.pose, rows, rho_beta, count, 2, scratch, block.gained)
             refine_by_active(
                 block.pose, rows[0], heard.range[m], bearing, heard.range_variance[m], variance,
                 count, block.gained,
             )  # fmt: skip
+
+
+@no_alloc
+def _weigh_at_sample(
+    block: Block,
+    slot: Int[np.ndarray, " m"],
+    heard: Measurements,
+    before: tuple[Poses, Poses],
+    scratch: Scratch,
+) -> None:
+    """Weigh a block's sampled poses anew: prior x likelihood / proposal at the sample.
+
+    ``before`` are the poses of the prior and of the proposal. Where both filters are linear this
+    is the likelihood before the sample; elsewhere it tells how well the proposal fitted.
+    """
+    block.gained[:] = 0.0
+    weigh_sample(before[0], before[1], block.pose, block.gained)
+    for m in range(slot.size):
+        n = slot[m]
+        if n < 0:
+            continue
+        rows, count = block.member[block.first[n] : block.first[n + 1]], block.count[n]
+        bearing, variance = heard.bearing[m], heard.bearing_variance[m]
+        if math.isnan(heard.range[m]):
+            weigh_by_bearing(block.pose, rows, count, bearing, variance, scratch, block.gained)
+        else:
+            rho_beta = (heard.range[m], bearing, heard.range_variance[m], variance)
+            weigh_by_active(block.pose, rows, rho_beta, count, 1, scratch, block.gained)
 
 
 @no_alloc
@@ -287,9 +317,16 @@ def _copy_members(particles: Particles, b: Whole, block: Block) -> None:
 
 @kernel
 def correct_particles(
-    arrays: Arrays, columns: Columns, normal: Float[np.ndarray, "p 3"], sensing: Sensing
+    arrays: Arrays,
+    columns: Columns,
+    normal: Float[np.ndarray, "p 3"],
+    sensing: Sensing,
+    sampled: bool,
 ) -> tuple[Arrays, Float[np.ndarray, " p"]]:
-    """Refine, sample, correct and extend a copy of all particles; returns it and log weights."""
+    """Refine, sample, correct and extend a copy of all particles; returns it and log weights.
+
+    ``sampled``: they are weighed at the sample.
+    """
     old, heard = Particles(*arrays), measurements(columns)
     blocks, known, total = old.pose.shape[0], old.landmark.size, normal.shape[0]
     slot = _slots(old.landmark, heard.landmark)
@@ -297,14 +334,17 @@ def correct_particles(
     pose, gained = old.pose.copy(), np.zeros((blocks, LANES))
     count = np.zeros((blocks, landmark.size, LANES), dtype=np.int64)
     member = np.empty((blocks, first[-1], MEMBER))
-    scratch, draw = scratch_for(widest), np.empty(3 * LANES)
+    scratch, draw, proposal = scratch_for(widest), np.empty(3 * LANES), np.empty(POSE)
     for b in range(blocks):
         block = Block(pose[b], gained[b], first, count[b], member[b])
         _copy_members(old, b, block)
         _refine(block, slot, heard, sensing, scratch)
+        proposal[:] = block.pose
         for k in range(draw.size):
             draw[k] = normal[min(b * LANES + k % LANES, total - 1), k // LANES]
         sample_pose(block.pose, draw)
+        if sampled:
+            _weigh_at_sample(block, slot, heard, (old.pose[b], proposal), scratch)
         _correct(block, slot, heard, sensing, scratch)
         n = known
         for m in range(slot.size):

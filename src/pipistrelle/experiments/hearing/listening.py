@@ -12,6 +12,7 @@ and only the count of clutter lacks the false alarms of the silence (about 0.01 
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Complex, Int
@@ -47,7 +48,7 @@ def listen(
     radii: Sequence[float],
     *,
     iteration: int = 0,
-    beam: Callable[..., Arrivals] = through_piston,
+    beam: Callable[..., Arrivals] | None = None,
     layout: Layout | None = None,
     find: Callable[..., Detections] = detect,
     oracle: Callable[..., Int[np.ndarray, " d"]] | None = label_detections,
@@ -64,8 +65,9 @@ def listen(
         Radii of the vehicle's piston; ``config.emitter.radius`` is not used.
     iteration : int
         Number of the world, part of the noise's key.
-    beam : callable
-        Gives the vehicle's call its directivity, as `through_piston` does.
+    beam : callable, optional
+        Gives the vehicle's call its directivity, as `through_piston` does: by default the piston
+        with the off-axis loss of the settings.
     layout : Layout, optional
         The arrays; those of the settings by default.
     find : callable
@@ -105,6 +107,7 @@ def listen(
     engine = _dense if config.receiver.engine == "dense" else _blocks
     beams: tuple[list[Heard], ...] = tuple([] for _ in radii)
     frames = range(setup.steps_per_frame, len(scenario.path), setup.steps_per_frame)
+    beam = beam or partial(through_piston, off_axis=config.emitter.off_axis)
     emissions = _emissions(scenario, frames, radii, config, beam)
     for number, (k, aimed) in enumerate(zip(frames, emissions, strict=True), start=1):
         key = stream_key(config.seed, iteration, "noise", number)
