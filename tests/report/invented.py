@@ -72,8 +72,10 @@ def trials_of(rng, world, name, strategy):
 
     where = position(name, strategy)
     turned = {"active": 0.06, "fused": 0.05, "passive": 0.055}[strategy]
-    seen = np.linspace(20.0, 36.0, beams) if strategy == "active" else np.full(beams, 40.0)
-    full = {"active": seen, "fused": seen - 6.0, "passive": seen - 13.0}[strategy]
+    seen, full = np.full(beams, 40.0), np.full(beams, 27.0)
+    if strategy == "active":
+        full = np.linspace(20.0, 36.0, beams)
+        seen = np.where(BEAMWIDTH < 64.0, full, 38.6)
     if strategy == "fused":
         seen = np.interp(BEAMWIDTH, [11.6, 33.3, 180.0], [40.1, 40.8, 43.7])
         full = np.interp(BEAMWIDTH, [11.6, 33.3, 180.0], [30.0, 31.9, 37.7])

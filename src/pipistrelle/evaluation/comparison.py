@@ -50,12 +50,19 @@ class Statement:
         "slightly above": it is above in this sample, but not seen to be. "within": it lies
         between minus and plus the margin.
     margin : float
+    sigma : float
+        How much one case varies over the worlds, in the sample's unit: a yardstick beside the
+        interval, which tells how surely a mean is known and not how large it is. NaN: none.
+    fitted : bool
+        Settings were fitted to this very number: that it holds proves little.
     """
 
     label: str
     sample: Float[np.ndarray, " n"]
     relation: Relation = "above"
     margin: float = 0.0
+    sigma: float = math.nan
+    fitted: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,7 +71,7 @@ class Finding:
 
     Attributes
     ----------
-    label, relation, margin : of the statement
+    label, relation, margin, sigma, fitted : of the statement
     n : int
         Worlds.
     mean, std : float
@@ -81,6 +88,8 @@ class Finding:
     label: str
     relation: Relation
     margin: float
+    sigma: float
+    fitted: bool
     n: int
     mean: float
     std: float
@@ -148,6 +157,8 @@ def judge(statements: Sequence[Statement], confidence: float = 0.95) -> tuple[Fi
                 label=statement.label,
                 relation=statement.relation,
                 margin=statement.margin,
+                sigma=statement.sigma,
+                fitted=statement.fitted,
                 n=moments[0],
                 mean=moments[1],
                 std=moments[2],

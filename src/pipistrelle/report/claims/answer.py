@@ -27,8 +27,8 @@ NUMBERS = (
 def answer(selections: Mapping[Rule, Selection], claims: Sequence[JudgedClaim]) -> list[str]:
     """Answer the question, then say what of the paper's claims is left.
 
-    Numbers leave diverged worlds out, as the paper does; where that bears on the answer, it is
-    given under every exclusion rule.
+    Numbers leave diverged worlds out, as the paper does, and beside each stands what it is with
+    everything counted; where that bears on the answer, it is given under every exclusion rule.
 
     Parameters
     ----------
@@ -41,13 +41,15 @@ def answer(selections: Mapping[Rule, Selection], claims: Sequence[JudgedClaim]) 
     list of str
         A line that stands alone, then sentences.
     """
-    papers = selections["world"]
+    papers, everything = selections["world"], selections["none"]
     by_rule = {rule: _headline(selection) for rule, selection in selections.items()}
     sentences = (
         *_otherwise(by_rule),
-        _counted(papers),
-        _compared("The landmarks that every strategy places are placed", papers, COMMON),
-        _compared("The vehicle is located", papers, POSITION),
+        _counted(papers, everything),
+        _compared(
+            "The landmarks that every strategy places are placed", papers, everything, COMMON
+        ),
+        _compared("The vehicle is located", papers, everything, POSITION),
         _diverged(papers.study),
         _verdicts(claims),
     )
@@ -155,28 +157,40 @@ def _diverged(study: Study) -> str:
     return f"The filter diverged, of the trials, {'; '.join(said)}." if said else ""
 
 
-def _counted(selection: Selection) -> str:
+def _counted(selection: Selection, everything: Selection) -> str:
     """Say how many landmarks fused and active place, at the narrowest and at the widest beam."""
     study = selection.study
     for name, title in filter_titles(study).items():
         if not {(name, "fused"), (name, "active")} <= study.trials.keys():
             continue
-        said = []
-        for i in dict.fromkeys((0, len(study.beamwidth) - 1)):
-            cells = [(name, "fused", i), (name, "active", i)]
-            fused, active = samples(selection, "landmarks_full", cells)
-            if len(fused):
-                beam = beam_name(study.beamwidth[i])
-                said.append(f"{np.mean(fused):.0f} instead of {np.mean(active):.0f} at {beam}")
-        if said:
+        if said := _placed(selection, name):
+            beside = _beside(study, _placed(everything, name))
             return (
                 "Hearing the beacon as well as its own calls, the vehicle fully places, of "
-                f"{landmark_count(study.config)} landmarks, {' and '.join(said)} ({title})."
+                f"{landmark_count(study.config)} landmarks, {said}{beside} ({title})."
             )
     return ""
 
 
-def _compared(subject: str, selection: Selection, score: str) -> str:
+def _placed(selection: Selection, name: str) -> str:
+    """Give the counts of fused and of active sensing with a filter, in words."""
+    said, study = [], selection.study
+    for i in dict.fromkeys((0, len(study.beamwidth) - 1)):
+        cells = [(name, "fused", i), (name, "active", i)]
+        fused, active = samples(selection, "landmarks_full", cells)
+        if len(fused):
+            beam = beam_name(study.beamwidth[i])
+            said.append(f"{np.mean(fused):.0f} instead of {np.mean(active):.0f} at {beam}")
+    return " and ".join(said)
+
+
+def _beside(study: Study, said: str) -> str:
+    """Put beside what was said what it is with everything counted, where anything diverged."""
+    diverged = any(trials.diverged.any() for trials in study.trials.values())
+    return f" (with everything counted: {said})" if diverged else ""
+
+
+def _compared(subject: str, selection: Selection, everything: Selection, score: str) -> str:
     """Say where fused is better than active, and where worse, with each filter."""
     said, undecided = [], []
     for name, title in filter_titles(selection.study).items():
@@ -187,14 +201,19 @@ def _compared(subject: str, selection: Selection, score: str) -> str:
                 f"Whether {what} better or worse with {title} is not decided: {_left(findings)}."
             )
         elif findings:
-            parts = [
-                f"{word} at {_beams(findings, holds)}"
-                for word, holds in (("better", True), ("worse", False))
-                if any(finding.holds is holds for finding in findings)
-            ]
-            words = " and ".join(parts) or "not significantly better or worse at any beamwidth"
-            said.append(f"with {title} {words}")
+            beside = _beside(selection.study, _where(everything.gains[name, score]))
+            said.append(f"with {title} {_where(findings)}{beside}")
     return " ".join([f"{subject} {'; '.join(said)}."] * bool(said) + undecided)
+
+
+def _where(findings: Sequence[Finding]) -> str:
+    """Say at which beamwidths fused is better, and at which worse."""
+    parts = [
+        f"{word} at {_beams(findings, holds)}"
+        for word, holds in (("better", True), ("worse", False))
+        if any(finding.holds is holds for finding in findings)
+    ]
+    return " and ".join(parts) or "not significantly better or worse at any beamwidth"
 
 
 def _beams(findings: Sequence[Finding], holds: bool) -> str:

@@ -5,7 +5,7 @@ about: active minus fused.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -83,8 +83,10 @@ def differences(
     *,
     name: str,
     relation: Relation = "above",
+    above: float = 0.0,
     below: float = math.inf,
     sigma: bool = False,
+    fitted: Callable[[float], bool] = lambda width: False,
 ) -> list[Statement]:
     """State something of one way's score minus another's, at each beamwidth.
 
@@ -98,10 +100,12 @@ def differences(
         Of the pair, for the reader.
     relation : str
         As `Statement` has it.
-    below : [deg]
-        Only beamwidths below this.
+    above, below : [deg]
+        Only beamwidths from the one on and below the other.
     sigma : bool
         The margin is the standard deviation over worlds that the two have in common; else 0.
+    fitted : function of a beamwidth [deg]
+        Whether the settings were fitted to what is stated there.
 
     Returns
     -------
@@ -114,15 +118,18 @@ def differences(
     blind = first[1] == second[1] == "passive"
     statements = []
     for i, width in enumerate(study.beamwidth[:1] if blind else study.beamwidth):
-        if width >= below:
+        if not above <= width < below:
             continue
         pair = samples(selection, score, [(*first, i), (*second, i)])
+        spread = pooled_std(*pair) if len(pair[0]) > 1 else math.nan
         statements.append(
             Statement(
                 label=name if blind else f"{name}, {beam_name(width)}",
                 sample=pair[0] - pair[1],
                 relation=relation,
-                margin=pooled_std(*pair) if sigma and len(pair[0]) > 1 else 0.0,
+                margin=spread if sigma and len(pair[0]) > 1 else 0.0,
+                sigma=spread,
+                fitted=bool(fitted(width)),
             )
         )
     return statements

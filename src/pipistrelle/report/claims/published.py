@@ -43,6 +43,16 @@ TABLE_II = (
 """Bradley & Abaid, Table II."""
 BEAMWIDTHS = (11.4, 14.2, 17.6, 21.8, 26.8, 33.2, 41.6, 51.4, 64.8, 83.0, 108.6, 180.0)
 """Bradley & Abaid, Appendix B [deg]."""
+FITTED = {
+    ("ekf", "total", 180.0),
+    ("fastslam", "total", 180.0),
+    ("ekf", "total", 0.0),
+    ("fastslam", "total", 0.0),
+    ("ekf", "full", 0.0),
+}
+"""Means of Table II that settings which the paper does not report were fitted to: of the levels,
+what is seen at 180 degrees and passively, which both filters see alike; of the rays, what passive
+EKF-SLAM places. Active sensing at 180 degrees was held under the paper's passive count besides."""
 EXCLUDED = {"ekf": 8, "fastslam": 15}
 """Worlds that the paper dropped, of `WORLDS` (Bradley & Abaid, Sec. V-A)."""
 WORLDS = 115

@@ -1,9 +1,12 @@
 """The paper's claims, each with a verdict by one rule.
 
-*Reproduced*: every part of the claim holds. *Not reproduced*: of some part, the opposite is
-significant. *Open*: neither, or the verdict changes with what is left out (`studied.RULES`). Of a
-part that must hold everywhere, one statement whose opposite is significant is enough; of a part
-that must hold at most beamwidths, it takes more than half.
+*Reproduced*: every part of the claim holds, whatever is left out (`studied.RULES`). *Not
+reproduced*: of some part the opposite is significant whatever is left out, and in the same
+direction. *Open*: neither. The rules of exclusion are compared part by part: a claim of which one
+part fails under one rule and another part under the next has not been refuted, nor has one that
+fails for too much here and for too little there. Of a part that must hold everywhere, one
+statement whose opposite is significant is enough; of a part that must hold at most beamwidths, it
+takes more than half.
 """
 
 import math
@@ -110,18 +113,38 @@ def judge_claims(
             rule: _judged(claim.parts(selection), confidence)
             for rule, selection in selections.items()
         }
-        verdicts = {rule: judgement.verdict for rule, judgement in by_rule.items()}
-        agreed = len(set(verdicts.values())) == 1
+        parts = zip(*(judgement.parts for judgement in by_rule.values()), strict=True)
+        verdict = _verdict([_holds_throughout(alike) for alike in parts])
         judged.append(
             JudgedClaim(
                 number=number,
                 sentence=claim.sentence,
-                verdict=by_rule["world"].verdict if agreed else "open",
-                reason=_reason(by_rule, agreed),
+                verdict=verdict,
+                reason=_reason(verdict, by_rule),
                 by_rule=by_rule,
             )
         )
     return tuple(judged)
+
+
+def with_everything(claim: JudgedClaim) -> Finding | None:
+    """Find the statement that decides a claim as it is where nothing is left out.
+
+    Parameters
+    ----------
+    claim : JudgedClaim
+
+    Returns
+    -------
+    Finding or None
+        None where nothing decides.
+    """
+    headline = claim.by_rule["world"]
+    for part, same in zip(headline.parts, claim.by_rule["none"].parts, strict=True):
+        for finding, twin in zip(part.findings, same.findings, strict=True):
+            if finding is headline.decisive:
+                return twin
+    return None
 
 
 def record(claim: JudgedClaim) -> dict[str, Any]:
@@ -157,6 +180,7 @@ def record(claim: JudgedClaim) -> dict[str, Any]:
         "sentence": claim.sentence,
         "verdict": claim.verdict,
         **_statistic(claim.by_rule["world"]),
+        "with_everything": None if (twin := with_everything(claim)) is None else _plain(twin),
         "rule": claim.reason,
         "by_exclusion": by_rule,
     }
@@ -192,15 +216,10 @@ def _judged(parts: Sequence[Part], confidence: float) -> Judgement:
                 holds=_holds([finding.holds for finding in mine], part.need),
             )
         )
-    verdict: Verdict = "open"
-    if any(part.holds is False for part in judged):
-        verdict = "not-reproduced"
-    elif all(part.holds for part in judged):
-        verdict = "reproduced"
     pairs = [(finding, part) for part in judged for finding in part.findings]
     decisive, part = min(pairs, key=_standing, default=(None, None))
     return Judgement(
-        verdict=verdict,
+        verdict=_verdict([part.holds for part in judged]),
         parts=tuple(judged),
         decisive=decisive,
         unit=part.unit if part else "",
@@ -216,6 +235,33 @@ def _holds(found: Sequence[bool | None], need: str) -> bool | None:
     if list(found).count(False) >= refuted:
         return False
     return True if list(found).count(True) >= enough else None
+
+
+def _verdict(parts: Sequence[bool | None]) -> Verdict:
+    """Decide a claim by its parts."""
+    if any(part is False for part in parts):
+        return "not-reproduced"
+    return "reproduced" if all(parts) else "open"
+
+
+def _holds_throughout(part: Sequence[JudgedPart]) -> bool | None:
+    """Decide a part by what it is under every rule: what changes is undecided."""
+    if all(judged.holds for judged in part):
+        return True
+    refuted = all(judged.holds is False for judged in part)
+    return False if refuted and set.intersection(*map(_failings, part)) else None
+
+
+def _failings(part: JudgedPart) -> set[float]:
+    """Tell in which directions the refuted statements of a part miss: too low, -1, or too high."""
+    return {_side(finding) for finding in part.findings if finding.holds is False}
+
+
+def _side(finding: Finding) -> float:
+    """Tell on which side of where it should be a mean lies."""
+    if finding.relation in ("above", "not above"):
+        return -1.0 if finding.relation == "above" else 1.0
+    return math.copysign(1.0, finding.mean - (finding.relation != "within") * finding.margin)
 
 
 def _standing(pair: tuple[Finding, JudgedPart]) -> tuple[int, float]:
@@ -235,12 +281,14 @@ def _standing(pair: tuple[Finding, JudgedPart]) -> tuple[int, float]:
     return order[part.holds], distance / error
 
 
-def _reason(by_rule: dict[Rule, Judgement], agreed: bool) -> str:
+def _reason(verdict: Verdict, by_rule: dict[Rule, Judgement]) -> str:
     """Say in a sentence why the verdict is what it is."""
     headline = by_rule["world"]
     if all(not part.findings for part in headline.parts):
         return "The study has no cases for this claim."
-    if not agreed:
+    if verdict == "open" and {one.verdict for one in by_rule.values()} == {"not-reproduced"}:
+        return "It fails whatever is left out, but for another reason each time: see its parts."
+    if len({one.verdict for one in by_rule.values()}) > 1:
         words = ", ".join(
             f"{judgement.verdict.replace('-', ' ')} {WITHOUT[rule]}"
             for rule, judgement in by_rule.items()
@@ -253,20 +301,29 @@ def _reason(by_rule: dict[Rule, Judgement], agreed: bool) -> str:
         "reproduced": "Every part holds, whatever is left out.",
         "not-reproduced": "The opposite of a part is significant, whatever is left out.",
         "open": "Not every part holds, and the opposite of none is significant.",
-    }[headline.verdict]
+    }[verdict]
 
 
 def _statistic(judgement: Judgement) -> dict[str, Any]:
     """Name the number that decides."""
     finding = judgement.decisive
     if finding is None:
-        return {"statistic": None, "of": None, "unit": "", "interval": None, "p": None, "n": 0}
+        return {
+            "statistic": None,
+            "of": None,
+            "unit": "",
+            "interval": None,
+            "sigma": None,
+            "p": None,
+            "n": 0,
+        }
     plain = _plain(finding)
     return {
         "statistic": plain["mean"],
         "of": finding.label,
         "unit": judgement.unit,
         "interval": plain["interval"],
+        "sigma": plain["sigma"],
         "p": plain["p"],
         "n": finding.n,
     }
@@ -282,6 +339,8 @@ def _plain(finding: Finding) -> dict[str, Any]:
         "label": finding.label,
         "relation": finding.relation,
         "margin": finite(finding.margin),
+        "sigma": finite(finding.sigma),
+        "fitted": finding.fitted,
         "n": finding.n,
         "mean": finite(finding.mean),
         "std": finite(finding.std),

@@ -26,7 +26,14 @@ from pipistrelle.report.claims.answer import answer, number_word
 from pipistrelle.report.claims.contrasts import selections
 from pipistrelle.report.claims.published import FILTERS
 from pipistrelle.report.claims.statements import CLAIMS, Claim
-from pipistrelle.report.claims.verdicts import WITHOUT, JudgedClaim, judge_claims, record, tally
+from pipistrelle.report.claims.verdicts import (
+    WITHOUT,
+    JudgedClaim,
+    judge_claims,
+    record,
+    tally,
+    with_everything,
+)
 from pipistrelle.report.page import overview
 from pipistrelle.report.page.svg import legend, panel_svg, readings, three_digits
 from pipistrelle.report.studied import RULES, Rule, Selection, Study, filter_titles
@@ -144,6 +151,7 @@ def page(
         spoken=SPOKEN,
         units=UNITS,
         tally=tally,
+        with_everything=with_everything,
         departures=overview.not_the_papers_line(summary["not_the_papers"]),
         consistency=overview.by_strategy(summary["consistency"]),
         config=to_toml(study.config),
@@ -291,4 +299,5 @@ def _shown(finding: Finding, unit: str) -> dict[str, str]:
         "mean": three_digits(factor * finding.mean) + end if finding.n else "none",
         "interval": " to ".join(words),
         "margin": f"± {margin}" if finding.relation == "within" else margin,
+        "sigmas": three_digits(finding.mean / finding.sigma) if finding.sigma > 0.0 else "",
     }
