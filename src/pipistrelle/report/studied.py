@@ -28,9 +28,15 @@ Way = tuple[str, str]
 Cell = tuple[str, str, int]
 """Filter, strategy and number of the beamwidth (of no meaning for passive)."""
 POSITION, HEADING = "position_rmse_m", "heading_rmse_rad"
+POSITION_ALIGNED, MAP_ALIGNED = "position_rmse_aligned_m", "map_rmse_aligned_m"
+FLOOR = "position_floor_m"
+"""The error of position that no estimator avoids."""
 SCORES = (
     POSITION,
     HEADING,
+    POSITION_ALIGNED,
+    MAP_ALIGNED,
+    FLOOR,
     "nees_mean",
     "nees_max",
     "landmarks_full",

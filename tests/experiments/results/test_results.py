@@ -33,6 +33,7 @@ KEYS = [
     "map_rmse_m",
     "position_rmse_aligned_m",
     "map_rmse_aligned_m",
+    "position_floor_m",
     "nees_mean",
     "nees_max",
     "diverged",

@@ -147,6 +147,7 @@ OTHERS = {
     "emitter.frequency": 40e3,
     "emitter.radius": 0.02,
     "emitter.level_db": 60.0,
+    "emitter.off_axis": "power",
     "emitter.pulse": 2.0e-3,
     "beacon.frequency": 25e3,
     "beacon.level_db": 55.0,
@@ -178,10 +179,12 @@ OTHERS = {
     "rays.prune": 0.3,
     "rays.power": 4.0,
     "rays.weights": "aggregated",
+    "rays.likelihood": "printed",
     "rays.partial": "heaviest",
     "fastslam.particles": 30,
     "fastslam.resample_below": 1.0,
     "fastslam.mixture": "exact",
+    "fastslam.weights": "sampled",
 }
 """Another value of every setting, far enough from its default to be heard or believed."""
 FEW = ("air.spreading", "target.shape", "emitter.radius", "beacon.level_db", "receiver.elements",

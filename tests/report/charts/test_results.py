@@ -12,8 +12,8 @@ from pipistrelle.report.studied import COMMON, RULES
 from report.invented import BEAMWIDTH, invent, only
 
 NAMES = [
-    "gain", "anees_ekf", "anees_fastslam", "position_rmse", "heading_rmse", "map_rmse",
-    "landmarks", "table_ii",
+    "gain", "anees_ekf", "anees_fastslam", "position_rmse", "position_rmse_aligned",
+    "heading_rmse", "map_rmse", "map_rmse_aligned", "landmarks", "table_ii",
 ]  # fmt: skip
 
 
@@ -96,6 +96,17 @@ def test_gains_are_paired_and_full_where_significant(study, charts):
     np.testing.assert_allclose(series.y, difference.mean(axis=0), rtol=1e-9)
     excludes = (series.low > 0) | (series.high < 0)
     assert (~series.filled | excludes).all(), "Holm rejects only what the interval alone excludes"
+
+
+def test_beside_the_raw_error_of_position_stands_what_no_estimator_avoids(charts, study):
+    line = series_of(charts["position_rmse"], "EKF", "no estimator avoids")
+    floor = study.trials["ekf", "active"].scores["position_floor_m"]
+    kept = ~study.trials["ekf", "active"].diverged.any(axis=1)
+    assert line.dashed
+    np.testing.assert_allclose(line.y, floor[kept].mean(axis=0), rtol=0.02)
+    for name in ("position_rmse_aligned", "heading_rmse", "map_rmse"):
+        names = [series.name for panel in charts[name].panels for series in panel.series]
+        assert "no estimator avoids" not in names
 
 
 def test_table_ii_stands_beside_ours(charts):

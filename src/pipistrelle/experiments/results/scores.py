@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Track
+from pipistrelle.estimation.motion import motion_step
 from pipistrelle.evaluation.accuracy import (
     alignment,
     heaviest,
@@ -18,7 +19,7 @@ from pipistrelle.evaluation.accuracy import (
     scored_landmarks,
 )
 from pipistrelle.evaluation.consistency import diverged, track_nees
-from pipistrelle.experiments.drives import Truth
+from pipistrelle.experiments.drives import Drive, Truth
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,6 +53,8 @@ class Scores:
         Of the fully initialised landmarks whose true positions are known.
     position_rmse_aligned_m, map_rmse_aligned_m : float or None
         The same, path and map each after its own rigid motion; at least two points.
+    position_floor_m : float or None
+        Of a path that is right but for what was lost before the first scan (`position_floor`).
     nees_mean, nees_max : float or None
     diverged : bool or None
         Whether any NEES is not finite or above the limit; without truth, True where the path is
@@ -69,6 +72,7 @@ class Scores:
     map_rmse_m: float | None
     position_rmse_aligned_m: float | None
     map_rmse_aligned_m: float | None
+    position_floor_m: float | None = None
     nees_mean: float | None
     nees_max: float | None
     diverged: bool | None
@@ -168,6 +172,66 @@ def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Sc
         measurements_per_frame=sum(len(s.landmark) for s in scans) / len(scans) if scans else None,
         gated=track.gated,
     )
+
+
+def position_floor(drive: Drive, scans: Sequence[Scan]) -> float | None:
+    r"""RMSE of position that no estimator avoids, but by luck.
+
+    What is heard tells where things are relative to the vehicle, and never where the vehicle was
+    before it heard anything. Until then it reckons from its controls; by the first scan that holds
+    anything, at step j, the noise has moved and turned it unseen, and so all that follows:
+
+    .. math:: \hat x_k = T x_k, \quad T = \hat x_j \circ x_j^{-1} \quad (k \ge j), \qquad
+              \hat x_k \text{ by the controls alone} \quad (k < j)
+
+    Parameters
+    ----------
+    drive : Drive
+    scans : sequence of Scan
+
+    Returns
+    -------
+    [m] or None
+        Over the steps, the start excluded. None where the truth is not known at step j.
+
+    Notes
+    -----
+    The error that is left is one turn and shift of everything: alignment removes it.
+
+    Examples
+    --------
+    A metre ahead unseen, then a straight drive.
+
+    >>> from pipistrelle.detection.scans import make_scan
+    >>> from pipistrelle.estimation.motion import Motion
+    >>> path = np.array([[0.0, 0, 0], [2, 0, 0], [3, 0, 0]])
+    >>> drive = Drive(
+    ...     motion=Motion(model="unicycle", control_std=(1.0, 0.1)),
+    ...     start=Gaussian(mean=np.zeros(3), covariance=np.eye(3)),
+    ...     time=np.arange(3.0), controls=np.array([[1.0, 0.0], [1.0, 0.0]]),
+    ...     truth=Truth(time=np.arange(3.0), path=path),
+    ... )
+    >>> position_floor(drive, [make_scan(1.0, np.array([4]), np.array([0.2]))])
+    1.0
+    """
+    if drive.truth.path is None:
+        return None
+    true, steps = drive.truth.path, len(drive.controls)
+    heard = [scan.time for scan in scans if len(scan.landmark)]
+    first = int(np.searchsorted(drive.time, heard[0] - 1e-9)) if heard else steps
+    first = min(first, steps)
+    reckoned = [drive.start.mean]
+    for control, dt in zip(drive.controls[:first], np.diff(drive.time), strict=False):
+        reckoned.append(motion_step(drive.motion, reckoned[-1], control, dt))
+    lost, was = reckoned[first], true[first]
+    if heard and not np.isfinite(was).all():
+        return None
+    turn = lost[2] - was[2]
+    x, y = moved(was[np.newaxis, :2], np.array([0.0, 0.0, turn]))[0]
+    after = moved(true[first:, :2], np.array([lost[0] - x, lost[1] - y, turn]))
+    error = position_error(np.concatenate([np.array(reckoned)[:first, :2], after]), true[:, :2])[1:]
+    known = error[np.isfinite(error)]
+    return rmse(known) if known.size else None
 
 
 @np.errstate(over="ignore", invalid="ignore")

@@ -31,7 +31,12 @@ from pipistrelle.experiments.hearing.scenario import (
     standing_landmarks,
 )
 from pipistrelle.experiments.machine import check_memory
-from pipistrelle.experiments.results.scores import TrialResult, score, score_path
+from pipistrelle.experiments.results.scores import (
+    TrialResult,
+    position_floor,
+    score,
+    score_path,
+)
 from pipistrelle.experiments.runs.checking import check_filters, failed_trial
 from pipistrelle.experiments.runs.filtering import run_filter
 from pipistrelle.experiments.runs.preparing import prepared
@@ -250,7 +255,9 @@ def run_trial(
         filter=name,
         track=track,
         scans=tuple(had),
-        scores=score(track, truth, had, known.nees_limit),
+        scores=replace(
+            score(track, truth, had, known.nees_limit), position_floor_m=position_floor(drive, had)
+        ),
         wall_s=wall_s,
         online=None if track.online is None else score_path(track.online, drive.truth.path),
     )

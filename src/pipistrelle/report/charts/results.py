@@ -15,8 +15,11 @@ from pipistrelle.report.charts.timelines import anees_charts
 from pipistrelle.report.claims.published import FILTERS, TABLE_II, beam_name, cell_of, row_name
 from pipistrelle.report.studied import (
     COMMON,
+    FLOOR,
     HEADING,
+    MAP_ALIGNED,
     POSITION,
+    POSITION_ALIGNED,
     Cell,
     Selection,
     Study,
@@ -48,6 +51,8 @@ class ErrorChart:
         Of the CSV.
     scale : float
         From the score to the axis.
+    more : str
+        Of the caption, at its end.
     """
 
     name: str
@@ -56,6 +61,7 @@ class ErrorChart:
     label: str
     column: str
     scale: float = 1.0
+    more: str = ""
 
 
 ERRORS = (
@@ -65,6 +71,17 @@ ERRORS = (
         score=POSITION,
         label="position RMSE [m]",
         column="position_rmse_m",
+        more="; dashed: what no estimator avoids, the vehicle having turned unseen before its "
+        "first scan",
+    ),
+    ErrorChart(
+        name="position_rmse_aligned",
+        title="Vehicle position RMSE after alignment",
+        score=POSITION_ALIGNED,
+        label="aligned position RMSE [m]",
+        column="position_rmse_aligned_m",
+        more=". Each path after the rigid motion that fits it best: without the one turn of "
+        "everything that is most of the raw error",
     ),
     ErrorChart(
         name="heading_rmse",
@@ -80,6 +97,15 @@ ERRORS = (
         score=COMMON,
         label="map RMSE [m]",
         column="map_rmse_m",
+    ),
+    ErrorChart(
+        name="map_rmse_aligned",
+        title="Map RMSE of each strategy's own landmarks after alignment",
+        score=MAP_ALIGNED,
+        label="aligned map RMSE [m]",
+        column="map_rmse_aligned_m",
+        more=". Each map after the rigid motion that fits it best; strategies place different "
+        "landmarks",
     ),
 )
 
@@ -264,15 +290,29 @@ def _error_chart(selection: Selection, what: ErrorChart) -> Chart:
         line = _mean_line(study, way, per_beam, flat=flat)
         worlds = _worlds_above(study, way, line, per_beam, flat=flat)
         found.setdefault(way[0], []).extend([line, worlds])
+    if what.score == POSITION:
+        for name, mine in found.items():
+            mine.append(_floor_line(selection, name))
     lines = [s for mine in found.values() for s in mine if not MARKS[s.style].pinned]
     vertical = linear_axis(what.label, [1.07 * end for end in ends(lines)], floor=0.0)
     return Chart(
         name=what.name,
         title=what.title,
         caption="Mean ± σ over worlds; dots: single worlds above that (passive's at the right "
-        "edge, where they do not depend on the beam), triangles: those beyond the panel",
+        "edge, where they do not depend on the beam), triangles: those beyond the panel"
+        + what.more,
         panels=_by_filter(study, found, vertical),
         columns=("beamwidth_deg", what.column),
+    )
+
+
+def _floor_line(selection: Selection, name: str) -> Series:
+    """Return the mean error that no estimator avoids in the worlds that a filter keeps."""
+    study = selection.study
+    way = next(way for way in study.trials if way[0] == name)
+    floor = [mean_std(sample)[0] for sample in _per_beam(selection, way, FLOOR)]
+    return Series(
+        name="no estimator avoids", role="ink", x=study.beamwidth, y=np.array(floor), dashed=True
     )
 
 
