@@ -97,7 +97,9 @@ def trials_of(rng, world, name, strategy):
     placed = {"active": 0.5, "fused": 0.52, "passive": 0.6}[strategy]
     scores[COMMON] = placed + 0.2 * world[:, None] + 0.05 * noise(rng, worlds, len(BEAMWIDTH))
     no = np.zeros((worlds, beams), dtype=bool)
-    return Trials(failed=no, diverged=no.copy(), scores=scores, nees=nees)
+    ideal = np.full((2, beams, FRAMES), 3.0)
+    ideal[1] = 6.0
+    return Trials(failed=no, diverged=no.copy(), scores=scores, nees=nees, consistent=ideal)
 
 
 def invent(worlds=60, seed=1, planned=None):
@@ -209,7 +211,11 @@ def world_tables_of(study, row, cases, broken, full, error):
             trial[score] = round(value) if whole else value
         tables["trials"].append(trial | {"diverged": bool(trials.diverged[row, column])})
         nees = trials.nees[row, column]
-        tables["steps"] += [head | {"frame": k, "nees": v} for k, v in enumerate(nees, start=1)]
+        ideal = trials.consistent[:, column].T
+        tables["steps"] += [
+            head | {"frame": k, "nees": v, "nees_expected": mean, "nees_variance": variance}
+            for k, (v, (mean, variance)) in enumerate(zip(nees, ideal, strict=True), start=1)
+        ]
         tables["landmarks"] += [
             head | {"landmark": k + 1, "full": bool(full[case.number, k]), "error_m": off}
             for k, off in enumerate(error[case.number].tolist())

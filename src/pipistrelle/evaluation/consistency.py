@@ -161,11 +161,54 @@ def anees_bounds(runs: int, confidence: float = 0.95, states: int = 3) -> tuple[
     >>> round(low, 2), round(high, 2)
     (2.55, 3.48)
     """
+    low, high = anees_bounds_about(
+        np.array(float(states)), np.array(2.0 * states), runs, confidence
+    )
+    return float(low), float(high)
+
+
+def anees_bounds_about(
+    mean: Float[np.ndarray, "*k"],
+    variance: Float[np.ndarray, "*k"],
+    runs: int,
+    confidence: float = 0.95,
+) -> tuple[Float[np.ndarray, "*k"], Float[np.ndarray, "*k"]]:
+    r"""Interval of ANEES where a consistent filter's NEES has another mean than its states.
+
+    As after an exact start (`evaluation.bound.nees_of_exact_start`). A weighted sum of chi-squares
+    is taken as the gamma distribution of the same mean m and variance v, which for equal weights
+    it is:
+
+    .. math:: \Gamma\left(\text{shape } \frac{N m^2}{v}, \text{scale } \frac{v}{N m}\right)
+
+    Parameters
+    ----------
+    mean, variance : (*k)
+        Of one run's NEES; 3 and 6 make `anees_bounds`. Of a mean of 0, nothing is between.
+    runs : N, at least 1
+    confidence : between 0 and 1
+
+    Returns
+    -------
+    low, high : (*k)
+
+    Notes
+    -----
+    Source: Welch, Biometrika 29, 1938; Satterthwaite, Biometrics Bulletin 2, 1946.
+
+    Examples
+    --------
+    >>> low, high = anees_bounds_about(np.array([2.24]), np.array([3.6]), 107)
+    >>> low.round(2), high.round(2)
+    (array([1.89]), array([2.61]))
+    """
     from scipy.special import gammaincinv  # scipy.stats says the same, and loads for a second
 
-    tail, freedom = (1.0 - confidence) / 2.0, runs * states
-    low, high = 2.0 * gammaincinv(freedom / 2.0, [tail, 1.0 - tail]) / runs
-    return float(low), float(high)
+    tail = (1.0 - confidence) / 2.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shape, scale = runs * mean**2 / variance, variance / (runs * mean)
+        low, high = (scale * gammaincinv(shape, edge) for edge in (tail, 1.0 - tail))
+    return np.where(mean > 0.0, low, 0.0), np.where(mean > 0.0, high, 0.0)
 
 
 def diverged(nees: Float[np.ndarray, " k"], limit: float) -> bool:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.config import Config, InputError
 from pipistrelle.experiments.studies.plan import RADIUS, Plan, cases_of
 from pipistrelle.experiments.studies.store import load_study
-from pipistrelle.experiments.studies.world import world_schemas
+from pipistrelle.experiments.studies.world import STEPS, world_schemas
 from pipistrelle.experiments.studies.world_files import (
     check_world,
     damaged,
@@ -122,7 +122,7 @@ def _study(
                 for key, group in cases.partition_by("filter", "strategy", as_dict=True).items()
             },
             _scores(trials, worlds, number),
-            _nees(steps, worlds, number),
+            {column: _over_time(steps, column, worlds, number) for column in STEPS[2:]},
             _maps(landmarks, worlds, number),
         ),
         errors=tuple((i, s, f, b, text or "") for i, s, f, b, text in told.rows()),
@@ -133,7 +133,7 @@ def _study(
 def _trials(
     columns: dict[tuple[str, ...], Int[np.ndarray, " b"]],
     scores: dict[str, np.ndarray],
-    nees: Float[np.ndarray, "n c k"],
+    nees: dict[str, Float[np.ndarray, "n c k"]],
     maps: tuple[Bool[np.ndarray, "n c l"], Float[np.ndarray, "n c l"]],
 ) -> dict[tuple[str, str], Trials]:
     """Give each filter and strategy its columns."""
@@ -144,7 +144,8 @@ def _trials(
             diverged=scores["diverged"][:, c],
             scores={score: scores[score][:, c] for score in SCORES}
             | {COMMON: common[name, strategy]},
-            nees=nees[:, c],
+            nees=nees["nees"][:, c],
+            consistent=_means(nees["nees_expected"][:, c], nees["nees_variance"][:, c]),
         )
         for (name, strategy), c in sorted(columns.items())
     }
@@ -179,15 +180,22 @@ def _places(
     return np.searchsorted(worlds, table["iteration"].to_numpy()), columns[case]
 
 
-def _nees(
-    steps: "pl.DataFrame", worlds: Int[np.ndarray, " n"], number: dict[int, int]
+def _over_time(
+    steps: "pl.DataFrame", column: str, worlds: Int[np.ndarray, " n"], number: dict[int, int]
 ) -> Float[np.ndarray, "n c k"]:
-    """Lay out the NEES by world, case and frame."""
+    """Lay out a column by world, case and frame."""
     last = max(steps["frame"].to_list(), default=0)
-    nees = np.full((len(worlds), len(number), last), np.nan)
+    laid = np.full((len(worlds), len(number), last), np.nan)
     frame = steps["frame"].to_numpy().astype(np.intp) - 1
-    nees[(*_places(steps, worlds, number), frame)] = steps["nees"].to_numpy()
-    return nees
+    laid[(*_places(steps, worlds, number), frame)] = steps[column].to_numpy()
+    return laid
+
+
+def _means(*columns: Float[np.ndarray, "n b k"]) -> Float[np.ndarray, "i b k"]:
+    """Average columns over the worlds that have them; NaN where none has."""
+    counts = [np.sum(np.isfinite(column), axis=0) for column in columns]
+    with np.errstate(invalid="ignore"):
+        return np.array([np.nansum(c, axis=0) / n for c, n in zip(columns, counts, strict=True)])
 
 
 def _maps(

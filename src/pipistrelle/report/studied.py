@@ -62,12 +62,15 @@ class Trials:
         beamwidths for passive too, for the landmarks in common change with them.
     nees : (n, b, k)
         At each frame.
+    consistent : (2, b, k)
+        Mean and variance of a consistent filter's NEES at each frame, averaged over the worlds.
     """
 
     failed: Bool[np.ndarray, "n b"]
     diverged: Bool[np.ndarray, "n b"]
     scores: dict[str, Float[np.ndarray, "n _"]]
     nees: Float[np.ndarray, "n b k"]
+    consistent: Float[np.ndarray, "2 b k"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

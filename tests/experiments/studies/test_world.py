@@ -7,6 +7,7 @@ import pytest
 
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config
+from pipistrelle.evaluation.bound import nees_of_exact_start, pose_bound
 from pipistrelle.evaluation.consistency import nees
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
@@ -46,14 +47,25 @@ def test_each_case_of_a_world_scores_as_it_does_alone(records, alone):
 def test_steps_are_the_errors_and_the_nees_at_the_frames(records, alone):
     for record, mission in zip(records, alone, strict=True):
         track, truth = mission.trials[0].track, mission.scenario.path
-        assert record.steps.shape == (10, 3)
+        assert record.steps.shape == (10, 5)
         for frame in range(10):
             k = 4 * (frame + 1)
             error = track.pose.mean[k] - truth[k]
             error[2] = (error[2] + np.pi) % (2 * np.pi) - np.pi
             expected = [np.hypot(*error[:2]), error[2], nees(error, track.pose.covariance[k])]
             # single precision, after wrapping to 1e-15 of a turn
-            np.testing.assert_allclose(record.steps[frame], expected, rtol=1.2e-7, atol=1e-14)
+            np.testing.assert_allclose(record.steps[frame, :3], expected, rtol=1.2e-7, atol=1e-14)
+
+
+def test_beside_the_nees_stands_that_of_a_consistent_filter_whatever_the_filter(records, alone):
+    for record, mission in zip(records, alone, strict=True):
+        drive, path = mission.drive, mission.scenario.path
+        scans = scans_of(mission.heard, record.case.strategy, mission.config)
+        bound = pose_bound(
+            drive.motion, drive.controls, drive.time, path, drive.truth.landmarks, scans
+        )
+        expected = nees_of_exact_start(bound, path, drive.start.covariance)
+        np.testing.assert_allclose(record.steps[:, 3:], np.transpose(expected)[4::4], rtol=1e-5)
 
 
 def test_the_map_is_kept_with_the_distance_of_each_landmark_from_its_place(records, alone):
@@ -300,7 +312,7 @@ def test_what_is_not_finite_stays_so_and_what_is_not_there_is_null(plan, records
     scores = replace(
         records[0].scores, nees_max=np.inf, position_rmse_m=np.nan, map_rmse_m=None, diverged=True
     )
-    steps = np.array([[np.nan, np.inf, np.inf]], dtype=np.float32)
+    steps = np.array([[np.nan, np.inf, np.inf, 2.2, 3.5]], dtype=np.float32)
     tables = world_tables(plan, 0, [replace(records[0], scores=scores, steps=steps)])
     (row,) = as_rows(tables["trials"])
     assert row["nees_max"] == np.inf
@@ -341,7 +353,7 @@ def test_every_column_of_a_worlds_tables_holds_what_its_name_says(plan, records)
         assert {name: row[name] for name in scored} == asdict(record.scores)
         own = tables["steps"].filter(case=record.case.number)
         assert own["frame"].to_list() == list(range(1, 11))
-        names = ["position_error_m", "heading_error_rad", "nees"]
+        names = ["position_error_m", "heading_error_rad", "nees", "nees_expected", "nees_variance"]
         np.testing.assert_array_equal(own.select(names).to_numpy(), record.steps)
         own = tables["landmarks"].filter(case=record.case.number)
         assert own["landmark"].to_list() == record.landmark.tolist()
@@ -362,6 +374,8 @@ def test_columns_bear_the_names_of_what_varies(plan, records):
         "position_error_m": "Float32",
         "heading_error_rad": "Float32",
         "nees": "Float32",
+        "nees_expected": "Float32",
+        "nees_variance": "Float32",
     }
 
 

@@ -80,12 +80,16 @@ def test_single_worlds_are_those_above_the_band(study, charts):
 
 def test_anees_is_the_mean_over_the_worlds_that_count_within_its_bounds(study, charts):
     active, _, passive = charts["anees_ekf"].panels
-    assert [s.name for s in active.series][::11] == ["180°", "11°"]
+    ideal, *lines = active.series
+    assert [s.name for s in lines][::11] == ["180°", "11°"]
     nees = np.delete(study.trials["ekf", "active"].nees, 4, axis=0)
     np.testing.assert_allclose(active.series[-1].y, nees[:, 0].mean(axis=0), rtol=1e-12)
-    assert active.span[:2] == pytest.approx(anees_bounds(19))
+    low, high = anees_bounds(19)
+    np.testing.assert_allclose(ideal.low, low, rtol=1e-12)
+    np.testing.assert_allclose(ideal.high, high, rtol=1e-12)
+    assert set(ideal.y) == {3.0}
     assert active.posts == pytest.approx([lap_time(study) * k for k in (1, 2, 3)])
-    assert active.series[-1].strength > active.series[0].strength
+    assert lines[-1].strength > lines[0].strength
     assert active.y == passive.y
 
 

@@ -79,14 +79,16 @@ def test_noise_swings_as_often_down_as_up(study):
 
 @pytest.mark.parametrize(("level", "expected"), [(3.0, 0.0), (3.0 * np.e, 1.0), (3.0 / np.e, 1.0)])
 def test_the_departure_counts_over_and_under_confidence_alike(level, expected):
-    assert departure(np.full((5, 2, 10), level)) == pytest.approx(np.full(5, expected), abs=1e-12)
-    assert departure(np.full((1, 2, 10), level)) == pytest.approx([expected], abs=1e-12)
+    for ideal in (3.0, 2.2):
+        nees, consistent = np.full((5, 2, 10), level * ideal / 3.0), np.full((2, 10), ideal)
+        assert departure(nees, consistent) == pytest.approx(np.full(5, expected), abs=1e-12)
+        assert departure(nees[:1], consistent) == pytest.approx([expected], abs=1e-12)
 
 
 def test_the_departure_is_that_of_the_mean_over_worlds():
     """Half the worlds at 1 and half at 5 make an ANEES of 3: no departure, to order 1/n."""
     nees = np.repeat([1.0, 5.0], 200)[:, None, None] * np.ones((400, 1, 6))
-    values = departure(nees)
+    values = departure(nees, np.full((1, 6), 3.0))
     assert abs(values.mean()) < 1 / 400
     single = np.square(np.log(nees / 3.0)).mean()
     assert single > 0.5, "the control: averaging over worlds last would see one"

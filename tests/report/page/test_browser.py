@@ -12,7 +12,8 @@ from report.invented import invent, only
 CHROMIUM = Path("/usr/bin/chromium")
 WIDTHS = {"phone": 390, "desk": 1280}
 FIGURES = (
-    "gain", "anees_ekf", "anees_fastslam", "position_rmse", "heading_rmse", "map_rmse",
+    "gain", "anees_ekf", "anees_fastslam", "position_rmse",
+    "position_rmse_aligned", "heading_rmse", "map_rmse", "map_rmse_aligned",
     "landmarks", "table_ii", "piston", "example_map",
 )  # fmt: skip
 

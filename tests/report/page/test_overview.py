@@ -87,9 +87,25 @@ def test_consistency_is_told_in_shares_of_time():
     ]
     assert (row["inside"], row["above"]) == pytest.approx((75 / 375, 225 / 375))
     assert row["bounds"] == pytest.approx([low, high])
+    assert row["expected"] == 3.0
     squares = [0.0, np.log((high + 1) / 3) ** 2, np.log((low - 1) / 3) ** 2]
     assert row["departure"] == pytest.approx(np.dot(squares, [75, 225, 75]) / 375)
     assert row["beamwidth"] is None
+
+
+def test_consistency_is_held_against_what_a_consistent_filter_has_there():
+    study = invent(20)
+    passive = study.trials["ekf", "passive"]
+    passive.consistent[0] = 2.0
+    passive.consistent[1] = 3.0
+    passive.nees[:] = 2.0
+    (row,) = [
+        r
+        for r in consistency_rows(select(study, "world"))
+        if (r["filter"], r["strategy"]) == ("ekf", "passive")
+    ]
+    assert (row["inside"], row["departure"], row["expected"]) == (1.0, 0.0, 2.0)
+    assert row["bounds"][0] < 2.0 < row["bounds"][1] < anees_bounds(20)[1]
 
 
 def test_strategies_are_averages_over_beamwidths():

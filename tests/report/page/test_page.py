@@ -27,7 +27,7 @@ from report.invented import STRATEGIES, invent, with_third, write_store
 
 FIGURES = [
     "anees_ekf", "anees_fastslam", "example_map", "gain", "heading_rmse", "landmarks", "map_rmse",
-    "piston", "position_rmse", "table_ii",
+    "map_rmse_aligned", "piston", "position_rmse", "position_rmse_aligned", "table_ii",
 ]  # fmt: skip
 BAD = "<script>alert('a')</script>\"'&"
 

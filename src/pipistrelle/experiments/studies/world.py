@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipistrelle.acoustics.emitter import beamwidth
-from pipistrelle.config import Config, Strategy
+from pipistrelle.config import Config, FilterConfig, Strategy
 from pipistrelle.detection.faces import Heard
 from pipistrelle.detection.merging import scan_of
 from pipistrelle.detection.noise import Noise, noise_of
@@ -30,6 +30,7 @@ from pipistrelle.evaluation.accuracy import (
     pose_error,
     position_error,
 )
+from pipistrelle.evaluation.bound import nees_of_exact_start, pose_bound
 from pipistrelle.evaluation.consistency import track_nees
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import (
@@ -48,6 +49,10 @@ if TYPE_CHECKING:
 
 ONLINE = ("position_rmse_m", "heading_rmse_rad", "nees_mean", "nees_max")
 """Scores that a table has of the path as it was believed at its time, too, if it was revised."""
+
+STEPS = ("position_error_m", "heading_error_rad", "nees", "nees_expected", "nees_variance")
+"""What a table has of each frame: errors and NEES; of a consistent filter, mean and variance."""
+Frames = Float[np.ndarray, "k 2"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,8 +75,9 @@ class TrialRecord:
         Detections without a label.
     wall_s, cpu_s : [s]
         Time that the filter took.
-    steps : (k, 3) [m, rad, 1]
-        Position error, heading error and NEES at each frame.
+    steps : (k, 5) [m, rad, 1, 1, 1]
+        Position error, heading error and NEES at each frame; of a consistent filter's NEES the
+        mean and the variance.
     landmark : (n)
         Labels.
     full : (n)
@@ -88,7 +94,7 @@ class TrialRecord:
     clutter_per_frame: float | None = None
     wall_s: float = 0.0
     cpu_s: float = 0.0
-    steps: Float[np.ndarray, "k 3"]
+    steps: Float[np.ndarray, "k 5"]
     landmark: Int[np.ndarray, " n"]
     full: Bool[np.ndarray, " n"]
     landmark_error: Float[np.ndarray, " n"]
@@ -116,7 +122,7 @@ def run_world(plan: Plan, iteration: int) -> tuple[TrialRecord, ...]:
     >>> config = Config(scenario=ScenarioConfig(steps=8, landmarks=12))
     >>> plan = Plan(name="one", iterations=1, config=config, grid={}, **ways)
     >>> [record.steps.shape for record in run_world(plan, 0)]
-    [(2, 3)]
+    [(2, 5)]
     """
     records = [record for cases in heard_together(plan) for record in _run_cases(cases, iteration)]
     return tuple(sorted(records, key=lambda record: record.case.number))
@@ -192,7 +198,7 @@ def world_tables(
         return pl.DataFrame(world | data).select(pl.col(c).cast(kind) for c, kind in kinds)
 
     steps = {"frame": [np.arange(1, len(record.steps) + 1) for record in records]}
-    for i, column in enumerate(("position_error_m", "heading_error_rad", "nees")):
+    for i, column in enumerate(STEPS):
         steps[column] = [record.steps[:, i] for record in records]
     landmarks = {
         "landmark": [record.landmark for record in records],
@@ -244,7 +250,7 @@ def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
         "steps": {
             **world,
             "frame": pl.UInt16,
-            **dict.fromkeys(("position_error_m", "heading_error_rad", "nees"), pl.Float32),
+            **dict.fromkeys(STEPS, pl.Float32),
         },
         "landmarks": {**world, "landmark": pl.Int16, "full": pl.Boolean, "error_m": pl.Float32},
     }
@@ -283,7 +289,12 @@ def _run_cases(cases: Sequence[PlannedCase], iteration: int) -> list[TrialRecord
     def scans(radius: float, strategy: Strategy, noise: Noise) -> tuple[Scan, ...]:
         return tuple(noise(scan_of(frame, strategy)) for frame in beams[radius])
 
-    return [_try_case(case, scenario, beams, scans, iteration) for case in cases]
+    @cache
+    def consistent(radius: float, strategy: Strategy, filtered: FilterConfig) -> Frames:
+        told = config.model_copy(update={"filter": filtered})
+        return _consistent(scans(radius, strategy, noise_of(filtered)), scenario, told)
+
+    return [_try_case(case, scenario, beams, scans, consistent, iteration) for case in cases]
 
 
 def _try_case(
@@ -291,9 +302,10 @@ def _try_case(
     scenario: Scenario,
     beams: Mapping[float, Sequence[Heard]],
     scans_of: Callable[[float, Strategy, Noise], Sequence[Scan]],
+    consistent: Callable[[float, Strategy, FilterConfig], Frames],
     iteration: int,
 ) -> TrialRecord:
-    """Run a trial, whatever comes of it; filters share the scans of a beam and a strategy."""
+    """Run a trial, whatever comes of it; filters share what a beam and a strategy bring."""
     try:
         drive, radius = drive_of(scenario, case.config), case.config.emitter.radius
         heard, noise = beams[radius], noise_of(case.config.filter)
@@ -312,7 +324,12 @@ def _try_case(
             clutter_per_frame=sum(h.clutter or 0 for h in heard) / len(heard) if heard else None,
             wall_s=result.wall_s,
             cpu_s=cpu_s,
-            steps=_frame_errors(result.track, scenario, case.config),
+            steps=np.column_stack(
+                [
+                    _frame_errors(result.track, scenario, case.config),
+                    consistent(radius, case.strategy, case.config.filter),
+                ]
+            ),
             landmark=estimate.landmark,
             full=estimate.full,
             landmark_error=landmark_error(estimate, *standing_landmarks(scenario)),
@@ -342,13 +359,24 @@ def _frame_errors(track: Track, scenario: Scenario, config: Config) -> Float[np.
     return np.column_stack(columns).astype(np.float32)
 
 
+def _consistent(scans: Sequence[Scan], scenario: Scenario, config: Config) -> Frames:
+    """Return mean and variance of a consistent filter's NEES at each frame, the start exact."""
+    drive, every = drive_of(scenario, config), config.scenario.steps_per_frame
+    bound = pose_bound(
+        drive.motion, drive.controls, drive.time, scenario.path, standing_landmarks(scenario), scans
+    )
+    frames = slice(every, None, every)
+    expected = nees_of_exact_start(bound, scenario.path, drive.start.covariance)
+    return np.column_stack([column[frames] for column in expected]).astype(np.float32)
+
+
 def _failed(case: PlannedCase, error: str) -> TrialRecord:
     """Record that a trial failed."""
     return TrialRecord(
         case=case,
         beamwidth_deg=_beamwidth_deg(case),
         error=error,
-        steps=np.empty((0, 3), np.float32),
+        steps=np.empty((0, len(STEPS)), np.float32),
         landmark=np.empty(0, int),
         full=np.empty(0, bool),
         landmark_error=np.empty(0),

@@ -5,11 +5,11 @@ import re
 import numpy as np
 
 from pipistrelle.config import STRATEGIES
-from pipistrelle.evaluation.consistency import anees, anees_bounds
+from pipistrelle.evaluation.consistency import anees, anees_bounds_about
 from pipistrelle.figures.chart import Chart, Panel, Series, ends, linear_axis, log_axis
 from pipistrelle.report.claims.contrasts import frame_time, lap_time
 from pipistrelle.report.claims.published import beam_name
-from pipistrelle.report.studied import Selection, Way, filter_titles, kept
+from pipistrelle.report.studied import Selection, Study, Way, filter_titles, kept
 
 
 def anees_charts(selection: Selection) -> list[Chart]:
@@ -41,8 +41,10 @@ def _anees_chart(selection: Selection, name: str, title: str) -> Chart:
         (int(np.sum(kept(selection, [(name, way, i)])))
          for way, series in lines.items() for i in range(len(series))), default=0,
     )  # fmt: skip
-    span = anees_bounds(runs) if runs else (1.0, 9.0)
-    vertical = log_axis("ANEES", [*span, *ends(s for mine in lines.values() for s in mine)])
+    if runs:
+        for way, mine in lines.items():
+            mine.insert(0, _ideal(study, (name, way), runs))
+    vertical = log_axis("ANEES", ends(s for mine in lines.values() for s in mine) or [1.0, 9.0])
     lap = lap_time(study)
     panels = [
         Panel(
@@ -51,7 +53,6 @@ def _anees_chart(selection: Selection, name: str, title: str) -> Chart:
             x=linear_axis("time [s]", [series[0].x[-1] / 1.05], floor=0.0),
             y=vertical,
             series=tuple(series),
-            span=(*span, "95 % of a consistent filter"),
             posts=tuple(lap * k for k in range(1, int(series[0].x[-1] / lap) + 1)),
         )
         for way, series in lines.items()
@@ -60,10 +61,26 @@ def _anees_chart(selection: Selection, name: str, title: str) -> Chart:
         name="anees_" + re.sub(r"\W+", "_", name),
         title=f"Consistency of {title}: average NEES over time",
         caption="The stronger a line, the narrower the beam; grey: where a consistent filter's "
-        f"ANEES over {runs} world{'' if runs == 1 else 's'} lies with 95 %; dotted: "
-        "the vehicle is back at its start",
+        f"ANEES over {runs} world{'' if runs == 1 else 's'} lies with 95 %, after a start that is "
+        "exact and thought uncertain, at one beamwidth or another; dotted: the vehicle is back at "
+        "its start",
         panels=tuple(panels),
         columns=("time_s", "anees"),
+    )
+
+
+def _ideal(study: Study, way: Way, runs: int) -> Series:
+    """Return a consistent filter's ANEES over so many worlds: its mean, and all beams' bounds."""
+    expected, variance = study.trials[way].consistent
+    low, high = anees_bounds_about(expected, variance, runs)
+    return Series(
+        name="a consistent filter",
+        role="grid",
+        x=frame_time(study, expected.shape[1]),
+        y=np.mean(expected, axis=0),
+        low=np.min(low, axis=0),
+        high=np.max(high, axis=0),
+        dashed=True,
     )
 
 

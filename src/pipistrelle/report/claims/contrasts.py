@@ -7,6 +7,7 @@ about: active minus fused.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -32,9 +33,6 @@ from pipistrelle.report.studied import (
     lost_worlds,
     samples,
 )
-
-STATES = 3.0
-"""Expected NEES of a consistent filter of the pose (Bradley & Abaid, Sec. V-A)."""
 
 
 def selections(study: Study) -> dict[Rule, Selection]:
@@ -191,12 +189,16 @@ def curves(selection: Selection, ways: Sequence[Way]) -> list[Float[np.ndarray, 
     return [mine[counts] for mine in nees]
 
 
-def departure(nees: Float[np.ndarray, "m b k"]) -> Float[np.ndarray, " m"]:
+def departure(
+    nees: Float[np.ndarray, "m b k"], expected: Float[np.ndarray, "b k"]
+) -> Float[np.ndarray, " m"]:
     """How far ANEES is from that of a consistent filter, averaged over the beamwidths.
 
     Parameters
     ----------
     nees : (m, b, k)
+    expected : (b, k)
+        Of a consistent filter.
 
     Returns
     -------
@@ -204,20 +206,26 @@ def departure(nees: Float[np.ndarray, "m b k"]) -> Float[np.ndarray, " m"]:
         Jackknife pseudo-values of `anees_departure`, which is smooth where the jackknife has to
         be; of a single world, its own.
     """
-    beams = range(nees.shape[1])
-    if len(nees) < 2:
-        return np.mean([anees_departure(nees[:, i]) for i in beams], axis=0)
-    return np.mean([pseudovalues(nees[:, i], anees_departure) for i in beams], axis=0)
+    found = []
+    for i, curve in enumerate(expected):
+        statistic = partial(anees_departure, expected=curve)
+        alone = len(nees) < 2
+        found.append(statistic(nees[:, i]) if alone else pseudovalues(nees[:, i], statistic))
+    return np.mean(found, axis=0)
 
 
-def anees_departure(anees: Float[np.ndarray, "*j k"]) -> Float[np.ndarray, "*j"]:
+def anees_departure(
+    anees: Float[np.ndarray, "*j k"], expected: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, "*j"]:
     r"""How far ANEES is from that of a consistent filter, over all frames.
 
-    .. math:: T = \frac{1}{K} \sum_k \ln^2(\bar\epsilon_k / 3)
+    .. math:: T = \frac{1}{K} \sum_k \ln^2(\bar\epsilon_k / E_k)
 
     Parameters
     ----------
     anees : (*j, k)
+    expected : (k)
+        E, below 3 where the start is exact (`evaluation.bound.nees_of_exact_start`).
 
     Returns
     -------
@@ -225,14 +233,15 @@ def anees_departure(anees: Float[np.ndarray, "*j k"]) -> Float[np.ndarray, "*j"]
 
     Notes
     -----
-    Bradley & Abaid, Eq. (24) and Sec. V-B: over-confident above 3, under-confident below.
+    Bradley & Abaid, Eq. (24) and Sec. V-B, who compare with 3: over-confident above,
+    under-confident below.
 
     Examples
     --------
-    >>> anees_departure(np.array([[3.0, 3.0], [3.0 * np.e, 3.0 / np.e]]))
+    >>> anees_departure(np.array([[3.0, 2.0], [3.0 * np.e, 2.0 / np.e]]), np.array([3.0, 2.0]))
     array([0., 1.])
     """
-    return np.mean(np.square(np.log(anees / STATES)), axis=-1)
+    return np.mean(np.square(np.log(anees / expected)), axis=-1)
 
 
 def lap_fit(study: Study) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]] | None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from pipistrelle.config import Config
 from pipistrelle.estimation.catalogue import CATALOGUE
-from pipistrelle.evaluation.consistency import anees, anees_bounds
+from pipistrelle.evaluation.consistency import anees, anees_bounds_about
 from pipistrelle.experiments.studies.plan import RADIUS
 from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
 from pipistrelle.report.claims.contrasts import anees_departure
@@ -175,8 +175,8 @@ def consistency_rows(selection: Selection) -> list[dict[str, Any]]:
     Returns
     -------
     list of dict
-        Per case: worlds, time mean of ANEES, shares of time inside and above its 95 % bounds, and
-        its `anees_departure`.
+        Per case: worlds, time mean of ANEES and of a consistent filter's, the means of its 95 %
+        bounds, shares of time inside and above them, and its `anees_departure`.
 
     Notes
     -----
@@ -190,7 +190,8 @@ def consistency_rows(selection: Selection) -> list[dict[str, Any]]:
             if not counts.any() or not trials.nees.shape[2]:
                 continue
             mean = anees(trials.nees[counts, i])
-            low, high = anees_bounds(int(counts.sum()))
+            expected, variance = trials.consistent[:, i]
+            low, high = anees_bounds_about(expected, variance, int(counts.sum()))
             rows.append(
                 {
                     "filter": name,
@@ -198,10 +199,11 @@ def consistency_rows(selection: Selection) -> list[dict[str, Any]]:
                     "beamwidth": None if strategy == "passive" else beam_name(study.beamwidth[i]),
                     "n": int(counts.sum()),
                     "anees": float(np.mean(mean)),
-                    "bounds": [low, high],
+                    "expected": float(np.mean(expected)),
+                    "bounds": [float(np.mean(low)), float(np.mean(high))],
                     "inside": float(np.mean((mean >= low) & (mean <= high))),
                     "above": float(np.mean(mean > high)),
-                    "departure": float(anees_departure(mean)),
+                    "departure": float(anees_departure(mean, expected)),
                 }
             )
     return rows
@@ -221,7 +223,7 @@ def by_strategy(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for row in rows:
         groups.setdefault((row["filter"], row["strategy"]), []).append(row)
-    keys = ("anees", "inside", "above", "departure")
+    keys = ("anees", "expected", "inside", "above", "departure")
     return [
         {"filter": name, "strategy": strategy, "n": min(row["n"] for row in mine)}
         | {key: float(np.mean([row[key] for row in mine])) for key in keys}

@@ -1,0 +1,205 @@
+r"""The bound: how surely any estimator can know the vehicle's pose, from what it was told.
+
+The posterior Cramér-Rao bound along the true path is the covariance that an extended Kalman filter
+would have with every Jacobian taken at the truth: it hangs on what was heard and on how noisy
+controls and measurements are said to be, and on no estimate. The start is exact, and landmarks are
+not known before they are heard, but for a flat prior. It tells two things:
+
+- how much of an estimator's error is its own fault;
+- what NEES a consistent filter has that believes its start uncertain while it is exact: less than
+  the number of states, since part of what it allows for never happens.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipistrelle.detection.scans import BEARING_STD, NUMBERS, RANGE, RANGE_STD, Scan
+from pipistrelle.estimation.ekf.gaussian import (
+    correct_active,
+    correct_bearing,
+    flush,
+    joint_of,
+    propagate,
+)
+from pipistrelle.estimation.measurement import NEAREST, observe
+from pipistrelle.estimation.motion import Motion, MotionNumbers, motion_numbers
+from pipistrelle.jit import kernel
+
+PRIOR_STD = 20.0
+"""Of a landmark before it is heard [m]."""
+
+
+def pose_bound(
+    motion: Motion,
+    controls: Float[np.ndarray, "k 2"],
+    time: Float[np.ndarray, " t"],
+    path: Float[np.ndarray, "t 3"],
+    landmarks: tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]],
+    scans: Sequence[Scan],
+) -> Float[np.ndarray, "t 3 3"]:
+    r"""Posterior Cramér-Rao bound of the pose at every step, after an exact start.
+
+    .. math:: \bar P = F P F^T + U Q U^T, \qquad P^{-1} = \bar P^{-1} + H^T R^{-1} H
+
+    with F, U and H at the truth.
+
+    Parameters
+    ----------
+    motion : Motion
+    controls : (k, 2)
+    time : (k + 1) [s]
+    path : (k + 1, 3) [m, m, rad]
+        True poses, the start first.
+    landmarks : labels (n) and true positions (n, 2) [m]
+    scans : sequence of Scan
+        Who was heard when, with a range or without, and how surely: of the measurements the
+        standard deviations alone count. Rows of other labels are left out.
+
+    Returns
+    -------
+    (k + 1, 3, 3) [m, rad, squared]
+        No estimator without bias has less. Zero at the start.
+
+    Notes
+    -----
+    Source: Tichavsky, Muravchik & Nehorai, IEEE Transactions on Signal Processing 46, 1998.
+
+    Examples
+    --------
+    A standing vehicle that hears nothing stays where it was.
+
+    >>> motion = Motion(model="unicycle", control_std=(0.1, 0.1), noise_at_rest=False)
+    >>> nowhere = np.empty(0, int), np.empty((0, 2))
+    >>> still, path = np.zeros((2, 2)), np.zeros((3, 3))
+    >>> float(pose_bound(motion, still, np.arange(3.0), path, nowhere, []).max())
+    0.0
+    """
+    labels, places = landmarks
+    count = [len(scan.landmark) for scan in scans]
+    step = np.repeat(np.searchsorted(time, [scan.time - 1e-9 for scan in scans]), count)
+    label = np.concatenate([np.empty(0, np.int64), *(scan.landmark for scan in scans)])
+    numbers = np.concatenate([np.empty((NUMBERS, 0)), *(scan.numbers for scan in scans)], axis=1)
+    known = np.isin(label, labels)
+    heard, first, slot = np.unique(label[known], return_index=True, return_inverse=True)
+    order = np.argsort(first)  # whom it hears first stands first: the state grows as a filter's
+    place = {int(one): point for one, point in zip(labels, places, strict=True)}
+    return _bound(
+        path,
+        controls,
+        np.diff(time),
+        motion_numbers(motion),
+        np.array([place[int(one)] for one in heard[order]]).reshape(-1, 2),
+        (step[known], np.argsort(order)[slot]),
+        np.ascontiguousarray(numbers[:, known]),
+    )
+
+
+@kernel
+def _bound(
+    path: Float[np.ndarray, "t 3"],
+    controls: Float[np.ndarray, "k 2"],
+    dt: Float[np.ndarray, " k"],
+    motion: MotionNumbers,
+    places: Float[np.ndarray, "n 2"],
+    row: tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]],
+    numbers: Float[np.ndarray, "7 m"],
+) -> Float[np.ndarray, "t 3 3"]:
+    """Carry the covariance along the true path; of each measurement its step and its place."""
+    room = 3 + 2 * places.shape[0]
+    mean, prior = np.zeros(room), np.zeros((room, room))
+    for n in range(places.shape[0]):
+        for a in range(2):
+            mean[3 + 2 * n + a] = places[n, a]
+            prior[3 + 2 * n + a, 3 + 2 * n + a] = PRIOR_STD * PRIOR_STD
+    joint, size, m = joint_of(mean, prior, room), 3, 0
+    joint.W[:] = 0.0  # the state grows into columns that wait
+    bound = np.zeros((path.shape[0], 3, 3))
+    steps, slots = row
+    for k in range(1, path.shape[0]):
+        for a in range(3):
+            joint.mean[a] = path[k - 1, a]
+        propagate(
+            joint.mean, joint.covariance, controls[k - 1 : k], dt[k - 1 : k], motion,
+            np.empty((1, 3)), np.empty((1, 3, 3)),
+        )  # fmt: skip
+        for a in range(3):
+            joint.mean[a] = path[k, a]
+        while m < steps.size and steps[m] <= k:
+            i, mean = 3 + 2 * slots[m], joint.mean
+            if i == size:
+                flush(joint, size)
+                size += 2
+            near, angle, _, _, _ = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
+            across = numbers[BEARING_STD, m] ** 2
+            if near >= NEAREST and not math.isnan(numbers[RANGE, m]):
+                along = numbers[RANGE_STD, m] ** 2
+                correct_active(joint, size, i, near, angle, along, across, np.inf)
+            elif near >= NEAREST:
+                correct_bearing(joint, size, i, angle, across, np.inf)
+            m += 1
+        flush(joint, size)
+        for a in range(3):
+            for b in range(3):
+                bound[k, a, b] = joint.covariance[a, b]
+    return bound
+
+
+def nees_of_exact_start(
+    bound: Float[np.ndarray, "t 3 3"],
+    path: Float[np.ndarray, "t 3"],
+    start_covariance: Float[np.ndarray, "3 3"],
+) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, " t"]]:
+    r"""Mean and variance of a consistent filter's NEES where a start thought uncertain is exact.
+
+    What is heard is relative to the vehicle, so an error of the start would never be noticed: it
+    would move and turn the whole path. A filter that allows for it with P_0 therefore has
+
+    .. math:: P_k = B_k + G_k P_0 G_k^T, \qquad
+              G_k = \begin{pmatrix} 1 & 0 & y_0 - y_k \\ 0 & 1 & x_k - x_0 \\ 0 & 0 & 1
+              \end{pmatrix}
+
+    at step k, with B_k the covariance after an exact start, which is that of its errors here. So
+
+    .. math:: E[\epsilon_k] = \operatorname{tr} P_k^{-1} B_k, \qquad
+              \operatorname{Var}[\epsilon_k] = 2 \operatorname{tr} (P_k^{-1} B_k)^2,
+
+    not 3 and 6, as where the start is drawn from P_0: the NEES is a sum of squares of normal
+    numbers whose variances are the eigenvalues of :math:`P_k^{-1} B_k`, all below one.
+
+    Parameters
+    ----------
+    bound : (k + 1, 3, 3) [m, rad, squared]
+        B, as `pose_bound` gives it.
+    path : (k + 1, 3) [m, m, rad]
+        True poses.
+    start_covariance : (3, 3) [m, rad, squared]
+        P_0; zero, and the mean is the rank of B.
+
+    Returns
+    -------
+    mean, variance : (k + 1)
+
+    Notes
+    -----
+    Bradley & Abaid, Eq. (23), compare with 3, though their filters begin "matching the vehicle's
+    initial state" with a P_0 (Sec. IV).
+
+    Examples
+    --------
+    As uncertain as the start alone: half of each of three numbers.
+
+    >>> mean, variance = nees_of_exact_start(np.eye(3)[None], np.zeros((1, 3)), np.eye(3))
+    >>> mean, variance
+    (array([1.5]), array([1.5]))
+    """
+    G = np.tile(np.eye(3), (len(path), 1, 1))
+    G[:, 0, 2] = path[0, 1] - path[:, 1]
+    G[:, 1, 2] = path[:, 0] - path[0, 0]
+    total = bound + G @ start_covariance @ np.swapaxes(G, 1, 2)
+    share = np.linalg.pinv(total, hermitian=True) @ bound
+    mean = np.trace(share, axis1=1, axis2=2)
+    variance = 2.0 * np.trace(share @ share, axis1=1, axis2=2)
+    return mean, variance
