@@ -119,7 +119,7 @@ def _rate(frames: int, elapsed: float) -> str:
     return f"{frames:>5} frames{speed}"
 
 
-def closing_table(trials: "Sequence[TrialResult]", aligned: bool, there: int | None = None) -> str:
+def closing_table(trials: "Sequence[TrialResult]", there: int | None = None) -> str:
     """Compare the estimates of one world, a column each; what no estimate has is left out.
 
     Six columns fit into 100 characters. Of particles, landmarks are those of the heaviest particle.
@@ -127,8 +127,6 @@ def closing_table(trials: "Sequence[TrialResult]", aligned: bool, there: int | N
     Parameters
     ----------
     trials : sequence of TrialResult, at least one
-    aligned : bool
-        Show the errors after alignment too.
     there : int, optional
         Landmarks of the world, where that is known.
 
@@ -136,7 +134,7 @@ def closing_table(trials: "Sequence[TrialResult]", aligned: bool, there: int | N
     -------
     str
     """
-    columns = [dict(_cells(trial, aligned, there)) for trial in trials]
+    columns = [dict(_cells(trial, there)) for trial in trials]
     filters = [short_name(trial.filter) for trial in trials]
     lines = [("", *(trial.strategy for trial in trials)), ("", *filters)]
     width = max(11, 1 + max(map(len, filters)))
@@ -149,15 +147,14 @@ def closing_table(trials: "Sequence[TrialResult]", aligned: bool, there: int | N
     )
 
 
-def _cells(trial: "TrialResult", aligned: bool, there: int | None) -> Iterator[tuple[str, str]]:
+def _cells(trial: "TrialResult", there: int | None) -> Iterator[tuple[str, str]]:
     """Word what there is to say of an estimate, with titles; nothing of what it lacks."""
     s = trial.scores
     yield "position RMSE [m]", _number(s.position_rmse_m, 3)
     yield "heading RMSE [rad]", _number(s.heading_rmse_rad, 4)
     yield "map RMSE [m]", _number(s.map_rmse_m, 3)
-    if aligned:
-        yield "position RMSE, aligned [m]", _number(s.position_rmse_aligned_m, 3)
-        yield "map RMSE, aligned [m]", _number(s.map_rmse_aligned_m, 3)
+    yield "position RMSE, aligned [m]", _number(s.position_rmse_aligned_m, 3)
+    yield "map RMSE, aligned [m]", _number(s.map_rmse_aligned_m, 3)
     yield "position, unavoidable [m]", _number(s.position_floor_m, 3)
     yield "NEES, mean", _number(s.nees_mean, 2)
     yield "NEES, largest", _number(s.nees_max, 1)

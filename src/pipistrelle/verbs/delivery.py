@@ -142,7 +142,7 @@ def deliver(
     )
     if not options.quiet:
         there = None if truth.landmarks is None else len(truth.landmarks[0])
-        put(closing_table(trials, ignored_rows is not None, there))
+        put(closing_table(trials, there))
     failed = [t for t in trials if not np.all(np.isfinite(t.track.pose.mean))]
     for trial in failed:
         why = trial.error or "its path is not finite"
