@@ -1,8 +1,9 @@
 """Fit the four numbers that the paper does not report and that nothing else settles.
 
-    python papers/bradley_abaid/calibration.py [--worlds 100] [--workers 2] [--output FILE]
+    python papers/bradley_abaid/calibration.py PLAN [--worlds 100] [--workers 2] [--output FILE]
 
-Fitted, each to one mean of Table II, in this order:
+PLAN is paper or physics: the readings of a plan that ships with the package. Fitted, each to one
+mean of Table II, in this order:
 
     beacon.level_db     landmarks seen, passive                   39.5
     emitter.level_db    landmarks seen, fused at 180 degrees      43.7
@@ -36,6 +37,7 @@ from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
 from pipistrelle.experiments.runs.trial import drive_of, run_trial, scans_of
+from pipistrelle.experiments.studies.plan_file import PLANS, find_plan, read_plan
 
 SEED = 1000
 BEAMS = {"180": 0.0025, "33": 0.0088, "11": 0.025}
@@ -48,7 +50,7 @@ PAPER_FULL = 26.6
 """Fully initialised by passive EKF-SLAM: Table II."""
 POWERS = (1.0, 2.0, 3.0, 4.0)
 PRUNES = tuple(float(f"{digit}e-{decade}") for decade in range(12, 1, -1) for digit in (1, 2, 5))
-OUTPUT = Path(__file__).parents[2] / "src/pipistrelle/experiments/studies/paper_calibration.toml"
+STUDIES = Path(__file__).parents[2] / "src/pipistrelle/experiments/studies"
 Run = Callable[[Callable[[int], Any]], list[Any]]
 """Calls a function with the number of each world; lists what it returns."""
 
@@ -56,15 +58,18 @@ Run = Callable[[Callable[[int], Any]], list[Any]]
 def main() -> None:
     """Fit, write and print."""
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    options.add_argument("plan", choices=PLANS)
     options.add_argument("--worlds", type=int, default=100)
     options.add_argument("--workers", type=int, default=2)
-    options.add_argument("--output", type=Path, default=OUTPUT)
+    options.add_argument("--output", type=Path)
     chosen = options.parse_args()
+    readings = read_plan(find_plan(chosen.plan)).config.model_copy(update={"seed": SEED})
     with in_worlds(chosen.worlds, chosen.workers) as run:
-        config, seen = fit_levels(Config(seed=SEED), run)
+        config, seen = fit_levels(readings, run)
         rays = fit_rays(config, run)
     text = tomli_w.dumps(summary(config, seen, rays))
-    chosen.output.write_text(f"# Written by papers/bradley_abaid/calibration.py\n\n{text}")
+    output = chosen.output or STUDIES / f"{chosen.plan}_calibration.toml"
+    output.write_text(f"# Written by papers/bradley_abaid/calibration.py {chosen.plan}\n\n{text}")
     print(text)
 
 

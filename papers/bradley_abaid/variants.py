@@ -2,8 +2,8 @@
 
     python papers/bradley_abaid/variants.py FOLDER [--workers 2]
 
-Each variant is a study of its own below FOLDER, 5750 trials in the worlds of the first; one that is
-done is only read. Written as ``variants.csv`` beside this file: landmarks that passive EKF-SLAM
+Each variant is a study of its own below FOLDER, the plan `physics` with something changed: 5750
+trials in the worlds of the first. One that is done is only read. Written as ``variants.csv`` beside this file: landmarks that passive EKF-SLAM
 places, worlds left out, gain of fused over active sensing in position at 11 degrees, verdicts.
 """
 
@@ -17,6 +17,19 @@ from pathlib import Path
 
 VARIANTS: dict[str, dict[str, str]] = {
     "study": {},
+    "runs": {
+        "detection.snapshots": "runs",
+        "detection.peak-db": "0",
+        "emitter.level-db": "50.4",
+        "beacon.level-db": "43.3",
+        "rays.prune": "5e-6",
+    },
+    "off_axis": {
+        "emitter.off-axis": "power",
+        "emitter.level-db": "48.8",
+        "beacon.level-db": "42.8",
+        "rays.prune": "2e-5",
+    },
     "n1": {"rays.power": "1", "rays.prune": "5e-4"},
     "n3": {"rays.power": "3", "rays.prune": "2e-9"},
     "aggregated": {"rays.weights": "aggregated"},
@@ -30,7 +43,8 @@ VARIANTS: dict[str, dict[str, str]] = {
     "particles1000": {"fastslam.particles": "1000"},
 }
 """Settings by the variant's name. With each power of n goes the tau that reaches the paper's count,
-with the bistatic law the levels that do (``sensitivity.csv``)."""
+with the bistatic law the levels that do (``sensitivity.csv``), with the paper's reading of
+snapshots and of the off-axis loss, each alone, both (``readings.csv``)."""
 OUT = Path(__file__).with_name("variants.csv")
 
 
@@ -74,7 +88,7 @@ def main() -> None:
     for name, settings in VARIANTS.items():
         folder = given.folder / name
         words = ["--output", str(folder), "--workers", given.workers, *flags(settings)]
-        pipistrelle("study", "paper", *words)
+        pipistrelle("study", "physics", *words)
         pipistrelle("report", str(folder))
         rows.append({"variant": name, "settings": " ".join(flags(settings)), **dict(found(folder))})
     with OUT.open("w", encoding="utf-8", newline="") as file:

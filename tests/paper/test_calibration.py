@@ -9,16 +9,21 @@ from statistics import fmean
 import pytest
 
 from pipistrelle.config import Config
-from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
+from pipistrelle.experiments.studies.plan_file import PLANS, find_plan, read_plan
 from pipistrelle.report.claims.published import TABLE_II
 
 SCRIPT = Path(__file__).parents[2] / "papers/bradley_abaid/calibration.py"
 PAPER = {(row.filter, round(row.beamwidth)): row for row in TABLE_II}
 
 
+@pytest.fixture(scope="module", params=PLANS)
+def plan(request) -> str:
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def found() -> dict:
-    text = files("pipistrelle.experiments.studies").joinpath("paper_calibration.toml").read_text()
+def found(plan) -> dict:
+    text = files("pipistrelle.experiments.studies").joinpath(f"{plan}_calibration.toml").read_text()
     return tomllib.loads(text)
 
 
@@ -27,15 +32,18 @@ def value(config: Config, name: str) -> float:
     return getattr(getattr(config, section), field)
 
 
-def test_the_fitted_values_are_those_of_the_papers_study_and_the_defaults(found):
+def test_the_fitted_values_are_those_of_the_study(found, plan):
     assert len(found["fitted"]) == 4
     for name, fitted in found["fitted"].items():
-        assert value(read_plan(find_plan("paper")).config, name) == fitted
-        assert value(Config(), name) == fitted
+        assert value(read_plan(find_plan(plan)).config, name) == fitted
 
 
-def test_the_worlds_of_the_fit_are_not_those_of_the_study(found):
-    assert found["worlds"]["seed"] != read_plan(find_plan("paper")).config.seed
+def test_the_defaults_are_those_of_the_study_of_physics():
+    assert read_plan(find_plan("physics")).config == Config(seed=2022)
+
+
+def test_the_worlds_of_the_fit_are_not_those_of_the_study(found, plan):
+    assert found["worlds"]["seed"] != read_plan(find_plan(plan)).config.seed
 
 
 def test_only_three_numbers_of_table_ii_were_fitted_to(found):
@@ -67,13 +75,14 @@ def test_the_power_is_the_least_above_one_that_reaches_the_papers_count(found):
 
 
 @pytest.mark.slow
-def test_some_of_its_worlds_heard_again_see_as_many_landmarks(found):
+def test_some_of_its_worlds_heard_again_see_as_many_landmarks(found, plan):
     spec = importlib.util.spec_from_file_location("calibration", SCRIPT)
     assert spec is not None
     assert spec.loader is not None
     calibration = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(calibration)
-    worlds, config = 12, Config(seed=found["worlds"]["seed"])
+    config = read_plan(find_plan(plan)).config
+    worlds, config = 12, config.model_copy(update={"seed": found["worlds"]["seed"]})
     seen = [calibration.landmarks_seen(config, ("180", "11"), world) for world in range(worlds)]
     for name in ("fused 180", "passive"):
         fit = found["fitted_to"][name]

@@ -36,7 +36,8 @@ exec {command} --workers {workers} --shard "$SLURM_ARRAY_TASK_ID/{shards}" -o {f
 
 def study(
     plan: Annotated[
-        str, Parameter(metavar="PLAN", help="paper, or a FILE.toml such as the study's plan.toml.")
+        str,
+        Parameter(metavar="PLAN", help="paper, physics or a FILE.toml, as a study's plan.toml."),
     ] = "paper",
     /,
     *,
@@ -141,7 +142,9 @@ def _share(text: str | None) -> tuple[int, int]:
 
 def _command(word: str, plan: "Plan", layer: Layer) -> str:
     """Return the command line of a plan and of the settings laid over it."""
-    place = word if word == "paper" else str(Path(word).absolute())
+    from pipistrelle.experiments.studies.plan_file import PLANS
+
+    place = word if word in PLANS else str(Path(word).absolute())
     words = ["pipistrelle", "study", place, "--iterations", str(plan.iterations)]
     for key, given in layer.items():
         values = given.value if isinstance(given.value, (list, tuple)) else [given.value]

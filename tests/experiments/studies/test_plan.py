@@ -43,15 +43,26 @@ def test_the_papers_plan_is_fifty_cases_in_115_worlds():
     assert [case.number for case in cases] == list(range(50))
 
 
-def test_the_papers_plan_ships_with_the_package_and_names_what_was_fitted():
-    text = files("pipistrelle.experiments.studies").joinpath("paper.toml").read_text()
+def named(plan):
+    """Return the settings that a plan of the package names, its seed aside, by section."""
+    text = files("pipistrelle.experiments.studies").joinpath(f"{plan}.toml").read_text()
     config = tomllib.loads(text)["config"]
-    assert {name: list(table) for name, table in config.items() if name != "seed"} == {
-        "emitter": ["level_db"],
-        "beacon": ["level_db"],
-        "rays": ["prune", "power"],
-    }
     assert "seed" in config
+    return {name: list(table) for name, table in config.items() if name != "seed"}
+
+
+def test_the_plans_of_the_package_name_what_was_fitted_and_the_papers_how_it_is_read():
+    fitted = {"emitter": ["level_db"], "beacon": ["level_db"], "rays": ["prune", "power"]}
+    assert named("physics") == fitted
+    readings = {"detection": ["snapshots", "peak_db"], "emitter": ["off_axis", "level_db"]}
+    assert named("paper") == fitted | readings
+
+
+def test_the_plans_of_the_package_have_the_same_cases_and_worlds():
+    paper, physics = (read_plan(find_plan(name)) for name in ("paper", "physics"))
+    assert paper.grid == physics.grid
+    assert (paper.strategies, paper.filters) == (physics.strategies, physics.filters)
+    assert (paper.iterations, paper.config.seed) == (physics.iterations, physics.config.seed)
 
 
 def test_the_papers_radii_are_those_that_its_appendix_lists_beamwidths_for():
@@ -262,7 +273,8 @@ def test_a_flag_with_a_refused_value_is_named(refused):
 
 
 def test_a_plan_that_is_not_there_is_refused():
-    with pytest.raises(InputError, match=r"^none\.toml: found no such file; expected paper"):
+    said = r"^none\.toml: found no such file; expected paper or physics, or the path"
+    with pytest.raises(InputError, match=said):
         find_plan("none.toml")
 
 

@@ -34,7 +34,7 @@ def test_the_papers_own_settings_are_not_said_to_differ():
 def test_settings_that_are_not_the_papers_are_named_with_both_values():
     study = as_the_paper(invent(2), scenario={"steps": 200}, beacon={"level_db": 45.0})
     assert not_the_papers_line(not_the_papers(study)) == (
-        "Not the paper's study: scenario.steps 200 (paper 1500), beacon.level_db 45 (paper 42.8)"
+        "Not the paper's study: scenario.steps 200 (paper 1500), beacon.level_db 45 (paper 43.2)"
     )
 
 

@@ -51,13 +51,18 @@ class _Head(Section):
     )
 
 
+PLANS = ("paper", "physics")
+"""Plans that ship with the package: the paper's study as its words may be read, and as physics has
+it where they leave a choice."""
+
+
 def find_plan(word: str) -> Path:
     """Find a plan by the word that names it.
 
     Parameters
     ----------
     word : str
-        "paper", or the path of a file.
+        One of `PLANS`, or the path of a file.
 
     Returns
     -------
@@ -74,10 +79,12 @@ def find_plan(word: str) -> Path:
     'paper.toml'
     """
     path = Path(word)
-    if word == "paper":
-        return Path(str(files("pipistrelle.experiments.studies") / "paper.toml"))
+    if word in PLANS:
+        return Path(str(files("pipistrelle.experiments.studies") / f"{word}.toml"))
     if not path.is_file():
-        raise InputError(f"{word}: found no such file; expected paper, or the path of a plan")
+        raise InputError(
+            f"{word}: found no such file; expected {' or '.join(PLANS)}, or the path of a plan"
+        )
     return path
 
 

@@ -75,7 +75,7 @@ def _ideal(study: Study, way: Way, runs: int) -> Series:
     low, high = anees_bounds_about(expected, variance, runs)
     return Series(
         name="a consistent filter",
-        role="grid",
+        role="ink",
         x=frame_time(study, expected.shape[1]),
         y=np.mean(expected, axis=0),
         low=np.min(low, axis=0),

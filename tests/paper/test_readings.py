@@ -1,0 +1,62 @@
+"""The plan of the paper is the reading that the experiment chose, by its own rule."""
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
+
+TABLE = Path(__file__).parents[2] / "papers/bradley_abaid/readings.csv"
+READ_AS = {
+    ("snapshots", "maxima"): {"detection.snapshots": "maxima", "detection.peak_db": -8.0},
+    ("snapshots", "run, strongest"): {"detection.snapshots": "runs", "detection.peak_db": 0.0},
+    ("snapshots", "run, 3 dB"): {"detection.snapshots": "runs", "detection.peak_db": -3.0},
+    ("snapshots", "run, 8 dB"): {"detection.snapshots": "runs", "detection.peak_db": -8.0},
+    ("off_axis", "20 log p"): {"emitter.off_axis": "pressure"},
+    ("off_axis", "10 log p"): {"emitter.off_axis": "power"},
+    ("likelihood", "density"): {"rays.likelihood": "normal"},
+    ("likelihood", "printed"): {"rays.likelihood": "printed"},
+    ("weights", "marginal"): {"fastslam.weights": "marginal"},
+    ("weights", "sampled"): {"fastslam.weights": "sampled"},
+}
+PHYSICS = {"off_axis": "20 log p", "likelihood": "density"}
+"""What is physically right, where one of two readings is not."""
+
+
+@pytest.fixture(scope="module")
+def rows():
+    with TABLE.open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def settings_of(row):
+    factors = ("snapshots", "off_axis", "likelihood", "weights")
+    return {k: v for factor in factors for k, v in READ_AS[factor, row[factor]].items()}
+
+
+def value(config, name):
+    section, field = name.split(".")
+    return getattr(getattr(config, section), field)
+
+
+def test_all_combinations_were_tried(rows):
+    assert len({tuple(settings_of(row).values()) for row in rows}) == len(rows) == 4 * 2 * 2 * 2
+    misfits = [float(row["misfit"]) for row in rows]
+    assert misfits == sorted(misfits)
+
+
+def test_the_plan_is_the_physically_rightest_of_those_within_a_standard_error_of_the_least(rows):
+    near = [row for row in rows if float(row["above_best"]) <= float(row["above_best_error"])]
+    rightness = [sum(row[name] == level for name, level in PHYSICS.items()) for row in near]
+    chosen = near[rightness.index(max(rightness))]
+    config = read_plan(find_plan("paper")).config
+    for name, level in settings_of(chosen).items():
+        assert value(config, name) == level
+
+
+def test_the_defaults_are_one_of_the_readings(rows):
+    config = read_plan(find_plan("physics")).config
+    mine = [r for r in rows if all(value(config, k) == v for k, v in settings_of(r).items())]
+    assert len(mine) == 1
+    assert float(mine[0]["above_best"]) > 2.0 * float(mine[0]["above_best_error"])
