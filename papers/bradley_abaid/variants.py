@@ -3,8 +3,9 @@
     python papers/bradley_abaid/variants.py FOLDER [--workers 2]
 
 Each variant is a study of its own below FOLDER, the plan `physics` with something changed: 5750
-trials in the worlds of the first. One that is done is only read. Written as ``variants.csv`` beside this file: landmarks that passive EKF-SLAM
-places, worlds left out, gain of fused over active sensing in position at 11 degrees, verdicts.
+trials in the worlds of the first. One that is done is only read. Written as ``variants.csv`` beside
+this file: landmarks that passive EKF-SLAM places, worlds left out, gain of fused over active
+sensing in position at 11 degrees, verdicts.
 """
 
 import argparse

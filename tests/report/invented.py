@@ -9,7 +9,7 @@ import polars as pl
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config
 from pipistrelle.experiments.studies.plan import cases_of
-from pipistrelle.experiments.studies.plan_file import read_plan
+from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
 from pipistrelle.experiments.studies.store import open_store
 from pipistrelle.experiments.studies.world import world_schemas
 from pipistrelle.experiments.studies.world_files import TABLES, with_sums, world_file
@@ -29,7 +29,7 @@ format = 1
 name = "invented"
 iterations = {iterations}
 [config]
-seed = 2022
+{settings}
 [grid]
 "emitter.radius" = {radii}
 """
@@ -157,9 +157,9 @@ def write_store(folder: Path, study: Study, *, iterations=None, seed=3, failed=(
     """
     rng = np.random.default_rng(seed)
     text = folder.parent / f"{folder.name}.toml"
-    text.write_text(
-        PLAN.format(iterations=iterations or len(study.worlds), radii=list(RADII)) + grid
-    )
+    settings = find_plan("paper").read_text().split("[config]\n")[1].split("\n\n")[0]
+    worlds = iterations or len(study.worlds)
+    text.write_text(PLAN.format(iterations=worlds, radii=list(RADII), settings=settings) + grid)
     plan = read_plan(text)
     open_store(folder, plan)
     schemas, cases = world_schemas(plan), cases_of(plan)

@@ -189,7 +189,10 @@ def test_a_length_of_time_is_worded_in_the_unit_that_fits(seconds, words):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("none.toml", "none.toml: found no such file; expected paper, or the path of a plan"),
+        (
+            "none.toml",
+            "none.toml: found no such file; expected paper or physics, or the path of a plan",
+        ),
         ("small.toml --iterations 0", "--iterations: found 0, expected 1 to 1000000"),
         ("small.toml --iterations 2.5", "--iterations: found '2.5', expected a whole number"),
         ("small.toml --workers 0", "--workers: found 0, expected 1 to 1000000"),
