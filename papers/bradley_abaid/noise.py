@@ -9,7 +9,6 @@ file: landmarks placed, position errors and what fused sensing gains on active, 
 error over the worlds, everything counted, and the worlds that a filter loses.
 """
 
-import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -20,7 +19,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 from calibration import Run, changed, in_worlds
-from readings import BEAMS, CASES, fit_tau, settings, write_table
+from readings import BEAMS, CASES, asked, fit_tau, settings, write_table
 
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import Config
@@ -43,13 +42,7 @@ OUTPUT = Path(__file__).with_name("noise.csv")
 
 def main() -> None:
     """Fit, run what is not done, and write the table."""
-    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    options.add_argument("folder", type=Path)
-    options.add_argument("--worlds", type=int, default=60)
-    options.add_argument("--workers", type=int, default=2)
-    chosen = options.parse_args()
-    chosen.folder.mkdir(parents=True, exist_ok=True)
-    rows = []
+    chosen, rows = asked(__doc__), []
     with in_worlds(chosen.worlds, chosen.workers) as run:
         for level in LEVELS:
             path = chosen.folder / f"noise_{level}.parquet"

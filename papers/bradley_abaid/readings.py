@@ -40,13 +40,17 @@ from calibration import PAPER_FULL, SEED, Run, changed, fit_levels, in_worlds
 
 from pipistrelle.config import Config, Strategy
 from pipistrelle.detection.faces import Heard
+from pipistrelle.evaluation.accuracy import rmse
+from pipistrelle.evaluation.comparison import pooled_std
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
 from pipistrelle.experiments.runs.trial import drive_of, run_trial, scans_of
-from pipistrelle.report.claims.published import EXCLUDED, TABLE_II, WORLDS
+from pipistrelle.report.claims.published import EXCLUDED, FITTED, TABLE_II, WORLDS
 
 Change = dict[str, Any]
+Levels = tuple[str, ...]
+"""Of each factor, one."""
 Changing = Callable[[Sequence[Heard], int], Sequence[Heard]]
 """Takes what was heard in a world, and its number; returns what is to be mapped."""
 SNAPSHOTS: dict[str, Change] = {
@@ -79,8 +83,6 @@ PRUNES = tuple(float(f"{digit}e-{decade}") for decade in range(40, 1, -1) for di
 CASES_TRIED = {"ekf": 27 / 28, "fastslam": 31 / 67}
 """Worlds lost in one of these nine cases, of those lost in one of the study's 25: as the plan
 `physics` loses them among its 115. The paper's counts are scaled by it."""
-FITTED = {("total", 180), ("total", 0)}
-"""Rows of Table II that the levels are fitted to: what is seen is the same for both filters."""
 EXPECTED = {name: CASES_TRIED[name] * count / WORLDS for name, count in EXCLUDED.items()}
 """Share of worlds that the paper would lose in these cases."""
 DRAWS = 2000
@@ -89,22 +91,30 @@ OUTPUT = Path(__file__).with_name("readings.csv")
 
 def main() -> None:
     """Fit, run what is not done, and write the table."""
-    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    options.add_argument("folder", type=Path)
-    options.add_argument("--worlds", type=int, default=60)
-    options.add_argument("--workers", type=int, default=2)
-    chosen = options.parse_args()
-    chosen.folder.mkdir(parents=True, exist_ok=True)
+    chosen = asked(__doc__)
     with in_worlds(chosen.worlds, chosen.workers) as run:
         fits = fitted(chosen.folder / f"fits_{chosen.worlds}.json", run)
         run(partial(world_done, chosen.folder, fits))
     trials = pl.concat(
         pl.read_parquet(chosen.folder / f"world_{world}.parquet") for world in range(chosen.worlds)
     )
-    table = misfits(trials, fits)
+    readings = all_readings(trials)
+    values = drawn(readings, chosen.worlds)
+    table = misfits(readings, values, fits)
     write_table(table, "rays.prune", OUTPUT)
     with pl.Config(tbl_rows=-1, tbl_cols=-1, tbl_width_chars=200, float_precision=2):
-        print(table, main_effects(trials), sep="\n")
+        print(table, main_effects(list(readings), values), sep="\n")
+
+
+def asked(about: str) -> argparse.Namespace:
+    """Read the command line: a folder for what is done, made if it is not there; the worlds."""
+    options = argparse.ArgumentParser(description=about.splitlines()[0])
+    options.add_argument("folder", type=Path)
+    options.add_argument("--worlds", type=int, default=60)
+    options.add_argument("--workers", type=int, default=2)
+    chosen = options.parse_args()
+    chosen.folder.mkdir(parents=True, exist_ok=True)
+    return chosen
 
 
 def write_table(table: pl.DataFrame, tau: str, path: Path) -> None:
@@ -237,6 +247,7 @@ class Reading:
                 chosen = chosen.filter(pl.col(factor) == level)
         ekf = pl.col("filter") == "ekf"
         chosen = chosen.filter(ekf | (pl.col("weights") == levels["weights"]))
+        self.worlds = trials["world"].n_unique()
         self.columns = {
             (name, score): self._columns(chosen.filter(pl.col("filter") == name), score)
             for name in EXCLUDED
@@ -262,7 +273,7 @@ class Reading:
                 beam = round(printed.beamwidth)
                 case = ("fused" if beam else "passive", beam)
                 for score in ("full", "total"):
-                    if (score, beam) in FITTED or (name, score, beam) == ("ekf", "full", 0):
+                    if (name, score, printed.beamwidth) in FITTED:
                         continue
                     mean, sigma = getattr(printed, score)
                     off.append((self.columns[name, score][case][counted].mean() - mean) / sigma)
@@ -273,7 +284,9 @@ class Reading:
         gap = self.gap(rows)
         beyond = [max(gap[b] - 1.0, 0.0) if b >= 65 else max(1.0 - gap[b], 0.0) for b in BEAMS]
         return {
-            "landmarks": rms(off), "left_out": rms(shares), "gap": rms(beyond),
+            "landmarks": rmse(np.array(off)),
+            "left_out": rmse(np.array(shares)),
+            "gap": rmse(np.array(beyond)),
             **{f"left_out_{name}": share * WORLDS for name, share in lost.items()},
         }  # fmt: skip
 
@@ -284,22 +297,16 @@ class Reading:
         gaps = {}
         for beam in BEAMS:
             active = seen["active", beam][rows]
-            sigma = math.sqrt(0.5 * (passive.var(ddof=1) + active.var(ddof=1)))
-            gaps[beam] = float(passive.mean() - active.mean()) / sigma
+            gaps[beam] = float(passive.mean() - active.mean()) / pooled_std(passive, active)
         return gaps
-
-
-def rms(values: Sequence[float]) -> float:
-    """Root of the mean square."""
-    return math.sqrt(fmean(value * value for value in values))
 
 
 def misfit_of(parts: Mapping[str, float]) -> float:
     """Put the three parts together."""
-    return rms([parts["landmarks"], parts["left_out"], parts["gap"]])
+    return rmse(np.array([parts["landmarks"], parts["left_out"], parts["gap"]]))
 
 
-def all_readings(trials: pl.DataFrame) -> dict[tuple[str, ...], Reading]:
+def all_readings(trials: pl.DataFrame) -> dict[Levels, Reading]:
     """Lay out every combination."""
     return {
         levels: Reading(trials, dict(zip(FACTORS, levels, strict=True)))
@@ -307,23 +314,20 @@ def all_readings(trials: pl.DataFrame) -> dict[tuple[str, ...], Reading]:
     }
 
 
-def drawn(trials: pl.DataFrame) -> tuple[list[tuple[str, ...]], np.ndarray]:
+def drawn(readings: Mapping[Levels, Reading], worlds: int) -> np.ndarray:
     """Misfits of all combinations (draws, combinations): of all worlds first, then by bootstrap."""
-    readings, worlds = all_readings(trials), trials["world"].n_unique()
     rng = np.random.default_rng(12)
     draws = [np.arange(worlds), *rng.integers(0, worlds, (DRAWS, worlds))]
-    values = [[misfit_of(reading.parts(rows)) for reading in readings.values()] for rows in draws]
-    return list(readings), np.array(values)
+    return np.array([[misfit_of(r.parts(rows)) for r in readings.values()] for rows in draws])
 
 
-def misfits(trials: pl.DataFrame, fits: Mapping[str, Change]) -> pl.DataFrame:
+def misfits(
+    readings: Mapping[Levels, Reading], values: np.ndarray, fits: Mapping[str, Change]
+) -> pl.DataFrame:
     """Table of all combinations: what was fitted, what was found, the misfit; the least first."""
-    names, values = drawn(trials)
-    readings, rows = all_readings(trials), np.arange(trials["world"].n_unique())
-    best = int(values[0].argmin())
-    table = []
-    for i, levels in enumerate(names):
-        reading = readings[levels]
+    best, table = int(values[0].argmin()), []
+    for i, (levels, reading) in enumerate(readings.items()):
+        rows = np.arange(reading.worlds)
         table.append(
             {
                 **dict(zip(FACTORS, levels, strict=True)),
@@ -339,9 +343,8 @@ def misfits(trials: pl.DataFrame, fits: Mapping[str, Change]) -> pl.DataFrame:
     return pl.DataFrame(table).sort("misfit")
 
 
-def main_effects(trials: pl.DataFrame) -> pl.DataFrame:
+def main_effects(names: Sequence[Levels], values: np.ndarray) -> pl.DataFrame:
     """How far each level's mean misfit lies from the mean of all, with its standard error."""
-    names, values = drawn(trials)
     rows = []
     for place, (factor, levels) in enumerate(FACTORS.items()):
         for level in levels:

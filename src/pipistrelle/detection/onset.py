@@ -9,7 +9,7 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 
 
 @no_alloc
-def _steer(
+def steer(
     matched: Complex[np.ndarray, "l f c e"],
     low: Whole,
     lags: Whole,
@@ -80,7 +80,7 @@ def arrival_lag(
     reach, last = reach_of(pulse), matched.shape[0] - 1
     low, high = max(b - reach, 0), min(b + reach, last)
     first = max(low - 1, 0)
-    _steer(matched, first, min(high + 1, last) - first + 1, f, p, u, beam)
+    steer(matched, first, min(high + 1, last) - first + 1, f, p, u, beam)
     centre, largest = b, -1.0
     for near in range(low, high + 1):
         z = abs(beam[near - first])

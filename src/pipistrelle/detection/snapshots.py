@@ -26,7 +26,7 @@ from jaxtyping import Complex, Float, Int, Shaped
 
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config, InputError
-from pipistrelle.detection.onset import arrival_lag, reach_of
+from pipistrelle.detection.onset import arrival_lag, reach_of, steer
 from pipistrelle.geometry import wrap
 from pipistrelle.jit import Whole, kernel, no_alloc
 
@@ -395,17 +395,18 @@ def _loudest_lag(
     f: Whole,
     p: Whole,
     u: float,
+    beam: Complex[np.ndarray, " r"],
 ) -> tuple[Whole, float]:
-    """Lag, of those from the first to before the last, loudest in the beam steered to u; power."""
-    turn, loudest, highest = complex(math.cos(u), -math.sin(u)), lags[0], -1.0
-    for b in range(lags[0], lags[1]):
-        x, beam, phase = matched[b, f, p], 0.0 + 0.0j, 1.0 + 0.0j
-        for e in range(x.size):
-            beam += x[e] * phase
-            phase *= turn
-        power = beam.real * beam.real + beam.imag * beam.imag
+    """Lag, of those from the first to before the last, loudest in the beam steered to u; power.
+
+    ``beam`` is room for so many lags.
+    """
+    loudest, highest = lags[0], -1.0
+    steer(matched, lags[0], lags[1] - lags[0], f, p, u, beam)
+    for k in range(lags[1] - lags[0]):
+        power = beam[k].real * beam[k].real + beam[k].imag * beam[k].imag
         if power > highest:
-            loudest, highest = b, power
+            loudest, highest = lags[0] + k, power
     return loudest, highest
 
 
@@ -461,7 +462,8 @@ def _find_peaks(
     face, tone = np.empty(128, dtype=np.int64), np.empty(128, dtype=np.int64)
     delay, sine, peak_power = np.empty(128), np.empty(128), np.empty(128)
     power, place = np.empty(scan.shape[1]), np.empty(scan.shape[1], dtype=np.int64)
-    beam = np.empty(2 * reach_of(pulse) + 3, dtype=np.complex128)
+    room = 2 * reach_of(pulse) + 3
+    beam = np.empty(max(room, matched.shape[0]) if rule.runs else room, dtype=np.complex128)
     row, count = faces * tones, 0
     for test in _candidates(energy, rule.threshold, row if pulse > 1 else energy.size):
         within = _snapshot(energy, test, row, tones, pulse, rule.runs, rule.threshold, rule.leakage)
@@ -478,7 +480,7 @@ def _find_peaks(
                 continue
             b, top = within[0], power[i] + 0.125 * slope * slope / bend
             if rule.runs:
-                b, top = _loudest_lag(matched, within, f, p, u)
+                b, top = _loudest_lag(matched, within, f, p, u, beam)
                 if _is_leakage(energy, b * row + test % row, row, tones, pulse, rule.leakage):
                     continue
             if count == face.size:

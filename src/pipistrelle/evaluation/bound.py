@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 
 from pipistrelle.detection.scans import BEARING_STD, NUMBERS, RANGE, RANGE_STD, Scan
 from pipistrelle.estimation.ekf.gaussian import (
+    Joint,
     correct_active,
     correct_bearing,
     flush,
@@ -26,7 +27,7 @@ from pipistrelle.estimation.ekf.gaussian import (
 )
 from pipistrelle.estimation.measurement import NEAREST, observe
 from pipistrelle.estimation.motion import Motion, MotionNumbers, motion_numbers
-from pipistrelle.jit import kernel
+from pipistrelle.jit import Whole, kernel, no_alloc
 
 PRIOR_STD = 20.0
 """Of a landmark before it is heard [m]."""
@@ -97,6 +98,20 @@ def pose_bound(
     )
 
 
+@no_alloc
+def _correct(
+    joint: Joint, size: Whole, i: Whole, numbers: Float[np.ndarray, "7 m"], m: Whole
+) -> None:
+    """Correct with measurement m as if it had been what the state at index i makes expect."""
+    mean, across = joint.mean, numbers[BEARING_STD, m] ** 2
+    near, angle, _, _, _ = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
+    if near >= NEAREST and not math.isnan(numbers[RANGE, m]):
+        along = numbers[RANGE_STD, m] ** 2
+        correct_active(joint, size, i, near, angle, along, across, np.inf)
+    elif near >= NEAREST:
+        correct_bearing(joint, size, i, angle, across, np.inf)
+
+
 @kernel
 def _bound(
     path: Float[np.ndarray, "t 3"],
@@ -118,29 +133,25 @@ def _bound(
     joint.W[:] = 0.0  # the state grows into columns that wait
     bound = np.zeros((path.shape[0], 3, 3))
     steps, slots = row
+    stepped, spread = np.empty((1, 3)), np.empty((1, 3, 3))
     for k in range(1, path.shape[0]):
         for a in range(3):
             joint.mean[a] = path[k - 1, a]
         propagate(
             joint.mean, joint.covariance, controls[k - 1 : k], dt[k - 1 : k], motion,
-            np.empty((1, 3)), np.empty((1, 3, 3)),
+            stepped, spread,
         )  # fmt: skip
         for a in range(3):
             joint.mean[a] = path[k, a]
         while m < steps.size and steps[m] <= k:
-            i, mean = 3 + 2 * slots[m], joint.mean
+            i = 3 + 2 * slots[m]
             if i == size:
                 flush(joint, size)
                 size += 2
-            near, angle, _, _, _ = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
-            across = numbers[BEARING_STD, m] ** 2
-            if near >= NEAREST and not math.isnan(numbers[RANGE, m]):
-                along = numbers[RANGE_STD, m] ** 2
-                correct_active(joint, size, i, near, angle, along, across, np.inf)
-            elif near >= NEAREST:
-                correct_bearing(joint, size, i, angle, across, np.inf)
+            _correct(joint, size, i, numbers, m)
             m += 1
-        flush(joint, size)
+        if joint.waiting[0] > 0:
+            flush(joint, size)
         for a in range(3):
             for b in range(3):
                 bound[k, a, b] = joint.covariance[a, b]

@@ -226,9 +226,8 @@ def position_floor(drive: Drive, scans: Sequence[Scan]) -> float | None:
     lost, was = reckoned[first], true[first]
     if heard and not np.isfinite(was).all():
         return None
-    turn = lost[2] - was[2]
-    x, y = moved(was[np.newaxis, :2], np.array([0.0, 0.0, turn]))[0]
-    after = moved(true[first:, :2], np.array([lost[0] - x, lost[1] - y, turn]))
+    turned = np.array([lost[0], lost[1], lost[2] - was[2]])
+    after = moved(true[first:, :2] - was[:2], turned)
     error = position_error(np.concatenate([np.array(reckoned)[:first, :2], after]), true[:, :2])[1:]
     known = error[np.isfinite(error)]
     return rmse(known) if known.size else None

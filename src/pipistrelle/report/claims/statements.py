@@ -80,15 +80,14 @@ def counts_as_printed(selection: Selection) -> list[Part]:
     Bradley & Abaid, Table II.
     """
     parts = []
-    for kind, score in (("Fully initialised", "landmarks_full"), ("Total", "landmarks_total")):
+    for kind, counted in (("Fully initialised", "full"), ("Total", "total")):
         statements = []
         for row in TABLE_II:
             if (cell := cell_of(selection.study, row)) is None:
                 continue
-            printed, sigma = row.full if score == "landmarks_full" else row.total
-            (count,) = samples(selection, score, [cell])
+            printed, sigma = getattr(row, counted)
+            (count,) = samples(selection, f"landmarks_{counted}", [cell])
             label = f"{FILTERS[row.filter]}, {row_name(row)}"
-            kind_of = score.removeprefix("landmarks_")
             statements.append(
                 Statement(
                     label=label,
@@ -96,7 +95,7 @@ def counts_as_printed(selection: Selection) -> list[Part]:
                     relation="within",
                     margin=sigma,
                     sigma=sigma,
-                    fitted=(row.filter, kind_of, row.beamwidth) in FITTED,
+                    fitted=(row.filter, counted, row.beamwidth) in FITTED,
                 )
             )
         sentence = f"{kind}: our mean minus the paper's lies within the paper's σ"
