@@ -365,9 +365,9 @@ def _consistent(scans: Sequence[Scan], scenario: Scenario, config: Config) -> Fr
     bound = pose_bound(
         drive.motion, drive.controls, drive.time, scenario.path, standing_landmarks(scenario), scans
     )
-    frames = slice(every, None, every)
-    expected = nees_of_exact_start(bound, scenario.path, drive.start.covariance)
-    return np.column_stack([column[frames] for column in expected]).astype(np.float32)
+    frames = slice(None, None, every)
+    expected = nees_of_exact_start(bound[frames], scenario.path[frames], drive.start.covariance)
+    return np.column_stack(expected)[1:].astype(np.float32)
 
 
 def _failed(case: PlannedCase, error: str) -> TrialRecord:
