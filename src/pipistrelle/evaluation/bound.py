@@ -210,7 +210,10 @@ def nees_of_exact_start(
     G[:, 0, 2] = path[0, 1] - path[:, 1]
     G[:, 1, 2] = path[:, 0] - path[0, 0]
     total = bound + G @ start_covariance @ np.swapaxes(G, 1, 2)
-    share = np.linalg.pinv(total, hermitian=True) @ bound
+    if np.linalg.eigvalsh(start_covariance)[0] > 0.0:
+        share = np.linalg.inv(total) @ bound
+    else:  # the first step's noise has rank 2
+        share = np.linalg.pinv(total, hermitian=True) @ bound
     mean = np.trace(share, axis1=1, axis2=2)
     variance = 2.0 * np.trace(share @ share, axis1=1, axis2=2)
     return mean, variance
