@@ -59,18 +59,31 @@ def main() -> None:
     """Fit, write and print."""
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("plan", choices=PLANS)
-    options.add_argument("--worlds", type=int, default=100)
-    options.add_argument("--workers", type=int, default=2)
-    options.add_argument("--output", type=Path)
+    options.add_argument("--worlds", type=at_least(2), default=100, help="how many [%(default)s]")
+    options.add_argument("--workers", type=at_least(1), default=2, help="processes [%(default)s]")
+    options.add_argument("--output", type=Path, help="file [beside the plan]")
     chosen = options.parse_args()
+    output = chosen.output or STUDIES / f"{chosen.plan}_calibration.toml"
+    if output.is_dir() or not output.parent.is_dir():
+        options.error(f"--output: {output} cannot be a file; name one in a folder that there is")
     readings = read_plan(find_plan(chosen.plan)).config.model_copy(update={"seed": SEED})
     with in_worlds(chosen.worlds, chosen.workers) as run:
         config, seen = fit_levels(readings, run)
         rays = fit_rays(config, run)
     text = tomli_w.dumps(summary(config, seen, rays))
-    output = chosen.output or STUDIES / f"{chosen.plan}_calibration.toml"
     output.write_text(f"# Written by papers/bradley_abaid/calibration.py {chosen.plan}\n\n{text}")
     print(text)
+
+
+def at_least(least: int) -> Callable[[str], int]:
+    """Return what reads a whole number that is not less."""
+
+    def number(text: str) -> int:
+        if (found := int(text)) < least:
+            raise argparse.ArgumentTypeError(f"found {found}, expected at least {least}")
+        return found
+
+    return number
 
 
 @contextmanager

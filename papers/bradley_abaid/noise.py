@@ -6,7 +6,8 @@ White noise is added to what is heard, to each tone by itself: 0.05, 0.10 and 0.
 0.2 m to ranges, as much as the filters are told at most. Levels are the study's, tau is fitted anew
 to the paper's count of landmarks that passive EKF-SLAM places. Written as ``noise.csv`` beside this
 file: landmarks placed, position errors and what fused sensing gains on active, with its standard
-error over the worlds, everything counted, and the worlds that a filter loses.
+error over the worlds, everything counted, and the worlds that a filter loses. With other than 60
+worlds the table goes into FOLDER.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,7 +20,17 @@ from typing import Any
 import numpy as np
 import polars as pl
 from calibration import Run, changed, in_worlds
-from readings import BEAMS, CASES, asked, fit_tau, settings, write_table
+from readings import (
+    BEAMS,
+    CASES,
+    asked,
+    fit_tau,
+    keep,
+    published,
+    read_kept,
+    settings,
+    write_table,
+)
 
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import Config
@@ -45,12 +56,12 @@ def main() -> None:
     chosen, rows = asked(__doc__), []
     with in_worlds(chosen.worlds, chosen.workers) as run:
         for level in LEVELS:
-            path = chosen.folder / f"noise_{level}.parquet"
+            path = chosen.folder / f"noise_{level}_{chosen.worlds}.parquet"
             if not path.exists():
-                tried(level, run).write_parquet(path)
-            rows.append(row(level, pl.read_parquet(path)))
+                keep(tried(level, run), path)
+            rows.append(row(level, read_kept(path)))
             print(rows[-1], flush=True)
-    write_table(pl.DataFrame(rows), "tau", OUTPUT)
+    write_table(pl.DataFrame(rows), published(OUTPUT, chosen), "tau")
 
 
 def tried(level: float, run: Run) -> pl.DataFrame:

@@ -88,6 +88,17 @@ def test_the_misfits_stand_as_the_experiment_found_them():
     )
 
 
+def test_the_misfits_of_the_studies_stand_as_they_were_measured():
+    with (PAPER / "held_out.csv").open(encoding="utf-8") as file:
+        table = {row["study"]: row for row in csv.DictReader(file)}
+    assert list(table) == ["paper", "physics", "runs", "off_axis"]
+    for row in table.values():
+        assert f"{float(row['misfit']):.2f} ± {float(row['standard_error']):.2f}" in findings()
+    physics = table["physics"]
+    words = f"{float(physics['above_first']):.2f} ± {float(physics['above_first_error']):.2f} more"
+    assert words in findings()
+
+
 def test_the_noise_table_stands_as_the_experiment_found_it():
     with (PAPER / "noise.csv").open(encoding="utf-8") as file:
         table = list(csv.DictReader(file))
