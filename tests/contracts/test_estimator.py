@@ -13,6 +13,7 @@ from pipistrelle.detection.scans import Scan, with_columns
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.ekf.filter import EkfSlam
+from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
 from pipistrelle.estimation.fastslam.filter import FastSlam
 from pipistrelle.estimation.motion import Motion, motion_jacobians, motion_step
 from pipistrelle.experiments.drives import Drive
@@ -264,6 +265,12 @@ class TestEkfSlam(EstimatorContract):
     @pytest.fixture
     def slam(self):
         return EkfSlam(motion=BICYCLE, rays=ray_config())
+
+
+class TestInvariantEkfSlam(EstimatorContract):
+    @pytest.fixture
+    def slam(self):
+        return InvariantEkfSlam(motion=BICYCLE, rays=ray_config())
 
 
 class TestFastSlam(EstimatorContract):

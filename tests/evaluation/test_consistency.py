@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.linalg import expm
 
+from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.evaluation.consistency import (
     anees,
     anees_bounds,
@@ -91,7 +93,8 @@ BROKEN = np.diag([1.0, np.nan, 1.0])
 def of_ones(*covariances):
     """Return the NEES of a track that is off by one in all states."""
     k = len(covariances)
-    return track_nees(np.ones((k, 3)), np.stack(covariances), np.zeros((k, 3)))
+    pose = Gaussian(mean=np.ones((k, 3)), covariance=np.stack(covariances))
+    return track_nees(pose, np.zeros((k, 3)))
 
 
 def test_after_an_exact_start_there_is_no_nees_until_the_covariance_is_positive_definite():
@@ -120,7 +123,9 @@ def test_an_uncertain_start_has_the_nees_of_its_poses_bit_for_bit():
     P = covariances(rng, 50)
     error = draws(rng, P) * [1.0, 1.0, 0.01]
     P[30] = ONE_STEP
-    assert (track_nees(error, P, np.zeros_like(error)) == nees(error, P)).all()
+    assert (
+        track_nees(Gaussian(mean=error, covariance=P), np.zeros_like(error)) == nees(error, P)
+    ).all()
 
 
 @given(SEED)
@@ -133,7 +138,33 @@ def test_the_nees_of_a_track_forgets_whole_turns_of_the_heading(seed):
     wound = true + error + np.column_stack([0.0 * turns, 0.0 * turns, turns])
     worst = np.linalg.cond(P).max()
     expected = pytest.approx(nees(error, P), rel=1e-13 * worst, abs=1e-9)
-    assert track_nees(wound, P, true) == expected
+    assert track_nees(Gaussian(mean=wound, covariance=P), true) == expected
+
+
+def test_the_nees_of_an_invariant_error_is_chi_square_however_far_the_turn_carries_a_pose():
+    """Truths are drawn as exp(xi) times a pose 30 m from the start, unsure by 0.3 rad."""
+    rng, runs = np.random.default_rng(5), 4000
+    P = np.diag([0.2**2, 0.1**2, 0.3**2])
+    xi = rng.multivariate_normal(np.zeros(3), P, runs)
+    truth, T = [], np.array([[1.0, 0, 0], [0, 1, -30.0], [0, 0, 1]])  # of (30, 0)
+    for x, y, turn in xi:
+        lie = expm(np.array([[0, -turn, x], [turn, 0, y], [0, 0, 0]]))
+        truth.append([*(lie @ [30.0, 0.0, 1.0])[:2], 0.4 + turn])
+    back = np.linalg.inv(T)
+    mean = np.tile([30.0, 0.0, 0.4], (runs, 1))
+    covariance = np.tile(back @ P @ back.T, (runs, 1, 1))
+
+    def mean_nees(invariant):
+        start = {"mean": np.zeros((1, 3)), "covariance": np.eye(3)[None]}
+        parts = {
+            name: np.concatenate([start[name], part])
+            for name, part in (("mean", mean), ("covariance", covariance))
+        }
+        true = np.concatenate([np.zeros((1, 3)), truth])
+        return track_nees(Gaussian(**parts, invariant=invariant), true)[1:].mean()
+
+    assert mean_nees(invariant=True) == pytest.approx(3.0, abs=4 * np.sqrt(6 / runs))
+    assert mean_nees(invariant=False) > 100
 
 
 def test_there_is_no_nees_without_truth_and_an_infinite_one_of_a_lost_estimate():
@@ -141,7 +172,9 @@ def test_there_is_no_nees_without_truth_and_an_infinite_one_of_a_lost_estimate()
     true[1:3] = np.nan
     mean[2:] = np.nan
     P = np.tile(np.eye(3), (4, 1, 1))
-    np.testing.assert_array_equal(track_nees(mean, P, true), [3.0, np.nan, np.nan, np.inf])
+    np.testing.assert_array_equal(
+        track_nees(Gaussian(mean=mean, covariance=P), true), [3.0, np.nan, np.nan, np.inf]
+    )
 
 
 def test_the_nees_of_a_consistent_filter_averages_to_three_and_of_an_overconfident_one_to_more():

@@ -17,10 +17,14 @@ class Gaussian:
     ----------
     mean : (*n, d)
     covariance : (*n, d, d)
+        Of true value minus mean; to first order, where that is not what is normal.
+    invariant : bool
+        Of poses: whether the right-invariant error is normal (`estimation.ekf.invariant`).
     """
 
     mean: Float[np.ndarray, "*n d"]
     covariance: Float[np.ndarray, "*n d d"]
+    invariant: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

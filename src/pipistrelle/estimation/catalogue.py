@@ -127,7 +127,8 @@ def check_name(name: str) -> str:
     --------
     >>> check_name("ukf")
     Traceback (most recent call last):
-    pipistrelle.config.InputError: filter: found 'ukf', expected one of ekf, fastslam, module:Class
+    pipistrelle.config.InputError: filter: found 'ukf', expected one of ekf, fastslam, iekf,
+    module:Class
     """
     module, colon, kind = name.partition(":")
     dotted = all(part.isidentifier() for part in module.split("."))
@@ -214,6 +215,13 @@ def _ekf(config: Config, motion: "Motion") -> "Estimator":
     return EkfSlam(motion=motion, rays=config.rays, gate=config.filter.gate)
 
 
+def _iekf(config: Config, motion: "Motion") -> "Estimator":
+    """Build right-invariant EKF-SLAM."""
+    from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
+
+    return InvariantEkfSlam(motion=motion, rays=config.rays, gate=config.filter.gate)
+
+
 def _ekf_bytes(landmarks: int, members: int, _: Config) -> float:
     """Count the covariances: the one before, the one at work, the one after."""
     return 3.0 * DOUBLE * (3 + 2 * landmarks * members) ** 2
@@ -251,6 +259,14 @@ CATALOGUE = {
             sections=("filter", "rays", "fastslam"),
             nees_limit=2750.0,
             memory=_fastslam_bytes,
+        ),
+        Entry(
+            name="iekf",
+            title="invariant EKF",
+            build=_iekf,
+            sections=("filter", "rays"),
+            nees_limit=50.0,
+            memory=_ekf_bytes,
         ),
     )
 }

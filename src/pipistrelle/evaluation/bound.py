@@ -18,6 +18,8 @@ from jaxtyping import Float, Int
 
 from pipistrelle.detection.scans import BEARING_STD, NUMBERS, RANGE, RANGE_STD, Scan
 from pipistrelle.estimation.ekf.gaussian import (
+    LINEAR,
+    WAITING,
     Joint,
     correct_active,
     correct_bearing,
@@ -129,7 +131,7 @@ def _bound(
         for a in range(2):
             mean[3 + 2 * n + a] = places[n, a]
             prior[3 + 2 * n + a, 3 + 2 * n + a] = PRIOR_STD * PRIOR_STD
-    joint, size, m = joint_of(mean, prior, room), 3, 0
+    joint, size, m = joint_of(mean, prior, room, LINEAR), 3, 0
     joint.W[:] = 0.0  # the state grows into columns that wait
     bound = np.zeros((path.shape[0], 3, 3))
     steps, slots = row
@@ -150,7 +152,7 @@ def _bound(
                 size += 2
             _correct(joint, size, i, numbers, m)
             m += 1
-        if joint.waiting[0] > 0:
+        if joint.taken[WAITING] > 0:
             flush(joint, size)
         for a in range(3):
             for b in range(3):

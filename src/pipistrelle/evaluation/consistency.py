@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
+from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.evaluation.accuracy import pose_error
 
 
@@ -65,11 +66,7 @@ def _eliminated(
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def track_nees(
-    mean: Float[np.ndarray, "k 3"],
-    covariance: Float[np.ndarray, "k 3 3"],
-    true: Float[np.ndarray, "k 3"],
-) -> Float[np.ndarray, " k"]:
+def track_nees(pose: Gaussian, true: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
     """NEES of each pose of a track, NaN where there is none to speak of.
 
     After an exact start the noise of the first control step, of rank 2, leaves the covariance
@@ -77,8 +74,8 @@ def track_nees(
 
     Parameters
     ----------
-    mean : (k, 3) [m, m, rad]
-    covariance : (k, 3, 3) [m, rad, squared]
+    pose : Gaussian of (k, 3) and (k, 3, 3) [m, m, rad]
+        Where it is ``invariant``, the error is the right-invariant one about the first position.
     true : (k, 3) [m, m, rad]
         NaN where it is not known.
 
@@ -96,13 +93,35 @@ def track_nees(
     Examples
     --------
     >>> exact_start = np.stack([np.zeros((3, 3)), np.diag([1.0, 0.0, 1.0]), np.eye(3)])
-    >>> track_nees(np.ones((3, 3)), exact_start, np.zeros((3, 3)))
+    >>> track_nees(Gaussian(mean=np.ones((3, 3)), covariance=exact_start), np.zeros((3, 3)))
     array([nan, nan,  3.])
     """
-    epsilon, definite = _eliminated(pose_error(mean, true), covariance)
+    error, covariance = pose_error(pose.mean, true), pose.covariance
+    if pose.invariant:
+        error, covariance = _right_invariant(pose, error)
+    epsilon, definite = _eliminated(error, covariance)
     begun = np.logical_or.accumulate(definite)
     exact = ~begun & definite.any() & np.isfinite(covariance).all(axis=(1, 2))
     return np.where(exact | ~np.isfinite(true).all(axis=1), np.nan, epsilon)
+
+
+def _right_invariant(
+    pose: Gaussian, error: Float[np.ndarray, "k 3"]
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3 3"]]:
+    r"""Turn linear errors and their covariances into right-invariant ones about the first position.
+
+    With positions from there, :math:`\hat p = R(\xi_\theta) p + V(\xi_\theta) \xi_p`; the error
+    that takes the estimate to the truth, as the filter has it, is the negative one.
+    """
+    shift, turn = pose.mean[:, :2] - pose.mean[0, :2], error[:, 2]
+    true_x, true_y = (shift - error[:, :2]).T
+    c, s, half = np.cos(turn), np.sin(turn), 0.5 * turn
+    x, y = shift[:, 0] - c * true_x + s * true_y, shift[:, 1] - s * true_x - c * true_y
+    along = np.where(np.abs(half) > 1e-4, half / np.tan(np.where(half == 0.0, 1.0, half)), 1.0)
+    xi = np.column_stack([along * x + half * y, along * y - half * x, turn])
+    T = np.tile(np.eye(3), (len(turn), 1, 1))
+    T[:, 0, 2], T[:, 1, 2] = shift[:, 1], -shift[:, 0]
+    return xi, T @ pose.covariance @ np.swapaxes(T, 1, 2)
 
 
 def anees(nees: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " k"]:

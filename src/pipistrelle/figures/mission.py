@@ -278,7 +278,7 @@ def _draw_errors(rows: Sequence["Axes"], trial: TrialResult, true_path: np.ndarr
     heading.fill_between(elapsed, -bound, bound, color=colour, alpha=0.16, lw=0)
     heading.plot(elapsed, turn, color=colour, lw=1.1)
     consistency.axhspan(*anees_bounds(1), color="#d9d9d9", alpha=0.6, lw=0)
-    epsilon = track_nees(track.pose.mean, covariance, true_path)
+    epsilon = track_nees(track.pose, true_path)
     consistency.plot(elapsed, epsilon, color=colour, lw=0.9)
     consistency.set(yscale="log", xlabel="time [s]", xlim=(0.0, elapsed[-1]))
     for axes in (position, heading):

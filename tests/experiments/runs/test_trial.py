@@ -79,7 +79,7 @@ def test_fused_hears_what_active_or_passive_hear_in_every_frame_of_a_mission():
 
 
 def test_an_unknown_filter_is_refused_by_name():
-    with pytest.raises(InputError, match="found 'ukf', expected one of ekf, fastslam"):
+    with pytest.raises(InputError, match="found 'ukf', expected one of ekf, fastslam, iekf"):
         run_mission(SHORT, ("fused",), ("ukf",))
 
 

@@ -74,9 +74,12 @@ def test_the_papers_radii_are_those_that_its_appendix_lists_beamwidths_for():
 @pytest.mark.parametrize(
     ("filters", "said"),
     [
-        ('["ukf"]', "filters.0: found 'ukf', expected 'ekf', 'fastslam' or module:Class"),
-        ("[3]", "filters.0: found 3, expected 'ekf', 'fastslam' or module:Class"),
-        ('["ekf", "a.b:"]', "filters.1: found 'a.b:', expected 'ekf', 'fastslam' or module:Class"),
+        ('["ukf"]', "filters.0: found 'ukf', expected 'ekf', 'fastslam', 'iekf' or module:Class"),
+        ("[3]", "filters.0: found 3, expected 'ekf', 'fastslam', 'iekf' or module:Class"),
+        (
+            '["ekf", "a.b:"]',
+            "filters.1: found 'a.b:', expected 'ekf', 'fastslam', 'iekf' or module:Class",
+        ),
         ('["a:B", "c:B"]', "filters: a:B and c:B would write the same files"),
         ('["a:B", "a:B"]', "filters: found 'a:B' twice"),
     ],

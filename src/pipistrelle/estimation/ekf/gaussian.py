@@ -9,6 +9,18 @@ them. So the columns of W wait: a point's rows have them subtracted when they ar
 others catch up together, many columns in one pass over memory. Every number is subtracted in the
 order of the measurements, as if each had been taken off at once. ``size`` is the length of the
 state in arrays that may be longer, ``i`` the state index of a point.
+
+The covariance is that of one of two errors. The *linear* error is true state minus mean. In the
+*right-invariant* error :math:`\xi` the truth is the mean moved by one rigid motion, and each
+position shifted besides,
+
+.. math:: \theta = \hat\theta + \xi_\theta, \quad
+          p = R(\xi_\theta)\,\hat p + V(\xi_\theta)\,\xi_p, \quad
+          l = R(\xi_\theta)\,\hat l + V(\xi_\theta)\,\xi_l
+
+with V the integral of the rotation. An error of heading turns vehicle and landmarks alike, so what
+is measured from one to the other does not hang on it: it has no column in H, and ``turns`` is 0,
+which is 1 for the linear error.
 """
 
 import math
@@ -23,9 +35,12 @@ from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 GATED, APPLIED = 1, 0
+LINEAR, INVARIANT = 1.0, 0.0
+"""How much an error of heading turns what is measured, by the error whose covariance is kept."""
 LANE = 8
 """Doubles in a cache line: rows of a multiple of it all begin on one."""
-MOST_WAITING = 32
+MOST_WAITING, WAITING = 32, 0
+"""How many columns may wait, and where ``taken`` has how many do: the pose has taken all."""
 
 
 class Joint(NamedTuple):
@@ -36,18 +51,20 @@ class Joint(NamedTuple):
     mean : (n)
     covariance : (n, m)
         Columns beyond n fill the last cache line. Rows i and i + 1 of a point lack the columns of
-        W from ``taken[i]`` to ``waiting[0]``, those of the pose none.
+        W from ``taken[i]`` to ``taken[WAITING]``, those of the pose none.
     W : (w, m)
         The columns that wait, a row each.
     taken : (n)
-    waiting : (1)
+        One array with the number that waits: a kernel is handed a record by its width.
+    turns : float
+        LINEAR or INVARIANT.
     """
 
     mean: Float[np.ndarray, " n"]
     covariance: Float[np.ndarray, "n m"]
     W: Float[np.ndarray, "w m"]
     taken: Int[np.ndarray, " n"]
-    waiting: Int[np.ndarray, "1"]
+    turns: float
 
 
 class State(NamedTuple):
@@ -86,7 +103,7 @@ def _on_cache_lines(rows: Whole, width: Whole) -> Float[np.ndarray, "rows width"
 
 @kernel
 def joint_of(
-    mean: Float[np.ndarray, " d"], covariance: Float[np.ndarray, "d d"], room: Whole
+    mean: Float[np.ndarray, " d"], covariance: Float[np.ndarray, "d d"], room: Whole, turns: float
 ) -> Joint:
     """Copy a mean (d) and a covariance (d, d) into a `Joint` with room for so many numbers."""
     size, width = mean.size, _lanes(mean.size)
@@ -101,7 +118,7 @@ def joint_of(
             wider[a, b] = 0.0
         for k in range(MOST_WAITING):
             W[k, b] = 0.0
-    return Joint(longer, wider, W, np.zeros(room, np.int64), np.zeros(1, np.int64))
+    return Joint(longer, wider, W, np.zeros(room, np.int64), turns)
 
 
 @kernel
@@ -123,7 +140,7 @@ def _point_rows(
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Rows i and i + 1 of the covariance, with all that waits subtracted from them."""
     pi, pj, W = joint.covariance[i], joint.covariance[i + 1], joint.W
-    first, last, width = joint.taken[i], joint.waiting[0], _lanes(size)
+    first, last, width = joint.taken[i], joint.taken[WAITING], _lanes(size)
     joint.taken[i] = last
     fours = first + (last - first) // 4 * 4
     for k in range(first, fours, 4):
@@ -151,7 +168,7 @@ def flush(joint: Joint, size: Whole) -> None:
         joint.taken[i] = 0
         for b in range(i):
             covariance[b, i], covariance[b, i + 1] = pi[b], pj[b]
-    joint.waiting[0] = 0
+    joint.taken[WAITING] = 0
 
 
 @no_alloc
@@ -164,7 +181,32 @@ def _defer(joint: Joint, size: Whole, w: Float[np.ndarray, " m"], step: float) -
         p0[a] -= x * w[a]
         p1[a] -= y * w[a]
         p2[a] -= h * w[a]
-    joint.waiting[0] += 1
+    joint.taken[WAITING] += 1
+
+
+@no_alloc
+def _retract(
+    mean: Float[np.ndarray, " n"],
+    size: Whole,
+    w0: Float[np.ndarray, " m"],
+    e0: float,
+    w1: Float[np.ndarray, " m"],
+    e1: float,
+) -> None:
+    """Move the mean by the exponential of the invariant error e0 w0 + e1 w1."""
+    turn = e0 * w0[2] + e1 * w1[2]
+    c, s = math.cos(turn), math.sin(turn)
+    if abs(turn) < 1e-4:
+        along, across = 1.0 - turn * turn / 6.0, 0.5 * turn
+    else:
+        along, across = s / turn, (1.0 - c) / turn
+    for point in range((size - 1) // 2):
+        i = 0 if point == 0 else 2 * point + 1
+        x, y = mean[i], mean[i + 1]
+        u, v = e0 * w0[i] + e1 * w1[i], e0 * w0[i + 1] + e1 * w1[i + 1]
+        mean[i] = c * x - s * y + along * u - across * v
+        mean[i + 1] = s * x + c * y + across * u + along * v
+    mean[2] += turn
 
 
 @kernel
@@ -201,7 +243,7 @@ def propagate(
 @no_alloc
 def bearing_variance(joint: Joint, size: Whole, i: Whole, c: float, s: float, k: float) -> float:
     """Innovation variance H P H^T of the bearing of the member at state index i, without R."""
-    h0, h1 = s * k, -c * k  # by pose: (h0, h1, -1); by member: (-h0, -h1)
+    h0, h1, turns = s * k, -c * k, joint.turns  # by pose: (h0, h1, -turns); by member: (-h0, -h1)
     p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
     pi, pj = _point_rows(joint, size, i)
     pxx = p0[0] - 2.0 * p0[i] + pi[i]
@@ -211,7 +253,7 @@ def bearing_variance(joint: Joint, size: Whole, i: Whole, c: float, s: float, k:
     pyh = p1[2] - p2[i + 1]
     return (
         h0 * h0 * pxx + 2.0 * h0 * h1 * pxy + h1 * h1 * pyy
-        - 2.0 * (h0 * pxh + h1 * pyh) + p2[2]
+        - turns * 2.0 * (h0 * pxh + h1 * pyh) + turns * p2[2]
     )  # fmt: skip
 
 
@@ -224,22 +266,25 @@ def correct_bearing(
     distance, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     if distance < NEAREST:
         return APPLIED
-    if joint.waiting[0] == MOST_WAITING:
+    if joint.taken[WAITING] == MOST_WAITING:
         flush(joint, size)
     innovation = wrap_angle(bearing - expected)
-    h0, h1 = s * k, -c * k
+    h0, h1, turns = s * k, -c * k, joint.turns
     p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
     pi, pj = _point_rows(joint, size, i)
-    w0 = joint.W[joint.waiting[0]]
+    w0 = joint.W[joint.taken[WAITING]]
     for a in range(size):
-        w0[a] = h0 * (p0[a] - pi[a]) + h1 * (p1[a] - pj[a]) - p2[a]
-    S = h0 * (w0[0] - w0[i]) + h1 * (w0[1] - w0[i + 1]) - w0[2] + variance
+        w0[a] = h0 * (p0[a] - pi[a]) + h1 * (p1[a] - pj[a]) - turns * p2[a]
+    S = h0 * (w0[0] - w0[i]) + h1 * (w0[1] - w0[i + 1]) - turns * w0[2] + variance
     if innovation * innovation > bound * S:
         return GATED
     root = 1.0 / math.sqrt(S)
     for a in range(size):
         w0[a] *= root
-    _defer(joint, size, w0, root * innovation)
+    step = root * innovation
+    if turns == 0.0:
+        _retract(joint.mean, size, w0, step, w0, 0.0)
+    _defer(joint, size, w0, turns * step)
     return APPLIED
 
 
@@ -259,20 +304,20 @@ def correct_active(
     near, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     if near < NEAREST:
         return APPLIED
-    if joint.waiting[0] + 2 > MOST_WAITING:
+    if joint.taken[WAITING] + 2 > MOST_WAITING:
         flush(joint, size)
     nu0, nu1 = distance - near, wrap_angle(bearing - expected)
-    h0, h1 = s * k, -c * k
+    h0, h1, turns = s * k, -c * k, joint.turns
     p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
     pi, pj = _point_rows(joint, size, i)
-    w0, w1 = joint.W[joint.waiting[0]], joint.W[joint.waiting[0] + 1]
+    w0, w1 = joint.W[joint.taken[WAITING]], joint.W[joint.taken[WAITING] + 1]
     for a in range(size):
         east, north = p0[a] - pi[a], p1[a] - pj[a]
         w0[a] = -c * east - s * north
-        w1[a] = h0 * east + h1 * north - p2[a]
+        w1[a] = h0 * east + h1 * north - turns * p2[a]
     S00 = -c * (w0[0] - w0[i]) - s * (w0[1] - w0[i + 1]) + range_variance
-    S01 = h0 * (w0[0] - w0[i]) + h1 * (w0[1] - w0[i + 1]) - w0[2]
-    S11 = h0 * (w1[0] - w1[i]) + h1 * (w1[1] - w1[i + 1]) - w1[2] + bearing_variance
+    S01 = h0 * (w0[0] - w0[i]) + h1 * (w0[1] - w0[i + 1]) - turns * w0[2]
+    S11 = h0 * (w1[0] - w1[i]) + h1 * (w1[1] - w1[i + 1]) - turns * w1[2] + bearing_variance
     L00 = math.sqrt(S00)
     L10 = S01 / L00
     L11 = math.sqrt(S11 - L10 * L10)
@@ -283,15 +328,16 @@ def correct_active(
     for a in range(size):
         w0[a] /= L00
         w1[a] = (w1[a] - L10 * w0[a]) / L11
-    _defer(joint, size, w0, e0)
-    _defer(joint, size, w1, e1)
+    if turns == 0.0:
+        _retract(joint.mean, size, w0, e0, w1, e1)
+    _defer(joint, size, w0, turns * e0)
+    _defer(joint, size, w1, turns * e1)
     return APPLIED
 
 
 @no_alloc
 def initialise(
-    mean: Float[np.ndarray, " n"],
-    covariance: Float[np.ndarray, "n m"],
+    joint: Joint,
     size: Whole,
     i: Whole,
     distance: float,
@@ -304,9 +350,10 @@ def initialise(
     The first ``size`` rows but the member's own are the rest of the state, with which it is
     correlated through the pose.
     """
+    mean, covariance = joint.mean, joint.covariance
     direction = mean[2] + bearing
     c, s = math.cos(direction), math.sin(direction)
-    gx, gy = -distance * s, distance * c
+    gx, gy = -joint.turns * distance * s, joint.turns * distance * c
     mean[i], mean[i + 1] = mean[0] + distance * c, mean[1] + distance * s
     for a in range(size):
         if a != i and a != i + 1:

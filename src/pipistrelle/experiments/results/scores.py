@@ -269,7 +269,7 @@ def score_path(pose: Gaussian, true_path: Float[np.ndarray, "k 3"] | None) -> Pa
     rows = np.isfinite(known).all(axis=1) & (np.arange(len(known)) > 0)
     path, truth = pose.mean[rows], known[rows]
     error = pose_error(path, truth)
-    epsilon = track_nees(pose.mean, pose.covariance, known)[1:]
+    epsilon = track_nees(pose, known)[1:]
     epsilon = epsilon[~np.isnan(epsilon)]
     return PathScores(
         position_rmse_m=_rmse(position_error(path, truth)),

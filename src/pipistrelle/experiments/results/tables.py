@@ -124,7 +124,7 @@ def step_table(track: Track, true_path: Float[np.ndarray, "k 3"] | None) -> "pl.
         **_pose_columns("true_{}", true),
         "position_error_m": position_error(mean, true),
         "heading_error_rad": error[:, 2],
-        "nees": track_nees(mean, covariance, true),
+        "nees": track_nees(track.pose, true),
     }
     truth = pl.DataFrame(scored)
     return pl.DataFrame(known).hstack(truth if true_path is not None else truth.clear(len(mean)))

@@ -94,7 +94,7 @@ def run_filter(
         belief, poses = estimator.predict(belief, controls[done:], dt[done:], rng)
         poses = _whole("predict", poses, len(controls) - done)
         mean[done + 1 :], covariance[done + 1 :] = poses.mean, poses.covariance
-    online = Gaussian(mean=mean, covariance=covariance)
+    online = Gaussian(mean=mean, covariance=covariance, invariant=belief.pose().invariant)
     cloud = belief if isinstance(belief, ParticleCloud) else None
     revised = _whole("path", belief.path(), time.size) if isinstance(belief, Trajectory) else None
     return Track(

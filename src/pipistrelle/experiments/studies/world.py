@@ -353,7 +353,7 @@ def _frame_errors(track: Track, scenario: Scenario, config: Config) -> Float[np.
     """Return position error [m], heading error [rad] and NEES at each frame."""
     every = config.scenario.steps_per_frame
     frames = slice(every, None, every)
-    epsilon = track_nees(track.pose.mean, track.pose.covariance, scenario.path)[frames]
+    epsilon = track_nees(track.pose, scenario.path)[frames]
     mean, true = track.pose.mean[frames], scenario.path[frames]
     columns = (position_error(mean, true), pose_error(mean, true)[:, 2], epsilon)
     return np.column_stack(columns).astype(np.float32)

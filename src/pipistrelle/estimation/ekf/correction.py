@@ -1,0 +1,227 @@
+"""A frame's correction of one Gaussian over a pose and the members of all landmarks.
+
+A frame is taken in measurement by measurement, each at the current mean: first the landmarks
+already mapped, in the order of the scan, then the new ones are placed from the corrected pose.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from pipistrelle.estimation.ekf.gaussian import (
+    APPLIED,
+    GATED,
+    State,
+    bearing_variance,
+    correct_active,
+    correct_bearing,
+    drop_members,
+    flush,
+    gaussian_of,
+    initialise,
+    joint_of,
+)
+from pipistrelle.estimation.measurement import (
+    Columns,
+    Measurements,
+    Row,
+    measurements,
+    observe,
+    row_of,
+)
+from pipistrelle.estimation.rays import (
+    AS_PRINTED,
+    Sensing,
+    heaviest_member,
+    log_likelihood,
+    survivors,
+    weigh_and_share,
+)
+from pipistrelle.geometry import wrap_angle
+from pipistrelle.jit import Whole, kernel, no_alloc, no_alloc_inlined
+
+
+class _Scratch(NamedTuple):
+    """Room to work on the members of one landmark, and on the order of the state's numbers."""
+
+    likelihood: Float[np.ndarray, " m"]
+    share: Float[np.ndarray, " m"]
+    keep: Bool[np.ndarray, " m"]
+    source: Int[np.ndarray, " n"]
+
+
+@kernel
+def _scratch(members: Whole) -> _Scratch:
+    """Make room for so many members."""
+    return _Scratch(
+        np.empty(members),
+        np.empty(members),
+        np.empty(members, np.bool_),
+        np.empty(3 + 2 * members, np.int64),
+    )
+
+
+@no_alloc
+def _members_of(
+    landmark: Int[np.ndarray, " h"], members: Whole, label: Whole
+) -> tuple[Whole, Whole]:
+    """Index of a landmark's first member and how many it has (0: not mapped)."""
+    for first in range(members):
+        if landmark[first] == label:
+            last = first + 1
+            while last < members and landmark[last] == label:
+                last += 1
+            return first, last - first
+    return members, 0
+
+
+@no_alloc_inlined
+def _correct_ray(
+    state: State,
+    first: Whole,
+    count: Whole,
+    row: Row,
+    sensing: Sensing,
+    scratch: _Scratch,
+) -> Whole:
+    """Weigh a ray's members by a bearing and share it among them; GATED when none expected it."""
+    joint, mean, size = state.joint, state.joint.mean, 3 + 2 * state.members[0]
+    weight, outcome = state.weight[first:], GATED
+    bearing, variance = row.bearing, row.bearing_variance
+    for j in range(count):
+        i = 3 + 2 * (first + j)
+        _, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
+        innovation = wrap_angle(bearing - expected)
+        S = bearing_variance(joint, size, i, c, s, k) + variance
+        scratch.likelihood[j] = log_likelihood(innovation, S, sensing.sharing == AS_PRINTED)
+        if innovation * innovation <= sensing.passive_bound * S:
+            outcome = APPLIED
+    if outcome == GATED:
+        return GATED
+    weigh_and_share(
+        scratch.likelihood, weight, count, sensing.power, sensing.aggregated, scratch.share
+    )
+    for j in range(count):
+        if scratch.share[j] > 0.0:
+            i = 3 + 2 * (first + j)
+            correct_bearing(joint, size, i, bearing, variance / scratch.share[j], np.inf)
+    return APPLIED
+
+
+@no_alloc
+def _range_for_ray(
+    state: State,
+    first: Whole,
+    count: Whole,
+    row: Row,
+    sensing: Sensing,
+    scratch: _Scratch,
+) -> None:
+    """Give a partial landmark its range: one member is left."""
+    left = 0 if sensing.reinitialise else heaviest_member(state.weight[first:], count)
+    for j in range(count):
+        scratch.keep[j] = j == left
+    drop_members(state, first, count, scratch.keep, scratch.source)
+    state.weight[first] = 1.0
+    distance, bearing, variance = row.range, row.bearing, row.bearing_variance
+    joint, mean = state.joint, state.joint.mean
+    size, i = 3 + 2 * state.members[0], 3 + 2 * first
+    if sensing.reinitialise:
+        initialise(joint, size, i, distance, bearing, row.range_variance, variance)
+    else:
+        _, _, c, s, _ = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
+        mean[i], mean[i + 1] = mean[0] + distance * c, mean[1] + distance * s
+        correct_bearing(joint, size, i, bearing, variance, np.inf)
+
+
+@no_alloc
+def _correct_known(state: State, row: Row, sensing: Sensing, scratch: _Scratch) -> Whole:
+    """Correct with one measurement of a mapped landmark; tell whether it was gated."""
+    first, count = _members_of(state.landmark, state.members[0], row.landmark)
+    distance, bearing, variance = row.range, row.bearing, row.bearing_variance
+    joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
+    passive = math.isnan(distance)
+    if count == 1 and passive:
+        return correct_bearing(joint, size, i, bearing, variance, sensing.passive_bound)
+    if count == 1:
+        spread, bound = row.range_variance, sensing.active_bound
+        return correct_active(joint, size, i, distance, bearing, spread, variance, bound)
+    if not passive:
+        _range_for_ray(state, first, count, row, sensing, scratch)
+        return APPLIED
+    if _correct_ray(state, first, count, row, sensing, scratch) == GATED:
+        return GATED
+    if survivors(state.weight[first:], count, sensing.prune, scratch.keep) < count:
+        drop_members(state, first, count, scratch.keep, scratch.source)
+    return APPLIED
+
+
+@no_alloc
+def _add_new(state: State, row: Row, sensing: Sensing) -> None:
+    """Append a measurement's landmark, one member or a ray of them (Eqs. (16) to (18))."""
+    joint, passive = state.joint, math.isnan(row.range)
+    count = sensing.ray_ranges.size if passive else 1
+    for j in range(count):
+        far = sensing.ray_ranges[j] if passive else row.range
+        spread = sensing.ray_stds[j] ** 2 if passive else row.range_variance
+        member = state.members[0]
+        size = 3 + 2 * member
+        initialise(joint, size, size, far, row.bearing, spread, row.bearing_variance)
+        state.landmark[member], state.weight[member] = row.landmark, 1.0 / count
+        state.members[0] += 1
+
+
+@no_alloc
+def _take_in(
+    state: State,
+    heard: Measurements,
+    known: Bool[np.ndarray, " m"],
+    sensing: Sensing,
+    scratch: _Scratch,
+) -> Whole:
+    """Correct with what is mapped, then append what is not; returns how many were gated."""
+    gated = 0
+    for m in range(heard.landmark.size):
+        if known[m]:
+            gated += _correct_known(state, row_of(heard, m), sensing, scratch)
+    flush(state.joint, 3 + 2 * state.members[0])
+    for m in range(heard.landmark.size):
+        if not known[m]:
+            _add_new(state, row_of(heard, m), sensing)
+    mean = state.joint.mean
+    mean[2] = wrap_angle(mean[2])
+    return gated
+
+
+@kernel
+def corrected(
+    old_mean: Float[np.ndarray, " d"],
+    old_covariance: Float[np.ndarray, "d d"],
+    old_landmark: Int[np.ndarray, " h"],
+    old_weight: Float[np.ndarray, " h"],
+    columns: Columns,
+    sensing: Sensing,
+    turns: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Whole]:
+    """Correct, prune and extend a copy of the belief; returns its arrays and the gated count.
+
+    ``turns`` says of which error the covariance is, as in `Joint`.
+    """
+    heard = measurements(columns)
+    members, rows = old_landmark.size, heard.landmark.size
+    most, known = members, np.empty(rows, dtype=np.bool_)
+    for m in range(rows):
+        known[m] = _members_of(old_landmark, members, heard.landmark[m])[1] > 0
+        if not known[m]:
+            most += sensing.ray_ranges.size if math.isnan(heard.range[m]) else 1
+    joint, scratch = joint_of(old_mean, old_covariance, 3 + 2 * most, turns), _scratch(most)
+    landmark, weight = np.empty(most, dtype=np.int64), np.empty(most)
+    state = State(joint, landmark, weight, np.full(1, members))
+    for member in range(members):
+        landmark[member], weight[member] = old_landmark[member], old_weight[member]
+    gated = _take_in(state, heard, known, sensing, scratch)
+    members = state.members[0]
+    mean, covariance = gaussian_of(joint, 3 + 2 * members)
+    return mean, covariance, landmark[:members].copy(), weight[:members].copy(), gated
