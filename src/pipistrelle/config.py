@@ -212,6 +212,8 @@ class RayConfig(Section):
     """Share by this measurement's likelihoods (the paper's text) or by all so far (Sola's code)."""
     likelihood: Literal["normal", "printed"] = "normal"
     """Of a member: the normal density, or 1/sqrt(2 pi S) inside the exponent, as Eq. (19) reads."""
+    spacing: Literal["paper", "auto"] = "paper"
+    """As above, or, by the EKFs, bearings too precise for such members wait to be crossed."""
     partial: Literal["reinitialise", "heaviest"] = "reinitialise"
     """A range for a partial landmark: place it anew, or move its heaviest member."""
 
@@ -220,6 +222,8 @@ class RayConfig(Section):
         near, far = self.range_bounds
         if near >= far:
             raise ValueError(f"range_bounds must rise, found [{near}, {far}]")
+        if self.spacing == "auto" and self.likelihood == "printed":
+            raise ValueError('spacing "auto" needs likelihood "normal", found "printed"')
         return self
 
 

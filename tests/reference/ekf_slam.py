@@ -16,6 +16,8 @@ NEAREST = 1e-3
 LEAST_SHARE = 1e-12
 LEAST_AGGREGATED = 0.05
 CORRESPONDENCE_STD = 1.0
+WAITS = -1.0
+SURE = 0.2
 
 
 def wrapped(angle):
@@ -79,6 +81,14 @@ def logarithm(weight):
     return math.log(weight) if weight > 0 else -math.inf
 
 
+def crossing(z):
+    """Where p + r u crosses p0 + t (q - p0), of z = (p, heading, p0, q, bearing): x, y, r, t."""
+    p, p0, q = z[:2], z[3:5], z[5:7]
+    u = np.array([np.cos(z[2] + z[7]), np.sin(z[2] + z[7])])
+    r, t = np.linalg.solve(np.column_stack([u, p0 - q]), p0 - p)
+    return np.array([*(p + r * u), r, t])
+
+
 class SlowEkfSlam:
     """The filter and its belief in one object that changes in place.
 
@@ -86,6 +96,9 @@ class SlowEkfSlam:
     `common_bearing_noise` correlates the members of a new ray through the bearing they share;
     `joseph` updates the covariance by Joseph's form.
     """
+
+    turns = 1.0
+    """How much an error of heading turns a bearing."""
 
     def __init__(
         self,
@@ -212,7 +225,26 @@ class SlowEkfSlam:
         R = np.diag([self.range_variance, self.bearing_variance]) * inflation
         if math.isnan(distance):
             nu, H, R = nu[1:], H[1:], R[1:, 1:]
+            if self.precise:
+                bias, variance = self.curvature(block)
+                nu, R = nu - bias, R + variance * inflation
         return nu, H, R
+
+    @property
+    def precise(self):
+        """Whether bearings are too precise for members as wide as these."""
+        linear_to = self.rays.ratio**2 / 2
+        return self.rays.spacing == "auto" and math.sqrt(self.bearing_variance) < linear_to
+
+    def curvature(self, block):
+        """Mean and variance of the bearing's second-order term: tr(M P) / 2, tr(M P M P) / 2."""
+        dx, dy = self.X[self.at(block)] - self.X[:2]
+        M = np.array([[2 * dx * dy, dy**2 - dx**2], [dy**2 - dx**2, -2 * dx * dy]])
+        M = M / max(math.hypot(dx, dy), NEAREST) ** 4
+        D = np.zeros((2, self.X.size))
+        D[:, :2], D[:, self.at(block)] = -np.eye(2), np.eye(2)
+        MP = M @ D @ self.P @ D.T
+        return np.trace(MP) / 2, np.trace(MP @ MP) / 2
 
     def correct(self, block, nu, H, R, inflation=1.0):
         """Eq. (11); the correspondence, if carried, is measured without error."""
@@ -257,6 +289,8 @@ class SlowEkfSlam:
     def measure(self, label, distance, bearing):
         if len(self.members(label)) == 1:
             self.measure_full(label, distance, bearing)
+        elif math.isnan(distance) and self.aggregated[self.members(label)[0]] == WAITS:
+            self.cross(label, bearing)
         elif math.isnan(distance):
             self.measure_ray(label, bearing)
         elif self.rays.partial == "reinitialise":
@@ -344,7 +378,9 @@ class SlowEkfSlam:
         if self.carry_correspondence:
             G, noise = np.zeros((1, self.X.size)), np.array([[CORRESPONDENCE_STD**2]])
             self.insert(end, ("correspondence", label), [label], G, noise)
-        if math.isnan(distance):
+        if math.isnan(distance) and self.precise:
+            self.await_crossing(end, label, bearing)
+        elif math.isnan(distance):
             self.cast_ray(end, label, bearing)
         else:
             self.place(end, label, distance, bearing)
@@ -364,6 +400,42 @@ class SlowEkfSlam:
         block = ("member", label, 0)
         self.insert(position, block, m, G, Gz @ R @ Gz.T)
         self.aggregated[block] = 1.0
+
+    def await_crossing(self, position, label, bearing):
+        """Keep where a precise bearing was heard from, and a point that it was heard through."""
+        ranges = ray_ranges(self.rays)
+        for j, ahead in enumerate((0.0, ranges[len(ranges) // 2])):
+            m, G, Gz = self.point(ahead, bearing)
+            block = ("member", label, j)
+            self.insert(
+                position + j, block, m, G, self.bearing_variance * np.outer(Gz[:, 1], Gz[:, 1])
+            )
+            self.aggregated[block] = WAITS
+
+    def cross(self, label, bearing):
+        """Place a landmark where a bearing crosses the one that waits, if that is sure."""
+        origin, through = self.members(label)
+        involved = [0, 1, 2]
+        for block in (origin, through):
+            involved += range(self.at(block).start, self.at(block).stop)
+        z = np.append(self.X[involved], bearing)
+        found = crossing(z)
+        if found[2] < NEAREST or found[3] <= 0:
+            return
+        step = 1e-30
+        J = np.array([crossing(z + 1j * step * e).imag / step for e in np.eye(z.size)]).T
+        G = np.zeros((4, self.X.size))
+        G[:, involved] = J[:, :-1]
+        G[:, 2] *= self.turns
+        range_variance = G[2] @ self.P @ G[2] + J[2, -1] ** 2 * self.bearing_variance
+        if math.sqrt(range_variance) > SURE * found[2]:
+            return
+        position = self.blocks.index(origin)
+        noise = self.bearing_variance * np.outer(J[:2, -1], J[:2, -1])
+        placed = ("member", label, 2)
+        self.insert(position, placed, found[:2].real, G[:2], noise)
+        self.aggregated[placed] = 1.0
+        self.drop([origin, through])
 
     def cast_ray(self, position, label, bearing):
         ranges = ray_ranges(self.rays)

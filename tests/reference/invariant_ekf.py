@@ -15,6 +15,8 @@ QUARTER = np.array([[0.0, -1.0], [1.0, 0.0]])
 class SlowInvariantEkfSlam(SlowEkfSlam):
     """The state is kept about the origin of the world; P is that of xi, blocks as in the state."""
 
+    turns = 0.0
+
     def points(self):
         """Where the positions lie in the state: the vehicle's, then each member's."""
         return [slice(0, 2), *(self.at(block) for block in self.all_members())]

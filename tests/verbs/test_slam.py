@@ -95,6 +95,19 @@ def test_slam_takes_the_settings_of_fastslam_from_flags_and_files_and_keeps_them
     np.testing.assert_array_equal(track("2", "fused_fastslam"), track("again", "fused_fastslam"))
 
 
+def test_slam_fits_the_rays_to_the_bearings_unless_asked_otherwise(obey, log, undrawn):
+    def spacing(*words):
+        shutil.rmtree("two", ignore_errors=True)
+        assert obey("slam", log, "--quiet", "-o", "two", *words)[0] == 0
+        return tomllib.loads(Path("two/config.toml").read_text())["rays"]["spacing"]
+
+    assert spacing() == "auto"
+    assert spacing("--rays.spacing", "paper") == "paper"
+    assert spacing("--rays.likelihood", "printed") == "paper"
+    status, _, said = obey("slam", log, "--rays.likelihood", "printed", "--rays.spacing", "auto")
+    assert (status, "needs likelihood" in said) == (2, True)
+
+
 def test_slam_takes_from_the_log_what_the_log_decides_and_says_so(obey, log, undrawn):
     own = Config().filter.range_std
     Path("mission.toml").write_text("[filter]\nrange_std = 0.7\n")

@@ -1,11 +1,11 @@
 """Options that verbs share: every setting as a flag, and the short names of a mission."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import radians
 from pathlib import Path
-from types import NoneType
+from types import MappingProxyType, NoneType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict, Union, get_args, get_origin
 
 from cyclopts import Group, Parameter, convert
@@ -54,13 +54,17 @@ Particles = Annotated[
 ]
 
 
-def setting_flags(shown: Callable[[Key], bool] = lambda _: True) -> Any:
+def setting_flags(
+    shown: Callable[[Key], bool] = lambda _: True, own: Mapping[Key, Any] = MappingProxyType({})
+) -> Any:
     """Make the type from which the command line builds a flag for every setting.
 
     Parameters
     ----------
     shown : function of a setting's key
         Whether the help names the setting; its flag works either way.
+    own : mapping of keys
+        Defaults that a verb has of its own, for the help.
 
     Returns
     -------
@@ -75,8 +79,9 @@ def setting_flags(shown: Callable[[Key], bool] = lambda _: True) -> Any:
     sections: dict[str, dict[str, Any]] = {}
     top: dict[str, Any] = {}
     for key, field in known_settings().items():
-        default = field.default if isinstance(field.default, tuple) else (field.default,)
-        settled = "" if field.default is None else f"[default: {' '.join(map(str, default))}]"
+        value = own.get(key, field.default)
+        default = value if isinstance(value, tuple) else (value,)
+        settled = "" if value is None else f"[default: {' '.join(map(str, default))}]"
         words = f"{field.description or ''} {settled}"
         flag = Parameter(help=" ".join(words.split()), show=shown(key), negative=())
         kind: Any = Whole if field.annotation is int else _unbounded(field.annotation)

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 GATE = 0.999
 """Share of a measurement's predicted distribution that is accepted of real logs."""
 GATE_KEY: Key = ("filter", "gate")
+OWN = {("rays", "spacing"): "auto"}
+"""Settings that a recorded log has others of than a simulated mission: its sensor is anyone's."""
 SUSPECT = 0.2
 """Share of a log's rows that may not fit before its units are asked about."""
 LOGGED = frozenset(
@@ -67,7 +69,7 @@ def _is_open(key: Key) -> bool:
 if TYPE_CHECKING:
     SlamFlags = dict[str, Any]
 else:
-    SlamFlags = setting_flags(shown=lambda key: _is_open(key) and key != GATE_KEY)
+    SlamFlags = setting_flags(lambda key: _is_open(key) and key != GATE_KEY, OWN)
 
 
 def slam(
@@ -165,7 +167,10 @@ def _with_log(layer: Layer, recorded: "Log", log: Path) -> Config:
     """Settle what the log decides; say so where a file or the environment says otherwise."""
     gate = GATE if recorded.gate is None else recorded.gate
     decided = {key: Given(getattr(recorded, key[1]), f"{log}: {key[1]}") for key in LOGGED}
-    wished, settled = resolve(layer), resolve({GATE_KEY: Given(gate, str(log))} | layer | decided)
+    own = {GATE_KEY: Given(gate, str(log))}
+    if ("rays", "likelihood") not in layer:  # another reading of the paper is of the paper's rays
+        own |= {key: Given(value, "slam") for key, value in OWN.items()}
+    wished, settled = resolve(layer), resolve(own | layer | decided)
     for section, name in sorted(LOGGED & layer.keys()):
         value = getattr(getattr(settled, section), name)
         if getattr(getattr(wished, section), name) != value:

@@ -192,6 +192,7 @@ OTHERS = {
     "rays.power": 4.0,
     "rays.weights": "aggregated",
     "rays.likelihood": "printed",
+    "rays.spacing": "auto",
     "rays.partial": "heaviest",
     "fastslam.particles": 30,
     "fastslam.resample_below": 1.0,

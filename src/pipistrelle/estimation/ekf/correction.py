@@ -10,6 +10,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from pipistrelle.estimation.ekf.crossing import (
+    WAITS,
+    await_crossing,
+    curved,
+    is_precise,
+    linear_to,
+    place_crossing,
+)
 from pipistrelle.estimation.ekf.gaussian import (
     APPLIED,
     GATED,
@@ -137,20 +145,10 @@ def _range_for_ray(
 
 
 @no_alloc
-def _correct_known(state: State, row: Row, sensing: Sensing, scratch: _Scratch) -> Whole:
-    """Correct with one measurement of a mapped landmark; tell whether it was gated."""
-    first, count = _members_of(state.landmark, state.members[0], row.landmark)
-    distance, bearing, variance = row.range, row.bearing, row.bearing_variance
-    joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
-    passive = math.isnan(distance)
-    if count == 1 and passive:
-        return correct_bearing(joint, size, i, bearing, variance, sensing.passive_bound)
-    if count == 1:
-        spread, bound = row.range_variance, sensing.active_bound
-        return correct_active(joint, size, i, distance, bearing, spread, variance, bound)
-    if not passive:
-        _range_for_ray(state, first, count, row, sensing, scratch)
-        return APPLIED
+def _correct_partial(
+    state: State, first: Whole, count: Whole, row: Row, sensing: Sensing, scratch: _Scratch
+) -> Whole:
+    """Correct a ray with a bearing, and prune it; tell whether it was gated."""
     if _correct_ray(state, first, count, row, sensing, scratch) == GATED:
         return GATED
     if survivors(state.weight[first:], count, sensing.prune, scratch.keep) < count:
@@ -159,9 +157,60 @@ def _correct_known(state: State, row: Row, sensing: Sensing, scratch: _Scratch) 
 
 
 @no_alloc
+def _correct_precisely(
+    state: State,
+    first: Whole,
+    count: Whole,
+    row: Row,
+    sensing: Sensing,
+    scratch: _Scratch,
+) -> Whole:
+    """Cross a bearing that waits, or correct with a precise one; tell whether it was gated.
+
+    To the members of a ray, which an earlier, coarser one has cast, it is no more precise than they
+    are linear.
+    """
+    joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
+    if count == 1:
+        bearing, variance = curved(joint, size, i, row)
+        return correct_bearing(joint, size, i, bearing, variance, sensing.passive_bound)
+    if state.weight[first] != WAITS:
+        variance = linear_to(sensing) ** 2
+        coarse = Row(row.landmark, row.bearing, row.range, variance, row.range_variance)
+        return _correct_partial(state, first, count, coarse, sensing, scratch)
+    if place_crossing(state, first, row):
+        scratch.keep[0], scratch.keep[1] = True, False
+        drop_members(state, first, count, scratch.keep, scratch.source)
+    return APPLIED
+
+
+@no_alloc
+def _correct_known(state: State, row: Row, sensing: Sensing, scratch: _Scratch) -> Whole:
+    """Correct with one measurement of a mapped landmark; tell whether it was gated."""
+    first, count = _members_of(state.landmark, state.members[0], row.landmark)
+    distance, bearing, variance = row.range, row.bearing, row.bearing_variance
+    joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
+    passive = math.isnan(distance)
+    if passive and (state.weight[first] == WAITS or is_precise(row, sensing)):
+        return _correct_precisely(state, first, count, row, sensing, scratch)
+    if count == 1 and passive:
+        return correct_bearing(joint, size, i, bearing, variance, sensing.passive_bound)
+    if count == 1:
+        spread, bound = row.range_variance, sensing.active_bound
+        return correct_active(joint, size, i, distance, bearing, spread, variance, bound)
+    if not passive:
+        _range_for_ray(state, first, count, row, sensing, scratch)
+        return APPLIED
+    return _correct_partial(state, first, count, row, sensing, scratch)
+
+
+@no_alloc
 def _add_new(state: State, row: Row, sensing: Sensing) -> None:
     """Append a measurement's landmark, one member or a ray of them (Eqs. (16) to (18))."""
     joint, passive = state.joint, math.isnan(row.range)
+    if passive and is_precise(row, sensing):
+        await_crossing(state, row, sensing)
+        return
     count = sensing.ray_ranges.size if passive else 1
     for j in range(count):
         far = sensing.ray_ranges[j] if passive else row.range
@@ -215,7 +264,7 @@ def corrected(
     for m in range(rows):
         known[m] = _members_of(old_landmark, members, heard.landmark[m])[1] > 0
         if not known[m]:
-            most += sensing.ray_ranges.size if math.isnan(heard.range[m]) else 1
+            most += max(sensing.ray_ranges.size, 2) if math.isnan(heard.range[m]) else 1
     joint, scratch = joint_of(old_mean, old_covariance, 3 + 2 * most, turns), _scratch(most)
     landmark, weight = np.empty(most, dtype=np.int64), np.empty(most)
     state = State(joint, landmark, weight, np.full(1, members))

@@ -13,6 +13,7 @@ from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.ekf.correction import corrected
+from pipistrelle.estimation.ekf.crossing import WAITS
 from pipistrelle.estimation.ekf.gaussian import LINEAR, propagate
 from pipistrelle.estimation.measurement import columns_of
 from pipistrelle.estimation.motion import Motion, motion_numbers
@@ -31,7 +32,8 @@ class EkfBelief:
     landmark : (h)
         Label of each member; the members of a ray stand together, near to far.
     weight : (h)
-        Aggregated likelihood of each member within its landmark.
+        Aggregated likelihood of each member within its landmark; `crossing.WAITS` of the two points
+        of a bearing that waits to be crossed.
     gated : int
         Measurements rejected so far.
     """
@@ -48,15 +50,39 @@ class EkfBelief:
 
     def landmarks(self) -> Landmarks:
         """Return the map, one row per member."""
-        members = self.landmark.size
-        blocks = self.covariance[3:, 3:].reshape(members, 2, members, 2)
-        rows = np.arange(members)
-        return Landmarks(
-            landmark=self.landmark.copy(),
-            mean=self.mean[3:].reshape(-1, 2).copy(),
-            covariance=blocks[rows, :, rows, :],
-            weight=self.weight.copy(),
-        )
+        return map_rows(self, self.mean[3:].reshape(-1, 2), self.covariance[3:, 3:])
+
+
+def map_rows(
+    belief: EkfBelief, mean: Float[np.ndarray, "h 2"], covariance: Float[np.ndarray, "d d"]
+) -> Landmarks:
+    """Lay out a map, one row per member, from the linear error of all.
+
+    A bearing that waits is told as two members, equally likely, half as far as the point that it
+    was heard through and twice as far, and as unsure of their range.
+
+    Parameters
+    ----------
+    belief : EkfBelief
+    mean : (h, 2) [m]
+    covariance : (2h, 2h) [m^2]
+
+    Returns
+    -------
+    Landmarks
+    """
+    members = len(mean)
+    blocks, rows = covariance.reshape(members, 2, members, 2), np.arange(members)
+    means, own, weight = mean.copy(), blocks[rows, :, rows, :], belief.weight.copy()
+    for first in np.flatnonzero(weight == WAITS)[::2]:
+        ray = mean[first + 1] - mean[first]
+        pair = covariance[2 * first : 2 * first + 4, 2 * first : 2 * first + 4]
+        for member, share in ((first, 0.5), (first + 1, 2.0)):
+            G = np.kron([[1.0 - share, share]], np.eye(2))
+            spread = G @ pair @ G.T + np.outer(share * ray, share * ray) / 4.0
+            means[member], own[member] = mean[first] + share * ray, (spread + spread.T) / 2.0
+            weight[member] = 0.5
+    return Landmarks(landmark=belief.landmark.copy(), mean=means, covariance=own, weight=weight)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -241,6 +241,18 @@ def propagate(
 
 
 @no_alloc
+def relative_covariance(joint: Joint, size: Whole, i: Whole) -> tuple[float, float, float]:
+    """Entries xx, xy, yy of the covariance of the member at index i less the vehicle's position."""
+    p0, p1 = joint.covariance[0], joint.covariance[1]
+    pi, pj = _point_rows(joint, size, i)
+    return (
+        p0[0] - 2.0 * p0[i] + pi[i],
+        p0[1] - p0[i + 1] - p1[i] + pi[i + 1],
+        p1[1] - 2.0 * p1[i + 1] + pj[i + 1],
+    )
+
+
+@no_alloc
 def bearing_variance(joint: Joint, size: Whole, i: Whole, c: float, s: float, k: float) -> float:
     """Innovation variance H P H^T of the bearing of the member at state index i, without R."""
     h0, h1, turns = s * k, -c * k, joint.turns  # by pose: (h0, h1, -turns); by member: (-h0, -h1)

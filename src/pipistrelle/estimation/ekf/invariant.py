@@ -38,7 +38,7 @@ from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.ekf.correction import corrected
-from pipistrelle.estimation.ekf.filter import EkfBelief
+from pipistrelle.estimation.ekf.filter import EkfBelief, map_rows
 from pipistrelle.estimation.ekf.gaussian import INVARIANT
 from pipistrelle.estimation.measurement import columns_of
 from pipistrelle.estimation.motion import Motion, MotionNumbers, motion_numbers, propagate_pose
@@ -72,15 +72,12 @@ class InvariantBelief(EkfBelief):
 
     def landmarks(self) -> Landmarks:
         """Return the map, one row per member, its covariances those of the linear error."""
-        known = EkfBelief.landmarks(self)
-        turned = known.mean @ np.array([[0.0, 1.0], [-1.0, 0.0]])  # (-y, x): J l
-        across = self.covariance[2, 3:].reshape(-1, 2)
-        lever = turned[:, :, None] * across[:, None, :]
-        square = turned[:, :, None] * turned[:, None, :] * self.covariance[2, 2]
-        return replace(
-            known,
-            mean=known.mean + self.origin,
-            covariance=known.covariance + (lever + np.swapaxes(lever, 1, 2)) + square,
+        mean = self.mean[3:].reshape(-1, 2)
+        turned = (mean @ np.array([[0.0, 1.0], [-1.0, 0.0]])).ravel()  # (-y, x): J l
+        lever = np.outer(turned, self.covariance[2, 3:])
+        square = np.outer(turned, turned) * self.covariance[2, 2]
+        return map_rows(
+            self, mean + self.origin, self.covariance[3:, 3:] + (lever + lever.T) + square
         )
 
 
