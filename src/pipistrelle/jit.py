@@ -2,6 +2,7 @@
 
 A division by zero makes infinity, as in NumPy, and no exception. Nothing is reordered or fused
 (no ``fastmath``): a result does not depend on how many numbers the processor takes at a time.
+Nobody calls a kernel from C, so none has a wrapper for it: a sixth of the time to compile them.
 
 A kernel takes eight arguments at most; what belongs together is a record, a NamedTuple. At its door
 a record costs a microsecond and a plain tuple nothing, so a kernel that is called for every frame
@@ -28,7 +29,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 def _compiler(**options: bool | str) -> Callable[[_Function], _Function]:
     """Return a decorator that compiles, and keeps what it compiled in checked files."""
-    compiled: Any = njit(cache=True, error_model="numpy", **options)  # pyrefly: ignore[no-matching-overload]
+    compiled: Any = njit(cache=True, error_model="numpy", no_cfunc_wrapper=True, **options)  # pyrefly: ignore[no-matching-overload]
     return lambda function: checked(compiled(function))
 
 

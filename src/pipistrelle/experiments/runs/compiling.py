@@ -11,7 +11,7 @@ import numpy as np
 
 from pipistrelle.config import Config, ScenarioConfig
 from pipistrelle.detection.scans import make_scan
-from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.beliefs import Estimator, Gaussian
 from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.experiments.hearing.scenario import bicycle
 from pipistrelle.experiments.machine import cores
@@ -23,25 +23,38 @@ _SECOND = "from pipistrelle.experiments.runs.compiling import compile_others; co
 def compile_kernels() -> None:
     """Compile every kernel, or load it from the cache, by a mission of two frames.
 
-    Where the cache is empty a second process compiles those of all filters but the first
-    meanwhile. Nothing depends on it: what it leaves undone is done here.
+    Where the cache is empty a second process compiles those of all filters that share none with
+    the first meanwhile. Nothing depends on it: what it leaves undone is done here.
     """
     tiny = Config(scenario=ScenarioConfig(steps=8, landmarks=4, radius=10.0))
     cached = any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbc"))
     if not cached and cores() > 1:
         with _second_process(_SECOND):
-            run_mission(tiny, ("fused",), tuple(CATALOGUE)[:1])
+            run_mission(tiny, ("fused",), _families()[0])
     run_mission(tiny, ("active", "fused", "passive"), tuple(CATALOGUE))
 
 
 def compile_others() -> None:
-    """Compile all filters' kernels but the first's, by one frame, made up: it needs no other."""
-    for known in tuple(CATALOGUE.values())[1:]:
-        slam, rng = known.build(Config(), bicycle(Config().motion)), np.random.default_rng(0)
+    """Compile the kernels of the other families, by one frame, made up: it needs no other."""
+    for name in _families()[1]:
+        slam, rng = _built(name), np.random.default_rng(0)
         belief = slam.init(Gaussian(mean=np.zeros(3), covariance=np.eye(3)))
         belief, _ = slam.predict(belief, np.ones((1, 2)), np.ones(1), rng)
         heard = {"range": np.array([1.0, np.nan]), "range_std": 0.1, "bearing_std": 0.1}
         slam.update(belief, make_scan(1.0, np.arange(2), np.zeros(2), **heard), rng)
+
+
+def _families() -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the filters of the first one's package, whose kernels they share, and the others."""
+    package = {name: type(_built(name)).__module__.rpartition(".")[0] for name in CATALOGUE}
+    own = package[next(iter(CATALOGUE))]
+    related = tuple(name for name in CATALOGUE if package[name] == own)
+    return related, tuple(name for name in CATALOGUE if name not in related)
+
+
+def _built(name: str) -> Estimator:
+    """Build a filter by the defaults."""
+    return CATALOGUE[name].build(Config(), bicycle(Config().motion))
 
 
 @contextmanager
