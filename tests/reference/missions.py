@@ -8,6 +8,7 @@ from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan, make_scan, with_columns
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.ekf.filter import EkfSlam
+from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
 from pipistrelle.estimation.motion import Motion, motion_step
 from pipistrelle.geometry import range_and_bearing, wrap
 
@@ -131,21 +132,27 @@ def ray_config(**changes):
     return RayConfig(**({"prune": 1e-3, "power": 1.0} | changes))
 
 
-@dataclass(frozen=True, kw_only=True)
-class AssumingEkf(EkfSlam):
-    """The filter for tests that try other noise: whatever a scan says, it was measured so."""
+def assuming(kind):
+    """Make of a filter one for which all was measured so, whatever a scan says."""
 
-    range_std: float = 0.2
-    bearing_std: float = 0.15
+    @dataclass(frozen=True, kw_only=True)
+    class Assuming(kind):
+        range_std: float = 0.2
+        bearing_std: float = 0.15
 
-    def update(self, belief, scan, rng=None):
-        assumed = measured_to(scan, self.range_std, self.bearing_std)
-        return EkfSlam.update(self, belief, assumed, rng)
+        def update(self, belief, scan, rng=None):
+            assumed = measured_to(scan, self.range_std, self.bearing_std)
+            return kind.update(self, belief, assumed, rng)
+
+    return Assuming
 
 
-def paper_filter(**changes):
+KINDS = {kind: assuming(kind) for kind in (EkfSlam, InvariantEkfSlam)}
+
+
+def paper_filter(kind=EkfSlam, **changes):
     """Return the filter with the paper's settings, but for the changes."""
-    return replace(AssumingEkf(motion=BICYCLE, rays=ray_config()), **changes)
+    return replace(KINDS[kind](motion=BICYCLE, rays=ray_config()), **changes)
 
 
 def paper_mission(strategy, frames=375, seed=3, **changes):

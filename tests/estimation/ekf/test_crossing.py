@@ -14,21 +14,11 @@ from pipistrelle.settings import from_flags, resolve
 from reference.drives import turn_and_drive
 from reference.ekf_slam import SlowEkfSlam
 from reference.invariant_ekf import SlowInvariantEkfSlam
-from reference.missions import BICYCLE, START, followed, measured_to, paper_mission, scan_with
+from reference.missions import BICYCLE, START, followed, paper_filter, paper_mission, scan_with
 
 FITTED = RayConfig(spacing="auto", prune=1e-3, power=1.0)
 SHARP = {"range_std": 0.05, "bearing_std": 0.01}
 KINDS = [EkfSlam, InvariantEkfSlam]
-
-
-def told(kind, std):
-    """A filter to which every row is as precise."""
-
-    class Assuming(kind):
-        def update(self, belief, scan, rng=None):
-            return kind.update(self, belief, measured_to(scan, **std), rng)
-
-    return Assuming(motion=BICYCLE, rays=FITTED)
 
 
 @pytest.mark.parametrize("strategy", ["fused", "passive"])
@@ -39,7 +29,9 @@ def test_a_run_with_precise_bearings_equals_the_slow_reference(kind, reference, 
     mission = paper_mission(strategy, frames=50, bearing_std=0.01, range_std=0.05)
     slow = reference(BICYCLE, 0.05, 0.01, FITTED).start(START.mean, START.covariance)
     counts = set()
-    for frame, (belief, _) in enumerate(followed(told(kind, SHARP), mission)):
+    for frame, (belief, _) in enumerate(
+        followed(paper_filter(kind, rays=FITTED, **SHARP), mission)
+    ):
         slow.predict(mission.controls[frame], mission.dt[frame])
         slow.update(mission.scans[frame])
         np.testing.assert_array_equal(belief.landmark, slow.landmark)

@@ -16,6 +16,7 @@ from reference.ekf_slam import SlowEkfSlam
 from reference.missions import (
     BICYCLE,
     CIRCLE,
+    KINDS,
     SENSING,
     START,
     STEP,
@@ -176,9 +177,10 @@ def test_correspondence_carried_in_the_state_changes_nothing():
 # Covariance
 
 
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("strategy", SENSING)
-def test_covariance_is_symmetric_and_positive_through_a_whole_mission(strategy):
-    for frame, (belief, _) in enumerate(followed(paper_filter(), paper_mission(strategy))):
+def test_covariance_is_symmetric_and_positive_through_a_whole_mission(strategy, kind):
+    for frame, (belief, _) in enumerate(followed(paper_filter(kind), paper_mission(strategy))):
         np.testing.assert_array_equal(belief.covariance, belief.covariance.T)
         if frame % 5 == 0:
             assert np.linalg.eigvalsh(belief.covariance)[0] > 0

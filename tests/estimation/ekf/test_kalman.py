@@ -6,14 +6,15 @@ import pytest
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import Motion, motion_step
 from pipistrelle.geometry import range_and_bearing
-from reference.missions import START, STEP, STEPS_PER_FRAME, paper_filter, scan_of, steady
+from reference.missions import KINDS, START, STEP, STEPS_PER_FRAME, paper_filter, scan_of, steady
 
 
-def test_drive_along_an_axis_with_known_heading_equals_a_plain_kalman_filter():
+@pytest.mark.parametrize("kind", KINDS)
+def test_drive_along_an_axis_with_known_heading_equals_a_plain_kalman_filter(kind):
     """Range is linear for landmarks ahead and behind; y and heading are known and stay apart."""
     rng = np.random.default_rng(1)
     motion = Motion(model="bicycle", control_std=(0.1, 0.0), wheelbase=0.2)
-    slam = paper_filter(motion=motion)
+    slam = paper_filter(kind, motion=motion)
     start = Gaussian(mean=np.zeros(3), covariance=np.diag([0.3**2, 0, 0]))
     ahead = np.array([1.0, 1.0, -1.0])
     truth = np.array([rng.normal(0, 0.3), 30.0, 50.0, -8.0])

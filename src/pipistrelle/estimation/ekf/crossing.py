@@ -132,21 +132,19 @@ def place_crossing(state: State, first: Whole, row: Row) -> bool:
     joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
     mean, direction = joint.mean, joint.mean[2] + row.bearing
     nx, ny, sine, r, t = _from_vehicle(joint, i, direction)
-    if r < NEAREST or t <= 0.0:
+    ux, uy = math.cos(direction), math.sin(direction)
+    lever, most = r * (nx * uy - ny * ux) / sine, SURE * SURE * r * r
+    by_bearing = lever * lever * row.bearing_variance
+    if r < NEAREST or t <= 0.0 or by_bearing > most:
         return False
     flush(joint, size)
-    ux, uy = math.cos(direction), math.sin(direction)
-    lever = r * (nx * uy - ny * ux) / sine
     variance = _range_row(joint, size, i, (nx, ny, sine), t, lever)
-    sure = variance + lever * lever * row.bearing_variance <= SURE * SURE * r * r
-    if sure:
-        _take_place(joint, size, i, (ux, uy, r, lever), variance, row.bearing_variance)
-        mean[i], mean[i + 1] = mean[0] + r * ux, mean[1] + r * uy
-        state.weight[first] = 1.0
-    for k in range(3):
-        for a in range(size):
-            joint.W[k, a] = 0.0
-    return sure
+    if variance + by_bearing > most:
+        return False
+    _take_place(joint, size, i, (ux, uy, r, lever), variance, row.bearing_variance)
+    mean[i], mean[i + 1] = mean[0] + r * ux, mean[1] + r * uy
+    state.weight[first] = 1.0
+    return True
 
 
 @no_alloc

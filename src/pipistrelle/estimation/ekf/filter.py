@@ -5,6 +5,7 @@ correspondence is constant and known and stays out of it). How a frame corrects 
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,7 +18,7 @@ from pipistrelle.estimation.ekf.crossing import WAITS
 from pipistrelle.estimation.ekf.gaussian import LINEAR, propagate
 from pipistrelle.estimation.measurement import columns_of
 from pipistrelle.estimation.motion import Motion, motion_numbers
-from pipistrelle.estimation.rays import sensing_of
+from pipistrelle.estimation.rays import Sensing, sensing_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -186,19 +187,37 @@ class EkfSlam:
         """
         if scan.landmark.size == 0:
             return belief
-        mean, covariance, landmark, weight, gated = corrected(
-            belief.mean,
-            belief.covariance,
-            belief.landmark,
-            belief.weight,
-            columns_of(scan),
-            sensing_of(self.rays, self.gate),
-            LINEAR,
-        )
-        return EkfBelief(
-            mean=mean,
-            covariance=covariance,
-            landmark=landmark,
-            weight=weight,
-            gated=belief.gated + gated,
-        )
+        return EkfBelief(**taken_in(belief, scan, sensing_of(self.rays, self.gate), LINEAR))
+
+
+def taken_in(belief: EkfBelief, scan: Scan, sensing: Sensing, turns: float) -> dict[str, Any]:
+    """Return what a scan makes of the fields of an `EkfBelief`.
+
+    Parameters
+    ----------
+    belief : EkfBelief
+    scan : Scan
+    sensing : Sensing
+    turns : float
+        Of which error the covariance is: `gaussian.LINEAR` or `gaussian.INVARIANT`.
+
+    Returns
+    -------
+    dict of field to value
+    """
+    mean, covariance, landmark, weight, gated = corrected(
+        belief.mean,
+        belief.covariance,
+        belief.landmark,
+        belief.weight,
+        columns_of(scan),
+        sensing,
+        turns,
+    )
+    return {
+        "mean": mean,
+        "covariance": covariance,
+        "landmark": landmark,
+        "weight": weight,
+        "gated": belief.gated + gated,
+    }

@@ -37,10 +37,8 @@ from jaxtyping import Float
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
-from pipistrelle.estimation.ekf.correction import corrected
-from pipistrelle.estimation.ekf.filter import EkfBelief, map_rows
+from pipistrelle.estimation.ekf.filter import EkfBelief, map_rows, taken_in
 from pipistrelle.estimation.ekf.gaussian import INVARIANT
-from pipistrelle.estimation.measurement import columns_of
 from pipistrelle.estimation.motion import Motion, MotionNumbers, motion_numbers, propagate_pose
 from pipistrelle.estimation.rays import sensing_of
 from pipistrelle.jit import kernel, no_alloc
@@ -173,23 +171,8 @@ class InvariantEkfSlam:
         """
         if scan.landmark.size == 0:
             return belief
-        mean, covariance, landmark, weight, gated = corrected(
-            belief.mean,
-            belief.covariance,
-            belief.landmark,
-            belief.weight,
-            columns_of(scan),
-            sensing_of(self.rays, self.gate),
-            INVARIANT,
-        )
-        return InvariantBelief(
-            mean=mean,
-            covariance=covariance,
-            landmark=landmark,
-            weight=weight,
-            gated=belief.gated + gated,
-            origin=belief.origin,
-        )
+        sensing = sensing_of(self.rays, self.gate)
+        return InvariantBelief(origin=belief.origin, **taken_in(belief, scan, sensing, INVARIANT))
 
 
 def _placed(
