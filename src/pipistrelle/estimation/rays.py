@@ -35,9 +35,8 @@ A member is a Gaussian in x and y, and a bearing is linear in them only nearly. 
 angle a member's far end is nearer by its share :math:`\alpha` than its middle, so its bearing is
 off by some :math:`\alpha^2/2`, 0.045 rad for 0.3: nothing beside the paper's R, all there is
 beside a bearing good to 0.003 rad. ``spacing = "auto"`` therefore lets bearings more precise than
-that wait until another crosses them (`estimation.ekf.crossing`). Finer members would not do: with
-:math:`\alpha` of 0.05 to 0.2 the filter still diverges, for each of many members, all but one of
-them wrong, takes its share of a bearing that leaves no room for any.
+that wait until another crosses them (`estimation.ekf.crossing`). Finer members alone
+did not do: with :math:`\alpha` of 0.05 to 0.2 the filters still diverged on such bearings.
 
 Departures from the printed page: the paper prints :math:`\sigma_j = \alpha s_{j-1}`, which
 contradicts its own :math:`\alpha = \sigma/s` and leaves gaps between the members. Members of one
