@@ -183,8 +183,10 @@ class MotionConfig(Section):
 
 
 class FilterConfig(Section):
-    """What both filters assume."""
+    """What the filters assume."""
 
+    noise: Literal["constant", "measured"] = "constant"
+    """The next two for every row (the paper's), or each row's own, where it has some."""
     range_std: Positive = 0.2
     """[m]"""
     bearing_std: Positive = 0.15
@@ -193,6 +195,8 @@ class FilterConfig(Section):
     """x, y [m], heading [rad]"""
     gate: Probability = 1.0
     """Measurements outside this share of their predicted distribution are dropped; 1: none."""
+    robust: Literal["none", "huber"] = "none"
+    """Huber's: a measurement that surprises by more than 2 sigma counts less, the more it does."""
 
 
 class RayConfig(Section):

@@ -45,7 +45,11 @@ def test_the_help_of_slam_leaves_out_what_a_log_decides(obey):
     found = set(re.findall(r"--[a-z]+\.[a-z-]+", obey("slam", "--help")[1]))
     rays = ("ratio", "density", "prune", "power", "weights", "partial", "likelihood", "spacing")
     swarm = ("particles", "resample-below", "mixture", "weights")
-    assert found == {f"--rays.{name}" for name in rays} | {f"--fastslam.{name}" for name in swarm}
+    assert found == {
+        *(f"--filter.{name}" for name in ("noise", "robust")),
+        *(f"--rays.{name}" for name in rays),
+        *(f"--fastslam.{name}" for name in swarm),
+    }
 
 
 def test_the_defaults_that_the_help_names_are_those_of_the_settings(obey):

@@ -36,10 +36,14 @@ class Heard:
         A row per label and caller, both rising; with UNLABELLED for a label, a row per echo.
     clutter : int or None
         Detections without a label; None where nobody tells labels.
+    certainty : (2, m) [rad], [m], or None
+        Standard deviations of the rows' bearings and ranges, as the signal tells; NaN where it does
+        not. They are kept beside the rows, and `pipistrelle.detection.noise` puts them in.
     """
 
     rows: Scan
     clutter: int | None
+    certainty: Float[np.ndarray, "2 m"] | None = None
 
 
 def average_faces(
@@ -86,11 +90,11 @@ def average_faces(
     """
     labels, clutter = _distinct(label)
     found = _found(detections)
-    landmark, caller, numbers = _average(
+    landmark, caller, numbers, certainty = _average(
         labels, label, found, averaging == "weighted", 0.5 * speed_of_sound
     )
     rows = Scan(time=time, landmark=landmark, caller=caller, numbers=numbers)
-    return Heard(rows=rows, clutter=int(clutter))
+    return Heard(rows=rows, clutter=int(clutter), certainty=certainty)
 
 
 def same_echo(
@@ -158,13 +162,15 @@ class _Found(NamedTuple):
     bearing: Float[np.ndarray, " d"]
     delay: Float[np.ndarray, " d"]
     power: Float[np.ndarray, " d"]
+    bearing_std: Float[np.ndarray, " d"]
+    delay_std: Float[np.ndarray, " d"]
 
 
 def _found(detections: Detections) -> tuple[np.ndarray, ...]:
     """Return the columns of a `_Found`, a plain tuple, which a kernel is handed faster."""
     return (
         detections.face, detections.caller, detections.angle, detections.bearing, detections.delay,
-        detections.power,
+        detections.power, detections.bearing_std, detections.delay_std,
     )  # fmt: skip
 
 
@@ -195,11 +201,13 @@ def _average(
     detections: tuple,
     weighted: bool,
     metres: float,
-) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, "7 m"]]:
+) -> tuple[
+    Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, "7 m"], Float[np.ndarray, "2 m"]
+]:
     """Mean direction and delay of each label and caller over its strongest rows per face.
 
-    Returns label, caller and numbers of each pair that occurs. A second of the vehicle's own call
-    is so many metres of range.
+    Returns label, caller, numbers and certainty of each pair that occurs. A second of the vehicle's
+    own call is so many metres of range.
     """
     found = _Found(*detections)
     faces = callers = 0
@@ -208,6 +216,7 @@ def _average(
     landmark = np.empty(labels.size * callers, dtype=np.int64)
     caller, row = np.empty(landmark.size, dtype=np.int64), 0
     numbers = np.full((NUMBERS, landmark.size), np.nan)
+    certainty = np.full((2, landmark.size), np.nan)
     strongest = np.empty(faces, dtype=np.int64)
     for i in range(labels.size):
         for p in range(callers):
@@ -217,7 +226,7 @@ def _average(
                     best = strongest[found.face[d]]
                     if best < 0 or found.power[d] > found.power[best]:
                         strongest[found.face[d]] = d
-            total = east = north = late = loudest = 0.0
+            total = east = north = late = loudest = across = along = 0.0
             for f in range(faces):
                 d = strongest[f]
                 if d >= 0:
@@ -226,15 +235,19 @@ def _average(
                     east += weight * math.cos(found.bearing[d])
                     north += weight * math.sin(found.bearing[d])
                     late += weight * found.delay[d]
+                    across += (weight * found.bearing_std[d]) ** 2
+                    along += (weight * found.delay_std[d]) ** 2
                     loudest = max(loudest, found.power[d])
             if total > 0.0:
                 landmark[row], caller[row] = labels[i], p
                 numbers[BEARING, row] = wrap_angle(math.atan2(north, east))
+                certainty[0, row] = math.sqrt(across) / total
                 if p == OWN:
                     numbers[RANGE, row] = metres * (late / total)
+                    certainty[1, row] = metres * (math.sqrt(along) / total)
                 numbers[LEVEL, row] = 10.0 * math.log10(loudest)
                 row += 1
-    return landmark[:row], caller[:row], numbers[:, :row].copy()
+    return landmark[:row], caller[:row], numbers[:, :row].copy(), certainty[:, :row].copy()
 
 
 @kernel

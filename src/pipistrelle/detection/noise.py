@@ -5,17 +5,26 @@ It is stated of the rows that a filter is handed, after those of one landmark we
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.config import FilterConfig
-from pipistrelle.detection.scans import BEARING_STD, RANGE_STD, Scan
+from pipistrelle.detection.faces import Heard
+from pipistrelle.detection.scans import BEARING_STD, OWN, RANGE_STD, Scan, with_columns
 from pipistrelle.jit import kernel
 
 Noise = Callable[[Scan], Scan]
 """Gives rows the standard deviations that they do not have."""
+
+BEARING_FLOOR = (0.002, 0.009)
+"""Error [rad] of a bearing that no level removes, by the vehicle's own call and by another's: what
+echoes that overlap do to each other and leave no trace beside the beam. With these the errors in
+the paper's worlds have the variances that are told; another's echoes come at all times, and overlap
+more."""
+RANGE_FLOOR = 0.01
+"""Error [m] of a range that no level removes, likewise."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,6 +64,39 @@ def _filled(
         if math.isnan(filled[RANGE_STD, m]):
             filled[RANGE_STD, m] = range_std
     return filled
+
+
+def measured(heard: Heard) -> Heard:
+    r"""Give the rows of a frame the standard deviations that the signal tells, before they merge.
+
+    .. math:: \sigma^2 = \sigma_{signal}^2 + \sigma_{floor}^2
+
+    Parameters
+    ----------
+    heard : Heard
+
+    Returns
+    -------
+    Heard
+        The same where the signal tells nothing.
+
+    Examples
+    --------
+    >>> from pipistrelle.detection.scans import make_scan
+    >>> rows = make_scan(0.5, np.array([3]), np.zeros(1), range=np.array([2.0]))
+    >>> heard = Heard(rows=rows, clutter=0, certainty=np.array([[0.003], [0.0]]))
+    >>> measured(heard).rows.bearing_std, measured(heard).rows.range_std
+    (array([0.00360555]), array([0.01]))
+    """
+    if heard.certainty is None:
+        return heard
+    across, along = heard.certainty
+    told = with_columns(
+        heard.rows,
+        bearing_std=np.hypot(across, np.where(heard.rows.caller == OWN, *BEARING_FLOOR)),
+        range_std=np.hypot(along, RANGE_FLOOR),
+    )
+    return replace(heard, rows=told)
 
 
 def as_said(scan: Scan) -> Scan:

@@ -18,7 +18,7 @@ Bradley & Abaid, Sec. II-D; what the paper leaves open is settled in the setting
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +26,7 @@ from jaxtyping import Complex, Float, Int, Shaped
 
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config, InputError
+from pipistrelle.detection.certainty import bearing_std, delay_std, loudest_noise, over_noise
 from pipistrelle.detection.onset import arrival_lag, reach_of, steer
 from pipistrelle.geometry import wrap
 from pipistrelle.jit import Whole, kernel, no_alloc
@@ -56,6 +57,9 @@ class Detections:
         Since the emission. Of another caller's tone it is nobody's to use but the label's.
     power : (m)
         Of the steered beam, divided by the elements: their number times the SNR of one.
+    bearing_std, delay_std : (m) [rad], [s]
+        How sure the detector is of each (`detection.certainty`); NaN, as by default, where it does
+        not say.
     """
 
     face: Int[np.ndarray, " m"]
@@ -64,6 +68,14 @@ class Detections:
     bearing: Float[np.ndarray, " m"]
     delay: Float[np.ndarray, " m"]
     power: Float[np.ndarray, " m"]
+    bearing_std: Float[np.ndarray, " m"] = field(default_factory=lambda: np.empty(0))
+    delay_std: Float[np.ndarray, " m"] = field(default_factory=lambda: np.empty(0))
+
+    def __post_init__(self) -> None:
+        """Say that a detector does not say how sure it is."""
+        for name in ("bearing_std", "delay_std"):
+            if not len(getattr(self, name)):
+                object.__setattr__(self, name, np.full(len(self.power), np.nan))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,6 +92,8 @@ class Detector:
         Power ratios.
     sine_limit : float
         Sine of the largest angle off the normal that counts.
+    loudest_noise : float
+        Most that noise alone leaves beside a beam, in units of the noise of one output.
     normal : (f) [rad]
     wave : (c) [rad]
         Phase between neighbours at 90 degrees, 2 pi f d / c, per tone.
@@ -94,6 +108,7 @@ class Detector:
     leakage: float
     peak: float
     sine_limit: float
+    loudest_noise: float
     normal: Float[np.ndarray, " f"]
     wave: Float[np.ndarray, " c"]
     scan: Float[np.ndarray, "c n"]
@@ -145,6 +160,7 @@ def detector(config: Config, layout: Layout, tones: Float[np.ndarray, " c"]) -> 
         leakage=10.0 ** (settings.leakage_db / 10.0),
         peak=10.0 ** (settings.peak_db / 10.0),
         sine_limit=math.sin(math.radians(settings.angle_limit_deg)),
+        loudest_noise=loudest_noise(elements),
         normal=layout.normal,
         wave=wave,
         scan=scan,
@@ -197,12 +213,14 @@ def detect(
         detector.leakage,
         detector.peak,
         detector.sine_limit,
+        detector.loudest_noise,
         detector.wave,
         detector.scan,
         detector.table,
     )
     lags = (start, interval, pulse)
-    face, caller, delay, sine, power = _find_peaks(matched, energy, rules, lags)
+    whole, numbers = _find_peaks(matched, energy, rules, lags)
+    (face, caller), (delay, sine, power, bearing_std, delay_std) = whole, numbers
     angle = np.arcsin(sine)
     return Detections(
         face=face,
@@ -211,6 +229,8 @@ def detect(
         bearing=wrap(angle + detector.normal[face]),
         delay=delay,
         power=power,
+        bearing_std=bearing_std,
+        delay_std=delay_std,
     )
 
 
@@ -222,6 +242,7 @@ class _Rules(NamedTuple):
     leakage: float
     peak: float
     sine_limit: float
+    loudest_noise: float
     wave: Float[np.ndarray, " c"]
     scan: Float[np.ndarray, "c n"]
     table: Float[np.ndarray, "c 2 k n"]
@@ -431,11 +452,12 @@ def _peaks(power: Float[np.ndarray, " n"], ratio: float, place: Int[np.ndarray, 
 
 
 @kernel
-def _grown(column: Shaped[np.ndarray, " m"]) -> Shaped[np.ndarray, " 2*m"]:
-    """Copy of a column with twice the room."""
-    wide = np.empty(2 * column.size, dtype=column.dtype)
-    for i in range(column.size):
-        wide[i] = column[i]
+def _grown(columns: Shaped[np.ndarray, "k m"]) -> Shaped[np.ndarray, "k 2*m"]:
+    """Copy of columns with twice the room."""
+    wide = np.empty((columns.shape[0], 2 * columns.shape[1]), dtype=columns.dtype)
+    for k in range(columns.shape[0]):
+        for i in range(columns.shape[1]):
+            wide[k, i] = columns[k, i]
     return wide
 
 
@@ -445,22 +467,16 @@ def _find_peaks(
     energy: Float[np.ndarray, " t"],
     rules: tuple,
     lags: tuple,
-) -> tuple[
-    Int[np.ndarray, " m"],
-    Int[np.ndarray, " m"],
-    Float[np.ndarray, " m"],
-    Float[np.ndarray, " m"],
-    Float[np.ndarray, " m"],
-]:
-    """Every peak of every snapshot: face, caller, delay, sine of the angle and power.
+) -> tuple[Int[np.ndarray, "2 m"], Float[np.ndarray, "5 m"]]:
+    """Every peak of every snapshot.
 
-    The last arguments are the columns of a `_Rules` and a `_Lags`.
+    Returns face and caller; delay, sine of the angle, power, and the standard deviations of bearing
+    and delay. The last arguments are the columns of a `_Rules` and a `_Lags`.
     """
     rule, lag = _Rules(*rules), _Lags(*lags)
     _, faces, tones, elements = matched.shape
     scan, wave, pulse = rule.scan, rule.wave, lag.pulse
-    face, tone = np.empty(128, dtype=np.int64), np.empty(128, dtype=np.int64)
-    delay, sine, peak_power = np.empty(128), np.empty(128), np.empty(128)
+    whole, numbers = np.empty((2, 128), dtype=np.int64), np.empty((5, 128))
     power, place = np.empty(scan.shape[1]), np.empty(scan.shape[1], dtype=np.int64)
     room = 2 * reach_of(pulse) + 3
     beam = np.empty(max(room, matched.shape[0]) if rule.runs else room, dtype=np.complex128)
@@ -483,12 +499,15 @@ def _find_peaks(
                 b, top = _loudest_lag(matched, within, f, p, u, beam)
                 if _is_leakage(energy, b * row + test % row, row, tones, pulse, rule.leakage):
                     continue
-            if count == face.size:
-                face, tone, delay = _grown(face), _grown(tone), _grown(delay)
-                sine, peak_power = _grown(sine), _grown(peak_power)
-            face[count], tone[count], sine[count] = f, p, u / wave[p]
+            if count == whole.shape[1]:
+                whole, numbers = _grown(whole), _grown(numbers)
+            whole[0, count], whole[1, count] = f, p
             late = arrival_lag(matched, b, f, p, u, pulse, beam)
-            delay[count] = lag.start + lag.interval * late
-            peak_power[count] = top / elements
+            sine, top = u / wave[p], top / elements
+            over = over_noise(top, energy[b * row + test % row], elements, rule.loudest_noise)
+            across = wave[p] * math.sqrt(1.0 - sine * sine)
+            numbers[0, count], numbers[1, count] = lag.start + lag.interval * late, sine
+            numbers[2, count], numbers[3, count] = top, bearing_std(over, across, elements)
+            numbers[4, count] = lag.interval * delay_std(over, pulse)
             count += 1
-    return face[:count], tone[:count], delay[:count], sine[:count], peak_power[:count]
+    return whole[:, :count], numbers[:, :count]

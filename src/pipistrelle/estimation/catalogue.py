@@ -212,14 +212,20 @@ def _ekf(config: Config, motion: "Motion") -> "Estimator":
     """Build EKF-SLAM."""
     from pipistrelle.estimation.ekf.filter import EkfSlam
 
-    return EkfSlam(motion=motion, rays=config.rays, gate=config.filter.gate)
+    return EkfSlam(motion=motion, **_gaussian(config))
 
 
 def _iekf(config: Config, motion: "Motion") -> "Estimator":
     """Build right-invariant EKF-SLAM."""
     from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
 
-    return InvariantEkfSlam(motion=motion, rays=config.rays, gate=config.filter.gate)
+    return InvariantEkfSlam(motion=motion, **_gaussian(config))
+
+
+def _gaussian(config: Config) -> dict[str, Any]:
+    """Return the settings of both EKFs."""
+    settings = config.filter
+    return {"rays": config.rays, "gate": settings.gate, "robust": settings.robust == "huber"}
 
 
 def _ekf_bytes(landmarks: int, members: int, _: Config) -> float:

@@ -116,6 +116,8 @@ class Sensing(NamedTuple):
         likelihood), EXACT (all of it each, as in a Gaussian mixture) or FITTED (federated, and
         ``spacing = "auto"``). One number, for the filter's speed hangs on how many there are in
         this record.
+    robust : bool
+        Whether a measurement that surprises counts less.
     """
 
     passive_bound: float
@@ -127,6 +129,7 @@ class Sensing(NamedTuple):
     aggregated: bool
     reinitialise: bool
     sharing: int
+    robust: bool
 
 
 @lru_cache(maxsize=16)
@@ -152,13 +155,17 @@ def gate_bounds(gate: float) -> tuple[float, float]:
 
 
 @lru_cache(maxsize=16)
-def sensing_of(rays: RayConfig, gate: float, exact: bool = False) -> Sensing:
+def sensing_of(
+    rays: RayConfig, gate: float, *, robust: bool = False, exact: bool = False
+) -> Sensing:
     """Gather what the kernels need to know of gates and rays, once per filter.
 
     Parameters
     ----------
     rays : RayConfig
     gate : (0, 1]
+    robust : bool
+        Whether a measurement that surprises counts less (`estimation.ekf.huber`).
     exact : bool
         Whether a bearing corrects every member by R itself, as in a Gaussian mixture (FastSLAM):
         its weights are densities.
@@ -181,6 +188,7 @@ def sensing_of(rays: RayConfig, gate: float, exact: bool = False) -> Sensing:
         aggregated=rays.weights == "aggregated",
         reinitialise=rays.partial == "reinitialise",
         sharing=EXACT if exact else _SHARING[rays.spacing, rays.likelihood],
+        robust=robust,
     )
 
 

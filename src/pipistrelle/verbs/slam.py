@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 GATE = 0.999
 """Share of a measurement's predicted distribution that is accepted of real logs."""
 GATE_KEY: Key = ("filter", "gate")
-OWN = {("rays", "spacing"): "auto"}
+OWN: dict[Key, str] = {("rays", "spacing"): "auto", ("filter", "noise"): "measured"}
 """Settings that a recorded log has others of than a simulated mission: its sensor is anyone's."""
 SUSPECT = 0.2
 """Share of a log's rows that may not fit before its units are asked about."""
@@ -168,8 +168,9 @@ def _with_log(layer: Layer, recorded: "Log", log: Path) -> Config:
     gate = GATE if recorded.gate is None else recorded.gate
     decided = {key: Given(getattr(recorded, key[1]), f"{log}: {key[1]}") for key in LOGGED}
     own = {GATE_KEY: Given(gate, str(log))}
-    if ("rays", "likelihood") not in layer:  # another reading of the paper is of the paper's rays
-        own |= {key: Given(value, "slam") for key, value in OWN.items()}
+    own |= {key: Given(value, "slam") for key, value in OWN.items()}
+    if ("rays", "likelihood") in layer:  # another reading of the paper is of the paper's rays
+        del own["rays", "spacing"]
     wished, settled = resolve(layer), resolve(own | layer | decided)
     for section, name in sorted(LOGGED & layer.keys()):
         value = getattr(getattr(settled, section), name)

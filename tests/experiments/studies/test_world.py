@@ -181,6 +181,8 @@ OTHERS = {
     "motion.wheelbase": 0.3,
     "motion.speed_std": 0.2,
     "motion.steering_std": 0.06,
+    "filter.noise": "measured",
+    "filter.robust": "huber",
     "filter.range_std": 0.4,
     "filter.bearing_std": 0.05,
     "filter.initial_pose_std": [0.1, 0.1, 0.1],

@@ -31,6 +31,7 @@ from pipistrelle.estimation.ekf.gaussian import (
     initialise,
     joint_of,
 )
+from pipistrelle.estimation.ekf.huber import tempered
 from pipistrelle.estimation.measurement import (
     Columns,
     Measurements,
@@ -188,6 +189,8 @@ def _correct_precisely(
 def _correct_known(state: State, row: Row, sensing: Sensing, scratch: _Scratch) -> Whole:
     """Correct with one measurement of a mapped landmark; tell whether it was gated."""
     first, count = _members_of(state.landmark, state.members[0], row.landmark)
+    if sensing.robust and state.weight[first] != WAITS:
+        row = tempered(state, first, count, row)
     distance, bearing, variance = row.range, row.bearing, row.bearing_variance
     joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
     passive = math.isnan(distance)

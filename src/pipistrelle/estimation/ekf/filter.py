@@ -97,6 +97,8 @@ class EkfSlam:
     gate : float
         A measurement outside this share of its predicted distribution (chi-square) is dropped;
         1 drops none.
+    robust : bool
+        Whether a measurement that surprises counts less (`estimation.ekf.huber`).
 
     Examples
     --------
@@ -114,6 +116,7 @@ class EkfSlam:
     motion: Motion
     rays: RayConfig
     gate: float = 1.0
+    robust: bool = False
 
     def init(self, pose: Gaussian) -> EkfBelief:
         """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
@@ -187,7 +190,9 @@ class EkfSlam:
         """
         if scan.landmark.size == 0:
             return belief
-        return EkfBelief(**taken_in(belief, scan, sensing_of(self.rays, self.gate), LINEAR))
+        return EkfBelief(
+            **taken_in(belief, scan, sensing_of(self.rays, self.gate, robust=self.robust), LINEAR)
+        )
 
 
 def taken_in(belief: EkfBelief, scan: Scan, sensing: Sensing, turns: float) -> dict[str, Any]:

@@ -90,6 +90,8 @@ class InvariantEkfSlam:
     gate : float
         A measurement outside this share of its predicted distribution (chi-square) is dropped;
         1 drops none.
+    robust : bool
+        Whether a measurement that surprises counts less (`estimation.ekf.huber`).
 
     Examples
     --------
@@ -111,6 +113,7 @@ class InvariantEkfSlam:
     motion: Motion
     rays: RayConfig
     gate: float = 1.0
+    robust: bool = False
 
     def init(self, pose: Gaussian) -> InvariantBelief:
         """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
@@ -171,7 +174,7 @@ class InvariantEkfSlam:
         """
         if scan.landmark.size == 0:
             return belief
-        sensing = sensing_of(self.rays, self.gate)
+        sensing = sensing_of(self.rays, self.gate, robust=self.robust)
         return InvariantBelief(origin=belief.origin, **taken_in(belief, scan, sensing, INVARIANT))
 
 

@@ -227,7 +227,7 @@ class FastSlam:
             return belief
         particles = self.settings.particles
         normal, uniform = rng.standard_normal((particles, 3)), rng.random(particles)
-        sensing = sensing_of(self.rays, self.gate, self.settings.mixture == "exact")
+        sensing = sensing_of(self.rays, self.gate, exact=self.settings.mixture == "exact")
         sampled = self.settings.weights == "sampled"
         inside, gated = self._inside(belief, scan, sensing)
         corrected, gained = correct_particles(

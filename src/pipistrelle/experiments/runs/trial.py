@@ -13,7 +13,7 @@ from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import Config, Strategy
 from pipistrelle.detection.faces import Heard
 from pipistrelle.detection.merging import scan_of
-from pipistrelle.detection.noise import noise_of
+from pipistrelle.detection.noise import measured, noise_of
 from pipistrelle.detection.scans import Scan, rows_of
 from pipistrelle.estimation.association import Associate, told
 from pipistrelle.estimation.beliefs import (
@@ -119,8 +119,9 @@ def scans_of(heard: Sequence[Heard], strategy: Strategy, config: Config) -> tupl
     tuple of Scan
         As many.
     """
-    noise = noise_of(config.filter)
-    return tuple(noise(scan_of(frame, strategy)) for frame in heard)
+    noise, said = noise_of(config.filter), config.filter.noise == "measured"
+    frames = map(measured, heard) if said else heard
+    return tuple(noise(scan_of(frame, strategy)) for frame in frames)
 
 
 def drive_of(scenario: Scenario, config: Config) -> Drive:
