@@ -16,6 +16,7 @@ from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
 from pipistrelle.estimation.fastslam.filter import FastSlam
 from pipistrelle.estimation.motion import Motion, motion_jacobians, motion_step
+from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.runs.filtering import run_filter
 from reference.missions import (
@@ -271,6 +272,12 @@ class TestInvariantEkfSlam(EstimatorContract):
     @pytest.fixture
     def slam(self):
         return InvariantEkfSlam(motion=BICYCLE, rays=ray_config())
+
+
+class TestSmoother(EstimatorContract):
+    @pytest.fixture(params=["none", "huber"])
+    def slam(self, request):
+        return Smoother(motion=BICYCLE, rays=ray_config(), robust=request.param == "huber")
 
 
 class TestFastSlam(EstimatorContract):

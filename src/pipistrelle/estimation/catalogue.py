@@ -222,6 +222,13 @@ def _iekf(config: Config, motion: "Motion") -> "Estimator":
     return InvariantEkfSlam(motion=motion, **_gaussian(config))
 
 
+def _smoother(config: Config, motion: "Motion") -> "Estimator":
+    """Build the smoother."""
+    from pipistrelle.estimation.smoother.filter import Smoother
+
+    return Smoother(motion=motion, **_gaussian(config))
+
+
 def _gaussian(config: Config) -> dict[str, Any]:
     """Return the settings of both EKFs."""
     settings = config.filter
@@ -270,6 +277,14 @@ CATALOGUE = {
             name="iekf",
             title="invariant EKF",
             build=_iekf,
+            sections=("filter", "rays"),
+            nees_limit=50.0,
+            memory=_ekf_bytes,
+        ),
+        Entry(
+            name="smoother",
+            title="smoother",
+            build=_smoother,
             sections=("filter", "rays"),
             nees_limit=50.0,
             memory=_ekf_bytes,

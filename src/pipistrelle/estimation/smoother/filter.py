@@ -1,0 +1,377 @@
+r"""The smoother: nothing is linearised for good, and the whole path is thought over again.
+
+A filter folds what it hears into one Gaussian, linearised where it then thought it was. Here all
+that was ever heard stays a *factor* between a pose and a landmark, and a sparse solver (GTSAM's
+iSAM2: Kaess et al., International Journal of Robotics Research 31, 2012) goes on to linearise what
+has moved. Poses are those from which something was heard (`legs` has the steps between).
+
+A landmark enters with its first range, and else where two of its bearings cross clearly
+(`crossing`), with all its bearings so far: until then it waits, its bearings say nothing, and it
+counts as partial. It enters with a prior of `PRIOR_STD`, which says next to nothing and leaves no
+graph without a solution. What cannot be solved with new landmarks is solved without them: they go
+on waiting.
+
+``robust`` takes each measurement by Huber's loss. What is believed at a frame is the pose of iSAM2;
+`SmootherBelief.path` and the map are the optimum of everything so far.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import gtsam
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipistrelle.config import RayConfig
+from pipistrelle.detection.scans import Scan, rows_of
+from pipistrelle.estimation.beliefs import Gaussian, Landmarks
+from pipistrelle.estimation.measurement import measurement_jacobians, observe
+from pipistrelle.estimation.motion import Motion
+from pipistrelle.estimation.rays import gate_bounds, ray_members
+from pipistrelle.estimation.smoother.crossing import Bearing, crossing
+from pipistrelle.estimation.smoother.graph import (
+    Link,
+    Solver,
+    in_world,
+    landmark_key,
+    leg_factor,
+    links,
+    pose_key,
+    pose_of,
+    start_factor,
+)
+from pipistrelle.estimation.smoother.legs import (
+    NOWHERE,
+    Leg,
+    between,
+    longer,
+    placed,
+    symmetric,
+    turned,
+)
+from pipistrelle.geometry import wrap_angle
+
+PRIOR_STD = 20.0
+"""Of a landmark about the place where it enters [m]."""
+BELIEVED = 2.0
+"""Standard deviations that a measurement may be off without counting less."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SmootherBelief:
+    """A link of the graph's chain, and what waits to enter it.
+
+    Attributes
+    ----------
+    at : Gaussian of (3) and (3, 3)
+        The last pose of the graph, as it was believed when it entered.
+    leg : Leg
+        The steps since.
+    link : Link
+    mapped : tuple of int
+        Landmarks in the graph, in order of entry.
+    waiting : dict of label to tuple of Bearing
+    gated : int
+    rays : RayConfig
+    solver : Solver
+        Shared with the beliefs before and after.
+    """
+
+    at: Gaussian
+    leg: Leg = NOWHERE
+    link: Link
+    mapped: tuple[int, ...] = ()
+    waiting: Mapping[int, tuple[Bearing, ...]] = field(default_factory=dict)
+    gated: int = 0
+    rays: RayConfig
+    solver: Solver
+
+    def pose(self) -> Gaussian:
+        """Return the vehicle's pose, (3) and (3, 3)."""
+        if not len(self.leg.mean):
+            return self.at
+        steps = placed(self.at, self.leg)
+        return Gaussian(mean=steps.mean[-1], covariance=steps.covariance[-1])
+
+    def path(self) -> Gaussian:
+        """Return the start and every control step so far, by all that is known now."""
+        best = self.solver.solve(self.link)
+        start = best.pose(0)
+        parts = [Gaussian(mean=start.mean[None], covariance=start.covariance[None])]
+        for link in links(self.link):
+            if link.leg:
+                ends = np.array([best.pose_mean(link.node - 1), best.pose_mean(link.node)])
+                parts.append(between(ends, best.joint(link.node - 1, link.node), link.leg))
+        parts.append(placed(best.pose(self.link.node), self.leg))
+        return Gaussian(
+            mean=np.concatenate([part.mean for part in parts]),
+            covariance=np.concatenate([part.covariance for part in parts]),
+        )
+
+    def landmarks(self) -> Landmarks:
+        """Return the map: a row for each landmark in the graph, a ray for each that waits."""
+        best = self.solver.solve(self.link) if self.mapped or self.waiting else None
+        if best is None:
+            return _rows([], [])
+        points = [(label, best.point(label), 1.0) for label in self.mapped]
+        rays = [
+            (label, member, weight)
+            for label, bearings in self.waiting.items()
+            for member, weight in _ray(best.pose(bearings[-1].node), bearings[-1], self.rays)
+        ]
+        return _rows(points, rays)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Smoother:
+    """Incremental smoothing and mapping by iSAM2.
+
+    Attributes
+    ----------
+    motion : Motion
+    rays : RayConfig
+        How far a landmark may be that waits; nothing else is done with rays.
+    gate : float
+        A measurement outside this share of its predicted distribution (chi-square) is dropped;
+        1 drops none.
+    robust : bool
+        Whether a measurement that surprises counts less.
+
+    Examples
+    --------
+    >>> from pipistrelle.detection.scans import make_scan
+    >>> motion = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
+    >>> slam = Smoother(motion=motion, rays=RayConfig())
+    >>> belief = slam.init(Gaussian(mean=np.zeros(3), covariance=np.eye(3) * 1e-4))
+    >>> known = {"range": np.array([2.0, np.nan]), "range_std": 0.2, "bearing_std": 0.15}
+    >>> scan = make_scan(0.0, np.array([4, 9]), np.array([0.1, 0.2]), **known)
+    >>> slam.update(belief, scan).landmarks().landmark.tolist()
+    [4, 9, 9, 9, 9]
+    """
+
+    motion: Motion
+    rays: RayConfig
+    gate: float = 1.0
+    robust: bool = False
+
+    def init(self, pose: Gaussian) -> SmootherBelief:
+        """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
+        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        factors.add(start_factor(0, pose))
+        values.insert(pose_key(0), gtsam.Pose2(*pose.mean))
+        return SmootherBelief(
+            at=Gaussian(mean=pose.mean.astype(float), covariance=pose.covariance.astype(float)),
+            link=Link(before=None, node=0, leg=None, factors=factors, values=values),
+            rays=self.rays,
+            solver=Solver(),
+        )
+
+    def predict(
+        self,
+        belief: SmootherBelief,
+        controls: Float[np.ndarray, "k 2"],
+        dt: Float[np.ndarray, " k"],
+        rng: np.random.Generator | None = None,
+    ) -> tuple[SmootherBelief, Gaussian]:
+        """Carry the belief through the control steps of a frame.
+
+        Parameters
+        ----------
+        belief : SmootherBelief
+        controls : (k, 2) [m/s, rad or rad/s]
+        dt : (k) [s]
+        rng : Generator, optional
+            Not used: nothing is drawn.
+
+        Returns
+        -------
+        belief : SmootherBelief
+        poses : Gaussian of (k, 3) and (k, 3, 3)
+            After each step.
+        """
+        leg = longer(belief.leg, self.motion, controls, dt)
+        steps, new = placed(belief.at, leg), len(leg.mean) - len(dt)
+        poses = Gaussian(mean=steps.mean[new:], covariance=steps.covariance[new:])
+        return replace(belief, leg=leg), poses
+
+    def update(
+        self, belief: SmootherBelief, scan: Scan, rng: np.random.Generator | None = None
+    ) -> SmootherBelief:
+        """Let a frame's measurements enter the graph, and what they place.
+
+        Parameters
+        ----------
+        belief : SmootherBelief
+        scan : Scan
+        rng : Generator, optional
+            Not used: nothing is drawn.
+
+        Returns
+        -------
+        SmootherBelief
+        """
+        if scan.landmark.size == 0:
+            return belief
+        here = _arrived(belief)
+        if self.gate < 1.0 and belief.mapped:
+            inside = _inside(here, scan, self.gate)
+            dropped = int(np.count_nonzero(~inside))
+            here, scan = replace(here, gated=here.gated + dropped), rows_of(scan, inside)
+        for placing in (True, False):
+            heard = self._heard(here, scan, placing=placing)
+            try:
+                return _settled(heard)
+            except RuntimeError:  # what entered cannot be solved
+                continue
+        return _settled(here)
+
+    def _heard(self, here: SmootherBelief, scan: Scan, *, placing: bool) -> SmootherBelief:
+        """Add a frame's factors, and those of what it places, if it may, as a link."""
+        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        mapped, waiting, node = list(here.mapped), dict(here.waiting), here.link.node
+        poses = _poses(here)
+        columns = (scan.landmark, scan.bearing, scan.range, scan.bearing_std, scan.range_std)
+        for label, bearing, distance, across, along in zip(*map(_listed, columns), strict=True):
+            if label not in mapped:
+                if math.isnan(distance):
+                    queue = (*waiting.get(label, ()), Bearing(node, bearing, across))
+                    waiting[label], place = queue, crossing(poses, queue) if placing else None
+                else:
+                    place = _ahead(poses[node], bearing, distance)
+                if place is None:
+                    continue
+                mapped.append(label)
+                values.insert(landmark_key(label), place)
+                factors.add(_prior(label, place))
+                for earlier in waiting.pop(label, ()):
+                    factors.add(self._bearing(earlier, label))
+                if math.isnan(distance):
+                    continue
+            if math.isnan(distance):
+                factors.add(self._bearing(Bearing(node, bearing, across), label))
+            else:
+                factors.add(self._range(node, label, (bearing, distance), (across, along)))
+        link = Link(before=here.link, node=node, leg=None, factors=factors, values=values)
+        return replace(here, link=link, mapped=tuple(mapped), waiting=waiting)
+
+    def _bearing(self, heard: Bearing, label: int) -> gtsam.BearingFactor2D:
+        """Return what a bearing says."""
+        noise = self._noise(gtsam.noiseModel.Isotropic.Sigma(1, heard.std))
+        keys = pose_key(heard.node), landmark_key(label)
+        return gtsam.BearingFactor2D(*keys, gtsam.Rot2(heard.bearing), noise)
+
+    def _range(
+        self, node: int, label: int, heard: tuple[float, float], std: tuple[float, float]
+    ) -> gtsam.BearingRangeFactor2D:
+        """Return what a bearing and a range say."""
+        noise = self._noise(gtsam.noiseModel.Diagonal.Sigmas(np.array(std)))
+        bearing, distance = heard
+        keys = pose_key(node), landmark_key(label)
+        return gtsam.BearingRangeFactor2D(*keys, gtsam.Rot2(bearing), distance, noise)
+
+    def _noise(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
+        """Return a noise model, with Huber's loss where that is asked for."""
+        if not self.robust:
+            return noise
+        huber = gtsam.noiseModel.mEstimator.Huber.Create(BELIEVED)
+        return gtsam.noiseModel.Robust.Create(huber, noise)
+
+
+def _arrived(belief: SmootherBelief) -> SmootherBelief:
+    """Let the leg enter the graph, where the vehicle has moved, and its end be the last pose."""
+    if not belief.leg.moves():
+        return belief
+    node, pose = belief.link.node + 1, belief.pose()
+    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    factors.add(leg_factor(node, belief.leg))
+    values.insert(pose_key(node), gtsam.Pose2(*pose.mean))
+    link = Link(before=belief.link, node=node, leg=belief.leg, factors=factors, values=values)
+    return replace(belief, at=pose, leg=NOWHERE, link=link)
+
+
+def _settled(belief: SmootherBelief) -> SmootherBelief:
+    """Return the belief with the last pose as the solver has it."""
+    isam, key = belief.solver.reach(belief.link), pose_key(belief.link.node)
+    mean = pose_of(isam.calculateEstimatePose2(key))
+    return replace(belief, at=in_world(mean, isam.marginalCovariance(key)))
+
+
+def _poses(here: SmootherBelief) -> Float[np.ndarray, "n 3"]:
+    """Return the graph's poses by their numbers, the last as it is expected."""
+    isam = here.solver.reach(here.link)
+    return gtsam.utilities.extractPose2(isam.calculateEstimate())
+
+
+def _inside(here: SmootherBelief, scan: Scan, gate: float) -> Bool[np.ndarray, " m"]:
+    """Tell which measurements are inside a share of their predicted distribution, or are new."""
+    isam, key = here.solver.reach(here.link), pose_key(here.link.node)
+    pose = pose_of(isam.calculateEstimatePose2(key))
+    bounds, inside = gate_bounds(gate), np.ones(scan.landmark.size, bool)
+    M = np.eye(5)
+    M[:3, :3] = turned(pose[2])
+    for m, label in enumerate(scan.landmark.tolist()):
+        if label not in here.mapped:
+            continue
+        other = landmark_key(label)
+        point = np.array(isam.calculateEstimatePoint2(other))
+        told = isam.jointMarginalCovariance([key, other])
+        joint = np.block([[told.at(a, b) for b in (key, other)] for a in (key, other)])
+        near, expected, _, _, _ = observe(*pose, *point)
+        H = np.hstack(measurement_jacobians(pose, point)) @ M
+        off = np.array([scan.range[m] - near, wrap_angle(scan.bearing[m] - expected)])
+        R = np.square([scan.range_std[m], scan.bearing_std[m]])
+        rows = slice(1, 2) if math.isnan(scan.range[m]) else slice(0, 2)
+        S = (H @ joint @ H.T + np.diag(R))[rows, rows]
+        squared = float(off[rows] @ np.linalg.solve(S, off[rows]))
+        inside[m] = squared <= bounds[len(off[rows]) - 1]
+    return inside
+
+
+def _ahead(pose: Float[np.ndarray, "3"], bearing: float, distance: float) -> np.ndarray:
+    """Return the point at a bearing and a range from a pose."""
+    angle = pose[2] + bearing
+    return pose[:2] + distance * np.array([math.cos(angle), math.sin(angle)])
+
+
+def _prior(label: int, place: Float[np.ndarray, "2"]) -> gtsam.PriorFactorPoint2:
+    """Return what is known of a landmark beforehand: next to nothing."""
+    noise = gtsam.noiseModel.Isotropic.Sigma(2, PRIOR_STD)
+    return gtsam.PriorFactorPoint2(landmark_key(label), place, noise)
+
+
+def _listed(column: np.ndarray) -> list:
+    """Return a column as Python's numbers."""
+    return column.tolist()
+
+
+def _ray(pose: Gaussian, heard: Bearing, rays: RayConfig) -> list[tuple[Gaussian, float]]:
+    """Return the members of the ray that a landmark lies on which waits: two or more."""
+    ranges, stds = ray_members(rays)
+    if len(ranges) == 1:
+        ranges, stds = np.repeat(ranges, 2), np.repeat(stds, 2)
+    direction = turned(pose.mean[2] + heard.bearing)[:2, :2]
+    return [
+        (
+            Gaussian(
+                mean=_ahead(pose.mean, heard.bearing, far),
+                covariance=symmetric(
+                    direction @ np.diag([spread**2, (far * heard.std) ** 2]) @ direction.T
+                    + pose.covariance[:2, :2]
+                ),
+            ),
+            1.0 / len(ranges),
+        )
+        for far, spread in zip(ranges, stds, strict=True)
+    ]
+
+
+def _rows(*parts: list[tuple[int, Gaussian, float]]) -> Landmarks:
+    """Lay out a map of labels, places and weights."""
+    rows = [row for part in parts for row in part]
+    return Landmarks(
+        landmark=np.array([label for label, _, _ in rows], dtype=np.int64),
+        mean=np.array([place.mean for _, place, _ in rows]).reshape(-1, 2),
+        covariance=np.array([place.covariance for _, place, _ in rows]).reshape(-1, 2, 2),
+        weight=np.array([weight for _, _, weight in rows], dtype=float),
+    )

@@ -1,0 +1,195 @@
+"""The graph: poses and landmarks with all that is known of them, solved by GTSAM's iSAM2.
+
+What entered it is a chain, each link what one frame added to the one before, and never changed: a
+belief is a link. The solver itself changes; it stands at one link, goes on to the next as frames
+come, and is built anew where it is asked for a link that it has left behind.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.smoother.legs import SMALLEST_STD, Leg, symmetric, turned
+
+RELINEARIZE = 0.1
+"""Change of a variable [m, rad] beyond which iSAM2 linearises anew what hangs on it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Link:
+    """What one frame added to a graph.
+
+    Attributes
+    ----------
+    before : Link or None
+    node : int
+        Number of the pose from which the frame was heard.
+    leg : Leg or None
+        The way to it, where it is new.
+    factors : NonlinearFactorGraph
+    values : Values
+        Where what is new is thought to be.
+    """
+
+    before: "Link | None"
+    node: int
+    leg: Leg | None
+    factors: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+
+
+def links(last: Link) -> Iterator[Link]:
+    """Walk through a chain, the first link first."""
+    chain: list[Link] = []
+    link: Link | None = last
+    while link:
+        chain.append(link)
+        link = link.before
+    return reversed(chain)
+
+
+@dataclass(kw_only=True)
+class Solver:
+    """iSAM2, standing at one link of a chain."""
+
+    at: Link | None = None
+    isam: gtsam.ISAM2 = field(default_factory=lambda: _new())
+    best: "Best | None" = None
+
+    def reach(self, link: Link) -> gtsam.ISAM2:
+        """Return iSAM2 as it is after a link.
+
+        Raises
+        ------
+        RuntimeError
+            Where the link makes a graph that cannot be solved; the solver then stands nowhere.
+        """
+        if self.at is link:
+            return self.isam
+        way = (link,) if link.before is self.at else links(link)
+        if link.before is not self.at or self.at is None:
+            self.isam = _new()
+        self.at = None
+        for step in way:
+            self.isam.update(step.factors, step.values)
+        self.at = link
+        return self.isam
+
+    def solve(self, link: Link) -> "Best":
+        """Return the best solution of all that entered up to a link."""
+        if self.best is None or self.best.link is not link:
+            graph = gtsam.NonlinearFactorGraph()
+            for step in links(link):
+                graph.push_back(step.factors)
+            self.best = Best(link=link, graph=graph, found=self.reach(link).calculateEstimate())
+        return self.best
+
+
+def _new() -> gtsam.ISAM2:
+    """Return a solver that knows nothing."""
+    settings = gtsam.ISAM2Params()
+    settings.setRelinearizeThreshold(RELINEARIZE)
+    return gtsam.ISAM2(settings)
+
+
+@dataclass(kw_only=True)
+class Best:
+    """The most likely poses and landmarks, all linearised where they are, and their covariances.
+
+    Attributes
+    ----------
+    link : Link
+    graph : NonlinearFactorGraph
+    found : Values
+        Where iSAM2 thinks them: Levenberg and Marquardt begin there.
+    """
+
+    link: Link
+    graph: gtsam.NonlinearFactorGraph
+    found: gtsam.Values
+
+    @cached_property
+    def values(self) -> gtsam.Values:
+        """Return the optimum, or what iSAM2 found where none can be reached from there."""
+        try:
+            return gtsam.LevenbergMarquardtOptimizer(self.graph, self.found).optimize()
+        except RuntimeError:
+            return self.found
+
+    @cached_property
+    def marginals(self) -> gtsam.Marginals:
+        """Return what tells covariances at the optimum."""
+        return gtsam.Marginals(self.graph, self.values)
+
+    def pose_mean(self, node: int) -> Float[np.ndarray, "3"]:
+        """Return where a pose is."""
+        return pose_of(self.values.atPose2(pose_key(node)))
+
+    def pose(self, node: int) -> Gaussian:
+        """Return a pose, (3) and (3, 3)."""
+        mean = self.pose_mean(node)
+        return in_world(mean, self.marginals.marginalCovariance(pose_key(node)))
+
+    def point(self, label: int) -> Gaussian:
+        """Return a landmark, (2) and (2, 2)."""
+        key = landmark_key(label)
+        mean = np.array(self.values.atPoint2(key))
+        return Gaussian(mean=mean, covariance=symmetric(self.marginals.marginalCovariance(key)))
+
+    def joint(self, node: int, other: int) -> Float[np.ndarray, "6 6"]:
+        """Return the covariance of two poses."""
+        keys = pose_key(node), pose_key(other)
+        told = self.marginals.jointMarginalCovariance(list(keys))
+        M = np.zeros((6, 6))
+        for part, key in enumerate(keys):
+            rows = slice(3 * part, 3 * part + 3)
+            M[rows, rows] = turned(self.values.atPose2(key).theta())
+        return M @ np.block([[told.at(a, b) for b in keys] for a in keys]) @ M.T
+
+
+def pose_key(node: int) -> int:
+    """Name a pose in the graph."""
+    return gtsam.symbol("x", node)
+
+
+def landmark_key(label: int) -> int:
+    """Name a landmark in the graph."""
+    return gtsam.symbol("l", label)
+
+
+def pose_of(pose: gtsam.Pose2) -> Float[np.ndarray, "3"]:
+    """Return GTSAM's pose as ours [m, m, rad]."""
+    return np.array([pose.x(), pose.y(), pose.theta()])
+
+
+def in_world(mean: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"]) -> Gaussian:
+    """Return a pose whose covariance is told in its own axes, as GTSAM does."""
+    M = turned(mean[2])
+    return Gaussian(mean=mean, covariance=symmetric(M @ covariance @ M.T))
+
+
+def start_factor(node: int, pose: Gaussian) -> gtsam.PriorFactorPose2:
+    """Return what is known of a pose (3) and (3, 3) beforehand."""
+    M = turned(pose.mean[2])
+    return gtsam.PriorFactorPose2(
+        pose_key(node), gtsam.Pose2(*pose.mean), _gaussian(M.T @ pose.covariance @ M)
+    )
+
+
+def leg_factor(node: int, leg: Leg) -> gtsam.BetweenFactorPose2:
+    """Return what the controls say of the way from the pose before to this one."""
+    M = turned(leg.mean[-1, 2])
+    noise = _gaussian(M.T @ leg.covariance[-1] @ M)
+    return gtsam.BetweenFactorPose2(
+        pose_key(node - 1), pose_key(node), gtsam.Pose2(*leg.mean[-1]), noise
+    )
+
+
+def _gaussian(covariance: Float[np.ndarray, "3 3"]) -> gtsam.noiseModel.Gaussian:
+    """Return a noise model, which must have an inverse."""
+    return gtsam.noiseModel.Gaussian.Covariance(covariance + SMALLEST_STD**2 * np.eye(3))
