@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -5,7 +7,7 @@ from hypothesis import strategies as st
 
 from pipistrelle.detection.faces import Heard, average_faces, same_echo, unlabelled
 from pipistrelle.detection.merging import scan_of
-from pipistrelle.detection.scans import COLUMNS, OWN, UNLABELLED
+from pipistrelle.detection.scans import COLUMNS, OWN, UNLABELLED, with_columns
 from pipistrelle.detection.snapshots import Detections
 from pipistrelle.geometry import circular_mean, wrap
 from reference.missions import scan_with
@@ -42,6 +44,12 @@ def crowd(rng, count=40, labels=8):
     )
     label = rng.integers(0, labels, count)
     return detections(*rows), np.where(label == 0, UNLABELLED, label)
+
+
+def sure(rng, found):
+    """Return detections that say how sure they are."""
+    stds = rng.uniform(0.001, 0.1, (2, found.power.size))
+    return replace(found, bearing_std=stds[0], delay_std=1e-3 * stds[1])
 
 
 def heard_of(found, label, averaging="plain"):
@@ -85,13 +93,50 @@ def test_each_landmark_gets_the_mean_of_its_strongest_estimate_of_each_face(seed
 def test_the_order_of_the_detections_does_not_matter(seed, averaging):
     rng = np.random.default_rng(seed)
     found, label = crowd(rng)
+    found = sure(rng, found)
     order = rng.permutation(label.size)
     columns = {name: getattr(found, name)[order] for name in Detections.__slots__}
     one = heard_of(found, label, averaging)
     two = heard_of(Detections(**columns), label[order], averaging)
     for name in COLUMNS:
         assert getattr(one.rows, name).tobytes() == getattr(two.rows, name).tobytes()
+    assert one.certainty.tobytes() == two.certainty.tobytes()
     assert one.clutter == two.clutter
+
+
+@given(seed=SEEDS, averaging=AVERAGING)
+@law
+def test_a_mean_is_as_sure_as_its_parts_and_their_weights_make_it(seed, averaging):
+    rng = np.random.default_rng(seed)
+    found, label = crowd(rng)
+    found = sure(rng, found)
+    heard = heard_of(found, label, averaging)
+    assert heard.certainty.shape == (2, heard.rows.landmark.size)
+    for i, (landmark, tone) in enumerate(zip(heard.rows.landmark, heard.rows.caller, strict=True)):
+        rows = strongest(found, label, landmark, tone)
+        weight = np.cos(found.angle[rows]) ** 2 if averaging == "weighted" else np.ones(len(rows))
+        weight /= weight.sum()
+        across = np.sqrt(np.sum(np.square(weight * found.bearing_std[rows])))
+        assert heard.certainty[0, i] == pytest.approx(across, rel=1e-12)
+        along = 0.5 * 343.0 * np.sqrt(np.sum(np.square(weight * found.delay_std[rows])))
+        assert heard.certainty[1, i] == pytest.approx(along if tone == OWN else NAN, nan_ok=True)
+
+
+def test_a_plain_mean_of_n_has_the_root_of_the_summed_variances_over_n():
+    found = detections((0, 0, 44, 0.02, 9), (1, 0, -46, 0.02, 8), (0, 0, 44, 0.02, 1))
+    found = replace(
+        found, bearing_std=np.array([0.03, 0.04, 9.0]), delay_std=np.array([3e-6, 4e-6, 9.0])
+    )
+    heard = heard_of(found, [5, 5, 5])
+    np.testing.assert_allclose(heard.certainty, [[0.05 / 2], [343.0 / 2 * 5e-6 / 2]], rtol=1e-12)
+
+
+def test_a_mean_of_which_one_part_says_nothing_says_nothing():
+    found = detections((0, 0, 44, 0.02, 9), (1, 0, -46, 0.02, 8), (0, 0, 10, 0.03, 9))
+    found = replace(found, bearing_std=np.array([0.03, NAN, 0.02]), delay_std=np.full(3, 1e-6))
+    heard = heard_of(found, [5, 5, 6])
+    assert np.isnan(heard.certainty[0]).tolist() == [True, False]
+    assert np.isfinite(heard.certainty[1]).all()
 
 
 def test_directions_either_side_of_straight_back_average_straight_back():
@@ -241,6 +286,31 @@ def test_without_labels_rows_are_what_they_were_and_nobodys():
         np.testing.assert_array_equal(getattr(nobodys.rows, name), getattr(heard.rows, name))
     fused = scan_of(nobodys, "fused")
     assert fused.landmark.size == nobodys.rows.landmark.size, "nothing is merged without a label"
+
+
+def test_without_labels_rows_are_as_sure_as_they_were():
+    rng = np.random.default_rng(3)
+    found, label = crowd(rng)
+    heard = heard_of(sure(rng, found), label)
+    np.testing.assert_array_equal(unlabelled(heard).certainty, heard.certainty)
+
+
+def test_rows_of_one_landmark_fuse_by_inverse_variances_where_all_are_told_and_plainly_else():
+    rows = scan_with(
+        [4, 4, 4], [3.1, -3.1, -3.0], [5.0, NAN, NAN], caller=np.arange(3),
+        bearing_std=np.array([0.01, 0.02, 0.04]), range_std=0.3,
+    )  # fmt: skip
+    weight = np.array([16.0, 4.0, 1.0])
+    fused = scan_of(Heard(rows=rows, clutter=0), "fused")
+    mean = wrap(3.1 + np.average(wrap(rows.bearing - 3.1), weights=weight))
+    assert fused.bearing[0] == pytest.approx(mean, abs=1e-12)
+    assert fused.bearing_std[0] == pytest.approx(0.04 / np.sqrt(21.0), rel=1e-12)
+    assert fused.range_std.tolist() == [0.3]
+    unsaid = with_columns(rows, bearing_std=np.array([0.01, NAN, 0.04]))
+    plain = scan_of(Heard(rows=unsaid, clutter=0), "fused")
+    mean = wrap(3.1 + np.mean(wrap(rows.bearing - 3.1)))
+    assert plain.bearing[0] == pytest.approx(mean, abs=1e-12)
+    assert np.isnan(plain.bearing_std).all()
 
 
 def test_three_callers_of_one_landmark_are_averaged_as_directions():

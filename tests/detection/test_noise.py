@@ -1,9 +1,19 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from pipistrelle.config import FilterConfig
-from pipistrelle.detection.noise import ConstantNoise, noise_of
-from pipistrelle.detection.scans import COLUMNS
+from pipistrelle.config import Config, FilterConfig
+from pipistrelle.detection.faces import Heard
+from pipistrelle.detection.noise import (
+    BEARING_FLOOR,
+    RANGE_FLOOR,
+    ConstantNoise,
+    measured,
+    noise_of,
+)
+from pipistrelle.detection.scans import COLUMNS, with_columns
+from pipistrelle.experiments.runs.trial import scans_of
 from reference.missions import scan_with
 
 NAN = np.nan
@@ -32,3 +42,82 @@ def test_the_noise_of_the_settings_is_theirs(range_std, bearing_std):
     noise = noise_of(FilterConfig(range_std=range_std, bearing_std=bearing_std))
     assert noise == ConstantNoise(range_std=range_std, bearing_std=bearing_std)
     assert hash(noise) == hash(noise_of(FilterConfig(range_std=range_std, bearing_std=bearing_std)))
+
+
+# What the signal tells
+
+ROWS = scan_with(
+    [3, 3, 8, 9], [0.1, 0.14, 0.3, -1.0], [2.0, NAN, NAN, 5.0],
+    caller=np.array([0, 1, 2, 0]), bearing_std=NAN, range_std=NAN, level_db=12.0,
+)  # fmt: skip
+CERTAINTY = np.array([[0.003, 0.01, 0.02, 0.0], [0.004, NAN, NAN, 0.0]])
+HEARD = Heard(rows=ROWS, clutter=2, certainty=CERTAINTY)
+
+
+def test_rows_are_as_sure_as_the_signal_tells_and_no_surer_than_the_floor_of_their_caller():
+    told = measured(HEARD)
+    own, other = BEARING_FLOOR
+    expected = np.hypot(CERTAINTY[0], [own, other, other, own])
+    np.testing.assert_allclose(told.rows.bearing_std, expected, rtol=1e-15)
+    expected = [np.hypot(0.004, RANGE_FLOOR), NAN, NAN, RANGE_FLOOR]
+    np.testing.assert_allclose(told.rows.range_std, expected, rtol=1e-15)
+    assert own < other, "another's echoes come at all times, and overlap more"
+
+
+def test_what_the_signal_tells_changes_nothing_else():
+    told = measured(HEARD)
+    for name in set(COLUMNS) - {"bearing_std", "range_std"}:
+        np.testing.assert_array_equal(getattr(told.rows, name), getattr(ROWS, name))
+    assert (told.rows.time, told.clutter) == (ROWS.time, 2)
+    assert told.certainty is CERTAINTY
+    assert np.isnan(ROWS.bearing_std).all(), "the frame itself stays as it was"
+
+
+def test_a_frame_of_which_the_signal_tells_nothing_stays_as_it_is():
+    untold = replace(HEARD, certainty=None)
+    assert measured(untold) is untold
+    unsure = replace(HEARD, certainty=np.full((2, 4), NAN))
+    assert np.isnan(measured(unsure).rows.bearing_std).all()
+
+
+def settled(noise):
+    return Config(filter=FilterConfig(noise=noise, range_std=0.2, bearing_std=0.15))
+
+
+@pytest.mark.parametrize("strategy", ["active", "fused", "passive"])
+def test_with_constant_noise_scans_are_to_the_bit_those_of_a_detector_that_tells_nothing(strategy):
+    sure = scans_of([HEARD], strategy, settled("constant"))
+    unsure = scans_of([replace(HEARD, certainty=None)], strategy, settled("constant"))
+    for one, other in zip(sure, unsure, strict=True):
+        for name in COLUMNS:
+            assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
+        assert set(one.bearing_std.tolist()) == {0.15}
+
+
+def test_with_measured_noise_a_scan_is_as_sure_as_its_rows_and_constants_fill_what_is_left():
+    certainty = CERTAINTY.copy()
+    certainty[:, 3] = NAN
+    (scan,) = scans_of([replace(HEARD, certainty=certainty)], "fused", settled("measured"))
+    own, other = np.hypot(CERTAINTY[0, :2], BEARING_FLOOR)
+    both = 1.0 / np.hypot(1.0 / own, 1.0 / other)
+    assert scan.landmark.tolist() == [3, 8, 9]
+    expected = [both, np.hypot(0.02, BEARING_FLOOR[1]), 0.15]
+    np.testing.assert_allclose(scan.bearing_std, expected, rtol=1e-12)
+    np.testing.assert_allclose(scan.range_std, [np.hypot(0.004, RANGE_FLOOR), 0.2, 0.2], rtol=1e-15)
+
+
+def test_measured_noise_merges_rows_by_their_inverse_variances_and_constant_noise_plainly():
+    variance = np.square(measured(HEARD).rows.bearing_std[:2])
+    mean = np.average(ROWS.bearing[:2], weights=1.0 / variance)
+    (scan,) = scans_of([HEARD], "fused", settled("measured"))
+    assert scan.bearing[0] == pytest.approx(mean, rel=1e-12)
+    assert abs(mean - 0.1) < 0.2 * abs(mean - 0.14), "the vehicle's own call is the surer one"
+    (scan,) = scans_of([HEARD], "fused", settled("constant"))
+    assert scan.bearing[0] == pytest.approx(0.12, rel=1e-12)
+
+
+@pytest.mark.parametrize("noise", ["constant", "measured"])
+def test_rows_that_state_their_own_noise_merge_by_it_where_the_signal_tells_nothing(noise):
+    rows = with_columns(ROWS, bearing_std=np.array([0.03, 0.01, 0.1, 0.1]))
+    (scan,) = scans_of([Heard(rows=rows, clutter=0)], "fused", settled(noise))
+    assert scan.bearing[0] == pytest.approx((0.1 / 9.0 + 0.14) / (1.0 / 9.0 + 1.0), rel=1e-12)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipistrelle.detection.scans import make_scan
+from pipistrelle.detection.scans import make_scan, with_columns
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import Motion, motion_step
 from pipistrelle.experiments.drives import Drive, Truth
@@ -11,12 +11,15 @@ from pipistrelle.geometry import range_and_bearing, wrap
 TURTLE = Motion(model="unicycle", control_std=(0.03, 0.03), noise_at_rest=False)
 SIDE = 6.0
 """Half the width of the field [m]."""
+GROSS = 0.5
+"""A gross error of a bearing [rad]."""
 
 
-def turn_and_drive(seed, looks=300, landmarks=60, bearing_std=0.003):
+def turn_and_drive(seed, looks=300, landmarks=60, bearing_std=0.003, gross=0.0):
     """Turn in place, drive 0.4 m, look; eight bearings at most, ahead, from 0.2 to 5 m.
 
-    Returns the drive, its start exact, and its scans.
+    A share of them is off by half a radian besides. Returns the drive, its start exact, and its
+    scans.
     """
     rng = np.random.default_rng(seed)
     points = field(rng, landmarks)
@@ -39,7 +42,14 @@ def turn_and_drive(seed, looks=300, landmarks=60, bearing_std=0.003):
         controls=np.array(controls),
         truth=Truth(time=time, path=np.array(path), landmarks=true),
     )
-    return drive, scans
+    return drive, [with_gross_errors(rng, scan, gross) for scan in scans] if gross else scans
+
+
+def with_gross_errors(rng, scan, share):
+    """Turn a share of a scan's bearings by half a radian, to either side."""
+    turned = GROSS * rng.choice([-1.0, 1.0], scan.bearing.size)
+    turned *= rng.random(scan.bearing.size) < share
+    return with_columns(scan, bearing=wrap(scan.bearing + turned))
 
 
 def field(rng, count):

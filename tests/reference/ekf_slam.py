@@ -18,6 +18,7 @@ LEAST_AGGREGATED = 0.05
 CORRESPONDENCE_STD = 1.0
 WAITS = -1.0
 SURE = 0.2
+BELIEVED = 2.0
 
 
 def wrapped(angle):
@@ -94,7 +95,8 @@ class SlowEkfSlam:
 
     `carry_correspondence` keeps each landmark's number in the state, as Eq. (8) does;
     `common_bearing_noise` correlates the members of a new ray through the bearing they share;
-    `joseph` updates the covariance by Joseph's form.
+    `joseph` updates the covariance by Joseph's form; `robust` lets a measurement that surprises
+    count less, and `tempered` counts how often a range or a bearing did.
     """
 
     turns = 1.0
@@ -111,12 +113,13 @@ class SlowEkfSlam:
         carry_correspondence=False,
         common_bearing_noise=False,
         joseph=False,
+        robust=False,
     ):
         self.motion, self.rays, self.gate = motion, rays, gate
         self.range_variance, self.bearing_variance = range_std**2, bearing_std**2
         self.carry_correspondence = carry_correspondence
         self.common_bearing_noise = common_bearing_noise
-        self.joseph = joseph
+        self.joseph, self.robust, self.tempered = joseph, robust, 0
 
     def start(self, mean, covariance):
         self.blocks: list[tuple] = [POSE]
@@ -287,6 +290,39 @@ class SlowEkfSlam:
         self.X[2] = wrapped(self.X[2])
 
     def measure(self, label, distance, bearing):
+        """Measure a mapped landmark, as surely as it is believed."""
+        stated = self.range_variance, self.bearing_variance
+        if self.robust:
+            self.range_variance, self.bearing_variance = self.believed(label, distance, bearing)
+        self.measure_known(label, distance, bearing)
+        self.range_variance, self.bearing_variance = stated
+
+    def believed(self, label, distance, bearing):
+        """Variances of range and bearing by Huber's rule; a bearing that waits expects nothing."""
+        members, believed = self.members(label), [self.range_variance, self.bearing_variance]
+        if self.aggregated[members[0]] == WAITS or any(map(self.too_near, members)):
+            return believed
+        surprises = []
+        for block in members:
+            d, phi, H = self.predicted(block)
+            spread = H @ self.P @ H.T
+            surprises.append(
+                self.surprise(wrapped(bearing - phi), spread[1, 1], self.bearing_variance)
+            )
+            if len(members) == 1 and not math.isnan(distance):
+                _, believed[0] = self.surprise(distance - d, spread[0, 0], self.range_variance)
+        _, believed[1] = min(surprises)
+        self.tempered += (believed[0] > self.range_variance) + (believed[1] > self.bearing_variance)
+        return believed
+
+    @staticmethod
+    def surprise(nu, expected, variance):
+        """Surprise e, and the variance with which an innovation's becomes S e / k, where e > k."""
+        S = expected + variance
+        e = abs(nu) / math.sqrt(S)
+        return e, S * e / BELIEVED - expected if e > BELIEVED else variance
+
+    def measure_known(self, label, distance, bearing):
         if len(self.members(label)) == 1:
             self.measure_full(label, distance, bearing)
         elif math.isnan(distance) and self.aggregated[self.members(label)[0]] == WAITS:

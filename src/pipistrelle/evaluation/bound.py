@@ -160,6 +160,33 @@ def _bound(
     return bound
 
 
+def path_bound(bound: Float[np.ndarray, "t 3 3"]) -> tuple[float, float]:
+    r"""Least RMSE of position and heading over a path, of which the bound is known at every step.
+
+    .. math:: \sqrt{\tfrac1K \sum_k (B_k)_{xx} + (B_k)_{yy}}, \qquad
+              \sqrt{\tfrac1K \sum_k (B_k)_{\theta\theta}}
+
+    Parameters
+    ----------
+    bound : (k + 1, 3, 3) [m, rad, squared]
+        As `pose_bound` gives it; the start is not counted.
+
+    Returns
+    -------
+    position, heading : [m], [rad]
+        Zero of a path without a step.
+
+    Examples
+    --------
+    >>> path_bound(np.stack([np.zeros((3, 3)), np.diag([9.0, 16.0, 1.0])]))
+    (5.0, 1.0)
+    """
+    if len(bound) < 2:
+        return 0.0, 0.0
+    x, y, heading = np.mean(bound[1:], axis=0).diagonal().tolist()
+    return math.sqrt(x + y), math.sqrt(heading)
+
+
 def nees_of_exact_start(
     bound: Float[np.ndarray, "t 3 3"],
     path: Float[np.ndarray, "t 3"],

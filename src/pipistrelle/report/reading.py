@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import Config, InputError
-from pipistrelle.experiments.studies.plan import RADIUS, Plan, cases_of
+from pipistrelle.experiments.studies.plan import RADIUS, Plan, cases_of, common
 from pipistrelle.experiments.studies.store import load_study
 from pipistrelle.experiments.studies.world import STEPS, world_schemas
 from pipistrelle.experiments.studies.world_files import (
@@ -83,10 +83,7 @@ def _combinations(plan: Plan) -> list[tuple[dict[str, Any], Config, list[int]]]:
     found: dict[str, tuple[dict[str, Any], Config, list[int]]] = {}
     for case in cases_of(plan):
         settings = {name: value for name, value in case.values.items() if name != RADIUS}
-        radius = {"radius": plan.config.emitter.radius}
-        emitter = case.config.emitter.model_copy(update=radius)
-        config = case.config.model_copy(update={"emitter": emitter})
-        _, _, numbers = found.setdefault(repr(settings), (settings, config, []))
+        _, _, numbers = found.setdefault(repr(settings), (settings, common(plan, settings), []))
         numbers.append(case.number)
     return list(found.values())
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pipistrelle.config import InputError
 from pipistrelle.detection.logs.folder import read_log, write_log
 from pipistrelle.detection.logs.recording import Log
-from pipistrelle.detection.scans import Scan
+from pipistrelle.detection.scans import Scan, with_columns
 from reference.missions import scan_with
 
 DATA = Path(__file__).parents[2] / "data"
@@ -31,6 +31,7 @@ range_bounds = [0.5, 20.0]
 BICYCLE = UNICYCLE.replace("unicycle", "bicycle").replace("velocity", "speed")
 BICYCLE = BICYCLE.replace("angular_rate", "steering") + "wheelbase = 0.3\n"
 ODOMETRY = "time,velocity,angular_rate\n0.0,1.0,0.1\n0.1,2.0,0.2\n0.3,3.0,0.3\n0.4,9.0,9.0\n"
+NAN, STATED = np.nan, ",bearing_std,range_std"
 MEASUREMENTS = "time,landmark,bearing,range\n0.1,7,0.5,4.0\n0.1,3,-0.5,\n0.25,7,0.4,3.5\n"
 
 
@@ -47,8 +48,8 @@ def recorded(folder, settings=UNICYCLE, odometry=ODOMETRY, measurements=MEASUREM
     return folder
 
 
-def measured(*rows):
-    return "\n".join(["time,landmark,bearing,range", *rows, ""])
+def measured(*rows, stated=""):
+    return "\n".join(["time,landmark,bearing,range" + stated, *rows, ""])
 
 
 def same(first, second):
@@ -151,6 +152,40 @@ def test_blank_lines_comments_spaces_and_foreign_line_ends_do_no_harm(folder):
         text = "\r\n".join(["# by hand", lines[0], "", *(f" {line}" for line in lines[1:]), " "])
         (folder / name).write_bytes(b"\xef\xbb\xbf" + text.encode())
     assert same(read_log(folder), plain)
+
+
+# How sure a measurement is
+
+
+@pytest.mark.parametrize(
+    ("stated", "rows", "bearing_std", "range_std"),
+    [
+        ("", ["0.1,7,0.5,4", "0.1,3,0.2,"], [NAN, NAN], [NAN, NAN]),
+        (",bearing_std", ["0.1,7,0.5,4,0.01", "0.1,3,0.2,,"], [0.01, NAN], [NAN, NAN]),
+        (",range_std", ["0.1,7,0.5,4,", "0.1,3,0.2,4,0.3"], [NAN, NAN], [NAN, 0.3]),
+        (STATED, ["0.1,7,0.5,4,0.01,0.3", "0.1,3,0.2,4,,"], [0.01, NAN], [0.3, NAN]),
+        (STATED, ["0.1,7,0.5,4,1,2", "0.1,3,0.2,5,3,4"], [1, 3], [2, 4]),
+    ],
+)
+def test_rows_may_state_how_sure_they_are(tmp_path, stated, rows, bearing_std, range_std):
+    (scan,) = read_log(recorded(tmp_path, measurements=measured(*rows, stated=stated))).scans
+    np.testing.assert_array_equal(scan.bearing_std, bearing_std)
+    np.testing.assert_array_equal(scan.range_std, range_std)
+    assert scan.landmark.tolist() == [7, 3]
+
+
+def test_a_range_std_beside_an_empty_range_does_no_harm(tmp_path):
+    rows = measured("0.1,7,0.5,,0.01,0.3", stated=STATED)
+    (scan,) = read_log(recorded(tmp_path, measurements=rows)).scans
+    assert np.isnan(scan.range).all()
+    assert scan.bearing_std.tolist() == [0.01]
+
+
+def test_what_rows_state_stays_with_them_when_others_are_dropped(tmp_path):
+    rows = ["0.1,-1,0,1,1,", "0.1,7,0,1,2,", "0.3,8,0,1,3,", "0.3,-1,0,1,4,", "9.0,8,0,1,5,"]
+    log = read_log(recorded(tmp_path, measurements=measured(*rows, stated=STATED)))
+    assert [scan.bearing_std.tolist() for scan in log.scans] == [[2.0], [3.0]]
+    assert log.ignored_rows == {"clutter": 2, "outside_odometry": 1}
 
 
 # Merged steps
@@ -322,6 +357,29 @@ ROWS = {
 }
 
 
+STATING_ROWS = {
+    "no bearing std": ("0.1,7,0.5,1,0,1", "line 3", "bearing_std 0.0", "above 0 rad"),
+    "no range std": ("0.1,7,0.5,1,1,0", "line 3", "range_std 0.0", "a range_std above 0 m"),
+    "negative": ("0.1,7,0.5,1,-0.1,1", "line 3", "bearing_std -0.1", "a bearing_std above 0"),
+    "large": ("0.1,7,0.5,1,0.1,1e10", "line 3", "range_std 10000000000.0", "up to 1e+09 m"),
+    "small": ("0.1,7,0.5,1,1e-155,1", "line 3", "bearing_std 1e-155", "up to 1e+09 rad"),
+    "beside no range": ("0.1,7,0.5,,0.1,-1", "line 3", "range_std -1.0", "above 0 m"),
+    "text": ("0.1,7,0.5,1,low,1", "line 3", "bearing_std 'low'", "or leave it empty"),
+    "nan": ("0.1,7,0.5,1,1,nan", "line 3", "range_std 'nan'", "a finite number"),
+    "infinite": ("0.1,7,0.5,1,inf,1", "line 3", "bearing_std 'inf'", "a finite number"),
+    "missing": ("0.1,7,0.5,1,1", "line 3", "5 fields", "6: time, landmark, bearing, range, bear"),
+    "extra": ("0.1,7,0.5,1,1,1,1", "line 3", "7 fields", "6"),
+}
+
+
+@pytest.mark.parametrize(
+    ("row", "parts"), [(r, p) for r, *p in STATING_ROWS.values()], ids=STATING_ROWS
+)
+def test_a_bad_standard_deviation_is_refused_by_its_line(tmp_path, row, parts):
+    rows = measured("0.06,1,0,1,0.1,", row, stated=STATED)
+    refused(recorded(tmp_path, measurements=rows), "measurements.csv", *parts)
+
+
 @pytest.mark.parametrize(("row", "parts"), [(r, p) for r, *p in ROWS.values()], ids=ROWS)
 def test_a_bad_measurement_is_refused_by_its_line(tmp_path, row, parts):
     refused(
@@ -379,6 +437,39 @@ def test_a_wrong_header_is_refused(folder, name, header):
     lines = (folder / name).read_text().splitlines()
     (folder / name).write_text("\n".join([header, *lines[1:]]))
     refused(folder, name, "line 1", repr(header), repr(lines[0]))
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        ",range_std,bearing_std",
+        ",bearing_std,bearing_std",
+        ",bearing_std,range_std,level_db",
+        ",detour_std",
+        ",bearing_sdt",
+        ";bearing_std",
+        ",",
+    ],
+)
+def test_a_header_with_columns_that_are_unknown_or_misplaced_names_those_that_may_follow(
+    tmp_path, more
+):
+    header = f"time,landmark,bearing,range{more}"
+    folder = recorded(tmp_path, measurements=f"{header}\n0.1,7,0.5,4,0.1,0.1\n")
+    may = "'time,landmark,bearing,range', perhaps followed by bearing_std, range_std;"
+    refused(folder, "measurements.csv, line 1", repr(header), may)
+
+
+def test_no_columns_may_follow_those_of_odometry(tmp_path):
+    odometry = ODOMETRY.replace("rate\n", "rate,range_std\n")
+    message = refused(recorded(tmp_path, odometry=odometry), "odometry.csv, line 1")
+    assert "perhaps" not in message
+
+
+@pytest.mark.parametrize("stated", ["bearing_std,landmark,bearing,range", "landmark,bearing,range"])
+def test_no_column_goes_before_the_four(tmp_path, stated):
+    folder = recorded(tmp_path, measurements=f"{stated}\n0.1,7,0.5,4.0\n")
+    refused(folder, "measurements.csv, line 1", repr(stated))
 
 
 @pytest.mark.parametrize(
@@ -443,6 +534,16 @@ def test_the_log_on_the_pages_of_the_documentation_is_sound(tmp_path):
     assert [scan.landmark.tolist() for scan in log.scans] == [[7, 3], [7]]
 
 
+def test_the_columns_on_the_pages_of_the_documentation_are_sound(tmp_path):
+    page = (Path(__file__).parents[3] / "docs" / "log_format.md").read_text()
+    (text,) = re.findall(r"^```text\n(time,[^\n]+_std\n.+?)^```", page, re.M | re.S)
+    first, second = read_log(recorded(tmp_path, measurements=text)).scans
+    assert first.landmark.tolist() == [7, 3]
+    np.testing.assert_array_equal(first.bearing_std, [0.004, 0.02])
+    np.testing.assert_array_equal([*first.range_std, *second.range_std], [0.01, NAN, 0.2])
+    assert np.isnan(second.bearing_std).all()
+
+
 @pytest.mark.parametrize("name", ["unicycle_log", "bicycle_log"])
 def test_a_log_survives_being_written(tmp_path, name):
     log = read_log(DATA / name)
@@ -505,13 +606,37 @@ def test_a_written_folder_says_what_it_holds(tmp_path):
     write_log(tmp_path, read_log(DATA / "bicycle_log"))
     readme = (tmp_path / "README.md").read_text()
     assert "time,speed,steering" in readme
-    assert "time,landmark,bearing,range" in readme
+    assert "  time,landmark,bearing,range;" in readme
+    assert "no bearing_std or\nrange_std of its own, that of log.toml holds." in readme
+
+
+@pytest.mark.parametrize(
+    ("stated", "header"),
+    [
+        ({}, ""),
+        ({"bearing_std": [NAN, NAN]}, ""),
+        ({"bearing_std": [0.01, NAN]}, ",bearing_std"),
+        ({"range_std": [NAN, 0.3]}, ",range_std"),
+        ({"bearing_std": [0.1, 0.2], "range_std": [NAN, 0.3]}, ",bearing_std,range_std"),
+    ],
+)
+def test_columns_are_written_only_of_what_some_row_states(tmp_path, stated, header):
+    log = read_log(DATA / "unicycle_log")
+    first, *others = log.scans
+    said = {name: np.resize(values, first.landmark.size) for name, values in stated.items()}
+    log = replace(log, scans=(with_columns(first, **said), *others))
+    write_log(tmp_path / log.name, log)
+    lines = (tmp_path / log.name / "measurements.csv").read_text().splitlines()
+    assert lines[0] == "time,landmark,bearing,range" + header
+    assert lines[0] + ";" in (tmp_path / log.name / "README.md").read_text()
+    assert same(read_log(tmp_path / log.name), log)
 
 
 NUMBER = st.floats(-1e6, 1e6)
 ANGLE = st.floats(-np.pi, np.pi, exclude_max=True)
 LABEL = st.integers(0, 2**53 - 1)
 RANGE = st.floats(1e-9, 1e6) | st.just(np.nan)
+ROW = st.tuples(ANGLE, RANGE, RANGE, RANGE)
 
 
 @st.composite
@@ -525,10 +650,10 @@ def drives(draw):
     scans = []
     for k in sorted(draw(st.sets(st.integers(0, steps), min_size=1))):
         for _ in range(draw(st.integers(1, 1 if k == 0 else 3))):
-            rows = draw(st.dictionaries(LABEL, st.tuples(ANGLE, RANGE), min_size=1))
-            bearing, distance = np.array(list(rows.values())).T
-            unsaid = {"range_std": np.nan, "bearing_std": np.nan}  # a log says it once for all
-            scans.append(scan_with(list(rows), bearing, distance, time=time[k].item(), **unsaid))
+            rows = draw(st.dictionaries(LABEL, ROW, min_size=1))
+            bearing, distance, *stds = np.array(list(rows.values())).T
+            said = dict(zip(("range_std", "bearing_std"), stds, strict=True))
+            scans.append(scan_with(list(rows), bearing, distance, time=time[k].item(), **said))
     return replace(
         read_log(DATA / "unicycle_log"),
         time=time,

@@ -8,17 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipistrelle.config import InputError
+from pipistrelle.config import Config, FilterConfig, InputError
 from pipistrelle.detection.logs.folder import read_log, write_log
 from pipistrelle.detection.logs.readers import Reader
 from pipistrelle.detection.scans import COLUMNS, with_columns
 from pipistrelle.experiments.drives import NO_TRUTH
-from pipistrelle.experiments.runs.replay import as_heard_by, load, motion_of, start_of
+from pipistrelle.experiments.runs.replay import as_heard_by, load, motion_of, replay, start_of
 from pipistrelle.experiments.runs.truth_files import read_truth, write_truth
 from reference.missions import scan_with
 
 DATA = Path(__file__).parents[2] / "data"
 MADE_UP = DATA / "mrclam_made_up"
+NAN = np.nan
 
 
 @pytest.fixture
@@ -307,3 +308,77 @@ def test_the_filters_take_the_logs_motion_and_start():
     assert start.mean.tolist() == [0.0, -1.0, 0.0]
     assert start.covariance.tolist() == np.diag([0.05**2, 0.05**2, 0.0436**2]).tolist()
     assert not motion_of(load(MADE_UP, 1)[0]).noise_at_rest
+
+
+# How sure a measurement is
+
+
+def looks(*rows):
+    """A log of a vehicle that stands at a place it is sure of, and looks at a post once a second.
+
+    Rows (bearing, bearing_std, range_std) of a post 2 m away.
+    """
+    time = np.arange(len(rows) + 1.0)
+    scans = [
+        scan_with([7], [bearing], [2.0], time=at, bearing_std=bearing_std, range_std=range_std)
+        for at, (bearing, bearing_std, range_std) in zip(time[1:], rows, strict=True)
+    ]
+    return replace(
+        read_log(DATA / "unicycle_log"), time=time, controls=np.zeros((len(rows), 2)),
+        dt=np.diff(time), scans=tuple(scans), initial_pose=(0.0, 0.0, 0.0),
+        initial_pose_std=(0.0, 0.0, 0.0), noise_at_rest=False, range_std=0.2, bearing_std=0.1,
+    )  # fmt: skip
+
+
+def replayed(log, noise, estimator="ekf"):
+    """Replay a log as `pipistrelle slam` does, which takes the constants from it."""
+    constants = {"range_std": log.range_std, "bearing_std": log.bearing_std}
+    config = Config(filter=FilterConfig(noise=noise, **constants))
+    (trial,) = replay(log, NO_TRUTH, ["fused"], [estimator], None, config)
+    return trial
+
+
+def bearing_of_post(trial):
+    """Return where the map has the post [rad]."""
+    ((x, y),) = trial.track.landmarks.mean
+    return np.arctan2(y, x)
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "iekf"])
+def test_a_row_stated_ten_times_more_precise_pulls_the_estimate_a_hundred_times_as_much(estimator):
+    said = replayed(looks((0.0, NAN, NAN), (0.02, 0.01, NAN)), "measured", estimator)
+    assert bearing_of_post(said) == pytest.approx(0.02 * 100 / 101, rel=1e-3)
+    unsaid = replayed(looks((0.0, NAN, NAN), (0.02, NAN, NAN)), "measured", estimator)
+    assert bearing_of_post(unsaid) == pytest.approx(0.02 / 2, rel=1e-3)
+
+
+def test_constant_noise_ignores_what_the_rows_state():
+    rows = [(0.0, 0.3, NAN), (0.02, 0.01, 0.02), (0.01, NAN, 0.5)]
+    said = replayed(looks(*rows), "constant")
+    unsaid = replayed(looks(*((bearing, NAN, NAN) for bearing, *_ in rows)), "constant")
+    assert {scan.bearing_std.item() for scan in said.scans} == {0.1}
+    assert {scan.range_std.item() for scan in said.scans} == {0.2}
+    one, other = said.track, unsaid.track
+    assert one.pose.mean.tobytes() == other.pose.mean.tobytes()
+    assert one.landmarks.mean.tobytes() == other.landmarks.mean.tobytes()
+    assert one.landmarks.covariance.tobytes() == other.landmarks.covariance.tobytes()
+
+
+def test_fields_that_are_empty_are_filled_with_the_logs_own_constants(folder):
+    lines = (folder / "measurements.csv").read_text().splitlines()
+    stated = [f"{line},0.01," if k % 2 else f"{line},,0.5" for k, line in enumerate(lines[1:])]
+    header = f"{lines[0]},bearing_std,range_std"
+    (folder / "measurements.csv").write_text("\n".join([header, *stated]))
+    log, _ = load(folder)
+    scans = replayed(log, "measured").scans
+    told = np.concatenate([np.stack((scan.bearing_std, scan.range_std)) for scan in scans], axis=1)
+    pairs = {(0.01, log.range_std), (log.bearing_std, 0.5)}
+    assert set(map(tuple, told.T.tolist())) == pairs
+
+
+def test_what_rows_state_is_heard_by_every_strategy():
+    log = looks((0.3, 0.01, 0.02), (0.0, NAN, 0.03))
+    for strategy in ("active", "fused", "passive"):
+        first, second = as_heard_by(log.scans, strategy, 2.0)
+        assert (first.bearing_std.item(), first.range_std.item()) == (0.01, 0.02)
+        np.testing.assert_array_equal([*second.bearing_std, *second.range_std], [NAN, 0.03])

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import ConfigDict, Field, ValidationError, field_validator
 
 from pipistrelle.config import InputError, NonNegative, Positive, Probability, Real, Section
-from pipistrelle.detection.logs.recording import MEASUREMENT, Log, assemble
+from pipistrelle.detection.logs.recording import MEASUREMENT, STATED, Log, assemble
 from pipistrelle.detection.logs.text_tables import read_table, read_text, table_text
 from pipistrelle.files import LOG, OwnFiles
 from pipistrelle.refusals import expectation, meant, refusal, shown, values_expected
@@ -29,12 +29,13 @@ _README = """A recorded log of Pipistrelle. Replay it with: pipistrelle slam FOL
 
 log.toml          motion model, start and noise; m, s, rad; _std are standard deviations
 odometry.csv      {odometry}; a row holds until the next one's time, the last only ends the log
-measurements.csv  time,landmark,bearing,range; an empty range is passive
+measurements.csv  {measurements}; an empty range is passive
 truth.csv         time,x,y,heading; optional, for scoring only
 landmarks.csv     landmark,x,y; optional, for scoring only
 SHA256SUMS        what was written here: nothing else is ever overwritten
 
-Bearings are relative to the heading, counter-clockwise.
+Bearings are relative to the heading, counter-clockwise. Where a measurement has no bearing_std or
+range_std of its own, that of log.toml holds.
 """
 
 
@@ -126,7 +127,7 @@ def read_log(folder: Path) -> Log:
     first, second = _CONTROLS[settings.motion]
     return assemble(
         read_table(folder / "odometry.csv", ("time", first, second)),
-        read_table(folder / "measurements.csv", MEASUREMENT, optional="range"),
+        read_table(folder / "measurements.csv", MEASUREMENT, optional=("range", *STATED)),
         step=settings.step,
         name=folder.resolve().name,
         wheelbase=getattr(settings, "wheelbase", 1.0),
@@ -139,8 +140,9 @@ def write_log(folder: Path, log: Log) -> None:
     """Write a log folder that `read_log` reads back exactly.
 
     Steps become rows, at the precision of the numbers. Scans that share a step are spread over it
-    in their order; empty scans leave no row. An earlier log that we wrote is replaced, its truth
-    removed (`pipistrelle.files`); ``log.toml`` comes last.
+    in their order; empty scans leave no row. How surely it was measured is told row by row, if any
+    row states it. An earlier log that we wrote is replaced, its truth removed
+    (`pipistrelle.files`); ``log.toml`` comes last.
 
     Parameters
     ----------
@@ -183,8 +185,10 @@ def write_log(folder: Path, log: Log) -> None:
     controls = np.vstack((log.controls, np.zeros(2)))
     odometry = table_text(("time", first, second), log.time, *controls.T)
     own.write("odometry.csv", odometry)
-    own.write("measurements.csv", table_text(MEASUREMENT, *_measurement_columns(log)))
-    own.write("README.md", _README.format(odometry=f"time,{first},{second}"))
+    measured = _measurement_columns(log)
+    own.write("measurements.csv", table_text(tuple(measured), *measured.values()))
+    columns = {"odometry": f"time,{first},{second}", "measurements": ",".join(measured)}
+    own.write("README.md", _README.format(**columns))
     own.write("log.toml", text)
 
 
@@ -218,8 +222,11 @@ def _key_refusal(path: Path, fault: Any, model: type[_Settings]) -> InputError:
     return refusal(f"{path}, key {key!r}", found, expectation(fault), "correct the value")
 
 
-def _measurement_columns(log: Log) -> tuple[np.ndarray, ...]:
-    """Columns of ``measurements.csv``; scans of one step lie spread over it, in their order."""
+def _measurement_columns(log: Log) -> dict[str, np.ndarray]:
+    """Columns of ``measurements.csv``; scans of one step lie spread over it, in their order.
+
+    Of how surely it was measured there are those of which any row says something.
+    """
     used = np.array([scan.time for scan in log.scans])
     index = np.searchsorted(log.time, used)
     start = log.time[np.maximum(index - 1, 0)]
@@ -227,6 +234,10 @@ def _measurement_columns(log: Log) -> tuple[np.ndarray, ...]:
     count = np.searchsorted(used, used, side="right") - np.searchsorted(used, used)
     stamp = np.where(rank + 1 == count, used, start + (used - start) * (rank + 1) / count)
     sizes = [len(scan.landmark) for scan in log.scans]
-    fields = [[getattr(scan, name) for scan in log.scans] for name in MEASUREMENT[1:]]
-    columns = [np.concatenate(field) if field else np.empty(0) for field in fields]
-    return (np.repeat(stamp, sizes), *columns)
+    column = {"time": np.repeat(stamp, sizes)}
+    for name in (*MEASUREMENT[1:], *STATED):
+        fields = [getattr(scan, name) for scan in log.scans]
+        values = np.concatenate(fields) if fields else np.empty(0)
+        if name in MEASUREMENT or not np.isnan(values).all():
+            column[name] = values
+    return column

@@ -22,6 +22,8 @@ from pipistrelle.refusals import refusal
 
 MEASUREMENT = ("time", "landmark", "bearing", "range")
 """What is said of a measurement: when it was made, and the columns of its scan."""
+STATED = ("bearing_std", "range_std")
+"""What may be said besides: how surely it was measured."""
 
 _RESOLUTION = 1e-6  # [s], of the boundaries of merged steps
 _STEPS_MAX = 10_000_000
@@ -99,6 +101,7 @@ def assemble(
     ----------
     odometry : Table of ``time`` and two controls
     measurements : Table of ``time``, ``landmark``, ``bearing`` and ``range``
+        Perhaps with ``bearing_std`` and ``range_std``, NaN where nobody says.
     step : [s]
         Length of the steps into which rows are merged; None: one step each.
     span : (start, end) [s]
@@ -140,7 +143,8 @@ def assemble(
         expected = f"some of landmarks, between {time[0].item()!r} s and {time[-1].item()!r} s"
         fix = "use the odometry's clock" if len(stamp) else "label rows of landmarks"
         raise refusal(measurements.path, found, expected, fix)
-    measured = {name: measurements.column[name][inside] for name in MEASUREMENT}
+    said = (*MEASUREMENT, *(name for name in STATED if name in measurements.column))
+    measured = {name: measurements.column[name][inside] for name in said}
     return Log(
         time=time,
         controls=controls,

@@ -15,6 +15,7 @@ from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.refusals import refusal
 
 _LABELS = ("landmark", "subject", "barcode")
+_ABOVE_ZERO = {"range": "m", "bearing_std": "rad", "range_std": "m"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,7 +28,7 @@ class Table:
     line : (n)
         Line of each row in the file, from 1.
     column : dict of str to (n)
-        Values by column; labels are integers, a missing range is NaN.
+        Values by column; labels are integers, what is missing is NaN.
     """
 
     path: Path
@@ -36,12 +37,16 @@ class Table:
 
 
 def read_table(
-    path: Path, columns: tuple[str, ...], *, separator: str | None = ",", optional: str = ""
+    path: Path,
+    columns: tuple[str, ...],
+    *,
+    separator: str | None = ",",
+    optional: tuple[str, ...] = (),
 ) -> Table:
     r"""Read rows of numbers; blank lines and lines that begin with ``#`` are skipped.
 
-    Each column keeps what its name promises: ``time`` never runs back, ``range`` is positive,
-    labels are integers.
+    Each column keeps what its name promises: ``time`` never runs back, ``range`` and the standard
+    deviations are positive, labels are integers.
 
     Parameters
     ----------
@@ -50,8 +55,9 @@ def read_table(
         With a separator, the first line must hold them.
     separator : str or None
         None: white space, and no header.
-    optional : name
-        The column whose fields may be empty.
+    optional : names
+        The columns whose fields may be empty. Those that are not among ``columns`` may follow them,
+        in this order; one that the header does not hold is empty in every row.
 
     Returns
     -------
@@ -77,10 +83,13 @@ def read_table(
     if content and separator:
         line, header = content.pop(0)
         names = [name.strip().strip('"') for name in header.split(separator)]
-        if names != list(columns):
+        more = tuple(name for name in optional if name not in columns)
+        if names != [*columns, *(name for name in more if name in names)]:
             expected = f"the header {separator.join(columns)!r}"
+            expected += f", perhaps followed by {', '.join(more)}" * bool(more)
             where, found = f"{path}, line {line}", repr(header[:80])
             raise refusal(where, found, expected, "name the columns so")
+        columns = tuple(names)
     if not content:
         expected = f"rows of {', '.join(columns)}"
         raise refusal(path, "no rows", expected, "add them")
@@ -89,6 +98,7 @@ def read_table(
         rows = [_read_row(path, columns, separator, optional, *item) for item in content]
         values = np.array(rows)
     column = dict(zip(columns, values.T.copy(), strict=True))
+    column |= {name: np.full(len(values), np.nan) for name in optional if name not in column}
     table = Table(path=path, line=np.array([line for line, _ in content]), column=column)
     _check_columns(table)
     return table
@@ -198,7 +208,7 @@ def _read_row(
     path: Path,
     columns: tuple[str, ...],
     separator: str | None,
-    optional: str,
+    optional: tuple[str, ...],
     line: int,
     text: str,
 ) -> list[float]:
@@ -209,7 +219,7 @@ def _read_row(
         raise refusal(where, f"{len(fields)} fields in {text[:80]!r}", expected, "correct the row")
     row = []
     for name, field in zip(columns, fields, strict=True):
-        if name == optional and not field.strip():
+        if name in optional and not field.strip():
             row.append(math.nan)
             continue
         try:
@@ -217,20 +227,21 @@ def _read_row(
         except ValueError:
             row.append(math.nan)
         if not math.isfinite(row[-1]):
-            fix = "correct the field" + " or leave it empty" * (name == optional)
+            fix = "correct the field" + " or leave it empty" * (name in optional)
             raise refusal(where, f"{name} {field.strip()[:80]!r}", "a finite number", fix)
     return row
 
 
 def _check_columns(table: Table) -> None:
-    """Check times, ranges and labels, and make the labels integers."""
+    """Check times, labels and what is above zero, and make the labels integers."""
     for name, values in table.column.items():
         if name == "time":
             wrong = np.diff(values, prepend=-np.inf) < 0
             promise = "a time that does not run backwards"
-        elif name == "range":
+        elif name in _ABOVE_ZERO:
             wrong = (values < 1.0 / LARGEST) | (values > LARGEST)
-            promise = f"a range above 0 m, up to {LARGEST:g} m"
+            unit = _ABOVE_ZERO[name]
+            promise = f"a {name} above 0 {unit}, up to {LARGEST:g} {unit}"
         elif name in _LABELS:
             wrong = (values != np.rint(values)) | (values < UNLABELLED) | (values >= 2**53)
             promise = f"an integer, from 0 on, or {UNLABELLED} for clutter"

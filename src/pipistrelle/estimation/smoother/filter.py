@@ -215,6 +215,7 @@ class Smoother:
             return belief
         here = _arrived(belief)
         if self.gate < 1.0 and belief.mapped:
+            here = _solved(here)
             inside = _inside(here, scan, self.gate)
             dropped = int(np.count_nonzero(~inside))
             here, scan = replace(here, gated=here.gated + dropped), rows_of(scan, inside)
@@ -228,8 +229,9 @@ class Smoother:
 
     def _heard(self, here: SmootherBelief, scan: Scan, *, placing: bool) -> SmootherBelief:
         """Add a frame's factors, and those of what it places, if it may, as a link."""
-        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        mapped, waiting, node = list(here.mapped), dict(here.waiting), here.link.node
+        link = _next_to(here)
+        factors, values, node = link.factors, link.values, link.node
+        mapped, waiting = list(here.mapped), dict(here.waiting)
         poses = _poses(here)
         columns = (scan.landmark, scan.bearing, scan.range, scan.bearing_std, scan.range_std)
         for label, bearing, distance, across, along in zip(*map(_listed, columns), strict=True):
@@ -252,7 +254,6 @@ class Smoother:
                 factors.add(self._bearing(Bearing(node, bearing, across), label))
             else:
                 factors.add(self._range(node, label, (bearing, distance), (across, along)))
-        link = Link(before=here.link, node=node, leg=None, factors=factors, values=values)
         return replace(here, link=link, mapped=tuple(mapped), waiting=waiting)
 
     def _bearing(self, heard: Bearing, label: int) -> gtsam.BearingFactor2D:
@@ -286,12 +287,44 @@ def _arrived(belief: SmootherBelief) -> SmootherBelief:
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     factors.add(leg_factor(node, belief.leg))
     values.insert(pose_key(node), gtsam.Pose2(*pose.mean))
-    link = Link(before=belief.link, node=node, leg=belief.leg, factors=factors, values=values)
-    return replace(belief, at=pose, leg=NOWHERE, link=link)
+    link = _after(belief.link, factors, values)
+    return replace(belief, at=pose, leg=NOWHERE, link=replace(link, node=node, leg=belief.leg))
+
+
+def _next_to(here: SmootherBelief) -> Link:
+    """Return a new link, still to be filled: in the place of the leg's, where none has asked it."""
+    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    last = here.link
+    if last.leg is None or here.solver.at is last:
+        return _after(last, factors, values)
+    factors.push_back(last.factors)
+    values.insert(last.values)
+    return replace(last, factors=factors, values=values)
+
+
+def _after(last: Link, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Link:
+    """Return a link after another, of the same pose."""
+    return replace(last, before=last, leg=None, factors=factors, values=values)
+
+
+def _solved(belief: SmootherBelief) -> SmootherBelief:
+    """Return the belief when its graph is solved, thoroughly where it must be.
+
+    Raises RuntimeError where it cannot be solved.
+    """
+    try:
+        belief.solver.reach(belief.link)
+    except RuntimeError:
+        if belief.link.thorough:
+            raise
+        belief = replace(belief, link=replace(belief.link, thorough=True))
+        belief.solver.reach(belief.link)
+    return belief
 
 
 def _settled(belief: SmootherBelief) -> SmootherBelief:
     """Return the belief with the last pose as the solver has it."""
+    belief = _solved(belief)
     isam, key = belief.solver.reach(belief.link), pose_key(belief.link.node)
     mean = pose_of(isam.calculateEstimatePose2(key))
     return replace(belief, at=in_world(mean, isam.marginalCovariance(key)))
@@ -299,8 +332,12 @@ def _settled(belief: SmootherBelief) -> SmootherBelief:
 
 def _poses(here: SmootherBelief) -> Float[np.ndarray, "n 3"]:
     """Return the graph's poses by their numbers, the last as it is expected."""
-    isam = here.solver.reach(here.link)
-    return gtsam.utilities.extractPose2(isam.calculateEstimate())
+    last = here.link
+    known = last if last.leg is None or last is here.solver.at else last.before
+    poses = np.empty((0, 3))
+    if known is not None:
+        poses = gtsam.utilities.extractPose2(here.solver.reach(known).calculateEstimate())
+    return np.vstack([poses[: last.node], here.at.mean])
 
 
 def _inside(here: SmootherBelief, scan: Scan, gate: float) -> Bool[np.ndarray, " m"]:

@@ -5,8 +5,8 @@ belief is a link. The solver itself changes; it stands at one link, goes on to t
 come, and is built anew where it is asked for a link that it has left behind.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
@@ -34,6 +34,9 @@ class Link:
     factors : NonlinearFactorGraph
     values : Values
         Where what is new is thought to be.
+    thorough : bool
+        Whether to solve by QR factors, which cost twice as much as Cholesky's, for these were too
+        coarse: some noise is so small beside another.
     """
 
     before: "Link | None"
@@ -41,6 +44,7 @@ class Link:
     leg: Leg | None
     factors: gtsam.NonlinearFactorGraph
     values: gtsam.Values
+    thorough: bool = False
 
 
 def links(last: Link) -> Iterator[Link]:
@@ -58,7 +62,7 @@ class Solver:
     """iSAM2, standing at one link of a chain."""
 
     at: Link | None = None
-    isam: gtsam.ISAM2 = field(default_factory=lambda: _new())
+    isam: gtsam.ISAM2 | None = None
     best: "Best | None" = None
 
     def reach(self, link: Link) -> gtsam.ISAM2:
@@ -69,16 +73,16 @@ class Solver:
         RuntimeError
             Where the link makes a graph that cannot be solved; the solver then stands nowhere.
         """
-        if self.at is link:
-            return self.isam
-        way = (link,) if link.before is self.at else links(link)
-        if link.before is not self.at or self.at is None:
-            self.isam = _new()
-        self.at = None
-        for step in way:
-            self.isam.update(step.factors, step.values)
-        self.at = link
-        return self.isam
+        isam, at = self.isam, self.at
+        if isam is None or at is not link:
+            way: Iterable[Link] = (link,)
+            if isam is None or at is None or at is not link.before or at.thorough != link.thorough:
+                isam, way = _new(link.thorough), links(link)
+            self.isam, self.at = isam, None
+            for step in way:
+                isam.update(step.factors, step.values)
+            self.at = link
+        return isam
 
     def solve(self, link: Link) -> "Best":
         """Return the best solution of all that entered up to a link."""
@@ -90,11 +94,17 @@ class Solver:
         return self.best
 
 
-def _new() -> gtsam.ISAM2:
+def _new(thorough: bool) -> gtsam.ISAM2:
     """Return a solver that knows nothing."""
     settings = gtsam.ISAM2Params()
     settings.setRelinearizeThreshold(RELINEARIZE)
+    settings.setFactorization(_factors(thorough))
     return gtsam.ISAM2(settings)
+
+
+def _factors(thorough: bool) -> str:
+    """Return what solves a linear system, as GTSAM names it."""
+    return "QR" if thorough else "CHOLESKY"
 
 
 @dataclass(kw_only=True)
@@ -116,15 +126,19 @@ class Best:
     @cached_property
     def values(self) -> gtsam.Values:
         """Return the optimum, or what iSAM2 found where none can be reached from there."""
+        settings = gtsam.LevenbergMarquardtParams()
+        settings.setLinearSolverType(f"MULTIFRONTAL_{_factors(self.link.thorough)}")
         try:
-            return gtsam.LevenbergMarquardtOptimizer(self.graph, self.found).optimize()
+            return gtsam.LevenbergMarquardtOptimizer(self.graph, self.found, settings).optimize()
         except RuntimeError:
             return self.found
 
     @cached_property
-    def marginals(self) -> gtsam.Marginals:
+    def there(self) -> gtsam.ISAM2:
         """Return what tells covariances at the optimum."""
-        return gtsam.Marginals(self.graph, self.values)
+        isam = _new(self.link.thorough)
+        isam.update(self.graph, self.values)
+        return isam
 
     def pose_mean(self, node: int) -> Float[np.ndarray, "3"]:
         """Return where a pose is."""
@@ -133,18 +147,18 @@ class Best:
     def pose(self, node: int) -> Gaussian:
         """Return a pose, (3) and (3, 3)."""
         mean = self.pose_mean(node)
-        return in_world(mean, self.marginals.marginalCovariance(pose_key(node)))
+        return in_world(mean, self.there.marginalCovariance(pose_key(node)))
 
     def point(self, label: int) -> Gaussian:
         """Return a landmark, (2) and (2, 2)."""
         key = landmark_key(label)
         mean = np.array(self.values.atPoint2(key))
-        return Gaussian(mean=mean, covariance=symmetric(self.marginals.marginalCovariance(key)))
+        return Gaussian(mean=mean, covariance=symmetric(self.there.marginalCovariance(key)))
 
     def joint(self, node: int, other: int) -> Float[np.ndarray, "6 6"]:
         """Return the covariance of two poses."""
         keys = pose_key(node), pose_key(other)
-        told = self.marginals.jointMarginalCovariance(list(keys))
+        told = self.there.jointMarginalCovariance(list(keys))
         M = np.zeros((6, 6))
         for part, key in enumerate(keys):
             rows = slice(3 * part, 3 * part + 3)

@@ -201,7 +201,8 @@ def replay(
     beamwidth : [rad], optional
         See `as_heard_by`.
     config : Config
-        Its sections that estimators read; what the log decides must agree with it.
+        Its sections that estimators read; what the log decides must agree with it. With "constant"
+        noise, what the rows themselves say of it is ignored.
     progress, watch : callable, optional
 
     Returns
@@ -237,9 +238,11 @@ def replay(
         truth=truth,
     )
     check_filters(filters, drive.motion, config)
-    noise = noise_of(config.filter)
+    noise, scans = noise_of(config.filter), log.scans
+    if config.filter.noise == "constant":
+        scans = [with_columns(scan, bearing_std=math.nan, range_std=math.nan) for scan in scans]
     heard = {
-        strategy: tuple(map(noise, as_heard_by(log.scans, strategy, beamwidth)))
+        strategy: tuple(map(noise, as_heard_by(scans, strategy, beamwidth)))
         for strategy in strategies
     }
     return run_trials(filters, drive, heard, config, progress=progress, watch=watch)

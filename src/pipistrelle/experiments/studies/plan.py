@@ -5,7 +5,7 @@ depend on the vehicle's beam: there is one for all radii, heard beside the narro
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 from typing import Any, cast
 
@@ -36,6 +36,9 @@ class Plan:
         What holds where the grid says nothing else.
     grid : dict
         Settings by their dotted name, with the values that each takes.
+    own : dict
+        Settings of one filter alone by its name, each by its dotted name; they change nothing that
+        is heard.
     """
 
     name: str
@@ -44,6 +47,7 @@ class Plan:
     filters: tuple[str, ...]
     config: Config
     grid: Mapping[str, tuple[Any, ...]]
+    own: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +61,7 @@ class PlannedCase(Case):
     values : dict
         Of the grid's settings; None for the radius of a passive case.
     config : Config
-        With these values.
+        With these values, and what is the filter's own.
     """
 
     number: int
@@ -97,10 +101,71 @@ def cases_of(plan: Plan) -> tuple[PlannedCase, ...]:
                 strategy=strategy,
                 filter=name,
                 values=values | {RADIUS: None} if passive else values,
-                config=config,
+                config=own_config(plan, name, config),
             )
             cases.append(case)
     return tuple(cases)
+
+
+def own_config(plan: Plan, name: str, config: Config) -> Config:
+    """Return settings with those that are one filter's own.
+
+    Parameters
+    ----------
+    plan : Plan
+    name : str
+        Of the filter.
+    config : Config
+
+    Returns
+    -------
+    Config
+
+    Raises
+    ------
+    InputError
+        For a value that its setting does not take.
+
+    Examples
+    --------
+    >>> own = {"iekf": {"filter.noise": "measured"}}
+    >>> ways = {"strategies": ("fused",), "filters": ("ekf", "iekf")}
+    >>> plan = Plan(name="two", iterations=1, config=Config(), grid={}, own=own, **ways)
+    >>> [case.config.filter.noise for case in cases_of(plan)]
+    ['constant', 'measured']
+    """
+    if name not in plan.own:
+        return config
+    own = {
+        cast(Key, tuple(key.split("."))): Given(value, f"own.{name}.{key}")
+        for key, value in plan.own[name].items()
+    }
+    return resolve(from_flags(config.model_dump(mode="json")) | own)
+
+
+def common(plan: Plan, values: Mapping[str, Any]) -> Config:
+    """Return a plan's settings with some values of its grid, and no filter's own.
+
+    Parameters
+    ----------
+    plan : Plan
+    values : dict
+        By their dotted names.
+
+    Returns
+    -------
+    Config
+
+    Examples
+    --------
+    >>> ways = {"strategies": ("fused",), "filters": ("ekf",), "config": Config()}
+    >>> plan = Plan(name="one", iterations=1, grid={"filter.gate": (0.9,)}, **ways)
+    >>> common(plan, {"filter.gate": 0.9}).filter.gate
+    0.9
+    """
+    settled = from_flags(plan.config.model_dump(mode="json"))
+    ((_, config),) = combinations(settled, {name: (one,) for name, one in values.items()}, "grid.")
+    return config
 
 
 def combinations(

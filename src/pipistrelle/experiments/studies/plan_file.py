@@ -11,7 +11,13 @@ from pydantic import Field, PlainValidator, ValidationError
 from pydantic_core import PydanticCustomError
 
 from pipistrelle.config import STRATEGIES, Config, InputError, Section, Strategy
-from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, check_distinct, check_name
+from pipistrelle.estimation.catalogue import (
+    CATALOGUE,
+    PAPERS,
+    SECTIONS,
+    check_distinct,
+    check_name,
+)
 from pipistrelle.experiments.studies.plan import MOST_CASES, MOST_WORLDS, Plan, combinations
 from pipistrelle.refusals import expectation, meant, shown
 from pipistrelle.settings import (
@@ -51,9 +57,9 @@ class _Head(Section):
     )
 
 
-PLANS = ("paper", "physics")
+PLANS = ("paper", "physics", "beyond")
 """Plans that ship with the package: the paper's study as its words may be read, and as physics has
-it where they leave a choice."""
+it where they leave a choice; and the same question asked of estimators at their best."""
 
 
 def find_plan(word: str) -> Path:
@@ -148,10 +154,36 @@ def read_plan(path: Path, over: Layer | None = None, iterations: int | None = No
         filters=head.filters,
         config=resolve(layer),
         grid=grid,
+        own=_own(path, table.get("own", {}), head.filters, grid, layer),
     )
     for _ in combinations(layer, grid, f"{path}: grid."):
         pass
     return plan
+
+
+def _own(
+    path: Path, table: Any, filters: Sequence[str], grid: Mapping[str, Any], layer: Layer
+) -> dict[str, dict[str, Any]]:
+    """Check the settings that are one filter's own: none of them changes what is heard."""
+    if not isinstance(table, dict) or not all(isinstance(mine, dict) for mine in table.values()):
+        raise InputError(f"{path}: own: found {shown(table)}, expected a table for each filter")
+    own: dict[str, dict[str, Any]] = {}
+    for name, mine in table.items():
+        where = f"{path}: own.{name}"
+        if name not in filters:
+            raise InputError(f"{where}: no filter of this plan; {_meant(name, filters)}")
+        given: Layer = {}
+        for key, setting, value in _settings(path, f"own.{name}", mine):
+            if key[0] not in SECTIONS:
+                sections = ", ".join(SECTIONS)
+                why = f"this setting changes what is heard; expected one of the sections {sections}"
+                raise InputError(f"{where}.{setting}: {why}")
+            if setting in grid:
+                raise InputError(f"{where}.{setting}: the plan varies this setting; take it out")
+            given[key] = Given(value, f"{where}.{setting}")
+        settled: Any = resolve(layer | given).model_dump(mode="json")
+        own[name] = {".".join(key): settled[key[0]][key[1]] for key in given}
+    return own
 
 
 def plan_text(plan: Plan) -> str:
@@ -217,6 +249,7 @@ def _as_table(plan: Plan) -> dict[str, Any]:
     """Return a plan as nested tables and lists; what the grid varies has its default beside it."""
     layer = from_flags(plan.config.model_dump(mode="json"))
     kept = {key: layer[key] for key in layer if ".".join(key) not in plan.grid}
+    own = {name: dict(settings) for name, settings in plan.own.items()}
     return {
         "format": FORMAT,
         "name": plan.name,
@@ -225,12 +258,13 @@ def _as_table(plan: Plan) -> dict[str, Any]:
         "filters": list(plan.filters),
         "config": resolve(kept).model_dump(mode="json", exclude_none=True),
         "grid": {name: list(values) for name, values in plan.grid.items()},
+        **({"own": own} if own else {}),
     }
 
 
 def _head(path: Path, table: Mapping[str, Any], iterations: int | None) -> _Head:
     """Check what a plan holds beside settings and grid."""
-    known = (*_Head.model_fields, "config", "grid")
+    known = (*_Head.model_fields, "config", "grid", "own")
     for name in table:
         if name not in known:
             raise InputError(f"{path}: {name}: no such key of a plan; {_meant(name, known)}")

@@ -7,7 +7,7 @@ What a case is: `studies.plan`. Cases whose settings differ in nothing that is s
 import json
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from math import degrees
@@ -19,8 +19,6 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config, FilterConfig, Strategy
 from pipistrelle.detection.faces import Heard
-from pipistrelle.detection.merging import scan_of
-from pipistrelle.detection.noise import Noise, noise_of
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Track, Trajectory
 from pipistrelle.estimation.catalogue import SECTIONS
@@ -30,7 +28,7 @@ from pipistrelle.evaluation.accuracy import (
     pose_error,
     position_error,
 )
-from pipistrelle.evaluation.bound import nees_of_exact_start, pose_bound
+from pipistrelle.evaluation.bound import nees_of_exact_start, path_bound, pose_bound
 from pipistrelle.evaluation.consistency import track_nees
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import (
@@ -41,7 +39,7 @@ from pipistrelle.experiments.hearing.scenario import (
 )
 from pipistrelle.experiments.results.scores import PathScores, Scores
 from pipistrelle.experiments.runs.checking import first_belief
-from pipistrelle.experiments.runs.trial import drive_of, run_trial
+from pipistrelle.experiments.runs.trial import drive_of, run_trial, scans_of
 from pipistrelle.experiments.studies.plan import Plan, PlannedCase, cases_of
 
 if TYPE_CHECKING:
@@ -52,7 +50,8 @@ ONLINE = ("position_rmse_m", "heading_rmse_rad", "nees_mean", "nees_max")
 
 STEPS = ("position_error_m", "heading_error_rad", "nees", "nees_expected", "nees_variance")
 """What a table has of each frame: errors and NEES; of a consistent filter, mean and variance."""
-Frames = Float[np.ndarray, "k 2"]
+BOUNDS = ("position_bound_m", "heading_bound_rad")
+"""What a table has of the least error that the sound leaves, as the signal tells its noise."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,6 +68,8 @@ class TrialRecord:
     scores : Scores or None
     online : PathScores or None
         Of the path as it was believed at its time, where the filter revises it.
+    bound : position [m] and heading [rad], or None
+        Their least RMSE, as `evaluation.bound.path_bound` has it.
     landmarks_full_mean : float or None
         Over the particles, where the filter has some.
     clutter_per_frame : float or None
@@ -90,6 +91,7 @@ class TrialRecord:
     error: str | None = None
     scores: Scores | None = None
     online: PathScores | None = None
+    bound: tuple[float, float] | None = None
     landmarks_full_mean: float | None = None
     clutter_per_frame: float | None = None
     wall_s: float = 0.0
@@ -244,7 +246,7 @@ def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
             "status": pl.String,
             "error": pl.String,
             **(scores | counts | {"diverged": pl.Boolean}),
-            **dict.fromkeys(last, pl.Float64),
+            **dict.fromkeys((*BOUNDS, *last), pl.Float64),
             **dict.fromkeys(_online_columns(plan), pl.Float64),
         },
         "steps": {
@@ -283,53 +285,85 @@ def _run_cases(cases: Sequence[PlannedCase], iteration: int) -> list[TrialRecord
         _let_interruptions_pass(failure)
         error = traceback.format_exc()
         return [_failed(case, error) for case in cases]
-    beams = dict(zip(radii, heard, strict=True))
-
-    @cache
-    def scans(radius: float, strategy: Strategy, noise: Noise) -> tuple[Scan, ...]:
-        return tuple(noise(scan_of(frame, strategy)) for frame in beams[radius])
-
-    @cache
-    def consistent(radius: float, strategy: Strategy, filtered: FilterConfig) -> Frames:
-        told = config.model_copy(update={"filter": filtered})
-        return _consistent(scans(radius, strategy, noise_of(filtered)), scenario, told)
-
-    return [_try_case(case, scenario, beams, scans, consistent, iteration) for case in cases]
+    shared = _Shared(scenario, config, dict(zip(radii, heard, strict=True)))
+    return [_try_case(case, shared, iteration) for case in cases]
 
 
-def _try_case(
-    case: PlannedCase,
-    scenario: Scenario,
-    beams: Mapping[float, Sequence[Heard]],
-    scans_of: Callable[[float, Strategy, Noise], Sequence[Scan]],
-    consistent: Callable[[float, Strategy, FilterConfig], Frames],
-    iteration: int,
-) -> TrialRecord:
+class _Shared:
+    """What the cases of a world share: each is worked out once."""
+
+    def __init__(
+        self, scenario: Scenario, config: Config, beams: Mapping[float, Sequence[Heard]]
+    ) -> None:
+        self.scenario, self.beams, self._config = scenario, beams, config
+        self._scans_of, self._bound_of = cache(self._scans), cache(self._bound)
+
+    def scans(self, radius: float, strategy: Strategy, told: FilterConfig) -> tuple[Scan, ...]:
+        """Return what a strategy takes of a beam's frames, and how surely, as a filter is told."""
+        return self._scans_of(radius, strategy, _noise_alone(told))
+
+    def consistent(
+        self, radius: float, strategy: Strategy, told: FilterConfig
+    ) -> Float[np.ndarray, "k 2"]:
+        """Return mean and variance of a consistent filter's NEES at each frame, the start exact."""
+        frames = slice(None, None, self._config.scenario.steps_per_frame)
+        bound = self._bound_of(radius, strategy, _noise_alone(told))[frames]
+        start = np.diag(np.square(told.initial_pose_std))
+        expected = nees_of_exact_start(bound, self.scenario.path[frames], start)
+        return np.column_stack(expected)[1:].astype(np.float32)
+
+    def reached(self, radius: float, strategy: Strategy, told: FilterConfig) -> tuple[float, float]:
+        """Return the least RMSE of position and heading, the noise as the signal tells it."""
+        measured = _noise_alone(told).model_copy(update={"noise": "measured"})
+        return path_bound(self._bound_of(radius, strategy, measured))
+
+    def _scans(self, radius: float, strategy: Strategy, noise: FilterConfig) -> tuple[Scan, ...]:
+        """Take the scans of a beam."""
+        told = self._config.model_copy(update={"filter": noise})
+        return scans_of(self.beams[radius], strategy, told)
+
+    def _bound(
+        self, radius: float, strategy: Strategy, noise: FilterConfig
+    ) -> Float[np.ndarray, "t 3 3"]:
+        """Work out the bound of the pose at every step."""
+        drive, landmarks = (
+            drive_of(self.scenario, self._config),
+            standing_landmarks(self.scenario),
+        )
+        scans = self._scans_of(radius, strategy, noise)
+        path = self.scenario.path
+        return pose_bound(drive.motion, drive.controls, drive.time, path, landmarks, scans)
+
+
+def _noise_alone(told: FilterConfig) -> FilterConfig:
+    """Return of a filter's settings what states the noise, all else at its default."""
+    noise = ("noise", "range_std", "bearing_std")
+    return FilterConfig(**{name: getattr(told, name) for name in noise})
+
+
+def _try_case(case: PlannedCase, shared: _Shared, iteration: int) -> TrialRecord:
     """Run a trial, whatever comes of it; filters share what a beam and a strategy bring."""
     try:
+        scenario, told = shared.scenario, case.config.filter
         drive, radius = drive_of(scenario, case.config), case.config.emitter.radius
-        heard, noise = beams[radius], noise_of(case.config.filter)
-        scans = scans_of(radius, case.strategy, noise)
+        heard, scans = shared.beams[radius], shared.scans(radius, case.strategy, told)
         began = time.thread_time()
         result = run_trial(replace(case, iteration=iteration), drive, scans, case.config)
         cpu_s = time.thread_time() - began
         estimate = heaviest(result.track.landmarks)
         full = result.track.full
+        frames = _frame_errors(result.track, scenario, case.config)
         return TrialRecord(
             case=case,
             beamwidth_deg=_beamwidth_deg(case),
             scores=result.scores,
             online=result.online,
+            bound=shared.reached(radius, case.strategy, told),
             landmarks_full_mean=float(result.scores.landmarks_full if full is None else full),
             clutter_per_frame=sum(h.clutter or 0 for h in heard) / len(heard) if heard else None,
             wall_s=result.wall_s,
             cpu_s=cpu_s,
-            steps=np.column_stack(
-                [
-                    _frame_errors(result.track, scenario, case.config),
-                    consistent(radius, case.strategy, case.config.filter),
-                ]
-            ),
+            steps=np.column_stack([frames, shared.consistent(radius, case.strategy, told)]),
             landmark=estimate.landmark,
             full=estimate.full,
             landmark_error=landmark_error(estimate, *standing_landmarks(scenario)),
@@ -357,17 +391,6 @@ def _frame_errors(track: Track, scenario: Scenario, config: Config) -> Float[np.
     mean, true = track.pose.mean[frames], scenario.path[frames]
     columns = (position_error(mean, true), pose_error(mean, true)[:, 2], epsilon)
     return np.column_stack(columns).astype(np.float32)
-
-
-def _consistent(scans: Sequence[Scan], scenario: Scenario, config: Config) -> Frames:
-    """Return mean and variance of a consistent filter's NEES at each frame, the start exact."""
-    drive, every = drive_of(scenario, config), config.scenario.steps_per_frame
-    bound = pose_bound(
-        drive.motion, drive.controls, drive.time, scenario.path, standing_landmarks(scenario), scans
-    )
-    frames = slice(None, None, every)
-    expected = nees_of_exact_start(bound[frames], scenario.path[frames], drive.start.covariance)
-    return np.column_stack(expected)[1:].astype(np.float32)
 
 
 def _failed(case: PlannedCase, error: str) -> TrialRecord:
@@ -406,6 +429,7 @@ def _row(iteration: int, record: TrialRecord, columns: Sequence[str]) -> dict[st
         "status": "done" if record.error is None else "failed",
         "error": record.error,
         **(nothing if scores is None else asdict(scores)),
+        **dict(zip(BOUNDS, record.bound or (None, None), strict=True)),
         "landmarks_full_mean": record.landmarks_full_mean,
         "clutter_per_frame": record.clutter_per_frame,
         "wall_s": record.wall_s,

@@ -180,7 +180,9 @@ def _plan_sum(plan: Plan) -> str:
     air = config.pop("air", {})
     air["speed_of_sound"] = plan.config.air.celerity  # given or not
     grid = {name: list(values) for name, values in plan.grid.items()}
-    said = json.dumps([plan.strategies, plan.filters, config, air, grid], sort_keys=True)
+    own = {name: dict(settings) for name, settings in plan.own.items()}
+    parts = [plan.strategies, plan.filters, config, air, grid, *([own] if own else [])]
+    said = json.dumps(parts, sort_keys=True)
     return sha256(said.encode()).hexdigest()
 
 
