@@ -9,8 +9,8 @@ from benchmarks.table import Row
 
 COMMAND = "./dev bench --only peer"
 MISSING = (
-    "gtsam_isam2_ms: left out, for gtsam is not installed; the extra `peers` names it: "
-    "python -m pip install 'gtsam>=4.2.1', in the environment that ./dev made"
+    "gtsam_isam2_ms: left out, for gtsam is not installed; the extra `smoother` names it: "
+    "python -m pip install 'gtsam>=4.3', in the environment that ./dev made"
 )
 
 

@@ -150,7 +150,7 @@ def unlabelled(heard: Heard) -> Heard:
     array([-1])
     """
     nobody = np.full_like(heard.rows.landmark, UNLABELLED)
-    return Heard(rows=replace(heard.rows, landmark=nobody), clutter=None)
+    return replace(heard, rows=replace(heard.rows, landmark=nobody), clutter=None)
 
 
 class _Found(NamedTuple):

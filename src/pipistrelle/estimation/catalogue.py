@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from pipistrelle.config import Config, InputError
@@ -41,6 +42,8 @@ class Entry:
         A NEES above it means that the estimator has diverged.
     memory : function of the number of landmarks, the members of each, and Config
         Most bytes that it holds at once: all landmarks are there, and all of them still rays.
+    needs : str
+        A module that it cannot do without and that an extra of its name installs, or nothing.
     """
 
     name: str
@@ -49,6 +52,36 @@ class Entry:
     sections: tuple[str, ...]
     nees_limit: float
     memory: Callable[[int, int, Config], float]
+    needs: str = ""
+
+
+def is_there(name: str) -> bool:
+    """Tell whether what an estimator of the catalogue needs is installed.
+
+    Examples
+    --------
+    >>> is_there("ekf")
+    True
+    """
+    return not CATALOGUE[name].needs or find_spec(CATALOGUE[name].needs) is not None
+
+
+def check_there(name: str) -> None:
+    """Refuse an estimator of the catalogue that needs what is not installed.
+
+    Parameters
+    ----------
+    name : str
+
+    Raises
+    ------
+    InputError
+    """
+    if not is_there(name):
+        raise InputError(
+            f"filter {name}: needs {CATALOGUE[name].needs}, which is not installed; "
+            f"python -m pip install 'pipistrelle[{name}]' installs it"
+        )
 
 
 def entry(name: str) -> Entry:
@@ -224,6 +257,7 @@ def _iekf(config: Config, motion: "Motion") -> "Estimator":
 
 def _smoother(config: Config, motion: "Motion") -> "Estimator":
     """Build the smoother."""
+    check_there("smoother")
     from pipistrelle.estimation.smoother.filter import Smoother
 
     return Smoother(motion=motion, **_gaussian(config))
@@ -233,6 +267,12 @@ def _gaussian(config: Config) -> dict[str, Any]:
     """Return the settings of both EKFs."""
     settings = config.filter
     return {"rays": config.rays, "gate": settings.gate, "robust": settings.robust == "huber"}
+
+
+def _smoother_bytes(landmarks: int, _: int, config: Config) -> float:
+    """Count the factors, were every landmark heard from every pose; measured: a kilobyte each."""
+    poses = config.scenario.steps / config.scenario.steps_per_frame
+    return poses * landmarks * 1e3
 
 
 def _ekf_bytes(landmarks: int, members: int, _: Config) -> float:
@@ -287,7 +327,8 @@ CATALOGUE = {
             build=_smoother,
             sections=("filter", "rays"),
             nees_limit=50.0,
-            memory=_ekf_bytes,
+            memory=_smoother_bytes,
+            needs="gtsam",
         ),
     )
 }

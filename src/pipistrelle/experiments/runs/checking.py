@@ -12,7 +12,7 @@ import numpy as np
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Belief, Gaussian, Track, no_landmarks
-from pipistrelle.estimation.catalogue import CATALOGUE, check_distinct, entry
+from pipistrelle.estimation.catalogue import CATALOGUE, check_distinct, check_there, entry
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.outside import worded
 from pipistrelle.experiments.cases import Case
@@ -39,6 +39,7 @@ def check_filters(filters: Sequence[str], motion: Motion, config: Config) -> Non
     check_distinct(filters)
     for name in filters:
         if name in CATALOGUE:
+            check_there(name)
             continue
         try:
             belief = first_belief(name, motion, config)

@@ -12,7 +12,7 @@ import numpy as np
 from pipistrelle.config import Config, ScenarioConfig
 from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import Estimator, Gaussian
-from pipistrelle.estimation.catalogue import CATALOGUE
+from pipistrelle.estimation.catalogue import CATALOGUE, is_there
 from pipistrelle.experiments.hearing.scenario import bicycle
 from pipistrelle.experiments.machine import cores
 from pipistrelle.experiments.runs.trial import run_mission
@@ -31,7 +31,7 @@ def compile_kernels() -> None:
     if not cached and cores() > 1:
         with _second_process(_SECOND):
             run_mission(tiny, ("fused",), _families()[0])
-    run_mission(tiny, ("active", "fused", "passive"), tuple(CATALOGUE))
+    run_mission(tiny, ("active", "fused", "passive"), tuple(filter(is_there, CATALOGUE)))
 
 
 def compile_others() -> None:
@@ -46,10 +46,11 @@ def compile_others() -> None:
 
 def _families() -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names of the filters of the first one's package, whose kernels they share, and the others."""
-    package = {name: type(_built(name)).__module__.rpartition(".")[0] for name in CATALOGUE}
+    there = tuple(filter(is_there, CATALOGUE))
+    package = {name: type(_built(name)).__module__.rpartition(".")[0] for name in there}
     own = package[next(iter(CATALOGUE))]
-    related = tuple(name for name in CATALOGUE if package[name] == own)
-    return related, tuple(name for name in CATALOGUE if name not in related)
+    related = tuple(name for name in there if package[name] == own)
+    return related, tuple(name for name in there if name not in related)
 
 
 def _built(name: str) -> Estimator:
