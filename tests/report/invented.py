@@ -93,7 +93,8 @@ def trials_of(rng, world, name, strategy):
     scores["landmarks_full_mean"] = scores["landmarks_full"] + 0.1
     scores["position_rmse_aligned_m"] = 0.2 * scores["position_rmse_m"]
     scores["map_rmse_aligned_m"] = scores["position_rmse_aligned_m"] + 0.01
-    scores["position_floor_m"] = np.tile(0.23 + 0.05 * world[:, None], beams)
+    scores["position_bound_m"] = np.tile(0.23 + 0.05 * world[:, None], beams)
+    scores["heading_bound_rad"] = 0.1 * scores["position_bound_m"]
     placed = {"active": 0.5, "fused": 0.52, "passive": 0.6}[strategy]
     scores[COMMON] = placed + 0.2 * world[:, None] + 0.05 * noise(rng, worlds, len(BEAMWIDTH))
     no = np.zeros((worlds, beams), dtype=bool)

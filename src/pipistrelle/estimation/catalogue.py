@@ -161,7 +161,7 @@ def check_name(name: str) -> str:
     >>> check_name("ukf")
     Traceback (most recent call last):
     pipistrelle.config.InputError: filter: found 'ukf', expected one of ekf, fastslam, iekf,
-    module:Class
+    smoother, module:Class
     """
     module, colon, kind = name.partition(":")
     dotted = all(part.isidentifier() for part in module.split("."))

@@ -29,14 +29,15 @@ Cell = tuple[str, str, int]
 """Filter, strategy and number of the beamwidth (of no meaning for passive)."""
 POSITION, HEADING = "position_rmse_m", "heading_rmse_rad"
 POSITION_ALIGNED, MAP_ALIGNED = "position_rmse_aligned_m", "map_rmse_aligned_m"
-FLOOR = "position_floor_m"
-"""The error of position that no estimator avoids."""
+POSITION_BOUND, HEADING_BOUND = "position_bound_m", "heading_bound_rad"
+"""The least errors that the sound leaves to any estimator."""
 SCORES = (
     POSITION,
     HEADING,
     POSITION_ALIGNED,
     MAP_ALIGNED,
-    FLOOR,
+    POSITION_BOUND,
+    HEADING_BOUND,
     "nees_mean",
     "nees_max",
     "landmarks_full",
@@ -125,7 +126,7 @@ class Selection:
         Per filter, the worlds in which any of its cases diverged or failed.
     gains : dict of tuple of Finding
         Active minus fused at each beamwidth, judged as a family of its own, by filter and score:
-        `POSITION` and `COMMON`. Empty where the study lacks one of the two.
+        `POSITION`, `POSITION_ALIGNED` and `COMMON`. Empty where the study lacks one of the two.
     """
 
     study: Study

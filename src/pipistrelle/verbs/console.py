@@ -156,6 +156,8 @@ def _cells(trial: "TrialResult", there: int | None) -> Iterator[tuple[str, str]]
     yield "position RMSE, aligned [m]", _number(s.position_rmse_aligned_m, 3)
     yield "map RMSE, aligned [m]", _number(s.map_rmse_aligned_m, 3)
     yield "position, unavoidable [m]", _number(s.position_floor_m, 3)
+    yield "position, bound [m]", _number(s.position_bound_m, 3)
+    yield "heading, bound [rad]", _number(s.heading_bound_rad, 4)
     yield "NEES, mean", _number(s.nees_mean, 2)
     yield "NEES, largest", _number(s.nees_max, 1)
     yield "landmarks, placed / heard", f"{s.landmarks_full} / {s.landmarks_total}"

@@ -1,7 +1,7 @@
 """Scores: how good an estimate is, by the truth."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +18,7 @@ from pipistrelle.evaluation.accuracy import (
     rmse,
     scored_landmarks,
 )
+from pipistrelle.evaluation.bound import path_bound, pose_bound
 from pipistrelle.evaluation.consistency import diverged, track_nees
 from pipistrelle.experiments.drives import Drive, Truth
 
@@ -55,6 +56,9 @@ class Scores:
         The same, path and map each after its own rigid motion; at least two points.
     position_floor_m : float or None
         Of a path that is right but for what was lost before the first scan (`position_floor`).
+    position_bound_m, heading_bound_rad : float or None
+        Least that any estimator without bias has in the mean over such drives, the start exact and
+        the noise as the signal tells it (`evaluation.bound.path_bound`).
     nees_mean, nees_max : float or None
     diverged : bool or None
         Whether any NEES is not finite or above the limit; without truth, True where the path is
@@ -73,6 +77,8 @@ class Scores:
     position_rmse_aligned_m: float | None
     map_rmse_aligned_m: float | None
     position_floor_m: float | None = None
+    position_bound_m: float | None = None
+    heading_bound_rad: float | None = None
     nees_mean: float | None
     nees_max: float | None
     diverged: bool | None
@@ -231,6 +237,45 @@ def position_floor(drive: Drive, scans: Sequence[Scan]) -> float | None:
     error = position_error(np.concatenate([np.array(reckoned)[:first, :2], after]), true[:, :2])[1:]
     known = error[np.isfinite(error)]
     return rmse(known) if known.size else None
+
+
+def drive_bound(drive: Drive, scans: Sequence[Scan]) -> Float[np.ndarray, "t 3 3"] | None:
+    """Return the bound of the pose at every step of a drive whose truth is known.
+
+    Parameters
+    ----------
+    drive : Drive
+    scans : sequence of Scan
+        With their standard deviations.
+
+    Returns
+    -------
+    (k + 1, 3, 3) [m, rad, squared], or None
+        None where the truth is not known at every step, or no landmark's is.
+    """
+    path, landmarks = drive.truth.path, drive.truth.landmarks
+    if path is None or landmarks is None or not np.isfinite(path).all():
+        return None
+    return pose_bound(drive.motion, drive.controls, drive.time, path, landmarks, scans)
+
+
+def with_bound(scores: Scores, bound: Float[np.ndarray, "t 3 3"] | None) -> Scores:
+    """Return scores with the least errors beside them.
+
+    Parameters
+    ----------
+    scores : Scores
+    bound : (k + 1, 3, 3) or None
+        As `drive_bound` gives it.
+
+    Returns
+    -------
+    Scores
+    """
+    if bound is None:
+        return scores
+    position, heading = path_bound(bound)
+    return replace(scores, position_bound_m=position, heading_bound_rad=heading)
 
 
 @np.errstate(over="ignore", invalid="ignore")

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import Config, Strategy
@@ -33,9 +34,11 @@ from pipistrelle.experiments.hearing.scenario import (
 from pipistrelle.experiments.machine import check_memory
 from pipistrelle.experiments.results.scores import (
     TrialResult,
+    drive_bound,
     position_floor,
     score,
     score_path,
+    with_bound,
 )
 from pipistrelle.experiments.runs.checking import check_filters, failed_trial
 from pipistrelle.experiments.runs.filtering import run_filter
@@ -102,6 +105,8 @@ def run_mission(
     (heard,) = listen(scenario, config, (config.emitter.radius,), progress=progress)
     scans = {strategy: scans_of(heard, strategy, config) for strategy in strategies}
     trials = run_trials(filters, drive, scans, config, progress=progress, watch=watch)
+    bounds = _bounds(drive, heard, strategies, config)
+    trials = tuple(replace(t, scores=with_bound(t.scores, bounds[t.strategy])) for t in trials)
     return Mission(config=config, scenario=scenario, drive=drive, heard=heard, trials=trials)
 
 
@@ -122,6 +127,15 @@ def scans_of(heard: Sequence[Heard], strategy: Strategy, config: Config) -> tupl
     noise, said = noise_of(config.filter), config.filter.noise == "measured"
     frames = map(measured, heard) if said else heard
     return tuple(noise(scan_of(frame, strategy)) for frame in frames)
+
+
+def _bounds(
+    drive: Drive, heard: Sequence[Heard], strategies: Sequence[Strategy], config: Config
+) -> dict[str, Float[np.ndarray, "t 3 3"] | None]:
+    """Work out the bound of each strategy, the noise as the signal tells it."""
+    noise = config.filter.model_copy(update={"noise": "measured"})
+    told = config.model_copy(update={"filter": noise})
+    return {name: drive_bound(drive, scans_of(heard, name, told)) for name in strategies}
 
 
 def drive_of(scenario: Scenario, config: Config) -> Drive:

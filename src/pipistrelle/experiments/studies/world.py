@@ -28,7 +28,7 @@ from pipistrelle.evaluation.accuracy import (
     pose_error,
     position_error,
 )
-from pipistrelle.evaluation.bound import nees_of_exact_start, path_bound, pose_bound
+from pipistrelle.evaluation.bound import nees_of_exact_start, pose_bound
 from pipistrelle.evaluation.consistency import track_nees
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import (
@@ -37,7 +37,7 @@ from pipistrelle.experiments.hearing.scenario import (
     standing_landmarks,
     world_of,
 )
-from pipistrelle.experiments.results.scores import PathScores, Scores
+from pipistrelle.experiments.results.scores import PathScores, Scores, with_bound
 from pipistrelle.experiments.runs.checking import first_belief
 from pipistrelle.experiments.runs.trial import drive_of, run_trial, scans_of
 from pipistrelle.experiments.studies.plan import Plan, PlannedCase, cases_of
@@ -50,8 +50,6 @@ ONLINE = ("position_rmse_m", "heading_rmse_rad", "nees_mean", "nees_max")
 
 STEPS = ("position_error_m", "heading_error_rad", "nees", "nees_expected", "nees_variance")
 """What a table has of each frame: errors and NEES; of a consistent filter, mean and variance."""
-BOUNDS = ("position_bound_m", "heading_bound_rad")
-"""What a table has of the least error that the sound leaves, as the signal tells its noise."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,8 +66,6 @@ class TrialRecord:
     scores : Scores or None
     online : PathScores or None
         Of the path as it was believed at its time, where the filter revises it.
-    bound : position [m] and heading [rad], or None
-        Their least RMSE, as `evaluation.bound.path_bound` has it.
     landmarks_full_mean : float or None
         Over the particles, where the filter has some.
     clutter_per_frame : float or None
@@ -91,7 +87,6 @@ class TrialRecord:
     error: str | None = None
     scores: Scores | None = None
     online: PathScores | None = None
-    bound: tuple[float, float] | None = None
     landmarks_full_mean: float | None = None
     clutter_per_frame: float | None = None
     wall_s: float = 0.0
@@ -246,7 +241,7 @@ def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
             "status": pl.String,
             "error": pl.String,
             **(scores | counts | {"diverged": pl.Boolean}),
-            **dict.fromkeys((*BOUNDS, *last), pl.Float64),
+            **dict.fromkeys(last, pl.Float64),
             **dict.fromkeys(_online_columns(plan), pl.Float64),
         },
         "steps": {
@@ -312,10 +307,12 @@ class _Shared:
         expected = nees_of_exact_start(bound, self.scenario.path[frames], start)
         return np.column_stack(expected)[1:].astype(np.float32)
 
-    def reached(self, radius: float, strategy: Strategy, told: FilterConfig) -> tuple[float, float]:
-        """Return the least RMSE of position and heading, the noise as the signal tells it."""
+    def bound(
+        self, radius: float, strategy: Strategy, told: FilterConfig
+    ) -> Float[np.ndarray, "t 3 3"]:
+        """Return the bound of the pose at every step, the noise as the signal tells it."""
         measured = _noise_alone(told).model_copy(update={"noise": "measured"})
-        return path_bound(self._bound_of(radius, strategy, measured))
+        return self._bound_of(radius, strategy, measured)
 
     def _scans(self, radius: float, strategy: Strategy, noise: FilterConfig) -> tuple[Scan, ...]:
         """Take the scans of a beam."""
@@ -326,13 +323,9 @@ class _Shared:
         self, radius: float, strategy: Strategy, noise: FilterConfig
     ) -> Float[np.ndarray, "t 3 3"]:
         """Work out the bound of the pose at every step."""
-        drive, landmarks = (
-            drive_of(self.scenario, self._config),
-            standing_landmarks(self.scenario),
-        )
-        scans = self._scans_of(radius, strategy, noise)
-        path = self.scenario.path
-        return pose_bound(drive.motion, drive.controls, drive.time, path, landmarks, scans)
+        scans, world = self._scans_of(radius, strategy, noise), self.scenario
+        truth, motion = (world.path, standing_landmarks(world)), bicycle(self._config.motion)
+        return pose_bound(motion, world.controls, world.time, *truth, scans)
 
 
 def _noise_alone(told: FilterConfig) -> FilterConfig:
@@ -356,9 +349,8 @@ def _try_case(case: PlannedCase, shared: _Shared, iteration: int) -> TrialRecord
         return TrialRecord(
             case=case,
             beamwidth_deg=_beamwidth_deg(case),
-            scores=result.scores,
+            scores=with_bound(result.scores, shared.bound(radius, case.strategy, told)),
             online=result.online,
-            bound=shared.reached(radius, case.strategy, told),
             landmarks_full_mean=float(result.scores.landmarks_full if full is None else full),
             clutter_per_frame=sum(h.clutter or 0 for h in heard) / len(heard) if heard else None,
             wall_s=result.wall_s,
@@ -429,7 +421,6 @@ def _row(iteration: int, record: TrialRecord, columns: Sequence[str]) -> dict[st
         "status": "done" if record.error is None else "failed",
         "error": record.error,
         **(nothing if scores is None else asdict(scores)),
-        **dict(zip(BOUNDS, record.bound or (None, None), strict=True)),
         "landmarks_full_mean": record.landmarks_full_mean,
         "clutter_per_frame": record.clutter_per_frame,
         "wall_s": record.wall_s,

@@ -15,11 +15,12 @@ from pipistrelle.report.charts.timelines import anees_charts
 from pipistrelle.report.claims.published import FILTERS, TABLE_II, beam_name, cell_of, row_name
 from pipistrelle.report.studied import (
     COMMON,
-    FLOOR,
     HEADING,
+    HEADING_BOUND,
     MAP_ALIGNED,
     POSITION,
     POSITION_ALIGNED,
+    POSITION_BOUND,
     Cell,
     Selection,
     Study,
@@ -53,6 +54,8 @@ class ErrorChart:
         From the score to the axis.
     more : str
         Of the caption, at its end.
+    bound : one of `studied.SCORES`, or nothing
+        The least that any estimator has.
     """
 
     name: str
@@ -62,8 +65,11 @@ class ErrorChart:
     column: str
     scale: float = 1.0
     more: str = ""
+    bound: str = ""
 
 
+BOUND = "; dashed: the bound, the least that any estimator has, the noise as the signal tells it"
+"""What the caption says of it."""
 ERRORS = (
     ErrorChart(
         name="position_rmse",
@@ -71,8 +77,8 @@ ERRORS = (
         score=POSITION,
         label="position RMSE [m]",
         column="position_rmse_m",
-        more="; dashed: what no estimator avoids, the vehicle having turned unseen before its "
-        "first scan",
+        more=BOUND,
+        bound=POSITION_BOUND,
     ),
     ErrorChart(
         name="position_rmse_aligned",
@@ -90,6 +96,8 @@ ERRORS = (
         label="heading RMSE [°]",
         column="heading_rmse_deg",
         scale=180.0 / np.pi,
+        more=BOUND,
+        bound=HEADING_BOUND,
     ),
     ErrorChart(
         name="map_rmse",
@@ -290,9 +298,8 @@ def _error_chart(selection: Selection, what: ErrorChart) -> Chart:
         line = _mean_line(study, way, per_beam, flat=flat)
         worlds = _worlds_above(study, way, line, per_beam, flat=flat)
         found.setdefault(way[0], []).extend([line, worlds])
-    if what.score == POSITION:
-        for name, mine in found.items():
-            mine.append(_floor_line(selection, name))
+        if what.bound:
+            found[way[0]].append(_bound_line(selection, way, what))
     lines = [s for mine in found.values() for s in mine if not MARKS[s.style].pinned]
     vertical = linear_axis(what.label, [1.07 * end for end in ends(lines)], floor=0.0)
     return Chart(
@@ -306,16 +313,16 @@ def _error_chart(selection: Selection, what: ErrorChart) -> Chart:
     )
 
 
-def _floor_line(selection: Selection, name: str) -> Series:
-    """Return the least mean error that no estimator avoids in the worlds that a filter keeps."""
-    study = selection.study
-    floors = [
-        [mean_std(sample)[0] for sample in _per_beam(selection, way, FLOOR)]
-        for way in study.trials
-        if way[0] == name
-    ]
-    least = np.min(floors, axis=0)  # who hears nothing for longer, loses more
-    return Series(name="no estimator avoids", role="ink", x=study.beamwidth, y=least, dashed=True)
+def _bound_line(selection: Selection, way: Way, what: ErrorChart) -> Series:
+    """Return the mean of the least errors over the worlds that count."""
+    least = [what.scale * mean_std(one)[0] for one in _per_beam(selection, way, what.bound)]
+    return Series(
+        name=f"{way[1]}, bound",
+        role=way[1],
+        x=selection.study.beamwidth,
+        y=np.array(least),
+        dashed=True,
+    )
 
 
 def _per_beam(selection: Selection, way: Way, score: str) -> list[Float[np.ndarray, " m"]]:

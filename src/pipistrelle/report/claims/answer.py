@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from pipistrelle.config import STRATEGIES
 from pipistrelle.evaluation.comparison import Finding
 from pipistrelle.experiments.hearing.scenario import landmark_count
 from pipistrelle.report.claims.published import beam_name
@@ -11,6 +12,9 @@ from pipistrelle.report.claims.verdicts import WITHOUT, JudgedClaim
 from pipistrelle.report.studied import (
     COMMON,
     POSITION,
+    POSITION_ALIGNED,
+    POSITION_BOUND,
+    Cell,
     Rule,
     Selection,
     Study,
@@ -50,6 +54,9 @@ def answer(selections: Mapping[Rule, Selection], claims: Sequence[JudgedClaim]) 
             "The landmarks that every strategy places are placed", papers, everything, COMMON
         ),
         _compared("The vehicle is located", papers, everything, POSITION),
+        _compared("After alignment its path is", papers, everything, POSITION_ALIGNED),
+        _allowed(everything),
+        *_reached(everything),
         _diverged(papers.study),
         _verdicts(claims),
     )
@@ -231,6 +238,56 @@ def _beams(findings: Sequence[Finding], holds: bool) -> str:
         return "every beamwidth"
     which = ", ".join(run[0] if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs)
     return f"{count} of {len(findings)} beamwidths ({which})"
+
+
+def _allowed(everything: Selection) -> str:
+    """Say what the bound makes of the question, whatever the estimator."""
+    study = everything.study
+    for name in filter_titles(study):
+        if not {(name, "fused"), (name, "active")} <= study.trials.keys():
+            continue
+        said = []
+        for i in dict.fromkeys((len(study.beamwidth) - 1, len(study.beamwidth) // 2, 0)):
+            cells = [(name, "active", i), (name, "fused", i)]
+            alone, both = (np.mean(one) for one in samples(everything, POSITION_BOUND, cells))
+            if not both > 0.0:
+                return ""
+            beam = beam_name(study.beamwidth[i])
+            said.append(f"{alone:.3f} m to {both:.3f} m at {beam} ({alone / both - 1.0:.0%})")
+        return (
+            "Whatever the estimator, listening may lower the least error that the sound leaves "
+            f"from {', '.join(said)}, in the mean over all worlds."
+        )
+    return ""
+
+
+def _reached(everything: Selection) -> list[str]:
+    """Say of each filter how near it comes to the least error that the sound leaves."""
+    study, sentences = everything.study, []
+    for name, title in filter_titles(study).items():
+        said = []
+        for strategy in STRATEGIES:
+            if (name, strategy) not in study.trials:
+                continue
+            beams = 1 if strategy == "passive" else len(study.beamwidth)
+            times = [_over_bound(everything, (name, strategy, i)) for i in range(beams)]
+            if np.isfinite(times).all():
+                low, high = f"{min(times):.2f}", f"{max(times):.2f}"
+                said.append(f"{strategy} {low}" + (f" to {high}" if high != low else ""))
+        if said:
+            sentences.append(
+                f"{title[0].upper()}{title[1:]}, with everything counted, has of that least error, "
+                f"by strategy and over the beamwidths, {', '.join(said)} times."
+            )
+    return sentences
+
+
+def _over_bound(everything: Selection, cell: Cell) -> float:
+    """Return the mean error of position over the mean bound."""
+    (error,), (least,) = (
+        samples(everything, score, [cell]) for score in (POSITION, POSITION_BOUND)
+    )
+    return float(np.mean(error) / np.mean(least)) if len(error) and len(least) else np.nan
 
 
 def _verdicts(claims: Sequence[JudgedClaim]) -> str:

@@ -23,6 +23,7 @@ from pipistrelle.report.claims.published import beam_name
 from pipistrelle.report.studied import (
     COMMON,
     POSITION,
+    POSITION_ALIGNED,
     RULES,
     Rule,
     Selection,
@@ -68,7 +69,7 @@ def select(study: Study, rule: Rule) -> Selection:
     gains = {
         (name, score): judge(differences(bare, score, *_gain(name), name=name))
         for name in names
-        for score in (POSITION, COMMON)
+        for score in (POSITION, POSITION_ALIGNED, COMMON)
     }
     return replace(bare, gains=gains)
 
