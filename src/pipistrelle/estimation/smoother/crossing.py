@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-PARALLAX = 0.3
+PARALLAX = 0.5
 """Least angle [rad] at which two bearings place a landmark."""
 SURE = 0.5
 """Most standard deviations of the place, as a share of the range: beyond, it is anybody's guess."""

@@ -231,7 +231,7 @@ class Smoother:
         """Add a frame's factors, and those of what it places, if it may, as a link."""
         link = _next_to(here)
         factors, values, node = link.factors, link.values, link.node
-        mapped, waiting = list(here.mapped), dict(here.waiting)
+        mapped, waiting, crossed = list(here.mapped), dict(here.waiting), False
         poses = _poses(here)
         columns = (scan.landmark, scan.bearing, scan.range, scan.bearing_std, scan.range_std)
         for label, bearing, distance, across, along in zip(*map(_listed, columns), strict=True):
@@ -246,6 +246,7 @@ class Smoother:
                 mapped.append(label)
                 values.insert(landmark_key(label), place)
                 factors.add(_prior(label, place))
+                crossed |= label in here.waiting
                 for earlier in waiting.pop(label, ()):
                     factors.add(self._bearing(earlier, label))
                 if math.isnan(distance):
@@ -254,6 +255,7 @@ class Smoother:
                 factors.add(self._bearing(Bearing(node, bearing, across), label))
             else:
                 factors.add(self._range(node, label, (bearing, distance), (across, along)))
+        link = replace(link, crossed=crossed)
         return replace(here, link=link, mapped=tuple(mapped), waiting=waiting)
 
     def _bearing(self, heard: Bearing, label: int) -> gtsam.BearingFactor2D:
@@ -304,7 +306,7 @@ def _next_to(here: SmootherBelief) -> Link:
 
 def _after(last: Link, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Link:
     """Return a link after another, of the same pose."""
-    return replace(last, before=last, leg=None, factors=factors, values=values)
+    return replace(last, before=last, leg=None, factors=factors, values=values, crossed=False)
 
 
 def _solved(belief: SmootherBelief) -> SmootherBelief:

@@ -18,6 +18,9 @@ from pipistrelle.estimation.smoother.legs import SMALLEST_STD, Leg, symmetric, t
 
 RELINEARIZE = 0.1
 """Change of a variable [m, rad] beyond which iSAM2 linearises anew what hangs on it."""
+ANEW = 5
+"""Times that all is linearised anew where bearings enter that had waited: many of them enter at
+once, from poses that they correct, and a graph that was linearised before may never recover."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,6 +40,8 @@ class Link:
     thorough : bool
         Whether to solve by QR factors, which cost twice as much as Cholesky's, for these were too
         coarse: some noise is so small beside another.
+    crossed : bool
+        Whether bearings entered that had waited.
     """
 
     before: "Link | None"
@@ -45,6 +50,7 @@ class Link:
     factors: gtsam.NonlinearFactorGraph
     values: gtsam.Values
     thorough: bool = False
+    crossed: bool = False
 
 
 def links(last: Link) -> Iterator[Link]:
@@ -81,6 +87,8 @@ class Solver:
             self.isam, self.at = isam, None
             for step in way:
                 isam.update(step.factors, step.values)
+                for _ in range(ANEW if step.crossed else 0):
+                    isam.update(force_relinearize=True)
             self.at = link
         return isam
 
