@@ -18,6 +18,16 @@ ROWS = {
     "fastslam_mission_ms": "test_mission[fastslam-fused]",
 }
 """The stage behind each row."""
+RATIOS = {
+    "iekf_over_ekf": "test_estimator[iekf]",
+    "smoother_over_ekf": "test_estimator[smoother]",
+}
+DRIVES = {
+    "precise_ekf_m": "test_precise_bearings[ekf]",
+    "precise_iekf_m": "test_precise_bearings[iekf]",
+    "precise_smoother_m": "test_precise_bearings[smoother]",
+}
+"""The stages that tell a ratio, and an error."""
 BOTH = "test_listening_to_few_frames_by_samples_and_by_blocks"
 
 
@@ -56,6 +66,16 @@ def rows(stages: dict[str, Any]) -> Iterator[Row]:
             ratio=seconds / extra.get("frames", 1) / extra["calibration_s"],
             floor=None if floor is None else 1e3 * floor,
         )
+    for name, test in RATIOS.items():
+        if test in stages:
+            ratio = stages[test]["extra_info"]["over_ekf"]
+            note = f"{1e3 * stages[test]['stats']['median']:.1f} ms"
+            yield row(name, ratio, _command(test), ratio=ratio, note=note)
+    for name, test in DRIVES.items():
+        if test in stages:
+            error = stages[test]["extra_info"]["aligned_m"]
+            note = f"in {1e3 * stages[test]['stats']['median']:.0f} ms"
+            yield row(name, error, _command(test), ratio=error, note=note)
     if BOTH in stages:
         ratio = stages[BOTH]["extra_info"]["over_blocks"]
         yield row("dense_over_block", ratio, _command(BOTH), ratio=ratio)

@@ -13,11 +13,13 @@ from benchmarks.calibration import calibrate
 from benchmarks.counts import covariance_updates, elementary_functions
 from benchmarks.limits import elementary_function, multiply_add
 from benchmarks.worlds import RADII, scans_of, some_frames, world_of
-from pipistrelle.config import Config, ReceiverConfig
+from pipistrelle.config import Config, FilterConfig, RayConfig, ReceiverConfig
+from pipistrelle.estimation.catalogue import is_there
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.machine import keep_freed_memory
 from pipistrelle.experiments.runs.trial import drive_of, run_trial
+from reference.drives import turn_and_drive
 
 keep_freed_memory()  # as the commands do
 CONFIG = Config()
@@ -77,3 +79,33 @@ def test_mission(benchmark, name, strategy):
         seconds = elementary_functions(case, drive, scans, CONFIG) * elementary_function()
     benchmark.extra_info["floor_s"] = seconds
     benchmark.pedantic(run_trial, (case, drive, scans, CONFIG), rounds=15, warmup_rounds=1)
+
+
+@pytest.mark.parametrize("name", list(filter(is_there, ("iekf", "smoother"))))
+def test_estimator(benchmark, name):
+    """Time a fused mission and, before each of its rounds, the EKF's."""
+    scans, drive, ekf = scans_of(CONFIG, "fused"), drive_of(WORLD, CONFIG), []
+
+    def the_ekfs():
+        began = time.process_time()
+        run_trial(Case(strategy="fused", filter="ekf"), drive, scans, CONFIG)
+        ekf.append(time.process_time() - began)
+
+    case, rounds = Case(strategy="fused", filter=name), 5
+    benchmark.pedantic(
+        run_trial, (case, drive, scans, CONFIG), setup=the_ekfs, rounds=rounds, warmup_rounds=1
+    )
+    pairs = zip(benchmark.stats.stats.data, ekf[-rounds:], strict=True)
+    benchmark.extra_info["over_ekf"] = median(mine / its for mine, its in pairs)
+
+
+@pytest.mark.parametrize("name", list(filter(is_there, ("ekf", "iekf", "smoother"))))
+def test_precise_bearings(benchmark, name):
+    """Time a drive of 300 looks by bearings good to 0.003 rad; keep its aligned error."""
+    drive, scans = turn_and_drive(1)
+    config = Config(
+        filter=FilterConfig(gate=0.999), rays=RayConfig(range_bounds=(0.1, 10.0), spacing="auto")
+    )
+    case = Case(strategy="passive", filter=name)
+    found = benchmark.pedantic(run_trial, (case, drive, scans, config), rounds=3, warmup_rounds=1)
+    benchmark.extra_info["aligned_m"] = found.scores.position_rmse_aligned_m

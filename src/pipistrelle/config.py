@@ -186,7 +186,7 @@ class FilterConfig(Section):
     """What the filters assume."""
 
     noise: Literal["constant", "measured"] = "constant"
-    """The next two for every row (the paper's), or each row's own, where it has some."""
+    """The next two for every row (the paper's), or what the signal or a log tells of each."""
     range_std: Positive = 0.2
     """[m]"""
     bearing_std: Positive = 0.15
@@ -196,7 +196,7 @@ class FilterConfig(Section):
     gate: Probability = 1.0
     """Measurements outside this share of their predicted distribution are dropped; 1: none."""
     robust: Literal["none", "huber"] = "none"
-    """Huber's: a measurement that surprises by more than 2 sigma counts less, the more it does."""
+    """Huber's, by EKFs and smoother: what surprises by more than 2 sigma counts less."""
 
 
 class RayConfig(Section):
