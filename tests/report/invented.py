@@ -94,6 +94,7 @@ def trials_of(rng, world, name, strategy):
     scores["position_rmse_aligned_m"] = 0.2 * scores["position_rmse_m"]
     scores["map_rmse_aligned_m"] = scores["position_rmse_aligned_m"] + 0.01
     scores["position_bound_m"] = np.tile(0.23 + 0.05 * world[:, None], beams)
+    scores["online_position_rmse_m"] = np.full((worlds, beams), np.nan)
     scores["heading_bound_rad"] = 0.1 * scores["position_bound_m"]
     placed = {"active": 0.5, "fused": 0.52, "passive": 0.6}[strategy]
     scores[COMMON] = placed + 0.2 * world[:, None] + 0.05 * noise(rng, worlds, len(BEAMWIDTH))

@@ -49,6 +49,15 @@ def test_what_was_written_is_read(written):
         np.testing.assert_array_equal(trials.nees[good], there.nees[good])
 
 
+def test_the_settings_of_a_study_are_the_common_ones_and_no_filters_own(tmp_path):
+    own = "[own.fastslam]\nfilter.gate = 0.5\nfastslam.particles = 7\n"
+    plan, _, _ = write_store(tmp_path / "store", invent(2), grid=own)
+    assert {case.config.fastslam.particles for case in cases_of(plan)} == {100, 7}
+    (read,) = read_study(tmp_path / "store")
+    assert read.config == plan.config
+    assert (read.config.filter.gate, read.config.fastslam.particles) == (1.0, 100)
+
+
 def test_failed_trials_are_known_and_have_no_numbers(written):
     folder, _, plan, _, _, failed = written
     (read,) = read_study(folder)

@@ -20,7 +20,7 @@ from pipistrelle.experiments.studies.world_files import (
     done_worlds,
     world_file,
 )
-from pipistrelle.report.studied import COMMON, SCORES, Study, Trials
+from pipistrelle.report.studied import COMMON, ONLINE_POSITION, SCORES, Study, Trials
 
 if TYPE_CHECKING:
     import polars as pl
@@ -163,6 +163,8 @@ def _scores(
     found["diverged"][at] = trials["diverged"].fill_null(value=False).to_numpy()
     for score in SCORES:
         found[score] = np.full(shape, np.nan)
+        if score == ONLINE_POSITION and score not in trials.columns:
+            continue
         found[score][at] = trials[score].cast(pl.Float64).fill_null(np.nan).to_numpy()
     return found
 

@@ -31,8 +31,11 @@ POSITION, HEADING = "position_rmse_m", "heading_rmse_rad"
 POSITION_ALIGNED, MAP_ALIGNED = "position_rmse_aligned_m", "map_rmse_aligned_m"
 POSITION_BOUND, HEADING_BOUND = "position_bound_m", "heading_bound_rad"
 """The least errors that the sound leaves to any estimator."""
+ONLINE_POSITION = "online_position_rmse_m"
+"""Of the path as it was believed at its time, where the filter revises it."""
 SCORES = (
     POSITION,
+    ONLINE_POSITION,
     HEADING,
     POSITION_ALIGNED,
     MAP_ALIGNED,

@@ -34,6 +34,8 @@ KEYS = [
     "position_rmse_aligned_m",
     "map_rmse_aligned_m",
     "position_floor_m",
+    "position_bound_m",
+    "heading_bound_rad",
     "nees_mean",
     "nees_max",
     "diverged",

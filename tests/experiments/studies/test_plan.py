@@ -7,7 +7,8 @@ from importlib.resources import files
 import pytest
 
 from pipistrelle.config import Config, EmitterConfig, InputError, RayConfig
-from pipistrelle.experiments.studies.plan import Plan, cases_of
+from pipistrelle.estimation.catalogue import SECTIONS
+from pipistrelle.experiments.studies.plan import Plan, cases_of, common
 from pipistrelle.experiments.studies.plan_file import (
     changed_settings,
     find_plan,
@@ -18,6 +19,7 @@ from pipistrelle.settings import from_flags
 from reference.studies import SMALL, plan_of
 
 BARE = "format = 1\niterations = 2\n"
+KNOWN = "'ekf', 'fastslam', 'iekf', 'smoother'"
 
 
 @pytest.fixture
@@ -74,12 +76,9 @@ def test_the_papers_radii_are_those_that_its_appendix_lists_beamwidths_for():
 @pytest.mark.parametrize(
     ("filters", "said"),
     [
-        ('["ukf"]', "filters.0: found 'ukf', expected 'ekf', 'fastslam', 'iekf' or module:Class"),
-        ("[3]", "filters.0: found 3, expected 'ekf', 'fastslam', 'iekf' or module:Class"),
-        (
-            '["ekf", "a.b:"]',
-            "filters.1: found 'a.b:', expected 'ekf', 'fastslam', 'iekf' or module:Class",
-        ),
+        ('["ukf"]', f"filters.0: found 'ukf', expected {KNOWN} or module:Class"),
+        ("[3]", f"filters.0: found 3, expected {KNOWN} or module:Class"),
+        ('["ekf", "a.b:"]', f"filters.1: found 'a.b:', expected {KNOWN} or module:Class"),
         ('["a:B", "c:B"]', "filters: a:B and c:B would write the same files"),
         ('["a:B", "a:B"]', "filters: found 'a:B' twice"),
     ],
@@ -276,7 +275,7 @@ def test_a_flag_with_a_refused_value_is_named(refused):
 
 
 def test_a_plan_that_is_not_there_is_refused():
-    said = r"^none\.toml: found no such file; expected paper or physics, or the path"
+    said = r"^none\.toml: found no such file; expected paper or physics or beyond, or the path"
     with pytest.raises(InputError, match=said):
         find_plan("none.toml")
 
@@ -300,3 +299,121 @@ def test_the_settings_that_are_not_varied_are_those_of_the_plan(tmp_path):
         expected = EmitterConfig(radius=case.config.emitter.radius, level_db=40.0)
         assert case.config.emitter == expected
         assert case.config.scenario.steps == 40
+
+
+# Settings that are one filter's own
+
+OWN = BARE + (
+    'filters = ["ekf", "iekf", "a.b:Mine"]\n'
+    "[config]\nfilter.gate = 0.99\n"
+    '[grid]\n"rays.power" = [1.0, 3.0]\n'
+    '[own.iekf]\nfilter.noise = "measured"\nrays.spacing = "auto"\n'
+    '[own."a.b:Mine"]\nfilter.gate = 0.5\nfilter.initial_pose_std = [0.1, 0.1, 0.2]\n'
+)
+
+
+def test_a_filters_own_settings_are_those_of_its_cases_alone(tmp_path):
+    plan = plan_of(tmp_path, OWN)
+    assert plan.own["iekf"] == {"filter.noise": "measured", "rays.spacing": "auto"}
+    for case in cases_of(plan):
+        shared = common(plan, {"rays.power": case.values["rays.power"]})
+        assert shared.filter.gate == 0.99
+        assert case.config.rays.power == shared.rays.power == case.values["rays.power"]
+        told, rays = case.config.filter, case.config.rays
+        if case.filter == "ekf":
+            assert case.config == shared
+        elif case.filter == "iekf":
+            assert (told.noise, told.gate, rays.spacing) == ("measured", 0.99, "auto")
+        else:
+            assert (told.noise, told.gate, rays.spacing) == ("constant", 0.5, "paper")
+            assert told.initial_pose_std == (0.1, 0.1, 0.2)
+
+
+def test_a_plan_with_settings_of_a_filters_own_reads_as_it_was_written(tmp_path):
+    plan = plan_of(tmp_path, OWN)
+    assert plan_of(tmp_path, plan_text(plan)) == plan
+    assert changed_settings(plan, plan_of(tmp_path, plan_text(plan))) == []
+
+
+def test_a_plan_without_them_is_written_as_ever(tmp_path):
+    plan = plan_of(tmp_path, SMALL)
+    assert plan.own == {}
+    keys = ["format", "name", "iterations", "strategies", "filters", "config", "grid"]
+    assert list(tomllib.loads(plan_text(plan))) == keys
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("own = 3\n", "PLAN: own: found 3, expected a table for each filter"),
+        ("[own]\nekf = 3\n", "PLAN: own: found {'ekf': 3}, expected a table for each filter"),
+        (
+            "[own.iekf]\nfilter.gate = 0.9\n",
+            "PLAN: own.iekf: no filter of this plan; did you mean ekf?",
+        ),
+        (
+            "[own.ekf]\nemitter.radius = 0.01\n",
+            "PLAN: own.ekf.emitter.radius: this setting changes what is heard; expected one of the "
+            "sections filter, rays, fastslam",
+        ),
+        ("[own.ekf]\nseed = 1\n", "PLAN: own.ekf.seed: this setting changes what is heard"),
+        (
+            '[own.ekf]\nrays.power = 2.0\n[grid]\n"rays.power" = [1.0, 2.0]\n',
+            "PLAN: own.ekf.rays.power: the plan varies this setting; take it out",
+        ),
+        (
+            "[own.ekf]\nfilter.gat = 0.9\n",
+            "PLAN: own.ekf.filter.gat: no such setting; did you mean filter.gate?",
+        ),
+        ("[own.ekf]\nfilter = 3\n", "PLAN: own.ekf.filter: no such setting"),
+        (
+            "[own.ekf]\nfilter.gate = 2.0\n",
+            "PLAN: own.ekf.filter.gate: found 2.0, expected less than or equal to 1",
+        ),
+        (
+            "[own.ekf]\nfilter.initial_pose_std = [0.1, 0.1]\n",
+            "PLAN: own.ekf.filter.initial_pose_std: found [0.1, 0.1], expected 3 values",
+        ),
+        (
+            "[own.ekf]\nrays.range_bounds = [9.0, 3.0]\n",
+            "PLAN: own.ekf.rays.range_bounds: range_bounds must rise, found [9.0, 3.0]",
+        ),
+    ],
+)
+def test_settings_that_cannot_be_a_filters_own_are_refused_in_a_line(refused, text, said):
+    found = refused(BARE + text)
+    assert found.startswith(said)
+    assert "\n" not in found
+
+
+def test_settings_that_are_wrong_beside_a_value_of_the_grid_are_refused(refused):
+    text = '[own.ekf]\nrays.spacing = "auto"\n[grid]\n"rays.likelihood" = ["normal", "printed"]\n'
+    said = refused(BARE + text)
+    assert said.startswith("PLAN: ")
+    assert 'spacing "auto" needs likelihood "normal", found "printed"' in said
+
+
+def test_plans_that_differ_in_what_is_a_filters_own_are_told_apart(tmp_path):
+    there = plan_of(tmp_path, OWN)
+    asked = plan_of(tmp_path, OWN.replace('filter.noise = "measured"', "filter.gate = 0.9"))
+    assert changed_settings(there, asked) == [
+        'own.iekf.filter.noise: "measured" there, nothing asked for',
+        "own.iekf.filter.gate: nothing there, 0.9 asked for",
+    ]
+
+
+def test_a_table_of_a_filters_own_that_is_empty_says_nothing(tmp_path):
+    bare, empty = plan_of(tmp_path, BARE), plan_of(tmp_path, BARE + "[own.ekf]\n")
+    assert changed_settings(bare, empty) == []
+    assert plan_text(bare) == plan_text(empty)
+
+
+def test_the_plan_beyond_asks_the_question_of_four_filters_in_the_worlds_of_physics():
+    beyond, physics = (read_plan(find_plan(name)) for name in ("beyond", "physics"))
+    assert beyond.filters == ("ekf", "fastslam", "iekf", "smoother")
+    assert len(cases_of(beyond)) == 100
+    assert beyond.grid == physics.grid
+    assert (beyond.strategies, beyond.iterations) == (physics.strategies, physics.iterations)
+    assert set(beyond.own) == {"fastslam", "iekf", "smoother"}
+    heard = [p.config.model_dump(exclude=set(SECTIONS)) for p in (beyond, physics)]
+    assert heard[0] == heard[1]

@@ -142,6 +142,15 @@ def test_one_bit_that_a_disk_changed_is_noticed(folder, plan, records, table, pl
     assert "remove trials/iteration_00003.parquet" in str(refused.value)
 
 
+def test_a_world_of_a_plan_with_other_settings_of_a_filters_own_is_noticed(folder, plan, records):
+    own = {"ekf": {"filter.gate": 0.9}}
+    for there, here in (({}, own), (own, {}), (own, {"ekf": {"filter.gate": 0.8}})):
+        write_world(folder, replace(plan, own=there), 0, records)
+        check_world(folder, replace(plan, own=there, iterations=99), 0)
+        with pytest.raises(InputError, match=r"iteration_00000\.parquet: was computed by another"):
+            check_world(folder, replace(plan, own=here), 0)
+
+
 def test_a_world_of_another_plan_is_noticed_and_more_worlds_are_no_other_plan(
     folder, plan, records
 ):

@@ -102,15 +102,29 @@ def test_gains_are_paired_and_full_where_significant(study, charts):
     assert (~series.filled | excludes).all(), "Holm rejects only what the interval alone excludes"
 
 
-def test_beside_the_raw_error_of_position_stands_what_no_estimator_avoids(charts, study):
-    line = series_of(charts["position_rmse"], "EKF", "no estimator avoids")
-    floor = study.trials["ekf", "active"].scores["position_floor_m"]
-    kept = ~study.trials["ekf", "active"].diverged.any(axis=1)
-    assert line.dashed
-    np.testing.assert_allclose(line.y, floor[kept].mean(axis=0), rtol=0.02)
-    for name in ("position_rmse_aligned", "heading_rmse", "map_rmse"):
+@pytest.mark.parametrize(
+    ("chart", "score", "scale"),
+    [
+        ("position_rmse", "position_bound_m", 1.0),
+        ("heading_rmse", "heading_bound_rad", 180.0 / np.pi),
+    ],
+)
+def test_beside_a_raw_error_of_the_path_stands_the_bound_dashed(charts, study, chart, score, scale):
+    keep = np.arange(20) != 4
+    assert "dashed: the bound" in charts[chart].caption
+    for way in ("active", "fused", "passive"):
+        line = series_of(charts[chart], "EKF", f"{way}, bound")
+        least = scale * study.trials["ekf", way].scores[score][keep].mean(axis=0)
+        assert line.dashed
+        assert line.role == way
+        np.testing.assert_allclose(line.y, np.broadcast_to(least, 12), rtol=1e-12)
+
+
+def test_errors_that_have_no_bound_stand_alone(charts):
+    for name in ("position_rmse_aligned", "map_rmse", "map_rmse_aligned"):
         names = [series.name for panel in charts[name].panels for series in panel.series]
-        assert "no estimator avoids" not in names
+        assert not [one for one in names if one.endswith("bound")]
+        assert "bound" not in charts[name].caption
 
 
 def test_table_ii_stands_beside_ours(charts):

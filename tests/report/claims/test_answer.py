@@ -5,7 +5,7 @@ import numpy as np
 from pipistrelle.report.claims.answer import answer
 from pipistrelle.report.claims.contrasts import selections
 from pipistrelle.report.claims.verdicts import judge_claims
-from pipistrelle.report.studied import COMMON
+from pipistrelle.report.studied import COMMON, POSITION, POSITION_BOUND
 from report.invented import BEAMWIDTH, changed, invent, only
 
 
@@ -27,11 +27,13 @@ def jitter(size):
 
 def test_a_more_accurate_map_at_narrow_beams_is_said_so():
     gain = np.where(BEAMWIDTH < 30.0, -0.3, 0.0)
-    headline, counted, placed, located, tally = told(with_map(invent(60), gain + jitter(0.1)))
+    study = with_map(invent(60), gain + jitter(0.1))
+    headline, counted, placed, located, aligned, *_, tally = told(study)
     assert headline == "Yes: a fuller map, and a more accurate one where the beam is narrow."
     assert "30 instead of 20 at 11° and 38 instead of 36 at 180°" in counted
     assert "with EKF better at 5 of 12 beamwidths (11° to 27°)" in placed
     assert located.startswith("The vehicle is located")
+    assert aligned.startswith("After alignment its path is with EKF")
     assert tally.startswith("Of the paper's eight claims,")
 
 
@@ -95,7 +97,7 @@ def test_a_filter_without_a_world_left_is_undecided_and_the_other_answers():
     lines = told(study)
     assert lines[0] == "Yes: a fuller map, and a more accurate one at every beamwidth."
     placed = next(line for line in lines if line.startswith("The landmarks that"))
-    beside = "(with everything counted: better at every beamwidth). Whether the landmarks that"
+    beside = "(with everything counted: the same). Whether the landmarks that"
     assert f"with FastSLAM 2.0 better at every beamwidth {beside}" in placed
     assert placed.endswith("placed better or worse with EKF is not decided: no world is left.")
     study.trials["fastslam", "passive"].diverged[:] = True
@@ -110,7 +112,7 @@ def test_an_answer_that_hangs_on_what_is_left_out_is_given_both_ways():
         spoilt = np.where(np.arange(60) < 20, 3.0, 0.0)[:, None]
         study = changed(study, (name, "fused"), COMMON, lambda error, more=spoilt: error + more)
         study.trials[name, "fused"].diverged[:20] = True
-    headline, without, within, _, _, _, diverged, _ = told(study)
+    headline, without, within, *_, diverged, _ = told(study)
     assert headline == "A fuller map, yes; a more accurate one depends on which worlds are counted."
     assert without == (
         "Without diverged worlds and without diverged cases: "
@@ -121,3 +123,37 @@ def test_an_answer_that_hangs_on_what_is_left_out_is_given_both_ways():
         "The filter diverged, of the trials, with EKF fused in 33.3 %; "
         "with FastSLAM 2.0 fused in 33.3 %."
     )
+
+
+def with_bound(study, way, least):
+    return changed(study, way, POSITION_BOUND, lambda bound: np.broadcast_to(least, bound.shape))
+
+
+def test_what_the_bound_allows_is_said_at_three_beams_and_how_near_each_filter_comes():
+    study = invent(60)
+    for name in ("ekf", "fastslam"):
+        for strategy, least in (("active", 0.3), ("fused", 0.25), ("passive", 0.5)):
+            study = with_bound(study, (name, strategy), least)
+            far = least * (1.5 if name == "ekf" else 2.0)
+            study = changed(study, (name, strategy), POSITION, lambda e, far=far: 0.0 * e + far)
+    *_, allowed, ekf, fastslam, _ = told(study)
+    assert allowed == (
+        "Whatever the estimator, listening may lower the least error that the sound leaves from "
+        "0.300 m to 0.250 m at 180° (20%), 0.300 m to 0.250 m at 42° (20%), "
+        "0.300 m to 0.250 m at 11° (20%), in the mean over all worlds."
+    )
+    assert ekf == (
+        "EKF has of that least error, with everything counted, by strategy and over the "
+        "beamwidths, active 1.50, fused 1.50, passive 1.50 times."
+    )
+    assert fastslam.startswith("FastSLAM 2.0 has")
+    assert fastslam.endswith("active 2.00, fused 2.00, passive 2.00 times.")
+
+
+def test_worlds_without_a_bound_are_answered_without_it():
+    study = invent(20)
+    for way in study.trials:
+        study = with_bound(study, way, np.nan)
+    said = " ".join(told(study))
+    assert said.startswith("It builds a fuller map")
+    assert "least error" not in said

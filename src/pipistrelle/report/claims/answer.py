@@ -11,6 +11,7 @@ from pipistrelle.report.claims.published import beam_name
 from pipistrelle.report.claims.verdicts import WITHOUT, JudgedClaim
 from pipistrelle.report.studied import (
     COMMON,
+    ONLINE_POSITION,
     POSITION,
     POSITION_ALIGNED,
     POSITION_BOUND,
@@ -19,6 +20,7 @@ from pipistrelle.report.studied import (
     Selection,
     Study,
     filter_titles,
+    mean_std,
     samples,
 )
 
@@ -171,7 +173,7 @@ def _counted(selection: Selection, everything: Selection) -> str:
         if not {(name, "fused"), (name, "active")} <= study.trials.keys():
             continue
         if said := _placed(selection, name):
-            beside = _beside(study, _placed(everything, name))
+            beside = _beside(study, said, _placed(everything, name))
             return (
                 "Hearing the beacon as well as its own calls, the vehicle fully places, of "
                 f"{landmark_count(study.config)} landmarks, {said}{beside} ({title})."
@@ -191,10 +193,11 @@ def _placed(selection: Selection, name: str) -> str:
     return " and ".join(said)
 
 
-def _beside(study: Study, said: str) -> str:
+def _beside(study: Study, said: str, counted: str) -> str:
     """Put beside what was said what it is with everything counted, where anything diverged."""
     diverged = any(trials.diverged.any() for trials in study.trials.values())
-    return f" (with everything counted: {said})" if diverged else ""
+    told = "the same" if said == counted else counted
+    return f" (with everything counted: {told})" if diverged else ""
 
 
 def _compared(subject: str, selection: Selection, everything: Selection, score: str) -> str:
@@ -208,8 +211,8 @@ def _compared(subject: str, selection: Selection, everything: Selection, score: 
                 f"Whether {what} better or worse with {title} is not decided: {_left(findings)}."
             )
         elif findings:
-            beside = _beside(selection.study, _where(everything.gains[name, score]))
-            said.append(f"with {title} {_where(findings)}{beside}")
+            here, there = _where(findings), _where(everything.gains[name, score])
+            said.append(f"with {title} {here}{_beside(selection.study, here, there)}")
     return " ".join([f"{subject} {'; '.join(said)}."] * bool(said) + undecided)
 
 
@@ -249,7 +252,7 @@ def _allowed(everything: Selection) -> str:
         said = []
         for i in dict.fromkeys((len(study.beamwidth) - 1, len(study.beamwidth) // 2, 0)):
             cells = [(name, "active", i), (name, "fused", i)]
-            alone, both = (np.mean(one) for one in samples(everything, POSITION_BOUND, cells))
+            alone, both = (mean_std(one)[0] for one in samples(everything, POSITION_BOUND, cells))
             if not both > 0.0:
                 return ""
             beam = beam_name(study.beamwidth[i])
@@ -265,29 +268,28 @@ def _reached(everything: Selection) -> list[str]:
     """Say of each filter how near it comes to the least error that the sound leaves."""
     study, sentences = everything.study, []
     for name, title in filter_titles(study).items():
-        said = []
-        for strategy in STRATEGIES:
-            if (name, strategy) not in study.trials:
-                continue
+        ways = [way for way in study.trials if way[0] == name]
+        online = any(np.isfinite(study.trials[way].scores[ONLINE_POSITION]).any() for way in ways)
+        score, said = ONLINE_POSITION if online else POSITION, []
+        for _, strategy in sorted(ways, key=lambda way: STRATEGIES.index(way[1])):
             beams = 1 if strategy == "passive" else len(study.beamwidth)
-            times = [_over_bound(everything, (name, strategy, i)) for i in range(beams)]
+            times = [_over_bound(everything, score, (name, strategy, i)) for i in range(beams)]
             if np.isfinite(times).all():
                 low, high = f"{min(times):.2f}", f"{max(times):.2f}"
                 said.append(f"{strategy} {low}" + (f" to {high}" if high != low else ""))
         if said:
+            beside = ", of the path as it was believed at each time" if online else ""
             sentences.append(
-                f"{title[0].upper()}{title[1:]}, with everything counted, has of that least error, "
-                f"by strategy and over the beamwidths, {', '.join(said)} times."
+                f"{title[0].upper()}{title[1:]} has of that least error, with everything counted"
+                f"{beside}, by strategy and over the beamwidths, {', '.join(said)} times."
             )
     return sentences
 
 
-def _over_bound(everything: Selection, cell: Cell) -> float:
+def _over_bound(everything: Selection, score: str, cell: Cell) -> float:
     """Return the mean error of position over the mean bound."""
-    (error,), (least,) = (
-        samples(everything, score, [cell]) for score in (POSITION, POSITION_BOUND)
-    )
-    return float(np.mean(error) / np.mean(least)) if len(error) and len(least) else np.nan
+    errors, least = (samples(everything, name, [cell])[0] for name in (score, POSITION_BOUND))
+    return float(np.mean(errors) / np.mean(least)) if len(errors) and len(least) else np.nan
 
 
 def _verdicts(claims: Sequence[JudgedClaim]) -> str:
