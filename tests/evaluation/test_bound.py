@@ -1,17 +1,26 @@
 """The bound along the true path, and what NEES a consistent filter has after an exact start."""
 
+from collections import deque
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from pipistrelle.config import Config, ScenarioConfig
-from pipistrelle.evaluation.bound import PRIOR_STD, nees_of_exact_start, pose_bound
+from pipistrelle.config import Config, RayConfig, ScenarioConfig
+from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.motion import motion_step
+from pipistrelle.estimation.smoother.filter import Smoother
+from pipistrelle.evaluation.bound import PRIOR_STD, nees_of_exact_start, path_bound, pose_bound
 from pipistrelle.evaluation.consistency import anees_bounds_about
+from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import standing_landmarks, world_of
+from pipistrelle.experiments.runs.filtering import run_filter
 from pipistrelle.experiments.runs.trial import drive_of, scans_of
+from pipistrelle.geometry import range_and_bearing, wrap
 from reference.ekf_slam import moved
-from reference.missions import scan_with
+from reference.missions import BICYCLE, CIRCLE, START, scan_with, scattered
+from reference.optimum import from_the_truth
 
 STEPS, EVERY, STEP = 60, 4, 0.125
 SETTINGS = Config(scenario=ScenarioConfig(steps=STEPS, landmarks=12, radius=12.0))
@@ -94,6 +103,15 @@ def test_twice_the_noise_raises_the_bound_and_more_to_hear_lowers_it():
     assert area(heard("fused")) < area(heard("passive")) < area([])
 
 
+def test_of_a_path_it_is_the_root_of_the_mean_over_the_steps_and_the_start_is_none():
+    bound = bound_of(heard("fused"))
+    position, heading = path_bound(bound)
+    squared = bound[1:, 0, 0] + bound[1:, 1, 1]
+    assert position == pytest.approx(np.sqrt(squared.sum() / STEPS), rel=1e-12)
+    assert heading == pytest.approx(np.sqrt(bound[1:, 2, 2].sum() / STEPS), rel=1e-12)
+    assert path_bound(bound[:1]) == (0.0, 0.0)
+
+
 def test_rows_of_unknown_labels_and_frames_without_rows_tell_nothing():
     scans = heard("active")
     stranger = scan_with([999], [0.1], [3.0], time=0.25)
@@ -158,6 +176,50 @@ def test_over_the_papers_mission_it_is_some_two_and_a_quarter_for_active_sensing
         )  # fmt: skip
         values.append(nees_of_exact_start(bound, world.path, drive.start.covariance)[0][1:].mean())
     assert np.mean(values) == pytest.approx(2.24, abs=0.1)  # by a linear simulation
+
+
+def drawn(seed, frames=60):
+    """A world of noise exactly as it is told, its start exact: drive, scans, places by label."""
+    rng = np.random.default_rng(seed)
+    controls = np.tile(CIRCLE, (frames * EVERY, 1))
+    path, points = [START.mean], scattered(rng, 100)
+    points = points[np.hypot(*points.T) > 11.0][:40]  # the drive is a circle of radius 7.4 m
+    for control in controls:
+        noisy = control + rng.normal(size=2) * BICYCLE.control_std
+        path.append(motion_step(BICYCLE, path[-1], noisy, STEP))
+    scans = []
+    for k in range(EVERY, len(path), EVERY):
+        distance, bearing = range_and_bearing(path[k], points)
+        near = np.flatnonzero(distance < 18.0)
+        ranged = np.where(distance < 8.0, distance + rng.normal(0, 0.2, 40), np.nan)
+        turned = wrap(bearing + rng.normal(0, 0.05, 40))
+        scans.append(
+            scan_with(near + 1, turned[near], ranged[near], time=k * STEP, bearing_std=0.05)
+        )
+    time, labels = STEP * np.arange(len(path)), np.arange(1, 41)
+    truth = Truth(time=time, path=np.array(path), landmarks=(labels, points))
+    start = Gaussian(mean=START.mean, covariance=np.zeros((3, 3)))
+    drive = Drive(motion=BICYCLE, start=start, time=time, controls=controls, truth=truth)
+    return drive, scans, dict(zip(labels.tolist(), points, strict=True))
+
+
+@pytest.mark.slow
+def test_the_smoother_online_and_the_best_from_the_truth_have_the_errors_of_the_bound():
+    """Over 12 worlds the squares of errors are what the bound says, to the chance of one in 500."""
+    squares, slam = [], Smoother(motion=BICYCLE, rays=RayConfig())
+    for seed in range(12):
+        drive, scans, places = drawn(seed)
+        last, true = deque(maxlen=1), drive.truth.path
+        track = run_filter(slam, drive, scans, None, watch=lambda *seen, to=last: to.append(seen))
+        _, best = from_the_truth(last[0][1], true, places)
+        bound = pose_bound(BICYCLE, drive.controls, drive.time, true, drive.truth.landmarks, scans)
+        for estimate in (track.online.mean[-1], best.pose_mean(len(scans))):
+            error = estimate - true[-1]
+            error[2] = wrap(error[2])
+            squares.append(error @ np.linalg.solve(bound[-1], error))
+    for one in (squares[::2], squares[1::2]):
+        low, high = chi2.ppf([0.001, 0.999], 3 * 12)
+        assert low < np.sum(one) < high
 
 
 def test_bounds_about_another_mean_are_chi_squares_where_the_weights_are_equal():

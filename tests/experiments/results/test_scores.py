@@ -1,4 +1,4 @@
-"""What no estimator avoids: the turn and shift before the first scan."""
+"""What no estimator avoids: the turn and shift before the first scan, and the bound."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from pipistrelle.evaluation.accuracy import alignment, moved, rmse
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
 from pipistrelle.experiments.hearing.scenario import world_of
-from pipistrelle.experiments.results.scores import position_floor
+from pipistrelle.experiments.results.scores import drive_bound, position_floor, with_bound
 from pipistrelle.experiments.runs.trial import drive_of, run_trial
 from reference.ekf_slam import moved as driven
 from reference.missions import scan_with
@@ -95,3 +95,49 @@ def told(numbers):
     numbers = numbers.copy()
     numbers[BEARING_STD], numbers[RANGE_STD] = 0.02, 0.02
     return numbers
+
+
+# The bound
+
+
+def sure(*steps, bearing_std=0.05):
+    """Scans of three landmarks by bearing and range."""
+    rows = [1, 2, 3], [0.1, 0.2, 0.3], [4.0, 5.0, np.nan]
+    return [
+        scan_with(*rows, time=float(DRIVE.time[step]), bearing_std=bearing_std) for step in steps
+    ]
+
+
+def test_the_bound_of_a_drive_is_put_beside_its_scores_and_changes_no_other():
+    scans = sure(4, 8, 12)
+    scores = run_trial(Case(strategy="active", filter="ekf"), DRIVE, scans, CONFIG).scores
+    bound = drive_bound(DRIVE, scans)
+    beside = with_bound(scores, bound)
+    squared = np.mean(bound[1:], axis=0).diagonal()
+    assert beside.position_bound_m == pytest.approx(np.sqrt(squared[0] + squared[1]))
+    assert beside.heading_bound_rad == pytest.approx(np.sqrt(squared[2]))
+    assert replace(beside, position_bound_m=None, heading_bound_rad=None) == scores
+    assert with_bound(scores, None) is scores
+
+
+def test_the_bound_of_a_drive_hangs_on_no_start_and_rises_with_the_noise():
+    apart = replace(DRIVE.start, covariance=np.eye(3))
+    unsure = drive_bound(replace(DRIVE, start=apart), sure(4, 8, 12))
+    np.testing.assert_array_equal(unsure, drive_bound(DRIVE, sure(4, 8, 12)))
+    position = [with_bound_of(std) for std in (0.05, 0.1, 0.2)]
+    assert position[0] < position[1] < position[2]
+
+
+def with_bound_of(bearing_std):
+    """Trace of the bound over all steps."""
+    bound = drive_bound(DRIVE, sure(*range(4, 401, 4), bearing_std=bearing_std))
+    return float(np.trace(bound.sum(axis=0)))
+
+
+def test_where_the_truth_is_not_whole_there_is_no_bound():
+    path = WORLD.path.copy()
+    path[300] = np.nan
+    holes = Truth(time=DRIVE.time, path=path, landmarks=DRIVE.truth.landmarks)
+    for truth in (NO_TRUTH, holes, replace(DRIVE.truth, landmarks=None)):
+        assert drive_bound(replace(DRIVE, truth=truth), sure(4)) is None
+    assert drive_bound(DRIVE, sure(4)) is not None

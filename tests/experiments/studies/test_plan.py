@@ -275,7 +275,7 @@ def test_a_flag_with_a_refused_value_is_named(refused):
 
 
 def test_a_plan_that_is_not_there_is_refused():
-    said = r"^none\.toml: found no such file; expected paper or physics or beyond, or the path"
+    said = r"^none\.toml: found no such file; expected paper, physics, beyond or the path"
     with pytest.raises(InputError, match=said):
         find_plan("none.toml")
 

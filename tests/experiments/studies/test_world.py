@@ -7,10 +7,12 @@ import pytest
 
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config
+from pipistrelle.detection.scans import with_columns
 from pipistrelle.evaluation.bound import nees_of_exact_start, pose_bound
 from pipistrelle.evaluation.consistency import nees
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
+from pipistrelle.experiments.runs import trial
 from pipistrelle.experiments.runs.trial import drive_of, run_mission, run_trial, scans_of
 from pipistrelle.experiments.studies import world
 from pipistrelle.experiments.studies.plan import Plan, cases_of
@@ -396,3 +398,71 @@ def test_an_interruption_that_a_library_hides_is_no_failed_trial(plan, monkeypat
     monkeypatch.setattr(world, stage, hidden)
     with pytest.raises(KeyboardInterrupt):
         run_world(plan, 0)
+
+
+# The bound
+
+
+@pytest.fixture(scope="module")
+def bounded(tmp_path_factory):
+    """Records of a world whose filters are told different noise, or weigh it otherwise."""
+    text = SMALL.replace("steps = 40", "steps = 80") + (
+        '"filter.noise" = ["constant", "measured"]\n"filter.robust" = ["none", "huber"]\n'
+        "[own.iekf]\nfilter.range_std = 0.7\nfilter.gate = 0.99\n"
+    )
+    text = text.replace("[config", 'filters = ["ekf", "fastslam", "iekf", "smoother"]\n[config')
+    return run_world(plan_of(tmp_path_factory.mktemp("bounded"), text), 0)
+
+
+def bounds_of(records, strategy, radius=0.0025):
+    """All bounds of a strategy at a radius, each once."""
+    return {
+        tuple(getattr(record.scores, name) for name in BOUNDS)
+        for record in records
+        if record.case.strategy == strategy and record.case.config.emitter.radius == radius
+    }
+
+
+@pytest.mark.parametrize("strategy", ["active", "fused", "passive"])
+def test_the_bound_is_one_for_all_filters_whatever_they_are_told(bounded, strategy):
+    assert {record.error for record in bounded} == {None}
+    for radius in (0.0025, 0.025):
+        found = bounds_of(bounded, strategy, radius)
+        assert len(found) == (0 if (strategy, radius) == ("passive", 0.0025) else 1)
+        assert all(0.0 < value < 1.0 for pair in found for value in pair)
+
+
+def test_hearing_more_never_raises_the_bound(bounded):
+    (passive,) = bounds_of(bounded, "passive", 0.025)
+    for radius in (0.0025, 0.025):
+        (active,) = bounds_of(bounded, "active", radius)
+        (fused,) = bounds_of(bounded, "fused", radius)
+        assert all(both <= alone for both, alone in zip(fused, active, strict=True))
+        assert all(both <= alone for both, alone in zip(fused, passive, strict=True))
+    (wide,), (narrow,) = (bounds_of(bounded, "active", radius) for radius in (0.0025, 0.025))
+    assert all(one <= other for one, other in zip(wide, narrow, strict=True))
+
+
+def test_twice_the_noise_that_the_signal_tells_raises_the_bound_and_no_constant_does(
+    plan, monkeypatch
+):
+    def doubled(heard):
+        rows, stds = told(heard).rows, ("bearing_std", "range_std")
+        more = {name: 2.0 * getattr(rows, name) for name in stds}
+        return replace(heard, rows=with_columns(rows, **more))
+
+    told, short = trial.measured, replace(plan, strategies=("active",), filters=("ekf",))
+    before = run_world(short, 0)
+    coarse = short.config.filter.model_copy(update={"range_std": 0.4, "bearing_std": 0.3})
+    stated = replace(short, config=short.config.model_copy(update={"filter": coarse}))
+    monkeypatch.setattr(trial, "measured", doubled)
+    after = run_world(short, 0)
+    monkeypatch.setattr(trial, "measured", told)
+    pairs = zip(before, after, strict=True)
+    share = [b.scores.heading_bound_rad / a.scores.heading_bound_rad for a, b in pairs]
+    assert max(share) > 1.03
+    for one, other, same in zip(before, after, run_world(stated, 0), strict=True):
+        for name in BOUNDS:
+            assert getattr(other.scores, name) > getattr(one.scores, name)
+            assert getattr(same.scores, name) == getattr(one.scores, name)
+        assert other.scores.position_rmse_m == one.scores.position_rmse_m

@@ -21,6 +21,8 @@ RELINEARIZE = 0.1
 ANEW = 5
 """Times that all is linearised anew where bearings enter that had waited: many of them enter at
 once, from poses that they correct, and a graph that was linearised before may never recover."""
+CONVERGED = 1e-9
+"""Change of the squared error, and its share of it, under which the optimum is reached."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -136,6 +138,8 @@ class Best:
         """Return the optimum, or what iSAM2 found where none can be reached from there."""
         settings = gtsam.LevenbergMarquardtParams()
         settings.setLinearSolverType(f"MULTIFRONTAL_{_factors(self.link.thorough)}")
+        settings.setRelativeErrorTol(CONVERGED)
+        settings.setAbsoluteErrorTol(CONVERGED)
         try:
             return gtsam.LevenbergMarquardtOptimizer(self.graph, self.found, settings).optimize()
         except RuntimeError:
@@ -213,5 +217,5 @@ def leg_factor(node: int, leg: Leg) -> gtsam.BetweenFactorPose2:
 
 
 def _gaussian(covariance: Float[np.ndarray, "3 3"]) -> gtsam.noiseModel.Gaussian:
-    """Return a noise model, which must have an inverse."""
-    return gtsam.noiseModel.Gaussian.Covariance(covariance + SMALLEST_STD**2 * np.eye(3))
+    """Return a noise model, which must have an inverse; GTSAM may not drop small correlations."""
+    return gtsam.noiseModel.Gaussian.Covariance(covariance + SMALLEST_STD**2 * np.eye(3), False)

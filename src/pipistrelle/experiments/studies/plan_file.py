@@ -89,7 +89,7 @@ def find_plan(word: str) -> Path:
         return Path(str(files("pipistrelle.experiments.studies") / f"{word}.toml"))
     if not path.is_file():
         raise InputError(
-            f"{word}: found no such file; expected {' or '.join(PLANS)}, or the path of a plan"
+            f"{word}: found no such file; expected {', '.join(PLANS)} or the path of a plan"
         )
     return path
 
@@ -181,6 +181,10 @@ def _own(
             if setting in grid:
                 raise InputError(f"{where}.{setting}: the plan varies this setting; take it out")
             given[key] = Given(value, f"{where}.{setting}")
+        if not given:
+            continue
+        for _ in combinations(layer | given, grid, f"{path}: grid."):
+            pass
         settled: Any = resolve(layer | given).model_dump(mode="json")
         own[name] = {".".join(key): settled[key[0]][key[1]] for key in given}
     return own

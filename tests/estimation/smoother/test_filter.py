@@ -1,0 +1,353 @@
+"""The smoother against everything at once by numpy, from the truth, and by its laws."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipistrelle.estimation.beliefs import Gaussian, placed
+from pipistrelle.estimation.motion import Motion
+from pipistrelle.estimation.smoother.filter import Smoother
+from pipistrelle.estimation.smoother.graph import Solver, landmark_key, links
+from pipistrelle.experiments.drives import Drive
+from pipistrelle.experiments.runs.filtering import run_filter
+from pipistrelle.geometry import wrap
+from reference.everything import Everything
+from reference.missions import (
+    BICYCLE,
+    CIRCLE,
+    SENSING,
+    START,
+    STEP,
+    STEPS_PER_FRAME,
+    draw_mission,
+    followed,
+    measured_to,
+    paper_mission,
+    ray_config,
+    scan_of,
+    scan_with,
+    scattered,
+    steady,
+)
+from reference.optimum import from_the_truth
+
+STD = {"range_std": 0.2, "bearing_std": 0.05}
+STOPS = 2e-3
+"""Share of a deviation within which Levenberg and Marquardt stop, at the paper's noise."""
+STANDING = replace(BICYCLE, noise_at_rest=False)
+
+
+def smoother(motion=BICYCLE, **changes):
+    return Smoother(motion=motion, rays=ray_config(), **changes)
+
+
+def scaled_mission(strategy, scale, frames=30, seed=5, **changes):
+    """A drive in the paper's circle, all noise on it scaled; returns its motion and start too."""
+    rng = np.random.default_rng(seed)
+    motion = replace(BICYCLE, control_std=(0.1 * scale, 0.03 * scale))
+    start = Gaussian(mean=START.mean, covariance=scale**2 * START.covariance)
+    std = {name: scale * value for name, value in STD.items()}
+    field, drive = scattered(rng, 50), steady(CIRCLE, frames)
+    mission = draw_mission(rng, motion, start, field, drive, **SENSING[strategy], **std, **changes)
+    scans = [measured_to(scan, **std) for scan in mission.scans]
+    return replace(mission, scans=scans), motion, start
+
+
+def without_noise(mission, start):
+    """The mission as it would be had nothing been off: no step, no bearing, no range."""
+    exact = replace(START, mean=start.mean, covariance=np.zeros((3, 3)))
+    motion, rng = replace(BICYCLE, control_std=(0.0, 0.0)), np.random.default_rng(0)
+    silent = draw_mission(
+        rng, motion, exact, mission.landmarks, mission.controls,
+        **SENSING["fused"], range_std=0.0, bearing_std=0.0,
+    )  # fmt: skip
+    return replace(silent, scans=[measured_to(scan, **STD) for scan in silent.scans])
+
+
+def at_once(belief, mission, motion, start, *, robust=False):
+    """Everything at once, of the landmarks that the belief has placed; it is told their priors."""
+    rows = [
+        (leg, *row)
+        for leg, scan in enumerate(mission.scans, start=1)
+        for row in zip(
+            scan.landmark.tolist(), scan.bearing, scan.range, scan.bearing_std, scan.range_std,
+            strict=True,
+        )
+    ]  # fmt: skip
+    entered = {
+        label: np.array(link.values.atPoint2(landmark_key(label)))
+        for link in links(belief.link)
+        for label in belief.mapped
+        if link.values.exists(landmark_key(label))
+    }
+    legs = list(zip(mission.controls, mission.dt, strict=True))
+    every = Everything(motion, start, legs, rows, entered, robust=robust)
+    x = every.solved(every.begun({label: mission.landmarks[label - 1] for label in entered}))
+    return every.labels, *every.told(x)
+
+
+def differences(belief, labels, path, spread, places, known):
+    """Greatest differences: of poses and landmarks in deviations, of covariances as shares.
+
+    Poses first those of the graph, then all; then landmarks.
+    """
+    found, rows = belief.path(), belief.landmarks()
+    off = found.mean - path
+    off[:, 2] = wrap(off[:, 2])
+    off /= np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
+    share = relative(found.covariance, spread)
+    full = np.array([np.flatnonzero(rows.landmark == label)[0] for label in labels])
+    far = (rows.mean[full] - places) / np.sqrt(np.diagonal(known, axis1=1, axis2=2))
+    nodes = slice(None, None, STEPS_PER_FRAME)
+    return (
+        (np.abs(off[nodes]).max(), share[nodes].max()),
+        (np.abs(off).max(), share.max()),
+        (np.abs(far).max(), relative(rows.covariance[full], known).max()),
+    )
+
+
+def relative(found, expected):
+    """Greatest difference of each covariance, as a share of its greatest number."""
+    return np.abs(found - expected).max(axis=(1, 2)) / np.abs(expected).max(axis=(1, 2))
+
+
+# Everything at once
+
+
+@pytest.mark.parametrize("strategy", SENSING)
+def test_poses_and_map_are_the_best_there_are_of_everything_at_once(strategy):
+    """The paper's noise; between the scans a leg is linear, which shows: see the next two."""
+    mission, motion, start = scaled_mission(strategy, 1.0)
+    *_, (belief, _) = followed(smoother(motion), mission, start)
+    nodes, every, places = differences(belief, *at_once(belief, mission, motion, start))
+    assert len(belief.mapped) > 15
+    assert max(nodes) < STOPS
+    assert max(places) < 10 * STOPS
+    assert every[0] < 0.06
+    assert every[1] < 0.01
+
+
+@pytest.mark.parametrize("strategy", SENSING)
+@pytest.mark.parametrize("scale", [1e-2, 1e-4])
+def test_so_are_the_poses_between_the_scans_as_far_as_noise_is_small(strategy, scale):
+    mission, motion, start = scaled_mission(strategy, scale)
+    *_, (belief, _) = followed(smoother(motion), mission, start)
+    nodes, every, places = differences(belief, *at_once(belief, mission, motion, start))
+    assert max(*nodes, *places) < max(1e-6, 1e-3 * scale)
+    assert every[0] < max(1e-6, 0.06 * scale)
+    assert every[1] < max(1e-6, 0.01 * scale)
+
+
+def test_covariances_of_all_steps_are_those_of_everything_at_once_where_nothing_was_off():
+    mission, motion, start = scaled_mission("fused", 1.0)
+    mission = without_noise(mission, start)
+    *_, (belief, _) = followed(smoother(motion), mission, start)
+    nodes, every, places = differences(belief, *at_once(belief, mission, motion, start))
+    assert every[0] < 1e-6
+    assert max(nodes[1], every[1], places[1]) < 1e-6
+
+
+@pytest.mark.parametrize("strategy", SENSING)
+def test_what_is_off_by_far_counts_by_hubers_loss(strategy):
+    mission, motion, start = scaled_mission(strategy, 1.0, outliers=0.05)
+    *_, (belief, _) = followed(smoother(motion, robust=True), mission, start)
+    best = at_once(belief, mission, motion, start, robust=True)
+    nodes, _, places = differences(belief, *best)
+    assert max(nodes) < 3 * STOPS
+    assert max(places) < 30 * STOPS
+    *_, (trusting, _) = followed(smoother(motion), mission, start)
+    off = [np.hypot(*(b.path().mean[4::4] - mission.path[1:])[:, :2].T) for b in (belief, trusting)]
+    assert off[0].mean() < 0.7 * off[1].mean()
+
+
+# From the truth
+
+
+def assert_the_same_optimum(belief, path, places, within=1e-3):
+    best, other = from_the_truth(belief, path, places)
+    for node in range(belief.link.node + 1):
+        off = other.pose_mean(node) - best.pose_mean(node)
+        assert np.hypot(*off[:2]) < within
+        assert abs(wrap(off[2])) < within
+
+
+def check_reached(strategy, frames, seed):
+    mission = paper_mission(strategy, frames=frames, seed=seed)
+    scans = [measured_to(scan, **STD) for scan in mission.scans]
+    *_, (belief, _) = followed(smoother(), replace(mission, scans=scans))
+    belief.path()
+    stepwise = np.repeat(mission.path, STEPS_PER_FRAME, axis=0)[STEPS_PER_FRAME - 1 :]
+    assert_the_same_optimum(belief, stepwise, dict(enumerate(mission.landmarks, start=1)))
+
+
+@pytest.mark.parametrize("strategy", SENSING)
+@pytest.mark.parametrize("seed", range(3))
+def test_the_optimum_from_its_own_poses_is_the_one_from_the_truth(strategy, seed):
+    check_reached(strategy, 60, seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("strategy", SENSING)
+@pytest.mark.parametrize("seed", range(8))
+def test_the_optimum_of_a_whole_mission_is_the_one_from_the_truth(strategy, seed):
+    check_reached(strategy, 375, seed)
+
+
+# Turned and shifted
+
+
+@pytest.mark.parametrize("strategy", SENSING)
+@pytest.mark.parametrize(
+    ("turn", "within"),
+    [
+        pytest.param(np.pi / 2, 1e-6, id="by a quarter"),
+        pytest.param(2.0, 3e-3, id="by any angle"),
+    ],
+)
+def test_turning_and_shifting_the_world_turns_and_shifts_all_that_is_told(strategy, turn, within):
+    """A landmark is linearised anew when x or y has moved: exactly so by a quarter alone."""
+    mission, shift = paper_mission(strategy, frames=30), np.array([300.0, -40.0])
+    c, s = np.cos(turn), np.sin(turn)
+    R, whole = np.array([[c, -s], [s, c]]), np.eye(3)
+    whole[:2, :2] = R
+    moved = Gaussian(
+        mean=np.array([*(R @ START.mean[:2] + shift), wrap(START.mean[2] + turn)]),
+        covariance=whole @ START.covariance @ whole.T,
+    )
+    *_, (belief, _) = followed(smoother(), mission)
+    *_, (other, _) = followed(smoother(), mission, moved)
+    for one, there in ((belief.pose(), other.pose()), (belief.path(), other.path())):
+        at, expected = there.mean[..., :2], one.mean[..., :2] @ R.T + shift
+        np.testing.assert_allclose(at, expected, rtol=0, atol=within)
+        heading = wrap(there.mean[..., 2] - one.mean[..., 2] - turn)
+        np.testing.assert_allclose(heading, 0.0, rtol=0, atol=within)
+        turned = whole @ one.covariance @ whole.T
+        np.testing.assert_allclose(there.covariance, turned, rtol=0, atol=within)
+    known, found = belief.landmarks(), other.landmarks()
+    np.testing.assert_array_equal(found.landmark, known.landmark)
+    np.testing.assert_allclose(found.mean, known.mean @ R.T + shift, rtol=0, atol=20 * within)
+    assert relative(found.covariance, R @ known.covariance @ R.T).max() < 20 * within
+
+
+# A pose for every step
+
+
+def drive_of(controls, scans, start=START, motion=STANDING):
+    """Return the drive of these controls, each a step long, and the scans, each at a step."""
+    time = STEP * np.arange(len(controls) + 1)
+    heard = [replace(scan, time=float(time[step])) for step, scan in scans]
+    return Drive(motion=motion, start=start, time=time, controls=np.array(controls, float)), heard
+
+
+def test_scans_before_any_step_at_one_time_and_while_standing_leave_a_pose_for_every_step():
+    near, far = scan_of((1, 4.0, 0.3), (2, np.nan, -0.5)), scan_of((2, np.nan, -0.45))
+    still, ahead = [(0.0, 0.0)] * 3, [CIRCLE] * 5
+    scans = [(0, near), (0, far), (3, near), (3, far), (6, near), (8, near), (8, far), (11, far)]
+    drive, heard = drive_of([*still, *ahead, *still], scans)
+    track = run_filter(smoother(STANDING), drive, heard, None)
+    assert track.pose.mean.shape == (12, 3)
+    assert np.isfinite(track.pose.mean).all()
+    assert np.isfinite(track.pose.covariance).all()
+    np.testing.assert_array_equal(track.pose.mean[:4], np.tile(track.pose.mean[0], (4, 1)))
+    np.testing.assert_array_equal(track.pose.mean[8:], np.tile(track.pose.mean[8], (4, 1)))
+    assert np.all(np.diff(track.pose.mean[3:9, 0]) > 0.05)
+
+
+def test_a_drive_that_hears_nothing_is_reckoned():
+    drive, _ = drive_of([CIRCLE] * 6, [])
+    track = run_filter(smoother(), drive, [], None)
+    np.testing.assert_allclose(track.pose.mean, track.online.mean, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(track.pose.covariance, track.online.covariance, rtol=0, atol=2e-12)
+
+
+# Beliefs
+
+
+def all_told(belief):
+    path, pose, rows = belief.path(), belief.pose(), belief.landmarks()
+    return (*vars_of(path), *vars_of(pose), rows.landmark, rows.mean, rows.covariance, rows.weight)
+
+
+def vars_of(gaussian):
+    return gaussian.mean, gaussian.covariance
+
+
+def test_a_belief_kept_aside_answers_to_the_same_bits_after_others_went_on():
+    mission = paper_mission("fused", frames=24)
+    beliefs = [belief for belief, _ in followed(smoother(), mission)]
+    kept = beliefs[9]
+    before = [np.copy(answer) for answer in all_told(kept)]
+    beliefs[-1].path()
+    for answers in (all_told(kept), all_told(replace(kept, solver=Solver()))):
+        for now, then in zip(answers, before, strict=True):
+            np.testing.assert_array_equal(now, then)
+
+
+def test_two_ways_on_from_one_belief_do_not_know_of_each_other():
+    mission, slam = paper_mission("fused", frames=12), smoother()
+    *_, (kept, _) = followed(slam, mission)
+    here = slam.predict(kept, mission.controls[0], mission.dt[0])[0]
+    one = slam.update(here, scan_of((90, 3.0, 0.5)))
+    other = slam.update(here, scan_of((91, 2.0, -0.5)))
+    assert 90 in one.landmarks().landmark
+    assert 90 not in other.landmarks().landmark
+    assert 91 not in one.landmarks().landmark
+
+
+# The gate
+
+
+def known_landmark(gate):
+    """A filter and its belief of landmark 1, heard three times at 5 m, to the left."""
+    slam = smoother(STANDING, gate=gate)
+    sure = Gaussian(mean=np.zeros(3), covariance=1e-8 * np.eye(3))
+    belief = slam.init(sure)
+    for _ in range(3):
+        belief = slam.update(belief, scan_of((1, 5.0, 0.3)))
+    return slam, belief
+
+
+@pytest.mark.parametrize(
+    ("row", "dropped"),
+    [
+        pytest.param((1, 5.1, 0.35), 0, id="inside"),
+        pytest.param((1, 6.5, 0.3), 1, id="range outside"),
+        pytest.param((1, 5.0, 1.3), 1, id="bearing outside"),
+        pytest.param((1, np.nan, 1.3), 1, id="bearing alone, outside"),
+        pytest.param((1, np.nan, 0.4), 0, id="bearing alone, inside"),
+        pytest.param((2, 6.5, 1.3), 0, id="of a landmark that is new"),
+    ],
+)
+def test_what_is_outside_the_gate_is_dropped_and_counted(row, dropped):
+    slam, belief = known_landmark(0.999)
+    after = slam.update(belief, scan_of(row))
+    assert after.gated == dropped
+    same = np.array_equal(after.landmarks().mean, belief.landmarks().mean)
+    assert same == bool(dropped)
+
+
+def test_the_gate_is_where_the_distribution_of_what_is_expected_has_it():
+    """The landmark known three times over: a fourth look is off by R (1 + 1/3)."""
+    slam, belief = known_landmark(0.99)
+    edge = np.sqrt(9.2103404 * 0.2**2 * 4 / 3)
+    for off, dropped in ((0.99 * edge, 0), (1.01 * edge, 1)):
+        assert slam.update(belief, scan_of((1, 5.0 + off, 0.3))).gated == dropped
+
+
+def test_an_open_gate_drops_nothing():
+    slam, belief = known_landmark(1.0)
+    assert slam.update(belief, scan_of((1, 50.0, -2.0))).gated == 0
+
+
+# The prior
+
+
+def test_a_landmark_heard_once_is_as_sure_as_its_range_and_bearing():
+    slam = smoother(Motion(model="unicycle", control_std=(0.1, 0.1)))
+    sure = Gaussian(mean=np.zeros(3), covariance=np.zeros((3, 3)))
+    rows = slam.update(slam.init(sure), scan_with([7], [0.0], [4.0])).landmarks()
+    assert placed(rows).all()
+    np.testing.assert_allclose(rows.mean, [[4.0, 0.0]], atol=1e-9)
+    own = 1.0 / (1.0 / np.array([0.2**2, (4.0 * 0.15) ** 2]) + 1.0 / 20.0**2)
+    np.testing.assert_allclose(rows.covariance[0], np.diag(own), rtol=0, atol=1e-9)
