@@ -264,7 +264,7 @@ def _smoother(config: Config, motion: "Motion") -> "Estimator":
 
 
 def _gaussian(config: Config) -> dict[str, Any]:
-    """Return the settings of both EKFs."""
+    """Return the settings that both EKFs and the smoother take."""
     settings = config.filter
     return {"rays": config.rays, "gate": settings.gate, "robust": settings.robust == "huber"}
 

@@ -83,8 +83,9 @@ def _combinations(plan: Plan) -> list[tuple[dict[str, Any], Config, list[int]]]:
     found: dict[str, tuple[dict[str, Any], Config, list[int]]] = {}
     for case in cases_of(plan):
         settings = {name: value for name, value in case.values.items() if name != RADIUS}
-        _, _, numbers = found.setdefault(repr(settings), (settings, common(plan, settings), []))
-        numbers.append(case.number)
+        if (key := repr(settings)) not in found:
+            found[key] = (settings, common(plan, settings), [])
+        found[key][2].append(case.number)
     return list(found.values())
 
 

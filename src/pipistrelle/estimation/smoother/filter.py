@@ -234,7 +234,9 @@ class Smoother:
         mapped, waiting, crossed = list(here.mapped), dict(here.waiting), False
         poses = _poses(here)
         columns = (scan.landmark, scan.bearing, scan.range, scan.bearing_std, scan.range_std)
-        for label, bearing, distance, across, along in zip(*map(_listed, columns), strict=True):
+        for label, bearing, distance, across, along in zip(
+            *map(np.ndarray.tolist, columns), strict=True
+        ):
             if label not in mapped:
                 if math.isnan(distance):
                     queue = (*waiting.get(label, ()), Bearing(node, bearing, across))
@@ -377,11 +379,6 @@ def _prior(label: int, place: Float[np.ndarray, "2"]) -> gtsam.PriorFactorPoint2
     """Return what is known of a landmark beforehand: next to nothing."""
     noise = gtsam.noiseModel.Isotropic.Sigma(2, PRIOR_STD)
     return gtsam.PriorFactorPoint2(landmark_key(label), place, noise)
-
-
-def _listed(column: np.ndarray) -> list:
-    """Return a column as Python's numbers."""
-    return column.tolist()
 
 
 def _ray(pose: Gaussian, heard: Bearing, rays: RayConfig) -> list[tuple[Gaussian, float]]:
