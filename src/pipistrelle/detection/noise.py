@@ -99,6 +99,26 @@ def measured(heard: Heard) -> Heard:
     return replace(heard, rows=told)
 
 
+def unstated(scan: Scan) -> Scan:
+    """Forget how surely the rows of a scan say that they were measured.
+
+    Parameters
+    ----------
+    scan : Scan
+
+    Returns
+    -------
+    Scan
+
+    Examples
+    --------
+    >>> from pipistrelle.detection.scans import make_scan
+    >>> unstated(make_scan(0.5, np.array([3]), np.zeros(1), bearing_std=0.1)).bearing_std
+    array([nan])
+    """
+    return with_columns(scan, bearing_std=math.nan, range_std=math.nan)
+
+
 def as_said(scan: Scan) -> Scan:
     """Leave it to the rows themselves.
 

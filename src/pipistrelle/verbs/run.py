@@ -123,11 +123,11 @@ def _log(mission: "Mission", scans: "Sequence[Scan]") -> "Log":
     import numpy as np
 
     from pipistrelle.detection.logs.recording import Log
-    from pipistrelle.detection.scans import with_columns
+    from pipistrelle.detection.noise import unstated
 
     config, drive = mission.config, mission.drive
     if config.filter.noise == "constant":  # log.toml says it
-        scans = [with_columns(scan, bearing_std=np.nan, range_std=np.nan) for scan in scans]
+        scans = list(map(unstated, scans))
     x, y, heading = drive.start.mean.tolist()
     return Log(
         name=f"run-{config.seed}",

@@ -9,7 +9,7 @@ import numpy as np
 from pipistrelle.config import Config, Strategy
 from pipistrelle.detection.logs.readers import READERS, Reader, Robot, reader_of
 from pipistrelle.detection.logs.recording import Log
-from pipistrelle.detection.noise import noise_of
+from pipistrelle.detection.noise import noise_of, unstated
 from pipistrelle.detection.scans import Scan, rows_of, with_columns
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import Motion
@@ -240,7 +240,7 @@ def replay(
     check_filters(filters, drive.motion, config)
     noise, scans = noise_of(config.filter), log.scans
     if config.filter.noise == "constant":
-        scans = [with_columns(scan, bearing_std=math.nan, range_std=math.nan) for scan in scans]
+        scans = list(map(unstated, scans))
     heard = {
         strategy: tuple(map(noise, as_heard_by(scans, strategy, beamwidth)))
         for strategy in strategies
