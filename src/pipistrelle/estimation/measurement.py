@@ -16,6 +16,8 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 
 NEAREST = 1e-3
 """A measurement of a point nearer than this [m] says nothing that can be linearised."""
+BELIEVED = 2.0
+"""Standard deviations that a measurement may be off before Huber's rule lets it count less."""
 
 
 class Measurements(NamedTuple):

@@ -20,12 +20,9 @@ from pipistrelle.estimation.ekf.gaussian import (
     bearing_variance,
     relative_covariance,
 )
-from pipistrelle.estimation.measurement import NEAREST, Row, observe
+from pipistrelle.estimation.measurement import BELIEVED, NEAREST, Row, observe
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, no_alloc
-
-BELIEVED = 2.0
-"""Standard deviations that a measurement may be off without counting less (k)."""
 
 
 @no_alloc

@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan, rows_of
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
-from pipistrelle.estimation.measurement import measurement_jacobians, observe
+from pipistrelle.estimation.measurement import BELIEVED, measurement_jacobians, observe
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.rays import gate_bounds, ray_members
 from pipistrelle.estimation.smoother.crossing import Bearing, crossing
@@ -54,8 +54,6 @@ from pipistrelle.geometry import wrap_angle
 
 PRIOR_STD = 20.0
 """Of a landmark about the place where it enters [m]."""
-BELIEVED = 2.0
-"""Standard deviations that a measurement may be off without counting less."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
