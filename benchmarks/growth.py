@@ -92,10 +92,10 @@ def _mapped(landmarks: int) -> dict[str, float]:
     from pipistrelle.detection.scans import make_scan
     from pipistrelle.estimation.beliefs import Gaussian
     from pipistrelle.estimation.catalogue import entry
-    from pipistrelle.experiments.hearing.scenario import bicycle
+    from pipistrelle.experiments.hearing.scenario import motion_of
 
     rng, label = np.random.default_rng(landmarks), np.arange(landmarks)
-    slam = entry("ekf").build(Config(), bicycle(Config().motion))
+    slam = entry("ekf").build(Config(), motion_of(Config().motion))
     start = slam.init(Gaussian(mean=np.zeros(3), covariance=np.eye(3)))
     noise = {"bearing_std": 0.15, "range_std": 0.2}
     bearing, distance = rng.uniform(-3.0, 3.0, landmarks), rng.uniform(2.0, 20.0, landmarks)

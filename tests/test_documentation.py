@@ -124,13 +124,13 @@ def test_the_guides_second_caller_is_mapped_and_its_moving_one_is_not(guide):
 def test_the_guides_filter_drives_a_mission(guide):
     from pipistrelle.config import Config, ScenarioConfig
     from pipistrelle.estimation.catalogue import entry
-    from pipistrelle.experiments.hearing.scenario import bicycle, draw_scenario
+    from pipistrelle.experiments.hearing.scenario import draw_scenario, motion_of
     from pipistrelle.experiments.runs.filtering import run_filter
     from pipistrelle.experiments.runs.trial import drive_of
 
     config = Config(scenario=ScenarioConfig(steps=40, landmarks=3))
     world = draw_scenario(config, np.random.default_rng(7))
-    lost = guide["DeadReckoning"](motion=bicycle(config.motion))
+    lost = guide["DeadReckoning"](motion=motion_of(config.motion))
     track = run_filter(lost, drive_of(world, config), (), np.random.default_rng(7))
     ekf = entry("ekf").build(config, lost.motion)
     same = run_filter(ekf, drive_of(world, config), (), np.random.default_rng(7))
@@ -229,7 +229,7 @@ def test_the_guides_filter_goes_by_its_name(tmp_path, monkeypatch):
     from pipistrelle.config import Config
     from pipistrelle.estimation.beliefs import Gaussian
     from pipistrelle.estimation.catalogue import entry
-    from pipistrelle.experiments.hearing.scenario import bicycle
+    from pipistrelle.experiments.hearing.scenario import motion_of
 
     texts = [text for text in blocks("python", DOCS / "extending.md") if "Reckoning" in text]
     (tmp_path / "guided.py").write_text("".join(texts))
@@ -238,7 +238,7 @@ def test_the_guides_filter_goes_by_its_name(tmp_path, monkeypatch):
     config, sure = Config(), Gaussian(mean=np.zeros(3), covariance=np.zeros((3, 3)))
     spread = []
     for name in ("DeadReckoning", "WarierReckoning"):
-        slam = entry(f"guided:{name}").build(config, bicycle(config.motion))
+        slam = entry(f"guided:{name}").build(config, motion_of(config.motion))
         spread.append(slam.predict(slam.init(sure), np.ones((1, 2)), np.ones(1), None)[1])
     np.testing.assert_allclose(4.0 * spread[0].covariance, spread[1].covariance, rtol=1e-12)
     assert entry("guided:WarierReckoning").title == "Dead reckoning, warier"

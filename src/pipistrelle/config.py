@@ -45,8 +45,10 @@ class Section(BaseModel):
 
 
 class ScenarioConfig(Section):
-    """The true world: a noisy circular drive among random landmarks."""
+    """The true world: a noisy drive, round the paper's circle, among random landmarks."""
 
+    world: Annotated[str, Field(min_length=1)] | None = None
+    """Folder of a world of one's own; what it leaves open is drawn as the rest says."""
     steps: Count = 1500
     """Control steps."""
     step: Positive = 0.125
@@ -59,6 +61,14 @@ class ScenarioConfig(Section):
     """Nominal steering angle [rad]."""
     start: tuple[Real, Real, Real] = (0.0, -7.408, 0.0)
     """True start: x, y [m], heading [rad]; unreported: the noise-free path circles the centre."""
+    course: Literal["circle", "eight", "corridor", "lawn-mower"] = "circle"
+    """A circle by constant controls, or another shape, for which a driver steers."""
+    extent: Positive = 12.0
+    """Half the length of a course that is no circle [m]."""
+    lane: Positive = 4.0
+    """Distance of a lawn-mower's lanes, of an orchard's rows; a corridor's width [m]."""
+    field: Literal["disc", "rows", "rooms"] = "disc"
+    """Landmarks lie anywhere on a disc, in an orchard's rows, or at corners of rooms."""
     landmarks: Annotated[int, Field(ge=0)] = 50
     """Number of landmarks, without the beacon."""
     radius: Positive = 25.0
@@ -172,14 +182,18 @@ class AssociationConfig(Section):
 
 
 class MotionConfig(Section):
-    """The front wheel of a bicycle, and the noise of its controls."""
+    """How the vehicle moves, the front wheel of a bicycle, and the noise of its controls."""
 
+    model: Literal["bicycle", "unicycle"] = "bicycle"
+    """Commanded are speed and steering angle, or speed and angular rate."""
     wheelbase: Positive = 0.2
     """[m]"""
     speed_std: NonNegative = 0.1
     """[m/s]"""
     steering_std: NonNegative = 0.03
-    """[rad]"""
+    """Of a bicycle [rad]."""
+    angular_rate_std: NonNegative = 0.1
+    """Of a unicycle [rad/s]."""
 
 
 class FilterConfig(Section):

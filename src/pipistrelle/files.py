@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 from pipistrelle.config import InputError
 
 SUMS = "SHA256SUMS"
-RESULTS, REPORT, LOG = KINDS = ("results", "a report", "a log")
+RESULTS, REPORT, LOG, WORLD = KINDS = ("results", "a report", "a log", "a world")
 _KIND = "# Of Pipistrelle: {}\n"
 _LINE = re.compile(r"([0-9a-f]{64}) [ *](.+)")
 
@@ -29,7 +29,7 @@ class OwnFiles:
     ----------
     folder : Path
     kind : str
-        What they are together: results, a report, a log. One kind never replaces another.
+        What they are together: results, a report, a log, a world. One kind never replaces another.
 
     Examples
     --------

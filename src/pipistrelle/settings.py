@@ -29,6 +29,8 @@ NOT_SETTINGS = frozenset({"PIPISTRELLE_DATA"})
 """Variables of the environment that share the prefix and set nothing."""
 
 Key = tuple[str, ...]
+FOLDERS: frozenset[Key] = frozenset({("scenario", "world")})
+"""Settings that are paths: in a file, from where the file lies."""
 
 _DEEPEST = 8
 """Levels of tables and lists that a file may have."""
@@ -93,7 +95,41 @@ def from_file(path: Path) -> Layer:
     ...     from_file(file)["rays", "power"].value
     3.0
     """
-    return _layer(leaves(read_toml(path), known_settings()), ".".join, f"{path}: ")
+    layer = from_table(read_toml(path), f"{path}: ")
+    for key in FOLDERS & layer.keys():
+        if isinstance(layer[key].value, str):
+            layer[key] = layer[key]._replace(value=str(path.parent / layer[key].value))
+    return layer
+
+
+def from_table(values: Mapping[str, Any], where: str, above: str = "") -> Layer:
+    """Name the settings of a table in a file.
+
+    Parameters
+    ----------
+    values : mapping
+        Settings, and sections of settings.
+    where : str
+        What a refusal says of the file.
+    above : str
+        What stands before a setting's name there.
+
+    Returns
+    -------
+    Layer
+
+    Raises
+    ------
+    InputError
+        A key that is no setting.
+
+    Examples
+    --------
+    >>> from_table({"seed": 3}, "world.toml: ", "config.")
+    {('seed',): Given(value=3, where='world.toml: config.seed')}
+    """
+    given = leaves(values, known_settings())
+    return _layer(given, lambda key: above + ".".join(key), where)
 
 
 def from_environment(environment: Mapping[str, str]) -> Layer:

@@ -16,6 +16,7 @@ from pipistrelle.acoustics.arrivals import (
 )
 from pipistrelle.acoustics.callers import VEHICLE, callers_of
 from pipistrelle.acoustics.emitter import piston_directivity
+from pipistrelle.acoustics.target import Bodies
 from pipistrelle.config import (
     AirConfig,
     BeaconConfig,
@@ -322,3 +323,49 @@ def test_of_many_emissions_the_impossible_one_is_named():
     poses = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.5]])
     with pytest.raises(InputError, match=r"pose \[1\. +1\. +0\.5\]: found vehicle to landmark 1"):
         sounds_of_emissions(poses, 0 * poses[:, :2], poses[1:, :2], np.array([5.0, 0.0]), CONFIG)
+
+
+# Bodies of their own
+
+
+def through(bodies, config, pose=ORIGIN):
+    landmarks = np.array([[5.0, 0.5], [6.0, -2.0], [3.0, 4.0]])
+    callers = callers_of(config, np.array([0.0, 9.0]))
+    heard, _ = arrivals_of_emissions(pose[None], STILL[None], landmarks, callers, config, bodies)
+    return heard
+
+
+@pytest.mark.parametrize("shape", ["cylinder", "sphere"])
+def test_bodies_like_the_usual_target_sound_like_it(shape):
+    config = Config(target=TargetConfig(shape=shape, radius=0.04))
+    usual = Bodies(radius=np.full(3, 0.04), sphere=np.full(3, shape == "sphere"))
+    for name in ("level_db", "delay", "bearing", "landmark"):
+        found, expected = (getattr(through(b, config), name) for b in (usual, None))
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+
+
+def test_a_larger_body_is_louder_by_its_shapes_law_and_only_that_one():
+    config = Config()
+    usual = through(None, config)
+    for sphere, gain in ((False, 10.0), (True, 20.0)):
+        like = Config(target=TargetConfig(shape="sphere" if sphere else "cylinder"))
+        large = Bodies(radius=np.array([0.25, 0.025, 0.025]), sphere=np.full(3, sphere))
+        more = through(large, like).level_db - through(None, like).level_db
+        own, other = usual.caller == VEHICLE, usual.landmark != 1
+        np.testing.assert_allclose(more[own & ~other], gain, atol=1e-9)
+        np.testing.assert_allclose(more[other], 0.0, atol=1e-12)
+        passive = more[~own & ~other]
+        assert passive.shape == (1,)
+        assert passive[0] > 0.5 * gain
+
+
+def test_spheres_among_cylinders_throw_as_spheres_do():
+    cylinders = Config()
+    spheres = Config(target=TargetConfig(shape="sphere"))
+    mixed = Bodies(radius=np.full(3, 0.025), sphere=np.array([True, False, True]))
+    levels = through(mixed, cylinders).level_db
+    label = through(None, cylinders).landmark
+    alone = [through(None, config).level_db for config in (cylinders, spheres)]
+    of_sphere = np.isin(label, [1, 3])
+    np.testing.assert_allclose(levels, np.where(of_sphere, alone[1], alone[0]), atol=1e-12)
+    assert np.abs(alone[1] - alone[0])[of_sphere].max() > 0.1

@@ -20,7 +20,13 @@ from pipistrelle.acoustics.propagation import (
     passive_spreading_loss_db,
     spreading_loss_db,
 )
-from pipistrelle.acoustics.target import target_strength_db
+from pipistrelle.acoustics.target import (
+    Bodies,
+    backscatter_db,
+    strength_of_bodies_db,
+    target_strength_db,
+    with_usual,
+)
 from pipistrelle.acoustics.ways import Ways, refuse_impossible, turn_of_sound, ways_home
 from pipistrelle.config import AirConfig, Config
 
@@ -125,6 +131,7 @@ def arrivals_of_emissions(
     landmarks: Float[np.ndarray, "n 2"],
     callers: Sequence[Caller],
     config: Config,
+    bodies: Bodies | None = None,
 ) -> tuple[Arrivals, Int[np.ndarray, " k"]]:
     """Arrivals of several emissions in one world, emission after emission (`arrivals_of_emission`).
 
@@ -136,6 +143,8 @@ def arrivals_of_emissions(
     callers : sequence of c Caller
         The vehicle first; paths and velocities (k, 2), a row for each emission (`callers_at`).
     config : Config
+    bodies : Bodies, optional
+        Of the landmarks; as the settings have them, by default.
 
     Returns
     -------
@@ -164,10 +173,12 @@ def arrivals_of_emissions(
     """
     ways = ways_home(poses, velocities, landmarks, callers)
     refuse_impossible(poses, ways, callers)
-    own, emission = _own_echoes(ways, callers[VEHICLE], config)
+    if bodies is not None:
+        bodies = with_usual(bodies, len(callers) - 1, config.target)
+    own, emission = _own_echoes(ways, callers[VEHICLE], config, bodies)
     parts, emissions = [own], [emission]
     for j in range(1, len(callers)):
-        parts.append(_sounds_of(j, ways, callers[j], config))
+        parts.append(_sounds_of(j, ways, callers[j], config, bodies))
         emissions.append(np.repeat(np.arange(len(poses)), ways.homeward.shape[1]))
     emission = np.concatenate(emissions)
     order = np.argsort(emission, kind="stable")
@@ -268,7 +279,7 @@ def arrivals_at(arrivals: Arrivals, rows: Bool[np.ndarray, " a"] | slice) -> Arr
 
 
 def _own_echoes(
-    ways: Ways, caller: Caller, config: Config
+    ways: Ways, caller: Caller, config: Config, bodies: Bodies | None
 ) -> tuple[Arrivals, Int[np.ndarray, " a"]]:
     """Return the echoes of the vehicle's call from all ahead, and the emission of each."""
     c = config.air.celerity
@@ -276,6 +287,8 @@ def _own_echoes(
     back, closing = ways.homeward.ravel()[ahead], ways.closing.ravel()[ahead]
     emission, target = np.divmod(ahead, ways.homeward.shape[1])
     path, loss_db = back + back, spreading_loss_db(2.0 * back, ways=2)
+    if bodies is not None:
+        loss_db = loss_db - backscatter_db(bodies, config.target)[target]
     frequency = doppler_frequency(
         caller.frequency, receiver_speed=closing, source_speed=closing, speed_of_sound=c
     )
@@ -295,14 +308,17 @@ def _own_echoes(
     return heard, emission
 
 
-def _sounds_of(j: int, ways: Ways, caller: Caller, config: Config) -> Arrivals:
+def _sounds_of(
+    j: int, ways: Ways, caller: Caller, config: Config, bodies: Bodies | None
+) -> Arrivals:
     """Return another caller's sounds at all emissions, by label: its echoes and its direct call."""
     c, (emissions, targets) = config.air.celerity, ways.homeward.shape
     itself = ways.landmarks + j - 1
     incoming = ways.target - ways.target[:, itself : itself + 1]
     outward = np.hypot(incoming[..., 0], incoming[..., 1])
     path = ways.homeward + outward
-    loss_db = _loss_db(itself, ways, incoming, outward, caller, config)
+    strength_db = _strength_db(turn_of_sound(incoming, ways.offset), caller, config, bodies)
+    loss_db = _loss_db(itself, ways, outward, strength_db, config.air)
     frequency = _shifted(itself, ways, incoming, outward, caller.frequency, c)
     absorption = _absorption(config.air, caller.frequency)
     return Arrivals(
@@ -348,25 +364,28 @@ def _shifted(
 def _loss_db(
     itself: int,
     ways: Ways,
-    incoming: Float[np.ndarray, "_ t 2"],
     outward: Float[np.ndarray, "_ t"],
-    caller: Caller,
-    config: Config,
+    strength_db: Float[np.ndarray, "k t"],
+    air: AirConfig,
 ) -> Float[np.ndarray, "k t"]:
     """Spreading less target strength of a caller's echoes; of its direct call, spreading alone."""
-    air, target = config.air, config.target
-    strength_db = target_strength_db(
-        turn_of_sound(incoming, ways.offset),
-        radius=target.radius,
-        frequency=caller.frequency,
-        shape=target.shape,
-        speed_of_sound=air.celerity,
-    )
     sent = np.broadcast_to(outward, strength_db.shape).copy()
     sent[:, itself] = 1.0  # no echo of itself: any distance will do
     loss_db = passive_spreading_loss_db(sent, ways.homeward, law=air.spreading) - strength_db
     loss_db[:, itself] = spreading_loss_db(ways.homeward[:, itself])
     return loss_db
+
+
+def _strength_db(
+    turn: Float[np.ndarray, "k t"], caller: Caller, config: Config, bodies: Bodies | None
+) -> Float[np.ndarray, "k t"]:
+    """Target strength of all that reflects a caller's sound."""
+    usual, tone, c = config.target, caller.frequency, config.air.celerity
+    if bodies is not None:
+        return strength_of_bodies_db(turn, bodies, usual=usual, frequency=tone, speed_of_sound=c)
+    return target_strength_db(
+        turn, radius=usual.radius, frequency=tone, shape=usual.shape, speed_of_sound=c
+    )
 
 
 @lru_cache(maxsize=64)

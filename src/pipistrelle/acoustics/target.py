@@ -6,19 +6,35 @@ of the two is left out, so the formulae are near the exact series (0.1 to 0.9 dB
 degrees and a smooth version of it nearer to the forward direction.
 """
 
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from pipistrelle.acoustics.emitter import jinc
-from pipistrelle.config import InputError
+from pipistrelle.config import InputError, TargetConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bodies:
+    """Sizes and shapes of things that reflect, each its own.
+
+    Attributes
+    ----------
+    radius : (n) [m]
+    sphere : (n)
+        Whether each is a sphere; else a cylinder.
+    """
+
+    radius: Float[np.ndarray, " n"]
+    sphere: Bool[np.ndarray, " n"]
 
 
 def target_strength_db(
     angle: Float[np.ndarray, "*n"] | float,
     *,
-    radius: float,
+    radius: float | Float[np.ndarray, " m"],
     frequency: float,
     shape: Literal["cylinder", "sphere"],
     speed_of_sound: float,
@@ -38,6 +54,7 @@ def target_strength_db(
     angle : (*n) [rad]
         By how much the sound is turned: pi is back to where it came from, 0 straight on.
     radius : [m]
+        Or one for each of the last axis of the angles.
     frequency : [Hz]
     shape : "cylinder" or "sphere"
     speed_of_sound : [m/s]
@@ -74,3 +91,87 @@ def target_strength_db(
     else:
         raise InputError(f"target.shape: found {shape!r}, expected 'cylinder' or 'sphere'; choose")
     return np.asarray(10.0 * np.log10(intensity))
+
+
+def strength_of_bodies_db(
+    angle: Float[np.ndarray, "*k n"],
+    bodies: Bodies,
+    *,
+    usual: TargetConfig,
+    frequency: float,
+    speed_of_sound: float,
+) -> Float[np.ndarray, "*k n"]:
+    r"""Scattered intensity relative to backscatter of the usual target.
+
+    Backscatter grows with the radius as :math:`I(\pi) = r / 2` of a cylinder and :math:`r^2 / 4` of
+    a sphere, so a body of radius r throws back :math:`10 \log_{10} (r / r_0)` or
+    :math:`20 \log_{10} (r / r_0)` more than one of its shape with the usual radius :math:`r_0`,
+    for which the source levels stand.
+
+    Parameters
+    ----------
+    angle : (*k, n) [rad]
+        By how much the sound is turned.
+    bodies : Bodies
+    usual : TargetConfig
+    frequency : [Hz]
+    speed_of_sound : [m/s]
+
+    Returns
+    -------
+    (*k, n) [dB]
+
+    Notes
+    -----
+    Bradley & Abaid, Eq. (4), of which only the relative part is theirs. See `target_strength_db`.
+
+    Examples
+    --------
+    >>> posts = Bodies(radius=np.array([0.025, 0.25, 0.25]), sphere=np.array([False, False, True]))
+    >>> heard = dict(usual=TargetConfig(), frequency=30e3, speed_of_sound=343.0)
+    >>> strength_of_bodies_db(np.full((1, 3), np.pi), posts, **heard)
+    array([[ 0., 10., 20.]])
+    """
+    of = {"radius": bodies.radius, "frequency": frequency, "speed_of_sound": speed_of_sound}
+    relative = np.where(
+        bodies.sphere,
+        target_strength_db(angle, shape="sphere", **of),
+        target_strength_db(angle, shape="cylinder", **of),
+    )
+    return relative + backscatter_db(bodies, usual)
+
+
+def backscatter_db(bodies: Bodies, usual: TargetConfig) -> Float[np.ndarray, " n"]:
+    """How much more bodies throw back than one of their shape with the usual radius.
+
+    Parameters
+    ----------
+    bodies : Bodies
+    usual : TargetConfig
+
+    Returns
+    -------
+    (n) [dB]
+        As `strength_of_bodies_db` at an angle of pi.
+    """
+    return np.where(bodies.sphere, 20.0, 10.0) * np.log10(bodies.radius / usual.radius)
+
+
+def with_usual(bodies: Bodies, count: int, usual: TargetConfig) -> Bodies:
+    """Add bodies as the settings have them.
+
+    Parameters
+    ----------
+    bodies : Bodies
+    count : int
+    usual : TargetConfig
+
+    Returns
+    -------
+    Bodies
+        The others first.
+    """
+    return Bodies(
+        radius=np.append(bodies.radius, np.full(count, usual.radius)),
+        sphere=np.append(bodies.sphere, np.full(count, usual.shape == "sphere")),
+    )

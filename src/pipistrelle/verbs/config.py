@@ -12,7 +12,8 @@ def show(*, mission: Annotated[MissionOptions | None, Parameter(name="*")] = Non
     """Print the settings as TOML, file, environment and flags applied."""
     from pipistrelle.settings import to_toml
 
-    put(to_toml(mission_config(mission or MissionOptions())), end="")
+    config, _ = mission_config(mission or MissionOptions())
+    put(to_toml(config), end="")
 
 
 def schema() -> None:

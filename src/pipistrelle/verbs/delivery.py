@@ -4,9 +4,10 @@ import contextlib
 import os
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -92,6 +93,7 @@ def deliver(
     callers: Sequence["Caller"] = (),
     beamwidth: float | None = None,
     ignored_rows: dict[str, int] | None = None,
+    beside: Mapping[str, bytes] = MappingProxyType({}),
     watch: "MissionRecorder | None" = None,
 ) -> int:
     """Write results, figure and film in place of earlier ones, print the table, the folder last.
@@ -111,6 +113,8 @@ def deliver(
         Of the vehicle's call.
     ignored_rows : dict, optional
         Number of dropped log rows by reason; without it there was no log.
+    beside : dict of name to content, optional
+        Files that are to stand beside the results.
     watch : MissionRecorder, optional
         What it saw becomes the film.
 
@@ -138,6 +142,7 @@ def deliver(
         trials=trials,
         truth=truth,
         ignored_rows=ignored_rows or {},
+        beside=beside,
         draw=draw,
     )
     if not options.quiet:

@@ -43,6 +43,8 @@ def _filter(_: Any, tokens: Sequence[Any]) -> str:
 
 
 if TYPE_CHECKING:
+    from pipistrelle.experiments.hearing.worlds import World
+
     _LISTED: Any = str
     ChosenFilter = str
 else:  # the help names those that are listed
@@ -171,11 +173,19 @@ class MissionOptions:
         Parameter(help="Receiver: fast or literal; sets receiver.engine. [default: block]"),
     ] = None
     particles: Particles = None
+    world: Annotated[
+        Path | None,
+        Parameter(
+            metavar="DIR",
+            help="A world of your own: landmarks.csv, path.csv, world.toml; sets scenario.world. "
+            "[default: one is drawn]",
+        ),
+    ] = None
     settings: Annotated[SettingFlags | None, Parameter(name="*")] = None
 
 
-def mission_config(options: MissionOptions) -> Config:
-    """Resolve the settings of a mission: defaults < file < environment < flags.
+def mission_config(options: MissionOptions) -> tuple[Config, "World | None"]:
+    """Resolve the settings of a mission: defaults < world < file < environment < flags.
 
     Parameters
     ----------
@@ -184,6 +194,8 @@ def mission_config(options: MissionOptions) -> Config:
     Returns
     -------
     Config
+    World or None
+        The one that the settings name.
 
     Raises
     ------
@@ -192,22 +204,35 @@ def mission_config(options: MissionOptions) -> Config:
 
     Examples
     --------
-    >>> mission_config(MissionOptions(duration=60.0)).scenario.steps
+    >>> config, _ = mission_config(MissionOptions(duration=60.0))
+    >>> config.scenario.steps
     480
     """
     layer = layers(options.config, options.settings)
     short: Layer = {
+        ("scenario", "world"): Given(options.world and str(options.world), "--world"),
         ("scenario", "landmarks"): Given(options.landmarks, "--landmarks"),
         ("receiver", "engine"): Given(options.engine, "--engine"),
         ("fastslam", "particles"): Given(options.particles, "--particles"),
     }
-    base = resolve(layer | short_names(short, options.settings))
+    world, layer = _on_world(layer | short_names(short, options.settings))
+    base = resolve(layer)
     if options.duration is not None:
         steps = _steps(options.duration, base)
         short["scenario", "steps"] = Given(steps, f"--duration {options.duration:g}")
     if options.beamwidth is not None:
         short["emitter", "radius"] = Given(_radius(options.beamwidth, base), "--beamwidth")
-    return resolve(layer | short_names(short, options.settings))
+    return resolve(layer | short_names(short, options.settings)), world
+
+
+def _on_world(layer: Layer) -> tuple["World | None", Layer]:
+    """Lay the settings of the world that others name beneath them."""
+    if ("scenario", "world") not in layer:
+        return None, layer
+    from pipistrelle.experiments.hearing.world_folder import named_world, settled
+
+    world = named_world(layer)
+    return world, layer if world is None else settled(world, layer)
 
 
 def layers(config: Path | None, settings: SettingFlags | None) -> Layer:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from pipistrelle.config import InputError
-from pipistrelle.files import LOG, OwnFiles
+from pipistrelle.files import LOG, WORLD, OwnFiles
 from pipistrelle.verbs.options import (
     Chosen,
     ChosenFilter,
@@ -41,12 +41,21 @@ def run(
             "[default: no]",
         ),
     ] = None,
+    save_world: Annotated[
+        Path | None,
+        Parameter(
+            metavar="DIR",
+            help="Write the world that was drawn as one for --world. [default: no]",
+        ),
+    ] = None,
 ) -> int:
     """Drive through one random world and map it, the three strategies side by side."""
     mission, output = mission or MissionOptions(), output or OutputOptions()
-    config, ways = mission_config(mission), filters(estimator, mission.particles)
-    if save_log is not None:
-        _check_vacant(save_log, output)
+    config, known = mission_config(mission)
+    ways = filters(estimator, mission.particles)
+    _check_saved(save_log, save_world, output)
+    from pipistrelle.experiments.hearing.world_folder import kept_world, write_world
+    from pipistrelle.experiments.hearing.worlds import ANY
     from pipistrelle.experiments.runs.preparing import warnings_of
     from pipistrelle.experiments.runs.trial import run_mission
     from pipistrelle.verbs import delivery
@@ -57,16 +66,21 @@ def run(
         delivery.get_ready(output)
         watch = delivery.recorder(output)
         with progress(output.quiet) as show:
-            done = run_mission(config, strategies(strategy), ways, progress=show, watch=watch)
-        warn(*warnings_of(config))
+            looking = {"progress": show, "watch": watch}
+            done = run_mission(config, strategies(strategy), ways, world=known or ANY, **looking)
+        warn(*warnings_of(config, done.scenario.callers))
+        if save_world is not None:
+            write_world(save_world, done.scenario, config)
         if save_log is not None:
             heard = {trial.strategy: trial.scans for trial in done.trials}
             _save_log(save_log, done, heard.get("fused", done.trials[0].scans))
+        kept, files = (config, {}) if known is None else kept_world(config, known)
         return delivery.deliver(
             folder,
             done.trials,
             done.drive.truth,
-            config=config,
+            config=kept,
+            beside=files,
             seed=config.seed,
             options=output,
             callers=done.scenario.callers[1:],
@@ -75,23 +89,36 @@ def run(
         )
 
 
-def _check_vacant(folder: Path, output: OutputOptions) -> None:
-    """Refuse to write a log over anything else."""
-    from pipistrelle.detection.logs.folder import FILES
+def _check_saved(log: Path | None, world: Path | None, output: OutputOptions) -> None:
+    """Refuse to write a log or a world over anything else, or both into one folder."""
+    from pipistrelle.detection.logs import folder as log_folder
+    from pipistrelle.experiments.hearing import world_folder
     from pipistrelle.experiments.runs import truth_files
 
+    if log is not None:
+        _check_vacant("--save-log", log, LOG, (*log_folder.FILES, *truth_files.FILES), output)
+    if world is not None:
+        _check_vacant("--save-world", world, WORLD, world_folder.FILES, output)
+    if log is not None and world is not None and log.resolve() == world.resolve():
+        raise InputError(f"--save-world: {world} is that of --save-log; name another")
+
+
+def _check_vacant(
+    flag: str, folder: Path, kind: str, names: Sequence[str], output: OutputOptions
+) -> None:
+    """Refuse a folder in which anything but what we wrote of a kind would be replaced."""
     if output.output is not None and folder.resolve() == output.output.resolve():
-        raise InputError(f"--save-log: {folder} is the result folder; name another")
+        raise InputError(f"{flag}: {folder} is the result folder; name another")
     if not folder.exists() or not any(folder.iterdir()):
         return
     if not output.overwrite:
-        raise InputError(f"--save-log: {folder} is not empty; name a new folder or add --overwrite")
-    if not (own := OwnFiles(folder, LOG)):
+        raise InputError(f"{flag}: {folder} is not empty; name a new folder or add --overwrite")
+    if not (own := OwnFiles(folder, kind)):
         raise InputError(
-            f"--save-log: {folder} is not empty and holds no log of Pipistrelle (its SHA256SUMS "
+            f"{flag}: {folder} is not empty and holds nothing of Pipistrelle (its SHA256SUMS "
             "would name it), so nothing in it was overwritten; name a new folder"
         )
-    own.check((*FILES, *truth_files.FILES))
+    own.check(names)
 
 
 def _beamwidth(mission: "Mission") -> float:
@@ -135,7 +162,7 @@ def _log(mission: "Mission", scans: "Sequence[Scan]") -> "Log":
         controls=drive.controls,
         dt=np.diff(drive.time),
         scans=tuple(scans),
-        motion="bicycle",
+        motion=drive.motion.model,
         wheelbase=drive.motion.wheelbase,
         control_std=drive.motion.control_std,
         initial_pose=(x, y, heading),

@@ -20,7 +20,7 @@ from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.hearing.listening import listen
-from pipistrelle.experiments.hearing.scenario import bicycle, draw_scenario
+from pipistrelle.experiments.hearing.scenario import draw_scenario, motion_of
 from pipistrelle.experiments.results.scores import score_path
 from pipistrelle.experiments.runs.filtering import run_filter
 from pipistrelle.experiments.runs.trial import drive_of, run_mission, run_trial, scans_of
@@ -288,7 +288,7 @@ def test_a_path_that_is_revised_is_nearer_to_the_truth():
 
 @pytest.mark.parametrize("name", ["ekf", "fastslam"])
 def test_a_filter_told_at_the_start_and_left_alone_at_the_end_keeps_what_it_knows(name):
-    motion = bicycle(Config().motion)
+    motion = motion_of(Config().motion)
     known = replace(drive(5), motion=motion)
     first = scan_with([3, 4], [0.1, -0.2], [2.0, np.nan], time=0.0)
     track = run_filter(entry(name).build(Config(), motion), known, [first], RNG(7))

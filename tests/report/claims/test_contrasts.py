@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.estimation.motion import motion_step
-from pipistrelle.experiments.hearing.scenario import bicycle
+from pipistrelle.experiments.hearing.scenario import motion_of
 from pipistrelle.report.claims.contrasts import (
     approach,
     curves,
@@ -35,7 +35,7 @@ def turning(study, **scenario):
 def test_a_lap_takes_what_the_motion_model_takes_to_turn_once(study):
     config = study.config
     controls = np.array([config.scenario.speed, config.scenario.steering])
-    pose = motion_step(bicycle(config.motion), np.zeros(3), controls, config.scenario.step)
+    pose = motion_step(motion_of(config.motion), np.zeros(3), controls, config.scenario.step)
     assert lap_time(study) == pytest.approx(2 * np.pi / pose[2] * config.scenario.step, rel=1e-9)
     assert lap_time(study) == pytest.approx(62.1, abs=0.05), "as the paper's drive: three laps"
 

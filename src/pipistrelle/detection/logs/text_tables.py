@@ -4,8 +4,10 @@ A sound file is read at once, 60,000 rows in some hundredths of a second; any ot
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -15,7 +17,7 @@ from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.refusals import refusal
 
 _LABELS = ("landmark", "subject", "barcode")
-_ABOVE_ZERO = {"range": "m", "bearing_std": "rad", "range_std": "m"}
+_ABOVE_ZERO = {"range": "m", "bearing_std": "rad", "range_std": "m", "radius": "m"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,6 +44,7 @@ def read_table(
     *,
     separator: str | None = ",",
     optional: tuple[str, ...] = (),
+    words: Mapping[str, tuple[str, ...]] = MappingProxyType({}),
 ) -> Table:
     r"""Read rows of numbers; blank lines and lines that begin with ``#`` are skipped.
 
@@ -58,6 +61,8 @@ def read_table(
     optional : names
         The columns whose fields may be empty. Those that are not among ``columns`` may follow them,
         in this order; one that the header does not hold is empty in every row.
+    words : dict of column to words
+        Columns that hold one of these words; their values are its place in the list.
 
     Returns
     -------
@@ -93,6 +98,7 @@ def read_table(
     if not content:
         expected = f"rows of {', '.join(columns)}"
         raise refusal(path, "no rows", expected, "add them")
+    content = [(i, _numbered(f"{path}, line {i}", line, columns, words)) for i, line in content]
     values = _read_at_once([text for _, text in content], len(columns), separator)
     if values is None:
         rows = [_read_row(path, columns, separator, optional, *item) for item in content]
@@ -191,6 +197,24 @@ def read_text(path: Path) -> str:
     except OSError as error:
         fix = "check the path and its permissions"
         raise refusal(path, str(error.strerror), "a readable text file", fix) from None
+
+
+def _numbered(
+    where: str, line: str, columns: tuple[str, ...], words: Mapping[str, tuple[str, ...]]
+) -> str:
+    """Put numbers for words in a row of fields between commas."""
+    fields = line.split(",") if words else []
+    if len(fields) != len(columns):
+        return line
+    for name in words:
+        place = columns.index(name) if name in columns else None
+        if place is None or not (word := fields[place].strip()):
+            continue
+        if word not in words[name]:
+            found = f"{name} {word[:80]!r}"
+            raise refusal(where, found, " or ".join(words[name]), "correct the field")
+        fields[place] = str(words[name].index(word))
+    return ",".join(fields)
 
 
 def _read_at_once(

@@ -189,7 +189,7 @@ def _emissions(
         velocities = (poses[:, :2] - scenario.path[steps - 1, :2]) / config.scenario.step
         callers = callers_at(scenario.callers, scenario.time, steps)
         emission, count = arrivals_of_emissions(
-            poses, velocities, scenario.landmarks, callers, config
+            poses, velocities, scenario.landmarks, callers, config, scenario.bodies
         )
         aimed = [
             beam(

@@ -7,15 +7,14 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of, moves
+from pipistrelle.acoustics.target import Bodies
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import Config, InputError, MotionConfig, ScenarioConfig
-from pipistrelle.estimation.motion import Motion, motion_step
+from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.drives import LabelledPoints
-
-TRIES = 2000
-"""Draws of one landmark before the request counts as impossible."""
-DENSEST = math.pi / math.sqrt(12.0)
-"""Largest share of the plane that equal discs can cover."""
+from pipistrelle.experiments.hearing.courses import course_of, driven
+from pipistrelle.experiments.hearing.fields import TRIES, landmarks_in, nearest
+from pipistrelle.experiments.hearing.worlds import ANY, World
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,6 +31,8 @@ class Scenario:
     landmarks : (n, 2) [m]
     callers : tuple of Caller
         The vehicle first; paths have a place for each of the times.
+    bodies : Bodies or None
+        Of the landmarks, where they are not as the settings have them.
     """
 
     time: Float[np.ndarray, " t"]
@@ -39,9 +40,10 @@ class Scenario:
     controls: Float[np.ndarray, "t-1 2"]
     landmarks: Float[np.ndarray, "n 2"]
     callers: tuple[Caller, ...]
+    bodies: Bodies | None = None
 
 
-def world_of(config: Config, iteration: int = 0) -> Scenario:
+def world_of(config: Config, iteration: int = 0, world: World = ANY) -> Scenario:
     """Draw one of the worlds that the settings' seed stands for.
 
     Parameters
@@ -49,6 +51,7 @@ def world_of(config: Config, iteration: int = 0) -> Scenario:
     config : Config
     iteration : int
         Number of the world.
+    world : World
 
     Returns
     -------
@@ -66,16 +69,18 @@ def world_of(config: Config, iteration: int = 0) -> Scenario:
     (True, False)
     """
     key = stream_key(config.seed, iteration, "scenario")
-    return draw_scenario(config, np.random.default_rng(key))
+    return draw_scenario(config, np.random.default_rng(key), world)
 
 
-def draw_scenario(config: Config, rng: np.random.Generator) -> Scenario:
+def draw_scenario(config: Config, rng: np.random.Generator, world: World = ANY) -> Scenario:
     """Draw a world: the path first, then the beacon and the landmarks clear of it.
 
     Parameters
     ----------
     config : Config
     rng : Generator
+    world : World
+        What it knows is not drawn.
 
     Returns
     -------
@@ -84,7 +89,7 @@ def draw_scenario(config: Config, rng: np.random.Generator) -> Scenario:
     Raises
     ------
     InputError
-        When the landmarks or the beacon find no place.
+        When the landmarks or the beacon find no place, or the world's path is too short.
 
     Notes
     -----
@@ -96,16 +101,25 @@ def draw_scenario(config: Config, rng: np.random.Generator) -> Scenario:
     >>> world.path.shape, world.landmarks.shape
     ((1501, 3), (50, 2))
     """
-    setup = config.scenario
-    controls = np.tile([setup.speed, setup.steering], (setup.steps, 1))
-    path = _drive(np.array(setup.start), controls, setup.step, config.motion, rng)
-    beacon = _place_beacon(setup, path[:, :2], rng)
+    setup, motion = config.scenario, motion_of(config.motion)
+    time = np.arange(setup.steps + 1) * setup.step
+    path, controls = driven(world.course or course_of(setup, motion), setup, motion, rng)
+    if world.callers is None:
+        callers: tuple[Caller, ...] = callers_of(config, _place_beacon(setup, path[:, :2], rng))
+    else:
+        vehicle, _ = callers_of(config, np.zeros(2))
+        callers = (vehicle, *(visitor.at(time) for visitor in world.callers))
+    landmarks = world.landmarks
+    if landmarks is None:
+        others = (np.asarray(c.place) for c in callers[VEHICLE + 1 :] if not moves(c))
+        landmarks = landmarks_in(setup, path[:, :2], np.array([*others]).reshape(-1, 2), rng)
     return Scenario(
-        time=np.arange(setup.steps + 1) * setup.step,
+        time=time,
         path=path,
         controls=controls,
-        landmarks=_place_landmarks(setup, path[:, :2], beacon, rng),
-        callers=callers_of(config, beacon),
+        landmarks=landmarks,
+        callers=callers,
+        bodies=world.bodies,
     )
 
 
@@ -176,7 +190,7 @@ def moving_labels(scenario: Scenario) -> tuple[int, ...]:
     return tuple(label for label, caller in labelled if moves(caller))
 
 
-def bicycle(motion: MotionConfig) -> Motion:
+def motion_of(motion: MotionConfig) -> Motion:
     """Return the settings' motion model, as the filters take it.
 
     Parameters
@@ -193,37 +207,15 @@ def bicycle(motion: MotionConfig) -> Motion:
 
     Examples
     --------
-    >>> bicycle(MotionConfig(speed_std=0.2)).control_std
+    >>> motion_of(MotionConfig(speed_std=0.2)).control_std
     (0.2, 0.03)
     """
+    bicycle = motion.model == "bicycle"
     return Motion(
-        model="bicycle",
-        control_std=(motion.speed_std, motion.steering_std),
+        model=motion.model,
+        control_std=(motion.speed_std, motion.steering_std if bicycle else motion.angular_rate_std),
         wheelbase=motion.wheelbase,
     )
-
-
-def _drive(
-    start: Float[np.ndarray, "3"],
-    controls: Float[np.ndarray, "k 2"],
-    dt: float,
-    motion: MotionConfig,
-    rng: np.random.Generator,
-) -> Float[np.ndarray, "t 3"]:
-    """Drive with noise on both controls (Bradley & Abaid, Eq. (5))."""
-    model = bicycle(motion)
-    noisy = controls + rng.standard_normal(controls.shape) * model.control_std
-    path = np.empty((len(controls) + 1, 3))
-    path[0] = start
-    for k, control in enumerate(noisy):
-        path[k + 1] = motion_step(model, path[k], control, dt)
-    return path
-
-
-def _distance(points: Float[np.ndarray, "n 2"], place: Float[np.ndarray, "2"]) -> float:
-    """Distance of the nearest of the points; infinite where there is none."""
-    offset = points - place
-    return math.sqrt(np.min(np.sum(offset * offset, axis=1), initial=math.inf))
 
 
 def _place_beacon(
@@ -233,48 +225,10 @@ def _place_beacon(
     for _ in range(TRIES):
         direction = rng.uniform(-math.pi, math.pi)
         beacon = setup.beacon_distance * np.array([math.cos(direction), math.sin(direction)])
-        if _distance(path, beacon) >= setup.clearance:
+        if nearest(path, beacon) >= setup.clearance:
             return beacon
     raise InputError(
         f"scenario.beacon_distance: found {setup.beacon_distance:g} m, but no bearing there is "
         f"{setup.clearance:g} m clear of the path; expected a distance away from the path, or a "
         "smaller scenario.clearance"
-    )
-
-
-def _place_landmarks(
-    setup: ScenarioConfig,
-    path: Float[np.ndarray, "k 2"],
-    beacon: Float[np.ndarray, "2"],
-    rng: np.random.Generator,
-) -> Float[np.ndarray, "n 2"]:
-    """Draw landmarks one by one, uniformly over the disc, until each keeps its distances."""
-    half = 0.5 * setup.spacing
-    most = DENSEST * ((setup.radius + half) / max(half, 1e-100)) ** 2
-    if setup.landmarks > max(most, 1.0):
-        raise _too_many(setup, f"at most {max(int(most), 1)} fit")
-    placed = np.empty((setup.landmarks, 2))
-    for i in range(setup.landmarks):
-        for _ in range(TRIES):
-            distance = setup.radius * math.sqrt(rng.uniform())
-            direction = rng.uniform(-math.pi, math.pi)
-            place = distance * np.array([math.cos(direction), math.sin(direction)])
-            if (
-                _distance(placed[:i], place) >= setup.spacing
-                and _distance(path, place) >= setup.clearance
-                and _distance(beacon[None], place) >= setup.clearance
-            ):
-                placed[i] = place
-                break
-        else:
-            raise _too_many(setup, f"room was found for {i}")
-    return placed
-
-
-def _too_many(setup: ScenarioConfig, limit: str) -> InputError:
-    """Say that the landmarks do not fit, and what to change."""
-    return InputError(
-        f"scenario.landmarks: found {setup.landmarks}, but {limit} at {setup.spacing:g} m from "
-        f"each other within {setup.radius:g} m of the centre; expected fewer landmarks, a smaller "
-        "scenario.spacing or scenario.clearance, or a larger scenario.radius"
     )

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from pydantic import BaseModel
@@ -47,6 +48,7 @@ bearings counter-clockwise from the heading. S is the sensing strategy, F the fi
 | landmarks.parquet | every hypothesis of every landmark, beside the true positions |
 | measurements.parquet | what each strategy measured; no range where it was passive |
 | mission.* | pictures |
+| worlds/ | the world that was heard, where it was one of your own |
 | SHA256SUMS | what was written here: `--overwrite` touches nothing else (`sha256sum -c`) |
 
 RMSE and NEES leave out the start; after an exact one the NEES begins where the covariance is
@@ -72,6 +74,7 @@ def write_results(
     trials: Sequence[TrialResult],
     truth: Truth,
     ignored_rows: dict[str, int],
+    beside: Mapping[str, bytes] = MappingProxyType({}),
     draw: Callable[[Path], None] = lambda _: None,
 ) -> None:
     """Write everything into a result folder, in place of earlier results.
@@ -91,6 +94,8 @@ def write_results(
         At the times of the tracks; ``truth.tum`` leaves out what is not known.
     ignored_rows : dict
         Number of dropped log rows by reason.
+    beside : dict of name to content, optional
+        Other files, relative to the folder.
     draw : callable, optional
         Given a folder to draw the pictures into.
 
@@ -130,6 +135,8 @@ def write_results(
         known = np.isfinite(truth.path).all(axis=1)
         own.write("truth.tum", tum_text(truth.time[known], truth.path[known]))
     _write_tables(own, trials, truth)
+    for name, content in beside.items():
+        own.write(name, content)
     with own.room() as room:
         draw(room)
     summary = {

@@ -13,7 +13,7 @@ from pipistrelle.config import Config, ScenarioConfig
 from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import Estimator, Gaussian
 from pipistrelle.estimation.catalogue import CATALOGUE, is_there
-from pipistrelle.experiments.hearing.scenario import bicycle
+from pipistrelle.experiments.hearing.scenario import motion_of
 from pipistrelle.experiments.machine import cores
 from pipistrelle.experiments.runs.trial import run_mission
 
@@ -55,7 +55,7 @@ def _families() -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 def _built(name: str) -> Estimator:
     """Build a filter by the defaults."""
-    return CATALOGUE[name].build(Config(), bicycle(Config().motion))
+    return CATALOGUE[name].build(Config(), motion_of(Config().motion))
 
 
 @contextmanager

@@ -4,25 +4,35 @@
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
+from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.sampling import sampling
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.snapshots import detector
 from pipistrelle.experiments.hearing.scenario import Scenario, world_of
+from pipistrelle.experiments.hearing.worlds import ANY, World
 from pipistrelle.experiments.machine import check_length, check_recording
 
 
 def prepared(
-    config: Config, *, strategies: int = 1, filters: int = 1, workers: int = 1
+    config: Config,
+    *,
+    world: World = ANY,
+    strategies: int = 1,
+    filters: int = 1,
+    workers: int = 1,
 ) -> Scenario:
     """Draw the first world of a mission's settings, when all is sound that it is heard with.
 
     Parameters
     ----------
     config : Config
+    world : World
+        What is known of it beforehand.
     strategies, filters : int
         Number of each that are kept in memory.
     workers : int
@@ -47,7 +57,7 @@ def prepared(
     pipistrelle.config.InputError: emitter.frequency: found 36000 Hz, expected a multiple of 5000 Hz
     """
     check_length(config.scenario, strategies=strategies, filters=filters, workers=workers)
-    scenario = world_of(config)
+    scenario = world_of(config, world=world)
     settled = sampling(config, scenario.callers)
     layout = square_of_four(config.receiver)
     detector(config, layout, settled.tones)
@@ -56,7 +66,7 @@ def prepared(
     return scenario
 
 
-def warnings_of(config: Config) -> tuple[str, ...]:
+def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ...]:
     r"""Tell what a receiver confuses: bearings by its spacing, tones by its sampling.
 
     Elements a distance d apart cannot tell the angle :math:`\theta` off their normal from another,
@@ -67,6 +77,8 @@ def warnings_of(config: Config) -> tuple[str, ...]:
     Parameters
     ----------
     config : Config
+    callers : sequence of Caller
+        Of the world; by default the paper's two.
 
     Returns
     -------
@@ -90,9 +102,9 @@ def warnings_of(config: Config) -> tuple[str, ...]:
     spacing, rate = config.receiver.spacing, config.receiver.sample_rate
     limit = min(config.detection.angle_limit_deg, config.detection.scan_limit_deg)
     said = []
-    for section in ("emitter", "beacon"):
-        frequency = getattr(config, section).frequency
-        tone, wave = f"{section}.frequency ({frequency:g} Hz)", config.air.celerity / frequency
+    for j, caller in enumerate(callers or callers_of(config, np.zeros(2))):
+        frequency, key = caller.frequency, "emitter" if j == VEHICLE else caller.name
+        tone, wave = f"{key}.frequency ({frequency:g} Hz)", config.air.celerity / frequency
         nearest = wave / spacing - math.sin(math.radians(limit))  # its lobe lies at the limit
         if nearest < 1.0:
             said.append(

@@ -27,10 +27,11 @@ from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.experiments.hearing.listening import Progress, listen
 from pipistrelle.experiments.hearing.scenario import (
     Scenario,
-    bicycle,
+    motion_of,
     moving_labels,
     standing_landmarks,
 )
+from pipistrelle.experiments.hearing.worlds import ANY, World
 from pipistrelle.experiments.machine import check_memory
 from pipistrelle.experiments.results.scores import (
     TrialResult,
@@ -64,6 +65,7 @@ def run_mission(
     strategies: Sequence[Strategy],
     filters: Sequence[str] = ("ekf",),
     *,
+    world: World = ANY,
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> Mission:
@@ -75,6 +77,8 @@ def run_mission(
     strategies : sequence of "active", "fused", "passive"
     filters : sequence of str
         The names of estimators.
+    world : World
+        What is known of it beforehand.
     progress, watch : callable, optional
 
     Returns
@@ -93,7 +97,8 @@ def run_mission(
     >>> len(mission.heard), len(mission.trials[0].track.time)
     (10, 41)
     """
-    scenario = prepared(config, strategies=len(strategies), filters=len(filters))
+    kept = {"strategies": len(strategies), "filters": len(filters)}
+    scenario = prepared(config, world=world, **kept)
     check_memory(
         filters,
         len(standing_landmarks(scenario)[0]),
@@ -152,7 +157,7 @@ def drive_of(scenario: Scenario, config: Config) -> Drive:
         Its true landmarks are the landmarks and then the callers that stand: the beacon is last.
     """
     return Drive(
-        motion=bicycle(config.motion),
+        motion=motion_of(config.motion),
         start=Gaussian(
             mean=scenario.path[0],
             covariance=np.diag(np.square(config.filter.initial_pose_std)),

@@ -7,13 +7,17 @@ depend on the vehicle's beam: there is one for all radii, heard beside the narro
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import product
+from types import MappingProxyType
 from typing import Any, cast
 
 from pipistrelle.config import Config, Strategy
 from pipistrelle.experiments.cases import Case
+from pipistrelle.experiments.hearing.world_folder import laid_over
+from pipistrelle.experiments.hearing.worlds import ANY, World
 from pipistrelle.settings import Given, Key, Layer, from_flags, resolve
 
 RADIUS = "emitter.radius"
+WORLD = "scenario.world"
 MOST_CASES = 2**15 - 1
 """What their numbers have room for in the tables."""
 MOST_WORLDS = 1_000_000
@@ -39,6 +43,8 @@ class Plan:
     own : dict
         Settings of one filter alone by its name, each by its dotted name; they change nothing that
         is heard.
+    worlds : dict
+        Worlds that ``scenario.world`` names, by their names.
     """
 
     name: str
@@ -48,6 +54,11 @@ class Plan:
     config: Config
     grid: Mapping[str, tuple[Any, ...]]
     own: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    worlds: Mapping[str, World] = field(default_factory=dict)
+
+    def world(self, config: Config) -> World:
+        """Return what is known beforehand of the worlds of some settings."""
+        return ANY if config.scenario.world is None else self.worlds[config.scenario.world]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,7 +102,7 @@ def cases_of(plan: Plan) -> tuple[PlannedCase, ...]:
     settled = from_flags(plan.config.model_dump(mode="json"))
     narrowest = max(plan.grid.get(RADIUS, (plan.config.emitter.radius,)))
     cases: list[PlannedCase] = []
-    for values, config in combinations(settled, plan.grid, "grid."):
+    for values, config in combinations(settled, plan.grid, "grid.", plan.worlds):
         for strategy, name in product(plan.strategies, plan.filters):
             passive = strategy == "passive" and RADIUS in values
             if passive and config.emitter.radius != narrowest:
@@ -164,12 +175,16 @@ def common(plan: Plan, values: Mapping[str, Any]) -> Config:
     0.9
     """
     settled = from_flags(plan.config.model_dump(mode="json"))
-    ((_, config),) = combinations(settled, {name: (one,) for name, one in values.items()}, "grid.")
+    grid = {name: (one,) for name, one in values.items()}
+    ((_, config),) = combinations(settled, grid, "grid.", plan.worlds)
     return config
 
 
 def combinations(
-    layer: Layer, grid: Mapping[str, tuple[Any, ...]], prefix: str
+    layer: Layer,
+    grid: Mapping[str, tuple[Any, ...]],
+    prefix: str,
+    worlds: Mapping[str, World] = MappingProxyType({}),
 ) -> Iterator[tuple[dict[str, Any], Config]]:
     """Walk through the product of a grid.
 
@@ -181,6 +196,8 @@ def combinations(
         Settings by their dotted name, with the values that each takes.
     prefix : str
         Before such a name, where a refusal says which value is wrong.
+    worlds : dict
+        Those that the grid names.
 
     Yields
     ------
@@ -206,4 +223,6 @@ def combinations(
             cast(Key, tuple(name.split("."))): Given(value, prefix + name)
             for name, value in named.items()
         }
-        yield named, resolve(layer | varied)
+        world = worlds[named[WORLD]] if WORLD in named else None
+        over = layer | varied if world is None else laid_over(world, layer, varied)
+        yield named, resolve(over)

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from hashlib import sha256
 from importlib.resources import files
 from math import prod
 from pathlib import Path
@@ -18,7 +19,20 @@ from pipistrelle.estimation.catalogue import (
     check_distinct,
     check_name,
 )
-from pipistrelle.experiments.studies.plan import MOST_CASES, MOST_WORLDS, Plan, combinations
+from pipistrelle.experiments.hearing.world_folder import (
+    WORLD_KEY,
+    named_world,
+    read_world,
+    settled,
+)
+from pipistrelle.experiments.hearing.worlds import World
+from pipistrelle.experiments.studies.plan import (
+    MOST_CASES,
+    MOST_WORLDS,
+    WORLD,
+    Plan,
+    combinations,
+)
 from pipistrelle.refusals import expectation, meant, shown
 from pipistrelle.settings import (
     Given,
@@ -135,8 +149,17 @@ def read_plan(path: Path, over: Layer | None = None, iterations: int | None = No
         key: Given(value, f"{path}: config.{name}")
         for key, name, value in _settings(path, "config", within["config"])
     }
+    if WORLD_KEY in layer and isinstance(layer[WORLD_KEY].value, str):
+        layer[WORLD_KEY] = Given(_beside(path, layer[WORLD_KEY].value), layer[WORLD_KEY].where)
     layer |= over
-    asked = list(_settings(path, "grid", within["grid"]))
+    worlds: dict[str, World] = {}
+    if (world := named_world(layer)) is not None:
+        layer = settled(world, layer) | {WORLD_KEY: Given(world.name, layer[WORLD_KEY].where)}
+        worlds[world.name] = world
+    asked = [
+        (key, name, _worlds(path, values, worlds) if key == WORLD_KEY else values)
+        for key, name, values in _settings(path, "grid", within["grid"])
+    ]
     lengths = [len(values) for _, _, values in asked if isinstance(values, list)]
     most = prod(lengths) * len(head.strategies) * len(head.filters)
     if most > MOST_CASES:
@@ -154,15 +177,41 @@ def read_plan(path: Path, over: Layer | None = None, iterations: int | None = No
         filters=head.filters,
         config=resolve(layer),
         grid=grid,
-        own=_own(path, table.get("own", {}), head.filters, grid, layer),
+        own=_own(path, table.get("own", {}), head.filters, grid, layer, worlds),
+        worlds=worlds,
     )
-    for _ in combinations(layer, grid, f"{path}: grid."):
+    for _ in combinations(layer, grid, f"{path}: grid.", worlds):
         pass
     return plan
 
 
+def _beside(path: Path, folder: str) -> str:
+    """Return the path of a folder that a file names, from where the file lies."""
+    return str(path.parent / folder)
+
+
+def _worlds(path: Path, folders: Any, known: dict[str, World]) -> Any:
+    """Read the worlds of a grid, and return their names."""
+    if not isinstance(folders, list) or not all(isinstance(one, str) for one in folders):
+        return folders  # refused with all other values
+    names = []
+    for folder in folders:
+        world = read_world(Path(_beside(path, folder)))
+        if world.files != known.setdefault(world.name, world).files:
+            raise InputError(
+                f"{path}: grid.{WORLD}: found two worlds called {world.name}; rename a folder"
+            )
+        names.append(world.name)
+    return names
+
+
 def _own(
-    path: Path, table: Any, filters: Sequence[str], grid: Mapping[str, Any], layer: Layer
+    path: Path,
+    table: Any,
+    filters: Sequence[str],
+    grid: Mapping[str, Any],
+    layer: Layer,
+    worlds: Mapping[str, World],
 ) -> dict[str, dict[str, Any]]:
     """Check the settings that are one filter's own: none of them changes what is heard."""
     if not isinstance(table, dict) or not all(isinstance(mine, dict) for mine in table.values()):
@@ -183,7 +232,7 @@ def _own(
             given[key] = Given(value, f"{where}.{setting}")
         if not given:
             continue
-        for _ in combinations(layer | given, grid, f"{path}: grid."):
+        for _ in combinations(layer | given, grid, f"{path}: grid.", worlds):
             pass
         settled: Any = resolve(layer | given).model_dump(mode="json")
         own[name] = {".".join(key): settled[key[0]][key[1]] for key in given}
@@ -235,6 +284,7 @@ def changed_settings(there: Plan, asked: Plan) -> list[str]:
     old, new = (
         {".".join(key): value for key, value in leaves(_as_table(plan))}
         | {"config.air.speed_of_sound": plan.config.air.celerity}  # given or not
+        | {f"worlds/{name}": _digest(world) for name, world in plan.worlds.items()}
         for plan in (there, asked)
     )
     return [
@@ -242,6 +292,14 @@ def changed_settings(there: Plan, asked: Plan) -> list[str]:
         for name in dict.fromkeys((*old, *new))
         if name != "iterations" and (name not in old or name not in new or old[name] != new[name])
     ]
+
+
+def _digest(world: World) -> str:
+    """Return some letters that stand for what a world's folder holds."""
+    told = sha256()
+    for name in sorted(world.files):
+        told.update(f"{name}\n{len(world.files[name])}\n".encode() + world.files[name])
+    return told.hexdigest()[:16]
 
 
 def _worded(table: Mapping[str, Any], name: str) -> str:
@@ -254,6 +312,11 @@ def _as_table(plan: Plan) -> dict[str, Any]:
     layer = from_flags(plan.config.model_dump(mode="json"))
     kept = {key: layer[key] for key in layer if ".".join(key) not in plan.grid}
     own = {name: dict(settings) for name, settings in plan.own.items()}
+    if plan.config.scenario.world is not None:
+        kept[WORLD_KEY] = Given(f"worlds/{plan.config.scenario.world}", "")
+    grid = {name: list(values) for name, values in plan.grid.items()}
+    if WORLD in grid:
+        grid[WORLD] = [f"worlds/{name}" for name in grid[WORLD]]
     return {
         "format": FORMAT,
         "name": plan.name,
@@ -261,7 +324,7 @@ def _as_table(plan: Plan) -> dict[str, Any]:
         "strategies": list(plan.strategies),
         "filters": list(plan.filters),
         "config": resolve(kept).model_dump(mode="json", exclude_none=True),
-        "grid": {name: list(values) for name, values in plan.grid.items()},
+        "grid": grid,
         **({"own": own} if own else {}),
     }
 

@@ -14,6 +14,7 @@ from uuid import uuid4
 
 from pipistrelle import __version__
 from pipistrelle.config import InputError
+from pipistrelle.experiments.hearing.world_folder import kept_world
 from pipistrelle.experiments.studies.plan import Plan
 from pipistrelle.experiments.studies.plan_file import changed_settings, plan_text, read_plan
 from pipistrelle.experiments.studies.world import world_schemas
@@ -42,6 +43,7 @@ radians; what ends in _deg is in degrees.
 |---|---|
 | plan.toml | what is tried: every setting, and the grid of those that vary |
 | config.toml | the settings alone |
+| worlds/ | worlds of one's own that the plan names |
 | trials/ | one row per case: the scores, or the error of a trial that failed |
 | steps/ | errors and NEES at each frame (frame 1 is the first call; the start has no row) |
 | landmarks/ | the final map: is a landmark fully initialised, and how far off is it |
@@ -97,7 +99,9 @@ def open_store(folder: Path, plan: Plan) -> None:
         seen = list(folder.iterdir())
         there = read_plan(kept) if kept.exists() else None
         left = [path for path in seen if _LEFT.fullmatch(path.name)]
-        _refuse_strange(folder, there, [path.name for path in seen if path not in left])
+        kept_first = [folder / "worlds"]  # a plan names what must be there
+        strange = [path.name for path in seen if path not in [*left, *kept_first]]
+        _refuse_strange(folder, there, strange)
         if there is not None and (found := changed_settings(there, plan)):
             told = "".join(f"\n  {line}" for line in found)
             raise InputError(
@@ -109,9 +113,13 @@ def open_store(folder: Path, plan: Plan) -> None:
                     f"{kept}: was changed since Pipistrelle wrote it, so it is not replaced; "
                     f"set iterations = {plan.iterations} in it"
                 )
+            _keep_worlds(folder, plan)
             _put(kept, plan_text(plan))
         readme = README.format(name=plan.name, version=__version__)
-        for name, text in (("config.toml", to_toml(plan.config)), ("README.md", readme)):
+        config = plan.config
+        if config.scenario.world is not None:
+            config, _ = kept_world(config, plan.world(config))
+        for name, text in (("config.toml", to_toml(config)), ("README.md", readme)):
             if not (folder / name).exists():
                 _put(folder / name, text)
         for table in TABLES:
@@ -121,6 +129,20 @@ def open_store(folder: Path, plan: Plan) -> None:
             path.unlink(missing_ok=True)
     except OSError as error:
         raise unusable(folder, error) from error
+
+
+def _keep_worlds(folder: Path, plan: Plan) -> None:
+    """Copy the worlds that a plan names into its folder."""
+    for world in plan.worlds.values():
+        _, files = kept_world(plan.config, world)
+        for name, content in files.items():
+            path = folder / name
+            if path.exists() and path.read_bytes() != content:
+                raise InputError(
+                    f"{path}: is not the world that is asked for; name a new folder with -o DIR"
+                )
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(path, content, writer=f".{uuid4().hex[:8]}")
 
 
 def _refuse_strange(folder: Path, there: Plan | None, strange: Sequence[str]) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from pipistrelle.config import InputError
 from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.estimation.outside import look_in
-from pipistrelle.experiments.hearing.scenario import bicycle, standing_landmarks
+from pipistrelle.experiments.hearing.scenario import motion_of, standing_landmarks
 from pipistrelle.experiments.machine import check_memory, keep_freed_memory
 from pipistrelle.experiments.runs.checking import check_filters
 from pipistrelle.experiments.runs.preparing import prepared, warnings_of
@@ -190,12 +190,14 @@ def check_cases(plan: Plan, workers: int) -> None:
     """
     for cases in heard_together(plan):
         with _named(cases[0]):
-            here = len(standing_landmarks(prepared(cases[0].config, workers=workers))[0])
+            config = cases[0].config
+            scenario = prepared(config, world=plan.world(config), workers=workers)
+            here = len(standing_landmarks(scenario)[0])
         for case in cases:
             heard = {"passive": case.strategy != "active", "workers": workers}
             with _named(case):
                 check_memory([case.filter], here, case.config, **heard)
-                check_filters([case.filter], bicycle(case.config.motion), case.config)
+                check_filters([case.filter], motion_of(case.config.motion), case.config)
 
 
 @contextmanager

@@ -33,10 +33,11 @@ from pipistrelle.evaluation.consistency import track_nees
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import (
     Scenario,
-    bicycle,
+    motion_of,
     standing_landmarks,
     world_of,
 )
+from pipistrelle.experiments.hearing.worlds import World
 from pipistrelle.experiments.results.scores import PathScores, Scores, with_bound
 from pipistrelle.experiments.runs.checking import first_belief
 from pipistrelle.experiments.runs.trial import drive_of, run_trial, scans_of
@@ -121,7 +122,11 @@ def run_world(plan: Plan, iteration: int) -> tuple[TrialRecord, ...]:
     >>> [record.steps.shape for record in run_world(plan, 0)]
     [(2, 5)]
     """
-    records = [record for cases in heard_together(plan) for record in _run_cases(cases, iteration)]
+    records = [
+        record
+        for cases in heard_together(plan)
+        for record in _run_cases(cases, iteration, plan.world(cases[0].config))
+    ]
     return tuple(sorted(records, key=lambda record: record.case.number))
 
 
@@ -255,7 +260,7 @@ def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
 
 def _online_columns(plan: Plan) -> tuple[str, ...]:
     """Name the columns that a plan has only if one of its filters revises its path."""
-    motion = bicycle(plan.config.motion)
+    motion = motion_of(plan.config.motion)
     for name in plan.filters:
         if isinstance(first_belief(name, motion, plan.config), Trajectory):
             return tuple(f"online_{score}" for score in ONLINE)
@@ -269,12 +274,12 @@ def _heard_settings(case: PlannedCase) -> str:
     return json.dumps(settings)
 
 
-def _run_cases(cases: Sequence[PlannedCase], iteration: int) -> list[TrialRecord]:
+def _run_cases(cases: Sequence[PlannedCase], iteration: int, world: World) -> list[TrialRecord]:
     """Draw and hear a world for cases that share it, and try each."""
     config = cases[0].config
     radii = sorted({case.config.emitter.radius for case in cases})
     try:
-        scenario = world_of(config, iteration)
+        scenario = world_of(config, iteration, world)
         heard = listen(scenario, config, radii, iteration=iteration)
     except Exception as failure:
         _let_interruptions_pass(failure)
@@ -324,7 +329,7 @@ class _Shared:
     ) -> Float[np.ndarray, "t 3 3"]:
         """Work out the bound of the pose at every step."""
         scans, world = self._scans_of(radius, strategy, noise), self.scenario
-        truth, motion = (world.path, standing_landmarks(world)), bicycle(self._config.motion)
+        truth, motion = (world.path, standing_landmarks(world)), motion_of(self._config.motion)
         return pose_bound(motion, world.controls, world.time, *truth, scans)
 
 

@@ -1,0 +1,349 @@
+r"""Where the vehicle is sent: by controls, by way-points that a driver steers for, or along poses.
+
+The paper's course is a circle of constant controls, driven blindly. A vehicle on any other shape
+would lose it within a round, so a driver who sees where the vehicle is steers for a point a little
+ahead on the line through the way-points (pure pursuit): by the angle off the heading,
+:math:`\gamma = \varphi`, for a front wheel, along the arc through the point, :math:`\omega = 2 V
+\sin\varphi / \ell`, for a unicycle. Noise is added to what he commands; what he commands is what
+the filters know.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.config import InputError, ScenarioConfig
+from pipistrelle.estimation.motion import Motion, motion_step
+from pipistrelle.geometry import wrap, wrap_angle
+
+AHEAD = 1.0
+"""How far ahead of the vehicle the driver aims [m]."""
+LOCK = 0.6
+"""Largest angle to which he turns a front wheel [rad]."""
+SLACK = 1e-6
+"""By how much two times may differ that are one, in steps or seconds."""
+EIGHT = 96
+"""Way-points of a figure of eight."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Commands:
+    """What is commanded, whatever comes of it; the vehicle starts where the settings say.
+
+    Attributes
+    ----------
+    time : (n) [s]
+        Since the start, rising: a row holds until the next one's, the last only ends the drive.
+    rows : (n, 2)
+        Speed [m/s], and steering angle [rad] of a bicycle or angular rate [rad/s] of a unicycle.
+    """
+
+    time: Float[np.ndarray, " n"]
+    rows: Float[np.ndarray, "n 2"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Waypoints:
+    """A line through points, and from the last to the first as often as there is time.
+
+    Attributes
+    ----------
+    points : (n, 2) [m]
+        At least two; the vehicle starts at the first.
+    """
+
+    points: Float[np.ndarray, "n 2"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Poses:
+    """Where the vehicle is, and what its filters are told that it was commanded.
+
+    Attributes
+    ----------
+    time : (n) [s]
+        Since the start, rising; poses in between are interpolated.
+    path : (n, 3) [m, m, rad]
+    commands : Commands or None
+        None: what would have led along the path, less noise.
+    """
+
+    time: Float[np.ndarray, " n"]
+    path: Float[np.ndarray, "n 3"]
+    commands: Commands | None = None
+
+
+Course = Commands | Waypoints | Poses
+
+
+def course_of(setup: ScenarioConfig, motion: Motion) -> Course:
+    """Return the course that the settings name.
+
+    Parameters
+    ----------
+    setup : ScenarioConfig
+    motion : Motion
+
+    Returns
+    -------
+    Course
+        Of a circle its constant controls; a unicycle turns as the bicycle of its wheelbase does.
+
+    Notes
+    -----
+    Bradley & Abaid, Sec. IV: the circle.
+
+    Examples
+    --------
+    >>> unicycle = Motion(model="unicycle", control_std=(0.1, 0.1))
+    >>> course_of(ScenarioConfig(course="corridor", extent=9.0, lane=4.0), unicycle).points
+    array([[-9., -1.],
+           [ 9., -1.],
+           [ 9.,  1.],
+           [-9.,  1.]])
+    """
+    a = setup.extent
+    if setup.course == "eight":
+        t = np.linspace(0.0, 2.0 * np.pi, EIGHT, endpoint=False)
+        return Waypoints(points=a * np.column_stack((np.sin(t), np.sin(t) * np.cos(t))))
+    if setup.course == "corridor":
+        side = 0.25 * setup.lane
+        return Waypoints(points=np.array([[-a, -side], [a, -side], [a, side], [-a, side]]))
+    if setup.course == "lawn-mower":
+        return Waypoints(points=_lanes(a, setup.lane))
+    turn = setup.steering
+    if motion.model == "unicycle":
+        turn = setup.speed * math.sin(setup.steering) / motion.wheelbase
+    always = np.array([[setup.speed, turn], [0.0, 0.0]])
+    return Commands(time=np.array([0.0, math.inf]), rows=always)
+
+
+def steps_of(course: Course, setup: ScenarioConfig) -> int:
+    """Count the control steps of a course that ends somewhere.
+
+    Parameters
+    ----------
+    course : Course
+    setup : ScenarioConfig
+        Its step, and the speed between way-points.
+
+    Returns
+    -------
+    int
+        Of way-points as many as the line takes, from the first to the last.
+
+    Raises
+    ------
+    InputError
+        Way-points without a speed.
+
+    Examples
+    --------
+    >>> steps_of(Waypoints(points=np.array([[0.0, 0.0], [7.5, 0.0]])), ScenarioConfig())
+    80
+    """
+    if isinstance(course, Waypoints):
+        _check_speed(setup)
+        seconds = float(np.hypot(*np.diff(course.points, axis=0).T).sum()) / setup.speed
+        return max(math.ceil(seconds / setup.step - SLACK), 1)
+    return math.floor(float(course.time[-1]) / setup.step + SLACK)
+
+
+def driven(
+    course: Course, setup: ScenarioConfig, motion: Motion, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 2"]]:
+    """Drive a course, with noise on both controls.
+
+    Parameters
+    ----------
+    course : Course
+    setup : ScenarioConfig
+        Its steps, their length, and the speed between way-points.
+    motion : Motion
+    rng : Generator
+
+    Returns
+    -------
+    path : (k + 1, 3) [m, m, rad]
+        True poses, the start first.
+    controls : (k, 2)
+        As the filters know them.
+
+    Raises
+    ------
+    InputError
+        Way-points without a speed, or a course that ends before the drive.
+
+    Notes
+    -----
+    Bradley & Abaid, Eq. (5).
+
+    Examples
+    --------
+    Straight on without noise, then round the first corner of a corridor:
+
+    >>> still = Motion(model="unicycle", control_std=(0.0, 0.0))
+    >>> setup = ScenarioConfig(course="corridor", extent=3.0, steps=80)
+    >>> path, _ = driven(course_of(setup, still), setup, still, np.random.default_rng(7))
+    >>> path[16].round(3), path[-1, :2].round(1)
+    (array([-1.5, -1. ,  0. ]), array([3. , 0.2]))
+    """
+    if not isinstance(course, Waypoints):
+        _check_length(course, setup)
+    time = np.arange(setup.steps + 1) * setup.step
+    if isinstance(course, Poses):
+        path = _poses_at(time, course)
+        if course.commands is not None:
+            return path, _held(time, course.commands)
+        return path, controls_between(path, setup.step, motion) - _noise(setup, motion, rng)
+    noise = _noise(setup, motion, rng)
+    if isinstance(course, Waypoints):
+        return _steered(course.points, noise, setup, motion)
+    controls, path = _held(time, course), np.empty((setup.steps + 1, 3))
+    path[0] = setup.start
+    for k, control in enumerate(controls + noise):
+        path[k + 1] = motion_step(motion, path[k], control, setup.step)
+    return path, controls
+
+
+def controls_between(
+    path: Float[np.ndarray, "t 3"], dt: float, motion: Motion
+) -> Float[np.ndarray, "t-1 2"]:
+    r"""Controls that lead from each pose to the next, as nearly as the motion model can.
+
+    A unicycle's arc has the turn of the heading, and a bicycle's front wheel the steering angle
+    that makes it, :math:`\sin\gamma = B \Delta\theta / (V \Delta_t)`; the speed is that along the
+    arc's chord, or the wheel's way. What the poses move sideways is lost.
+
+    Parameters
+    ----------
+    path : (k + 1, 3) [m, m, rad]
+    dt : [s]
+    motion : Motion
+
+    Returns
+    -------
+    (k, 2)
+
+    Examples
+    --------
+    >>> motion = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
+    >>> there = motion_step(motion, np.zeros(3), np.array([0.75, 0.1]), 0.125)
+    >>> controls_between(np.array([np.zeros(3), there]), 0.125, motion).round(9)
+    array([[0.75, 0.1 ]])
+    """
+    moved, turned = np.diff(path[:, :2], axis=0), wrap(np.diff(path[:, 2]))
+    if motion.model == "unicycle":
+        ahead = path[:-1, 2] + 0.5 * turned
+        along = moved[:, 0] * np.cos(ahead) + moved[:, 1] * np.sin(ahead)
+        return np.column_stack((along / dt / np.sinc(turned / (2.0 * np.pi)), turned / dt))
+    way = np.hypot(*moved.T)
+    forwards = moved[:, 0] * np.cos(path[:-1, 2]) + moved[:, 1] * np.sin(path[:-1, 2]) >= 0.0
+    way = np.where(forwards, way, -way)
+    sine = np.divide(motion.wheelbase * turned, way, out=np.zeros_like(way), where=way != 0.0)
+    return np.column_stack((way / dt, np.arcsin(np.clip(sine, -1.0, 1.0))))
+
+
+def _lanes(extent: float, lane: float) -> Float[np.ndarray, "n 2"]:
+    """Return the corners of lanes to and fro, from one side of a square to the other."""
+    across = np.arange(-extent, extent + 0.5 * lane, lane)
+    ends = np.tile([[-extent, extent], [extent, -extent]], (len(across), 1))[: len(across)]
+    return np.column_stack((ends.ravel(), np.repeat(across, 2)))
+
+
+def _noise(
+    setup: ScenarioConfig, motion: Motion, rng: np.random.Generator
+) -> Float[np.ndarray, "k 2"]:
+    """Draw the noise on both controls."""
+    return rng.standard_normal((setup.steps, 2)) * motion.control_std
+
+
+def _held(time: Float[np.ndarray, " t"], commands: Commands) -> Float[np.ndarray, "t-1 2"]:
+    """Return what is commanded at the start of each step."""
+    rows = np.searchsorted(commands.time, time[:-1] + SLACK, side="right") - 1
+    return commands.rows[rows]
+
+
+def _poses_at(time: Float[np.ndarray, " t"], course: Poses) -> Float[np.ndarray, "t 3"]:
+    """Return the poses at some times: to the bit, where they are those of the course."""
+    if np.array_equal(time, course.time[: len(time)]):
+        return course.path[: len(time)].copy()
+    columns = (*course.path.T[:2], np.unwrap(course.path[:, 2]))
+    path = np.column_stack([np.interp(time, course.time, column) for column in columns])
+    path[:, 2] = wrap(path[:, 2])
+    return path
+
+
+def _steered(
+    points: Float[np.ndarray, "n 2"],
+    noise: Float[np.ndarray, "k 2"],
+    setup: ScenarioConfig,
+    motion: Motion,
+) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "k 2"]]:
+    """Steer for a point that stays ahead on the closed line through the way-points."""
+    _check_speed(setup)
+    line = np.vstack((points, points[:1]))
+    along = np.append(0.0, np.hypot(*np.diff(line, axis=0).T).cumsum())
+    x, y = points[0].tolist()
+    dx, dy = (points[1] - points[0]).tolist()
+    path, controls = np.empty((len(noise) + 1, 3)), np.empty((len(noise), 2))
+    path[0], aim = (x, y, wrap_angle(math.atan2(dy, dx))), 0.0
+    for k, off in enumerate(noise):
+        aim = _ahead(path[k], aim, line, along)
+        controls[k] = _towards(path[k], _at(aim, line, along), setup.speed, motion)
+        path[k + 1] = motion_step(motion, path[k], controls[k] + off, setup.step)
+    return path, controls
+
+
+def _ahead(
+    pose: Float[np.ndarray, "3"],
+    aim: float,
+    line: Float[np.ndarray, "n 2"],
+    along: Float[np.ndarray, " n"],
+) -> float:
+    """Move the aim on along a line until it is far enough ahead, or a round further [m]."""
+    for _ in range(math.ceil(10.0 * along[-1] / AHEAD)):
+        x, y = _at(aim, line, along)
+        if math.hypot(x - pose[0], y - pose[1]) >= AHEAD:
+            break
+        aim += 0.1 * AHEAD
+    return aim
+
+
+def _at(
+    aim: float, line: Float[np.ndarray, "n 2"], along: Float[np.ndarray, " n"]
+) -> tuple[float, float]:
+    """Return the point so far along a closed line."""
+    here = aim % along[-1]
+    return float(np.interp(here, along, line[:, 0])), float(np.interp(here, along, line[:, 1]))
+
+
+def _towards(
+    pose: Float[np.ndarray, "3"], point: tuple[float, float], speed: float, motion: Motion
+) -> tuple[float, float]:
+    """Return the controls that bring the vehicle to a point ahead, as far as they can."""
+    off = wrap_angle(math.atan2(point[1] - pose[1], point[0] - pose[0]) - pose[2])
+    if motion.model == "bicycle":
+        return speed, min(max(off, -LOCK), LOCK)
+    off = min(max(off, -0.5 * math.pi), 0.5 * math.pi)
+    return speed, 2.0 * speed * math.sin(off) / AHEAD
+
+
+def _check_speed(setup: ScenarioConfig) -> None:
+    """Refuse a vehicle that drives nowhere."""
+    if setup.speed <= 0.0:
+        raise InputError(
+            f"scenario.speed: found {setup.speed:g} m/s, expected more than 0 to drive between "
+            "way-points; correct it"
+        )
+
+
+def _check_length(course: Commands | Poses, setup: ScenarioConfig) -> None:
+    """Refuse a course that ends before the drive."""
+    if course.time[-1] < setup.steps * setup.step - SLACK:
+        raise InputError(
+            f"scenario.steps: found {setup.steps}, but the path of {setup.world} ends after "
+            f"{steps_of(course, setup)} steps of {setup.step:g} s; expected as many, or fewer"
+        )

@@ -1,0 +1,159 @@
+"""How landmarks lie: over the paper's disc, in the rows of an orchard, at the corners of rooms."""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.config import InputError, ScenarioConfig
+
+TRIES = 2000
+"""Draws of one landmark before the request counts as impossible."""
+DENSEST = math.pi / math.sqrt(12.0)
+"""Largest share of the plane that equal discs can cover."""
+OFF = 0.1
+"""Of its distance to the next, how far a tree may stand off its row, or along it."""
+ROOM = (0.75, 1.5)
+"""Width and depth of rooms, in widths of the corridor: drawn between these."""
+
+Points = Float[np.ndarray, "n 2"]
+
+
+def landmarks_in(
+    setup: ScenarioConfig, path: Points, callers: Points, rng: np.random.Generator
+) -> Points:
+    """Draw the landmarks of a world, clear of what is there already.
+
+    Parameters
+    ----------
+    setup : ScenarioConfig
+    path : (k, 2) [m]
+        Of the vehicle.
+    callers : (m, 2) [m]
+        That stand.
+    rng : Generator
+
+    Returns
+    -------
+    (n, 2) [m]
+        Of an orchard or of rooms those nearest the centre, from there on.
+
+    Raises
+    ------
+    InputError
+        When they find no place.
+
+    Notes
+    -----
+    Bradley & Abaid, Sec. IV: the disc.
+
+    Examples
+    --------
+    >>> setup, nowhere = ScenarioConfig(field="rows", lane=4.0, landmarks=8), np.empty((0, 2))
+    >>> trees = landmarks_in(setup, nowhere, nowhere, np.random.default_rng(7))
+    >>> np.unique(np.rint(trees[:, 1]))
+    array([-2.,  2.])
+    """
+    _refuse_crowd(setup)
+    if setup.field == "disc":
+        return _scattered(setup, path, callers, rng)
+    grown = _rows(setup, rng) if setup.field == "rows" else _corners(setup, rng)
+    places = np.array([place for place in grown if math.hypot(*place) <= setup.radius])
+    placed = np.empty((0, 2))
+    for place in places[np.argsort(np.hypot(*places.reshape(-1, 2).T), kind="stable")]:
+        if len(placed) == setup.landmarks:
+            break
+        if _is_clear(place, setup, path, callers) and nearest(placed, place) >= setup.clearance:
+            placed = np.vstack((placed, place))
+    if len(placed) < setup.landmarks:
+        raise _too_many(setup, f"room was found for {len(placed)}")
+    return placed
+
+
+def nearest(points: Points, place: Float[np.ndarray, "2"]) -> float:
+    """Return the distance of the nearest of the points [m]; infinite where there is none.
+
+    Parameters
+    ----------
+    points : (n, 2) [m]
+    place : (2) [m]
+
+    Returns
+    -------
+    float
+    """
+    offset = points - place
+    return math.sqrt(np.min(np.sum(offset * offset, axis=1), initial=math.inf))
+
+
+def _scattered(
+    setup: ScenarioConfig, path: Points, callers: Points, rng: np.random.Generator
+) -> Points:
+    """Draw landmarks one by one, uniformly over the disc, until each keeps its distances."""
+    placed = np.empty((setup.landmarks, 2))
+    for i in range(setup.landmarks):
+        for _ in range(TRIES):
+            distance = setup.radius * math.sqrt(rng.uniform())
+            direction = rng.uniform(-math.pi, math.pi)
+            place = distance * np.array([math.cos(direction), math.sin(direction)])
+            apart = nearest(placed[:i], place) >= setup.spacing
+            if apart and _is_clear(place, setup, path, callers):
+                placed[i] = place
+                break
+        else:
+            raise _too_many(setup, f"room was found for {i}")
+    return placed
+
+
+def _rows(setup: ScenarioConfig, rng: np.random.Generator) -> Iterator[tuple[float, float]]:
+    """Plant trees in rows along x, half a lane beside the lanes of a lawn-mower."""
+    if setup.spacing == 0.0:
+        raise InputError(
+            "scenario.spacing: found 0, expected the distance of two trees of a row [m]"
+        )
+    first = math.ceil((setup.radius - setup.extent) / setup.lane)
+    across = np.arange(-setup.extent - (first - 0.5) * setup.lane, setup.radius, setup.lane)
+    along = np.arange(-setup.radius, setup.radius, setup.spacing) + rng.uniform() * setup.spacing
+    for y in across.tolist():
+        for x in along.tolist():
+            off = OFF * setup.spacing * rng.uniform(-1.0, 1.0, 2)
+            yield x + off[0], y + off[1]
+
+
+def _corners(setup: ScenarioConfig, rng: np.random.Generator) -> Iterator[tuple[float, float]]:
+    """Build rooms on both sides of a corridor along x, and name their corners."""
+    for side in (-1.0, 1.0):
+        x, wall = -setup.radius, 0.5 * side * setup.lane
+        while x < setup.radius:
+            width, depth = setup.lane * rng.uniform(*ROOM, 2)
+            yield from ((x, wall), (x, wall + side * depth), (x + width, wall + side * depth))
+            x += width
+
+
+def _is_clear(
+    place: tuple[float, float] | Float[np.ndarray, "2"],
+    setup: ScenarioConfig,
+    path: Points,
+    callers: Points,
+) -> bool:
+    """Tell whether a place is clear of the path and of all callers."""
+    at, least = np.asarray(place), setup.clearance
+    return nearest(path, at) >= least and nearest(callers, at) >= least
+
+
+def _refuse_crowd(setup: ScenarioConfig) -> None:
+    """Refuse what no drawing could place."""
+    half = 0.5 * setup.spacing
+    most = DENSEST * ((setup.radius + half) / max(half, 1e-100)) ** 2
+    if setup.field == "disc" and setup.landmarks > max(most, 1.0):
+        raise _too_many(setup, f"at most {max(int(most), 1)} fit")
+
+
+def _too_many(setup: ScenarioConfig, limit: str) -> InputError:
+    """Say that the landmarks do not fit, and what to change."""
+    return InputError(
+        f"scenario.landmarks: found {setup.landmarks}, but {limit} at {setup.spacing:g} m from "
+        f"each other within {setup.radius:g} m of the centre; expected fewer landmarks, a smaller "
+        "scenario.spacing or scenario.clearance, or a larger scenario.radius"
+    )

@@ -1,0 +1,457 @@
+"""Worlds as folders: text files that say what is known of a world, read and written.
+
+``world.toml`` holds settings and callers, ``landmarks.csv`` the landmarks, ``path.csv`` the way of
+the vehicle; each may be left out, and what it would say is drawn. What a file is wrong in is
+refused by line or key.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import ConfigDict, Field, ValidationError
+
+from pipistrelle.acoustics.callers import VEHICLE, Caller, moves
+from pipistrelle.acoustics.target import Bodies
+from pipistrelle.config import (
+    Config,
+    InputError,
+    Level,
+    Positive,
+    Real,
+    Section,
+    TargetConfig,
+)
+from pipistrelle.detection.logs.text_tables import (
+    Table,
+    check_unique,
+    read_table,
+    read_text,
+    table_text,
+)
+from pipistrelle.estimation.catalogue import SECTIONS
+from pipistrelle.experiments.hearing.courses import Commands, Course, Poses, Waypoints, steps_of
+from pipistrelle.experiments.hearing.scenario import Scenario
+from pipistrelle.experiments.hearing.worlds import Visitor, World
+from pipistrelle.files import WORLD, OwnFiles
+from pipistrelle.refusals import expectation, refusal, shown
+from pipistrelle.settings import Given, Key, Layer, from_table, parse_toml, resolve
+
+WORLD_KEY: Key = ("scenario", "world")
+_COUNT: Key = ("scenario", "landmarks")
+_STEPS: Key = ("scenario", "steps")
+FILES = ("world.toml", "landmarks.csv", "path.csv")
+"""What a world may consist of, beside the routes of its callers."""
+_CONTROLS = {"bicycle": ("speed", "steering"), "unicycle": ("velocity", "angular_rate")}
+_POSE = ("time", "x", "y", "heading")
+_HEADERS = {
+    ("x", "y"): "way-points",
+    _POSE: "poses",
+    **{("time", *names): "controls" for names in _CONTROLS.values()},
+    **{(*_POSE, *names): "poses and controls" for names in _CONTROLS.values()},
+}
+"""What a path's columns say of it."""
+_SHAPES = ("cylinder", "sphere")
+_README = """\
+A world of Pipistrelle. Hear it with: pipistrelle run --world FOLDER
+
+world.toml      settings that belong to the world ([config]), and who calls ([[callers]])
+landmarks.csv   landmark,x,y and perhaps radius,shape [m]; numbered from 1
+path.csv        the vehicle's way: x,y (way-points), time,{controls} (controls), or
+                time,x,y,heading (poses), perhaps with the controls behind
+SHA256SUMS      what was written here: nothing else is ever overwritten
+
+Each file may be left out: what it would say is drawn, by --seed. Where the controls follow the
+poses nothing of the path is drawn; take the two columns away, and the noise on them is.
+"""
+
+
+class _CallerTable(Section):
+    model_config = ConfigDict(strict=True)
+
+    name: Annotated[str, Field(pattern=r"^\w[\w-]*$")] | None = None
+    frequency: Positive
+    level_db: Level
+    place: Annotated[tuple[Real, Real], Field(strict=False)] | None = None
+    route: str | None = None
+
+
+class _WorldTable(Section):
+    model_config = ConfigDict(strict=True)
+
+    format: Literal[1]
+    config: dict[str, Any] = Field(default_factory=dict)
+    callers: Annotated[tuple[_CallerTable, ...], Field(strict=False)] | None = None
+
+
+def named_world(layer: Layer) -> World | None:
+    """Read the world that settings name.
+
+    Parameters
+    ----------
+    layer : Layer
+
+    Returns
+    -------
+    World or None
+        None where they name none.
+
+    Raises
+    ------
+    InputError
+        As `read_world`.
+    """
+    given = layer.get(WORLD_KEY)
+    return None if given is None or given.value is None else read_world(Path(str(given.value)))
+
+
+def settled(world: World, layer: Layer) -> Layer:
+    """Lay a world's settings beneath others.
+
+    Parameters
+    ----------
+    world : World
+    layer : Layer
+
+    Returns
+    -------
+    Layer
+        With the number of its landmarks, and of the steps that its path takes unless that is given.
+
+    Raises
+    ------
+    InputError
+        Where the layer says otherwise than the world.
+    """
+    beneath = world.settings | _decided(world, layer) | layer
+    if world.course is not None and _STEPS not in beneath:
+        steps = steps_of(world.course, resolve(beneath).scenario)
+        beneath[_STEPS] = Given(steps, f"{world.name}: path.csv")
+    return beneath
+
+
+def laid_over(world: World, layer: Layer, values: Layer) -> Layer:
+    """Lay a world's settings over others, as one value of a grid.
+
+    Parameters
+    ----------
+    world : World
+    layer : Layer
+        Settings that hold where neither the world nor the values say anything else.
+    values : Layer
+        Of the rest of the grid.
+
+    Returns
+    -------
+    Layer
+        The drive ends with the world's path, if that is shorter.
+
+    Raises
+    ------
+    InputError
+        Where the values say otherwise than the world.
+    """
+    over = layer | world.settings | _decided(world, values) | values
+    if isinstance(world.course, Commands | Poses):
+        setup = resolve(over).scenario
+        steps = min(setup.steps, steps_of(world.course, setup))
+        over[_STEPS] = Given(steps, f"{world.name}: path.csv")
+    return over
+
+
+def _decided(world: World, layer: Layer) -> Layer:
+    """Return the settings in which a world leaves no choice; refuse a layer that makes one."""
+    decided: Layer = {}
+    if world.landmarks is not None:
+        decided[_COUNT] = Given(len(world.landmarks), f"{world.name}: landmarks.csv")
+    for key, told in decided.items():
+        if key in layer and layer[key].value != told.value:
+            raise InputError(
+                f"{layer[key].where}: found {shown(layer[key].value)}, but the world's "
+                f"landmarks.csv has {told.value}; leave it out"
+            )
+    return decided
+
+
+def read_world(folder: Path) -> World:
+    r"""Read what a folder says of a world.
+
+    Parameters
+    ----------
+    folder : Path
+
+    Returns
+    -------
+    World
+        Named as the folder.
+
+    Raises
+    ------
+    InputError
+        With the file and the line or key, what was found, what was expected and the fix.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as place:
+    ...     _ = (Path(place) / "landmarks.csv").write_text("landmark,x,y\n1,2.5,0\n2,-1,4\n")
+    ...     _ = (Path(place) / "path.csv").write_text("x,y\n-5,0\n5,0\n5,5\n")
+    ...     world = read_world(Path(place))
+    >>> world.landmarks[1], world.course.points.shape, world.callers
+    (array([-1.,  4.]), (3, 2), None)
+    """
+    if not folder.is_dir():
+        found = "a file" if folder.exists() else "no such folder"
+        raise refusal(folder, found, f"a folder with {', '.join(FILES)}", "name a world's folder")
+    there = [name for name in FILES if (folder / name).exists()]
+    if not there:
+        expected = f"one of {', '.join(FILES)}, or several"
+        raise refusal(folder, "none of its files", expected, "see `pipistrelle run --save-world`")
+    table = _read_head(folder / "world.toml") if "world.toml" in there else _WorldTable(format=1)
+    settings = from_table(table.config, f"{folder / 'world.toml'}: ", "config.")
+    if WORLD_KEY in settings:
+        raise InputError(f"{settings[WORLD_KEY].where}: a world has no other world; take it out")
+    landmarks = bodies = course = None
+    config = resolve(settings)
+    if "landmarks.csv" in there:
+        landmarks, bodies = _read_landmarks(folder / "landmarks.csv", config.target)
+    if "path.csv" in there:
+        course = _read_course(folder / "path.csv", config)
+    callers = None
+    if table.callers is not None:
+        callers = _callers(folder, table.callers)
+        there += [told.route for told in table.callers if told.route is not None]
+    return World(
+        name=folder.resolve().name,
+        landmarks=landmarks,
+        bodies=bodies,
+        course=course,
+        callers=callers,
+        settings=settings,
+        files={name: (folder / name).read_bytes() for name in dict.fromkeys(there)},
+    )
+
+
+def kept_world(config: Config, world: World) -> tuple[Config, dict[str, bytes]]:
+    """Return what a folder of results keeps of the world that they are of.
+
+    Parameters
+    ----------
+    config : Config
+    world : World
+
+    Returns
+    -------
+    Config
+        It names the folder's own copy.
+    dict of name to content
+        The copy's files, relative to the folder.
+    """
+    place = f"worlds/{world.name}"
+    scenario = config.scenario.model_copy(update={"world": place})
+    files = {f"{place}/{name}": content for name, content in world.files.items()}
+    return config.model_copy(update={"scenario": scenario}), files
+
+
+def write_world(folder: Path, scenario: Scenario, config: Config) -> None:
+    """Write a world as it was drawn, so that it can be heard again, or changed.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if need be.
+    scenario : Scenario
+    config : Config
+        What is not at its default, and no filter's, stands in ``world.toml``.
+
+    Raises
+    ------
+    InputError
+        Where a file cannot be written, or one in its place is not as we wrote it.
+    """
+    import tomli_w
+
+    own = OwnFiles(folder, WORLD)
+    own.clear((*FILES, "README.md"))
+    names = _CONTROLS[config.motion.model]
+    own.write("README.md", _README.format(controls=",".join(names)))
+    own.write("landmarks.csv", _landmark_text(scenario, config.target))
+    controls = np.vstack((scenario.controls, np.zeros(2)))
+    columns = (scenario.time, *scenario.path.T, *controls.T)
+    own.write("path.csv", table_text((*_POSE, *names), *columns))
+    told = []
+    for caller in scenario.callers[VEHICLE + 1 :]:
+        row = {"name": caller.name, "frequency": caller.frequency, "level_db": caller.level_db}
+        if moves(caller):
+            row["route"] = f"{caller.name}.csv"
+            route = table_text(("time", "x", "y"), scenario.time, *np.asarray(caller.place).T)
+            own.write(row["route"], route)
+        else:
+            row["place"] = np.asarray(caller.place).tolist()
+        told.append(row)
+    head = {"format": 1, "config": _own_settings(config), "callers": told}
+    own.write("world.toml", tomli_w.dumps(head))
+
+
+def _own_settings(config: Config) -> dict[str, Any]:
+    """Return the settings of a world that are not at their defaults."""
+    decides = {"world", "landmarks", "steps"}
+    said = config.model_dump(mode="json", exclude_defaults=True, exclude={"seed", *SECTIONS})
+    return {
+        section: kept
+        for section, values in said.items()
+        if (kept := {k: v for k, v in values.items() if section != "scenario" or k not in decides})
+    }
+
+
+def _landmark_text(scenario: Scenario, usual: TargetConfig) -> str:
+    """Lay out the landmarks, with their bodies where these are their own."""
+    numbers = np.arange(1, len(scenario.landmarks) + 1)
+    text = table_text(("landmark", "x", "y"), numbers, *scenario.landmarks.T)
+    bodies = scenario.bodies
+    if bodies is None:
+        return text
+    head, *rows = text.splitlines()
+    kinds = zip(rows, bodies.radius.tolist(), bodies.sphere.tolist(), strict=True)
+    lines = [f"{row},{radius!r},{_SHAPES[sphere]}" for row, radius, sphere in kinds]
+    return "\n".join([f"{head},radius,shape", *lines, ""])
+
+
+def _read_head(path: Path) -> _WorldTable:
+    """Read ``world.toml``, or refuse its first fault."""
+    raw = parse_toml(read_text(path), path)
+    try:
+        return _WorldTable.model_validate(raw)
+    except ValidationError as error:
+        fault = min(error.errors(include_url=False), key=lambda f: f["loc"][0] != "format")
+    key = ".".join(str(part + 1) if isinstance(part, int) else part for part in fault["loc"])
+    if fault["type"] == "missing":
+        raise refusal(path, f"no key {key!r}", "it", f"add {key!r}")
+    if fault["type"] == "extra_forbidden":
+        raise refusal(path, f"the unknown key {key!r}", "format, config, callers", "remove it")
+    found = shown(fault["input"])
+    raise refusal(f"{path}, key {key!r}", found, expectation(fault), "correct the value")
+
+
+def _read_landmarks(
+    path: Path, usual: TargetConfig
+) -> tuple[Float[np.ndarray, "n 2"], Bodies | None]:
+    """Read places of landmarks by their numbers, and bodies where there are columns for them."""
+    words = {"shape": _SHAPES}
+    more = ("radius", "shape")
+    table = read_table(path, ("landmark", "x", "y"), optional=more, words=words)
+    check_unique(table, "landmark")
+    label, count = table.column["landmark"], len(table.line)
+    wrong = (label < 1) | (label > count)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        where, found = f"{path}, line {table.line[row]}", f"landmark {label[row]}"
+        raise refusal(where, found, f"the numbers 1 to {count}", "number the landmarks from 1 on")
+    order = np.argsort(label)
+    places = np.column_stack((table.column["x"], table.column["y"]))[order]
+    _refuse_coincident(table, places[label - 1])
+    radius, shape = (table.column[name][order] for name in more)
+    if np.isnan(radius).all() and np.isnan(shape).all():
+        return places, None
+    sphere = np.where(np.isnan(shape), usual.shape == "sphere", shape == _SHAPES.index("sphere"))
+    return places, Bodies(radius=np.where(np.isnan(radius), usual.radius, radius), sphere=sphere)
+
+
+def _refuse_coincident(table: Table, places: Float[np.ndarray, "n 2"]) -> None:
+    """Refuse two landmarks at one place."""
+    x, y = places.T
+    check_unique(Table(path=table.path, line=table.line, column={"x": x, "y": y}), "x", "y")
+
+
+def _read_course(path: Path, config: Config) -> Course:
+    """Read the vehicle's way, as its columns say."""
+    columns = _columns(path, config.motion.model)
+    table = read_table(path, columns)
+    column = table.column
+    if "time" not in columns:
+        return Waypoints(points=_waypoints(table))
+    _check_rising(table)
+    time = column["time"] - column["time"][0]
+    names = [name for name in columns if name not in _POSE]
+    commands = None
+    if names:
+        commands = Commands(time=time, rows=np.column_stack([column[name] for name in names]))
+    if "heading" not in columns:
+        assert commands is not None
+        return commands
+    poses = np.column_stack([column[name] for name in _POSE[1:]])
+    return Poses(time=time, path=poses, commands=commands)
+
+
+def _columns(path: Path, model: str) -> tuple[str, ...]:
+    """Return the columns of a path by its header, one of those that say what it is."""
+    lines = (line for line in read_text(path).splitlines() if line.strip() and line[0] != "#")
+    header = next(lines, "")
+    columns = tuple(name.strip().strip('"') for name in header.split(","))
+    known = {names: kind for names, kind in _HEADERS.items() if _fits(names, model)}
+    if columns not in known:
+        fix = "name the columns so"
+        if columns in _HEADERS:
+            fix = f"or set motion.model: it is {model!r}"
+        expected = " or ".join(f"{','.join(names)!r} ({kind})" for names, kind in known.items())
+        raise refusal(f"{path}, line 1", f"{header[:80]!r}", expected, fix)
+    return columns
+
+
+def _fits(columns: tuple[str, ...], model: str) -> bool:
+    """Tell whether controls among the columns are those of a motion model."""
+    others = {name for key, names in _CONTROLS.items() if key != model for name in names}
+    return not others.intersection(columns)
+
+
+def _waypoints(table: Table) -> Float[np.ndarray, "n 2"]:
+    """Return way-points, each apart from the one before."""
+    points = np.column_stack((table.column["x"], table.column["y"]))
+    if len(points) < 2:
+        raise refusal(table.path, "one way-point", "at least two", "add rows")
+    same = ~np.diff(points, axis=0).any(axis=1)
+    if same.any():
+        row = int(np.argmax(same)) + 1
+        where = f"{table.path}, line {table.line[row]}"
+        raise refusal(where, "the way-point before it again", "another", "remove the row")
+    return points
+
+
+def _check_rising(table: Table) -> None:
+    """Refuse a path of one row, or two rows of one time."""
+    if len(table.line) < 2:
+        raise refusal(table.path, "one row", "at least two: the last ends the drive", "add rows")
+    check_unique(table, "time")
+
+
+def _callers(folder: Path, tables: tuple[_CallerTable, ...]) -> tuple[Visitor, ...]:
+    """Return who calls, each from a place or along a route."""
+    visitors: list[Visitor] = []
+    for number, told in enumerate(tables, start=1):
+        where = f"{folder / 'world.toml'}, key 'callers.{number}"
+        name = told.name or ("beacon" if len(tables) == 1 else f"caller{number}")
+        if name in ("vehicle", *(visitor.caller.name for visitor in visitors)):
+            raise refusal(
+                f"{where}.name'", f"{name!r} again", "a name of its own", "choose another"
+            )
+        if (told.place is None) == (told.route is None):
+            found = "neither" if told.place is None else "both"
+            raise refusal(f"{where}'", f"{found} of place and route", "one of them", "give one")
+        caller = Caller(name=name, frequency=told.frequency, level_db=told.level_db)
+        visitors.append(_visitor(folder, caller, told, where))
+    return tuple(visitors)
+
+
+def _visitor(folder: Path, caller: Caller, told: _CallerTable, where: str) -> Visitor:
+    """Give a caller its place or its route."""
+    if told.route is None:
+        return Visitor(caller=replace(caller, place=np.array(told.place)))
+    if Path(told.route).name != told.route:
+        expected = "the name of a file in the world's folder"
+        raise refusal(f"{where}.route'", shown(told.route), expected, "put it there")
+    table = read_table(folder / told.route, ("time", "x", "y"))
+    _check_rising(table)
+    route = np.column_stack((table.column["x"], table.column["y"]))
+    return Visitor(caller=caller, time=table.column["time"], route=route)

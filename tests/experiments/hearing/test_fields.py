@@ -1,0 +1,64 @@
+"""Fields: orchards stand in rows, rooms have corners, all keep clear; what does not fit is told."""
+
+import numpy as np
+import pytest
+
+from pipistrelle.config import InputError, ScenarioConfig
+from pipistrelle.experiments.hearing.fields import OFF, landmarks_in, nearest
+
+NOWHERE = np.empty((0, 2))
+
+
+def field(kind, seed=7, path=NOWHERE, callers=NOWHERE, **settings):
+    setup = ScenarioConfig(field=kind, **settings)
+    return landmarks_in(setup, path, callers, np.random.default_rng(seed))
+
+
+def test_an_orchard_stands_in_rows_between_the_lanes():
+    trees = field("rows", landmarks=60, lane=4.0, extent=12.0, spacing=3.0)
+    row = (trees[:, 1] + 12.0) / 4.0 - 0.5
+    assert np.abs(row - np.rint(row)).max() <= OFF * 3.0 / 4.0
+    one = np.sort(trees[np.rint(row) == np.rint(row[0])][:, 0])
+    assert np.abs(np.diff(one) - 3.0).max() <= 2.0 * OFF * 3.0
+
+
+def test_rooms_have_their_corners_at_the_corridors_walls_or_behind_them():
+    corners = field("rooms", landmarks=40, lane=4.0)
+    at_wall = np.isclose(np.abs(corners[:, 1]), 2.0)
+    assert 10 < at_wall.sum() < 30
+    assert np.abs(corners[~at_wall][:, 1]).min() >= 2.0 + 0.75 * 4.0
+
+
+@pytest.mark.parametrize("kind", ["disc", "rows", "rooms"])
+def test_all_keep_clear_of_path_callers_and_each_other(kind):
+    path = np.column_stack((np.linspace(-12.0, 12.0, 200), np.full(200, 1.7)))
+    callers = np.array([[0.0, -2.0], [3.0, 4.0]])
+    for seed in range(5):
+        places = field(kind, seed, path, callers, landmarks=30)
+        assert np.hypot(*places.T).max() <= 25.0
+        for i, place in enumerate(places):
+            assert nearest(path, place) >= 0.5
+            assert nearest(callers, place) >= 0.5
+            assert nearest(places[:i], place) >= (3.0 if kind == "disc" else 0.5)
+
+
+@pytest.mark.parametrize("kind", ["rows", "rooms"])
+def test_other_seeds_draw_others(kind):
+    assert not np.array_equal(field(kind, 1), field(kind, 2))
+    assert np.array_equal(field(kind, 1), field(kind, 1))
+
+
+@pytest.mark.parametrize("kind", ["disc", "rows", "rooms"])
+def test_what_does_not_fit_is_refused(kind):
+    with pytest.raises(InputError, match=r"scenario\.landmarks: found 400, but (at most|room)"):
+        field(kind, landmarks=400, radius=12.0)
+
+
+def test_trees_without_a_distance_are_refused():
+    with pytest.raises(InputError, match=r"scenario\.spacing: found 0"):
+        field("rows", spacing=0.0)
+
+
+@pytest.mark.parametrize("kind", ["disc", "rows", "rooms"])
+def test_there_may_be_none(kind):
+    assert field(kind, landmarks=0).shape == (0, 2)

@@ -1,0 +1,301 @@
+"""Worlds as folders: what is written is read back to the bit, and what is wrong has a line."""
+
+import numpy as np
+import pytest
+
+from pipistrelle.acoustics.callers import Caller
+from pipistrelle.acoustics.target import Bodies
+from pipistrelle.config import Config, InputError, MotionConfig, ScenarioConfig
+from pipistrelle.experiments.hearing.courses import Commands, Poses, Waypoints
+from pipistrelle.experiments.hearing.scenario import Scenario, world_of
+from pipistrelle.experiments.hearing.world_folder import (
+    laid_over,
+    named_world,
+    read_world,
+    settled,
+    write_world,
+)
+from pipistrelle.experiments.hearing.worlds import Visitor, World
+from pipistrelle.settings import from_flags, resolve
+
+LANDMARKS = "landmark,x,y\n1,2.5,0\n2,-1,4\n"
+
+
+def folder_with(tmp_path, **files):
+    """Write a world's folder; a name's last _ stands for its dot."""
+    folder = tmp_path / "own [1]"
+    folder.mkdir(exist_ok=True)
+    for name, text in files.items():
+        (folder / ".".join(name.rsplit("_", 1))).write_text(text)
+    return folder
+
+
+def heard(config, world):
+    return world_of(config, 0, world)
+
+
+@pytest.mark.parametrize("model", ["bicycle", "unicycle"])
+def test_a_world_that_was_drawn_is_read_back_to_the_bit(tmp_path, model):
+    config = Config(
+        scenario=ScenarioConfig(steps=80, landmarks=12, course="eight"),
+        motion=MotionConfig(model=model),
+    )
+    drawn = world_of(config, 5)
+    write_world(tmp_path / "w", drawn, config)
+    layer = from_flags({"scenario": {"world": str(tmp_path / "w")}, "seed": 99})
+    world = named_world(layer)
+    again_config = resolve(settled(world, layer))
+    again = heard(again_config, world)
+    for name in ("time", "path", "controls", "landmarks"):
+        assert getattr(again, name).tobytes() == getattr(drawn, name).tobytes()
+    assert [caller.name for caller in again.callers] == ["vehicle", "beacon"]
+    np.testing.assert_array_equal(again.callers[1].place, drawn.callers[1].place)
+    assert again_config.scenario.steps == 80
+    assert again_config.motion == config.motion
+
+
+def test_bodies_and_routes_are_read_back_too(tmp_path):
+    time = np.arange(9) * 0.125
+    boat = np.column_stack((time, -time))
+    drawn = Scenario(
+        time=time,
+        path=np.column_stack((time, time, 0.0 * time)),
+        controls=np.ones((8, 2)),
+        landmarks=np.array([[1.0, 5.0], [2.0, 5.0]]),
+        callers=(
+            Caller(name="vehicle", frequency=35e3, level_db=49.7),
+            Caller(name="boat", frequency=25e3, level_db=40.0, place=boat),
+        ),
+        bodies=Bodies(radius=np.array([0.1, 0.3]), sphere=np.array([True, False])),
+    )
+    write_world(tmp_path / "w", drawn, Config())
+    again = heard(Config(scenario=ScenarioConfig(steps=8)), read_world(tmp_path / "w"))
+    np.testing.assert_array_equal(again.bodies.radius, [0.1, 0.3])
+    assert again.bodies.sphere.tolist() == [True, False]
+    np.testing.assert_array_equal(again.callers[1].place, boat)
+    assert again.callers[1].level_db == 40.0
+
+
+def test_what_a_world_leaves_open_is_drawn_as_ever(tmp_path):
+    config = Config(scenario=ScenarioConfig(steps=40, landmarks=8))
+    drawn = world_of(config)
+    world = read_world(folder_with(tmp_path, landmarks_csv=LANDMARKS))
+    own = heard(config, world)
+    assert own.path.tobytes() == drawn.path.tobytes()
+    np.testing.assert_array_equal(own.callers[1].place, drawn.callers[1].place)
+    assert own.landmarks.tolist() == [[2.5, 0.0], [-1.0, 4.0]]
+
+
+def test_the_order_of_landmarks_in_the_file_does_not_matter(tmp_path):
+    folder = folder_with(tmp_path, landmarks_csv="landmark,x,y\n2,-1,4\n1,2.5,0\n")
+    assert read_world(folder).landmarks.tolist() == [[2.5, 0.0], [-1.0, 4.0]]
+
+
+def test_bodies_that_are_not_told_are_the_settings(tmp_path):
+    rows = "landmark,x,y,radius,shape\n1,0,1,0.2,\n2,0,2,,sphere\n3,0,3,,\n"
+    folder = folder_with(
+        tmp_path,
+        landmarks_csv=rows,
+        world_toml="format = 1\n[config.target]\nradius = 0.07\n",
+    )
+    bodies = read_world(folder).bodies
+    assert bodies.radius.tolist() == [0.2, 0.07, 0.07]
+    assert bodies.sphere.tolist() == [False, True, False]
+
+
+def test_columns_say_what_a_path_is(tmp_path):
+    def course(text):
+        return read_world(folder_with(tmp_path, path_csv=text)).course
+
+    assert isinstance(course("x,y\n0,0\n1,0\n"), Waypoints)
+    commands = course("time,speed,steering\n5,1,0.1\n6,0,0\n")
+    assert isinstance(commands, Commands)
+    assert commands.time.tolist() == [0.0, 1.0]
+    poses = course("time,x,y,heading\n0,0,0,0\n1,1,0,0\n")
+    assert isinstance(poses, Poses)
+    assert poses.commands is None
+    both = course("time,x,y,heading,speed,steering\n0,0,0,0,1,0\n1,1,0,0,0,0\n")
+    assert both.commands.rows.tolist() == [[1.0, 0.0], [0.0, 0.0]]
+
+
+def test_steps_are_those_of_the_path_unless_given(tmp_path):
+    world = read_world(folder_with(tmp_path, path_csv="x,y\n0,0\n7.5,0\n"))
+    assert resolve(settled(world, {})).scenario.steps == 80
+    fast = from_flags({"scenario": {"speed": 1.5}})
+    assert resolve(settled(world, fast)).scenario.steps == 40
+    given = from_flags({"scenario": {"steps": 10}})
+    assert resolve(settled(world, given)).scenario.steps == 10
+
+
+def test_a_worlds_settings_are_beneath_all_others_and_over_a_plans_in_its_grid(tmp_path):
+    folder = folder_with(tmp_path, world_toml="format = 1\n[config]\nair.temperature_c = 5.0\n")
+    world, warm = read_world(folder), from_flags({"air": {"temperature_c": 30.0}})
+    assert resolve(settled(world, {})).air.temperature_c == 5.0
+    assert resolve(settled(world, warm)).air.temperature_c == 30.0
+    assert resolve(laid_over(world, warm, {})).air.temperature_c == 5.0
+    assert resolve(laid_over(world, {}, warm)).air.temperature_c == 30.0
+
+
+def test_in_a_grid_the_drive_ends_with_the_worlds_path(tmp_path):
+    world = read_world(folder_with(tmp_path, path_csv="time,speed,steering\n0,1,0\n2,0,0\n"))
+    for asked, had in ((1500, 16), (8, 8)):
+        layer = from_flags({"scenario": {"steps": asked}})
+        assert resolve(laid_over(world, layer, {})).scenario.steps == had
+
+
+def test_a_visitor_stands_before_and_after_his_route():
+    boat = Caller(name="boat", frequency=25e3, level_db=40.0)
+    route = np.array([[0.0, 0.0], [2.0, 4.0]])
+    visitor = Visitor(caller=boat, time=np.array([1.0, 2.0]), route=route)
+    places = visitor.at(np.array([0.0, 1.5, 9.0])).place
+    assert places.tolist() == [[0.0, 0.0], [1.0, 2.0], [2.0, 4.0]]
+
+
+def test_callers_have_names_of_their_own(tmp_path):
+    one = "[[callers]]\nfrequency = 30e3\nlevel_db = 40.0\nplace = [1.0, 2.0]\n"
+    named = [
+        [visitor.caller.name for visitor in read_world(folder).callers]
+        for text in (one, one + one)
+        for folder in [folder_with(tmp_path, world_toml="format = 1\n" + text)]
+    ]
+    assert named == [["beacon"], ["caller1", "caller2"]]
+
+
+def test_there_may_be_nobody_else_who_calls(tmp_path):
+    world = read_world(folder_with(tmp_path, world_toml="format = 1\ncallers = []\n"))
+    config = Config(scenario=ScenarioConfig(steps=8, landmarks=5))
+    assert [caller.name for caller in heard(config, world).callers] == ["vehicle"]
+
+
+WRONG = {
+    "no header": ({"landmarks_csv": "1,2,3\n"}, "landmarks.csv, line 1: found '1,2,3'"),
+    "a label too high": (
+        {"landmarks_csv": "landmark,x,y\n1,0,0\n3,1,1\n"},
+        "landmarks.csv, line 3: found landmark 3, expected the numbers 1 to 2",
+    ),
+    "clutter": (
+        {"landmarks_csv": "landmark,x,y\n-1,0,0\n"},
+        "landmarks.csv, line 2: found landmark -1",
+    ),
+    "a label twice": (
+        {"landmarks_csv": "landmark,x,y\n1,0,0\n1,1,1\n"},
+        "line 3: found landmark 1 again",
+    ),
+    "a place twice": (
+        {"landmarks_csv": "landmark,x,y\n1,0,0\n2,0,0\n"},
+        "line 3: found x 0.0, y 0.0 again",
+    ),
+    "no shape": (
+        {"landmarks_csv": "landmark,x,y,shape\n1,0,0,cube\n"},
+        "line 2: found shape 'cube', expected cylinder or sphere",
+    ),
+    "no radius": (
+        {"landmarks_csv": "landmark,x,y,radius\n1,0,0,-2\n"},
+        "line 2: found radius -2.0, expected a radius above 0 m",
+    ),
+    "not a number": (
+        {"landmarks_csv": "landmark,x,y\n1,nan,0\n"},
+        "line 2: found x 'nan', expected a finite number",
+    ),
+    "unknown columns": ({"path_csv": "a,b\n0,0\n"}, "path.csv, line 1: found 'a,b', expected"),
+    "another model's": (
+        {"path_csv": "time,velocity,angular_rate\n0,0,0\n"},
+        "or set motion.model: it is 'bicycle'",
+    ),
+    "one way-point": ({"path_csv": "x,y\n0,0\n"}, "path.csv: found one way-point"),
+    "the same way-point": (
+        {"path_csv": "x,y\n0,0\n0,0\n"},
+        "path.csv, line 3: found the way-point before it again",
+    ),
+    "one row": ({"path_csv": "time,speed,steering\n0,0,0\n"}, "path.csv: found one row"),
+    "a time twice": (
+        {"path_csv": "time,speed,steering\n0,0,0\n0,1,0\n"},
+        "line 3: found time 0.0 again",
+    ),
+    "time that runs back": (
+        {"path_csv": "time,speed,steering\n1,0,0\n0,1,0\n"},
+        "line 3: found time 0.0 after 1.0",
+    ),
+    "an empty file": ({"path_csv": ""}, "path.csv, line 1: found ''"),
+    "no format": ({"world_toml": ""}, "world.toml: found no key 'format'"),
+    "another format": ({"world_toml": "format = 2"}, "world.toml, key 'format': found 2"),
+    "an unknown key": ({"world_toml": "format = 1\nname = 'a'"}, "found the unknown key 'name'"),
+    "an unknown setting": (
+        {"world_toml": "format = 1\n[config]\nair.temprature_c = 3.0"},
+        "config.air.temprature_c: no such setting; did you mean config.air.temperature_c?",
+    ),
+    "a wrong setting": (
+        {"world_toml": "format = 1\n[config]\nair.temperature_c = 99.0"},
+        "config.air.temperature_c: found 99.0, expected less than 60",
+    ),
+    "a world of its own": (
+        {"world_toml": "format = 1\n[config]\nscenario.world = 'b'"},
+        "config.scenario.world: a world has no other world",
+    ),
+    "a caller nowhere": (
+        {"world_toml": "format = 1\n[[callers]]\nfrequency = 3e4\nlevel_db = 40.0"},
+        "key 'callers.1': found neither of place and route",
+    ),
+    "a caller everywhere": (
+        {
+            "world_toml": "format = 1\n[[callers]]\nfrequency = 3e4\nlevel_db = 40.0\n"
+            "place = [0.0, 1.0]\nroute = 'a.csv'"
+        },
+        "key 'callers.1': found both of place and route",
+    ),
+    "a route elsewhere": (
+        {
+            "world_toml": "format = 1\n[[callers]]\nfrequency = 3e4\nlevel_db = 40.0\n"
+            "route = '../a.csv'"
+        },
+        "key 'callers.1.route': found '../a.csv'",
+    ),
+    "no route": (
+        {
+            "world_toml": "format = 1\n[[callers]]\nfrequency = 3e4\nlevel_db = 40.0\n"
+            "route = 'a.csv'"
+        },
+        "a.csv: found no such file",
+    ),
+    "text for a number": (
+        {
+            "world_toml": "format = 1\n[[callers]]\nfrequency = '3e4'\nlevel_db = 40.0\n"
+            "place = [0.0, 1.0]"
+        },
+        "key 'callers.1.frequency': found '3e4', expected a valid number",
+    ),
+    "the vehicle's name": (
+        {
+            "world_toml": "format = 1\n[[callers]]\nname = 'vehicle'\nfrequency = 3e4\n"
+            "level_db = 40.0\nplace = [0.0, 1.0]"
+        },
+        "key 'callers.1.name': found 'vehicle' again",
+    ),
+    "no TOML": ({"world_toml": "format = "}, "world.toml: found"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_is_wrong_is_refused_where_it_stands(tmp_path, case):
+    files, said = WRONG[case]
+    with pytest.raises(InputError) as refused:
+        read_world(folder_with(tmp_path, **files))
+    assert said in str(refused.value)
+    assert "own [1]" in str(refused.value)
+
+
+def test_a_folder_without_a_world_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    for name, found in (("nowhere", "no such folder"), ("file", "a file"), ("", "none of its")):
+        with pytest.raises(InputError, match=found):
+            read_world(tmp_path / name)
+
+
+def test_settings_that_contradict_the_world_are_refused(tmp_path):
+    world = read_world(folder_with(tmp_path, landmarks_csv=LANDMARKS))
+    more = from_flags({"scenario": {"landmarks": 7}})
+    for settle in (lambda: settled(world, more), lambda: laid_over(world, {}, more)):
+        with pytest.raises(InputError, match=r"--scenario\.landmarks: found 7, but .* has 2"):
+            settle()
+    assert resolve(settled(world, from_flags({"scenario": {"landmarks": 2}})))
+    assert World(name="any").settings == {}
