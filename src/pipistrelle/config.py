@@ -194,6 +194,25 @@ class MotionConfig(Section):
     """Of a bicycle [rad]."""
     angular_rate_std: NonNegative = 0.1
     """Of a unicycle [rad/s]."""
+    speed_bias: Real = 0.0
+    """What is added to every commanded speed, noise apart [m/s]."""
+    turn_bias: Real = 0.0
+    """The same of the steering angle [rad] or the angular rate [rad/s]."""
+
+
+class AssumedConfig(Section):
+    """What the filters and the front end believe otherwise than it is."""
+
+    wheelbase: Positive | None = None
+    """[m]; unless given, the true one, as all here."""
+    speed_std: NonNegative | None = None
+    """[m/s]"""
+    steering_std: NonNegative | None = None
+    """[rad]"""
+    angular_rate_std: NonNegative | None = None
+    """[rad/s]"""
+    speed_of_sound: Annotated[float, Field(ge=10, le=10_000)] | None = None
+    """By which delays become ranges, and phases bearings [m/s]."""
 
 
 class FilterConfig(Section):
@@ -207,6 +226,8 @@ class FilterConfig(Section):
     """[rad]"""
     initial_pose_std: tuple[NonNegative, NonNegative, NonNegative] = (0.05, 0.05, 0.0436)
     """x, y [m], heading [rad]"""
+    start: Literal["exact", "drawn"] = "exact"
+    """The first pose that they are told: the true one (the paper's), or drawn with these."""
     gate: Probability = 1.0
     """Measurements outside this share of their predicted distribution are dropped; 1: none."""
     robust: Literal["none", "huber"] = "none"
@@ -272,6 +293,13 @@ class Config(Section):
     detection: DetectionConfig = DetectionConfig()
     association: AssociationConfig = AssociationConfig()
     motion: MotionConfig = MotionConfig()
+    assumed: AssumedConfig = AssumedConfig()
     filter: FilterConfig = FilterConfig()
     rays: RayConfig = RayConfig()
     fastslam: FastSlamConfig = FastSlamConfig()
+
+    @property
+    def believed_celerity(self) -> float:
+        """The speed of sound that the front end counts with [m/s]."""
+        assumed = self.assumed.speed_of_sound
+        return self.air.celerity if assumed is None else assumed

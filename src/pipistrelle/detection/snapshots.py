@@ -146,7 +146,7 @@ def detector(config: Config, layout: Layout, tones: Float[np.ndarray, " c"]) -> 
 
     settings, elements = config.detection, layout.position.size
     spacing = _spacing(layout)
-    wave = 2.0 * np.pi * tones * spacing / config.air.celerity
+    wave = 2.0 * np.pi * tones * spacing / config.believed_celerity
     if wave.max() > 2.0 * np.pi * WIDEST:
         found = f"receiver.spacing: found {spacing:g} m, {wave.max() / (2.0 * np.pi):g} waves"
         raise InputError(f"{found}; expected at most {WIDEST}, half a wave for a plain beam")

@@ -187,6 +187,47 @@ def path_bound(bound: Float[np.ndarray, "t 3 3"]) -> tuple[float, float]:
     return math.sqrt(x + y), math.sqrt(heading)
 
 
+def bound_of_drawn_start(
+    bound: Float[np.ndarray, "t 3 3"],
+    path: Float[np.ndarray, "t 3"],
+    start_covariance: Float[np.ndarray, "3 3"],
+) -> Float[np.ndarray, "t 3 3"]:
+    r"""Bound of the pose where the start is not exact, but drawn.
+
+    .. math:: P_k = B_k + G_k P_0 G_k^T, \qquad
+              G_k = \begin{pmatrix} 1 & 0 & y_0 - y_k \\ 0 & 1 & x_k - x_0 \\ 0 & 0 & 1
+              \end{pmatrix}
+
+    What is heard is relative to the vehicle, so an error of the start is never noticed: it moves
+    and turns the whole path.
+
+    Parameters
+    ----------
+    bound : (k + 1, 3, 3) [m, rad, squared]
+        B, as `pose_bound` gives it.
+    path : (k + 1, 3) [m, m, rad]
+        True poses.
+    start_covariance : (3, 3) [m, rad, squared]
+        P_0.
+
+    Returns
+    -------
+    (k + 1, 3, 3) [m, rad, squared]
+
+    Examples
+    --------
+    A heading that is off by 0.1 rad puts what is 10 m ahead a metre aside.
+
+    >>> path, turned = np.array([[0.0, 0, 0], [10, 0, 0]]), np.diag([0.0, 0.0, 0.01])
+    >>> float(bound_of_drawn_start(np.zeros((2, 3, 3)), path, turned)[1, 1, 1])
+    1.0
+    """
+    G = np.tile(np.eye(3), (len(path), 1, 1))
+    G[:, 0, 2] = path[0, 1] - path[:, 1]
+    G[:, 1, 2] = path[:, 0] - path[0, 0]
+    return bound + G @ start_covariance @ np.swapaxes(G, 1, 2)
+
+
 def nees_of_exact_start(
     bound: Float[np.ndarray, "t 3 3"],
     path: Float[np.ndarray, "t 3"],
@@ -194,14 +235,8 @@ def nees_of_exact_start(
 ) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, " t"]]:
     r"""Mean and variance of a consistent filter's NEES where a start thought uncertain is exact.
 
-    What is heard is relative to the vehicle, so an error of the start would never be noticed: it
-    would move and turn the whole path. A filter that allows for it with P_0 therefore has
-
-    .. math:: P_k = B_k + G_k P_0 G_k^T, \qquad
-              G_k = \begin{pmatrix} 1 & 0 & y_0 - y_k \\ 0 & 1 & x_k - x_0 \\ 0 & 0 & 1
-              \end{pmatrix}
-
-    at step k, with B_k the covariance after an exact start, which is that of its errors here. So
+    A filter that allows for an error of the start with P_0 has the covariance P_k of
+    `bound_of_drawn_start` at step k; that of its errors, here, is the B_k of an exact start. So
 
     .. math:: E[\epsilon_k] = \operatorname{tr} P_k^{-1} B_k, \qquad
               \operatorname{Var}[\epsilon_k] = 2 \operatorname{tr} (P_k^{-1} B_k)^2,
@@ -235,10 +270,7 @@ def nees_of_exact_start(
     >>> mean, variance
     (array([1.5]), array([1.5]))
     """
-    G = np.tile(np.eye(3), (len(path), 1, 1))
-    G[:, 0, 2] = path[0, 1] - path[:, 1]
-    G[:, 1, 2] = path[:, 0] - path[0, 0]
-    total = bound + G @ start_covariance @ np.swapaxes(G, 1, 2)
+    total = bound_of_drawn_start(bound, path, start_covariance)
     if np.linalg.eigvalsh(start_covariance)[0] > 0.0:
         share = np.linalg.inv(total) @ bound
     else:  # the first step's noise has rank 2

@@ -48,6 +48,8 @@ LOGGED = frozenset(
     }
 )
 """Settings of the filter that a log decides."""
+OF_WORLDS = frozenset({("filter", "start")})
+"""Settings of the filter that only mean something where the truth is drawn."""
 _FOLDERS = ", or ".join(reader.help for reader in READERS)
 FOLDERS = f"{_FOLDERS[0].upper()}{_FOLDERS[1:]}."
 ROBOTS = f"Whose log of {', or of '.join(r.robot_help for r in READERS if r.robots)}."
@@ -63,7 +65,7 @@ SlamConfig = create_model("SlamConfig", __base__=Section, **_REPLAYED)
 
 def _is_open(key: Key) -> bool:
     """Whether a log leaves a setting open."""
-    return key[0] in SlamConfig.model_fields and key not in LOGGED
+    return key[0] in SlamConfig.model_fields and key not in LOGGED | OF_WORLDS
 
 
 if TYPE_CHECKING:

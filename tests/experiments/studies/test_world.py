@@ -191,11 +191,19 @@ OTHERS = {
     "motion.speed_std": 0.2,
     "motion.steering_std": 0.06,
     "motion.angular_rate_std": 0.2,
+    "motion.speed_bias": 0.1,
+    "motion.turn_bias": 0.01,
+    "assumed.wheelbase": 0.3,
+    "assumed.speed_std": 0.2,
+    "assumed.steering_std": 0.06,
+    "assumed.angular_rate_std": 0.3,
+    "assumed.speed_of_sound": 335.0,
     "filter.noise": "measured",
     "filter.robust": "huber",
     "filter.range_std": 0.4,
     "filter.bearing_std": 0.05,
     "filter.initial_pose_std": [0.1, 0.1, 0.1],
+    "filter.start": "drawn",
     "filter.gate": 0.05,
     "rays.ratio": 0.2,
     "rays.density": 2.0,
@@ -214,6 +222,7 @@ OTHERS = {
 """Another value of every setting, far enough from its default to be heard or believed."""
 FEW = ("air.spreading", "target.shape", "emitter.radius", "beacon.level_db", "receiver.elements",
        "detection.peak_db", "association.bearing_gate", "motion.speed_std", "scenario.landmarks",
+       "assumed.wheelbase",
        "filter.range_std", "rays.power", "fastslam.particles", "seed")  # fmt: skip
 """One of each section."""
 
@@ -228,6 +237,7 @@ NEEDS = {
     "scenario.extent": {"scenario": {"course": "eight"}},
     "scenario.lane": {"scenario": {"field": "rows"}},
     "motion.angular_rate_std": {"motion": {"model": "unicycle"}},
+    "assumed.angular_rate_std": {"motion": {"model": "unicycle"}},
 }
 """What a setting means something with."""
 

@@ -152,7 +152,11 @@ def steps_of(course: Course, setup: ScenarioConfig) -> int:
 
 
 def driven(
-    course: Course, setup: ScenarioConfig, motion: Motion, rng: np.random.Generator
+    course: Course,
+    setup: ScenarioConfig,
+    motion: Motion,
+    rng: np.random.Generator,
+    bias: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 2"]]:
     """Drive a course, with noise on both controls.
 
@@ -163,6 +167,8 @@ def driven(
         Its steps, their length, and the speed between way-points.
     motion : Motion
     rng : Generator
+    bias : (speed [m/s], steering angle [rad] or angular rate [rad/s])
+        What the vehicle does beyond what it is told, noise apart.
 
     Returns
     -------
@@ -197,8 +203,8 @@ def driven(
         path = _poses_at(time, course)
         if course.commands is not None:
             return path, _held(time, course.commands)
-        return path, controls_between(path, setup.step, motion) - _noise(setup, motion, rng)
-    noise = _noise(setup, motion, rng)
+        return path, controls_between(path, setup.step, motion) - _noise(setup, motion, rng, bias)
+    noise = _noise(setup, motion, rng, bias)
     if isinstance(course, Waypoints):
         return _steered(course.points, noise, setup, motion)
     controls, path = _held(time, course), np.empty((setup.steps + 1, 3))
@@ -254,10 +260,10 @@ def _lanes(extent: float, lane: float) -> Float[np.ndarray, "n 2"]:
 
 
 def _noise(
-    setup: ScenarioConfig, motion: Motion, rng: np.random.Generator
+    setup: ScenarioConfig, motion: Motion, rng: np.random.Generator, bias: tuple[float, float]
 ) -> Float[np.ndarray, "k 2"]:
-    """Draw the noise on both controls."""
-    return rng.standard_normal((setup.steps, 2)) * motion.control_std
+    """Draw the noise on both controls, about its bias."""
+    return rng.standard_normal((setup.steps, 2)) * motion.control_std + bias
 
 
 def _held(time: Float[np.ndarray, " t"], commands: Commands) -> Float[np.ndarray, "t-1 2"]:

@@ -225,7 +225,7 @@ def _heard(time: float, detections: Detections, arrivals: Arrivals, rig: _Rig) -
         detections,
         label,
         averaging=config.detection.averaging,
-        speed_of_sound=config.air.celerity,
+        speed_of_sound=config.believed_celerity,
     )
     return unlabelled(heard) if rig.oracle is None else heard
 

@@ -103,7 +103,8 @@ def draw_scenario(config: Config, rng: np.random.Generator, world: World = ANY) 
     """
     setup, motion = config.scenario, motion_of(config.motion)
     time = np.arange(setup.steps + 1) * setup.step
-    path, controls = driven(world.course or course_of(setup, motion), setup, motion, rng)
+    bias = (config.motion.speed_bias, config.motion.turn_bias)
+    path, controls = driven(world.course or course_of(setup, motion), setup, motion, rng, bias)
     if world.callers is None:
         callers: tuple[Caller, ...] = callers_of(config, _place_beacon(setup, path[:, :2], rng))
     else:
@@ -216,6 +217,28 @@ def motion_of(motion: MotionConfig) -> Motion:
         control_std=(motion.speed_std, motion.steering_std if bicycle else motion.angular_rate_std),
         wheelbase=motion.wheelbase,
     )
+
+
+def assumed_motion(config: Config) -> Motion:
+    """Return the motion model that the filters believe in.
+
+    Parameters
+    ----------
+    config : Config
+        Its sections motion and assumed.
+
+    Returns
+    -------
+    Motion
+
+    Examples
+    --------
+    >>> from pipistrelle.config import AssumedConfig
+    >>> assumed_motion(Config(assumed=AssumedConfig(wheelbase=0.25))).wheelbase
+    0.25
+    """
+    given = config.assumed.model_dump(exclude_none=True, exclude={"speed_of_sound"})
+    return motion_of(config.motion.model_copy(update=given))
 
 
 def _place_beacon(

@@ -22,11 +22,13 @@ from pipistrelle.estimation.beliefs import (
     Gaussian,
 )
 from pipistrelle.estimation.catalogue import CATALOGUE, entry, short_name
+from pipistrelle.evaluation.bound import bound_of_drawn_start
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.experiments.hearing.listening import Progress, listen
 from pipistrelle.experiments.hearing.scenario import (
     Scenario,
+    assumed_motion,
     motion_of,
     moving_labels,
     standing_landmarks,
@@ -44,6 +46,7 @@ from pipistrelle.experiments.results.scores import (
 from pipistrelle.experiments.runs.checking import check_filters, failed_trial
 from pipistrelle.experiments.runs.filtering import run_filter
 from pipistrelle.experiments.runs.preparing import prepared
+from pipistrelle.geometry import wrap_angle
 
 Watch = Callable[[str, str, Scan, Belief], None]
 """Called with strategy, filter, scan and the belief after it."""
@@ -137,31 +140,40 @@ def scans_of(heard: Sequence[Heard], strategy: Strategy, config: Config) -> tupl
 def _bounds(
     drive: Drive, heard: Sequence[Heard], strategies: Sequence[Strategy], config: Config
 ) -> dict[str, Float[np.ndarray, "t 3 3"] | None]:
-    """Work out the bound of each strategy, the noise as the signal tells it."""
+    """Work out the bound of each strategy, of who knows the motion, and the noise by the signal."""
     noise = config.filter.model_copy(update={"noise": "measured"})
     told = config.model_copy(update={"filter": noise})
-    return {name: drive_bound(drive, scans_of(heard, name, told)) for name in strategies}
+    known, bounds = replace(drive, motion=motion_of(config.motion)), {}
+    for name in strategies:
+        bound = drive_bound(known, scans_of(heard, name, told))
+        if bound is not None and config.filter.start == "drawn" and drive.truth.path is not None:
+            bound = bound_of_drawn_start(bound, drive.truth.path, drive.start.covariance)
+        bounds[name] = bound
+    return bounds
 
 
-def drive_of(scenario: Scenario, config: Config) -> Drive:
+def drive_of(scenario: Scenario, config: Config, iteration: int = 0) -> Drive:
     """Tell what a filter may know of a world, and the truth to score it by.
 
     Parameters
     ----------
     scenario : Scenario
     config : Config
+    iteration : int
+        Number of the world, part of the key of a start that is drawn.
 
     Returns
     -------
     Drive
         Its true landmarks are the landmarks and then the callers that stand: the beacon is last.
     """
+    start, spread = scenario.path[0], np.array(config.filter.initial_pose_std)
+    if config.filter.start == "drawn":
+        start = start + spread * _generator(config.seed, iteration, "start").standard_normal(3)
+        start[2] = wrap_angle(start[2])
     return Drive(
-        motion=motion_of(config.motion),
-        start=Gaussian(
-            mean=scenario.path[0],
-            covariance=np.diag(np.square(config.filter.initial_pose_std)),
-        ),
+        motion=assumed_motion(config),
+        start=Gaussian(mean=start, covariance=np.diag(np.square(spread))),
         time=scenario.time,
         controls=scenario.controls,
         truth=Truth(time=scenario.time, path=scenario.path, landmarks=standing_landmarks(scenario)),

@@ -145,17 +145,8 @@ def read_plan(path: Path, over: Layer | None = None, iterations: int | None = No
             raise InputError(
                 f"{path}: {name}: found {shown(settings)}, expected a table of settings"
             )
-    layer: Layer = {
-        key: Given(value, f"{path}: config.{name}")
-        for key, name, value in _settings(path, "config", within["config"])
-    }
-    if WORLD_KEY in layer and isinstance(layer[WORLD_KEY].value, str):
-        layer[WORLD_KEY] = Given(_beside(path, layer[WORLD_KEY].value), layer[WORLD_KEY].where)
-    layer |= over
     worlds: dict[str, World] = {}
-    if (world := named_world(layer)) is not None:
-        layer = settled(world, layer) | {WORLD_KEY: Given(world.name, layer[WORLD_KEY].where)}
-        worlds[world.name] = world
+    layer = _laid(path, within["config"], over, worlds)
     asked = [
         (key, name, _worlds(path, values, worlds) if key == WORLD_KEY else values)
         for key, name, values in _settings(path, "grid", within["grid"])
@@ -183,6 +174,22 @@ def read_plan(path: Path, over: Layer | None = None, iterations: int | None = No
     for _ in combinations(layer, grid, f"{path}: grid.", worlds):
         pass
     return plan
+
+
+def _laid(path: Path, table: Mapping[str, Any], over: Layer, worlds: dict[str, World]) -> Layer:
+    """Lay a plan's settings over those of the world that they name, and others over them."""
+    layer: Layer = {
+        key: Given(value, f"{path}: config.{name}")
+        for key, name, value in _settings(path, "config", table)
+    }
+    if WORLD_KEY in layer and isinstance(layer[WORLD_KEY].value, str):
+        layer[WORLD_KEY] = Given(_beside(path, layer[WORLD_KEY].value), layer[WORLD_KEY].where)
+    layer |= over
+    world = named_world(layer)
+    if world is None:
+        return layer
+    worlds[world.name] = world
+    return settled(world, layer) | {WORLD_KEY: Given(world.name, layer[WORLD_KEY].where)}
 
 
 def _beside(path: Path, folder: str) -> str:

@@ -28,7 +28,11 @@ from pipistrelle.evaluation.accuracy import (
     pose_error,
     position_error,
 )
-from pipistrelle.evaluation.bound import nees_of_exact_start, pose_bound
+from pipistrelle.evaluation.bound import (
+    bound_of_drawn_start,
+    nees_of_exact_start,
+    pose_bound,
+)
 from pipistrelle.evaluation.consistency import track_nees
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import (
@@ -49,6 +53,8 @@ if TYPE_CHECKING:
 ONLINE = ("position_rmse_m", "heading_rmse_rad", "nees_mean", "nees_max")
 """Scores that a table has of the path as it was believed at its time, too, if it was revised."""
 
+NEES_OF_DRAWN_START = (3.0, 6.0)
+"""Mean and variance of a consistent filter's NEES: chi-square of three numbers."""
 STEPS = ("position_error_m", "heading_error_rad", "nees", "nees_expected", "nees_variance")
 """What a table has of each frame: errors and NEES; of a consistent filter, mean and variance."""
 
@@ -271,6 +277,7 @@ def _heard_settings(case: PlannedCase) -> str:
     """Return as text all settings that bear on a case's world and on what is heard in it."""
     settings = case.config.model_dump(mode="json", exclude=set(SECTIONS))
     del settings["emitter"]["radius"]
+    settings["assumed"] = case.config.believed_celerity  # the rest is the filters' alone
     return json.dumps(settings)
 
 
@@ -305,11 +312,13 @@ class _Shared:
     def consistent(
         self, radius: float, strategy: Strategy, told: FilterConfig
     ) -> Float[np.ndarray, "k 2"]:
-        """Return mean and variance of a consistent filter's NEES at each frame, the start exact."""
+        """Return mean and variance of a consistent filter's NEES at each frame."""
         frames = slice(None, None, self._config.scenario.steps_per_frame)
+        path = self.scenario.path[frames]
+        if told.start == "drawn":
+            return np.tile(np.array(NEES_OF_DRAWN_START, np.float32), (len(path) - 1, 1))
         bound = self._bound_of(radius, strategy, _noise_alone(told))[frames]
-        start = np.diag(np.square(told.initial_pose_std))
-        expected = nees_of_exact_start(bound, self.scenario.path[frames], start)
+        expected = nees_of_exact_start(bound, path, _start_covariance(told))
         return np.column_stack(expected)[1:].astype(np.float32)
 
     def bound(
@@ -317,7 +326,10 @@ class _Shared:
     ) -> Float[np.ndarray, "t 3 3"]:
         """Return the bound of the pose at every step, the noise as the signal tells it."""
         measured = _noise_alone(told).model_copy(update={"noise": "measured"})
-        return self._bound_of(radius, strategy, measured)
+        bound = self._bound_of(radius, strategy, measured)
+        if told.start == "drawn":
+            return bound_of_drawn_start(bound, self.scenario.path, _start_covariance(told))
+        return bound
 
     def _scans(self, radius: float, strategy: Strategy, noise: FilterConfig) -> tuple[Scan, ...]:
         """Take the scans of a beam."""
@@ -333,6 +345,11 @@ class _Shared:
         return pose_bound(motion, world.controls, world.time, *truth, scans)
 
 
+def _start_covariance(told: FilterConfig) -> Float[np.ndarray, "3 3"]:
+    """Return how surely a filter is told the first pose."""
+    return np.diag(np.square(told.initial_pose_std))
+
+
 def _noise_alone(told: FilterConfig) -> FilterConfig:
     """Return of a filter's settings what states the noise, all else at its default."""
     noise = ("noise", "range_std", "bearing_std")
@@ -343,7 +360,7 @@ def _try_case(case: PlannedCase, shared: _Shared, iteration: int) -> TrialRecord
     """Run a trial, whatever comes of it; filters share what a beam and a strategy bring."""
     try:
         scenario, told = shared.scenario, case.config.filter
-        drive, radius = drive_of(scenario, case.config), case.config.emitter.radius
+        drive, radius = drive_of(scenario, case.config, iteration), case.config.emitter.radius
         heard, scans = shared.beams[radius], shared.scans(radius, case.strategy, told)
         began = time.thread_time()
         result = run_trial(replace(case, iteration=iteration), drive, scans, case.config)
