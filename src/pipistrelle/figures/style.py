@@ -12,6 +12,47 @@ INK = "#333333"
 """Text, the beacon, and any strategy without a colour of its own."""
 TRUTH = "#8a8a8a"
 """What is true: the path and the landmarks."""
+PAGE = {
+    "light": {
+        "paper": "#fbfaf7",
+        "card": "#ffffff",
+        "ink": "#22262b",
+        "soft": "#5d646d",
+        "line": "#e3e0d8",
+        "grid": "#e9e7e1",
+        "truth": TRUTH,
+        "span": "#dcd9d1",
+        "accent": "#b8384b",
+        "good": "#1c7a4d",
+        "bad": "#b3363f",
+        "wait": "#80630f",
+        "good-wash": "#e6f3ec",
+        "bad-wash": "#fae9ea",
+        "wait-wash": "#f8f0da",
+        **STRATEGY_COLOURS,
+    },
+    "dark": {
+        "paper": "#14171b",
+        "card": "#1b1f24",
+        "ink": "#e8e6e1",
+        "soft": "#a3a9b1",
+        "line": "#30353c",
+        "grid": "#2a2f36",
+        "truth": "#9a9fa6",
+        "span": "#343a42",
+        "accent": "#f2838f",
+        "good": "#6fcf9c",
+        "bad": "#f08b92",
+        "wait": "#e0bd5c",
+        "good-wash": "#17301f",
+        "bad-wash": "#3a1d20",
+        "wait-wash": "#332a12",
+        "active": "#7fb0f2",
+        "fused": "#f2838f",
+        "passive": "#f0bd45",
+    },
+}
+"""Colours of a page, by the scheme that its reader prefers."""
 COLUMNS = 3
 """Most panels beside each other; further ones start a new row."""
 
@@ -58,6 +99,27 @@ def strategy_colour(strategy: str) -> str:
     '#d1495b'
     """
     return STRATEGY_COLOURS.get(strategy, INK)
+
+
+def page_colours() -> str:
+    """Write the colours of a page as a style sheet's variables.
+
+    Returns
+    -------
+    str
+        CSS: a variable for each name of `PAGE`, light unless the reader prefers dark.
+
+    Examples
+    --------
+    >>> print(page_colours()[:25])
+    :root { --paper: #fbfaf7;
+    """
+
+    def root(scheme: str) -> str:
+        stated = " ".join(f"--{name}: {colour};" for name, colour in PAGE[scheme].items())
+        return f":root {{ {stated} }}"
+
+    return f"{root('light')}\n@media (prefers-color-scheme: dark) {{ {root('dark')} }}"
 
 
 def save_figure(figure: "Figure", folder: Path, name: str) -> tuple[Path, Path]:

@@ -18,7 +18,7 @@ from markupsafe import Markup
 from pipistrelle import __version__
 from pipistrelle.evaluation.comparison import Finding
 from pipistrelle.figures.chart import Chart, Panel, columns_of, csv_rows, csv_text
-from pipistrelle.figures.style import STRATEGY_COLOURS
+from pipistrelle.figures.style import page_colours
 from pipistrelle.files import REPORT, OwnFiles
 from pipistrelle.report.charts.results import CHARTS, study_charts
 from pipistrelle.report.charts.setting import model_charts
@@ -142,7 +142,7 @@ def page(
         models=[_figure(chart.name, {"always": [chart]}) for chart in models],
         style=Markup((here / "page.css").read_text(encoding="utf-8")),
         script=Markup((here / "page.js").read_text(encoding="utf-8")),
-        colours=STRATEGY_COLOURS,
+        colours=Markup(page_colours()),
         filters=filter_titles(study),
         papers=FILTERS,
         number_word=number_word,
