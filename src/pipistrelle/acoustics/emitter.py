@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import j1
 
-from pipistrelle.config import InputError
+from pipistrelle.config import Config, InputError
 
 HALF_POWER = 1.6163399483107033
 """Root x of (2 J1(x) / x)^2 = 1/2: ka sin(angle) where the beam has fallen to half its power."""
@@ -143,6 +143,26 @@ def beamwidth(
         raise InputError(f"radius: found {radius}, expected metres above 0; give a piston a size")
     k = 2.0 * np.pi * frequency / speed_of_sound
     return np.asarray(2.0 * np.arcsin(np.minimum(HALF_POWER / (k * np.asarray(radius)), 1.0)))
+
+
+def beamwidth_of(config: Config) -> float:
+    """Half-power beamwidth of the vehicle's call, as the settings have it.
+
+    Parameters
+    ----------
+    config : Config
+
+    Returns
+    -------
+    [rad]
+
+    Examples
+    --------
+    >>> round(float(np.degrees(beamwidth_of(Config()))), 1)
+    33.3
+    """
+    call = {"frequency": config.emitter.frequency, "speed_of_sound": config.air.celerity}
+    return float(beamwidth(config.emitter.radius, **call))
 
 
 def piston_radius(

@@ -94,6 +94,7 @@ def deliver(
     beamwidth: float | None = None,
     ignored_rows: dict[str, int] | None = None,
     beside: Mapping[str, bytes] = MappingProxyType({}),
+    log: Mapping[str, object] | None = None,
     watch: "MissionRecorder | None" = None,
 ) -> int:
     """Write results, figure and film in place of earlier ones, print the table, the folder last.
@@ -115,6 +116,8 @@ def deliver(
         Number of dropped log rows by reason; without it there was no log.
     beside : dict of name to content, optional
         Files that are to stand beside the results.
+    log : mapping, optional
+        Which log it was (`log_entry`).
     watch : MissionRecorder, optional
         What it saw becomes the film.
 
@@ -143,6 +146,7 @@ def deliver(
         truth=truth,
         ignored_rows=ignored_rows or {},
         beside=beside,
+        log=log,
         draw=draw,
     )
     if not options.quiet:

@@ -54,6 +54,7 @@ def run(
     config, known = mission_config(mission)
     ways = filters(estimator, mission.particles)
     _check_saved(save_log, save_world, output)
+    from pipistrelle.acoustics.emitter import beamwidth_of
     from pipistrelle.experiments.hearing.world_folder import kept_world, write_world
     from pipistrelle.experiments.hearing.worlds import ANY
     from pipistrelle.experiments.runs.preparing import warnings_of
@@ -84,7 +85,7 @@ def run(
             seed=config.seed,
             options=output,
             callers=done.scenario.callers[1:],
-            beamwidth=_beamwidth(done),
+            beamwidth=beamwidth_of(config),
             watch=watch,
         )
 
@@ -119,16 +120,6 @@ def _check_vacant(
             "would name it), so nothing in it was overwritten; name a new folder"
         )
     own.check(names)
-
-
-def _beamwidth(mission: "Mission") -> float:
-    """Return the half-power beamwidth of the vehicle's call [rad]."""
-    from pipistrelle.acoustics.emitter import beamwidth
-
-    emitter, air = mission.config.emitter, mission.config.air
-    return float(
-        beamwidth(emitter.radius, frequency=emitter.frequency, speed_of_sound=air.celerity)
-    )
 
 
 def _save_log(folder: Path, mission: "Mission", scans: "Sequence[Scan]") -> None:

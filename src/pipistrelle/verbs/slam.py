@@ -118,6 +118,7 @@ def slam(
     if beamwidth is not None and not 0 < beamwidth <= 360:
         raise InputError(f"--beamwidth: found {beamwidth:g}, expected above 0 and up to 360 [deg]")
     from pipistrelle.experiments.machine import check_memory
+    from pipistrelle.experiments.runs.again import log_entry
     from pipistrelle.experiments.runs.replay import load, replay
     from pipistrelle.verbs import delivery
 
@@ -145,6 +146,7 @@ def slam(
             options=output,
             beamwidth=beam,
             ignored_rows=recorded.ignored_rows,
+            log=log_entry(log, robot, beam),
             watch=watch,
         )
 

@@ -34,6 +34,8 @@ class Reader:
     robots : function of a folder, optional
         Lists the robots whose logs it holds, by number or by name: ``read`` is given one of these.
         Without it there is one, and it needs no name.
+    files : tuple of str
+        Patterns of what it may read in the folder, by which a log is known to be the same again.
     help, robot_help : str
         What the command line says of the folder, and of whom ``--robot`` chooses from.
     """
@@ -43,6 +45,7 @@ class Reader:
     recognises: Callable[[Path], bool]
     read: "Callable[..., Log]"
     robots: Callable[[Path], Sequence[Robot]] | None = None
+    files: tuple[str, ...] = ("*",)
     help: str = ""
     robot_help: str = ""
 
@@ -107,6 +110,7 @@ LOG_FOLDER = Reader(
     help="a log folder",
     recognises=lambda folder: (folder / "log.toml").exists(),
     read=_read_log_folder,
+    files=("log.toml", "odometry.csv", "measurements.csv"),
 )
 MRCLAM = Reader(
     name="mrclam",
@@ -116,6 +120,7 @@ MRCLAM = Reader(
     recognises=_is_mrclam,
     read=_read_mrclam,
     robots=_mrclam_robots,
+    files=("*.dat",),
 )
 READERS = (LOG_FOLDER, MRCLAM)
 """All formats, in the order in which they are asked."""

@@ -39,7 +39,7 @@ bearings counter-clockwise from the heading. S is the sensing strategy, F the fi
 
 | file | what it holds |
 |---|---|
-| summary.json | the scores of each estimate; null: no truth, or not a finite number |
+| summary.json | the scores of each estimate{log}; null: no truth, or not a finite number |
 | config.toml | every setting |
 | track_S_F.tum | estimated path, the start and every control step: time x y z qx qy qz qw |
 {online}| truth.tum | true path at the same times, where it is known |
@@ -49,6 +49,7 @@ bearings counter-clockwise from the heading. S is the sensing strategy, F the fi
 | measurements.parquet | what each strategy measured; no range where it was passive |
 | mission.* | pictures |
 | worlds/ | the world that was heard, where it was one of your own |
+| view.html | the mission frame by frame, once `pipistrelle view` on this folder has made it |
 | SHA256SUMS | what was written here: `--overwrite` touches nothing else (`sha256sum -c`) |
 
 RMSE and NEES leave out the start; after an exact one the NEES begins where the covariance is
@@ -60,6 +61,7 @@ gate rejected, ignored_rows what was dropped from a recorded log.
     evo_ape tum truth.tum track_S_F.tum --align
 """
 
+LOG = ", and which log was solved, how it was heard, and its files' sums"
 ONLINE = """\
 | track_S_F_online.tum | the same as it was believed at each time; F revised it by what came after |
 """
@@ -75,6 +77,7 @@ def write_results(
     truth: Truth,
     ignored_rows: dict[str, int],
     beside: Mapping[str, bytes] = MappingProxyType({}),
+    log: Mapping[str, object] | None = None,
     draw: Callable[[Path], None] = lambda _: None,
 ) -> None:
     """Write everything into a result folder, in place of earlier results.
@@ -96,6 +99,8 @@ def write_results(
         Number of dropped log rows by reason.
     beside : dict of name to content, optional
         Other files, relative to the folder.
+    log : mapping, optional
+        Which recorded log was solved, and how it was heard (`runs.again.log_entry`).
     draw : callable, optional
         Given a folder to draw the pictures into.
 
@@ -122,7 +127,8 @@ def write_results(
     settings = config.model_dump(mode="json", exclude_none=True)
     own.write("config.toml", tomli_w.dumps(settings))
     online = ONLINE if any(trial.online for trial in trials) else ""
-    readme = README.format(command=command, version=__version__, seed=seed, online=online)
+    told = {"online": online, "log": "" if log is None else LOG}
+    readme = README.format(command=command, version=__version__, seed=seed, **told)
     own.write("README.md", readme)
     for trial in trials:
         name, track = f"{trial.strategy}_{short_name(trial.filter)}", trial.track
@@ -144,6 +150,7 @@ def write_results(
         "version": __version__,
         "config_hash": config_hash(config),
         "seed": seed,
+        **({} if log is None else {"log": dict(log)}),
         "runs": [_run(trial, ignored_rows) for trial in trials],
     }
     own.write("summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
@@ -191,7 +198,25 @@ def config_hash(config: BaseModel) -> str:
     >>> config_hash(Config(seed=7)) == config_hash(Config()), len(config_hash(Config()))
     (True, 16)
     """
-    settings = config.model_dump(mode="json", exclude_none=True)
+    return settings_hash(config.model_dump(mode="json", exclude_none=True))
+
+
+def settings_hash(settings: Mapping[str, object]) -> str:
+    """Sixteen hexadecimal digits that stand for settings, as ``config.toml`` has them.
+
+    Parameters
+    ----------
+    settings : nested mapping
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> settings_hash({"seed": 7, "rays": {}}) == settings_hash({"rays": {}, "seed": 7})
+    True
+    """
     text = json.dumps(settings, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

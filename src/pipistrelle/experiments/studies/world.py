@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipistrelle.acoustics.emitter import beamwidth
+from pipistrelle.acoustics.emitter import beamwidth_of
 from pipistrelle.config import Config, FilterConfig, Strategy
 from pipistrelle.detection.faces import Heard
 from pipistrelle.detection.scans import Scan
@@ -424,8 +424,7 @@ def _beamwidth_deg(case: PlannedCase) -> float | None:
     """Return the half-power beamwidth of the vehicle's call, where it matters."""
     if case.strategy == "passive":
         return None
-    emitter, c = case.config.emitter, case.config.air.celerity
-    return degrees(beamwidth(emitter.radius, frequency=emitter.frequency, speed_of_sound=c))
+    return degrees(beamwidth_of(case.config))
 
 
 def _row(iteration: int, record: TrialRecord, columns: Sequence[str]) -> dict[str, Any]:
