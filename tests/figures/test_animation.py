@@ -6,7 +6,7 @@ from PIL import Image
 
 from pipistrelle.config import InputError
 from pipistrelle.estimation.beliefs import Landmarks, placed
-from pipistrelle.figures.animation import _pruned, _stage, animate_mission
+from pipistrelle.figures.animation import _stage, animate_mission, pruned
 from pipistrelle.figures.recorder import MissionRecorder
 from pipistrelle.geometry import range_and_bearing
 from reference.missions import map_with
@@ -142,10 +142,10 @@ def test_a_panel_shows_the_map_of_its_frame_and_rings_what_has_just_turned_full(
 def test_pruned_are_the_members_that_no_member_of_the_same_landmark_follows():
     before = rows_of([1, 1, 1, 2, 2], [0.7, 2.1, 6.4, 0.0, 5.0])
     after = rows_of([1, 1, 2, 3], [2.3, 6.0, 4.0, 0.7])
-    assert _pruned(before, after).tolist() == [True, False, False, True, False]
+    assert pruned(before, after).tolist() == [True, False, False, True, False]
     nothing = rows_of([], [])
-    assert _pruned(before, nothing).all()
-    assert len(_pruned(nothing, after)) == 0
+    assert pruned(before, nothing).all()
+    assert len(pruned(nothing, after)) == 0
 
 
 def test_an_mp4_without_ffmpeg_is_refused_with_the_fix(recorder, tmp_path, monkeypatch):

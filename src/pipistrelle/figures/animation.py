@@ -299,7 +299,7 @@ class _Panel:
         )
         self.full.set(verts=ellipses(rows.mean[full], rows.covariance[full], PLACED))
         self.dots.set_data(*rows.mean[full].T)
-        gone = _pruned(self.rows, rows)
+        gone = pruned(self.rows, rows)
         outlines = ellipses(self.rows.mean[gone], self.rows.covariance[gone], RAY)
         self.pruned.set(verts=outlines)
         age = np.array(
@@ -320,8 +320,27 @@ class _Panel:
         self.rows = rows
 
 
-def _pruned(before: Landmarks, after: Landmarks) -> Bool[np.ndarray, " h"]:
-    """Tell which rows of a map have no successor: none of the same landmark is nearest to them."""
+def pruned(before: Landmarks, after: Landmarks) -> Bool[np.ndarray, " h"]:
+    """Tell which rows of a map have no successor: none of the same landmark is nearest to them.
+
+    Parameters
+    ----------
+    before : Landmarks of h rows
+    after : Landmarks
+
+    Returns
+    -------
+    (h)
+
+    Examples
+    --------
+    >>> from pipistrelle.estimation.beliefs import no_landmarks
+    >>> def row(x):
+    ...     point = {"mean": np.array([[x, 0.0]]), "covariance": np.eye(2)[None]}
+    ...     return Landmarks(landmark=np.array([7]), weight=np.ones(1), **point)
+    >>> pruned(row(1.0), row(1.5)), pruned(row(1.0), no_landmarks())
+    (array([False]), array([ True]))
+    """
     gone = np.ones(len(before.landmark), dtype=bool)
     if len(gone):
         away = np.linalg.norm(before.mean[:, None] - after.mean, axis=2)

@@ -250,7 +250,22 @@ def _draw_clouds(maps: Sequence["Axes"], trials: Sequence[TrialResult], truth: T
 
 
 def _title(axes: "Axes", trial: TrialResult, truth: Truth) -> None:
-    """Say what the panel is and what came out; of how many landmarks, if that is known."""
+    """Say what the panel is and what came out."""
+    head(axes, trial.strategy, trial.filter).set_text(outcome(trial, truth))
+
+
+def outcome(trial: TrialResult, truth: Truth) -> str:
+    """Say what came of an estimate: its error, if known, and how many landmarks of how many.
+
+    Parameters
+    ----------
+    trial : TrialResult
+    truth : Truth
+
+    Returns
+    -------
+    str
+    """
     scores = trial.scores
     there = scores.landmarks_total if truth.landmarks is None else len(truth.landmarks[0])
     parts = [f"{scores.landmarks_full} of {there} landmarks placed"]
@@ -258,8 +273,7 @@ def _title(axes: "Axes", trial: TrialResult, truth: Truth) -> None:
         parts.insert(0, f"RMSE {rmse:.2f} m" if rmse < 100.0 else f"RMSE {rmse:.3g} m")
     if scores.diverged:
         parts = ["diverged", *parts[:-1]]
-    line = head(axes, trial.strategy, trial.filter)
-    line.set_text(" · ".join(parts))
+    return " · ".join(parts)
 
 
 def _draw_errors(rows: Sequence["Axes"], trial: TrialResult, true_path: np.ndarray) -> None:

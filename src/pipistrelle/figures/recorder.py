@@ -1,4 +1,4 @@
-"""What a filter believes while it runs, kept for a film."""
+"""What a filter believes while it runs, kept for a film or a page."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.beliefs import Belief, Landmarks, ParticleCloud
+from pipistrelle.estimation.beliefs import Belief, Landmarks, ParticleCloud, Trajectory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -18,16 +18,23 @@ class Snapshot:
     scan : Scan
     pose : (3) [m, m, rad]
         After the update.
+    covariance : (3, 3)
+        Of the pose.
     landmarks : Landmarks
         After the update.
     cloud : (p, 3) [m, m, rad] or None
         The poses of the particles, where there are any.
+    path : (k + 1, 2) [m] or None
+        Where the vehicle was at the start and after every control step so far, as it is believed
+        now: of a filter that revises its path, where it was asked.
     """
 
     scan: Scan
     pose: Float[np.ndarray, "3"]
+    covariance: Float[np.ndarray, "3 3"]
     landmarks: Landmarks
     cloud: Float[np.ndarray, "p 3"] | None = None
+    path: Float[np.ndarray, "t 2"] | None = None
 
 
 class MissionRecorder:
@@ -35,6 +42,14 @@ class MissionRecorder:
 
     An instance is called after each update, as the ``watch`` of a trial; ``snapshots`` holds a
     list for each (strategy, filter), in the order of their first frames.
+
+    Parameters
+    ----------
+    rest : int, optional
+        A filter that revises its path thinks all of it over, each time that it is asked for its
+        map: ask at the first frame and then so many frames later, or a sixtieth of those that it
+        has seen if that is more, and for the path every fifth time. In between the map stays.
+        Without it such a filter is asked for its map at every frame, and never for its path.
 
     Examples
     --------
@@ -54,15 +69,29 @@ class MissionRecorder:
     [(('fused', 'ekf'), 1)]
     """
 
-    def __init__(self) -> None:
+    def __init__(self, rest: int | None = None) -> None:
         self.snapshots: dict[tuple[str, str], list[Snapshot]] = {}
+        self._rest = rest
+        self._asked: dict[tuple[str, str], list[int]] = {}
 
     def __call__(self, strategy: str, estimator: str, scan: Scan, belief: Belief) -> None:
         """Keep a snapshot."""
+        frames = self.snapshots.setdefault((strategy, estimator), [])
+        path, landmarks = None, None
+        if self._rest is not None and isinstance(belief, Trajectory):
+            asked = self._asked.setdefault((strategy, estimator), [])
+            if asked and len(frames) - asked[-1] < max(self._rest, len(frames) // 60):
+                landmarks = frames[-1].landmarks
+            else:
+                path = belief.path().mean[:, :2] if len(asked) % 5 == 0 else None
+                asked.append(len(frames))
+        pose = belief.pose()
         snapshot = Snapshot(
             scan=scan,
-            pose=belief.pose().mean,
-            landmarks=belief.landmarks(),
+            pose=pose.mean,
+            covariance=pose.covariance,
+            landmarks=belief.landmarks() if landmarks is None else landmarks,
             cloud=belief.cloud() if isinstance(belief, ParticleCloud) else None,
+            path=path,
         )
-        self.snapshots.setdefault((strategy, estimator), []).append(snapshot)
+        frames.append(snapshot)
