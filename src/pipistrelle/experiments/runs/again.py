@@ -21,6 +21,8 @@ from pipistrelle.detection.logs.readers import Robot, reader_of
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.hearing.listening import Progress
+from pipistrelle.experiments.hearing.world_folder import read_world
+from pipistrelle.experiments.hearing.worlds import ANY
 from pipistrelle.experiments.results.reading import SUMMARY, Summary, read_summary
 from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.results.tables import tum_text
@@ -111,7 +113,9 @@ def again(
     filters = list(dict.fromkeys(run.filter for run in summary.runs))
     if summary.log is None:
         _check_simulated(folder, log)
-        mission = run_mission(config, strategies, filters, progress=progress, watch=watch)
+        world = ANY if (kept := config.scenario.world) is None else read_world(Path(kept))
+        looking = {"progress": progress, "watch": watch}
+        mission = run_mission(config, strategies, filters, world=world, **looking)
         trials, truth = mission.trials, mission.drive.truth
         callers, beam = mission.scenario.callers[1:], beamwidth_of(config)
     else:
