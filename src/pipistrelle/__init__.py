@@ -1,3 +1,33 @@
-"""Sonar SLAM with one's own calls, someone else's, or both: from waveform to verdict."""
+"""Sonar SLAM with one's own calls, someone else's, or both: from waveform to verdict.
+
+>>> import pipistrelle
+>>> done = pipistrelle.run(seed=7, duration=4.0, strategies="fused")
+>>> done.summary["landmarks_full"].item() > 0
+True
+"""
+
+from importlib import import_module
+from typing import Any
 
 __version__ = "0.1.0"
+__all__ = ["Config", "InputError", "load", "run", "slam", "study"]
+_ROOMS = {
+    "Config": "config",
+    "InputError": "config",
+    "load": "scripting.loading",
+    "run": "scripting.results",
+    "slam": "scripting.results",
+    "study": "scripting.studies",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Find what is asked for when it is asked for: importing the package loads nothing else."""
+    if name in _ROOMS:
+        return getattr(import_module(f"pipistrelle.{_ROOMS[name]}"), name)
+    raise AttributeError(f"module 'pipistrelle' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """List what there is."""
+    return [*__all__, "__version__"]

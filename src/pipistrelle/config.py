@@ -226,8 +226,8 @@ class FilterConfig(Section):
     """[rad]"""
     initial_pose_std: tuple[NonNegative, NonNegative, NonNegative] = (0.05, 0.05, 0.0436)
     """x, y [m], heading [rad]"""
-    start: Literal["exact", "drawn"] = "exact"
-    """The first pose that they are told: the true one (the paper's), or drawn with these."""
+    first_pose: Literal["exact", "drawn"] = "exact"
+    """What they are told of the start: the true pose (the paper's), or one drawn with these."""
     gate: Probability = 1.0
     """Measurements outside this share of their predicted distribution are dropped; 1: none."""
     robust: Literal["none", "huber"] = "none"

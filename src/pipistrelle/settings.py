@@ -184,6 +184,73 @@ def from_flags(values: Mapping[str, Any]) -> Layer:
     return _layer(given, lambda key: "--" + ".".join(key).replace("_", "-"))
 
 
+def from_keywords(values: Mapping[str, Any]) -> Layer:
+    """Name the settings that were given as keywords of a call.
+
+    Parameters
+    ----------
+    values : mapping
+        Settings, and sections of settings; two underscores part a section from its settings.
+
+    Returns
+    -------
+    Layer
+
+    Raises
+    ------
+    InputError
+        A keyword that is no setting.
+
+    Examples
+    --------
+    >>> from_keywords({"rays__power": 8.0, "air": {"temperature_c": 5.0}})["rays", "power"]
+    Given(value=8.0, where='rays__power')
+    >>> from_keywords({"rays__powr": 8.0})
+    Traceback (most recent call last):
+    pipistrelle.config.InputError: rays__powr: no such setting; did you mean rays__power?
+    """
+    given = leaves(spread(values, "__"), known_settings())
+    return _layer(given, "__".join)
+
+
+def spread(table: Mapping[str, Any], parts: str) -> dict[str, Any]:
+    """Spread names with parts over nested tables.
+
+    Parameters
+    ----------
+    table : mapping
+    parts : str
+        What stands between two parts of a name.
+
+    Returns
+    -------
+    dict
+
+    Raises
+    ------
+    InputError
+        A name that is a value and a section.
+
+    Examples
+    --------
+    >>> spread({"seed": 3, "rays.power": 8.0, "rays": {"prune": 0.1}}, ".")
+    {'seed': 3, 'rays': {'power': 8.0, 'prune': 0.1}}
+    """
+    nested: dict[str, Any] = {}
+    for name, value in table.items():
+        *sections, leaf = str(name).split(parts)
+        inner: Any = nested
+        for section in (*sections, *([leaf] if isinstance(value, Mapping) else ())):
+            inner = inner.setdefault(section, {})
+            if not isinstance(inner, dict):
+                raise InputError(f"{name}: found {section} as a value too; give a section or one")
+        if isinstance(value, Mapping):
+            inner |= spread(value, parts)
+        else:
+            inner[leaf] = value
+    return nested
+
+
 def resolve(layer: Layer) -> Config:
     """Check the settings and complete them with the defaults.
 

@@ -10,7 +10,7 @@ import pytest
 
 from pipistrelle import files
 from pipistrelle.estimation.catalogue import PAPERS
-from pipistrelle.experiments.runs import trial
+from pipistrelle.scripting import missions
 from reference.command_line import COMPILING, SHORT, contents, summary, table, track
 
 
@@ -34,13 +34,13 @@ def test_a_run_tells_its_stages_its_scores_and_last_its_folder(obey):
 
 
 def test_both_filters_are_told_compared_and_drawn_in_100_columns(obey, monkeypatch):
-    run_mission, seen = trial.run_mission, []
+    run_mission, seen = missions.run_mission, []
 
     def seeing(*words, **named):
         seen.append(run_mission(*words, **named))
         return seen[-1]
 
-    monkeypatch.setattr(trial, "run_mission", seeing)
+    monkeypatch.setattr(missions, "run_mission", seeing)
     status, printed, said = obey("run", *SHORT, "--filter", "both", "--particles", "7", "-o", "one")
     assert status == 0
     names = [(s, f) for s in ("active", "fused", "passive") for f in PAPERS]
@@ -61,7 +61,7 @@ def test_both_filters_are_told_compared_and_drawn_in_100_columns(obey, monkeypat
 
 
 def test_the_closing_table_keeps_its_columns_however_large_its_numbers(obey, monkeypatch, undrawn):
-    run_mission = trial.run_mission
+    run_mission = missions.run_mission
 
     def wild(*words, **named):
         mission = run_mission(*words, **named)
@@ -69,7 +69,7 @@ def test_the_closing_table_keeps_its_columns_however_large_its_numbers(obey, mon
         scores = replace(first.scores, position_rmse_m=-1.234e300, nees_max=float("inf"))
         return replace(mission, trials=(replace(first, scores=scores), *others))
 
-    monkeypatch.setattr(trial, "run_mission", wild)
+    monkeypatch.setattr(missions, "run_mission", wild)
     rows = table(obey("run", *SHORT, "-o", "one")[1])
     assert rows["position RMSE [m]"][0] == " -1.23e+300"
     assert rows["NEES, largest"][0].strip() == "inf"
@@ -98,7 +98,7 @@ def test_results_are_replaced_only_when_asked(obey, refused, undrawn):
 
 @pytest.mark.parametrize("trouble", [KeyboardInterrupt, MemoryError])
 @pytest.mark.parametrize(
-    "place", ["experiments.runs.trial.run_mission", "figures.mission.draw_mission"]
+    "place", ["scripting.missions.run_mission", "figures.mission.draw_mission"]
 )
 def test_earlier_results_and_logs_outlive_a_mission_that_comes_to_nothing(
     obey, undrawn, monkeypatch, trouble, place
@@ -119,7 +119,7 @@ def test_earlier_results_and_logs_outlive_a_mission_that_comes_to_nothing(
 
 
 def test_an_estimate_that_is_not_finite_is_a_failed_trial(obey, monkeypatch, undrawn):
-    run_mission = trial.run_mission
+    run_mission = missions.run_mission
 
     def lost(*words, **named):
         mission = run_mission(*words, **named)
@@ -128,7 +128,7 @@ def test_an_estimate_that_is_not_finite_is_a_failed_trial(obey, monkeypatch, und
         failed = replace(done, track=replace(done.track, pose=pose))
         return replace(mission, trials=(failed, *mission.trials[1:]))
 
-    monkeypatch.setattr(trial, "run_mission", lost)
+    monkeypatch.setattr(missions, "run_mission", lost)
     status, printed, said = obey("run", *SHORT, "-o", "one")
     assert (status, printed.splitlines()[-1]) == (1, "one")
     assert "warning: active ekf failed" in said

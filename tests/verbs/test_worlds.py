@@ -99,7 +99,7 @@ def test_a_world_that_a_file_names_lies_where_the_file_does(obey, here):
             "--world and --scenario.world are one setting",
         ),
         (("--save-world", "here/posts [1]"), "is not empty; name a new folder or add --overwrite"),
-        (("--save-world", "here/posts [1]", "--overwrite"), "holds nothing of Pipistrelle"),
+        (("--save-world", "here/posts [1]", "--overwrite"), "holds no world of Pipistrelle"),
         (("--save-world", "two", "-o", "two"), "two is the result folder; name another"),
         (("--save-world", "a", "--save-log", "a"), "a is that of --save-log; name another"),
         (("--save-world", "one", "--overwrite"), "one: holds results of Pipistrelle, which a wor"),

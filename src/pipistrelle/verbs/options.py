@@ -3,15 +3,15 @@
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from math import radians
 from pathlib import Path
 from types import MappingProxyType, NoneType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict, Union, get_args, get_origin
 
 from cyclopts import Group, Parameter, convert
 
-from pipistrelle.config import STRATEGIES, Config, InputError, Strategy
-from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, entry
+from pipistrelle.config import Config, InputError
+from pipistrelle.estimation.catalogue import CATALOGUE, entry
+from pipistrelle.scripting.asking import WORLD, mission_settings, named_filters
 from pipistrelle.settings import (
     Given,
     Key,
@@ -20,7 +20,6 @@ from pipistrelle.settings import (
     from_file,
     from_flags,
     known_settings,
-    resolve,
 )
 
 Chosen = Literal["active", "fused", "passive", "all"]
@@ -208,31 +207,19 @@ def mission_config(options: MissionOptions) -> tuple[Config, "World | None"]:
     >>> config.scenario.steps
     480
     """
-    layer = layers(options.config, options.settings)
     short: Layer = {
-        ("scenario", "world"): Given(options.world and str(options.world), "--world"),
+        WORLD: Given(options.world and str(options.world), "--world"),
         ("scenario", "landmarks"): Given(options.landmarks, "--landmarks"),
         ("receiver", "engine"): Given(options.engine, "--engine"),
         ("fastslam", "particles"): Given(options.particles, "--particles"),
     }
-    world, layer = _on_world(layer | short_names(short, options.settings))
-    base = resolve(layer)
-    if options.duration is not None:
-        steps = _steps(options.duration, base)
-        short["scenario", "steps"] = Given(steps, f"--duration {options.duration:g}")
-    if options.beamwidth is not None:
-        short["emitter", "radius"] = Given(_radius(options.beamwidth, base), "--beamwidth")
-    return resolve(layer | short_names(short, options.settings)), world
-
-
-def _on_world(layer: Layer) -> tuple["World | None", Layer]:
-    """Lay the settings of the world that others name beneath them."""
-    if ("scenario", "world") not in layer:
-        return None, layer
-    from pipistrelle.experiments.hearing.world_folder import named_world, settled
-
-    world = named_world(layer)
-    return world, layer if world is None else settled(world, layer)
+    return mission_settings(
+        layers(options.config, None),
+        from_flags(options.settings or {}),
+        short,
+        beamwidth=Given(options.beamwidth, "--beamwidth"),
+        duration=Given(options.duration, "--duration"),
+    )
 
 
 def layers(config: Path | None, settings: SettingFlags | None) -> Layer:
@@ -254,57 +241,6 @@ def layers(config: Path | None, settings: SettingFlags | None) -> Layer:
     """
     file = {} if config is None else from_file(config)
     return file | from_environment(os.environ) | from_flags(settings or {})
-
-
-def short_names(short: Layer, settings: SettingFlags | None) -> Layer:
-    """Keep the short names that were given.
-
-    Parameters
-    ----------
-    short : Layer
-        Of the value None where the name was not given.
-    settings : nested dict, optional
-
-    Returns
-    -------
-    Layer
-
-    Raises
-    ------
-    InputError
-        Where the setting was given by its own flag too.
-
-    Examples
-    --------
-    >>> short_names({("seed",): Given(3, "-s")}, {"seed": 4})
-    Traceback (most recent call last):
-    pipistrelle.config.InputError: -s and --seed are one setting; give one of them
-    """
-    flags = from_flags(settings or {})
-    short = {key: given for key, given in short.items() if given.value is not None}
-    for key in short.keys() & flags.keys():
-        both = f"{short[key].where} and {flags[key].where}"
-        raise InputError(f"{both} are one setting; give one of them")
-    return short
-
-
-def strategies(chosen: Chosen) -> tuple[Strategy, ...]:
-    """Name the strategies of a choice.
-
-    Parameters
-    ----------
-    chosen : one strategy, or "all"
-
-    Returns
-    -------
-    tuple of str
-
-    Examples
-    --------
-    >>> strategies("all"), strategies("fused")
-    (('active', 'fused', 'passive'), ('fused',))
-    """
-    return STRATEGIES if chosen == "all" else (chosen,)
 
 
 def filters(chosen: ChosenFilter, particles: int | None) -> tuple[str, ...]:
@@ -330,7 +266,7 @@ def filters(chosen: ChosenFilter, particles: int | None) -> tuple[str, ...]:
     >>> filters("both", 300), filters("ekf", None)
     (('ekf', 'fastslam'), ('ekf',))
     """
-    names = PAPERS if chosen == "both" else (chosen,)
+    names = named_filters(chosen)
     if particles is not None and not any("fastslam" in entry(n).sections for n in names):
         able = [known.name for known in CATALOGUE.values() if "fastslam" in known.sections]
         others = " or ".join(f"--filter {name}" for name in (*able, "both"))
@@ -338,31 +274,4 @@ def filters(chosen: ChosenFilter, particles: int | None) -> tuple[str, ...]:
             f"--particles: found {particles}, but --filter is {chosen}, which has none; "
             f"add {others}"
         )
-    for name in names:
-        entry(name)
     return names
-
-
-def _steps(duration: float, config: Config) -> int:
-    """Count the control steps of a drive; at least one frame."""
-    scenario = config.scenario
-    frame = scenario.step * scenario.steps_per_frame
-    if not frame <= duration or duration / scenario.step == float("inf"):
-        raise InputError(
-            f"--duration: found {duration:g}, expected at least one frame ({frame:g} s), "
-            "in finite time"
-        )
-    return round(duration / scenario.step)
-
-
-def _radius(beamwidth: float, config: Config) -> float:
-    """Find the piston that makes a beamwidth [deg]."""
-    from pipistrelle.acoustics.emitter import piston_radius
-
-    return float(
-        piston_radius(
-            radians(beamwidth),
-            frequency=config.emitter.frequency,
-            speed_of_sound=config.air.celerity,
-        )
-    )

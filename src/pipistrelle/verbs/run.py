@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from pipistrelle.config import InputError
 from pipistrelle.files import LOG, WORLD, OwnFiles
+from pipistrelle.scripting.asking import named_strategies
 from pipistrelle.verbs.options import (
     Chosen,
     ChosenFilter,
@@ -16,7 +17,6 @@ from pipistrelle.verbs.options import (
     OutputOptions,
     filters,
     mission_config,
-    strategies,
 )
 
 if TYPE_CHECKING:
@@ -54,40 +54,24 @@ def run(
     config, known = mission_config(mission)
     ways = filters(estimator, mission.particles)
     _check_saved(save_log, save_world, output)
-    from pipistrelle.acoustics.emitter import beamwidth_of
-    from pipistrelle.experiments.hearing.world_folder import kept_world, write_world
-    from pipistrelle.experiments.hearing.worlds import ANY
-    from pipistrelle.experiments.runs.preparing import warnings_of
-    from pipistrelle.experiments.runs.trial import run_mission
+    from pipistrelle.experiments.hearing.world_folder import write_world
+    from pipistrelle.scripting.missions import simulated
     from pipistrelle.verbs import delivery
     from pipistrelle.verbs.console import progress
     from pipistrelle.verbs.streams import warn
 
     with delivery.result_folder(output, "run") as folder:
         delivery.get_ready(output)
-        watch = delivery.recorder(output)
+        watch, chosen = delivery.recorder(output), named_strategies(strategy)
         with progress(output.quiet) as show:
-            looking = {"progress": show, "watch": watch}
-            done = run_mission(config, strategies(strategy), ways, world=known or ANY, **looking)
-        warn(*warnings_of(config, done.scenario.callers))
+            done, heard = simulated(config, chosen, ways, known, progress=show, watch=watch)
+        warn(*done.said)
         if save_world is not None:
-            write_world(save_world, done.scenario, config)
+            write_world(save_world, heard.scenario, config)
         if save_log is not None:
-            heard = {trial.strategy: trial.scans for trial in done.trials}
-            _save_log(save_log, done, heard.get("fused", done.trials[0].scans))
-        kept, files = (config, {}) if known is None else kept_world(config, known)
-        return delivery.deliver(
-            folder,
-            done.trials,
-            done.drive.truth,
-            config=kept,
-            beside=files,
-            seed=config.seed,
-            options=output,
-            callers=done.scenario.callers[1:],
-            beamwidth=beamwidth_of(config),
-            watch=watch,
-        )
+            scans = {trial.strategy: trial.scans for trial in done.trials}
+            _save_log(save_log, heard, scans.get("fused", done.trials[0].scans))
+        return delivery.deliver(folder, done, output, watch)
 
 
 def _check_saved(log: Path | None, world: Path | None, output: OutputOptions) -> None:
@@ -115,8 +99,9 @@ def _check_vacant(
     if not output.overwrite:
         raise InputError(f"{flag}: {folder} is not empty; name a new folder or add --overwrite")
     if not (own := OwnFiles(folder, kind)):
+        what = kind.removeprefix("a ")
         raise InputError(
-            f"{flag}: {folder} is not empty and holds nothing of Pipistrelle (its SHA256SUMS "
+            f"{flag}: {folder} is not empty and holds no {what} of Pipistrelle (its SHA256SUMS "
             "would name it), so nothing in it was overwritten; name a new folder"
         )
     own.check(names)

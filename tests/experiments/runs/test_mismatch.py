@@ -85,7 +85,7 @@ def test_a_bias_moves_the_vehicle_and_is_told_to_nobody(model):
 
 
 def test_starts_are_drawn_as_surely_as_the_filters_are_told():
-    config = with_(filter=FilterConfig(start="drawn"))
+    config = with_(filter=FilterConfig(first_pose="drawn"))
     world, std = world_of(config), np.array(config.filter.initial_pose_std)
     off = np.array([drive_of(world, config, i).start.mean for i in range(2000)]) - world.path[0]
     drawn = off / std
@@ -98,7 +98,7 @@ def test_starts_are_drawn_as_surely_as_the_filters_are_told():
 
 
 def test_the_bound_of_a_drawn_start_is_that_of_not_knowing_it():
-    exact, drawn = (with_(filter=FilterConfig(start=start)) for start in ("exact", "drawn"))
+    exact, drawn = (with_(filter=FilterConfig(first_pose=start)) for start in ("exact", "drawn"))
     missions = [run_mission(config, ["fused"]) for config in (exact, drawn)]
     bounds = [mission.trials[0].scores.position_bound_m for mission in missions]
     world = missions[1].scenario
@@ -119,7 +119,7 @@ def test_a_study_hears_a_world_once_for_all_that_filters_assume():
     ways = {"strategies": ("fused",), "filters": ("ekf",)}
     grid = {
         "assumed.wheelbase": (0.15, 0.2),
-        "filter.start": ("exact", "drawn"),
+        "filter.first_pose": ("exact", "drawn"),
         "assumed.speed_of_sound": (335.0, 343.0),
     }
     plan = Plan(name="wrong", iterations=1, config=with_(), grid=grid, **ways)
@@ -127,6 +127,6 @@ def test_a_study_hears_a_world_once_for_all_that_filters_assume():
     records = run_world(plan, 0)
     assert all(record.error is None for record in records)
     assert len({record.scores.position_rmse_m for record in records}) == 8
-    expected = {record.case.values["filter.start"]: record.steps[:, 3:] for record in records}
+    expected = {record.case.values["filter.first_pose"]: record.steps[:, 3:] for record in records}
     assert np.unique(expected["drawn"], axis=0).tolist() == [[3.0, 6.0]]
     assert expected["exact"][:, 0].max() < 3.0

@@ -203,7 +203,7 @@ OTHERS = {
     "filter.range_std": 0.4,
     "filter.bearing_std": 0.05,
     "filter.initial_pose_std": [0.1, 0.1, 0.1],
-    "filter.start": "drawn",
+    "filter.first_pose": "drawn",
     "filter.gate": 0.05,
     "rays.ratio": 0.2,
     "rays.density": 2.0,

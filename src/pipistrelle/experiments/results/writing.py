@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import BaseModel
@@ -27,6 +28,9 @@ from pipistrelle.experiments.results.tables import (
     tum_text,
 )
 from pipistrelle.files import RESULTS, OwnFiles
+
+if TYPE_CHECKING:
+    import polars as pl
 
 FORMAT = 1
 README = """\
@@ -140,7 +144,10 @@ def write_results(
     if truth.path is not None:
         known = np.isfinite(truth.path).all(axis=1)
         own.write("truth.tum", tum_text(truth.time[known], truth.path[known]))
-    _write_tables(own, trials, truth)
+    for name, table in tables_of(trials, truth).items():
+        buffer = io.BytesIO()
+        table.write_parquet(buffer)
+        own.write(f"{name}.parquet", buffer.getvalue())
     for name, content in beside.items():
         own.write(name, content)
     with own.room() as room:
@@ -151,13 +158,24 @@ def write_results(
         "config_hash": config_hash(config),
         "seed": seed,
         **({} if log is None else {"log": dict(log)}),
-        "runs": [_run(trial, ignored_rows) for trial in trials],
+        "runs": [run_entry(trial, ignored_rows) for trial in trials],
     }
     own.write("summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
 
 
-def _write_tables(own: OwnFiles, trials: Sequence[TrialResult], truth: Truth) -> None:
-    """Write the tables of all trials; those of one strategy share their measurements."""
+def tables_of(trials: Sequence[TrialResult], truth: Truth) -> "dict[str, pl.DataFrame]":
+    """Lay out the tables of a mission; trials of one strategy share their measurements.
+
+    Parameters
+    ----------
+    trials : sequence of TrialResult
+    truth : Truth
+
+    Returns
+    -------
+    dict of DataFrame
+        ``steps``, ``landmarks`` and ``measurements``, as the files of these names hold them.
+    """
     import polars as pl
 
     def named(table: pl.DataFrame, **names: str) -> pl.DataFrame:
@@ -172,11 +190,7 @@ def _write_tables(own: OwnFiles, trials: Sequence[TrialResult], truth: Truth) ->
         ],
         "measurements": [named(measurement_table(s), strategy=name) for name, s in heard.items()],
     }
-    for name, parts in tables.items():
-        if parts:
-            buffer = io.BytesIO()
-            pl.concat(parts).write_parquet(buffer)
-            own.write(f"{name}.parquet", buffer.getvalue())
+    return {name: pl.concat(parts) for name, parts in tables.items() if parts}
 
 
 def config_hash(config: BaseModel) -> str:
@@ -221,8 +235,19 @@ def settings_hash(settings: Mapping[str, object]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _run(trial: TrialResult, ignored_rows: dict[str, int]) -> dict[str, object]:
-    """Return a trial's entry of the summary; what is not finite becomes null."""
+def run_entry(trial: TrialResult, ignored_rows: Mapping[str, int]) -> dict[str, object]:
+    """Return a trial's entry of the summary.
+
+    Parameters
+    ----------
+    trial : TrialResult
+    ignored_rows : dict
+
+    Returns
+    -------
+    dict
+        What is not finite becomes None.
+    """
     run: dict[str, object] = {
         "strategy": trial.strategy,
         "filter": trial.filter,

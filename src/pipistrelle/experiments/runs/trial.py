@@ -146,7 +146,11 @@ def _bounds(
     known, bounds = replace(drive, motion=motion_of(config.motion)), {}
     for name in strategies:
         bound = drive_bound(known, scans_of(heard, name, told))
-        if bound is not None and config.filter.start == "drawn" and drive.truth.path is not None:
+        if (
+            bound is not None
+            and config.filter.first_pose == "drawn"
+            and drive.truth.path is not None
+        ):
             bound = bound_of_drawn_start(bound, drive.truth.path, drive.start.covariance)
         bounds[name] = bound
     return bounds
@@ -168,7 +172,7 @@ def drive_of(scenario: Scenario, config: Config, iteration: int = 0) -> Drive:
         Its true landmarks are the landmarks and then the callers that stand: the beacon is last.
     """
     start, spread = scenario.path[0], np.array(config.filter.initial_pose_std)
-    if config.filter.start == "drawn":
+    if config.filter.first_pose == "drawn":
         start = start + spread * _generator(config.seed, iteration, "start").standard_normal(3)
         start[2] = wrap_angle(start[2])
     return Drive(

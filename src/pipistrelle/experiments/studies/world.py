@@ -315,7 +315,7 @@ class _Shared:
         """Return mean and variance of a consistent filter's NEES at each frame."""
         frames = slice(None, None, self._config.scenario.steps_per_frame)
         path = self.scenario.path[frames]
-        if told.start == "drawn":
+        if told.first_pose == "drawn":
             return np.tile(np.array(NEES_OF_DRAWN_START, np.float32), (len(path) - 1, 1))
         bound = self._bound_of(radius, strategy, _noise_alone(told))[frames]
         expected = nees_of_exact_start(bound, path, _start_covariance(told))
@@ -327,7 +327,7 @@ class _Shared:
         """Return the bound of the pose at every step, the noise as the signal tells it."""
         measured = _noise_alone(told).model_copy(update={"noise": "measured"})
         bound = self._bound_of(radius, strategy, measured)
-        if told.start == "drawn":
+        if told.first_pose == "drawn":
             return bound_of_drawn_start(bound, self.scenario.path, _start_covariance(told))
         return bound
 

@@ -1,0 +1,228 @@
+"""What is asked for in words: settings by keyword, strategies and estimators by name.
+
+Words come from a command line or from Python; where each was given is said in its refusal.
+"""
+
+from collections.abc import Mapping, Sequence
+from math import isfinite, radians
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+from pipistrelle.config import STRATEGIES, Config, InputError, Strategy
+from pipistrelle.estimation.catalogue import PAPERS, check_distinct, entry
+from pipistrelle.refusals import meant, shown
+from pipistrelle.settings import (
+    Given,
+    Key,
+    Layer,
+    from_file,
+    from_flags,
+    from_table,
+    resolve,
+    spread,
+)
+
+if TYPE_CHECKING:
+    from pipistrelle.experiments.hearing.worlds import World
+
+Base = Config | Mapping[str, Any] | str | Path | None
+"""Settings to start from: as they were resolved, as a table, or the file that holds it."""
+STEPS: Key = ("scenario", "steps")
+RADIUS: Key = ("emitter", "radius")
+WORLD: Key = ("scenario", "world")
+
+
+def base_layer(base: Base) -> Layer:
+    """Name the settings to start from.
+
+    Parameters
+    ----------
+    base : Config, mapping, path or None
+
+    Returns
+    -------
+    Layer
+
+    Raises
+    ------
+    InputError
+        A key that is no setting.
+
+    Examples
+    --------
+    >>> base_layer({"rays.power": 3.0})["rays", "power"]
+    Given(value=3.0, where='config: rays.power')
+    """
+    if base is None:
+        return {}
+    if isinstance(base, Config):
+        return from_flags(base.model_dump(mode="json", exclude_defaults=True))
+    if isinstance(base, Mapping):
+        return from_table(spread(base, "."), "config: ")
+    return from_file(Path(base))
+
+
+def short_names(short: Layer, flags: Layer) -> Layer:
+    """Keep the short names that were given.
+
+    Parameters
+    ----------
+    short : Layer
+        Of the value None where the name was not given.
+    flags : Layer
+        What was given by its own name.
+
+    Returns
+    -------
+    Layer
+
+    Raises
+    ------
+    InputError
+        Where a setting was given by both names.
+
+    Examples
+    --------
+    >>> short_names({("seed",): Given(3, "-s")}, {("seed",): Given(4, "--seed")})
+    Traceback (most recent call last):
+    pipistrelle.config.InputError: -s and --seed are one setting; give one of them
+    """
+    short = {key: given for key, given in short.items() if given.value is not None}
+    for key in short.keys() & flags.keys():
+        both = f"{short[key].where} and {flags[key].where}"
+        raise InputError(f"{both} are one setting; give one of them")
+    return short
+
+
+def mission_settings(
+    beneath: Layer, flags: Layer, short: Layer, *, beamwidth: Given, duration: Given
+) -> tuple[Config, "World | None"]:
+    """Resolve the settings of a mission: defaults < world < beneath < flags.
+
+    Parameters
+    ----------
+    beneath, flags : Layer
+    short : Layer
+        Settings by their short names.
+    beamwidth, duration : Given
+        Half-power beamwidth of the vehicle's call [deg], length of the drive [s], or None.
+
+    Returns
+    -------
+    Config
+    World or None
+        The one that the settings name.
+
+    Raises
+    ------
+    InputError
+        An unknown setting or a refused value, a setting given twice, less than one frame.
+
+    Examples
+    --------
+    >>> nothing = Given(None, "")
+    >>> minute = Given(60.0, "duration")
+    >>> config, _ = mission_settings({}, {}, {}, beamwidth=nothing, duration=minute)
+    >>> config.scenario.steps
+    480
+    """
+    layer = beneath | flags | short_names(short, flags)
+    world = None
+    if WORLD in layer:
+        from pipistrelle.experiments.hearing.world_folder import named_world, settled
+
+        world = named_world(layer)
+        layer = layer if world is None else settled(world, layer)
+    base, more = resolve(layer), {}
+    if duration.value is not None:
+        more[STEPS] = Given(_steps(duration, base), f"{duration.where} {duration.value:g}")
+    if beamwidth.value is not None:
+        more[RADIUS] = Given(_radius(beamwidth.value, base), beamwidth.where)
+    return resolve(layer | short_names(more, flags)), world
+
+
+def named_strategies(chosen: str | Sequence[str]) -> tuple[Strategy, ...]:
+    """Name the strategies of a choice.
+
+    Parameters
+    ----------
+    chosen : one strategy, several, or "all"
+
+    Returns
+    -------
+    tuple of str
+
+    Raises
+    ------
+    InputError
+        For anything else.
+
+    Examples
+    --------
+    >>> named_strategies("all"), named_strategies(["fused"])
+    (('active', 'fused', 'passive'), ('fused',))
+    """
+    if isinstance(chosen, str):
+        chosen = STRATEGIES if chosen == "all" else (chosen,)
+    for one in chosen:
+        if one not in get_args(Strategy):
+            near = meant(str(one), STRATEGIES)
+            fix = f"did you mean {near!r}?" if near else "choose"
+            expected = "'active', 'fused', 'passive' or 'all'"
+            raise InputError(f"strategies: found {shown(one)}, expected {expected}; {fix}")
+    return tuple(one for one in STRATEGIES if one in chosen)
+
+
+def named_filters(chosen: str | Sequence[str]) -> tuple[str, ...]:
+    """Name the filters of a choice.
+
+    Parameters
+    ----------
+    chosen : the name of an estimator, several, or "both", the paper's two
+
+    Returns
+    -------
+    tuple of str
+
+    Raises
+    ------
+    InputError
+        For an estimator that is not there, or two of one short name.
+
+    Examples
+    --------
+    >>> named_filters("both"), named_filters(["ekf", "iekf"])
+    (('ekf', 'fastslam'), ('ekf', 'iekf'))
+    """
+    if isinstance(chosen, str):
+        chosen = PAPERS if chosen == "both" else (chosen,)
+    names = tuple(dict.fromkeys(chosen))
+    for name in names:
+        entry(name)
+    check_distinct(names, "filters")
+    return names
+
+
+def _steps(duration: Given, config: Config) -> int:
+    """Count the control steps of a drive; at least one frame."""
+    scenario = config.scenario
+    frame = scenario.step * scenario.steps_per_frame
+    if not frame <= duration.value or not isfinite(duration.value / scenario.step):
+        raise InputError(
+            f"{duration.where}: found {duration.value:g}, expected at least one frame "
+            f"({frame:g} s), in finite time"
+        )
+    return round(duration.value / scenario.step)
+
+
+def _radius(beamwidth: float, config: Config) -> float:
+    """Find the piston that makes a beamwidth [deg]."""
+    from pipistrelle.acoustics.emitter import piston_radius
+
+    return float(
+        piston_radius(
+            radians(beamwidth),
+            frequency=config.emitter.frequency,
+            speed_of_sound=config.air.celerity,
+        )
+    )

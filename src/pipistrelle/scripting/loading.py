@@ -1,0 +1,59 @@
+"""Folders of results and of studies, opened again."""
+
+import warnings
+from pathlib import Path
+
+from pipistrelle.experiments.results.reading import read_summary
+from pipistrelle.experiments.runs.again import again
+from pipistrelle.experiments.runs.trial import Watch
+from pipistrelle.scripting.missions import Done
+from pipistrelle.scripting.results import Results
+from pipistrelle.scripting.studies import StudyResults
+
+
+def load(folder: Path | str, /) -> Results | StudyResults:
+    """Open what a folder holds; a mission is done again only where it must be drawn.
+
+    Parameters
+    ----------
+    folder : Path
+        As `pipistrelle run`, `slam` or `study` has filled it.
+
+    Returns
+    -------
+    Results or StudyResults
+
+    Raises
+    ------
+    InputError
+        Where it is no such folder.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import pipistrelle
+    >>> with TemporaryDirectory() as place:
+    ...     done = pipistrelle.run(strategies="fused", duration=4.0, output=f"{place}/one")
+    ...     same = pipistrelle.load(f"{place}/one")
+    ...     same.tracks.equals(done.tracks)
+    True
+    """
+    place = Path(folder)
+    if (place / "plan.toml").is_file():
+        return StudyResults(place)
+    read_summary(place)
+
+    def redo(watch: Watch | None) -> Done:
+        found = again(place, watch=watch)
+        if found.difference:
+            warnings.warn(found.difference, stacklevel=3)
+        return Done(
+            config=found.config,
+            seed=found.config.seed,
+            trials=found.trials,
+            truth=found.truth,
+            callers=found.callers,
+            beamwidth=found.beamwidth,
+        )
+
+    return Results(redo, folder=place)

@@ -1,0 +1,208 @@
+"""What a recorded log decides, what it leaves to be asked for, and what looks odd in it."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import create_model
+
+from pipistrelle.config import Config, InputError, Section
+from pipistrelle.estimation.catalogue import SECTIONS, short_name
+from pipistrelle.settings import Given, Key, Layer, resolve
+
+if TYPE_CHECKING:
+    from pipistrelle.detection.logs.recording import Log
+    from pipistrelle.experiments.drives import Truth
+    from pipistrelle.experiments.results.scores import TrialResult
+
+GATE = 0.999
+"""Share of a measurement's predicted distribution that is accepted of real logs."""
+GATE_KEY: Key = ("filter", "gate")
+OWN: dict[Key, str] = {("rays", "spacing"): "auto", ("filter", "noise"): "measured"}
+"""Settings that a recorded log has others of than a simulated mission: its sensor is anyone's."""
+SUSPECT = 0.2
+"""Share of a log's rows that may not fit before its units are asked about."""
+LOGGED = frozenset(
+    {
+        ("filter", "range_std"),
+        ("filter", "bearing_std"),
+        ("filter", "initial_pose_std"),
+        ("rays", "range_bounds"),
+    }
+)
+"""Settings of the filter that a log decides."""
+OF_WORLDS = frozenset({("filter", "first_pose")})
+"""Settings of the filter that only mean something where the truth is drawn."""
+
+_REPLAYED: dict[str, Any] = {
+    name: (Config.model_fields[name].annotation, ...) for name in ("seed", *SECTIONS)
+}
+SlamConfig = create_model("SlamConfig", __base__=Section, **_REPLAYED)
+"""What a log's replay depends on, beside the log; a file for ``--config``."""
+
+
+def is_open(key: Key) -> bool:
+    """Tell whether a log leaves a setting open.
+
+    Parameters
+    ----------
+    key : Key
+
+    Returns
+    -------
+    bool
+
+    Examples
+    --------
+    >>> is_open(("rays", "power")), is_open(("filter", "range_std")), is_open(("air", "spreading"))
+    (True, False, False)
+    """
+    return key[0] in SlamConfig.model_fields and key not in LOGGED | OF_WORLDS
+
+
+def check_open(flags: Layer) -> None:
+    """Refuse settings that were asked for and that a log does not leave open.
+
+    Parameters
+    ----------
+    flags : Layer
+
+    Raises
+    ------
+    InputError
+        With the first of them.
+
+    Examples
+    --------
+    >>> check_open({("filter", "range_std"): Given(0.1, "filter__range_std")})
+    Traceback (most recent call last):
+    pipistrelle.config.InputError: filter__range_std: the log decides this; leave it out
+    """
+    for key, given in flags.items():
+        if not is_open(key):
+            why = "the log decides this" if key in LOGGED else "means nothing to a recorded log"
+            raise InputError(f"{given.where}: {why}; leave it out")
+
+
+def with_log(layer: Layer, recorded: "Log", log: Path) -> tuple[Config, list[str]]:
+    """Settle what a log decides.
+
+    Parameters
+    ----------
+    layer : Layer
+        What is asked for.
+    recorded : Log
+    log : Path
+        Where it lies.
+
+    Returns
+    -------
+    Config
+    list of str
+        A line for each setting of which the layer says otherwise.
+    """
+    gate = GATE if recorded.gate is None else recorded.gate
+    decided = {key: Given(getattr(recorded, key[1]), f"{log}: {key[1]}") for key in LOGGED}
+    own = {GATE_KEY: Given(gate, str(log))}
+    own |= {key: Given(value, "slam") for key, value in OWN.items()}
+    if ("rays", "likelihood") in layer:  # another reading of the paper is of the paper's rays
+        del own["rays", "spacing"]
+    wished, settled, told = resolve(layer), resolve(own | layer | decided), []
+    for section, name in sorted(LOGGED & layer.keys()):
+        value = getattr(getattr(settled, section), name)
+        if getattr(getattr(wished, section), name) != value:
+            where = layer[section, name].where
+            told.append(f"{where}: the log decides this, and says {value}")
+    return settled, told
+
+
+def check_room(recorded: "Log", filters: Sequence[str], config: Config) -> None:
+    """Refuse a log whose landmarks may need more memory than there is.
+
+    Parameters
+    ----------
+    recorded : Log
+    filters : sequence of str
+    config : Config
+
+    Raises
+    ------
+    InputError
+        With the estimate.
+    """
+    from pipistrelle.experiments.machine import check_memory
+
+    there = len({label for scan in recorded.scans for label in scan.landmark.tolist()})
+    check_memory(filters, there, config, passive=True)
+
+
+def beforehand(recorded: "Log", truth: "Truth", log: Path) -> list[str]:
+    """Tell what was left out of a log, and of its truth.
+
+    Parameters
+    ----------
+    recorded : Log
+    truth : Truth
+    log : Path
+
+    Returns
+    -------
+    list of str
+    """
+    told = []
+    if recorded.ignored_rows:
+        reasons = (
+            f"{count} {reason.replace('_', ' ')}" for reason, count in recorded.ignored_rows.items()
+        )
+        told.append(f"{log}: rows left out: {', '.join(reasons)}")
+    if truth.path is not None:
+        steps = len(truth.time) - 1
+        known = sum(1 for pose in truth.path[1:] if pose[0] == pose[0])
+        if known < steps:
+            told.append(f"{log}: the truth covers {known} of {steps} steps; only these are scored")
+    return told
+
+
+def afterwards(recorded: "Log", trials: "Sequence[TrialResult]", log: Path) -> list[str]:
+    """Ask whether a log has the units that are expected, where much of it does not fit.
+
+    Parameters
+    ----------
+    recorded : Log
+    trials : sequence of TrialResult
+    log : Path
+
+    Returns
+    -------
+    list of str
+    """
+    rows, turned, told = sum(len(scan.landmark) for scan in recorded.scans), recorded.turned, []
+    for trial in trials:
+        heard, name = sum(len(scan.landmark) for scan in trial.scans), short_name(trial.filter)
+        if not heard:
+            told.append(
+                f"{log}: nothing in it is heard by {trial.strategy} sensing, so it maps nothing"
+            )
+        elif (
+            turned <= SUSPECT * rows and SUSPECT * heard < trial.scores.gated and _is_finite(trial)
+        ):
+            told.append(
+                f"{log}: {trial.scores.gated} of {heard} measurements do not fit what was expected "
+                f"({trial.strategy} {name}); are bearings in radians and ranges in metres?"
+            )
+    if turned > SUSPECT * rows:
+        told.append(f"{log}: {turned} of {rows} bearings are beyond a turn; are they in radians?")
+    near, far = recorded.range_bounds
+    ranges = [r for scan in recorded.scans for r in scan.range.tolist() if r == r]
+    beyond = sum(not near <= r <= far for r in ranges)
+    if beyond > SUSPECT * len(ranges):
+        told.append(
+            f"{log}: {beyond} of {len(ranges)} ranges are not within range_bounds ({near:g} to "
+            f"{far:g} m); are ranges in metres?"
+        )
+    return told
+
+
+def _is_finite(trial: "TrialResult") -> bool:
+    """Tell whether a trial's path is somewhere: else its failure says enough."""
+    return all(number == number for pose in trial.track.pose.mean.tolist() for number in pose)

@@ -1,0 +1,356 @@
+"""What comes of a mission, as a notebook likes it: frames, pictures, and the mission once more."""
+
+import json
+import warnings
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from io import BytesIO
+from math import radians
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipistrelle.config import InputError
+from pipistrelle.detection.logs.readers import Robot
+from pipistrelle.experiments.hearing.listening import Progress
+from pipistrelle.experiments.machine import keep_freed_memory
+from pipistrelle.experiments.results.folder import prepare_folder
+from pipistrelle.experiments.results.writing import run_entry, tables_of
+from pipistrelle.experiments.runs.replay import load as load_log
+from pipistrelle.experiments.runs.trial import Watch
+from pipistrelle.scripting.asking import (
+    WORLD,
+    Base,
+    base_layer,
+    mission_settings,
+    named_filters,
+    named_strategies,
+    short_names,
+)
+from pipistrelle.scripting.missions import Done, drawn, filmed, keep, simulated, solved
+from pipistrelle.scripting.recorded import beforehand, check_open, check_room, with_log
+from pipistrelle.settings import Given, Layer, from_keywords
+
+if TYPE_CHECKING:
+    import polars as pl
+    from matplotlib.figure import Figure
+
+Redo = Callable[[Watch | None], Done]
+"""Does a mission once more, watched; the same settings give the same bits."""
+COLUMNS = ("strategy", "filter", "position_rmse_m", "position_rmse_aligned_m", "map_rmse_m",
+           "nees_mean", "landmarks_full", "landmarks_total")  # fmt: skip
+"""Of the table that a notebook shows."""
+
+
+class Results:
+    """What `run`, `slam` and `load` return: the scores, tracks, maps and measurements of a mission.
+
+    Frames are polars' (`to_pandas` turns one into pandas'), with units in the names of columns;
+    where there are several strategies or filters, each row says of which it is.
+
+    Examples
+    --------
+    >>> import pipistrelle
+    >>> done = pipistrelle.run(strategies="fused", duration=4.0, landmarks=10)
+    >>> done.summary["strategy"].to_list(), done.tracks.height
+    (['fused'], 33)
+    >>> done.tracks.columns[:4]
+    ['strategy', 'filter', 'time_s', 'x_m']
+    """
+
+    def __init__(
+        self,
+        redo: Redo,
+        done: Done | None = None,
+        folder: Path | None = None,
+        command: str = "pipistrelle",
+    ) -> None:
+        self.folder = folder
+        """Where the results are kept, if anywhere."""
+        self._redo, self._command = redo, command
+        if done is not None:
+            self._done = done
+
+    @cached_property
+    def _done(self) -> Done:
+        """The mission itself, done once more where only its folder is known."""
+        return self._redo(None)
+
+    @cached_property
+    def summary(self) -> "pl.DataFrame":
+        """The scores, a row for each strategy and filter, as ``summary.json`` names them."""
+        import polars as pl
+
+        if self.folder is not None:
+            rows = json.loads((self.folder / "summary.json").read_text())["runs"]
+        else:
+            rows = [run_entry(trial, self._done.ignored_rows) for trial in self._done.trials]
+        nested = ("ignored_rows", "online")
+        flat = [{name: row[name] for name in row if name not in nested} for row in rows]
+        return pl.DataFrame(flat, infer_schema_length=None)
+
+    @property
+    def tracks(self) -> "pl.DataFrame":
+        """A row for each control step: estimate, standard deviations, truth, errors, NEES."""
+        return self._tables["steps"]
+
+    @property
+    def landmarks(self) -> "pl.DataFrame":
+        """A row for each hypothesis of each landmark, with the true place beside it."""
+        return self._tables["landmarks"]
+
+    @property
+    def measurements(self) -> "pl.DataFrame":
+        """A row for each measurement of each strategy; no range where it was passive."""
+        return self._tables["measurements"]
+
+    @cached_property
+    def _tables(self) -> "dict[str, pl.DataFrame]":
+        """The tables, from the folder where there is one."""
+        import polars as pl
+
+        if self.folder is None:
+            return tables_of(self._done.trials, self._done.truth)
+        names = ("steps", "landmarks", "measurements")
+        return {name: pl.read_parquet(self.folder / f"{name}.parquet") for name in names}
+
+    def figure(self) -> "Figure":
+        """Draw maps and errors side by side, as ``mission.png`` has them."""
+        return drawn(self._done)
+
+    def animate(self, path: Path | str = "mission.gif") -> Path:
+        """Film the mission, which is done once more for it.
+
+        Parameters
+        ----------
+        path : Path
+            Ends in .gif or .mp4.
+
+        Returns
+        -------
+        Path
+
+        Raises
+        ------
+        InputError
+            With another ending, or where the film cannot be made.
+        """
+        from pipistrelle.figures.film import film_writer
+        from pipistrelle.figures.recorder import MissionRecorder
+
+        film_writer(Path(path))
+        watch = MissionRecorder()
+        filmed(self._redo(watch), watch, Path(path))
+        return Path(path)
+
+    def save(self, folder: Path | str, *, overwrite: bool = False) -> Path:
+        """Write the results as the command line does.
+
+        Parameters
+        ----------
+        folder : Path
+            A new one, or an empty one.
+        overwrite : bool
+            Whether earlier results in it may be replaced.
+
+        Returns
+        -------
+        Path
+
+        Raises
+        ------
+        InputError
+            Where the folder cannot be had.
+        """
+        place = prepare_folder(Path(folder), "run", overwrite)
+        keep(self._done, place, self._command)
+        return place
+
+    def to_xarray(self) -> Any:
+        """Return the tracks with the dimensions strategy, filter and time (extra ``export``).
+
+        Raises
+        ------
+        InputError
+            Where xarray or pandas is not installed.
+        """
+        try:
+            frame = self.tracks.to_pandas().set_index(["strategy", "filter", "time_s"])
+            return frame.to_xarray()
+        except ImportError as missing:
+            raise InputError(
+                f"to_xarray: found no {missing.name}; install it: pip install 'pipistrelle[export]'"
+            ) from None
+
+    def __repr__(self) -> str:
+        """Show the scores as a table."""
+        return f"Results of a mission\n{self.summary.select(COLUMNS)}"
+
+    def _repr_html_(self) -> str:
+        """Show the figure, and the scores beneath it."""
+        from base64 import b64encode
+
+        room = BytesIO()
+        self.figure().savefig(room, format="png", dpi=80)
+        picture = b64encode(room.getvalue()).decode()
+        table = self.summary.select(COLUMNS)._repr_html_()
+        return f'<img alt="The mission" src="data:image/png;base64,{picture}"/>{table}'
+
+
+def run(
+    config: Base = None,
+    /,
+    *,
+    strategies: str | Sequence[str] = "all",
+    filters: str | Sequence[str] = "ekf",
+    world: Path | str | None = None,
+    beamwidth: float | None = None,
+    landmarks: int | None = None,
+    duration: float | None = None,
+    output: Path | str | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    **settings: Any,
+) -> Results:
+    """Drive through one world and map it, as `pipistrelle run` does.
+
+    Settings are keywords: ``seed=3``, ``rays__power=8.0``, or a section of them at a time,
+    ``air={"temperature_c": 5.0}``; `pipistrelle config show` lists them. Variables of the
+    environment count for the command line alone.
+
+    Parameters
+    ----------
+    config : Config, mapping, or path of a TOML file, optional
+        Settings to start from.
+    strategies : "active", "fused", "passive", several of them, or "all"
+    filters : str
+        The name of an estimator, several of them, or "both", the paper's two.
+    world : Path, optional
+        Folder of a world of one's own.
+    beamwidth : [deg], optional
+        Half-power beamwidth of the vehicle's call.
+    landmarks : int, optional
+        Number of landmarks.
+    duration : [s], optional
+    output : Path, optional
+        Where to keep the results; nothing is written without it.
+    overwrite : bool
+        Whether earlier results there may be replaced.
+    progress : callable, optional
+        Called with what is done, how many frames of it are, and of how many.
+    **settings
+
+    Returns
+    -------
+    Results
+
+    Raises
+    ------
+    InputError
+        An unknown setting or a refused value; a world, an estimator or a folder that cannot be had.
+
+    Examples
+    --------
+    >>> quiet = run(strategies="active", duration=4.0, landmarks=10, beacon__level_db=-50.0)
+    >>> quiet.measurements["range_m"].null_count()
+    0
+    >>> run(rays__powr=3)
+    Traceback (most recent call last):
+    pipistrelle.config.InputError: rays__powr: no such setting; did you mean rays__power?
+    """
+    short: Layer = {
+        WORLD: Given(None if world is None else str(world), "world"),
+        ("scenario", "landmarks"): Given(landmarks, "landmarks"),
+    }
+    asked, known = mission_settings(
+        base_layer(config),
+        from_keywords(settings),
+        short,
+        beamwidth=Given(beamwidth, "beamwidth"),
+        duration=Given(duration, "duration"),
+    )
+    chosen, ways = named_strategies(strategies), named_filters(filters)
+
+    def redo(watch: Watch | None) -> Done:
+        done, _ = simulated(asked, chosen, ways, known, progress=progress, watch=watch)
+        return done
+
+    return _finished(redo, output, overwrite, "pipistrelle.run(...)")
+
+
+def slam(
+    log: Path | str,
+    /,
+    *,
+    config: Base = None,
+    robot: Robot | None = None,
+    strategies: str | Sequence[str] = "fused",
+    filters: str | Sequence[str] = "ekf",
+    beamwidth: float | None = None,
+    gate: float | None = None,
+    output: Path | str | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    **settings: Any,
+) -> Results:
+    """Solve a recorded log, as `pipistrelle slam` does.
+
+    What looks odd in it is a warning.
+
+    Parameters
+    ----------
+    log : Path
+        Its folder.
+    config : Config, mapping, or path of a TOML file, optional
+        Settings to start from.
+    robot : int or str, optional
+        Whose log, where there are several.
+    strategies : "active", "fused", "passive", several of them, or "all"
+        What is kept: only what has a range, all as it is, or only bearings.
+    filters : str
+        The name of an estimator, several of them, or "both", the paper's two.
+    beamwidth : [deg], optional
+        Ranges outside a beam of this width about the heading are hidden.
+    gate : float, optional
+        Measurements outside this share of their predicted distribution are dropped.
+    output, overwrite, progress, **settings
+        As of `run`; what the log decides is refused.
+
+    Returns
+    -------
+    Results
+
+    Raises
+    ------
+    InputError
+        What is wrong in the log, by line or key; as `run`.
+    """
+    place, flags = Path(log), from_keywords(settings)
+    check_open(flags)
+    short = short_names({("filter", "gate"): Given(gate, "gate")}, flags)
+    if beamwidth is not None and not 0 < beamwidth <= 360:
+        raise InputError(f"beamwidth: found {beamwidth:g}, expected above 0 and up to 360 [deg]")
+    recorded, truth = load_log(place, robot)
+    settled, overruled = with_log(base_layer(config) | flags | short, recorded, place)
+    chosen, ways = named_strategies(strategies), named_filters(filters)
+    check_room(recorded, ways, settled)
+    for line in (*overruled, *beforehand(recorded, truth, place)):
+        warnings.warn(line, stacklevel=2)
+    asked = (settled, chosen, ways, None if beamwidth is None else radians(beamwidth))
+
+    def redo(watch: Watch | None) -> Done:
+        return solved(place, robot, (recorded, truth), *asked, progress=progress, watch=watch)
+
+    return _finished(redo, output, overwrite, f"pipistrelle.slam({str(log)!r}, ...)")
+
+
+def _finished(redo: Redo, output: Path | str | None, overwrite: bool, command: str) -> Results:
+    """Do a mission, and keep it where that is asked for."""
+    keep_freed_memory()
+    place = None if output is None else prepare_folder(Path(output), "run", overwrite)
+    done = redo(None)
+    for line in done.said:
+        warnings.warn(line, stacklevel=3)
+    results = Results(redo, done, place, command)
+    if place is not None:
+        keep(done, place, command)
+    return results

@@ -1,0 +1,148 @@
+"""A study, as a notebook likes it: its tables as frames, its report as a page."""
+
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+from pipistrelle.experiments.studies.plan import Plan
+from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
+from pipistrelle.experiments.studies.store import load_study
+from pipistrelle.experiments.studies.study import StudyProgress, run_study
+from pipistrelle.settings import from_keywords
+
+if TYPE_CHECKING:
+    import polars as pl
+
+SCORES = ("position_rmse_m", "position_rmse_aligned_m", "heading_rmse_rad", "map_rmse_m",
+          "nees_mean", "landmarks_full", "position_bound_m")  # fmt: skip
+"""Of the summary: means over the worlds."""
+
+
+class StudyResults:
+    """What `study` and `load` return: a study's folder, as far as it is done.
+
+    Frames are polars'; a case is one combination of the grid, a strategy and a filter.
+
+    Examples
+    --------
+    >>> import pipistrelle
+    >>> short = {"steps": 8, "landmarks": 5}
+    >>> few = pipistrelle.study("physics", iterations=1, scenario=short)
+    >>> few.trials.height, few.summary.height
+    (50, 50)
+    """
+
+    def __init__(self, folder: Path, kept_by: "TemporaryDirectory[str] | None" = None) -> None:
+        self.folder = folder
+        """Where the study is; gone with this object, if no folder was named."""
+        self._kept_by, self._stored = kept_by, load_study(folder)
+
+    @property
+    def plan(self) -> Plan:
+        """What is tried."""
+        return self._stored.plan
+
+    @cached_property
+    def trials(self) -> "pl.DataFrame":
+        """A row for each world and case: the scores."""
+        return self._stored.trials.collect()
+
+    @cached_property
+    def steps(self) -> "pl.DataFrame":
+        """A row for each world, case and frame: errors and NEES."""
+        return self._stored.steps.collect()
+
+    @cached_property
+    def landmarks(self) -> "pl.DataFrame":
+        """A row for each world, case and landmark: is it placed, and how far off."""
+        return self._stored.landmarks.collect()
+
+    @cached_property
+    def summary(self) -> "pl.DataFrame":
+        """A row for each case: its settings, the worlds that count, mean scores over them."""
+        import polars as pl
+
+        case = ["case", "strategy", "filter", *self.plan.grid, "beamwidth_deg"]
+        means = [pl.col(score).mean() for score in SCORES]
+        done = self.trials.filter(pl.col("status") == "done")
+        return done.group_by(case, maintain_order=True).agg(pl.len().alias("worlds"), *means)
+
+    def report(self, folder: Path | str | None = None) -> Path:
+        """Put the study on one page, with its figures.
+
+        Parameters
+        ----------
+        folder : Path, optional
+            By default that of the study.
+
+        Returns
+        -------
+        Path
+            Of the page.
+
+        Raises
+        ------
+        InputError
+            Where it cannot be written.
+        """
+        from pipistrelle.report.page.page import write_report
+        from pipistrelle.report.reading import read_study
+
+        target = self.folder / "report" if folder is None else Path(folder)
+        write_report(read_study(self.folder), target, progress=lambda _: None)
+        return target / "index.html"
+
+    def __repr__(self) -> str:
+        """Show the mean scores as a table."""
+        return f"Study {self.plan.name}\n{self.summary}"
+
+    def _repr_html_(self) -> str:
+        """Show the mean scores as a table."""
+        return self.summary._repr_html_()
+
+
+def study(
+    plan: Path | str = "paper",
+    /,
+    *,
+    iterations: int | None = None,
+    workers: int = 1,
+    output: Path | str | None = None,
+    progress: Callable[[StudyProgress], None] | None = None,
+    **settings: Any,
+) -> StudyResults:
+    """Try all cases of a plan in many worlds, as `pipistrelle study` does.
+
+    Parameters
+    ----------
+    plan : "paper", "physics", "beyond" or the path of a plan
+    iterations : int, optional
+        Number of worlds; the plan's by default.
+    workers : int
+        Processes. More than one are spawned, so a script must be guarded by
+        ``if __name__ == "__main__"``; a notebook need not be.
+    output : Path, optional
+        The study's folder, which it goes on in; without one it is gone when what is returned is.
+    progress : callable, optional
+        Given how far the study is whenever a world is done.
+    **settings
+        As of `run`, over the plan's own.
+
+    Returns
+    -------
+    StudyResults
+
+    Raises
+    ------
+    InputError
+        A plan that is refused, a folder of another study, or what a world is refused for.
+    """
+    tried = read_plan(find_plan(str(plan)), from_keywords(settings), iterations)
+    kept_by = None
+    if output is None:
+        kept_by = TemporaryDirectory(prefix="pipistrelle-")
+        output = kept_by.name
+    run_study(tried, Path(output), workers=workers, progress=progress)
+    return StudyResults(Path(output), kept_by)

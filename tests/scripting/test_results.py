@@ -1,0 +1,183 @@
+"""From Python: what is handed back, that it is the command line's, and that nothing surprises."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib.figure
+import numpy as np
+import polars as pl
+import pytest
+
+import pipistrelle
+from pipistrelle import Config, InputError
+from pipistrelle.__main__ import main
+
+SHORT = {"duration": 4.0, "landmarks": 10}
+LOG = Path(__file__).parents[1] / "data" / "unicycle_log"
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["pipistrelle"])
+
+
+@pytest.fixture(scope="module")
+def done():
+    return pipistrelle.run(**SHORT, filters="both", fastslam__particles=7)
+
+
+def test_frames_are_those_of_the_folder_of_the_command_line(capsys, done):
+    words = ("--duration", "4", "--landmarks", "10", "--filter", "both", "--particles", "7")
+    assert main(["run", *words, "-o", "one"]) == 0
+    capsys.readouterr()
+    for name, mine in (
+        ("steps", done.tracks),
+        ("landmarks", done.landmarks),
+        ("measurements", done.measurements),
+    ):
+        assert mine.equals(pl.read_parquet(f"one/{name}.parquet"))
+    runs = json.loads(Path("one/summary.json").read_text())["runs"]
+    for row, run in zip(done.summary.rows(named=True), runs, strict=True):
+        assert {k: v for k, v in row.items() if k != "wall_s"} == {
+            k: v for k, v in run.items() if k not in ("wall_s", "ignored_rows")
+        }
+    loaded = pipistrelle.load("one")
+    assert loaded.tracks.equals(done.tracks)
+    assert loaded.summary.drop("wall_s").equals(done.summary.drop("wall_s"))
+
+
+def test_nothing_is_written_unless_a_folder_is_named(done, tmp_path):
+    assert done.folder is None
+    assert list(tmp_path.iterdir()) == []
+    kept = pipistrelle.run(**SHORT, strategies="fused", output="one")
+    assert kept.folder == Path("one")
+    assert (Path("one") / "summary.json").exists()
+    with pytest.raises(InputError, match="one"):
+        pipistrelle.run(**SHORT, output="one")
+    again = pipistrelle.run(**SHORT, strategies="fused", output="one", overwrite=True)
+    assert again.tracks.equals(kept.tracks)
+
+
+def test_called_twice_it_finds_the_same(done):
+    again = pipistrelle.run(**SHORT, filters="both", fastslam__particles=7)
+    assert again.tracks.equals(done.tracks)
+    assert again.summary.drop("wall_s").equals(done.summary.drop("wall_s"))
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"rays__power": 8.0, "seed": 3},
+        {"rays": {"power": 8.0}, "seed": 3},
+        {"rays": {"power": 8.0, "prune": 1e-5}, "seed": 3},
+    ],
+)
+def test_settings_are_keywords_or_sections(asked):
+    found = pipistrelle.run(**SHORT, strategies="fused", **asked)
+    same = pipistrelle.run({"rays.power": 8.0, "seed": 3}, **SHORT, strategies="fused")
+    assert found.tracks.equals(same.tracks)
+
+
+def test_settings_to_start_from_may_be_settings_a_table_or_a_file(done):
+    Path("mine.toml").write_text("seed = 3\nfilter.bearing_std = 0.1\n")
+    config = Config(seed=3, filter={"bearing_std": 0.1})
+    bases = (config, {"seed": 3, "filter": {"bearing_std": 0.1}}, "mine.toml", Path("mine.toml"))
+    first, *others = (pipistrelle.run(base, **SHORT, strategies="passive").tracks for base in bases)
+    assert all(one.equals(first) for one in others)
+    over = pipistrelle.run(config, seed=4, **SHORT, strategies="passive").tracks
+    assert not over.equals(first)
+
+
+@pytest.mark.parametrize(
+    ("words", "asked", "said"),
+    [
+        ((), {"rays__powr": 8.0}, "rays__powr: no such setting; did you mean rays__power?"),
+        ((), {"bearing_std": 8.0}, "bearing_std: no such setting; did you mean filter__bearing"),
+        ((), {"rays__power": -1.0}, "rays__power: found -1.0, expected greater than 0"),
+        ((), {"seed": 1.5}, "seed: found 1.5, expected a valid integer"),
+        ((), {"rays": 3}, "rays: found 3, expected a section of settings"),
+        ((), {"rays": {"power": 2.0}, "rays__power__x": 2}, "found power as a value too"),
+        (({"ray.power": 3.0},), {}, "config: ray.power: no such setting; did you mean rays.power?"),
+        (("nowhere.toml",), {}, "nowhere.toml"),
+        ((), {"strategies": "activ"}, "strategies: found 'activ', expected 'active', 'fused', 'pa"),
+        ((), {"strategies": ["fused", 3]}, "strategies: found 3"),
+        ((), {"filters": "ukf"}, "filter: found 'ukf', expected one of ekf"),
+        ((), {"world": "nowhere"}, "nowhere: found no such folder"),
+        ((), {"duration": 0.1}, "duration: found 0.1, expected at least one frame (0.5 s)"),
+        ((), {"duration": 9.0, "scenario__steps": 3}, "duration 9 and scenario__steps are one set"),
+        ((), {"landmarks": 9, "scenario__landmarks": 3}, "landmarks and scenario__landmarks are"),
+        ((), {"duration": float("nan")}, "duration: found nan"),
+    ],
+)
+def test_mistakes_are_told_in_the_words_of_the_call(words, asked, said):
+    with pytest.raises((InputError, OSError)) as refused:
+        pipistrelle.run(*words, **asked)
+    assert said in str(refused.value)
+
+
+def test_a_log_is_solved_as_by_the_command_line(capsys):
+    found = pipistrelle.slam(LOG, strategies="all", beamwidth=90.0, rays__power=4.0)
+    words = ("--strategy", "all", "--beamwidth", "90", "--rays.power", "4.0", "-o", "one")
+    assert main(["slam", str(LOG), *words]) == 0
+    capsys.readouterr()
+    assert found.tracks.equals(pl.read_parquet("one/steps.parquet"))
+    assert found.measurements.equals(pl.read_parquet("one/measurements.parquet"))
+    with pytest.raises(InputError, match="filter__range_std: the log decides this"):
+        pipistrelle.slam(LOG, filter__range_std=0.1)
+    with pytest.raises(InputError, match="air__temperature_c: means nothing to a recorded log"):
+        pipistrelle.slam(LOG, air__temperature_c=1.0)
+    with pytest.raises(InputError, match="beamwidth: found 0"):
+        pipistrelle.slam(LOG, beamwidth=0.0)
+
+
+def test_figures_and_films_are_drawn_of_the_mission(done):
+    figure = done.figure()
+    assert isinstance(figure, matplotlib.figure.Figure)
+    assert done.animate("one.gif").read_bytes()[:6] == b"GIF89a"
+    with pytest.raises(InputError, match=r"found the ending '.png'"):
+        done.animate("one.png")
+
+
+def test_loaded_results_are_done_again_where_they_must_be_drawn(done):
+    pipistrelle.run(**SHORT, strategies="fused", output="one")
+    loaded = pipistrelle.load("one")
+    assert loaded.animate("two.gif").exists()
+    track = Path("one/track_fused_ekf.tum")
+    track.write_text(track.read_text().replace("1", "2"))
+    with pytest.warns(UserWarning, match=r"track_fused_ekf\.tum"):
+        pipistrelle.load("one").figure()
+
+
+def test_what_is_no_folder_of_ours_is_refused(tmp_path):
+    for name in ("nowhere", "."):
+        with pytest.raises(InputError):
+            pipistrelle.load(name)
+
+
+def test_a_notebook_is_shown_the_figure_and_the_scores(done):
+    html = done._repr_html_()
+    assert html.startswith('<img alt="The mission" src="data:image/png;base64,')
+    assert "position_rmse_m" in html
+    assert "fastslam" in repr(done)
+
+
+def test_frames_go_on_to_other_libraries(done):
+    pytest.importorskip("xarray", reason="the extra export is not installed")
+    data = done.to_xarray()
+    assert data.sizes["strategy"] == 3
+    one = data.sel(strategy="fused", filter="ekf").x_m.values
+    mine = done.tracks.filter(pl.col("strategy") == "fused", pl.col("filter") == "ekf")["x_m"]
+    np.testing.assert_array_equal(one, mine.to_numpy())
+
+
+def test_importing_the_package_loads_no_numpy_and_lists_its_doors():
+    code = (
+        "import sys, pipistrelle; print(sorted({'numpy', 'polars', 'pydantic'} & set(sys.modules)),"
+        " dir(pipistrelle)); pipistrelle.nothing"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ran.stdout.startswith("[] ['Config', 'InputError', '__version__', 'load', 'run', 'slam'")
+    assert "module 'pipistrelle' has no attribute 'nothing'" in ran.stderr

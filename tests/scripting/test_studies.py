@@ -1,0 +1,67 @@
+"""Studies from Python: the command line's tables, in a folder of one's own or a passing one."""
+
+import sys
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+import pipistrelle
+from pipistrelle import InputError
+from pipistrelle.__main__ import main
+from reference.studies import SMALL
+
+TIMES = ("wall_s", "cpu_s")
+
+
+@pytest.fixture(autouse=True)
+def small(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["pipistrelle"])
+    Path("small.toml").write_text(SMALL)
+
+
+def test_its_tables_are_those_of_the_command_line(capsys):
+    found = pipistrelle.study("small.toml", iterations=2)
+    assert main(["study", "small.toml", "--iterations", "2", "--workers", "1", "-o", "s"]) == 0
+    capsys.readouterr()
+    loaded = pipistrelle.load("s")
+    assert found.trials.drop(TIMES).equals(loaded.trials.drop(TIMES))
+    assert found.steps.equals(loaded.steps)
+    assert found.landmarks.equals(loaded.landmarks)
+    assert loaded.plan.iterations == 2
+    kept = found.folder
+    assert kept.is_dir()
+    del found
+    assert not kept.exists()
+
+
+def test_its_summary_is_the_mean_over_the_worlds():
+    found = pipistrelle.study("small.toml", iterations=3, output="s")
+    assert found.summary.height == 10
+    assert found.summary["worlds"].unique().to_list() == [3]
+    row = found.summary.row(0, named=True)
+    mine = found.trials.filter(pl.col("case") == row["case"])
+    assert row["position_rmse_m"] == pytest.approx(mine["position_rmse_m"].mean())
+    assert "position_rmse_m" in found._repr_html_()
+    assert "Study small" in repr(found)
+
+
+def test_it_goes_on_where_it_stopped_and_settings_lie_over_the_plan():
+    one = pipistrelle.study("small.toml", iterations=1, output="s", scenario__landmarks=9)
+    more = pipistrelle.study("small.toml", iterations=2, output="s", scenario={"landmarks": 9})
+    assert more.trials.filter(pl.col("iteration") == 0).equals(one.trials)
+    assert more.plan.config.scenario.landmarks == 9
+    with pytest.raises(InputError, match="is the plan of another study"):
+        pipistrelle.study("small.toml", output="s")
+    with pytest.raises(InputError, match="scenario__landmark: no such setting; did you mean"):
+        pipistrelle.study("small.toml", scenario__landmark=9)
+    with pytest.raises(InputError, match="nowhere: found no such file"):
+        pipistrelle.study("nowhere")
+
+
+def test_its_report_is_a_page():
+    found = pipistrelle.study("small.toml", iterations=2, output="s")
+    page = found.report("page")
+    assert page == Path("page/index.html")
+    assert "<h1" in page.read_text()
