@@ -9,7 +9,7 @@ True
 from importlib import import_module
 from typing import Any
 
-__version__ = "0.1.0"
+__version__: str
 __all__ = ["Config", "InputError", "load", "run", "slam", "study"]
 _ROOMS = {
     "Config": "config",
@@ -23,6 +23,8 @@ _ROOMS = {
 
 def __getattr__(name: str) -> Any:
     """Find what is asked for when it is asked for: importing the package loads nothing else."""
+    if name == "__version__":
+        return import_module("pipistrelle.version").find_version()
     if name in _ROOMS:
         return getattr(import_module(f"pipistrelle.{_ROOMS[name]}"), name)
     raise AttributeError(f"module 'pipistrelle' has no attribute {name!r}")

@@ -7,8 +7,8 @@ from itertools import pairwise, zip_longest
 
 from cyclopts import App, CycloptsError, MissingArgumentError, UnusedCliTokensError
 
-from pipistrelle import __version__
 from pipistrelle.verbs.streams import flush_results, say
+from pipistrelle.version import find_version
 
 SPELLINGS = (
     "A setting is --rays.power 3 as a flag, PIPISTRELLE_RAYS__POWER=3 in the environment and "
@@ -20,7 +20,7 @@ FILMS = ("gif", "mp4")
 app = App(
     name="pipistrelle",
     help="Sonar SLAM with one's own calls, someone else's, or both: from waveform to verdict.",
-    version=__version__,
+    version=find_version,
     help_format="plaintext",
     exit_on_error=False,
     print_error=False,

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import BaseModel
 
-from pipistrelle import __version__
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.results.scores import TrialResult
@@ -28,6 +27,7 @@ from pipistrelle.experiments.results.tables import (
     tum_text,
 )
 from pipistrelle.files import RESULTS, OwnFiles
+from pipistrelle.version import find_version
 
 if TYPE_CHECKING:
     import polars as pl
@@ -132,7 +132,7 @@ def write_results(
     own.write("config.toml", tomli_w.dumps(settings))
     online = ONLINE if any(trial.online for trial in trials) else ""
     told = {"online": online, "log": "" if log is None else LOG}
-    readme = README.format(command=command, version=__version__, seed=seed, **told)
+    readme = README.format(command=command, version=find_version(), seed=seed, **told)
     own.write("README.md", readme)
     for trial in trials:
         name, track = f"{trial.strategy}_{short_name(trial.filter)}", trial.track
@@ -154,7 +154,7 @@ def write_results(
         draw(room)
     summary = {
         "format": FORMAT,
-        "version": __version__,
+        "version": find_version(),
         "config_hash": config_hash(config),
         "seed": seed,
         **({} if log is None else {"log": dict(log)}),

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pipistrelle import __version__
 from pipistrelle.acoustics.callers import Caller
 from pipistrelle.acoustics.emitter import beamwidth_of
 from pipistrelle.config import Config
@@ -32,6 +31,7 @@ from pipistrelle.experiments.runs.replay import load, replay
 from pipistrelle.experiments.runs.trial import Mission, Watch, run_mission
 from pipistrelle.refusals import refusal
 from pipistrelle.settings import from_file, read_toml, resolve
+from pipistrelle.version import find_version
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -246,8 +246,8 @@ def _reason(folder: Path, summary: Summary) -> str:
     """Say why a mission may not be what it was, where that is known."""
     if settings_hash(read_toml(folder / "config.toml")) != summary.config_hash:
         return "; config.toml was changed since"
-    if summary.version != __version__:
-        return f"; it was written by version {summary.version}, this is {__version__}"
+    if summary.version != find_version():
+        return f"; it was written by version {summary.version}, this is {find_version()}"
     return ""
 
 

@@ -12,7 +12,6 @@ from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 from uuid import uuid4
 
-from pipistrelle import __version__
 from pipistrelle.config import InputError
 from pipistrelle.experiments.hearing.world_folder import kept_world
 from pipistrelle.experiments.studies.plan import Plan
@@ -26,6 +25,7 @@ from pipistrelle.experiments.studies.world_files import (
 )
 from pipistrelle.files import write_whole
 from pipistrelle.settings import to_toml
+from pipistrelle.version import find_version
 
 if TYPE_CHECKING:
     import polars as pl
@@ -115,7 +115,7 @@ def open_store(folder: Path, plan: Plan) -> None:
                 )
             _keep_worlds(folder, plan)
             _put(kept, plan_text(plan))
-        readme = README.format(name=plan.name, version=__version__)
+        readme = README.format(name=plan.name, version=find_version())
         config = plan.config
         if config.scenario.world is not None:
             config, _ = kept_world(config, plan.world(config))
