@@ -20,23 +20,24 @@ mpl.use("Agg")
 
 project = "Pipistrelle"
 author = "The Pipistrelle developers"
-version = release = pipistrelle.__version__
+release = pipistrelle.__version__
+version = release.partition("+")[0]
 
 suppress_warnings = ["config.cache"]  # the gallery is given a function
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
-    "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
     "sphinx_gallery.gen_gallery",
+    "docs.formulae",
 ]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "**sg_execution_times.rst"]  # whose table is fetched from elsewhere
 default_role = "literal"
 myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
 
 html_theme = "furo"
-html_title = f"Pipistrelle {release}"
+html_title = f"Pipistrelle {version}"
 html_static_path = ["_static"]
 html_css_files = ["pages.css"]
 html_copy_source = False

@@ -1,6 +1,7 @@
 """What the documentation says is there, is there; what it shows, happens."""
 
 import re
+import subprocess
 import sys
 from pathlib import Path
 from pkgutil import resolve_name
@@ -257,3 +258,35 @@ def test_the_readme_shows_what_the_command_prints(tmp_path, capsys):
         assert re.sub(r"[\d.]+", "#", line).split() == re.sub(r"[\d.]+", "#", other).split()
         # Another machine's mathematics may move a detection or two across the threshold.
         np.testing.assert_allclose(*np.array(numbers, dtype=float), rtol=0.1)
+
+
+CHROMIUM = Path("/usr/bin/chromium")
+
+
+@pytest.mark.slow
+def test_the_built_pages_are_read_without_a_network_and_without_a_word(tmp_path):
+    """The examples are left out: they are run by tests of their own."""
+    driver = pytest.importorskip(
+        "playwright.sync_api", reason="playwright is not installed (./dev test installs it)"
+    )
+    if not CHROMIUM.exists():
+        pytest.skip(f"no browser: {CHROMIUM} is missing (Debian's package chromium)")
+    build = [sys.executable, "-m", "sphinx", "-q", "-D", "plot_gallery=0", DOCS, tmp_path]
+    subprocess.run(build, cwd=ROOT, check=True)
+    pages, asked, noise, fonts = sorted(tmp_path.rglob("*.html")), set(), [], set()
+    with driver.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
+        page = browser.new_page()
+        page.on("request", lambda request: asked.add(request.url))
+        page.on("console", lambda message: noise.append(message.text))
+        page.on("pageerror", lambda error: noise.append(str(error)))
+        for path in pages:
+            page.goto(path.as_uri())
+            faces = "document.fonts.ready.then(f => [...f].map(x => x.family + ' ' + x.status))"
+            if page.locator("math").count():
+                fonts.add(tuple(page.evaluate(faces)))
+        browser.close()
+    assert {"index", "equations", "estimation", "search"} <= {path.stem for path in pages}
+    assert [url for url in asked if not url.startswith((tmp_path.as_uri(), "data:"))] == []
+    assert noise == []
+    assert fonts == {("STIX Two Math loaded",)}

@@ -48,6 +48,7 @@ def range_and_bearing(
 
     .. math:: d_i = \lVert m_i - x_v \rVert, \qquad
               \phi_i = \operatorname{atan2}(y_i - y_v, x_i - x_v) - \theta_v
+       :label: eq-6
 
     Parameters
     ----------

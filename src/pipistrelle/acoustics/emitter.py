@@ -73,6 +73,7 @@ def piston_directivity(
 
     .. math:: p(\phi) = \left| \frac{2 J_1(ka\sin\phi)}{ka\sin\phi} \right|
               \text{ for } |\phi| \le 90°, \text{ else } 0, \qquad k = 2\pi f / c
+       :label: eq-1
 
     Parameters
     ----------

@@ -17,6 +17,7 @@ def spreading_loss_db(
     r"""Spherical spreading over a path, re 1 m.
 
     .. math:: \beta = r \, 20 \log_{10} \frac{d}{r}
+       :label: eq-2
 
     Parameters
     ----------
@@ -106,6 +107,7 @@ def absorption_db_per_m(
     .. math:: \alpha = 8.686 f^2 \left[ 1.84 \cdot 10^{-11} \frac{\tau^{1/2}}{p}
               + \tau^{-5/2} \left( 0.01275 e^{-2239.1/T} \frac{f_{rO}}{f_{rO}^2 + f^2}
               + 0.1068 e^{-3352/T} \frac{f_{rN}}{f_{rN}^2 + f^2} \right) \right]
+       :label: eq-3
 
     with the temperature :math:`\tau = T / 293.15` K and the pressure p in units of 101.325 kPa, the
     relaxation frequencies of oxygen and nitrogen

@@ -45,6 +45,7 @@ def target_strength_db(
               + \frac1{2\pi k} \cot^2\frac\gamma2 \, \sin^2(kr\sin\gamma) \\
               I_\text{sphere}(\gamma) &= \frac{r^2}4 \left[ 1
               + \cot^2\frac\gamma2 \, J_1^2(kr\sin\gamma) \right]
+       :label: eq-4
 
     Written with :math:`\cot(\gamma/2) = 2\cos^2(\gamma/2) / \sin\gamma` they are finite everywhere:
     in the forward direction :math:`I(0)/I(\pi)` is :math:`4kr/\pi` and :math:`1 + (kr)^2`.

@@ -130,7 +130,12 @@ def measurement_jacobians(
               H_m = \begin{bmatrix} c & s \\ -s/d & c/d \end{bmatrix}
 
     with (c, s) the unit vector from the vehicle to the landmark and d their distance. A passive
-    measurement has the second rows alone.
+    measurement is the bearing alone,
+
+    .. math:: \phi_i = \operatorname{atan2}(y_i - y_v, x_i - x_v) - \theta_v
+       :label: eq-7
+
+    and has the second rows alone.
 
     Parameters
     ----------

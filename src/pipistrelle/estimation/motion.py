@@ -155,6 +155,7 @@ def motion_step(
     .. math:: x_k = x_{k-1} + V\Delta_t \cos(\theta_{k-1} + \gamma), \quad
               y_k = y_{k-1} + V\Delta_t \sin(\theta_{k-1} + \gamma), \quad
               \theta_k = \theta_{k-1} + \tfrac{V\Delta_t}{B}\sin\gamma
+       :label: eq-5
 
     for the bicycle's front wheel; for the unicycle the exact arc of speed V and angular rate
     omega, written by its chord :math:`V\Delta_t \operatorname{sinc}(\omega\Delta_t/2)`.

@@ -8,24 +8,44 @@ ranges that grow by the factor :math:`\beta`, each as long as its range allows,
           \sigma_j = \alpha s_j, \quad
           N_g = 1 + \left\lceil \log_\beta\left(\frac{1-\alpha}{1+\alpha}
           \frac{s_{max}}{s_{min}}\right) \right\rceil .
+   :label: eq-17
 
 Seen from the vehicle the members differ in range only, so one bearing cannot tell them apart; a
 few bearings from different places can. Each new bearing does three things to a ray:
 
-1. **Weigh.** The likelihood of member j is :math:`\lambda_j = N(\nu_j; 0, S_j)`. Its aggregated
-   likelihood, :math:`\Lambda_j \leftarrow \Lambda_j \lambda_j`, normalised over the ray, is its
-   probability given all bearings so far. With ``likelihood = "printed"`` the likelihood is
-   :math:`\exp(-\tfrac12 \nu_j^2 S_j^{-1} / \sqrt{2\pi S_j})`, as the unbalanced bracket of the
-   printed formula may be read: no density, and sharper where S is below 1/(2 pi).
+1. **Weigh.** The aggregated likelihood of member j is its probability given all bearings so far;
+   a bearing multiplies it by its own likelihood :math:`\lambda_j`:
+
+   .. math:: \Lambda_j = 1 / N_g \text{ at first}, \qquad
+             \Lambda_j \leftarrow \Lambda_j \lambda_j \Big/ \sum_i \Lambda_i \lambda_i
+      :label: eq-18
+
 2. **Share.** The measurement is one; the members are several. Were each corrected with the full
    measurement, its information would be counted :math:`N_g` times. Federated information sharing
-   gives member j the share :math:`\rho_j`, that is the noise :math:`R/\rho_j`; the shares sum to
-   one, so the information does too (the principle of measurement reproduction). The shares are
-   :math:`\rho_j \propto \lambda_j^n` (``weights = "instantaneous"``, the paper's text) or
-   :math:`\rho_j \propto \Lambda_j^n` with shares under 0.05 skipped and not handed on
-   (``"aggregated"``, as in Sola's own implementation).
-3. **Prune.** Members with :math:`\Lambda_j < \tau/N`, N the number before this prune, are dropped.
-   The heaviest always stays. A ray of one member is a landmark: *fully initialised*.
+   gives member j the share :math:`\rho_j`; the shares sum to one, so the information does too (the
+   principle of measurement reproduction):
+
+   .. math:: R_j = R / \rho_j, \qquad R^{-1} = \sum_j R_j^{-1}
+      :label: eq-20
+
+   The shares are
+
+   .. math:: \lambda_j = N(\nu_j; 0, S_j), \qquad
+             \rho_j = \lambda_j^n \Big/ \sum_i \lambda_i^n
+      :label: eq-19
+
+   with ``weights = "instantaneous"``, the paper's text, or :math:`\rho_j \propto \Lambda_j^n` with
+   shares under 0.05 skipped and not handed on (``"aggregated"``, as in Sola's own implementation).
+   With ``likelihood = "printed"`` the likelihood is
+   :math:`\exp(-\tfrac12 \nu_j^2 S_j^{-1} / \sqrt{2\pi S_j})`, as the unbalanced bracket of the
+   printed formula may be read: no density, and sharper where S is below 1/(2 pi).
+3. **Prune.** Members are dropped whose aggregated likelihood has become small,
+
+   .. math:: \Lambda_j < \tau / N
+      :label: eq-21
+
+   N the number before this prune. The heaviest always stays. A ray of one member is a landmark:
+   *fully initialised*.
 
 Which to take? ``paper`` settings reproduce the paper; ``aggregated`` weights, or a power n of 3
 to 8, make the filter far more consistent: members that are certainly wrong then no longer pull

@@ -213,6 +213,7 @@ def rmse(error: Float[np.ndarray, " n"]) -> float:
     r"""Root mean square of errors, in their unit.
 
     .. math:: \mathrm{RMSE} = \sqrt{\frac{1}{N} \sum_{i=1}^{N} e_i^2}
+       :label: eq-26-27
 
     Parameters
     ----------

@@ -13,6 +13,7 @@ def nees(
     r"""Normalised estimation error squared.
 
     .. math:: \epsilon_k = (\hat x_k - x_k)^T P_k^{-1} (\hat x_k - x_k)
+       :label: eq-23
 
     Solved by elimination: the sum of the squared residuals over the pivots.
 
@@ -128,6 +129,7 @@ def anees(nees: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " k"]:
     r"""Average NEES over runs, step by step.
 
     .. math:: \bar\epsilon_k = \frac{1}{N} \sum_{i=1}^{N} \epsilon_{i_k}
+       :label: eq-24
 
     Parameters
     ----------
@@ -155,6 +157,7 @@ def anees_bounds(runs: int, confidence: float = 0.95, states: int = 3) -> tuple[
 
     .. math:: \epsilon_1 = \chi^2_{N N_x}(C / 2) / N, \qquad
               \epsilon_2 = \chi^2_{N N_x}(1 - C / 2) / N, \qquad C = 1 - \mathrm{confidence}
+       :label: eq-25
 
     Below it the filter is under-confident, above it over-confident.
 

@@ -1,7 +1,13 @@
-"""EKF-SLAM with rays: one Gaussian over the pose and every landmark hypothesis.
+r"""EKF-SLAM with rays: one Gaussian over the pose and every landmark hypothesis.
 
-The state is the pose and, two numbers each, the members of all landmarks (Eq. (8); the
-correspondence is constant and known and stays out of it). How a frame corrects it: `correction`.
+The state is the pose and, two numbers each, the members of all landmarks,
+
+.. math:: \hat X = [\hat x_v, \hat y_v, \hat\theta_v, \hat x_1, \hat y_1, \dots,
+          \hat x_h, \hat y_h]^T
+   :label: eq-8
+
+(Eq. (8); the correspondence is constant and known and stays out of it). How a frame corrects it:
+`correction`.
 """
 
 from dataclasses import dataclass
@@ -23,7 +29,10 @@ from pipistrelle.estimation.rays import Sensing, sensing_of
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EkfBelief:
-    """A joint Gaussian over pose and members (Bradley & Abaid, Eqs. (8) and (9)).
+    r"""A joint Gaussian over pose x and members m (Bradley & Abaid, Eqs. (8) and (9)).
+
+    .. math:: P = \begin{bmatrix} P_{xx} & P_{xm} \\ P_{mx} & P_{mm} \end{bmatrix}
+       :label: eq-9
 
     Attributes
     ----------
@@ -135,7 +144,13 @@ class EkfSlam:
         dt: Float[np.ndarray, " k"],
         rng: np.random.Generator | None = None,
     ) -> tuple[EkfBelief, Gaussian]:
-        """Carry the belief through the control steps of a frame.
+        r"""Carry the belief through the control steps of a frame.
+
+        .. math:: \bar P_{xx} = F P_{xx} F^T + U Q U^T, \qquad
+                  \bar P_{xm} = \bar P_{mx}^T = F P_{xm}
+           :label: eq-10
+
+        with F and U the derivatives of the motion by the pose and by the control.
 
         Parameters
         ----------
@@ -171,7 +186,20 @@ class EkfSlam:
     def update(
         self, belief: EkfBelief, scan: Scan, rng: np.random.Generator | None = None
     ) -> EkfBelief:
-        """Correct the belief with a frame's measurements.
+        r"""Correct the belief with a frame's measurements.
+
+        .. math:: K_i = \bar P H_i^T (H_i \bar P H_i^T + R)^{-1}, \qquad
+                  \hat X = \bar X + K_i (z_i - \bar z_i), \qquad
+                  \hat P = (I - K_i H_i) \bar P
+           :label: eq-11
+
+        A landmark that is not in the map is placed where it was heard,
+
+        .. math:: \hat x_i = \hat x_v + d_i \cos(\phi_i + \hat\theta_v), \qquad
+                  \hat y_i = \hat y_v + d_i \sin(\phi_i + \hat\theta_v)
+           :label: eq-16
+
+        or, without a range, as a ray.
 
         Parameters
         ----------

@@ -1,16 +1,40 @@
 r"""FastSLAM 2.0 with rays: each particle a sampled path with its own map.
 
-Given a path, landmarks are independent: a particle (Eqs. (12) and (22)) needs one small Gaussian
-per hypothesis and no joint covariance. A frame goes through five steps.
+Given a path, landmarks are independent: a particle needs one small Gaussian for each and no joint
+covariance (Eq. (12)),
+
+.. math:: Y^{[j]} = \bigl\langle \hat x^{[j]}, \{\hat m_1^{[j]}, \hat P_1^{[j]}\}, \dots,
+          \{\hat m_N^{[j]}, \hat P_N^{[j]}\} \bigr\rangle
+   :label: eq-12
+
+and for a ray one per member, with its aggregated likelihood (Eq. (22)):
+
+.. math:: \{\hat m_i^{[j]}, \hat P_i^{[j]}\} \to
+          \{\hat m_{i,1}^{[j]}, \hat P_{i,1}^{[j]}, \Lambda_{i,1}^{[j]}\}, \dots,
+          \{\hat m_{i,N_g}^{[j]}, \hat P_{i,N_g}^{[j]}, \Lambda_{i,N_g}^{[j]}\}
+   :label: eq-22
+
+A frame goes through five steps.
 
 1. **Propose.** Mean and covariance of the pose accumulate over the control steps since the last
    sample, then each measurement of a mapped landmark refines them (Eqs. (13) and (14), in Kalman
-   form, each at the refined mean). A particle's weight grows by each measurement's marginal
-   likelihood :math:`N(\nu_i; 0, H_x P_{i-1} H_x^T + H_m P_m H_m^T + R)`, the product of which is
-   the likelihood of the frame given the particle's past. Of a partial landmark it
-   is the members' mixture, :math:`\sum_j \Lambda_j N(\nu_j; 0, S_j)`, for a bearing and for a
-   range with its bearing alike; a new landmark adds no weight.
-2. **Sample** the pose, once.
+   form, each at the refined mean):
+
+   .. math:: S_i = H_x P_{i-1} H_x^T + H_m P_m H_m^T + R, \qquad
+             K_i = P_{i-1} H_x^T S_i^{-1}, \\
+             \hat x_i = \hat x_{i-1} + K_i \nu_i, \qquad
+             P_i = (I - K_i H_x) P_{i-1}
+      :label: eq-14
+
+   A particle's weight grows by each measurement's marginal likelihood
+   :math:`N(\nu_i; 0, S_i)`, the product of which is the likelihood of the frame given the
+   particle's past. Of a partial landmark it is the members' mixture,
+   :math:`\sum_j \Lambda_j N(\nu_j; 0, S_j)`, for a bearing and for a range with its bearing alike;
+   a new landmark adds no weight.
+2. **Sample** the pose, once, of what it was refined to:
+
+   .. math:: \hat x_k^{[j]} \sim p(x_k \mid \hat x_{k-1}^{[j]}, u_k, z_k)
+      :label: eq-13
 3. **Correct** the landmarks, weigh, share and prune the rays (`rays`), from the sampled pose.
 4. **Place** new landmarks from the sampled pose.
 5. **Resample** when too few particles count (`resampling`).

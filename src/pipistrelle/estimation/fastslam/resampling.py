@@ -2,7 +2,7 @@ r"""Resampling: from weighted particles to equally weighted ones.
 
 Both steps of FastSLAM 2.0 that forget live here. The weights tell how many particles still count,
 
-.. math:: N_\mathrm{eff} = \Big( \sum_j w_j^2 \Big)^{-1}
+.. math:: N_\mathrm{eff} = \left( \sum_j w_j^2 \right)^{-1}
 
 (Eq. (15)); below a threshold the particles are drawn anew, each as often as its weight says. The
 draw is *stratified*: one uniform number in each of N equal strata of [0, 1), so particle j gets
@@ -60,6 +60,7 @@ def effective_particles(weight: Float[np.ndarray, " p"]) -> float:
     r"""Return how many equally weighted particles would be worth as much.
 
     .. math:: N_\mathrm{eff} = 1 / \sum_j w_j^2
+       :label: eq-15
 
     Parameters
     ----------
