@@ -30,6 +30,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx_gallery.gen_gallery",
     "docs.formulae",
+    "docs.settings_page",
 ]
 exclude_patterns = ["_build", "**sg_execution_times.rst"]  # whose table is fetched from elsewhere
 default_role = "literal"

@@ -85,13 +85,13 @@ class AirConfig(Section):
     """The medium. Humidity is unreported in the paper."""
 
     speed_of_sound: Annotated[float, Field(ge=10, le=10_000)] | None = None
-    """[m/s]; unless given, that of the temperature T: 343 sqrt(T / 293.15 K)."""
+    """Speed of sound [m/s]; unless given, that of the temperature T: 343 sqrt(T / 293.15 K)."""
     temperature_c: Annotated[float, Field(gt=-50, lt=60)] = 20.0
-    """[degrees Celsius]"""
+    """Temperature [degrees Celsius]."""
     relative_humidity: Annotated[float, Field(ge=0, le=1)] = 0.5
-    """[0 to 1]"""
+    """Relative humidity [0 to 1]."""
     pressure_kpa: Positive = 101.325
-    """[kPa]"""
+    """Pressure [kPa]."""
     spreading: Literal["paper", "bistatic"] = "paper"
     """Passive echoes lose 20 log10(d1 + d2), the paper's mirror law, or 20 log10(d1 d2) [dB]."""
 
@@ -109,14 +109,14 @@ class TargetConfig(Section):
     shape: Literal["cylinder", "sphere"] = "cylinder"
     """Short-wave rigid cylinder (the paper's formula, mended) or sphere."""
     radius: Positive = 0.025
-    """[m]"""
+    """Radius of a landmark [m]."""
 
 
 class EmitterConfig(Section):
     """The vehicle's back-baffled piston and its call."""
 
     frequency: Positive = 35e3
-    """[Hz]"""
+    """Tone of the call [Hz]."""
     radius: Positive = 0.0088
     """Radius of the piston [m]; 8.8 mm makes a half-power beamwidth of 33 degrees."""
     level_db: Level = 49.7
@@ -131,7 +131,7 @@ class BeaconConfig(Section):
     """The omnidirectional beacon's call."""
 
     frequency: Positive = 30e3
-    """[Hz]"""
+    """Tone of the call [Hz]."""
     level_db: Level = 42.8
     """Source level at 1 m [dB]; unreported, fitted."""
 
@@ -144,7 +144,7 @@ class ReceiverConfig(Section):
     spacing: Positive = 0.0049
     """Distance between two microphones [m]: half a wavelength at 35 kHz."""
     sample_rate: Positive = 200e3
-    """[Hz]"""
+    """Samples of a microphone in a second [Hz]."""
     noise_level_db: Level = 0.0
     """Noise of one complex sample [dB], on the scale of the source levels."""
     engine: Literal["block", "dense"] = "block"
@@ -187,13 +187,13 @@ class MotionConfig(Section):
     model: Literal["bicycle", "unicycle"] = "bicycle"
     """Commanded are speed and steering angle, or speed and angular rate."""
     wheelbase: Positive = 0.2
-    """[m]"""
+    """Distance between the axles [m]."""
     speed_std: NonNegative = 0.1
-    """[m/s]"""
+    """Noise of the speed [m/s]."""
     steering_std: NonNegative = 0.03
-    """Of a bicycle [rad]."""
+    """Noise of the steering angle of a bicycle [rad]."""
     angular_rate_std: NonNegative = 0.1
-    """Of a unicycle [rad/s]."""
+    """Noise of the angular rate of a unicycle [rad/s]."""
     speed_bias: Real = 0.0
     """What is added to every commanded speed, noise apart [m/s]."""
     turn_bias: Real = 0.0
@@ -201,16 +201,16 @@ class MotionConfig(Section):
 
 
 class AssumedConfig(Section):
-    """What the filters and the front end believe otherwise than it is."""
+    """What filters and front end believe otherwise than it is; unless given, the truth."""
 
     wheelbase: Positive | None = None
-    """[m]; unless given, the true one, as all here."""
+    """Distance between the axles [m]."""
     speed_std: NonNegative | None = None
-    """[m/s]"""
+    """Noise of the speed [m/s]."""
     steering_std: NonNegative | None = None
-    """[rad]"""
+    """Noise of the steering angle of a bicycle [rad]."""
     angular_rate_std: NonNegative | None = None
-    """[rad/s]"""
+    """Noise of the angular rate of a unicycle [rad/s]."""
     speed_of_sound: Annotated[float, Field(ge=10, le=10_000)] | None = None
     """By which delays become ranges, and phases bearings [m/s]."""
 
@@ -221,11 +221,11 @@ class FilterConfig(Section):
     noise: Literal["constant", "measured"] = "constant"
     """The next two for every row (the paper's), or what the signal or a log tells of each."""
     range_std: Positive = 0.2
-    """[m]"""
+    """Noise of a range [m]."""
     bearing_std: Positive = 0.15
-    """[rad]"""
+    """Noise of a bearing [rad]."""
     initial_pose_std: tuple[NonNegative, NonNegative, NonNegative] = (0.05, 0.05, 0.0436)
-    """x, y [m], heading [rad]"""
+    """How unsure the start is: x, y [m], heading [rad]."""
     first_pose: Literal["exact", "drawn"] = "exact"
     """What they are told of the start: the true pose (the paper's), or one drawn with these."""
     gate: Probability = 1.0

@@ -1,0 +1,106 @@
+"""The page of all settings, made of `Config` when the pages are built."""
+
+import json
+import re
+
+from pydantic import TypeAdapter
+
+from pipistrelle.config import LARGEST, Config
+from pipistrelle.settings import PREFIX, from_flags, known_settings
+
+PLACE = "<!-- settings -->"
+ANY = "any number"
+UNIT = re.compile(r" ?\[((?!0 to 1)[^]]+)\]")
+HEADER = "| setting | default | unit | range | meaning |\n|---|---|---|---|---|\n"
+
+
+def add_settings(app, docname, content):
+    """Put every setting where the page asks for them."""
+    if docname == "settings":
+        content[0] = content[0].replace(PLACE, markdown())
+
+
+def markdown():
+    """Lay out a table for each section, under its name."""
+    parts, above = [], None
+    for key in known_settings():
+        if key[:-1] != above:
+            above = key[:-1]
+            parts.append("\n".join((*titled(above), HEADER)))
+        parts[-1] += row(key)
+    return "\n".join(parts)
+
+
+def titled(section):
+    """Return the heading of a section, and what it says of itself."""
+    if not section:
+        return "## Of a whole mission", ""
+    meaning = type(getattr(Config(), section[0])).__doc__
+    return f"## {section[0]}", "", " ".join(meaning.split()), ""
+
+
+def row(key):
+    """Return a setting's row of the table; under its name, its flag and its variable."""
+    field = known_settings()[key]
+    text = " ".join(field.description.split())
+    units = [] if isinstance(field.default, str) else UNIT.findall(text)
+    if len(units) == 1:
+        text = UNIT.sub("", text)
+    text = text.replace("|", "\\|")
+    default = "" if field.default is None else f"`{json.dumps(field.default)}`"
+    name = f"`{key[-1]}`<br>`{flag(key)}`<br>`{variable(key)}`"
+    return f"| {name} | {default} | {', '.join(units)} | {extent(field)} | {text} |\n"
+
+
+def flag(key):
+    """Return the flag that gives a setting."""
+    value = None
+    for name in reversed(key):
+        value = {name: value}
+    return from_flags(value)[key].where
+
+
+def variable(key):
+    """Return the variable of the environment that gives a setting."""
+    return PREFIX + "__".join(key).upper()
+
+
+def extent(field):
+    """Say which values a setting takes; bounds that hold for every number are left to the text."""
+    schema = TypeAdapter(field.rebuild_annotation()).json_schema()
+    kinds = [kind for kind in schema.get("anyOf", [schema]) if kind.get("type") != "null"]
+    return " or ".join(bounds(kind) for kind in kinds)
+
+
+def bounds(kind):
+    """Say what a kind of value is bounded by."""
+    whole = "whole, " if kind["type"] == "integer" else ""
+    if "enum" in kind:
+        return ", ".join(f"`{choice}`" for choice in kind["enum"])
+    if kind["type"] == "array":
+        inner = [bounds(part) for part in kind["prefixItems"]]
+        return f"{len(inner)} numbers" + ("" if inner[0] == ANY else f", each {inner[0]}")
+    if {"minimum", "maximum"} <= kind.keys() and kind["maximum"] < LARGEST:
+        return whole + f"{number(kind['minimum'])} to {number(kind['maximum'])}"
+    told = [
+        f"{sign} {number(kind[name])}"
+        for name, sign in (
+            ("minimum", "≥"),
+            ("exclusiveMinimum", ">"),
+            ("maximum", "≤"),
+            ("exclusiveMaximum", "<"),
+        )
+        if name in kind and abs(kind[name]) < LARGEST
+    ]
+    return whole + (", ".join(told) or ANY)
+
+
+def number(value):
+    """Write a bound, with a minus as the pages have it."""
+    text = f"{value:g}"
+    return f"−{text[1:]}" if value < 0 else text
+
+
+def setup(app):
+    app.connect("source-read", add_settings)
+    return {"parallel_read_safe": True}

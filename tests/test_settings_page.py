@@ -1,0 +1,91 @@
+"""The page of settings: every one of them, spelled as it can be given, with what it takes."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from docs.settings_page import PLACE, extent, flag, markdown, row, variable
+
+from pipistrelle.config import Config, InputError
+from pipistrelle.settings import from_environment, from_flags, known_settings, resolve
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "settings.md"
+SETTINGS = list(known_settings())
+
+
+def test_every_setting_has_its_row_under_its_section():
+    assert PAGE.read_text().count(PLACE) == 1
+    sections = re.split(r"^## ", markdown(), flags=re.MULTILINE)[1:]
+    named = {text.split("\n")[0]: re.findall(r"^\| `(\w+)`<br>", text, re.M) for text in sections}
+    wanted = {"Of a whole mission": ["seed"]}
+    for section, name in (key for key in SETTINGS if len(key) == 2):
+        wanted.setdefault(section, []).append(name)
+    assert named == wanted
+
+
+@pytest.mark.parametrize("key", SETTINGS, ids=".".join)
+def test_a_row_spells_the_setting_as_it_can_be_given(key):
+    cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", row(key))[1:-1]]
+    assert len(cells) == 5
+    name, default, _, takes, meaning = cells
+    assert name == f"`{key[-1]}`<br>`{flag(key)}`<br>`{variable(key)}`"
+    value = known_settings()[key].default
+    assert default == ("" if value is None else f"`{json.dumps(value)}`")
+    assert list(from_environment({variable(key): "1"})) == [key]
+    words = flag(key).removeprefix("--").replace("-", "_").split(".")
+    assert tuple(words) == key
+    assert takes
+    assert re.search(r"\w{3}", meaning), "a unit alone says nothing"
+
+
+@pytest.mark.parametrize(
+    ("key", "takes"),
+    [
+        (("seed",), "whole, ≥ 0"),
+        (("scenario", "speed"), "any number"),
+        (("scenario", "start"), "3 numbers"),
+        (("scenario", "step"), "> 0"),
+        (("air", "speed_of_sound"), "10 to 10000"),
+        (("air", "temperature_c"), "> −50, < 60"),
+        (("air", "spreading"), "`paper`, `bistatic`"),
+        (("receiver", "elements"), "whole, 2 to 64"),
+        (("detection", "peak_db"), "−300 to 0"),
+        (("detection", "false_alarm"), "≥ 1e-100, < 0.1"),
+        (("filter", "initial_pose_std"), "3 numbers, each ≥ 0"),
+        (("rays", "range_bounds"), "2 numbers, each > 0"),
+    ],
+)
+def test_what_a_setting_takes_is_said_in_a_few_signs(key, takes):
+    assert extent(known_settings()[key]) == takes
+
+
+@pytest.mark.parametrize("key", SETTINGS, ids=".".join)
+def test_a_bound_that_the_page_names_is_where_values_are_refused(key):
+    takes = extent(known_settings()[key])
+    if "`" in takes or "numbers" in takes:
+        return
+    bounds = re.findall(r"([≥>≤<]) ([−\de.-]+)", takes)
+    if between := re.search(r"([−\d.]+) to ([−\d.]+)", takes):
+        bounds = [("≥", between[1]), ("≤", between[2])]
+    for sign, text in bounds:
+        bound = float(text.replace("−", "-"))
+        beyond = bound + (-1.0 if sign in "≥>" else 1.0)
+        nested = {key[0]: {key[1]: beyond}} if len(key) == 2 else {key[0]: int(beyond)}
+        with pytest.raises(InputError, match=re.escape(flag(key))):
+            resolve(from_flags(nested))
+
+
+def test_units_stand_in_their_column_and_not_twice():
+    cells = row(("scenario", "beacon_distance")).split(" | ")
+    assert cells[2:] == ["m", "> 0", "Distance of the beacon from the centre. |\n"]
+    assert row(("air", "spreading")).split(" | ")[2].strip() == "", "a word has no unit"
+    start = row(("filter", "initial_pose_std"))
+    assert "| m, rad |" in start
+    assert "x, y [m], heading [rad]" in start, "several say which is which"
+
+
+def test_the_start_of_the_page_is_true():
+    assert resolve(from_environment({"PIPISTRELLE_RAYS__POWER": "3"})).rays.power == 3.0
+    assert resolve(from_flags({"rays": {"power": 3.0}})).rays.power == 3.0
+    assert Config().rays.power == 2.0
