@@ -9,7 +9,7 @@ import numpy as np
 SHORT = ("--duration", "4", "--landmarks", "10")
 """A world of eight frames."""
 COMPILING = "Compiling kernels (once) ..."
-"""Said on a slow machine, or the first time."""
+"""Said where the cache holds no kernels."""
 
 
 def summary(folder):

@@ -10,6 +10,7 @@ import pytest
 
 from pipistrelle import files
 from pipistrelle.estimation.catalogue import PAPERS
+from pipistrelle.experiments.runs import compiling
 from pipistrelle.scripting import missions
 from reference.command_line import COMPILING, SHORT, contents, summary, table, track
 
@@ -31,6 +32,17 @@ def test_a_run_tells_its_stages_its_scores_and_last_its_folder(obey):
     assert rows["landmarks, placed / heard"] == counts
     assert "fully placed, particles' mean" not in rows
     assert {"mission.png", "mission.pdf", "config.toml"} <= {p.name for p in Path("one").iterdir()}
+
+
+@pytest.mark.parametrize(("words", "said"), [((), 1), (("--quiet",), 0)])
+def test_compiling_is_told_of_when_kernels_are_compiled(obey, undrawn, monkeypatch, words, said):
+    monkeypatch.setattr(compiling, "compile_kernels", lambda tell: tell and tell())
+    assert obey("run", *SHORT, *words)[2].count(COMPILING) == said
+
+
+def test_nothing_is_told_of_kernels_that_are_loaded(obey, undrawn):
+    obey("run", *SHORT)
+    assert COMPILING not in obey("run", *SHORT)[2]
 
 
 def test_both_filters_are_told_compared_and_drawn_in_100_columns(obey, monkeypatch):

@@ -39,7 +39,7 @@ def unheard(monkeypatch):
 
     for module in (trial, world):
         monkeypatch.setattr(module, "listen", asked)
-    monkeypatch.setattr(compiling, "compile_kernels", lambda: None)
+    monkeypatch.setattr(compiling, "compile_kernels", lambda *_: None)
 
 
 def assert_both_tracks(folder, name):

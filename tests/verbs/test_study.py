@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from pipistrelle.__main__ import main
+from pipistrelle.experiments.runs import compiling
 from pipistrelle.experiments.studies import study, world
 from pipistrelle.experiments.studies.plan_file import read_plan
 from pipistrelle.experiments.studies.world_files import done_worlds
@@ -47,6 +48,14 @@ def failing(monkeypatch):
         return run_trial(case, drive, scans, config)
 
     monkeypatch.setattr(world, "run_trial", moody)
+
+
+@pytest.mark.parametrize(("words", "said"), [((), 1), (("--quiet",), 0)])
+def test_compiling_is_told_of_when_kernels_are_compiled(capsys, monkeypatch, words, said):
+    monkeypatch.setattr(compiling, "compile_kernels", lambda tell: tell and tell())
+    line = ("study", "small.toml", "--iterations", "1", "--workers", "1", "-o", "one")
+    assert main([*line, *words]) == 0
+    assert capsys.readouterr().err.count(COMPILING) == said
 
 
 def test_a_study_tells_how_far_it_is_what_came_of_it_and_last_its_folder(obey):

@@ -27,7 +27,7 @@ def announced(message: str, after: float = 3.0) -> Iterator[None]:
 
     Examples
     --------
-    >>> with announced("Compiling kernels (once) ..."):
+    >>> with announced("Drawing mission.gif ..."):
     ...     pass
     """
     timer = Timer(after, say, (message,))
@@ -37,6 +37,16 @@ def announced(message: str, after: float = 3.0) -> Iterator[None]:
         yield
     finally:
         timer.cancel()
+
+
+def announce_compiling() -> None:
+    """Say that kernels are compiled, which takes long, and only once.
+
+    Examples
+    --------
+    >>> announce_compiling()
+    """
+    say("Compiling kernels (once) ...")
 
 
 @contextmanager

@@ -5,7 +5,7 @@ import os
 import shlex
 import sys
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from pipistrelle.experiments.results.folder import prepare_folder
 from pipistrelle.scripting.missions import Done, filmed, keep
-from pipistrelle.verbs.console import announced, closing_table
+from pipistrelle.verbs.console import announce_compiling, announced, closing_table
 from pipistrelle.verbs.options import OutputOptions
 from pipistrelle.verbs.streams import put, warn
 
@@ -68,13 +68,12 @@ def recorder(options: OutputOptions) -> "MissionRecorder | None":
 
 
 def get_ready(options: OutputOptions) -> None:
-    """Compile all kernels, or load them, and say so if it takes long; keep memory for them."""
+    """Load all kernels; compile those that are not there, and say so. Keep memory for them."""
     from pipistrelle.experiments.machine import keep_freed_memory
     from pipistrelle.experiments.runs.compiling import compile_kernels
 
     keep_freed_memory()
-    with _waiting("Compiling kernels (once) ...", options):
-        compile_kernels()
+    compile_kernels(None if options.quiet else announce_compiling)
 
 
 def deliver(
@@ -100,7 +99,8 @@ def deliver(
     def film(room: Path) -> None:
         if watch is not None and watch.snapshots:
             path = room / f"mission.{options.animate}"
-            with _waiting(f"Drawing {path.name} ...", options):
+            message = f"Drawing {path.name} ..."
+            with contextlib.nullcontext() if options.quiet else announced(message):
                 filmed(done, watch, path)
 
     keep(done, folder, _command(), film)
@@ -119,8 +119,3 @@ def _command() -> str:
     """Return the command line as text, names that are no text by their bytes."""
     words = shlex.join(["pipistrelle", *sys.argv[1:]])
     return os.fsencode(words).decode(errors="backslashreplace")
-
-
-def _waiting(message: str, options: OutputOptions) -> AbstractContextManager[None]:
-    """Say what takes long, unless quiet."""
-    return contextlib.nullcontext() if options.quiet else announced(message)

@@ -12,7 +12,7 @@ from cyclopts import Parameter
 
 from pipistrelle.config import InputError
 from pipistrelle.settings import Layer
-from pipistrelle.verbs.console import announced
+from pipistrelle.verbs.console import announce_compiling
 from pipistrelle.verbs.options import SettingFlags, Whole, layers
 from pipistrelle.verbs.streams import put, say, warn
 
@@ -173,8 +173,7 @@ def _compiled_first(show: Show, quiet: bool) -> Show:
         if not ready and so_far.done < so_far.worlds:
             from pipistrelle.experiments.runs.compiling import compile_kernels
 
-            with announced("Compiling kernels (once) ...", 1e9 if quiet else 3.0):
-                compile_kernels()
+            compile_kernels(None if quiet else announce_compiling)
         ready = True
         show(so_far)
 

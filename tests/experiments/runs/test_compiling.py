@@ -1,8 +1,10 @@
 """The second process that compiles: it may fail, be impossible or be unwanted."""
 
+import os
 import subprocess
 import sys
 
+import numba
 import pytest
 
 from pipistrelle.experiments.runs import compiling as kernels
@@ -72,3 +74,45 @@ def test_second_process_leaves_the_filters_compiled_that_are_not_the_first():
     kernels.compile_others()
     assert correct_particles.signatures
     assert summarise.signatures
+
+
+@pytest.fixture
+def told():
+    """How often compiling was told of."""
+    return []
+
+
+def test_the_first_of_the_kernels_that_are_compiled_is_told_of(monkeypatch, told):
+    def mission(*_):
+        numba.njit(lambda x: x + 1)(1.0)
+        numba.njit(lambda x: x + 2)(1.0)
+
+    monkeypatch.setattr(kernels, "run_mission", mission)
+    kernels.compile_kernels(lambda: told.append(1))
+    assert told == [1]
+    numba.njit(lambda x: x + 3)(1.0)
+    assert told == [1], "what is compiled afterwards is somebody else's"
+
+
+def test_kernels_that_are_there_are_loaded_and_nothing_is_told(tmp_path, told):
+    code = (
+        "from pipistrelle.experiments.runs import compiling\n"
+        "from pipistrelle.geometry import wrap_angle\n"
+        "compiling.run_mission = lambda *_: wrap_angle(4.0)\n"
+        "compiling.cores = lambda: 1\n"
+        "compiling.compile_kernels(lambda: print('compiling'))"
+    )
+    for wanted in ("compiling\n", ""):
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert (done.stdout, done.stderr) == (wanted, "")
+
+
+def test_nobody_need_be_told(monkeypatch):
+    monkeypatch.setattr(kernels, "run_mission", lambda *_: numba.njit(lambda x: x - 1)(1.0))
+    kernels.compile_kernels()

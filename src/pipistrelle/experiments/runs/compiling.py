@@ -3,11 +3,12 @@
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from numba.core.event import Event, Listener, install_listener
 
 from pipistrelle.config import Config, ScenarioConfig
 from pipistrelle.detection.scans import make_scan
@@ -20,12 +21,39 @@ from pipistrelle.experiments.runs.trial import run_mission
 _SECOND = "from pipistrelle.experiments.runs.compiling import compile_others; compile_others()"
 
 
-def compile_kernels() -> None:
+def compile_kernels(tell: Callable[[], object] | None = None) -> None:
     """Compile every kernel, or load it from the cache, by a mission of two frames.
 
     Where the cache is empty a second process compiles those of all filters that share none with
     the first meanwhile. Nothing depends on it: what it leaves undone is done here.
+
+    Parameters
+    ----------
+    tell : function of nothing, optional
+        Called once, when the first kernel is about to be compiled, and not merely loaded.
     """
+    with install_listener("numba:compile", _Once(tell)):
+        _compile_or_load()
+
+
+class _Once(Listener):
+    """Tell of the first kernel that is compiled."""
+
+    def __init__(self, tell: Callable[[], object] | None) -> None:
+        self.tell = tell
+
+    def on_start(self, event: Event) -> None:
+        """Tell, and forget whom."""
+        tell, self.tell = self.tell, None
+        if tell is not None:
+            tell()
+
+    def on_end(self, event: Event) -> None:
+        """Say nothing."""
+
+
+def _compile_or_load() -> None:
+    """Run what needs every kernel."""
     tiny = Config(scenario=ScenarioConfig(steps=8, landmarks=4, radius=10.0))
     cached = any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbc"))
     if not cached and cores() > 1:
