@@ -11,7 +11,7 @@ from matplotlib import pyplot
 from matplotlib.collections import LineCollection, PolyCollection
 from PIL import Image
 
-from pipistrelle.estimation.beliefs import Gaussian, placed
+from pipistrelle.estimation.beliefs import Gaussian, no_landmarks, placed
 from pipistrelle.evaluation.accuracy import position_error
 from pipistrelle.evaluation.consistency import nees
 from pipistrelle.figures.mission import draw_mission
@@ -137,6 +137,53 @@ def test_the_legend_stands_once_and_names_everything(three):
     (legend,) = three.legends
     assert len(legend.texts) == 8
     assert all(axes.get_legend() is None for axes in three.axes)
+
+
+RAY, BEAM = "unresolved ray, 1σ, darker: likelier", "its beam"
+TIED, FULL = "placed landmark, 95 %, and its error", "placed landmark, 95 %"
+
+
+def named(trial, **scene) -> set[str]:
+    """What the legend of one map names."""
+    return {text.get_text() for text in draw_mission([trial], **scene).legends[0].texts}
+
+
+def test_a_map_without_rays_or_without_a_call_names_none(mission):
+    active, passive = (named(mission.trials[s], **mission.scene) for s in ("active", "passive"))
+    assert active ^ passive == {RAY, BEAM}
+    assert BEAM in active
+    assert TIED in active & passive
+
+
+def test_landmarks_are_named_as_they_are_drawn(mission):
+    trial, truth = mission.trials["active"], mission.scene["truth"]
+    unknown = mission.scene | {"truth": replace(truth, landmarks=None)}
+    assert {FULL, TIED, "true landmark"} & named(trial, **unknown) == {FULL}
+    empty = replace(trial, track=replace(trial.track, landmarks=no_landmarks()))
+    assert {FULL, TIED, "true landmark"} & named(empty, **mission.scene) == {"true landmark"}
+
+
+def test_particles_are_named_where_there_are_any(mission, swarms):
+    assert "particles" in named(swarms["fused"], **mission.scene)
+    assert "particles" not in named(mission.trials["fused"], **mission.scene)
+
+
+def test_a_vehicle_that_cannot_be_drawn_is_not_named(mission):
+    trial = mission.trials["active"]
+    mean = trial.track.pose.mean.copy()
+    mean[700:] = np.nan
+    pose = replace(trial.track.pose, mean=mean)
+    lost = named(replace(trial, track=replace(trial.track, pose=pose)), **mission.scene)
+    assert not lost & {"vehicle at the end", BEAM}
+    assert "estimated path" in lost
+
+
+def test_a_page_has_no_room_for_what_its_legend_does_not_name(mission):
+    figure = draw_mission([mission.trials["fused"]])
+    box, height = figure.legends[0], figure.get_figheight()
+    figure.canvas.draw()
+    below = figure.axes[0].get_position().y0 * height
+    assert below - box.get_window_extent().y1 / figure.dpi < 0.6, "inches"
 
 
 def test_each_filter_has_a_row_and_each_strategy_a_column(six):

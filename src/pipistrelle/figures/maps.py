@@ -278,8 +278,8 @@ def legend(figure: "Figure", names: Iterable[str], columns: int, left: float, ri
     )
 
 
-def _symbols() -> dict[str, "Artist"]:
-    """Return what each name in a legend stands for."""
+def _symbols() -> dict[str, "Artist | tuple[Artist, ...]"]:
+    """Return what each name in a legend stands for; several lie upon each other."""
     from matplotlib.lines import Line2D
     from matplotlib.path import Path
 
@@ -291,17 +291,20 @@ def _symbols() -> dict[str, "Artist"]:
 
     dart, sector = Path(vehicle(np.zeros(3), 1.0)), Path(beam(np.array([-0.5, 0, 0]), 0.8, 1.0))
     member = Path(ellipses(np.zeros((1, 2)), np.array([[[1.0, 0.4], [0.4, 0.4]]]), RAY)[0])
+    full, tie = mark("o", 7.5, "#33333330", INK), line(lw=0.7)
     return {
         "true path": line(TRUTH, lw=3.2, alpha=0.45),
         "estimated path": line(lw=1.2),
         "true landmark": mark("o", 5.0, "none", TRUTH),
-        "placed landmark, 95 %": mark("o", 7.5, "#33333330", INK),
+        "placed landmark, 95 %": full,
+        "placed landmark, 95 %, and its error": (full, tie),
         "unresolved ray, 1σ, darker: likelier": mark(member, 14.0, "#33333350"),
         "beacon": mark("*", 11.0, INK, "white"),
         "caller": mark("*", 11.0, INK, "white"),
         "moving caller": line(lw=1.0, ls="-."),
         "vehicle at the end": mark(dart, 10.0, INK),
         "its beam": mark(sector, 14.0, "#33333338"),
+        "particles": mark(dart, 10.0, "#33333350"),
         "range and bearing": line(lw=1.4),
         "bearing alone": line(lw=0.7, ls=(0, (4, 3))),
         "ray, 1σ, darker: likelier": mark(member, 14.0, "#33333350"),

@@ -34,19 +34,6 @@ ERRORS = (0.95, 0.95, 0.7)
 """Heights of the error rows: position, heading, NEES [inch]."""
 LABELS = ("y [m]", "position error\nand 3σ [m]", "heading error\nand 3σ [°]", "NEES\nand 95 %")
 """Of the rows' vertical axes."""
-SYMBOLS = (
-    ("true path", 0),
-    ("estimated path", None),
-    ("true landmark", 1),
-    ("placed landmark, 95 %", None),
-    ("unresolved ray, 1σ, darker: likelier", None),
-    ("beacon", 2),
-    ("caller", 3),
-    ("moving caller", 4),
-    ("vehicle at the end", None),
-    ("its beam", 5),
-)
-"""The legend, and which of true path, true landmarks, who calls and beamwidth an entry needs."""
 
 
 def draw_mission(
@@ -107,11 +94,7 @@ def draw_mission(
     maps = [trial.track.landmarks for trial in trials]
     limits = view(truth, callers, paths, maps)
     places = cells([(trial.strategy, trial.filter) for trial in trials])
-    shown = callers_shown(callers)
-    who = [name in shown for name in ("beacon", "caller", "moving caller")]
-    known = [truth.path is not None, truth.landmarks is not None]
-    given = [*known, *who, beamwidth is not None]
-    names = [name for name, of in SYMBOLS if of is None or given[of]]
+    names = _symbols(trials, truth, callers, beamwidth)
     with matplotlib.rc_context(STYLE):
         figure, panels = _panels(places, limits, len(names), errors=truth.path is not None)
         for trial, (axes, *rows) in zip(trials, panels, strict=True):
@@ -127,6 +110,33 @@ def draw_mission(
             _scale_errors([rows for _, *rows in panels])
         legend(figure, names, 4 if figure.get_figwidth() > 8.0 else 2, LEFT, RIGHT)
     return figure
+
+
+def _symbols(
+    trials: Sequence[TrialResult],
+    truth: Truth,
+    callers: Sequence[Caller],
+    beamwidth: float | None,
+) -> list[str]:
+    """Name what is drawn in any of the maps, in the order of the legend."""
+    tied = any(_ties(trial, truth.landmarks) for trial in trials)
+    full = [placed(trial.track.landmarks) for trial in trials]
+    ending = [trial for trial in trials if np.isfinite(trial.track.pose.mean[-1]).all()]
+    calling = [trial for trial in ending if trial.strategy != "passive"]
+    shown = callers_shown(callers)
+    drawn = {
+        "true path": truth.path is not None,
+        "estimated path": True,
+        "true landmark": truth.landmarks is not None and len(truth.landmarks[0]) > 0,
+        "placed landmark, 95 %, and its error": tied,
+        "placed landmark, 95 %": not tied and any(rows.any() for rows in full),
+        "unresolved ray, 1σ, darker: likelier": any(not rows.all() for rows in full),
+        **{name: name in shown for name in ("beacon", "caller", "moving caller")},
+        "vehicle at the end": bool(ending),
+        "its beam": beamwidth is not None and bool(calling),
+        "particles": any(trial.track.cloud is not None for trial in ending),
+    }
+    return [name for name, there in drawn.items() if there]
 
 
 def _panels(
@@ -148,7 +158,7 @@ def _panels(
     gaps = [0.0, 0.5, 0.12, 0.12][: len(heights)]
     block = TOP + sum(heights) + sum(gaps) + 0.42
     entries = 4 if total > 8.0 else 2
-    page = blocks * block + LEGEND * max(8 // entries, -(-names // entries)) / 2
+    page = blocks * block + LEGEND * -(-names // entries) / 2
     figure = Figure(figsize=(total, page))
     panels: list[list[Axes]] = []
     for row, column in places:
