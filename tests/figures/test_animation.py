@@ -5,9 +5,10 @@ import pytest
 from PIL import Image
 
 from pipistrelle.config import InputError
+from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.figures.animation import _stage, animate_mission, pruned
-from pipistrelle.figures.recorder import MissionRecorder
+from pipistrelle.figures.recorder import MissionRecorder, Snapshot
 from pipistrelle.geometry import range_and_bearing
 from reference.missions import map_with
 
@@ -169,3 +170,24 @@ def test_a_place_that_cannot_be_written_is_refused(recorder, tmp_path):
 def test_a_film_of_nothing_is_an_error(tmp_path):
     with pytest.raises(ValueError, match="at least one frame"):
         animate_mission({}, tmp_path / "mission.gif")
+
+
+def test_a_films_legend_names_what_its_frames_show(recorder, mission, tmp_path):
+    def named(strategy, frames=slice(None)):
+        key = strategy, "ekf"
+        figure, _ = _stage({key: recorder.snapshots[key][frames]}, **mission.scene)
+        return [text.get_text() for text in figure.legends[0].texts]
+
+    full = "placed landmark, 95 %"
+    rays = ["ray, 1σ, darker: likelier", "just pruned"]
+    assert named("active") == ["range and bearing", full, "beacon"]
+    assert named("passive") == ["bearing alone", *rays, full, "beacon"]
+    assert named("fused") == ["range and bearing", "bearing alone", *rays, full, "beacon"]
+
+
+def test_a_film_of_nothing_but_a_drive_needs_no_legend(tmp_path):
+    frame = Snapshot(
+        scan=make_scan(0.0, np.empty(0), np.empty(0)), pose=np.zeros(3), landmarks=rows_of([], [])
+    )
+    animate_mission({("active", "ekf"): [frame]}, tmp_path / "empty.gif")
+    assert (tmp_path / "empty.gif").read_bytes().startswith(b"GIF89a")

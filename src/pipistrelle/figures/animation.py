@@ -41,14 +41,6 @@ WIDTH, LEFT, RIGHT, TOP, BOTTOM, GAP, LINE = 3.66, 0.58, 0.12, 0.58, 0.54, 0.16,
 """Of a panel; margins, the space between panels and a line of the legend [inch]."""
 DPI = 100
 """Pixels per inch."""
-SYMBOLS = (
-    "range and bearing",
-    "bearing alone",
-    "ray, 1σ, darker: likelier",
-    "just pruned",
-    "placed landmark, 95 %",
-)
-"""The legend, but for who calls."""
 FLASH = 4
 """Pictures during which a landmark that has turned full is ringed."""
 
@@ -127,6 +119,22 @@ def _times(
     return np.array([frames[i].scan.time for i in chosen])
 
 
+def _symbols(snapshots: Mapping[tuple[str, str], Sequence[Snapshot]]) -> list[str]:
+    """Name what is heard and believed in any of the frames, in the order of the legend."""
+    frames = [frame for seen in snapshots.values() for frame in seen]
+    ranged = [np.isfinite(frame.scan.range) for frame in frames]
+    full = [placed(frame.landmarks) for frame in frames]
+    rays = any(not rows.all() for rows in full)
+    drawn = {
+        "range and bearing": any(rows.any() for rows in ranged),
+        "bearing alone": any(not rows.all() for rows in ranged),
+        "ray, 1σ, darker: likelier": rays,
+        "just pruned": rays,
+        "placed landmark, 95 %": any(rows.any() for rows in full),
+    }
+    return [name for name, there in drawn.items() if there]
+
+
 def _stage(
     snapshots: Mapping[tuple[str, str], Sequence[Snapshot]],
     truth: Truth,
@@ -142,7 +150,7 @@ def _stage(
     (left, right), (bottom, top) = limits
     places = cells(list(snapshots))
     rows, columns = (1 + max(indices) for indices in zip(*places, strict=True))
-    names = [*SYMBOLS, *sorted(callers_shown(callers))]
+    names = [*_symbols(snapshots), *sorted(callers_shown(callers))]
     foot = LINE * -(-len(names) // (2 * columns))
     high = TOP + WIDTH * (top - bottom) / (right - left) + BOTTOM
     size = np.array([LEFT + RIGHT + columns * (WIDTH + GAP) - GAP, rows * high + foot])

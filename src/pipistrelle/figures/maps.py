@@ -1,6 +1,6 @@
 """A map around what is estimated: its limits, the true world, the panel's name, the legend."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -239,14 +239,14 @@ def head(axes: "Axes", strategy: str, estimator: str) -> "Annotation":
     return axes.annotate("", xytext=(0, 7), fontsize=9.5, **above)
 
 
-def legend(figure: "Figure", names: Iterable[str], columns: int, left: float, right: float) -> None:
+def legend(figure: "Figure", names: Sequence[str], columns: int, left: float, right: float) -> None:
     """Explain symbols once for all panels, in neutral ink, at the bottom of a figure.
 
     Parameters
     ----------
     figure : Figure
-    names : iterable of str
-        As they are to be read.
+    names : sequence of str
+        As they are to be read; without any there is no legend.
     columns : int
     left, right : [inch]
         Margins.
@@ -264,11 +264,13 @@ def legend(figure: "Figure", names: Iterable[str], columns: int, left: float, ri
     >>> [text.get_text() for text in figure.legends[0].texts]
     ['true path', 'beacon']
     """
+    if not names:
+        return
     width, height = figure.get_size_inches()
     symbols = _symbols()
     figure.legend(
         handles=[symbols[name] for name in names],
-        labels=list(names),
+        labels=names,
         loc="lower left",
         bbox_to_anchor=(left / width, 0.07 / height, 1.0 - (left + right) / width, 0.0),
         mode="expand",
