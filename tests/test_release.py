@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
+PAGES = [path.read_text() for path in (ROOT / "docs").glob("*.md")]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 WORKFLOWS = {
     path.stem: yaml.safe_load(path.read_text())
@@ -99,3 +100,13 @@ def test_the_build_of_a_release_knows_the_tags():
         if step.get("uses", "").startswith("actions/checkout@")
     ]
     assert checkout["with"]["fetch-depth"] == 0
+
+
+def test_what_an_extra_installs_is_used():
+    sources = [path.read_text() for path in (ROOT / "src" / "pipistrelle").rglob("*.py")]
+    for extra, needed in PROJECT["optional-dependencies"].items():
+        for requirement in needed:
+            name = re.split(r"[^\w]", requirement, maxsplit=1)[0]
+            used = re.compile(rf"^ *(?:import|from) {name}\b", re.MULTILINE)
+            assert any(used.search(text) for text in sources), f"{extra}: {name}"
+            assert any(f"pipistrelle[{extra}]" in page for page in PAGES), extra
