@@ -98,14 +98,15 @@ def read_summary(folder: Path) -> Summary:
     try:
         summary = Summary.model_validate_json(path.read_bytes())
     except ValidationError as refused:
-        fault = refused.errors(include_url=False)[0]
-        if fault["loc"][:1] == ("runs",) and fault["type"] == "missing":
+        faults = refused.errors(include_url=False)
+        if any(fault["loc"] == ("runs",) and fault["type"] == "missing" for fault in faults):
             raise _no_results(folder) from None
-        key = ".".join(map(str, fault["loc"]))
+        key = ".".join(map(str, faults[0]["loc"]))
         where = f"{path}: {key}" if key else path
-        found = "nothing" if fault["type"] == "missing" else shown(fault["input"])
-        fix = "run or solve it anew with --overwrite"
-        raise refusal(where, found, expectation(fault), fix) from None
+        missing = faults[0]["type"] == "missing"
+        found = "nothing" if missing else shown(faults[0]["input"])
+        expected = "a value" if missing else expectation(faults[0])
+        raise refusal(where, found, expected, "run or solve it anew with --overwrite") from None
     if not summary.runs:
         raise refusal(f"{path}: runs", "none", "an estimate", "run or solve it anew")
     return summary

@@ -17,6 +17,7 @@ from pipistrelle.acoustics.callers import Caller
 from pipistrelle.acoustics.emitter import beamwidth_of
 from pipistrelle.config import Config
 from pipistrelle.detection.logs.readers import Robot, reader_of
+from pipistrelle.detection.logs.recording import Log
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.hearing.listening import Progress
@@ -50,7 +51,8 @@ class Again:
     beamwidth : [rad] or None
         Of the vehicle's call; of a log, that outside which ranges were hidden.
     mission : Mission or None
-        None of a log.
+    log : Log or None
+        One of the two: simulated, or recorded.
     difference : str
         How its tracks are not those of the folder, in a line; empty where they are, bit for bit.
     """
@@ -61,6 +63,7 @@ class Again:
     callers: tuple[Caller, ...]
     beamwidth: float | None
     mission: Mission | None
+    log: Log | None
     difference: str
 
 
@@ -110,20 +113,18 @@ def again(
     summary = read_summary(folder)
     config = resolve(from_file(folder / "config.toml"))
     strategies = list(dict.fromkeys(run.strategy for run in summary.runs))
-    filters = list(dict.fromkeys(run.filter for run in summary.runs))
+    tried = strategies, list(dict.fromkeys(run.filter for run in summary.runs))
     if summary.log is None:
         _check_simulated(folder, log)
         world = ANY if (kept := config.scenario.world) is None else read_world(Path(kept))
         looking = {"progress": progress, "watch": watch}
-        mission = run_mission(config, strategies, filters, world=world, **looking)
+        mission, recorded = run_mission(config, *tried, world=world, **looking), None
         trials, truth = mission.trials, mission.drive.truth
         callers, beam = mission.scenario.callers[1:], beamwidth_of(config)
     else:
         recorded, truth = load(_log_of(folder, summary, log), summary.log.robot)
         mission, callers, beam = None, (), summary.log.beamwidth_rad
-        trials = replay(
-            recorded, truth, strategies, filters, beam, config, progress=progress, watch=watch
-        )
+        trials = replay(recorded, truth, *tried, beam, config, progress=progress, watch=watch)
     return Again(
         config=config,
         trials=trials,
@@ -131,6 +132,7 @@ def again(
         callers=callers,
         beamwidth=beam,
         mission=mission,
+        log=recorded,
         difference=_difference(folder, summary, trials),
     )
 

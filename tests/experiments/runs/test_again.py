@@ -1,0 +1,201 @@
+"""A mission done again from its folder is the mission: bit for bit, or with a line that says why."""
+
+import json
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipistrelle.__main__ import main
+from pipistrelle.config import InputError
+from pipistrelle.experiments.runs.again import again
+from reference.command_line import SHORT
+
+OWN = Path(__file__).parents[2] / "data"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Result folders of a run and of two replays of its log, and the log."""
+    place = tmp_path_factory.mktemp("made")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["pipistrelle"])
+        patch.setattr("pipistrelle.figures.mission.draw_mission", lambda *_, **__: None)
+        patch.setattr("pipistrelle.figures.style.save_figure", lambda *_: None)
+        words = {
+            "run": ("run", *SHORT, "--seed", "5", "--filter", "both", "--beamwidth", "60",
+                    "--filter.gate", "0.99", "--save-log", place / "log"),
+            "slam": ("slam", place / "log", "--strategy", "all", "--beamwidth", "70",
+                     "--gate", "0.9", "--rays.density", "5"),
+            "robot": ("slam", OWN / "mrclam_made_up", "--robot", "1"),
+        }  # fmt: skip
+        for name, line in words.items():
+            assert main([*map(str, line), "--quiet", "-o", str(place / name)]) == 0
+    return place
+
+
+@pytest.fixture
+def folders(made, tmp_path, monkeypatch):
+    """The same to be changed, as they were left but for where they are."""
+    shutil.copytree(made, tmp_path / "made")
+    monkeypatch.chdir(tmp_path / "made")
+    summary = json.loads(Path("slam/summary.json").read_text())
+    summary["log"]["path"] = str(tmp_path / "made" / "log")
+    Path("slam/summary.json").write_text(json.dumps(summary))
+    return tmp_path / "made"
+
+
+def refused(folder, **options):
+    with pytest.raises(InputError) as refusal:
+        again(Path(folder), **options)
+    return str(refusal.value)
+
+
+@pytest.mark.parametrize("name", ["run", "slam", "robot"])
+def test_the_tracks_are_those_of_the_folder_bit_for_bit(made, name):
+    done = again(made / name)
+    assert done.difference == ""
+    kept = json.loads((made / name / "summary.json").read_text())["runs"]
+    assert [(t.strategy, t.filter) for t in done.trials] == [
+        (run["strategy"], run["filter"]) for run in kept
+    ]
+    for trial, run in zip(done.trials, kept, strict=True):
+        assert trial.scores.position_rmse_m == run["position_rmse_m"]
+        assert trial.scores.landmarks_full == run["landmarks_full"]
+        assert trial.scores.gated == run["gated"]
+
+
+def test_a_simulated_mission_comes_with_its_world(made):
+    done = again(made / "run")
+    assert done.log is None
+    assert done.mission is not None
+    assert done.mission.trials == done.trials
+    assert [caller.name for caller in done.callers] == ["beacon"]
+    assert np.degrees(done.beamwidth) == pytest.approx(60.0)
+    assert len(done.truth.landmarks[0]) == 11
+    assert done.config.filter.gate == 0.99
+
+
+def test_a_recorded_one_comes_with_its_log_and_the_beam_that_hid_its_ranges(made):
+    done = again(made / "slam")
+    assert done.mission is None
+    assert done.log is not None
+    assert done.log.name == "log"
+    assert done.callers == ()
+    assert np.degrees(done.beamwidth) == pytest.approx(70.0)
+    assert done.config.filter.gate == 0.9
+    assert again(made / "robot").beamwidth is None
+
+
+def test_whoever_watches_sees_every_frame(made):
+    seen, told = [], []
+    done = again(
+        made / "run",
+        watch=lambda *frame: seen.append(frame[:2]),
+        progress=lambda *stage: told.append(stage[0]),
+    )
+    assert len(seen) == sum(len(trial.scans) for trial in done.trials) == 48
+    assert {"listening", "fused ekf", "passive fastslam"} <= set(told)
+
+
+def test_a_folder_in_which_a_track_was_changed_is_told_by_how_much(folders):
+    path = Path("run/track_fused_ekf.tum")
+    first, *others = path.read_text().splitlines()
+    time, x, *rest = first.split()
+    path.write_text("\n".join([" ".join([time, str(float(x) + 0.25), *rest]), *others]) + "\n")
+    found = again(Path("run")).difference
+    assert found == f"{path}: is not as it is found now, by up to 0.25 m"
+
+
+def test_a_track_that_is_gone_and_one_of_other_rows_are_told(folders):
+    Path("run/track_active_ekf.tum").unlink()
+    Path("run/track_fused_fastslam.tum").write_text("not a track\n")
+    found = again(Path("run")).difference
+    assert found == "run/track_active_ekf.tum: cannot be read, nor are 1 more"
+
+
+def test_settings_that_were_changed_are_told_and_followed(folders):
+    path = Path("run/config.toml")
+    path.write_text(re.sub(r"(?m)^bearing_std = .*$", "bearing_std = 0.5", path.read_text()))
+    done = again(Path("run"))
+    assert done.config.filter.bearing_std == 0.5
+    assert re.fullmatch(
+        r"run/track_active_ekf.tum: is not as it is found now, by up to [\d.e-]+ m, nor are 5 "
+        r"more; config.toml was changed since",
+        done.difference,
+    )
+
+
+def test_another_version_is_told(folders):
+    summary = json.loads(Path("run/summary.json").read_text())
+    Path("run/summary.json").write_text(json.dumps({**summary, "version": "0.0.9"}))
+    assert again(Path("run")).difference == "", "what is the same is the same"
+    Path("run/track_fused_ekf.tum").write_text("0 0 0 0 0 0 0 1\n")
+    assert "; it was written by version 0.0.9, this is " in again(Path("run")).difference
+
+
+def test_a_log_that_is_gone_is_asked_for_and_may_be_elsewhere(folders):
+    Path("log").rename("moved [1] away")
+    said = refused("slam")
+    assert said.startswith("slam/summary.json: log.path: found ")
+    assert "which is not there, expected the folder of the log that was solved; put it back" in said
+    assert again(Path("slam"), log=Path("moved [1] away")).difference == ""
+    assert "option --log: found nowhere, which is not there" in refused("slam", log=Path("nowhere"))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda: Path("log/odometry.csv").open("a").write("99,0,0\n"), "odometry.csv was changed"),
+        (lambda: Path("log/landmarks.csv").unlink(), "landmarks.csv is gone"),
+        (
+            lambda: [Path("log", name).unlink() for name in ("truth.csv", "odometry.csv")],
+            "odometry.csv is gone, and 1 more",
+        ),
+    ],
+)
+def test_a_log_that_was_changed_is_refused_by_its_file(folders, change, said):
+    change()
+    found = refused("slam")
+    assert (
+        f"found not the log that was solved ({said}), expected it as slam was made of it" in found
+    )
+    assert found.endswith("put that back, or solve it as it is, `pipistrelle slam`, and name that "
+                          "folder")  # fmt: skip
+
+
+def test_a_truth_that_came_later_is_a_change(folders):
+    shutil.copytree(OWN / "unicycle_log", "other")
+    Path("other/truth.csv").unlink()
+    assert main(["slam", "other", "--quiet", "-o", "solved"]) == 0
+    assert again(Path("solved")).difference == ""
+    shutil.copy(OWN / "unicycle_log" / "truth.csv", "other/truth.csv")
+    assert "(truth.csv is new)" in refused("solved")
+
+
+def test_what_does_not_belong_to_a_log_may_change(folders):
+    Path("log/notes.txt").write_text("a user's")
+    Path("log/README.md").write_text("a user's")
+    assert again(Path("slam")).difference == ""
+
+
+def test_a_folder_that_does_not_say_which_log_it_was_is_refused(folders):
+    summary = json.loads(Path("slam/summary.json").read_text())
+    del summary["log"]
+    Path("slam/summary.json").write_text(json.dumps(summary))
+    assert refused("slam") == (
+        "slam/summary.json: log: found nothing, expected which log was solved (it is the folder of "
+        "an earlier version); solve it anew, `pipistrelle slam LOG -o DIR`, and name DIR"
+    )
+
+
+def test_a_log_for_a_mission_that_had_none_is_refused(folders):
+    assert "option --log: found log, expected none" in refused("run", log=Path("log"))
+
+
+def test_settings_that_are_none_are_refused_where_they_stand(folders):
+    Path("run/config.toml").write_text("[rays]\npowr = 1\n")
+    assert refused("run").startswith("run/config.toml: rays.powr: no such setting")
