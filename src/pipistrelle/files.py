@@ -76,7 +76,7 @@ class OwnFiles:
                 "replace; name another folder"
             )
         for name in sorted({*names, *self._sums}):
-            self._refuse(name)
+            self.refuse(name)
 
     def clear(self, names: Iterable[str] = ()) -> None:
         """Remove what we wrote, and nothing else.
@@ -116,7 +116,7 @@ class OwnFiles:
             As `check`, or where it cannot be written.
         """
         data = content.encode() if isinstance(content, str) else content
-        self._refuse(name)
+        self.refuse(name)
         path = self.folder / name
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -147,8 +147,19 @@ class OwnFiles:
         except OSError as error:
             raise _unwritable(self.folder, error) from error
 
-    def _refuse(self, name: str) -> None:
-        """Refuse to replace a file that is not as we wrote it."""
+    def refuse(self, name: str) -> None:
+        """Refuse to replace a file that is not as we wrote it.
+
+        Parameters
+        ----------
+        name : str
+            Relative to the folder; what is not there may be written.
+
+        Raises
+        ------
+        InputError
+            With the file.
+        """
         path, known = self.folder / name, name in self._sums
         if not known and os.path.lexists(self._partial(name)):
             path = self._partial(name)

@@ -40,6 +40,11 @@ app.command(
     help_epilogue=SPELLINGS,
 )
 app.command(
+    "pipistrelle.verbs.view:view",
+    name="view",
+    help="Play a mission in a browser, frame by frame: one page, which asks for nothing outside.",
+)
+app.command(
     "pipistrelle.verbs.study:study",
     name="study",
     help="Run many worlds, and all that a plan varies in each; again on one folder: go on.",

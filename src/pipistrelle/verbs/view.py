@@ -1,0 +1,135 @@
+"""`pipistrelle view`: a mission, frame by frame, on one page."""
+
+import os
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from pipistrelle.config import InputError
+from pipistrelle.files import RESULTS, OwnFiles, write_whole
+
+if TYPE_CHECKING:
+    from pipistrelle.figures.player.playback import Playback
+
+PAGE = "view.html"
+"""Name of the page in a result folder."""
+REST = 3
+"""Frames for which a smoother, which solves all anew for it, is not asked for its map."""
+
+
+def view(
+    folder: Annotated[Path, Parameter(help="The result folder of a run or slam.")],
+    /,
+    *,
+    output: Annotated[
+        Path | None,
+        Parameter(
+            name=("--output", "-o"),
+            metavar="FILE.html",
+            help=f"Where the page goes. [default: FOLDER/{PAGE}]",
+        ),
+    ] = None,
+    rerun: Annotated[
+        Path | None,
+        Parameter(
+            metavar="FILE.rrd",
+            help="Write a recording for the Rerun viewer as well; needs the extra view. "
+            "[default: no]",
+        ),
+    ] = None,
+    log: Annotated[
+        Path | None,
+        Parameter(
+            metavar="DIR",
+            help="Where the log is that was solved, if it was moved. [default: where it was]",
+        ),
+    ] = None,
+    overwrite: Annotated[
+        bool, Parameter(negative=(), help="Replace a FILE that is there already.")
+    ] = False,
+    quiet: Annotated[bool, Parameter(negative=(), help="Print the page's path alone.")] = False,
+) -> None:
+    """Play a mission in a browser: do it again from its result folder, and keep every frame."""
+    from pipistrelle.experiments.results.reading import read_summary
+
+    read_summary(folder)
+    target = folder / PAGE if output is None else output
+    _check_place(target, folder, ".html", "-o", overwrite)
+    if rerun is not None:
+        from pipistrelle.figures.player.rerun_file import check_there
+
+        check_there()
+        _check_place(rerun, folder, ".rrd", "--rerun", overwrite)
+    from pipistrelle.figures.player.page import page
+    from pipistrelle.verbs.streams import put
+
+    played = _play_again(folder, log, quiet)
+    if rerun is not None:
+        from pipistrelle.figures.player.rerun_file import recording
+
+        _write(rerun, folder, recording(played))
+    _write(target, folder, page(played).encode())
+    if rerun is not None and not quiet:
+        put(rerun)
+    put(target)
+
+
+def _play_again(folder: Path, log: Path | None, quiet: bool) -> "Playback":
+    """Do the mission again, and lay out what was seen of it."""
+    from pipistrelle.experiments.runs.again import again
+    from pipistrelle.figures.player.playback import playback
+    from pipistrelle.figures.recorder import MissionRecorder
+    from pipistrelle.verbs import delivery
+    from pipistrelle.verbs.console import progress
+    from pipistrelle.verbs.options import OutputOptions
+    from pipistrelle.verbs.streams import warn
+
+    delivery.get_ready(OutputOptions(quiet=quiet))
+    watch = MissionRecorder(rest=REST)
+    with progress(quiet) as show:
+        done = again(folder, log=log, progress=show, watch=watch)
+    if done.difference:
+        warn(f"{done.difference}; what is shown is found now")
+    return playback(done, watch.snapshots)
+
+
+def _check_place(path: Path, folder: Path, ending: str, option: str, overwrite: bool) -> None:
+    """Refuse a place that a file cannot have, before there is anything to write."""
+    fix = f"name another with {option} FILE{ending}"
+    if path.suffix.lower() != ending:
+        raise InputError(f"{option}: found {path}, expected a name that ends in {ending}")
+    if path.is_dir():
+        raise InputError(f"{path}: found a folder, expected a file; {fix}")
+    if _is_in(path, folder):
+        try:
+            OwnFiles(folder, RESULTS).refuse(path.name)
+        except InputError as refused:
+            raise InputError(str(refused).replace("name another folder", fix)) from None
+    elif os.path.lexists(path) and not overwrite:
+        raise InputError(f"{path}: is there already; {fix}, or add --overwrite")
+    if path.parent.exists():
+        try:
+            TemporaryFile(dir=path.parent).close()
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written ({error.strerror}); {fix}") from None
+
+
+def _is_in(path: Path, folder: Path) -> bool:
+    """Tell whether a file's place is the result folder itself."""
+    return path.parent.resolve() == folder.resolve()
+
+
+def _write(path: Path, folder: Path, data: bytes) -> None:
+    """Write a file that is whole or not there; in the result folder, as one of its own."""
+    if _is_in(path, folder):
+        OwnFiles(folder, RESULTS).write(path.name, data)
+        return
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, data)
+    except OSError as error:
+        raise InputError(
+            f"{path}: could not be written ({error.strerror}); make room or name another file"
+        ) from error
