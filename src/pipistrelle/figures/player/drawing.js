@@ -33,7 +33,10 @@ const outline = ({ x, y, xx, xy, yy }, scale) => {
   return `M${one}${arc}${other}${arc}${one}Z`;
 };
 
-const polygon = (points) => `${polyline(points)}Z`;
+const polygon = (points) => {
+  const edge = polyline(points);
+  return edge && `${edge}Z`;
+};
 
 const sector = (pose, width, length) => {
   const arc = Array.from({ length: 41 }, (_, i) =>

@@ -1,0 +1,245 @@
+"""The numbers of a page are those that the filters had, frame by frame."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipistrelle.config import InputError
+from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.experiments.drives import NO_TRUTH
+from pipistrelle.figures.animation import pruned
+from pipistrelle.figures.player.playback import MOST_PARTICLES, playback
+from pipistrelle.figures.recorder import MissionRecorder
+
+
+def rows_of(rows, frame):
+    part = slice(*rows.first[frame : frame + 2])
+    return rows.landmark[part], rows.numbers[part]
+
+
+def of(played, strategy, estimator):
+    (found,) = [e for e in played.estimates if (e.strategy, e.filter) == (strategy, estimator)]
+    return found
+
+
+def test_every_frame_of_every_estimate_is_there(watched, played):
+    _, snapshots = watched
+    assert [(e.strategy, e.filter) for e in played.estimates] == list(snapshots)
+    assert len(played.estimates) == 6
+    for estimate in played.estimates:
+        frames = snapshots[estimate.strategy, estimate.filter]
+        assert len(frames) == len(played.time) == 40
+        np.testing.assert_array_equal(estimate.pose, [frame.pose for frame in frames])
+        for i in (0, 17, 39):
+            scan, believed = frames[i].scan, frames[i].landmarks
+            labels, numbers = rows_of(estimate.heard, i)
+            assert labels.tolist() == scan.landmark.tolist()
+            np.testing.assert_array_equal(numbers, np.column_stack([scan.bearing, scan.range]))
+            labels, numbers = rows_of(estimate.mapped, i)
+            assert labels.tolist() == believed.landmark.tolist()
+            np.testing.assert_array_equal(numbers[:, :2], believed.mean)
+            np.testing.assert_array_equal(numbers[:, 3], believed.covariance[:, 0, 1])
+            np.testing.assert_array_equal(numbers[:, 5], believed.weight)
+
+
+def test_times_are_those_since_the_start_and_the_truth_is_that_of_the_frames(watched, played):
+    done, _ = watched
+    np.testing.assert_allclose(played.time, 0.5 * np.arange(1, 41))
+    np.testing.assert_array_equal(played.true_pose, done.truth.path[4::4])
+    np.testing.assert_array_equal(played.true_start, done.truth.path[0])
+    assert played.title == "Mission of seed 7"
+    assert played.facts == ("20.0 s", "40 frames", "beam 33°", "21 landmarks")
+    ((label, name, place),) = played.callers
+    assert (label, name) == (21, "beacon")
+    np.testing.assert_array_equal(place, done.truth.landmarks[1][-1])
+
+
+def test_the_spread_is_that_of_the_pose(watched, played):
+    _, snapshots = watched
+    covariance = snapshots["fused", "ekf"][20].covariance
+    expected = [covariance[0, 0], covariance[0, 1], covariance[1, 1], covariance[2, 2]]
+    np.testing.assert_array_equal(of(played, "fused", "ekf").spread[20], expected)
+
+
+def test_what_is_pruned_is_shown_at_the_frame_that_pruned_it(watched, played):
+    _, snapshots = watched
+    frames, estimate = snapshots["passive", "ekf"], of(played, "passive", "ekf")
+    assert len(rows_of(estimate.pruned, 0)[0]) == 0
+    total = 0
+    for i in range(1, 40):
+        before = frames[i - 1].landmarks
+        gone = pruned(before, frames[i].landmarks)
+        total += gone.sum()
+        np.testing.assert_array_equal(rows_of(estimate.pruned, i)[1][:, :2], before.mean[gone])
+    assert total > 5
+
+
+def test_particles_are_shown_and_of_many_a_part(watched, played):
+    done, snapshots = watched
+    assert of(played, "fused", "ekf").cloud is None
+    assert of(played, "fused", "fastslam").cloud.shape == (40, 100, 3)
+    key = ("fused", "fastslam")
+    many = {key: [replace(f, cloud=np.tile(f.cloud, (5, 1))) for f in snapshots[key]]}
+    (estimate,) = playback(done, many).estimates
+    assert estimate.cloud.shape == (40, 167, 3)
+    assert estimate.cloud.shape[1] <= MOST_PARTICLES
+
+
+def test_of_a_long_recording_frames_are_chosen_evenly_and_the_last_is_among_them(watched):
+    done, snapshots = watched
+    few = playback(done, snapshots, most=9)
+    np.testing.assert_allclose(np.diff(few.time), 2.5, atol=0.51)
+    assert few.time[-1] == pytest.approx(20.0)
+    assert "40 frames, of which 9 are shown" in few.facts
+    frames = snapshots["fused", "ekf"]
+    chosen = [round(2 * t) - 1 for t in few.time]
+    expected = [frames[i].pose for i in chosen]
+    np.testing.assert_array_equal(of(few, "fused", "ekf").pose, expected)
+    np.testing.assert_array_equal(few.true_pose, done.truth.path[[4 * i + 4 for i in chosen]])
+
+
+def test_an_estimate_that_ended_early_stays_where_it_was(watched):
+    done, snapshots = watched
+    short = {**snapshots, ("active", "ekf"): snapshots["active", "ekf"][:10]}
+    estimate = of(playback(done, short), "active", "ekf")
+    assert len(estimate.pose) == 40
+    np.testing.assert_array_equal(estimate.pose[9:], np.tile(estimate.pose[9], (31, 1)))
+
+
+def test_estimates_without_a_frame_are_left_out_and_none_at_all_is_refused(watched):
+    done, snapshots = watched
+    some = {key: frames for key, frames in snapshots.items() if key[0] == "fused"}
+    assert len(playback(done, some).estimates) == 2
+    failed = replace(done, trials=(replace(done.trials[0], error="it fell"),))
+    with pytest.raises(InputError, match=r"no estimate has a frame .*active ekf: it fell"):
+        playback(failed, {})
+
+
+def test_without_truth_there_is_none_and_the_map_is_around_what_is_estimated(watched):
+    done, snapshots = watched
+    blind = playback(replace(done, truth=NO_TRUTH, callers=()), snapshots)
+    assert (blind.true_pose, blind.true_start, blind.landmarks) == (None, None, None)
+    assert "no truth known" in blind.facts
+    (left, right), (bottom, top) = blind.limits
+    path = snapshots["fused", "ekf"][-1].pose
+    assert left < path[0] < right
+    assert bottom < path[1] < top
+
+
+def far_away(done, snapshots, shift):
+    """The same mission somewhere else."""
+
+    def moved(points):
+        shifted = points.copy()
+        shifted[..., :2] += shift
+        return shifted
+
+    truth = replace(
+        done.truth,
+        path=moved(done.truth.path),
+        landmarks=(done.truth.landmarks[0], moved(done.truth.landmarks[1])),
+    )
+    callers = tuple(replace(caller, place=moved(caller.place)) for caller in done.callers)
+    trials = []
+    for trial in done.trials:
+        pose = replace(trial.track.pose, mean=moved(trial.track.pose.mean))
+        rows = replace(trial.track.landmarks, mean=moved(trial.track.landmarks.mean))
+        trials.append(replace(trial, track=replace(trial.track, pose=pose, landmarks=rows)))
+    seen = {
+        key: [
+            replace(
+                f,
+                pose=moved(f.pose),
+                landmarks=replace(f.landmarks, mean=moved(f.landmarks.mean)),
+                cloud=None if f.cloud is None else moved(f.cloud),
+            )
+            for f in frames
+        ]
+        for key, frames in snapshots.items()
+    }
+    return replace(done, truth=truth, callers=callers, trials=tuple(trials)), seen
+
+
+def test_a_world_far_from_where_coordinates_begin_is_shown_about_another_origin(watched, played):
+    assert played.origin.tolist() == [0.0, 0.0]
+    done, snapshots = watched
+    far = playback(*far_away(done, snapshots, np.array([4e5, 5.2e6])))
+    assert far.origin.tolist() == [4e5, 5.2e6]
+    for name in ("limits", "true_pose", "true_start"):
+        np.testing.assert_allclose(getattr(far, name), getattr(played, name), atol=1e-8)
+    np.testing.assert_allclose(far.callers[0][2], played.callers[0][2], atol=1e-8)
+    np.testing.assert_allclose(far.landmarks[1], played.landmarks[1], atol=1e-8)
+    for one, other in zip(far.estimates, played.estimates, strict=True):
+        for name in ("start", "pose"):
+            np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-8)
+        np.testing.assert_allclose(one.mapped.numbers, other.mapped.numbers, atol=1e-8)
+        np.testing.assert_allclose(one.pruned.numbers, other.pruned.numbers, atol=1e-8)
+
+
+class Revising:
+    """A belief that says how often it was asked, and may revise its path."""
+
+    gated = 0
+
+    def __init__(self, frame, asked, real):
+        self.frame, self.asked, self.real = frame, asked, real
+
+    def pose(self):
+        return Gaussian(mean=np.array([float(self.frame), 0.0, 0.0]), covariance=np.eye(3))
+
+    def landmarks(self):
+        self.asked["map"].append(self.frame)
+        return self.real.landmarks
+
+    def path(self):
+        self.asked["path"].append(self.frame)
+        mean = np.arange(3.0 * (4 * self.frame + 5)).reshape(-1, 3)
+        return Gaussian(mean=mean, covariance=np.tile(np.eye(3), (len(mean), 1, 1)))
+
+
+def revised(watched, rest, frames=40):
+    _, snapshots = watched
+    seen, asked, watch = snapshots["fused", "ekf"], {"map": [], "path": []}, MissionRecorder(rest)
+    for i in range(frames):
+        real = seen[i % 40]
+        watch("fused", "ekf", real.scan, Revising(i, asked, real))
+    return asked, watch.snapshots
+
+
+def test_a_filter_that_revises_its_path_is_let_rest(watched):
+    asked, snapshots = revised(watched, 3)
+    assert asked["map"] == list(range(0, 40, 3))
+    assert asked["path"] == [0, 15, 30]
+    frames = snapshots["fused", "ekf"]
+    assert frames[4].landmarks is frames[3].landmarks
+    assert frames[6].landmarks is not frames[5].landmarks
+    assert [i for i, frame in enumerate(frames) if frame.path is not None] == [0, 15, 30]
+    assert frames[15].path.shape == (65, 2)
+    asked, snapshots = revised(watched, None)
+    assert (asked["map"], asked["path"]) == (list(range(40)), [])
+
+
+def test_the_longer_it_goes_on_the_longer_it_may_rest(watched):
+    asked, _ = revised(watched, 3, frames=600)
+    gaps = np.diff(asked["map"])
+    assert gaps[0] == 3
+    assert gaps[-1] == 9
+    assert np.all(np.diff(gaps) >= 0)
+
+
+def test_paths_as_they_were_revised_stand_at_their_frames_and_the_last_is_the_tracks(watched):
+    done, _ = watched
+    _, snapshots = revised(watched, 3)
+    (trial,) = [t for t in done.trials if (t.strategy, t.filter) == ("fused", "ekf")]
+    end = trial.track.pose.mean + 1.0
+    track = replace(trial.track, online=trial.track.pose, pose=replace(trial.track.pose, mean=end))
+    (estimate,) = playback(
+        replace(done, trials=(replace(trial, track=track),)), snapshots
+    ).estimates
+    assert estimate.revised_at.tolist() == [0, 15, 30, 39]
+    told = snapshots["fused", "ekf"][15].path
+    np.testing.assert_array_equal(rows_of(estimate.revised, 1)[1], told[:65:4])
+    np.testing.assert_array_equal(rows_of(estimate.revised, 3)[1], end[::4, :2])
+    np.testing.assert_array_equal(rows_of(estimate.mapped, 39)[1][:, :2], track.landmarks.mean)
+    assert estimate.start[0] == trial.track.pose.mean[0, 0]

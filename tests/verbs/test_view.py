@@ -1,0 +1,233 @@
+"""`pipistrelle view`: a page beside the results, and what stands in its way."""
+
+import json
+import shutil
+import sys
+from hashlib import sha256
+from pathlib import Path
+
+import pytest
+
+from pipistrelle.__main__ import main
+from pipistrelle.figures.player import rerun_file
+from reference.command_line import SHORT
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A run's folder."""
+    folder = tmp_path_factory.mktemp("made") / "one"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["pipistrelle"])
+        patch.setattr("pipistrelle.figures.mission.draw_mission", lambda *_, **__: None)
+        patch.setattr("pipistrelle.figures.style.save_figure", lambda *_: None)
+        assert main(["run", *SHORT, "--quiet", "-o", str(folder)]) == 0
+    return folder
+
+
+@pytest.fixture
+def folder(made):
+    """The same in the test's own folder, to be changed."""
+    return shutil.copytree(made, Path("one"))
+
+
+def sums(folder):
+    lines = (folder / "SHA256SUMS").read_text().splitlines()[1:]
+    return {name: its_sum for its_sum, name in (line.split("  ") for line in lines)}
+
+
+def is_page(path):
+    text = path.read_text(encoding="utf-8")
+    return text.startswith("<!doctype html>") and "Mission of seed" in text
+
+
+def test_the_page_stands_beside_the_results_as_one_of_them(obey, folder):
+    status, printed, said = obey("view", folder)
+    assert (status, printed) == (0, "one/view.html\n")
+    stages = [line[:17].strip() for line in said.splitlines() if "frames/s" in line]
+    assert stages == ["listening", "active ekf", "fused ekf", "passive ekf"]
+    page = folder / "view.html"
+    assert is_page(page)
+    assert sums(folder)["view.html"] == sha256(page.read_bytes()).hexdigest()
+    first = page.read_bytes()
+    assert obey("view", folder, "--quiet") == (0, "one/view.html\n", "")
+    assert page.read_bytes() == first, "the same mission, the same page"
+
+
+def test_a_new_mission_in_the_folder_takes_the_old_page_away(obey, folder, undrawn):
+    obey("view", folder, "--quiet")
+    assert obey("run", *SHORT, "--quiet", "--overwrite", "-o", folder)[0] == 0
+    assert not (folder / "view.html").exists()
+
+
+def test_the_page_goes_where_it_is_told_and_leaves_the_folder_as_it_was(obey, folder):
+    before = sorted(path.name for path in folder.iterdir())
+    for place in ("page.html", "a new [folder]/p q.HTML"):
+        assert obey("view", folder, "--quiet", "-o", place) == (0, f"{place}\n", "")
+        assert is_page(Path(place))
+    assert sorted(path.name for path in folder.iterdir()) == before
+
+
+def test_a_page_in_the_folder_by_another_name_is_one_of_its_files_too(obey, folder):
+    obey("view", folder, "--quiet", "-o", folder / "again.html")
+    assert "again.html" in sums(folder)
+
+
+def test_what_is_not_ours_in_the_folder_is_never_replaced(obey, folder, refused):
+    page = folder / "view.html"
+    page.write_text("mine")
+    for more in ((), ("--overwrite",)):
+        assert refused("view", folder, *more) == (
+            "one/view.html: is not Pipistrelle's, so it is not replaced; move it away, or name "
+            "another with -o FILE.html"
+        )
+        assert page.read_text() == "mine"
+    page.unlink()
+    obey("view", folder, "--quiet")
+    page.write_text(page.read_text() + "<!-- mine -->")
+    assert "was changed since Pipistrelle wrote it" in refused("view", folder, "--overwrite")
+
+
+def test_what_stands_elsewhere_is_replaced_when_that_is_asked_for(obey, folder, refused):
+    Path("page.html").write_text("mine")
+    said = refused("view", folder, "-o", "page.html")
+    assert said == (
+        "page.html: is there already; name another with -o FILE.html, or add --overwrite"
+    )
+    assert Path("page.html").read_text() == "mine"
+    assert obey("view", folder, "--quiet", "--overwrite", "-o", "page.html")[0] == 0
+    assert is_page(Path("page.html"))
+
+
+@pytest.mark.parametrize(
+    ("place", "said"),
+    [
+        ("page.pdf", "-o: found page.pdf, expected a name that ends in .html"),
+        ("page", "-o: found page, expected a name that ends in .html"),
+        ("/dev/stdout", "expected a name that ends in .html"),
+        ("folder.html", "folder.html: found a folder, expected a file; name another with -o"),
+        ("file/page.html", "file/page.html: cannot be written (Not a directory); name another"),
+        ("loop.html", "loop.html: is there already"),
+    ],
+)
+def test_a_place_that_a_page_cannot_have_is_refused_before_anything_is_done(
+    folder, refused, place, said, monkeypatch
+):
+    monkeypatch.setattr("pipistrelle.verbs.view._play_again", None)
+    Path("folder.html").mkdir()
+    Path("file").write_text("")
+    Path("loop.html").symlink_to("loop.html")
+    assert said in refused("view", folder, "-o", place)
+
+
+def test_a_folder_that_cannot_be_written_is_refused_by_name(folder, refused, monkeypatch):
+    def closed(**_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("pipistrelle.verbs.view.TemporaryFile", closed)
+    assert refused("view", folder) == (
+        "one/view.html: cannot be written (Permission denied); name another with -o FILE.html"
+    )
+
+
+def test_a_disk_that_is_full_leaves_what_was_there(obey, folder, refused, monkeypatch):
+    Path("page.html").write_text("mine")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pipistrelle.files.write_down", full)
+    said = refused("view", folder, "--quiet", "--overwrite", "-o", "page.html")
+    assert "page.html: could not be written (No space left on device); make room" in said
+    assert Path("page.html").read_text() == "mine"
+    assert "one/view.html: could not be written" in refused("view", folder, "--quiet")
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: None, "none: found no such folder, expected the result folder of"),
+        (lambda: Path("none").write_text(""), "none: found a file, expected the result folder of"),
+        (lambda: Path("none").mkdir(), "none: found no summary.json"),
+    ],
+)
+def test_what_is_no_folder_of_results_is_refused(refused, make, said):
+    make()
+    assert said in refused("view", "none")
+
+
+def test_a_study_is_refused_with_what_to_do_instead(obey, refused, undrawn):
+    obey("study", "paper", "--iterations", "1", "--quiet", "--scenario.steps", "8",
+         "--scenario.landmarks", "2", "-o", "study")  # fmt: skip
+    said = refused("view", "study")
+    assert said.startswith("study: found a study, which keeps many worlds and the frames of none")
+    assert "`pipistrelle report` puts it on a page; `pipistrelle run --config study/conf" in said
+    assert main(["run", "--config", "study/config.toml", "--quiet", "-o", "one"]) == 0
+    assert main(["view", "one", "--quiet"]) == 0
+
+
+def test_tracks_that_are_others_are_said_in_a_line_and_the_page_is_made(obey, folder):
+    path = folder / "track_fused_ekf.tum"
+    path.write_text(path.read_text().replace("0.5", "0.6"))
+    status, printed, said = obey("view", folder, "--quiet")
+    assert (status, printed) == (0, "one/view.html\n")
+    (line,) = said.splitlines()
+    assert line.startswith("pipistrelle: warning: one/track_fused_ekf.tum: is not as it is found")
+    assert line.endswith("; what is shown is found now")
+    assert is_page(folder / "view.html")
+
+
+def test_a_log_that_was_solved_is_played_too_and_may_be_moved(obey, refused, undrawn):
+    obey("run", *SHORT, "--quiet", "--save-log", "log", "-o", "one")
+    obey("slam", "log", "--beamwidth", "60", "--quiet", "-o", "two")
+    entry = json.loads(Path("two/summary.json").read_text())["log"]
+    assert entry["path"] == str(Path("log").resolve())
+    assert entry["robot"] is None
+    assert sorted(entry["files"]) == [
+        "landmarks.csv", "log.toml", "measurements.csv", "odometry.csv", "truth.csv",
+    ]  # fmt: skip
+    assert "and which log was solved, how it was heard" in Path("two/README.md").read_text()
+    assert obey("view", "two", "--quiet") == (0, "two/view.html\n", "")
+    page = Path("two/view.html").read_text()
+    assert "<h1>Log log</h1>" in page
+    assert "ranges within 60°" in page
+    Path("log").rename("moved")
+    assert "put it back, or say with --log DIR where it is" in refused("view", "two")
+    assert obey("view", "two", "--quiet", "--log", "moved") == (0, "two/view.html\n", "")
+    assert "option --log: found moved, expected none" in refused("view", "one", "--log", "moved")
+
+
+def test_an_estimator_from_outside_is_played_under_its_own_title(obey, undrawn):
+    Path("mine.py").write_text(
+        "from typing import ClassVar\n"
+        "from pipistrelle.estimation.ekf.filter import EkfSlam\n"
+        "class Mine(EkfSlam):\n"
+        "    title: ClassVar[str] = '<i>Mine</i>'\n"
+    )
+    words = ("--filter", "mine:Mine", "--strategy", "fused")
+    assert obey("run", *SHORT, *words, "--quiet", "-o", "one")[0] == 0
+    assert obey("view", "one", "--quiet") == (0, "one/view.html\n", "")
+    page = Path("one/view.html").read_text()
+    assert "fused \\u00b7 \\u003ci>Mine\\u003c/i>" in page
+
+
+def test_a_recording_needs_its_package_and_a_name_of_its_kind(folder, refused, monkeypatch):
+    monkeypatch.setattr(rerun_file, "find_spec", lambda _: None)
+    assert refused("view", folder, "--rerun", "x.rrd") == (
+        "--rerun: needs rerun-sdk, which is not installed; "
+        "python -m pip install 'pipistrelle[view]' installs it"
+    )
+    monkeypatch.setattr(rerun_file, "find_spec", lambda _: True)
+    said = refused("view", folder, "--rerun", "x.html")
+    assert said == "--rerun: found x.html, expected a name that ends in .rrd"
+    Path("x.rrd").write_text("mine")
+    assert "x.rrd: is there already" in refused("view", folder, "--rerun", "x.rrd")
+    assert not (folder / "view.html").exists()
+
+
+def test_a_recording_is_written_beside_the_page(obey, folder, monkeypatch):
+    monkeypatch.setattr(rerun_file, "find_spec", lambda _: True)
+    monkeypatch.setattr(rerun_file, "recording", lambda played: played.title.encode())
+    assert obey("view", folder, "--rerun", "x.rrd")[:2] == (0, "x.rrd\none/view.html\n")
+    assert Path("x.rrd").read_bytes() == b"Mission of seed 7"
+    assert is_page(folder / "view.html")
