@@ -169,11 +169,12 @@ const cloudAt = ({ cloud }, frame) => {
   return Array.from({ length: cloud.particles }, (_, i) => poseOf(cloud.pose, frame * cloud.particles + i));
 };
 
-// Rings where the chosen landmark is believed and truly is, and the way of the sound that tells.
+// The chosen landmark, all guesses of it or a ring, and the way of the sound that tells of it.
 const drawChosen = (map, d, estimate, frame, believed, chosen) => {
   const ray = believed.get(chosen), place = trueLandmarks.get(chosen), truth = trueAt(frame);
-  const spot = ray ? heaviest(ray) : place;
-  if (spot && isKnown(spot)) d.chosen = ring(spot, 15 * map.pixel);
+  const [spot] = ray || [place];
+  if (ray && ray.length > 1) d.chosen = ray.map((one) => outline(one, mission.scales.ray)).join("");
+  else if (spot && isKnown(spot)) d.chosen = ring(spot, 15 * map.pixel);
   const heard = heardAt(estimate, frame).find(({ landmark }) => landmark === chosen);
   if (!heard || !place || !truth || !isKnown(truth)) return;
   const callers = heard.ranged ? [] : mission.callers.filter(({ moves, label }) => !moves && label !== chosen);

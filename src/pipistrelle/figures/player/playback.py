@@ -64,16 +64,18 @@ class Estimate:
     pose : (n, 3) [m, m, rad]
     spread : (n, 4) [m^2, m^2, m^2, rad^2]
         Of the pose's covariance xx, xy, yy and that of the heading.
-    heard : Rows of bearing [rad] and range [m], NaN where there is none
-    mapped : Rows of x, y [m], xx, xy, yy [m^2] and weight
-    pruned : Rows as of a map
-        Of the map one frame before, what has no successor.
+    heard : Rows
+        Bearing [rad] and range [m], NaN where there is none.
+    mapped : Rows
+        x, y [m], xx, xy, yy [m^2] and weight of each member.
+    pruned : Rows
+        The same of what has no successor, at the frame that lacks it.
     cloud : (n, p, 3) [m, m, rad] or None
         The particles' poses.
     revised_at : (j)
         Frames at which the path so far was told anew.
-    revised : Rows of x, y [m], some for each of these
-        The start, and each frame so far.
+    revised : Rows
+        For each of these the start, and each frame so far: x, y [m].
     """
 
     strategy: str
@@ -110,8 +112,9 @@ class Playback:
     true_pose : (n, 3) [m, m, rad] or None
         NaN where it is not known.
     landmarks : labels (m) and true positions (m, 2) [m], or None
-    callers : tuple of label, name and places (2) or (n, 2) [m]
-        The label of one that stands is that of the landmark which it is.
+    callers : tuple
+        Label, name and places, (2) or (n, 2) [m], of each. The label of one that stands is that of
+        the landmark which it is.
     beamwidth : [rad] or None
     farthest : [m]
         That a landmark may be of which a bearing alone is known.

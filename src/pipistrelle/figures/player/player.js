@@ -127,8 +127,9 @@ const storyOf = ({ maps }, frame, landmark) => {
   const title = name[0].toUpperCase() + name.slice(1);
   if (!ray) return `${title}: ${maps.some((map) => map.has(landmark)) ? "not heard yet" : "never heard"}.`;
   const best = heaviest(ray), off = place ? `, ${apart(best, place)} from where it is` : "";
+  if (ray.length > 1 && best.weight < 0.5) return `${title}: a ray of ${ray.length}, undecided.`;
   if (ray.length > 1) {
-    return `${title}: a ray of ${ray.length}, the likeliest ${Math.round(100 * best.weight)} %${off}.`;
+    return `${title}: a ray of ${ray.length}, the likeliest ${Math.min(99, Math.round(100 * best.weight))} %${off}.`;
   }
   let since = frame;
   while (since && (maps[since - 1].get(landmark) || []).length === 1) since--;
@@ -245,6 +246,8 @@ const addBeside = () => {
 const show = () => {
   control.stage.replaceChildren();
   control.stage.className = state.shown.length > 1 ? "two" : "alone";
+  const { left, right, bottom, top } = wholeWorld();
+  control.stage.style.setProperty("--aspect", (right - left) / (top - bottom));
   panels = state.shown.map(makePanel);
   document.getElementById("beside").hidden = state.shown.length > 1 || mission.estimates.length === 1;
   draw();
