@@ -15,10 +15,11 @@ from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
 from pipistrelle.estimation.fastslam.filter import FastSlam
-from pipistrelle.estimation.motion import Motion, motion_jacobians, motion_step
+from pipistrelle.estimation.motion import Motion, motion_jacobians, motion_noise, motion_step
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.runs.filtering import run_filter
+from pipistrelle.geometry import wrap
 from reference.missions import (
     BICYCLE,
     CIRCLE,
@@ -34,6 +35,7 @@ from reference.missions import (
     scattered,
     steady,
 )
+from reference.odometry import as_poses
 
 CONTROLS, DT = np.tile(CIRCLE, (STEPS_PER_FRAME, 1)), np.full(STEPS_PER_FRAME, STEP)
 SHARP = {"range_std": 0.05, "bearing_std": 0.02}
@@ -189,6 +191,22 @@ class EstimatorContract:
         np.testing.assert_array_equal(track.pose.covariance, same.pose.covariance)
         np.testing.assert_array_equal(track.landmarks.mean, same.landmarks.mean)
 
+    @pytest.mark.parametrize("noise_at_rest", [True, False])
+    def test_a_drive_told_by_poses_gives_the_same_track_and_map(self, slam, noise_at_rest):
+        motion = replace(slam.motion, noise_at_rest=noise_at_rest)
+        drive, scans, _ = small_world(seed=5, frames=25)
+        controls = drive.controls.copy()
+        controls[::7] = 0.0
+        drive = replace(drive, motion=motion, controls=controls)
+        told = as_poses(drive)
+        assert told.controls.shape == (len(controls), 9)
+        track = run_filter(replace(slam, motion=motion), drive, scans, rng())
+        other = run_filter(replace(slam, motion=told.motion), told, scans, rng())
+        np.testing.assert_allclose(wrap(other.pose.mean - track.pose.mean), 0.0, atol=1e-9)
+        np.testing.assert_allclose(other.pose.covariance, track.pose.covariance, atol=1e-9)
+        np.testing.assert_array_equal(other.landmarks.landmark, track.landmarks.landmark)
+        np.testing.assert_allclose(other.landmarks.mean, track.landmarks.mean, rtol=0, atol=1e-8)
+
     def test_first_scan_may_come_before_any_step_and_steps_after_the_last_scan(self, slam):
         drive, scans, _ = small_world(seed=5, frames=4)
         first = replace(scans[0], time=0.0)
@@ -226,7 +244,7 @@ class DeadReckoning:
         means, covariances = [], []
         for control, step in zip(controls, dt, strict=True):
             F, U = motion_jacobians(self.motion, mean, control, step)
-            Q = np.diag(np.square(self.motion.control_std))
+            Q = motion_noise(self.motion, control)
             mean = motion_step(self.motion, mean, control, step)
             covariance = F @ covariance @ F.T + U @ Q @ U.T
             covariance = (covariance + covariance.T) / 2

@@ -1,26 +1,38 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pipistrelle.estimation.measurement import NEAREST, measurement_jacobians
-from pipistrelle.estimation.motion import Motion, motion_jacobians, motion_step
+from pipistrelle.estimation.motion import (
+    Motion,
+    motion_jacobians,
+    motion_noise,
+    motion_numbers,
+    motion_step,
+    propagate_pose,
+)
 from pipistrelle.geometry import range_and_bearing, wrap
-from reference.ekf_slam import moved
+from reference.ekf_slam import moved, noise_of
+from reference.odometry import as_motions, by_poses, wandering
 
 BICYCLE = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
 UNICYCLE = Motion(model="unicycle", control_std=(0.1, 0.15))
+POSES = Motion(model="poses", control_std=(0.02, 0.01, 0.03))
 
 # Central differences with this step: the rounding error is about 10 m * 2e-16 / 1e-5 = 2e-10,
 # the truncation error 1e-10 / 6 times third derivatives of at most about 50.
 STEP = 1e-5
 TOLERANCE = 1e-8
 
-models = st.sampled_from([BICYCLE, UNICYCLE])
 angles = st.floats(-np.pi, np.pi)
 lengths = st.floats(-10, 10)
 poses = st.tuples(lengths, lengths, angles).map(np.array)
 controls = st.tuples(st.floats(-2, 2), st.floats(-1.2, 1.2)).map(np.array)
+ways = st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(-1.2, 1.2)).map(np.array)
+steps = st.tuples(st.sampled_from([BICYCLE, UNICYCLE]), controls) | st.tuples(st.just(POSES), ways)
 durations = st.floats(0.01, 0.5)
 
 
@@ -34,8 +46,9 @@ def differences(function, at, angle_row):
     return np.array(columns).T
 
 
-@given(models, poses, controls, durations)
-def test_motion_jacobians_are_the_finite_differences_of_the_step(motion, pose, control, dt):
+@given(steps, poses, durations)
+def test_motion_jacobians_are_the_finite_differences_of_the_step(step, pose, dt):
+    motion, control = step
     F, U = motion_jacobians(motion, pose, control, dt)
     by_pose = differences(lambda x: motion_step(motion, x, control, dt), pose, 2)
     by_control = differences(lambda u: motion_step(motion, pose, u, dt), control, 2)
@@ -43,8 +56,9 @@ def test_motion_jacobians_are_the_finite_differences_of_the_step(motion, pose, c
     np.testing.assert_allclose(U, by_control, atol=TOLERANCE)
 
 
-@given(models, poses, controls, durations)
-def test_step_and_jacobians_equal_those_of_the_slow_reference(motion, pose, control, dt):
+@given(steps, poses, durations)
+def test_step_and_jacobians_equal_those_of_the_slow_reference(step, pose, dt):
+    motion, control = step
     after, F, U = moved(motion, pose, control, dt)
     change = motion_step(motion, pose, control, dt) - after
     change[2] = wrap(change[2])
@@ -82,8 +96,10 @@ def test_unicycle_is_smooth_where_its_series_takes_over(side):
     np.testing.assert_allclose(above, below, rtol=0, atol=1e-11)
 
 
-@given(poses, poses, controls, durations, models)
-def test_motion_looks_the_same_from_every_frame(pose, frame, control, dt, motion):
+@given(poses, poses, steps, durations)
+def test_motion_looks_the_same_from_every_frame(pose, frame, step, dt):
+    motion, control = step
+
     def seen_from(pose):
         c, s = np.cos(frame[2]), np.sin(frame[2])
         xy = np.array([[c, -s], [s, c]]) @ pose[:2] + frame[:2]
@@ -95,9 +111,70 @@ def test_motion_looks_the_same_from_every_frame(pose, frame, control, dt, motion
     np.testing.assert_allclose([*change[:2], wrap(change[2])], 0, atol=1e-14 * 40)
 
 
-@given(models, poses, controls, durations)
-def test_heading_after_a_step_is_wrapped(motion, pose, control, dt):
+@given(steps, poses, durations)
+def test_heading_after_a_step_is_wrapped(step, pose, dt):
+    motion, control = step
     assert -np.pi <= motion_step(motion, pose, 10 * control, dt)[2] < np.pi
+
+
+def test_the_motion_since_a_pose_is_forward_then_to_the_left_and_its_length_of_time_is_nothing():
+    north = np.array([2.0, 1.0, np.pi / 2])
+    for dt in (0.1, 10.0):
+        after = motion_step(POSES, north, np.array([3.0, 0.5, 0.25]), dt)
+        np.testing.assert_allclose(after, [1.5, 4.0, np.pi / 2 + 0.25], rtol=1e-15)
+
+
+@given(poses, controls, durations, st.sampled_from([BICYCLE, UNICYCLE]))
+def test_controls_told_as_motions_lead_to_the_same_pose(pose, control, dt, motion):
+    (way,) = as_motions(motion, [control], [dt])
+    change = motion_step(by_poses(motion), pose, way, dt) - motion_step(motion, pose, control, dt)
+    np.testing.assert_allclose([*change[:2], wrap(change[2])], 0, atol=1e-14 * 20)
+
+
+@pytest.mark.parametrize("motion", [BICYCLE, UNICYCLE, POSES])
+@pytest.mark.parametrize("noise_at_rest", [True, False])
+def test_noise_is_that_of_the_model_and_none_at_rest_where_that_is_exact(motion, noise_at_rest):
+    motion = replace(motion, noise_at_rest=noise_at_rest)
+    still = np.zeros(len(motion.control_std))
+    moving = [still + unit for unit in np.eye(still.size)]
+    for control in (still, *moving):
+        exact = not noise_at_rest and control is still
+        expected = np.diag(np.square(motion.control_std)) * (not exact)
+        np.testing.assert_array_equal(motion_noise(motion, control), expected)
+        np.testing.assert_array_equal(noise_of(motion, control), expected)
+
+
+def test_a_motion_that_says_its_covariance_has_it_and_one_that_does_not_the_models():
+    told = np.array([0.1, 0.0, 0.2, 4.0, 0.5, -0.3, 2.0, 0.1, 1.0])
+    expected = [[4.0, 0.5, -0.3], [0.5, 2.0, 0.1], [-0.3, 0.1, 1.0]]
+    np.testing.assert_array_equal(motion_noise(POSES, told), expected)
+    told[3:] = np.nan
+    np.testing.assert_array_equal(motion_noise(POSES, told), motion_noise(POSES, told[:3]))
+
+
+def test_a_stated_covariance_counts_at_rest_unless_rest_is_exact():
+    still = np.array([0.0, 0.0, 0.0, 4.0, 0.5, -0.3, 2.0, 0.1, 1.0])
+    assert motion_noise(POSES, still)[0, 0] == 4.0
+    assert not motion_noise(replace(POSES, noise_at_rest=False), still).any()
+
+
+@pytest.mark.parametrize("stated", [True, False])
+@pytest.mark.parametrize("motion", [BICYCLE, UNICYCLE, POSES])
+def test_a_pose_is_carried_with_its_covariance_as_the_jacobians_say(motion, stated):
+    rng = np.random.default_rng(2)
+    drive = wandering(rng, 50, stated=stated)
+    drive = drive if motion is POSES else drive[:, :2]
+    pose, P, slow = np.array([1.0, -2.0, 3.0]), np.diag([0.04, 0.02, 0.01]), None
+    for control in drive:
+        F, U = motion_jacobians(motion, pose, control, 0.3)
+        slow = F @ P @ F.T + U @ motion_noise(motion, control) @ U.T
+        after = motion_step(motion, pose, control, 0.3)
+        shift = propagate_pose(pose, P, control, 0.3, motion_numbers(motion))
+        np.testing.assert_array_equal(pose, after)
+        np.testing.assert_allclose(P, slow, rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(P, P.T)
+        np.testing.assert_allclose(shift, (F[1, 2], -F[0, 2]), atol=1e-15)
+        assert np.linalg.eigvalsh(P)[0] > 0.0
 
 
 @given(poses, st.floats(0.5, 30), angles)

@@ -20,6 +20,7 @@ from pipistrelle.experiments.runs.trial import drive_of, scans_of
 from pipistrelle.geometry import range_and_bearing, wrap
 from reference.ekf_slam import moved
 from reference.missions import BICYCLE, CIRCLE, START, scan_with, scattered
+from reference.odometry import as_poses
 from reference.optimum import from_the_truth
 
 STEPS, EVERY, STEP = 60, 4, 0.125
@@ -79,6 +80,13 @@ def test_the_bound_is_the_prior_of_everything_given_everything_heard_at_once(str
     bound = bound_of(scans)
     for k in (EVERY, 18, STEPS):
         np.testing.assert_allclose(bound[k], conditioned_bound(scans, k), rtol=0, atol=1e-11)
+
+
+def test_a_drive_told_by_poses_has_the_same_bound():
+    scans, told = heard("fused"), as_poses(DRIVE)
+    same = pose_bound(told.motion, told.controls, told.time, WORLD.path, PLACES, scans)
+    np.testing.assert_allclose(same, bound_of(scans), rtol=0, atol=1e-13)
+    assert same[-1].any()
 
 
 def test_the_bound_hangs_on_no_measurement_but_on_who_was_heard_how_surely():

@@ -28,8 +28,20 @@ def wrapped(angle):
 
 
 def moved(motion, pose, control, dt):
-    """Pose after one step, and the Jacobians by pose F (3, 3) and by control U (3, 2)."""
-    return {"bicycle": bicycle, "unicycle": unicycle}[motion.model](motion, pose, control, dt)
+    """Pose after one step, and the Jacobians by pose F (3, 3) and by what is noisy U (3, n)."""
+    models = {"bicycle": bicycle, "unicycle": unicycle, "poses": poses}
+    return models[motion.model](motion, pose, control, dt)
+
+
+def noise_of(motion, control):
+    """Covariance of what is noisy in a control step."""
+    told = 3 if motion.model == "poses" else 2
+    if not motion.noise_at_rest and all(number == 0 for number in control[:told]):
+        return np.zeros((told, told))
+    if len(control) > 3 and not math.isnan(control[3]):
+        xx, xy, xh, yy, yh, hh = control[3:]
+        return np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
+    return np.diag(np.square(motion.control_std))
 
 
 def bicycle(motion, pose, control, dt):
@@ -59,6 +71,16 @@ def unicycle(_, pose, control, dt):
     F = [[1, 0, -v * dt * sinc * s], [0, 1, v * dt * sinc * c], [0, 0, 1]]
     by_rate = [v * dt * (slope * c - sinc * s) * dt / 2, v * dt * (slope * s + sinc * c) * dt / 2]
     U = [[dt * sinc * c, by_rate[0]], [dt * sinc * s, by_rate[1]], [0, dt]]
+    return np.array(after), np.array(F), np.array(U)
+
+
+def poses(_, pose, control, dt):
+    """The motion itself, in the axes of the pose before: forward f, sideways g, and a turn."""
+    (x, y, th), (f, g, turn) = pose, control[:3]
+    c, s = math.cos(th), math.sin(th)
+    after = [x + f * c - g * s, y + f * s + g * c, wrapped(th + turn)]
+    F = [[1, 0, -f * s - g * c], [0, 1, f * c - g * s], [0, 0, 1]]
+    U = [[c, -s, 0], [s, c, 0], [0, 0, 1]]
     return np.array(after), np.array(F), np.array(U)
 
 
@@ -194,9 +216,7 @@ class SlowEkfSlam:
         means, covariances = [], []
         for control, step in zip(controls, dt, strict=True):
             self.X[:3], F, U = moved(self.motion, self.X[:3], control, step)
-            Q = np.diag(np.square(self.motion.control_std))
-            if not self.motion.noise_at_rest and control[0] == 0 and control[1] == 0:
-                Q = np.zeros((2, 2))
+            Q = noise_of(self.motion, control)
             P = self.P.copy()
             P[:3, :3] = F @ self.P[:3, :3] @ F.T + U @ Q @ U.T
             P[:3, 3:] = F @ self.P[:3, 3:]

@@ -19,6 +19,7 @@ from reference.ekf_slam import (
     NEAREST,
     logarithm,
     moved,
+    noise_of,
     normalised,
     ray_ranges,
     wrapped,
@@ -131,9 +132,7 @@ class SlowFastSlam:
         """Advance by the nominal controls; mean and covariance of the swarm after each step."""
         means, covariances = [], []
         for control, step in zip(controls, dt, strict=True):
-            Q = np.diag(np.square(self.motion.control_std))
-            if not self.motion.noise_at_rest and control[0] == 0 and control[1] == 0:
-                Q = np.zeros((2, 2))
+            Q = noise_of(self.motion, control)
             for p in self.particles:
                 p.pose, F, U = moved(self.motion, p.pose, control, step)
                 p.P = F @ p.P @ F.T + U @ Q @ U.T

@@ -7,7 +7,7 @@ SE_n(2), the truth is exp(xi) times the estimate. Rays and bookkeeping are those
 import numpy as np
 from scipy.linalg import expm
 
-from reference.ekf_slam import SlowEkfSlam, moved
+from reference.ekf_slam import SlowEkfSlam, moved, noise_of
 
 QUARTER = np.array([[0.0, -1.0], [1.0, 0.0]])
 
@@ -42,10 +42,8 @@ class SlowInvariantEkfSlam(SlowEkfSlam):
         means, covariances = [], []
         for control, step in zip(controls, dt, strict=True):
             self.X[:3], _, U = moved(self.motion, self.X[:3], control, step)
-            Q = np.diag(np.square(self.motion.control_std))
-            if not self.motion.noise_at_rest and control[0] == 0 and control[1] == 0:
-                Q = np.zeros((2, 2))
-            by_noise = np.zeros((self.X.size, 2))
+            Q = noise_of(self.motion, control)
+            by_noise = np.zeros((self.X.size, len(Q)))
             by_noise[:3] = U
             by_noise = self.change() @ by_noise
             self.P = self.P + by_noise @ Q @ by_noise.T

@@ -30,7 +30,7 @@ SENSING = {
 class Mission:
     """Truth and what a filter is given; landmark i (from 0) bears the label i + 1.
 
-    `path` holds the start, then the pose at each frame; `controls` (frames, 4, 2) are nominal.
+    `path` holds the start, then the pose at each frame; `controls` (frames, 4, c) are nominal.
     """
 
     path: np.ndarray
@@ -64,8 +64,8 @@ def draw_mission(
         pose = path[-1]
         for control in nominal:
             moving = motion.noise_at_rest or np.any(control)
-            noise = rng.normal(size=2) * motion.control_std * moving
-            pose = motion_step(motion, pose, control + noise, STEP)
+            noise = rng.normal(size=len(motion.control_std)) * motion.control_std * moving
+            pose = motion_step(motion, pose, control[: noise.size] + noise, STEP)
         path.append(pose)
         distance, bearing = range_and_bearing(pose, landmarks)
         active = (distance < reach) & (np.abs(bearing) < beamwidth / 2)

@@ -177,7 +177,7 @@ class Estimator(Protocol[B]):
     def predict(
         self,
         belief: B,
-        controls: Float[np.ndarray, "k 2"],
+        controls: Float[np.ndarray, "k c"],
         dt: Float[np.ndarray, " k"],
         rng: np.random.Generator,
     ) -> tuple[B, Gaussian]:

@@ -1,7 +1,16 @@
-"""Motion models with their Jacobians.
+r"""Motion models with their Jacobians.
+
+What a vehicle's *controls* are is its model's business, a row for each step: two numbers of a
+bicycle or a unicycle. Of *poses*, as odometry tells them, they are the motion itself since the pose
+before, in the vehicle's axes there, forward, sideways and turn,
+
+.. math:: (x, y)_k = (x, y)_{k-1} + R(\theta_{k-1}) \, (d_x, d_y), \quad
+          \theta_k = \theta_{k-1} + d_\theta
+
+and, where a recorder says how sure it is, the six numbers of that motion's covariance besides.
 
 The kernels return plain numbers, so that the filters can inline them; the functions beside them
-say the same in arrays. In the kernels a motion model is a number: 0 bicycle, 1 unicycle.
+say the same in arrays. In the kernels a motion model is a number: 0 bicycle, 1 unicycle, 2 poses.
 """
 
 import math
@@ -13,9 +22,12 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.geometry import wrap_angle
-from pipistrelle.jit import Whole, kernel, no_alloc
+from pipistrelle.jit import Whole, no_alloc
 
-MOTION_MODELS = ("bicycle", "unicycle")
+MOTION_MODELS = ("bicycle", "unicycle", "poses")
+BY_POSES = MOTION_MODELS.index("poses")
+MOVED = 3
+"""Numbers of a relative motion; those of its covariance follow: xx, xy, xh, yy, yh, hh."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,18 +36,20 @@ class Motion:
 
     Attributes
     ----------
-    model : "bicycle" or "unicycle"
-        Controls are speed [m/s] and steering angle [rad], or speed [m/s] and angular rate [rad/s].
-    control_std : (speed [m/s], steering [rad] or angular rate [rad/s])
-        Noise of one control step.
+    model : "bicycle", "unicycle" or "poses"
+        Controls are speed [m/s] and steering angle [rad], speed [m/s] and angular rate [rad/s], or
+        the motion since the pose before: forward, sideways (to the left) [m] and turn [rad],
+        perhaps with its covariance, xx, xy, xh, yy, yh, hh (x forward, h turn; NaN: not said).
+    control_std : one for each of these, (2) or (3)
+        Noise of one control step; of poses, of a motion that does not say its covariance.
     wheelbase : [m]
         Bicycle only.
     noise_at_rest : bool
-        False: a step whose two controls are zero is exact.
+        False: a step whose controls are zero, or whose motion is, is exact.
     """
 
-    model: Literal["bicycle", "unicycle"]
-    control_std: tuple[float, float]
+    model: Literal["bicycle", "unicycle", "poses"]
+    control_std: tuple[float, ...]
     wheelbase: float = 1.0
     noise_at_rest: bool = True
 
@@ -46,6 +60,7 @@ class MotionNumbers(NamedTuple):
     model: int
     wheelbase: float
     speed_variance: float
+    sideways_variance: float
     turn_variance: float
     noise_at_rest: bool
 
@@ -72,20 +87,31 @@ def motion_numbers(motion: Motion) -> MotionNumbers:
         model=MOTION_MODELS.index(motion.model),
         wheelbase=float(motion.wheelbase),
         speed_variance=float(motion.control_std[0]) ** 2,
-        turn_variance=float(motion.control_std[1]) ** 2,
+        sideways_variance=float(motion.control_std[1]) ** 2 if motion.model == "poses" else 0.0,
+        turn_variance=float(motion.control_std[-1]) ** 2,
         noise_at_rest=motion.noise_at_rest,
     )
 
 
-@kernel
+@no_alloc
 def motion_increment(
-    model: Whole, wheelbase: float, heading: float, speed: float, turn: float, dt: float
+    model: Whole, wheelbase: float, heading: float, control: Float[np.ndarray, " c"], dt: float
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
     """One noise-free control step, for kernels.
 
     Returns dx, dy, dheading; dx/dheading, dy/dheading are -dy, dx; then the six entries of the
-    Jacobian U by speed (x, y, heading) and by turn (x, y, heading).
+    Jacobian U by speed (x, y, heading) and by turn (x, y, heading). Of poses the column by what is
+    sideways is missing: it is a quarter turn of the first.
     """
+    if model == BY_POSES:
+        c, s = math.cos(heading), math.sin(heading)
+        ahead, aside = control[0], control[1]
+        return (
+            c * ahead - s * aside, s * ahead + c * aside, control[2],
+            c, s, 0.0,
+            0.0, 0.0, 1.0,
+        )  # fmt: skip
+    speed, turn = control[0], control[1]
     if model == 0:
         c, s = math.cos(heading + turn), math.sin(heading + turn)
         dx, dy = speed * dt * c, speed * dt * s
@@ -113,31 +139,56 @@ def motion_increment(
 
 
 @no_alloc
+def relative_noise(
+    control: Float[np.ndarray, " c"], motion: MotionNumbers
+) -> tuple[float, float, float, float, float, float]:
+    """Entries xx, xy, xh, yy, yh, hh of the covariance of a motion since a pose, in its axes."""
+    moves = control[0] != 0.0 or control[1] != 0.0 or control[2] != 0.0
+    if not (motion.noise_at_rest or moves):
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    if control.size > MOVED and not math.isnan(control[MOVED]):
+        return (
+            control[MOVED], control[MOVED + 1], control[MOVED + 2],
+            control[MOVED + 3], control[MOVED + 4], control[MOVED + 5],
+        )  # fmt: skip
+    return motion.speed_variance, 0.0, 0.0, motion.sideways_variance, 0.0, motion.turn_variance
+
+
+@no_alloc
 def propagate_pose(
     pose: Float[np.ndarray, "3"],
     P: Float[np.ndarray, "3 3"],
-    speed: float,
-    turn: float,
+    control: Float[np.ndarray, " c"],
     dt: float,
     motion: MotionNumbers,
 ) -> tuple[float, float]:
     """Carry a pose (3) and its covariance (3, 3) through a control step, in place.
 
-    F P F^T + U Q U^T (Bradley & Abaid, Eq. (10)); Q alone has rank 2. Returns dx and dy [m].
+    F P F^T + U Q U^T (Bradley & Abaid, Eq. (10)); Q alone has rank 2, of poses 3. Returns dx and dy
+    [m].
     """
     dx, dy, dheading, u00, u10, u20, u01, u11, u21 = motion_increment(
-        motion.model, motion.wheelbase, pose[2], speed, turn, dt
+        motion.model, motion.wheelbase, pose[2], control, dt
     )
     pose[0] += dx
     pose[1] += dy
     pose[2] = wrap_angle(pose[2] + dheading)
-    noisy = 1.0 if motion.noise_at_rest or speed != 0.0 or turn != 0.0 else 0.0
-    q0, q1 = noisy * motion.speed_variance, noisy * motion.turn_variance
     xx = P[0, 0] - 2.0 * dy * P[0, 2] + dy * dy * P[2, 2]
     xy = P[0, 1] + dx * P[0, 2] - dy * P[1, 2] - dx * dy * P[2, 2]
     yy = P[1, 1] + 2.0 * dx * P[1, 2] + dx * dx * P[2, 2]
     xh = P[0, 2] - dy * P[2, 2]
     yh = P[1, 2] + dx * P[2, 2]
+    if motion.model == BY_POSES:
+        c, s, noise = u00, u10, relative_noise(control, motion)
+        P[0, 0] = xx + c * c * noise[0] - 2.0 * c * s * noise[1] + s * s * noise[3]
+        P[0, 1] = P[1, 0] = xy + c * s * (noise[0] - noise[3]) + (c * c - s * s) * noise[1]
+        P[1, 1] = yy + s * s * noise[0] + 2.0 * c * s * noise[1] + c * c * noise[3]
+        P[0, 2] = P[2, 0] = xh + c * noise[2] - s * noise[4]
+        P[1, 2] = P[2, 1] = yh + s * noise[2] + c * noise[4]
+        P[2, 2] += noise[5]
+        return dx, dy
+    noisy = 1.0 if motion.noise_at_rest or control[0] != 0.0 or control[1] != 0.0 else 0.0
+    q0, q1 = noisy * motion.speed_variance, noisy * motion.turn_variance
     P[0, 0] = xx + q0 * u00 * u00 + q1 * u01 * u01
     P[0, 1] = P[1, 0] = xy + q0 * u00 * u10 + q1 * u01 * u11
     P[1, 1] = yy + q0 * u10 * u10 + q1 * u11 * u11
@@ -148,7 +199,7 @@ def propagate_pose(
 
 
 def motion_step(
-    motion: Motion, pose: Float[np.ndarray, "3"], control: Float[np.ndarray, "2"], dt: float
+    motion: Motion, pose: Float[np.ndarray, "3"], control: Float[np.ndarray, " c"], dt: float
 ) -> Float[np.ndarray, "3"]:
     r"""The pose after one noise-free control step.
 
@@ -158,13 +209,15 @@ def motion_step(
        :label: eq-5
 
     for the bicycle's front wheel; for the unicycle the exact arc of speed V and angular rate
-    omega, written by its chord :math:`V\Delta_t \operatorname{sinc}(\omega\Delta_t/2)`.
+    omega, written by its chord :math:`V\Delta_t \operatorname{sinc}(\omega\Delta_t/2)`; of poses
+    the motion as it is.
 
     Parameters
     ----------
     motion : Motion
     pose : (3) [m, m, rad]
-    control : (2) [m/s, rad or rad/s]
+    control : (c)
+        As the model has them.
     dt : [s]
 
     Returns
@@ -182,27 +235,27 @@ def motion_step(
     >>> motion_step(motion, np.zeros(3), np.array([np.pi, np.pi]), 0.5).round(12)
     array([1.        , 1.        , 1.57079633])
     """
-    numbers = motion_numbers(motion)
-    moved = motion_increment(numbers.model, numbers.wheelbase, pose[2], control[0], control[1], dt)
+    moved = _increment(motion, pose, control, dt)
     return np.array([pose[0] + moved[0], pose[1] + moved[1], wrap_angle(pose[2] + moved[2])])
 
 
 def motion_jacobians(
-    motion: Motion, pose: Float[np.ndarray, "3"], control: Float[np.ndarray, "2"], dt: float
-) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 2"]]:
-    """Derivatives F and U of `motion_step` by the pose and by the control.
+    motion: Motion, pose: Float[np.ndarray, "3"], control: Float[np.ndarray, " c"], dt: float
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 n"]]:
+    """Derivatives F and U of `motion_step` by the pose and by what of the control is noisy.
 
     Parameters
     ----------
     motion : Motion
     pose : (3) [m, m, rad]
-    control : (2) [m/s, rad or rad/s]
+    control : (c)
+        As the model has them.
     dt : [s]
 
     Returns
     -------
     F : (3, 3)
-    U : (3, 2)
+    U : (3, 2), of poses (3, 3)
 
     Notes
     -----
@@ -215,8 +268,50 @@ def motion_jacobians(
     >>> F[1, 2], U[2, 1]
     (np.float64(1.0), np.float64(5.0))
     """
-    numbers = motion_numbers(motion)
-    moved = motion_increment(numbers.model, numbers.wheelbase, pose[2], control[0], control[1], dt)
+    moved = _increment(motion, pose, control, dt)
     F = np.eye(3)
     F[0, 2], F[1, 2] = -moved[1], moved[0]
-    return F, np.array(moved[3:]).reshape(2, 3).T.copy()
+    columns = [moved[3:6], moved[6:]]
+    if motion.model == "poses":
+        columns.insert(1, (-moved[4], moved[3], 0.0))
+    return F, np.array(columns).T.copy()
+
+
+def motion_noise(motion: Motion, control: Float[np.ndarray, " c"]) -> Float[np.ndarray, "n n"]:
+    """Covariance Q of a control step's noise: what of the control is noisy, as the model has it.
+
+    Parameters
+    ----------
+    motion : Motion
+    control : (c)
+        Of poses with the covariance that its motion has, perhaps.
+
+    Returns
+    -------
+    (2, 2), of poses (3, 3)
+        Zero at rest, where that is exact.
+
+    Notes
+    -----
+    Bradley & Abaid, with Eq. (10).
+
+    Examples
+    --------
+    >>> motion_noise(Motion(model="poses", control_std=(0.5, 0.25, 0.125)), np.ones(3)).diagonal()
+    array([0.25    , 0.0625  , 0.015625])
+    """
+    if motion.model == "poses":
+        numbers = relative_noise(np.asarray(control, dtype=float), motion_numbers(motion))
+        xx, xy, xh, yy, yh, hh = numbers
+        return np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
+    exact = not motion.noise_at_rest and not np.any(control)
+    return np.diag(np.square(motion.control_std)) * (0.0 if exact else 1.0)
+
+
+def _increment(
+    motion: Motion, pose: Float[np.ndarray, "3"], control: Float[np.ndarray, " c"], dt: float
+) -> tuple[float, ...]:
+    """Call `motion_increment` from arrays."""
+    numbers = motion_numbers(motion)
+    control = np.asarray(control, dtype=float)
+    return motion_increment(numbers.model, numbers.wheelbase, pose[2], control, dt)

@@ -37,7 +37,7 @@ PRIOR_STD = 20.0
 
 def pose_bound(
     motion: Motion,
-    controls: Float[np.ndarray, "k 2"],
+    controls: Float[np.ndarray, "k c"],
     time: Float[np.ndarray, " t"],
     path: Float[np.ndarray, "t 3"],
     landmarks: tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]],
@@ -52,7 +52,8 @@ def pose_bound(
     Parameters
     ----------
     motion : Motion
-    controls : (k, 2)
+    controls : (k, c)
+        As the motion model has them.
     time : (k + 1) [s]
     path : (k + 1, 3) [m, m, rad]
         True poses, the start first.
@@ -117,7 +118,7 @@ def _correct(
 @kernel
 def _bound(
     path: Float[np.ndarray, "t 3"],
-    controls: Float[np.ndarray, "k 2"],
+    controls: Float[np.ndarray, "k c"],
     dt: Float[np.ndarray, " k"],
     motion: MotionNumbers,
     places: Float[np.ndarray, "n 2"],

@@ -47,8 +47,8 @@ class Drive:
     start : Gaussian of (3) and (3, 3)
     time : (k + 1) [s]
         Of the start and of the end of each step.
-    controls : (k, 2)
-        Of each step.
+    controls : (k, c)
+        Of each step, as the motion model has them.
     truth : Truth
         At the same times; nothing of it, by default. Its landmarks are those that stand.
     moving : tuple of int
@@ -58,6 +58,6 @@ class Drive:
     motion: Motion
     start: Gaussian
     time: Float[np.ndarray, " t"]
-    controls: Float[np.ndarray, "t-1 2"]
+    controls: Float[np.ndarray, "t-1 c"]
     truth: Truth = NO_TRUTH
     moving: tuple[int, ...] = ()

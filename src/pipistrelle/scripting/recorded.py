@@ -1,6 +1,7 @@
 """What a recorded log decides, what it leaves to be asked for, and what looks odd in it."""
 
 from collections.abc import Sequence
+from math import hypot
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -137,7 +138,7 @@ def check_room(recorded: "Log", filters: Sequence[str], config: Config) -> None:
 
 
 def beforehand(recorded: "Log", truth: "Truth", log: Path) -> list[str]:
-    """Tell what was left out of a log, and of its truth.
+    """Tell what was left out of a log and of its truth, and where its odometry jumps.
 
     Parameters
     ----------
@@ -155,12 +156,32 @@ def beforehand(recorded: "Log", truth: "Truth", log: Path) -> list[str]:
             f"{count} {reason.replace('_', ' ')}" for reason, count in recorded.ignored_rows.items()
         )
         told.append(f"{log}: rows left out: {', '.join(reasons)}")
+    told += _jumps(recorded, log)
     if truth.path is not None:
         steps = len(truth.time) - 1
         known = sum(1 for pose in truth.path[1:] if pose[0] == pose[0])
         if known < steps:
             told.append(f"{log}: the truth covers {known} of {steps} steps; only these are scored")
     return told
+
+
+def _jumps(recorded: "Log", log: Path) -> list[str]:
+    """Ask whether poses are of one frame, where a step goes much farther than others."""
+    if recorded.motion != "poses":
+        return []
+    from pipistrelle.detection.logs.poses import jumps
+
+    found = jumps(recorded.controls, recorded.dt)
+    if not found.size:
+        return []
+    step = int(found[0])
+    ahead, aside, turn = recorded.controls[step, :3].tolist()
+    others = f", and {found.size - 1} more such steps" * (found.size > 1)
+    return [
+        f"{log}: the odometry moves by {hypot(ahead, aside):.3g} m and turns by {turn:.3g} rad "
+        f"in the {recorded.dt[step]:.3g} s from {recorded.time[step].item()!r} s on{others}; "
+        "was its frame begun anew?"
+    ]
 
 
 def afterwards(recorded: "Log", trials: "Sequence[TrialResult]", log: Path) -> list[str]:

@@ -479,7 +479,7 @@ def test_no_column_goes_before_the_four(tmp_path, stated):
         ("velocity_std", "velocity_sdt", ("unknown key 'velocity_sdt'", "mean 'velocity_std'?")),
         ("range_std = 0.2", "range_std = 0.2\ncolour = 3", ("unknown key 'colour'", "remove it")),
         ("format = 1", "format = 2", ("key 'format': found 2", "expected 1")),
-        ('"unicycle"', '"tricycle"', ("'tricycle'", "expected 'unicycle' or 'bicycle'")),
+        ('"unicycle"', '"tricycle"', ("'tricycle'", "expected 'unicycle', 'bicycle' or 'poses'")),
         ("range_std = 0.2", "range_std = -0.2", ("'range_std': found -0.2", "greater than 0")),
         ("range_std = 0.2", "range_std = nan", ("'range_std': found nan", "finite number")),
         ("range_std = 0.2", 'range_std = "0.2"', ("'range_std': found '0.2'", "valid number")),

@@ -1,6 +1,7 @@
 """The filter against its slow reference, closed forms and statistics."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -31,6 +32,7 @@ from reference.missions import (
     scattered,
     steady,
 )
+from reference.odometry import ANYONE, wandering
 
 FIELDS = ("mean", "covariance", "landmark", "weight")
 
@@ -130,6 +132,16 @@ def test_unicycle_that_stops_turns_and_reverses_equals_the_slow_reference():
     controls = rng.uniform([-0.5, -1], [1, 1], size=(60, STEPS_PER_FRAME, 2))
     controls[rng.random(controls.shape[:2]) < 0.3] = 0
     controls[rng.random(controls.shape[:2]) < 0.2, 1] = 0
+    field = scattered(rng, 20, radius=10.0)
+    mission = draw_mission(rng, motion, START, field, controls, beamwidth=2.0, hearing=10.0)
+    assert_equal_to_reference(paper_filter(motion=motion), mission)
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_a_drive_by_poses_equals_the_slow_reference(stated):
+    rng = np.random.default_rng(8)
+    motion = replace(ANYONE, noise_at_rest=stated)
+    controls = wandering(rng, 60 * STEPS_PER_FRAME, stated=stated).reshape(60, STEPS_PER_FRAME, -1)
     field = scattered(rng, 20, radius=10.0)
     mission = draw_mission(rng, motion, START, field, controls, beamwidth=2.0, hearing=10.0)
     assert_equal_to_reference(paper_filter(motion=motion), mission)

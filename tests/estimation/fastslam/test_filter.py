@@ -2,6 +2,7 @@
 
 import copy
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from reference.missions import (
     scan_of,
     scattered,
 )
+from reference.odometry import ANYONE, wandering
 from reference.swarms import (
     Drawn,
     arrays_of,
@@ -182,6 +184,17 @@ def test_unicycle_that_stops_reverses_and_turns_past_pi_equals_the_slow_referenc
     controls[rng.random(controls.shape[:2]) < 0.3] = 0
     controls[rng.random(controls.shape[0]) < 0.3] = 0
     controls[0] = 0
+    start = Gaussian(mean=np.array([0, 0, np.pi - 0.01]), covariance=START.covariance)
+    field = scattered(rng, 10, radius=10.0)
+    mission = draw_mission(rng, motion, start, field, controls, beamwidth=2.0, hearing=10.0)
+    assert_equal_to_reference(swarm_filter(5, motion=motion), mission, start)
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_a_drive_by_poses_equals_the_slow_reference(stated):
+    rng = np.random.default_rng(8)
+    motion = replace(ANYONE, noise_at_rest=stated)
+    controls = wandering(rng, 30 * 4, stated=stated).reshape(30, 4, -1)
     start = Gaussian(mean=np.array([0, 0, np.pi - 0.01]), covariance=START.covariance)
     field = scattered(rng, 10, radius=10.0)
     mission = draw_mission(rng, motion, start, field, controls, beamwidth=2.0, hearing=10.0)

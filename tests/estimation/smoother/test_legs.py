@@ -16,6 +16,7 @@ from pipistrelle.estimation.smoother.legs import (
 from pipistrelle.geometry import wrap
 from reference.ekf_slam import moved
 from reference.missions import BICYCLE, CIRCLE, STEP
+from reference.odometry import as_motions, by_poses
 
 STEPS = 6
 LEG = longer(NOWHERE, BICYCLE, np.tile([CIRCLE[0], 0.2], (STEPS, 1)), np.full(STEPS, STEP))
@@ -48,6 +49,13 @@ def test_a_leg_made_longer_is_the_leg_made_at_once():
     both = longer(one, BICYCLE, np.tile([CIRCLE[0], 0.2], (STEPS - 2, 1)), np.full(STEPS - 2, STEP))
     np.testing.assert_array_equal(both.mean, LEG.mean)
     np.testing.assert_array_equal(both.covariance, LEG.covariance)
+
+
+def test_a_leg_by_poses_is_the_leg_of_the_controls_that_led_there():
+    controls, dt = np.tile([CIRCLE[0], 0.2], (STEPS, 1)), np.full(STEPS, STEP)
+    told = longer(NOWHERE, by_poses(BICYCLE), as_motions(BICYCLE, controls, dt), dt)
+    np.testing.assert_allclose(told.mean, LEG.mean, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(told.covariance, LEG.covariance, rtol=0, atol=1e-16)
 
 
 def test_ends_as_the_controls_have_them_leave_the_prediction():
@@ -108,3 +116,7 @@ def test_a_leg_moves_unless_it_stands_without_noise():
     restless = Motion(model="unicycle", control_std=(0.1, 0.1))
     assert longer(NOWHERE, restless, *still).moves()
     assert longer(NOWHERE, standing, np.array([[0.0, 0.3]]), np.ones(1)).moves()
+    told = np.zeros((3, 3))
+    assert longer(NOWHERE, by_poses(restless), told, np.ones(3)).moves()
+    assert not longer(NOWHERE, by_poses(standing), told, np.ones(3)).moves()
+    assert longer(NOWHERE, by_poses(standing), told + 1e-9, np.ones(3)).moves()

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import ConfigDict, Field, ValidationError, field_validator
 
 from pipistrelle.config import InputError, NonNegative, Positive, Probability, Real, Section
+from pipistrelle.detection.logs.poses import MOTION_COVARIANCE, POSE, poses_along
 from pipistrelle.detection.logs.recording import MEASUREMENT, STATED, Log, assemble
 from pipistrelle.detection.logs.text_tables import read_table, read_text, table_text
 from pipistrelle.files import LOG, OwnFiles
@@ -21,14 +22,21 @@ _Triple = Annotated[tuple[Real, Real, Real], Field(strict=False)]
 _Triple_std = Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(strict=False)]
 _Bounds = Annotated[tuple[Positive, Positive], Field(strict=False)]
 
-_CONTROLS = {"unicycle": ("velocity", "angular_rate"), "bicycle": ("speed", "steering")}
+_NOISY = {
+    "unicycle": ("velocity", "angular_rate"),
+    "bicycle": ("speed", "steering"),
+    "poses": ("forward", "sideways", "turn"),
+}
+"""What of a row of odometry has a standard deviation in ``log.toml``."""
+_ODOMETRY = _NOISY | {"poses": POSE}
+"""Columns of a row of odometry, besides its time."""
 
 FILES = ("odometry.csv", "measurements.csv", "README.md", "log.toml")
 """A log's, in the order in which they are written."""
 _README = """A recorded log of Pipistrelle. Replay it with: pipistrelle slam FOLDER
 
 log.toml          motion model, start and noise; m, s, rad; _std are standard deviations
-odometry.csv      {odometry}; a row holds until the next one's time, the last only ends the log
+odometry.csv      {odometry}; {held}
 measurements.csv  {measurements}; an empty range is passive
 truth.csv         time,x,y,heading; optional, for scoring only
 landmarks.csv     landmark,x,y; optional, for scoring only
@@ -37,13 +45,15 @@ SHA256SUMS        what was written here: nothing else is ever overwritten
 Bearings are relative to the heading, counter-clockwise. Where a measurement has no bearing_std or
 range_std of its own, that of log.toml holds.
 """
+_HELD = "a row holds until the next one's time, the last only ends the log"
+_FOLLOWED = "what counts is the way from row to row, wherever they begin"
 
 
 class _Settings(Section):
     model_config = ConfigDict(strict=True)
 
     format: Literal[1]
-    motion: Literal["unicycle", "bicycle"]
+    motion: Literal["unicycle", "bicycle", "poses"]
     initial_pose: _Triple
     initial_pose_std: _Triple_std
     range_std: Positive
@@ -72,7 +82,17 @@ class _BicycleSettings(_Settings):
     wheelbase: Positive
 
 
-_SETTINGS: dict[str, type[_Settings]] = {"unicycle": _UnicycleSettings, "bicycle": _BicycleSettings}
+class _PosesSettings(_Settings):
+    forward_std: NonNegative
+    sideways_std: NonNegative
+    turn_std: NonNegative
+
+
+_SETTINGS: dict[str, type[_Settings]] = {
+    "unicycle": _UnicycleSettings,
+    "bicycle": _BicycleSettings,
+    "poses": _PosesSettings,
+}
 _SHARED = tuple(name for name in _Settings.model_fields if name not in ("format", "step"))
 
 
@@ -80,8 +100,8 @@ def read_log(folder: Path) -> Log:
     r"""Read a log folder: ``log.toml``, ``odometry.csv`` and ``measurements.csv``.
 
     With a ``step``, the rows of odometry are merged into steps of that length (the last may be
-    shorter), each with the time-weighted mean of its controls. Times are compared to 1e-6 s then,
-    and exactly otherwise.
+    shorter), each with the time-weighted mean of its controls, of poses with the motion from its
+    start to its end. Times are compared to 1e-6 s then, and exactly otherwise.
 
     Parameters
     ----------
@@ -124,25 +144,26 @@ def read_log(folder: Path) -> Log:
     (0.5, array([7]), array([nan]))
     """
     settings = _read_settings(folder / "log.toml")
-    first, second = _CONTROLS[settings.motion]
+    columns, stds = ("time", *_ODOMETRY[settings.motion]), _NOISY[settings.motion]
+    optional = MOTION_COVARIANCE if settings.motion == "poses" else ()
     return assemble(
-        read_table(folder / "odometry.csv", ("time", first, second)),
+        read_table(folder / "odometry.csv", columns, optional=optional),
         read_table(folder / "measurements.csv", MEASUREMENT, optional=("range", *STATED)),
         step=settings.step,
         name=folder.resolve().name,
         wheelbase=getattr(settings, "wheelbase", 1.0),
-        control_std=(getattr(settings, f"{first}_std"), getattr(settings, f"{second}_std")),
+        control_std=tuple(getattr(settings, f"{name}_std") for name in stds),
         **{name: getattr(settings, name) for name in _SHARED},
     )
 
 
 def write_log(folder: Path, log: Log) -> None:
-    """Write a log folder that `read_log` reads back exactly.
+    """Write a log folder that `read_log` reads back exactly, motions of poses but for rounding.
 
-    Steps become rows, at the precision of the numbers. Scans that share a step are spread over it
-    in their order; empty scans leave no row. How surely it was measured is told row by row, if any
-    row states it. An earlier log that we wrote is replaced, its truth removed
-    (`pipistrelle.files`); ``log.toml`` comes last.
+    Steps become rows, at the precision of the numbers; poses begin at the origin. Scans that share
+    a step are spread over it in their order; empty scans leave no row. How surely it was measured
+    is told row by row, if any row states it. An earlier log that we wrote is replaced, its truth
+    removed (`pipistrelle.files`); ``log.toml`` comes last.
 
     Parameters
     ----------
@@ -175,27 +196,27 @@ def write_log(folder: Path, log: Log) -> None:
 
     own = OwnFiles(folder, LOG)
     own.clear(FILES)
-    first, second = _CONTROLS[log.motion]
     settings = {"format": 1} | {name: getattr(log, name) for name in _SHARED}
-    settings |= {f"{first}_std": log.control_std[0], f"{second}_std": log.control_std[1]}
+    stds = zip(_NOISY[log.motion], log.control_std, strict=True)
+    settings |= {f"{name}_std": std for name, std in stds}
     if log.motion == "bicycle":
         settings["wheelbase"] = log.wheelbase
     model = _SETTINGS[log.motion].model_validate(settings)
     text = tomli_w.dumps(model.model_dump(mode="json", exclude_defaults=True))
-    controls = np.vstack((log.controls, np.zeros(2)))
-    odometry = table_text(("time", first, second), log.time, *controls.T)
-    own.write("odometry.csv", odometry)
+    driven = _odometry_columns(log)
+    own.write("odometry.csv", table_text(tuple(driven), *driven.values()))
     measured = _measurement_columns(log)
     own.write("measurements.csv", table_text(tuple(measured), *measured.values()))
-    columns = {"odometry": f"time,{first},{second}", "measurements": ",".join(measured)}
-    own.write("README.md", _README.format(**columns))
+    columns = {"odometry": ",".join(driven), "measurements": ",".join(measured)}
+    held = _FOLLOWED if log.motion == "poses" else _HELD
+    own.write("README.md", _README.format(**columns, held=held))
     own.write("log.toml", text)
 
 
 def _read_settings(path: Path) -> _Settings:
     """Settings of ``log.toml``; the first error, unknown keys before missing ones."""
     raw = parse_toml(read_text(path), path)
-    model = _SETTINGS["bicycle" if raw.get("motion") == "bicycle" else "unicycle"]
+    model = _SETTINGS.get(str(raw.get("motion")), _UnicycleSettings)
     try:
         return model.model_validate(raw)
     except ValidationError as error:
@@ -220,6 +241,17 @@ def _key_refusal(path: Path, fault: Any, model: type[_Settings]) -> InputError:
         return refusal(path, f"the unknown key {key!r}", f"one of {', '.join(known)}", fix)
     found = shown(fault["input"])
     return refusal(f"{path}, key {key!r}", found, expectation(fault), "correct the value")
+
+
+def _odometry_columns(log: Log) -> dict[str, np.ndarray]:
+    """Columns of ``odometry.csv``: controls from each time on, or poses, and how they were told."""
+    if log.motion != "poses":
+        rows = np.vstack((log.controls, np.zeros(2)))
+        return {"time": log.time} | dict(zip(_ODOMETRY[log.motion], rows.T, strict=True))
+    column = dict(zip(POSE, poses_along(log.controls).T, strict=True))
+    stated = log.controls[:, len(POSE) :]
+    rows = np.vstack((np.full(stated.shape[1], np.nan), stated))
+    return {"time": log.time} | column | dict(zip(MOTION_COVARIANCE, rows.T, strict=False))
 
 
 def _measurement_columns(log: Log) -> dict[str, np.ndarray]:

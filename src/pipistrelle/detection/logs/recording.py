@@ -1,6 +1,7 @@
 """A recorded drive: rows of odometry become steps, measurements become scans.
 
-A row of odometry holds from its time to the next row's; the last row only ends the log. A
+A row of odometry holds from its time to the next row's; the last row only ends the log. A row of
+poses says where the vehicle is, and a step is the motion from one to another (`poses`). A
 measurement is used at the end of the step (t[i-1], t[i]] that holds it, at the start when its time
 is the first row's. Oddities that sound logs contain are dropped and counted. This is the same for
 all formats, and here alone do recorded measurements become scans.
@@ -15,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from pipistrelle.detection.logs.poses import motions_between
 from pipistrelle.detection.logs.text_tables import Table, check_unique, rows_kept
 from pipistrelle.detection.scans import UNLABELLED, Scan, make_scan
 from pipistrelle.geometry import wrap
@@ -41,19 +43,21 @@ class Log:
     name : str
     time : (k + 1) [s]
         The start, then the end of each step.
-    controls : (k, 2)
-        Velocity [m/s] and angular rate [rad/s] (bicycle: speed and steering angle [rad]).
+    controls : (k, 2), of poses (k, 3) or (k, 9)
+        Velocity [m/s] and angular rate [rad/s] (bicycle: speed and steering angle [rad]); of poses
+        the motion in the step, forward, sideways [m] and turn [rad], perhaps with its covariance
+        (`pipistrelle.estimation.motion`).
     dt : (k) [s]
         Length of each step.
     scans : tuple of Scan
         In order; each bears exactly the ``time`` entry at which it is used.
-    motion : "unicycle" or "bicycle"
+    motion : "unicycle", "bicycle" or "poses"
     wheelbase : [m]
         Bicycle only.
-    control_std : (2)
-        Noise of the two controls in one step, constant over it.
+    control_std : (2), of poses (3)
+        Noise of the controls in one step, constant over it; of a motion that does not say its own.
     noise_at_rest : bool
-        False: a step whose two controls are zero is exact.
+        False: a step whose controls are zero, or whose motion is, is exact.
     initial_pose, initial_pose_std : (3) [m, m, rad]
     range_std : [m]
     bearing_std : [rad]
@@ -69,12 +73,12 @@ class Log:
 
     name: str
     time: Float[np.ndarray, " t"]
-    controls: Float[np.ndarray, "t-1 2"]
+    controls: Float[np.ndarray, "t-1 c"]
     dt: Float[np.ndarray, " t-1"]
     scans: tuple[Scan, ...]
-    motion: Literal["unicycle", "bicycle"]
+    motion: Literal["unicycle", "bicycle", "poses"]
     wheelbase: float = 1.0
-    control_std: tuple[float, float]
+    control_std: tuple[float, ...]
     noise_at_rest: bool = True
     initial_pose: tuple[float, float, float]
     initial_pose_std: tuple[float, float, float]
@@ -99,7 +103,8 @@ def assemble(
 
     Parameters
     ----------
-    odometry : Table of ``time`` and two controls
+    odometry : Table of ``time`` and two controls, or of poses
+        Of ``motion = "poses"`` as `motions_between` takes them.
     measurements : Table of ``time``, ``landmark``, ``bearing`` and ``range``
         Perhaps with ``bearing_std`` and ``range_std``, NaN where nobody says.
     step : [s]
@@ -119,15 +124,19 @@ def assemble(
     ------
     InputError
         If nothing of the odometry or of the measurements is left, a landmark is measured twice at
-        one time, or times can be no seconds.
+        one time, or times can be no seconds; what `motions_between` refuses.
     """
     check_seconds(odometry)
     check_seconds(measurements, math.inf)
-    stamp, *columns = odometry.column.values()
+    stamp = odometry.column["time"]
     last = np.append(np.diff(stamp) > 0, True)
-    time, controls = _cut(odometry.path, stamp[last], np.column_stack(columns)[last], span)
-    if step is not None:
-        time, controls = _merge(odometry.path, time, controls, step)
+    rows = _cut(odometry.path, stamp[last], span)
+    time = rows if step is None else _merged(odometry.path, rows, step)
+    if settings["motion"] == "poses":
+        controls = motions_between(odometry, time)
+    else:
+        _, *columns = odometry.column.values()
+        controls = _mean_controls(stamp[last], np.column_stack(columns)[last], rows, time)
     clutter = measurements.column["landmark"] == UNLABELLED
     measurements = rows_kept(measurements, ~clutter)
     check_unique(measurements, "time", "landmark")
@@ -185,10 +194,8 @@ def check_seconds(table: Table, longest_gap: float = _LONGEST_GAP) -> None:
     raise refusal(table.path, found, "seconds", f"multiply them by {factor:g}")
 
 
-def _cut(
-    path: Path, time: np.ndarray, controls: np.ndarray, span: tuple[float, float]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Times (k + 1) and controls (k) of the rows within a span."""
+def _cut(path: Path, time: np.ndarray, span: tuple[float, float]) -> np.ndarray:
+    """Times (k + 1) of the rows within a span, its ends among them."""
     start, end = max(time[0], span[0]), min(time[-1], span[1])
     if start >= end:
         found = f"times from {time[0].item()!r} to {time[-1].item()!r}"
@@ -196,24 +203,30 @@ def _cut(
             raise refusal(path, found, "two times or more", "add the row that ends the log")
         expected = f"some between {span[0]!r} and {span[1]!r}"
         raise refusal(path, found, expected, "use odometry and truth of one drive")
-    cut = np.concatenate(([start], time[(time > start) & (time < end)], [end]))
-    return cut, controls[np.searchsorted(time, cut[:-1], side="right") - 1]
+    return np.concatenate(([start], time[(time > start) & (time < end)], [end]))
 
 
-def _merge(
-    path: Path, time: np.ndarray, controls: np.ndarray, step: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Steps of one length, each with the time-weighted mean of the controls that it spans."""
+def _merged(path: Path, time: np.ndarray, step: float) -> np.ndarray:
+    """Times of the start and of the ends of steps of one length."""
     count = max(1.0, np.ceil((time[-1] - time[0] - _RESOLUTION) / step))
     if count > _STEPS_MAX:
         found = f"{time[-1] - time[0]:g} s in steps of {step:g} s"
         raise refusal(path, found, f"at most {_STEPS_MAX} steps", "correct the times or the step")
-    merged = np.append(time[0] + step * np.arange(count), time[-1])
-    edges = np.union1d(time, merged)
-    row = np.searchsorted(time, edges[:-1], side="right") - 1
-    driven = np.diff(edges)[:, None] * controls[row]
-    total = np.add.reduceat(driven, np.searchsorted(edges, merged[:-1]))
-    return merged, total / np.diff(merged)[:, None]
+    return np.append(time[0] + step * np.arange(count), time[-1])
+
+
+def _mean_controls(
+    stamp: np.ndarray, controls: np.ndarray, rows: np.ndarray, time: np.ndarray
+) -> np.ndarray:
+    """Controls of each step: the time-weighted mean of those of the rows that it spans."""
+    held = controls[np.searchsorted(stamp, rows[:-1], side="right") - 1]
+    if time is rows:
+        return held
+    edges = np.union1d(rows, time)
+    row = np.searchsorted(rows, edges[:-1], side="right") - 1
+    driven = np.diff(edges)[:, None] * held[row]
+    total = np.add.reduceat(driven, np.searchsorted(edges, time[:-1]))
+    return total / np.diff(time)[:, None]
 
 
 def _scans(

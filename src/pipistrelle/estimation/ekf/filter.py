@@ -140,7 +140,7 @@ class EkfSlam:
     def predict(
         self,
         belief: EkfBelief,
-        controls: Float[np.ndarray, "k 2"],
+        controls: Float[np.ndarray, "k c"],
         dt: Float[np.ndarray, " k"],
         rng: np.random.Generator | None = None,
     ) -> tuple[EkfBelief, Gaussian]:
@@ -155,7 +155,8 @@ class EkfSlam:
         Parameters
         ----------
         belief : EkfBelief
-        controls : (k, 2) [m/s, rad or rad/s]
+        controls : (k, c)
+            As the motion model has them.
         dt : (k) [s]
         rng : Generator, optional
             Not used: this filter draws nothing.

@@ -213,7 +213,7 @@ def _retract(
 def propagate(
     mean: Float[np.ndarray, " d"],
     covariance: Float[np.ndarray, "d d"],
-    controls: Float[np.ndarray, "k 2"],
+    controls: Float[np.ndarray, "k c"],
     dt: Float[np.ndarray, " k"],
     motion: MotionNumbers,
     pose_means: Float[np.ndarray, "k 3"],
@@ -223,7 +223,7 @@ def propagate(
     pose, P = mean[:3], covariance[:3, :3].copy()
     shift_x = shift_y = 0.0  # entries (0, 2) and (1, 2) of the product of the F
     for k in range(controls.shape[0]):
-        dx, dy = propagate_pose(pose, P, controls[k, 0], controls[k, 1], dt[k], motion)
+        dx, dy = propagate_pose(pose, P, controls[k], dt[k], motion)
         shift_x -= dy
         shift_y += dx
         for a in range(3):  # an assignment of slices would compile for a second longer

@@ -129,7 +129,7 @@ class InvariantEkfSlam:
     def predict(
         self,
         belief: InvariantBelief,
-        controls: Float[np.ndarray, "k 2"],
+        controls: Float[np.ndarray, "k c"],
         dt: Float[np.ndarray, " k"],
         rng: np.random.Generator | None = None,
     ) -> tuple[InvariantBelief, Gaussian]:
@@ -138,7 +138,8 @@ class InvariantEkfSlam:
         Parameters
         ----------
         belief : InvariantBelief
-        controls : (k, 2) [m/s, rad or rad/s]
+        controls : (k, c)
+            As the motion model has them.
         dt : (k) [s]
         rng : Generator, optional
             Not used: this filter draws nothing.
@@ -207,7 +208,7 @@ def _about(
 def _propagate(
     mean: Float[np.ndarray, " d"],
     covariance: Float[np.ndarray, "d d"],
-    controls: Float[np.ndarray, "k 2"],
+    controls: Float[np.ndarray, "k c"],
     dt: Float[np.ndarray, " k"],
     motion: MotionNumbers,
     pose_means: Float[np.ndarray, "k 3"],
@@ -217,7 +218,7 @@ def _propagate(
     pose, P = mean[:3], covariance[:3, :3].copy()
     noise, gathered = np.zeros((3, 3)), np.empty((3, 3))
     for k in range(controls.shape[0]):
-        propagate_pose(pose, noise, controls[k, 0], controls[k, 1], dt[k], motion)
+        propagate_pose(pose, noise, controls[k], dt[k], motion)
         _about(P, pose[0], pose[1], pose_covariances[k])
         for a in range(3):
             pose_means[k, a] = pose[a]

@@ -192,7 +192,7 @@ class FastSlam:
     def predict(
         self,
         belief: FastSlamBelief,
-        controls: Float[np.ndarray, "k 2"],
+        controls: Float[np.ndarray, "k c"],
         dt: Float[np.ndarray, " k"],
         rng: np.random.Generator | None = None,
     ) -> tuple[FastSlamBelief, Gaussian]:
@@ -201,7 +201,8 @@ class FastSlam:
         Parameters
         ----------
         belief : FastSlamBelief
-        controls : (k, 2) [m/s, rad or rad/s]
+        controls : (k, c)
+            As the motion model has them.
         dt : (k) [s]
         rng : Generator, optional
             Not used: poses are drawn once a frame, by `update`.

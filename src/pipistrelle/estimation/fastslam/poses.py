@@ -21,7 +21,12 @@ from pipistrelle.estimation.fastslam.block import (
     X,
     Y,
 )
-from pipistrelle.estimation.motion import MotionNumbers, motion_increment
+from pipistrelle.estimation.motion import (
+    BY_POSES,
+    MotionNumbers,
+    motion_increment,
+    relative_noise,
+)
 from pipistrelle.jit import kernel, no_alloc
 
 SMALLEST_STD = 1e-6
@@ -118,11 +123,34 @@ def _propagate_block(pose: Poses, step: tuple[float, ...], q0: float, q1: float)
         pose[PHH + i] = hh + q0 * u20 * u20 + q1 * u21 * u21
 
 
+@no_alloc
+def _propagate_block_by(pose: Poses, step: tuple[float, ...], noise: tuple[float, ...]) -> None:
+    """Move a block's poses by a motion with a covariance, both in the vehicle's frame."""
+    ahead, aside, turn = step[0], step[1], step[2]
+    qxx, qxy, qxh, qyy, qyh, qhh = noise
+    for i in range(LANES):
+        c, s = cosine_and_sine(pose[HEADING + i])
+        dx, dy = c * ahead - s * aside, s * ahead + c * aside
+        xh, yh, hh = pose[PXH + i], pose[PYH + i], pose[PHH + i]
+        pose[X + i] += dx
+        pose[Y + i] += dy
+        pose[HEADING + i] = wrapped(pose[HEADING + i] + turn)
+        noise_xx = c * c * qxx - 2.0 * c * s * qxy + s * s * qyy
+        noise_xy = c * s * (qxx - qyy) + (c * c - s * s) * qxy
+        noise_yy = s * s * qxx + 2.0 * c * s * qxy + c * c * qyy
+        pose[PXX + i] += dy * dy * hh - 2.0 * dy * xh + noise_xx
+        pose[PXY + i] += dx * xh - dy * yh - dx * dy * hh + noise_xy
+        pose[PYY + i] += 2.0 * dx * yh + dx * dx * hh + noise_yy
+        pose[PXH + i] = xh - dy * hh + c * qxh - s * qyh
+        pose[PYH + i] = yh + dx * hh + s * qxh + c * qyh
+        pose[PHH + i] = hh + qhh
+
+
 @kernel
 def propagate(
     pose: Float[np.ndarray, "b rows"],
     weight: Float[np.ndarray, " p"],
-    controls: Float[np.ndarray, "k 2"],
+    controls: Float[np.ndarray, "k c"],
     dt: Float[np.ndarray, " k"],
     motion: MotionNumbers,
     pose_means: Float[np.ndarray, "k 3"],
@@ -130,13 +158,17 @@ def propagate(
 ) -> None:
     """Move every particle through control steps, in place, and summarise after each."""
     for k in range(dt.size):
-        speed, turn = controls[k, 0], controls[k, 1]
-        step = motion_increment(motion.model, motion.wheelbase, 0.0, speed, turn, dt[k])
-        noisy = 1.0 if motion.noise_at_rest or speed != 0.0 or turn != 0.0 else 0.0
-        for b in range(pose.shape[0]):
-            _propagate_block(
-                pose[b], step, noisy * motion.speed_variance, noisy * motion.turn_variance
-            )
+        control = controls[k]
+        step = motion_increment(motion.model, motion.wheelbase, 0.0, control, dt[k])
+        if motion.model == BY_POSES:
+            noise = relative_noise(control, motion)
+            for b in range(pose.shape[0]):
+                _propagate_block_by(pose[b], step, noise)
+        else:
+            noisy = 1.0 if motion.noise_at_rest or control[0] != 0.0 or control[1] != 0.0 else 0.0
+            q0, q1 = noisy * motion.speed_variance, noisy * motion.turn_variance
+            for b in range(pose.shape[0]):
+                _propagate_block(pose[b], step, q0, q1)
         mean, covariance = summarise(pose, weight)
         for a in range(3):
             pose_means[k, a] = mean[a]

@@ -168,7 +168,7 @@ class Smoother:
     def predict(
         self,
         belief: SmootherBelief,
-        controls: Float[np.ndarray, "k 2"],
+        controls: Float[np.ndarray, "k c"],
         dt: Float[np.ndarray, " k"],
         rng: np.random.Generator | None = None,
     ) -> tuple[SmootherBelief, Gaussian]:
@@ -177,7 +177,8 @@ class Smoother:
         Parameters
         ----------
         belief : SmootherBelief
-        controls : (k, 2) [m/s, rad or rad/s]
+        controls : (k, c)
+            As the motion model has them.
         dt : (k) [s]
         rng : Generator, optional
             Not used: nothing is drawn.

@@ -50,7 +50,7 @@ NOWHERE = Leg(mean=np.empty((0, 3)), covariance=np.empty((0, 3, 3)))
 
 
 def longer(
-    leg: Leg, motion: Motion, controls: Float[np.ndarray, "k 2"], dt: Float[np.ndarray, " k"]
+    leg: Leg, motion: Motion, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]
 ) -> Leg:
     """Return a leg with control steps added.
 
@@ -173,7 +173,7 @@ def _moved_by_start(
 def _carried(
     start: Float[np.ndarray, "3"],
     spread: Float[np.ndarray, "3 3"],
-    controls: Float[np.ndarray, "k 2"],
+    controls: Float[np.ndarray, "k c"],
     dt: Float[np.ndarray, " k"],
     motion: MotionNumbers,
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3 3"]]:
@@ -181,6 +181,6 @@ def _carried(
     pose, P = start.copy(), spread.copy()
     means, covariances = np.empty((dt.size, 3)), np.empty((dt.size, 3, 3))
     for k in range(dt.size):
-        propagate_pose(pose, P, controls[k, 0], controls[k, 1], dt[k], motion)
+        propagate_pose(pose, P, controls[k], dt[k], motion)
         means[k], covariances[k] = pose, P
     return means, covariances

@@ -1,0 +1,287 @@
+r"""Poses as odometry: from where the vehicle stood to how it moved in each step.
+
+A recorder's frame begins anywhere and drifts away. What it is right about is the way from one pose
+to the next, told in the vehicle's axes at the first of them:
+
+.. math:: (d_x, d_y) = R(\theta_k)^T (p_{k+1} - p_k), \quad d_\theta = \theta_{k+1} - \theta_k
+
+Ways follow one another, so rows merge into steps without loss. A step that ends between two rows
+ends on the curve of constant velocity between them: forwards, sideways and turning at once.
+
+How sure it is of a way, a row may say: the covariance of what led to it from the row before. That
+of a step is what its ways add up to, an error of heading turning all that is still to come; a way
+that is cut gives each part its share by time.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipistrelle.detection.logs.text_tables import Table
+from pipistrelle.geometry import wrap
+from pipistrelle.refusals import refusal
+
+POSE = ("x", "y", "heading")
+"""Columns of a row of poses, besides its time."""
+MOTION_COVARIANCE = ("motion_xx", "motion_xy", "motion_xh", "motion_yy", "motion_yh", "motion_hh")
+"""And those that may follow: of the motion since the row before, in the vehicle's axes there."""
+
+_RESOLUTION = 1e-6  # [s], within which a step ends with a row
+_INDEFINITE = 1e-6  # how far below 0 an eigenvalue may be by the rounding of a file's numbers
+_FULL = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
+_UNUSUAL = 10.0  # times what is usual
+_JUMP = (0.5, 0.5)  # [m], [rad]: less in one step is no jump
+
+
+def motions_between(odometry: Table, time: Float[np.ndarray, " t"]) -> Float[np.ndarray, "t-1 c"]:
+    r"""How the vehicle moved from each time to the next, by rows of poses.
+
+    Parameters
+    ----------
+    odometry : Table
+        Of ``time``, ``x``, ``y`` and ``heading``, perhaps with the columns of `MOTION_COVARIANCE`.
+        Of rows of one time the last says where the vehicle is.
+    time : (k + 1) [s]
+        Rising, from the first row's time or later to the last row's or sooner.
+
+    Returns
+    -------
+    (k, 3), or (k, 9) where a row says how sure it is
+        Forward, sideways [m] and turn [rad] in [-pi, pi), then the covariance, NaN where it is not
+        said for all of a step. Zero to the bit where the vehicle stands.
+
+    Raises
+    ------
+    InputError
+        With the line: of a heading that can be no radians, of a covariance that is none.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> rows = {"time": np.array([0.0, 1.0]), "x": np.array([5.0, 5.0]), "y": np.array([0.0, 2.0])}
+    >>> column = rows | {"heading": np.full(2, np.pi / 2)}
+    >>> table = Table(path=Path("odometry.csv"), line=np.array([2, 3]), column=column)
+    >>> motions_between(table, np.array([0.0, 0.5, 1.0])).round(9) + 0.0
+    array([[1., 0., 0.],
+           [1., 0., 0.]])
+    """
+    stamp = odometry.column["time"]
+    poses = np.column_stack([odometry.column[name] for name in POSE])
+    _check_headings(odometry)
+    stated = _covariances(odometry)
+    last = np.append(np.diff(stamp) > 0.0, True)
+    ends = _at_rows(time, stamp[last])
+    there = _poses_at(ends, stamp[last], poses[last])
+    moved = relative_motions(there)
+    if np.isnan(stated[1:]).all():
+        return moved
+    covariance = _step_covariances(ends, there, stamp, poses, stated)
+    return np.hstack([moved, covariance[:, *_FULL]])
+
+
+def relative_motions(poses: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t-1 3"]:
+    """How each pose lies as seen from the one before.
+
+    Parameters
+    ----------
+    poses : (k + 1, 3) [m, m, rad]
+
+    Returns
+    -------
+    (k, 3) [m, m, rad]
+        Forward, sideways, and the turn the shorter way.
+
+    Examples
+    --------
+    >>> relative_motions(np.array([[1.0, 1.0, 3.0], [1.0, 1.0, -3.0]])).round(3) + 0.0
+    array([[0.   , 0.   , 0.283]])
+    """
+    d, heading = np.diff(poses[:, :2], axis=0), poses[:, 2]
+    ways = _turned(d, -heading[:-1])
+    turn = np.diff(heading)
+    return np.column_stack([ways, np.where(np.abs(turn) < np.pi, turn, wrap(turn))])
+
+
+def poses_along(motions: Float[np.ndarray, "k _"]) -> Float[np.ndarray, "k+1 3"]:
+    """Where motions lead, one after another, from the origin on.
+
+    Parameters
+    ----------
+    motions : (k, 3 or more) [m, m, rad]
+        Forward, sideways, turn; what follows is not looked at.
+
+    Returns
+    -------
+    (k + 1, 3) [m, m, rad]
+        Headings wrapped. `relative_motions` gives the motions again, but for rounding.
+
+    Examples
+    --------
+    >>> poses_along(np.array([[1.0, 0.0, np.pi / 2], [1.0, 0.0, 0.0]])).round(3)[:, :2] + 0.0
+    array([[0., 0.],
+           [1., 0.],
+           [1., 1.]])
+    """
+    heading = np.append(0.0, np.cumsum(motions[:, 2]))
+    places = np.cumsum(_turned(motions[:, :2], heading[:-1]), axis=0)
+    return np.column_stack([np.vstack([np.zeros((1, 2)), places]), wrap(heading)])
+
+
+def jumps(motions: Float[np.ndarray, "k _"], dt: Float[np.ndarray, " k"]) -> Int[np.ndarray, " j"]:
+    """Find the steps that are perhaps no motion, but a frame that was begun anew.
+
+    Parameters
+    ----------
+    motions : (k, 3 or more) [m, m, rad]
+    dt : (k) [s]
+
+    Returns
+    -------
+    (j)
+        Those in which the vehicle would go, or turn, more than ten times as fast as in nine tenths
+        of the steps in which it does so at all, and half a metre or half a radian or more.
+
+    Examples
+    --------
+    >>> drive = np.tile([0.1, 0.0, 0.0], (20, 1))
+    >>> drive[7] = [40.0, -3.0, 0.0]
+    >>> jumps(drive, np.full(20, 0.1))
+    array([7])
+    """
+    found = np.zeros(len(dt), dtype=bool)
+    for size, least in zip((np.hypot(*motions.T[:2]), np.abs(motions[:, 2])), _JUMP, strict=True):
+        speed = size / dt
+        usual = np.percentile(speed[size > 0.0], 90.0) if np.any(size > 0.0) else 0.0
+        found |= (size >= least) & (speed > _UNUSUAL * usual)
+    return np.flatnonzero(found)
+
+
+def _turned(
+    points: Float[np.ndarray, "k 2"], angle: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, "k 2"]:
+    """Turn each point by its angle."""
+    c, s, (x, y) = np.cos(angle), np.sin(angle), points.T
+    return np.column_stack([c * x - s * y, s * x + c * y])
+
+
+def _at_rows(
+    time: Float[np.ndarray, " t"], rows: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " t"]:
+    """Put times that are a row's but for rounding where the row is."""
+    after = np.clip(np.searchsorted(rows, time), 1, len(rows) - 1)
+    nearest = np.where(time - rows[after - 1] < rows[after] - time, rows[after - 1], rows[after])
+    return np.where(np.abs(nearest - time) <= _RESOLUTION, nearest, time)
+
+
+def _poses_at(
+    time: Float[np.ndarray, " t"], rows: Float[np.ndarray, " n"], poses: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "t 3"]:
+    """Poses at other times: at the rows' own, and on the curves of constant velocity between."""
+    ways = np.vstack([relative_motions(poses), np.zeros((1, 3))])
+    lengths = np.append(np.diff(rows), 1.0)
+    row = np.searchsorted(rows, time, side="right") - 1
+    share, way, start = (time - rows[row]) / lengths[row], ways[row], poses[row]
+    velocity = _across_arc(way[:, :2], way[:, 2], back=True)
+    part = _across_arc(share[:, None] * velocity, share * way[:, 2])
+    there = start[:, :2] + _turned(part, start[:, 2])
+    return np.column_stack([there, start[:, 2] + share * way[:, 2]])
+
+
+def _across_arc(
+    points: Float[np.ndarray, "k 2"], turn: Float[np.ndarray, " k"], *, back: bool = False
+) -> Float[np.ndarray, "k 2"]:
+    """Lead velocities times time along turns to where they end; or back from there."""
+    half = 0.5 * turn
+    chord = np.sinc(half / np.pi)[:, None]
+    return _turned(points / chord, -half) if back else _turned(points * chord, half)
+
+
+def _step_covariances(
+    time: Float[np.ndarray, " t"],
+    there: Float[np.ndarray, "t 3"],
+    stamp: Float[np.ndarray, " n"],
+    poses: Float[np.ndarray, "n 3"],
+    stated: Float[np.ndarray, "n 3 3"],
+) -> Float[np.ndarray, "t-1 3 3"]:
+    """Add up what the rows say of their ways, in the axes at the start of each step.
+
+    Rows, those of one time too, and the ends of steps cut the drive into parts, each of one way.
+    """
+    extra = np.flatnonzero(~np.isin(time, stamp))
+    order = np.argsort(np.append(stamp, time[extra]), kind="stable")
+    cut, at = np.append(stamp, time[extra])[order], np.vstack([poses, there[extra]])[order]
+    way = np.cumsum(order < len(stamp))[:-1]  # by the row to which it leads
+    whole = stamp[way] - stamp[way - 1]
+    share = np.divide(np.diff(cut), whole, out=np.ones(len(whole)), where=whole > 0.0)
+    step = np.searchsorted(time, cut[1:]) - 1
+    used = (step >= 0) & (step < len(time) - 1)
+    step, start, end = step[used], at[:-1][used], at[1:][used]
+    first = there[step]
+    A = np.tile(np.eye(3), (len(step), 1, 1))
+    turn = start[:, 2] - first[:, 2]
+    A[:, 0, 0] = A[:, 1, 1] = np.cos(turn)
+    A[:, 1, 0] = np.sin(turn)
+    A[:, 0, 1] = -A[:, 1, 0]
+    lever = _turned(there[step + 1, :2] - end[:, :2], -first[:, 2])
+    A[:, 0, 2], A[:, 1, 2] = -lever[:, 1], lever[:, 0]
+    parts = A @ (share[used, None, None] * stated[way[used]]) @ np.swapaxes(A, 1, 2)
+    total = np.zeros((len(time) - 1, 3, 3))
+    np.add.at(total, step, parts)
+    return total
+
+
+def _check_headings(odometry: Table) -> None:
+    """Refuse headings of which one is more than a turn from the one before."""
+    turn = np.abs(np.diff(odometry.column["heading"]))
+    far = np.flatnonzero(turn > 2.0 * np.pi * 1.001)
+    if far.size:
+        row = int(far[0]) + 1
+        before, after = odometry.column["heading"][row - 1 : row + 1].tolist()
+        where = f"{odometry.path}, line {odometry.line[row]}"
+        expected = "at most a turn between two rows"
+        raise refusal(where, f"heading {after!r} after {before!r}", expected, "write radians")
+
+
+def _covariances(odometry: Table) -> Float[np.ndarray, "n 3 3"]:
+    """Return what each row says of the way that led to it, NaN where it says nothing."""
+    absent = np.full(len(odometry.line), np.nan)
+    column = [odometry.column.get(name, absent) for name in MOTION_COVARIANCE]
+    values = np.column_stack(column)
+    lacks = np.isnan(values)
+    some = lacks.any(axis=1) & ~lacks.all(axis=1)
+    if some.any():
+        row = int(np.argmax(some))
+        missing = ", ".join(np.array(MOTION_COVARIANCE)[lacks[row]])
+        fix = "complete the row, or leave all six empty"
+        raise refusal(_line(odometry, row), f"no {missing}", "all of a covariance, or none", fix)
+    full = np.empty((len(values), 3, 3))
+    full[:, *_FULL] = values
+    full[:, *_FULL[::-1]] = values
+    said = np.flatnonzero(~lacks.any(axis=1))
+    full[said] = _definite(odometry, full[said], said)
+    return full
+
+
+def _definite(
+    odometry: Table, covariance: Float[np.ndarray, "n 3 3"], rows: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 3 3"]:
+    """Refuse what is no covariance; lift eigenvalues that rounding has put below zero."""
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    std = np.sqrt(np.maximum(variance, 0.0))
+    unit = np.where(std > 0.0, std, 1.0)[:, :, None]
+    unit = unit * np.swapaxes(unit, 1, 2)
+    value, vector = np.linalg.eigh(covariance / unit)
+    wrong = (variance < 0.0).any(axis=1) | (value[:, 0] < -_INDEFINITE)
+    if wrong.any():
+        found = int(np.argmax(wrong))
+        numbers = ", ".join(f"{x:g}" for x in covariance[found][_FULL])
+        expected = "variances of 0 or more and correlations between -1 and 1"
+        fix = f"correct {MOTION_COVARIANCE[0]} to {MOTION_COVARIANCE[-1]}, or write more digits"
+        raise refusal(_line(odometry, int(rows[found])), f"the covariance {numbers}", expected, fix)
+    lifted = vector * np.maximum(value, 0.0)[:, None, :] @ np.swapaxes(vector, 1, 2) * unit
+    low = value[:, 0] < 0.0
+    return np.where(low[:, None, None], 0.5 * (lifted + np.swapaxes(lifted, 1, 2)), covariance)
+
+
+def _line(odometry: Table, row: int) -> str:
+    """Say where a row stands."""
+    return f"{odometry.path}, line {odometry.line[row]}"
