@@ -29,8 +29,8 @@ def test_a_short_mission_keeps_to_its_annotations(engine):
     assert [trial.strategy for trial in mission.trials] == list(STRATEGIES)
 
 
-@pytest.mark.parametrize("name", ["unicycle_log", "bicycle_log"])
+@pytest.mark.parametrize("name", ["unicycle_log", "bicycle_log", "poses_log"])
 def test_a_recorded_log_keeps_to_its_annotations(name):
     log, truth = load(LOGS / name)
-    trials = replay(log, truth, STRATEGIES, ("ekf",), 0.6, Config())
-    assert len(trials) == 3
+    trials = replay(log, truth, STRATEGIES, ("ekf", "iekf", "fastslam"), 0.6, Config())
+    assert len(trials) == 9

@@ -16,6 +16,7 @@ DATA = Path(__file__).resolve().parents[1] / "data"
 LOGS: dict[str, tuple[str, ...]] = {
     "unicycle_log": (),
     "bicycle_log": (),
+    "poses_log": (),
     "mrclam_made_up": ("--robot", "1"),
 }
 MANNERS = (

@@ -32,7 +32,7 @@ def as_poses(drive):
     return replace(drive, motion=by_poses(drive.motion), controls=controls)
 
 
-def wandering(rng, count, *, stated):
+def wandering(rng, count, *, stated, silent=0.3):
     """Return motions that go ahead, aside and about, some of them none; some say how surely."""
     motions = rng.uniform([-0.05, -0.05, -0.3], [0.12, 0.05, 0.3], (count, 3))
     motions[rng.random(count) < 0.3] = 0.0
@@ -40,7 +40,7 @@ def wandering(rng, count, *, stated):
         return motions
     roots = rng.normal(size=(count, 3, 3)) * 0.02
     covariance = (roots @ np.swapaxes(roots, 1, 2))[:, *UPPER]
-    covariance[rng.random(count) < 0.3] = np.nan
+    covariance[rng.random(count) < silent] = np.nan
     return np.hstack([motions, covariance])
 
 

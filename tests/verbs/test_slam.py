@@ -11,9 +11,14 @@ import pytest
 
 from pipistrelle.__main__ import main
 from pipistrelle.config import Config
-from pipistrelle.estimation.catalogue import PAPERS
+from pipistrelle.detection.logs.folder import read_log
+from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS
 from pipistrelle.experiments.runs import replay
+from pipistrelle.experiments.runs.replay import motion_of
 from reference.command_line import SHORT, summary, track
+from reference.odometry import as_motions, poses_file
+
+DATA = Path(__file__).parents[1] / "data"
 
 
 @pytest.mark.parametrize("estimator", PAPERS)
@@ -33,6 +38,55 @@ def test_a_run_and_its_log_give_one_track(obey, strategy, estimator, undrawn):
     (again,) = summary("two")["runs"]
     for score in ("position_rmse_m", "heading_rmse_rad", "nees_mean", "gated", "landmarks_full"):
         assert again[score] == pytest.approx(run[score], rel=1e-9)
+
+
+def told_by_poses(log, folder):
+    """Write a log's drive as poses of a recorder, with what each step's noise comes to."""
+    recorded = read_log(log)
+    motions = as_motions(motion_of(recorded), recorded.controls, recorded.dt)
+    shutil.copytree(log, folder)
+    text = poses_file((40.0, -7.0, 2.5), motions, recorded.time)
+    (folder / "odometry.csv").write_text(text)
+    gone = "motion|step|wheelbase|(velocity|angular_rate|speed|steering)_std"
+    kept = re.sub(rf"(?m)^({gone}) = .*\n", "", (log / "log.toml").read_text())
+    told = 'motion = "poses"\nforward_std = 9\nsideways_std = 9\nturn_std = 9\n'
+    (folder / "log.toml").write_text(told + kept)
+    return folder
+
+
+@pytest.mark.parametrize("estimator", CATALOGUE)
+@pytest.mark.parametrize("name", ["unicycle_log", "bicycle_log"])
+def test_a_log_told_by_poses_gives_the_logs_track_and_map(obey, name, estimator, undrawn):
+    poses = told_by_poses(DATA / name, Path("poses"))
+    words = ("--filter", estimator, "--quiet")
+    for log, folder in ((DATA / name, "one"), (poses, "two")):
+        assert obey("slam", log, *words, "-o", folder) == (0, f"{folder}\n", "")
+    one, two = (track(folder, f"fused_{estimator}") for folder in ("one", "two"))
+    np.testing.assert_allclose(two, one, rtol=0, atol=1e-8)
+    maps = [np.loadtxt(f"{folder}/map_fused_{estimator}.csv", delimiter=",", skiprows=1,
+                       usecols=range(6)) for folder in ("one", "two")]  # fmt: skip
+    np.testing.assert_allclose(maps[1], maps[0], rtol=0, atol=1e-7)
+
+
+def test_a_log_of_poses_is_mapped_and_scored(obey):
+    status, printed, said = obey("slam", DATA / "poses_log", "-o", "two", "--quiet")
+    assert (status, printed, said) == (0, "two\n", "")
+    (run,) = summary("two")["runs"]
+    assert run["position_rmse_m"] < 0.03
+    assert run["landmarks_full"] == 4
+
+
+def test_a_frame_that_was_begun_anew_is_asked_about(obey, undrawn):
+    log = shutil.copytree(DATA / "poses_log", "log")
+    header, *rows = [line.split(",") for line in Path("log/odometry.csv").read_text().splitlines()]
+    for row in rows[20:]:
+        row[1] = f"{float(row[1]) + 30:.5f}"
+    Path("log/odometry.csv").write_text("\n".join(map(",".join, [header, *rows])))
+    _, _, said = obey("slam", log, "-o", "two", "--quiet")
+    assert (
+        "warning: log: the odometry moves by 29.9 m and turns by 0.167 rad in the 0.2 s from 1.8 s "
+        "on; was its frame begun anew?\n"
+    ) in said
 
 
 @pytest.fixture(scope="module")

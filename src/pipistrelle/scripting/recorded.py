@@ -179,7 +179,7 @@ def _jumps(recorded: "Log", log: Path) -> list[str]:
     others = f", and {found.size - 1} more such steps" * (found.size > 1)
     return [
         f"{log}: the odometry moves by {hypot(ahead, aside):.3g} m and turns by {turn:.3g} rad "
-        f"in the {recorded.dt[step]:.3g} s from {recorded.time[step].item()!r} s on{others}; "
+        f"in the {recorded.dt[step]:.3g} s from {recorded.time[step]:.15g} s on{others}; "
         "was its frame begun anew?"
     ]
 

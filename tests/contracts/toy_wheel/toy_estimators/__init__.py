@@ -7,7 +7,7 @@ import numpy as np
 
 from pipistrelle.config import Config
 from pipistrelle.estimation.beliefs import Gaussian, no_landmarks
-from pipistrelle.estimation.motion import Motion, motion_jacobians, motion_step
+from pipistrelle.estimation.motion import Motion, motion_jacobians, motion_noise, motion_step
 
 SHIFT = np.array([1.0, 0.0, 0.0])
 """By how much `Shifted` revises its path [m, m, rad]."""
@@ -40,7 +40,7 @@ class DeadReckoning:
         means, covariances = [], []
         for control, step in zip(controls, dt, strict=True):
             F, U = motion_jacobians(self.motion, mean, control, step)
-            Q = np.diag(np.square(self.motion.control_std)) * self.doubt
+            Q = motion_noise(self.motion, control) * self.doubt
             mean = motion_step(self.motion, mean, control, step)
             covariance = F @ covariance @ F.T + U @ Q @ U.T
             means.append(mean)
