@@ -295,11 +295,13 @@ def test_a_step_of_which_a_part_says_nothing_has_the_noise_of_the_settings():
 @pytest.mark.parametrize(("model", "wheelbase"), [("unicycle", 1.0), ("bicycle", 0.2)])
 def test_a_covariance_of_rank_two_may_be_rounded_and_has_no_eigenvalue_below_zero(model, wheelbase):
     motion = Motion(model=model, control_std=(0.1, 0.15), wheelbase=wheelbase)
-    told = as_motions(motion, np.tile([0.7, 0.3], (20, 1)), np.full(20, 0.1))
-    rounded = np.array([[float(f"{number:.9g}") for number in row] for row in told[:, 3:]])
+    controls = np.random.default_rng(1).uniform(0.2, 0.8, (20, 2))
+    told = as_motions(motion, controls, np.full(20, 0.1))
+    rounded = np.array([[float(f"{number:.8g}") for number in row] for row in told[:, 3:]])
     time, poses = np.arange(21.0), ends(told[:, :3])
     read = motions_between(table(time, poses, np.vstack([rounded[:1], rounded])), time)
     np.testing.assert_allclose(read[:, 3:], told[:, 3:], rtol=1e-6, atol=1e-10)
+    assert np.linalg.eigvalsh(stated_of(np.hstack([told[:, :3], rounded]))).min() < -1e-16
     assert np.linalg.eigvalsh(stated_of(read)).min() >= -1e-18
 
 
@@ -307,6 +309,7 @@ def test_a_covariance_of_rank_two_may_be_rounded_and_has_no_eigenvalue_below_zer
 
 COVARIANCES = {
     "part": ("1,0,0,4,,,2,0,1", "no motion_xy, motion_xh", "all of a covariance, or none"),
+    "hardly negative": ("1,0,0,4,0,0,-1e-9,0,1", "the covariance 4, 0, 0, -1e-09, 0, 1"),
     "negative": ("1,0,0,4,0,0,-2,0,1", "the covariance 4, 0, 0, -2, 0, 1", "0 or more"),
     "correlated": ("1,0,0,1,2,0,1,0,1", "the covariance 1, 2, 0, 1, 0, 1", "between -1 and 1"),
     "correlated with none": ("1,0,0,1,0,0.1,1,0,0", "the covariance 1, 0, 0.1, 1, 0, 0", "digits"),
