@@ -17,7 +17,9 @@ from tempfile import TemporaryDirectory
 from pipistrelle.config import InputError
 
 SUMS = "SHA256SUMS"
-RESULTS, REPORT, LOG, WORLD = KINDS = ("results", "a report", "a log", "a world")
+RESULTS, REPORT, LOG, WORLD, COMPARISON = KINDS = (
+    "results", "a report", "a log", "a world", "a comparison",
+)  # fmt: skip
 _KIND = "# Of Pipistrelle: {}\n"
 _LINE = re.compile(r"([0-9a-f]{64}) [ *](.+)")
 
@@ -56,6 +58,49 @@ class OwnFiles:
     def __bool__(self) -> bool:
         """Whether we wrote anything here."""
         return bool(self._sums)
+
+    @property
+    def there(self) -> str | None:
+        """What of ours is here, as `KINDS` have it; None where nothing is."""
+        return self._there if self._sums else None
+
+    def __contains__(self, name: str) -> bool:
+        """Whether a file is on the list: we wrote it, or began to."""
+        return name in self._sums
+
+    def read(self, name: str) -> bytes:
+        """Read a file that is as we wrote it.
+
+        Parameters
+        ----------
+        name : str
+            Relative to the folder.
+
+        Returns
+        -------
+        bytes
+
+        Raises
+        ------
+        InputError
+            Where it is not there, cannot be read, or is not as we wrote it.
+        """
+        path = self.folder / name
+        try:
+            if path.exists() and not path.is_file():  # a pipe may never end
+                raise InputError(f"{path}: is no file; remove what stands in its place")
+            data = path.read_bytes()
+        except FileNotFoundError:
+            raise InputError(f"{path}: is missing; run again what wrote the others") from None
+        except OSError as error:
+            raise InputError(f"{path}: could not be read ({error.strerror})") from error
+        if name not in self._sums:
+            raise InputError(f"{path}: is not Pipistrelle's: {SUMS} does not name it")
+        if sha256(data).hexdigest() != self._sums[name]:
+            raise InputError(
+                f"{path}: was changed since Pipistrelle wrote it; run again what wrote it"
+            )
+        return data
 
     def check(self, names: Iterable[str] = ()) -> None:
         """Refuse a folder in which what would be replaced is not as we wrote it.

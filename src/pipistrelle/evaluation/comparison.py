@@ -23,6 +23,10 @@ probability 1 - alpha / 2, whatever the dependence (Source: Strassburger & Bretz
 Medicine 27, 2008; Guilbaud, Biometrical Journal 50, 2008). Upper bounds are built alike, and
 both sides together hold with probability 1 - alpha. The price: of a rejected mean, while others
 stand, the bound says which side of the edge it is on, and no more.
+
+Where two cases have not met the same worlds, nothing is paired and a difference is that of two
+means. Its standard error is :math:`\sqrt{s_1^2 / n_1 + s_2^2 / n_2}`, and its t distribution has
+the degrees of freedom of Welch (Source: Biometrika 34, 1947).
 """
 
 import math
@@ -55,6 +59,8 @@ class Statement:
         interval, which tells how surely a mean is known and not how large it is. NaN: none.
     fitted : bool
         Settings were fitted to this very number: that it holds proves little.
+    against : (m) or None
+        Numbers of other worlds: what is stated is the mean of ``sample`` less theirs.
     """
 
     label: str
@@ -63,6 +69,7 @@ class Statement:
     margin: float = 0.0
     sigma: float = math.nan
     fitted: bool = False
+    against: Float[np.ndarray, " m"] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,9 +80,10 @@ class Finding:
     ----------
     label, relation, margin, sigma, fitted : of the statement
     n : int
-        Worlds.
+        Worlds; of two samples, those of the smaller.
     mean, std : float
-        Of the sample; NaN where it is too small to have one.
+        Of the sample; NaN where it is too small to have one. Of two samples the difference of the
+        means, and the standard deviation of one sample that would know it as surely.
     alone : low, high
         t interval of this mean by itself.
     interval : low, high
@@ -159,7 +167,7 @@ def judge(statements: Sequence[Statement], confidence: float = 0.95) -> tuple[Fi
                 margin=statement.margin,
                 sigma=statement.sigma,
                 fitted=statement.fitted,
-                n=moments[0],
+                n=_worlds(statement),
                 mean=moments[1],
                 std=moments[2],
                 alone=(centre - width, centre + width),
@@ -260,18 +268,40 @@ def pseudovalues(
     return n * statistic(mean[None])[0] - (n - 1) * statistic(without)
 
 
-def _moments(statement: Statement) -> tuple[int, float, float]:
+def _worlds(statement: Statement) -> int:
+    """Count the worlds of a statement, of two samples the fewer."""
+    both = [statement.sample, *([] if statement.against is None else [statement.against])]
+    return min(map(len, both))
+
+
+def _moments(statement: Statement) -> tuple[float, float, float]:
+    """Return number, mean and standard deviation of a statement's sample.
+
+    Of two samples those of one whose mean would be known as surely, by Welch.
+    """
+    n, mean, std = _sample_moments(statement.label, statement.sample)
+    if statement.against is None:
+        return n, mean, std
+    m, other, spread = _sample_moments(statement.label, statement.against)
+    squares = std * std / max(n, 1), spread * spread / max(m, 1)
+    if not sum(squares) > 0.0:
+        return n, mean - other, math.nan
+    freedom = sum(squares) ** 2 / (squares[0] ** 2 / (n - 1) + squares[1] ** 2 / (m - 1))
+    return freedom + 1.0, mean - other, math.sqrt(sum(squares) * (freedom + 1.0))
+
+
+def _sample_moments(label: str, numbers: Float[np.ndarray, " n"]) -> tuple[int, float, float]:
     """Return number, mean and standard deviation of a sample; NaN where there is none."""
-    sample = np.asarray(statement.sample, dtype=np.float64)
+    sample = np.asarray(numbers, dtype=np.float64)
     if not np.all(np.isfinite(sample)):
-        raise ValueError(f"{statement.label}: found a number that is not finite")
+        raise ValueError(f"{label}: found a number that is not finite")
     mean = float(np.mean(sample)) if len(sample) else math.nan
     # What never varies says nothing of how much it varies.
     spread = len(sample) > 1 and np.ptp(sample) > 0.0
     return len(sample), mean, float(np.std(sample, ddof=1)) if spread else math.nan
 
 
-def _half_width(moments: tuple[int, float, float], tail: float) -> float:
+def _half_width(moments: tuple[float, float, float], tail: float) -> float:
     """Return the half-width of the t interval that leaves this much outside on each side."""
     from scipy.special import stdtrit
 
@@ -280,7 +310,7 @@ def _half_width(moments: tuple[int, float, float], tail: float) -> float:
 
 
 def _lower_bounds(
-    samples: Sequence[tuple[int, float, float]], edges: Sequence[float], alpha: float
+    samples: Sequence[tuple[float, float, float]], edges: Sequence[float], alpha: float
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Bound means from below and return Holm-adjusted p values of not being above their edges."""
     from scipy.special import stdtr
@@ -303,7 +333,7 @@ def _lower_bounds(
 
 def _verdict(
     statement: Statement,
-    moments: tuple[int, float, float],
+    moments: tuple[float, float, float],
     p_low: Float[np.ndarray, " e"],
     p_high: Float[np.ndarray, " e"],
     tail: float,

@@ -55,6 +55,11 @@ app.command(
     name="report",
     help="Put a study on one page: the paper's claims judged, every figure, the numbers.",
 )
+app.command(
+    "pipistrelle.verbs.compare:compare",
+    name="compare",
+    help="Put results side by side: scores, paths and settings of runs, logs or studies.",
+)
 config = App(name="config", help="Show the settings, or what a file of settings may hold.")
 config.command(
     "pipistrelle.verbs.config:show",

@@ -15,6 +15,21 @@ if TYPE_CHECKING:
     from pipistrelle.experiments.runs.trial import Progress
 
 
+TITLES = {
+    "position_rmse_m": ("position RMSE [m]", 3),
+    "heading_rmse_rad": ("heading RMSE [rad]", 4),
+    "map_rmse_m": ("map RMSE [m]", 3),
+    "position_rmse_aligned_m": ("position RMSE, aligned [m]", 3),
+    "map_rmse_aligned_m": ("map RMSE, aligned [m]", 3),
+    "position_floor_m": ("position, unavoidable [m]", 3),
+    "position_bound_m": ("position, bound [m]", 3),
+    "heading_bound_rad": ("heading, bound [rad]", 4),
+    "nees_mean": ("NEES, mean", 2),
+    "nees_max": ("NEES, largest", 1),
+}
+"""Scores as a person reads them, and their digits."""
+
+
 @contextmanager
 def announced(message: str, after: float = 3.0) -> Iterator[None]:
     """Say what is being waited for, if it takes long.
@@ -160,16 +175,8 @@ def closing_table(trials: "Sequence[TrialResult]", there: int | None = None) -> 
 def _cells(trial: "TrialResult", there: int | None) -> Iterator[tuple[str, str]]:
     """Word what there is to say of an estimate, with titles; nothing of what it lacks."""
     s = trial.scores
-    yield "position RMSE [m]", _number(s.position_rmse_m, 3)
-    yield "heading RMSE [rad]", _number(s.heading_rmse_rad, 4)
-    yield "map RMSE [m]", _number(s.map_rmse_m, 3)
-    yield "position RMSE, aligned [m]", _number(s.position_rmse_aligned_m, 3)
-    yield "map RMSE, aligned [m]", _number(s.map_rmse_aligned_m, 3)
-    yield "position, unavoidable [m]", _number(s.position_floor_m, 3)
-    yield "position, bound [m]", _number(s.position_bound_m, 3)
-    yield "heading, bound [rad]", _number(s.heading_bound_rad, 4)
-    yield "NEES, mean", _number(s.nees_mean, 2)
-    yield "NEES, largest", _number(s.nees_max, 1)
+    for name, (title, digits) in TITLES.items():
+        yield title, _number(getattr(s, name), digits)
     yield "landmarks, placed / heard", f"{s.landmarks_full} / {s.landmarks_total}"
     yield "landmarks in the world", "" if there is None else str(there)
     yield "fully placed, particles' mean", _number(trial.track.full, 1)

@@ -103,7 +103,7 @@ def deliver(
             with contextlib.nullcontext() if options.quiet else announced(message):
                 filmed(done, watch, path)
 
-    keep(done, folder, _command(), film)
+    keep(done, folder, command_line(), film)
     if not options.quiet:
         known = done.truth.landmarks
         put(closing_table(done.trials, None if known is None else len(known[0])))
@@ -115,7 +115,12 @@ def deliver(
     return 1 if failed else 0
 
 
-def _command() -> str:
-    """Return the command line as text, names that are no text by their bytes."""
+def command_line() -> str:
+    """Return the command line as text, names that are no text by their bytes.
+
+    Returns
+    -------
+    str
+    """
     words = shlex.join(["pipistrelle", *sys.argv[1:]])
     return os.fsencode(words).decode(errors="backslashreplace")

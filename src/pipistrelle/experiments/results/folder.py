@@ -1,6 +1,7 @@
 """A folder for results: made, or refused."""
 
 import contextlib
+from collections.abc import Sequence
 from datetime import datetime
 from itertools import count
 from pathlib import Path
@@ -25,7 +26,14 @@ RESERVED = (
 """What a result folder may hold: another's file of such a name is in the way."""
 
 
-def prepare_folder(path: Path | None, name: str, overwrite: bool) -> Path:
+def prepare_folder(
+    path: Path | None,
+    name: str,
+    overwrite: bool,
+    *,
+    kind: str = RESULTS,
+    reserved: Sequence[str] = RESERVED,
+) -> Path:
     """Make the folder that the results go to, and see that it can be written.
 
     Without a path it is ``runs/<time>-<name>``, and ``runs/latest`` comes to point at it where
@@ -40,6 +48,10 @@ def prepare_folder(path: Path | None, name: str, overwrite: bool) -> Path:
     overwrite : bool
         Accept a folder of earlier results, by their ``SHA256SUMS`` (`pipistrelle.files`). They
         stay until `write_results` makes way for the new ones.
+    kind : str
+        What is to stand there, as `pipistrelle.files` has it.
+    reserved : sequence of str
+        Patterns of names that it may use.
 
     Returns
     -------
@@ -59,7 +71,9 @@ def prepare_folder(path: Path | None, name: str, overwrite: bool) -> Path:
     True
     """
     try:
-        folder = _new_folder(name) if path is None else _chosen_folder(path, overwrite)
+        folder = (
+            _new_folder(name) if path is None else _chosen_folder(path, overwrite, kind, reserved)
+        )
         TemporaryFile(dir=folder).close()
     except OSError as error:
         raise InputError(
@@ -89,21 +103,22 @@ def _new_folder(name: str) -> Path:
     return folder
 
 
-def _chosen_folder(folder: Path, overwrite: bool) -> Path:
+def _chosen_folder(folder: Path, overwrite: bool, kind: str, reserved: Sequence[str]) -> Path:
     """Make a folder, or accept one of earlier results."""
     folder.mkdir(parents=True, exist_ok=True)
     if not any(folder.iterdir()):
         return folder
+    word = kind.removeprefix("a ")
     if not overwrite:
         raise InputError(
             f"{folder}: is not empty; name a new folder with -o DIR, or add --overwrite "
-            "to replace earlier results"
+            f"to replace the {word} there"
         )
-    own = OwnFiles(folder, RESULTS)
+    own = OwnFiles(folder, kind)
     if not own:
         raise InputError(
-            f"{folder}: is not empty and holds no results of Pipistrelle (its SHA256SUMS would "
+            f"{folder}: is not empty and holds no {word} of Pipistrelle's (its SHA256SUMS would "
             "name them), so nothing in it was overwritten; name another folder with -o DIR"
         )
-    own.check(path.name for pattern in RESERVED for path in folder.glob(pattern))
+    own.check(path.name for pattern in reserved for path in folder.glob(pattern))
     return folder

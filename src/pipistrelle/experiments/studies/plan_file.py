@@ -288,12 +288,7 @@ def changed_settings(there: Plan, asked: Plan) -> list[str]:
     >>> changed_settings(*plans)
     ['config.seed: 1 there, 2 asked for']
     """
-    old, new = (
-        {".".join(key): value for key, value in leaves(_as_table(plan))}
-        | {"config.air.speed_of_sound": plan.config.air.celerity}  # given or not
-        | {f"worlds/{name}": _digest(world) for name, world in plan.worlds.items()}
-        for plan in (there, asked)
-    )
+    old, new = plan_settings(there), plan_settings(asked)
     return [
         f"{name}: {_worded(old, name)} there, {_worded(new, name)} asked for"
         for name in dict.fromkeys((*old, *new))
@@ -307,6 +302,28 @@ def _digest(world: World) -> str:
     for name in sorted(world.files):
         told.update(f"{name}\n{len(world.files[name])}\n".encode() + world.files[name])
     return told.hexdigest()[:16]
+
+
+def plan_settings(plan: Plan) -> dict[str, Any]:
+    """Name all that a plan says by dotted names.
+
+    Parameters
+    ----------
+    plan : Plan
+
+    Returns
+    -------
+    dict
+        The speed of sound too, given or not, and of each world what stands for its files.
+
+    Examples
+    --------
+    >>> plan_settings(read_plan(find_plan("paper")))["iterations"]
+    115
+    """
+    told = {".".join(key): value for key, value in leaves(_as_table(plan))}
+    worlds = {f"worlds/{name}": _digest(world) for name, world in plan.worlds.items()}
+    return told | worlds | {"config.air.speed_of_sound": plan.config.air.celerity}
 
 
 def _worded(table: Mapping[str, Any], name: str) -> str:

@@ -1,0 +1,153 @@
+"""What folders have in common: estimates by their names, and settings by their values."""
+
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any, TypeVar
+
+from pipistrelle.estimation.catalogue import short_name
+
+Estimate = tuple[str, str]
+"""Strategy and filter."""
+K = TypeVar("K", bound=Hashable)
+
+
+def alike(folders: Sequence[Sequence[Estimate]]) -> tuple[bool, bool]:
+    """Tell whether strategy and filter tell estimates of one folder apart, in any of them.
+
+    What does not is no part of an estimate's name: then a folder of one filter is compared with
+    another of one, whichever they are, strategy by strategy.
+
+    Parameters
+    ----------
+    folders : sequence of sequences of estimates
+
+    Returns
+    -------
+    bool, bool
+        Of the strategy, of the filter.
+
+    Examples
+    --------
+    >>> both = [("active", "ekf"), ("fused", "ekf")]
+    >>> alike([both, [("fused", "smoother")]])
+    (True, False)
+    """
+    strategy, name = (
+        any(len({estimate[part] for estimate in estimates}) > 1 for estimates in folders)
+        for part in (0, 1)
+    )
+    return strategy, name
+
+
+def named(estimate: Estimate, parts: tuple[bool, bool] = (True, True)) -> Estimate:
+    """Leave out of an estimate's name what tells nothing apart.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    parts : bool, bool
+        As `alike` gives them.
+
+    Returns
+    -------
+    Estimate
+        Nothing in place of what is left out.
+
+    Examples
+    --------
+    >>> named(("fused", "ekf"), (True, False))
+    ('fused', '')
+    """
+    strategy, name = estimate
+    return strategy * parts[0], name * parts[1]
+
+
+def worded(estimates: Sequence[Estimate]) -> str:
+    """Word what estimates have in common.
+
+    Parameters
+    ----------
+    estimates : sequence of Estimate
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> worded([("fused", "ekf"), ("fused", "mine:Own")]), worded([("fused", "mine:Own")])
+    ('fused', 'fused Own')
+    """
+    strategies, filters = ({estimate[part] for estimate in estimates} for part in (0, 1))
+    common = [only for (only, *others) in (sorted(strategies), sorted(filters)) if not others]
+    return " ".join(map(short_name, common))
+
+
+def matched(keys: Sequence[Sequence[K]]) -> tuple[tuple[K, ...], dict[K, tuple[int, ...]]]:
+    """Part keys into those that all have, and those that only some have.
+
+    Parameters
+    ----------
+    keys : sequence of sequences
+        Of each folder, no two alike.
+
+    Returns
+    -------
+    tuple
+        Those of all, in the order of the first.
+    dict of tuple of int
+        Those of some, and which have them.
+
+    Examples
+    --------
+    >>> matched([["a", "b"], ["c", "b"]])
+    (('b',), {'a': (0,), 'c': (1,)})
+    """
+    owners = {
+        key: tuple(i for i, mine in enumerate(keys) if key in mine) for each in keys for key in each
+    }
+    everywhere = tuple(key for key, who in owners.items() if len(who) == len(keys))
+    return everywhere, {key: who for key, who in owners.items() if len(who) < len(keys)}
+
+
+def differing(settings: Sequence[Mapping[str, Any]]) -> dict[str, tuple[Any, ...]]:
+    """Find the settings that are not the same everywhere.
+
+    Parameters
+    ----------
+    settings : sequence of mappings by dotted names
+
+    Returns
+    -------
+    dict of tuple
+        The value of each, by name; None where one says nothing of it.
+
+    Examples
+    --------
+    >>> differing([{"seed": 1, "rays.power": 2.0}, {"seed": 1, "rays.power": 3.0, "x": 0}])
+    {'rays.power': (2.0, 3.0), 'x': (None, 0)}
+    """
+    found = {
+        name: tuple(one.get(name) for one in settings)
+        for name in dict.fromkeys(name for one in settings for name in one)
+    }
+    return {name: values for name, values in found.items() if any(v != values[0] for v in values)}
+
+
+def section(name: str) -> str:
+    """Name the section of a setting; one that is in none is a section of its own.
+
+    Parameters
+    ----------
+    name : str
+        Dotted.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> section("rays.power"), section("seed")
+    ('rays', 'seed')
+    """
+    return name.partition(".")[0]

@@ -1,0 +1,309 @@
+"""A comparison as files: every number in a table, the settings that differ, a figure, a README."""
+
+import io
+import json
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipistrelle import __version__
+from pipistrelle.estimation.catalogue import short_name
+from pipistrelle.experiments.comparing.folders import LETTERS
+from pipistrelle.experiments.comparing.missions import ComparedMissions
+from pipistrelle.experiments.comparing.studies import ComparedStudies
+from pipistrelle.files import COMPARISON, OwnFiles
+
+if TYPE_CHECKING:
+    import polars as pl
+
+Compared = ComparedMissions | ComparedStudies
+RESERVED = (
+    *(f"comparison.{ending}" for ending in ("csv", "parquet", "png", "pdf")),
+    "settings.csv",
+    "README.md",
+)
+"""What a comparison's folder may hold."""
+NOT_SCORES = ("strategy", "filter", "ignored_rows", "online")
+"""What else an estimate's entry of ``summary.json`` holds."""
+README = """\
+# A comparison
+
+    {command}
+
+Pipistrelle {version}. SI units and radians; what ends in _deg is in degrees. A difference is that
+of a folder less the first, {first}.
+
+{folders}
+
+{notes}
+
+| file | what it holds |
+|---|---|
+| comparison.csv, comparison.parquet | {table} |
+| settings.csv | the settings that differ, a column for each folder; empty: it says nothing |
+| comparison.png, comparison.pdf | {figure} |
+| SHA256SUMS | what was written here: `--overwrite` touches nothing else (`sha256sum -c`) |
+"""
+MISSIONS = (
+    "a row for each estimate, folder and score",
+    "the paths, as they are and each after the rigid motion that brings it nearest to its truth "
+    "(without one, to the first folder's path); beside them the distance from there",
+)
+STUDIES = (
+    "a row for each case, study and score: means, their difference, its interval by itself "
+    "(alone_low, alone_high) and as one of all cases (low, high, p; Holm)",
+    "the differences by case: thick by itself, thin as one of all cases; full points are "
+    "significant",
+)
+
+
+def write_comparison(
+    folder: Path,
+    compared: Compared,
+    *,
+    command: str,
+    notes: Sequence[str],
+    draw: Callable[[Path], None] = lambda _: None,
+) -> None:
+    """Write a comparison into a folder, in place of an earlier one.
+
+    Parameters
+    ----------
+    folder : Path
+        As `results.folder.prepare_folder` gives it.
+    compared : ComparedMissions or ComparedStudies
+    command : str
+        The command line, for the reader.
+    notes : sequence of str
+        What a reader must know of it.
+    draw : callable, optional
+        Given a folder to draw the figure into.
+
+    Raises
+    ------
+    InputError
+        Where a file cannot be written, or one that would be replaced is not as we wrote it.
+    """
+    own = OwnFiles(folder, COMPARISON)
+    own.clear(RESERVED)
+    buffer, table = io.BytesIO(), comparison_table(compared)
+    table.write_parquet(buffer)
+    own.write("comparison.parquet", buffer.getvalue())
+    own.write("comparison.csv", table.write_csv())
+    own.write("settings.csv", settings_table(compared).write_csv())
+    with own.room() as room:
+        draw(room)
+    what, figure = MISSIONS if isinstance(compared, ComparedMissions) else STUDIES
+    text = README.format(
+        command=command,
+        version=__version__,
+        first=LETTERS[0],
+        folders="\n".join(f"- {x}: {spelt(f)}" for x, f in lettered(compared.folders)),
+        notes="\n".join(f"- {note}" for note in notes),
+        table=what,
+        figure=figure,
+    )
+    own.write("README.md", text)
+
+
+def lettered(folders: Sequence[Path]) -> list[tuple[str, Path]]:
+    """Give each folder its letter.
+
+    Parameters
+    ----------
+    folders : sequence of Path
+
+    Returns
+    -------
+    list of letter and Path
+
+    Examples
+    --------
+    >>> [letter for letter, _ in lettered([Path("one"), Path("two")])]
+    ['A', 'B']
+    """
+    return list(zip(LETTERS, folders, strict=False))
+
+
+def spelt(folder: Path) -> str:
+    r"""Spell a folder's name, what is no character by its bytes or its number.
+
+    Parameters
+    ----------
+    folder : Path
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> spelt(Path("one [2]")), spelt(Path("a" + chr(10)))
+    ('one [2]', 'a\\n')
+    """
+    text = os.fsencode(folder).decode(errors="backslashreplace")
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def scores_of(run: Mapping[str, Any]) -> dict[str, float | None]:
+    """Return all numbers of an estimate's entry of ``summary.json``, those of its online path too.
+
+    Parameters
+    ----------
+    run : mapping
+
+    Returns
+    -------
+    dict
+        Whether it diverged is 0 or 1; None of what has no number.
+
+    Examples
+    --------
+    >>> scores_of({"filter": "ekf", "gated": 3, "diverged": False, "nees_max": None})
+    {'gated': 3.0, 'diverged': 0.0, 'nees_max': None}
+    """
+    told = {name: value for name, value in run.items() if name not in NOT_SCORES}
+    told |= {f"online_{name}": value for name, value in (run.get("online") or {}).items()}
+    return {name: None if value is None else float(value) for name, value in told.items()}
+
+
+def less(value: float | None, first: float | None) -> float | None:
+    """Subtract, where both are there.
+
+    Examples
+    --------
+    >>> less(3.0, 1.0), less(3.0, None)
+    (2.0, None)
+    """
+    return None if value is None or first is None else value - first
+
+
+def comparison_table(compared: Compared) -> "pl.DataFrame":
+    """Lay out all numbers of a comparison.
+
+    Parameters
+    ----------
+    compared : ComparedMissions or ComparedStudies
+
+    Returns
+    -------
+    DataFrame
+        Null where there is no number.
+    """
+    import polars as pl
+
+    missions = isinstance(compared, ComparedMissions)
+    rows = _mission_rows(compared) if missions else _study_rows(compared)
+    return pl.DataFrame(rows, infer_schema_length=None).with_columns(
+        pl.selectors.float().fill_nan(None)
+    )
+
+
+def settings_table(compared: Compared) -> "pl.DataFrame":
+    """Lay out the settings that differ, the version of Pipistrelle among them.
+
+    Parameters
+    ----------
+    compared : ComparedMissions or ComparedStudies
+
+    Returns
+    -------
+    DataFrame of text
+        A row for each, a column for each folder.
+    """
+    import polars as pl
+
+    letters = [letter for letter, _ in lettered(compared.folders)]
+    rows = [dict(zip(("setting", *letters), row, strict=True)) for row in settings_rows(compared)]
+    return pl.DataFrame(rows, schema=dict.fromkeys(("setting", *letters), pl.String))
+
+
+def settings_rows(compared: Compared) -> list[tuple[str | None, ...]]:
+    """Word the settings that differ: its name, then its value in each folder, None of none.
+
+    Parameters
+    ----------
+    compared : ComparedMissions or ComparedStudies
+
+    Returns
+    -------
+    list of tuples
+    """
+    told: dict[str, tuple[Any, ...]] = {}
+    if len(set(compared.versions)) > 1:
+        told["version of Pipistrelle"] = tuple(version or None for version in compared.versions)
+    return [
+        (name, *map(_worded, values)) for name, values in (told | {**compared.settings}).items()
+    ]
+
+
+def _worded(value: Any) -> str | None:
+    """Word a setting's value."""
+    return value if value is None or isinstance(value, str) else json.dumps(value)
+
+
+def _mission_rows(compared: ComparedMissions) -> list[dict[str, Any]]:
+    """Lay out the scores of estimates."""
+    rows = []
+    for estimate in compared.compared:
+        told = [scores_of(scores) for scores in estimate.scores]
+        for score in dict.fromkeys(name for scores in told for name in scores):
+            for (letter, folder), (strategy, name), scores in zip(
+                lettered(compared.folders), estimate.estimates, told, strict=True
+            ):
+                value = scores.get(score)
+                rows.append(
+                    {
+                        "estimate": estimate.title,
+                        "score": score,
+                        "letter": letter,
+                        "folder": spelt(folder),
+                        "strategy": strategy,
+                        "filter": short_name(name),
+                        "value": value,
+                        "difference": less(value, told[0].get(score)),
+                    }
+                )
+    return rows
+
+
+def _study_rows(compared: ComparedStudies) -> list[dict[str, Any]]:
+    """Lay out the differences of cases."""
+    rows = []
+    for case in compared.cases:
+        finding = case.finding
+        bounds = (*finding.interval, *finding.alone)
+        low, high, alone_low, alone_high = (x if math.isfinite(x) else None for x in bounds)
+        rows.append(
+            {
+                "case": case.label,
+                "strategy": case.strategies[1],
+                "filter": short_name(case.filters[1]),
+                **{name: _cell(value) for name, value in case.values.items()},
+                "beamwidth_deg": case.beamwidth_deg,
+                "score": case.score,
+                "letter": LETTERS[case.other],
+                "folder": spelt(compared.folders[case.other]),
+                "paired": case.paired,
+                "worlds_first": case.worlds[0],
+                "worlds": case.worlds[1],
+                "mean_first": case.means[0],
+                "mean": case.means[1],
+                "difference": finding.mean,
+                "low": low,
+                "high": high,
+                "alone_low": alone_low,
+                "alone_high": alone_high,
+                "p": finding.p,
+                "diverged_first": case.diverged[0],
+                "diverged": case.diverged[1],
+            }
+        )
+    return rows
+
+
+def _cell(value: Any) -> Any:
+    """Return a setting's value as a table holds it."""
+    return value if value is None or isinstance(value, (int, float, str)) else json.dumps(value)

@@ -1,0 +1,237 @@
+"""Results side by side: paths of several runs in one map, differences of studies by case."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipistrelle.estimation.catalogue import title_of
+from pipistrelle.experiments.comparing.missions import ComparedEstimate, ComparedMissions
+from pipistrelle.experiments.comparing.studies import ComparedCase, ComparedStudies
+from pipistrelle.experiments.comparing.writing import lettered, spelt
+from pipistrelle.figures.style import INK, STYLE, TRUTH
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+RUNS = ("#0b6e69", "#c8501e", "#6a3fa0", "#7d8a12", "#b03a7a", "#2f6db3")
+"""Colours of folders, which are none of the strategies'; told apart by their dashes, too."""
+DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.2, 1.4)), (0, (6, 2, 1.2, 2)))
+WIDTH, ROW, REST = 12.0, 3.7, 0.75
+"""Of a figure of paths [inch]: its width, the height of an estimate, and what is left for words."""
+STUDY_PANELS = {
+    "position_rmse_m": "position RMSE [m]",
+    "heading_rmse_rad": "heading RMSE [rad]",
+    "map_rmse_aligned_m": "map RMSE, aligned [m]",
+    "landmarks_full": "landmarks placed",
+}
+"""Scores of studies that are drawn."""
+SURE = 0.05
+"""A point is full where p is below, as one of all cases."""
+
+
+def draw_comparison(compared: ComparedMissions | ComparedStudies) -> "Figure":
+    """Draw missions or studies side by side.
+
+    Of missions a row for each estimate: the paths and the landmarks they place, as they are and
+    each after the rigid motion that brings it nearest to its truth; beside them the distance from
+    there over time. Of studies a panel for each of `STUDY_PANELS`: a case's difference, thick its
+    interval by itself, thin that as one of all cases.
+
+    Parameters
+    ----------
+    compared : ComparedMissions or ComparedStudies
+
+    Returns
+    -------
+    Figure
+        Not known to pyplot: it is freed when it is let go.
+    """
+    import matplotlib
+
+    with matplotlib.rc_context(STYLE):
+        if isinstance(compared, ComparedMissions):
+            return _draw_missions(compared)
+        return _draw_studies(compared)
+
+
+def _draw_missions(compared: ComparedMissions) -> "Figure":
+    """Draw a row of maps and errors for each estimate."""
+    from matplotlib.figure import Figure
+
+    rows = len(compared.compared)
+    figure = Figure(figsize=(WIDTH, rows * ROW + REST), layout="constrained")
+    grid = figure.add_gridspec(2 * rows, 3)
+    known = any(truth is not None for truth in compared.truths)
+    for row, estimate in enumerate(compared.compared):
+        raw = figure.add_subplot(grid[2 * row : 2 * row + 2, 0])
+        aligned = figure.add_subplot(grid[2 * row : 2 * row + 2, 1])
+        limits = _limits(compared, estimate)
+        for axes, fitted in ((raw, False), (aligned, True)):
+            _draw_paths(axes, compared, estimate, fitted=fitted)
+            axes.set(xlim=limits[0], ylim=limits[1], aspect="equal", xlabel="x [m]")
+        raw.set_ylabel("y [m]")
+        raw.set_title(", ".join(filter(None, [estimate.title, "as they are"])), loc="left")
+        whom = "its truth" if known else "the first"
+        aligned.set_title(f"each turned and shifted onto {whom}", loc="left")
+        _draw_errors(figure, (grid[2 * row, 2], grid[2 * row + 1, 2]), estimate, known=known)
+    _name_folders(figure, compared)
+    return figure
+
+
+def _limits(
+    compared: ComparedMissions, estimate: ComparedEstimate
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return limits that hold what is true, or else all; and of the rest what is not far away."""
+    truths = [truth.pose[:, :2] for truth in compared.truths if truth is not None]
+    paths = [points for view in estimate.views for points in (view.raw, view.aligned)]
+    marks = [points for view in estimate.views for points in (view.placed, view.placed_aligned)]
+    shown, rest = (np.concatenate(parts) for parts in (truths or paths, [*paths, *marks]))
+    shown, rest = (points[np.isfinite(points).all(axis=1)] for points in (shown, rest))
+    shown = shown if len(shown) else np.zeros((1, 2))
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    room = 0.5 * np.max(high - low) + 0.5
+    near = np.clip(rest, low - room, high + room)
+    low, high = (f(np.concatenate([shown, near]), axis=0) for f in (np.min, np.max))
+    centre, half = (low + high) / 2.0, np.full(2, 0.55 * np.max(high - low) + 0.25)
+    (left, bottom), (right, top) = (centre - half).tolist(), (centre + half).tolist()
+    return (left, right), (bottom, top)
+
+
+def _draw_paths(
+    axes: "Axes", compared: ComparedMissions, estimate: ComparedEstimate, *, fitted: bool
+) -> None:
+    """Draw what is true, broad, and each path with the landmarks that it places."""
+    axes.grid(True)
+    axes.set_axisbelow(True)
+    truths = {i: truth for i, truth in enumerate(compared.truths) if truth is not None}
+    for i, truth in list(truths.items())[: 1 if compared.one_drive else None]:
+        colour = TRUTH if compared.one_drive else _look(i)["color"]
+        axes.plot(*truth.pose[:, :2].T, color=colour, lw=3.2, alpha=0.35, zorder=2)
+    for i, view in enumerate(estimate.views):
+        path, placed = (view.aligned, view.placed_aligned) if fitted else (view.raw, view.placed)
+        axes.plot(*path.T, lw=1.3, zorder=4 + 0.1 * i, **_look(i))
+        colour = _look(i)["color"]
+        axes.plot(*placed.T, "o", ms=3.2, mfc="none", mec=colour, mew=0.8, zorder=3)
+
+
+def _draw_errors(
+    figure: "Figure", places: Sequence[Any], estimate: ComparedEstimate, *, known: bool
+) -> None:
+    """Draw the distances over time, as the paths are and when each is aligned."""
+    first: Axes | None = None
+    for place, name in zip(places, ("as it is", "aligned"), strict=True):
+        axes = figure.add_subplot(place, sharex=first)
+        for i, view in enumerate(estimate.views):
+            error = view.error if first is None else view.error_aligned
+            axes.plot(view.time, error, lw=1.1, **_look(i))
+        axes.grid(True)
+        axes.set_axisbelow(True)
+        what = "error" if known else "from the first"
+        axes.set_ylabel(f"{what},\n{name} [m]", multialignment="center")
+        axes.set_ylim(0.0, _highest([line.get_ydata() for line in axes.lines]))
+        axes.set_xlim(0.0, max(view.time[-1] for view in estimate.views))
+        if first is None:
+            axes.tick_params(labelbottom=False)
+        else:
+            axes.set_xlabel("time [s]")
+        first = first or axes
+
+
+def _highest(errors: Sequence[Any]) -> float:
+    """Return where an axis of errors ends: above all of them, but for those that are lost."""
+    most = [np.max(e[np.isfinite(e)], initial=0.0) for e in map(np.asarray, errors)]
+    return float(1.08 * min(max(most), 20.0 * max(min(most), 0.5))) or 1.0
+
+
+def _look(i: int) -> dict[str, Any]:
+    """Return colour and dashes of a folder."""
+    return {"color": RUNS[i % len(RUNS)], "ls": DASHES[i % len(DASHES)]}
+
+
+def _name_folders(figure: "Figure", compared: ComparedMissions) -> None:
+    """Say at the bottom which folder is which, and by what filter where that is not one."""
+    from matplotlib.lines import Line2D
+
+    handles: list[Artist] = []
+    names: list[str] = []
+    if any(truth is not None for truth in compared.truths):
+        handles.append(Line2D([], [], color=TRUTH, lw=3.2, alpha=0.35))
+        names.append("true path")
+    for i, (letter, folder) in enumerate(lettered(compared.folders)):
+        handles.append(Line2D([], [], lw=1.3, **_look(i)))
+        filters = dict.fromkeys(title_of(e.estimates[i][1]) for e in compared.compared)
+        names.append(f"{letter}  {_short(spelt(folder))} ({' and '.join(filters)})")
+    handles.append(Line2D([], [], lw=0, marker="o", ms=3.2, mfc="none", mec=INK))
+    names.append("placed landmarks")
+    legend = figure.legend(handles, names, loc="outside lower left", ncols=min(len(names), 5))
+    for text in legend.get_texts():
+        text.set_parse_math(False)
+
+
+def _short(name: str, most: int = 40) -> str:
+    """Return the end of a long name."""
+    return name if len(name) <= most else f"…{name[1 - most :]}"
+
+
+def _draw_studies(compared: ComparedStudies) -> "Figure":
+    """Draw the differences of each score in a panel, a line for each case."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
+    first = [case for case in compared.cases if case.score == compared.cases[0].score]
+    labels = list(dict.fromkeys(case.label for case in first))
+    others = len(compared.folders) - 1
+    height = max(2.0, (0.1 + 0.12 * others) * len(labels)) + 1.4
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    panels = figure.subplots(1, len(STUDY_PANELS), sharey=True)
+    for axes, (score, title) in zip(panels, STUDY_PANELS.items(), strict=True):
+        mine = [case for case in compared.cases if case.score == score]
+        axes.axvline(0.0, color=INK, lw=0.8, zorder=1)
+        for k, case in enumerate(mine):
+            place = k // others + (case.other - 1 - 0.5 * (others - 1)) * 0.6 / others
+            _draw_case(axes, case, place)
+        axes.set_title(title, loc="left", weight="bold")
+        axes.set_xlabel("other less A" if others > 1 else "B less A")
+        axes.xaxis.set_major_locator(MaxNLocator(4))
+        axes.grid(True, axis="x")
+        axes.set_axisbelow(True)
+    panels[0].set_yticks(range(len(labels)), labels)
+    panels[0].set_ylim(len(labels) - 0.5, -0.5)
+    for text in panels[0].get_yticklabels():
+        text.set_parse_math(False)
+    _name_studies(figure, compared)
+    return figure
+
+
+def _draw_case(axes: "Axes", case: ComparedCase, place: float) -> None:
+    """Draw a difference with its intervals, as far as they are known."""
+    finding, colour = case.finding, RUNS[case.other % len(RUNS)]
+    for bounds, width in ((finding.interval, 0.9), (finding.alone, 2.6)):
+        if np.isfinite(bounds).all():
+            axes.hlines(place, *bounds, color=colour, lw=width, zorder=2)
+    face = colour if finding.p < SURE else "white"
+    axes.plot(finding.mean, place, "o", ms=4.6, mfc=face, mec=colour, zorder=3)
+
+
+def _name_studies(figure: "Figure", compared: ComparedStudies) -> None:
+    """Say at the bottom which folder is which, and what is thick, thin and full."""
+    from matplotlib.lines import Line2D
+
+    handles: list[Artist] = [Line2D([], [], lw=0)]
+    names = [f"A  {_short(spelt(compared.folders[0]))}"]
+    for i, (letter, folder) in list(enumerate(lettered(compared.folders)))[1:]:
+        colour = RUNS[i % len(RUNS)]
+        handles.append(Line2D([], [], color=colour, lw=2.6))
+        names.append(f"{letter}  {_short(spelt(folder))}")
+    handles += [
+        Line2D([], [], color=INK, lw=2.6),
+        Line2D([], [], color=INK, lw=0.9),
+        Line2D([], [], color=INK, lw=0, marker="o", ms=4.6),
+    ]
+    names += ["95 %, by itself", "95 %, as one of all cases", "significant so"]
+    legend = figure.legend(handles, names, loc="outside lower left", ncols=min(len(names), 6))
+    for text in legend.get_texts():
+        text.set_parse_math(False)

@@ -1,0 +1,229 @@
+"""`pipistrelle compare`: results side by side."""
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from pipistrelle.verbs.console import TITLES, announced
+from pipistrelle.verbs.streams import put
+from pipistrelle.verbs.text_tables import text_table
+
+if TYPE_CHECKING:
+    from pipistrelle.experiments.comparing.missions import ComparedEstimate, ComparedMissions
+    from pipistrelle.experiments.comparing.studies import ComparedCase, ComparedStudies
+    from pipistrelle.experiments.comparing.writing import Compared
+
+MISSION_ROWS = TITLES | {
+    "landmarks_full": ("landmarks placed", 0),
+    "landmarks_total": ("landmarks heard", 0),
+    "measurements_per_frame": ("measurements per frame", 2),
+    "gated": ("rejected by the gate", 0),
+    "diverged": ("diverged", 0),
+    "wall_s": ("time of the filter [s]", 2),
+}
+"""Scores of a mission that are shown, and their digits; the files have all."""
+STUDY_TABLES = {
+    name: TITLES[name]
+    for name in (
+        "position_rmse_m",
+        "heading_rmse_rad",
+        "position_rmse_aligned_m",
+        "map_rmse_aligned_m",
+    )
+} | {"landmarks_full": ("landmarks placed", 2)}
+"""Scores of a study that are shown, a table each."""
+SURE = 0.05
+"""A difference is marked whose p is below, as one of all cases."""
+
+
+def compare(
+    *folders: Annotated[
+        Path, Parameter(help="Folders of `run` or `slam`, or of studies; two or more.")
+    ],
+    output: Annotated[
+        Path | None,
+        Parameter(
+            name=("--output", "-o"),
+            metavar="DIR",
+            help="Keep all numbers and a figure there. [default: print the tables alone]",
+        ),
+    ] = None,
+    overwrite: Annotated[
+        bool, Parameter(negative=(), help="Replace an earlier comparison in DIR.")
+    ] = False,
+    drop_diverged: Annotated[
+        bool,
+        Parameter(negative=(), help="Of studies: leave out worlds in which either case diverged."),
+    ] = False,
+    quiet: Annotated[bool, Parameter(negative=(), help="Print the result folder alone.")] = False,
+) -> None:
+    """Put results side by side, the first of them held against each other one."""
+    from pipistrelle.config import InputError
+    from pipistrelle.experiments.comparing import missions, studies
+    from pipistrelle.experiments.comparing.folders import kind_of
+
+    if output is None and (overwrite or quiet):
+        flag = "--overwrite" if overwrite else "--quiet"
+        raise InputError(f"{flag}: nothing is kept without -o DIR; add it, or leave the flag out")
+    compared: Compared
+    if kind_of(folders) == "studies":
+        compared = studies.compare_studies(folders, drop_diverged=drop_diverged)
+        notes, shown = studies.notes_of(compared), _study_tables(compared)
+    elif drop_diverged:
+        raise InputError("--drop-diverged: is for studies; a run is one world; leave it out")
+    else:
+        compared = missions.compare_missions(folders)
+        notes, shown = missions.notes_of(compared), _mission_tables(compared)
+    if output is not None:
+        _keep(output, compared, notes, overwrite=overwrite, quiet=quiet)
+    if not quiet:
+        put("\n\n".join([_names(compared), *shown, _settings(compared), *_joined(notes)]))
+    if output is not None:
+        put(output)
+
+
+def _keep(
+    output: Path, compared: "Compared", notes: Sequence[str], *, overwrite: bool, quiet: bool
+) -> None:
+    """Write the comparison into its folder, or leave none."""
+    from pipistrelle.experiments.comparing.writing import RESERVED, write_comparison
+    from pipistrelle.experiments.results.folder import prepare_folder
+    from pipistrelle.figures.comparison import draw_comparison
+    from pipistrelle.figures.style import save_figure
+    from pipistrelle.files import COMPARISON
+    from pipistrelle.verbs.delivery import command_line
+
+    folder = prepare_folder(output, "compare", overwrite, kind=COMPARISON, reserved=RESERVED)
+
+    def draw(room: Path) -> None:
+        save_figure(draw_comparison(compared), room, "comparison")
+
+    try:
+        with announced("Drawing the comparison ...", 1e9 if quiet else 3.0):
+            write_comparison(folder, compared, command=command_line(), notes=notes, draw=draw)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            folder.rmdir()
+        raise
+
+
+def _joined(notes: Sequence[str]) -> list[str]:
+    """Return notes as one block, or none."""
+    return ["\n".join(notes)] if notes else []
+
+
+def _names(compared: "Compared") -> str:
+    """Say which folder is which."""
+    from pipistrelle.experiments.comparing.studies import ComparedStudies
+    from pipistrelle.experiments.comparing.writing import lettered, spelt
+
+    told = [f"{letter}  {spelt(folder)}" for letter, folder in lettered(compared.folders)]
+    if isinstance(compared, ComparedStudies):
+        counts = zip(compared.done, compared.planned, strict=True)
+        told = [
+            f"{line}: {done} worlds" + f" of {planned}" * (done < planned)
+            for line, (done, planned) in zip(told, counts, strict=True)
+        ]
+    return "\n".join(told)
+
+
+def _settings(compared: "Compared") -> str:
+    """Show the settings that differ."""
+    from pipistrelle.experiments.comparing.writing import lettered, settings_rows
+
+    rows = settings_rows(compared)
+    if not rows:
+        return "No setting differs."
+    heads = [["settings that differ", *(letter for letter, _ in lettered(compared.folders))]]
+    return text_table("", heads, [["-" if cell is None else cell for cell in row] for row in rows])
+
+
+def _mission_tables(compared: "ComparedMissions") -> Iterator[str]:
+    """Show each estimate's scores, and what they differ by."""
+    from pipistrelle.experiments.comparing.writing import lettered
+
+    letters = [letter for letter, _ in lettered(compared.folders)]
+    for estimate in compared.compared:
+        words = [_unlike(estimate, i) for i in range(len(letters))]
+        heads = [[estimate.title, *letters, *(f"{x} - {letters[0]}" for x in letters[1:])]]
+        if any(words):
+            heads.append(["", *words, *[""] * (len(letters) - 1)])
+        yield text_table("", heads, list(_score_rows(estimate)))
+
+
+def _unlike(estimate: "ComparedEstimate", i: int) -> str:
+    """Word what of a folder's estimate is not in the title."""
+    from pipistrelle.estimation.catalogue import short_name
+
+    title = estimate.title.split()
+    words = map(short_name, estimate.estimates[i])
+    return " ".join(word for word in words if word not in title)
+
+
+def _score_rows(estimate: "ComparedEstimate") -> Iterator[list[str]]:
+    """Word the scores that any folder has."""
+    from pipistrelle.experiments.comparing.writing import less, scores_of
+
+    told = [scores_of(scores) for scores in estimate.scores]
+    for name, (title, digits) in MISSION_ROWS.items():
+        values = [scores.get(name) for scores in told]
+        if name == "diverged":
+            if any(values):
+                words = ("-" if v is None else "yes" if v else "no" for v in values)
+                yield [title, *words, *[""] * (len(values) - 1)]
+        elif any(value is not None for value in values) and (name != "gated" or any(values)):
+            gaps = [_signed(less(value, values[0]), digits) for value in values[1:]]
+            yield [title, *(_number(value, digits) for value in values), *gaps]
+
+
+def _study_tables(compared: "ComparedStudies") -> Iterator[str]:
+    """Show the means of each score by case, and their differences with intervals."""
+    several = len(compared.folders) > 2
+    for name, (title, digits) in STUDY_TABLES.items():
+        cases = [case for case in compared.cases if case.score == name]
+        rows = [_case_row(case, digits, several) for case in cases]
+        other = "other" if several else "B"
+        heads = [[title, "A", other, f"{other} - A", "95 %, all cases", "", "worlds", "diverged"]]
+        yield text_table("", heads, rows)
+
+
+def _case_row(case: "ComparedCase", digits: int, several: bool) -> list[str]:
+    """Word a score of a case."""
+    from pipistrelle.experiments.comparing.folders import LETTERS
+
+    finding, means = case.finding, case.means
+    low, high = (_signed(bound, digits) for bound in finding.interval)
+    known = all(abs(bound) < float("inf") for bound in finding.interval)
+    worlds = dict.fromkeys(case.worlds)
+    return [
+        case.label + f", {LETTERS[case.other]}" * several,
+        *(_number(_known(mean), digits) for mean in means),
+        _signed(_known(finding.mean), digits),
+        f"{low} to {high}" if known else "-",
+        "*" * (finding.p < SURE) + "~" * (not case.paired),
+        " / ".join(map(str, worlds)),
+        " / ".join(map(str, case.diverged)) if any(case.diverged) else "",
+    ]
+
+
+def _known(value: float) -> float | None:
+    """Return a number, and None of what is none."""
+    return value if value == value else None
+
+
+def _number(value: Any, digits: int) -> str:
+    """Print a number, a huge one in few digits."""
+    if value is None:
+        return "-"
+    return f"{value:.{digits}f}" if abs(value) < 1e5 else f"{value:.3g}"
+
+
+def _signed(value: float | None, digits: int) -> str:
+    """Print a difference with its sign."""
+    if value is None:
+        return "-"
+    text = _number(value, digits)
+    return text if text.startswith("-") else f"+{text}"
