@@ -10,8 +10,8 @@ from pipistrelle.settings import PREFIX, from_flags, known_settings
 
 PLACE = "<!-- settings -->"
 ANY = "any number"
+SIGN = re.compile("([≥>≤<]) ")
 UNIT = re.compile(r" ?\[((?!0 to 1)[^]]+)\]")
-HEADER = "| setting | default | unit | range | meaning |\n|---|---|---|---|---|\n"
 
 
 def add_settings(app, docname, content):
@@ -21,35 +21,43 @@ def add_settings(app, docname, content):
 
 
 def markdown():
-    """Lay out a table for each section, under its name."""
+    """Lay out the settings of each section, under its name."""
     parts, above = [], None
     for key in known_settings():
         if key[:-1] != above:
             above = key[:-1]
-            parts.append("\n".join((*titled(above), HEADER)))
-        parts[-1] += row(key)
+            parts.append(titled(above))
+        parts[-1] += entry(key)
     return "\n".join(parts)
 
 
 def titled(section):
     """Return the heading of a section, and what it says of itself."""
     if not section:
-        return "## Of a whole mission", ""
+        return ""
     meaning = type(getattr(Config(), section[0])).__doc__
-    return f"## {section[0]}", "", " ".join(meaning.split()), ""
+    return f"## {section[0]}\n\n{' '.join(meaning.split())}\n\n"
 
 
-def row(key):
-    """Return a setting's row of the table; under its name, its flag and its variable."""
+def entry(key):
+    """Say what a setting means, what it is by default and what it takes; its flag and variable."""
     field = known_settings()[key]
     text = " ".join(field.description.split())
     units = [] if isinstance(field.default, str) else UNIT.findall(text)
     if len(units) == 1:
         text = UNIT.sub("", text)
-    text = text.replace("|", "\\|")
-    default = "" if field.default is None else f"`{json.dumps(field.default)}`"
-    name = f"`{key[-1]}`<br>`{flag(key)}`<br>`{variable(key)}`"
-    return f"| {name} | {default} | {', '.join(units)} | {extent(field)} | {text} |\n"
+    unit, takes = f" {units[0]}" if len(units) == 1 else "", extent(field)
+    if field.default is None:
+        takes = f"None by default; {takes}{unit}"
+    else:
+        takes = f"Default `{told(field.default)}`{unit}; {takes}"
+    takes = SIGN.sub("\\1\N{NO-BREAK SPACE}", takes)
+    return f"`{key[-1]}`\n: {text} {takes}.\\\n  `{flag(key)}`, `{variable(key)}`\n\n"
+
+
+def told(value):
+    """Write a value as a file of settings has it."""
+    return json.dumps(list(value) if isinstance(value, tuple) else value)
 
 
 def flag(key):
@@ -76,7 +84,7 @@ def bounds(kind):
     """Say what a kind of value is bounded by."""
     whole = "whole, " if kind["type"] == "integer" else ""
     if "enum" in kind:
-        return ", ".join(f"`{choice}`" for choice in kind["enum"])
+        return " or ".join(f"`{choice}`" for choice in kind["enum"])
     if kind["type"] == "array":
         inner = [bounds(part) for part in kind["prefixItems"]]
         return f"{len(inner)} numbers" + ("" if inner[0] == ANY else f", each {inner[0]}")

@@ -1,11 +1,11 @@
 """The page of settings: every one of them, spelled as it can be given, with what it takes."""
 
-import json
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
-from docs.settings_page import PLACE, extent, flag, markdown, row, variable
+from docs.settings_page import PLACE, entry, extent, flag, markdown, variable
 
 from pipistrelle.config import Config, InputError
 from pipistrelle.settings import from_environment, from_flags, known_settings, resolve
@@ -14,29 +14,38 @@ PAGE = Path(__file__).resolve().parents[1] / "docs" / "settings.md"
 SETTINGS = list(known_settings())
 
 
-def test_every_setting_has_its_row_under_its_section():
+def test_every_setting_has_its_place_under_its_section():
     assert PAGE.read_text().count(PLACE) == 1
     sections = re.split(r"^## ", markdown(), flags=re.MULTILINE)[1:]
-    named = {text.split("\n")[0]: re.findall(r"^\| `(\w+)`<br>", text, re.M) for text in sections}
-    wanted = {"Of a whole mission": ["seed"]}
+    named = {text.split("\n")[0]: re.findall(r"^`(\w+)`\n: ", text, re.M) for text in sections}
+    wanted = {}
     for section, name in (key for key in SETTINGS if len(key) == 2):
         wanted.setdefault(section, []).append(name)
     assert named == wanted
+    assert markdown().startswith("`seed`\n: ")
 
 
 @pytest.mark.parametrize("key", SETTINGS, ids=".".join)
-def test_a_row_spells_the_setting_as_it_can_be_given(key):
-    cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", row(key))[1:-1]]
-    assert len(cells) == 5
-    name, default, _, takes, meaning = cells
-    assert name == f"`{key[-1]}`<br>`{flag(key)}`<br>`{variable(key)}`"
-    value = known_settings()[key].default
-    assert default == ("" if value is None else f"`{json.dumps(value)}`")
+def test_an_entry_spells_the_setting_as_it_can_be_given(key):
+    name, says, spelled = entry(key).replace("\xa0", " ").strip().split("\n")
+    assert name == f"`{key[-1]}`"
+    assert spelled == f"  `{flag(key)}`, `{variable(key)}`"
+    meaning, default, takes = re.fullmatch(
+        r": (.*?) (None by default|Default `[^`]*`[^;]*); (.+)\.\\", says
+    ).groups()
+    field = known_settings()[key]
+    if field.default is None:
+        assert default == "None by default"
+        takes = takes.removesuffix(" m/s")
+    else:
+        assert tomllib.loads("it = " + default.split("`")[1])["it"] == (
+            list(field.default) if isinstance(field.default, tuple) else field.default
+        )
+    assert takes == extent(field)
+    assert re.search(r"\w{3}", meaning), "a unit alone says nothing"
     assert list(from_environment({variable(key): "1"})) == [key]
     words = flag(key).removeprefix("--").replace("-", "_").split(".")
     assert tuple(words) == key
-    assert takes
-    assert re.search(r"\w{3}", meaning), "a unit alone says nothing"
 
 
 @pytest.mark.parametrize(
@@ -48,7 +57,7 @@ def test_a_row_spells_the_setting_as_it_can_be_given(key):
         (("scenario", "step"), "> 0"),
         (("air", "speed_of_sound"), "10 to 10000"),
         (("air", "temperature_c"), "> −50, < 60"),
-        (("air", "spreading"), "`paper`, `bistatic`"),
+        (("air", "spreading"), "`paper` or `bistatic`"),
         (("receiver", "elements"), "whole, 2 to 64"),
         (("detection", "peak_db"), "−300 to 0"),
         (("detection", "false_alarm"), "≥ 1e-100, < 0.1"),
@@ -76,13 +85,15 @@ def test_a_bound_that_the_page_names_is_where_values_are_refused(key):
             resolve(from_flags(nested))
 
 
-def test_units_stand_in_their_column_and_not_twice():
-    cells = row(("scenario", "beacon_distance")).split(" | ")
-    assert cells[2:] == ["m", "> 0", "Distance of the beacon from the centre. |\n"]
-    assert row(("air", "spreading")).split(" | ")[2].strip() == "", "a word has no unit"
-    start = row(("filter", "initial_pose_std"))
-    assert "| m, rad |" in start
-    assert "x, y [m], heading [rad]" in start, "several say which is which"
+def test_a_unit_stands_beside_the_default_and_not_twice():
+    assert entry(("scenario", "beacon_distance")).startswith(
+        "`beacon_distance`\n: Distance of the beacon from the centre. Default `15.0` m; >\xa00.\\\n"
+    )
+    assert 'Default `"paper"`; `paper` or `bistatic`.' in entry(("air", "spreading"))
+    assert (
+        "x, y [m], heading [rad]. Default `[0.05, 0.05, 0.0436]`; 3 numbers, each ≥\xa00."
+        in entry(("filter", "initial_pose_std"))
+    )
 
 
 def test_the_start_of_the_page_is_true():
