@@ -6,9 +6,6 @@
 True
 """
 
-from importlib import import_module
-from typing import Any
-
 __version__: str
 __all__ = ["Config", "InputError", "load", "run", "slam", "study"]
 _ROOMS = {
@@ -21,8 +18,10 @@ _ROOMS = {
 }
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Find what is asked for when it is asked for: importing the package loads nothing else."""
+    from importlib import import_module
+
     if name == "__version__":
         return import_module("pipistrelle.version").find_version()
     if name in _ROOMS:

@@ -187,7 +187,10 @@ def test_a_films_legend_names_what_its_frames_show(recorder, mission, tmp_path):
 
 def test_a_film_of_nothing_but_a_drive_needs_no_legend(tmp_path):
     frame = Snapshot(
-        scan=make_scan(0.0, np.empty(0), np.empty(0)), pose=np.zeros(3), landmarks=rows_of([], [])
+        scan=make_scan(0.0, np.empty(0), np.empty(0)),
+        pose=np.zeros(3),
+        covariance=np.zeros((3, 3)),
+        landmarks=rows_of([], []),
     )
     animate_mission({("active", "ekf"): [frame]}, tmp_path / "empty.gif")
     assert (tmp_path / "empty.gif").read_bytes().startswith(b"GIF89a")

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from pipistrelle.experiments.runs import trial
+from pipistrelle.scripting import missions
 
 
 def test_a_bug_keeps_its_traceback(obey, monkeypatch):
     def broken(*_, **__):
         raise ValueError("ours")
 
-    monkeypatch.setattr(trial, "run_mission", broken)
+    monkeypatch.setattr(missions, "run_mission", broken)
     with pytest.raises(ValueError, match="ours"):
         obey("run", "-o", "one")
 
@@ -22,7 +22,7 @@ def test_an_interrupted_run_says_so_and_leaves_no_empty_folder(obey, monkeypatch
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(trial, "run_mission", interrupted)
+    monkeypatch.setattr(missions, "run_mission", interrupted)
     assert obey("run") == (130, "", "pipistrelle: interrupted\n")
     assert list(Path("runs").iterdir()) == []
 
@@ -31,7 +31,7 @@ def test_memory_that_ends_is_said_in_a_line(refused, tmp_path, monkeypatch):
     def full(*_, **__):
         raise MemoryError("unable to allocate")
 
-    monkeypatch.setattr("pipistrelle.experiments.runs.trial.run_mission", full)
+    monkeypatch.setattr("pipistrelle.scripting.missions.run_mission", full)
     assert "not enough memory" in refused("run", "-o", tmp_path / "results")
     assert not (tmp_path / "results").exists()
 

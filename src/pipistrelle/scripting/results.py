@@ -174,12 +174,14 @@ class Results:
             Where xarray or pandas is not installed.
         """
         try:
-            frame = self.tracks.to_pandas().set_index(["strategy", "filter", "time_s"])
-            return frame.to_xarray()
+            import pandas  # noqa: F401 - these three are asked for by polars, and by each other
+            import pyarrow  # noqa: F401
+            import xarray  # noqa: F401
         except ImportError as missing:
             raise InputError(
                 f"to_xarray: found no {missing.name}; install it: pip install 'pipistrelle[export]'"
             ) from None
+        return self.tracks.to_pandas().set_index(["strategy", "filter", "time_s"]).to_xarray()
 
     def __repr__(self) -> str:
         """Show the scores as a table."""

@@ -75,7 +75,7 @@ def setting_flags(
     Examples
     --------
     >>> sorted(setting_flags().__annotations__)[:3]
-    ['air', 'association', 'beacon']
+    ['air', 'association', 'assumed']
     """
     sections: dict[str, dict[str, Any]] = {}
     top: dict[str, Any] = {}

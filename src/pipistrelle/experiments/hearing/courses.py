@@ -4,8 +4,8 @@ The paper's course is a circle of constant controls, driven blindly. A vehicle o
 would lose it within a round, so a driver who sees where the vehicle is steers for a point a little
 ahead on the line through the way-points (pure pursuit): by the angle off the heading,
 :math:`\gamma = \varphi`, for a front wheel, along the arc through the point, :math:`\omega = 2 V
-\sin\varphi / \ell`, for a unicycle. Noise is added to what he commands; what he commands is what
-the filters know.
+\sin\varphi / a`, for a unicycle, with a how far ahead that is. Noise is added to what he commands;
+what he commands is what the filters know.
 """
 
 import math
@@ -194,7 +194,7 @@ def driven(
     >>> setup = ScenarioConfig(course="corridor", extent=3.0, steps=80)
     >>> path, _ = driven(course_of(setup, still), setup, still, np.random.default_rng(7))
     >>> path[16].round(3), path[-1, :2].round(1)
-    (array([-1.5, -1. ,  0. ]), array([3. , 0.2]))
+    (array([-1.5, -1. ,  0. ]), array([2.8, 0.8]))
     """
     if not isinstance(course, Waypoints):
         _check_length(course, setup)
