@@ -40,8 +40,9 @@ class Entry:
         The sections of the settings that it reads; none of them changes what is heard.
     nees_limit : float
         A NEES above it means that the estimator has diverged.
-    memory : function of the number of landmarks, the members of each, and Config
-        Most bytes that it holds at once: all landmarks are there, and all of them still rays.
+    memory : callable
+        Given the number of landmarks, that of each one's members, and a Config: the most bytes that
+        it holds at once, when all landmarks are there and all of them still rays.
     needs : str
         A module that it cannot do without and that an extra of its name installs, or nothing.
     """
