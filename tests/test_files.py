@@ -47,6 +47,27 @@ def test_what_we_wrote_is_known_again_replaced_and_removed(own, tmp_path):
     assert not OwnFiles(tmp_path, RESULTS)
 
 
+def test_what_is_read_is_as_it_was_written_or_refused_by_name(own, tmp_path):
+    assert OwnFiles(tmp_path, RESULTS).read("one.txt") == b"first"
+    assert ("one.txt" in own, "three.txt" in own) == (True, False)
+    (tmp_path / "three.txt").write_text("mine")
+    (tmp_path / "one.txt").write_text("first!")
+    for name, why in (("one.txt", "was changed since"), ("three.txt", "is not Pipistrelle's")):
+        with pytest.raises(InputError, match=why):
+            own.read(name)
+    (tmp_path / "one.txt").unlink()
+    with pytest.raises(InputError, match=r"one\.txt: is missing"):
+        own.read("one.txt")
+    os.mkfifo(tmp_path / "one.txt")
+    with pytest.raises(InputError, match=r"one\.txt: is no file"):
+        own.read("one.txt")
+
+
+def test_what_of_ours_is_there_is_said_by_its_kind(own, tmp_path):
+    assert OwnFiles(tmp_path, REPORT).there == RESULTS
+    assert OwnFiles(tmp_path / "empty", REPORT).there is None
+
+
 @pytest.mark.skipif(which("sha256sum") is None, reason="this system has no sha256sum")
 def test_anybody_can_check_the_sums(own, tmp_path):
     own.write("one.txt", "second")

@@ -42,6 +42,38 @@ def test_a_mean_alone_has_the_t_interval(seed, n):
     assert finding.mean == pytest.approx(sample.mean(), rel=1e-12)
 
 
+@given(SEED, st.integers(3, 40), st.integers(3, 40))
+def test_a_difference_of_two_samples_has_the_interval_of_welch(seed, n, m):
+    rng = np.random.default_rng(seed)
+    first, second = rng.normal(1.0, 2.0, n), rng.normal(2.0, 0.3, m)
+    (finding,) = judge([Statement(label="", sample=second, against=first)])
+    known = stats.ttest_ind(second, first, equal_var=False)
+    alone = known.confidence_interval(0.95)
+    assert finding.alone == pytest.approx((alone.low, alone.high), rel=1e-9, abs=1e-9)
+    assert finding.interval == pytest.approx((alone.low, alone.high), rel=1e-9, abs=1e-9)
+    assert finding.p == pytest.approx(known.pvalue, rel=1e-9)
+    assert finding.mean == pytest.approx(second.mean() - first.mean(), rel=1e-9, abs=1e-12)
+    assert finding.n == min(n, m)
+
+
+def test_what_of_two_samples_has_no_spread_or_no_number_decides_nothing():
+    some, none, one = np.array([1.0, 2.0, 4.0]), np.empty(0), np.array([3.0])
+    for sample, against in ((some, none), (none, some), (some, one), (one, one), (some * 0, some)):
+        (finding,) = judge([Statement(label="", sample=sample, against=against)])
+        assert finding.holds is None
+        assert finding.interval == (-math.inf, math.inf)
+        assert finding.n == min(len(sample), len(against))
+
+
+def test_pairs_and_two_samples_stand_in_one_family():
+    rng = np.random.default_rng(4)
+    a, b, c = (rng.normal(level, 1.0, 30) for level in (0.0, 0.7, 0.6))
+    family = [Statement(label="p", sample=b - a), Statement(label="u", sample=c, against=a)]
+    alone = [judge([statement])[0].p for statement in family]
+    together = [finding.p for finding in judge(family)]
+    assert together == pytest.approx(holm(np.array(alone)), rel=1e-9)
+
+
 def test_holms_adjustment_is_that_of_a_hand_worked_family():
     assert holm(np.array([0.01, 0.04, 0.03, 0.005])) == pytest.approx([0.03, 0.06, 0.06, 0.02])
 

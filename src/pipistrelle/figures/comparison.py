@@ -181,8 +181,8 @@ def _draw_studies(compared: ComparedStudies) -> "Figure":
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
-    first = [case for case in compared.cases if case.score == compared.cases[0].score]
-    labels = list(dict.fromkeys(case.label for case in first))
+    first = compared.cases[0]
+    labels = [c.label for c in compared.cases if (c.score, c.other) == (first.score, first.other)]
     others = len(compared.folders) - 1
     height = max(2.0, (0.1 + 0.12 * others) * len(labels)) + 1.4
     figure = Figure(figsize=(WIDTH, height), layout="constrained")

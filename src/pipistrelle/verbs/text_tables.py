@@ -60,4 +60,4 @@ def _drawn(title: str, heads: Sequence[Sequence[str]], rows: Sequence[Sequence[s
     out = io.StringIO()
     width = shutil.get_terminal_size().columns
     Console(file=out, force_terminal=True, width=width).print(table)
-    return out.getvalue().rstrip("\n")
+    return "\n".join(line.rstrip() for line in out.getvalue().rstrip("\n").splitlines())

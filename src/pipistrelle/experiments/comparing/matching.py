@@ -4,9 +4,8 @@ from collections.abc import Hashable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from pipistrelle.estimation.catalogue import short_name
+from pipistrelle.experiments.results.stored import Estimate
 
-Estimate = tuple[str, str]
-"""Strategy and filter."""
 K = TypeVar("K", bound=Hashable)
 
 

@@ -18,7 +18,6 @@ from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.evaluation.accuracy import alignment, moved, position_error
 from pipistrelle.experiments.comparing.folders import LETTERS
 from pipistrelle.experiments.comparing.matching import (
-    Estimate,
     alike,
     differing,
     matched,
@@ -26,7 +25,12 @@ from pipistrelle.experiments.comparing.matching import (
     section,
     worded,
 )
-from pipistrelle.experiments.results.stored import StoredMission, StoredPath, read_mission
+from pipistrelle.experiments.results.stored import (
+    Estimate,
+    StoredMission,
+    StoredPath,
+    read_mission,
+)
 from pipistrelle.geometry import wrap
 
 _ROUNDING = 1e-6  # [m, rad]: paths that differ by less are of one drive

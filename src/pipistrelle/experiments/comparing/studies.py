@@ -345,7 +345,7 @@ def _counted(
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return the worlds that have a number, and it."""
     values = trials[score].cast(float).fill_null(np.nan).to_numpy()
-    counts = (trials["status"] == "done").to_numpy() & np.isfinite(values)
+    counts = np.isfinite(values)
     if drop_diverged:
         counts &= ~trials["diverged"].fill_null(value=False).to_numpy()
     return trials["iteration"].to_numpy()[counts], values[counts]

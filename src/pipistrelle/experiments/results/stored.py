@@ -107,7 +107,7 @@ def read_mission(folder: Path) -> StoredMission:
         )
     except InputError:
         raise
-    except (ValueError, KeyError, TypeError, IndexError) as error:  # the sums were changed, too
+    except (ValueError, LookupError, TypeError, AttributeError) as error:  # sums of its own
         found = f"files that Pipistrelle would not write ({error})"
         raise refusal(folder, found, "results of it", "run again what wrote them") from error
 

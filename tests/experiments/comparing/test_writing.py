@@ -1,0 +1,136 @@
+"""A comparison as files."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pipistrelle.config import Config, FilterConfig, InputError
+from pipistrelle.experiments.comparing.missions import compare_missions
+from pipistrelle.experiments.comparing.studies import compare_studies
+from pipistrelle.experiments.comparing.writing import (
+    comparison_table,
+    settings_rows,
+    settings_table,
+    spelt,
+    write_comparison,
+)
+from pipistrelle.experiments.studies.plan import Plan
+from pipistrelle.files import COMPARISON, SUMS, OwnFiles
+from reference.results import loop, mission_folder, study_folder, turned
+
+OFF = turned(loop(), 0.1, (0.5, -0.2))
+
+
+@pytest.fixture
+def missions(tmp_path):
+    lost = np.full_like(OFF, np.nan)
+    one = {("active", "ekf"): loop(), ("fused", "ekf"): OFF}
+    two = {("active", "iekf"): lost, ("fused", "iekf"): loop()}
+    sharp = Config(filter=FilterConfig(noise="measured", initial_pose_std=(0.1, 0.1, 0.1)))
+    folders = [
+        mission_folder(tmp_path / "one", one),
+        mission_folder(tmp_path / "two, [2]", two, config=sharp),
+    ]
+    return compare_missions(folders)
+
+
+@pytest.fixture
+def studies(tmp_path):
+    plan = Plan(
+        name="made-up", iterations=3, strategies=("active", "passive"), filters=("ekf",),
+        config=Config(), grid={"emitter.radius": (0.0025, 0.025), "filter.noise": ("constant",)},
+    )  # fmt: skip
+    folders = [
+        study_folder(tmp_path / name, plan, lambda case, world, k=k: 1.0 + k * (2 + world))
+        for k, name in enumerate(("one", "two"))
+    ]
+    return compare_studies(folders)
+
+
+def test_missions_have_a_row_for_each_estimate_folder_and_score(missions):
+    table = comparison_table(missions)
+    rmse = table.filter(pl.col("score") == "position_rmse_m")
+    assert rmse["letter"].to_list() == ["A", "B", "A", "B"]
+    assert rmse["filter"].to_list() == ["ekf", "iekf"] * 2
+    assert rmse["estimate"].to_list() == ["active", "active", "fused", "fused"]
+    first, lost, off, exact = rmse["value"].to_list()
+    assert (first, lost) == (0.0, None)
+    assert off > 0.5 > exact == 0.0
+    assert rmse["difference"].to_list() == [0.0, None, 0.0, pytest.approx(-off)]
+    diverged = table.filter(pl.col("score") == "diverged")["value"].to_list()
+    assert diverged == [0.0, 1.0, 0.0, 0.0]
+    assert {"wall_s", "landmarks_full", "nees_max"} <= set(table["score"])
+    assert not {"strategy", "filter", "ignored_rows", "online"} & set(table["score"])
+
+
+def test_studies_have_a_row_for_each_case_and_score(studies):
+    table = comparison_table(studies)
+    mine = table.filter(pl.col("score") == "map_rmse_m")
+    assert mine.select("case", "emitter.radius", "filter.noise", "worlds", "paired").rows() == [
+        ("active ekf, 33.0°, filter.noise constant", 0.0025, "constant", 3, True),
+        ("active ekf, 33.0°, filter.noise constant", 0.025, "constant", 3, True),
+        ("passive ekf, filter.noise constant", None, "constant", 3, True),
+    ]
+    assert mine["difference"].to_list() == pytest.approx([3.0] * 3)
+    assert mine["mean"].to_list() == pytest.approx([4.0] * 3)
+    low, high = mine["alone_low"][0], mine["alone_high"][0]
+    assert (low + high) / 2.0 == pytest.approx(3.0)
+    none = table.filter(pl.col("score") == "heading_rmse_rad")
+    assert none.select("mean", "difference", "low", "alone_high").row(0) == (None,) * 4
+
+
+def test_settings_have_a_column_for_each_folder_and_the_version_where_it_differs(missions):
+    assert settings_rows(missions) == [
+        ("filter.noise", "constant", "measured"),
+        ("filter.initial_pose_std", "[0.05, 0.05, 0.0436]", "[0.1, 0.1, 0.1]"),
+    ]
+    assert settings_table(missions).columns == ["setting", "A", "B"]
+    other = replace(missions, versions=("0.1.0", ""), settings={})
+    assert settings_rows(other) == [("version of Pipistrelle", "0.1.0", None)]
+    assert settings_table(replace(other, versions=("1", "1"))).rows() == []
+
+
+@pytest.mark.parametrize("kind", ["missions", "studies"])
+def test_a_comparison_is_written_with_its_sums_and_says_what_it_is(kind, request, tmp_path):
+    compared, folder = request.getfixturevalue(kind), tmp_path / "out"
+
+    def draw(room):
+        (room / "comparison.png").write_bytes(b"picture")
+
+    write_comparison(
+        folder, compared, command="pipistrelle compare one", notes=["A note."], draw=draw
+    )
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == [
+        "README.md", "SHA256SUMS", "comparison.csv", "comparison.parquet", "comparison.png",
+        "settings.csv",
+    ]  # fmt: skip
+    assert OwnFiles(folder, COMPARISON).there == COMPARISON
+    assert (folder / SUMS).read_text().startswith("# Of Pipistrelle: a comparison\n")
+    table = comparison_table(compared)
+    assert pl.read_parquet(folder / "comparison.parquet").equals(table)
+    assert pl.read_csv(folder / "comparison.csv").height == table.height
+    readme = (folder / "README.md").read_text()
+    for part in ("pipistrelle compare one", "- A note.", f"- A: {spelt(compared.folders[0])}"):
+        assert part in readme
+
+
+def test_what_a_user_changed_in_an_earlier_comparison_is_not_replaced(missions, tmp_path):
+    folder = tmp_path / "out"
+    given = {"command": "", "notes": ()}
+    write_comparison(folder, missions, **given)
+    write_comparison(folder, missions, **given)
+    (folder / "comparison.csv").write_text("mine")
+    with pytest.raises(InputError, match=r"comparison\.csv: was changed since"):
+        write_comparison(folder, missions, **given)
+    assert (folder / "comparison.csv").read_text() == "mine"
+    assert (folder / "README.md").exists()
+
+
+def test_names_are_spelt_whatever_they_are_made_of():
+    assert spelt(Path("a b [1] µ")) == "a b [1] µ"
+    assert spelt(Path("a\nb")) == "a\\nb"
+    assert spelt(Path("a\udcff")) == "a\\xff"
