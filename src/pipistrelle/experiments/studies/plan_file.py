@@ -26,9 +26,11 @@ from pipistrelle.experiments.hearing.world_folder import (
     settled,
 )
 from pipistrelle.experiments.hearing.worlds import World
+from pipistrelle.experiments.studies.beamwidths import BEAMWIDTH, with_radii
 from pipistrelle.experiments.studies.plan import (
     MOST_CASES,
     MOST_WORLDS,
+    RADIUS,
     WORLD,
     Plan,
     combinations,
@@ -147,9 +149,10 @@ def read_plan(path: Path, over: Layer | None = None, iterations: int | None = No
             )
     worlds: dict[str, World] = {}
     layer = _laid(path, within["config"], over, worlds)
+    radii = with_radii(f"{path}: grid", within["grid"], head.strategies, layer)
     asked = [
         (key, name, _worlds(path, values, worlds) if key == WORLD_KEY else values)
-        for key, name, values in _settings(path, "grid", within["grid"])
+        for key, name, values in _settings(path, "grid", radii)
     ]
     lengths = [len(values) for _, _, values in asked if isinstance(values, list)]
     most = prod(lengths) * len(head.strategies) * len(head.filters)
@@ -159,7 +162,8 @@ def read_plan(path: Path, over: Layer | None = None, iterations: int | None = No
     for key in (key for key in layer if ".".join(key) in grid):
         # The plan in a study's folder names every setting; a default there says nothing.
         if key in over or resolve({key: layer[key]}) != Config():
-            why = f"the plan varies this setting; take it out of [grid] in {path}"
+            name = f" as {BEAMWIDTH}" * (BEAMWIDTH in within["grid"] and ".".join(key) == RADIUS)
+            why = f"the plan varies this setting{name}; take it out of [grid] in {path}"
             raise InputError(f"{layer[key].where}: {why}")
     plan = Plan(
         name=head.name,
@@ -396,7 +400,8 @@ def _settings(
         if name in known:
             yield known[name], name, value
         elif value != {} or not any(other.startswith(f"{name}.") for other in known):
-            raise InputError(f"{path}: {table}.{name}: no such setting; {_meant(name, known)}")
+            names = [*known, BEAMWIDTH] if table == "grid" else known
+            raise InputError(f"{path}: {table}.{name}: no such setting; {_meant(name, names)}")
 
 
 def _values(path: Path, name: str, key: Key, values: Any, layer: Layer) -> tuple[Any, ...]:
