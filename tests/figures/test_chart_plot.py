@@ -54,6 +54,16 @@ def test_lines_and_bands_are_those_of_the_series():
     assert (box.ymin, box.ymax) == pytest.approx((0.1, 0.9))
 
 
+def test_every_band_lies_under_every_line():
+    edges = {"low": np.full(3, 0.1), "high": np.full(3, 0.9)}
+    series = [fused(), *(fused(name=str(i), style="dots", **edges) for i in range(40))]
+    (axes,) = draw_chart(chart_of(panel_of(*series))).axes
+    bands = [band.get_zorder() for band in axes.collections]
+    assert len(bands) == 40
+    assert max(bands) < min(line.get_zorder() for line in axes.lines)
+    assert min(bands) > 1.0, "over the grid and the rules"
+
+
 def test_axes_have_the_charts_scales_limits_and_ticks():
     (axes,) = draw_chart(chart_of(panel_of(fused()))).axes
     assert (axes.get_xscale(), axes.get_yscale()) == ("log", "linear")

@@ -127,8 +127,9 @@ def _draw_series(axes: "Axes", series: Series, top: float, order: float) -> None
         if mark.spread == "bars":
             axes.vlines(x, series.low, series.high, lw=1.6, **given)
         else:
+            below = order - 0.5  # every band under every line
             axes.fill_between(
-                x, series.low, series.high, color=colour, alpha=BAND, lw=0, zorder=order
+                x, series.low, series.high, color=colour, alpha=BAND, lw=0, zorder=below
             )
     if mark.joined:
         axes.plot(x, y, lw=1.4, ls=(0, (4, 3)) if series.dashed else "-", **given)

@@ -65,6 +65,15 @@ def test_bands_end_and_worlds_are_pinned_at_the_edge_of_the_panel():
         assert 0.0 < min(y) < max(y) < 280.0
 
 
+def test_every_band_lies_under_every_line_and_symbol():
+    edges = {"low": np.full(2, 2.0), "high": np.full(2, 8.0)}
+    panel = panel_of(line([5, 5]), line([4, 4], style="dots"), line([6, 6], **edges),
+                     line([7, 7], style="points", **edges))  # fmt: skip
+    order = [e.get("class").split()[0] for e in drawn(panel) if e.get("class")]
+    kinds = [kind for kind in order if kind in ("band", "line", "dot", "bars")]
+    assert kinds == ["band", "line", "line", "dot", "dot", "line", "bars", "dot", "dot"]
+
+
 def test_texts_are_escaped():
     bad = '<img src=x onerror="alert(1)">'
     series = line([1.0, 2.0], name=bad)

@@ -45,6 +45,9 @@ def panel_svg(panel: Panel) -> Markup:
     """
     frame = _frame(panel)
     parts = [*_grid(panel, frame)]
+    for series in panel.series:  # every band under every line
+        if MARKS[series.style].spread == "band":
+            parts += _spread(series, frame)
     for series in panel.series:
         parts += _series(series, frame)
     if not panel.equal:
@@ -199,7 +202,7 @@ def _grid(panel: Panel, frame: _Frame) -> list[Markup]:
 
 
 def _series(series: Series, frame: _Frame) -> list[Markup]:
-    """Draw one series as its mark says."""
+    """Draw one series as its mark says, but for its band."""
     mark = MARKS[series.style]
     x, y = _across(frame, series.x), _down(frame, series.y)
     known = np.flatnonzero(np.isfinite(x) & np.isfinite(y)).tolist()
@@ -207,9 +210,7 @@ def _series(series: Series, frame: _Frame) -> list[Markup]:
         return [_text(series.tips[i], x[i], y[i] + 4.0, "middle") for i in known]
     if mark.pinned and not series.tips:
         return _pinned(series, x, y, frame.panel.y.limits[1])
-    parts = []
-    if series.low is not None and series.high is not None:
-        parts.append(_spread(series, x, _down(frame, series.low), _down(frame, series.high)))
+    parts = _spread(series, frame) if mark.spread == "bars" else []
     if mark.joined:
         parts.append(_stroke("line dashed" if series.dashed else "line", series, _path(x, y)))
     if mark.symbol:
@@ -232,8 +233,12 @@ def _pinned(series: Series, x: np.ndarray, y: np.ndarray, top: float) -> list[Ma
     return [_stroke(kind, series, d) for kind, d in (("marks", dots), ("tops", tops)) if d]
 
 
-def _spread(series: Series, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> Markup:
-    """Draw the band of a line, or the bars of points."""
+def _spread(series: Series, frame: _Frame) -> list[Markup]:
+    """Draw the band of a line, or the bars of points, where there is one."""
+    if series.low is None or series.high is None:
+        return []
+    x = _across(frame, series.x)
+    low, high = _down(frame, series.low), _down(frame, series.high)
     both = np.isfinite(low) & np.isfinite(high)
     ends = list(zip(x[both].tolist(), low[both].tolist(), high[both].tolist(), strict=True))
     if MARKS[series.style].spread == "bars":
@@ -242,7 +247,7 @@ def _spread(series: Series, x: np.ndarray, low: np.ndarray, high: np.ndarray) ->
         edge = [f"{a:.1f} {c:.1f}" for a, _, c in ends]
         edge += [f"{a:.1f} {b:.1f}" for a, b, _ in reversed(ends)]
         kind, d = "band", "M" + "L".join(edge) + "z" if edge else ""
-    return Markup('<path class="{} c-{}" d="{}"/>').format(kind, series.role, d)
+    return [Markup('<path class="{} c-{}" d="{}"/>').format(kind, series.role, d)]
 
 
 def _path(x: np.ndarray, y: np.ndarray) -> str:
