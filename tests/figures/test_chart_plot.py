@@ -88,6 +88,31 @@ def test_points_that_are_not_filled_are_open():
     assert hollow.get_markerfacecolor() == "white"
 
 
+def test_names_with_dollars_are_names_and_no_formulae(tmp_path):
+    words = Axis(label="$x_1^", limits=(-1.0, 1.0), ticks=((0.0, "a$b$c"),))
+    figure = draw_chart(chart_of(panel_of(fused(name="$\\frac{"), title="$", x=words)))
+    save_figure(figure, tmp_path, "c")
+    (axes,) = figure.axes
+    assert [text.get_text() for text in axes.get_xticklabels()] == ["a$b$c"]
+
+
+def test_a_dash_stands_for_a_level_on_paper_and_page():
+    series = fused(style="levels")
+    (axes,) = draw_chart(chart_of(panel_of(series))).axes
+    assert axes.lines[0].get_marker() == "_"
+    assert legend([panel_of(series)]) == [("fused", "fused", "dashed")]
+    drawn = ElementTree.fromstring(str(panel_svg(panel_of(series))))
+    assert len([e for e in drawn.iter("path") if "dot" in e.get("class").split()]) == 3
+
+
+def test_an_axis_of_words_has_them_in_the_csv_for_points_beside_them_too():
+    named = ((0.0, "plain"), (1.0, "measured"))
+    axis = Axis(label="noise", limits=(-0.6, 1.6), ticks=named, named=named, words=True)
+    points = fused(x=np.array([0.1, 0.9]), y=np.array([1.0, 2.0]), style="points")
+    rows = csv_rows(chart_of(panel_of(points, x=axis)))
+    assert [row[3] for row in rows[1:]] == ["plain", "measured"]
+
+
 def test_names_are_told_once_for_all_panels_and_not_at_all_when_many():
     figure = draw_chart(chart_of(panel_of(fused()), panel_of(fused(), title="FastSLAM 2.0")))
     assert [text.get_text() for text in figure.legends[0].texts] == ["fused"]

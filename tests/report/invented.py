@@ -14,6 +14,7 @@ from pipistrelle.experiments.studies.store import open_store
 from pipistrelle.experiments.studies.world import world_schemas
 from pipistrelle.experiments.studies.world_files import TABLES, with_sums, world_file
 from pipistrelle.report.studied import COMMON, SCORES, Study, Trials
+from pipistrelle.report.variables import beam_variable
 
 RADII = (
     0.0025, 0.0031, 0.0038, 0.0047, 0.0058, 0.0071, 0.0088, 0.0108, 0.0133, 0.0164, 0.0203, 0.025,
@@ -98,24 +99,37 @@ def trials_of(rng, world, name, strategy):
     scores["heading_bound_rad"] = 0.1 * scores["position_bound_m"]
     placed = {"active": 0.5, "fused": 0.52, "passive": 0.6}[strategy]
     scores[COMMON] = placed + 0.2 * world[:, None] + 0.05 * noise(rng, worlds, len(BEAMWIDTH))
+    scores["map_rmse_m"] = np.tile(placed + 0.2 * world[:, None], beams)
     no = np.zeros((worlds, beams), dtype=bool)
     ideal = np.full((2, beams, FRAMES), 3.0)
     ideal[1] = 6.0
-    return Trials(failed=no, diverged=no.copy(), scores=scores, nees=nees, consistent=ideal)
+    return Trials(
+        at=np.arange(len(BEAMWIDTH)) % beams,
+        failed=no,
+        diverged=no.copy(),
+        scores=scores,
+        placed=np.ones((worlds, beams, 1), dtype=bool),
+        off=scores["map_rmse_m"][:, :, None],
+        nees=nees,
+        consistent=ideal,
+    )
 
 
 def invent(worlds=60, seed=1, planned=None):
     """A study whose every claim is the paper's."""
     rng = np.random.default_rng(seed)
     world = noise(rng, worlds)
+    config = Config(seed=2022)
     return Study(
         name="invented",
-        settings={},
+        variables=(beam_variable("emitter.radius", RADII[::-1], BEAMWIDTH),),
         grid={"emitter.radius": (0.0025, 0.025)},
         planned=worlds if planned is None else planned,
         worlds=np.arange(worlds),
-        config=Config(seed=2022),
+        config=config,
+        configs=(config,) * len(BEAMWIDTH),
         beamwidth=BEAMWIDTH,
+        drawing=np.zeros(len(BEAMWIDTH), dtype=int),
         trials={
             (name, strategy): trials_of(rng, world, name, strategy)
             for name in FILTERS
@@ -136,6 +150,38 @@ def changed(study, way, score, change):
 def only(study, ways):
     """The same study with some ways alone."""
     return replace(study, trials={way: study.trials[way] for way in ways})
+
+
+def narrowed(study, columns):
+    """The same study at some of its beamwidths alone."""
+    columns = list(columns)
+    (beam,) = study.variables
+    few = beam_variable(beam.setting, [beam.given[i] for i in columns], BEAMWIDTH[columns])
+    trials = {}
+    for way, mine in study.trials.items():
+        b = [0] if way[1] == "passive" else columns
+        trials[way] = replace(
+            mine,
+            at=np.arange(len(columns)) % len(b),
+            failed=mine.failed[:, b],
+            diverged=mine.diverged[:, b],
+            scores={
+                score: table[:, columns if score == COMMON else b]
+                for score, table in mine.scores.items()
+            },
+            placed=mine.placed[:, b],
+            off=mine.off[:, b],
+            nees=mine.nees[:, b],
+            consistent=mine.consistent[:, b],
+        )
+    return replace(
+        study,
+        variables=(few,),
+        configs=study.configs[: len(columns)],
+        beamwidth=study.beamwidth[columns],
+        drawing=study.drawing[columns],
+        trials=trials,
+    )
 
 
 def with_third(study, name):

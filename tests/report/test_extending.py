@@ -39,7 +39,7 @@ def extended(guide, tmp_path_factory):
     study = invent(8)
     study.trials["ekf", "fused"].diverged[3] = True
     write_report(
-        (study,),
+        study,
         folder,
         claims=(*CLAIMS, guide["headings"]),
         charts=(*CHARTS, guide["world_charts"]),
@@ -96,7 +96,7 @@ def test_a_claim_of_ones_own_can_be_refuted_and_leaves_the_others_as_they_are(gu
 
 def test_what_is_added_to_the_list_needs_no_other_place(guide, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "_write_figure", lambda *_: None)
-    write_report((invent(2),), tmp_path, claims=(guide["headings"],), charts=())
+    write_report(invent(2), tmp_path, claims=(guide["headings"],), charts=())
     page = Sections((tmp_path / "index.html").read_text(encoding="utf-8"))
     assert [number for number, _ in page.claims] == ["1"]
     assert page.figures == ["piston", "example_map"]

@@ -11,8 +11,17 @@ from pipistrelle.experiments.studies.plan import cases_of
 from pipistrelle.experiments.studies.plan_file import read_plan
 from pipistrelle.experiments.studies.world_files import TABLES, with_sums, world_file
 from pipistrelle.report.reading import read_study
-from pipistrelle.report.studied import COMMON, SCORES
+from pipistrelle.report.studied import (
+    COMMON,
+    SCORES,
+    Failure,
+    along,
+    case_name,
+    combination_name,
+    values,
+)
 from report.invented import BEAMWIDTH, ERROR, FILTERS, RADII, STRATEGIES, invent, write_store
+from report.planted import LEVELS, write_planted
 
 
 @pytest.fixture(scope="module")
@@ -31,13 +40,15 @@ def cell_of(case):
 
 def test_what_was_written_is_read(written):
     folder, study, _, _, _, _ = written
-    (read,) = read_study(folder)
+    read = read_study(folder)
     assert (read.name, read.planned, read.worlds.tolist()) == ("invented", 9, list(range(5)))
     assert read.beamwidth == pytest.approx(BEAMWIDTH, rel=1e-12)
     assert set(read.trials) == {(f, s) for f in FILTERS for s in STRATEGIES}
     assert read.config.seed == 2022
-    assert read.settings == {}
+    (beam,) = read.variables
+    assert (beam.name, beam.words[0], beam.words[-1]) == ("beamwidth", "11°", "180°")
     assert list(read.grid) == ["emitter.radius"]
+    assert {config.emitter.radius for config in read.configs} == set(RADII)
     for way, trials in read.trials.items():
         there = study.trials[way]
         good = ~trials.failed
@@ -53,19 +64,21 @@ def test_the_settings_of_a_study_are_the_common_ones_and_no_filters_own(tmp_path
     own = "[own.fastslam]\nfilter.gate = 0.5\nfastslam.particles = 7\n"
     plan, _, _ = write_store(tmp_path / "store", invent(2), grid=own)
     assert {case.config.fastslam.particles for case in cases_of(plan)} == {100, 7}
-    (read,) = read_study(tmp_path / "store")
+    read = read_study(tmp_path / "store")
     assert read.config == plan.config
     assert (read.config.filter.gate, read.config.fastslam.particles) == (1.0, 100)
 
 
 def test_failed_trials_are_known_and_have_no_numbers(written):
     folder, _, plan, _, _, failed = written
-    (read,) = read_study(folder)
+    read = read_study(folder)
     assert sum(int(trials.failed.sum()) for trials in read.trials.values()) == len(failed)
     told = []
     for world, number in failed:
         name, strategy, column = cell_of(cases_of(plan)[number])
-        told.append((world, strategy, name, float(BEAMWIDTH[column]), ERROR))
+        width = float(BEAMWIDTH[column])
+        told.append(Failure(iteration=world, strategy=strategy, filter=name, beamwidth_deg=width,
+                            settings={}, error=ERROR))  # fmt: skip
         trials = read.trials[name, strategy]
         assert trials.failed[world, column]
         assert np.isnan(trials.scores["position_rmse_m"][world, column])
@@ -78,7 +91,7 @@ def test_what_diverged_and_what_it_cost_is_read_trial_by_trial(tmp_path):
     diverged = {way: rng.random(t.diverged.shape) < 0.3 for way, t in study.trials.items()}
     spoilt = {way: replace(t, diverged=diverged[way]) for way, t in study.trials.items()}
     plan, _, _ = write_store(tmp_path / "store", replace(study, trials=spoilt))
-    (read,) = read_study(tmp_path / "store")
+    read = read_study(tmp_path / "store")
     for way, trials in read.trials.items():
         np.testing.assert_array_equal(trials.diverged, diverged[way])
         assert not trials.failed.any()
@@ -87,7 +100,7 @@ def test_what_diverged_and_what_it_cost_is_read_trial_by_trial(tmp_path):
 
 def test_the_map_error_is_that_of_the_landmarks_every_strategy_has_placed(written):
     folder, _, plan, full, error, _ = written
-    (read,) = read_study(folder)
+    read = read_study(folder)
     number = {cell_of(case): case.number for case in cases_of(plan)}
     for world in range(len(read.worlds)):
         for name in FILTERS:
@@ -107,7 +120,7 @@ def test_worlds_without_their_file_of_trials_are_left_out(written, tmp_path):
     folder, study = tmp_path / "store", written[1]
     write_store(folder, study)
     (folder / "trials" / "iteration_00002.parquet").unlink()
-    (read,) = read_study(folder)
+    read = read_study(folder)
     assert read.worlds.tolist() == [0, 1, 3, 4]
     expected = study.trials["ekf", "fused"].scores["position_rmse_m"][[0, 1, 3, 4]]
     np.testing.assert_array_equal(read.trials["ekf", "fused"].scores["position_rmse_m"], expected)
@@ -118,20 +131,87 @@ def test_what_is_not_finite_stays_so(written, tmp_path):
     study.trials["ekf", "fused"].scores["position_rmse_m"][0, 3] = np.inf
     study.trials["ekf", "fused"].nees[1, 3, 7] = np.inf
     write_store(folder, study)
-    (read,) = read_study(folder)
+    read = read_study(folder)
     assert np.isposinf(read.trials["ekf", "fused"].scores["position_rmse_m"][0, 3])
     assert np.isposinf(read.trials["ekf", "fused"].nees[1, 3, 7])
 
 
-def test_further_settings_make_studies_of_their_own(tmp_path):
-    folder = tmp_path / "store"
-    write_store(folder, invent(3), grid='"air.relative_humidity" = [0.3, 0.7]\n')
-    dry, moist = read_study(folder)
-    assert dry.settings == {"air.relative_humidity": 0.3}
-    assert moist.settings == {"air.relative_humidity": 0.7}
-    assert moist.config.air.relative_humidity == 0.7
-    assert len(dry.beamwidth) == len(moist.beamwidth) == len(RADII)
-    assert dry.config.emitter.radius == moist.config.emitter.radius
+def test_further_settings_are_further_variables_and_every_combination_has_its_numbers(tmp_path):
+    grid = '"air.relative_humidity" = [0.7, 0.3]\nbeamwidth = [33, 180]\n'
+
+    def by_both(case):
+        wet, radius = case.values["air.relative_humidity"], case.values["emitter.radius"]
+        return {"position_rmse_m": 10.0 * wet + (0.0 if radius is None else 1e3 * radius)}
+
+    plan = write_planted(tmp_path / "s", grid, worlds=2, effect=by_both, spread=0.0,
+                         ways='filters = ["ekf"]\n')  # fmt: skip
+    read = read_study(tmp_path / "s")
+    wet, beam = read.variables
+    assert (wet.words, beam.words) == (("0.3", "0.7"), ("33°", "180°")), "rising, both"
+    names = [combination_name(read, i) for i in range(4)]
+    assert names[:2] == ["air.relative_humidity = 0.3, 33°", "air.relative_humidity = 0.3, 180°"]
+    assert along(read, wet).tolist() == [[0, 1], [2, 3]]
+    assert along(read, beam).tolist() == [[0, 2], [1, 3]]
+    narrow, wide = plan.grid["emitter.radius"]
+    bare = 0.8 + 0.2 * np.array([-1.0, 1.0]) / np.sqrt(2.0)
+    for i, (moist, radius) in enumerate([(0.3, narrow), (0.3, wide), (0.7, narrow), (0.7, wide)]):
+        assert read.configs[i].air.relative_humidity == moist
+        assert read.configs[i].emitter.radius == radius
+        active = values(read, "position_rmse_m", ("ekf", "active", i))
+        assert sorted(active) == pytest.approx(sorted(bare + 10.0 * moist + 1e3 * radius))
+        passive = values(read, "position_rmse_m", ("ekf", "passive", i))
+        assert sorted(passive) == pytest.approx(sorted(bare + 10.0 * moist))
+    assert read.trials["ekf", "passive"].at.tolist() == [0, 0, 1, 1]
+    assert case_name(read, ("ekf", "passive"), 3) == "air.relative_humidity = 0.7"
+    assert case_name(read, ("ekf", "active"), 3) == "air.relative_humidity = 0.7, 180°"
+    assert read.config == plan.config
+
+
+def test_words_and_lists_keep_the_plans_order_and_what_has_one_value_is_no_variable(tmp_path):
+    grid = (
+        '"rays.range_bounds" = [[2.0, 40.0], [0.5, 20.0]]\n"rays.power" = [3.0]\n'
+        '"rays.weights" = ["instantaneous", "aggregated"]'
+    )
+    write_planted(tmp_path / "s", grid, worlds=1)
+    read = read_study(tmp_path / "s")
+    bounds, weights = read.variables
+    assert bounds.words == ("[2, 40]", "[0.5, 20]")
+    assert weights.words == ("instantaneous", "aggregated")
+    assert (bounds.numbers, weights.numbers) == (None, None)
+    assert {config.rays.power for config in read.configs} == {3.0}
+    assert read.configs[1].rays.weights == "aggregated"
+    assert read.configs[1].rays.range_bounds == (2.0, 40.0)
+
+
+def test_a_radius_is_no_beamwidth_where_the_tone_varies_too_or_all_beams_are_as_wide(tmp_path):
+    tones = '"emitter.radius" = [0.0025, 0.025]\n"emitter.frequency" = [35e3, 40e3]'
+    write_planted(tmp_path / "tones", tones, worlds=1)
+    radius, _ = read_study(tmp_path / "tones").variables
+    assert (radius.name, radius.words) == ("emitter.radius", ("0.0025", "0.025"))
+    write_planted(tmp_path / "wide", '"emitter.radius" = [0.0025, 0.001]', worlds=1)
+    (radius,) = read_study(tmp_path / "wide").variables
+    assert (radius.name, radius.words) == ("emitter.radius", ("0.001", "0.0025"))
+
+
+def test_combinations_know_whether_they_meet_the_same_landmarks(tmp_path):
+    write_planted(tmp_path / "level", LEVELS, worlds=1)
+    assert read_study(tmp_path / "level").drawing.tolist() == [0, 0, 0]
+    grid = '"scenario.landmarks" = [12, 20]\n"rays.power" = [1, 2]'
+    write_planted(tmp_path / "count", grid, worlds=1)
+    assert read_study(tmp_path / "count").drawing.tolist() == [0, 0, 1, 1]
+    crowded = '"scenario.radius" = [3.0, 25.0]\n"rays.power" = [1, 2]'
+    write_planted(tmp_path / "crowded", crowded, worlds=1)
+    first, again, other, _ = read_study(tmp_path / "crowded").drawing
+    assert first == again != other, "a world that cannot be drawn is one of its own"
+
+
+def test_a_failed_trial_is_told_with_its_values(tmp_path):
+    grid = '"air.relative_humidity" = [0.3, 0.7]\n'
+    plan, *_ = write_store(tmp_path / "store", invent(2), grid=grid, failed=((1, 30),))
+    (failure,) = read_study(tmp_path / "store").errors
+    humid = cases_of(plan)[30].values["air.relative_humidity"]
+    assert failure.settings == {"air.relative_humidity": f"{humid:g}"}
+    assert failure.iteration == 1
 
 
 def test_a_folder_that_is_no_study_is_refused(tmp_path):

@@ -41,7 +41,7 @@ class Mark:
         Small and many, for single worlds: those above the panel stand at its edge.
     written : bool
         No symbol: what `tips` say stands at the points.
-    swatch : "line", "dot" or "star"
+    swatch : "line", "dashed", "dot" or "star"
         Its sign in the page's legend.
     """
 
@@ -54,7 +54,7 @@ class Mark:
     radius: float = 3.2
     pinned: bool = False
     written: bool = False
-    swatch: Literal["line", "dot", "star"] = "line"
+    swatch: Literal["line", "dashed", "dot", "star"] = "line"
 
 
 def _star(outer: float, inner: float) -> tuple[tuple[float, float], ...]:
@@ -64,11 +64,14 @@ def _star(outer: float, inner: float) -> tuple[tuple[float, float], ...]:
     return tuple(zip((reach * np.cos(turn)).tolist(), (reach * np.sin(turn)).tolist(), strict=True))
 
 
+_DASH = ((-9.0, -1.0), (9.0, -1.0), (9.0, 1.0), (-9.0, 1.0))
+
 MARKS = {
     "line": Mark(joined=True),
     "dots": Mark(joined=True, symbol="o"),
     "points": Mark(spread="bars", symbol="o", radius=4.2, swatch="dot"),
     "marks": Mark(symbol="o", size=2.4, radius=3.0, pinned=True),
+    "levels": Mark(symbol="_", size=11.0, corners=_DASH, swatch="dashed"),
     "stars": Mark(symbol="*", size=13.0, edge=0.8, corners=_star(9.0, 3.6), swatch="star"),
     "text": Mark(written=True),
 }
@@ -126,12 +129,19 @@ class Axis:
     limits : low, high
     log : bool
     ticks : tuple of value and text
+    named : tuple of value and text
+        The places at which there is something to read out, as the page calls them; where there are
+        none, it takes the ticks.
+    words : bool
+        The numbers are no more than the order of those names: the CSV has the names.
     """
 
     label: str
     limits: tuple[float, float]
     log: bool = False
     ticks: tuple[tuple[float, str], ...]
+    named: tuple[tuple[float, str], ...] = ()
+    words: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -392,9 +402,17 @@ def csv_rows(chart: Chart, **constant: str) -> list[list[str]]:
             low = nothing if series.low is None else series.low
             high = nothing if series.high is None else series.high
             head = [*constant.values(), panel.title, series.name, series.style]
-            for point in zip(series.x, series.y, low, high, strict=True):
-                rows.append([*head, *("" if math.isnan(v) else f"{v:.9g}" for v in point)])
+            for place, *point in zip(series.x, series.y, low, high, strict=True):
+                numbers = ("" if math.isnan(v) else f"{v:.9g}" for v in point)
+                rows.append([*head, _place(panel.x, place), *numbers])
     return rows
+
+
+def _place(axis: Axis, value: float) -> str:
+    """Write where a point stands: the name that is nearest, or the number."""
+    if axis.words:
+        return min(axis.named, key=lambda name: abs(name[0] - value))[1]
+    return "" if math.isnan(value) else f"{value:.9g}"
 
 
 def csv_text(rows: Sequence[Sequence[str]]) -> str:

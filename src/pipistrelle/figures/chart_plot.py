@@ -18,6 +18,8 @@ ROW, REST = 3.3, 0.8
 """Height of a row of panels, and of title and legend together [inch]."""
 TEXT = {"grid": "#8a8a8a"}
 """Colours of text where it would be too faint in its role's own."""
+PLAIN = {"text.parse_math": False}
+"""Names are shown as they are, dollars included."""
 BAND = 0.15
 """Opacity of a band."""
 
@@ -58,7 +60,7 @@ def draw_chart(chart: Chart) -> "Figure":
         (left, right), (low, high) = first.x.limits, first.y.limits
         height = WIDTH[columns] / columns * (high - low) / (right - left)
     size = (WIDTH[columns], rows * height + REST)
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(STYLE | PLAIN):
         figure = Figure(figsize=size)
         figure.set_layout_engine("constrained", w_pad=0.1, h_pad=0.06)
         figure.suptitle(chart.title, x=0.01, ha="left", fontsize=12, weight="bold")

@@ -1,16 +1,23 @@
 """A study's folder as arrays.
 
-A study over further settings falls apart into one `Study` for each combination of them. Only
-worlds that are whole are read: those whose file of trials stands.
+Only worlds that are whole are read: those whose file of trials stands.
 """
 
+import json
+from collections.abc import Sequence
+from itertools import product
+from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config, InputError
+from pipistrelle.estimation.catalogue import SECTIONS
+from pipistrelle.experiments.hearing.scenario import standing_landmarks, world_of
+from pipistrelle.experiments.studies.beamwidths import MAKERS
 from pipistrelle.experiments.studies.plan import RADIUS, Plan, cases_of, common
 from pipistrelle.experiments.studies.store import load_study
 from pipistrelle.experiments.studies.world import STEPS, world_schemas
@@ -20,13 +27,29 @@ from pipistrelle.experiments.studies.world_files import (
     done_worlds,
     world_file,
 )
-from pipistrelle.report.studied import COMMON, ONLINE_POSITION, SCORES, Study, Trials
+from pipistrelle.report.studied import (
+    COMMON,
+    ONLINE_POSITION,
+    SCORES,
+    Failure,
+    Study,
+    Trials,
+    Way,
+    rmse_of,
+)
+from pipistrelle.report.variables import (
+    BEAM,
+    Variable,
+    beam_variable,
+    setting_variable,
+    word_of,
+)
 
 if TYPE_CHECKING:
     import polars as pl
 
 
-def read_study(folder: Path) -> tuple[Study, ...]:
+def read_study(folder: Path) -> Study:
     """Read what a study has done so far.
 
     Parameters
@@ -36,8 +59,7 @@ def read_study(folder: Path) -> tuple[Study, ...]:
 
     Returns
     -------
-    tuple of Study
-        One for each combination of the settings other than the beamwidth's, in order.
+    Study
 
     Raises
     ------
@@ -56,14 +78,9 @@ def read_study(folder: Path) -> tuple[Study, ...]:
                 f"{folder}: no world is done yet; `pipistrelle study` with -o {folder} goes on"
             )
         steps, landmarks = stored.steps.collect(), stored.landmarks.collect()
-        studies = []
-        for settings, config, numbers in _combinations(stored.plan):
-            mine = pl.col("case").is_in(numbers)
-            tables = [table.filter(mine) for table in (trials, steps, landmarks)]
-            studies.append(_study(stored.plan, config, settings, *tables))
+        return _study(stored.plan, trials, steps, landmarks)
     except (OSError, pl.exceptions.PolarsError) as error:
         raise _unreadable(folder, stored.plan) from error
-    return tuple(studies)
 
 
 def _unreadable(folder: Path, plan: Plan) -> InputError:
@@ -78,84 +95,158 @@ def _unreadable(folder: Path, plan: Plan) -> InputError:
     return InputError(f"{folder}: could not be read, though each file can; run the report again")
 
 
-def _combinations(plan: Plan) -> list[tuple[dict[str, Any], Config, list[int]]]:
-    """Part the cases by the settings that are not the beamwidth's."""
-    found: dict[str, tuple[dict[str, Any], Config, list[int]]] = {}
-    for case in cases_of(plan):
-        settings = {name: value for name, value in case.values.items() if name != RADIUS}
-        if (key := repr(settings)) not in found:
-            found[key] = (settings, common(plan, settings), [])
-        found[key][2].append(case.number)
-    return list(found.values())
+def _variables(plan: Plan) -> tuple[Variable, ...]:
+    """Name what a plan varies; of the radius, the beamwidth where nothing else decides it."""
+    found = []
+    for setting, values in plan.grid.items():
+        if len(values) < 2:
+            continue
+        variable = setting_variable(setting, values)
+        if setting == RADIUS and not plan.grid.keys() & set(MAKERS):
+            widths = [_degrees(common(plan, {RADIUS: radius})) for radius in values]
+            if len(set(widths)) == len(widths):
+                variable = beam_variable(RADIUS, values, widths)
+        found.append(variable)
+    return tuple(found)
+
+
+def _degrees(config: Config) -> float:
+    """Return the half-power beamwidth of the vehicle's call [deg]."""
+    tone = {"frequency": config.emitter.frequency, "speed_of_sound": config.air.celerity}
+    return degrees(beamwidth(config.emitter.radius, **tone))
+
+
+def _combinations(plan: Plan, variables: Sequence[Variable]) -> list[dict[str, Any]]:
+    """Lay out the values of each combination, by their settings."""
+    alone = {setting: values[0] for setting, values in plan.grid.items() if len(values) == 1}
+    return [
+        alone | dict(zip((variable.setting for variable in variables), values, strict=True))
+        for values in product(*(variable.given for variable in variables))
+    ]
+
+
+def _numbers(
+    plan: Plan, cases: "pl.DataFrame", variables: Sequence[Variable]
+) -> dict[Way, Int[np.ndarray, " c"]]:
+    """Number the case of each combination by filter and strategy."""
+    given = [[repr(value) for value in variable.given] for variable in variables]
+    values = {case.number: case.values for case in cases_of(plan)}
+    found: dict[Way, Int[np.ndarray, ...]] = {}
+    for case, name, strategy in cases.rows():
+        numbers = found.setdefault((name, strategy), np.empty(list(map(len, given)), dtype=int))
+        mine = [values[case][variable.setting] for variable in variables]
+        at = tuple(
+            slice(None) if value is None else known.index(repr(value))
+            for value, known in zip(mine, given, strict=True)
+        )
+        numbers[at] = case
+    return {way: numbers.reshape(-1) for way, numbers in sorted(found.items())}
+
+
+def _drawings(configs: Sequence[Config], world: int) -> Int[np.ndarray, " c"]:
+    """Tell by a world drawn anew which combinations meet the same landmarks."""
+    drawn: dict[Any, int] = {}
+    known: dict[str, int] = {}
+    found = []
+    for number, config in enumerate(configs):
+        table = config.model_dump(mode="json", exclude=set(SECTIONS))
+        del table["emitter"]["radius"]
+        if (same := json.dumps(table)) not in known:
+            try:
+                key = tuple(part.tobytes() for part in standing_landmarks(world_of(config, world)))
+            except InputError:
+                key = number
+            known[same] = drawn.setdefault(key, len(drawn))
+        found.append(known[same])
+    return np.array(found)
 
 
 def _study(
-    plan: Plan,
-    config: Config,
-    settings: dict[str, Any],
-    trials: "pl.DataFrame",
-    steps: "pl.DataFrame",
-    landmarks: "pl.DataFrame",
+    plan: Plan, trials: "pl.DataFrame", steps: "pl.DataFrame", landmarks: "pl.DataFrame"
 ) -> Study:
-    """Lay one combination out as arrays."""
+    """Lay a study out as arrays."""
     import polars as pl
 
+    variables = _variables(plan)
+    settings = _combinations(plan, variables)
+    configs = tuple(common(plan, values) for values in settings)
     worlds = np.unique(trials["iteration"].to_numpy())
-    key = ["case", "filter", "strategy", "beamwidth_deg"]
-    cases = trials.select(key).unique().sort("beamwidth_deg", "case")
-    number = {case: i for i, case in enumerate(cases["case"].to_list())}
+    cases = trials.select("case", "filter", "strategy").unique().sort("case")
+    numbers = _numbers(plan, cases, variables)
     broken = trials.filter(pl.col("status") != "done").sort("iteration", "case")
-    told = broken.select("iteration", "strategy", "filter", "beamwidth_deg", "error")
+    count = len(cases_of(plan))
     return Study(
         name=plan.name,
-        settings=settings,
+        variables=variables,
         grid=dict(plan.grid),
         planned=plan.iterations,
         worlds=worlds,
-        config=config,
-        beamwidth=cases["beamwidth_deg"].drop_nulls().unique().sort().to_numpy(),
+        config=plan.config,
+        configs=configs,
+        beamwidth=np.array(list(map(_degrees, configs))),
+        drawing=_drawings(configs, int(worlds[0])),
         trials=_trials(
-            {
-                key: np.array([number[case] for case in group["case"].to_list()])
-                for key, group in cases.partition_by("filter", "strategy", as_dict=True).items()
-            },
-            _scores(trials, worlds, number),
-            {column: _over_time(steps, column, worlds, number) for column in STEPS[2:]},
-            _maps(landmarks, worlds, number),
+            numbers,
+            _scores(trials, worlds, count),
+            {column: _over_time(steps, column, worlds, count) for column in STEPS[2:]},
+            _maps(landmarks, worlds, count),
         ),
-        errors=tuple((i, s, f, b, text or "") for i, s, f, b, text in told.rows()),
+        errors=_failures(plan, broken, variables),
         cpu_s=float(trials["cpu_s"].sum()),
     )
 
 
+def _failures(
+    plan: Plan, broken: "pl.DataFrame", variables: Sequence[Variable]
+) -> tuple[Failure, ...]:
+    """Tell which trials failed, with what and under which values."""
+    values = {case.number: case.values for case in cases_of(plan)}
+    others = [variable for variable in variables if variable.name != BEAM]
+    return tuple(
+        Failure(
+            iteration=row["iteration"],
+            strategy=row["strategy"],
+            filter=row["filter"],
+            beamwidth_deg=row["beamwidth_deg"],
+            settings={v.name: word_of(v, values[row["case"]][v.setting]) for v in others},
+            error=row["error"] or "",
+        )
+        for row in broken.iter_rows(named=True)
+    )
+
+
 def _trials(
-    columns: dict[tuple[str, ...], Int[np.ndarray, " b"]],
+    numbers: dict[Way, Int[np.ndarray, " c"]],
     scores: dict[str, np.ndarray],
-    nees: dict[str, Float[np.ndarray, "n c k"]],
-    maps: tuple[Bool[np.ndarray, "n c l"], Float[np.ndarray, "n c l"]],
-) -> dict[tuple[str, str], Trials]:
-    """Give each filter and strategy its columns."""
-    common = _common(columns, *maps)
-    return {
-        (name, strategy): Trials(
+    nees: dict[str, Float[np.ndarray, "n a k"]],
+    maps: tuple[Bool[np.ndarray, "n a l"], Float[np.ndarray, "n a l"]],
+) -> dict[Way, Trials]:
+    """Give each filter and strategy its cases, in the order of the combinations."""
+    common = _common(numbers, *maps)
+    found = {}
+    for way, mine in numbers.items():
+        first = np.sort(np.unique(mine, return_index=True)[1])
+        c = mine[first]
+        found[way] = Trials(
+            at=np.argmax(mine[:, None] == c, axis=1),
             failed=scores["failed"][:, c],
             diverged=scores["diverged"][:, c],
-            scores={score: scores[score][:, c] for score in SCORES}
-            | {COMMON: common[name, strategy]},
+            scores={score: scores[score][:, c] for score in SCORES} | {COMMON: common[way]},
+            placed=maps[0][:, c],
+            off=maps[1][:, c],
             nees=nees["nees"][:, c],
             consistent=_means(nees["nees_expected"][:, c], nees["nees_variance"][:, c]),
         )
-        for (name, strategy), c in sorted(columns.items())
-    }
+    return found
 
 
 def _scores(
-    trials: "pl.DataFrame", worlds: Int[np.ndarray, " n"], number: dict[int, int]
+    trials: "pl.DataFrame", worlds: Int[np.ndarray, " n"], count: int
 ) -> dict[str, np.ndarray]:
     """Lay the trials out by world and case; one that is not there has failed."""
     import polars as pl
 
-    shape, at = (len(worlds), len(number)), _places(trials, worlds, number)
+    shape, at = (len(worlds), count), _places(trials, worlds)
     found: dict[str, np.ndarray] = {
         "failed": np.ones(shape, bool),
         "diverged": np.zeros(shape, bool),
@@ -170,24 +261,20 @@ def _scores(
     return found
 
 
-def _places(
-    table: "pl.DataFrame", worlds: Int[np.ndarray, " n"], number: dict[int, int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the row of the world and the column of the case of each row of a table."""
-    known = np.array(sorted(number))
-    columns = np.array([number[case] for case in known.tolist()])
-    case = np.searchsorted(known, table["case"].to_numpy())
-    return np.searchsorted(worlds, table["iteration"].to_numpy()), columns[case]
+def _places(table: "pl.DataFrame", worlds: Int[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the row of the world and the number of the case of each row of a table."""
+    case = table["case"].to_numpy().astype(np.intp)
+    return np.searchsorted(worlds, table["iteration"].to_numpy()), case
 
 
 def _over_time(
-    steps: "pl.DataFrame", column: str, worlds: Int[np.ndarray, " n"], number: dict[int, int]
-) -> Float[np.ndarray, "n c k"]:
+    steps: "pl.DataFrame", column: str, worlds: Int[np.ndarray, " n"], count: int
+) -> Float[np.ndarray, "n a k"]:
     """Lay out a column by world, case and frame."""
     last = max(steps["frame"].to_list(), default=0)
-    laid = np.full((len(worlds), len(number), last), np.nan)
+    laid = np.full((len(worlds), count, last), np.nan)
     frame = steps["frame"].to_numpy().astype(np.intp) - 1
-    laid[(*_places(steps, worlds, number), frame)] = steps[column].to_numpy()
+    laid[(*_places(steps, worlds), frame)] = steps[column].to_numpy()
     return laid
 
 
@@ -199,33 +286,27 @@ def _means(*columns: Float[np.ndarray, "n b k"]) -> Float[np.ndarray, "i b k"]:
 
 
 def _maps(
-    landmarks: "pl.DataFrame", worlds: Int[np.ndarray, " n"], number: dict[int, int]
-) -> tuple[Bool[np.ndarray, "n c l"], Float[np.ndarray, "n c l"]]:
+    landmarks: "pl.DataFrame", worlds: Int[np.ndarray, " n"], count: int
+) -> tuple[Bool[np.ndarray, "n a l"], Float[np.ndarray, "n a l"]]:
     """Lay out which landmarks are fully initialised, and how far off each is."""
     last = max(landmarks["landmark"].to_list(), default=0)
-    shape = (len(worlds), len(number), last + 1)
-    full, error = np.zeros(shape, dtype=bool), np.zeros(shape)
+    shape = (len(worlds), count, last + 1)
+    full, error = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=np.float32)
     label = landmarks["landmark"].to_numpy().astype(np.intp)
-    at = (*_places(landmarks, worlds, number), label)
+    at = (*_places(landmarks, worlds), label)
     full[at], error[at] = landmarks["full"].to_numpy(), landmarks["error_m"].to_numpy()
     return full, error
 
 
 def _common(
-    columns: dict[tuple[str, ...], np.ndarray],
-    full: Bool[np.ndarray, "n c l"],
-    error: Float[np.ndarray, "n c l"],
-) -> dict[tuple[str, ...], Float[np.ndarray, "n b"]]:
+    numbers: dict[Way, Int[np.ndarray, " c"]],
+    full: Bool[np.ndarray, "n a l"],
+    error: Float[np.ndarray, "n a l"],
+) -> dict[Way, Float[np.ndarray, "n c"]]:
     """Return the map RMSE over the landmarks that all strategies of a filter have placed."""
     found = {}
-    for name in {name for name, _ in columns}:
-        mine = {key: c for key, c in columns.items() if key[0] == name}
-        widest = max(len(c) for c in mine.values())
-        spread = {key: np.resize(c, widest) for key, c in mine.items()}
-        shared = np.all([full[:, c] for c in spread.values()], axis=0)
-        count = np.sum(shared, axis=2)
-        for key, c in spread.items():
-            square = np.sum(np.where(shared, error[:, c] ** 2, 0.0), axis=2)
-            mean = np.divide(square, count, out=np.full(count.shape, np.nan), where=count > 0)
-            found[key] = np.sqrt(mean)
+    for name in {name for name, _ in numbers}:
+        mine = {way: c for way, c in numbers.items() if way[0] == name}
+        shared = np.all([full[:, c] for c in mine.values()], axis=0)
+        found |= {way: rmse_of(error[:, c], shared) for way, c in mine.items()}
     return found

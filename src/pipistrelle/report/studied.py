@@ -1,4 +1,8 @@
-"""What a study found: worlds in rows, beamwidths in columns, a record per filter and strategy.
+"""What a study found: worlds in rows, combinations in columns, a record per filter and strategy.
+
+A combination is a value of each variable; they are numbered as a product is, the last variable
+fastest. In the paper's study, whose one variable is the beamwidth, their numbers are those of the
+beamwidths.
 
 And what of it counts: a `Selection` is a study under one exclusion rule, and everything that is
 claimed, charted or told is taken from one.
@@ -15,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.config import Config
 from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.evaluation.comparison import Finding
+from pipistrelle.report.variables import BEAM, Variable
 
 Rule = Literal["world", "case", "none"]
 RULES: dict[Rule, str] = {
@@ -26,9 +31,11 @@ RULES: dict[Rule, str] = {
 Way = tuple[str, str]
 """Filter and strategy."""
 Cell = tuple[str, str, int]
-"""Filter, strategy and number of the beamwidth (of no meaning for passive)."""
+"""Filter, strategy and number of the combination."""
 POSITION, HEADING = "position_rmse_m", "heading_rmse_rad"
 POSITION_ALIGNED, MAP_ALIGNED = "position_rmse_aligned_m", "map_rmse_aligned_m"
+MAP = "map_rmse_m"
+"""Of the landmarks that the case itself has placed."""
 POSITION_BOUND, HEADING_BOUND = "position_bound_m", "heading_bound_rad"
 """The least errors that the sound leaves to any estimator."""
 ONLINE_POSITION = "online_position_rmse_m"
@@ -38,6 +45,7 @@ SCORES = (
     ONLINE_POSITION,
     HEADING,
     POSITION_ALIGNED,
+    MAP,
     MAP_ALIGNED,
     POSITION_BOUND,
     HEADING_BOUND,
@@ -53,67 +61,107 @@ COMMON = "common_map_rmse_m"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trials:
-    """One filter's trials with one strategy, in n worlds at b beamwidths (passive: at one).
+    """One filter's trials with one strategy, in n worlds, b cases in each.
 
     Attributes
     ----------
+    at : (c)
+        Which case is that of each combination: passive has one for all beamwidths.
     failed : (n, b)
         The trial raised an error, or is not there.
     diverged : (n, b)
         Its NEES is not finite or passes the filter's limit.
     scores : dict of (n, b)
-        By the names of `SCORES` and `COMMON`; NaN where there is no number. `COMMON` has all
-        beamwidths for passive too, for the landmarks in common change with them.
+        By the names of `SCORES`; NaN where there is no number. `COMMON` is there too, one for each
+        combination, for the landmarks in common change with the other strategies'.
+    placed : (n, b, l)
+        Which landmarks, by their labels, are fully initialised at the end.
+    off : (n, b, l) [m]
+        How far from the truth those are; of the others without meaning.
     nees : (n, b, k)
         At each frame.
     consistent : (2, b, k)
         Mean and variance of a consistent filter's NEES at each frame, averaged over the worlds.
     """
 
+    at: Int[np.ndarray, " c"]
     failed: Bool[np.ndarray, "n b"]
     diverged: Bool[np.ndarray, "n b"]
     scores: dict[str, Float[np.ndarray, "n _"]]
+    placed: Bool[np.ndarray, "n b l"]
+    off: Float[np.ndarray, "n b l"]
     nees: Float[np.ndarray, "n b k"]
     consistent: Float[np.ndarray, "2 b k"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Failure:
+    """A trial that failed.
+
+    Attributes
+    ----------
+    iteration : int
+        Its world.
+    strategy, filter : str
+    beamwidth_deg : float or None
+        None for passive.
+    settings : dict of str
+        What it had of the variables, but for the beam, as words.
+    error : str
+        The traceback.
+    """
+
+    iteration: int
+    strategy: str
+    filter: str
+    beamwidth_deg: float | None
+    settings: dict[str, str]
+    error: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Study:
-    """One combination of a study's settings, as far as it is done.
+    """A study, as far as it is done: n worlds, c combinations of its variables.
 
     Attributes
     ----------
     name : str
         The plan's; not to be trusted.
-    settings : dict
-        The combination: dotted setting to value; empty where only the beamwidth varies.
+    variables : tuple of Variable
+        In the plan's order, those with two values or more; none where the study varies strategies
+        and filters alone.
     grid : dict
-        All dotted settings that the study varies, with their values.
+        All dotted settings that the study varies, with their values, as the plan has them.
     planned : int
         Worlds asked for.
     worlds : (n)
         Numbers of those done.
     config : Config
-        With the combination applied.
-    beamwidth : (b) [deg]
-        Rising.
+        What holds where the variables say nothing.
+    configs : tuple of Config, one per combination
+        Without any filter's own.
+    beamwidth : (c) [deg]
+        Of the vehicle's call.
+    drawing : (c)
+        Combinations with one number meet the same landmarks, world by world.
     trials : dict
         By filter and strategy.
-    errors : tuple of world, strategy, filter, beamwidth [deg] or None, text
-        Of the trials that failed.
+    errors : tuple of Failure
     cpu_s : [s]
         Of all filters.
     """
 
     name: str
-    settings: dict[str, Any]
+    variables: tuple[Variable, ...]
     grid: dict[str, tuple[Any, ...]]
     planned: int
     worlds: Int[np.ndarray, " n"]
     config: Config
-    beamwidth: Float[np.ndarray, " b"]
+    configs: tuple[Config, ...]
+    beamwidth: Float[np.ndarray, " c"]
+    drawing: Int[np.ndarray, " c"]
     trials: dict[Way, Trials]
-    errors: tuple[tuple[int, str, str, float | None, str], ...]
+    errors: tuple[Failure, ...]
     cpu_s: float
 
 
@@ -128,7 +176,7 @@ class Selection:
     lost : dict of (n)
         Per filter, the worlds in which any of its cases diverged or failed.
     gains : dict of tuple of Finding
-        Active minus fused at each beamwidth, judged as a family of its own, by filter and score:
+        Active minus fused at each combination, judged as a family of its own, by filter and score:
         `POSITION`, `POSITION_ALIGNED` and `COMMON`. Empty where the study lacks one of the two.
     """
 
@@ -136,6 +184,81 @@ class Selection:
     rule: Rule
     lost: Mapping[str, Bool[np.ndarray, " n"]]
     gains: Mapping[tuple[str, str], tuple[Finding, ...]]
+
+
+def along(study: Study, variable: Variable) -> Int[np.ndarray, "k m"]:
+    """Number the combinations by the values of a variable and by those of all the others.
+
+    Parameters
+    ----------
+    study : Study
+    variable : Variable
+        One of the study's.
+
+    Returns
+    -------
+    (k, m)
+        A row per value.
+    """
+    shape = [len(one.given) for one in study.variables]
+    numbers = np.arange(len(study.beamwidth)).reshape(shape)
+    return np.moveaxis(numbers, study.variables.index(variable), 0).reshape(len(variable.given), -1)
+
+
+def combination_name(study: Study, number: int, without: Sequence[Variable] = ()) -> str:
+    """Name a combination by the values of its variables.
+
+    Parameters
+    ----------
+    study : Study
+    number : int
+    without : sequence of Variable
+        Left out.
+
+    Returns
+    -------
+    str
+        Empty where nothing is left to name.
+    """
+    at = np.unravel_index(number, [len(one.given) for one in study.variables] or [1])
+    return ", ".join(
+        variable.words[i] if variable.name == BEAM else f"{variable.name} = {variable.words[i]}"
+        for variable, i in zip(study.variables, at, strict=False)
+        if variable not in without
+    )
+
+
+def case_name(study: Study, way: Way, number: int) -> str:
+    """Name a combination by those of its variables that a way's cases depend on.
+
+    Parameters
+    ----------
+    study : Study
+    way : Way
+    number : int
+
+    Returns
+    -------
+    str
+        Empty for passive sensing where only the beam varies.
+    """
+    at = study.trials[way].at
+    idle = [v for v in study.variables if np.all(at[along(study, v)] == at[along(study, v)][:1])]
+    return combination_name(study, number, idle)
+
+
+def own_cases(trials: Trials) -> Int[np.ndarray, " b"]:
+    """Return the number of the first combination of each case.
+
+    Parameters
+    ----------
+    trials : Trials
+
+    Returns
+    -------
+    (b)
+    """
+    return np.unique(trials.at, return_index=True)[1]
 
 
 def filter_titles(study: Study) -> dict[str, str]:
@@ -193,7 +316,7 @@ def kept(selection: Selection, cells: Sequence[Cell]) -> Bool[np.ndarray, " n"]:
     counts = np.ones(len(selection.study.worlds), dtype=bool)
     for name, strategy, column in cells:
         trials = selection.study.trials[name, strategy]
-        column = 0 if strategy == "passive" else column
+        column = trials.at[column]
         counts &= ~trials.failed[:, column]
         if selection.rule == "case":
             counts &= ~trials.diverged[:, column]
@@ -216,9 +339,9 @@ def values(study: Study, score: str, cell: Cell) -> Float[np.ndarray, " n"]:
     -------
     (n)
     """
-    name, strategy, column = cell
-    table = study.trials[name, strategy].scores[score]
-    return table[:, column if table.shape[1] > 1 else 0]
+    name, strategy, number = cell
+    trials = study.trials[name, strategy]
+    return trials.scores[score][:, number if score == COMMON else trials.at[number]]
 
 
 def samples(
@@ -239,6 +362,33 @@ def samples(
     columns = np.array([values(selection.study, score, cell) for cell in cells])
     both = kept(selection, cells) & np.all(np.isfinite(columns), axis=0)
     return list(columns[:, both])
+
+
+def rmse_of(
+    off: Float[np.ndarray, "*n l"], shared: Bool[np.ndarray, "*n l"]
+) -> Float[np.ndarray, "*n"]:
+    """Root mean square over some landmarks.
+
+    Parameters
+    ----------
+    off : (*n, l) [m]
+    shared : (*n, l)
+        Which count.
+
+    Returns
+    -------
+    (*n) [m]
+        NaN where none counts.
+
+    Examples
+    --------
+    >>> rmse_of(np.array([[3.0, 4.0, 9.0]]), np.array([[True, True, False]])).round(3)
+    array([3.536])
+    """
+    count = np.sum(shared, axis=-1)
+    square = np.sum(np.where(shared, np.asarray(off, dtype=np.float64) ** 2, 0.0), axis=-1)
+    mean = np.divide(square, count, out=np.full(count.shape, np.nan), where=count > 0)
+    return np.sqrt(mean)
 
 
 def mean_std(sample: Float[np.ndarray, " m"]) -> tuple[float, float]:

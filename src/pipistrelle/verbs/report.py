@@ -19,25 +19,27 @@ def report(
     ] = None,
     quiet: Annotated[bool, Parameter(negative=(), help="Print the page's path alone.")] = False,
 ) -> None:
-    """Judge the paper's claims by a study, and put it on one page with its figures."""
-    from pipistrelle.report.page.overview import failed_trials, not_the_papers, not_the_papers_line
+    """Answer a study's question on one page, with its figures; judge the paper's claims by it."""
+    from pipistrelle.report.page.overview import not_the_papers_line
     from pipistrelle.report.page.page import write_report
     from pipistrelle.report.reading import read_study
     from pipistrelle.verbs.streams import put, say
 
     target = folder / "report" if output is None else output
-    studies = read_study(folder)
-    claims = write_report(
-        studies, target, progress=lambda name: None if quiet else say(f"Drawing {name} ...")
+    study = read_study(folder)
+    told = write_report(
+        study, target, progress=lambda name: None if quiet else say(f"Drawing {name} ...")
     )
     if not quiet:
-        done, planned = len(studies[0].worlds), studies[0].planned
-        if done < planned:
-            put(f"partial: {done} of {planned} worlds")
-        if count := sum(map(failed_trials, studies)):
+        if told["partial"]:
+            put(f"partial: {told['worlds_done']} of {told['worlds_planned']} worlds")
+        if count := told["trials_failed"]:
             put(f"failed: {count} trial{'' if count == 1 else 's'}; see the page")
-        if line := not_the_papers_line(not_the_papers(studies[0])):
+        if not told["claims"]:
+            for sentence in told["answer"]:
+                put(sentence)
+        elif line := not_the_papers_line(told["not_the_papers"]):
             put(line)
-        for claim in claims:
-            put(f"{claim.number}  {claim.verdict.replace('-', ' '):<15} {claim.sentence}")
+        for claim in told["claims"]:
+            put(f"{claim['claim']}  {claim['verdict'].replace('-', ' '):<15} {claim['sentence']}")
     put(target / "index.html")

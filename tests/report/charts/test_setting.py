@@ -45,5 +45,5 @@ def test_the_map_is_the_world_that_the_study_heard(charts):
 def test_a_world_that_cannot_be_drawn_is_left_out():
     study = invent(2)
     setup = study.config.scenario.model_copy(update={"landmarks": 50_000})
-    crowded = replace(study, config=study.config.model_copy(update={"scenario": setup}))
+    crowded = replace(study, configs=(study.config.model_copy(update={"scenario": setup}),) * 12)
     assert [chart.name for chart in model_charts(crowded)] == ["piston"]

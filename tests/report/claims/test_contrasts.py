@@ -29,7 +29,8 @@ def study():
 
 def turning(study, **scenario):
     setup = study.config.scenario.model_copy(update=scenario)
-    return replace(study, config=study.config.model_copy(update={"scenario": setup}))
+    config = study.config.model_copy(update={"scenario": setup})
+    return replace(study, config=config, configs=(config,) * len(study.configs))
 
 
 def test_a_lap_takes_what_the_motion_model_takes_to_turn_once(study):

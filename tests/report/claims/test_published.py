@@ -1,16 +1,18 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pipistrelle.report.claims.published import (
-    BEAMWIDTHS,
     CROSSING,
     NARROW,
     TABLE_II,
-    beam_name,
     cell_of,
+    papers_cases,
     row_name,
 )
-from report.invented import BEAMWIDTH, invent, only
+from pipistrelle.report.variables import BEAMWIDTHS, beam_name, setting_variable
+from report.invented import BEAMWIDTH, invent, narrowed, only, with_third
 
 
 def test_the_beams_of_the_papers_radii_bear_the_papers_names():
@@ -40,3 +42,15 @@ def test_a_row_without_its_case_finds_none():
 def test_more_landmarks_are_seen_than_placed(row):
     assert row.total[0] > row.full[0]
     assert np.all(np.array([*row.full, *row.total]) > 0)
+
+
+def test_a_study_holds_the_papers_cases_with_all_of_them_and_no_other_variable():
+    study = invent(2)
+    assert papers_cases(study)
+    assert papers_cases(with_third(study, "toy:Slam")), "another filter beside them"
+    for way in study.trials:
+        assert not papers_cases(only(study, [other for other in study.trials if other != way]))
+    assert not papers_cases(narrowed(study, range(1, 12))), "eleven of its beams"
+    level = setting_variable("beacon.level_db", [36.8, 48.8])
+    assert not papers_cases(replace(study, variables=(*study.variables, level)))
+    assert not papers_cases(replace(study, variables=()))

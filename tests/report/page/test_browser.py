@@ -7,7 +7,9 @@ import pytest
 
 from pipistrelle.report.page import page as module
 from pipistrelle.report.page.page import write_report
+from pipistrelle.report.reading import read_study
 from report.invented import invent, only
+from report.planted import LEVELS, by_level, write_planted
 
 CHROMIUM = Path("/usr/bin/chromium")
 WIDTHS = {"phone": 390, "desk": 1280}
@@ -38,10 +40,29 @@ def written(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("page")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "_write_figure", lambda *_: None)
-        write_report((invent(8, planned=115),), folder)
+        write_report(invent(8, planned=115), folder)
     return folder / "index.html"
 
 
+CONTRAST = """() => {
+  const light = ([r, g, b]) => [r, g, b].map((v) => v / 255).map(
+    (v) => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4
+  ).reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
+  const numbers = (text) => text.match(/[\\d.]+/g).map(Number);
+  const ground = (element) => {
+    for (let e = element; e; e = e.parentElement) {
+      const [r, g, b, a] = numbers(getComputedStyle(e).backgroundColor);
+      if (a === undefined || a === 1) return [r, g, b];
+    }
+  };
+  const texts = "h1,h2,h3,.answer,.lede li,.verdict,.note,.tile,td,th,td small";
+  return [...document.querySelectorAll(texts)]
+    .filter((e) => e.getClientRects().length).map((e) => {
+      const [a, b] = [light(numbers(getComputedStyle(e).color)), light(ground(e))];
+      return [(Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05), e.className || e.tagName];
+    }).sort((one, other) => one[0] - other[0]);
+}"""
+"""Contrasts of what is written, the least first, and on what."""
 SCREENS = [
     pytest.param((screen, scheme), id=f"{screen}-{scheme}", marks=marks)
     for screen, scheme, marks in (
@@ -99,16 +120,96 @@ def test_every_figure_and_every_panel_is_visible(opened):
             assert box["height"] >= 150
 
 
-def test_a_panel_alone_is_about_half_as_wide_as_the_page(browser, tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def grid(tmp_path_factory) -> Path:
+    """The page of a study of two variables, one filter and two strategies."""
+    folder = tmp_path_factory.mktemp("grid")
+    plan = '"rays.weights" = ["instantaneous", "aggregated"]\n' + LEVELS
+    ways = 'filters = ["ekf"]\nstrategies = ["fused", "passive"]\n'
+    write_planted(folder / "s", plan, ways=ways, effect=by_level(0.3), worlds=8)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "_write_figure", lambda *_: None)
+        write_report(read_study(folder / "s"), folder / "r")
+    return folder / "r" / "index.html"
+
+
+def test_figures_of_a_filter_alone_fill_the_page_side_by_side(browser, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "_write_figure", lambda *_: None)
     ways = [("ekf", way) for way in ("active", "fused", "passive")]
-    write_report((only(invent(3), ways),), tmp_path)
+    write_report(only(invent(3), ways), tmp_path)
     page = browser.new_page(viewport={"width": 1280, "height": 900})
     page.goto((tmp_path / "index.html").as_uri())
-    whole = page.locator("figure#position_rmse").bounding_box()["width"]
+    whole = page.locator("main").bounding_box()["width"]
+    left, right = (
+        page.locator(f"figure#{name}").bounding_box()
+        for name in ("position_rmse", "position_rmse_aligned")
+    )
+    assert left["y"] == right["y"]
+    assert left["width"] + right["width"] > 0.95 * whole
     alone = page.locator("figure#position_rmse svg.panel:visible")
     assert alone.count() == 1
-    assert 0.4 * whole < alone.bounding_box()["width"] < 0.6 * whole
+    assert alone.bounding_box()["width"] > 0.9 * left["width"]
+    page.close()
+
+
+def test_the_last_of_an_odd_number_of_single_panels_stands_beside_its_words(
+    browser, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(module, "_write_figure", lambda *_: None)
+    write_report(only(invent(3), [("ekf", "active"), ("ekf", "fused")]), tmp_path)
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page.goto((tmp_path / "index.html").as_uri())
+    lone = page.locator("figure.lone")
+    assert [one.get_attribute("id") for one in lone.all()] == ["map_rmse_aligned"]
+    whole = page.locator("main").bounding_box()["width"]
+    panel = lone.locator("svg.panel:visible").bounding_box()
+    words = lone.locator("figcaption:visible").bounding_box()
+    assert lone.bounding_box()["width"] > 0.95 * whole
+    assert words["x"] > panel["x"] + panel["width"]
+    assert panel["y"] - 20 < words["y"] < panel["y"] + panel["height"]
+    page.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("screen", WIDTHS)
+def test_a_grids_answer_and_effects_are_on_the_first_screen_and_nothing_is_cut(
+    browser, grid, screen, scheme
+):
+    context = browser.new_context(
+        viewport={"width": WIDTHS[screen], "height": 900}, color_scheme=scheme
+    )
+    page, noise = context.new_page(), []
+    page.on("console", lambda message: noise.append(message.text))
+    page.on("pageerror", lambda error: noise.append(str(error)))
+    page.goto(grid.as_uri())
+    assert noise == []
+    inner = page.evaluate("document.documentElement.clientWidth")
+    assert page.evaluate("document.documentElement.scrollWidth") <= inner
+    answer = page.locator(".answer").bounding_box()
+    assert answer["y"] + answer["height"] < 450
+    assert page.locator(".lede li").first.bounding_box()["y"] < 900
+    if screen == "desk":
+        table = page.locator('section[data-variable="beacon.level_db"] table').first
+        assert table.bounding_box()["y"] < 900
+        shown = page.locator("#effects td.shown")
+        assert shown.count() >= 2
+        assert shown.first.evaluate("e => getComputedStyle(e).fontWeight") == "650"
+    assert page.evaluate(CONTRAST)[0][0] >= 4.5
+    context.close()
+
+
+def test_names_of_values_are_read_out_on_a_grids_panels(browser, grid):
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page.goto(grid.as_uri())
+    page.locator("figure#position_rmse_by_beacon_level_db .none svg.panel").first.focus()
+    page.keyboard.press("ArrowRight")
+    readout = page.locator("#readout")
+    readout.wait_for(state="visible")
+    assert readout.inner_text().splitlines()[0] == "beacon.level_db = 36.8"
+    assert "fused: " in readout.inner_text()
+    page.locator("figure#position_rmse_by_rays_weights .none svg.panel").first.focus()
+    page.keyboard.press("ArrowRight")
+    assert page.locator("#readout").inner_text().splitlines()[0] == "instantaneous"
     page.close()
 
 
@@ -189,26 +290,7 @@ def test_the_switch_shows_the_figures_under_another_rule(opened):
 def test_text_stands_out_from_its_ground(opened):
     """At least 4.5 to 1, as the accessibility guidelines ask for."""
     page, _ = opened
-    ratios = page.evaluate(
-        """() => {
-          const light = ([r, g, b]) => [r, g, b].map((v) => v / 255).map(
-            (v) => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4
-          ).reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
-          const numbers = (text) => text.match(/[\\d.]+/g).map(Number);
-          const ground = (element) => {
-            for (let e = element; e; e = e.parentElement) {
-              const [r, g, b, a] = numbers(getComputedStyle(e).backgroundColor);
-              if (a === undefined || a === 1) return [r, g, b];
-            }
-          };
-          const texts = "h1,h2,h3,.answer,.lede li,.verdict,.note,.tile,td,th";
-          return [...document.querySelectorAll(texts)]
-            .filter((e) => e.getClientRects().length).map((e) => {
-              const [a, b] = [light(numbers(getComputedStyle(e).color)), light(ground(e))];
-              return [(Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05), e.className || e.tagName];
-            });
-        }"""
-    )
+    ratios = page.evaluate(CONTRAST)
     assert len(ratios) > 50
     assert [(ratio, what) for ratio, what in ratios if ratio < 4.5] == []
 

@@ -3,6 +3,7 @@
 import math
 import re
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipistrelle.figures.chart import Axis, Panel, Series
-from pipistrelle.report.page.svg import legend, panel_svg, readings, three_digits
+from pipistrelle.report.numbers import three_digits
+from pipistrelle.report.page.svg import legend, panel_svg, readings
 
 
 def panel_of(*series, log=False, limits=(0.0, 10.0), ticks=(), **given):
@@ -95,6 +97,21 @@ def test_each_place_is_read_out_once_and_all_columns_fill_the_panel():
     starts = [float(tip.get("x")) for tip in tips]
     ends = [float(tip.get("x")) + float(tip.get("width")) for tip in tips]
     assert ends[:-1] == pytest.approx(starts[1:], abs=0.11)
+
+
+def test_places_with_names_are_read_out_by_them_and_points_beside_belong_to_the_nearest():
+    named = ((10.0, "level = 10"), (50.0, "level = 50"), (90.0, "level = 90"))
+    x = Axis(label="level [°]", limits=(0.0, 100.0), ticks=named[:1], named=named)
+    panel = panel_of(
+        line([1.0, 2.0, 3.0], x=[9.0, 49.0, 89.0], style="points"),
+        line([4.0, 5.0], x=[11.0, 91.0], style="points", name="passive"),
+    )
+    panel = replace(panel, x=x)
+    tips = [e for e in drawn(panel).iter("rect") if "tip" in e.get("class").split()]
+    assert [tip.find("title").text for tip in tips] == [
+        "level = 10\nfused: 1\npassive: 4", "level = 50\nfused: 2",
+        "level = 90\nfused: 3\npassive: 5",
+    ]  # fmt: skip
 
 
 def test_long_series_are_read_out_at_some_eighty_places():

@@ -7,11 +7,11 @@ from jaxtyping import Float
 
 from pipistrelle.acoustics.callers import VEHICLE, Caller, moves
 from pipistrelle.acoustics.emitter import HALF_POWER, piston_directivity, piston_radius
-from pipistrelle.config import InputError
+from pipistrelle.config import Config, InputError
 from pipistrelle.experiments.hearing.scenario import Scenario, world_of
 from pipistrelle.figures.chart import Axis, Chart, Panel, Series
-from pipistrelle.report.claims.published import beam_name
-from pipistrelle.report.studied import Study
+from pipistrelle.report.studied import Study, combination_name
+from pipistrelle.report.variables import width_name
 
 
 def model_charts(study: Study) -> list[Chart]:
@@ -48,9 +48,11 @@ def piston(study: Study) -> Chart:
     Bradley & Abaid, Eq. (1) and Appendix B.
     """
     series = _protractor()
-    last = max(len(study.beamwidth) - 1, 1)
-    for i in reversed(range(len(study.beamwidth))):
-        series += _beam(study, float(study.beamwidth[i]), 1.0 - 0.75 * i / last)
+    widths, first = np.unique(study.beamwidth, return_index=True)
+    last = max(len(widths) - 1, 1)
+    for i in reversed(range(len(widths))):
+        config = study.configs[first[i]]
+        series += _beam(config, float(widths[i]), 1.0 - 0.75 * i / last)
     panel = Panel(
         title="",
         x=Axis(label="", limits=(-1.15, 1.15), ticks=()),
@@ -84,7 +86,7 @@ def example_map(study: Study) -> Chart:
     -----
     Bradley & Abaid, Sec. IV.
     """
-    config, number = study.config, int(study.worlds[0])
+    config, number = study.configs[0], int(study.worlds[0])
     world = world_of(config, number)
     setup = config.scenario
     reach = 1.04 * max(setup.radius, setup.beacon_distance, float(np.abs(world.path[:, :2]).max()))
@@ -94,20 +96,25 @@ def example_map(study: Study) -> Chart:
     return Chart(
         name="example_map",
         title="A world of the study",
-        caption=f"World {number}: {len(world.landmarks)} landmarks{others} and the vehicle's "
-        f"true path of {world.time[-1]:g} s; the dashed circle has a radius of {setup.radius:g} m",
+        caption=f"World {number}{_where(study)}: {len(world.landmarks)} landmarks{others} and the "
+        f"vehicle's true path of {world.time[-1]:g} s; the dashed circle has a radius of "
+        f"{setup.radius:g} m",
         panels=(panel,),
         columns=("x_m", "y_m"),
     )
 
 
-def _beam(study: Study, width: float, strength: float) -> list[Series]:
+def _where(study: Study) -> str:
+    """Say which of the study's worlds is drawn, where the combinations meet others."""
+    return f" where {combination_name(study, 0)}" if study.drawing.any() else ""
+
+
+def _beam(config: Config, width: float, strength: float) -> list[Series]:
     """Return a beam's outline and, where it has half its power, a dot that tells its numbers."""
-    config = study.config
     tone = {"frequency": config.emitter.frequency, "speed_of_sound": config.air.celerity}
     half = np.radians(np.array([width])) / 2.0
     radius = float(piston_radius(np.radians(width), **tone))
-    name, angle = beam_name(width), np.radians(np.linspace(-90.0, 90.0, 361))
+    name, angle = width_name(width), np.radians(np.linspace(-90.0, 90.0, 361))
     pressure, edge = (piston_directivity(at, radius=radius, **tone) for at in (angle, half))
     ka = HALF_POWER / float(np.sin(half[0]))
     told = f"{name}\nradius: {1e3 * radius:.1f} mm\nka: {ka:.1f}"

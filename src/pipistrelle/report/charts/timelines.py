@@ -1,15 +1,25 @@
 """ANEES over time as charts, one per filter."""
 
-import re
+import math
 
 import numpy as np
 
 from pipistrelle.config import STRATEGIES
 from pipistrelle.evaluation.consistency import anees, anees_bounds_about
 from pipistrelle.figures.chart import Chart, Panel, Series, ends, linear_axis, log_axis
+from pipistrelle.report.charts.axes import slug
 from pipistrelle.report.claims.contrasts import frame_time, lap_time
-from pipistrelle.report.claims.published import beam_name
-from pipistrelle.report.studied import Selection, Study, Way, filter_titles, kept
+from pipistrelle.report.numbers import listed
+from pipistrelle.report.studied import (
+    Selection,
+    Study,
+    Way,
+    case_name,
+    filter_titles,
+    kept,
+    own_cases,
+)
+from pipistrelle.report.variables import BEAM
 
 
 def anees_charts(selection: Selection) -> list[Chart]:
@@ -34,23 +44,21 @@ def anees_charts(selection: Selection) -> list[Chart]:
 def _anees_chart(selection: Selection, name: str, title: str) -> Chart:
     """Chart one filter's ANEES over time."""
     study = selection.study
-    ways = [way for way in STRATEGIES if (name, way) in study.trials]
-    lines = {way: _anees_lines(selection, (name, way)) for way in ways}
+    ways = [(name, strategy) for strategy in STRATEGIES if (name, strategy) in study.trials]
+    lines = {way: _anees_lines(selection, way) for way in ways}
     lines = {way: series for way, series in lines.items() if series}
-    runs = min(
-        (int(np.sum(kept(selection, [(name, way, i)])))
-         for way, series in lines.items() for i in range(len(series))), default=0,
-    )  # fmt: skip
-    if runs:
+    runs = min((_runs(selection, way) for way in lines), default=0)
+    alike = _drives_alike(study)
+    if runs and alike:
         for way, mine in lines.items():
-            mine.insert(0, _ideal(study, (name, way), runs))
+            mine.insert(0, _ideal(study, way, runs))
     vertical = log_axis("ANEES", ends(s for mine in lines.values() for s in mine) or [1.0, 9.0])
-    lap = lap_time(study)
+    lap = lap_time(study) if alike else math.inf
     panels = [
         Panel(
-            title=way,
-            role=way,
-            x=linear_axis("time [s]", [series[0].x[-1] / 1.05], floor=0.0),
+            title=way[1],
+            role=way[1],
+            x=linear_axis("time [s]", [max(s.x[-1] for s in series) / 1.05], floor=0.0),
             y=vertical,
             series=tuple(series),
             posts=tuple(lap * k for k in range(1, int(series[0].x[-1] / lap) + 1)),
@@ -58,19 +66,54 @@ def _anees_chart(selection: Selection, name: str, title: str) -> Chart:
         for way, series in lines.items()
     ]
     return Chart(
-        name="anees_" + re.sub(r"\W+", "_", name),
+        name=f"anees_{slug(name)}",
         title=f"Consistency of {title}: average NEES over time",
-        caption="The stronger a line, the narrower the beam; grey: where a consistent filter's "
-        f"ANEES over {runs} world{'' if runs == 1 else 's'} lies with 95 %, after a start that is "
-        "exact and thought uncertain, at one beamwidth or another; dotted: the vehicle is back at "
-        "its start",
+        caption=_caption(study, runs, alike=alike),
         panels=tuple(panels),
         columns=("time_s", "anees"),
     )
 
 
+def _caption(study: Study, runs: int, *, alike: bool) -> str:
+    """Say what the lines are, and what is grey and dotted."""
+    said = []
+    if [variable.name for variable in study.variables] == [BEAM]:
+        said.append("The stronger a line, the narrower the beam")
+    elif study.variables:
+        which = "the lower" if study.variables[0].numbers else "the earlier listed"
+        of = listed([variable.name for variable in study.variables])
+        said.append(f"A line for each combination of {of}; the stronger, {which}")
+    if alike:
+        one = ", at one beamwidth or another" if BEAM in {v.name for v in study.variables} else ""
+        said.append(
+            "grey: where a consistent filter's ANEES over "
+            f"{runs} world{'' if runs == 1 else 's'} lies with 95 %, after a start that is exact "
+            f"and thought uncertain{one}"
+        )
+        said.append("dotted: the vehicle is back at its start")
+    words = "; ".join(said)
+    return words[:1].upper() + words[1:]
+
+
+def _runs(selection: Selection, way: Way) -> int:
+    """Count the worlds of the case that has the fewest, of those that have any."""
+    cases = own_cases(selection.study.trials[way])
+    counts = [int(np.sum(kept(selection, [(*way, int(i))]))) for i in cases]
+    return min((count for count in counts if count), default=0)
+
+
+def _drives_alike(study: Study) -> bool:
+    """Tell whether all combinations drive the same laps at the same times."""
+    frames = next(iter(study.trials.values())).nees.shape[2]
+    drives = {
+        (lap_time(study, i), *frame_time(study, frames, i)[-1:].tolist(), config.scenario.steps)
+        for i, config in enumerate(study.configs)
+    }
+    return len(drives) == 1
+
+
 def _ideal(study: Study, way: Way, runs: int) -> Series:
-    """Return a consistent filter's ANEES over so many worlds: its mean, and all beams' bounds."""
+    """Return a consistent filter's ANEES over so many worlds: its mean, and all cases' bounds."""
     expected, variance = study.trials[way].consistent
     low, high = anees_bounds_about(expected, variance, runs)
     return Series(
@@ -88,19 +131,18 @@ def _anees_lines(selection: Selection, way: Way) -> list[Series]:
     """Return ANEES over time, the widest beam first and faintest."""
     study = selection.study
     nees = study.trials[way].nees
-    time = frame_time(study, nees.shape[2])
+    cases = own_cases(study.trials[way]).tolist() if nees.shape[2] else []
     found = []
-    for i in reversed(range(nees.shape[1] if len(time) else 0)):
+    for column, i in reversed(list(enumerate(cases))):
         counts = kept(selection, [(*way, i)])
-        single = way[1] == "passive"
         if counts.any():
             found.append(
                 Series(
-                    name="passive" if single else beam_name(study.beamwidth[i]),
+                    name=case_name(study, way, i) or way[1],
                     role=way[1],
-                    x=time,
-                    y=anees(nees[counts, i]),
-                    strength=1.0 if single else 1.0 - 0.75 * i / max(nees.shape[1] - 1, 1),
+                    x=frame_time(study, nees.shape[2], i),
+                    y=anees(nees[counts, column]),
+                    strength=1.0 - 0.75 * column / max(len(cases) - 1, 1),
                 )
             )
     return found

@@ -1,21 +1,19 @@
-"""The answer in plain words: what listening to the beacon does to the map, and how surely."""
+"""The answer to the paper's question: what listening to the beacon does to the map, how surely."""
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pipistrelle.config import STRATEGIES
 from pipistrelle.evaluation.comparison import Finding
 from pipistrelle.experiments.hearing.scenario import landmark_count
-from pipistrelle.report.claims.published import beam_name
 from pipistrelle.report.claims.verdicts import WITHOUT, JudgedClaim
+from pipistrelle.report.effects.levels import diverged, times_the_bound
+from pipistrelle.report.numbers import number_word
 from pipistrelle.report.studied import (
     COMMON,
-    ONLINE_POSITION,
     POSITION,
     POSITION_ALIGNED,
     POSITION_BOUND,
-    Cell,
     Rule,
     Selection,
     Study,
@@ -23,11 +21,7 @@ from pipistrelle.report.studied import (
     mean_std,
     samples,
 )
-
-NUMBERS = (
-    "none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten",
-    "eleven", "twelve",
-)  # fmt: skip
+from pipistrelle.report.variables import width_name
 
 
 def answer(selections: Mapping[Rule, Selection], claims: Sequence[JudgedClaim]) -> list[str]:
@@ -59,7 +53,7 @@ def answer(selections: Mapping[Rule, Selection], claims: Sequence[JudgedClaim]) 
         _compared("After alignment its path is", papers, everything, POSITION_ALIGNED),
         _allowed(everything),
         *_reached(everything),
-        _diverged(papers.study),
+        diverged(papers.study),
         _verdicts(claims),
     )
     headline = by_rule["world"]
@@ -69,26 +63,6 @@ def answer(selections: Mapping[Rule, Selection], claims: Sequence[JudgedClaim]) 
         if fuller:
             headline = "A fuller map, yes; a more accurate one depends on which worlds are counted."
     return [headline, *(sentence for sentence in sentences if sentence)]
-
-
-def number_word(count: int) -> str:
-    """Write a count as a word, where it has one that is short.
-
-    Parameters
-    ----------
-    count : int
-        Not negative.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> number_word(0), number_word(8), number_word(30)
-    ('none', 'eight', '30')
-    """
-    return NUMBERS[count] if count < len(NUMBERS) else str(count)
 
 
 def _headline(selection: Selection) -> str:
@@ -151,21 +125,6 @@ def _otherwise(by_rule: dict[Rule, str]) -> list[str]:
     return [line[0].upper() + line[1:] for line in said]
 
 
-def _diverged(study: Study) -> str:
-    """Say which strategies diverged how often."""
-    said = []
-    for name, title in filter_titles(study).items():
-        shares = {
-            way[1]: float(np.mean(trials.diverged))
-            for way, trials in study.trials.items()
-            if way[0] == name and trials.diverged.any()
-        }
-        if shares:
-            parts = ", ".join(f"{way} in {100.0 * share:.1f} %" for way, share in shares.items())
-            said.append(f"with {title} {parts}")
-    return f"The filter diverged, of the trials, {'; '.join(said)}." if said else ""
-
-
 def _counted(selection: Selection, everything: Selection) -> str:
     """Say how many landmarks fused and active place, at the narrowest and at the widest beam."""
     study = selection.study
@@ -188,7 +147,7 @@ def _placed(selection: Selection, name: str) -> str:
         cells = [(name, "fused", i), (name, "active", i)]
         fused, active = samples(selection, "landmarks_full", cells)
         if len(fused):
-            beam = beam_name(study.beamwidth[i])
+            beam = width_name(study.beamwidth[i])
             said.append(f"{np.mean(fused):.0f} instead of {np.mean(active):.0f} at {beam}")
     return " and ".join(said)
 
@@ -255,7 +214,7 @@ def _allowed(everything: Selection) -> str:
             alone, both = (mean_std(one)[0] for one in samples(everything, POSITION_BOUND, cells))
             if not both > 0.0:
                 return ""
-            beam = beam_name(study.beamwidth[i])
+            beam = width_name(study.beamwidth[i])
             said.append(f"{alone:.3f} m to {both:.3f} m at {beam} ({alone / both - 1.0:.0%})")
         return (
             "Whatever the estimator, listening may lower the least error that the sound leaves "
@@ -266,30 +225,16 @@ def _allowed(everything: Selection) -> str:
 
 def _reached(everything: Selection) -> list[str]:
     """Say of each filter how near it comes to the least error that the sound leaves."""
-    study, sentences = everything.study, []
-    for name, title in filter_titles(study).items():
-        ways = [way for way in study.trials if way[0] == name]
-        online = any(np.isfinite(study.trials[way].scores[ONLINE_POSITION]).any() for way in ways)
-        score, said = ONLINE_POSITION if online else POSITION, []
-        for _, strategy in sorted(ways, key=lambda way: STRATEGIES.index(way[1])):
-            beams = 1 if strategy == "passive" else len(study.beamwidth)
-            times = [_over_bound(everything, score, (name, strategy, i)) for i in range(beams)]
-            if np.isfinite(times).all():
-                low, high = f"{min(times):.2f}", f"{max(times):.2f}"
-                said.append(f"{strategy} {low}" + (f" to {high}" if high != low else ""))
-        if said:
+    sentences = []
+    for name, title in filter_titles(everything.study).items():
+        times, online = times_the_bound(everything, name)
+        if times:
             beside = ", of the path as it was believed at each time" if online else ""
             sentences.append(
                 f"{title[0].upper()}{title[1:]} has of that least error, with everything counted"
-                f"{beside}, by strategy and over the beamwidths, {', '.join(said)} times."
+                f"{beside}, by strategy and over the beamwidths, {times} times."
             )
     return sentences
-
-
-def _over_bound(everything: Selection, score: str, cell: Cell) -> float:
-    """Return the mean error of position over the mean bound."""
-    errors, least = (samples(everything, name, [cell])[0] for name in (score, POSITION_BOUND))
-    return float(np.mean(errors) / np.mean(least)) if len(errors) and len(least) else np.nan
 
 
 def _verdicts(claims: Sequence[JudgedClaim]) -> str:

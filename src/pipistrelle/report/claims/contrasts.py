@@ -19,7 +19,6 @@ from pipistrelle.evaluation.comparison import (
     pooled_std,
     pseudovalues,
 )
-from pipistrelle.report.claims.published import beam_name
 from pipistrelle.report.studied import (
     COMMON,
     POSITION,
@@ -29,9 +28,11 @@ from pipistrelle.report.studied import (
     Selection,
     Study,
     Way,
+    case_name,
     filter_titles,
     kept,
     lost_worlds,
+    own_cases,
     samples,
 )
 
@@ -87,14 +88,14 @@ def differences(
     sigma: bool = False,
     fitted: Callable[[float], bool] = lambda width: False,
 ) -> list[Statement]:
-    """State something of one way's score minus another's, at each beamwidth.
+    """State something of one way's score minus another's, at each combination.
 
     Parameters
     ----------
     selection : Selection
     score : one of `studied.SCORES`, or `studied.COMMON`
     first, second : filter and strategy
-        Both passive: there is one beamwidth, that of none.
+        Both passive: the beamwidth makes no further combinations.
     name : str
         Of the pair, for the reader.
     relation : str
@@ -114,16 +115,19 @@ def differences(
     study = selection.study
     if not {first, second} <= study.trials.keys():
         return []
-    blind = first[1] == second[1] == "passive"
+    numbers = sorted({*own_cases(study.trials[first]), *own_cases(study.trials[second])})
+    named = max((first, second), key=lambda way: len(own_cases(study.trials[way])))
     statements = []
-    for i, width in enumerate(study.beamwidth[:1] if blind else study.beamwidth):
+    for i in map(int, numbers):
+        width = float(study.beamwidth[i])
         if not above <= width < below:
             continue
         pair = samples(selection, score, [(*first, i), (*second, i)])
         spread = pooled_std(*pair) if len(pair[0]) > 1 else math.nan
+        at = case_name(study, named, i)
         statements.append(
             Statement(
-                label=name if blind else f"{name}, {beam_name(width)}",
+                label=f"{name}, {at}" if at else name,
                 sample=pair[0] - pair[1],
                 relation=relation,
                 margin=spread if sigma and len(pair[0]) > 1 else 0.0,
@@ -278,23 +282,25 @@ def lap_fit(study: Study) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " 
     return rise, swing
 
 
-def frame_time(study: Study, frames: int) -> Float[np.ndarray, " k"]:
+def frame_time(study: Study, frames: int, number: int = 0) -> Float[np.ndarray, " k"]:
     """Times of the frames.
 
     Parameters
     ----------
     study : Study
     frames : int
+    number : int
+        Of the combination.
 
     Returns
     -------
     (k) [s]
     """
-    scenario = study.config.scenario
+    scenario = study.configs[number].scenario
     return np.arange(1, frames + 1) * (scenario.steps_per_frame * scenario.step)
 
 
-def lap_time(study: Study) -> float:
+def lap_time(study: Study, number: int = 0) -> float:
     r"""Time of one round of the drive without noise.
 
     .. math:: 2 \pi B / (V |\sin\gamma|)
@@ -302,6 +308,8 @@ def lap_time(study: Study) -> float:
     Parameters
     ----------
     study : Study
+    number : int
+        Of the combination.
 
     Returns
     -------
@@ -312,7 +320,7 @@ def lap_time(study: Study) -> float:
     -----
     Bradley & Abaid, Eq. (5).
     """
-    config = study.config
+    config = study.configs[number]
     rate = config.scenario.speed * abs(math.sin(config.scenario.steering)) / config.motion.wheelbase
     return 2.0 * math.pi / rate if rate > 0.0 else math.inf
 

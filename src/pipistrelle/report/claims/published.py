@@ -4,8 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipistrelle.config import STRATEGIES
 from pipistrelle.estimation.catalogue import PAPERS, entry
 from pipistrelle.report.studied import Cell, Study
+from pipistrelle.report.variables import BEAM, BEAMWIDTHS, beam_name
 
 FILTERS = {name: entry(name).title for name in PAPERS}
 """The paper's two filters: of these its claims speak, whatever others a study has."""
@@ -41,8 +43,6 @@ TABLE_II = (
     Printed(filter="fastslam", beamwidth=0.0, full=(22.1, 4.9), total=(39.4, 3.3)),
 )
 """Bradley & Abaid, Table II."""
-BEAMWIDTHS = (11.4, 14.2, 17.6, 21.8, 26.8, 33.2, 41.6, 51.4, 64.8, 83.0, 108.6, 180.0)
-"""Bradley & Abaid, Appendix B [deg]."""
 FITTED = {
     ("ekf", "total", 180.0),
     ("fastslam", "total", 180.0),
@@ -56,10 +56,31 @@ EKF-SLAM places. Active sensing at 180 degrees was held under the paper's passiv
 EXCLUDED = {"ekf": 8, "fastslam": 15}
 """Worlds that the paper dropped, of `WORLDS` (Bradley & Abaid, Sec. V-A)."""
 WORLDS = 115
+NEAR = 0.25
+"""Beamwidths nearer than this are one [deg]: the paper rounds its radii to a tenth of a mm."""
 CROSSING = 41.0
 """Below the case that the paper rounds to 42 degrees, where it sees fused overtake active [deg]."""
 NARROW = 64.0
 """Below the case that the paper rounds to 65 degrees, where its gap passes one sigma [deg]."""
+
+
+def papers_cases(study: Study) -> bool:
+    """Tell whether a study holds the cases of which the paper speaks.
+
+    Parameters
+    ----------
+    study : Study
+
+    Returns
+    -------
+    bool
+        Both its filters with all three strategies, at its twelve beamwidths, and no other variable;
+        further filters and beamwidths may stand beside them.
+    """
+    ways = {(name, strategy) for name in FILTERS for strategy in STRATEGIES}
+    beams = [variable.name for variable in study.variables] == [BEAM]
+    near = [np.any(np.abs(study.beamwidth - width) < NEAR) for width in BEAMWIDTHS]
+    return beams and ways <= study.trials.keys() and all(near)
 
 
 def cell_of(study: Study, printed: Printed) -> Cell | None:
@@ -80,28 +101,8 @@ def cell_of(study: Study, printed: Printed) -> Cell | None:
         return None
     if strategy == "passive":
         return printed.filter, strategy, 0
-    near = np.flatnonzero(np.abs(study.beamwidth - printed.beamwidth) < 0.25)
+    near = np.flatnonzero(np.abs(study.beamwidth - printed.beamwidth) < NEAR)
     return (printed.filter, strategy, int(near[0])) if len(near) else None
-
-
-def beam_name(beamwidth: float) -> str:
-    """Name a beamwidth: as the paper does where it is one of the paper's, within 0.2 degrees.
-
-    Parameters
-    ----------
-    beamwidth : [deg]
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> beam_name(11.575), beam_name(12.5)
-    ('11°', '12°')
-    """
-    near = min(BEAMWIDTHS, key=lambda printed: abs(printed - beamwidth))
-    return f"{near if abs(near - beamwidth) < 0.2 else beamwidth:.0f}°"
 
 
 def row_name(printed: Printed) -> str:

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 from pipistrelle.evaluation.comparison import Finding, judge
 from pipistrelle.report.claims.statements import CLAIMS, Claim, Part
+from pipistrelle.report.effects.comparing import plain
 from pipistrelle.report.studied import Rule, Selection
 
 Verdict = Literal["reproduced", "not-reproduced", "open"]
@@ -330,22 +331,13 @@ def _statistic(judgement: Judgement) -> dict[str, Any]:
 
 
 def _plain(finding: Finding) -> dict[str, Any]:
-    """Lay a finding out as JSON can hold it."""
-
-    def finite(value: float) -> float | None:
-        return value if math.isfinite(value) else None
-
+    """Lay a finding out as JSON can hold it, with what was claimed."""
     return {
         "label": finding.label,
         "relation": finding.relation,
-        "margin": finite(finding.margin),
-        "sigma": finite(finding.sigma),
+        "margin": finding.margin if math.isfinite(finding.margin) else None,
+        "sigma": finding.sigma if math.isfinite(finding.sigma) else None,
         "fitted": finding.fitted,
-        "n": finding.n,
-        "mean": finite(finding.mean),
-        "std": finite(finding.std),
-        "alone": [finite(bound) for bound in finding.alone],
-        "interval": [finite(bound) for bound in finding.interval],
-        "p": finite(finding.p),
+        **plain(finding),
         "holds": finding.holds,
     }

@@ -15,19 +15,21 @@ from pipistrelle.report.claims.published import (
     EXCLUDED,
     TABLE_II,
     WORLDS,
-    beam_name,
     cell_of,
     row_name,
 )
 from pipistrelle.report.studied import (
     Selection,
     Study,
+    case_name,
     filter_titles,
     kept,
     lost_worlds,
     mean_std,
+    own_cases,
     samples,
 )
+from pipistrelle.report.variables import setting_variable, width_name
 from pipistrelle.settings import known_settings
 
 
@@ -175,8 +177,8 @@ def consistency_rows(selection: Selection) -> list[dict[str, Any]]:
     Returns
     -------
     list of dict
-        Per case: worlds, time mean of ANEES and of a consistent filter's, the means of its 95 %
-        bounds, shares of time inside and above them, and its `anees_departure`.
+        Per case: where it is, worlds, time mean of ANEES and of a consistent filter's, the means of
+        its 95 % bounds, shares of time inside and above them, and its `anees_departure`.
 
     Notes
     -----
@@ -184,19 +186,24 @@ def consistency_rows(selection: Selection) -> list[dict[str, Any]]:
     """
     rows, study = [], selection.study
     for (name, strategy), trials in study.trials.items():
-        for i in range(trials.nees.shape[1]):
-            counts = kept(selection, [(name, strategy, i)])
-            counts &= np.all(np.isfinite(trials.nees[:, i]), axis=1)
-            if not counts.any() or not trials.nees.shape[2]:
+        for i, number in enumerate(own_cases(trials).tolist()):
+            counts = kept(selection, [(name, strategy, number)])
+            frames = np.isfinite(trials.consistent[0, i])
+            nees = trials.nees[:, i, frames]
+            counts &= np.all(np.isfinite(nees), axis=1)
+            if not counts.any() or not nees.shape[1]:
                 continue
-            mean = anees(trials.nees[counts, i])
-            expected, variance = trials.consistent[:, i]
+            mean = anees(nees[counts])
+            expected, variance = trials.consistent[:, i, frames]
             low, high = anees_bounds_about(expected, variance, int(counts.sum()))
             rows.append(
                 {
                     "filter": name,
                     "strategy": strategy,
-                    "beamwidth": None if strategy == "passive" else beam_name(study.beamwidth[i]),
+                    "beamwidth": None
+                    if strategy == "passive"
+                    else width_name(float(study.beamwidth[number])),
+                    "at": case_name(study, (name, strategy), number),
                     "n": int(counts.sum()),
                     "anees": float(np.mean(mean)),
                     "expected": float(np.mean(expected)),
@@ -210,7 +217,7 @@ def consistency_rows(selection: Selection) -> list[dict[str, Any]]:
 
 
 def by_strategy(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Average `consistency_rows` over the beamwidths.
+    """Average `consistency_rows` over the combinations.
 
     Parameters
     ----------
@@ -232,7 +239,7 @@ def by_strategy(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _asked(config: Config, grid: Mapping[str, Sequence[Any]]) -> dict[str, Any]:
-    """Return every setting but the seed by its dotted name; of the radius, all its values."""
+    """Return every setting but the seed by its dotted name; of what varies, all its values."""
     found: dict[str, Any] = {}
     table = config.model_dump(mode="json")
     for key in known_settings():
@@ -242,7 +249,8 @@ def _asked(config: Config, grid: Mapping[str, Sequence[Any]]) -> dict[str, Any]:
         found[".".join(key)] = value
     found["air.speed_of_sound"] = config.air.celerity
     del found["seed"]
-    return found | {RADIUS: sorted(grid.get(RADIUS, [found[RADIUS]]))}
+    varied = {name: setting_variable(name, values).given for name, values in grid.items()}
+    return found | {RADIUS: [found[RADIUS]]} | {name: [*given] for name, given in varied.items()}
 
 
 def _worded(value: Any) -> str:

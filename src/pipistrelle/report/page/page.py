@@ -5,84 +5,72 @@ through the template's escaping. The same folder gives the same bytes.
 """
 
 import json
-import math
-import platform
 from collections.abc import Callable, Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
 
-from pipistrelle import __version__
 from pipistrelle.evaluation.comparison import Finding
 from pipistrelle.figures.chart import Chart, Panel, columns_of, csv_rows, csv_text
 from pipistrelle.figures.style import page_colours
 from pipistrelle.files import REPORT, OwnFiles
-from pipistrelle.report.charts.results import CHARTS, study_charts
+from pipistrelle.report.charts.results import Figure, answers, study_charts
 from pipistrelle.report.charts.setting import model_charts
-from pipistrelle.report.claims.answer import answer, number_word
-from pipistrelle.report.claims.contrasts import selections
 from pipistrelle.report.claims.published import FILTERS
-from pipistrelle.report.claims.statements import CLAIMS, Claim
-from pipistrelle.report.claims.verdicts import (
-    WITHOUT,
-    JudgedClaim,
-    judge_claims,
-    record,
-    tally,
-    with_everything,
-)
+from pipistrelle.report.claims.statements import Claim
+from pipistrelle.report.claims.verdicts import WITHOUT, tally, with_everything
+from pipistrelle.report.effects.measures import MEASURES
+from pipistrelle.report.numbers import UNITS, number_word, three_digits
 from pipistrelle.report.page import overview
-from pipistrelle.report.page.svg import legend, panel_svg, readings, three_digits
-from pipistrelle.report.studied import RULES, Rule, Selection, Study, filter_titles
+from pipistrelle.report.page.effect_tables import effect_tables
+from pipistrelle.report.page.summary import Answered, answered, summary
+from pipistrelle.report.page.svg import legend, panel_svg, readings
+from pipistrelle.report.studied import RULES, Rule, Study, filter_titles
 from pipistrelle.settings import to_toml
 
-FORMAT = 1
-UNITS = {"rad": (180.0 / math.pi, "°"), "m": (1.0, "m"), "landmarks": (1.0, ""), "": (1.0, "")}
-"""How a number is shown: its factor and its sign."""
 SPOKEN = {"reproduced": "Reproduced", "not-reproduced": "Not reproduced", "open": "Open"}
-LIBRARIES = ("numpy", "scipy", "numba", "polars", "pydantic", "matplotlib", "jinja2")
 
 
 def write_report(
-    studies: tuple[Study, ...],
+    study: Study,
     folder: Path,
     *,
-    claims: Sequence[Claim] = CLAIMS,
-    charts: Sequence[Callable[[Selection], list[Chart]]] = CHARTS,
+    claims: Sequence[Claim] | None = None,
+    charts: Sequence[Figure] | None = None,
     progress: Callable[[str], None] = lambda _: None,
-) -> tuple[JudgedClaim, ...]:
-    """Judge a study and write its page, its figures and its summary.
+) -> dict[str, Any]:
+    """Answer a study's question and write its page, its figures and its summary.
 
     Parameters
     ----------
-    studies : tuple of Study
-        As `reading.read_study` gives them; the first is shown, of further ones the verdicts.
+    study : Study
+        As `reading.read_study` gives it.
     folder : Path
         Made where it is missing; ``index.html``, ``summary.json`` and ``figures``.
-    claims : sequence of Claim
-    charts : sequence of functions of a Selection
-        Each gives the charts of a figure; they have names of their own.
+    claims : sequence of Claim, optional
+        To be judged; if not said, the paper's where the study holds its cases, else none.
+    charts : sequence of functions of a Selection, optional
+        Each gives the charts of a figure; they have names of their own. If not said, as
+        `charts.results.study_charts` has it.
     progress : callable, optional
         Given the name of each figure before it is drawn.
 
     Returns
     -------
-    tuple of JudgedClaim
-        Of the first study.
+    dict
+        As ``summary.json`` holds it.
 
     Raises
     ------
     InputError
         Where a file cannot be written, or one that would be replaced is not as we wrote it.
     """
-    selected = [selections(study) for study in studies]
-    judged = [judge_claims(by_rule, claims) for by_rule in selected]
-    found = {rule: study_charts(selection, charts) for rule, selection in selected[0].items()}
-    models = model_charts(studies[0])
-    drawn, texts = [*_distinct(found), *models], _csv_texts(selected[0], found, models)
+    told = answered(study, claims)
+    found = {rule: study_charts(one, charts) for rule, one in told.selections.items()}
+    models = model_charts(study)
+    drawn, texts = [*_distinct(found), *models], _csv_texts(told, found, models)
     own = OwnFiles(folder, REPORT)
     own.clear(["index.html", "summary.json", *_names(drawn, texts)])
     with own.room("figures") as room:
@@ -91,10 +79,10 @@ def write_report(
             _write_figure(chart, room)
     for name, text in texts.items():
         own.write(f"figures/{name}.csv", text)
-    summary = _summary(studies, selected[0], judged)
-    own.write("index.html", page(studies[0], judged[0], found, models, summary))
-    own.write("summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    return judged[0]
+    numbers = summary(told)
+    own.write("index.html", page(told, found, models, numbers))
+    own.write("summary.json", json.dumps(numbers, indent=1, allow_nan=False) + "\n")
+    return numbers
 
 
 def _names(charts: Sequence[Chart], texts: Mapping[str, str]) -> list[str]:
@@ -104,21 +92,19 @@ def _names(charts: Sequence[Chart], texts: Mapping[str, str]) -> list[str]:
 
 
 def page(
-    study: Study,
-    claims: tuple[JudgedClaim, ...],
+    told: Answered,
     found: dict[Rule, list[Chart]],
     models: list[Chart],
-    summary: dict[str, Any],
+    numbers: dict[str, Any],
 ) -> str:
     """Write the page.
 
     Parameters
     ----------
-    study : Study
-    claims : tuple of JudgedClaim
+    told : Answered
     found : charts by exclusion rule
     models : charts that no exclusion changes
-    summary : dict
+    numbers : dict
         As ``summary.json`` holds it.
 
     Returns
@@ -128,34 +114,51 @@ def page(
     """
     from jinja2 import Environment, StrictUndefined
 
-    here = files("pipistrelle.report.page")
+    here, study = files("pipistrelle.report.page"), told.study
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters |= {"number": three_digits, "p": _p, "finding": _shown}
     template = environment.from_string((here / "page.html").read_text(encoding="utf-8"))
+    figures = [_figure(chart.name, found) for chart in _distinct(found)]
     return template.render(
         study=study,
-        claims=claims,
-        summary=summary,
-        figures=[_figure(chart.name, found) for chart in _distinct(found)],
-        models=[_figure(chart.name, {"always": [chart]}) for chart in models],
+        papers=told.papers,
+        headline=told.rule,
+        question=told.question,
+        claims=told.claims,
+        summary=numbers,
+        tables=effect_tables(study, told.effects[told.rule]),
+        measures=MEASURES,
+        units=UNITS,
+        figures=_side_by_side([figure for figure in figures if answers(figure["name"])]),
+        further=_side_by_side([figure for figure in figures if not answers(figure["name"])]),
+        models=_side_by_side([_figure(chart.name, {"always": [chart]}) for chart in models]),
         style=Markup((here / "page.css").read_text(encoding="utf-8")),
         script=Markup((here / "page.js").read_text(encoding="utf-8")),
         colours=Markup(page_colours()),
         filters=filter_titles(study),
-        papers=FILTERS,
+        papers_filters=FILTERS,
         number_word=number_word,
         rules=RULES,
         without=WITHOUT,
         spoken=SPOKEN,
-        units=UNITS,
         tally=tally,
         with_everything=with_everything,
-        departures=overview.not_the_papers_line(summary["not_the_papers"]),
-        consistency=overview.by_strategy(summary["consistency"]),
+        departures=overview.not_the_papers_line(numbers["not_the_papers"]) if told.papers else "",
+        consistency=overview.by_strategy(numbers["consistency"]),
         config=to_toml(study.config),
     )
+
+
+def _side_by_side(figures: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Put figures of one panel side by side, and the last of an odd number beside its words."""
+    single = [figure for figure in figures if figure["columns"] == 1]
+    for figure in single:
+        figure["place"] = "single"
+    if len(single) % 2:
+        single[-1]["place"] = "lone"
+    return figures
 
 
 def _distinct(found: Mapping[Any, list[Chart]]) -> list[Chart]:
@@ -177,7 +180,7 @@ def _figure(name: str, found: Mapping[Any, list[Chart]]) -> dict[str, Any]:
     first = next(iter(named.values()))
     count = len(first.panels)
     columns = count if count <= 4 else columns_of(count)  # the style sheet has four as two by two
-    return {"name": name, "title": first.title, "by_rule": by_rule, "columns": columns}
+    return {"name": name, "title": first.title, "by_rule": by_rule, "columns": columns, "place": ""}
 
 
 def _panel(panel: Panel) -> dict[str, Any]:
@@ -196,7 +199,7 @@ def _write_figure(chart: Chart, folder: Path) -> None:
 
 
 def _csv_texts(
-    by_rule: Mapping[Rule, Selection], found: dict[Rule, list[Chart]], models: list[Chart]
+    told: Answered, found: dict[Rule, list[Chart]], models: list[Chart]
 ) -> dict[str, str]:
     """Write the numbers behind each figure, under all exclusion rules."""
     texts = {chart.name: csv_text(csv_rows(chart)) for chart in models}
@@ -208,8 +211,10 @@ def _csv_texts(
                     new = csv_rows(other, exclusion=rule)
                     rows += new[1:] if rows else new
         texts[chart.name] = csv_text(rows)
+    if not told.papers:
+        return texts
     table = []
-    for rule, selection in by_rule.items():
+    for rule, selection in told.selections.items():
         for row in overview.table_ii_rows(selection):
             flat = {"exclusion": rule}
             for key, value in row.items():
@@ -219,62 +224,6 @@ def _csv_texts(
     header = list(dict.fromkeys(key for row in table for key in row))
     cells = [["" if row.get(key) is None else str(row[key]) for key in header] for row in table]
     return texts | {"table_ii": csv_text([header, *cells])}
-
-
-def _summary(
-    studies: tuple[Study, ...],
-    by_rule: Mapping[Rule, Selection],
-    judged: list[tuple[JudgedClaim, ...]],
-) -> dict[str, Any]:
-    """Lay out everything that the page says, for programs."""
-    study, claims = studies[0], judged[0]
-    return {
-        "format": FORMAT,
-        "version": __version__,
-        "versions": {"python": platform.python_version()} | _versions(),
-        "study": study.name,
-        "seed": study.config.seed,
-        "worlds_planned": study.planned,
-        "worlds_done": len(study.worlds),
-        "partial": len(study.worlds) < study.planned,
-        "trials": sum(trials.failed.size for trials in study.trials.values()),
-        "filters_cpu_s": study.cpu_s,
-        "settings": study.settings,
-        "not_the_papers": overview.not_the_papers(study),
-        "answer": answer(by_rule, claims),
-        "claims": [record(claim) for claim in claims],
-        "exclusion_rules": dict(RULES),
-        "exclusions": overview.exclusion_rows(study),
-        "trials_failed": sum(overview.failed_trials(other) for other in studies),
-        "table_ii": overview.table_ii_rows(by_rule["world"]),
-        "consistency": overview.consistency_rows(by_rule["world"]),
-        "failed": [
-            {"iteration": i, "strategy": s, "filter": f, "beamwidth_deg": b, "error": text}
-            | {"settings": other.settings}
-            for other in studies
-            for i, s, f, b, text in other.errors
-        ],
-        "variants": [
-            {
-                "settings": other.settings,
-                "worlds_done": len(other.worlds),
-                "trials_failed": overview.failed_trials(other),
-                "verdicts": [claim.verdict for claim in mine],
-            }
-            for other, mine in zip(studies, judged, strict=True)
-        ],
-    }
-
-
-def _versions() -> dict[str, str]:
-    """Read the versions of the libraries that numbers and pictures depend on."""
-    found = {}
-    for name in LIBRARIES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "unknown"
-    return found
 
 
 def _p(p: float, sentence: bool = False) -> str:

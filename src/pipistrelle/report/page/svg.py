@@ -14,10 +14,11 @@ from jaxtyping import Float
 from markupsafe import Markup
 
 from pipistrelle.figures.chart import MARKS, Axis, Panel, Series, explained, legend_series
+from pipistrelle.report.numbers import three_digits
 
 WIDTH, HEIGHT = 400.0, 280.0
 """Of a panel, in its own units, which are pixels on a small screen."""
-LEFT, RIGHT, TOP, BOTTOM = 46.0, 8.0, 10.0, 42.0
+LEFT, RIGHT, TOP, BOTTOM = 54.0, 8.0, 10.0, 42.0
 """Margins."""
 READINGS = 80
 """Most places along a panel where its numbers are read out."""
@@ -86,6 +87,8 @@ def readings(panel: Panel) -> list[tuple[float, str, list[tuple[str, str]]]]:
     named = [s for s in panel.series if s.listed and explained(s) and len(s.x)]
     if not named or panel.equal:
         return []
+    if panel.x.named:
+        return [(place, name, _said_at(named, panel.x, place)) for place, name in panel.x.named]
     span = panel.x.limits[1] - panel.x.limits[0]
     ticks = np.array([value for value, _ in panel.x.ticks])
     every = np.unique(np.concatenate([s.x for s in named]))
@@ -104,28 +107,17 @@ def readings(panel: Panel) -> list[tuple[float, str, list[tuple[str, str]]]]:
     return found
 
 
-def three_digits(value: float) -> str:
-    """Write a number in three digits.
-
-    Parameters
-    ----------
-    value : float
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> [three_digits(value) for value in (0.12345, 43.71, -1234.5, float("inf"))]
-    ['0.123', '43.7', '−1234', '∞']
-    """
-    if not math.isfinite(value):
-        return "∞" if value > 0 else ("−∞" if value < 0 else "no number")
-    digits = max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0
-    text = f"{value:.{min(digits, 4)}f}" if abs(value) < 1e5 else f"{value:.2e}"
-    text = text.rstrip("0").rstrip(".") if "." in text and "e" not in text else text
-    return text.replace("-", "−") if float(text) else "0"
+def _said_at(named: Sequence[Series], axis: Axis, place: float) -> list[tuple[str, str]]:
+    """Say of each series the number whose place, of those that have names, is this one."""
+    places = np.array([value for value, _ in axis.named])
+    said = []
+    for series in named:
+        away = np.abs(_share(axis, series.x) - _share(axis, place))
+        nearest = np.abs(_share(axis, series.x)[:, None] - _share(axis, places)).min(axis=1)
+        i = int(np.argmin(away))
+        if away[i] <= nearest[i] and math.isfinite(series.y[i]):
+            said.append((series.name, _number(series, i)))
+    return said
 
 
 class _Frame(NamedTuple):
@@ -295,6 +287,7 @@ def _columns(panel: Panel, frame: _Frame) -> list[tuple[str, float, float]]:
     if not said:
         return []
     unit = "°" if "[°]" in panel.x.label else (" s" if "[s]" in panel.x.label else "")
+    unit = "" if panel.x.named else unit
     at = [float(_across(frame, place)) for place, _, _ in said]
     edges = [LEFT, *((a + b) / 2.0 for a, b in pairwise(at)), WIDTH - RIGHT]
     texts = [

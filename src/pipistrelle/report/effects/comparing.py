@@ -1,0 +1,332 @@
+"""Effects: two values of one variable in the same world, all else alike, over many worlds.
+
+Every value is compared with the first: of numbers the least, of words the one listed first. What
+else varies is averaged over, world by world, and looked at one by one besides. Strategies and
+filters are compared in the same way, the first of them with each other one. All contrasts of a
+variable with a filter are one family for each measure (`pipistrelle.evaluation.comparison`): of
+numbers the ends, which are what the answer speaks of, and the values between them another.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.config import STRATEGIES
+from pipistrelle.evaluation.comparison import Finding, Statement, judge
+from pipistrelle.report.effects.measures import MEASURES, Measure, change
+from pipistrelle.report.studied import (
+    Cell,
+    Rule,
+    Selection,
+    Study,
+    along,
+    combination_name,
+    filter_titles,
+    kept,
+)
+
+STRATEGY, FILTER = "strategy", "filter"
+"""What a study compares beside its variables."""
+Pair = tuple[Cell, Cell]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contrast:
+    """Two values of one variable, all else alike.
+
+    Attributes
+    ----------
+    factor : str
+        The variable's name, `STRATEGY` or `FILTER`.
+    filter, strategy : str
+        With which they are compared; empty for the one that is itself compared.
+    before, after : str
+        The two values, as words.
+    end : bool
+        It is what the answer speaks of: of numbers the least and the greatest, of words any two.
+    pairs : tuple of pairs of Cell
+        One for each combination of the rest.
+    names : tuple of str
+        Of those combinations.
+    """
+
+    factor: str
+    filter: str
+    strategy: str
+    before: str
+    after: str
+    end: bool = True
+    pairs: tuple[Pair, ...]
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Effect:
+    """What the worlds say of a contrast in one measure.
+
+    Attributes
+    ----------
+    contrast : Contrast
+    measure : Measure
+    finding : Finding
+        Of the mean over the combinations of the rest; of a ratio, of its logarithm.
+    untouched : bool
+        The two are the same to the last digit, in every world.
+    apart : tuple of Finding
+        At each of those combinations, a family of their own; empty where there is one.
+    """
+
+    contrast: Contrast
+    measure: Measure
+    finding: Finding
+    untouched: bool
+    apart: tuple[Finding, ...]
+
+
+def contrasts_of(study: Study) -> tuple[Contrast, ...]:
+    """List what a study compares.
+
+    Parameters
+    ----------
+    study : Study
+
+    Returns
+    -------
+    tuple of Contrast
+        Those of the variables, in their order, then strategies, then filters.
+    """
+    return (*_of_variables(study), *_of_strategies(study), *_of_filters(study))
+
+
+def effects_of(selection: Selection) -> tuple[Effect, ...]:
+    """Judge everything that a study compares, in every measure.
+
+    Parameters
+    ----------
+    selection : Selection
+
+    Returns
+    -------
+    tuple of Effect
+    """
+    families: dict[tuple[str, str, bool], list[Contrast]] = {}
+    for contrast in contrasts_of(selection.study):
+        family = contrast.factor, contrast.filter or contrast.strategy, contrast.end
+        families.setdefault(family, []).append(contrast)
+    return tuple(
+        effect
+        for family in families.values()
+        for measure in MEASURES
+        for effect in _judged(selection, family, measure)
+    )
+
+
+def resolvable(finding: Finding) -> float:
+    """Tell how small an effect would have been significant.
+
+    Parameters
+    ----------
+    finding : Finding
+        An undecided one.
+
+    Returns
+    -------
+    float
+        Half the width of its interval, in the sample's unit; infinite where nothing could be.
+    """
+    low, high = finding.interval
+    return max(finding.mean - low, high - finding.mean) if finding.n > 1 else math.inf
+
+
+def record(by_rule: Mapping[Rule, Sequence[Effect]], headline: Rule) -> list[dict[str, Any]]:
+    """Lay effects out for ``summary.json``.
+
+    Parameters
+    ----------
+    by_rule : dict of sequence of Effect
+        The same effects under each exclusion rule.
+    headline : one of `studied.RULES`
+        By which the study is answered: what an effect is at each combination is told of this alone.
+
+    Returns
+    -------
+    list of dict
+        A ratio's mean and intervals are ratios; what is not finite is None.
+    """
+    return [
+        {
+            "variable": one[0].contrast.factor,
+            "filter": one[0].contrast.filter or None,
+            "strategy": one[0].contrast.strategy or None,
+            "from": one[0].contrast.before,
+            "to": one[0].contrast.after,
+            "measure": one[0].measure.score,
+            "unit": "ratio" if one[0].measure.ratio else one[0].measure.unit,
+            "averaged_over": len(one[0].contrast.pairs),
+            "by_exclusion": {
+                rule: _plain_effect(effect) for rule, effect in zip(by_rule, one, strict=True)
+            },
+            "apart": _plain_apart(dict(zip(by_rule, one, strict=True))[headline]),
+        }
+        for one in zip(*by_rule.values(), strict=True)
+    ]
+
+
+def plain(finding: Finding, *, ratio: bool = False) -> dict[str, Any]:
+    """Lay a finding out as JSON can hold it.
+
+    Parameters
+    ----------
+    finding : Finding
+    ratio : bool
+        Its numbers are logarithms of ratios, and become these.
+
+    Returns
+    -------
+    dict
+        What is not finite is None.
+    """
+
+    def size(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    def finite(value: float) -> float | None:
+        return size(float(np.exp(value))) if ratio and math.isfinite(value) else size(value)
+
+    return {
+        "n": finding.n,
+        "mean": finite(finding.mean),
+        "std": size(finding.std),
+        "alone": [finite(bound) for bound in finding.alone],
+        "interval": [finite(bound) for bound in finding.interval],
+        "p": size(finding.p),
+    }
+
+
+def _plain_effect(effect: Effect) -> dict[str, Any]:
+    """Lay out what one exclusion rule makes of an effect."""
+    ratio, finding = effect.measure.ratio, effect.finding
+    would = math.nan if finding.holds is not None or effect.untouched else resolvable(finding)
+    would = math.exp(would) if ratio and would < 700.0 else would
+    return {
+        **plain(finding, ratio=ratio),
+        "shown": finding.holds is not None,
+        "untouched": effect.untouched,
+        "would_have_shown": would if math.isfinite(would) else None,
+    }
+
+
+def _plain_apart(effect: Effect) -> list[dict[str, Any]]:
+    """Lay out what an effect is at each combination of the rest."""
+    return [
+        {"at": name} | plain(one, ratio=effect.measure.ratio) | {"shown": one.holds is not None}
+        for name, one in zip(effect.contrast.names, effect.apart, strict=False)
+    ]
+
+
+def _of_variables(study: Study) -> Iterator[Contrast]:
+    """Compare every value of each variable with its first."""
+    for variable in study.variables:
+        rows = along(study, variable)
+        for name in filter_titles(study):
+            for strategy in STRATEGIES:
+                if (name, strategy) not in study.trials:
+                    continue
+                at = study.trials[name, strategy].at[rows]
+                if np.all(at == at[:1]):
+                    continue  # passive sensing has no beam
+                for j in range(1, len(rows)):
+                    first = np.unique(at[[0, j]], axis=1, return_index=True)[1]
+                    mine = [(int(rows[0, m]), int(rows[j, m])) for m in np.sort(first)]
+                    yield Contrast(
+                        factor=variable.name,
+                        filter=name,
+                        strategy=strategy,
+                        before=variable.words[0],
+                        after=variable.words[j],
+                        end=variable.numbers is None or j == len(rows) - 1,
+                        pairs=tuple(((name, strategy, a), (name, strategy, b)) for a, b in mine),
+                        names=tuple(combination_name(study, a, [variable]) for a, _ in mine),
+                    )
+
+
+def _of_strategies(study: Study) -> Iterator[Contrast]:
+    """Compare with each filter the first strategy with the others."""
+    for name in filter_titles(study):
+        first, *others = (way for way in STRATEGIES if (name, way) in study.trials)
+        for other in others:
+            pairs, names = _everywhere(study, (name, first), (name, other))
+            yield Contrast(factor=STRATEGY, filter=name, strategy="", before=first, after=other,
+                           pairs=pairs, names=names)  # fmt: skip
+
+
+def _of_filters(study: Study) -> Iterator[Contrast]:
+    """Compare in each strategy the first filter with the others."""
+    titles = filter_titles(study)
+    for strategy in STRATEGIES:
+        there = [name for name in titles if (name, strategy) in study.trials]
+        for other in there[1:]:
+            pairs, names = _everywhere(study, (there[0], strategy), (other, strategy))
+            yield Contrast(factor=FILTER, filter="", strategy=strategy, before=titles[there[0]],
+                           after=titles[other], pairs=pairs, names=names)  # fmt: skip
+
+
+def _everywhere(
+    study: Study, before: tuple[str, str], after: tuple[str, str]
+) -> tuple[tuple[Pair, ...], tuple[str, ...]]:
+    """Pair two ways at every combination at which one of them has a case of its own."""
+    at = np.array([study.trials[way].at for way in (before, after)])
+    numbers = np.sort(np.unique(at, axis=1, return_index=True)[1]).tolist()
+    pairs = tuple(((*before, i), (*after, i)) for i in numbers)
+    return pairs, tuple(combination_name(study, i) for i in numbers)
+
+
+def _judged(selection: Selection, family: Sequence[Contrast], measure: Measure) -> Iterator[Effect]:
+    """Judge a family of contrasts in one measure; what nothing touches needs no judging."""
+    samples = [_mean_change(selection, measure, contrast.pairs) for contrast in family]
+    untouched = [len(sample) > 0 and not sample.any() for sample in samples]
+    means = _findings(samples, untouched)
+    apart = [
+        [_mean_change(selection, measure, [pair]) for pair in contrast.pairs]
+        if len(contrast.pairs) > 1
+        else []
+        for contrast in family
+    ]
+    flat = [sample for mine in apart for sample in mine]
+    singles = iter(_findings(flat, [len(one) > 0 and not one.any() for one in flat]))
+    for contrast, finding, same, mine in zip(family, means, untouched, apart, strict=True):
+        yield Effect(
+            contrast=contrast,
+            measure=measure,
+            finding=finding,
+            untouched=same,
+            apart=tuple(next(singles) for _ in mine),
+        )
+
+
+def _findings(
+    samples: Sequence[Float[np.ndarray, " m"]], untouched: Sequence[bool]
+) -> list[Finding]:
+    """Judge samples as a family, without those that are nothing but zeros."""
+    statements = [Statement(label="", sample=sample) for sample in samples]
+    touched = [one for one, same in zip(statements, untouched, strict=True) if not same]
+    judged = iter(judge(touched))
+    return [
+        judge([one])[0] if same else next(judged)
+        for one, same in zip(statements, untouched, strict=True)
+    ]
+
+
+def _mean_change(
+    selection: Selection, measure: Measure, pairs: Sequence[Pair]
+) -> Float[np.ndarray, " m"]:
+    """Return the change averaged over some pairs of cases, in the worlds that have all of them."""
+    study = selection.study
+    changes = np.array([change(study, measure, *pair) for pair in pairs])
+    counts = kept(selection, [cell for pair in pairs for cell in pair])
+    counts &= np.all(np.isfinite(changes), axis=0)
+    return np.mean(changes[:, counts], axis=0)

@@ -1,0 +1,143 @@
+"""A study read as the question that it asks, and everything that is told of it, for programs.
+
+A study that holds the paper's cases is asked the paper's question, and its claims are judged; any
+other is asked what its variables do.
+"""
+
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+from pipistrelle import __version__
+from pipistrelle.report.claims.answer import answer as papers_answer
+from pipistrelle.report.claims.contrasts import selections
+from pipistrelle.report.claims.published import papers_cases
+from pipistrelle.report.claims.statements import CLAIMS, Claim
+from pipistrelle.report.claims.verdicts import JudgedClaim, judge_claims, record
+from pipistrelle.report.effects import comparing
+from pipistrelle.report.effects.answer import HEADLINE, answer, question
+from pipistrelle.report.effects.comparing import Effect, effects_of
+from pipistrelle.report.page import overview
+from pipistrelle.report.page.effect_tables import case_rows
+from pipistrelle.report.studied import RULES, Rule, Selection, Study
+
+FORMAT = 1
+LIBRARIES = ("numpy", "scipy", "numba", "polars", "pydantic", "matplotlib", "jinja2")
+PAPERS_QUESTION = "Does listening to someone else’s calls as well as one’s own build a better map?"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answered:
+    """A study and the question that it answers.
+
+    Attributes
+    ----------
+    study : Study
+    papers : bool
+        It holds the paper's cases and is asked the paper's question.
+    question : str
+    rule : one of `studied.RULES`
+        By which it is answered.
+    selections : dict of Selection
+        Under each rule.
+    effects : dict of tuple of Effect
+        Under each rule.
+    claims : tuple of JudgedClaim
+    answer : list of str
+        A line that stands alone, then sentences.
+    """
+
+    study: Study
+    papers: bool
+    question: str
+    rule: Rule
+    selections: Mapping[Rule, Selection]
+    effects: Mapping[Rule, tuple[Effect, ...]]
+    claims: tuple[JudgedClaim, ...]
+    answer: list[str]
+
+
+def answered(study: Study, claims: Sequence[Claim] | None = None) -> Answered:
+    """Ask a study its question.
+
+    Parameters
+    ----------
+    study : Study
+    claims : sequence of Claim, optional
+        As `write_report` takes them.
+
+    Returns
+    -------
+    Answered
+    """
+    papers, by_rule = papers_cases(study), selections(study)
+    effects = {rule: effects_of(selection) for rule, selection in by_rule.items()}
+    asked = (CLAIMS if papers else ()) if claims is None else claims
+    judged = judge_claims(by_rule, asked)
+    said = papers_answer(by_rule, judged) if papers else answer(by_rule[HEADLINE], effects)
+    return Answered(
+        study=study,
+        papers=papers,
+        question=PAPERS_QUESTION if papers else question(study),
+        rule="world" if papers else HEADLINE,
+        selections=by_rule,
+        effects=effects,
+        claims=judged,
+        answer=said,
+    )
+
+
+def summary(told: Answered) -> dict[str, Any]:
+    """Lay out everything that the page says, for programs.
+
+    Parameters
+    ----------
+    told : Answered
+
+    Returns
+    -------
+    dict
+    """
+    study, selection = told.study, told.selections[told.rule]
+    return {
+        "format": FORMAT,
+        "version": __version__,
+        "versions": {"python": platform.python_version()} | _versions(),
+        "study": study.name,
+        "seed": study.config.seed,
+        "worlds_planned": study.planned,
+        "worlds_done": len(study.worlds),
+        "partial": len(study.worlds) < study.planned,
+        "trials": sum(trials.failed.size for trials in study.trials.values()),
+        "filters_cpu_s": study.cpu_s,
+        "variables": [
+            {"name": v.name, "setting": v.setting, "label": v.label, "values": [*v.words]}
+            for v in study.variables
+        ],
+        "not_the_papers": overview.not_the_papers(study),
+        "question": told.question,
+        "answer": told.answer,
+        "answered_by": told.rule,
+        "effects": comparing.record(told.effects, told.rule),
+        "cases": case_rows(selection),
+        "claims": [record(claim) for claim in told.claims],
+        "exclusion_rules": dict(RULES),
+        "exclusions": overview.exclusion_rows(study),
+        "trials_failed": overview.failed_trials(study),
+        "table_ii": overview.table_ii_rows(selection) if told.papers else [],
+        "consistency": overview.consistency_rows(selection),
+        "failed": [asdict(failure) for failure in study.errors],
+    }
+
+
+def _versions() -> dict[str, str]:
+    """Read the versions of the libraries that numbers and pictures depend on."""
+    found = {}
+    for name in LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "unknown"
+    return found

@@ -1,0 +1,187 @@
+"""Effects: which cases are compared, in which worlds, as which family."""
+
+import json
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from pipistrelle.evaluation.comparison import Statement, judge
+from pipistrelle.report.claims.contrasts import select, selections
+from pipistrelle.report.effects.comparing import contrasts_of, effects_of, record, resolvable
+from pipistrelle.report.effects.measures import MEASURES
+from pipistrelle.report.reading import read_study
+from pipistrelle.report.studied import RULES
+from report.invented import changed, invent, only
+from report.planted import LEVELS, by_level, write_planted
+
+BOTH = 'strategies = ["fused", "passive"]\nfilters = ["ekf"]\n'
+TWO = LEVELS + '\n"rays.power" = [1.0, 3.0]'
+POSITION = MEASURES[0]
+
+
+def study_of(tmp_path, *args, **given):
+    write_planted(tmp_path / "s", *args, **given)
+    return read_study(tmp_path / "s")
+
+
+def position(effects, **asked):
+    """Effects on the position's error of the contrasts asked for."""
+    found = [effect for effect in effects if effect.measure is POSITION]
+    return [e for e in found if all(getattr(e.contrast, k) == v for k, v in asked.items())]
+
+
+def test_every_value_of_a_variable_is_compared_with_its_first_in_each_strategy(tmp_path):
+    study = study_of(tmp_path, worlds=2, ways='filters = ["ekf", "fastslam"]\n')
+    mine = [c for c in contrasts_of(study) if c.factor == "beacon.level_db"]
+    assert Counter((c.filter, c.strategy, c.before, c.after, c.end) for c in mine) == {
+        (name, strategy, "36.8", after, after == "48.8"): 1
+        for name in ("ekf", "fastslam")
+        for strategy in ("active", "fused", "passive")
+        for after in ("42.8", "48.8")
+    }
+    assert all(len(c.pairs) == 1 for c in mine)
+
+
+def test_strategies_and_filters_are_compared_with_the_first_of_them(tmp_path):
+    study = study_of(tmp_path, worlds=2, ways='filters = ["fastslam", "ekf"]\n')
+    ways = [c for c in contrasts_of(study) if c.factor == "strategy"]
+    assert [(c.filter, c.before, c.after) for c in ways] == [
+        (name, "active", after) for name in ("ekf", "fastslam") for after in ("fused", "passive")
+    ]
+    filters = [c for c in contrasts_of(study) if c.factor == "filter"]
+    assert [(c.strategy, c.before, c.after) for c in filters] == [
+        (strategy, "EKF", "FastSLAM 2.0") for strategy in ("active", "fused", "passive")
+    ]
+    assert {len(c.pairs) for c in (*ways, *filters)} == {3}, "one at each level"
+
+
+def test_the_beam_does_nothing_to_passive_sensing_and_is_not_compared_in_it():
+    study = invent(3)
+    mine = [c for c in contrasts_of(study) if c.factor == "beamwidth"]
+    assert {c.strategy for c in mine} == {"active", "fused"}
+    assert len(mine) == 2 * 2 * 11
+    (far,) = [c for c in contrasts_of(study) if (c.filter, c.after) == ("ekf", "passive")]
+    assert len(far.pairs) == 12
+    assert far.names[:2] == ("11°", "14°")
+
+
+def test_what_else_varies_is_averaged_over_world_by_world_and_looked_at_apart(tmp_path):
+    def effect(case):
+        more = {1.0: 0.1, 3.0: 0.5}[case.values["rays.power"]]
+        return {"position_rmse_m": more * (case.values["beacon.level_db"] > 40.0)}
+
+    study = study_of(tmp_path, TWO, effect=effect, spread=0.01)
+    (end,) = position(effects_of(select(study, "none")), factor="beacon.level_db", end=True)
+    assert end.contrast.names == ("rays.power = 1", "rays.power = 3")
+    assert [f.mean for f in end.apart] == pytest.approx([0.1, 0.5], abs=0.01)
+    table = study.trials["ekf", "fused"].scores["position_rmse_m"]
+    by_hand = 0.5 * (table[:, 4] - table[:, 0] + table[:, 5] - table[:, 1])
+    assert end.finding.mean == pytest.approx(by_hand.mean())
+    assert end.finding.std == pytest.approx(by_hand.std(ddof=1))
+    assert end.finding.n == 12
+
+
+def test_a_family_is_judged_as_the_projects_comparisons_are(tmp_path):
+    study = study_of(tmp_path, ways=BOTH, effect=by_level(0.03), spread=0.05)
+    effects = effects_of(select(study, "none"))
+    for end in (True, False):
+        mine = position(effects, factor="beacon.level_db", end=end)
+        samples = []
+        for effect in mine:
+            table = study.trials["ekf", effect.contrast.strategy].scores["position_rmse_m"]
+            samples.append(table[:, 2 if end else 1] - table[:, 0])
+        expected = judge([Statement(label="", sample=sample) for sample in samples])
+        assert [e.finding.p for e in mine] == [f.p for f in expected]
+        assert [e.finding.interval for e in mine] == [f.interval for f in expected]
+        assert len(mine) == 2
+
+
+def test_what_nothing_touches_is_known_as_such_and_makes_nothing_harder_to_show(tmp_path):
+    study = study_of(tmp_path, ways=BOTH, effect=by_level(0.03), spread=0.05)
+    passive = study.trials["ekf", "passive"].scores["position_rmse_m"]
+    passive[:, 1:] = passive[:, :1]
+    fused, idle = position(effects_of(select(study, "none")), factor="beacon.level_db", end=True)
+    assert (fused.untouched, idle.untouched) == (False, True)
+    assert (idle.finding.mean, idle.finding.holds) == (0.0, None)
+    table = study.trials["ekf", "fused"].scores["position_rmse_m"]
+    (alone,) = judge([Statement(label="", sample=table[:, 2] - table[:, 0])])
+    assert fused.finding.p == alone.p
+
+
+@pytest.mark.parametrize(("rule", "left"), [("world", 8), ("case", 9), ("none", 12)])
+def test_the_worlds_are_those_that_the_rule_counts_and_have_a_number(tmp_path, rule, left):
+    def diverged(case, world):
+        level = case.values["beacon.level_db"]
+        return (level == 48.8 and world < 3) or (level == 42.8 and world == 7)
+
+    study = study_of(tmp_path, diverged=diverged)
+    (end,) = position(effects_of(select(study, rule)), factor="beacon.level_db", end=True)
+    assert end.finding.n == left
+    study.trials["ekf", "fused"].scores["position_rmse_m"][11, 2] = np.inf
+    (end,) = position(effects_of(select(study, rule)), factor="beacon.level_db", end=True)
+    assert end.finding.n == left - 1
+
+
+def test_what_would_have_been_significant_is_half_the_familys_interval(tmp_path):
+    study = study_of(tmp_path, ways=BOTH, spread=0.2)
+    first, second = position(effects_of(select(study, "none")), factor="beacon.level_db", end=True)
+    tables = [study.trials["ekf", way].scores["position_rmse_m"] for way in ("fused", "passive")]
+    one, other = (table[:, 2] - table[:, 0] for table in tables)
+    assert first.finding.holds is second.finding.holds is None
+    for more, shown in ((1.01, True), (0.99, None)):
+        larger = one - one.mean() + more * resolvable(first.finding)
+        statements = [Statement(label="", sample=sample) for sample in (larger, other)]
+        assert judge(statements)[0].holds is shown
+
+
+def test_a_single_world_decides_nothing_and_none_still_less(tmp_path):
+    study = study_of(tmp_path, worlds=1, effect=by_level(1.0))
+    for effect in effects_of(select(study, "none")):
+        assert effect.finding.holds is None
+        assert effect.untouched or resolvable(effect.finding) == np.inf
+    study.trials["ekf", "fused"].failed[:] = True
+    assert {effect.finding.n for effect in effects_of(select(study, "none"))} == {0}
+
+
+def test_the_record_is_plain_json_with_ratios_as_ratios(tmp_path):
+    study = study_of(tmp_path, TWO, ways=BOTH, effect=lambda case: (
+        {"nees_mean": 100.0} if case.values["beacon.level_db"] > 48.0 else {}
+    ))  # fmt: skip
+    by_rule = {rule: effects_of(one) for rule, one in selections(study).items()}
+    rows = record(by_rule, "none")
+    json.dumps(rows, allow_nan=False)
+    assert len(rows) == len(by_rule["none"])
+    (nees,) = [
+        row for row in rows
+        if (row["measure"], row["to"], row["strategy"]) == ("nees_mean", "48.8", "fused")
+    ]  # fmt: skip
+    found = nees["by_exclusion"]["none"]
+    assert set(nees["by_exclusion"]) == set(RULES)
+    assert (nees["unit"], nees["variable"], nees["from"]) == ("ratio", "beacon.level_db", "36.8")
+    assert (nees["averaged_over"], [one["at"] for one in nees["apart"]]) == (
+        2, ["rays.power = 1", "rays.power = 3"],
+    )  # fmt: skip
+    assert found["shown"]
+    assert found["alone"][0] < found["mean"] < found["alone"][1]
+    assert 40.0 < found["mean"] < 80.0
+
+
+def test_a_study_without_anything_to_compare_has_no_effects():
+    assert effects_of(select(only(invent(3), [("ekf", "passive")]), "none")) == ()
+
+
+def test_over_many_studies_without_an_effect_a_family_is_wrong_as_seldom_as_it_says():
+    """Five in a hundred at most, whatever the number of strategies, within three errors."""
+    wrong, runs = 0, 150
+    study = only(invent(12), [("ekf", "active"), ("ekf", "fused")])
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        for way in study.trials:
+            drawn = rng.normal(1.0, 0.2, study.trials[way].scores["position_rmse_m"].shape)
+            study = changed(study, way, "position_rmse_m", lambda _, now=drawn: now)
+        effects = effects_of(select(study, "none"))
+        mine = position(effects, factor="beamwidth", end=False)
+        wrong += any(effect.finding.holds is not None for effect in mine)
+    assert wrong / runs <= 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / runs)
+    assert len(mine) == 20

@@ -1,0 +1,82 @@
+"""What is looked at, and how two cases are compared in it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipistrelle.report.effects.measures import MEASURES, change
+from pipistrelle.report.studied import SCORES
+from report.invented import changed, invent
+
+BEFORE, AFTER = ("ekf", "fused", 0), ("ekf", "fused", 5)
+
+
+@pytest.fixture
+def study():
+    return invent(6)
+
+
+def measured(title):
+    (found,) = [measure for measure in MEASURES if measure.title == title]
+    return found
+
+
+def test_every_measure_is_a_score_that_is_read():
+    assert {measure.score for measure in MEASURES} <= set(SCORES)
+    assert {measure.bound for measure in MEASURES} - {""} <= set(SCORES)
+    assert len({measure.title for measure in MEASURES}) == len(MEASURES) == 6
+
+
+def test_a_change_is_after_minus_before_in_the_same_world(study):
+    for title in ("position error", "aligned position error", "heading error"):
+        score = study.trials["ekf", "fused"].scores[measured(title).score]
+        expected = score[:, 5] - score[:, 0]
+        np.testing.assert_array_equal(change(study, measured(title), BEFORE, AFTER), expected)
+
+
+def test_nees_changes_by_a_ratio(study):
+    twice = changed(
+        study, ("ekf", "fused"), "nees_mean", lambda n: np.where([[1] * 5 + [0] * 7], n, 2 * n)
+    )
+    nees = study.trials["ekf", "fused"].scores["nees_mean"]
+    found = np.exp(change(twice, measured("NEES"), BEFORE, AFTER))
+    assert found == pytest.approx(2.0 * nees[:, 5] / nees[:, 0])
+
+
+def with_maps(study, placed, off):
+    """The same study with the maps of fused EKF, landmarks in the last dimension."""
+    trials = study.trials["ekf", "fused"]
+    shape = (6, 12, len(placed[0]))
+    full, error = np.zeros(shape, bool), np.zeros(shape)
+    full[:, [0, 5]], error[:, [0, 5]] = placed, off
+    return replace(
+        study, trials=study.trials | {("ekf", "fused"): replace(trials, placed=full, off=error)}
+    )
+
+
+def test_maps_are_compared_over_the_landmarks_that_both_have_placed(study):
+    made = with_maps(study, [[1, 1, 0], [1, 1, 1]], [[3.0, 4.0, 90.0], [3.0, 8.0, 70.0]])
+    expected = np.sqrt((9 + 64) / 2) - np.sqrt((9 + 16) / 2)
+    assert change(made, measured("map error"), BEFORE, AFTER) == pytest.approx(np.full(6, expected))
+
+
+def test_maps_without_a_landmark_in_common_have_no_difference(study):
+    made = with_maps(study, [[1, 0], [0, 1]], [[1.0, 1.0], [1.0, 1.0]])
+    assert np.isnan(change(made, measured("map error"), BEFORE, AFTER)).all()
+
+
+def test_maps_of_other_landmarks_are_compared_as_they_are(study):
+    made = with_maps(study, [[1, 1], [1, 1]], [[1.0, 1.0], [2.0, 2.0]])
+    elsewhere = replace(made, drawing=np.arange(12))
+    own = made.trials["ekf", "fused"].scores["map_rmse_m"]
+    found = change(elsewhere, measured("map error"), BEFORE, AFTER)
+    np.testing.assert_array_equal(found, own[:, 5] - own[:, 0])
+    assert change(made, measured("map error"), BEFORE, AFTER) == pytest.approx(np.ones(6))
+
+
+def test_passive_sensing_is_compared_with_any_beam_by_its_one_case(study):
+    passive = study.trials["ekf", "passive"].scores["position_rmse_m"][:, 0]
+    fused = study.trials["ekf", "fused"].scores["position_rmse_m"][:, 7]
+    found = change(study, MEASURES[0], ("ekf", "fused", 7), ("ekf", "passive", 7))
+    np.testing.assert_array_equal(found, passive - fused)

@@ -1,0 +1,75 @@
+"""What varies: in which order, under which names, on which axis."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipistrelle.report.variables import (
+    beam_variable,
+    geometric,
+    places,
+    setting_variable,
+    word_of,
+    written,
+)
+
+
+def test_numbers_rise_and_stand_where_they_are():
+    level = setting_variable("beacon.level_db", [48.8, 36.8, 42.8])
+    assert level.given == (36.8, 42.8, 48.8)
+    assert places(level).tolist() == [36.8, 42.8, 48.8]
+    assert level.label == "beacon.level_db [dB]"
+    assert level.meaning.startswith("Source level at 1 m [dB]")
+
+
+@pytest.mark.parametrize(
+    ("setting", "values", "words"),
+    [
+        ("rays.weights", ["instantaneous", "aggregated"], ("instantaneous", "aggregated")),
+        ("rays.range_bounds", [[2.0, 40.0], [0.5, 20.0]], ("[2, 40]", "[0.5, 20]")),
+        ("made.up", [True, False], ("true", "false")),
+        ("made.up", [3, "auto"], ("3", "auto")),
+    ],
+)
+def test_what_is_no_number_keeps_its_order_and_is_counted_along_the_axis(setting, values, words):
+    variable = setting_variable(setting, values)
+    assert (variable.words, variable.numbers) == (words, None)
+    assert places(variable).tolist() == [0.0, 1.0]
+    assert variable.label == setting, "words have no unit"
+    assert [word_of(variable, value) for value in values] == list(words)
+
+
+def test_a_unit_is_what_the_setting_says_and_a_range_is_none():
+    assert setting_variable("scenario.speed", [1, 2]).label == "scenario.speed [m/s]"
+    assert setting_variable("air.relative_humidity", [0.1, 0.2]).label == "air.relative_humidity"
+    assert setting_variable("scenario.steps", [100, 200]).label == "scenario.steps"
+    assert setting_variable("filter.range_std", [0.1, 0.2]).meaning == "", (
+        "a unit alone says little"
+    )
+
+
+@given(st.lists(st.floats(1e-12, 1e12), min_size=2, max_size=9, unique=True))
+def test_values_are_written_so_that_they_differ(values):
+    words = written(values)
+    assert len(set(words)) == len(values)
+    assert [float(word) for word in words] == pytest.approx(values, rel=1e-5)
+
+
+def test_beams_are_named_in_degrees_narrowest_first_and_told_apart():
+    beams = beam_variable("emitter.radius", [0.0025, 0.007, 0.025], [180.0, 42.5, 11.575])
+    assert beams.words == ("11°", "42.5°", "180°")
+    assert beams.given == (0.025, 0.007, 0.0025)
+    close = beam_variable("emitter.radius", [0.025, 0.0249], [11.35, 11.55])
+    assert close.words == ("11.35°", "11.55°")
+
+
+@given(st.floats(1e-6, 1e6), st.floats(1.3, 10.0), st.integers(3, 8))
+def test_a_geometric_row_is_known_and_an_arithmetic_one_is_not(first, ratio, count):
+    assert geometric(first * ratio ** np.arange(count))
+    assert not geometric(first * (1.0 + (ratio - 1.0) * np.arange(count)))
+
+
+@pytest.mark.parametrize("numbers", [[-1.0, 0.1, 1.0], [0.0, 1.0, 10.0], [1.0, 100.0]])
+def test_numbers_without_logarithms_and_pairs_are_no_geometric_row(numbers):
+    assert not geometric(numbers)
