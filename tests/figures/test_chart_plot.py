@@ -88,6 +88,16 @@ def test_points_that_are_not_filled_are_open():
     assert hollow.get_markerfacecolor() == "white"
 
 
+def test_a_legend_of_long_names_takes_more_rows_and_stays_within_the_figure(tmp_path):
+    names = [f"rays.power = {k}, air.spreading = bistatic, and more" for k in range(4)]
+    figure = draw_chart(chart_of(panel_of(*(fused(name=name, strength=0.5) for name in names))))
+    save_figure(figure, tmp_path, "c")
+    (legend_drawn,) = figure.legends
+    box = legend_drawn.get_window_extent()
+    assert box.x1 <= figure.bbox.x1
+    assert {handle.get_alpha() for handle in legend_drawn.legend_handles} == {0.5}
+
+
 def test_names_with_dollars_are_names_and_no_formulae(tmp_path):
     words = Axis(label="$x_1^", limits=(-1.0, 1.0), ticks=((0.0, "a$b$c"),))
     figure = draw_chart(chart_of(panel_of(fused(name="$\\frac{"), title="$", x=words)))
@@ -100,7 +110,7 @@ def test_a_dash_stands_for_a_level_on_paper_and_page():
     series = fused(style="levels")
     (axes,) = draw_chart(chart_of(panel_of(series))).axes
     assert axes.lines[0].get_marker() == "_"
-    assert legend([panel_of(series)]) == [("fused", "fused", "dashed")]
+    assert legend([panel_of(series)]) == [("fused", "fused", "dashed", 1.0)]
     drawn = ElementTree.fromstring(str(panel_svg(panel_of(series))))
     assert len([e for e in drawn.iter("path") if "dot" in e.get("class").split()]) == 3
 
@@ -156,5 +166,5 @@ def test_a_mark_is_one_row_for_paper_and_page(monkeypatch):
     shapes = [e.get("d") for e in drawn.iter("path") if "dot" in e.get("class").split()]
     assert len(shapes) == len(X)
     assert [shape.count("L") for shape in shapes] == [3, 3, 3]
-    assert legend([panel]) == [("fused", "fused", "dot")]
+    assert legend([panel]) == [("fused", "fused", "dot", 1.0)]
     assert csv_rows(chart_of(panel))[1][2] == "diamonds"

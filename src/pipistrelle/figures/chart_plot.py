@@ -20,6 +20,8 @@ TEXT = {"grid": "#8a8a8a"}
 """Colours of text where it would be too faint in its role's own."""
 PLAIN = {"text.parse_math": False}
 """Names are shown as they are, dollars included."""
+LETTER = 0.065
+"""Width of a letter of the legend [inch]."""
 BAND = 0.15
 """Opacity of a band."""
 
@@ -68,7 +70,10 @@ def draw_chart(chart: Chart) -> "Figure":
             axes = figure.add_subplot(rows, columns, i + 1)
             _draw_panel(axes, panel)
         if handles := [_handle(*named) for named in legend_series(chart.panels).items()]:
-            figure.legend(handles=handles, loc="outside lower left", ncols=min(len(handles), 6))
+            longest = max(len(handle.get_label()) for handle in handles)
+            fitting = max(1, int(size[0] / (0.5 + LETTER * longest)))
+            ncols = min(len(handles), 6, fitting)
+            figure.legend(handles=handles, loc="outside lower left", ncols=ncols)
     return figure
 
 
@@ -154,6 +159,7 @@ def _handle(name: str, series: Series) -> Any:
         [],
         [],
         color=colour,
+        alpha=series.strength if series.strength < 1.0 else None,
         ls="--" if series.dashed else "-",
         lw=1.4 if mark.joined or series.low is not None else 0.0,
         marker=mark.symbol,

@@ -144,5 +144,7 @@ def test_what_is_no_number_is_told():
 
 def test_the_legend_names_each_series_once_and_nothing_where_there_are_many():
     few = [panel_of(line([1.0]), line([2.0], name="passive", dashed=True))] * 2
-    assert legend(few) == [("fused", "fused", "line"), ("passive", "fused", "dashed")]
+    assert legend(few) == [("fused", "fused", "line", 1.0), ("passive", "fused", "dashed", 1.0)]
+    faint = [panel_of(line([1.0], strength=0.25))]
+    assert legend(faint) == [("fused", "fused", "line", 0.25)]
     assert legend([panel_of(*(line([1.0], name=str(i)) for i in range(12)))]) == []

@@ -1,12 +1,11 @@
 """Effects as clauses: what raises what, by how much, and what would have been seen."""
 
-import math
 from collections.abc import Mapping, Sequence
 
 from pipistrelle.evaluation.comparison import Finding
 from pipistrelle.report.effects.comparing import FILTER, STRATEGY, Effect, resolvable
-from pipistrelle.report.effects.measures import MEASURES, Measure
-from pipistrelle.report.numbers import amount, interval, listed, three_digits
+from pipistrelle.report.effects.measures import MEASURES
+from pipistrelle.report.numbers import amount, interval, listed
 from pipistrelle.report.studied import Study, filter_titles
 from pipistrelle.report.variables import BEAM, Variable
 
@@ -45,29 +44,32 @@ def direction(finding: Finding) -> int:
     return {True: 1, False: -1, None: 0}[finding.holds]
 
 
-def size(finding: Finding, measure: Measure, *, signed: bool = False) -> str:
-    """Write by how much a measure changes, with its 95 % interval.
+def size(finding: Finding, unit: str, *, signed: bool = False) -> str:
+    """Write how large a difference is, with its own 95 % interval.
 
     Parameters
     ----------
     finding : Finding
-    measure : Measure
+    unit : one of `numbers.UNITS`
     signed : bool
         As it is, rather than the size of a rise or of a fall.
 
     Returns
     -------
     str
-        Of a ratio, the factor.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pipistrelle.evaluation.comparison import Statement, judge
+    >>> (fall,) = judge([Statement(label="", sample=-np.array([0.3, 0.4, 0.5]))])
+    >>> size(fall, "m"), size(fall, "m", signed=True)
+    ('0.4 m [0.152, 0.648]', '−0.4 m [−0.648, −0.152]')
     """
-    low, high = finding.alone
-    mean = finding.mean
-    if measure.ratio:
-        mean, low, high = (math.exp(min(value, 700.0)) for value in (mean, low, high))
-        return f"{three_digits(mean)}-fold {interval((low, high), '')}"
+    mean, (low, high) = finding.mean, finding.alone
     if not signed and mean < 0.0:
         mean, low, high = -mean, -high, -low
-    return f"{amount(mean, measure.unit)} {interval((low, high), measure.unit)}"
+    return f"{amount(mean, unit)} {interval((low, high), unit)}"
 
 
 def the(variable: Variable) -> str:
@@ -131,7 +133,7 @@ def clauses(study: Study, effects: Sequence[Effect], beside: Mapping[Effect, Eff
         objects = [
             _KINDS[kind][1].format(
                 owner=owner(study, effect, noun=not said and not i),
-                size=size(effect.finding, effect.measure),
+                size=size(effect.finding, effect.measure.unit),
                 mean=amount(effect.finding.mean, effect.measure.unit),
                 least=amount(resolvable(effect.finding), effect.measure.unit),
                 otherwise=_otherwise(effect, beside.get(effect)),
@@ -222,7 +224,7 @@ def in_between(study: Study, effects: Sequence[Effect]) -> list[str]:
             more = "more" if most.finding.mean > 0.0 else "less"
             said.append(
                 f"at {most.contrast.after} {owner(study, most, noun=False)} is "
-                f"{size(most.finding, most.measure)} {more} than at {most.contrast.before}"
+                f"{size(most.finding, most.measure.unit)} {more} than at {most.contrast.before}"
             )
     return said
 
@@ -254,7 +256,9 @@ def elsewhere(study: Study, effects: Sequence[Effect]) -> list[str]:
             finding, name = max(other, key=lambda pair: abs(pair[0].mean))
             many = f" and at {len(other) - 1} more" if len(other) > 1 else ""
             verb, whose = VERBS[direction(finding)], owner(study, effect, noun=False)
-            said.append(f"at {name}{many} it {verb} {whose} by {size(finding, effect.measure)}")
+            said.append(
+                f"at {name}{many} it {verb} {whose} by {size(finding, effect.measure.unit)}"
+            )
     return said
 
 
@@ -289,9 +293,7 @@ def _changed(effects: Sequence[Effect], sign: int) -> list[str]:
 
 
 def _case(effect: Effect, all_of: Sequence[Effect]) -> str:
-    """Name an effect among others of its family: the strategy, and the value where it is one of
-    several.
-    """
+    """Name an effect among others: its strategy, and its value where there are several."""
     several = len({other.contrast.after for other in all_of}) > 1
     parts = (effect.contrast.strategy, effect.contrast.after if several else "")
     return " ".join(part for part in parts if part)
@@ -304,4 +306,4 @@ def _otherwise(effect: Effect, other: Effect | None) -> str:
     if other.finding.n < 2:
         return "; without diverged cases too few worlds are left"
     shown = "" if direction(other.finding) else ", not shown"
-    return f"; without diverged cases {size(other.finding, effect.measure, signed=True)}{shown}"
+    return f"; without diverged cases {size(other.finding, FIRST.unit, signed=True)}{shown}"

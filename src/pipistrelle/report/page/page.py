@@ -68,7 +68,8 @@ def write_report(
         Where a file cannot be written, or one that would be replaced is not as we wrote it.
     """
     told = answered(study, claims)
-    found = {rule: study_charts(one, charts) for rule, one in told.selections.items()}
+    rules = sorted(RULES, key=lambda rule: rule != told.rule)  # the one that answers is printed
+    found = {rule: study_charts(told.selections[rule], charts) for rule in rules}
     models = model_charts(study)
     drawn, texts = [*_distinct(found), *models], _csv_texts(told, found, models)
     own = OwnFiles(folder, REPORT)

@@ -310,7 +310,7 @@ def _number(series: Series, i: int) -> str:
     )
 
 
-def legend(panels: Sequence[Panel]) -> list[tuple[str, str, str]]:
+def legend(panels: Sequence[Panel]) -> list[tuple[str, str, str, float]]:
     """List what the panels' legend explains.
 
     Parameters
@@ -319,7 +319,7 @@ def legend(panels: Sequence[Panel]) -> list[tuple[str, str, str]]:
 
     Returns
     -------
-    list of name, role, and "line", "dashed", "dot", "hollow" or "star"
+    list of name, role, "line", "dashed", "dot", "hollow" or "star", and opacity
         Empty where the names are many: there the caption tells.
     """
     found = []
@@ -327,5 +327,5 @@ def legend(panels: Sequence[Panel]) -> list[tuple[str, str, str]]:
         kind = "dashed" if series.dashed else MARKS[series.style].swatch
         if series.filled is not None and not series.filled.any() and not series.dashed:
             kind = "hollow"
-        found.append((name, series.role, kind))
+        found.append((name, series.role, kind, series.strength))
     return found
