@@ -8,6 +8,7 @@ import polars as pl
 
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config
+from pipistrelle.experiments.hearing.scenario import world_of
 from pipistrelle.experiments.studies.plan import cases_of
 from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
 from pipistrelle.experiments.studies.store import open_store
@@ -130,6 +131,7 @@ def invent(worlds=60, seed=1, planned=None):
         configs=(config,) * len(BEAMWIDTH),
         beamwidth=BEAMWIDTH,
         drawing=np.zeros(len(BEAMWIDTH), dtype=int),
+        example=world_of(config),
         trials={
             (name, strategy): trials_of(rng, world, name, strategy)
             for name in FILTERS

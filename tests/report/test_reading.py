@@ -205,6 +205,19 @@ def test_combinations_know_whether_they_meet_the_same_landmarks(tmp_path):
     assert first == again != other, "a world that cannot be drawn is one of its own"
 
 
+def test_combinations_of_named_worlds_meet_the_landmarks_of_these(tmp_path):
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        rows = ["landmark,x,y", "1,2,2", f"2,5,{len(name)}", *(["3,1,6"] * (name == "two"))]
+        (tmp_path / name / "landmarks.csv").write_text("\n".join(rows) + "\n")
+    folders = ", ".join(f'"{(tmp_path / name).as_posix()}"' for name in ("two", "one"))
+    write_planted(tmp_path / "named", f'"scenario.world" = [{folders}]', worlds=1)
+    study = read_study(tmp_path / "named")
+    assert study.variables[0].words == ("two", "one")
+    assert study.drawing.tolist() == [0, 1]
+    assert study.example.landmarks.tolist() == [[2, 2], [5, 3], [1, 6]]
+
+
 def test_a_failed_trial_is_told_with_its_values(tmp_path):
     grid = '"air.relative_humidity" = [0.3, 0.7]\n'
     plan, *_ = write_store(tmp_path / "store", invent(2), grid=grid, failed=((1, 30),))

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config, InputError
 from pipistrelle.estimation.catalogue import SECTIONS
-from pipistrelle.experiments.hearing.scenario import standing_landmarks, world_of
+from pipistrelle.experiments.hearing.scenario import Scenario, standing_landmarks, world_of
 from pipistrelle.experiments.studies.beamwidths import MAKERS
 from pipistrelle.experiments.studies.plan import RADIUS, Plan, cases_of, common
 from pipistrelle.experiments.studies.store import load_study
@@ -143,20 +143,27 @@ def _numbers(
     return {way: numbers.reshape(-1) for way, numbers in sorted(found.items())}
 
 
-def _drawings(configs: Sequence[Config], world: int) -> Int[np.ndarray, " c"]:
+def _drawn(plan: Plan, config: Config, world: int) -> Scenario | None:
+    """Draw a world anew, if that can still be done."""
+    try:
+        return world_of(config, world, plan.world(config))
+    except InputError:
+        return None
+
+
+def _drawings(plan: Plan, configs: Sequence[Config], world: int) -> Int[np.ndarray, " c"]:
     """Tell by a world drawn anew which combinations meet the same landmarks."""
-    drawn: dict[Any, int] = {}
+    numbers: dict[Any, int] = {}
     known: dict[str, int] = {}
     found = []
     for number, config in enumerate(configs):
         table = config.model_dump(mode="json", exclude=set(SECTIONS))
         del table["emitter"]["radius"]
         if (same := json.dumps(table)) not in known:
-            try:
-                key = tuple(part.tobytes() for part in standing_landmarks(world_of(config, world)))
-            except InputError:
-                key = number
-            known[same] = drawn.setdefault(key, len(drawn))
+            key: Any = number
+            if drawn := _drawn(plan, config, world):
+                key = tuple(part.tobytes() for part in standing_landmarks(drawn))
+            known[same] = numbers.setdefault(key, len(numbers))
         found.append(known[same])
     return np.array(found)
 
@@ -184,7 +191,8 @@ def _study(
         config=plan.config,
         configs=configs,
         beamwidth=np.array(list(map(_degrees, configs))),
-        drawing=_drawings(configs, int(worlds[0])),
+        drawing=_drawings(plan, configs, int(worlds[0])),
+        example=_drawn(plan, configs[0], int(worlds[0])),
         trials=_trials(
             numbers,
             _scores(trials, worlds, count),

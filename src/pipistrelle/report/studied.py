@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.config import Config
 from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.evaluation.comparison import Finding
+from pipistrelle.experiments.hearing.scenario import Scenario
 from pipistrelle.report.variables import BEAM, Variable
 
 Rule = Literal["world", "case", "none"]
@@ -144,6 +145,9 @@ class Study:
         Of the vehicle's call.
     drawing : (c)
         Combinations with one number meet the same landmarks, world by world.
+    example : Scenario or None
+        The first of the worlds where the variables have their first values, drawn anew; None where
+        it cannot be.
     trials : dict
         By filter and strategy.
     errors : tuple of Failure
@@ -160,6 +164,7 @@ class Study:
     configs: tuple[Config, ...]
     beamwidth: Float[np.ndarray, " c"]
     drawing: Int[np.ndarray, " c"]
+    example: Scenario | None
     trials: dict[Way, Trials]
     errors: tuple[Failure, ...]
     cpu_s: float

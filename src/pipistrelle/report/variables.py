@@ -84,7 +84,7 @@ def setting_variable(setting: str, values: Sequence[Any]) -> Variable:
         numbers=tuple(map(float, given)) if numeric else None,
         label=f"{setting} [{unit[1]}]" if unit and numeric else setting,
         column=setting,
-        meaning="" if unit and unit[0] == meaning else meaning,
+        meaning=meaning,
     )
 
 

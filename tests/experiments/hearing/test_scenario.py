@@ -26,10 +26,11 @@ def beacon_of(drawn):
     return beacon.place
 
 
-def test_what_there_is_to_map_is_known_before_a_world_is_drawn():
+def test_what_there_is_to_map_are_the_landmarks_and_all_who_call_but_the_vehicle():
     config = Config(scenario=ScenarioConfig(landmarks=9, steps=20))
-    labels, _ = standing_landmarks(draw_scenario(config, np.random.default_rng(3)))
-    assert landmark_count(config) == len(labels) == 10
+    drawn = draw_scenario(config, np.random.default_rng(3))
+    labels, _ = standing_landmarks(drawn)
+    assert landmark_count(drawn) == len(labels) == 10
 
 
 def nearest(points, others):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from pipistrelle.arithmetic.random_stream import stream_key
-from pipistrelle.experiments.hearing.scenario import draw_scenario
+from pipistrelle.config import Config, ScenarioConfig
+from pipistrelle.experiments.hearing.scenario import draw_scenario, world_of
 from pipistrelle.report.charts.setting import model_charts
 from report.invented import BEAMWIDTH, invent
 
@@ -43,7 +44,18 @@ def test_the_map_is_the_world_that_the_study_heard(charts):
 
 
 def test_a_world_that_cannot_be_drawn_is_left_out():
-    study = invent(2)
-    setup = study.config.scenario.model_copy(update={"landmarks": 50_000})
-    crowded = replace(study, configs=(study.config.model_copy(update={"scenario": setup}),) * 12)
+    crowded = replace(invent(2), example=None)
     assert [chart.name for chart in model_charts(crowded)] == ["piston"]
+
+
+def test_a_world_without_a_disc_is_shown_whole_and_without_its_circle():
+    setup = ScenarioConfig(course="corridor", field="rooms", extent=40.0)
+    config = Config(scenario=setup)
+    study = replace(invent(2), configs=(config,) * len(BEAMWIDTH), example=world_of(config))
+    chart = {chart.name: chart for chart in model_charts(study)}["example_map"]
+    (panel,) = chart.panels
+    assert "circle" not in chart.caption
+    assert "edge" not in [series.name for series in panel.series]
+    for series in panel.series:
+        for values, axis in ((series.x, panel.x), (series.y, panel.y)):
+            assert axis.limits[0] < np.min(values) <= np.max(values) < axis.limits[1]

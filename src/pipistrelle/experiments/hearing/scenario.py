@@ -124,12 +124,12 @@ def draw_scenario(config: Config, rng: np.random.Generator, world: World = ANY) 
     )
 
 
-def landmark_count(config: Config) -> int:
-    """Count what a world of these settings has to map: the landmarks, and all callers but one.
+def landmark_count(scenario: Scenario) -> int:
+    """Count what a world has to map: the landmarks, and all callers but one.
 
     Parameters
     ----------
-    config : Config
+    scenario : Scenario
 
     Returns
     -------
@@ -138,11 +138,10 @@ def landmark_count(config: Config) -> int:
 
     Examples
     --------
-    >>> landmark_count(Config(scenario=ScenarioConfig(landmarks=12)))
+    >>> landmark_count(world_of(Config(scenario=ScenarioConfig(landmarks=12))))
     13
     """
-    callers = callers_of(config, np.zeros(2))  # wherever the beacon stands
-    return config.scenario.landmarks + len(callers[VEHICLE + 1 :])
+    return len(scenario.landmarks) + len(scenario.callers[VEHICLE + 1 :])
 
 
 def standing_landmarks(scenario: Scenario) -> LabelledPoints:

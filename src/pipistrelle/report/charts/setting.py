@@ -1,15 +1,17 @@
 """Charts of what a study is made of: the emitter's beams and one of the worlds."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.acoustics.callers import VEHICLE, Caller, moves
 from pipistrelle.acoustics.emitter import HALF_POWER, piston_directivity, piston_radius
-from pipistrelle.config import Config, InputError
-from pipistrelle.experiments.hearing.scenario import Scenario, world_of
+from pipistrelle.config import Config
+from pipistrelle.experiments.hearing.scenario import Scenario
 from pipistrelle.figures.chart import Axis, Chart, Panel, Series
+from pipistrelle.report.numbers import listed
 from pipistrelle.report.studied import Study, combination_name
 from pipistrelle.report.variables import width_name
 
@@ -26,10 +28,8 @@ def model_charts(study: Study) -> list[Chart]:
     list of Chart
         Without the map where the world cannot be drawn.
     """
-    try:
-        return [piston(study), example_map(study)]
-    except InputError:
-        return [piston(study)]
+    maps = [] if study.example is None else [example_map(study, study.example)]
+    return [piston(study), *maps]
 
 
 def piston(study: Study) -> Chart:
@@ -71,12 +71,14 @@ def piston(study: Study) -> Chart:
     )
 
 
-def example_map(study: Study) -> Chart:
-    """Chart the first world of the study, drawn anew from its seed.
+def example_map(study: Study, world: Scenario) -> Chart:
+    """Chart a world of the study.
 
     Parameters
     ----------
     study : Study
+    world : Scenario
+        Its example.
 
     Returns
     -------
@@ -86,22 +88,30 @@ def example_map(study: Study) -> Chart:
     -----
     Bradley & Abaid, Sec. IV.
     """
-    config, number = study.configs[0], int(study.worlds[0])
-    world = world_of(config, number)
-    setup = config.scenario
-    reach = 1.04 * max(setup.radius, setup.beacon_distance, float(np.abs(world.path[:, :2]).max()))
-    axis = Axis(label="", limits=(-reach, reach), ticks=())
-    panel = Panel(title="", x=axis, y=axis, series=_world(world, setup.radius), equal=True)
-    others = "".join(f", the {caller.name}" for caller in world.callers[VEHICLE + 1 :])
+    setup, told, series = study.configs[0].scenario, "", _world(world)
+    if setup.field == "disc" and setup.world is None:
+        told = f"; the dashed circle has a radius of {setup.radius:g} m"
+        series = (_disc(setup.radius), *series)
+    x, y = _square(series)
+    count, others = len(world.landmarks), [caller.name for caller in world.callers[VEHICLE + 1 :]]
+    shown = listed([f"{count} landmarks", *(f"the {name}" for name in others)])
     return Chart(
         name="example_map",
         title="A world of the study",
-        caption=f"World {number}{_where(study)}: {len(world.landmarks)} landmarks{others} and the "
-        f"vehicle's true path of {world.time[-1]:g} s; the dashed circle has a radius of "
-        f"{setup.radius:g} m",
-        panels=(panel,),
+        caption=f"World {study.worlds[0]}{_where(study)}: {shown}, and the vehicle's true path of "
+        f"{world.time[-1]:g} s{told}",
+        panels=(Panel(title="", x=x, y=y, series=series, equal=True),),
         columns=("x_m", "y_m"),
     )
+
+
+def _square(series: Sequence[Series]) -> tuple[Axis, Axis]:
+    """Return axes of one length that leave a margin around some series."""
+    places = np.array([[part(s.x), part(s.y)] for s in series for part in (np.min, np.max)])
+    low, high = places.min(axis=0), places.max(axis=0)
+    reach = 0.52 * float(np.max(high - low))
+    x, y = ((float(at) - reach, float(at) + reach) for at in (low + high) / 2.0)
+    return Axis(label="", limits=x, ticks=()), Axis(label="", limits=y, ticks=())
 
 
 def _where(study: Study) -> str:
@@ -158,20 +168,18 @@ def _protractor() -> list[Series]:
     ]
 
 
-def _world(world: Scenario, radius: float) -> tuple[Series, ...]:
-    """Return path, landmarks and callers within the circle that holds them."""
+def _disc(radius: float) -> Series:
+    """Return the edge of the disc on which landmarks are drawn."""
     circle = np.linspace(0.0, 2.0 * np.pi, 181)
+    x, y = radius * np.cos(circle), radius * np.sin(circle)
+    return Series(name="edge", role="grid", x=x, y=y, dashed=True, listed=False)
+
+
+def _world(world: Scenario) -> tuple[Series, ...]:
+    """Return path, landmarks and callers."""
     start = world.path[:1, :2]
     labels = [f"landmark {i}" for i in range(1, len(world.landmarks) + 1)]
     return (
-        Series(
-            name="edge",
-            role="grid",
-            x=radius * np.cos(circle),
-            y=radius * np.sin(circle),
-            dashed=True,
-            listed=False,
-        ),
         Series(name="true path", role="truth", x=world.path[:, 0], y=world.path[:, 1]),
         Series(
             name="start",

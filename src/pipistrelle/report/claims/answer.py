@@ -134,10 +134,15 @@ def _counted(selection: Selection, everything: Selection) -> str:
         if said := _placed(selection, name):
             beside = _beside(study, said, _placed(everything, name))
             return (
-                "Hearing the beacon as well as its own calls, the vehicle fully places, of "
-                f"{landmark_count(study.config)} landmarks, {said}{beside} ({title})."
+                "Hearing the beacon as well as its own calls, the vehicle fully places"
+                f"{_of_all(study)} {said}{beside} ({title})."
             )
     return ""
+
+
+def _of_all(study: Study) -> str:
+    """Say how many landmarks there are, if that is known."""
+    return f", of {landmark_count(study.example)} landmarks," if study.example else ""
 
 
 def _placed(selection: Selection, name: str) -> str:
