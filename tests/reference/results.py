@@ -36,13 +36,13 @@ def turned(path, angle, shift=(0.0, 0.0)):
 TRUTH = Truth(time=TIME, path=loop(), landmarks=(LABELS, PLACES))
 
 
-def mission_folder(folder, paths, *, truth=TRUTH, config=None, time=TIME):
+def mission_folder(folder, paths, *, truth=TRUTH, config=None, time=TIME, gated=0):
     """Write what `run` leaves of estimates, `paths` (k, 3) by strategy and filter."""
     config, scans = config or Config(), (scan_with([1], [0.1], [4.0], time=time[4]),)
     trials = []
     for (strategy, name), path in paths.items():
         pose = Gaussian(mean=np.array(path), covariance=np.tile(np.eye(3), (len(path), 1, 1)))
-        track = Track(time=time, pose=pose, gated=0, landmarks=map_with(
+        track = Track(time=time, pose=pose, gated=gated, landmarks=map_with(
             [1, 2, 3, 3], [*PLACES, PLACES[2] + 1.0], np.tile(0.04 * np.eye(2), (4, 1, 1)),
             [1.0, 1.0, 0.5, 0.5]))  # fmt: skip
         scores = score(track, truth, scans, 50.0)

@@ -4,6 +4,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,11 @@ KEPT = [
 ]  # fmt: skip
 
 
+def rising(level):
+    """Errors that rise with the world and with the case."""
+    return lambda case, world: 2.0 + world + level * (1 + case.number)
+
+
 @pytest.fixture
 def missions(in_a_folder_of_its_own):
     sharp = Config(filter=FilterConfig(noise="measured"))
@@ -37,11 +43,7 @@ def studies(in_a_folder_of_its_own):
             name=name, iterations=4, strategies=("active", "fused"), filters=filters,
             config=Config(), grid={},
         )  # fmt: skip
-        study_folder(
-            Path(name),
-            plan,
-            lambda case, world, level=level: 2.0 + world + level * (1 + case.number),
-        )
+        study_folder(Path(name), plan, rising(level))
 
 
 def rows(printed):
@@ -122,6 +124,40 @@ def test_studies_are_compared_case_by_case(obey, studies):
     assert rows(blocks[6])["filters"] == ['["ekf"]', '["iekf"]']
     assert blocks[7].startswith("Paired over the worlds that both have met.\n*: p < 0.05")
     assert len(blocks) == 8
+
+
+def test_what_is_sure_is_marked_and_so_is_what_is_not_paired(obey, studies):
+    plan = Plan(
+        name="three", iterations=4, strategies=("active", "fused"), filters=("ekf",),
+        config=Config(), grid={},
+    )  # fmt: skip
+    plain = rising(1.0)
+    study_folder(
+        Path("three"),
+        plan,
+        lambda case, world: (
+            plain(case, world) - (1.0 + 0.01 * world if case.number else 0.9 * (world % 2))
+        ),
+    )
+    study_folder(Path("four"), replace(plan, config=Config(seed=8)), rising(0.9))
+    _, printed, _ = obey("compare", "one", "three", "four")
+    marks = {
+        words[0]: "".join(word for word in words if word in ("*", "~", "*~"))
+        for words in (
+            re.split(r"\s{2,}", line) for line in printed.split("\n\n")[1].splitlines()[1:]
+        )
+    }
+    assert marks == {
+        "active ekf, B": "", "active ekf, C": "~", "fused ekf, B": "*", "fused ekf, C": "~",
+    }  # fmt: skip
+
+
+def test_what_the_gate_rejected_is_told_where_it_rejected_anything(obey, missions):
+    _, printed, _ = obey("compare", "one", "two")
+    assert "rejected by the gate" not in printed
+    mission_folder(Path("gated"), {("fused", "ekf"): OFF}, gated=3)
+    _, printed, _ = obey("compare", "one", "gated")
+    assert rows(printed)["rejected by the gate"] == ["0", "3", "+3"]
 
 
 def test_a_difference_that_never_varies_has_no_interval(obey, studies):
