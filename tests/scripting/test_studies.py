@@ -1,8 +1,10 @@
 """Studies from Python: the command line's tables, in a folder of one's own or a passing one."""
 
 import sys
+import tomllib
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 import pytest
 
@@ -11,6 +13,7 @@ from pipistrelle import InputError
 from pipistrelle.__main__ import main
 from reference.studies import SMALL
 
+FEW = {"scenario": {"steps": 8, "landmarks": 5}}
 TIMES = ("wall_s", "cpu_s")
 
 
@@ -58,6 +61,27 @@ def test_it_goes_on_where_it_stopped_and_settings_lie_over_the_plan():
         pipistrelle.study("small.toml", scenario__landmark=9)
     with pytest.raises(InputError, match="nowhere: found no such file"):
         pipistrelle.study("nowhere")
+
+
+def test_a_plan_may_be_a_table_and_is_refused_in_its_own_words():
+    told = tomllib.loads(SMALL)
+    from_file = pipistrelle.study("small.toml", iterations=1)
+    assert pipistrelle.study(told, iterations=1).plan == from_file.plan
+    levels = {"iterations": 1, "strategies": ("fused",), "filters": ["ekf"], "config": FEW}
+    for values in ([30.0, 40.0], (30.0, 40.0), np.linspace(30.0, 40.0, 2)):
+        found = pipistrelle.study(levels | {"grid": {"beacon": {"level_db": values}}})
+        assert found.trials["beacon.level_db"].to_list() == [30.0, 40.0]
+    for changes, why in (
+        ({"grid": {"beacon.level": [30.0]}}, r"plan: grid\.beacon\.level: no such setting"),
+        ({"grid": {"beacon.level_db": 30.0}}, r"plan: grid\.beacon\.level_db: found 30"),
+        ({"worlds": 3}, "plan: worlds: no such key"),
+        ({"strategies": "fused"}, "plan: strategies: found"),
+        ({"iterations": None}, "plan: iterations: found"),
+    ):
+        with pytest.raises(InputError, match=why):
+            pipistrelle.study(levels | changes)
+    with pytest.raises(InputError, match="plan: iterations: missing"):
+        pipistrelle.study({})
 
 
 def test_its_report_is_a_page():

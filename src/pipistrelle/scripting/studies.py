@@ -1,13 +1,13 @@
 """A study, as a notebook likes it: its tables as frames, its report as a page."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from pipistrelle.experiments.studies.plan import Plan
-from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
+from pipistrelle.experiments.studies.plan_file import FORMAT, find_plan, plan_of, read_plan
 from pipistrelle.experiments.studies.store import load_study
 from pipistrelle.experiments.studies.study import StudyProgress, run_study
 from pipistrelle.settings import from_keywords
@@ -104,7 +104,7 @@ class StudyResults:
 
 
 def study(
-    plan: Path | str = "paper",
+    plan: Path | str | Mapping[str, Any] = "paper",
     /,
     *,
     iterations: int | None = None,
@@ -117,7 +117,8 @@ def study(
 
     Parameters
     ----------
-    plan : "paper", "physics", "beyond" or the path of a plan
+    plan : "paper", "physics", "beyond", the path of a plan, or a table
+        A table holds what the file would; paths in it lead from the folder where Python works.
     iterations : int, optional
         Number of worlds; the plan's by default.
     workers : int
@@ -138,11 +139,30 @@ def study(
     ------
     InputError
         A plan that is refused, a folder of another study, or what a world is refused for.
+
+    Examples
+    --------
+    >>> levels = {"grid": {"beacon.level_db": [36.8, 48.8]}, "filters": ["ekf"]}
+    >>> study(levels, iterations=1, scenario={"steps": 8, "landmarks": 5}).trials.height
+    6
     """
-    tried = read_plan(find_plan(str(plan)), from_keywords(settings), iterations)
+    over = from_keywords(settings)
+    if isinstance(plan, Mapping):
+        tried = plan_of(_listed({"format": FORMAT, **plan}), over=over, iterations=iterations)
+    else:
+        tried = read_plan(find_plan(str(plan)), over, iterations)
     kept_by = None
     if output is None:
         kept_by = TemporaryDirectory(prefix="pipistrelle-")
         output = kept_by.name
     run_study(tried, Path(output), workers=workers, progress=progress)
     return StudyResults(Path(output), kept_by)
+
+
+def _listed(value: Any) -> Any:
+    """Write arrays and tuples as lists, as a file would."""
+    if isinstance(value, Mapping):
+        return {name: _listed(inner) for name, inner in value.items()}
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return [*map(_listed, value)] if isinstance(value, (list, tuple)) else value

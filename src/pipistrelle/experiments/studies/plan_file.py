@@ -139,7 +139,43 @@ def read_plan(path: Path, over: Layer | None = None, iterations: int | None = No
     >>> plan.iterations, len(cases_of(plan))
     (115, 50)
     """
-    over, table = over or {}, read_toml(path)
+    return plan_of(read_toml(path), path, over, iterations)
+
+
+def plan_of(
+    table: Mapping[str, Any],
+    path: Path = Path("plan"),
+    over: Layer | None = None,
+    iterations: int | None = None,
+) -> Plan:
+    """Make a plan of what its file would hold, and check every combination.
+
+    Parameters
+    ----------
+    table : mapping
+    path : Path
+        What it is called in a refusal, and from whose folder its paths lead.
+    over : Layer, optional
+        Settings from the environment and from flags.
+    iterations : int, optional
+        Number of worlds, in place of the plan's.
+
+    Returns
+    -------
+    Plan
+
+    Raises
+    ------
+    InputError
+        Where the table is no plan: the key, what was found, what was expected.
+
+    Examples
+    --------
+    >>> levels = {"beacon.level_db": [36.8, 42.8]}
+    >>> plan_of({"format": 1, "iterations": 6, "grid": levels}).grid
+    {'beacon.level_db': (36.8, 42.8)}
+    """
+    over = over or {}
     head = _head(path, table, iterations)
     within = {"config": table.get("config", {}), "grid": table.get("grid", {})}
     for name, settings in within.items():
