@@ -71,10 +71,10 @@ def test_a_folder_that_holds_something_else_is_named_as_what_it_is(tmp_path):
     (tmp_path / "file").write_text("one")
     refused(tmp_path / "file", "found a file")
     (tmp_path / "empty").mkdir()
-    refused(tmp_path / "empty", "found no SHA256SUMS")
+    refused(tmp_path / "empty", "found no summary.json")
     OwnFiles(tmp_path / "log", LOG).folder.mkdir()
     OwnFiles(tmp_path / "log", LOG).write("log.toml", "format = 1")
-    refused(tmp_path / "log", "found a log of Pipistrelle")
+    refused(tmp_path / "log", "found a recorded log")
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,8 @@ def test_a_file_that_is_changed_cut_or_gone_is_named(folder, name):
         (folder / name).write_text(other)
         refused(folder, f"{folder / name}: was changed since Pipistrelle wrote it")
     (folder / name).unlink()
-    refused(folder, f"{folder / name}: is missing")
+    none = f"{folder}: found no summary.json"
+    refused(folder, none if name == "summary.json" else f"{folder / name}: is missing")
     (folder / name).mkdir()
     refused(folder, f"{folder / name}: is no file")
     (folder / name).rmdir()
@@ -103,17 +104,15 @@ def test_files_that_nothing_is_read_from_may_be_changed(folder):
 def test_results_that_were_interrupted_are_not_whole(folder):
     lines = (folder / SUMS).read_text().splitlines()
     (folder / SUMS).write_text("\n".join(line for line in lines if "summary" not in line))
-    refused(folder, "results that are not whole", "run again")
+    refused(folder, "a summary.json that SHA256SUMS does not name", "run or solve it anew")
 
 
 @pytest.mark.parametrize(
     ("name", "text", "part"),
     [
-        ("summary.json", '{"format": 2}', "found format 2"),
-        ("summary.json", '{"format": 1, "runs": []}', "holds no estimate"),
-        ("summary.json", "[]", "would not write"),
-        ("summary.json", "{", "would not write"),
-        ("summary.json", '{"format": 1, "runs": [{}]}', "would not write"),
+        ("summary.json", '{"format": 2, "runs": []}', "format: found 2"),
+        ("summary.json", "[]", "summary.json: found []"),
+        ("summary.json", "{", "found text that is no JSON"),
         ("config.toml", "seed = ", "would not write"),
         ("track_fused_ekf.tum", "1 2 3\n", "would not write"),
         ("track_fused_ekf.tum", "one\n", "would not write"),

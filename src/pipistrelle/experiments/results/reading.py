@@ -7,6 +7,7 @@ from pydantic import BaseModel, ValidationError
 
 from pipistrelle.config import InputError, Strategy
 from pipistrelle.detection.logs.readers import READERS, Robot
+from pipistrelle.files import COMPARISON, RESULTS, WORLD, OwnFiles
 from pipistrelle.refusals import expectation, refusal, shown
 
 SUMMARY = "summary.json"
@@ -106,6 +107,8 @@ def read_summary(folder: Path) -> Summary:
         missing = faults[0]["type"] == "missing"
         found = "nothing" if missing else shown(faults[0]["input"])
         expected = "a value" if missing else expectation(faults[0])
+        if faults[0]["type"] == "json_invalid":
+            found, expected = "text that is no JSON", "a mission's summary"
         raise refusal(where, found, expected, "run or solve it anew with --overwrite") from None
     if not summary.runs:
         raise refusal(f"{path}: runs", "none", "an estimate", "run or solve it anew")
@@ -123,6 +126,9 @@ def _no_results(folder: Path) -> InputError:
         settings = f"`pipistrelle run --config {folder / 'config.toml'} -o DIR`"
         fix = f"`pipistrelle report` puts it on a page; {settings} makes a mission of its settings"
         return refusal(folder, found, expected, fix)
+    there = OwnFiles(folder, RESULTS).there
+    if there in (COMPARISON, WORLD):
+        return refusal(folder, f"{there} of Pipistrelle", expected, "name the folder of a run")
     if (folder / "index.html").exists():
         fix = "open its index.html, or name the folder of a run"
         return refusal(folder, "a report", expected, fix)

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from pipistrelle.config import InputError
 from pipistrelle.estimation.catalogue import short_name
-from pipistrelle.experiments.results.writing import FORMAT
+from pipistrelle.experiments.results.reading import SUMMARY, read_summary
 from pipistrelle.files import RESULTS, SUMS, OwnFiles
 from pipistrelle.refusals import refusal
 from pipistrelle.settings import leaves
@@ -88,12 +88,12 @@ def read_mission(folder: Path) -> StoredMission:
     --------
     >>> read_mission(Path("nowhere"))
     Traceback (most recent call last):
-    pipistrelle.config.InputError: nowhere: found no such folder, expected results of Pipistrelle;
-    check the path
+    pipistrelle.config.InputError: nowhere: found no such folder, expected the result folder of
+    `pipistrelle run` or `pipistrelle slam`; check the path
     """
     own = results_in(folder)
     try:
-        summary = _summary(own)
+        summary = json.loads(own.read(SUMMARY))
         scores = {(run["strategy"], run["filter"]): run for run in summary["runs"]}
         names = {estimate: f"{estimate[0]}_{short_name(estimate[1])}" for estimate in scores}
         return StoredMission(
@@ -146,32 +146,14 @@ def results_in(folder: Path) -> OwnFiles:
     ------
     InputError
     """
-    expected, fix = "results of Pipistrelle", "check the path"
-    if not folder.is_dir():
-        found = "a file" if folder.exists() else "no such folder"
-        raise refusal(folder, found, expected, fix)
     own = OwnFiles(folder, RESULTS)
-    if own.there not in (RESULTS, None):
-        raise refusal(folder, f"{own.there} of Pipistrelle", "results of it", fix)
-    if not own:
-        found = f"no {SUMS}, which every folder of results has"
-        raise refusal(folder, found, expected, fix)
-    if "summary.json" not in own:
-        found = "results that are not whole: summary.json, the last of them, was not written"
-        raise refusal(folder, found, "whole ones", "run again what wrote them")
+    if own.there == RESULTS and (folder / SUMMARY).exists() and SUMMARY in own:
+        own.read(SUMMARY)
+    read_summary(folder)
+    if SUMMARY not in own:
+        found = f"a {SUMMARY} that {SUMS} does not name"
+        raise refusal(folder, found, "results as they were written", "run or solve it anew")
     return own
-
-
-def _summary(own: OwnFiles) -> Mapping[str, Any]:
-    """Read the scores of all estimates."""
-    where, summary = own.folder / "summary.json", json.loads(own.read("summary.json"))
-    if summary.get("format") != FORMAT:
-        found = f"format {summary.get('format')!r}"
-        fix = "use the version of Pipistrelle that wrote it"
-        raise refusal(where, found, f"format {FORMAT}", fix)
-    if not summary["runs"]:
-        raise InputError(f"{where}: holds no estimate")
-    return summary
 
 
 def _path(text: bytes) -> StoredPath:
