@@ -22,6 +22,8 @@ place_kernels()
 
 Whole = int | np.integer
 """A whole number in a kernel: Numba's are Python's, those of arrays NumPy's."""
+Flag = bool | np.bool_
+"""The same of a truth value."""
 
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])

@@ -237,6 +237,8 @@ NEEDS = {
     "scenario.extent": {"scenario": {"course": "eight"}},
     "scenario.lane": {"scenario": {"field": "rows"}},
     "motion.angular_rate_std": {"motion": {"model": "unicycle"}},
+    "filter.robust": {"filter": {"noise": "measured"}},
+    "rays.spacing": {"filter": {"bearing_std": 0.003}},
     "assumed.angular_rate_std": {"motion": {"model": "unicycle"}},
 }
 """What a setting means something with."""

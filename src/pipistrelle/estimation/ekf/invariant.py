@@ -188,9 +188,9 @@ def _placed(
 
 @no_alloc
 def _about(
-    P: Float[np.ndarray, "3 3"], x: float, y: float, shifted: Float[np.ndarray, "3 3"]
+    P: Float[np.ndarray, "d d"], x: float, y: float, shifted: Float[np.ndarray, "3 3"]
 ) -> None:
-    """Write M P M^T, M = [[1, 0, -y], [0, 1, x], [0, 0, 1]]: the error of a point turned along.
+    """Write M P M^T of the first three, M = [[1, 0, -y], [0, 1, x], [0, 0, 1]].
 
     It makes of the covariance of the invariant error that of the linear error of a pose at (x, y);
     with (-x, -y), the other way.

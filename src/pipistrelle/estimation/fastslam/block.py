@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 
 from pipistrelle.arithmetic.elementary import arctangent, cosine_and_sine, logarithm, wrapped
 from pipistrelle.estimation.measurement import NEAREST
-from pipistrelle.jit import Whole, inlined, no_alloc
+from pipistrelle.jit import Flag, Whole, inlined, no_alloc
 
 LANES = 32
 """Particles in a block. With half as many the compiler unrolls the loops instead of widening them;
@@ -41,7 +41,7 @@ ROUNDING = 1e-12
 @inlined
 def _bearing(
     pose: Poses, member: Member, bearing: float, i: Whole
-) -> tuple[float, float, float, bool]:
+) -> tuple[float, float, float, Flag]:
     """Innovation of a member's bearing; its slopes by x and y of the pose; whether it has any."""
     dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
     squared = dx * dx + dy * dy
@@ -70,7 +70,7 @@ def _spread(member: Member, h0: float, h1: float, i: Whole) -> float:
 @inlined
 def _foreseen(
     pose: Poses, member: Member, bearing: float, variance: float, i: Whole
-) -> tuple[float, float, bool]:
+) -> tuple[float, float, Flag]:
     """Innovation of a member's bearing, its variance, and whether it was foreseen at all."""
     innovation, h0, h1, far = _bearing(pose, member, bearing, i)
     a0, a1, a2 = _bearing_gain(pose, h0, h1, i)
@@ -186,7 +186,7 @@ def correct_by_bearing(
 @inlined
 def _active(
     pose: Poses, member: Member, distance: float, bearing: float, i: Whole
-) -> tuple[float, float, float, float, float, bool]:
+) -> tuple[float, float, float, float, float, Flag]:
     """Innovations of range and bearing, direction (c, s), inverse range, whether it is far."""
     dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
     near = math.sqrt(dx * dx + dy * dy)

@@ -333,7 +333,7 @@ def _prune(rows: Rows, count: Counts, members: Whole, prune: float, scratch: Scr
 
 
 @no_alloc
-def _close_up(rows: Rows, count: Counts, keep: Float[np.ndarray, "h lanes"]) -> None:
+def _close_up(rows: Rows, count: Counts, keep: Float[np.ndarray, "_ lanes"]) -> None:
     """Move the members that are kept to the front, lane by lane."""
     for i in range(LANES):
         left = 0

@@ -72,6 +72,14 @@ Arrays = tuple[
     Float[np.ndarray, "b c numbers"],
 ]
 """The same as a plain tuple, which a kernel takes in no time."""
+Extended = tuple[
+    Float[np.ndarray, "b rows"],
+    Int[np.ndarray, " more"],
+    Int[np.ndarray, " more+1"],
+    Int[np.ndarray, "b more lanes"],
+    Float[np.ndarray, "b members numbers"],
+]
+"""The same with the landmarks of a scan that were not there."""
 
 
 class Block(NamedTuple):
@@ -322,7 +330,7 @@ def correct_particles(
     normal: Float[np.ndarray, "p 3"],
     sensing: Sensing,
     sampled: bool,
-) -> tuple[Arrays, Float[np.ndarray, " p"]]:
+) -> tuple[Extended, Float[np.ndarray, " p"]]:
     """Refine, sample, correct and extend a copy of all particles; returns it and log weights.
 
     ``sampled``: they are weighed at the sample.

@@ -17,7 +17,7 @@ OFF = 0.1
 ROOM = (0.75, 1.5)
 """Width and depth of rooms, in widths of the corridor: drawn between these."""
 
-Points = Float[np.ndarray, "n 2"]
+Points = Float[np.ndarray, "_ 2"]
 
 
 def landmarks_in(
