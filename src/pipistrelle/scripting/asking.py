@@ -3,6 +3,7 @@
 Words come from a command line or from Python; where each was given is said in its refusal.
 """
 
+import sys
 from collections.abc import Mapping, Sequence
 from math import isfinite, radians
 from pathlib import Path
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 Base = Config | Mapping[str, Any] | str | Path | None
 """Settings to start from: as they were resolved, as a table, or the file that holds it."""
+Filters = str | type | Sequence[str | type]
+"""Estimators: by name, or one's own as classes."""
 STEPS: Key = ("scenario", "steps")
 RADIUS: Key = ("emitter", "radius")
 WORLD: Key = ("scenario", "world")
@@ -173,12 +176,12 @@ def named_strategies(chosen: str | Sequence[str]) -> tuple[Strategy, ...]:
     return tuple(one for one in STRATEGIES if one in chosen)
 
 
-def named_filters(chosen: str | Sequence[str]) -> tuple[str, ...]:
+def named_filters(chosen: Filters) -> tuple[str, ...]:
     """Name the filters of a choice.
 
     Parameters
     ----------
-    chosen : the name of an estimator, several, or "both", the paper's two
+    chosen : the name of an estimator or its class, several of them, or "both", the paper's two
 
     Returns
     -------
@@ -193,14 +196,29 @@ def named_filters(chosen: str | Sequence[str]) -> tuple[str, ...]:
     --------
     >>> named_filters("both"), named_filters(["ekf", "iekf"])
     (('ekf', 'fastslam'), ('ekf', 'iekf'))
+    >>> from pipistrelle.estimation.ekf.filter import EkfSlam
+    >>> named_filters(EkfSlam)
+    ('pipistrelle.estimation.ekf.filter:EkfSlam',)
     """
-    if isinstance(chosen, str):
+    if isinstance(chosen, (str, type)):
         chosen = PAPERS if chosen == "both" else (chosen,)
-    names = tuple(dict.fromkeys(chosen))
+    named = (_name_of(one) if isinstance(one, type) else one for one in chosen)
+    names = tuple(dict.fromkeys(named))
     for name in names:
         entry(name)
     check_distinct(names, "filters")
     return names
+
+
+def _name_of(kind: type) -> str:
+    """Return the name by which workers and folders find a class, ``module:Class``."""
+    module, name = kind.__module__, kind.__qualname__
+    if getattr(sys.modules.get(module), name, None) is not kind:
+        raise InputError(
+            f"filters: found the class {name}, which its module, {module}, does not have by this "
+            "name; expected one that others find, as module:Class: define it outside of functions"
+        )
+    return f"{module}:{name}"
 
 
 def _steps(duration: Given, config: Config) -> int:

@@ -20,6 +20,7 @@ from pipistrelle.experiments.runs.trial import Watch
 from pipistrelle.scripting.asking import (
     WORLD,
     Base,
+    Filters,
     base_layer,
     mission_settings,
     named_filters,
@@ -203,7 +204,7 @@ def run(
     /,
     *,
     strategies: str | Sequence[str] = "all",
-    filters: str | Sequence[str] = "ekf",
+    filters: Filters = "ekf",
     world: Path | str | None = None,
     beamwidth: float | None = None,
     landmarks: int | None = None,
@@ -224,8 +225,8 @@ def run(
     config : Config, mapping, or path of a TOML file, optional
         Settings to start from.
     strategies : "active", "fused", "passive", several of them, or "all"
-    filters : str
-        The name of an estimator, several of them, or "both", the paper's two.
+    filters : str or class
+        The name of an estimator or its class, several of them, or "both", the paper's two.
     world : Path, optional
         Folder of a world of one's own.
     beamwidth : [deg], optional
@@ -286,7 +287,7 @@ def slam(
     config: Base = None,
     robot: Robot | None = None,
     strategies: str | Sequence[str] = "fused",
-    filters: str | Sequence[str] = "ekf",
+    filters: Filters = "ekf",
     beamwidth: float | None = None,
     gate: float | None = None,
     output: Path | str | None = None,
@@ -308,8 +309,8 @@ def slam(
         Whose log, where there are several.
     strategies : "active", "fused", "passive", several of them, or "all"
         What is kept: only what has a range, all as it is, or only bearings.
-    filters : str
-        The name of an estimator, several of them, or "both", the paper's two.
+    filters : str or class
+        The name of an estimator or its class, several of them, or "both", the paper's two.
     beamwidth : [deg], optional
         Ranges outside a beam of this width about the heading are hidden.
     gate : float, optional
