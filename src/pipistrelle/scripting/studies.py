@@ -6,6 +6,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+from pipistrelle.config import InputError
 from pipistrelle.experiments.studies.plan import Plan
 from pipistrelle.experiments.studies.plan_file import FORMAT, find_plan, plan_of, read_plan
 from pipistrelle.experiments.studies.store import load_study
@@ -14,6 +15,9 @@ from pipistrelle.settings import from_keywords
 
 if TYPE_CHECKING:
     import polars as pl
+    from matplotlib.figure import Figure
+
+    from pipistrelle.report.page.summary import Answered
 
 SCORES = ("position_rmse_m", "position_rmse_aligned_m", "heading_rmse_rad", "map_rmse_m",
           "nees_mean", "landmarks_full", "position_bound_m")  # fmt: skip
@@ -69,6 +73,27 @@ class StudyResults:
         done = self.trials.filter(pl.col("status") == "done")
         return done.group_by(case, maintain_order=True).agg(pl.len().alias("worlds"), *means)
 
+    @property
+    def answer(self) -> list[str]:
+        """What the report answers to the study's question: a line, then sentences."""
+        return list(self._told.answer)
+
+    def figure(self) -> "Figure":
+        """Draw the first figure of the report: what is asked, by what is varied."""
+        from pipistrelle.figures.chart_plot import draw_chart
+        from pipistrelle.report.charts.results import study_charts
+
+        told = self._told
+        return draw_chart(study_charts(told.selections[told.rule])[0])
+
+    @cached_property
+    def _told(self) -> "Answered":
+        """The study, as the report reads it."""
+        from pipistrelle.report.page.summary import answered
+        from pipistrelle.report.reading import read_study
+
+        return answered(read_study(self.folder))
+
     def report(self, folder: Path | str | None = None) -> Path:
         """Put the study on one page, with its figures.
 
@@ -109,6 +134,8 @@ def study(
     *,
     iterations: int | None = None,
     workers: int = 1,
+    shard: tuple[int, int] = (0, 1),
+    scheduler: str | None = None,
     output: Path | str | None = None,
     progress: Callable[[StudyProgress], None] | None = None,
     **settings: Any,
@@ -124,6 +151,12 @@ def study(
     workers : int
         Processes. More than one are spawned, so a script must be guarded by
         ``if __name__ == "__main__"``; a notebook need not be.
+    shard : i, n
+        Only each n-th world, from world i on: of several calls that share an output, on machines
+        that share a disk, each does its part.
+    scheduler : str, optional
+        Of a Dask cluster: "local" for one that is made here, of so many workers, and guarded alike;
+        or the address of one that is there. Needs the extra ``cluster``.
     output : Path, optional
         The study's folder, which it goes on in; without one it is gone when what is returned is.
     progress : callable, optional
@@ -138,7 +171,8 @@ def study(
     Raises
     ------
     InputError
-        A plan that is refused, a folder of another study, or what a world is refused for.
+        A plan that is refused, a folder of another study, what a world is refused for, a share
+        that is none, or a cluster that cannot be had.
 
     Examples
     --------
@@ -146,6 +180,9 @@ def study(
     >>> study(levels, iterations=1, scenario={"steps": 8, "landmarks": 5}).trials.height
     6
     """
+    i, n = shard
+    if not 0 <= i < n:
+        raise InputError(f"shard: found {shard}, expected (i, n) with i from 0 to n - 1: (0, 4)")
     over = from_keywords(settings)
     if isinstance(plan, Mapping):
         tried = plan_of(_listed({"format": FORMAT, **plan}), over=over, iterations=iterations)
@@ -155,7 +192,8 @@ def study(
     if output is None:
         kept_by = TemporaryDirectory(prefix="pipistrelle-")
         output = kept_by.name
-    run_study(tried, Path(output), workers=workers, progress=progress)
+    where = {"workers": workers, "shard": (i, n), "scheduler": scheduler}
+    run_study(tried, Path(output), progress=progress, **where)
     return StudyResults(Path(output), kept_by)
 
 

@@ -1,0 +1,68 @@
+r"""
+The same on a cluster
+=====================
+
+A thousand worlds are too many for one laptop. They need nothing of each other, so they may be tried
+by as many machines as there are. But is what comes of it the same? Elsewhere it hangs on the number
+of workers, or on who was first. Here every random number is drawn by its seed, its world and its
+purpose: it cannot.
+"""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import matplotlib.pyplot as plt
+
+import pipistrelle
+from pipistrelle.figures.style import STRATEGY_COLOURS, STYLE, TRUTH
+
+# %%
+# A study as in :doc:`08_your_own_study`: does a louder beacon fill the map?
+
+plan = """
+format = 1
+name = "loud"
+iterations = 6
+strategies = ["fused"]
+filters = ["ekf"]
+config.scenario.steps = 160
+grid."beacon.level_db" = [36.0, 48.0]
+"""
+
+# %%
+# It is done three times. By one process. In three *shards*, each of which does every third world of
+# one folder: so do machines that share a disk, and ``pipistrelle study PLAN --shard 0/16 --emit
+# slurm`` prints the script that has SLURM do it. And by a Dask cluster (``pip install
+# 'pipistrelle[cluster]'``), here of two workers on this machine; elsewhere ``scheduler`` is the
+# address of yours, ``tcp://HOST:PORT``.
+#
+# Workers are processes, which import the script that starts them: what starts them stands under
+# ``if __name__ == "__main__"``.
+
+if __name__ == "__main__":
+    found = {}
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "loud.toml")
+        path.write_text(plan)
+        found["one process"] = pipistrelle.study(path).trials
+        for i in range(3):
+            part = pipistrelle.study(path, shard=(i, 3), output=Path(folder, "shards"))
+            print(f"shard {i}: {part.trials['iteration'].n_unique()} worlds are done")
+        found["three shards"] = part.trials
+        found["Dask"] = pipistrelle.study(path, scheduler="local", workers=2).trials
+
+    plt.rcParams.update(STYLE)
+    figure, axes = plt.subplots(figsize=(6.0, 3.2), layout="constrained")
+    marks = {"one process": (14, TRUTH), "three shards": (9, STRATEGY_COLOURS["passive"])}
+    for name, trials in found.items():
+        size, colour = marks.get(name, (4, STRATEGY_COLOURS["fused"]))
+        axes.plot(
+            trials["iteration"], trials["landmarks_full"], "o", ms=size, color=colour, label=name
+        )
+    axes.set(xlabel="world", ylabel="landmarks placed")
+    axes.legend()
+    plt.show()
+
+    tables = [t.drop("wall_s", "cpu_s").sort("iteration", "case") for t in found.values()]
+    answer = sum(not table.equals(tables[0]) for table in tables)
+    print(f"{answer} of {len(tables)} differ in any bit of {tables[0].width} columns")
