@@ -29,7 +29,8 @@ figure = done.figure()
 print(done.measurements.head(3))
 score = done.summary.row(0, named=True)
 print(f"{score['landmarks_full']} landmarks placed, {score['map_rmse_m']:.2f} m off")
-print(f"position {score['position_rmse_m']:.2f} m off, {score['position_rmse_aligned_m']:.2f} m aligned")
+for name in ("position_rmse_m", "position_rmse_aligned_m", "nees_mean"):
+    print(f"{name:<24} {score[name]:.2f}")
 
 # %%
 # The map is the right shape and turned as a whole: before its first scan the vehicle has already

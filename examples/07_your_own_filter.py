@@ -43,9 +43,9 @@ done = pipistrelle.run(
 figure = done.figure()
 
 # %%
-# The first NEES are alike, for nothing is heard before the first frame. Then ranges hold the map's
-# size; without them it drifts, and most posts stay rays. Dead reckoning knows that it knows little:
-# its errors are large, and in their band.
+# Ranges hold the size of the map; without them it drifts, most posts stay rays, and those that are
+# placed are far off: bearings of a narrow beam, all ahead, hardly cross. Dead reckoning knows that
+# it knows little: its errors are the largest, and within their band.
 #
 # How many times as far off is who does not listen?
 

@@ -14,8 +14,8 @@ import pipistrelle
 
 # %%
 # A *plan* is a file of settings, and of lists of values to combine: three worlds, nearly empty to
-# full, two strategies, one filter, that is six *cases*. All cases of an iteration are in one world,
-# with the same wheels and the same noise: it is compared with itself, and needs few to tell.
+# full, two strategies, one filter, that is six *cases*. The cases of an iteration share a drive, with
+# all slips of its wheels, and the strategies a recording: what is left to differ is what is asked.
 
 plan = """
 format = 1

@@ -52,15 +52,15 @@ if __name__ == "__main__":
         found["Dask"] = pipistrelle.study(path, scheduler="local", workers=2).trials
 
     plt.rcParams.update(STYLE)
-    figure, axes = plt.subplots(figsize=(6.0, 3.2), layout="constrained")
-    marks = {"one process": (14, TRUTH), "three shards": (9, STRATEGY_COLOURS["passive"])}
-    for name, trials in found.items():
-        size, colour = marks.get(name, (4, STRATEGY_COLOURS["fused"]))
-        axes.plot(
-            trials["iteration"], trials["landmarks_full"], "o", ms=size, color=colour, label=name
-        )
-    axes.set(xlabel="world", ylabel="landmarks placed")
-    axes.legend()
+    figure, axes = plt.subplots(figsize=(6.0, 3.4), layout="constrained")
+    sizes, colours = (14, 9, 4), (TRUTH, STRATEGY_COLOURS["passive"], STRATEGY_COLOURS["fused"])
+    for (name, trials), size, colour in zip(found.items(), sizes, colours, strict=True):
+        placed = trials["iteration"], trials["landmarks_full"]
+        axes.plot(*placed, "o", ms=size, color=colour, label=name)
+    for row in trials.filter(iteration=5).iter_rows(named=True):
+        axes.annotate(f"  {row['beacon.level_db']:.0f} dB", (5.15, row["landmarks_full"]))
+    axes.set(xlabel="world", ylabel="landmarks placed", xlim=(-0.3, 5.8))
+    figure.legend(loc="outside upper center", ncols=3)
     plt.show()
 
     tables = [t.drop("wall_s", "cpu_s").sort("iteration", "case") for t in found.values()]
