@@ -1,5 +1,6 @@
 """Settings of the documentation; `./dev docs` builds it, warnings as errors."""
 
+import os
 import re
 import sys
 from importlib import import_module
@@ -17,6 +18,7 @@ BENCHMARKS = ROOT / "benchmarks" / "latest.json"
 sys.path.insert(0, str(ROOT))
 
 mpl.use("Agg")
+os.environ["DASK_LOGGING__DISTRIBUTED"] = "warning"  # a tutorial starts a cluster
 
 project = "Pipistrelle"
 author = "The Pipistrelle developers"

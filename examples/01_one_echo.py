@@ -57,10 +57,12 @@ echo = Arrivals(
     caller=np.array([0], dtype=np.int8),
     landmark=np.array([1]),
 )
-settled, rng = sampling(config, callers_of(config, np.zeros(2))[:1]), np.random.default_rng(7)
+vehicle, _ = callers_of(config, np.zeros(2))
+settled, rng = sampling(config, [vehicle]), np.random.default_rng(7)
 blocks, layout = blocks_to_hear(echo, settled) + 30, square_of_four(config.receiver)
 samples = record_samples(blocks, echo, layout, settled, rng)
-call = {"tones": settled.tones, "rate": settled.rate, "length": settled.pulse * settled.block}
+length, rate = settled.pulse * settled.block, settled.rate
+call = {"tones": settled.tones, "rate": rate, "length": length}
 matched = filter_samples(samples, **call, noise_std=settled.noise_std)
 heard = {"microphone": samples[:, 0, 0], "matched filter": matched[:, 0, 0, 0]}
 
@@ -69,9 +71,9 @@ figure, (beam, *axes) = plt.subplots(3, figsize=(7.0, 5.0), layout="constrained"
 side, blue = np.linspace(-90.0, 90.0, 361), STRATEGY_COLOURS["active"]
 beam.plot(side, piston_directivity(np.radians(side), **piston) ** 2, color=blue)
 beam.plot(10.0, piston_directivity(angle, **piston) ** 2, "o", color=blue)
-beam.set(xlabel="angle off the axis [°]; dot: the post", ylabel="power sent", ylim=(0.0, None))
+beam.set(xlabel="angle off the axis [°]; dot: the post", ylabel="power sent", ylim=0.0)
 for panel, (name, signal) in zip(axes, heard.items(), strict=True):
-    time = 1e3 * (call["length"] + np.arange(signal.size)) / call["rate"]
+    time = 1e3 * (length + np.arange(signal.size)) / rate
     panel.plot(time, np.abs(signal), color=blue, lw=0.5)
     panel.axvline(1e3 * delay, color=TRUTH, ls=":", zorder=0)
     panel.set(ylabel=name, xlim=(0.0, 52.0), ylim=(0.0, None))
@@ -79,8 +81,10 @@ panel.set_xlabel("time since the call [ms]; dotted: the echo begins")
 plt.show()
 
 # %%
-# How high does the peak stand above the noise? (One microphone tells how far away the post is, not
-# where it is: :doc:`02_one_frame` asks forty.)
+# How high does the peak stand above the noise?
 
 answer = float(20.0 * np.log10(np.abs(heard["matched filter"]).max()))
 print(f"{answer:.1f} dB")
+
+# %%
+# One microphone tells how far away the post is, not where. :doc:`02_one_frame` asks forty.

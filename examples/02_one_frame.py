@@ -30,10 +30,11 @@ own, c = config.emitter, config.air.celerity
 # only: of that one it hears nothing but the beacon's echo. Number 4 is the beacon itself.
 
 pose, velocity = np.zeros(3), np.array([0.75, 0.0])
-landmarks, beacon = np.array([[6.0, 1.5], [4.0, -1.0], [-5.0, 3.0]]), np.array([9.0, 10.0])
-callers = callers_of(config, beacon)
+landmarks = np.array([[6.0, 1.5], [4.0, -1.0], [-5.0, 3.0]])
+callers = callers_of(config, beacon=np.array([9.0, 10.0]))
 arrivals = arrivals_of_emission(pose, velocity, landmarks, callers, config)
-arrivals = through_piston(arrivals, radius=own.radius, frequency=own.frequency, speed_of_sound=c)
+piston = {"radius": own.radius, "frequency": own.frequency, "speed_of_sound": c}
+arrivals = through_piston(arrivals, **piston)
 for i in np.argsort(arrivals.delay):
     print(
         f"{callers[arrivals.caller[i]].name:<7} landmark {arrivals.landmark[i]}: "
@@ -57,8 +58,8 @@ finder = detector(config, layout, settled.tones)
 found = detect(matched, finder, start=start, interval=1.0 / settled.rate, pulse=length)
 
 # %%
-# The front face. Where a call of one tone begins and ends it leaks into the other, 33 dB weaker but
-# above the threshold: the detector must know.
+# The front face; dots are detections. Where a call of one tone begins and ends it leaks into the
+# other, 33 dB weaker but above the threshold: the detector must know.
 
 plt.rcParams.update(STYLE)
 figure, axes = plt.subplots(figsize=(8.0, 3.2), layout="constrained")
@@ -66,11 +67,11 @@ energy = np.sum(np.abs(matched[:, 0]) ** 2, axis=-1)
 lag = 1e3 * (start + np.arange(len(matched)) / settled.rate)
 for tone, strategy in enumerate(("active", "passive")):
     here, colour = (found.face == 0) & (found.caller == tone), STRATEGY_COLOURS[strategy]
-    label = f"{callers[tone].name}, {callers[tone].frequency / 1e3:.0f} kHz; dots: detections"
+    label = f"{callers[tone].name}, {callers[tone].frequency / 1e3:.0f} kHz"
     axes.semilogy(lag, energy[:, tone], color=colour, lw=0.8, label=label)
     axes.plot(1e3 * found.delay[here], found.power[here], "o", color=colour)
 axes.axhline(finder.threshold, color="black", ls=":", lw=1.0, label="threshold")
-axes.set(xlabel="time since the calls [ms]", ylabel="energy of ten microphones", ylim=(1.0, None))
+axes.set(xlabel="time since the calls [ms]", ylabel="energy of ten microphones", ylim=1.0)
 figure.legend(loc="outside upper center", ncols=3)
 plt.show()
 

@@ -25,21 +25,22 @@ figure = done.figure()
 
 for score in done.summary.iter_rows(named=True):
     print(
-        f"{score['strategy']:<8} {score['measurements_per_frame']:4.1f} measurements a frame, "
-        f"{score['landmarks_full']} landmarks placed; position {score['position_rmse_m']:.2f} m "
-        f"off, aligned {score['position_rmse_aligned_m']:.2f} m"
+        f"{score['strategy']:<8}"
+        f"{score['measurements_per_frame']:5.1f} measurements a frame, "
+        f"{score['landmarks_full']} landmarks placed, "
+        f"position {score['position_rmse_m']:.2f} m off"
     )
 
 # %%
 # Six times as many measurements, a fuller map, and yet, in this world, no better track: a bearing
-# says less than a range, and the filter, too sure of what bearings tell it, takes up a turn that
-# it never made. :doc:`/estimators` has one that does not. Whether listening makes a *better* map
-# is no question for one world; :doc:`08_your_own_study` asks several.
+# says less than a range, and this filter trusts bearings too much. :doc:`/estimators` has one that
+# is less easily misled. Whether listening makes a *better* map is no question for one world;
+# :doc:`08_your_own_study` asks several.
 #
 # How many landmarks has the fused vehicle heard of that its own calls never found?
 
 heard = done.landmarks.drop_nulls("x_m")
-known = {strategy: set(rows["landmark"]) for (strategy,), rows in heard.group_by("strategy")}
+known = {way: set(rows["landmark"]) for (way,), rows in heard.group_by("strategy")}
 answer = len(known["fused"] - known["active"])
 print(answer)
 

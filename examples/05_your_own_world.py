@@ -18,7 +18,7 @@ import pipistrelle
 # settings that belong to the place, and who calls: instead of the beacon, a mate behind the wall.
 
 posts = [(x, y) for x in (-10, -6, -2, 2, 6, 10) for y in (-2.5, 2.5)]
-rows = [f"{i},{x},{y},{0.2 if i == 7 else 0.025}" for i, (x, y) in enumerate(posts, start=1)]
+rows = [f"{i},{x},{y},{0.2 if i == 7 else 0.025}" for i, (x, y) in enumerate(posts, 1)]
 files = {
     "landmarks.csv": "\n".join(["landmark,x,y,radius", *rows]),
     "path.csv": "x,y\n-11,-0.7\n11,-0.7\n11,0.7\n-11,0.7\n",
@@ -43,7 +43,8 @@ place = [0.0, 9.0]
 with TemporaryDirectory() as folder:
     for name, text in files.items():
         Path(folder, name).write_text(text)
-    done = pipistrelle.run(world=folder, strategies=["active", "fused"], motion__steering_std=0.02)
+    heard = ["active", "fused"]
+    done = pipistrelle.run(world=folder, strategies=heard, motion__steering_std=0.02)
 figure = done.figure()
 
 # %%

@@ -37,9 +37,8 @@ class BearingsOnly(EkfSlam):
 # %%
 # Beside the EKF they map the world of :doc:`03_one_mission`, from one and the same recording.
 
-done = pipistrelle.run(
-    seed=7, strategies="active", filters=["ekf", BearingsOnly, DeadReckoning], duration=62.5
-)
+filters = ["ekf", BearingsOnly, DeadReckoning]
+done = pipistrelle.run(seed=7, strategies="active", filters=filters, duration=62.5)
 figure = done.figure()
 
 # %%

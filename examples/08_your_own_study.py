@@ -9,13 +9,14 @@ to need someone else's calls?
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from textwrap import fill
 
 import pipistrelle
 
 # %%
-# A *plan* is a file of settings, and of lists of values to combine: three worlds, nearly empty to
-# full, two strategies, one filter, that is six *cases*. The cases of an iteration share a drive, with
-# all slips of its wheels, and the strategies a recording: what is left to differ is what is asked.
+# A *plan* is a file of settings, and of lists of values to combine: three numbers of posts, two
+# strategies, one filter, that is six *cases*. The cases of an iteration share a drive, with all
+# slips of its wheels, and the strategies a recording: what differs is what is asked.
 
 plan = """
 format = 1
@@ -43,7 +44,7 @@ figure = tried.figure()
 # ``tried.report()`` writes as a page, say it in words:
 
 for line in tried.answer:
-    print(line)
+    print(fill(line, 88))
 
 # %%
 # The vehicle's own echoes want posts. Someone else's calls are a landmark by themselves, that is
@@ -52,8 +53,8 @@ for line in tried.answer:
 # What does listening gain where five posts stand?
 
 few = tried.trials.filter(tried.trials["scenario.landmarks"] == 5)
-active, fused = (few.filter(strategy=way)["position_rmse_m"] for way in ("active", "fused"))
-gain = active - fused
+error = {way: rows["position_rmse_m"] for (way,), rows in few.group_by("strategy")}
+gain = error["active"] - error["fused"]
 answer = gain.mean()
 print(f"{answer:.2f} m, ± {gain.std() / len(gain) ** 0.5:.2f} m, in {len(gain)} worlds")
 

@@ -53,8 +53,8 @@ if __name__ == "__main__":
 
     plt.rcParams.update(STYLE)
     figure, axes = plt.subplots(figsize=(6.0, 3.4), layout="constrained")
-    sizes, colours = (14, 9, 4), (TRUTH, STRATEGY_COLOURS["passive"], STRATEGY_COLOURS["fused"])
-    for (name, trials), size, colour in zip(found.items(), sizes, colours, strict=True):
+    looks = (14, TRUTH), (9, STRATEGY_COLOURS["passive"]), (4, STRATEGY_COLOURS["fused"])
+    for (name, trials), (size, colour) in zip(found.items(), looks, strict=True):
         placed = trials["iteration"], trials["landmarks_full"]
         axes.plot(*placed, "o", ms=size, color=colour, label=name)
     for row in trials.filter(iteration=5).iter_rows(named=True):

@@ -13,6 +13,7 @@ import pytest
 import pipistrelle
 from pipistrelle import Config, InputError
 from pipistrelle.__main__ import main
+from pipistrelle.estimation.ekf.filter import EkfSlam
 
 SHORT = {"duration": 4.0, "landmarks": 10}
 LOG = Path(__file__).parents[1] / "data" / "unicycle_log"
@@ -181,3 +182,35 @@ def test_importing_the_package_loads_no_numpy_and_lists_its_doors():
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert ran.stdout.startswith("[] ['Config', 'InputError', '__version__', 'load', 'run', 'slam'")
     assert "module 'pipistrelle' has no attribute 'nothing'" in ran.stderr
+
+
+class Deaf(EkfSlam):
+    """The EKF that hears nothing."""
+
+    def update(self, belief, scan, rng=None):
+        return belief
+
+
+def test_a_filter_may_be_a_class_and_goes_by_its_name(done):
+    found = pipistrelle.run(**SHORT, strategies="fused", filters=["ekf", Deaf], output="one")
+    name = f"{Deaf.__module__}:Deaf"
+    assert found.summary["filter"].to_list() == ["ekf", name]
+    assert found.summary["landmarks_full"][1] == 0 < found.summary["landmarks_full"][0]
+    assert Path("one/track_fused_Deaf.tum").exists()
+    alone = pipistrelle.slam(LOG, filters=Deaf)
+    assert alone.summary["filter"].to_list() == [name]
+    again = pipistrelle.load("one")
+    assert again.tracks.equals(found.tracks)
+
+
+def test_a_class_that_nobody_else_finds_is_refused():
+    class Hidden(Deaf):
+        """Of this function alone."""
+
+    with pytest.raises(InputError, match="define it outside of functions"):
+        pipistrelle.run(**SHORT, filters=Hidden)
+    for wrong in (3, None, ["ekf", 3], [Deaf, object()]):
+        with pytest.raises(InputError, match="expected an estimator's name or its class"):
+            pipistrelle.run(**SHORT, filters=wrong)
+    with pytest.raises(InputError, match="lacks init, predict, update"):
+        pipistrelle.run(**SHORT, filters=int)

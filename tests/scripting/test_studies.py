@@ -1,5 +1,6 @@
 """Studies from Python: the command line's tables, in a folder of one's own or a passing one."""
 
+import json
 import sys
 import tomllib
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 import pipistrelle
 from pipistrelle import InputError
 from pipistrelle.__main__ import main
+from pipistrelle.scripting import studies
 from reference.studies import SMALL
 
 FEW = {"scenario": {"steps": 8, "landmarks": 5}}
@@ -89,3 +91,34 @@ def test_its_report_is_a_page():
     page = found.report("page")
     assert page == Path("page/index.html")
     assert "<h1" in page.read_text()
+
+
+def test_it_answers_and_draws_as_its_report_does():
+    found = pipistrelle.study("small.toml", output="s")
+    summary = json.loads((found.report().parent / "summary.json").read_text())
+    assert found.answer == summary["answer"]
+    assert "beam" in found.answer[0]
+    titles = [axes.get_title(loc="left") for axes in found.figure().axes]
+    assert "position error" in titles
+
+
+def test_shards_on_one_folder_and_a_cluster_do_the_whole(monkeypatch):
+    whole = pipistrelle.study("small.toml").trials.drop(TIMES)
+    for i, done in ((1, {1}), (0, {0, 1, 2})):
+        part = pipistrelle.study("small.toml", shard=(i, 2), output="s")
+        assert set(part.trials["iteration"]) == done
+    assert part.trials.drop(TIMES).equals(whole)
+    asked = []
+    monkeypatch.setattr(studies, "run_study", lambda *a, **k: asked.append(k))
+    with pytest.raises(InputError):  # nothing was done
+        pipistrelle.study("small.toml", scheduler="tcp://here:1", workers=3, output="t")
+    assert [(k["scheduler"], k["workers"], k["shard"]) for k in asked] == [
+        ("tcp://here:1", 3, (0, 1))
+    ]
+
+
+@pytest.mark.parametrize("shard", [(2, 2), (-1, 2), (0, 0), (0.5, 2), "0/2", (1,), None])
+def test_a_share_that_is_none_is_refused(shard):
+    with pytest.raises(InputError, match=r"shard: found .*, expected \(i, n\)"):
+        pipistrelle.study("small.toml", shard=shard, output="s")
+    assert not Path("s").exists()

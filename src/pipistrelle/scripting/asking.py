@@ -4,7 +4,7 @@ Words come from a command line or from Python; where each was given is said in i
 """
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from math import isfinite, radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -190,7 +190,8 @@ def named_filters(chosen: Filters) -> tuple[str, ...]:
     Raises
     ------
     InputError
-        For an estimator that is not there, or two of one short name.
+        For an estimator that is not there, a class that others would not find, or two of one short
+        name.
 
     Examples
     --------
@@ -200,18 +201,21 @@ def named_filters(chosen: Filters) -> tuple[str, ...]:
     >>> named_filters(EkfSlam)
     ('pipistrelle.estimation.ekf.filter:EkfSlam',)
     """
-    if isinstance(chosen, (str, type)):
+    if isinstance(chosen, (str, type)) or not isinstance(chosen, Iterable):
         chosen = PAPERS if chosen == "both" else (chosen,)
-    named = (_name_of(one) if isinstance(one, type) else one for one in chosen)
-    names = tuple(dict.fromkeys(named))
+    names = tuple(dict.fromkeys(map(_name_of, chosen)))
     for name in names:
         entry(name)
     check_distinct(names, "filters")
     return names
 
 
-def _name_of(kind: type) -> str:
-    """Return the name by which workers and folders find a class, ``module:Class``."""
+def _name_of(kind: str | type) -> str:
+    """Return the name by which workers and folders find an estimator: of a class, module:Class."""
+    if isinstance(kind, str):
+        return kind
+    if not isinstance(kind, type):
+        raise InputError(f"filters: found {shown(kind)}, expected an estimator's name or its class")
     module, name = kind.__module__, kind.__qualname__
     if getattr(sys.modules.get(module), name, None) is not kind:
         raise InputError(

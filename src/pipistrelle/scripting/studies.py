@@ -11,6 +11,7 @@ from pipistrelle.experiments.studies.plan import Plan
 from pipistrelle.experiments.studies.plan_file import FORMAT, find_plan, plan_of, read_plan
 from pipistrelle.experiments.studies.store import load_study
 from pipistrelle.experiments.studies.study import StudyProgress, run_study
+from pipistrelle.refusals import shown
 from pipistrelle.settings import from_keywords
 
 if TYPE_CHECKING:
@@ -36,6 +37,8 @@ class StudyResults:
     >>> few = pipistrelle.study("physics", iterations=1, scenario=short)
     >>> few.trials.height, few.summary.height
     (50, 50)
+    >>> few.answer[0]
+    'Not decided: no world is left.'
     """
 
     def __init__(self, folder: Path, kept_by: "TemporaryDirectory[str] | None" = None) -> None:
@@ -180,10 +183,7 @@ def study(
     >>> study(levels, iterations=1, scenario={"steps": 8, "landmarks": 5}).trials.height
     6
     """
-    i, n = shard
-    if not 0 <= i < n:
-        raise InputError(f"shard: found {shard}, expected (i, n) with i from 0 to n - 1: (0, 4)")
-    over = from_keywords(settings)
+    share, over = _share(shard), from_keywords(settings)
     if isinstance(plan, Mapping):
         tried = plan_of(_listed({"format": FORMAT, **plan}), over=over, iterations=iterations)
     else:
@@ -192,7 +192,7 @@ def study(
     if output is None:
         kept_by = TemporaryDirectory(prefix="pipistrelle-")
         output = kept_by.name
-    where = {"workers": workers, "shard": (i, n), "scheduler": scheduler}
+    where = {"workers": workers, "shard": share, "scheduler": scheduler}
     run_study(tried, Path(output), progress=progress, **where)
     return StudyResults(Path(output), kept_by)
 
@@ -204,3 +204,12 @@ def _listed(value: Any) -> Any:
     if hasattr(value, "tolist"):
         return value.tolist()
     return [*map(_listed, value)] if isinstance(value, (list, tuple)) else value
+
+
+def _share(given: object) -> tuple[int, int]:
+    """Check which share of the worlds is asked for."""
+    match given:
+        case (int(i), int(n)) if 0 <= i < n:
+            return i, n
+    expected = "(i, n) with i from 0 to n - 1, as in (0, 4)"
+    raise InputError(f"shard: found {shown(given)}, expected {expected}")
