@@ -38,22 +38,22 @@ account = {
     "absorption": -propagation.absorption_db_per_m(tone, **air) * 2.0 * distance,
     "beam": 20.0 * np.log10(piston_directivity(angle, **piston)),
 }
-closing = speed * np.cos(angle)
-heard_tone = propagation.doppler_frequency(
-    tone, receiver_speed=closing, source_speed=closing, speed_of_sound=c
-)
+closing = dict.fromkeys(("receiver_speed", "source_speed"), speed * np.cos(angle))
+heard_tone = propagation.doppler_frequency(tone, **closing, speed_of_sound=c)
 delay, level_db = 2.0 * distance / c, sum(account.values())
 print(*(f"{name} {part:.1f} dB" for name, part in account.items()), sep=", ")
-print(f"after {1e3 * delay:.1f} ms, {heard_tone - tone:.0f} Hz too high: {level_db:.1f} dB")
+print(f"after {1e3 * delay:.1f} ms, {heard_tone - tone:+.0f} Hz: {level_db:.1f} dB")
 
 # %%
 # The *matched filter* knows what was called. It adds the 560 samples of a call's 2.8 ms up, each
-# turned as the call was; the echo grows, noise hardly does. That gains 10 log 560 = 27.5 dB. Who
+# turned as the call was; the echo grows, noise hardly does. That gains 10 log₁₀ 560 = 27.5 dB. Who
 # drives towards an echo hears it higher than it was called, and loses some of that: here 2.7 dB.
 
-columns = {"delay": delay, "level_db": level_db, "bearing": angle, "frequency": heard_tone}
 echo = Arrivals(
-    **{name: np.array([value]) for name, value in columns.items()},
+    delay=np.array([delay]),
+    level_db=np.array([level_db]),
+    bearing=np.array([angle]),
+    frequency=np.array([heard_tone]),
     caller=np.array([0], dtype=np.int8),
     landmark=np.array([1]),
 )

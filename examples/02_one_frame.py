@@ -50,7 +50,8 @@ for i in np.argsort(arrivals.delay):
 
 layout, settled = square_of_four(config.receiver), sampling(config, callers)
 rng = np.random.default_rng(config.seed)
-samples = record_samples(blocks_to_hear(arrivals, settled), arrivals, layout, settled, rng)
+blocks = blocks_to_hear(arrivals, settled)
+samples = record_samples(blocks, arrivals, layout, settled, rng)
 length, start = settled.pulse * settled.block, settled.pulse * BLOCK
 call = {"tones": settled.tones, "rate": settled.rate, "length": length}
 matched = filter_samples(samples, **call, noise_std=settled.noise_std)

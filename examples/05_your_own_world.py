@@ -13,8 +13,8 @@ from tempfile import TemporaryDirectory
 import pipistrelle
 
 # %%
-# ``landmarks.csv`` says what reflects; a column more, and one post is a drum of 20 cm that is much
-# louder. ``path.csv`` here has way-points, for which a driver steers. ``world.toml`` has the
+# ``landmarks.csv`` says what reflects; a column more, and one post is a drum, 20 cm in radius and
+# much louder. ``path.csv`` here has way-points, for which a driver steers. ``world.toml`` has the
 # settings that belong to the place, and who calls: instead of the beacon, a mate behind the wall.
 
 posts = [(x, y) for x in (-10, -6, -2, 2, 6, 10) for y in (-2.5, 2.5)]

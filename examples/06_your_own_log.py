@@ -54,7 +54,7 @@ range_bounds = [0.5, 12.0]""",
     "measurements.csv": "\n".join(["time,landmark,bearing,range", *measured]),
     "truth.csv": "\n".join(["time,x,y,heading", *truth]),
     "landmarks.csv": "\n".join(
-        ["landmark,x,y", *(f"{i},{z.real},{z.imag}" for i, z in enumerate(posts, start=1))]
+        ["landmark,x,y", *(f"{i},{z.real},{z.imag}" for i, z in enumerate(posts, 1))]
     ),
 }
 with TemporaryDirectory() as folder:
