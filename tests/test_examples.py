@@ -146,6 +146,8 @@ def test_dead_reckoning_is_as_far_off_as_what_was_commanded(play):
     off = np.sqrt(np.mean(np.sum(np.square(reckoned - truth), axis=1)))
     assert done["error"]["__main__:DeadReckoning"] == pytest.approx(off, rel=1e-9)
     assert done["answer"] == pytest.approx(off / done["error"]["ekf"])
+    rays = done["done"].landmarks.filter(status="partial")["filter"].unique().to_list()
+    assert rays == ["__main__:BearingsOnly"]
     ranges = done["done"].measurements["range_m"]
     assert ranges.null_count() == 0, "what one filter forgets, the others are given"
 
@@ -170,10 +172,20 @@ def test_listening_gains_where_posts_are_few_and_not_where_they_are_many(play):
     )
 
 
-def test_one_process_shards_and_a_cluster_find_the_same(play, tmp_path_factory):
-    pytest.importorskip("distributed", reason="Dask is not installed: the extra [cluster]")
+def test_one_process_shards_and_a_cluster_find_the_same(play, tmp_path_factory, monkeypatch):
+    """The cluster's workers are threads, which start at once; the docs' build starts processes."""
+    dask = pytest.importorskip("distributed", reason="Dask is not installed: the extra [cluster]")
+    started = []
+
+    def in_threads(**asked):
+        started.append(asked["n_workers"])
+        return local(**asked, processes=False)
+
+    local = dask.LocalCluster
+    monkeypatch.setattr(dask, "LocalCluster", in_threads)
     done = play("09_on_a_cluster")
     assert done["answer"] == 0
+    assert started == [2]
     assert [table.height for table in done["tables"]] == [12, 12, 12]
     plan = tmp_path_factory.mktemp("control") / "loud.toml"
     plan.write_text(done["plan"])
