@@ -31,7 +31,7 @@ distance, angle, speed = 8.0, np.radians(10.0), 0.75
 # counted in the call's level; 0 dB is the noise in a sample of a microphone. The echo is below it.
 
 piston = {"radius": config.emitter.radius, "frequency": tone, "speed_of_sound": c}
-air = config.air.model_dump(include={"temperature_c", "relative_humidity", "pressure_kpa"})
+air = config.air.model_dump(exclude={"speed_of_sound", "spreading"})
 account = {
     "call": config.emitter.level_db,
     "spreading": -propagation.spreading_loss_db(2.0 * distance, ways=2),

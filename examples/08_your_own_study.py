@@ -44,7 +44,7 @@ figure = tried.figure()
 # ``tried.report()`` writes as a page, say it in words:
 
 for line in tried.answer:
-    print(fill(line, 88))
+    print(fill(line, 84))
 
 # %%
 # The vehicle's own echoes want posts. Someone else's calls are a landmark by themselves, that is
