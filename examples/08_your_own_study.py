@@ -7,35 +7,25 @@ to many worlds, and answered with error bars. Here is one: how sparse must a wor
 to need someone else's calls?
 """
 
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from textwrap import fill
 
 import pipistrelle
 
 # %%
-# A *plan* is a file of settings, and of lists of values to combine: three numbers of posts, two
+# A *plan* is a table of settings, and of lists of values to combine: three numbers of posts, two
 # strategies, one filter, that is six *cases*. The cases of an iteration share a drive, with all
-# slips of its wheels, and the strategies a recording: what differs is what is asked.
+# slips of its wheels, and the strategies a recording: what differs is what is asked. (In a file,
+# the same table is for ``pipistrelle study sparse.toml``.)
 
-plan = """
-format = 1
-name = "sparse"
-iterations = 12
-strategies = ["active", "fused"]
-filters = ["iekf"]
-
-[config]
-filter.noise = "measured"
-scenario.steps = 320
-
-[grid]
-"scenario.landmarks" = [5, 15, 45]
-"""
-with TemporaryDirectory() as folder:
-    path = Path(folder, "sparse.toml")
-    path.write_text(plan)
-    tried = pipistrelle.study(path)
+sparse = {
+    "name": "sparse",
+    "iterations": 12,
+    "strategies": ["active", "fused"],
+    "filters": ["iekf"],
+    "config": {"filter": {"noise": "measured"}, "scenario": {"steps": 320}},
+    "grid": {"scenario.landmarks": [5, 15, 45]},
+}
+tried = pipistrelle.study(sparse)
 figure = tried.figure()
 
 # %%
