@@ -30,9 +30,10 @@ DRIVE = drive_of(WORLD, SETTINGS)
 PLACES = standing_landmarks(WORLD)
 
 
-def heard(strategy):
+def heard(strategy, noise="constant"):
     (frames,) = listen(WORLD, SETTINGS, [0.0025])
-    return scans_of(frames, strategy, SETTINGS)
+    told = SETTINGS.filter.model_copy(update={"noise": noise})
+    return scans_of(frames, strategy, SETTINGS.model_copy(update={"filter": told}))
 
 
 def bound_of(scans, *, motion=DRIVE.motion, places=PLACES):
@@ -50,6 +51,8 @@ def conditioned_bound(scans, last):
     spread = np.zeros((poses, noise))
     for k in range(1, last + 1):
         _, F, U = moved(DRIVE.motion, WORLD.path[k - 1], DRIVE.controls[k - 1], STEP)
+        dx, dy = WORLD.path[k, :2] - WORLD.path[k - 1, :2]  # truly, not as commanded
+        F[0, 2], F[1, 2] = -dy, dx
         spread[3 * k : 3 * k + 3] = F @ spread[3 * k - 3 : 3 * k]
         spread[3 * k : 3 * k + 3, 2 * k - 2 : 2 * k] = U * DRIVE.motion.control_std
     C = np.zeros((poses + places.size, poses + places.size))
@@ -80,6 +83,16 @@ def test_the_bound_is_the_prior_of_everything_given_everything_heard_at_once(str
     bound = bound_of(scans)
     for k in (EVERY, 18, STEPS):
         np.testing.assert_allclose(bound[k], conditioned_bound(scans, k), rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("strategy", ["active", "fused", "passive"])
+def test_a_heading_once_lost_is_never_known_again(strategy):
+    """What is heard is relative to the vehicle: of how it stood in the world it tells nothing."""
+    scans = heard(strategy, "measured")
+    first = round(min(scan.time for scan in scans if len(scan.landmark)) / STEP)
+    heading = bound_of(scans)[:, 2, 2]
+    assert heading[first] > 0.01**2
+    assert np.all(heading[first:] >= heading[first] * (1.0 - 1e-3))
 
 
 def test_a_drive_told_by_poses_has_the_same_bound():

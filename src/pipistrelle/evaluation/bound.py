@@ -25,10 +25,9 @@ from pipistrelle.estimation.ekf.gaussian import (
     correct_bearing,
     flush,
     joint_of,
-    propagate,
 )
 from pipistrelle.estimation.measurement import NEAREST, observe
-from pipistrelle.estimation.motion import Motion, MotionNumbers, motion_numbers
+from pipistrelle.estimation.motion import Motion, MotionNumbers, motion_numbers, propagate_pose
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 PRIOR_STD = 20.0
@@ -47,7 +46,10 @@ def pose_bound(
 
     .. math:: \bar P = F P F^T + U Q U^T, \qquad P^{-1} = \bar P^{-1} + H^T R^{-1} H
 
-    with F, U and H at the truth.
+    with F, U and H at the truth: F holds the way that the vehicle truly went in a step, not the one
+    that it was commanded. A whole path with its landmarks may be turned, and nothing that is heard
+    of it changes; with any other F the noise of the path would tell of a heading that nothing
+    tells.
 
     Parameters
     ----------
@@ -115,6 +117,22 @@ def _correct(
         correct_bearing(joint, size, i, angle, across, np.inf)
 
 
+@no_alloc
+def _carry(
+    covariance: Float[np.ndarray, "n _"], dx: float, dy: float, noise: Float[np.ndarray, "3 3"]
+) -> None:
+    """Carry a covariance through a step of (dx, dy), in place: F C F^T, and the noise."""
+    for j in range(covariance.shape[0]):
+        covariance[0, j] -= dy * covariance[2, j]
+        covariance[1, j] += dx * covariance[2, j]
+    for i in range(covariance.shape[0]):
+        covariance[i, 0] -= dy * covariance[i, 2]
+        covariance[i, 1] += dx * covariance[i, 2]
+    for a in range(3):
+        for b in range(3):
+            covariance[a, b] += noise[a, b]
+
+
 @kernel
 def _bound(
     path: Float[np.ndarray, "t 3"],
@@ -136,14 +154,11 @@ def _bound(
     joint.W[:] = 0.0  # the state grows into columns that wait
     bound = np.zeros((path.shape[0], 3, 3))
     steps, slots = row
-    stepped, spread = np.empty((1, 3)), np.empty((1, 3, 3))
+    pose, noise = np.empty(3), np.empty((3, 3))
     for k in range(1, path.shape[0]):
-        for a in range(3):
-            joint.mean[a] = path[k - 1, a]
-        propagate(
-            joint.mean, joint.covariance, controls[k - 1 : k], dt[k - 1 : k], motion,
-            stepped, spread,
-        )  # fmt: skip
+        pose[:], noise[:] = path[k - 1], 0.0
+        propagate_pose(pose, noise, controls[k - 1], dt[k - 1], motion)
+        _carry(joint.covariance, path[k, 0] - path[k - 1, 0], path[k, 1] - path[k - 1, 1], noise)
         for a in range(3):
             joint.mean[a] = path[k, a]
         while m < steps.size and steps[m] <= k:
