@@ -5,8 +5,9 @@ Only worlds that are whole are read: those whose file of trials stands.
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
-from math import degrees
+from math import degrees, isclose
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,6 +48,9 @@ from pipistrelle.report.variables import (
 
 if TYPE_CHECKING:
     import polars as pl
+
+SAME = 1e-4
+"""Share by which a value may differ from the truth and be meant to be it: 337.1 m/s at 10 °C."""
 
 
 def read_study(folder: Path) -> Study:
@@ -108,6 +112,26 @@ def _variables(plan: Plan) -> tuple[Variable, ...]:
                 variable = beam_variable(RADIUS, values, widths)
         found.append(variable)
     return tuple(found)
+
+
+def _against_truth(variable: Variable, configs: Sequence[Config]) -> Variable:
+    """Compare what may be assumed, or a bias, with the truth, if it is one and among the values."""
+    truths = {_truth(variable.setting, config) for config in configs}
+    truth = truths.pop() if len(truths) == 1 else None
+    if truth is None or variable.numbers is None:
+        return variable
+    near = [i for i, one in enumerate(variable.numbers) if isclose(one, truth, rel_tol=SAME)]
+    return replace(variable, base=near[0]) if len(near) == 1 else variable
+
+
+def _truth(setting: str, config: Config) -> float | None:
+    """Return what a setting is where nothing is assumed wrongly, if it is one of those."""
+    section, _, name = setting.partition(".")
+    if setting == "assumed.speed_of_sound":
+        return config.air.celerity
+    if section == "assumed":
+        return float(getattr(config.motion, name))
+    return 0.0 if section == "motion" and name.endswith("_bias") else None
 
 
 def _degrees(config: Config) -> float:
@@ -177,6 +201,7 @@ def _study(
     variables = _variables(plan)
     settings = _combinations(plan, variables)
     configs = tuple(common(plan, values) for values in settings)
+    variables = tuple(_against_truth(variable, configs) for variable in variables)
     worlds = np.unique(trials["iteration"].to_numpy())
     cases = trials.select("case", "filter", "strategy").unique().sort("case")
     numbers = _numbers(plan, cases, variables)

@@ -39,6 +39,9 @@ class Variable:
         Of a CSV.
     meaning : str
         What the setting says of itself.
+    base : int
+        Which of the values the others are compared with: the truth, where the setting is what is
+        assumed of it and the truth is among them; else the first.
     """
 
     name: str
@@ -49,6 +52,7 @@ class Variable:
     label: str
     column: str
     meaning: str
+    base: int = 0
 
 
 def setting_variable(setting: str, values: Sequence[Any]) -> Variable:
@@ -227,6 +231,27 @@ def places(variable: Variable) -> Float[np.ndarray, " k"]:
     if variable.numbers is None:
         return np.arange(len(variable.given), dtype=np.float64)
     return np.array(variable.numbers)
+
+
+def two_sided(variable: Variable) -> bool:
+    """Tell whether numbers lie on either side of the one that they are compared with.
+
+    Parameters
+    ----------
+    variable : Variable
+
+    Returns
+    -------
+    bool
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> sound = setting_variable("assumed.speed_of_sound", [337.0, 343.0, 349.0])
+    >>> [two_sided(replace(sound, base=base)) for base in range(3)]
+    [False, True, False]
+    """
+    return variable.numbers is not None and 0 < variable.base < len(variable.given) - 1
 
 
 def geometric(numbers: Sequence[float]) -> bool:

@@ -55,7 +55,9 @@ def effect_charts(selection: Selection) -> list[Chart]:
     charts = []
     for (factor, whose), family in families.items():
         variable = next((v for v in study.variables if v.name == factor), None)
-        words = (family[0].contrast.before, *dict.fromkeys(e.contrast.after for e in family))
+        first = family[0].contrast.before
+        words = (first, *dict.fromkeys(effect.contrast.after for effect in family))
+        words = variable.words if variable else words
         axis = axis_of(variable) if variable else axis_of_words(words)
         at = dict(zip(words, places(variable) if variable else range(len(words)), strict=True))
         title = titles.get(whose, f"{whose} sensing")
@@ -63,7 +65,7 @@ def effect_charts(selection: Selection) -> list[Chart]:
             Chart(
                 name=f"effect_{slug(factor)}_{slug(whose)}",
                 title=f"What {'the ' * ('.' not in factor)}{factor} changes, {title}",
-                caption=_caption(family, words[0]),
+                caption=_caption(family, first),
                 panels=tuple(_panel(measure, family, axis, at) for measure in MEASURES),
                 columns=(variable.column if variable else factor, "change"),
             )
@@ -159,7 +161,7 @@ def _changes(
     at: Mapping[str, float],
     effects: Sequence[Effect],
 ) -> Series:
-    """Return the differences of one strategy, from none at the first value on."""
+    """Return the differences of one strategy, none at the value that others are compared with."""
     measure, findings = effects[0].measure, [effect.finding for effect in effects]
     mean, edges = _bars(findings)
     mean, edges = np.append(0.0, mean), np.vstack(([np.nan, np.nan], edges))
@@ -170,7 +172,10 @@ def _changes(
     x = np.array([at[effects[0].contrast.before], *(at[e.contrast.after] for e in effects)])
     shown = [True, *(finding.holds is not None for finding in findings)]
     x = beside(axis, x.astype(np.float64), strategy, among, far=1.0 if axis.words else 3.0)
-    return about(strategy or "difference", strategy or "ink", x, mean, edges, shown)
+    rising = np.argsort(x)
+    shown = [shown[i] for i in rising]
+    name, role = strategy or "difference", strategy or "ink"
+    return about(name, role, x[rising], mean[rising], edges[rising], shown)
 
 
 def _bars(findings: Iterable[Finding]) -> tuple[np.ndarray, np.ndarray]:

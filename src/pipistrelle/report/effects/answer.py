@@ -22,7 +22,7 @@ from pipistrelle.report.effects.wording import (
 )
 from pipistrelle.report.numbers import listed
 from pipistrelle.report.studied import Rule, Selection, Study, filter_titles
-from pipistrelle.report.variables import BEAM, Variable
+from pipistrelle.report.variables import BEAM, Variable, two_sided
 
 HEADLINE: Rule = "none"
 """What the answer leaves out: nothing, for what a setting makes diverge is part of what it does."""
@@ -132,7 +132,7 @@ def _headline(
         return f"nothing that was heard depends on {the(variable)}"
     if few := _few(ends):
         return few
-    several = variable.numbers is None and len(variable.given) > 2
+    several = two_sided(variable) or (variable.numbers is None and len(variable.given) > 2)
     if said := _by_value(variable, ends) if several else _by_direction(study, variable, ends):
         return said
     if any(effect.measure is FIRST and direction(effect.finding) for effect in mine):
@@ -152,13 +152,13 @@ def _few(effects: Sequence[Effect]) -> str:
 
 
 def _by_direction(study: Study, variable: Variable, ends: Sequence[Effect]) -> str:
-    """Say what a higher number does, or the second of two words."""
+    """Say what another number does, or the second of two words."""
     if variable.name == BEAM:
         what = "a wider beam"
     elif variable.numbers is None:
         what = f"{variable.name} = {variable.words[1]} instead of {variable.words[0]}"
     else:
-        what = f"a higher {variable.name}"
+        what = f"a {'lower' if variable.base else 'higher'} {variable.name}"
     moved = {sign: [e for e in ends if direction(e.finding) == sign] for sign in VERBS}
     parts = []
     for sign, mine in moved.items():
@@ -171,7 +171,7 @@ def _by_direction(study: Study, variable: Variable, ends: Sequence[Effect]) -> s
 
 
 def _by_value(variable: Variable, ends: Sequence[Effect]) -> str:
-    """Say which of several words raise or lower it, against the first."""
+    """Say which of several values raise or lower it, against the first or the truth."""
     said = {}
     for sign, verb in VERBS.items():
         moved = [effect for effect in ends if direction(effect.finding) == sign]
@@ -182,7 +182,8 @@ def _by_value(variable: Variable, ends: Sequence[Effect]) -> str:
             said[verb] = f"{listed(values)} {those}{' of some' * some}"
     if not said:
         return ""
-    return f"{variable.name}: against {variable.words[0]}, {listed(list(said.values()))}"
+    first = variable.words[variable.base]
+    return f"{variable.name}: against {first}, {listed(list(said.values()))}"
 
 
 def _whose(study: Study, effects: Sequence[Effect], count: int) -> str:

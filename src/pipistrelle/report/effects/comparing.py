@@ -1,10 +1,11 @@
 """Effects: two values of one variable in the same world, all else alike, over many worlds.
 
-Every value is compared with the first: of numbers the least, of words the one listed first. What
-else varies is averaged over, world by world, and looked at one by one besides. Strategies and
-filters are compared in the same way, the first of them with each other one. All contrasts of a
-variable with a filter are one family for each measure (`pipistrelle.evaluation.comparison`): of
-numbers the ends, which are what the answer speaks of, and the values between them another.
+Every value is compared with the first: of numbers the least, of words the one listed first; of
+what filters may assume wrongly, and of biases, with the truth. What else varies is averaged over,
+world by world, and looked at one by one besides. Strategies and filters are compared in the same
+way, the first of them with each other one. All contrasts of a variable with a filter are one
+family for each measure (`pipistrelle.evaluation.comparison`): of numbers the ends, which are what
+the answer speaks of, and the values between them another.
 """
 
 import math
@@ -47,7 +48,7 @@ class Contrast:
     before, after : str
         The two values, as words.
     end : bool
-        It is what the answer speaks of: of numbers the least and the greatest, of words any two.
+        It is what the answer speaks of: of numbers the least or the greatest, of words any two.
     pairs : tuple of pairs of Cell
         One for each combination of the rest.
     names : tuple of str
@@ -229,9 +230,10 @@ def _plain_apart(effect: Effect) -> list[dict[str, Any]]:
 
 
 def _of_variables(study: Study) -> Iterator[Contrast]:
-    """Compare every value of each variable with its first."""
+    """Compare every value of each variable with its first, or with the truth."""
     for variable in study.variables:
-        rows = along(study, variable)
+        rows, base = along(study, variable), variable.base
+        ends = range(len(rows)) if variable.numbers is None else (0, len(rows) - 1)
         for name in filter_titles(study):
             for strategy in STRATEGIES:
                 if (name, strategy) not in study.trials:
@@ -239,16 +241,16 @@ def _of_variables(study: Study) -> Iterator[Contrast]:
                 at = study.trials[name, strategy].at[rows]
                 if np.all(at == at[:1]):
                     continue  # passive sensing has no beam
-                for j in range(1, len(rows)):
-                    first = np.unique(at[[0, j]], axis=1, return_index=True)[1]
-                    mine = [(int(rows[0, m]), int(rows[j, m])) for m in np.sort(first)]
+                for j in (j for j in range(len(rows)) if j != base):
+                    first = np.unique(at[[base, j]], axis=1, return_index=True)[1]
+                    mine = [(int(rows[base, m]), int(rows[j, m])) for m in np.sort(first)]
                     yield Contrast(
                         factor=variable.name,
                         filter=name,
                         strategy=strategy,
-                        before=variable.words[0],
+                        before=variable.words[base],
                         after=variable.words[j],
-                        end=variable.numbers is None or j == len(rows) - 1,
+                        end=j in ends,
                         pairs=tuple(((name, strategy, a), (name, strategy, b)) for a, b in mine),
                         names=tuple(combination_name(study, a, [variable]) for a, _ in mine),
                     )

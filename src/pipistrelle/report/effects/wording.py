@@ -204,14 +204,15 @@ def in_between(study: Study, effects: Sequence[Effect]) -> list[str]:
     Returns
     -------
     list of str
-        A clause for each strategy that has such a value.
+        A clause for each strategy that has such a value, on either side of the truth.
     """
     variable = variable_of(study, effects[0])
     if variable is None or variable.numbers is None:
         return []
     said = []
-    for strategy in dict.fromkeys(effect.contrast.strategy for effect in effects):
-        *inner, end = (effect for effect in effects if effect.contrast.strategy == strategy)
+    for side in _sides(variable, effects):
+        (end,) = (effect for effect in side if effect.contrast.end)
+        inner = [effect for effect in side if effect is not end]
         low, high = min(0.0, end.finding.alone[0]), max(0.0, end.finding.alone[1])
         beyond = [
             effect
@@ -227,6 +228,15 @@ def in_between(study: Study, effects: Sequence[Effect]) -> list[str]:
                 f"{size(most.finding, most.measure.unit)} {more} than at {most.contrast.before}"
             )
     return said
+
+
+def _sides(variable: Variable, effects: Sequence[Effect]) -> list[list[Effect]]:
+    """Part effects by strategy, and by the side of the value that they are compared with."""
+    sides: dict[tuple[str, bool], list[Effect]] = {}
+    for effect in effects:
+        above = variable.words.index(effect.contrast.after) > variable.base
+        sides.setdefault((effect.contrast.strategy, above), []).append(effect)
+    return list(sides.values())
 
 
 def elsewhere(study: Study, effects: Sequence[Effect]) -> list[str]:

@@ -19,6 +19,7 @@ from pipistrelle.report.studied import (
     own_cases,
     samples,
 )
+from pipistrelle.report.variables import two_sided
 
 
 def effect_tables(study: Study, effects: Sequence[Effect]) -> list[dict[str, Any]]:
@@ -106,7 +107,9 @@ def _heading(study: Study, effect: Effect) -> dict[str, Any]:
         return {"name": contrast.factor, "title": what, "meaning": "", "varied": False}
     ends = f", {contrast.after} instead of {contrast.before}" * (len(variable.words) == 2)
     if variable.numbers is not None:
-        ends = f", from {variable.words[0]} to {variable.words[-1]}"
+        ends = f", from {contrast.before} to {variable.words[0 if variable.base else -1]}"
+    if two_sided(variable):
+        ends = f", against {contrast.before}"
     title = the(variable) + ends
     return {
         "name": variable.name,
@@ -124,7 +127,7 @@ def _label(study: Study, effect: Effect) -> str:
         whose = titles.get(contrast.filter, f"{contrast.strategy} sensing")
         return f"{whose}: {contrast.after} instead of {contrast.before}"
     whose = f"{contrast.strategy} {titles[contrast.filter]}"
-    if variable.numbers is not None:
+    if variable.numbers is not None and not two_sided(variable):
         return whose if contrast.end else f"{whose}, to {contrast.after}"
     if len(variable.words) == 2:
         return whose
