@@ -175,11 +175,13 @@ def _by_value(variable: Variable, ends: Sequence[Effect]) -> str:
     said = {}
     for sign, verb in VERBS.items():
         moved = [effect for effect in ends if direction(effect.finding) == sign]
-        values = list(dict.fromkeys(effect.contrast.after for effect in moved))
+        found = {effect.contrast.after for effect in moved}
+        values = [word for word in variable.words if word in found]
         if values:
-            some = len(moved) < sum(effect.contrast.after in values for effect in ends)
+            count = sum(effect.contrast.after in found for effect in ends)
             those = f"{verb[:-1] if len(values) > 1 else verb} the position error"
-            said[verb] = f"{listed(values)} {those}{' of some' * some}"
+            some = f" in {len(moved)} of {count} cases" if len(moved) < count else ""
+            said[verb] = f"{listed(values)} {those}{some}"
     if not said:
         return ""
     first = variable.words[variable.base]

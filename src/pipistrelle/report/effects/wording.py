@@ -130,13 +130,15 @@ def clauses(study: Study, effects: Sequence[Effect], beside: Mapping[Effect, Eff
         kinds[_kind(effect)].append(effect)
     said: list[str] = []
     for kind, mine in kinds.items():
+        without = {effect: _otherwise(effect, beside.get(effect)) for effect in mine}
         objects = [
             _KINDS[kind][1].format(
                 owner=owner(study, effect, noun=not said and not i),
                 size=size(effect.finding, effect.measure.unit),
                 mean=amount(effect.finding.mean, effect.measure.unit),
                 least=amount(resolvable(effect.finding), effect.measure.unit),
-                otherwise=_otherwise(effect, beside.get(effect)),
+                besides=f" ({without[effect]})" if without[effect] else "",
+                otherwise=f"; {without[effect]}" if without[effect] else "",
             )
             for i, effect in enumerate(mine)
         ]
@@ -146,8 +148,8 @@ def clauses(study: Study, effects: Sequence[Effect], beside: Mapping[Effect, Eff
 
 
 _KINDS = {
-    "up": ("raises {}", "{owner} by {size}{otherwise}"),
-    "down": ("lowers {}", "{owner} by {size}{otherwise}"),
+    "up": ("raises {}", "{owner} by {size}{besides}"),
+    "down": ("lowers {}", "{owner} by {size}{besides}"),
     "open": (
         "shows no effect on {}",
         "{owner} ({mean}, where {least} would have been shown{otherwise})",
@@ -295,18 +297,26 @@ def _changed(effects: Sequence[Effect], sign: int) -> list[str]:
     found = []
     for measure in MEASURES[1:]:
         mine = [effect for effect in effects if effect.measure is measure]
-        moved = [_case(effect, mine) for effect in mine if direction(effect.finding) == sign]
+        moved = [effect for effect in mine if direction(effect.finding) == sign]
         if moved:
-            which = f" ({', '.join(moved)})" if len(mine) > len(moved) else ""
+            which = f" ({', '.join(_cases(moved, mine))})" if len(mine) > len(moved) else ""
             found.append(f"the {measure.title}{which}")
     return found
 
 
-def _case(effect: Effect, all_of: Sequence[Effect]) -> str:
-    """Name an effect among others: its strategy, and its value where there are several."""
-    several = len({other.contrast.after for other in all_of}) > 1
-    parts = (effect.contrast.strategy, effect.contrast.after if several else "")
-    return " ".join(part for part in parts if part)
+def _cases(effects: Sequence[Effect], all_of: Sequence[Effect]) -> list[str]:
+    """Name effects among others: their strategies, and of one that not all values move, these."""
+    named = []
+    for strategy in dict.fromkeys(effect.contrast.strategy for effect in effects):
+        mine, every = (
+            [effect.contrast.after for effect in some if effect.contrast.strategy == strategy]
+            for some in (effects, all_of)
+        )
+        if strategy and len(mine) == len(every):
+            named.append(strategy)
+        else:
+            named += [" ".join(filter(None, (strategy, value))) for value in mine]
+    return named
 
 
 def _otherwise(effect: Effect, other: Effect | None) -> str:
@@ -314,6 +324,6 @@ def _otherwise(effect: Effect, other: Effect | None) -> str:
     if other is None or direction(other.finding) == direction(effect.finding) or effect.untouched:
         return ""
     if other.finding.n < 2:
-        return "; without diverged cases too few worlds are left"
+        return "without diverged cases too few worlds are left"
     shown = "" if direction(other.finding) else ", not shown"
-    return f"; without diverged cases {size(other.finding, FIRST.unit, signed=True)}{shown}"
+    return f"without diverged cases {size(other.finding, FIRST.unit, signed=True)}{shown}"
