@@ -59,6 +59,24 @@ def test_points_are_the_effects_with_their_own_intervals_full_where_shown(select
     assert chart.panels[-1].rules == (1.0,), "a ratio of one is no change"
 
 
+def test_points_rise_along_the_axis_with_none_at_the_truth(tmp_path):
+    grid = '"assumed.wheelbase" = [0.18, 0.2, 0.22]'
+
+    def effect(case):
+        return {
+            "position_rmse_m": {0.18: 0.3, 0.2: 0.0, 0.22: 0.6}[case.values["assumed.wheelbase"]]
+        }
+
+    write_planted(tmp_path / "s", grid, effect=effect)
+    (chart,) = effect_charts(select(read_study(tmp_path / "s"), "none"))
+    (fused,) = chart.panels[0].series
+    assert fused.x == pytest.approx([0.18, 0.2, 0.22], abs=1e-3)
+    assert fused.y == pytest.approx([0.3, 0.0, 0.6], abs=0.03)
+    assert np.isnan(fused.low).tolist() == [False, True, False]
+    assert fused.filled.all()
+    assert chart.caption.startswith("Difference to 0.2 in the same world")
+
+
 def test_without_variables_strategies_and_filters_have_the_charts():
     study = replace(narrowed(invent(6), [5]), variables=())
     names = [chart.name for chart in effect_charts(select(study, "none"))]

@@ -223,6 +223,86 @@ def test_an_answer_that_hangs_on_what_diverged_is_told_both_ways(planted):
     assert lost == "The filter diverged, of the trials, with EKF fused in 6.2 %."
 
 
+SOUNDS = '"assumed.speed_of_sound" = [337.0, 340.0, 343.0, 346.0, 349.0]'
+
+
+def off_by(metres, fused=1.0):
+    """Plant a rise with the distance from the true speed of sound."""
+
+    def effect(case):
+        far = abs(case.values["assumed.speed_of_sound"] - 343.0) / 6.0
+        return {"position_rmse_m": metres * far * (fused if case.strategy == "fused" else 1.0)}
+
+    return effect
+
+
+def test_what_is_assumed_wrongly_is_answered_for_on_both_sides_of_the_truth(planted):
+    headline, sentence, *_ = planted(SOUNDS, effect=off_by(0.3))
+    assert headline == (
+        "assumed.speed_of_sound: against 343, 337 and 349 raise the position error."
+    )
+    assert re.fullmatch(
+        rf"assumed\.speed_of_sound from 343 to 337 raises fused EKF's position error by "
+        rf"0\.[23]\d* m {INTERVAL}; assumed\.speed_of_sound from 343 to 349 raises fused EKF's "
+        rf"position error by 0\.[23]\d* m {INTERVAL}\.", sentence,
+    )  # fmt: skip
+
+
+def test_of_what_only_some_cases_show_it_is_said_how_many(planted):
+    headline, *_ = planted(SOUNDS, ways=BOTH, effect=off_by(0.3, fused=0.0))
+    assert headline == (
+        "assumed.speed_of_sound: against 343, 337 and 349 raise the position error in 2 of 4 cases."
+    )
+
+
+def test_a_value_between_the_truth_and_an_end_is_told_of_its_own_side(planted):
+    def effect(case):
+        return {"position_rmse_m": 0.3 * (case.values["assumed.speed_of_sound"] == 340.0)}
+
+    headline, sentence, *_ = planted(SOUNDS, effect=effect)
+    assert headline == (
+        "assumed.speed_of_sound changes the position error, but no effect from end to end is shown."
+    )
+    assert re.search(rf"; at 340 fused EKF's is 0\.[23]\d* m {INTERVAL} more than at 343", sentence)
+    assert "at 346" not in sentence
+
+
+def test_where_the_truth_is_the_greatest_value_a_lower_one_is_what_errs(planted):
+    headline, sentence, *_ = planted(
+        '"assumed.speed_of_sound" = [337.0, 343.0]', effect=off_by(0.3)
+    )
+    assert headline == "A lower assumed.speed_of_sound raises the position error."
+    assert sentence.startswith("assumed.speed_of_sound from 343 to 337 raises fused EKF's")
+
+
+def test_beside_the_position_a_strategy_that_every_value_moves_is_named_once(planted):
+    def effect(case):
+        far = abs(case.values["assumed.speed_of_sound"] - 343.0) / 6.0
+        return {
+            "heading_rmse_rad": 0.3 * far * (case.strategy == "fused"),
+            "map_rmse_m": 0.3 * (case.values["assumed.speed_of_sound"] == 349.0),
+        }
+
+    _, sentence, *_ = planted(SOUNDS, ways=BOTH, effect=effect)
+    assert sentence.endswith(
+        " Besides, it raises the heading error (fused) and the map error (fused 349, passive 349)."
+    )
+
+
+def test_what_is_so_without_diverged_cases_stands_in_brackets_behind_a_size(planted):
+    def effect(case):
+        return {"position_rmse_m": 0.01 * (case.values["beacon.level_db"] == 48.8)}
+
+    def diverged(case, world):
+        return case.values["beacon.level_db"] == 48.8 and world < 8
+
+    _, sentence, *_ = planted(worlds=16, effect=effect, diverged=diverged, far=1.0, spread=0.1)
+    assert re.search(
+        rf"raises fused EKF's position error by 0\.[3-7]\d* m {INTERVAL} "
+        rf"\(without diverged cases −?0\.\d+ m {INTERVAL}, not shown\)", sentence,
+    )  # fmt: skip
+
+
 def test_the_beamwidth_is_called_so_and_passive_sensing_has_no_part_in_it():
     study = narrowed(only(invent(20), [("ekf", "fused"), ("ekf", "passive")]), [0, 5, 11])
     assert question(study) == "What does the beamwidth change?"

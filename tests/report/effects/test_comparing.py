@@ -43,6 +43,45 @@ def test_every_value_of_a_variable_is_compared_with_its_first_in_each_strategy(t
     assert all(len(c.pairs) == 1 for c in mine)
 
 
+SOUNDS = '"assumed.speed_of_sound" = [349.0, 346.0, 343.0, 340.0, 337.0]'
+
+
+def test_what_is_assumed_wrongly_is_compared_with_the_truth_on_either_side(tmp_path):
+    study = study_of(tmp_path, SOUNDS, worlds=2)
+    mine = [c for c in contrasts_of(study) if c.factor == "assumed.speed_of_sound"]
+    assert [(c.before, c.after, c.end) for c in mine] == [
+        ("343", "337", True), ("343", "340", False), ("343", "346", False), ("343", "349", True),
+    ]  # fmt: skip
+    assert [c.pairs for c in mine] == [
+        ((("ekf", "fused", 2), ("ekf", "fused", other)),) for other in (0, 1, 3, 4)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("grid", "truth"),
+    [
+        ('"assumed.wheelbase" = [0.18, 0.2, 0.22]', "0.2"),
+        ('"assumed.steering_std" = [0.015, 0.03]', "0.03"),
+        ('"motion.turn_bias" = [-0.003, 0.0, 0.003]', "0"),
+        ('"air.temperature_c" = [10.0]\n"assumed.speed_of_sound" = [331.0, 337.1, 343.0]', "337.1"),
+        ('"assumed.wheelbase" = [0.18, 0.19, 0.22]', "0.18"),
+        ('"air.temperature_c" = [10, 20]\n"assumed.speed_of_sound" = [331.0, 337.1, 343.0]', "331"),
+        ('"motion.wheelbase" = [0.18, 0.2, 0.22]', "0.18"),
+        ('"filter.bearing_std" = [0.1, 0.15, 0.2]', "0.1"),
+    ],
+)
+def test_the_truth_is_what_holds_in_every_combination_and_where_there_is_none_the_least(
+    tmp_path, grid, truth
+):
+    study = study_of(tmp_path, grid, worlds=2)
+    last = study.variables[-1]
+    assert last.words[last.base] == truth
+    mine = [c for c in contrasts_of(study) if c.factor == last.name]
+    assert {c.before for c in mine} == {truth}
+    ends = {c.after for c in mine if c.end}
+    assert ends == {last.words[0], last.words[-1]} - {truth}
+
+
 def test_strategies_and_filters_are_compared_with_the_first_of_them(tmp_path):
     study = study_of(tmp_path, worlds=2, ways='filters = ["fastslam", "ekf"]\n')
     ways = [c for c in contrasts_of(study) if c.factor == "strategy"]

@@ -83,6 +83,17 @@ def test_a_planted_effect_stands_on_the_first_screen_in_the_table_and_in_the_sum
     assert page.summary["question"] == "What does beacon.level_db change?"
 
 
+def test_a_table_of_what_is_assumed_wrongly_has_a_row_for_either_side_of_the_truth(reported):
+    page = reported('"assumed.wheelbase" = [0.16, 0.18, 0.2, 0.22, 0.24]', ways=BOTH, worlds=3)
+    table, between = page.said('<section class="effect"', "</section>").split("Values between")
+    assert table.startswith("assumed.wheelbase, against 0.2 ")
+    for part, values in ((table, ("0.16", "0.24")), (between, ("0.18", "0.22"))):
+        for strategy in ("fused", "passive"):
+            for value in values:
+                assert f"{strategy} EKF: {value} instead of 0.2 " in part
+        assert part.count(" instead of ") == 4
+
+
 def test_where_nothing_is_planted_nothing_is_shown_anywhere(reported):
     """The negative control: of 24 worlds, and none of the families is wrong in this draw."""
     page = reported(ways=BOTH, worlds=24)
@@ -96,6 +107,9 @@ def test_where_nothing_is_planted_nothing_is_shown_anywhere(reported):
 
 KINDS = {
     "a number": (LEVELS, FUSED_EKF, "What does beacon.level_db change?"),
+    "an assumption": (
+        '"assumed.wheelbase" = [0.18, 0.2, 0.22]', BOTH, "What does assumed.wheelbase change?",
+    ),
     "a beamwidth": ("beamwidth = [180, 33, 11]", ONE_FILTER, "What does the beamwidth change?"),
     "words": (
         '"rays.weights" = ["instantaneous", "aggregated"]', BOTH, "What does rays.weights change?",
