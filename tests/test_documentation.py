@@ -247,6 +247,48 @@ def test_the_guides_filter_goes_by_its_name(tmp_path, monkeypatch):
     assert entry("guided:WarierReckoning").nees_limit == 50.0
 
 
+def test_the_plans_of_the_page_on_robustness_have_the_truth_among_their_values(tmp_path):
+    from pipistrelle.experiments.studies.plan_file import read_plan
+    from pipistrelle.report.reading import read_study
+    from report.planted import write_planted
+
+    page = DOCS / "robustness.md"
+    (text,) = blocks("toml", page)
+    head = text[: text.index("[grid]")]
+    rows = re.findall(r"^\| `(\w+)` \| (`\".*`) \|$", page.read_text(), re.MULTILINE)
+    grids = {"sound": text[text.index("[grid]") :].splitlines()[1:]}
+    grids |= {name: re.findall(r"`([^`]+)`", cell) for name, cell in rows}
+    truth = {}
+    for name, lines in grids.items():
+        path = tmp_path / f"{name}.toml"
+        named = head.replace('name = "sound"', f'name = "{name}"')
+        path.write_text("\n".join((named, "[grid]", *lines)))
+        plan = read_plan(path)
+        assert (plan.name, plan.filters) == (name, ("ekf", "iekf"))
+        write_planted(tmp_path / name, "\n".join(lines), worlds=1)
+        study = read_study(tmp_path / name)
+        truth |= {one.name: one.words[one.base] for one in study.variables}
+    assert truth == {
+        "assumed.speed_of_sound": "343", "motion.speed_bias": "0", "assumed.wheelbase": "0.2",
+        "motion.turn_bias": "0", "assumed.speed_std": "0.1", "assumed.steering_std": "0.03",
+        "filter.first_pose": "exact",
+    }  # fmt: skip
+
+
+def test_the_scale_of_a_path_on_the_page_on_robustness_is_its_size_wherever_it_lies():
+    import polars as pl
+
+    names = vars(ModuleType("guide"))
+    for block in blocks("python", DOCS / "robustness.md"):
+        exec(compile(block, "robustness.md", "exec"), names)
+    angle = np.linspace(0.0, 6.0, 50)
+    true = np.column_stack((3.0 * np.cos(angle), np.sin(angle)))
+    turned = 1.25 * true @ np.array([[0.6, 0.8], [-0.8, 0.6]]) + (4.0, -7.0)
+    columns = ("x_m", "y_m", "true_x_m", "true_y_m")
+    track = pl.DataFrame(dict(zip(columns, np.hstack((turned, true)).T, strict=True)))
+    assert names["scale"](track) == pytest.approx(1.25)
+
+
 @pytest.mark.slow
 def test_the_readme_shows_what_the_command_prints(tmp_path, capsys):
     from pipistrelle.__main__ import main
