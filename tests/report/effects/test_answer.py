@@ -267,6 +267,16 @@ def test_a_value_between_the_truth_and_an_end_is_told_of_its_own_side(planted):
     assert "at 346" not in sentence
 
 
+def test_what_rises_on_one_side_of_the_truth_alone_is_not_told_again_of_its_inner_value(planted):
+    def effect(case):
+        return {"position_rmse_m": 0.05 * max(343.0 - case.values["assumed.speed_of_sound"], 0.0)}
+
+    headline, sentence, *_ = planted(SOUNDS, effect=effect)
+    assert headline == "assumed.speed_of_sound: against 343, 337 raises the position error."
+    assert "from 343 to 349 shows no effect on" in sentence
+    assert " more than at " not in sentence
+
+
 def test_where_the_truth_is_the_greatest_value_a_lower_one_is_what_errs(planted):
     headline, sentence, *_ = planted(
         '"assumed.speed_of_sound" = [337.0, 343.0]', effect=off_by(0.3)

@@ -94,6 +94,13 @@ def test_a_table_of_what_is_assumed_wrongly_has_a_row_for_either_side_of_the_tru
         assert part.count(" instead of ") == 4
 
 
+def test_where_the_truth_is_the_greatest_value_a_table_goes_down_from_it(reported):
+    page = reported('"assumed.wheelbase" = [0.16, 0.18, 0.2]', worlds=3)
+    table, between = page.said('<section class="effect"', "</section>").split("Values between")
+    assert table.startswith("assumed.wheelbase, from 0.2 to 0.16 ")
+    assert "fused EKF, to 0.18 " in between
+
+
 def test_where_nothing_is_planted_nothing_is_shown_anywhere(reported):
     """The negative control: of 24 worlds, and none of the families is wrong in this draw."""
     page = reported(ways=BOTH, worlds=24)
