@@ -40,7 +40,10 @@ EDGE = 1.08
 """Where single worlds stand that do not depend on the beam, as a share of the widest."""
 WORLDS = "Mean ± σ over worlds; dots: single worlds above that"
 PASSIVE = " (passive's at the right edge, where they do not depend on the beam)"
-BOUND = "; dashed: the bound, the least that any estimator has, the noise as the signal tells it"
+BOUND = (
+    "; dashed: the bound, the least root mean square that any estimator has, the noise as the "
+    "signal tells it (a mean of RMSEs may be a fifth below)"
+)
 """What captions say of each."""
 
 

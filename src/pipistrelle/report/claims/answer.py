@@ -220,7 +220,7 @@ def _allowed(everything: Selection) -> str:
             if not both > 0.0:
                 return ""
             beam = width_name(study.beamwidth[i])
-            said.append(f"{alone:.3f} m to {both:.3f} m at {beam} ({alone / both - 1.0:.0%})")
+            said.append(f"{alone:.3f} m to {both:.3f} m at {beam} ({1.0 - both / alone:.0%})")
         return (
             "Whatever the estimator, listening may lower the least error that the sound leaves "
             f"from {', '.join(said)}, in the mean over all worlds."
@@ -236,8 +236,8 @@ def _reached(everything: Selection) -> list[str]:
         if times:
             beside = ", of the path as it was believed at each time" if online else ""
             sentences.append(
-                f"{title[0].upper()}{title[1:]} has of that least error, with everything counted"
-                f"{beside}, by strategy and over the beamwidths, {times} times."
+                f"{title[0].upper()}{title[1:]} has of that least error, root mean squares with "
+                f"everything counted{beside}, by strategy and over the beamwidths, {times} times."
             )
     return sentences
 

@@ -240,4 +240,4 @@ def _bound(selection: Selection) -> list[str]:
             when = " (of the path as it was believed at each time)" if online else ""
             said.append(f"{title}{when} {times}")
     lead = "In multiples of the bound, the least position error that the sound leaves to any"
-    return [f"{lead} estimator: {'; '.join(said)}."] if said else []
+    return [f"{lead} estimator (root mean squares): {'; '.join(said)}."] if said else []

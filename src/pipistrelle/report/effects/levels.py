@@ -115,6 +115,12 @@ def _error(selection: Selection, way: Way) -> str:
 
 
 def _over_bound(selection: Selection, score: str, cell: Cell) -> float:
-    """Return the mean error of position over the mean bound."""
+    """Return the error of position over the bound, each the root of its mean square.
+
+    The bound is one of squares: the plain mean of an efficient estimator's RMSEs, of which most is
+    one normal number, a heading once lost, is down to 0.8 of it.
+    """
     errors, least = (samples(selection, name, [cell])[0] for name in (score, POSITION_BOUND))
-    return float(np.mean(errors) / np.mean(least)) if len(errors) and len(least) else np.nan
+    if not len(errors) or not len(least):
+        return np.nan
+    return float(np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(least))))
