@@ -32,20 +32,21 @@ def _findings() -> Iterator[tuple[str, str]]:
 
 
 def _libraries() -> Iterator[tuple[str, str]]:
-    """Read the versions of what the package requires."""
+    """Read the versions of what the package requires, and of what its extras bring."""
     try:
         required = requires("pipistrelle") or []
     except PackageNotFoundError:
         yield "libraries", "not known: pipistrelle is not installed; python -m pip install ."
         return
     for requirement in required:
-        if "extra ==" in requirement:
-            continue
         name = re.split(r"[^\w.-]", requirement, maxsplit=1)[0]
+        extra = re.search(r"extra == ['\"]([\w-]+)", requirement)
+        whole = f"pipistrelle[{extra[1]}]" if extra else requirement
+        beside = f" (extra {extra[1]})" if extra else ""
         try:
-            yield name, version(name)
+            yield name, version(name) + beside
         except PackageNotFoundError:
-            yield name, f"not found; python -m pip install '{requirement}'"
+            yield name, f"not found{beside}; python -m pip install '{whole}'"
 
 
 def _data(place: str | None) -> str:

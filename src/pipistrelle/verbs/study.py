@@ -37,7 +37,9 @@ exec {command} --workers {workers} --shard "$SLURM_ARRAY_TASK_ID/{shards}" -o {f
 def study(
     plan: Annotated[
         str,
-        Parameter(metavar="PLAN", help="paper, physics or a FILE.toml, as a study's plan.toml."),
+        Parameter(
+            metavar="PLAN", help="paper, physics, beyond or a FILE.toml, as a study's plan.toml."
+        ),
     ] = "paper",
     /,
     *,
