@@ -182,9 +182,15 @@ def test_a_range_std_beside_an_empty_range_does_no_harm(tmp_path):
 
 
 def test_what_rows_state_stays_with_them_when_others_are_dropped(tmp_path):
-    rows = ["0.1,-1,0,1,1,", "0.1,7,0,1,2,", "0.3,8,0,1,3,", "0.3,-1,0,1,4,", "9.0,8,0,1,5,"]
+    rows = [
+        "0.1,-1,0,1,0.1,",
+        "0.1,7,0,1,0.2,",
+        "0.3,8,0,1,0.3,",
+        "0.3,-1,0,1,0.4,",
+        "9,8,0,1,0.5,",
+    ]
     log = read_log(recorded(tmp_path, measurements=measured(*rows, stated=STATED)))
-    assert [scan.bearing_std.tolist() for scan in log.scans] == [[2.0], [3.0]]
+    assert [scan.bearing_std.tolist() for scan in log.scans] == [[0.2], [0.3]]
     assert log.ignored_rows == {"clutter": 2, "outside_odometry": 1}
 
 
@@ -358,12 +364,13 @@ ROWS = {
 
 
 STATING_ROWS = {
-    "no bearing std": ("0.1,7,0.5,1,0,1", "line 3", "bearing_std 0.0", "above 0 rad"),
-    "no range std": ("0.1,7,0.5,1,1,0", "line 3", "range_std 0.0", "a range_std above 0 m"),
-    "negative": ("0.1,7,0.5,1,-0.1,1", "line 3", "bearing_std -0.1", "a bearing_std above 0"),
+    "no bearing std": ("0.1,7,0.5,1,0,1", "line 3", "bearing_std 0.0", "from 1e-06 rad"),
+    "no range std": ("0.1,7,0.5,1,1,0", "line 3", "range_std 0.0", "a range_std from 1e-06 m"),
+    "negative": ("0.1,7,0.5,1,-0.1,1", "line 3", "bearing_std -0.1", "a bearing_std from 1e-06"),
     "large": ("0.1,7,0.5,1,0.1,1e10", "line 3", "range_std 10000000000.0", "up to 1e+09 m"),
-    "small": ("0.1,7,0.5,1,1e-155,1", "line 3", "bearing_std 1e-155", "up to 1e+09 rad"),
-    "beside no range": ("0.1,7,0.5,,0.1,-1", "line 3", "range_std -1.0", "above 0 m"),
+    "small": ("0.1,7,0.5,1,1e-155,1", "line 3", "bearing_std 1e-155", "from 1e-06 rad"),
+    "vague": ("0.1,7,0.5,1,2e4,1", "line 3", "bearing_std 20000.0", "up to 10000 rad"),
+    "beside no range": ("0.1,7,0.5,,0.1,-1", "line 3", "range_std -1.0", "from 1e-06 m"),
     "text": ("0.1,7,0.5,1,low,1", "line 3", "bearing_std 'low'", "or leave it empty"),
     "nan": ("0.1,7,0.5,1,1,nan", "line 3", "range_std 'nan'", "a finite number"),
     "infinite": ("0.1,7,0.5,1,inf,1", "line 3", "bearing_std 'inf'", "a finite number"),
@@ -636,7 +643,8 @@ NUMBER = st.floats(-1e6, 1e6)
 ANGLE = st.floats(-np.pi, np.pi, exclude_max=True)
 LABEL = st.integers(0, 2**53 - 1)
 RANGE = st.floats(1e-9, 1e6) | st.just(np.nan)
-ROW = st.tuples(ANGLE, RANGE, RANGE, RANGE)
+RANGE_STD, BEARING_STD = (st.floats(1e-6, most) | st.just(np.nan) for most in (1e6, 1e4))
+ROW = st.tuples(ANGLE, RANGE, RANGE_STD, BEARING_STD)
 
 
 @st.composite

@@ -17,7 +17,14 @@ from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.refusals import refusal
 
 _LABELS = ("landmark", "subject", "barcode")
-_ABOVE_ZERO = {"range": "m", "bearing_std": "rad", "range_std": "m", "radius": "m"}
+_LEAST_STD = 1e-6  # of either noise: what is told more precisely leaves nothing to solve with
+_ABOVE_ZERO = {
+    "range": ("m", 1.0 / LARGEST, LARGEST),
+    "bearing_std": ("rad", _LEAST_STD, 1e4),
+    "range_std": ("m", _LEAST_STD, LARGEST),
+    "radius": ("m", 1.0 / LARGEST, LARGEST),
+}
+"""What a column must be above zero in, at least and at most."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -263,9 +270,10 @@ def _check_columns(table: Table) -> None:
             wrong = np.diff(values, prepend=-np.inf) < 0
             promise = "a time that does not run backwards"
         elif name in _ABOVE_ZERO:
-            wrong = (values < 1.0 / LARGEST) | (values > LARGEST)
-            unit = _ABOVE_ZERO[name]
-            promise = f"a {name} above 0 {unit}, up to {LARGEST:g} {unit}"
+            unit, least, most = _ABOVE_ZERO[name]
+            wrong = (values < least) | (values > most)
+            from_here = f"from {least:g}" if least == _LEAST_STD else "above 0"
+            promise = f"a {name} {from_here} {unit}, up to {most:g} {unit}"
         elif name in _LABELS:
             wrong = (values != np.rint(values)) | (values < UNLABELLED) | (values >= 2**53)
             promise = f"an integer, from 0 on, or {UNLABELLED} for clutter"
