@@ -90,12 +90,11 @@ def measured(heard: Heard) -> Heard:
     """
     if heard.certainty is None:
         return heard
-    across, along = heard.certainty
-    told = with_columns(
-        heard.rows,
-        bearing_std=np.hypot(across, np.where(heard.rows.caller == OWN, *BEARING_FLOOR)),
-        range_std=np.hypot(along, RANGE_FLOOR),
-    )
+    rows, (across, along) = heard.rows, heard.certainty
+    numbers = rows.numbers.copy()
+    numbers[BEARING_STD] = np.hypot(across, np.where(rows.caller == OWN, *BEARING_FLOOR))
+    numbers[RANGE_STD] = np.hypot(along, RANGE_FLOOR)
+    told = Scan(time=rows.time, landmark=rows.landmark, caller=rows.caller, numbers=numbers)
     return replace(heard, rows=told)
 
 

@@ -9,7 +9,6 @@ import time
 import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from functools import cache
 from math import degrees
 from typing import TYPE_CHECKING, Any
 
@@ -296,6 +295,10 @@ def _run_cases(cases: Sequence[PlannedCase], iteration: int, world: World) -> li
     return [_try_case(case, shared, iteration) for case in cases]
 
 
+_Told = tuple[float, Strategy, FilterConfig]
+"""Of which beam, by which strategy, with which noise."""
+
+
 class _Shared:
     """What the cases of a world share: each is worked out once."""
 
@@ -303,11 +306,13 @@ class _Shared:
         self, scenario: Scenario, config: Config, beams: Mapping[float, Sequence[Heard]]
     ) -> None:
         self.scenario, self.beams, self._config = scenario, beams, config
-        self._scans_of, self._bound_of = cache(self._scans), cache(self._bound)
+        # No `cache` of a method: it would hold what holds it, and a world's sound for long.
+        self._scans_known: dict[_Told, tuple[Scan, ...]] = {}
+        self._bound_known: dict[_Told, Float[np.ndarray, "t 3 3"]] = {}
 
     def scans(self, radius: float, strategy: Strategy, told: FilterConfig) -> tuple[Scan, ...]:
         """Return what a strategy takes of a beam's frames, and how surely, as a filter is told."""
-        return self._scans_of(radius, strategy, _noise_alone(told))
+        return self._scans(radius, strategy, _noise_alone(told))
 
     def consistent(
         self, radius: float, strategy: Strategy, told: FilterConfig
@@ -317,7 +322,7 @@ class _Shared:
         path = self.scenario.path[frames]
         if told.first_pose == "drawn":
             return np.tile(np.array(NEES_OF_DRAWN_START, np.float32), (len(path) - 1, 1))
-        bound = self._bound_of(radius, strategy, _noise_alone(told))[frames]
+        bound = self._bound(radius, strategy, _noise_alone(told))[frames]
         expected = nees_of_exact_start(bound, path, _start_covariance(told))
         return np.column_stack(expected)[1:].astype(np.float32)
 
@@ -326,23 +331,30 @@ class _Shared:
     ) -> Float[np.ndarray, "t 3 3"]:
         """Return the bound of the pose at every step, the noise as the signal tells it."""
         measured = _noise_alone(told).model_copy(update={"noise": "measured"})
-        bound = self._bound_of(radius, strategy, measured)
+        bound = self._bound(radius, strategy, measured)
         if told.first_pose == "drawn":
             return bound_of_drawn_start(bound, self.scenario.path, _start_covariance(told))
         return bound
 
     def _scans(self, radius: float, strategy: Strategy, noise: FilterConfig) -> tuple[Scan, ...]:
         """Take the scans of a beam."""
-        told = self._config.model_copy(update={"filter": noise})
-        return scans_of(self.beams[radius], strategy, told)
+        key = radius, strategy, noise
+        if key not in self._scans_known:
+            told = self._config.model_copy(update={"filter": noise})
+            self._scans_known[key] = scans_of(self.beams[radius], strategy, told)
+        return self._scans_known[key]
 
     def _bound(
         self, radius: float, strategy: Strategy, noise: FilterConfig
     ) -> Float[np.ndarray, "t 3 3"]:
         """Work out the bound of the pose at every step."""
-        scans, world = self._scans_of(radius, strategy, noise), self.scenario
-        truth, motion = (world.path, standing_landmarks(world)), motion_of(self._config.motion)
-        return pose_bound(motion, world.controls, world.time, *truth, scans)
+        key = radius, strategy, noise
+        if key not in self._bound_known:
+            scans, world = self._scans(*key), self.scenario
+            truth, motion = (world.path, standing_landmarks(world)), motion_of(self._config.motion)
+            bound = pose_bound(motion, world.controls, world.time, *truth, scans)
+            self._bound_known[key] = bound
+        return self._bound_known[key]
 
 
 def _start_covariance(told: FilterConfig) -> Float[np.ndarray, "3 3"]:
