@@ -11,6 +11,7 @@ from pipistrelle.estimation.beliefs import placed
 from pipistrelle.experiments.drives import NO_TRUTH
 from pipistrelle.figures.player.page import page as written_page
 from pipistrelle.figures.player.playback import Rows, playback
+from reference.pages import contrasts
 
 CHROMIUM = Path("/usr/bin/chromium")
 WIDTHS = {"phone": 390, "desk": 1280}
@@ -415,25 +416,6 @@ def test_a_path_that_was_revised_stands_beside_the_one_believed_then(browser, pl
 def test_text_stands_out_from_its_ground(opened):
     """At least 4.5 to 1, as the accessibility guidelines ask for."""
     page, _ = opened
-    ratios = page.evaluate(
-        """() => {
-          const light = ([r, g, b]) => [r, g, b].map((v) => v / 255).map(
-            (v) => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4
-          ).reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
-          const numbers = (text) => text.match(/[\\d.]+/g).map(Number);
-          const ground = (element) => {
-            for (let e = element; e; e = e.parentElement) {
-              const [r, g, b, a] = numbers(getComputedStyle(e).backgroundColor);
-              if (a === undefined || a === 1) return [r, g, b];
-            }
-          };
-          const texts = "h1,h2,p,b,small,output,figcaption,label,button,.tick,.axis span";
-          return [...document.querySelectorAll(texts)]
-            .filter((e) => e.getClientRects().length).map((e) => {
-              const [a, b] = [light(numbers(getComputedStyle(e).color)), light(ground(e))];
-              return [(Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05), e.className || e.tagName];
-            });
-        }"""
-    )
+    ratios = contrasts(page, "h1,h2,p,b,small,output,figcaption,label,button,.tick,.axis span")
     assert len(ratios) > 20
     assert [(ratio, what) for ratio, what in ratios if ratio < 4.5] == []

@@ -8,6 +8,7 @@ import pytest
 from pipistrelle.report.page import page as module
 from pipistrelle.report.page.page import write_report
 from pipistrelle.report.reading import read_study
+from reference.pages import contrasts
 from report.invented import invent, only
 from report.planted import LEVELS, by_level, write_planted
 
@@ -44,25 +45,8 @@ def written(tmp_path_factory) -> Path:
     return folder / "index.html"
 
 
-CONTRAST = """() => {
-  const light = ([r, g, b]) => [r, g, b].map((v) => v / 255).map(
-    (v) => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4
-  ).reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
-  const numbers = (text) => text.match(/[\\d.]+/g).map(Number);
-  const ground = (element) => {
-    for (let e = element; e; e = e.parentElement) {
-      const [r, g, b, a] = numbers(getComputedStyle(e).backgroundColor);
-      if (a === undefined || a === 1) return [r, g, b];
-    }
-  };
-  const texts = "h1,h2,h3,.answer,.lede li,.verdict,.note,.tile,td,th,td small";
-  return [...document.querySelectorAll(texts)]
-    .filter((e) => e.getClientRects().length).map((e) => {
-      const [a, b] = [light(numbers(getComputedStyle(e).color)), light(ground(e))];
-      return [(Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05), e.className || e.tagName];
-    }).sort((one, other) => one[0] - other[0]);
-}"""
-"""Contrasts of what is written, the least first, and on what."""
+WRITTEN = "h1,h2,h3,.answer,.lede li,.verdict,.note,.tile,td,th,td small"
+"""Where something is written."""
 SCREENS = [
     pytest.param((screen, scheme), id=f"{screen}-{scheme}", marks=marks)
     for screen, scheme, marks in (
@@ -194,7 +178,7 @@ def test_a_grids_answer_and_effects_are_on_the_first_screen_and_nothing_is_cut(
         shown = page.locator("#effects td.shown")
         assert shown.count() >= 2
         assert shown.first.evaluate("e => getComputedStyle(e).fontWeight") == "650"
-    assert page.evaluate(CONTRAST)[0][0] >= 4.5
+    assert contrasts(page, WRITTEN)[0][0] >= 4.5
     context.close()
 
 
@@ -290,7 +274,7 @@ def test_the_switch_shows_the_figures_under_another_rule(opened):
 def test_text_stands_out_from_its_ground(opened):
     """At least 4.5 to 1, as the accessibility guidelines ask for."""
     page, _ = opened
-    ratios = page.evaluate(CONTRAST)
+    ratios = contrasts(page, WRITTEN)
     assert len(ratios) > 50
     assert [(ratio, what) for ratio, what in ratios if ratio < 4.5] == []
 
