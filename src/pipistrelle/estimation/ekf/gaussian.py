@@ -212,17 +212,14 @@ def _retract(
 @kernel
 def propagate(
     mean: Float[np.ndarray, " d"],
-    covariance: Float[np.ndarray, "d _"],
+    covariance: Float[np.ndarray, "d d"],
     controls: Float[np.ndarray, "k c"],
     dt: Float[np.ndarray, " k"],
     motion: MotionNumbers,
     pose_means: Float[np.ndarray, "k 3"],
     pose_covariances: Float[np.ndarray, "k 3 3"],
 ) -> None:
-    """Advance mean and covariance in place; cross-covariances once, by the product of the F.
-
-    Columns of the covariance beyond the state wait, and are left as they are.
-    """
+    """Advance mean and covariance in place; cross-covariances once, by the product of the F."""
     pose, P = mean[:3], covariance[:3, :3].copy()
     shift_x = shift_y = 0.0  # entries (0, 2) and (1, 2) of the product of the F
     for k in range(controls.shape[0]):

@@ -15,7 +15,7 @@ from pipistrelle.report.charts.axes import (
     each_combination,
     slug,
 )
-from pipistrelle.report.effects.comparing import FILTER, STRATEGY, Effect, effects_of
+from pipistrelle.report.effects.comparing import Effect, effects_of, families_of
 from pipistrelle.report.effects.measures import MEASURES, Measure
 from pipistrelle.report.effects.wording import the
 from pipistrelle.report.numbers import UNITS
@@ -46,14 +46,8 @@ def effect_charts(selection: Selection) -> list[Chart]:
         Without variables, what strategies and filters change.
     """
     study, titles = selection.study, filter_titles(selection.study)
-    families: dict[tuple[str, str], list[Effect]] = {}
-    for effect in effects_of(selection):
-        contrast = effect.contrast
-        if not study.variables or contrast.factor not in (STRATEGY, FILTER):
-            family = contrast.factor, contrast.filter or contrast.strategy
-            families.setdefault(family, []).append(effect)
     charts = []
-    for (factor, whose), family in families.items():
+    for (factor, whose), family in families_of(study, effects_of(selection)).items():
         variable = next((v for v in study.variables if v.name == factor), None)
         first = family[0].contrast.before
         words = (first, *dict.fromkeys(effect.contrast.after for effect in family))

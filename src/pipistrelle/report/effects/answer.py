@@ -7,7 +7,7 @@ changes, and where nothing is shown, how little would have been.
 from collections.abc import Mapping, Sequence
 
 from pipistrelle.config import STRATEGIES
-from pipistrelle.report.effects.comparing import FILTER, STRATEGY, Effect
+from pipistrelle.report.effects.comparing import FILTER, STRATEGY, Effect, families_of
 from pipistrelle.report.effects.levels import diverged, errors_of, times_the_bound
 from pipistrelle.report.effects.measures import MEASURES
 from pipistrelle.report.effects.wording import (
@@ -74,12 +74,7 @@ def answer(selection: Selection, by_rule: Mapping[Rule, Sequence[Effect]]) -> li
     """
     study, effects = selection.study, by_rule[HEADLINE]
     beside = dict(zip(effects, by_rule[OTHERWISE], strict=True))
-    families: dict[tuple[str, str], list[Effect]] = {}
-    for effect in effects:
-        contrast = effect.contrast
-        if not study.variables or contrast.factor not in (STRATEGY, FILTER):
-            family = contrast.factor, contrast.filter or contrast.strategy
-            families.setdefault(family, []).append(effect)
+    families = families_of(study, effects)
     levels = [] if study.variables else errors_of(selection)
     lines = [_headline(study, v, families) for v in study.variables] or _compared(families)
     lines = lines or [levels.pop(0) if levels else "Not decided: no world is left"]

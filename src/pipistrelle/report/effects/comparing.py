@@ -126,6 +126,28 @@ def effects_of(selection: Selection) -> tuple[Effect, ...]:
     )
 
 
+def families_of(study: Study, effects: Sequence[Effect]) -> dict[tuple[str, str], list[Effect]]:
+    """Group effects by what is compared, and by the filter or the strategy with which.
+
+    Parameters
+    ----------
+    study : Study
+    effects : sequence of Effect
+
+    Returns
+    -------
+    dict of list of Effect
+        Of a study that has variables, these alone: not strategies, nor filters.
+    """
+    families: dict[tuple[str, str], list[Effect]] = {}
+    for effect in effects:
+        contrast = effect.contrast
+        if not study.variables or contrast.factor not in (STRATEGY, FILTER):
+            family = contrast.factor, contrast.filter or contrast.strategy
+            families.setdefault(family, []).append(effect)
+    return families
+
+
 def resolvable(finding: Finding) -> float:
     """Tell how small an effect would have been significant.
 
