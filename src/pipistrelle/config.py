@@ -181,6 +181,13 @@ class AssociationConfig(Section):
     """Arrivals expected further than this under the threshold cannot be matched [dB]."""
 
 
+class ListeningConfig(Section):
+    """What is taken of what was heard."""
+
+    timing: bool = False
+    """Of others' echoes also when: how much later than the call that came straight."""
+
+
 class MotionConfig(Section):
     """How the vehicle moves, the front wheel of a bicycle, and the noise of its controls."""
 
@@ -219,11 +226,13 @@ class FilterConfig(Section):
     """What the filters assume."""
 
     noise: Literal["constant", "measured"] = "constant"
-    """The next two for every row (the paper's), or what the signal or a log tells of each."""
+    """The next three for every row (the paper's), or what the signal or a log tells of each."""
     range_std: Positive = 0.2
     """Noise of a range [m]."""
     bearing_std: Positive = 0.15
     """Noise of a bearing [rad]."""
+    detour_std: Positive = 0.2
+    """Noise of a detour [m]."""
     initial_pose_std: tuple[NonNegative, NonNegative, NonNegative] = (0.05, 0.05, 0.0436)
     """How unsure the start is: x, y [m], heading [rad]."""
     first_pose: Literal["exact", "drawn"] = "exact"
@@ -292,6 +301,7 @@ class Config(Section):
     receiver: ReceiverConfig = ReceiverConfig()
     detection: DetectionConfig = DetectionConfig()
     association: AssociationConfig = AssociationConfig()
+    listening: ListeningConfig = ListeningConfig()
     motion: MotionConfig = MotionConfig()
     assumed: AssumedConfig = AssumedConfig()
     filter: FilterConfig = FilterConfig()

@@ -386,7 +386,10 @@ def test_matched_filters_give_an_echo_the_gain_of_its_samples():
 
 def test_a_record_shorter_than_the_call_holds_nothing():
     found = found_in(matched_of(echoes((6e-3, 0, OWN, 30, 1.0)), blocks=SETTLED.pulse - 1))
-    assert all(getattr(found, f.name).size == 0 for f in fields(Detections))
+    columns = [getattr(found, f.name) for f in fields(Detections) if f.name != "direct"]
+    assert all(column.size == 0 for column in columns)
+    assert found.direct.detection.tolist() == [-1, -1]
+    assert np.isnan([found.direct.delay, found.direct.delay_std]).all()
 
 
 def test_a_crowd_of_detections_finds_room():

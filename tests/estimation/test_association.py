@@ -69,15 +69,19 @@ def test_what_cannot_be_labels_is_refused_before_a_kernel_sees_it(label):
     assert labelled(scan, [4, UNLABELLED, 4]).landmark.tolist() == [4]
 
 
-def test_ranges_and_detours_come_with_their_own_noise_from_the_first_row_that_has_them():
+def test_ranges_come_with_their_own_noise_from_the_first_row_that_has_them_and_detours_all_stay():
     scan = make_scan(
         0.0, np.full(4, 4), np.full(4, 0.1), bearing_std=0.01, caller=np.array([3, 0, 1, 2]),
         range=np.array([NAN, 5.0, 9.0, NAN]), range_std=np.array([0.9, 0.2, 0.3, 0.4]),
         detour=np.array([NAN, NAN, 7.0, 6.0]), detour_std=np.array([0.8, 0.7, 0.5, 0.6]),
     )  # fmt: skip
     merged = labelled(scan, scan.landmark)
-    assert (merged.range.tolist(), merged.range_std.tolist()) == ([5.0], [0.2])
-    assert (merged.detour.tolist(), merged.detour_std.tolist()) == ([7.0], [0.5])
+    assert merged.landmark.tolist() == [4, 4]
+    assert (merged.range[0], merged.range_std[0], merged.bearing[0]) == (5.0, 0.2, 0.1)
+    assert np.isnan([merged.range[1], merged.bearing[1]]).all()
+    assert (merged.detour.tolist(), merged.detour_std.tolist()) == ([7.0, 6.0], [0.5, 0.6])
+    assert merged.caller.tolist() == [1, 2]
+    assert labelled(merged, merged.landmark) is merged
 
 
 def test_merged_rows_are_of_the_call_of_the_first_of_them():

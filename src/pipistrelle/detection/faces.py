@@ -12,9 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipistrelle.detection.direct import DirectCalls
 from pipistrelle.detection.scans import (
     BEARING,
+    DETOUR,
     LEVEL,
+    NOBODY,
     NUMBERS,
     OWN,
     RANGE,
@@ -39,11 +42,16 @@ class Heard:
     certainty : (2, m) [rad], [m], or None
         Standard deviations of the rows' bearings and ranges, as the signal tells; NaN where it does
         not. They are kept beside the rows, and `pipistrelle.detection.noise` puts them in.
+    detour : (2, m) [m], or None
+        How much later than the direct call of its caller each row came, as a way of sound, and the
+        standard deviation of that; NaN where there is none. They are kept beside the rows too:
+        `timed` puts them in.
     """
 
     rows: Scan
     clutter: int | None
     certainty: Float[np.ndarray, "2 m"] | None = None
+    detour: Float[np.ndarray, "2 m"] | None = None
 
 
 def average_faces(
@@ -53,12 +61,14 @@ def average_faces(
     *,
     averaging: str,
     speed_of_sound: float,
+    callers: Int[np.ndarray, " c"] = NOBODY,
 ) -> Heard:
     r"""Average what the faces say of each label, per caller: the strongest detection of each face.
 
     Bearings are averaged as directions, ``plain`` or ``weighted`` by the inverse variance at the
     array's angle, :math:`\cos^2\theta`. The range, of the vehicle's own call alone, is c/2 times
-    the mean delay.
+    the mean delay; the detour, of another's, c times what the mean delay has over that of its
+    direct call. What comes while the direct call still lasts has none: it was heard with it.
 
     Parameters
     ----------
@@ -69,6 +79,8 @@ def average_faces(
         Of each detection, or UNLABELLED.
     averaging : "plain" or "weighted"
     speed_of_sound : [m/s]
+    callers : (c)
+        Labels that the callers bear as landmarks, where somebody tells.
 
     Returns
     -------
@@ -89,12 +101,12 @@ def average_faces(
     (array([41.]), array([3.43]))
     """
     labels, clutter = _distinct(label)
-    found = _found(detections)
-    landmark, caller, numbers, certainty = _average(
-        labels, label, found, averaging == "weighted", 0.5 * speed_of_sound
+    found, direct = _found(detections), _direct(detections.direct)
+    landmark, caller, numbers, certainty, detour = _average(
+        labels, label, found, direct, averaging == "weighted", speed_of_sound
     )
-    rows = Scan(time=time, landmark=landmark, caller=caller, numbers=numbers)
-    return Heard(rows=rows, clutter=int(clutter), certainty=certainty)
+    rows = Scan(time=time, landmark=landmark, caller=caller, numbers=numbers, callers=callers)
+    return Heard(rows=rows, clutter=int(clutter), certainty=certainty, detour=detour)
 
 
 def same_echo(
@@ -153,6 +165,33 @@ def unlabelled(heard: Heard) -> Heard:
     return replace(heard, rows=replace(heard.rows, landmark=nobody), clutter=None)
 
 
+def timed(heard: Heard) -> Heard:
+    """Let the rows of a frame say how much later than their caller's direct call they came.
+
+    Parameters
+    ----------
+    heard : Heard
+
+    Returns
+    -------
+    Heard
+        The same where nobody listened for it.
+
+    Examples
+    --------
+    >>> from pipistrelle.detection.scans import make_scan
+    >>> rows = make_scan(0.5, np.array([4]), np.array([0.2]), caller=1)
+    >>> heard = Heard(rows=rows, clutter=0, detour=np.array([[3.0], [0.02]]))
+    >>> timed(heard).rows.detour
+    array([3.])
+    """
+    if heard.detour is None:
+        return heard
+    numbers = heard.rows.numbers.copy()
+    numbers[DETOUR] = heard.detour[0]
+    return replace(heard, rows=replace(heard.rows, numbers=numbers))
+
+
 class _Found(NamedTuple):
     """Detections, as the kernels take them."""
 
@@ -172,6 +211,22 @@ def _found(detections: Detections) -> tuple[np.ndarray, ...]:
         detections.face, detections.caller, detections.angle, detections.bearing, detections.delay,
         detections.power, detections.bearing_std, detections.delay_std,
     )  # fmt: skip
+
+
+class _Direct(NamedTuple):
+    """Direct calls, as the kernels take them."""
+
+    detection: Int[np.ndarray, " c"]
+    delay: Float[np.ndarray, " c"]
+    delay_std: Float[np.ndarray, " c"]
+    pulse: float
+
+
+def _direct(calls: DirectCalls | None) -> tuple:
+    """Return the columns of a `_Direct`."""
+    if calls is None:
+        return np.empty(0, np.int64), np.empty(0), np.empty(0), 0.0
+    return calls.detection, calls.delay, calls.delay_std, calls.pulse
 
 
 @kernel
@@ -199,17 +254,21 @@ def _average(
     labels: Int[np.ndarray, " n"],
     label: Int[np.ndarray, " d"],
     detections: tuple,
+    calls: tuple,
     weighted: bool,
-    metres: float,
+    speed_of_sound: float,
 ) -> tuple[
-    Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, "7 m"], Float[np.ndarray, "2 m"]
+    Int[np.ndarray, " m"],
+    Int[np.ndarray, " m"],
+    Float[np.ndarray, "7 m"],
+    Float[np.ndarray, "2 m"],
+    Float[np.ndarray, "2 m"],
 ]:
     """Mean direction and delay of each label and caller over its strongest rows per face.
 
-    Returns label, caller, numbers and certainty of each pair that occurs. A second of the vehicle's
-    own call is so many metres of range.
+    Returns label, caller, numbers, certainty and detour of each pair that occurs.
     """
-    found = _Found(*detections)
+    found, direct, metres = _Found(*detections), _Direct(*calls), 0.5 * speed_of_sound
     faces = callers = 0
     for d in range(label.size):
         faces, callers = max(faces, found.face[d] + 1), max(callers, found.caller[d] + 1)
@@ -217,6 +276,7 @@ def _average(
     caller, row = np.empty(landmark.size, dtype=np.int64), 0
     numbers = np.full((NUMBERS, landmark.size), np.nan)
     certainty = np.full((2, landmark.size), np.nan)
+    detour = np.full((2, landmark.size), np.nan)
     strongest = np.empty(faces, dtype=np.int64)
     for i in range(labels.size):
         for p in range(callers):
@@ -245,9 +305,16 @@ def _average(
                 if p == OWN:
                     numbers[RANGE, row] = metres * (late / total)
                     certainty[1, row] = metres * (math.sqrt(along) / total)
+                elif p < direct.delay.size and late / total - direct.delay[p] >= direct.pulse:
+                    spread = math.hypot(math.sqrt(along) / total, direct.delay_std[p])
+                    detour[0, row] = speed_of_sound * (late / total - direct.delay[p])
+                    detour[1, row] = speed_of_sound * spread
                 numbers[LEVEL, row] = 10.0 * math.log10(loudest)
                 row += 1
-    return landmark[:row], caller[:row], numbers[:, :row].copy(), certainty[:, :row].copy()
+    return (
+        landmark[:row], caller[:row], numbers[:, :row].copy(), certainty[:, :row].copy(),
+        detour[:, :row].copy(),
+    )  # fmt: skip
 
 
 @kernel

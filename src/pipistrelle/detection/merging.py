@@ -16,6 +16,7 @@ from pipistrelle.detection.scans import (
     BEARING,
     BEARING_STD,
     DETOUR,
+    DETOUR_STD,
     LEVEL,
     NUMBERS,
     OWN,
@@ -69,7 +70,8 @@ def labelled(scan: Scan, label: Int[np.ndarray, " m"]) -> Scan:
               \bar\sigma^{-2} = \sum_i \sigma_i^{-2} ,
 
     and else the plain mean, of which nobody says how sure it is. The rest is the first that there
-    is among them.
+    is among them, but that each detour stays: those after the first are rows without a bearing, at
+    the end.
 
     Parameters
     ----------
@@ -94,7 +96,7 @@ def labelled(scan: Scan, label: Int[np.ndarray, " m"]) -> Scan:
     >>> told.landmark, told.bearing.round(9), told.bearing_std.round(4)
     (array([7]), array([0.3]), array([0.0707]))
     """
-    if label is scan.landmark and _settled(label):
+    if label is scan.landmark and _settled(label, scan.bearing):
         return scan
     named = replace(scan, landmark=_checked(scan, np.asarray(label)))
     return _fused(named, own=True, others=True, labels_only=True)
@@ -104,7 +106,7 @@ def _fused(scan: Scan, *, own: bool, others: bool, labels_only: bool) -> Scan:
     """Take the rows of some callers and make one row of those of each landmark."""
     numbers = np.ascontiguousarray(scan.numbers)
     landmark, caller, numbers = _fuse(scan.landmark, scan.caller, numbers, own, others, labels_only)
-    return Scan(time=scan.time, landmark=landmark, caller=caller, numbers=numbers)
+    return replace(scan, landmark=landmark, caller=caller, numbers=numbers)
 
 
 def _checked(scan: Scan, label: np.ndarray) -> Int[np.ndarray, " m"]:
@@ -120,13 +122,13 @@ def _checked(scan: Scan, label: np.ndarray) -> Int[np.ndarray, " m"]:
 
 
 @kernel
-def _settled(label: Int[np.ndarray, " m"]) -> bool:
-    """Whether every row has a label, and none the label of another."""
+def _settled(label: Int[np.ndarray, " m"], bearing: Float[np.ndarray, " m"]) -> bool:
+    """Whether every row has a label, and, where it has a bearing, none the label of another."""
     for m in range(label.size):
         if label[m] == UNLABELLED:
             return False
         for other in range(m):
-            if label[other] == label[m]:
+            if label[other] == label[m] and not math.isnan(bearing[m]):
                 return False
     return True
 
@@ -142,15 +144,20 @@ def _fuse(
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"], Float[np.ndarray, "7 k"]]:
     """Take the rows of some callers and make one row of those of each landmark.
 
-    Rows without a label stay as they are, or are left out.
+    Rows without a label stay as they are, or are left out. Detours after a landmark's first are
+    rows of their own, at the end.
     """
     most = label.size
     landmark, caller = np.empty(most, np.int64), np.empty(most, np.int64)
     numbers, merged = np.full((NUMBERS, most), np.nan), np.zeros(most, np.int64)
     turn, weighted, weight = np.zeros(most), np.zeros(most), np.zeros(most)
     bearing, std, count = given[BEARING], given[BEARING_STD], 0
+    further, detours = np.empty(most, np.int64), 0
     for m in range(most):
         if not (own if whose[m] == OWN else others) or (labels_only and label[m] == UNLABELLED):
+            continue
+        if math.isnan(bearing[m]):
+            further[detours], detours = m, detours + 1
             continue
         k = count
         while k > 0 and label[m] != UNLABELLED and landmark[k - 1] != label[m]:
@@ -160,13 +167,39 @@ def _fuse(
         else:
             k, count = count, count + 1
             landmark[k], caller[k] = label[m], whose[m]
+        if not math.isnan(given[DETOUR, m]):
+            if math.isnan(numbers[DETOUR, k]):
+                caller[k] = whose[m]
+            else:
+                further[detours], detours = m, detours + 1
         _take(numbers, k, given, m)
         off = wrap_angle(bearing[m] - numbers[BEARING, k])  # from the first row's
         merged[k] += 1
         turn[k] += off
         weighted[k] += off / (std[m] * std[m])
         weight[k] += 1.0 / (std[m] * std[m])
-    for k in range(count):
+    _average(numbers[:, :count], merged, turn, weighted, weight)
+    for m in further[:detours]:
+        landmark[count], caller[count] = label[m], whose[m]
+        for number in (DETOUR, DETOUR_STD, LEVEL):
+            numbers[number, count] = given[number, m]
+        count += 1
+    return landmark[:count], caller[:count], numbers[:, :count].copy()
+
+
+@kernel
+def _average(
+    numbers: Float[np.ndarray, "7 k"],
+    merged: Int[np.ndarray, " k"],
+    turn: Float[np.ndarray, " k"],
+    weighted: Float[np.ndarray, " k"],
+    weight: Float[np.ndarray, " k"],
+) -> None:
+    """Turn the first bearing of each row to the mean of all that were merged.
+
+    They are so far from it in sum, plainly and weighted, with so much weight.
+    """
+    for k in range(numbers.shape[1]):
         if merged[k] > 1:
             first = numbers[BEARING, k]
             if math.isnan(weight[k]):
@@ -175,7 +208,6 @@ def _fuse(
             else:
                 numbers[BEARING, k] = wrap_angle(first + weighted[k] / weight[k])
                 numbers[BEARING_STD, k] = 1.0 / math.sqrt(weight[k])
-    return landmark[:count], caller[:count], numbers[:, :count].copy()
 
 
 @kernel

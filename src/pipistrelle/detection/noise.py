@@ -12,7 +12,14 @@ from jaxtyping import Float
 
 from pipistrelle.config import FilterConfig
 from pipistrelle.detection.faces import Heard
-from pipistrelle.detection.scans import BEARING_STD, OWN, RANGE_STD, Scan, with_columns
+from pipistrelle.detection.scans import (
+    BEARING_STD,
+    DETOUR_STD,
+    OWN,
+    RANGE_STD,
+    Scan,
+    with_columns,
+)
 from pipistrelle.jit import kernel
 
 Noise = Callable[[Scan], Scan]
@@ -25,6 +32,8 @@ the paper's worlds have the variances that are told; another's echoes come at al
 more."""
 RANGE_FLOOR = 0.01
 """Error [m] of a range that no level removes, likewise."""
+DETOUR_FLOOR = 0.014
+"""Error [m] of a detour that no level removes, likewise."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,28 +42,30 @@ class ConstantNoise:
 
     Attributes
     ----------
-    range_std, bearing_std : [m], [rad]
+    range_std, bearing_std, detour_std : [m], [rad], [m]
 
     Examples
     --------
     >>> from pipistrelle.detection.scans import make_scan
     >>> scan = make_scan(0.5, np.array([3, 8]), np.zeros(2), bearing_std=np.array([0.02, np.nan]))
-    >>> ConstantNoise(range_std=0.2, bearing_std=0.15)(scan).bearing_std
+    >>> ConstantNoise(range_std=0.2, bearing_std=0.15, detour_std=0.2)(scan).bearing_std
     array([0.02, 0.15])
     """
 
     range_std: float
     bearing_std: float
+    detour_std: float
 
     def __call__(self, scan: Scan) -> Scan:
         """Give rows the standard deviations that they do not have."""
-        numbers = _filled(np.ascontiguousarray(scan.numbers), self.bearing_std, self.range_std)
-        return Scan(time=scan.time, landmark=scan.landmark, caller=scan.caller, numbers=numbers)
+        stds = self.bearing_std, self.range_std, self.detour_std
+        numbers = _filled(np.ascontiguousarray(scan.numbers), *stds)
+        return replace(scan, numbers=numbers)
 
 
 @kernel
 def _filled(
-    numbers: Float[np.ndarray, "7 m"], bearing_std: float, range_std: float
+    numbers: Float[np.ndarray, "7 m"], bearing_std: float, range_std: float, detour_std: float
 ) -> Float[np.ndarray, "7 m"]:
     """Copy numbers, with constants where they say nothing of how surely a row was measured."""
     filled = numbers.copy()
@@ -63,6 +74,8 @@ def _filled(
             filled[BEARING_STD, m] = bearing_std
         if math.isnan(filled[RANGE_STD, m]):
             filled[RANGE_STD, m] = range_std
+        if math.isnan(filled[DETOUR_STD, m]):
+            filled[DETOUR_STD, m] = detour_std
     return filled
 
 
@@ -94,8 +107,9 @@ def measured(heard: Heard) -> Heard:
     numbers = rows.numbers.copy()
     numbers[BEARING_STD] = np.hypot(across, np.where(rows.caller == OWN, *BEARING_FLOOR))
     numbers[RANGE_STD] = np.hypot(along, RANGE_FLOOR)
-    told = Scan(time=rows.time, landmark=rows.landmark, caller=rows.caller, numbers=numbers)
-    return replace(heard, rows=told)
+    if heard.detour is not None:
+        numbers[DETOUR_STD] = np.hypot(heard.detour[1], DETOUR_FLOOR)
+    return replace(heard, rows=replace(rows, numbers=numbers))
 
 
 def unstated(scan: Scan) -> Scan:
@@ -115,7 +129,7 @@ def unstated(scan: Scan) -> Scan:
     >>> unstated(make_scan(0.5, np.array([3]), np.zeros(1), bearing_std=0.1)).bearing_std
     array([nan])
     """
-    return with_columns(scan, bearing_std=math.nan, range_std=math.nan)
+    return with_columns(scan, bearing_std=math.nan, range_std=math.nan, detour_std=math.nan)
 
 
 def as_said(scan: Scan) -> Scan:
@@ -144,4 +158,8 @@ def noise_of(settings: FilterConfig) -> Noise:
     -------
     Noise
     """
-    return ConstantNoise(range_std=settings.range_std, bearing_std=settings.bearing_std)
+    return ConstantNoise(
+        range_std=settings.range_std,
+        bearing_std=settings.bearing_std,
+        detour_std=settings.detour_std,
+    )

@@ -1,6 +1,6 @@
 """Scans: what one frame measured, a row per measurement, as associations and filters see it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -11,6 +11,8 @@ UNLABELLED = -1
 """Label of a measurement of which nobody says whose it is."""
 OWN = 0
 """Number of the vehicle among the callers, as in `pipistrelle.acoustics.callers`."""
+NOBODY = np.empty(0, dtype=np.int64)
+"""Of no caller is it known which landmark it is."""
 
 COLUMNS = (
     "landmark",
@@ -42,19 +44,24 @@ class Scan:
     landmark : (m)
         Label, as whoever recorded it says; UNLABELLED where nobody does.
     caller : (m)
-        Whose call it is: OWN, or the number of another. Of several calls, the first of theirs.
+        Whose call it is: OWN, or the number of another. Of several calls, the one that has a
+        detour, else the first of theirs.
     numbers : (7, m)
         The other columns, in the order of `COLUMNS`.
+    callers : (c)
+        Label that each caller bears as a landmark, by its number; UNLABELLED for the vehicle and
+        for whom nobody knows, as for those beyond.
     """
 
     time: float
     landmark: Int[np.ndarray, " m"]
     caller: Int[np.ndarray, " m"]
     numbers: Float[np.ndarray, "7 m"]
+    callers: Int[np.ndarray, " c"] = field(default_factory=lambda: NOBODY)
 
     @property
     def bearing(self) -> Float[np.ndarray, " m"]:
-        """Relative to the heading, counter-clockwise [rad], in [-pi, pi)."""
+        """Relative to the heading, counter-clockwise [rad]; NaN where a row is but a detour."""
         return self.numbers[BEARING]
 
     @property
@@ -146,7 +153,7 @@ def with_columns(scan: Scan, **columns: np.ndarray | float) -> Scan:
     array([-0.2, -1. ])
     """
     own = {name: getattr(scan, name) for name in COLUMNS}
-    return _made_of(scan.time, scan.landmark.shape, own | columns)
+    return replace(_made_of(scan.time, scan.landmark.shape, own | columns), callers=scan.callers)
 
 
 def _made_of(time: float, shape: tuple[int, ...], given: dict[str, np.ndarray | float]) -> Scan:
@@ -182,8 +189,8 @@ def rows_of(scan: Scan, rows: Bool[np.ndarray, " m"] | Int[np.ndarray, " k"]) ->
     >>> rows_of(scan, scan.bearing > 0.5).landmark
     array([8])
     """
-    return Scan(
-        time=scan.time,
+    return replace(
+        scan,
         landmark=scan.landmark[rows],
         caller=scan.caller[rows],
         numbers=np.ascontiguousarray(scan.numbers[:, rows]),

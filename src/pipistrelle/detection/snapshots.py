@@ -27,6 +27,7 @@ from jaxtyping import Complex, Float, Int, Shaped
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.certainty import bearing_std, delay_std, loudest_noise, over_noise
+from pipistrelle.detection.direct import DirectCalls, direct_calls
 from pipistrelle.detection.onset import arrival_lag, reach_of, steer
 from pipistrelle.geometry import wrap
 from pipistrelle.jit import Whole, kernel, no_alloc
@@ -60,6 +61,8 @@ class Detections:
     bearing_std, delay_std : (m) [rad], [s]
         How sure the detector is of each (`detection.certainty`); NaN, as by default, where it does
         not say.
+    direct : DirectCalls or None
+        When the other callers were heard directly; None where the detector does not say.
     """
 
     face: Int[np.ndarray, " m"]
@@ -70,6 +73,7 @@ class Detections:
     power: Float[np.ndarray, " m"]
     bearing_std: Float[np.ndarray, " m"] = field(default_factory=lambda: np.empty(0))
     delay_std: Float[np.ndarray, " m"] = field(default_factory=lambda: np.empty(0))
+    direct: DirectCalls | None = None
 
     def __post_init__(self) -> None:
         """Say that a detector does not say how sure it is."""
@@ -220,6 +224,7 @@ def detect(
     )
     lags = (start, interval, pulse)
     whole, numbers = _find_peaks(matched, energy, rules, lags)
+    found, (began, began_std) = direct_calls(matched, whole, numbers, matched.shape[2], lags)
     (face, caller), (delay, sine, power, bearing_std, delay_std) = whole, numbers
     angle = np.arcsin(sine)
     return Detections(
@@ -231,6 +236,9 @@ def detect(
         power=power,
         bearing_std=bearing_std,
         delay_std=delay_std,
+        direct=DirectCalls(
+            detection=found, delay=began, delay_std=began_std, pulse=pulse * interval
+        ),
     )
 
 

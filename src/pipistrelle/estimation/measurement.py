@@ -1,7 +1,7 @@
-"""The measurement model with its Jacobians: range and bearing of a point.
+"""The measurement model with its Jacobians: range, bearing and detour of a point.
 
-`Measurements` are the rows of a scan as the filters' kernels take them. A filter that weighs what
-else a scan may hold (its detours, its levels) adds a field here.
+`Measurements` and `Detours` are the rows of a scan as the filters' kernels take them. A filter that
+weighs what else a scan may hold (its levels) adds a field here.
 """
 
 import math
@@ -10,7 +10,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.detection.scans import BEARING, BEARING_STD, RANGE, RANGE_STD, Scan
+from pipistrelle.detection.scans import (
+    BEARING,
+    BEARING_STD,
+    DETOUR,
+    DETOUR_STD,
+    RANGE,
+    RANGE_STD,
+    UNLABELLED,
+    Scan,
+)
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
@@ -41,8 +50,30 @@ class Measurements(NamedTuple):
     range_variance: Float[np.ndarray, " m"]
 
 
-Columns = tuple[Int[np.ndarray, " m"], Float[np.ndarray, "7 m"]]
-"""Labels and numbers of a scan."""
+class Detours(NamedTuple):
+    """Those rows of a scan that have a detour whose caller is known by its label.
+
+    Attributes
+    ----------
+    landmark, caller : (d)
+        Labels; no landmark is its own caller.
+    detour : (d) [m]
+    variance : (d) [m^2]
+    """
+
+    landmark: Int[np.ndarray, " d"]
+    caller: Int[np.ndarray, " d"]
+    detour: Float[np.ndarray, " d"]
+    variance: Float[np.ndarray, " d"]
+
+
+Columns = tuple[
+    Int[np.ndarray, " m"],
+    Float[np.ndarray, "7 m"],
+    Int[np.ndarray, " m"],
+    Int[np.ndarray, " c"],
+]
+"""Labels, numbers and callers of a scan's rows, and the callers' labels."""
 
 
 def columns_of(scan: Scan) -> Columns:
@@ -54,15 +85,17 @@ def columns_of(scan: Scan) -> Columns:
 
     Returns
     -------
-    tuple of labels and numbers
+    tuple of labels, numbers, callers and callers' labels
         A plain tuple: a kernel takes one in no time, and a record in microseconds.
     """
-    return scan.landmark, np.ascontiguousarray(scan.numbers)
+    return scan.landmark, np.ascontiguousarray(scan.numbers), scan.caller, scan.callers
 
 
 @kernel
 def measurements(columns: Columns) -> Measurements:
     """Return the rows of a scan as the kernels take them: standard deviations are squared here.
+
+    What is but a further detour, without a bearing, stands at the end and is left out.
 
     Examples
     --------
@@ -71,15 +104,46 @@ def measurements(columns: Columns) -> Measurements:
     >>> measurements(columns_of(scan)).bearing_variance
     array([0.25])
     """
-    landmark, numbers = columns
-    bearing_std, range_std = numbers[BEARING_STD], numbers[RANGE_STD]
+    landmark, numbers, _, _ = columns
+    rows = landmark.size
+    while rows > 0 and math.isnan(numbers[BEARING, rows - 1]):
+        rows -= 1
+    bearing_std, range_std = numbers[BEARING_STD, :rows], numbers[RANGE_STD, :rows]
     return Measurements(
-        landmark,
-        numbers[BEARING],
-        numbers[RANGE],
+        landmark[:rows],
+        numbers[BEARING, :rows],
+        numbers[RANGE, :rows],
         bearing_std * bearing_std,
         range_std * range_std,
     )
+
+
+@kernel
+def detours(columns: Columns) -> Detours:
+    """Return the detours of a scan as the kernels take them.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> from pipistrelle.detection.scans import make_scan
+    >>> timed = {"detour": np.array([3.0, np.nan]), "detour_std": 0.5}
+    >>> scan = make_scan(0.0, np.array([4, 9]), np.zeros(2), caller=1, **timed)
+    >>> of = detours(columns_of(replace(scan, callers=np.array([-1, 9]))))
+    >>> of.landmark, of.caller, of.variance
+    (array([4]), array([9]), array([0.25]))
+    """
+    landmark, numbers, caller, callers = columns
+    count, rows, whose = 0, np.empty(landmark.size, np.int64), np.empty(landmark.size, np.int64)
+    for m in range(landmark.size):
+        if math.isnan(numbers[DETOUR, m]) or caller[m] >= callers.size:
+            continue
+        label = callers[caller[m]]
+        if label != UNLABELLED and label != landmark[m]:
+            rows[count], whose[count] = m, label
+            count += 1
+    kept = rows[:count]
+    std = numbers[DETOUR_STD][kept]
+    return Detours(landmark[kept], whose[:count], numbers[DETOUR][kept], std * std)
 
 
 class Row(NamedTuple):
@@ -162,3 +226,132 @@ def measurement_jacobians(
         np.array([[-c, -s, 0.0], [s * k, -c * k, -1.0]]),
         np.array([[c, s], [-s * k, c * k]]),
     )
+
+
+@kernel
+def detour_slopes(
+    x: float, y: float, px: float, py: float, bx: float, by: float
+) -> tuple[float, float, float, float, float]:
+    """Detour over a point and its slopes, for kernels.
+
+    Of the vehicle at (x, y), the point (px, py) and the caller at (bx, by). Returns the detour [m],
+    its derivatives by the point (2) and by the caller (2); those by the vehicle are the rest, for
+    the three together may be moved. Ways are bounded from below by `NEAREST`.
+    """
+    ux, uy, near = _away(x, y, px, py)
+    wx, wy, onward = _away(bx, by, px, py)
+    vx, vy, straight = _away(x, y, bx, by)
+    return onward + near - straight, wx + ux, wy + uy, -wx - vx, -wy - vy
+
+
+@kernel
+def _away(x: float, y: float, px: float, py: float) -> tuple[float, float, float]:
+    """Direction cosines and distance from (x, y) to (px, py)."""
+    dx, dy = px - x, py - y
+    distance = math.sqrt(dx * dx + dy * dy)
+    inverse = 1.0 / max(distance, NEAREST)
+    return dx * inverse, dy * inverse, distance
+
+
+@kernel
+def range_by_detour(detour: float, dx: float, dy: float, c: float, s: float) -> float:
+    """Range of a point in the direction (c, s) of the vehicle, the caller being (dx, dy) from it.
+
+    Infinite or negative where no point there has such a detour; see `landmark_range`.
+    """
+    straight = math.sqrt(dx * dx + dy * dy)
+    return 0.5 * detour * (2.0 * straight + detour) / (straight + detour - c * dx - s * dy)
+
+
+@kernel
+def caller_range_by_detour(detour: float, dx: float, dy: float, c: float, s: float) -> float:
+    """Range of a caller in the direction (c, s) of the vehicle, the point being (dx, dy) from it.
+
+    Infinite or negative where no caller there makes such a detour.
+    """
+    near = math.sqrt(dx * dx + dy * dy)
+    return 0.5 * detour * (2.0 * near - detour) / (c * dx + s * dy + detour - near)
+
+
+def detour_of(
+    vehicle: Float[np.ndarray, "2"], point: Float[np.ndarray, "2"], caller: Float[np.ndarray, "2"]
+) -> float:
+    r"""How much longer the way of a caller's sound over a point is than the straight one.
+
+    .. math:: e = |b - l| + |l - p| - |b - p|
+
+    Points of one detour lie on an ellipse whose foci are the caller b and the vehicle p.
+
+    Parameters
+    ----------
+    vehicle, point, caller : (2) [m]
+
+    Returns
+    -------
+    [m]
+
+    Examples
+    --------
+    >>> detour_of(np.zeros(2), np.array([3.0, 4.0]), np.array([6.0, 0.0]))
+    4.0
+    """
+    return detour_slopes(*vehicle, *point, *caller)[0]
+
+
+def detour_jacobians(
+    vehicle: Float[np.ndarray, "2"], point: Float[np.ndarray, "2"], caller: Float[np.ndarray, "2"]
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    r"""Derivatives of the detour by the vehicle's position, the point's and the caller's.
+
+    .. math:: e_l = w + u, \quad e_b = -w - v, \quad e_p = v - u
+
+    with the unit vectors u and w to the point from the vehicle and from the caller, and v from the
+    vehicle to the caller.
+
+    Parameters
+    ----------
+    vehicle, point, caller : (2) [m]
+
+    Returns
+    -------
+    by vehicle, by point, by caller : (2)
+
+    Examples
+    --------
+    Beyond the vehicle, in line, every step away is two.
+
+    >>> detour_jacobians(np.zeros(2), np.array([-3.0, 0.0]), np.array([6.0, 0.0]))[1]
+    array([-2.,  0.])
+    """
+    _, *slopes = detour_slopes(*vehicle, *point, *caller)
+    by_point, by_caller = np.array(slopes[:2]), np.array(slopes[2:])
+    return -by_point - by_caller, by_point, by_caller
+
+
+def landmark_range(detour: float, caller: Float[np.ndarray, "2"], bearing: float) -> float:
+    r"""Range of a point of which bearing and detour are known, and where the caller is.
+
+    .. math:: r = \frac{(d + e)^2 - d^2}{2 (d + e - u \cdot v)}
+
+    with v the way from the vehicle to the caller, d its length and u the direction of the bearing:
+    where the ray from the vehicle crosses the ellipse of that detour. Between vehicle and caller
+    numerator and denominator vanish together: there a detour says nothing of the range.
+
+    Parameters
+    ----------
+    detour : [m]
+    caller : (2) [m]
+        From the vehicle, in its axes.
+    bearing : [rad]
+
+    Returns
+    -------
+    [m]
+
+    Examples
+    --------
+    >>> round(landmark_range(4.0, np.array([6.0, 0.0]), math.atan2(4.0, 3.0)), 9)
+    5.0
+    """
+    dx, dy = caller
+    return range_by_detour(detour, dx, dy, math.cos(bearing), math.sin(bearing))

@@ -186,6 +186,7 @@ OTHERS = {
     "association.delay_gate": 0.01,
     "association.bearing_gate": 0.01,
     "association.margin_db": 0.0,
+    "listening.timing": True,
     "motion.model": "unicycle",
     "motion.wheelbase": 0.3,
     "motion.speed_std": 0.2,
@@ -202,6 +203,7 @@ OTHERS = {
     "filter.robust": "huber",
     "filter.range_std": 0.4,
     "filter.bearing_std": 0.05,
+    "filter.detour_std": 0.7,
     "filter.initial_pose_std": [0.1, 0.1, 0.1],
     "filter.first_pose": "drawn",
     "filter.gate": 0.05,
@@ -222,7 +224,7 @@ OTHERS = {
 """Another value of every setting, far enough from its default to be heard or believed."""
 FEW = ("air.spreading", "target.shape", "emitter.radius", "beacon.level_db", "receiver.elements",
        "detection.peak_db", "association.bearing_gate", "motion.speed_std", "scenario.landmarks",
-       "assumed.wheelbase",
+       "assumed.wheelbase", "listening.timing",
        "filter.range_std", "rays.power", "fastslam.particles", "seed")  # fmt: skip
 """One of each section."""
 
@@ -237,6 +239,7 @@ NEEDS = {
     "scenario.extent": {"scenario": {"course": "eight"}},
     "scenario.lane": {"scenario": {"field": "rows"}},
     "motion.angular_rate_std": {"motion": {"model": "unicycle"}},
+    "filter.detour_std": {"listening": {"timing": True}},
     "filter.robust": {"filter": {"noise": "measured"}},
     "rays.spacing": {"filter": {"bearing_std": 0.003}},
     "assumed.angular_rate_std": {"motion": {"model": "unicycle"}},

@@ -23,7 +23,7 @@ from pipistrelle.acoustics.arrivals import (
     arrivals_of_emissions,
     through_piston,
 )
-from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_at
+from pipistrelle.acoustics.callers import VEHICLE, callers_at
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.layout import Layout, square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
@@ -31,9 +31,10 @@ from pipistrelle.arrays.sampling import BLOCK, Sampling, block_shape, blocks_to_
 from pipistrelle.config import Config
 from pipistrelle.detection.faces import Heard, average_faces, same_echo, unlabelled
 from pipistrelle.detection.matched import filter_blocks, filter_samples
+from pipistrelle.detection.scans import NOBODY
 from pipistrelle.detection.snapshots import Detections, Detector, detect, detector
 from pipistrelle.experiments.hearing.oracle import faintest_level_db, label_detections
-from pipistrelle.experiments.hearing.scenario import Scenario
+from pipistrelle.experiments.hearing.scenario import Scenario, caller_labels
 
 TOGETHER = 25
 """Frames whose arrivals are computed at a time: arrays of a few thousand keep NumPy busy."""
@@ -103,7 +104,7 @@ def listen(
     """
     setup = config.scenario
     ears = layout or square_of_four(config.receiver)
-    rig = _rig(config, scenario.callers, ears, find, oracle)
+    rig = _rig(config, scenario, ears, find, oracle)
     engine = _dense if config.receiver.engine == "dense" else _blocks
     beams: tuple[list[Heard], ...] = tuple([] for _ in radii)
     frames = range(setup.steps_per_frame, len(scenario.path), setup.steps_per_frame)
@@ -144,18 +145,19 @@ class _Rig:
     find: Callable[..., Detections]
     oracle: Callable[..., Int[np.ndarray, " d"]] | None
     faintest_db: float
+    callers: Int[np.ndarray, " c"]
     workspace: Workspace
 
 
 def _rig(
     config: Config,
-    callers: Sequence[Caller],
+    scenario: Scenario,
     layout: Layout,
     find: Callable[..., Detections],
     oracle: Callable[..., Int[np.ndarray, " d"]] | None,
 ) -> _Rig:
     """Settle what every frame of a path is heard with."""
-    settled = sampling(config, callers)
+    settled = sampling(config, scenario.callers)
     finder = detector(config, layout, settled.tones)
     return _Rig(
         config=config,
@@ -171,6 +173,7 @@ def _rig(
             noise_std=settled.noise_std,
             margin_db=config.association.margin_db,
         ),
+        callers=caller_labels(scenario) if oracle else NOBODY,
         workspace=Workspace(),
     )
 
@@ -226,6 +229,7 @@ def _heard(time: float, detections: Detections, arrivals: Arrivals, rig: _Rig) -
         label,
         averaging=config.detection.averaging,
         speed_of_sound=config.believed_celerity,
+        callers=rig.callers,
     )
     return unlabelled(heard) if rig.oracle is None else heard
 

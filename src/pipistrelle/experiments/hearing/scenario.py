@@ -4,12 +4,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of, moves
 from pipistrelle.acoustics.target import Bodies
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import Config, InputError, MotionConfig, ScenarioConfig
+from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.drives import LabelledPoints
 from pipistrelle.experiments.hearing.courses import course_of, driven
@@ -188,6 +189,28 @@ def moving_labels(scenario: Scenario) -> tuple[int, ...]:
     """
     labelled = enumerate(scenario.callers[VEHICLE + 1 :], start=len(scenario.landmarks) + 1)
     return tuple(label for label, caller in labelled if moves(caller))
+
+
+def caller_labels(scenario: Scenario) -> Int[np.ndarray, " c"]:
+    """List the labels that the callers bear as landmarks, by their numbers.
+
+    Parameters
+    ----------
+    scenario : Scenario
+
+    Returns
+    -------
+    (c)
+        UNLABELLED for the vehicle.
+
+    Examples
+    --------
+    >>> caller_labels(world_of(Config()))
+    array([-1, 51])
+    """
+    labels = len(scenario.landmarks) + np.arange(len(scenario.callers))
+    labels[VEHICLE] = UNLABELLED
+    return labels
 
 
 def motion_of(motion: MotionConfig) -> Motion:

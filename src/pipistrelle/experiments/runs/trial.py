@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import Config, Strategy
-from pipistrelle.detection.faces import Heard
+from pipistrelle.detection.faces import Heard, timed
 from pipistrelle.detection.merging import scan_of
 from pipistrelle.detection.noise import measured, noise_of
 from pipistrelle.detection.scans import Scan, rows_of
@@ -133,7 +133,8 @@ def scans_of(heard: Sequence[Heard], strategy: Strategy, config: Config) -> tupl
         As many.
     """
     noise, said = noise_of(config.filter), config.filter.noise == "measured"
-    frames = map(measured, heard) if said else heard
+    frames = map(timed, heard) if config.listening.timing else heard
+    frames = map(measured, frames) if said else frames
     return tuple(noise(scan_of(frame, strategy)) for frame in frames)
 
 

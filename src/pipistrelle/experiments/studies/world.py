@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipistrelle.acoustics.emitter import beamwidth_of
-from pipistrelle.config import Config, FilterConfig, Strategy
+from pipistrelle.config import Config, FilterConfig, ListeningConfig, Strategy
 from pipistrelle.detection.faces import Heard
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Track, Trajectory
@@ -295,8 +295,8 @@ def _run_cases(cases: Sequence[PlannedCase], iteration: int, world: World) -> li
     return [_try_case(case, shared, iteration) for case in cases]
 
 
-_Told = tuple[float, Strategy, FilterConfig]
-"""Of which beam, by which strategy, with which noise."""
+_Told = tuple[float, Strategy, FilterConfig, ListeningConfig]
+"""Of which beam, by which strategy, with which noise, and what is listened for."""
 
 
 class _Shared:
@@ -310,51 +310,45 @@ class _Shared:
         self._scans_known: dict[_Told, tuple[Scan, ...]] = {}
         self._bound_known: dict[_Told, Float[np.ndarray, "t 3 3"]] = {}
 
-    def scans(self, radius: float, strategy: Strategy, told: FilterConfig) -> tuple[Scan, ...]:
+    def scans(self, case: PlannedCase) -> tuple[Scan, ...]:
         """Return what a strategy takes of a beam's frames, and how surely, as a filter is told."""
-        return self._scans(radius, strategy, _noise_alone(told))
+        return self._scans(_told(case))
 
-    def consistent(
-        self, radius: float, strategy: Strategy, told: FilterConfig
-    ) -> Float[np.ndarray, "k 2"]:
+    def consistent(self, case: PlannedCase) -> Float[np.ndarray, "k 2"]:
         """Return mean and variance of a consistent filter's NEES at each frame."""
         frames = slice(None, None, self._config.scenario.steps_per_frame)
-        path = self.scenario.path[frames]
+        path, told = self.scenario.path[frames], case.config.filter
         if told.first_pose == "drawn":
             return np.tile(np.array(NEES_OF_DRAWN_START, np.float32), (len(path) - 1, 1))
-        bound = self._bound(radius, strategy, _noise_alone(told))[frames]
+        bound = self._bound(_told(case))[frames]
         expected = nees_of_exact_start(bound, path, _start_covariance(told))
         return np.column_stack(expected)[1:].astype(np.float32)
 
-    def bound(
-        self, radius: float, strategy: Strategy, told: FilterConfig
-    ) -> Float[np.ndarray, "t 3 3"]:
+    def bound(self, case: PlannedCase) -> Float[np.ndarray, "t 3 3"]:
         """Return the bound of the pose at every step, the noise as the signal tells it."""
-        measured = _noise_alone(told).model_copy(update={"noise": "measured"})
-        bound = self._bound(radius, strategy, measured)
+        radius, strategy, noise, listening = _told(case)
+        measured, told = noise.model_copy(update={"noise": "measured"}), case.config.filter
+        bound = self._bound((radius, strategy, measured, listening))
         if told.first_pose == "drawn":
             return bound_of_drawn_start(bound, self.scenario.path, _start_covariance(told))
         return bound
 
-    def _scans(self, radius: float, strategy: Strategy, noise: FilterConfig) -> tuple[Scan, ...]:
+    def _scans(self, told: _Told) -> tuple[Scan, ...]:
         """Take the scans of a beam."""
-        key = radius, strategy, noise
-        if key not in self._scans_known:
-            told = self._config.model_copy(update={"filter": noise})
-            self._scans_known[key] = scans_of(self.beams[radius], strategy, told)
-        return self._scans_known[key]
+        if told not in self._scans_known:
+            radius, strategy, noise, listening = told
+            config = self._config.model_copy(update={"filter": noise, "listening": listening})
+            self._scans_known[told] = scans_of(self.beams[radius], strategy, config)
+        return self._scans_known[told]
 
-    def _bound(
-        self, radius: float, strategy: Strategy, noise: FilterConfig
-    ) -> Float[np.ndarray, "t 3 3"]:
+    def _bound(self, told: _Told) -> Float[np.ndarray, "t 3 3"]:
         """Work out the bound of the pose at every step."""
-        key = radius, strategy, noise
-        if key not in self._bound_known:
-            scans, world = self._scans(*key), self.scenario
+        if told not in self._bound_known:
+            scans, world = self._scans(told), self.scenario
             truth, motion = (world.path, standing_landmarks(world)), motion_of(self._config.motion)
             bound = pose_bound(motion, world.controls, world.time, *truth, scans)
-            self._bound_known[key] = bound
-        return self._bound_known[key]
+            self._bound_known[told] = bound
+        return self._bound_known[told]
 
 
 def _start_covariance(told: FilterConfig) -> Float[np.ndarray, "3 3"]:
@@ -362,18 +356,24 @@ def _start_covariance(told: FilterConfig) -> Float[np.ndarray, "3 3"]:
     return np.diag(np.square(told.initial_pose_std))
 
 
+def _told(case: PlannedCase) -> _Told:
+    """Return what tells a case's scans from those of others in its world."""
+    config = case.config
+    return config.emitter.radius, case.strategy, _noise_alone(config.filter), config.listening
+
+
 def _noise_alone(told: FilterConfig) -> FilterConfig:
     """Return of a filter's settings what states the noise, all else at its default."""
-    noise = ("noise", "range_std", "bearing_std")
+    noise = ("noise", "range_std", "bearing_std", "detour_std")
     return FilterConfig(**{name: getattr(told, name) for name in noise})
 
 
 def _try_case(case: PlannedCase, shared: _Shared, iteration: int) -> TrialRecord:
     """Run a trial, whatever comes of it; filters share what a beam and a strategy bring."""
     try:
-        scenario, told = shared.scenario, case.config.filter
-        drive, radius = drive_of(scenario, case.config, iteration), case.config.emitter.radius
-        heard, scans = shared.beams[radius], shared.scans(radius, case.strategy, told)
+        scenario = shared.scenario
+        drive, scans = drive_of(scenario, case.config, iteration), shared.scans(case)
+        heard = shared.beams[case.config.emitter.radius]
         began = time.thread_time()
         result = run_trial(replace(case, iteration=iteration), drive, scans, case.config)
         cpu_s = time.thread_time() - began
@@ -383,13 +383,13 @@ def _try_case(case: PlannedCase, shared: _Shared, iteration: int) -> TrialRecord
         return TrialRecord(
             case=case,
             beamwidth_deg=_beamwidth_deg(case),
-            scores=with_bound(result.scores, shared.bound(radius, case.strategy, told)),
+            scores=with_bound(result.scores, shared.bound(case)),
             online=result.online,
             landmarks_full_mean=float(result.scores.landmarks_full if full is None else full),
             clutter_per_frame=sum(h.clutter or 0 for h in heard) / len(heard) if heard else None,
             wall_s=result.wall_s,
             cpu_s=cpu_s,
-            steps=np.column_stack([frames, shared.consistent(radius, case.strategy, told)]),
+            steps=np.column_stack([frames, shared.consistent(case)]),
             landmark=estimate.landmark,
             full=estimate.full,
             landmark_error=landmark_error(estimate, *standing_landmarks(scenario)),

@@ -1,0 +1,175 @@
+r"""The direct call of another caller: found by what it is, and when it began.
+
+Of all sound in a caller's tone that which came straight is the first, and as loud as anything; an
+echo may be louder only where a landmark stands so near the straight line that the sound it bends
+forward adds up. So: the loudest in the tone, and of what is not much fainter than that the first.
+
+**When it began.** Echoes of what stands near the line set in while the direct call lasts, and draw
+the best fit of a whole call by up to its length, and the beam aside. Before it there is nothing. So
+its front edge is sought alone, in what the matched filter's outputs gain from a block to the next:
+what a new block brings less what an old one takes,
+
+.. math:: s_k = y_{k+1} - y_k = x_{k+M} - x_k
+
+at each element; which is noise until the call begins, and its amplitudes A after the block in which
+it does, of which the call fills the share
+:math:`1 - q = \operatorname{Re}(A^H s_k) / \lVert A \rVert^2`. A is the mean of the two blocks that
+follow; no direction is asked. The edge is as sure as those few blocks are loud, and as well as they
+fit:
+
+.. math:: \sigma_q^2 = \frac{\sigma_s^2}{2 \lVert A \rVert^2} \left(1 + \frac{(1 - q)^2}{2}\right)
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from pipistrelle.jit import Whole, kernel, no_alloc
+
+FAINTER = 0.1
+"""Least power of the direct call, as a share of the loudest of its tone."""
+RISE = 0.3
+"""Least amplitude of its front edge, as a share of what the loudest lag near makes expect."""
+CLEAR = 3.0
+"""Least energy of its front edge, in means of that of the noise."""
+AFTER = 2
+"""Blocks behind the edge that tell the amplitude: what sets in later does not matter."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DirectCalls:
+    """Where and when each caller was heard directly.
+
+    Attributes
+    ----------
+    detection : (c)
+        Number of a detection of it; -1 of the vehicle, and of whom nothing was heard.
+    delay, delay_std : (c) [s]
+        When it began; NaN likewise.
+    pulse : [s]
+        How long it lasts.
+    """
+
+    detection: Int[np.ndarray, " c"]
+    delay: Float[np.ndarray, " c"]
+    delay_std: Float[np.ndarray, " c"]
+    pulse: float
+
+
+@no_alloc
+def loudest_first(
+    caller: Int[np.ndarray, " d"],
+    delay: Float[np.ndarray, " d"],
+    power: Float[np.ndarray, " d"],
+    p: Whole,
+) -> Whole:
+    """Number of the detection that is the direct call of caller p; -1 where none was heard."""
+    loudest, first = 0.0, -1
+    for d in range(caller.size):
+        if caller[d] == p:
+            loudest = max(loudest, power[d])
+    for d in range(caller.size):
+        earlier = first < 0 or delay[d] < delay[first]
+        if caller[d] == p and power[d] >= FAINTER * loudest and earlier:
+            first = d
+    return first
+
+
+@kernel
+def front_edge(
+    matched: Complex[np.ndarray, "l f c e"], b: Whole, f: Whole, p: Whole, pulse: Whole
+) -> tuple[float, float]:
+    """Lag at which the first call of a tone begins, and its standard deviation; NaN where unclear.
+
+    Sought from two calls before lag b to it.
+    """
+    stride, elements = max(pulse // 14, 1), matched.shape[3]
+    low = max(b - 2 * (pulse + stride), b % stride)
+    count = (min(b + stride, matched.shape[0] - 1) - low) // stride
+    if count <= AFTER:
+        return math.nan, math.nan
+    gain, loudest = np.empty((count, elements), dtype=np.complex128), 0.0
+    energy = np.zeros(count)
+    for k in range(count):
+        after, before, level = low + (k + 1) * stride, low + k * stride, 0.0
+        for e in range(elements):
+            y = matched[after, f, p, e]
+            gain[k, e] = y - matched[before, f, p, e]
+            energy[k] += gain[k, e].real ** 2 + gain[k, e].imag ** 2
+            level += y.real**2 + y.imag**2
+        loudest = max(loudest, level)
+    noise = 2.0 * stride / pulse
+    least = max((RISE * stride / pulse) ** 2 * loudest, CLEAR * noise * elements)
+    for k in range(count - AFTER):
+        if energy[k : k + 1 + AFTER].min() >= least:  # what leaks from another tone is gone at once
+            lag, std = _fitted(gain, k, noise)
+            return low + pulse + stride * lag, stride * std
+    return math.nan, math.nan
+
+
+@no_alloc
+def _mean_after(gain: Complex[np.ndarray, "k e"], begin: Whole, e: Whole) -> complex:
+    """Mean of the blocks behind one, at an element."""
+    total = 0.0j
+    for a in range(begin + 1, begin + 1 + AFTER):
+        total += gain[a, e]
+    return total / AFTER
+
+
+@no_alloc
+def _fitted(gain: Complex[np.ndarray, "k e"], k: Whole, noise: float) -> tuple[float, float]:
+    """Where in the blocks before k and at k the call begins that fits what follows best.
+
+    In blocks from the first. What the fit leaves is noise, where it is more than that.
+    """
+    least, best, std, elements = math.inf, math.nan, math.nan, gain.shape[1]
+    for begin in range(max(k - 1, 0), k + 1):
+        square, along, misfit = 0.0, 0.0, 0.0
+        for e in range(elements):
+            A, s = _mean_after(gain, begin, e), gain[begin, e]
+            square += A.real * A.real + A.imag * A.imag
+            along += A.real * s.real + A.imag * s.imag
+        share = min(max(along / square, 0.0), 1.0) if square > 0.0 else 0.0
+        for e in range(elements):
+            A = _mean_after(gain, begin, e)
+            misfit += abs(gain[begin, e] - share * A) ** 2
+            misfit += abs(gain[begin - 1, e]) ** 2 if begin > 0 else 0.0
+            for a in range(begin + 1, begin + 1 + AFTER):
+                misfit += abs(gain[a, e] - A) ** 2
+        if square > 0.0 and misfit < least:
+            left = max(noise, misfit / elements)
+            least, best = misfit, begin + 1.0 - share
+            std = math.sqrt(0.5 * left * (1.0 + share * share / AFTER) / square)
+    return best, std
+
+
+@kernel
+def direct_calls(
+    matched: Complex[np.ndarray, "l f c e"],
+    whole: Int[np.ndarray, "2 d"],
+    numbers: Float[np.ndarray, "5 d"],
+    tones: Whole,
+    lags: tuple[float, float, Whole],
+) -> tuple[Int[np.ndarray, " c"], Float[np.ndarray, "2 c"]]:
+    """Find the direct call of every caller but the vehicle, by loudness and order, and its edge.
+
+    ``whole`` are face and caller of each detection, ``numbers`` delay, sine of the angle, power and
+    the standard deviations of bearing and delay; ``lags`` the delay of lag 0 [s], the distance of
+    two lags [s] and the lags of a call. Returns the columns of `DirectCalls`: where the edge is
+    unclear, that of the whole call.
+    """
+    start, interval, pulse = lags
+    found = np.full(tones, -1, dtype=np.int64)
+    when = np.full((2, tones), np.nan)
+    for p in range(1, tones):
+        d = loudest_first(whole[1], numbers[0], numbers[2], p)
+        if d < 0:
+            continue
+        b = int((numbers[0, d] - start) / interval + 0.5)
+        lag, std = front_edge(matched, b, whole[0, d], p, pulse)
+        found[p], when[0, p], when[1, p] = d, numbers[0, d], numbers[4, d]
+        if not math.isnan(lag):
+            when[0, p], when[1, p] = start + interval * lag, interval * std
+    return found, when
