@@ -26,12 +26,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
+from pipistrelle.detection.onset import reach_of
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 FAINTER = 0.1
 """Least power of the direct call, as a share of the loudest of its tone."""
 RISE = 0.3
 """Least amplitude of its front edge, as a share of what the loudest lag near makes expect."""
+LEAKAGE = 0.005
+"""Power, as a share of a detection's of another tone at the same time, that may be its leakage."""
 CLEAR = 3.0
 """Least energy of its front edge, in means of that of the noise."""
 AFTER = 2
@@ -81,9 +84,10 @@ def loudest_first(
 def front_edge(
     matched: Complex[np.ndarray, "l f c e"], b: Whole, f: Whole, p: Whole, pulse: Whole
 ) -> tuple[float, float]:
-    """Lag at which the first call of a tone begins, and its standard deviation; NaN where unclear.
+    """Lag at which the first call of a tone begins, and its standard deviation.
 
-    Sought from two calls before lag b to it.
+    Sought from two calls before lag b to it. NaN where none is clear, or where something stood out
+    before it that did not last: a call that an echo at its heels has all but extinguished.
     """
     stride, elements = max(pulse // 14, 1), matched.shape[3]
     low = max(b - 2 * (pulse + stride), b % stride)
@@ -101,9 +105,13 @@ def front_edge(
             level += y.real**2 + y.imag**2
         loudest = max(loudest, level)
     noise = 2.0 * stride / pulse
-    least = max((RISE * stride / pulse) ** 2 * loudest, CLEAR * noise * elements)
+    faintest = CLEAR * noise * elements
+    least, first = max((RISE * stride / pulse) ** 2 * loudest, faintest), count
     for k in range(count - AFTER):
-        if energy[k : k + 1 + AFTER].min() >= least:  # what leaks from another tone is gone at once
+        first = min(first, k) if energy[k] >= faintest else first
+        if energy[k : k + 1 + AFTER].min() >= least:
+            if first < k - 1:
+                break
             lag, std = _fitted(gain, k, noise)
             return low + pulse + stride * lag, stride * std
     return math.nan, math.nan
@@ -157,19 +165,33 @@ def direct_calls(
 
     ``whole`` are face and caller of each detection, ``numbers`` delay, sine of the angle, power and
     the standard deviations of bearing and delay; ``lags`` the delay of lag 0 [s], the distance of
-    two lags [s] and the lags of a call. Returns the columns of `DirectCalls`: where the edge is
-    unclear, that of the whole call.
+    two lags [s] and the lags of a call. Returns the columns of `DirectCalls`; of a call that began
+    before the record the whole's best fit.
     """
     start, interval, pulse = lags
     found = np.full(tones, -1, dtype=np.int64)
     when = np.full((2, tones), np.nan)
     for p in range(1, tones):
         d = loudest_first(whole[1], numbers[0], numbers[2], p)
-        if d < 0:
+        if d < 0 or _may_leak(whole, numbers, d, pulse * interval):
             continue
         b = int((numbers[0, d] - start) / interval + 0.5)
-        lag, std = front_edge(matched, b, whole[0, d], p, pulse)
-        found[p], when[0, p], when[1, p] = d, numbers[0, d], numbers[4, d]
+        lag, std = (numbers[0, d] - start) / interval, numbers[4, d] / interval
+        if b > pulse + reach_of(pulse):
+            lag, std = front_edge(matched, b, whole[0, d], p, pulse)
         if not math.isnan(lag):
-            when[0, p], when[1, p] = start + interval * lag, interval * std
+            found[p], when[0, p], when[1, p] = d, start + interval * lag, interval * std
     return found, when
+
+
+@no_alloc
+def _may_leak(
+    whole: Int[np.ndarray, "2 d"], numbers: Float[np.ndarray, "5 d"], d: Whole, within: float
+) -> bool:
+    """Whether detection d is so faint beside one of another tone that it may be its leakage."""
+    for other in range(whole.shape[1]):
+        if whole[0, other] == whole[0, d] and whole[1, other] != whole[1, d]:
+            near = abs(numbers[0, other] - numbers[0, d]) <= within
+            if near and numbers[2, d] < LEAKAGE * numbers[2, other]:
+                return True
+    return False

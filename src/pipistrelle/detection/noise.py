@@ -32,7 +32,7 @@ the paper's worlds have the variances that are told; another's echoes come at al
 more."""
 RANGE_FLOOR = 0.01
 """Error [m] of a range that no level removes, likewise."""
-DETOUR_FLOOR = 0.014
+DETOUR_FLOOR = 0.006
 """Error [m] of a detour that no level removes, likewise."""
 
 

@@ -1,7 +1,9 @@
 """A frame's correction of one Gaussian over a pose and the members of all landmarks.
 
 A frame is taken in measurement by measurement, each at the current mean: first the landmarks
-already mapped, in the order of the scan, then the new ones are placed from the corrected pose.
+already mapped, in the order of the scan, then the new ones are placed from the corrected pose, then
+detours correct what both of its ends has placed, and weigh what one has (`timing`). A bearing that
+a detour places, with it, is not taken in besides.
 """
 
 import math
@@ -32,10 +34,18 @@ from pipistrelle.estimation.ekf.gaussian import (
     joint_of,
 )
 from pipistrelle.estimation.ekf.huber import tempered
+from pipistrelle.estimation.ekf.timing import (
+    correct_detour,
+    place_by_detour,
+    unsure_by_detour,
+    weigh_by_detour,
+)
 from pipistrelle.estimation.measurement import (
     Columns,
+    Detours,
     Measurements,
     Row,
+    detours,
     measurements,
     observe,
     row_of,
@@ -208,9 +218,128 @@ def _correct_known(state: State, row: Row, sensing: Sensing, scratch: _Scratch) 
 
 
 @no_alloc
-def _add_new(state: State, row: Row, sensing: Sensing) -> None:
+def _single(state: State, label: Whole) -> Whole:
+    """Return the one member of a landmark; -1 where it has another number of them."""
+    first, count = _members_of(state.landmark, state.members[0], label)
+    return first if count == 1 else -1
+
+
+@no_alloc
+def _surest(state: State, row: Row, timed: Detours, used: Bool[np.ndarray, " d"]) -> Whole:
+    """Return the detour that tells the range of a row's landmark most surely; -1 where none does.
+
+    It is one over the landmark, of a caller that is placed, or one of its own call over a placed
+    one.
+    """
+    best, least, size = -1, math.inf, 3 + 2 * state.members[0]
+    for d in range(timed.landmark.size):
+        of_caller = timed.caller[d] == row.landmark
+        if used[d] or not (of_caller or timed.landmark[d] == row.landmark):
+            continue
+        other = _single(state, timed.landmark[d] if of_caller else timed.caller[d])
+        if other < 0:
+            continue
+        measured = (timed.detour[d], timed.variance[d], row.bearing, row.bearing_variance)
+        share = unsure_by_detour(state.joint, size, 3 + 2 * other, of_caller, measured)
+        if share < least:
+            best, least = d, share
+    return best
+
+
+@no_alloc
+def _place(
+    state: State, member: Whole, row: Row, timed: Detours, d: Whole, used: Bool[np.ndarray, " d"]
+) -> None:
+    """Place a landmark, of which there is one member, by detour d and its bearing."""
+    of_caller = timed.caller[d] == row.landmark
+    other = _single(state, timed.landmark[d] if of_caller else timed.caller[d])
+    measured = (timed.detour[d], timed.variance[d], row.bearing, row.bearing_variance)
+    size = 3 + 2 * state.members[0]
+    place_by_detour(state.joint, size, 3 + 2 * member, 3 + 2 * other, of_caller, measured)
+    used[d] = True
+
+
+@no_alloc
+def _placed_by_detour(
+    state: State,
+    row: Row,
+    timed: Detours,
+    used: Bool[np.ndarray, " d"],
+    scratch: _Scratch,
+) -> bool:
+    """Place a ray, or a bearing that waits, by a detour that tells its range surely; tell if so."""
+    first, count = _members_of(state.landmark, state.members[0], row.landmark)
+    if count == 1 or not math.isnan(row.range):
+        return False
+    d = _surest(state, row, timed, used)
+    if d < 0:
+        return False
+    for j in range(count):
+        scratch.keep[j] = j == 0
+    drop_members(state, first, count, scratch.keep, scratch.source)
+    state.weight[first] = 1.0
+    _place(state, first, row, timed, d, used)
+    return True
+
+
+@no_alloc
+def _weigh(
+    state: State,
+    timed: Detours,
+    d: Whole,
+    of_caller: bool,
+    sensing: Sensing,
+    scratch: _Scratch,
+) -> None:
+    """Weigh the members of a ray by detour d, and prune it."""
+    label = timed.caller[d] if of_caller else timed.landmark[d]
+    other = _single(state, timed.landmark[d] if of_caller else timed.caller[d])
+    ray = _members_of(state.landmark, state.members[0], label)
+    first, count = ray
+    if state.weight[first] == WAITS:
+        return
+    weigh_by_detour(
+        state, ray, other, of_caller, timed.detour[d], timed.variance[d], scratch.likelihood
+    )
+    weight = state.weight[first:]
+    weigh_and_share(
+        scratch.likelihood, weight, count, sensing.power, sensing.aggregated, scratch.share
+    )
+    if survivors(weight, count, sensing.prune, scratch.keep) < count:
+        drop_members(state, first, count, scratch.keep, scratch.source)
+
+
+@no_alloc
+def _correct_by_detour(
+    state: State, timed: Detours, d: Whole, sensing: Sensing, scratch: _Scratch
+) -> Whole:
+    """Correct landmark, caller and vehicle by a detour, or weigh a ray; tell if it was gated."""
+    member, caller = _single(state, timed.landmark[d]), _single(state, timed.caller[d])
+    if member >= 0 and caller >= 0:
+        size, i, ib = 3 + 2 * state.members[0], 3 + 2 * member, 3 + 2 * caller
+        return correct_detour(
+            state.joint, size, i, ib, timed.detour[d], timed.variance[d],
+            sensing.passive_bound, sensing.robust,
+        )  # fmt: skip
+    ray = timed.landmark[d] if caller >= 0 else timed.caller[d]
+    if (member >= 0 or caller >= 0) and _members_of(state.landmark, state.members[0], ray)[1]:
+        _weigh(state, timed, d, caller < 0, sensing, scratch)
+    return APPLIED
+
+
+@no_alloc
+def _add_new(
+    state: State, row: Row, timed: Detours, used: Bool[np.ndarray, " d"], sensing: Sensing
+) -> None:
     """Append a measurement's landmark, one member or a ray of them (Eqs. (16) to (18))."""
     joint, passive = state.joint, math.isnan(row.range)
+    d = _surest(state, row, timed, used) if passive else -1
+    if d >= 0:
+        member = state.members[0]
+        state.landmark[member], state.weight[member] = row.landmark, 1.0
+        state.members[0] += 1
+        _place(state, member, row, timed, d, used)
+        return
     if passive and is_precise(row, sensing):
         await_crossing(state, row, sensing)
         return
@@ -229,19 +358,30 @@ def _add_new(state: State, row: Row, sensing: Sensing) -> None:
 def _take_in(
     state: State,
     heard: Measurements,
-    known: Bool[np.ndarray, " m"],
+    timed: Detours,
+    known: tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " d"]],
     sensing: Sensing,
     scratch: _Scratch,
 ) -> Whole:
-    """Correct with what is mapped, then append what is not; returns how many were gated."""
-    gated = 0
+    """Correct with what is mapped, then append what is not; returns how many were gated.
+
+    ``known``: of which rows the landmark is mapped, and which detours have been used.
+    """
+    gated, (mapped, used) = 0, known
     for m in range(heard.landmark.size):
-        if known[m]:
-            gated += _correct_known(state, row_of(heard, m), sensing, scratch)
+        if mapped[m]:
+            row = row_of(heard, m)
+            if used.size == 0 or not _placed_by_detour(state, row, timed, used, scratch):
+                gated += _correct_known(state, row, sensing, scratch)
     flush(state.joint, 3 + 2 * state.members[0])
     for m in range(heard.landmark.size):
-        if not known[m]:
-            _add_new(state, row_of(heard, m), sensing)
+        if not mapped[m]:
+            _add_new(state, row_of(heard, m), timed, used, sensing)
+    for d in range(used.size):
+        if not used[d]:
+            gated += _correct_by_detour(state, timed, d, sensing, scratch)
+    if used.size:
+        flush(state.joint, 3 + 2 * state.members[0])
     mean = state.joint.mean
     mean[2] = wrap_angle(mean[2])
     return gated
@@ -261,7 +401,7 @@ def corrected(
 
     ``turns`` says of which error the covariance is, as in `Joint`.
     """
-    heard = measurements(columns)
+    heard, timed = measurements(columns), detours(columns)
     members, rows = old_landmark.size, heard.landmark.size
     most, known = members, np.empty(rows, dtype=np.bool_)
     for m in range(rows):
@@ -273,7 +413,8 @@ def corrected(
     state = State(joint, landmark, weight, np.full(1, members))
     for member in range(members):
         landmark[member], weight[member] = old_landmark[member], old_weight[member]
-    gated = _take_in(state, heard, known, sensing, scratch)
+    used = np.zeros(timed.landmark.size, dtype=np.bool_)
+    gated = _take_in(state, heard, timed, (known, used), sensing, scratch)
     members = state.members[0]
     mean, covariance = gaussian_of(joint, 3 + 2 * members)
     return mean, covariance, landmark[:members].copy(), weight[:members].copy(), gated

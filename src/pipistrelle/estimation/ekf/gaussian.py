@@ -135,7 +135,7 @@ def gaussian_of(
 
 
 @no_alloc
-def _point_rows(
+def point_rows(
     joint: Joint, size: Whole, i: Whole
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Rows i and i + 1 of the covariance, with all that waits subtracted from them."""
@@ -164,7 +164,7 @@ def flush(joint: Joint, size: Whole) -> None:
     """Let every row catch up: afterwards nothing waits."""
     covariance = joint.covariance
     for i in range(3, size, 2):
-        pi, pj = _point_rows(joint, i + 2, i)
+        pi, pj = point_rows(joint, i + 2, i)
         joint.taken[i] = 0
         for b in range(i):
             covariance[b, i], covariance[b, i + 1] = pi[b], pj[b]
@@ -172,7 +172,7 @@ def flush(joint: Joint, size: Whole) -> None:
 
 
 @no_alloc
-def _defer(joint: Joint, size: Whole, w: Float[np.ndarray, " m"], step: float) -> None:
+def defer(joint: Joint, size: Whole, w: Float[np.ndarray, " m"], step: float) -> None:
     """Add step w to the mean, subtract w w^T from the pose's rows, and let the points' wait."""
     mean, p0, p1, p2 = joint.mean, joint.covariance[0], joint.covariance[1], joint.covariance[2]
     x, y, h = w[0], w[1], w[2]
@@ -185,7 +185,7 @@ def _defer(joint: Joint, size: Whole, w: Float[np.ndarray, " m"], step: float) -
 
 
 @no_alloc
-def _retract(
+def retract(
     mean: Float[np.ndarray, " n"],
     size: Whole,
     w0: Float[np.ndarray, " m"],
@@ -244,7 +244,7 @@ def propagate(
 def relative_covariance(joint: Joint, size: Whole, i: Whole) -> tuple[float, float, float]:
     """Entries xx, xy, yy of the covariance of the member at index i less the vehicle's position."""
     p0, p1 = joint.covariance[0], joint.covariance[1]
-    pi, pj = _point_rows(joint, size, i)
+    pi, pj = point_rows(joint, size, i)
     return (
         p0[0] - 2.0 * p0[i] + pi[i],
         p0[1] - p0[i + 1] - p1[i] + pi[i + 1],
@@ -257,7 +257,7 @@ def bearing_variance(joint: Joint, size: Whole, i: Whole, c: float, s: float, k:
     """Innovation variance H P H^T of the bearing of the member at state index i, without R."""
     h0, h1, turns = s * k, -c * k, joint.turns  # by pose: (h0, h1, -turns); by member: (-h0, -h1)
     p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
-    pi, pj = _point_rows(joint, size, i)
+    pi, pj = point_rows(joint, size, i)
     pxx = p0[0] - 2.0 * p0[i] + pi[i]
     pxy = p0[1] - p0[i + 1] - p1[i] + pi[i + 1]
     pyy = p1[1] - 2.0 * p1[i + 1] + pj[i + 1]
@@ -283,7 +283,7 @@ def correct_bearing(
     innovation = wrap_angle(bearing - expected)
     h0, h1, turns = s * k, -c * k, joint.turns
     p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
-    pi, pj = _point_rows(joint, size, i)
+    pi, pj = point_rows(joint, size, i)
     w0 = joint.W[joint.taken[WAITING]]
     for a in range(size):
         w0[a] = h0 * (p0[a] - pi[a]) + h1 * (p1[a] - pj[a]) - turns * p2[a]
@@ -295,8 +295,8 @@ def correct_bearing(
         w0[a] *= root
     step = root * innovation
     if turns == 0.0:
-        _retract(joint.mean, size, w0, step, w0, 0.0)
-    _defer(joint, size, w0, turns * step)
+        retract(joint.mean, size, w0, step, w0, 0.0)
+    defer(joint, size, w0, turns * step)
     return APPLIED
 
 
@@ -321,7 +321,7 @@ def correct_active(
     nu0, nu1 = distance - near, wrap_angle(bearing - expected)
     h0, h1, turns = s * k, -c * k, joint.turns
     p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
-    pi, pj = _point_rows(joint, size, i)
+    pi, pj = point_rows(joint, size, i)
     w0, w1 = joint.W[joint.taken[WAITING]], joint.W[joint.taken[WAITING] + 1]
     for a in range(size):
         east, north = p0[a] - pi[a], p1[a] - pj[a]
@@ -341,9 +341,9 @@ def correct_active(
         w0[a] /= L00
         w1[a] = (w1[a] - L10 * w0[a]) / L11
     if turns == 0.0:
-        _retract(joint.mean, size, w0, e0, w1, e1)
-    _defer(joint, size, w0, turns * e0)
-    _defer(joint, size, w1, turns * e1)
+        retract(joint.mean, size, w0, e0, w1, e1)
+    defer(joint, size, w0, turns * e0)
+    defer(joint, size, w1, turns * e1)
     return APPLIED
 
 
