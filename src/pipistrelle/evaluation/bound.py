@@ -16,7 +16,16 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.detection.scans import BEARING_STD, NUMBERS, RANGE, RANGE_STD, Scan
+from pipistrelle.detection.scans import (
+    BEARING,
+    BEARING_STD,
+    DETOUR_STD,
+    NUMBERS,
+    RANGE,
+    RANGE_STD,
+    UNLABELLED,
+    Scan,
+)
 from pipistrelle.estimation.ekf.gaussian import (
     LINEAR,
     WAITING,
@@ -26,6 +35,7 @@ from pipistrelle.estimation.ekf.gaussian import (
     flush,
     joint_of,
 )
+from pipistrelle.estimation.ekf.timing import tell_detour
 from pipistrelle.estimation.measurement import NEAREST, observe
 from pipistrelle.estimation.motion import Motion, MotionNumbers, motion_numbers, propagate_pose
 from pipistrelle.jit import Whole, kernel, no_alloc
@@ -61,8 +71,8 @@ def pose_bound(
         True poses, the start first.
     landmarks : labels (n) and true positions (n, 2) [m]
     scans : sequence of Scan
-        Who was heard when, with a range or without, and how surely: of the measurements the
-        standard deviations alone count. Rows of other labels are left out.
+        Who was heard when, with a range or a detour or without, and how surely: of the
+        measurements the standard deviations alone count. Rows of other labels are left out.
 
     Returns
     -------
@@ -89,18 +99,28 @@ def pose_bound(
     label = np.concatenate([np.empty(0, np.int64), *(scan.landmark for scan in scans)])
     numbers = np.concatenate([np.empty((NUMBERS, 0)), *(scan.numbers for scan in scans)], axis=1)
     known = np.isin(label, labels)
-    heard, first, slot = np.unique(label[known], return_index=True, return_inverse=True)
-    order = np.argsort(first)  # whom it hears first stands first: the state grows as a filter's
+    caller = np.concatenate([np.empty(0, np.int64), *map(_whose, scans)])[known]
+    caller[~np.isin(caller, labels)] = UNLABELLED
+    met = np.column_stack([label[known], np.where(caller == UNLABELLED, label[known], caller)])
+    heard, first = np.unique(met, return_index=True)
+    heard = heard[np.argsort(first)]  # whom it hears first stands first, as in a filter's state
+    slot = {int(one): number for number, one in enumerate(heard)} | {UNLABELLED: UNLABELLED}
     place = {int(one): point for one, point in zip(labels, places, strict=True)}
     return _bound(
         path,
         controls,
         np.diff(time),
         motion_numbers(motion),
-        np.array([place[int(one)] for one in heard[order]]).reshape(-1, 2),
-        (step[known], np.argsort(order)[slot]),
+        np.array([place[int(one)] for one in heard]).reshape(-1, 2),
+        (step[known], *(np.array([slot[int(i)] for i in w], int) for w in (label[known], caller))),
         np.ascontiguousarray(numbers[:, known]),
     )
+
+
+def _whose(scan: Scan) -> Int[np.ndarray, " m"]:
+    """Return the label of each row's caller, UNLABELLED where there is no detour of one known."""
+    who = np.append(scan.callers, UNLABELLED)[np.minimum(scan.caller, len(scan.callers))]
+    return np.where(np.isnan(scan.detour) | (who == scan.landmark), UNLABELLED, who)
 
 
 @no_alloc
@@ -108,6 +128,8 @@ def _correct(
     joint: Joint, size: Whole, i: Whole, numbers: Float[np.ndarray, "7 m"], m: Whole
 ) -> None:
     """Correct with measurement m as if it had been what the state at index i makes expect."""
+    if math.isnan(numbers[BEARING, m]):
+        return
     mean, across = joint.mean, numbers[BEARING_STD, m] ** 2
     near, angle, _, _, _ = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     if near >= NEAREST and not math.isnan(numbers[RANGE, m]):
@@ -140,10 +162,10 @@ def _bound(
     dt: Float[np.ndarray, " k"],
     motion: MotionNumbers,
     places: Float[np.ndarray, "n 2"],
-    row: tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]],
+    row: tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Int[np.ndarray, " m"]],
     numbers: Float[np.ndarray, "7 m"],
 ) -> Float[np.ndarray, "t 3 3"]:
-    """Carry the covariance along the true path; of each measurement its step and its place."""
+    """Carry the covariance along the true path; of each row step, place and its caller's place."""
     room = 3 + 2 * places.shape[0]
     mean, prior = np.zeros(room), np.zeros((room, room))
     for n in range(places.shape[0]):
@@ -153,7 +175,7 @@ def _bound(
     joint, size, m = joint_of(mean, prior, room, LINEAR), 3, 0
     joint.W[:] = 0.0  # the state grows into columns that wait
     bound = np.zeros((path.shape[0], 3, 3))
-    steps, slots = row
+    steps, slots, callers = row
     pose, noise = np.empty(3), np.empty((3, 3))
     for k in range(1, path.shape[0]):
         pose[:], noise[:] = path[k - 1], 0.0
@@ -162,11 +184,13 @@ def _bound(
         for a in range(3):
             joint.mean[a] = path[k, a]
         while m < steps.size and steps[m] <= k:
-            i = 3 + 2 * slots[m]
-            if i == size:
+            i, ib = 3 + 2 * slots[m], 3 + 2 * callers[m]
+            if max(i, ib) >= size:
                 flush(joint, size)
-                size += 2
+                size = max(i, ib) + 2
             _correct(joint, size, i, numbers, m)
+            if callers[m] != UNLABELLED:
+                tell_detour(joint, size, i, ib, numbers[DETOUR_STD, m] ** 2)
             m += 1
         if joint.taken[WAITING] > 0:
             flush(joint, size)

@@ -4,7 +4,10 @@ A detour :math:`e = |b - l| + |l - p| - |b - p|` binds the vehicle p, the landma
 b, each a part of the state, and asks nothing of the heading. With :math:`e_l, e_b` its slopes by
 landmark and caller, and :math:`e_p = -e_l - e_b`,
 
-- it **corrects** all three where landmark and caller are placed (`correct_detour`);
+- it **corrects** all three where landmark and caller are placed (`correct_detour`), to second
+  order: a way of length L of which the variance across is t is longer by :math:`t / 2L` than its
+  means say, which is known to the square of that (Bar-Shalom, Li & Kirubarajan 2001,
+  Sec. 10.3.2): what has just been placed is unsure of its ways;
 - it **places** one of the two that is new or a ray, x, by the other, y, which is placed: with the
   bearing, whose direction is u, there is one range r in closed form
   (`pipistrelle.estimation.measurement.landmark_range`), and
@@ -63,10 +66,7 @@ def _bend(dx: float, dy: float, xx: float, xy: float, yy: float) -> float:
 def _expected(
     joint: Joint, size: Whole, i: Whole, ib: Whole, w: Float[np.ndarray, " m"]
 ) -> tuple[float, float]:
-    """Detour over the point at index i of the caller at ib, and its variance, to second order.
-
-    P H^T is written into w.
-    """
+    """Detour over the point at index i of the caller at ib, and its variance; P H^T goes into w."""
     mean = joint.mean
     detour, lx, ly, bx, by = detour_slopes(
         mean[0], mean[1], mean[i], mean[i + 1], mean[ib], mean[ib + 1]
@@ -78,6 +78,15 @@ def _expected(
     for a in range(size):
         w[a] = px * p0[a] + py * p1[a] + lx * li[a] + ly * lj[a] + bx * bi[a] + by * bj[a]
     variance = px * w[0] + py * w[1] + lx * w[i] + ly * w[i + 1] + bx * w[ib] + by * w[ib + 1]
+    return detour, variance
+
+
+@no_alloc
+def _bends(joint: Joint, size: Whole, i: Whole, ib: Whole) -> tuple[float, float]:
+    """How much longer the detour is to second order, and how much larger its variance, at most."""
+    mean, p0, p1 = joint.mean, joint.covariance[0], joint.covariance[1]
+    li, lj = point_rows(joint, size, i)
+    bi, bj = point_rows(joint, size, ib)
     near = _bend(
         mean[i] - mean[0], mean[i + 1] - mean[1], li[i] - 2.0 * p0[i] + p0[0],
         li[i + 1] - p0[i + 1] - p1[i] + p0[1], lj[i + 1] - 2.0 * p1[i + 1] + p1[1],
@@ -91,7 +100,7 @@ def _expected(
         bi[ib + 1] - p0[ib + 1] - p1[ib] + p0[1], bj[ib + 1] - 2.0 * p1[ib + 1] + p1[1],
     )  # fmt: skip
     bent = near + onward + straight
-    return detour + 0.5 * (near + onward - straight), variance + 0.5 * bent * bent
+    return 0.5 * (near + onward - straight), 0.5 * bent * bent
 
 
 @no_alloc
@@ -113,7 +122,8 @@ def correct_detour(
         flush(joint, size)
     w = joint.W[joint.taken[WAITING]]
     expected, spread = _expected(joint, size, i, ib, w)
-    innovation, S = detour - expected, spread + variance
+    longer, wider = _bends(joint, size, i, ib)
+    innovation, S = detour - expected - longer, spread + wider + variance
     if robust:
         S *= max(abs(innovation) / (BELIEVED * math.sqrt(S)), 1.0)
     if innovation * innovation > bound * S:
@@ -126,6 +136,19 @@ def correct_detour(
         retract(joint.mean, size, w, step, w, 0.0)
     defer(joint, size, w, joint.turns * step)
     return APPLIED
+
+
+@no_alloc
+def tell_detour(joint: Joint, size: Whole, i: Whole, ib: Whole, variance: float) -> None:
+    """Correct with a detour as expected, to first order: the covariance alone changes."""
+    if joint.taken[WAITING] == MOST_WAITING:
+        flush(joint, size)
+    w = joint.W[joint.taken[WAITING]]
+    _, spread = _expected(joint, size, i, ib, w)
+    root = 1.0 / math.sqrt(spread + variance)
+    for a in range(size):
+        w[a] *= root
+    defer(joint, size, w, 0.0)
 
 
 @no_alloc
@@ -151,7 +174,9 @@ def weigh_by_detour(
         ix = 3 + 2 * (ray[0] + j)
         i, ib = (iy, ix) if of_caller else (ix, iy)
         expected, spread = _expected(joint, size, i, ib, w)
-        likelihood[j] = log_likelihood(detour - expected, spread + variance, False)
+        longer, wider = _bends(joint, size, i, ib)
+        off, S = detour - expected - longer, spread + wider + variance
+        likelihood[j] = log_likelihood(off, S, False)
 
 
 @no_alloc

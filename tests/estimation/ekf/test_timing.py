@@ -1,0 +1,277 @@
+"""Detours: against the slow references, by their slopes, where they place, and what they spare."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipistrelle.detection.scans import make_scan
+from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.ekf.filter import EkfSlam
+from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
+from pipistrelle.estimation.measurement import (
+    caller_range_by_detour,
+    detour_jacobians,
+    detour_of,
+    landmark_range,
+)
+from pipistrelle.estimation.motion import Motion
+from pipistrelle.geometry import range_and_bearing, wrap
+from reference.missions import (
+    BICYCLE,
+    CIRCLE,
+    START,
+    draw_mission,
+    followed,
+    paper_filter,
+    paper_mission,
+    ray_config,
+    scattered,
+    steady,
+)
+from reference.timed_ekf import SlowTimedEkfSlam, SlowTimedInvariantEkfSlam
+
+KINDS = [EkfSlam, InvariantEkfSlam]
+PAIRS = [(EkfSlam, SlowTimedEkfSlam), (InvariantEkfSlam, SlowTimedInvariantEkfSlam)]
+NAN = np.nan
+law = settings(deadline=None, max_examples=100)
+coordinates = st.floats(-20.0, 20.0)
+points = st.tuples(coordinates, coordinates).map(np.array)
+
+
+# The measurement
+
+
+def apart(*places):
+    return all(np.hypot(*(a - b)) > 0.5 for i, a in enumerate(places) for b in places[:i])
+
+
+@law
+@given(points, points, points)
+def test_slopes_of_a_detour_are_its_differences(vehicle, landmark, caller):
+    if not apart(vehicle, landmark, caller):
+        return
+    for place, slope in enumerate(detour_jacobians(vehicle, landmark, caller)):
+        for axis in range(2):
+            ends = [np.array([vehicle, landmark, caller]) for _ in range(2)]
+            ends[0][place, axis] += 1e-6
+            ends[1][place, axis] -= 1e-6
+            found = (detour_of(*ends[0]) - detour_of(*ends[1])) / 2e-6
+            assert slope[axis] == pytest.approx(found, abs=1e-7)
+
+
+@law
+@given(points, points, points)
+def test_the_closed_forms_give_back_the_ranges_that_made_the_detour(vehicle, landmark, caller):
+    e = detour_of(vehicle, landmark, caller)
+    if not apart(vehicle, landmark, caller) or e < 0.1:
+        return
+    near, onward = landmark - vehicle, caller - vehicle
+    found = landmark_range(e, onward, np.arctan2(near[1], near[0]))
+    assert found == pytest.approx(np.hypot(*near), rel=1e-6)
+    u = onward / np.hypot(*onward)
+    found = caller_range_by_detour(e, *near, *u)
+    if np.hypot(*onward) < 100.0:
+        assert found == pytest.approx(np.hypot(*onward), rel=1e-5)
+
+
+# Against the references
+
+
+def timed(mission, rng, callers=(1,), detour_std=0.05, share=0.7):
+    """Return the mission with detours of some of its landmarks' calls, more rows where several."""
+    scans, numbers = [], np.array([-1, *callers])
+    for scan, pose in zip(mission.scans, mission.path[1:], strict=True):
+        rows = [scan]
+        for number, label in enumerate(callers, start=1):
+            caller = mission.landmarks[label - 1]
+            e = np.array(
+                [detour_of(pose[:2], mission.landmarks[i - 1], caller) for i in scan.landmark]
+            )
+            heard = (scan.landmark != label) & (rng.random(e.size) < share) & (e > 0.5)
+            e = np.where(heard, e + rng.normal(0.0, detour_std, e.size), NAN)
+            rows.append((number, e))
+        scans.append(with_detours(scan, rows[1:], numbers, detour_std))
+    return replace(mission, scans=scans)
+
+
+def with_detours(scan, told, numbers, detour_std):
+    """Return a scan with the first caller's detours in its rows, the others' as rows at the end."""
+    (_, first), *others = told
+    label, caller, e = scan.landmark, np.full(scan.landmark.size, 1), first
+    columns = {"bearing": scan.bearing, "range": scan.range}
+    for number, more in others:
+        further = np.isfinite(more)
+        label = np.concatenate([label, scan.landmark[further]])
+        caller = np.concatenate([caller, np.full(further.sum(), number)])
+        e = np.concatenate([e, more[further]])
+        columns = {
+            name: np.concatenate([c, np.full(further.sum(), NAN)]) for name, c in columns.items()
+        }
+    known = {"range_std": 0.2, "bearing_std": 0.15, "detour_std": detour_std}
+    made = make_scan(
+        scan.time,
+        label,
+        columns["bearing"],
+        range=columns["range"],
+        caller=caller,
+        detour=e,
+        **known,
+    )
+    return replace(made, callers=numbers)
+
+
+def check_reference(
+    kind, reference, strategy, *, callers=(1,), frames=60, gate=1.0, robust=False, **rays
+):
+    mission = timed(
+        paper_mission(strategy, frames=frames, range_std=0.1, bearing_std=0.05),
+        np.random.default_rng(5), callers,
+    )  # fmt: skip
+    known = {"range_std": 0.2, "bearing_std": 0.15}
+    slam = paper_filter(kind, rays=ray_config(**rays), gate=gate, robust=robust, **known)
+    slow = reference(BICYCLE, 0.2, 0.15, slam.rays, gate, robust=robust)
+    slow.detour_variance = 0.05**2
+    slow.start(START.mean, START.covariance)
+    for frame, (belief, _) in enumerate(followed(slam, mission)):
+        slow.predict(mission.controls[frame], mission.dt[frame])
+        slow.update(mission.scans[frame])
+        np.testing.assert_array_equal(belief.landmark, slow.landmark)
+        np.testing.assert_allclose(belief.weight, slow.weight, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(belief.pose().mean, slow.mean[:3], rtol=0, atol=1e-5)
+        linear = slow.linear() if hasattr(slow, "linear") else slow.covariance
+        np.testing.assert_allclose(belief.pose().covariance, linear[:3, :3], rtol=0, atol=1e-5)
+        landmarks = belief.landmarks()
+        np.testing.assert_allclose(landmarks.mean.ravel(), slow.mean[3:], rtol=0, atol=1e-4)
+    assert belief.gated == slow.gated
+
+
+@pytest.mark.parametrize(("kind", "reference"), PAIRS)
+@pytest.mark.parametrize("strategy", ["fused", "passive"])
+@pytest.mark.parametrize("callers", [(1,), (1, 2, 3)])
+def test_a_run_with_detours_equals_the_slow_reference(kind, reference, strategy, callers):
+    check_reference(kind, reference, strategy, callers=callers)
+
+
+@pytest.mark.parametrize(("kind", "reference"), PAIRS)
+def test_a_robust_gated_run_with_detours_equals_the_slow_reference(kind, reference):
+    check_reference(kind, reference, "fused", gate=0.99, robust=True, weights="aggregated")
+
+
+# What it is for
+
+CALLER, LANDMARK = np.array([6.0, -2.0]), np.array([2.0, 9.0])
+
+
+def standing(kind):
+    """A filter whose vehicle stands at the origin, sure of it, and has placed a caller, label 2."""
+    slam = paper_filter(kind, range_std=0.01, bearing_std=0.01)
+    belief = slam.init(Gaussian(mean=np.zeros(3), covariance=np.eye(3) * 1e-8))
+    distance, bearing = range_and_bearing(np.zeros(3), CALLER[None])
+    return slam, slam.update(belief, make_scan(0.0, np.array([2]), bearing, range=distance))
+
+
+def heard(place, e, label=7, caller=1):
+    """A scan of one echo from a place, with a detour."""
+    _, bearing = range_and_bearing(np.zeros(3), place[None])
+    scan = make_scan(0.0, np.array([label]), bearing, caller=caller, detour=e, detour_std=0.05)
+    return replace(scan, callers=np.array([-1, 2]))
+
+
+def mapped(belief, label):
+    """Mean and covariance of a landmark's members."""
+    landmarks = belief.landmarks()
+    rows = landmarks.landmark == label
+    return landmarks.mean[rows], landmarks.covariance[rows]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_landmark_heard_once_is_placed_by_its_detour(kind):
+    slam, belief = standing(kind)
+    belief = slam.update(belief, heard(LANDMARK, detour_of(np.zeros(2), LANDMARK, CALLER)))
+    mean, covariance = mapped(belief, 7)
+    np.testing.assert_allclose(mean, [LANDMARK], atol=1e-3)
+    assert 0.01 < np.sqrt(np.linalg.eigvalsh(covariance[0])[-1]) < 0.3
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_placed_landmark_is_as_unsure_as_many_draws_of_what_places_it(kind):
+    slam, belief = standing(kind)
+    e, rng = detour_of(np.zeros(2), LANDMARK, CALLER), np.random.default_rng(3)
+    _, covariance = mapped(slam.update(belief, heard(LANDMARK, e)), 7)
+    spread = np.sqrt(np.linalg.eigvalsh(mapped(belief, 2)[1][0]).mean())
+    bearing = np.arctan2(LANDMARK[1], LANDMARK[0])
+    drawn = []
+    for turned, late, *moved in rng.normal(size=(4000, 4)) * [0.01, 0.05, spread, spread]:
+        r = landmark_range(e + late, CALLER + moved, bearing + turned)
+        drawn.append(r * np.array([np.cos(bearing + turned), np.sin(bearing + turned)]))
+    ratio = np.linalg.eigvalsh(np.linalg.solve(np.cov(np.transpose(drawn)), covariance[0]))
+    assert (ratio > 0.7).all(), "the caller's own noise is not round"
+    assert (ratio < 1.4).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_detour_between_vehicle_and_caller_places_nothing_and_moves_nothing_far(kind):
+    slam, belief = standing(kind)
+    between = 0.5 * CALLER + [0.02, 0.05]
+    after = slam.update(belief, heard(between, detour_of(np.zeros(2), between, CALLER)))
+    assert len(mapped(after, 7)[0]) > 1, "a ray"
+    np.testing.assert_allclose(after.pose().mean, belief.pose().mean, atol=1e-6)
+    np.testing.assert_allclose(mapped(after, 2)[0], [CALLER], atol=0.05)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_detour_of_a_caller_that_nobody_knows_is_a_bearing_alone(kind):
+    slam, belief = standing(kind)
+    e = detour_of(np.zeros(2), LANDMARK, CALLER)
+    known = heard(LANDMARK, e)
+    plain = slam.update(belief, replace(known, numbers=heard(LANDMARK, NAN).numbers))
+    for callers in (np.array([-1]), np.array([-1, -1]), np.array([-1, 7]), np.array([-1, 30])):
+        found = slam.update(belief, replace(known, callers=callers))
+        assert found.mean.tobytes() == plain.mean.tobytes()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_caller_that_is_a_ray_is_placed_by_a_landmark_that_is_known(kind):
+    slam = paper_filter(kind, range_std=0.01, bearing_std=0.01)
+    belief = slam.init(Gaussian(mean=np.zeros(3), covariance=np.eye(3) * 1e-8))
+    both = range_and_bearing(np.zeros(3), np.array([LANDMARK, CALLER]))
+    known = make_scan(0.0, np.array([7]), both[1][:1], range=both[0][:1])
+    belief = slam.update(slam.update(belief, known), make_scan(0.0, np.array([2]), both[1][1:]))
+    assert len(mapped(belief, 2)[0]) > 1
+    e = np.array([detour_of(np.zeros(2), LANDMARK, CALLER), NAN])
+    scan = make_scan(0.0, np.array([7, 2]), both[1], caller=1, detour=e, detour_std=0.05)
+    after = slam.update(belief, replace(scan, callers=np.array([-1, 2])))
+    np.testing.assert_allclose(mapped(after, 2)[0], [CALLER], atol=0.01)
+
+
+STEADY = Motion(model="bicycle", control_std=(0.05, 0.005), wheelbase=0.2)
+
+
+def final_nees(factor, runs=40):
+    """Mean NEES of the pose after twenty seconds, the detours' noise told as a factor of itself."""
+    nees = []
+    for seed in range(runs):
+        rng, noise = np.random.default_rng([7, seed]), {"range_std": 0.05, "bearing_std": 0.02}
+        start = Gaussian(mean=START.mean, covariance=np.diag([0.02, 0.02, 0.01]) ** 2)
+        mission = draw_mission(
+            rng, STEADY, start, scattered(rng, 12, radius=12.0), steady(CIRCLE, 40),
+            beamwidth=0.0, hearing=30.0, **noise,
+        )  # fmt: skip
+        mission = timed(mission, rng, detour_std=0.1)
+        told = np.array([1, 1, 1, 1, 1, factor, 1])[:, None]
+        scans = [replace(scan, numbers=scan.numbers * told) for scan in mission.scans]
+        rays = ray_config(power=8.0, prune=1e-9)
+        slam = paper_filter(InvariantEkfSlam, motion=STEADY, rays=rays, **noise)
+        *_, (belief, _) = followed(slam, replace(mission, scans=scans), start)
+        off = belief.pose().mean - mission.path[-1]
+        off[2] = wrap(off[2])
+        nees.append(off @ np.linalg.solve(belief.pose().covariance, off))
+    return np.mean(nees)
+
+
+def test_the_invariant_filter_with_detours_is_consistent_and_not_if_told_a_tenth_of_their_noise():
+    assert 1.5 < final_nees(1.0) < 5.0, "3, with the chance of 40 draws"
+    assert final_nees(0.1) > 7.0
