@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from hashlib import sha256
 from shutil import which
 
 import pytest
@@ -188,3 +189,15 @@ def test_who_was_overtaken_is_content_and_who_lost_a_file_is_not(tmp_path):
     path.write_text("by another")
     put_in_place(partial, path)
     assert path.read_text() == "by another"
+
+
+def test_a_device_in_place_of_the_list_or_of_a_file_of_ours_is_never_read(own, tmp_path):
+    (tmp_path / "one.txt").unlink()
+    (tmp_path / "one.txt").symlink_to("/dev/null")
+    own._sums["one.txt"] = sha256(b"").hexdigest()  # of what a device that ends would give
+    with pytest.raises(InputError, match=r"one\.txt: was changed"):
+        own.check()
+    (tmp_path / SUMS).unlink()
+    (tmp_path / SUMS).symlink_to("/dev/null")
+    with pytest.raises(InputError, match=f"{SUMS}: is no file; remove what stands in its place"):
+        OwnFiles(tmp_path, RESULTS)

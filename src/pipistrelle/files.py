@@ -33,6 +33,11 @@ class OwnFiles:
     kind : str
         What they are together: results, a report, a log, a world. One kind never replaces another.
 
+    Raises
+    ------
+    InputError
+        Where what stands in the list's place is no file.
+
     Examples
     --------
     >>> with TemporaryDirectory() as name:
@@ -46,6 +51,7 @@ class OwnFiles:
 
     def __init__(self, folder: Path, kind: str) -> None:
         self.folder, self.kind = folder, kind
+        check_ordinary(folder / SUMS)
         try:
             lines = (folder / SUMS).read_text(encoding="utf-8").splitlines()
         except (OSError, UnicodeDecodeError):
@@ -87,8 +93,7 @@ class OwnFiles:
         """
         path = self.folder / name
         try:
-            if path.exists() and not path.is_file():  # a pipe may never end
-                raise InputError(f"{path}: is no file; remove what stands in its place")
+            check_ordinary(path)
             data = path.read_bytes()
         except FileNotFoundError:
             raise InputError(f"{path}: is missing; run again what wrote the others") from None
@@ -219,6 +224,8 @@ class OwnFiles:
         """Whether a file is as we wrote it."""
         path = self.folder / name
         try:
+            if not path.is_file():  # a pipe may never end
+                return False
             return sha256(path.read_bytes()).hexdigest() == self._sums.get(name)
         except OSError:
             return False
@@ -253,6 +260,29 @@ def _unwritable(path: Path, error: OSError) -> InputError:
     return InputError(
         f"{path}: could not be written ({error.strerror}); make room or name another folder"
     )
+
+
+def check_ordinary(path: Path) -> None:
+    """Refuse to read what stands in a file's place and is none: a pipe or a device may never end.
+
+    Parameters
+    ----------
+    path : Path
+        Of a file in a folder of ours; it may be missing.
+
+    Raises
+    ------
+    InputError
+        For a folder, a pipe or a device.
+
+    Examples
+    --------
+    >>> check_ordinary(Path("/dev/null"))
+    Traceback (most recent call last):
+    pipistrelle.config.InputError: /dev/null: is no file; remove what stands in its place
+    """
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: is no file; remove what stands in its place")
 
 
 def write_whole(path: Path, data: bytes, writer: str = "") -> None:

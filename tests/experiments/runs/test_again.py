@@ -196,3 +196,16 @@ def test_a_log_for_a_mission_that_had_none_is_refused(folders):
 def test_settings_that_are_none_are_refused_where_they_stand(folders):
     Path("run/config.toml").write_text("[rays]\npowr = 1\n")
     assert refused("run").startswith("run/config.toml: rays.powr: no such setting")
+
+
+@pytest.mark.parametrize("name", ["config.toml", "summary.json"])
+def test_a_device_in_place_of_a_file_is_refused_by_name(folders, name):
+    Path("run", name).unlink()
+    Path("run", name).symlink_to("/dev/null")  # a pipe would be waited for without an end
+    assert refused("run") == f"run/{name}: is no file; remove what stands in its place"
+
+
+def test_a_device_in_place_of_a_track_is_told(folders):
+    Path("run/track_fused_ekf.tum").unlink()
+    Path("run/track_fused_ekf.tum").symlink_to("/dev/null")
+    assert again(Path("run")).difference.startswith("run/track_fused_ekf.tum: cannot be read")

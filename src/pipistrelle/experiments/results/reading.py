@@ -7,7 +7,7 @@ from pydantic import BaseModel, ValidationError
 
 from pipistrelle.config import InputError, Strategy
 from pipistrelle.detection.logs.readers import READERS, Robot
-from pipistrelle.files import COMPARISON, RESULTS, WORLD, OwnFiles
+from pipistrelle.files import COMPARISON, RESULTS, WORLD, OwnFiles, check_ordinary
 from pipistrelle.refusals import expectation, refusal, shown
 
 SUMMARY = "summary.json"
@@ -96,6 +96,7 @@ def read_summary(folder: Path) -> Summary:
     path = folder / SUMMARY
     if not path.exists() or (folder / "plan.toml").exists():
         raise _no_results(folder)
+    check_ordinary(path)
     try:
         summary = Summary.model_validate_json(path.read_bytes())
     except ValidationError as refused:

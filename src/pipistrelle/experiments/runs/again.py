@@ -15,7 +15,7 @@ import numpy as np
 
 from pipistrelle.acoustics.callers import Caller
 from pipistrelle.acoustics.emitter import beamwidth_of
-from pipistrelle.config import Config
+from pipistrelle.config import Config, InputError
 from pipistrelle.detection.logs.readers import Robot, reader_of
 from pipistrelle.detection.logs.recording import Log
 from pipistrelle.estimation.catalogue import short_name
@@ -30,6 +30,7 @@ from pipistrelle.experiments.results.writing import settings_hash
 from pipistrelle.experiments.runs import truth_files
 from pipistrelle.experiments.runs.replay import load, replay
 from pipistrelle.experiments.runs.trial import Mission, Watch, run_mission
+from pipistrelle.files import check_ordinary
 from pipistrelle.refusals import refusal
 from pipistrelle.settings import from_file, read_toml, resolve
 from pipistrelle.version import find_version
@@ -111,6 +112,7 @@ def again(
     ('', True)
     """
     summary = read_summary(folder)
+    check_ordinary(folder / "config.toml")
     config = resolve(from_file(folder / "config.toml"))
     strategies = list(dict.fromkeys(run.strategy for run in summary.runs))
     tried = strategies, list(dict.fromkeys(run.filter for run in summary.runs))
@@ -231,8 +233,9 @@ def _difference(folder: Path, summary: Summary, trials: Sequence[TrialResult]) -
         name = f"track_{trial.strategy}_{short_name(trial.filter)}.tum"
         here = tum_text(track.time, track.pose.mean)
         try:
+            check_ordinary(folder / name)
             there = (folder / name).read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError):
+        except (OSError, UnicodeDecodeError, InputError):
             found[name] = "cannot be read"
             continue
         if here != there:
