@@ -133,7 +133,8 @@ def check_recording(
         driven: path,
         "scenario.radius": _farthest(scenario.landmarks),
         "scenario.beacon_distance": max(
-            _farthest(caller.place) for caller in scenario.callers if caller.place is not None
+            (_farthest(caller.place) for caller in scenario.callers if caller.place is not None),
+            default=0.0,
         ),
     }
     key = max(reach, key=reach.__getitem__)

@@ -15,7 +15,8 @@ from pipistrelle.experiments.hearing.world_folder import (
     settled,
     write_world,
 )
-from pipistrelle.experiments.hearing.worlds import Visitor, World
+from pipistrelle.experiments.hearing.worlds import ANY, Visitor, World
+from pipistrelle.experiments.runs.preparing import prepared
 from pipistrelle.settings import from_flags, resolve
 
 LANDMARKS = "landmark,x,y\n1,2.5,0\n2,-1,4\n"
@@ -164,7 +165,40 @@ def test_callers_have_names_of_their_own(tmp_path):
 def test_there_may_be_nobody_else_who_calls(tmp_path):
     world = read_world(folder_with(tmp_path, world_toml="format = 1\ncallers = []\n"))
     config = Config(scenario=ScenarioConfig(steps=8, landmarks=5))
-    assert [caller.name for caller in heard(config, world).callers] == ["vehicle"]
+    scenario = heard(config, world)
+    assert [caller.name for caller in scenario.callers] == ["vehicle"]
+    assert len(prepared(config, world=world).callers) == 1
+
+
+def test_a_header_alone_says_that_nothing_reflects(tmp_path):
+    bare = world_of(Config(scenario=ScenarioConfig(steps=8, landmarks=0)), 0, ANY)
+    write_world(tmp_path / "bare", bare, Config())
+    assert len(read_world(tmp_path / "bare").landmarks) == 0
+
+
+@pytest.mark.parametrize("name", ["landmark.csv", "Landmarks.csv", "paths.csv", "World.toml"])
+def test_a_file_that_is_misspelt_is_not_passed_over(tmp_path, name):
+    right = {"l": "landmarks.csv", "p": "path.csv", "w": "world.toml"}[name[0].lower()]
+    kept = {"landmarks_csv": LANDMARKS, "path_csv": "x,y\n0,0\n9,0\n", "world_toml": "format = 1"}
+    folder = folder_with(tmp_path, **kept)
+    read_world(folder)
+    (folder / right).rename(folder / name)
+    with pytest.raises(InputError) as refused:
+        read_world(folder)
+    assert str(refused.value) == f"{folder}: found {name!r}, expected {right!r}; rename it"
+
+
+def test_a_route_may_be_called_almost_as_a_path(tmp_path):
+    told = '[[callers]]\nname = "boat"\nfrequency = 30e3\nlevel_db = 40\nroute = "path2.csv"\n'
+    files = {"world_toml": f"format = 1\n{told}", "path2_csv": "time,x,y\n0,1,2\n9,1,3\n"}
+    assert read_world(folder_with(tmp_path, **files)).callers is not None
+
+
+def test_a_link_to_nothing_is_not_passed_over(tmp_path):
+    folder = folder_with(tmp_path, path_csv="x,y\n0,0\n9,0\n")
+    (folder / "landmarks.csv").symlink_to("gone")
+    with pytest.raises(InputError, match=r"landmarks\.csv: found a link to no file"):
+        read_world(folder)
 
 
 WRONG = {

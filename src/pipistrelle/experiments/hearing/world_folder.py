@@ -5,7 +5,10 @@ the vehicle; each may be left out, and what it would say is drawn. What a file i
 refused by line or key.
 """
 
+import os
+from collections.abc import Sequence
 from dataclasses import replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -205,11 +208,13 @@ def read_world(folder: Path) -> World:
     if not folder.is_dir():
         found = "a file" if folder.exists() else "no such folder"
         raise refusal(folder, found, f"a folder with {', '.join(FILES)}", "name a world's folder")
-    there = [name for name in FILES if (folder / name).exists()]
+    there = [name for name in FILES if os.path.lexists(folder / name)]
+    table = _read_head(folder / "world.toml") if "world.toml" in there else _WorldTable(format=1)
+    routes = [told.route for told in table.callers or () if told.route is not None]
+    _refuse_misspelt(folder, (*there, *routes))
     if not there:
         expected = f"one of {', '.join(FILES)}, or several"
         raise refusal(folder, "none of its files", expected, "see `pipistrelle run --save-world`")
-    table = _read_head(folder / "world.toml") if "world.toml" in there else _WorldTable(format=1)
     settings = from_table(table.config, f"{folder / 'world.toml'}: ", "config.")
     if WORLD_KEY in settings:
         raise InputError(f"{settings[WORLD_KEY].where}: a world has no other world; take it out")
@@ -222,7 +227,7 @@ def read_world(folder: Path) -> World:
     callers = None
     if table.callers is not None:
         callers = _callers(folder, table.callers)
-        there += [told.route for told in table.callers if told.route is not None]
+        there += routes
     return World(
         name=folder.resolve().name,
         landmarks=landmarks,
@@ -295,6 +300,15 @@ def write_world(folder: Path, scenario: Scenario, config: Config) -> None:
     own.write("world.toml", tomli_w.dumps(head))
 
 
+def _refuse_misspelt(folder: Path, there: Sequence[str]) -> None:
+    """Refuse a file whose name is nearly that of one that is missing: it would be passed over."""
+    missing = [name for name in FILES if name not in there]
+    for path in sorted(folder.iterdir()):
+        near = get_close_matches(path.name.lower(), missing, n=1, cutoff=0.85)
+        if near and path.name not in (*FILES, *there):
+            raise refusal(folder, f"{path.name!r}", repr(near[0]), "rename it")
+
+
 def _own_settings(config: Config) -> dict[str, Any]:
     """Return the settings of a world that are not at their defaults."""
     decides = {"world", "landmarks", "steps"}
@@ -341,6 +355,8 @@ def _read_landmarks(
     """Read places of landmarks by their numbers, and bodies where there are columns for them."""
     words = {"shape": _SHAPES}
     more = ("radius", "shape")
+    if _is_header_alone(path):
+        return np.empty((0, 2)), None
     table = read_table(path, ("landmark", "x", "y"), optional=more, words=words)
     check_unique(table, "landmark")
     label, count = table.column["landmark"], len(table.line)
@@ -357,6 +373,13 @@ def _read_landmarks(
         return places, None
     sphere = np.where(np.isnan(shape), usual.shape == "sphere", shape == _SHAPES.index("sphere"))
     return places, Bodies(radius=np.where(np.isnan(radius), usual.radius, radius), sphere=sphere)
+
+
+def _is_header_alone(path: Path) -> bool:
+    """Tell whether a file has the header of landmarks and no row: none is there."""
+    lines = [line for line in read_text(path).splitlines() if line.strip() and line[0] != "#"]
+    names = [name.strip() for name in lines[0].split(",")] if len(lines) == 1 else []
+    return names[:3] == ["landmark", "x", "y"] and not set(names[3:]) - {"radius", "shape"}
 
 
 def _refuse_coincident(table: Table, places: Float[np.ndarray, "n 2"]) -> None:
