@@ -35,6 +35,10 @@ STRATEGIES: tuple[Strategy, ...] = ("active", "fused", "passive")
 class InputError(ValueError):
     """A user's mistake: says where it is, what was found, what was expected and the fix."""
 
+    def _render_traceback_(self) -> list[str]:
+        """Show a notebook the line alone, for what it names is the user's and not in our code."""
+        return [f"InputError: {self}"]
+
 
 class Section(BaseModel):
     """A frozen group of settings: unknown keys and non-finite numbers are refused."""

@@ -184,13 +184,15 @@ def from_flags(values: Mapping[str, Any]) -> Layer:
     return _layer(given, lambda key: "--" + ".".join(key).replace("_", "-"))
 
 
-def from_keywords(values: Mapping[str, Any]) -> Layer:
+def from_keywords(values: Mapping[str, Any], others: Iterable[str] = ()) -> Layer:
     """Name the settings that were given as keywords of a call.
 
     Parameters
     ----------
     values : mapping
         Settings, and sections of settings; two underscores part a section from its settings.
+    others : iterable of str
+        What the call takes beside settings, which may have been meant.
 
     Returns
     -------
@@ -210,7 +212,7 @@ def from_keywords(values: Mapping[str, Any]) -> Layer:
     pipistrelle.config.InputError: rays__powr: no such setting; did you mean rays__power?
     """
     given = leaves(spread(values, "__"), known_settings())
-    return _layer(given, "__".join)
+    return _layer(given, "__".join, others=others)
 
 
 def spread(table: Mapping[str, Any], parts: str) -> dict[str, Any]:
@@ -284,7 +286,7 @@ def resolve(layer: Layer) -> Config:
     try:
         # JSON is strict where TOML is (text is no number) and lenient where TOML must be (a
         # list makes a tuple).
-        return Config.model_validate_json(json.dumps(nested, default=str), strict=True)
+        return Config.model_validate_json(json.dumps(nested, default=_plain), strict=True)
     except ValidationError as refused:
         problems = [_problem(error, layer) for error in refused.errors(include_url=False)]
         raise InputError("\n".join(problems)) from None
@@ -431,7 +433,10 @@ def leaves(
 
 
 def _layer(
-    given: Iterable[tuple[Key, Any]], spell: Callable[[Key], str], prefix: str = ""
+    given: Iterable[tuple[Key, Any]],
+    spell: Callable[[Key], str],
+    prefix: str = "",
+    others: Iterable[str] = (),
 ) -> Layer:
     """Say of each value where it was given; refuse what is no setting."""
     layer = {}
@@ -441,13 +446,21 @@ def _layer(
             layer[key] = Given(value, where)
         elif any(key == known[: len(key)] for known in known_settings()):
             if value != {}:
-                raise InputError(f"{where}: found {shown(value)}, expected a section of settings")
+                near = f"; did you mean {where}s?" if f"{where}s" in others else ""
+                expected = f"expected a section of settings{near}"
+                raise InputError(f"{where}: found {shown(value)}, {expected}")
         else:
-            names = {".".join(known): known for known in known_settings()}
+            names = {".".join(known): spell(known) for known in known_settings()}
+            names |= {name: name for name in others}
             near = meant(".".join(key), names)
-            fix = f"did you mean {spell(names[near])}?" if near else "see `pipistrelle config show`"
+            fix = f"did you mean {names[near]}?" if near else "see `pipistrelle config show`"
             raise InputError(f"{where}: no such setting; {fix}")
     return layer
+
+
+def _plain(value: Any) -> Any:
+    """Return an array or a number of NumPy's as Python's own, anything else as text."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 def _from_text(text: str) -> Any:

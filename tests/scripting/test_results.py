@@ -111,6 +111,13 @@ def test_settings_to_start_from_may_be_settings_a_table_or_a_file(done):
         ((), {"duration": 9.0, "scenario__steps": 3}, "duration 9 and scenario__steps are one set"),
         ((), {"landmarks": 9, "scenario__landmarks": 3}, "landmarks and scenario__landmarks are"),
         ((), {"duration": float("nan")}, "duration: found nan"),
+        ((), {"duration": "60"}, "duration: found '60', expected a number"),
+        ((), {"beamwidth": [60.0]}, "beamwidth: found [60.0], expected a number"),
+        ((), {"strategies": []}, "strategies: found (), expected 'active'"),
+        ((), {"strategies": None}, "strategies: found None, expected 'active'"),
+        ((), {"filters": []}, "filters: found none, expected an estimator's name"),
+        ((), {"word": "here"}, "word: no such setting; did you mean world?"),
+        ((), {"filter": "iekf"}, "filter: found 'iekf', expected a section of settings; did you"),
     ],
 )
 def test_mistakes_are_told_in_the_words_of_the_call(words, asked, said):
@@ -156,6 +163,39 @@ def test_what_is_no_folder_of_ours_is_refused(tmp_path):
     for name in ("nowhere", "."):
         with pytest.raises(InputError):
             pipistrelle.load(name)
+
+
+def test_a_table_that_is_cut_or_none_is_refused_by_name(done):
+    table = done.save("one") / "steps.parquet"
+    table.write_bytes(table.read_bytes()[:100])
+    with pytest.raises(InputError, match=r"one/steps\.parquet: found no table that is whole"):
+        _ = pipistrelle.load("one").tracks
+    table.unlink()
+    table.symlink_to("/dev/null")
+    with pytest.raises(InputError, match=r"one/steps\.parquet: is no file"):
+        _ = pipistrelle.load("one").tracks
+
+
+def test_a_notebook_tells_a_mistake_in_a_line():
+    assert InputError("rays__powr: no such setting")._render_traceback_() == [
+        "InputError: rays__powr: no such setting"
+    ]
+
+
+def test_a_notebook_draws_a_figure_that_is_the_last_line_of_a_cell(done):
+    assert done.figure()._repr_png_().startswith(b"\x89PNG")
+
+
+def test_numbers_may_be_numpys():
+    few = pipistrelle.run(
+        seed=np.int64(3),
+        duration=np.float32(4.0),
+        landmarks=np.int64(10),
+        strategies="fused",
+        rays__range_bounds=np.array([0.5, 15.0]),
+    )
+    same = pipistrelle.run(seed=3, **SHORT, strategies="fused", rays__range_bounds=[0.5, 15.0])
+    assert few.tracks.equals(same.tracks)
 
 
 def test_a_notebook_is_shown_the_figure_and_the_scores(done):

@@ -6,6 +6,7 @@ Words come from a command line or from Python; where each was given is said in i
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from math import isfinite, radians
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -140,8 +141,35 @@ def mission_settings(
     if duration.value is not None:
         more[STEPS] = Given(_steps(duration, base), f"{duration.where} {duration.value:g}")
     if beamwidth.value is not None:
-        more[RADIUS] = Given(_radius(beamwidth.value, base), beamwidth.where)
+        more[RADIUS] = Given(_radius(number(beamwidth), base), beamwidth.where)
     return resolve(layer | short_names(more, flags)), world
+
+
+def number(given: Given) -> float:
+    """Return a value that is a number.
+
+    Parameters
+    ----------
+    given : Given
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    InputError
+        For anything else, text that spells a number among it.
+
+    Examples
+    --------
+    >>> number(Given("60", "duration"))
+    Traceback (most recent call last):
+    pipistrelle.config.InputError: duration: found '60', expected a number
+    """
+    if not isinstance(given.value, Real):
+        raise InputError(f"{given.where}: found {shown(given.value)}, expected a number")
+    return float(given.value)
 
 
 def named_strategies(chosen: str | Sequence[str]) -> tuple[Strategy, ...]:
@@ -167,7 +195,8 @@ def named_strategies(chosen: str | Sequence[str]) -> tuple[Strategy, ...]:
     """
     if isinstance(chosen, str):
         chosen = STRATEGIES if chosen == "all" else (chosen,)
-    for one in chosen:
+    chosen = tuple(chosen) if isinstance(chosen, Iterable) else (chosen,)
+    for one in chosen or (chosen,):
         if one not in get_args(Strategy):
             near = meant(str(one), STRATEGIES)
             fix = f"did you mean {near!r}?" if near else "choose"
@@ -204,6 +233,8 @@ def named_filters(chosen: Filters) -> tuple[str, ...]:
     if isinstance(chosen, (str, type)) or not isinstance(chosen, Iterable):
         chosen = PAPERS if chosen == "both" else (chosen,)
     names = tuple(dict.fromkeys(map(_name_of, chosen)))
+    if not names:
+        raise InputError("filters: found none, expected an estimator's name or its class")
     for name in names:
         entry(name)
     check_distinct(names, "filters")
@@ -229,7 +260,7 @@ def _steps(duration: Given, config: Config) -> int:
     """Count the control steps of a drive; at least one frame."""
     scenario = config.scenario
     frame = scenario.step * scenario.steps_per_frame
-    if not frame <= duration.value or not isfinite(duration.value / scenario.step):
+    if not frame <= number(duration) or not isfinite(duration.value / scenario.step):
         raise InputError(
             f"{duration.where}: found {duration.value:g}, expected at least one frame "
             f"({frame:g} s), in finite time"

@@ -17,6 +17,8 @@ from pipistrelle.experiments.results.folder import prepare_folder
 from pipistrelle.experiments.results.writing import run_entry, tables_of
 from pipistrelle.experiments.runs.replay import load as load_log
 from pipistrelle.experiments.runs.trial import Watch
+from pipistrelle.files import check_ordinary
+from pipistrelle.refusals import refusal
 from pipistrelle.scripting.asking import (
     WORLD,
     Base,
@@ -25,6 +27,7 @@ from pipistrelle.scripting.asking import (
     mission_settings,
     named_filters,
     named_strategies,
+    number,
     short_names,
 )
 from pipistrelle.scripting.missions import Done, drawn, filmed, keep, simulated, solved
@@ -40,6 +43,8 @@ Redo = Callable[[Watch | None], Done]
 COLUMNS = ("strategy", "filter", "position_rmse_m", "position_rmse_aligned_m", "map_rmse_m",
            "nees_mean", "landmarks_full", "landmarks_total")  # fmt: skip
 """Of the table that a notebook shows."""
+TABLES = ("steps", "landmarks", "measurements")
+"""That a result folder holds, each with its ending."""
 
 
 class Results:
@@ -111,8 +116,16 @@ class Results:
 
         if self.folder is None:
             return tables_of(self._done.trials, self._done.truth)
-        names = ("steps", "landmarks", "measurements")
-        return {name: pl.read_parquet(self.folder / f"{name}.parquet") for name in names}
+        paths = {name: self.folder / f"{name}.parquet" for name in TABLES}
+        tables = {}
+        for name, path in paths.items():
+            check_ordinary(path)
+            try:
+                tables[name] = pl.read_parquet(path.read_bytes())
+            except (OSError, pl.exceptions.PolarsError):
+                found, fix = "no table that is whole", "do the mission anew"
+                raise refusal(path, found, "what was written there", fix) from None
+        return tables
 
     def figure(self) -> "Figure":
         """Draw maps and errors side by side, as ``mission.png`` has them."""
@@ -266,7 +279,7 @@ def run(
     }
     asked, known = mission_settings(
         base_layer(config),
-        from_keywords(settings),
+        from_keywords(settings, run.__kwdefaults__ or ()),
         short,
         beamwidth=Given(beamwidth, "beamwidth"),
         duration=Given(duration, "duration"),
@@ -327,10 +340,10 @@ def slam(
     InputError
         What is wrong in the log, by line or key; as `run`.
     """
-    place, flags = Path(log), from_keywords(settings)
+    place, flags = Path(log), from_keywords(settings, slam.__kwdefaults__ or ())
     check_open(flags)
     short = short_names({("filter", "gate"): Given(gate, "gate")}, flags)
-    if beamwidth is not None and not 0 < beamwidth <= 360:
+    if beamwidth is not None and not 0 < number(Given(beamwidth, "beamwidth")) <= 360:
         raise InputError(f"beamwidth: found {beamwidth:g}, expected above 0 and up to 360 [deg]")
     recorded, truth = load_log(place, robot)
     settled, overruled = with_log(base_layer(config) | flags | short, recorded, place)

@@ -183,7 +183,7 @@ def study(
     >>> study(levels, iterations=1, scenario={"steps": 8, "landmarks": 5}).trials.height
     6
     """
-    share, over = _share(shard), from_keywords(settings)
+    share, over = _share(shard), from_keywords(settings, study.__kwdefaults__ or ())
     if isinstance(plan, Mapping):
         tried = plan_of(_listed({"format": FORMAT, **plan}), over=over, iterations=iterations)
     else:
