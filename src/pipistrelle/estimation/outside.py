@@ -56,7 +56,8 @@ def class_of(name: str) -> type:
     except (Exception, SystemExit) as error:
         if isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}."):
             place = f"neither installed nor in {Path.cwd()}"
-            raise InputError(f"filter {name}: found no module {error.name}, {place}") from None
+            fix = f"; write {module[:-3]}:{wanted}" if module.endswith(".py") else ""
+            raise InputError(f"filter {name}: found no module {error.name}, {place}{fix}") from None
         raise InputError(f"filter {name}: importing {module} fails: {worded(error)}") from error
     if not isinstance(kind, type):
         found = f"no class {wanted}" if kind is None else f"{wanted}, which is no class,"

@@ -7,10 +7,11 @@ from pathlib import Path
 from types import MappingProxyType, NoneType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict, Union, get_args, get_origin
 
-from cyclopts import Group, Parameter, convert
+from cyclopts import Group, Parameter
 
 from pipistrelle.config import Config, InputError
 from pipistrelle.estimation.catalogue import CATALOGUE, entry
+from pipistrelle.refusals import meant
 from pipistrelle.scripting.asking import WORLD, mission_settings, named_filters
 from pipistrelle.settings import (
     Given,
@@ -38,7 +39,16 @@ Whole = Annotated[int, Parameter(converter=_whole)]
 
 def _filter(_: Any, tokens: Sequence[Any]) -> str:
     """Read the name of a filter, one that is listed or one from outside."""
-    return tokens[0].value if ":" in tokens[0].value else convert(_LISTED, tokens)
+    name = tokens[0].value
+    if ":" in name or name in get_args(_LISTED):
+        return name
+    near = meant(name, get_args(_LISTED))
+    fix = f"; did you mean {near!r}?" if near and "," not in name else ""
+    more = "; several: run once for each, and `pipistrelle compare`" if "," in name else ""
+    listed = ", ".join(get_args(_LISTED))
+    raise ValueError(
+        f"found {name!r}, expected {listed} or one of your own, module:Class{fix}{more}"
+    )
 
 
 if TYPE_CHECKING:

@@ -1,5 +1,7 @@
 """Missions side by side: which estimates are compared, and how near their paths come."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from pipistrelle.experiments.comparing.folders import kind_of
 from pipistrelle.experiments.comparing.missions import compare_missions, notes_of, path_view
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
 from pipistrelle.experiments.results.stored import StoredPath
+from pipistrelle.files import RESULTS, OwnFiles
 from reference.results import PLACES, STEPS, TIME, TRUTH, loop, mission_folder, turned
 
 OFF = turned(loop(), 0.1, (0.5, -0.2))
@@ -190,3 +193,17 @@ def test_missions_and_studies_are_not_compared(tmp_path):
     with pytest.raises(InputError, match="nowhere: found no such folder"):
         kind_of([tmp_path / "study", tmp_path / "nowhere"])
     assert kind_of([mission, tmp_path / "nowhere"]) == "missions"
+
+
+def test_which_logs_were_solved_and_how_is_named_where_it_differs(folders):
+    one, two = folders({("active", "ekf"): OFF}, {("active", "ekf"): NOISY})
+    for folder, path, beam in ((one, "here", 0.5), (two, "there", None)):
+        own = OwnFiles(folder, RESULTS)
+        told = json.loads(own.read("summary.json"))
+        told["log"] = {"path": path, "robot": None, "beamwidth_rad": beam, "files": {path: "00"}}
+        own.write("summary.json", json.dumps(told))
+    settings = compare_missions([one, two]).settings
+    assert settings["log.path"] == ("here", "there")
+    assert settings["log.beamwidth_rad"] == (0.5, None)
+    assert "log.robot" not in settings
+    assert len(set(settings["log.files"])) == 2

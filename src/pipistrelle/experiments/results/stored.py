@@ -9,6 +9,7 @@ import json
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +100,8 @@ def read_mission(folder: Path) -> StoredMission:
         return StoredMission(
             folder=folder,
             version=str(summary["version"]),
-            settings=flattened(tomllib.loads(own.read("config.toml").decode())),
+            settings=flattened(tomllib.loads(own.read("config.toml").decode()))
+            | _log_settings(summary.get("log")),
             scores=scores,
             paths={key: _path(own.read(f"track_{name}.tum")) for key, name in names.items()},
             maps={key: _placed(own.read(f"map_{name}.csv")) for key, name in names.items()},
@@ -110,6 +112,15 @@ def read_mission(folder: Path) -> StoredMission:
     except (ValueError, LookupError, TypeError, AttributeError) as error:  # sums of its own
         found = f"files that Pipistrelle would not write ({error})"
         raise refusal(folder, found, "results of it", "run again what wrote them") from error
+
+
+def _log_settings(told: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Name which log was solved and how it was looked at, beside the settings."""
+    if told is None:
+        return {}
+    asked = {f"log.{name}": told[name] for name in ("path", "robot", "beamwidth_rad")}
+    sums = json.dumps(told["files"], sort_keys=True).encode()
+    return {**asked, "log.files": sha256(sums).hexdigest()[:8]}
 
 
 def flattened(table: Mapping[str, Any]) -> dict[str, Any]:
