@@ -86,8 +86,9 @@ def front_edge(
 ) -> tuple[float, float]:
     """Lag at which the first call of a tone begins, and its standard deviation.
 
-    Sought from two calls before lag b to it. NaN where none is clear, or where something stood out
-    before it that did not last: a call that an echo at its heels has all but extinguished.
+    Sought from two calls before lag b to it. NaN where none stands out; and with an infinite
+    deviation where something stood out that did not last: a call that an echo at its heels has all
+    but extinguished.
     """
     stride, elements = max(pulse // 14, 1), matched.shape[3]
     low = max(b - 2 * (pulse + stride), b % stride)
@@ -114,7 +115,7 @@ def front_edge(
                 break
             lag, std = _fitted(gain, k, noise)
             return low + pulse + stride * lag, stride * std
-    return math.nan, math.nan
+    return math.nan, math.nan if first == count else math.inf
 
 
 @no_alloc
@@ -165,8 +166,8 @@ def direct_calls(
 
     ``whole`` are face and caller of each detection, ``numbers`` delay, sine of the angle, power and
     the standard deviations of bearing and delay; ``lags`` the delay of lag 0 [s], the distance of
-    two lags [s] and the lags of a call. Returns the columns of `DirectCalls`; of a call that began
-    before the record the whole's best fit.
+    two lags [s] and the lags of a call. Returns the columns of `DirectCalls`; of a call
+    that began before the record, or rises too little, the whole's best fit.
     """
     start, interval, pulse = lags
     found = np.full(tones, -1, dtype=np.int64)
@@ -176,11 +177,13 @@ def direct_calls(
         if d < 0 or _may_leak(whole, numbers, d, pulse * interval):
             continue
         b = int((numbers[0, d] - start) / interval + 0.5)
-        lag, std = (numbers[0, d] - start) / interval, numbers[4, d] / interval
+        lag, std = math.nan, math.nan
         if b > pulse + reach_of(pulse):
             lag, std = front_edge(matched, b, whole[0, d], p, pulse)
-        if not math.isnan(lag):
+        if std != math.inf:
             found[p], when[0, p], when[1, p] = d, start + interval * lag, interval * std
+        if math.isnan(std):
+            when[0, p], when[1, p] = numbers[0, d], numbers[4, d]
     return found, when
 
 

@@ -1,0 +1,227 @@
+"""The direct call: what recognises it, when it began, and what a detour is worth."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from pipistrelle.acoustics.arrivals import Arrivals
+from pipistrelle.acoustics.callers import callers_of
+from pipistrelle.arithmetic.random_stream import stream_key
+from pipistrelle.arrays.layout import square_of_four
+from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
+from pipistrelle.arrays.sampling import BLOCK, sampling
+from pipistrelle.config import Config
+from pipistrelle.detection.faces import average_faces, timed
+from pipistrelle.detection.matched import filter_blocks
+from pipistrelle.detection.noise import DETOUR_FLOOR, measured
+from pipistrelle.detection.snapshots import detect, detector
+from pipistrelle.experiments.hearing.listening import listen
+from pipistrelle.experiments.hearing.oracle import label_detections
+from pipistrelle.experiments.hearing.scenario import caller_labels, world_of
+
+CONFIG = Config()
+SETTLED, SQUARE = sampling(CONFIG, callers_of(CONFIG, np.zeros(2))), square_of_four(CONFIG.receiver)
+FINDER = detector(CONFIG, SQUARE, SETTLED.tones)
+C, PULSE = CONFIG.air.celerity, CONFIG.emitter.pulse
+GAIN_DB = 10.0 * np.log10(SETTLED.pulse * SETTLED.block)
+OWN, BEACON = 0, 1
+SAMPLED = BLOCK / SETTLED.block / np.sqrt(3.0)
+"""What a delay is late by [s], rms: a call is heard from the next sample on."""
+
+
+def detected(*sounds, key=1, noisy=True, blocks=200):
+    """Detect sounds (delay [s], bearing [rad], tone, SNR of a call at one element [dB])."""
+    delay, bearing, tone, snr_db = map(np.array, zip(*sounds, strict=True))
+    arrivals = Arrivals(
+        delay=delay,
+        level_db=snr_db - GAIN_DB,
+        bearing=bearing,
+        frequency=SETTLED.tones[tone],
+        caller=tone.astype(np.int8),
+        landmark=np.arange(1, delay.size + 1),
+    )
+    heard = noise_blocks(blocks, SQUARE, SETTLED, stream_key(7, key, "direct"))
+    if not noisy:
+        heard *= 1e-6
+    add_echo_blocks(heard, arrivals, SQUARE, SETTLED)
+    matched = filter_blocks(heard, pulse=SETTLED.pulse, block=SETTLED.block, noise_std=1.0)
+    timing = {"start": SETTLED.pulse * BLOCK, "interval": BLOCK, "pulse": SETTLED.pulse}
+    return detect(matched, FINDER, **timing)
+
+
+def off_by(found, delay):
+    """How much later [m] the direct call is thought to have begun."""
+    return C * (found.direct.delay[BEACON] - delay)
+
+
+def test_the_vehicle_has_no_direct_call_and_silence_has_none():
+    found = detected((0.02, 0.3, OWN, 20.0))
+    assert found.direct.detection.tolist() == [-1, -1]
+    assert np.isnan(found.direct.delay).all()
+
+
+def test_the_first_of_a_tone_is_its_direct_call_though_an_echo_be_louder():
+    found = detected((0.015, 0.3, BEACON, 20.0), (0.022, 1.9, BEACON, 26.0))
+    assert abs(off_by(found, 0.015)) < 0.02
+    strongest = found.power[found.caller == BEACON].argmax()
+    assert C * (found.delay[found.caller == BEACON][strongest] - 0.015) > 2.0, (
+        "or nothing is proved"
+    )
+
+
+def test_what_is_much_fainter_than_the_loudest_is_no_direct_call():
+    found = detected((0.012, 0.3, BEACON, 12.0), (0.022, 1.9, BEACON, 32.0))
+    assert abs(off_by(found, 0.022)) < 0.02
+
+
+def test_what_may_be_the_leakage_of_another_tone_is_no_direct_call():
+    faint = (0.0200, 0.3, BEACON, 22.0)
+    assert detected(faint).direct.detection[BEACON] >= 0
+    beside = detected(faint, (0.0200, 0.35, OWN, 46.0))
+    assert (beside.caller == BEACON).any()
+    assert beside.direct.detection[BEACON] == -1
+
+
+@pytest.mark.parametrize("apart", [0.15, 0.3, 0.6])
+def test_an_echo_at_the_heels_of_the_direct_call_does_not_move_its_front_edge(apart):
+    worst, drawn = 0.0, 0.0
+    for key in range(40):
+        rng = np.random.default_rng(key)
+        delay = 0.02 + rng.random() * BLOCK
+        late = delay + apart / C + rng.random() / SETTLED.tones[BEACON]
+        found = detected((delay, 0.3, BEACON, 26.0), (late, 0.45, BEACON, 25.0), key=key)
+        if found.direct.detection[BEACON] < 0:
+            continue  # the two all but extinguish each other
+        first = found.direct.detection[BEACON]
+        worst = max(worst, abs(off_by(found, delay)))
+        drawn = max(drawn, abs(C * (found.delay[first] - delay)))
+    assert worst < 0.06
+    assert drawn > 2.0 * worst, "the whole call's best fit is drawn by it"
+
+
+@cache
+def edges(snr_db, count=600):
+    """Errors and told deviations [s] of the front edges of isolated direct calls."""
+    rng, rows = np.random.default_rng([3, int(snr_db)]), []
+    for i in range(count):
+        delay = 0.012 + rng.random() * BLOCK
+        direct = detected((delay, rng.uniform(-0.6, 0.6), BEACON, snr_db), key=i, blocks=90).direct
+        rows.append((direct.delay[BEACON] - delay, direct.delay_std[BEACON]))
+    return np.array(rows).T
+
+
+@pytest.mark.parametrize("snr_db", [21.0, 25.0, 30.0])
+def test_a_front_edge_is_as_sure_as_it_says(snr_db):
+    off, std = edges(snr_db)
+    heard = np.isfinite(off)
+    assert heard.mean() > 0.95
+    share = np.mean(off[heard] ** 2 / (std[heard] ** 2 + SAMPLED**2))
+    assert 0.6 < share < 1.5
+    assert np.mean(off[heard] ** 2 / (0.25 * std[heard] ** 2)) > 2.0, "half of that would not do"
+
+
+def test_rows_say_how_much_later_than_the_direct_call_they_came_and_how_surely():
+    delays = np.array([0.02, 0.031, 0.028])
+    found = detected(
+        (delays[0], 0.3, BEACON, 26.0), (delays[1], 1.2, BEACON, 20.0), (delays[2], -2.0, OWN, 20.0)
+    )
+    near = np.abs(found.delay[:, None] - delays).argmin(axis=1)
+    label = np.where(found.caller == OWN, 7, np.where(near == 0, 51, 4))
+    heard = average_faces(0.5, found, label, averaging="plain", speed_of_sound=C)
+    assert np.isnan(heard.rows.detour).all(), "until somebody asks"
+    rows = measured(timed(heard)).rows
+    told = dict(zip(rows.landmark.tolist(), rows.detour, strict=True))
+    assert told[4] == pytest.approx(C * 0.011, abs=0.05)
+    assert np.isnan([told[7], told[51]]).all(), "an own echo, and the direct call itself"
+    stds = dict(zip(rows.landmark.tolist(), rows.detour_std, strict=True))
+    assert DETOUR_FLOOR < stds[4] < 0.1
+
+
+def test_what_comes_while_the_direct_call_lasts_has_no_detour():
+    for apart, heard_apart in ((0.8 * PULSE, False), (1.3 * PULSE, True)):
+        found = detected((0.02, 0.0, BEACON, 26.0), (0.02 + apart, 3.1, BEACON, 20.0))
+        late = found.delay > 0.02 + 0.5 * apart
+        label = np.where(late, 4, 51)
+        rows = timed(average_faces(0.5, found, label, averaging="plain", speed_of_sound=C)).rows
+        assert np.isfinite(rows.detour[rows.landmark == 4]).tolist() == [heard_apart]
+
+
+# In the paper's worlds
+
+
+@cache
+def in_worlds(radius=0.0088, worlds=3):
+    """Errors of direct calls, of the strongest detections, and of detours with their deviations."""
+    direct, strongest, rows = [], [], []
+    for world in range(worlds):
+        config = Config(seed=1000)
+        scenario, true = world_of(config, world), []
+        beacon = int(caller_labels(scenario)[BEACON])
+
+        def listened(found, arrivals, *layout, true=true, beacon=beacon, **gates):
+            of = arrivals.caller == BEACON
+            delays = dict(zip(arrivals.landmark[of].tolist(), arrivals.delay[of], strict=True))
+            true.append(delays)
+            heard = np.flatnonzero(found.caller == BEACON)
+            direct.append(off_by(found, delays[beacon]))
+            strongest.append(C * (found.delay[heard[found.power[heard].argmax()]] - delays[beacon]))
+            return label_detections(found, arrivals, *layout, **gates)
+
+        (frames,) = listen(scenario, config, (radius,), iteration=world, oracle=listened)
+        for frame, delays in zip(frames, true, strict=True):
+            told = measured(timed(frame)).rows
+            for label, e, std in zip(
+                told.landmark.tolist(), told.detour, told.detour_std, strict=True
+            ):
+                if np.isfinite(e) and label != beacon:
+                    rows.append((e - C * (delays[label] - delays[beacon]), std))
+    return np.array(direct), np.array(strongest), np.array(rows).T
+
+
+def test_in_the_papers_worlds_the_direct_call_is_hardly_ever_another():
+    direct, strongest, _ = in_worlds()
+    known = np.isfinite(direct)
+    assert known.mean() > 0.93
+    assert np.mean(np.abs(direct[known]) > 0.15) < 0.002
+    assert np.sqrt(np.mean(direct[known] ** 2)) < 0.03
+    assert np.mean(np.abs(strongest) > 0.15) > 0.03, "the strongest alone is not enough"
+
+
+def test_in_the_papers_worlds_detours_are_as_good_as_they_say():
+    _, _, (off, std) = in_worlds()
+    assert off.size > 15000
+    assert np.median(np.abs(off)) < 0.015
+    assert np.sqrt(np.mean(off**2)) < 0.06
+    assert 0.7 < np.mean((off / std) ** 2) < 1.5
+    assert np.mean((off / (0.5 * std)) ** 2) > 2.5
+
+
+def test_the_dense_engine_times_as_the_block_engine_does():
+    off = {}
+    for engine in ("block", "dense"):
+        config = Config.model_validate({
+            "seed": 1000, "scenario": {"steps": 40}, "receiver": {"engine": engine},
+        })  # fmt: skip
+        (frames,) = listen(world_of(config, 0), config, (0.0088,))
+        told = [dict(zip(f.rows.landmark.tolist(), f.detour[0], strict=True)) for f in frames]
+        off[engine] = [
+            (n, label, e) for n, f in enumerate(told) for label, e in f.items() if e == e
+        ]
+    both = {key[:2]: key[2] for key in off["block"]}
+    apart = [e - both[n, label] for n, label, e in off["dense"] if (n, label) in both]
+    assert len(apart) > 100
+    assert np.median(np.abs(apart)) < 0.03
+
+
+def test_with_timing_off_scans_are_to_the_bit_those_of_old():
+    from pipistrelle.experiments.runs.trial import scans_of
+
+    config = Config.model_validate({"scenario": {"steps": 40}})
+    (frames,) = listen(world_of(config), config, (0.0088,))
+    for strategy in ("active", "fused", "passive"):
+        scans = scans_of(frames, strategy, config)
+        old = scans_of([replace(f, detour=None) for f in frames], strategy, config)
+        assert [s.numbers.tobytes() for s in scans] == [s.numbers.tobytes() for s in old]
+        assert all(np.isnan(s.detour).all() for s in scans)
