@@ -11,7 +11,7 @@ not known before they are heard, but for a flat prior. It tells two things:
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -112,9 +112,14 @@ def pose_bound(
         np.diff(time),
         motion_numbers(motion),
         np.array([place[int(one)] for one in heard]).reshape(-1, 2),
-        (step[known], *(np.array([slot[int(i)] for i in w], int) for w in (label[known], caller))),
+        (step[known], _slots(slot, label[known]), _slots(slot, caller)),
         np.ascontiguousarray(numbers[:, known]),
     )
+
+
+def _slots(slot: Mapping[int, int], label: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
+    """Look up where labels stand in the state."""
+    return np.array([slot[one] for one in label.tolist()], dtype=np.int64)
 
 
 def _whose(scan: Scan) -> Int[np.ndarray, " m"]:

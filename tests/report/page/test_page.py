@@ -196,6 +196,13 @@ def test_one_world_is_not_many(tmp_path, whole, undrawn):
         assert not re.search(r"\b1 worlds", text)
 
 
+def test_few_worlds_are_said_to_be_few(tmp_path, whole, undrawn):
+    warning = "so few worlds may show what others would not"
+    assert warning in whole
+    write_report(invent(20), tmp_path)
+    assert warning not in (tmp_path / "index.html").read_text(encoding="utf-8")
+
+
 def test_all_rules_can_be_looked_at(reported):
     reader = read(reported)
     shown = [set(attrs.get("class", "").split()) for attrs in reader.of("div")]

@@ -323,7 +323,7 @@ def _correct_by_detour(
         )  # fmt: skip
     ray = timed.landmark[d] if caller >= 0 else timed.caller[d]
     if (member >= 0 or caller >= 0) and _members_of(state.landmark, state.members[0], ray)[1]:
-        _weigh(state, timed, d, caller < 0, sensing, scratch)
+        _weigh(state, timed, d, bool(caller < 0), sensing, scratch)
     return APPLIED
 
 

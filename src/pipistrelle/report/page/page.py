@@ -31,6 +31,8 @@ from pipistrelle.report.studied import RULES, Rule, Study, filter_titles
 from pipistrelle.settings import to_toml
 
 SPOKEN = {"reproduced": "Reproduced", "not-reproduced": "Not reproduced", "open": "Open"}
+FEW = 20
+"""Worlds under which a reader is warned: a few agree by chance on what many do not show."""
 
 
 def write_report(
@@ -129,6 +131,7 @@ def page(
         question=told.question,
         claims=told.claims,
         summary=numbers,
+        few=FEW,
         tables=effect_tables(study, told.effects[told.rule]),
         measures=MEASURES,
         units=UNITS,
