@@ -66,3 +66,7 @@ if __name__ == "__main__":
     tables = [t.drop("wall_s", "cpu_s").sort("iteration", "case") for t in found.values()]
     answer = sum(not table.equals(tables[0]) for table in tables)
     print(f"{answer} of {len(tables)} differ in any bit of {tables[0].width} columns")
+
+# %%
+# The paper's question is answered so, as often as one likes. What it left out, *when* an echo
+# comes: :doc:`10_when_not_only_where`.

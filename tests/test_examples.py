@@ -42,7 +42,7 @@ def scripts():
 def test_every_tutorial_is_tested():
     names = {path.stem for path in scripts()}
     here = Path(__file__).read_text(encoding="utf-8")
-    assert len(names) == 9
+    assert len(names) == 10
     assert {name for name in names if f'play("{name}")' not in here} == set()
 
 
@@ -191,3 +191,23 @@ def test_one_process_shards_and_a_cluster_find_the_same(play, tmp_path_factory, 
     plan.write_text(done["plan"])
     other = pipistrelle.study(plan, seed=8).trials.drop("wall_s", "cpu_s").sort("iteration", "case")
     assert not other.equals(done["tables"][0]), "another seed finds something else"
+
+
+def test_two_detours_place_a_landmark_as_surely_as_the_information_of_all_says(play):
+    """Bearings, ranges and detours by differences, about what they came from: all are exact."""
+    done = play("10_when_not_only_where")
+    places = np.concatenate([done["vehicle"], done["callers"].ravel(), done["landmark"]])
+
+    def said(x):
+        pose, one, two, landmark = x[:3], x[3:5], x[5:7], x[7:]
+        ranges, bearings = done["range_and_bearing"](pose, np.array([one, two, landmark]))
+        detours = [done["detour_of"](pose[:2], landmark, caller) for caller in (one, two)]
+        return np.array([*pose, *ranges[:2], *bearings, *detours])
+
+    slopes = [(said(places + d) - said(places - d)) / 2e-6 for d in 1e-6 * np.eye(9)]
+    std = [0.05, 0.05, 0.02, 0.2, 0.2, 0.05, 0.05, 0.05, 0.05, 0.05]
+    whitened = np.array(slopes).T / np.array(std)[:, None]
+    covariance = np.linalg.inv(whitened.T @ whitened)[7:, 7:]
+    expected = np.sqrt(np.linalg.eigvalsh(covariance)[-1])
+    assert done["answer"] == pytest.approx(expected, rel=0.1), "but for what is bent"
+    assert [len(belief.landmarks().landmark) for belief in done["beliefs"]] == [6, 3, 3]

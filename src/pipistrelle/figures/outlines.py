@@ -100,3 +100,39 @@ def vehicle(pose: Float[np.ndarray, "3"], length: float) -> Float[np.ndarray, "4
     shape = length * np.array([[0.58, 0.0], [-0.42, 0.36], [-0.2, 0.0], [-0.42, -0.36]])
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     return pose[:2] + shape @ np.array([[cos, sin], [-sin, cos]])
+
+
+def detour_ellipse(
+    vehicle: Float[np.ndarray, "2"], caller: Float[np.ndarray, "2"], detour: float
+) -> Float[np.ndarray, "121 2"]:
+    r"""Where all points lie that have a detour: an ellipse about vehicle and caller.
+
+    .. math:: |b - l| + |l - p| = d + e, \qquad d = |b - p|
+
+    Its half axes are :math:`(d + e)/2` and :math:`\sqrt{(d + e)^2 - d^2}/2`.
+
+    Parameters
+    ----------
+    vehicle, caller : (2) [m]
+        The foci.
+    detour : [m]
+
+    Returns
+    -------
+    (121, 2) [m]
+        A closed outline.
+
+    Examples
+    --------
+    >>> outline = detour_ellipse(np.zeros(2), np.array([6.0, 0.0]), 4.0)
+    >>> outline.min(axis=0), outline.max(axis=0)
+    (array([-2., -4.]), array([8., 4.]))
+    """
+    across = caller - vehicle
+    straight = np.hypot(*across)
+    long = 0.5 * (straight + detour)
+    short = np.sqrt(np.maximum(long**2 - 0.25 * straight**2, 0.0))
+    angle = np.linspace(0.0, 2.0 * np.pi, 121)
+    c, s = across / straight if straight > 0.0 else np.array([1.0, 0.0])
+    x, y = long * np.cos(angle), short * np.sin(angle)
+    return 0.5 * (vehicle + caller) + np.column_stack([c * x - s * y, s * x + c * y])
