@@ -5,10 +5,11 @@ import re
 
 from pydantic import TypeAdapter
 
-from pipistrelle.config import LARGEST, Config
-from pipistrelle.settings import PREFIX, from_flags, known_settings
+from pipistrelle.config import LARGEST, CallerConfig, Config
+from pipistrelle.settings import CALLERS, PREFIX, from_flags, known_settings
 
 PLACE = "<!-- settings -->"
+CALLER = "<!-- callers -->"
 ANY = "any number"
 SIGN = re.compile("([≥>≤<]) ")
 UNIT = re.compile(r" ?\[((?!0 to 1)[^]]+)\]")
@@ -17,7 +18,7 @@ UNIT = re.compile(r" ?\[((?!0 to 1)[^]]+)\]")
 def add_settings(app, docname, content):
     """Put every setting where the page asks for them."""
     if docname == "settings":
-        content[0] = content[0].replace(PLACE, markdown())
+        content[0] = content[0].replace(PLACE, markdown()).replace(CALLER, callers())
 
 
 def markdown():
@@ -29,6 +30,16 @@ def markdown():
             parts.append(titled(above))
         parts[-1] += entry(key)
     return "\n".join(parts)
+
+
+def callers():
+    """Lay out what a table of `[[callers]]` may say."""
+    parts = []
+    for name, field in CallerConfig.model_fields.items():
+        text = " ".join(field.description.split())
+        takes = "" if name in ("name", "route", "waypoints") else f"; {extent(field)}"
+        parts.append(SIGN.sub("\\1\N{NO-BREAK SPACE}", f"`{name}`\n: {text.rstrip('.')}{takes}."))
+    return "\n\n".join(parts)
 
 
 def titled(section):
@@ -46,7 +57,8 @@ def entry(key):
     units = [] if isinstance(field.default, str) else UNIT.findall(text)
     if len(units) == 1:
         text = UNIT.sub("", text)
-    unit, takes = f" {units[0]}" if len(units) == 1 else "", extent(field)
+    unit = f" {units[0]}" if len(units) == 1 else ""
+    takes = "tables, see [below](#several-callers)" if key == CALLERS else extent(field)
     if field.default is None:
         takes = f"None by default; {takes}{unit}"
     else:

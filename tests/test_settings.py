@@ -10,13 +10,18 @@ from pipistrelle.config import AirConfig, Config, InputError, RayConfig, Scenari
 from pipistrelle.experiments.studies.plan import cases_of
 from pipistrelle.experiments.studies.plan_file import plan_text, read_plan
 from pipistrelle.settings import (
+    CALLERS,
     from_environment,
     from_file,
     from_flags,
+    from_keywords,
+    from_text,
     known_settings,
     resolve,
     to_toml,
 )
+
+TABLES = "expected a list of tables, one for each caller, as [{frequency = 30e3}]"
 
 
 def written(folder: Path, text: str) -> Path:
@@ -42,7 +47,7 @@ def test_every_setting_of_the_configuration_is_known_and_says_what_it_means():
         if isinstance(values, dict)
         for leaf in values
     }
-    assert set(known_settings()) == leaves | {("seed",)}
+    assert set(known_settings()) == leaves | {("seed",), CALLERS}
     silent = [".".join(key) for key, field in known_settings().items() if not field.description]
     assert silent == []
 
@@ -111,6 +116,72 @@ def test_layers_leave_alone_what_they_do_not_name(tmp_path):
             "rays.range_bounds = [1, -2]",
             "rays.range_bounds: found [1, -2], expected greater than 0 as value 2",
         ),
+        ("callers = 3", f"callers: found 3, {TABLES}"),
+        ("[callers]\nfrequency = 3e4", f"callers: found {{'frequency': 30000.0}}, {TABLES}"),
+        ("callers = [3]", "callers.1: found 3, expected a table that says who calls"),
+        (
+            "[[callers]]\nfreqency = 1",
+            "callers.1.freqency: no such key of a caller; did you mean frequency?",
+        ),
+        (
+            "[[callers]]\n[[callers]]\nfrequency = -1",
+            "callers.2.frequency: found -1, expected greater than 0",
+        ),
+        (
+            "[[callers]]\nlevel_db = 'loud'",
+            "callers.1.level_db: found 'loud', expected a valid number",
+        ),
+        (
+            "[[callers]]\nname = 'a b'",
+            "callers.1.name: found 'a b', expected up to 40 letters, digits, _ and -",
+        ),
+        (
+            "[[callers]]\nname = 'Vehicle'",
+            "callers: found the name 'Vehicle' again, expected another; choose one",
+        ),
+        (
+            "callers = [{}, {name = 'beacon'}]",
+            "callers: found the name 'beacon' again, expected another; choose one",
+        ),
+        ("[[callers]]\nplace = [1]", "callers.1.place: found [1], expected x and y"),
+        ("[[callers]]\nplace = [1, nan]", "callers.1.place: found [1, nan], expected x and y"),
+        (
+            "[[callers]]\nplace = [1, 2]\ndistance = 3",
+            "callers.1: found a place and a distance, expected one of them; leave one out",
+        ),
+        (
+            "[[callers]]\nwaypoints = [[1, 2]]",
+            "callers.1.waypoints: found [[1, 2]], expected a list of points [x, y], two at least",
+        ),
+        (
+            "[[callers]]\ncourse = 'line'",
+            "callers.1.course: found 'line', expected 'circle' or 'walk'",
+        ),
+        (
+            "[[callers]]\nspeed = 1.0",
+            "callers.1: found speed, which a caller that stands has not; leave one of them out",
+        ),
+        (
+            "[[callers]]\ncourse = 'circle'\ndistance = 3",
+            'callers.1: found distance, which course = "circle" has not; leave one of them out',
+        ),
+        (
+            "[[callers]]\ncourse = 'walk'\nroute = 'a.csv'",
+            "callers.1: found course, which a route has not; leave one of them out",
+        ),
+        (
+            "[[callers]]\ncourse = 'circle'\nspeed = 0",
+            "callers.1: found speed 0, expected another; give a place to one that stands",
+        ),
+        (
+            "[[callers]]\nroute = [[0, 1, 2], [0, 1, 2]]",
+            "callers.1: found time 0 after 0 in row 2 of the route, expected times that rise",
+        ),
+        (
+            "[[callers]]\nroute = [[0, 1, 2]]",
+            "callers.1.route: found [[0, 1, 2]], expected a CSV file of time,x,y, or two such rows",
+        ),
+        ("[[callers]]\n" * 8, "callers: found 8 callers, expected at most 7 besides the vehicle"),
         (
             "rays.power = 2\nrays.range_bounds = [3, 2]",
             "rays.range_bounds: range_bounds must rise, found [3.0, 2.0]",
@@ -179,6 +250,38 @@ def test_a_mistake_in_the_environment_is_said_with_its_variable(name, text, said
     with pytest.raises(InputError) as refused:
         resolve(from_environment({name: text}))
     assert str(refused.value) == f"{name}: {said}"
+
+
+CALLING = (
+    "{}, {name = 'boat', frequency = 25e3, level_db = 40, course = 'circle', centre = [1, 2]}",
+    "{place = [3, 4]}, {frequency = 25e3, waypoints = [[1, 2], [3, 4.5]], speed = -0.5}",
+    "{course = 'walk', memory = 3.0, speed_std = 0.2, distance = 4}",
+    "{route = [[0, 1, 2], [1.5, 3, 4]]}",
+    "",
+)
+
+
+@pytest.mark.parametrize("text", CALLING)
+def test_callers_are_the_same_wherever_they_are_given_and_when_they_are_written(tmp_path, text):
+    config = resolve(from_file(written(tmp_path, f"callers = [{text}]")))
+    assert config.callers is not None
+    assert len(config.callers) == text.count("{")
+    assert resolve(from_environment({"PIPISTRELLE_CALLERS": f"[{text}]"})) == config
+    assert resolve(from_flags({"callers": from_text(f"[{text}]")})) == config
+    assert resolve(from_keywords({"callers": config.callers})) == config
+    assert resolve(from_file(written(tmp_path, to_toml(config)))) == config
+    assert resolve(from_flags(config.model_dump(mode="json"))) == config
+
+
+def test_without_callers_the_settings_say_what_they_said_before():
+    told = Config().model_dump(mode="json", exclude_none=True)
+    assert "callers" not in told
+    assert resolve(from_flags(told)) == Config()
+
+
+def test_a_route_lies_where_its_file_of_settings_does(tmp_path):
+    layer = from_file(written(tmp_path, "[[callers]]\nroute = 'boat.csv'\n"))
+    assert layer[CALLERS].value == [{"route": (tmp_path / "boat.csv").as_posix()}]
 
 
 def test_a_mistake_in_a_flag_is_said_with_the_flag():

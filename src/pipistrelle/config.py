@@ -6,9 +6,17 @@ so. This module needs pydantic alone, so that the command line can show its help
 """
 
 import math
-from typing import Annotated, Literal
+from itertools import pairwise
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    field_validator,
+    model_validator,
+)
 
 LARGEST = 1e9
 """No setting needs more of its unit, nor its inverse less: what is squared stays a number."""
@@ -82,7 +90,7 @@ class ScenarioConfig(Section):
     clearance: NonNegative = 0.5
     """Smallest distance of landmarks and beacon from the path and from each other [m]."""
     beacon_distance: Positive = 15.0
-    """Distance of the beacon from the centre [m]."""
+    """Distance of the beacon from the centre [m], and of callers that say nothing else."""
 
 
 class AirConfig(Section):
@@ -132,12 +140,110 @@ class EmitterConfig(Section):
 
 
 class BeaconConfig(Section):
-    """The omnidirectional beacon's call."""
+    """The omnidirectional beacon's call; where callers are listed, what the first leaves open."""
 
     frequency: Positive = 30e3
     """Tone of the call [Hz]."""
     level_db: Level = 42.8
-    """Source level at 1 m [dB]; unreported, fitted."""
+    """Source level at 1 m [dB]; unreported, fitted. Of every caller that says no other."""
+
+
+Point = tuple[Real, Real]
+MOST_OTHERS = 7
+"""Callers besides the vehicle that a recording can tell apart."""
+_WAYS = {
+    "route": ((), "a route"),
+    "waypoints": (("speed",), "way-points"),
+    "circle": (("speed", "centre", "radius"), 'course = "circle"'),
+    "walk": (("place", "distance", "speed_std", "memory"), 'course = "walk"'),
+    "stand": (("place", "distance"), "a caller that stands"),
+}
+"""What may be said of each way to be somewhere, and how a refusal calls it."""
+
+
+class CallerConfig(Section):
+    """Someone else who calls, alike in all directions: from a place, or along a way."""
+
+    name: Annotated[str, Field(pattern=r"^\w[\w-]*$", max_length=40)] | None = None
+    """In messages, figures and files; else `beacon` of the first, `caller2` of the second."""
+    frequency: Positive | None = None
+    """Tone of the call [Hz], each caller's own; else, of the first, the beacon's."""
+    level_db: Level | None = None
+    """Source level at 1 m [dB]; else the beacon's."""
+    place: Point | None = None
+    """Where it stands, or a walk begins: x, y [m]."""
+    distance: Positive | None = None
+    """Else how far from the centre, the direction drawn [m]; else `scenario.beacon_distance`."""
+    course: Literal["circle", "walk"] | None = None
+    """It circles, from a place that is drawn, or walks at random."""
+    centre: Point | None = None
+    """Of the circle: x, y [m]; else the origin."""
+    radius: Positive | None = None
+    """Of the circle [m]; else `scenario.beacon_distance`."""
+    waypoints: Annotated[tuple[Point, ...], Field(min_length=2)] | None = None
+    """Or a line from point to point, x, y [m], and from the last to the first, again and again."""
+    speed: Real | None = None
+    """Along circle or line [m/s]; below 0 the other way round; else `scenario.speed`."""
+    speed_std: Positive | None = None
+    """Of a walk: standard deviation of the velocity along each axis [m/s]; else 0.5."""
+    memory: Positive | None = None
+    """Of a walk: time after which a velocity is forgotten, but for 1/e [s]; else 10."""
+    route: str | Annotated[tuple[tuple[Real, Real, Real], ...], Field(min_length=2)] | None = None
+    """Or where it is when: a CSV file of `time,x,y`, or its rows [s, m, m]; else it stands."""
+
+    @property
+    def way(self) -> str:
+        """How it is where it is: route, waypoints, circle, walk or stand."""
+        if self.route is not None:
+            return "route"
+        return "waypoints" if self.waypoints is not None else self.course or "stand"
+
+    @model_validator(mode="after")
+    def _one_way(self) -> "CallerConfig":
+        given = self.model_dump(exclude_none=True, exclude={"name", "frequency", "level_db"})
+        may, called = _WAYS[self.way]
+        for key in given:
+            if key not in may and key != ("course" if self.way == self.course else self.way):
+                raise ValueError(f"found {key}, which {called} has not; leave one of them out")
+        if self.place is not None and self.distance is not None:
+            raise ValueError("found a place and a distance, expected one of them; leave one out")
+        if self.speed == 0.0:
+            raise ValueError("found speed 0, expected another; give a place to one that stands")
+        if isinstance(self.route, tuple):
+            _check_rising(self.route)
+        return self
+
+
+def _check_rising(route: tuple[tuple[float, float, float], ...]) -> None:
+    """Refuse rows of which one is not later than the one before."""
+    for row, ((before, *_), (time, *_)) in enumerate(pairwise(route), start=2):
+        if time <= before:
+            raise ValueError(
+                f"found time {time:g} after {before:g} in row {row} of the route, expected times "
+                "that rise"
+            )
+
+
+def caller_names(callers: tuple[CallerConfig, ...]) -> tuple[str, ...]:
+    """Name callers: as they are told, else by their place in the list.
+
+    Parameters
+    ----------
+    callers : tuple of CallerConfig
+
+    Returns
+    -------
+    tuple of str
+
+    Examples
+    --------
+    >>> caller_names((CallerConfig(), CallerConfig(name="boat"), CallerConfig()))
+    ('beacon', 'boat', 'caller3')
+    """
+    return tuple(
+        caller.name or ("beacon" if j == 1 else f"caller{j}")
+        for j, caller in enumerate(callers, start=1)
+    )
 
 
 class ReceiverConfig(Section):
@@ -297,6 +403,8 @@ class Config(Section):
 
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 7
     """Seed of every random stream."""
+    callers: Annotated[tuple[CallerConfig, ...], Field(max_length=MOST_OTHERS)] | None = None
+    """Whoever calls besides the vehicle, a table each; the paper's beacon unless they are given."""
     scenario: ScenarioConfig = ScenarioConfig()
     air: AirConfig = AirConfig()
     target: TargetConfig = TargetConfig()
@@ -311,6 +419,16 @@ class Config(Section):
     filter: FilterConfig = FilterConfig()
     rays: RayConfig = RayConfig()
     fastslam: FastSlamConfig = FastSlamConfig()
+
+    @field_validator("callers", mode="after")
+    @classmethod
+    def _each_its_own_name(cls, callers: Any) -> Any:
+        names: list[str] = ["vehicle"]
+        for name in caller_names(callers or ()):
+            if name.casefold() in names:
+                raise ValueError(f"found the name {name!r} again, expected another; choose one")
+            names.append(name.casefold())
+        return callers
 
     @property
     def believed_celerity(self) -> float:

@@ -18,10 +18,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from pipistrelle.config import Config, InputError, Section
+from pipistrelle.config import MOST_OTHERS, CallerConfig, Config, InputError, Section
 from pipistrelle.refusals import expectation, meant, refusal, shown, values_expected
 
 PREFIX = "PIPISTRELLE_"
@@ -31,6 +31,8 @@ NOT_SETTINGS = frozenset({"PIPISTRELLE_DATA"})
 Key = tuple[str, ...]
 FOLDERS: frozenset[Key] = frozenset({("scenario", "world")})
 """Settings that are paths: in a file, from where the file lies."""
+CALLERS: Key = ("callers",)
+"""The setting that is a list of tables."""
 
 _DEEPEST = 8
 """Levels of tables and lists that a file may have."""
@@ -99,7 +101,38 @@ def from_file(path: Path) -> Layer:
     for key in FOLDERS & layer.keys():
         if isinstance(layer[key].value, str):
             layer[key] = layer[key]._replace(value=str(path.parent / layer[key].value))
+    if CALLERS in layer:
+        layer[CALLERS] = layer[CALLERS]._replace(value=beside(path, layer[CALLERS].value))
     return layer
+
+
+def beside(path: Path, callers: Any) -> Any:
+    """Let the routes of callers lead from where a file lies.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    callers : object
+        What it gives as callers, sound or not.
+
+    Returns
+    -------
+    object
+
+    Examples
+    --------
+    >>> beside(Path("there/plan.toml"), [{"route": "boat.csv"}, {"place": [1, 2]}])
+    [{'route': 'there/boat.csv'}, {'place': [1, 2]}]
+    """
+    if not isinstance(callers, list):
+        return callers
+    return [
+        told | {"route": (path.parent / told["route"]).as_posix()}
+        if isinstance(told, dict) and isinstance(told.get("route"), str)
+        else told
+        for told in callers
+    ]
 
 
 def from_table(values: Mapping[str, Any], where: str, above: str = "") -> Layer:
@@ -156,7 +189,7 @@ def from_environment(environment: Mapping[str, str]) -> Layer:
     [1, 15]
     """
     given = (
-        (tuple(name.removeprefix(PREFIX).lower().split("__")), _from_text(environment[name]))
+        (tuple(name.removeprefix(PREFIX).lower().split("__")), from_text(environment[name]))
         for name in sorted(environment)
         if name.startswith(PREFIX) and name not in NOT_SETTINGS
     )
@@ -289,7 +322,14 @@ def resolve(layer: Layer) -> Config:
         return Config.model_validate_json(json.dumps(nested, default=_plain), strict=True)
     except ValidationError as refused:
         problems = [_problem(error, layer) for error in refused.errors(include_url=False)]
-        raise InputError("\n".join(problems)) from None
+        raise InputError("\n".join(dict.fromkeys(problems))) from None
+
+
+def _plain(value: Any) -> Any:
+    """Return what JSON has not as what it has: of settings a table, of all else text."""
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json", exclude_none=True)
+    return str(value)
 
 
 def to_toml(config: Config) -> str:
@@ -319,10 +359,25 @@ def to_toml(config: Config) -> str:
             if leaf == next(iter(type(table).model_fields)):
                 lines += ["", f"# {' '.join((type(table).__doc__ or '').split())}", f"[{section}]"]
         value = getattr(table, leaf)
+        if key == CALLERS and value:
+            continue  # a table each, at the end
         assignment = f"# {leaf} =" if value is None else f"{leaf} = {json.dumps(value)}"
-        meaning = known_settings()[key].description
-        lines.append(f"{assignment:<39} # {' '.join(meaning.split())}" if meaning else assignment)
+        lines.append(_remarked(assignment, known_settings()[key]))
+    for caller in config.callers or ():
+        told = caller.model_dump(mode="json", exclude_none=True)
+        fields = type(caller).model_fields
+        lines += ["", f"# {type(caller).__doc__}", "[[callers]]"]
+        lines += [
+            _remarked(f"{leaf} = {json.dumps(told[leaf], ensure_ascii=False)}", fields[leaf])
+            for leaf in told
+        ]
     return "\n".join(lines) + "\n"
+
+
+def _remarked(assignment: str, field: FieldInfo) -> str:
+    """Write beside a setting what it means."""
+    meaning = " ".join((field.description or "").split())
+    return f"{assignment:<39} # {meaning}" if meaning else assignment
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -463,8 +518,22 @@ def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
-def _from_text(text: str) -> Any:
-    """Read a TOML value, or a number that TOML spells otherwise; anything else is text."""
+def from_text(text: str) -> Any:
+    """Read a TOML value, or a number that TOML spells otherwise; anything else is text.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    object
+
+    Examples
+    --------
+    >>> from_text("[{ frequency = 25e3 }]"), from_text("left")
+    ([{'frequency': 25000.0}], 'left')
+    """
     with suppress(InputError):
         read = parse_toml(f"value = {text}", "")
         if read.keys() == {"value"}:
@@ -477,6 +546,8 @@ def _from_text(text: str) -> Any:
 
 def _problem(error: Any, layer: Layer) -> str:
     """Say where a refused value stands, what was found and what was expected."""
+    if error["loc"][:1] == CALLERS and CALLERS in layer:
+        return _caller_problem(error, layer[CALLERS])
     key = tuple(part for part in error["loc"] if isinstance(part, str))
     expected = expectation(error)
     if key not in layer:  # a rule between settings: its message holds what was found
@@ -489,3 +560,37 @@ def _problem(error: Any, layer: Layer) -> str:
     elif key != error["loc"]:
         expected += f" as value {error['loc'][-1] + 1}"
     return f"{where}: found {shown(value)}, expected {expected}"
+
+
+def _caller_problem(error: Any, given: Given) -> str:
+    """Say the same of a list of callers, which are counted from 1 on."""
+    _, *inner = error["loc"]
+    expected, where = expectation(error), given.where
+    if not inner:
+        if error["type"] == "value_error":
+            return f"{where}: {expected}"
+        if error["type"] == "too_long":
+            found = f"{len(error['input'])} callers"
+            return f"{where}: found {found}, expected at most {MOST_OTHERS} besides the vehicle"
+        tables = "a list of tables, one for each caller, as [{frequency = 30e3}]"
+        return f"{where}: found {shown(error['input'])}, expected {tables}"
+    where, told = f"{where}.{inner[0] + 1}", given.value[inner[0]]
+    if len(inner) == 1:
+        if error["type"] == "value_error":
+            return f"{where}: {expected}"
+        return f"{where}: found {shown(told)}, expected a table that says who calls"
+    name = inner[1]
+    if error["type"] == "extra_forbidden":
+        near = meant(name, CallerConfig.model_fields)
+        fix = f"did you mean {near}?" if near else f"it has {', '.join(CallerConfig.model_fields)}"
+        return f"{where}.{name}: no such key of a caller; {fix}"
+    if name == "route":
+        expected = "a CSV file of time,x,y, or two such rows"
+    elif name == "name" and error["type"].startswith("string"):
+        expected = "up to 40 letters, digits, _ and -"
+    elif name == "waypoints":
+        expected = "a list of points [x, y], two at least"
+    elif name in ("place", "centre"):
+        expected = "x and y"
+    found = told.get(name) if isinstance(told, dict) else getattr(told, name)
+    return f"{where}.{name}: found {shown(found)}, expected {expected}"

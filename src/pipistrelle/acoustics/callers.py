@@ -40,6 +40,8 @@ class Caller:
     velocity : (2) or (t, 2) [m/s], or None
         Of a caller that moves, where it calls; None where it stands, or where `callers_at` is to
         take it from the path.
+    key : str
+        Its section of the settings, where it has one: a refusal then names that.
     """
 
     name: str
@@ -47,6 +49,7 @@ class Caller:
     level_db: float
     place: Float[np.ndarray, "2"] | Float[np.ndarray, "t 2"] | None = None
     velocity: Float[np.ndarray, "2"] | Float[np.ndarray, "t 2"] | None = None
+    key: str = ""
 
 
 def callers_of(config: Config, beacon: Float[np.ndarray, "2"]) -> tuple[Caller, Caller]:
@@ -74,8 +77,14 @@ def callers_of(config: Config, beacon: Float[np.ndarray, "2"]) -> tuple[Caller, 
     """
     own, other = config.emitter, config.beacon
     return (
-        Caller(name="vehicle", frequency=own.frequency, level_db=own.level_db),
-        Caller(name="beacon", frequency=other.frequency, level_db=other.level_db, place=beacon),
+        Caller(name="vehicle", frequency=own.frequency, level_db=own.level_db, key="emitter"),
+        Caller(
+            name="beacon",
+            frequency=other.frequency,
+            level_db=other.level_db,
+            place=beacon,
+            key="beacon",
+        ),
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.acoustics.callers import MOST, VEHICLE, Caller, check_caller
+from pipistrelle.acoustics.callers import MOST, Caller, check_caller
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config, InputError
 
@@ -71,7 +71,7 @@ def sampling(config: Config, callers: Sequence[Caller]) -> Sampling:
     rate, pulse = config.receiver.sample_rate, config.emitter.pulse
     for caller in callers:
         check_caller(caller)
-    keys = ["emitter.frequency", *(f"{caller.name}.frequency" for caller in callers[VEHICLE + 1 :])]
+    keys = [f"{caller.key or caller.name}.frequency" for caller in callers]
     tones = np.array([caller.frequency for caller in callers])
     for key, value, unit, count in (
         ("receiver.sample_rate", rate, "Hz", rate * BLOCK),
@@ -80,10 +80,11 @@ def sampling(config: Config, callers: Sequence[Caller]) -> Sampling:
     ):
         if round(count) < 1 or abs(count - round(count)) > 1e-6:
             step = f"{BLOCK:g} s" if unit == "s" else f"{1 / BLOCK:g} Hz"
-            raise InputError(f"{key}: found {value:g} {unit}, expected a multiple of {step}")
+            free = free_tones(config, callers, value) if key in keys else ""
+            raise InputError(f"{key}: found {value:g} {unit}, expected a multiple of {step}{free}")
     if not 1 <= len(callers) <= MOST:
         raise InputError(f"callers: found {len(callers)}, expected 1 to {MOST}; leave some out")
-    _refuse_alike(callers, keys, rate)
+    _refuse_alike(config, callers, keys)
     return Sampling(
         rate=rate,
         block=round(rate * BLOCK),
@@ -94,8 +95,70 @@ def sampling(config: Config, callers: Sequence[Caller]) -> Sampling:
     )
 
 
-def _refuse_alike(callers: Sequence[Caller], keys: Sequence[str], rate: float) -> None:
+def clear_frequency(config: Config) -> float:
+    r"""Highest tone that the arrays take for no other: not by its direction, not by its sampling.
+
+    Elements a distance d apart cannot tell the angle :math:`\theta` off their normal from another,
+    the grating lobe, :math:`\sin\theta_g = \sin\theta - \lambda / d`: of a longer wave than d
+    times :math:`1 + \sin\theta`, with the largest angle that is kept, it lies outside. Half the
+    sampling rate is the highest that real samples hold.
+
+    Parameters
+    ----------
+    config : Config
+
+    Returns
+    -------
+    [Hz]
+
+    Notes
+    -----
+    Van Trees, Optimum Array Processing (2002), Sec. 2.4.
+
+    Examples
+    --------
+    >>> round(clear_frequency(Config()))
+    35607
+    """
+    limit = math.radians(min(config.detection.angle_limit_deg, config.detection.scan_limit_deg))
+    longest = config.air.celerity / (config.receiver.spacing * (1.0 + math.sin(limit)))
+    return min(longest, config.receiver.sample_rate / 2.0)
+
+
+def free_tones(config: Config, callers: Sequence[Caller], near: float) -> str:
+    """Say which tones would do in place of one: clear ones that no caller has, the two nearest.
+
+    Parameters
+    ----------
+    config : Config
+    callers : sequence of Caller
+    near : [Hz]
+
+    Returns
+    -------
+    str
+        For a refusal, in brackets; empty where there is none.
+
+    Examples
+    --------
+    >>> from pipistrelle.acoustics.callers import callers_of
+    >>> free_tones(Config(), callers_of(Config(), np.zeros(2)), 31e3)
+    ' (the nearest that are free: 20000 and 25000 Hz)'
+    """
+    bins, whole = [c.frequency * BLOCK for c in callers], round(config.receiver.sample_rate * BLOCK)
+    taken = {round(count) % whole for count in bins if abs(count - round(count)) <= 1e-6}
+    most = min(math.floor(clear_frequency(config) * BLOCK), 1000)
+    free = [count for count in range(1, most + 1) if count not in taken]
+    best = sorted(sorted(free, key=lambda count: abs(count - near * BLOCK))[:2])
+    if not best:
+        return ""
+    tones = " and ".join(f"{count / BLOCK:g}" for count in best)
+    return f" (the nearest that are free: {tones} Hz)" if best[1:] else f" ({tones} Hz is free)"
+
+
+def _refuse_alike(config: Config, callers: Sequence[Caller], keys: Sequence[str]) -> None:
     """Refuse tones that are one bin of a block: equal, or the sampling rate apart."""
+    rate = config.receiver.sample_rate
     for j, (key, caller) in enumerate(zip(keys, callers, strict=True)):
         for other in callers[:j]:
             apart = round((caller.frequency - other.frequency) * BLOCK)
@@ -103,9 +166,10 @@ def _refuse_alike(callers: Sequence[Caller], keys: Sequence[str], rate: float) -
                 own = f"the {other.name}'s own"
                 if apart:
                     own = f"{own} {other.frequency:g} Hz once it is sampled at {rate:g} Hz"
+                free = free_tones(config, callers, caller.frequency)
                 raise InputError(
-                    f"{key}: found {caller.frequency:g} Hz, {own}; expected another, or the two "
-                    "calls cannot be told apart"
+                    f"{key}: found {caller.frequency:g} Hz, {own}; expected another{free}, or the "
+                    "two calls cannot be told apart"
                 )
 
 

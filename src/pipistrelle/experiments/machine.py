@@ -132,10 +132,13 @@ def check_recording(
     reach = {
         driven: path,
         "scenario.radius": _farthest(scenario.landmarks),
-        "scenario.beacon_distance": max(
-            (_farthest(caller.place) for caller in scenario.callers if caller.place is not None),
-            default=0.0,
-        ),
+        **{
+            "scenario.beacon_distance" if caller.key == "beacon" else caller.key or caller.name: (
+                _farthest(caller.place)
+            )
+            for caller in scenario.callers
+            if caller.place is not None
+        },
     }
     key = max(reach, key=reach.__getitem__)
     # To a landmark and home: at most twice across the circle around the centre that holds all.

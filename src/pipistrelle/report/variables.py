@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from pipistrelle.config import CallerConfig, caller_names
 from pipistrelle.settings import known_settings
 
 BEAM = "beamwidth"
@@ -186,9 +187,17 @@ def written(values: Sequence[Any]) -> tuple[str, ...]:
     --------
     >>> written([1.0, 2.5]), written([1.0, 1.0000001]), written([True, "paper", [0.5, 20.0]])
     (('1', '2.5'), ('1.0', '1.0000001'), ('true', 'paper', '[0.5, 20]'))
+
+    Callers are named:
+
+    >>> written([[], [{}], [{}, {"frequency": 25e3, "course": "circle"}]])
+    ('nobody', 'beacon', 'beacon, caller2 (circle)')
     """
-    short = tuple(_short(value) for value in values)
-    return short if len(set(short)) == len(short) else tuple(map(_whole, values))
+    for words in (_calling, _short):
+        short = tuple(map(words, values))
+        if len(set(short)) == len(short):
+            return short
+    return tuple(map(_whole, values))
 
 
 def word_of(variable: Variable, value: Any) -> str:
@@ -284,10 +293,22 @@ def _near(beamwidth: float) -> float | None:
     return near if abs(near - beamwidth) < 0.2 else None
 
 
+def _calling(value: Any) -> str:
+    """Write a list of callers by their names and ways, and any other value in a few digits."""
+    if not isinstance(value, list) or not all(isinstance(one, dict) for one in value):
+        return _short(value)
+    callers = tuple(CallerConfig(**one) for one in value)
+    names = zip(caller_names(callers), (caller.way for caller in callers), strict=True)
+    return ", ".join(f"{name} ({way})".removesuffix(" (stand)") for name, way in names) or "nobody"
+
+
 def _short(value: Any) -> str:
     """Write a value in a few digits."""
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(map(_short, value))}]"
+    if isinstance(value, dict):  # a route is long
+        value = {key: f"{len(one)} rows" if key == "route" else one for key, one in value.items()}
+        return f"{{{', '.join(f'{key} = {_short(one)}' for key, one in value.items())}}}"
     if isinstance(value, str):
         return value
     return json.dumps(value) if isinstance(value, bool) else f"{value:g}"

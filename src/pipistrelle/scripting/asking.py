@@ -14,6 +14,7 @@ from pipistrelle.config import STRATEGIES, Config, InputError, Strategy
 from pipistrelle.estimation.catalogue import PAPERS, check_distinct, entry
 from pipistrelle.refusals import meant, shown
 from pipistrelle.settings import (
+    CALLERS,
     Given,
     Key,
     Layer,
@@ -132,6 +133,10 @@ def mission_settings(
     """
     layer = beneath | flags | short_names(short, flags)
     world = None
+    if CALLERS in layer:
+        from pipistrelle.experiments.hearing.others import with_routes
+
+        layer = with_routes(layer)
     if WORLD in layer:
         from pipistrelle.experiments.hearing.world_folder import named_world, settled
 

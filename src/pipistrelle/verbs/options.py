@@ -14,12 +14,14 @@ from pipistrelle.estimation.catalogue import CATALOGUE, entry
 from pipistrelle.refusals import meant
 from pipistrelle.scripting.asking import WORLD, mission_settings, named_filters
 from pipistrelle.settings import (
+    CALLERS,
     Given,
     Key,
     Layer,
     from_environment,
     from_file,
     from_flags,
+    from_text,
     known_settings,
 )
 
@@ -35,6 +37,11 @@ def _whole(_: Any, tokens: Sequence[Any]) -> int:
 
 
 Whole = Annotated[int, Parameter(converter=_whole)]
+
+
+def _tables(_: Any, tokens: Sequence[Any]) -> Any:
+    """Read a list of tables as a file has it, on one line."""
+    return from_text(tokens[0].value)
 
 
 def _filter(_: Any, tokens: Sequence[Any]) -> str:
@@ -96,6 +103,8 @@ def setting_flags(
         words = f"{field.description or ''} {settled}"
         flag = Parameter(help=" ".join(words.split()), show=shown(key), negative=())
         kind: Any = Whole if field.annotation is int else _unbounded(field.annotation)
+        if key == CALLERS:
+            kind = Annotated[Any, Parameter(converter=_tables, n_tokens=1, metavar="TABLES")]
         if len(key) == 1:
             top[key[0]] = Annotated[kind, flag]
         else:

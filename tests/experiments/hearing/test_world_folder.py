@@ -5,7 +5,7 @@ import pytest
 
 from pipistrelle.acoustics.callers import Caller
 from pipistrelle.acoustics.target import Bodies
-from pipistrelle.config import Config, InputError, MotionConfig, ScenarioConfig
+from pipistrelle.config import Config, InputError, MotionConfig, ScenarioConfig, caller_names
 from pipistrelle.experiments.hearing.courses import Commands, Poses, Waypoints
 from pipistrelle.experiments.hearing.scenario import Scenario, world_of
 from pipistrelle.experiments.hearing.world_folder import (
@@ -15,7 +15,7 @@ from pipistrelle.experiments.hearing.world_folder import (
     settled,
     write_world,
 )
-from pipistrelle.experiments.hearing.worlds import ANY, Visitor, World
+from pipistrelle.experiments.hearing.worlds import ANY, World
 from pipistrelle.experiments.runs.preparing import prepared
 from pipistrelle.settings import from_flags, resolve
 
@@ -144,22 +144,54 @@ def test_in_a_grid_the_drive_ends_with_the_worlds_path(tmp_path):
         assert resolve(laid_over(world, layer, {})).scenario.steps == had
 
 
-def test_a_visitor_stands_before_and_after_his_route():
-    boat = Caller(name="boat", frequency=25e3, level_db=40.0)
-    route = np.array([[0.0, 0.0], [2.0, 4.0]])
-    visitor = Visitor(caller=boat, time=np.array([1.0, 2.0]), route=route)
-    places = visitor.at(np.array([0.0, 1.5, 9.0])).place
-    assert places.tolist() == [[0.0, 0.0], [1.0, 2.0], [2.0, 4.0]]
-
-
 def test_callers_have_names_of_their_own(tmp_path):
     one = "[[callers]]\nfrequency = 30e3\nlevel_db = 40.0\nplace = [1.0, 2.0]\n"
     named = [
-        [visitor.caller.name for visitor in read_world(folder).callers]
+        [*caller_names(read_world(folder).callers)]
         for text in (one, one + one)
         for folder in [folder_with(tmp_path, world_toml="format = 1\n" + text)]
     ]
-    assert named == [["beacon"], ["caller1", "caller2"]]
+    assert named == [["beacon"], ["beacon", "caller2"]]
+
+
+def test_a_worlds_callers_say_what_those_of_the_settings_may(tmp_path):
+    told = "[[callers]]\n[[callers]]\nfrequency = 25e3\ncourse = 'circle'\nradius = 6.0\n"
+    config = Config(scenario=ScenarioConfig(steps=8, landmarks=5))
+    world = heard(config, read_world(folder_with(tmp_path, world_toml="format = 1\n" + told)))
+    _, beacon, circling = world.callers
+    assert (beacon.frequency, beacon.level_db) == (30e3, 42.8)
+    assert np.hypot(*beacon.place) == pytest.approx(15.0)
+    np.testing.assert_allclose(np.hypot(*circling.place.T), 6.0)
+
+
+def test_callers_that_settings_list_stand_over_the_worlds_unless_it_is_one_of_a_grid(tmp_path):
+    told = "format = 1\n[[callers]]\nname = 'mate'\nplace = [1.0, 2.0]\n"
+    world = read_world(folder_with(tmp_path, world_toml=told))
+    layer = from_flags({"callers": [{"name": "boat", "place": [9.0, 9.0]}]})
+    layer |= from_flags({"scenario": {"steps": 8, "landmarks": 5}})
+    names = [
+        heard(resolve(over), world).callers[1].name
+        for over in (
+            settled(world, layer),
+            laid_over(world, layer, {}),
+            laid_over(world, {}, layer),
+        )
+    ]
+    assert names == ["boat", "mate", "boat"]
+
+
+def test_a_caller_of_any_name_is_written_without_harm_to_the_worlds_files(tmp_path):
+    callers = [{"name": name, "course": "circle"} for name in ("path", "landmarks")]
+    callers[1]["frequency"] = 25e3
+    scenario = from_flags({"scenario": {"steps": 8, "landmarks": 5}, "callers": callers})
+    config = resolve(scenario)
+    drawn = world_of(config, 2)
+    write_world(tmp_path / "w", drawn, config)
+    again = heard(Config(scenario=config.scenario), read_world(tmp_path / "w"))
+    assert [caller.name for caller in again.callers] == ["vehicle", "path", "landmarks"]
+    assert again.path.tobytes() == drawn.path.tobytes()
+    for one, other in zip(again.callers[1:], drawn.callers[1:], strict=True):
+        np.testing.assert_array_equal(one.place, other.place)
 
 
 def test_there_may_be_nobody_else_who_calls(tmp_path):
@@ -266,23 +298,27 @@ WRONG = {
         {"world_toml": "format = 1\n[config]\nscenario.world = 'b'"},
         "config.scenario.world: a world has no other world",
     ),
-    "a caller nowhere": (
-        {"world_toml": "format = 1\n[[callers]]\nfrequency = 3e4\nlevel_db = 40.0"},
-        "key 'callers.1': found neither of place and route",
+    "callers among the settings": (
+        {"world_toml": "format = 1\n[config]\ncallers = []\n"},
+        "world.toml: config.callers: a world's callers are [[callers]]; take out config.",
+    ),
+    "no list of callers": (
+        {"world_toml": "format = 1\n[callers]\nfrequency = 3e4\n"},
+        "world.toml: callers: found {'frequency': 30000.0}, expected a list of tables",
     ),
     "a caller everywhere": (
         {
             "world_toml": "format = 1\n[[callers]]\nfrequency = 3e4\nlevel_db = 40.0\n"
-            "place = [0.0, 1.0]\nroute = 'a.csv'"
+            "place = [0.0, 1.0]\nroute = [[0, 1, 2], [1, 1, 2]]"
         },
-        "key 'callers.1': found both of place and route",
+        "world.toml: callers.1: found place, which a route has not; leave one of them out",
     ),
     "a route elsewhere": (
         {
             "world_toml": "format = 1\n[[callers]]\nfrequency = 3e4\nlevel_db = 40.0\n"
             "route = '../a.csv'"
         },
-        "key 'callers.1.route': found '../a.csv'",
+        "world.toml: callers.1.route: found '../a.csv'",
     ),
     "no route": (
         {
@@ -296,14 +332,14 @@ WRONG = {
             "world_toml": "format = 1\n[[callers]]\nfrequency = '3e4'\nlevel_db = 40.0\n"
             "place = [0.0, 1.0]"
         },
-        "key 'callers.1.frequency': found '3e4', expected a valid number",
+        "world.toml: callers.1.frequency: found '3e4', expected a valid number",
     ),
     "the vehicle's name": (
         {
             "world_toml": "format = 1\n[[callers]]\nname = 'vehicle'\nfrequency = 3e4\n"
             "level_db = 40.0\nplace = [0.0, 1.0]"
         },
-        "key 'callers.1.name': found 'vehicle' again",
+        "world.toml: callers: found the name 'vehicle' again",
     ),
     "no TOML": ({"world_toml": "format = "}, "world.toml: found"),
 }

@@ -161,7 +161,7 @@ def test_a_plan_as_written_reads_as_the_same_plan(tmp_path):
     plan = plan_of(tmp_path, SMALL, over=from_flags({"rays": {"power": 3.0}}))
     written = plan_text(plan)
     assert plan_of(tmp_path, written) == plan
-    assert set(tomllib.loads(written)["config"]) == set(Config.model_fields)
+    assert set(tomllib.loads(written)["config"]) == set(Config.model_fields) - {"callers"}
 
 
 def test_a_plan_made_of_both_a_setting_and_its_values_can_be_read_again(tmp_path):
@@ -354,7 +354,7 @@ def test_a_plan_without_them_is_written_as_ever(tmp_path):
         (
             "[own.ekf]\nemitter.radius = 0.01\n",
             "PLAN: own.ekf.emitter.radius: this setting changes what is heard; expected one of the "
-            "sections filter, rays, fastslam",
+            "sections listening, filter, rays, fastslam",
         ),
         ("[own.ekf]\nseed = 1\n", "PLAN: own.ekf.seed: this setting changes what is heard"),
         (
@@ -417,3 +417,50 @@ def test_the_plan_beyond_asks_the_question_of_four_filters_in_the_worlds_of_phys
     assert set(beyond.own) == {"fastslam", "iekf", "smoother"}
     heard = [p.config.model_dump(exclude=set(SECTIONS)) for p in (beyond, physics)]
     assert heard[0] == heard[1]
+
+
+CALLERS = """
+[grid]
+callers = [
+  [],
+  [{}],
+  [{}, {frequency = 25e3, course = "circle"}],
+  [{}, {name = "boat", frequency = 25e3, route = "boat.csv"}],
+]
+"""
+
+
+def test_a_grid_may_list_callers_and_the_plan_holds_their_routes(tmp_path):
+    (tmp_path / "boat.csv").write_text("time,x,y\n0,1,2\n9,3,4\n")
+    plan = plan_of(tmp_path, BARE + CALLERS)
+    cases = cases_of(plan)
+    assert Counter(len(case.config.callers) for case in cases) == {0: 6, 1: 6, 2: 12}
+    assert cases[-1].config.callers[1].route == ((0.0, 1.0, 2.0), (9.0, 3.0, 4.0))
+    (tmp_path / "boat.csv").unlink()
+    again = plan_of(tmp_path, plan_text(plan))
+    assert again == plan
+    assert changed_settings(plan, again) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[grid]\ncallers = 3", "PLAN: grid.callers: found 3, expected a list of values"),
+        ("[grid]\ncallers = [3]", "PLAN: grid.callers: found 3, expected a list of tables"),
+        ("[grid]\ncallers = [{}]", "PLAN: grid.callers: found {}, expected a list of tables"),
+        ("[grid]\ncallers = [[{x = 1}]]", "PLAN: grid.callers.1.x: no such key of a caller"),
+        ("[grid]\ncallers = [[{}], [{}]]", "PLAN: grid.callers: found [{}] twice"),
+        ("[config.callers]\nx = 1", "PLAN: config.callers: found {'x': 1}, expected a list of"),
+        ("[[config.callers]]\nspeed = 1", "PLAN: config.callers.1: found speed, which a caller"),
+        (
+            "[[config.callers]]\nroute = 'boat.csv'",
+            "boat.csv: found no such file",
+        ),
+        (
+            "[config]\ncallers = [{}]\n[grid]\ncallers = [[]]",
+            "PLAN: config.callers: the plan varies this setting",
+        ),
+    ],
+)
+def test_callers_of_a_plan_that_cannot_be_are_refused_in_a_line(refused, text, said):
+    assert said in refused(BARE + text)

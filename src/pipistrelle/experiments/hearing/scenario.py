@@ -1,6 +1,7 @@
 """The true world: a noisy drive, landmarks around it, and whoever calls there."""
 
-import math
+from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,12 +10,13 @@ from jaxtyping import Float, Int
 from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of, moves
 from pipistrelle.acoustics.target import Bodies
 from pipistrelle.arithmetic.random_stream import stream_key
-from pipistrelle.config import Config, InputError, MotionConfig, ScenarioConfig
+from pipistrelle.config import CallerConfig, Config, InputError, MotionConfig, ScenarioConfig
 from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.drives import LabelledPoints
 from pipistrelle.experiments.hearing.courses import course_of, driven
-from pipistrelle.experiments.hearing.fields import TRIES, landmarks_in, nearest
+from pipistrelle.experiments.hearing.fields import landmarks_in
+from pipistrelle.experiments.hearing.others import Around, callers_among, place_at
 from pipistrelle.experiments.hearing.worlds import ANY, World
 
 
@@ -76,6 +78,9 @@ def world_of(config: Config, iteration: int = 0, world: World = ANY) -> Scenario
 def draw_scenario(config: Config, rng: np.random.Generator, world: World = ANY) -> Scenario:
     """Draw a world: the path first, then the beacon and the landmarks clear of it.
 
+    Where callers are listed, they are drawn last: path and landmarks are those of the paper's
+    beacon, whoever calls. Landmarks keep clear of callers that a world's folder puts somewhere.
+
     Parameters
     ----------
     config : Config
@@ -90,7 +95,8 @@ def draw_scenario(config: Config, rng: np.random.Generator, world: World = ANY) 
     Raises
     ------
     InputError
-        When the landmarks or the beacon find no place, or the world's path is too short.
+        When landmarks, the beacon or a caller find no place, the world's path is too short, or as
+        `callers_among`.
 
     Notes
     -----
@@ -106,21 +112,23 @@ def draw_scenario(config: Config, rng: np.random.Generator, world: World = ANY) 
     time = np.arange(setup.steps + 1) * setup.step
     bias = (config.motion.speed_bias, config.motion.turn_bias)
     path, controls = driven(world.course or course_of(setup, motion), setup, motion, rng, bias)
-    if world.callers is None:
-        callers: tuple[Caller, ...] = callers_of(config, _place_beacon(setup, path[:, :2], rng))
-    else:
-        vehicle, _ = callers_of(config, np.zeros(2))
-        callers = (vehicle, *(visitor.at(time) for visitor in world.callers))
+    given = config.callers is None and world.callers is not None
+    told, first = world.callers if given else config.callers, deepcopy(rng)
+    beacon = np.zeros(2) if given else _place_beacon(setup, path[:, :2], rng)
     landmarks = world.landmarks
     if landmarks is None:
-        others = (np.asarray(c.place) for c in callers[VEHICLE + 1 :] if not moves(c))
-        landmarks = landmarks_in(setup, path[:, :2], np.array([*others]).reshape(-1, 2), rng)
+        callers = _places(told or ()) if given else beacon[np.newaxis]
+        landmarks = landmarks_in(setup, path[:, :2], callers, rng)
+    vehicle, *others = callers_of(config, beacon)
+    if told is not None:
+        around = Around(config=config, time=time, path=path[:, :2], landmarks=landmarks)
+        others = callers_among(around, told, rng, None if given else first)
     return Scenario(
         time=time,
         path=path,
         controls=controls,
         landmarks=landmarks,
-        callers=callers,
+        callers=(vehicle, *others),
         bodies=world.bodies,
     )
 
@@ -263,15 +271,19 @@ def assumed_motion(config: Config) -> Motion:
     return motion_of(config.motion.model_copy(update=given))
 
 
+def _places(callers: Sequence[CallerConfig]) -> Float[np.ndarray, "n 2"]:
+    """Return where those callers stand that say it."""
+    places = [caller.place for caller in callers if caller.way == "stand" and caller.place]
+    return np.array(places, dtype=float).reshape(-1, 2)
+
+
 def _place_beacon(
     setup: ScenarioConfig, path: Float[np.ndarray, "k 2"], rng: np.random.Generator
 ) -> Float[np.ndarray, "2"]:
     """Put the beacon at a random bearing, clear of the path."""
-    for _ in range(TRIES):
-        direction = rng.uniform(-math.pi, math.pi)
-        beacon = setup.beacon_distance * np.array([math.cos(direction), math.sin(direction)])
-        if nearest(path, beacon) >= setup.clearance:
-            return beacon
+    beacon = place_at(setup.beacon_distance, setup, rng, [path])
+    if beacon is not None:
+        return beacon
     raise InputError(
         f"scenario.beacon_distance: found {setup.beacon_distance:g} m, but no bearing there is "
         f"{setup.clearance:g} m clear of the path; expected a distance away from the path, or a "

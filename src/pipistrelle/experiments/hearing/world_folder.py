@@ -7,26 +7,17 @@ refused by line or key.
 
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 from pydantic import ConfigDict, Field, ValidationError
 
-from pipistrelle.acoustics.callers import VEHICLE, Caller, moves
+from pipistrelle.acoustics.callers import VEHICLE, moves
 from pipistrelle.acoustics.target import Bodies
-from pipistrelle.config import (
-    Config,
-    InputError,
-    Level,
-    Positive,
-    Real,
-    Section,
-    TargetConfig,
-)
+from pipistrelle.config import CallerConfig, Config, InputError, Section, TargetConfig
 from pipistrelle.detection.logs.text_tables import (
     Table,
     check_unique,
@@ -36,11 +27,21 @@ from pipistrelle.detection.logs.text_tables import (
 )
 from pipistrelle.estimation.catalogue import SECTIONS
 from pipistrelle.experiments.hearing.courses import Commands, Course, Poses, Waypoints, steps_of
+from pipistrelle.experiments.hearing.others import routes_read
 from pipistrelle.experiments.hearing.scenario import Scenario
-from pipistrelle.experiments.hearing.worlds import Visitor, World
+from pipistrelle.experiments.hearing.worlds import World
 from pipistrelle.files import WORLD, OwnFiles
 from pipistrelle.refusals import expectation, refusal, shown
-from pipistrelle.settings import Given, Key, Layer, from_table, parse_toml, resolve
+from pipistrelle.settings import (
+    CALLERS,
+    Given,
+    Key,
+    Layer,
+    beside,
+    from_table,
+    parse_toml,
+    resolve,
+)
 
 WORLD_KEY: Key = ("scenario", "world")
 _COUNT: Key = ("scenario", "landmarks")
@@ -71,22 +72,12 @@ poses nothing of the path is drawn; take the two columns away, and the noise on 
 """
 
 
-class _CallerTable(Section):
-    model_config = ConfigDict(strict=True)
-
-    name: Annotated[str, Field(pattern=r"^\w[\w-]*$")] | None = None
-    frequency: Positive
-    level_db: Level
-    place: Annotated[tuple[Real, Real], Field(strict=False)] | None = None
-    route: str | None = None
-
-
 class _WorldTable(Section):
     model_config = ConfigDict(strict=True)
 
     format: Literal[1]
     config: dict[str, Any] = Field(default_factory=dict)
-    callers: Annotated[tuple[_CallerTable, ...], Field(strict=False)] | None = None
+    callers: Any = None
 
 
 def named_world(layer: Layer) -> World | None:
@@ -157,6 +148,8 @@ def laid_over(world: World, layer: Layer, values: Layer) -> Layer:
         Where the values say otherwise than the world.
     """
     over = layer | world.settings | _decided(world, values) | values
+    if world.callers is not None and CALLERS not in values:
+        over.pop(CALLERS, None)
     if isinstance(world.course, Commands | Poses):
         setup = resolve(over).scenario
         steps = min(setup.steps, steps_of(world.course, setup))
@@ -210,7 +203,7 @@ def read_world(folder: Path) -> World:
         raise refusal(folder, found, f"a folder with {', '.join(FILES)}", "name a world's folder")
     there = [name for name in FILES if os.path.lexists(folder / name)]
     table = _read_head(folder / "world.toml") if "world.toml" in there else _WorldTable(format=1)
-    routes = [told.route for told in table.callers or () if told.route is not None]
+    callers, routes = _callers(folder / "world.toml", table.callers)
     _refuse_misspelt(folder, (*there, *routes))
     if not there:
         expected = f"one of {', '.join(FILES)}, or several"
@@ -218,16 +211,16 @@ def read_world(folder: Path) -> World:
     settings = from_table(table.config, f"{folder / 'world.toml'}: ", "config.")
     if WORLD_KEY in settings:
         raise InputError(f"{settings[WORLD_KEY].where}: a world has no other world; take it out")
+    if CALLERS in settings:
+        raise InputError(
+            f"{settings[CALLERS].where}: a world's callers are [[callers]]; take out config."
+        )
     landmarks = bodies = course = None
     config = resolve(settings)
     if "landmarks.csv" in there:
         landmarks, bodies = _read_landmarks(folder / "landmarks.csv", config.target)
     if "path.csv" in there:
         course = _read_course(folder / "path.csv", config)
-    callers = None
-    if table.callers is not None:
-        callers = _callers(folder, table.callers)
-        there += routes
     return World(
         name=folder.resolve().name,
         landmarks=landmarks,
@@ -235,7 +228,7 @@ def read_world(folder: Path) -> World:
         course=course,
         callers=callers,
         settings=settings,
-        files={name: (folder / name).read_bytes() for name in dict.fromkeys(there)},
+        files={name: (folder / name).read_bytes() for name in dict.fromkeys([*there, *routes])},
     )
 
 
@@ -290,7 +283,7 @@ def write_world(folder: Path, scenario: Scenario, config: Config) -> None:
     for caller in scenario.callers[VEHICLE + 1 :]:
         row = {"name": caller.name, "frequency": caller.frequency, "level_db": caller.level_db}
         if moves(caller):
-            row["route"] = f"{caller.name}.csv"
+            row["route"] = f"caller_{caller.name}.csv"
             route = table_text(("time", "x", "y"), scenario.time, *np.asarray(caller.place).T)
             own.write(row["route"], route)
         else:
@@ -312,7 +305,8 @@ def _refuse_misspelt(folder: Path, there: Sequence[str]) -> None:
 def _own_settings(config: Config) -> dict[str, Any]:
     """Return the settings of a world that are not at their defaults."""
     decides = {"world", "landmarks", "steps"}
-    said = config.model_dump(mode="json", exclude_defaults=True, exclude={"seed", *SECTIONS})
+    others = {"seed", *CALLERS, *SECTIONS}
+    said = config.model_dump(mode="json", exclude_defaults=True, exclude=others)
     return {
         section: kept
         for section, values in said.items()
@@ -449,32 +443,18 @@ def _check_rising(table: Table) -> None:
     check_unique(table, "time")
 
 
-def _callers(folder: Path, tables: tuple[_CallerTable, ...]) -> tuple[Visitor, ...]:
-    """Return who calls, each from a place or along a route."""
-    visitors: list[Visitor] = []
-    for number, told in enumerate(tables, start=1):
-        where = f"{folder / 'world.toml'}, key 'callers.{number}"
-        name = told.name or ("beacon" if len(tables) == 1 else f"caller{number}")
-        if name in ("vehicle", *(visitor.caller.name for visitor in visitors)):
-            raise refusal(
-                f"{where}.name'", f"{name!r} again", "a name of its own", "choose another"
-            )
-        if (told.place is None) == (told.route is None):
-            found = "neither" if told.place is None else "both"
-            raise refusal(f"{where}'", f"{found} of place and route", "one of them", "give one")
-        caller = Caller(name=name, frequency=told.frequency, level_db=told.level_db)
-        visitors.append(_visitor(folder, caller, told, where))
-    return tuple(visitors)
-
-
-def _visitor(folder: Path, caller: Caller, told: _CallerTable, where: str) -> Visitor:
-    """Give a caller its place or its route."""
-    if told.route is None:
-        return Visitor(caller=replace(caller, place=np.array(told.place)))
-    if Path(told.route).name != told.route:
-        expected = "the name of a file in the world's folder"
-        raise refusal(f"{where}.route'", shown(told.route), expected, "put it there")
-    table = read_table(folder / told.route, ("time", "x", "y"))
-    _check_rising(table)
-    route = np.column_stack((table.column["x"], table.column["y"]))
-    return Visitor(caller=caller, time=table.column["time"], route=route)
+def _callers(path: Path, told: Any) -> tuple[tuple[CallerConfig, ...] | None, list[str]]:
+    """Return who calls, by the rules of settings, and the files that hold routes."""
+    if told is None:
+        return None, []
+    files = []
+    for number, one in enumerate(told if isinstance(told, list) else (), start=1):
+        route = one.get("route") if isinstance(one, dict) else None
+        if isinstance(route, str):
+            if Path(route).name != route:
+                expected = "the name of a file in the world's folder"
+                where = f"{path}: callers.{number}.route"
+                raise refusal(where, shown(route), expected, "put it there")
+            files.append(route)
+    given = Given(routes_read(beside(path, told)), f"{path}: callers")
+    return resolve({CALLERS: given}).callers, files

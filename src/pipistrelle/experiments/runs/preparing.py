@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of
+from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of, moves
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.sampling import sampling
 from pipistrelle.config import Config, InputError
@@ -55,6 +55,7 @@ def prepared(
     >>> prepared(Config(emitter=EmitterConfig(frequency=36e3)))
     Traceback (most recent call last):
     pipistrelle.config.InputError: emitter.frequency: found 36000 Hz, expected a multiple of 5000 Hz
+    (the nearest that are free: 25000 and 35000 Hz)
     """
     check_length(config.scenario, strategies=strategies, filters=filters, workers=workers)
     scenario = world_of(config, world=world)
@@ -102,8 +103,8 @@ def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ..
     spacing, rate = config.receiver.spacing, config.receiver.sample_rate
     limit = min(config.detection.angle_limit_deg, config.detection.scan_limit_deg)
     said = []
-    for j, caller in enumerate(callers or callers_of(config, np.zeros(2))):
-        frequency, key = caller.frequency, "emitter" if j == VEHICLE else caller.name
+    for caller in callers or callers_of(config, np.zeros(2)):
+        frequency, key = caller.frequency, caller.key or caller.name
         tone, wave = f"{key}.frequency ({frequency:g} Hz)", config.air.celerity / frequency
         nearest = wave / spacing - math.sin(math.radians(limit))  # its lobe lies at the limit
         if nearest < 1.0:
@@ -122,9 +123,18 @@ def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ..
 
 
 def _refuse_supersonic(scenario: Scenario, config: Config) -> None:
-    """Refuse a vehicle that outruns its own sound."""
-    moved = np.hypot(*np.diff(scenario.path[:, :2], axis=0).T)
-    speed, c = moved.max(initial=0.0) / config.scenario.step, config.air.celerity
+    """Refuse a vehicle, or a caller, that outruns its own sound."""
+
+    def fastest(path: np.ndarray) -> float:
+        return np.hypot(*np.diff(path, axis=0).T).max(initial=0.0) / config.scenario.step
+
+    speed, c = fastest(scenario.path[:, :2]), config.air.celerity
+    for caller in scenario.callers[VEHICLE + 1 :]:
+        if moves(caller) and not (his := fastest(np.asarray(caller.place))) < c:
+            raise InputError(
+                f"{caller.key or caller.name}: it reaches {his:.3g} m/s, expected less than the "
+                f"speed of sound ({c:.3g} m/s); slow it down"
+            )
     if not speed < c:
         key = "motion.speed_std" if abs(config.scenario.speed) < c else "scenario.speed"
         raise InputError(

@@ -19,6 +19,7 @@ from pipistrelle.estimation.catalogue import (
     check_distinct,
     check_name,
 )
+from pipistrelle.experiments.hearing.others import routes_read, with_routes
 from pipistrelle.experiments.hearing.world_folder import (
     WORLD_KEY,
     named_world,
@@ -37,9 +38,11 @@ from pipistrelle.experiments.studies.plan import (
 )
 from pipistrelle.refusals import expectation, meant, shown
 from pipistrelle.settings import (
+    CALLERS,
     Given,
     Key,
     Layer,
+    beside,
     from_flags,
     known_settings,
     leaves,
@@ -187,7 +190,7 @@ def plan_of(
     layer = _laid(path, within["config"], over, worlds)
     radii = with_radii(f"{path}: grid", within["grid"], head.strategies, layer)
     asked = [
-        (key, name, _worlds(path, values, worlds) if key == WORLD_KEY else values)
+        (key, name, _read(path, key, values, worlds))
         for key, name, values in _settings(path, "grid", radii)
     ]
     lengths = [len(values) for _, _, values in asked if isinstance(values, list)]
@@ -224,7 +227,9 @@ def _laid(path: Path, table: Mapping[str, Any], over: Layer, worlds: dict[str, W
     }
     if WORLD_KEY in layer and isinstance(layer[WORLD_KEY].value, str):
         layer[WORLD_KEY] = Given(_beside(path, layer[WORLD_KEY].value), layer[WORLD_KEY].where)
-    layer |= over
+    if CALLERS in layer:
+        layer[CALLERS] = layer[CALLERS]._replace(value=beside(path, layer[CALLERS].value))
+    layer = with_routes(layer | over)
     world = named_world(layer)
     if world is None:
         return layer
@@ -235,6 +240,15 @@ def _laid(path: Path, table: Mapping[str, Any], over: Layer, worlds: dict[str, W
 def _beside(path: Path, folder: str) -> str:
     """Return the path of a folder that a file names, from where the file lies."""
     return str(path.parent / folder)
+
+
+def _read(path: Path, key: Key, values: Any, worlds: dict[str, World]) -> Any:
+    """Read the files that a grid names: of worlds, and of the routes of callers."""
+    if key == WORLD_KEY:
+        return _worlds(path, values, worlds)
+    if key == CALLERS and isinstance(values, list):
+        return [routes_read(beside(path, callers)) for callers in values]
+    return values
 
 
 def _worlds(path: Path, folders: Any, known: dict[str, World]) -> Any:
@@ -431,7 +445,7 @@ def _settings(
 ) -> Iterator[tuple[Key, str, Any]]:
     """Walk through a table's settings: key, dotted name and value of each."""
     known = {".".join(key): key for key in known_settings()}
-    for key, value in leaves(settings):
+    for key, value in leaves(settings, (CALLERS,)):
         name = ".".join(key)
         if name in known:
             yield known[name], name, value
@@ -452,9 +466,14 @@ def _values(path: Path, name: str, key: Key, values: Any, layer: Layer) -> tuple
         table: Any = resolve(layer | {key: Given(value, where)}).model_dump(mode="json")
         for part in key:
             table = table[part]
-        checked.append(table)
+        checked.append(_stated(table) if key == CALLERS else table)
     _check_distinct(where, checked)
     return tuple(checked)
+
+
+def _stated(callers: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return of callers what is said of them."""
+    return [{k: v for k, v in one.items() if v is not None} for one in callers]
 
 
 def _check_distinct(where: str, values: Sequence[Any]) -> None:
@@ -462,7 +481,7 @@ def _check_distinct(where: str, values: Sequence[Any]) -> None:
     known = set()
     for value in values:
         before = len(known)
-        known.add(tuple(value) if isinstance(value, list) else value)
+        known.add(json.dumps(value) if isinstance(value, list) else value)
         if len(known) == before:
             raise InputError(f"{where}: found {shown(value)} twice, expected each value once")
 

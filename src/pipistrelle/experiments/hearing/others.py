@@ -1,0 +1,347 @@
+r"""Where others call from: a place that is given or drawn, a circle, a line, a walk, a route.
+
+Path and landmarks of a world do not depend on who calls in it: callers are drawn after both, each
+from a stream of its own, so that one more changes none of the rest. The first is drawn as the
+paper's beacon; where it says nothing of its place, it is the beacon.
+
+A walk has a velocity that is forgotten and drawn anew all the time (Ornstein and Uhlenbeck),
+
+.. math:: v_{k+1} = a v_k + \sqrt{1 - a^2} \, \sigma \, n_k, \qquad a = e^{-\Delta_t / \tau},
+
+along each axis, n normal, and is thrown back where it would leave the disc of the landmarks.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.acoustics.callers import Caller, callers_of, moves
+from pipistrelle.arrays.sampling import free_tones
+from pipistrelle.config import CallerConfig, Config, InputError, ScenarioConfig, caller_names
+from pipistrelle.detection.logs.text_tables import check_unique, read_table
+from pipistrelle.experiments.hearing.fields import TRIES, nearest
+from pipistrelle.settings import CALLERS, Layer
+
+WALK_STD, WALK_MEMORY = 0.5, 10.0
+"""Of a walk that says no other: the velocity along an axis [m/s], and how long it lasts [s]."""
+
+Points = Float[np.ndarray, "_ 2"]
+
+
+def with_routes(layer: Layer) -> Layer:
+    r"""Put the rows of callers' routes in place of the files that hold them.
+
+    Parameters
+    ----------
+    layer : Layer
+
+    Returns
+    -------
+    Layer
+        Settings that are whole wherever they are taken.
+
+    Raises
+    ------
+    InputError
+        What is wrong with a file, by its line.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from pipistrelle.settings import from_flags
+    >>> with TemporaryDirectory() as place:
+    ...     path = Path(place) / "boat.csv"
+    ...     _ = path.write_text("time,x,y\n0,1,2\n5,3,4\n")
+    ...     layer = with_routes(from_flags({"callers": [{"route": str(path)}]}))
+    >>> layer["callers",].value
+    [{'route': [[0.0, 1.0, 2.0], [5.0, 3.0, 4.0]]}]
+    """
+    if CALLERS not in layer:
+        return layer
+    given = layer[CALLERS]
+    return layer | {CALLERS: given._replace(value=routes_read(given.value))}
+
+
+def routes_read(callers: Any) -> Any:
+    """Put rows in place of files, as `with_routes`, in what is given as callers, sound or not.
+
+    Parameters
+    ----------
+    callers : object
+
+    Returns
+    -------
+    object
+    """
+    if not isinstance(callers, (list, tuple)):
+        return callers
+    tables = [
+        one.model_dump(mode="json", exclude_none=True) if isinstance(one, CallerConfig) else one
+        for one in callers
+    ]
+    return [
+        one | {"route": _rows(Path(one["route"]))}
+        if isinstance(one, dict) and isinstance(one.get("route"), str)
+        else one
+        for one in tables
+    ]
+
+
+def _rows(path: Path) -> list[list[float]]:
+    """Read a route."""
+    table = read_table(path, ("time", "x", "y"))
+    check_unique(table, "time")
+    return np.column_stack([*table.column.values()]).tolist()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Around:
+    """What callers are put into.
+
+    Attributes
+    ----------
+    config : Config
+    time : (t) [s]
+    path : (t, 2) [m]
+        Of the vehicle.
+    landmarks : (n, 2) [m]
+    """
+
+    config: Config
+    time: Float[np.ndarray, " t"]
+    path: Float[np.ndarray, "t 2"]
+    landmarks: Points
+
+
+def callers_among(
+    around: Around,
+    told: Sequence[CallerConfig],
+    rng: np.random.Generator,
+    first: np.random.Generator | None = None,
+) -> tuple[Caller, ...]:
+    """Put callers where they say that they are, and draw what they leave open.
+
+    Parameters
+    ----------
+    around : Around
+    told : sequence of CallerConfig
+    rng : Generator
+        Its children are used, one for each caller.
+    first : Generator, optional
+        In place of the first child: as it was before the beacon was drawn.
+
+    Returns
+    -------
+    tuple of Caller
+        With a place, or one for each time; without the vehicle.
+
+    Raises
+    ------
+    InputError
+        For a tone that nobody tells, or a caller that finds no place.
+
+    Examples
+    --------
+    >>> still = Around(
+    ...     config=Config(), time=np.arange(3.0), path=np.zeros((3, 2)), landmarks=np.empty((0, 2))
+    ... )
+    >>> boat = CallerConfig(course="circle", radius=4.0, speed=1.0, centre=(9.0, 0.0))
+    >>> (one,) = callers_among(still, [boat], np.random.default_rng(7))
+    >>> one.name, one.frequency, np.hypot(*(one.place - [9.0, 0.0]).T)
+    ('beacon', 30000.0, array([4., 4., 4.]))
+    """
+    streams: list[np.random.Generator] = rng.spawn(len(told))
+    if first is not None:
+        streams[:1] = [first] * len(told[:1])
+    callers: list[Caller] = []
+    names, beacon = caller_names(tuple(told)), around.config.beacon
+    for j, (one, name, stream) in enumerate(zip(told, names, streams, strict=True), start=1):
+        frequency = beacon.frequency if one.frequency is None and j == 1 else one.frequency
+        if frequency is None:
+            known = (*callers_of(around.config, np.zeros(2))[:1], *callers)
+            free = free_tones(around.config, known, beacon.frequency)
+            raise InputError(
+                f"callers.{j}.frequency: found none, expected a tone of its own{free}; give one, "
+                "for only the first may have the beacon's"
+            )
+        level_db = beacon.level_db if one.level_db is None else one.level_db
+        caller = Caller(name=name, frequency=frequency, level_db=level_db, key=f"callers.{j}")
+        _check_speed(caller.key, one, around.config)
+        is_beacon = first is not None and j == 1 and one.distance is None
+        taken = [] if is_beacon else [around.landmarks, _standing(callers)]
+        found = _WAYS[one.way](one, around, taken, stream)
+        if found is None:
+            raise _no_place(caller.key, one, around)
+        callers.append(replace(caller, place=found))
+    return tuple(callers)
+
+
+def place_at(
+    distance: float,
+    setup: ScenarioConfig,
+    rng: np.random.Generator,
+    clear_of: Iterable[Points],
+) -> Float[np.ndarray, "2"] | None:
+    """Draw a place at a distance from the centre, clear of points.
+
+    Parameters
+    ----------
+    distance : [m]
+    setup : ScenarioConfig
+        Its clearance.
+    rng : Generator
+    clear_of : sequence of (k, 2) [m]
+
+    Returns
+    -------
+    (2) [m] or None
+        None where none was found.
+
+    Examples
+    --------
+    >>> place = place_at(3.0, ScenarioConfig(), np.random.default_rng(7), [np.zeros((1, 2))])
+    >>> round(float(np.hypot(*place)), 9)
+    3.0
+    """
+    clear_of = [*clear_of]
+    for _ in range(TRIES):
+        direction = rng.uniform(-math.pi, math.pi)
+        place = distance * np.array([math.cos(direction), math.sin(direction)])
+        if all(nearest(points, place) >= setup.clearance for points in clear_of):
+            return place
+    return None
+
+
+def _stand(
+    one: CallerConfig, around: Around, taken: Sequence[Points], rng: np.random.Generator
+) -> Float[np.ndarray, "2"] | None:
+    """Stand where it is told, or at a distance, clear of the path and of what stands there."""
+    if one.place is not None:
+        return np.array(one.place)
+    setup = around.config.scenario
+    return place_at(_distance(one, setup), setup, rng, [around.path, *taken])
+
+
+def _circle(
+    one: CallerConfig, around: Around, taken: Sequence[Points], rng: np.random.Generator
+) -> Float[np.ndarray, "t 2"] | None:
+    """Circle at constant speed, from anywhere on the circle."""
+    setup = around.config.scenario
+    radius = setup.beacon_distance if one.radius is None else one.radius
+    turned = (setup.speed if one.speed is None else one.speed) / radius * around.time
+
+    def drawn() -> Float[np.ndarray, "t 2"]:
+        angle = rng.uniform(-math.pi, math.pi) + turned
+        circle = radius * np.column_stack((np.cos(angle), np.sin(angle)))
+        return circle + np.array(one.centre or (0.0, 0.0))
+
+    return _away_from_vehicle(drawn, around)
+
+
+def _walk(
+    one: CallerConfig, around: Around, taken: Sequence[Points], rng: np.random.Generator
+) -> Float[np.ndarray, "t 2"] | None:
+    """Walk at random over the disc of the landmarks."""
+    setup = around.config.scenario
+    std = WALK_STD if one.speed_std is None else one.speed_std
+    kept = math.exp(-setup.step / (WALK_MEMORY if one.memory is None else one.memory))
+    fresh = std * math.sqrt(1.0 - kept * kept)
+
+    def drawn() -> Float[np.ndarray, "t 2"]:
+        begin = np.array(one.place or place_at(_distance(one, setup), setup, rng, []))
+        noise = rng.standard_normal((around.time.size, 2))
+        path, limit = np.empty_like(noise), max(setup.radius, math.hypot(*begin))
+        path[0], velocity = begin, std * noise[0]
+        for k in range(1, around.time.size):
+            velocity = kept * velocity + fresh * noise[k]
+            path[k] = path[k - 1] + velocity * setup.step
+            away = math.hypot(*path[k])
+            if away > limit:
+                normal = path[k] / away
+                path[k] = max(2.0 * limit - away, 0.0) * normal
+                velocity = velocity - 2.0 * (velocity @ normal) * normal
+        return path
+
+    return _away_from_vehicle(drawn, around)
+
+
+def _line(
+    one: CallerConfig, around: Around, taken: Sequence[Points], rng: np.random.Generator
+) -> Float[np.ndarray, "t 2"]:
+    """Go along the closed line through way-points at constant speed."""
+    speed = around.config.scenario.speed if one.speed is None else one.speed
+    points = np.array([*(one.waypoints or ()), *(one.waypoints or ())[:1]])
+    along = np.append(0.0, np.hypot(*np.diff(points, axis=0).T).cumsum())
+    if along[-1] == 0.0:
+        return np.tile(points[0], (around.time.size, 1))
+    here = np.mod(speed * around.time, along[-1])
+    return np.column_stack([np.interp(here, along, column) for column in points.T])
+
+
+def _route(
+    one: CallerConfig, around: Around, taken: Sequence[Points], rng: np.random.Generator
+) -> Float[np.ndarray, "t 2"]:
+    """Be where the route says, and stand before its first time and after its last."""
+    rows = _rows(Path(one.route)) if isinstance(one.route, str) else one.route
+    time, *place = np.array(rows).T
+    return np.column_stack([np.interp(around.time, time, column) for column in place])
+
+
+_WAYS: dict[str, Callable[..., np.ndarray | None]] = {
+    "stand": _stand,
+    "circle": _circle,
+    "walk": _walk,
+    "waypoints": _line,
+    "route": _route,
+}
+
+
+def _distance(one: CallerConfig, setup: ScenarioConfig) -> float:
+    """Return how far from the centre a caller is to be [m]."""
+    return setup.beacon_distance if one.distance is None else one.distance
+
+
+def _check_speed(key: str, one: CallerConfig, config: Config) -> None:
+    """Refuse a caller that would outrun its own sound."""
+    c = config.air.celerity
+    for name, most in (("speed", c), ("speed_std", c / 5.0)):
+        speed = getattr(one, name)
+        if speed is not None and not abs(speed) < most:
+            raise InputError(
+                f"{key}.{name}: found {speed:g} m/s, expected less than {most:.3g} m/s, for sound "
+                "is to be faster; slow it down"
+            )
+
+
+def _standing(callers: Sequence[Caller]) -> Points:
+    """Return where callers stand."""
+    return np.array([c.place for c in callers if not moves(c)]).reshape(-1, 2)
+
+
+def _away_from_vehicle(
+    drawn: Callable[[], Float[np.ndarray, "t 2"]], around: Around
+) -> Float[np.ndarray, "t 2"] | None:
+    """Draw a way until it keeps its distance from the vehicle at all times."""
+    for _ in range(TRIES):
+        path = drawn()
+        offset = path - around.path
+        if np.hypot(*offset.T).min() >= around.config.scenario.clearance:
+            return path
+    return None
+
+
+def _no_place(key: str, one: CallerConfig, around: Around) -> InputError:
+    """Say that a caller was given no place, and what to change."""
+    setup = around.config.scenario
+    if one.way == "stand":
+        what = f"no direction there is {setup.clearance:g} m clear of path, landmarks and callers"
+        where = f"{key}.distance: found {_distance(one, setup):g} m, but {what}; expected another"
+    else:
+        what = f"it comes nearer than {setup.clearance:g} m to the vehicle wherever it sets out"
+        where = f"{key}: found a {one.way} on which {what}; expected another"
+    return InputError(f"{where}, or a smaller scenario.clearance")

@@ -1,0 +1,246 @@
+"""Others who call: where they are, and that one more changes nothing else."""
+
+import numpy as np
+import pytest
+
+from pipistrelle.acoustics.callers import callers_at, moves
+from pipistrelle.arithmetic.random_stream import stream_key
+from pipistrelle.config import CallerConfig, Config, InputError, ScenarioConfig
+from pipistrelle.experiments.hearing.courses import course_of, driven
+from pipistrelle.experiments.hearing.fields import TRIES, landmarks_in, nearest
+from pipistrelle.experiments.hearing.others import WALK_MEMORY, WALK_STD, with_routes
+from pipistrelle.experiments.hearing.scenario import (
+    caller_labels,
+    motion_of,
+    moving_labels,
+    standing_landmarks,
+    world_of,
+)
+from pipistrelle.settings import from_flags, resolve
+
+SEEDS = range(6)
+MATE = {"frequency": 25e3}
+BEACON, LAST = (-14.111586629921728, -5.085579886916962), (-0.7128813181024322, -2.8077788365621412)
+"""Of the paper's third world, as it was drawn before there were lists: beacon, last landmark."""
+
+
+def config_of(*callers, **scenario):
+    """Return settings of callers, in a small world."""
+    setup = {"steps": 160, "landmarks": 20} | scenario
+    return resolve(from_flags({"callers": [*callers], "scenario": setup}))
+
+
+def paper(**scenario):
+    return Config(scenario=ScenarioConfig(**({"steps": 160, "landmarks": 20} | scenario)))
+
+
+def world_as_ever(config, iteration):
+    """Draw the paper's world by itself: path, then beacon, then landmarks."""
+    setup, motion = config.scenario, motion_of(config.motion)
+    rng = np.random.default_rng(stream_key(config.seed, iteration, "scenario"))
+    path, _ = driven(course_of(setup, motion), setup, motion, rng)
+    for _ in range(TRIES):
+        direction = rng.uniform(-np.pi, np.pi)
+        beacon = setup.beacon_distance * np.array([np.cos(direction), np.sin(direction)])
+        if nearest(path[:, :2], beacon) >= setup.clearance:
+            break
+    return path, beacon, landmarks_in(setup, path[:, :2], beacon[None], rng)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("distance", [15.0, 7.4])
+def test_the_papers_beacon_is_the_list_of_one_to_the_bit(seed, distance):
+    config = paper(beacon_distance=distance)
+    ever = world_as_ever(config, seed)
+    listed = config_of({}, beacon_distance=distance)
+    for drawn in (world_of(config, seed), world_of(listed, seed)):
+        found = (drawn.path, drawn.callers[1].place, drawn.landmarks)
+        assert [part.tobytes() for part in found] == [part.tobytes() for part in ever]
+        told = [(c.name, c.frequency, c.level_db) for c in drawn.callers]
+        assert told == [("vehicle", 35e3, 49.7), ("beacon", 30e3, 42.8)]
+
+
+def test_the_papers_world_is_what_it_was():
+    drawn = world_of(Config(), 3)
+    assert drawn.callers[1].place.tolist() == pytest.approx(BEACON, abs=1e-9)
+    assert drawn.landmarks[-1].tolist() == pytest.approx(LAST, abs=1e-9)
+
+
+MORE = {
+    "a place": {"place": [3.0, 4.0]},
+    "a distance": {"distance": 6.0},
+    "a circle": {"course": "circle", "radius": 4.0},
+    "a walk": {"course": "walk"},
+    "a line": {"waypoints": [[9.0, 9.0], [-9.0, 9.0]]},
+    "a route": {"route": [[0.0, 9.0, 9.0], [5.0, 1.0, 9.0]]},
+}
+
+
+@pytest.mark.parametrize("way", MORE)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_one_caller_more_changes_neither_path_nor_landmarks_nor_those_before(seed, way):
+    one = world_of(config_of({}), seed)
+    two = world_of(config_of({}, MATE), seed)
+    three = world_of(config_of({}, MATE, {"frequency": 20e3} | MORE[way]), seed)
+    for drawn in (two, three):
+        assert drawn.path.tobytes() == one.path.tobytes()
+        assert drawn.landmarks.tobytes() == one.landmarks.tobytes()
+        assert drawn.callers[1].place.tobytes() == one.callers[1].place.tobytes()
+    assert three.callers[2].place.tobytes() == two.callers[2].place.tobytes()
+
+
+@pytest.mark.parametrize("way", MORE)
+def test_path_and_landmarks_do_not_depend_on_where_the_first_caller_is(way):
+    ever, drawn = world_of(paper(), 2), world_of(config_of(MORE[way]), 2)
+    assert drawn.path.tobytes() == ever.path.tobytes()
+    assert drawn.landmarks.tobytes() == ever.landmarks.tobytes()
+    assert drawn.callers[1].place.tobytes() != ever.callers[1].place.tobytes()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_caller_at_another_distance_lies_in_the_beacons_direction(seed):
+    near, ever = (
+        world_of(c, seed).callers[1].place for c in (config_of({"distance": 5.0}), paper())
+    )
+    assert np.hypot(*near) == pytest.approx(5.0)
+    np.testing.assert_allclose(near * 3.0, ever)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_drawn_callers_keep_clear_of_all_that_stands_and_of_the_path(seed):
+    tones = ({"frequency": 5e3 * k, "distance": 8.0} for k in range(1, 6))
+    drawn = world_of(config_of({"distance": 8.0}, *tones, clearance=1.5), seed)
+    places = np.array([caller.place for caller in drawn.callers[1:]])
+    np.testing.assert_allclose(np.hypot(*places.T), 8.0)
+    assert min(nearest(drawn.path[:, :2], place) for place in places) >= 1.5
+    assert min(nearest(drawn.landmarks, place) for place in places) >= 1.5
+    assert min(nearest(places[:i], place) for i, place in enumerate(places)) >= 1.5
+
+
+def test_who_moves_is_no_landmark_and_bears_the_label_of_its_place_in_the_list():
+    drawn = world_of(
+        config_of({}, MATE | {"course": "circle"}, {"frequency": 2e4, "place": [1, 2]})
+    )
+    assert caller_labels(drawn).tolist() == [-1, 21, 22, 23]
+    assert moving_labels(drawn) == (22,)
+    labels, places = standing_landmarks(drawn)
+    assert labels[-2:].tolist() == [21, 23]
+    assert places[-1].tolist() == [1.0, 2.0]
+
+
+def test_a_circle_is_gone_round_at_its_speed_and_the_other_way_round_below_zero():
+    for speed in (0.75, -1.5):
+        told = {"course": "circle", "radius": 6.0, "speed": speed, "centre": [2.0, -1.0]}
+        place = world_of(config_of(told)).callers[1].place - [2.0, -1.0]
+        np.testing.assert_allclose(np.hypot(*place.T), 6.0)
+        turned = np.diff(np.unwrap(np.arctan2(place[:, 1], place[:, 0])))
+        np.testing.assert_allclose(turned, speed / 6.0 * 0.125, rtol=1e-9)
+
+
+def test_a_circle_says_where_it_says_nothing_what_the_scenario_does():
+    place = (
+        world_of(config_of({"course": "circle"}, beacon_distance=9.0, speed=0.5)).callers[1].place
+    )
+    np.testing.assert_allclose(np.hypot(*place.T), 9.0)
+    chord = 2.0 * 9.0 * np.sin(0.5 * 0.125 / 9.0 / 2.0)
+    np.testing.assert_allclose(np.hypot(*np.diff(place, axis=0).T), chord)
+
+
+def test_a_line_is_gone_along_and_back_to_where_it_began():
+    told = {"waypoints": [[0.0, 12.0], [3.0, 12.0], [3.0, 16.0]], "speed": 1.0}
+    place = world_of(config_of(told)).callers[1].place
+    at = dict(zip((0.125 * np.arange(161)).tolist(), place.tolist(), strict=True))
+    assert at[0.0] == [0.0, 12.0]
+    assert at[3.0] == [3.0, 12.0]
+    assert at[5.0] == [3.0, 14.0]
+    np.testing.assert_allclose([at[9.5], at[12.0]], [[1.5, 14.0], [0.0, 12.0]], atol=1e-12)
+    still = world_of(config_of(told | {"speed": -1.0})).callers[1].place
+    np.testing.assert_allclose(still[:96], place[96:0:-1], atol=1e-12)
+
+
+def test_on_a_route_one_stands_before_it_and_after_it():
+    told = {"route": [[1.0, 0.0, 9.0], [2.0, 2.0, 13.0]]}
+    place = world_of(config_of(told)).callers[1].place
+    assert place[[0, 12, 160]].tolist() == [[0.0, 9.0], [1.0, 11.0], [2.0, 13.0]]
+
+
+def test_a_walk_has_the_spread_and_the_memory_that_it_says_and_stays_on_the_disc():
+    std, memory, dt = 0.4, 2.0, 0.125
+    told = {"course": "walk", "speed_std": std, "memory": memory, "place": [0.0, 0.0]}
+    config = config_of(told, steps=40_000, radius=1e4, landmarks=0, start=(9e3, 0.0, 0.0))
+    velocity = np.diff(world_of(config).callers[1].place, axis=0).T / dt
+    independent = velocity.size * dt / (2.0 * memory)
+    assert velocity.std() == pytest.approx(std, rel=5.0 / np.sqrt(2.0 * independent))
+    for lag in (1, 8, 24):
+        kept = np.mean(velocity[:, lag:] * velocity[:, :-lag]) / np.mean(velocity**2)
+        assert kept == pytest.approx(np.exp(-lag * dt / memory), abs=5.0 / np.sqrt(independent))
+    for seed in SEEDS:
+        place = world_of(config_of(told | {"speed_std": 3.0}, radius=14.0), seed).callers[1].place
+        assert np.hypot(*place.T).max() <= 14.0
+    assert (WALK_STD, WALK_MEMORY) == (0.5, 10.0)  # as docs and settings say
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_what_is_drawn_to_move_keeps_clear_of_the_vehicle(seed):
+    for told in ({"course": "circle", "radius": 7.4}, {"course": "walk", "distance": 7.4}):
+        drawn = world_of(config_of(told, clearance=2.0), seed)
+        assert np.hypot(*(drawn.callers[1].place - drawn.path[:, :2]).T).min() >= 2.0
+
+
+def test_velocities_are_those_of_the_steps_that_end_where_it_calls():
+    drawn = world_of(config_of({"course": "circle", "radius": 5.0}))
+    _, boat = callers_at(drawn.callers, drawn.time, np.array([4, 8]))
+    place = drawn.callers[1].place
+    np.testing.assert_allclose(boat.velocity, (place[[4, 8]] - place[[3, 7]]) / 0.125)
+    assert moves(boat)
+
+
+REFUSED = {
+    "no tone": (({}, {}), "callers.2.frequency: found none, expected a tone of its own"),
+    "no room": (
+        ({"distance": 7.4},),
+        "callers.1.distance: found 7.4 m, but no direction there is 5 m clear of path",
+    ),
+    "always beside the vehicle": (
+        ({"course": "circle", "radius": 1e-3, "centre": [0.0, -7.408]},),
+        "callers.1: found a circle on which it comes nearer than 5 m to the vehicle",
+    ),
+    "faster than sound": (
+        ({"course": "circle", "speed": -343.0},),
+        "callers.1.speed: found -343 m/s, expected less than 343 m/s",
+    ),
+    "walks faster than sound": (
+        ({}, MATE | {"course": "walk", "speed_std": 70.0}),
+        "callers.2.speed_std: found 70 m/s, expected less than 68.6 m/s",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_caller_that_cannot_be_is_refused_by_its_key(case):
+    callers, said = REFUSED[case]
+    with pytest.raises(InputError) as refused:
+        world_of(config_of(*callers, clearance=5.0, landmarks=0, steps=600))
+    assert str(refused.value).startswith(said)
+
+
+def test_a_route_may_be_a_file_and_what_is_wrong_in_it_has_a_line(tmp_path):
+    path = tmp_path / "boat.csv"
+    path.write_text("time,x,y\n0,1,2\n5,3,4\n")
+    told = CallerConfig(route=str(path))
+    drawn = world_of(Config(callers=(told,), scenario=ScenarioConfig(steps=40, landmarks=3)))
+    assert drawn.callers[1].place[-1].tolist() == [3.0, 4.0]
+    for text, said in (
+        ("time,x,y\n0,1,2\n0,3,4\n", "line 3: found time 0.0 again"),
+        ("time,x,y\n1,1,2\n0,3,4\n", "line 3: found time 0.0 after 1.0"),
+        ("time,x\n0,1\n", "line 1: found 'time,x', expected the header 'time,x,y'"),
+        ("time,x,y\n0,nan,1\n", "line 2: found x 'nan'"),
+        ("", "no rows"),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputError, match=r"boat\.csv") as refused:
+            with_routes(from_flags({"callers": [{"route": str(path)}]}))
+        assert said in str(refused.value)
+    path.write_text("time,x,y\n0,1,2\n")
+    with pytest.raises(InputError, match=r"route: found .*two such rows"):
+        resolve(with_routes(from_flags({"callers": [{"route": str(path)}]})))
