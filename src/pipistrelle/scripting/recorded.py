@@ -21,6 +21,8 @@ GATE = 0.999
 GATE_KEY: Key = ("filter", "gate")
 OWN: dict[Key, str] = {("rays", "spacing"): "auto", ("filter", "noise"): "measured"}
 """Settings that a recorded log has others of than a simulated mission: its sensor is anyone's."""
+TIMING: Key = ("listening", "timing")
+"""Is on where a log has detours."""
 SUSPECT = 0.2
 """Share of a log's rows that may not fit before its units are asked about."""
 LOGGED = frozenset(
@@ -106,6 +108,9 @@ def with_log(layer: Layer, recorded: "Log", log: Path) -> tuple[Config, list[str
     decided = {key: Given(getattr(recorded, key[1]), f"{log}: {key[1]}") for key in LOGGED}
     own = {GATE_KEY: Given(gate, str(log))}
     own |= {key: Given(value, "slam") for key, value in OWN.items()}
+    own[TIMING] = Given(has_detours(recorded), str(log))
+    if recorded.detour_std is not None:
+        own["filter", "detour_std"] = Given(recorded.detour_std, f"{log}: detour_std")
     if ("rays", "likelihood") in layer:  # another reading of the paper is of the paper's rays
         del own["rays", "spacing"]
     wished, settled, told = resolve(layer), resolve(own | layer | decided), []
@@ -115,6 +120,20 @@ def with_log(layer: Layer, recorded: "Log", log: Path) -> tuple[Config, list[str
             where = layer[section, name].where
             told.append(f"{where}: the log decides this, and says {value}")
     return settled, told
+
+
+def has_detours(recorded: "Log") -> bool:
+    """Tell whether any row of a log has a detour.
+
+    Parameters
+    ----------
+    recorded : Log
+
+    Returns
+    -------
+    bool
+    """
+    return any((scan.detour == scan.detour).any() for scan in recorded.scans)
 
 
 def check_room(recorded: "Log", filters: Sequence[str], config: Config) -> None:

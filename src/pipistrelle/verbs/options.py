@@ -39,8 +39,8 @@ def _whole(_: Any, tokens: Sequence[Any]) -> int:
 Whole = Annotated[int, Parameter(converter=_whole)]
 
 
-def _tables(_: Any, tokens: Sequence[Any]) -> Any:
-    """Read a list of tables as a file has it, on one line."""
+def _as_written(_: Any, tokens: Sequence[Any]) -> Any:
+    """Read a value as a file has it, on one line."""
     return from_text(tokens[0].value)
 
 
@@ -99,12 +99,17 @@ def setting_flags(
     for key, field in known_settings().items():
         value = own.get(key, field.default)
         default = value if isinstance(value, tuple) else (value,)
-        settled = "" if value is None else f"[default: {' '.join(map(str, default))}]"
+        told = [str(one).lower() if isinstance(one, bool) else str(one) for one in default]
+        settled = "" if value is None else f"[default: {' '.join(told)}]"
         words = f"{field.description or ''} {settled}"
         flag = Parameter(help=" ".join(words.split()), show=shown(key), negative=())
         kind: Any = Whole if field.annotation is int else _unbounded(field.annotation)
         if key == CALLERS:
-            kind = Annotated[Any, Parameter(converter=_tables, n_tokens=1, metavar="TABLES")]
+            kind = Annotated[Any, Parameter(converter=_as_written, n_tokens=1, metavar="TABLES")]
+        elif field.annotation is bool:
+            kind = Annotated[
+                Any, Parameter(converter=_as_written, n_tokens=1, metavar="true|false")
+            ]
         if len(key) == 1:
             top[key[0]] = Annotated[kind, flag]
         else:

@@ -20,7 +20,7 @@ from pipistrelle.verbs.options import (
 )
 
 if TYPE_CHECKING:
-    from pipistrelle.detection.logs.recording import Log
+    from pipistrelle.detection.logs.recording import Log, LogCaller
     from pipistrelle.detection.scans import Scan
     from pipistrelle.experiments.runs.trial import Mission
 
@@ -129,6 +129,7 @@ def _log(mission: "Mission", scans: "Sequence[Scan]") -> "Log":
     from pipistrelle.detection.noise import unstated
 
     config, drive = mission.config, mission.drive
+    timing = config.listening.timing
     if config.filter.noise == "constant":  # log.toml says it
         scans = list(map(unstated, scans))
     x, y, heading = drive.start.mean.tolist()
@@ -145,7 +146,23 @@ def _log(mission: "Mission", scans: "Sequence[Scan]") -> "Log":
         initial_pose_std=config.filter.initial_pose_std,
         range_std=config.filter.range_std,
         bearing_std=config.filter.bearing_std,
+        detour_std=config.filter.detour_std if timing else None,
+        callers=_log_callers(mission) if timing else (),
         range_bounds=config.rays.range_bounds,
         gate=config.filter.gate,
         ignored_rows={},
+    )
+
+
+def _log_callers(mission: "Mission") -> "tuple[LogCaller, ...]":
+    """Return whoever else called, as a log names them."""
+    from pipistrelle.acoustics.callers import moves
+    from pipistrelle.detection.logs.recording import LogCaller
+    from pipistrelle.experiments.hearing.scenario import caller_labels
+
+    world = mission.scenario
+    labelled = zip(world.callers[1:], caller_labels(world)[1:].tolist(), strict=True)
+    return tuple(
+        LogCaller(name=caller.name, landmark=label, moves=moves(caller))
+        for caller, label in labelled
     )

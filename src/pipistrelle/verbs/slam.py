@@ -13,6 +13,7 @@ from pipistrelle.scripting.recorded import (
     GATE,
     GATE_KEY,
     OWN,
+    TIMING,
     beforehand,
     check_open,
     check_room,
@@ -44,7 +45,9 @@ ROBOTS = f"Whose log of {', or of '.join(r.robot_help for r in READERS if r.robo
 if TYPE_CHECKING:
     SlamFlags = dict[str, Any]
 else:
-    SlamFlags = setting_flags(lambda key: is_open(key) and key != GATE_KEY, OWN)
+    SlamFlags = setting_flags(
+        lambda key: is_open(key) and key != GATE_KEY, OWN | {TIMING: "where the log has detours"}
+    )
 
 
 def slam(

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipistrelle.config import Config, FilterConfig, InputError
+from pipistrelle.config import Config, FilterConfig, InputError, ListeningConfig
 from pipistrelle.detection.logs.folder import read_log, write_log
 from pipistrelle.detection.logs.readers import Reader
-from pipistrelle.detection.scans import COLUMNS, with_columns
+from pipistrelle.detection.logs.recording import LogCaller
+from pipistrelle.detection.scans import COLUMNS, make_scan, with_columns
 from pipistrelle.experiments.drives import NO_TRUTH
 from pipistrelle.experiments.runs.replay import as_heard_by, load, motion_of, replay, start_of
 from pipistrelle.experiments.runs.truth_files import read_truth, write_truth
@@ -274,6 +275,52 @@ def test_hiding_leaves_all_but_the_range_as_it_was_recorded():
     (heard,) = as_heard_by([scan], "fused", 0.5)
     for name in set(COLUMNS) - {"range"}:
         np.testing.assert_array_equal(getattr(heard, name), getattr(scan, name))
+
+
+TIMED = make_scan(
+    2.0,
+    np.array([1, 2, 3, 1]),
+    np.array([0.1, 0.2, 0.3, np.nan]),
+    range=np.array([4.0, np.nan, 5.0, np.nan]),
+    caller=np.array([1, 1, 0, 2]),
+    detour=np.array([3.0, 4.0, np.nan, 7.0]),
+    detour_std=0.1,
+)
+
+
+@pytest.mark.parametrize(
+    ("strategy", "landmark", "detour"),
+    [
+        ("fused", [1, 2, 3, 1], [3.0, 4.0, np.nan, 7.0]),
+        ("passive", [1, 2, 3, 1], [3.0, 4.0, np.nan, 7.0]),
+        ("active", [1, 3], [np.nan, np.nan]),
+    ],
+)
+def test_detours_are_heard_by_who_listens_to_others(strategy, landmark, detour):
+    (heard,) = as_heard_by([TIMED], strategy)
+    assert heard.landmark.tolist() == landmark
+    np.testing.assert_array_equal(heard.detour, detour)
+
+
+def test_what_is_not_listened_for_is_as_if_it_had_not_been_recorded():
+    callers = (LogCaller(name="boat", landmark=9), LogCaller(name="mate", landmark=8))
+    log = replace(looks((0.1, 0.1, 0.1)), callers=callers)
+    (look,) = log.scans
+    timed = replace(TIMED, time=look.time, callers=np.array([-1, 9, 8]))
+    log = replace(log, scans=(timed,))
+    for timing, rows in ((True, 4), (False, 3)):
+        config = Config(listening=ListeningConfig(timing=timing))
+        (trial,) = replay(log, NO_TRUTH, ["fused"], ["ekf"], None, config)
+        (scan,) = trial.scans
+        assert scan.landmark.size == rows
+        assert np.isnan(scan.detour).all() != timing
+
+
+def test_rows_of_a_caller_that_moves_are_left_out():
+    log = replace(looks((0.1, 0.1, 0.1)), callers=(LogCaller(name="b", landmark=7, moves=True),))
+    assert replayed(log, "measured").track.landmarks.landmark.size == 0
+    still = replace(log, callers=(LogCaller(name="b", landmark=7),))
+    assert replayed(still, "measured").track.landmarks.landmark.tolist() == [7]
 
 
 def test_hiding_changes_no_scan_and_keeps_empty_ones():

@@ -4,15 +4,31 @@ Whatever is wrong with a file is refused by line or key. `recording` says how ro
 measurements scans.
 """
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, ValidationError, field_validator
+from pydantic import ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
-from pipistrelle.config import InputError, NonNegative, Positive, Probability, Real, Section
+from pipistrelle.config import (
+    MOST_OTHERS,
+    InputError,
+    NonNegative,
+    Positive,
+    Probability,
+    Real,
+    Section,
+)
 from pipistrelle.detection.logs.poses import MOTION_COVARIANCE, POSE, poses_along
-from pipistrelle.detection.logs.recording import MEASUREMENT, STATED, Log, assemble
+from pipistrelle.detection.logs.recording import (
+    CALLER,
+    MEASUREMENT,
+    STATED,
+    Log,
+    LogCaller,
+    assemble,
+)
 from pipistrelle.detection.logs.text_tables import read_table, read_text, table_text
 from pipistrelle.files import LOG, OwnFiles
 from pipistrelle.refusals import expectation, meant, refusal, shown, values_expected
@@ -21,6 +37,8 @@ from pipistrelle.settings import parse_toml
 _Triple = Annotated[tuple[Real, Real, Real], Field(strict=False)]
 _Triple_std = Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(strict=False)]
 _Bounds = Annotated[tuple[Positive, Positive], Field(strict=False)]
+_Point = Annotated[tuple[Real, Real], Field(strict=False)]
+_Point_std = Annotated[tuple[NonNegative, NonNegative], Field(strict=False)]
 
 _NOISY = {
     "unicycle": ("velocity", "angular_rate"),
@@ -45,8 +63,29 @@ SHA256SUMS        what was written here: nothing else is ever overwritten
 Bearings are relative to the heading, counter-clockwise. Where a measurement has no bearing_std or
 range_std of its own, that of log.toml holds.
 """
+_DETOURS = """
+A detour [m] is how much longer the way of a caller's sound over the landmark is than the straight
+one; log.toml says which landmark each caller is. A row without a bearing is one detour more.
+"""
 _HELD = "a row holds until the next one's time, the last only ends the log"
 _FOLLOWED = "what counts is the way from row to row, wherever they begin"
+
+
+class _CallerTable(Section):
+    model_config = ConfigDict(strict=True)
+
+    name: Annotated[str, Field(pattern=r"^\w[\w-]*$")]
+    landmark: Annotated[int, Field(ge=0, lt=2**53)]
+    moves: bool = False
+    place: _Point | None = None
+    place_std: _Point_std | None = None
+
+    @field_validator("place_std")
+    @classmethod
+    def _of_a_place(cls, std: Any, known: ValidationInfo) -> Any:
+        if std is not None and known.data.get("place") is None:
+            raise ValueError("a place beside it")
+        return std
 
 
 class _Settings(Section):
@@ -58,10 +97,20 @@ class _Settings(Section):
     initial_pose_std: _Triple_std
     range_std: Positive
     bearing_std: Positive
+    detour_std: Positive | None = None
     range_bounds: _Bounds
     step: Positive | None = None
     gate: Probability | None = None
     noise_at_rest: bool = True
+    callers: Annotated[tuple[_CallerTable, ...], Field(strict=False, max_length=MOST_OTHERS)] = ()
+
+    @field_validator("callers")
+    @classmethod
+    def _apart(cls, callers: tuple[_CallerTable, ...]) -> tuple[_CallerTable, ...]:
+        for what in ("name", "landmark"):
+            if len({getattr(caller, what) for caller in callers}) < len(callers):
+                raise ValueError(f"a {what} of its own for each caller")
+        return callers
 
     @field_validator("range_bounds")
     @classmethod
@@ -146,14 +195,25 @@ def read_log(folder: Path) -> Log:
     settings = _read_settings(folder / "log.toml")
     columns, stds = ("time", *_ODOMETRY[settings.motion]), _NOISY[settings.motion]
     optional = MOTION_COVARIANCE if settings.motion == "poses" else ()
+    names = tuple(caller.name for caller in settings.callers)
+    measured = read_table(
+        folder / "measurements.csv",
+        MEASUREMENT,
+        optional=("bearing", "range", *STATED, CALLER),
+        in_order=False,
+        words={CALLER: names or ("a name that [[callers]] of log.toml have",)},
+    )
+    measured.column[CALLER] += 1.0  # the vehicle is number 0
+    told = {name: getattr(settings, name) for name in _SHARED}
+    told["callers"] = tuple(LogCaller(**caller.model_dump()) for caller in settings.callers)
     return assemble(
         read_table(folder / "odometry.csv", columns, optional=optional),
-        read_table(folder / "measurements.csv", MEASUREMENT, optional=("range", *STATED)),
+        measured,
         step=settings.step,
         name=folder.resolve().name,
         wheelbase=getattr(settings, "wheelbase", 1.0),
         control_std=tuple(getattr(settings, f"{name}_std") for name in stds),
-        **{name: getattr(settings, name) for name in _SHARED},
+        **told,
     )
 
 
@@ -196,20 +256,22 @@ def write_log(folder: Path, log: Log) -> None:
 
     own = OwnFiles(folder, LOG)
     own.clear(FILES)
-    settings = {"format": 1} | {name: getattr(log, name) for name in _SHARED}
+    settings: dict[str, Any] = {"format": 1} | {name: getattr(log, name) for name in _SHARED}
+    settings["callers"] = [asdict(caller) for caller in log.callers]
     stds = zip(_NOISY[log.motion], log.control_std, strict=True)
     settings |= {f"{name}_std": std for name, std in stds}
     if log.motion == "bicycle":
         settings["wheelbase"] = log.wheelbase
     model = _SETTINGS[log.motion].model_validate(settings)
-    text = tomli_w.dumps(model.model_dump(mode="json", exclude_defaults=True))
+    text = tomli_w.dumps(model.model_dump(mode="json", exclude_defaults=True, exclude_none=True))
     driven = _odometry_columns(log)
     own.write("odometry.csv", table_text(tuple(driven), *driven.values()))
     measured = _measurement_columns(log)
     own.write("measurements.csv", table_text(tuple(measured), *measured.values()))
     columns = {"odometry": ",".join(driven), "measurements": ",".join(measured)}
     held = _FOLLOWED if log.motion == "poses" else _HELD
-    own.write("README.md", _README.format(**columns, held=held))
+    more = _DETOURS if "detour" in measured else ""
+    own.write("README.md", _README.format(**columns, held=held) + more)
     own.write("log.toml", text)
 
 
@@ -229,6 +291,11 @@ def _read_settings(path: Path) -> _Settings:
 
 def _key_refusal(path: Path, fault: Any, model: type[_Settings]) -> InputError:
     known, name = model.model_fields, fault["loc"][0]
+    if name == "callers" and len(fault["loc"]) > 2:
+        return _caller_refusal(path, fault)
+    if name == "callers" and fault["type"] == "too_long":
+        found = f"{len(fault['input'])} callers"
+        return refusal(f"{path}, key 'callers'", found, f"at most {MOST_OTHERS}", "leave some out")
     if name in known and (count := values_expected(fault, known[name])) is not None:
         found = f"{len(fault['input'])} values"
         return refusal(f"{path}, key {name!r}", found, f"{count}", "mend the list")
@@ -241,6 +308,22 @@ def _key_refusal(path: Path, fault: Any, model: type[_Settings]) -> InputError:
         return refusal(path, f"the unknown key {key!r}", f"one of {', '.join(known)}", fix)
     found = shown(fault["input"])
     return refusal(f"{path}, key {key!r}", found, expectation(fault), "correct the value")
+
+
+def _caller_refusal(path: Path, fault: Any) -> InputError:
+    """Refuse a caller by its number, from 1 on, and key."""
+    _, number, name, *_ = fault["loc"]
+    key, known = f"callers.{number + 1}.{name}", _CallerTable.model_fields
+    if fault["type"] == "missing":
+        return refusal(path, f"no key {key!r}", "a name and a landmark", f"add {key!r}")
+    if fault["type"] == "extra_forbidden":
+        near = meant(name, known)
+        fix = f"did you mean {near!r}?" if near else "remove it"
+        return refusal(path, f"the unknown key {key!r}", f"one of {', '.join(known)}", fix)
+    expected = expectation(fault)
+    if name == "name" and fault["type"] == "string_pattern_mismatch":
+        expected = "letters, digits, _ and -"
+    return refusal(f"{path}, key {key!r}", shown(fault["input"]), expected, "correct the value")
 
 
 def _odometry_columns(log: Log) -> dict[str, np.ndarray]:
@@ -272,4 +355,7 @@ def _measurement_columns(log: Log) -> dict[str, np.ndarray]:
         values = np.concatenate(fields) if fields else np.empty(0)
         if name in MEASUREMENT or not np.isnan(values).all():
             column[name] = values
+    whose = np.concatenate([np.empty(0, dtype=np.int64), *(scan.caller for scan in log.scans)])
+    if log.callers and whose.any():
+        column[CALLER] = np.array(["", *(caller.name for caller in log.callers)])[whose]
     return column

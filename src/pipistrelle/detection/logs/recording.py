@@ -9,7 +9,7 @@ all formats, and here alone do recorded measurements become scans.
 
 import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,20 +18,46 @@ from jaxtyping import Float
 
 from pipistrelle.detection.logs.poses import motions_between
 from pipistrelle.detection.logs.text_tables import Table, check_unique, rows_kept
-from pipistrelle.detection.scans import UNLABELLED, Scan, make_scan
+from pipistrelle.detection.scans import NOBODY, OWN, UNLABELLED, Scan, make_scan
 from pipistrelle.geometry import wrap
 from pipistrelle.refusals import refusal
 
 MEASUREMENT = ("time", "landmark", "bearing", "range")
 """What is said of a measurement: when it was made, and the columns of its scan."""
-STATED = ("bearing_std", "range_std")
-"""What may be said besides: how surely it was measured."""
+STATED = ("bearing_std", "range_std", "detour", "detour_std")
+"""What may be said besides: how surely it was measured, and how much later than the direct call it
+came, as a way of sound."""
+CALLER = "caller"
+"""Whose call it was, where it was not the vehicle's own: a number, from 1 on."""
 
 _RESOLUTION = 1e-6  # [s], of the boundaries of merged steps
 _STEPS_MAX = 10_000_000
 _LATEST = 1e11  # [s], beyond the year 5000 if counted from 1970
 _LONGEST_GAP = 10.0  # [s], typically between two rows of odometry, or of the truth
 _UNITS = (1e-3, 1e-6, 1e-9)  # [s], of other clocks
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogCaller:
+    """Someone else whose calls were recorded.
+
+    Attributes
+    ----------
+    name : str
+        As rows have it.
+    landmark : int
+        The label that it bears as a landmark.
+    moves : bool
+        Then it is no landmark of the map, and rows of its label are left out.
+    place, place_std : (2) [m] or None
+        Where it stands, and how surely that is known, if it is.
+    """
+
+    name: str
+    landmark: int
+    moves: bool = False
+    place: tuple[float, float] | None = None
+    place_std: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,8 +87,12 @@ class Log:
     initial_pose, initial_pose_std : (3) [m, m, rad]
     range_std : [m]
     bearing_std : [rad]
+    detour_std : [m] or None
+        None: not said.
     range_bounds : (2) [m]
         Nearest and farthest range of a passive landmark.
+    callers : tuple of LogCaller
+        Whoever else called; the first is number 1 of the scans' callers.
     gate : float or None
         Share of a measurement's predicted distribution that is accepted; None: not said.
     ignored_rows : dict of str to int
@@ -84,7 +114,9 @@ class Log:
     initial_pose_std: tuple[float, float, float]
     range_std: float
     bearing_std: float
+    detour_std: float | None = None
     range_bounds: tuple[float, float]
+    callers: tuple[LogCaller, ...] = ()
     gate: float | None = None
     ignored_rows: dict[str, int]
     turned: int = 0
@@ -106,7 +138,8 @@ def assemble(
     odometry : Table of ``time`` and two controls, or of poses
         Of ``motion = "poses"`` as `motions_between` takes them.
     measurements : Table of ``time``, ``landmark``, ``bearing`` and ``range``
-        Perhaps with ``bearing_std`` and ``range_std``, NaN where nobody says.
+        Perhaps with ``bearing_std``, ``range_std``, ``detour``, ``detour_std`` and ``caller``, its
+        number, NaN where nobody says. A row without a bearing is a further detour of a landmark.
     step : [s]
         Length of the steps into which rows are merged; None: one step each.
     span : (start, end) [s]
@@ -124,7 +157,8 @@ def assemble(
     ------
     InputError
         If nothing of the odometry or of the measurements is left, a landmark is measured twice at
-        one time, or times can be no seconds; what `motions_between` refuses.
+        one time by the same call, a detour is of nobody's call, or times can be no seconds; what
+        `motions_between` refuses.
     """
     check_seconds(odometry)
     check_seconds(measurements, math.inf)
@@ -139,7 +173,8 @@ def assemble(
         controls = _mean_controls(stamp[last], np.column_stack(columns)[last], rows, time)
     clutter = measurements.column["landmark"] == UNLABELLED
     measurements = rows_kept(measurements, ~clutter)
-    check_unique(measurements, "time", "landmark")
+    measurements = _of_callers(measurements)
+    check_unique(measurements, "time", "landmark", besides=CALLER)
     stamp = measurements.column["time"]
     inside = (stamp >= time[0]) & (stamp <= time[-1])
     ignored = Counter(ignored_rows or {})
@@ -152,13 +187,15 @@ def assemble(
         expected = f"some of landmarks, between {time[0].item()!r} s and {time[-1].item()!r} s"
         fix = "use the odometry's clock" if len(stamp) else "label rows of landmarks"
         raise refusal(measurements.path, found, expected, fix)
-    said = (*MEASUREMENT, *(name for name in STATED if name in measurements.column))
+    said = (*MEASUREMENT, CALLER, *(name for name in STATED if name in measurements.column))
     measured = {name: measurements.column[name][inside] for name in said}
     return Log(
         time=time,
         controls=controls,
         dt=np.diff(time),
-        scans=_scans(time, measured, 0.0 if step is None else _RESOLUTION),
+        scans=_scans(
+            time, measured, 0.0 if step is None else _RESOLUTION, settings.get("callers", ())
+        ),
         ignored_rows={reason: count for reason, count in ignored.items() if count},
         turned=int(np.sum(np.abs(measured["bearing"]) > 2.0 * np.pi)),
         **settings,
@@ -229,18 +266,56 @@ def _mean_controls(
     return total / np.diff(time)[:, None]
 
 
+def _of_callers(measurements: Table) -> Table:
+    """Number the callers of all rows; refuse a detour of nobody's call, and rows of nothing."""
+    column, nothing = measurements.column, np.full(len(measurements.line), np.nan)
+    caller, detour = column.get(CALLER, nothing), column.get("detour", nothing)
+    unheard = np.isnan(column["bearing"]) & (np.isnan(detour) | ~np.isnan(column["range"]))
+    for wrong, found, expected, fix in (
+        (
+            unheard,
+            "bearing ''",
+            "a finite number, or a further detour alone, without a range",
+            "correct the field",
+        ),
+        (
+            ~np.isnan(detour) & np.isnan(caller),
+            "a detour of nobody's call",
+            "the name of a caller beside it",
+            "add it in the column 'caller', and to [[callers]] of log.toml",
+        ),
+    ):
+        if wrong.any():
+            where = f"{measurements.path}, line {measurements.line[int(np.argmax(wrong))]}"
+            raise refusal(where, found, expected, fix)
+    number = np.where(np.isnan(caller), OWN, caller).astype(np.int64)
+    return replace(measurements, column=column | {CALLER: number})
+
+
 def _scans(
-    time: np.ndarray, measured: dict[str, np.ndarray], resolution: float
+    time: np.ndarray,
+    measured: dict[str, np.ndarray],
+    resolution: float,
+    callers: tuple[LogCaller, ...],
 ) -> tuple[Scan, ...]:
-    """One scan for each time of measurement, at the end of the step that holds it."""
+    """One scan for each time of measurement, at the end of the step that holds it.
+
+    Rows without a bearing go to its end.
+    """
+    stamp = measured["time"]
+    order = np.lexsort((np.isnan(measured["bearing"]), stamp))
+    measured = {name: column[order] for name, column in measured.items()}
+    labels = np.array([UNLABELLED, *(caller.landmark for caller in callers)]) if callers else NOBODY
     stamp, bearing = measured["time"], measured["bearing"]
     said = measured | {
         "time": time[np.searchsorted(time, stamp - resolution)],
-        "bearing": np.where(np.abs(bearing) < np.pi, bearing, wrap(bearing)),
+        "bearing": np.where(~(np.abs(bearing) >= np.pi), bearing, wrap(bearing)),
     }
     cuts = np.flatnonzero(np.diff(stamp)) + 1
     parts = zip(*(np.split(column, cuts) for column in said.values()), strict=True)
     rows = (dict(zip(said, part, strict=True)) for part in parts)
     return tuple(
-        make_scan(**row | {"time": float(row["time"][0])}) for row in rows if row["time"].size
+        replace(make_scan(**row | {"time": float(row["time"][0])}), callers=labels)
+        for row in rows
+        if row["time"].size
     )

@@ -22,9 +22,11 @@ _ABOVE_ZERO = {
     "range": ("m", 1.0 / LARGEST, LARGEST),
     "bearing_std": ("rad", _LEAST_STD, 1e4),
     "range_std": ("m", _LEAST_STD, LARGEST),
+    "detour": ("m", 0.0, LARGEST),
+    "detour_std": ("m", _LEAST_STD, LARGEST),
     "radius": ("m", 1.0 / LARGEST, LARGEST),
 }
-"""What a column must be above zero in, at least and at most."""
+"""What a column is above zero in, or from there on, at least and at most."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,6 +53,7 @@ def read_table(
     *,
     separator: str | None = ",",
     optional: tuple[str, ...] = (),
+    in_order: bool = True,
     words: Mapping[str, tuple[str, ...]] = MappingProxyType({}),
 ) -> Table:
     r"""Read rows of numbers; blank lines and lines that begin with ``#`` are skipped.
@@ -66,8 +69,10 @@ def read_table(
     separator : str or None
         None: white space, and no header.
     optional : names
-        The columns whose fields may be empty. Those that are not among ``columns`` may follow them,
-        in this order; one that the header does not hold is empty in every row.
+        The columns whose fields may be empty. Those that are not among ``columns`` may follow them;
+        one that the header does not hold is empty in every row.
+    in_order : bool
+        Whether those that follow do so in this order.
     words : dict of column to words
         Columns that hold one of these words; their values are its place in the list.
 
@@ -96,7 +101,9 @@ def read_table(
         line, header = content.pop(0)
         names = [name.strip().strip('"') for name in header.split(separator)]
         more = tuple(name for name in optional if name not in columns)
-        if names != [*columns, *(name for name in more if name in names)]:
+        extra, there = names[len(columns) :], [name for name in more if name in names]
+        sound = extra == there if in_order else sorted(extra) == sorted(there)
+        if names[: len(columns)] != [*columns] or not sound:
             expected = f"the header {separator.join(columns)!r}"
             expected += f", perhaps followed by {', '.join(more)}" * bool(more)
             where, found = f"{path}, line {line}", repr(header[:80])
@@ -124,6 +131,7 @@ def table_text(columns: tuple[str, ...], *values: np.ndarray) -> str:
     ----------
     columns : names
     values : one (n) for each name
+        Numbers, or words without commas.
 
     Returns
     -------
@@ -135,8 +143,15 @@ def table_text(columns: tuple[str, ...], *values: np.ndarray) -> str:
     'landmark,range\n4,0.1\n7,\n'
     """
     rows = zip(*(column.tolist() for column in values), strict=True)
-    lines = [",".join("" if x != x else repr(x) for x in row) for row in rows]
+    lines = [",".join(map(_field, row)) for row in rows]
     return "\n".join([",".join(columns), *lines, ""])
+
+
+def _field(value: float | str) -> str:
+    """Write a field: NaN empty, words as they are."""
+    if isinstance(value, str):
+        return value
+    return "" if value != value else repr(value)
 
 
 def rows_kept(table: Table, kept: Bool[np.ndarray, " n"]) -> Table:
@@ -155,13 +170,15 @@ def rows_kept(table: Table, kept: Bool[np.ndarray, " n"]) -> Table:
     return replace(table, line=table.line[kept], column=column)
 
 
-def check_unique(table: Table, *names: str) -> None:
+def check_unique(table: Table, *names: str, besides: str | None = None) -> None:
     """Refuse a table of which two rows agree in all of these columns.
 
     Parameters
     ----------
     table : Table
     names : one or more columns
+    besides : str, optional
+        One more, of whole numbers, that a refusal does not tell.
 
     Raises
     ------
@@ -176,7 +193,8 @@ def check_unique(table: Table, *names: str) -> None:
     pipistrelle.config.InputError: x.csv, line 4: found landmark 4 again, expected it once, as in
     line 2; remove one of the rows
     """
-    key = np.column_stack([table.column[name] for name in names])
+    told = [table.column[name] for name in (*names, *([besides] if besides else []))]
+    key = np.column_stack(told)
     order = np.lexsort(key.T[::-1])
     same = ~np.diff(key[order], axis=0).any(axis=1)
     if same.any():
@@ -272,7 +290,7 @@ def _check_columns(table: Table) -> None:
         elif name in _ABOVE_ZERO:
             unit, least, most = _ABOVE_ZERO[name]
             wrong = (values < least) | (values > most)
-            from_here = f"from {least:g}" if least == _LEAST_STD else "above 0"
+            from_here = f"from {least:g}" if least in (_LEAST_STD, 0.0) else "above 0"
             promise = f"a {name} {from_here} {unit}, up to {most:g} {unit}"
         elif name in _LABELS:
             wrong = (values != np.rint(values)) | (values < UNLABELLED) | (values >= 2**53)

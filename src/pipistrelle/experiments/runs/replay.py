@@ -87,8 +87,9 @@ def as_heard_by(
     """Leave of recorded scans what a strategy would have heard.
 
     Inside the beam, where the absolute bearing is at most half its width, range and bearing are
-    heard actively. Outside it only the bearing is heard, passively. Fused takes both, active what
-    has a range, passive all bearings and no range. Without a beam nothing is outside it.
+    heard actively. Outside it only the bearing is heard, passively, and detours everywhere. Fused
+    takes both, active what has a range and no detours, passive all bearings and no range. Without a
+    beam nothing is outside it.
 
     Parameters
     ----------
@@ -117,8 +118,34 @@ def as_heard_by(
         hidden = (np.abs(scan.bearing) > limit) | (strategy == "passive")
         distance = np.where(hidden, np.nan, scan.range)
         kept = np.isfinite(distance) | (strategy != "active")
-        heard.append(rows_of(with_columns(scan, range=distance), kept))
+        taken = rows_of(with_columns(scan, range=distance), kept)
+        heard.append(without_detours(taken) if strategy == "active" else taken)
     return tuple(heard)
+
+
+def without_detours(scan: Scan) -> Scan:
+    """Forget of a scan how much later than direct calls echoes came, and rows that are but that.
+
+    Parameters
+    ----------
+    scan : Scan
+
+    Returns
+    -------
+    Scan
+
+    Examples
+    --------
+    >>> from pipistrelle.detection.scans import make_scan
+    >>> rows = np.array([8, 8]), np.array([0.4, np.nan])
+    >>> scan = make_scan(0.0, *rows, caller=np.array([1, 2]), detour=np.array([3.0, 5.0]))
+    >>> without_detours(scan).landmark, without_detours(scan).detour
+    (array([8]), array([nan]))
+    """
+    if np.isnan(scan.detour).all():
+        return scan
+    bearings = rows_of(scan, ~np.isnan(scan.bearing))
+    return with_columns(bearings, detour=math.nan, detour_std=math.nan)
 
 
 def motion_of(log: Log) -> Motion:
@@ -236,9 +263,12 @@ def replay(
         time=log.time,
         controls=log.controls,
         truth=truth,
+        moving=tuple(caller.landmark for caller in log.callers if caller.moves),
     )
     check_filters(filters, drive.motion, config)
     noise, scans = noise_of(config.filter), log.scans
+    if not config.listening.timing:
+        scans = list(map(without_detours, scans))
     if config.filter.noise == "constant":
         scans = list(map(unstated, scans))
     heard = {
