@@ -1,3 +1,4 @@
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -5,7 +6,8 @@ import pytest
 from PIL import Image
 
 from pipistrelle.config import InputError
-from pipistrelle.detection.scans import make_scan
+from pipistrelle.detection.scans import DETOUR, make_scan
+from pipistrelle.detection.scans import rows_of as rows_of_scan
 from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.figures.animation import _stage, animate_mission, pruned
 from pipistrelle.figures.recorder import MissionRecorder, Snapshot
@@ -123,6 +125,22 @@ def test_a_panel_shows_measurements_along_their_bearings_as_far_as_their_ranges(
     assert bearing == pytest.approx(frame.scan.bearing[ranged])
     tips = np.array([segment[1] for segment in panels[1].bearings.get_segments()])
     assert range_and_bearing(frame.pose, tips)[1] == pytest.approx(frame.scan.bearing[~ranged])
+
+
+def test_a_further_detour_of_a_landmark_has_no_direction_to_draw(recorder, mission):
+    frame = recorder.snapshots["fused", "ekf"][100]
+    old, k = frame.scan, len(frame.scan.landmark)
+    rows = np.append(np.arange(k), 0)
+    more = rows_of_scan(old, rows)
+    more.numbers[:2, k], more.numbers[DETOUR, k] = np.nan, 3.0
+    panels = []
+    for scan in (old, more):
+        _, (panel, *_) = _stage({("fused", "ekf"): [replace(frame, scan=scan)]}, **mission.scene)
+        panel._show_scan(panel.frames[0])
+        panels.append(panel)
+    for lines in ("ranges", "bearings"):
+        one, other = (getattr(panel, lines).get_segments() for panel in panels)
+        np.testing.assert_array_equal(one, other)
 
 
 def test_a_panel_shows_the_map_of_its_frame_and_rings_what_has_just_turned_full(recorder, mission):

@@ -7,14 +7,18 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 
+import pipistrelle
 from pipistrelle.__main__ import main
 from pipistrelle.config import Config
 from pipistrelle.detection.logs.folder import read_log
+from pipistrelle.detection.scans import COLUMNS
 from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS
 from pipistrelle.experiments.runs import replay
 from pipistrelle.experiments.runs.replay import motion_of
+from pipistrelle.settings import from_text
 from reference.command_line import SHORT, summary, track
 from reference.odometry import as_motions, poses_file
 
@@ -38,6 +42,49 @@ def test_a_run_and_its_log_give_one_track(obey, strategy, estimator, undrawn):
     (again,) = summary("two")["runs"]
     for score in ("position_rmse_m", "heading_rmse_rad", "nees_mean", "gated", "landmarks_full"):
         assert again[score] == pytest.approx(run[score], rel=1e-9)
+
+
+CHORUS = (
+    "[{}, {frequency = 25e3}, {name = 'boat', frequency = 20e3, course = 'circle', radius = 10}]"
+)
+
+
+@pytest.mark.parametrize("noise", ["constant", "measured"])
+def test_a_log_keeps_detours_and_whose_they_are_to_the_bit(obey, noise, undrawn):
+    told = ("--filter.noise", noise, "--filter.gate", "0.99")
+    words = ("--callers", CHORUS, "--listening.timing", "true", "--strategy", "fused")
+    obey("run", *SHORT, *words, *told, "--save-log", "log", "-o", "one")
+    settings = {"filter__noise": noise, "filter__gate": 0.99, "rays__spacing": "paper"}
+    timing = {"callers": from_text(CHORUS), "listening__timing": True}
+    ran = pipistrelle.run(
+        strategies="fused", duration=4, landmarks=10, **settings, **timing
+    )  # the same again: its scans are in no file
+    solved = pipistrelle.slam("log", **settings)
+    (one,), (two,) = ran._done.trials, solved._done.trials
+    assert [scan.time for scan in one.scans if scan.landmark.size] == [s.time for s in two.scans]
+    rows = 0
+    for scan, again in zip((s for s in one.scans if s.landmark.size), two.scans, strict=True):
+        assert scan.callers.tolist() == again.callers.tolist() == [-1, 11, 12, 13]
+        for name in set(COLUMNS) - {"level_db"}:
+            np.testing.assert_array_equal(getattr(scan, name), getattr(again, name))
+        rows += np.sum(np.isnan(scan.bearing))
+    assert rows > 0, "some landmark is lit up by two"
+    np.testing.assert_allclose(two.track.pose.mean, one.track.pose.mean, rtol=0, atol=1e-9)
+    assert ran.measurements.equals(solved.measurements)
+    assert {*solved.measurements["caller"].drop_nulls()} == {"beacon", "caller2", "boat"}
+
+
+def test_slam_listens_for_detours_where_there_are_some_unless_told_otherwise(obey, undrawn):
+    words = ("--listening.timing", "true", "--strategy", "fused")
+    obey("run", *SHORT, *words, "--save-log", "log", "-o", "one")
+    for more, timing in (((), True), (("--listening.timing", "false"), False)):
+        obey("slam", "log", *more, "--quiet", "-o", "two", "--overwrite")
+        heard = pl.read_parquet("two/measurements.parquet")
+        assert (heard["detour_m"].null_count() < heard.height) == timing
+        config = tomllib.loads(Path("two/config.toml").read_text())
+        assert config["listening"]["timing"] is timing
+    obey("slam", str(DATA / "unicycle_log"), "--quiet", "-o", "two", "--overwrite")
+    assert tomllib.loads(Path("two/config.toml").read_text())["listening"]["timing"] is False
 
 
 def told_by_poses(log, folder):
@@ -141,7 +188,7 @@ def test_slam_takes_the_settings_of_fastslam_from_flags_and_files_and_keeps_them
     stages = [line[:17].strip() for line in said.splitlines() if "frames/s" in line]
     assert stages == ["fused ekf", "fused fastslam"]
     kept = tomllib.loads(Path("2/config.toml").read_text())
-    assert list(kept) == ["seed", "filter", "rays", "fastslam"]
+    assert list(kept) == ["seed", "listening", "filter", "rays", "fastslam"]
     swarm = {"particles": 9, "resample_below": 0.5, "mixture": "exact", "weights": "marginal"}
     assert kept["fastslam"] == swarm
     words = ("--filter", "both", "--config", "2/config.toml", "--quiet")

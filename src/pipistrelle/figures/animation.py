@@ -28,7 +28,7 @@ from pipistrelle.figures.maps import (
     view,
 )
 from pipistrelle.figures.outlines import PLACED, RAY, beam, ellipses, vehicle
-from pipistrelle.figures.recorder import Snapshot
+from pipistrelle.figures.recorder import Snapshot, heard_from
 from pipistrelle.figures.style import INK, STYLE, TRUTH, strategy_colour
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def _times(
 def _symbols(snapshots: Mapping[tuple[str, str], Sequence[Snapshot]]) -> list[str]:
     """Name what is heard and believed in any of the frames, in the order of the legend."""
     frames = [frame for seen in snapshots.values() for frame in seen]
-    ranged = [np.isfinite(frame.scan.range) for frame in frames]
+    ranged = [np.isfinite(heard_from(frame.scan).range) for frame in frames]
     full = [placed(frame.landmarks) for frame in frames]
     rays = any(not rows.all() for rows in full)
     drawn = {
@@ -290,7 +290,7 @@ class _Panel:
 
     def _show_scan(self, frame: Snapshot) -> None:
         """Point to what was heard: as far as its range, or out of the map without one."""
-        scan, origin = frame.scan, frame.pose[:2]
+        scan, origin = heard_from(frame.scan), frame.pose[:2]
         angle, ranged = frame.pose[2] + scan.bearing, np.isfinite(scan.range)
         reach = np.where(ranged, scan.range, self.size)
         tip = origin + reach[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.detection.scans import Scan
+from pipistrelle.detection.scans import Scan, rows_of
 from pipistrelle.estimation.beliefs import Belief, Landmarks, ParticleCloud, Trajectory
 
 
@@ -35,6 +35,27 @@ class Snapshot:
     landmarks: Landmarks
     cloud: Float[np.ndarray, "p 3"] | None = None
     path: Float[np.ndarray, "t 2"] | None = None
+
+
+def heard_from(scan: Scan) -> Scan:
+    """Leave of a scan the rows that have a direction to draw: the others are further detours.
+
+    Parameters
+    ----------
+    scan : Scan
+
+    Returns
+    -------
+    Scan
+
+    Examples
+    --------
+    >>> from pipistrelle.detection.scans import make_scan
+    >>> rows = np.array([8, 8]), np.array([0.4, np.nan])
+    >>> heard_from(make_scan(0.0, *rows, detour=np.array([3.0, 5.0]))).landmark
+    array([8])
+    """
+    return rows_of(scan, ~np.isnan(scan.bearing))
 
 
 class MissionRecorder:

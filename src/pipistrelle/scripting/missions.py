@@ -42,7 +42,9 @@ class Done:
     trials : tuple of TrialResult
     truth : Truth
     callers : tuple of Caller
-        Who was heard besides the vehicle.
+        Who was heard besides the vehicle, where that is known.
+    names : tuple of str
+        As measurements name them.
     beamwidth : [rad] or None
         Of the vehicle's call.
     ignored_rows : dict
@@ -60,6 +62,7 @@ class Done:
     trials: tuple[TrialResult, ...]
     truth: Truth
     callers: tuple[Caller, ...] = ()
+    names: tuple[str, ...] = ()
     beamwidth: float | None = None
     ignored_rows: Mapping[str, int] = field(default_factory=dict)
     log: Mapping[str, object] | None = None
@@ -107,6 +110,7 @@ def simulated(
         trials=mission.trials,
         truth=mission.drive.truth,
         callers=mission.scenario.callers[1:],
+        names=tuple(caller.name for caller in mission.scenario.callers[1:]),
         beamwidth=beamwidth_of(config),
         beside=files,
         said=warnings_of(config, mission.scenario.callers),
@@ -161,6 +165,7 @@ def solved(
         seed=config.seed,
         trials=trials,
         truth=truth,
+        names=tuple(caller.name for caller in recorded.callers),
         beamwidth=beamwidth,
         ignored_rows=recorded.ignored_rows,
         log=log_entry(place, robot, beamwidth),
@@ -244,6 +249,7 @@ def keep(
         trials=done.trials,
         truth=done.truth,
         ignored_rows=dict(done.ignored_rows),
+        callers=done.names,
         beside=done.beside,
         log=done.log,
         draw=draw,

@@ -106,7 +106,7 @@ class Results:
 
     @property
     def measurements(self) -> "pl.DataFrame":
-        """A row for each measurement of each strategy; no range where it was passive."""
+        """A row for each measurement of each strategy; null is what was not measured."""
         return self._tables["measurements"]
 
     @cached_property
@@ -115,7 +115,7 @@ class Results:
         import polars as pl
 
         if self.folder is None:
-            return tables_of(self._done.trials, self._done.truth)
+            return tables_of(self._done.trials, self._done.truth, self._done.names)
         paths = {name: self.folder / f"{name}.parquet" for name in TABLES}
         tables = {}
         for name, path in paths.items():

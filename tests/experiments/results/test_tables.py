@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import Gaussian, Track
 from pipistrelle.evaluation.accuracy import pose_error, position_error
 from pipistrelle.evaluation.consistency import nees
@@ -140,5 +141,24 @@ def test_a_passive_measurement_has_no_range_in_the_table():
         scan_with([9], [0.4], [2.0], time=1.5),
     ]
     table = measurement_table(scans)
-    assert table.rows() == [(0.5, 3, 0.1, 7.0), (0.5, 9, -0.2, None), (1.5, 9, 0.4, 2.0)]
+    rows = table.select("time_s", "landmark", "bearing_rad", "range_m").rows()
+    assert rows == [(0.5, 3, 0.1, 7.0), (0.5, 9, -0.2, None), (1.5, 9, 0.4, 2.0)]
     assert table.schema["landmark"] == pl.Int64
+
+
+def test_detours_stand_beside_whose_call_it_was_and_are_null_where_there_are_none():
+    timed = make_scan(
+        1.0,
+        np.array([4, 4, 5]),
+        np.array([0.5, np.nan, 0.1]),
+        caller=np.array([1, 2, 0]),
+        detour=np.array([3.0, 7.0, np.nan]),
+        detour_std=0.2,
+    )
+    told = measurement_table([timed], ["beacon"])
+    assert told.schema == measurement_table([]).schema
+    assert told.select("bearing_rad", "detour_m", "detour_std_m", "caller").rows() == [
+        (0.5, 3.0, 0.2, "beacon"),
+        (None, 7.0, 0.2, "caller2"),
+        (0.1, None, None, None),
+    ]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.config import InputError
+from pipistrelle.detection.scans import rows_of as rows_of_scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.experiments.drives import NO_TRUTH
 from pipistrelle.figures.animation import pruned
@@ -41,6 +42,24 @@ def test_every_frame_of_every_estimate_is_there(watched, played):
             np.testing.assert_array_equal(numbers[:, :2], believed.mean)
             np.testing.assert_array_equal(numbers[:, 3], believed.covariance[:, 0, 1])
             np.testing.assert_array_equal(numbers[:, 5], believed.weight)
+
+
+def test_further_detours_are_not_drawn_and_leave_nothing_that_is_no_number(watched, played):
+    done, snapshots = watched
+    timed = {
+        key: [replace(frame, scan=with_detour(frame.scan)) for frame in frames]
+        for key, frames in snapshots.items()
+    }
+    for one, other in zip(playback(done, timed).estimates, played.estimates, strict=True):
+        np.testing.assert_array_equal(one.heard.numbers, other.heard.numbers)
+        assert np.isfinite(one.heard.numbers[:, 0]).all()
+
+
+def with_detour(scan):
+    """Return a scan with one row more, if it has any, which is but a detour."""
+    more = rows_of_scan(scan, np.append(np.arange(scan.landmark.size), 0)[: scan.landmark.size * 2])
+    more.numbers[:, scan.landmark.size :] = np.nan
+    return more
 
 
 def test_times_are_those_since_the_start_and_the_truth_is_that_of_the_frames(watched, played):

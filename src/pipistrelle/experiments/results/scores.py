@@ -162,6 +162,7 @@ def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Sc
     labels, positions = truth.landmarks or (np.empty(0, int), np.empty((0, 2)))
     mapped, true = scored_landmarks(estimate, labels, positions)
     finite = bool(np.all(np.isfinite(track.pose.mean)))
+    rows = sum(int(np.sum(~np.isnan(scan.bearing))) for scan in scans)
     return Scores(
         position_rmse_m=path.position_rmse_m,
         heading_rmse_rad=path.heading_rmse_rad,
@@ -175,7 +176,7 @@ def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Sc
         else diverged(np.array([worst]), limit),
         landmarks_full=int(np.sum(estimate.full)),
         landmarks_total=len(estimate.landmark),
-        measurements_per_frame=sum(len(s.landmark) for s in scans) / len(scans) if scans else None,
+        measurements_per_frame=rows / len(scans) if scans else None,
         gated=track.gated,
     )
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.detection.scans import Scan
+from pipistrelle.detection.scans import OWN, Scan
 from pipistrelle.estimation.beliefs import Landmarks, Track, placed
 from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
 from pipistrelle.evaluation.consistency import track_nees
@@ -196,24 +196,28 @@ def landmark_table(landmarks: Landmarks, true_landmarks: LabelledPoints | None) 
     )
 
 
-def measurement_table(scans: Sequence[Scan]) -> "pl.DataFrame":
+def measurement_table(scans: Sequence[Scan], callers: Sequence[str] = ()) -> "pl.DataFrame":
     """Lay out scans, one row per measurement.
 
     Parameters
     ----------
     scans : sequence of Scan
+    callers : sequence of str
+        Names of those who call besides the vehicle; the first is number 1.
 
     Returns
     -------
     DataFrame
-        ``range_m`` is null where the measurement is passive.
+        ``range_m`` is null where the measurement is passive, ``detour_m`` where nothing is known of
+        when it came, ``bearing_rad`` where a row is but a further detour, ``caller`` where it was
+        the vehicle's own call, or nobody says whose.
 
     Examples
     --------
     >>> from pipistrelle.detection.scans import make_scan
     >>> scan = make_scan(1.0, np.array([7]), np.array([0.5]))
     >>> measurement_table([scan]).rows()
-    [(1.0, 7, 0.5, None)]
+    [(1.0, 7, 0.5, None, None, None, None)]
     """
     import polars as pl
 
@@ -226,5 +230,20 @@ def measurement_table(scans: Sequence[Scan]) -> "pl.DataFrame":
             "landmark": joined([s.landmark for s in scans], np.int64),
             "bearing_rad": joined([s.bearing for s in scans], np.float64),
             "range_m": joined([s.range for s in scans], np.float64),
-        }
-    ).with_columns(pl.col("range_m").fill_nan(None))
+            "detour_m": joined([s.detour for s in scans], np.float64),
+            "detour_std_m": joined([s.detour_std for s in scans], np.float64),
+            "caller": [_name(j, callers) for s in scans for j in s.caller.tolist()],
+        },
+        schema_overrides={"caller": pl.String},
+    ).with_columns(
+        pl.col("bearing_rad", "range_m", "detour_m").fill_nan(None),
+        # Noise is stated of every row, whether it has a detour or not.
+        detour_std_m=pl.when(pl.col("detour_m").is_not_nan()).then("detour_std_m").fill_nan(None),
+    )
+
+
+def _name(number: int, callers: Sequence[str]) -> str | None:
+    """Return the name of a caller other than the vehicle; unless it is told, its number."""
+    if number == OWN:
+        return None
+    return callers[number - 1] if number <= len(callers) else f"caller{number}"

@@ -50,7 +50,8 @@ bearings counter-clockwise from the heading. S is the sensing strategy, F the fi
 | map_S_F.csv | final map with covariances; a partial landmark by its heaviest hypothesis |
 | steps.parquet | estimated and true poses, standard deviations, errors, NEES |
 | landmarks.parquet | every hypothesis of every landmark, beside the true positions |
-| measurements.parquet | what each strategy measured; no range where it was passive |
+| measurements.parquet | what each strategy measured; no range where it was passive; of echoes of \
+another's call the detour, where it is known |
 | mission.* | pictures |
 | worlds/ | the world that was heard, where it was one of your own |
 | view.html | the mission frame by frame, once `pipistrelle view` on this folder has made it |
@@ -80,6 +81,7 @@ def write_results(
     trials: Sequence[TrialResult],
     truth: Truth,
     ignored_rows: dict[str, int],
+    callers: Sequence[str] = (),
     beside: Mapping[str, bytes] = MappingProxyType({}),
     log: Mapping[str, object] | None = None,
     draw: Callable[[Path], None] = lambda _: None,
@@ -101,6 +103,8 @@ def write_results(
         At the times of the tracks; ``truth.tum`` leaves out what is not known.
     ignored_rows : dict
         Number of dropped log rows by reason.
+    callers : sequence of str
+        Names of those who call besides the vehicle.
     beside : dict of name to content, optional
         Other files, relative to the folder.
     log : mapping, optional
@@ -144,7 +148,7 @@ def write_results(
     if truth.path is not None:
         known = np.isfinite(truth.path).all(axis=1)
         own.write("truth.tum", tum_text(truth.time[known], truth.path[known]))
-    for name, table in tables_of(trials, truth).items():
+    for name, table in tables_of(trials, truth, callers).items():
         buffer = io.BytesIO()
         table.write_parquet(buffer)
         own.write(f"{name}.parquet", buffer.getvalue())
@@ -163,13 +167,17 @@ def write_results(
     own.write("summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
 
 
-def tables_of(trials: Sequence[TrialResult], truth: Truth) -> "dict[str, pl.DataFrame]":
+def tables_of(
+    trials: Sequence[TrialResult], truth: Truth, callers: Sequence[str] = ()
+) -> "dict[str, pl.DataFrame]":
     """Lay out the tables of a mission; trials of one strategy share their measurements.
 
     Parameters
     ----------
     trials : sequence of TrialResult
     truth : Truth
+    callers : sequence of str
+        Names of those who call besides the vehicle.
 
     Returns
     -------
@@ -188,7 +196,9 @@ def tables_of(trials: Sequence[TrialResult], truth: Truth) -> "dict[str, pl.Data
         "landmarks": [
             named(landmark_table(t.track.landmarks, truth.landmarks), **names) for t, names in both
         ],
-        "measurements": [named(measurement_table(s), strategy=name) for name, s in heard.items()],
+        "measurements": [
+            named(measurement_table(scans, callers), strategy=name) for name, scans in heard.items()
+        ],
     }
     return {name: pl.concat(parts) for name, parts in tables.items() if parts}
 

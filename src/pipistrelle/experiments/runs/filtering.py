@@ -11,7 +11,16 @@ from jaxtyping import Bool, Float
 from pipistrelle.config import InputError
 from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.noise import Noise, as_said
-from pipistrelle.detection.scans import BEARING, BEARING_STD, NUMBERS, RANGE, RANGE_STD, Scan
+from pipistrelle.detection.scans import (
+    BEARING,
+    BEARING_STD,
+    DETOUR,
+    DETOUR_STD,
+    NUMBERS,
+    RANGE,
+    RANGE_STD,
+    Scan,
+)
 from pipistrelle.estimation.association import Associate, told
 from pipistrelle.estimation.beliefs import (
     B,
@@ -62,7 +71,8 @@ def run_filter(
     Raises
     ------
     InputError
-        For a bearing or range that is no number, a row of which nobody says how sure it is, scans
+        For a row that is neither bearing nor detour, or no number, one of which nobody says how
+        sure it is, scans
         out of order or at a time that is not one of the drive's, labels that are none, or poses
         that are not one for each step.
     """
@@ -136,14 +146,15 @@ def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]
             "scans in the order of time"
         )
     numbers = _numbers(scans)
-    bearing, distance = numbers[BEARING], numbers[RANGE]
-    usable = np.isfinite(bearing)
+    bearing, distance, detour = numbers[BEARING], numbers[RANGE], numbers[DETOUR]
+    usable = np.isfinite(bearing) | (np.isnan(bearing) & np.isnan(distance) & ~np.isnan(detour))
     usable &= np.isnan(distance) | ((distance > 0.0) & (distance < np.inf))
+    usable &= ~(np.abs(detour) == np.inf)
     _refuse(
         scans,
         usable,
         "numbers that no filter can use, for the landmarks {}; expected finite bearings [rad] and "
-        "ranges above 0 [m], NaN where passive",
+        "ranges above 0 [m], NaN where passive; a row without a bearing has a detour [m] alone",
     )
     return steps.tolist()
 
@@ -152,13 +163,16 @@ def _refuse_unstated(scans: Sequence[Scan]) -> None:
     """Refuse rows of which nobody says how sure they are."""
     numbers = _numbers(scans)
     bearing_std, range_std = numbers[BEARING_STD], numbers[RANGE_STD]
-    stated = (bearing_std > 0.0) & (bearing_std < np.inf)
+    detour_std = numbers[DETOUR_STD]
+    stated = np.isnan(numbers[BEARING]) | ((bearing_std > 0.0) & (bearing_std < np.inf))
+    stated &= np.isnan(numbers[DETOUR]) | ((detour_std > 0.0) & (detour_std < np.inf))
     stated &= np.isnan(numbers[RANGE]) | ((range_std > 0.0) & (range_std < np.inf))
     _refuse(
         scans,
         stated,
         "no standard deviations above 0 for the landmarks {}; expected bearing_std [rad], and "
-        "range_std [m] where there is a range, as pipistrelle.detection.noise states them",
+        "range_std and detour_std [m] where there are such, as pipistrelle.detection.noise states "
+        "them",
     )
 
 

@@ -19,7 +19,7 @@ from pipistrelle.experiments.runs.again import Again
 from pipistrelle.figures.animation import pruned
 from pipistrelle.figures.maps import view
 from pipistrelle.figures.mission import outcome
-from pipistrelle.figures.recorder import Snapshot
+from pipistrelle.figures.recorder import Snapshot, heard_from
 
 MOST_FRAMES = 3000
 """Of a longer recording so many are shown, evenly spaced."""
@@ -304,7 +304,7 @@ def _rows(landmarks: Sequence[np.ndarray], numbers: Sequence[np.ndarray], column
 
 def _heard(frames: Sequence[Snapshot]) -> Rows:
     """Lay out what was heard."""
-    scans = [frame.scan for frame in frames]
+    scans = [heard_from(frame.scan) for frame in frames]
     numbers = [np.column_stack([scan.bearing, scan.range]) for scan in scans]
     return _rows([scan.landmark for scan in scans], numbers, 2)
 
