@@ -43,7 +43,7 @@ class Link:
         Whether to solve by QR factors, which cost twice as much as Cholesky's, for these were too
         coarse: some noise is so small beside another.
     crossed : bool
-        Whether bearings entered that had waited.
+        Whether bearings entered that had waited, or many detours.
     """
 
     before: "Link | None"
@@ -91,6 +91,7 @@ class Solver:
                 isam.update(step.factors, step.values)
                 for _ in range(ANEW if step.crossed else 0):
                     isam.update(force_relinearize=True)
+                isam.calculateEstimatePose2(pose_key(step.node))  # what is asked changes it
             self.at = link
         return isam
 
