@@ -19,12 +19,15 @@ class Everything:
 
     `legs` holds pairs of controls (k, 2) and durations (k); `rows` holds, of what was heard, the
     number of the leg at whose end it was (0: before any), label, bearing, range or NaN, and their
-    deviations; `priors` the place of each landmark about which it may be next to anywhere.
+    deviations; `priors` the place of each landmark about which it may be next to anywhere;
+    `detours`, of each, the number of the leg, the labels of landmark and caller, itself and its
+    deviation.
     """
 
-    def __init__(self, motion, start, legs, rows, priors, *, robust=False):
+    def __init__(self, motion, start, legs, rows, priors, *, detours=(), robust=False):
         self.start, self.robust, self.labels = start, robust, list(priors)
         self.rows = [row for row in rows if row[1] in priors]
+        self.detours = [one for one in detours if one[1] in priors and one[2] in priors]
         self.priors = np.array([priors[label] for label in self.labels]).reshape(-1, 2)
         self.legs, column = [], 3
         for controls, dt in legs:
@@ -79,6 +82,17 @@ class Everything:
                 J.append(np.array([dx, dy]) / d @ D / along)
             less = np.sqrt(min(1.0, BELIEVED / np.linalg.norm(r))) if self.robust else 1.0
             yield less * np.array(r), less * np.array(J)
+        for leg, label, caller, detour, along in self.detours:
+            pose, by_pose = mean[ends[leg]][:2], slope[ends[leg]][:2]
+            places = [self.first + 2 * self.labels.index(one) for one in (label, caller)]
+            (point, D), (call, E) = [(x[i : i + 2], np.eye(2, self.size, i)) for i in places]
+            over, by_over = length(call - point, E - D)
+            back, by_back = length(point - pose, D - by_pose)
+            straight, by_straight = length(call - pose, E - by_pose)
+            r = np.array([over + back - straight - detour]) / along
+            J = (by_over + by_back - by_straight)[None] / along
+            less = np.sqrt(min(1.0, BELIEVED / np.linalg.norm(r))) if self.robust else 1.0
+            yield less * r, less * J
 
     def stacked(self, x):
         """Return all that does not fit, with its derivatives, and what that loses in all."""
@@ -117,6 +131,12 @@ def huber(r):
     """Return what a part loses that is weighted as Huber has it, twice over as squares are."""
     size = np.linalg.norm(r)  # of r = sqrt(BELIEVED / n) times a misfit of n deviations
     return size**2 if size <= BELIEVED else 2.0 * size**2 - BELIEVED**2
+
+
+def length(way, slope):
+    """Return how long a way is, and its slope."""
+    far = np.hypot(*way)
+    return far, way / far @ slope
 
 
 def turned(heading):

@@ -9,6 +9,7 @@ from pipistrelle.estimation.smoother.legs import (
     NOWHERE,
     SMALLEST_STD,
     between,
+    carried,
     longer,
     placed,
     turned,
@@ -63,6 +64,20 @@ def test_ends_as_the_controls_have_them_leave_the_prediction():
     told, steps = between(ends, joint, LEG), placed(A, LEG)
     np.testing.assert_allclose(told.mean, steps.mean, rtol=0, atol=1e-12)
     np.testing.assert_allclose(told.covariance, steps.covariance, rtol=0, atol=2e-12)
+
+
+def test_what_is_known_of_the_start_and_of_what_stands_is_carried_to_the_end():
+    rng = np.random.default_rng(2)
+    L = rng.normal(size=(5, 5))
+    joint = L @ L.T
+    start = Gaussian(mean=A.mean, covariance=joint[:3, :3])
+    ends, expected = predicted_joint(start, LEG)
+    told = carried(A.mean, joint, LEG)
+    np.testing.assert_allclose(told[:3, :3], expected[3:, 3:], rtol=0, atol=1e-10)
+    np.testing.assert_array_equal(told[3:, 3:], joint[3:, 3:])
+    dx, dy = ends[1, :2] - A.mean[:2]
+    F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(told[:3, 3:], F @ joint[:3, 3:], rtol=0, atol=1e-12)
 
 
 def test_an_end_that_is_known_is_gone_through_and_what_led_to_it_is_moved_less():

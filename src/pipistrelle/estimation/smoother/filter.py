@@ -7,9 +7,12 @@ has moved. Poses are those from which something was heard (`legs` has the steps 
 
 A landmark enters with its first range, and else where two of its bearings cross clearly
 (`crossing`), with all its bearings so far: until then it waits, its bearings say nothing, and it
-counts as partial. It enters with a prior of `PRIOR_STD`, which says next to nothing and leaves no
-graph without a solution. What cannot be solved with new landmarks is solved without them: they go
-on waiting.
+counts as partial. Where the calls of another are timed, it enters with the first detour that makes
+its range sure (`placing`), for which its caller must be in the graph; a caller, likewise, by the
+detour over a landmark that is. A detour is a factor between pose, landmark and caller (`detours`),
+and waits, too, until both are there. What enters does so with a prior of `PRIOR_STD`, which says
+next to nothing and leaves no graph without a solution. What cannot be solved with new landmarks is
+solved without them: they go on waiting.
 
 ``robust`` takes each measurement by Huber's loss. What is believed at a frame is the pose of iSAM2;
 `SmootherBelief.path` and the map are the optimum of everything so far.
@@ -21,15 +24,17 @@ from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan, rows_of
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
-from pipistrelle.estimation.measurement import BELIEVED, measurement_jacobians, observe
+from pipistrelle.estimation.measurement import BELIEVED
 from pipistrelle.estimation.motion import Motion
-from pipistrelle.estimation.rays import gate_bounds, ray_members
+from pipistrelle.estimation.rays import ray_members
 from pipistrelle.estimation.smoother.crossing import Bearing, crossing
+from pipistrelle.estimation.smoother.detours import Detour, detour_factors, detours_of, parted
+from pipistrelle.estimation.smoother.gating import detours_inside, rows_inside
 from pipistrelle.estimation.smoother.graph import (
     Link,
     Solver,
@@ -50,10 +55,13 @@ from pipistrelle.estimation.smoother.legs import (
     symmetric,
     turned,
 )
-from pipistrelle.geometry import wrap_angle
+from pipistrelle.estimation.smoother.placing import Around, clues_of, placed_by
 
 PRIOR_STD = 20.0
 """Of a landmark about the place where it enters [m]."""
+MANY = 20
+"""Detours that had waited, beyond which all is linearised anew when they enter: they correct many
+poses at once, as do bearings that had waited (`graph.ANEW`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,6 +78,8 @@ class SmootherBelief:
     mapped : tuple of int
         Landmarks in the graph, in order of entry.
     waiting : dict of label to tuple of Bearing
+    detours : tuple of Detour
+        Those that wait, for their landmark or for their caller.
     gated : int
     rays : RayConfig
     solver : Solver
@@ -81,6 +91,7 @@ class SmootherBelief:
     link: Link
     mapped: tuple[int, ...] = ()
     waiting: Mapping[int, tuple[Bearing, ...]] = field(default_factory=dict)
+    detours: tuple[Detour, ...] = ()
     gated: int = 0
     rays: RayConfig
     solver: Solver
@@ -214,19 +225,31 @@ class Smoother:
             return belief
         here = _arrived(belief)
         if self.gate < 1.0 and belief.mapped:
-            here = _solved(here)
-            inside = _inside(here, scan, self.gate)
-            dropped = int(np.count_nonzero(~inside))
-            here, scan = replace(here, gated=here.gated + dropped), rows_of(scan, inside)
+            here, scan, detours = self._gated(_solved(here), scan)
+        else:
+            detours = detours_of(scan, here.link.node)
         for placing in (True, False):
-            heard = self._heard(here, scan, placing=placing)
+            heard = self._heard(here, scan, detours, placing=placing)
             try:
                 return _settled(heard)
             except RuntimeError:  # what entered cannot be solved
                 continue
         return _settled(here)
 
-    def _heard(self, here: SmootherBelief, scan: Scan, *, placing: bool) -> SmootherBelief:
+    def _gated(
+        self, here: SmootherBelief, scan: Scan
+    ) -> tuple[SmootherBelief, Scan, tuple[Detour, ...]]:
+        """Return what is inside the gate, and count what is not."""
+        isam, node, rows = here.solver.reach(here.link), here.link.node, scan.landmark.size
+        scan = rows_of(scan, rows_inside(isam, node, here.mapped, scan, self.gate))
+        heard = detours_of(scan, node)
+        detours = detours_inside(isam, here.mapped, heard, self.gate)
+        dropped = rows - scan.landmark.size + len(heard) - len(detours)
+        return replace(here, gated=here.gated + dropped), scan, detours
+
+    def _heard(
+        self, here: SmootherBelief, scan: Scan, detours: tuple[Detour, ...], *, placing: bool
+    ) -> SmootherBelief:
         """Add a frame's factors, and those of what it places, if it may, as a link."""
         link = _next_to(here)
         factors, values, node = link.factors, link.values, link.node
@@ -236,28 +259,40 @@ class Smoother:
         for label, bearing, distance, across, along in zip(
             *map(np.ndarray.tolist, columns), strict=True
         ):
+            if math.isnan(bearing):  # but a detour
+                continue
+            heard, passive = Bearing(node, bearing, across), math.isnan(distance)
             if label not in mapped:
-                if math.isnan(distance):
-                    queue = (*waiting.get(label, ()), Bearing(node, bearing, across))
-                    waiting[label], place = queue, crossing(poses, queue) if placing else None
-                else:
-                    place = _ahead(poses[node], bearing, distance)
+                place, sure = _ahead(poses[node], bearing, distance), False
+                if passive:
+                    waiting[label], place = (*waiting.get(label, ()), heard), None
+                    if placing:
+                        place, sure = _placed(here, poses, waiting[label], label, detours)
                 if place is None:
                     continue
                 mapped.append(label)
                 values.insert(landmark_key(label), place)
                 factors.add(_prior(label, place))
-                crossed |= label in here.waiting
+                crossed |= label in here.waiting and not sure
                 for earlier in waiting.pop(label, ()):
                     factors.add(self._bearing(earlier, label))
-                if math.isnan(distance):
+                if passive:
                     continue
-            if math.isnan(distance):
-                factors.add(self._bearing(Bearing(node, bearing, across), label))
+            if passive:
+                factors.add(self._bearing(heard, label))
             else:
                 factors.add(self._range(node, label, (bearing, distance), (across, along)))
-        link = replace(link, crossed=crossed)
-        return replace(here, link=link, mapped=tuple(mapped), waiting=waiting)
+        here = replace(here, link=replace(link, crossed=crossed))
+        return self._timed(replace(here, mapped=tuple(mapped), waiting=waiting), detours)
+
+    def _timed(self, here: SmootherBelief, detours: tuple[Detour, ...]) -> SmootherBelief:
+        """Add the detours to the last link whose ends are both in the graph; the others wait."""
+        link, known = here.link, set(here.mapped)
+        entering, late = parted((*here.detours, *detours), known)
+        for factor in detour_factors(entering, robust=self.robust):
+            link.factors.add(factor)
+        many = sum(one.node < link.node for one in entering) > MANY
+        return replace(here, link=replace(link, crossed=link.crossed or many), detours=late)
 
     def _bearing(self, heard: Bearing, label: int) -> gtsam.BearingFactor2D:
         """Return what a bearing says."""
@@ -333,39 +368,37 @@ def _settled(belief: SmootherBelief) -> SmootherBelief:
     return replace(belief, at=in_world(mean, isam.marginalCovariance(key)))
 
 
+def _known(here: SmootherBelief) -> Link | None:
+    """Return the last link that has been solved."""
+    last = here.link
+    return last if last.leg is None or last is here.solver.at else last.before
+
+
+def _placed(
+    here: SmootherBelief,
+    poses: Float[np.ndarray, "n 3"],
+    waiting: tuple[Bearing, ...],
+    label: int,
+    detours: tuple[Detour, ...],
+) -> tuple[Float[np.ndarray, "2"] | None, bool]:
+    """Return where one stands that was only ever heard, if it shows, and whether by a detour."""
+    known, clues = _known(here), clues_of(label, detours, here.mapped)
+    if clues and known is not None:
+        leg, isam = None if known is here.link else here.link.leg, here.solver.reach(known)
+        around = Around(isam=isam, node=known.node, leg=leg, pose=here.at.mean)
+        place = placed_by(around, waiting[-1], label, clues)
+        if place is not None:
+            return place, True
+    return crossing(poses, waiting), False
+
+
 def _poses(here: SmootherBelief) -> Float[np.ndarray, "n 3"]:
     """Return the graph's poses by their numbers, the last as it is expected."""
-    last = here.link
-    known = last if last.leg is None or last is here.solver.at else last.before
+    last, known = here.link, _known(here)
     poses = np.empty((0, 3))
     if known is not None:
         poses = gtsam.utilities.extractPose2(here.solver.reach(known).calculateEstimate())
     return np.vstack([poses[: last.node], here.at.mean])
-
-
-def _inside(here: SmootherBelief, scan: Scan, gate: float) -> Bool[np.ndarray, " m"]:
-    """Tell which measurements are inside a share of their predicted distribution, or are new."""
-    isam, key = here.solver.reach(here.link), pose_key(here.link.node)
-    pose = pose_of(isam.calculateEstimatePose2(key))
-    bounds, inside = gate_bounds(gate), np.ones(scan.landmark.size, bool)
-    M = np.eye(5)
-    M[:3, :3] = turned(pose[2])
-    for m, label in enumerate(scan.landmark.tolist()):
-        if label not in here.mapped:
-            continue
-        other = landmark_key(label)
-        point = np.array(isam.calculateEstimatePoint2(other))
-        told = isam.jointMarginalCovariance([key, other])
-        joint = np.block([[told.at(a, b) for b in (key, other)] for a in (key, other)])
-        near, expected, _, _, _ = observe(*pose, *point)
-        H = np.hstack(measurement_jacobians(pose, point)) @ M
-        off = np.array([scan.range[m] - near, wrap_angle(scan.bearing[m] - expected)])
-        R = np.square([scan.range_std[m], scan.bearing_std[m]])
-        rows = slice(1, 2) if math.isnan(scan.range[m]) else slice(0, 2)
-        S = (H @ joint @ H.T + np.diag(R))[rows, rows]
-        squared = float(off[rows] @ np.linalg.solve(S, off[rows]))
-        inside[m] = squared <= bounds[len(off[rows]) - 1]
-    return inside
 
 
 def _ahead(pose: Float[np.ndarray, "3"], bearing: float, distance: float) -> np.ndarray:

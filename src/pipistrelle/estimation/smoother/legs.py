@@ -94,6 +94,37 @@ def placed(start: Gaussian, leg: Leg) -> Gaussian:
     return Gaussian(mean=_composed(start.mean, leg.mean), covariance=symmetric(covariance))
 
 
+def carried(
+    start: Float[np.ndarray, "3"], joint: Float[np.ndarray, "d d"], leg: Leg
+) -> Float[np.ndarray, "d d"]:
+    """Return the covariance of a leg's end and of what stands, from that of its start and this.
+
+    Parameters
+    ----------
+    start : (3) [m, m, rad]
+        The pose from which it leads.
+    joint : (d, d)
+        The pose's covariance stands first.
+    leg : Leg
+
+    Returns
+    -------
+    (d, d)
+
+    Examples
+    --------
+    >>> ahead = Leg(mean=np.array([[2.0, 0.0, 0.0]]), covariance=0.01 * np.eye(3)[None])
+    >>> turn = np.diag([0.0, 0.0, 0.01, 0.0, 0.0])
+    >>> carried(np.zeros(3), turn, ahead).diagonal()
+    array([0.01, 0.05, 0.02, 0.  , 0.  ])
+    """
+    F, M = np.eye(len(joint)), turned(start[2])
+    F[:3, :3] = _moved_by_start(start, leg.mean[-1:])[0]
+    ahead = F @ joint @ F.T
+    ahead[:3, :3] += M @ leg.covariance[-1] @ M.T
+    return ahead
+
+
 def between(ends: Float[np.ndarray, "2 3"], joint: Float[np.ndarray, "6 6"], leg: Leg) -> Gaussian:
     """Return a leg's poses when those at its ends are known, (m, 3) and (m, 3, 3).
 

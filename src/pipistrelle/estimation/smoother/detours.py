@@ -1,0 +1,205 @@
+r"""Detours in the graph: one factor for all that a frame tells of them, and detours that wait.
+
+A detour :math:`e = |b - l| + |l - p| - |b - p|` is a factor between the pose from which it was
+heard, the landmark l and the caller b, which is a landmark of the graph too. GTSAM has none such,
+so it calls us back. It does so once for a frame: a factor holds all its detours, and a kernel works
+out their misfits and slopes together. A factor for each detour says the same and calls back twenty
+times as often. Nothing is filled in that would be empty else: what was heard from one pose hangs
+together anyway once the solver has eliminated the pose.
+
+Huber's loss is taken of each detour by itself, within the factor. As in GTSAM, an error is
+:math:`\sqrt{2 \rho(z)}` for whom asks how well all fits, and :math:`\sqrt{w} z` with
+:math:`\sqrt{w} J` for whom asks for slopes, with
+
+.. math:: z = \frac{e - \hat e}{\sigma}, \quad w = \min(1, k / |z|), \quad
+          \rho = \tfrac12 z^2 \text{ or } k |z| - \tfrac12 k^2 .
+
+A detour whose landmark or caller is not in the graph yet waits (`Detour`), and enters when both
+are. No more than `MOST` wait: beyond, the oldest are dropped.
+"""
+
+import math
+from collections.abc import Collection, Iterable
+from itertools import groupby
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.measurement import BELIEVED, columns_of, detour_slopes, detours
+from pipistrelle.estimation.smoother.graph import landmark_key, pose_key
+from pipistrelle.jit import kernel
+
+MOST = 1000
+"""Detours that may wait: those of some fifty frames."""
+
+
+class Detour(NamedTuple):
+    """What was heard of a detour: from which pose, over which landmark, of whose call [m]."""
+
+    node: int
+    landmark: int
+    caller: int
+    detour: float
+    std: float
+
+
+def detours_of(scan: Scan, node: int) -> tuple[Detour, ...]:
+    """Return the detours of a scan that was heard from a pose.
+
+    Parameters
+    ----------
+    scan : Scan
+    node : int
+        Number of the pose.
+
+    Returns
+    -------
+    tuple of Detour
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> from pipistrelle.detection.scans import make_scan
+    >>> timed = {"caller": 1, "detour": 3.0, "detour_std": 0.5}
+    >>> scan = make_scan(0.0, np.array([4]), np.zeros(1), **timed)
+    >>> detours_of(replace(scan, callers=np.array([-1, 9])), 7)
+    (Detour(node=7, landmark=4, caller=9, detour=3.0, std=0.5),)
+    """
+    if scan.callers.size == 0:
+        return ()
+    found = detours(columns_of(scan))
+    columns = found.landmark, found.caller, found.detour, np.sqrt(found.variance)
+    return tuple(Detour(node, *row) for row in zip(*map(np.ndarray.tolist, columns), strict=True))
+
+
+def parted(
+    heard: Iterable[Detour], mapped: Collection[int]
+) -> tuple[tuple[Detour, ...], tuple[Detour, ...]]:
+    """Part detours that may enter the graph from those that wait, of which the newest are kept.
+
+    Parameters
+    ----------
+    heard : iterable of Detour
+        The newest last.
+    mapped : collection of int
+        Landmarks in the graph.
+
+    Returns
+    -------
+    entering, waiting : tuple of Detour
+        In the order in which they were heard.
+
+    Examples
+    --------
+    >>> heard = [Detour(0, 4, 9, 3.0, 0.5), Detour(1, 5, 9, 2.0, 0.5)]
+    >>> [[one.landmark for one in part] for part in parted(heard, {4, 9})]
+    [[4], [5]]
+    """
+    entering, waiting = [], []
+    for one in heard:
+        ready = one.landmark in mapped and one.caller in mapped
+        (entering if ready else waiting).append(one)
+    return tuple(entering), tuple(waiting[-MOST:])
+
+
+def detour_factors(heard: Iterable[Detour], *, robust: bool) -> list[gtsam.CustomFactor]:
+    """Return what detours say: a factor for those that were heard from one pose.
+
+    Parameters
+    ----------
+    heard : iterable of Detour
+        Those of one pose follow one another.
+    robust : bool
+        Whether one that surprises counts less.
+
+    Returns
+    -------
+    list of CustomFactor
+
+    Examples
+    --------
+    >>> heard = [Detour(0, 4, 9, 3.0, 0.5), Detour(0, 5, 9, 2.0, 0.5), Detour(3, 4, 9, 2.0, 0.5)]
+    >>> [len(factor.keys()) for factor in detour_factors(heard, robust=False)]
+    [4, 3]
+    """
+    return [
+        _factor(node, list(rows), BELIEVED if robust else math.inf)
+        for node, rows in groupby(heard, key=lambda one: one.node)
+    ]
+
+
+def _factor(node: int, rows: list[Detour], believed: float) -> gtsam.CustomFactor:
+    """Return the factor of detours that were heard from one pose."""
+    points = sorted({one.landmark for one in rows} | {one.caller for one in rows})
+    place = {label: k for k, label in enumerate(points)}
+    ends = np.array([[place[one.landmark], place[one.caller]] for one in rows], dtype=np.int64)
+    told = np.array([[one.detour, one.std] for one in rows])
+    vehicle, others = pose_key(node), [landmark_key(label) for label in points]
+
+    def misfit(
+        _: gtsam.CustomFactor, values: gtsam.Values, slopes: gtsam.JacobianVector | None
+    ) -> Float[np.ndarray, " d"]:
+        pose = values.atPose2(vehicle)
+        places = np.concatenate(list(map(values.atPoint2, others))).reshape(-1, 2)
+        at = pose.x(), pose.y(), pose.theta()
+        if slopes is None:
+            return losses(at, places, ends, told, believed)
+        r, by_pose, by_place = misfits(at, places, ends, told, believed)
+        slopes[:] = gtsam.JacobianVector([by_pose, *by_place])  # one by one takes twice as long
+        return r
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(rows)), [vehicle, *others], misfit)
+
+
+@kernel
+def losses(
+    at: tuple[float, float, float],
+    places: Float[np.ndarray, "n 2"],
+    ends: Int[np.ndarray, "d 2"],
+    told: Float[np.ndarray, "d 2"],
+    believed: float,
+) -> Float[np.ndarray, " d"]:
+    """Roots of what detours lose, twice over, with the sign of their misfits.
+
+    ``at`` is the pose; the rows of ``ends`` number landmark and caller among the places, those of
+    ``told`` are the detour and its standard deviation.
+    """
+    r = np.empty(len(ends))
+    for i in range(len(ends)):
+        (px, py), (bx, by) = places[ends[i, 0]], places[ends[i, 1]]
+        expected, _, _, _, _ = detour_slopes(at[0], at[1], px, py, bx, by)
+        z = (expected - told[i, 0]) / told[i, 1]
+        far = abs(z)
+        r[i] = z if far <= believed else z / far * math.sqrt(believed * (2.0 * far - believed))
+    return r
+
+
+@kernel
+def misfits(
+    at: tuple[float, float, float],
+    places: Float[np.ndarray, "n 2"],
+    ends: Int[np.ndarray, "d 2"],
+    told: Float[np.ndarray, "d 2"],
+    believed: float,
+) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d 3"], Float[np.ndarray, "n d 2"]]:
+    """Misfits of detours and their slopes, weighted as Huber's loss has it; see `losses`.
+
+    The slopes are by the pose, in its own axes, and by each place.
+    """
+    c, s, count = math.cos(at[2]), math.sin(at[2]), len(ends)
+    r, by_pose, by_place = np.empty(count), np.zeros((count, 3)), np.zeros((len(places), count, 2))
+    for i in range(count):
+        landmark, caller = ends[i]
+        (px, py), (bx, by) = places[landmark], places[caller]
+        expected, u, v, p, q = detour_slopes(at[0], at[1], px, py, bx, by)
+        z = (expected - told[i, 0]) / told[i, 1]
+        less = math.sqrt(believed / abs(z)) if abs(z) > believed else 1.0
+        r[i], scale = less * z, less / told[i, 1]
+        u, v, p, q = scale * u, scale * v, scale * p, scale * q
+        by_place[landmark, i], by_place[caller, i] = (u, v), (p, q)
+        by_pose[i, 0] = -c * (u + p) - s * (v + q)
+        by_pose[i, 1] = s * (u + p) - c * (v + q)
+    return r, by_pose, by_place

@@ -1,0 +1,58 @@
+"""Made-up missions whose callers are heard to call: echoes come later than calls, by a detour."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from pipistrelle.detection.scans import DETOUR, DETOUR_STD, NUMBERS, Scan
+
+
+def detours_to(points, vehicle, caller):
+    """How much longer the way over each point (n, 2) is than that straight from the caller."""
+    over = np.hypot(*(points - caller).T) + np.hypot(*(points - vehicle).T)
+    return over - np.hypot(*(caller - vehicle))
+
+
+def timed(mission, callers, rng, *, std=0.05, off=None):
+    """Return a mission whose echoes have detours of callers, each a landmark by its label.
+
+    A row has that of the first caller, unless it is heard from there; those of others are rows
+    without a bearing. All are told to be good to `std`, and off by it, or by `off`.
+    """
+    off = std if off is None else off
+    scans = [
+        _timed(scan, mission.path[k][:2], mission.landmarks, callers, rng, std, off)
+        for k, scan in enumerate(mission.scans, start=1)
+    ]
+    return replace(mission, scans=scans)
+
+
+def _timed(scan, vehicle, landmarks, callers, rng, std, off):
+    """Give a scan the detours over what is in it, of all callers that are in it."""
+    numbers, landmark, caller = (
+        [scan.numbers.copy()],
+        [scan.landmark],
+        [np.zeros_like(scan.landmark)],
+    )
+    first = numbers[0]
+    for k, label in enumerate(callers, start=1):
+        over = np.flatnonzero(scan.landmark != label)
+        if label not in scan.landmark:
+            continue
+        heard = detours_to(landmarks[scan.landmark[over] - 1], vehicle, landmarks[label - 1])
+        heard = heard + rng.normal(0.0, off, over.size)
+        if k == 1:
+            first[DETOUR, over], first[DETOUR_STD, over], caller[0][over] = heard, std, k
+        else:
+            more = np.full((NUMBERS, over.size), np.nan)
+            more[DETOUR], more[DETOUR_STD] = heard, std
+            numbers.append(more)
+            landmark.append(scan.landmark[over])
+            caller.append(np.full(over.size, k))
+    return Scan(
+        time=scan.time,
+        landmark=np.concatenate(landmark),
+        caller=np.concatenate(caller),
+        numbers=np.concatenate(numbers, axis=1),
+        callers=np.array([-1, *callers]),
+    )
