@@ -13,7 +13,7 @@ from fuzz.judging import Tried, contents, faults_of, lost, unsound_results
 from fuzz.logs import DATA, DRAWN
 from fuzz.mutations import FACTORS, HUGE, NUMBERS, VALUES, WORDS, one_of, short, spoiled
 from fuzz.running import Ending, command, undrawn
-from pipistrelle.settings import Key, known_settings
+from pipistrelle.settings import CALLERS, Key, known_settings
 
 COUNTS = ("-1", "0", "1", "2", "3", "1.5", "1e12", "9223372036854775807", "9223372036854775808")
 """Of things that each take time: none that would rightly take long."""
@@ -47,6 +47,25 @@ HEADS = {
 """What a plan's own keys may be given."""
 
 
+CALLER = {
+    "name": ("'boat'", "'a b'", "'vehicle'", "''", "1", "[]"),
+    "frequency": ("25e3", "25000", "26e3", "35e3", "0", "-5e3", "1e12", "nan", "'high'"),
+    "level_db": ("40", "-301", "inf", "'loud'", "[]"),
+    "place": ("[1, 2]", "[0.0, -7.408]", "[1e9, 0]", "[1e12, 0]", "[1]", "3", "[nan, 0]"),
+    "distance": ("4", "7.4", "0", "1e-300", "1e9"),
+    "course": ("'circle'", "'walk'", "'line'", "1"),
+    "radius": ("5.0", "1e-9", "1e9", "-1"),
+    "centre": ("[1, 2]", "[]"),
+    "speed": ("0.5", "-0.5", "0", "343.0", "1e9"),
+    "speed_std": ("0.3", "1e9", "0"),
+    "memory": ("3.0", "1e-9", "1e9"),
+    "waypoints": ("[[1, 2], [3, 4]]", "[[1, 2]]", "[]", "[1, 2]", "[[1, 2], [1, 2]]"),
+    "route": ("'nowhere.csv'", "'.'", "'odd.toml'", "[[0, 1, 2], [1, 3, 4]]", "[[0, 1, 2]]"),
+    "colour": ("1",),
+}
+"""What a caller may be told to be."""
+
+
 @dataclass(frozen=True, slots=True)
 class Odd:
     """A setting, and what it is given: as a file has it."""
@@ -60,8 +79,12 @@ class Odd:
 
 def odd_setting(rng: Generator) -> Odd:
     """Draw a setting, and an odd value for it."""
-    key = one_of(rng, [*known_settings()])
+    key = one_of(rng, [*known_settings(), CALLERS, CALLERS])
     field = known_settings()[key]
+    if key == CALLERS and rng.random() < 0.9:
+        return Odd(
+            key, f"[{', '.join(_caller(rng) for _ in range(one_of(rng, [0, 1, 2, 2, 3, 8])))}]"
+        )
     if isinstance(field.default, str):
         choices = [*map(repr, get_args(field.annotation)), "''", "'x'", "1", "true", "[]"]
         return Odd(key, one_of(rng, choices))
@@ -79,6 +102,12 @@ def odd_setting(rng: Generator) -> Odd:
     return Odd(key, _number(rng, key, 1.0 if field.default is None else field.default))
 
 
+def _caller(rng: Generator) -> str:
+    """Draw a table of a caller, odd or not."""
+    keys = rng.permutation([*CALLER])[: one_of(rng, [0, 1, 2, 3])].tolist()
+    return f"{{{', '.join(f'{key} = {one_of(rng, CALLER[key])}' for key in keys)}}}"
+
+
 def _number(rng: Generator, key: Key, default: float) -> str:
     """Draw an odd number in place of another."""
     if isinstance(default, int) and key != ("seed",):
@@ -94,6 +123,8 @@ def toml(values: dict[Key, str], above: str = "") -> str:
 
 def flags(odd: Odd) -> list[str]:
     """Give a setting as a flag."""
+    if odd.key == CALLERS:
+        return ["--callers", odd.value]
     words = odd.value.strip("[]").replace(",", " ").split() if odd.value[:1] == "[" else [odd.value]
     words = [word.strip("'\"") for word in words]
     return ["--" + ".".join(odd.key).replace("_", "-"), *words]

@@ -167,8 +167,9 @@ def driven(
         Its steps, their length, and the speed between way-points.
     motion : Motion
     rng : Generator
-    bias : (speed [m/s], steering angle [rad] or angular rate [rad/s])
-        What the vehicle does beyond what it is told, noise apart.
+    bias : two numbers
+        What the vehicle does beyond what it is told, noise apart: of speed [m/s], and of steering
+        angle [rad] or angular rate [rad/s].
 
     Returns
     -------

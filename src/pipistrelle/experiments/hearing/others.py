@@ -64,19 +64,26 @@ def with_routes(layer: Layer) -> Layer:
     if CALLERS not in layer:
         return layer
     given = layer[CALLERS]
-    return layer | {CALLERS: given._replace(value=routes_read(given.value))}
+    return layer | {CALLERS: given._replace(value=routes_read(given.value, given.where))}
 
 
-def routes_read(callers: Any) -> Any:
+def routes_read(callers: Any, where: str) -> Any:
     """Put rows in place of files, as `with_routes`, in what is given as callers, sound or not.
 
     Parameters
     ----------
     callers : object
+    where : str
+        They were given, for a refusal.
 
     Returns
     -------
     object
+
+    Raises
+    ------
+    InputError
+        As `with_routes`.
     """
     if not isinstance(callers, (list, tuple)):
         return callers
@@ -85,17 +92,20 @@ def routes_read(callers: Any) -> Any:
         for one in callers
     ]
     return [
-        one | {"route": _rows(Path(one["route"]))}
+        one | {"route": _rows(one["route"], f"{where}.{number}.route")}
         if isinstance(one, dict) and isinstance(one.get("route"), str)
         else one
-        for one in tables
+        for number, one in enumerate(tables, start=1)
     ]
 
 
-def _rows(path: Path) -> list[list[float]]:
+def _rows(path: str, where: str) -> list[list[float]]:
     """Read a route."""
-    table = read_table(path, ("time", "x", "y"))
-    check_unique(table, "time")
+    try:
+        table = read_table(Path(path), ("time", "x", "y"))
+        check_unique(table, "time")
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
     return np.column_stack([*table.column.values()]).tolist()
 
 
@@ -287,7 +297,7 @@ def _route(
     one: CallerConfig, around: Around, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "t 2"]:
     """Be where the route says, and stand before its first time and after its last."""
-    rows = _rows(Path(one.route)) if isinstance(one.route, str) else one.route
+    rows = _rows(one.route, "callers") if isinstance(one.route, str) else one.route
     time, *place = np.array(rows).T
     return np.column_stack([np.interp(around.time, time, column) for column in place])
 

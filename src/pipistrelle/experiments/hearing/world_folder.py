@@ -456,5 +456,6 @@ def _callers(path: Path, told: Any) -> tuple[tuple[CallerConfig, ...] | None, li
                 where = f"{path}: callers.{number}.route"
                 raise refusal(where, shown(route), expected, "put it there")
             files.append(route)
-    given = Given(routes_read(beside(path, told)), f"{path}: callers")
+    where = f"{path}: callers"
+    given = Given(routes_read(beside(path, told), where), where)
     return resolve({CALLERS: given}).callers, files

@@ -247,7 +247,8 @@ def _read(path: Path, key: Key, values: Any, worlds: dict[str, World]) -> Any:
     if key == WORLD_KEY:
         return _worlds(path, values, worlds)
     if key == CALLERS and isinstance(values, list):
-        return [routes_read(beside(path, callers)) for callers in values]
+        where = f"{path}: grid.callers"
+        return [routes_read(beside(path, callers), where) for callers in values]
     return values
 
 
