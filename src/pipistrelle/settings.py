@@ -326,10 +326,10 @@ def resolve(layer: Layer) -> Config:
 
 
 def _plain(value: Any) -> Any:
-    """Return what JSON has not as what it has: of settings a table, of all else text."""
+    """Return what JSON has not as what it has: settings, NumPy's numbers, all else as text."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", exclude_none=True)
-    return str(value)
+    return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 def to_toml(config: Config) -> str:
@@ -511,11 +511,6 @@ def _layer(
             fix = f"did you mean {names[near]}?" if near else "see `pipistrelle config show`"
             raise InputError(f"{where}: no such setting; {fix}")
     return layer
-
-
-def _plain(value: Any) -> Any:
-    """Return an array or a number of NumPy's as Python's own, anything else as text."""
-    return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 def from_text(text: str) -> Any:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipistrelle.detection.scans import DETOUR, DETOUR_STD, NUMBERS, Scan
+from pipistrelle.detection.scans import COLUMNS, DETOUR, DETOUR_STD, NUMBERS, make_scan
 
 
 def detours_to(points, vehicle, caller):
@@ -49,10 +49,6 @@ def _timed(scan, vehicle, landmarks, callers, rng, std, off):
             numbers.append(more)
             landmark.append(scan.landmark[over])
             caller.append(np.full(over.size, k))
-    return Scan(
-        time=scan.time,
-        landmark=np.concatenate(landmark),
-        caller=np.concatenate(caller),
-        numbers=np.concatenate(numbers, axis=1),
-        callers=np.array([-1, *callers]),
-    )
+    columns = dict(zip(COLUMNS[2:], np.concatenate(numbers, axis=1), strict=True))
+    made = make_scan(scan.time, np.concatenate(landmark), caller=np.concatenate(caller), **columns)
+    return replace(made, callers=np.array([-1, *callers]))

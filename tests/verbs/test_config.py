@@ -67,5 +67,6 @@ def test_flags_go_over_the_environment_over_the_file(settings, monkeypatch):
 def test_the_schema_says_what_every_setting_means(obey):
     schema = json.loads(obey("config", "schema")[1])
     sections = schema["$defs"].values()
-    assert len(sections) == sum(type(v) is dict for v in Config().model_dump().values())
+    listed = 1  # those of a caller, of which there may be several
+    assert len(sections) == sum(type(v) is dict for v in Config().model_dump().values()) + listed
     assert all("description" in field for s in sections for field in s["properties"].values())

@@ -48,7 +48,8 @@ def test_the_help_of_slam_leaves_out_what_a_log_decides(obey):
     rays = ("ratio", "density", "prune", "power", "weights", "partial", "likelihood", "spacing")
     swarm = ("particles", "resample-below", "mixture", "weights")
     assert found == {
-        *(f"--filter.{name}" for name in ("noise", "robust")),
+        "--listening.timing",
+        *(f"--filter.{name}" for name in ("noise", "detour-std", "robust")),
         *(f"--rays.{name}" for name in rays),
         *(f"--fastslam.{name}" for name in swarm),
     }

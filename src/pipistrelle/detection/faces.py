@@ -268,24 +268,18 @@ def _average(
 
     Returns label, caller, numbers, certainty and detour of each pair that occurs.
     """
-    found, direct, metres = _Found(*detections), _Direct(*calls), 0.5 * speed_of_sound
+    found, metres = _Found(*detections), 0.5 * speed_of_sound
     faces = callers = 0
     for d in range(label.size):
         faces, callers = max(faces, found.face[d] + 1), max(callers, found.caller[d] + 1)
     landmark = np.empty(labels.size * callers, dtype=np.int64)
     caller, row = np.empty(landmark.size, dtype=np.int64), 0
     numbers = np.full((NUMBERS, landmark.size), np.nan)
-    certainty = np.full((2, landmark.size), np.nan)
-    detour = np.full((2, landmark.size), np.nan)
+    certainty, detour = np.full((2, landmark.size), np.nan), np.full((2, landmark.size), np.nan)
     strongest = np.empty(faces, dtype=np.int64)
     for i in range(labels.size):
         for p in range(callers):
-            strongest[:] = -1
-            for d in range(label.size):
-                if label[d] == labels[i] and found.caller[d] == p:
-                    best = strongest[found.face[d]]
-                    if best < 0 or found.power[d] > found.power[best]:
-                        strongest[found.face[d]] = d
+            _take_strongest(label, labels[i], p, detections, strongest)
             total = east = north = late = loudest = across = along = 0.0
             for f in range(faces):
                 d = strongest[f]
@@ -305,16 +299,44 @@ def _average(
                 if p == OWN:
                     numbers[RANGE, row] = metres * (late / total)
                     certainty[1, row] = metres * (math.sqrt(along) / total)
-                elif p < direct.delay.size and late / total - direct.delay[p] >= direct.pulse:
-                    spread = math.hypot(math.sqrt(along) / total, direct.delay_std[p])
-                    detour[0, row] = speed_of_sound * (late / total - direct.delay[p])
-                    detour[1, row] = speed_of_sound * spread
+                else:
+                    apart, spread = _after(calls, p, late / total, math.sqrt(along) / total)
+                    detour[0, row], detour[1, row] = speed_of_sound * apart, speed_of_sound * spread
                 numbers[LEVEL, row] = 10.0 * math.log10(loudest)
                 row += 1
     return (
         landmark[:row], caller[:row], numbers[:, :row].copy(), certainty[:, :row].copy(),
         detour[:, :row].copy(),
     )  # fmt: skip
+
+
+@kernel
+def _take_strongest(
+    label: Int[np.ndarray, " d"],
+    wanted: Whole,
+    caller: Whole,
+    detections: tuple,
+    strongest: Int[np.ndarray, " f"],
+) -> None:
+    """Write which detection of a label and a caller is the strongest of each face; -1 for none."""
+    found, strongest[:] = _Found(*detections), -1
+    for d in range(label.size):
+        if label[d] == wanted and found.caller[d] == caller:
+            best = strongest[found.face[d]]
+            if best < 0 or found.power[d] > found.power[best]:
+                strongest[found.face[d]] = d
+
+
+@kernel
+def _after(calls: tuple, caller: Whole, delay: float, std: float) -> tuple[float, float]:
+    """How long after a caller's direct call a sound came, and the standard deviation of that.
+
+    NaN where nobody knows, or where the call still lasted.
+    """
+    direct = _Direct(*calls)
+    if caller >= direct.delay.size or not delay - direct.delay[caller] >= direct.pulse:
+        return math.nan, math.nan
+    return delay - direct.delay[caller], math.hypot(std, direct.delay_std[caller])
 
 
 @kernel

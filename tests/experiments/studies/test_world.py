@@ -142,6 +142,7 @@ def test_cases_that_hear_the_same_world_listen_once(plan, monkeypatch):
 
 OTHERS = {
     "seed": 8,
+    "callers": [{}, {"frequency": 25e3}],
     "scenario.steps": 24,
     "scenario.step": 0.1,
     "scenario.steps_per_frame": 5,
@@ -224,7 +225,7 @@ OTHERS = {
 """Another value of every setting, far enough from its default to be heard or believed."""
 FEW = ("air.spreading", "target.shape", "emitter.radius", "beacon.level_db", "receiver.elements",
        "detection.peak_db", "association.bearing_gate", "motion.speed_std", "scenario.landmarks",
-       "assumed.wheelbase", "listening.timing",
+       "assumed.wheelbase", "listening.timing", "callers",
        "filter.range_std", "rays.power", "fastslam.particles", "seed")  # fmt: skip
 """One of each section."""
 
