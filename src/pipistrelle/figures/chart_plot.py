@@ -51,7 +51,7 @@ def draw_chart(chart: Chart) -> "Figure":
     """
     import matplotlib
 
-    from pipistrelle.figures.picture import Picture
+    from pipistrelle.figures.picture import picture
 
     count = len(chart.panels)
     if count == 0:
@@ -64,7 +64,7 @@ def draw_chart(chart: Chart) -> "Figure":
         height = WIDTH[columns] / columns * (high - low) / (right - left)
     size = (WIDTH[columns], rows * height + REST)
     with matplotlib.rc_context(STYLE | PLAIN):
-        figure = Picture(figsize=size)
+        figure = picture(*size)
         figure.set_layout_engine("constrained", w_pad=0.1, h_pad=0.06)
         figure.suptitle(chart.title, x=0.01, ha="left", fontsize=12, weight="bold")
         for i, panel in enumerate(chart.panels):

@@ -147,7 +147,7 @@ def _panels(
     errors: bool,
 ) -> tuple["Figure", list[list["Axes"]]]:
     """Lay out one map per trial, with its error rows below, in inches."""
-    from pipistrelle.figures.picture import Picture
+    from pipistrelle.figures.picture import picture
 
     (left, right), (bottom, top) = limits
     blocks, columns = (1 + max(indices) for indices in zip(*places, strict=True))
@@ -159,7 +159,7 @@ def _panels(
     block = TOP + sum(heights) + sum(gaps) + 0.42
     entries = 4 if total > 8.0 else 2
     page = blocks * block + LEGEND * -(-names // entries) / 2
-    figure = Picture(figsize=(total, page))
+    figure = picture(total, page)
     panels: list[list[Axes]] = []
     for row, column in places:
         x, y = LEFT + column * (width + GAP), page - row * block - TOP
