@@ -343,6 +343,10 @@ class FilterConfig(Section):
     """Noise of a bearing [rad]."""
     detour_std: Positive = 0.2
     """Noise of a detour [m]."""
+    caller_speed_std: Positive = 1.0
+    """Velocity along an axis of a caller that moves, before anything is known of it [m/s]."""
+    caller_walk_std: NonNegative = 0.2
+    """How far that velocity strays in a second, and in t seconds by sqrt(t) as much [m/s]."""
     initial_pose_std: tuple[NonNegative, NonNegative, NonNegative] = (0.05, 0.05, 0.0436)
     """How unsure the start is: x, y [m], heading [rad]."""
     first_pose: Literal["exact", "drawn"] = "exact"

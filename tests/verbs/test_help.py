@@ -50,6 +50,7 @@ def test_the_help_of_slam_leaves_out_what_a_log_decides(obey):
     assert found == {
         "--listening.timing",
         *(f"--filter.{name}" for name in ("noise", "detour-std", "robust")),
+        *(f"--filter.caller-{name}-std" for name in ("speed", "walk")),
         *(f"--rays.{name}" for name in rays),
         *(f"--fastslam.{name}" for name in swarm),
     }

@@ -12,7 +12,7 @@ UNLABELLED = -1
 OWN = 0
 """Number of the vehicle among the callers, as in `pipistrelle.acoustics.callers`."""
 NOBODY = np.empty(0, dtype=np.int64)
-"""Of no caller is it known which landmark it is."""
+"""Of no caller is it known which landmark it is, or that it moves."""
 
 COLUMNS = (
     "landmark",
@@ -51,6 +51,8 @@ class Scan:
     callers : (c)
         Label that each caller bears as a landmark, by its number; UNLABELLED for the vehicle and
         for whom nobody knows, as for those beyond.
+    moving : (v)
+        Labels of the callers that move.
     """
 
     time: float
@@ -58,6 +60,7 @@ class Scan:
     caller: Int[np.ndarray, " m"]
     numbers: Float[np.ndarray, "7 m"]
     callers: Int[np.ndarray, " c"] = field(default_factory=lambda: NOBODY)
+    moving: Int[np.ndarray, " v"] = field(default_factory=lambda: NOBODY)
 
     @property
     def bearing(self) -> Float[np.ndarray, " m"]:
@@ -153,7 +156,8 @@ def with_columns(scan: Scan, **columns: np.ndarray | float) -> Scan:
     array([-0.2, -1. ])
     """
     own = {name: getattr(scan, name) for name in COLUMNS}
-    return replace(_made_of(scan.time, scan.landmark.shape, own | columns), callers=scan.callers)
+    made = _made_of(scan.time, scan.landmark.shape, own | columns)
+    return replace(made, callers=scan.callers, moving=scan.moving)
 
 
 def _made_of(time: float, shape: tuple[int, ...], given: dict[str, np.ndarray | float]) -> Scan:

@@ -1,6 +1,7 @@
 """What estimators believe and how they are asked: records, and the protocols of both."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -63,6 +64,31 @@ def no_landmarks() -> Landmarks:
     )
 
 
+def some_of(landmarks: Landmarks, rows: Bool[np.ndarray, " h"]) -> Landmarks:
+    """Take some rows of a map.
+
+    Parameters
+    ----------
+    landmarks : Landmarks of h rows
+    rows : (h)
+
+    Returns
+    -------
+    Landmarks
+
+    Examples
+    --------
+    >>> some_of(no_landmarks(), np.zeros(0, bool)).landmark.size
+    0
+    """
+    return Landmarks(
+        landmark=landmarks.landmark[rows],
+        mean=landmarks.mean[rows],
+        covariance=landmarks.covariance[rows],
+        weight=landmarks.weight[rows],
+    )
+
+
 def placed(landmarks: Landmarks) -> Bool[np.ndarray, " h"]:
     """Tell which rows of a map are fully initialised landmarks, not members of a ray.
 
@@ -111,6 +137,9 @@ class Track:
         Their weighted mean number of fully initialised landmarks.
     online : Gaussian of (k, 3) and (k, 3, 3), or None
         Of a filter that revises its path: each pose as it was believed at its time.
+    callers : dict of label to Gaussian of (k, 2) and (k, 2, 2)
+        Where callers that move were believed to be, as they were heard: at the steps that hold a
+        scan, once they were placed, else NaN.
     """
 
     time: Float[np.ndarray, " k"]
@@ -120,6 +149,7 @@ class Track:
     cloud: Float[np.ndarray, "p 3"] | None = None
     full: float | None = None
     online: Gaussian | None = None
+    callers: Mapping[int, Gaussian] = field(default_factory=dict)
 
 
 @runtime_checkable
@@ -137,6 +167,15 @@ class Belief(Protocol):
 
     def landmarks(self) -> Landmarks:
         """Return the map."""
+        ...
+
+
+@runtime_checkable
+class Following(Protocol):
+    """A belief that follows callers that move, which are no landmarks of its map."""
+
+    def moving(self) -> Landmarks:
+        """Return where they are now, a row per hypothesis."""
         ...
 
 

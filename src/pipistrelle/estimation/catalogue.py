@@ -43,6 +43,9 @@ class Entry:
     memory : callable
         Given the number of landmarks, that of each one's members, and a Config: the most bytes that
         it holds at once, when all landmarks are there and all of them still rays.
+    follows : bool
+        Whether it is told of callers that move (`estimation.beliefs.Following`), or of what stands
+        alone.
     needs : str
         A module that it cannot do without and that an extra of its name installs, or nothing.
     """
@@ -53,6 +56,7 @@ class Entry:
     sections: tuple[str, ...]
     nees_limit: float
     memory: Callable[[int, int, Config], float]
+    follows: bool = False
     needs: str = ""
 
 
@@ -98,8 +102,10 @@ def entry(name: str) -> Entry:
     - ``config``: all settings.
 
     Its other fields need defaults. It may have the attributes ``title``, as a reader is to know
-    it (else its name), and ``nees_limit`` (else infinity: only a NEES that is not finite means
-    that it diverged). What memory it needs is not known, and not checked.
+    it (else its name), ``nees_limit`` (else infinity: only a NEES that is not finite means
+    that it diverged) and ``follows`` (else False: True gives it what is heard of callers that
+    move, whose labels are in the scan's ``moving``). What memory it needs is not known, and not
+    checked.
 
     Parameters
     ----------
@@ -137,6 +143,7 @@ def entry(name: str) -> Entry:
         sections=("listening", "filter", "rays"),
         nees_limit=float(limit),
         memory=lambda landmarks, members, config: 0.0,
+        follows=bool(getattr(kind, "follows", False)),
     )
 
 
@@ -246,14 +253,14 @@ def _ekf(config: Config, motion: "Motion") -> "Estimator":
     """Build EKF-SLAM."""
     from pipistrelle.estimation.ekf.filter import EkfSlam
 
-    return EkfSlam(motion=motion, **_gaussian(config))
+    return EkfSlam(motion=motion, **_gaussian(config), **_of_callers(config))
 
 
 def _iekf(config: Config, motion: "Motion") -> "Estimator":
     """Build right-invariant EKF-SLAM."""
     from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
 
-    return InvariantEkfSlam(motion=motion, **_gaussian(config))
+    return InvariantEkfSlam(motion=motion, **_gaussian(config), **_of_callers(config))
 
 
 def _smoother(config: Config, motion: "Motion") -> "Estimator":
@@ -268,6 +275,14 @@ def _gaussian(config: Config) -> dict[str, Any]:
     """Return the settings that both EKFs and the smoother take."""
     settings = config.filter
     return {"rays": config.rays, "gate": settings.gate, "robust": settings.robust == "huber"}
+
+
+def _of_callers(config: Config) -> dict[str, Any]:
+    """Return what filters that follow callers are told of how they move."""
+    return {
+        "speed_std": config.filter.caller_speed_std,
+        "walk_std": config.filter.caller_walk_std,
+    }
 
 
 def _smoother_bytes(landmarks: int, _: int, config: Config) -> float:
@@ -305,6 +320,7 @@ CATALOGUE = {
             sections=("listening", "filter", "rays"),
             nees_limit=50.0,
             memory=_ekf_bytes,
+            follows=True,
         ),
         Entry(
             name="fastslam",
@@ -321,6 +337,7 @@ CATALOGUE = {
             sections=("listening", "filter", "rays"),
             nees_limit=50.0,
             memory=_ekf_bytes,
+            follows=True,
         ),
         Entry(
             name="smoother",

@@ -72,8 +72,9 @@ Columns = tuple[
     Float[np.ndarray, "7 m"],
     Int[np.ndarray, " m"],
     Int[np.ndarray, " c"],
+    Int[np.ndarray, " v"],
 ]
-"""Labels, numbers and callers of a scan's rows, and the callers' labels."""
+"""Labels, numbers and callers of a scan's rows; the labels of the callers, and of who moves."""
 
 
 def columns_of(scan: Scan) -> Columns:
@@ -85,10 +86,11 @@ def columns_of(scan: Scan) -> Columns:
 
     Returns
     -------
-    tuple of labels, numbers, callers and callers' labels
+    tuple of labels, numbers, callers, callers' labels and labels of who moves
         A plain tuple: a kernel takes one in no time, and a record in microseconds.
     """
-    return scan.landmark, np.ascontiguousarray(scan.numbers), scan.caller, scan.callers
+    numbers = np.ascontiguousarray(scan.numbers)
+    return scan.landmark, numbers, scan.caller, scan.callers, scan.moving
 
 
 @kernel
@@ -104,7 +106,7 @@ def measurements(columns: Columns) -> Measurements:
     >>> measurements(columns_of(scan)).bearing_variance
     array([0.25])
     """
-    landmark, numbers, _, _ = columns
+    landmark, numbers, _, _, _ = columns
     rows = landmark.size
     while rows > 0 and math.isnan(numbers[BEARING, rows - 1]):
         rows -= 1
@@ -132,7 +134,7 @@ def detours(columns: Columns) -> Detours:
     >>> of.landmark, of.caller, of.variance
     (array([4]), array([9]), array([0.25]))
     """
-    landmark, numbers, caller, callers = columns
+    landmark, numbers, caller, callers, _ = columns
     count, rows, whose = 0, np.empty(landmark.size, np.int64), np.empty(landmark.size, np.int64)
     for m in range(landmark.size):
         if math.isnan(numbers[DETOUR, m]) or caller[m] >= callers.size:

@@ -3,7 +3,8 @@
 No filter is handed a `Truth`: a trial takes it from the drive when the estimate is made.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -26,11 +27,14 @@ class Truth:
     path : (k, 3) [m, m, rad] or None
         True poses; NaN where they are not known.
     landmarks : labels (n) and positions (n, 2) [m], or None
+    callers : dict of label to (k, 2) [m]
+        Paths of the callers that move.
     """
 
     time: Float[np.ndarray, " k"]
     path: Float[np.ndarray, "k 3"] | None = None
     landmarks: LabelledPoints | None = None
+    callers: Mapping[int, Float[np.ndarray, "k 2"]] = field(default_factory=dict)
 
 
 NO_TRUTH = Truth(time=np.empty(0))
@@ -51,8 +55,8 @@ class Drive:
         Of each step, as the motion model has them.
     truth : Truth
         At the same times; nothing of it, by default. Its landmarks are those that stand.
-    moving : tuple of int
-        Labels of what moves: no landmarks, though heard.
+    moving : dict of label to str
+        Names of the callers that move: no landmarks, though heard.
     """
 
     motion: Motion
@@ -60,4 +64,4 @@ class Drive:
     time: Float[np.ndarray, " t"]
     controls: Float[np.ndarray, "t-1 c"]
     truth: Truth = NO_TRUTH
-    moving: tuple[int, ...] = ()
+    moving: Mapping[int, str] = field(default_factory=dict)

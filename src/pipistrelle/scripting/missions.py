@@ -20,7 +20,7 @@ from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.results.writing import write_results
 from pipistrelle.experiments.runs.again import log_entry
 from pipistrelle.experiments.runs.preparing import warnings_of
-from pipistrelle.experiments.runs.replay import replay
+from pipistrelle.experiments.runs.replay import moving_of, replay
 from pipistrelle.experiments.runs.trial import Mission, Watch, run_mission
 from pipistrelle.scripting.recorded import SlamConfig, afterwards
 
@@ -45,6 +45,8 @@ class Done:
         Who was heard besides the vehicle, where that is known.
     names : tuple of str
         As measurements name them.
+    moving : dict of label to str
+        The names of those that move.
     beamwidth : [rad] or None
         Of the vehicle's call.
     ignored_rows : dict
@@ -63,6 +65,7 @@ class Done:
     truth: Truth
     callers: tuple[Caller, ...] = ()
     names: tuple[str, ...] = ()
+    moving: Mapping[int, str] = field(default_factory=dict)
     beamwidth: float | None = None
     ignored_rows: Mapping[str, int] = field(default_factory=dict)
     log: Mapping[str, object] | None = None
@@ -111,6 +114,7 @@ def simulated(
         truth=mission.drive.truth,
         callers=mission.scenario.callers[1:],
         names=tuple(caller.name for caller in mission.scenario.callers[1:]),
+        moving=mission.drive.moving,
         beamwidth=beamwidth_of(config),
         beside=files,
         said=warnings_of(config, mission.scenario.callers),
@@ -166,6 +170,7 @@ def solved(
         trials=trials,
         truth=truth,
         names=tuple(caller.name for caller in recorded.callers),
+        moving=moving_of(recorded),
         beamwidth=beamwidth,
         ignored_rows=recorded.ignored_rows,
         log=log_entry(place, robot, beamwidth),
@@ -250,6 +255,7 @@ def keep(
         truth=done.truth,
         ignored_rows=dict(done.ignored_rows),
         callers=done.names,
+        moving=done.moving,
         beside=done.beside,
         log=done.log,
         draw=draw,

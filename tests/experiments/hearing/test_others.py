@@ -12,7 +12,7 @@ from pipistrelle.experiments.hearing.others import WALK_MEMORY, WALK_STD, with_r
 from pipistrelle.experiments.hearing.scenario import (
     caller_labels,
     motion_of,
-    moving_labels,
+    moving_callers,
     standing_landmarks,
     world_of,
 )
@@ -122,7 +122,7 @@ def test_who_moves_is_no_landmark_and_bears_the_label_of_its_place_in_the_list()
         config_of({}, MATE | {"course": "circle"}, {"frequency": 2e4, "place": [1, 2]})
     )
     assert caller_labels(drawn).tolist() == [-1, 21, 22, 23]
-    assert moving_labels(drawn) == (22,)
+    assert [*moving_callers(drawn)] == [22]
     labels, places = standing_landmarks(drawn)
     assert labels[-2:].tolist() == [21, 23]
     assert places[-1].tolist() == [1.0, 2.0]

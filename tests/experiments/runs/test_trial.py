@@ -384,7 +384,7 @@ def test_a_caller_that_moves_is_heard_but_is_no_landmark():
     drive = drive_of(three, SHORT)
     labels, places = drive.truth.landmarks
     assert labels.tolist() == [*range(1, 52), 53]
-    assert (places[-1].tolist(), drive.moving) == ([-12.0, 3.0], (52,))
+    assert (places[-1].tolist(), drive.moving) == ([-12.0, 3.0], {52: "boat"})
     (heard,) = listen(three, SHORT, (SHORT.emitter.radius,))
     scans = scans_of(heard, "fused", SHORT)
     assert any(52 in scan.landmark for scan in scans)

@@ -205,6 +205,8 @@ OTHERS = {
     "filter.range_std": 0.4,
     "filter.bearing_std": 0.05,
     "filter.detour_std": 0.7,
+    "filter.caller_speed_std": 0.3,
+    "filter.caller_walk_std": 0.6,
     "filter.initial_pose_std": [0.1, 0.1, 0.1],
     "filter.first_pose": "drawn",
     "filter.gate": 0.05,
@@ -236,11 +238,14 @@ def test_the_settings_that_are_varied_here_are_all_there_are():
     assert {name.split(".")[0] for name in FEW} == set(Config.model_fields)
 
 
+ROAMING = {"listening": {"timing": True}, "callers": [{"course": "circle", "radius": 9.0}]}
 NEEDS = {
     "scenario.extent": {"scenario": {"course": "eight"}},
     "scenario.lane": {"scenario": {"field": "rows"}},
     "motion.angular_rate_std": {"motion": {"model": "unicycle"}},
     "filter.detour_std": {"listening": {"timing": True}},
+    "filter.caller_speed_std": ROAMING,
+    "filter.caller_walk_std": ROAMING,
     "filter.robust": {"filter": {"noise": "measured"}},
     "rays.spacing": {"filter": {"bearing_std": 0.003}},
     "assumed.angular_rate_std": {"motion": {"model": "unicycle"}},

@@ -329,9 +329,17 @@ def _correct_by_detour(
 
 @no_alloc
 def _add_new(
-    state: State, row: Row, timed: Detours, used: Bool[np.ndarray, " d"], sensing: Sensing
+    state: State,
+    row: Row,
+    timed: Detours,
+    used: Bool[np.ndarray, " d"],
+    moving: Int[np.ndarray, " v"],
+    sensing: Sensing,
 ) -> None:
-    """Append a measurement's landmark, one member or a ray of them (Eqs. (16) to (18))."""
+    """Append a measurement's landmark, one member or a ray of them (Eqs. (16) to (18)).
+
+    Bearings of a caller that moves do not cross where it is: it is a ray, however precise they are.
+    """
     joint, passive = state.joint, math.isnan(row.range)
     d = _surest(state, row, timed, used) if passive else -1
     if d >= 0:
@@ -340,16 +348,19 @@ def _add_new(
         state.members[0] += 1
         _place(state, member, row, timed, d, used)
         return
+    across = row.bearing_variance
     if passive and is_precise(row, sensing):
-        await_crossing(state, row, sensing)
-        return
+        if row.landmark not in moving:
+            await_crossing(state, row, sensing)
+            return
+        across = linear_to(sensing) ** 2
     count = sensing.ray_ranges.size if passive else 1
     for j in range(count):
         far = sensing.ray_ranges[j] if passive else row.range
         spread = sensing.ray_stds[j] ** 2 if passive else row.range_variance
         member = state.members[0]
         size = 3 + 2 * member
-        initialise(joint, size, size, far, row.bearing, spread, row.bearing_variance)
+        initialise(joint, size, size, far, row.bearing, spread, across)
         state.landmark[member], state.weight[member] = row.landmark, 1.0 / count
         state.members[0] += 1
 
@@ -359,15 +370,15 @@ def _take_in(
     state: State,
     heard: Measurements,
     timed: Detours,
-    known: tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " d"]],
+    known: tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " d"], Int[np.ndarray, " v"]],
     sensing: Sensing,
     scratch: _Scratch,
 ) -> Whole:
     """Correct with what is mapped, then append what is not; returns how many were gated.
 
-    ``known``: of which rows the landmark is mapped, and which detours have been used.
+    ``known``: of which rows the landmark is mapped, which detours have been used, who moves.
     """
-    gated, (mapped, used) = 0, known
+    gated, (mapped, used, moving) = 0, known
     for m in range(heard.landmark.size):
         if mapped[m]:
             row = row_of(heard, m)
@@ -376,7 +387,7 @@ def _take_in(
     flush(state.joint, 3 + 2 * state.members[0])
     for m in range(heard.landmark.size):
         if not mapped[m]:
-            _add_new(state, row_of(heard, m), timed, used, sensing)
+            _add_new(state, row_of(heard, m), timed, used, moving, sensing)
     for d in range(used.size):
         if not used[d]:
             gated += _correct_by_detour(state, timed, d, sensing, scratch)
@@ -414,7 +425,7 @@ def corrected(
     for member in range(members):
         landmark[member], weight[member] = old_landmark[member], old_weight[member]
     used = np.zeros(timed.landmark.size, dtype=np.bool_)
-    gated = _take_in(state, heard, timed, (known, used), sensing, scratch)
+    gated = _take_in(state, heard, timed, (known, used, columns[4]), sensing, scratch)
     members = state.members[0]
     mean, covariance = gaussian_of(joint, 3 + 2 * members)
     return mean, covariance, landmark[:members].copy(), weight[:members].copy(), gated

@@ -7,7 +7,7 @@ The state is the pose and, two numbers each, the members of all landmarks,
    :label: eq-8
 
 (Eq. (8); the correspondence is constant and known and stays out of it). How a frame corrects it:
-`correction`.
+`correction`. A caller that moves has its velocity there, too: `roaming`.
 """
 
 from dataclasses import dataclass
@@ -18,10 +18,11 @@ from jaxtyping import Float, Int
 
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.beliefs import Gaussian, Landmarks
+from pipistrelle.estimation.beliefs import Gaussian, Landmarks, some_of
 from pipistrelle.estimation.ekf.correction import corrected
 from pipistrelle.estimation.ekf.crossing import WAITS
 from pipistrelle.estimation.ekf.gaussian import LINEAR, propagate
+from pipistrelle.estimation.ekf.roaming import is_velocity, roam, stands, with_velocities
 from pipistrelle.estimation.measurement import columns_of
 from pipistrelle.estimation.motion import Motion, motion_numbers
 from pipistrelle.estimation.rays import Sensing, sensing_of
@@ -40,7 +41,8 @@ class EkfBelief:
         x, y [m], heading [rad]; then x, y [m] of each member.
     covariance : (3 + 2h, 3 + 2h)
     landmark : (h)
-        Label of each member; the members of a ray stand together, near to far.
+        Label of each member; the members of a ray stand together, near to far. A caller that moves
+        has a member more, its velocity [m/s], by another label (`roaming.velocity_of`).
     weight : (h)
         Aggregated likelihood of each member within its landmark; `crossing.WAITS` of the two points
         of a bearing that waits to be crossed.
@@ -60,6 +62,16 @@ class EkfBelief:
 
     def landmarks(self) -> Landmarks:
         """Return the map, one row per member."""
+        rows = self.rows()
+        return some_of(rows, stands(rows.landmark))
+
+    def moving(self) -> Landmarks:
+        """Return the callers that move, one row per member."""
+        rows = self.rows()
+        return some_of(rows, ~stands(rows.landmark) & ~is_velocity(rows.landmark))
+
+    def rows(self) -> Landmarks:
+        """Return all members, velocities too, by the linear error."""
         return map_rows(self, self.mean[3:].reshape(-1, 2), self.covariance[3:, 3:])
 
 
@@ -108,6 +120,9 @@ class EkfSlam:
         1 drops none.
     robust : bool
         Whether a measurement that surprises counts less (`estimation.ekf.huber`).
+    speed_std, walk_std : float
+        Of callers that move: the velocity [m/s] along an axis before anything is known of it, and
+        how far it strays in a second (`estimation.ekf.roaming`).
 
     Examples
     --------
@@ -126,6 +141,8 @@ class EkfSlam:
     rays: RayConfig
     gate: float = 1.0
     robust: bool = False
+    speed_std: float = 1.0
+    walk_std: float = 0.2
 
     def init(self, pose: Gaussian) -> EkfBelief:
         """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
@@ -175,6 +192,7 @@ class EkfSlam:
         poses = Gaussian(mean=np.empty((len(dt), 3)), covariance=np.empty((len(dt), 3, 3)))
         numbers = motion_numbers(self.motion)
         propagate(mean, covariance, controls, dt, numbers, poses.mean, poses.covariance)
+        roam(mean, covariance, belief.landmark, dt.sum(), self.walk_std)
         moved = EkfBelief(
             mean=mean,
             covariance=covariance,
@@ -219,9 +237,9 @@ class EkfSlam:
         """
         if scan.landmark.size == 0:
             return belief
-        return EkfBelief(
-            **taken_in(belief, scan, sensing_of(self.rays, self.gate, robust=self.robust), LINEAR)
-        )
+        sensing = sensing_of(self.rays, self.gate, robust=self.robust)
+        corrected = EkfBelief(**taken_in(belief, scan, sensing, LINEAR))
+        return with_velocities(corrected, scan.moving, self.speed_std)
 
 
 def taken_in(belief: EkfBelief, scan: Scan, sensing: Sensing, turns: float) -> dict[str, Any]:

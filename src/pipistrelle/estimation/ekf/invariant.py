@@ -21,6 +21,8 @@ for vehicle and every member of every landmark. Then
 - a new landmark has the row of the vehicle's position, and noise of its own;
 - a correction moves the whole mean by the exponential of its step.
 
+The velocity of a caller that moves is turned as points are (`estimation.ekf.roaming`).
+
 Rays are members as before. The frame's origin is the start, so that levers are as short as the
 drive and no number is lost to coordinates far from zero.
 
@@ -39,6 +41,7 @@ from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.ekf.filter import EkfBelief, map_rows, taken_in
 from pipistrelle.estimation.ekf.gaussian import INVARIANT
+from pipistrelle.estimation.ekf.roaming import is_velocity, roam, with_velocities
 from pipistrelle.estimation.motion import Motion, MotionNumbers, motion_numbers, propagate_pose
 from pipistrelle.estimation.rays import sensing_of
 from pipistrelle.jit import kernel, no_alloc
@@ -68,15 +71,14 @@ class InvariantBelief(EkfBelief):
         placed = _placed(self.mean[:3], self.origin)
         return Gaussian(mean=placed, covariance=covariance, invariant=True)
 
-    def landmarks(self) -> Landmarks:
-        """Return the map, one row per member, its covariances those of the linear error."""
+    def rows(self) -> Landmarks:
+        """Return all members, velocities too, by the linear error."""
         mean = self.mean[3:].reshape(-1, 2)
         turned = (mean @ np.array([[0.0, 1.0], [-1.0, 0.0]])).ravel()  # (-y, x): J l
         lever = np.outer(turned, self.covariance[2, 3:])
         square = np.outer(turned, turned) * self.covariance[2, 2]
-        return map_rows(
-            self, mean + self.origin, self.covariance[3:, 3:] + (lever + lever.T) + square
-        )
+        origin = np.where(is_velocity(self.landmark)[:, np.newaxis], 0.0, self.origin)
+        return map_rows(self, mean + origin, self.covariance[3:, 3:] + (lever + lever.T) + square)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,6 +94,9 @@ class InvariantEkfSlam:
         1 drops none.
     robust : bool
         Whether a measurement that surprises counts less (`estimation.ekf.huber`).
+    speed_std, walk_std : float
+        Of callers that move: the velocity [m/s] along an axis before anything is known of it, and
+        how far it strays in a second (`estimation.ekf.roaming`).
 
     Examples
     --------
@@ -114,6 +119,8 @@ class InvariantEkfSlam:
     rays: RayConfig
     gate: float = 1.0
     robust: bool = False
+    speed_std: float = 1.0
+    walk_std: float = 0.2
 
     def init(self, pose: Gaussian) -> InvariantBelief:
         """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
@@ -154,6 +161,7 @@ class InvariantEkfSlam:
         poses = Gaussian(mean=np.empty((len(dt), 3)), covariance=np.empty((len(dt), 3, 3)))
         numbers = motion_numbers(self.motion)
         _propagate(mean, covariance, controls, dt, numbers, poses.mean, poses.covariance)
+        roam(mean, covariance, belief.landmark, dt.sum(), self.walk_std)
         placed = replace(poses, mean=_placed(poses.mean, belief.origin), invariant=True)
         return replace(belief, mean=mean, covariance=covariance), placed
 
@@ -176,7 +184,9 @@ class InvariantEkfSlam:
         if scan.landmark.size == 0:
             return belief
         sensing = sensing_of(self.rays, self.gate, robust=self.robust)
-        return InvariantBelief(origin=belief.origin, **taken_in(belief, scan, sensing, INVARIANT))
+        fields = taken_in(belief, scan, sensing, INVARIANT)
+        corrected = InvariantBelief(origin=belief.origin, **fields)
+        return with_velocities(corrected, scan.moving, self.speed_std)
 
 
 def _placed(

@@ -178,8 +178,8 @@ def standing_landmarks(scenario: Scenario) -> LabelledPoints:
     return labels, np.vstack((landmarks, *standing.values()))
 
 
-def moving_labels(scenario: Scenario) -> tuple[int, ...]:
-    """List the labels of the callers that move, which are no landmarks of a map.
+def moving_callers(scenario: Scenario) -> dict[int, Caller]:
+    """Label the callers that move, which are no landmarks of a map.
 
     Parameters
     ----------
@@ -187,16 +187,16 @@ def moving_labels(scenario: Scenario) -> tuple[int, ...]:
 
     Returns
     -------
-    tuple of int
-        Rising.
+    dict of label to Caller
+        Labels rising.
 
     Examples
     --------
-    >>> moving_labels(world_of(Config()))
-    ()
+    >>> moving_callers(world_of(Config()))
+    {}
     """
     labelled = enumerate(scenario.callers[VEHICLE + 1 :], start=len(scenario.landmarks) + 1)
-    return tuple(label for label, caller in labelled if moves(caller))
+    return {label: caller for label, caller in labelled if moves(caller)}
 
 
 def caller_labels(scenario: Scenario) -> Int[np.ndarray, " c"]:

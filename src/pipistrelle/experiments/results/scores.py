@@ -60,6 +60,9 @@ class Scores:
         Least that any estimator without bias has in the mean over such drives, the start exact and
         the noise as the signal tells it (`evaluation.bound.path_bound`).
     nees_mean, nees_max : float or None
+    caller_rmse_m, caller_rmse_aligned_m : float or None
+        Of the callers that move and are followed, at the scans since each was placed; the second
+        after a rigid motion of all that is estimated of them.
     diverged : bool or None
         Whether any NEES is not finite or above the limit; without truth, True where the path is
         not finite, else None.
@@ -81,6 +84,8 @@ class Scores:
     heading_bound_rad: float | None = None
     nees_mean: float | None
     nees_max: float | None
+    caller_rmse_m: float | None = None
+    caller_rmse_aligned_m: float | None = None
     diverged: bool | None
     landmarks_full: int
     landmarks_total: int
@@ -161,6 +166,7 @@ def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Sc
     estimate = heaviest(track.landmarks)
     labels, positions = truth.landmarks or (np.empty(0, int), np.empty((0, 2)))
     mapped, true = scored_landmarks(estimate, labels, positions)
+    followed, walked = _followed(track, truth)
     finite = bool(np.all(np.isfinite(track.pose.mean)))
     rows = sum(int(np.sum(~np.isnan(scan.bearing))) for scan in scans)
     return Scores(
@@ -171,6 +177,8 @@ def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Sc
         map_rmse_aligned_m=_aligned_rmse(mapped, true),
         nees_mean=path.nees_mean,
         nees_max=worst,
+        caller_rmse_m=_rmse(position_error(followed, walked)),
+        caller_rmse_aligned_m=_aligned_rmse(followed, walked),
         diverged=(None if finite else True)
         if worst is None
         else diverged(np.array([worst]), limit),
@@ -179,6 +187,20 @@ def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Sc
         measurements_per_frame=rows / len(scans) if scans else None,
         gated=track.gated,
     )
+
+
+def _followed(
+    track: Track, truth: Truth
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
+    """Return where callers that move were believed to be, all together, and where they were."""
+    both = [
+        np.hstack((believed.mean, truth.callers[label]))
+        for label, believed in track.callers.items()
+        if label in truth.callers
+    ]
+    rows = np.concatenate([np.empty((0, 4)), *both])
+    rows = rows[~np.isnan(rows).any(axis=1)]
+    return rows[:, :2], rows[:, 2:]
 
 
 def position_floor(drive: Drive, scans: Sequence[Scan]) -> float | None:

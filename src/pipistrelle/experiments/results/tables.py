@@ -50,6 +50,28 @@ def tum_text(time: Float[np.ndarray, " k"], path: Float[np.ndarray, "k 3"]) -> s
     )
 
 
+def place_text(time: Float[np.ndarray, " k"], place: Float[np.ndarray, "k 2"]) -> str:
+    """Write the places of one whose heading is not known as `tum_text`, with none.
+
+    Parameters
+    ----------
+    time : (k) [s]
+    place : (k, 2) [m]
+        Rows that are NaN are left out.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> print(place_text(np.arange(2.0), np.array([[np.nan, np.nan], [1.0, 2.0]])), end="")
+    1.000000 1.000000000000 2.000000000000 0 0 0 0.000000000000 1.000000000000
+    """
+    known = ~np.isnan(place).any(axis=1)
+    return tum_text(time[known], np.column_stack((place[known], np.zeros(known.sum()))))
+
+
 def map_text(landmarks: Landmarks) -> str:
     """Write a map as one line per landmark: mean, covariance and status.
 

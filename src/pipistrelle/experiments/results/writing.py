@@ -23,6 +23,7 @@ from pipistrelle.experiments.results.tables import (
     landmark_table,
     map_text,
     measurement_table,
+    place_text,
     step_table,
     tum_text,
 )
@@ -46,7 +47,7 @@ bearings counter-clockwise from the heading. S is the sensing strategy, F the fi
 | summary.json | the scores of each estimate{log}; null: no truth, or not a finite number |
 | config.toml | every setting |
 | track_S_F.tum | estimated path, the start and every control step: time x y z qx qy qz qw |
-{online}| truth.tum | true path at the same times, where it is known |
+{online}{callers}| truth.tum | true path at the same times, where it is known |
 | map_S_F.csv | final map with covariances; a partial landmark by its heaviest hypothesis |
 | steps.parquet | estimated and true poses, standard deviations, errors, NEES |
 | landmarks.parquet | every hypothesis of every landmark, beside the true positions |
@@ -71,6 +72,12 @@ ONLINE = """\
 | track_S_F_online.tum | the same as it was believed at each time; F revised it by what came after |
 """
 
+CALLERS = """\
+| caller_N_S_F.tum | estimated places of caller N, which moves, at the frames since it was placed; \
+no heading is known, and none told |
+| truth_N.tum | its true path, where it is known |
+"""
+
 
 def write_results(
     folder: Path,
@@ -82,6 +89,7 @@ def write_results(
     truth: Truth,
     ignored_rows: dict[str, int],
     callers: Sequence[str] = (),
+    moving: Mapping[int, str] = MappingProxyType({}),
     beside: Mapping[str, bytes] = MappingProxyType({}),
     log: Mapping[str, object] | None = None,
     draw: Callable[[Path], None] = lambda _: None,
@@ -105,6 +113,8 @@ def write_results(
         Number of dropped log rows by reason.
     callers : sequence of str
         Names of those who call besides the vehicle.
+    moving : mapping of label to str, optional
+        Names of those that move.
     beside : dict of name to content, optional
         Other files, relative to the folder.
     log : mapping, optional
@@ -136,6 +146,7 @@ def write_results(
     own.write("config.toml", tomli_w.dumps(settings))
     online = ONLINE if any(trial.online for trial in trials) else ""
     told = {"online": online, "log": "" if log is None else LOG}
+    told["callers"] = CALLERS if any(trial.track.callers for trial in trials) else ""
     readme = README.format(command=command, version=find_version(), seed=seed, **told)
     own.write("README.md", readme)
     for trial in trials:
@@ -145,9 +156,14 @@ def write_results(
             text = tum_text(track.time, track.online.mean)
             own.write(f"track_{name}_online.tum", text)
         own.write(f"map_{name}.csv", map_text(track.landmarks))
+        for label, believed in track.callers.items():
+            text = place_text(track.time, believed.mean)
+            own.write(f"caller_{moving[label]}_{name}.tum", text)
     if truth.path is not None:
         known = np.isfinite(truth.path).all(axis=1)
         own.write("truth.tum", tum_text(truth.time[known], truth.path[known]))
+    for label, path in truth.callers.items():
+        own.write(f"truth_{moving[label]}.tum", place_text(truth.time, path))
     for name, table in tables_of(trials, truth, callers).items():
         buffer = io.BytesIO()
         table.write_parquet(buffer)

@@ -4,6 +4,7 @@ What could not be used, whoever made it, is refused here, before or after a filt
 """
 
 from collections.abc import Callable, Sequence
+from math import nan
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -25,10 +26,13 @@ from pipistrelle.estimation.association import Associate, told
 from pipistrelle.estimation.beliefs import (
     B,
     Estimator,
+    Following,
     Gaussian,
+    Landmarks,
     ParticleCloud,
     Track,
     Trajectory,
+    placed,
 )
 from pipistrelle.experiments.drives import Drive
 
@@ -83,6 +87,7 @@ def run_filter(
     mean, covariance = np.empty((time.size, 3)), np.empty((time.size, 3, 3))
     mean[0], covariance[0] = drive.start.mean, drive.start.covariance
     dt, belief, done = np.diff(time), estimator.init(drive.start), 0
+    callers: dict[int, Gaussian] = {}
     for number, (k, scan) in enumerate(zip(steps, scans, strict=True), start=1):
         if k > done:
             belief, poses = estimator.predict(belief, controls[done:k], dt[done:k], rng)
@@ -96,6 +101,8 @@ def run_filter(
         belief = estimator.update(belief, named, rng)
         pose = belief.pose()
         mean[k], covariance[k] = pose.mean, pose.covariance
+        if scan.moving.size and isinstance(belief, Following):
+            _follow(callers, belief.moving(), k, time.size)
         if watch:
             watch(named, belief)
         if progress:
@@ -115,7 +122,16 @@ def run_filter(
         cloud=cloud.cloud() if cloud else None,
         full=cloud.full if cloud else None,
         online=online if revised else None,
+        callers=callers,
     )
+
+
+def _follow(callers: dict[int, Gaussian], moving: Landmarks, k: int, steps: int) -> None:
+    """Note where callers that move are at step k, those that are placed."""
+    for row in np.flatnonzero(placed(moving)):
+        nowhere = Gaussian(mean=np.full((steps, 2), nan), covariance=np.full((steps, 2, 2), nan))
+        track = callers.setdefault(int(moving.landmark[row]), nowhere)
+        track.mean[k], track.covariance[k] = moving.mean[row], moving.covariance[row]
 
 
 def _whole(who: str, path: Gaussian, poses: int) -> Gaussian:

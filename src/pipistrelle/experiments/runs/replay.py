@@ -205,6 +205,20 @@ def start_of(log: Log) -> Gaussian:
     return Gaussian(mean=np.array(log.initial_pose, dtype=float), covariance=np.diag(variance))
 
 
+def moving_of(log: Log) -> dict[int, str]:
+    """Name the callers of a log that move, by their labels.
+
+    Parameters
+    ----------
+    log : Log
+
+    Returns
+    -------
+    dict of label to str
+    """
+    return {caller.landmark: caller.name for caller in log.callers if caller.moves}
+
+
 def replay(
     log: Log,
     truth: Truth,
@@ -263,7 +277,7 @@ def replay(
         time=log.time,
         controls=log.controls,
         truth=truth,
-        moving=tuple(caller.landmark for caller in log.callers if caller.moves),
+        moving=moving_of(log),
     )
     check_filters(filters, drive.motion, config)
     noise, scans = noise_of(config.filter), log.scans

@@ -30,7 +30,7 @@ from pipistrelle.experiments.hearing.scenario import (
     Scenario,
     assumed_motion,
     motion_of,
-    moving_labels,
+    moving_callers,
     standing_landmarks,
 )
 from pipistrelle.experiments.hearing.worlds import ANY, World
@@ -176,13 +176,19 @@ def drive_of(scenario: Scenario, config: Config, iteration: int = 0) -> Drive:
     if config.filter.first_pose == "drawn":
         start = start + spread * _generator(config.seed, iteration, "start").standard_normal(3)
         start[2] = wrap_angle(start[2])
+    moving = moving_callers(scenario)
     return Drive(
         motion=assumed_motion(config),
         start=Gaussian(mean=start, covariance=np.diag(np.square(spread))),
         time=scenario.time,
         controls=scenario.controls,
-        truth=Truth(time=scenario.time, path=scenario.path, landmarks=standing_landmarks(scenario)),
-        moving=moving_labels(scenario),
+        truth=Truth(
+            time=scenario.time,
+            path=scenario.path,
+            landmarks=standing_landmarks(scenario),
+            callers={label: np.asarray(caller.place) for label, caller in moving.items()},
+        ),
+        moving={label: caller.name for label, caller in moving.items()},
     )
 
 
@@ -247,7 +253,8 @@ def run_trial(
     case : Case
     drive : Drive
     scans : sequence of Scan
-        As `scans_of` gives them; what is labelled as a caller that moves is left out.
+        As `scans_of` gives them. What is labelled as a caller that moves is left out, unless the
+        settings have timing and the estimator follows.
     config : Config
     associate : Associate
         Says who is who, between prediction and correction. Of rows that it merges, the settings say
@@ -259,8 +266,11 @@ def run_trial(
     TrialResult
     """
     strategy, name = case.strategy, case.filter
-    if drive.moving:
-        scans = [rows_of(scan, ~np.isin(scan.landmark, drive.moving)) for scan in scans]
+    known = entry(name)
+    if drive.moving and known.follows and config.listening.timing:
+        scans = [replace(scan, moving=np.array([*drive.moving])) for scan in scans]
+    elif drive.moving:
+        scans = [rows_of(scan, ~np.isin(scan.landmark, [*drive.moving])) for scan in scans]
 
     def report(done: int, total: int) -> None:
         if progress:
@@ -273,7 +283,6 @@ def run_trial(
         if watch:
             watch(strategy, name, scan, belief)
 
-    known = entry(name)
     began = clock.perf_counter()
     track = run_filter(
         known.build(config, drive.motion),
