@@ -1,12 +1,14 @@
 """The bound along the true path, and what NEES a consistent filter has after an exact start."""
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 from pipistrelle.config import Config, RayConfig, ScenarioConfig
+from pipistrelle.detection.scans import rows_of, with_columns
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import motion_step
 from pipistrelle.estimation.smoother.filter import Smoother
@@ -253,3 +255,40 @@ def test_bounds_about_another_mean_are_chi_squares_where_the_weights_are_equal()
         np.array([weights.sum()]), np.array([2 * (weights**2).sum()]), 30
     )
     assert np.mean((means > low) & (means < high)) == pytest.approx(0.95, abs=0.006)
+
+
+# Callers that move
+
+
+def with_boat(scans, route, detour_std=0.05):
+    """Scans in which label 12 is a caller on a route, heard in every frame with its detours."""
+    timed, labels = [], PLACES[0]
+    for scan in scans:
+        rows = rows_of(scan, scan.landmark != 12)
+        e = {"detour": np.ones(len(rows.landmark)), "detour_std": detour_std, "caller": 1}
+        timed.append(replace(with_columns(rows, **e), callers=np.array([-1, 12])))
+    assert 12 in labels
+    return timed
+
+
+def bound_with_boat(route, wander, detour_std=0.05):
+    rest = PLACES[0] != 12
+    return pose_bound(
+        DRIVE.motion, DRIVE.controls, DRIVE.time, WORLD.path, (PLACES[0][rest], PLACES[1][rest]),
+        with_boat(heard("fused"), route, detour_std), {12: route}, wander,
+    )  # fmt: skip
+
+
+def test_one_that_never_strays_and_has_no_speed_is_bounded_as_one_that_stands():
+    stands = np.tile(PLACES[1][PLACES[0] == 12], (STEPS + 1, 1))
+    still = bound_of(with_boat(heard("fused"), stands))
+    np.testing.assert_allclose(bound_with_boat(stands, (1e-9, 0.0)), still, rtol=0, atol=1e-9)
+
+
+def test_the_more_a_caller_strays_the_less_its_calls_tell():
+    route = np.column_stack([np.linspace(3.0, 9.0, STEPS + 1), np.full(STEPS + 1, 4.0)])
+    bounds = [path_bound(bound_with_boat(route, (1.0, walk)))[0] for walk in (0.0, 0.3, 3.0, 1e4)]
+    assert bounds == sorted(bounds)
+    assert bounds[0] < bounds[-1] - 1e-6
+    deaf = path_bound(bound_with_boat(route, (1.0, 0.3), detour_std=1e6))[0]
+    assert bounds[-1] < deaf, "many detours at once place even one that may be anywhere"

@@ -3,7 +3,8 @@ r"""The bound: how surely any estimator can know the vehicle's pose, from what i
 The posterior Cramér-Rao bound along the true path is the covariance that an extended Kalman filter
 would have with every Jacobian taken at the truth: it hangs on what was heard and on how noisy
 controls and measurements are said to be, and on no estimate. The start is exact, and landmarks are
-not known before they are heard, but for a flat prior. It tells two things:
+not known before they are heard, but for a flat prior. A caller that moves does so as filters
+believe it does (`estimation.ekf.roaming`). It tells two things:
 
 - how much of an estimator's error is its own fault;
 - what NEES a consistent filter has that believes its start uncertain while it is exact: less than
@@ -12,6 +13,7 @@ not known before they are heard, but for a flat prior. It tells two things:
 
 import math
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -35,6 +37,7 @@ from pipistrelle.estimation.ekf.gaussian import (
     flush,
     joint_of,
 )
+from pipistrelle.estimation.ekf.roaming import roam, velocity_of
 from pipistrelle.estimation.ekf.timing import tell_detour
 from pipistrelle.estimation.measurement import NEAREST, observe
 from pipistrelle.estimation.motion import Motion, MotionNumbers, motion_numbers, propagate_pose
@@ -42,6 +45,8 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 
 PRIOR_STD = 20.0
 """Of a landmark before it is heard [m]."""
+NO_ROUTES: Mapping[int, np.ndarray] = MappingProxyType({})
+"""Nobody moves."""
 
 
 def pose_bound(
@@ -51,6 +56,8 @@ def pose_bound(
     path: Float[np.ndarray, "t 3"],
     landmarks: tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]],
     scans: Sequence[Scan],
+    routes: Mapping[int, Float[np.ndarray, "t 2"]] = NO_ROUTES,
+    wander: tuple[float, float] = (1.0, 0.2),
 ) -> Float[np.ndarray, "t 3 3"]:
     r"""Posterior Cramér-Rao bound of the pose at every step, after an exact start.
 
@@ -73,6 +80,11 @@ def pose_bound(
     scans : sequence of Scan
         Who was heard when, with a range or a detour or without, and how surely: of the
         measurements the standard deviations alone count. Rows of other labels are left out.
+    routes : dict of label to (k + 1, 2) [m], optional
+        True places of the callers that move.
+    wander : (2) [m/s], optional
+        What is known of their velocities: the standard deviation of each along an axis at the
+        start, and that of how far it strays in a second.
 
     Returns
     -------
@@ -93,7 +105,8 @@ def pose_bound(
     >>> float(pose_bound(motion, still, np.arange(3.0), path, nowhere, []).max())
     0.0
     """
-    labels, places = landmarks
+    fixed, places = landmarks
+    labels = np.append(fixed, np.array([*routes], np.int64))
     count = [len(scan.landmark) for scan in scans]
     step = np.repeat(np.searchsorted(time, [scan.time - 1e-9 for scan in scans]), count)
     label = np.concatenate([np.empty(0, np.int64), *(scan.landmark for scan in scans)])
@@ -104,14 +117,19 @@ def pose_bound(
     met = np.column_stack([label[known], np.where(caller == UNLABELLED, label[known], caller)])
     heard, first = np.unique(met, return_index=True)
     heard = heard[np.argsort(first)]  # whom it hears first stands first, as in a filter's state
-    slot = {int(one): number for number, one in enumerate(heard)} | {UNLABELLED: UNLABELLED}
-    place = {int(one): point for one, point in zip(labels, places, strict=True)}
+    moving = [one for one in heard.tolist() if one in routes]
+    state = np.append(np.array([velocity_of(one) for one in moving], np.int64), heard)
+    slot = {one: number for number, one in enumerate(state.tolist())} | {UNLABELLED: UNLABELLED}
+    place = dict(zip(fixed.tolist(), places, strict=True))
+    place |= {one: routes[one][0] for one in moving}
+    place |= {velocity_of(one): np.zeros(2) for one in moving}
+    ways = np.array([routes[one] for one in moving]).reshape(-1, len(path), 2)
     return _bound(
         path,
         controls,
         np.diff(time),
         motion_numbers(motion),
-        np.array([place[int(one)] for one in heard]).reshape(-1, 2),
+        (state, np.array([place[one] for one in state.tolist()]).reshape(-1, 2), ways, wander),
         (step[known], _slots(slot, label[known]), _slots(slot, caller)),
         np.ascontiguousarray(numbers[:, known]),
     )
@@ -161,23 +179,48 @@ def _carry(
 
 
 @kernel
+def _let_move(
+    mean: Float[np.ndarray, " n"],
+    labels: Int[np.ndarray, " n"],
+    ways: Float[np.ndarray, "v t 2"],
+    k: Whole,
+) -> None:
+    """Put those who move where they are at step k; their velocities are the first of the state."""
+    for v in range(ways.shape[0]):
+        for n in range(labels.size):
+            if labels[n] == velocity_of(labels[v]):
+                mean[3 + 2 * n], mean[4 + 2 * n] = ways[v, k, 0], ways[v, k, 1]
+
+
+@kernel
 def _bound(
     path: Float[np.ndarray, "t 3"],
     controls: Float[np.ndarray, "k c"],
     dt: Float[np.ndarray, " k"],
     motion: MotionNumbers,
-    places: Float[np.ndarray, "n 2"],
+    world: tuple[
+        Int[np.ndarray, " n"],
+        Float[np.ndarray, "n 2"],
+        Float[np.ndarray, "v t 2"],
+        tuple[float, float],
+    ],
     row: tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Int[np.ndarray, " m"]],
     numbers: Float[np.ndarray, "7 m"],
 ) -> Float[np.ndarray, "t 3 3"]:
-    """Carry the covariance along the true path; of each row step, place and its caller's place."""
-    room = 3 + 2 * places.shape[0]
+    """Carry the covariance along the true path; of each row step, place and its caller's place.
+
+    ``world``: labels and places of the state, the velocities of those who move first; their ways,
+    and what is known of these.
+    """
+    labels, places, ways, (speed_std, walk_std) = world
+    room, moving = 3 + 2 * places.shape[0], ways.shape[0]
     mean, prior = np.zeros(room), np.zeros((room, room))
     for n in range(places.shape[0]):
+        std = speed_std if n < moving else PRIOR_STD
         for a in range(2):
             mean[3 + 2 * n + a] = places[n, a]
-            prior[3 + 2 * n + a, 3 + 2 * n + a] = PRIOR_STD * PRIOR_STD
-    joint, size, m = joint_of(mean, prior, room, LINEAR), 3, 0
+            prior[3 + 2 * n + a, 3 + 2 * n + a] = std * std
+    joint, size, m = joint_of(mean, prior, room, LINEAR), 3 + 2 * moving, 0
     joint.W[:] = 0.0  # the state grows into columns that wait
     bound = np.zeros((path.shape[0], 3, 3))
     steps, slots, callers = row
@@ -186,6 +229,9 @@ def _bound(
         pose[:], noise[:] = path[k - 1], 0.0
         propagate_pose(pose, noise, controls[k - 1], dt[k - 1], motion)
         _carry(joint.covariance, path[k, 0] - path[k - 1, 0], path[k, 1] - path[k - 1, 1], noise)
+        if moving > 0:
+            roam(joint.mean, joint.covariance, labels, dt[k - 1], walk_std)
+            _let_move(joint.mean, labels, ways, k)
         for a in range(3):
             joint.mean[a] = path[k, a]
         while m < steps.size and steps[m] <= k:

@@ -38,6 +38,8 @@ KEYS = [
     "heading_bound_rad",
     "nees_mean",
     "nees_max",
+    "caller_rmse_m",
+    "caller_rmse_aligned_m",
     "diverged",
     "landmarks_full",
     "landmarks_total",

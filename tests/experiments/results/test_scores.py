@@ -111,7 +111,7 @@ def sure(*steps, bearing_std=0.05):
 def test_the_bound_of_a_drive_is_put_beside_its_scores_and_changes_no_other():
     scans = sure(4, 8, 12)
     scores = run_trial(Case(strategy="active", filter="ekf"), DRIVE, scans, CONFIG).scores
-    bound = drive_bound(DRIVE, scans)
+    bound = drive_bound(DRIVE, scans, Config())
     beside = with_bound(scores, bound)
     squared = np.mean(bound[1:], axis=0).diagonal()
     assert beside.position_bound_m == pytest.approx(np.sqrt(squared[0] + squared[1]))
@@ -122,15 +122,15 @@ def test_the_bound_of_a_drive_is_put_beside_its_scores_and_changes_no_other():
 
 def test_the_bound_of_a_drive_hangs_on_no_start_and_rises_with_the_noise():
     apart = replace(DRIVE.start, covariance=np.eye(3))
-    unsure = drive_bound(replace(DRIVE, start=apart), sure(4, 8, 12))
-    np.testing.assert_array_equal(unsure, drive_bound(DRIVE, sure(4, 8, 12)))
+    unsure = drive_bound(replace(DRIVE, start=apart), sure(4, 8, 12), Config())
+    np.testing.assert_array_equal(unsure, drive_bound(DRIVE, sure(4, 8, 12), Config()))
     position = [with_bound_of(std) for std in (0.05, 0.1, 0.2)]
     assert position[0] < position[1] < position[2]
 
 
 def with_bound_of(bearing_std):
     """Trace of the bound over all steps."""
-    bound = drive_bound(DRIVE, sure(*range(4, 401, 4), bearing_std=bearing_std))
+    bound = drive_bound(DRIVE, sure(*range(4, 401, 4), bearing_std=bearing_std), Config())
     return float(np.trace(bound.sum(axis=0)))
 
 
@@ -139,5 +139,5 @@ def test_where_the_truth_is_not_whole_there_is_no_bound():
     path[300] = np.nan
     holes = Truth(time=DRIVE.time, path=path, landmarks=DRIVE.truth.landmarks)
     for truth in (NO_TRUTH, holes, replace(DRIVE.truth, landmarks=None)):
-        assert drive_bound(replace(DRIVE, truth=truth), sure(4)) is None
-    assert drive_bound(DRIVE, sure(4)) is not None
+        assert drive_bound(replace(DRIVE, truth=truth), sure(4), Config()) is None
+    assert drive_bound(DRIVE, sure(4), Config()) is not None

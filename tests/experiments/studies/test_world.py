@@ -238,7 +238,7 @@ def test_the_settings_that_are_varied_here_are_all_there_are():
     assert {name.split(".")[0] for name in FEW} == set(Config.model_fields)
 
 
-ROAMING = {"listening": {"timing": True}, "callers": [{"course": "circle", "radius": 9.0}]}
+ROAMING = {"listening": {"timing": True}, "callers": [{"course": "circle", "radius": 5.0}]}
 NEEDS = {
     "scenario.extent": {"scenario": {"course": "eight"}},
     "scenario.lane": {"scenario": {"field": "rows"}},

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from pipistrelle.config import Config
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Track
 from pipistrelle.estimation.motion import motion_step
@@ -18,7 +19,7 @@ from pipistrelle.evaluation.accuracy import (
     rmse,
     scored_landmarks,
 )
-from pipistrelle.evaluation.bound import path_bound, pose_bound
+from pipistrelle.evaluation.bound import NO_ROUTES, path_bound, pose_bound
 from pipistrelle.evaluation.consistency import diverged, track_nees
 from pipistrelle.experiments.drives import Drive, Truth
 
@@ -262,7 +263,9 @@ def position_floor(drive: Drive, scans: Sequence[Scan]) -> float | None:
     return rmse(known) if known.size else None
 
 
-def drive_bound(drive: Drive, scans: Sequence[Scan]) -> Float[np.ndarray, "t 3 3"] | None:
+def drive_bound(
+    drive: Drive, scans: Sequence[Scan], config: Config
+) -> Float[np.ndarray, "t 3 3"] | None:
     """Return the bound of the pose at every step of a drive whose truth is known.
 
     Parameters
@@ -270,6 +273,8 @@ def drive_bound(drive: Drive, scans: Sequence[Scan]) -> Float[np.ndarray, "t 3 3
     drive : Drive
     scans : sequence of Scan
         With their standard deviations.
+    config : Config
+        It says whether callers that move are followed, and what is known of how they move.
 
     Returns
     -------
@@ -279,7 +284,17 @@ def drive_bound(drive: Drive, scans: Sequence[Scan]) -> Float[np.ndarray, "t 3 3
     path, landmarks = drive.truth.path, drive.truth.landmarks
     if path is None or landmarks is None or not np.isfinite(path).all():
         return None
-    return pose_bound(drive.motion, drive.controls, drive.time, path, landmarks, scans)
+    told = config.filter
+    return pose_bound(
+        drive.motion,
+        drive.controls,
+        drive.time,
+        path,
+        landmarks,
+        scans,
+        drive.truth.callers if config.listening.timing else NO_ROUTES,
+        (told.caller_speed_std, told.caller_walk_std),
+    )
 
 
 def with_bound(scores: Scores, bound: Float[np.ndarray, "t 3 3"] | None) -> Scores:

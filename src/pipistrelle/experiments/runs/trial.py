@@ -146,7 +146,7 @@ def _bounds(
     told = config.model_copy(update={"filter": noise})
     known, bounds = replace(drive, motion=motion_of(config.motion)), {}
     for name in strategies:
-        bound = drive_bound(known, scans_of(heard, name, told))
+        bound = drive_bound(known, scans_of(heard, name, told), config)
         if (
             bound is not None
             and config.filter.first_pose == "drawn"

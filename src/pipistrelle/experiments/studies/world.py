@@ -30,7 +30,6 @@ from pipistrelle.evaluation.accuracy import (
 from pipistrelle.evaluation.bound import (
     bound_of_drawn_start,
     nees_of_exact_start,
-    pose_bound,
 )
 from pipistrelle.evaluation.consistency import track_nees
 from pipistrelle.experiments.hearing.listening import listen
@@ -41,7 +40,7 @@ from pipistrelle.experiments.hearing.scenario import (
     world_of,
 )
 from pipistrelle.experiments.hearing.worlds import World
-from pipistrelle.experiments.results.scores import PathScores, Scores, with_bound
+from pipistrelle.experiments.results.scores import PathScores, Scores, drive_bound, with_bound
 from pipistrelle.experiments.runs.checking import first_belief
 from pipistrelle.experiments.runs.trial import drive_of, run_trial, scans_of
 from pipistrelle.experiments.studies.plan import Plan, PlannedCase, cases_of
@@ -306,6 +305,7 @@ class _Shared:
         self, scenario: Scenario, config: Config, beams: Mapping[float, Sequence[Heard]]
     ) -> None:
         self.scenario, self.beams, self._config = scenario, beams, config
+        self._drive = drive_of(scenario, config)
         # No `cache` of a method: it would hold what holds it, and a world's sound for long.
         self._scans_known: dict[_Told, tuple[Scan, ...]] = {}
         self._bound_known: dict[_Told, Float[np.ndarray, "t 3 3"]] = {}
@@ -344,9 +344,11 @@ class _Shared:
     def _bound(self, told: _Told) -> Float[np.ndarray, "t 3 3"]:
         """Work out the bound of the pose at every step."""
         if told not in self._bound_known:
-            scans, world = self._scans(told), self.scenario
-            truth, motion = (world.path, standing_landmarks(world)), motion_of(self._config.motion)
-            bound = pose_bound(motion, world.controls, world.time, *truth, scans)
+            _, _, noise, listening = told
+            config = self._config.model_copy(update={"filter": noise, "listening": listening})
+            known = replace(self._drive, motion=motion_of(config.motion))
+            bound = drive_bound(known, self._scans(told), config)
+            assert bound is not None, "the truth of a world is known"
             self._bound_known[told] = bound
         return self._bound_known[told]
 
@@ -363,9 +365,10 @@ def _told(case: PlannedCase) -> _Told:
 
 
 def _noise_alone(told: FilterConfig) -> FilterConfig:
-    """Return of a filter's settings what states the noise, all else at its default."""
+    """Return of a filter's settings what states noise, and that of callers; else the defaults."""
     noise = ("noise", "range_std", "bearing_std", "detour_std")
-    return FilterConfig(**{name: getattr(told, name) for name in noise})
+    callers = ("caller_speed_std", "caller_walk_std")
+    return FilterConfig(**{name: getattr(told, name) for name in noise + callers})
 
 
 def _try_case(case: PlannedCase, shared: _Shared, iteration: int) -> TrialRecord:

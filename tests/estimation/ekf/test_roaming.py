@@ -1,0 +1,202 @@
+"""Callers that move: against slow references, by how sure the filters are, and where they are."""
+
+import numpy as np
+import pytest
+
+from pipistrelle.config import CallerConfig, Config, FilterConfig, ListeningConfig, ScenarioConfig
+from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.ekf.filter import EkfSlam
+from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
+from pipistrelle.estimation.ekf.roaming import roam, velocity_of
+from pipistrelle.estimation.motion import Motion
+from pipistrelle.experiments.runs.trial import run_mission
+from reference.missions import (
+    BICYCLE,
+    CIRCLE,
+    START,
+    draw_mission,
+    followed,
+    paper_filter,
+    paper_mission,
+    ray_config,
+    scattered,
+    steady,
+)
+from reference.roaming import (
+    BOAT,
+    SlowRoamingEkfSlam,
+    SlowRoamingInvariantEkfSlam,
+    drift,
+    wandering,
+    with_boat,
+)
+
+KINDS = [EkfSlam, InvariantEkfSlam]
+PAIRS = [(EkfSlam, SlowRoamingEkfSlam), (InvariantEkfSlam, SlowRoamingInvariantEkfSlam)]
+
+
+# Against what is slow
+
+
+def test_two_callers_and_a_ray_go_on_as_the_exact_solution_does():
+    rng = np.random.default_rng(4)
+    landmark = np.array([7, 3, 3, 3, 5, velocity_of(3), 8, velocity_of(7)])
+    size = 3 + 2 * landmark.size
+    root = rng.normal(size=(size, size))
+    mean, P = rng.normal(size=size), root @ root.T
+    F, Q = drift(8, {0: 7, 1: 5, 2: 5, 3: 5}, 1.7, 0.3)
+    whole, noise = np.eye(size), np.zeros((size, size))
+    whole[3:, 3:], noise[3:, 3:] = F, Q
+    expected = whole @ P @ whole.T + noise
+    went, spread = mean.copy(), P.copy()
+    roam(went, spread, landmark, 1.7, 0.3)
+    np.testing.assert_allclose(went, whole @ mean, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(spread, expected, rtol=0, atol=1e-11)
+
+
+def boat_mission(strategy, frames=60):
+    rng = np.random.default_rng(8)
+    mission = paper_mission(strategy, frames=frames, range_std=0.1, bearing_std=0.05)
+    return with_boat(mission, wandering(rng, frames, [6.0, 2.0], 0.5, 0.2), rng, direct=0.8)
+
+
+@pytest.mark.parametrize(("kind", "reference"), PAIRS)
+@pytest.mark.parametrize(("strategy", "frames"), [("fused", 60), ("passive", 120)])
+def test_a_run_with_a_caller_that_moves_equals_the_slow_reference(
+    kind, reference, strategy, frames
+):
+    mission = boat_mission(strategy, frames)
+    slam = paper_filter(kind, range_std=0.2, bearing_std=0.15)
+    slow = reference(BICYCLE, 0.2, 0.15, slam.rays, 1.0)
+    slow.detour_variance = 0.05**2
+    slow.start(START.mean, START.covariance)
+    placed = 0
+    for frame, (belief, _) in enumerate(followed(slam, mission)):
+        slow.predict(mission.controls[frame], mission.dt[frame])
+        slow.update(mission.scans[frame])
+        np.testing.assert_array_equal(belief.landmark, slow.landmark)
+        np.testing.assert_allclose(belief.weight, slow.weight, rtol=0, atol=1e-5)
+        rows = belief.rows()
+        np.testing.assert_allclose(rows.mean.ravel(), slow.mean[3:], rtol=0, atol=1e-4)
+        linear = slow.linear() if hasattr(slow, "linear") else slow.covariance
+        np.testing.assert_allclose(belief.pose().covariance, linear[:3, :3], rtol=0, atol=1e-5)
+        placed += len(belief.moving().landmark) == 1
+    assert placed > 30
+
+
+# What is told of it
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_caller_that_moves_is_no_landmark_of_the_map_and_neither_is_its_velocity(kind):
+    mission = boat_mission("fused", frames=40)
+    slam = paper_filter(kind)
+    *_, (belief, _) = followed(slam, mission)
+    assert velocity_of(BOAT) in belief.landmark
+    assert BOAT not in belief.landmarks().landmark
+    assert (belief.landmarks().landmark > 0).all()
+    assert belief.moving().landmark.tolist() == [BOAT]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_bearings_of_a_caller_that_moves_are_never_crossed(kind):
+    """From a drive along a line, a boat beside it, at the same speed, is always abeam."""
+    rng, frames = np.random.default_rng(2), 30
+    start = Gaussian(mean=np.zeros(3), covariance=np.eye(3) * 1e-8)
+    still = Motion(model="bicycle", control_std=(1e-3, 1e-4), wheelbase=0.2)
+    field = {"landmarks": np.array([[500.0, 500.0]]), "beamwidth": 0.0}
+    mission = draw_mission(rng, still, start, controls=steady((1.0, 0.0), frames), **field)
+    beside = mission.path[1:, :2] + [0.0, 9.0]
+    mission = with_boat(mission, beside, rng, bearing_std=1e-3)
+    slam = paper_filter(kind, motion=still, rays=ray_config(spacing="auto"), bearing_std=1e-3)
+    beliefs = [belief for belief, _ in followed(slam, mission, start)]
+    assert all(len(belief.moving().landmark) > 1 for belief in beliefs), "a ray, and no more"
+    assert all((belief.weight >= 0.0).all() for belief in beliefs), "nothing waits to be crossed"
+
+
+def test_the_invariant_filter_follows_in_any_direction_alike():
+    """Turned by a radian and shifted, the same mission is believed, turned and shifted."""
+    mission = boat_mission("fused", frames=40)
+    turn, shift = np.array([[np.cos(1), -np.sin(1)], [np.sin(1), np.cos(1)]]), np.array([7.0, -4.0])
+    slam = paper_filter(InvariantEkfSlam)
+    x, y, heading = START.mean
+    M = np.eye(3)
+    M[:2, :2] = turn
+    start = Gaussian(
+        mean=np.array([*(turn @ [x, y] + shift), heading + 1.0]),
+        covariance=M @ START.covariance @ M.T,
+    )
+    *_, (plain, _) = followed(slam, mission)
+    *_, (turned, _) = followed(slam, mission, start)
+    expected = plain.moving().mean @ turn.T + shift
+    np.testing.assert_allclose(turned.moving().mean, expected, rtol=0, atol=1e-8)
+
+
+# How sure it is
+
+
+STEADY = Motion(model="bicycle", control_std=(0.05, 0.005), wheelbase=0.2)
+
+
+def caller_nees(kind, told, runs=40):
+    """Mean NEES of a boat's place after twenty seconds, its walk told as a factor of itself."""
+    nees, walk_std = [], 0.3
+    for seed in range(runs):
+        rng, noise = np.random.default_rng([5, seed]), {"range_std": 0.05, "bearing_std": 0.02}
+        start = Gaussian(mean=START.mean, covariance=np.diag([0.02, 0.02, 0.01]) ** 2)
+        mission = draw_mission(
+            rng, STEADY, start, scattered(rng, 12, radius=12.0), steady(CIRCLE, 40),
+            beamwidth=np.pi, hearing=30.0, **noise,
+        )  # fmt: skip
+        path = wandering(rng, 40, [5.0, 3.0], 0.5, walk_std)
+        mission = with_boat(mission, path, rng, bearing_std=0.02, detour_std=0.1, direct=0.5)
+        slam = paper_filter(
+            kind, motion=STEADY, rays=ray_config(power=8.0, prune=1e-9), speed_std=0.5,
+            walk_std=told * walk_std, **noise,
+        )  # fmt: skip
+        *_, (belief, _) = followed(slam, mission, start)
+        boat = belief.moving()
+        off = boat.mean[0] - path[-1]
+        nees.append(off @ np.linalg.solve(boat.covariance[0], off))
+    return np.mean(nees)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_how_sure_a_caller_is_followed_is_true_unless_its_walk_is_told_a_thirtieth(kind):
+    assert 1.2 < caller_nees(kind, 1.0) < 3.0, "2, with the chance of 40 draws"
+    assert caller_nees(kind, 1 / 30) > 5.0
+
+
+# In sound
+
+SAILING = Config(
+    callers=(CallerConfig(course="circle", radius=10.0, speed=0.75),),
+    scenario=ScenarioConfig(steps=600),
+    listening=ListeningConfig(timing=True),
+)
+
+
+def test_a_caller_that_circles_is_followed_by_its_sound():
+    done = run_mission(SAILING, ["fused", "passive"], ["iekf", "fastslam"])
+    for trial in done.trials:
+        if trial.filter == "fastslam":
+            assert not trial.track.callers, "it knows of what stands alone"
+            continue
+        (label,) = trial.track.callers
+        true, found = done.drive.truth.callers[label], trial.track.callers[label]
+        known = np.isfinite(found.mean[:, 0])
+        assert known.sum() > 0.8 * len(trial.scans)
+        error = np.hypot(*(found.mean - true)[known].T)
+        assert np.sqrt(np.mean(error**2)) == pytest.approx(trial.scores.caller_rmse_m)
+        assert trial.scores.caller_rmse_aligned_m < trial.scores.caller_rmse_m < 1.0
+        assert label not in trial.track.landmarks.landmark
+
+
+def test_without_timing_a_caller_that_moves_is_left_out_as_ever():
+    deaf = SAILING.model_copy(update={"listening": ListeningConfig(timing=False)})
+    strays = deaf.model_copy(update={"filter": FilterConfig(caller_walk_std=9.0)})
+    one, other = (run_mission(config, ["fused"], ["iekf"]).trials[0] for config in (deaf, strays))
+    assert not one.track.callers
+    assert one.scores.caller_rmse_m is None
+    assert one.scores == other.scores
+    assert one.track.pose.mean.tobytes() == other.track.pose.mean.tobytes()
