@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 
 from pipistrelle.acoustics.callers import Caller
+from pipistrelle.config import CallerConfig, Config, ListeningConfig, ScenarioConfig
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks, Track
 from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.results.scores import Scores, TrialResult
+from pipistrelle.experiments.runs.again import Again
+from pipistrelle.experiments.runs.trial import run_mission
+from pipistrelle.figures.recorder import MissionRecorder
 from pipistrelle.geometry import range_and_bearing, wrap
 from reference.missions import map_with, scan_with
 
@@ -224,3 +228,32 @@ def mission() -> Mission:
         trials={strategy: trial for strategy, (trial, _) in made.items()},
         watched={strategy: frames for strategy, (_, frames) in made.items()},
     )
+
+
+@pytest.fixture(scope="session")
+def timed() -> tuple[Again, dict]:
+    """A short mission that hears when, among three callers of which one moves; and its frames."""
+    callers = (
+        CallerConfig(place=(10.0, -5.0)),
+        CallerConfig(name="mate", frequency=25e3, place=(5.0, -14.0)),
+        CallerConfig(name="boat", frequency=20e3, course="circle", radius=16.0),
+    )
+    config = Config(
+        seed=7,
+        scenario=ScenarioConfig(steps=160, landmarks=8),
+        listening=ListeningConfig(timing=True),
+        callers=callers,
+    )
+    watch = MissionRecorder()
+    done = run_mission(config, ("active", "fused"), ("ekf",), watch=watch)
+    again = Again(
+        config=config,
+        trials=done.trials,
+        truth=done.drive.truth,
+        callers=done.scenario.callers[1:],
+        beamwidth=2.0 * HALF_BEAM,
+        mission=done,
+        log=None,
+        difference="",
+    )
+    return again, watch.snapshots

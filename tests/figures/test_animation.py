@@ -10,6 +10,7 @@ from pipistrelle.detection.scans import DETOUR, make_scan
 from pipistrelle.detection.scans import rows_of as rows_of_scan
 from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.figures.animation import _stage, animate_mission, pruned
+from pipistrelle.figures.detours import callers_at, drawn_detours
 from pipistrelle.figures.recorder import MissionRecorder, Snapshot
 from pipistrelle.geometry import range_and_bearing
 from reference.missions import map_with
@@ -212,3 +213,54 @@ def test_a_film_of_nothing_but_a_drive_needs_no_legend(tmp_path):
     )
     animate_mission({("active", "ekf"): [frame]}, tmp_path / "empty.gif")
     assert (tmp_path / "empty.gif").read_bytes().startswith(b"GIF89a")
+
+
+def test_a_panel_shows_the_detour_ellipses_of_its_frame_two_at_most(timed):
+    again, snapshots = timed
+    scene = {"truth": again.truth, "callers": again.callers, "beamwidth": again.beamwidth}
+    figure, panels = _stage(snapshots, **scene)
+    named = [text.get_text() for text in figure.legends[0].texts]
+    assert {"detour ellipse and its way", "caller as estimated"} <= set(named)
+    active, fused = panels
+    counts = set()
+    for frame, label in zip(fused.frames, fused.resolved, strict=True):
+        for panel in panels:
+            panel._show_detours(frame, label if panel is fused else -1)
+        outlines, ways = fused.detours.get_paths(), fused.ways.get_segments()
+        expected = drawn_detours(frame, label)[0]
+        assert len(outlines) == len(ways) == len(fused.spot.get_xdata()) + (len(outlines) > 1)
+        for outline, ellipse in zip(outlines, expected, strict=True):
+            np.testing.assert_array_equal(outline.vertices[:121], ellipse)
+        counts.add(len(outlines))
+        stars = callers_at(frame).mean
+        np.testing.assert_array_equal(fused.callers.get_xydata(), stars)
+        assert active.detours.get_paths() == []
+    assert {1, 2} <= counts <= {0, 1, 2}
+    assert fused.detours.get_clip_on()
+
+
+def test_a_mission_without_timing_has_neither_ellipses_nor_marks_nor_a_word_of_them(
+    recorder, mission
+):
+    figure, panels = _stage(recorder.snapshots, **mission.scene)
+    assert "detour ellipse and its way" not in [t.get_text() for t in figure.legends[0].texts]
+    for panel in panels:
+        frame = panel.frames[200]
+        panel._show_detours(frame, panel.resolved[200])
+        panel._show_vehicle(frame.pose, frame.scan.time, 200)
+        drawn = (panel.detours.get_paths(), panel.ways.get_segments())
+        assert drawn == ([], [])
+        assert [len(one.get_xdata()) for one in (panel.callers, panel.spot, panel.movers)] == [
+            0
+        ] * 3
+
+
+def test_a_caller_that_moves_is_a_star_where_it_is_at_the_time(timed):
+    again, snapshots = timed
+    boat = again.callers[2].place
+    _, panels = _stage(snapshots, truth=again.truth, callers=again.callers, beamwidth=None)
+    frame = panels[0].frames[20]
+    panels[0]._show_vehicle(frame.pose, frame.scan.time, 20)
+    step = np.searchsorted(again.truth.time, frame.scan.time - 1e-9)
+    assert 0 < step < len(boat) - 1
+    np.testing.assert_array_equal(panels[0].movers.get_xydata(), boat[[step]])

@@ -285,3 +285,22 @@ print("matplotlib.pyplot" in sys.modules)
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     )
     assert run.stdout.split() == ["False", "False"]
+
+
+def test_callers_are_marked_where_they_are_believed_to_be_where_detours_were_heard(timed, three):
+    again, _ = timed
+    figure = draw_mission(again.trials, truth=again.truth, callers=again.callers)
+    named = [text.get_text() for text in figure.legends[0].texts]
+    assert named.index("caller as estimated") == named.index("caller") + 2, "a moving one between"
+    for axes, trial in zip(maps(figure), again.trials, strict=True):
+        open_stars = [line for line in axes.lines if line.get_markerfacecolor() == "none"]
+        (stars,) = [line for line in open_stars if line.get_marker() == "*"]
+        rows = trial.track.landmarks
+        full = placed(rows) & np.isin(rows.landmark, [9, 10])
+        assert full.any()
+        np.testing.assert_array_equal(stars.get_xydata(), rows.mean[full])
+    assert "caller as estimated" not in [text.get_text() for text in three.legends[0].texts]
+    for axes in maps(three):
+        assert "none" not in [
+            line.get_markerfacecolor() for line in axes.lines if line.get_marker() == "*"
+        ]

@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipistrelle.acoustics.callers import Caller
+from pipistrelle.acoustics.callers import Caller, moves
 from pipistrelle.config import InputError
+from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.experiments.drives import NO_TRUTH, LabelledPoints, Truth
 from pipistrelle.figures.closeup import Closeup, add_closeups
+from pipistrelle.figures.detours import callers_at, callers_marked, drawn_detours, resolved
 from pipistrelle.figures.film import film_writer
 from pipistrelle.figures.maps import (
     callers_shown,
@@ -62,6 +64,11 @@ def animate_mission(
     landmarks that are fully initialised in their 95 % ellipses, ringed when they have just become
     so. Particles, if there are any, are enlarged in a corner that follows the vehicle.
 
+    Where detours were heard, those of the landmark that they place, weigh or have placed last are
+    thin ellipses, two at most, about the vehicle and the caller, with the way of the sound and a
+    dark dot where they cross. Callers are then marked where they are believed to be, too, as they
+    are where there are several.
+
     Parameters
     ----------
     snapshots : for each (strategy, filter), frames in the order of time
@@ -70,7 +77,7 @@ def animate_mission(
         Ends in .gif, or in .mp4, which needs ffmpeg.
     truth : Truth
     callers : sequence of Caller, optional
-        Without the vehicle; one that moves is drawn as its path.
+        Without the vehicle; one that moves is drawn as its path and a star on it.
     beamwidth : [rad], optional
     pictures : int, at least 1
         At most so many frames are shown, evenly spaced, the last among them.
@@ -121,7 +128,8 @@ def _times(
 
 def _symbols(snapshots: Mapping[tuple[str, str], Sequence[Snapshot]]) -> list[str]:
     """Name what is heard and believed in any of the frames, in the order of the legend."""
-    frames = [frame for seen in snapshots.values() for frame in seen]
+    recorded = list(snapshots.values())
+    frames = [frame for seen in recorded for frame in seen]
     ranged = [np.isfinite(heard_from(frame.scan).range) for frame in frames]
     full = [placed(frame.landmarks) for frame in frames]
     rays = any(not rows.all() for rows in full)
@@ -131,6 +139,12 @@ def _symbols(snapshots: Mapping[tuple[str, str], Sequence[Snapshot]]) -> list[st
         "ray, 1σ, darker: likelier": rays,
         "just pruned": rays,
         "placed landmark, 95 %": any(rows.any() for rows in full),
+        "detour ellipse and its way": any(set(resolved(seen)) - {UNLABELLED} for seen in recorded),
+        "caller as estimated": any(
+            callers_marked([frame.scan for frame in seen])
+            and any(np.isfinite(callers_at(frame).mean).any() for frame in seen)
+            for seen in recorded
+        ),
     }
     return [name for name, there in drawn.items() if there]
 
@@ -169,6 +183,7 @@ def _stage(
         axes.set_axisbelow(True)
         draw_truth(axes, truth.landmarks, callers)
         panels.append(_Panel(axes, head(axes, strategy, name), frames, strategy, truth))
+        panels[-1].moving = [np.asarray(one.place) for one in callers if moves(one)]
         panels[-1].beamwidth = None if strategy == "passive" else beamwidth
     _enlarge(panels, truth.landmarks)
     legend(figure, names, 2 * columns, LEFT, RIGHT)
@@ -226,6 +241,9 @@ class _Panel:
         self.size = axes.get_xlim()[1] - axes.get_xlim()[0]
         self.colour = strategy_colour(strategy)
         self.beamwidth: float | None = None
+        self.moving: list[Float[np.ndarray, "t 2"]] = []
+        self.resolved = resolved(frames)
+        self.marked = callers_marked([frame.scan for frame in frames])
         self.rows, self.turned_full = frames[0].landmarks, {}
         self.artists: list[Artist] = []
         self.closeup: Closeup | None = None
@@ -255,11 +273,16 @@ class _Panel:
         self.members = areas(lw=0.8)
         self.pruned = areas(fc="none", ec=INK, lw=0.8, ls=":")
         self.true = points(color=TRUTH, lw=3.2, alpha=0.45)
+        self.detours = areas(fc="none", ec=INK, lw=0.9, alpha=0.7)
+        self.ways = lines(colors=INK, lw=0.9, alpha=0.7)
         self.bearings = lines(colors=colour, lw=0.7, ls=(0, (4, 3)), alpha=0.6)
         self.ranges = lines(colors=colour, lw=1.4)
         self.full = areas(fc=shades(colour, np.full(1, 0.2)), ec=colour, lw=0.8)
         self.dots = points("o", ms=2.6, mfc=colour, mec="none")
+        self.spot = points("o", ms=4.0, mfc=INK, mec="none")
         self.rings = areas(fc="none", lw=1.6)
+        self.movers = points("*", ms=12, mfc=INK, mec="white", mew=0.8)
+        self.callers = points("*", ms=12, mfc="none", mec=colour, mew=1.1)
         self.estimated = points(color=colour, lw=1.2)
         self.vehicle = areas(fc=INK, ec="white", lw=0.8)
         keep(self.line)
@@ -271,6 +294,7 @@ class _Panel:
         self._show_vehicle(frame.pose, time, now)
         self._show_scan(frame)
         self._show_map(frame.landmarks, picture)
+        self._show_detours(frame, self.resolved[now])
         for artist in self.artists:
             self.axes.draw_artist(artist)
 
@@ -284,6 +308,8 @@ class _Panel:
         if self.truth.path is not None:
             true = self.truth.path[self.truth.time <= time + 1e-9]
             self.true.set_data(*true[:, :2].T)
+            there = [way[len(true) - 1] for way in self.moving if len(way) == len(self.truth.time)]
+            self.movers.set_data(*np.reshape(there, (-1, 2)).T)
         cloud = self.frames[now].cloud
         if self.closeup and cloud is not None:
             self.closeup.show(cloud, self.path[: now + 1], true)
@@ -296,6 +322,15 @@ class _Panel:
         tip = origin + reach[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
         self.ranges.set_segments([np.stack([origin, end]) for end in tip[ranged]])
         self.bearings.set_segments([np.stack([origin, end]) for end in tip[~ranged]])
+
+    def _show_detours(self, frame: Snapshot, landmark: int) -> None:
+        """Show a landmark's detours, and where callers are believed to be."""
+        outlines, ways = drawn_detours(frame, landmark)
+        self.detours.set_verts(outlines)
+        self.ways.set_segments(ways)
+        self.spot.set_data(*np.reshape([way[1] for way in ways[:1]], (-1, 2)).T)
+        if self.marked:
+            self.callers.set_data(*callers_at(frame).mean.T)
 
     def _show_map(self, rows: Landmarks, picture: int) -> None:
         """Show rays, what was pruned from them since the last picture, and full landmarks."""

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 from pipistrelle.acoustics.callers import Caller
 from pipistrelle.estimation.beliefs import placed
@@ -12,6 +13,7 @@ from pipistrelle.evaluation.consistency import anees_bounds, track_nees
 from pipistrelle.experiments.drives import NO_TRUTH, LabelledPoints, Truth
 from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.figures.closeup import add_closeups
+from pipistrelle.figures.detours import callers_believed, callers_marked
 from pipistrelle.figures.maps import (
     callers_shown,
     cells,
@@ -132,6 +134,7 @@ def _symbols(
         "placed landmark, 95 %": not tied and any(rows.any() for rows in full),
         "unresolved ray, 1σ, darker: likelier": any(not rows.all() for rows in full),
         **{name: name in shown for name in ("beacon", "caller", "moving caller")},
+        "caller as estimated": any(len(_callers(trial)) for trial in trials),
         "vehicle at the end": bool(ending),
         "its beam": beamwidth is not None and bool(calling),
         "particles": any(trial.track.cloud is not None for trial in ending),
@@ -208,6 +211,9 @@ def _draw_estimate(axes: "Axes", trial: TrialResult, true_landmarks: LabelledPoi
     axes.add_collection(PolyCollection(list(outline), **style, zorder=4))
     ties = _ties(trial, true_landmarks)
     axes.add_collection(LineCollection(ties, colors=INK, lw=0.7, zorder=4.5))
+    if len(callers := _callers(trial)):
+        x, y = callers.T
+        axes.plot(x, y, "*", ms=12, mfc="none", mec=colour, mew=1.1, zorder=5.5)
     outline = ellipses(rows.mean[~full], rows.covariance[~full], RAY)
     weight = rows.weight[~full]
     style = {"fc": shades(colour, weight), "ec": shades(colour, weight, most=1.0), "lw": 0.8}
@@ -215,6 +221,14 @@ def _draw_estimate(axes: "Axes", trial: TrialResult, true_landmarks: LabelledPoi
     labels = np.unique(rows.landmark[~full])
     rays = [rows.mean[rows.landmark == label] for label in labels]
     axes.add_collection(LineCollection(rays, colors=colour, lw=0.6, alpha=0.45, zorder=1.5))
+
+
+def _callers(trial: TrialResult) -> Float[np.ndarray, "c 2"]:
+    """Return where the callers are believed to be at the end that a picture marks."""
+    if not callers_marked(trial.scans):
+        return np.empty((0, 2))
+    mean = callers_believed(trial.track.landmarks, trial.scans[-1].callers).mean
+    return mean[np.isfinite(mean).all(axis=1)]
 
 
 def _ties(trial: TrialResult, true_landmarks: LabelledPoints | None) -> list[np.ndarray]:

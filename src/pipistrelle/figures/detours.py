@@ -1,0 +1,213 @@
+"""Which detours a picture shows: those that resolve a ray, by ellipses about caller and vehicle.
+
+Both stand where they are believed to be at that frame. Of a frame one landmark is shown so, and
+of its detours two at most: with its bearing, or with each other, they cross where it is.
+"""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipistrelle.detection.scans import UNLABELLED, Scan
+from pipistrelle.estimation.beliefs import Gaussian, Landmarks, placed
+from pipistrelle.figures.outlines import detour_ellipse
+from pipistrelle.figures.recorder import Snapshot
+
+MOST = 2
+"""Ellipses that are shown at a time."""
+RECENT = 40
+"""Frames for which a landmark is shown so that detours have placed: each frame's ellipses cross
+there, wherever the vehicle goes."""
+
+
+def callers_believed(landmarks: Landmarks, labels: Int[np.ndarray, " c"]) -> Gaussian:
+    """Where callers are believed to be: as the landmarks that they are, once they are placed.
+
+    Parameters
+    ----------
+    landmarks : Landmarks
+    labels : (c)
+        Of each caller, by its number, as `Scan.callers`.
+
+    Returns
+    -------
+    Gaussian of (c, 2) [m] and (c, 2, 2) [m^2]
+        NaN for the vehicle, and for who is not placed or no landmark of the map.
+
+    Examples
+    --------
+    >>> point = {"mean": np.array([[3.0, 4.0]]), "covariance": np.eye(2)[None]}
+    >>> one = Landmarks(landmark=np.array([7]), weight=np.ones(1), **point)
+    >>> callers_believed(one, np.array([-1, 7, 8])).mean
+    array([[nan, nan],
+           [ 3.,  4.],
+           [nan, nan]])
+    """
+    mean, covariance = np.full((len(labels), 2), np.nan), np.full((len(labels), 2, 2), np.nan)
+    full = placed(landmarks)
+    for number, label in enumerate(labels.tolist()):
+        row = np.flatnonzero(full & (landmarks.landmark == label))
+        if label != UNLABELLED and len(row):
+            mean[number], covariance[number] = landmarks.mean[row[0]], landmarks.covariance[row[0]]
+    return Gaussian(mean=mean, covariance=covariance)
+
+
+def callers_at(frame: Snapshot) -> Gaussian:
+    """Where callers are believed to be at a frame: all pictures ask here.
+
+    Parameters
+    ----------
+    frame : Snapshot
+
+    Returns
+    -------
+    Gaussian of (c, 2) [m] and (c, 2, 2) [m^2]
+        As `callers_believed`, by the callers' numbers.
+    """
+    return callers_believed(frame.landmarks, frame.scan.callers)
+
+
+def callers_marked(scans: Sequence[Scan]) -> bool:
+    """Tell whether a picture marks where callers are believed to be.
+
+    Parameters
+    ----------
+    scans : sequence of Scan
+
+    Returns
+    -------
+    bool
+        Where there are several, or where detours were heard, whose ellipses are about them. The
+        paper's one beacon is a landmark as any other.
+    """
+    several = any(np.sum(scan.callers != UNLABELLED) > 1 for scan in scans[-1:])
+    return several or any(np.isfinite(scan.detour).any() for scan in scans)
+
+
+def detours_at(frame: Snapshot) -> dict[int, Int[np.ndarray, " k"]]:
+    """Rows of a frame's scan whose detour makes an ellipse, by their landmark.
+
+    Parameters
+    ----------
+    frame : Snapshot
+
+    Returns
+    -------
+    dict of label to (k) rows
+        Of landmarks of the map, heard from callers that are placed. Of several the first two are
+        those whose ellipses cross most squarely there.
+    """
+    scan, heard = frame.scan, np.isfinite(frame.scan.detour)
+    heard &= (scan.caller < len(scan.callers)) & np.isin(scan.landmark, frame.landmarks.landmark)
+    if not heard.any() or not np.isfinite(frame.pose).all():
+        return {}
+    callers, found = callers_at(frame).mean, defaultdict(list)
+    for row in np.flatnonzero(heard).tolist():
+        if np.isfinite(callers[scan.caller[row]]).all():
+            found[int(scan.landmark[row])].append(row)
+    return {label: _squarest(frame, label, callers, rows) for label, rows in found.items()}
+
+
+def _squarest(
+    frame: Snapshot, label: int, callers: Float[np.ndarray, "c 2"], rows: list[int]
+) -> Int[np.ndarray, " k"]:
+    r"""Put the two rows first whose ellipses cross most squarely at a landmark.
+
+    An ellipse's normal there halves the angle between the ways to its foci:
+    :math:`(l - b)/|l - b| + (l - p)/|l - p|`.
+    """
+    if len(rows) <= MOST:
+        return np.array(rows)
+    here = frame.landmarks.landmark == label
+    spot = frame.landmarks.mean[here][np.argmax(frame.landmarks.weight[here])]
+
+    def away(points: np.ndarray) -> np.ndarray:
+        legs = spot - points
+        return legs / np.maximum(np.linalg.norm(legs, axis=-1, keepdims=True), 1e-9)
+
+    normal = away(callers[frame.scan.caller[rows]]) + away(frame.pose[:2])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    x, y = normal.T
+    pairs = combinations(range(len(rows)), 2)
+    first = max(pairs, key=lambda pair: abs(x[pair[0]] * y[pair[1]] - y[pair[0]] * x[pair[1]]))
+    return np.array(rows)[[*first, *(i for i in range(len(rows)) if i not in first)]]
+
+
+def resolved(frames: Sequence[Snapshot]) -> list[int]:
+    """Choose for each frame the landmark whose detours are shown.
+
+    The one that the frame's detours have just placed; else the ray of the fewest members that
+    they weigh; else the one that they placed last, `RECENT` frames ago at most. Of several the one
+    that was shown before, or that has two detours.
+
+    Parameters
+    ----------
+    frames : sequence of Snapshot
+        In the order of time.
+
+    Returns
+    -------
+    list of label
+        UNLABELLED where there is none.
+
+    Examples
+    --------
+    >>> resolved([])
+    []
+    """
+    members, since, timed, ranged = {}, {}, set(), set()
+    shown, found = UNLABELLED, []
+    for now, frame in enumerate(frames):
+        before, told, scan = members, detours_at(frame), frame.scan
+        labels, counts = np.unique(frame.landmarks.landmark, return_counts=True)
+        members = dict(zip(labels.tolist(), counts.tolist(), strict=True))
+        timed.update(told)
+        ranged.update(scan.landmark[np.isfinite(scan.range)].tolist())
+        for label in timed - ranged:
+            if members.get(label) == 1 and before.get(label) != 1:
+                since[label] = now
+        ranks = {}
+        for label, rows in told.items():
+            age = now - since.get(label, -RECENT - 1)
+            if members[label] > 1:
+                rank = (1, members[label])
+            elif age <= RECENT:
+                rank = (2 if age else 0, age)
+            else:
+                continue
+            ranks[label] = (*rank, label != shown, -min(len(rows), MOST), label)
+        shown = min(ranks, key=lambda label: ranks[label], default=UNLABELLED)
+        found.append(shown)
+    return found
+
+
+def drawn_detours(
+    frame: Snapshot, label: int
+) -> tuple[list[Float[np.ndarray, "121 2"]], list[Float[np.ndarray, "3 2"]]]:
+    """Ellipses of a landmark's detours at a frame, and the ways of which they tell.
+
+    Parameters
+    ----------
+    frame : Snapshot
+    label : int
+
+    Returns
+    -------
+    ellipses : list of (121, 2) [m]
+        Two at most.
+    ways : list of (3, 2) [m]
+        From the caller to the likeliest place of the landmark and on to the vehicle.
+    """
+    rows = detours_at(frame).get(label, ())[:MOST]
+    here = frame.landmarks.landmark == label
+    callers, vehicle = callers_at(frame).mean, frame.pose[:2]
+    outlines, ways = [], []
+    for row in rows:
+        spot = frame.landmarks.mean[here][np.argmax(frame.landmarks.weight[here])]
+        caller = callers[frame.scan.caller[row]]
+        outlines.append(detour_ellipse(vehicle, caller, float(frame.scan.detour[row])))
+        ways.append(np.stack([caller, spot, vehicle]))
+    return outlines, ways

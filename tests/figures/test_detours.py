@@ -1,0 +1,145 @@
+"""Which detours a picture shows, and that their ellipses go through what they tell of."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipistrelle.detection.scans import UNLABELLED, make_scan
+from pipistrelle.estimation.measurement import detour_of
+from pipistrelle.figures.detours import (
+    MOST,
+    RECENT,
+    callers_at,
+    callers_believed,
+    callers_marked,
+    detours_at,
+    drawn_detours,
+    resolved,
+)
+from pipistrelle.figures.recorder import Snapshot
+from reference.missions import map_with
+
+CALLERS = {1: np.array([8.0, 1.0]), 2: np.array([-3.0, 6.0]), 3: np.array([-3.0, 6.5])}
+SPOT = np.array([4.0, 7.0])
+LABELS = np.array([UNLABELLED, 91, 92, 93])
+
+
+def frame_of(members, heard, ranged=()):
+    """A frame: members of each landmark, who was heard whose call threw back, and ranges."""
+    rows = [(90 + number, place) for number, place in CALLERS.items()]
+    rows += [(label, SPOT + k) for label, count in members.items() for k in range(count)]
+    label, mean = zip(*rows, strict=True)
+    weight = [1.0 / members.get(one, 1) for one in label]
+    landmark, caller = (np.array(column, dtype=int) for column in zip(*heard, strict=True))
+    detour = [detour_of(np.zeros(2), SPOT, CALLERS[one]) for one in caller.tolist()]
+    distance = np.where(np.isin(landmark, ranged), 8.0, np.nan)
+    scan = make_scan(0.0, landmark, np.zeros(len(heard)), range=distance, detour=np.array(detour),
+                     caller=caller)  # fmt: skip
+    return Snapshot(
+        scan=replace(scan, callers=LABELS),
+        pose=np.zeros(3),
+        covariance=np.zeros((3, 3)),
+        landmarks=map_with(label, mean, weight=weight),
+    )
+
+
+def test_callers_are_believed_where_their_landmark_is_once_it_is_placed():
+    rows = map_with(
+        [91, 92, 92], [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]], np.tile(np.eye(2), (3, 1, 1))
+    )
+    known = callers_believed(rows, LABELS)
+    np.testing.assert_array_equal(known.mean[1], [1.0, 2.0])
+    np.testing.assert_array_equal(known.covariance[1], np.eye(2))
+    assert np.isnan(known.mean[[0, 2, 3]]).all(), "the vehicle, a ray, and one never heard"
+
+
+def test_an_ellipse_goes_through_the_landmark_that_its_detour_tells_of():
+    (ellipse,), (way,) = drawn_detours(frame_of({5: 1}, [(5, 1)]), 5)
+    caller = CALLERS[1]
+    length = np.hypot(*(ellipse - caller).T) + np.hypot(*ellipse.T)
+    expected = np.hypot(*(SPOT - caller)) + np.hypot(*SPOT)
+    np.testing.assert_allclose(length, expected)
+    assert np.hypot(*(ellipse - SPOT).T).min() < 0.3
+    np.testing.assert_array_equal(way, [caller, SPOT, [0.0, 0.0]])
+
+
+def test_of_three_detours_two_are_drawn_that_cross_most_squarely():
+    frame = frame_of({5: 1}, [(5, 2), (5, 3), (5, 1)])
+    rows = detours_at(frame)[5]
+    assert len(rows) == 3
+    assert 1 in frame.scan.caller[rows[:MOST]], "two and three stand beside each other"
+    assert len(drawn_detours(frame, 5)[0]) == MOST == 2
+    assert len(drawn_detours(frame_of({5: 1}, [(5, 2), (5, 3)]), 5)[0]) == 2
+
+
+def test_a_detour_of_a_caller_that_is_not_placed_makes_no_ellipse():
+    frame = frame_of({5: 1}, [(5, 1), (5, 2)])
+    some = frame.landmarks.landmark != 92
+    rows = {name: getattr(frame.landmarks, name)[some] for name in ("landmark", "mean", "weight")}
+    blind = replace(
+        frame, landmarks=map_with(rows["landmark"], rows["mean"], weight=rows["weight"])
+    )
+    assert frame.scan.caller[detours_at(blind)[5]].tolist() == [1]
+    unknown = replace(frame, scan=replace(frame.scan, callers=LABELS[:2]))
+    assert frame.scan.caller[detours_at(unknown)[5]].tolist() == [1], "a number beyond the labels"
+    assert detours_at(replace(frame, pose=np.full(3, np.nan))) == {}
+    assert drawn_detours(frame, 77) == ([], []), "a landmark that nobody knows"
+
+
+def test_what_is_placed_now_goes_before_a_ray_and_a_ray_before_what_was_placed():
+    heard = [(5, 1), (6, 1), (7, 1)]
+    frames = [
+        frame_of({5: 4, 6: 3, 7: 4}, heard),
+        frame_of({5: 1, 6: 3, 7: 4}, heard),
+        frame_of({5: 1, 6: 3, 7: 2}, heard),
+        frame_of({5: 1, 6: 1, 7: 1}, [(5, 1), (7, 1)]),
+        frame_of({5: 1, 6: 1, 7: 1}, [(5, 1), (7, 1)]),
+        frame_of({5: 1, 6: 1, 7: 1}, [(5, 1)]),
+    ]
+    assert resolved(frames) == [6, 5, 7, 7, 7, 5]
+
+
+def test_a_landmark_is_shown_for_a_while_after_detours_have_placed_it():
+    frames = [frame_of({5: 4}, [(5, 1)])] + [frame_of({5: 1}, [(5, 1)])] * (RECENT + 9)
+    shown = [label == 5 for label in resolved(frames)]
+    assert shown == [True] * (RECENT + 2) + [False] * 8
+
+
+def test_a_landmark_that_a_range_has_placed_is_none_that_detours_resolve():
+    frames = [frame_of({5: 1}, [(5, 1)], ranged) for ranged in ((5,), ())]
+    assert resolved(frames) == [UNLABELLED, UNLABELLED]
+    assert resolved(frames[1:]) == [5], "else it is"
+
+
+def test_of_two_landmarks_alike_the_one_stays_that_was_shown_or_has_two_detours():
+    one, both = [(5, 1), (6, 1)], [(5, 1), (6, 1), (6, 2)]
+    assert resolved([frame_of({5: 2, 6: 2}, both), frame_of({5: 2, 6: 2}, one)]) == [6, 6]
+    assert resolved([frame_of({5: 2, 6: 2}, one), frame_of({5: 2, 6: 2}, both)]) == [5, 5]
+
+
+def test_a_mission_without_timing_has_no_ellipse_and_its_one_beacon_no_mark(mission):
+    for frames in mission.watched.values():
+        scans = [scan for scan, _ in frames]
+        assert not callers_marked(scans)
+    silent = make_scan(0.0, np.array([5]), np.zeros(1))
+    assert not callers_marked([replace(silent, callers=LABELS[:2])])
+    assert callers_marked([replace(silent, callers=LABELS)]), "several"
+
+
+@pytest.mark.parametrize("strategy", ["active", "fused"])
+def test_ellipses_of_a_mission_pass_near_their_landmark(timed, strategy):
+    _, snapshots = timed
+    frames = snapshots[strategy, "ekf"]
+    chosen = resolved(frames)
+    assert (set(chosen) == {UNLABELLED}) == (strategy == "active"), "active takes no detours"
+    counts = []
+    for frame, label in zip(frames, chosen, strict=True):
+        outlines, ways = drawn_detours(frame, label)
+        counts.append(len(outlines))
+        for outline, way in zip(outlines, ways, strict=True):
+            near = np.hypot(*(outline - way[1]).T).min()
+            assert near < 0.2 * np.hypot(*np.diff(way, axis=0).T).sum()
+            believed = callers_at(frame).mean
+            assert (believed == way[0]).all(axis=1).any()
+    assert set(counts) == ({0} if strategy == "active" else {1, 2})
