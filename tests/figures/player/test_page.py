@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.figures.player.page import SCRIPTS, page
-from pipistrelle.figures.player.playback import Rows
+from pipistrelle.figures.player.playback import Rows, playback
 
 BAD = "</script><script>alert('a')</script>\"'&"
 
@@ -44,6 +44,19 @@ def test_the_numbers_are_the_missions(played):
         np.testing.assert_array_equal(unpacked(rows["numbers"]).reshape(shape), same)
     assert held["scales"]["placed"] == pytest.approx(np.sqrt(-2.0 * np.log(0.05)))
     assert held["farthest"] == 20.0
+
+
+def test_a_page_speaks_of_detours_only_where_some_were_heard(played, timed):
+    silent, told = page(played), page(playback(*timed))
+    for word in ('ellipses" type', "A detour ellipse", "E hides the detour ellipses"):
+        assert word not in silent
+        assert word in told
+    for one in numbers(silent)["estimates"]:
+        assert not {"callers", "detours", "resolved"} & one.keys(), "no number more than before"
+    active, fused = numbers(told)["estimates"]
+    assert "callers" in active
+    assert {"callers", "detours", "resolved"} <= fused.keys()
+    assert "detours" not in active
 
 
 def test_the_same_mission_gives_the_same_bytes(played):

@@ -1,15 +1,18 @@
 """The numbers of a page are those that the filters had, frame by frame."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from pipistrelle.config import InputError
+from pipistrelle.detection.logs.recording import LogCaller
 from pipistrelle.detection.scans import rows_of as rows_of_scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.experiments.drives import NO_TRUTH
 from pipistrelle.figures.animation import pruned
+from pipistrelle.figures.detours import callers_at, resolved
 from pipistrelle.figures.player.playback import MOST_PARTICLES, playback
 from pipistrelle.figures.recorder import MissionRecorder
 
@@ -262,3 +265,42 @@ def test_paths_as_they_were_revised_stand_at_their_frames_and_the_last_is_the_tr
     np.testing.assert_array_equal(rows_of(estimate.revised, 3)[1], end[::4, :2])
     np.testing.assert_array_equal(rows_of(estimate.mapped, 39)[1][:, :2], track.landmarks.mean)
     assert estimate.start[0] == trial.track.pose.mean[0, 0]
+
+
+def test_detours_are_laid_out_with_where_their_callers_are_believed_to_be(timed):
+    again, snapshots = timed
+    shown = playback(again, snapshots)
+    assert [place.ndim for *_, place in shown.callers] == [1, 1, 2]
+    active, fused = shown.estimates
+    assert len(active.detours.landmark) == 0
+    frames = snapshots["fused", "ekf"]
+    assert fused.resolved.tolist() == resolved(frames)
+    assert fused.callers.shape == (40, 3, 5)
+    assert np.isnan(fused.callers[:, 2]).all(), "who moves is not estimated"
+    for i in (0, 17, 39):
+        believed = callers_at(frames[i])
+        np.testing.assert_array_equal(fused.callers[i, :, :2], believed.mean[1:])
+        np.testing.assert_array_equal(fused.callers[i, :, 3], believed.covariance[1:, 0, 1])
+        labels, numbers = rows_of(fused.detours, i)
+        assert np.unique(labels, return_counts=True)[1].max() <= 2
+        scan = frames[i].scan
+        for label, (caller, detour) in zip(labels, numbers, strict=True):
+            (row,) = np.flatnonzero((scan.landmark == label) & (scan.detour == detour))
+            assert scan.caller[row] - 1 == caller
+
+
+def test_without_detours_nothing_is_laid_out_for_them(played):
+    for estimate in played.estimates:
+        assert estimate.callers is None
+        assert len(estimate.detours.landmark) == 0
+        assert set(estimate.resolved) == {-1}
+
+
+def test_a_logs_callers_have_names_and_no_true_place(watched):
+    done, snapshots = watched
+    log = SimpleNamespace(name="own", callers=(LogCaller(name="mate", landmark=21),))
+    ((label, name, place),) = playback(
+        replace(done, log=log, mission=None, callers=()), snapshots
+    ).callers
+    assert (label, name) == (21, "mate")
+    assert np.isnan(place).all()

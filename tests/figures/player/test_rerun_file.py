@@ -1,10 +1,13 @@
 """A recording for the Rerun viewer, where its package is; a clear line where it is not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pipistrelle.config import InputError
 from pipistrelle.figures.player import rerun_file
+from pipistrelle.figures.player.playback import playback
 from pipistrelle.figures.player.rerun_file import check_there, recording
 
 
@@ -54,6 +57,21 @@ def test_a_recording_tells_of_all_that_the_page_shows(played, tmp_path):
     assert {"/fused_fastslam/particles", "/fused_ekf/beam"} <= found
     assert "/passive_ekf/beam" not in found
     assert {"/truth/path", "/truth/vehicle", "/truth/landmarks", "/truth/beacon"} <= found
+    assert not {name for name in found if name.endswith(("/detours", "/callers"))}
     errors = {f"/{what}/active_ekf/{part}" for what in ("position", "heading")
               for part in ("error", "bound")}  # fmt: skip
     assert errors <= found
+
+
+def test_a_recording_tells_of_detours_where_some_were_heard(timed, tmp_path):
+    rerun = pytest.importorskip(
+        "rerun", reason="rerun-sdk is not installed: pip install 'pipistrelle[view]'"
+    )
+    rerun.set_strict_mode(True)
+    told = playback(*timed)
+    nowhere = tuple((label, name, np.full(2, np.nan)) for label, name, _ in told.callers[:1])
+    file = tmp_path / "mission.rrd"
+    file.write_bytes(recording(replace(told, callers=(*nowhere, *told.callers[1:]))))
+    found = entities(file)
+    assert {"/fused_ekf/detours", "/fused_ekf/callers", "/truth/mate", "/truth/boat"} <= found
+    assert "/truth/beacon" not in found, "nobody knows where"

@@ -2,8 +2,8 @@
 
 const LAYERS = [
   "grid", "beam", "member-1", "member-2", "member-3", "member-4", "member-5", "member-6", "spines",
-  "pruned-3", "pruned-2", "pruned-1", "true-path", "places", "way", "bearings", "ranges", "tips",
-  "ties", "placed", "dots", "fresh", "caller-path", "callers", "path", "revised", "cloud", "spread",
+  "pruned-3", "pruned-2", "pruned-1", "true-path", "places", "detours", "detour-ways", "way", "bearings", "ranges", "tips",
+  "ties", "placed", "dots", "detour-spot", "fresh", "caller-path", "callers", "believed-callers", "path", "revised", "cloud", "spread",
   "true-vehicle", "vehicle", "chosen",
 ];
 const OPACITIES = 6;
@@ -38,6 +38,7 @@ const look = (map, { left, right, bottom, top }) => {
 };
 
 const drawMap = (map, estimate, frame, chosen) => {
+  map.names = callerNames(map, estimate, frame);
   const pose = poseOf(estimate.pose, frame), believed = estimate.maps[frame];
   const d = {};
   drawGrid(map, d);
@@ -45,6 +46,8 @@ const drawMap = (map, estimate, frame, chosen) => {
   drawHeard(d, estimate, frame, pose, map.pixel);
   drawRays(d, estimate, frame, believed);
   drawPlaced(map, d, estimate, frame, believed);
+  drawCallers(map, d, estimate, frame);
+  drawDetours(d, estimate, frame, pose, believed, chosen);
   drawVehicle(map, d, estimate, frame, pose);
   drawChosen(map, d, estimate, frame, believed, chosen);
   for (const name of LAYERS) map.layers[name].setAttribute("d", d[name] || "");
@@ -60,13 +63,16 @@ const drawGrid = (map, d) => {
   const digits = Math.max(0, -Math.floor(Math.log10(step)));
   for (const x of xs) words.push([x.toFixed(digits), x - x0 + edge, bottom + edge]);
   for (const y of ys.slice(1)) words.push([y.toFixed(digits), left + edge, y - y0 + edge]);
-  words.push(...callerNames(map));
+  words.push(...map.names);
   writeWords(map, words);
 };
 
-const callerNames = (map) =>
-  mission.callers.filter((caller) => !caller.moves).map(({ name, place: [x, y] }) =>
-    [name, x + 9 * map.pixel, y + 7 * map.pixel, "name"]);
+// By where they are, or, where nobody knows that, by where they are believed to be.
+const callerNames = (map, estimate, frame) =>
+  mission.callers.map((caller, i) => ({ caller, spot: placeOf(caller, frame), belief: callerAt(estimate, i, frame) }))
+    .map(({ caller, spot, belief }) => ({ caller, spot: isKnown(spot) ? spot : belief }))
+    .filter(({ spot }) => isKnown(spot))
+    .map(({ caller, spot: { x, y } }) => [caller.name, x + 9 * map.pixel, y + 7 * map.pixel, "name"]);
 
 const writeWords = (map, words) => {
   map.texts.style.fontSize = `${11 * map.pixel}px`;
@@ -85,10 +91,9 @@ const drawTruth = (map, d, frame) => {
   const radius = PLACE_PIXELS * map.pixel;
   d.places = [...trueLandmarks.values()].map((place) => ring(place, radius)).join("");
   const stars = [], ways = [];
-  for (const { moves, place } of mission.callers) {
-    const now = moves ? 2 * frame : 0;
-    stars.push(star({ x: place[now], y: place[now + 1] }, STAR_PIXELS * map.pixel));
-    if (moves) ways.push(polyline(pointsOf(place, 2, frame)));
+  for (const caller of mission.callers) {
+    stars.push(star(placeOf(caller, frame), STAR_PIXELS * map.pixel));
+    if (caller.moves) ways.push(polyline(pointsOf(caller.place, 2, frame)));
   }
   d.callers = stars.join("");
   d["caller-path"] = ways.join("");
@@ -140,6 +145,29 @@ const drawPlaced = (map, d, estimate, frame, believed) => {
   d.fresh = fresh.filter(isKnown).map((one) => ring(one, 11 * map.pixel)).join("");
 };
 
+// A caller that stands is a landmark, in its ellipse already; one that moves is in its own.
+const drawCallers = (map, d, estimate, frame) => {
+  const believed = mission.callers.map(({ moves }, i) => ({ moves, ...callerAt(estimate, i, frame) })).filter(isKnown);
+  d["believed-callers"] = believed.map((one) => star(one, 1.25 * STAR_PIXELS * map.pixel)
+    + (one.moves ? outline(one, mission.scales.placed) : "")).join("");
+};
+
+// The detours of the chosen landmark, or of that which they resolve: ellipses about the vehicle and
+// the caller, and the ways of which they tell.
+const drawDetours = (d, estimate, frame, pose, believed, chosen) => {
+  if (!state.ellipses || !isKnown(pose)) return;
+  const heard = detoursShown(estimate, frame, chosen), ellipses = [], ways = [], spots = [];
+  for (const { landmark, caller, detour } of heard) {
+    const from = callerAt(estimate, caller, frame), spot = heaviest(believed.get(landmark));
+    ellipses.push(detourEllipse(pose, from, detour));
+    ways.push(polyline([from, spot, pose]));
+    spots.push(dot(spot));
+  }
+  d.detours = ellipses.join("");
+  d["detour-ways"] = ways.join("");
+  d["detour-spot"] = spots.slice(0, 1).join("");
+};
+
 // The path told last, where the estimator revises it, and the frames since.
 const pathSoFar = (estimate, frame) => {
   const told = estimate.revisedAt.findLastIndex((one) => one <= frame);
@@ -178,5 +206,6 @@ const drawChosen = (map, d, estimate, frame, believed, chosen) => {
   const heard = heardAt(estimate, frame).find(({ landmark }) => landmark === chosen);
   if (!heard || !place || !truth || !isKnown(truth)) return;
   const callers = heard.ranged ? [] : mission.callers.filter(({ moves, label }) => !moves && label !== chosen);
-  d.way = callers.map(({ place: [x, y] }) => line({ x, y }, place)).join("") + line(place, truth);
+  d.way = callers.map((caller) => placeOf(caller, frame)).filter(isKnown)
+    .map((from) => line(from, place)).join("") + line(place, truth);
 };

@@ -51,6 +51,28 @@ const heardAt = (estimate, frame) =>
   rowsOf(estimate.heard, frame).map(({ landmark, numbers: [bearing, range] }) =>
     ({ landmark, bearing, range, ranged: Number.isFinite(range) }));
 
+// Where a caller truly is at a frame.
+const placeOf = ({ moves, place }, frame) => {
+  const [x, y] = place.subarray(moves ? 2 * frame : 0);
+  return { x, y };
+};
+
+// Where a caller is believed to be at a frame, by its place among the callers.
+const callerAt = ({ callers }, caller, frame) => {
+  const first = 5 * (frame * mission.callers.length + caller);
+  const [x, y, xx, xy, yy] = callers ? callers.subarray(first, first + 5) : [];
+  return { x, y, xx, xy, yy };
+};
+
+// The detours of a frame that are shown: two at most, of the chosen landmark or of one they resolve.
+const detoursShown = ({ detours, resolved }, frame, chosen) => {
+  if (!detours) return [];
+  const heard = rowsOf(detours, frame).map(({ landmark, numbers: [caller, detour] }) =>
+    ({ landmark, caller, detour }));
+  const own = heard.filter(({ landmark }) => landmark === chosen);
+  return own.length ? own : heard.filter(({ landmark }) => landmark === resolved[frame]);
+};
+
 const trueLandmarks = new Map();
 if (mission.landmarks) {
   mission.landmarks.label.forEach((label, i) => {

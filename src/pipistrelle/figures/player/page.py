@@ -44,6 +44,7 @@ def page(playback: Playback) -> str:
     script = "".join((here / name).read_text(encoding="utf-8") for name in SCRIPTS)
     return template.render(
         title=playback.title,
+        detours=any(len(estimate.detours.landmark) for estimate in playback.estimates),
         facts=playback.facts,
         version=__version__,
         colours=Markup(page_colours()),
@@ -79,7 +80,12 @@ def _numbers(playback: Playback) -> dict[str, Any]:
 def _estimate(estimate: Estimate) -> dict[str, Any]:
     """Lay out what the script is to know of an estimate."""
     known = estimate.strategy in STRATEGY_COLOURS
-    return {
+    told = {}
+    if estimate.callers is not None:
+        told["callers"] = _packed(estimate.callers)
+    if len(estimate.detours.landmark):
+        told |= {"detours": _rows(estimate.detours), "resolved": _packed(estimate.resolved)}
+    return told | {
         "name": _name(estimate),
         "role": estimate.strategy if known else "ink",
         "calls": estimate.strategy != "passive",

@@ -17,6 +17,7 @@ from pipistrelle.experiments.drives import LabelledPoints
 from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.runs.again import Again
 from pipistrelle.figures.animation import pruned
+from pipistrelle.figures.detours import MOST, callers_at, callers_marked, detours_at, resolved
 from pipistrelle.figures.maps import view
 from pipistrelle.figures.mission import outcome
 from pipistrelle.figures.recorder import Snapshot, heard_from
@@ -76,6 +77,14 @@ class Estimate:
         Frames at which the path so far was told anew.
     revised : Rows
         For each of these the start, and each frame so far: x, y [m].
+    callers : (n, c, 5) or None
+        Where each caller of the playback is believed to be: x, y [m], xx, xy, yy [m^2], NaN where
+        that is not known. None where no picture marks it.
+    detours : Rows
+        Those that make an ellipse, two of a landmark at most: whose call it was, by its place among
+        the callers, and how much longer its way [m].
+    resolved : (n)
+        Label of the landmark whose detours are shown, -1 for none.
     """
 
     strategy: str
@@ -90,6 +99,9 @@ class Estimate:
     cloud: Float[np.ndarray, "n p 3"] | None
     revised_at: Int[np.ndarray, " j"]
     revised: Rows
+    callers: Float[np.ndarray, "n c 5"] | None
+    detours: Rows
+    resolved: Int[np.ndarray, " n"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,7 +126,7 @@ class Playback:
     landmarks : labels (m) and true positions (m, 2) [m], or None
     callers : tuple
         Label, name and places, (2) or (n, 2) [m], of each. The label of one that stands is that of
-        the landmark which it is.
+        the landmark which it is. Places are NaN where they are not known: of a log.
     beamwidth : [rad] or None
     farthest : [m]
         That a landmark may be of which a bearing alone is known.
@@ -246,6 +258,9 @@ def _callers(
     done: Again, steps: Int[np.ndarray, " n"], origin: Float[np.ndarray, "2"]
 ) -> tuple[tuple[int, str, np.ndarray], ...]:
     """Return the callers with their labels, and of a path the places at the frames."""
+    if done.log is not None:
+        unknown = np.full(2, np.nan)
+        return tuple((caller.landmark, caller.name, unknown) for caller in done.log.callers)
     count = 0 if done.mission is None else len(done.mission.scenario.landmarks)
     places = [np.asarray(caller.place, dtype=float) for caller in done.callers]
     return tuple(
@@ -290,6 +305,9 @@ def _estimate(
         cloud=_cloud(shown, origin),
         revised_at=revised_at,
         revised=revised,
+        callers=_callers_believed(shown, origin) if callers_marked(trial.scans) else None,
+        detours=_detours(shown),
+        resolved=np.array(resolved(frames), dtype=int)[at],
     )
 
 
@@ -307,6 +325,30 @@ def _heard(frames: Sequence[Snapshot]) -> Rows:
     scans = [heard_from(frame.scan) for frame in frames]
     numbers = [np.column_stack([scan.bearing, scan.range]) for scan in scans]
     return _rows([scan.landmark for scan in scans], numbers, 2)
+
+
+def _callers_believed(
+    frames: Sequence[Snapshot], origin: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, "n c 5"]:
+    """Lay out where the callers are believed to be, the vehicle left out."""
+    believed = [callers_at(frame) for frame in frames]
+    return np.array(
+        [
+            np.column_stack([b.mean - origin, b.covariance[:, (0, 0, 1), (0, 1, 1)]])[1:]
+            for b in believed
+        ]
+    )
+
+
+def _detours(frames: Sequence[Snapshot]) -> Rows:
+    """Lay out the detours that make ellipses: callers are counted without the vehicle."""
+    labels, numbers = [], []
+    for frame in frames:
+        rows = [row for found in detours_at(frame).values() for row in found[:MOST].tolist()]
+        scan = frame.scan
+        labels.append(scan.landmark[rows].astype(int))
+        numbers.append(np.column_stack([scan.caller[rows] - 1, scan.detour[rows]]))
+    return _rows(labels, numbers, 2)
 
 
 def _mapped(maps: Sequence[Landmarks], origin: Float[np.ndarray, "2"]) -> Rows:

@@ -1,6 +1,6 @@
 // The player: which estimates are shown, which frame, how fast, and what keys and fingers do.
 
-const state = { frame: 0, clock: 0, playing: false, speed: 1, shown: [], chosen: null };
+const state = { frame: 0, clock: 0, playing: false, speed: 1, shown: [], chosen: null, ellipses: true };
 const control = Object.fromEntries(
   ["play", "back", "on", "slider", "clock", "speed", "stage"].map((id) => [id, document.getElementById(id)]),
 );
@@ -213,6 +213,13 @@ const play = () => {
 const toggle = () => (state.playing ? pause() : play());
 const step = (frames) => { pause(); seek(state.frame + frames); };
 
+const ellipses = document.getElementById("ellipses"); // only where detours were heard
+const toggleEllipses = () => {
+  state.ellipses = !state.ellipses;
+  ellipses.setAttribute("aria-pressed", state.ellipses);
+  draw();
+};
+
 const KEYS = {
   " ": toggle,
   ArrowRight: ({ shiftKey }) => step(shiftKey ? 10 : 1),
@@ -220,6 +227,7 @@ const KEYS = {
   Home: () => step(-FRAMES),
   End: () => step(FRAMES),
   Escape: () => choose(null),
+  ...(ellipses && { e: toggleEllipses }),
 };
 
 const onKey = (event) => {
@@ -264,6 +272,7 @@ const start = () => {
   control.back.addEventListener("click", () => step(-1));
   control.on.addEventListener("click", () => step(1));
   document.getElementById("beside").addEventListener("click", addBeside);
+  if (ellipses) ellipses.addEventListener("click", toggleEllipses);
   document.addEventListener("keydown", onKey);
   new ResizeObserver(() => draw()).observe(control.stage);
   state.shown = mission.estimates.length > 1 ? firstPair() : [0];
