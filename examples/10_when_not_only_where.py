@@ -43,40 +43,48 @@ known = slam.update(start, make_scan(0.0, np.array([1, 2]), bearings, range=rang
 detours = np.array([detour_of(vehicle[:2], landmark, caller) for caller in callers])
 _, bearing = range_and_bearing(vehicle, landmark[None])
 labels = np.array([-1, 1, 2])  # of the vehicle, and of the callers by their numbers
-heard = {"a bearing alone: a ray": 0, "one detour: an ellipse": 1, "two detours": 2}
 beliefs = []
-for count in heard.values():
+for count in range(3):
     rows = max(count, 1)  # a further detour is a row without a bearing
     said = np.where(np.arange(2) < count, detours, np.nan)[:rows]
-    whence = np.array([bearing[0], np.nan])[:rows]
     who = {"caller": np.array([1, 2])[:rows], "detour": said}
-    scan = make_scan(0.5, np.full(rows, 3), whence, **who, **stds)
+    scan = make_scan(0.5, np.full(rows, 3), np.append(bearing, np.nan)[:rows], **who, **stds)
     beliefs.append(slam.update(known, replace(scan, callers=labels)))
 
 # %%
-# Dotted: the bearing. Outlines: one standard deviation of each member.
+# Left: the bearing, dotted, its ray, and where the caller's ellipse crosses both: the landmark. By
+# delay alone, right: two callers' ellipses cross there, and where the roughest bearing says no.
+# Faint: the same if the callers stood elsewhere. Dashed: the sound's way, as long over all of it.
 
 plt.rcParams.update(STYLE)
-figure, panels = plt.subplots(1, 3, figsize=(8.0, 3.1), layout="constrained", sharey=True)
-colour = STRATEGY_COLOURS["passive"]
-for axes, (title, count), belief in zip(panels, heard.items(), beliefs, strict=True):
-    mapped = belief.landmarks()
-    for outline in ellipses(mapped.mean, mapped.covariance, RAY):
-        axes.plot(*outline.T, color=colour, lw=1.0)
-    for caller, detour in zip(callers[:count], detours, strict=False):
-        axes.plot(*detour_ellipse(vehicle[:2], caller, detour).T, color=INK, lw=0.8, ls="--")
-    axes.plot(*np.outer([0.0, 3.0], landmark).T, color=colour, lw=0.8, ls=":")
-    axes.plot(*callers.T, "*", color=INK, ms=8)
-    axes.plot(0.0, 0.0, ">", color=INK, ms=7)
-    axes.plot(*landmark, "o", mfc="none", mec="black", ms=8)
-    axes.set(title=title, xlim=(-10.0, 13.0), ylim=(-8.0, 15.0), aspect="equal", xlabel="x [m]")
+figure, panels = plt.subplots(1, 2, figsize=(8.0, 4.2), layout="constrained", sharey=True)
+colour, at = STRATEGY_COLOURS["passive"], {"textcoords": "offset points", "ha": "right"}
+(ray, one), rng = [belief.landmarks() for belief in beliefs[:2]], np.random.default_rng(1)
+for outline in ellipses(ray.mean, ray.covariance, RAY)[ray.landmark == 3]:
+    panels[0].plot(*outline.T, color=colour, lw=1.1)
+panels[0].plot(*np.outer([0.0, 2.0], landmark).T, color=colour, lw=1.1, ls=":")
+panels[0].fill(*ellipses(one.mean, one.covariance, RAY)[2].T, fc=colour, ec=INK, zorder=3)
+for mean, spread, detour in zip(one.mean, one.covariance, detours, strict=False):
+    for caller in rng.multivariate_normal(mean, spread, 40):
+        panels[1].plot(*detour_ellipse(vehicle[:2], caller, detour).T, color=colour, alpha=0.1)
+panels[1].plot(*landmark, "o", mfc="none", mec=INK, ms=9)
+panels[1].annotate("or here", (-1.2, -4.4), (15, -16), **at)
+for axes, title, count in zip(panels, ("bearing and detour", "two detours"), (1, 2), strict=True):
+    for k, caller in enumerate(callers[:count]):
+        axes.plot(*detour_ellipse(vehicle[:2], caller, detours[k]).T, color=INK, lw=0.9)
+        axes.plot(*np.stack([caller, landmark]).T, "--", color=INK, lw=0.8)
+        axes.plot(*caller, "*", color=INK, ms=11)
+        axes.annotate(f"caller {k + 1}", caller, (9, -17), **at)
+    axes.plot(*np.outer([0.0, 1.0], landmark).T, ">--", color=INK, lw=0.8, ms=9, markevery=[0])
+    axes.annotate("vehicle", vehicle[:2], (18, -16), **at)
+    axes.annotate("landmark", landmark, (56, 6), **at)
+    axes.set(title=title, xlim=(-9.5, 13.0), ylim=(-7.5, 13.5), aspect="equal", xlabel="x [m]")
 panels[0].set_ylabel("y [m]")
 plt.show()
 
 # %%
 # How surely is the landmark's place known, with two detours?
 
-mapped = beliefs[-1].landmarks()
-spread = mapped.covariance[mapped.landmark == 3][0]
+spread = beliefs[-1].landmarks().covariance[2]
 answer = float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))
 print(f"{answer:.2f} m")
