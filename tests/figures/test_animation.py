@@ -264,3 +264,15 @@ def test_a_caller_that_moves_is_a_star_where_it_is_at_the_time(timed):
     step = np.searchsorted(again.truth.time, frame.scan.time - 1e-9)
     assert 0 < step < len(boat) - 1
     np.testing.assert_array_equal(panels[0].movers.get_xydata(), boat[[step]])
+
+
+def test_a_caller_that_moves_trails_where_it_was_followed(timed):
+    again, snapshots = timed
+    figure, panels = _stage(snapshots, truth=again.truth, callers=again.callers, beamwidth=None)
+    assert "its estimated track" in [text.get_text() for text in figure.legends[0].texts]
+    panel = panels[1]
+    panel._show_moving(panel.frames[30].moving, 30)
+    (trail,) = panel.trails.get_segments()
+    believed = [frame.moving.mean[0] for frame in panel.frames[:31] if len(frame.moving.mean)]
+    np.testing.assert_array_equal(trail[-len(believed) :], believed)
+    assert len(panel.around.get_paths()) == 1

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.detection.scans import UNLABELLED, make_scan
+from pipistrelle.estimation.beliefs import some_of
 from pipistrelle.estimation.measurement import detour_of
 from pipistrelle.figures.detours import (
     MOST,
@@ -143,3 +144,15 @@ def test_ellipses_of_a_mission_pass_near_their_landmark(timed, strategy):
             believed = callers_at(frame).mean
             assert (believed == way[0]).all(axis=1).any()
     assert set(counts) == ({0} if strategy == "active" else {1, 2})
+
+
+def test_one_that_moves_is_believed_where_it_is_followed():
+    frame = frame_of({5: 1}, [(5, 1)])
+    boat = map_with([91], [[2.0, -1.0]], [0.04 * np.eye(2)])
+    still = replace(frame, landmarks=some_of(frame.landmarks, frame.landmarks.landmark != 91))
+    assert np.isnan(callers_at(still).mean[1]).all()
+    followed = replace(still, moving=boat)
+    np.testing.assert_array_equal(callers_at(followed).mean[1], [2.0, -1.0])
+    (ellipse,), _ = drawn_detours(followed, 5)
+    length = np.hypot(*(ellipse - [2.0, -1.0]).T) + np.hypot(*ellipse.T)
+    np.testing.assert_allclose(length, length[0], rtol=1e-9)

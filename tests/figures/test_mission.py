@@ -294,7 +294,7 @@ def test_callers_are_marked_where_they_are_believed_to_be_where_detours_were_hea
     assert named.index("caller as estimated") == named.index("caller") + 2, "a moving one between"
     for axes, trial in zip(maps(figure), again.trials, strict=True):
         open_stars = [line for line in axes.lines if line.get_markerfacecolor() == "none"]
-        (stars,) = [line for line in open_stars if line.get_marker() == "*"]
+        stars, *_ = [line for line in open_stars if line.get_marker() == "*"]
         rows = trial.track.landmarks
         full = placed(rows) & np.isin(rows.landmark, [9, 10])
         assert full.any()
@@ -304,3 +304,32 @@ def test_callers_are_marked_where_they_are_believed_to_be_where_detours_were_hea
         assert "none" not in [
             line.get_markerfacecolor() for line in axes.lines if line.get_marker() == "*"
         ]
+
+
+def test_a_caller_that_moves_is_drawn_as_it_was_followed(timed, mission):
+    again, _ = timed
+    figure = draw_mission(again.trials, truth=again.truth, callers=again.callers)
+    assert "its estimated track" in [text.get_text() for text in figure.legends[0].texts]
+    fused = next(trial for trial in again.trials if trial.strategy == "fused")
+    (track,) = fused.track.callers.values()
+    known = track.mean[np.isfinite(track.mean).all(axis=1)]
+    axes = maps(figure)[again.trials.index(fused)]
+    drawn = [line.get_xydata() for line in axes.lines if line.get_linestyle() == ":"]
+    assert len(known) > 20
+    np.testing.assert_array_equal(drawn[0], known)
+    assert any(np.array_equal(line.get_xydata(), known[-1:]) for line in axes.lines), "at the end"
+    assert "its estimated track" not in named(mission.trials["fused"], **mission.scene)
+
+
+def test_a_caller_that_is_out_of_sight_at_the_end_is_not_drawn_there(timed):
+    again, _ = timed
+    fused = next(trial for trial in again.trials if trial.strategy == "fused")
+    (label,) = fused.track.callers
+    lost = fused.track.callers[label]
+    mean = np.where(np.arange(len(lost.mean))[:, None] < 100, lost.mean, np.nan)
+    track = replace(fused.track, callers={label: replace(lost, mean=mean)})
+    figure = draw_mission([replace(fused, track=track)], truth=again.truth, callers=again.callers)
+    known = mean[np.isfinite(mean).all(axis=1)]
+    lines = [line.get_xydata() for line in maps(figure)[0].lines]
+    assert any(np.array_equal(line, known) for line in lines)
+    assert not any(np.array_equal(line, known[-1:]) for line in lines)

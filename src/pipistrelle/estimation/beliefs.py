@@ -9,6 +9,9 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle.detection.scans import Scan
 
+LOST = 2.0
+"""Standard deviation [m] beyond which nobody can say where a caller is that moves."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Gaussian:
@@ -89,6 +92,30 @@ def some_of(landmarks: Landmarks, rows: Bool[np.ndarray, " h"]) -> Landmarks:
     )
 
 
+def joined(some: Landmarks, others: Landmarks) -> Landmarks:
+    """Put the rows of two maps together.
+
+    Parameters
+    ----------
+    some, others : Landmarks
+
+    Returns
+    -------
+    Landmarks
+
+    Examples
+    --------
+    >>> joined(no_landmarks(), no_landmarks()).weight
+    array([], dtype=float64)
+    """
+    return Landmarks(
+        landmark=np.concatenate((some.landmark, others.landmark)),
+        mean=np.concatenate((some.mean, others.mean)),
+        covariance=np.concatenate((some.covariance, others.covariance)),
+        weight=np.concatenate((some.weight, others.weight)),
+    )
+
+
 def placed(landmarks: Landmarks) -> Bool[np.ndarray, " h"]:
     """Tell which rows of a map are fully initialised landmarks, not members of a ray.
 
@@ -117,6 +144,30 @@ def placed(landmarks: Landmarks) -> Bool[np.ndarray, " h"]:
     return count[row] == 1
 
 
+def in_sight(moving: Landmarks) -> Landmarks:
+    """Take of callers that move those whose place is known.
+
+    Parameters
+    ----------
+    moving : Landmarks of h rows
+        As a `Following` belief has them.
+
+    Returns
+    -------
+    Landmarks
+        One row for each that has but one, no more than `LOST` unsure in any direction.
+
+    Examples
+    --------
+    >>> rows = dict(landmark=np.array([4, 9, 9]), weight=np.array([1.0, 0.5, 0.5]))
+    >>> spread = np.eye(2) * np.array([0.01, 1.0, 1.0])[:, None, None]
+    >>> in_sight(Landmarks(mean=np.zeros((3, 2)), covariance=spread, **rows)).landmark
+    array([4])
+    """
+    widest = np.linalg.eigvalsh(moving.covariance)[:, -1]
+    return some_of(moving, placed(moving) & (widest <= LOST * LOST))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
     """What a filter made of one mission: the start, then one row per control step.
@@ -138,8 +189,8 @@ class Track:
     online : Gaussian of (k, 3) and (k, 3, 3), or None
         Of a filter that revises its path: each pose as it was believed at its time.
     callers : dict of label to Gaussian of (k, 2) and (k, 2, 2)
-        Where callers that move were believed to be, as they were heard: at the steps that hold a
-        scan, once they were placed, else NaN.
+        Where callers that move were believed to be at their time: at the steps that hold a scan
+        and at which they were `in_sight`, else NaN.
     """
 
     time: Float[np.ndarray, " k"]

@@ -18,7 +18,13 @@ from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.experiments.drives import NO_TRUTH, LabelledPoints, Truth
 from pipistrelle.figures.closeup import Closeup, add_closeups
-from pipistrelle.figures.detours import callers_at, callers_marked, drawn_detours, resolved
+from pipistrelle.figures.detours import (
+    callers_at,
+    callers_believed,
+    callers_marked,
+    drawn_detours,
+    resolved,
+)
 from pipistrelle.figures.film import film_writer
 from pipistrelle.figures.maps import (
     callers_shown,
@@ -145,6 +151,7 @@ def _symbols(snapshots: Mapping[tuple[str, str], Sequence[Snapshot]]) -> list[st
             and any(np.isfinite(callers_at(frame).mean).any() for frame in seen)
             for seen in recorded
         ),
+        "its estimated track": any(len(frame.moving.landmark) for frame in frames),
     }
     return [name for name, there in drawn.items() if there]
 
@@ -224,6 +231,15 @@ def _play(
         yield np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
 
 
+def _followed(frames: Sequence[Snapshot]) -> list[Float[np.ndarray, "n 2"]]:
+    """Return where each caller that moves was believed to be at every frame, NaN until placed."""
+    labels = sorted({label for frame in frames for label in frame.moving.landmark.tolist()})
+    return [
+        np.array([callers_believed(frame.moving, np.array([label])).mean[0] for frame in frames])
+        for label in labels
+    ]
+
+
 class _Panel:
     """The things that move on one map, and what has to be remembered of them."""
 
@@ -244,6 +260,7 @@ class _Panel:
         self.moving: list[Float[np.ndarray, "t 2"]] = []
         self.resolved = resolved(frames)
         self.marked = callers_marked([frame.scan for frame in frames])
+        self.tracks = _followed(frames)
         self.rows, self.turned_full = frames[0].landmarks, {}
         self.artists: list[Artist] = []
         self.closeup: Closeup | None = None
@@ -281,6 +298,8 @@ class _Panel:
         self.dots = points("o", ms=2.6, mfc=colour, mec="none")
         self.spot = points("o", ms=4.0, mfc=INK, mec="none")
         self.rings = areas(fc="none", lw=1.6)
+        self.trails = lines(colors=colour, lw=1.2, ls=":")
+        self.around = areas(fc=shades(colour, np.full(1, 0.2)), ec=colour, lw=0.8)
         self.movers = points("*", ms=12, mfc=INK, mec="white", mew=0.8)
         self.callers = points("*", ms=12, mfc="none", mec=colour, mew=1.1)
         self.estimated = points(color=colour, lw=1.2)
@@ -295,6 +314,7 @@ class _Panel:
         self._show_scan(frame)
         self._show_map(frame.landmarks, picture)
         self._show_detours(frame, self.resolved[now])
+        self._show_moving(frame.moving, now)
         for artist in self.artists:
             self.axes.draw_artist(artist)
 
@@ -331,6 +351,11 @@ class _Panel:
         self.spot.set_data(*np.reshape([way[1] for way in ways[:1]], (-1, 2)).T)
         if self.marked:
             self.callers.set_data(*callers_at(frame).mean.T)
+
+    def _show_moving(self, rows: Landmarks, now: int) -> None:
+        """Show the tracks of callers that move, and how surely they are where they are now."""
+        self.around.set(verts=ellipses(rows.mean, rows.covariance, PLACED))
+        self.trails.set_segments([track[: now + 1] for track in self.tracks])
 
     def _show_map(self, rows: Landmarks, picture: int) -> None:
         """Show rays, what was pruned from them since the last picture, and full landmarks."""

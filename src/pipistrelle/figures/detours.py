@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.detection.scans import UNLABELLED, Scan
-from pipistrelle.estimation.beliefs import Gaussian, Landmarks, placed
+from pipistrelle.estimation.beliefs import Gaussian, Landmarks, joined, placed
 from pipistrelle.figures.outlines import detour_ellipse
 from pipistrelle.figures.recorder import Snapshot
 
@@ -67,7 +67,7 @@ def callers_at(frame: Snapshot) -> Gaussian:
     Gaussian of (c, 2) [m] and (c, 2, 2) [m^2]
         As `callers_believed`, by the callers' numbers.
     """
-    return callers_believed(frame.landmarks, frame.scan.callers)
+    return callers_believed(joined(frame.landmarks, frame.moving), frame.scan.callers)
 
 
 def callers_marked(scans: Sequence[Scan]) -> bool:

@@ -306,6 +306,7 @@ def _symbols() -> dict[str, "Artist | tuple[Artist, ...]"]:
         "caller": mark("*", 11.0, INK, "white"),
         "moving caller": line(lw=1.0, ls="-."),
         "caller as estimated": mark("*", 11.0, "none", INK),
+        "its estimated track": line(lw=1.2, ls=":"),
         "detour ellipse and its way": mark(oval, 16.0, "none", "#33333399"),
         "vehicle at the end": mark(dart, 10.0, INK),
         "its beam": mark(sector, 14.0, "#33333338"),

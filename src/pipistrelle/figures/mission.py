@@ -134,7 +134,8 @@ def _symbols(
         "placed landmark, 95 %": not tied and any(rows.any() for rows in full),
         "unresolved ray, 1σ, darker: likelier": any(not rows.all() for rows in full),
         **{name: name in shown for name in ("beacon", "caller", "moving caller")},
-        "caller as estimated": any(len(_callers(trial)) for trial in trials),
+        "caller as estimated": any(len(_callers(t)) or t.track.callers for t in trials),
+        "its estimated track": any(trial.track.callers for trial in trials),
         "vehicle at the end": bool(ending),
         "its beam": beamwidth is not None and bool(calling),
         "particles": any(trial.track.cloud is not None for trial in ending),
@@ -214,6 +215,7 @@ def _draw_estimate(axes: "Axes", trial: TrialResult, true_landmarks: LabelledPoi
     if len(callers := _callers(trial)):
         x, y = callers.T
         axes.plot(x, y, "*", ms=12, mfc="none", mec=colour, mew=1.1, zorder=5.5)
+    _draw_followed(axes, trial)
     outline = ellipses(rows.mean[~full], rows.covariance[~full], RAY)
     weight = rows.weight[~full]
     style = {"fc": shades(colour, weight), "ec": shades(colour, weight, most=1.0), "lw": 0.8}
@@ -221,6 +223,23 @@ def _draw_estimate(axes: "Axes", trial: TrialResult, true_landmarks: LabelledPoi
     labels = np.unique(rows.landmark[~full])
     rays = [rows.mean[rows.landmark == label] for label in labels]
     axes.add_collection(LineCollection(rays, colors=colour, lw=0.6, alpha=0.45, zorder=1.5))
+
+
+def _draw_followed(axes: "Axes", trial: TrialResult) -> None:
+    """Draw the tracks of callers that move, and where they are at the end, as they are believed."""
+    from matplotlib.collections import PolyCollection
+
+    colour = strategy_colour(trial.strategy)
+    for track in trial.track.callers.values():
+        known = np.isfinite(track.mean).all(axis=1)
+        mean, covariance = track.mean[known], track.covariance[known]
+        axes.plot(*mean.T, color=colour, lw=1.2, ls=":", zorder=5.5)
+        if trial.track.time[known][-1] < trial.scans[-1].time:
+            continue  # out of sight at the end
+        axes.plot(*mean[-1:].T, "*", ms=12, mfc="none", mec=colour, mew=1.1, zorder=5.5)
+        outline = list(ellipses(mean[-1:], covariance[-1:], PLACED))
+        fill = shades(colour, np.full(1, 0.2))
+        axes.add_collection(PolyCollection(outline, fc=fill, ec=colour, lw=0.8, zorder=4))
 
 
 def _callers(trial: TrialResult) -> Float[np.ndarray, "c 2"]:

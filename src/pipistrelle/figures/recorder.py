@@ -1,12 +1,20 @@
 """What a filter believes while it runs, kept for a film or a page."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.detection.scans import Scan, rows_of
-from pipistrelle.estimation.beliefs import Belief, Landmarks, ParticleCloud, Trajectory
+from pipistrelle.estimation.beliefs import (
+    Belief,
+    Following,
+    Landmarks,
+    ParticleCloud,
+    Trajectory,
+    in_sight,
+    no_landmarks,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,6 +30,8 @@ class Snapshot:
         Of the pose.
     landmarks : Landmarks
         After the update.
+    moving : Landmarks
+        The callers that move and are in sight, of a filter that follows them.
     cloud : (p, 3) [m, m, rad] or None
         The poses of the particles, where there are any.
     path : (k + 1, 2) [m] or None
@@ -33,6 +43,7 @@ class Snapshot:
     pose: Float[np.ndarray, "3"]
     covariance: Float[np.ndarray, "3 3"]
     landmarks: Landmarks
+    moving: Landmarks = field(default_factory=no_landmarks)
     cloud: Float[np.ndarray, "p 3"] | None = None
     path: Float[np.ndarray, "t 2"] | None = None
 
@@ -112,6 +123,7 @@ class MissionRecorder:
             pose=pose.mean,
             covariance=pose.covariance,
             landmarks=belief.landmarks() if landmarks is None else landmarks,
+            moving=in_sight(belief.moving()) if isinstance(belief, Following) else no_landmarks(),
             cloud=belief.cloud() if isinstance(belief, ParticleCloud) else None,
             path=path,
         )

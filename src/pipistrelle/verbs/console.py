@@ -24,6 +24,8 @@ TITLES = {
     "position_floor_m": ("position, unavoidable [m]", 3),
     "position_bound_m": ("position, bound [m]", 3),
     "heading_bound_rad": ("heading, bound [rad]", 4),
+    "caller_rmse_m": ("moving callers' RMSE [m]", 3),
+    "caller_rmse_aligned_m": ("moving callers' RMSE, aligned [m]", 3),
     "nees_mean": ("NEES, mean", 2),
     "nees_max": ("NEES, largest", 1),
 }

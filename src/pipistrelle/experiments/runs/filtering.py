@@ -32,7 +32,7 @@ from pipistrelle.estimation.beliefs import (
     ParticleCloud,
     Track,
     Trajectory,
-    placed,
+    in_sight,
 )
 from pipistrelle.experiments.drives import Drive
 
@@ -127,8 +127,9 @@ def run_filter(
 
 
 def _follow(callers: dict[int, Gaussian], moving: Landmarks, k: int, steps: int) -> None:
-    """Note where callers that move are at step k, those that are placed."""
-    for row in np.flatnonzero(placed(moving)):
+    """Note where callers that move are at step k, those that are in sight."""
+    moving = in_sight(moving)
+    for row in range(moving.landmark.size):
         nowhere = Gaussian(mean=np.full((steps, 2), nan), covariance=np.full((steps, 2, 2), nan))
         track = callers.setdefault(int(moving.landmark[row]), nowhere)
         track.mean[k], track.covariance[k] = moving.mean[row], moving.covariance[row]
