@@ -257,6 +257,15 @@ B = TypeVar("B", bound=Belief)
 
 
 @runtime_checkable
+class Informed(Protocol[B]):
+    """An estimator that may be told of landmarks beforehand."""
+
+    def knowing(self, belief: B, known: Landmarks) -> B:
+        """Return a first belief that has landmarks in its map, placed, each one's error its own."""
+        ...
+
+
+@runtime_checkable
 class Estimator(Protocol[B]):
     """A SLAM filter: a frozen record of its settings, with beliefs going in and coming out."""
 

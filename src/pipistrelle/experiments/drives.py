@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.beliefs import Gaussian, Landmarks, no_landmarks
 from pipistrelle.estimation.motion import Motion
 
 LabelledPoints = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]
@@ -55,6 +55,8 @@ class Drive:
         Of each step, as the motion model has them.
     truth : Truth
         At the same times; nothing of it, by default. Its landmarks are those that stand.
+    known : Landmarks
+        Where landmarks stand that are known beforehand, and how surely.
     moving : dict of label to str
         Names of the callers that move: no landmarks, though heard.
     """
@@ -64,4 +66,5 @@ class Drive:
     time: Float[np.ndarray, " t"]
     controls: Float[np.ndarray, "t-1 c"]
     truth: Truth = NO_TRUTH
+    known: Landmarks = field(default_factory=no_landmarks)
     moving: Mapping[int, str] = field(default_factory=dict)

@@ -758,6 +758,7 @@ def test_a_caller_of_a_log_without_callers_is_refused_with_where_to_name_it(tmp_
         ("place = [1, 2.5]", "", ("'callers.2.place_std'", "a place beside it")),
         ("place_std = [0.1, 0.2]", "place_std = [-1, 0]", ("'callers.2.place_std'",)),
         ("place_std = [0.1, 0.2]", "moves = 1", ("'callers.2.moves'",)),
+        ("place = [1, 2.5]", "moves = true\nplace = [1, 2.5]", ("place of a caller that moves",)),
         (CALLERS, "callers = 3", ("'callers'", "found 3")),
         (CALLERS, "callers = [3]", ("callers",)),
         (CALLERS, "[callers]\nname = 'boat'\nlandmark = 3", ("'callers'",)),

@@ -13,9 +13,11 @@ from pipistrelle.detection.logs.folder import read_log, write_log
 from pipistrelle.detection.logs.readers import Reader
 from pipistrelle.detection.logs.recording import LogCaller
 from pipistrelle.detection.scans import COLUMNS, make_scan, with_columns
+from pipistrelle.estimation.measurement import detour_of
 from pipistrelle.experiments.drives import NO_TRUTH
 from pipistrelle.experiments.runs.replay import as_heard_by, load, motion_of, replay, start_of
 from pipistrelle.experiments.runs.truth_files import read_truth, write_truth
+from pipistrelle.geometry import range_and_bearing
 from reference.missions import scan_with
 
 DATA = Path(__file__).parents[2] / "data"
@@ -429,3 +431,26 @@ def test_what_rows_state_is_heard_by_every_strategy():
         first, second = as_heard_by(log.scans, strategy, 2.0)
         assert (first.bearing_std.item(), first.range_std.item()) == (0.01, 0.02)
         np.testing.assert_array_equal([*second.bearing_std, *second.range_std], [NAN, 0.03])
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "iekf"])
+def test_the_place_of_a_logs_caller_places_what_it_lights_up(estimator):
+    posts, boat = np.array([[3.0, 4.0], [-2.0, 6.0], [5.0, -1.0]]), np.array([8.0, 5.0])
+    _, bearing = range_and_bearing(np.zeros(3), posts)
+    e = np.array([detour_of(np.zeros(2), post, boat) for post in posts])
+    made = scan_with([1, 2, 3], bearing, time=1.0, caller=1, detour=e, detour_std=0.02)
+    scan = replace(made, callers=np.array([-1, 9]))
+    caller = LogCaller(name="boat", landmark=9, place=(8.0, 5.0))
+    told = FilterConfig(bearing_std=0.01, detour_std=0.02)
+    config = Config(listening=ListeningConfig(timing=True), filter=told)
+    for known in (True, False):
+        callers = (caller if known else replace(caller, place=None),)
+        log = replace(looks((0.0, 0.1, 0.1)), callers=callers, scans=(scan,))
+        (trial,) = replay(log, NO_TRUTH, ["fused"], [estimator], None, config)
+        rows = trial.track.landmarks
+        assert (9 in rows.landmark) == known
+        for label, post in zip((1, 2, 3), posts, strict=True):
+            mine = rows.mean[rows.landmark == label]
+            assert (len(mine) == 1) == known, "a ray, else"
+            if known:
+                np.testing.assert_allclose(mine[0], post, rtol=0, atol=0.05)

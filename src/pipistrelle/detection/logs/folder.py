@@ -80,6 +80,13 @@ class _CallerTable(Section):
     place: _Point | None = None
     place_std: _Point_std | None = None
 
+    @field_validator("place")
+    @classmethod
+    def _of_what_stands(cls, place: Any, known: ValidationInfo) -> Any:
+        if place is not None and known.data.get("moves"):
+            raise ValueError("no place of a caller that moves")
+        return place
+
     @field_validator("place_std")
     @classmethod
     def _of_a_place(cls, std: Any, known: ValidationInfo) -> Any:

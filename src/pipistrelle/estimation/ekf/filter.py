@@ -10,8 +10,8 @@ The state is the pose and, two numbers each, the members of all landmarks,
 `correction`. A caller that moves has its velocity there, too: `roaming`.
 """
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -75,6 +75,10 @@ class EkfBelief:
         return map_rows(self, self.mean[3:].reshape(-1, 2), self.covariance[3:, 3:])
 
 
+Kept = TypeVar("Kept", bound=EkfBelief)
+"""The same kind of belief as was given."""
+
+
 def map_rows(
     belief: EkfBelief, mean: Float[np.ndarray, "h 2"], covariance: Float[np.ndarray, "d d"]
 ) -> Landmarks:
@@ -105,6 +109,34 @@ def map_rows(
             means[member], own[member] = mean[first] + share * ray, (spread + spread.T) / 2.0
             weight[member] = 0.5
     return Landmarks(landmark=belief.landmark.copy(), mean=means, covariance=own, weight=weight)
+
+
+def with_points(belief: Kept, known: Landmarks, by_pose: Float[np.ndarray, "n 3"]) -> Kept:
+    """Append landmarks to a belief that has none.
+
+    Parameters
+    ----------
+    belief : EkfBelief
+    known : Landmarks of n / 2 rows
+        Their covariances are of errors of their own.
+    by_pose : (n, 3)
+        How the errors of the state hang on the pose's.
+
+    Returns
+    -------
+    EkfBelief
+    """
+    P, cross = belief.covariance, by_pose @ belief.covariance
+    own = np.zeros((len(by_pose), len(by_pose)))
+    for row, covariance in enumerate(known.covariance):
+        own[2 * row : 2 * row + 2, 2 * row : 2 * row + 2] = covariance
+    return replace(
+        belief,
+        mean=np.append(belief.mean, known.mean.ravel()),
+        covariance=np.block([[P, cross.T], [cross, cross @ by_pose.T + own]]),
+        landmark=known.landmark.astype(np.int64),
+        weight=np.ones(known.landmark.size),
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -153,6 +185,32 @@ class EkfSlam:
             weight=np.empty(0),
             gated=0,
         )
+
+    def knowing(self, belief: EkfBelief, known: Landmarks) -> EkfBelief:
+        """Return a first belief that has landmarks in its map.
+
+        Parameters
+        ----------
+        belief : EkfBelief
+            Without landmarks.
+        known : Landmarks
+            One row each.
+
+        Returns
+        -------
+        EkfBelief
+
+        Examples
+        --------
+        >>> motion = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
+        >>> slam = EkfSlam(motion=motion, rays=RayConfig())
+        >>> belief = slam.init(Gaussian(mean=np.zeros(3), covariance=np.eye(3)))
+        >>> point = {"mean": np.array([[3.0, 4.0]]), "covariance": np.eye(2)[None]}
+        >>> post = Landmarks(landmark=np.array([7]), weight=np.ones(1), **point)
+        >>> slam.knowing(belief, post).landmarks().mean
+        array([[3., 4.]])
+        """
+        return with_points(belief, known, np.zeros((2 * known.landmark.size, 3)))
 
     def predict(
         self,

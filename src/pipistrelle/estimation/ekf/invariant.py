@@ -39,7 +39,7 @@ from jaxtyping import Float
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
-from pipistrelle.estimation.ekf.filter import EkfBelief, map_rows, taken_in
+from pipistrelle.estimation.ekf.filter import EkfBelief, map_rows, taken_in, with_points
 from pipistrelle.estimation.ekf.gaussian import INVARIANT
 from pipistrelle.estimation.ekf.roaming import is_velocity, roam, with_velocities
 from pipistrelle.estimation.motion import Motion, MotionNumbers, motion_numbers, propagate_pose
@@ -132,6 +132,28 @@ class InvariantEkfSlam:
             gated=0,
             origin=pose.mean[:2].astype(float),
         )
+
+    def knowing(self, belief: InvariantBelief, known: Landmarks) -> InvariantBelief:
+        r"""Return a first belief that has landmarks in its map.
+
+        That they stand where they do, whichever way the vehicle looks, is
+        :math:`\xi_l = e_l - J\hat l\,\xi_\theta`, with their own errors e.
+
+        Parameters
+        ----------
+        belief : InvariantBelief
+            Without landmarks.
+        known : Landmarks
+            One row each.
+
+        Returns
+        -------
+        InvariantBelief
+        """
+        mean = known.mean - belief.origin
+        by_pose = np.zeros((mean.size, 3))
+        by_pose[:, 2] = -(mean @ np.array([[0.0, 1.0], [-1.0, 0.0]])).ravel()  # (y, -x)
+        return with_points(belief, replace(known, mean=mean), by_pose)
 
     def predict(
         self,

@@ -28,6 +28,7 @@ from pipistrelle.estimation.beliefs import (
     Estimator,
     Following,
     Gaussian,
+    Informed,
     Landmarks,
     ParticleCloud,
     Track,
@@ -87,6 +88,8 @@ def run_filter(
     mean, covariance = np.empty((time.size, 3)), np.empty((time.size, 3, 3))
     mean[0], covariance[0] = drive.start.mean, drive.start.covariance
     dt, belief, done = np.diff(time), estimator.init(drive.start), 0
+    if drive.known.landmark.size and isinstance(estimator, Informed):
+        belief = estimator.knowing(belief, drive.known)
     callers: dict[int, Gaussian] = {}
     for number, (k, scan) in enumerate(zip(steps, scans, strict=True), start=1):
         if k > done:

@@ -11,7 +11,7 @@ from pipistrelle.detection.logs.readers import READERS, Reader, Robot, reader_of
 from pipistrelle.detection.logs.recording import Log
 from pipistrelle.detection.noise import noise_of, unstated
 from pipistrelle.detection.scans import Scan, rows_of, with_columns
-from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.experiments.hearing.listening import Progress
@@ -20,6 +20,11 @@ from pipistrelle.experiments.runs.checking import check_filters
 from pipistrelle.experiments.runs.trial import Watch, run_trials
 from pipistrelle.experiments.runs.truth_files import TRUTHS, WithTruth, with_files_beside
 from pipistrelle.refusals import refusal
+
+KNOWN_STD = (1e-3, 1e-3)
+"""How surely a caller's place is known of which a log does not say it [m]."""
+LEAST_STD = 1e-6
+"""That a place is told to be off [m]: below it nothing is left to solve with."""
 
 
 def load(
@@ -277,6 +282,7 @@ def replay(
         time=log.time,
         controls=log.controls,
         truth=truth,
+        known=_known_callers(log),
         moving=moving_of(log),
     )
     check_filters(filters, drive.motion, config)
@@ -290,6 +296,18 @@ def replay(
         for strategy in strategies
     }
     return run_trials(filters, drive, heard, config, progress=progress, watch=watch)
+
+
+def _known_callers(log: Log) -> Landmarks:
+    """Return where callers stand of which the log says it."""
+    told = [caller for caller in log.callers if caller.place is not None]
+    stds = [np.maximum(caller.place_std or KNOWN_STD, LEAST_STD) for caller in told]
+    return Landmarks(
+        landmark=np.array([caller.landmark for caller in told], dtype=np.int64),
+        mean=np.array([caller.place for caller in told], dtype=float).reshape(-1, 2),
+        covariance=np.array([np.eye(2) * std**2 for std in stds]).reshape(-1, 2, 2),
+        weight=np.ones(len(told)),
+    )
 
 
 def _whose(
