@@ -13,22 +13,25 @@ def detours_to(points, vehicle, caller):
     return over - np.hypot(*(caller - vehicle))
 
 
-def timed(mission, callers, rng, *, std=0.05, off=None):
+def timed(mission, callers, rng, *, std=0.05, off=None, share=1.0, least=0.0, direct=True):
     """Return a mission whose echoes have detours of callers, each a landmark by its label.
 
     A row has that of the first caller, unless it is heard from there; those of others are rows
-    without a bearing. All are told to be good to `std`, and off by it, or by `off`.
+    without a bearing. All are told to be good to `std`, and off by it, or by `off`; of detours
+    longer than `least` [m] that share is heard, and unless `direct` is False only where the scan
+    holds the caller itself.
     """
     off = std if off is None else off
     scans = [
-        _timed(scan, mission.path[k][:2], mission.landmarks, callers, rng, std, off)
-        for k, scan in enumerate(mission.scans, start=1)
+        _timed(scan, pose[:2], mission.landmarks, callers, rng, std, off, (share, least, direct))
+        for scan, pose in zip(mission.scans, mission.path[1:], strict=True)
     ]
     return replace(mission, scans=scans)
 
 
-def _timed(scan, vehicle, landmarks, callers, rng, std, off):
+def _timed(scan, vehicle, landmarks, callers, rng, std, off, kept):
     """Give a scan the detours over what is in it, of all callers that are in it."""
+    share, least, direct = kept
     numbers, landmark, caller = (
         [scan.numbers.copy()],
         [scan.landmark],
@@ -36,11 +39,14 @@ def _timed(scan, vehicle, landmarks, callers, rng, std, off):
     )
     first = numbers[0]
     for k, label in enumerate(callers, start=1):
-        over = np.flatnonzero(scan.landmark != label)
-        if label not in scan.landmark:
+        if direct and label not in scan.landmark:
             continue
-        heard = detours_to(landmarks[scan.landmark[over] - 1], vehicle, landmarks[label - 1])
-        heard = heard + rng.normal(0.0, off, over.size)
+        true = detours_to(landmarks[scan.landmark - 1], vehicle, landmarks[label - 1])
+        audible = (scan.landmark != label) & (true > least)
+        if share < 1.0:
+            audible &= rng.random(true.size) < share
+        over = np.flatnonzero(audible)
+        heard = true[over] + rng.normal(0.0, off, over.size)
         if k == 1:
             first[DETOUR, over], first[DETOUR_STD, over], caller[0][over] = heard, std, k
         else:

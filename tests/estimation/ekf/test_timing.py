@@ -32,10 +32,13 @@ from reference.missions import (
     steady,
 )
 from reference.timed_ekf import SlowTimedEkfSlam, SlowTimedInvariantEkfSlam
+from reference.timing import timed
 
 KINDS = [EkfSlam, InvariantEkfSlam]
 PAIRS = [(EkfSlam, SlowTimedEkfSlam), (InvariantEkfSlam, SlowTimedInvariantEkfSlam)]
 NAN = np.nan
+SOME = {"share": 0.7, "least": 0.5, "direct": False}
+"""Which detours are heard: so many of those that are not about zero, of callers heard or not."""
 law = settings(deadline=None, max_examples=100)
 coordinates = st.floats(-20.0, 20.0)
 points = st.tuples(coordinates, coordinates).map(np.array)
@@ -80,56 +83,11 @@ def test_the_closed_forms_give_back_the_ranges_that_made_the_detour(vehicle, lan
 # Against the references
 
 
-def timed(mission, rng, callers=(1,), detour_std=0.05, share=0.7):
-    """Return the mission with detours of some of its landmarks' calls, more rows where several."""
-    scans, numbers = [], np.array([-1, *callers])
-    for scan, pose in zip(mission.scans, mission.path[1:], strict=True):
-        rows = [scan]
-        for number, label in enumerate(callers, start=1):
-            caller = mission.landmarks[label - 1]
-            e = np.array(
-                [detour_of(pose[:2], mission.landmarks[i - 1], caller) for i in scan.landmark]
-            )
-            heard = (scan.landmark != label) & (rng.random(e.size) < share) & (e > 0.5)
-            e = np.where(heard, e + rng.normal(0.0, detour_std, e.size), NAN)
-            rows.append((number, e))
-        scans.append(with_detours(scan, rows[1:], numbers, detour_std))
-    return replace(mission, scans=scans)
-
-
-def with_detours(scan, told, numbers, detour_std):
-    """Return a scan with the first caller's detours in its rows, the others' as rows at the end."""
-    (_, first), *others = told
-    label, caller, e = scan.landmark, np.full(scan.landmark.size, 1), first
-    columns = {"bearing": scan.bearing, "range": scan.range}
-    for number, more in others:
-        further = np.isfinite(more)
-        label = np.concatenate([label, scan.landmark[further]])
-        caller = np.concatenate([caller, np.full(further.sum(), number)])
-        e = np.concatenate([e, more[further]])
-        columns = {
-            name: np.concatenate([c, np.full(further.sum(), NAN)]) for name, c in columns.items()
-        }
-    known = {"range_std": 0.2, "bearing_std": 0.15, "detour_std": detour_std}
-    made = make_scan(
-        scan.time,
-        label,
-        columns["bearing"],
-        range=columns["range"],
-        caller=caller,
-        detour=e,
-        **known,
-    )
-    return replace(made, callers=numbers)
-
-
 def check_reference(
     kind, reference, strategy, *, callers=(1,), frames=60, gate=1.0, robust=False, **rays
 ):
-    mission = timed(
-        paper_mission(strategy, frames=frames, range_std=0.1, bearing_std=0.05),
-        np.random.default_rng(5), callers,
-    )  # fmt: skip
+    mission = paper_mission(strategy, frames=frames, range_std=0.1, bearing_std=0.05)
+    mission = timed(mission, callers, np.random.default_rng(5), **SOME)
     known = {"range_std": 0.2, "bearing_std": 0.15}
     slam = paper_filter(kind, rays=ray_config(**rays), gate=gate, robust=robust, **known)
     slow = reference(BICYCLE, 0.2, 0.15, slam.rays, gate, robust=robust)
@@ -260,7 +218,7 @@ def final_nees(factor, runs=40):
             rng, STEADY, start, scattered(rng, 12, radius=12.0), steady(CIRCLE, 40),
             beamwidth=0.0, hearing=30.0, **noise,
         )  # fmt: skip
-        mission = timed(mission, rng, detour_std=0.1)
+        mission = timed(mission, (1,), rng, std=0.1, **SOME)
         told = np.array([1, 1, 1, 1, 1, factor, 1])[:, None]
         scans = [replace(scan, numbers=scan.numbers * told) for scan in mission.scans]
         rays = ray_config(power=8.0, prune=1e-9)
