@@ -56,6 +56,10 @@ class Section(BaseModel):
     )
 
 
+MOST_OTHERS = 7
+"""Callers besides the vehicle that a recording can tell apart."""
+
+
 class ScenarioConfig(Section):
     """The true world: a noisy drive, round the paper's circle, among random landmarks."""
 
@@ -73,6 +77,8 @@ class ScenarioConfig(Section):
     """Nominal steering angle [rad]."""
     start: tuple[Real, Real, Real] = (0.0, -7.408, 0.0)
     """True start: x, y [m], heading [rad]; unreported: the noise-free path circles the centre."""
+    vehicle: Annotated[int, Field(ge=1, le=1 + MOST_OTHERS)] = 1
+    """Whose mission it is: of 2 on, callers with `course = "mission"`, in their order."""
     course: Literal["circle", "eight", "corridor", "lawn-mower"] = "circle"
     """A circle by constant controls, or another shape, for which a driver steers."""
     extent: Positive = 12.0
@@ -149,13 +155,12 @@ class BeaconConfig(Section):
 
 
 Point = tuple[Real, Real]
-MOST_OTHERS = 7
-"""Callers besides the vehicle that a recording can tell apart."""
 _WAYS = {
     "route": ((), "a route"),
     "waypoints": (("speed",), "way-points"),
     "circle": (("speed", "centre", "radius"), 'course = "circle"'),
     "walk": (("place", "distance", "speed_std", "memory"), 'course = "walk"'),
+    "mission": ((), 'course = "mission"'),
     "stand": (("place", "distance"), "a caller that stands"),
 }
 """What may be said of each way to be somewhere, and how a refusal calls it."""
@@ -174,8 +179,8 @@ class CallerConfig(Section):
     """Where it stands, or a walk begins: x, y [m]."""
     distance: Positive | None = None
     """Else how far from the centre, the direction drawn [m]; else `scenario.beacon_distance`."""
-    course: Literal["circle", "walk"] | None = None
-    """It circles, from a place that is drawn, or walks at random."""
+    course: Literal["circle", "walk", "mission"] | None = None
+    """It circles, from a place that is drawn, walks at random, or maps the world as the vehicle."""
     centre: Point | None = None
     """Of the circle: x, y [m]; else the origin."""
     radius: Positive | None = None
@@ -193,7 +198,7 @@ class CallerConfig(Section):
 
     @property
     def way(self) -> str:
-        """How it is where it is: route, waypoints, circle, walk or stand."""
+        """How it is where it is: route, waypoints, circle, walk, mission or stand."""
         if self.route is not None:
             return "route"
         return "waypoints" if self.waypoints is not None else self.course or "stand"

@@ -42,6 +42,8 @@ class Caller:
         take it from the path.
     key : str
         Its section of the settings, where it has one: a refusal then names that.
+    mission : (t, 3) [m, m, rad] and (t - 1, 2), or None
+        Of one that maps the world, too: its poses, and its controls as it knows them.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Caller:
     place: Float[np.ndarray, "2"] | Float[np.ndarray, "t 2"] | None = None
     velocity: Float[np.ndarray, "2"] | Float[np.ndarray, "t 2"] | None = None
     key: str = ""
+    mission: tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 2"]] | None = None
 
 
 def callers_of(config: Config, beacon: Float[np.ndarray, "2"]) -> tuple[Caller, Caller]:

@@ -191,9 +191,12 @@ def direct_calls(
 def _may_leak(
     whole: Int[np.ndarray, "2 d"], numbers: Float[np.ndarray, "5 d"], d: Whole, within: float
 ) -> bool:
-    """Whether detection d is so faint beside one of another tone that it may be its leakage."""
+    """Whether detection d is so faint beside one of another tone that it may be its leakage.
+
+    At any face: what reaches a face from behind its endfire leaks there, too, and is not listed.
+    """
     for other in range(whole.shape[1]):
-        if whole[0, other] == whole[0, d] and whole[1, other] != whole[1, d]:
+        if whole[1, other] != whole[1, d]:
             near = abs(numbers[0, other] - numbers[0, d]) <= within
             if near and numbers[2, d] < LEAKAGE * numbers[2, other]:
                 return True

@@ -147,7 +147,7 @@ def study(
 
     Parameters
     ----------
-    plan : "paper", "physics", "beyond", the path of a plan, or a table
+    plan : "paper", "physics", "beyond", "timing", "callers", "pair", the path of a plan, or a table
         A table holds what the file would; paths in it lead from the folder where Python works.
     iterations : int, optional
         Number of worlds; the plan's by default.

@@ -38,7 +38,9 @@ def study(
     plan: Annotated[
         str,
         Parameter(
-            metavar="PLAN", help="paper, physics, beyond or a FILE.toml, as a study's plan.toml."
+            metavar="PLAN",
+            help="paper, physics, beyond, timing, callers, pair or a FILE.toml, as a study's "
+            "plan.toml.",
         ),
     ] = "paper",
     /,

@@ -5,17 +5,19 @@ import pytest
 
 from pipistrelle.acoustics.callers import callers_at, moves
 from pipistrelle.arithmetic.random_stream import stream_key
-from pipistrelle.config import CallerConfig, Config, InputError, ScenarioConfig
-from pipistrelle.experiments.hearing.courses import course_of, driven
+from pipistrelle.config import CallerConfig, Config, InputError, MotionConfig, ScenarioConfig
+from pipistrelle.experiments.hearing import others
+from pipistrelle.experiments.hearing.courses import course_of, driven, motion_of
 from pipistrelle.experiments.hearing.fields import TRIES, landmarks_in, nearest
+from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.others import WALK_MEMORY, WALK_STD, with_routes
 from pipistrelle.experiments.hearing.scenario import (
     caller_labels,
-    motion_of,
     moving_callers,
     standing_landmarks,
     world_of,
 )
+from pipistrelle.experiments.runs.trial import drive_of
 from pipistrelle.settings import from_flags, resolve
 
 SEEDS = range(6)
@@ -244,3 +246,74 @@ def test_a_route_may_be_a_file_and_what_is_wrong_in_it_has_a_line(tmp_path):
     path.write_text("time,x,y\n0,1,2\n")
     with pytest.raises(InputError, match=r"route: found .*two such rows"):
         resolve(with_routes(from_flags({"callers": [{"route": str(path)}]})))
+
+
+# Missions of others
+
+ANOTHER = CallerConfig(name="mate", course="mission")
+PAIR = Config(
+    callers=(ANOTHER,), scenario=ScenarioConfig(steps=200, landmarks=20, radius=15.0, clearance=0.6)
+)
+
+
+def seen_by(vehicle, config=PAIR):
+    setup = config.scenario.model_copy(update={"vehicle": vehicle})
+    return world_of(config.model_copy(update={"scenario": setup}))
+
+
+def test_a_mission_is_driven_as_the_vehicle_drives_clear_of_all():
+    world = seen_by(1)
+    alone = world_of(PAIR.model_copy(update={"callers": None}))
+    assert world.path.tobytes() == alone.path.tobytes(), "who else drives changes nothing"
+    assert world.landmarks.tobytes() == alone.landmarks.tobytes()
+    mate = world.callers[1]
+    path, controls = mate.mission
+    np.testing.assert_array_equal(mate.place, path[:, :2])
+    np.testing.assert_array_equal(controls, world.controls)
+    start = np.hypot(*path[0, :2]), np.hypot(*world.path[0, :2])
+    assert start[0] == pytest.approx(start[1]), "the same course, turned about the centre"
+    assert np.hypot(*(path - world.path)[:, :2].T).min() > 0.6
+    gaps = np.hypot(*(path[:, None, :2] - world.landmarks).transpose(2, 0, 1))
+    assert gaps.min() > 0.6
+    speed = np.hypot(*np.diff(path[:, :2], axis=0).T) / PAIR.scenario.step
+    assert speed.mean() == pytest.approx(0.75, rel=0.05)
+    assert speed.std() == pytest.approx(PAIR.motion.speed_std, rel=0.3), "with noise of its own"
+
+
+def test_two_vehicles_are_in_one_world_each_the_others_caller():
+    first, second = seen_by(1), seen_by(2)
+    assert first.landmarks.tobytes() == second.landmarks.tobytes()
+    np.testing.assert_array_equal(second.path, first.callers[1].mission[0])
+    np.testing.assert_array_equal(second.callers[1].place, first.path[:, :2])
+    np.testing.assert_array_equal(second.callers[1].mission[0], first.path)
+    assert [c.frequency for c in second.callers] == [c.frequency for c in first.callers]
+    drive = drive_of(second, PAIR)
+    np.testing.assert_array_equal(drive.truth.path, second.path)
+    np.testing.assert_array_equal(drive.truth.callers[21], first.path[:, :2])
+
+
+def test_each_of_two_vehicles_has_noise_of_its_own():
+    levels = []
+    for vehicle in (1, 2):
+        setup = PAIR.scenario.model_copy(update={"vehicle": vehicle, "steps": 40})
+        config = PAIR.model_copy(update={"scenario": setup})
+        (heard,) = listen(world_of(PAIR.model_copy(update={"scenario": PAIR.scenario})), config,
+                          (0.0025,))  # fmt: skip
+        levels.append(np.concatenate([one.rows.level_db for one in heard]))
+    assert not np.array_equal(*levels)
+
+
+def test_a_vehicle_that_has_no_mission_is_refused_by_its_number():
+    with pytest.raises(InputError, match=r"scenario\.vehicle: found 3, but 2 in this world"):
+        seen_by(3)
+    with pytest.raises(InputError, match=r"scenario\.vehicle: found 2, but 1 in this world"):
+        seen_by(2, PAIR.model_copy(update={"callers": None}))
+
+
+def test_a_mission_that_finds_no_way_is_refused_with_its_key(monkeypatch):
+    monkeypatch.setattr(others, "TRIES", 3)
+    wild = PAIR.model_copy(update={"motion": MotionConfig(speed_std=1.0)})
+    crowd = ScenarioConfig(steps=1500, landmarks=60, radius=12.0, clearance=0.6, spacing=0.7)
+    wild = wild.model_copy(update={"scenario": crowd})
+    with pytest.raises(InputError, match=r"callers\.1: found no mission 0\.6 m clear"):
+        world_of(wild)

@@ -5,11 +5,11 @@ import pytest
 from scipy.stats import kstest
 
 from pipistrelle.config import Config, InputError, MotionConfig, ScenarioConfig
+from pipistrelle.experiments.hearing.courses import motion_of
 from pipistrelle.experiments.hearing.scenario import (
     Scenario,
     draw_scenario,
     landmark_count,
-    motion_of,
     standing_landmarks,
 )
 

@@ -6,12 +6,8 @@ import pytest
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import AssumedConfig, Config, FilterConfig, MotionConfig, ScenarioConfig
 from pipistrelle.evaluation.bound import bound_of_drawn_start, pose_bound
-from pipistrelle.experiments.hearing.scenario import (
-    assumed_motion,
-    motion_of,
-    standing_landmarks,
-    world_of,
-)
+from pipistrelle.experiments.hearing.courses import motion_of
+from pipistrelle.experiments.hearing.scenario import assumed_motion, standing_landmarks, world_of
 from pipistrelle.experiments.runs.trial import drive_of, run_mission, scans_of
 from pipistrelle.experiments.studies.plan import Plan
 from pipistrelle.experiments.studies.world import heard_together, run_world

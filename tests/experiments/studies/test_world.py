@@ -143,6 +143,7 @@ def test_cases_that_hear_the_same_world_listen_once(plan, monkeypatch):
 OTHERS = {
     "seed": 8,
     "callers": [{}, {"frequency": 25e3}],
+    "scenario.vehicle": 2,
     "scenario.steps": 24,
     "scenario.step": 0.1,
     "scenario.steps_per_frame": 5,
@@ -240,6 +241,7 @@ def test_the_settings_that_are_varied_here_are_all_there_are():
 
 ROAMING = {"listening": {"timing": True}, "callers": [{"course": "circle", "radius": 5.0}]}
 NEEDS = {
+    "scenario.vehicle": {"callers": [{"course": "mission"}]},
     "scenario.extent": {"scenario": {"course": "eight"}},
     "scenario.lane": {"scenario": {"field": "rows"}},
     "motion.angular_rate_std": {"motion": {"model": "unicycle"}},

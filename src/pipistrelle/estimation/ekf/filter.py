@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.beliefs import Gaussian, Landmarks, some_of
+from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.ekf.correction import corrected
 from pipistrelle.estimation.ekf.crossing import WAITS
 from pipistrelle.estimation.ekf.gaussian import LINEAR, propagate
@@ -62,17 +62,36 @@ class EkfBelief:
 
     def landmarks(self) -> Landmarks:
         """Return the map, one row per member."""
-        rows = self.rows()
-        return some_of(rows, stands(rows.landmark))
+        return self.rows(stands(self.landmark))
 
     def moving(self) -> Landmarks:
         """Return the callers that move, one row per member."""
-        rows = self.rows()
-        return some_of(rows, ~stands(rows.landmark) & ~is_velocity(rows.landmark))
+        return self.rows(~stands(self.landmark) & ~is_velocity(self.landmark))
 
-    def rows(self) -> Landmarks:
-        """Return all members, velocities too, by the linear error."""
-        return map_rows(self, self.mean[3:].reshape(-1, 2), self.covariance[3:, 3:])
+    def rows(self, kept: Bool[np.ndarray, " h"]) -> Landmarks:
+        """Return some members by the linear error, those of a landmark together."""
+        at = numbers_of(kept)
+        mean, covariance = self.mean[at].reshape(-1, 2), self.covariance[np.ix_(at, at)]
+        return map_rows(self.landmark[kept], self.weight[kept], mean, covariance)
+
+
+def numbers_of(kept: Bool[np.ndarray, " h"]) -> Int[np.ndarray, " n"]:
+    """Return where the numbers of some members stand in the state.
+
+    Parameters
+    ----------
+    kept : (h)
+
+    Returns
+    -------
+    (n)
+
+    Examples
+    --------
+    >>> numbers_of(np.array([False, True]))
+    array([5, 6])
+    """
+    return (3 + 2 * np.flatnonzero(kept)[:, np.newaxis] + np.arange(2)).ravel()
 
 
 Kept = TypeVar("Kept", bound=EkfBelief)
@@ -80,7 +99,10 @@ Kept = TypeVar("Kept", bound=EkfBelief)
 
 
 def map_rows(
-    belief: EkfBelief, mean: Float[np.ndarray, "h 2"], covariance: Float[np.ndarray, "d d"]
+    landmark: Int[np.ndarray, " h"],
+    weights: Float[np.ndarray, " h"],
+    mean: Float[np.ndarray, "h 2"],
+    covariance: Float[np.ndarray, "d d"],
 ) -> Landmarks:
     """Lay out a map, one row per member, from the linear error of all.
 
@@ -89,7 +111,8 @@ def map_rows(
 
     Parameters
     ----------
-    belief : EkfBelief
+    landmark, weights : (h)
+        As of an `EkfBelief`.
     mean : (h, 2) [m]
     covariance : (2h, 2h) [m^2]
 
@@ -99,7 +122,7 @@ def map_rows(
     """
     members = len(mean)
     blocks, rows = covariance.reshape(members, 2, members, 2), np.arange(members)
-    means, own, weight = mean.copy(), blocks[rows, :, rows, :], belief.weight.copy()
+    means, own, weight = mean.copy(), blocks[rows, :, rows, :], weights.copy()
     for first in np.flatnonzero(weight == WAITS)[::2]:
         ray = mean[first + 1] - mean[first]
         pair = covariance[2 * first : 2 * first + 4, 2 * first : 2 * first + 4]
@@ -108,7 +131,7 @@ def map_rows(
             spread = G @ pair @ G.T + np.outer(share * ray, share * ray) / 4.0
             means[member], own[member] = mean[first] + share * ray, (spread + spread.T) / 2.0
             weight[member] = 0.5
-    return Landmarks(landmark=belief.landmark.copy(), mean=means, covariance=own, weight=weight)
+    return Landmarks(landmark=landmark.copy(), mean=means, covariance=own, weight=weight)
 
 
 def with_points(belief: Kept, known: Landmarks, by_pose: Float[np.ndarray, "n 3"]) -> Kept:

@@ -34,12 +34,18 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
-from pipistrelle.estimation.ekf.filter import EkfBelief, map_rows, taken_in, with_points
+from pipistrelle.estimation.ekf.filter import (
+    EkfBelief,
+    map_rows,
+    numbers_of,
+    taken_in,
+    with_points,
+)
 from pipistrelle.estimation.ekf.gaussian import INVARIANT
 from pipistrelle.estimation.ekf.roaming import is_velocity, roam, with_velocities
 from pipistrelle.estimation.motion import Motion, MotionNumbers, motion_numbers, propagate_pose
@@ -71,14 +77,16 @@ class InvariantBelief(EkfBelief):
         placed = _placed(self.mean[:3], self.origin)
         return Gaussian(mean=placed, covariance=covariance, invariant=True)
 
-    def rows(self) -> Landmarks:
-        """Return all members, velocities too, by the linear error."""
-        mean = self.mean[3:].reshape(-1, 2)
+    def rows(self, kept: Bool[np.ndarray, " h"]) -> Landmarks:
+        """Return some members by the linear error, those of a landmark together."""
+        at = numbers_of(kept)
+        mean = self.mean[at].reshape(-1, 2)
         turned = (mean @ np.array([[0.0, 1.0], [-1.0, 0.0]])).ravel()  # (-y, x): J l
-        lever = np.outer(turned, self.covariance[2, 3:])
+        lever = np.outer(turned, self.covariance[2, at])
         square = np.outer(turned, turned) * self.covariance[2, 2]
-        origin = np.where(is_velocity(self.landmark)[:, np.newaxis], 0.0, self.origin)
-        return map_rows(self, mean + origin, self.covariance[3:, 3:] + (lever + lever.T) + square)
+        linear = self.covariance[np.ix_(at, at)] + (lever + lever.T) + square
+        placed = np.where(is_velocity(self.landmark[kept])[:, np.newaxis], mean, mean + self.origin)
+        return map_rows(self.landmark[kept], self.weight[kept], placed, linear)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

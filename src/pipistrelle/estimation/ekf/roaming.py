@@ -118,6 +118,8 @@ def with_velocities(belief: "Kept", moving: Int[np.ndarray, " v"], std: float) -
     (array([  9, -11]), array([0., 1., 2., 3., 4., 0., 0.]), array([1., 1., 1., 1., 1., 4., 4.]))
     """
     known = belief.landmark
+    if np.count_nonzero(is_velocity(known)) == moving.size:
+        return belief
     new = moving[np.isin(moving, known) & ~np.isin(_SUM - moving, known)]
     if new.size == 0:
         return belief

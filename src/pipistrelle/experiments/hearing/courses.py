@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.config import InputError, ScenarioConfig
+from pipistrelle.config import InputError, MotionConfig, ScenarioConfig
 from pipistrelle.estimation.motion import Motion, motion_step
 from pipistrelle.geometry import wrap, wrap_angle
 
@@ -76,6 +76,34 @@ class Poses:
 
 
 Course = Commands | Waypoints | Poses
+
+
+def motion_of(motion: MotionConfig) -> Motion:
+    """Return the settings' motion model, as the filters take it.
+
+    Parameters
+    ----------
+    motion : MotionConfig
+
+    Returns
+    -------
+    Motion
+
+    Notes
+    -----
+    Bradley & Abaid, Eq. (5).
+
+    Examples
+    --------
+    >>> motion_of(MotionConfig(speed_std=0.2)).control_std
+    (0.2, 0.03)
+    """
+    bicycle = motion.model == "bicycle"
+    return Motion(
+        model=motion.model,
+        control_std=(motion.speed_std, motion.steering_std if bicycle else motion.angular_rate_std),
+        wheelbase=motion.wheelbase,
+    )
 
 
 def course_of(setup: ScenarioConfig, motion: Motion) -> Course:

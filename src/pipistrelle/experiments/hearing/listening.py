@@ -105,13 +105,14 @@ def listen(
     setup = config.scenario
     ears = layout or square_of_four(config.receiver)
     rig = _rig(config, scenario, ears, find, oracle)
+    purpose = "noise" if setup.vehicle == 1 else f"noise of {setup.vehicle}"
     engine = _dense if config.receiver.engine == "dense" else _blocks
     beams: tuple[list[Heard], ...] = tuple([] for _ in radii)
     frames = range(setup.steps_per_frame, len(scenario.path), setup.steps_per_frame)
     beam = beam or partial(through_piston, off_axis=config.emitter.off_axis)
     emissions = _emissions(scenario, frames, radii, config, beam)
     for number, (k, aimed) in enumerate(zip(frames, emissions, strict=True), start=1):
-        key = stream_key(config.seed, iteration, "noise", number)
+        key = stream_key(config.seed, iteration, purpose, number)
         recorded = engine(aimed, rig, key)
         for heard, arrivals, detections in zip(beams, aimed, recorded, strict=True):
             heard.append(_heard(float(scenario.time[k]), detections, arrivals, rig))

@@ -9,6 +9,9 @@ A walk has a velocity that is forgotten and drawn anew all the time (Ornstein an
 .. math:: v_{k+1} = a v_k + \sqrt{1 - a^2} \, \sigma \, n_k, \qquad a = e^{-\Delta_t / \tau},
 
 along each axis, n normal, and is thrown back where it would leave the disc of the landmarks.
+
+A mission is another vehicle's: the course of the first, turned about the centre by an angle that is
+drawn, with noise of its own, clear of the landmarks as of the first vehicle.
 """
 
 import math
@@ -24,7 +27,9 @@ from pipistrelle.acoustics.callers import Caller, callers_of, moves
 from pipistrelle.arrays.sampling import free_tones
 from pipistrelle.config import CallerConfig, Config, InputError, ScenarioConfig, caller_names
 from pipistrelle.detection.logs.text_tables import check_unique, read_table
+from pipistrelle.experiments.hearing.courses import Course, course_of, driven, motion_of
 from pipistrelle.experiments.hearing.fields import TRIES, nearest
+from pipistrelle.geometry import wrap
 from pipistrelle.settings import CALLERS, Layer
 
 WALK_STD, WALK_MEMORY = 0.5, 10.0
@@ -120,12 +125,15 @@ class Around:
     path : (t, 2) [m]
         Of the vehicle.
     landmarks : (n, 2) [m]
+    course : Course, optional
+        Of the vehicle, where it is not the one that the settings name.
     """
 
     config: Config
     time: Float[np.ndarray, " t"]
     path: Float[np.ndarray, "t 2"]
     landmarks: Points
+    course: Course | None = None
 
 
 def callers_among(
@@ -183,11 +191,16 @@ def callers_among(
         caller = Caller(name=name, frequency=frequency, level_db=level_db, key=f"callers.{j}")
         _check_speed(caller.key, one, around.config)
         is_beacon = first is not None and j == 1 and one.distance is None
-        taken = [] if is_beacon else [around.landmarks, _standing(callers)]
-        found = _WAYS[one.way](one, around, taken, stream)
-        if found is None:
+        taken = [] if is_beacon and one.way == "stand" else [around.landmarks, _standing(callers)]
+        if one.way == "mission":
+            found = _mission(around, taken, stream)
+            caller = replace(caller, mission=found)
+            place = None if found is None else found[0][:, :2]
+        else:
+            place = _WAYS[one.way](one, around, taken, stream)
+        if place is None:
             raise _no_place(caller.key, one, around)
-        callers.append(replace(caller, place=found))
+        callers.append(replace(caller, place=place))
     return tuple(callers)
 
 
@@ -302,6 +315,25 @@ def _route(
     return np.column_stack([np.interp(around.time, time, column) for column in place])
 
 
+def _mission(
+    around: Around, taken: Sequence[Points], rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 2"]] | None:
+    """Drive as the vehicle does, elsewhere: poses and controls, or None where all is in the way."""
+    setup, told = around.config.scenario, around.config.motion
+    motion, bias = motion_of(told), (told.speed_bias, told.turn_bias)
+    course = around.course or course_of(setup, motion)
+    for _ in range(TRIES):
+        angle = rng.uniform(-math.pi, math.pi)
+        path, controls = driven(course, setup, motion, rng, bias)
+        c, s = math.cos(angle), math.sin(angle)
+        places = path[:, :2] @ np.array([[c, s], [-s, c]])
+        away = [np.hypot(*(places - around.path).T).min()]
+        away += [min(nearest(places, point) for point in points) for points in taken if len(points)]
+        if min(away) >= setup.clearance:
+            return np.column_stack((places, wrap(path[:, 2] + angle))), controls
+    return None
+
+
 _WAYS: dict[str, Callable[..., np.ndarray | None]] = {
     "stand": _stand,
     "circle": _circle,
@@ -348,7 +380,10 @@ def _away_from_vehicle(
 def _no_place(key: str, one: CallerConfig, around: Around) -> InputError:
     """Say that a caller was given no place, and what to change."""
     setup = around.config.scenario
-    if one.way == "stand":
+    if one.way == "mission":
+        what = "it comes nearer than that to the vehicle, a landmark or a caller in every drive"
+        where = f"{key}: found no mission {setup.clearance:g} m clear, for {what}; expected another"
+    elif one.way == "stand":
         what = f"no direction there is {setup.clearance:g} m clear of path, landmarks and callers"
         where = f"{key}.distance: found {_distance(one, setup):g} m, but {what}; expected another"
     else:

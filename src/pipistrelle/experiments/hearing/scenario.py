@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -10,11 +10,11 @@ from jaxtyping import Float, Int
 from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of, moves
 from pipistrelle.acoustics.target import Bodies
 from pipistrelle.arithmetic.random_stream import stream_key
-from pipistrelle.config import CallerConfig, Config, InputError, MotionConfig, ScenarioConfig
+from pipistrelle.config import CallerConfig, Config, InputError, ScenarioConfig
 from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.drives import LabelledPoints
-from pipistrelle.experiments.hearing.courses import course_of, driven
+from pipistrelle.experiments.hearing.courses import course_of, driven, motion_of
 from pipistrelle.experiments.hearing.fields import landmarks_in
 from pipistrelle.experiments.hearing.others import Around, callers_among, place_at
 from pipistrelle.experiments.hearing.worlds import ANY, World
@@ -111,7 +111,8 @@ def draw_scenario(config: Config, rng: np.random.Generator, world: World = ANY) 
     setup, motion = config.scenario, motion_of(config.motion)
     time = np.arange(setup.steps + 1) * setup.step
     bias = (config.motion.speed_bias, config.motion.turn_bias)
-    path, controls = driven(world.course or course_of(setup, motion), setup, motion, rng, bias)
+    course = world.course or course_of(setup, motion)
+    path, controls = driven(course, setup, motion, rng, bias)
     given = config.callers is None and world.callers is not None
     told, first = world.callers if given else config.callers, deepcopy(rng)
     beacon = np.zeros(2) if given else _place_beacon(setup, path[:, :2], rng)
@@ -121,9 +122,11 @@ def draw_scenario(config: Config, rng: np.random.Generator, world: World = ANY) 
         landmarks = landmarks_in(setup, path[:, :2], callers, rng)
     vehicle, *others = callers_of(config, beacon)
     if told is not None:
-        around = Around(config=config, time=time, path=path[:, :2], landmarks=landmarks)
+        around = Around(
+            config=config, time=time, path=path[:, :2], landmarks=landmarks, course=course
+        )
         others = callers_among(around, told, rng, None if given else first)
-    return Scenario(
+    drawn = Scenario(
         time=time,
         path=path,
         controls=controls,
@@ -131,6 +134,25 @@ def draw_scenario(config: Config, rng: np.random.Generator, world: World = ANY) 
         callers=(vehicle, *others),
         bodies=world.bodies,
     )
+    return _mission_of(drawn, setup.vehicle)
+
+
+def _mission_of(world: Scenario, vehicle: int) -> Scenario:
+    """Return a world as another vehicle in it has it, by its number: the first is its caller."""
+    if vehicle == 1:
+        return world
+    others = [j for j, caller in enumerate(world.callers) if caller.mission is not None]
+    if vehicle > 1 + len(others):
+        raise InputError(
+            f"scenario.vehicle: found {vehicle}, but {1 + len(others)} in this world have a "
+            'mission; expected one of them, or more callers with course = "mission"'
+        )
+    j = others[vehicle - 2]
+    path, controls = world.callers[j].mission or (world.path, world.controls)
+    mission = world.path, world.controls
+    first = replace(world.callers[j], place=world.path[:, :2], mission=mission)
+    callers = tuple(first if k == j else caller for k, caller in enumerate(world.callers))
+    return replace(world, path=path, controls=controls, callers=callers)
 
 
 def landmark_count(scenario: Scenario) -> int:
@@ -219,34 +241,6 @@ def caller_labels(scenario: Scenario) -> Int[np.ndarray, " c"]:
     labels = len(scenario.landmarks) + np.arange(len(scenario.callers))
     labels[VEHICLE] = UNLABELLED
     return labels
-
-
-def motion_of(motion: MotionConfig) -> Motion:
-    """Return the settings' motion model, as the filters take it.
-
-    Parameters
-    ----------
-    motion : MotionConfig
-
-    Returns
-    -------
-    Motion
-
-    Notes
-    -----
-    Bradley & Abaid, Eq. (5).
-
-    Examples
-    --------
-    >>> motion_of(MotionConfig(speed_std=0.2)).control_std
-    (0.2, 0.03)
-    """
-    bicycle = motion.model == "bicycle"
-    return Motion(
-        model=motion.model,
-        control_std=(motion.speed_std, motion.steering_std if bicycle else motion.angular_rate_std),
-        wheelbase=motion.wheelbase,
-    )
 
 
 def assumed_motion(config: Config) -> Motion:

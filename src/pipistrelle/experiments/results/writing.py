@@ -149,21 +149,9 @@ def write_results(
     told["callers"] = CALLERS if any(trial.track.callers for trial in trials) else ""
     readme = README.format(command=command, version=find_version(), seed=seed, **told)
     own.write("README.md", readme)
-    for trial in trials:
-        name, track = f"{trial.strategy}_{short_name(trial.filter)}", trial.track
-        own.write(f"track_{name}.tum", tum_text(track.time, track.pose.mean))
-        if track.online is not None:
-            text = tum_text(track.time, track.online.mean)
-            own.write(f"track_{name}_online.tum", text)
-        own.write(f"map_{name}.csv", map_text(track.landmarks))
-        for label, believed in track.callers.items():
-            text = place_text(track.time, believed.mean)
-            own.write(f"caller_{moving[label]}_{name}.tum", text)
-    if truth.path is not None:
-        known = np.isfinite(truth.path).all(axis=1)
-        own.write("truth.tum", tum_text(truth.time[known], truth.path[known]))
-    for label, path in truth.callers.items():
-        own.write(f"truth_{moving[label]}.tum", place_text(truth.time, path))
+    texts = _texts(trials, truth, moving)
+    for name, text in texts.items():
+        own.write(name, text)
     for name, table in tables_of(trials, truth, callers).items():
         buffer = io.BytesIO()
         table.write_parquet(buffer)
@@ -181,6 +169,28 @@ def write_results(
         "runs": [run_entry(trial, ignored_rows) for trial in trials],
     }
     own.write("summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
+
+
+def _texts(
+    trials: Sequence[TrialResult], truth: Truth, moving: Mapping[int, str]
+) -> dict[str, str]:
+    """Write tracks and maps, and the true paths, each as the file of its name."""
+    texts: dict[str, str] = {}
+    for trial in trials:
+        name, track = f"{trial.strategy}_{short_name(trial.filter)}", trial.track
+        texts[f"track_{name}.tum"] = tum_text(track.time, track.pose.mean)
+        if track.online is not None:
+            texts[f"track_{name}_online.tum"] = tum_text(track.time, track.online.mean)
+        texts[f"map_{name}.csv"] = map_text(track.landmarks)
+        for label, believed in track.callers.items():
+            text = place_text(track.time, believed.mean)
+            texts[f"caller_{moving[label]}_{name}.tum"] = text
+    if truth.path is not None:
+        known = np.isfinite(truth.path).all(axis=1)
+        texts["truth.tum"] = tum_text(truth.time[known], truth.path[known])
+    for label, path in truth.callers.items():
+        texts[f"truth_{moving[label]}.tum"] = place_text(truth.time, path)
+    return texts
 
 
 def tables_of(

@@ -14,7 +14,7 @@ from pipistrelle.config import Config, ScenarioConfig
 from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import Estimator, Gaussian
 from pipistrelle.estimation.catalogue import CATALOGUE, is_there
-from pipistrelle.experiments.hearing.scenario import motion_of
+from pipistrelle.experiments.hearing.courses import motion_of
 from pipistrelle.experiments.machine import cores
 from pipistrelle.experiments.runs.trial import run_mission
 

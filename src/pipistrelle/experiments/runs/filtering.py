@@ -4,6 +4,7 @@ What could not be used, whoever made it, is refused here, before or after a filt
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from math import nan
 
 import numpy as np
@@ -25,11 +26,11 @@ from pipistrelle.detection.scans import (
 from pipistrelle.estimation.association import Associate, told
 from pipistrelle.estimation.beliefs import (
     B,
+    Belief,
     Estimator,
     Following,
     Gaussian,
     Informed,
-    Landmarks,
     ParticleCloud,
     Track,
     Trajectory,
@@ -81,21 +82,17 @@ def run_filter(
         out of order or at a time that is not one of the drive's, labels that are none, or poses
         that are not one for each step.
     """
-    time, controls = drive.time, drive.controls
+    time = drive.time
     steps = _steps_of(scans, time)
     if associate is told:
         _refuse_unstated(scans)
-    mean, covariance = np.empty((time.size, 3)), np.empty((time.size, 3, 3))
-    mean[0], covariance[0] = drive.start.mean, drive.start.covariance
-    dt, belief, done = np.diff(time), estimator.init(drive.start), 0
-    if drive.known.landmark.size and isinstance(estimator, Informed):
-        belief = estimator.knowing(belief, drive.known)
+    path = Gaussian(mean=np.empty((time.size, 3)), covariance=np.empty((time.size, 3, 3)))
+    path.mean[0], path.covariance[0] = drive.start.mean, drive.start.covariance
+    belief, done = _first_belief(estimator, drive), 0
     callers: dict[int, Gaussian] = {}
     for number, (k, scan) in enumerate(zip(steps, scans, strict=True), start=1):
         if k > done:
-            belief, poses = estimator.predict(belief, controls[done:k], dt[done:k], rng)
-            poses = _whole("predict", poses, k - done)
-            mean[done + 1 : k + 1], covariance[done + 1 : k + 1] = poses.mean, poses.covariance
+            belief = _carried(estimator, belief, drive, slice(done, k), rng, path)
             done = k
         named = labelled(scan, associate(belief, scan))
         if named is not scan:
@@ -103,18 +100,16 @@ def run_filter(
             _refuse_unstated([named])
         belief = estimator.update(belief, named, rng)
         pose = belief.pose()
-        mean[k], covariance[k] = pose.mean, pose.covariance
-        if scan.moving.size and isinstance(belief, Following):
-            _follow(callers, belief.moving(), k, time.size)
+        path.mean[k], path.covariance[k] = pose.mean, pose.covariance
+        _follow(callers, scan, belief, (k, time.size))
         if watch:
             watch(named, belief)
         if progress:
             progress(number, len(scans))
-    if done < len(controls):
-        belief, poses = estimator.predict(belief, controls[done:], dt[done:], rng)
-        poses = _whole("predict", poses, len(controls) - done)
-        mean[done + 1 :], covariance[done + 1 :] = poses.mean, poses.covariance
-    online = Gaussian(mean=mean, covariance=covariance, invariant=belief.pose().invariant)
+    if done < len(drive.controls):
+        left = slice(done, len(drive.controls))
+        belief = _carried(estimator, belief, drive, left, rng, path)
+    online = replace(path, invariant=belief.pose().invariant)
     cloud = belief if isinstance(belief, ParticleCloud) else None
     revised = _whole("path", belief.path(), time.size) if isinstance(belief, Trajectory) else None
     return Track(
@@ -129,9 +124,35 @@ def run_filter(
     )
 
 
-def _follow(callers: dict[int, Gaussian], moving: Landmarks, k: int, steps: int) -> None:
-    """Note where callers that move are at step k, those that are in sight."""
-    moving = in_sight(moving)
+def _carried(
+    estimator: Estimator[B],
+    belief: B,
+    drive: Drive,
+    steps: slice,
+    rng: np.random.Generator,
+    path: Gaussian,
+) -> B:
+    """Carry a belief through control steps, and write the poses after each into the path."""
+    dt = np.diff(drive.time)[steps]
+    belief, poses = estimator.predict(belief, drive.controls[steps], dt, rng)
+    poses, after = _whole("predict", poses, len(dt)), slice(steps.start + 1, steps.stop + 1)
+    path.mean[after], path.covariance[after] = poses.mean, poses.covariance
+    return belief
+
+
+def _first_belief(estimator: Estimator[B], drive: Drive) -> B:
+    """Return what an estimator believes at the start, with what is known beforehand."""
+    belief = estimator.init(drive.start)
+    if drive.known.landmark.size and isinstance(estimator, Informed):
+        belief = estimator.knowing(belief, drive.known)
+    return belief
+
+
+def _follow(callers: dict[int, Gaussian], scan: Scan, belief: Belief, at: tuple[int, int]) -> None:
+    """Note where callers that move are at step k of so many, those that are in sight."""
+    if scan.moving.size == 0 or not isinstance(belief, Following):
+        return
+    moving, (k, steps) = in_sight(belief.moving()), at
     for row in range(moving.landmark.size):
         nowhere = Gaussian(mean=np.full((steps, 2), nan), covariance=np.full((steps, 2, 2), nan))
         track = callers.setdefault(int(moving.landmark[row]), nowhere)

@@ -25,11 +25,11 @@ from pipistrelle.estimation.catalogue import CATALOGUE, entry, short_name
 from pipistrelle.evaluation.bound import bound_of_drawn_start
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive, Truth
+from pipistrelle.experiments.hearing.courses import motion_of
 from pipistrelle.experiments.hearing.listening import Progress, listen
 from pipistrelle.experiments.hearing.scenario import (
     Scenario,
     assumed_motion,
-    motion_of,
     moving_callers,
     standing_landmarks,
 )
@@ -267,10 +267,7 @@ def run_trial(
     """
     strategy, name = case.strategy, case.filter
     known = entry(name)
-    if drive.moving and known.follows and config.listening.timing:
-        scans = [replace(scan, moving=np.array([*drive.moving])) for scan in scans]
-    elif drive.moving:
-        scans = [rows_of(scan, ~np.isin(scan.landmark, [*drive.moving])) for scan in scans]
+    scans = _told_who_moves(scans, drive, follows=known.follows and config.listening.timing)
 
     def report(done: int, total: int) -> None:
         if progress:
@@ -307,6 +304,16 @@ def run_trial(
         wall_s=wall_s,
         online=None if track.online is None else score_path(track.online, drive.truth.path),
     )
+
+
+def _told_who_moves(scans: Sequence[Scan], drive: Drive, *, follows: bool) -> Sequence[Scan]:
+    """Tell in scans who moves, or leave their rows out."""
+    if not drive.moving:
+        return scans
+    moving = np.array([*drive.moving])
+    if follows:
+        return [replace(scan, moving=moving) for scan in scans]
+    return [rows_of(scan, ~np.isin(scan.landmark, moving)) for scan in scans]
 
 
 def _generator(seed: int, iteration: int, purpose: str) -> np.random.Generator:

@@ -76,9 +76,10 @@ class _Head(Section):
     )
 
 
-PLANS = ("paper", "physics", "beyond")
+PLANS = ("paper", "physics", "beyond", "timing", "callers", "pair")
 """Plans that ship with the package: the paper's study as its words may be read, and as physics has
-it where they leave a choice; and the same question asked of estimators at their best."""
+it where they leave a choice; the same question asked of estimators at their best, and of those who
+hear when, too; who calls, and from where; and two vehicles that hear each other."""
 
 
 def find_plan(word: str) -> Path:

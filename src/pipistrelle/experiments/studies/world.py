@@ -32,13 +32,9 @@ from pipistrelle.evaluation.bound import (
     nees_of_exact_start,
 )
 from pipistrelle.evaluation.consistency import track_nees
+from pipistrelle.experiments.hearing.courses import motion_of
 from pipistrelle.experiments.hearing.listening import listen
-from pipistrelle.experiments.hearing.scenario import (
-    Scenario,
-    motion_of,
-    standing_landmarks,
-    world_of,
-)
+from pipistrelle.experiments.hearing.scenario import Scenario, standing_landmarks, world_of
 from pipistrelle.experiments.hearing.worlds import World
 from pipistrelle.experiments.results.scores import PathScores, Scores, drive_bound, with_bound
 from pipistrelle.experiments.runs.checking import first_belief
