@@ -190,7 +190,8 @@ class Track:
         Of a filter that revises its path: each pose as it was believed at its time.
     callers : dict of label to Gaussian of (k, 2) and (k, 2, 2)
         Where callers that move were believed to be at their time: at the steps that hold a scan
-        and at which they were `in_sight`, else NaN.
+        and at which they were `in_sight`, else NaN. Of a filter that revises them
+        (`Retracing`), where it believes at the end that they were.
     """
 
     time: Float[np.ndarray, " k"]
@@ -250,6 +251,18 @@ class Trajectory(Protocol):
 
     def path(self) -> Gaussian:
         """Return the start and every control step so far, (k + 1, 3) and (k + 1, 3, 3)."""
+        ...
+
+
+@runtime_checkable
+class Retracing(Protocol):
+    """A belief that may revise where callers that move have been."""
+
+    def tracks(self) -> Mapping[int, Gaussian]:
+        """Return of each caller by its label (k + 1, 2) and (k + 1, 2, 2), NaN where not known.
+
+        A row for the start and one for every control step so far.
+        """
         ...
 
 

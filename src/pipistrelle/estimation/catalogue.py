@@ -268,7 +268,7 @@ def _smoother(config: Config, motion: "Motion") -> "Estimator":
     check_there("smoother")
     from pipistrelle.estimation.smoother.filter import Smoother
 
-    return Smoother(motion=motion, **_gaussian(config))
+    return Smoother(motion=motion, **_gaussian(config), **_of_callers(config))
 
 
 def _gaussian(config: Config) -> dict[str, Any]:
@@ -346,6 +346,7 @@ CATALOGUE = {
             sections=("listening", "filter", "rays"),
             nees_limit=50.0,
             memory=_smoother_bytes,
+            follows=True,
             needs="gtsam",
         ),
     )

@@ -397,6 +397,23 @@ def test_a_caller_that_moves_is_heard_but_is_no_landmark():
     assert kept == sum(np.count_nonzero(scan.landmark != 52) for scan in scans)
 
 
+@pytest.mark.parametrize("seed", [1000, 1001])
+def test_the_smoother_follows_a_caller_that_circles_by_its_sound(seed):
+    config = Config(
+        seed=seed,
+        scenario=ScenarioConfig(steps=280),
+        callers=({"course": "circle", "radius": 10.0, "speed": 0.75},),
+        listening={"timing": True},
+        filter=FilterConfig(noise="measured", robust="huber"),
+    )
+    for trial in run_mission(config, ["fused", "passive"], ["smoother"]).trials:
+        (track,) = trial.track.callers.values()
+        assert np.isfinite(track.mean[:, 0]).sum() > 0.75 * len(trial.scans)
+        assert trial.scores.caller_rmse_m < 1.0
+        assert trial.scores.caller_rmse_aligned_m < 0.05
+        assert not {*trial.track.callers} & {*trial.track.landmarks.landmark.tolist()}
+
+
 def test_trials_of_one_world_do_not_depend_on_their_order():
     scenario = draw_scenario(SHORT, RNG(3))
     mission = run_mission(SHORT, ("fused",))
@@ -463,3 +480,30 @@ def test_predictions_that_are_not_one_pose_for_each_step_are_refused(left):
 
     with pytest.raises(InputError, match=r"predict: found arrays of .* one after each step"):
         run_filter(Short(), drive(5), [scan_with([3], [0.1], time=0.5)], RNG(7))
+
+
+@pytest.mark.parametrize("rows", [5, 6, 7])
+def test_tracks_of_callers_that_are_not_a_place_for_each_step_are_refused(rows):
+    @dataclass(frozen=True, kw_only=True)
+    class Chaser(Line):
+        def moving(self):
+            return map_with([9], [[1.0, 2.0]])
+
+        def tracks(self):
+            places = np.tile([3.0, 4.0], (rows, 1))
+            return {9: Gaussian(mean=places, covariance=np.tile(np.eye(2), (rows, 1, 1)))}
+
+    class Chasing(Retraced):
+        def init(self, pose):
+            return Chaser(at=pose.mean[0], variance=1.0, means=(pose.mean[0],), variances=(1.0,))
+
+        def predict(self, belief, controls, dt, rng):
+            line, poses = super().predict(belief, controls, dt, rng)
+            return Chaser(**{one.name: getattr(line, one.name) for one in fields(line)}), poses
+
+    heard = replace(scan_with([3], [0.1], [40.0], time=0.5), moving=np.array([9]))
+    if rows == 6:
+        assert run_filter(Chasing(), drive(5), [heard], RNG(7)).callers[9].mean[0, 0] == 3.0
+    else:
+        with pytest.raises(InputError, match=r"tracks: found arrays of .* for caller 9"):
+            run_filter(Chasing(), drive(5), [heard], RNG(7))

@@ -15,7 +15,8 @@ Huber's loss is taken of each detour by itself, within the factor. As in GTSAM, 
           \rho = \tfrac12 z^2 \text{ or } k |z| - \tfrac12 k^2 .
 
 A detour whose landmark or caller is not in the graph yet waits (`Detour`), and enters when both
-are. No more than `MOST` wait: beyond, the oldest are dropped.
+are. No more than `MOST` wait: beyond, the oldest are dropped. Where landmark or caller moves, the
+factor is of its place at that pose (`roaming`), and a detour from before it was placed is dropped.
 """
 
 import math
@@ -29,7 +30,14 @@ from jaxtyping import Float, Int
 
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.measurement import BELIEVED, columns_of, detour_slopes, detours
-from pipistrelle.estimation.smoother.graph import landmark_key, pose_key
+from pipistrelle.estimation.smoother.graph import pose_key
+from pipistrelle.estimation.smoother.roaming import (
+    NO_CHAINS,
+    Chains,
+    is_there,
+    known_of,
+    point_key,
+)
 from pipistrelle.jit import kernel
 
 MOST = 1000
@@ -76,7 +84,10 @@ def detours_of(scan: Scan, node: int) -> tuple[Detour, ...]:
 
 
 def parted(
-    heard: Iterable[Detour], mapped: Collection[int]
+    heard: Iterable[Detour],
+    mapped: Collection[int],
+    chains: Chains = NO_CHAINS,
+    moving: Collection[int] = (),
 ) -> tuple[tuple[Detour, ...], tuple[Detour, ...]]:
     """Part detours that may enter the graph from those that wait, of which the newest are kept.
 
@@ -86,6 +97,10 @@ def parted(
         The newest last.
     mapped : collection of int
         Landmarks in the graph.
+    chains : mapping of label to Chain
+        Callers that move and are in the graph.
+    moving : collection of int
+        Labels of all who move; what tells of one when it was not in the graph is dropped.
 
     Returns
     -------
@@ -98,14 +113,19 @@ def parted(
     >>> [[one.landmark for one in part] for part in parted(heard, {4, 9})]
     [[4], [5]]
     """
-    entering, waiting = [], []
+    entering, waiting, known = [], [], known_of(mapped, chains)
     for one in heard:
-        ready = one.landmark in mapped and one.caller in mapped
+        ends = one.landmark, one.caller
+        if moving and any(end in moving and not is_there(end, one.node, chains) for end in ends):
+            continue
+        ready = one.landmark in known and one.caller in known
         (entering if ready else waiting).append(one)
     return tuple(entering), tuple(waiting[-MOST:])
 
 
-def detour_factors(heard: Iterable[Detour], *, robust: bool) -> list[gtsam.CustomFactor]:
+def detour_factors(
+    heard: Iterable[Detour], *, robust: bool, chains: Chains = NO_CHAINS
+) -> list[gtsam.CustomFactor]:
     """Return what detours say: a factor for those that were heard from one pose.
 
     Parameters
@@ -114,6 +134,8 @@ def detour_factors(heard: Iterable[Detour], *, robust: bool) -> list[gtsam.Custo
         Those of one pose follow one another.
     robust : bool
         Whether one that surprises counts less.
+    chains : mapping of label to Chain
+        Callers that move.
 
     Returns
     -------
@@ -126,18 +148,18 @@ def detour_factors(heard: Iterable[Detour], *, robust: bool) -> list[gtsam.Custo
     [4, 3]
     """
     return [
-        _factor(node, list(rows), BELIEVED if robust else math.inf)
+        _factor(node, list(rows), BELIEVED if robust else math.inf, chains)
         for node, rows in groupby(heard, key=lambda one: one.node)
     ]
 
 
-def _factor(node: int, rows: list[Detour], believed: float) -> gtsam.CustomFactor:
+def _factor(node: int, rows: list[Detour], believed: float, chains: Chains) -> gtsam.CustomFactor:
     """Return the factor of detours that were heard from one pose."""
     points = sorted({one.landmark for one in rows} | {one.caller for one in rows})
     place = {label: k for k, label in enumerate(points)}
     ends = np.array([[place[one.landmark], place[one.caller]] for one in rows], dtype=np.int64)
     told = np.array([[one.detour, one.std] for one in rows])
-    vehicle, others = pose_key(node), [landmark_key(label) for label in points]
+    vehicle, others = pose_key(node), [point_key(label, node, chains) for label in points]
 
     def misfit(
         _: gtsam.CustomFactor, values: gtsam.Values, slopes: gtsam.JacobianVector | None

@@ -14,12 +14,15 @@ and waits, too, until both are there. What enters does so with a prior of `PRIOR
 next to nothing and leaves no graph without a solution. What cannot be solved with new landmarks is
 solved without them: they go on waiting.
 
+A caller that moves has a place and a velocity of each node (`roaming`), once a range or a detour
+places it: bearings that cross say nothing of what has moved between them. It is no landmark.
+
 ``robust`` takes each measurement by Huber's loss. What is believed at a frame is the pose of iSAM2;
-`SmootherBelief.path` and the map are the optimum of everything so far.
+`SmootherBelief.path`, `SmootherBelief.tracks` and the map are the optimum of everything so far.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import gtsam
@@ -56,6 +59,17 @@ from pipistrelle.estimation.smoother.legs import (
     turned,
 )
 from pipistrelle.estimation.smoother.placing import Around, clues_of, placed_by
+from pipistrelle.estimation.smoother.roaming import (
+    Chain,
+    Chains,
+    gone_on,
+    insert_state,
+    known_of,
+    place_key,
+    speed_factor,
+    state_of,
+    walk_factor,
+)
 
 PRIOR_STD = 20.0
 """Of a landmark about the place where it enters [m]."""
@@ -80,6 +94,14 @@ class SmootherBelief:
     waiting : dict of label to tuple of Bearing
     detours : tuple of Detour
         Those that wait, for their landmark or for their caller.
+    chains : mapping of label to Chain
+        Callers that move and are in the graph.
+    states : mapping of label to Gaussian of (4) and (4, 4)
+        Their places and velocities at the last pose of the graph, as ``at``.
+    unplaced : mapping of label to Bearing
+        The last of each caller that moves and is not in the graph.
+    walk_std : float
+        How far a caller's velocity strays in a second [m/s].
     gated : int
     rays : RayConfig
     solver : Solver
@@ -92,6 +114,10 @@ class SmootherBelief:
     mapped: tuple[int, ...] = ()
     waiting: Mapping[int, tuple[Bearing, ...]] = field(default_factory=dict)
     detours: tuple[Detour, ...] = ()
+    chains: Chains = field(default_factory=dict)
+    states: Mapping[int, Gaussian] = field(default_factory=dict)
+    unplaced: Mapping[int, Bearing] = field(default_factory=dict)
+    walk_std: float = 0.0
     gated: int = 0
     rays: RayConfig
     solver: Solver
@@ -131,6 +157,39 @@ class SmootherBelief:
         ]
         return _rows(points, rays)
 
+    def moving(self) -> Landmarks:
+        """Return callers that move: a row for each in the graph, a ray for each heard just now."""
+        now = {
+            label: gone_on(state, self.leg.seconds, self.walk_std)
+            for label, state in self.states.items()
+        }
+        points = [(label, _place_in(state), 1.0) for label, state in now.items()]
+        rays = [
+            (label, member, weight)
+            for label, heard in self.unplaced.items()
+            if heard.node == self.link.node
+            for member, weight in _ray(self.at, heard, self.rays)
+        ]
+        return _rows(points, rays)
+
+    def tracks(self) -> dict[int, Gaussian]:
+        """Return where callers that move were at the poses of the graph, by all that is known now.
+
+        Of each by its label (k + 1, 2) and (k + 1, 2, 2): a row for the start and every control
+        step so far, NaN where the graph has none.
+        """
+        best, found = self.solver.solve(self.link), {}
+        steps = [0, *(len(link.leg.mean) for link in links(self.link) if link.leg)]
+        rows = np.cumsum(steps)
+        size = rows[-1] + len(self.leg.mean) + 1
+        for label, chain in self.chains.items():
+            mean, covariance = np.full((size, 2), np.nan), np.full((size, 2, 2), np.nan)
+            for node in range(chain.first, self.link.node + 1):
+                place = best.place(place_key(chain, node))
+                mean[rows[node]], covariance[rows[node]] = place.mean, place.covariance
+            found[label] = Gaussian(mean=mean, covariance=covariance)
+        return found
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Smoother:
@@ -146,6 +205,9 @@ class Smoother:
         1 drops none.
     robust : bool
         Whether a measurement that surprises counts less.
+    speed_std, walk_std : float
+        Of callers that move: the velocity [m/s] along an axis before anything is known of it, and
+        how far it strays in a second (`estimation.smoother.roaming`).
 
     Examples
     --------
@@ -163,6 +225,8 @@ class Smoother:
     rays: RayConfig
     gate: float = 1.0
     robust: bool = False
+    speed_std: float = 1.0
+    walk_std: float = 0.2
 
     def init(self, pose: Gaussian) -> SmootherBelief:
         """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
@@ -173,8 +237,34 @@ class Smoother:
             at=Gaussian(mean=pose.mean.astype(float), covariance=pose.covariance.astype(float)),
             link=Link(before=None, node=0, leg=None, factors=factors, values=values),
             rays=self.rays,
+            walk_std=self.walk_std,
             solver=Solver(),
         )
+
+    def knowing(self, belief: SmootherBelief, known: Landmarks) -> SmootherBelief:
+        """Return a first belief that has landmarks in its map.
+
+        Parameters
+        ----------
+        belief : SmootherBelief
+            As `init` gives it.
+        known : Landmarks
+            One row each.
+
+        Returns
+        -------
+        SmootherBelief
+        """
+        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values(belief.link.values)
+        factors.push_back(belief.link.factors)
+        for label, place, spread in zip(
+            known.landmark.tolist(), known.mean, known.covariance, strict=True
+        ):
+            noise = gtsam.noiseModel.Gaussian.Covariance(spread, False)
+            values.insert(landmark_key(label), place)
+            factors.add(gtsam.PriorFactorPoint2(landmark_key(label), place, noise))
+        link = replace(belief.link, factors=factors, values=values)
+        return replace(belief, link=link, mapped=tuple(known.landmark.tolist()))
 
     def predict(
         self,
@@ -223,8 +313,8 @@ class Smoother:
         """
         if scan.landmark.size == 0:
             return belief
-        here = _arrived(belief)
-        if self.gate < 1.0 and belief.mapped:
+        here = _arrived(belief, roving=bool(scan.moving.size or belief.chains))
+        if self.gate < 1.0 and (belief.mapped or belief.chains):
             here, scan, detours = self._gated(_solved(here), scan)
         else:
             detours = detours_of(scan, here.link.node)
@@ -241,9 +331,9 @@ class Smoother:
     ) -> tuple[SmootherBelief, Scan, tuple[Detour, ...]]:
         """Return what is inside the gate, and count what is not."""
         isam, node, rows = here.solver.reach(here.link), here.link.node, scan.landmark.size
-        scan = rows_of(scan, rows_inside(isam, node, here.mapped, scan, self.gate))
+        scan = rows_of(scan, rows_inside(isam, node, here.mapped, scan, self.gate, here.chains))
         heard = detours_of(scan, node)
-        detours = detours_inside(isam, here.mapped, heard, self.gate)
+        detours = detours_inside(isam, here.mapped, heard, self.gate, here.chains)
         dropped = rows - scan.landmark.size + len(heard) - len(detours)
         return replace(here, gated=here.gated + dropped), scan, detours
 
@@ -254,12 +344,10 @@ class Smoother:
         link = _next_to(here)
         factors, values, node = link.factors, link.values, link.node
         mapped, waiting, crossed = list(here.mapped), dict(here.waiting), False
-        poses = _poses(here)
-        columns = (scan.landmark, scan.bearing, scan.range, scan.bearing_std, scan.range_std)
-        for label, bearing, distance, across, along in zip(
-            *map(np.ndarray.tolist, columns), strict=True
-        ):
-            if math.isnan(bearing):  # but a detour
+        poses, moving = _poses(here), {*scan.moving.tolist(), *here.chains}
+        chains, unplaced = self._roving(here, link, scan, detours, moving, placing=placing)
+        for label, bearing, distance, across, along in _directions(scan):
+            if label in moving:
                 continue
             heard, passive = Bearing(node, bearing, across), math.isnan(distance)
             if label not in mapped:
@@ -272,42 +360,83 @@ class Smoother:
                     continue
                 mapped.append(label)
                 values.insert(landmark_key(label), place)
-                factors.add(_prior(label, place))
+                factors.add(_prior(landmark_key(label), place))
                 crossed |= label in here.waiting and not sure
                 for earlier in waiting.pop(label, ()):
-                    factors.add(self._bearing(earlier, label))
+                    factors.add(self._bearing(earlier, landmark_key(label)))
                 if passive:
                     continue
-            if passive:
-                factors.add(self._bearing(heard, label))
-            else:
-                factors.add(self._range(node, label, (bearing, distance), (across, along)))
-        here = replace(here, link=replace(link, crossed=crossed))
-        return self._timed(replace(here, mapped=tuple(mapped), waiting=waiting), detours)
+            told = (bearing, distance), (across, along)
+            factors.add(self._direction(node, landmark_key(label), *told))
+        here = replace(here, link=replace(link, crossed=crossed), chains=chains, unplaced=unplaced)
+        return self._timed(replace(here, mapped=tuple(mapped), waiting=waiting), detours, moving)
 
-    def _timed(self, here: SmootherBelief, detours: tuple[Detour, ...]) -> SmootherBelief:
+    def _roving(
+        self,
+        here: SmootherBelief,
+        link: Link,
+        scan: Scan,
+        detours: tuple[Detour, ...],
+        moving: Collection[int],
+        *,
+        placing: bool,
+    ) -> tuple[Chains, dict[int, Bearing]]:
+        """Add to a link what a frame tells of callers that move, and of those it places, if it may.
+
+        Returns those in the graph, and the bearings of those that are not.
+        """
+        chains, unplaced = dict(here.chains), dict(here.unplaced)
+        for label, bearing, distance, across, along in _directions(scan) if moving else ():
+            if label not in moving:
+                continue
+            if label not in chains:
+                place = _ahead(here.at.mean, bearing, distance)
+                if math.isnan(distance):
+                    unplaced[label] = Bearing(link.node, bearing, across)
+                    place = _by_detour(here, unplaced[label], label, detours) if placing else None
+                if place is None:
+                    continue
+                unplaced.pop(label, None)
+                chains[label] = Chain(len(chains), link.node)
+                self._begin(link, chains[label], place)
+            told = (bearing, distance), (across, along)
+            link.factors.add(self._direction(link.node, place_key(chains[label], link.node), *told))
+        return chains, unplaced
+
+    def _begin(self, link: Link, chain: Chain, place: Float[np.ndarray, "2"]) -> None:
+        """Add to a link where a caller enters that moves, how fast, nobody knows."""
+        insert_state(link.values, chain, link.node, np.append(place, np.zeros(2)))
+        link.factors.add(_prior(place_key(chain, link.node), place))
+        link.factors.add(speed_factor(chain, self.speed_std))
+
+    def _timed(
+        self, here: SmootherBelief, detours: tuple[Detour, ...], moving: Collection[int]
+    ) -> SmootherBelief:
         """Add the detours to the last link whose ends are both in the graph; the others wait."""
         link, known = here.link, set(here.mapped)
-        entering, late = parted((*here.detours, *detours), known)
-        for factor in detour_factors(entering, robust=self.robust):
+        entering, late = parted((*here.detours, *detours), known, here.chains, moving)
+        for factor in detour_factors(entering, robust=self.robust, chains=here.chains):
             link.factors.add(factor)
         many = sum(one.node < link.node for one in entering) > MANY
         return replace(here, link=replace(link, crossed=link.crossed or many), detours=late)
 
-    def _bearing(self, heard: Bearing, label: int) -> gtsam.BearingFactor2D:
-        """Return what a bearing says."""
+    def _bearing(self, heard: Bearing, point: int) -> gtsam.BearingFactor2D:
+        """Return what a bearing says of what has this name in the graph."""
         noise = self._noise(gtsam.noiseModel.Isotropic.Sigma(1, heard.std))
-        keys = pose_key(heard.node), landmark_key(label)
+        keys = pose_key(heard.node), point
         return gtsam.BearingFactor2D(*keys, gtsam.Rot2(heard.bearing), noise)
 
-    def _range(
-        self, node: int, label: int, heard: tuple[float, float], std: tuple[float, float]
-    ) -> gtsam.BearingRangeFactor2D:
-        """Return what a bearing and a range say."""
-        noise = self._noise(gtsam.noiseModel.Diagonal.Sigmas(np.array(std)))
+    def _direction(
+        self, node: int, point: int, heard: tuple[float, float], std: tuple[float, float]
+    ) -> gtsam.BearingRangeFactor2D | gtsam.BearingFactor2D:
+        """Return what a bearing says, and a range, where there is one."""
         bearing, distance = heard
-        keys = pose_key(node), landmark_key(label)
-        return gtsam.BearingRangeFactor2D(*keys, gtsam.Rot2(bearing), distance, noise)
+        if math.isnan(distance):
+            return self._bearing(Bearing(node, bearing, std[0]), point)
+        noise = self._noise(gtsam.noiseModel.Diagonal.Sigmas(np.array(std)))
+        return gtsam.BearingRangeFactor2D(
+            pose_key(node), point, gtsam.Rot2(bearing), distance, noise
+        )
 
     def _noise(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
         """Return a noise model, with Huber's loss where that is asked for."""
@@ -317,16 +446,32 @@ class Smoother:
         return gtsam.noiseModel.Robust.Create(huber, noise)
 
 
-def _arrived(belief: SmootherBelief) -> SmootherBelief:
-    """Let the leg enter the graph, where the vehicle has moved, and its end be the last pose."""
-    if not belief.leg.moves():
+def _directions(scan: Scan) -> Iterator[tuple[int, float, float, float, float]]:
+    """Walk through label, bearing, range and their deviations, but for what is a detour alone."""
+    columns = (scan.landmark, scan.bearing, scan.range, scan.bearing_std, scan.range_std)
+    for row in zip(*map(np.ndarray.tolist, columns), strict=True):
+        if not math.isnan(row[1]):
+            yield row
+
+
+def _arrived(belief: SmootherBelief, *, roving: bool) -> SmootherBelief:
+    """Let the leg enter the graph and its end be the last pose, where any has moved.
+
+    The vehicle may have, and callers that rove, if time has passed.
+    """
+    leg, states = belief.leg, {}
+    if not (leg.moves() or (roving and leg.seconds > 0.0)):
         return belief
     node, pose = belief.link.node + 1, belief.pose()
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     factors.add(leg_factor(node, belief.leg))
     values.insert(pose_key(node), gtsam.Pose2(*pose.mean))
-    link = _after(belief.link, factors, values)
-    return replace(belief, at=pose, leg=NOWHERE, link=replace(link, node=node, leg=belief.leg))
+    for label, chain in belief.chains.items():
+        states[label] = gone_on(belief.states[label], leg.seconds, belief.walk_std)
+        insert_state(values, chain, node, states[label].mean)
+        factors.add(walk_factor(chain, node, leg.seconds, belief.walk_std))
+    link = replace(_after(belief.link, factors, values), node=node, leg=leg)
+    return replace(belief, at=pose, leg=NOWHERE, link=link, states=states)
 
 
 def _next_to(here: SmootherBelief) -> Link:
@@ -365,7 +510,10 @@ def _settled(belief: SmootherBelief) -> SmootherBelief:
     belief = _solved(belief)
     isam, key = belief.solver.reach(belief.link), pose_key(belief.link.node)
     mean = pose_of(isam.calculateEstimatePose2(key))
-    return replace(belief, at=in_world(mean, isam.marginalCovariance(key)))
+    states = {
+        label: state_of(isam, chain, belief.link.node) for label, chain in belief.chains.items()
+    }
+    return replace(belief, at=in_world(mean, isam.marginalCovariance(key)), states=states)
 
 
 def _known(here: SmootherBelief) -> Link | None:
@@ -382,14 +530,26 @@ def _placed(
     detours: tuple[Detour, ...],
 ) -> tuple[Float[np.ndarray, "2"] | None, bool]:
     """Return where one stands that was only ever heard, if it shows, and whether by a detour."""
-    known, clues = _known(here), clues_of(label, detours, here.mapped)
-    if clues and known is not None:
-        leg, isam = None if known is here.link else here.link.leg, here.solver.reach(known)
-        around = Around(isam=isam, node=known.node, leg=leg, pose=here.at.mean)
-        place = placed_by(around, waiting[-1], label, clues)
-        if place is not None:
-            return place, True
-    return crossing(poses, waiting), False
+    place = _by_detour(here, waiting[-1], label, detours)
+    return (crossing(poses, waiting), False) if place is None else (place, True)
+
+
+def _by_detour(
+    here: SmootherBelief, heard: Bearing, label: int, detours: tuple[Detour, ...]
+) -> Float[np.ndarray, "2"] | None:
+    """Return where one stands by its bearing and the surest of its detours, if any is sure."""
+    known, clues = _known(here), clues_of(label, detours, known_of(here.mapped, here.chains))
+    if not clues or known is None:
+        return None
+    around = Around(
+        isam=here.solver.reach(known),
+        node=known.node,
+        leg=None if known is here.link else here.link.leg,
+        pose=here.at.mean,
+        chains=here.chains,
+        walk_std=here.walk_std,
+    )
+    return placed_by(around, heard, label, clues)
 
 
 def _poses(here: SmootherBelief) -> Float[np.ndarray, "n 3"]:
@@ -407,10 +567,15 @@ def _ahead(pose: Float[np.ndarray, "3"], bearing: float, distance: float) -> np.
     return pose[:2] + distance * np.array([math.cos(angle), math.sin(angle)])
 
 
-def _prior(label: int, place: Float[np.ndarray, "2"]) -> gtsam.PriorFactorPoint2:
-    """Return what is known of a landmark beforehand: next to nothing."""
+def _prior(point: int, place: Float[np.ndarray, "2"]) -> gtsam.PriorFactorPoint2:
+    """Return what is known beforehand of where one stands: next to nothing."""
     noise = gtsam.noiseModel.Isotropic.Sigma(2, PRIOR_STD)
-    return gtsam.PriorFactorPoint2(landmark_key(label), place, noise)
+    return gtsam.PriorFactorPoint2(point, place, noise)
+
+
+def _place_in(state: Gaussian) -> Gaussian:
+    """Return the place of a caller's place and velocity."""
+    return Gaussian(mean=state.mean[:2], covariance=state.covariance[:2, :2])
 
 
 def _ray(pose: Gaussian, heard: Bearing, rays: RayConfig) -> list[tuple[Gaussian, float]]:

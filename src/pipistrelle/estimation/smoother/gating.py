@@ -16,13 +16,19 @@ from pipistrelle.estimation.measurement import (
 )
 from pipistrelle.estimation.rays import gate_bounds
 from pipistrelle.estimation.smoother.detours import Detour
-from pipistrelle.estimation.smoother.graph import landmark_key, pose_key, pose_of
+from pipistrelle.estimation.smoother.graph import pose_key, pose_of
 from pipistrelle.estimation.smoother.legs import turned
+from pipistrelle.estimation.smoother.roaming import NO_CHAINS, Chains, known_of, point_key
 from pipistrelle.geometry import wrap_angle
 
 
 def rows_inside(
-    isam: gtsam.ISAM2, node: int, mapped: Collection[int], scan: Scan, gate: float
+    isam: gtsam.ISAM2,
+    node: int,
+    mapped: Collection[int],
+    scan: Scan,
+    gate: float,
+    chains: Chains = NO_CHAINS,
 ) -> Bool[np.ndarray, " m"]:
     """Tell of which rows bearing and range are inside, or are of what is new.
 
@@ -35,6 +41,8 @@ def rows_inside(
         Landmarks in the graph.
     scan : Scan
     gate : float
+    chains : mapping of label to Chain
+        Callers that move and are in the graph.
 
     Returns
     -------
@@ -43,13 +51,13 @@ def rows_inside(
     """
     key = pose_key(node)
     pose = pose_of(isam.calculateEstimatePose2(key))
-    bounds, inside = gate_bounds(gate), np.ones(scan.landmark.size, bool)
-    M = np.eye(5)
+    known, bounds = known_of(mapped, chains), gate_bounds(gate)
+    M, inside = np.eye(5), np.ones(scan.landmark.size, bool)
     M[:3, :3] = turned(pose[2])
     for m, label in enumerate(scan.landmark.tolist()):
-        if label not in mapped or math.isnan(scan.bearing[m]):
+        if label not in known or math.isnan(scan.bearing[m]):
             continue
-        other = landmark_key(label)
+        other = point_key(label, node, chains)
         point = np.array(isam.calculateEstimatePoint2(other))
         joint = _joint(isam, key, other)
         near, expected, _, _, _ = observe(*pose, *point)
@@ -64,7 +72,11 @@ def rows_inside(
 
 
 def detours_inside(
-    isam: gtsam.ISAM2, mapped: Collection[int], heard: Sequence[Detour], gate: float
+    isam: gtsam.ISAM2,
+    mapped: Collection[int],
+    heard: Sequence[Detour],
+    gate: float,
+    chains: Chains = NO_CHAINS,
 ) -> tuple[Detour, ...]:
     """Return those detours that are inside, or whose landmark or caller is new.
 
@@ -79,22 +91,26 @@ def detours_inside(
     heard : sequence of Detour
         All from one pose.
     gate : float
+    chains : mapping of label to Chain
+        Callers that move and are in the graph.
 
     Returns
     -------
     tuple of Detour
     """
-    bound = gate_bounds(gate)[0]
+    known, bound = known_of(mapped, chains), gate_bounds(gate)[0]
     return tuple(
         one
         for one in heard
-        if not (one.landmark in mapped and one.caller in mapped) or _surprise(isam, one) <= bound
+        if not (one.landmark in known and one.caller in known)
+        or _surprise(isam, one, chains) <= bound
     )
 
 
-def _surprise(isam: gtsam.ISAM2, one: Detour) -> float:
+def _surprise(isam: gtsam.ISAM2, one: Detour, chains: Chains) -> float:
     """Return the squared distance of a detour from what is expected, in its variances."""
-    keys = pose_key(one.node), landmark_key(one.landmark), landmark_key(one.caller)
+    ends = [point_key(end, one.node, chains) for end in (one.landmark, one.caller)]
+    keys = pose_key(one.node), *ends
     pose = pose_of(isam.calculateEstimatePose2(keys[0]))
     points = [np.array(isam.calculateEstimatePoint2(key)) for key in keys[1:]]
     by_pose, *by_points = detour_jacobians(pose[:2], *points)

@@ -150,7 +150,11 @@ class Best:
     def there(self) -> gtsam.ISAM2:
         """Return what tells covariances at the optimum."""
         isam = _new(self.link.thorough)
-        isam.update(self.graph, self.values)
+        try:
+            isam.update(self.graph, self.values)
+        except RuntimeError:  # as in `Link.thorough`
+            isam = _new(thorough=True)
+            isam.update(self.graph, self.values)
         return isam
 
     def pose_mean(self, node: int) -> Float[np.ndarray, "3"]:
@@ -164,7 +168,10 @@ class Best:
 
     def point(self, label: int) -> Gaussian:
         """Return a landmark, (2) and (2, 2)."""
-        key = landmark_key(label)
+        return self.place(landmark_key(label))
+
+    def place(self, key: int) -> Gaussian:
+        """Return a landmark or a caller's place by its name in the graph, (2) and (2, 2)."""
         mean = np.array(self.values.atPoint2(key))
         return Gaussian(mean=mean, covariance=symmetric(self.there.marginalCovariance(key)))
 

@@ -35,10 +35,13 @@ class Leg:
         Poses after each step, in the axes of the one from which it leads.
     covariance : (m, 3, 3)
         Of x, y and heading in those axes.
+    seconds : float
+        How long they took.
     """
 
     mean: Float[np.ndarray, "m 3"]
     covariance: Float[np.ndarray, "m 3 3"]
+    seconds: float = 0.0
 
     def moves(self) -> bool:
         """Tell whether the vehicle has moved, or may have."""
@@ -66,6 +69,7 @@ def longer(
     return Leg(
         mean=np.concatenate([leg.mean, mean]),
         covariance=np.concatenate([leg.covariance, covariance]),
+        seconds=leg.seconds + float(dt.sum()),
     )
 
 

@@ -13,7 +13,7 @@ detour may be none, nothing is known.
 
 import math
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
@@ -22,8 +22,14 @@ from jaxtyping import Float
 from pipistrelle.estimation.measurement import caller_range_by_detour, range_by_detour
 from pipistrelle.estimation.smoother.crossing import Bearing
 from pipistrelle.estimation.smoother.detours import Detour
-from pipistrelle.estimation.smoother.graph import landmark_key, pose_key, pose_of
+from pipistrelle.estimation.smoother.graph import pose_key, pose_of
 from pipistrelle.estimation.smoother.legs import Leg, carried, turned
+from pipistrelle.estimation.smoother.roaming import (
+    Chains,
+    point_key,
+    spread_on,
+    velocity_key,
+)
 
 SHARE = 0.2
 """Most standard deviations of a range by detour, as a share of it: beyond, it places nothing."""
@@ -48,25 +54,46 @@ class Around:
         The way from it to the last, where that is another.
     pose : (3) [m, m, rad]
         The last, as it is expected.
+    chains : mapping of label to Chain
+        Callers that move and are in the graph.
+    walk_std : float
+        How far the velocity of one strays in a second [m/s].
     """
 
     isam: gtsam.ISAM2
     node: int
     leg: Leg | None
     pose: Float[np.ndarray, "3"]
+    chains: Chains = field(default_factory=dict)
+    walk_std: float = 0.0
 
     def place(self, label: int) -> Float[np.ndarray, "2"]:
-        """Return where a landmark is."""
-        return np.array(self.isam.calculateEstimatePoint2(landmark_key(label)))
+        """Return where a landmark is, or where a caller that moves is expected."""
+        place = np.array(self.isam.calculateEstimatePoint2(self._keys(label)[0]))
+        if self.leg and label in self.chains:
+            velocity = self.isam.calculateEstimatePoint2(self._keys(label)[1])
+            place += self.leg.seconds * velocity
+        return place
 
     def joint(self, label: int) -> Float[np.ndarray, "5 5"]:
-        """Return the covariance of the last pose and of a landmark."""
-        keys = pose_key(self.node), landmark_key(label)
-        told, M = self.isam.jointMarginalCovariance(list(keys)), np.eye(5)
+        """Return the covariance of the last pose and of a landmark, or of a caller's place."""
+        keys = pose_key(self.node), *self._keys(label)
+        told, M = self.isam.jointMarginalCovariance(list(keys)), np.eye(2 * len(keys) + 1)
         start = pose_of(self.isam.calculateEstimatePose2(keys[0]))
         M[:3, :3] = turned(start[2])
         P = M @ np.block([[told.at(a, b) for b in keys] for a in keys]) @ M.T
-        return P if self.leg is None else carried(start, P, self.leg)
+        if self.leg:
+            P = carried(start, P, self.leg)
+            if label in self.chains:
+                P = spread_on(P, self.leg.seconds, self.walk_std)
+        return P[:5, :5]
+
+    def _keys(self, label: int) -> tuple[int, ...]:
+        """Name a landmark in the graph, or a caller's place and velocity."""
+        point = point_key(label, self.node, self.chains)
+        if label in self.chains:
+            return point, velocity_key(self.chains[label], self.node)
+        return (point,)
 
 
 def clues_of(label: int, heard: Iterable[Detour], mapped: Collection[int]) -> tuple[Detour, ...]:

@@ -3,7 +3,7 @@
 What could not be used, whoever made it, is refused here, before or after a filter has it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from math import nan
 
@@ -32,6 +32,7 @@ from pipistrelle.estimation.beliefs import (
     Gaussian,
     Informed,
     ParticleCloud,
+    Retracing,
     Track,
     Trajectory,
     in_sight,
@@ -53,7 +54,8 @@ def run_filter(
     """Predict to each scan, say who is who in it, update with it, and keep the pose of every step.
 
     Where the belief revises its path (`Trajectory`), the track is the path as it is believed at
-    the end, and the poses that were kept are beside it.
+    the end, and the poses that were kept are beside it. Where it revises those of callers, too
+    (`Retracing`), they are likewise.
 
     Parameters
     ----------
@@ -120,7 +122,7 @@ def run_filter(
         cloud=cloud.cloud() if cloud else None,
         full=cloud.full if cloud else None,
         online=online if revised else None,
-        callers=callers,
+        callers=_retraced(callers, belief, time.size),
     )
 
 
@@ -157,6 +159,21 @@ def _follow(callers: dict[int, Gaussian], scan: Scan, belief: Belief, at: tuple[
         nowhere = Gaussian(mean=np.full((steps, 2), nan), covariance=np.full((steps, 2, 2), nan))
         track = callers.setdefault(int(moving.landmark[row]), nowhere)
         track.mean[k], track.covariance[k] = moving.mean[row], moving.covariance[row]
+
+
+def _retraced(callers: dict[int, Gaussian], belief: Belief, steps: int) -> Mapping[int, Gaussian]:
+    """Return the tracks of callers as a belief has them at the end, where it revises them."""
+    if not callers or not isinstance(belief, Retracing):
+        return callers
+    tracks = belief.tracks()
+    for label, track in tracks.items():
+        found, expected = (np.shape(track.mean), np.shape(track.covariance)), (steps, 2)
+        if found != (expected, (*expected, 2)):
+            raise InputError(
+                f"tracks: found arrays of {found[0]} and {found[1]} for caller {label}, expected "
+                f"{expected} and {(*expected, 2)}: the start and every control step"
+            )
+    return tracks
 
 
 def _whole(who: str, path: Gaussian, poses: int) -> Gaussian:

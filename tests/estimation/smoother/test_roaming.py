@@ -1,0 +1,284 @@
+"""Callers that move in the graph: their law, when they enter, and how well they are followed."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from scipy import stats
+
+from pipistrelle.detection.scans import NOBODY, rows_of
+from pipistrelle.estimation.beliefs import Gaussian, placed
+from pipistrelle.estimation.ekf.roaming import roam, velocity_of
+from pipistrelle.estimation.smoother.filter import Smoother
+from pipistrelle.estimation.smoother.graph import Solver, links
+from pipistrelle.estimation.smoother.placing import Around
+from pipistrelle.estimation.smoother.roaming import (
+    Chain,
+    gone_on,
+    place_key,
+    velocity_key,
+    walk_factor,
+)
+from pipistrelle.experiments.drives import Drive
+from pipistrelle.experiments.runs.filtering import run_filter
+from reference.missions import followed, ray_config
+from reference.walking import CALLER, FRAME, roaming_mission, scaled, walk_covariance
+
+SPEED, WALK = 0.7, 0.3
+MOTION, START = scaled(0.1)
+STATE = Gaussian(
+    mean=np.array([4.0, -1.0, 0.5, 0.2]),
+    covariance=np.diag([0.3, 0.2, 0.1, 0.4]) + 0.02 * np.ones((4, 4)),
+)
+
+
+def smoother(**changes):
+    told = {"speed_std": SPEED, "walk_std": WALK} | changes
+    return Smoother(motion=MOTION, rays=ray_config(), **told)
+
+
+def surprise(off, covariance):
+    return float(off @ np.linalg.solve(covariance, off))
+
+
+@pytest.fixture(scope="module")
+def roaming():
+    """A mission and its beliefs, frame by frame."""
+    mission, places = roaming_mission(np.random.default_rng(4), frames=16)
+    return mission, places, [belief for belief, _ in followed(smoother(), mission, START)]
+
+
+# The law
+
+
+def test_a_state_goes_on_as_in_the_ekf():
+    mean, covariance = np.append(np.zeros(3), STATE.mean), np.zeros((7, 7))
+    covariance[3:, 3:] = STATE.covariance
+    roam(mean, covariance, np.array([9, velocity_of(9)]), 1.5, WALK)
+    later = gone_on(STATE, 1.5, WALK)
+    np.testing.assert_allclose(later.mean, mean[3:], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(later.covariance, covariance[3:, 3:], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("seconds", [0.125, 1.0, 40.0])
+@pytest.mark.parametrize("walk_std", [0.3, 5.0])
+def test_the_factor_says_of_two_states_what_the_law_has(seconds, walk_std):
+    chain, values, rng = Chain(number=2, first=0), gtsam.Values(), np.random.default_rng(0)
+    states = rng.normal(size=(2, 4))
+    for node, state in enumerate(states, start=7):
+        values.insert(place_key(chain, node), state[:2])
+        values.insert(velocity_key(chain, node), state[2:])
+    off = states[1] - gone_on(Gaussian(mean=states[0], covariance=np.eye(4)), seconds, 0.0).mean
+    loss = 0.5 * surprise(off, walk_covariance(seconds, walk_std))
+    assert walk_factor(chain, 8, seconds, walk_std).error(values) == pytest.approx(loss, rel=1e-3)
+
+
+# When they enter
+
+
+def test_one_that_moves_is_no_landmark_and_is_where_it_is(roaming):
+    _, places, beliefs = roaming
+    last = beliefs[-1]
+    assert CALLER not in last.landmarks().landmark
+    now = last.moving()
+    assert now.landmark.tolist() == [CALLER]
+    assert surprise(now.mean[0] - places[-1], now.covariance[0]) < 16.0
+    assert np.sqrt(np.trace(now.covariance[0])) < 2.0
+
+
+def test_until_it_is_placed_it_is_a_ray_and_only_when_just_heard():
+    mission, _ = roaming_mission(np.random.default_rng(4), frames=3)
+    first = mission.scans[0]
+    alone = rows_of(first, first.landmark == CALLER)
+    slam = smoother()
+    belief = slam.predict(slam.init(START), mission.controls[0], mission.dt[0])[0]
+    belief = slam.update(belief, alone)
+    assert not belief.landmarks().landmark.size
+    assert not placed(belief.moving()).any()
+    assert belief.moving().landmark.size > 1
+    others = rows_of(mission.scans[1], mission.scans[1].landmark != CALLER)
+    belief = slam.predict(belief, mission.controls[1], mission.dt[1])[0]
+    assert not slam.update(belief, others).moving().landmark.size
+
+
+def test_bearings_that_cross_place_what_stands_and_never_what_moves():
+    mission, _ = roaming_mission(np.random.default_rng(4), 40, speed_std=1e-9, walk_std=0.0)
+    callers = [rows_of(scan, scan.landmark == CALLER) for scan in mission.scans]
+    standing = [replace(scan, moving=NOBODY) for scan in callers]
+    *_, (stands, _) = followed(smoother(), replace(mission, scans=standing), START)
+    *_, (moves, _) = followed(smoother(), replace(mission, scans=callers), START)
+    assert stands.mapped == (CALLER,)
+    assert not moves.chains
+
+
+def test_detours_from_before_it_was_placed_are_dropped_and_those_of_others_wait(roaming):
+    mission, _, beliefs = roaming
+    entered = next(k for k, belief in enumerate(beliefs) if belief.chains)
+    first = beliefs[-1].chains[CALLER].first
+    assert 1 <= entered == first - 1
+    assert np.isfinite(mission.scans[0].detour).any()
+    assert not any(one.node < first for belief in beliefs for one in belief.detours)
+    waited = [one for belief in beliefs for one in belief.detours]
+    assert all(one.landmark not in beliefs[-1].mapped[:1] for one in waited)
+
+
+def test_a_range_places_it_at_once():
+    mission, places = roaming_mission(np.random.default_rng(2), frames=1, ranges=1)
+    *_, (belief, _) = followed(smoother(), mission, START)
+    assert belief.chains == {CALLER: Chain(number=0, first=1)}
+    now = belief.moving()
+    assert surprise(now.mean[0] - places[1], now.covariance[0]) < 16.0
+
+
+def test_a_landmark_is_placed_by_the_call_of_one_that_moves(roaming):
+    _, _, beliefs = roaming
+    chains, mapped = beliefs[-1].chains, beliefs[-1].mapped
+    assert len(mapped) > 15
+    seen = beliefs[chains[CALLER].first + 1]
+    leg = smoother().predict(seen, roaming[0].controls[0], roaming[0].dt[0])[0]
+    around = Around(
+        isam=seen.solver.reach(seen.link), node=seen.link.node, leg=leg.leg, pose=leg.pose().mean,
+        chains=seen.chains, walk_std=WALK,
+    )  # fmt: skip
+    told, there = around.joint(CALLER), around.place(CALLER)
+    empty = rows_of(roaming[0].scans[0], np.array([0]))
+    new = replace(empty, landmark=np.array([77]))  # it waits, and only the leg enters
+    new = replace(new, numbers=np.where(np.arange(7)[:, None] == 0, 0.3, empty.numbers))
+    new.numbers[[1, 2]] = np.nan
+    gone = smoother().update(leg, new)
+    after = Around(
+        isam=gone.solver.reach(gone.link), node=gone.link.node, leg=None, pose=gone.pose().mean,
+        chains=gone.chains, walk_std=WALK,
+    )  # fmt: skip
+    assert gone.link.node == seen.link.node + 1
+    np.testing.assert_allclose(there, after.place(CALLER), rtol=0, atol=1e-3)
+    np.testing.assert_allclose(told, after.joint(CALLER), rtol=0, atol=1e-3)
+    np.testing.assert_allclose(leg.moving().covariance[0], told[3:, 3:], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(leg.moving().mean[0], there, rtol=0, atol=1e-6)
+
+
+def test_it_goes_on_while_the_vehicle_surely_stands():
+    motion = replace(MOTION, noise_at_rest=False)
+    mission, _ = roaming_mission(np.random.default_rng(2), frames=4, ranges=1)
+    slam = replace(smoother(), motion=motion)
+    still = replace(mission, controls=np.zeros_like(mission.controls))
+    beliefs = [belief for belief, _ in followed(slam, still, START)]
+    assert [belief.link.node for belief in beliefs] == [1, 2, 3, 4]
+    assert np.isfinite(beliefs[-1].tracks()[CALLER].mean[4::4]).all()
+    alone = [rows_of(scan, scan.landmark != CALLER) for scan in mission.scans]
+    alone = replace(still, scans=[replace(scan, moving=NOBODY) for scan in alone])
+    assert [belief.link.node for belief, _ in followed(slam, alone, START)] == [0] * 4
+
+
+# How well they are followed
+
+
+def test_one_that_stands_is_a_landmark():
+    mission, _ = roaming_mission(
+        np.random.default_rng(8), 16, ranges=2, speed_std=1e-9, walk_std=0.0
+    )
+    standing = [replace(scan, moving=NOBODY) for scan in mission.scans]
+    *_, (moves, _) = followed(smoother(speed_std=1e-4, walk_std=0.0), mission, START)
+    *_, (stands, _) = followed(smoother(), replace(mission, scans=standing), START)
+    rows, track = stands.landmarks(), moves.tracks()[CALLER]
+    (row,) = np.flatnonzero(rows.landmark == CALLER)
+    std = np.sqrt(rows.covariance[row].diagonal().min())
+    for k in (4, 32, 64):
+        np.testing.assert_allclose(track.mean[k], rows.mean[row], rtol=0, atol=0.02 * std)
+        np.testing.assert_allclose(
+            track.covariance[k], rows.covariance[row], rtol=0, atol=0.02 * std**2
+        )
+    for found, expected in ((moves.path(), stands.path()), (moves.pose(), stands.pose())):
+        np.testing.assert_allclose(found.mean, expected.mean, rtol=0, atol=2e-3)
+        np.testing.assert_allclose(found.covariance, expected.covariance, rtol=0, atol=1e-4)
+
+
+def nees(seed, walk_std):
+    """Surprises of the caller's last place, online and at the end, and of one halfway."""
+    mission, places = roaming_mission(np.random.default_rng(1000 + seed), frames=20)
+    *_, (belief, _) = followed(smoother(walk_std=walk_std), mission, START)
+    now, track = belief.moving(), belief.tracks()[CALLER]
+    return [
+        surprise(now.mean[0] - places[20], now.covariance[0]),
+        surprise(track.mean[80] - places[20], track.covariance[80]),
+        surprise(track.mean[48] - places[12], track.covariance[48]),
+    ]
+
+
+def test_places_are_off_by_what_they_say_where_it_moves_as_told_and_not_where_it_is_told_to_stay():
+    runs = 36
+    low, high = stats.chi2(2 * runs).ppf([5e-4, 1.0 - 5e-4]) / runs
+    means = np.mean([nees(seed, WALK) for seed in range(runs)], axis=0)
+    assert np.all((low < means) & (means < high)), means
+    deceived = np.mean([nees(seed, 1e-3) for seed in range(8)], axis=0)
+    assert np.all(deceived > 3.0 * high), deceived
+
+
+def test_what_comes_later_tells_where_it_was(roaming):
+    _, places, beliefs = roaming
+    revised = beliefs[-1].tracks()[CALLER]
+    heard = np.arange(beliefs[-1].chains[CALLER].first, 17)
+    rows = 4 * heard
+    assert np.flatnonzero(np.isfinite(revised.mean[:, 0])).tolist() == rows.tolist()
+    online = np.array([beliefs[k - 1].moving().mean[0] for k in heard])
+    late = np.sqrt(np.mean((revised.mean[rows] - places[heard]) ** 2))
+    assert late < np.sqrt(np.mean((online - places[heard]) ** 2))
+
+
+def test_a_track_is_what_is_believed_at_the_end(roaming):
+    mission, _, beliefs = roaming
+    drive = Drive(
+        motion=MOTION,
+        start=START,
+        time=np.append(0.0, np.cumsum(mission.dt)),
+        controls=mission.controls.reshape(-1, mission.controls.shape[-1]),
+    )
+    scans = [replace(scan, time=drive.time[4 * k]) for k, scan in enumerate(mission.scans, 1)]
+    track = run_filter(smoother(), drive, scans, np.random.default_rng(0))
+    np.testing.assert_array_equal(track.callers[CALLER].mean, beliefs[-1].tracks()[CALLER].mean)
+    assert len(track.pose.mean) == len(track.callers[CALLER].mean)
+
+
+# Bits, and the gate
+
+
+def test_a_belief_left_behind_goes_on_to_the_same_bits(roaming):
+    mission, _, beliefs = roaming
+    slam, other = smoother(), replace(beliefs[9], solver=Solver())
+    for frame in range(10, 16):
+        other, _ = slam.predict(other, mission.controls[frame], mission.dt[frame])
+        other = slam.update(other, mission.scans[frame])
+    np.testing.assert_array_equal(other.moving().covariance, beliefs[-1].moving().covariance)
+    for now, then in zip(
+        (other.tracks()[CALLER], other.path()),
+        (beliefs[-1].tracks()[CALLER], beliefs[-1].path()),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(now.mean, then.mean)
+        np.testing.assert_array_equal(now.covariance, then.covariance)
+
+
+def test_the_gate_drops_a_bearing_of_it_that_cannot_be(roaming):
+    mission, _, beliefs = roaming
+    slam, scan = smoother(gate=1.0 - 1e-9), mission.scans[12]
+    numbers = scan.numbers.copy()
+    numbers[0, -1] += 1.5
+    gone = slam.predict(beliefs[11], mission.controls[12], mission.dt[12])[0]
+    assert slam.update(gone, scan).gated == 0
+    wrong = slam.update(gone, replace(scan, numbers=numbers))
+    assert wrong.gated == 1
+    assert np.isfinite(wrong.moving().mean).all()
+
+
+def test_each_frame_ties_a_caller_by_one_factor_that_never_asks_python(roaming):
+    _, _, beliefs = roaming
+    first, last = beliefs[-1].chains[CALLER].first, beliefs[-1].link.node
+    ties = [
+        factor
+        for link in links(beliefs[-1].link)
+        for factor in (link.factors.at(k) for k in range(link.factors.size()))
+        if isinstance(factor, gtsam.LinearContainerFactor)
+    ]
+    assert len(ties) == last - first
+    assert last * FRAME == pytest.approx(8.0)
