@@ -12,6 +12,7 @@ from pipistrelle.experiments.studies.plan import Plan, cases_of, common
 from pipistrelle.experiments.studies.plan_file import (
     changed_settings,
     find_plan,
+    plan_settings,
     plan_text,
     read_plan,
 )
@@ -275,7 +276,7 @@ def test_a_flag_with_a_refused_value_is_named(refused):
 
 
 def test_a_plan_that_is_not_there_is_refused():
-    said = r"^none\.toml: found no such file; expected paper, physics, beyond or the path"
+    said = r"^none\.toml: found no such file; expected paper, physics, beyond, timing, callers, pair or the path"
     with pytest.raises(InputError, match=said):
         find_plan("none.toml")
 
@@ -464,3 +465,28 @@ def test_a_grid_may_list_callers_and_the_plan_holds_their_routes(tmp_path):
 )
 def test_callers_of_a_plan_that_cannot_be_are_refused_in_a_line(refused, text, said):
     assert said in refused(BARE + text)
+
+
+def test_timing_is_beyond_with_timing_and_nothing_else():
+    timing, beyond = (plan_settings(read_plan(find_plan(name))) for name in ("timing", "beyond"))
+    differ = {
+        name for name in timing.keys() | beyond.keys() if timing.get(name) != beyond.get(name)
+    }
+    assert differ == {"name", "config.listening.timing"}
+    assert timing["config.listening.timing"] is True
+
+
+@pytest.mark.parametrize("name", ["callers", "pair"])
+def test_who_calls_is_asked_in_the_worlds_of_the_papers_study_and_timed(name):
+    plan, physics = (read_plan(find_plan(word)) for word in (name, "physics"))
+    assert plan.config.listening.timing
+    for part in ("seed", "emitter", "beacon", "motion", "air", "target", "detection"):
+        assert getattr(plan.config, part) == getattr(physics.config, part)
+    assert plan.config.scenario == physics.config.scenario
+
+
+def test_a_pair_is_two_vehicles_of_one_world():
+    plan = read_plan(find_plan("pair"))
+    assert plan.grid["scenario.vehicle"] == (1, 2)
+    (mate,) = plan.config.callers
+    assert mate.way == "mission"
