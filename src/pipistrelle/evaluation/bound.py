@@ -3,8 +3,9 @@ r"""The bound: how surely any estimator can know the vehicle's pose, from what i
 The posterior Cramér-Rao bound along the true path is the covariance that an extended Kalman filter
 would have with every Jacobian taken at the truth: it hangs on what was heard and on how noisy
 controls and measurements are said to be, and on no estimate. The start is exact, and landmarks are
-not known before they are heard, but for a flat prior. A caller that moves does so as filters
-believe it does (`estimation.ekf.roaming`). It tells two things:
+not known before they are heard, but for a flat prior. A caller that moves strays as filters
+believe that it does (`estimation.ekf.roaming`), from the way that it truly went. It tells two
+things:
 
 - how much of an estimator's error is its own fault;
 - what NEES a consistent filter has that believes its start uncertain while it is exact: less than
@@ -66,7 +67,12 @@ def pose_bound(
     with F, U and H at the truth: F holds the way that the vehicle truly went in a step, not the one
     that it was commanded. A whole path with its landmarks may be turned, and nothing that is heard
     of it changes; with any other F the noise of the path would tell of a heading that nothing
-    tells.
+    tells. So would that of a caller's velocity: of one that goes from b, v to b', v' in a time T,
+
+    .. math:: \delta b' = \delta b + T \delta v + J (b' - b - T v)\, \delta\theta, \qquad
+              \delta v' = \delta v + J (v' - v)\, \delta\theta
+
+    with J a quarter turn and :math:`\delta\theta` the error of the heading.
 
     Parameters
     ----------
@@ -178,18 +184,39 @@ def _carry(
             covariance[a, b] += noise[a, b]
 
 
+@no_alloc
+def _turn_with(covariance: Float[np.ndarray, "n _"], i: Whole, x: float, y: float) -> None:
+    """Let the point at index i turn by (x, y) with the heading: its error gains J (x, y) dtheta."""
+    for j in range(covariance.shape[0]):
+        covariance[i, j] -= y * covariance[2, j]
+        covariance[i + 1, j] += x * covariance[2, j]
+    for j in range(covariance.shape[0]):
+        covariance[j, i] -= y * covariance[j, 2]
+        covariance[j, i + 1] += x * covariance[j, 2]
+
+
 @kernel
 def _let_move(
-    mean: Float[np.ndarray, " n"],
+    joint: Joint,
     labels: Int[np.ndarray, " n"],
     ways: Float[np.ndarray, "v t 2"],
-    k: Whole,
+    step: tuple[Whole, float, float],
 ) -> None:
-    """Put those who move where they are at step k; their velocities are the first of the state."""
+    """Put those who move where they are at step k, and turn what the walk has added.
+
+    Their velocities are the first of the state, each that of the step which follows; ``step`` is k
+    with the length of the step to it and of the next.
+    """
+    k, before, after = step
+    onward = min(k + 1, ways.shape[1] - 1)
     for v in range(ways.shape[0]):
+        gone, going = ways[v, k] - ways[v, k - 1], ways[v, onward] - ways[v, k]
+        dx = going[0] / after - gone[0] / before if onward > k else 0.0
+        dy = going[1] / after - gone[1] / before if onward > k else 0.0
+        _turn_with(joint.covariance, 3 + 2 * v, dx, dy)
         for n in range(labels.size):
             if labels[n] == velocity_of(labels[v]):
-                mean[3 + 2 * n], mean[4 + 2 * n] = ways[v, k, 0], ways[v, k, 1]
+                joint.mean[3 + 2 * n], joint.mean[4 + 2 * n] = ways[v, k, 0], ways[v, k, 1]
 
 
 @kernel
@@ -228,10 +255,10 @@ def _bound(
     for k in range(1, path.shape[0]):
         pose[:], noise[:] = path[k - 1], 0.0
         propagate_pose(pose, noise, controls[k - 1], dt[k - 1], motion)
-        _carry(joint.covariance, path[k, 0] - path[k - 1, 0], path[k, 1] - path[k - 1, 1], noise)
         if moving > 0:
             roam(joint.mean, joint.covariance, labels, dt[k - 1], walk_std)
-            _let_move(joint.mean, labels, ways, k)
+            _let_move(joint, labels, ways, (k, dt[k - 1], dt[min(k, dt.size - 1)]))
+        _carry(joint.covariance, path[k, 0] - path[k - 1, 0], path[k, 1] - path[k - 1, 1], noise)
         for a in range(3):
             joint.mean[a] = path[k, a]
         while m < steps.size and steps[m] <= k:
