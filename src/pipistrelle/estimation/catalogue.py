@@ -306,7 +306,8 @@ def _fastslam(config: Config, motion: "Motion") -> "Estimator":
 
 def _fastslam_bytes(landmarks: int, members: int, config: Config) -> float:
     """Count the particles: those before, the corrected ones, the resampled ones."""
-    each = 6 * landmarks * members + landmarks
+    ties = 4 if config.listening.timing else 0
+    each = 6 * landmarks * members + landmarks + ties * landmarks
     return 3.0 * DOUBLE * config.fastslam.particles * each
 
 

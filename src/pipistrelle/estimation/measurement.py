@@ -59,12 +59,15 @@ class Detours(NamedTuple):
         Labels; no landmark is its own caller.
     detour : (d) [m]
     variance : (d) [m^2]
+    row : (d)
+        Where in the scan.
     """
 
     landmark: Int[np.ndarray, " d"]
     caller: Int[np.ndarray, " d"]
     detour: Float[np.ndarray, " d"]
     variance: Float[np.ndarray, " d"]
+    row: Int[np.ndarray, " d"]
 
 
 Columns = tuple[
@@ -145,7 +148,7 @@ def detours(columns: Columns) -> Detours:
             count += 1
     kept = rows[:count]
     std = numbers[DETOUR_STD][kept]
-    return Detours(landmark[kept], whose[:count], numbers[DETOUR][kept], std * std)
+    return Detours(landmark[kept], whose[:count], numbers[DETOUR][kept], std * std, kept)
 
 
 class Row(NamedTuple):

@@ -1,5 +1,6 @@
 """FastSLAM 2.0: particles, each a sampled path with its own map.
 
 `filter` is the method, `resampling` its last step. The kernels: `particles` walks over all of them,
-a `block` of 32 at a time, whose rays `block_rays` weighs and prunes.
+a `block` of 32 at a time, whose rays `block_rays` weighs and prunes. Where detours are heard,
+`ties` tells which landmarks are tied to whom, and `block_ties` corrects them with their callers.
 """

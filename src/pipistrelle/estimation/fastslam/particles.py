@@ -1,4 +1,6 @@
-"""Kernels on all particles: gate, correct, resample. A block's steps: `block`, `block_rays`.
+"""Kernels on all particles: gate, correct, resample.
+
+A block's steps are in `block`, `block_rays` and, of what is tied to a caller, `ties`.
 
 Landmark n of a block has its members in the rows ``member[b, first[n] : first[n + 1]]``, of which
 lane i has the first ``count[b, n, i]``: the particles share the rows, not the members.
@@ -40,9 +42,22 @@ from pipistrelle.estimation.fastslam.block_rays import (
     weigh_by_active,
     weigh_by_bearing,
 )
-from pipistrelle.estimation.measurement import Columns, Measurements, measurements
+from pipistrelle.estimation.fastslam.block_ties import joined, known_surely, place_by_detour
+from pipistrelle.estimation.fastslam.ties import (
+    Tied,
+    Ties,
+    copy_row,
+    gated_detours,
+    heard_of,
+    put_row,
+    shift_all,
+    slot_of,
+    take_tied,
+    tie_landmarks,
+)
+from pipistrelle.estimation.measurement import Columns, Measurements, detours, measurements
 from pipistrelle.estimation.rays import Sensing
-from pipistrelle.jit import Whole, kernel, no_alloc
+from pipistrelle.jit import Whole, kernel, no_alloc, no_alloc_inlined
 
 
 class Particles(NamedTuple):
@@ -116,11 +131,17 @@ def _active_gated(
 
 
 @kernel
-def gated_by_all(arrays: Arrays, columns: Columns, sensing: Sensing) -> Bool[np.ndarray, " m"]:
-    """Whether each measurement is beyond the gate of every particle that could use it."""
-    particles, heard = Particles(*arrays), measurements(columns)
+def gated_by_all(
+    arrays: Arrays, tied: Tied, columns: Columns, sensing: Sensing
+) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " m"], int]:
+    """Whether each row of a scan is beyond the gate of every particle that could use it.
+
+    Then whether its detour is, and how many are.
+    """
+    particles, heard, told = Particles(*arrays), measurements(columns), detours(columns)
     slot = _slots(particles.landmark, heard.landmark)
-    gated, blocks = np.zeros(slot.size, dtype=np.bool_), particles.pose.shape[0]
+    gated, blocks = np.zeros(columns[0].size, dtype=np.bool_), particles.pose.shape[0]
+    deaf = np.zeros_like(gated)
     for m in range(slot.size):
         n = slot[m]
         gated[m] = n >= 0
@@ -137,7 +158,16 @@ def gated_by_all(arrays: Arrays, columns: Columns, sensing: Sensing) -> Bool[np.
                 gated[m] = gated[m] and bearing_beyond(
                     pose, rows[j], bearing, variance, count, j, sensing.passive_bound
                 )
-    return gated
+    deaf[told.row] = gated_detours(
+        particles.pose, particles.first, particles.count, particles.member, particles.landmark,
+        tied, told, sensing.passive_bound,
+    )  # fmt: skip
+    number = np.count_nonzero(gated)
+    for m in range(gated.size):
+        of = slot_of(heard.landmark, columns[0][m])
+        gated[m] = of >= 0 and gated[of]
+        number += deaf[m] and not gated[m]
+    return gated, deaf, int(number)
 
 
 @no_alloc
@@ -240,30 +270,51 @@ def _weigh_at_sample(
             weigh_by_active(block.pose, rows, rho_beta, count, 1, scratch, block.gained)
 
 
+@no_alloc_inlined
+def _correct_row(
+    block: Block, n: Whole, heard: Measurements, m: Whole, sensing: Sensing, scratch: Scratch
+) -> None:
+    """Correct a block's landmark n from its sampled poses by measurement m, in place."""
+    rows, bearing = block.member[block.first[n] : block.first[n + 1]], heard.bearing[m]
+    pose, variance, count = block.pose, heard.bearing_variance[m], block.count[n]
+    if math.isnan(heard.range[m]):
+        correct_ray(pose, rows, count, bearing, variance, sensing, scratch)
+        return
+    correct_by_active(
+        pose, rows[0], heard.range[m], bearing, heard.range_variance[m], variance, count
+    )
+    if most(count) > 1:
+        _range_for_ray(pose, rows, count, heard, m, sensing, scratch.total)
+        count[:] = 1
+
+
 @no_alloc
 def _correct(
     block: Block,
     slot: Int[np.ndarray, " m"],
     heard: Measurements,
+    ties: Ties,
     sensing: Sensing,
     scratch: Scratch,
 ) -> None:
-    """Correct a block's measured landmarks from its sampled poses, in place."""
+    """Correct a block's measured landmarks from its sampled poses, in place.
+
+    Those tied to a caller together with it, in lanes where both have one member.
+    """
     for m in range(slot.size):
         n = slot[m]
         if n < 0:
             continue
-        rows, bearing = block.member[block.first[n] : block.first[n + 1]], heard.bearing[m]
-        pose, variance, count = block.pose, heard.bearing_variance[m], block.count[n]
-        if math.isnan(heard.range[m]):
-            correct_ray(pose, rows, count, bearing, variance, sensing, scratch)
-            continue
-        correct_by_active(
-            pose, rows[0], heard.range[m], bearing, heard.range_variance[m], variance, count
-        )
-        if most(count) > 1:
-            _range_for_ray(pose, rows, count, heard, m, sensing, scratch.total)
-            count[:] = 1
+        h, row, turns = ties.hub[n], block.member[block.first[n]], 0
+        if h >= 0:
+            turns = joined(block.count[n], block.count[h], ties.turn)
+        if turns > 0:
+            copy_row(row, ties.row)
+            take_tied(block.pose, block.member[block.first[h]], block.count[h], n, ties, heard, m)
+        if turns < LANES:
+            _correct_row(block, n, heard, m, sensing, scratch)
+        if turns > 0:
+            put_row(ties.row, row, ties.turn)
 
 
 @no_alloc
@@ -282,6 +333,33 @@ def _add_new(
             heard.bearing_variance[m], -math.log(members), count,
         )  # fmt: skip
     count[:] = members
+
+
+@no_alloc
+def _place(
+    block: Block,
+    slot: Int[np.ndarray, " m"],
+    known: Whole,
+    heard: Measurements,
+    ties: Ties,
+    sensing: Sensing,
+) -> None:
+    """Place a block's new landmarks, and rays whose range a detour tells."""
+    new = known
+    for m in range(slot.size):
+        n = slot[m]
+        if n < 0:
+            n, new = new, new + 1
+            rows = block.member[block.first[n] : block.first[n + 1]]
+            _add_new(block.pose, rows, block.count[n], heard, m, sensing)
+        h = ties.hub[n]
+        if h >= 0 and not math.isnan(ties.detour[m]):
+            caller, member = block.member[block.first[h]], block.member[block.first[n]]
+            said = heard.bearing[m], ties.detour[m], heard.bearing_variance[m], ties.variance[m]
+            known_surely(block.pose, caller, block.count[h], ties.timed)
+            place_by_detour(
+                block.pose, caller, member, ties.tie[n], said, block.count[n], ties.timed
+            )
 
 
 @kernel
@@ -326,24 +404,29 @@ def _copy_members(particles: Particles, b: Whole, block: Block) -> None:
 @kernel
 def correct_particles(
     arrays: Arrays,
+    tied: Tied,
     columns: Columns,
     normal: Float[np.ndarray, "p 3"],
     sensing: Sensing,
     sampled: bool,
-) -> tuple[Extended, Float[np.ndarray, " p"]]:
-    """Refine, sample, correct and extend a copy of all particles; returns it and log weights.
+) -> tuple[Extended, Tied, Float[np.ndarray, " p"]]:
+    """Refine, sample, correct and extend a copy of all particles; returns it, ties, log weights.
 
     ``sampled``: they are weighed at the sample.
     """
-    old, heard = Particles(*arrays), measurements(columns)
+    old, heard, told = Particles(*arrays), measurements(columns), detours(columns)
     blocks, known, total = old.pose.shape[0], old.landmark.size, normal.shape[0]
     slot = _slots(old.landmark, heard.landmark)
     landmark, first, widest = _rows(old, slot, heard, sensing.ray_ranges.size)
+    hub, tie = tie_landmarks(tied, landmark, old.count, total, told, columns[3])
+    told_of = heard_of(hub, landmark, heard.landmark, told)
     pose, gained = old.pose.copy(), np.zeros((blocks, LANES))
     count = np.zeros((blocks, landmark.size, LANES), dtype=np.int64)
     member = np.empty((blocks, first[-1], MEMBER))
     scratch, draw, proposal = scratch_for(widest), np.empty(3 * LANES), np.empty(POSE)
+    room = np.empty(LANES), np.empty(LANES), np.empty(MEMBER)
     for b in range(blocks):
+        ties = Ties(hub, tie[b], *told_of, *room)
         block = Block(pose[b], gained[b], first, count[b], member[b])
         _copy_members(old, b, block)
         _refine(block, slot, heard, sensing, scratch)
@@ -353,14 +436,11 @@ def correct_particles(
         sample_pose(block.pose, draw)
         if sampled:
             _weigh_at_sample(block, slot, heard, (old.pose[b], proposal), scratch)
-        _correct(block, slot, heard, sensing, scratch)
-        n = known
-        for m in range(slot.size):
-            if slot[m] < 0:
-                rows = block.member[first[n] : first[n + 1]]
-                _add_new(block.pose, rows, block.count[n], heard, m, sensing)
-                n += 1
-    return (pose, landmark, first, count, member), gained.ravel()[:total]
+        shift_all(ties, first, block.member, -1.0)
+        _correct(block, slot, heard, ties, sensing, scratch)
+        _place(block, slot, known, heard, ties, sensing)
+        shift_all(ties, first, block.member, 1.0)
+    return (pose, landmark, first, count, member), (hub, tie), gained.ravel()[:total]
 
 
 @kernel
