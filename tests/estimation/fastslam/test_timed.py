@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipistrelle.detection.scans import Scan, with_columns
+from pipistrelle.detection.scans import BEARING, DETOUR, RANGE, with_columns
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.fastslam.block import LANES
 from pipistrelle.estimation.measurement import detour_of
@@ -194,10 +194,9 @@ def test_detours_of_whom_nobody_knows_change_nothing():
 def doubled(scan):
     """Return the scan with a further detour of each landmark, by a caller of whom nobody knows."""
     numbers = scan.numbers.copy()
-    numbers[:4] = np.nan
-    numbers[3] = 7.0
-    return Scan(
-        time=scan.time,
+    numbers[[BEARING, RANGE]], numbers[DETOUR] = np.nan, 7.0
+    return replace(
+        scan,
         landmark=np.tile(scan.landmark, 2),
         caller=np.concatenate([scan.caller, np.full(scan.landmark.size, 2)]),
         numbers=np.concatenate([scan.numbers, numbers], axis=1),
