@@ -312,3 +312,26 @@ def test_a_heading_that_is_lost_is_not_known_again_by_how_a_caller_strays():
         first_scan = bound[EVERY, 2, 2]
         least.append(heading[EVERY:].min() / first_scan)
     assert least == pytest.approx([1.0, 1.0], abs=1e-6)
+
+
+def test_a_caller_that_is_first_heard_late_is_bounded_by_what_was_heard():
+    """Until then its place and velocity hang together, and turn with the heading."""
+    rng = np.random.default_rng(6)
+    walk = np.cumsum(rng.normal(0.0, 1.0, (STEPS + 1, 2)), axis=0) * STEP + [3.0, 4.0]
+    rest = PLACES[0] != 12
+    known = PLACES[0][rest], PLACES[1][rest]
+    scans = with_boat(heard("fused"), walk)
+    late = [
+        replace(scan, callers=np.array([-1, -1])) if i < len(scans) - 3 else scan
+        for i, scan in enumerate(scans)
+    ]
+    world = DRIVE.motion, DRIVE.controls, DRIVE.time, WORLD.path, known
+    vague = [
+        with_columns(scan, detour_std=1e9) if i < len(scans) - 3 else scan
+        for i, scan in enumerate(scans)
+    ]
+    last, same, ever = (
+        pose_bound(*world, told, {12: walk}, (1.0, 0.5)) for told in (late, vague, scans)
+    )
+    np.testing.assert_allclose(last, same, rtol=1e-6, atol=1e-12)
+    assert path_bound(ever)[0] < path_bound(last)[0]

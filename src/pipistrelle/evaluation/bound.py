@@ -124,7 +124,8 @@ def pose_bound(
     heard, first = np.unique(met, return_index=True)
     heard = heard[np.argsort(first)]  # whom it hears first stands first, as in a filter's state
     moving = [one for one in heard.tolist() if one in routes]
-    state = np.append(np.array([velocity_of(one) for one in moving], np.int64), heard)
+    velocities = np.array([velocity_of(one) for one in moving], np.int64)
+    state = np.concatenate((velocities, moving, heard[~np.isin(heard, moving)])).astype(np.int64)
     slot = {one: number for number, one in enumerate(state.tolist())} | {UNLABELLED: UNLABELLED}
     place = dict(zip(fixed.tolist(), places, strict=True))
     place |= {one: routes[one][0] for one in moving}
@@ -198,14 +199,13 @@ def _turn_with(covariance: Float[np.ndarray, "n _"], i: Whole, x: float, y: floa
 @kernel
 def _let_move(
     joint: Joint,
-    labels: Int[np.ndarray, " n"],
     ways: Float[np.ndarray, "v t 2"],
     step: tuple[Whole, float, float],
 ) -> None:
     """Put those who move where they are at step k, and turn what the walk has added.
 
-    Their velocities are the first of the state, each that of the step which follows; ``step`` is k
-    with the length of the step to it and of the next.
+    Their velocities are the first of the state, each that of the step which follows, and then their
+    places; ``step`` is k with the length of the step to it and of the next.
     """
     k, before, after = step
     onward = min(k + 1, ways.shape[1] - 1)
@@ -214,9 +214,8 @@ def _let_move(
         dx = going[0] / after - gone[0] / before if onward > k else 0.0
         dy = going[1] / after - gone[1] / before if onward > k else 0.0
         _turn_with(joint.covariance, 3 + 2 * v, dx, dy)
-        for n in range(labels.size):
-            if labels[n] == velocity_of(labels[v]):
-                joint.mean[3 + 2 * n], joint.mean[4 + 2 * n] = ways[v, k, 0], ways[v, k, 1]
+        i = 3 + 2 * (ways.shape[0] + v)
+        joint.mean[i], joint.mean[i + 1] = ways[v, k, 0], ways[v, k, 1]
 
 
 @kernel
@@ -236,8 +235,8 @@ def _bound(
 ) -> Float[np.ndarray, "t 3 3"]:
     """Carry the covariance along the true path; of each row step, place and its caller's place.
 
-    ``world``: labels and places of the state, the velocities of those who move first; their ways,
-    and what is known of these.
+    ``world``: labels and places of the state, first the velocities and then the places of those who
+    move, which hang together before they are heard; their ways, and what is known of these.
     """
     labels, places, ways, (speed_std, walk_std) = world
     room, moving = 3 + 2 * places.shape[0], ways.shape[0]
@@ -247,7 +246,7 @@ def _bound(
         for a in range(2):
             mean[3 + 2 * n + a] = places[n, a]
             prior[3 + 2 * n + a, 3 + 2 * n + a] = std * std
-    joint, size, m = joint_of(mean, prior, room, LINEAR), 3 + 2 * moving, 0
+    joint, size, m = joint_of(mean, prior, room, LINEAR), 3 + 4 * moving, 0
     joint.W[:] = 0.0  # the state grows into columns that wait
     bound = np.zeros((path.shape[0], 3, 3))
     steps, slots, callers = row
@@ -257,7 +256,7 @@ def _bound(
         propagate_pose(pose, noise, controls[k - 1], dt[k - 1], motion)
         if moving > 0:
             roam(joint.mean, joint.covariance, labels, dt[k - 1], walk_std)
-            _let_move(joint, labels, ways, (k, dt[k - 1], dt[min(k, dt.size - 1)]))
+            _let_move(joint, ways, (k, dt[k - 1], dt[min(k, dt.size - 1)]))
         _carry(joint.covariance, path[k, 0] - path[k - 1, 0], path[k, 1] - path[k - 1, 1], noise)
         for a in range(3):
             joint.mean[a] = path[k, a]
