@@ -146,7 +146,7 @@ class SlowTimedFastSlam(SlowFastSlam):
             return
         rows = list(zip(scan.landmark.tolist(), scan.range, scan.bearing, strict=True))
         inside = {row[0] for row in rows if not math.isnan(row[2]) and self.inside_any(*row)}
-        kept = rows_of(scan, np.isin(scan.landmark, list(inside)))
+        kept = rows_of(scan, np.isnan(scan.bearing) | np.isin(scan.landmark, list(inside)))
         told = self.said_of(kept)
         said = [one for one in told if self.detour_inside_any(*one)]
         self.gated += len(told) - len(said)

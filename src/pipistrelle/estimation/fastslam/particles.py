@@ -51,7 +51,6 @@ from pipistrelle.estimation.fastslam.ties import (
     heard_of,
     put_row,
     shift_all,
-    slot_of,
     take_tied,
     tie_landmarks,
 )
@@ -162,12 +161,7 @@ def gated_by_all(
         particles.pose, particles.first, particles.count, particles.member, particles.landmark,
         tied, told, sensing.passive_bound,
     )  # fmt: skip
-    number = np.count_nonzero(gated)
-    for m in range(gated.size):
-        of = slot_of(heard.landmark, columns[0][m])
-        gated[m] = of >= 0 and gated[of]
-        number += deaf[m] and not gated[m]
-    return gated, deaf, int(number)
+    return gated, deaf, int(np.count_nonzero(gated | deaf))
 
 
 @no_alloc
