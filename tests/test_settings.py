@@ -155,7 +155,7 @@ def test_layers_leave_alone_what_they_do_not_name(tmp_path):
         ),
         (
             "[[callers]]\ncourse = 'line'",
-            "callers.1.course: found 'line', expected 'circle' or 'walk'",
+            "callers.1.course: found 'line', expected 'circle', 'walk' or 'mission'",
         ),
         (
             "[[callers]]\nspeed = 1.0",
