@@ -22,7 +22,7 @@ from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.ekf.correction import corrected
 from pipistrelle.estimation.ekf.crossing import WAITS
 from pipistrelle.estimation.ekf.gaussian import LINEAR, propagate
-from pipistrelle.estimation.ekf.roaming import is_velocity, roam, stands, with_velocities
+from pipistrelle.estimation.ekf.roaming import is_velocity, roam, stands, velocities_missing
 from pipistrelle.estimation.measurement import columns_of
 from pipistrelle.estimation.motion import Motion, motion_numbers
 from pipistrelle.estimation.rays import Sensing, sensing_of
@@ -134,32 +134,70 @@ def map_rows(
     return Landmarks(landmark=landmark.copy(), mean=means, covariance=own, weight=weight)
 
 
-def with_points(belief: Kept, known: Landmarks, by_pose: Float[np.ndarray, "n 3"]) -> Kept:
-    """Append landmarks to a belief that has none.
+def with_points(belief: Kept, known: Landmarks, by_state: Float[np.ndarray, "n d"]) -> Kept:
+    """Append members to a belief.
 
     Parameters
     ----------
     belief : EkfBelief
     known : Landmarks of n / 2 rows
         Their covariances are of errors of their own.
-    by_pose : (n, 3)
-        How the errors of the state hang on the pose's.
+    by_state : (n, d)
+        How their errors hang on the state's besides.
 
     Returns
     -------
     EkfBelief
     """
-    P, cross = belief.covariance, by_pose @ belief.covariance
-    own = np.zeros((len(by_pose), len(by_pose)))
+    P, cross = belief.covariance, by_state @ belief.covariance
+    own = np.zeros((len(by_state), len(by_state)))
     for row, covariance in enumerate(known.covariance):
         own[2 * row : 2 * row + 2, 2 * row : 2 * row + 2] = covariance
     return replace(
         belief,
         mean=np.append(belief.mean, known.mean.ravel()),
-        covariance=np.block([[P, cross.T], [cross, cross @ by_pose.T + own]]),
-        landmark=known.landmark.astype(np.int64),
-        weight=np.ones(known.landmark.size),
+        covariance=np.block([[P, cross.T], [cross, cross @ by_state.T + own]]),
+        landmark=np.append(belief.landmark, known.landmark),
+        weight=np.append(belief.weight, known.weight),
     )
+
+
+def with_velocities(belief: Kept, moving: Int[np.ndarray, " v"], std: float) -> Kept:
+    """Give each caller that moves a velocity, once it has a place.
+
+    Parameters
+    ----------
+    belief : EkfBelief
+    moving : (v)
+        Labels of who moves.
+    std : [m/s]
+        Of a velocity of which nothing is known, along an axis.
+
+    Returns
+    -------
+    EkfBelief
+
+    Examples
+    --------
+    >>> belief = EkfBelief(
+    ...     mean=np.arange(5.0), covariance=np.eye(5), landmark=np.array([9]), weight=np.ones(1),
+    ...     gated=0,
+    ... )
+    >>> belief = with_velocities(belief, np.array([8, 9]), 2.0)
+    >>> belief.landmark, belief.mean, belief.covariance.diagonal()
+    (array([  9, -11]), array([0., 1., 2., 3., 4., 0., 0.]), array([1., 1., 1., 1., 1., 4., 4.]))
+    """
+    labels = velocities_missing(belief.landmark, moving)
+    if labels.size == 0:
+        return belief
+    size = labels.size
+    unknown = Landmarks(
+        landmark=labels,
+        mean=np.zeros((size, 2)),
+        covariance=np.tile(std * std * np.eye(2), (size, 1, 1)),
+        weight=np.ones(size),
+    )
+    return with_points(belief, unknown, np.zeros((2 * size, belief.mean.size)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -45,9 +45,10 @@ from pipistrelle.estimation.ekf.filter import (
     numbers_of,
     taken_in,
     with_points,
+    with_velocities,
 )
 from pipistrelle.estimation.ekf.gaussian import INVARIANT
-from pipistrelle.estimation.ekf.roaming import is_velocity, roam, with_velocities
+from pipistrelle.estimation.ekf.roaming import is_velocity, roam
 from pipistrelle.estimation.motion import Motion, MotionNumbers, motion_numbers, propagate_pose
 from pipistrelle.estimation.rays import sensing_of
 from pipistrelle.jit import kernel, no_alloc

@@ -20,19 +20,11 @@ The right-invariant error treats it as it treats a point, and means the same: of
 axes stays so when it is turned. Both EKFs share what is here.
 """
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, TypeVar
-
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipistrelle.detection.scans import UNLABELLED
+from pipistrelle.detection.scans import NOBODY, UNLABELLED
 from pipistrelle.jit import Whole, kernel
-
-if TYPE_CHECKING:
-    from pipistrelle.estimation.ekf.filter import EkfBelief
-
-    Kept = TypeVar("Kept", bound=EkfBelief)
 
 _NOBODY, _SUM = UNLABELLED, UNLABELLED - 1
 """Labels are from 0 on; that of a caller and that of its velocity have one sum."""
@@ -91,48 +83,30 @@ def stands(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
     return ~velocity & ~np.isin(landmark, _SUM - landmark[velocity])
 
 
-def with_velocities(belief: "Kept", moving: Int[np.ndarray, " v"], std: float) -> "Kept":
-    """Give each caller that moves a velocity, once it has a place.
+def velocities_missing(
+    landmark: Int[np.ndarray, " h"], moving: Int[np.ndarray, " v"]
+) -> Int[np.ndarray, " n"]:
+    """Return the labels of the velocities that a state lacks: of who moves and has a place.
 
     Parameters
     ----------
-    belief : EkfBelief
+    landmark : (h)
     moving : (v)
         Labels of who moves.
-    std : [m/s]
-        Of a velocity of which nothing is known, along an axis.
 
     Returns
     -------
-    EkfBelief
+    (n)
 
     Examples
     --------
-    >>> from pipistrelle.estimation.ekf.filter import EkfBelief
-    >>> belief = EkfBelief(
-    ...     mean=np.arange(5.0), covariance=np.eye(5), landmark=np.array([9]), weight=np.ones(1),
-    ...     gated=0,
-    ... )
-    >>> belief = with_velocities(belief, np.array([8, 9]), 2.0)
-    >>> belief.landmark, belief.mean, belief.covariance.diagonal()
-    (array([  9, -11]), array([0., 1., 2., 3., 4., 0., 0.]), array([1., 1., 1., 1., 1., 4., 4.]))
+    >>> velocities_missing(np.array([4, 51]), np.array([51, 52]))
+    array([-53])
     """
-    known = belief.landmark
-    if np.count_nonzero(is_velocity(known)) == moving.size:
-        return belief
-    new = moving[np.isin(moving, known) & ~np.isin(_SUM - moving, known)]
-    if new.size == 0:
-        return belief
-    size = belief.mean.size
-    covariance = std * std * np.eye(size + 2 * new.size)
-    covariance[:size, :size] = belief.covariance
-    return replace(
-        belief,
-        mean=np.append(belief.mean, np.zeros(2 * new.size)),
-        covariance=covariance,
-        landmark=np.append(known, _SUM - new),
-        weight=np.append(belief.weight, np.ones(new.size)),
-    )
+    if np.count_nonzero(is_velocity(landmark)) == moving.size:
+        return NOBODY
+    velocity = _SUM - moving
+    return velocity[np.isin(moving, landmark) & ~np.isin(velocity, landmark)]
 
 
 @kernel

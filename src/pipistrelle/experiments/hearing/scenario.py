@@ -194,8 +194,8 @@ def standing_landmarks(scenario: Scenario) -> LabelledPoints:
     (array([ 1, 51]), (51, 2))
     """
     landmarks = scenario.landmarks
-    labelled = enumerate(scenario.callers[VEHICLE + 1 :], start=len(landmarks) + 1)
-    standing = {label: np.asarray(c.place) for label, c in labelled if not moves(c)}
+    others = _others(scenario).items()
+    standing = {label: np.asarray(c.place) for label, c in others if not moves(c)}
     labels = np.array([*range(1, len(landmarks) + 1), *standing])
     return labels, np.vstack((landmarks, *standing.values()))
 
@@ -217,8 +217,12 @@ def moving_callers(scenario: Scenario) -> dict[int, Caller]:
     >>> moving_callers(world_of(Config()))
     {}
     """
-    labelled = enumerate(scenario.callers[VEHICLE + 1 :], start=len(scenario.landmarks) + 1)
-    return {label: caller for label, caller in labelled if moves(caller)}
+    return {label: caller for label, caller in _others(scenario).items() if moves(caller)}
+
+
+def _others(scenario: Scenario) -> dict[int, Caller]:
+    """Label all callers but the vehicle, as landmarks."""
+    return dict(enumerate(scenario.callers[VEHICLE + 1 :], start=len(scenario.landmarks) + 1))
 
 
 def caller_labels(scenario: Scenario) -> Int[np.ndarray, " c"]:

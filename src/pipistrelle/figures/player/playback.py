@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from pipistrelle.acoustics.callers import moves
 from pipistrelle.config import InputError
-from pipistrelle.estimation.beliefs import Landmarks
+from pipistrelle.estimation.beliefs import Landmarks, some_of
 from pipistrelle.experiments.drives import LabelledPoints
 from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.runs.again import Again
@@ -366,12 +366,7 @@ def _gone(before: Landmarks | None, after: Landmarks) -> Landmarks:
     kept = np.zeros(len(rows.landmark), bool)
     if before is not None and before is not after:
         kept = pruned(before, after)
-    return Landmarks(
-        landmark=rows.landmark[kept],
-        mean=rows.mean[kept],
-        covariance=rows.covariance[kept],
-        weight=rows.weight[kept],
-    )
+    return some_of(rows, kept)
 
 
 def _cloud(
