@@ -6,7 +6,7 @@ echo (`same_echo`).
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -46,12 +46,15 @@ class Heard:
         How much later than the direct call of its caller each row came, as a way of sound, and the
         standard deviation of that; NaN where there is none. They are kept beside the rows too:
         `timed` puts them in.
+    callers : (c)
+        Labels that the callers bear as landmarks, where somebody tells: whose the detours are.
     """
 
     rows: Scan
     clutter: int | None
     certainty: Float[np.ndarray, "2 m"] | None = None
     detour: Float[np.ndarray, "2 m"] | None = None
+    callers: Int[np.ndarray, " c"] = field(default_factory=lambda: NOBODY)
 
 
 def average_faces(
@@ -105,8 +108,13 @@ def average_faces(
     landmark, caller, numbers, certainty, detour = _average(
         labels, label, found, direct, averaging == "weighted", speed_of_sound
     )
-    rows = Scan(time=time, landmark=landmark, caller=caller, numbers=numbers, callers=callers)
-    return Heard(rows=rows, clutter=int(clutter), certainty=certainty, detour=detour)
+    return Heard(
+        rows=Scan(time=time, landmark=landmark, caller=caller, numbers=numbers),
+        clutter=int(clutter),
+        certainty=certainty,
+        detour=detour,
+        callers=callers,
+    )
 
 
 def same_echo(
@@ -189,7 +197,7 @@ def timed(heard: Heard) -> Heard:
         return heard
     numbers = heard.rows.numbers.copy()
     numbers[DETOUR] = heard.detour[0]
-    return replace(heard, rows=replace(heard.rows, numbers=numbers))
+    return replace(heard, rows=replace(heard.rows, numbers=numbers, callers=heard.callers))
 
 
 class _Found(NamedTuple):

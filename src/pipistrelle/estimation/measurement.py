@@ -70,14 +70,10 @@ class Detours(NamedTuple):
     row: Int[np.ndarray, " d"]
 
 
-Columns = tuple[
-    Int[np.ndarray, " m"],
-    Float[np.ndarray, "7 m"],
-    Int[np.ndarray, " m"],
-    Int[np.ndarray, " c"],
-    Int[np.ndarray, " v"],
-]
-"""Labels, numbers and callers of a scan's rows; the labels of the callers, and of who moves."""
+Columns = tuple[Int[np.ndarray, " m"], Float[np.ndarray, "7 m"]]
+"""Labels and numbers of a scan's rows."""
+Timings = tuple[Int[np.ndarray, " m"], Int[np.ndarray, " c"], Int[np.ndarray, " v"]]
+"""Callers of a scan's rows; the labels of the callers, and of who moves."""
 
 
 def columns_of(scan: Scan) -> Columns:
@@ -89,11 +85,27 @@ def columns_of(scan: Scan) -> Columns:
 
     Returns
     -------
-    tuple of labels, numbers, callers, callers' labels and labels of who moves
+    tuple of labels and numbers
         A plain tuple: a kernel takes one in no time, and a record in microseconds.
     """
-    numbers = np.ascontiguousarray(scan.numbers)
-    return scan.landmark, numbers, scan.caller, scan.callers, scan.moving
+    return scan.landmark, np.ascontiguousarray(scan.numbers)
+
+
+def timings_of(scan: Scan) -> Timings | None:
+    """Return what says whose detours a scan holds, as kernels take it.
+
+    Parameters
+    ----------
+    scan : Scan
+
+    Returns
+    -------
+    tuple of callers, callers' labels and labels of who moves, or None
+        Where it names no caller: a kernel that is given None is compiled without a word on detours.
+    """
+    if scan.callers.size == 0 and scan.moving.size == 0:
+        return None
+    return scan.caller, scan.callers, scan.moving
 
 
 @kernel
@@ -109,7 +121,7 @@ def measurements(columns: Columns) -> Measurements:
     >>> measurements(columns_of(scan)).bearing_variance
     array([0.25])
     """
-    landmark, numbers, _, _, _ = columns
+    landmark, numbers = columns
     rows = landmark.size
     while rows > 0 and math.isnan(numbers[BEARING, rows - 1]):
         rows -= 1
@@ -124,7 +136,7 @@ def measurements(columns: Columns) -> Measurements:
 
 
 @kernel
-def detours(columns: Columns) -> Detours:
+def detours(columns: Columns, timings: Timings) -> Detours:
     """Return the detours of a scan as the kernels take them.
 
     Examples
@@ -133,11 +145,12 @@ def detours(columns: Columns) -> Detours:
     >>> from pipistrelle.detection.scans import make_scan
     >>> timed = {"detour": np.array([3.0, np.nan]), "detour_std": 0.5}
     >>> scan = make_scan(0.0, np.array([4, 9]), np.zeros(2), caller=1, **timed)
-    >>> of = detours(columns_of(replace(scan, callers=np.array([-1, 9]))))
+    >>> scan = replace(scan, callers=np.array([-1, 9]))
+    >>> of = detours(columns_of(scan), timings_of(scan))
     >>> of.landmark, of.caller, of.variance
     (array([4]), array([9]), array([0.25]))
     """
-    landmark, numbers, caller, callers, _ = columns
+    (landmark, numbers), (caller, callers, _) = columns, timings
     count, rows, whose = 0, np.empty(landmark.size, np.int64), np.empty(landmark.size, np.int64)
     for m in range(landmark.size):
         if math.isnan(numbers[DETOUR, m]) or caller[m] >= callers.size:

@@ -50,6 +50,10 @@ NO_ROUTES: Mapping[int, np.ndarray] = MappingProxyType({})
 """Nobody moves."""
 
 
+_Timed = tuple[Int[np.ndarray, " m"], Float[np.ndarray, "v t 2"], tuple[float, float]]
+"""The place of each row's caller, the ways of those who move, and what is known of these."""
+
+
 def pose_bound(
     motion: Motion,
     controls: Float[np.ndarray, "k c"],
@@ -131,14 +135,16 @@ def pose_bound(
     place |= {one: routes[one][0] for one in moving}
     place |= {velocity_of(one): np.zeros(2) for one in moving}
     ways = np.array([routes[one] for one in moving]).reshape(-1, len(path), 2)
+    timed = bool(moving) or np.any(caller != UNLABELLED)
     return _bound(
         path,
         controls,
         np.diff(time),
         motion_numbers(motion),
-        (state, np.array([place[one] for one in state.tolist()]).reshape(-1, 2), ways, wander),
-        (step[known], _slots(slot, label[known]), _slots(slot, caller)),
+        (state, np.array([place[one] for one in state.tolist()]).reshape(-1, 2)),
+        (step[known], _slots(slot, label[known])),
         np.ascontiguousarray(numbers[:, known]),
+        (_slots(slot, caller), ways, wander) if timed else None,
     )
 
 
@@ -218,56 +224,77 @@ def _let_move(
         joint.mean[i], joint.mean[i + 1] = ways[v, k, 0], ways[v, k, 1]
 
 
+@no_alloc
+def _grown(joint: Joint, size: Whole, slot: Whole) -> Whole:
+    """Let the state reach the place of a number; returns its size."""
+    if 3 + 2 * slot < size:
+        return size
+    flush(joint, size)
+    return 5 + 2 * slot
+
+
+@no_alloc
+def _hear(
+    joint: Joint,
+    size: Whole,
+    slot: Whole,
+    numbers: Float[np.ndarray, "7 m"],
+    m: Whole,
+    timed: _Timed | None,
+) -> Whole:
+    """Correct with measurement m of a place, and its detour; returns the size of the state."""
+    size = _grown(joint, size, slot)
+    if timed is not None:
+        size = _grown(joint, size, timed[0][m])
+    _correct(joint, size, 3 + 2 * slot, numbers, m)
+    if timed is not None and timed[0][m] != UNLABELLED:
+        i, ib, variance = 3 + 2 * slot, 3 + 2 * timed[0][m], numbers[DETOUR_STD, m] ** 2
+        tell_detour(joint, size, i, ib, variance)
+    return size
+
+
 @kernel
 def _bound(
     path: Float[np.ndarray, "t 3"],
     controls: Float[np.ndarray, "k c"],
     dt: Float[np.ndarray, " k"],
     motion: MotionNumbers,
-    world: tuple[
-        Int[np.ndarray, " n"],
-        Float[np.ndarray, "n 2"],
-        Float[np.ndarray, "v t 2"],
-        tuple[float, float],
-    ],
-    row: tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Int[np.ndarray, " m"]],
+    world: tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]],
+    row: tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]],
     numbers: Float[np.ndarray, "7 m"],
+    timed: _Timed | None,
 ) -> Float[np.ndarray, "t 3 3"]:
-    """Carry the covariance along the true path; of each row step, place and its caller's place.
+    """Carry the covariance along the true path; of each row step and place.
 
     ``world``: labels and places of the state, first the velocities and then the places of those who
-    move, which hang together before they are heard; their ways, and what is known of these.
+    move, which hang together before they are heard.
     """
-    labels, places, ways, (speed_std, walk_std) = world
-    room, moving = 3 + 2 * places.shape[0], ways.shape[0]
+    (labels, places), moving = world, 0
+    room = 3 + 2 * places.shape[0]
     mean, prior = np.zeros(room), np.zeros((room, room))
-    for n in range(places.shape[0]):
-        std = speed_std if n < moving else PRIOR_STD
-        for a in range(2):
-            mean[3 + 2 * n + a] = places[n, a]
-            prior[3 + 2 * n + a, 3 + 2 * n + a] = std * std
+    mean[3:] = places.ravel()
+    for n in range(3, room):
+        prior[n, n] = PRIOR_STD**2
+    if timed is not None:
+        moving = timed[1].shape[0]
+        for n in range(3, 3 + 2 * moving):
+            prior[n, n] = timed[2][0] ** 2
     joint, size, m = joint_of(mean, prior, room, LINEAR), 3 + 4 * moving, 0
     joint.W[:] = 0.0  # the state grows into columns that wait
     bound = np.zeros((path.shape[0], 3, 3))
-    steps, slots, callers = row
+    steps, slots = row
     pose, noise = np.empty(3), np.empty((3, 3))
     for k in range(1, path.shape[0]):
         pose[:], noise[:] = path[k - 1], 0.0
         propagate_pose(pose, noise, controls[k - 1], dt[k - 1], motion)
-        if moving > 0:
-            roam(joint.mean, joint.covariance, labels, dt[k - 1], walk_std)
-            _let_move(joint, ways, (k, dt[k - 1], dt[min(k, dt.size - 1)]))
+        if timed is not None and moving > 0:
+            roam(joint.mean, joint.covariance, labels, dt[k - 1], timed[2][1])
+            _let_move(joint, timed[1], (k, dt[k - 1], dt[min(k, dt.size - 1)]))
         _carry(joint.covariance, path[k, 0] - path[k - 1, 0], path[k, 1] - path[k - 1, 1], noise)
         for a in range(3):
             joint.mean[a] = path[k, a]
         while m < steps.size and steps[m] <= k:
-            i, ib = 3 + 2 * slots[m], 3 + 2 * callers[m]
-            if max(i, ib) >= size:
-                flush(joint, size)
-                size = max(i, ib) + 2
-            _correct(joint, size, i, numbers, m)
-            if callers[m] != UNLABELLED:
-                tell_detour(joint, size, i, ib, numbers[DETOUR_STD, m] ** 2)
+            size = _hear(joint, size, slots[m], numbers, m, timed)
             m += 1
         if joint.taken[WAITING] > 0:
             flush(joint, size)

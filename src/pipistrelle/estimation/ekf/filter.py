@@ -22,8 +22,8 @@ from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.ekf.correction import corrected
 from pipistrelle.estimation.ekf.crossing import WAITS
 from pipistrelle.estimation.ekf.gaussian import LINEAR, propagate
-from pipistrelle.estimation.ekf.roaming import is_velocity, roam, stands, velocities_missing
-from pipistrelle.estimation.measurement import columns_of
+from pipistrelle.estimation.ekf.roaming import is_velocity, roam, roams, stands, velocities_missing
+from pipistrelle.estimation.measurement import columns_of, timings_of
 from pipistrelle.estimation.motion import Motion, motion_numbers
 from pipistrelle.estimation.rays import Sensing, sensing_of
 
@@ -187,6 +187,8 @@ def with_velocities(belief: Kept, moving: Int[np.ndarray, " v"], std: float) -> 
     >>> belief.landmark, belief.mean, belief.covariance.diagonal()
     (array([  9, -11]), array([0., 1., 2., 3., 4., 0., 0.]), array([1., 1., 1., 1., 1., 4., 4.]))
     """
+    if moving.size == 0:
+        return belief
     labels = velocities_missing(belief.landmark, moving)
     if labels.size == 0:
         return belief
@@ -311,7 +313,8 @@ class EkfSlam:
         poses = Gaussian(mean=np.empty((len(dt), 3)), covariance=np.empty((len(dt), 3, 3)))
         numbers = motion_numbers(self.motion)
         propagate(mean, covariance, controls, dt, numbers, poses.mean, poses.covariance)
-        roam(mean, covariance, belief.landmark, dt.sum(), self.walk_std)
+        if roams(belief.landmark):
+            roam(mean, covariance, belief.landmark, dt.sum(), self.walk_std)
         moved = EkfBelief(
             mean=mean,
             covariance=covariance,
@@ -382,6 +385,7 @@ def taken_in(belief: EkfBelief, scan: Scan, sensing: Sensing, turns: float) -> d
         belief.landmark,
         belief.weight,
         columns_of(scan),
+        timings_of(scan),
         sensing,
         turns,
     )

@@ -48,7 +48,7 @@ from pipistrelle.estimation.ekf.filter import (
     with_velocities,
 )
 from pipistrelle.estimation.ekf.gaussian import INVARIANT
-from pipistrelle.estimation.ekf.roaming import is_velocity, roam
+from pipistrelle.estimation.ekf.roaming import is_velocity, roam, roams
 from pipistrelle.estimation.motion import Motion, MotionNumbers, motion_numbers, propagate_pose
 from pipistrelle.estimation.rays import sensing_of
 from pipistrelle.jit import kernel, no_alloc
@@ -192,7 +192,8 @@ class InvariantEkfSlam:
         poses = Gaussian(mean=np.empty((len(dt), 3)), covariance=np.empty((len(dt), 3, 3)))
         numbers = motion_numbers(self.motion)
         _propagate(mean, covariance, controls, dt, numbers, poses.mean, poses.covariance)
-        roam(mean, covariance, belief.landmark, dt.sum(), self.walk_std)
+        if roams(belief.landmark):
+            roam(mean, covariance, belief.landmark, dt.sum(), self.walk_std)
         placed = replace(poses, mean=_placed(poses.mean, belief.origin), invariant=True)
         return replace(belief, mean=mean, covariance=covariance), placed
 

@@ -61,6 +61,21 @@ def is_velocity(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
     return landmark < _NOBODY
 
 
+@kernel
+def roams(landmark: Int[np.ndarray, " h"]) -> bool:
+    """Tell whether any row of a state is a velocity.
+
+    Examples
+    --------
+    >>> roams(np.array([4, 51])), roams(np.array([4, 51, -53]))
+    (False, True)
+    """
+    least = 0
+    for label in landmark:
+        least = min(least, label)
+    return least < _NOBODY
+
+
 def stands(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
     """Tell which rows of a state are of what stands, neither callers that move nor velocities.
 

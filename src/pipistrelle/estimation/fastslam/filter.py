@@ -92,7 +92,7 @@ from pipistrelle.estimation.fastslam.particles import (
 from pipistrelle.estimation.fastslam.poses import SMALLEST_STD, propagate, summarise
 from pipistrelle.estimation.fastslam.resampling import effective_particles, normalised, stratified
 from pipistrelle.estimation.fastslam.ties import Tied, resample_ties
-from pipistrelle.estimation.measurement import columns_of
+from pipistrelle.estimation.measurement import Timings, columns_of, timings_of
 from pipistrelle.estimation.motion import Motion, motion_numbers
 from pipistrelle.estimation.rays import Sensing, sensing_of
 
@@ -131,8 +131,9 @@ class FastSlamBelief:
         Weighted mean number of fully initialised landmarks.
     gated : int
         Measurements rejected so far.
-    hub : (n)
-        Number of the caller that each landmark is tied to, or -1 (`ties`).
+    hub : (k)
+        Number of the caller that each landmark is tied to, or -1 (`ties`): of those that were there
+        when detours came last.
     tie : (b, n, 4 L)
         How its place moves with that one's; no rows while nobody is tied.
     """
@@ -148,7 +149,7 @@ class FastSlamBelief:
     best_member: Float[np.ndarray, "c 6"]
     full: float
     gated: int
-    hub: Int[np.ndarray, " n"]
+    hub: Int[np.ndarray, " k"]
     tie: Float[np.ndarray, "b n numbers"]
 
     def pose(self) -> Gaussian:
@@ -288,7 +289,7 @@ class FastSlam:
         sampled = self.settings.weights == "sampled"
         inside, gated = self._inside(belief, scan, sensing)
         corrected, (hub, tie), gained = correct_particles(
-            *_held(belief), columns_of(inside), normal, sensing, sampled
+            *_held(belief), columns_of(inside), _timings(belief, inside), normal, sensing, sampled
         )
         poses, landmark, first, count, member = corrected
         weight = normalised(belief.log_weight + gained)
@@ -317,7 +318,8 @@ class FastSlam:
         """Drop the measurements and detours that no particle expected; tell how many."""
         if self.gate >= 1.0:
             return scan, 0
-        dropped, deaf, gated = gated_by_all(*_held(belief), columns_of(scan), sensing)
+        told = columns_of(scan), _timings(belief, scan)
+        dropped, deaf, gated = gated_by_all(*_held(belief), *told, sensing)
         if deaf.any():
             scan = with_columns(scan, detour=np.where(deaf, np.nan, scan.detour))
         return rows_of(scan, ~dropped), gated
@@ -327,6 +329,11 @@ def _held(belief: FastSlamBelief) -> tuple[Arrays, Tied]:
     """Return a belief's particles as the kernels take them, and their ties."""
     arrays = belief.poses, belief.landmark, belief.first, belief.count, belief.member
     return arrays, (belief.hub, belief.tie)
+
+
+def _timings(belief: FastSlamBelief, scan: Scan) -> Timings | None:
+    """Return what says whose detours a scan holds; None where nobody's, and nothing is tied."""
+    return timings_of(scan) if belief.tie.size == 0 else (scan.caller, scan.callers, scan.moving)
 
 
 def _resampled(belief: FastSlamBelief, ancestor: Int[np.ndarray, " p"]) -> FastSlamBelief:

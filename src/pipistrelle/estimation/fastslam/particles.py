@@ -54,7 +54,13 @@ from pipistrelle.estimation.fastslam.ties import (
     take_tied,
     tie_landmarks,
 )
-from pipistrelle.estimation.measurement import Columns, Measurements, detours, measurements
+from pipistrelle.estimation.measurement import (
+    Columns,
+    Measurements,
+    Timings,
+    detours,
+    measurements,
+)
 from pipistrelle.estimation.rays import Sensing
 from pipistrelle.jit import Whole, kernel, no_alloc, no_alloc_inlined
 
@@ -131,13 +137,13 @@ def _active_gated(
 
 @kernel
 def gated_by_all(
-    arrays: Arrays, tied: Tied, columns: Columns, sensing: Sensing
+    arrays: Arrays, tied: Tied, columns: Columns, timings: Timings | None, sensing: Sensing
 ) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " m"], int]:
     """Whether each row of a scan is beyond the gate of every particle that could use it.
 
     Then whether its detour is, and how many are.
     """
-    particles, heard, told = Particles(*arrays), measurements(columns), detours(columns)
+    particles, heard = Particles(*arrays), measurements(columns)
     slot = _slots(particles.landmark, heard.landmark)
     gated, blocks = np.zeros(columns[0].size, dtype=np.bool_), particles.pose.shape[0]
     deaf = np.zeros_like(gated)
@@ -157,10 +163,12 @@ def gated_by_all(
                 gated[m] = gated[m] and bearing_beyond(
                     pose, rows[j], bearing, variance, count, j, sensing.passive_bound
                 )
-    deaf[told.row] = gated_detours(
-        particles.pose, particles.first, particles.count, particles.member, particles.landmark,
-        tied, told, sensing.passive_bound,
-    )  # fmt: skip
+    if timings is not None:
+        told = detours(columns, timings)
+        deaf[told.row] = gated_detours(
+            particles.pose, particles.first, particles.count, particles.member, particles.landmark,
+            tied, told, sensing.passive_bound,
+        )  # fmt: skip
     return gated, deaf, int(np.count_nonzero(gated | deaf))
 
 
@@ -283,11 +291,23 @@ def _correct_row(
 
 
 @no_alloc
+def _correct_tied(block: Block, n: Whole, heard: Measurements, m: Whole, ties: Ties) -> Whole:
+    """Correct landmark n, in the row of the ties, with its caller; tell in how many lanes."""
+    h, turns = ties.hub[n], 0
+    if h >= 0:
+        turns = joined(block.count[n], block.count[h], ties.turn)
+    if turns > 0:
+        copy_row(block.member[block.first[n]], ties.row)
+        take_tied(block.pose, block.member[block.first[h]], block.count[h], n, ties, heard, m)
+    return turns
+
+
+@no_alloc
 def _correct(
     block: Block,
     slot: Int[np.ndarray, " m"],
     heard: Measurements,
-    ties: Ties,
+    ties: Ties | None,
     sensing: Sensing,
     scratch: Scratch,
 ) -> None:
@@ -296,19 +316,15 @@ def _correct(
     Those tied to a caller together with it, in lanes where both have one member.
     """
     for m in range(slot.size):
-        n = slot[m]
+        n, turns = slot[m], 0
         if n < 0:
             continue
-        h, row, turns = ties.hub[n], block.member[block.first[n]], 0
-        if h >= 0:
-            turns = joined(block.count[n], block.count[h], ties.turn)
-        if turns > 0:
-            copy_row(row, ties.row)
-            take_tied(block.pose, block.member[block.first[h]], block.count[h], n, ties, heard, m)
+        if ties is not None:
+            turns = _correct_tied(block, n, heard, m, ties)
         if turns < LANES:
             _correct_row(block, n, heard, m, sensing, scratch)
-        if turns > 0:
-            put_row(ties.row, row, ties.turn)
+        if ties is not None and turns > 0:
+            put_row(ties.row, block.member[block.first[n]], ties.turn)
 
 
 @no_alloc
@@ -330,12 +346,24 @@ def _add_new(
 
 
 @no_alloc
+def _place_tied(block: Block, n: Whole, heard: Measurements, m: Whole, ties: Ties) -> None:
+    """Place landmark n where it is a ray and a detour tells its range."""
+    h = ties.hub[n]
+    if h < 0 or math.isnan(ties.detour[m]):
+        return
+    caller, member = block.member[block.first[h]], block.member[block.first[n]]
+    said = heard.bearing[m], ties.detour[m], heard.bearing_variance[m], ties.variance[m]
+    known_surely(block.pose, caller, block.count[h], ties.timed)
+    place_by_detour(block.pose, caller, member, ties.tie[n], said, block.count[n], ties.timed)
+
+
+@no_alloc
 def _place(
     block: Block,
     slot: Int[np.ndarray, " m"],
     known: Whole,
     heard: Measurements,
-    ties: Ties,
+    ties: Ties | None,
     sensing: Sensing,
 ) -> None:
     """Place a block's new landmarks, and rays whose range a detour tells."""
@@ -346,14 +374,8 @@ def _place(
             n, new = new, new + 1
             rows = block.member[block.first[n] : block.first[n + 1]]
             _add_new(block.pose, rows, block.count[n], heard, m, sensing)
-        h = ties.hub[n]
-        if h >= 0 and not math.isnan(ties.detour[m]):
-            caller, member = block.member[block.first[h]], block.member[block.first[n]]
-            said = heard.bearing[m], ties.detour[m], heard.bearing_variance[m], ties.variance[m]
-            known_surely(block.pose, caller, block.count[h], ties.timed)
-            place_by_detour(
-                block.pose, caller, member, ties.tie[n], said, block.count[n], ties.timed
-            )
+        if ties is not None:
+            _place_tied(block, n, heard, m, ties)
 
 
 @kernel
@@ -400,6 +422,7 @@ def correct_particles(
     arrays: Arrays,
     tied: Tied,
     columns: Columns,
+    timings: Timings | None,
     normal: Float[np.ndarray, "p 3"],
     sensing: Sensing,
     sampled: bool,
@@ -408,19 +431,21 @@ def correct_particles(
 
     ``sampled``: they are weighed at the sample.
     """
-    old, heard, told = Particles(*arrays), measurements(columns), detours(columns)
+    old, heard = Particles(*arrays), measurements(columns)
     blocks, known, total = old.pose.shape[0], old.landmark.size, normal.shape[0]
     slot = _slots(old.landmark, heard.landmark)
     landmark, first, widest = _rows(old, slot, heard, sensing.ray_ranges.size)
-    hub, tie = tie_landmarks(tied, landmark, old.count, total, told, columns[3])
-    told_of = heard_of(hub, landmark, heard.landmark, told)
+    told_of = np.empty(0), np.empty(0)
+    if timings is not None:
+        told = detours(columns, timings)
+        tied = tie_landmarks(tied, landmark, old.count, total, told, timings[1])
+        told_of = heard_of(tied[0], landmark, heard.landmark, told)
     pose, gained = old.pose.copy(), np.zeros((blocks, LANES))
     count = np.zeros((blocks, landmark.size, LANES), dtype=np.int64)
     member = np.empty((blocks, first[-1], MEMBER))
     scratch, draw, proposal = scratch_for(widest), np.empty(3 * LANES), np.empty(POSE)
     room = np.empty(LANES), np.empty(LANES), np.empty(MEMBER)
     for b in range(blocks):
-        ties = Ties(hub, tie[b], *told_of, *room)
         block = Block(pose[b], gained[b], first, count[b], member[b])
         _copy_members(old, b, block)
         _refine(block, slot, heard, sensing, scratch)
@@ -430,11 +455,16 @@ def correct_particles(
         sample_pose(block.pose, draw)
         if sampled:
             _weigh_at_sample(block, slot, heard, (old.pose[b], proposal), scratch)
-        shift_all(ties, first, block.member, -1.0)
-        _correct(block, slot, heard, ties, sensing, scratch)
-        _place(block, slot, known, heard, ties, sensing)
-        shift_all(ties, first, block.member, 1.0)
-    return (pose, landmark, first, count, member), (hub, tie), gained.ravel()[:total]
+        if timings is None:
+            _correct(block, slot, heard, None, sensing, scratch)
+            _place(block, slot, known, heard, None, sensing)
+        else:
+            ties = Ties(tied[0], tied[1][b], *told_of, *room)
+            shift_all(ties, first, block.member, -1.0)
+            _correct(block, slot, heard, ties, sensing, scratch)
+            _place(block, slot, known, heard, ties, sensing)
+            shift_all(ties, first, block.member, 1.0)
+    return (pose, landmark, first, count, member), tied, gained.ravel()[:total]
 
 
 @kernel

@@ -25,7 +25,7 @@ from pipistrelle.estimation.fastslam.block_ties import (
 from pipistrelle.estimation.measurement import Detours, Measurements
 from pipistrelle.jit import Whole, kernel, no_alloc, no_alloc_inlined
 
-Tied = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "b n numbers"]]
+Tied = tuple[Int[np.ndarray, " tied"], Float[np.ndarray, "b ties numbers"]]
 """Who is tied to whom, and how."""
 
 
@@ -167,7 +167,7 @@ def gated_detours(
     gated = np.zeros(told.landmark.size, dtype=np.bool_)
     for d in range(gated.size):
         n, h = slot_of(landmark, told.landmark[d]), slot_of(landmark, told.caller[d])
-        gated[d] = n >= 0 and h >= 0 and hub[n] == h
+        gated[d] = 0 <= n < hub.size and h >= 0 and hub[n] == h
         for b in range(pose.shape[0] if gated[d] else 0):
             caller = member[b, first[h]]
             joined(count[b, n], count[b, h], turn)

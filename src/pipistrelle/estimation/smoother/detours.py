@@ -29,7 +29,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.measurement import BELIEVED, columns_of, detour_slopes, detours
+from pipistrelle.estimation.measurement import (
+    BELIEVED,
+    columns_of,
+    detour_slopes,
+    detours,
+    timings_of,
+)
 from pipistrelle.estimation.smoother.graph import pose_key
 from pipistrelle.estimation.smoother.roaming import (
     NO_CHAINS,
@@ -76,9 +82,10 @@ def detours_of(scan: Scan, node: int) -> tuple[Detour, ...]:
     >>> detours_of(replace(scan, callers=np.array([-1, 9])), 7)
     (Detour(node=7, landmark=4, caller=9, detour=3.0, std=0.5),)
     """
-    if scan.callers.size == 0:
+    timings = timings_of(scan)
+    if timings is None:
         return ()
-    found = detours(columns_of(scan))
+    found = detours(columns_of(scan), timings)
     columns = found.landmark, found.caller, found.detour, np.sqrt(found.variance)
     return tuple(Detour(node, *row) for row in zip(*map(np.ndarray.tolist, columns), strict=True))
 

@@ -21,7 +21,7 @@ RELINEARIZE = 0.1
 ANEW = 5
 """Times that all is linearised anew where bearings enter that had waited: many of them enter at
 once, from poses that they correct, and a graph that was linearised before may never recover."""
-CONVERGED = 1e-9
+CONVERGED = 1e-7
 """Change of the squared error, and its share of it, under which the optimum is reached."""
 
 

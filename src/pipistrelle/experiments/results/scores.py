@@ -169,7 +169,7 @@ def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Sc
     mapped, true = scored_landmarks(estimate, labels, positions)
     followed, walked = _followed(track, truth)
     finite = bool(np.all(np.isfinite(track.pose.mean)))
-    rows = sum(int(np.sum(~np.isnan(scan.bearing))) for scan in scans)
+    rows = np.count_nonzero(~np.isnan(np.concatenate([[], *(scan.bearing for scan in scans)])))
     return Scores(
         position_rmse_m=path.position_rmse_m,
         heading_rmse_rad=path.heading_rmse_rad,
