@@ -18,6 +18,7 @@ LEAST_AGGREGATED = 0.05
 CORRESPONDENCE_STD = 1.0
 WAITS = -1.0
 SURE = 0.2
+PARALLAX = 0.35
 BELIEVED = 2.0
 
 
@@ -477,6 +478,10 @@ class SlowEkfSlam:
         z = np.append(self.X[involved], bearing)
         found = crossing(z)
         if found[2] < NEAREST or found[3] <= 0:
+            return
+        ray, heading = z[5:7] - z[3:5], z[2] + bearing
+        turn = math.atan2(ray[1], ray[0]) - heading
+        if self.robust and abs(math.sin(turn)) < PARALLAX:
             return
         step = 1e-30
         J = np.array([crossing(z + 1j * step * e).imag / step for e in np.eye(z.size)]).T

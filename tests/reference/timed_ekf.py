@@ -9,6 +9,7 @@ from reference.ekf_slam import BELIEVED, NEAREST, POSE, WAITS, SlowEkfSlam, norm
 from reference.invariant_ekf import QUARTER, SlowInvariantEkfSlam
 
 SURE = 0.1
+FARTHER = 3.0
 TINY = 1e-6
 FARTHEST = 1e4
 
@@ -129,8 +130,9 @@ class Timed:
             by_state = by_state @ np.linalg.inv(self.change())
             by_state[:2, 2] -= QUARTER @ point
         spread = by_state @ self.P @ by_state.T + noise @ R @ noise.T
+        farther = (FARTHER**2 - 1.0) * noise[2, 0] ** 2 * R[0, 0] if self.robust else 0.0
         return (
-            math.sqrt(max(spread[2, 2], 0.0)) / r,
+            math.sqrt(max(spread[2, 2] + farther, 0.0)) / r,
             point,
             by_state[:2],
             (noise @ R @ noise.T)[:2, :2],

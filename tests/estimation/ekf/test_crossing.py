@@ -49,9 +49,9 @@ def test_a_run_with_precise_bearings_equals_the_slow_reference(kind, reference, 
     assert max(waiting for _, waiting in counts) > 5
 
 
-def heard_from(kind, *bearings, std=0.01, at=(0.0, 2.0)):
+def heard_from(kind, *bearings, std=0.01, at=(0.0, 2.0), robust=False):
     """Hear landmark 4 from the origin and, sure of both, from another place at right angles."""
-    slam = kind(motion=BICYCLE, rays=FITTED)
+    slam = kind(motion=BICYCLE, rays=FITTED, robust=robust)
     belief = slam.init(Gaussian(mean=np.zeros(3), covariance=1e-12 * np.eye(3)))
     belief = slam.update(belief, scan_with([4], bearings[:1], bearing_std=std))
     if len(bearings) > 1:
@@ -106,6 +106,15 @@ def test_a_bearing_that_does_not_cross_surely_ahead_places_nothing(kind, second)
     belief = heard_from(kind, 0.0, second)
     assert belief.landmarks().landmark.tolist() == [4, 4]
     assert np.isfinite(belief.covariance).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("degrees", "robust"), [(15.0, 2), (19.0, 2), (22.0, 1), (45.0, 1)])
+def test_where_bearings_may_be_far_off_only_those_that_cross_clearly_place(kind, degrees, robust):
+    plain, careful = (
+        heard_from(kind, 0.0, -np.radians(degrees), robust=how).landmarks() for how in (False, True)
+    )
+    assert (len(plain.landmark), len(careful.landmark)) == (1, robust)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -114,8 +114,10 @@ def test_a_run_with_detours_equals_the_slow_reference(kind, reference, strategy,
 
 
 @pytest.mark.parametrize(("kind", "reference"), PAIRS)
-def test_a_robust_gated_run_with_detours_equals_the_slow_reference(kind, reference):
-    check_reference(kind, reference, "fused", gate=0.99, robust=True, weights="aggregated")
+@pytest.mark.parametrize("callers", [(1,), (1, 2, 3)])
+def test_a_robust_gated_run_with_detours_equals_the_slow_reference(kind, reference, callers):
+    known = {"callers": callers, "robust": True, "weights": "aggregated"}
+    check_reference(kind, reference, "fused", gate=0.99, **known)
 
 
 # What it is for
@@ -123,9 +125,9 @@ def test_a_robust_gated_run_with_detours_equals_the_slow_reference(kind, referen
 CALLER, LANDMARK = np.array([6.0, -2.0]), np.array([2.0, 9.0])
 
 
-def standing(kind):
+def standing(kind, robust=False):
     """A filter whose vehicle stands at the origin, sure of it, and has placed a caller, label 2."""
-    slam = paper_filter(kind, range_std=0.01, bearing_std=0.01)
+    slam = paper_filter(kind, range_std=0.01, bearing_std=0.01, robust=robust)
     belief = slam.init(Gaussian(mean=np.zeros(3), covariance=np.eye(3) * 1e-8))
     distance, bearing = range_and_bearing(np.zeros(3), CALLER[None])
     return slam, slam.update(belief, make_scan(0.0, np.array([2]), bearing, range=distance))
@@ -152,6 +154,22 @@ def test_a_landmark_heard_once_is_placed_by_its_detour(kind):
     mean, covariance = mapped(belief, 7)
     np.testing.assert_allclose(mean, [LANDMARK], atol=1e-3)
     assert 0.01 < np.sqrt(np.linalg.eigvalsh(covariance[0])[-1]) < 0.3
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_where_bearings_may_be_far_off_a_detour_places_what_is_sure_all_the_same(kind):
+    e, members = detour_of(np.zeros(2), LANDMARK, CALLER), {}
+    for robust in (False, True):
+        slam, belief = standing(kind, robust)
+        for std in (0.02, 0.07, 0.3):
+            _, bearing = range_and_bearing(np.zeros(3), LANDMARK[None])
+            timed = {"caller": 1, "detour": e, "detour_std": 0.05, "bearing_std": std}
+            scan = make_scan(0.0, np.array([7]), bearing, **timed)
+            after = slam.update(belief, replace(scan, callers=np.array([-1, 2])))
+            members[robust, std] = len(mapped(after, 7)[0])
+    ray = len(mapped(after, 7)[0])
+    assert [members[False, std] for std in (0.02, 0.07, 0.3)] == [1, 1, ray]
+    assert [members[True, std] for std in (0.02, 0.07, 0.3)] == [1, ray, ray]
 
 
 @pytest.mark.parametrize("kind", KINDS)

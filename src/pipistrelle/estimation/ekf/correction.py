@@ -155,7 +155,7 @@ def _correct_precisely(
         variance = linear_to(sensing) ** 2
         coarse = Row(row.landmark, row.bearing, row.range, variance, row.range_variance)
         return _correct_partial(state, first, count, coarse, sensing, scratch)
-    if place_crossing(state, first, row):
+    if place_crossing(state, first, row, sensing.robust):
         scratch.keep[0], scratch.keep[1] = True, False
         drop_members(state, first, count, scratch.keep, scratch.source)
     return APPLIED
@@ -240,13 +240,13 @@ def _take_in_timed(
     for m in range(heard.landmark.size):
         if known[m]:
             row = row_of(heard, m)
-            if not placed_by_detour(state, row, timed, scratch):
+            if not placed_by_detour(state, row, timed, sensing.robust, scratch):
                 gated += _correct_known(state, row, sensing, scratch)
     flush(state.joint, 3 + 2 * state.members[0])
     for m in range(heard.landmark.size):
         if not known[m]:
             row = row_of(heard, m)
-            if not added_by_detour(state, row, timed):
+            if not added_by_detour(state, row, timed, sensing.robust):
                 _add_new(state, row, sensing, row.landmark in timed.moving)
     for d in range(timed.landmark.size):
         if not timed.used[d]:

@@ -42,6 +42,9 @@ SURE = 0.2
 """Largest standard deviation of a placed landmark's range, as a share of it."""
 PARALLEL = 1e-9
 """Sine under which two bearings do not cross."""
+PARALLAX = 0.35
+"""Least sine at which they do where some may be off by more than they say, by degrees at times: of
+many bearings those would seem to cross first, and two have nobody to surprise."""
 
 
 @no_alloc
@@ -124,18 +127,20 @@ def _range_row(
 
 
 @no_alloc
-def place_crossing(state: State, first: Whole, row: Row) -> bool:
+def place_crossing(state: State, first: Whole, row: Row, robust: bool) -> bool:
     """Place a landmark where a bearing crosses the one that waits, if that is sure enough.
 
-    It takes the place of the first of the two points; the second is left to be dropped.
+    It takes the place of the first of the two points; the second is left to be dropped. ``robust``:
+    a bearing may be off by more than it says.
     """
     joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
     mean, direction = joint.mean, joint.mean[2] + row.bearing
     nx, ny, sine, r, t = _from_vehicle(joint, i, direction)
     ux, uy = math.cos(direction), math.sin(direction)
+    least = PARALLAX if robust else PARALLEL
     lever, most = r * (nx * uy - ny * ux) / sine, SURE * SURE * r * r
     by_bearing = lever * lever * row.bearing_variance
-    if r < NEAREST or t <= 0.0 or by_bearing > most:
+    if abs(sine) < least or r < NEAREST or t <= 0.0 or by_bearing > most:
         return False
     flush(joint, size)
     variance = _range_row(joint, size, i, (nx, ny, sine), t, lever)

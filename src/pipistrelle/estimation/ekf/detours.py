@@ -22,6 +22,10 @@ from pipistrelle.estimation.measurement import Columns, Row, Timings, detours
 from pipistrelle.estimation.rays import Sensing, survivors, weigh_and_share
 from pipistrelle.jit import Whole, kernel, no_alloc
 
+FARTHER = 3.0
+"""Times its standard deviation by which a bearing may be off where some are by more than they say:
+a place that is wrong, and sure, takes all others along."""
+
 
 class Timed(NamedTuple):
     """The detours of a frame, and who moves.
@@ -62,13 +66,14 @@ def _single(state: State, label: Whole) -> Whole:
 
 
 @no_alloc
-def _surest(state: State, row: Row, timed: Timed) -> Whole:
+def _surest(state: State, row: Row, timed: Timed, robust: bool) -> Whole:
     """Return the detour that tells the range of a row's landmark most surely; -1 where none does.
 
     It is one over the landmark, of a caller that is placed, or one of its own call over a placed
-    one.
+    one. ``robust``: it must be sure even if the bearing is off by `FARTHER` than it says.
     """
     best, least, size = -1, math.inf, 3 + 2 * state.members[0]
+    across = row.bearing_variance * (FARTHER * FARTHER if robust else 1.0)
     for d in range(timed.landmark.size):
         of_caller = timed.caller[d] == row.landmark
         if timed.used[d] or not (of_caller or timed.landmark[d] == row.landmark):
@@ -76,7 +81,7 @@ def _surest(state: State, row: Row, timed: Timed) -> Whole:
         other = _single(state, timed.landmark[d] if of_caller else timed.caller[d])
         if other < 0:
             continue
-        measured = (timed.detour[d], timed.variance[d], row.bearing, row.bearing_variance)
+        measured = (timed.detour[d], timed.variance[d], row.bearing, across)
         share = unsure_by_detour(state.joint, size, 3 + 2 * other, of_caller, measured)
         if share < least:
             best, least = d, share
@@ -95,12 +100,12 @@ def _place(state: State, member: Whole, row: Row, timed: Timed, d: Whole) -> Non
 
 
 @no_alloc
-def placed_by_detour(state: State, row: Row, timed: Timed, scratch: Scratch) -> bool:
+def placed_by_detour(state: State, row: Row, timed: Timed, robust: bool, scratch: Scratch) -> bool:
     """Place a ray, or a bearing that waits, by a detour that tells its range surely; tell if so."""
     first, count = members_of(state.landmark, state.members[0], row.landmark)
     if count == 1 or not math.isnan(row.range):
         return False
-    d = _surest(state, row, timed)
+    d = _surest(state, row, timed, robust)
     if d < 0:
         return False
     for j in range(count):
@@ -112,9 +117,9 @@ def placed_by_detour(state: State, row: Row, timed: Timed, scratch: Scratch) -> 
 
 
 @no_alloc
-def added_by_detour(state: State, row: Row, timed: Timed) -> bool:
+def added_by_detour(state: State, row: Row, timed: Timed, robust: bool) -> bool:
     """Append a passive measurement's landmark where a detour tells its range surely; tell if so."""
-    d = _surest(state, row, timed) if math.isnan(row.range) else -1
+    d = _surest(state, row, timed, robust) if math.isnan(row.range) else -1
     if d < 0:
         return False
     member = state.members[0]
