@@ -188,12 +188,14 @@ def written(values: Sequence[Any]) -> tuple[str, ...]:
     >>> written([1.0, 2.5]), written([1.0, 1.0000001]), written([True, "paper", [0.5, 20.0]])
     (('1', '2.5'), ('1.0', '1.0000001'), ('true', 'paper', '[0.5, 20]'))
 
-    Callers are named:
+    Callers are counted, or named:
 
-    >>> written([[], [{}], [{}, {"frequency": 25e3, "course": "circle"}]])
-    ('nobody', 'beacon', 'beacon, caller2 (circle)')
+    >>> written([[], [{}], [{"course": "walk"}], [{}, {"frequency": 25e3}]])
+    ('nobody', 'beacon', 'walk', '2')
+    >>> written([[{}], [{}, {"frequency": 25e3}], [{}, {"frequency": 25e3, "course": "circle"}]])
+    ('beacon', 'beacon, caller2', 'beacon, caller2 (circle)')
     """
-    for words in (_calling, _short):
+    for words in (_counted, _calling, _short):
         short = tuple(map(words, values))
         if len(set(short)) == len(short):
             return short
@@ -293,11 +295,29 @@ def _near(beamwidth: float) -> float | None:
     return near if abs(near - beamwidth) < 0.2 else None
 
 
+def _callers(value: Any) -> tuple[CallerConfig, ...] | None:
+    """Return the callers that a value lists, if it is such a list."""
+    if not isinstance(value, list) or not all(isinstance(one, dict) for one in value):
+        return None
+    return tuple(CallerConfig(**one) for one in value)
+
+
+def _counted(value: Any) -> str:
+    """Write one caller by its name, or the way that it goes, several by their number."""
+    callers = _callers(value)
+    if callers is None:
+        return _short(value)
+    if len(callers) != 1:
+        return str(len(callers)) if callers else "nobody"
+    (caller,), (name,) = callers, caller_names(callers)
+    return name if caller.name or caller.way == "stand" else caller.way
+
+
 def _calling(value: Any) -> str:
     """Write a list of callers by their names and ways, and any other value in a few digits."""
-    if not isinstance(value, list) or not all(isinstance(one, dict) for one in value):
+    callers = _callers(value)
+    if callers is None:
         return _short(value)
-    callers = tuple(CallerConfig(**one) for one in value)
     names = zip(caller_names(callers), (caller.way for caller in callers), strict=True)
     return ", ".join(f"{name} ({way})".removesuffix(" (stand)") for name, way in names) or "nobody"
 

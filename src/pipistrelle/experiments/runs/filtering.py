@@ -80,9 +80,8 @@ def run_filter(
     ------
     InputError
         For a row that is neither bearing nor detour, or no number, one of which nobody says how
-        sure it is, scans
-        out of order or at a time that is not one of the drive's, labels that are none, or poses
-        that are not one for each step.
+        sure it is, scans out of order or at a time that is not one of the drive's, labels that are
+        none, or poses that are not one for each step.
     """
     time = drive.time
     steps = _steps_of(scans, time)
@@ -91,11 +90,10 @@ def run_filter(
     path = Gaussian(mean=np.empty((time.size, 3)), covariance=np.empty((time.size, 3, 3)))
     path.mean[0], path.covariance[0] = drive.start.mean, drive.start.covariance
     belief, done = _first_belief(estimator, drive), 0
-    ways = drive.controls, np.diff(time)
     callers: dict[int, Gaussian] = {}
     for number, (k, scan) in enumerate(zip(steps, scans, strict=True), start=1):
         if k > done:
-            belief = _carried(estimator, belief, ways, slice(done, k), rng, path)
+            belief = _carried(estimator, belief, drive, slice(done, k), rng, path)
             done = k
         named = labelled(scan, associate(belief, scan))
         if named is not scan:
@@ -111,7 +109,7 @@ def run_filter(
             progress(number, len(scans))
     if done < len(drive.controls):
         left = slice(done, len(drive.controls))
-        belief = _carried(estimator, belief, ways, left, rng, path)
+        belief = _carried(estimator, belief, drive, left, rng, path)
     online = replace(path, invariant=belief.pose().invariant)
     cloud = belief if isinstance(belief, ParticleCloud) else None
     revised = _whole("path", belief.path(), time.size) if isinstance(belief, Trajectory) else None
@@ -130,16 +128,13 @@ def run_filter(
 def _carried(
     estimator: Estimator[B],
     belief: B,
-    ways: tuple[Float[np.ndarray, "k c"], Float[np.ndarray, " k"]],
+    drive: Drive,
     steps: slice,
     rng: np.random.Generator,
     path: Gaussian,
 ) -> B:
-    """Carry a belief through steps of all controls, and write the poses after each into the path.
-
-    ``ways`` are the controls, and how long each lasts.
-    """
-    controls, dt = ways[0][steps], ways[1][steps]
+    """Carry a belief through steps of a drive, and write the poses after each into the path."""
+    controls, dt = drive.controls[steps], np.diff(drive.time[steps.start : steps.stop + 1])
     belief, poses = estimator.predict(belief, controls, dt, rng)
     poses, after = _whole("predict", poses, len(dt)), slice(steps.start + 1, steps.stop + 1)
     path.mean[after], path.covariance[after] = poses.mean, poses.covariance
