@@ -346,8 +346,8 @@ class FilterConfig(Section):
     """Noise of a range [m]."""
     bearing_std: Positive = 0.15
     """Noise of a bearing [rad]."""
-    detour_std: Positive = 0.2
-    """Noise of a detour [m]."""
+    detour_std: Positive = 0.4
+    """Noise of a detour [m]: of a way, twice what the same delay is of a range."""
     caller_speed_std: Positive = 1.0
     """Velocity along an axis of a caller that moves, before anything is known of it [m/s]."""
     caller_walk_std: NonNegative = 0.2

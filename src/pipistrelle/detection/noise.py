@@ -48,7 +48,7 @@ class ConstantNoise:
     --------
     >>> from pipistrelle.detection.scans import make_scan
     >>> scan = make_scan(0.5, np.array([3, 8]), np.zeros(2), bearing_std=np.array([0.02, np.nan]))
-    >>> ConstantNoise(range_std=0.2, bearing_std=0.15, detour_std=0.2)(scan).bearing_std
+    >>> ConstantNoise(range_std=0.2, bearing_std=0.15, detour_std=0.4)(scan).bearing_std
     array([0.02, 0.15])
     """
 
