@@ -14,6 +14,8 @@ from pipistrelle.config import InputError
 
 _LONGEST = 80
 _PREFIXES = ("Value error, ", "Input should be ", "Value should ")
+_IN_WORDS = {"bool_parsing": "true or false", "bool_type": "true or false", "tuple_type": "a list"}
+"""What pydantic says of these kinds of fault is about Python."""
 
 
 def refusal(where: object, found: str, expected: str, fix: str) -> InputError:
@@ -74,7 +76,7 @@ def expectation(fault: Any) -> str:
     >>> expectation({"msg": "Input should be greater than 0"})
     'greater than 0'
     """
-    message = fault["msg"]
+    message = _IN_WORDS.get(fault.get("type"), fault["msg"])
     for prefix in _PREFIXES:
         message = message.removeprefix(prefix)
     return message

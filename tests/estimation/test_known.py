@@ -1,13 +1,17 @@
 """Landmarks that are known beforehand: they are in the map, and what is heard of them places us."""
 
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from pipistrelle.config import FastSlamConfig
+from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import Gaussian, Informed
 from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
+from pipistrelle.estimation.fastslam.filter import FastSlam
 from pipistrelle.estimation.measurement import measurement_jacobians
 from pipistrelle.geometry import range_and_bearing
 from reference.missions import BICYCLE, map_with, ray_config, scan_with
@@ -55,3 +59,46 @@ def test_what_is_heard_of_it_tells_the_pose_even_which_way_is_north(kind):
     np.testing.assert_allclose(after.pose().covariance, expected[:3, :3], rtol=0, atol=1e-6)
     assert after.pose().covariance[2, 2] < 0.3 * START.covariance[2, 2]
     np.testing.assert_allclose(after.pose().mean, START.mean, rtol=0, atol=1e-6)
+
+
+FASTSLAM = FastSlam(motion=BICYCLE, rays=ray_config(), settings=FastSlamConfig(particles=500))
+
+
+def test_fastslam_has_what_is_known_in_every_particle_as_surely():
+    belief = FASTSLAM.knowing(FASTSLAM.init(START), POSTS)
+    rows = belief.landmarks()
+    assert isinstance(FASTSLAM, Informed)
+    assert rows.landmark.tolist() == [7, 9]
+    np.testing.assert_array_equal(rows.mean, POSTS.mean)
+    np.testing.assert_array_equal(rows.covariance, POSTS.covariance)
+    assert rows.weight.tolist() == [1.0, 1.0]
+    assert belief.full == 2.0
+    np.testing.assert_allclose(belief.pose().covariance, START.covariance, rtol=0, atol=1e-9)
+
+
+def test_fastslam_learns_from_it_what_the_linear_update_does():
+    rng, belief = np.random.default_rng(7), FASTSLAM.knowing(FASTSLAM.init(START), POSTS)
+    distance, bearing = range_and_bearing(START.mean, POSTS.mean)
+    heard = scan_with([7, 9], bearing, distance, range_std=0.1, bearing_std=0.05)
+    after = FASTSLAM.update(belief, heard, rng).pose()
+    exact = EkfSlam(motion=BICYCLE, rays=ray_config())
+    told = exact.update(exact.knowing(exact.init(START), POSTS), heard).pose()
+    spread = np.sqrt(np.diag(told.covariance))
+    assert np.all(np.abs(after.mean - told.mean) < 0.3 * spread)
+    np.testing.assert_allclose(np.sqrt(np.diag(after.covariance)), spread, rtol=0.15)
+
+
+def test_fastslam_lights_landmarks_up_by_a_caller_whose_place_is_known():
+    known = map_with([7], [[1.0, 3.0]], [1e-6 * np.eye(2)])
+    belief = FASTSLAM.knowing(FASTSLAM.init(replace(START, covariance=1e-6 * np.eye(3))), known)
+    spot = np.array([8.0, -1.0])
+    bearing = range_and_bearing(START.mean, spot[None])[1]
+    over = np.hypot(*(spot - known.mean[0])) + np.hypot(*(spot - START.mean[:2]))
+    e = over - np.hypot(*(known.mean[0] - START.mean[:2]))
+    scan = make_scan(
+        0.0, np.array([20]), bearing, caller=1, detour=e, detour_std=0.02, bearing_std=0.01,
+    )  # fmt: skip
+    scan = replace(scan, callers=np.array([-1, 7]))
+    rows = FASTSLAM.update(belief, scan, np.random.default_rng(7)).landmarks()
+    assert np.sum(rows.landmark == 20) == 1, "placed at once"
+    np.testing.assert_allclose(rows.mean[rows.landmark == 20][0], spot, rtol=0, atol=0.1)

@@ -306,6 +306,23 @@ def test_callers_are_marked_where_they_are_believed_to_be_where_detours_were_hea
         ]
 
 
+def test_the_last_scans_detours_are_ellipses_about_vehicle_and_caller(timed, three, mission):
+    again, _ = timed
+    trial = next(trial for trial in again.trials if trial.strategy == "fused")
+    figure = draw_mission([trial], truth=again.truth, callers=again.callers)
+    assert "detour ellipse and its way" in [text.get_text() for text in figure.legends[0].texts]
+    (axes,), scan = maps(figure), trial.scans[-1]
+    lines = [part for part in axes.collections if isinstance(part, LineCollection)]
+    ways = [way for part in lines for way in part.get_segments() if way.shape == (3, 2)]
+    k = int(np.searchsorted(trial.track.time, scan.time))
+    assert 1 <= len(ways) <= 2
+    for caller, spot, vehicle in ways:
+        np.testing.assert_array_equal(vehicle, trial.track.pose.mean[k, :2])
+        e = np.hypot(*(spot - caller)) + np.hypot(*(spot - vehicle)) - np.hypot(*(caller - vehicle))
+        assert np.nanmin(np.abs(scan.detour - e)) < 0.5
+    assert "detour ellipse and its way" not in named(mission.trials["passive"], **mission.scene)
+
+
 def test_a_caller_that_moves_is_drawn_as_it_was_followed(timed, mission):
     again, _ = timed
     figure = draw_mission(again.trials, truth=again.truth, callers=again.callers)

@@ -289,6 +289,37 @@ def test_ranges_in_millimetres_are_asked_about(obey, log, undrawn):
     assert "ranges are not within range_bounds (0.5 to 20 m); are ranges in metres?\n" in said
 
 
+DETOURS = ("--callers", CHORUS, "--listening.timing", "true", "--strategy", "fused")
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"),
+    [
+        (1.0 / 343.0, r"(\d+) of \1 detours are below 0.2 m; are detours in metres\?\n"),
+        (1000.0, r"detours are more than twice the far end of range_bounds \(0.5 to 20 m\)"),
+    ],
+)
+def test_detours_in_seconds_or_millimetres_are_asked_about(obey, factor, said, undrawn):
+    obey("run", *SHORT, *DETOURS, "--save-log", "log", "-o", "one")
+    column = Path("log/measurements.csv").read_text().splitlines()[0].split(",").index("detour")
+    assert "metres" not in obey("slam", "log", "-o", "two", "--quiet")[2]
+    scaled(Path("log"), column, factor)
+    assert re.search(said, obey("slam", "log", "-o", "three", "--quiet")[2])
+
+
+def test_a_caller_that_no_row_measures_is_named_unless_its_place_is(obey, undrawn):
+    obey("run", *SHORT, *DETOURS, "--save-log", "log", "-o", "one")
+    path = Path("log/log.toml")
+    wrong = path.read_text().replace("landmark = 12", "landmark = 99")
+    for place, said in (
+        ("", "no row measures landmark 99, the caller 'caller2'"),
+        ("\nplace = [3, 4]", ""),
+    ):
+        path.write_text(wrong.replace("landmark = 99", f"landmark = 99{place}"))
+        told = obey("slam", "log", "-o", f"two{len(place)}", "--quiet")[2]
+        assert (said in told) if said else "no row measures" not in told
+
+
 def test_a_strategy_that_hears_nothing_of_a_log_is_named(obey, log, undrawn):
     path = log / "measurements.csv"
     path.write_text(re.sub(r"(?m)^([^,\n]+,\d+,[^,\n]+,)\S+$", r"\1", path.read_text()))

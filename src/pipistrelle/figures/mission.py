@@ -7,13 +7,18 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.acoustics.callers import Caller
-from pipistrelle.estimation.beliefs import placed
+from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
 from pipistrelle.evaluation.consistency import anees_bounds, track_nees
 from pipistrelle.experiments.drives import NO_TRUTH, LabelledPoints, Truth
 from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.figures.closeup import add_closeups
-from pipistrelle.figures.detours import callers_believed, callers_marked
+from pipistrelle.figures.detours import (
+    callers_believed,
+    callers_marked,
+    drawn_detours,
+    resolved,
+)
 from pipistrelle.figures.maps import (
     callers_shown,
     cells,
@@ -24,6 +29,7 @@ from pipistrelle.figures.maps import (
     view,
 )
 from pipistrelle.figures.outlines import PLACED, RAY, beam, ellipses, vehicle
+from pipistrelle.figures.recorder import Snapshot
 from pipistrelle.figures.style import INK, STYLE, TRUTH, strategy_colour
 
 if TYPE_CHECKING:
@@ -50,9 +56,11 @@ def draw_mission(
     A map shows the true and the estimated path, true landmarks (open circles) tied to their
     estimates (dots in their 95 % ellipses), the rays that are still unresolved (members at one
     standard deviation, the heavier the darker), who else calls, and the vehicle at the end with
-    its beam and, enlarged in a corner, its particles if it has any. Below, position and heading
-    errors stand against three standard deviations of the filter's own (in position, of the root
-    of the trace) and the NEES against the 95 % band of one run. All panels share their scales.
+    its beam and, enlarged in a corner, its particles if it has any. Where detours were heard, those
+    of one landmark in the last scan are ellipses about the vehicle and who called. Below, position
+    and heading errors stand against three standard deviations of the filter's own (in position, of
+    the root of the trace) and the NEES against the 95 % band of one run. All panels share their
+    scales.
 
     Parameters
     ----------
@@ -136,6 +144,7 @@ def _symbols(
         **{name: name in shown for name in ("beacon", "caller", "moving caller")},
         "caller as estimated": any(len(_callers(t)) or t.track.callers for t in trials),
         "its estimated track": any(trial.track.callers for trial in trials),
+        "detour ellipse and its way": any(_detours(trial)[0] for trial in trials),
         "vehicle at the end": bool(ending),
         "its beam": beamwidth is not None and bool(calling),
         "particles": any(trial.track.cloud is not None for trial in ending),
@@ -216,6 +225,7 @@ def _draw_estimate(axes: "Axes", trial: TrialResult, true_landmarks: LabelledPoi
         x, y = callers.T
         axes.plot(x, y, "*", ms=12, mfc="none", mec=colour, mew=1.1, zorder=5.5)
     _draw_followed(axes, trial)
+    _draw_detours(axes, trial)
     outline = ellipses(rows.mean[~full], rows.covariance[~full], RAY)
     weight = rows.weight[~full]
     style = {"fc": shades(colour, weight), "ec": shades(colour, weight, most=1.0), "lw": 0.8}
@@ -248,6 +258,40 @@ def _callers(trial: TrialResult) -> Float[np.ndarray, "c 2"]:
         return np.empty((0, 2))
     mean = callers_believed(trial.track.landmarks, trial.scans[-1].callers).mean
     return mean[np.isfinite(mean).all(axis=1)]
+
+
+def _draw_detours(axes: "Axes", trial: TrialResult) -> None:
+    """Draw the ellipses of a landmark's detours, and the ways of its sound."""
+    from matplotlib.collections import LineCollection, PolyCollection
+
+    outlines, ways = _detours(trial)
+    if outlines:
+        style = {"lw": 0.9, "alpha": 0.7, "zorder": 3.5}
+        axes.add_collection(PolyCollection(outlines, fc="none", ec=INK, **style))
+        axes.add_collection(LineCollection(ways, colors=INK, **style))
+
+
+def _detours(trial: TrialResult) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return ellipses and ways of a landmark's detours in the last scan, as the film has them."""
+    track, scan = trial.track, trial.scans[-1] if trial.scans else None
+    if scan is None or not np.isfinite(scan.detour).any():
+        return [], []
+    k = int(np.searchsorted(track.time, scan.time))
+    seen = {n: one for n, one in track.callers.items() if np.isfinite(one.mean[k]).all()}
+    moving = Landmarks(
+        landmark=np.array(list(seen), dtype=np.int64),
+        mean=np.array([one.mean[k] for one in seen.values()]).reshape(-1, 2),
+        covariance=np.array([one.covariance[k] for one in seen.values()]).reshape(-1, 2, 2),
+        weight=np.ones(len(seen)),
+    )
+    end = Snapshot(
+        scan=scan,
+        pose=track.pose.mean[k],
+        covariance=track.pose.covariance[k],
+        landmarks=track.landmarks,
+        moving=moving,
+    )
+    return drawn_detours(end, resolved([end])[0])
 
 
 def _ties(trial: TrialResult, true_landmarks: LabelledPoints | None) -> list[np.ndarray]:

@@ -25,6 +25,8 @@ TIMING: Key = ("listening", "timing")
 """Is on where a log has detours."""
 SUSPECT = 0.2
 """Share of a log's rows that may not fit before its units are asked about."""
+SHORT = 0.2
+"""A detour that few have [m]: it is none of a sound that lasts, and in seconds most are less."""
 LOGGED = frozenset(
     {
         ("filter", "range_std"),
@@ -175,7 +177,7 @@ def beforehand(recorded: "Log", truth: "Truth", log: Path) -> list[str]:
             f"{count} {reason.replace('_', ' ')}" for reason, count in recorded.ignored_rows.items()
         )
         told.append(f"{log}: rows left out: {', '.join(reasons)}")
-    told += _jumps(recorded, log)
+    told += [*_jumps(recorded, log), *_unheard(recorded, log)]
     if truth.path is not None:
         steps = len(truth.time) - 1
         known = sum(1 for pose in truth.path[1:] if pose[0] == pose[0])
@@ -203,6 +205,17 @@ def _jumps(recorded: "Log", log: Path) -> list[str]:
     ]
 
 
+def _unheard(recorded: "Log", log: Path) -> list[str]:
+    """Say which callers that nobody hears are not placed: their detours say nothing."""
+    heard = {label for scan in recorded.scans for label in scan.landmark.tolist()}
+    return [
+        f"{log}: no row measures landmark {caller.landmark}, the caller {caller.name!r}, so its "
+        "detours say nothing; correct its number, or say its place"
+        for caller in recorded.callers
+        if caller.landmark not in heard and caller.place is None
+    ]
+
+
 def afterwards(recorded: "Log", trials: "Sequence[TrialResult]", log: Path) -> list[str]:
     """Ask whether a log has the units that are expected, where much of it does not fit.
 
@@ -217,6 +230,7 @@ def afterwards(recorded: "Log", trials: "Sequence[TrialResult]", log: Path) -> l
     list of str
     """
     rows, turned, told = sum(len(scan.landmark) for scan in recorded.scans), recorded.turned, []
+    metric = "ranges and detours" if has_detours(recorded) else "ranges"
     for trial in trials:
         heard, name = sum(len(scan.landmark) for scan in trial.scans), short_name(trial.filter)
         if not heard:
@@ -228,19 +242,35 @@ def afterwards(recorded: "Log", trials: "Sequence[TrialResult]", log: Path) -> l
         ):
             told.append(
                 f"{log}: {trial.scores.gated} of {heard} measurements do not fit what was expected "
-                f"({trial.strategy} {name}); are bearings in radians and ranges in metres?"
+                f"({trial.strategy} {name}); are bearings in radians and {metric} in metres?"
             )
     if turned > SUSPECT * rows:
         told.append(f"{log}: {turned} of {rows} bearings are beyond a turn; are they in radians?")
+    return told + _out_of_bounds(recorded, log)
+
+
+def _out_of_bounds(recorded: "Log", log: Path) -> list[str]:
+    """Ask whether ranges and detours are in metres, where many cannot be.
+
+    A detour is no more than twice the range of its landmark.
+    """
+    import numpy as np
+
     near, far = recorded.range_bounds
-    ranges = [r for scan in recorded.scans for r in scan.range.tolist() if r == r]
-    beyond = sum(not near <= r <= far for r in ranges)
-    if beyond > SUSPECT * len(ranges):
-        told.append(
-            f"{log}: {beyond} of {len(ranges)} ranges are not within range_bounds ({near:g} to "
-            f"{far:g} m); are ranges in metres?"
-        )
-    return told
+    bounds = f"range_bounds ({near:g} to {far:g} m)"
+    ranges = np.concatenate([scan.range for scan in recorded.scans])
+    detours = np.concatenate([scan.detour for scan in recorded.scans])
+    ranges, detours = ranges[~np.isnan(ranges)], detours[~np.isnan(detours)]
+    odd = (
+        ("ranges", (ranges < near) | (ranges > far), SUSPECT, f"not within {bounds}"),
+        ("detours", detours > 2.0 * far, SUSPECT, f"more than twice the far end of {bounds}"),
+        ("detours", detours < SHORT, 1.0 - SUSPECT, f"below {SHORT:g} m"),
+    )
+    return [
+        f"{log}: {np.count_nonzero(rows)} of {rows.size} {what} are {where}; are {what} in metres?"
+        for what, rows, share, where in odd
+        if np.count_nonzero(rows) > share * rows.size
+    ]
 
 
 def _is_finite(trial: "TrialResult") -> bool:

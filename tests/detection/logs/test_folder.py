@@ -720,6 +720,7 @@ TIMED_WRONG = {
     "std 0": ("0.1,7,0.5,4.0,3,0,boat", "detour_std 0.0", "from 1e-06 m"),
     "no bearing": ("0.1,7,,4.0,3,,boat", "bearing ''", "without a range"),
     "nothing": ("0.1,7,,,,,boat", "bearing ''", "a further detour alone"),
+    "over itself": ("0.1,52,0.5,,3,,mate", "line 2", "a detour of a call over the caller itself"),
     "twice": ("0.1,7,0.5,,3,,boat\n0.1,7,,,4,,boat", "line 3", "landmark 7 again", "line 2"),
     "twice unheard": ("0.1,7,0.5,,,,\n0.1,7,0.4,,,,", "line 3", "landmark 7 again"),
 }
@@ -749,6 +750,9 @@ def test_a_caller_of_a_log_without_callers_is_refused_with_where_to_name_it(tmp_
         ("landmark = 52", "", ("no key 'callers.2.landmark'",)),
         ("landmark = 52", "landmark = 51", ("callers", "a landmark of its own")),
         ('name = "mate"', 'name = "boat"', ("callers", "a name of its own")),
+        ('name = "mate"', 'name = "Boat"', ("callers", "a name of its own")),
+        ('name = "mate"', 'name = "vehicle"', ("callers", 'not "vehicle"')),
+        ('name = "mate"', f'name = "{41 * "m"}"', ("'callers.2.name'", "40 at most")),
         ('name = "mate"', 'name = "a,b"', ("'callers.2.name'", "letters, digits, _ and -")),
         ("landmark = 52", "landmark = -1", ("'callers.2.landmark'", "found -1")),
         ("landmark = 52", "landmark = 1.5", ("'callers.2.landmark'", "found 1.5")),

@@ -248,6 +248,12 @@ def test_a_route_may_be_a_file_and_what_is_wrong_in_it_has_a_line(tmp_path):
         resolve(with_routes(from_flags({"callers": [{"route": str(path)}]})))
 
 
+@pytest.mark.parametrize("name", ["a\0b", 5000 * "x"])
+def test_a_route_of_a_name_that_no_file_can_have_is_refused(name):
+    with pytest.raises(InputError, match=r"callers\.1\.route: '.*expected a readable text file"):
+        with_routes(from_flags({"callers": [{"route": name}]}))
+
+
 # Missions of others
 
 ANOTHER = CallerConfig(name="mate", course="mission")

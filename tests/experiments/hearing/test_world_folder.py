@@ -5,7 +5,14 @@ import pytest
 
 from pipistrelle.acoustics.callers import Caller
 from pipistrelle.acoustics.target import Bodies
-from pipistrelle.config import Config, InputError, MotionConfig, ScenarioConfig, caller_names
+from pipistrelle.config import (
+    CallerConfig,
+    Config,
+    InputError,
+    MotionConfig,
+    ScenarioConfig,
+    caller_names,
+)
 from pipistrelle.experiments.hearing.courses import Commands, Poses, Waypoints
 from pipistrelle.experiments.hearing.scenario import Scenario, world_of
 from pipistrelle.experiments.hearing.world_folder import (
@@ -53,6 +60,20 @@ def test_a_world_that_was_drawn_is_read_back_to_the_bit(tmp_path, model):
     np.testing.assert_array_equal(again.callers[1].place, drawn.callers[1].place)
     assert again_config.scenario.steps == 80
     assert again_config.motion == config.motion
+
+
+def test_the_world_of_a_second_vehicle_is_read_back_as_that_of_the_first_and_only(tmp_path):
+    pair = (CallerConfig(name="mate", course="mission"),)
+    config = Config(callers=pair, scenario=ScenarioConfig(steps=80, landmarks=12, vehicle=2))
+    drawn = world_of(config, 5)
+    write_world(tmp_path / "w", drawn, config)
+    layer = from_flags({"scenario": {"world": str(tmp_path / "w")}})
+    world = named_world(layer)
+    again_config = resolve(settled(world, layer))
+    again = heard(again_config, world)
+    assert again_config.scenario.vehicle == 1
+    np.testing.assert_array_equal(again.path, drawn.path)
+    np.testing.assert_array_equal(again.callers[1].place, drawn.callers[1].place)
 
 
 def test_bodies_and_routes_are_read_back_too(tmp_path):

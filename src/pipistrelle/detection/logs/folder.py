@@ -74,7 +74,7 @@ _FOLLOWED = "what counts is the way from row to row, wherever they begin"
 class _CallerTable(Section):
     model_config = ConfigDict(strict=True)
 
-    name: Annotated[str, Field(pattern=r"^\w[\w-]*$")]
+    name: Annotated[str, Field(pattern=r"^\w[\w-]*$", max_length=40)]
     landmark: Annotated[int, Field(ge=0, lt=2**53)]
     moves: bool = False
     place: _Point | None = None
@@ -114,9 +114,11 @@ class _Settings(Section):
     @field_validator("callers")
     @classmethod
     def _apart(cls, callers: tuple[_CallerTable, ...]) -> tuple[_CallerTable, ...]:
-        for what in ("name", "landmark"):
-            if len({getattr(caller, what) for caller in callers}) < len(callers):
-                raise ValueError(f"a {what} of its own for each caller")
+        names = {"vehicle", *(caller.name.casefold() for caller in callers)}
+        if len(names) <= len(callers):
+            raise ValueError('a name of its own for each caller, not "vehicle", a or A alike')
+        if len({caller.landmark for caller in callers}) < len(callers):
+            raise ValueError("a landmark of its own for each caller")
         return callers
 
     @field_validator("range_bounds")
@@ -328,8 +330,8 @@ def _caller_refusal(path: Path, fault: Any) -> InputError:
         fix = f"did you mean {near!r}?" if near else "remove it"
         return refusal(path, f"the unknown key {key!r}", f"one of {', '.join(known)}", fix)
     expected = expectation(fault)
-    if name == "name" and fault["type"] == "string_pattern_mismatch":
-        expected = "letters, digits, _ and -"
+    if name == "name" and fault["type"] in ("string_pattern_mismatch", "string_too_long"):
+        expected = "letters, digits, _ and -, 40 at most"
     return refusal(f"{path}, key {key!r}", shown(fault["input"]), expected, "correct the value")
 
 

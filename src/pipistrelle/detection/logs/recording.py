@@ -173,7 +173,7 @@ def assemble(
         controls = _mean_controls(stamp[last], np.column_stack(columns)[last], rows, time)
     clutter = measurements.column["landmark"] == UNLABELLED
     measurements = rows_kept(measurements, ~clutter)
-    measurements = _of_callers(measurements)
+    measurements = _of_callers(measurements, settings.get("callers", ()))
     check_unique(measurements, "time", "landmark", besides=CALLER)
     stamp = measurements.column["time"]
     inside = (stamp >= time[0]) & (stamp <= time[-1])
@@ -266,10 +266,12 @@ def _mean_controls(
     return total / np.diff(time)[:, None]
 
 
-def _of_callers(measurements: Table) -> Table:
-    """Number the callers of all rows; refuse a detour of nobody's call, and rows of nothing."""
+def _of_callers(measurements: Table, callers: tuple[LogCaller, ...]) -> Table:
+    """Number the callers of all rows; refuse a detour that is none, and rows of nothing."""
     column, nothing = measurements.column, np.full(len(measurements.line), np.nan)
     caller, detour = column.get(CALLER, nothing), column.get("detour", nothing)
+    own = np.array([UNLABELLED, *(one.landmark for one in callers)])
+    whose = own[np.where(np.isnan(caller), OWN, caller).astype(np.int64)]
     unheard = np.isnan(column["bearing"]) & (np.isnan(detour) | ~np.isnan(column["range"]))
     for wrong, found, expected, fix in (
         (
@@ -283,6 +285,12 @@ def _of_callers(measurements: Table) -> Table:
             "a detour of nobody's call",
             "the name of a caller beside it",
             "add it in the column 'caller', and to [[callers]] of log.toml",
+        ),
+        (
+            ~np.isnan(detour) & ~np.isnan(caller) & (whose == column["landmark"]),
+            "a detour of a call over the caller itself",
+            "detours over other landmarks",
+            "leave the field of one that came straight empty",
         ),
     ):
         if wrong.any():

@@ -222,6 +222,34 @@ class FastSlam:
             tie=np.empty((blocks, 0, TIE)),
         )
 
+    def knowing(self, belief: FastSlamBelief, known: Landmarks) -> FastSlamBelief:
+        """Return a first belief that has landmarks in its map, the same in every particle.
+
+        Parameters
+        ----------
+        belief : FastSlamBelief
+            As `init` gives it.
+        known : Landmarks
+            One row each.
+
+        Returns
+        -------
+        FastSlamBelief
+        """
+        blocks, n = len(belief.poses), known.landmark.size
+        spread = known.covariance.reshape(n, 4)[:, [0, 1, 3]]
+        rows = np.column_stack([known.mean, spread, np.zeros(n)])
+        return replace(
+            belief,
+            landmark=known.landmark.astype(np.int64),
+            first=np.arange(n + 1),
+            count=np.ones((blocks, n, LANES), dtype=np.int64),
+            member=np.tile(np.repeat(rows, LANES, axis=1), (blocks, 1, 1)),
+            best_count=np.ones(n, dtype=np.int64),
+            best_member=rows,
+            full=float(n),
+        )
+
     def predict(
         self,
         belief: FastSlamBelief,
