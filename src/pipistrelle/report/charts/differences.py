@@ -202,7 +202,7 @@ def _gain_chart(selection: Selection, variable: Variable) -> Chart:
         spread = f"mean; {each_combination(study, variable)}"
     return Chart(
         name=f"gain_by_{slug(variable.name)}" if several else "gain",
-        title="What listening to the beacon adds to one's own calls"
+        title="What listening to others adds to one's own calls"
         + (f", over {the(variable)}" if several else ""),
         caption=f"RMSE of active minus that of fused in the same world, {spread}; "
         "above the line fused is better. Full: significant after Holm's correction over the "
