@@ -330,6 +330,22 @@ def test_a_study_that_only_listens_is_told_that_its_beam_is_nothing_to_it():
     assert "EKF passive" in bound
 
 
+def test_what_listening_adds_is_told_of_each_case_where_they_are_few_and_else_of_the_ends():
+    whole = only(invent(20), [("ekf", "active"), ("ekf", "fused")])
+    lead = rf"Fused instead of active sensing changes EKF's position error by −?[\d.]+ m {INTERVAL}"
+    case = rf"by (−?[\d.]+) m {INTERVAL} at (\d+)°"
+    (few,) = [said for said in told(narrowed(whole, [0, 11])) if said.startswith("Fused instead")]
+    (many,) = [said for said in told(whole) if said.startswith("Fused instead")]
+    assert re.fullmatch(rf"{lead}; {case}; {case}\.", few)
+    assert re.fullmatch(rf"{lead}, {case} to {case}\.", many)
+    for said in (few, many):
+        (least, _), (most, _) = re.findall(case, said)
+        assert float(least.replace("−", "-")) < float(most.replace("−", "-"))
+    assert {at for _, at in re.findall(case, few)} == {"11", "180"}
+    alone = told(only(invent(20), [("ekf", "fused"), ("ekf", "passive")]))
+    assert not any("instead of active" in said for said in alone)
+
+
 def test_questions_are_what_a_study_asks():
     study = invent(2)
     cases = {

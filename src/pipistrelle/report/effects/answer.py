@@ -17,6 +17,7 @@ from pipistrelle.report.effects.wording import (
     direction,
     elsewhere,
     in_between,
+    size,
     subject,
     the,
 )
@@ -32,6 +33,8 @@ FIRST = MEASURES[0]
 """What the line and the sentences speak of."""
 MOST_VALUES = 4
 """Of words, that a sentence goes through."""
+FEW_CASES = 6
+"""Cases of which each is told what listening gains there; of more, the least and the most."""
 
 
 def question(study: Study) -> str:
@@ -79,9 +82,27 @@ def answer(selection: Selection, by_rule: Mapping[Rule, Sequence[Effect]]) -> li
     lines = [_headline(study, v, families) for v in study.variables] or _compared(families)
     lines = lines or [levels.pop(0) if levels else "Not decided: no world is left"]
     sentences = [_sentence(study, family, beside) for family in families.values()]
-    bound = [] if not study.variables else _bound(selection)
+    bound = [] if not study.variables else [*_gains(study, effects), *_bound(selection)]
     headline = _sentenced("; ".join(lines))
     return [headline, *levels, *sentences, *bound, *filter(None, [diverged(study)])]
+
+
+def _gains(study: Study, effects: Sequence[Effect]) -> list[str]:
+    """Say with each filter what listening adds to one's own calls: in each case, where few are."""
+    said = []
+    for effect in effects:
+        contrast = effect.contrast
+        listens = (contrast.before, contrast.after) == ("active", "fused")
+        if not listens or effect.measure is not FIRST or effect.finding.n < 2:
+            continue
+        cases = sorted(zip(effect.apart, contrast.names, strict=False), key=lambda one: one[0].mean)
+        each = [f"by {size(found, FIRST.unit, signed=True)} at {at}" for found, at in cases]
+        whose = f"{filter_titles(study)[contrast.filter]}'s {FIRST.title}"
+        what = size(effect.finding, FIRST.unit, signed=True)
+        many = len(each) > FEW_CASES
+        where = f", {each[0]} to {each[-1]}" if many else "".join(f"; {one}" for one in each)
+        said.append(_sentenced(f"{subject(study, effect)} changes {whose} by {what}{where}"))
+    return said
 
 
 def _sentenced(words: str) -> str:
