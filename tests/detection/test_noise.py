@@ -39,11 +39,17 @@ def test_noise_changes_nothing_but_the_standard_deviations():
     assert np.isnan(scan.bearing_std).all(), "the scan itself stays as it was"
 
 
-@pytest.mark.parametrize(("range_std", "bearing_std"), [(0.2, 0.15), (1.0, 0.01)])
-def test_the_noise_of_the_settings_is_theirs(range_std, bearing_std):
-    noise = noise_of(FilterConfig(range_std=range_std, bearing_std=bearing_std))
-    assert noise == ConstantNoise(range_std=range_std, bearing_std=bearing_std, detour_std=0.2)
-    assert hash(noise) == hash(noise_of(FilterConfig(range_std=range_std, bearing_std=bearing_std)))
+@pytest.mark.parametrize("stds", [(0.2, 0.15, 0.4), (1.0, 0.01, 0.03)])
+def test_the_noise_of_the_settings_is_theirs(stds):
+    told = dict(zip(("range_std", "bearing_std", "detour_std"), stds, strict=True))
+    noise = noise_of(FilterConfig(**told))
+    assert noise == ConstantNoise(**told)
+    assert hash(noise) == hash(noise_of(FilterConfig(**told)))
+
+
+def test_a_detour_is_told_to_be_off_by_the_way_of_what_a_range_is():
+    noise = noise_of(FilterConfig())
+    assert noise.detour_std == 2.0 * noise.range_std
 
 
 # What the signal tells
