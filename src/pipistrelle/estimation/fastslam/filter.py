@@ -56,9 +56,9 @@ anew for each detour, a map would grow sure of what nobody told it. With detours
   worlds a thousand particles then had a median NEES of 19 to 50 instead of 2, and positions off by
   0.6 to 0.7 m instead of 0.4 to 0.5 m, for the swarm was rid within a few frames of all paths but
   those that turned at the start as one of them happened to. What they tell reaches the weights by
-  the map that they make, and even that asks for more particles: one mission in eight has a NEES
-  above ten, and the mean at 180° is 20, but 3 with 4000. Bearings and ranges weigh with what each
-  landmark is for itself; that those of one caller share its error made no difference there.
+  the map that they make, and even that asks for more particles: over 115 worlds the mean NEES is 3
+  to 5 instead of 2 to 3. Bearings and ranges weigh with what each landmark is for itself; that
+  those of one caller share its error made no difference there.
 - *Correct*: range, bearing and detour of a landmark correct it and its caller.
 - *Place*: where bearing and detour tell the range to a fifth of itself, a landmark is placed at
   once, or in place of its ray. Elsewhere (it stands between caller and vehicle, the angle at it is
