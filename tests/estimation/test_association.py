@@ -33,6 +33,17 @@ def test_rows_of_one_label_become_one_whatever_their_order():
         assert one.range[at] == 4.0
 
 
+def test_rows_without_a_bearing_stand_at_the_end_whatever_their_order():
+    rows = [(4, 0.3, 3.0, 1), (4, NAN, 3.0, 2), (5, 0.9, 2.0, 1)]
+    for order in permutations(rows):
+        label, bearing, detour, caller = map(np.array, zip(*order, strict=True))
+        scan = make_scan(0.0, label, bearing, caller=caller, detour=detour)
+        one = labelled(scan, scan.landmark)
+        assert np.isnan(one.bearing).tolist() == [False, False, True]
+        assert (one.landmark[2], one.caller[2]) == (4, 2)
+        assert labelled(one, one.landmark) is one
+
+
 def test_the_mean_of_directions_is_taken_across_the_cut_behind():
     scan = scan_with([5, 5], [np.pi - 0.1, -np.pi + 0.3], [NAN, NAN])
     (bearing,) = labelled(scan, scan.landmark).bearing

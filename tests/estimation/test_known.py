@@ -6,13 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipistrelle.config import FastSlamConfig
+from pipistrelle.config import FastSlamConfig, InputError
 from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import Gaussian, Informed
 from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
 from pipistrelle.estimation.fastslam.filter import FastSlam
-from pipistrelle.estimation.measurement import measurement_jacobians
+from pipistrelle.estimation.measurement import detour_of, measurement_jacobians
+from pipistrelle.experiments.drives import Drive
+from pipistrelle.experiments.runs.filtering import run_filter
 from pipistrelle.geometry import range_and_bearing
 from reference.missions import BICYCLE, map_with, ray_config, scan_with
 
@@ -102,3 +104,40 @@ def test_fastslam_lights_landmarks_up_by_a_caller_whose_place_is_known():
     rows = FASTSLAM.update(belief, scan, np.random.default_rng(7)).landmarks()
     assert np.sum(rows.landmark == 20) == 1, "placed at once"
     np.testing.assert_allclose(rows.mean[rows.landmark == 20][0], spot, rtol=0, atol=0.1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_who_moves_is_not_known_beforehand(kind):
+    slam = kind(motion=BICYCLE, rays=ray_config())
+    scan = make_scan(1.0, np.array([9]), np.array([0.2]), bearing_std=0.1)
+    drive = Drive(
+        motion=BICYCLE, start=START, time=np.arange(2.0), controls=np.ones((1, 2)), known=POSTS
+    )
+    run_filter(slam, drive, [scan], np.random.default_rng(7))
+    for told, heard in (
+        (replace(drive, moving={9: "boat"}), scan),
+        (drive, replace(scan, moving=np.array([9]))),
+    ):
+        with pytest.raises(InputError, match=r"known beforehand: found \[9\], which move"):
+            run_filter(slam, told, [heard], np.random.default_rng(7))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_gate_drops_a_bearing_that_cannot_be_and_keeps_its_detour(kind):
+    slam = kind(motion=BICYCLE, rays=ray_config(), gate=0.999)
+    still = replace(START, covariance=1e-6 * np.eye(3))
+    post, caller = POSTS.mean
+    known = map_with([7, 9], POSTS.mean, [0.04 * np.eye(2), 1e-6 * np.eye(2)])
+    (bearing,) = range_and_bearing(START.mean, post[None])[1]
+    scan = make_scan(
+        0.0, np.array([7]), np.array([bearing + 1.0]),
+        caller=1, detour=detour_of(START.mean[:2], post, caller), detour_std=0.02, bearing_std=0.01,
+    )  # fmt: skip
+    scan = replace(scan, callers=np.array([-1, 9]))
+    after = slam.update(slam.knowing(slam.init(still), known), scan)
+    rows = after.landmarks()
+    (spread,) = rows.covariance[rows.landmark == 7]
+    assert after.gated == 1
+    least, most = np.linalg.eigvalsh(spread)
+    assert least < 0.02**2
+    assert most == pytest.approx(0.04, rel=0.05), "along the ellipse nothing is told"

@@ -9,6 +9,7 @@ from reference.ekf_slam import BELIEVED, NEAREST, POSE, WAITS, SlowEkfSlam, norm
 from reference.invariant_ekf import QUARTER, SlowInvariantEkfSlam
 
 SURE = 0.1
+SOME = 3.0
 FARTHER = 3.0
 TINY = 1e-6
 FARTHEST = 1e4
@@ -85,7 +86,7 @@ class Timed:
             (*self.where(other, e, bearing, of_caller=caller == label), told)
             for told in self.timed
             for landmark, caller, e in [told]
-            if label in (landmark, caller)
+            if label in (landmark, caller) and e > SOME * math.sqrt(self.detour_variance)
             for other in self.members(landmark if caller == label else caller)
             if len(self.members(other[1])) == 1
         ]

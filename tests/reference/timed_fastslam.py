@@ -22,6 +22,7 @@ from reference.fastslam import (
 )
 
 SURE = 0.2
+SOME = 3.0
 
 
 @dataclass
@@ -200,6 +201,8 @@ class SlowTimedFastSlam(SlowFastSlam):
 
     def place_by_detour(self, p, label, bearing, detour):
         """Place a ray's landmark, with all its covariances, where that is sure enough."""
+        if detour <= SOME * math.sqrt(self.detour_variance):
+            return
         hub = self.hub[label]
         caller, angle = p.map[hub][0], p.pose[2] + bearing
         u, v = np.array([math.cos(angle), math.sin(angle)]), caller.mean - p.pose[:2]

@@ -87,6 +87,17 @@ def test_slam_listens_for_detours_where_there_are_some_unless_told_otherwise(obe
     assert tomllib.loads(Path("two/config.toml").read_text())["listening"]["timing"] is False
 
 
+def test_a_caller_that_moves_is_followed_in_a_log_without_a_detour(obey, undrawn):
+    ahead = "[{waypoints = [[5, -6], [5, -5]]}]"
+    words = ("--callers", ahead, "--listening.timing", "true", "--strategy", "active")
+    obey("run", *SHORT, *words, "--filter.gate", "0.99", "--save-log", "log", "-o", "one")
+    assert obey("slam", "log", "--filter.gate", "0.99", "--quiet", "-o", "two")[2] == ""
+    assert tomllib.loads(Path("two/config.toml").read_text())["listening"]["timing"] is True
+    ran, solved = track("one", "active_ekf"), track("two", "fused_ekf")
+    np.testing.assert_allclose(solved, ran, rtol=0, atol=1e-9)
+    assert Path("two/caller_beacon_fused_ekf.tum").is_file()
+
+
 def told_by_poses(log, folder):
     """Write a log's drive as poses of a recorder, with what each step's noise comes to."""
     recorded = read_log(log)
@@ -318,6 +329,12 @@ def test_a_caller_that_no_row_measures_is_named_unless_its_place_is(obey, undraw
         path.write_text(wrong.replace("landmark = 99", f"landmark = 99{place}"))
         told = obey("slam", "log", "-o", f"two{len(place)}", "--quiet")[2]
         assert (said in told) if said else "no row measures" not in told
+
+
+def test_a_caller_that_no_row_measures_is_not_missed_where_there_is_no_detour(obey, undrawn):
+    obey("run", *SHORT, *DETOURS[:-2], "--strategy", "active", "--save-log", "log", "-o", "one")
+    assert 'name = "boat"' in Path("log/log.toml").read_text()
+    assert obey("slam", "log", "-o", "two", "--quiet")[2] == ""
 
 
 def test_a_strategy_that_hears_nothing_of_a_log_is_named(obey, log, undrawn):

@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.config import Config, InputError
+from pipistrelle.config import MOST_OTHERS, Config, InputError
 
 VEHICLE = 0
 """Where the vehicle stands in every list of callers."""
-MOST = 8
+MOST = 1 + MOST_OTHERS
 """Callers that one recording can tell apart."""
 
 

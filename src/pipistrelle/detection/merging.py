@@ -123,9 +123,11 @@ def _checked(scan: Scan, label: np.ndarray) -> Int[np.ndarray, " m"]:
 
 @kernel
 def _settled(label: Int[np.ndarray, " m"], bearing: Float[np.ndarray, " m"]) -> bool:
-    """Whether every row has a label, and, where it has a bearing, none the label of another."""
+    """Whether every row has a label, and those with a bearing, one each, stand before the rest."""
     for m in range(label.size):
-        if label[m] == UNLABELLED:
+        if label[m] == UNLABELLED or (
+            m > 0 and math.isnan(bearing[m - 1]) > math.isnan(bearing[m])
+        ):
             return False
         for other in range(m):
             if label[other] == label[m] and not math.isnan(bearing[m]):

@@ -25,6 +25,10 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 
 NEAREST = 1e-3
 """A measurement of a point nearer than this [m] says nothing that can be linearised."""
+SOME = 3.0
+"""Standard deviations that a detour must be above none to place anything. Of what stands straight
+between vehicle and caller, and has none, any error of it makes something near one of the two, and
+surely."""
 BELIEVED = 2.0
 """Standard deviations that a measurement may be off before Huber's rule lets it count less."""
 
@@ -277,6 +281,8 @@ def range_by_detour(detour: float, dx: float, dy: float, c: float, s: float) -> 
 
     Infinite or negative where no point there has such a detour; see `landmark_range`.
     """
+    if detour <= 0.0:
+        return math.inf
     straight = math.sqrt(dx * dx + dy * dy)
     return 0.5 * detour * (2.0 * straight + detour) / (straight + detour - c * dx - s * dy)
 
@@ -287,6 +293,8 @@ def caller_range_by_detour(detour: float, dx: float, dy: float, c: float, s: flo
 
     Infinite or negative where no caller there makes such a detour.
     """
+    if detour <= 0.0:
+        return math.inf
     near = math.sqrt(dx * dx + dy * dy)
     return 0.5 * detour * (2.0 * near - detour) / (c * dx + s * dy + detour - near)
 
@@ -353,7 +361,8 @@ def landmark_range(detour: float, caller: Float[np.ndarray, "2"], bearing: float
 
     with v the way from the vehicle to the caller, d its length and u the direction of the bearing:
     where the ray from the vehicle crosses the ellipse of that detour. Between vehicle and caller
-    numerator and denominator vanish together: there a detour says nothing of the range.
+    numerator and denominator vanish together: there a detour says nothing of the range, and where
+    it is none, or less, there is none.
 
     Parameters
     ----------

@@ -56,7 +56,7 @@ def callers_believed(landmarks: Landmarks, labels: Int[np.ndarray, " c"]) -> Gau
 
 
 def callers_at(frame: Snapshot) -> Gaussian:
-    """Where callers are believed to be at a frame: all pictures ask here.
+    """Where callers are believed to be at a frame.
 
     Parameters
     ----------

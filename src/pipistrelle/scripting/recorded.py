@@ -22,7 +22,7 @@ GATE_KEY: Key = ("filter", "gate")
 OWN: dict[Key, str] = {("rays", "spacing"): "auto", ("filter", "noise"): "measured"}
 """Settings that a recorded log has others of than a simulated mission: its sensor is anyone's."""
 TIMING: Key = ("listening", "timing")
-"""Is on where a log has detours."""
+"""Is on where a log has detours, or a caller that moves: it is followed by whom it is timed."""
 SUSPECT = 0.2
 """Share of a log's rows that may not fit before its units are asked about."""
 SHORT = 0.2
@@ -110,7 +110,8 @@ def with_log(layer: Layer, recorded: "Log", log: Path) -> tuple[Config, list[str
     decided = {key: Given(getattr(recorded, key[1]), f"{log}: {key[1]}") for key in LOGGED}
     own = {GATE_KEY: Given(gate, str(log))}
     own |= {key: Given(value, "slam") for key, value in OWN.items()}
-    own[TIMING] = Given(has_detours(recorded), str(log))
+    moves = any(caller.moves for caller in recorded.callers)
+    own[TIMING] = Given(moves or has_detours(recorded), str(log))
     if recorded.detour_std is not None:
         own["filter", "detour_std"] = Given(recorded.detour_std, f"{log}: detour_std")
     if ("rays", "likelihood") in layer:  # another reading of the paper is of the paper's rays
@@ -208,11 +209,16 @@ def _jumps(recorded: "Log", log: Path) -> list[str]:
 def _unheard(recorded: "Log", log: Path) -> list[str]:
     """Say which callers that nobody hears are not placed: their detours say nothing."""
     heard = {label for scan in recorded.scans for label in scan.landmark.tolist()}
+    timed = {
+        number
+        for scan in recorded.scans
+        for number in scan.caller[scan.detour == scan.detour].tolist()
+    }
     return [
         f"{log}: no row measures landmark {caller.landmark}, the caller {caller.name!r}, so its "
         "detours say nothing; correct its number, or say its place"
-        for caller in recorded.callers
-        if caller.landmark not in heard and caller.place is None
+        for number, caller in enumerate(recorded.callers, start=1)
+        if number in timed and caller.landmark not in heard and caller.place is None
     ]
 
 

@@ -34,9 +34,6 @@ from pipistrelle.verbs.options import (
 )
 from pipistrelle.verbs.streams import warn
 
-if TYPE_CHECKING:
-    pass
-
 _FOLDERS = ", or ".join(reader.help for reader in READERS)
 FOLDERS = f"{_FOLDERS[0].upper()}{_FOLDERS[1:]}."
 ROBOTS = f"Whose log of {', or of '.join(r.robot_help for r in READERS if r.robots)}."
@@ -46,7 +43,8 @@ if TYPE_CHECKING:
     SlamFlags = dict[str, Any]
 else:
     SlamFlags = setting_flags(
-        lambda key: is_open(key) and key != GATE_KEY, OWN | {TIMING: "where the log has detours"}
+        lambda key: is_open(key) and key != GATE_KEY,
+        OWN | {TIMING: "where the log has detours, or a caller that moves"},
     )
 
 

@@ -240,6 +240,20 @@ def test_a_track_is_what_is_believed_at_the_end(roaming):
     assert len(track.pose.mean) == len(track.callers[CALLER].mean)
 
 
+def test_where_nothing_is_heard_a_track_is_what_was_believed_then(roaming):
+    mission, _, _ = roaming
+    time = np.append(0.0, np.cumsum(mission.dt))
+    controls = mission.controls.reshape(-1, mission.controls.shape[-1])
+    drive = Drive(motion=MOTION, start=START, time=time, controls=controls)
+    scans = [replace(scan, time=time[4 * k]) for k, scan in enumerate(mission.scans, 1)]
+    for silent in (10, 15):
+        scans[silent] = rows_of(scans[silent], np.arange(0))
+    rows = [4 * silent + 4 for silent in (10, 15)]
+    mean = run_filter(smoother(), drive, scans, np.random.default_rng(0)).callers[CALLER].mean
+    assert np.isfinite(mean[rows]).all()
+    assert np.abs(mean[rows] - mean[np.array(rows) - 4]).max() < 2.0, "a step away"
+
+
 # Bits, and the gate
 
 

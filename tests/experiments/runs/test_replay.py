@@ -414,6 +414,14 @@ def test_constant_noise_ignores_what_the_rows_state():
     assert one.landmarks.covariance.tobytes() == other.landmarks.covariance.tobytes()
 
 
+def test_constant_noise_is_of_a_landmark_however_many_calls_it_was_heard_by():
+    rows = np.zeros(3, int), np.array([0.3, 0.31, 0.29])
+    scan = make_scan(1.0, *rows, caller=np.array([0, 1, 2]))
+    log = replace(looks((0.0, NAN, NAN)), scans=(scan,))
+    for noise in ("constant", "measured"):
+        assert replayed(log, noise).scans[0].bearing_std.tolist() == [0.1]
+
+
 def test_fields_that_are_empty_are_filled_with_the_logs_own_constants(folder):
     lines = (folder / "measurements.csv").read_text().splitlines()
     stated = [f"{line},0.01," if k % 2 else f"{line},,0.5" for k, line in enumerate(lines[1:])]

@@ -23,7 +23,7 @@ axes stays so when it is turned. Both EKFs share what is here.
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipistrelle.detection.scans import NOBODY, UNLABELLED
+from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.jit import Whole, kernel
 
 _NOBODY, _SUM = UNLABELLED, UNLABELLED - 1
@@ -117,9 +117,9 @@ def velocities_missing(
     --------
     >>> velocities_missing(np.array([4, 51]), np.array([51, 52]))
     array([-53])
+    >>> velocities_missing(np.array([51, 52, -53]), np.array([52]))
+    array([-54])
     """
-    if np.count_nonzero(is_velocity(landmark)) == moving.size:
-        return NOBODY
     velocity = _SUM - moving
     return velocity[np.isin(moving, landmark) & ~np.isin(velocity, landmark)]
 

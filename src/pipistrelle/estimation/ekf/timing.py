@@ -17,7 +17,8 @@ landmark and caller, and :math:`e_p = -e_l - e_b`,
             q = r \left( u_\perp - u \frac{e_x \cdot u_\perp}{k} \right)
 
   correlates it with the caller as with the vehicle (`place_by_detour`). Between vehicle and caller
-  k vanishes, and the range is anybody's guess: it must be known to a tenth of itself;
+  k vanishes, and the range is anybody's guess: it must be known to a tenth of itself, and the
+  detour be surely one (`SOME`), for any error of none has a range, and seems sure;
 - else it **weighs** the members of a ray (`weigh_by_detour`).
 
 Between two rays a detour says nothing: a pair of members fits any.
@@ -43,6 +44,7 @@ from pipistrelle.estimation.ekf.gaussian import (
 from pipistrelle.estimation.measurement import (
     BELIEVED,
     NEAREST,
+    SOME,
     caller_range_by_detour,
     detour_slopes,
     range_by_detour,
@@ -219,10 +221,12 @@ def unsure_by_detour(
 
     ``measured`` are detour, its variance, bearing and its variance; ``of_caller``: the caller is
     placed by a landmark at index iy, else a landmark by the caller there. Infinite where it is more
-    than `SURE`.
+    than `SURE`, and where the detour may be none (`SOME`).
     """
     detour, along, bearing, across = measured
     mean, turns = joint.mean, joint.turns
+    if detour <= SOME * math.sqrt(along):
+        return math.inf
     r, ax, ay, k, side = _leverage(joint, iy, of_caller, detour, mean[2] + bearing)
     if r == 0.0:
         return math.inf

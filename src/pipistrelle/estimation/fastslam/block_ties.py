@@ -37,7 +37,7 @@ from pipistrelle.estimation.fastslam.block import (
     X,
     Y,
 )
-from pipistrelle.estimation.measurement import NEAREST, detour_slopes, range_by_detour
+from pipistrelle.estimation.measurement import NEAREST, SOME, detour_slopes, range_by_detour
 from pipistrelle.jit import Flag, Whole, inlined, no_alloc
 
 AXX, AXY, AYX, AYY = range(0, 4 * LANES, LANES)
@@ -230,10 +230,12 @@ def place_by_detour(
 
     ``heard`` are bearing and detour, then their variances. The landmark is tied to the caller; what
     was known of its ray is let go. Where caller and landmark are in line a slope tells nothing, so
-    both errors are tried, too.
+    both errors are tried, too; and what may be no detour (`SOME`) places nothing.
     """
     bearing, detour, bearing_variance, detour_variance = heard
     off = math.sqrt(bearing_variance), math.sqrt(detour_variance)
+    if detour <= SOME * off[1]:
+        return
     for i in range(LANES):
         if timed[i] == 0.0 or count[i] == 1:
             continue

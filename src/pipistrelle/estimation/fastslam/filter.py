@@ -67,7 +67,7 @@ anew for each detour, a map would grow sure of what nobody told it. With detours
 A caller that is a ray itself, or known less surely than a fifth of how far away it is, lights
 nothing up: its detours are let go until then, some 15 to 55 frames in the paper's worlds. So are
 those of a second caller, for a landmark is tied to one; to be tied to both were to tie everything
-to everything.
+to everything. And so is a detour of a landmark of which the frame has no bearing.
 """
 
 import math

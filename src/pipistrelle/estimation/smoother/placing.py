@@ -19,7 +19,7 @@ import gtsam
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.estimation.measurement import caller_range_by_detour, range_by_detour
+from pipistrelle.estimation.measurement import SOME, caller_range_by_detour, range_by_detour
 from pipistrelle.estimation.smoother.crossing import Bearing
 from pipistrelle.estimation.smoother.detours import Detour
 from pipistrelle.estimation.smoother.graph import pose_key, pose_of
@@ -33,9 +33,6 @@ from pipistrelle.estimation.smoother.roaming import (
 
 SHARE = 0.2
 """Most standard deviations of a range by detour, as a share of it: beyond, it places nothing."""
-LEAST = 3.0
-"""Standard deviations that a detour must be above none. Of what stands straight between, and has
-none, any error of it makes something that stands at the caller, and surely."""
 FAR = 1e6
 """A range beyond this [m] is none."""
 
@@ -196,7 +193,7 @@ def sure_range(
     >>> sure_range(np.array([6.0, 0.0, 0.0, 0.0]), spread, caller=False)[1]
     inf
     """
-    if way[3] <= LEAST * math.sqrt(spread[3, 3]):
+    if way[3] <= SOME * math.sqrt(spread[3, 3]):
         return math.nan, math.inf
     size, axes = np.linalg.eigh(spread)
     off = 2.0 * np.sqrt(np.maximum(size, 0.0)) * axes

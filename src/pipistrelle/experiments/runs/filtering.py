@@ -81,7 +81,7 @@ def run_filter(
     InputError
         For a row that is neither bearing nor detour, or no number, one of which nobody says how
         sure it is, scans out of order or at a time that is not one of the drive's, labels that are
-        none, or poses that are not one for each step.
+        none, landmarks known beforehand that move, or poses that are not one for each step.
     """
     time = drive.time
     steps = _steps_of(scans, time)
@@ -89,7 +89,7 @@ def run_filter(
         _refuse_unstated(scans)
     path = Gaussian(mean=np.empty((time.size, 3)), covariance=np.empty((time.size, 3, 3)))
     path.mean[0], path.covariance[0] = drive.start.mean, drive.start.covariance
-    belief, done = _first_belief(estimator, drive), 0
+    belief, done = _first_belief(estimator, drive, scans), 0
     callers: dict[int, Gaussian] = {}
     for number, (k, scan) in enumerate(zip(steps, scans, strict=True), start=1):
         if k > done:
@@ -141,9 +141,14 @@ def _carried(
     return belief
 
 
-def _first_belief(estimator: Estimator[B], drive: Drive) -> B:
+def _first_belief(estimator: Estimator[B], drive: Drive, scans: Sequence[Scan]) -> B:
     """Return what an estimator believes at the start, with what is known beforehand."""
-    belief = estimator.init(drive.start)
+    belief, known = estimator.init(drive.start), drive.known.landmark.tolist()
+    moving = {*drive.moving, *(label for scan in scans for label in scan.moving.tolist())}
+    if roving := sorted(moving.intersection(known)):
+        raise InputError(
+            f"landmarks known beforehand: found {roving}, which move; expected some that stand"
+        )
     if drive.known.landmark.size and isinstance(estimator, Informed):
         belief = estimator.knowing(belief, drive.known)
     return belief
@@ -164,7 +169,7 @@ def _retraced(callers: dict[int, Gaussian], belief: Belief, steps: int) -> Mappi
     """Return the tracks of callers as a belief has them at the end, where it revises them."""
     if not callers or not isinstance(belief, Retracing):
         return callers
-    tracks = belief.tracks()
+    tracks = dict(belief.tracks())
     for label, track in tracks.items():
         found, expected = (np.shape(track.mean), np.shape(track.covariance)), (steps, 2)
         if found != (expected, (*expected, 2)):
@@ -172,7 +177,18 @@ def _retraced(callers: dict[int, Gaussian], belief: Belief, steps: int) -> Mappi
                 f"tracks: found arrays of {found[0]} and {found[1]} for caller {label}, expected "
                 f"{expected} and {(*expected, 2)}: the start and every control step"
             )
+        if label in callers:
+            tracks[label] = _filled_up(track, callers[label])
     return tracks
+
+
+def _filled_up(track: Gaussian, online: Gaussian) -> Gaussian:
+    """Return a caller's track, where it has none at a scan as it was believed then."""
+    none = np.isnan(track.mean[:, :1])
+    return Gaussian(
+        mean=np.where(none, online.mean, track.mean),
+        covariance=np.where(none[..., np.newaxis], online.covariance, track.covariance),
+    )
 
 
 def _whole(who: str, path: Gaussian, poses: int) -> Gaussian:

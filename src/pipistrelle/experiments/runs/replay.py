@@ -9,6 +9,7 @@ import numpy as np
 from pipistrelle.config import Config, Strategy
 from pipistrelle.detection.logs.readers import READERS, Reader, Robot, reader_of
 from pipistrelle.detection.logs.recording import Log
+from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.noise import noise_of, unstated
 from pipistrelle.detection.scans import Scan, rows_of, with_columns
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
@@ -292,7 +293,9 @@ def replay(
     if config.filter.noise == "constant":
         scans = list(map(unstated, scans))
     heard = {
-        strategy: tuple(map(noise, as_heard_by(scans, strategy, beamwidth)))
+        strategy: tuple(
+            noise(labelled(scan, scan.landmark)) for scan in as_heard_by(scans, strategy, beamwidth)
+        )
         for strategy in strategies
     }
     return run_trials(filters, drive, heard, config, progress=progress, watch=watch)
