@@ -150,7 +150,8 @@ def test_a_study_from_the_command_line_in_this_process_or_in_others(toys, worker
     assert read_plan(Path("study/plan.toml")).filters == (RECKONING,)
 
 
-def test_its_study_has_a_page(toys, tmp_path):
+def test_its_study_has_a_page(toys, tmp_path, monkeypatch):
+    monkeypatch.setattr("pipistrelle.report.page.page._write_figure", lambda *_: None)
     small = SMALL.replace("iterations = 3", "iterations = 2")
     run_study(
         plan_of(tmp_path, f'filters = ["ekf", "fastslam", "{SHIFTED}"]\n{small}'), tmp_path / "s"

@@ -87,7 +87,8 @@ def test_a_plan_may_be_a_table_and_is_refused_in_its_own_words():
         pipistrelle.study({})
 
 
-def test_its_report_is_a_page_and_answers_and_draws_as_it_does():
+def test_its_report_is_a_page_and_answers_and_draws_as_it_does(monkeypatch):
+    monkeypatch.setattr("pipistrelle.report.page.page._write_figure", lambda *_: None)
     found = pipistrelle.study("small.toml", iterations=2, output="s")
     page = found.report("page")
     assert page == Path("page/index.html")

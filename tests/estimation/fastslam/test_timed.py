@@ -146,7 +146,7 @@ def assert_equal_whole_run(frames, strategy, callers, shares, mixture, weights, 
 def test_a_star_of_ties_equals_the_joint_gaussian_of_all(
     strategy, callers, shares, mixture, weights, gate
 ):
-    belief = assert_equal_whole_run(60, strategy, callers, shares, mixture, weights, gate)
+    belief = assert_equal_whole_run(40, strategy, callers, shares, mixture, weights, gate)
     assert np.abs(belief.tie).max() > 0.1
 
 

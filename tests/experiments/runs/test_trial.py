@@ -439,6 +439,7 @@ def test_what_a_filter_draws_is_of_the_seed_and_one_that_draws_nothing_does_not_
         assert (contents(one.track) != contents(two.track)) == draws
 
 
+@pytest.mark.slow
 def test_the_dense_engine_finds_about_the_same_landmarks():
     scenario = ScenarioConfig(steps=24)
     block, dense = (

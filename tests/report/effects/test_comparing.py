@@ -210,6 +210,7 @@ def test_a_study_without_anything_to_compare_has_no_effects():
     assert effects_of(select(only(invent(3), [("ekf", "passive")]), "none")) == ()
 
 
+@pytest.mark.slow
 def test_over_many_studies_without_an_effect_a_family_is_wrong_as_seldom_as_it_says():
     """Five in a hundred at most, whatever the number of strategies, within three errors."""
     wrong, runs = 0, 150

@@ -290,6 +290,9 @@ def _run_cases(cases: Sequence[PlannedCase], iteration: int, world: World) -> li
     return [_try_case(case, shared, iteration) for case in cases]
 
 
+_NOISE = ("noise", "range_std", "bearing_std", "detour_std")
+_CALLERS = ("caller_speed_std", "caller_walk_std")
+"""Settings of a filter that state noise, of what is heard and of how callers move."""
 _Told = tuple[float, Strategy, FilterConfig, ListeningConfig]
 """Of which beam, by which strategy, with which noise, and what is listened for."""
 
@@ -330,12 +333,14 @@ class _Shared:
         return bound
 
     def _scans(self, told: _Told) -> tuple[Scan, ...]:
-        """Take the scans of a beam."""
-        if told not in self._scans_known:
-            radius, strategy, noise, listening = told
+        """Take the scans of a beam, which nothing that is told of callers changes."""
+        radius, strategy, told_of, listening = told
+        noise = _alone(told_of, _NOISE)
+        key = (radius, strategy, noise, listening)
+        if key not in self._scans_known:
             config = self._config.model_copy(update={"filter": noise, "listening": listening})
-            self._scans_known[told] = scans_of(self.beams[radius], strategy, config)
-        return self._scans_known[told]
+            self._scans_known[key] = scans_of(self.beams[radius], strategy, config)
+        return self._scans_known[key]
 
     def _bound(self, told: _Told) -> Float[np.ndarray, "t 3 3"]:
         """Work out the bound of the pose at every step."""
@@ -357,14 +362,13 @@ def _start_covariance(told: FilterConfig) -> Float[np.ndarray, "3 3"]:
 def _told(case: PlannedCase) -> _Told:
     """Return what tells a case's scans from those of others in its world."""
     config = case.config
-    return config.emitter.radius, case.strategy, _noise_alone(config.filter), config.listening
+    told = _alone(config.filter, _NOISE + _CALLERS)
+    return config.emitter.radius, case.strategy, told, config.listening
 
 
-def _noise_alone(told: FilterConfig) -> FilterConfig:
-    """Return of a filter's settings what states noise, and that of callers; else the defaults."""
-    noise = ("noise", "range_std", "bearing_std", "detour_std")
-    callers = ("caller_speed_std", "caller_walk_std")
-    return FilterConfig(**{name: getattr(told, name) for name in noise + callers})
+def _alone(told: FilterConfig, names: Sequence[str]) -> FilterConfig:
+    """Return some of a filter's settings, and of the others the defaults."""
+    return FilterConfig(**{name: getattr(told, name) for name in names})
 
 
 def _try_case(case: PlannedCase, shared: _Shared, iteration: int) -> TrialRecord:
