@@ -132,8 +132,21 @@ def flipped(data: bytes) -> bytes:
     )
 
 
-@pytest.mark.parametrize("damage", [cut, flipped, lambda _: b""], ids=["cut", "flipped", "empty"])
-@pytest.mark.parametrize("kind", ["nbi", "nbc"])
+def emptied(_: bytes) -> bytes:
+    return b""
+
+
+AT_NIGHT = [("nbi", flipped), ("nbi", emptied), ("nbc", cut), ("nbc", emptied)]
+
+
+@pytest.mark.parametrize(
+    ("kind", "damage"),
+    [
+        ("nbi", cut),
+        ("nbc", flipped),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in AT_NIGHT),
+    ],
+)
 def test_a_damaged_file_is_thrown_away_and_its_kernel_compiled_anew(tmp_path, kind, damage):
     turned = COMPILE.replace("wrap_angle(4.0)", "print(wrap_angle(4.0), file=sys.stderr)")
     folder, said = place(tmp_path, "import sys; " + turned)

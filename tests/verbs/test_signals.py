@@ -24,7 +24,9 @@ landmarks = 8
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are those of POSIX")
-@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    "ending", [pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGINT]
+)
 def test_a_study_that_is_asked_to_end_ends_in_order(ending):
     Path("long.toml").write_text(PLAN)
     words = ["study", "long.toml", "--workers", "2", "-o", "one"]

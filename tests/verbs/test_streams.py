@@ -39,7 +39,12 @@ CLOSED = pytest.param("<&- >&- 2>&-", id="closed")
 UNTOLD = pytest.param("2>/dev/full", id="no room for what is said", marks=FULL)
 
 
-@pytest.mark.parametrize("streams", [LEFT, CLOSED, UNTOLD])
+def at_night(param):
+    """The same, left out of the fast suite."""
+    return pytest.param(*param.values, id=param.id, marks=[*param.marks, pytest.mark.slow])
+
+
+@pytest.mark.parametrize("streams", [CLOSED, *map(at_night, (LEFT, UNTOLD))])
 def test_a_study_goes_on_whatever_becomes_of_its_words(streams):
     Path("tiny.toml").write_text(TINY)
     status, printed = shell(f"{PIPISTRELLE} study tiny.toml -o one {streams}")

@@ -23,10 +23,22 @@ filters = ["ekf"]
 """
 
 
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """A folder with a world that was drawn, and what came of it."""
+    folder = tmp_path_factory.mktemp("kept")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr("pipistrelle.figures.mission.draw_mission", lambda *_, **__: None)
+        patch.setattr("pipistrelle.figures.style.save_figure", lambda *_: None)
+        assert main(["run", *SHORT, "--save-world", "here/drawn", "-o", "one", "--quiet"]) == 0
+    return folder
+
+
 @pytest.fixture
-def here(obey):
+def here(kept):
     """Two worlds in a folder: one drawn and kept, one of a user's own."""
-    assert obey("run", *SHORT, "--save-world", "here/drawn", "-o", "one")[0] == 0
+    shutil.copytree(kept, ".", dirs_exist_ok=True)
     own = Path("here/posts [1]")
     own.mkdir()
     (own / "landmarks.csv").write_text("landmark,x,y\n1,3,1\n2,6,-1\n3,9,1\n")

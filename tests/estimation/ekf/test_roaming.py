@@ -61,7 +61,9 @@ def boat_mission(strategy, frames=60):
 
 
 @pytest.mark.parametrize(("kind", "reference"), PAIRS)
-@pytest.mark.parametrize(("strategy", "frames"), [("fused", 60), ("passive", 90)])
+@pytest.mark.parametrize(
+    ("strategy", "frames"), [("fused", 60), pytest.param("passive", 120, marks=pytest.mark.slow)]
+)
 def test_a_run_with_a_caller_that_moves_equals_the_slow_reference(
     kind, reference, strategy, frames
 ):

@@ -83,6 +83,9 @@ def test_the_closed_forms_give_back_the_ranges_that_made_the_detour(vehicle, lan
 # Against the references
 
 
+ONE_OR_THREE = [pytest.param((1,), marks=pytest.mark.slow), (1, 2, 3)]
+
+
 def check_reference(
     kind, reference, strategy, *, callers=(1,), frames=60, gate=1.0, robust=False, **rays
 ):
@@ -108,13 +111,13 @@ def check_reference(
 
 @pytest.mark.parametrize(("kind", "reference"), PAIRS)
 @pytest.mark.parametrize("strategy", ["fused", "passive"])
-@pytest.mark.parametrize("callers", [(1,), (1, 2, 3)])
+@pytest.mark.parametrize("callers", ONE_OR_THREE)
 def test_a_run_with_detours_equals_the_slow_reference(kind, reference, strategy, callers):
     check_reference(kind, reference, strategy, callers=callers)
 
 
 @pytest.mark.parametrize(("kind", "reference"), PAIRS)
-@pytest.mark.parametrize("callers", [(1,), (1, 2, 3)])
+@pytest.mark.parametrize("callers", ONE_OR_THREE)
 def test_a_robust_gated_run_with_detours_equals_the_slow_reference(kind, reference, callers):
     known = {"callers": callers, "robust": True, "weights": "aggregated"}
     check_reference(kind, reference, "fused", gate=0.99, **known)

@@ -143,7 +143,7 @@ def test_whole_run_equals_the_slow_reference_with_every_option(
 def test_every_weight_with_every_likelihood_equals_the_slow_reference(likelihood, weights, mixture):
     rays = ray_config(power=2.0, likelihood=likelihood)
     slam = swarm_filter(5, mixture, weights=weights, rays=rays)
-    assert_equal_to_reference(slam, small_mission("fused", frames=32))
+    assert_equal_to_reference(slam, small_mission("fused", frames=20))
 
 
 rays = st.builds(
