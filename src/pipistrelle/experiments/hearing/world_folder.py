@@ -200,7 +200,8 @@ def read_world(folder: Path) -> World:
     """
     if not folder.is_dir():
         found = "a file" if folder.exists() else "no such folder"
-        raise refusal(folder, found, f"a folder with {', '.join(FILES)}", "name a world's folder")
+        expected, fix = f"a folder with {', '.join(FILES)}", "name a world's (scenario.world)"
+        raise refusal(folder, found, expected, fix)
     there = [name for name in FILES if os.path.lexists(folder / name)]
     table = _read_head(folder / "world.toml") if "world.toml" in there else _WorldTable(format=1)
     callers, routes = _callers(folder / "world.toml", table.callers)
