@@ -7,7 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from pipistrelle.config import STRATEGIES, Config, ReceiverConfig, ScenarioConfig
+from pipistrelle.config import (
+    STRATEGIES,
+    CallerConfig,
+    Config,
+    FilterConfig,
+    ListeningConfig,
+    ReceiverConfig,
+    ScenarioConfig,
+)
+from pipistrelle.estimation.catalogue import CATALOGUE, is_there
 from pipistrelle.experiments.runs.replay import load, replay
 from pipistrelle.experiments.runs.trial import run_mission
 
@@ -27,6 +36,20 @@ def test_a_short_mission_keeps_to_its_annotations(engine):
     )
     mission = run_mission(config, STRATEGIES)
     assert [trial.strategy for trial in mission.trials] == list(STRATEGIES)
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_a_mission_that_times_callers_keeps_to_its_annotations(name):
+    if not is_there(name):
+        pytest.skip(f"needs the extra {name}")
+    config = Config(
+        scenario=ScenarioConfig(steps=24, landmarks=12, radius=12.0),
+        callers=(CallerConfig(), CallerConfig(frequency=25e3, course="circle", radius=9.0)),
+        filter=FilterConfig(noise="measured", robust="huber", gate=0.999),
+        listening=ListeningConfig(timing=True),
+    )
+    trials = run_mission(config, STRATEGIES, (name,)).trials
+    assert any(trial.track.callers for trial in trials) == (name != "fastslam")
 
 
 @pytest.mark.parametrize("name", ["unicycle_log", "bicycle_log", "poses_log"])

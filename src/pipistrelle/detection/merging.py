@@ -125,12 +125,11 @@ def _checked(scan: Scan, label: np.ndarray) -> Int[np.ndarray, " m"]:
 def _settled(label: Int[np.ndarray, " m"], bearing: Float[np.ndarray, " m"]) -> bool:
     """Whether every row has a label, and those with a bearing, one each, stand before the rest."""
     for m in range(label.size):
-        if label[m] == UNLABELLED or (
-            m > 0 and math.isnan(bearing[m - 1]) > math.isnan(bearing[m])
-        ):
+        bare = math.isnan(bearing[m])
+        if label[m] == UNLABELLED or (m > 0 and math.isnan(bearing[m - 1]) and not bare):
             return False
         for other in range(m):
-            if label[other] == label[m] and not math.isnan(bearing[m]):
+            if label[other] == label[m] and not bare:
                 return False
     return True
 
@@ -192,14 +191,14 @@ def _fuse(
 @kernel
 def _average(
     numbers: Float[np.ndarray, "7 k"],
-    merged: Int[np.ndarray, " k"],
-    turn: Float[np.ndarray, " k"],
-    weighted: Float[np.ndarray, " k"],
-    weight: Float[np.ndarray, " k"],
+    merged: Int[np.ndarray, " m"],
+    turn: Float[np.ndarray, " m"],
+    weighted: Float[np.ndarray, " m"],
+    weight: Float[np.ndarray, " m"],
 ) -> None:
     """Turn the first bearing of each row to the mean of all that were merged.
 
-    They are so far from it in sum, plainly and weighted, with so much weight.
+    They are so far from it in sum, plainly and weighted, with so much weight; room may be left.
     """
     for k in range(numbers.shape[1]):
         if merged[k] > 1:

@@ -76,7 +76,7 @@ class Detours(NamedTuple):
 
 Columns = tuple[Int[np.ndarray, " m"], Float[np.ndarray, "7 m"]]
 """Labels and numbers of a scan's rows."""
-Timings = tuple[Int[np.ndarray, " m"], Int[np.ndarray, " c"], Int[np.ndarray, " v"]]
+Timings = tuple[Int[np.ndarray, " m"], Int[np.ndarray, " callers"], Int[np.ndarray, " v"]]
 """Callers of a scan's rows; the labels of the callers, and of who moves."""
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+from pydantic import ConfigDict, Field, ValidationError, field_validator
 
 from pipistrelle.config import (
     MOST_OTHERS,
@@ -82,14 +82,14 @@ class _CallerTable(Section):
 
     @field_validator("place")
     @classmethod
-    def _of_what_stands(cls, place: Any, known: ValidationInfo) -> Any:
+    def _of_what_stands(cls, place: Any, known: Any) -> Any:
         if place is not None and known.data.get("moves"):
             raise ValueError("no place of a caller that moves")
         return place
 
     @field_validator("place_std")
     @classmethod
-    def _of_a_place(cls, std: Any, known: ValidationInfo) -> Any:
+    def _of_a_place(cls, std: Any, known: Any) -> Any:
         if std is not None and known.data.get("place") is None:
             raise ValueError("a place beside it")
         return std

@@ -20,7 +20,7 @@ from pipistrelle.estimation.ekf.timing import (
 )
 from pipistrelle.estimation.measurement import Columns, Row, Timings, detours
 from pipistrelle.estimation.rays import Sensing, survivors, weigh_and_share
-from pipistrelle.jit import Whole, kernel, no_alloc
+from pipistrelle.jit import Flag, Whole, kernel, no_alloc
 
 FARTHER = 3.0
 """Times its standard deviation by which a bearing may be off where some are by more than they say:
@@ -131,7 +131,7 @@ def added_by_detour(state: State, row: Row, timed: Timed, robust: bool) -> bool:
 
 @no_alloc
 def _weigh(
-    state: State, timed: Timed, d: Whole, of_caller: bool, sensing: Sensing, scratch: Scratch
+    state: State, timed: Timed, d: Whole, of_caller: Flag, sensing: Sensing, scratch: Scratch
 ) -> None:
     """Weigh the members of a ray by detour d, and prune it."""
     label = timed.caller[d] if of_caller else timed.landmark[d]

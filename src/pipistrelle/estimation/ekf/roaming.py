@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipistrelle.detection.scans import UNLABELLED
-from pipistrelle.jit import Whole, kernel
+from pipistrelle.jit import Flag, Whole, kernel
 
 _NOBODY, _SUM = UNLABELLED, UNLABELLED - 1
 """Labels are from 0 on; that of a caller and that of its velocity have one sum."""
@@ -62,7 +62,7 @@ def is_velocity(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
 
 
 @kernel
-def roams(landmark: Int[np.ndarray, " h"]) -> bool:
+def roams(landmark: Int[np.ndarray, " h"]) -> Flag:
     """Tell whether any row of a state is a velocity.
 
     Examples
@@ -127,7 +127,7 @@ def velocities_missing(
 @kernel
 def roam(
     mean: Float[np.ndarray, " d"],
-    covariance: Float[np.ndarray, "d d"],
+    covariance: Float[np.ndarray, "d room"],
     landmark: Int[np.ndarray, " h"],
     seconds: float,
     walk_std: float,

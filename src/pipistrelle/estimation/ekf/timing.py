@@ -50,7 +50,7 @@ from pipistrelle.estimation.measurement import (
     range_by_detour,
 )
 from pipistrelle.estimation.rays import log_likelihood
-from pipistrelle.jit import Whole, no_alloc
+from pipistrelle.jit import Flag, Whole, no_alloc
 
 SURE = 0.1
 """Largest standard deviation of a range by which a detour places a point, as a share of it."""
@@ -158,7 +158,7 @@ def weigh_by_detour(
     state: State,
     ray: tuple[Whole, Whole],
     other: Whole,
-    of_caller: bool,
+    of_caller: Flag,
     detour: float,
     variance: float,
     likelihood: Float[np.ndarray, " m"],
@@ -183,7 +183,7 @@ def weigh_by_detour(
 
 @no_alloc
 def _leverage(
-    joint: Joint, iy: Whole, of_caller: bool, detour: float, direction: float
+    joint: Joint, iy: Whole, of_caller: Flag, detour: float, direction: float
 ) -> tuple[float, float, float, float, float]:
     """Where a detour and a direction place a point, by the one at index iy; r, a, k and e_x.u_perp.
 
@@ -214,7 +214,7 @@ def unsure_by_detour(
     joint: Joint,
     size: Whole,
     iy: Whole,
-    of_caller: bool,
+    of_caller: Flag,
     measured: tuple[float, float, float, float],
 ) -> float:
     """Standard deviation of the range by a detour and a bearing, as a share of it; or infinity.
@@ -251,7 +251,7 @@ def place_by_detour(
     size: Whole,
     i: Whole,
     iy: Whole,
-    of_caller: bool,
+    of_caller: Flag,
     measured: tuple[float, float, float, float],
 ) -> None:
     """Put a member at index i, by a detour and a bearing, and by the point placed at index iy.

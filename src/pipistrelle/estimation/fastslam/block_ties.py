@@ -46,7 +46,7 @@ TIE = 4 * LANES
 SURE = 0.2
 """A caller's detours count where its place is known to this share of how far away it is, and place
 a landmark where they tell its range to this share: beyond, no Gaussian has the ellipse's shape."""
-Tie = Float[np.ndarray, " numbers"]
+Tie = Float[np.ndarray, " slopes"]
 
 
 @no_alloc

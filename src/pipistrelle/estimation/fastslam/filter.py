@@ -149,8 +149,8 @@ class FastSlamBelief:
     best_member: Float[np.ndarray, "c 6"]
     full: float
     gated: int
-    hub: Int[np.ndarray, " k"]
-    tie: Float[np.ndarray, "b n numbers"]
+    hub: Int[np.ndarray, " hubs"]
+    tie: Float[np.ndarray, "b tied slopes"]
 
     def pose(self) -> Gaussian:
         """Return the vehicle's pose, (3) and (3, 3): of all particles."""

@@ -45,6 +45,7 @@ from pipistrelle.estimation.fastslam.block_rays import (
 from pipistrelle.estimation.fastslam.block_ties import joined, known_surely, place_by_detour
 from pipistrelle.estimation.fastslam.ties import (
     Tied,
+    TiedAfter,
     Ties,
     copy_row,
     gated_detours,
@@ -426,7 +427,7 @@ def correct_particles(
     normal: Float[np.ndarray, "p 3"],
     sensing: Sensing,
     sampled: bool,
-) -> tuple[Extended, Tied, Float[np.ndarray, " p"]]:
+) -> tuple[Extended, TiedAfter, Float[np.ndarray, " p"]]:
     """Refine, sample, correct and extend a copy of all particles; returns it, ties, log weights.
 
     ``sampled``: they are weighed at the sample.

@@ -25,8 +25,10 @@ from pipistrelle.estimation.fastslam.block_ties import (
 from pipistrelle.estimation.measurement import Detours, Measurements
 from pipistrelle.jit import Whole, kernel, no_alloc, no_alloc_inlined
 
-Tied = tuple[Int[np.ndarray, " tied"], Float[np.ndarray, "b ties numbers"]]
+Tied = tuple[Int[np.ndarray, " hubs"], Float[np.ndarray, "b tied slopes"]]
 """Who is tied to whom, and how."""
+TiedAfter = tuple[Int[np.ndarray, " reached"], Float[np.ndarray, "b longer slopes"]]
+"""The same, with those that are new."""
 
 
 class Ties(NamedTuple):
@@ -43,7 +45,7 @@ class Ties(NamedTuple):
     """
 
     hub: Int[np.ndarray, " n"]
-    tie: Float[np.ndarray, "n numbers"]
+    tie: Float[np.ndarray, "tied slopes"]
     detour: Float[np.ndarray, " m"]
     variance: Float[np.ndarray, " m"]
     turn: Lanes
@@ -68,7 +70,7 @@ def tie_landmarks(
     particles: Whole,
     told: Detours,
     callers: Int[np.ndarray, " c"],
-) -> Tied:
+) -> TiedAfter:
     """Return the ties of a scan's landmarks, too, those among them that are new and not counted.
 
     A landmark is tied to the first of whom it has a detour and whose place most particles know. A
@@ -107,7 +109,7 @@ def heard_of(
 
 @no_alloc
 def shift_all(
-    ties: Ties, first: Int[np.ndarray, " n+1"], member: Float[np.ndarray, "c numbers"], sign: float
+    ties: Ties, first: Int[np.ndarray, " ends"], member: Float[np.ndarray, "c numbers"], sign: float
 ) -> None:
     """Take from all tied landmarks what their callers add, the sign being -1; or add it."""
     for n in range(ties.tie.shape[0]):
@@ -154,7 +156,7 @@ def put_row(source: Member, target: Member, turn: Lanes) -> None:
 @kernel
 def gated_detours(
     pose: Float[np.ndarray, "b rows"],
-    first: Int[np.ndarray, " n+1"],
+    first: Int[np.ndarray, " ends"],
     count: Int[np.ndarray, "b n lanes"],
     member: Float[np.ndarray, "b c numbers"],
     landmark: Int[np.ndarray, " n"],
@@ -181,8 +183,8 @@ def gated_detours(
 
 @kernel
 def resample_ties(
-    tie: Float[np.ndarray, "b n numbers"], ancestor: Int[np.ndarray, " p"]
-) -> Float[np.ndarray, "b n numbers"]:
+    tie: Float[np.ndarray, "b tied slopes"], ancestor: Int[np.ndarray, " p"]
+) -> Float[np.ndarray, "b tied slopes"]:
     """Put the ties of the ancestors in the particles' places; spare lanes follow the last."""
     copies = np.empty_like(tie)
     for b in range(tie.shape[0]):
