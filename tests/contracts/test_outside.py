@@ -20,6 +20,7 @@ from pipistrelle.experiments.studies.store import load_study
 from pipistrelle.experiments.studies.study import run_study
 from reference.missions import BICYCLE
 from reference.studies import SMALL, assert_same, plan_of, results
+from report.drawing import draw_only
 
 RECKONING, SHIFTED = "toy_estimators:DeadReckoning", "toy_estimators:Shifted"
 SHORT = ("--duration", "10", "--seed", "7", "--quiet")
@@ -151,7 +152,7 @@ def test_a_study_from_the_command_line_in_this_process_or_in_others(toys, worker
 
 
 def test_its_study_has_a_page(toys, tmp_path, monkeypatch):
-    monkeypatch.setattr("pipistrelle.report.page.page._write_figure", lambda *_: None)
+    draw_only(monkeypatch)
     small = SMALL.replace("iterations = 3", "iterations = 2")
     run_study(
         plan_of(tmp_path, f'filters = ["ekf", "fastslam", "{SHIFTED}"]\n{small}'), tmp_path / "s"

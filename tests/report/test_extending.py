@@ -17,6 +17,7 @@ from pipistrelle.report.claims.verdicts import judge_claims, record
 from pipistrelle.report.page import page as module
 from pipistrelle.report.page.page import write_report
 from pipistrelle.report.studied import HEADING, RULES
+from report.drawing import draw_only
 from report.invented import BEAMWIDTH, changed, invent
 
 GUIDE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"
@@ -38,13 +39,8 @@ def extended(guide, tmp_path_factory):
     folder = tmp_path_factory.mktemp("extended")
     study = invent(8)
     study.trials["ekf", "fused"].diverged[3] = True
-    drawn = module._write_figure
     with pytest.MonkeyPatch.context() as patch:  # the package's own are drawn elsewhere
-        patch.setattr(
-            module,
-            "_write_figure",
-            lambda chart, room: chart.name == "worlds" and drawn(chart, room),
-        )
+        draw_only(patch, "worlds")
         write_report(
             study,
             folder,

@@ -15,6 +15,7 @@ from pipistrelle import InputError
 from pipistrelle.__main__ import main
 from pipistrelle.scripting import studies
 from reference.studies import SMALL
+from report.drawing import draw_only
 
 FEW = {"scenario": {"steps": 8, "landmarks": 5}}
 TIMES = ("wall_s", "cpu_s")
@@ -88,7 +89,7 @@ def test_a_plan_may_be_a_table_and_is_refused_in_its_own_words():
 
 
 def test_its_report_is_a_page_and_answers_and_draws_as_it_does(monkeypatch):
-    monkeypatch.setattr("pipistrelle.report.page.page._write_figure", lambda *_: None)
+    draw_only(monkeypatch)
     found = pipistrelle.study("small.toml", iterations=2, output="s")
     page = found.report("page")
     assert page == Path("page/index.html")

@@ -155,8 +155,12 @@ def check_room(recorded: "Log", filters: Sequence[str], config: Config) -> None:
     """
     from pipistrelle.experiments.machine import check_memory
 
-    there = len({label for scan in recorded.scans for label in scan.landmark.tolist()})
-    check_memory(filters, there, config, passive=True)
+    check_memory(filters, len(_labels(recorded)), config, passive=True)
+
+
+def _labels(recorded: "Log") -> set[int]:
+    """Return the labels of all rows."""
+    return {label for scan in recorded.scans for label in scan.landmark.tolist()}
 
 
 def beforehand(recorded: "Log", truth: "Truth", log: Path) -> list[str]:
@@ -208,7 +212,7 @@ def _jumps(recorded: "Log", log: Path) -> list[str]:
 
 def _unheard(recorded: "Log", log: Path) -> list[str]:
     """Say which callers that nobody hears are not placed: their detours say nothing."""
-    heard = {label for scan in recorded.scans for label in scan.landmark.tolist()}
+    heard = _labels(recorded)
     timed = {
         number
         for scan in recorded.scans

@@ -237,10 +237,11 @@ def aligned_error(kind, robust, seed, gross):
     return rmse(position_error(moved(path, alignment(path, true)), true))
 
 
+@pytest.mark.parametrize("drives", [12, pytest.param(30, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", KINDS)
-def test_gross_errors_among_precise_bearings_are_borne(kind):
+def test_gross_errors_among_precise_bearings_are_borne(kind, drives):
     calm, calm_robust, plain, robust = (
-        np.array([aligned_error(kind, robust, seed, gross) for seed in range(12)])
+        np.array([aligned_error(kind, robust, seed, gross) for seed in range(drives)])
         for gross in (0.0, 0.05)
         for robust in (False, True)
     )

@@ -83,7 +83,7 @@ def test_a_run_with_a_caller_that_moves_equals_the_slow_reference(
         linear = slow.linear() if hasattr(slow, "linear") else slow.covariance
         np.testing.assert_allclose(belief.pose().covariance, linear[:3, :3], rtol=0, atol=1e-5)
         placed += len(belief.moving().landmark) == 1
-    assert placed > 15
+    assert placed > 30
 
 
 # What is told of it

@@ -140,10 +140,13 @@ def test_whole_run_equals_the_slow_reference_with_every_option(
 @pytest.mark.parametrize("mixture", ["federated", "exact"])
 @pytest.mark.parametrize("weights", ["marginal", "sampled"])
 @pytest.mark.parametrize("likelihood", ["normal", "printed"])
-def test_every_weight_with_every_likelihood_equals_the_slow_reference(likelihood, weights, mixture):
+@pytest.mark.parametrize("frames", [20, pytest.param(32, marks=pytest.mark.slow)])
+def test_every_weight_with_every_likelihood_equals_the_slow_reference(
+    frames, likelihood, weights, mixture
+):
     rays = ray_config(power=2.0, likelihood=likelihood)
     slam = swarm_filter(5, mixture, weights=weights, rays=rays)
-    assert_equal_to_reference(slam, small_mission("fused", frames=20))
+    assert_equal_to_reference(slam, small_mission("fused", frames=frames))
 
 
 rays = st.builds(

@@ -142,11 +142,12 @@ def assert_equal_whole_run(frames, strategy, callers, shares, mixture, weights, 
     return belief
 
 
+@pytest.mark.parametrize("frames", [40, pytest.param(60, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("strategy", "callers", "shares", "mixture", "weights", "gate"), FEW)
 def test_a_star_of_ties_equals_the_joint_gaussian_of_all(
-    strategy, callers, shares, mixture, weights, gate
+    strategy, callers, shares, mixture, weights, gate, frames
 ):
-    belief = assert_equal_whole_run(40, strategy, callers, shares, mixture, weights, gate)
+    belief = assert_equal_whole_run(frames, strategy, callers, shares, mixture, weights, gate)
     assert np.abs(belief.tie).max() > 0.1
 
 

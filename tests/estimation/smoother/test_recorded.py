@@ -63,10 +63,11 @@ def test_no_log_of_precise_bearings_is_lost():
     assert np.median(online) < 0.06
 
 
-def test_gross_errors_of_one_bearing_in_twenty_cost_little_by_hubers_loss_and_all_without():
-    """Aligned RMSE: 0.03 to 0.07 m over three seeds, and metres without."""
-    drive, track, _ = mapped(0, gross=0.05, robust=True)
-    _, trusting, _ = mapped(0, gross=0.05)
+@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2))])
+def test_gross_errors_of_one_bearing_in_twenty_cost_little_by_hubers_loss_and_all_without(seed):
+    """Aligned RMSE of three seeds: 0.03 to 0.07 m, and metres without."""
+    drive, track, _ = mapped(seed, gross=0.05, robust=True)
+    _, trusting, _ = mapped(seed, gross=0.05)
     assert aligned(track.pose, drive) < 0.1
     assert aligned(track.pose, drive) < 0.1 * aligned(trusting.pose, drive)
 

@@ -18,12 +18,12 @@ from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
 from pipistrelle.experiments.studies.world_files import TABLES, done_worlds, with_sums, world_file
 from pipistrelle.files import LOG, RESULTS, OwnFiles
 from pipistrelle.report.claims.published import TABLE_II
-from pipistrelle.report.page import page as module
 from pipistrelle.report.page.page import write_report
 from pipistrelle.report.reading import read_study
 from pipistrelle.report.studied import RULES, Failure
 from pipistrelle.report.variables import setting_variable
 from pipistrelle.settings import from_flags
+from report.drawing import draw_only
 from report.invented import STRATEGIES, invent, narrowed, with_third, write_store
 
 FIGURES = [
@@ -83,14 +83,14 @@ def whole(tmp_path_factory):
     """The page of a study of two worlds, all there are, without its figures for paper."""
     folder = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "_write_figure", lambda *_: None)
+        draw_only(patch)
         write_report(invent(2), folder)
     return (folder / "index.html").read_text(encoding="utf-8")
 
 
 @pytest.fixture
 def undrawn(monkeypatch):
-    monkeypatch.setattr(module, "_write_figure", lambda *_: None)
+    draw_only(monkeypatch)
 
 
 def test_everything_is_there(reported):
@@ -332,10 +332,7 @@ def panels_of(folder, figure):
 
 
 def test_a_third_filter_has_its_panels_rows_and_files(tmp_path, monkeypatch):
-    drawn = module._write_figure
-    monkeypatch.setattr(
-        module, "_write_figure", lambda chart, room: "Smoother" in chart.name and drawn(chart, room)
-    )
+    draw_only(monkeypatch, "Smoother")
     write_report(with_third(invent(4), "toy_slam.filters:Smoother"), tmp_path)
     read(tmp_path)
     titles = ["EKF", "FastSLAM 2.0", "Smoother"]

@@ -12,8 +12,8 @@ from pipistrelle.__main__ import main
 from pipistrelle.experiments.studies.plan_file import read_plan
 from pipistrelle.experiments.studies.study import run_study
 from pipistrelle.report.claims.statements import CLAIMS
-from pipistrelle.report.page import page as module
 from pipistrelle.report.page.page import write_report
+from report.drawing import draw_only
 from report.invented import invent, narrowed, only, with_third, write_store
 from report.planted import FUSED_EKF, LEVELS, by_level, write_planted
 
@@ -24,7 +24,7 @@ ONE_FILTER = 'filters = ["ekf"]\n'
 
 @pytest.fixture(autouse=True)
 def undrawn(monkeypatch):
-    monkeypatch.setattr(module, "_write_figure", lambda *_: None)
+    draw_only(monkeypatch)
 
 
 class Page:
