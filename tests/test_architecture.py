@@ -81,6 +81,43 @@ def test_no_module_is_a_drawer():
     assert [path for path in SOURCES if path.stem in drawers] == []
 
 
+DISK = {
+    *("read_bytes", "read_text", "open", "loadtxt", "scan_parquet"),
+    *("write_bytes", "write_text", "unlink", "rename", "symlink_to", "rmtree", "rmdir"),
+}
+"""Methods that read, write or remove files."""
+AT_THE_DISK = {
+    "experiments/machine.py": {"read_text"},  # of the system: how much memory a process may have
+    "experiments/results/folder.py": {"symlink_to", "unlink"},  # runs/latest
+    "experiments/results/stored.py": {"loadtxt"},  # of bytes that were read
+    "experiments/runs/again.py": {"open"},  # sums of a log's files, of ordinary ones alone
+    "experiments/studies/store.py": {"unlink"},  # what a killed writer left, by its name
+    "experiments/studies/world_files.py": {"scan_parquet", "unlink"},  # checked; left by a kill
+    "detection/logs/text_tables.py": {"loadtxt"},  # of lines that were read
+    "figures/player/page.py": {"read_text"},  # the package's own pages
+    "report/page/page.py": {"read_text"},
+    "files.py": {"read_bytes", "open", "unlink"},
+    "own_files.py": {"read_bytes", "unlink", "rmdir"},
+    "figures/player/rerun_file.py": {"read_bytes"},  # what it wrote into a temporary folder
+    "kernel_cache.py": {"read_bytes", "unlink"},  # our own cache
+    "kernel_folder.py": {"read_bytes", "rmtree"},
+    "verbs/streams.py": {"open"},  # /dev/null
+    "version.py": {"read_text"},  # our own pyproject.toml
+}
+
+
+def test_files_are_read_and_written_through_one_door_but_where_a_reason_is_given():
+    found: dict[str, set[str]] = {}
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, (ast.Attribute, ast.Name)):
+                named = isinstance(node.func, ast.Name)
+                name = node.func.id if named else node.func.attr
+                if name in DISK and not (named and name == "read_text"):
+                    found.setdefault(path.relative_to(PACKAGE).as_posix(), set()).add(name)
+    assert found == AT_THE_DISK
+
+
 def test_tests_make_their_scans_and_maps_in_one_place():
     made = re.compile(r"^(?!\s*(?:class|def)\b).*\b(?:Scan|Landmarks)\(", re.MULTILINE)
     tests = [path for path in (ROOT / "tests").rglob("*.py") if path != Path(__file__)]

@@ -121,10 +121,11 @@ def test_whoever_says_the_version_says_the_same(tmp_path):
     from pipistrelle.config import Config
     from pipistrelle.experiments.drives import NO_TRUTH
     from pipistrelle.experiments.results.writing import write_results
+    from pipistrelle.own_files import RESULTS, OwnFiles
     from pipistrelle.report.page import summary
 
     mission = {"command": "pipistrelle", "seed": 7, "trials": (), "ignored_rows": {}}
-    write_results(tmp_path, config=Config(), truth=NO_TRUTH, **mission)
+    write_results(OwnFiles(tmp_path, RESULTS), config=Config(), truth=NO_TRUTH, **mission)
     kept = json.loads((tmp_path / "summary.json").read_text())["version"]
     command = [sys.executable, "-m", "pipistrelle", "--version"]
     told = subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()

@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     words = sys.argv[1:] if arguments is None else arguments
     hold_streams()
-    with heard_signals() as heard:
+    with heard_signals(last=arguments is None) as heard:
         try:
             from pipistrelle.verbs.command_line import obey
 
@@ -42,8 +42,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 raise
             say("pipistrelle: interrupted")
             status = 128 + (heard[0] if heard else signal.SIGINT)
-    if arguments is None:  # nothing is left to be interrupted
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
     return status
 
 

@@ -22,6 +22,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from pipistrelle.config import MOST_OTHERS, CallerConfig, Config, InputError, Section
+from pipistrelle.files import read_text
 from pipistrelle.refusals import expectation, meant, refusal, shown, values_expected
 
 PREFIX = "PIPISTRELLE_"
@@ -394,16 +395,9 @@ def read_toml(path: Path) -> dict[str, Any]:
     Raises
     ------
     InputError
-        As `parse_toml`, with the file.
-    OSError
-        The file cannot be read.
+        As `read_text` and `parse_toml`, with the file.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        found = f"byte {error.start}, which is no UTF-8 text"
-        raise refusal(path, found, "TOML", "save it as UTF-8") from None
-    return parse_toml(text, path)
+    return parse_toml(read_text(path), path)
 
 
 def parse_toml(text: str, where: object) -> dict[str, Any]:

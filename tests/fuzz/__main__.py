@@ -19,7 +19,7 @@ app = App(
 
 @app.default
 def fuzz(
-    target: Literal["logs", "settings", "studies", "kills"],
+    target: Literal["logs", "settings", "studies", "kills", "ownership", "results"],
     /,
     *,
     tries: Annotated[int, Parameter(validator=Number(gte=1))] = 100,

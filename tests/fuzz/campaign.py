@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fuzz import kills, logs, settings, studies
+from fuzz import kills, logs, ownership, results, settings, studies
 from fuzz.judging import Tried
 from fuzz.running import load_all
 
@@ -21,6 +21,8 @@ TARGETS: dict[str, ModuleType] = {
     "settings": settings,
     "studies": studies,
     "kills": kills,
+    "ownership": ownership,
+    "results": results,
 }
 """Each has `prepare`, for all tries, and `attempt`. A number in the order keys their randomness."""
 EVERY = 30.0

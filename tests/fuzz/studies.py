@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import os
 import pickle
 import re
 import shutil
@@ -224,6 +225,8 @@ def misplace(rng: Generator, study: Path, _: Path) -> Damage:
             ("a link to nowhere", lambda: path.symlink_to("nowhere")),
             ("a file of a word", lambda: path.write_text("word")),
             ("a link to another's", lambda: path.symlink_to(study / FILES[1])),
+            ("a pipe", lambda: os.mkfifo(path)),
+            ("a link to a device", lambda: path.symlink_to("/dev/zero")),
         ],
     )
     make()

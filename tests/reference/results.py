@@ -11,6 +11,7 @@ from pipistrelle.experiments.studies.plan import cases_of
 from pipistrelle.experiments.studies.store import open_store
 from pipistrelle.experiments.studies.world import TrialRecord
 from pipistrelle.experiments.studies.world_files import write_world
+from pipistrelle.own_files import RESULTS, OwnFiles
 from reference.missions import map_with, scan_with
 
 STEPS = 40
@@ -49,10 +50,9 @@ def mission_folder(folder, paths, *, truth=TRUTH, config=None, time=TIME, gated=
         trials.append(TrialResult(
             strategy=strategy, filter=name, track=track, scans=scans, scores=scores, wall_s=0.5,
         ))  # fmt: skip
-    folder.mkdir(parents=True, exist_ok=True)
     write_results(
-        folder, config=config, command="pipistrelle run", seed=7, trials=trials, truth=truth,
-        ignored_rows={},
+        OwnFiles(folder, RESULTS), config=config, command="pipistrelle run", seed=7,
+        trials=trials, truth=truth, ignored_rows={},
     )  # fmt: skip
     return folder
 

@@ -172,7 +172,7 @@ def test_a_table_that_is_cut_or_none_is_refused_by_name(done):
         _ = pipistrelle.load("one").tracks
     table.unlink()
     table.symlink_to("/dev/null")
-    with pytest.raises(InputError, match=r"one/steps\.parquet: is no file"):
+    with pytest.raises(InputError, match=r"one/steps\.parquet: found a pipe"):
         _ = pipistrelle.load("one").tracks
 
 

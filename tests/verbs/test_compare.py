@@ -12,7 +12,7 @@ import pytest
 
 from pipistrelle.config import Config, FilterConfig
 from pipistrelle.experiments.studies.plan import Plan
-from pipistrelle.files import SUMS
+from pipistrelle.own_files import SUMS
 from reference.command_line import COMPILING, SHORT, contents
 from reference.results import loop, mission_folder, study_folder, turned
 
@@ -209,9 +209,9 @@ def test_a_partial_study_says_how_far_it_is(obey, studies):
         (("one", "two", "--quiet"), "--quiet: nothing is kept without -o DIR"),
         (("one", "two", "--overwrite"), "--overwrite: nothing is kept without -o DIR"),
         (("one", "two", "--drop-diverged"), "--drop-diverged: is for studies"),
-        (("one", "two", "-o", "one"), "one: is not empty; name a new folder with -o DIR, or add"),
+        (("one", "two", "-o", "one"), "one: holds results of Pipistrelle, which a"),
         (("one", "two", "-o", "one", "--overwrite"), "one: holds results of Pipistrelle, which a"),
-        (("one", "two", "-o", "one/summary.json"), "cannot be used as a result folder"),
+        (("one", "two", "-o", "one/summary.json"), "cannot be used as a folder for a comparison"),
         (("one", "two", "-o", "mine", "--overwrite"), "mine: is not empty and holds no comparison"),
         (("one", "two", "--seed", "3"), "Unknown option: --seed"),
     ],

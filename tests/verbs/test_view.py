@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
+import pipistrelle
 from pipistrelle.__main__ import main
+from pipistrelle.config import InputError
 from pipistrelle.figures.player import rerun_file
 from reference.command_line import SHORT
 
@@ -120,6 +122,51 @@ def test_a_place_that_a_page_cannot_have_is_refused_before_anything_is_done(
     assert said in refused("view", folder, "-o", place)
 
 
+def test_a_page_is_never_written_through_a_link_or_over_a_users_partial(obey, folder):
+    Path("precious.txt").write_text("precious")
+    Path("page.html.partial").symlink_to("precious.txt")
+    Path("other.html").symlink_to("precious.txt")
+    Path("other.html.partial").write_text("half")
+    assert obey("view", folder, "--quiet", "-o", "page.html")[0] == 0
+    assert obey("view", folder, "--quiet", "--overwrite", "-o", "other.html")[0] == 0
+    assert Path("precious.txt").read_text() == "precious"
+    assert Path("page.html.partial").is_symlink()
+    assert Path("other.html.partial").read_text() == "half"
+    assert is_page(Path("other.html"))
+
+
+def test_a_page_that_appeared_meanwhile_is_not_replaced(obey, folder, refused, monkeypatch):
+    from pipistrelle.figures.player import page
+
+    def slow(*args):
+        Path("page.html").write_text("mine")
+        return page_of(*args)
+
+    page_of = page.page
+    monkeypatch.setattr(page, "page", slow)
+    assert "page.html: could not be written (File exists)" in refused(
+        "view", folder, "--quiet", "-o", "page.html"
+    )
+    assert Path("page.html").read_text() == "mine"
+
+
+def test_code_that_a_folder_names_is_not_run_unless_the_user_names_it(folder, refused, monkeypatch):
+    summary = json.loads((folder / "summary.json").read_text())
+    for run in summary["runs"]:
+        run["filter"] = "evil:X"
+    (folder / "summary.json").write_text(json.dumps(summary))
+    (folder / "evil.py").write_text("open('ran', 'w').close()\nclass X: pass\n")
+    monkeypatch.chdir(folder)
+    said = refused("view", ".")
+    assert "summary.json: runs.filter: found 'evil:X', whose code is not Pipistrelle's" in said
+    assert "add --filter evil:X" in said
+    with pytest.raises(InputError, match="whose code is not Pipistrelle's"):
+        pipistrelle.load(".").figure()
+    assert not Path("ran").exists()
+    assert "lacks init, predict, update" in refused("view", ".", "--filter", "evil:X")
+    assert Path("ran").exists()
+
+
 def test_a_folder_that_cannot_be_written_is_refused_by_name(folder, refused, monkeypatch):
     def closed(**_):
         raise PermissionError(13, "Permission denied")
@@ -137,10 +184,11 @@ def test_a_disk_that_is_full_leaves_what_was_there(obey, folder, refused, monkey
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("pipistrelle.files.write_down", full)
+    monkeypatch.setattr("pipistrelle.own_files.write_down", full)
     said = refused("view", folder, "--quiet", "--overwrite", "-o", "page.html")
     assert "page.html: could not be written (No space left on device); make room" in said
     assert Path("page.html").read_text() == "mine"
-    assert "one/view.html: could not be written" in refused("view", folder, "--quiet")
+    assert "one: could not be written" in refused("view", folder, "--quiet")
 
 
 @pytest.mark.parametrize(
@@ -206,7 +254,7 @@ def test_an_estimator_from_outside_is_played_under_its_own_title(obey, undrawn):
     )
     words = ("--filter", "mine:Mine", "--strategy", "fused")
     assert obey("run", *SHORT, *words, "--quiet", "-o", "one")[0] == 0
-    assert obey("view", "one", "--quiet") == (0, "one/view.html\n", "")
+    assert obey("view", "one", *words[:2], "--quiet") == (0, "one/view.html\n", "")
     page = Path("one/view.html").read_text()
     assert "fused \\u00b7 \\u003ci>Mine\\u003c/i>" in page
 

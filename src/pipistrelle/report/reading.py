@@ -28,6 +28,7 @@ from pipistrelle.experiments.studies.world_files import (
     done_worlds,
     world_file,
 )
+from pipistrelle.files import read_file
 from pipistrelle.report.studied import (
     COMMON,
     ONLINE_POSITION,
@@ -94,7 +95,7 @@ def _unreadable(folder: Path, plan: Plan) -> InputError:
     for world in sorted(done_worlds(folder)):
         for table, schema in world_schemas(plan).items():
             file = world_file(folder, table, world)
-            if pl.read_parquet(file.read_bytes()).schema != pl.Schema(schema):
+            if pl.read_parquet(read_file(file)).schema != pl.Schema(schema):
                 return damaged(folder, table, world, "has not the columns of this study")
     return InputError(f"{folder}: could not be read, though each file can; run the report again")
 

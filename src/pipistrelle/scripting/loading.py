@@ -6,18 +6,22 @@ from pathlib import Path
 from pipistrelle.experiments.results.reading import read_summary
 from pipistrelle.experiments.runs.again import again
 from pipistrelle.experiments.runs.trial import Watch
+from pipistrelle.scripting.asking import Filters, named_filters
 from pipistrelle.scripting.missions import Done
 from pipistrelle.scripting.results import Results
 from pipistrelle.scripting.studies import StudyResults
 
 
-def load(folder: Path | str, /) -> Results | StudyResults:
+def load(folder: Path | str, /, *, filters: Filters = ()) -> Results | StudyResults:
     """Open what a folder holds; a mission is done again only where it must be drawn.
 
     Parameters
     ----------
     folder : Path
         As `pipistrelle run`, `slam` or `study` has filled it.
+    filters : str or class, or several of them, optional
+        Estimators of your own, by name or class, that a mission was done with. Code that a folder
+        names is not run unless you name it, too.
 
     Returns
     -------
@@ -26,7 +30,8 @@ def load(folder: Path | str, /) -> Results | StudyResults:
     Raises
     ------
     InputError
-        Where it is no such folder.
+        Where it is no such folder; when a mission is done again, where it names an estimator that
+        is neither Pipistrelle's nor named here.
 
     Examples
     --------
@@ -42,9 +47,10 @@ def load(folder: Path | str, /) -> Results | StudyResults:
     if (place / "plan.toml").is_file():
         return StudyResults(place)
     read_summary(place)
+    trusted = named_filters(filters) if filters else ()
 
     def redo(watch: Watch | None) -> Done:
-        found = again(place, watch=watch)
+        found = again(place, trusted=trusted, watch=watch)
         if found.difference:
             warnings.warn(found.difference, stacklevel=3)
         return Done(

@@ -22,6 +22,7 @@ from pipistrelle.experiments.runs.again import log_entry
 from pipistrelle.experiments.runs.preparing import warnings_of
 from pipistrelle.experiments.runs.replay import moving_of, replay
 from pipistrelle.experiments.runs.trial import Mission, Watch, run_mission
+from pipistrelle.own_files import OwnFiles
 from pipistrelle.scripting.recorded import SlamConfig, afterwards
 
 if TYPE_CHECKING:
@@ -219,15 +220,15 @@ def filmed(done: Done, watch: "MissionRecorder", path: Path) -> None:
 
 
 def keep(
-    done: Done, folder: Path, command: str, more: Callable[[Path], None] = lambda _: None
+    done: Done, own: OwnFiles, command: str, more: Callable[[Path], None] = lambda _: None
 ) -> None:
     """Write a mission into its folder, in place of earlier results.
 
     Parameters
     ----------
     done : Done
-    folder : Path
-        As `prepare_folder` gives it.
+    own : OwnFiles
+        The folder, as `result_folder` lends it.
     command : str
         What was asked for, for the reader.
     more : callable, optional
@@ -247,7 +248,7 @@ def keep(
         more(room)
 
     write_results(
-        folder,
+        own,
         config=done.config,
         command=command,
         seed=done.seed,

@@ -13,11 +13,11 @@ from pipistrelle.config import InputError
 from pipistrelle.detection.logs.readers import Robot
 from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.machine import keep_freed_memory
-from pipistrelle.experiments.results.folder import prepare_folder
 from pipistrelle.experiments.results.writing import run_entry, tables_of
 from pipistrelle.experiments.runs.replay import load as load_log
 from pipistrelle.experiments.runs.trial import Watch
-from pipistrelle.files import check_ordinary
+from pipistrelle.files import read_file
+from pipistrelle.own_files import RESULTS, claim
 from pipistrelle.refusals import refusal
 from pipistrelle.scripting.asking import (
     WORLD,
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 Redo = Callable[[Watch | None], Done]
 """Does a mission once more, watched; the same settings give the same bits."""
+ALLOW = "overwrite=True"
 COLUMNS = ("strategy", "filter", "position_rmse_m", "position_rmse_aligned_m", "map_rmse_m",
            "nees_mean", "landmarks_full", "landmarks_total")  # fmt: skip
 """Of the table that a notebook shows."""
@@ -87,7 +88,7 @@ class Results:
         import polars as pl
 
         if self.folder is not None:
-            rows = json.loads((self.folder / "summary.json").read_text())["runs"]
+            rows = json.loads(read_file(self.folder / "summary.json"))["runs"]
         else:
             rows = [run_entry(trial, self._done.ignored_rows) for trial in self._done.trials]
         nested = ("ignored_rows", "online")
@@ -119,9 +120,8 @@ class Results:
         paths = {name: self.folder / f"{name}.parquet" for name in TABLES}
         tables = {}
         for name, path in paths.items():
-            check_ordinary(path)
             try:
-                tables[name] = pl.read_parquet(path.read_bytes())
+                tables[name] = pl.read_parquet(read_file(path))
             except (OSError, pl.exceptions.PolarsError):
                 found, fix = "no table that is whole", "do the mission anew"
                 raise refusal(path, found, "what was written there", fix) from None
@@ -175,9 +175,9 @@ class Results:
         InputError
             Where the folder cannot be had.
         """
-        place = prepare_folder(Path(folder), "run", overwrite)
-        keep(self._done, place, self._command)
-        return place
+        own = claim(Path(folder), RESULTS, overwrite=overwrite, flags=("save(DIR)", ALLOW))
+        keep(self._done, own, self._command)
+        return own.folder
 
     def to_xarray(self) -> Any:
         """Return the tracks with the dimensions strategy, filter and time (extra ``export``).
@@ -362,11 +362,12 @@ def slam(
 def _finished(redo: Redo, output: Path | str | None, overwrite: bool, command: str) -> Results:
     """Do a mission, and keep it where that is asked for."""
     keep_freed_memory()
-    place = None if output is None else prepare_folder(Path(output), "run", overwrite)
+    place = None if output is None else Path(output)
+    flags = ("output=DIR", ALLOW)
+    own = None if place is None else claim(place, RESULTS, overwrite=overwrite, flags=flags)
     done = redo(None)
     for line in done.said:
         warnings.warn(line, stacklevel=3)
-    results = Results(redo, done, place, command)
-    if place is not None:
-        keep(done, place, command)
-    return results
+    if own is not None:
+        keep(done, own, command)
+    return Results(redo, done, place, command)

@@ -1,6 +1,5 @@
 """`pipistrelle compare`: results side by side."""
 
-import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -89,25 +88,19 @@ def _keep(
     output: Path, compared: "Compared", notes: Sequence[str], *, overwrite: bool, quiet: bool
 ) -> None:
     """Write the comparison into its folder, or leave none."""
-    from pipistrelle.experiments.comparing.writing import RESERVED, write_comparison
-    from pipistrelle.experiments.results.folder import prepare_folder
+    from pipistrelle.experiments.comparing.writing import write_comparison
     from pipistrelle.figures.comparison import draw_comparison
     from pipistrelle.figures.style import save_figure
-    from pipistrelle.files import COMPARISON
+    from pipistrelle.own_files import COMPARISON, claim
     from pipistrelle.verbs.delivery import command_line
 
-    folder = prepare_folder(output, "compare", overwrite, kind=COMPARISON, reserved=RESERVED)
+    own = claim(output, COMPARISON, overwrite=overwrite)
 
     def draw(room: Path) -> None:
         save_figure(draw_comparison(compared), room, "comparison")
 
-    try:
-        with announced("Drawing the comparison ...", 1e9 if quiet else 3.0):
-            write_comparison(folder, compared, command=command_line(), notes=notes, draw=draw)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            folder.rmdir()
-        raise
+    with announced("Drawing the comparison ...", 1e9 if quiet else 3.0):
+        write_comparison(own, compared, command=command_line(), notes=notes, draw=draw)
 
 
 def _joined(notes: Sequence[str]) -> list[str]:

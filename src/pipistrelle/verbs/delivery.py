@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipistrelle.experiments.results.folder import prepare_folder
+from pipistrelle.experiments.results import folder
+from pipistrelle.own_files import OwnFiles
 from pipistrelle.scripting.missions import Done, filmed, keep
 from pipistrelle.verbs.console import announce_compiling, announced, closing_table
 from pipistrelle.verbs.options import OutputOptions
@@ -22,40 +23,14 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def result_folder(options: OutputOptions, name: str) -> Iterator[Path]:
-    """Make the result folder at once, and remove it if nothing comes to stand in it.
-
-    Earlier results that may be overwritten stay in it until `deliver`.
-
-    Parameters
-    ----------
-    options : OutputOptions
-    name : str
-        What runs.
-
-    Yields
-    ------
-    Path
-
-    Raises
-    ------
-    InputError
-        Where the folder cannot be had, or the film not be made.
-    """
+def result_folder(options: OutputOptions, name: str) -> Iterator[OwnFiles]:
+    """Lend the folder for results (`folder.result_folder`); refuse a film that cannot be made."""
     if options.animate:
         from pipistrelle.figures.film import film_writer
 
         film_writer(Path(f"mission.{options.animate}"))
-    folder = prepare_folder(options.output, name, options.overwrite)
-    try:
-        yield folder
-    except BaseException:
-        with contextlib.suppress(OSError):
-            folder.rmdir()
-            latest = folder.parent / "latest"
-            if options.output is None and not latest.exists():
-                latest.unlink()
-        raise
+    with folder.result_folder(options.output, name, overwrite=options.overwrite) as own:
+        yield own
 
 
 def recorder(options: OutputOptions) -> "MissionRecorder | None":
@@ -77,13 +52,14 @@ def get_ready(options: OutputOptions) -> None:
 
 
 def deliver(
-    folder: Path, done: Done, options: OutputOptions, watch: "MissionRecorder | None" = None
+    own: OwnFiles, done: Done, options: OutputOptions, watch: "MissionRecorder | None" = None
 ) -> int:
     """Write results, figure and film in place of earlier ones, print the table, the folder last.
 
     Parameters
     ----------
-    folder : Path
+    own : OwnFiles
+        The folder.
     done : Done
         Of at least one trial.
     options : OutputOptions
@@ -103,7 +79,7 @@ def deliver(
             with contextlib.nullcontext() if options.quiet else announced(message):
                 filmed(done, watch, path)
 
-    keep(done, folder, command_line(), film)
+    keep(done, own, command_line(), film)
     if not options.quiet:
         known = done.truth.landmarks
         put(closing_table(done.trials, None if known is None else len(known[0])))
@@ -111,7 +87,7 @@ def deliver(
     for trial in failed:
         why = trial.error or "its path is not finite"
         warn(f"{trial.strategy} {trial.filter} failed: {why}")
-    put(folder)
+    put(own.folder)
     return 1 if failed else 0
 
 

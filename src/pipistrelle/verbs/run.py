@@ -1,6 +1,5 @@
 """`pipistrelle run`: one random world, by sound, to a map."""
 
-import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -8,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from pipistrelle.config import InputError
-from pipistrelle.files import LOG, WORLD, OwnFiles
+from pipistrelle.own_files import LOG, WORLD, Kind, OwnFiles, claim
 from pipistrelle.scripting.asking import named_strategies
 from pipistrelle.verbs.options import (
     Chosen,
@@ -53,72 +52,53 @@ def run(
     mission, output = mission or MissionOptions(), output or OutputOptions()
     config, known = mission_config(mission)
     ways = filters(estimator, mission.particles)
-    _check_saved(save_log, save_world, output)
-    from pipistrelle.experiments.hearing.world_folder import write_world
+    _check_apart(output=output.output, save_log=save_log, save_world=save_world)
+    log = _claimed("--save-log", save_log, LOG, output.overwrite)
+    world = _claimed("--save-world", save_world, WORLD, output.overwrite)
+    from pipistrelle.experiments.hearing.world_folder import world_files
     from pipistrelle.scripting.missions import simulated
     from pipistrelle.verbs import delivery
     from pipistrelle.verbs.console import progress
     from pipistrelle.verbs.streams import warn
 
-    with delivery.result_folder(output, "run") as folder:
+    with delivery.result_folder(output, "run") as own:
         delivery.get_ready(output)
         watch, chosen = delivery.recorder(output), named_strategies(strategy)
         with progress(output.quiet) as show:
             done, heard = simulated(config, chosen, ways, known, progress=show, watch=watch)
         warn(*done.said)
-        if save_world is not None:
-            write_world(save_world, heard.scenario, config)
-        if save_log is not None:
+        if world is not None:
+            world.replace(world_files(heard.scenario, config))
+        if log is not None:
             scans = {trial.strategy: trial.scans for trial in done.trials}
-            _save_log(save_log, heard, scans.get("fused", done.trials[0].scans))
-        return delivery.deliver(folder, done, output, watch)
+            log.replace(_log_files(heard, scans.get("fused", done.trials[0].scans)))
+        return delivery.deliver(own, done, output, watch)
 
 
-def _check_saved(log: Path | None, world: Path | None, output: OutputOptions) -> None:
-    """Refuse to write a log or a world over anything else, or both into one folder."""
-    from pipistrelle.detection.logs import folder as log_folder
-    from pipistrelle.experiments.hearing import world_folder
-    from pipistrelle.experiments.runs import truth_files
-
-    if log is not None:
-        _check_vacant("--save-log", log, LOG, (*log_folder.FILES, *truth_files.FILES), output)
-    if world is not None:
-        _check_vacant("--save-world", world, WORLD, world_folder.FILES, output)
-    if log is not None and world is not None and log.resolve() == world.resolve():
-        raise InputError(f"--save-world: {world} is that of --save-log; name another")
+def _claimed(flag: str, folder: Path | None, kind: Kind, overwrite: bool) -> OwnFiles | None:
+    """Accept a folder that a flag names besides that of the results."""
+    if folder is None:
+        return None
+    return claim(folder, kind, overwrite=overwrite, flags=(f"{flag} DIR", "--overwrite"))
 
 
-def _check_vacant(
-    flag: str, folder: Path, kind: str, names: Sequence[str], output: OutputOptions
-) -> None:
-    """Refuse a folder in which anything but what we wrote of a kind would be replaced."""
-    if output.output is not None and folder.resolve() == output.output.resolve():
-        raise InputError(f"{flag}: {folder} is the result folder; name another")
-    if not folder.exists() or not any(folder.iterdir()):
-        return
-    if not output.overwrite:
-        raise InputError(f"{flag}: {folder} is not empty; name a new folder or add --overwrite")
-    if not (own := OwnFiles(folder, kind)):
-        what = kind.removeprefix("a ")
-        raise InputError(
-            f"{flag}: {folder} is not empty and holds no {what} of Pipistrelle (its SHA256SUMS "
-            "would name it), so nothing in it was overwritten; name a new folder"
-        )
-    own.check(names)
+def _check_apart(**folders: Path | None) -> None:
+    """Refuse to write two things into one folder, by the flags that name it."""
+    seen: dict[Path, str] = {}
+    for name, folder in folders.items():
+        flag = f"--{name.replace('_', '-')}"
+        if folder is None:
+            continue
+        if (other := seen.setdefault(folder.resolve(), flag)) != flag:
+            raise InputError(f"{flag}: {folder} is that of {other}; name another")
 
 
-def _save_log(folder: Path, mission: "Mission", scans: "Sequence[Scan]") -> None:
-    """Write what was heard as a log, and the truth beside it."""
-    from pipistrelle.detection.logs.folder import write_log
-    from pipistrelle.experiments.runs.truth_files import write_truth
+def _log_files(mission: "Mission", scans: "Sequence[Scan]") -> dict[str, str]:
+    """Return what was heard as a log, and the truth beside it."""
+    from pipistrelle.detection.logs.folder import log_files
+    from pipistrelle.experiments.runs.truth_files import truth_files
 
-    try:
-        write_log(folder, _log(mission, scans))
-        write_truth(folder, mission.drive.truth)
-    except BaseException:  # half a log is none
-        with contextlib.suppress(InputError):
-            OwnFiles(folder, LOG).clear()
-        raise
+    return truth_files(mission.drive.truth) | log_files(_log(mission, scans))
 
 
 def _log(mission: "Mission", scans: "Sequence[Scan]") -> "Log":

@@ -17,8 +17,13 @@ class Interrupted(KeyboardInterrupt):
 
 
 @contextmanager
-def heard_signals() -> Iterator[list[int]]:
+def heard_signals(*, last: bool = False) -> Iterator[list[int]]:
     """Let signals that ask for an end interrupt what is done, so that it is ended in order.
+
+    Parameters
+    ----------
+    last : bool
+        Whether nothing is left to be interrupted afterwards: signals are then ignored.
 
     Yields
     ------
@@ -48,4 +53,4 @@ def heard_signals() -> Iterator[list[int]]:
         yield heard
     finally:
         for ending, handler in before.items():
-            signal.signal(ending, handler)
+            signal.signal(ending, signal.SIG_IGN if last else handler)

@@ -99,7 +99,7 @@ def slam(
     settled, overruled = with_log(layer, recorded, log)
     warn(*overruled, *beforehand(recorded, truth, log))
     check_room(recorded, ways, settled)
-    with delivery.result_folder(output, "slam") as folder:
+    with delivery.result_folder(output, "slam") as own:
         delivery.get_ready(output)
         watch = delivery.recorder(output)
         beam = None if beamwidth is None else radians(beamwidth)
@@ -107,7 +107,7 @@ def slam(
         with progress(output.quiet) as show:
             done = solved(log, robot, (recorded, truth), *asked, progress=show, watch=watch)
         warn(*done.said)
-        return delivery.deliver(folder, done, output, watch)
+        return delivery.deliver(own, done, output, watch)
 
 
 def _layer(

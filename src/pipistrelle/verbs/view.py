@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from pipistrelle.config import InputError
-from pipistrelle.files import RESULTS, OwnFiles, write_whole
+from pipistrelle.files import write_whole
+from pipistrelle.own_files import RESULTS, OwnFiles
 
 if TYPE_CHECKING:
     from pipistrelle.figures.player.playback import Playback
@@ -46,6 +47,16 @@ def view(
             help="Where the log is that was solved, if it was moved. [default: where it was]",
         ),
     ] = None,
+    estimator: Annotated[
+        tuple[str, ...],
+        Parameter(
+            name="--filter",
+            metavar="MODULE:CLASS",
+            negative=(),
+            help="Run this code, an estimator of your own that the mission was done with. Code "
+            "that a folder names is not run unless you name it, too. [default: none]",
+        ),
+    ] = (),
     overwrite: Annotated[
         bool, Parameter(negative=(), help="Replace a FILE that is there already.")
     ] = False,
@@ -65,18 +76,20 @@ def view(
     from pipistrelle.figures.player.page import page
     from pipistrelle.verbs.streams import put
 
-    played = _play_again(folder, log, quiet)
+    played = _play_again(folder, log, estimator, quiet)
     if rerun is not None:
         from pipistrelle.figures.player.rerun_file import recording
 
-        _write(rerun, folder, recording(played))
-    _write(target, folder, page(played).encode())
+        _write(rerun, folder, recording(played), overwrite)
+    _write(target, folder, page(played).encode(), overwrite)
     if rerun is not None and not quiet:
         put(rerun)
     put(target)
 
 
-def _play_again(folder: Path, log: Path | None, quiet: bool) -> "Playback":
+def _play_again(
+    folder: Path, log: Path | None, trusted: tuple[str, ...], quiet: bool
+) -> "Playback":
     """Do the mission again, and lay out what was seen of it."""
     from pipistrelle.experiments.runs.again import again
     from pipistrelle.figures.player.playback import playback
@@ -89,7 +102,7 @@ def _play_again(folder: Path, log: Path | None, quiet: bool) -> "Playback":
     delivery.get_ready(OutputOptions(quiet=quiet))
     watch = MissionRecorder(rest=REST)
     with progress(quiet) as show:
-        done = again(folder, log=log, progress=show, watch=watch)
+        done = again(folder, log=log, trusted=trusted, progress=show, watch=watch)
     if done.difference:
         warn(f"{done.difference}; what is shown is found now")
     return playback(done, watch.snapshots)
@@ -121,15 +134,14 @@ def _is_in(path: Path, folder: Path) -> bool:
     return path.parent.resolve() == folder.resolve()
 
 
-def _write(path: Path, folder: Path, data: bytes) -> None:
+def _write(path: Path, folder: Path, data: bytes, overwrite: bool) -> None:
     """Write a file that is whole or not there; in the result folder, as one of its own."""
     if _is_in(path, folder):
-        OwnFiles(folder, RESULTS).write(path.name, data)
+        OwnFiles(folder, RESULTS).add(path.name, data)
         return
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, data)
+        write_whole(path, data, replace=overwrite)
     except OSError as error:
-        raise InputError(
-            f"{path}: could not be written ({error.strerror}); make room or name another file"
-        ) from error
+        fix = "make room or name another file"
+        raise InputError(f"{path}: could not be written ({error.strerror}); {fix}") from error

@@ -11,7 +11,7 @@ from pipistrelle.experiments.comparing.folders import kind_of
 from pipistrelle.experiments.comparing.missions import compare_missions, notes_of, path_view
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
 from pipistrelle.experiments.results.stored import StoredPath
-from pipistrelle.files import RESULTS, OwnFiles
+from pipistrelle.own_files import RESULTS, OwnFiles
 from reference.results import PLACES, STEPS, TIME, TRUTH, loop, mission_folder, turned
 
 OFF = turned(loop(), 0.1, (0.5, -0.2))
@@ -201,7 +201,7 @@ def test_which_logs_were_solved_and_how_is_named_where_it_differs(folders):
         own = OwnFiles(folder, RESULTS)
         told = json.loads(own.read("summary.json"))
         told["log"] = {"path": path, "robot": None, "beamwidth_rad": beam, "files": {path: "00"}}
-        own.write("summary.json", json.dumps(told))
+        own.add("summary.json", json.dumps(told).encode())
     settings = compare_missions([one, two]).settings
     assert settings["log.path"] == ("here", "there")
     assert settings["log.beamwidth_rad"] == (0.5, None)

@@ -18,7 +18,7 @@ from pipistrelle.experiments.comparing.writing import (
     write_comparison,
 )
 from pipistrelle.experiments.studies.plan import Plan
-from pipistrelle.files import COMPARISON, SUMS, OwnFiles
+from pipistrelle.own_files import COMPARISON, SUMS, OwnFiles
 from reference.results import loop, mission_folder, study_folder, turned
 
 OFF = turned(loop(), 0.1, (0.5, -0.2))
@@ -100,15 +100,14 @@ def test_a_comparison_is_written_with_its_sums_and_says_what_it_is(kind, request
     def draw(room):
         (room / "comparison.png").write_bytes(b"picture")
 
-    write_comparison(
-        folder, compared, command="pipistrelle compare one", notes=["A note."], draw=draw
-    )
+    given = {"command": "pipistrelle compare one", "notes": ["A note."], "draw": draw}
+    write_comparison(OwnFiles(folder, COMPARISON), compared, **given)
     names = sorted(path.name for path in folder.iterdir())
     assert names == [
         "README.md", "SHA256SUMS", "comparison.csv", "comparison.parquet", "comparison.png",
         "settings.csv",
     ]  # fmt: skip
-    assert OwnFiles(folder, COMPARISON).there == COMPARISON
+    assert OwnFiles(folder, COMPARISON).there == COMPARISON.title
     assert (folder / SUMS).read_text().startswith("# Of Pipistrelle: a comparison\n")
     table = comparison_table(compared)
     assert pl.read_parquet(folder / "comparison.parquet").equals(table)
@@ -121,11 +120,11 @@ def test_a_comparison_is_written_with_its_sums_and_says_what_it_is(kind, request
 def test_what_a_user_changed_in_an_earlier_comparison_is_not_replaced(missions, tmp_path):
     folder = tmp_path / "out"
     given = {"command": "", "notes": ()}
-    write_comparison(folder, missions, **given)
-    write_comparison(folder, missions, **given)
+    write_comparison(OwnFiles(folder, COMPARISON), missions, **given)
+    write_comparison(OwnFiles(folder, COMPARISON), missions, **given)
     (folder / "comparison.csv").write_text("mine")
     with pytest.raises(InputError, match=r"comparison\.csv: was changed since"):
-        write_comparison(folder, missions, **given)
+        write_comparison(OwnFiles(folder, COMPARISON), missions, **given)
     assert (folder / "comparison.csv").read_text() == "mine"
     assert (folder / "README.md").exists()
 

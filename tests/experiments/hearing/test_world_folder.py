@@ -20,10 +20,11 @@ from pipistrelle.experiments.hearing.world_folder import (
     named_world,
     read_world,
     settled,
-    write_world,
+    world_files,
 )
 from pipistrelle.experiments.hearing.worlds import ANY, World
 from pipistrelle.experiments.runs.preparing import prepared
+from pipistrelle.own_files import WORLD, OwnFiles
 from pipistrelle.settings import from_flags, resolve
 
 LANDMARKS = "landmark,x,y\n1,2.5,0\n2,-1,4\n"
@@ -49,7 +50,7 @@ def test_a_world_that_was_drawn_is_read_back_to_the_bit(tmp_path, model):
         motion=MotionConfig(model=model),
     )
     drawn = world_of(config, 5)
-    write_world(tmp_path / "w", drawn, config)
+    OwnFiles(tmp_path / "w", WORLD).replace(world_files(drawn, config))
     layer = from_flags({"scenario": {"world": str(tmp_path / "w")}, "seed": 99})
     world = named_world(layer)
     again_config = resolve(settled(world, layer))
@@ -66,7 +67,7 @@ def test_the_world_of_a_second_vehicle_is_read_back_as_that_of_the_first_and_onl
     pair = (CallerConfig(name="mate", course="mission"),)
     config = Config(callers=pair, scenario=ScenarioConfig(steps=80, landmarks=12, vehicle=2))
     drawn = world_of(config, 5)
-    write_world(tmp_path / "w", drawn, config)
+    OwnFiles(tmp_path / "w", WORLD).replace(world_files(drawn, config))
     layer = from_flags({"scenario": {"world": str(tmp_path / "w")}})
     world = named_world(layer)
     again_config = resolve(settled(world, layer))
@@ -90,7 +91,7 @@ def test_bodies_and_routes_are_read_back_too(tmp_path):
         ),
         bodies=Bodies(radius=np.array([0.1, 0.3]), sphere=np.array([True, False])),
     )
-    write_world(tmp_path / "w", drawn, Config())
+    OwnFiles(tmp_path / "w", WORLD).replace(world_files(drawn, Config()))
     again = heard(Config(scenario=ScenarioConfig(steps=8)), read_world(tmp_path / "w"))
     np.testing.assert_array_equal(again.bodies.radius, [0.1, 0.3])
     assert again.bodies.sphere.tolist() == [True, False]
@@ -207,7 +208,7 @@ def test_a_caller_of_any_name_is_written_without_harm_to_the_worlds_files(tmp_pa
     scenario = from_flags({"scenario": {"steps": 8, "landmarks": 5}, "callers": callers})
     config = resolve(scenario)
     drawn = world_of(config, 2)
-    write_world(tmp_path / "w", drawn, config)
+    OwnFiles(tmp_path / "w", WORLD).replace(world_files(drawn, config))
     again = heard(Config(scenario=config.scenario), read_world(tmp_path / "w"))
     assert [caller.name for caller in again.callers] == ["vehicle", "path", "landmarks"]
     assert again.path.tobytes() == drawn.path.tobytes()
@@ -225,7 +226,7 @@ def test_there_may_be_nobody_else_who_calls(tmp_path):
 
 def test_a_header_alone_says_that_nothing_reflects(tmp_path):
     bare = world_of(Config(scenario=ScenarioConfig(steps=8, landmarks=0)), 0, ANY)
-    write_world(tmp_path / "bare", bare, Config())
+    OwnFiles(tmp_path / "bare", WORLD).replace(world_files(bare, Config()))
     assert len(read_world(tmp_path / "bare").landmarks) == 0
 
 

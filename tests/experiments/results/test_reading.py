@@ -6,7 +6,7 @@ import pytest
 
 from pipistrelle.config import InputError
 from pipistrelle.experiments.results.reading import read_summary
-from pipistrelle.files import COMPARISON, WORLD, OwnFiles
+from pipistrelle.own_files import COMPARISON, WORLD, OwnFiles
 
 SOUND = {
     "format": 1,
@@ -62,8 +62,8 @@ def test_another_folder_is_told_what_it_is_and_what_to_do(tmp_path, files, said)
 
 @pytest.mark.parametrize("kind", [COMPARISON, WORLD])
 def test_another_folder_of_ours_is_told_by_its_kind(tmp_path, kind):
-    OwnFiles(tmp_path, kind).write("summary.csv", "one")
-    assert f"{tmp_path}: found {kind} of Pipistrelle, expected the result" in refused(tmp_path)
+    OwnFiles(tmp_path, kind).replace({"README.md": "one"})
+    assert f"{tmp_path}: found {kind.title} of Pipistrelle, expected" in refused(tmp_path)
 
 
 def test_a_summary_that_is_cut_is_no_json(tmp_path):

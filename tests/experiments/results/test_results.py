@@ -20,6 +20,7 @@ from pipistrelle.evaluation.accuracy import alignment, moved, position_error, rm
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
 from pipistrelle.experiments.results.scores import Scores, TrialResult, score
 from pipistrelle.experiments.results.writing import config_hash, write_results
+from pipistrelle.own_files import RESULTS, OwnFiles
 from reference.missions import map_with, scan_with
 
 STEPS = 400
@@ -104,7 +105,7 @@ def write(folder, *trials, truth=TRUTH, **changes):
         "truth": truth,
         "ignored_rows": {},
     }
-    write_results(folder, **(arguments | changes))
+    write_results(OwnFiles(folder, RESULTS), **(arguments | changes))
     return json.loads((folder / "summary.json").read_text())
 
 
@@ -310,14 +311,13 @@ def test_a_folder_that_has_gone_is_an_input_error_and_leaves_no_summary(tmp_path
         write(tmp_path / "file" / "below", trial(drifting_track()))
 
 
-def test_the_summary_is_written_last(tmp_path):
+def test_pictures_for_which_there_is_no_room_leave_nothing(tmp_path):
     def draw(room):
         raise OSError(28, "No space left on device")
 
-    with pytest.raises(InputError, match=r"could not be written \(No space left on device\)"):
+    with pytest.raises(InputError, match=r"could not be drawn there \(No space left on device\)"):
         write(tmp_path, trial(drifting_track()), draw=draw)
-    assert (tmp_path / "steps.parquet").exists()
-    assert not (tmp_path / "summary.json").exists()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_evo_reads_the_files_untouched_and_finds_our_errors(tmp_path):

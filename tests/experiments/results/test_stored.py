@@ -10,8 +10,8 @@ import pytest
 from pipistrelle.config import Config, InputError
 from pipistrelle.experiments.drives import NO_TRUTH
 from pipistrelle.experiments.results.stored import read_mission
-from pipistrelle.files import LOG, SUMS, OwnFiles
 from pipistrelle.geometry import wrap
+from pipistrelle.own_files import LOG, SUMS, OwnFiles
 from reference.results import PLACES, TIME, TRUTH, loop, mission_folder, turned
 
 PATHS = {("fused", "ekf"): loop(), ("active", "mine:Own"): turned(loop(), 0.2)}
@@ -73,7 +73,7 @@ def test_a_folder_that_holds_something_else_is_named_as_what_it_is(tmp_path):
     (tmp_path / "empty").mkdir()
     refused(tmp_path / "empty", "found no summary.json")
     OwnFiles(tmp_path / "log", LOG).folder.mkdir()
-    OwnFiles(tmp_path / "log", LOG).write("log.toml", "format = 1")
+    OwnFiles(tmp_path / "log", LOG).replace({"log.toml": "format = 1"})
     refused(tmp_path / "log", "found a recorded log")
 
 
@@ -90,10 +90,10 @@ def test_a_file_that_is_changed_cut_or_gone_is_named(folder, name):
     none = f"{folder}: found no summary.json"
     refused(folder, none if name == "summary.json" else f"{folder / name}: is missing")
     (folder / name).mkdir()
-    refused(folder, f"{folder / name}: is no file")
+    refused(folder, f"{folder / name}: found a folder")
     (folder / name).rmdir()
     os.mkfifo(folder / name)
-    refused(folder, f"{folder / name}: is no file")
+    refused(folder, f"{folder / name}: found a pipe or a device")
 
 
 def test_files_that_nothing_is_read_from_may_be_changed(folder):

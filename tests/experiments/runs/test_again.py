@@ -202,7 +202,10 @@ def test_settings_that_are_none_are_refused_where_they_stand(folders):
 def test_a_device_in_place_of_a_file_is_refused_by_name(folders, name):
     Path("run", name).unlink()
     Path("run", name).symlink_to("/dev/null")  # a pipe would be waited for without an end
-    assert refused("run") == f"run/{name}: is no file; remove what stands in its place"
+    assert refused("run") == (
+        f"run/{name}: found a pipe or a device, expected a file; remove what stands in its place, "
+        "or copy it into a file"
+    )
 
 
 def test_a_device_in_place_of_a_track_is_told(folders):

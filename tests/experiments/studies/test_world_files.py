@@ -21,6 +21,7 @@ from pipistrelle.experiments.studies.world_files import (
     world_file,
     write_world,
 )
+from pipistrelle.files import write_down
 from pipistrelle.settings import from_flags, resolve
 from reference.studies import contents, leftovers
 
@@ -54,11 +55,15 @@ def test_a_full_disk_ends_in_a_clear_error_and_leaves_what_was_there(
 ):
     write_world(folder, plan, 1, records)
     before = contents(folder)
-    partial = f".{'0' * 8}.partial"
-    monkeypatch.setattr(world_files, "uuid4", lambda: type("Same", (), {"hex": "0" * 32}))
+
+    def full(path, data):
+        if path.parent.name == table:
+            path.write_bytes(data[:7])
+            raise OSError(28, "No space left on device")
+        write_down(path, data)
+
+    monkeypatch.setattr(world_files, "write_down", full)
     for iteration in (0, 1):
-        path = world_file(folder, table, iteration)
-        path.with_name(path.name + partial).symlink_to("/dev/full")
         with pytest.raises(InputError, match=r"could not be written \(No space left on device\)"):
             write_world(folder, plan, iteration, failed_records(plan, "never written\n"))
     assert contents(folder) == before

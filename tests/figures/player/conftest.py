@@ -10,6 +10,7 @@ from pipistrelle.experiments.runs.again import again
 from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.figures.player.playback import playback
 from pipistrelle.figures.recorder import MissionRecorder
+from pipistrelle.own_files import RESULTS, OwnFiles
 
 FRAMES = 40
 
@@ -21,7 +22,7 @@ def watched(tmp_path_factory):
     first = run_mission(config, ("active", "fused", "passive"), ("ekf", "fastslam"))
     folder = Path(tmp_path_factory.mktemp("mission"))
     write_results(
-        folder, config=config, command="", seed=7, trials=first.trials,
+        OwnFiles(folder, RESULTS), config=config, command="", seed=7, trials=first.trials,
         truth=first.drive.truth, ignored_rows={},
     )  # fmt: skip
     watch = MissionRecorder(rest=3)

@@ -16,7 +16,7 @@ from pipistrelle.config import InputError
 from pipistrelle.experiments.studies.plan import cases_of
 from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
 from pipistrelle.experiments.studies.world_files import TABLES, done_worlds, with_sums, world_file
-from pipistrelle.files import LOG, RESULTS, OwnFiles
+from pipistrelle.own_files import LOG, REPORT, RESULTS, OwnFiles
 from pipistrelle.report.claims.published import TABLE_II
 from pipistrelle.report.page.page import write_report
 from pipistrelle.report.reading import read_study
@@ -101,17 +101,23 @@ def test_everything_is_there(reported):
     assert names == sorted(f"{name}.{kind}" for name in FIGURES for kind in ("csv", "pdf", "png"))
 
 
-@pytest.mark.parametrize("name", ["index.html", "summary.json", "figures/gain.png"])
+@pytest.mark.parametrize("name", ["index.html", "summary.json", "figures/gain.csv"])
 def test_a_users_file_in_the_place_of_the_reports_is_refused_by_name(
     store, tmp_path, undrawn, name
 ):
     site = tmp_path / "site"
     (site / name).parent.mkdir(parents=True)
     (site / name).write_text("mine")
-    with pytest.raises(InputError, match=f"{name}: is not Pipistrelle's, so it is not replaced"):
+    with pytest.raises(InputError, match="site: is not empty and holds no report of Pipistrelle"):
         write_report(read_study(store), site)
     assert [path for path in site.rglob("*") if path.is_file()] == [site / name]
+    shutil.rmtree(site)
+    OwnFiles(site, REPORT).replace({"figures/other.png": "an earlier report's"})
+    (site / name).write_text("mine")
+    with pytest.raises(InputError, match=f"{name}: is not Pipistrelle's, so it is not replaced"):
+        write_report(read_study(store), site)
     assert (site / name).read_text() == "mine"
+    assert (site / "figures" / "other.png").exists()
 
 
 def test_a_report_is_written_anew_in_its_own_place(store, tmp_path, undrawn):
@@ -359,15 +365,14 @@ def test_a_stored_study_of_a_filter_that_is_not_installed_can_be_read(store, tmp
         name = pl.col("filter").replace("fastslam", "no_such_module:Slam")
         changed = tables | {"trials": tables["trials"].with_columns(name)}
         paths["trials"].write_bytes(with_sums(changed, plan, world)["trials"])
-    write_report(read_study(folder), tmp_path)
-    assert panels_of(tmp_path, "map_rmse") == ["EKF", "Slam"]
+    write_report(read_study(folder), tmp_path / "report")
+    assert panels_of(tmp_path / "report", "map_rmse") == ["EKF", "Slam"]
 
 
 def test_a_report_never_takes_the_place_of_results_or_of_a_log(store, tmp_path, undrawn):
     for kind in (RESULTS, LOG):
-        folder = tmp_path / kind
-        folder.mkdir()
-        OwnFiles(folder, kind).write("summary.json", "precious")
-        with pytest.raises(InputError, match=f"holds {kind} of Pipistrelle, which a"):
+        folder, name = tmp_path / kind.title, kind.names[0]
+        OwnFiles(folder, kind).replace({name: "precious"})
+        with pytest.raises(InputError, match=f"holds {kind.title} of Pipistrelle, which a"):
             write_report(read_study(store), folder)
-        assert (folder / "summary.json").read_text() == "precious"
+        assert (folder / name).read_text() == "precious"

@@ -29,8 +29,9 @@ from pipistrelle.detection.logs.recording import (
     LogCaller,
     assemble,
 )
-from pipistrelle.detection.logs.text_tables import read_table, read_text, table_text
-from pipistrelle.files import LOG, OwnFiles
+from pipistrelle.detection.logs.text_tables import read_table, table_text
+from pipistrelle.files import read_text
+from pipistrelle.own_files import LOG, OwnFiles
 from pipistrelle.refusals import expectation, meant, refusal, shown, values_expected
 from pipistrelle.settings import parse_toml
 
@@ -49,8 +50,6 @@ _NOISY = {
 _ODOMETRY = _NOISY | {"poses": POSE}
 """Columns of a row of odometry, besides its time."""
 
-FILES = ("odometry.csv", "measurements.csv", "README.md", "log.toml")
-"""A log's, in the order in which they are written."""
 _README = """A recorded log of Pipistrelle. Replay it with: pipistrelle slam FOLDER
 
 log.toml          motion model, start and noise; m, s, rad; _std are standard deviations
@@ -261,10 +260,13 @@ def write_log(folder: Path, log: Log) -> None:
     0.0,1.0,0.2
     0.1,0.0,0.0
     """
+    OwnFiles(folder, LOG).replace(log_files(log))
+
+
+def log_files(log: Log) -> dict[str, str]:
+    """Return the files of a log's folder; ``log.toml`` is the last."""
     import tomli_w
 
-    own = OwnFiles(folder, LOG)
-    own.clear(FILES)
     settings: dict[str, Any] = {"format": 1} | {name: getattr(log, name) for name in _SHARED}
     settings["callers"] = [asdict(caller) for caller in log.callers]
     stds = zip(_NOISY[log.motion], log.control_std, strict=True)
@@ -274,14 +276,16 @@ def write_log(folder: Path, log: Log) -> None:
     model = _SETTINGS[log.motion].model_validate(settings)
     text = tomli_w.dumps(model.model_dump(mode="json", exclude_defaults=True, exclude_none=True))
     driven = _odometry_columns(log)
-    own.write("odometry.csv", table_text(tuple(driven), *driven.values()))
     measured = _measurement_columns(log)
-    own.write("measurements.csv", table_text(tuple(measured), *measured.values()))
     columns = {"odometry": ",".join(driven), "measurements": ",".join(measured)}
     held = _FOLLOWED if log.motion == "poses" else _HELD
     more = _DETOURS if "detour" in measured else ""
-    own.write("README.md", _README.format(**columns, held=held) + more)
-    own.write("log.toml", text)
+    return {
+        "odometry.csv": table_text(tuple(driven), *driven.values()),
+        "measurements.csv": table_text(tuple(measured), *measured.values()),
+        "README.md": _README.format(**columns, held=held) + more,
+        "log.toml": text,
+    }
 
 
 def _read_settings(path: Path) -> _Settings:

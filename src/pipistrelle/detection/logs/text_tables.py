@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import LARGEST
 from pipistrelle.detection.scans import UNLABELLED
-from pipistrelle.refusals import refusal, shown
+from pipistrelle.files import read_text
+from pipistrelle.refusals import refusal
 
 _LABELS = ("landmark", "subject", "barcode")
 _LEAST_STD = 1e-6  # of either noise: what is told more precisely leaves nothing to solve with
@@ -204,30 +205,6 @@ def check_unique(table: Table, *names: str, besides: str | None = None) -> None:
         where = f"{table.path}, line {table.line[later]}"
         expected = f"it once, as in line {table.line[earlier]}"
         raise refusal(where, f"{', '.join(values)} again", expected, "remove one of the rows")
-
-
-def read_text(path: Path) -> str:
-    """Return the text of a file, or refuse it."""
-    try:
-        if path.exists() and not (path.is_file() or path.is_dir()):  # a pipe may never end
-            fix = "put the rows into a file of their own"
-            raise refusal(path, "a pipe or a device", "a readable text file", fix)
-        return path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        found = "a link to no file" if path.is_symlink() else "no such file"
-        fix = "add it, or name the folder that holds it"
-        raise refusal(path, found, "a readable text file", fix) from None
-    except UnicodeDecodeError:
-        raise refusal(path, "bytes that are no text", "UTF-8 text", "save it as UTF-8") from None
-    except (OSError, ValueError) as error:  # a ValueError is of a name that no file can have
-        found, fix = getattr(error, "strerror", error), "check the path and its permissions"
-        raise refusal(_printable(path), str(found), "a readable text file", fix) from None
-
-
-def _printable(path: Path) -> str:
-    """Return a path as it is, or shown, where it is of no file's length or letters."""
-    text = str(path)
-    return text if text.isprintable() and len(text) < 4096 else shown(text)
 
 
 def _numbered(

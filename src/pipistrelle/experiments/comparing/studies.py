@@ -31,6 +31,7 @@ from pipistrelle.experiments.studies.plan import RADIUS, Plan, PlannedCase, case
 from pipistrelle.experiments.studies.plan_file import plan_settings
 from pipistrelle.experiments.studies.store import load_study
 from pipistrelle.experiments.studies.world_files import check_world, done_worlds
+from pipistrelle.files import read_file
 
 if TYPE_CHECKING:
     import polars as pl
@@ -365,8 +366,8 @@ def _mean(numbers: Float[np.ndarray, " n"]) -> float:
 def _version(folder: Path) -> str:
     """Return which version wrote a study, as its README says; nothing where it does not."""
     try:
-        text = (folder / "README.md").read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
+        text = read_file(folder / "README.md").decode()
+    except (OSError, UnicodeDecodeError, InputError):
         return ""
     found = _VERSION.search(text)
     return found[1] if found else ""

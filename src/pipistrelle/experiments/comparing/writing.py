@@ -13,18 +13,12 @@ from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.comparing.folders import LETTERS
 from pipistrelle.experiments.comparing.missions import ComparedMissions
 from pipistrelle.experiments.comparing.studies import ComparedStudies
-from pipistrelle.files import COMPARISON, OwnFiles
+from pipistrelle.own_files import OwnFiles, drawn_files
 
 if TYPE_CHECKING:
     import polars as pl
 
 Compared = ComparedMissions | ComparedStudies
-RESERVED = (
-    *(f"comparison.{ending}" for ending in ("csv", "parquet", "png", "pdf")),
-    "settings.csv",
-    "README.md",
-)
-"""What a comparison's folder may hold."""
 NOT_SCORES = ("strategy", "filter", "ignored_rows", "online")
 """What else an estimate's entry of ``summary.json`` holds."""
 README = """\
@@ -60,7 +54,7 @@ STUDIES = (
 
 
 def write_comparison(
-    folder: Path,
+    own: OwnFiles,
     compared: Compared,
     *,
     command: str,
@@ -71,8 +65,8 @@ def write_comparison(
 
     Parameters
     ----------
-    folder : Path
-        As `results.folder.prepare_folder` gives it.
+    own : OwnFiles
+        The folder, as `pipistrelle.own_files.claim` gives it.
     compared : ComparedMissions or ComparedStudies
     command : str
         The command line, for the reader.
@@ -86,15 +80,8 @@ def write_comparison(
     InputError
         Where a file cannot be written, or one that would be replaced is not as we wrote it.
     """
-    own = OwnFiles(folder, COMPARISON)
-    own.clear(RESERVED)
     buffer, table = io.BytesIO(), comparison_table(compared)
     table.write_parquet(buffer)
-    own.write("comparison.parquet", buffer.getvalue())
-    own.write("comparison.csv", table.write_csv())
-    own.write("settings.csv", settings_table(compared).write_csv())
-    with own.room() as room:
-        draw(room)
     what, figure = MISSIONS if isinstance(compared, ComparedMissions) else STUDIES
     text = README.format(
         command=command,
@@ -105,7 +92,15 @@ def write_comparison(
         table=what,
         figure=figure,
     )
-    own.write("README.md", text)
+    own.replace(
+        {
+            "comparison.parquet": buffer.getvalue(),
+            "comparison.csv": table.write_csv(),
+            "settings.csv": settings_table(compared).write_csv(),
+            **drawn_files(draw),
+            "README.md": text,
+        }
+    )
 
 
 def lettered(folders: Sequence[Path]) -> list[tuple[str, Path]]:

@@ -22,7 +22,6 @@ from pipistrelle.detection.logs.text_tables import (
     Table,
     check_unique,
     read_table,
-    read_text,
     table_text,
 )
 from pipistrelle.estimation.catalogue import SECTIONS
@@ -30,7 +29,7 @@ from pipistrelle.experiments.hearing.courses import Commands, Course, Poses, Way
 from pipistrelle.experiments.hearing.others import routes_read
 from pipistrelle.experiments.hearing.scenario import Scenario
 from pipistrelle.experiments.hearing.worlds import World
-from pipistrelle.files import WORLD, OwnFiles
+from pipistrelle.files import read_file, read_text
 from pipistrelle.refusals import expectation, refusal, shown
 from pipistrelle.settings import (
     CALLERS,
@@ -229,7 +228,7 @@ def read_world(folder: Path) -> World:
         course=course,
         callers=callers,
         settings=settings,
-        files={name: (folder / name).read_bytes() for name in dict.fromkeys([*there, *routes])},
+        files={name: read_file(folder / name) for name in dict.fromkeys([*there, *routes])},
     )
 
 
@@ -254,44 +253,33 @@ def kept_world(config: Config, world: World) -> tuple[Config, dict[str, bytes]]:
     return config.model_copy(update={"scenario": scenario}), files
 
 
-def write_world(folder: Path, scenario: Scenario, config: Config) -> None:
-    """Write a world as it was drawn, so that it can be heard again, or changed.
+def world_files(scenario: Scenario, config: Config) -> dict[str, str]:
+    """Return the files of a world as it was drawn, so that it can be heard again, or changed.
 
-    Parameters
-    ----------
-    folder : Path
-        Made if need be.
-    scenario : Scenario
-    config : Config
-        What is not at its default, and no filter's, stands in ``world.toml``.
-
-    Raises
-    ------
-    InputError
-        Where a file cannot be written, or one in its place is not as we wrote it.
+    Settings that are not at their defaults, and no filter's, stand in ``world.toml``.
     """
     import tomli_w
 
-    own = OwnFiles(folder, WORLD)
-    own.clear((*FILES, "README.md"))
     names = _CONTROLS[config.motion.model]
-    own.write("README.md", _README.format(controls=",".join(names)))
-    own.write("landmarks.csv", _landmark_text(scenario, config.target))
     controls = np.vstack((scenario.controls, np.zeros(2)))
     columns = (scenario.time, *scenario.path.T, *controls.T)
-    own.write("path.csv", table_text((*_POSE, *names), *columns))
-    told = []
+    files = {
+        "README.md": _README.format(controls=",".join(names)),
+        "landmarks.csv": _landmark_text(scenario, config.target),
+        "path.csv": table_text((*_POSE, *names), *columns),
+    }
+    callers = []
     for caller in scenario.callers[VEHICLE + 1 :]:
         row = {"name": caller.name, "frequency": caller.frequency, "level_db": caller.level_db}
         if moves(caller):
             row["route"] = f"caller_{caller.name}.csv"
             route = table_text(("time", "x", "y"), scenario.time, *np.asarray(caller.place).T)
-            own.write(row["route"], route)
+            files[row["route"]] = route
         else:
             row["place"] = np.asarray(caller.place).tolist()
-        told.append(row)
-    head = {"format": 1, "config": _own_settings(config), "callers": told}
-    own.write("world.toml", tomli_w.dumps(head))
+        callers.append(row)
+    head = {"format": 1, "config": _own_settings(config), "callers": callers}
+    return files | {"world.toml": tomli_w.dumps(head)}
 
 
 def _refuse_misspelt(folder: Path, there: Sequence[str]) -> None:

@@ -1,126 +1,96 @@
-"""A folder for results: made, or refused."""
+"""The folder that results go to: the one that was named, or a new one under ``runs``."""
 
 import contextlib
-from collections.abc import Sequence
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import datetime
 from itertools import count
 from pathlib import Path
-from tempfile import TemporaryFile
-from typing import get_args
 
-from pipistrelle.config import InputError, Strategy
-from pipistrelle.files import RESULTS, OwnFiles
+from pipistrelle.config import InputError
+from pipistrelle.files import partial_of
+from pipistrelle.own_files import COMMAND_LINE, RESULTS, OwnFiles, claim, make_folder, remove_empty
 
-RESERVED = (
-    "config.toml",
-    "README.md",
-    *(f"track_{strategy}_*.tum" for strategy in get_args(Strategy)),
-    *(f"map_{strategy}_*.csv" for strategy in get_args(Strategy)),
-    "caller_*.tum",
-    "truth.tum",
-    "truth_*.tum",
-    "steps.parquet",
-    "landmarks.parquet",
-    "measurements.parquet",
-    *(f"mission.{ending}" for ending in ("png", "pdf", "gif", "mp4")),
-    "summary.json",
-)
-"""What a result folder may hold: another's file of such a name is in the way."""
+_OURS = re.compile(r"\d{8}-\d{6}-(run|slam)(-\d+)?")
+"""Names that `result_folder` gives."""
 
 
-def prepare_folder(
-    path: Path | None,
-    name: str,
-    overwrite: bool,
-    *,
-    kind: str = RESULTS,
-    reserved: Sequence[str] = RESERVED,
-) -> Path:
-    """Make the folder that the results go to, and see that it can be written.
+@contextmanager
+def result_folder(
+    path: Path | None, name: str, *, overwrite: bool, flags: tuple[str, str] = COMMAND_LINE
+) -> Iterator[OwnFiles]:
+    """Lend the folder that the results go to; nothing is left of it if there come to be none.
 
-    Without a path it is ``runs/<time>-<name>``, and ``runs/latest`` comes to point at it where
-    the file system has symbolic links.
+    Without a path it is ``runs/<time>-<name>``, and once it is whole ``runs/latest`` points at it,
+    where the file system has symbolic links and nobody else's file has that name.
 
     Parameters
     ----------
     path : Path, optional
-        The folder itself.
-    name : str
-        What ran.
+    name : "run" or "slam"
+        What runs.
     overwrite : bool
-        Accept a folder of earlier results, by their ``SHA256SUMS`` (`pipistrelle.files`). They
-        stay until `write_results` makes way for the new ones.
-    kind : str
-        What is to stand there, as `pipistrelle.files` has it.
-    reserved : sequence of str
-        Patterns of names that it may use.
-
-    Returns
-    -------
-    Path
+        Whether earlier results may be replaced. They stay until the new ones are whole.
+    flags : str, str
+        As of `pipistrelle.own_files.claim`.
 
     Raises
     ------
     InputError
-        Where the folder is not empty, is not a folder or cannot be written; where what would be
-        replaced is not as we wrote it.
+        As `pipistrelle.own_files.claim`.
 
     Examples
     --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as parent:
-    ...     prepare_folder(Path(parent) / "one" / "two", "run", overwrite=False).is_dir()
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as parent:
+    ...     with result_folder(Path(parent) / "one", "run", overwrite=False) as own:
+    ...         own.replace({"summary.json": "{}"})
+    ...     own.folder.is_dir()
     True
     """
+    if path is not None:
+        yield claim(path, RESULTS, overwrite=overwrite, flags=flags)
+        return
+    made = _new_folder(name)
     try:
-        folder = (
-            _new_folder(name) if path is None else _chosen_folder(path, overwrite, kind, reserved)
-        )
-        TemporaryFile(dir=folder).close()
+        yield claim(made[0], RESULTS, overwrite=False)
+        _point_latest_at(made[0])
+    finally:
+        remove_empty(made)
+
+
+def _new_folder(name: str) -> list[Path]:
+    """Make ``runs/<time>-<name>``; return it, and ``runs`` if that was missing."""
+    runs = Path("runs")
+    try:
+        made = make_folder(runs)[:1]
+        stem = f"{datetime.now():%Y%m%d-%H%M%S}-{name}"
+        for attempt in count(1):
+            folder = runs / (stem if attempt == 1 else f"{stem}-{attempt}")
+            with contextlib.suppress(FileExistsError):
+                folder.mkdir()
+                break
+        return [folder, *made]
     except OSError as error:
         raise InputError(
-            f"{path or 'runs'}: cannot be used as a result folder ({error.strerror}); "
-            "name a folder that can be written with -o DIR"
+            f"{runs}: cannot be used as a folder for results ({error.strerror}); name one that "
+            f"can be written with {COMMAND_LINE[0]}"
         ) from error
-    return folder
 
 
-def _new_folder(name: str) -> Path:
-    """Make ``runs/<time>-<name>`` and point ``runs/latest`` at it."""
-    runs = Path("runs")
-    runs.mkdir(exist_ok=True)
-    stem = f"{datetime.now():%Y%m%d-%H%M%S}-{name}"
-    for attempt in count(1):
-        folder = runs / (stem if attempt == 1 else f"{stem}-{attempt}")
-        with contextlib.suppress(FileExistsError):
-            folder.mkdir()
-            break
-    link = runs / f"{folder.name}.partial"
+def _point_latest_at(folder: Path) -> None:
+    """Have ``runs/latest`` point at a folder, unless it is somebody else's."""
+    latest = folder.parent / "latest"
+    if os.path.lexists(latest) and not (
+        latest.is_symlink() and _OURS.fullmatch(str(latest.readlink()))
+    ):
+        return
+    link = partial_of(latest)
     with contextlib.suppress(OSError):
         link.symlink_to(folder.name, target_is_directory=True)
         try:
-            link.replace(runs / "latest")
+            link.replace(latest)
         finally:
             link.unlink(missing_ok=True)
-    return folder
-
-
-def _chosen_folder(folder: Path, overwrite: bool, kind: str, reserved: Sequence[str]) -> Path:
-    """Make a folder, or accept one of earlier results."""
-    folder.mkdir(parents=True, exist_ok=True)
-    if not any(folder.iterdir()):
-        return folder
-    word = kind.removeprefix("a ")
-    if not overwrite:
-        raise InputError(
-            f"{folder}: is not empty; name a new folder with -o DIR, or add --overwrite "
-            f"to replace the {word} there"
-        )
-    own = OwnFiles(folder, kind)
-    if not own:
-        raise InputError(
-            f"{folder}: is not empty and holds no {word} of Pipistrelle's (its SHA256SUMS would "
-            "name them), so nothing in it was overwritten; name another folder with -o DIR"
-        )
-    own.check(path.name for pattern in reserved for path in folder.glob(pattern))
-    return folder

@@ -7,7 +7,8 @@ from pydantic import BaseModel, ValidationError
 
 from pipistrelle.config import InputError, Strategy
 from pipistrelle.detection.logs.readers import READERS, Robot
-from pipistrelle.files import COMPARISON, RESULTS, WORLD, OwnFiles, check_ordinary
+from pipistrelle.files import read_file
+from pipistrelle.own_files import COMPARISON, RESULTS, WORLD, OwnFiles
 from pipistrelle.refusals import expectation, refusal, shown
 
 SUMMARY = "summary.json"
@@ -96,9 +97,8 @@ def read_summary(folder: Path) -> Summary:
     path = folder / SUMMARY
     if not path.exists() or (folder / "plan.toml").exists():
         raise _no_results(folder)
-    check_ordinary(path)
     try:
-        summary = Summary.model_validate_json(path.read_bytes())
+        summary = Summary.model_validate_json(read_file(path))
     except ValidationError as refused:
         faults = refused.errors(include_url=False)
         if any(fault["loc"] == ("runs",) and fault["type"] == "missing" for fault in faults):
@@ -128,7 +128,7 @@ def _no_results(folder: Path) -> InputError:
         fix = f"`pipistrelle report` puts it on a page; {settings} makes a mission of its settings"
         return refusal(folder, found, expected, fix)
     there = OwnFiles(folder, RESULTS).there
-    if there in (COMPARISON, WORLD):
+    if there in (COMPARISON.title, WORLD.title):
         return refusal(folder, f"{there} of Pipistrelle", expected, "name the folder of a run")
     if (folder / "index.html").exists():
         fix = "open its index.html, or name the folder of a run"

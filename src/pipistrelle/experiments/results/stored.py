@@ -19,7 +19,7 @@ from jaxtyping import Float
 from pipistrelle.config import InputError
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.results.reading import SUMMARY, read_summary
-from pipistrelle.files import RESULTS, SUMS, OwnFiles
+from pipistrelle.own_files import RESULTS, SUMS, OwnFiles
 from pipistrelle.refusals import refusal
 from pipistrelle.settings import leaves
 
@@ -158,7 +158,7 @@ def results_in(folder: Path) -> OwnFiles:
     InputError
     """
     own = OwnFiles(folder, RESULTS)
-    if own.there == RESULTS and (folder / SUMMARY).exists() and SUMMARY in own:
+    if own.there == RESULTS.title and (folder / SUMMARY).exists() and SUMMARY in own:
         own.read(SUMMARY)
     read_summary(folder)
     if SUMMARY not in own:

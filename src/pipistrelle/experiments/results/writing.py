@@ -27,7 +27,7 @@ from pipistrelle.experiments.results.tables import (
     step_table,
     tum_text,
 )
-from pipistrelle.files import RESULTS, OwnFiles
+from pipistrelle.own_files import OwnFiles, drawn_files
 from pipistrelle.version import find_version
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ no heading is known, and none told |
 
 
 def write_results(
-    folder: Path,
+    own: OwnFiles,
     *,
     config: BaseModel,
     command: str,
@@ -94,12 +94,12 @@ def write_results(
     log: Mapping[str, object] | None = None,
     draw: Callable[[Path], None] = lambda _: None,
 ) -> None:
-    """Write everything into a result folder, in place of earlier results.
+    """Write everything into a result folder, in place of earlier results: all of it, or nothing.
 
     Parameters
     ----------
-    folder : Path
-        As `prepare_folder` gives it.
+    own : OwnFiles
+        The folder, as `result_folder` lends it.
     config : pydantic model
         All settings; those that are None are left out of ``config.toml``.
     command : str
@@ -132,34 +132,30 @@ def write_results(
     >>> import tempfile
     >>> from pipistrelle.config import Config
     >>> from pipistrelle.experiments.drives import NO_TRUTH
+    >>> from pipistrelle.own_files import RESULTS, OwnFiles
     >>> with tempfile.TemporaryDirectory() as name:
     ...     run = {"command": "pipistrelle", "seed": 7, "trials": (), "ignored_rows": {}}
-    ...     write_results(Path(name), config=Config(), truth=NO_TRUTH, **run)
+    ...     write_results(OwnFiles(Path(name), RESULTS), config=Config(), truth=NO_TRUTH, **run)
     ...     sorted(path.name for path in Path(name).iterdir())
     ['README.md', 'SHA256SUMS', 'config.toml', 'summary.json']
     """
     import tomli_w
 
-    own = OwnFiles(folder, RESULTS)
-    own.clear()
     settings = config.model_dump(mode="json", exclude_none=True)
-    own.write("config.toml", tomli_w.dumps(settings))
-    online = ONLINE if any(trial.online for trial in trials) else ""
-    told = {"online": online, "log": "" if log is None else LOG}
-    told["callers"] = CALLERS if any(trial.track.callers for trial in trials) else ""
-    readme = README.format(command=command, version=find_version(), seed=seed, **told)
-    own.write("README.md", readme)
-    texts = _texts(trials, truth, moving)
-    for name, text in texts.items():
-        own.write(name, text)
+    parts = {
+        "online": ONLINE if any(trial.online for trial in trials) else "",
+        "log": "" if log is None else LOG,
+        "callers": CALLERS if any(trial.track.callers for trial in trials) else "",
+    }
+    readme = README.format(command=command, version=find_version(), seed=seed, **parts)
+    files: dict[str, str | bytes] = {"config.toml": tomli_w.dumps(settings), "README.md": readme}
+    files |= _texts(trials, truth, moving)
     for name, table in tables_of(trials, truth, callers).items():
         buffer = io.BytesIO()
         table.write_parquet(buffer)
-        own.write(f"{name}.parquet", buffer.getvalue())
-    for name, content in beside.items():
-        own.write(name, content)
-    with own.room() as room:
-        draw(room)
+        files[f"{name}.parquet"] = buffer.getvalue()
+    files |= beside
+    files |= drawn_files(draw)
     summary = {
         "format": FORMAT,
         "version": find_version(),
@@ -168,7 +164,8 @@ def write_results(
         **({} if log is None else {"log": dict(log)}),
         "runs": [run_entry(trial, ignored_rows) for trial in trials],
     }
-    own.write("summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
+    files["summary.json"] = json.dumps(summary, indent=2, allow_nan=False) + "\n"
+    own.replace(files)
 
 
 def _texts(

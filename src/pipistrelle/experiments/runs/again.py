@@ -6,7 +6,7 @@ of a recorded log, which it was and how it was heard (`log_entry`).
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from hashlib import file_digest
 from pathlib import Path
@@ -18,7 +18,7 @@ from pipistrelle.acoustics.emitter import beamwidth_of
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.logs.readers import Robot, reader_of
 from pipistrelle.detection.logs.recording import Log
-from pipistrelle.estimation.catalogue import short_name
+from pipistrelle.estimation.catalogue import CATALOGUE, short_name
 from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.hearing.world_folder import read_world
@@ -30,7 +30,7 @@ from pipistrelle.experiments.results.writing import settings_hash
 from pipistrelle.experiments.runs import truth_files
 from pipistrelle.experiments.runs.replay import load, replay
 from pipistrelle.experiments.runs.trial import Mission, Watch, run_mission
-from pipistrelle.files import check_ordinary
+from pipistrelle.files import read_file
 from pipistrelle.refusals import refusal
 from pipistrelle.settings import from_file, read_toml, resolve
 from pipistrelle.version import find_version
@@ -72,6 +72,7 @@ def again(
     folder: Path,
     *,
     log: Path | None = None,
+    trusted: Collection[str] = (),
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> Again:
@@ -83,6 +84,9 @@ def again(
         As `pipistrelle run` or `pipistrelle slam` has filled it.
     log : Path, optional
         Where the log is that was solved, if no longer where it was.
+    trusted : collection of str
+        Estimators from outside, ``module:Class``, whose code may be run. The folder may come from
+        anybody, and their modules may lie in it.
     progress, watch : callable, optional
         As of `run_mission`.
 
@@ -93,8 +97,8 @@ def again(
     Raises
     ------
     InputError
-        Where the folder is no such folder or lacks what this takes, or where the log is gone or
-        is not what it was.
+        Where the folder is no such folder or lacks what this takes, where it names an estimator
+        from outside that is not trusted, or where the log is gone or is not what it was.
 
     Examples
     --------
@@ -102,17 +106,25 @@ def again(
     >>> from pipistrelle.config import ScenarioConfig
     >>> from pipistrelle.experiments.drives import NO_TRUTH
     >>> from pipistrelle.experiments.results.writing import write_results
+    >>> from pipistrelle.own_files import RESULTS, OwnFiles
     >>> config = Config(scenario=ScenarioConfig(steps=8, landmarks=3))
     >>> done = run_mission(config, ["fused"])
     >>> kept = {"command": "pipistrelle run", "seed": config.seed, "ignored_rows": {}}
     >>> with TemporaryDirectory() as name:
-    ...     write_results(Path(name), config=config, trials=done.trials, truth=NO_TRUTH, **kept)
+    ...     own = OwnFiles(Path(name), RESULTS)
+    ...     write_results(own, config=config, trials=done.trials, truth=NO_TRUTH, **kept)
     ...     same = again(Path(name))
     >>> same.difference, np.array_equal(*(it.trials[0].track.pose.mean for it in (done, same)))
     ('', True)
     """
     summary = read_summary(folder)
-    check_ordinary(folder / "config.toml")
+    for name in {run.filter for run in summary.runs} - {*CATALOGUE, *trusted}:
+        raise refusal(
+            f"{folder / SUMMARY}: runs.filter",
+            f"{name!r}, whose code is not Pipistrelle's",
+            "one that you trust",
+            f"add --filter {name} (in Python: filters={name!r}) to run it",
+        )
     config = resolve(from_file(folder / "config.toml"))
     strategies = list(dict.fromkeys(run.strategy for run in summary.runs))
     tried = strategies, list(dict.fromkeys(run.filter for run in summary.runs))
@@ -233,8 +245,7 @@ def _difference(folder: Path, summary: Summary, trials: Sequence[TrialResult]) -
         name = f"track_{trial.strategy}_{short_name(trial.filter)}.tum"
         here = tum_text(track.time, track.pose.mean)
         try:
-            check_ordinary(folder / name)
-            there = (folder / name).read_text(encoding="utf-8")
+            there = read_file(folder / name).decode()
         except (OSError, UnicodeDecodeError, InputError):
             found[name] = "cannot be read"
             continue

@@ -18,7 +18,7 @@ from pipistrelle.detection.logs.readers import Robot
 from pipistrelle.detection.logs.recording import Log, check_seconds
 from pipistrelle.detection.logs.text_tables import check_unique, read_table, table_text
 from pipistrelle.experiments.drives import LabelledPoints, Truth
-from pipistrelle.files import LOG, OwnFiles
+from pipistrelle.own_files import LOG, OwnFiles
 from pipistrelle.refusals import refusal
 
 FILES = ("truth.csv", "landmarks.csv")
@@ -146,13 +146,20 @@ def write_truth(folder: Path, truth: Truth) -> None:
     4,1.0,-2.5
     """
     own = OwnFiles(folder, LOG)
+    for name, text in truth_files(truth).items():
+        own.add(name, text.encode())
+
+
+def truth_files(truth: Truth) -> dict[str, str]:
+    """Return the files of the truth that stand beside a log's; of what is unknown there is none."""
+    files = {}
     if truth.path is not None:
         rows = np.column_stack((truth.time, truth.path))[np.isfinite(truth.path).all(axis=1)]
-        own.write("truth.csv", table_text(_PATH, *rows.T))
+        files["truth.csv"] = table_text(_PATH, *rows.T)
     if truth.landmarks is not None:
         labels, positions = truth.landmarks
-        text = table_text(("landmark", "x", "y"), labels, *positions.T)
-        own.write("landmarks.csv", text)
+        files["landmarks.csv"] = table_text(("landmark", "x", "y"), labels, *positions.T)
+    return files
 
 
 def read_path(

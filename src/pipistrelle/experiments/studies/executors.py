@@ -236,18 +236,30 @@ def on_cluster(
             executor.shutdown(wait=False)
 
 
-@contextmanager
-def _client(address: str, workers: int) -> Iterator[Any]:
-    """Connect to a cluster, one on this machine if none is named."""
+def check_cluster(address: str) -> None:
+    """Refuse a cluster where Dask is not installed.
+
+    Raises
+    ------
+    InputError
+    """
     try:
         import cryptography  # noqa: F401  (Dask asks for it when it makes certificates)
-        from dask import config as dask_config
-        from distributed import Client, LocalCluster
+        import dask  # noqa: F401
+        import distributed  # noqa: F401
     except ImportError as error:
         raise InputError(
             f"--scheduler {address}: needs Dask, which is not installed; "
             "python -m pip install 'pipistrelle[cluster]'"
         ) from error
+
+
+@contextmanager
+def _client(address: str, workers: int) -> Iterator[Any]:
+    """Connect to a cluster, one on this machine if none is named."""
+    from dask import config as dask_config
+    from distributed import Client, LocalCluster
+
     if address != "local":
         try:
             client = Client(address, timeout="10s")

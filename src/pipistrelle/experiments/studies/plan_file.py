@@ -36,6 +36,7 @@ from pipistrelle.experiments.studies.plan import (
     Plan,
     combinations,
 )
+from pipistrelle.files import check_ordinary
 from pipistrelle.refusals import expectation, meant, shown
 from pipistrelle.settings import (
     CALLERS,
@@ -107,10 +108,11 @@ def find_plan(word: str) -> Path:
     path = Path(word)
     if word in PLANS:
         return Path(str(files("pipistrelle.experiments.studies") / f"{word}.toml"))
-    if not path.is_file():
+    if not path.exists():
         raise InputError(
             f"{word}: found no such file; expected {', '.join(PLANS)} or the path of a plan"
         )
+    check_ordinary(path)
     return path
 
 
@@ -132,9 +134,7 @@ def read_plan(path: Path, over: Layer | None = None, iterations: int | None = No
     Raises
     ------
     InputError
-        Where the file is no plan: the key, what was found, what was expected.
-    OSError
-        Where it cannot be read.
+        Where the file cannot be read or is no plan: the key, what was found, what was expected.
 
     Examples
     --------

@@ -4,13 +4,11 @@ So a study can be killed anywhere, continued, and written to by many processes a
 (`pipistrelle.experiments.studies.world_files`).
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
-from uuid import uuid4
 
 from pipistrelle.config import InputError
 from pipistrelle.experiments.hearing.world_folder import kept_world
@@ -23,15 +21,14 @@ from pipistrelle.experiments.studies.world_files import (
     scan_tables,
     unusable,
 )
-from pipistrelle.files import write_whole
+from pipistrelle.files import read_file, whole_name, write_whole
 from pipistrelle.settings import to_toml
 from pipistrelle.version import find_version
 
 if TYPE_CHECKING:
     import polars as pl
 
-_LEFT = re.compile(r"(plan\.toml|config\.toml|README\.md)\.[0-9a-f]{8}\.partial")
-"""What a killed writer may leave beside the tables."""
+_FILES = ("plan.toml", "config.toml", "README.md")
 README = """\
 # A study: {name}
 
@@ -98,7 +95,7 @@ def open_store(folder: Path, plan: Plan) -> None:
         # Looked at before the plan is sought: others who start now write their plan first.
         seen = list(folder.iterdir())
         there = read_plan(kept) if kept.exists() else None
-        left = [path for path in seen if _LEFT.fullmatch(path.name)]
+        left = [path for path in seen if whole_name(path.name) in _FILES]
         kept_first = [folder / "worlds"]  # a plan names what must be there
         strange = [path.name for path in seen if path not in [*left, *kept_first]]
         _refuse_strange(folder, there, strange)
@@ -114,14 +111,14 @@ def open_store(folder: Path, plan: Plan) -> None:
                     f"set iterations = {plan.iterations} in it"
                 )
             _keep_worlds(folder, plan)
-            _put(kept, plan_text(plan))
+            write_whole(kept, plan_text(plan).encode())
         readme = README.format(name=plan.name, version=find_version())
         config = plan.config
         if config.scenario.world is not None:
             config, _ = kept_world(config, plan.world(config))
         for name, text in (("config.toml", to_toml(config)), ("README.md", readme)):
             if not (folder / name).exists():
-                _put(folder / name, text)
+                write_whole(folder / name, text.encode())
         for table in TABLES:
             (folder / table).mkdir(exist_ok=True)
             TemporaryFile(dir=folder / table).close()
@@ -137,12 +134,12 @@ def _keep_worlds(folder: Path, plan: Plan) -> None:
         _, files = kept_world(plan.config, world)
         for name, content in files.items():
             path = folder / name
-            if path.exists() and path.read_bytes() != content:
+            if path.exists() and read_file(path) != content:
                 raise InputError(
                     f"{path}: is not the world that is asked for; name a new folder with -o DIR"
                 )
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(path, content, writer=f".{uuid4().hex[:8]}")
+            write_whole(path, content)
 
 
 def _refuse_strange(folder: Path, there: Plan | None, strange: Sequence[str]) -> None:
@@ -161,7 +158,7 @@ def _refuse_strange(folder: Path, there: Plan | None, strange: Sequence[str]) ->
 
 def _is_ours(kept: Path, plan: Plan) -> bool:
     """Whether a plan stands as we write it."""
-    return kept.read_text(encoding="utf-8") == plan_text(plan)
+    return read_file(kept) == plan_text(plan).encode()
 
 
 def load_study(folder: Path) -> StoredStudy:
@@ -194,8 +191,3 @@ def load_study(folder: Path) -> StoredStudy:
         for name in TABLES
     }
     return StoredStudy(plan=plan, **frames)
-
-
-def _put(path: Path, text: str) -> None:
-    """Write a file that many processes may write at once."""
-    write_whole(path, text.encode(), writer=f".{uuid4().hex[:8]}")

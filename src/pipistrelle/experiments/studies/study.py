@@ -25,6 +25,7 @@ from pipistrelle.experiments.runs.preparing import prepared, warnings_of
 from pipistrelle.experiments.studies.executors import (
     AHEAD,
     Results,
+    check_cluster,
     ended,
     in_processes,
     on_cluster,
@@ -123,6 +124,8 @@ def run_study(
     >>> so_far.done, so_far.ended
     (2, {'fused': 2})
     """
+    if scheduler is not None:
+        check_cluster(scheduler)
     check_cases(plan, workers if executor is None and scheduler in (None, "local") else 0)
     open_store(folder, plan)
     worlds = range(shard[0], plan.iterations, shard[1])

@@ -15,12 +15,18 @@ from hashlib import sha256
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
-from uuid import uuid4
 
 from pipistrelle.config import InputError
 from pipistrelle.experiments.studies.plan import Plan
 from pipistrelle.experiments.studies.world import TrialRecord, world_tables
-from pipistrelle.files import put_in_place, write_down
+from pipistrelle.files import (
+    check_ordinary,
+    partial_of,
+    put_in_place,
+    read_file,
+    whole_name,
+    write_down,
+)
 
 if TYPE_CHECKING:
     import polars as pl
@@ -105,18 +111,21 @@ def write_world(folder: Path, plan: Plan, iteration: int, records: Sequence[Tria
         Where they cannot be written; earlier ones are then as they were.
     """
     files = with_sums(world_tables(plan, iteration, records), plan, iteration)
-    partial = f".{uuid4().hex[:8]}.partial"
     paths = [world_file(folder, name, iteration) for name in TABLES]
+    partials = {path: partial_of(path) for path in paths}
     try:
-        for path in paths:
-            write_down(path.with_name(path.name + partial), files[path.parent.name])
+        for path, partial in partials.items():
+            write_down(partial, files[path.parent.name])
         _make_way(folder, iteration, files)
-        for path in paths:
-            put_in_place(path.with_name(path.name + partial), path)
+        for path, partial in partials.items():
+            put_in_place(partial, path)
     except OSError as error:
         raise unusable(folder, error) from error
     finally:
-        sweep(folder, [iteration] if paths[-1].exists() else [], partial)
+        for partial in partials.values():
+            with contextlib.suppress(OSError):
+                partial.unlink(missing_ok=True)
+        sweep(folder, [iteration] if paths[-1].exists() else [])
 
 
 def with_sums(tables: "Mapping[str, pl.DataFrame]", plan: Plan, iteration: int) -> dict[str, bytes]:
@@ -153,23 +162,15 @@ def _make_way(folder: Path, iteration: int, files: dict[str, bytes]) -> None:
     trials = world_file(folder, "trials", iteration)
     for name in TABLES[:-1]:
         with contextlib.suppress(FileNotFoundError):
-            if world_file(folder, name, iteration).read_bytes() != files[name]:
+            if read_file(world_file(folder, name, iteration)) != files[name]:
                 trials.unlink(missing_ok=True)
 
 
-def sweep(folder: Path, iterations: Iterable[int], partial: str = "") -> None:
-    """Remove what killed writers left of worlds that are done.
-
-    Parameters
-    ----------
-    folder : Path
-    iterations : iterable of int
-    partial : str
-        Remove the files that end so, too.
-    """
-    stems = tuple(f"iteration_{iteration:05d}." for iteration in iterations)
+def sweep(folder: Path, iterations: Iterable[int]) -> None:
+    """Remove what killed writers left of worlds that are done."""
+    names = {world_file(folder, "", iteration).name for iteration in iterations}
     for path in chain.from_iterable((folder / name).glob("*.partial") for name in TABLES):
-        if (partial and path.name.endswith(partial)) or path.name.startswith(stems):
+        if whole_name(path.name) in names:
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
 
@@ -240,7 +241,7 @@ def check_world(folder: Path, plan: Plan, iteration: int) -> bytes:
     for name in reversed(TABLES):
         path = world_file(folder, name, iteration)
         try:
-            found[name] = path.read_bytes()
+            found[name] = read_file(path)
             flaw = _flaw(name, found, plan, iteration)
         except FileNotFoundError:
             flaw = "is missing"
@@ -309,10 +310,12 @@ def scan_tables(folder: Path, table: str, worlds: Sequence[int]) -> "pl.LazyFram
     import polars as pl
 
     paths = [world_file(folder, table, world).absolute() for world in worlds]
+    for path in paths:
+        check_ordinary(path)
     try:
         os.fspath(folder.absolute()).encode()
     except UnicodeEncodeError:  # a name that Polars could not have
-        return pl.scan_parquet([path.read_bytes() for path in paths])
+        return pl.scan_parquet([read_file(path) for path in paths])
     return pl.scan_parquet(paths, glob=False)
 
 

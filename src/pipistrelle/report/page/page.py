@@ -15,7 +15,7 @@ from markupsafe import Markup
 from pipistrelle.evaluation.comparison import Finding
 from pipistrelle.figures.chart import Chart, Panel, columns_of, csv_rows, csv_text
 from pipistrelle.figures.style import page_colours
-from pipistrelle.files import REPORT, OwnFiles
+from pipistrelle.own_files import REPORT, claim, drawn_files
 from pipistrelle.report.charts.results import Figure, answers, study_charts
 from pipistrelle.report.charts.setting import model_charts
 from pipistrelle.report.claims.published import FILTERS
@@ -67,31 +67,27 @@ def write_report(
     Raises
     ------
     InputError
-        Where a file cannot be written, or one that would be replaced is not as we wrote it.
+        As `pipistrelle.own_files.claim`: an earlier report is replaced, and nothing else.
     """
+    own = claim(folder, REPORT, overwrite=True)
     told = answered(study, claims)
     rules = sorted(RULES, key=lambda rule: rule != told.rule)  # the one that answers is printed
     found = {rule: study_charts(told.selections[rule], charts) for rule in rules}
     models = model_charts(study)
     drawn, texts = [*_distinct(found), *models], _csv_texts(told, found, models)
-    own = OwnFiles(folder, REPORT)
-    own.clear(["index.html", "summary.json", *_names(drawn, texts)])
-    with own.room("figures") as room:
+
+    def draw(room: Path) -> None:
         for chart in drawn:
             progress(chart.name)
             _write_figure(chart, room)
-    for name, text in texts.items():
-        own.write(f"figures/{name}.csv", text)
+
     numbers = summary(told)
-    own.write("index.html", page(told, found, models, numbers))
-    own.write("summary.json", json.dumps(numbers, indent=1, allow_nan=False) + "\n")
+    files = drawn_files(draw, "figures/")
+    files |= {f"figures/{name}.csv": text.encode() for name, text in texts.items()}
+    files["index.html"] = page(told, found, models, numbers).encode()
+    files["summary.json"] = (json.dumps(numbers, indent=1, allow_nan=False) + "\n").encode()
+    own.replace(files)
     return numbers
-
-
-def _names(charts: Sequence[Chart], texts: Mapping[str, str]) -> list[str]:
-    """Name the files of the figures."""
-    pictures = [f"figures/{chart.name}.{ending}" for chart in charts for ending in ("png", "pdf")]
-    return [*pictures, *(f"figures/{name}.csv" for name in texts)]
 
 
 def page(
