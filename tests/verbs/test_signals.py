@@ -66,3 +66,16 @@ def test_signals_are_heard_as_before_afterwards():
     with heard_signals():
         assert signal.getsignal(signal.SIGTERM) is not before[1]
     assert [signal.getsignal(ending) for ending in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are those of POSIX")
+@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_after_the_work_is_done_changes_no_status(ending):
+    """It is sent when Python takes itself down, in a function that is called at the end."""
+    code = (
+        "import atexit, signal, sys; from pipistrelle.__main__ import main; "
+        f"atexit.register(signal.raise_signal, {int(ending)}); "
+        "sys.argv = ['pipistrelle', 'config', 'show']; sys.exit(main())"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, b"")

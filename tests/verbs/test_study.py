@@ -349,3 +349,11 @@ def test_a_job_script_of_the_papers_study_has_sixteen_tasks_unless_told_otherwis
     printed = obey("--emit", "slurm")[1]
     assert "#SBATCH --array=0-15\n" in printed
     assert "exec pipistrelle study paper --iterations 115 " in printed
+
+
+def test_a_cluster_without_its_extra_is_refused_before_a_folder_is_made(refused, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    for address in ("local", "tcp://127.0.0.1:8786"):
+        said = refused("small.toml", "--scheduler", address, "-o", "one")
+        assert f"--scheduler {address}: needs Dask, which is not installed" in said
+    assert not Path("one").exists()
