@@ -149,7 +149,7 @@ def lay_pipe(rng: Generator, folder: Path) -> str:
 
 
 DEEDS: tuple[Callable[[Generator, Path], str], ...] = (
-    *(lay_files, lay_files, lay_files, lay_links, link_ours, change_ours, list_all, list_all),
+    *(lay_files, lay_files, lay_files, lay_links, link_ours, change_ours, *[list_all] * 4),
     lay_pipe,
 )
 
@@ -165,7 +165,7 @@ def attempt(rng: Generator, place: Path, sound: Path) -> Tried:
     folder.mkdir(exist_ok=True)
     theirs = contents(place)
     told = [f"a folder of {like}"]
-    told += [one_of(rng, DEEDS)(rng, folder) for _ in range(int(rng.integers(0, 4)))]
+    told += [one_of(rng, DEEDS)(rng, folder) for _ in range(int(rng.integers(1, 5)))]
     before = contents(place)
     words = [word.format("target") for word in DOORS[door]]
     if door not in ALWAYS and rng.random() < 0.7:
