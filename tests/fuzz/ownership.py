@@ -129,7 +129,7 @@ def list_all(rng: Generator, folder: Path) -> str:
     )
     mode = one_of(rng, ["sums", "sums", "append", "bsd", "head below"])
     path = folder / SUMS
-    if path.is_symlink() or path.is_dir():
+    if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
         return "the list cannot be written"
     sums = {name: sha256((folder / name).read_bytes()).hexdigest() for name in names}
     lines = "".join(f"{one}  {name}\n" for name, one in sums.items())
