@@ -5,9 +5,10 @@ belief is a link. The solver itself changes; it stands at one link, goes on to t
 come, and is built anew where it is asked for a link that it has left behind.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import gtsam
 import numpy as np
@@ -16,6 +17,7 @@ from jaxtyping import Float
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.smoother.legs import SMALLEST_STD, Leg, symmetric, turned
 
+T = TypeVar("T")
 RELINEARIZE = 0.1
 """Change of a variable [m, rad] beyond which iSAM2 linearises anew what hangs on it."""
 ANEW = 5
@@ -149,13 +151,25 @@ class Best:
     @cached_property
     def there(self) -> gtsam.ISAM2:
         """Return what tells covariances at the optimum."""
-        isam = _new(self.link.thorough)
-        try:
-            isam.update(self.graph, self.values)
-        except RuntimeError:  # as in `Link.thorough`
-            isam = _new(thorough=True)
-            isam.update(self.graph, self.values)
+        return self._solver(thorough=self.link.thorough)
+
+    def _solver(self, *, thorough: bool) -> gtsam.ISAM2:
+        """Return all of the graph, linearised at the optimum."""
+        isam = _new(thorough)
+        isam.update(self.graph, self.values)
         return isam
+
+    def _asked(self, question: Callable[[gtsam.ISAM2], T]) -> T:
+        """Ask for covariances, by QR factors where Cholesky's are too coarse (`Link.thorough`)."""
+        try:
+            return question(self.there)
+        except RuntimeError:
+            self.there = self._solver(thorough=True)
+            return question(self.there)
+
+    def _covariance(self, key: int) -> Float[np.ndarray, "d d"]:
+        """Return the covariance of a pose or a point by its name in the graph."""
+        return self._asked(lambda isam: isam.marginalCovariance(key))
 
     def pose_mean(self, node: int) -> Float[np.ndarray, "3"]:
         """Return where a pose is."""
@@ -164,7 +178,7 @@ class Best:
     def pose(self, node: int) -> Gaussian:
         """Return a pose, (3) and (3, 3)."""
         mean = self.pose_mean(node)
-        return in_world(mean, self.there.marginalCovariance(pose_key(node)))
+        return in_world(mean, self._covariance(pose_key(node)))
 
     def point(self, label: int) -> Gaussian:
         """Return a landmark, (2) and (2, 2)."""
@@ -173,17 +187,17 @@ class Best:
     def place(self, key: int) -> Gaussian:
         """Return a landmark or a caller's place by its name in the graph, (2) and (2, 2)."""
         mean = np.array(self.values.atPoint2(key))
-        return Gaussian(mean=mean, covariance=symmetric(self.there.marginalCovariance(key)))
+        return Gaussian(mean=mean, covariance=symmetric(self._covariance(key)))
 
     def joint(self, node: int, other: int) -> Float[np.ndarray, "6 6"]:
         """Return the covariance of two poses."""
         keys = pose_key(node), pose_key(other)
-        told = self.there.jointMarginalCovariance(list(keys))
+        joint = self._asked(lambda isam: isam.jointMarginalCovariance(list(keys)))
         M = np.zeros((6, 6))
         for part, key in enumerate(keys):
             rows = slice(3 * part, 3 * part + 3)
             M[rows, rows] = turned(self.values.atPose2(key).theta())
-        return M @ np.block([[told.at(a, b) for b in keys] for a in keys]) @ M.T
+        return M @ np.block([[joint.at(a, b) for b in keys] for a in keys]) @ M.T
 
 
 def pose_key(node: int) -> int:
