@@ -179,7 +179,13 @@ def trial_of(strategy, time, path, points, rng) -> tuple[TrialResult, list]:
     track = Track(time=time, pose=pose, landmarks=end, gated=0)
     scans = tuple(scan for scan, _ in watched)
     result = TrialResult(
-        strategy=strategy, filter="ekf", track=track, scans=scans, scores=scores, wall_s=0.05
+        strategy=strategy,
+        filter="ekf",
+        track=track,
+        heard=scans,
+        scans=scans,
+        scores=scores,
+        wall_s=0.05,
     )
     return result, watched
 

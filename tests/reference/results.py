@@ -48,7 +48,8 @@ def mission_folder(folder, paths, *, truth=TRUTH, config=None, time=TIME, gated=
             [1.0, 1.0, 0.5, 0.5]))  # fmt: skip
         scores = score(track, truth, scans, 50.0)
         trials.append(TrialResult(
-            strategy=strategy, filter=name, track=track, scans=scans, scores=scores, wall_s=0.5,
+            strategy=strategy, filter=name, track=track, heard=scans, scans=scans, scores=scores,
+            wall_s=0.5,
         ))  # fmt: skip
     write_results(
         OwnFiles(folder, RESULTS), config=config, command="pipistrelle run", seed=7,

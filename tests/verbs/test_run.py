@@ -6,12 +6,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 
+import pipistrelle
 from pipistrelle import own_files
 from pipistrelle.estimation.catalogue import PAPERS
+from pipistrelle.estimation.fastslam.filter import FastSlam
 from pipistrelle.experiments.runs import compiling
 from pipistrelle.scripting import missions
+from pipistrelle.settings import from_text
 from reference.command_line import COMPILING, SHORT, contents, summary, table, track
 
 
@@ -144,6 +148,46 @@ def test_an_estimate_that_is_not_finite_is_a_failed_trial(obey, monkeypatch, und
     status, printed, said = obey("run", *SHORT, "-o", "one")
     assert (status, printed.splitlines()[-1]) == (1, "one")
     assert "warning: active ekf failed" in said
+
+
+def test_an_estimator_that_fails_costs_its_own_estimate_alone(obey, undrawn, monkeypatch):
+    def failing(*_):
+        raise RuntimeError("\n  No solution\nwas found.\n\nfor more information.")
+
+    monkeypatch.setattr(FastSlam, "update", failing)
+    words = ("--filter", "both", "--strategy", "active", "--quiet", "-o")
+    for verb in (("run", *SHORT, "--save-log", "log"), ("slam", "log")):
+        status, printed, said = obey(*verb, *words, verb[0])
+        assert (status, printed) == (1, f"{verb[0]}\n")
+        why = "active fastslam failed: RuntimeError: No solution (test_run.py, line "
+        assert said.startswith(f"pipistrelle: warning: {why}")
+        assert said.count("\n") == 1
+        ekf, lost = summary(verb[0])["runs"]
+        assert (ekf["filter"], ekf["diverged"], lost["diverged"]) == ("ekf", False, True)
+        assert np.isfinite(track(verb[0], "active_ekf")).all()
+    assert obey("view", "run", "--quiet")[0] == 0
+    with pytest.warns(UserWarning, match="active fastslam failed: RuntimeError: No solution"):
+        done = pipistrelle.slam("log", filters="both", strategies="active")
+    assert done.summary["filter"].to_list() == ["ekf", "fastslam"]
+
+
+def test_what_was_heard_hangs_on_no_filter(obey, undrawn):
+    boat = '[{name="boat",frequency=25000.0,course="circle"}]'
+    words = ("--duration", "4", "--landmarks", "8", "--particles", "20", "--strategy", "fused")
+    words += ("--listening.timing", "true", "--callers", boat, "--quiet")
+    for name in ("ekf", "both"):
+        own = [word for word in words if name == "both" or word not in ("--particles", "20")]
+        obey("run", *own, "--filter", name, "--save-log", f"log_{name}", "-o", name)
+    logs = [contents(f"log_{name}") for name in ("ekf", "both")]
+    assert logs[0]["measurements.csv"] == logs[1]["measurements.csv"]
+    one, two = (pl.read_parquet(f"{name}/measurements.parquet") for name in ("ekf", "both"))
+    assert one.equals(two)
+    boats = one.filter(landmark=9)
+    assert boats.height >= 4, "it is heard itself"
+    told = {"listening__timing": True, "callers": from_text(boat)}
+    told |= {"duration": 4, "landmarks": 8, "fastslam__particles": 20}
+    other = pipistrelle.run(strategies="fused", filters=["fastslam", "ekf"], **told)
+    assert other.measurements.equals(one)
 
 
 def test_a_saved_log_is_the_six_files_that_the_readme_promises(obey, undrawn):

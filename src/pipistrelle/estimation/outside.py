@@ -135,21 +135,14 @@ def _arguments(kind: Any, config: Config, motion: "Motion") -> dict[str, Any]:
 
 
 def worded(error: BaseException) -> str:
-    """Word an error that an estimator from outside raised.
-
-    Parameters
-    ----------
-    error : BaseException
-
-    Returns
-    -------
-    str
+    r"""Word an error that an estimator raised: its kind, and of its text the first line.
 
     Examples
     --------
-    >>> worded(ZeroDivisionError("division by zero"))
-    'ZeroDivisionError: division by zero'
+    >>> worded(ArithmeticError("\nno solution\nsee the manual"))
+    'ArithmeticError: no solution'
     """
     if isinstance(error, InputError):
         return str(error)
-    return f"{type(error).__name__}: {error}".removesuffix(": ")
+    first = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
+    return f"{type(error).__name__}: {first}".removesuffix(": ")

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from pydantic import BaseModel
 
 from pipistrelle.acoustics.callers import Caller
@@ -177,6 +178,15 @@ def solved(
         log=log_entry(place, robot, beamwidth),
         said=tuple(afterwards(recorded, trials, place)),
     )
+
+
+def failures(done: Done) -> list[str]:
+    """Say of each estimate that failed, or whose path is not finite, why."""
+    return [
+        f"{trial.strategy} {trial.filter} failed: {trial.error or 'its path is not finite'}"
+        for trial in done.trials
+        if not np.all(np.isfinite(trial.track.pose.mean))
+    ]
 
 
 def drawn(done: Done) -> "Figure":

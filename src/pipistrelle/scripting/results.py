@@ -30,7 +30,15 @@ from pipistrelle.scripting.asking import (
     number,
     short_names,
 )
-from pipistrelle.scripting.missions import Done, drawn, filmed, keep, simulated, solved
+from pipistrelle.scripting.missions import (
+    Done,
+    drawn,
+    failures,
+    filmed,
+    keep,
+    simulated,
+    solved,
+)
 from pipistrelle.scripting.recorded import beforehand, check_open, check_room, with_log
 from pipistrelle.settings import Given, Layer, from_keywords
 
@@ -366,7 +374,7 @@ def _finished(redo: Redo, output: Path | str | None, overwrite: bool, command: s
     flags = ("output=DIR", ALLOW)
     own = None if place is None else claim(place, RESULTS, overwrite=overwrite, flags=flags)
     done = redo(None)
-    for line in done.said:
+    for line in (*done.said, *failures(done)):
         warnings.warn(line, stacklevel=3)
     if own is not None:
         keep(done, own, command)

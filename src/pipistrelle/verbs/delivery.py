@@ -9,11 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from pipistrelle.experiments.results import folder
 from pipistrelle.own_files import OwnFiles
-from pipistrelle.scripting.missions import Done, filmed, keep
+from pipistrelle.scripting.missions import Done, failures, filmed, keep
 from pipistrelle.verbs.console import announce_compiling, announced, closing_table
 from pipistrelle.verbs.options import OutputOptions
 from pipistrelle.verbs.streams import put, warn
@@ -83,10 +81,8 @@ def deliver(
     if not options.quiet:
         known = done.truth.landmarks
         put(closing_table(done.trials, None if known is None else len(known[0])))
-    failed = [t for t in done.trials if not np.all(np.isfinite(t.track.pose.mean))]
-    for trial in failed:
-        why = trial.error or "its path is not finite"
-        warn(f"{trial.strategy} {trial.filter} failed: {why}")
+    failed = failures(done)
+    warn(*failed)
     put(own.folder)
     return 1 if failed else 0
 

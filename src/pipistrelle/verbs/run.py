@@ -70,8 +70,8 @@ def run(
         if world is not None:
             world.replace(world_files(heard.scenario, config))
         if log is not None:
-            scans = {trial.strategy: trial.scans for trial in done.trials}
-            log.replace(_log_files(heard, scans.get("fused", done.trials[0].scans)))
+            scans = {trial.strategy: trial.heard for trial in done.trials}
+            log.replace(_log_files(heard, scans.get("fused", done.trials[0].heard)))
         return delivery.deliver(own, done, output, watch)
 
 

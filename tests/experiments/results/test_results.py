@@ -90,6 +90,7 @@ def trial(track, strategy="fused", name="ekf"):
         strategy=strategy,
         filter=name,
         track=track,
+        heard=SCANS,
         scans=SCANS,
         scores=score(track, TRUTH, SCANS, EKF_LIMIT),
         wall_s=0.25,

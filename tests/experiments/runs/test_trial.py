@@ -414,6 +414,25 @@ def test_the_smoother_follows_a_caller_that_circles_by_its_sound(seed):
         assert not {*trial.track.callers} & {*trial.track.landmarks.landmark.tolist()}
 
 
+@pytest.mark.slow
+def test_the_smoother_has_a_map_where_cholesky_cannot_tell_its_covariances():
+    config = Config(
+        seed=774396,
+        scenario=ScenarioConfig(steps=160, landmarks=3),
+        motion={"speed_std": 1e-6},
+        listening={"timing": True},
+        callers=(
+            {"name": "c0", "frequency": 45e3, "course": "mission"},
+            {"name": "c1", "frequency": 25e3},
+            {"name": "c2", "frequency": 40e3, "course": "walk", "speed_std": 0.1},
+        ),
+    )
+    (trial,) = run_mission(config, ["active"], ["smoother"]).trials
+    assert trial.error is None
+    assert np.isfinite(trial.track.pose.covariance).all()
+    assert np.isfinite(trial.track.landmarks.covariance).all()
+
+
 def test_trials_of_one_world_do_not_depend_on_their_order():
     scenario = draw_scenario(SHORT, RNG(3))
     mission = run_mission(SHORT, ("fused",))

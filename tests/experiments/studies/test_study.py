@@ -75,7 +75,7 @@ def test_the_progress_counts_worlds_and_trials_by_strategy(plan, tmp_path):
 
 def test_of_several_failures_the_first_is_told(plan, tmp_path, monkeypatch):
     def failing(case, drive, scans, config):
-        raise FloatingPointError(f"weights of world {case.iteration}")
+        raise FloatingPointError(f"\nweights of world {case.iteration}\nsee the manual")
 
     monkeypatch.setattr(world, "run_trial", failing)
     seen = []

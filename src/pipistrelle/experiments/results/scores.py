@@ -96,7 +96,7 @@ class Scores:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrialResult:
-    """One estimate: a strategy's scans, what a filter made of them, and how good it is.
+    """One estimate: what a strategy heard, what a filter made of it, and how good that is.
 
     Attributes
     ----------
@@ -104,20 +104,23 @@ class TrialResult:
     filter : str
         The estimator's name.
     track : Track
+    heard : tuple of Scan
+        Of its strategy, one per frame, empty ones included: the same whatever the filter.
     scans : tuple of Scan
-        One per frame, empty ones included.
+        As the filter had them, likewise: perhaps without callers that move.
     scores : Scores
     wall_s : [s]
         Time that the estimate took.
     online : PathScores or None
         Of the path as it was believed at its time, where the filter revises it.
     error : str or None
-        What a filter from outside failed with; then its path is not a number anywhere.
+        What the filter failed with; then its path is not a number anywhere.
     """
 
     strategy: str
     filter: str
     track: Track
+    heard: tuple[Scan, ...]
     scans: tuple[Scan, ...]
     scores: Scores
     wall_s: float

@@ -213,7 +213,7 @@ def tables_of(
         return table.select(*(pl.lit(name).alias(key) for key, name in names.items()), pl.all())
 
     both = [(trial, {"strategy": trial.strategy, "filter": trial.filter}) for trial in trials]
-    heard = {trial.strategy: trial.scans for trial in trials}
+    heard = {trial.strategy: trial.heard for trial in trials}
     tables = {
         "steps": [named(step_table(t.track, truth.path), **names) for t, names in both],
         "landmarks": [

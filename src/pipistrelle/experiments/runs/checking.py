@@ -1,11 +1,11 @@
-"""Estimators from outside: asked to begin before anything is heard, recorded when they fail.
+"""Estimators that fail: those from outside are tried before anything is heard, all are recorded.
 
-An error of a filter that is ours is a mistake in this package, and is left alone.
+A trial that fails costs its own estimate; what the others found is kept.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
-from traceback import extract_tb
+from traceback import extract_tb, format_exc
 
 import numpy as np
 
@@ -46,7 +46,7 @@ def check_filters(filters: Sequence[str], motion: Motion, config: Config) -> Non
         except InputError:
             raise
         except Exception as error:
-            raise InputError(f"filter {name}: init fails: {_told(error)}") from error
+            raise InputError(f"filter {name}: init fails: {_placed(error)}") from error
         parts = ("pose", "landmarks", "gated")
         if lacking := [part for part in parts if not hasattr(belief, part)]:
             raise InputError(
@@ -93,20 +93,11 @@ def first_belief(name: str, motion: Motion, config: Config) -> Belief:
 
 
 def failed_trial(case: Case, drive: Drive, scans: Sequence[Scan], error: Exception) -> TrialResult:
-    """Return the estimate of a filter that failed: nowhere, and no map.
+    """Return the estimate of a filter that failed with an error: nowhere, and no map.
 
-    Parameters
-    ----------
-    case : Case
-    drive : Drive
-    scans : sequence of Scan
-    error : Exception
-        What it failed with.
-
-    Returns
-    -------
-    TrialResult
+    An interruption that a library hid behind the error is raised (`let_interruptions_pass`).
     """
+    let_interruptions_pass(error)
     k = drive.time.size
     nowhere = Gaussian(mean=np.full((k, 3), np.nan), covariance=np.full((k, 3, 3), np.nan))
     track = Track(time=drive.time, pose=nowhere, landmarks=no_landmarks(), gated=0)
@@ -114,14 +105,33 @@ def failed_trial(case: Case, drive: Drive, scans: Sequence[Scan], error: Excepti
         strategy=case.strategy,
         filter=case.filter,
         track=track,
+        heard=tuple(scans),
         scans=tuple(scans),
         scores=score(track, drive.truth, scans, 0.0),
         wall_s=0.0,
-        error=_told(error),
+        error=_placed(error),
     )
 
 
-def _told(error: Exception) -> str:
-    """Word an error that a filter from outside raised, and where."""
+def failure_text(error: Exception) -> str:
+    """Return the traceback of an error that is being handled and, as its last line, its words.
+
+    An interruption that a library hid behind the error is raised (`let_interruptions_pass`).
+    """
+    let_interruptions_pass(error)
+    return f"{format_exc()}{worded(error)}\n"
+
+
+def let_interruptions_pass(error: Exception) -> None:
+    """Raise the interruption that a library hid behind an error of its own: no trial failed."""
+    behind: BaseException | None = error
+    while behind is not None:
+        if isinstance(behind, KeyboardInterrupt):
+            raise behind
+        behind = behind.__cause__ or behind.__context__
+
+
+def _placed(error: Exception) -> str:
+    """Word an error that a filter raised, and say where."""
     place = extract_tb(error.__traceback__)[-1]
     return f"{worded(error)} ({Path(place.filename).name}, line {place.lineno})"

@@ -11,16 +11,13 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.arithmetic.random_stream import stream_key
-from pipistrelle.config import Config, Strategy
+from pipistrelle.config import Config, InputError, Strategy
 from pipistrelle.detection.faces import Heard, timed
 from pipistrelle.detection.merging import scan_of
 from pipistrelle.detection.noise import measured, noise_of
 from pipistrelle.detection.scans import Scan, rows_of
 from pipistrelle.estimation.association import Associate, told
-from pipistrelle.estimation.beliefs import (
-    Belief,
-    Gaussian,
-)
+from pipistrelle.estimation.beliefs import Belief, Gaussian
 from pipistrelle.estimation.catalogue import CATALOGUE, entry, short_name
 from pipistrelle.evaluation.bound import bound_of_drawn_start
 from pipistrelle.experiments.cases import Case
@@ -203,7 +200,7 @@ def run_trials(
 ) -> tuple[TrialResult, ...]:
     """Let each filter map what each strategy heard.
 
-    A filter from outside may fail: its path is then not a number, and the result says why.
+    A filter may fail: its path is then not a number, and the result says why.
 
     Parameters
     ----------
@@ -219,14 +216,19 @@ def run_trials(
     -------
     tuple of TrialResult
         For each strategy, one per filter.
+
+    Raises
+    ------
+    InputError
+        For scans that no filter of the catalogue can use.
     """
 
     def tried(case: Case, scans: Sequence[Scan]) -> TrialResult:
         try:
             return run_trial(case, drive, scans, config, progress=progress, watch=watch)
         except Exception as error:
-            if case.filter in CATALOGUE:
-                raise
+            if isinstance(error, InputError) and case.filter in CATALOGUE:
+                raise  # a user's mistake
             return failed_trial(case, drive, scans, error)
 
     return tuple(
@@ -265,7 +267,7 @@ def run_trial(
     -------
     TrialResult
     """
-    strategy, name = case.strategy, case.filter
+    strategy, name, heard = case.strategy, case.filter, tuple(scans)
     known = entry(name)
     scans = _told_who_moves(scans, drive, follows=known.follows and config.listening.timing)
 
@@ -297,6 +299,7 @@ def run_trial(
         strategy=strategy,
         filter=name,
         track=track,
+        heard=heard,
         scans=tuple(had),
         scores=replace(
             score(track, truth, had, known.nees_limit), position_floor_m=position_floor(drive, had)

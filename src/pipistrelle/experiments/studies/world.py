@@ -6,7 +6,6 @@ What a case is: `studies.plan`. Cases whose settings differ in nothing that is s
 
 import json
 import time
-import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from math import degrees
@@ -37,7 +36,7 @@ from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import Scenario, standing_landmarks, world_of
 from pipistrelle.experiments.hearing.worlds import World
 from pipistrelle.experiments.results.scores import PathScores, Scores, drive_bound, with_bound
-from pipistrelle.experiments.runs.checking import first_belief
+from pipistrelle.experiments.runs.checking import failure_text, first_belief
 from pipistrelle.experiments.runs.trial import drive_of, run_trial, scans_of
 from pipistrelle.experiments.studies.plan import Plan, PlannedCase, cases_of
 
@@ -63,7 +62,8 @@ class TrialRecord:
     beamwidth_deg : float or None
         Of the vehicle's call; None for passive.
     error : str or None
-        The traceback, if it failed; then there are neither scores nor rows of the other tables.
+        The traceback and, last, what it says in a line, if it failed; then there are neither
+        scores nor rows of the other tables.
     scores : Scores or None
     online : PathScores or None
         Of the path as it was believed at its time, where the filter revises it.
@@ -283,8 +283,7 @@ def _run_cases(cases: Sequence[PlannedCase], iteration: int, world: World) -> li
         scenario = world_of(config, iteration, world)
         heard = listen(scenario, config, radii, iteration=iteration)
     except Exception as failure:
-        _let_interruptions_pass(failure)
-        error = traceback.format_exc()
+        error = failure_text(failure)
         return [_failed(case, error) for case in cases]
     shared = _Shared(scenario, config, dict(zip(radii, heard, strict=True)))
     return [_try_case(case, shared, iteration) for case in cases]
@@ -398,17 +397,7 @@ def _try_case(case: PlannedCase, shared: _Shared, iteration: int) -> TrialRecord
             landmark_error=landmark_error(estimate, *standing_landmarks(scenario)),
         )
     except Exception as failure:
-        _let_interruptions_pass(failure)
-        return _failed(case, traceback.format_exc())
-
-
-def _let_interruptions_pass(failure: Exception) -> None:
-    """Raise the interruption that a library hid behind an error of its own: no trial failed."""
-    behind: BaseException | None = failure
-    while behind is not None:
-        if isinstance(behind, KeyboardInterrupt):
-            raise behind
-        behind = behind.__cause__ or behind.__context__
+        return _failed(case, failure_text(failure))
 
 
 @np.errstate(over="ignore", invalid="ignore")
