@@ -25,6 +25,9 @@ def test_a_column_that_no_scan_has_and_columns_of_several_lengths_are_refused():
     for wrong in ({"bearing": bearing[:1]}, {"bearing": bearing, "range": np.ones(3)}):
         with pytest.raises(InputError, match=r"expected \(2,\), that of landmark"):
             make_scan(0.5, label, **wrong)
+    for wrong, kind in (({"landmark": [3.5, 4.0]}, "whole numbers"), ({"range": "4"}, "numbers")):
+        with pytest.raises(InputError, match=f"expected {kind}"):
+            make_scan(0.5, **({"landmark": label, "bearing": bearing} | wrong))
     assert make_scan(0.5, [3, 4], [0, 1]).bearing.dtype == np.float64
 
 

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipistrelle.config import InputError
 from pipistrelle.estimation.measurement import NEAREST, measurement_jacobians
 from pipistrelle.estimation.motion import (
     Motion,
@@ -198,3 +199,24 @@ def test_measurement_jacobians_are_finite_at_a_landmark_that_the_vehicle_stands_
         H_x, H_m = measurement_jacobians(np.zeros(3), np.array([offset, 0.0]))
         assert np.isfinite(H_x).all()
         assert np.isfinite(H_m).all()
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"model": "tracked"}, "found the model 'tracked', expected one of bicycle, unicycle, pos"),
+        ({"control_std": (1.0, 1.0, 1.0)}, r"expected 2 numbers from 0 to 1e\+09 for a bicycle"),
+        ({"model": "poses"}, "expected 3 numbers"),
+        ({"control_std": (1.0, np.nan)}, "found control_std"),
+        ({"control_std": (1.0, -1.0)}, "found control_std"),
+        ({"control_std": ("a", "b")}, "found control_std"),
+        ({"wheelbase": 0.0}, "found wheelbase 0.0"),
+    ],
+)
+def test_a_motion_model_that_is_none_is_refused(given, said):
+    with pytest.raises(InputError, match=said):
+        Motion(**({"model": "bicycle", "control_std": (0.1, 0.1)} | given))
+
+
+def test_noise_of_controls_may_be_any_row_of_numbers():
+    assert Motion(model="bicycle", control_std=np.array([0.5, 0.25])).control_std == (0.5, 0.25)

@@ -19,7 +19,7 @@ app = App(
 
 @app.default
 def fuzz(
-    target: Literal["logs", "settings", "studies", "kills", "ownership", "results"],
+    target: Literal["logs", "settings", "studies", "kills", "steps", "ownership", "results"],
     /,
     *,
     tries: Annotated[int, Parameter(validator=Number(gte=1))] = 100,

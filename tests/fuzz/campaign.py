@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fuzz import kills, logs, ownership, results, settings, studies
+from fuzz import kills, logs, ownership, results, settings, steps, studies
 from fuzz.judging import Tried
 from fuzz.running import load_all
 
@@ -21,6 +21,7 @@ TARGETS: dict[str, ModuleType] = {
     "settings": settings,
     "studies": studies,
     "kills": kills,
+    "steps": steps,
     "ownership": ownership,
     "results": results,
 }

@@ -15,7 +15,8 @@ TESTS = Path(__file__).resolve().parents[1]
 
 
 @pytest.mark.parametrize(
-    ("target", "tries"), [("logs", 120), ("settings", 100), ("studies", 15), ("kills", 2)]
+    ("target", "tries"),
+    [("logs", 120), ("settings", 100), ("studies", 15), ("kills", 2), ("steps", 400)],
 )
 def test_nothing_odd_is_answered_by_a_fault(target, tries):
     command = [sys.executable, "-m", "fuzz", target, "--tries", str(tries), "--seed", "0"]

@@ -69,7 +69,8 @@ def draw_mission(
         path.append(pose)
         distance, bearing = range_and_bearing(pose, landmarks)
         active = (distance < reach) & (np.abs(bearing) < beamwidth / 2)
-        measured = np.where(active, distance + rng.normal(0, range_std, distance.size), np.nan)
+        noisy = np.abs(distance + rng.normal(0, range_std, distance.size))
+        measured = np.where(active, noisy, np.nan)
         turned = wrap(bearing + rng.normal(0, bearing_std, distance.size))
         wrong = rng.random(distance.size) < outliers
         turned = np.where(wrong, rng.uniform(-np.pi, np.pi, distance.size), turned)

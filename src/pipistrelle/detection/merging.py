@@ -96,7 +96,7 @@ def labelled(scan: Scan, label: Int[np.ndarray, " m"]) -> Scan:
     >>> told.landmark, told.bearing.round(9), told.bearing_std.round(4)
     (array([7]), array([0.3]), array([0.0707]))
     """
-    if label is scan.landmark and _settled(label, scan.bearing):
+    if label is scan.landmark and settled(label, scan.bearing):
         return scan
     named = replace(scan, landmark=_checked(scan, np.asarray(label)))
     return _fused(named, own=True, others=True, labels_only=True)
@@ -122,7 +122,7 @@ def _checked(scan: Scan, label: np.ndarray) -> Int[np.ndarray, " m"]:
 
 
 @kernel
-def _settled(label: Int[np.ndarray, " m"], bearing: Float[np.ndarray, " m"]) -> bool:
+def settled(label: Int[np.ndarray, " m"], bearing: Float[np.ndarray, " m"]) -> bool:
     """Whether every row has a label, and those with a bearing, one each, stand before the rest."""
     for m in range(label.size):
         bare = math.isnan(bearing[m])

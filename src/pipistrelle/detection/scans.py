@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import InputError
+from pipistrelle.refusals import shown
 
 UNLABELLED = -1
 """Label of a measurement of which nobody says whose it is."""
@@ -121,7 +122,7 @@ def make_scan(
     Raises
     ------
     InputError
-        For a column that no scan has, or columns of several lengths.
+        For a column that no scan has, or columns of several lengths, or of no numbers.
 
     Examples
     --------
@@ -171,7 +172,12 @@ def _made_of(time: float, shape: tuple[int, ...], given: dict[str, np.ndarray | 
     whole, numbers = np.empty((2, *shape), dtype=np.int64), np.empty((NUMBERS, *shape))
     given = {"caller": OWN} | given
     for row, name in zip([*whole, *numbers], COLUMNS, strict=True):
-        row[...] = given.get(name, np.nan)
+        value = np.asarray(given.get(name, np.nan))
+        kinds = "fiu" if row.dtype.kind == "f" else "iu"
+        if value.size and value.dtype.kind not in kinds:
+            kind = "numbers" if row.dtype.kind == "f" else "whole numbers"
+            raise InputError(f"scan: found {shown(given[name])} for {name}, expected {kind}")
+        row[...] = value
     return Scan(time=time, landmark=whole[0], caller=whole[1], numbers=numbers)
 
 

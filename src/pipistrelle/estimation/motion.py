@@ -21,6 +21,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from pipistrelle.config import LARGEST, InputError
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, no_alloc
 
@@ -52,6 +53,23 @@ class Motion:
     control_std: tuple[float, ...]
     wheelbase: float = 1.0
     noise_at_rest: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuse a model that there is not, and noise that is not one number for each control."""
+        if self.model not in MOTION_MODELS:
+            known = ", ".join(MOTION_MODELS)
+            raise InputError(f"motion: found the model {self.model!r}, expected one of {known}")
+        wanted = MOVED if self.model == "poses" else 2
+        stds = np.asarray(self.control_std)
+        sound = stds.shape == (wanted,) and stds.dtype.kind in "fiu"
+        if not (sound and np.all((stds >= 0.0) & (stds <= LARGEST))):
+            raise InputError(
+                f"motion: found control_std {self.control_std!r}, expected {wanted} numbers from 0 "
+                f"to {LARGEST:g} for a {self.model} model"
+            )
+        if not 0.0 < self.wheelbase <= LARGEST:
+            raise InputError(f"motion: found wheelbase {self.wheelbase!r}, expected one above 0 m")
+        object.__setattr__(self, "control_std", tuple(stds.tolist()))
 
 
 class MotionNumbers(NamedTuple):

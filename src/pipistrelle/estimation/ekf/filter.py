@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
+from pipistrelle.estimation.checking import usable_controls, usable_pose, usable_scan
 from pipistrelle.estimation.ekf.correction import corrected
 from pipistrelle.estimation.ekf.crossing import WAITS
 from pipistrelle.estimation.ekf.gaussian import LINEAR, propagate
@@ -241,9 +242,10 @@ class EkfSlam:
 
     def init(self, pose: Gaussian) -> EkfBelief:
         """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
+        pose = usable_pose(pose)
         return EkfBelief(
-            mean=pose.mean.astype(float),
-            covariance=pose.covariance.astype(float),
+            mean=pose.mean,
+            covariance=pose.covariance,
             landmark=np.empty(0, dtype=np.int64),
             weight=np.empty(0),
             gated=0,
@@ -309,9 +311,10 @@ class EkfSlam:
         -----
         Bradley & Abaid, Eq. (10).
         """
+        controls, dt = usable_controls(self.motion, controls, dt)
         mean, covariance = belief.mean.copy(), belief.covariance.copy()
         poses = Gaussian(mean=np.empty((len(dt), 3)), covariance=np.empty((len(dt), 3, 3)))
-        numbers = motion_numbers(self.motion)
+        numbers = tuple(motion_numbers(self.motion))
         propagate(mean, covariance, controls, dt, numbers, poses.mean, poses.covariance)
         if roams(belief.landmark):
             roam(mean, covariance, belief.landmark, dt.sum(), self.walk_std)
@@ -357,6 +360,7 @@ class EkfSlam:
         -----
         Bradley & Abaid, Eqs. (11) and (16) to (21).
         """
+        scan = usable_scan(scan)
         if scan.landmark.size == 0:
             return belief
         sensing = sensing_of(self.rays, self.gate, robust=self.robust)

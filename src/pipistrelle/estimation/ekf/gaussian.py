@@ -215,15 +215,18 @@ def propagate(
     covariance: Float[np.ndarray, "d d"],
     controls: Float[np.ndarray, "k c"],
     dt: Float[np.ndarray, " k"],
-    motion: MotionNumbers,
+    motion: tuple[int, float, float, float, float, bool],
     pose_means: Float[np.ndarray, "k 3"],
     pose_covariances: Float[np.ndarray, "k 3 3"],
 ) -> None:
-    """Advance mean and covariance in place; cross-covariances once, by the product of the F."""
-    pose, P = mean[:3], covariance[:3, :3].copy()
+    """Advance mean and covariance in place; cross-covariances once, by the product of the F.
+
+    The motion is `MotionNumbers` as a plain tuple.
+    """
+    pose, P, numbers = mean[:3], covariance[:3, :3].copy(), MotionNumbers(*motion)
     shift_x = shift_y = 0.0  # entries (0, 2) and (1, 2) of the product of the F
     for k in range(controls.shape[0]):
-        dx, dy = propagate_pose(pose, P, controls[k], dt[k], motion)
+        dx, dy = propagate_pose(pose, P, controls[k], dt[k], numbers)
         shift_x -= dy
         shift_y += dx
         for a in range(3):  # an assignment of slices would compile for a second longer

@@ -39,6 +39,7 @@ from jaxtyping import Bool, Float
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
+from pipistrelle.estimation.checking import usable_controls, usable_pose, usable_scan
 from pipistrelle.estimation.ekf.filter import (
     EkfBelief,
     map_rows,
@@ -133,13 +134,14 @@ class InvariantEkfSlam:
 
     def init(self, pose: Gaussian) -> InvariantBelief:
         """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
+        pose = usable_pose(pose)
         return InvariantBelief(
             mean=np.array([0.0, 0.0, pose.mean[2]]),
-            covariance=pose.covariance.astype(float),
+            covariance=pose.covariance,
             landmark=np.empty(0, dtype=np.int64),
             weight=np.empty(0),
             gated=0,
-            origin=pose.mean[:2].astype(float),
+            origin=pose.mean[:2],
         )
 
     def knowing(self, belief: InvariantBelief, known: Landmarks) -> InvariantBelief:
@@ -188,9 +190,10 @@ class InvariantEkfSlam:
         poses : Gaussian of (k, 3) and (k, 3, 3)
             After each step, their covariances those of the linear error.
         """
+        controls, dt = usable_controls(self.motion, controls, dt)
         mean, covariance = belief.mean.copy(), belief.covariance.copy()
         poses = Gaussian(mean=np.empty((len(dt), 3)), covariance=np.empty((len(dt), 3, 3)))
-        numbers = motion_numbers(self.motion)
+        numbers = tuple(motion_numbers(self.motion))
         _propagate(mean, covariance, controls, dt, numbers, poses.mean, poses.covariance)
         if roams(belief.landmark):
             roam(mean, covariance, belief.landmark, dt.sum(), self.walk_std)
@@ -213,6 +216,7 @@ class InvariantEkfSlam:
         -------
         InvariantBelief
         """
+        scan = usable_scan(scan)
         if scan.landmark.size == 0:
             return belief
         sensing = sensing_of(self.rays, self.gate, robust=self.robust)
@@ -252,15 +256,18 @@ def _propagate(
     covariance: Float[np.ndarray, "d d"],
     controls: Float[np.ndarray, "k c"],
     dt: Float[np.ndarray, " k"],
-    motion: MotionNumbers,
+    motion: tuple[int, float, float, float, float, bool],
     pose_means: Float[np.ndarray, "k 3"],
     pose_covariances: Float[np.ndarray, "k 3 3"],
 ) -> None:
-    """Advance mean and covariance in place; the noise of all steps enters the landmarks once."""
-    pose, P = mean[:3], covariance[:3, :3].copy()
+    """Advance mean and covariance in place; the noise of all steps enters the landmarks once.
+
+    The motion is `MotionNumbers` as a plain tuple.
+    """
+    pose, P, numbers = mean[:3], covariance[:3, :3].copy(), MotionNumbers(*motion)
     noise, gathered = np.zeros((3, 3)), np.empty((3, 3))
     for k in range(controls.shape[0]):
-        propagate_pose(pose, noise, controls[k], dt[k], motion)
+        propagate_pose(pose, noise, controls[k], dt[k], numbers)
         _about(P, pose[0], pose[1], pose_covariances[k])
         for a in range(3):
             pose_means[k, a] = pose[a]

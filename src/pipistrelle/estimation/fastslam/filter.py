@@ -76,9 +76,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.config import FastSlamConfig, RayConfig
+from pipistrelle.config import FastSlamConfig, InputError, RayConfig
 from pipistrelle.detection.scans import Scan, rows_of, with_columns
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
+from pipistrelle.estimation.checking import usable_controls, usable_pose, usable_scan
 from pipistrelle.estimation.fastslam.block import LANES, MEMBER
 from pipistrelle.estimation.fastslam.block_ties import TIE
 from pipistrelle.estimation.fastslam.particles import (
@@ -200,18 +201,19 @@ class FastSlam:
 
     def init(self, pose: Gaussian) -> FastSlamBelief:
         """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
+        pose = usable_pose(pose)
         particles = self.settings.particles
         blocks = -(-particles // LANES)
         numbers = np.concatenate([pose.mean, pose.covariance[*_PACKED]])
         return FastSlamBelief(
-            poses=np.tile(np.repeat(numbers.astype(float), LANES), (blocks, 1)),
+            poses=np.tile(np.repeat(numbers, LANES), (blocks, 1)),
             log_weight=np.zeros(particles),
             landmark=np.empty(0, dtype=np.int64),
             first=np.zeros(1, dtype=np.int64),
             count=np.empty((blocks, 0, LANES), dtype=np.int64),
             member=np.empty((blocks, 0, MEMBER)),
             estimate=Gaussian(
-                mean=pose.mean.astype(float),
+                mean=pose.mean,
                 covariance=pose.covariance + SMALLEST_STD**2 * np.eye(3),
             ),
             best_count=np.empty(0, dtype=np.int64),
@@ -278,6 +280,7 @@ class FastSlam:
         -----
         Bradley & Abaid, Eq. (10), per particle.
         """
+        controls, dt = usable_controls(self.motion, controls, dt)
         carried, steps = belief.poses.copy(), len(dt)
         poses = Gaussian(mean=np.empty((steps, 3)), covariance=np.empty((steps, 3, 3)))
         weight = normalised(belief.log_weight)
@@ -309,8 +312,11 @@ class FastSlam:
         -----
         Bradley & Abaid, Eqs. (12) to (22).
         """
+        scan = usable_scan(scan)
         if scan.landmark.size == 0:
             return belief
+        if rng is None:
+            raise InputError("update: found no generator, expected one: FastSLAM draws poses by it")
         particles = self.settings.particles
         normal, uniform = rng.standard_normal((particles, 3)), rng.random(particles)
         sensing = sensing_of(self.rays, self.gate, exact=self.settings.mixture == "exact")

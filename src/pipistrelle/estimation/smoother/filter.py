@@ -32,6 +32,7 @@ from jaxtyping import Float
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan, rows_of
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
+from pipistrelle.estimation.checking import usable_controls, usable_pose, usable_scan
 from pipistrelle.estimation.measurement import BELIEVED
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.smoother.belief import (
@@ -105,11 +106,12 @@ class Smoother:
 
     def init(self, pose: Gaussian) -> SmootherBelief:
         """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
+        pose = usable_pose(pose)
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         factors.add(start_factor(0, pose))
         values.insert(pose_key(0), gtsam.Pose2(*pose.mean))
         return SmootherBelief(
-            at=Gaussian(mean=pose.mean.astype(float), covariance=pose.covariance.astype(float)),
+            at=pose,
             link=Link(before=None, node=0, leg=None, factors=factors, values=values),
             rays=self.rays,
             walk_std=self.walk_std,
@@ -165,6 +167,7 @@ class Smoother:
         poses : Gaussian of (k, 3) and (k, 3, 3)
             After each step.
         """
+        controls, dt = usable_controls(self.motion, controls, dt)
         leg = longer(belief.leg, self.motion, controls, dt)
         steps, new = placed(belief.at, leg), len(leg.mean) - len(dt)
         poses = Gaussian(mean=steps.mean[new:], covariance=steps.covariance[new:])
@@ -186,8 +189,17 @@ class Smoother:
         -------
         SmootherBelief
         """
+        scan = usable_scan(scan)
         if scan.landmark.size == 0:
             return belief
+        try:
+            return self._updated(belief, scan)
+        except RuntimeError:  # a covariance that Cholesky's factors are too coarse for
+            belief = replace(belief, link=replace(belief.link, thorough=True))
+            return self._updated(solved(belief), scan)
+
+    def _updated(self, belief: SmootherBelief, scan: Scan) -> SmootherBelief:
+        """Let a frame's measurements enter the graph, and what they place."""
         here = arrived(belief, roving=bool(scan.moving.size or belief.chains))
         if self.gate < 1.0 and (belief.mapped or belief.chains):
             here, scan, detours = self._gated(solved(here), scan)

@@ -8,21 +8,12 @@ from dataclasses import replace
 from math import nan
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from pipistrelle.config import InputError
 from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.noise import Noise, as_said
-from pipistrelle.detection.scans import (
-    BEARING,
-    BEARING_STD,
-    DETOUR,
-    DETOUR_STD,
-    NUMBERS,
-    RANGE,
-    RANGE_STD,
-    Scan,
-)
+from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.association import Associate, told
 from pipistrelle.estimation.beliefs import (
     B,
@@ -37,6 +28,7 @@ from pipistrelle.estimation.beliefs import (
     Trajectory,
     in_sight,
 )
+from pipistrelle.estimation.checking import usable_scan
 from pipistrelle.experiments.drives import Drive
 
 
@@ -85,8 +77,6 @@ def run_filter(
     """
     time = drive.time
     steps = _steps_of(scans, time)
-    if associate is told:
-        _refuse_unstated(scans)
     path = Gaussian(mean=np.empty((time.size, 3)), covariance=np.empty((time.size, 3, 3)))
     path.mean[0], path.covariance[0] = drive.start.mean, drive.start.covariance
     belief, done = _first_belief(estimator, drive, scans), 0
@@ -95,10 +85,7 @@ def run_filter(
         if k > done:
             belief = _carried(estimator, belief, drive, slice(done, k), rng, path)
             done = k
-        named = labelled(scan, associate(belief, scan))
-        if named is not scan:
-            named = noise(named)
-            _refuse_unstated([named])
+        named = usable_scan(scan if associate is told else _named(scan, belief, associate, noise))
         belief = estimator.update(belief, named, rng)
         pose = belief.pose()
         path.mean[k], path.covariance[k] = pose.mean, pose.covariance
@@ -123,6 +110,12 @@ def run_filter(
         online=online if revised else None,
         callers=_retraced(callers, belief, time.size),
     )
+
+
+def _named(scan: Scan, belief: B, associate: Associate, noise: Noise) -> Scan:
+    """Give a scan the labels of an association, and its rows what nobody says of their noise."""
+    named = labelled(scan, associate(belief, scan))
+    return named if named is scan else noise(named)
 
 
 def _carried(
@@ -218,47 +211,4 @@ def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]
             f"scan at {scans[late + 1].time} s: follows one at {scans[late].time} s; expected "
             "scans in the order of time"
         )
-    numbers = _numbers(scans)
-    bearing, distance, detour = numbers[BEARING], numbers[RANGE], numbers[DETOUR]
-    usable = np.isfinite(bearing) | (np.isnan(bearing) & np.isnan(distance) & ~np.isnan(detour))
-    usable &= np.isnan(distance) | ((distance > 0.0) & (distance < np.inf))
-    usable &= ~(np.abs(detour) == np.inf)
-    _refuse(
-        scans,
-        usable,
-        "numbers that no filter can use, for the landmarks {}; expected finite bearings [rad] and "
-        "ranges above 0 [m], NaN where passive; a row without a bearing has a detour [m] alone",
-    )
     return steps.tolist()
-
-
-def _refuse_unstated(scans: Sequence[Scan]) -> None:
-    """Refuse rows of which nobody says how sure they are."""
-    numbers = _numbers(scans)
-    bearing_std, range_std = numbers[BEARING_STD], numbers[RANGE_STD]
-    detour_std = numbers[DETOUR_STD]
-    stated = np.isnan(numbers[BEARING]) | ((bearing_std > 0.0) & (bearing_std < np.inf))
-    stated &= np.isnan(numbers[DETOUR]) | ((detour_std > 0.0) & (detour_std < np.inf))
-    stated &= np.isnan(numbers[RANGE]) | ((range_std > 0.0) & (range_std < np.inf))
-    _refuse(
-        scans,
-        stated,
-        "no standard deviations above 0 for the landmarks {}; expected bearing_std [rad], and "
-        "range_std and detour_std [m] where there are such, as pipistrelle.detection.noise states "
-        "them",
-    )
-
-
-def _numbers(scans: Sequence[Scan]) -> Float[np.ndarray, "7 m"]:
-    """Return what all scans measured, one after another."""
-    return np.concatenate([np.empty((NUMBERS, 0)), *(scan.numbers for scan in scans)], axis=1)
-
-
-def _refuse(scans: Sequence[Scan], good: Bool[np.ndarray, " m"], found: str) -> None:
-    """Refuse scans of which not all rows are good; those of all scans follow one another."""
-    if good.all():
-        return
-    owner = np.repeat(np.arange(len(scans)), [scan.landmark.size for scan in scans])
-    first = owner[~good][0]
-    labels = scans[first].landmark[~good[owner == first]].tolist()
-    raise InputError(f"scan at {scans[first].time} s: found {found.format(labels)}")

@@ -1,0 +1,305 @@
+"""What a filter is handed, checked at its door: a first pose, control steps, scans.
+
+A kernel reads beyond an array that is shorter than it expects, and a NaN spreads through a belief
+without a word. So each call looks once at shapes, types and numbers. What is sound is handed on as
+it is; lists, and arrays of other types, become the arrays that kernels take.
+"""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipistrelle.config import LARGEST, InputError
+from pipistrelle.detection.merging import labelled, settled
+from pipistrelle.detection.scans import (
+    BEARING,
+    BEARING_STD,
+    DETOUR,
+    DETOUR_STD,
+    NUMBERS,
+    RANGE,
+    RANGE_STD,
+    UNLABELLED,
+    Scan,
+)
+from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.motion import MOVED, Motion
+from pipistrelle.jit import Flag, Whole, kernel
+from pipistrelle.refusals import shown
+
+FLOAT, INTEGER = np.dtype(np.float64), np.dtype(np.int64)
+ARRAY = np.ndarray
+WHOLES = ("landmark", "caller", "callers", "moving")
+"""Columns of a scan that hold whole numbers."""
+LEAST_STD = 1e-12
+"""Least standard deviation [m] or [rad]: the square of a smaller one is lost beside any other."""
+MOST_LABELS = 2**53
+"""Labels are below it, as those of a log."""
+INDEFINITE = 1e-6
+"""How far rounding may put a correlation matrix from being positive semidefinite."""
+
+UNSETTLED, NO_LABEL, NO_CALLER, TWICE, NO_NUMBER, UNSTATED, NO_CALLERS = range(1, 8)
+WORDS = {
+    NO_LABEL: "the labels {}; expected whole numbers from 0 on, or -1 for clutter",
+    NO_CALLER: "callers below 0 for the landmarks {}; expected 0 for the vehicle, or the number of "
+    "another",
+    TWICE: "two bearings by one call for the landmarks {}; expected one",
+    NO_NUMBER: "numbers that no filter can use, for the landmarks {}; expected finite bearings "
+    f"[rad] and ranges above 0 [m], NaN where passive, all up to {LARGEST:g}; a row without a "
+    "bearing has a detour [m] alone",
+    UNSTATED: "no standard deviations above 0 for the landmarks {}; expected bearing_std [rad], "
+    "and range_std and detour_std [m] where there are such, as pipistrelle.detection.noise states "
+    "them",
+}
+"""What is wrong with rows of a scan; in place of {} stand their labels."""
+
+
+def usable_pose(pose: Gaussian) -> Gaussian:
+    """Return a copy of a first pose as filters take it, (3) and (3, 3); refuse what is none."""
+    mean, covariance = _converted(pose.mean, FLOAT), _converted(pose.covariance, FLOAT)
+    if mean is None or covariance is None or (mean.shape, covariance.shape) != ((3,), (3, 3)):
+        raise InputError(
+            f"init: found {_shape_of(pose.mean)} and {_shape_of(pose.covariance)}, expected a pose "
+            "of 3 numbers and its covariance, 3 by 3"
+        )
+    lower = covariance[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    symmetric = np.allclose(covariance, covariance.T)
+    if not (symmetric and np.abs(mean).max() <= LARGEST and is_covariance(lower)):
+        raise InputError(
+            f"init: found the pose {mean.tolist()} and the covariance {covariance.tolist()}, "
+            f"expected numbers up to {LARGEST:g} and a symmetric covariance of variances of 0 or "
+            "more and correlations between -1 and 1"
+        )
+    return Gaussian(mean=mean, covariance=covariance)
+
+
+def usable_controls(
+    motion: Motion, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]
+) -> tuple[Float[np.ndarray, "k c"], Float[np.ndarray, " k"]]:
+    """Return control steps and their times [s] as filters take them; refuse what are none."""
+    steps, times = controls, dt
+    if not (_is_plain(controls) and _is_plain(dt)):
+        steps, times = _converted(controls, FLOAT), _converted(dt, FLOAT)
+    poses = motion.model == "poses"
+    widths = (MOVED, MOVED + 6) if poses else (2,)
+    if (
+        steps is None
+        or times is None
+        or steps.ndim != 2
+        or times.shape != steps.shape[:1]
+        or steps.shape[1] not in widths
+    ):
+        raise InputError(
+            f"predict: found controls of {_shape_of(controls)} and times of {_shape_of(dt)}, "
+            f"expected numbers: a row of {' or '.join(map(str, widths))} controls for each step of "
+            f"a {motion.model} model, and as many times"
+        )
+    if not _are_steps(steps, times, poses):
+        raise InputError(
+            f"predict: found the controls {steps.tolist()} during {times.tolist()} s, expected "
+            f"numbers up to {LARGEST:g} and times above 0"
+            + ", perhaps with a covariance: all six numbers, or NaN"
+            * poses
+        )
+    return steps, times
+
+
+def usable_scan(scan: Scan) -> Scan:
+    """Return a scan as filters take it: one row of each landmark's, and none without a label.
+
+    The rows of a landmark that several callers lit up are merged (`detection.merging.labelled`).
+
+    Raises
+    ------
+    InputError
+        For arrays that are no columns of one scan, labels that are none, a landmark that has two
+        bearings by one call, a row that is neither bearing nor detour or of which nobody says how
+        sure it is.
+    """
+    if not isinstance(scan, Scan):
+        raise InputError(
+            f"update: found {shown(scan)}, expected a Scan; pipistrelle.detection.scans.make_scan "
+            "makes one of columns"
+        )
+    if not _is_laid_out(scan):
+        scan = _laid_out(scan)
+    fault = _fault(scan.landmark, scan.caller, scan.numbers, scan.callers, scan.moving)
+    if fault > UNSETTLED:
+        raise InputError(f"scan at {scan.time} s: found {_worded(scan, fault)}")
+    return labelled(scan, scan.landmark) if fault else scan
+
+
+def _is_laid_out(scan: Scan) -> bool:
+    """Tell whether a scan's columns are arrays as kernels take them."""
+    landmark, caller, numbers = scan.landmark, scan.caller, scan.numbers
+    callers, moving = scan.callers, scan.moving
+    return (
+        type(landmark) is type(caller) is type(numbers) is type(callers) is type(moving) is ARRAY
+        and landmark.dtype == caller.dtype == callers.dtype == moving.dtype == INTEGER
+        and numbers.dtype == FLOAT
+        and landmark.ndim == callers.ndim == moving.ndim == 1
+        and caller.shape == landmark.shape
+        and numbers.shape == (NUMBERS, landmark.size)
+        and landmark.flags.carray
+        and caller.flags.carray
+        and numbers.flags.carray
+        and callers.flags.carray
+        and moving.flags.carray
+    )
+
+
+def _laid_out(scan: Scan) -> Scan:
+    """Return a scan of arrays as kernels take them, made of what can be such; refuse the rest."""
+    columns: dict[str, Any] = {name: _converted(getattr(scan, name), INTEGER) for name in WHOLES}
+    columns["numbers"] = _converted(scan.numbers, FLOAT)
+    if not any(column is None for column in columns.values()):
+        made = replace(scan, **columns)
+        if _is_laid_out(made):
+            return made
+    shapes = ", ".join(f"{name} {_shape_of(getattr(scan, name))}" for name in columns)
+    raise InputError(
+        f"scan at {scan.time} s: found {shapes}; expected whole numbers (m) for landmark and "
+        f"caller, numbers ({NUMBERS}, m), and rows of whole numbers for callers and moving; "
+        "pipistrelle.detection.scans.make_scan makes a scan of columns"
+    )
+
+
+def _is_plain(values: Any) -> bool:
+    """Tell whether these are floats laid out as kernels take them."""
+    return type(values) is ARRAY and values.dtype == FLOAT and values.flags.carray
+
+
+def _converted(values: Any, kind: np.dtype) -> np.ndarray | None:
+    """Return a copy of values as an array that kernels take; None where they are no such numbers.
+
+    Of an empty list nobody can say of which kind it is.
+    """
+    try:
+        given = np.asarray(values)
+    except (TypeError, ValueError):  # rows of unlike lengths
+        return None
+    if given.size and given.dtype.kind not in ("iu" if kind == INTEGER else "fiu"):
+        return None
+    return np.array(given, dtype=kind, order="C")
+
+
+def _shape_of(values: Any) -> str:
+    """Word what was found in place of an array."""
+    try:
+        given = np.asarray(values)
+    except (TypeError, ValueError):
+        return "rows of unlike lengths"
+    return f"{given.dtype} {given.shape}"
+
+
+def _worded(scan: Scan, fault: int) -> str:
+    """Say what is wrong with a scan, and name the landmarks of which it is."""
+    if fault == NO_CALLERS:
+        return (
+            f"the callers' labels {scan.callers.tolist()} and {scan.moving.tolist()} for who "
+            "moves; expected whole numbers from 0 on, or -1 for a caller whom nobody knows"
+        )
+    columns = scan.landmark, scan.caller, scan.numbers
+    rows = [m for m in range(scan.landmark.size) if _fault_of_row(*columns, m) == fault]
+    return WORDS[fault].format(scan.landmark[rows].tolist())
+
+
+@kernel
+def _fault(
+    landmark: Int[np.ndarray, " m"],
+    caller: Int[np.ndarray, " m"],
+    numbers: Float[np.ndarray, "7 m"],
+    callers: Int[np.ndarray, " c"],
+    moving: Int[np.ndarray, " v"],
+) -> int:
+    """Return what is wrong with the first row of a scan that is not sound; 0 where all are."""
+    for m in range(landmark.size):
+        fault = _fault_of_row(landmark, caller, numbers, m)
+        if fault:
+            return fault
+    for label in callers:
+        if label < UNLABELLED or label >= MOST_LABELS:
+            return NO_CALLERS
+    for label in moving:
+        if label < 0 or label >= MOST_LABELS:
+            return NO_CALLERS
+    return 0 if settled(landmark, numbers[BEARING]) else UNSETTLED
+
+
+@kernel
+def _fault_of_row(
+    landmark: Int[np.ndarray, " m"],
+    caller: Int[np.ndarray, " m"],
+    numbers: Float[np.ndarray, "7 m"],
+    m: Whole,
+) -> int:
+    """Return what is wrong with a row, or 0."""
+    if landmark[m] < UNLABELLED or landmark[m] >= MOST_LABELS:
+        return NO_LABEL
+    if caller[m] < 0:
+        return NO_CALLER
+    bearing, distance, detour = numbers[BEARING, m], numbers[RANGE, m], numbers[DETOUR, m]
+    silent = math.isnan(bearing)
+    if silent and (math.isnan(detour) or not math.isnan(distance)):
+        return NO_NUMBER
+    if abs(bearing) > LARGEST or distance <= 0.0 or distance > LARGEST or abs(detour) > LARGEST:
+        return NO_NUMBER
+    if not (silent or _is_std(numbers[BEARING_STD, m])):
+        return UNSTATED
+    if not (math.isnan(distance) or _is_std(numbers[RANGE_STD, m])):
+        return UNSTATED
+    if not (math.isnan(detour) or _is_std(numbers[DETOUR_STD, m])):
+        return UNSTATED
+    for other in range(0 if silent or landmark[m] == UNLABELLED else m):
+        again = landmark[other] == landmark[m] and caller[other] == caller[m]
+        if again and not math.isnan(numbers[BEARING, other]):
+            return TWICE
+    return 0
+
+
+@kernel
+def _is_std(value: float) -> Flag:
+    """Whether a number is a standard deviation."""
+    return LEAST_STD <= value <= LARGEST
+
+
+@kernel
+def _are_steps(
+    steps: Float[np.ndarray, "k c"], times: Float[np.ndarray, " k"], poses: Flag
+) -> Flag:
+    """Whether these are control steps."""
+    for k in range(times.size):
+        if not 0.0 < times[k] <= LARGEST:
+            return False
+        for c in range(min(steps.shape[1], MOVED)):
+            if not abs(steps[k, c]) <= LARGEST:
+                return False
+        said = poses and steps.shape[1] > MOVED and not np.isnan(steps[k, MOVED:]).all()
+        if said and not is_covariance(steps[k, MOVED:]):
+            return False
+    return True
+
+
+@kernel
+def is_covariance(entries: Float[np.ndarray, "6"]) -> Flag:
+    """Whether xx, xy, xh, yy, yh and hh are a covariance, but for rounding."""
+    xx, yy, hh = entries[0], entries[3], entries[5]
+    if not (0.0 <= xx <= LARGEST**2 and 0.0 <= yy <= LARGEST**2 and 0.0 <= hh <= LARGEST**2):
+        return False
+    a = _correlation(entries[1], xx, yy)
+    b = _correlation(entries[2], xx, hh)
+    c = _correlation(entries[4], yy, hh)
+    if not max(abs(a), abs(b), abs(c)) <= 1.0 + INDEFINITE:
+        return False
+    return 1.0 + 2.0 * a * b * c - a * a - b * b - c * c >= -INDEFINITE
+
+
+@kernel
+def _correlation(covariance: float, one: float, other: float) -> float:
+    """Correlation of two numbers; infinite where one of them has no variance to share."""
+    if covariance == 0.0:
+        return 0.0
+    return covariance / math.sqrt(one * other)

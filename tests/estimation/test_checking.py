@@ -1,0 +1,182 @@
+"""What filters refuse of what they are handed, step by step, and what they take as it is meant."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipistrelle.config import Config, FastSlamConfig, InputError
+from pipistrelle.detection.scans import NOBODY, make_scan, with_columns
+from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.catalogue import CATALOGUE, entry
+from pipistrelle.estimation.motion import Motion
+from reference.missions import BICYCLE, START, scan_of
+
+POSES = Motion(model="poses", control_std=(0.005, 0.003, 0.006))
+SCAN = scan_of((3, 5.0, 0.3), (8, np.nan, 1.0))
+TIMED = make_scan(
+    0.5, np.array([3, 8]), np.array([0.3, np.nan]), caller=np.array([1, 2]), bearing_std=0.1,
+    detour=np.array([3.0, 5.0]), detour_std=0.1,
+)  # fmt: skip
+
+
+def answers(belief):
+    pose, rows = belief.pose(), belief.landmarks()
+    parts = (pose.mean, pose.covariance, rows.landmark, rows.mean, rows.covariance, rows.weight)
+    return [part.copy() for part in parts]
+
+
+@pytest.fixture(params=CATALOGUE)
+def build(request):
+    """Return the filter of a motion model."""
+    config = Config(fastslam=FastSlamConfig(particles=20))
+    return lambda motion: entry(request.param).build(config, motion)
+
+
+@pytest.fixture
+def refused(build):
+    """Have a filter refuse what is done with it and its belief, which must not change."""
+
+    def refused(action, said, motion=BICYCLE):
+        slam, rng = build(motion), np.random.default_rng(7)
+        belief = slam.update(slam.init(START), SCAN, rng)
+        before = answers(belief)
+        with pytest.raises(InputError, match=said):
+            action(slam, belief, rng)
+        for now, then in zip(answers(belief), before, strict=True):
+            np.testing.assert_array_equal(now, then)
+
+    return refused
+
+
+FULL = [0.1, 0.0, 0.0, 1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4]
+
+
+def poses(place, value):
+    """Return a motion of which a number is another."""
+    return [[value if k == place else number for k, number in enumerate(FULL)]]
+
+
+@pytest.mark.parametrize(
+    ("motion", "controls", "dt", "said"),
+    [
+        (POSES, np.full((30, 3), 0.1), np.ones(1), r"controls of float64 \(30, 3\) and times of f"),
+        (POSES, [[0.1, 0.02]], np.ones(1), "a row of 3 or 9 controls for each step of a poses mod"),
+        (POSES, [[0.1, 0.02, 0.0]], np.ones(5), r"times of float64 \(5,\)"),
+        (BICYCLE, [0.1, 0.02], 0.2, r"float64 \(2,\) and times of float64 \(\), expected numbers"),
+        (BICYCLE, [[0.1, 0.02], [0.1]], [0.2, 0.2], "found controls of rows of unlike lengths"),
+        (BICYCLE, [["0.1", "0.2"]], [0.2], "expected numbers: a row of 2 controls"),
+        (BICYCLE, None, None, "found controls of object"),
+        (BICYCLE, [[0.1, np.nan]], [0.2], r"found the controls \[\[0.1, nan\]\] during \[0.2\] s"),
+        (BICYCLE, [[1e10, 0.0]], [0.2], r"expected numbers up to 1e\+09 and times above 0"),
+        (BICYCLE, [[0.1, 0.0]], [0.0], "times above 0"),
+        (BICYCLE, [[0.1, 0.0]], [np.inf], "times above 0"),
+        (POSES, poses(3, np.nan), [0.2], "perhaps with a covariance: all six numbers, or NaN"),
+        (POSES, poses(3, -1e-4), [0.2], "with a covariance"),
+        (POSES, poses(4, 2e-4), [0.2], "with a covariance"),
+        (POSES, [[*FULL[:3], 1, 0.9, 0.9, 1, -0.9, 1]], [0.2], "with a covariance"),
+    ],
+)
+def test_controls_that_are_none_of_the_model_are_refused(refused, motion, controls, dt, said):
+    refused(lambda slam, belief, rng: slam.predict(belief, controls, dt, rng), said, motion)
+
+
+def raw(**columns):
+    """Return a scan of columns that nobody looked at."""
+    return replace(SCAN, time=0.5, **columns)
+
+
+@pytest.mark.parametrize(
+    ("scan", "said"),
+    [
+        ([1, 2], r"update: found \[1, 2\], expected a Scan"),
+        (raw(numbers=SCAN.numbers[:6]), r"numbers float64 \(6, 2\); expected whole numbers \(m\)"),
+        (raw(caller=np.zeros(3, int)), r"caller int64 \(3,\)"),
+        (raw(landmark=np.array([3.0, 8.0])), r"scan at 0.5 s: found landmark float64 \(2,\)"),
+        (raw(landmark=np.array([[3, 8]])), r"landmark int64 \(1, 2\)"),
+        (raw(callers=None), "callers object"),
+        (raw(callers=np.array([-1, -7])), r"the callers' labels \[-1, -7\]"),
+        (raw(moving=np.array([-1])), r"and \[-1\] for who moves"),
+        (raw(caller=np.array([0, -1])), r"callers below 0 for the landmarks \[8\]"),
+        (raw(landmark=np.array([3, -2])), r"the labels \[-2\]; expected whole numbers from 0 on"),
+        (raw(landmark=np.array([3, 2**53])), "the labels"),
+        (raw(landmark=np.array([8, 8])), r"two bearings by one call for the landmarks \[8\]"),
+        (with_columns(SCAN, bearing=np.array([np.nan, 1.0])), r"can use, for the landmarks \[3\]"),
+        (with_columns(SCAN, bearing=np.array([np.inf, 1.0])), "numbers that no filter can use"),
+        (with_columns(SCAN, range=0.0), r"can use, for the landmarks \[3, 8\]"),
+        (with_columns(SCAN, range=1e10), "numbers that no filter can use"),
+        (with_columns(TIMED, detour=np.nan), r"can use, for the landmarks \[8\]"),
+        (with_columns(SCAN, bearing_std=np.nan), r"no standard deviations .* \[3, 8\]"),
+        (with_columns(SCAN, range_std=0.0), r"no standard deviations above 0 for .* \[3\]"),
+        (with_columns(TIMED, detour_std=np.inf), "no standard deviations"),
+    ],
+)
+def test_scans_that_no_filter_can_use_are_refused(refused, scan, said):
+    refused(lambda slam, belief, rng: slam.update(belief, scan, rng), said)
+
+
+@pytest.mark.parametrize(
+    ("mean", "covariance", "said"),
+    [
+        (np.zeros(2), np.eye(3), r"init: found float64 \(2,\) and float64 \(3, 3\)"),
+        (np.zeros(3), np.eye(2), "its covariance, 3 by 3"),
+        ([0.0, np.nan, 0.0], np.eye(3), r"found the pose \[0.0, nan, 0.0\]"),
+        (np.zeros(3), np.diag([1.0, -1.0, 1.0]), "a symmetric covariance"),
+        (np.zeros(3), np.eye(3) + np.eye(3, k=1) / 2, "a symmetric covariance"),
+        (np.zeros(3), np.eye(3) + 2 * (np.eye(3, k=1) + np.eye(3, k=-1)), "correlations between"),
+    ],
+)
+def test_a_first_pose_that_is_none_is_refused(build, mean, covariance, said):
+    with pytest.raises(InputError, match=said):
+        build(BICYCLE).init(Gaussian(mean=mean, covariance=covariance))
+
+
+def test_lists_and_other_arrays_are_taken_as_they_are_meant(build):
+    slam = build(BICYCLE)
+    started = slam.init(START)
+    controls, dt = np.array([[0.75, 0.25], [0.5, 0.0]]), np.array([0.25, 0.5])
+    expected = slam.predict(started, controls, dt)[0]
+    frozen = controls.copy()
+    frozen.setflags(write=False)
+    for other in (controls.tolist(), controls.astype(np.float32), np.asfortranarray(controls)):
+        moved = slam.predict(started, other, dt.tolist())[0]
+        np.testing.assert_array_equal(moved.pose().mean, expected.pose().mean)
+    assert slam.predict(started, frozen, dt)[1].mean.shape == (2, 3)
+    rows = {name: getattr(SCAN, name).tolist() for name in ("landmark", "caller", "numbers")}
+    wide = np.repeat(SCAN.numbers, 2, axis=1)[:, ::2]
+    heard = slam.update(started, SCAN, np.random.default_rng(7))
+    for scan in (raw(**rows, callers=[], moving=[]), raw(numbers=wide, callers=NOBODY)):
+        other = slam.update(started, scan, np.random.default_rng(7))
+        for one, two in zip(answers(other), answers(heard), strict=True):
+            np.testing.assert_array_equal(one, two)
+
+
+def test_clutter_is_left_out_and_what_several_calls_say_of_a_landmark_is_merged(build):
+    slam = build(BICYCLE)
+    started = slam.init(START)
+    both = make_scan(
+        0.5, np.array([-1, 3, 3]), np.array([2.0, 0.2, 0.4]), caller=np.array([1, 0, 1]),
+        range=np.array([np.nan, 5.0, np.nan]), range_std=0.2, bearing_std=0.1,
+    )  # fmt: skip
+    merged = scan_of((3, 5.0, 0.3))
+    merged = with_columns(merged, bearing_std=0.1 / np.sqrt(2), range_std=0.2)
+    found, expected = (
+        answers(slam.update(started, scan, np.random.default_rng(7))) for scan in (both, merged)
+    )
+    for one, two in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-12)
+
+
+def test_what_a_filter_was_handed_may_change_afterwards(build):
+    slam, start = build(BICYCLE), Gaussian(mean=np.zeros(3), covariance=np.eye(3) * 1e-4)
+    belief = slam.init(start)
+    before = answers(belief)
+    start.mean[:], start.covariance[:] = 7.0, 7.0
+    for now, then in zip(answers(belief), before, strict=True):
+        np.testing.assert_array_equal(now, then)
+
+
+def test_fastslam_asks_for_the_generator_by_which_it_draws():
+    slam = entry("fastslam").build(Config(), BICYCLE)
+    with pytest.raises(InputError, match="found no generator"):
+        slam.update(slam.init(START), replace(SCAN), None)
