@@ -13,6 +13,7 @@ from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import BLOCK, sampling
 from pipistrelle.config import Config
+from pipistrelle.detection.direct import direct_calls, front_edge, loudest_first
 from pipistrelle.detection.faces import average_faces, timed
 from pipistrelle.detection.matched import filter_blocks
 from pipistrelle.detection.noise import DETOUR_FLOOR, measured
@@ -146,6 +147,200 @@ def test_what_comes_while_the_direct_call_lasts_has_no_detour():
         label = np.where(late, 4, 51)
         rows = timed(average_faces(0.5, found, label, averaging="plain", speed_of_sound=C)).rows
         assert np.isfinite(rows.detour[rows.landmark == 4]).tolist() == [heard_apart]
+
+
+# By planted sounds: amplitudes block by block, the same at ten elements but for their phase
+
+BLOCKS, BEGIN, M, ELEMENTS = 110, 60, 14, 10
+
+
+def planted(*sounds, pulse=M, noise_std=0.0, rng=None):
+    """Matched outputs of sounds: first block, number of blocks, amplitude.
+
+    The square of the amplitude is the energy of a block over the mean of the noise that front edges
+    are sought in. What begins within a block fills the rest of it.
+    """
+    x = np.zeros((BLOCKS, 1, 2, ELEMENTS), dtype=complex)
+    phase, edges = np.exp(0.7j * np.arange(ELEMENTS)), np.arange(BLOCKS + 1)
+    for begin, lasts, amplitude in sounds:
+        share = np.diff(np.clip(edges, begin, begin + lasts))
+        x[:, 0, BEACON] += amplitude * np.sqrt(2.0) * share[:, None] * phase
+    if rng is not None:
+        x += noise_std / np.sqrt(2.0) * (rng.normal(size=(*x.shape, 2)) @ [1.0, 1.0j])
+    return filter_blocks(x, pulse=pulse, block=1, noise_std=1.0)
+
+
+def edge(*sounds, b=BEGIN, **more):
+    """Lag and standard deviation of the first edge up to lag b."""
+    return front_edge(planted(*sounds, **more), b, 0, BEACON, more.get("pulse", M))
+
+
+def told_std(share, amplitude):
+    """Standard deviation of an edge that fills a share of its block, by the formula."""
+    return np.sqrt((1.0 + 0.5 * share**2) / (2.0 * ELEMENTS * amplitude**2))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.25, 0.5, 0.9])
+def test_a_front_edge_without_noise_is_exact_and_as_sure_as_the_formula_says(share):
+    lag, std = edge((BEGIN - share, M, 5.0))
+    assert lag == pytest.approx(BEGIN - share, abs=1e-9)
+    assert std == pytest.approx(told_std(share, 5.0), rel=1e-9)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_a_front_edge_of_a_long_call_is_sought_in_fourteenths_of_it(share):
+    """Three blocks at once: their gain has three times the amplitude and of the noise."""
+    begin = BEGIN - 3.0 * share
+    lag, std = edge((begin, 3 * M, 5.0), pulse=3 * M)
+    assert lag == pytest.approx(begin, abs=1e-9)
+    assert std == pytest.approx(3.0 * told_std(share, np.sqrt(3.0) * 5.0), rel=1e-9)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_a_front_edge_strays_in_noise_as_much_as_it_says(share):
+    """In a third of the noise it allows for: so what the fit leaves is less, and does not count."""
+    rng, noise_std, count = np.random.default_rng(5), 0.3, 4000
+    found = [edge((BEGIN - share, M, 12.0), noise_std=noise_std, rng=rng) for _ in range(count)]
+    lag, std = np.array(found).T
+    assert std == pytest.approx(told_std(share, 12.0), rel=0.1)
+    drawn = np.std(lag) / noise_std
+    within = 4.0 / np.sqrt(2.0 * count)  # four deviations of a standard deviation of so many
+    assert within < 0.05
+    assert drawn == pytest.approx(np.mean(std), rel=within)
+    assert drawn != pytest.approx(np.mean(std) / 0.95, rel=0.005), "five hundredths would show"
+
+
+@pytest.mark.parametrize(
+    ("rough", "left"),
+    [
+        ([(BEGIN - 2, 1, 3.0j)], 9.0),
+        ([(BEGIN - 1, 1, 3.0j)], 9.0),
+        ([(BEGIN, 1, 3.0), (BEGIN + 1, 1, -3.0)], 18.0),
+    ],
+)
+def test_what_a_fit_leaves_makes_an_edge_less_sure(rough, left):
+    """It is what the block before it, its own and the two behind it have beside a call."""
+    lag, std = edge((BEGIN - 0.5, M, 50.0), *rough)
+    assert lag == pytest.approx(BEGIN - 0.5, abs=1e-9)
+    assert std == pytest.approx(np.sqrt(left) * told_std(0.5, 50.0), rel=1e-9)
+
+
+def test_an_edge_is_found_from_a_call_and_two_lags_later():
+    """The best fit of a whole call may be drawn so far by an echo at its heels."""
+    for later in (0, M - 1, M + 2):
+        lag, _ = edge((BEGIN, M, 5.0), b=BEGIN + later)
+        assert lag == pytest.approx(BEGIN, abs=1e-9)
+
+
+def test_what_was_heard_two_calls_before_is_no_part_of_an_edge():
+    burst = BEGIN - M - 3, 1, 5.0
+    assert edge(burst, (BEGIN, M, 5.0), b=BEGIN + M)[0] == pytest.approx(BEGIN, abs=1e-9)
+
+
+def test_an_edge_with_sound_before_it_that_did_not_last_is_none():
+    """It is told from nothing at all: then the whole's best fit may stand for it."""
+    call = BEGIN, M, 5.0
+    assert np.isnan(edge((BEGIN - 5, 1, 1.8), call)).tolist() == [True, False]
+    assert edge((BEGIN - 5, 1, 1.8), call)[1] == np.inf
+    assert np.isnan(edge()).all()
+
+
+def test_a_block_before_an_edge_may_be_one_that_the_call_fills_in_part():
+    lag, _ = edge((BEGIN - 1, 1, 1.8), (BEGIN, M, 6.2))
+    assert lag == pytest.approx(BEGIN - 1.8 / 6.2, abs=1e-9)
+    assert np.isnan(edge((BEGIN - 2, 1, 1.8), (BEGIN, M, 6.2))[0])
+
+
+def test_sound_stands_out_of_noise_from_three_times_its_energy_on():
+    for energy, stands_out in ((2.9, False), (3.1, True)):
+        _, std = edge((BEGIN - 5, 1, np.sqrt(energy)), (BEGIN, M, 5.0))
+        assert np.isinf(std) == stands_out
+        assert np.isnan(edge((BEGIN, M, np.sqrt(energy)))[0]) == (not stands_out)
+
+
+def test_an_edge_of_less_than_three_tenths_of_what_comes_after_is_none():
+    """That much sound that a beam does not point at leaks from a direction into another."""
+    for share, is_edge in ((0.28, False), (0.32, True)):
+        lag, std = edge((BEGIN - 6, M + 6, 50.0 * share), (BEGIN, M, 50.0 * (1.0 - share)))
+        assert np.isfinite(lag) == is_edge
+        assert np.isinf(std) == (not is_edge)
+
+
+def test_an_edge_is_of_a_sound_that_lasts_three_blocks():
+    for blocks, is_edge in ((2, False), (3, True)):
+        assert np.isfinite(edge((BEGIN - 1, blocks, 5.0))[0]) == is_edge
+
+
+def test_an_edge_needs_two_blocks_behind_it_in_the_record():
+    matched = planted((BEGIN, M, 5.0))
+    rises = BEGIN - M
+    for b in range(rises + 10):
+        lag, _ = front_edge(matched[: b + 1], b, 0, BEACON, M)
+        assert np.isfinite(lag) == (b >= rises + 3)
+
+
+# Which detection it is of
+
+START, INTERVAL = 0.5, 1e-4
+
+
+def calls_of(*detections, sounds=((BEGIN, M, 5.0),)):
+    """Direct calls among detections: caller, lag, power and standard deviation of the lag."""
+    caller, lag, power, std = np.array(detections).T
+    numbers = np.array([START + INTERVAL * lag, 0.0 * lag, power, 0.0 * lag, INTERVAL * std])
+    whole = np.array([np.zeros(lag.size), caller]).astype(np.int64)
+    return direct_calls(planted(*sounds), whole, numbers, 2, (START, INTERVAL, M))
+
+
+def test_the_first_that_is_a_tenth_as_loud_as_the_loudest_of_its_tone_is_the_direct_call():
+    caller, delay = np.array([1, 1, 0, 1, 1]), np.array([2.0, 3.0, 1.0, 5.0, 4.0])
+    for share, first in ((0.09, 4), (0.11, 1)):
+        power = np.array([0.01, share, 99.0, 1.0, 0.5])
+        assert loudest_first(caller, delay, power, 1) == first
+    assert loudest_first(caller, delay, power, 2) == -1
+
+
+def test_a_direct_call_has_the_time_and_deviation_of_its_edge_in_seconds():
+    found, (delay, std) = calls_of((OWN, 30, 9.0, 7.0), (BEACON, BEGIN + 3, 9.0, 7.0))
+    assert found.tolist() == [-1, 1]
+    assert delay[BEACON] == pytest.approx(START + INTERVAL * BEGIN, abs=1e-12)
+    assert std[BEACON] == pytest.approx(INTERVAL * told_std(0.0, 5.0), rel=1e-9)
+    assert np.isnan([delay[OWN], std[OWN]]).all()
+
+
+def test_a_call_that_rises_too_little_has_the_time_of_the_wholes_best_fit():
+    found, (delay, std) = calls_of((BEACON, BEGIN + 0.3, 9.0, 7.0), sounds=[(BEGIN, M, 1.5)])
+    assert (found[BEACON], delay[BEACON]) == (0, START + INTERVAL * (BEGIN + 0.3))
+    assert std[BEACON] == 7.0 * INTERVAL
+
+
+def test_a_call_that_another_all_but_extinguished_is_none():
+    found, when = calls_of((BEACON, BEGIN, 9.0, 7.0), sounds=[(BEGIN - 5, 1, 1.8), (BEGIN, M, 5.0)])
+    assert found[BEACON] == -1
+    assert np.isnan(when).all()
+
+
+def test_no_edge_is_sought_of_what_may_have_begun_before_the_record():
+    """A call and what two lags about the fit may hide: M + 2 lags must come before it."""
+    for lag, sought in ((M + 2.4, False), (M + 2.6, True)):
+        _, (delay, _) = calls_of((BEACON, lag, 9.0, 7.0), sounds=[(M, M, 5.0)])
+        expected = M if sought else lag
+        assert delay[BEACON] == pytest.approx(START + INTERVAL * expected, abs=1e-12)
+
+
+def test_only_what_is_two_hundredfold_louder_within_a_call_may_leak():
+    """A louder call of another tone at another time changes nothing, 10 ms away say."""
+    for apart in (-100.0, -M - 0.5, -M + 0.5, 0.0, M - 0.5, M + 0.5, 100.0):
+        for times in (190.0, 210.0):
+            found, _ = calls_of((BEACON, BEGIN, 1.0, 7.0), (OWN, BEGIN + apart, times, 7.0))
+            assert found[BEACON] == (-1 if abs(apart) < M and times > 200.0 else 0)
+
+
+def test_a_louder_call_of_another_tone_ten_milliseconds_away_changes_nothing():
+    faint = (0.0200, 0.3, BEACON, 22.0)
+    for apart in (-0.010, 0.010):
+        beside = detected(faint, (0.0200 + apart, 0.35, OWN, 46.0))
+        assert abs(off_by(beside, 0.0200)) < 0.06
 
 
 # In the paper's worlds

@@ -93,8 +93,6 @@ def front_edge(
     stride, elements = max(pulse // 14, 1), matched.shape[3]
     low = max(b - 2 * (pulse + stride), b % stride)
     count = (min(b + stride, matched.shape[0] - 1) - low) // stride
-    if count <= AFTER:
-        return math.nan, math.nan
     gain, loudest = np.empty((count, elements), dtype=np.complex128), 0.0
     energy = np.zeros(count)
     for k in range(count):
@@ -174,7 +172,7 @@ def direct_calls(
     when = np.full((2, tones), np.nan)
     for p in range(1, tones):
         d = loudest_first(whole[1], numbers[0], numbers[2], p)
-        if d < 0 or _may_leak(whole, numbers, d, pulse * interval):
+        if d < 0 or _may_leak(numbers[0], numbers[2], d, pulse * interval):
             continue
         b = int((numbers[0, d] - start) / interval + 0.5)
         lag, std = math.nan, math.nan
@@ -189,15 +187,14 @@ def direct_calls(
 
 @no_alloc
 def _may_leak(
-    whole: Int[np.ndarray, "2 d"], numbers: Float[np.ndarray, "5 d"], d: Whole, within: float
+    delay: Float[np.ndarray, " d"], power: Float[np.ndarray, " d"], d: Whole, within: float
 ) -> bool:
-    """Whether detection d is so faint beside one of another tone that it may be its leakage.
+    """Whether detection d is so faint beside one at the same time that it may be its leakage.
 
-    At any face: what reaches a face from behind its endfire leaks there, too, and is not listed.
+    That one is of another tone, for no direct call is so faint beside its own (`FAINTER`). It may
+    be at any face: what reaches a face from behind its endfire leaks there and is not listed.
     """
-    for other in range(whole.shape[1]):
-        if whole[1, other] != whole[1, d]:
-            near = abs(numbers[0, other] - numbers[0, d]) <= within
-            if near and numbers[2, d] < LEAKAGE * numbers[2, other]:
-                return True
+    for other in range(delay.size):
+        if abs(delay[other] - delay[d]) <= within and power[d] < LEAKAGE * power[other]:
+            return True
     return False
