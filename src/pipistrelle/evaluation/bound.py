@@ -40,7 +40,13 @@ from pipistrelle.estimation.ekf.gaussian import (
 )
 from pipistrelle.estimation.ekf.roaming import roam, velocity_of
 from pipistrelle.estimation.ekf.timing import tell_detour
-from pipistrelle.estimation.measurement import NEAREST, observe
+from pipistrelle.estimation.measurement import (
+    NEAREST,
+    columns_of,
+    detours,
+    observe,
+    timings_of,
+)
 from pipistrelle.estimation.motion import Motion, MotionNumbers, motion_numbers, propagate_pose
 from pipistrelle.jit import Whole, kernel, no_alloc
 
@@ -154,9 +160,12 @@ def _slots(slot: Mapping[int, int], label: Int[np.ndarray, " m"]) -> Int[np.ndar
 
 
 def _whose(scan: Scan) -> Int[np.ndarray, " m"]:
-    """Return the label of each row's caller, UNLABELLED where there is no detour of one known."""
-    who = np.append(scan.callers, UNLABELLED)[np.minimum(scan.caller, len(scan.callers))]
-    return np.where(np.isnan(scan.detour) | (who == scan.landmark), UNLABELLED, who)
+    """Return the label of the caller of each row's detour, UNLABELLED of a row without one."""
+    who, timings = np.full(len(scan.landmark), UNLABELLED), timings_of(scan)
+    if timings is not None:
+        heard = detours(columns_of(scan), timings)
+        who[heard.row] = heard.caller
+    return who
 
 
 @no_alloc
