@@ -152,6 +152,7 @@ def test_what_comes_while_the_direct_call_lasts_has_no_detour():
 # By planted sounds: amplitudes block by block, the same at ten elements but for their phase
 
 BLOCKS, BEGIN, M, ELEMENTS = 110, 60, 14, 10
+FACE, TONE = 1, 2
 
 
 def planted(*sounds, pulse=M, noise_std=0.0, rng=None):
@@ -160,11 +161,11 @@ def planted(*sounds, pulse=M, noise_std=0.0, rng=None):
     The square of the amplitude is the energy of a block over the mean of the noise that front edges
     are sought in. What begins within a block fills the rest of it.
     """
-    x = np.zeros((BLOCKS, 1, 2, ELEMENTS), dtype=complex)
+    x = np.zeros((BLOCKS, FACE + 1, TONE + 1, ELEMENTS), dtype=complex)
     phase, edges = np.exp(0.7j * np.arange(ELEMENTS)), np.arange(BLOCKS + 1)
     for begin, lasts, amplitude in sounds:
         share = np.diff(np.clip(edges, begin, begin + lasts))
-        x[:, 0, BEACON] += amplitude * np.sqrt(2.0) * share[:, None] * phase
+        x[:, FACE, TONE] += amplitude * np.sqrt(2.0) * share[:, None] * phase
     if rng is not None:
         x += noise_std / np.sqrt(2.0) * (rng.normal(size=(*x.shape, 2)) @ [1.0, 1.0j])
     return filter_blocks(x, pulse=pulse, block=1, noise_std=1.0)
@@ -172,7 +173,7 @@ def planted(*sounds, pulse=M, noise_std=0.0, rng=None):
 
 def edge(*sounds, b=BEGIN, **more):
     """Lag and standard deviation of the first edge up to lag b."""
-    return front_edge(planted(*sounds, **more), b, 0, BEACON, more.get("pulse", M))
+    return front_edge(planted(*sounds, **more), b, FACE, TONE, more.get("pulse", M))
 
 
 def told_std(share, amplitude):
@@ -232,6 +233,13 @@ def test_an_edge_is_found_from_a_call_and_two_lags_later():
         assert lag == pytest.approx(BEGIN, abs=1e-9)
 
 
+@pytest.mark.parametrize("odd", [(BEGIN - 1, 1, -1.2), (BEGIN, 1, 1.0)])
+def test_an_edge_is_nowhere_but_in_the_block_that_it_is_fitted_to(odd):
+    """A block against the call's phase, or louder than the call, is no more or less of a call."""
+    lag, _ = edge(odd, (BEGIN, M, 5.0))
+    assert lag == pytest.approx(BEGIN, abs=1e-9)
+
+
 def test_what_was_heard_two_calls_before_is_no_part_of_an_edge():
     burst = BEGIN - M - 3, 1, 5.0
     assert edge(burst, (BEGIN, M, 5.0), b=BEGIN + M)[0] == pytest.approx(BEGIN, abs=1e-9)
@@ -258,10 +266,11 @@ def test_sound_stands_out_of_noise_from_three_times_its_energy_on():
         assert np.isnan(edge((BEGIN, M, np.sqrt(energy)))[0]) == (not stands_out)
 
 
-def test_an_edge_of_less_than_three_tenths_of_what_comes_after_is_none():
-    """That much sound that a beam does not point at leaks from a direction into another."""
+@pytest.mark.parametrize("stride", [1, 3])
+def test_an_edge_of_less_than_three_tenths_of_what_comes_after_is_none(stride):
     for share, is_edge in ((0.28, False), (0.32, True)):
-        lag, std = edge((BEGIN - 6, M + 6, 50.0 * share), (BEGIN, M, 50.0 * (1.0 - share)))
+        before, lasts = (BEGIN - 6 * stride, 6 * stride, 50.0 * share), stride * M
+        lag, std = edge(before, (BEGIN, lasts, 50.0), pulse=lasts, b=BEGIN)
         assert np.isfinite(lag) == is_edge
         assert np.isinf(std) == (not is_edge)
 
@@ -275,7 +284,7 @@ def test_an_edge_needs_two_blocks_behind_it_in_the_record():
     matched = planted((BEGIN, M, 5.0))
     rises = BEGIN - M
     for b in range(rises + 10):
-        lag, _ = front_edge(matched[: b + 1], b, 0, BEACON, M)
+        lag, _ = front_edge(matched[: b + 1], b, FACE, TONE, M)
         assert np.isfinite(lag) == (b >= rises + 3)
 
 
@@ -288,8 +297,8 @@ def calls_of(*detections, sounds=((BEGIN, M, 5.0),)):
     """Direct calls among detections: caller, lag, power and standard deviation of the lag."""
     caller, lag, power, std = np.array(detections).T
     numbers = np.array([START + INTERVAL * lag, 0.0 * lag, power, 0.0 * lag, INTERVAL * std])
-    whole = np.array([np.zeros(lag.size), caller]).astype(np.int64)
-    return direct_calls(planted(*sounds), whole, numbers, 2, (START, INTERVAL, M))
+    whole = np.array([np.full(lag.size, FACE), caller]).astype(np.int64)
+    return direct_calls(planted(*sounds), whole, numbers, TONE + 1, (START, INTERVAL, M))
 
 
 def test_the_first_that_is_a_tenth_as_loud_as_the_loudest_of_its_tone_is_the_direct_call():
@@ -301,39 +310,39 @@ def test_the_first_that_is_a_tenth_as_loud_as_the_loudest_of_its_tone_is_the_dir
 
 
 def test_a_direct_call_has_the_time_and_deviation_of_its_edge_in_seconds():
-    found, (delay, std) = calls_of((OWN, 30, 9.0, 7.0), (BEACON, BEGIN + 3, 9.0, 7.0))
-    assert found.tolist() == [-1, 1]
-    assert delay[BEACON] == pytest.approx(START + INTERVAL * BEGIN, abs=1e-12)
-    assert std[BEACON] == pytest.approx(INTERVAL * told_std(0.0, 5.0), rel=1e-9)
+    found, (delay, std) = calls_of((OWN, 30, 9.0, 7.0), (TONE, BEGIN + 3, 9.0, 7.0))
+    assert found.tolist() == [-1, -1, 1]
+    assert delay[TONE] == pytest.approx(START + INTERVAL * BEGIN, abs=1e-12)
+    assert std[TONE] == pytest.approx(INTERVAL * told_std(0.0, 5.0), rel=1e-9)
     assert np.isnan([delay[OWN], std[OWN]]).all()
 
 
 def test_a_call_that_rises_too_little_has_the_time_of_the_wholes_best_fit():
-    found, (delay, std) = calls_of((BEACON, BEGIN + 0.3, 9.0, 7.0), sounds=[(BEGIN, M, 1.5)])
-    assert (found[BEACON], delay[BEACON]) == (0, START + INTERVAL * (BEGIN + 0.3))
-    assert std[BEACON] == 7.0 * INTERVAL
+    found, (delay, std) = calls_of((TONE, BEGIN + 0.3, 9.0, 7.0), sounds=[(BEGIN, M, 1.5)])
+    assert (found[TONE], delay[TONE]) == (0, START + INTERVAL * (BEGIN + 0.3))
+    assert std[TONE] == 7.0 * INTERVAL
 
 
 def test_a_call_that_another_all_but_extinguished_is_none():
-    found, when = calls_of((BEACON, BEGIN, 9.0, 7.0), sounds=[(BEGIN - 5, 1, 1.8), (BEGIN, M, 5.0)])
-    assert found[BEACON] == -1
+    found, when = calls_of((TONE, BEGIN, 9.0, 7.0), sounds=[(BEGIN - 5, 1, 1.8), (BEGIN, M, 5.0)])
+    assert found[TONE] == -1
     assert np.isnan(when).all()
 
 
 def test_no_edge_is_sought_of_what_may_have_begun_before_the_record():
     """A call and what two lags about the fit may hide: M + 2 lags must come before it."""
     for lag, sought in ((M + 2.4, False), (M + 2.6, True)):
-        _, (delay, _) = calls_of((BEACON, lag, 9.0, 7.0), sounds=[(M, M, 5.0)])
+        _, (delay, _) = calls_of((TONE, lag, 9.0, 7.0), sounds=[(M, M, 5.0)])
         expected = M if sought else lag
-        assert delay[BEACON] == pytest.approx(START + INTERVAL * expected, abs=1e-12)
+        assert delay[TONE] == pytest.approx(START + INTERVAL * expected, abs=1e-12)
 
 
 def test_only_what_is_two_hundredfold_louder_within_a_call_may_leak():
     """A louder call of another tone at another time changes nothing, 10 ms away say."""
     for apart in (-100.0, -M - 0.5, -M + 0.5, 0.0, M - 0.5, M + 0.5, 100.0):
         for times in (190.0, 210.0):
-            found, _ = calls_of((BEACON, BEGIN, 1.0, 7.0), (OWN, BEGIN + apart, times, 7.0))
-            assert found[BEACON] == (-1 if abs(apart) < M and times > 200.0 else 0)
+            found, _ = calls_of((TONE, BEGIN, 1.0, 7.0), (OWN, BEGIN + apart, times, 7.0))
+            assert found[TONE] == (-1 if abs(apart) < M and times > 200.0 else 0)
 
 
 def test_a_louder_call_of_another_tone_ten_milliseconds_away_changes_nothing():

@@ -202,6 +202,15 @@ def test_a_detour_between_vehicle_and_caller_places_nothing_and_moves_nothing_fa
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("stds", "members"), [(2.9, 2), (3.1, 1)])
+def test_in_line_with_the_caller_a_detour_that_may_be_none_places_nothing(kind, stds, members):
+    """Else its error would place what is between the two behind the caller, and surely."""
+    slam, belief = standing(kind)
+    after = slam.update(belief, heard(0.5 * CALLER, stds * 0.05))
+    assert min(len(mapped(after, 7)[0]), 2) == members
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_detour_of_a_caller_that_nobody_knows_is_a_bearing_alone(kind):
     slam, belief = standing(kind)
     e = detour_of(np.zeros(2), LANDMARK, CALLER)

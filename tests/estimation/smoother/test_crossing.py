@@ -54,6 +54,17 @@ def test_bearings_cross_clearly_from_the_least_parallax_on(more, there):
 
 
 @pytest.mark.parametrize(
+    ("earlier", "last", "there"),
+    [(0.249, 1e-4, True), (0.251, 1e-4, False), (1e-4, 0.353, True), (1e-4, 0.355, False)],
+)
+def test_bearings_cross_where_the_place_is_known_to_half_the_range(earlier, last, there):
+    """From (0, 0) and (2, 0) to (2, 2): 2 m and sqrt(8) m away, at an angle of 45 degrees."""
+    poses = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    heard = Bearing(0, np.pi / 4, earlier), Bearing(1, np.pi / 2, last)
+    assert (crossing(poses, heard) is not None) == there
+
+
+@pytest.mark.parametrize(
     "heard",
     [
         pytest.param((Bearing(0, 0.7, 0.01),), id="one alone"),

@@ -492,6 +492,14 @@ def test_the_gate_is_where_the_distribution_of_what_is_expected_has_it():
         assert slam.update(belief, scan_of((1, 5.0 + off, 0.3))).gated == dropped
 
 
+def test_the_gate_of_a_bearing_alone_is_that_of_one_number():
+    slam, belief = known_landmark(0.99)
+    bearing = float(np.arctan2(*belief.landmarks().mean[0, ::-1]))
+    edge = np.sqrt(6.6348966 * 0.15**2 * 4 / 3)
+    for off, dropped in ((0.99 * edge, 0), (1.01 * edge, 1)):
+        assert slam.update(belief, scan_of((1, np.nan, bearing + off))).gated == dropped
+
+
 @pytest.mark.parametrize(("share", "dropped"), [(0.99, 0), (1.01, 1)])
 @pytest.mark.parametrize("further", [False, True], ids=["beside a bearing", "alone"])
 def test_a_detour_is_dropped_alone_where_the_distribution_of_what_is_expected_has_it(

@@ -128,6 +128,18 @@ def test_commands_hold_until_the_next_and_the_last_only_ends():
     np.testing.assert_allclose(path[-1], [0.75, 0.0, 0.0])
 
 
+def test_a_time_that_is_a_steps_but_for_rounding_is_the_steps():
+    still = Motion(model="unicycle", control_std=(0.0, 0.0))
+    rows = np.array([[1.0, 0.0], [2.0, 0.0], [9.0, 9.0]])
+    course = Commands(time=np.array([0.0, 0.1 + 1e-9, 0.3]), rows=rows)
+    assert steps_of(course, ScenarioConfig(step=0.1)) == 3
+    _, controls = drive(course, still, steps=3, step=0.1)
+    assert controls[:, 0].tolist() == [1.0, 2.0, 2.0]
+    line = Waypoints(points=np.array([[0.0, 0.0], [0.1 + 0.2, 0.0]]))
+    assert 0.3 / 0.1 < 3.0 < (0.1 + 0.2) / 0.1
+    assert steps_of(line, ScenarioConfig(step=0.1, speed=1.0)) == 3
+
+
 @pytest.mark.parametrize("more", [1, 100])
 def test_a_drive_longer_than_its_course_is_refused(more):
     course = Commands(time=np.array([0.0, 0.5]), rows=np.zeros((2, 2)))

@@ -182,6 +182,32 @@ def test_a_walk_has_the_spread_and_the_memory_that_it_says_and_stays_on_the_disc
     assert (WALK_STD, WALK_MEMORY) == (0.5, 10.0)  # as docs and settings say
 
 
+def test_a_walk_from_beyond_the_disc_goes_no_further_away_and_jumps_nowhere():
+    far = {"course": "walk", "place": [40.0, 0.0]}
+    for seed in SEEDS:
+        place = world_of(config_of(far, radius=14.0), seed).callers[1].place
+        assert place[0].tolist() == [40.0, 0.0]
+        assert np.hypot(*place.T).max() <= 40.0
+        assert np.hypot(*np.diff(place, axis=0).T).max() < 8.0 * WALK_STD * 0.125
+
+
+def test_the_first_caller_keeps_clear_of_landmarks_unless_it_is_the_papers_beacon():
+    """The beacon was drawn before the landmarks: it is they that keep clear."""
+    angle = np.linspace(0.0, np.pi, 100)
+    half = others.Around(
+        config=Config(),
+        time=np.arange(3.0),
+        path=np.zeros((3, 2)),
+        landmarks=15.0 * np.column_stack((np.cos(angle), np.sin(angle))),
+    )
+    for told, clear in ((CallerConfig(distance=15.0), True), (CallerConfig(), False)):
+        beside = [
+            others.callers_among(half, [told], np.random.default_rng(1), first)[0].place[1] < 0.0
+            for first in map(np.random.default_rng, range(20))
+        ]
+        assert all(beside) == clear
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_what_is_drawn_to_move_keeps_clear_of_the_vehicle(seed):
     for told in ({"course": "circle", "radius": 7.4}, {"course": "walk", "distance": 7.4}):

@@ -114,6 +114,13 @@ def test_the_order_of_landmarks_in_the_file_does_not_matter(tmp_path):
     assert read_world(folder).landmarks.tolist() == [[2.5, 0.0], [-1.0, 4.0]]
 
 
+def test_bodies_go_with_the_numbers_of_their_landmarks(tmp_path):
+    rows = "landmark,x,y,radius,shape\n2,0,2,0.2,sphere\n1,0,1,0.1,cylinder\n"
+    bodies = read_world(folder_with(tmp_path, landmarks_csv=rows)).bodies
+    assert bodies.radius.tolist() == [0.1, 0.2]
+    assert bodies.sphere.tolist() == [False, True]
+
+
 def test_bodies_that_are_not_told_are_the_settings(tmp_path):
     rows = "landmark,x,y,radius,shape\n1,0,1,0.2,\n2,0,2,,sphere\n3,0,3,,\n"
     folder = folder_with(
@@ -164,6 +171,12 @@ def test_in_a_grid_the_drive_ends_with_the_worlds_path(tmp_path):
     for asked, had in ((1500, 16), (8, 8)):
         layer = from_flags({"scenario": {"steps": asked}})
         assert resolve(laid_over(world, layer, {})).scenario.steps == had
+
+
+def test_in_a_grid_the_plans_callers_call_in_a_world_that_lists_none(tmp_path):
+    world = read_world(folder_with(tmp_path, landmarks_csv=LANDMARKS))
+    layer = from_flags({"callers": [{"name": "boat", "place": [9.0, 9.0]}]})
+    assert [*caller_names(resolve(laid_over(world, layer, {})).callers)] == ["boat"]
 
 
 def test_callers_have_names_of_their_own(tmp_path):

@@ -141,14 +141,13 @@ def placed_by(
         Where none is sure.
     """
     angle, found = around.pose[2] + heard.bearing, []
-    own = np.diag([0.0, 0.0, heard.std**2, 0.0])
     for clue in clues:
         caller = clue.caller == label
         other = clue.landmark if caller else clue.caller
-        own[3, 3] = clue.std**2
+        own = np.diag([0.0, 0.0, heard.std**2, clue.std**2])
         way = np.array([*(around.place(other) - around.pose[:2]), angle, clue.detour])
         _, share = sure_range(way, own, caller=caller)
-        found.append((share, other, caller, way, own.copy()))
+        found.append((share, other, caller, way, own))
     share, other, caller, way, own = min(found, key=lambda one: one[:2])
     if share > SHARE:
         return None
