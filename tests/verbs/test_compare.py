@@ -122,7 +122,9 @@ def test_studies_are_compared_case_by_case(obey, studies):
     assert rows(blocks[3])["active"][:3] == ["4.500", "4.000", "-0.500"]
     assert rows(blocks[3])["fused"][:3] == ["5.500", "4.500", "-1.000"]
     assert rows(blocks[6])["filters"] == ['["ekf"]', '["iekf"]']
-    assert blocks[7].startswith("Paired over the worlds that both have met.\n*: p < 0.05")
+    assert blocks[7].startswith(
+        "Paired over the worlds that both have met.\n*: shown, as one of all cases"
+    )
     assert len(blocks) == 8
 
 

@@ -38,6 +38,12 @@ import numpy as np
 from jaxtyping import Float
 
 Relation = Literal["above", "not above", "slightly above", "within"]
+INTERVALS = (
+    "An interval is that of one difference by itself, at 95 %. Whether the difference is shown is "
+    "decided by Holm's correction over its family, all that it is compared with: one whose "
+    "interval leaves zero out need not be shown."
+)
+"""What a reader is told wherever `Finding.alone` is printed beside a mean."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

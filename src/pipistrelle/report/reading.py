@@ -20,6 +20,7 @@ from pipistrelle.estimation.catalogue import SECTIONS
 from pipistrelle.experiments.hearing.scenario import Scenario, standing_landmarks, world_of
 from pipistrelle.experiments.studies.beamwidths import MAKERS
 from pipistrelle.experiments.studies.plan import RADIUS, Plan, cases_of, common
+from pipistrelle.experiments.studies.plan_file import planned_worlds
 from pipistrelle.experiments.studies.store import load_study
 from pipistrelle.experiments.studies.world import STEPS, world_schemas
 from pipistrelle.experiments.studies.world_files import (
@@ -212,7 +213,7 @@ def _study(
         name=plan.name,
         variables=variables,
         grid=dict(plan.grid),
-        planned=plan.iterations,
+        planned=planned_worlds(plan),
         worlds=worlds,
         config=plan.config,
         configs=configs,

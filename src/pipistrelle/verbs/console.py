@@ -21,15 +21,16 @@ TITLES = {
     "map_rmse_m": ("map RMSE [m]", 3),
     "position_rmse_aligned_m": ("position RMSE, aligned [m]", 3),
     "map_rmse_aligned_m": ("map RMSE, aligned [m]", 3),
-    "position_floor_m": ("position, unavoidable [m]", 3),
-    "position_bound_m": ("position, bound [m]", 3),
-    "heading_bound_rad": ("heading, bound [rad]", 4),
+    "position_bound_m": ("position bound over worlds [m]", 3),
+    "heading_bound_rad": ("heading bound over worlds [rad]", 4),
     "caller_rmse_m": ("moving callers' RMSE [m]", 3),
     "caller_rmse_aligned_m": ("moving callers' RMSE, aligned [m]", 3),
     "nees_mean": ("NEES, mean", 2),
     "nees_max": ("NEES, largest", 1),
 }
 """Scores as a person reads them, and their digits."""
+BOUND = "A bound holds for the root mean square over many worlds: in one, an error may be below it."
+"""What is said under a table of one world that has a bound."""
 
 
 @contextmanager
@@ -150,6 +151,7 @@ def closing_table(trials: "Sequence[TrialResult]", there: int | None = None) -> 
     """Compare the estimates of one world, a column each; what no estimate has is left out.
 
     Six columns fit into 100 characters. Of particles, landmarks are those of the heaviest particle.
+    Under the table stands what a bound says, where there is one.
 
     Parameters
     ----------
@@ -169,9 +171,9 @@ def closing_table(trials: "Sequence[TrialResult]", there: int | None = None) -> 
         cells = [column[title] for column in columns]
         if any(cells):
             lines.append((title, *(text or "-" for text in cells)))
-    return "\n".join(
-        f"{line[0]:<30}" + "".join(f"{c:>{width}}" for c in line[1:]) for line in lines
-    )
+    rows = [f"{line[0]:<32}" + "".join(f"{c:>{width}}" for c in line[1:]) for line in lines]
+    bounded = any(trial.scores.position_bound_m is not None for trial in trials)
+    return "\n".join([*rows, BOUND] if bounded else rows)
 
 
 def _cells(trial: "TrialResult", there: int | None) -> Iterator[tuple[str, str]]:

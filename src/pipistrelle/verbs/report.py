@@ -1,7 +1,7 @@
 """`pipistrelle report`: a study on one page."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
@@ -20,6 +20,7 @@ def report(
     quiet: Annotated[bool, Parameter(negative=(), help="Print the page's path alone.")] = False,
 ) -> None:
     """Answer a study's question on one page, with its figures; judge the paper's claims by it."""
+    from pipistrelle.evaluation.comparison import INTERVALS
     from pipistrelle.report.page.overview import not_the_papers_line
     from pipistrelle.report.page.page import write_report
     from pipistrelle.report.reading import read_study
@@ -38,8 +39,19 @@ def report(
         if not told["claims"]:
             for sentence in told["answer"]:
                 put(sentence)
+            put(INTERVALS)
         elif line := not_the_papers_line(told["not_the_papers"]):
             put(line)
         for claim in told["claims"]:
             put(f"{claim['claim']}  {claim['verdict'].replace('-', ' '):<15} {claim['sentence']}")
+            if claim["verdict"] == "open":
+                put(f"{'':<18} {_why(claim)}")
     put(target / "index.html")
+
+
+def _why(claim: dict[str, Any]) -> str:
+    """Say why a claim is open, and how much of it is undecided."""
+    parts = claim["by_exclusion"]["world"]["parts"]
+    found = [finding["holds"] for part in parts for finding in part["findings"]]
+    undecided = f" {found.count(None)} of its {len(found)} statements are undecided."
+    return claim["rule"] + undecided * (None in found)

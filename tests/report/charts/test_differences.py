@@ -100,8 +100,11 @@ def test_the_gain_is_charted_along_each_variable_a_line_for_each_combination_of_
         by_power.caption
     )
     mean = [finding.mean for finding in selection.gains["ekf", "position_rmse_m"]]
-    shown = [series.y.tolist() for series in by_power.panels[0].series]
-    assert shown == [[mean[0], mean[2]], [mean[1], mean[3]]]
+    overall, *each = by_power.panels[0].series
+    assert [series.y.tolist() for series in each] == [[mean[0], mean[2]], [mean[1], mean[3]]]
+    assert all(series.low is None for series in each), "bars of so many would hide each other"
+    assert overall.y == pytest.approx([(mean[0] + mean[1]) / 2.0, (mean[2] + mean[3]) / 2.0])
+    assert np.all((overall.low < overall.y) & (overall.y < overall.high))
     active, fused = (study.trials["ekf", w].scores["position_rmse_m"] for w in ("active", "fused"))
     np.testing.assert_allclose(mean, (active - fused).mean(axis=0), rtol=1e-9)
 

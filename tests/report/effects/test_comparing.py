@@ -9,7 +9,7 @@ import pytest
 from pipistrelle.evaluation.comparison import Statement, judge
 from pipistrelle.report.claims.contrasts import select, selections
 from pipistrelle.report.effects.comparing import contrasts_of, effects_of, record, resolvable
-from pipistrelle.report.effects.measures import MEASURES
+from pipistrelle.report.effects.measures import GAINS, MEASURES
 from pipistrelle.report.reading import read_study
 from pipistrelle.report.studied import RULES
 from report.invented import changed, invent, only
@@ -34,6 +34,11 @@ def position(effects, **asked):
 def test_every_value_of_a_variable_is_compared_with_its_first_in_each_strategy(tmp_path):
     study = study_of(tmp_path, worlds=2, ways='filters = ["ekf", "fastslam"]\n')
     mine = [c for c in contrasts_of(study) if c.factor == "beacon.level_db"]
+    gains = [c for c in mine if c.measures == GAINS]
+    assert Counter((c.filter, c.strategy) for c in gains) == {
+        (name, strategy): 2 for name in ("ekf", "fastslam") for strategy in ("fused", "passive")
+    }
+    mine = [c for c in mine if c.measures == MEASURES]
     assert Counter((c.filter, c.strategy, c.before, c.after, c.end) for c in mine) == {
         (name, strategy, "36.8", after, after == "48.8"): 1
         for name in ("ekf", "fastslam")
@@ -97,7 +102,7 @@ def test_strategies_and_filters_are_compared_with_the_first_of_them(tmp_path):
 
 def test_the_beam_does_nothing_to_passive_sensing_and_is_not_compared_in_it():
     study = invent(3)
-    mine = [c for c in contrasts_of(study) if c.factor == "beamwidth"]
+    mine = [c for c in contrasts_of(study) if c.factor == "beamwidth" and c.measures == MEASURES]
     assert {c.strategy for c in mine} == {"active", "fused"}
     assert len(mine) == 2 * 2 * 11
     (far,) = [c for c in contrasts_of(study) if (c.filter, c.after) == ("ekf", "passive")]
@@ -225,3 +230,91 @@ def test_over_many_studies_without_an_effect_a_family_is_wrong_as_seldom_as_it_s
         wrong += any(effect.finding.holds is not None for effect in mine)
     assert wrong / runs <= 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / runs)
     assert len(mine) == 20
+
+
+def gains_by_level(case):
+    """Active's error falls by 0.3 m over the levels and fused's by 0.1 m: the gain by 0.2 m."""
+    falls = {"active": -0.3, "fused": -0.1, "passive": 0.0}[case.strategy]
+    return by_level(falls)(case)
+
+
+THREE = 'filters = ["ekf"]\n'
+
+
+def test_what_a_variable_does_to_the_gain_of_listening_is_active_less_the_other_in_each_world(
+    tmp_path,
+):
+    study = study_of(tmp_path, TWO, ways=THREE, effect=gains_by_level)
+    found = {
+        effect.contrast.strategy: effect
+        for effect in effects_of(select(study, "none"))
+        if effect.measure is GAINS[0]
+        and (effect.contrast.factor, effect.contrast.end) == ("beacon.level_db", True)
+    }
+    table = {way: study.trials["ekf", way].scores["position_rmse_m"] for way in (
+        "active", "fused", "passive",
+    )}  # fmt: skip
+    samples = []
+    for way in ("fused", "passive"):
+        gain = table["active"] - table[way]
+        samples.append(0.5 * (gain[:, 4] - gain[:, 0] + gain[:, 5] - gain[:, 1]))
+    for effect, sample in zip(found.values(), samples, strict=True):
+        assert effect.finding.mean == pytest.approx(sample.mean())
+    assert [*found] == ["fused", "passive"]
+    assert found["fused"].finding.mean == pytest.approx(-0.2, abs=0.03)
+    expected = judge([Statement(label="", sample=sample) for sample in samples])
+    assert [e.finding.p for e in found.values()] == pytest.approx([f.p for f in expected])
+    assert [f.mean for f in found["fused"].apart] == pytest.approx([-0.2, -0.2], abs=0.05)
+
+
+def test_a_gain_is_of_the_worlds_in_which_what_it_is_over_counts(tmp_path):
+    def diverged(case, world):
+        return case.strategy == "active" and world < 3
+
+    ways = 'filters = ["ekf"]\nstrategies = ["active", "fused"]\n'
+    study = study_of(tmp_path, ways=ways, diverged=diverged)
+    for rule, left in (("case", 9), ("none", 12)):
+        mine = [e for e in effects_of(select(study, rule)) if e.measure is GAINS[0]]
+        assert {effect.finding.n for effect in mine} == {left}
+
+
+def test_what_the_beam_does_to_the_gain_of_passive_sensing_is_what_it_does_to_active():
+    study = only(invent(6), [("ekf", "active"), ("ekf", "passive")])
+    effects = effects_of(select(study, "none"))
+    mine = [e for e in effects if e.contrast.factor == "beamwidth" and e.contrast.end]
+    (error,) = (e for e in mine if e.measure is POSITION)
+    (gain,) = (e for e in mine if e.measure is GAINS[0])
+    assert (error.contrast.strategy, gain.contrast.strategy) == ("active", "passive")
+    assert gain.finding.mean == pytest.approx(error.finding.mean)
+
+
+def test_a_gain_at_one_level_is_over_active_at_every_beam(tmp_path):
+    """Passive sensing has one case for all beams; what it gains over active has one for each."""
+    grid = '"emitter.radius" = [0.0025, 0.0088]\n"beacon.level_db" = [36.8, 48.8]'
+    study = study_of(tmp_path, grid, worlds=2, ways=THREE)
+    mine = [c for c in contrasts_of(study) if (c.factor, c.strategy) == (
+        "beacon.level_db", "passive",
+    )]  # fmt: skip
+    assert {c.measures: len(c.pairs) for c in mine} == {MEASURES: 1, GAINS: 2}
+
+
+def test_a_world_counts_only_where_every_averaged_pair_has_a_number(tmp_path):
+    study = study_of(tmp_path, TWO)
+    study.trials["ekf", "fused"].scores["position_rmse_m"][3, 5] = np.nan
+    (end,) = position(effects_of(select(study, "none")), factor="beacon.level_db", end=True)
+    assert len(end.contrast.pairs) == 2
+    assert end.finding.n == 11
+    assert [finding.n for finding in end.apart] == [12, 11]
+
+
+def test_gains_stand_in_the_record_beside_errors_under_names_of_their_own(tmp_path):
+    study = study_of(tmp_path, worlds=3, ways=THREE)
+    by_rule = {rule: effects_of(one) for rule, one in selections(study).items()}
+    rows = [row for row in record(by_rule, "none") if row["variable"] == "beacon.level_db"]
+    gains = [row for row in rows if row["measure"].startswith("gain_")]
+    assert {row["measure"] for row in gains} == {
+        "gain_position_rmse_m", "gain_position_rmse_aligned_m", "gain_heading_rmse_rad",
+        "gain_map_rmse_m",
+    }  # fmt: skip
+    assert {row["strategy"] for row in gains} == {"fused", "passive"}
+    assert len(rows) - len(gains) == 3 * 2 * len(MEASURES)

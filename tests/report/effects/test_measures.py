@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipistrelle.report.effects.measures import MEASURES, change
+from pipistrelle.report.effects.measures import GAINS, MEASURES, change
 from pipistrelle.report.studied import SCORES
 from report.invented import changed, invent
 
@@ -80,3 +80,17 @@ def test_passive_sensing_is_compared_with_any_beam_by_its_one_case(study):
     fused = study.trials["ekf", "fused"].scores["position_rmse_m"][:, 7]
     found = change(study, MEASURES[0], ("ekf", "fused", 7), ("ekf", "passive", 7))
     np.testing.assert_array_equal(found, passive - fused)
+
+
+def test_a_gain_in_the_map_is_over_the_landmarks_that_all_four_cases_have_placed(study):
+    four = with_maps(study, [[1, 1, 1, 0], [1, 1, 0, 1]], [[3.0, 4.0, 9.0, 9.0], [3.0, 8.0, 9, 9]])
+    alone = four.trials["ekf", "active"]
+    shape = (6, 12, 4)
+    placed, off = np.ones(shape, bool), np.full(shape, 5.0)
+    placed[:, 5, 0] = False  # leaves the second landmark alone to all four
+    four = replace(
+        four, trials=four.trials | {("ekf", "active"): replace(alone, placed=placed, off=off)}
+    )
+    (gain,) = (one for one in GAINS if one.score == "map_rmse_m")
+    found = change(four, gain, BEFORE, AFTER)
+    assert found == pytest.approx(np.full(6, (5.0 - 8.0) - (5.0 - 4.0)))

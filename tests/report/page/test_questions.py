@@ -214,7 +214,7 @@ def test_the_papers_study_is_asked_the_papers_question_and_has_its_claims_after_
     assert [one for one in page.ids if one in order] == order
     assert "effects" not in page.ids
     assert page.summary["answered_by"] == "world"
-    assert len(page.effects(variable="beamwidth")) == 2 * 2 * 11 * 6
+    assert len(page.effects(variable="beamwidth")) == 2 * 2 * 11 * (6 + 4), "errors, and gains"
 
 
 def test_a_further_filter_beside_the_papers_cases_changes_nothing_of_that(tmp_path):

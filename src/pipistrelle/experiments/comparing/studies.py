@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 
 from pipistrelle.config import Config, InputError
 from pipistrelle.estimation.catalogue import short_name
-from pipistrelle.evaluation.comparison import Finding, Statement, judge
+from pipistrelle.evaluation.comparison import INTERVALS, Finding, Statement, judge
 from pipistrelle.experiments.comparing.folders import LETTERS
 from pipistrelle.experiments.comparing.matching import (
     alike,
@@ -28,7 +28,7 @@ from pipistrelle.experiments.comparing.matching import (
     worded,
 )
 from pipistrelle.experiments.studies.plan import RADIUS, Plan, PlannedCase, cases_of
-from pipistrelle.experiments.studies.plan_file import plan_settings
+from pipistrelle.experiments.studies.plan_file import plan_settings, planned_worlds
 from pipistrelle.experiments.studies.store import load_study
 from pipistrelle.experiments.studies.world_files import check_world, done_worlds
 from pipistrelle.files import read_file
@@ -182,7 +182,7 @@ def compare_studies(folders: Sequence[Path], *, drop_diverged: bool = False) -> 
         folders=tuple(folders),
         versions=tuple(map(_version, folders)),
         done=tuple(one.worlds for one in told),
-        planned=tuple(one.plan.iterations for one in told),
+        planned=tuple(planned_worlds(one.plan) for one in told),
         cases=tuple(case for score in SCORES for case in _judged(pairs, score, drop_diverged)),
         alone=tuple((_label([case], varied, told[who[0]].trials), who) for case, who in left),
         settings=differing([plan_settings(one.plan) for one in told]),
@@ -394,7 +394,7 @@ def notes_of(compared: ComparedStudies) -> tuple[str, ...]:
         )
     else:
         notes.append("Paired where the worlds are the same, without a mark; ~: means over others.")
-    notes.append("*: p < 0.05 as one of all cases of its table (Holm), as are the intervals.")
+    notes.append(f"*: shown, as one of all cases of its table. {INTERVALS}")
     left = "are left out" if compared.dropped_diverged else "count, as far as they have a number"
     notes.append(f"Worlds in which a case diverged {left}.")
     for who in dict.fromkeys(its for _, its in compared.alone):

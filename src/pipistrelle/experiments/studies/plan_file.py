@@ -146,6 +146,31 @@ def read_plan(path: Path, over: Layer | None = None, iterations: int | None = No
     return plan_of(read_toml(path), path, over, iterations)
 
 
+def planned_worlds(plan: Plan) -> int:
+    """Tell how many worlds a whole study has.
+
+    Parameters
+    ----------
+    plan : Plan
+        As a study's folder keeps it.
+
+    Returns
+    -------
+    int
+        Of a plan that ships, its own number, though fewer were asked for.
+
+    Examples
+    --------
+    >>> planned_worlds(read_plan(find_plan("paper"), iterations=5))
+    115
+    """
+    if plan.name in PLANS:
+        shipped = read_plan(find_plan(plan.name))
+        if shipped.grid == plan.grid:
+            return max(plan.iterations, shipped.iterations)
+    return plan.iterations
+
+
 def plan_of(
     table: Mapping[str, Any],
     path: Path = Path("plan"),

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.evaluation.comparison import Finding
+from pipistrelle.evaluation.comparison import Finding, Statement, judge
 from pipistrelle.figures.chart import Axis, Chart, Panel, Series, ends, linear_axis, log_axis
 from pipistrelle.report.charts.axes import (
     axis_of,
@@ -15,7 +15,7 @@ from pipistrelle.report.charts.axes import (
     each_combination,
     slug,
 )
-from pipistrelle.report.effects.comparing import Effect, effects_of, families_of
+from pipistrelle.report.effects.comparing import Effect, effects_of, families_of, mean_change
 from pipistrelle.report.effects.measures import MEASURES, Measure
 from pipistrelle.report.effects.wording import the
 from pipistrelle.report.numbers import UNITS
@@ -199,7 +199,8 @@ def _gain_chart(selection: Selection, variable: Variable) -> Chart:
     several = len(study.variables) > 1
     spread = "mean and its 95 % interval"
     if several:
-        spread = f"mean; {each_combination(study, variable)}"
+        spread = f"mean; {each_combination(study, variable)}, points for their mean and its 95 % "
+        spread += "interval"
     return Chart(
         name=f"gain_by_{slug(variable.name)}" if several else "gain",
         title="What listening to others adds to one's own calls"
@@ -227,4 +228,18 @@ def _gains(selection: Selection, name: str, score: str, variable: Variable) -> l
             faint = 1.0 - 0.75 * j / (count - 1)
             one = replace(one, name=named, style="dots", low=None, high=None, strength=faint)
         series.append(one)
-    return series
+    return [_mean_gains(selection, name, score, variable), *series] if count > 1 else series
+
+
+def _mean_gains(selection: Selection, name: str, score: str, variable: Variable) -> Series:
+    """Return a filter's gains along a variable, in the mean over the combinations of the rest."""
+    measure = Measure(title="", score=score, unit="m")
+    pairs = [
+        [((name, "fused", i), (name, "active", i)) for i in row]
+        for row in along(selection.study, variable).tolist()
+    ]
+    samples = [mean_change(selection, measure, mine) for mine in pairs]
+    findings = judge([Statement(label="", sample=sample) for sample in samples])
+    shown = [finding.holds is not None for finding in findings]
+    mean, edges = _bars(findings)
+    return about(f"mean, {DIFFERENCE}", "fused", places(variable), mean, edges, shown)

@@ -1,7 +1,7 @@
 """The answer to a study's own question: what each variable does, in a line and a few sentences.
 
-The line speaks of the position's error; a sentence per variable and filter says by how much it
-changes, and where nothing is shown, how little would have been.
+The line speaks of the position's error. Sentences say by how much each variable changes what
+listening gains there, and the error itself; where nothing is shown, how little would have been.
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pipistrelle.config import STRATEGIES
 from pipistrelle.report.effects.comparing import FILTER, STRATEGY, Effect, families_of
 from pipistrelle.report.effects.levels import diverged, errors_of, times_the_bound
-from pipistrelle.report.effects.measures import MEASURES
+from pipistrelle.report.effects.measures import GAINS, MEASURES, Measure
 from pipistrelle.report.effects.wording import (
     VERBS,
     besides,
@@ -81,7 +81,9 @@ def answer(selection: Selection, by_rule: Mapping[Rule, Sequence[Effect]]) -> li
     levels = [] if study.variables else errors_of(selection)
     lines = [_headline(study, v, families) for v in study.variables] or _compared(families)
     lines = lines or [levels.pop(0) if levels else "Not decided: no world is left"]
-    sentences = [_sentence(study, family, beside) for family in families.values()]
+    sentences = [
+        said for those in (GAINS, MEASURES) for said in _each(study, families, beside, those)
+    ]
     bound = [] if not study.variables else [*_gains(study, effects), *_bound(selection)]
     headline = _sentenced("; ".join(lines))
     return [headline, *levels, *sentences, *bound, *filter(None, [diverged(study)])]
@@ -95,13 +97,20 @@ def _gains(study: Study, effects: Sequence[Effect]) -> list[str]:
         listens = (contrast.before, contrast.after) == ("active", "fused")
         if not listens or effect.measure is not FIRST or effect.finding.n < 2:
             continue
-        cases = sorted(zip(effect.apart, contrast.names, strict=False), key=lambda one: one[0].mean)
-        each = [f"by {size(found, FIRST.unit, signed=True)} at {at}" for found, at in cases]
         whose = f"{filter_titles(study)[contrast.filter]}'s {FIRST.title}"
         what = size(effect.finding, FIRST.unit, signed=True)
-        many = len(each) > FEW_CASES
-        where = f", {each[0]} to {each[-1]}" if many else "".join(f"; {one}" for one in each)
-        said.append(_sentenced(f"{subject(study, effect)} changes {whose} by {what}{where}"))
+        cases = sorted(zip(effect.apart, contrast.names, strict=False), key=lambda one: one[0].mean)
+        each = [(at, size(found, FIRST.unit, signed=True)) for found, at in cases]
+        words = [f"{subject(study, effect)} changes {whose} by {what}"]
+        if len(each) > FEW_CASES:
+            least, most = each[0], each[-1]
+            words += [
+                f"the least is {least[1]} at {least[0]}",
+                f"the most is {most[1]} at {most[0]}",
+            ]
+        else:
+            words += [f"at {at} it does by {change}" for at, change in each]
+        said.append(" ".join(map(_sentenced, words)))
     return said
 
 
@@ -111,24 +120,40 @@ def _sentenced(words: str) -> str:
     return f"{words[0] if plain else words[0].upper()}{words[1:].rstrip('.')}."
 
 
-def _sentence(study: Study, family: Sequence[Effect], beside: Mapping[Effect, Effect]) -> str:
+def _each(
+    study: Study,
+    families: Mapping[tuple[str, str], Sequence[Effect]],
+    beside: Mapping[Effect, Effect],
+    measures: Sequence[Measure],
+) -> list[str]:
+    """Say what each variable does with each filter, of some measures the first at length."""
+    chosen = ([one for one in family if one.measure in measures] for family in families.values())
+    return [_sentences(study, family, beside, measures) for family in chosen if family]
+
+
+def _sentences(
+    study: Study,
+    family: Sequence[Effect],
+    beside: Mapping[Effect, Effect],
+    measures: Sequence[Measure],
+) -> str:
     """Say what a variable does with a filter."""
-    ends = [effect for effect in family if effect.contrast.end]
+    first = [effect for effect in family if effect.measure is measures[0]]
     by_value: dict[str, list[Effect]] = {}
-    for effect in ends:
-        if effect.measure is FIRST:
+    for effect in first:
+        if effect.contrast.end:
             by_value.setdefault(effect.contrast.after, []).append(effect)
-    told = list(by_value.values())
-    if len(told) > MOST_VALUES:
-        told = sorted(told, key=_strength, reverse=True)[:MOST_VALUES]
+    values = list(by_value.values())
+    if len(values) > MOST_VALUES:
+        values = sorted(values, key=_strength, reverse=True)[:MOST_VALUES]
     said = []
-    for mine in told:
-        said.append(f"{subject(study, mine[0])} {clauses(study, mine, beside)}")
-        said += elsewhere(study, mine)
-    said += in_between(study, [effect for effect in family if effect.measure is FIRST])
-    if len(told) < len(by_value):
-        said.append(f"{len(by_value) - len(told)} more values are in the table")
-    return _sentenced("; ".join(said)) + besides(ends)
+    for mine in values:
+        said += [*clauses(study, mine, beside), *elsewhere(study, mine)]
+    said += in_between(study, first)
+    if len(values) < len(by_value):
+        said.append(f"{len(by_value) - len(values)} more values are in the table")
+    ends = [effect for effect in family if effect.contrast.end]
+    return " ".join(map(_sentenced, said)) + besides(ends, measures[1:])
 
 
 def _strength(effects: Sequence[Effect]) -> tuple[bool, float]:

@@ -5,7 +5,8 @@ what filters may assume wrongly, and of biases, with the truth. What else varies
 world by world, and looked at one by one besides. Strategies and filters are compared in the same
 way, the first of them with each other one. All contrasts of a variable with a filter are one
 family for each measure (`pipistrelle.evaluation.comparison`): of numbers the ends, which are what
-the answer speaks of, and the values between them another.
+the answer speaks of, and the values between them another. What a variable does to the gain of
+listening is compared alike: a gain is a measure, too (`measures.GAINS`).
 """
 
 import math
@@ -18,17 +19,19 @@ from jaxtyping import Float
 
 from pipistrelle.config import STRATEGIES
 from pipistrelle.evaluation.comparison import Finding, Statement, judge
-from pipistrelle.report.effects.measures import MEASURES, Measure, change
+from pipistrelle.report.effects.measures import GAINS, MEASURES, Measure, cells_of, change
 from pipistrelle.report.studied import (
     Cell,
     Rule,
     Selection,
     Study,
+    Way,
     along,
     combination_name,
     filter_titles,
     kept,
 )
+from pipistrelle.report.variables import Variable
 
 STRATEGY, FILTER = "strategy", "filter"
 """What a study compares beside its variables."""
@@ -53,6 +56,8 @@ class Contrast:
         One for each combination of the rest.
     names : tuple of str
         Of those combinations.
+    measures : tuple of Measure
+        What is compared; `measures.GAINS` where it is what the strategy gains.
     """
 
     factor: str
@@ -63,6 +68,7 @@ class Contrast:
     end: bool = True
     pairs: tuple[Pair, ...]
     names: tuple[str, ...]
+    measures: tuple[Measure, ...] = MEASURES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,14 +120,14 @@ def effects_of(selection: Selection) -> tuple[Effect, ...]:
     -------
     tuple of Effect
     """
-    families: dict[tuple[str, str, bool], list[Contrast]] = {}
-    for contrast in contrasts_of(selection.study):
-        family = contrast.factor, contrast.filter or contrast.strategy, contrast.end
-        families.setdefault(family, []).append(contrast)
+    families: dict[tuple[Any, ...], list[Contrast]] = {}
+    for one in contrasts_of(selection.study):
+        family = one.factor, one.filter or one.strategy, one.end, one.measures
+        families.setdefault(family, []).append(one)
     return tuple(
         effect
         for family in families.values()
-        for measure in MEASURES
+        for measure in family[0].measures
         for effect in _judged(selection, family, measure)
     )
 
@@ -148,6 +154,29 @@ def families_of(study: Study, effects: Sequence[Effect]) -> dict[tuple[str, str]
     return families
 
 
+def mean_change(
+    selection: Selection, measure: Measure, pairs: Sequence[Pair]
+) -> Float[np.ndarray, " m"]:
+    """Average a change over some pairs of cases, in the worlds that have all of them.
+
+    Parameters
+    ----------
+    selection : Selection
+    measure : Measure
+    pairs : sequence of pairs of Cell
+
+    Returns
+    -------
+    (m)
+        A number per world.
+    """
+    study = selection.study
+    changes = np.array([change(study, measure, *pair) for pair in pairs])
+    counts = kept(selection, [cell for pair in pairs for cell in cells_of(measure, *pair)])
+    counts &= np.all(np.isfinite(changes), axis=0)
+    return np.mean(changes[:, counts], axis=0)
+
+
 def resolvable(finding: Finding) -> float:
     """Tell how small an effect would have been significant.
 
@@ -159,7 +188,8 @@ def resolvable(finding: Finding) -> float:
     Returns
     -------
     float
-        Half the width of its interval, in the sample's unit; infinite where nothing could be.
+        In either direction: from the mean to the farther end of its family's interval, in the
+        sample's unit; infinite where nothing could be.
     """
     low, high = finding.interval
     return max(finding.mean - low, high - finding.mean) if finding.n > 1 else math.inf
@@ -187,7 +217,7 @@ def record(by_rule: Mapping[Rule, Sequence[Effect]], headline: Rule) -> list[dic
             "strategy": one[0].contrast.strategy or None,
             "from": one[0].contrast.before,
             "to": one[0].contrast.after,
-            "measure": one[0].measure.score,
+            "measure": "gain_" * bool(one[0].measure.over) + one[0].measure.score,
             "unit": "ratio" if one[0].measure.ratio else one[0].measure.unit,
             "averaged_over": len(one[0].contrast.pairs),
             "by_exclusion": {
@@ -252,30 +282,46 @@ def _plain_apart(effect: Effect) -> list[dict[str, Any]]:
 
 
 def _of_variables(study: Study) -> Iterator[Contrast]:
-    """Compare every value of each variable with its first, or with the truth."""
+    """Compare the values of each variable in every strategy, and in what each gains over active."""
     for variable in study.variables:
-        rows, base = along(study, variable), variable.base
-        ends = range(len(rows)) if variable.numbers is None else (0, len(rows) - 1)
         for name in filter_titles(study):
-            for strategy in STRATEGIES:
-                if (name, strategy) not in study.trials:
-                    continue
-                at = study.trials[name, strategy].at[rows]
-                if np.all(at == at[:1]):
-                    continue  # passive sensing has no beam
-                for j in (j for j in range(len(rows)) if j != base):
-                    first = np.unique(at[[base, j]], axis=1, return_index=True)[1]
-                    mine = [(int(rows[base, m]), int(rows[j, m])) for m in np.sort(first)]
-                    yield Contrast(
-                        factor=variable.name,
-                        filter=name,
-                        strategy=strategy,
-                        before=variable.words[base],
-                        after=variable.words[j],
-                        end=j in ends,
-                        pairs=tuple(((name, strategy, a), (name, strategy, b)) for a, b in mine),
-                        names=tuple(combination_name(study, a, [variable]) for a, _ in mine),
-                    )
+            ways = [(name, strategy) for strategy in STRATEGIES if (name, strategy) in study.trials]
+            for way in ways:
+                yield from _of_values(study, variable, [way], MEASURES)
+            over = name, GAINS[0].over
+            for way in ways:
+                if over in ways and way != over:
+                    yield from _of_values(study, variable, [way, over], GAINS)
+
+
+def _of_values(
+    study: Study, variable: Variable, ways: Sequence[Way], measures: tuple[Measure, ...]
+) -> Iterator[Contrast]:
+    """Compare every value of a variable with its first, or with the truth, in the first way.
+
+    Two combinations are one where none of the ways tells them apart.
+    """
+    rows, base = along(study, variable), variable.base
+    ends = range(len(rows)) if variable.numbers is None else (0, len(rows) - 1)
+    at = np.array([study.trials[way].at[rows] for way in ways])
+    if np.all(at == at[:, :1]):
+        return  # passive sensing has no beam
+    for j in (j for j in range(len(rows)) if j != base):
+        cases = at[:, [base, j]].reshape(-1, rows.shape[1])
+        first = np.sort(np.unique(cases, axis=1, return_index=True)[1])
+        yield Contrast(
+            factor=variable.name,
+            filter=ways[0][0],
+            strategy=ways[0][1],
+            before=variable.words[base],
+            after=variable.words[j],
+            end=j in ends,
+            pairs=tuple(
+                ((*ways[0], int(rows[base, m])), (*ways[0], int(rows[j, m]))) for m in first
+            ),
+            names=tuple(combination_name(study, int(rows[base, m]), [variable]) for m in first),
+            measures=measures,
+        )
 
 
 def _of_strategies(study: Study) -> Iterator[Contrast]:
@@ -311,11 +357,11 @@ def _everywhere(
 
 def _judged(selection: Selection, family: Sequence[Contrast], measure: Measure) -> Iterator[Effect]:
     """Judge a family of contrasts in one measure; what nothing touches needs no judging."""
-    samples = [_mean_change(selection, measure, contrast.pairs) for contrast in family]
+    samples = [mean_change(selection, measure, contrast.pairs) for contrast in family]
     untouched = [len(sample) > 0 and not sample.any() for sample in samples]
     means = _findings(samples, untouched)
     apart = [
-        [_mean_change(selection, measure, [pair]) for pair in contrast.pairs]
+        [mean_change(selection, measure, [pair]) for pair in contrast.pairs]
         if len(contrast.pairs) > 1
         else []
         for contrast in family
@@ -343,14 +389,3 @@ def _findings(
         judge([one])[0] if same else next(judged)
         for one, same in zip(statements, untouched, strict=True)
     ]
-
-
-def _mean_change(
-    selection: Selection, measure: Measure, pairs: Sequence[Pair]
-) -> Float[np.ndarray, " m"]:
-    """Return the change averaged over some pairs of cases, in the worlds that have all of them."""
-    study = selection.study
-    changes = np.array([change(study, measure, *pair) for pair in pairs])
-    counts = kept(selection, [cell for pair in pairs for cell in pair])
-    counts &= np.all(np.isfinite(changes), axis=0)
-    return np.mean(changes[:, counts], axis=0)

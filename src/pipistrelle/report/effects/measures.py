@@ -1,9 +1,11 @@
-"""What is looked at in each trial: six numbers, each better or worse by itself.
+"""What is looked at in each trial: six numbers, each better or worse by itself, and gains.
 
-`MEASURES` is the only list of them: table, figures, sentences and summary follow.
+`MEASURES` is the only list of them: table, figures, sentences and summary follow. A gain is the
+error of active sensing less that of a strategy that listens, in the same world.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -36,6 +38,8 @@ class Measure:
         Two cases are compared by the ratio of their numbers, not by the difference.
     bound : one of `studied.SCORES`, or nothing
         The least that any estimator has.
+    over : strategy, or nothing
+        The number is a gain: this strategy's, less the case's own.
     """
 
     title: str
@@ -43,6 +47,7 @@ class Measure:
     unit: str
     ratio: bool = False
     bound: str = ""
+    over: str = ""
 
 
 MEASURES = (
@@ -54,6 +59,30 @@ MEASURES = (
     Measure(title="NEES", score="nees_mean", unit="", ratio=True),
 )
 """The first is what the answer speaks of."""
+GAINS = tuple(
+    replace(
+        one, title=f"{one.title.removesuffix(' error')} gain over active", bound="", over="active"
+    )
+    for one in MEASURES
+    if one.unit in ("m", "rad")
+)
+"""What listening gains, of each error: above 0 where it helps."""
+
+
+def cells_of(measure: Measure, before: Cell, after: Cell) -> list[Cell]:
+    """List the cases of which a change is made: two, and of a gain those that it is over.
+
+    Parameters
+    ----------
+    measure : Measure
+    before, after : Cell
+
+    Returns
+    -------
+    list of Cell
+    """
+    cells = [before, after]
+    return cells + [(name, measure.over, number) for name, _, number in cells if measure.over]
 
 
 def change(study: Study, measure: Measure, before: Cell, after: Cell) -> Float[np.ndarray, " n"]:
@@ -69,18 +98,29 @@ def change(study: Study, measure: Measure, before: Cell, after: Cell) -> Float[n
     -------
     (n)
         After minus before; of a ratio its logarithm; NaN or infinite where one of them has no
-        number. A map's error is that of the landmarks which both have placed, if they met the same
-        ones; of those that only one has placed, nothing can be compared.
+        number. A map's error is that of the landmarks which all these cases have placed, as far as
+        they met the same ones; of those that only one has placed, nothing can be compared.
     """
-    if measure.score == MAP and study.drawing[before[2]] == study.drawing[after[2]]:
-        first, second = _shared_maps(study, before, after)
-    else:
-        first, second = (values(study, measure.score, cell) for cell in (before, after))
+    first, second, *over = _numbers(study, measure.score, cells_of(measure, before, after))
     with np.errstate(divide="ignore", invalid="ignore"):
+        if over:
+            first, second = over[0] - first, over[1] - second
         return np.log(second) - np.log(first) if measure.ratio else second - first
 
 
-def _shared_maps(study: Study, *cells: Cell) -> list[Float[np.ndarray, " n"]]:
+def _numbers(study: Study, score: str, cells: Sequence[Cell]) -> list[Float[np.ndarray, " n"]]:
+    """Return a score of cases; of maps, over the landmarks that all who met them have placed."""
+    found: dict[Cell, Float[np.ndarray, " n"]] = {}
+    for drawing in {study.drawing[number] for _, _, number in cells}:
+        mine = [cell for cell in cells if study.drawing[cell[2]] == drawing]
+        if score == MAP and len(mine) > 1:
+            found |= zip(mine, _shared_maps(study, mine), strict=True)
+        else:
+            found |= {cell: values(study, score, cell) for cell in mine}
+    return [found[cell] for cell in cells]
+
+
+def _shared_maps(study: Study, cells: Sequence[Cell]) -> list[Float[np.ndarray, " n"]]:
     """Return the map RMSE of cases over the landmarks that all of them have placed."""
     placed, off = [], []
     for name, strategy, number in cells:

@@ -4,13 +4,11 @@ from collections.abc import Mapping, Sequence
 
 from pipistrelle.evaluation.comparison import Finding
 from pipistrelle.report.effects.comparing import FILTER, STRATEGY, Effect, resolvable
-from pipistrelle.report.effects.measures import MEASURES
+from pipistrelle.report.effects.measures import Measure
 from pipistrelle.report.numbers import amount, interval, listed
 from pipistrelle.report.studied import Study, filter_titles
 from pipistrelle.report.variables import BEAM, Variable
 
-FIRST = MEASURES[0]
-"""What sentences speak of; of the rest they say whether it changes."""
 VERBS = {1: "raises", -1: "lowers"}
 
 
@@ -109,56 +107,45 @@ def subject(study: Study, effect: Effect) -> str:
     return f"{said}, on average over {listed(others)}," if len(contrast.pairs) > 1 else said
 
 
-def clauses(study: Study, effects: Sequence[Effect], beside: Mapping[Effect, Effect]) -> str:
-    """Say what two values of a variable do to the position's error, strategy by strategy.
+def clauses(study: Study, effects: Sequence[Effect], beside: Mapping[Effect, Effect]) -> list[str]:
+    """Say what two values of a variable do in one measure, strategy by strategy.
 
     Parameters
     ----------
     study : Study
     effects : sequence of Effect
-        On the position's error, of the same two values.
+        Of the same two values.
     beside : dict of Effect
         What is so without the cases that diverged.
 
     Returns
     -------
-    str
-        Verbs with their objects.
+    list of str
+        Sentences without capital and full stop, each of one strategy.
     """
-    kinds: dict[str, list[Effect]] = {kind: [] for kind in _KINDS}
-    for effect in effects:
-        kinds[_kind(effect)].append(effect)
     said: list[str] = []
-    for kind, mine in kinds.items():
-        without = {effect: _otherwise(effect, beside.get(effect)) for effect in mine}
-        objects = [
-            _KINDS[kind][1].format(
-                owner=owner(study, effect, noun=not said and not i),
-                size=size(effect.finding, effect.measure.unit),
-                mean=amount(effect.finding.mean, effect.measure.unit),
-                least=amount(resolvable(effect.finding), effect.measure.unit),
-                besides=f" ({without[effect]})" if without[effect] else "",
-                otherwise=f"; {without[effect]}" if without[effect] else "",
-            )
-            for i, effect in enumerate(mine)
-        ]
-        if objects:
-            said.append(_KINDS[kind][0].format(listed(objects)))
-    return listed(said)
+    for effect in effects:
+        unit = effect.measure.unit
+        words = _KINDS[_kind(effect)].format(
+            owner=owner(study, effect, noun=not said),
+            size=size(effect.finding, unit),
+            mean=amount(effect.finding.mean, unit),
+            least=amount(resolvable(effect.finding), unit),
+        )
+        said.append(f"{'it' if said else subject(study, effect)} {words}")
+        said += _otherwise(effect, beside.get(effect))
+    return said
 
 
 _KINDS = {
-    "up": ("raises {}", "{owner} by {size}{besides}"),
-    "down": ("lowers {}", "{owner} by {size}{besides}"),
-    "open": (
-        "shows no effect on {}",
-        "{owner} ({mean}, where {least} would have been shown{otherwise})",
-    ),
-    "alike": ("changes {}", "{owner} by {mean} in every world alike"),
-    "same": ("leaves {} as it is, to the last digit", "{owner}"),
-    "few": ("has too few worlds to tell of {}", "{owner}"),
+    "up": "raises {owner} by {size}",
+    "down": "lowers {owner} by {size}",
+    "open": "shows no effect on {owner} ({mean}, where {least} would have been shown)",
+    "alike": "changes {owner} by {mean} in every world alike",
+    "same": "leaves {owner} as it is, to the last digit",
+    "few": "has too few worlds to tell of {owner}",
 }
-"""What is said of an effect, by its kind: of several, and of each."""
+"""What is said of an effect, by its kind."""
 
 
 def _kind(effect: Effect) -> str:
@@ -201,7 +188,7 @@ def in_between(study: Study, effects: Sequence[Effect]) -> list[str]:
     ----------
     study : Study
     effects : sequence of Effect
-        On the position's error, of one variable.
+        In one measure, of one variable.
 
     Returns
     -------
@@ -248,7 +235,7 @@ def elsewhere(study: Study, effects: Sequence[Effect]) -> list[str]:
     ----------
     study : Study
     effects : sequence of Effect
-        On the position's error, of the same two values.
+        In one measure, of the same two values.
 
     Returns
     -------
@@ -274,28 +261,30 @@ def elsewhere(study: Study, effects: Sequence[Effect]) -> list[str]:
     return said
 
 
-def besides(effects: Sequence[Effect]) -> str:
+def besides(effects: Sequence[Effect], measures: Sequence[Measure]) -> str:
     """Say which of the other measures change, and in which direction.
 
     Parameters
     ----------
     effects : sequence of Effect
         Of one variable with one filter, between its ends.
+    measures : sequence of Measure
+        Those others.
 
     Returns
     -------
     str
         A sentence with a blank before it, or nothing.
     """
-    told = {verb: _changed(effects, sign) for sign, verb in VERBS.items()}
-    said = [f"{verb} {listed(what)}" for verb, what in told.items() if what]
+    changed = {verb: _changed(effects, measures, sign) for sign, verb in VERBS.items()}
+    said = [f"{verb} {listed(what)}" for verb, what in changed.items() if what]
     return f" Besides, it {listed(said)}." if said else ""
 
 
-def _changed(effects: Sequence[Effect], sign: int) -> list[str]:
+def _changed(effects: Sequence[Effect], measures: Sequence[Measure], sign: int) -> list[str]:
     """Name the measures that change in one direction, and where not in all cases, in which."""
     found = []
-    for measure in MEASURES[1:]:
+    for measure in measures:
         mine = [effect for effect in effects if effect.measure is measure]
         moved = [effect for effect in mine if direction(effect.finding) == sign]
         if moved:
@@ -319,11 +308,12 @@ def _cases(effects: Sequence[Effect], all_of: Sequence[Effect]) -> list[str]:
     return named
 
 
-def _otherwise(effect: Effect, other: Effect | None) -> str:
+def _otherwise(effect: Effect, other: Effect | None) -> list[str]:
     """Say what is so without the cases that diverged, where that is not the same."""
     if other is None or direction(other.finding) == direction(effect.finding) or effect.untouched:
-        return ""
+        return []
     if other.finding.n < 2:
-        return "without diverged cases too few worlds are left"
-    shown = "" if direction(other.finding) else ", not shown"
-    return f"without diverged cases {size(other.finding, FIRST.unit, signed=True)}{shown}"
+        return ["without diverged cases too few worlds are left"]
+    shown = "" if direction(other.finding) else ", which is not shown"
+    change = size(other.finding, effect.measure.unit, signed=True)
+    return [f"without diverged cases the change is {change}{shown}"]

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from pipistrelle.report.effects.comparing import STRATEGY, Effect
+from pipistrelle.report.effects.comparing import STRATEGY, Contrast, Effect
 from pipistrelle.report.effects.measures import MEASURES
 from pipistrelle.report.effects.wording import direction, the, variable_of
 from pipistrelle.report.numbers import amount, interval, three_digits
@@ -39,21 +39,21 @@ def effect_tables(study: Study, effects: Sequence[Effect]) -> list[dict[str, Any
         stand between a number's ends.
     """
     tables: dict[str, dict[str, Any]] = {}
-    rows: dict[tuple[str, ...], list[Effect]] = {}
+    rows: dict[Contrast, list[Effect]] = {}
     for effect in effects:
-        c = effect.contrast
-        rows.setdefault((c.factor, c.filter, c.strategy, c.before, c.after), []).append(effect)
-    for (factor, *_), mine in rows.items():
-        if factor not in tables:
-            tables[factor] = _heading(study, mine[0]) | {"rows": []}
+        rows.setdefault(effect.contrast, []).append(effect)
+    for contrast, mine in rows.items():
+        if contrast.factor not in tables:
+            tables[contrast.factor] = _heading(study, mine[0]) | {"rows": []}
+        cells = {effect.measure.score: _cell(effect) for effect in mine}
         row = {
             "label": _label(study, mine[0]),
-            "strategy": mine[0].contrast.strategy,
-            "end": mine[0].contrast.end,
-            "cells": [_cell(effect) for effect in mine],
+            "strategy": contrast.strategy,
+            "end": contrast.end,
+            "cells": [cells.get(measure.score) for measure in MEASURES],
             "apart": len(mine[0].apart),
         }
-        tables[factor]["rows"].append(row)
+        tables[contrast.factor]["rows"].append(row)
     return list(tables.values())
 
 
@@ -127,6 +127,8 @@ def _label(study: Study, effect: Effect) -> str:
         whose = titles.get(contrast.filter, f"{contrast.strategy} sensing")
         return f"{whose}: {contrast.after} instead of {contrast.before}"
     whose = f"{contrast.strategy} {titles[contrast.filter]}"
+    if effect.measure.over:
+        whose = f"gain of {whose} over {effect.measure.over}"
     if variable.numbers is not None and not two_sided(variable):
         return whose if contrast.end else f"{whose}, to {contrast.after}"
     if len(variable.words) == 2:
@@ -135,14 +137,14 @@ def _label(study: Study, effect: Effect) -> str:
 
 
 def _cell(effect: Effect) -> dict[str, Any]:
-    """Word an effect in a measure, with the interval that is told of it."""
+    """Word an effect in a measure, with its interval."""
     finding, measure = effect.finding, effect.measure
-    told = {"shown": direction(finding) != 0, "n": finding.n, "interval": "", "measure": measure}
+    cell = {"shown": direction(finding) != 0, "n": finding.n, "interval": ""}
     if effect.untouched:
-        return told | {"text": "same"}
+        return cell | {"text": "same"}
     if finding.n < 2:
-        return told | {"text": "?"}
-    low, high = finding.alone if told["shown"] else finding.interval
+        return cell | {"text": "?"}
+    low, high = finding.alone
     if measure.ratio:
         mean, low, high = np.exp(np.clip([finding.mean, low, high], -700.0, 700.0)).tolist()
         text, between = f"× {three_digits(mean)}", interval((low, high), "")
@@ -150,4 +152,4 @@ def _cell(effect: Effect) -> dict[str, Any]:
         text = "+" * (finding.mean > 0.0) + amount(finding.mean, measure.unit)
         between = interval((low, high), measure.unit)
     alike = not finding.std > 0.0
-    return told | {"text": text, "interval": "in every world" if alike else between}
+    return cell | {"text": text, "interval": "in every world" if alike else between}

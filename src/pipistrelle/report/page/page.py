@@ -12,7 +12,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from pipistrelle.evaluation.comparison import Finding
+from pipistrelle.evaluation.comparison import INTERVALS, Finding
 from pipistrelle.figures.chart import Chart, Panel, columns_of, csv_rows, csv_text
 from pipistrelle.figures.style import page_colours
 from pipistrelle.own_files import REPORT, claim, drawn_files
@@ -128,6 +128,7 @@ def page(
         claims=told.claims,
         summary=numbers,
         few=FEW,
+        intervals=INTERVALS,
         tables=effect_tables(study, told.effects[told.rule]),
         measures=MEASURES,
         units=UNITS,
