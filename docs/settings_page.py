@@ -11,6 +11,8 @@ from pipistrelle.settings import CALLERS, PREFIX, from_flags, known_settings
 PLACE = "<!-- settings -->"
 CALLER = "<!-- callers -->"
 ANY = "any number"
+WORDS = {"string": "a folder", "boolean": "`true` or `false`"}
+"""Settings that are no numbers; the only text that is free is the folder of a world."""
 SIGN = re.compile("([≥>≤<]) ")
 UNIT = re.compile(r" ?\[((?!0 to 1)[^]]+)\]")
 
@@ -97,6 +99,8 @@ def bounds(kind):
     whole = "whole, " if kind["type"] == "integer" else ""
     if "enum" in kind:
         return " or ".join(f"`{choice}`" for choice in kind["enum"])
+    if kind["type"] in WORDS:
+        return WORDS[kind["type"]]
     if kind["type"] == "array":
         inner = [bounds(part) for part in kind["prefixItems"]]
         return f"{len(inner)} numbers" + ("" if inner[0] == ANY else f", each {inner[0]}")

@@ -59,6 +59,8 @@ def test_an_entry_spells_the_setting_as_it_can_be_given(key):
         (("air", "speed_of_sound"), "10 to 10000"),
         (("air", "temperature_c"), "> −50, < 60"),
         (("air", "spreading"), "`paper` or `bistatic`"),
+        (("scenario", "world"), "a folder"),
+        (("listening", "timing"), "`true` or `false`"),
         (("receiver", "elements"), "whole, 2 to 64"),
         (("detection", "peak_db"), "−300 to 0"),
         (("detection", "false_alarm"), "≥ 1e-100, < 0.1"),

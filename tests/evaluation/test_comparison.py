@@ -298,3 +298,21 @@ def test_pseudovalues_free_a_square_of_its_bias_and_know_its_error():
     # By the delta method the error is 2 |mean| s / sqrt(n), to relative order 1 / sqrt(n).
     error = values.std(ddof=1) / math.sqrt(500)
     assert error == pytest.approx(2 * mean * math.sqrt(variance / 500), rel=3 / math.sqrt(500))
+
+
+def test_the_familys_intervals_are_as_wide_as_lets_all_of_them_hold_and_nothing_open_leaves_zero():
+    rng = np.random.default_rng(5)
+    samples = [rng.normal(mean, 1.0, 20) for mean in (5.0, 0.5, 0.3, -0.2, 0.0)]
+    findings = judge([Statement(label="", sample=sample) for sample in samples])
+    assert {True, None} <= {finding.holds for finding in findings}, "a family of both kinds"
+    for finding, sample in zip(findings, samples, strict=True):
+        known = stats.ttest_1samp(sample, 0.0).confidence_interval(1.0 - 0.05 / 5)
+        assert finding.family == pytest.approx((known.low, known.high), rel=1e-9)
+        low, high = finding.family
+        assert finding.holds is not None or low <= 0.0 <= high
+        assert low <= finding.alone[0] <= finding.alone[1] <= high
+        for more in (1.01, -1.01):
+            moved = sample - sample.mean() + more * (high - low) / 2.0
+            others = [other for other in samples if other is not sample]
+            again, *_ = judge([Statement(label="", sample=one) for one in (moved, *others)])
+            assert again.holds is (more > 0.0), "half the width is shown whatever the others are"

@@ -198,7 +198,9 @@ def with_third(study, name):
     return replace(study, trials=dict(sorted({**study.trials, **third}.items())))
 
 
-def write_store(folder: Path, study: Study, *, iterations=None, seed=3, failed=(), grid=""):
+def write_store(
+    folder: Path, study: Study, *, iterations=None, seed=3, failed=(), grid="", name="invented"
+):
     """Write a study into a folder as `pipistrelle study` does.
 
     `failed` holds pairs of a world's row and a case's number, `grid` further lines of the plan's
@@ -209,7 +211,8 @@ def write_store(folder: Path, study: Study, *, iterations=None, seed=3, failed=(
     text = folder.parent / f"{folder.name}.toml"
     settings = find_plan("paper").read_text().split("[config]\n")[1].split("\n\n")[0]
     worlds = iterations or len(study.worlds)
-    text.write_text(PLAN.format(iterations=worlds, radii=list(RADII), settings=settings) + grid)
+    plan = PLAN.format(iterations=worlds, radii=list(RADII), settings=settings) + grid
+    text.write_text(plan.replace("invented", name))
     plan = read_plan(text)
     open_store(folder, plan)
     schemas, cases = world_schemas(plan), cases_of(plan)

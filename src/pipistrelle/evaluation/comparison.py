@@ -22,7 +22,13 @@ So a bound passes its edge exactly where Holm rejects, and all lower bounds hold
 probability 1 - alpha / 2, whatever the dependence (Source: Strassburger & Bretz, Statistics in
 Medicine 27, 2008; Guilbaud, Biometrical Journal 50, 2008). Upper bounds are built alike, and
 both sides together hold with probability 1 - alpha. The price: of a rejected mean, while others
-stand, the bound says which side of the edge it is on, and no more.
+stand, the bound says which side of the edge it is on, and no more. How large a mean is, is told
+by a wider interval, Bonferroni's,
+
+.. math:: \bar d_i \pm t_{1 - \alpha / 2m} \, s_i / \sqrt{n_i},
+
+of which all m hold together with probability 1 - alpha, too. What leaves its edge out is rejected
+by Holm; what Holm rejects may reach just beyond it.
 
 Where two cases have not met the same worlds, nothing is paired and a difference is that of two
 means. Its standard error is :math:`\sqrt{s_1^2 / n_1 + s_2^2 / n_2}`, and its t distribution has
@@ -39,11 +45,11 @@ from jaxtyping import Float
 
 Relation = Literal["above", "not above", "slightly above", "within"]
 INTERVALS = (
-    "An interval is that of one difference by itself, at 95 %. Whether the difference is shown is "
-    "decided by Holm's correction over its family, all that it is compared with: one whose "
-    "interval leaves zero out need not be shown."
+    "Intervals hold together, at 95 %, for all differences that are judged as one family; a "
+    "difference of half an interval's width would have been shown in any case. Holm's correction "
+    "decides what is shown, now and then one whose interval just reaches zero."
 )
-"""What a reader is told wherever `Finding.alone` is printed beside a mean."""
+"""What a reader is told wherever `Finding.family` is printed beside a mean."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,6 +98,8 @@ class Finding:
         means, and the standard deviation of one sample that would know it as surely.
     alone : low, high
         t interval of this mean by itself.
+    family : low, high
+        Bonferroni's interval: as wide as lets all of the family hold together.
     interval : low, high
         Simultaneous interval, as the module says.
     p : float
@@ -108,6 +116,7 @@ class Finding:
     mean: float
     std: float
     alone: tuple[float, float]
+    family: tuple[float, float]
     interval: tuple[float, float]
     p: float
     holds: bool | None
@@ -162,9 +171,10 @@ def judge(statements: Sequence[Statement], confidence: float = 0.95) -> tuple[Fi
     findings = []
     for statement, own in zip(statements, rows, strict=True):
         moments = samples[own.start]
-        resolved = _half_width((moments[0], 0.0, 1.0), tail / len(samples)) <= 1.0
+        share = tail / len(samples)
+        resolved = _half_width((moments[0], 0.0, 1.0), share) <= 1.0
         holds, p = _verdict(statement, moments, p_low[own], p_high[own], tail, resolved)
-        width = _half_width(moments, tail)
+        width, wider = _half_width(moments, tail), _half_width(moments, share)
         centre = moments[1] if math.isfinite(moments[1]) else 0.0
         findings.append(
             Finding(
@@ -177,6 +187,7 @@ def judge(statements: Sequence[Statement], confidence: float = 0.95) -> tuple[Fi
                 mean=moments[1],
                 std=moments[2],
                 alone=(centre - width, centre + width),
+                family=(centre - wider, centre + wider),
                 interval=(float(np.max(low[own])), float(-np.max(high[own]))),
                 p=p,
                 holds=holds,

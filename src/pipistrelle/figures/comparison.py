@@ -209,7 +209,7 @@ def _draw_studies(compared: ComparedStudies) -> "Figure":
 def _draw_case(axes: "Axes", case: ComparedCase, place: float) -> None:
     """Draw a difference with its intervals, as far as they are known."""
     finding, colour = case.finding, RUNS[case.other % len(RUNS)]
-    for bounds, width in ((finding.interval, 0.9), (finding.alone, 2.6)):
+    for bounds, width in ((finding.family, 0.9), (finding.alone, 2.6)):
         if np.isfinite(bounds).all():
             axes.hlines(place, *bounds, color=colour, lw=width, zorder=2)
     face = colour if finding.p < SURE else "white"

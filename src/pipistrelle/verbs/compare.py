@@ -179,7 +179,7 @@ def _study_tables(compared: "ComparedStudies") -> Iterator[str]:
         cases = [case for case in compared.cases if case.score == name]
         rows = [_case_row(case, digits, several) for case in cases]
         other = "other" if several else "B"
-        heads = [[title, "A", other, f"{other} - A", "95 %", "", "worlds", "diverged"]]
+        heads = [[title, "A", other, f"{other} - A", "95 %, all cases", "", "worlds", "diverged"]]
         yield text_table("", heads, rows)
 
 
@@ -188,8 +188,8 @@ def _case_row(case: "ComparedCase", digits: int, several: bool) -> list[str]:
     from pipistrelle.experiments.comparing.folders import LETTERS
 
     finding, means = case.finding, case.means
-    low, high = (_signed(bound, digits) for bound in finding.alone)
-    known = all(abs(bound) < float("inf") for bound in finding.alone)
+    low, high = (_signed(bound, digits) for bound in finding.family)
+    known = all(abs(bound) < float("inf") for bound in finding.family)
     worlds = dict.fromkeys(case.worlds)
     return [
         case.label + f", {LETTERS[case.other]}" * several,

@@ -35,7 +35,7 @@ def test_each_measure_has_a_panel_and_each_strategy_its_points(selection):
         assert fused.x == pytest.approx([36.8, 42.8, 48.8], abs=0.3)
 
 
-def test_points_are_the_effects_with_their_own_intervals_full_where_shown(selection):
+def test_points_are_the_effects_with_their_intervals_full_where_shown(selection):
     (chart,) = effect_charts(selection)
     effects = effects_of(selection)
     for measure, panel in zip(MEASURES, chart.panels, strict=True):
@@ -47,7 +47,7 @@ def test_points_are_the_effects_with_their_own_intervals_full_where_shown(select
             ]  # fmt: skip
             factor = 180.0 / np.pi if measure.unit == "rad" else 1.0
             mean = np.array([0.0, *(e.finding.mean for e in mine)])
-            edges = np.array([e.finding.alone for e in mine])
+            edges = np.array([e.finding.family for e in mine])
             if measure.ratio:
                 mean, edges, factor = np.exp(mean), np.exp(edges), 1.0
             np.testing.assert_allclose(series.y, factor * mean, rtol=1e-12)

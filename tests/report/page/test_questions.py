@@ -9,9 +9,11 @@ from dataclasses import replace
 import pytest
 
 from pipistrelle.__main__ import main
+from pipistrelle.evaluation.comparison import INTERVALS
 from pipistrelle.experiments.studies.plan_file import read_plan
 from pipistrelle.experiments.studies.study import run_study
 from pipistrelle.report.claims.statements import CLAIMS
+from pipistrelle.report.numbers import three_digits
 from pipistrelle.report.page.page import write_report
 from report.drawing import draw_only
 from report.invented import invent, narrowed, only, with_third, write_store
@@ -305,3 +307,64 @@ def test_a_study_that_ran_is_answered_in_the_degrees_that_it_was_asked_in(tmp_pa
     with (page.folder / "figures" / "position_rmse.csv").open(newline="") as file:
         widths = {float(row["beamwidth_deg"]) for row in csv.DictReader(file)}
     assert {round(width, 6) for width in widths} >= {11.5, 33.2, 180.0}
+
+
+def test_every_interval_is_that_of_the_summary_and_half_of_it_would_have_been_shown(
+    tmp_path, capsys
+):
+    """One effect of the family is shown and one is not, and both go by one rule."""
+
+    def effect(case):
+        return by_level(0.3 if case.strategy == "fused" else 0.0)(case)
+
+    write_planted(tmp_path / "s", ways=BOTH, effect=effect)
+    assert main(["report", str(tmp_path / "s")]) == 0
+    assert INTERVALS in capsys.readouterr().out
+    page = Page(tmp_path / "s" / "report")
+    assert INTERVALS.replace("'", "’") in page.header.replace("'", "’")
+    for strategy, shown in (("fused", True), ("passive", False)):
+        (found,) = page.effects(measure="position_rmse_m", to="48.8", strategy=strategy)
+        found = found["by_exclusion"]["none"]
+        low, high = found["interval"]
+        assert found["shown"] is shown
+        assert f"[{three_digits(low)}, {three_digits(high)}]" in page.header
+        if not shown:
+            assert found["would_have_shown"] == pytest.approx((high - low) / 2.0)
+            assert f"where {three_digits((high - low) / 2.0)} m would have been" in page.header
+
+
+def test_a_gain_has_its_sentence_first_its_row_and_its_line(reported):
+    def effect(case):
+        return by_level({"active": -0.5, "fused": -0.1}[case.strategy])(case)
+
+    ways = 'strategies = ["active", "fused"]\nfilters = ["ekf"]\n'
+    page = reported(f'{LEVELS}\n"rays.power" = [1.0, 3.0]', ways=ways, effect=effect)
+    (found,) = page.effects(
+        measure="gain_position_rmse_m", variable="beacon.level_db", to="48.8", strategy="fused"
+    )
+    size = found["by_exclusion"]["none"]
+    assert size["mean"] == pytest.approx(-0.4, abs=0.05)
+    by = f"by {three_digits(-size['mean'])} m [{three_digits(-size['interval'][1])}, "
+    assert f"lowers fused EKF's position gain over active {by}" in page.summary["answer"][1]
+    assert re.search(r"gain of fused EKF over active −0\.[34]\d* m \[", page.header)
+    rows = list(csv.DictReader((page.folder / "figures/gain_by_beacon_level_db.csv").open()))
+    means = [row for row in rows if row["series"].startswith("mean, active minus fused")]
+    assert means
+    assert all(float(r["gain_m_low"]) < float(r["gain_m"]) < float(r["gain_m_high"]) for r in means)
+
+
+def test_a_short_run_of_a_plan_that_ships_is_partial_on_the_page_and_in_the_terminal(
+    tmp_path, capsys
+):
+    plan, *_ = write_store(tmp_path / "s", invent(2), name="paper")
+    assert (plan.name, plan.iterations) == ("paper", 2)
+    assert main(["report", str(tmp_path / "s")]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0] == "partial: 2 of 115 worlds"
+    open_ones = [i for i, line in enumerate(printed) if re.match(r"\d  open ", line)]
+    assert open_ones
+    for i in open_ones:
+        assert re.search(r"^ {19}\S.* \d+ of its \d+ statements are undecided\.$", printed[i + 1])
+    page = Page(tmp_path / "s" / "report")
+    assert page.summary["partial"] is True
+    assert "2 of 115 worlds are done" in page.header

@@ -47,7 +47,7 @@ MISSIONS = (
 )
 STUDIES = (
     "a row for each case, study and score: means, their difference, its interval by itself "
-    "(alone_low, alone_high) and as one of all cases (low, high, p; Holm)",
+    "(alone_low, alone_high) and as one of all cases (low, high), and p as one of them (Holm)",
     "the differences by case: thick by itself, thin as one of all cases; full points are "
     "significant",
 )
@@ -269,7 +269,7 @@ def _study_rows(compared: ComparedStudies) -> list[dict[str, Any]]:
     rows = []
     for case in compared.cases:
         finding = case.finding
-        bounds = (*finding.interval, *finding.alone)
+        bounds = (*finding.family, *finding.alone)
         low, high, alone_low, alone_high = (x if math.isfinite(x) else None for x in bounds)
         rows.append(
             {

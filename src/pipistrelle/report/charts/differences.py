@@ -120,9 +120,9 @@ def _caption(family: Sequence[Effect], first: str) -> str:
     """Say what the differences are of."""
     mean = "averaged over the combinations of the rest, " if family[0].apart else ""
     return (
-        f"Difference to {first} in the same world, {mean}mean over worlds and its 95 % interval. "
-        "Full: significant after Holm's correction. Map: landmarks that both have placed. NEES: "
-        "the ratio"
+        f"Difference to {first} in the same world, {mean}mean over worlds and its 95 % interval as "
+        "one of its family. Full: shown, by Holm's correction. Map: landmarks that both have "
+        "placed. NEES: the ratio"
     )
 
 
@@ -173,9 +173,9 @@ def _changes(
 
 
 def _bars(findings: Iterable[Finding]) -> tuple[np.ndarray, np.ndarray]:
-    """Return means, and the ends of each one's own interval; NaN where there is none."""
+    """Return means, and the ends of each one's interval; NaN where there is none."""
     found = list(findings)
-    edges = np.array([finding.alone for finding in found]).reshape(-1, 2)
+    edges = np.array([finding.family for finding in found]).reshape(-1, 2)
     edges[~np.isfinite(edges)] = np.nan
     return np.array([finding.mean for finding in found]), edges
 
@@ -197,17 +197,16 @@ def _gain_chart(selection: Selection, variable: Variable) -> Chart:
             for title, series in found.items()
         ]
     several = len(study.variables) > 1
-    spread = "mean and its 95 % interval"
+    spread = "mean and its 95 % interval as one of its panel"
     if several:
-        spread = f"mean; {each_combination(study, variable)}, points for their mean and its 95 % "
-        spread += "interval"
+        spread = f"mean; {each_combination(study, variable)}, points for their {spread}"
     return Chart(
         name=f"gain_by_{slug(variable.name)}" if several else "gain",
         title="What listening to others adds to one's own calls"
         + (f", over {the(variable)}" if several else ""),
         caption=f"RMSE of active minus that of fused in the same world, {spread}; "
-        "above the line fused is better. Full: significant after Holm's correction over the "
-        "panel. Map: landmarks that every strategy has placed",
+        "above the line fused is better. Full: shown, by Holm's correction over the panel. Map: "
+        "landmarks that every strategy has placed",
         panels=tuple(panels),
         columns=(variable.column, "gain_m"),
     )

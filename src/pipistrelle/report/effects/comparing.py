@@ -188,11 +188,10 @@ def resolvable(finding: Finding) -> float:
     Returns
     -------
     float
-        In either direction: from the mean to the farther end of its family's interval, in the
-        sample's unit; infinite where nothing could be.
+        Half the width of its interval, in the sample's unit; infinite where nothing could be.
     """
-    low, high = finding.interval
-    return max(finding.mean - low, high - finding.mean) if finding.n > 1 else math.inf
+    low, high = finding.family
+    return (high - low) / 2.0
 
 
 def record(by_rule: Mapping[Rule, Sequence[Effect]], headline: Rule) -> list[dict[str, Any]]:
@@ -229,12 +228,14 @@ def record(by_rule: Mapping[Rule, Sequence[Effect]], headline: Rule) -> list[dic
     ]
 
 
-def plain(finding: Finding, *, ratio: bool = False) -> dict[str, Any]:
+def plain(finding: Finding, *, effect: bool = False, ratio: bool = False) -> dict[str, Any]:
     """Lay a finding out as JSON can hold it.
 
     Parameters
     ----------
     finding : Finding
+    effect : bool
+        Its interval is the one that shows its size; else the one by which a claim is judged.
     ratio : bool
         Its numbers are logarithms of ratios, and become these.
 
@@ -255,7 +256,7 @@ def plain(finding: Finding, *, ratio: bool = False) -> dict[str, Any]:
         "mean": finite(finding.mean),
         "std": size(finding.std),
         "alone": [finite(bound) for bound in finding.alone],
-        "interval": [finite(bound) for bound in finding.interval],
+        "interval": [finite(bound) for bound in (finding.family if effect else finding.interval)],
         "p": size(finding.p),
     }
 
@@ -266,7 +267,7 @@ def _plain_effect(effect: Effect) -> dict[str, Any]:
     would = math.nan if finding.holds is not None or effect.untouched else resolvable(finding)
     would = math.exp(would) if ratio and would < 700.0 else would
     return {
-        **plain(finding, ratio=ratio),
+        **plain(finding, effect=True, ratio=ratio),
         "shown": finding.holds is not None,
         "untouched": effect.untouched,
         "would_have_shown": would if math.isfinite(would) else None,
@@ -276,7 +277,9 @@ def _plain_effect(effect: Effect) -> dict[str, Any]:
 def _plain_apart(effect: Effect) -> list[dict[str, Any]]:
     """Lay out what an effect is at each combination of the rest."""
     return [
-        {"at": name} | plain(one, ratio=effect.measure.ratio) | {"shown": one.holds is not None}
+        {"at": name}
+        | plain(one, effect=True, ratio=effect.measure.ratio)
+        | {"shown": one.holds is not None}
         for name, one in zip(effect.contrast.names, effect.apart, strict=False)
     ]
 

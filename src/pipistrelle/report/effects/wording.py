@@ -43,7 +43,7 @@ def direction(finding: Finding) -> int:
 
 
 def size(finding: Finding, unit: str, *, signed: bool = False) -> str:
-    """Write how large a difference is, with its own 95 % interval.
+    """Write how large a difference is, with its interval.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def size(finding: Finding, unit: str, *, signed: bool = False) -> str:
     >>> size(fall, "m"), size(fall, "m", signed=True)
     ('0.4 m [0.152, 0.648]', '−0.4 m [−0.648, −0.152]')
     """
-    mean, (low, high) = finding.mean, finding.alone
+    mean, (low, high) = finding.mean, finding.family
     if not signed and mean < 0.0:
         mean, low, high = -mean, -high, -low
     return f"{amount(mean, unit)} {interval((low, high), unit)}"
@@ -202,7 +202,7 @@ def in_between(study: Study, effects: Sequence[Effect]) -> list[str]:
     for side in _sides(variable, effects):
         (end,) = (effect for effect in side if effect.contrast.end)
         inner = [effect for effect in side if effect is not end]
-        low, high = min(0.0, end.finding.alone[0]), max(0.0, end.finding.alone[1])
+        low, high = min(0.0, end.finding.family[0]), max(0.0, end.finding.family[1])
         beyond = [
             effect
             for effect in inner

@@ -144,7 +144,7 @@ def _cell(effect: Effect) -> dict[str, Any]:
         return cell | {"text": "same"}
     if finding.n < 2:
         return cell | {"text": "?"}
-    low, high = finding.alone
+    low, high = finding.family
     if measure.ratio:
         mean, low, high = np.exp(np.clip([finding.mean, low, high], -700.0, 700.0)).tolist()
         text, between = f"× {three_digits(mean)}", interval((low, high), "")
