@@ -10,6 +10,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from pipistrelle.evaluation.comparison import Statement, judge
+
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = [*sorted(DOCS.glob("*.md")), DOCS / "api" / "index.md"]
@@ -329,8 +331,39 @@ def test_the_built_pages_are_read_without_a_network_and_without_a_word(tmp_path)
             faces = "document.fonts.ready.then(f => [...f].map(x => x.family + ' ' + x.status))"
             if page.locator("math").count():
                 fonts.add(tuple(page.evaluate(faces)))
+        first = [_first_found(page, tmp_path, word) for word in ("ray", "caller", "bound")]
         browser.close()
+    assert first == [f"glossary.html#term-{word}" for word in ("ray", "caller", "bound")]
     assert {"index", "equations", "estimation", "search"} <= {path.stem for path in pages}
     assert [url for url in asked if not url.startswith((tmp_path.as_uri(), "data:"))] == []
     assert noise == []
     assert fonts == {("STIX Two Math loaded",)}
+
+
+def _first_found(page, pages, word):
+    """Search the built pages for a word, and return where the first link leads."""
+    page.goto(f"{(pages / 'search.html').as_uri()}?q={word}")
+    return re.sub(r"\?[^#]*", "", page.locator("ul.search li > a").first.get_attribute("href"))
+
+
+def test_the_glossary_says_of_each_word_what_it_is_and_where_there_is_more():
+    text = (DOCS / "glossary.md").read_text(encoding="utf-8").split("```")[1]
+    entries = re.findall(r"^((?:\S.*\n)+)  (.+)$", text, flags=re.MULTILINE)
+    words = [word for names, _ in entries for word in names.splitlines()]
+    assert {"ray", "member", "label", "caller", "bound", "aligned", "gate", "family"} <= {*words}
+    assert len(words) == len({*words})
+    for names, meaning in entries:
+        assert re.search(r"\]\([\w-]+\.md(#[\w-]+)?\)", meaning), names
+        assert len(re.findall(r"[.:] [A-Z]", meaning)) <= 3, names
+
+
+def test_page_and_docs_say_one_thing_of_a_claim_of_absence():
+    """It is undecided while the worlds are too few to see one standard deviation."""
+    rule = "is not significant and the study could have seen one of one standard deviation, which"
+    page = (ROOT / "src/pipistrelle/report/page/page.html").read_text(encoding="utf-8")
+    assert all(rule in text for text in (page, (DOCS / "study.md").read_text(encoding="utf-8")))
+    worlds = [-0.1, 0.1, -0.05, 0.04]
+    few, many = (
+        Statement(label="", sample=np.tile(worlds, times), relation="not above") for times in (1, 2)
+    )
+    assert [judge([one])[0].holds for one in (few, many)] == [None, True]

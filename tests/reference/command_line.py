@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from pipistrelle.verbs.console import BOUND
+
 SHORT = ("--duration", "4", "--landmarks", "10")
 """A world of eight frames."""
 COMPILING = "Compiling kernels (once) ..."
@@ -22,8 +24,8 @@ def track(folder, name):
 
 def table(printed):
     """Rows of the closing table: title and cells, eleven characters each."""
-    lines = printed.splitlines()[:-1]
-    return {line[:30].strip(): re.findall(r".{11}", line[30:]) for line in lines[2:]}
+    lines = [line for line in printed.splitlines()[:-1] if line != BOUND]
+    return {line[:32].strip(): re.findall(r".{11}", line[32:]) for line in lines[2:]}
 
 
 def contents(folder):

@@ -16,6 +16,7 @@ from pipistrelle.estimation.fastslam.filter import FastSlam
 from pipistrelle.experiments.runs import compiling
 from pipistrelle.scripting import missions
 from pipistrelle.settings import from_text
+from pipistrelle.verbs.console import BOUND
 from reference.command_line import COMPILING, SHORT, contents, summary, table, track
 
 
@@ -35,6 +36,13 @@ def test_a_run_tells_its_stages_its_scores_and_last_its_folder(obey):
     counts = [f"{run['landmarks_full']} / {run['landmarks_total']}" for run in runs]
     assert rows["landmarks, placed / heard"] == counts
     assert "fully placed, particles' mean" not in rows
+    assert "position_floor_m" in summary("one")["runs"][0], "kept, and no row of one world"
+    titles = [title for title in rows if title.startswith(("position", "heading"))]
+    assert titles == [
+        "position RMSE [m]", "heading RMSE [rad]", "position RMSE, aligned [m]",
+        "position bound over worlds [m]", "heading bound over worlds [rad]",
+    ]  # fmt: skip
+    assert printed.splitlines()[-2] == BOUND
     assert {"mission.png", "mission.pdf", "config.toml"} <= {p.name for p in Path("one").iterdir()}
 
 

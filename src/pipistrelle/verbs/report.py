@@ -53,5 +53,4 @@ def _why(claim: dict[str, Any]) -> str:
     """Say why a claim is open, and how much of it is undecided."""
     parts = claim["by_exclusion"]["world"]["parts"]
     found = [finding["holds"] for part in parts for finding in part["findings"]]
-    undecided = f" {found.count(None)} of its {len(found)} statements are undecided."
-    return claim["rule"] + undecided * (None in found)
+    return f"{claim['rule']} Undecided: {found.count(None)} of {len(found)} statements."

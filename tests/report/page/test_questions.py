@@ -364,7 +364,7 @@ def test_a_short_run_of_a_plan_that_ships_is_partial_on_the_page_and_in_the_term
     open_ones = [i for i, line in enumerate(printed) if re.match(r"\d  open ", line)]
     assert open_ones
     for i in open_ones:
-        assert re.search(r"^ {19}\S.* \d+ of its \d+ statements are undecided\.$", printed[i + 1])
+        assert re.search(r"^ {19}\S.*\. Undecided: \d+ of \d+ statements\.$", printed[i + 1])
     page = Page(tmp_path / "s" / "report")
     assert page.summary["partial"] is True
     assert "2 of 115 worlds are done" in page.header
