@@ -241,4 +241,4 @@ def _mean_gains(selection: Selection, name: str, score: str, variable: Variable)
     findings = judge([Statement(label="", sample=sample) for sample in samples])
     shown = [finding.holds is not None for finding in findings]
     mean, edges = _bars(findings)
-    return about(f"mean, {DIFFERENCE}", "fused", places(variable), mean, edges, shown)
+    return about(f"mean, {DIFFERENCE}", "ink", places(variable), mean, edges, shown)
