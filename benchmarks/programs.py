@@ -30,7 +30,10 @@ def run(*, settings: Settings = Settings()):
 
 app(["--help"])
 """
-COMPILE = "from pipistrelle.experiments.runs.compiling import compile_kernels; compile_kernels()"
+COMPILE = (
+    "from pipistrelle.experiments.runs.compiling import compile_kernels;"
+    "compile_kernels(['ekf'], [False])"
+)
 LIBRARIES = "import pipistrelle.experiments.runs.trial, pipistrelle.figures.mission, polars"
 COMMAND = "./dev bench --only programs"
 
@@ -98,6 +101,6 @@ def _helps(rounds: int) -> tuple[float, float]:
 
 
 def _cold_compile() -> float:
-    """Time the compilation of every kernel [s]."""
+    """Time the compilation of the kernels of a first `pipistrelle run` [s]."""
     with TemporaryDirectory() as folder:
         return _wall("-c", COMPILE, NUMBA_CACHE_DIR=folder)

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numba import njit
 
+from pipistrelle import kernel_clock  # noqa: F401 - which listens from the first kernel on
 from pipistrelle.kernel_cache import checked
 from pipistrelle.kernel_folder import place_kernels
 

@@ -6,12 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from pipistrelle.kernel_clock import COMPILING  # noqa: F401 - said where the cache has none
 from pipistrelle.verbs.console import BOUND
 
 SHORT = ("--duration", "4", "--landmarks", "10")
 """A world of eight frames."""
-COMPILING = "Compiling kernels (once) ..."
-"""Said where the cache holds no kernels."""
 
 
 def summary(folder):

@@ -5,6 +5,7 @@ import tomllib
 from dataclasses import replace
 from pathlib import Path
 
+import numba
 import numpy as np
 import polars as pl
 import pytest
@@ -13,7 +14,6 @@ import pipistrelle
 from pipistrelle import own_files
 from pipistrelle.estimation.catalogue import PAPERS
 from pipistrelle.estimation.fastslam.filter import FastSlam
-from pipistrelle.experiments.runs import compiling
 from pipistrelle.scripting import missions
 from pipistrelle.settings import from_text
 from pipistrelle.verbs.console import BOUND
@@ -48,7 +48,13 @@ def test_a_run_tells_its_stages_its_scores_and_last_its_folder(obey):
 
 @pytest.mark.parametrize(("words", "said"), [((), 1), (("--quiet",), 0)])
 def test_compiling_is_told_of_when_kernels_are_compiled(obey, undrawn, monkeypatch, words, said):
-    monkeypatch.setattr(compiling, "compile_kernels", lambda tell: tell and tell())
+    run_mission = missions.run_mission
+
+    def compiling(*given, **named):
+        numba.njit(lambda x: x + 1)(1.0)
+        return run_mission(*given, **named)
+
+    monkeypatch.setattr(missions, "run_mission", compiling)
     assert obey("run", *SHORT, *words)[2].count(COMPILING) == said
 
 

@@ -111,8 +111,5 @@ def test_without_gtsam_the_other_filters_are_there_and_plans_that_name_it_are_re
 def test_without_gtsam_kernels_are_compiled_for_the_others(without_gtsam, monkeypatch):
     tried = []
     monkeypatch.setattr(compiling, "run_mission", lambda _, __, filters: tried.extend(filters))
-    compiling.compile_kernels()
-    assert "smoother" not in tried
-    assert set(CATALOGUE) - {"smoother"} <= set(tried)
-    related, others = compiling._families()
-    assert "smoother" not in related + others
+    compiling.compile_kernels(timings=[False])
+    assert tried == [name for name in CATALOGUE if name != "smoother"]

@@ -4,7 +4,6 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from threading import Timer
-from time import perf_counter
 from typing import TYPE_CHECKING
 
 from pipistrelle.estimation.catalogue import short_name
@@ -55,16 +54,6 @@ def announced(message: str, after: float = 3.0) -> Iterator[None]:
         yield
     finally:
         timer.cancel()
-
-
-def announce_compiling() -> None:
-    """Say that kernels are compiled, which takes long, and only once.
-
-    Examples
-    --------
-    >>> announce_compiling()
-    """
-    say("Compiling kernels (once) ...")
 
 
 @contextmanager
@@ -129,13 +118,18 @@ def _bars() -> "Iterator[Progress]":
 
 
 def _stopwatch() -> Callable[[str], float]:
-    """Return what times stages [s]: each from the last word of the one before it."""
-    began, latest = {}, perf_counter()
+    """Return what times stages [s]: each from the last word of the one before it.
+
+    Time in which kernels are compiled is not counted.
+    """
+    from pipistrelle.kernel_clock import wall_s
+
+    began, latest = {}, wall_s()
 
     def elapsed(stage: str) -> float:
         nonlocal latest
         begin = began.setdefault(stage, latest)
-        latest = perf_counter()
+        latest = wall_s()
         return latest - begin
 
     return elapsed
@@ -186,7 +180,22 @@ def _cells(trial: "TrialResult", there: int | None) -> Iterator[tuple[str, str]]
     yield "fully placed, particles' mean", _number(trial.track.full, 1)
     yield "measurements per frame", _number(s.measurements_per_frame, 2)
     yield "rejected by the gate", str(s.gated or "")
+    yield from _without_truth(trial)
     yield "diverged", "yes" if s.diverged else ""
+
+
+def _without_truth(trial: "TrialResult") -> Iterator[tuple[str, str]]:
+    """Word what an estimate tells of itself; nothing where the truth tells more."""
+    from math import hypot, sqrt
+
+    pose, rows = trial.track.pose, sum(len(scan.landmark) for scan in trial.scans)
+    known = trial.scores.position_rmse_m is not None
+    share = None if known or not rows else 100.0 * trial.scores.gated / rows
+    spread = float(pose.covariance[-1, 0, 0] + pose.covariance[-1, 1, 1])
+    steps = (pose.mean[1:, :2] - pose.mean[:-1, :2]).tolist()
+    yield "rejected by the gate [%]", _number(share, 2)
+    yield "final position, 1 sigma [m]", _number(None if known else sqrt(max(spread, 0.0)), 3)
+    yield "distance driven [m]", _number(None if known else sum(hypot(*step) for step in steps), 1)
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 from pipistrelle.experiments.results import folder
 from pipistrelle.own_files import OwnFiles
 from pipistrelle.scripting.missions import Done, failures, filmed, keep
-from pipistrelle.verbs.console import announce_compiling, announced, closing_table
+from pipistrelle.verbs.console import announced, closing_table
 from pipistrelle.verbs.options import OutputOptions
-from pipistrelle.verbs.streams import put, warn
+from pipistrelle.verbs.streams import put, say, warn
 
 if TYPE_CHECKING:
     from pipistrelle.figures.recorder import MissionRecorder
@@ -41,12 +41,12 @@ def recorder(options: OutputOptions) -> "MissionRecorder | None":
 
 
 def get_ready(options: OutputOptions) -> None:
-    """Load all kernels; compile those that are not there, and say so. Keep memory for them."""
+    """Keep memory that is freed, and have kernels announced that must be compiled."""
     from pipistrelle.experiments.machine import keep_freed_memory
-    from pipistrelle.experiments.runs.compiling import compile_kernels
+    from pipistrelle.kernel_clock import announce
 
     keep_freed_memory()
-    compile_kernels(None if options.quiet else announce_compiling)
+    announce(None if options.quiet else say)
 
 
 def deliver(

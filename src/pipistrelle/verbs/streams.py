@@ -52,7 +52,7 @@ def say(message: str) -> None:
 
     Examples
     --------
-    >>> say("Compiling kernels (once) ...")
+    >>> say("Drawing mission.gif ...")
     """
     text = "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in message)
     with suppress(OSError):

@@ -12,7 +12,6 @@ from cyclopts import Parameter
 
 from pipistrelle.config import InputError
 from pipistrelle.settings import Layer
-from pipistrelle.verbs.console import announce_compiling
 from pipistrelle.verbs.options import SettingFlags, Whole, layers
 from pipistrelle.verbs.streams import put, say, warn
 
@@ -113,7 +112,7 @@ def study(
                 shard=share,
                 scheduler=scheduler,
                 retry_failed=retry_failed,
-                progress=show if scheduler else _compiled_first(show, quiet),
+                progress=show if scheduler else _compiled_first(tried, show, quiet),
             )
     except KeyboardInterrupt:
         say(f"{folder}: worlds that are done are kept; the same command goes on with the rest")
@@ -168,16 +167,20 @@ def _slurm(name: str, command: str, folder: Path, shards: int, workers: int) -> 
     )
 
 
-def _compiled_first(show: Show, quiet: bool) -> Show:
-    """Compile kernels before the first world, so that not every worker has to."""
+def _compiled_first(plan: "Plan", show: Show, quiet: bool) -> Show:
+    """Compile a plan's kernels before the first world, so that not every worker has to."""
     ready = False
 
     def prepare(so_far: "StudyProgress") -> None:
         nonlocal ready
         if not ready and so_far.done < so_far.worlds:
             from pipistrelle.experiments.runs.compiling import compile_kernels
+            from pipistrelle.experiments.studies.plan import cases_of
+            from pipistrelle.kernel_clock import announce
 
-            compile_kernels(None if quiet else announce_compiling)
+            announce(None if quiet else say)
+            timings = {case.config.listening.timing for case in cases_of(plan)}
+            compile_kernels(plan.filters, sorted(timings))
         ready = True
         show(so_far)
 

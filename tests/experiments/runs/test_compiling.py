@@ -1,108 +1,114 @@
-"""The second process that compiles: it may fail, be impossible or be unwanted."""
+"""Kernels that are compiled: announced before, and no part of a filter's time."""
 
+import json
 import os
 import subprocess
 import sys
+import time
 
 import numba
 import pytest
+from numba.core.event import install_timer
 
-from pipistrelle.experiments.runs import compiling as kernels
+from pipistrelle import kernel_clock
+from pipistrelle.config import Config, ScenarioConfig
+from pipistrelle.estimation.catalogue import CATALOGUE, is_there
+from pipistrelle.experiments.runs import compiling, trial
+
+TINY = Config(scenario=ScenarioConfig(steps=8, landmarks=4, radius=10.0))
+COLD = """
+import json, sys, time
+from numba.core.event import install_recorder
+from pipistrelle.config import Config, ListeningConfig, ScenarioConfig
+from pipistrelle.experiments.runs.trial import run_mission
+tiny = ScenarioConfig(steps=8, landmarks=4, radius=10.0)
+
+
+def compiling(buffer):
+    total, depth = 0.0, 0
+    for at, event in buffer:
+        if event.is_start:
+            begun, depth = (begun if depth else at), depth + 1
+        else:
+            depth -= 1
+            total += 0.0 if depth else at - begun
+    return total
+
+
+for name in sys.argv[1:]:
+    for timing in (False, True):
+        config = Config(scenario=tiny, listening=ListeningConfig(timing=timing))
+        began = time.perf_counter()
+        with install_recorder("numba:compile") as recorder:
+            trials = run_mission(config, ("active", "fused", "passive"), (name,)).trials
+        took = time.perf_counter() - began
+        compiled = compiling(recorder.buffer)
+        print(json.dumps([name, timing, compiled, sum(t.wall_s for t in trials), took]))
+"""
 
 
 @pytest.fixture
-def started(monkeypatch):
-    """The processes that are started."""
-    begun, popen = [], subprocess.Popen
-
-    def start(*given, **options):
-        begun.append(popen(*given, **options))
-        return begun[-1]
-
-    monkeypatch.setattr(subprocess, "Popen", start)
-    return begun
+def said():
+    """What is announced, of the next that is compiled."""
+    lines = []
+    kernel_clock.announce(lines.append)
+    yield lines
+    kernel_clock.announce()
 
 
-def test_second_process_runs_its_statement_to_the_end(tmp_path, started):
-    done = tmp_path / "done"
-    with kernels._second_process(f"open({str(done)!r}, 'w').close()"):
-        pass
-    assert done.exists()
-    assert started[0].returncode == 0
+def test_the_first_of_the_kernels_that_are_compiled_is_announced_before(said):
+    numba.njit(lambda x: x + 1)(1.0)
+    assert said == [kernel_clock.COMPILING]
+    numba.njit(lambda x: x + 2)(1.0)
+    assert said == [kernel_clock.COMPILING]
+    kernel_clock.announce(said.append)
+    numba.njit(lambda x: x + 3)(1.0)
+    assert said == 2 * [kernel_clock.COMPILING]
 
 
-def test_second_process_that_fails_says_nothing_and_stops_nothing(started, capfd):
-    with kernels._second_process("raise SystemExit('broken')"):
-        pass
-    assert started[0].returncode == 1
+def test_nobody_need_be_told(capfd):
+    kernel_clock.announce(None)
+    numba.njit(lambda x: x - 1)(1.0)
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("interpreter", [None, "", "/nowhere/python"])
-def test_work_is_done_where_no_second_process_can_be_had(monkeypatch, interpreter):
-    monkeypatch.setattr(sys, "executable", interpreter)
-    worked = False
-    with kernels._second_process("pass"):
-        worked = True
-    assert worked
+def test_what_is_compiled_while_a_filter_runs_is_no_part_of_its_time(monkeypatch):
+    compiled, run_filter = [], trial.run_filter
+
+    def slowed(*given, **named):
+        with install_timer("numba:compile", compiled.append):
+            numba.njit(lambda x: x * 3)(1.0)
+        return run_filter(*given, **named)
+
+    monkeypatch.setattr(trial, "run_filter", slowed)
+    began = time.perf_counter()
+    (done,) = trial.run_mission(TINY, ("fused",)).trials
+    assert 0.0 < done.wall_s <= time.perf_counter() - began - sum(compiled)
+    assert sum(compiled) > 0.0
 
 
-def test_second_process_ends_with_the_work_that_breaks_off(started):
-    with pytest.raises(KeyboardInterrupt), kernels._second_process("import time; time.sleep(600)"):
-        raise KeyboardInterrupt
-    assert started[0].returncode is not None
-
-
-@pytest.mark.parametrize(("cores", "files", "processes"), [(2, 0, 1), (2, 1, 0), (1, 0, 0)])
-def test_second_process_is_asked_only_to_fill_an_empty_cache_beside_a_free_core(
-    tmp_path, monkeypatch, started, cores, files, processes
-):
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(kernels, "cores", lambda: cores)
-    monkeypatch.setattr(kernels, "run_mission", lambda *_: None)
-    monkeypatch.setattr(kernels, "_SECOND", "pass")
-    for name in range(files):
-        (tmp_path / f"{name}.nbc").touch()
-    kernels.compile_kernels()
-    assert len(started) == processes
-
-
-def test_second_process_leaves_the_filters_compiled_that_are_not_the_first():
-    from pipistrelle.estimation.fastslam.particles import correct_particles
-    from pipistrelle.estimation.fastslam.poses import summarise
-
-    kernels.compile_others()
-    assert correct_particles.signatures
-    assert summarise.signatures
-
-
-@pytest.fixture
-def told():
-    """How often compiling was told of."""
-    return []
-
-
-def test_the_first_of_the_kernels_that_are_compiled_is_told_of(monkeypatch, told):
-    def mission(*_):
-        numba.njit(lambda x: x + 1)(1.0)
-        numba.njit(lambda x: x + 2)(1.0)
-
-    monkeypatch.setattr(kernels, "run_mission", mission)
-    kernels.compile_kernels(lambda: told.append(1))
-    assert told == [1]
-    numba.njit(lambda x: x + 3)(1.0)
-    assert told == [1], "what is compiled afterwards is somebody else's"
-
-
-def test_kernels_that_are_there_are_loaded_and_nothing_is_told(tmp_path, told):
-    code = (
-        "from pipistrelle.experiments.runs import compiling\n"
-        "from pipistrelle.geometry import wrap_angle\n"
-        "compiling.run_mission = lambda *_: wrap_angle(4.0)\n"
-        "compiling.cores = lambda: 1\n"
-        "compiling.compile_kernels(lambda: print('compiling'))"
+@pytest.mark.slow
+def test_an_empty_cache_costs_no_filter_time_with_timing_or_without(tmp_path):
+    names = list(filter(is_there, CATALOGUE))
+    done = subprocess.run(
+        [sys.executable, "-c", COLD, *names],
+        env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")},
+        capture_output=True,
+        text=True,
+        check=True,
     )
-    for wanted in ("compiling\n", ""):
+    assert done.stderr == kernel_clock.COMPILING + "\n"
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [row[:2] for row in rows] == [[name, timed] for name in names for timed in (False, True)]
+    for name, timed, compiled, in_filters, took in rows:
+        assert 0.0 < in_filters <= took - compiled
+        shared = name == "smoother" or (name, timed) == ("iekf", True)
+        assert shared or compiled > took / 2.0, f"{name}, {timed}: little is compiled, or proved"
+
+
+def test_kernels_that_are_there_are_loaded_and_nothing_is_announced(tmp_path):
+    code = "from pipistrelle.geometry import wrap_angle; wrap_angle(4.0)"
+    for wanted in (kernel_clock.COMPILING + "\n", ""):
         done = subprocess.run(
             [sys.executable, "-c", code],
             env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")},
@@ -110,9 +116,17 @@ def test_kernels_that_are_there_are_loaded_and_nothing_is_told(tmp_path, told):
             text=True,
             check=True,
         )
-        assert (done.stdout, done.stderr) == (wanted, "")
+        assert (done.stdout, done.stderr) == ("", wanted)
 
 
-def test_nobody_need_be_told(monkeypatch):
-    monkeypatch.setattr(kernels, "run_mission", lambda *_: numba.njit(lambda x: x - 1)(1.0))
-    kernels.compile_kernels()
+def test_kernels_are_compiled_for_the_filters_and_timings_that_are_named(monkeypatch):
+    tried = []
+
+    def noted(config, _, filters):
+        tried.append((config.listening.timing, *filters))
+
+    monkeypatch.setattr(compiling, "run_mission", noted)
+    compiling.compile_kernels(["iekf", "my.own:Filter"], [True])
+    assert tried == [(True, "iekf")]
+    compiling.compile_kernels()
+    assert tried[1:] == [(timing, *filter(is_there, CATALOGUE)) for timing in (False, True)]

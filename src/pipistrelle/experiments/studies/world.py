@@ -5,7 +5,6 @@ What a case is: `studies.plan`. Cases whose settings differ in nothing that is s
 """
 
 import json
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from math import degrees
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from pipistrelle import kernel_clock
 from pipistrelle.acoustics.emitter import beamwidth_of
 from pipistrelle.config import Config, FilterConfig, ListeningConfig, Strategy
 from pipistrelle.detection.faces import Heard
@@ -376,9 +376,9 @@ def _try_case(case: PlannedCase, shared: _Shared, iteration: int) -> TrialRecord
         scenario = shared.scenario
         drive, scans = drive_of(scenario, case.config, iteration), shared.scans(case)
         heard = shared.beams[case.config.emitter.radius]
-        began = time.thread_time()
+        began = kernel_clock.cpu_s()
         result = run_trial(replace(case, iteration=iteration), drive, scans, case.config)
-        cpu_s = time.thread_time() - began
+        cpu_s = kernel_clock.cpu_s() - began
         estimate = heaviest(result.track.landmarks)
         full = result.track.full
         frames = _frame_errors(result.track, scenario, case.config)

@@ -1,0 +1,79 @@
+"""Clocks that stand still while kernels are compiled or loaded: that is no filter's time.
+
+The first kernel that is compiled, and not merely loaded, is announced before: it takes long.
+"""
+
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+from numba.core.event import Event, Listener, register
+
+COMPILING = "Compiling kernels (once; a minute or two) ..."
+_COMPILE, _LOCK = "numba:compile", "numba:compiler_lock"
+"""Numba tells when it compiles, and when it compiles or loads."""
+
+
+class _Clock(Listener):
+    """Sum up the time in which kernels are compiled or loaded, and announce the first."""
+
+    def __init__(self) -> None:
+        self.tell: Callable[[str], object] | None = _say
+        self.lost = (0.0, 0.0)
+        self._began, self._depth = (0.0, 0.0), 0
+
+    def on_start(self, event: Event) -> None:
+        """Stop the clocks."""
+        tell = self.tell
+        if event.kind == _COMPILE and tell is not None:
+            self.tell = None
+            tell(COMPILING)
+        if not self._depth:
+            self._began = _now()
+        self._depth += 1
+
+    def on_end(self, event: Event) -> None:
+        """Let the clocks go on, when the outermost of nested events is at its end."""
+        self._depth -= 1
+        if not self._depth:
+            (wall, cpu), began = _now(), self._began
+            self.lost = (self.lost[0] + wall - began[0], self.lost[1] + cpu - began[1])
+
+
+def wall_s() -> float:
+    """Return the time by the clock [s], without that of compiling and loading kernels."""
+    return time.perf_counter() - _CLOCK.lost[0]
+
+
+def cpu_s() -> float:
+    """Return this thread's processor time [s], without that of compiling and loading kernels."""
+    return time.thread_time() - _CLOCK.lost[1]
+
+
+def _say(line: str) -> None:
+    """Write a line to standard error, if anybody can read it."""
+    if sys.stderr is not None:
+        with suppress(OSError):
+            print(line, file=sys.stderr, flush=True)
+
+
+def announce(tell: Callable[[str], object] | None = _say) -> None:
+    """Have the next kernel that is compiled announced.
+
+    Parameters
+    ----------
+    tell : function of a line, optional
+        Called once; None: nobody is told.
+    """
+    _CLOCK.tell = tell
+
+
+def _now() -> tuple[float, float]:
+    """Return the time by the clock and this thread's processor time [s]."""
+    return time.perf_counter(), time.thread_time()
+
+
+_CLOCK = _Clock()
+for _kind in (_COMPILE, _LOCK):
+    register(_kind, _CLOCK)
