@@ -97,6 +97,8 @@ def extent(field):
 def bounds(kind):
     """Say what a kind of value is bounded by."""
     whole = "whole, " if kind["type"] == "integer" else ""
+    if "const" in kind:
+        return f"`{kind['const']}`"
     if "enum" in kind:
         return " or ".join(f"`{choice}`" for choice in kind["enum"])
     if kind["type"] in WORDS:

@@ -14,6 +14,7 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    PlainValidator,
     field_validator,
     model_validator,
 )
@@ -35,6 +36,19 @@ NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 Count = Annotated[int, Field(ge=1, lt=2**63)]
 Level = Annotated[float, Field(ge=-300, le=300)]
 Probability = Annotated[float, Field(gt=0, le=1)]
+
+
+def _gate(value: Any) -> Any:
+    """Refuse what is neither a share nor "auto"."""
+    if value == "auto" or (type(value) in (int, float) and 0.0 < value <= 1.0):
+        return value
+    raise ValueError('above 0 and up to 1, or "auto"')
+
+
+Gate = Annotated[
+    float | Literal["auto"],
+    PlainValidator(_gate, json_schema_input_type=Probability | Literal["auto"]),
+]
 
 Strategy = Literal["active", "fused", "passive"]
 STRATEGIES: tuple[Strategy, ...] = ("active", "fused", "passive")
@@ -356,8 +370,9 @@ class FilterConfig(Section):
     """How unsure the start is: x, y [m], heading [rad]."""
     first_pose: Literal["exact", "drawn"] = "exact"
     """What they are told of the start: the true pose (the paper's), or one drawn with these."""
-    gate: Probability = 1.0
-    """Measurements outside this share of their predicted distribution are dropped; 1: none."""
+    gate: Gate = 1.0
+    """Measurements outside this share of their predicted distribution are dropped; 1: none; "auto":
+    as suits the estimator."""
     robust: Literal["none", "huber"] = "none"
     """Huber's, by EKFs and smoother: what surprises by more than 2 sigma counts less."""
 

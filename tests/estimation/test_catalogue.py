@@ -5,7 +5,7 @@ import pytest
 
 from pipistrelle.config import Config, FastSlamConfig, FilterConfig, RayConfig
 from pipistrelle.estimation.beliefs import Gaussian
-from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, entry
+from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, entry, gate_of
 from reference.missions import BICYCLE, START, scan_of, scan_with
 
 RNG = np.random.default_rng
@@ -22,6 +22,15 @@ def test_the_gate_of_the_settings_is_the_filters(name, gate, gated):
     belief = slam.update(slam.init(START), scan_of((1, 5.0, 0.3), (2, 6.0, -0.4)), RNG(1))
     far_off = scan_with([1, 2], [2.3, -0.4], [np.nan, 12.0])
     assert slam.update(belief, far_off, RNG(2)).gated == gated
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+@pytest.mark.parametrize("robust", ["none", "huber"])
+def test_a_gate_that_is_left_open_is_the_estimators(name, robust):
+    config = Config(filter=FilterConfig(gate="auto", robust=robust))
+    drops_none = (name, robust) == ("smoother", "huber")
+    assert gate_of(name, config) == (1.0 if drops_none else 0.999)
+    assert entry(name).build(config, BICYCLE).gate == gate_of(name, config)
 
 
 @pytest.mark.parametrize("name", CATALOGUE)

@@ -16,10 +16,11 @@ from pipistrelle.config import Config
 from pipistrelle.detection.logs.folder import read_log
 from pipistrelle.detection.scans import COLUMNS
 from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS
+from pipistrelle.experiments.runs import again as once_more
 from pipistrelle.experiments.runs import replay
 from pipistrelle.experiments.runs.replay import motion_of
 from pipistrelle.settings import from_text
-from reference.command_line import SHORT, summary, track
+from reference.command_line import SHORT, summary, table, track
 from reference.odometry import as_motions, poses_file
 
 DATA = Path(__file__).parents[1] / "data"
@@ -174,14 +175,14 @@ def test_slam_hides_ranges_by_strategy_and_beam(obey, log, undrawn):
     assert "position RMSE, aligned [m]" in printed
 
 
-def test_the_gate_of_a_log_is_the_one_asked_for_else_its_own_else_nearly_all(obey, log, undrawn):
+def test_the_gate_of_a_log_is_the_one_asked_for_else_its_own_else_the_filters(obey, log, undrawn):
     def gate(*words):
         assert obey("slam", log, "--quiet", "--overwrite", "-o", "two", *words)[0] == 0
         return tomllib.loads(Path("two/config.toml").read_text())["filter"]["gate"]
 
     text = re.sub(r"gate = .*\n", "", (log / "log.toml").read_text())
     (log / "log.toml").write_text(text)
-    assert gate() == 0.999
+    assert gate() == "auto"
     (log / "log.toml").write_text("gate = 0.95\n" + text)
     assert gate() == 0.95
     Path("mission.toml").write_text("filter.gate = 0.9\n")
@@ -274,9 +275,24 @@ def test_measurements_that_do_not_fit_are_asked_about(obey, log, undrawn):
     gated = summary("two")["runs"][0]["gated"]
     assert re.fullmatch(
         rf"pipistrelle: warning: log: {gated} of \d+ measurements do not fit what was expected "
-        r"\(fused ekf\); are bearings in radians and ranges in metres\?\n",
+        r"\(fused ekf\); are bearings in radians and ranges in metres, "
+        r"and all labels right\?\n",
         said,
     )
+
+
+def test_a_gate_that_rejects_more_than_it_should_is_told_of_with_what_helps(obey, log, undrawn):
+    rows = [row.split(",") for row in (log / "measurements.csv").read_text().splitlines()]
+    last = max(i for i, row in enumerate(rows) if row[3])
+    rows[last][2] = repr(float(rows[last][2]) + 1.5)
+    (log / "measurements.csv").write_text("\n".join(map(",".join, [*rows, []])))
+    words = ("slam", log, "--quiet", "-o", "two", "--overwrite")
+    said = obey(*words, "--gate", "0.999")[2]
+    share = 100.0 / (len(rows) - 1)
+    assert f"the gate rejects {share:.1f}% of the measurements (fused ekf), expected 0.1%" in said
+    assert 'filter.robust = "huber"' in said
+    assert obey(*words, "--gate", "1")[2] == ""
+    assert obey(*words, "--gate", "0.99")[2] == "", "more is expected of a narrower gate"
 
 
 def test_bearings_beyond_a_turn_are_asked_about_whatever_the_gate(obey, log, undrawn):
@@ -363,7 +379,13 @@ def test_a_log_without_truth_is_mapped_and_not_scored(obey, log):
     status, printed, _ = obey("slam", log, "-o", "two")
     assert status == 0
     assert "RMSE" not in printed
-    assert "landmarks, placed / heard" in printed
+    rows = table(printed)
+    track = pl.read_parquet("two/steps.parquet")
+    last, moves = track.row(-1, named=True), track.select(pl.col("x_m", "y_m").diff()).drop_nulls()
+    spread = np.hypot(last["x_std_m"], last["y_std_m"])
+    told = {"rejected by the gate [%]": "0.00", "final position, 1 sigma [m]": f"{spread:.3f}"}
+    told["distance driven [m]"] = f"{np.hypot(*moves.to_numpy().T).sum():.1f}"
+    assert {title: rows[title][0].strip() for title in told} == told
     _, truth = replay.load(log)
     assert (truth.path, truth.landmarks) == (None, None)
 
@@ -386,3 +408,15 @@ def test_a_truth_that_covers_part_of_the_path_is_said_in_a_line(obey, tmp_path, 
     status, _, said = obey("slam", log, "-o", tmp_path / "results")
     assert status == 0
     assert "the truth covers 5 of 20 steps" in said
+
+
+def test_several_filters_side_by_side_have_each_the_gate_that_suits_it(obey, log, undrawn):
+    settings = (log / "log.toml").read_text()
+    (log / "log.toml").write_text(re.sub(r"gate = .*\n", "", settings))
+    words = ("--filter.robust", "huber", "--filter", "iekf,smoother")
+    assert obey("slam", log, *words, "-o", "both")[0] == 0
+    assert [run["filter"] for run in summary("both")["runs"]] == ["iekf", "smoother"]
+    for name, gate in (("iekf", "0.999"), ("smoother", "1")):
+        obey("slam", log, "--filter.robust", "huber", "--filter", name, "--gate", gate, "-o", name)
+        np.testing.assert_array_equal(track("both", f"fused_{name}"), track(name, f"fused_{name}"))
+    assert once_more.again(Path("both")).difference == ""

@@ -9,12 +9,12 @@ once. One that is not listed here goes by ``module:Class`` (`entry`).
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import partial
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from pipistrelle.config import Config, InputError
 from pipistrelle.estimation.outside import built, class_of, title_met
+from pipistrelle.refusals import meant
 
 if TYPE_CHECKING:
     from pipistrelle.estimation.beliefs import Estimator
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 DOUBLE = 8
 """Bytes of a number."""
+GATE = 0.999
+"""Share of a measurement's predicted distribution that is accepted of real logs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,6 +48,11 @@ class Entry:
     follows : bool
         Whether it is told of callers that move (`estimation.beliefs.Following`), or of what stands
         alone.
+    gate : float
+        What ``filter.gate = "auto"`` means to it: the share of a measurement's predicted
+        distribution that it accepts of a log that says nothing of it; 1 drops nothing.
+    robust_gate : float
+        The same with ``filter.robust = "huber"``.
     needs : str
         A module that it cannot do without and that an extra of its name installs, or nothing.
     """
@@ -57,7 +64,37 @@ class Entry:
     nees_limit: float
     memory: Callable[[int, int, Config], float]
     follows: bool = False
+    gate: float = GATE
+    robust_gate: float = GATE
     needs: str = ""
+
+
+def gate_of(name: str, config: Config) -> float:
+    """Return the share of a measurement's predicted distribution that an estimator accepts.
+
+    Parameters
+    ----------
+    name : str
+    config : Config
+
+    Returns
+    -------
+    float
+        The setting ``filter.gate``; where it is "auto", the estimator's own.
+
+    Examples
+    --------
+    >>> from pipistrelle.config import FilterConfig
+    >>> gate_of("ekf", Config()), gate_of("ekf", Config(filter=FilterConfig(gate="auto")))
+    (1.0, 0.999)
+    """
+    told = config.filter
+    if told.gate != "auto":
+        return told.gate
+    known = CATALOGUE.get(name)
+    if known is None:
+        return GATE
+    return known.robust_gate if told.robust == "huber" else known.gate
 
 
 def is_there(name: str) -> bool:
@@ -139,7 +176,7 @@ def entry(name: str) -> Entry:
     return Entry(
         name=name,
         title=title,
-        build=partial(built, name, kind),
+        build=lambda config, motion: built(name, kind, _with_gate(name, config), motion),
         sections=("listening", "filter", "rays"),
         nees_limit=float(limit),
         memory=lambda landmarks, members, config: 0.0,
@@ -147,12 +184,14 @@ def entry(name: str) -> Entry:
     )
 
 
-def check_name(name: str) -> str:
+def check_name(name: str, *groups: str) -> str:
     """Refuse what names no estimator, whether or not it is there.
 
     Parameters
     ----------
     name : str
+    *groups : str
+        Names of several estimators that were allowed, too, for the refusal.
 
     Returns
     -------
@@ -166,16 +205,18 @@ def check_name(name: str) -> str:
 
     Examples
     --------
-    >>> check_name("ukf")
+    >>> check_name("ikef")
     Traceback (most recent call last):
-    pipistrelle.config.InputError: filter: found 'ukf', expected one of ekf, fastslam, iekf,
-    smoother, module:Class
+    pipistrelle.config.InputError: filter: found 'ikef', expected one of ekf, fastslam, iekf,
+    smoother, module:Class; did you mean 'iekf'?
     """
     module, colon, kind = name.partition(":")
     dotted = all(part.isidentifier() for part in module.split("."))
     if name not in CATALOGUE and not (colon and dotted and kind.isidentifier()):
-        known = ", ".join(CATALOGUE)
-        raise InputError(f"filter: found {name!r}, expected one of {known}, module:Class")
+        known, near = (*CATALOGUE, *groups), meant(name, (*CATALOGUE, *groups))
+        fix = f"; did you mean {near!r}?" if near else ""
+        expected = f"one of {', '.join(known)}, module:Class"
+        raise InputError(f"filter: found {name!r}, expected {expected}{fix}")
     return name
 
 
@@ -253,14 +294,14 @@ def _ekf(config: Config, motion: "Motion") -> "Estimator":
     """Build EKF-SLAM."""
     from pipistrelle.estimation.ekf.filter import EkfSlam
 
-    return EkfSlam(motion=motion, **_gaussian(config), **_of_callers(config))
+    return EkfSlam(motion=motion, **_gaussian("ekf", config), **_of_callers(config))
 
 
 def _iekf(config: Config, motion: "Motion") -> "Estimator":
     """Build right-invariant EKF-SLAM."""
     from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
 
-    return InvariantEkfSlam(motion=motion, **_gaussian(config), **_of_callers(config))
+    return InvariantEkfSlam(motion=motion, **_gaussian("iekf", config), **_of_callers(config))
 
 
 def _smoother(config: Config, motion: "Motion") -> "Estimator":
@@ -268,13 +309,19 @@ def _smoother(config: Config, motion: "Motion") -> "Estimator":
     check_there("smoother")
     from pipistrelle.estimation.smoother.filter import Smoother
 
-    return Smoother(motion=motion, **_gaussian(config), **_of_callers(config))
+    return Smoother(motion=motion, **_gaussian("smoother", config), **_of_callers(config))
 
 
-def _gaussian(config: Config) -> dict[str, Any]:
+def _with_gate(name: str, config: Config) -> Config:
+    """Return the settings with a number for the gate, for an estimator from outside."""
+    told = config.filter.model_copy(update={"gate": gate_of(name, config)})
+    return config.model_copy(update={"filter": told})
+
+
+def _gaussian(name: str, config: Config) -> dict[str, Any]:
     """Return the settings that both EKFs and the smoother take."""
-    settings = config.filter
-    return {"rays": config.rays, "gate": settings.gate, "robust": settings.robust == "huber"}
+    gate, robust = gate_of(name, config), config.filter.robust == "huber"
+    return {"rays": config.rays, "gate": gate, "robust": robust}
 
 
 def _of_callers(config: Config) -> dict[str, Any]:
@@ -300,7 +347,7 @@ def _fastslam(config: Config, motion: "Motion") -> "Estimator":
     """Build FastSLAM 2.0."""
     from pipistrelle.estimation.fastslam.filter import FastSlam
 
-    gate = config.filter.gate
+    gate = gate_of("fastslam", config)
     return FastSlam(motion=motion, rays=config.rays, gate=gate, settings=config.fastslam)
 
 
@@ -348,6 +395,7 @@ CATALOGUE = {
             nees_limit=50.0,
             memory=_smoother_bytes,
             follows=True,
+            robust_gate=1.0,
             needs="gtsam",
         ),
     )

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from pipistrelle.acoustics.emitter import beamwidth_of
 from pipistrelle.config import Config, Strategy
 from pipistrelle.detection.logs.readers import Robot
 from pipistrelle.detection.logs.recording import Log
+from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.hearing.world_folder import kept_world
@@ -30,6 +32,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from pipistrelle.figures.recorder import MissionRecorder
+
+
+FAR = 4.0
+"""How many times the bound a position error may be before that is said."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,9 +125,23 @@ def simulated(
         moving=mission.drive.moving,
         beamwidth=beamwidth_of(config),
         beside=files,
-        said=warnings_of(config, mission.scenario.callers),
+        said=(*warnings_of(config, mission.scenario.callers), *_far_off(mission.trials)),
     )
     return done, mission
+
+
+def _far_off(trials: Sequence[TrialResult]) -> list[str]:
+    """Say which estimates are much farther off than the bound."""
+    pairs = [
+        (trial, trial.scores.position_rmse_m, trial.scores.position_bound_m) for trial in trials
+    ]
+    return [
+        f"{trial.strategy} {short_name(trial.filter)}: its position error, {error:.3g} m, is "
+        f"{error / bound:.1f} times the bound, {bound:.3g} m; what serves each estimator is in "
+        "docs/estimators.md"
+        for trial, error, bound in pairs
+        if error is not None and bound is not None and FAR * bound < error < inf
+    ]
 
 
 def solved(
@@ -176,7 +196,7 @@ def solved(
         beamwidth=beamwidth,
         ignored_rows=recorded.ignored_rows,
         log=log_entry(place, robot, beamwidth),
-        said=tuple(afterwards(recorded, trials, place)),
+        said=tuple(afterwards(recorded, trials, place, config)),
     )
 
 

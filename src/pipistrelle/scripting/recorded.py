@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import create_model
 
 from pipistrelle.config import Config, InputError, Section
-from pipistrelle.estimation.catalogue import SECTIONS, short_name
+from pipistrelle.estimation.catalogue import SECTIONS, gate_of, short_name
 from pipistrelle.settings import Given, Key, Layer, resolve
 
 if TYPE_CHECKING:
@@ -16,15 +16,19 @@ if TYPE_CHECKING:
     from pipistrelle.experiments.drives import Truth
     from pipistrelle.experiments.results.scores import TrialResult
 
-GATE = 0.999
-"""Share of a measurement's predicted distribution that is accepted of real logs."""
 GATE_KEY: Key = ("filter", "gate")
-OWN: dict[Key, str] = {("rays", "spacing"): "auto", ("filter", "noise"): "measured"}
+OWN: dict[Key, str] = {
+    GATE_KEY: "auto",
+    ("rays", "spacing"): "auto",
+    ("filter", "noise"): "measured",
+}
 """Settings that a recorded log has others of than a simulated mission: its sensor is anyone's."""
 TIMING: Key = ("listening", "timing")
 """Is on where a log has detours, or a caller that moves: it is followed by whom it is timed."""
 SUSPECT = 0.2
 """Share of a log's rows that may not fit before its units are asked about."""
+GATED = 0.01
+"""Share of a log's rows that the gate may reject beyond its own before that is said."""
 SHORT = 0.2
 """A detour that few have [m]: it is none of a sound that lasts, and in seconds most are less."""
 LOGGED = frozenset(
@@ -106,10 +110,10 @@ def with_log(layer: Layer, recorded: "Log", log: Path) -> tuple[Config, list[str
     list of str
         A line for each setting of which the layer says otherwise.
     """
-    gate = GATE if recorded.gate is None else recorded.gate
     decided = {key: Given(getattr(recorded, key[1]), f"{log}: {key[1]}") for key in LOGGED}
-    own = {GATE_KEY: Given(gate, str(log))}
-    own |= {key: Given(value, "slam") for key, value in OWN.items()}
+    own = {key: Given(value, "slam") for key, value in OWN.items()}
+    if recorded.gate is not None:
+        own[GATE_KEY] = Given(recorded.gate, str(log))
     moves = any(caller.moves for caller in recorded.callers)
     own[TIMING] = Given(moves or has_detours(recorded), str(log))
     if recorded.detour_std is not None:
@@ -226,7 +230,9 @@ def _unheard(recorded: "Log", log: Path) -> list[str]:
     ]
 
 
-def afterwards(recorded: "Log", trials: "Sequence[TrialResult]", log: Path) -> list[str]:
+def afterwards(
+    recorded: "Log", trials: "Sequence[TrialResult]", log: Path, config: Config
+) -> list[str]:
     """Ask whether a log has the units that are expected, where much of it does not fit.
 
     Parameters
@@ -234,6 +240,8 @@ def afterwards(recorded: "Log", trials: "Sequence[TrialResult]", log: Path) -> l
     recorded : Log
     trials : sequence of TrialResult
     log : Path
+    config : Config
+        Of the estimators.
 
     Returns
     -------
@@ -247,13 +255,20 @@ def afterwards(recorded: "Log", trials: "Sequence[TrialResult]", log: Path) -> l
             told.append(
                 f"{log}: nothing in it is heard by {trial.strategy} sensing, so it maps nothing"
             )
-        elif (
-            turned <= SUSPECT * rows and SUSPECT * heard < trial.scores.gated and _is_finite(trial)
-        ):
-            told.append(
-                f"{log}: {trial.scores.gated} of {heard} measurements do not fit what was expected "
-                f"({trial.strategy} {name}); are bearings in radians and {metric} in metres?"
-            )
+        elif turned <= SUSPECT * rows and _is_finite(trial):
+            gated, who = trial.scores.gated, f"{trial.strategy} {name}"
+            if SUSPECT * heard < gated:
+                told.append(
+                    f"{log}: {gated} of {heard} measurements do not fit what was expected ({who}); "
+                    f"are bearings in radians and {metric} in metres, and all labels right?"
+                )
+            elif (GATED + (expected := 1.0 - gate_of(trial.filter, config))) * heard < gated:
+                told.append(
+                    f"{log}: the gate rejects {gated / heard:.1%} of the measurements ({who}), "
+                    f"expected {expected:.1%}: they are less sure than they say, or something was "
+                    "placed wrong before; larger standard deviations help, or a gate of 1 with "
+                    'filter.robust = "huber"'
+                )
     if turned > SUSPECT * rows:
         told.append(f"{log}: {turned} of {rows} bearings are beyond a turn; are they in radians?")
     return told + _out_of_bounds(recorded, log)

@@ -28,7 +28,11 @@ def run(
     *,
     strategy: Annotated[Chosen, Parameter(help="What the vehicle listens to.")] = "all",
     estimator: Annotated[
-        ChosenFilter, Parameter(name="--filter", help="What draws the map.")
+        ChosenFilter,
+        Parameter(
+            name="--filter",
+            help="What draws the map; several, parted by commas, side by side.",
+        ),
     ] = "ekf",
     mission: Annotated[MissionOptions | None, Parameter(name="*")] = None,
     output: Annotated[OutputOptions | None, Parameter(name="*")] = None,
@@ -129,7 +133,7 @@ def _log(mission: "Mission", scans: "Sequence[Scan]") -> "Log":
         detour_std=config.filter.detour_std if timing else None,
         callers=_log_callers(mission) if timing else (),
         range_bounds=config.rays.range_bounds,
-        gate=config.filter.gate,
+        gate=None if config.filter.gate == "auto" else config.filter.gate,
         ignored_rows={},
     )
 

@@ -2,7 +2,7 @@
 
 from math import radians
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -10,7 +10,6 @@ from pipistrelle.config import InputError
 from pipistrelle.detection.logs.readers import READERS
 from pipistrelle.scripting.asking import named_strategies, short_names
 from pipistrelle.scripting.recorded import (
-    GATE,
     GATE_KEY,
     OWN,
     TIMING,
@@ -58,7 +57,11 @@ def slam(
         Parameter(help="What is kept: all as it is, only what has a range, or only bearings."),
     ] = "fused",
     estimator: Annotated[
-        ChosenFilter, Parameter(name="--filter", help="What draws the map.")
+        ChosenFilter,
+        Parameter(
+            name="--filter",
+            help="What draws the map; several, parted by commas, side by side.",
+        ),
     ] = "ekf",
     particles: Particles = None,
     beamwidth: Annotated[
@@ -70,11 +73,11 @@ def slam(
         ),
     ] = None,
     gate: Annotated[
-        float | None,
+        float | Literal["auto"] | None,
         Parameter(
             metavar="P",
             help="Drop measurements outside this share of their predicted distribution; sets "
-            f"filter.gate. [default: the log's own, else {GATE}]",
+            "filter.gate. [default: the log's own, else what suits the estimator]",
         ),
     ] = None,
     config: Annotated[
@@ -110,9 +113,7 @@ def slam(
         return delivery.deliver(own, done, output, watch)
 
 
-def _layer(
-    config: Path | None, settings: SlamFlags, gate: float | None, particles: int | None
-) -> Layer:
+def _layer(config: Path | None, settings: SlamFlags, gate: object, particles: int | None) -> Layer:
     """Lay file, environment and flags over each other; refuse flags for what the log decides."""
     flags = from_flags(settings)
     check_open(flags)
