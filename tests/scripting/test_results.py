@@ -102,10 +102,14 @@ def test_settings_to_start_from_may_be_settings_a_table_or_a_file(done):
         ((), {"rays": 3}, "rays: found 3, expected a section of settings"),
         ((), {"rays": {"power": 2.0}, "rays__power__x": 2}, "found power as a value too"),
         (({"ray.power": 3.0},), {}, "config: ray.power: no such setting; did you mean rays.power?"),
-        (("nowhere.toml",), {}, "nowhere.toml"),
+        (("nowhere.toml",), {}, "nowhere.toml: found no such file"),
+        ((7,), {}, "config: found 7, expected a Config, a mapping or the path of a TOML file"),
+        ((), {"landmarks": [[1, 2], [3, 4]]}, "and name it by world="),
         ((), {"strategies": "activ"}, "strategies: found 'activ', expected 'active', 'fused', 'pa"),
         ((), {"strategies": ["fused", 3]}, "strategies: found 3"),
         ((), {"filters": "ukf"}, "filter: found 'ukf', expected one of ekf"),
+        ((), {"filters": "ikef"}, "smoother, both, all, module:Class; did you mean 'iekf'?"),
+        ((), {"filters": ["ekf", "botch"]}, "did you mean 'both'?"),
         ((), {"world": "nowhere"}, "nowhere: found no such folder"),
         ((), {"duration": 0.1}, "duration: found 0.1, expected at least one frame (0.5 s)"),
         ((), {"duration": 9.0, "scenario__steps": 3}, "duration 9 and scenario__steps are one set"),
@@ -121,9 +125,19 @@ def test_settings_to_start_from_may_be_settings_a_table_or_a_file(done):
     ],
 )
 def test_mistakes_are_told_in_the_words_of_the_call(words, asked, said):
-    with pytest.raises((InputError, OSError)) as refused:
+    with pytest.raises(InputError) as refused:
         pipistrelle.run(*words, **asked)
     assert said in str(refused.value)
+
+
+def test_a_folder_that_is_not_empty_is_refused_in_pythons_words(done, tmp_path):
+    (tmp_path / "mine.txt").write_text("kept")
+    for ask in (done.save, lambda folder: pipistrelle.run(duration=4.0, output=folder)):
+        with pytest.raises(InputError, match="say overwrite=True") as refused:
+            ask(tmp_path)
+        assert "-o DIR" not in str(refused.value)
+        assert "--" not in str(refused.value)
+    assert (tmp_path / "mine.txt").read_text() == "kept"
 
 
 def test_a_log_is_solved_as_by_the_command_line(capsys):

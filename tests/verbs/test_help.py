@@ -75,5 +75,5 @@ def test_the_defaults_that_the_help_names_are_those_of_the_settings(obey):
 @pytest.mark.parametrize("verb", ["run", "slam"])
 def test_the_help_names_the_filters_there_are(obey, verb):
     words = " ".join(re.sub("[│╭╮╰╯─]", " ", obey(verb, "--help")[1]).split())
-    assert "[choices: ekf, fastslam, iekf, smoother, both] [default: ekf]" in words
+    assert "[choices: ekf, fastslam, iekf, smoother, both, all] [default: ekf]" in words
     assert "sets fastslam.particles" in words

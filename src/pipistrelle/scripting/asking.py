@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from pipistrelle.config import STRATEGIES, Config, InputError, Strategy
-from pipistrelle.estimation.catalogue import PAPERS, check_distinct, entry
-from pipistrelle.refusals import meant, shown
+from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, check_distinct, check_name, entry
+from pipistrelle.refusals import meant, refusal, shown
 from pipistrelle.settings import (
     CALLERS,
     Given,
@@ -32,6 +32,8 @@ Base = Config | Mapping[str, Any] | str | Path | None
 """Settings to start from: as they were resolved, as a table, or the file that holds it."""
 Filters = str | type | Sequence[str | type]
 """Estimators: by name, or one's own as classes."""
+GROUPS = {"both": PAPERS, "all": tuple(CATALOGUE)}
+"""Names that stand for several estimators."""
 STEPS: Key = ("scenario", "steps")
 RADIUS: Key = ("emitter", "radius")
 WORLD: Key = ("scenario", "world")
@@ -51,7 +53,7 @@ def base_layer(base: Base) -> Layer:
     Raises
     ------
     InputError
-        A key that is no setting.
+        A key that is no setting, a file that cannot be read, and what is none of these.
 
     Examples
     --------
@@ -64,7 +66,14 @@ def base_layer(base: Base) -> Layer:
         return from_flags(base.model_dump(mode="json", exclude_defaults=True))
     if isinstance(base, Mapping):
         return from_table(spread(base, "."), "config: ")
-    return from_file(Path(base))
+    if not isinstance(base, (str, Path)):
+        expected = "a Config, a mapping or the path of a TOML file"
+        raise refusal("config", shown(base), expected, "give settings by keyword")
+    try:
+        return from_file(Path(base))
+    except OSError as error:
+        found = (error.strerror or "nothing").lower()
+        raise refusal(base, found, "a TOML file of settings", "check the path") from None
 
 
 def short_names(short: Layer, flags: Layer) -> Layer:
@@ -215,7 +224,8 @@ def named_filters(chosen: Filters) -> tuple[str, ...]:
 
     Parameters
     ----------
-    chosen : the name of an estimator or its class, several of them, or "both", the paper's two
+    chosen : the name of an estimator or its class, several of them, or the name of a group
+        Text may hold several, parted by commas. Groups are "both", the paper's two, and "all".
 
     Returns
     -------
@@ -229,19 +239,21 @@ def named_filters(chosen: Filters) -> tuple[str, ...]:
 
     Examples
     --------
-    >>> named_filters("both"), named_filters(["ekf", "iekf"])
-    (('ekf', 'fastslam'), ('ekf', 'iekf'))
+    >>> named_filters("both"), named_filters("ekf,iekf"), named_filters(["ekf", "iekf"])
+    (('ekf', 'fastslam'), ('ekf', 'iekf'), ('ekf', 'iekf'))
     >>> from pipistrelle.estimation.ekf.filter import EkfSlam
     >>> named_filters(EkfSlam)
     ('pipistrelle.estimation.ekf.filter:EkfSlam',)
     """
-    if isinstance(chosen, (str, type)) or not isinstance(chosen, Iterable):
-        chosen = PAPERS if chosen == "both" else (chosen,)
+    if isinstance(chosen, str):
+        chosen = GROUPS.get(chosen) or [name.strip() for name in chosen.split(",")]
+    elif isinstance(chosen, type) or not isinstance(chosen, Iterable):
+        chosen = (chosen,)
     names = tuple(dict.fromkeys(map(_name_of, chosen)))
     if not names:
         raise InputError("filters: found none, expected an estimator's name or its class")
     for name in names:
-        entry(name)
+        entry(check_name(name, *GROUPS))
     check_distinct(names, "filters")
     return names
 

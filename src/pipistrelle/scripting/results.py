@@ -2,12 +2,12 @@
 
 import json
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from io import BytesIO
 from math import radians
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from pipistrelle.config import InputError
 from pipistrelle.detection.logs.readers import Robot
@@ -17,8 +17,9 @@ from pipistrelle.experiments.results.writing import run_entry, tables_of
 from pipistrelle.experiments.runs.replay import load as load_log
 from pipistrelle.experiments.runs.trial import Watch
 from pipistrelle.files import read_file
+from pipistrelle.kernel_clock import announce
 from pipistrelle.own_files import RESULTS, claim
-from pipistrelle.refusals import refusal
+from pipistrelle.refusals import refusal, shown
 from pipistrelle.scripting.asking import (
     WORLD,
     Base,
@@ -247,7 +248,7 @@ def run(
         Settings to start from.
     strategies : "active", "fused", "passive", several of them, or "all"
     filters : str or class
-        The name of an estimator or its class, several of them, or "both", the paper's two.
+        The name of an estimator or its class, several of them, "both", the paper's two, or "all".
     world : Path, optional
         Folder of a world of one's own.
     beamwidth : [deg], optional
@@ -281,6 +282,9 @@ def run(
     Traceback (most recent call last):
     pipistrelle.config.InputError: rays__powr: no such setting; did you mean rays__power?
     """
+    if isinstance(landmarks, Iterable) and not isinstance(landmarks, str):
+        fix = "places of your own are a world's: write them into one, and name it by world="
+        raise refusal("landmarks", shown(landmarks), "the number of landmarks", fix)
     short: Layer = {
         WORLD: Given(None if world is None else str(world), "world"),
         ("scenario", "landmarks"): Given(landmarks, "landmarks"),
@@ -310,7 +314,7 @@ def slam(
     strategies: str | Sequence[str] = "fused",
     filters: Filters = "ekf",
     beamwidth: float | None = None,
-    gate: float | None = None,
+    gate: float | Literal["auto"] | None = None,
     output: Path | str | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
@@ -331,11 +335,12 @@ def slam(
     strategies : "active", "fused", "passive", several of them, or "all"
         What is kept: only what has a range, all as it is, or only bearings.
     filters : str or class
-        The name of an estimator or its class, several of them, or "both", the paper's two.
+        The name of an estimator or its class, several of them, "both", the paper's two, or "all".
     beamwidth : [deg], optional
         Ranges outside a beam of this width about the heading are hidden.
-    gate : float, optional
-        Measurements outside this share of their predicted distribution are dropped.
+    gate : float or "auto", optional
+        Measurements outside this share of their predicted distribution are dropped; "auto", as
+        suits the estimator, unless the log says its own.
     output, overwrite, progress, **settings
         As of `run`; what the log decides is refused.
 
@@ -370,6 +375,7 @@ def slam(
 def _finished(redo: Redo, output: Path | str | None, overwrite: bool, command: str) -> Results:
     """Do a mission, and keep it where that is asked for."""
     keep_freed_memory()
+    announce()
     place = None if output is None else Path(output)
     flags = ("output=DIR", ALLOW)
     own = None if place is None else claim(place, RESULTS, overwrite=overwrite, flags=flags)

@@ -4,9 +4,11 @@ from collections.abc import Sequence
 from errno import ENOSPC
 from inspect import Parameter, signature
 from itertools import pairwise, zip_longest
+from pathlib import Path
 
 from cyclopts import App, CycloptsError, MissingArgumentError, UnusedCliTokensError
 
+from pipistrelle.detection.logs.readers import recording_of
 from pipistrelle.verbs.streams import flush_results, say
 from pipistrelle.version import find_version
 
@@ -53,7 +55,8 @@ app.command(
 app.command(
     "pipistrelle.verbs.report:report",
     name="report",
-    help="Put a study on one page: the paper's claims judged, every figure, the numbers.",
+    help="Put a study on one page: the answer to its question, its figures and its numbers; for a "
+    "plan of the paper's, its claims judged.",
 )
 app.command(
     "pipistrelle.verbs.compare:compare",
@@ -144,5 +147,7 @@ def _too_many(error: UnusedCliTokensError, word: str, words: Sequence[str]) -> s
         return f"--animate: found {word!r}, expected {' or '.join(FILMS)}"
     verb, kinds = " ".join(error.command_chain or ()), signature(error.target or obey).parameters
     takes = sum(kind.kind is Parameter.POSITIONAL_ONLY for kind in kinds.values())
+    if verb == "run" and (what := recording_of(Path(word))):
+        return f"run: found {word!r}, {what}; run makes up its own sound, and slam solves a log"
     most = "no arguments" if not takes else "one argument" if takes == 1 else f"{takes} arguments"
     return f"{verb}: found {word!r}, but {verb} takes {most}; options begin with --"

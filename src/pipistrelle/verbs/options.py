@@ -11,8 +11,7 @@ from cyclopts import Group, Parameter
 
 from pipistrelle.config import Config, InputError
 from pipistrelle.estimation.catalogue import CATALOGUE, entry
-from pipistrelle.refusals import meant
-from pipistrelle.scripting.asking import WORLD, mission_settings, named_filters
+from pipistrelle.scripting.asking import GROUPS, WORLD, mission_settings, named_filters
 from pipistrelle.settings import (
     CALLERS,
     Given,
@@ -44,28 +43,12 @@ def _as_written(_: Any, tokens: Sequence[Any]) -> Any:
     return from_text(tokens[0].value)
 
 
-def _filter(_: Any, tokens: Sequence[Any]) -> str:
-    """Read the name of a filter, one that is listed or one from outside."""
-    name = tokens[0].value
-    if ":" in name or name in get_args(_LISTED):
-        return name
-    near = meant(name, get_args(_LISTED))
-    fix = f"; did you mean {near!r}?" if near and "," not in name else ""
-    more = "; several: run once for each, and `pipistrelle compare`" if "," in name else ""
-    listed = ", ".join(get_args(_LISTED))
-    raise ValueError(
-        f"found {name!r}, expected {listed} or one of your own, module:Class{fix}{more}"
-    )
-
-
 if TYPE_CHECKING:
     from pipistrelle.experiments.hearing.worlds import World
 
-    _LISTED: Any = str
     ChosenFilter = str
 else:  # the help names those that are listed
-    _LISTED = Literal[(*CATALOGUE, "both")]
-    ChosenFilter = Annotated[_LISTED | str, Parameter(converter=_filter, metavar="CHOICE")]
+    ChosenFilter = Annotated[Literal[(*CATALOGUE, *GROUPS)] | str, Parameter(metavar="CHOICE")]
 Particles = Annotated[
     Whole | None,
     Parameter(metavar="N", help="Particles of FastSLAM; sets fastslam.particles. [default: 100]"),
@@ -123,6 +106,9 @@ def setting_flags(
 def _unbounded(kind: Any) -> Any:
     """Return a type without its bounds and without None: `resolve` refuses, in the same words."""
     parts = [_unbounded(part) for part in get_args(kind) if part is not NoneType]
+    either: Any = Union
+    if get_origin(kind) is Union and len(parts) > 1:
+        return either[tuple(parts)]
     if get_origin(kind) in (Annotated, Union):
         return parts[0]
     record: Any = tuple
@@ -272,7 +258,7 @@ def filters(chosen: ChosenFilter, particles: int | None) -> tuple[str, ...]:
 
     Parameters
     ----------
-    chosen : the name of an estimator, or "both", the paper's two
+    chosen : names of estimators, parted by commas, or that of a group
     particles : int, optional
         As asked for by the short name.
 
@@ -293,7 +279,7 @@ def filters(chosen: ChosenFilter, particles: int | None) -> tuple[str, ...]:
     names = named_filters(chosen)
     if particles is not None and not any("fastslam" in entry(n).sections for n in names):
         able = [known.name for known in CATALOGUE.values() if "fastslam" in known.sections]
-        others = " or ".join(f"--filter {name}" for name in (*able, "both"))
+        others = " or ".join(f"--filter {name}" for name in (*able, *GROUPS))
         raise InputError(
             f"--particles: found {particles}, but --filter is {chosen}, which has none; "
             f"add {others}"

@@ -8,6 +8,7 @@ from cyclopts import Parameter
 
 def report(
     folder: Annotated[Path, Parameter(help="A study's folder, whole or partial.")],
+    /,
     *,
     output: Annotated[
         Path | None,

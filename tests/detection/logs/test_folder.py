@@ -356,11 +356,18 @@ ROWS = {
     "no range": ("0.1,7,0.5,0", "line 3", "range 0.0", "above 0 m"),
     "negative range": ("0.1,7,0.5,-2", "line 3", "range -2.0", "above 0 m"),
     "label": ("0.1,7.5,0.5,1", "line 3", "landmark 7.5", "an integer"),
+    "no label": ("0.1,,0.5,1", "line 3", "landmark ''", "clutter -1; landmarks that nobody has"),
     "name": ("0.1,tree,0.5,1", "line 3", "landmark 'tree'", "a finite number"),
     "backwards": ("0.05,7,0.5,1", "line 3", "time 0.05 after 0.06", "backwards"),
     "twice": ("0.06,1,0.5,1", "line 3", "time 0.06, landmark 1 again", "line 2"),
     "outside but wrong": ("99,7,0.5,-2", "line 3", "range -2.0", "above 0 m"),
 }
+
+
+def test_measurements_without_a_column_of_labels_are_told_that_labels_must_be_known(tmp_path):
+    rows = "time,bearing,range\n0.1,0.5,1\n"
+    folder = recorded(tmp_path, measurements=rows)
+    refused(folder, "line 1", "the same whenever it is seen", "are not yet told apart in a log")
 
 
 STATING_ROWS = {

@@ -237,6 +237,10 @@ REFUSED = {
         ({"course": "circle", "speed": -343.0},),
         "callers.1.speed: found -343 m/s, expected less than 343 m/s",
     ),
+    "meets a caller that stands": (
+        ({"place": [9.0, 9.0]}, MATE | {"route": [[0.0, 5.0, 5.0], [4.0, 9.0, 9.0]]}),
+        "callers.2.route: at 4 s caller2 is where beacon is, x 9 m, y 9 m; expected callers apart",
+    ),
     "walks faster than sound": (
         ({}, MATE | {"course": "walk", "speed_std": 70.0}),
         "callers.2.speed_std: found 70 m/s, expected less than 68.6 m/s",

@@ -141,6 +141,32 @@ def test_a_folder_that_is_not_there_is_refused(tmp_path):
     refused(lambda: load(tmp_path), "log.toml", "no such file")
 
 
+@pytest.mark.parametrize(
+    ("names", "what", "fix"),
+    [
+        (["walk.WAV"], "an audio recording, which is not read", "detect the echoes"),
+        (["walk.mcap"], "a ROS bag, which is not read", "pip install rosbags"),
+        (["walk.bag"], "a ROS bag, which is not read", "pip install rosbags"),
+        (
+            ["bag/metadata.yaml", "bag/walk_0.db3"],
+            "a ROS bag, which is not read",
+            "into a log fold",
+        ),
+        (["walk.txt"], "a file", "check the path"),
+    ],
+)
+def test_a_recording_that_no_reader_takes_is_called_what_it_is(tmp_path, names, what, fix):
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    refused(lambda: load(tmp_path / names[0].split("/")[0]), what, "a log folder or a MRC", fix)
+
+
+def test_a_log_beside_a_recording_is_read(folder):
+    (folder / "walk.wav").touch()
+    assert load(folder)[0].scans
+
+
 def test_a_robot_is_named_for_a_mrclam_set_and_only_there(folder):
     refused(lambda: load(MADE_UP), "--robot", "found no robot", "(1)")
     refused(lambda: load(MADE_UP, 4), "--robot", "found robot 4", "(1)")

@@ -14,6 +14,14 @@ if TYPE_CHECKING:
     from pipistrelle.detection.logs.recording import Log
 
 
+_OTHERS = {
+    frozenset({".bag", ".db3", ".mcap"}): "a ROS bag, which is not read; write its odometry, and "
+    "bearings and ranges of its landmarks, into a log folder; `pip install rosbags` reads bags "
+    "without ROS",
+    frozenset({".wav", ".flac", ".aif", ".aiff", ".ogg", ".mp3"}): "an audio recording, which is "
+    "not read; detect the echoes in it, and write their bearings and ranges into a log folder",
+}
+"""Recordings that have no reader, by the endings of their files."""
 Robot = int | str
 """Whose log of several: by number or by name, as the format has it."""
 
@@ -75,6 +83,29 @@ def reader_of(folder: Path, readers: Sequence[Reader] = ()) -> Reader:
     """
     known = (*readers, *READERS)
     return next((reader for reader in known if reader.recognises(folder)), LOG_FOLDER)
+
+
+def recording_of(path: Path) -> str | None:
+    """Say what a recording is that no reader takes, by its name or by what a folder holds.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    str or None
+        What it is, and what can be done with it.
+
+    Examples
+    --------
+    >>> recording_of(Path("walk.mcap"))[:30], recording_of(Path("walk"))
+    ('a ROS bag, which is not read; ', None)
+    """
+    endings = {path.suffix.lower()}
+    if path.is_dir():
+        endings |= {file.suffix.lower() for file in path.iterdir()}
+    return next((words for known, words in _OTHERS.items() if endings & known), None)
 
 
 def _read_log_folder(folder: Path) -> "Log":

@@ -18,6 +18,10 @@ from pipistrelle.files import read_text
 from pipistrelle.refusals import refusal
 
 _LABELS = ("landmark", "subject", "barcode")
+_LABEL_IT = (
+    "number what your sensor tells apart, the same whenever it is seen, and clutter "
+    f"{UNLABELLED}; landmarks that nobody has labelled are not yet told apart in a log"
+)
 _LEAST_STD = 1e-6  # of either noise: what is told more precisely leaves nothing to solve with
 _ABOVE_ZERO = {
     "range": ("m", 1.0 / LARGEST, LARGEST),
@@ -108,7 +112,8 @@ def read_table(
             expected = f"the header {separator.join(columns)!r}"
             expected += f", perhaps followed by {', '.join(more)}" * bool(more)
             where, found = f"{path}, line {line}", repr(header[:80])
-            raise refusal(where, found, expected, "name the columns so")
+            missing = "landmark" in columns and "landmark" not in names
+            raise refusal(where, found, expected, _LABEL_IT if missing else "name the columns so")
         columns = tuple(names)
     if not content:
         expected = f"rows of {', '.join(columns)}"
@@ -260,6 +265,7 @@ def _read_row(
             row.append(math.nan)
         if not math.isfinite(row[-1]):
             fix = "correct the field" + " or leave it empty" * (name in optional)
+            fix = _LABEL_IT if name == "landmark" and not field.strip() else fix
             raise refusal(where, f"{name} {field.strip()[:80]!r}", "a finite number", fix)
     return row
 

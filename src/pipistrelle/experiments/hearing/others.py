@@ -201,6 +201,9 @@ def callers_among(
         if place is None:
             raise _no_place(caller.key, one, around)
         callers.append(replace(caller, place=place))
+        world = around.config.scenario.world if first is None else None
+        file = "" if world is None else f"{Path(world) / 'world.toml'}: "
+        _check_apart(callers, around, file + caller.key + ".route" * (one.way == "route"))
     return tuple(callers)
 
 
@@ -346,6 +349,26 @@ _WAYS: dict[str, Callable[..., np.ndarray | None]] = {
 def _distance(one: CallerConfig, setup: ScenarioConfig) -> float:
     """Return how far from the centre a caller is to be [m]."""
     return setup.beacon_distance if one.distance is None else one.distance
+
+
+def _check_apart(callers: Sequence[Caller], around: Around, where: str) -> None:
+    """Refuse the last caller where it is at another's place, or the vehicle's, at a call."""
+    *others, last = callers
+    calls = slice(
+        around.config.scenario.steps_per_frame, None, around.config.scenario.steps_per_frame
+    )
+    for name, place in [("vehicle", around.path), *((one.name, one.place) for one in others)]:
+        offset = np.broadcast_to(np.asarray(last.place) - np.asarray(place), around.path.shape)[
+            calls
+        ]
+        met = np.flatnonzero(~offset.any(axis=1))
+        if met.size:
+            k = calls.start * (1 + int(met[0]))
+            x, y = np.broadcast_to(np.asarray(last.place), around.path.shape)[k].tolist()
+            raise InputError(
+                f"{where}: at {around.time[k]:.15g} s {last.name} is where {name} is, x {x:g} m, "
+                f"y {y:g} m; expected callers apart from each other and from the vehicle; move one"
+            )
 
 
 def _check_speed(key: str, one: CallerConfig, config: Config) -> None:

@@ -7,7 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from pipistrelle.config import Config, Strategy
-from pipistrelle.detection.logs.readers import READERS, Reader, Robot, reader_of
+from pipistrelle.detection.logs.readers import (
+    READERS,
+    Reader,
+    Robot,
+    reader_of,
+    recording_of,
+)
 from pipistrelle.detection.logs.recording import Log
 from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.noise import noise_of, unstated
@@ -78,9 +84,14 @@ def load(
     ('bee', None)
     """
     known = (*readers, *READERS)
+    titles = " or ".join(reader.title for reader in known)
+    if not any(reader.recognises(folder) for reader in known) and folder.exists():
+        what, _, fix = (recording_of(folder) or "").partition("; ")
+        if what:
+            raise refusal(folder, what, titles, f"{fix} (docs/log_format.md)")
     if not folder.is_dir():
-        titles = " or ".join(reader.title for reader in known)
-        raise refusal(folder, "no such folder", titles, "check the path")
+        found = "a file" if folder.is_file() else "no such folder"
+        raise refusal(folder, found, titles, "check the path")
     reader = reader_of(folder, readers)
     whose = _whose(reader, folder, robot, known)
     with_truth = {**TRUTHS, **truths}.get(reader.name, with_files_beside)
