@@ -19,7 +19,9 @@ app = App(
 
 @app.default
 def fuzz(
-    target: Literal["logs", "settings", "studies", "kills", "steps", "ownership", "results"],
+    target: Literal[
+        "logs", "settings", "studies", "kills", "steps", "ownership", "results", "worlds"
+    ],
     /,
     *,
     tries: Annotated[int, Parameter(validator=Number(gte=1))] = 100,

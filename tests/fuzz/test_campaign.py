@@ -16,7 +16,16 @@ TESTS = Path(__file__).resolve().parents[1]
 
 @pytest.mark.parametrize(
     ("target", "tries"),
-    [("logs", 120), ("settings", 100), ("studies", 15), ("kills", 2), ("steps", 400)],
+    [
+        ("logs", 120),
+        ("settings", 100),
+        ("studies", 15),
+        ("kills", 2),
+        ("steps", 400),
+        ("ownership", 60),
+        ("results", 40),
+        ("worlds", 60),
+    ],
 )
 def test_nothing_odd_is_answered_by_a_fault(target, tries):
     command = [sys.executable, "-m", "fuzz", target, "--tries", str(tries), "--seed", "0"]
