@@ -50,33 +50,39 @@ def errors(log, robot, name, robust, gate):
     return [*(row[score] for score in SCORES), row["gated"] / heard]
 
 
-def table(title, logs):
-    """Print a row for each estimator: means over the logs."""
+def cells(logs):
+    """Return two cells for each estimator: means over the logs, with the gate and without."""
+    rows = {}
     for name in FILTERS:
         for robust in ("none", "huber") if name in HUBER else ("none",):
-            cells = []
+            row = rows.setdefault(name + ", Huber" * (robust == "huber"), [])
             for gate in GATES:
                 found = np.array([errors(*log, name, robust, gate) for log in logs])
                 track, mapped, share = found.mean(axis=0)
-                cells.append(f"{track:.3f} / {mapped:.3f}" + f", {share:.1%}" * (gate < 1.0))
-            shown = name + ", Huber" * (robust == "huber")
-            print(f"| {title} | {shown} | {' | '.join(cells)} |", flush=True)
+                row.append(f"{track:.3f} / {mapped:.3f}" + f" ({share:.1%})" * (gate < 1.0))
+    return rows
 
 
-def main(long=28_000):
+def main(long=8_000):
     """Print the table."""
-    print("| log | estimator | gate 0.999 | no gate |\n|---|---|--:|--:|", flush=True)
+    columns = {}
     if data := os.environ.get("PIPISTRELLE_DATA"):
         folder = Path(data) / "mrclam" / "MRCLAM_Dataset6"
-        table("MRCLAM 6", [(folder, robot) for robot in range(1, 6)])
+        columns["MRCLAM 6"] = cells([(folder, robot) for robot in range(1, 6)])
     for title, seeds, steps, share in (
         ("375 poses", range(1, 5), 1500, 0.0),
-        ("375 poses, 2 % wrong", range(1, 5), 1500, 0.02),
+        ("2 % wrong", range(1, 5), 1500, 0.02),
         (f"{long // 4} poses", (1,), long, 0.0),
     ):
         with TemporaryDirectory() as place:
             rooms = {seed: Path(place) / str(seed) for seed in seeds}
-            table(title, [(made_up(rooms[s], s, steps, share), None) for s in seeds])
+            columns[title] = cells([(made_up(rooms[s], s, steps, share), None) for s in seeds])
+    print("| | " + " | ".join(f"{title}: gate | none" for title in columns) + " |")
+    print("|---" + "|--:" * 2 * len(columns) + "|")
+    for name in next(iter(columns.values())):
+        print(
+            f"| {name} | " + " | ".join(c for rows in columns.values() for c in rows[name]) + " |"
+        )
 
 
 if __name__ == "__main__":

@@ -58,6 +58,19 @@ def test_compiling_is_told_of_when_kernels_are_compiled(obey, undrawn, monkeypat
     assert obey("run", *SHORT, *words)[2].count(COMPILING) == said
 
 
+def test_an_estimate_far_from_its_bound_is_told_of_once(obey, undrawn, monkeypatch):
+    words = ("run", *SHORT, "--strategy", "fused", "--filter", "ekf,iekf", "--quiet", "-o")
+    assert "times the bound" not in obey(*words, "one")[2]
+    monkeypatch.setattr(missions, "FAR", 0.0)
+    said = obey(*words, "two")[2].splitlines()
+    runs = summary("two")["runs"]
+    assert [run["filter"] for run in runs] == ["ekf", "iekf"]
+    for line, run in zip(said, runs, strict=True):
+        times = run["position_rmse_m"] / run["position_bound_m"]
+        assert line.startswith(f"pipistrelle: warning: fused {run['filter']}: its position error")
+        assert f"is {times:.1f} times the bound" in line
+
+
 def test_nothing_is_told_of_kernels_that_are_loaded(obey, undrawn):
     obey("run", *SHORT)
     assert COMPILING not in obey("run", *SHORT)[2]

@@ -384,7 +384,7 @@ def test_a_log_without_truth_is_mapped_and_not_scored(obey, log):
     last, moves = track.row(-1, named=True), track.select(pl.col("x_m", "y_m").diff()).drop_nulls()
     spread = np.hypot(last["x_std_m"], last["y_std_m"])
     told = {"rejected by the gate [%]": "0.00", "final position, 1 sigma [m]": f"{spread:.3f}"}
-    told["distance driven [m]"] = f"{np.hypot(*moves.to_numpy().T).sum():.1f}"
+    told["length of the track [m]"] = f"{np.hypot(*moves.to_numpy().T).sum():.1f}"
     assert {title: rows[title][0].strip() for title in told} == told
     _, truth = replay.load(log)
     assert (truth.path, truth.landmarks) == (None, None)

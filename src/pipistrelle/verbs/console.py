@@ -195,7 +195,7 @@ def _without_truth(trial: "TrialResult") -> Iterator[tuple[str, str]]:
     steps = (pose.mean[1:, :2] - pose.mean[:-1, :2]).tolist()
     yield "rejected by the gate [%]", _number(share, 2)
     yield "final position, 1 sigma [m]", _number(None if known else sqrt(max(spread, 0.0)), 3)
-    yield "distance driven [m]", _number(None if known else sum(hypot(*step) for step in steps), 1)
+    yield "length of the track [m]", _number(None if known else sum(hypot(*step) for step in steps), 1)
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -73,18 +73,25 @@ def test_nobody_need_be_told(capfd):
 
 
 def test_what_is_compiled_while_a_filter_runs_is_no_part_of_its_time(monkeypatch):
-    compiled, run_filter = [], trial.run_filter
+    compiled, took, run_filter, run_trial = [], [], trial.run_filter, trial.run_trial
+    trial.run_mission(TINY, ("fused",))  # all else is loaded
 
     def slowed(*given, **named):
         with install_timer("numba:compile", compiled.append):
             numba.njit(lambda x: x * 3)(1.0)
         return run_filter(*given, **named)
 
+    def timed(*given, **named):
+        began = time.perf_counter()
+        result = run_trial(*given, **named)
+        took.append(time.perf_counter() - began)
+        return result
+
     monkeypatch.setattr(trial, "run_filter", slowed)
-    began = time.perf_counter()
+    monkeypatch.setattr(trial, "run_trial", timed)
     (done,) = trial.run_mission(TINY, ("fused",)).trials
-    assert 0.0 < done.wall_s <= time.perf_counter() - began - sum(compiled)
-    assert sum(compiled) > 0.0
+    assert 0.0 < done.wall_s <= took[0] - compiled[0]
+    assert compiled[0] > took[0] / 2.0, "little was compiled: this proves nothing"
 
 
 @pytest.mark.slow
