@@ -192,10 +192,10 @@ def _without_truth(trial: "TrialResult") -> Iterator[tuple[str, str]]:
     known = trial.scores.position_rmse_m is not None
     share = None if known or not rows else 100.0 * trial.scores.gated / rows
     spread = float(pose.covariance[-1, 0, 0] + pose.covariance[-1, 1, 1])
-    steps = (pose.mean[1:, :2] - pose.mean[:-1, :2]).tolist()
+    way = sum(hypot(*step) for step in (pose.mean[1:, :2] - pose.mean[:-1, :2]).tolist())
     yield "rejected by the gate [%]", _number(share, 2)
     yield "final position, 1 sigma [m]", _number(None if known else sqrt(max(spread, 0.0)), 3)
-    yield "length of the track [m]", _number(None if known else sum(hypot(*step) for step in steps), 1)
+    yield "length of the track [m]", _number(None if known else way, 1)
 
 
 def _number(value: float | None, digits: int) -> str:
