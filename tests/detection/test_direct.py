@@ -13,11 +13,11 @@ from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import BLOCK, sampling
 from pipistrelle.config import Config
-from pipistrelle.detection.direct import direct_calls, front_edge, loudest_first
+from pipistrelle.detection.direct import DirectCalls, direct_calls, front_edge, loudest_first
 from pipistrelle.detection.faces import average_faces, timed
 from pipistrelle.detection.matched import filter_blocks
 from pipistrelle.detection.noise import DETOUR_FLOOR, measured
-from pipistrelle.detection.snapshots import detect, detector
+from pipistrelle.detection.snapshots import Detections, detect, detector
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.oracle import label_detections
 from pipistrelle.experiments.hearing.scenario import caller_labels, world_of
@@ -138,6 +138,20 @@ def test_rows_say_how_much_later_than_the_direct_call_they_came_and_how_surely()
     assert np.isnan([told[7], told[51]]).all(), "an own echo, and the direct call itself"
     stds = dict(zip(rows.landmark.tolist(), rows.detour_std, strict=True))
     assert DETOUR_FLOOR < stds[4] < 0.1
+
+
+def test_a_detour_is_as_unsure_as_echo_and_direct_call_together():
+    one, nan = np.ones(1), np.nan
+    direct = DirectCalls(
+        detection=np.array([-1, -1]), pulse=PULSE,
+        delay=np.array([nan, 0.02]), delay_std=np.array([nan, 4e-5]),
+    )  # fmt: skip
+    echo = Detections(
+        face=np.array([0]), caller=np.array([BEACON]), angle=one, bearing=one, power=one,
+        delay=np.array([0.03]), delay_std=np.array([3e-5]), bearing_std=one, direct=direct,
+    )  # fmt: skip
+    heard = average_faces(0.5, echo, np.array([4]), averaging="plain", speed_of_sound=C)
+    np.testing.assert_allclose(heard.detour[:, 0], [C * 0.01, C * 5e-5], rtol=1e-12)
 
 
 def test_what_comes_while_the_direct_call_lasts_has_no_detour():

@@ -285,23 +285,6 @@ def test_one_that_never_strays_and_has_no_speed_is_bounded_as_one_that_stands():
     np.testing.assert_allclose(bound_with_boat(stands, (1e-9, 0.0)), still, rtol=0, atol=1e-9)
 
 
-def test_a_callers_own_row_is_no_detour_over_itself():
-    """Its direct call is what detours are counted from: to the filters that row has none, too."""
-    scans = [
-        replace(
-            with_columns(scan, detour=1.0, detour_std=0.01, caller=1), callers=np.array([-1, 12])
-        )
-        for scan in heard("fused")
-    ]
-    none = [
-        with_columns(scan, detour=np.where(scan.landmark == 12, np.nan, scan.detour))
-        for scan in scans
-    ]
-    assert any((scan.landmark == 12).any() for scan in scans)
-    assert bound_of(scans)[-1, 0, 0] < bound_of(heard("fused"))[-1, 0, 0]
-    np.testing.assert_array_equal(bound_of(scans), bound_of(none))
-
-
 def test_the_more_a_caller_strays_the_less_its_calls_tell():
     route = np.column_stack([np.linspace(3.0, 9.0, STEPS + 1), np.full(STEPS + 1, 4.0)])
     bounds = [path_bound(bound_with_boat(route, (1.0, walk)))[0] for walk in (0.0, 0.3, 3.0, 1e4)]

@@ -145,10 +145,12 @@ def detours(columns: Columns, timings: Timings) -> Detours:
 
     Examples
     --------
+    A caller's own row is no detour over itself.
+
     >>> from dataclasses import replace
     >>> from pipistrelle.detection.scans import make_scan
-    >>> timed = {"detour": np.array([3.0, np.nan]), "detour_std": 0.5}
-    >>> scan = make_scan(0.0, np.array([4, 9]), np.zeros(2), caller=1, **timed)
+    >>> timed = {"detour": np.array([3.0, np.nan, 2.0]), "detour_std": 0.5}
+    >>> scan = make_scan(0.0, np.array([4, 5, 9]), np.zeros(3), caller=1, **timed)
     >>> scan = replace(scan, callers=np.array([-1, 9]))
     >>> of = detours(columns_of(scan), timings_of(scan))
     >>> of.landmark, of.caller, of.variance
