@@ -285,6 +285,20 @@ def test_an_echo_places_its_landmark_where_ray_and_ellipse_cross_with_the_slopes
     np.testing.assert_allclose(C, by_both @ R @ by_both.T, atol=1e-8)
 
 
+@pytest.mark.parametrize(("spread", "gated"), [(0.01, 1), (5.0, 0)])
+def test_the_gate_drops_no_detour_that_counts_for_no_particle(spread, gated):
+    """The caller is known to more than a fifth of how far away it is, or it is not."""
+    slam, belief = known(1e-9, gate=0.999)
+    bearing, detour = np.arctan2(*POINT[::-1]), detour_of(np.zeros(2), POINT, PLACE)
+    belief = slam.update(belief, heard(bearing, detour), drawing())
+    A, member = tie_of(belief, 0, ECHO), belief.member.copy()
+    for slot, more in enumerate((np.eye(2), A @ A.T)):
+        numbers = spread * more[[0, 0, 1], [0, 1, 1]]
+        member[:, slot, 2 * LANES : 5 * LANES] += np.repeat(numbers, LANES)
+    wrong = heard(bearing, detour + 50.0)
+    assert slam.update(replace(belief, member=member), wrong, drawing()).gated == gated
+
+
 ALONG = detour_of(np.zeros(2), np.array([3.0, 0.0]), PLACE)
 
 
