@@ -43,7 +43,7 @@ def attempt(rng: Generator, place: Path, sound: list[dict[str, bytes]]) -> Tried
     words = words if rng.random() < 0.3 else words[:-2]
     ending = command(place, *words, before=undrawn, limit=LIMIT)
     places = [f"world/{file}" for file in {*world, *files}]
-    faults = faults_of(ending, [*places, "world: ", "world ", "scenario.", "callers."])
+    faults = faults_of(ending, [*places, "world: ", "world ", "scenario.", "callers.", "motion."])
     faults += lost(before, contents(place / "world"), "a file of the world")
     status = ending.found if ending.how == "returned" else None
     faults += [f for f in unsound_results(place / "out", status) if "worlds among" not in f]
