@@ -38,13 +38,13 @@ from pipistrelle.experiments.studies.study import run_study
 left = int(sys.argv[3])
 
 def mortal(act, before):
-    def once(path, what):
+    def once(path, what, **how):
         global left
         left -= 1
         if left == 0:
             before(path, what)
             os.kill(os.getpid(), signal.SIGKILL)
-        act(path, what)
+        act(path, what, **how)
     return once
 
 write = files.write_down

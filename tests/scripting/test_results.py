@@ -133,11 +133,16 @@ def test_mistakes_are_told_in_the_words_of_the_call(words, asked, said):
 def test_a_folder_that_is_not_empty_is_refused_in_pythons_words(done, tmp_path):
     (tmp_path / "mine.txt").write_text("kept")
     for ask in (done.save, lambda folder: pipistrelle.run(duration=4.0, output=folder)):
-        with pytest.raises(InputError, match="say overwrite=True") as refused:
+        with pytest.raises(InputError, match="is not empty") as refused:
             ask(tmp_path)
         assert "-o DIR" not in str(refused.value)
         assert "--" not in str(refused.value)
     assert (tmp_path / "mine.txt").read_text() == "kept"
+    place = done.save(tmp_path / "ours")
+    with pytest.raises(
+        InputError, match=r"save\(DIR\), or add overwrite=True to replace the results"
+    ):
+        done.save(place)
 
 
 def test_a_log_is_solved_as_by_the_command_line(capsys):

@@ -301,7 +301,7 @@ def test_a_file_that_is_no_text_is_named(folder):
     refused(folder, "odometry.csv", "UTF-8")
     (folder / "odometry.csv").unlink()
     (folder / "odometry.csv").mkdir()
-    refused(folder, "odometry.csv", "text file")
+    refused(folder, "odometry.csv", "found a folder, expected a file")
 
 
 @pytest.mark.parametrize("name", ["log.toml", "odometry.csv", "measurements.csv"])

@@ -299,7 +299,7 @@ def test_a_strategy_hears_its_part(strategy, beamwidth, landmark, distance):
 
 
 def test_hiding_leaves_all_but_the_range_as_it_was_recorded():
-    said = {name: np.arange(1.0, 6.0) + 10 * i for i, name in enumerate(COLUMNS)}
+    said = {name: np.arange(1, 6) + 10 * i for i, name in enumerate(COLUMNS)}
     scan = with_columns(SCAN, **said | {"bearing": SCAN.bearing, "range": SCAN.range})
     (heard,) = as_heard_by([scan], "fused", 0.5)
     for name in set(COLUMNS) - {"range"}:

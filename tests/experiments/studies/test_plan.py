@@ -370,7 +370,7 @@ def test_a_plan_without_them_is_written_as_ever(tmp_path):
         ("[own.ekf]\nfilter = 3\n", "PLAN: own.ekf.filter: no such setting"),
         (
             "[own.ekf]\nfilter.gate = 2.0\n",
-            "PLAN: own.ekf.filter.gate: found 2.0, expected less than or equal to 1",
+            'PLAN: own.ekf.filter.gate: found 2.0, expected above 0 and up to 1, or "auto"',
         ),
         (
             "[own.ekf]\nfilter.initial_pose_std = [0.1, 0.1]\n",
