@@ -87,6 +87,7 @@ def test_the_mission_is_as_far_above_the_bound_as_its_track_and_the_truth_say(pl
     assert done["score"]["position_floor_m"] < bound, "the floor is a part of what the bound counts"
 
 
+@pytest.mark.filterwarnings("ignore:.*times the bound")  # as is said of it
 def test_the_fused_mission_knows_what_either_strategy_knows(play):
     done = play("04_three_strategies")
     known = done["known"]
@@ -133,6 +134,7 @@ def test_the_log_is_mapped_as_well_as_the_filter_says(play, tmp_path_factory):
     assert control.summary["map_rmse_m"][0] > 3.3 * stated, "bearings the wrong way round must fail"
 
 
+@pytest.mark.filterwarnings("ignore:.*times the bound")  # as is said of it
 def test_dead_reckoning_is_as_far_off_as_what_was_commanded(play):
     done = play("07_your_own_filter")
     config, (x, y, heading) = Config(), Config().scenario.start

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipistrelle.detection.scans import BEARING, DETOUR, RANGE, with_columns
+from pipistrelle.detection.scans import BEARING, DETOUR, DETOUR_STD, RANGE, with_columns
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.fastslam.block import LANES
 from pipistrelle.estimation.measurement import detour_of
@@ -195,7 +195,7 @@ def test_detours_of_whom_nobody_knows_change_nothing():
 def doubled(scan):
     """Return the scan with a further detour of each landmark, by a caller of whom nobody knows."""
     numbers = scan.numbers.copy()
-    numbers[[BEARING, RANGE]], numbers[DETOUR] = np.nan, 7.0
+    numbers[[BEARING, RANGE]], numbers[DETOUR], numbers[DETOUR_STD] = np.nan, 7.0, 0.4
     return replace(
         scan,
         landmark=np.tile(scan.landmark, 2),
