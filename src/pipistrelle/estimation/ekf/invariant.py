@@ -49,7 +49,7 @@ from pipistrelle.estimation.ekf.filter import (
     with_velocities,
 )
 from pipistrelle.estimation.ekf.gaussian import INVARIANT
-from pipistrelle.estimation.ekf.roaming import is_velocity, roam, roams
+from pipistrelle.estimation.ekf.roaming import roam, roams
 from pipistrelle.estimation.motion import Motion, MotionNumbers, motion_numbers, propagate_pose
 from pipistrelle.estimation.rays import sensing_of
 from pipistrelle.jit import kernel, no_alloc
@@ -80,15 +80,14 @@ class InvariantBelief(EkfBelief):
         return Gaussian(mean=placed, covariance=covariance, invariant=True)
 
     def rows(self, kept: Bool[np.ndarray, " h"]) -> Landmarks:
-        """Return some members by the linear error, those of a landmark together."""
+        """Return some members that are points by the linear error, those of a landmark together."""
         at = numbers_of(kept)
         mean = self.mean[at].reshape(-1, 2)
         turned = (mean @ np.array([[0.0, 1.0], [-1.0, 0.0]])).ravel()  # (-y, x): J l
         lever = np.outer(turned, self.covariance[2, at])
         square = np.outer(turned, turned) * self.covariance[2, 2]
         linear = self.covariance[np.ix_(at, at)] + (lever + lever.T) + square
-        placed = np.where(is_velocity(self.landmark[kept])[:, np.newaxis], mean, mean + self.origin)
-        return map_rows(self.landmark[kept], self.weight[kept], placed, linear)
+        return map_rows(self.landmark[kept], self.weight[kept], mean + self.origin, linear)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
