@@ -22,7 +22,9 @@ RELINEARIZE = 0.1
 """Change of a variable [m, rad] beyond which iSAM2 linearises anew what hangs on it."""
 ANEW = 5
 """Times that all is linearised anew where bearings enter that had waited: many of them enter at
-once, from poses that they correct, and a graph that was linearised before may never recover."""
+once, from poses that they correct, and a graph that was linearised before may never recover.
+Without it logs of bearings of 0.003 rad are lost (`test_recorded`); in twelve worlds heard by sound
+it changes nothing."""
 CONVERGED = 1e-7
 """Change of the squared error, and its share of it, under which the optimum is reached."""
 
