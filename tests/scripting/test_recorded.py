@@ -31,7 +31,8 @@ def test_units_are_asked_about_by_the_share_of_what_a_strategy_heard(gated, aske
     lines = afterwards(
         log_of(distance=np.ones(10)), [trial_of(heard, gated)], Path("log"), Config()
     )
-    assert [f"{gated} of 5 measurements do not fit" in line for line in lines] == [True] * asked
+    assert any(f"{gated} of 5 measurements do not fit" in line for line in lines) == asked
+    assert len(lines) == 1, "else it is said that the gate rejects more than its share"
 
 
 @pytest.mark.parametrize(("short", "asked"), [(8, False), (9, True)])
