@@ -14,17 +14,8 @@ from fuzz.mutations import one_of
 from fuzz.running import command, undrawn
 from pipistrelle.own_files import KINDS, SUMS
 from reference.command_line import SHORT
+from reference.studies import TINY
 
-PLAN = """\
-format = 1
-name = "tiny"
-iterations = 1
-strategies = ["fused"]
-filters = ["ekf"]
-[config.scenario]
-steps = 8
-landmarks = 5
-"""
 RUN = ("run", *SHORT, "--strategy", "fused", "--quiet")
 DOORS: dict[str, tuple[str, ...]] = {
     "results": (*RUN, "-o", "{}"),
@@ -55,7 +46,7 @@ def prepare(base: Path) -> Path:
     """Have each command write once, so that there is something to replace."""
     sound = base / "sound"
     sound.mkdir()
-    (sound / "tiny.toml").write_text(PLAN)
+    (sound / "tiny.toml").write_text(TINY)
     (sound / "outside").mkdir()
     for name in ("secret.txt", "deep.txt"):
         (sound / "outside" / name).write_text(f"precious {name}")

@@ -21,6 +21,17 @@ landmarks = 12
 "emitter.radius" = [0.0025, 0.025]
 """
 """Three worlds of ten frames, ten cases in each."""
+TINY = """\
+format = 1
+name = "tiny"
+iterations = 1
+strategies = ["fused"]
+filters = ["ekf"]
+[config.scenario]
+steps = 8
+landmarks = 5
+"""
+"""One world of two frames, one case in it."""
 TIMINGS = ("wall_s", "cpu_s")
 
 

@@ -15,18 +15,9 @@ from pipistrelle.config import InputError
 from pipistrelle.verbs.command_line import app
 from reference.command_line import SHORT
 from reference.results import loop, mission_folder
+from reference.studies import TINY
 
 LOG = Path(__file__).parents[1] / "data" / "unicycle_log"
-TINY = """\
-format = 1
-name = "tiny"
-iterations = 1
-strategies = ["fused"]
-filters = ["ekf"]
-[config.scenario]
-steps = 8
-landmarks = 5
-"""
 READ = {"--config", "--world", "--log", "LOG", "FOLDER", "--folder", "FOLDERS"}
 """What names a place that is only read."""
 RUN = ("run", *SHORT, "--strategy", "fused", "-o")
