@@ -273,3 +273,42 @@ def test_a_class_that_nobody_else_finds_is_refused():
             pipistrelle.run(**SHORT, filters=wrong)
     with pytest.raises(InputError, match="lacks init, predict, update"):
         pipistrelle.run(**SHORT, filters=int)
+
+
+CALLERS = ({"name": "bee", "frequency": 25000.0, "course": "circle"},)
+
+
+@pytest.mark.parametrize("kind", ["a log", "a caller that moves", "a world of one's own"])
+def test_what_is_loaded_is_saved_as_it_was_kept_first(kind, tmp_path):
+    if kind == "a log":
+        pipistrelle.slam(LOG, beamwidth=90.0, output="one")
+    elif kind == "a caller that moves":
+        timed = {"listening": {"timing": True}, "callers": CALLERS}
+        pipistrelle.run(**SHORT, strategies="fused", **timed, output="one")
+    else:
+        Path("posts").mkdir()
+        Path("posts/landmarks.csv").write_text("landmark,x,y\n1,2.5,0\n2,-1,4\n")
+        pipistrelle.run(duration=2.0, strategies="fused", world="posts", output="one")
+    pipistrelle.load("one").save("two")
+    one, two = (contents(name) for name in ("one", "two"))
+    assert one.keys() == two.keys()
+    alike = one.keys() - {"README.md", "SHA256SUMS", "summary.json"}
+    alike -= {name for name in alike if name.startswith("mission.")}
+    assert {name for name in alike if one[name] != two[name]} == set()
+    first, second = (without_times(files["summary.json"]) for files in (one, two))
+    assert first == second
+    assert ("log" in first) == (kind == "a log")
+
+
+def contents(folder):
+    """Every file below a folder."""
+    paths = [path for path in Path(folder).rglob("*") if path.is_file()]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
+
+
+def without_times(text):
+    """A summary, but for the time that estimates took."""
+    summary = json.loads(text)
+    for run in summary["runs"]:
+        del run["wall_s"]
+    return summary

@@ -3,11 +3,12 @@
 import warnings
 from pathlib import Path
 
+from pipistrelle.experiments.hearing.world_folder import read_world
 from pipistrelle.experiments.results.reading import read_summary
 from pipistrelle.experiments.runs.again import again
 from pipistrelle.experiments.runs.trial import Watch
 from pipistrelle.scripting.asking import Filters, named_filters
-from pipistrelle.scripting.missions import Done
+from pipistrelle.scripting.missions import Done, done_of, done_of_log
 from pipistrelle.scripting.results import Results
 from pipistrelle.scripting.studies import StudyResults
 
@@ -46,20 +47,18 @@ def load(folder: Path | str, /, *, filters: Filters = ()) -> Results | StudyResu
     place = Path(folder)
     if (place / "plan.toml").is_file():
         return StudyResults(place)
-    read_summary(place)
+    summary = read_summary(place)
     trusted = named_filters(filters) if filters else ()
 
     def redo(watch: Watch | None) -> Done:
         found = again(place, trusted=trusted, watch=watch)
         if found.difference:
             warnings.warn(found.difference, stacklevel=3)
-        return Done(
-            config=found.config,
-            seed=found.config.seed,
-            trials=found.trials,
-            truth=found.truth,
-            callers=found.callers,
-            beamwidth=found.beamwidth,
-        )
+        if found.log is not None and summary.log is not None:
+            entry = summary.log.model_dump()
+            return done_of_log(found.log, found.truth, found.config, found.trials, entry)
+        assert found.mission is not None
+        world = found.config.scenario.world
+        return done_of(found.mission, None if world is None else read_world(Path(world)))
 
     return Results(redo, folder=place)

@@ -1,10 +1,10 @@
 """A mission as it was asked for: simulated or recorded, then drawn, kept, looked at again."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import BaseModel
@@ -114,8 +114,14 @@ def simulated(
     """
     looking = {"progress": progress, "watch": watch}
     mission = run_mission(config, strategies, filters, world=world or ANY, **looking)
+    return done_of(mission, world), mission
+
+
+def done_of(mission: Mission, world: World | None) -> Done:
+    """Return a simulated mission with all that its folder is to hold, its own world too."""
+    config = mission.config
     kept, files = (config, {}) if world is None else kept_world(config, world)
-    done = Done(
+    return Done(
         config=kept,
         seed=config.seed,
         trials=mission.trials,
@@ -127,7 +133,6 @@ def simulated(
         beside=files,
         said=(*warnings_of(config, mission.scenario.callers), *_far_off(mission.trials)),
     )
-    return done, mission
 
 
 def _far_off(trials: Sequence[TrialResult]) -> list[str]:
@@ -186,17 +191,29 @@ def solved(
     recorded, truth = log
     looking = {"progress": progress, "watch": watch}
     trials = replay(recorded, truth, strategies, filters, beamwidth, config, **looking)
+    entry = log_entry(place, robot, beamwidth)
+    said = tuple(afterwards(recorded, trials, place, config))
+    return replace(done_of_log(recorded, truth, config, trials, entry), said=said)
+
+
+def done_of_log(
+    recorded: Log,
+    truth: Truth,
+    config: Config,
+    trials: Sequence[TrialResult],
+    entry: Mapping[str, Any],
+) -> Done:
+    """Return a log that was solved with all that its folder is to hold; `log_entry` says which."""
     return Done(
         config=SlamConfig(**{name: getattr(config, name) for name in SlamConfig.model_fields}),
         seed=config.seed,
-        trials=trials,
+        trials=tuple(trials),
         truth=truth,
         names=tuple(caller.name for caller in recorded.callers),
         moving=moving_of(recorded),
-        beamwidth=beamwidth,
+        beamwidth=entry["beamwidth_rad"],
         ignored_rows=recorded.ignored_rows,
-        log=log_entry(place, robot, beamwidth),
-        said=tuple(afterwards(recorded, trials, place, config)),
+        log=entry,
     )
 
 
