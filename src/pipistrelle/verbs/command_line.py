@@ -6,7 +6,13 @@ from inspect import Parameter, signature
 from itertools import pairwise, zip_longest
 from pathlib import Path
 
-from cyclopts import App, CycloptsError, MissingArgumentError, UnusedCliTokensError
+from cyclopts import (
+    App,
+    CycloptsError,
+    MissingArgumentError,
+    UnknownOptionError,
+    UnusedCliTokensError,
+)
 
 from pipistrelle.detection.logs.readers import recording_of
 from pipistrelle.verbs.streams import flush_results, say
@@ -96,6 +102,7 @@ def obey(words: Sequence[str], heard: Sequence[int] = ()) -> int:
         Exit status.
     """
     try:
+        _refuse_sections(words)
         status = app(_completed(words)) or 0
         flush_results()
     except SystemExit:  # help, whose reader has left
@@ -108,6 +115,31 @@ def obey(words: Sequence[str], heard: Sequence[int] = ()) -> int:
             say(f"pipistrelle: error: {line}")
         return 2
     return status
+
+
+def _refuse_sections(words: Sequence[str]) -> None:
+    """Refuse a value for a whole section of settings: it would be that of its first setting."""
+    names = [word.partition("=")[0] for word in words if word.startswith("--")]
+    if not names or {"--help", "--version"} & {*names}:  # which load no settings
+        return
+    from pipistrelle.config import InputError
+
+    sections = _sections()
+    for name in names:
+        if name[2:] in sections:
+            first = next(iter(sections[name[2:]]))
+            raise InputError(f"{name}: is a section of settings; name one of it, as {name}.{first}")
+
+
+def _sections() -> dict[str, list[str]]:
+    """Return the settings of each section; --filter is an option, too."""
+    from pipistrelle.settings import known_settings
+
+    found: dict[str, list[str]] = {}
+    for section, *rest in known_settings():
+        if rest and section != "filter":
+            found.setdefault(section, []).append(rest[0].replace("_", "-"))
+    return found
 
 
 def _completed(words: Sequence[str]) -> list[str]:
@@ -131,6 +163,8 @@ def _explained(error: Exception, words: Sequence[str]) -> str | None:
         return f"{error.filename}: {error.strerror}"
     if isinstance(error, OSError) and error.errno == ENOSPC:  # a full disk behind our output
         return f"the output could not be written: {error.strerror}"
+    if isinstance(error, UnknownOptionError):
+        return _unknown(error)
     if isinstance(error, UnusedCliTokensError) and error.unused_tokens and error.target:
         return _too_many(error, error.unused_tokens[0], words)
     if isinstance(error, MissingArgumentError) and error.keyword and error.argument:
@@ -139,6 +173,18 @@ def _explained(error: Exception, words: Sequence[str]) -> str | None:
             found = len(error.tokens_so_far) % expected
             return f"{error.keyword}: found {found} values, expected {expected}"
     return str(error) if isinstance(error, (CycloptsError, InputError)) else None
+
+
+def _unknown(error: UnknownOptionError) -> str:
+    """Name the option that was probably meant: spelt alike, or ending in the same part."""
+    from pipistrelle.refusals import meant
+
+    word = (error.token.keyword or error.token.value).partition("=")[0]
+    names = {name[2:] for argument in error.argument_collection for name in argument.names}
+    known, wanted = sorted(names - _sections().keys()), word.lstrip("-").replace("_", "-")
+    same = [name for name in known if name.partition(".")[2] == wanted]
+    near = same[0] if same else meant(wanted, known)
+    return f"Unknown option: {word}. " + (f"Did you mean --{near}?" if near else "See --help.")
 
 
 def _too_many(error: UnusedCliTokensError, word: str, words: Sequence[str]) -> str:
