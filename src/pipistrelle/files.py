@@ -28,13 +28,13 @@ def check_ordinary(path: Path) -> None:
     --------
     >>> check_ordinary(Path("/dev/null"))
     Traceback (most recent call last):
-    pipistrelle.config.InputError: /dev/null: found a pipe or a device, expected a file; remove what
-    stands in its place, or copy it into a file
+    pipistrelle.config.InputError: /dev/null: found a pipe or a device, expected a file; put what it
+    holds into a file
     """
     if path.exists() and not path.is_file():
-        found = "a folder" if path.is_dir() else "a pipe or a device"
-        fix = "remove what stands in its place, or copy it into a file"
-        raise refusal(path, found, "a file", fix)
+        if path.is_dir():
+            raise refusal(path, "a folder", "a file", "name a file, or move the folder away")
+        raise refusal(path, "a pipe or a device", "a file", "put what it holds into a file")
 
 
 def read_file(path: Path) -> bytes:

@@ -29,6 +29,15 @@ def test_samples_are_correlated_with_the_call_of_each_tone():
         np.testing.assert_allclose(matched[lag], heard / (2.0 * np.sqrt(length)), atol=1e-12)
 
 
+def test_real_samples_are_heard_as_complex_ones():
+    settled = {"tones": np.array([35e3]), "rate": 200e3, "length": 40, "noise_std": 1.0}
+    samples = drawn(300, 2, 3).real
+    expected = filter_samples(samples.astype(complex), **settled)
+    np.testing.assert_allclose(filter_samples(samples, **settled), expected, atol=1e-12)
+    single = filter_samples(samples.astype(np.float32), **settled)
+    np.testing.assert_allclose(single, expected, atol=1e-4)
+
+
 def test_record_of_a_single_call_has_one_lag_and_a_shorter_one_none():
     settled = {"pulse": 14, "block": 40, "noise_std": 1.0}
     assert filter_blocks(drawn(14, 4, 2, 10), **settled).shape[0] == 1

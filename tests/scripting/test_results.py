@@ -178,6 +178,14 @@ def test_loaded_results_are_done_again_where_they_must_be_drawn(done):
         pipistrelle.load("one").figure()
 
 
+def test_what_is_no_path_is_refused_in_words(tmp_path):
+    for ask in (pipistrelle.load, pipistrelle.slam):
+        with pytest.raises(InputError, match="found 7, expected the path of a folder"):
+            ask(7)
+    with pytest.raises(InputError, match="a world of your own is named by world="):
+        pipistrelle.run(str(tmp_path))
+
+
 def test_what_is_no_folder_of_ours_is_refused(tmp_path):
     for name in ("nowhere", "."):
         with pytest.raises(InputError):

@@ -163,7 +163,8 @@ def test_code_that_a_folder_names_is_not_run_unless_the_user_names_it(folder, re
     with pytest.raises(InputError, match="whose code is not Pipistrelle's"):
         pipistrelle.load(".").figure()
     assert not Path("ran").exists()
-    assert "lacks init, predict, update" in refused("view", ".", "--filter", "evil:X")
+    for name in ("evil:X", "ekf,evil:X"):
+        assert "lacks init, predict, update" in refused("view", ".", "--filter", name)
     assert Path("ran").exists()
 
 

@@ -61,6 +61,7 @@ def filter_samples(
     Parameters
     ----------
     samples : (samples, faces, elements) complex
+        Real ones, as a recording has them, are taken as such.
     tones : (c) [Hz]
     rate : [Hz]
     length : int
@@ -80,7 +81,7 @@ def filter_samples(
     replica = np.exp(-2j * np.pi * tones * n / rate) / (noise_std * math.sqrt(length))
     return oaconvolve(
         samples[:, :, None, :],
-        replica.astype(samples.dtype)[:, None, :, None],
+        replica.astype(np.result_type(samples, np.complex64))[:, None, :, None],
         mode="valid",
         axes=0,
     )

@@ -69,11 +69,21 @@ def base_layer(base: Base) -> Layer:
     if not isinstance(base, (str, Path)):
         expected = "a Config, a mapping or the path of a TOML file"
         raise refusal("config", shown(base), expected, "give settings by keyword")
+    if Path(base).is_dir():
+        fix = "a world of your own is named by world="
+        raise refusal(base, "a folder", "a TOML file of settings", fix)
     try:
         return from_file(Path(base))
     except OSError as error:
         found = (error.strerror or "nothing").lower()
         raise refusal(base, found, "a TOML file of settings", "check the path") from None
+
+
+def folder_named(place: object, name: str) -> Path:
+    """Return the folder that an argument of some name gives; refuse what is no path."""
+    if not isinstance(place, (str, Path)):
+        raise refusal(name, shown(place), "the path of a folder", "name one")
+    return Path(place)
 
 
 def short_names(short: Layer, flags: Layer) -> Layer:

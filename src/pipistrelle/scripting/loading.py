@@ -7,7 +7,7 @@ from pipistrelle.experiments.hearing.world_folder import read_world
 from pipistrelle.experiments.results.reading import read_summary
 from pipistrelle.experiments.runs.again import again
 from pipistrelle.experiments.runs.trial import Watch
-from pipistrelle.scripting.asking import Filters, named_filters
+from pipistrelle.scripting.asking import Filters, folder_named, named_filters
 from pipistrelle.scripting.missions import Done, done_of, done_of_log
 from pipistrelle.scripting.results import Results
 from pipistrelle.scripting.studies import StudyResults
@@ -44,7 +44,7 @@ def load(folder: Path | str, /, *, filters: Filters = ()) -> Results | StudyResu
     ...     same.tracks.equals(done.tracks)
     True
     """
-    place = Path(folder)
+    place = folder_named(folder, "load")
     if (place / "plan.toml").is_file():
         return StudyResults(place)
     summary = read_summary(place)

@@ -25,6 +25,7 @@ from pipistrelle.scripting.asking import (
     Base,
     Filters,
     base_layer,
+    folder_named,
     mission_settings,
     named_filters,
     named_strategies,
@@ -353,7 +354,7 @@ def slam(
     InputError
         What is wrong in the log, by line or key; as `run`.
     """
-    place, flags = Path(log), from_keywords(settings, slam.__kwdefaults__ or ())
+    place, flags = folder_named(log, "log"), from_keywords(settings, slam.__kwdefaults__ or ())
     check_open(flags)
     short = short_names({("filter", "gate"): Given(gate, "gate")}, flags)
     if beamwidth is not None and not 0 < number(Given(beamwidth, "beamwidth")) <= 360:

@@ -23,7 +23,7 @@ def report(
     """Answer a study's question on one page, with its figures; judge the paper's claims by it."""
     from pipistrelle.evaluation.comparison import INTERVALS
     from pipistrelle.report.page.overview import not_the_papers_line
-    from pipistrelle.report.page.page import write_report
+    from pipistrelle.report.page.page import FEW, write_report
     from pipistrelle.report.reading import read_study
     from pipistrelle.verbs.streams import put, say
 
@@ -41,6 +41,9 @@ def report(
             for sentence in told["answer"]:
                 put(sentence)
             put(INTERVALS)
+            if (count := told["worlds_done"]) < FEW:
+                worlds = "1 world" if count == 1 else f"{count} worlds"
+                put(f"This is of {worlds}: so few may show what others would not.")
         elif line := not_the_papers_line(told["not_the_papers"]):
             put(line)
         for claim in told["claims"]:

@@ -102,7 +102,8 @@ def _play_again(
     delivery.get_ready(OutputOptions(quiet=quiet))
     watch = MissionRecorder(rest=REST)
     with progress(quiet) as show:
-        done = again(folder, log=log, trusted=trusted, progress=show, watch=watch)
+        named = [one for name in trusted for one in name.split(",")]
+        done = again(folder, log=log, trusted=named, progress=show, watch=watch)
     if done.difference:
         warn(f"{done.difference}; what is shown is found now")
     return playback(done, watch.snapshots)

@@ -203,8 +203,7 @@ def test_a_device_in_place_of_a_file_is_refused_by_name(folders, name):
     Path("run", name).unlink()
     Path("run", name).symlink_to("/dev/null")  # a pipe would be waited for without an end
     assert refused("run") == (
-        f"run/{name}: found a pipe or a device, expected a file; remove what stands in its place, "
-        "or copy it into a file"
+        f"run/{name}: found a pipe or a device, expected a file; put what it holds into a file"
     )
 
 

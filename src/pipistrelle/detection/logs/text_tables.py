@@ -112,7 +112,7 @@ def read_table(
             expected = f"the header {separator.join(columns)!r}"
             expected += f", perhaps followed by {', '.join(more)}" * bool(more)
             where, found = f"{path}, line {line}", repr(header[:80])
-            missing = "landmark" in columns and "landmark" not in names
+            missing = "landmark" not in names and "bearing" in {*columns} & {*names}
             raise refusal(where, found, expected, _LABEL_IT if missing else "name the columns so")
         columns = tuple(names)
     if not content:
