@@ -18,7 +18,6 @@ from pipistrelle.report.effects.wording import (
     elsewhere,
     in_between,
     size,
-    subject,
     the,
 )
 from pipistrelle.report.numbers import listed
@@ -97,11 +96,9 @@ def _gains(study: Study, effects: Sequence[Effect]) -> list[str]:
         listens = (contrast.before, contrast.after) == ("active", "fused")
         if not listens or effect.measure is not FIRST or effect.finding.n < 2:
             continue
-        whose = f"{filter_titles(study)[contrast.filter]}'s {FIRST.title}"
-        what = size(effect.finding, FIRST.unit, signed=True)
         cases = sorted(zip(effect.apart, contrast.names, strict=False), key=lambda one: one[0].mean)
         each = [(at, size(found, FIRST.unit, signed=True)) for found, at in cases]
-        words = [f"{subject(study, effect)} changes {whose} by {what}"]
+        words = clauses(study, [effect], {})
         if len(each) > FEW_CASES:
             least, most = each[0], each[-1]
             words += [
@@ -109,7 +106,7 @@ def _gains(study: Study, effects: Sequence[Effect]) -> list[str]:
                 f"the most is {most[1]} at {most[0]}",
             ]
         else:
-            words += [f"at {at} it does by {change}" for at, change in each]
+            words += [f"at {at} it changes by {change}" for at, change in each]
         said.append(" ".join(map(_sentenced, words)))
     return said
 
