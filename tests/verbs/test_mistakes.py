@@ -54,7 +54,7 @@ import pytest
         ("slam x --robust huber", "Unknown option: --robust. Did you mean --filter.robust?"),
         ("run --assumed 3", "--assumed: is a section of settings; name one of it, as --assumed."),
         ("run --config none.toml", "none.toml: found no such file"),
-        ("run --config .", ".: found a folder, expected a file"),
+        ("run --config .", "--config: found '.', expected the path of a TOML file"),
         ("run --landmarks 9999", "scenario.landmarks: found 9999"),
         ("run --animate=avi", 'Invalid value "avi" for --animate'),
         ("run --animate avi", "--animate: found 'avi', expected gif or mp4"),

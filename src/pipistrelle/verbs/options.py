@@ -249,6 +249,8 @@ def layers(config: Path | None, settings: SettingFlags | None) -> Layer:
     >>> layers(None, {"seed": 3})["seed",].value
     3
     """
+    if config is not None and not config.name:
+        raise InputError(f"--config: found {str(config)!r}, expected the path of a TOML file")
     file = {} if config is None else from_file(config)
     return file | from_environment(os.environ) | from_flags(settings or {})
 
