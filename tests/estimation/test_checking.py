@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -194,3 +195,22 @@ def test_fastslam_asks_for_the_generator_by_which_it_draws():
     slam = entry("fastslam").build(Config(), BICYCLE)
     with pytest.raises(InputError, match="found no generator"):
         slam.update(slam.init(START), replace(SCAN), None)
+
+
+@pytest.mark.parametrize(
+    "flaw",
+    [
+        {"mean": np.array([[np.nan, 1.0], [2.0, 3.0]])},
+        {"mean": np.zeros(2)},
+        {"covariance": -np.tile(np.eye(2), (2, 1, 1))},
+        {"covariance": np.eye(2)},
+        {"landmark": np.array([3, -1])},
+        {"landmark": np.array([3, 3])},
+        {"landmark": np.array([3.5, 4.0])},
+    ],
+)
+def test_landmarks_known_beforehand_that_are_none_are_refused(refused, flaw):
+    sound = {"landmark": np.array([3, 8]), "mean": np.ones((2, 2)), "weight": np.ones(2),
+             "covariance": np.tile(np.eye(2), (2, 1, 1))}  # fmt: skip
+    known = SimpleNamespace(**sound | flaw)
+    refused(lambda slam, belief, rng: slam.knowing(belief, known), "knowing: found")

@@ -25,7 +25,7 @@ from pipistrelle.detection.scans import (
     UNLABELLED,
     Scan,
 )
-from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.motion import MOVED, Motion
 from pipistrelle.jit import Flag, Whole, kernel
 from pipistrelle.refusals import shown
@@ -74,6 +74,35 @@ def usable_pose(pose: Gaussian) -> Gaussian:
             "more and correlations between -1 and 1"
         )
     return Gaussian(mean=mean, covariance=covariance)
+
+
+def usable_known(known: Landmarks) -> Landmarks:
+    """Return landmarks known beforehand as filters take them; refuse what are none."""
+    label, mean = _converted(known.landmark, INTEGER), _converted(known.mean, FLOAT)
+    covariance = _converted(known.covariance, FLOAT)
+    n = -1 if label is None or label.ndim != 1 else label.size
+    if (
+        label is None
+        or mean is None
+        or covariance is None
+        or (mean.shape, covariance.shape) != ((n, 2), (n, 2, 2))
+    ):
+        given = (known.landmark, known.mean, known.covariance)
+        raise InputError(
+            f"knowing: found {', '.join(map(_shape_of, given))}; expected n labels, whole numbers, "
+            "and places (n, 2) with their covariances (n, 2, 2)"
+        )
+    xx, xy, yx, yy = covariance.reshape(n, 4).T
+    good = (label >= 0) & (np.abs(mean).max(axis=1, initial=0.0) <= LARGEST)
+    good &= (xx >= 0.0) & (yy >= 0.0) & (xx + yy <= LARGEST**2) & np.isclose(xy, yx)
+    good &= xy * xy <= xx * yy * (1.0 + INDEFINITE)
+    if not good.all() or np.unique(label).size < n:
+        raise InputError(
+            f"knowing: found the landmarks {label[~good].tolist() or label.tolist()}; expected "
+            f"labels from 0 on, each once, places up to {LARGEST:g} m, and covariances that are "
+            "symmetric and positive semidefinite"
+        )
+    return replace(known, landmark=label, mean=mean, covariance=covariance)
 
 
 def usable_controls(

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
-from pipistrelle.estimation.checking import usable_controls, usable_pose, usable_scan
+from pipistrelle.estimation.checking import usable_controls, usable_known, usable_pose, usable_scan
 from pipistrelle.estimation.ekf.correction import corrected
 from pipistrelle.estimation.ekf.crossing import WAITS
 from pipistrelle.estimation.ekf.gaussian import LINEAR, propagate
@@ -275,6 +275,7 @@ class EkfSlam:
         >>> slam.knowing(belief, post).landmarks().mean
         array([[3., 4.]])
         """
+        known = usable_known(known)
         return with_points(belief, known, np.zeros((2 * known.landmark.size, 3)))
 
     def predict(

@@ -39,7 +39,7 @@ from jaxtyping import Bool, Float
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
-from pipistrelle.estimation.checking import usable_controls, usable_pose, usable_scan
+from pipistrelle.estimation.checking import usable_controls, usable_known, usable_pose, usable_scan
 from pipistrelle.estimation.ekf.filter import (
     EkfBelief,
     map_rows,
@@ -160,6 +160,7 @@ class InvariantEkfSlam:
         -------
         InvariantBelief
         """
+        known = usable_known(known)
         mean = known.mean - belief.origin
         by_pose = np.zeros((mean.size, 3))
         by_pose[:, 2] = -(mean @ np.array([[0.0, 1.0], [-1.0, 0.0]])).ravel()  # (y, -x)

@@ -79,7 +79,7 @@ from jaxtyping import Float, Int
 from pipistrelle.config import FastSlamConfig, InputError, RayConfig
 from pipistrelle.detection.scans import Scan, rows_of, with_columns
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
-from pipistrelle.estimation.checking import usable_controls, usable_pose, usable_scan
+from pipistrelle.estimation.checking import usable_controls, usable_known, usable_pose, usable_scan
 from pipistrelle.estimation.fastslam.block import LANES, MEMBER
 from pipistrelle.estimation.fastslam.block_ties import TIE
 from pipistrelle.estimation.fastslam.particles import (
@@ -238,6 +238,7 @@ class FastSlam:
         -------
         FastSlamBelief
         """
+        known = usable_known(known)
         blocks, n = len(belief.poses), known.landmark.size
         spread = known.covariance.reshape(n, 4)[:, [0, 1, 3]]
         rows = np.column_stack([known.mean, spread, np.zeros(n)])

@@ -32,7 +32,7 @@ from jaxtyping import Float
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan, rows_of
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
-from pipistrelle.estimation.checking import usable_controls, usable_pose, usable_scan
+from pipistrelle.estimation.checking import usable_controls, usable_known, usable_pose, usable_scan
 from pipistrelle.estimation.measurement import BELIEVED
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.smoother.belief import (
@@ -132,6 +132,7 @@ class Smoother:
         -------
         SmootherBelief
         """
+        known = usable_known(known)
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values(belief.link.values)
         factors.push_back(belief.link.factors)
         for label, place, spread in zip(
