@@ -37,7 +37,7 @@ _LINE = re.compile(r"([0-9a-f]{64}) [ *](.+)")
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """What we write into a folder; one kind never replaces another."""
+    """A kind of output folder, with the names of its files; one kind never replaces another."""
 
     title: str
     names: tuple[str, ...]
@@ -200,7 +200,7 @@ def drawn_files(draw: Callable[[Path], None], under: str = "") -> dict[str, byte
 
 
 class OwnFiles:
-    """What we wrote into a folder, by its list of sums; and the way to write more.
+    """The files that we wrote into a folder, known by its list of sums; it writes more of them.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a filter is handed, checked at its door: a first pose, control steps, scans.
+"""Checks of a filter's inputs: a first pose, known landmarks, control steps, scans.
 
 A kernel reads beyond an array that is shorter than it expects, and a NaN spreads through a belief
 without a word. So each call looks once at shapes, types and numbers. What is sound is handed on as
@@ -314,7 +314,7 @@ def _are_steps(
 
 @kernel
 def is_covariance(entries: Float[np.ndarray, "6"]) -> Flag:
-    """Whether xx, xy, xh, yy, yh and hh are a covariance, but for rounding."""
+    """Whether xx, xy, xh, yy, yh and hh are a covariance, up to rounding."""
     xx, yy, hh = entries[0], entries[3], entries[5]
     if not (0.0 <= xx <= LARGEST**2 and 0.0 <= yy <= LARGEST**2 and 0.0 <= hh <= LARGEST**2):
         return False

@@ -72,11 +72,7 @@ def base_layer(base: Base) -> Layer:
     if Path(base).is_dir():
         fix = "a world of your own is named by world="
         raise refusal(base, "a folder", "a TOML file of settings", fix)
-    try:
-        return from_file(Path(base))
-    except OSError as error:
-        found = (error.strerror or "nothing").lower()
-        raise refusal(base, found, "a TOML file of settings", "check the path") from None
+    return from_file(Path(base))
 
 
 def folder_named(place: object, name: str) -> Path:

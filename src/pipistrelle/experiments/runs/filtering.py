@@ -113,7 +113,7 @@ def run_filter(
 
 
 def _named(scan: Scan, belief: B, associate: Associate, noise: Noise) -> Scan:
-    """Give a scan the labels of an association, and its rows what nobody says of their noise."""
+    """Return a scan with the labels of an association, and with the noise of merged rows."""
     named = labelled(scan, associate(belief, scan))
     return named if named is scan else noise(named)
 
