@@ -225,9 +225,7 @@ def test_text_and_lists_in_the_environment_are_spelled_as_in_a_file():
             }
         )
     )
-    assert config.rays == RayConfig(
-        weights="aggregated", partial="heaviest", range_bounds=(1, 15.5)
-    )
+    assert config.rays == RayConfig(weights="aggregated", ranged="heaviest", range_bounds=(1, 15.5))
     assert config.seed == 11
 
 

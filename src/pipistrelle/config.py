@@ -396,8 +396,8 @@ class RayConfig(Section):
     """Of a member: the normal density, or 1/sqrt(2 pi S) inside the exponent, as Eq. (19) reads."""
     spacing: Literal["paper", "auto"] = "paper"
     """As above, or, by the EKFs, bearings too precise for such members wait to be crossed."""
-    partial: Literal["reinitialise", "heaviest"] = "reinitialise"
-    """A range for a partial landmark: place it anew, or move its heaviest member."""
+    ranged: Literal["anew", "heaviest", "reset", "corrected", "bearing", "others", "moved"] = "anew"
+    """What a range does to a ray: it is placed anew, or as `estimation.rays` lists."""
 
     @model_validator(mode="after")
     def _ordered(self) -> "RayConfig":
@@ -406,6 +406,10 @@ class RayConfig(Section):
             raise ValueError(f"range_bounds must rise, found [{near}, {far}]")
         if self.spacing == "auto" and self.likelihood == "printed":
             raise ValueError('spacing "auto" needs likelihood "normal", found "printed"')
+        if self.spacing == "auto" and self.ranged not in ("anew", "bearing"):
+            raise ValueError(
+                f'spacing "auto" needs ranged "anew" or "bearing", found "{self.ranged}"'
+            )
         return self
 
 

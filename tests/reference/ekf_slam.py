@@ -348,12 +348,10 @@ class SlowEkfSlam:
             self.measure_full(label, distance, bearing)
         elif math.isnan(distance) and self.aggregated[self.members(label)[0]] == WAITS:
             self.cross(label, bearing)
-        elif math.isnan(distance):
+        elif math.isnan(distance) or self.rays.ranged == "bearing":
             self.measure_ray(label, bearing)
-        elif self.rays.partial == "reinitialise":
-            self.reinitialise(label, distance, bearing)
         else:
-            self.move_heaviest(label, distance, bearing)
+            self.measure_ranged_ray(label, distance, bearing)
 
     def measure_full(self, label, distance, bearing):
         (block,) = self.members(label)
@@ -411,22 +409,54 @@ class SlowEkfSlam:
         total = sum(self.aggregated[block] for block in left)
         self.aggregated.update({block: self.aggregated[block] / total for block in left})
 
-    def reinitialise(self, label, distance, bearing):
+    def measure_ranged_ray(self, label, distance, bearing):
+        """Give a ray a range, in each of the ways in which the sentence may be read."""
+        members, ranged = self.members(label), self.rays.ranged
+        heaviest = max(members, key=self.aggregated.__getitem__)
+        if ranged == "anew":
+            self.place_again(label, distance, bearing)
+        elif ranged == "others":
+            self.drop([heaviest])
+            left = self.members(label)
+            self.aggregated.update(zip(left, self.renormalised(left), strict=True))
+            self.measure_ray(label, bearing)
+        elif ranged == "moved":
+            self.move(heaviest, distance)
+            self.measure_ray(label, bearing)
+        else:
+            self.drop([b for b in members if b != heaviest])
+            self.aggregated[heaviest] = 1.0
+            self.range_heaviest(label, heaviest, distance, bearing)
+
+    def range_heaviest(self, label, heaviest, distance, bearing):
+        """Give the only member that is kept its range, then measure its bearing."""
+        known = math.nan
+        if self.rays.ranged == "corrected":
+            known = distance
+        elif self.rays.ranged == "heaviest":
+            self.move(heaviest, distance)
+        elif self.rays.ranged == "reset":
+            _, expected, _ = self.predicted(heaviest)
+            heaviest = self.place_again(label, distance, expected)
+        if not self.too_near(heaviest):
+            self.correct(heaviest, *self.innovation(heaviest, known, bearing))
+
+    def renormalised(self, members):
+        """Weights that sum to 1; alike where all have underflown."""
+        total = sum(self.aggregated[block] for block in members)
+        return [self.aggregated[b] / total if total > 0 else 1 / len(members) for b in members]
+
+    def place_again(self, label, distance, bearing):
         """Place a partial landmark anew, where its first member stood in the state."""
         position = self.blocks.index(self.members(label)[0])
         self.drop(self.members(label))
         self.place(position, label, distance, bearing)
+        return self.members(label)[0]
 
-    def move_heaviest(self, label, distance, bearing):
-        """Keep the heaviest member at the measured range, then measure its bearing."""
-        members = self.members(label)
-        heaviest = max(members, key=self.aggregated.__getitem__)
-        self.drop([b for b in members if b != heaviest])
-        self.aggregated[heaviest] = 1.0
-        offset = self.X[self.at(heaviest)] - self.X[:2]
-        self.X[self.at(heaviest)] = self.X[:2] + distance * offset / np.linalg.norm(offset)
-        if not self.too_near(heaviest):
-            self.correct(heaviest, *self.innovation(heaviest, math.nan, bearing))
+    def move(self, block, distance):
+        """Put a member's mean at a range, in the direction in which it is."""
+        offset = self.X[self.at(block)] - self.X[:2]
+        self.X[self.at(block)] = self.X[:2] + distance * offset / np.linalg.norm(offset)
 
     # Initialisation, Eqs. (16) and (17)
 

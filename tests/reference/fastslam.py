@@ -241,23 +241,30 @@ class SlowFastSlam:
             if self.too_near(p.pose, members[0]):
                 return 0.0
             return float(log_normal(*self.expected(p, members[0], distance, bearing)[:2]))
+        distance = math.nan if self.by_bearing(distance) else distance
         logs = self.log_likelihoods(p, members, bearing, distance)
         return log_sum([logarithm(m.weight) + log for m, log in zip(members, logs, strict=True)])
+
+    def by_bearing(self, distance):
+        """Whether a ray takes a measurement's bearing alone."""
+        return math.isnan(distance) or self.rays.ranged in ("bearing", "others", "moved")
 
     def refine(self, p, members, distance, bearing):
         if self.settings.weights == "marginal":
             p.log_weight += self.log_weight_gain(p, members, distance, bearing)
         if len(members) == 1:
             p.pose, p.P = self.refined(p, members[0], distance, bearing)
-        elif math.isnan(distance) and self.settings.mixture == "federated":
+        elif not self.by_bearing(distance):
+            return
+        elif self.settings.mixture == "federated":
             logs = self.log_lambdas(p, members, bearing)
             for member, share in zip(members, self.shares(members, logs), strict=True):
                 if share > 0:
-                    p.pose, p.P = self.refined(p, member, distance, bearing, 1 / share)
-        elif math.isnan(distance):
+                    p.pose, p.P = self.refined(p, member, math.nan, bearing, 1 / share)
+        else:
             logs = self.log_likelihoods(p, members, bearing)
             weights = self.aggregated(members, logs)
-            refined = [self.refined(p, member, distance, bearing) for member in members]
+            refined = [self.refined(p, member, math.nan, bearing) for member in members]
             p.pose, p.P = moments(weights, refined)
 
     def refined(self, p, member, distance, bearing, inflation=1.0):
@@ -297,12 +304,28 @@ class SlowFastSlam:
             return [self.corrected(pose, members[0], distance, bearing)]
         if math.isnan(distance):
             return self.correct_ray(pose, members, bearing)
-        if self.rays.partial == "reinitialise":
-            return [self.placed(pose, distance, bearing)]
-        best = members[heaviest(members)]
+        ranged, best = self.rays.ranged, members[heaviest(members)]
         offset = best.mean - pose[:2]
         at = pose[:2] + distance * offset / np.linalg.norm(offset)
-        return [self.corrected(pose, Member(at, best.covariance), math.nan, bearing)]
+        if ranged == "anew":
+            return [self.placed(pose, distance, bearing)]
+        if ranged == "bearing":
+            return self.correct_ray(pose, members, bearing)
+        if ranged == "others":
+            left = [m for m in members if m is not best]
+            total = sum(m.weight for m in left)
+            left = [Member(m.mean, m.covariance, m.weight / total) for m in left]
+            return self.correct_ray(pose, left, bearing)
+        if ranged == "moved":
+            moved = [Member(at, m.covariance, m.weight) if m is best else m for m in members]
+            return self.correct_ray(pose, moved, bearing)
+        if ranged == "corrected":
+            return [self.corrected(pose, Member(best.mean, best.covariance), distance, bearing)]
+        kept = Member(at, best.covariance)
+        if ranged == "reset":
+            expected = math.atan2(offset[1], offset[0]) - pose[2]
+            kept = self.placed(pose, distance, expected)
+        return [self.corrected(pose, kept, math.nan, bearing)]
 
     def corrected(self, pose, member, distance, bearing, inflation=1.0):
         if self.too_near(pose, member):

@@ -47,6 +47,21 @@ few bearings from different places can. Each new bearing does three things to a 
    N the number before this prune. The heaviest always stays. A ray of one member is a landmark:
    *fully initialised*.
 
+A *range* of a landmark that is still a ray is a fourth thing, and here the paper can be read in
+several ways ("all but the heaviest weighted hypothesis is kept, the measured range is taken as the
+true range, and the bearing and correspondence are updated as usual"). ``ranged`` says which:
+
+- ``anew``: the ray goes, and the landmark is placed at range and bearing as a new one;
+- ``heaviest``: the heaviest member alone is kept, its mean at the measured range in its direction,
+  its covariance as it was; the bearing corrects it;
+- ``reset``: the same, its covariance that of a landmark placed there;
+- ``corrected``: the heaviest alone is kept, and corrected by range and bearing as a landmark is;
+- ``bearing``: the range is not used; the bearing does its three things to the ray;
+- ``others``: the sentence to the letter: the heaviest goes, and the bearing does its three things
+  to all others;
+- ``moved``: the heaviest is moved to the measured range, the others stay, and the bearing does its
+  three things to all.
+
 Which to take? ``paper`` settings reproduce the paper; ``aggregated`` weights, or a power n of 3
 to 8, make the filter far more consistent: members that are certainly wrong then no longer pull
 the vehicle.
@@ -81,6 +96,12 @@ SMALLEST_AGGREGATED_SHARE = 0.05
 SMALLEST_SHARE = 1e-12
 UNDERFLOW = 1e-200
 FEDERATED, AS_PRINTED, EXACT, FITTED = range(4)
+ANEW, HEAVIEST, RESET, CORRECTED, BEARING, OTHERS, MOVED = range(7)
+RANGED = {
+    "anew": ANEW, "heaviest": HEAVIEST, "reset": RESET, "corrected": CORRECTED,
+    "bearing": BEARING, "others": OTHERS, "moved": MOVED,
+}  # fmt: skip
+"""What a range does to a ray, by the setting's names; from BEARING on it stays a ray."""
 _SHARING = {
     ("paper", "normal"): FEDERATED, ("paper", "printed"): AS_PRINTED, ("auto", "normal"): FITTED,
 }  # fmt: skip
@@ -130,7 +151,9 @@ class Sensing(NamedTuple):
     ray_ranges, ray_stds : (h) [m]
         Read-only.
     power, prune : float
-    aggregated, reinitialise : bool
+    aggregated : bool
+    ranged : int
+        What a range does to a ray, one of the numbers of `RANGED`.
     sharing : int
         How members take a bearing: FEDERATED, AS_PRINTED (federated, by the other reading of the
         likelihood), EXACT (all of it each, as in a Gaussian mixture) or FITTED (federated, and
@@ -147,7 +170,7 @@ class Sensing(NamedTuple):
     power: float
     prune: float
     aggregated: bool
-    reinitialise: bool
+    ranged: int
     sharing: int
     robust: bool
 
@@ -206,7 +229,7 @@ def sensing_of(
         power=rays.power,
         prune=rays.prune,
         aggregated=rays.weights == "aggregated",
-        reinitialise=rays.partial == "reinitialise",
+        ranged=RANGED[rays.ranged],
         sharing=EXACT if exact else _SHARING[rays.spacing, rays.likelihood],
         robust=robust,
     )
@@ -250,6 +273,16 @@ def heaviest_member(weights: Float[np.ndarray, " h"], count: Whole) -> Whole:
         if weights[j] > weights[best]:
             best = j
     return best
+
+
+@no_alloc
+def renormalise(weights: Float[np.ndarray, " h"], count: Whole) -> None:
+    """Make the first weights sum to one; alike where all have underflown."""
+    total = 0.0
+    for j in range(count):
+        total += weights[j]
+    for j in range(count):
+        weights[j] = weights[j] / total if total > 0.0 else 1.0 / count
 
 
 @no_alloc

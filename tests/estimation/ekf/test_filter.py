@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from pipistrelle.config import RayConfig
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import Motion
+from pipistrelle.estimation.rays import RANGED
 from pipistrelle.geometry import range_and_bearing, wrap
 from reference.ekf_slam import SlowEkfSlam
 from reference.missions import (
@@ -40,16 +41,17 @@ OPTIONS = list(
     itertools.product(
         ("fused", "passive"),
         ("instantaneous", "aggregated"),
-        ("reinitialise", "heaviest"),
+        ("anew", "heaviest", "bearing"),
         (1.0, 3.0),
         (1.0, 0.999),
     )
 )
 FEW = [
-    ("active", "instantaneous", "reinitialise", 1.0, 0.999),
-    ("fused", "instantaneous", "reinitialise", 1.0, 1.0),
+    ("active", "instantaneous", "anew", 1.0, 0.999),
+    ("fused", "instantaneous", "anew", 1.0, 1.0),
     ("fused", "aggregated", "heaviest", 3.0, 0.999),
-    ("passive", "instantaneous", "reinitialise", 3.0, 0.999),
+    ("passive", "instantaneous", "anew", 3.0, 0.999),
+    *(("fused", "instantaneous", ranged, 2.0, 1.0) for ranged in RANGED if ranged != "anew"),
 ]
 FIELDS = ("mean", "covariance", "landmark", "weight")
 
@@ -71,27 +73,27 @@ def assert_equal_to_reference(slam, mission, start=START):
     return belief
 
 
-def assert_equal_run(mission, weights, partial, power, gate):
-    slam = paper_filter(rays=ray_config(weights=weights, partial=partial, power=power), gate=gate)
+def assert_equal_run(mission, weights, ranged, power, gate):
+    slam = paper_filter(rays=ray_config(weights=weights, ranged=ranged, power=power), gate=gate)
     belief = assert_equal_to_reference(slam, mission)
     assert (belief.gated > 0) == (gate < 1)
     return belief
 
 
-@pytest.mark.parametrize(("strategy", "weights", "partial", "power", "gate"), FEW)
-def test_run_equals_the_slow_reference(strategy, weights, partial, power, gate):
+@pytest.mark.parametrize(("strategy", "weights", "ranged", "power", "gate"), FEW)
+def test_run_equals_the_slow_reference(strategy, weights, ranged, power, gate):
     mission = paper_mission(strategy, frames=60, outliers=0.04)
-    belief = assert_equal_run(mission, weights, partial, power, gate)
+    belief = assert_equal_run(mission, weights, ranged, power, gate)
     assert np.unique(belief.landmark).size > 8
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("strategy", "weights", "partial", "power", "gate"), [*OPTIONS, FEW[0]])
+@pytest.mark.parametrize(("strategy", "weights", "ranged", "power", "gate"), [*OPTIONS, FEW[0]])
 def test_whole_run_equals_the_slow_reference_with_every_option(
-    strategy, weights, partial, power, gate
+    strategy, weights, ranged, power, gate
 ):
     mission = paper_mission(strategy, outliers=0.02)
-    belief = assert_equal_run(mission, weights, partial, power, gate)
+    belief = assert_equal_run(mission, weights, ranged, power, gate)
     assert np.unique(belief.landmark).size > 30
 
 
@@ -103,7 +105,7 @@ rays = st.builds(
     prune=st.floats(0, 0.3),
     power=st.floats(0.5, 8),
     weights=st.sampled_from(["instantaneous", "aggregated"]),
-    partial=st.sampled_from(["reinitialise", "heaviest"]),
+    ranged=st.sampled_from([*RANGED]),
     likelihood=st.sampled_from(["normal", "printed"]),
 )
 

@@ -193,10 +193,10 @@ def test_a_bearing_that_one_member_of_a_ray_expects_surprises_nobody(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("partial", ["reinitialise", "heaviest"])
-def test_a_range_that_places_a_ray_surprises_nobody(kind, partial):
+@pytest.mark.parametrize("ranged", ["anew", "heaviest"])
+def test_a_range_that_places_a_ray_surprises_nobody(kind, ranged):
     slams = [
-        paper_filter(kind, robust=robust, rays=ray_config(partial=partial))
+        paper_filter(kind, robust=robust, rays=ray_config(ranged=ranged))
         for robust in (False, True)
     ]
     ray = slams[0].update(slams[0].init(SURE), scan_with([7], [0.0]))

@@ -137,7 +137,7 @@ def test_range_places_a_partial_landmark_anew():
 
 
 def test_range_moves_the_heaviest_member_where_settings_say_so():
-    slam = paper_filter(rays=ray_config(partial="heaviest"))
+    slam = paper_filter(rays=ray_config(ranged="heaviest"))
     *_, before = seen_along_a_line(slam, frames=2)
     heaviest = np.argmax(np.where(before.landmark == 7, before.weight, 0))
     offset = before.mean[3:].reshape(-1, 2)[heaviest] - before.mean[:2]

@@ -24,7 +24,7 @@ from pipistrelle.estimation.fastslam.block import (
     refine_by_active,
     refine_by_bearing,
 )
-from pipistrelle.estimation.fastslam.block_rays import scratch_for, weigh_by_active
+from pipistrelle.estimation.fastslam.block_rays import part_lanes, scratch_for, weigh_by_active
 from pipistrelle.estimation.measurement import NEAREST
 
 
@@ -103,7 +103,9 @@ def weighed(unit, distance=5.0):
     rows[:, X:XX] *= unit
     rows[:, XX:LOG_WEIGHT] *= unit**2
     log_weight, heard = np.zeros(LANES), (distance * unit, 0.1, 0.04 * unit**2, 0.01)
-    weigh_by_active(pose, rows, heard, count, 2, scratch_for(3), log_weight)
+    scratch = scratch_for(3)
+    part_lanes(count, scratch)
+    weigh_by_active(pose, rows, heard, count, scratch.ray, scratch, log_weight)
     assert not log_weight[1::2].any()
     refine_by_active(pose, rows[0], *heard, count, log_weight)
     return log_weight[:2]

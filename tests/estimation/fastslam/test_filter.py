@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from pipistrelle.config import RayConfig
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import Motion
+from pipistrelle.estimation.rays import RANGED
 from reference.missions import (
     CIRCLE,
     START,
@@ -42,17 +43,17 @@ OPTIONS = list(
     itertools.product(
         ("fused",),
         ("instantaneous", "aggregated"),
-        ("reinitialise", "heaviest"),
+        ("anew", "heaviest", "bearing"),
         ("federated", "exact"),
         (1.0, 3.0),
         (1.0,),
     )
 )
 FEW = [
-    ("active", "instantaneous", "reinitialise", "federated", 1.0, 0.999),
-    ("fused", "instantaneous", "reinitialise", "federated", 2.0, 1.0),
+    ("active", "instantaneous", "anew", "federated", 1.0, 0.999),
+    ("fused", "instantaneous", "anew", "federated", 2.0, 1.0),
     ("fused", "aggregated", "heaviest", "exact", 3.0, 0.999),
-    ("passive", "instantaneous", "reinitialise", "exact", 1.0, 0.999),
+    ("passive", "instantaneous", "anew", "exact", 1.0, 0.999),
     ("passive", "aggregated", "heaviest", "federated", 3.0, 1.0),
 ]
 
@@ -111,8 +112,8 @@ def assert_equal_to_reference(slam, mission, start=START):
     return belief, slow
 
 
-def assert_equal_whole_run(mission, particles, weights, partial, mixture, power, gate):
-    rays = ray_config(weights=weights, partial=partial, power=power)
+def assert_equal_whole_run(mission, particles, weights, ranged, mixture, power, gate):
+    rays = ray_config(weights=weights, ranged=ranged, power=power)
     slam = swarm_filter(particles, mixture, rays=rays, gate=gate)
     belief, slow = assert_equal_to_reference(slam, mission)
     assert slow.resampled > 2
@@ -120,21 +121,32 @@ def assert_equal_whole_run(mission, particles, weights, partial, mixture, power,
     assert (belief.gated > 0) == (gate < 1)
 
 
-@pytest.mark.parametrize(("strategy", "weights", "partial", "mixture", "power", "gate"), FEW[::2])
-def test_run_equals_the_slow_reference(strategy, weights, partial, mixture, power, gate):
+@pytest.mark.parametrize(("strategy", "weights", "ranged", "mixture", "power", "gate"), FEW[::2])
+def test_run_equals_the_slow_reference(strategy, weights, ranged, mixture, power, gate):
     mission = small_mission(strategy, frames=32, outliers=0.04)
-    assert_equal_whole_run(mission, 5, weights, partial, mixture, power, gate)
+    assert_equal_whole_run(mission, 5, weights, ranged, mixture, power, gate)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("strategy", "weights", "partial", "mixture", "power", "gate"), [*OPTIONS, *FEW]
+    ("strategy", "weights", "ranged", "mixture", "power", "gate"), [*OPTIONS, *FEW]
 )
 def test_whole_run_equals_the_slow_reference_with_every_option(
-    strategy, weights, partial, mixture, power, gate
+    strategy, weights, ranged, mixture, power, gate
 ):
     mission = small_mission(strategy, outliers=0.02)
-    assert_equal_whole_run(mission, 20, weights, partial, mixture, power, gate)
+    assert_equal_whole_run(mission, 20, weights, ranged, mixture, power, gate)
+
+
+@pytest.mark.parametrize("ranged", [ranged for ranged in RANGED if ranged != "anew"])
+@pytest.mark.parametrize(
+    ("weights", "mixture"),
+    [("marginal", "federated"), ("sampled", "federated"), ("sampled", "exact")],
+)
+def test_every_range_for_a_ray_equals_the_slow_reference(ranged, weights, mixture):
+    rays = ray_config(power=2.0, ranged=ranged)
+    slam = swarm_filter(4, mixture, weights=weights, rays=rays)
+    assert_equal_to_reference(slam, small_mission("fused", frames=16))
 
 
 @pytest.mark.parametrize("mixture", ["federated", "exact"])
@@ -157,7 +169,7 @@ rays = st.builds(
     prune=st.floats(0, 0.3),
     power=st.floats(0.5, 8),
     weights=st.sampled_from(["instantaneous", "aggregated"]),
-    partial=st.sampled_from(["reinitialise", "heaviest"]),
+    ranged=st.sampled_from([*RANGED]),
     likelihood=st.sampled_from(["normal", "printed"]),
 )
 

@@ -219,7 +219,7 @@ OTHERS = {
     "rays.weights": "aggregated",
     "rays.likelihood": "printed",
     "rays.spacing": "auto",
-    "rays.partial": "heaviest",
+    "rays.ranged": "heaviest",
     "fastslam.particles": 30,
     "fastslam.resample_below": 1.0,
     "fastslam.mixture": "exact",

@@ -29,6 +29,7 @@ from pipistrelle.estimation.ekf.detours import (
 from pipistrelle.estimation.ekf.gaussian import (
     APPLIED,
     GATED,
+    Joint,
     State,
     bearing_variance,
     correct_active,
@@ -51,10 +52,17 @@ from pipistrelle.estimation.measurement import (
     row_of,
 )
 from pipistrelle.estimation.rays import (
+    ANEW,
     AS_PRINTED,
+    BEARING,
+    CORRECTED,
+    MOVED,
+    OTHERS,
+    RESET,
     Sensing,
     heaviest_member,
     log_likelihood,
+    renormalise,
     survivors,
     weigh_and_share,
 )
@@ -96,7 +104,7 @@ def _correct_ray(
 
 
 @no_alloc
-def _range_for_ray(
+def _leave_one(
     state: State,
     first: Whole,
     count: Whole,
@@ -104,21 +112,61 @@ def _range_for_ray(
     sensing: Sensing,
     scratch: Scratch,
 ) -> None:
-    """Give a partial landmark its range: one member is left."""
-    left = 0 if sensing.reinitialise else heaviest_member(state.weight[first:], count)
+    """Give a ray its range where that leaves one member: a full landmark."""
+    left = 0 if sensing.ranged == ANEW else heaviest_member(state.weight[first:], count)
     for j in range(count):
         scratch.keep[j] = j == left
     drop_members(state, first, count, scratch.keep, scratch.source)
     state.weight[first] = 1.0
     distance, bearing, variance = row.range, row.bearing, row.bearing_variance
-    joint, mean = state.joint, state.joint.mean
-    size, i = 3 + 2 * state.members[0], 3 + 2 * first
-    if sensing.reinitialise:
+    joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
+    if sensing.ranged == ANEW:
         initialise(joint, size, i, distance, bearing, row.range_variance, variance)
+        return
+    if sensing.ranged == CORRECTED:
+        correct_active(joint, size, i, distance, bearing, row.range_variance, variance, np.inf)
+        return
+    if sensing.ranged == RESET:
+        mean = joint.mean
+        _, expected, _, _, _ = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
+        initialise(joint, size, i, distance, expected, row.range_variance, variance)
     else:
-        _, _, c, s, _ = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
-        mean[i], mean[i + 1] = mean[0] + distance * c, mean[1] + distance * s
-        correct_bearing(joint, size, i, bearing, variance, np.inf)
+        _move_to_range(joint, i, distance)
+    correct_bearing(joint, size, i, bearing, variance, np.inf)
+
+
+@no_alloc
+def _move_to_range(joint: Joint, i: Whole, distance: float) -> None:
+    """Put the mean of the member at state index i at a range, in the direction in which it is."""
+    mean = joint.mean
+    _, _, c, s, _ = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
+    mean[i], mean[i + 1] = mean[0] + distance * c, mean[1] + distance * s
+
+
+@no_alloc
+def _correct_ranged_ray(
+    state: State,
+    first: Whole,
+    count: Whole,
+    row: Row,
+    sensing: Sensing,
+    scratch: Scratch,
+) -> Whole:
+    """Correct a ray with range and bearing, as `rays` lists; tell whether it was gated."""
+    if sensing.ranged < BEARING:
+        _leave_one(state, first, count, row, sensing, scratch)
+        return APPLIED
+    weight = state.weight[first:]
+    heaviest = heaviest_member(weight, count)
+    if sensing.ranged == MOVED:
+        _move_to_range(state.joint, 3 + 2 * (first + heaviest), row.range)
+    if sensing.ranged == OTHERS:
+        for j in range(count):
+            scratch.keep[j] = j != heaviest
+        drop_members(state, first, count, scratch.keep, scratch.source)
+        count -= 1
+        renormalise(weight, count)
+    return _correct_partial(state, first, count, row, sensing, scratch)
 
 
 @no_alloc
@@ -169,7 +217,7 @@ def _correct_known(state: State, row: Row, sensing: Sensing, scratch: Scratch) -
         row = tempered(state, first, count, row)
     distance, bearing, variance = row.range, row.bearing, row.bearing_variance
     joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
-    passive = math.isnan(distance)
+    passive = math.isnan(distance) or (count > 1 and sensing.ranged == BEARING)
     if passive and (state.weight[first] == WAITS or is_precise(row, sensing)):
         return _correct_precisely(state, first, count, row, sensing, scratch)
     if count == 1 and passive:
@@ -178,8 +226,7 @@ def _correct_known(state: State, row: Row, sensing: Sensing, scratch: Scratch) -
         spread, bound = row.range_variance, sensing.active_bound
         return correct_active(joint, size, i, distance, bearing, spread, variance, bound)
     if not passive:
-        _range_for_ray(state, first, count, row, sensing, scratch)
-        return APPLIED
+        return _correct_ranged_ray(state, first, count, row, sensing, scratch)
     return _correct_partial(state, first, count, row, sensing, scratch)
 
 

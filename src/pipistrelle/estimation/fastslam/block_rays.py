@@ -5,6 +5,7 @@ stay logs, so that no product of likelihoods underflows. ``rows`` (h, 6 `LANES`)
 one landmark; lane i has the first ``count[i]`` of them.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -24,8 +25,12 @@ from pipistrelle.estimation.fastslam.block import (
     PXY,
     PYH,
     PYY,
+    XX,
+    XY,
+    YY,
     Counts,
     Lanes,
+    Member,
     Poses,
     X,
     Y,
@@ -34,6 +39,7 @@ from pipistrelle.estimation.fastslam.block import (
     expect_bearing,
     refine_by_bearing,
 )
+from pipistrelle.estimation.measurement import NEAREST
 from pipistrelle.estimation.rays import (
     AS_PRINTED,
     EXACT,
@@ -41,7 +47,7 @@ from pipistrelle.estimation.rays import (
     SMALLEST_SHARE,
     Sensing,
 )
-from pipistrelle.jit import Whole, kernel, no_alloc
+from pipistrelle.jit import Whole, inlined, kernel, no_alloc
 
 Rows = Float[np.ndarray, "h numbers"]
 """The members of one landmark."""
@@ -55,8 +61,9 @@ class Scratch(NamedTuple):
     likelihood, posterior, share : (h, `LANES`)
         Of each member; the first two are logs.
     largest, total : (`LANES`)
-    whole : (`LANES`)
-        Shares of one.
+    whole, alone, ray : (`LANES`)
+        One in all lanes, in those where a landmark has one member, in those where it has several
+        (`part_lanes`); else zero.
     refined : (h, `POSE`)
         Poses as each member alone would have them.
     """
@@ -67,6 +74,8 @@ class Scratch(NamedTuple):
     largest: Lanes
     total: Lanes
     whole: Lanes
+    alone: Lanes
+    ray: Lanes
     refined: Float[np.ndarray, "h rows"]
 
 
@@ -80,8 +89,18 @@ def scratch_for(members: Whole) -> Scratch:
         np.empty(LANES),
         np.empty(LANES),
         np.ones(LANES),
+        np.empty(LANES),
+        np.empty(LANES),
         np.empty((members, POSE)),
     )
+
+
+@no_alloc
+def part_lanes(count: Counts, scratch: Scratch) -> None:
+    """Tell the lanes in which a landmark has one member from those in which it is a ray."""
+    for i in range(LANES):
+        scratch.alone[i] = 1.0 if count[i] == 1 else 0.0
+        scratch.ray[i] = 1.0 - scratch.alone[i]
 
 
 @no_alloc
@@ -121,8 +140,11 @@ def _weigh(rows: Rows, members: Whole, scratch: Scratch) -> None:
 
 
 @no_alloc
-def _share(members: Whole, sensing: Sensing, scratch: Scratch) -> None:
-    """Divide the measurement: shares go with a power of the likelihoods, now or aggregated."""
+def _share(members: Whole, sensing: Sensing, turn: Lanes, scratch: Scratch) -> None:
+    """Divide the measurement: shares go with a power of the likelihoods, now or aggregated.
+
+    Lanes without a turn have no share.
+    """
     logs = scratch.posterior if sensing.aggregated else scratch.likelihood
     smallest = SMALLEST_AGGREGATED_SHARE if sensing.aggregated else SMALLEST_SHARE
     largest, total = scratch.largest, scratch.total
@@ -137,14 +159,14 @@ def _share(members: Whole, sensing: Sensing, scratch: Scratch) -> None:
         share = scratch.share[j]
         for i in range(LANES):
             part = share[i] / total[i]
-            share[i] = part if part >= smallest else 0.0
+            share[i] = turn[i] * part if part >= smallest else 0.0
 
 
 @no_alloc
-def _add(log_likelihood: Lanes, log_weight: Lanes) -> None:
-    """Add log likelihoods, and their constant, to log weights."""
+def _add(log_likelihood: Lanes, numbers: Whole, turn: Lanes, log_weight: Lanes) -> None:
+    """Add log likelihoods of so many numbers, and their constants, to log weights."""
     for i in range(LANES):
-        log_weight[i] += log_likelihood[i] - HALF_LOG_TAU
+        log_weight[i] += log_likelihood[i] - numbers * HALF_LOG_TAU if turn[i] > 0.0 else 0.0
 
 
 @no_alloc
@@ -179,16 +201,20 @@ def weigh_by_bearing(
     count: Counts,
     bearing: float,
     variance: float,
+    turn: Lanes,
     scratch: Scratch,
     log_weight: Lanes,
 ) -> None:
-    """Weigh the poses by the bearing of a landmark: the density of its members' mixture."""
+    """Weigh the poses by the bearing of a landmark: the density of its members' mixture.
+
+    ``turn`` says whose turn it is (1 or 0), here and below.
+    """
     _expect_ray(pose, rows, count, bearing, variance, False, scratch)
     if most(count) == 1:
-        _add(scratch.likelihood[0], log_weight)
+        _add(scratch.likelihood[0], 1, turn, log_weight)
         return
     _weigh(rows, most(count), scratch)
-    _add(scratch.total, log_weight)
+    _add(scratch.total, 1, turn, log_weight)
 
 
 @no_alloc
@@ -199,22 +225,23 @@ def refine_by_ray(
     bearing: float,
     variance: float,
     sensing: Sensing,
+    turn: Lanes,
     scratch: Scratch,
     log_weight: Lanes,
 ) -> None:
     """Correct the poses by the bearing of a landmark, and weigh them by its likelihood."""
     members = most(count)
-    weigh_by_bearing(pose, rows, count, bearing, variance, scratch, log_weight)
+    weigh_by_bearing(pose, rows, count, bearing, variance, turn, scratch, log_weight)
     if members == 1:
-        refine_by_bearing(pose, rows[0], bearing, variance, scratch.whole)
+        refine_by_bearing(pose, rows[0], bearing, variance, turn)
         return
     if sensing.sharing == EXACT:
-        _refine_to_mixture(pose, rows, members, bearing, variance, scratch)
+        _refine_to_mixture(pose, rows, members, bearing, variance, turn, scratch)
         return
     if sensing.sharing == AS_PRINTED:
         _expect_ray(pose, rows, count, bearing, variance, True, scratch)
         _weigh(rows, members, scratch)
-    _share(members, sensing, scratch)
+    _share(members, sensing, turn, scratch)
     for j in range(members):
         refine_by_bearing(pose, rows[j], bearing, variance, scratch.share[j])
 
@@ -225,19 +252,17 @@ def weigh_by_active(
     rows: Rows,
     heard: tuple[float, float, float, float],
     count: Counts,
-    least: Whole,
+    turn: Lanes,
     scratch: Scratch,
     log_weight: Lanes,
 ) -> None:
-    """Weigh the poses whose landmark has so many members at least by its range and bearing.
+    """Weigh the poses by range and bearing of a landmark.
 
     By the members' mixture, of which one member is a case: a density over range and bearing for
     all, so that weights do not hang on the units of either. ``heard`` are the two and their
     variances.
     """
     members = most(count)
-    if members < least:
-        return
     distance, bearing, range_variance, bearing_variance = heard
     for j in range(members):
         expect_active(
@@ -245,20 +270,25 @@ def weigh_by_active(
             scratch.likelihood[j],
         )  # fmt: skip
     _weigh(rows, members, scratch)
-    for i in range(LANES):
-        log_weight[i] += scratch.total[i] - 2.0 * HALF_LOG_TAU if count[i] >= least else 0.0
+    _add(scratch.total, 2, turn, log_weight)
 
 
 @no_alloc
 def _refine_to_mixture(
-    pose: Poses, rows: Rows, members: Whole, bearing: float, variance: float, scratch: Scratch
+    pose: Poses,
+    rows: Rows,
+    members: Whole,
+    bearing: float,
+    variance: float,
+    turn: Lanes,
+    scratch: Scratch,
 ) -> None:
     """Set the poses to mean and covariance of the mixture of the members' refinements."""
     for j in range(members):
         refined, weight = scratch.refined[j], scratch.posterior[j]
         for k in range(POSE):
             refined[k] = pose[k]
-        refine_by_bearing(refined, rows[j], bearing, variance, scratch.whole)
+        refine_by_bearing(refined, rows[j], bearing, variance, turn)
         for i in range(LANES):
             weight[i] = exponential(weight[i])
     pose[:] = 0.0
@@ -288,21 +318,85 @@ def correct_ray(
     bearing: float,
     variance: float,
     sensing: Sensing,
+    turn: Lanes,
     scratch: Scratch,
 ) -> None:
     """Weigh, correct and prune a landmark's members from certain poses, in place."""
     members = most(count)
     if members == 1:
-        correct_by_bearing(pose, rows[0], bearing, variance, scratch.whole)
+        correct_by_bearing(pose, rows[0], bearing, variance, turn)
         return
     _expect_ray(pose, rows, count, bearing, variance, sensing.sharing == AS_PRINTED, scratch)
     _weigh(rows, members, scratch)
     if sensing.sharing != EXACT:
-        _share(members, sensing, scratch)
+        _share(members, sensing, turn, scratch)
     for j in range(members):
-        share = scratch.whole if sensing.sharing == EXACT else scratch.share[j]
+        share = turn if sensing.sharing == EXACT else scratch.share[j]
         correct_by_bearing(pose, rows[j], bearing, variance, share)
     _prune(rows, count, members, sensing.prune, scratch)
+
+
+@inlined
+def _heaviest(rows: Rows, count: Counts, i: Whole) -> Whole:
+    """Index of the heaviest member of a lane, the first of equals."""
+    best = 0
+    for j in range(1, count[i]):
+        best = j if rows[j, LOG_WEIGHT + i] > rows[best, LOG_WEIGHT + i] else best
+    return best
+
+
+@no_alloc
+def keep_heaviest(rows: Rows, count: Counts) -> None:
+    """Leave each lane the heaviest of its members."""
+    for i in range(LANES):
+        best = _heaviest(rows, count, i)
+        for k in range(i, MEMBER, LANES):
+            rows[0, k] = rows[best, k]
+        rows[0, LOG_WEIGHT + i], count[i] = 0.0, 1
+
+
+@no_alloc
+def drop_heaviest(rows: Rows, count: Counts) -> None:
+    """Leave each lane that has several members all but the heaviest."""
+    for i in range(LANES):
+        if count[i] == 1:
+            continue
+        best, total = _heaviest(rows, count, i), 0.0
+        for j in range(best, count[i] - 1):
+            for k in range(i, MEMBER, LANES):
+                rows[j, k] = rows[j + 1, k]
+        count[i] -= 1
+        second = rows[_heaviest(rows, count, i), LOG_WEIGHT + i]
+        for j in range(count[i]):
+            total += math.exp(rows[j, LOG_WEIGHT + i] - second)
+        for j in range(count[i]):
+            rows[j, LOG_WEIGHT + i] -= second + math.log(total)
+
+
+@no_alloc
+def heaviest_to_range(pose: Poses, rows: Rows, count: Counts, distance: float, turn: Lanes) -> None:
+    """Move the heaviest member to a range, in the direction in which it is; its spread stays."""
+    for i in range(LANES):
+        if turn[i] > 0.0:
+            member = rows[_heaviest(rows, count, i)]
+            dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
+            scale = distance / max(math.sqrt(dx * dx + dy * dy), 1e-12)
+            member[X + i], member[Y + i] = pose[X + i] + dx * scale, pose[Y + i] + dy * scale
+
+
+@no_alloc
+def reset_member(
+    pose: Poses, member: Member, range_variance: float, bearing_variance: float, turn: Lanes
+) -> None:
+    """Give a member the covariance that it would have if it were placed where it is."""
+    for i in range(LANES):
+        if turn[i] > 0.0:
+            dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
+            squared = max(dx * dx + dy * dy, NEAREST * NEAREST)
+            along = range_variance / squared
+            member[XX + i] = along * dx * dx + bearing_variance * dy * dy
+            member[XY + i] = (along - bearing_variance) * dx * dy
+            member[YY + i] = along * dy * dy + bearing_variance * dx * dx
 
 
 @no_alloc

@@ -14,15 +14,12 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle.estimation.fastslam.block import (
     LANES,
-    LOG_WEIGHT,
     MEMBER,
     POSE,
     Counts,
     Lanes,
     Member,
     Poses,
-    X,
-    Y,
     active_beyond,
     bearing_beyond,
     correct_by_active,
@@ -36,8 +33,13 @@ from pipistrelle.estimation.fastslam.block_rays import (
     Rows,
     Scratch,
     correct_ray,
+    drop_heaviest,
+    heaviest_to_range,
+    keep_heaviest,
     most,
+    part_lanes,
     refine_by_ray,
+    reset_member,
     scratch_for,
     weigh_by_active,
     weigh_by_bearing,
@@ -62,7 +64,15 @@ from pipistrelle.estimation.measurement import (
     detours,
     measurements,
 )
-from pipistrelle.estimation.rays import Sensing
+from pipistrelle.estimation.rays import (
+    ANEW,
+    BEARING,
+    CORRECTED,
+    MOVED,
+    OTHERS,
+    RESET,
+    Sensing,
+)
 from pipistrelle.jit import Whole, kernel, no_alloc, no_alloc_inlined
 
 
@@ -184,37 +194,40 @@ def _initialise_active(
     )  # fmt: skip
 
 
-@no_alloc
-def _range_for_ray(
+@no_alloc_inlined
+def _correct_by_range(
     pose: Poses,
     rows: Rows,
     count: Counts,
     heard: Measurements,
     m: Whole,
     sensing: Sensing,
-    share: Lanes,
+    scratch: Scratch,
 ) -> None:
-    """Give partial landmarks the range of measurement m: of each one member is left, the first.
-
-    ``share`` is room for what each lane takes of the bearing: one where it had a ray, else zero.
-    """
-    if sensing.reinitialise:
-        _initialise_active(pose, rows[0], heard, m, count)
+    """Correct a landmark by range and bearing, a ray as `estimation.rays` lists, in place."""
+    ranged, bearing, variance = sensing.ranged, heard.bearing[m], heard.bearing_variance[m]
+    distance, range_variance = heard.range[m], heard.range_variance[m]
+    if ranged == CORRECTED:
+        keep_heaviest(rows, count)
+    part_lanes(count, scratch)
+    correct_by_active(pose, rows[0], distance, bearing, range_variance, variance, count)
+    if most(count) == 1:
         return
-    for i in range(LANES):
-        share[i] = 0.0
-        if count[i] == 1:
-            continue
-        share[i], best = 1.0, 0
-        for j in range(1, count[i]):
-            best = j if rows[j, LOG_WEIGHT + i] > rows[best, LOG_WEIGHT + i] else best
-        for k in range(i, MEMBER, LANES):
-            rows[0, k] = rows[best, k]
-        dx, dy = rows[0, X + i] - pose[X + i], rows[0, Y + i] - pose[Y + i]
-        scale = heard.range[m] / max(math.sqrt(dx * dx + dy * dy), 1e-12)
-        rows[0, X + i], rows[0, Y + i] = pose[X + i] + dx * scale, pose[Y + i] + dy * scale
-        rows[0, LOG_WEIGHT + i] = 0.0
-    correct_by_bearing(pose, rows[0], heard.bearing[m], heard.bearing_variance[m], share)
+    if ranged == ANEW:
+        _initialise_active(pose, rows[0], heard, m, count)
+        count[:] = 1
+    elif ranged < BEARING:
+        keep_heaviest(rows, count)
+        heaviest_to_range(pose, rows, count, distance, scratch.ray)
+        if ranged == RESET:
+            reset_member(pose, rows[0], range_variance, variance, scratch.ray)
+        correct_by_bearing(pose, rows[0], bearing, variance, scratch.ray)
+    else:
+        if ranged == MOVED:
+            heaviest_to_range(pose, rows, count, distance, scratch.ray)
+        elif ranged == OTHERS:
+            drop_heaviest(rows, count)
+        correct_ray(pose, rows, count, bearing, variance, sensing, scratch.ray, scratch)
 
 
 @no_alloc
@@ -234,15 +247,40 @@ def _refine(
         variance, count = heard.bearing_variance[m], block.count[n]
         if math.isnan(heard.range[m]):
             refine_by_ray(
-                block.pose, rows, count, bearing, variance, sensing, scratch, block.gained
-            )
+                block.pose, rows, count, bearing, variance, sensing, scratch.whole, scratch,
+                block.gained,
+            )  # fmt: skip
         else:
-            rho_beta = (heard.range[m], bearing, heard.range_variance[m], variance)
-            weigh_by_active(block.pose, rows, rho_beta, count, 2, scratch, block.gained)
+            if most(count) > 1:
+                part_lanes(count, scratch)
+                _refine_by_ranged_ray(block, rows, count, heard, m, sensing, scratch)
             refine_by_active(
                 block.pose, rows[0], heard.range[m], bearing, heard.range_variance[m], variance,
                 count, block.gained,
             )  # fmt: skip
+
+
+@no_alloc
+def _refine_by_ranged_ray(
+    block: Block,
+    rows: Rows,
+    count: Counts,
+    heard: Measurements,
+    m: Whole,
+    sensing: Sensing,
+    scratch: Scratch,
+) -> None:
+    """Weigh a block's poses by range and bearing where a landmark is a ray; or by its bearing.
+
+    Where a range leaves it a ray, its bearing refines and weighs them as if it came alone.
+    """
+    pose, gained, bearing = block.pose, block.gained, heard.bearing[m]
+    variance, ray = heard.bearing_variance[m], scratch.ray
+    if sensing.ranged >= BEARING:
+        refine_by_ray(pose, rows, count, bearing, variance, sensing, ray, scratch, gained)
+        return
+    rho_beta = (heard.range[m], bearing, heard.range_variance[m], variance)
+    weigh_by_active(pose, rows, rho_beta, count, ray, scratch, gained)
 
 
 @no_alloc
@@ -251,6 +289,7 @@ def _weigh_at_sample(
     slot: Int[np.ndarray, " m"],
     heard: Measurements,
     before: tuple[Poses, Poses],
+    sensing: Sensing,
     scratch: Scratch,
 ) -> None:
     """Weigh a block's sampled poses anew: prior x likelihood / proposal at the sample.
@@ -266,11 +305,17 @@ def _weigh_at_sample(
             continue
         rows, count = block.member[block.first[n] : block.first[n + 1]], block.count[n]
         bearing, variance = heard.bearing[m], heard.bearing_variance[m]
+        pose, gained = block.pose, block.gained
         if math.isnan(heard.range[m]):
-            weigh_by_bearing(block.pose, rows, count, bearing, variance, scratch, block.gained)
-        else:
-            rho_beta = (heard.range[m], bearing, heard.range_variance[m], variance)
-            weigh_by_active(block.pose, rows, rho_beta, count, 1, scratch, block.gained)
+            whole = scratch.whole
+            weigh_by_bearing(pose, rows, count, bearing, variance, whole, scratch, gained)
+            continue
+        part_lanes(count, scratch)
+        by_range = scratch.alone if sensing.ranged >= BEARING else scratch.whole
+        rho_beta = (heard.range[m], bearing, heard.range_variance[m], variance)
+        weigh_by_active(pose, rows, rho_beta, count, by_range, scratch, gained)
+        if sensing.ranged >= BEARING and most(count) > 1:
+            weigh_by_bearing(pose, rows, count, bearing, variance, scratch.ray, scratch, gained)
 
 
 @no_alloc_inlined
@@ -281,14 +326,9 @@ def _correct_row(
     rows, bearing = block.member[block.first[n] : block.first[n + 1]], heard.bearing[m]
     pose, variance, count = block.pose, heard.bearing_variance[m], block.count[n]
     if math.isnan(heard.range[m]):
-        correct_ray(pose, rows, count, bearing, variance, sensing, scratch)
+        correct_ray(pose, rows, count, bearing, variance, sensing, scratch.whole, scratch)
         return
-    correct_by_active(
-        pose, rows[0], heard.range[m], bearing, heard.range_variance[m], variance, count
-    )
-    if most(count) > 1:
-        _range_for_ray(pose, rows, count, heard, m, sensing, scratch.total)
-        count[:] = 1
+    _correct_by_range(pose, rows, count, heard, m, sensing, scratch)
 
 
 @no_alloc
@@ -455,7 +495,7 @@ def correct_particles(
             draw[k] = normal[min(b * LANES + k % LANES, total - 1), k // LANES]
         sample_pose(block.pose, draw)
         if sampled:
-            _weigh_at_sample(block, slot, heard, (old.pose[b], proposal), scratch)
+            _weigh_at_sample(block, slot, heard, (old.pose[b], proposal), sensing, scratch)
         if timings is None:
             _correct(block, slot, heard, None, sensing, scratch)
             _place(block, slot, known, heard, None, sensing)
