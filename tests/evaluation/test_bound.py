@@ -42,6 +42,13 @@ def bound_of(scans, *, motion=DRIVE.motion, places=PLACES):
     return pose_bound(motion, DRIVE.controls, DRIVE.time, WORLD.path, places, scans)
 
 
+def true_control(k):
+    """Speed and steering angle that truly led to step k: the front wheel's way and direction."""
+    (x, y, heading), (to_x, to_y, _) = WORLD.path[k - 1 : k + 1]
+    way = np.array([to_x - x, to_y - y])
+    return np.hypot(*way) / STEP, wrap(np.arctan2(way[1], way[0]) - heading)
+
+
 def conditioned_bound(scans, last):
     """Compute the same at a step at once: the prior of all poses and landmarks, given all heard.
 
@@ -52,9 +59,7 @@ def conditioned_bound(scans, last):
     poses, noise = 3 * (last + 1), 2 * last
     spread = np.zeros((poses, noise))
     for k in range(1, last + 1):
-        _, F, U = moved(DRIVE.motion, WORLD.path[k - 1], DRIVE.controls[k - 1], STEP)
-        dx, dy = WORLD.path[k, :2] - WORLD.path[k - 1, :2]  # truly, not as commanded
-        F[0, 2], F[1, 2] = -dy, dx
+        _, F, U = moved(DRIVE.motion, WORLD.path[k - 1], true_control(k), STEP)
         spread[3 * k : 3 * k + 3] = F @ spread[3 * k - 3 : 3 * k]
         spread[3 * k : 3 * k + 3, 2 * k - 2 : 2 * k] = U * DRIVE.motion.control_std
     C = np.zeros((poses + places.size, poses + places.size))
@@ -98,7 +103,8 @@ def test_a_heading_once_lost_is_never_known_again(strategy):
 
 
 def test_a_drive_told_by_poses_has_the_same_bound():
-    scans, told = heard("fused"), as_poses(DRIVE)
+    truly = np.array([true_control(k) for k in range(1, STEPS + 1)])
+    scans, told = heard("fused"), as_poses(replace(DRIVE, controls=truly))
     same = pose_bound(told.motion, told.controls, told.time, WORLD.path, PLACES, scans)
     np.testing.assert_allclose(same, bound_of(scans), rtol=0, atol=1e-13)
     assert same[-1].any()

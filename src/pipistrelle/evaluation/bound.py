@@ -47,7 +47,13 @@ from pipistrelle.estimation.measurement import (
     observe,
     timings_of,
 )
-from pipistrelle.estimation.motion import Motion, MotionNumbers, motion_numbers, propagate_pose
+from pipistrelle.estimation.motion import (
+    Motion,
+    MotionNumbers,
+    controls_between,
+    motion_numbers,
+    propagate_pose,
+)
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 PRIOR_STD = 20.0
@@ -74,10 +80,11 @@ def pose_bound(
 
     .. math:: \bar P = F P F^T + U Q U^T, \qquad P^{-1} = \bar P^{-1} + H^T R^{-1} H
 
-    with F, U and H at the truth: F holds the way that the vehicle truly went in a step, not the one
-    that it was commanded. A whole path with its landmarks may be turned, and nothing that is heard
-    of it changes; with any other F the noise of the path would tell of a heading that nothing
-    tells. So would that of a caller's velocity: of one that goes from b, v to b', v' in a time T,
+    with F, U and H at the truth: F holds the way that the vehicle truly went in a step, and U the
+    speed and steering or turn that led it, not what was commanded. A whole path with its landmarks
+    may be turned, and nothing that is heard of it changes; with any other F the noise of the path
+    would tell of a heading that nothing tells. So would that of a caller's velocity: of one that
+    goes from b, v to b', v' in a time T,
 
     .. math:: \delta b' = \delta b + T \delta v + J (b' - b - T v)\, \delta\theta, \qquad
               \delta v' = \delta v + J (v' - v)\, \delta\theta
@@ -105,7 +112,9 @@ def pose_bound(
     Returns
     -------
     (k + 1, 3, 3) [m, rad, squared]
-        No estimator without bias has less. Zero at the start.
+        No estimator that is without bias along this path has less. Zero at the start. One that
+        knows what paths are like may be biased along each and have less in the mean: a mean of
+        such bounds over worlds is a measure to hold errors against, no bound of their mean.
 
     Notes
     -----
@@ -144,7 +153,7 @@ def pose_bound(
     timed = bool(moving) or np.any(caller != UNLABELLED)
     return _bound(
         path,
-        controls,
+        _true_controls(motion, controls, time, path),
         np.diff(time),
         motion_numbers(motion),
         (state, np.array([place[one] for one in state.tolist()]).reshape(-1, 2)),
@@ -152,6 +161,22 @@ def pose_bound(
         np.ascontiguousarray(numbers[:, known]),
         (_slots(slot, caller), ways, wander) if timed else None,
     )
+
+
+def _true_controls(
+    motion: Motion,
+    controls: Float[np.ndarray, "k c"],
+    time: Float[np.ndarray, " t"],
+    path: Float[np.ndarray, "t 3"],
+) -> Float[np.ndarray, "k c"]:
+    """Return the controls that led along the path; of a step that commands nothing, that.
+
+    Of poses the noise does not hang on how far they were apart, and they are as they are.
+    """
+    if motion.model == "poses":
+        return controls
+    commanded = controls.any(axis=1, keepdims=True)
+    return np.where(commanded, controls_between(path, np.diff(time), motion), controls)
 
 
 def _slots(slot: Mapping[int, int], label: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:

@@ -8,14 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipistrelle.config import InputError, ScenarioConfig
-from pipistrelle.estimation.motion import Motion, motion_step
+from pipistrelle.estimation.motion import Motion, controls_between, motion_step
 from pipistrelle.experiments.hearing.courses import (
     AHEAD,
     LOCK,
     Commands,
     Poses,
     Waypoints,
-    controls_between,
     course_of,
     driven,
     steps_of,

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.config import InputError, MotionConfig, ScenarioConfig
-from pipistrelle.estimation.motion import Motion, motion_step
+from pipistrelle.estimation.motion import Motion, controls_between, motion_step
 from pipistrelle.geometry import wrap, wrap_angle
 
 AHEAD = 1.0
@@ -241,44 +241,6 @@ def driven(
     for k, control in enumerate(controls + noise):
         path[k + 1] = motion_step(motion, path[k], control, setup.step)
     return path, controls
-
-
-def controls_between(
-    path: Float[np.ndarray, "t 3"], dt: float, motion: Motion
-) -> Float[np.ndarray, "t-1 2"]:
-    r"""Controls that lead from each pose to the next, as nearly as the motion model can.
-
-    A unicycle's arc has the turn of the heading, and a bicycle's front wheel the steering angle
-    that makes it, :math:`\sin\gamma = B \Delta\theta / (V \Delta_t)`; the speed is that along the
-    arc's chord, or the wheel's way. What the poses move sideways is lost.
-
-    Parameters
-    ----------
-    path : (k + 1, 3) [m, m, rad]
-    dt : [s]
-    motion : Motion
-
-    Returns
-    -------
-    (k, 2)
-
-    Examples
-    --------
-    >>> motion = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
-    >>> there = motion_step(motion, np.zeros(3), np.array([0.75, 0.1]), 0.125)
-    >>> controls_between(np.array([np.zeros(3), there]), 0.125, motion).round(9)
-    array([[0.75, 0.1 ]])
-    """
-    moved, turned = np.diff(path[:, :2], axis=0), wrap(np.diff(path[:, 2]))
-    if motion.model == "unicycle":
-        ahead = path[:-1, 2] + 0.5 * turned
-        along = moved[:, 0] * np.cos(ahead) + moved[:, 1] * np.sin(ahead)
-        return np.column_stack((along / dt / np.sinc(turned / (2.0 * np.pi)), turned / dt))
-    way = np.hypot(*moved.T)
-    forwards = moved[:, 0] * np.cos(path[:-1, 2]) + moved[:, 1] * np.sin(path[:-1, 2]) >= 0.0
-    way = np.where(forwards, way, -way)
-    sine = np.divide(motion.wheelbase * turned, way, out=np.zeros_like(way), where=way != 0.0)
-    return np.column_stack((way / dt, np.arcsin(np.clip(sine, -1.0, 1.0))))
 
 
 def _lanes(extent: float, lane: float) -> Float[np.ndarray, "n 2"]:
