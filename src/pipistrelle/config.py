@@ -396,6 +396,8 @@ class RayConfig(Section):
     """Of a member: the normal density, or 1/sqrt(2 pi S) inside the exponent, as Eq. (19) reads."""
     spacing: Literal["paper", "auto"] = "paper"
     """As above, or, by the EKFs, bearings too precise for such members wait to be crossed."""
+    merge: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """Neighbours of a ray become one within so many standard deviations of each other; 0: none."""
     ranged: Literal["anew", "heaviest", "reset", "corrected", "bearing", "others", "moved"] = "anew"
     """What a range does to a ray: it is placed anew, or as `estimation.rays` lists."""
 

@@ -408,6 +408,31 @@ class SlowEkfSlam:
         left = self.members(label)
         total = sum(self.aggregated[block] for block in left)
         self.aggregated.update({block: self.aggregated[block] / total for block in left})
+        if self.rays.merge > 0:
+            self.merge(left)
+
+    def merge(self, members):
+        """Let neighbours that agree become one: moments of the mixture of two states."""
+        one = members[0]
+        for other in members[1:]:
+            i, j = self.at(one), self.at(other)
+            d, S = self.X[j] - self.X[i], (self.P[i, i] + self.P[j, j]) / 2
+            if d @ np.linalg.solve(S, d) > self.rays.merge**2:
+                one = other
+                continue
+            w = np.array([self.aggregated[one], self.aggregated[other]])
+            a, b = w / w.sum()
+            as_one = np.eye(self.X.size)
+            as_other = as_one.copy()
+            as_other[i] = as_one[j]
+            means = as_one @ self.X, as_other @ self.X
+            mean = a * means[0] + b * means[1]
+            self.P = sum(
+                share * (T @ self.P @ T.T + np.outer(m - mean, m - mean))
+                for share, T, m in zip((a, b), (as_one, as_other), means, strict=True)
+            )
+            self.X, self.aggregated[one] = mean, w.sum()
+            self.drop([other])
 
     def measure_ranged_ray(self, label, distance, bearing):
         """Give a ray a range, in each of the ways in which the sentence may be read."""

@@ -295,7 +295,22 @@ class SlowFastSlam:
         best = members[heaviest(members)]
         left = [member for member in members if member.weight >= least or member is best]
         total = sum(member.weight for member in left)
-        return [Member(m.mean, m.covariance, m.weight / total) for m in left]
+        left = [Member(m.mean, m.covariance, m.weight / total) for m in left]
+        return self.merge(left) if self.rays.merge > 0 else left
+
+    def merge(self, members):
+        """Let neighbours that agree become one: mean and covariance of the mixture of two."""
+        merged = members[:1]
+        for other in members[1:]:
+            one = merged[-1]
+            d, S = other.mean - one.mean, (one.covariance + other.covariance) / 2
+            if d @ np.linalg.solve(S, d) > self.rays.merge**2:
+                merged.append(other)
+                continue
+            w = one.weight + other.weight
+            pair = [(m.mean, m.covariance) for m in (one, other)]
+            merged[-1] = Member(*moments([one.weight / w, other.weight / w], pair), w)
+        return merged
 
     # Landmarks, given the sampled pose: Eq. (11)
 

@@ -150,7 +150,7 @@ class Sensing(NamedTuple):
         Largest squared Mahalanobis distances.
     ray_ranges, ray_stds : (h) [m]
         Read-only.
-    power, prune : float
+    power, prune, merge : float
     aggregated : bool
     ranged : int
         What a range does to a ray, one of the numbers of `RANGED`.
@@ -169,6 +169,7 @@ class Sensing(NamedTuple):
     ray_stds: Float[np.ndarray, " h"]
     power: float
     prune: float
+    merge: float
     aggregated: bool
     ranged: int
     sharing: int
@@ -228,6 +229,7 @@ def sensing_of(
         ray_stds=ray_stds,
         power=rays.power,
         prune=rays.prune,
+        merge=rays.merge,
         aggregated=rays.weights == "aggregated",
         ranged=RANGED[rays.ranged],
         sharing=EXACT if exact else _SHARING[rays.spacing, rays.likelihood],

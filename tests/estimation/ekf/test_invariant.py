@@ -64,7 +64,8 @@ def assert_equal_to_reference(slam, mission, start=START):
 
 @pytest.mark.parametrize(("strategy", "weights", "ranged"), OPTIONS)
 def test_run_equals_the_slow_reference(strategy, weights, ranged):
-    slam = invariant_filter(weights=weights, ranged=ranged, power=2.0, gate=0.999)
+    merge = 1.0 if weights == "aggregated" else 0.0
+    slam = invariant_filter(weights=weights, ranged=ranged, merge=merge, power=2.0, gate=0.999)
     belief = assert_equal_to_reference(slam, paper_mission(strategy, frames=24, outliers=0.06))
     assert np.unique(belief.landmark).size > 5
     assert belief.gated > 0

@@ -10,6 +10,7 @@ from reference.ekf_slam import SlowEkfSlam
 from reference.missions import (
     BICYCLE,
     CIRCLE,
+    KINDS,
     START,
     STEP,
     draw_mission,
@@ -34,6 +35,24 @@ def seen_along_a_line(slam, *, frames=12, speed=2.0):
         belief = slam.update(belief, scan_of((7, np.nan, bearing)))
         yield belief
         belief, _ = slam.predict(belief, np.array([[speed, 0.0]]), np.array([STEP]))
+
+
+def bearing_of(point, pose):
+    """Bearing of a point from a pose."""
+    return wrap(np.arctan2(point[1] - pose[1], point[0] - pose[0]) - pose[2])
+
+
+def mixture_of(belief, label):
+    """Mean and covariance of a landmark's mixture, and its covariance with the pose."""
+    members = np.flatnonzero(belief.landmark == label)
+    rows, w = 3 + 2 * members[:, None] + np.arange(2), belief.weight[members]
+    means = belief.mean[rows]
+    mean = w @ means
+    own = sum(
+        share * (belief.covariance[np.ix_(row, row)] + np.outer(m - mean, m - mean))
+        for share, row, m in zip(w, rows, means, strict=True)
+    )
+    return mean, own, sum(s * belief.covariance[row, :3] for s, row in zip(w, rows, strict=True))
 
 
 def test_landmark_heard_once_is_a_ray_along_its_bearing_and_not_fully_initialised():
@@ -151,6 +170,23 @@ def test_range_moves_the_heaviest_member_where_settings_say_so():
     spread = np.linalg.eigvalsh(before.covariance[np.ix_(rows, rows)] - after.covariance[5:, 5:])
     assert spread[0] == pytest.approx(0, abs=1e-14)
     assert spread[1] > 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_members_that_agree_become_the_mixture_of_the_two(kind):
+    """One member or several: mean and covariance of the landmark, with all else, are the same."""
+    merging, keeping = (
+        paper_filter(kind, rays=ray_config(prune=0.0, merge=merge)) for merge in (1.0, 0.0)
+    )
+    for belief in seen_along_a_line(keeping, frames=40):
+        heard = scan_of((7, np.nan, bearing_of(TRUTH, belief.mean)))
+        apart, merged = keeping.update(belief, heard), merging.update(belief, heard)
+        if merged.landmark.size < apart.landmark.size:
+            break
+    assert 1 < merged.landmark.size < apart.landmark.size
+    for one, other in zip(mixture_of(apart, 7), mixture_of(merged, 7), strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-12)
+    assert np.linalg.eigvalsh(merged.covariance).min() > -1e-12
 
 
 def test_gate_drops_a_bearing_that_no_member_expected():

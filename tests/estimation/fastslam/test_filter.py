@@ -171,6 +171,7 @@ rays = st.builds(
     weights=st.sampled_from(["instantaneous", "aggregated"]),
     ranged=st.sampled_from([*RANGED]),
     likelihood=st.sampled_from(["normal", "printed"]),
+    merge=st.sampled_from([0.0, 0.5, 2.0]),
 )
 
 

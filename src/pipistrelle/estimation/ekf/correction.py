@@ -42,6 +42,7 @@ from pipistrelle.estimation.ekf.gaussian import (
 )
 from pipistrelle.estimation.ekf.huber import tempered
 from pipistrelle.estimation.ekf.members import Scratch, members_of, scratch_for
+from pipistrelle.estimation.ekf.merging import merge_members
 from pipistrelle.estimation.measurement import (
     Columns,
     Measurements,
@@ -176,8 +177,11 @@ def _correct_partial(
     """Correct a ray with a bearing, and prune it; tell whether it was gated."""
     if _correct_ray(state, first, count, row, sensing, scratch) == GATED:
         return GATED
-    if survivors(state.weight[first:], count, sensing.prune, scratch.keep) < count:
+    kept = survivors(state.weight[first:], count, sensing.prune, scratch.keep)
+    if kept < count:
         drop_members(state, first, count, scratch.keep, scratch.source)
+    if sensing.merge > 0.0 and kept > 1:
+        merge_members(state, first, kept, sensing.merge, scratch)
     return APPLIED
 
 

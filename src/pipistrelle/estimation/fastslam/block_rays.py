@@ -47,7 +47,7 @@ from pipistrelle.estimation.rays import (
     SMALLEST_SHARE,
     Sensing,
 )
-from pipistrelle.jit import Whole, inlined, kernel, no_alloc
+from pipistrelle.jit import Flag, Whole, inlined, kernel, no_alloc
 
 Rows = Float[np.ndarray, "h numbers"]
 """The members of one landmark."""
@@ -334,6 +334,8 @@ def correct_ray(
         share = turn if sensing.sharing == EXACT else scratch.share[j]
         correct_by_bearing(pose, rows[j], bearing, variance, share)
     _prune(rows, count, members, sensing.prune, scratch)
+    if sensing.merge > 0.0:
+        _merge_members(rows, count, sensing.merge)
 
 
 @inlined
@@ -424,6 +426,40 @@ def _prune(rows: Rows, count: Counts, members: Whole, prune: float, scratch: Scr
             row[LOG_WEIGHT + i] = posterior[i] - total[i]
     if dropped > 0:
         _close_up(rows, count, scratch.share)
+
+
+@no_alloc
+def _merge_members(rows: Rows, count: Counts, limit: float) -> None:
+    """Merge neighbours of a ray that agree, from near to far, as `ekf.merging` does."""
+    for i in range(LANES):
+        last = 0
+        for j in range(1, count[i]):
+            if not _merged(rows[last], rows[j], limit, i):
+                last += 1
+                for k in range(i, MEMBER, LANES):
+                    rows[last, k] = rows[j, k]
+        count[i] = last + 1
+        if last == 0:
+            rows[0, LOG_WEIGHT + i] = 0.0
+
+
+@no_alloc
+def _merged(one: Member, other: Member, limit: float, i: Whole) -> Flag:
+    """Put the mixture of a lane's two members in the place of the first, if they agree."""
+    x, y = other[X + i] - one[X + i], other[Y + i] - one[Y + i]
+    xx, xy = 0.5 * (one[XX + i] + other[XX + i]), 0.5 * (one[XY + i] + other[XY + i])
+    yy = 0.5 * (one[YY + i] + other[YY + i])
+    if yy * x * x - 2.0 * xy * x * y + xx * y * y > limit * limit * (xx * yy - xy * xy):
+        return False
+    b = 1.0 / (1.0 + math.exp(one[LOG_WEIGHT + i] - other[LOG_WEIGHT + i]))
+    a = 1.0 - b
+    one[X + i] += b * x
+    one[Y + i] += b * y
+    one[XX + i] = a * one[XX + i] + b * other[XX + i] + a * b * x * x
+    one[XY + i] = a * one[XY + i] + b * other[XY + i] + a * b * x * y
+    one[YY + i] = a * one[YY + i] + b * other[YY + i] + a * b * y * y
+    one[LOG_WEIGHT + i] -= math.log(a)
+    return True
 
 
 @no_alloc
