@@ -426,6 +426,8 @@ class FastSlamConfig(Section):
     """Bearings shared among a ray's members (the paper's) or an exact Gaussian mixture."""
     weights: Literal["marginal", "sampled"] = "marginal"
     """Weigh by the likelihood before the sample, or at it by prior x likelihood / proposal."""
+    resampled_rays: Literal["kept", "restart"] = "kept"
+    """What a resampling does to the weights of rays' members: nothing, or all become alike."""
 
 
 class Config(Section):

@@ -396,6 +396,9 @@ class SlowFastSlam:
             chosen.append(copy.deepcopy(self.particles[ancestor]))
         for p in chosen:
             p.log_weight = -math.log(count)
+            for members in p.map.values() if self.settings.resampled_rays == "restart" else ():
+                for member in members:
+                    member.weight = 1 / len(members)
         self.particles = chosen
         self.resampled += 1
 

@@ -110,11 +110,20 @@ class AssumingFastSlam(FastSlam):
 
 
 def swarm_filter(
-    particles=20, mixture="federated", resample_below=0.75, weights="marginal", **changes
+    particles=20,
+    mixture="federated",
+    resample_below=0.75,
+    weights="marginal",
+    resampled_rays="kept",
+    **changes,
 ):
     """Return the filter with the paper's settings, but for the changes."""
     swarm = FastSlamConfig(
-        particles=particles, mixture=mixture, resample_below=resample_below, weights=weights
+        particles=particles,
+        mixture=mixture,
+        resample_below=resample_below,
+        weights=weights,
+        resampled_rays=resampled_rays,
     )
     slam = AssumingFastSlam(motion=BICYCLE, rays=ray_config(), settings=swarm)
     return replace(slam, **changes)

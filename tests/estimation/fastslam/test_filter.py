@@ -138,6 +138,12 @@ def test_whole_run_equals_the_slow_reference_with_every_option(
     assert_equal_whole_run(mission, 20, weights, ranged, mixture, power, gate)
 
 
+def test_rays_that_restart_at_resampling_equal_the_slow_reference():
+    slam = swarm_filter(5, resampled_rays="restart", resample_below=1.0, rays=ray_config(power=2.0))
+    _, slow = assert_equal_to_reference(slam, small_mission("fused", frames=16))
+    assert slow.resampled > 2
+
+
 @pytest.mark.parametrize("ranged", [ranged for ranged in RANGED if ranged != "anew"])
 @pytest.mark.parametrize(
     ("weights", "mixture"),

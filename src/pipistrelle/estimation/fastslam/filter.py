@@ -37,7 +37,9 @@ A frame goes through five steps.
       :label: eq-13
 3. **Correct** the landmarks, weigh, share and prune the rays (`rays`), from the sampled pose.
 4. **Place** new landmarks from the sampled pose.
-5. **Resample** when too few particles count (`resampling`).
+5. **Resample** when too few particles count (`resampling`). The members of a ray keep their
+   weights, or, with ``resampled_rays = "restart"``, become alike again, as the particles do: a ray
+   then collapses only by what is heard between two resamplings.
 
 ``mixture`` says how a bearing treats a ray. ``federated``, the paper's way, corrects every member
 with the noise R / share. ``exact`` uses that members are independent given the pose: each is
@@ -89,6 +91,7 @@ from pipistrelle.estimation.fastslam.particles import (
     mean_full,
     particle_map,
     resample_into,
+    restart_rays,
 )
 from pipistrelle.estimation.fastslam.poses import SMALLEST_STD, propagate, summarise
 from pipistrelle.estimation.fastslam.resampling import effective_particles, normalised, stratified
@@ -347,7 +350,8 @@ class FastSlam:
         )
         if effective_particles(weight) >= self.settings.resample_below * particles:
             return after
-        return _resampled(after, stratified(weight, uniform))
+        restart = self.settings.resampled_rays == "restart"
+        return _resampled(after, stratified(weight, uniform), restart)
 
     def _inside(self, belief: FastSlamBelief, scan: Scan, sensing: Sensing) -> tuple[Scan, int]:
         """Drop the measurements and detours that no particle expected; tell how many."""
@@ -371,10 +375,14 @@ def _timings(belief: FastSlamBelief, scan: Scan) -> Timings | None:
     return timings_of(scan) if belief.tie.size == 0 else (scan.caller, scan.callers, scan.moving)
 
 
-def _resampled(belief: FastSlamBelief, ancestor: Int[np.ndarray, " p"]) -> FastSlamBelief:
+def _resampled(
+    belief: FastSlamBelief, ancestor: Int[np.ndarray, " p"], restart: bool
+) -> FastSlamBelief:
     """Put copies of the ancestors in the particles' places, all of one weight."""
     arrays, (_, tie) = _held(belief)
     poses, count, member = resample_into(arrays, ancestor)
+    if restart:
+        restart_rays(belief.first, count, member)
     log_weight = np.full(ancestor.size, -math.log(ancestor.size))
     tie = resample_ties(tie, ancestor) if tie.size else tie
     return replace(belief, poses=poses, log_weight=log_weight, count=count, member=member, tie=tie)

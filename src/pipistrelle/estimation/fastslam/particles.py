@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle.estimation.fastslam.block import (
     LANES,
+    LOG_WEIGHT,
     MEMBER,
     POSE,
     Counts,
@@ -558,3 +559,17 @@ def resample_into(
                 for i in range(LANES):
                     member[b, j, k + i] = old.member[source[i] // LANES, j, k + source[i] % LANES]
     return pose, count, member
+
+
+@kernel
+def restart_rays(
+    first: Int[np.ndarray, " n+1"],
+    count: Int[np.ndarray, "b n lanes"],
+    member: Float[np.ndarray, "b c numbers"],
+) -> None:
+    """Make the members of each ray alike again, in place."""
+    for b in range(count.shape[0]):
+        for n in range(count.shape[1]):
+            for j in range(first[n], first[n + 1]):
+                for i in range(LANES):
+                    member[b, j, LOG_WEIGHT + i] = -math.log(count[b, n, i])
