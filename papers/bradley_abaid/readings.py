@@ -2,20 +2,21 @@
 
     python papers/bradley_abaid/readings.py FOLDER [--worlds 60] [--workers 2]
 
-The paper's words fit several programs. Five of its silences are varied, in all combinations:
+The paper's words fit several programs. Six of its silences are varied, in all combinations:
 
     snapshots    every loudest lag, or a run above the threshold: its strongest peak, those within
                  3 dB of it, those within 8 dB
     off axis     20 log p or 10 log p
     likelihood   Eq. (19) as a density, or with its root inside the exponent
     weights      FastSLAM's: marginal, or prior x likelihood / proposal at the sampled pose
-    ranged       what a range does to a partial landmark: seven readings of one sentence
-                 (`pipistrelle.estimation.rays` lists them)
+    ranged       a range for a partial landmark places it anew, or is not used until bearings have
+                 placed it
+    resampled    FastSLAM's rays keep their weights when particles are resampled, or restart
 
 In each, the levels and tau are fitted anew to the same three means of Table II, under the same
-constraint, as `calibration` has it (n is its 2); none of the three hangs on the last two silences,
-nor do active and passive trials on the last. The *misfit* is the distance to what was not fitted,
-the root of the mean square of three parts:
+constraint, as `calibration` has it (n is its 2); none of the three hangs on the last three
+silences. The *misfit* is the distance to what was not fitted, the root of the mean square of three
+parts:
 
     landmarks    Table II's other means, ours less the paper's in the paper's sigma (RMS)
     left out     the worlds that a filter loses: log of our share over the paper's (RMS)
@@ -29,9 +30,12 @@ the plan `paper`; of equals, the one of the least misfit. No claim's verdict is 
 A second measure stands beside it, and chooses nothing: *features*, how many of `FEATURES` the
 means have, which the paper states of its curves.
 
+Five more readings of what a range does (`pipistrelle.estimation.rays` lists all seven) are tried
+with the other readings of the plans `paper` and `physics` alone: ``ranges.csv``.
+
 The worlds have seed 1000; the study's have 2022. What is done is kept in FOLDER; ``readings.csv``
-beside this file is the table, with standard errors by bootstrap over the worlds. With other than 60
-worlds it goes into FOLDER.
+and ``ranges.csv`` beside this file are the tables, with standard errors by bootstrap over the
+worlds. With other than 60 worlds they go into FOLDER.
 """
 
 import argparse
@@ -85,20 +89,30 @@ WEIGHTS: dict[str, Change] = {
     "marginal": {"fastslam.weights": "marginal"},
     "sampled": {"fastslam.weights": "sampled"},
 }
-RANGED: dict[str, Change] = {name: {"rays.ranged": name} for name in RANGE_READINGS}
+RANGED: dict[str, Change] = {name: {"rays.ranged": name} for name in ("anew", "bearing")}
+ALL_RANGED: dict[str, Change] = {name: {"rays.ranged": name} for name in RANGE_READINGS}
+RESAMPLED: dict[str, Change] = {
+    name: {"fastslam.resampled_rays": name} for name in ("kept", "restart")
+}
 FACTORS = {
     "snapshots": SNAPSHOTS, "off_axis": OFF_AXIS, "likelihood": LIKELIHOOD, "weights": WEIGHTS,
-    "ranged": RANGED,
+    "ranged": RANGED, "resampled": RESAMPLED,
 }  # fmt: skip
 DEFAULTS = {
     "snapshots": "maxima", "off_axis": "20 log p", "likelihood": "density", "weights": "marginal",
-    "ranged": "anew",
+    "ranged": "anew", "resampled": "kept",
 }  # fmt: skip
+PLANS = {
+    "paper": {"snapshots": "run, strongest", "off_axis": "10 log p", "likelihood": "density"},
+    "physics": {"snapshots": "maxima", "off_axis": "20 log p", "likelihood": "density"},
+}
+"""Of the first three factors, what the plans have."""
 BEAMS = {180: 0.0025, 65: 0.0047, 33: 0.0088, 11: 0.025}
 """Half-power beamwidth [deg] and radius of the piston [m]: Table II's, and where the gap opens."""
 CASES: list[tuple[Strategy, int]] = [
     *((way, beam) for way in ("active", "fused") for beam in BEAMS), ("passive", 0),
 ]  # fmt: skip
+PASSIVE: tuple[Strategy, int] = ("passive", 0)
 PRUNES = tuple(float(f"{digit}e-{decade}") for decade in range(40, 1, -1) for digit in (1, 2, 5))
 CASES_TRIED = {"ekf": 27 / 28, "fastslam": 31 / 65}
 """Worlds lost in one of these nine cases, of those lost in one of the study's 25: as the plan
@@ -113,10 +127,12 @@ above EKF with each strategy; EKF's active below passive, and fused lower at 11 
 FastSLAM's fused above active and passive."""
 DRAWS = 1000
 ANY = "any"
-"""Stands where a level makes no difference: of ranges where no ray is given one."""
+"""Stands where a level makes no difference."""
+VARIED = {"weights": WEIGHTS, "ranged": ALL_RANGED, "resampled": RESAMPLED}
 WHOLE = 60
 """Worlds of the published tables."""
 OUTPUT = Path(__file__).with_name("readings.csv")
+RANGES = Path(__file__).with_name("ranges.csv")
 
 
 def main() -> None:
@@ -130,6 +146,7 @@ def main() -> None:
     values = drawn(list(readings.values()))
     table = misfits(readings, values, fits)
     write_table(table, published(OUTPUT, chosen), "rays.prune")
+    write_table(ranges(trials), published(RANGES, chosen))
     tied = table.filter("tied").sort("departures", "misfit")
     print("chosen by the rule, of", tied.height, "tied:", tied.select(*FACTORS).row(0))
     with pl.Config(tbl_rows=-1, tbl_cols=-1, tbl_width_chars=200, float_precision=2):
@@ -281,22 +298,39 @@ def trials_in(fits: Mapping[str, Change], world: int) -> Iterator[dict[str, Any]
             heard = heard or listen(scenario, config, list(BEAMS.values()), iteration=world)
             for strategy, beam in CASES:
                 scans = scans_of(heard[[*BEAMS].index(beam or 11)], strategy, config)
-                filters = [("ekf", "marginal"), *(("fastslam", name) for name in WEIGHTS)]
-                mixed = RANGED if strategy == "fused" else [ANY]
-                for (name, weights), ranged in product(filters, mixed):
+                for case, levels in varied(chosen, strategy):
+                    change = {
+                        key: value
+                        for factor, level in levels.items()
+                        for key, value in VARIED[factor].get(level, {}).items()
+                    }
                     scores = run_trial(
-                        Case(strategy=strategy, filter=name, iteration=world),
+                        Case(strategy=strategy, filter=case, iteration=world),
                         drive_of(scenario, config),
                         scans,
-                        changed(config, WEIGHTS[weights] | RANGED.get(ranged, {})),
+                        changed(config, change),
                     ).scores
                     yield {
-                        **chosen, "weights": weights, "ranged": ranged, "filter": name,
-                        "strategy": strategy, "beam": beam, "world": world,
-                        "full": scores.landmarks_full, "total": scores.landmarks_total,
-                        "diverged": scores.diverged, "position": scores.position_rmse_m,
-                        "nees": scores.nees_mean,
+                        **chosen, **levels, "filter": case, "strategy": strategy, "beam": beam,
+                        "world": world, "full": scores.landmarks_full,
+                        "total": scores.landmarks_total, "diverged": scores.diverged,
+                        "position": scores.position_rmse_m, "nees": scores.nees_mean,
                     }  # fmt: skip
+
+
+def varied(chosen: Mapping[str, str], strategy: Strategy) -> Iterator[tuple[str, dict[str, str]]]:
+    """List filters with their levels of the last three factors, where these make a difference."""
+    ranges = RANGED if strategy == "fused" else [ANY]
+    restarts = [ANY] if strategy == "active" else RESAMPLED
+    for ranged in ranges:
+        yield "ekf", {"weights": ANY, "ranged": ranged, "resampled": ANY}
+        for weights, resampled in product(WEIGHTS, restarts):
+            yield "fastslam", {"weights": weights, "ranged": ranged, "resampled": resampled}
+    if strategy == "fused" and chosen in PLANS.values():
+        for ranged in (name for name in ALL_RANGED if name not in RANGED):
+            yield "ekf", {"weights": ANY, "ranged": ranged, "resampled": ANY}
+            for resampled in RESAMPLED:
+                yield "fastslam", {"weights": "marginal", "ranged": ranged, "resampled": resampled}
 
 
 # The misfit
@@ -306,10 +340,9 @@ class Reading:
     """One combination's numbers, a row per world: (worlds, cases) of each filter."""
 
     def __init__(self, trials: pl.DataFrame, levels: Mapping[str, str]) -> None:
-        chosen, ekf = trials, pl.col("filter") == "ekf"
+        chosen = trials
         for factor, level in levels.items():
-            here = pl.col(factor).is_in([level, ANY])
-            chosen = chosen.filter(here | ekf if factor == "weights" else here)
+            chosen = chosen.filter(pl.col(factor).is_in([level, ANY]))
         self.worlds = trials["world"].n_unique()
         self.columns = {
             (name, score): self._columns(chosen.filter(pl.col("filter") == name), score)
@@ -359,7 +392,6 @@ class Reading:
             {name: self.means(name, s, rows) for name in EXCLUDED} for s in ("position", "nees")
         )
         ekf, fastslam = position["ekf"], position["fastslam"]
-        passive = "passive", 0
         beats = {b: ekf["fused", b] < ekf["active", b] for b in BEAMS}
         both = [(way, b) for way in ("active", "fused") for b in BEAMS]
         level = {
@@ -379,7 +411,7 @@ class Reading:
         return {
             "crossing": sum(beats[b] == (b < 42) for b in BEAMS),
             "never": sum(fastslam["fused", b] >= fastslam["active", b] for b in BEAMS),
-            "passive_worst": sum(m[passive] > m[case] for m in (ekf, fastslam) for case in both),
+            "passive_worst": sum(m[PASSIVE] > m[case] for m in (ekf, fastslam) for case in both),
             "fastslam_worse": sum(fastslam[case] > ekf[case] for case in ekf),
             "anees": sum(order),
         }
@@ -450,6 +482,25 @@ def misfits(
         )
     tied = pl.col("above_best") <= pl.col("above_best_error")
     return pl.DataFrame(table).with_columns(tied=tied).sort("misfit")
+
+
+def ranges(trials: pl.DataFrame) -> pl.DataFrame:
+    """Table of all that a range may do to a ray, with the other readings of two plans."""
+    table = []
+    for (plan, base), ranged, resampled in product(PLANS.items(), ALL_RANGED, RESAMPLED):
+        levels = {"ranged": ranged, "resampled": resampled}
+        reading = Reading(trials, base | levels | {"weights": "marginal"})
+        rows = np.arange(reading.worlds)
+        parts = reading.parts(rows)
+        row = {"plan": plan, **levels, **parts, "misfit": misfit_of(parts)}
+        for name, (way, beam) in product(EXCLUDED, [("fused", b) for b in BEAMS] + [PASSIVE]):
+            full = reading.columns[name, "full"][way, beam]
+            nees = reading.columns[name, "nees"][way, beam]
+            row[f"full_{beam or way}_{name}"] = reading.means(name, "full", rows)[way, beam]
+            row[f"full_{beam or way}_{name}_all"] = full.mean()
+            row[f"nees_{beam or way}_{name}_median"] = np.median(nees)
+        table.append(row | reading.features(rows))
+    return pl.DataFrame(table)
 
 
 def main_effects(names: Sequence[Levels], values: np.ndarray) -> pl.DataFrame:
