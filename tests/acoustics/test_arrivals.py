@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import minimize_scalar
 from scipy.special import jn_zeros
 
 from pipistrelle.acoustics.arrivals import (
@@ -336,23 +337,36 @@ def through(bodies, config, pose=ORIGIN):
 
 
 @pytest.mark.parametrize("shape", ["cylinder", "sphere"])
-def test_bodies_like_the_usual_target_sound_like_it(shape):
+def test_bodies_whose_size_is_not_stated_are_the_usual_points_to_the_bit(shape):
     config = Config(target=TargetConfig(shape=shape, radius=0.04))
-    usual = Bodies(radius=np.full(3, 0.04), sphere=np.full(3, shape == "sphere"))
-    for name in ("level_db", "delay", "bearing", "landmark"):
+    usual = Bodies(radius=np.full(3, np.nan), sphere=np.full(3, shape == "sphere"))
+    for name in ("delay", "bearing", "frequency", "landmark"):
         found, expected = (getattr(through(b, config), name) for b in (usual, None))
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+        assert found.tobytes() == expected.tobytes()
+    found, expected = (through(b, config).level_db for b in (usual, None))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 
-def test_a_larger_body_is_louder_by_its_shapes_law_and_only_that_one():
-    config = Config()
-    usual = through(None, config)
+def test_an_own_echo_of_a_body_has_its_bearing_and_the_way_to_its_surface():
+    trunks = Bodies(radius=np.array([0.3, 0.15, np.nan]), sphere=np.zeros(3, dtype=bool))
+    centre, surface = through(None, CONFIG), through(trunks, CONFIG)
+    own = surface.caller == VEHICLE
+    nearer = 343.0 / 2.0 * (centre.delay - surface.delay)[own]
+    np.testing.assert_allclose(nearer, [0.3, 0.15, 0.0, 0.0], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(surface.bearing[own], centre.bearing[own], rtol=0, atol=1e-15)
+    assert surface.landmark[own].tolist() == [1, 2, 3, 4]
+
+
+def test_a_larger_body_is_louder_by_its_shapes_law_and_its_nearer_surface_and_only_that_one():
+    usual, reach = through(None, CONFIG), math.hypot(5.0, 0.5)
+    nearer = 40.0 * math.log10(reach / (reach - 0.25)) + 0.5 * 1.1329
     for sphere, gain in ((False, 10.0), (True, 20.0)):
-        like = Config(target=TargetConfig(shape="sphere" if sphere else "cylinder"))
-        large = Bodies(radius=np.array([0.25, 0.025, 0.025]), sphere=np.full(3, sphere))
+        target = TargetConfig(shape="sphere" if sphere else "cylinder", radius=0.025)
+        like = CONFIG.model_copy(update={"target": target})
+        large = Bodies(radius=np.array([0.25, np.nan, np.nan]), sphere=np.full(3, sphere))
         more = through(large, like).level_db - through(None, like).level_db
         own, other = usual.caller == VEHICLE, usual.landmark != 1
-        np.testing.assert_allclose(more[own & ~other], gain, atol=1e-9)
+        np.testing.assert_allclose(more[own & ~other], gain + nearer, atol=1e-4)
         np.testing.assert_allclose(more[other], 0.0, atol=1e-12)
         passive = more[~own & ~other]
         assert passive.shape == (1,)
@@ -362,10 +376,120 @@ def test_a_larger_body_is_louder_by_its_shapes_law_and_only_that_one():
 def test_spheres_among_cylinders_throw_as_spheres_do():
     cylinders = Config()
     spheres = Config(target=TargetConfig(shape="sphere"))
-    mixed = Bodies(radius=np.full(3, 0.025), sphere=np.array([True, False, True]))
+    mixed = Bodies(radius=np.full(3, np.nan), sphere=np.array([True, False, True]))
     levels = through(mixed, cylinders).level_db
     label = through(None, cylinders).landmark
     alone = [through(None, config).level_db for config in (cylinders, spheres)]
     of_sphere = np.isin(label, [1, 3])
     np.testing.assert_allclose(levels, np.where(of_sphere, alone[1], alone[0]), atol=1e-12)
     assert np.abs(alone[1] - alone[0])[of_sphere].max() > 0.1
+
+
+def orchard(seed, count):
+    """Emissions among trunks, heard by a vehicle and a boat on the move; nobody within a trunk."""
+    rng = np.random.default_rng(seed)
+    poses, boat = rng.uniform(-9.0, 9.0, (count, 3)), rng.uniform(-9.0, 9.0, (count, 2))
+    places, radius = rng.uniform(-12.0, 12.0, (30, 2)), rng.uniform(0.05, 0.6, 30)
+    ends = np.vstack((poses[:, :2], boat))
+    free = np.hypot(*(places[:, None] - ends).T).min(axis=0) > radius + 1e-3
+    vehicle, beacon = callers_of(CONFIG, STILL)
+    speeds = rng.uniform(-1.0, 1.0, (2, count, 2))
+    callers = (vehicle, replace(beacon, place=boat, velocity=speeds[1]))
+    bodies = Bodies(radius=radius[free], sphere=rng.uniform(size=free.sum()) < 0.5)
+    return poses, speeds[0], places[free], callers, CONFIG, bodies
+
+
+def least_way(source, receiver, centre, radius):
+    """Length of the least way by a disc, and its last point, by a search along the circle."""
+    line = source - receiver
+    along = np.clip((centre - receiver) @ line / (line @ line), 0.0, 1.0)
+    if np.hypot(*(receiver + along * line - centre)) < radius:
+        return np.hypot(*line), source
+
+    def point(angle):
+        return centre + radius * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
+
+    def length(angle):
+        return sum(np.hypot(*(point(angle) - end).T) for end in (source, receiver))
+
+    around = np.linspace(-np.pi, np.pi, 721)
+    start = around[np.argmin(length(around))]
+    found = minimize_scalar(
+        length, bounds=(start - 0.01, start + 0.01), method="bounded", options={"xatol": 1e-12}
+    )
+    return found.fun, point(found.x)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_echoes_of_bodies_come_by_the_least_way_over_their_surface(seed):
+    poses, velocities, places, callers, config, bodies = orchard(seed, 4)
+    heard, count = arrivals_of_emissions(poses, velocities, places, callers, config, bodies)
+    emission, checked = np.repeat(np.arange(4), count), 0
+    for a in np.flatnonzero((heard.caller == BEACON) & (heard.landmark <= len(places))):
+        k, i = emission[a], heard.landmark[a] - 1
+        receiver, boat = poses[k, :2], callers[BEACON].place[k]
+        path, last = least_way(boat, receiver, places[i], bodies.radius[i])
+        assert 343.0 * heard.delay[a] == pytest.approx(path, rel=0, abs=1e-9)
+        bearing = np.arctan2(*(last - receiver)[::-1]) - poses[k, 2]
+        assert wrap(bearing - heard.bearing[a]) == pytest.approx(0.0, abs=1e-5)
+        boat_later = boat + 1e-4 * callers[BEACON].velocity[k]
+        later = receiver + 1e-4 * velocities[k]
+        longer = least_way(boat_later, later, places[i], bodies.radius[i])[0] - path
+        shift = heard.frequency[a] / 30e3 - 1.0
+        assert shift == pytest.approx(-longer / 1e-4 / 343.0, abs=3e-5)
+        checked += 1
+    assert checked > 40
+
+
+def test_among_bodies_many_emissions_bring_bit_for_bit_what_each_brings_alone():
+    poses, velocities, places, callers, config, bodies = orchard(0, 4)
+    heard, count = arrivals_of_emissions(poses, velocities, places, callers, config, bodies)
+    rows = np.repeat(np.arange(4), count)
+    for k in range(4):
+        boat = callers[BEACON]
+        boat = replace(boat, place=boat.place[[k]], velocity=boat.velocity[[k]])
+        alone, _ = arrivals_of_emissions(
+            poses[[k]], velocities[[k]], places, (callers[VEHICLE], boat), config, bodies
+        )
+        for name in Arrivals.__slots__:
+            assert getattr(arrivals_at(heard, rows == k), name).tobytes() == (
+                getattr(alone, name).tobytes()
+            )
+
+
+def test_nothing_jumps_where_a_body_comes_between_beacon_and_vehicle():
+    sideways, still = np.linspace(-0.6, 0.6, 2401), np.zeros((2401, 2))
+    poses = np.column_stack((0.0 * sideways, sideways, 0.0 * sideways))
+    config = as_by_hand("bistatic").model_copy(update={"target": TargetConfig(radius=0.3)})
+    callers, place = callers_of(config, np.array([-9.0, 0.0])), np.array([[-4.0, 0.0]])
+    trunk = Bodies(radius=np.array([0.3]), sphere=np.array([False]))
+    heard, _ = arrivals_of_emissions(poses, still, place, callers, config, trunk)
+    centre, _ = arrivals_of_emissions(poses, still, place, callers, config)
+    passive, direct = ((heard.caller == BEACON) & (heard.landmark == label) for label in (1, 2))
+    late = heard.delay[passive] - heard.delay[direct]
+    aside = wrap(heard.bearing[passive] - heard.bearing[direct])
+    louder = (heard.level_db - centre.level_db)[passive]
+    hidden = np.abs(sideways) * 5.0 / np.hypot(9.0, sideways) < 0.3
+    np.testing.assert_allclose(late[hidden], 0.0, atol=1e-16)
+    np.testing.assert_allclose(aside[hidden], 0.0, atol=1e-14)
+    assert late[~hidden].min() > 0.0
+    for column, most in ((343.0 * late, 1e-4), (aside, 3e-4), (louder, 1e-3)):
+        assert np.abs(np.diff(column)).max() < most
+
+
+@pytest.mark.parametrize(
+    ("landmark", "beacon", "found"),
+    [
+        ([0.2, 0.0], [5.0, 0.0], r"vehicle to landmark 2: 0\.2 m, within its radius of 0\.3 m"),
+        ([0.3, 0.0], [5.0, 0.0], r"vehicle to landmark 2: 0\.3 m, within its radius of 0\.3 m"),
+        ([5.0, 0.25], [5.0, 0.0], r"beacon to landmark 2: 0\.25 m, within its radius of 0\.3 m"),
+    ],
+)
+def test_nobody_may_be_within_a_body_or_touch_it(landmark, beacon, found):
+    landmarks, callers = np.array([[3.0, 3.0], landmark]), callers_of(CONFIG, np.array(beacon))
+    sized = Bodies(radius=np.array([np.nan, 0.3]), sphere=np.zeros(2, dtype=bool))
+    world = ORIGIN[None], STILL[None], landmarks, callers, CONFIG
+    with pytest.raises(InputError, match=rf"world .*{found}.* move them apart"):
+        arrivals_of_emissions(*world, sized)
+    points = replace(sized, radius=np.full(2, np.nan))
+    assert arrivals_of_emissions(*world, points)[1].tolist() == [6 if beacon[0] == 5.0 else 5]

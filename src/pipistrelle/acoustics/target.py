@@ -23,6 +23,7 @@ class Bodies:
     Attributes
     ----------
     radius : (n) [m]
+        NaN of a body whose size is not stated: it has the usual target's, and counts as a point.
     sphere : (n)
         Whether each is a sphere; else a cylinder.
     """
@@ -133,7 +134,11 @@ def strength_of_bodies_db(
     >>> strength_of_bodies_db(np.full((1, 3), np.pi), posts, **heard)
     array([[ 0., 10., 20.]])
     """
-    of = {"radius": bodies.radius, "frequency": frequency, "speed_of_sound": speed_of_sound}
+    of = {
+        "radius": _radius(bodies, usual),
+        "frequency": frequency,
+        "speed_of_sound": speed_of_sound,
+    }
     relative = np.where(
         bodies.sphere,
         target_strength_db(angle, shape="sphere", **of),
@@ -155,11 +160,16 @@ def backscatter_db(bodies: Bodies, usual: TargetConfig) -> Float[np.ndarray, " n
     (n) [dB]
         As `strength_of_bodies_db` at an angle of pi.
     """
-    return np.where(bodies.sphere, 20.0, 10.0) * np.log10(bodies.radius / usual.radius)
+    return np.where(bodies.sphere, 20.0, 10.0) * np.log10(_radius(bodies, usual) / usual.radius)
+
+
+def _radius(bodies: Bodies, usual: TargetConfig) -> Float[np.ndarray, " n"]:
+    """Return the bodies' radii, the usual target's where none is stated [m]."""
+    return np.where(np.isnan(bodies.radius), usual.radius, bodies.radius)
 
 
 def with_usual(bodies: Bodies, count: int, usual: TargetConfig) -> Bodies:
-    """Add bodies as the settings have them.
+    """Add bodies as the settings have them, which are points.
 
     Parameters
     ----------
@@ -173,6 +183,6 @@ def with_usual(bodies: Bodies, count: int, usual: TargetConfig) -> Bodies:
         The others first.
     """
     return Bodies(
-        radius=np.append(bodies.radius, np.full(count, usual.radius)),
+        radius=np.append(bodies.radius, np.full(count, np.nan)),
         sphere=np.append(bodies.sphere, np.full(count, usual.shape == "sphere")),
     )

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.acoustics.callers import VEHICLE, Caller
+from pipistrelle.acoustics.surfaces import reflecting_points
 from pipistrelle.config import InputError
 from pipistrelle.geometry import wrap
 
@@ -23,6 +24,9 @@ class Ways:
 
     Attributes
     ----------
+    poses : (k, 3) [m, m, rad]
+        Of the vehicle.
+    velocities : (k, 2) [m/s]
     landmarks : int
         How many of the targets are landmarks.
     target : (1 or k, t, 2) [m]
@@ -38,6 +42,8 @@ class Ways:
         The targets' speed towards the vehicle.
     """
 
+    poses: Float[np.ndarray, "k 3"]
+    velocities: Float[np.ndarray, "k 2"]
     landmarks: int
     target: Float[np.ndarray, "_ t 2"]
     offset: Float[np.ndarray, "k t 2"]
@@ -81,18 +87,71 @@ def ways_home(
     """
     others = callers[VEHICLE + 1 :]
     target = _joined(landmarks, [caller.place for caller in others])
+    drift, still = None, np.zeros(2)
+    if any(caller.velocity is not None for caller in others):
+        velocity = [still if c.velocity is None else c.velocity for c in others]
+        drift = _joined(np.zeros_like(landmarks), velocity)
+    return _measured(poses, velocities, len(landmarks), target, drift)
+
+
+def ways_by_surface(ways: Ways, caller: int, extent: Float[np.ndarray, " t"]) -> Ways:
+    """Measure the ways anew, from the points of the targets' surfaces that throw a caller's sound.
+
+    While all move these points move, too, but to first order no way changes by that, for it is the
+    least one: the speeds along it are those of its ends.
+
+    Parameters
+    ----------
+    ways : Ways
+        From the targets' centres.
+    caller : int
+        Its number in the list of callers.
+    extent : (t) [m]
+        Radius of each target; 0 of a point.
+
+    Returns
+    -------
+    Ways
+        The same to the bit where all targets are points.
+
+    Examples
+    --------
+    >>> from pipistrelle.acoustics.callers import callers_of
+    >>> from pipistrelle.config import Config
+    >>> trunk, callers = np.array([[5.0, 0.0]]), callers_of(Config(), np.array([0.0, 9.0]))
+    >>> centre = ways_home(np.zeros((1, 3)), np.zeros((1, 2)), trunk, callers)
+    >>> ways_by_surface(centre, VEHICLE, np.array([0.3, 0.0])).homeward
+    array([[4.7, 9. ]])
+    """
+    if not extent.any():
+        return ways
+    vehicle = ways.poses[:, np.newaxis, :2]
+    itself = ways.landmarks + caller - 1
+    source = vehicle if caller == VEHICLE else ways.target[:, itself : itself + 1]
+    target = reflecting_points(source, vehicle, ways.target, extent)
+    return _measured(ways.poses, ways.velocities, ways.landmarks, target, ways.drift)
+
+
+def _measured(
+    poses: Float[np.ndarray, "k 3"],
+    velocities: Float[np.ndarray, "k 2"],
+    landmarks: int,
+    target: Float[np.ndarray, "_ t 2"],
+    drift: Float[np.ndarray, "_ t 2"] | None,
+) -> Ways:
+    """Measure the ways from all targets, the first of which are landmarks, to the vehicle."""
     offset = target - poses[:, np.newaxis, :2]
     homeward = np.hypot(offset[..., 0], offset[..., 1])
     east, north = velocities[:, :1], velocities[:, 1:]
-    drift, approach, still = None, 0.0, np.zeros(2)
+    approach = 0.0
     with np.errstate(divide="ignore", invalid="ignore"):  # refused by name, later
         closing = (offset[..., 0] * east + offset[..., 1] * north) / homeward
-        if any(caller.velocity is not None for caller in others):
-            velocity = [still if c.velocity is None else c.velocity for c in others]
-            drift = _joined(np.zeros_like(landmarks), velocity)
+        if drift is not None:
             approach = -np.sum(drift * offset, axis=-1) / homeward
     return Ways(
-        landmarks=len(landmarks),
+        poses=poses,
+        velocities=velocities,
+        landmarks=landmarks,
         target=target,
         offset=offset,
         homeward=homeward,
@@ -141,39 +200,47 @@ def turn_of_sound(
 
 
 def refuse_impossible(
-    poses: Float[np.ndarray, "k 3"], ways: Ways, callers: Sequence[Caller]
+    ways: Ways, callers: Sequence[Caller], extent: Float[np.ndarray, " t"]
 ) -> None:
-    """Refuse points that coincide and coordinates that are not finite.
+    """Refuse points that coincide, coordinates that are not finite, and who is within a body.
 
     Parameters
     ----------
-    poses : (k, 3) [m, m, rad]
     ways : Ways
+        From the targets' centres.
     callers : sequence of Caller
+    extent : (t) [m]
+        Radius of each target; 0 of a point.
 
     Raises
     ------
     InputError
-        With the two that coincide, or are nowhere.
+        With the two that coincide, or are nowhere, or the body and who is within it.
     """
-    between = [ways.homeward]
+    between, within = [ways.homeward], [extent]
     for itself in range(ways.landmarks, ways.homeward.shape[1]):
         before = ways.target[:, :itself] - ways.target[:, itself : itself + 1]
         apart = np.hypot(before[..., 0], before[..., 1])
-        between.append(np.broadcast_to(apart, (len(poses), itself)))
-    paths = np.hstack(between)
-    nearest, farthest = paths.min(axis=1, initial=math.inf), paths.max(axis=1, initial=0.0)
-    good = (nearest > 0.0) & (farthest < math.inf) & np.isfinite(poses[:, 2])
+        between.append(np.broadcast_to(apart, (len(ways.poses), itself)))
+        within.append(extent[:itself])
+    paths, least = np.hstack(between), np.concatenate(within)
+    farthest, heading = paths.max(axis=1, initial=0.0), ways.poses[:, 2]
+    good = (paths > least).all(axis=1) & (farthest < math.inf) & np.isfinite(heading)
     if good.all():
         return
     bad, others = int(np.argmin(good)), [caller.name for caller in callers[VEHICLE + 1 :]]
+    pose = ways.poses[bad]
     names = [f"landmark {i}" for i in range(1, ways.landmarks + 1)] + others
     ends = [f"vehicle to {name}" for name in names]
     for itself, name in enumerate(others, start=ways.landmarks):
         ends += [f"{name} to {other}" for other in names[:itself]]
-    found = [f"{e}: {d} m" for e, d in zip(ends, paths[bad], strict=True) if not 0.0 < d < math.inf]
+    found = [
+        f"{end}: {path} m" + (f", within its radius of {radius} m" if radius else "")
+        for end, path, radius in zip(ends, paths[bad], least, strict=True)
+        if not radius < path < math.inf
+    ]
     raise InputError(
-        f"world around the pose {poses[bad]}: found {', '.join(found) or 'no finite heading'}; "
-        f"expected {', '.join(['vehicle', *others])} and landmarks at distinct, finite points; "
-        "move them apart (scenario.clearance keeps them so)"
+        f"world around the pose {pose}: found {', '.join(found) or 'no finite heading'}; "
+        f"expected {', '.join(['vehicle', *others])} and landmarks at distinct, finite points, and "
+        "nobody within a body; move them apart (scenario.clearance keeps them so)"
     )

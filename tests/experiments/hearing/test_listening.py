@@ -12,6 +12,7 @@ from pipistrelle.acoustics.arrivals import (
     through_piston,
 )
 from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of
+from pipistrelle.acoustics.target import Bodies
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
@@ -505,3 +506,19 @@ def test_a_path_that_does_not_fit_the_scenario_is_refused():
     boat = Caller(name="boat", frequency=25e3, level_db=42.8, place=np.zeros((8, 2)))
     with pytest.raises(InputError, match=r"caller boat: .*expected \(9, 2\)"):
         listen(replace(world, callers=(*world.callers, boat)), config, [0.0088])
+
+
+def test_echoes_of_a_trunk_are_labelled_and_measured_from_its_surface():
+    world, config = short(40)
+    trunk = np.arange(50) < 25
+    bodies = Bodies(radius=np.where(trunk, 0.3, np.nan), sphere=~trunk)
+    (heard,) = listen(replace(world, bodies=bodies), config, (0.0025,))
+    labels = np.concatenate([frame.rows.landmark for frame in heard])
+    ranges = np.concatenate([frame.rows.range for frame in heard])
+    step = np.repeat(range(4, 41, 4), [frame.rows.landmark.size for frame in heard])
+    own = np.isfinite(ranges) & (labels > 0) & (labels < BEACON)
+    offset = world.landmarks[labels[own] - 1] - world.path[step[own], :2]
+    nearer, sized = np.hypot(*offset.T) - ranges[own], trunk[labels[own] - 1]
+    assert min(sized.sum(), (~sized).sum()) > 10
+    assert nearer[sized].mean() == pytest.approx(0.3, abs=0.02)
+    assert nearer[~sized].mean() == pytest.approx(0.0, abs=0.02)

@@ -77,6 +77,13 @@ def crowd(seed):
     return detections(*zip(*rows, strict=True)), arrivals
 
 
+def test_where_a_body_hides_the_beacon_the_beacon_is_heard():
+    behind = [(30.0, 0.2, 1, landmark, -3.0) for landmark in (3, 7, 9)]
+    for nearer in (-1e-15, 0.0, 1e-15):  # what rounding makes of one way measured twice
+        ways = [(30.0 * (1.0 + nearer), *row[1:]) for row in behind[:2]] + behind[2:]
+        assert labels(detections((30.1, 0.22, 1, 0, 50.0)), true_arrivals(*ways)) == [9]
+
+
 def slow_labels(found, arrivals):
     """Match one by one, the strongest first, in plain words."""
     label, taken = [UNLABELLED] * found.face.size, set()

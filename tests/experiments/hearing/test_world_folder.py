@@ -1,5 +1,7 @@
 """Worlds as folders: what is written is read back to the bit, and what is wrong has a line."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -121,16 +123,34 @@ def test_bodies_go_with_the_numbers_of_their_landmarks(tmp_path):
     assert bodies.sphere.tolist() == [False, True]
 
 
-def test_bodies_that_are_not_told_are_the_settings(tmp_path):
+def test_only_a_body_whose_radius_is_stated_has_a_size_and_is_written_with_it(tmp_path):
     rows = "landmark,x,y,radius,shape\n1,0,1,0.2,\n2,0,2,,sphere\n3,0,3,,\n"
     folder = folder_with(
         tmp_path,
         landmarks_csv=rows,
         world_toml="format = 1\n[config.target]\nradius = 0.07\n",
     )
-    bodies = read_world(folder).bodies
-    assert bodies.radius.tolist() == [0.2, 0.07, 0.07]
-    assert bodies.sphere.tolist() == [False, True, False]
+    world = read_world(folder)
+    np.testing.assert_array_equal(world.bodies.radius, [0.2, np.nan, np.nan])
+    assert world.bodies.sphere.tolist() == [False, True, False]
+    drawn = world_of(Config(scenario=ScenarioConfig(steps=8)), 0, world)
+    written = world_files(drawn, Config())["landmarks.csv"].splitlines()
+    assert written[1:] == ["1,0.0,1.0,0.2,cylinder", "2,0.0,2.0,,sphere", "3,0.0,3.0,,cylinder"]
+
+
+def test_the_beacon_is_drawn_beside_bodies_that_have_a_size(tmp_path):
+    config, angles = Config(scenario=ScenarioConfig(steps=8)), np.arange(0.2, 6.1, 0.03)
+    ring = config.scenario.beacon_distance * np.column_stack((np.cos(angles), np.sin(angles)))
+    rows = [f"{i},{x},{y},0.3" for i, (x, y) in enumerate(ring.tolist(), 1)]
+    text = "\n".join(["landmark,x,y,radius", *rows, ""])
+    world = read_world(folder_with(tmp_path, landmarks_csv=text))
+    points = replace(world, bodies=None)
+    apart, before = (
+        np.hypot(*(one.landmarks - one.callers[1].place).T).min()
+        for one in (heard(config, world), heard(config, points))
+    )
+    assert before < 0.3
+    assert apart >= config.scenario.clearance
 
 
 def test_columns_say_what_a_path_is(tmp_path):

@@ -20,6 +20,9 @@ from pipistrelle.detection.snapshots import Detections
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel
 
+_TOGETHER = 1e-9
+"""Candidates as near as this, in squared gates, arrive together."""
+
 
 def label_detections(
     detections: Detections,
@@ -34,7 +37,9 @@ def label_detections(
 
     A true arrival of the same face and caller is a candidate if its delay and its bearing are
     within the gates and its level is not hopeless. The strongest detection chooses first, the
-    nearest candidate in units of the gates; each arrival is given once per face.
+    nearest candidate in units of the gates; each arrival is given once per face. What a body in the
+    way throws on arrives with the call itself, which is then the one that was heard: of candidates
+    that arrive together the last is chosen, and a caller's own call comes after its echoes.
 
     Parameters
     ----------
@@ -167,7 +172,7 @@ def _label(
             if abs(wrap_angle(true.bearing[a] - normal[face[d]])) > 0.5 * np.pi:
                 continue
             off = abs(wrap_angle(bearing[d] - true.bearing[a])) / gates.bearing
-            if off <= 1.0 and late * late + off * off < best:
+            if off <= 1.0 and late * late + off * off < best + _TOGETHER:
                 nearest, best = a, late * late + off * off
         if nearest >= 0:
             label[d] = true.landmark[nearest]

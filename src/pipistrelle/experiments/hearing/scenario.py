@@ -115,7 +115,7 @@ def draw_scenario(config: Config, rng: np.random.Generator, world: World = ANY) 
     path, controls = driven(course, setup, motion, rng, bias)
     given = config.callers is None and world.callers is not None
     told, first = world.callers if given else config.callers, deepcopy(rng)
-    beacon = np.zeros(2) if given else _place_beacon(setup, path[:, :2], rng)
+    beacon = np.zeros(2) if given else _place_beacon(setup, [path[:, :2], _sized(world)], rng)
     landmarks = world.landmarks
     if landmarks is None:
         callers = _places(told or ()) if given else beacon[np.newaxis]
@@ -275,15 +275,22 @@ def _places(callers: Sequence[CallerConfig]) -> Float[np.ndarray, "n 2"]:
     return np.array(places, dtype=float).reshape(-1, 2)
 
 
+def _sized(world: World) -> Float[np.ndarray, "n 2"]:
+    """Return where a world has bodies whose size is stated."""
+    if world.landmarks is None or world.bodies is None:
+        return np.empty((0, 2))
+    return world.landmarks[np.isfinite(world.bodies.radius)]
+
+
 def _place_beacon(
-    setup: ScenarioConfig, path: Float[np.ndarray, "k 2"], rng: np.random.Generator
+    setup: ScenarioConfig, clear_of: Sequence[Float[np.ndarray, "k 2"]], rng: np.random.Generator
 ) -> Float[np.ndarray, "2"]:
-    """Put the beacon at a random bearing, clear of the path."""
-    beacon = place_at(setup.beacon_distance, setup, rng, [path])
+    """Put the beacon at a random bearing, clear of the path and of bodies that have a size."""
+    beacon = place_at(setup.beacon_distance, setup, rng, clear_of)
     if beacon is not None:
         return beacon
     raise InputError(
         f"scenario.beacon_distance: found {setup.beacon_distance:g} m, but no bearing there is "
-        f"{setup.clearance:g} m clear of the path; expected a distance away from the path, or a "
+        f"{setup.clearance:g} m clear of the path and of bodies; expected another distance, or a "
         "smaller scenario.clearance"
     )

@@ -265,7 +265,7 @@ def world_files(scenario: Scenario, config: Config) -> dict[str, str]:
     columns = (scenario.time, *scenario.path.T, *controls.T)
     files = {
         "README.md": _README.format(controls=",".join(names)),
-        "landmarks.csv": _landmark_text(scenario, config.target),
+        "landmarks.csv": _landmark_text(scenario),
         "path.csv": table_text((*_POSE, *names), *columns),
     }
     callers = []
@@ -303,7 +303,7 @@ def _own_settings(config: Config) -> dict[str, Any]:
     }
 
 
-def _landmark_text(scenario: Scenario, usual: TargetConfig) -> str:
+def _landmark_text(scenario: Scenario) -> str:
     """Lay out the landmarks, with their bodies where these are their own."""
     numbers = np.arange(1, len(scenario.landmarks) + 1)
     text = table_text(("landmark", "x", "y"), numbers, *scenario.landmarks.T)
@@ -311,8 +311,9 @@ def _landmark_text(scenario: Scenario, usual: TargetConfig) -> str:
     if bodies is None:
         return text
     head, *rows = text.splitlines()
-    kinds = zip(rows, bodies.radius.tolist(), bodies.sphere.tolist(), strict=True)
-    lines = [f"{row},{radius!r},{_SHAPES[sphere]}" for row, radius, sphere in kinds]
+    radii = ["" if np.isnan(radius) else repr(radius) for radius in bodies.radius.tolist()]
+    kinds = zip(rows, radii, bodies.sphere.tolist(), strict=True)
+    lines = [f"{row},{radius},{_SHAPES[sphere]}" for row, radius, sphere in kinds]
     return "\n".join([f"{head},radius,shape", *lines, ""])
 
 
@@ -355,7 +356,7 @@ def _read_landmarks(
     if np.isnan(radius).all() and np.isnan(shape).all():
         return places, None
     sphere = np.where(np.isnan(shape), usual.shape == "sphere", shape == _SHAPES.index("sphere"))
-    return places, Bodies(radius=np.where(np.isnan(radius), usual.radius, radius), sphere=sphere)
+    return places, Bodies(radius=radius, sphere=sphere)
 
 
 def _is_header_alone(path: Path) -> bool:
