@@ -181,20 +181,21 @@ _WAYS = {
 
 
 class CallerConfig(Section):
-    """Someone else who calls, alike in all directions: from a place, or along a way."""
+    """Someone else who calls, from a place or along a way; but for vehicles in all directions."""
 
     name: Annotated[str, Field(pattern=r"^\w[\w-]*$", max_length=40)] | None = None
     """In messages, figures and files; else `beacon` of the first, `caller2` of the second."""
     frequency: Positive | None = None
     """Tone of the call [Hz], each caller's own; else, of the first, the beacon's."""
     level_db: Level | None = None
-    """Source level at 1 m [dB]; else the beacon's."""
+    """Source level at 1 m [dB]; else the beacon's, or, of a mission, the vehicle's."""
     place: Point | None = None
     """Where it stands, or a walk begins: x, y [m]."""
     distance: Positive | None = None
     """Else how far from the centre, the direction drawn [m]; else `scenario.beacon_distance`."""
     course: Literal["circle", "walk", "mission"] | None = None
-    """It circles, from a place that is drawn, walks at random, or maps the world as the vehicle."""
+    """It circles, from a place that is drawn, walks at random, or maps the world as the vehicle,
+    and calls through a piston like the vehicle's."""
     centre: Point | None = None
     """Of the circle: x, y [m]; else the origin."""
     radius: Positive | None = None

@@ -5,8 +5,8 @@ stood still until the last echo; of its motion, and of that of callers that move
 shift is kept.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -35,6 +35,7 @@ from pipistrelle.acoustics.ways import (
     ways_home,
 )
 from pipistrelle.config import AirConfig, Config
+from pipistrelle.geometry import wrap
 
 _DEEPEST_NULL = 1e-12
 
@@ -57,6 +58,9 @@ class Arrivals:
         Whose call it is, an index into the list of callers: VEHICLE, or from 1 on.
     landmark : (a)
         Label of what it comes from: landmark i (from 0) bears i + 1, caller j (from 1) n + j.
+    departure : (a) [rad], or None
+        Where it left another vehicle, relative to that one's heading; NaN of who calls alike in all
+        directions. None where there is no other vehicle.
     """
 
     delay: Float[np.ndarray, " a"]
@@ -65,6 +69,7 @@ class Arrivals:
     frequency: Float[np.ndarray, " a"]
     caller: Int8[np.ndarray, " a"]
     landmark: Int[np.ndarray, " a"]
+    departure: Float[np.ndarray, " a"] | None = None
 
 
 def arrivals_of_emission(
@@ -104,7 +109,8 @@ def arrivals_of_emission(
     Arrivals
         In this order: active echoes by label, those behind the baffle left out (the target
         strength is 0 dB: all come straight back); then for each other caller its passive echoes
-        by label, among them, under its own label, its direct call, which no target has weakened.
+        by label, among them, under its own label, its direct call, which no target has weakened;
+        of another vehicle those that left ahead of it, as `through_piston` takes them.
 
     Raises
     ------
@@ -197,12 +203,24 @@ def arrivals_of_emissions(
         surface = ways_by_surface(ways, j, extent)
         parts.append(_sounds_of(j, surface, callers[j], config, strength_db))
         emissions.append(np.repeat(np.arange(len(poses)), ways.homeward.shape[1]))
+        if (heading := callers[j].heading) is not None:
+            departure = _departures(j, surface, heading)
+            sent = in_front(departure)
+            parts[-1] = arrivals_at(replace(parts[-1], departure=departure), sent)
+            emissions[-1] = emissions[-1][sent]
     emission = np.concatenate(emissions)
     order = np.argsort(emission, kind="stable")
     columns = {
         name: np.concatenate([getattr(part, name) for part in parts]).take(order)
         for name in Arrivals.__slots__
+        if name != "departure"
     }
+    if any(part.departure is not None for part in parts):
+        alike = [np.full(part.delay.size, np.nan) for part in parts]
+        left = [
+            a if p.departure is None else p.departure for a, p in zip(alike, parts, strict=True)
+        ]
+        columns["departure"] = np.concatenate(left).take(order)
     return Arrivals(**columns), np.bincount(emission, minlength=len(poses))
 
 
@@ -263,14 +281,7 @@ def through_piston(
     level_db = arrivals.level_db.copy()
     decibels = 20.0 if off_axis == "pressure" else 10.0
     level_db[own] += decibels * np.log10(np.maximum(pressure, _DEEPEST_NULL))
-    return Arrivals(
-        delay=arrivals.delay,
-        level_db=level_db,
-        bearing=arrivals.bearing,
-        frequency=arrivals.frequency,
-        caller=arrivals.caller,
-        landmark=arrivals.landmark,
-    )
+    return replace(arrivals, level_db=level_db)
 
 
 def arrivals_at(arrivals: Arrivals, rows: Bool[np.ndarray, " a"] | slice) -> Arrivals:
@@ -292,6 +303,7 @@ def arrivals_at(arrivals: Arrivals, rows: Bool[np.ndarray, " a"] | slice) -> Arr
         frequency=arrivals.frequency[rows],
         caller=arrivals.caller[rows],
         landmark=arrivals.landmark[rows],
+        departure=None if arrivals.departure is None else arrivals.departure[rows],
     )
 
 
@@ -345,6 +357,55 @@ def _sounds_of(
         caller=np.full(path.size, j, dtype=np.int8),
         landmark=np.tile(np.arange(1, targets + 1), emissions),
     )
+
+
+def _departures(j: int, ways: Ways, heading: Float[np.ndarray, " k"]) -> Float[np.ndarray, " a"]:
+    """Return where the sounds of another vehicle left it, relative to its heading, by label."""
+    itself = ways.landmarks + j - 1
+    way = ways.target - ways.target[:, itself : itself + 1]
+    way[:, itself] = -ways.offset[:, itself]  # the direct call goes to the vehicle
+    return wrap(np.arctan2(way[..., 1], way[..., 0]) - heading[:, np.newaxis]).ravel()
+
+
+def through_pistons(
+    arrivals: Arrivals,
+    callers: Sequence[Caller],
+    beam: Callable[..., Arrivals],
+    *,
+    radius: float,
+    speed_of_sound: float,
+) -> Arrivals:
+    """What arrives when pistons of one radius send the calls of the vehicle and of other vehicles.
+
+    Parameters
+    ----------
+    arrivals : Arrivals
+        Of `arrivals_of_emission`.
+    callers : sequence of Caller
+        Of the same emission.
+    beam : callable
+        Gives the vehicle's call its directivity, as `through_piston` does; of another vehicle it is
+        handed the sounds as if they were echoes where they departed to.
+    radius : [m]
+    speed_of_sound : [m/s]
+
+    Returns
+    -------
+    Arrivals
+        The same rows in the same order; those of who calls alike in all directions as they were.
+    """
+    c, own = speed_of_sound, callers[VEHICLE].frequency
+    heard = beam(arrivals, radius=radius, frequency=own, speed_of_sound=c)
+    departure = arrivals.departure
+    if departure is None:
+        return heard
+    as_echoes = replace(arrivals, bearing=departure, caller=np.zeros_like(arrivals.caller))
+    level_db = heard.level_db.copy()
+    for j in np.unique(arrivals.caller[np.isfinite(departure)]):
+        rows, tone = arrivals.caller == j, callers[j].frequency
+        as_own = arrivals_at(as_echoes, rows)
+        level_db[rows] = beam(as_own, radius=radius, frequency=tone, speed_of_sound=c).level_db
+    return replace(heard, level_db=level_db)
 
 
 def _shifted(

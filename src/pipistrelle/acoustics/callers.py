@@ -1,9 +1,9 @@
 """Who calls: the vehicle itself, and whoever else it listens to.
 
-Callers are a list. The first is the vehicle, the only one that moves with the ears and whose call
-is given a beam; the others call alike in all directions, from a place or along a path. All call at
-once. Each has a tone of its own, by which its call is told from the rest. The paper's list is of
-two: the vehicle and the beacon.
+Callers are a list. The first is the vehicle, the only one that moves with the ears. Its call is
+given a beam, and so is that of other vehicles, which have a heading; the others call alike in all
+directions, from a place or along a path. All call at once. Each has a tone of its own, by which its
+call is told from the rest. The paper's list is of two: the vehicle and the beacon.
 
 A caller other than the vehicle is also a landmark: it reflects the calls of all but itself, and is
 heard directly in its own tone. Landmarks bear the labels 1 to n, caller j the label n + j.
@@ -42,6 +42,9 @@ class Caller:
         take it from the path.
     key : str
         Its section of the settings, where it has one: a refusal then names that.
+    heading : (t) [rad], or None
+        Where another vehicle's piston points, for each of the places; None of one that calls alike
+        in all directions.
     mission : (t, 3) [m, m, rad] and (t - 1, 2), or None
         Of one that maps the world, too: its poses, and its controls as it knows them.
     """
@@ -52,6 +55,7 @@ class Caller:
     place: Float[np.ndarray, "2"] | Float[np.ndarray, "t 2"] | None = None
     velocity: Float[np.ndarray, "2"] | Float[np.ndarray, "t 2"] | None = None
     key: str = ""
+    heading: Float[np.ndarray, " t"] | None = None
     mission: tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 2"]] | None = None
 
 
@@ -229,4 +233,5 @@ def _at(caller: Caller, time: Float[np.ndarray, " t"], steps: Int[np.ndarray, " 
         last = (path[steps] - path[steps - 1]) / (time[steps] - time[steps - 1])[:, np.newaxis]
     else:
         last = np.asarray(velocity)[steps]
-    return replace(caller, place=path[steps], velocity=last)
+    heading = None if caller.heading is None else caller.heading[steps]
+    return replace(caller, place=path[steps], velocity=last, heading=heading)

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from pipistrelle.acoustics.arrivals import arrivals_of_emissions, through_piston, through_pistons
 from pipistrelle.acoustics.callers import callers_at, moves
+from pipistrelle.acoustics.emitter import piston_directivity
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import CallerConfig, Config, InputError, MotionConfig, ScenarioConfig
 from pipistrelle.experiments.hearing import others
@@ -18,6 +20,7 @@ from pipistrelle.experiments.hearing.scenario import (
     world_of,
 )
 from pipistrelle.experiments.runs.trial import drive_of
+from pipistrelle.geometry import wrap
 from pipistrelle.settings import from_flags, resolve
 
 SEEDS = range(6)
@@ -297,6 +300,16 @@ def seen_by(vehicle, config=PAIR):
     return world_of(config.model_copy(update={"scenario": setup}))
 
 
+def heard_at(world, radius, k=4):
+    """What arrives after the first call, all pistons of one radius."""
+    callers = callers_at(world.callers, world.time, np.array([k]))
+    speed = (world.path[k] - world.path[k - 1])[None, :2] / PAIR.scenario.step
+    poses = world.path[k][None]
+    heard, _ = arrivals_of_emissions(poses, speed, world.landmarks, callers, PAIR)
+    c = PAIR.air.celerity
+    return through_pistons(heard, callers, through_piston, radius=radius, speed_of_sound=c)
+
+
 def test_a_mission_is_driven_as_the_vehicle_drives_clear_of_all():
     world = seen_by(1)
     alone = world_of(PAIR.model_copy(update={"callers": None}))
@@ -322,10 +335,47 @@ def test_two_vehicles_are_in_one_world_each_the_others_caller():
     np.testing.assert_array_equal(second.path, first.callers[1].mission[0])
     np.testing.assert_array_equal(second.callers[1].place, first.path[:, :2])
     np.testing.assert_array_equal(second.callers[1].mission[0], first.path)
-    assert [c.frequency for c in second.callers] == [c.frequency for c in first.callers]
+    for view, turn in ((first, 1), (second, -1)):  # whose call it is, whoever hears it
+        assert [c.frequency for c in view.callers] == [35e3, 30e3][::turn]
+        assert [c.level_db for c in view.callers] == [PAIR.emitter.level_db] * 2
     drive = drive_of(second, PAIR)
     np.testing.assert_array_equal(drive.truth.path, second.path)
     np.testing.assert_array_equal(drive.truth.callers[21], first.path[:, :2])
+
+
+@pytest.mark.parametrize("hearing", [1, 2])
+def test_a_vehicles_call_is_the_same_to_itself_and_to_the_other(hearing):
+    """What left towards a landmark, by its echo at home and by that which the other hears."""
+    seen = {vehicle: seen_by(vehicle) for vehicle in (1, 2)}
+    sent = {v: heard_at(world, radius=0.0088) for v, world in seen.items()}
+    plain = {v: heard_at(world, radius=1e-6) for v, world in seen.items()}
+    home = 3 - hearing
+    lost = {}  # to the beam, by who hears it and the landmark
+    for v, caller in ((home, 0), (hearing, 1)):
+        own = (sent[v].caller == caller) & (sent[v].landmark <= 20)
+        gone = sent[v].level_db[own] - plain[v].level_db[own]
+        lost[v] = dict(zip(sent[v].landmark[own].tolist(), gone.tolist(), strict=True))
+    assert lost[hearing].keys() == lost[home].keys(), "nothing leaves behind the baffle"
+    assert 3 < len(lost[home]) < 17
+    for landmark, level in lost[home].items():
+        assert lost[hearing][landmark] == pytest.approx(level, abs=1e-9)
+    assert min(lost[home].values()) < -10.0 < max(lost[home].values())
+
+
+def test_a_direct_call_comes_through_the_piston_that_sends_it():
+    world = seen_by(1)
+    heard, plain = heard_at(world, radius=0.0088), heard_at(world, radius=1e-6)
+    mate, k = world.callers[1], 4
+    x, y = world.path[k, :2] - mate.place[k]
+    off = wrap(np.arctan2(y, x) - mate.heading[k])
+    direct = heard.landmark == 21
+    assert direct[heard.caller == 1].any() == (abs(off) < np.pi / 2)
+    assert np.any(heard.caller == 1)
+    gain = 20 * np.log10(
+        piston_directivity(off, frequency=30e3, radius=0.0088, speed_of_sound=PAIR.air.celerity)
+    )
+    gained = (heard.level_db - plain.level_db)[direct & (heard.caller == 1)]
+    np.testing.assert_allclose(gained, gain, atol=1e-6)
 
 
 def test_each_of_two_vehicles_has_noise_of_its_own():

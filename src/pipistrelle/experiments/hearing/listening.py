@@ -22,6 +22,7 @@ from pipistrelle.acoustics.arrivals import (
     arrivals_at,
     arrivals_of_emissions,
     through_piston,
+    through_pistons,
 )
 from pipistrelle.acoustics.callers import VEHICLE, callers_at
 from pipistrelle.arithmetic.random_stream import stream_key
@@ -196,11 +197,8 @@ def _emissions(
             poses, velocities, scenario.landmarks, callers, config, scenario.bodies
         )
         aimed = [
-            beam(
-                emission,
-                radius=radius,
-                frequency=callers[VEHICLE].frequency,
-                speed_of_sound=config.air.celerity,
+            through_pistons(
+                emission, callers, beam, radius=radius, speed_of_sound=config.air.celerity
             )
             for radius in radii
         ]
@@ -237,18 +235,18 @@ def _heard(time: float, detections: Detections, arrivals: Arrivals, rig: _Rig) -
 
 def _blocks(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[Detections]:
     """Yield, per beam, what is detected of its arrivals from block sums."""
-    layout, settled, space = rig.layout, rig.sampling, rig.workspace
-    pulse, own = settled.pulse, np.count_nonzero(aimed[0].caller == VEHICLE)  # they come first
+    layout, settled, space, pulse = rig.layout, rig.sampling, rig.workspace, rig.sampling.pulse
+    own, others = _parted(aimed[0])
     shape = block_shape(blocks_to_hear(aimed[0], settled), layout, settled)
     shared = noise_blocks(shape[0], layout, settled, key, out=space.array("shared", shape))
-    add_echo_blocks(shared, arrivals_at(aimed[0], slice(own, None)), layout, settled)
+    add_echo_blocks(shared, arrivals_at(aimed[0], others), layout, settled)
     lags = (shape[0] - pulse + 1, *shape[1:])
     for left, arrivals in zip(range(len(aimed) - 1, -1, -1), aimed, strict=True):
         signal = shared
         if left:  # the last beam may write on what it shares
             signal = space.array("signal", shape)
             np.copyto(signal, shared)
-        add_echo_blocks(signal, arrivals_at(arrivals, slice(own)), layout, settled)
+        add_echo_blocks(signal, arrivals_at(arrivals, own), layout, settled)
         matched = filter_blocks(
             signal,
             pulse=pulse,
@@ -257,6 +255,15 @@ def _blocks(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[Detectio
             out=space.array("matched", lags),
         )
         yield rig.find(matched, rig.detector, start=pulse * BLOCK, interval=BLOCK, pulse=pulse)
+
+
+def _parted(arrivals: Arrivals) -> tuple[slice | np.ndarray, slice | np.ndarray]:
+    """Tell the rows that go through a piston from those that all beamwidths share."""
+    if arrivals.departure is None:
+        own = np.count_nonzero(arrivals.caller == VEHICLE)  # they come first
+        return slice(own), slice(own, None)
+    beamed = (arrivals.caller == VEHICLE) | np.isfinite(arrivals.departure)
+    return beamed, ~beamed
 
 
 def _dense(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[Detections]:

@@ -187,15 +187,17 @@ def callers_among(
                 f"callers.{j}.frequency: found none, expected a tone of its own{free}; give one, "
                 "for only the first may have the beacon's"
             )
-        level_db = beacon.level_db if one.level_db is None else one.level_db
+        usual = around.config.emitter if one.way == "mission" else beacon
+        level_db = usual.level_db if one.level_db is None else one.level_db
         caller = Caller(name=name, frequency=frequency, level_db=level_db, key=f"callers.{j}")
         _check_speed(caller.key, one, around.config)
         is_beacon = first is not None and j == 1 and one.distance is None
         taken = [] if is_beacon and one.way == "stand" else [around.landmarks, _standing(callers)]
         if one.way == "mission":
             found = _mission(around, taken, stream)
-            caller = replace(caller, mission=found)
             place = None if found is None else found[0][:, :2]
+            heading = None if found is None else found[0][:, 2]
+            caller = replace(caller, mission=found, heading=heading)
         else:
             place = _WAYS[one.way](one, around, taken, stream)
         if place is None:

@@ -138,7 +138,10 @@ def draw_scenario(config: Config, rng: np.random.Generator, world: World = ANY) 
 
 
 def _mission_of(world: Scenario, vehicle: int) -> Scenario:
-    """Return a world as another vehicle in it has it, by its number: the first is its caller."""
+    """Return a world as another vehicle in it has it, by its number: the first is its caller.
+
+    Each keeps its own tone and level.
+    """
     if vehicle == 1:
         return world
     others = [j for j, caller in enumerate(world.callers) if caller.mission is not None]
@@ -148,11 +151,22 @@ def _mission_of(world: Scenario, vehicle: int) -> Scenario:
             'mission; expected one of them, or more callers with course = "mission"'
         )
     j = others[vehicle - 2]
-    path, controls = world.callers[j].mission or (world.path, world.controls)
-    mission = world.path, world.controls
-    first = replace(world.callers[j], place=world.path[:, :2], mission=mission)
-    callers = tuple(first if k == j else caller for k, caller in enumerate(world.callers))
-    return replace(world, path=path, controls=controls, callers=callers)
+    one, other = world.callers[VEHICLE], world.callers[j]
+    path, controls = other.mission or (world.path, world.controls)
+    callers = list(world.callers)
+    callers[VEHICLE] = replace(
+        one, frequency=other.frequency, level_db=other.level_db, key=other.key
+    )
+    callers[j] = replace(
+        other,
+        frequency=one.frequency,
+        level_db=one.level_db,
+        key=one.key,
+        place=world.path[:, :2],
+        heading=world.path[:, 2],
+        mission=(world.path, world.controls),
+    )
+    return replace(world, path=path, controls=controls, callers=tuple(callers))
 
 
 def landmark_count(scenario: Scenario) -> int:
