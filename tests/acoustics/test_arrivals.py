@@ -442,20 +442,18 @@ def test_echoes_of_bodies_come_by_the_least_way_over_their_surface(seed):
     assert checked > 40
 
 
-def test_among_bodies_many_emissions_bring_bit_for_bit_what_each_brings_alone():
-    poses, velocities, places, callers, config, bodies = orchard(0, 4)
+@pytest.mark.parametrize("seed", range(3))
+def test_among_bodies_many_emissions_bring_bit_for_bit_what_each_brings_alone(seed):
+    poses, velocities, places, callers, config, bodies = orchard(seed, 6)
     heard, count = arrivals_of_emissions(poses, velocities, places, callers, config, bodies)
-    rows = np.repeat(np.arange(4), count)
-    for k in range(4):
-        boat = callers[BEACON]
-        boat = replace(boat, place=boat.place[[k]], velocity=boat.velocity[[k]])
-        alone, _ = arrivals_of_emissions(
-            poses[[k]], velocities[[k]], places, (callers[VEHICLE], boat), config, bodies
-        )
+    rows, (vehicle, boat) = np.repeat(np.arange(6), count), callers
+    for k in range(6):
+        now = replace(boat, place=boat.place[[k]], velocity=boat.velocity[[k]])
+        at = poses[[k]], velocities[[k]], places, (vehicle, now), config
+        alone, _ = arrivals_of_emissions(*at, bodies)
+        among = arrivals_at(heard, rows == k)
         for name in COLUMNS:
-            assert getattr(arrivals_at(heard, rows == k), name).tobytes() == (
-                getattr(alone, name).tobytes()
-            )
+            assert getattr(among, name).tobytes() == getattr(alone, name).tobytes()
 
 
 def test_nothing_jumps_where_a_body_comes_between_beacon_and_vehicle():

@@ -70,3 +70,15 @@ def test_a_point_is_its_own_to_the_bit():
     source, receiver = centre[:, 3:4], np.ones((4, 1, 2))
     found = reflecting_points(source, receiver, centre, np.zeros(5))
     assert found.tobytes() == np.broadcast_to(centre, (4, 5, 2)).tobytes()
+
+
+def test_a_point_hangs_on_no_other_body_or_emission_by_a_bit():
+    rng = np.random.default_rng(7)
+    centre, radius = rng.uniform(-9.0, 9.0, (1, 200, 2)), rng.uniform(0.05, 0.6, 200)
+    source, receiver = np.full((1, 1, 2), 12.0), rng.uniform(-13.0, -10.0, (5, 1, 2))
+    together = reflecting_points(source, receiver, centre, radius)
+    for k in range(5):
+        for t in range(200):
+            here = source, receiver[k : k + 1], centre[:, t : t + 1]
+            alone = reflecting_points(*here, radius[t : t + 1])
+            assert alone.tobytes() == together[k, t].tobytes()
