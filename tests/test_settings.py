@@ -300,7 +300,7 @@ able = st.floats(min_value=1e-9, max_value=1e9)
 def test_settings_written_as_toml_read_back_bit_for_bit(tmp_path_factory, seed, bounds, start):
     config = Config(
         seed=seed,
-        scenario=ScenarioConfig(start=start, speed=-start[0]),
+        scenario=ScenarioConfig(start=start),
         rays=RayConfig(range_bounds=bounds, weights="aggregated"),
     )
     path = written(tmp_path_factory.getbasetemp(), to_toml(config))

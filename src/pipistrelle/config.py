@@ -21,6 +21,16 @@ from pydantic import (
 
 LARGEST = 1e9
 """No setting needs more of its unit, nor its inverse less: what is squared stays a number."""
+FARTHEST = 1e6
+"""No range, detour or step of a vehicle is longer [m], nor any less sure."""
+FASTEST = 1e4
+"""No vehicle is faster [m/s]."""
+WIDEST = 1e4
+"""No vehicle steers by more [rad] or turns faster [rad/s], nor is a bearing less sure [rad]."""
+LONGEST_STEP = 1e5
+"""No control step is longer [s]: more than a day."""
+LEAST_STD = 1e-6
+"""No measurement is surer [m] or [rad]: beside the other numbers its variance would be lost."""
 
 
 def _not_tiny(value: float) -> float:
@@ -33,6 +43,8 @@ def _not_tiny(value: float) -> float:
 Real = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(gt=0, le=LARGEST), AfterValidator(_not_tiny)]
 NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
+DistanceStd = Annotated[float, Field(ge=LEAST_STD, le=FARTHEST)]
+AngleStd = Annotated[float, Field(ge=LEAST_STD, le=WIDEST)]
 Count = Annotated[int, Field(ge=1, lt=2**63)]
 Level = Annotated[float, Field(ge=-300, le=300)]
 Probability = Annotated[float, Field(gt=0, le=1)]
@@ -81,13 +93,13 @@ class ScenarioConfig(Section):
     """Folder of a world of one's own; what it leaves open is drawn as the rest says."""
     steps: Count = 1500
     """Control steps."""
-    step: Positive = 0.125
+    step: Annotated[Positive, Field(le=LONGEST_STEP)] = 0.125
     """Length of a control step [s]."""
     steps_per_frame: Count = 4
     """Control steps between two emissions."""
-    speed: Real = 0.75
+    speed: Annotated[float, Field(ge=-FASTEST, le=FASTEST)] = 0.75
     """Nominal speed [m/s]."""
-    steering: Real = 0.027
+    steering: Annotated[float, Field(ge=-WIDEST, le=WIDEST)] = 0.027
     """Nominal steering angle [rad]."""
     start: tuple[Real, Real, Real] = (0.0, -7.408, 0.0)
     """True start: x, y [m], heading [rad]; unreported: the noise-free path circles the centre."""
@@ -357,11 +369,11 @@ class FilterConfig(Section):
 
     noise: Literal["constant", "measured"] = "constant"
     """The next three for every row (the paper's), or what the signal or a log tells of each."""
-    range_std: Positive = 0.2
+    range_std: DistanceStd = 0.2
     """Noise of a range [m]."""
-    bearing_std: Positive = 0.15
+    bearing_std: AngleStd = 0.15
     """Noise of a bearing [rad]."""
-    detour_std: Positive = 0.4
+    detour_std: DistanceStd = 0.4
     """Noise of a detour [m]: of a way, twice what the same delay is of a range."""
     caller_speed_std: Positive = 1.0
     """Velocity along an axis of a caller that moves, before anything is known of it [m/s]."""

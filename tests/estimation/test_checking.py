@@ -14,6 +14,7 @@ from pipistrelle.estimation.catalogue import CATALOGUE, entry
 from pipistrelle.estimation.motion import Motion
 from reference.missions import BICYCLE, START, scan_of
 
+UNICYCLE = Motion(model="unicycle", control_std=(0.1, 0.1))
 POSES = Motion(model="poses", control_std=(0.005, 0.003, 0.006))
 SCAN = scan_of((3, 5.0, 0.3), (8, np.nan, 1.0))
 TIMED = make_scan(
@@ -70,7 +71,12 @@ def poses(place, value):
         (BICYCLE, [["0.1", "0.2"]], [0.2], "expected numbers: a row of 2 controls"),
         (BICYCLE, None, None, "found controls of object"),
         (BICYCLE, [[0.1, np.nan]], [0.2], r"found the controls \[\[0.1, nan\]\] during \[0.2\] s"),
-        (BICYCLE, [[1e10, 0.0]], [0.2], r"expected numbers up to 1e\+09 and times above 0"),
+        (BICYCLE, [[2e4, 0.0]], [0.2], "a speed up to 10000 m/s, an angle up to 10000 rad"),
+        (BICYCLE, [[0.1, -2e4]], [0.2], "a speed up to 10000 m/s, an angle up to 10000 rad"),
+        (UNICYCLE, [[0.1, 2e4]], [0.2], "a rate up to 10000 rad/s"),
+        (POSES, poses(0, 2e6), [0.2], r"moves up to 1e\+06 m and a turn up to 10000 rad"),
+        (POSES, poses(2, 2e4), [0.2], "a turn up to 10000 rad"),
+        (BICYCLE, [[0.1, 0.0]], [1e9], "times above 0, up to 100000 s"),
         (BICYCLE, [[0.1, 0.0]], [0.0], "times above 0"),
         (BICYCLE, [[0.1, 0.0]], [np.inf], "times above 0"),
         (POSES, poses(3, np.nan), [0.2], "perhaps with a covariance: all six numbers, or NaN"),
@@ -118,10 +124,12 @@ def raw(**columns):
         (with_columns(SCAN, bearing=np.array([np.nan, 1.0])), r"can use, for the landmarks \[3\]"),
         (with_columns(SCAN, bearing=np.array([np.inf, 1.0])), "numbers that no filter can use"),
         (with_columns(SCAN, range=0.0), r"can use, for the landmarks \[3, 8\]"),
-        (with_columns(SCAN, range=1e10), "numbers that no filter can use"),
+        (with_columns(SCAN, range=2e6), "numbers that no filter can use"),
         (with_columns(TIMED, detour=np.nan), r"can use, for the landmarks \[8\]"),
         (with_columns(SCAN, bearing_std=np.nan), r"no standard deviations .* \[3, 8\]"),
-        (with_columns(SCAN, range_std=0.0), r"no standard deviations above 0 for .* \[3\]"),
+        (with_columns(SCAN, range_std=1e-7), r"deviations from 1e-06 on for .* \[3\]"),
+        (with_columns(SCAN, bearing_std=2e4), "bearing_std up to 10000 rad"),
+        (with_columns(SCAN, range_std=2e6), r"detour_std up to 1e\+06 m"),
         (with_columns(TIMED, detour_std=np.inf), "no standard deviations"),
     ],
 )

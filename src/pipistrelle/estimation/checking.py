@@ -12,7 +12,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.config import LARGEST, InputError
+from pipistrelle.config import (
+    FARTHEST,
+    FASTEST,
+    LARGEST,
+    LEAST_STD,
+    LONGEST_STEP,
+    WIDEST,
+    InputError,
+)
 from pipistrelle.detection.merging import labelled, settled
 from pipistrelle.detection.scans import (
     BEARING,
@@ -34,8 +42,19 @@ FLOAT, INTEGER = np.dtype(np.float64), np.dtype(np.int64)
 ARRAY = np.ndarray
 WHOLES = ("landmark", "caller", "callers", "moving")
 """Columns of a scan that hold whole numbers."""
-LEAST_STD = 1e-12
-"""Least standard deviation [m] or [rad]: the square of a smaller one is lost beside any other."""
+MOST = {
+    "bicycle": ((FASTEST, WIDEST), f"a speed up to {FASTEST:g} m/s, an angle up to {WIDEST:g} rad"),
+    "unicycle": (
+        (FASTEST, WIDEST),
+        f"a speed up to {FASTEST:g} m/s, a rate up to {WIDEST:g} rad/s",
+    ),
+    "poses": (
+        (FARTHEST, FARTHEST, WIDEST),
+        f"moves up to {FARTHEST:g} m and a turn up to {WIDEST:g} rad, perhaps with a covariance: "
+        "all six numbers, or NaN",
+    ),
+}
+"""Largest controls of each motion model, in numbers and in words."""
 MOST_LABELS = 2**53
 """Labels are below it, as those of a log."""
 INDEFINITE = 1e-6
@@ -48,11 +67,11 @@ WORDS = {
     "another",
     TWICE: "two bearings by one call for the landmarks {}; expected one",
     NO_NUMBER: "numbers that no filter can use, for the landmarks {}; expected finite bearings "
-    f"[rad] and ranges above 0 [m], NaN where passive, all up to {LARGEST:g}; a row without a "
-    "bearing has a detour [m] alone",
-    UNSTATED: "no standard deviations above 0 for the landmarks {}; expected bearing_std [rad], "
-    "and range_std and detour_std [m] where there are such, as pipistrelle.detection.noise states "
-    "them",
+    f"[rad] and ranges above 0 [m], NaN where passive, up to {FARTHEST:g}; a row without a bearing "
+    "has a detour [m] alone",
+    UNSTATED: f"no standard deviations from {LEAST_STD:g} on for the landmarks {{}}; expected "
+    f"bearing_std up to {WIDEST:g} rad, and range_std and detour_std up to {FARTHEST:g} m where "
+    "there are such, as pipistrelle.detection.noise states them",
 }
 """What is wrong with rows of a scan; in place of {} stand their labels."""
 
@@ -126,12 +145,11 @@ def usable_controls(
             f"expected numbers: a row of {' or '.join(map(str, widths))} controls for each step of "
             f"a {motion.model} model, and as many times"
         )
-    if not _are_steps(steps, times, poses):
+    most, words = MOST[motion.model]
+    if not _are_steps(steps, times, most, poses):
         raise InputError(
             f"predict: found the controls {steps.tolist()} during {times.tolist()} s, expected "
-            f"numbers up to {LARGEST:g} and times above 0"
-            + ", perhaps with a covariance: all six numbers, or NaN"
-            * poses
+            f"times above 0, up to {LONGEST_STEP:g} s, and {words}"
         )
     return steps, times
 
@@ -274,13 +292,13 @@ def _fault_of_row(
     silent = math.isnan(bearing)
     if silent and (math.isnan(detour) or not math.isnan(distance)):
         return NO_NUMBER
-    if abs(bearing) > LARGEST or distance <= 0.0 or distance > LARGEST or abs(detour) > LARGEST:
+    if abs(bearing) > LARGEST or distance <= 0.0 or distance > FARTHEST or abs(detour) > FARTHEST:
         return NO_NUMBER
-    if not (silent or _is_std(numbers[BEARING_STD, m])):
+    if not (silent or LEAST_STD <= numbers[BEARING_STD, m] <= WIDEST):
         return UNSTATED
-    if not (math.isnan(distance) or _is_std(numbers[RANGE_STD, m])):
+    if not (math.isnan(distance) or LEAST_STD <= numbers[RANGE_STD, m] <= FARTHEST):
         return UNSTATED
-    if not (math.isnan(detour) or _is_std(numbers[DETOUR_STD, m])):
+    if not (math.isnan(detour) or LEAST_STD <= numbers[DETOUR_STD, m] <= FARTHEST):
         return UNSTATED
     for other in range(0 if silent or landmark[m] == UNLABELLED else m):
         again = landmark[other] == landmark[m] and caller[other] == caller[m]
@@ -290,21 +308,18 @@ def _fault_of_row(
 
 
 @kernel
-def _is_std(value: float) -> Flag:
-    """Whether a number is a standard deviation."""
-    return LEAST_STD <= value <= LARGEST
-
-
-@kernel
 def _are_steps(
-    steps: Float[np.ndarray, "k c"], times: Float[np.ndarray, " k"], poses: Flag
+    steps: Float[np.ndarray, "k c"],
+    times: Float[np.ndarray, " k"],
+    most: tuple[float, ...],
+    poses: Flag,
 ) -> Flag:
     """Whether these are control steps."""
     for k in range(times.size):
-        if not 0.0 < times[k] <= LARGEST:
+        if not 0.0 < times[k] <= LONGEST_STEP:
             return False
-        for c in range(min(steps.shape[1], MOVED)):
-            if not abs(steps[k, c]) <= LARGEST:
+        for c in range(len(most)):
+            if not abs(steps[k, c]) <= most[c]:
                 return False
         said = poses and steps.shape[1] > MOVED and not np.isnan(steps[k, MOVED:]).all()
         if said and not is_covariance(steps[k, MOVED:]):

@@ -342,7 +342,7 @@ def test_rows_of_clutter_may_be_of_one_time(tmp_path):
 
 ROWS = {
     "unsquarable": ("0.1,7,1e155,1", "line 3", "bearing 1e+155", "between -1e+09 and 1e+09"),
-    "far": ("0.1,7,0.5,1e10", "line 3", "range 10000000000.0", "up to 1e+09 m"),
+    "far": ("0.1,7,0.5,1e10", "line 3", "range 10000000000.0", "up to 1e+06 m"),
     "no clutter": ("0.1,-2,0.5,1", "line 3", "landmark -2.0", "from 0 on, or -1 for clutter"),
     "missing field": ("0.1,7,0.5", "line 3", "3 fields", "4: time, landmark, bearing, range"),
     "extra field": ("0.1,7,0.5,1,2", "line 3", "5 fields", "4"),
@@ -374,7 +374,7 @@ STATING_ROWS = {
     "no bearing std": ("0.1,7,0.5,1,0,1", "line 3", "bearing_std 0.0", "from 1e-06 rad"),
     "no range std": ("0.1,7,0.5,1,1,0", "line 3", "range_std 0.0", "a range_std from 1e-06 m"),
     "negative": ("0.1,7,0.5,1,-0.1,1", "line 3", "bearing_std -0.1", "a bearing_std from 1e-06"),
-    "large": ("0.1,7,0.5,1,0.1,1e10", "line 3", "range_std 10000000000.0", "up to 1e+09 m"),
+    "large": ("0.1,7,0.5,1,0.1,1e10", "line 3", "range_std 10000000000.0", "up to 1e+06 m"),
     "small": ("0.1,7,0.5,1,1e-155,1", "line 3", "bearing_std 1e-155", "from 1e-06 rad"),
     "vague": ("0.1,7,0.5,1,2e4,1", "line 3", "bearing_std 20000.0", "up to 10000 rad"),
     "beside no range": ("0.1,7,0.5,,0.1,-1", "line 3", "range_std -1.0", "from 1e-06 m"),
@@ -422,6 +422,9 @@ def test_a_file_of_wrong_rows_alone_is_refused_too(tmp_path, row):
         ("0.5,,0", ("line 6", "velocity ''")),
         ("0.5,nan,0", ("line 6", "velocity 'nan'")),
         ("0.35,1,0", ("line 6", "time 0.35 after 0.4", "backwards")),
+        ("0.5,2e4,0", ("line 6", "velocity 20000.0", "from -10000 m/s, up to 10000 m/s")),
+        ("0.5,1,-2e4", ("line 6", "angular_rate -20000.0", "from -10000 rad/s")),
+        ("2e5,1,0", ("line 6", "200000.0 after 0.4", "100000 s apart", "`step` in log.toml")),
     ],
 )
 def test_a_bad_odometry_row_is_refused_by_its_line(tmp_path, row, parts):
@@ -493,7 +496,7 @@ def test_no_column_goes_before_the_four(tmp_path, stated):
         ("range_std = 0.2", "range_std = 0.2\ncolour = 3", ("unknown key 'colour'", "remove it")),
         ("format = 1", "format = 2", ("key 'format': found 2", "expected 1")),
         ('"unicycle"', '"tricycle"', ("'tricycle'", "expected 'unicycle', 'bicycle' or 'poses'")),
-        ("range_std = 0.2", "range_std = -0.2", ("'range_std': found -0.2", "greater than 0")),
+        ("range_std = 0.2", "range_std = -0.2", ("'range_std': found -0.2", "equal to 0.000001")),
         ("range_std = 0.2", "range_std = nan", ("'range_std': found nan", "finite number")),
         ("range_std = 0.2", 'range_std = "0.2"', ("'range_std': found '0.2'", "valid number")),
         ("range_std = 0.2", "range_std = true", ("'range_std': found True", "valid number")),
@@ -508,7 +511,7 @@ def test_no_column_goes_before_the_four(tmp_path, stated):
         ("range_std = 0.2", "range_std = 0.2\ngate = 1.5", ("'gate': found 1.5", "equal to 1")),
         ("range_std = 0.2", "range_std = ", ("TOML", "line 7")),
         ("range_std = 0.2", "range_std = 1e155", ("'range_std': found 1e+155", "less than")),
-        ("range_std = 0.2", "range_std = 1e-155", ("'range_std': found 1e-155", "at least 1e-09")),
+        ("range_std = 0.2", "range_std = 1e-155", ("'range_std': found 1e-155", "equal to 0.000001")),
         ("[1.0, -2.0", "[1e300, -2.0", ("'initial_pose[0]': found 1e+300", "less than")),
         ("range_std = 0.2", "range_std = " + "[" * 5000, ("more than 8 levels", "mend the file")),
         ("range_std = 0.2", "range_std = " + "2" * 5000, ("integer of many digits", "64 bits")),
@@ -795,7 +798,7 @@ def test_detours_and_callers_survive_being_written(tmp_path):
     assert "A detour [m] is" in (tmp_path / "again" / "drive" / "README.md").read_text()
 
 
-NUMBER = st.floats(-1e6, 1e6)
+NUMBER = st.floats(-1e4, 1e4)
 ANGLE = st.floats(-np.pi, np.pi, exclude_max=True)
 LABEL = st.integers(0, 2**53 - 1)
 RANGE = st.floats(1e-9, 1e6) | st.just(np.nan)

@@ -337,6 +337,7 @@ def test_what_is_no_covariance_is_refused_by_its_line(tmp_path, row, parts):
         ("0.5,,2,0", ("line 6", "x ''")),
         ("0.5,nan,2,0", ("line 6", "x 'nan'")),
         ("0.5,1e12,2,0", ("line 6", "x 1000000000000.0", "between -1e+09 and 1e+09")),
+        ("0.5,2e6,1,3", ("line 6", "x, y [2000000.0, 1.0] after", "at most 1e+06 m between")),
         ("0.35,1,2,0", ("line 6", "time 0.35 after 0.4", "backwards")),
         ("0.5,5,1,-179.0", ("line 6", "heading -179.0 after 3.0", "write radians")),
         ("0.5,5,1,9.5", ("line 6", "heading 9.5 after 3.0", "at most a turn between two rows")),

@@ -12,7 +12,10 @@ import numpy as np
 from pydantic import ConfigDict, Field, ValidationError, field_validator
 
 from pipistrelle.config import (
+    LONGEST_STEP,
     MOST_OTHERS,
+    AngleStd,
+    DistanceStd,
     InputError,
     NonNegative,
     Positive,
@@ -101,11 +104,11 @@ class _Settings(Section):
     motion: Literal["unicycle", "bicycle", "poses"]
     initial_pose: _Triple
     initial_pose_std: _Triple_std
-    range_std: Positive
-    bearing_std: Positive
-    detour_std: Positive | None = None
+    range_std: DistanceStd
+    bearing_std: AngleStd
+    detour_std: DistanceStd | None = None
     range_bounds: _Bounds
-    step: Positive | None = None
+    step: Annotated[Positive, Field(le=LONGEST_STEP)] | None = None
     gate: Probability | None = None
     noise_at_rest: bool = True
     callers: Annotated[tuple[_CallerTable, ...], Field(strict=False, max_length=MOST_OTHERS)] = ()

@@ -16,6 +16,7 @@ that is cut gives each part its share by time.
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipistrelle.config import FARTHEST
 from pipistrelle.detection.logs.text_tables import Table
 from pipistrelle.geometry import wrap
 from pipistrelle.refusals import refusal
@@ -52,7 +53,8 @@ def motions_between(odometry: Table, time: Float[np.ndarray, " t"]) -> Float[np.
     Raises
     ------
     InputError
-        With the line: of a heading that can be no radians, of a covariance that is none.
+        With the line: of a heading that can be no radians, a place too far from the one before,
+        a covariance that is none.
 
     Examples
     --------
@@ -66,7 +68,7 @@ def motions_between(odometry: Table, time: Float[np.ndarray, " t"]) -> Float[np.
     """
     stamp = odometry.column["time"]
     poses = np.column_stack([odometry.column[name] for name in POSE])
-    _check_headings(odometry)
+    _check_ways(odometry, poses)
     stated = _covariances(odometry)
     last = np.append(np.diff(stamp) > 0.0, True)
     ends = _at_rows(time, stamp[last])
@@ -229,8 +231,8 @@ def _step_covariances(
     return total
 
 
-def _check_headings(odometry: Table) -> None:
-    """Refuse headings of which one is more than a turn from the one before."""
+def _check_ways(odometry: Table, poses: Float[np.ndarray, "n 3"]) -> None:
+    """Refuse poses of which one is more than a turn, or too far, from the one before."""
     turn = np.abs(np.diff(odometry.column["heading"]))
     far = np.flatnonzero(turn > 2.0 * np.pi * 1.001)
     if far.size:
@@ -239,6 +241,13 @@ def _check_headings(odometry: Table) -> None:
         where = f"{odometry.path}, line {odometry.line[row]}"
         expected = "at most a turn between two rows"
         raise refusal(where, f"heading {after!r} after {before!r}", expected, "write radians")
+    far = np.flatnonzero(np.hypot(*np.diff(poses[:, :2], axis=0).T) > FARTHEST)
+    if far.size:
+        row = int(far[0]) + 1
+        before, after = poses[row - 1 : row + 1, :2].tolist()
+        expected = f"at most {FARTHEST:g} m between two rows"
+        fix = "write metres, or begin the log where the frame does"
+        raise refusal(_line(odometry, row), f"x, y {after} after {before}", expected, fix)
 
 
 def _covariances(odometry: Table) -> Float[np.ndarray, "n 3 3"]:

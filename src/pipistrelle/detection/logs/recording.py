@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from pipistrelle.config import LONGEST_STEP
 from pipistrelle.detection.logs.poses import motions_between
 from pipistrelle.detection.logs.text_tables import Table, check_unique, rows_kept
 from pipistrelle.detection.scans import NOBODY, OWN, UNLABELLED, Scan, make_scan
@@ -165,7 +166,7 @@ def assemble(
     stamp = odometry.column["time"]
     last = np.append(np.diff(stamp) > 0, True)
     rows = _cut(odometry.path, stamp[last], span)
-    time = rows if step is None else _merged(odometry.path, rows, step)
+    time = _single(odometry, rows) if step is None else _merged(odometry.path, rows, step)
     if settings["motion"] == "poses":
         controls = motions_between(odometry, time)
     else:
@@ -241,6 +242,18 @@ def _cut(path: Path, time: np.ndarray, span: tuple[float, float]) -> np.ndarray:
         expected = f"some between {span[0]!r} and {span[1]!r}"
         raise refusal(path, found, expected, "use odometry and truth of one drive")
     return np.concatenate(([start], time[(time > start) & (time < end)], [end]))
+
+
+def _single(odometry: Table, time: np.ndarray) -> np.ndarray:
+    """Return the times of rows that are a step each; refuse one that holds too long."""
+    long = np.flatnonzero(np.diff(time) > LONGEST_STEP)
+    if long.size:
+        row = int(np.searchsorted(odometry.column["time"], time[long[0] + 1]))
+        found = f"time {time[long[0] + 1].item()!r} after {time[long[0]].item()!r}"
+        expected = f"rows at most {LONGEST_STEP:g} s apart"
+        fix = "part the log there, or merge rows into steps by `step` in log.toml"
+        raise refusal(f"{odometry.path}, line {odometry.line[row]}", found, expected, fix)
+    return time
 
 
 def _merged(path: Path, time: np.ndarray, step: float) -> np.ndarray:

@@ -12,7 +12,7 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipistrelle.config import LARGEST
+from pipistrelle.config import FARTHEST, FASTEST, LARGEST, LEAST_STD, WIDEST
 from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.files import read_text
 from pipistrelle.refusals import refusal
@@ -22,16 +22,19 @@ _LABEL_IT = (
     "number what your sensor tells apart, the same whenever it is seen, and clutter "
     f"{UNLABELLED}; landmarks that nobody has labelled are not yet told apart in a log"
 )
-_LEAST_STD = 1e-6  # of either noise: what is told more precisely leaves nothing to solve with
-_ABOVE_ZERO = {
-    "range": ("m", 1.0 / LARGEST, LARGEST),
-    "bearing_std": ("rad", _LEAST_STD, 1e4),
-    "range_std": ("m", _LEAST_STD, LARGEST),
-    "detour": ("m", 0.0, LARGEST),
-    "detour_std": ("m", _LEAST_STD, LARGEST),
+_BOUNDS = {
+    "range": ("m", 1.0 / LARGEST, FARTHEST),
+    "bearing_std": ("rad", LEAST_STD, WIDEST),
+    "range_std": ("m", LEAST_STD, FARTHEST),
+    "detour": ("m", 0.0, FARTHEST),
+    "detour_std": ("m", LEAST_STD, FARTHEST),
     "radius": ("m", 1.0 / LARGEST, LARGEST),
+    "velocity": ("m/s", -FASTEST, FASTEST),
+    "speed": ("m/s", -FASTEST, FASTEST),
+    "angular_rate": ("rad/s", -WIDEST, WIDEST),
+    "steering": ("rad", -WIDEST, WIDEST),
 }
-"""What a column is above zero in, or from there on, at least and at most."""
+"""Unit, least and most of a column's numbers."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -271,15 +274,15 @@ def _read_row(
 
 
 def _check_columns(table: Table) -> None:
-    """Check times, labels and what is above zero, and make the labels integers."""
+    """Check times, labels and what has bounds, and make the labels integers."""
     for name, values in table.column.items():
         if name == "time":
             wrong = np.diff(values, prepend=-np.inf) < 0
             promise = "a time that does not run backwards"
-        elif name in _ABOVE_ZERO:
-            unit, least, most = _ABOVE_ZERO[name]
+        elif name in _BOUNDS:
+            unit, least, most = _BOUNDS[name]
             wrong = (values < least) | (values > most)
-            from_here = f"from {least:g}" if least in (_LEAST_STD, 0.0) else "above 0"
+            from_here = "above 0" if least == 1.0 / LARGEST else f"from {least:g}"
             promise = f"a {name} {from_here} {unit}, up to {most:g} {unit}"
         elif name in _LABELS:
             wrong = (values != np.rint(values)) | (values < UNLABELLED) | (values >= 2**53)
