@@ -511,7 +511,11 @@ def test_no_column_goes_before_the_four(tmp_path, stated):
         ("range_std = 0.2", "range_std = 0.2\ngate = 1.5", ("'gate': found 1.5", "equal to 1")),
         ("range_std = 0.2", "range_std = ", ("TOML", "line 7")),
         ("range_std = 0.2", "range_std = 1e155", ("'range_std': found 1e+155", "less than")),
-        ("range_std = 0.2", "range_std = 1e-155", ("'range_std': found 1e-155", "equal to 0.000001")),
+        (
+            "range_std = 0.2",
+            "range_std = 1e-155",
+            ("'range_std': found 1e-155", "equal to 0.000001"),
+        ),
         ("[1.0, -2.0", "[1e300, -2.0", ("'initial_pose[0]': found 1e+300", "less than")),
         ("range_std = 0.2", "range_std = " + "[" * 5000, ("more than 8 levels", "mend the file")),
         ("range_std = 0.2", "range_std = " + "2" * 5000, ("integer of many digits", "64 bits")),

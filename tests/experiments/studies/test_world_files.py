@@ -11,12 +11,14 @@ import pytest
 from pipistrelle.config import InputError
 from pipistrelle.experiments.studies import world_files
 from pipistrelle.experiments.studies.store import load_study, open_store
+from pipistrelle.experiments.studies.study import run_study
 from pipistrelle.experiments.studies.world import failed_records, run_world
 from pipistrelle.experiments.studies.world_files import (
     TABLES,
     check_world,
     done_worlds,
     read_ended_trials,
+    refuse_strange,
     sweep,
     world_file,
     write_world,
@@ -107,6 +109,29 @@ def test_what_a_killed_writer_left_is_no_result_and_goes_when_its_world_is_done(
     assert leftovers(folder) == [living]
     sweep(folder, [1])
     assert leftovers(folder) == []
+
+
+@pytest.mark.parametrize("table", ["steps", "landmarks"])
+@pytest.mark.parametrize("kind", ["text", "link", "other columns"])
+def test_a_file_of_somebodys_in_a_tables_place_is_refused_before_the_work(
+    folder, plan, tmp_path, table, kind
+):
+    path, other = world_file(folder, table, 1), tmp_path / "mine.parquet"
+    pl.DataFrame({"mine": [1.0]}).write_parquet(other)
+    if kind == "link":
+        path.symlink_to(other)
+    else:
+        path.write_bytes(b"my notes" if kind == "text" else other.read_bytes())
+    before = contents(folder)
+    with pytest.raises(InputError, match=f"{table}/iteration_00001.parquet: is no table .* move"):
+        run_study(plan, folder)
+    assert contents(folder) == before
+
+
+def test_tables_that_a_killed_writer_left_without_trials_block_nothing(folder, plan, records):
+    write_world(folder, plan, 1, records)
+    world_file(folder, "trials", 1).unlink()
+    refuse_strange(folder, plan, range(3))
 
 
 def test_a_writer_that_was_overtaken_is_content(folder, plan, records, monkeypatch):

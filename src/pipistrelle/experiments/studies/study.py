@@ -37,6 +37,7 @@ from pipistrelle.experiments.studies.world_files import (
     EndedTrial,
     done_worlds,
     read_ended_trials,
+    refuse_strange,
     sweep,
     write_world,
 )
@@ -109,8 +110,9 @@ def run_study(
     Raises
     ------
     InputError
-        Where the folder holds another plan, results cannot be written, or workers, memory for
-        them on this machine, or an estimator, cannot be had.
+        Where the folder holds another plan, or somebody's files in the place of tables, results
+        cannot be written, or workers, memory for them on this machine, or an estimator, cannot be
+        had.
 
     Examples
     --------
@@ -139,6 +141,7 @@ def run_study(
             waiting.append(iteration)
         else:
             so_far = _advanced(so_far, trials)
+    refuse_strange(folder, plan, waiting)
     show = progress or (lambda _: None)
     show(so_far)
     place, here = folder.absolute(), Path.cwd()

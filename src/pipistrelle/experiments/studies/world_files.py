@@ -12,13 +12,17 @@ import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from hashlib import sha256
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from pipistrelle.config import InputError
 from pipistrelle.experiments.studies.plan import Plan
-from pipistrelle.experiments.studies.world import TrialRecord, world_tables
+from pipistrelle.experiments.studies.world import (
+    TrialRecord,
+    world_schemas,
+    world_tables,
+)
 from pipistrelle.files import (
     check_ordinary,
     partial_of,
@@ -126,6 +130,43 @@ def write_world(folder: Path, plan: Plan, iteration: int, records: Sequence[Tria
             with contextlib.suppress(OSError):
                 partial.unlink(missing_ok=True)
         sweep(folder, [iteration] if paths[-1].exists() else [])
+
+
+def refuse_strange(folder: Path, plan: Plan, iterations: Iterable[int]) -> None:
+    """Refuse to compute worlds in whose tables' place somebody else's files stand.
+
+    What a killed writer left without its trials is whole and ours, known by its columns.
+
+    Parameters
+    ----------
+    folder : Path
+    plan : Plan
+    iterations : iterable of int
+
+    Raises
+    ------
+    InputError
+        With the file.
+    """
+    schemas = world_schemas(plan)
+    for iteration, name in product(iterations, TABLES[:-1]):
+        path = world_file(folder, name, iteration)
+        if os.path.lexists(path) and not _is_table(path, schemas[name]):
+            raise InputError(
+                f"{path}: is no table of this study as Pipistrelle wrote it, so it is not "
+                "replaced; move it away, or name another folder with -o DIR"
+            )
+
+
+def _is_table(path: Path, schema: "Mapping[str, pl.DataType]") -> bool:
+    """Whether a file is a whole table of these columns, and no link."""
+    import polars as pl
+
+    with contextlib.suppress(OSError, pl.exceptions.PolarsError):
+        return not path.is_symlink() and schema == pl.read_parquet_schema(
+            io.BytesIO(read_file(path))
+        )
+    return False
 
 
 def with_sums(tables: "Mapping[str, pl.DataFrame]", plan: Plan, iteration: int) -> dict[str, bytes]:
