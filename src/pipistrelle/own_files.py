@@ -141,9 +141,11 @@ def claim(
             f"the {word} there"
         )
     if not own.there:
+        listed = os.path.lexists(folder / SUMS)
+        named = f"its {SUMS} is not Pipistrelle's" if listed else f"no {SUMS} names any"
         raise InputError(
-            f"{folder}: is not empty and holds no {word} of Pipistrelle's (its {SUMS} would name "
-            f"them), so nothing in it is replaced; name a new folder with {another}"
+            f"{folder}: is not empty and holds no {word} of Pipistrelle's ({named}), so nothing in "
+            f"it is replaced; name a new folder with {another}"
         )
     own.check()
     return own

@@ -28,6 +28,9 @@ def test_a_column_that_no_scan_has_and_columns_of_several_lengths_are_refused():
     for wrong, kind in (({"landmark": [3.5, 4.0]}, "whole numbers"), ({"range": "4"}, "numbers")):
         with pytest.raises(InputError, match=f"expected {kind}"):
             make_scan(0.5, **({"landmark": label, "bearing": bearing} | wrong))
+    for ragged in ({"landmark": [[1], [2, 3]]}, {"bearing": [[1.0], [2.0, 3.0]]}):
+        with pytest.raises(InputError, match="rows of unlike lengths for"):
+            make_scan(0.5, **({"landmark": label, "bearing": bearing} | ragged))
     assert make_scan(0.5, [3, 4], [0, 1]).bearing.dtype == np.float64
 
 

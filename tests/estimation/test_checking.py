@@ -154,6 +154,26 @@ def test_a_first_pose_that_is_none_is_refused(build, mean, covariance, said):
         build(BICYCLE).init(Gaussian(mean=mean, covariance=covariance))
 
 
+def test_objects_of_another_kind_are_refused_in_words(build):
+    slam = build(BICYCLE)
+    belief, rng = slam.init(START), np.random.default_rng(7)
+    with pytest.raises(InputError, match=r"init: found .* expected a Gaussian of a pose"):
+        slam.init(np.zeros(3))
+    with pytest.raises(InputError, match="knowing: found None, expected Landmarks"):
+        slam.knowing(belief, None)
+    for other in (None, START, "belief"):
+        with pytest.raises(InputError, match=f"of this filter, {type(belief).__name__};"):
+            slam.predict(other, [[0.1, 0.0]], [0.1], rng)
+        with pytest.raises(InputError, match=r"belief: found .* init returns the first"):
+            slam.update(other, SCAN, rng)
+
+
+@pytest.mark.parametrize("gate", [-1.0, 0.0, 2.0, np.nan, "auto", None, True])
+def test_a_gate_that_is_no_share_is_refused_when_a_filter_is_made(build, gate):
+    with pytest.raises(InputError, match=r"gate: found .* expected above 0 and up to 1"):
+        replace(build(BICYCLE), gate=gate)
+
+
 def test_lists_and_other_arrays_are_taken_as_they_are_meant(build):
     slam = build(BICYCLE)
     started = slam.init(START)

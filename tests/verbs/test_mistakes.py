@@ -25,6 +25,11 @@ import pytest
         ("run --filter smother", "module:Class; did you mean 'smoother'?"),
         ("run --filter ekf,ikef", "found 'ikef', expected one of ekf"),
         ("run --filter ekf,", "found '', expected one of ekf"),
+        ("run --filter all,ekf", "found 'all' in a list; it stands alone, for ekf, fastslam, iekf"),
+        ("study --duration 5", "--duration. Did you mean --scenario.steps?"),
+        ("study --beamwidth 5", "--beamwidth. Did you mean --emitter.radius?"),
+        ("run --receiver.sample-rate 20", "found 20 Hz, expected a multiple of 5000 Hz"),
+        ("config show --receiver.sample-rate 20", "found 20 Hz, expected a multiple of 5000 Hz"),
         ("run walk.wav", "found 'walk.wav', an audio recording, which is not read; detect the ec"),
         ("report", "FOLDER requires an argument"),
         ("report --folder one", "Unknown option: --folder"),
@@ -119,6 +124,37 @@ def test_a_mistake_is_said_in_a_line_and_nothing_is_made(refused, words, said):
     assert said in refused(*words.split())
     assert [path.name for path in Path().iterdir() if path.name != "runs"] == []
     assert not any(Path().glob("runs/*"))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["run", "-o", ""], "-o: found ''"),
+        (["run", "--save-log="], "--save-log: found ''"),
+        (["slam", ""], "slam: found ''"),
+        (["report", "", "-o", "d"], "report: found '', expected a value; for this folder write ."),
+    ],
+)
+def test_an_empty_path_is_refused_and_not_taken_for_this_folder(refused, words, said):
+    assert said in refused(*words)
+
+
+def test_a_folder_of_ours_that_is_no_log_is_called_what_it_is(refused):
+    for title in ("results", "a report"):
+        Path("d").mkdir(exist_ok=True)
+        Path("d/SHA256SUMS").write_text(f"# Of Pipistrelle: {title}\n{'0' * 64}  summary.json\n")
+        assert f"d: found {title} of Pipistrelle, expected a log folder" in refused("slam", "d")
+        assert "`pipistrelle view` plays results" in refused("slam", "d")
+    Path("s/trials").mkdir(parents=True)
+    Path("s/plan.toml").touch()
+    assert "s: found a study of Pipistrelle" in refused("slam", "s")
+
+
+def test_a_list_of_sums_that_is_a_users_is_not_said_to_name_ours(refused):
+    Path("d").mkdir()
+    Path("d/SHA256SUMS").write_text(f"{'0' * 64}  notes.txt\n")
+    Path("d/notes.txt").touch()
+    assert "(its SHA256SUMS is not Pipistrelle's)" in refused("run", "-o", "d")
 
 
 def test_a_mistake_in_a_file_or_the_environment_is_said_with_its_place(refused, monkeypatch):

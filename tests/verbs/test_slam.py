@@ -281,6 +281,11 @@ def test_measurements_that_do_not_fit_are_asked_about(obey, log, undrawn):
     )
 
 
+def test_of_poses_the_unit_of_headings_is_asked_about_too(obey, undrawn):
+    said = obey("slam", DATA / "poses_log", "-o", "two", "--quiet", "--gate", "0.01")[2]
+    assert "are bearings and headings in radians" in said
+
+
 def test_a_gate_that_rejects_more_than_it_should_is_told_of_with_what_helps(obey, log, undrawn):
     rows = [row.split(",") for row in (log / "measurements.csv").read_text().splitlines()]
     last = max(i for i, row in enumerate(rows) if row[3])

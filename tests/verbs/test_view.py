@@ -12,6 +12,7 @@ import pipistrelle
 from pipistrelle.__main__ import main
 from pipistrelle.config import InputError
 from pipistrelle.figures.player import rerun_file
+from pipistrelle.own_files import REPORT, OwnFiles
 from reference.command_line import SHORT
 
 
@@ -99,6 +100,13 @@ def test_what_stands_elsewhere_is_replaced_when_that_is_asked_for(obey, folder, 
     assert Path("page.html").read_text() == "mine"
     assert obey("view", folder, "--quiet", "--overwrite", "-o", "page.html")[0] == 0
     assert is_page(Path("page.html"))
+
+
+def test_a_page_of_another_folder_of_ours_stays_whole_though_replacing_is_allowed(folder, refused):
+    OwnFiles(Path("report"), REPORT).replace({"summary.json": b"{}", "index.html": b"a report"})
+    said = refused("view", folder, "--overwrite", "-o", "report/index.html")
+    assert "report/index.html: is of a report of Pipistrelle, which stays whole;" in said
+    assert Path("report/index.html").read_bytes() == b"a report"
 
 
 @pytest.mark.parametrize(

@@ -130,7 +130,8 @@ def make_scan(
     >>> scan.range, scan.bearing_std
     (array([nan, nan]), array([0.15, 0.15]))
     """
-    return _made_of(time, np.shape(landmark), {"landmark": landmark, "bearing": bearing} | columns)
+    given = {"landmark": landmark, "bearing": bearing} | columns
+    return _made_of(time, _shape("landmark", landmark), given)
 
 
 def with_columns(scan: Scan, **columns: np.ndarray | float) -> Scan:
@@ -165,7 +166,8 @@ def _made_of(time: float, shape: tuple[int, ...], given: dict[str, np.ndarray | 
     """Make a scan of columns, and of what a column that is not given says."""
     if unknown := sorted(given.keys() - set(COLUMNS)):
         raise InputError(f"scan: no such column {unknown[0]}; expected one of {', '.join(COLUMNS)}")
-    if lengths := {n: np.shape(v) for n, v in given.items() if np.shape(v) not in ((), shape)}:
+    shapes = {name: _shape(name, value) for name, value in given.items()}
+    if lengths := {name: found for name, found in shapes.items() if found not in ((), shape)}:
         raise InputError(
             f"scan: found columns of the shapes {lengths}, expected {shape}, that of landmark"
         )
@@ -179,6 +181,16 @@ def _made_of(time: float, shape: tuple[int, ...], given: dict[str, np.ndarray | 
             raise InputError(f"scan: found {shown(given[name])} for {name}, expected {kind}")
         row[...] = value
     return Scan(time=time, landmark=whole[0], caller=whole[1], numbers=numbers)
+
+
+def _shape(name: str, values: np.ndarray | float) -> tuple[int, ...]:
+    """Return the shape of a column; refuse rows of unlike lengths."""
+    try:
+        return np.shape(values)
+    except ValueError:
+        raise InputError(
+            f"scan: found rows of unlike lengths for {name}, expected one number for each row"
+        ) from None
 
 
 def rows_of(scan: Scan, rows: Bool[np.ndarray, " m"] | Int[np.ndarray, " k"]) -> Scan:

@@ -76,8 +76,30 @@ WORDS = {
 """What is wrong with rows of a scan; in place of {} stand their labels."""
 
 
+def check_gate(gate: Any) -> None:
+    """Refuse a filter's gate that is no share."""
+    if isinstance(gate, bool) or not isinstance(gate, (int, float)) or not 0.0 < gate <= 1.0:
+        raise InputError(
+            f"gate: found {shown(gate)}, expected above 0 and up to 1; 1 drops nothing"
+        )
+
+
+def check_belief(belief: Any, kind: type) -> None:
+    """Refuse what is no belief of a filter."""
+    if not isinstance(belief, kind):
+        raise InputError(
+            f"belief: found {shown(belief)}, expected one of this filter, {kind.__name__}; init "
+            "returns the first, and predict and update those that follow"
+        )
+
+
 def usable_pose(pose: Gaussian) -> Gaussian:
     """Return a copy of a first pose as filters take it, (3) and (3, 3); refuse what is none."""
+    if not isinstance(pose, Gaussian):
+        raise InputError(
+            f"init: found {shown(pose)}, expected a Gaussian of a pose, (3), and its covariance, "
+            "(3, 3); it is in pipistrelle.estimation.beliefs"
+        )
     mean, covariance = _converted(pose.mean, FLOAT), _converted(pose.covariance, FLOAT)
     if mean is None or covariance is None or (mean.shape, covariance.shape) != ((3,), (3, 3)):
         raise InputError(
@@ -97,6 +119,11 @@ def usable_pose(pose: Gaussian) -> Gaussian:
 
 def usable_known(known: Landmarks) -> Landmarks:
     """Return landmarks known beforehand as filters take them; refuse what are none."""
+    if not isinstance(known, Landmarks):
+        raise InputError(
+            f"knowing: found {shown(known)}, expected Landmarks; they are in "
+            "pipistrelle.estimation.beliefs"
+        )
     label, mean = _converted(known.landmark, INTEGER), _converted(known.mean, FLOAT)
     covariance = _converted(known.covariance, FLOAT)
     n = -1 if label is None or label.ndim != 1 else label.size

@@ -252,16 +252,25 @@ def named_filters(chosen: Filters) -> tuple[str, ...]:
     ('pipistrelle.estimation.ekf.filter:EkfSlam',)
     """
     if isinstance(chosen, str):
-        chosen = GROUPS.get(chosen) or [name.strip() for name in chosen.split(",")]
+        chosen = GROUPS.get(chosen) or (chosen,)
     elif isinstance(chosen, type) or not isinstance(chosen, Iterable):
         chosen = (chosen,)
-    names = tuple(dict.fromkeys(map(_name_of, chosen)))
+    parted = (each for one in chosen for each in _parted(one))
+    names = tuple(dict.fromkeys(map(_name_of, parted)))
     if not names:
         raise InputError("filters: found none, expected an estimator's name or its class")
     for name in names:
+        if name in GROUPS:
+            means = ", ".join(GROUPS[name])
+            raise InputError(f"filters: found {name!r} in a list; it stands alone, for {means}")
         entry(check_name(name, *GROUPS))
     check_distinct(names, "filters")
     return names
+
+
+def _parted(chosen: str | type) -> Sequence[str | type]:
+    """Part names at their commas; a class is one."""
+    return [name.strip() for name in chosen.split(",")] if isinstance(chosen, str) else (chosen,)
 
 
 def _name_of(kind: str | type) -> str:

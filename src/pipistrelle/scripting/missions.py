@@ -6,7 +6,6 @@ from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from pydantic import BaseModel
 
 from pipistrelle.acoustics.callers import Caller
@@ -19,7 +18,7 @@ from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.hearing.world_folder import kept_world
 from pipistrelle.experiments.hearing.worlds import ANY, World
-from pipistrelle.experiments.results.scores import TrialResult
+from pipistrelle.experiments.results.scores import TrialResult, is_placed
 from pipistrelle.experiments.results.writing import write_results
 from pipistrelle.experiments.runs.again import log_entry
 from pipistrelle.experiments.runs.preparing import warnings_of
@@ -222,7 +221,7 @@ def failures(done: Done) -> list[str]:
     return [
         f"{trial.strategy} {trial.filter} failed: {trial.error or 'its path is not finite'}"
         for trial in done.trials
-        if not np.all(np.isfinite(trial.track.pose.mean))
+        if not is_placed(trial)
     ]
 
 

@@ -247,20 +247,23 @@ def afterwards(
     -------
     list of str
     """
+    from pipistrelle.experiments.results.scores import is_placed
+
     rows, turned, told = sum(len(scan.landmark) for scan in recorded.scans), recorded.turned, []
     metric = "ranges and detours" if has_detours(recorded) else "ranges"
+    angles = "bearings and headings" if recorded.motion == "poses" else "bearings"
     for trial in trials:
         heard, name = sum(len(scan.landmark) for scan in trial.scans), short_name(trial.filter)
         if not heard:
             told.append(
                 f"{log}: nothing in it is heard by {trial.strategy} sensing, so it maps nothing"
             )
-        elif turned <= SUSPECT * rows and _is_finite(trial):
+        elif turned <= SUSPECT * rows and is_placed(trial):
             gated, who = trial.scores.gated, f"{trial.strategy} {name}"
             if SUSPECT * heard < gated:
                 told.append(
                     f"{log}: {gated} of {heard} measurements do not fit what was expected ({who}); "
-                    f"are bearings in radians and {metric} in metres, and all labels right?"
+                    f"are {angles} in radians and {metric} in metres, and all labels right?"
                 )
             elif (GATED + (expected := 1.0 - gate_of(trial.filter, config))) * heard < gated:
                 told.append(
@@ -296,8 +299,3 @@ def _out_of_bounds(recorded: "Log", log: Path) -> list[str]:
         for what, rows, share, where in odd
         if np.count_nonzero(rows) > share * rows.size
     ]
-
-
-def _is_finite(trial: "TrialResult") -> bool:
-    """Tell whether a trial's path is somewhere: else its failure says enough."""
-    return all(number == number for pose in trial.track.pose.mean.tolist() for number in pose)

@@ -24,6 +24,8 @@ SPELLINGS = (
 )
 
 FILMS = ("gif", "mp4")
+SHORT = {"scenario.steps": "duration", "emitter.radius": "beamwidth"}
+"""Settings that some verbs also take by a short name of another meaning."""
 
 app = App(
     name="pipistrelle",
@@ -102,6 +104,7 @@ def obey(words: Sequence[str], heard: Sequence[int] = ()) -> int:
         Exit status.
     """
     try:
+        _refuse_empty(words)
         _refuse_sections(words)
         status = app(_completed(words)) or 0
         flush_results()
@@ -115,6 +118,17 @@ def obey(words: Sequence[str], heard: Sequence[int] = ()) -> int:
             say(f"pipistrelle: error: {line}")
         return 2
     return status
+
+
+def _refuse_empty(words: Sequence[str]) -> None:
+    """Refuse an empty word, which as a path would be the folder that one is in."""
+    from pipistrelle.config import InputError
+
+    for before, word in pairwise(("pipistrelle", *words)):
+        flag, given, value = word.partition("=")
+        if not word or (flag.startswith("-") and given and not value):
+            where = flag if given else before
+            raise InputError(f"{where}: found '', expected a value; for this folder write .")
 
 
 def _refuse_sections(words: Sequence[str]) -> None:
@@ -182,7 +196,7 @@ def _unknown(error: UnknownOptionError) -> str:
     word = (error.token.keyword or error.token.value).partition("=")[0]
     names = {name[2:] for argument in error.argument_collection for name in argument.names}
     known, wanted = sorted(names - _sections().keys()), word.lstrip("-").replace("_", "-")
-    same = [name for name in known if name.partition(".")[2] == wanted]
+    same = [name for name in known if wanted in (name.partition(".")[2], SHORT.get(name))]
     near = same[0] if same else meant(wanted, known)
     return f"Unknown option: {word}. " + (f"Did you mean --{near}?" if near else "See --help.")
 

@@ -10,9 +10,15 @@ from pipistrelle.verbs.streams import put
 
 def show(*, mission: Annotated[MissionOptions | None, Parameter(name="*")] = None) -> None:
     """Print the settings as TOML, file, environment and flags applied."""
+    import numpy as np
+
+    from pipistrelle.acoustics.callers import callers_of
+    from pipistrelle.arrays.sampling import sampling
     from pipistrelle.settings import to_toml
 
     config, _ = mission_config(mission or MissionOptions())
+    callers = callers_of(config, np.zeros(2))[: 2 if config.callers is None else 1]
+    sampling(config, callers)  # it refuses the rates and tones that `run` does
     put(to_toml(config), end="")
 
 

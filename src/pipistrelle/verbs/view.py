@@ -94,6 +94,7 @@ def _play_again(
     from pipistrelle.experiments.runs.again import again
     from pipistrelle.figures.player.playback import playback
     from pipistrelle.figures.recorder import MissionRecorder
+    from pipistrelle.scripting.asking import named_filters
     from pipistrelle.verbs import delivery
     from pipistrelle.verbs.console import progress
     from pipistrelle.verbs.options import OutputOptions
@@ -102,7 +103,7 @@ def _play_again(
     delivery.get_ready(OutputOptions(quiet=quiet))
     watch = MissionRecorder(rest=REST)
     with progress(quiet) as show:
-        named = [one for name in trusted for one in name.split(",")]
+        named = named_filters(trusted) if trusted else ()
         done = again(folder, log=log, trusted=named, progress=show, watch=watch)
     if done.difference:
         warn(f"{done.difference}; what is shown is found now")
@@ -121,6 +122,8 @@ def _check_place(path: Path, folder: Path, ending: str, option: str, overwrite: 
             OwnFiles(folder, RESULTS).refuse(path.name)
         except InputError as refused:
             raise InputError(str(refused).replace("name another folder", fix)) from None
+    elif path.name in (other := OwnFiles(path.parent, RESULTS)):
+        raise InputError(f"{path}: is of {other.there} of Pipistrelle, which stays whole; {fix}")
     elif os.path.lexists(path) and not overwrite:
         raise InputError(f"{path}: is there already; {fix}, or add --overwrite")
     if path.parent.exists():

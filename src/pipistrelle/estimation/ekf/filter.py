@@ -19,7 +19,14 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
-from pipistrelle.estimation.checking import usable_controls, usable_known, usable_pose, usable_scan
+from pipistrelle.estimation.checking import (
+    check_belief,
+    check_gate,
+    usable_controls,
+    usable_known,
+    usable_pose,
+    usable_scan,
+)
 from pipistrelle.estimation.ekf.correction import corrected
 from pipistrelle.estimation.ekf.crossing import WAITS
 from pipistrelle.estimation.ekf.gaussian import LINEAR, propagate
@@ -240,6 +247,10 @@ class EkfSlam:
     speed_std: float = 1.0
     walk_std: float = 0.2
 
+    def __post_init__(self) -> None:
+        """Refuse a gate that is no share."""
+        check_gate(self.gate)
+
     def init(self, pose: Gaussian) -> EkfBelief:
         """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
         pose = usable_pose(pose)
@@ -275,6 +286,7 @@ class EkfSlam:
         >>> slam.knowing(belief, post).landmarks().mean
         array([[3., 4.]])
         """
+        check_belief(belief, EkfBelief)
         known = usable_known(known)
         return with_points(belief, known, np.zeros((2 * known.landmark.size, 3)))
 
@@ -312,6 +324,7 @@ class EkfSlam:
         -----
         Bradley & Abaid, Eq. (10).
         """
+        check_belief(belief, EkfBelief)
         controls, dt = usable_controls(self.motion, controls, dt)
         mean, covariance = belief.mean.copy(), belief.covariance.copy()
         poses = Gaussian(mean=np.empty((len(dt), 3)), covariance=np.empty((len(dt), 3, 3)))
@@ -361,6 +374,7 @@ class EkfSlam:
         -----
         Bradley & Abaid, Eqs. (11) and (16) to (21).
         """
+        check_belief(belief, EkfBelief)
         scan = usable_scan(scan)
         if scan.landmark.size == 0:
             return belief

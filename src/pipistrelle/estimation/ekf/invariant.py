@@ -39,7 +39,14 @@ from jaxtyping import Bool, Float
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
-from pipistrelle.estimation.checking import usable_controls, usable_known, usable_pose, usable_scan
+from pipistrelle.estimation.checking import (
+    check_belief,
+    check_gate,
+    usable_controls,
+    usable_known,
+    usable_pose,
+    usable_scan,
+)
 from pipistrelle.estimation.ekf.filter import (
     EkfBelief,
     map_rows,
@@ -131,6 +138,10 @@ class InvariantEkfSlam:
     speed_std: float = 1.0
     walk_std: float = 0.2
 
+    def __post_init__(self) -> None:
+        """Refuse a gate that is no share."""
+        check_gate(self.gate)
+
     def init(self, pose: Gaussian) -> InvariantBelief:
         """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
         pose = usable_pose(pose)
@@ -160,6 +171,7 @@ class InvariantEkfSlam:
         -------
         InvariantBelief
         """
+        check_belief(belief, InvariantBelief)
         known = usable_known(known)
         mean = known.mean - belief.origin
         by_pose = np.zeros((mean.size, 3))
@@ -190,6 +202,7 @@ class InvariantEkfSlam:
         poses : Gaussian of (k, 3) and (k, 3, 3)
             After each step, their covariances those of the linear error.
         """
+        check_belief(belief, InvariantBelief)
         controls, dt = usable_controls(self.motion, controls, dt)
         mean, covariance = belief.mean.copy(), belief.covariance.copy()
         poses = Gaussian(mean=np.empty((len(dt), 3)), covariance=np.empty((len(dt), 3, 3)))
@@ -216,6 +229,7 @@ class InvariantEkfSlam:
         -------
         InvariantBelief
         """
+        check_belief(belief, InvariantBelief)
         scan = usable_scan(scan)
         if scan.landmark.size == 0:
             return belief

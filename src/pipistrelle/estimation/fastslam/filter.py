@@ -81,7 +81,14 @@ from jaxtyping import Float, Int
 from pipistrelle.config import FastSlamConfig, InputError, RayConfig
 from pipistrelle.detection.scans import Scan, rows_of, with_columns
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
-from pipistrelle.estimation.checking import usable_controls, usable_known, usable_pose, usable_scan
+from pipistrelle.estimation.checking import (
+    check_belief,
+    check_gate,
+    usable_controls,
+    usable_known,
+    usable_pose,
+    usable_scan,
+)
 from pipistrelle.estimation.fastslam.block import LANES, MEMBER
 from pipistrelle.estimation.fastslam.block_ties import TIE
 from pipistrelle.estimation.fastslam.particles import (
@@ -202,6 +209,10 @@ class FastSlam:
     gate: float = 1.0
     settings: FastSlamConfig = _PAPER
 
+    def __post_init__(self) -> None:
+        """Refuse a gate that is no share."""
+        check_gate(self.gate)
+
     def init(self, pose: Gaussian) -> FastSlamBelief:
         """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
         pose = usable_pose(pose)
@@ -241,6 +252,7 @@ class FastSlam:
         -------
         FastSlamBelief
         """
+        check_belief(belief, FastSlamBelief)
         known = usable_known(known)
         blocks, n = len(belief.poses), known.landmark.size
         spread = known.covariance.reshape(n, 4)[:, [0, 1, 3]]
@@ -284,6 +296,7 @@ class FastSlam:
         -----
         Bradley & Abaid, Eq. (10), per particle.
         """
+        check_belief(belief, FastSlamBelief)
         controls, dt = usable_controls(self.motion, controls, dt)
         carried, steps = belief.poses.copy(), len(dt)
         poses = Gaussian(mean=np.empty((steps, 3)), covariance=np.empty((steps, 3, 3)))
@@ -316,6 +329,7 @@ class FastSlam:
         -----
         Bradley & Abaid, Eqs. (12) to (22).
         """
+        check_belief(belief, FastSlamBelief)
         scan = usable_scan(scan)
         if scan.landmark.size == 0:
             return belief

@@ -32,7 +32,14 @@ from jaxtyping import Float
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan, rows_of
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
-from pipistrelle.estimation.checking import usable_controls, usable_known, usable_pose, usable_scan
+from pipistrelle.estimation.checking import (
+    check_belief,
+    check_gate,
+    usable_controls,
+    usable_known,
+    usable_pose,
+    usable_scan,
+)
 from pipistrelle.estimation.measurement import BELIEVED
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.smoother.belief import (
@@ -104,6 +111,10 @@ class Smoother:
     speed_std: float = 1.0
     walk_std: float = 0.2
 
+    def __post_init__(self) -> None:
+        """Refuse a gate that is no share."""
+        check_gate(self.gate)
+
     def init(self, pose: Gaussian) -> SmootherBelief:
         """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
         pose = usable_pose(pose)
@@ -132,6 +143,7 @@ class Smoother:
         -------
         SmootherBelief
         """
+        check_belief(belief, SmootherBelief)
         known = usable_known(known)
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values(belief.link.values)
         factors.push_back(belief.link.factors)
@@ -168,6 +180,7 @@ class Smoother:
         poses : Gaussian of (k, 3) and (k, 3, 3)
             After each step.
         """
+        check_belief(belief, SmootherBelief)
         controls, dt = usable_controls(self.motion, controls, dt)
         leg = longer(belief.leg, self.motion, controls, dt)
         steps, new = placed(belief.at, leg), len(leg.mean) - len(dt)
@@ -190,6 +203,7 @@ class Smoother:
         -------
         SmootherBelief
         """
+        check_belief(belief, SmootherBelief)
         scan = usable_scan(scan)
         if scan.landmark.size == 0:
             return belief

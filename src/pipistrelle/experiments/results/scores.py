@@ -128,6 +128,11 @@ class TrialResult:
     error: str | None = None
 
 
+def is_placed(trial: TrialResult) -> bool:
+    """Whether a trial's path is somewhere, all along; else its failure says enough."""
+    return bool(np.isfinite(trial.track.pose.mean).all())
+
+
 @np.errstate(over="ignore", invalid="ignore")
 def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Scores:
     """Score a track and its map against the truth.

@@ -26,6 +26,7 @@ from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.runs.checking import check_filters
 from pipistrelle.experiments.runs.trial import Watch, run_trials
 from pipistrelle.experiments.runs.truth_files import TRUTHS, WithTruth, with_files_beside
+from pipistrelle.own_files import LOG, OwnFiles
 from pipistrelle.refusals import refusal
 
 KNOWN_STD = (1e-3, 1e-3)
@@ -93,9 +94,19 @@ def load(
         found = "a file" if folder.is_file() else "no such folder"
         raise refusal(folder, found, titles, "check the path")
     reader = reader_of(folder, readers)
+    if not reader.recognises(folder) and (what := _of_ours(folder)):
+        fix = "name the log itself; `pipistrelle view` plays results, `report` is for studies"
+        raise refusal(folder, f"{what} of Pipistrelle", titles, fix)
     whose = _whose(reader, folder, robot, known)
     with_truth = {**TRUTHS, **truths}.get(reader.name, with_files_beside)
     return with_truth(reader.read, folder, *whose)
+
+
+def _of_ours(folder: Path) -> str | None:
+    """Tell what a folder of ours holds, by its list of sums, or a study by its plan."""
+    if (folder / "plan.toml").is_file() and (folder / "trials").is_dir():
+        return "a study"
+    return OwnFiles(folder, LOG).there
 
 
 def as_heard_by(
