@@ -100,6 +100,12 @@ def add_modules(app, docname, content):
             content[0] += f"\n{heading}\n{'-' * len(heading)}\n\n{line}\n"
 
 
+def link_tutorials(app, docname, content):
+    """Lead links to the examples, which stand in the repository, to their pages."""
+    text = re.sub(r"\]\(\.\./examples/(\w+)\.py\)", r"](gallery/\1)", content[0])
+    content[0] = text.replace("](../examples)", "](gallery/index)")
+
+
 def add_benchmarks(app, docname, content):
     """Put the last run's timings where a page asks for them."""
     from benchmarks.table import markdown, read
@@ -155,6 +161,7 @@ def add_default(app, what, name, obj, options, lines):
 
 def setup(app):
     app.connect("source-read", add_modules)
+    app.connect("source-read", link_tutorials)
     app.connect("source-read", add_benchmarks)
     app.connect("builder-inited", show_kernels, priority=900)
     app.connect("autodoc-process-docstring", protect, priority=100)

@@ -88,12 +88,17 @@ def lay_links(rng: Generator, folder: Path) -> str:
     return f"{name} -> {target}"
 
 
+def _one_of_ours(rng: Generator, folder: Path) -> Path | None:
+    """Draw a file, and no link, in a folder."""
+    ours = [path for path in folder.rglob("*") if path.is_file() and not path.is_symlink()]
+    return one_of(rng, sorted(ours)) if ours else None
+
+
 def link_ours(rng: Generator, folder: Path) -> str:
     """Move a file of ours away, and put a link to it in its place."""
-    ours = [p for p in folder.rglob("*") if p.is_file() and not p.is_symlink()]
-    if not ours:
+    path = _one_of_ours(rng, folder)
+    if path is None:
         return "nothing to move"
-    path = one_of(rng, sorted(ours))
     moved = folder.parent / "outside" / f"moved-{path.name}"
     path.rename(moved)
     path.symlink_to(os.path.relpath(moved, path.parent))
@@ -102,10 +107,9 @@ def link_ours(rng: Generator, folder: Path) -> str:
 
 def change_ours(rng: Generator, folder: Path) -> str:
     """Change a file that we wrote."""
-    ours = [p for p in folder.rglob("*") if p.is_file() and not p.is_symlink()]
-    if not ours:
+    path = _one_of_ours(rng, folder)
+    if path is None:
         return "nothing to change"
-    path = one_of(rng, sorted(ours))
     path.write_bytes(path.read_bytes() + b"\nmine")
     return f"{path.relative_to(folder)} is changed"
 

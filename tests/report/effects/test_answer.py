@@ -84,7 +84,7 @@ def test_each_strategy_has_its_clause_and_one_that_is_not_touched_is_said_to_be(
     headline, _, sentence, *_ = planted(ways=ways, effect=effect)
     assert headline == (
         "A higher beacon.level_db raises the position error of fused sensing and lowers that of "
-        "passive sensing."
+        "passive sensing, and changes the position gain over active."
     )
     assert re.search(r" shows no effect on active EKF's position error \(", sentence)
     assert re.search(r"\. It raises fused EKF's by 0\.(29|3)\d* m ", sentence)
@@ -422,7 +422,8 @@ def test_a_filter_from_outside_is_named_by_its_class_and_many_cases_are_counted(
     better = changed(study, ("ekf", "fused"), "position_rmse_m", lambda e: e[:, ::-1])
     headline, *sentences = told(better)
     assert headline == (
-        "A wider beam raises the position error of fused EKF and lowers that of 5 of 6 cases."
+        "A wider beam raises the position error of fused EKF and lowers that of 5 of 6 cases, and "
+        "lowers the position gain over active."
     )
     errors = [line for line in sentences if "position error" in line.split(" by ")[0]]
     assert [line.split(" by ")[0].rpartition("lowers ")[2] for line in errors[1:3]] == [
@@ -438,7 +439,8 @@ def test_what_a_variable_does_to_the_gain_of_listening_is_the_first_sentence(pla
     headline, sentence, *_ = planted(TWO, ways=ways, effect=effect)
     assert (
         headline
-        == "A higher beacon.level_db lowers the position error; no effect of rays.power is shown."
+        == "A higher beacon.level_db lowers the position error, and lowers the position gain over "
+        "active; no effect of rays.power is shown."
     )
     found = re.match(
         r"beacon\.level_db from 36\.8 to 48\.8, on average over rays\.power, lowers fused EKF's "

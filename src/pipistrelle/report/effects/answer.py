@@ -172,14 +172,29 @@ def _headline(
         return few
     several = two_sided(variable) or (variable.numbers is None and len(variable.given) > 2)
     if said := _by_value(variable, ends) if several else _by_direction(study, variable, ends):
-        return said
+        return said + _of_gain(mine, several)
     if any(effect.measure is FIRST and direction(effect.finding) for effect in mine):
-        return f"{the(variable)} changes the position error, but no effect from end to end is shown"
+        words = (
+            f"{the(variable)} changes the position error, but no effect from end to end is shown"
+        )
+        return words + _of_gain(mine, several)
     moved = {effect.measure.title for effect in mine if direction(effect.finding)}
-    if others := [measure.title for measure in MEASURES if measure.title in moved]:
+    if others := [one.title for one in (*MEASURES, *GAINS) if one.title in moved]:
         of = f"no effect of {the(variable)} on the position error is shown"
         return f"{of}, but one on the {listed(others)}"
     return f"no effect of {the(variable)} is shown"
+
+
+def _of_gain(effects: Sequence[Effect], several: bool) -> str:
+    """Add to a line what a variable does to the gain of listening, where that is shown."""
+    gains = (e.finding for e in effects if e.contrast.end and e.measure is GAINS[0])
+    verbs = {VERBS[sign] for sign in map(direction, gains) if sign}
+    if not verbs:
+        return ""
+    title = f"the {GAINS[0].title}"
+    if several:
+        return f", and {title} changes"
+    return f", and {verbs.pop() if len(verbs) == 1 else 'changes'} {title}"
 
 
 def _few(effects: Sequence[Effect]) -> str:
