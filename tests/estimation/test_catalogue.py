@@ -25,6 +25,21 @@ def test_the_gate_of_the_settings_is_the_filters(name, gate, gated):
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
+@pytest.mark.parametrize(("off", "counted"), [((0.3, 0.2), True), ((2.0, 0.0), False)])
+def test_innovations_of_placed_landmarks_that_are_used_are_added_up(name, off, counted):
+    """A landmark that was placed by one look is as unsure as a second one: S = 2 R."""
+    config = Config(filter=FilterConfig(gate=0.999), fastslam=FastSlamConfig(particles=1))
+    slam = entry(name).build(config, BICYCLE)
+    sure = Gaussian(mean=np.zeros(3), covariance=1e-12 * np.eye(3))
+    belief = slam.update(slam.init(sure), scan_of((1, 5.0, 0.0), (2, np.nan, 2.0)), RNG(1))
+    assert belief.innovations.degrees == 0, "what is placed was not expected anywhere"
+    after = slam.update(belief, scan_of((1, 5.0 + off[0], off[1]), (2, np.nan, 2.0)), RNG(2))
+    squared = off[0] ** 2 / (2 * 0.2**2) + off[1] ** 2 / (2 * 0.15**2)
+    expected = (squared, 2) if counted else (0, 0)
+    np.testing.assert_allclose(after.innovations, expected, rtol=2e-3)
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
 @pytest.mark.parametrize("robust", ["none", "huber"])
 def test_a_gate_that_is_left_open_is_the_estimators(name, robust):
     config = Config(filter=FilterConfig(gate="auto", robust=robust))

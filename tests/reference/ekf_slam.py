@@ -146,7 +146,7 @@ class SlowEkfSlam:
 
     def start(self, mean, covariance):
         self.blocks: list[tuple] = [POSE]
-        self.aggregated, self.gated = {}, 0
+        self.aggregated, self.gated, self.innovations = {}, 0, np.zeros(2)
         self.X, self.P = np.array(mean, float), np.array(covariance, float)
         return self
 
@@ -358,9 +358,11 @@ class SlowEkfSlam:
         if self.too_near(block):
             return
         nu, H, R = self.innovation(block, distance, bearing)
-        if self.outside(self.distance_squared(nu, H, R)[0], len(nu)):
+        squared, _ = self.distance_squared(nu, H, R)
+        if self.outside(squared, len(nu)):
             self.gated += 1
         else:
+            self.innovations += squared, len(nu)
             self.correct(block, nu, H, R)
 
     def measure_ray(self, label, bearing):

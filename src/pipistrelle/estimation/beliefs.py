@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -168,6 +168,28 @@ def in_sight(moving: Landmarks) -> Landmarks:
     return some_of(moving, placed(moving) & (widest <= LOST * LOST))
 
 
+class Innovations(NamedTuple):
+    """How far off measurements of placed landmarks were that a filter has used.
+
+    Attributes
+    ----------
+    squared : float
+        Sum of the normalised innovations squared, each in the variance that the filter expected.
+    degrees : float
+        Sum of their degrees of freedom: two of range and bearing, one of a bearing.
+    """
+
+    squared: float = 0.0
+    degrees: float = 0.0
+
+    def plus(self, squared: float, degrees: float) -> "Innovations":
+        """Return the sums with some more added."""
+        return Innovations(self.squared + squared, self.degrees + degrees)
+
+
+NO_INNOVATIONS = Innovations()
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
     """What a filter made of one mission: the start, then one row per control step.
@@ -182,6 +204,8 @@ class Track:
         The final map.
     gated : int
         Measurements that the gate rejected.
+    innovations : Innovations
+        All zero where the filter does not count them.
     cloud : (p, 3) [m, m, rad] or None
         The particles' last poses, where the filter has particles.
     full : float or None
@@ -198,6 +222,7 @@ class Track:
     pose: Gaussian
     landmarks: Landmarks
     gated: int
+    innovations: Innovations = NO_INNOVATIONS
     cloud: Float[np.ndarray, "p 3"] | None = None
     full: float | None = None
     online: Gaussian | None = None

@@ -70,6 +70,7 @@ def assert_equal_to_reference(slam, mission, start=START):
                 getattr(belief, field), getattr(slow, field), rtol=0, atol=1e-9, err_msg=field
             )
         assert belief.gated == slow.gated
+        np.testing.assert_allclose(belief.innovations, slow.innovations, rtol=1e-6)
     return belief
 
 

@@ -59,6 +59,7 @@ def assert_equal_to_reference(slam, mission, start=START):
         ):
             np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
         assert belief.gated == slow.gated
+        np.testing.assert_allclose(belief.innovations, slow.innovations, rtol=1e-6)
     return belief
 
 

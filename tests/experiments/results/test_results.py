@@ -46,6 +46,7 @@ KEYS = [
     "landmarks_total",
     "measurements_per_frame",
     "gated",
+    "nis_mean",
     "ignored_rows",
     "wall_s",
 ]

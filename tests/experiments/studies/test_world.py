@@ -397,7 +397,9 @@ def test_every_column_of_a_worlds_tables_holds_what_its_name_says(plan, records)
     trials, scored = as_rows(tables["trials"]), asdict(records[0].scores)
     for row, record in zip(trials, records, strict=True):
         assert (row["iteration"], row["case"]) == (3, record.case.number)
-        assert {name: row[name] for name in scored} == asdict(record.scores)
+        assert "nis_mean" not in row, "worlds of a study that was begun before have none"
+        kept = {name: row[name] for name in scored if name != "nis_mean"}
+        assert kept == {name: v for name, v in asdict(record.scores).items() if name in kept}
         own = tables["steps"].filter(case=record.case.number)
         assert own["frame"].to_list() == list(range(1, 11))
         names = ["position_error_m", "heading_error_rad", "nees", "nees_expected", "nees_variance"]

@@ -28,6 +28,7 @@ from pipistrelle.estimation.ekf.detours import (
 )
 from pipistrelle.estimation.ekf.gaussian import (
     APPLIED,
+    BEYOND,
     GATED,
     Joint,
     State,
@@ -194,15 +195,11 @@ def _correct_precisely(
     sensing: Sensing,
     scratch: Scratch,
 ) -> Whole:
-    """Cross a bearing that waits, or correct with a precise one; tell whether it was gated.
+    """Cross a bearing that waits, or correct a ray with a precise one; tell whether it was gated.
 
     To the members of a ray, which an earlier, coarser one has cast, it is no more precise than they
     are linear.
     """
-    joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
-    if count == 1:
-        bearing, variance = curved(joint, size, i, row)
-        return correct_bearing(joint, size, i, bearing, variance, sensing.passive_bound)
     if state.weight[first] != WAITS:
         variance = linear_to(sensing) ** 2
         coarse = Row(row.landmark, row.bearing, row.range, variance, row.range_variance)
@@ -213,22 +210,40 @@ def _correct_precisely(
     return APPLIED
 
 
+@no_alloc_inlined
+def _correct_placed(
+    state: State, first: Whole, row: Row, sensing: Sensing, scratch: Scratch
+) -> Whole:
+    """Correct a placed landmark, and add up its innovations; tell whether it was gated."""
+    joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
+    distance, bearing, variance = row.range, row.bearing, row.bearing_variance
+    if math.isnan(distance):
+        if is_precise(row, sensing):
+            bearing, variance = curved(joint, size, i, row)
+        degrees, bound = 1.0, sensing.passive_bound
+        squared = correct_bearing(joint, size, i, bearing, variance, bound)
+    else:
+        degrees, bound, spread = 2.0, sensing.active_bound, row.range_variance
+        squared = correct_active(joint, size, i, distance, bearing, spread, variance, bound)
+    if squared == BEYOND:
+        return GATED
+    if not math.isnan(squared):
+        scratch.innovations[0] += squared
+        scratch.innovations[1] += degrees
+    return APPLIED
+
+
 @no_alloc
 def _correct_known(state: State, row: Row, sensing: Sensing, scratch: Scratch) -> Whole:
     """Correct with one measurement of a mapped landmark; tell whether it was gated."""
     first, count = members_of(state.landmark, state.members[0], row.landmark)
     if sensing.robust and state.weight[first] != WAITS:
         row = tempered(state, first, count, row)
-    distance, bearing, variance = row.range, row.bearing, row.bearing_variance
-    joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
-    passive = math.isnan(distance) or (count > 1 and sensing.ranged == BEARING)
+    if count == 1:
+        return _correct_placed(state, first, row, sensing, scratch)
+    passive = math.isnan(row.range) or sensing.ranged == BEARING
     if passive and (state.weight[first] == WAITS or is_precise(row, sensing)):
         return _correct_precisely(state, first, count, row, sensing, scratch)
-    if count == 1 and passive:
-        return correct_bearing(joint, size, i, bearing, variance, sensing.passive_bound)
-    if count == 1:
-        spread, bound = row.range_variance, sensing.active_bound
-        return correct_active(joint, size, i, distance, bearing, spread, variance, bound)
     if not passive:
         return _correct_ranged_ray(state, first, count, row, sensing, scratch)
     return _correct_partial(state, first, count, row, sensing, scratch)
@@ -316,8 +331,10 @@ def corrected(
     timings: Timings | None,
     sensing: Sensing,
     turns: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Whole]:
-    """Correct, prune and extend a copy of the belief; returns its arrays and the gated count.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Whole, float, float]:
+    """Correct, prune and extend a copy of the belief.
+
+    Returns its arrays, the gated count, and the two numbers of `beliefs.Innovations`.
 
     ``turns`` says of which error the covariance is, as in `Joint`.
     """
@@ -339,4 +356,6 @@ def corrected(
         gated = _take_in_timed(state, heard, known, timed_of(columns, timings), sensing, scratch)
     joint.mean[2], members = wrap_angle(joint.mean[2]), state.members[0]
     mean, covariance = gaussian_of(joint, 3 + 2 * members)
-    return mean, covariance, landmark[:members].copy(), weight[:members].copy(), gated
+    squared, degrees = scratch.innovations
+    landmark, weight = landmark[:members].copy(), weight[:members].copy()
+    return mean, covariance, landmark, weight, gated, squared, degrees

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.beliefs import Gaussian, Landmarks
+from pipistrelle.estimation.beliefs import NO_INNOVATIONS, Gaussian, Innovations, Landmarks
 from pipistrelle.estimation.checking import (
     check_belief,
     check_gate,
@@ -56,6 +56,7 @@ class EkfBelief:
         of a bearing that waits to be crossed.
     gated : int
         Measurements rejected so far.
+    innovations : Innovations
     """
 
     mean: Float[np.ndarray, " d"]
@@ -63,6 +64,7 @@ class EkfBelief:
     landmark: Int[np.ndarray, " h"]
     weight: Float[np.ndarray, " h"]
     gated: int
+    innovations: Innovations = NO_INNOVATIONS
 
     def pose(self) -> Gaussian:
         """Return the vehicle's pose, (3) and (3, 3)."""
@@ -338,6 +340,7 @@ class EkfSlam:
             landmark=belief.landmark,
             weight=belief.weight,
             gated=belief.gated,
+            innovations=belief.innovations,
         )
         return moved, poses
 
@@ -398,7 +401,7 @@ def taken_in(belief: EkfBelief, scan: Scan, sensing: Sensing, turns: float) -> d
     -------
     dict of field to value
     """
-    mean, covariance, landmark, weight, gated = corrected(
+    mean, covariance, landmark, weight, gated, squared, degrees = corrected(
         belief.mean,
         belief.covariance,
         belief.landmark,
@@ -414,4 +417,5 @@ def taken_in(belief: EkfBelief, scan: Scan, sensing: Sensing, turns: float) -> d
         "landmark": landmark,
         "weight": weight,
         "gated": belief.gated + gated,
+        "innovations": belief.innovations.plus(squared, degrees),
     }

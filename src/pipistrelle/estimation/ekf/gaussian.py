@@ -35,6 +35,8 @@ from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 GATED, APPLIED = 1, 0
+BEYOND, UNFORESEEN = -1.0, math.nan
+"""In place of a squared innovation: beyond the gate, or of a point too near to foresee anything."""
 LINEAR, INVARIANT = 1.0, 0.0
 """How much an error of heading turns what is measured, by the error whose covariance is kept."""
 LANE = 8
@@ -275,12 +277,15 @@ def bearing_variance(joint: Joint, size: Whole, i: Whole, c: float, s: float, k:
 @no_alloc
 def correct_bearing(
     joint: Joint, size: Whole, i: Whole, bearing: float, variance: float, bound: float
-) -> Whole:
-    """Correct the state with the bearing of the member at index i; GATED when beyond bound."""
+) -> float:
+    """Correct the state with the bearing of the member at index i, unless it is beyond the bound.
+
+    Returns the squared innovation in its variance, BEYOND or UNFORESEEN.
+    """
     mean = joint.mean
     distance, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     if distance < NEAREST:
-        return APPLIED
+        return UNFORESEEN
     if joint.taken[WAITING] == MOST_WAITING:
         flush(joint, size)
     innovation = wrap_angle(bearing - expected)
@@ -292,7 +297,7 @@ def correct_bearing(
         w0[a] = h0 * (p0[a] - pi[a]) + h1 * (p1[a] - pj[a]) - turns * p2[a]
     S = h0 * (w0[0] - w0[i]) + h1 * (w0[1] - w0[i + 1]) - turns * w0[2] + variance
     if innovation * innovation > bound * S:
-        return GATED
+        return BEYOND
     root = 1.0 / math.sqrt(S)
     for a in range(size):
         w0[a] *= root
@@ -300,7 +305,7 @@ def correct_bearing(
     if turns == 0.0:
         retract(joint.mean, size, w0, step, w0, 0.0)
     defer(joint, size, w0, turns * step)
-    return APPLIED
+    return step * step
 
 
 @no_alloc
@@ -313,12 +318,12 @@ def correct_active(
     range_variance: float,
     bearing_variance: float,
     bound: float,
-) -> Whole:
-    """Correct the state with range and bearing of the member at index i; GATED beyond bound."""
+) -> float:
+    """Do the same with range and bearing; returns their squared innovation in its variances."""
     mean = joint.mean
     near, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     if near < NEAREST:
-        return APPLIED
+        return UNFORESEEN
     if joint.taken[WAITING] + 2 > MOST_WAITING:
         flush(joint, size)
     nu0, nu1 = distance - near, wrap_angle(bearing - expected)
@@ -339,7 +344,7 @@ def correct_active(
     e0 = nu0 / L00
     e1 = (nu1 - L10 * e0) / L11
     if e0 * e0 + e1 * e1 > bound:
-        return GATED
+        return BEYOND
     for a in range(size):
         w0[a] /= L00
         w1[a] = (w1[a] - L10 * w0[a]) / L11
@@ -347,7 +352,7 @@ def correct_active(
         retract(joint.mean, size, w0, e0, w1, e1)
     defer(joint, size, w0, turns * e0)
     defer(joint, size, w1, turns * e1)
-    return APPLIED
+    return e0 * e0 + e1 * e1
 
 
 @no_alloc

@@ -9,12 +9,16 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 
 
 class Scratch(NamedTuple):
-    """Room to work on the members of one landmark, and on the order of the state's numbers."""
+    """Room to work on the members of one landmark, and on the order of the state's numbers.
+
+    ``innovations`` (2) adds up what `beliefs.Innovations` holds.
+    """
 
     likelihood: Float[np.ndarray, " m"]
     share: Float[np.ndarray, " m"]
     keep: Bool[np.ndarray, " m"]
     source: Int[np.ndarray, " n"]
+    innovations: Float[np.ndarray, "2"]
 
 
 @kernel
@@ -25,6 +29,7 @@ def scratch_for(members: Whole) -> Scratch:
         np.empty(members),
         np.empty(members, np.bool_),
         np.empty(3 + 2 * members, np.int64),
+        np.zeros(2),
     )
 
 

@@ -288,6 +288,29 @@ def active_beyond(
 
 
 @no_alloc
+def squared_innovation(
+    pose: Poses,
+    member: Member,
+    distance: float,
+    bearing: float,
+    range_variance: float,
+    bearing_variance: float,
+    i: Whole,
+) -> float:
+    """Square of what surprises lane i, in its variance; not a number of what is too near."""
+    nu0, nu1, c, s, k, far = _active(pose, member, distance, bearing, i)
+    _, _, _, _, _, _, S00, S01, S11 = _active_spread(
+        pose, member, c, s, k, range_variance, bearing_variance, i
+    )
+    if not far:
+        return math.nan
+    if math.isnan(distance):
+        return nu1 * nu1 / S11
+    e0, e1, _, _, _ = _whitened(nu0, nu1, S00, S01, S11)
+    return e0 * e0 + e1 * e1
+
+
+@no_alloc
 def refine_by_active(
     pose: Poses,
     member: Member,

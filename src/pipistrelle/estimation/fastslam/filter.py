@@ -80,7 +80,7 @@ from jaxtyping import Float, Int
 
 from pipistrelle.config import FastSlamConfig, InputError, RayConfig
 from pipistrelle.detection.scans import Scan, rows_of, with_columns
-from pipistrelle.estimation.beliefs import Gaussian, Landmarks
+from pipistrelle.estimation.beliefs import NO_INNOVATIONS, Gaussian, Innovations, Landmarks
 from pipistrelle.estimation.checking import (
     check_belief,
     check_gate,
@@ -95,6 +95,7 @@ from pipistrelle.estimation.fastslam.particles import (
     Arrays,
     correct_particles,
     gated_by_all,
+    innovations_of,
     mean_full,
     particle_map,
     resample_into,
@@ -142,6 +143,8 @@ class FastSlamBelief:
         Weighted mean number of fully initialised landmarks.
     gated : int
         Measurements rejected so far.
+    innovations : Innovations
+        Of the heaviest particle of each time, before the scan.
     hub : (k)
         Number of the caller that each landmark is tied to, or -1 (`ties`): of those that were there
         when detours came last.
@@ -160,6 +163,7 @@ class FastSlamBelief:
     best_member: Float[np.ndarray, "c 6"]
     full: float
     gated: int
+    innovations: Innovations = NO_INNOVATIONS
     hub: Int[np.ndarray, " hubs"]
     tie: Float[np.ndarray, "b tied slopes"]
 
@@ -340,6 +344,8 @@ class FastSlam:
         sensing = sensing_of(self.rays, self.gate, exact=self.settings.mixture == "exact")
         sampled = self.settings.weights == "sampled"
         inside, gated = self._inside(belief, scan, sensing)
+        heaviest = int(np.argmax(belief.log_weight))
+        off = innovations_of(_held(belief)[0], columns_of(inside), heaviest)
         corrected, (hub, tie), gained = correct_particles(
             *_held(belief), columns_of(inside), _timings(belief, inside), normal, sensing, sampled
         )
@@ -359,6 +365,7 @@ class FastSlam:
             best_member=best_member,
             full=mean_full(count, weight),
             gated=belief.gated + gated,
+            innovations=belief.innovations.plus(*off),
             hub=hub,
             tie=tie,
         )

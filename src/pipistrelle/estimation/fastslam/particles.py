@@ -28,6 +28,7 @@ from pipistrelle.estimation.fastslam.block import (
     initialise_member,
     refine_by_active,
     sample_pose,
+    squared_innovation,
     weigh_sample,
 )
 from pipistrelle.estimation.fastslam.block_rays import (
@@ -182,6 +183,29 @@ def gated_by_all(
             tied, told, sensing.passive_bound,
         )  # fmt: skip
     return gated, deaf, int(np.count_nonzero(gated | deaf))
+
+
+@kernel
+def innovations_of(arrays: Arrays, columns: Columns, particle: Whole) -> tuple[float, float]:
+    """Add up one particle's squared innovations of a scan's rows of landmarks that it has placed.
+
+    Returns their sum, and that of their degrees of freedom.
+    """
+    particles, heard = Particles(*arrays), measurements(columns)
+    slot, b, i = _slots(particles.landmark, heard.landmark), particle // LANES, particle % LANES
+    squared, degrees = 0.0, 0.0
+    for m in range(slot.size):
+        n = slot[m]
+        if n < 0 or particles.count[b, n, i] != 1:
+            continue
+        one = squared_innovation(
+            particles.pose[b], particles.member[b, particles.first[n]], heard.range[m],
+            heard.bearing[m], heard.range_variance[m], heard.bearing_variance[m], i,
+        )  # fmt: skip
+        if not math.isnan(one):
+            squared += one
+            degrees += 1.0 if math.isnan(heard.range[m]) else 2.0
+    return squared, degrees
 
 
 @no_alloc

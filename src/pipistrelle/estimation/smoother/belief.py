@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.config import RayConfig
-from pipistrelle.estimation.beliefs import Gaussian, Landmarks
+from pipistrelle.estimation.beliefs import NO_INNOVATIONS, Gaussian, Innovations, Landmarks
 from pipistrelle.estimation.rays import ray_members
 from pipistrelle.estimation.smoother.crossing import Bearing
 from pipistrelle.estimation.smoother.detours import Detour
@@ -62,6 +62,8 @@ class SmootherBelief:
     walk_std : float
         How far a caller's velocity strays in a second [m/s].
     gated : int
+    innovations : Innovations
+        Where there is a gate: without one nothing is foreseen.
     rays : RayConfig
     solver : Solver
         Shared with the beliefs before and after.
@@ -78,6 +80,7 @@ class SmootherBelief:
     unplaced: Mapping[int, Bearing] = field(default_factory=dict)
     walk_std: float = 0.0
     gated: int = 0
+    innovations: Innovations = NO_INNOVATIONS
     rays: RayConfig
     solver: Solver
 

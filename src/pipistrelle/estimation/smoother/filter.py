@@ -234,10 +234,12 @@ class Smoother:
         """Return what is inside the gate, and count what is not."""
         isam, node, rows = here.solver.reach(here.link), here.link.node, scan.landmark.size
         heard = detours_of(scan, node)  # of all rows: a bearing that is wrong is nothing to them
-        scan = rows_of(scan, rows_inside(isam, node, here.mapped, scan, self.gate, here.chains))
+        inside, off_by = rows_inside(isam, node, here.mapped, scan, self.gate, here.chains)
+        scan = rows_of(scan, inside)
         detours = detours_inside(isam, here.mapped, heard, self.gate, here.chains)
         dropped = rows - scan.landmark.size + len(heard) - len(detours)
-        return replace(here, gated=here.gated + dropped), scan, detours
+        innovations = here.innovations.plus(*off_by)
+        return replace(here, gated=here.gated + dropped, innovations=innovations), scan, detours
 
     def _heard(
         self, here: SmootherBelief, scan: Scan, detours: tuple[Detour, ...], *, placing: bool

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.beliefs import NO_INNOVATIONS, Innovations
 from pipistrelle.estimation.measurement import (
     detour_jacobians,
     detour_of,
@@ -29,7 +30,7 @@ def rows_inside(
     scan: Scan,
     gate: float,
     chains: Chains = NO_CHAINS,
-) -> Bool[np.ndarray, " m"]:
+) -> tuple[Bool[np.ndarray, " m"], Innovations]:
     """Tell of which rows bearing and range are inside, or are of what is new.
 
     Parameters
@@ -48,11 +49,13 @@ def rows_inside(
     -------
     (m)
         True where a row is but a detour.
+    Innovations
+        Of the rows that are inside, and of nothing new.
     """
     key = pose_key(node)
     pose = pose_of(isam.calculateEstimatePose2(key))
     known, bounds = known_of(mapped, chains), gate_bounds(gate)
-    M, inside = np.eye(5), np.ones(scan.landmark.size, bool)
+    M, inside, off_by = np.eye(5), np.ones(scan.landmark.size, bool), NO_INNOVATIONS
     M[:3, :3] = turned(pose[2])
     for m, label in enumerate(scan.landmark.tolist()):
         if label not in known or math.isnan(scan.bearing[m]):
@@ -68,7 +71,9 @@ def rows_inside(
         S = (H @ joint @ H.T + np.diag(R))[rows, rows]
         squared = float(off[rows] @ np.linalg.solve(S, off[rows]))
         inside[m] = squared <= bounds[len(off[rows]) - 1]
-    return inside
+        if inside[m]:
+            off_by = off_by.plus(squared, len(off[rows]))
+    return inside, off_by
 
 
 def detours_inside(

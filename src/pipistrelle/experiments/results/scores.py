@@ -73,6 +73,9 @@ class Scores:
         Mean over the scans.
     gated : int
         Measurements that the gate rejected.
+    nis_mean : float or None
+        Normalised innovation squared per degree of freedom of what was used of placed landmarks:
+        about 1 where the filter believes rightly. None where it does not say (`Innovations`).
     """
 
     position_rmse_m: float | None
@@ -92,6 +95,7 @@ class Scores:
     landmarks_total: int
     measurements_per_frame: float | None
     gated: int
+    nis_mean: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -177,6 +181,7 @@ def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Sc
     mapped, true = scored_landmarks(estimate, labels, positions)
     followed, walked = _followed(track, truth)
     finite = bool(np.all(np.isfinite(track.pose.mean)))
+    squared, degrees = track.innovations
     rows = np.count_nonzero(~np.isnan(np.concatenate([[], *(scan.bearing for scan in scans)])))
     return Scores(
         position_rmse_m=path.position_rmse_m,
@@ -195,6 +200,7 @@ def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Sc
         landmarks_total=len(estimate.landmark),
         measurements_per_frame=rows / len(scans) if scans else None,
         gated=track.gated,
+        nis_mean=squared / degrees if degrees else None,
     )
 
 

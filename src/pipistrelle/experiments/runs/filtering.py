@@ -16,12 +16,14 @@ from pipistrelle.detection.noise import Noise, as_said
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.association import Associate, told
 from pipistrelle.estimation.beliefs import (
+    NO_INNOVATIONS,
     B,
     Belief,
     Estimator,
     Following,
     Gaussian,
     Informed,
+    Innovations,
     ParticleCloud,
     Retracing,
     Track,
@@ -105,11 +107,18 @@ def run_filter(
         pose=revised or online,
         landmarks=belief.landmarks(),
         gated=belief.gated,
+        innovations=_innovations(belief),
         cloud=cloud.cloud() if cloud else None,
         full=cloud.full if cloud else None,
         online=online if revised else None,
         callers=_retraced(callers, belief, time.size),
     )
+
+
+def _innovations(belief: Belief) -> Innovations:
+    """Return the innovations that a belief has added up; none where it does not."""
+    found = getattr(belief, "innovations", None)
+    return found if isinstance(found, Innovations) else NO_INNOVATIONS
 
 
 def _named(scan: Scan, belief: B, associate: Associate, noise: Noise) -> Scan:

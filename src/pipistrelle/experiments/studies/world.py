@@ -232,7 +232,9 @@ def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
         name: pl.Float64 if isinstance(_cell(values[0]), (int, float)) else pl.String
         for name, values in plan.grid.items()
     }
-    scores = dict.fromkeys((field.name for field in fields(Scores)), pl.Float64)
+    # Worlds of a study that was begun before have no such column, and go on being read.
+    kept = (field.name for field in fields(Scores) if field.name != "nis_mean")
+    scores = dict.fromkeys(kept, pl.Float64)
     counts = dict.fromkeys(("landmarks_full", "landmarks_total", "gated"), pl.Int32)
     last = ("landmarks_full_mean", "clutter_per_frame", "wall_s", "cpu_s")
     return {
