@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from pipistrelle.evaluation.bound import IN_ONE_WORLD
 from pipistrelle.kernel_clock import COMPILING  # noqa: F401 - said where the cache has none
-from pipistrelle.verbs.console import BOUND
 
 SHORT = ("--duration", "4", "--landmarks", "10")
 """A world of eight frames."""
@@ -23,7 +23,7 @@ def track(folder, name):
 
 def table(printed):
     """Rows of the closing table: title and cells, eleven characters each."""
-    lines = [line for line in printed.splitlines()[:-1] if line != BOUND]
+    lines = [line for line in printed.splitlines()[:-1] if line != IN_ONE_WORLD]
     return {line[:32].strip(): re.findall(r".{11}", line[32:]) for line in lines[2:]}
 
 

@@ -19,7 +19,7 @@ def log_of(**columns):
 
 def trial_of(scan, gated):
     track = SimpleNamespace(pose=SimpleNamespace(mean=np.zeros((2, 3))))
-    scores = SimpleNamespace(gated=gated)
+    scores = SimpleNamespace(gated=gated, nis_mean=None)
     return SimpleNamespace(
         scans=[scan], scores=scores, filter="ekf", strategy="active", track=track
     )

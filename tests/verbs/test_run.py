@@ -14,9 +14,9 @@ import pipistrelle
 from pipistrelle import own_files
 from pipistrelle.estimation.catalogue import PAPERS
 from pipistrelle.estimation.fastslam.filter import FastSlam
+from pipistrelle.evaluation.bound import IN_ONE_WORLD
 from pipistrelle.scripting import missions
 from pipistrelle.settings import from_text
-from pipistrelle.verbs.console import BOUND
 from reference.command_line import COMPILING, SHORT, contents, summary, table, track
 
 
@@ -42,7 +42,7 @@ def test_a_run_tells_its_stages_its_scores_and_last_its_folder(obey):
         "position RMSE [m]", "heading RMSE [rad]", "position RMSE, aligned [m]",
         "position bound over worlds [m]", "heading bound over worlds [rad]",
     ]  # fmt: skip
-    assert printed.splitlines()[-2] == BOUND
+    assert printed.splitlines()[-2] == IN_ONE_WORLD
     assert {"mission.png", "mission.pdf", "config.toml"} <= {p.name for p in Path("one").iterdir()}
 
 

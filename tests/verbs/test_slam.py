@@ -296,7 +296,9 @@ def test_a_gate_that_rejects_more_than_it_should_is_told_of_with_what_helps(obey
     share = 100.0 / (len(rows) - 1)
     assert f"the gate rejects {share:.1f}% of the measurements (fused ekf), expected 0.1%" in said
     assert 'filter.robust = "huber"' in said
-    assert obey(*words, "--gate", "1")[2] == ""
+    said = obey(*words, "--gate", "1")[2]
+    assert re.search(r"its innovations are [\d.]+ times what it expects \(NIS [\d.]+, 1 ", said)
+    assert said.count("\n") == 1, "it rejects nothing, and believes too much"
     assert obey(*words, "--gate", "0.99")[2] == "", "more is expected of a narrower gate"
 
 
@@ -386,13 +388,26 @@ def test_a_log_without_truth_is_mapped_and_not_scored(obey, log):
     assert "RMSE" not in printed
     rows = table(printed)
     track = pl.read_parquet("two/steps.parquet")
-    last, moves = track.row(-1, named=True), track.select(pl.col("x_m", "y_m").diff()).drop_nulls()
+    last = track.row(-1, named=True)
     spread = np.hypot(last["x_std_m"], last["y_std_m"])
     told = {"rejected by the gate [%]": "0.00", "final position, 1 sigma [m]": f"{spread:.3f}"}
-    told["length of the track [m]"] = f"{np.hypot(*moves.to_numpy().T).sum():.1f}"
+    recorded, truth = replay.load(log)
+    told["driven, by the odometry [m]"] = f"{np.abs(recorded.controls[:, 0]) @ recorded.dt:.1f}"
+    (run,) = summary("two")["runs"]
+    told["innovations, NIS"] = f"{run['nis_mean']:.2f}"
     assert {title: rows[title][0].strip() for title in told} == told
-    _, truth = replay.load(log)
     assert (truth.path, truth.landmarks) == (None, None)
+
+
+@pytest.mark.parametrize(("share", "warned"), [(1.0, False), (0.05, True)])
+def test_innovations_larger_than_a_filter_expects_are_said(obey, log, undrawn, share, warned):
+    path = log / "log.toml"
+    stds = re.compile(r"(?m)^((?:range|bearing|speed|steering)_std = )(\S+)$")
+    path.write_text(stds.sub(lambda row: f"{row[1]}{share * float(row[2])}", path.read_text()))
+    _, _, said = obey("slam", log, "--gate", "1", "-o", "two", "--quiet")
+    (run,) = summary("two")["runs"]
+    assert (run["nis_mean"] > 2.0) == warned
+    assert (f"(NIS {run['nis_mean']:.3g}, 1 where it believes rightly)" in said) == warned
 
 
 def test_a_log_whose_truth_ends_early_is_scored_where_it_is_known(obey, log, undrawn):

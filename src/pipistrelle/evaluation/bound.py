@@ -56,6 +56,10 @@ from pipistrelle.estimation.motion import (
 )
 from pipistrelle.jit import Whole, kernel, no_alloc
 
+IN_ONE_WORLD = (
+    "A bound holds for the root mean square over many worlds: in one, an error may be below it."
+)
+"""What is said wherever a bound stands beside errors."""
 PRIOR_STD = 20.0
 """Of a landmark before it is heard [m]."""
 NO_ROUTES: Mapping[int, np.ndarray] = MappingProxyType({})

@@ -25,7 +25,7 @@ from pipistrelle.experiments.runs.preparing import warnings_of
 from pipistrelle.experiments.runs.replay import moving_of, replay
 from pipistrelle.experiments.runs.trial import Mission, Watch, run_mission
 from pipistrelle.own_files import OwnFiles
-from pipistrelle.scripting.recorded import SlamConfig, afterwards
+from pipistrelle.scripting.recorded import SlamConfig, afterwards, driven, surprise
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -64,6 +64,8 @@ class Done:
         Files that are to stand beside the results.
     said : tuple of str
         What a user is to be warned of.
+    driven : [m] or None
+        How far a log's odometry says that the vehicle drove.
     """
 
     config: BaseModel
@@ -78,6 +80,7 @@ class Done:
     log: Mapping[str, object] | None = None
     beside: Mapping[str, bytes] = field(default_factory=dict)
     said: tuple[str, ...] = ()
+    driven: float | None = None
 
 
 def simulated(
@@ -130,7 +133,11 @@ def done_of(mission: Mission, world: World | None) -> Done:
         moving=mission.drive.moving,
         beamwidth=beamwidth_of(config),
         beside=files,
-        said=(*warnings_of(config, mission.scenario.callers), *_far_off(mission.trials)),
+        said=(
+            *warnings_of(config, mission.scenario.callers),
+            *_far_off(mission.trials),
+            *filter(None, map(surprise, mission.trials)),
+        ),
     )
 
 
@@ -213,6 +220,7 @@ def done_of_log(
         beamwidth=entry["beamwidth_rad"],
         ignored_rows=recorded.ignored_rows,
         log=entry,
+        driven=driven(recorded),
     )
 
 

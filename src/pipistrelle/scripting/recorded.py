@@ -1,7 +1,7 @@
 """What a recorded log decides, what it leaves to be asked for, and what looks odd in it."""
 
 from collections.abc import Sequence
-from math import hypot
+from math import hypot, inf, sqrt
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +29,8 @@ SUSPECT = 0.2
 """Share of a log's rows that may not fit before its units are asked about."""
 GATED = 0.01
 """Share of a log's rows that the gate may reject beyond its own before that is said."""
+SURPRISING = 2.0
+"""NIS above which that is said; below 1 a filter is careful, as any is with the paper's noise."""
 SHORT = 0.2
 """A detour that few have [m]: it is none of a sound that lasts, and in seconds most are less."""
 LOGGED = frozenset(
@@ -141,6 +143,22 @@ def has_detours(recorded: "Log") -> bool:
     bool
     """
     return any((scan.detour == scan.detour).any() for scan in recorded.scans)
+
+
+def driven(recorded: "Log") -> float:
+    """Return how far the vehicle drove by its odometry [m], forwards and backwards.
+
+    Parameters
+    ----------
+    recorded : Log
+
+    Returns
+    -------
+    float
+    """
+    if recorded.motion == "poses":
+        return sum(hypot(*step) for step in recorded.controls[:, :2].tolist())
+    return float(abs(recorded.controls[:, 0] * recorded.dt).sum())
 
 
 def check_room(recorded: "Log", filters: Sequence[str], config: Config) -> None:
@@ -272,9 +290,32 @@ def afterwards(
                     "placed wrong before; larger standard deviations help, or a gate of 1 with "
                     'filter.robust = "huber"'
                 )
+            elif surprised := surprise(trial):
+                told.append(f"{log}: {surprised}")
     if turned > SUSPECT * rows:
         told.append(f"{log}: {turned} of {rows} bearings are beyond a turn; are they in radians?")
     return told + _out_of_bounds(recorded, log)
+
+
+def surprise(trial: "TrialResult") -> str:
+    """Say that innovations are much larger than a filter expects; nothing where they are not.
+
+    Parameters
+    ----------
+    trial : TrialResult
+
+    Returns
+    -------
+    str
+    """
+    nis = trial.scores.nis_mean
+    if nis is None or not SURPRISING < nis < inf:
+        return ""
+    return (
+        f"{trial.strategy} {short_name(trial.filter)}: its innovations are {sqrt(nis):.1f} times "
+        f"what it expects (NIS {nis:.3g}, 1 where it believes rightly): measurements or odometry "
+        "are less sure than they say, or labels are wrong; larger standard deviations help"
+    )
 
 
 def _out_of_bounds(recorded: "Log", log: Path) -> list[str]:

@@ -28,8 +28,12 @@ TITLES = {
     "nees_max": ("NEES, largest", 1),
 }
 """Scores as a person reads them, and their digits."""
-BOUND = "A bound holds for the root mean square over many worlds: in one, an error may be below it."
-"""What is said under a table of one world that has a bound."""
+NIS_TITLE = "innovations, NIS"
+NIS = (
+    "NIS: how large innovations are, squared, beside what the filter expects; 1 where it believes "
+    "rightly."
+)
+"""What is said under a table that has innovations."""
 
 
 @contextmanager
@@ -141,23 +145,29 @@ def _rate(frames: int, elapsed: float) -> str:
     return f"{frames:>5} frames{speed}"
 
 
-def closing_table(trials: "Sequence[TrialResult]", there: int | None = None) -> str:
+def closing_table(
+    trials: "Sequence[TrialResult]", there: int | None = None, driven: float | None = None
+) -> str:
     """Compare the estimates of one world, a column each; what no estimate has is left out.
 
     Six columns fit into 100 characters. Of particles, landmarks are those of the heaviest particle.
-    Under the table stands what a bound says, where there is one.
+    Under the table stands what a bound says, and the NIS, where there is one.
 
     Parameters
     ----------
     trials : sequence of TrialResult, at least one
     there : int, optional
         Landmarks of the world, where that is known.
+    driven : [m], optional
+        By the odometry.
 
     Returns
     -------
     str
     """
-    columns = [dict(_cells(trial, there)) for trial in trials]
+    from pipistrelle.evaluation.bound import IN_ONE_WORLD
+
+    columns = [dict(_cells(trial, there, driven)) for trial in trials]
     filters = [short_name(trial.filter) for trial in trials]
     lines = [("", *(trial.strategy for trial in trials)), ("", *filters)]
     width = max(11, 1 + max(map(len, filters)))
@@ -167,10 +177,13 @@ def closing_table(trials: "Sequence[TrialResult]", there: int | None = None) -> 
             lines.append((title, *(text or "-" for text in cells)))
     rows = [f"{line[0]:<32}" + "".join(f"{c:>{width}}" for c in line[1:]) for line in lines]
     bounded = any(trial.scores.position_bound_m is not None for trial in trials)
-    return "\n".join([*rows, BOUND] if bounded else rows)
+    weighed = any(column[NIS_TITLE] for column in columns)
+    return "\n".join([*rows, *[IN_ONE_WORLD] * bounded, *[NIS] * weighed])
 
 
-def _cells(trial: "TrialResult", there: int | None) -> Iterator[tuple[str, str]]:
+def _cells(
+    trial: "TrialResult", there: int | None, driven: float | None
+) -> Iterator[tuple[str, str]]:
     """Word what there is to say of an estimate, with titles; nothing of what it lacks."""
     s = trial.scores
     for name, (title, digits) in TITLES.items():
@@ -180,22 +193,22 @@ def _cells(trial: "TrialResult", there: int | None) -> Iterator[tuple[str, str]]
     yield "fully placed, particles' mean", _number(trial.track.full, 1)
     yield "measurements per frame", _number(s.measurements_per_frame, 2)
     yield "rejected by the gate", str(s.gated or "")
-    yield from _without_truth(trial)
+    yield from _without_truth(trial, driven)
     yield "diverged", "yes" if s.diverged else ""
 
 
-def _without_truth(trial: "TrialResult") -> Iterator[tuple[str, str]]:
+def _without_truth(trial: "TrialResult", driven: float | None) -> Iterator[tuple[str, str]]:
     """Word what an estimate tells of itself; nothing where the truth tells more."""
-    from math import hypot, sqrt
+    from math import sqrt
 
     pose, rows = trial.track.pose, sum(len(scan.landmark) for scan in trial.scans)
     known = trial.scores.position_rmse_m is not None
     share = None if known or not rows else 100.0 * trial.scores.gated / rows
     spread = float(pose.covariance[-1, 0, 0] + pose.covariance[-1, 1, 1])
-    way = sum(hypot(*step) for step in (pose.mean[1:, :2] - pose.mean[:-1, :2]).tolist())
+    yield NIS_TITLE, _number(None if known else trial.scores.nis_mean, 2)
     yield "rejected by the gate [%]", _number(share, 2)
     yield "final position, 1 sigma [m]", _number(None if known else sqrt(max(spread, 0.0)), 3)
-    yield "length of the track [m]", _number(None if known else way, 1)
+    yield "driven, by the odometry [m]", _number(None if known else driven, 1)
 
 
 def _number(value: float | None, digits: int) -> str:

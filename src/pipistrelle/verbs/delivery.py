@@ -80,7 +80,7 @@ def deliver(
     keep(done, own, command_line(), film)
     if not options.quiet:
         known = done.truth.landmarks
-        put(closing_table(done.trials, None if known is None else len(known[0])))
+        put(closing_table(done.trials, None if known is None else len(known[0]), done.driven))
     failed = failures(done)
     warn(*failed)
     put(own.folder)

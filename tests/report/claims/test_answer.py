@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from pipistrelle.evaluation.bound import IN_ONE_WORLD
 from pipistrelle.report.claims.answer import answer
 from pipistrelle.report.claims.contrasts import selections
 from pipistrelle.report.claims.verdicts import judge_claims
@@ -140,7 +141,7 @@ def test_what_the_bound_allows_is_said_at_three_beams_and_how_near_each_filter_c
     assert allowed == (
         "Whatever the estimator, listening may lower the least error that the sound leaves from "
         "0.300 m to 0.250 m at 180° (17%), 0.300 m to 0.250 m at 42° (17%), "
-        "0.300 m to 0.250 m at 11° (17%), in the mean over all worlds."
+        f"0.300 m to 0.250 m at 11° (17%), in the mean over all worlds. {IN_ONE_WORLD}"
     )
     assert ekf == (
         "EKF has of that least error, root mean squares with everything counted, by strategy and "

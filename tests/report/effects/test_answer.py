@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipistrelle.evaluation.bound import IN_ONE_WORLD
 from pipistrelle.report.claims.contrasts import selections
 from pipistrelle.report.effects.answer import HEADLINE, answer, question
 from pipistrelle.report.effects.comparing import effects_of
@@ -331,6 +332,7 @@ def test_a_study_that_only_listens_is_told_that_its_beam_is_nothing_to_it():
     headline, bound = told(study)
     assert headline == "Nothing that was heard depends on the beamwidth."
     assert bound.startswith("In multiples of the bound, the least position error")
+    assert bound.endswith(IN_ONE_WORLD), "the same remark about luck as in the terminal"
     assert "EKF passive" in bound
 
 

@@ -42,7 +42,7 @@ WORLDS = "Mean ± σ over worlds; dots: single worlds above that"
 PASSIVE = " (passive's at the right edge, where they do not depend on the beam)"
 BOUND = (
     "; dashed: the bound, the least root mean square that any estimator has, the noise as the "
-    "signal tells it (a mean of RMSEs may be a fifth below)"
+    "signal tells it (a mean of RMSEs may be a fifth below, and one world's farther)"
 )
 """What captions say of each."""
 

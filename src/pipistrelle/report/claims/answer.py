@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from pipistrelle.evaluation.bound import IN_ONE_WORLD
 from pipistrelle.evaluation.comparison import Finding
 from pipistrelle.experiments.hearing.scenario import landmark_count
 from pipistrelle.report.claims.verdicts import WITHOUT, JudgedClaim
@@ -223,7 +224,7 @@ def _allowed(everything: Selection) -> str:
             said.append(f"{alone:.3f} m to {both:.3f} m at {beam} ({1.0 - both / alone:.0%})")
         return (
             "Whatever the estimator, listening may lower the least error that the sound leaves "
-            f"from {', '.join(said)}, in the mean over all worlds."
+            f"from {', '.join(said)}, in the mean over all worlds. {IN_ONE_WORLD}"
         )
     return ""
 

@@ -7,6 +7,7 @@ listening gains there, and the error itself; where nothing is shown, how little 
 from collections.abc import Mapping, Sequence
 
 from pipistrelle.config import STRATEGIES
+from pipistrelle.evaluation.bound import IN_ONE_WORLD
 from pipistrelle.report.effects.comparing import FILTER, STRATEGY, Effect, families_of
 from pipistrelle.report.effects.levels import diverged, errors_of, times_the_bound
 from pipistrelle.report.effects.measures import GAINS, MEASURES, Measure
@@ -293,4 +294,6 @@ def _bound(selection: Selection) -> list[str]:
             when = " (of the path as it was believed at each time)" if online else ""
             said.append(f"{title}{when} {times}")
     lead = "In multiples of the bound, the least position error that the sound leaves to any"
-    return [f"{lead} estimator (root mean squares): {'; '.join(said)}."] if said else []
+    return (
+        [f"{lead} estimator (root mean squares): {'; '.join(said)}. {IN_ONE_WORLD}"] if said else []
+    )
