@@ -57,7 +57,7 @@ from pipistrelle.estimation.motion import (
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 IN_ONE_WORLD = (
-    "The bound is the least root mean square without bias on that path: in one world luck may beat it."
+    "The bound is the least root mean square without bias on a path: in one world luck may beat it."
 )
 """What is said wherever a bound stands beside errors."""
 PRIOR_STD = 20.0
