@@ -30,12 +30,14 @@ the plan `paper`; of equals, the one of the least misfit. No claim's verdict is 
 A second measure stands beside it, and chooses nothing: *features*, how many of `FEATURES` the
 means have, which the paper states of its curves.
 
-Five more readings of what a range does (`pipistrelle.estimation.rays` lists all seven) are tried
-with the other readings of the plans `paper` and `physics` alone: ``ranges.csv``.
+Of five more readings of what a range does (`pipistrelle.estimation.rays` lists all seven) one, the
+heaviest member moved, is tried with the first three silences in all combinations, the last two at
+their defaults; the other four with those of the plans `paper` and `physics` alone. They are in the
+same table, and under the same rule.
 
 The worlds have seed 1000; the study's have 2022. What is done is kept in FOLDER; ``readings.csv``
-and ``ranges.csv`` beside this file are the tables, with standard errors by bootstrap over the
-worlds. With other than 60 worlds they go into FOLDER.
+beside this file is the table, with standard errors by bootstrap over the worlds. With other than 60
+worlds it goes into FOLDER.
 """
 
 import argparse
@@ -132,7 +134,6 @@ VARIED = {"weights": WEIGHTS, "ranged": ALL_RANGED, "resampled": RESAMPLED}
 WHOLE = 60
 """Worlds of the published tables."""
 OUTPUT = Path(__file__).with_name("readings.csv")
-RANGES = Path(__file__).with_name("ranges.csv")
 
 
 def main() -> None:
@@ -146,7 +147,6 @@ def main() -> None:
     values = drawn(list(readings.values()))
     table = misfits(readings, values, fits)
     write_table(table, published(OUTPUT, chosen), "rays.prune")
-    write_table(ranges(trials), published(RANGES, chosen))
     tied = table.filter("tied").sort("departures", "misfit")
     print("chosen by the rule, of", tied.height, "tied:", tied.select(*FACTORS).row(0))
     with pl.Config(tbl_rows=-1, tbl_cols=-1, tbl_width_chars=200, float_precision=2):
@@ -326,11 +326,12 @@ def varied(chosen: Mapping[str, str], strategy: Strategy) -> Iterator[tuple[str,
         yield "ekf", {"weights": ANY, "ranged": ranged, "resampled": ANY}
         for weights, resampled in product(WEIGHTS, restarts):
             yield "fastslam", {"weights": weights, "ranged": ranged, "resampled": resampled}
-    if strategy == "fused" and chosen in PLANS.values():
-        for ranged in (name for name in ALL_RANGED if name not in RANGED):
-            yield "ekf", {"weights": ANY, "ranged": ranged, "resampled": ANY}
-            for resampled in RESAMPLED:
-                yield "fastslam", {"weights": "marginal", "ranged": ranged, "resampled": resampled}
+    more = [name for name in ALL_RANGED if name not in RANGED]
+    plans = chosen in PLANS.values()
+    for ranged in (more if plans else ["moved"]) if strategy == "fused" else []:
+        yield "ekf", {"weights": ANY, "ranged": ranged, "resampled": ANY}
+        for resampled in RESAMPLED if plans else ["kept"]:
+            yield "fastslam", {"weights": "marginal", "ranged": ranged, "resampled": resampled}
 
 
 # The misfit
@@ -385,6 +386,15 @@ class Reading:
             "gap": rmse(np.array(beyond)),
             **{f"left_out_{name}": share * WORLDS for name, share in lost.items()},
         }  # fmt: skip
+
+    def placed(self, rows: np.ndarray) -> dict[str, float]:
+        """Landmarks placed and median NEES of each case in which a ray may be given a range."""
+        found = {}
+        for name, (way, beam) in product(EXCLUDED, [*(("fused", b) for b in BEAMS), PASSIVE]):
+            case = f"{beam or way}_{name}"
+            found[f"full_{case}"] = self.means(name, "full", rows)[way, beam]
+            found[f"nees_{case}"] = float(np.median(self.columns[name, "nees"][way, beam][rows]))
+        return found
 
     def features(self, rows: np.ndarray) -> dict[str, int]:
         """Count the statements about the paper's curves that the means have."""
@@ -444,10 +454,11 @@ def misfit_of(parts: Mapping[str, float]) -> float:
 
 
 def all_readings(trials: pl.DataFrame) -> dict[Levels, Reading]:
-    """Lay out every combination."""
+    """Lay out every combination that was tried."""
+    fused = (pl.col("strategy") == "fused") & (pl.col("filter") == "fastslam")
+    tried = trials.filter(fused).select(*FACTORS).unique().sort(*FACTORS)
     return {
-        levels: Reading(trials, dict(zip(FACTORS, levels, strict=True)))
-        for levels in product(*FACTORS.values())
+        levels: Reading(trials, dict(zip(FACTORS, levels, strict=True))) for levels in tried.rows()
     }
 
 
@@ -475,6 +486,7 @@ def misfits(
                 "standard_error": values[1:, i].std(),
                 "above_best": values[0, i] - values[0, best],
                 "above_best_error": (values[1:, i] - values[1:, best]).std(),
+                **reading.placed(rows),
                 **reading.features(rows),
                 "features": sum(reading.features(rows).values()),
                 "departures": sum(map(str.__ne__, levels, DEFAULTS.values())),
@@ -484,28 +496,13 @@ def misfits(
     return pl.DataFrame(table).with_columns(tied=tied).sort("misfit")
 
 
-def ranges(trials: pl.DataFrame) -> pl.DataFrame:
-    """Table of all that a range may do to a ray, with the other readings of two plans."""
-    table = []
-    for (plan, base), ranged, resampled in product(PLANS.items(), ALL_RANGED, RESAMPLED):
-        levels = {"ranged": ranged, "resampled": resampled}
-        reading = Reading(trials, base | levels | {"weights": "marginal"})
-        rows = np.arange(reading.worlds)
-        parts = reading.parts(rows)
-        row = {"plan": plan, **levels, **parts, "misfit": misfit_of(parts)}
-        for name, (way, beam) in product(EXCLUDED, [("fused", b) for b in BEAMS] + [PASSIVE]):
-            full = reading.columns[name, "full"][way, beam]
-            nees = reading.columns[name, "nees"][way, beam]
-            row[f"full_{beam or way}_{name}"] = reading.means(name, "full", rows)[way, beam]
-            row[f"full_{beam or way}_{name}_all"] = full.mean()
-            row[f"nees_{beam or way}_{name}_median"] = np.median(nees)
-        table.append(row | reading.features(rows))
-    return pl.DataFrame(table)
-
-
 def main_effects(names: Sequence[Levels], values: np.ndarray) -> pl.DataFrame:
-    """How far each level's mean misfit lies from the mean of all, with its standard error."""
-    rows = []
+    """How far each level's mean misfit lies from the mean of all, with its standard error.
+
+    Of the combinations in which all six silences are crossed.
+    """
+    crossed = [i for i, name in enumerate(names) if name in set(product(*FACTORS.values()))]
+    names, values, rows = [names[i] for i in crossed], values[:, crossed], []
     for place, (factor, levels) in enumerate(FACTORS.items()):
         for level in levels:
             mine = [i for i, name in enumerate(names) if name[place] == level]
