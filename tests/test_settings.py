@@ -217,7 +217,7 @@ def test_text_and_lists_in_the_environment_are_spelled_as_in_a_file():
         from_environment(
             {
                 "PIPISTRELLE_RAYS__WEIGHTS": "aggregated",
-                "PIPISTRELLE_RAYS__PARTIAL": '"heaviest"',
+                "PIPISTRELLE_RAYS__RANGED": '"heaviest"',
                 "PIPISTRELLE_RAYS__RANGE_BOUNDS": "[1, 15.5]",
                 "PIPISTRELLE_SEED": "11",
                 "PIPISTRELLE_DATA": "/somewhere",

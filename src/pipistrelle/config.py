@@ -181,6 +181,7 @@ class BeaconConfig(Section):
 
 
 Point = tuple[Real, Real]
+RouteRow = Annotated[tuple[Real, ...], Field(min_length=3, max_length=4)]
 _WAYS = {
     "route": ((), "a route"),
     "waypoints": (("speed",), "way-points"),
@@ -220,8 +221,9 @@ class CallerConfig(Section):
     """Of a walk: standard deviation of the velocity along each axis [m/s]; else 0.5."""
     memory: Positive | None = None
     """Of a walk: time after which a velocity is forgotten, but for 1/e [s]; else 10."""
-    route: str | Annotated[tuple[tuple[Real, Real, Real], ...], Field(min_length=2)] | None = None
-    """Or where it is when: a CSV file of `time,x,y`, or its rows [s, m, m]; else it stands."""
+    route: str | Annotated[tuple[RouteRow, ...], Field(min_length=2)] | None = None
+    """Or where it is when: a CSV file of `time,x,y`, or its rows [s, m, m]; else it stands. With a
+    fourth column, `heading` [rad], it is another vehicle, which calls through a piston."""
 
     @property
     def way(self) -> str:
@@ -246,8 +248,10 @@ class CallerConfig(Section):
         return self
 
 
-def _check_rising(route: tuple[tuple[float, float, float], ...]) -> None:
-    """Refuse rows of which one is not later than the one before."""
+def _check_rising(route: tuple[tuple[float, ...], ...]) -> None:
+    """Refuse rows of which one is not later than the one before, or only some have a heading."""
+    if len({len(row) for row in route}) > 1:
+        raise ValueError("found headings in some rows of the route, expected one in all or in none")
     for row, ((before, *_), (time, *_)) in enumerate(pairwise(route), start=2):
         if time <= before:
             raise ValueError(

@@ -378,6 +378,23 @@ def test_a_direct_call_comes_through_the_piston_that_sends_it():
     np.testing.assert_allclose(gained, gain, atol=1e-6)
 
 
+def test_a_route_with_headings_is_a_vehicle_and_half_of_them_are_refused(tmp_path):
+    rows = [(0.0, 20.0, 0.0, 3.0), (10.0, 20.0, 1.0, -3.0)]
+    whole, half = tmp_path / "whole.csv", tmp_path / "half.csv"
+    head = "time,x,y,heading\n"
+    whole.write_text(head + "".join(f"{t},{x},{y},{h}\n" for t, x, y, h in rows))
+    half.write_text(head + "0,20,0,3\n10,20,1,\n")
+    world = world_of(resolve(with_routes(from_flags({"callers": [{"route": str(whole)}]}))))
+    heading = world.callers[1].heading
+    assert heading[[0, -1]].tolist() == [3.0, -3.0]
+    assert np.abs(heading).min() == 3.0, "turned the short way, through half a turn"
+    with pytest.raises(InputError, match=r"half\.csv, line 3: found no heading"):
+        with_routes(from_flags({"callers": [{"route": str(half)}]}))
+    mixed = [{"route": [(0, 1, 2), (1, 2, 3, 0.5)]}]
+    with pytest.raises(InputError, match="headings in some rows"):
+        resolve(from_flags({"callers": mixed}))
+
+
 def test_each_of_two_vehicles_has_noise_of_its_own():
     levels = []
     for vehicle in (1, 2):

@@ -75,6 +75,9 @@ def test_the_world_of_a_second_vehicle_is_read_back_as_that_of_the_first_and_onl
     again_config = resolve(settled(world, layer))
     again = heard(again_config, world)
     assert again_config.scenario.vehicle == 1
+    for one, other in zip(again.callers, drawn.callers, strict=True):
+        assert (one.frequency, one.level_db) == (other.frequency, other.level_db)
+    np.testing.assert_array_equal(again.callers[1].heading, drawn.callers[1].heading)
     np.testing.assert_array_equal(again.path, drawn.path)
     np.testing.assert_array_equal(again.callers[1].place, drawn.callers[1].place)
 

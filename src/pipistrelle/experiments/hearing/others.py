@@ -107,11 +107,21 @@ def routes_read(callers: Any, where: str) -> Any:
 def _rows(path: str, where: str) -> list[list[float]]:
     """Read a route."""
     try:
-        table = read_table(Path(path), ("time", "x", "y"))
+        table = read_table(Path(path), ("time", "x", "y"), optional=("heading",))
         check_unique(table, "time")
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
-    return np.column_stack([*table.column.values()]).tolist()
+    *columns, heading = table.column.values()
+    silent = np.isnan(heading)
+    if not silent.all():
+        if silent.any():
+            line = table.line[int(np.argmax(silent))]
+            raise InputError(
+                f"{where}: {path}, line {line}: found no heading, expected one in every row or in "
+                "none; fill it in"
+            )
+        columns.append(heading)
+    return np.column_stack(columns).tolist()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -200,6 +210,7 @@ def callers_among(
             caller = replace(caller, mission=found, heading=heading)
         else:
             place = _WAYS[one.way](one, around, taken, stream)
+            caller = replace(caller, heading=_heading(one, around))
         if place is None:
             raise _no_place(caller.key, one, around)
         callers.append(replace(caller, place=place))
@@ -315,9 +326,21 @@ def _route(
     one: CallerConfig, around: Around, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "t 2"]:
     """Be where the route says, and stand before its first time and after its last."""
-    rows = _rows(one.route, "callers") if isinstance(one.route, str) else one.route
-    time, *place = np.array(rows).T
-    return np.column_stack([np.interp(around.time, time, column) for column in place])
+    time, *place = np.array(_route_rows(one)).T
+    return np.column_stack([np.interp(around.time, time, column) for column in place[:2]])
+
+
+def _route_rows(one: CallerConfig) -> Any:
+    """Return the rows of a route, from its file where it is one."""
+    return _rows(one.route, "callers") if isinstance(one.route, str) else one.route
+
+
+def _heading(one: CallerConfig, around: Around) -> Float[np.ndarray, " t"] | None:
+    """Return where a route says that its vehicle points, if it does."""
+    rows = np.array(_route_rows(one)) if one.way == "route" else np.empty((0, 0))
+    if rows.shape[1] < 4:
+        return None
+    return wrap(np.interp(around.time, rows[:, 0], np.unwrap(rows[:, 3])))
 
 
 def _mission(

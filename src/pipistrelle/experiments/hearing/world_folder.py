@@ -273,12 +273,19 @@ def world_files(scenario: Scenario, config: Config) -> dict[str, str]:
         row = {"name": caller.name, "frequency": caller.frequency, "level_db": caller.level_db}
         if moves(caller):
             row["route"] = f"caller_{caller.name}.csv"
-            route = table_text(("time", "x", "y"), scenario.time, *np.asarray(caller.place).T)
-            files[row["route"]] = route
+            way = (scenario.time, *np.asarray(caller.place).T)
+            if caller.heading is None:
+                files[row["route"]] = table_text(("time", "x", "y"), *way)
+            else:
+                files[row["route"]] = table_text(("time", *_POSE[1:]), *way, caller.heading)
         else:
             row["place"] = np.asarray(caller.place).tolist()
         callers.append(row)
-    head = {"format": 1, "config": _own_settings(config), "callers": callers}
+    vehicle = scenario.callers[VEHICLE]
+    call = {"frequency": vehicle.frequency, "level_db": vehicle.level_db}
+    emitter = config.emitter.model_copy(update=call)
+    own = _own_settings(config.model_copy(update={"emitter": emitter}))
+    head = {"format": 1, "config": own, "callers": callers}
     return files | {"world.toml": tomli_w.dumps(head)}
 
 
