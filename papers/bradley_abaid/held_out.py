@@ -2,8 +2,8 @@
 
     python papers/bradley_abaid/held_out.py STUDY_FOLDER...
 
-`readings.py` chooses the least of 32 misfits in sixty worlds, and the least of many is in part
-luck. Here the same measure is taken of studies at full size, in their own worlds and with their
+`readings.py` chooses among many misfits in sixty worlds, and the least of many is in part luck.
+Here the same measure is taken of studies at full size, in worlds of another seed and with their
 frozen settings, from the nine cases that the experiment has. Written as ``held_out.csv`` beside
 this file, with standard errors by bootstrap over the worlds; the first study is the one that the
 others are compared with.
@@ -38,6 +38,8 @@ def main() -> None:
             {
                 "study": name,
                 **reading.parts(np.arange(reading.worlds)),
+                **reading.placed(np.arange(reading.worlds)),
+                **reading.features(np.arange(reading.worlds)),
                 "misfit": values[0, i],
                 "standard_error": values[1:, i].std(),
                 "above_first": values[0, i] - values[0, 0],
@@ -59,6 +61,8 @@ def reading_of(folder: Path) -> Reading:
         pl.col("iteration").alias("world"),
         pl.col("landmarks_full").alias("full"),
         pl.col("landmarks_total").alias("total"),
+        pl.col("position_rmse_m").alias("position"),
+        pl.col("nees_mean").alias("nees"),
         pl.when(pl.col("strategy") == "passive").then(0).otherwise(pl.coalesce(near)).alias("beam"),
     )
     return Reading(named.drop_nulls("beam"), {})
