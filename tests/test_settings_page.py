@@ -53,7 +53,7 @@ def test_an_entry_spells_the_setting_as_it_can_be_given(key):
     ("key", "takes"),
     [
         (("seed",), "whole, ≥ 0"),
-        (("scenario", "speed"), "any number"),
+        (("scenario", "speed"), "−10000 to 10000"),
         (("scenario", "start"), "3 numbers"),
         (("scenario", "step"), "> 0"),
         (("air", "speed_of_sound"), "10 to 10000"),
@@ -78,7 +78,7 @@ def test_a_bound_that_the_page_names_is_where_values_are_refused(key):
     if "`" in takes or "numbers" in takes:
         return
     bounds = re.findall(r"([≥>≤<]) ([−\de.-]+)", takes)
-    if between := re.search(r"([−\d.]+) to ([−\d.]+)", takes):
+    if between := re.search(r"([−\de.+-]+) to ([−\de.+-]+)", takes):
         bounds = [("≥", between[1]), ("≤", between[2])]
     for sign, text in bounds:
         bound = float(text.replace("−", "-"))

@@ -127,7 +127,7 @@ def raw(**columns):
         (with_columns(SCAN, range=2e6), "numbers that no filter can use"),
         (with_columns(TIMED, detour=np.nan), r"can use, for the landmarks \[8\]"),
         (with_columns(SCAN, bearing_std=np.nan), r"no standard deviations .* \[3, 8\]"),
-        (with_columns(SCAN, range_std=1e-7), r"deviations from 1e-06 on for .* \[3\]"),
+        (with_columns(SCAN, range_std=1e-13), r"deviations above 0 for .* \[3\]"),
         (with_columns(SCAN, bearing_std=2e4), "bearing_std up to 10000 rad"),
         (with_columns(SCAN, range_std=2e6), r"detour_std up to 1e\+06 m"),
         (with_columns(TIMED, detour_std=np.inf), "no standard deviations"),

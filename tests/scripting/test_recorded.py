@@ -14,7 +14,7 @@ from reference.missions import scan_with
 def log_of(**columns):
     """A log of one scan of ten rows, from half a metre to 20 m."""
     scan = scan_with(np.arange(10), np.zeros(10), **columns)
-    return SimpleNamespace(scans=[scan], turned=0, range_bounds=(0.5, 20.0))
+    return SimpleNamespace(scans=[scan], turned=0, range_bounds=(0.5, 20.0), motion="unicycle")
 
 
 def trial_of(scan, gated):

@@ -45,8 +45,9 @@ def test_every_setting_is_in_the_help_with_its_default(obey, verb):
 
 def test_the_help_of_slam_leaves_out_what_a_log_decides(obey):
     found = set(re.findall(r"--[a-z]+\.[a-z-]+", obey("slam", "--help")[1]))
-    rays = ("ratio", "density", "prune", "power", "weights", "partial", "likelihood", "spacing")
-    swarm = ("particles", "resample-below", "mixture", "weights")
+    rays = ("ratio", "density", "prune", "power", "weights", "likelihood", "spacing")
+    rays = (*rays, "merge", "ranged")
+    swarm = ("particles", "resample-below", "mixture", "weights", "resampled-rays")
     assert found == {
         "--listening.timing",
         *(f"--filter.{name}" for name in ("noise", "detour-std", "robust")),

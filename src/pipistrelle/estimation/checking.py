@@ -16,7 +16,6 @@ from pipistrelle.config import (
     FARTHEST,
     FASTEST,
     LARGEST,
-    LEAST_STD,
     LONGEST_STEP,
     WIDEST,
     InputError,
@@ -42,6 +41,8 @@ FLOAT, INTEGER = np.dtype(np.float64), np.dtype(np.int64)
 ARRAY = np.ndarray
 WHOLES = ("landmark", "caller", "callers", "moving")
 """Columns of a scan that hold whole numbers."""
+LEAST = 1e-12
+"""Least standard deviation [m] or [rad]: the square of a smaller one is lost beside any other."""
 MOST = {
     "bicycle": ((FASTEST, WIDEST), f"a speed up to {FASTEST:g} m/s, an angle up to {WIDEST:g} rad"),
     "unicycle": (
@@ -69,7 +70,7 @@ WORDS = {
     NO_NUMBER: "numbers that no filter can use, for the landmarks {}; expected finite bearings "
     f"[rad] and ranges above 0 [m], NaN where passive, up to {FARTHEST:g}; a row without a bearing "
     "has a detour [m] alone",
-    UNSTATED: f"no standard deviations from {LEAST_STD:g} on for the landmarks {{}}; expected "
+    UNSTATED: "no standard deviations above 0 for the landmarks {}; expected "
     f"bearing_std up to {WIDEST:g} rad, and range_std and detour_std up to {FARTHEST:g} m where "
     "there are such, as pipistrelle.detection.noise states them",
 }
@@ -321,11 +322,11 @@ def _fault_of_row(
         return NO_NUMBER
     if abs(bearing) > LARGEST or distance <= 0.0 or distance > FARTHEST or abs(detour) > FARTHEST:
         return NO_NUMBER
-    if not (silent or LEAST_STD <= numbers[BEARING_STD, m] <= WIDEST):
+    if not (silent or LEAST <= numbers[BEARING_STD, m] <= WIDEST):
         return UNSTATED
-    if not (math.isnan(distance) or LEAST_STD <= numbers[RANGE_STD, m] <= FARTHEST):
+    if not (math.isnan(distance) or LEAST <= numbers[RANGE_STD, m] <= FARTHEST):
         return UNSTATED
-    if not (math.isnan(detour) or LEAST_STD <= numbers[DETOUR_STD, m] <= FARTHEST):
+    if not (math.isnan(detour) or LEAST <= numbers[DETOUR_STD, m] <= FARTHEST):
         return UNSTATED
     for other in range(0 if silent or landmark[m] == UNLABELLED else m):
         again = landmark[other] == landmark[m] and caller[other] == caller[m]

@@ -122,11 +122,11 @@ def obey(words: Sequence[str], heard: Sequence[int] = ()) -> int:
 
 def _refuse_empty(words: Sequence[str]) -> None:
     """Refuse an empty word, which as a path would be the folder that one is in."""
-    from pipistrelle.config import InputError
-
     for before, word in pairwise(("pipistrelle", *words)):
         flag, given, value = word.partition("=")
         if not word or (flag.startswith("-") and given and not value):
+            from pipistrelle.config import InputError
+
             where = flag if given else before
             raise InputError(f"{where}: found '', expected a value; for this folder write .")
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipistrelle.acoustics.arrivals import Arrivals
+from pipistrelle.acoustics.arrivals import Arrivals, arrivals_at
 from pipistrelle.acoustics.callers import callers_of
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks
@@ -135,7 +135,7 @@ def test_labels_follow_their_rows_in_any_order(seed):
     rows, truth = rng.permutation(found.face.size), rng.permutation(arrivals.delay.size)
     columns = [f.name for f in fields(found) if f.name != "direct"]
     turned = Detections(**{name: getattr(found, name)[rows] for name in columns})
-    other = Arrivals(**{f.name: getattr(arrivals, f.name)[truth] for f in fields(arrivals)})
+    other = arrivals_at(arrivals, truth)
     assert labels(turned, other) == np.array(labels(found, arrivals))[rows].tolist()
 
 

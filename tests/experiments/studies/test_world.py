@@ -220,10 +220,12 @@ OTHERS = {
     "rays.likelihood": "printed",
     "rays.spacing": "auto",
     "rays.ranged": "heaviest",
+    "rays.merge": 2.0,
     "fastslam.particles": 30,
     "fastslam.resample_below": 1.0,
     "fastslam.mixture": "exact",
     "fastslam.weights": "sampled",
+    "fastslam.resampled_rays": "restart",
 }
 """Another value of every setting, far enough from its default to be heard or believed."""
 FEW = ("air.spreading", "target.shape", "emitter.radius", "beacon.level_db", "receiver.elements",
