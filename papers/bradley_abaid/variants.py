@@ -31,6 +31,7 @@ VARIANTS: dict[str, dict[str, str]] = {
         "beacon.level-db": "42.8",
         "rays.prune": "2e-5",
     },
+    "bearing": {"rays.ranged": "bearing"},
     "n1": {"rays.power": "1", "rays.prune": "5e-4"},
     "n3": {"rays.power": "3", "rays.prune": "2e-9"},
     "aggregated": {"rays.weights": "aggregated"},
