@@ -58,7 +58,7 @@ def test_the_plans_of_the_package_name_what_was_fitted_and_the_papers_how_it_is_
     fitted = {"emitter": ["level_db"], "beacon": ["level_db"], "rays": ["prune", "power"]}
     assert named("physics") == fitted
     readings = {"detection": ["snapshots", "peak_db"], "emitter": ["off_axis", "level_db"]}
-    assert named("paper") == fitted | readings
+    assert named("paper") == fitted | readings | {"rays": ["ranged", *fitted["rays"]]}
 
 
 def test_the_plans_of_the_package_have_the_same_cases_and_worlds():
@@ -478,9 +478,9 @@ def test_timing_is_beyond_with_timing_and_nothing_else():
 
 
 @pytest.mark.parametrize("name", ["callers", "pair"])
-def test_who_calls_is_asked_in_the_worlds_of_the_papers_study_and_timed(name):
+def test_who_calls_is_asked_in_the_worlds_of_the_papers_study(name):
     plan, physics = (read_plan(find_plan(word)) for word in (name, "physics"))
-    assert plan.config.listening.timing
+    assert plan.config.listening.timing == (name == "callers")
     for part in ("seed", "emitter", "beacon", "motion", "air", "target", "detection"):
         assert getattr(plan.config, part) == getattr(physics.config, part)
     assert plan.config.scenario == physics.config.scenario
