@@ -132,7 +132,10 @@ def test_a_mistake_is_said_in_a_line_and_nothing_is_made(refused, words, said):
         (["run", "-o", ""], "-o: found ''"),
         (["run", "--save-log="], "--save-log: found ''"),
         (["slam", ""], "slam: found ''"),
-        (["report", "", "-o", "d"], "report: found '', expected a value; for this folder write ."),
+        (
+            ["report", "", "-o", "d"],
+            "report: found '', expected a value (for the folder that you are in: .)",
+        ),
     ],
 )
 def test_an_empty_path_is_refused_and_not_taken_for_this_folder(refused, words, said):

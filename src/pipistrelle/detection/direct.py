@@ -24,7 +24,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from pipistrelle.detection.onset import reach_of
 from pipistrelle.jit import Whole, kernel, no_alloc
@@ -59,6 +59,51 @@ class DirectCalls:
     delay: Float[np.ndarray, " c"]
     delay_std: Float[np.ndarray, " c"]
     pulse: float
+
+
+def own_alone(
+    calls: DirectCalls,
+    label: Int[np.ndarray, " d"],
+    own: Int[np.ndarray, " c"],
+    beamed: Bool[np.ndarray, " c"],
+) -> DirectCalls:
+    """Keep of callers with a beam the direct calls that bear their own label alone.
+
+    One that calls alike in all directions is always heard first. One with a beam may point away,
+    and the first of its tone is then an echo, which bears the label of what threw it.
+
+    Parameters
+    ----------
+    calls : DirectCalls
+    label : (d)
+        Whose echo each detection is.
+    own : (c)
+        The labels that the callers bear themselves.
+    beamed : (c)
+
+    Returns
+    -------
+    DirectCalls
+
+    Examples
+    --------
+    >>> time = np.array([np.nan, 0.01])
+    >>> heard = DirectCalls(detection=np.array([-1, 0]), delay=time, delay_std=time, pulse=0.003)
+    >>> named = np.array([-1, 51]), np.array([False, True])
+    >>> own_alone(heard, np.array([51]), *named).delay
+    array([ nan, 0.01])
+    >>> own_alone(heard, np.array([7]), *named).delay
+    array([nan, nan])
+    """
+    heard = calls.detection >= 0
+    of = np.where(heard, label[np.where(heard, calls.detection, 0)], own) if label.size else own
+    wrong = beamed & (of != own)
+    return DirectCalls(
+        detection=np.where(wrong, -1, calls.detection),
+        delay=np.where(wrong, np.nan, calls.delay),
+        delay_std=np.where(wrong, np.nan, calls.delay_std),
+        pulse=calls.pulse,
+    )
 
 
 @no_alloc

@@ -128,7 +128,9 @@ def _refuse_empty(words: Sequence[str]) -> None:
             from pipistrelle.config import InputError
 
             where = flag if given else before
-            raise InputError(f"{where}: found '', expected a value; for this folder write .")
+            raise InputError(
+                f"{where}: found '', expected a value (for the folder that you are in: .)"
+            )
 
 
 def _refuse_sections(words: Sequence[str]) -> None:

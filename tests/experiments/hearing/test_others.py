@@ -7,7 +7,14 @@ from pipistrelle.acoustics.arrivals import arrivals_of_emissions, through_piston
 from pipistrelle.acoustics.callers import callers_at, moves
 from pipistrelle.acoustics.emitter import piston_directivity
 from pipistrelle.arithmetic.random_stream import stream_key
-from pipistrelle.config import CallerConfig, Config, InputError, MotionConfig, ScenarioConfig
+from pipistrelle.config import (
+    CallerConfig,
+    Config,
+    InputError,
+    ListeningConfig,
+    MotionConfig,
+    ScenarioConfig,
+)
 from pipistrelle.experiments.hearing import others
 from pipistrelle.experiments.hearing.courses import course_of, driven, motion_of
 from pipistrelle.experiments.hearing.fields import TRIES, landmarks_in, nearest
@@ -19,7 +26,7 @@ from pipistrelle.experiments.hearing.scenario import (
     standing_landmarks,
     world_of,
 )
-from pipistrelle.experiments.runs.trial import drive_of
+from pipistrelle.experiments.runs.trial import drive_of, scans_of
 from pipistrelle.geometry import wrap
 from pipistrelle.settings import from_flags, resolve
 
@@ -360,6 +367,24 @@ def test_a_vehicles_call_is_the_same_to_itself_and_to_the_other(hearing):
     for landmark, level in lost[home].items():
         assert lost[hearing][landmark] == pytest.approx(level, abs=1e-9)
     assert min(lost[home].values()) < -10.0 < max(lost[home].values())
+
+
+def test_of_a_vehicle_that_points_away_no_echo_is_taken_for_its_direct_call():
+    config = PAIR.model_copy(update={"listening": ListeningConfig(timing=True)})
+    frames, detours = {True: 0, False: 0}, {True: 0, False: 0}
+    for number in range(3):
+        world = world_of(config, number)
+        (heard,) = listen(world, config, (0.0088,), iteration=number)
+        mate = world.callers[1]
+        for k, scan in enumerate(scans_of(heard, "passive", config), start=1):
+            k *= PAIR.scenario.steps_per_frame
+            x, y = world.path[k, :2] - mate.place[k]
+            away = bool(abs(wrap(np.arctan2(y, x) - mate.heading[k])) > np.pi / 2)
+            frames[away] += 1
+            detours[away] += int(np.isfinite(scan.detour).sum())
+    assert min(frames.values()) > 20
+    assert detours[True] == 0
+    assert detours[False] > 100
 
 
 def test_a_direct_call_comes_through_the_piston_that_sends_it():

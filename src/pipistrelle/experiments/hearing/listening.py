@@ -11,11 +11,11 @@ and only the count of clutter lacks the false alarms of the silence (about 0.01 
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Complex, Int
+from jaxtyping import Bool, Complex, Int
 
 from pipistrelle.acoustics.arrivals import (
     Arrivals,
@@ -30,6 +30,7 @@ from pipistrelle.arrays.layout import Layout, square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
 from pipistrelle.arrays.sampling import BLOCK, Sampling, block_shape, blocks_to_hear, sampling
 from pipistrelle.config import Config
+from pipistrelle.detection.direct import own_alone
 from pipistrelle.detection.faces import Heard, average_faces, same_echo, unlabelled
 from pipistrelle.detection.matched import filter_blocks, filter_samples
 from pipistrelle.detection.scans import NOBODY
@@ -148,6 +149,7 @@ class _Rig:
     oracle: Callable[..., Int[np.ndarray, " d"]] | None
     faintest_db: float
     callers: Int[np.ndarray, " c"]
+    beamed: Bool[np.ndarray, " c"]
     workspace: Workspace
 
 
@@ -176,6 +178,7 @@ def _rig(
             margin_db=config.association.margin_db,
         ),
         callers=caller_labels(scenario) if oracle else NOBODY,
+        beamed=np.array([caller.heading is not None for caller in scenario.callers]),
         workspace=Workspace(),
     )
 
@@ -222,6 +225,9 @@ def _heard(time: float, detections: Detections, arrivals: Arrivals, rig: _Rig) -
             pulse=config.emitter.pulse,
             faintest_db=rig.faintest_db,
         )
+        if detections.direct is not None and rig.beamed.any():
+            direct = own_alone(detections.direct, label, rig.callers, rig.beamed)
+            detections = replace(detections, direct=direct)
     heard = average_faces(
         time,
         detections,

@@ -297,7 +297,7 @@ def _sized(world: World) -> Float[np.ndarray, "n 2"]:
 
 
 def _place_beacon(
-    setup: ScenarioConfig, clear_of: Sequence[Float[np.ndarray, "k 2"]], rng: np.random.Generator
+    setup: ScenarioConfig, clear_of: Sequence[Float[np.ndarray, "_ 2"]], rng: np.random.Generator
 ) -> Float[np.ndarray, "2"]:
     """Put the beacon at a random bearing, clear of the path and of bodies that have a size."""
     beacon = place_at(setup.beacon_distance, setup, rng, clear_of)
