@@ -72,7 +72,7 @@ def rows_inside(
         squared = float(off[rows] @ np.linalg.solve(S, off[rows]))
         inside[m] = squared <= bounds[len(off[rows]) - 1]
         if inside[m]:
-            off_by = off_by.plus(squared, len(off[rows]))
+            off_by = off_by.plus(squared, float(len(off[rows])))
     return inside, off_by
 
 
