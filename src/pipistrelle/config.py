@@ -194,7 +194,7 @@ _WAYS = {
 
 
 class CallerConfig(Section):
-    """Someone else who calls, from a place or along a way; but for vehicles in all directions."""
+    """Someone else who calls, in all directions or as another vehicle: from a place or a way."""
 
     name: Annotated[str, Field(pattern=r"^\w[\w-]*$", max_length=40)] | None = None
     """In messages, figures and files; else `beacon` of the first, `caller2` of the second."""
@@ -416,7 +416,7 @@ class RayConfig(Section):
     merge: Annotated[float, Field(ge=0, le=10)] = 0.0
     """Neighbours of a ray become one within so many standard deviations of each other; 0: none."""
     ranged: Literal["anew", "heaviest", "reset", "corrected", "bearing", "others", "moved"] = "anew"
-    """What a range does to a ray: it is placed anew, or as `estimation.rays` lists."""
+    """How a range for a ray is read: it places the landmark anew, or as `estimation.rays` lists."""
 
     @model_validator(mode="after")
     def _ordered(self) -> "RayConfig":
@@ -444,7 +444,7 @@ class FastSlamConfig(Section):
     weights: Literal["marginal", "sampled"] = "marginal"
     """Weigh by the likelihood before the sample, or at it by prior x likelihood / proposal."""
     resampled_rays: Literal["kept", "restart"] = "kept"
-    """What a resampling does to the weights of rays' members: nothing, or all become alike."""
+    """Whether rays keep their members' weights at a resampling, or restart with equal ones."""
 
 
 class Config(Section):

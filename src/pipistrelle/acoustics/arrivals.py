@@ -375,7 +375,7 @@ def through_pistons(
     radius: float,
     speed_of_sound: float,
 ) -> Arrivals:
-    """What arrives when pistons of one radius send the calls of the vehicle and of other vehicles.
+    """Give the calls of the vehicle and of other vehicles the beams of pistons of one radius.
 
     Parameters
     ----------

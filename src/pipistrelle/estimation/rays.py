@@ -101,7 +101,7 @@ RANGED = {
     "anew": ANEW, "heaviest": HEAVIEST, "reset": RESET, "corrected": CORRECTED,
     "bearing": BEARING, "others": OTHERS, "moved": MOVED,
 }  # fmt: skip
-"""What a range does to a ray, by the setting's names; from BEARING on it stays a ray."""
+"""Numbers of the readings of `rays.ranged`; from BEARING on a ray stays a ray."""
 _SHARING = {
     ("paper", "normal"): FEDERATED, ("paper", "printed"): AS_PRINTED, ("auto", "normal"): FITTED,
 }  # fmt: skip

@@ -59,7 +59,7 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 IN_ONE_WORLD = (
     "The bound is the least root mean square without bias on a path: in one world luck may beat it."
 )
-"""What is said wherever a bound stands beside errors."""
+"""The sentence that stands wherever a bound is shown beside errors."""
 PRIOR_STD = 20.0
 """Of a landmark before it is heard [m]."""
 NO_ROUTES: Mapping[int, np.ndarray] = MappingProxyType({})

@@ -33,7 +33,7 @@ NIS = (
     "NIS: how large innovations are, squared, beside what the filter expects; 1 where it believes "
     "rightly."
 )
-"""What is said under a table that has innovations."""
+"""The sentence that stands under a table with innovations."""
 
 
 @contextmanager
