@@ -363,9 +363,8 @@ class Reading:
         """Say how far some worlds are from the paper, in each of the three parts."""
         off, lost = [], {}
         for name in EXCLUDED:
-            diverged = np.any([c[rows] for c in self.columns[name, "diverged"].values()], axis=0)
-            lost[name] = fmean(diverged)
-            counted = rows[~self.lost(name, rows)]
+            lost[name] = fmean(self.diverged(name, rows))
+            counted = self.kept(name, rows)
             for printed in (row for row in TABLE_II if row.filter == name):
                 beam = round(printed.beamwidth)
                 case = ("fused" if beam else "passive", beam)
@@ -429,13 +428,17 @@ class Reading:
     def means(self, name: str, score: str, rows: np.ndarray) -> dict[tuple[str, int], float]:
         """Mean of a score in each case, of the worlds that a filter does not lose."""
         columns = self.columns[name, score]
-        kept = rows[~self.lost(name, rows)]
+        kept = self.kept(name, rows)
         return {case: float(column[kept].mean()) for case, column in columns.items()}
 
-    def lost(self, name: str, rows: np.ndarray) -> np.ndarray:
-        """Whether a filter diverged in any case of each world; nowhere if it did in all of them."""
-        lost = np.any([c[rows] for c in self.columns[name, "diverged"].values()], axis=0)
-        return lost & ~lost.all()
+    def diverged(self, name: str, rows: np.ndarray) -> np.ndarray:
+        """Whether a filter diverged in any case of each of some worlds."""
+        return np.any([c[rows] for c in self.columns[name, "diverged"].values()], axis=0)
+
+    def kept(self, name: str, rows: np.ndarray) -> np.ndarray:
+        """Leave out the worlds in which a filter diverged; none if it did in all of them."""
+        lost = self.diverged(name, rows)
+        return rows if lost.all() else rows[~lost]
 
     def gap(self, rows: np.ndarray) -> dict[int, float]:
         """Passive minus active seen, in standard deviations over the worlds."""

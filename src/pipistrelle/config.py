@@ -244,11 +244,11 @@ class CallerConfig(Section):
         if self.speed == 0.0:
             raise ValueError("found speed 0, expected another; give a place to one that stands")
         if isinstance(self.route, tuple):
-            _check_rising(self.route)
+            _check_rows(self.route)
         return self
 
 
-def _check_rising(route: tuple[tuple[float, ...], ...]) -> None:
+def _check_rows(route: tuple[tuple[float, ...], ...]) -> None:
     """Refuse rows of which one is not later than the one before, or only some have a heading."""
     if len({len(row) for row in route}) > 1:
         raise ValueError("found headings in some rows of the route, expected one in all or in none")
