@@ -193,6 +193,10 @@ _WAYS = {
 """What may be said of each way to be somewhere, and how a refusal calls it."""
 
 
+_CLOCK = ("period", "offset", "jitter", "times")
+"""What may be said of when a caller calls."""
+
+
 class CallerConfig(Section):
     """Someone else who calls, in all directions or as another vehicle: from a place or a way."""
 
@@ -224,6 +228,20 @@ class CallerConfig(Section):
     route: str | Annotated[tuple[RouteRow, ...], Field(min_length=2)] | None = None
     """Or where it is when: a CSV file of `time,x,y`, or its rows [s, m, m]; else it stands. With a
     fourth column, `heading` [rad], it is another vehicle, which calls through a piston."""
+    period: Annotated[float, Field(ge=0.05, le=LARGEST)] | None = None
+    """Time from one call to the next [s]; without any of these four it calls when the vehicle does,
+    with `offset` or `jitter` alone as often."""
+    offset: NonNegative | None = None
+    """Time of its first call [s]; else 0."""
+    jitter: NonNegative | None = None
+    """Standard deviation of each call's time [s], at most a tenth of the period; else 0."""
+    times: tuple[NonNegative, ...] | None = None
+    """Or the times of all its calls [s]."""
+
+    @property
+    def own_clock(self) -> bool:
+        """Whether it calls at times of its own, not when the vehicle does."""
+        return any(one is not None for one in (self.period, self.offset, self.jitter, self.times))
 
     @property
     def way(self) -> str:
@@ -234,7 +252,8 @@ class CallerConfig(Section):
 
     @model_validator(mode="after")
     def _one_way(self) -> "CallerConfig":
-        given = self.model_dump(exclude_none=True, exclude={"name", "frequency", "level_db"})
+        besides = {"name", "frequency", "level_db", *_CLOCK}
+        given = self.model_dump(exclude_none=True, exclude=besides)
         may, called = _WAYS[self.way]
         for key in given:
             if key not in may and key != ("course" if self.way == self.course else self.way):
@@ -245,7 +264,19 @@ class CallerConfig(Section):
             raise ValueError("found speed 0, expected another; give a place to one that stands")
         if isinstance(self.route, tuple):
             _check_rows(self.route)
+        if self.times is not None:
+            _check_times(self)
         return self
+
+
+def _check_times(caller: CallerConfig) -> None:
+    """Refuse times of calls beside a rule that makes them, and times that do not rise."""
+    for key in _CLOCK[:-1]:
+        if getattr(caller, key) is not None:
+            raise ValueError(f"found times and {key}, expected one of them; leave one out")
+    for before, time in pairwise(caller.times or ()):
+        if time <= before:
+            raise ValueError(f"found time {time:g} after {before:g}, expected times that rise")
 
 
 def _check_rows(route: tuple[tuple[float, ...], ...]) -> None:

@@ -98,3 +98,41 @@ def circular_mean(
     """
     weight = np.ones_like(angle) if weight is None else weight
     return float(wrap(np.arctan2(weight @ np.sin(angle), weight @ np.cos(angle))))
+
+
+def poses_at(
+    time: Float[np.ndarray, " k"], known: Float[np.ndarray, " n"], path: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "k 3"]:
+    """Poses at other times, linear in between, NaN outside.
+
+    Parameters
+    ----------
+    time : (k) [s]
+    known : (n) [s]
+        Times of the poses that are known, rising.
+    path : (n, 3) [m, m, rad]
+        These poses, the heading unwrapped.
+
+    Returns
+    -------
+    (k, 3) [m, m, rad]
+
+    Examples
+    --------
+    >>> path = np.array([[0.0, 0.0, 3.0], [1.0, 2.0, 4.0]])
+    >>> poses_at(np.array([0.25, 2.0]), np.array([0.0, 1.0]), path)
+    array([[0.25, 0.5 , 3.25],
+           [ nan,  nan,  nan]])
+    """
+    columns = [np.interp(time, known, column, left=np.nan, right=np.nan) for column in path.T]
+    return np.column_stack(columns)
+
+
+def path_at(
+    time: Float[np.ndarray, " k"], known: Float[np.ndarray, " n"], path: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "k 3"]:
+    """Poses at other times as `poses_at`, of a path whose headings are wrapped, and stay so."""
+    x, y, heading = path.T
+    poses = poses_at(time, known, np.column_stack((x, y, np.unwrap(heading))))
+    poses[:, 2] = wrap(poses[:, 2])
+    return poses

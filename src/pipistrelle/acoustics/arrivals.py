@@ -307,6 +307,12 @@ def arrivals_at(arrivals: Arrivals, rows: Bool[np.ndarray, " a"] | slice) -> Arr
     )
 
 
+def arrivals_together(parts: Sequence[Arrivals]) -> Arrivals:
+    """Put arrivals of the same callers after one another."""
+    names = [name for name in Arrivals.__slots__ if getattr(parts[0], name) is not None]
+    return Arrivals(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
+
+
 def _own_echoes(
     ways: Ways, caller: Caller, config: Config, bodies: Bodies | None
 ) -> tuple[Arrivals, Int[np.ndarray, " a"]]:

@@ -2,8 +2,9 @@
 
 Callers are a list. The first is the vehicle, the only one that moves with the ears. Its call is
 given a beam, and so is that of other vehicles, which have a heading; the others call alike in all
-directions, from a place or along a path. All call at once. Each has a tone of its own, by which its
-call is told from the rest. The paper's list is of two: the vehicle and the beacon.
+directions, from a place or along a path. All call when the vehicle does, but for those that have a
+clock of their own. Each has a tone of its own, by which its call is told from the rest. The paper's
+list is of two: the vehicle and the beacon.
 
 A caller other than the vehicle is also a landmark: it reflects the calls of all but itself, and is
 heard directly in its own tone. Landmarks bear the labels 1 to n, caller j the label n + j.
@@ -47,6 +48,8 @@ class Caller:
         in all directions.
     mission : (t, 3) [m, m, rad] and (t - 1, 2), or None
         Of one that maps the world, too: its poses, and its controls as it knows them.
+    calls : (m) [s], or None
+        When it calls, rising; None of one that calls when the vehicle does.
     """
 
     name: str
@@ -57,6 +60,7 @@ class Caller:
     key: str = ""
     heading: Float[np.ndarray, " t"] | None = None
     mission: tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 2"]] | None = None
+    calls: Float[np.ndarray, " m"] | None = None
 
 
 def callers_of(config: Config, beacon: Float[np.ndarray, "2"]) -> tuple[Caller, Caller]:

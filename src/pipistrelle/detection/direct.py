@@ -65,12 +65,13 @@ def own_alone(
     calls: DirectCalls,
     label: Int[np.ndarray, " d"],
     own: Int[np.ndarray, " c"],
-    beamed: Bool[np.ndarray, " c"],
+    missable: Bool[np.ndarray, " c"],
 ) -> DirectCalls:
-    """Keep of callers with a beam the direct calls that bear their own label alone.
+    """Keep of callers that may be missed the direct calls that bear their own label alone.
 
-    One that calls alike in all directions is always heard first. One with a beam may point away,
-    and the first of its tone is then an echo, which bears the label of what threw it.
+    One that calls when the vehicle does, alike in all directions, is always heard first. One with a
+    beam may point away, and one with a clock of its own may call while the vehicle does: the first
+    of its tone is then an echo, which bears the label of what threw it.
 
     Parameters
     ----------
@@ -79,7 +80,7 @@ def own_alone(
         Whose echo each detection is.
     own : (c)
         The labels that the callers bear themselves.
-    beamed : (c)
+    missable : (c)
 
     Returns
     -------
@@ -97,7 +98,7 @@ def own_alone(
     """
     heard = calls.detection >= 0
     of = np.where(heard, label[np.where(heard, calls.detection, 0)], own) if label.size else own
-    wrong = beamed & (of != own)
+    wrong = missable & (of != own)
     return DirectCalls(
         detection=np.where(wrong, -1, calls.detection),
         delay=np.where(wrong, np.nan, calls.delay),

@@ -48,6 +48,8 @@ class Heard:
         `timed` puts them in.
     callers : (c)
         Labels that the callers bear as landmarks, where somebody tells: whose the detours are.
+    between : bool
+        Whether it is a call that was heard between the vehicle's own.
     """
 
     rows: Scan
@@ -55,6 +57,7 @@ class Heard:
     certainty: Float[np.ndarray, "2 m"] | None = None
     detour: Float[np.ndarray, "2 m"] | None = None
     callers: Int[np.ndarray, " c"] = field(default_factory=lambda: NOBODY)
+    between: bool = False
 
 
 def average_faces(

@@ -18,11 +18,12 @@ Bradley & Abaid, Sec. II-D; what the paper leaves open is settled in the setting
 """
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float, Int, Shaped
+from jaxtyping import Bool, Complex, Float, Int, Shaped
 
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config, InputError
@@ -80,6 +81,9 @@ class Detections:
         for name in ("bearing_std", "delay_std"):
             if not len(getattr(self, name)):
                 object.__setattr__(self, name, np.full(len(self.power), np.nan))
+
+
+_COLUMNS = ("face", "caller", "angle", "bearing", "delay", "power", "bearing_std", "delay_std")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -240,6 +244,51 @@ def detect(
             detection=found, delay=began, delay_std=began_std, pulse=pulse * interval
         ),
     )
+
+
+def detections_at(found: Detections, rows: Bool[np.ndarray, " m"]) -> Detections:
+    """Take some rows; direct calls that are not among them are forgotten."""
+    direct = found.direct
+    if direct is not None:
+        kept = np.append(rows, False)  # the last stands for none
+        number = np.where(kept, np.cumsum(kept) - 1, -1)[direct.detection]
+        direct = replace(direct, detection=number)
+    columns = {name: getattr(found, name)[rows] for name in _COLUMNS}
+    return Detections(**columns, direct=direct)
+
+
+def call_in(
+    matched: Complex[np.ndarray, "l f c e"],
+    found: Detections,
+    caller: int,
+    stretch: tuple[float, float],
+    *,
+    start: float,
+    interval: float,
+    pulse: int,
+) -> Detections:
+    """Take what is of one call of a caller that calls at its own times, and find its direct call.
+
+    It is all of the caller's tone in a stretch of the frame [s]; the other arguments are as those
+    of `detect`.
+    """
+    begin, end = stretch
+    inside = (begin <= found.delay) & (found.delay < end)
+    near = detections_at(found, inside | (found.caller != caller))  # others may leak
+    if found.direct is not None:
+        whole = np.stack((near.face, near.caller))
+        numbers = np.stack((near.delay, near.angle, near.power, near.bearing_std, near.delay_std))
+        lags, tones = (start, interval, pulse), matched.shape[2]
+        first, (began, std) = direct_calls(matched, whole, numbers, tones, lags)
+        heard = DirectCalls(detection=first, delay=began, delay_std=std, pulse=pulse * interval)
+        near = replace(near, direct=heard)
+    return detections_at(near, near.caller == caller)
+
+
+def joined(parts: Sequence[Detections]) -> Detections:
+    """Put what two frames hold of one call after one another; the first has its direct call."""
+    columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _COLUMNS}
+    return Detections(**columns, direct=parts[0].direct)
 
 
 class _Rules(NamedTuple):

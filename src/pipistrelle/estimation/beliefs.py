@@ -1,7 +1,7 @@
 """What estimators believe and how they are asked: records, and the protocols of both."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -227,6 +227,23 @@ class Track:
     full: float | None = None
     online: Gaussian | None = None
     callers: Mapping[int, Gaussian] = field(default_factory=dict)
+
+
+def at_steps(track: Track, steps: Int[np.ndarray, " k"]) -> Track:
+    """Take a track at some of its steps."""
+    if steps.size == track.time.size:
+        return track
+
+    def there(path: Gaussian) -> Gaussian:
+        return replace(path, mean=path.mean[steps], covariance=path.covariance[steps])
+
+    return replace(
+        track,
+        time=track.time[steps],
+        pose=there(track.pose),
+        online=None if track.online is None else there(track.online),
+        callers={label: there(path) for label, path in track.callers.items()},
+    )
 
 
 @runtime_checkable

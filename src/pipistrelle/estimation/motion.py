@@ -23,7 +23,7 @@ from jaxtyping import Float
 
 from pipistrelle.config import LARGEST, InputError
 from pipistrelle.geometry import wrap, wrap_angle
-from pipistrelle.jit import Whole, no_alloc
+from pipistrelle.jit import Whole, kernel, no_alloc
 
 MOTION_MODELS = ("bicycle", "unicycle", "poses")
 BY_POSES = MOTION_MODELS.index("poses")
@@ -255,6 +255,45 @@ def motion_step(
     """
     moved = _increment(motion, pose, control, dt)
     return np.array([pose[0] + moved[0], pose[1] + moved[1], wrap_angle(pose[2] + moved[2])])
+
+
+def relative_motions(
+    motion: Motion, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3 3"]]:
+    """The motion of each control step in the vehicle's axes before it, and its covariance.
+
+    Parameters
+    ----------
+    motion : Motion
+    controls : (k, c)
+        As the model has them.
+    dt : (k) [s]
+
+    Returns
+    -------
+    (k, 3) [m, m, rad]
+    (k, 3, 3)
+
+    Examples
+    --------
+    >>> motion = Motion(model="unicycle", control_std=(0.1, 0.1))
+    >>> way, covariance = relative_motions(motion, np.array([[2.0, 0.0]]), np.array([0.5]))
+    >>> way, covariance[0].diagonal().round(4)
+    (array([[1., 0., 0.]]), array([0.0025, 0.0006, 0.0025]))
+    """
+    numbers = motion_numbers(motion)
+    return _relative_motions(np.ascontiguousarray(controls, dtype=float), dt, numbers)
+
+
+@kernel
+def _relative_motions(
+    controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"], motion: MotionNumbers
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3 3"]]:
+    """Carry a pose at the origin through each control step alone."""
+    ways, covariances = np.zeros((dt.size, 3)), np.zeros((dt.size, 3, 3))
+    for k in range(dt.size):
+        propagate_pose(ways[k], covariances[k], controls[k], dt[k], motion)
+    return ways, covariances
 
 
 def controls_between(

@@ -157,7 +157,7 @@ def pose_bound(
     timed = bool(moving) or np.any(caller != UNLABELLED)
     return _bound(
         path,
-        _true_controls(motion, controls, time, path),
+        true_controls(motion, controls, time, path),
         np.diff(time),
         motion_numbers(motion),
         (state, np.array([place[one] for one in state.tolist()]).reshape(-1, 2)),
@@ -167,7 +167,7 @@ def pose_bound(
     )
 
 
-def _true_controls(
+def true_controls(
     motion: Motion,
     controls: Float[np.ndarray, "k c"],
     time: Float[np.ndarray, " t"],

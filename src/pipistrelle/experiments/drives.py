@@ -3,14 +3,15 @@
 No filter is handed a `Truth`: a trial takes it from the drive when the estimate is made.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks, no_landmarks
-from pipistrelle.estimation.motion import Motion
+from pipistrelle.estimation.motion import Motion, relative_motions
+from pipistrelle.geometry import path_at
 
 LabelledPoints = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]
 """Labels and positions [m] of landmarks."""
@@ -68,3 +69,52 @@ class Drive:
     truth: Truth = NO_TRUTH
     known: Landmarks = field(default_factory=no_landmarks)
     moving: Mapping[int, str] = field(default_factory=dict)
+
+
+def split_at(drive: Drive, times: Sequence[float]) -> tuple[Drive, Int[np.ndarray, " t"]]:
+    r"""Split the steps of a drive in which something happened between their ends.
+
+    A part of a step goes that share :math:`\lambda` of its way, in a straight line, turning
+    evenly, with the share :math:`\lambda` of its covariance. Controls are then motions from pose to
+    pose (`pipistrelle.estimation.motion`).
+
+    Parameters
+    ----------
+    drive : Drive
+    times : sequence of [s]
+
+    Returns
+    -------
+    Drive
+        The same where nothing happened between the steps' ends.
+    (t)
+        Where the times of the drive stand among those of the result.
+    """
+    time, controls, inside = drive.time, drive.controls, np.array(times, dtype=float)
+    inside = inside[(inside > time[0]) & (inside < time[-1])]
+    if np.isin(inside, time).all():
+        return drive, np.arange(time.size)
+    fine = np.union1d(time, inside)
+    step = np.searchsorted(time, fine[1:]) - 1
+    length = np.diff(time)[step]
+    begin, end = (fine[:-1] - time[step]) / length, (fine[1:] - time[step]) / length
+    way, covariance = relative_motions(drive.motion, controls, np.diff(time))
+    before, after = begin[:, np.newaxis] * way[step], end[:, np.newaxis] * way[step]
+    c, s = np.cos(before[:, 2]), np.sin(before[:, 2])
+    turn = np.zeros((step.size, 3, 3))  # into the axes at the part's begin
+    turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1], turn[:, 2, 2] = c, s, -s, c, 1.0
+    moved = np.einsum("kij,kj->ki", turn, after - before)
+    share = (end - begin)[:, np.newaxis, np.newaxis]
+    spread = share * turn @ covariance[step] @ turn.transpose(0, 2, 1)
+    rows, columns = np.triu_indices(3)
+    path = drive.truth.path
+    callers = {
+        label: np.column_stack([np.interp(fine, time, column) for column in way.T])
+        for label, way in drive.truth.callers.items()
+    }
+    path = None if path is None else path_at(fine, time, path)
+    truth = replace(drive.truth, time=fine, path=path, callers=callers)
+    motion = Motion(model="poses", control_std=(0.0, 0.0, 0.0))
+    parts = np.column_stack((moved, spread[:, rows, columns]))
+    split = replace(drive, motion=motion, time=fine, controls=parts, truth=truth)
+    return split, np.searchsorted(fine, time)

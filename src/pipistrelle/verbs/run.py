@@ -111,8 +111,10 @@ def _log(mission: "Mission", scans: "Sequence[Scan]") -> "Log":
 
     from pipistrelle.detection.logs.recording import Log
     from pipistrelle.detection.noise import unstated
+    from pipistrelle.experiments.drives import split_at
 
-    config, drive = mission.config, mission.drive
+    config = mission.config
+    drive, _ = split_at(mission.drive, [scan.time for scan in scans])
     timing = config.listening.timing
     if config.filter.noise == "constant":  # log.toml says it
         scans = list(map(unstated, scans))

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from pipistrelle.config import InputError, MotionConfig, ScenarioConfig
 from pipistrelle.estimation.motion import Motion, controls_between, motion_step
-from pipistrelle.geometry import wrap, wrap_angle
+from pipistrelle.geometry import path_at, wrap_angle
 
 AHEAD = 1.0
 """How far ahead of the vehicle the driver aims [m]."""
@@ -267,10 +267,7 @@ def _poses_at(time: Float[np.ndarray, " t"], course: Poses) -> Float[np.ndarray,
     """Return the poses at some times: to the bit, where they are those of the course."""
     if np.array_equal(time, course.time[: len(time)]):
         return course.path[: len(time)].copy()
-    columns = (*course.path.T[:2], np.unwrap(course.path[:, 2]))
-    path = np.column_stack([np.interp(time, course.time, column) for column in columns])
-    path[:, 2] = wrap(path[:, 2])
-    return path
+    return path_at(time, course.time, course.path)
 
 
 def _steered(

@@ -13,18 +13,13 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Int
 
-from pipistrelle.acoustics.arrivals import (
-    Arrivals,
-    arrivals_at,
-    arrivals_of_emissions,
-    through_piston,
-    through_pistons,
-)
-from pipistrelle.acoustics.callers import VEHICLE, callers_at
+from pipistrelle.acoustics.arrivals import Arrivals, arrivals_at, through_piston
+from pipistrelle.acoustics.callers import VEHICLE
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.layout import Layout, square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
@@ -34,12 +29,18 @@ from pipistrelle.detection.direct import own_alone
 from pipistrelle.detection.faces import Heard, average_faces, same_echo, unlabelled
 from pipistrelle.detection.matched import filter_blocks, filter_samples
 from pipistrelle.detection.scans import NOBODY
-from pipistrelle.detection.snapshots import Detections, Detector, detect, detector
+from pipistrelle.detection.snapshots import (
+    Detections,
+    Detector,
+    call_in,
+    detect,
+    detections_at,
+    detector,
+    joined,
+)
+from pipistrelle.experiments.hearing.frames import CallHeard, frames_of
 from pipistrelle.experiments.hearing.oracle import faintest_level_db, label_detections
 from pipistrelle.experiments.hearing.scenario import Scenario, caller_labels
-
-TOGETHER = 25
-"""Frames whose arrivals are computed at a time: arrays of a few thousand keep NumPy busy."""
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, the frames done and their number."""
@@ -83,7 +84,8 @@ def listen(
 
     Returns
     -------
-    tuple, one per radius, of tuples of Heard, one per frame
+    tuple, one per radius, of tuples of Heard
+        One per frame, and one per call that brings something of those who have clocks of their own.
 
     Raises
     ------
@@ -110,17 +112,44 @@ def listen(
     purpose = "noise" if setup.vehicle == 1 else f"noise of {setup.vehicle}"
     engine = _dense if config.receiver.engine == "dense" else _blocks
     beams: tuple[list[Heard], ...] = tuple([] for _ in radii)
-    frames = range(setup.steps_per_frame, len(scenario.path), setup.steps_per_frame)
     beam = beam or partial(through_piston, off_axis=config.emitter.off_axis)
-    emissions = _emissions(scenario, frames, radii, config, beam)
-    for number, (k, aimed) in enumerate(zip(frames, emissions, strict=True), start=1):
+    calls: dict[int, tuple[CallHeard, list[list[Detections]]]] = {}
+    for number, frame in enumerate(frames_of(scenario, radii, config, beam), start=1):
         key = stream_key(config.seed, iteration, purpose, number)
-        recorded = engine(aimed, rig, key)
-        for heard, arrivals, detections in zip(beams, aimed, recorded, strict=True):
-            heard.append(_heard(float(scenario.time[k]), detections, arrivals, rig))
+        for call in frame.calls:
+            calls.setdefault(call.number, (call, [[] for _ in radii]))
+        for r, record in enumerate(engine(frame.aimed, rig, key)):
+            found = rig.find(record.matched, rig.detector, **record.lags)
+            for call in frame.calls:
+                calls[call.number][1][r].append(_of_call(call, frame.time, record, found))
+            if rig.own_clock.any():
+                found = detections_at(found, ~rig.own_clock[found.caller])
+            beams[r].append(_heard(frame.time, found, frame.aimed[r], rig))
         if progress:
-            progress("listening", number, len(frames))
-    return tuple(tuple(heard) for heard in beams)
+            progress("listening", number, setup.steps // setup.steps_per_frame)
+    for call, parts in calls.values():
+        for heard, part, sounds in zip(beams, parts, call.sounds, strict=True):
+            between = _heard(call.call.time, joined(part), sounds, rig)
+            if between.rows.landmark.size:
+                heard.append(replace(between, between=True))
+    return tuple(tuple(sorted(heard, key=lambda one: one.rows.time)) for heard in beams)
+
+
+class _Record(NamedTuple):
+    """The matched filter's output of a frame; it holds until the next is made."""
+
+    matched: Complex[np.ndarray, "l f c e"]
+    start: float
+    """Delay of lag 0 [s]."""
+    interval: float
+    """Between two lags [s]."""
+    pulse: int
+    """Lags in a call."""
+
+    @property
+    def lags(self) -> dict[str, Any]:
+        """What a detector is told of the lags."""
+        return {"start": self.start, "interval": self.interval, "pulse": self.pulse}
 
 
 class Workspace:
@@ -149,7 +178,8 @@ class _Rig:
     oracle: Callable[..., Int[np.ndarray, " d"]] | None
     faintest_db: float
     callers: Int[np.ndarray, " c"]
-    beamed: Bool[np.ndarray, " c"]
+    missable: Bool[np.ndarray, " c"]
+    own_clock: Bool[np.ndarray, " c"]
     workspace: Workspace
 
 
@@ -163,6 +193,7 @@ def _rig(
     """Settle what every frame of a path is heard with."""
     settled = sampling(config, scenario.callers)
     finder = detector(config, layout, settled.tones)
+    own_clock = np.array([caller.calls is not None for caller in scenario.callers])
     return _Rig(
         config=config,
         layout=layout,
@@ -178,36 +209,19 @@ def _rig(
             margin_db=config.association.margin_db,
         ),
         callers=caller_labels(scenario) if oracle else NOBODY,
-        beamed=np.array([caller.heading is not None for caller in scenario.callers]),
+        missable=own_clock | [caller.heading is not None for caller in scenario.callers],
+        own_clock=own_clock,
         workspace=Workspace(),
     )
 
 
-def _emissions(
-    scenario: Scenario,
-    frames: Sequence[int],
-    radii: Sequence[float],
-    config: Config,
-    beam: Callable[..., Arrivals],
-) -> Iterator[list[Arrivals]]:
-    """Yield each frame's arrivals, one per piston; many frames are computed at a time."""
-    for first in range(0, len(frames), TOGETHER):
-        steps = np.array(frames[first : first + TOGETHER])
-        poses = scenario.path[steps]
-        velocities = (poses[:, :2] - scenario.path[steps - 1, :2]) / config.scenario.step
-        callers = callers_at(scenario.callers, scenario.time, steps)
-        emission, count = arrivals_of_emissions(
-            poses, velocities, scenario.landmarks, callers, config, scenario.bodies
-        )
-        aimed = [
-            through_pistons(
-                emission, callers, beam, radius=radius, speed_of_sound=config.air.celerity
-            )
-            for radius in radii
-        ]
-        end = np.cumsum(count)
-        for rows in map(slice, end - count, end):
-            yield [arrivals_at(arrivals, rows) for arrivals in aimed]
+def _of_call(call: CallHeard, time: float, record: "_Record", found: Detections) -> Detections:
+    """Take what a frame that began at a time holds of a call; delays as those of its sounds."""
+    after, early = call.call.time - time, 0.5 * record.interval * record.pulse
+    stretch = after - early, call.until - time - early
+    part = call_in(record.matched, found, call.call.caller, stretch, **record.lags)
+    direct = part.direct and replace(part.direct, delay=part.direct.delay - after)
+    return replace(part, delay=part.delay - after, direct=direct)
 
 
 def _heard(time: float, detections: Detections, arrivals: Arrivals, rig: _Rig) -> Heard:
@@ -225,8 +239,8 @@ def _heard(time: float, detections: Detections, arrivals: Arrivals, rig: _Rig) -
             pulse=config.emitter.pulse,
             faintest_db=rig.faintest_db,
         )
-        if detections.direct is not None and rig.beamed.any():
-            direct = own_alone(detections.direct, label, rig.callers, rig.beamed)
+        if detections.direct is not None and rig.missable.any():
+            direct = own_alone(detections.direct, label, rig.callers, rig.missable)
             detections = replace(detections, direct=direct)
     heard = average_faces(
         time,
@@ -239,8 +253,8 @@ def _heard(time: float, detections: Detections, arrivals: Arrivals, rig: _Rig) -
     return unlabelled(heard) if rig.oracle is None else heard
 
 
-def _blocks(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[Detections]:
-    """Yield, per beam, what is detected of its arrivals from block sums."""
+def _blocks(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]:
+    """Yield what is recorded of each beam's arrivals, from block sums."""
     layout, settled, space, pulse = rig.layout, rig.sampling, rig.workspace, rig.sampling.pulse
     own, others = _parted(aimed[0])
     shape = block_shape(blocks_to_hear(aimed[0], settled), layout, settled)
@@ -260,7 +274,7 @@ def _blocks(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[Detectio
             noise_std=settled.noise_std,
             out=space.array("matched", lags),
         )
-        yield rig.find(matched, rig.detector, start=pulse * BLOCK, interval=BLOCK, pulse=pulse)
+        yield _Record(matched, start=pulse * BLOCK, interval=BLOCK, pulse=pulse)
 
 
 def _parted(arrivals: Arrivals) -> tuple[slice | np.ndarray, slice | np.ndarray]:
@@ -272,7 +286,7 @@ def _parted(arrivals: Arrivals) -> tuple[slice | np.ndarray, slice | np.ndarray]
     return beamed, ~beamed
 
 
-def _dense(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[Detections]:
+def _dense(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]:
     """Yield the same from every sample until the next call, in single precision."""
     settled, setup = rig.sampling, rig.config.scenario
     length = settled.pulse * settled.block
@@ -294,4 +308,4 @@ def _dense(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[Detection
             noise_std=settled.noise_std,
         )
         start, interval = settled.pulse * BLOCK, 1.0 / settled.rate
-        yield rig.find(matched, rig.detector, start=start, interval=interval, pulse=length)
+        yield _Record(matched, start=start, interval=interval, pulse=length)

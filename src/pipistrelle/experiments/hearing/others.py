@@ -213,7 +213,8 @@ def callers_among(
             caller = replace(caller, heading=_heading(one, around))
         if place is None:
             raise _no_place(caller.key, one, around)
-        callers.append(replace(caller, place=place))
+        calls = _times(caller.key, one, around, stream)
+        callers.append(replace(caller, place=place, calls=calls))
         world = around.config.scenario.world if first is None else None
         file = "" if world is None else f"{Path(world) / 'world.toml'}: "
         _check_apart(callers, around, file + caller.key + ".route" * (one.way == "route"))
@@ -374,6 +375,26 @@ _WAYS: dict[str, Callable[..., np.ndarray | None]] = {
 def _distance(one: CallerConfig, setup: ScenarioConfig) -> float:
     """Return how far from the centre a caller is to be [m]."""
     return setup.beacon_distance if one.distance is None else one.distance
+
+
+def _times(
+    key: str, one: CallerConfig, around: Around, rng: np.random.Generator
+) -> Float[np.ndarray, " m"] | None:
+    """Return when a caller with a clock of its own calls; None of one that has none."""
+    if not one.own_clock:
+        return None
+    if one.times is not None:
+        return np.array(one.times)
+    setup = around.config.scenario
+    period = setup.steps_per_frame * setup.step if one.period is None else one.period
+    jitter = 0.0 if one.jitter is None else one.jitter
+    if jitter > 0.1 * period:
+        raise InputError(
+            f"{key}.jitter: found {jitter:g} s, expected at most a tenth of the period of "
+            f"{period:g} s; make it smaller"
+        )
+    times = np.arange(0.0 if one.offset is None else one.offset, around.time[-1], period)
+    return np.unique((times + jitter * rng.standard_normal(len(times))).clip(0.0))
 
 
 def _check_apart(callers: Sequence[Caller], around: Around, where: str) -> None:

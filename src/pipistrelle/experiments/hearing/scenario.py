@@ -152,6 +152,12 @@ def _mission_of(world: Scenario, vehicle: int) -> Scenario:
         )
     j = others[vehicle - 2]
     one, other = world.callers[VEHICLE], world.callers[j]
+    if other.calls is not None:
+        raise InputError(
+            f"scenario.vehicle: found {vehicle}, which has a clock of its own ({other.key}), "
+            "expected one that calls when the first does; take out its period, offset, jitter and "
+            "times"
+        )
     path, controls = other.mission or (world.path, world.controls)
     callers = list(world.callers)
     callers[VEHICLE] = replace(

@@ -280,6 +280,8 @@ def world_files(scenario: Scenario, config: Config) -> dict[str, str]:
                 files[row["route"]] = table_text(("time", *_POSE[1:]), *way, caller.heading)
         else:
             row["place"] = np.asarray(caller.place).tolist()
+        if caller.calls is not None:
+            row["times"] = caller.calls.tolist()
         callers.append(row)
     vehicle = scenario.callers[VEHICLE]
     call = {"frequency": vehicle.frequency, "level_db": vehicle.level_db}

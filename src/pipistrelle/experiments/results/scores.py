@@ -19,9 +19,9 @@ from pipistrelle.evaluation.accuracy import (
     rmse,
     scored_landmarks,
 )
-from pipistrelle.evaluation.bound import NO_ROUTES, path_bound, pose_bound
+from pipistrelle.evaluation.bound import NO_ROUTES, path_bound, pose_bound, true_controls
 from pipistrelle.evaluation.consistency import diverged, track_nees
-from pipistrelle.experiments.drives import Drive, Truth
+from pipistrelle.experiments.drives import Drive, Truth, split_at
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -299,16 +299,18 @@ def drive_bound(
     if path is None or landmarks is None or not np.isfinite(path).all():
         return None
     told = config.filter
+    controls = true_controls(drive.motion, drive.controls, drive.time, path)
+    parted, steps = split_at(replace(drive, controls=controls), [scan.time for scan in scans])
     return pose_bound(
-        drive.motion,
-        drive.controls,
-        drive.time,
-        path,
+        parted.motion,
+        parted.controls,
+        parted.time,
+        path if parted.truth.path is None else parted.truth.path,
         landmarks,
         scans,
-        drive.truth.callers if config.listening.timing else NO_ROUTES,
+        parted.truth.callers if config.listening.timing else NO_ROUTES,
         (told.caller_speed_std, told.caller_walk_std),
-    )
+    )[steps]
 
 
 def with_bound(scores: Scores, bound: Float[np.ndarray, "t 3 3"] | None) -> Scores:

@@ -17,11 +17,11 @@ from pipistrelle.detection.merging import scan_of
 from pipistrelle.detection.noise import measured, noise_of
 from pipistrelle.detection.scans import Scan, rows_of
 from pipistrelle.estimation.association import Associate, told
-from pipistrelle.estimation.beliefs import Belief, Gaussian
+from pipistrelle.estimation.beliefs import Belief, Gaussian, at_steps
 from pipistrelle.estimation.catalogue import CATALOGUE, entry, short_name
 from pipistrelle.evaluation.bound import bound_of_drawn_start
 from pipistrelle.experiments.cases import Case
-from pipistrelle.experiments.drives import Drive, Truth
+from pipistrelle.experiments.drives import Drive, Truth, split_at
 from pipistrelle.experiments.hearing.courses import motion_of
 from pipistrelle.experiments.hearing.listening import Progress, listen
 from pipistrelle.experiments.hearing.scenario import (
@@ -132,7 +132,8 @@ def scans_of(heard: Sequence[Heard], strategy: Strategy, config: Config) -> tupl
     noise, said = noise_of(config.filter), config.filter.noise == "measured"
     frames = map(timed, heard) if config.listening.timing else heard
     frames = map(measured, frames) if said else frames
-    return tuple(noise(scan_of(frame, strategy)) for frame in frames)
+    scans = ((frame, scan_of(frame, strategy)) for frame in frames)
+    return tuple(noise(scan) for frame, scan in scans if scan.landmark.size or not frame.between)
 
 
 def _bounds(
@@ -267,8 +268,7 @@ def run_trial(
     -------
     TrialResult
     """
-    strategy, name, heard = case.strategy, case.filter, tuple(scans)
-    known = entry(name)
+    strategy, name, heard, known = case.strategy, case.filter, tuple(scans), entry(case.filter)
     scans = _told_who_moves(scans, drive, follows=known.follows and config.listening.timing)
 
     def report(done: int, total: int) -> None:
@@ -283,9 +283,10 @@ def run_trial(
             watch(strategy, name, scan, belief)
 
     began = kernel_clock.wall_s()
+    parted, steps = split_at(drive, [scan.time for scan in scans])
     track = run_filter(
-        known.build(config, drive.motion),
-        drive,
+        known.build(config, parted.motion),
+        parted,
         scans,
         _generator(config.seed, case.iteration, name),
         associate=associate,
@@ -294,16 +295,16 @@ def run_trial(
         watch=look,
     )
     wall_s = kernel_clock.wall_s() - began
+    track = at_steps(track, steps)
     truth = drive.truth if associate is told else replace(drive.truth, landmarks=None)
+    scores = score(track, truth, had, known.nees_limit)
     return TrialResult(
         strategy=strategy,
         filter=name,
         track=track,
         heard=heard,
         scans=tuple(had),
-        scores=replace(
-            score(track, truth, had, known.nees_limit), position_floor_m=position_floor(drive, had)
-        ),
+        scores=replace(scores, position_floor_m=position_floor(drive, had)),
         wall_s=wall_s,
         online=None if track.online is None else score_path(track.online, drive.truth.path),
     )

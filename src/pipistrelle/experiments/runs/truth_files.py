@@ -18,6 +18,7 @@ from pipistrelle.detection.logs.readers import Robot
 from pipistrelle.detection.logs.recording import Log, check_seconds
 from pipistrelle.detection.logs.text_tables import check_unique, read_table, table_text
 from pipistrelle.experiments.drives import LabelledPoints, Truth
+from pipistrelle.geometry import poses_at
 from pipistrelle.own_files import LOG, OwnFiles
 from pipistrelle.refusals import refusal
 
@@ -236,31 +237,3 @@ def read_landmarks(path: Path, columns: tuple[str, ...], separator: str | None) 
     table = read_table(path, columns, separator=separator)
     check_unique(table, columns[0])
     return table.column[columns[0]], np.column_stack((table.column["x"], table.column["y"]))
-
-
-def poses_at(
-    time: Float[np.ndarray, " k"], known: Float[np.ndarray, " n"], path: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "k 3"]:
-    """Poses at other times, linear in between, NaN outside.
-
-    Parameters
-    ----------
-    time : (k) [s]
-    known : (n) [s]
-        Times of the poses that are known, rising.
-    path : (n, 3) [m, m, rad]
-        These poses, the heading unwrapped.
-
-    Returns
-    -------
-    (k, 3) [m, m, rad]
-
-    Examples
-    --------
-    >>> path = np.array([[0.0, 0.0, 3.0], [1.0, 2.0, 4.0]])
-    >>> poses_at(np.array([0.25, 2.0]), np.array([0.0, 1.0]), path)
-    array([[0.25, 0.5 , 3.25],
-           [ nan,  nan,  nan]])
-    """
-    columns = [np.interp(time, known, column, left=np.nan, right=np.nan) for column in path.T]
-    return np.column_stack(columns)
