@@ -210,10 +210,10 @@ def write_store(
     rng = np.random.default_rng(seed)
     text = folder.parent / f"{folder.name}.toml"
     settings = find_plan("paper").read_text().split("[config]\n")[1].split("\n\n")[0]
-    worlds = iterations or len(study.worlds)
+    worlds = max(iterations or 0, study.planned)
     plan = PLAN.format(iterations=worlds, radii=list(RADII), settings=settings) + grid
     text.write_text(plan.replace("invented", name))
-    plan = read_plan(text)
+    plan = read_plan(text, iterations=iterations or len(study.worlds))
     open_store(folder, plan)
     schemas, cases = world_schemas(plan), cases_of(plan)
     shape = (len(study.worlds), len(cases), LANDMARKS)

@@ -20,7 +20,6 @@ from pipistrelle.estimation.catalogue import SECTIONS
 from pipistrelle.experiments.hearing.scenario import Scenario, standing_landmarks, world_of
 from pipistrelle.experiments.studies.beamwidths import MAKERS
 from pipistrelle.experiments.studies.plan import RADIUS, Plan, cases_of, common
-from pipistrelle.experiments.studies.plan_file import planned_worlds
 from pipistrelle.experiments.studies.store import load_study
 from pipistrelle.experiments.studies.world import STEPS, world_schemas
 from pipistrelle.experiments.studies.world_files import (
@@ -213,7 +212,7 @@ def _study(
         name=plan.name,
         variables=variables,
         grid=dict(plan.grid),
-        planned=planned_worlds(plan),
+        planned=plan.planned,
         worlds=worlds,
         config=plan.config,
         configs=configs,

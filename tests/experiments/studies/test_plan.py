@@ -295,6 +295,20 @@ def test_all_that_differs_is_named_but_for_the_number_of_worlds(tmp_path):
     ]
 
 
+def test_how_many_worlds_the_file_names_is_remembered_and_is_no_setting(tmp_path):
+    few = read_plan(find_plan("paper"), iterations=5)
+    assert (few.iterations, few.planned) == (5, 115)
+    assert plan_text(few).splitlines()[2:4] == ["iterations = 5", "planned = 115"]
+    more = plan_of(tmp_path, SMALL, iterations=30)
+    assert (more.iterations, more.planned) == (30, 30)
+    few = plan_of(tmp_path, SMALL, iterations=1)
+    assert plan_of(tmp_path, plan_text(few)) == few
+    assert changed_settings(few, more) == []
+    assert "planned" not in plan_settings(few)
+    with pytest.raises(InputError, match=r"small\.toml: planned: found 'many', expected a"):
+        plan_of(tmp_path, 'planned = "many"\n' + SMALL)
+
+
 def test_the_settings_that_are_not_varied_are_those_of_the_plan(tmp_path):
     text = SMALL + '"emitter.level_db" = [40.0]\n'
     for case in cases_of(plan_of(tmp_path, text)):

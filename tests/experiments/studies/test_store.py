@@ -42,6 +42,41 @@ def test_more_worlds_of_one_plan_are_asked_for_in_one_folder_and_fewer_change_no
     assert read_plan(folder / "plan.toml").iterations == 8
 
 
+def test_a_folder_remembers_how_many_worlds_its_plan_names(tmp_path, plan):
+    folder, kept = tmp_path / "few", tmp_path / "few" / "plan.toml"
+    open_store(folder, plan_of(tmp_path, iterations=1))
+    assert (read_plan(kept).iterations, read_plan(kept).planned) == (1, 3)
+    open_store(folder, read_plan(kept))
+    open_store(folder, plan_of(tmp_path, iterations=2))
+    assert (read_plan(kept).iterations, read_plan(kept).planned) == (2, 3)
+    open_store(folder, plan)
+    assert (read_plan(kept), "planned" in kept.read_text()) == (plan, False)
+    open_store(
+        folder, plan_of(tmp_path, SMALL.replace("iterations = 3", "iterations = 9"), iterations=2)
+    )
+    assert (read_plan(kept).iterations, read_plan(kept).planned) == (3, 9)
+
+
+def test_a_folder_from_before_it_remembered_is_read_and_goes_on(tmp_path, plan):
+    """It named the worlds that were asked for, and no others."""
+    folder, kept = tmp_path / "old", tmp_path / "old" / "plan.toml"
+    open_store(folder, replace(plan, iterations=1, planned=1))
+    assert "planned" not in kept.read_text()
+    assert load_study(folder).plan.planned == 1
+    open_store(folder, plan_of(tmp_path, iterations=2))
+    assert (read_plan(kept).iterations, read_plan(kept).planned) == (2, 3)
+
+
+def test_a_plan_with_notes_is_left_where_only_the_planned_number_is_new(tmp_path, folder, plan):
+    kept = folder / "plan.toml"
+    kept.write_text("# what I think of it\n" + kept.read_text())
+    before = kept.read_text()
+    open_store(
+        folder, plan_of(tmp_path, SMALL.replace("iterations = 3", "iterations = 9"), iterations=2)
+    )
+    assert kept.read_text() == before
+
+
 def test_another_plan_is_refused_with_the_difference(folder, tmp_path):
     before = contents(folder)
     other = plan_of(tmp_path, SMALL.replace("steps = 40", "steps = 44"))

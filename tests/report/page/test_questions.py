@@ -15,6 +15,7 @@ from pipistrelle.experiments.studies.study import run_study
 from pipistrelle.report.claims.statements import CLAIMS
 from pipistrelle.report.numbers import three_digits
 from pipistrelle.report.page.page import write_report
+from reference.studies import TINY
 from report.drawing import draw_only
 from report.invented import invent, narrowed, only, with_third, write_store
 from report.planted import FUSED_EKF, LEVELS, by_level, write_planted
@@ -289,6 +290,25 @@ def test_a_partial_study_says_that_effects_may_still_change(tmp_path):
     assert "effects may still change" in Page(tmp_path).header
 
 
+def test_a_plan_of_ones_own_that_ran_in_fewer_worlds_is_partial_on_the_page_and_in_the_terminal(
+    tmp_path, capsys
+):
+    plan, folder = tmp_path / "tiny.toml", tmp_path / "s"
+    plan.write_text(TINY.replace("iterations = 1", "iterations = 4"))
+    for worlds, told in ((2, ["partial: 2 of 4 worlds"]), (4, [])):
+        assert (
+            main(["study", str(plan), "--iterations", str(worlds), "-o", str(folder), "--quiet"])
+            == 0
+        )
+        capsys.readouterr()
+        assert main(["report", str(folder)]) == 0
+        printed = capsys.readouterr().out.splitlines()
+        assert [line for line in printed if line.startswith("partial")] == told
+        page = Page(folder / "report")
+        assert page.summary["partial"] is bool(told)
+        assert ("2 of 4 worlds are done" in page.header) is bool(told)
+
+
 def test_a_study_that_ran_is_answered_in_the_degrees_that_it_was_asked_in(tmp_path):
     """From the plan's beamwidths to the page, with a filter's own settings, nothing invented."""
     plan = tmp_path / "wide.toml"
@@ -356,7 +376,7 @@ def test_a_gain_has_its_sentence_first_its_row_and_its_line(reported):
 def test_a_short_run_of_a_plan_that_ships_is_partial_on_the_page_and_in_the_terminal(
     tmp_path, capsys
 ):
-    plan, *_ = write_store(tmp_path / "s", invent(2), name="paper")
+    plan, *_ = write_store(tmp_path / "s", invent(2, planned=115), name="paper")
     assert (plan.name, plan.iterations) == ("paper", 2)
     assert main(["report", str(tmp_path / "s")]) == 0
     printed = capsys.readouterr().out.splitlines()

@@ -28,7 +28,7 @@ from pipistrelle.experiments.comparing.matching import (
     worded,
 )
 from pipistrelle.experiments.studies.plan import RADIUS, Plan, PlannedCase, cases_of
-from pipistrelle.experiments.studies.plan_file import plan_settings, planned_worlds
+from pipistrelle.experiments.studies.plan_file import plan_settings
 from pipistrelle.experiments.studies.store import load_study
 from pipistrelle.experiments.studies.world_files import check_world, done_worlds
 from pipistrelle.files import read_file
@@ -182,7 +182,7 @@ def compare_studies(folders: Sequence[Path], *, drop_diverged: bool = False) -> 
         folders=tuple(folders),
         versions=tuple(map(_version, folders)),
         done=tuple(one.worlds for one in told),
-        planned=tuple(planned_worlds(one.plan) for one in told),
+        planned=tuple(one.plan.planned for one in told),
         cases=tuple(case for score in SCORES for case in _judged(pairs, score, drop_diverged)),
         alone=tuple((_label([case], varied, told[who[0]].trials), who) for case, who in left),
         settings=differing([plan_settings(one.plan) for one in told]),

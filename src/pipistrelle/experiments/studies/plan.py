@@ -45,6 +45,9 @@ class Plan:
         is heard.
     worlds : dict
         Worlds that ``scenario.world`` names, by their names.
+    planned : int
+        Number of worlds of a whole study, as the plan's file names it, though fewer were asked for;
+        at least ``iterations`` in what is read.
     """
 
     name: str
@@ -55,6 +58,7 @@ class Plan:
     grid: Mapping[str, tuple[Any, ...]]
     own: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     worlds: Mapping[str, World] = field(default_factory=dict)
+    planned: int = 0
 
     def world(self, config: Config) -> World:
         """Return what is known beforehand of the worlds of some settings."""

@@ -71,6 +71,7 @@ class _Head(Section):
     format: Literal[1]
     name: Annotated[str, Field(pattern=r"^\w[\w.-]*$")]
     iterations: Annotated[int, Field(ge=1, le=MOST_WORLDS)]
+    planned: int = 0
     strategies: Annotated[tuple[Strategy, ...], Field(min_length=1)] = STRATEGIES
     filters: Annotated[tuple[Annotated[str, PlainValidator(_named)], ...], Field(min_length=1)] = (
         PAPERS
@@ -146,31 +147,6 @@ def read_plan(path: Path, over: Layer | None = None, iterations: int | None = No
     return plan_of(read_toml(path), path, over, iterations)
 
 
-def planned_worlds(plan: Plan) -> int:
-    """Tell how many worlds a whole study has.
-
-    Parameters
-    ----------
-    plan : Plan
-        As a study's folder keeps it.
-
-    Returns
-    -------
-    int
-        Of a plan that ships, its own number, though fewer were asked for.
-
-    Examples
-    --------
-    >>> planned_worlds(read_plan(find_plan("paper"), iterations=5))
-    115
-    """
-    if plan.name in PLANS:
-        shipped = read_plan(find_plan(plan.name))
-        if shipped.grid == plan.grid:
-            return max(plan.iterations, shipped.iterations)
-    return plan.iterations
-
-
 def plan_of(
     table: Mapping[str, Any],
     path: Path = Path("plan"),
@@ -233,6 +209,7 @@ def plan_of(
     plan = Plan(
         name=head.name,
         iterations=head.iterations,
+        planned=max(head.iterations, head.planned),
         strategies=head.strategies,
         filters=head.filters,
         config=resolve(layer),
@@ -402,7 +379,7 @@ def plan_settings(plan: Plan) -> dict[str, Any]:
     >>> plan_settings(read_plan(find_plan("paper")))["iterations"]
     115
     """
-    told = {".".join(key): value for key, value in leaves(_as_table(plan))}
+    told = {".".join(key): value for key, value in leaves(_as_table(plan)) if key != ("planned",)}
     worlds = {f"worlds/{name}": _digest(world) for name, world in plan.worlds.items()}
     return told | worlds | {"config.air.speed_of_sound": plan.config.air.celerity}
 
@@ -426,6 +403,7 @@ def _as_table(plan: Plan) -> dict[str, Any]:
         "format": FORMAT,
         "name": plan.name,
         "iterations": plan.iterations,
+        **({"planned": plan.planned} if plan.planned > plan.iterations else {}),
         "strategies": list(plan.strategies),
         "filters": list(plan.filters),
         "config": resolve(kept).model_dump(mode="json", exclude_none=True),
@@ -442,6 +420,8 @@ def _head(path: Path, table: Mapping[str, Any], iterations: int | None) -> _Head
             raise InputError(f"{path}: {name}: no such key of a plan; {_meant(name, known)}")
     given = {"name": path.stem} | {k: v for k, v in table.items() if k in _Head.model_fields}
     if iterations is not None:
+        if isinstance(given.get("iterations"), int):
+            given.setdefault("planned", given["iterations"])
         given["iterations"] = iterations
     try:
         head = _Head.model_validate_json(json.dumps(given, default=str), strict=True)

@@ -5,7 +5,7 @@ So a study can be killed anywhere, continued, and written to by many processes a
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
@@ -104,14 +104,8 @@ def open_store(folder: Path, plan: Plan) -> None:
             raise InputError(
                 f"{kept}: is the plan of another study; name a new folder with -o DIR{told}"
             )
-        if there is None or there.iterations < plan.iterations:
-            if there is not None and not _is_ours(kept, there):
-                raise InputError(
-                    f"{kept}: was changed since Pipistrelle wrote it, so it is not replaced; "
-                    f"set iterations = {plan.iterations} in it"
-                )
-            _keep_worlds(folder, plan)
-            write_whole(kept, plan_text(plan).encode())
+        if there is None or there.iterations < plan.iterations or there.planned < plan.planned:
+            _keep_plan(folder, there, plan)
         readme = README.format(name=plan.name, version=find_version())
         config = plan.config
         if config.scenario.world is not None:
@@ -126,6 +120,23 @@ def open_store(folder: Path, plan: Plan) -> None:
             path.unlink(missing_ok=True)
     except OSError as error:
         raise unusable(folder, error) from error
+
+
+def _keep_plan(folder: Path, there: Plan | None, plan: Plan) -> None:
+    """Write a plan into its folder, with the larger numbers of worlds where one is there."""
+    kept = folder / "plan.toml"
+    if there is not None:
+        if not _is_ours(kept, there):
+            if plan.iterations <= there.iterations:
+                return
+            raise InputError(
+                f"{kept}: was changed since Pipistrelle wrote it, so it is not replaced; "
+                f"set iterations = {plan.iterations} in it"
+            )
+        most = max(there.iterations, plan.iterations)
+        plan = replace(plan, iterations=most, planned=max(there.planned, plan.planned))
+    _keep_worlds(folder, plan)
+    write_whole(kept, plan_text(plan).encode())
 
 
 def _keep_worlds(folder: Path, plan: Plan) -> None:
