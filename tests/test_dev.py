@@ -1,4 +1,4 @@
-"""The set-up script: two who start at once make one environment."""
+"""The set-up script: two who start at once make one environment, and help costs none."""
 
 import subprocess
 import sys
@@ -41,3 +41,11 @@ def test_of_those_who_start_at_once_one_makes_the_environment_and_the_others_wai
     ended = [process.communicate(timeout=60) for process in started]
     assert [process.returncode for process in started] == [0] * 4
     assert sorted(told for told, _ in ended) == ["", "", "", "made\n"]
+
+
+def test_its_help_names_that_of_the_verbs():
+    for asked in ("help", "--help"):
+        done = subprocess.run([sys.executable, DEV, asked], capture_output=True, text=True)
+        assert done.returncode == 0
+        assert "`pipistrelle --help`" in done.stdout
+        assert "`pipistrelle VERB --help`" in done.stdout
