@@ -1,12 +1,13 @@
 """Clocks that stand still while kernels are compiled or loaded: that is no filter's time.
 
-The first kernel that is compiled, and not merely loaded, is announced before: it takes long.
+The first kernel of a process that is compiled, and not merely loaded, is announced before: it takes
+long. It is announced once, and never while input is judged, for a refusal should stand alone.
 """
 
 import sys
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 
 from numba.core.event import Event, Listener, register
 
@@ -20,15 +21,16 @@ class _Clock(Listener):
 
     def __init__(self) -> None:
         self.tell: Callable[[str], object] | None = _say
+        self.said, self.judging = False, 0
         self.lost = (0.0, 0.0)
         self._began, self._depth = (0.0, 0.0), 0
 
     def on_start(self, event: Event) -> None:
         """Stop the clocks."""
-        tell = self.tell
-        if event.kind == _COMPILE and tell is not None:
-            self.tell = None
-            tell(COMPILING)
+        held = self.said or self.judging
+        if event.kind == _COMPILE and self.tell is not None and not held:
+            self.said = True
+            self.tell(COMPILING)
         if not self._depth:
             self._began = _now()
         self._depth += 1
@@ -59,14 +61,24 @@ def _say(line: str) -> None:
 
 
 def announce(tell: Callable[[str], object] | None = _say) -> None:
-    """Have the next kernel that is compiled announced.
+    """Name who is told when the first kernel of this process is compiled.
 
     Parameters
     ----------
     tell : function of a line, optional
-        Called once; None: nobody is told.
+        Called at most once in a process; None: nobody is told.
     """
     _CLOCK.tell = tell
+
+
+@contextmanager
+def judging() -> Iterator[None]:
+    """Announce nothing meanwhile: input is judged, and its few kernels are compiled soon."""
+    _CLOCK.judging += 1
+    try:
+        yield
+    finally:
+        _CLOCK.judging -= 1
 
 
 def _now() -> tuple[float, float]:

@@ -11,9 +11,9 @@ import pytest
 from numba.core.event import install_timer
 
 from pipistrelle import kernel_clock
-from pipistrelle.config import Config, ScenarioConfig
+from pipistrelle.config import Config, InputError, ScenarioConfig
 from pipistrelle.estimation.catalogue import CATALOGUE, is_there
-from pipistrelle.experiments.runs import compiling, trial
+from pipistrelle.experiments.runs import compiling, preparing, trial
 
 TINY = Config(scenario=ScenarioConfig(steps=8, landmarks=4, radius=10.0))
 COLD = """
@@ -48,28 +48,47 @@ for name in sys.argv[1:]:
 
 
 @pytest.fixture
-def said():
-    """What is announced, of the next that is compiled."""
+def said(monkeypatch):
+    """What is announced of the next that is compiled, as if it were this process's first."""
     lines = []
+    monkeypatch.setattr(kernel_clock._CLOCK, "said", False)
     kernel_clock.announce(lines.append)
     yield lines
     kernel_clock.announce()
 
 
-def test_the_first_of_the_kernels_that_are_compiled_is_announced_before(said):
+def test_the_first_of_the_kernels_that_are_compiled_is_announced_before_and_no_other(said):
     numba.njit(lambda x: x + 1)(1.0)
     assert said == [kernel_clock.COMPILING]
     numba.njit(lambda x: x + 2)(1.0)
     assert said == [kernel_clock.COMPILING]
-    kernel_clock.announce(said.append)
+    kernel_clock.announce(said.append)  # by a second mission in this process
     numba.njit(lambda x: x + 3)(1.0)
-    assert said == 2 * [kernel_clock.COMPILING]
+    assert said == [kernel_clock.COMPILING]
 
 
-def test_nobody_need_be_told(capfd):
+def test_nobody_need_be_told(said, capfd):
     kernel_clock.announce(None)
     numba.njit(lambda x: x - 1)(1.0)
     assert capfd.readouterr() == ("", "")
+    kernel_clock.announce(said.append)
+    numba.njit(lambda x: x - 2)(1.0)
+    assert said == [kernel_clock.COMPILING], "who was not told was counted as told"
+
+
+def test_nothing_is_announced_while_input_is_judged(said, monkeypatch):
+    """The world is drawn by kernels, and may be refused."""
+
+    def drawn(*_, **__):
+        numba.njit(lambda x: x + 4)(1.0)
+        raise InputError("scenario.landmarks: too many")
+
+    monkeypatch.setattr(preparing, "world_of", drawn)
+    with pytest.raises(InputError, match="too many"):
+        trial.run_mission(TINY, ("fused",))
+    assert said == []
+    numba.njit(lambda x: x + 5)(1.0)
+    assert said == [kernel_clock.COMPILING]
 
 
 def test_what_is_compiled_while_a_filter_runs_is_no_part_of_its_time(monkeypatch):

@@ -18,6 +18,7 @@ from pipistrelle.estimation.outside import worded
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.results.scores import TrialResult, score
+from pipistrelle.kernel_clock import judging
 
 
 def check_filters(filters: Sequence[str], motion: Motion, config: Config) -> None:
@@ -65,6 +66,7 @@ def _nothing() -> None:
     """Stand for a method that a belief need not have."""
 
 
+@judging()
 def first_belief(name: str, motion: Motion, config: Config) -> Belief:
     """Return what an estimator believes before it has moved or heard anything.
 

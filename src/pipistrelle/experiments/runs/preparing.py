@@ -16,8 +16,10 @@ from pipistrelle.detection.snapshots import detector
 from pipistrelle.experiments.hearing.scenario import Scenario, world_of
 from pipistrelle.experiments.hearing.worlds import ANY, World
 from pipistrelle.experiments.machine import check_length, check_recording
+from pipistrelle.kernel_clock import judging
 
 
+@judging()
 def prepared(
     config: Config,
     *,
