@@ -107,7 +107,7 @@ def test_settings_to_start_from_may_be_settings_a_table_or_a_file(done):
         ((), {"landmarks": [[1, 2], [3, 4]]}, "and name it by world="),
         ((), {"strategies": "activ"}, "strategies: found 'activ', expected 'active', 'fused', 'pa"),
         ((), {"strategies": ["fused", 3]}, "strategies: found 3"),
-        ((), {"filters": "ukf"}, "filter: found 'ukf', expected one of ekf"),
+        ((), {"filters": "ukf"}, "filters: found 'ukf', expected one of ekf"),
         ((), {"filters": "ikef"}, "smoother, both, all, module:Class; did you mean 'iekf'?"),
         ((), {"filters": ["ekf", "botch"]}, "did you mean 'both'?"),
         ((), {"world": "nowhere"}, "nowhere: found no such folder"),

@@ -184,7 +184,7 @@ def entry(name: str) -> Entry:
     )
 
 
-def check_name(name: str, *groups: str) -> str:
+def check_name(name: str, *groups: str, where: str = "filter") -> str:
     """Refuse what names no estimator, whether or not it is there.
 
     Parameters
@@ -192,6 +192,8 @@ def check_name(name: str, *groups: str) -> str:
     name : str
     *groups : str
         Names of several estimators that were allowed, too, for the refusal.
+    where : str
+        Where it is named.
 
     Returns
     -------
@@ -216,7 +218,7 @@ def check_name(name: str, *groups: str) -> str:
         known, near = (*CATALOGUE, *groups), meant(name, (*CATALOGUE, *groups))
         fix = f"; did you mean {near!r}?" if near else ""
         expected = f"one of {', '.join(known)}, module:Class"
-        raise InputError(f"filter: found {name!r}, expected {expected}{fix}")
+        raise InputError(f"{where}: found {name!r}, expected {expected}{fix}")
     return name
 
 

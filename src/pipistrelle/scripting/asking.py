@@ -225,13 +225,15 @@ def named_strategies(chosen: str | Sequence[str]) -> tuple[Strategy, ...]:
     return tuple(one for one in STRATEGIES if one in chosen)
 
 
-def named_filters(chosen: Filters) -> tuple[str, ...]:
+def named_filters(chosen: Filters, where: str = "filters") -> tuple[str, ...]:
     """Name the filters of a choice.
 
     Parameters
     ----------
     chosen : the name of an estimator or its class, several of them, or the name of a group
         Text may hold several, parted by commas. Groups are "both", the paper's two, and "all".
+    where : str
+        What the choice is called in a refusal.
 
     Returns
     -------
@@ -256,15 +258,15 @@ def named_filters(chosen: Filters) -> tuple[str, ...]:
     elif isinstance(chosen, type) or not isinstance(chosen, Iterable):
         chosen = (chosen,)
     parted = (each for one in chosen for each in _parted(one))
-    names = tuple(dict.fromkeys(map(_name_of, parted)))
+    names = tuple(dict.fromkeys(_name_of(one, where) for one in parted))
     if not names:
-        raise InputError("filters: found none, expected an estimator's name or its class")
+        raise InputError(f"{where}: found none, expected an estimator's name or its class")
     for name in names:
         if name in GROUPS:
             means = ", ".join(GROUPS[name])
-            raise InputError(f"filters: found {name!r} in a list; it stands alone, for {means}")
-        entry(check_name(name, *GROUPS))
-    check_distinct(names, "filters")
+            raise InputError(f"{where}: found {name!r} in a list; it stands alone, for {means}")
+        entry(check_name(name, *GROUPS, where=where))
+    check_distinct(names, where)
     return names
 
 
@@ -273,16 +275,16 @@ def _parted(chosen: str | type) -> Sequence[str | type]:
     return [name.strip() for name in chosen.split(",")] if isinstance(chosen, str) else (chosen,)
 
 
-def _name_of(kind: str | type) -> str:
+def _name_of(kind: str | type, where: str) -> str:
     """Return the name by which workers and folders find an estimator: of a class, module:Class."""
     if isinstance(kind, str):
         return kind
     if not isinstance(kind, type):
-        raise InputError(f"filters: found {shown(kind)}, expected an estimator's name or its class")
+        raise InputError(f"{where}: found {shown(kind)}, expected an estimator's name or its class")
     module, name = kind.__module__, kind.__qualname__
     if getattr(sys.modules.get(module), name, None) is not kind:
         raise InputError(
-            f"filters: found the class {name}, which its module, {module}, does not have by this "
+            f"{where}: found the class {name}, which its module, {module}, does not have by this "
             "name; expected one that others find, as module:Class: define it outside of functions"
         )
     return f"{module}:{name}"

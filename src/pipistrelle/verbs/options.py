@@ -278,7 +278,7 @@ def filters(chosen: ChosenFilter, particles: int | None) -> tuple[str, ...]:
     >>> filters("both", 300), filters("ekf", None)
     (('ekf', 'fastslam'), ('ekf',))
     """
-    names = named_filters(chosen)
+    names = named_filters(chosen, "--filter")
     if particles is not None and not any("fastslam" in entry(n).sections for n in names):
         able = [known.name for known in CATALOGUE.values() if "fastslam" in known.sections]
         others = " or ".join(f"--filter {name}" for name in (*able, *GROUPS))

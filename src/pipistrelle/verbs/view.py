@@ -103,7 +103,7 @@ def _play_again(
     delivery.get_ready(OutputOptions(quiet=quiet))
     watch = MissionRecorder(rest=REST)
     with progress(quiet) as show:
-        named = named_filters(trusted) if trusted else ()
+        named = named_filters(trusted, "--filter") if trusted else ()
         done = again(folder, log=log, trusted=named, progress=show, watch=watch)
     if done.difference:
         warn(f"{done.difference}; what is shown is found now")
