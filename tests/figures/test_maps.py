@@ -79,8 +79,14 @@ def test_a_view_grows_by_no_more_than_half(std):
     assert np.all(np.ptp(most, axis=1) <= 1.5 * np.ptp(least, axis=1) + 1e-9)
 
 
-def test_a_view_does_not_grow_for_a_ray_nor_for_what_it_could_not_reach():
-    assert (frame(0.8, rows=2) == frame(0.0)).all()
+def test_a_view_grows_until_it_holds_the_members_of_a_ray_as_they_are_drawn():
+    assert frame(0.8, rows=2)[0] == pytest.approx(
+        (-5.6, 5.0 + 0.8), rel=1e-4
+    )  # one standard deviation
+
+
+def test_a_view_does_not_grow_for_what_it_could_not_reach():
+    assert (frame(3.0, x=9.0, rows=2) == frame(0.0)).all()
     assert (frame(3.0, x=9.0) == frame(0.0)).all()
     assert (frame(3.0, x=np.nan) == frame(0.0)).all()
 
@@ -127,7 +133,7 @@ def test_callers_are_drawn_as_stars_where_they_stand_and_as_lines_where_they_mov
     assert left < path[:, 0].min() < 40.0 < right
 
 
-def test_stars_bear_their_names_but_for_the_one_beacon():
+def test_stars_and_paths_bear_their_names_but_for_the_one_beacon():
     beacon = Caller(name="beacon", frequency=30e3, level_db=42.8, place=np.array([3.0, 4.0]))
     post = replace(beacon, name="a $5 post", frequency=25e3, place=np.array([-2.0, 1.0]))
     boat = replace(beacon, name="boat", frequency=20e3, place=np.zeros((9, 2)))
@@ -141,7 +147,7 @@ def test_stars_bear_their_names_but_for_the_one_beacon():
         return names, callers_shown(callers)
 
     assert drawn(beacon) == ({}, {"beacon"})
-    assert drawn(beacon, boat) == ({}, {"beacon", "moving caller"})
+    assert drawn(beacon, boat) == ({"boat": [0.0, 0.0]}, {"beacon", "moving caller"})
     assert drawn(post) == ({"a $5 post": [-2.0, 1.0]}, {"caller"})
     both = {"beacon": [3.0, 4.0], "a $5 post": [-2.0, 1.0]}
     assert drawn(beacon, post) == (both, {"caller"})

@@ -3,6 +3,7 @@ import subprocess
 import sys
 import weakref
 from dataclasses import replace
+from itertools import pairwise
 
 import matplotlib
 import numpy as np
@@ -54,6 +55,19 @@ def test_titles_say_the_result(three, mission):
         scores = mission.trials[strategy].scores
         counts = f"{scores.landmarks_full} of 51 landmarks placed"
         assert words(axes) == [strategy, "EKF", f"RMSE {scores.position_rmse_m:.2f} m · {counts}"]
+
+
+@pytest.mark.parametrize("end", [1.0, 5.0, 20.0, 187.5, 1000.0])
+def test_labels_of_the_time_do_not_touch_those_of_the_panel_beside(mission, end):
+    figure = draw_mission(list(mission.trials.values()), **mission.scene)
+    rows = figure.axes[3::4]
+    rows[0].set_xlim(0.0, end)
+    figure.canvas.draw()
+    shown = [label for axes in rows for label in axes.get_xticklabels() if label.get_text()]
+    inside = [label for label in shown if 0.0 <= label.get_position()[0] <= end]
+    boxes = sorted((b.x0, b.x1) for b in (label.get_window_extent() for label in inside))
+    assert len(boxes) >= 9
+    assert all(left[1] + 2.0 < right[0] for left, right in pairwise(boxes))
 
 
 def test_all_panels_have_the_same_scales(three):

@@ -57,7 +57,7 @@ def view(
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Limits of a map that shows what is true or, without truth, what is estimated, and ellipses.
 
-    The ellipses of placed landmarks widen it by at most half, a quarter to each side.
+    The ellipses of placed landmarks, and of rays, widen it by at most half, a quarter to each side.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def view(
         Without the vehicle.
     paths : estimated poses (k, 3) [m, m, rad]
     maps : Landmarks
-        Only fully initialised ones count.
+        The places of those that are not fully initialised do not count, their ellipses do.
 
     Returns
     -------
@@ -110,10 +110,11 @@ def _around_ellipses(
     """Return the lowest and highest corner of a frame that grows for ellipses in its reach."""
     corners = [centre - half, centre + half]
     for rows in maps:
-        full = placed(rows) & np.all(np.abs(rows.mean - centre) < 1.5 * half, axis=1)
-        outlines = ellipses(rows.mean[full], rows.covariance[full], PLACED).reshape(-1, 2)
-        outlines = outlines[np.isfinite(outlines).all(axis=1)]
-        corners.extend(np.clip(outlines, centre - 1.5 * half, centre + 1.5 * half))
+        full, near = placed(rows), np.all(np.abs(rows.mean - centre) < 1.5 * half, axis=1)
+        for shown, size in ((near & full, PLACED), (near & ~full, RAY)):
+            outlines = ellipses(rows.mean[shown], rows.covariance[shown], size).reshape(-1, 2)
+            outlines = outlines[np.isfinite(outlines).all(axis=1)]
+            corners.extend(np.clip(outlines, centre - 1.5 * half, centre + 1.5 * half))
     return np.min(corners, axis=0), np.max(corners, axis=0)
 
 
@@ -124,7 +125,7 @@ def draw_truth(
 ) -> None:
     """Draw the true landmarks as open circles, each caller as a star or, where it moves, its path.
 
-    Stars bear their names, but for the paper's one beacon, which the legend names.
+    Stars and paths bear their names, but for the paper's one beacon, which the legend names.
 
     Parameters
     ----------
@@ -152,11 +153,11 @@ def draw_truth(
         place = np.asarray(caller.place)
         if moves(caller):
             axes.plot(*place.reshape(-1, 2).T, color=INK, lw=1.0, ls="-.", zorder=3.4)
-            continue
-        x, y = place
-        axes.plot(x, y, "*", ms=12, mfc=INK, mec="white", mew=0.8, zorder=3.5)
-        if named:
-            axes.annotate(caller.name, (x, y), parse_math=False, color=INK, zorder=7, **style)
+        else:
+            axes.plot(*place, "*", ms=12, mfc=INK, mec="white", mew=0.8, zorder=3.5)
+        if named or moves(caller):
+            end = place.reshape(-1, 2)[-1]
+            axes.annotate(caller.name, end, parse_math=False, color=INK, zorder=7, **style)
 
 
 def callers_shown(callers: Sequence[Caller]) -> set[str]:

@@ -387,8 +387,8 @@ def _draw_errors(rows: Sequence["Axes"], trial: TrialResult, true_path: np.ndarr
 
 
 def _scale_errors(panels: Sequence[Sequence["Axes"]]) -> None:
-    """Scale the error rows, common to all panels; a bound far above the errors is cut."""
-    from matplotlib.ticker import LogLocator
+    """Scale the error rows and their time, common to all; a bound far above the errors is cut."""
+    from matplotlib.ticker import LogLocator, MaxNLocator
 
     def highest(row: int) -> float:
         errors = np.concatenate([np.abs(panel[row].lines[0].get_ydata()) for panel in panels])
@@ -397,6 +397,9 @@ def _scale_errors(panels: Sequence[Sequence["Axes"]]) -> None:
         return float(np.clip(1.05 * bound, 1.2 * error, 3.0 * error))
 
     position, heading, consistency = panels[0]
+    # A label at the end of the time would touch the 0 of the panel beside.
+    consistency.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], prune="upper"))
+    consistency.xaxis.set_major_formatter("{x:g}")
     position.set_ylim(0.0, highest(0))
     heading.set_ylim(-highest(1), highest(1))
     largest = max(panel[2].dataLim.ymax for panel in panels)
