@@ -291,15 +291,13 @@ def test_a_partial_study_says_that_effects_may_still_change(tmp_path):
 
 
 def test_a_plan_of_ones_own_that_ran_in_fewer_worlds_is_partial_on_the_page_and_in_the_terminal(
-    tmp_path, capsys
+    tmp_path, capsys, monkeypatch
 ):
+    draw_only(monkeypatch)
     plan, folder = tmp_path / "tiny.toml", tmp_path / "s"
     plan.write_text(TINY.replace("iterations = 1", "iterations = 4"))
     for worlds, told in ((2, ["partial: 2 of 4 worlds"]), (4, [])):
-        assert (
-            main(["study", str(plan), "--iterations", str(worlds), "-o", str(folder), "--quiet"])
-            == 0
-        )
+        run_study(read_plan(plan, iterations=worlds), folder)
         capsys.readouterr()
         assert main(["report", str(folder)]) == 0
         printed = capsys.readouterr().out.splitlines()
