@@ -252,6 +252,7 @@ NEEDS = {
     "filter.caller_walk_std": ROAMING,
     "filter.robust": {"filter": {"noise": "measured"}},
     "rays.spacing": {"filter": {"bearing_std": 0.003}},
+    "rays.merge": {"scenario": {"steps": 80}},
     "assumed.angular_rate_std": {"motion": {"model": "unicycle"}},
 }
 """What a setting means something with."""
