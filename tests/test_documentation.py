@@ -168,13 +168,17 @@ def heard_and_drive(steps=120):
 def test_the_guides_association_finds_again_what_the_oracle_knew(guide):
     from pipistrelle.detection.faces import unlabelled
     from pipistrelle.detection.merging import scan_of
+    from pipistrelle.detection.noise import as_told
     from pipistrelle.experiments.cases import Case
     from pipistrelle.experiments.runs.trial import run_trial, scans_of
 
     config, heard, drive = heard_and_drive()
     case = Case(strategy="active", filter="ekf")
     told = run_trial(case, drive, scans_of(heard, "active", config), config).track
-    hidden = [scan_of(unlabelled(frame), "active") for frame in heard]
+    hidden = [
+        scan_of(as_told(unlabelled(frame).rows, config.filter, timing=False), "active")
+        for frame in heard
+    ]
     trial = run_trial(case, drive, hidden, config, associate=guide["nearest"])
     found = trial.track
     np.testing.assert_array_equal(found.pose.mean, told.pose.mean)
@@ -190,11 +194,15 @@ def test_the_guides_association_finds_again_what_the_oracle_knew(guide):
 
 def test_the_guides_noise_reaches_the_filter_row_by_row(guide):
     from pipistrelle.detection.merging import scan_of
+    from pipistrelle.detection.noise import as_told
     from pipistrelle.experiments.cases import Case
     from pipistrelle.experiments.runs.trial import run_trial, scans_of
 
     config, heard, drive = heard_and_drive(40)
-    scans = [guide["by_level"](scan_of(frame, "active")) for frame in heard]
+    scans = [
+        guide["by_level"](scan_of(as_told(frame.rows, config.filter, timing=False), "active"))
+        for frame in heard
+    ]
     said = np.concatenate([scan.bearing_std for scan in scans])
     assert said.min() == 0.1
     assert 0.1 < said.max() <= 0.3

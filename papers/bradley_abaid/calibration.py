@@ -109,7 +109,9 @@ def landmarks_seen(config: Config, beams: Sequence[str], world: int) -> dict[str
     for beam, frames in zip(beams, heard, strict=True):
         cases |= {f"{strategy} {beam}": (strategy, frames) for strategy in ("fused", "active")}
     return {
-        name: len({label for frame in frames for label in scan_of(frame, way).landmark.tolist()})
+        name: len(
+            {label for frame in frames for label in scan_of(frame.rows, way).landmark.tolist()}
+        )
         for name, (way, frames) in cases.items()
     }
 

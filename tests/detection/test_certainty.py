@@ -23,7 +23,6 @@ from pipistrelle.detection.certainty import (
     over_noise,
 )
 from pipistrelle.detection.matched import filter_blocks
-from pipistrelle.detection.noise import measured
 from pipistrelle.detection.scans import OWN
 from pipistrelle.detection.snapshots import Detections, detect, detector
 from pipistrelle.experiments.hearing.listening import listen
@@ -339,7 +338,7 @@ def world_errors(iteration, radii):
         radii, listen(scenario, CONFIG, radii, iteration=iteration), strict=True
     ):
         for frame in frames:
-            rows = measured(frame).rows
+            rows = frame.rows
             kept = np.isin(rows.landmark, label)  # the beacon itself is none
             k = int(np.searchsorted(scenario.time, rows.time - 1e-9))
             where = place[order[np.searchsorted(label[order], rows.landmark[kept])]]

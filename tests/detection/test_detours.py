@@ -1,5 +1,6 @@
 """How near detours of isolated echoes come to the least error that any estimator has."""
 
+import math
 from functools import cache
 
 import numpy as np
@@ -12,6 +13,7 @@ from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import BLOCK, sampling
 from pipistrelle.config import Config
+from pipistrelle.detection.certainty import DETOUR_FLOOR
 from pipistrelle.detection.faces import average_faces
 from pipistrelle.detection.matched import filter_blocks
 from pipistrelle.detection.scans import UNLABELLED
@@ -67,8 +69,8 @@ def detour_off(snr_db, key, heels=None):
     row = np.flatnonzero(frame.rows.landmark == ECHO)
     if row.size == 0:
         return np.nan, np.nan
-    e, std = frame.detour[:, row[0]]
-    return e - C * (echo - direct), std
+    e, std = frame.rows.detour[row[0]], frame.rows.detour_std[row[0]]
+    return e - C * (echo - direct), math.sqrt(std**2 - DETOUR_FLOOR**2)
 
 
 @cache

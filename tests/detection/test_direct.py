@@ -13,10 +13,11 @@ from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import BLOCK, sampling
 from pipistrelle.config import AssociationConfig, Config
+from pipistrelle.detection.certainty import DETOUR_FLOOR
 from pipistrelle.detection.direct import DirectCalls, direct_calls, front_edge, loudest_first
-from pipistrelle.detection.faces import average_faces, timed
+from pipistrelle.detection.faces import average_faces
 from pipistrelle.detection.matched import filter_blocks
-from pipistrelle.detection.noise import DETOUR_FLOOR, measured
+from pipistrelle.detection.scans import with_columns
 from pipistrelle.detection.snapshots import Detections, detect, detector
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.oracle import label_detections
@@ -131,8 +132,7 @@ def test_rows_say_how_much_later_than_the_direct_call_they_came_and_how_surely()
     near = np.abs(found.delay[:, None] - delays).argmin(axis=1)
     label = np.where(found.caller == OWN, 7, np.where(near == 0, 51, 4))
     heard = average_faces(0.5, found, label, averaging="plain", speed_of_sound=C)
-    assert np.isnan(heard.rows.detour).all(), "until somebody asks"
-    rows = measured(timed(heard)).rows
+    rows = heard.rows
     told = dict(zip(rows.landmark.tolist(), rows.detour, strict=True))
     assert told[4] == pytest.approx(C * 0.011, abs=0.05)
     assert np.isnan([told[7], told[51]]).all(), "an own echo, and the direct call itself"
@@ -151,7 +151,9 @@ def test_a_detour_is_as_unsure_as_echo_and_direct_call_together():
         delay=np.array([0.03]), delay_std=np.array([3e-5]), bearing_std=one, direct=direct,
     )  # fmt: skip
     heard = average_faces(0.5, echo, np.array([4]), averaging="plain", speed_of_sound=C)
-    np.testing.assert_allclose(heard.detour[:, 0], [C * 0.01, C * 5e-5], rtol=1e-12)
+    spread = np.hypot(C * 5e-5, DETOUR_FLOOR)
+    np.testing.assert_allclose(heard.rows.detour, C * 0.01, rtol=1e-12)
+    np.testing.assert_allclose(heard.rows.detour_std, spread, rtol=1e-12)
 
 
 def test_what_comes_while_the_direct_call_lasts_has_no_detour():
@@ -159,7 +161,7 @@ def test_what_comes_while_the_direct_call_lasts_has_no_detour():
         found = detected((0.02, 0.0, BEACON, 26.0), (0.02 + apart, 3.1, BEACON, 20.0))
         late = found.delay > 0.02 + 0.5 * apart
         label = np.where(late, 4, 51)
-        rows = timed(average_faces(0.5, found, label, averaging="plain", speed_of_sound=C)).rows
+        rows = average_faces(0.5, found, label, averaging="plain", speed_of_sound=C).rows
         assert np.isfinite(rows.detour[rows.landmark == 4]).tolist() == [heard_apart]
 
 
@@ -392,7 +394,7 @@ def in_worlds(radius=0.0088, worlds=3, delay_gate=0.25):
 
         (frames,) = listen(scenario, config, (radius,), iteration=world, oracle=listened)
         for frame, delays in zip(frames, true, strict=True):
-            told = measured(timed(frame)).rows
+            told = frame.rows
             echoes = (told.caller == BEACON) & (told.landmark != beacon)
             for label, e, std in zip(
                 told.landmark[echoes].tolist(),
@@ -460,7 +462,7 @@ def test_the_dense_engine_times_as_the_block_engine_does():
             "seed": 1000, "scenario": {"steps": 40}, "receiver": {"engine": engine},
         })  # fmt: skip
         (frames,) = listen(world_of(config, 0), config, (0.0088,))
-        told = [dict(zip(f.rows.landmark.tolist(), f.detour[0], strict=True)) for f in frames]
+        told = [dict(zip(f.rows.landmark.tolist(), f.rows.detour, strict=True)) for f in frames]
         off[engine] = [
             (n, label, e) for n, f in enumerate(told) for label, e in f.items() if e == e
         ]
@@ -477,6 +479,7 @@ def test_with_timing_off_scans_are_to_the_bit_those_of_old():
     (frames,) = listen(world_of(config), config, (0.0088,))
     for strategy in ("active", "fused", "passive"):
         scans = scans_of(frames, strategy, config)
-        old = scans_of([replace(f, detour=None) for f in frames], strategy, config)
+        untimed = [replace(f, rows=with_columns(f.rows, detour=np.nan)) for f in frames]
+        old = scans_of(untimed, strategy, config)
         assert [s.numbers.tobytes() for s in scans] == [s.numbers.tobytes() for s in old]
         assert all(np.isnan(s.detour).all() for s in scans)

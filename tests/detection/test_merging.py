@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipistrelle.detection.certainty import BEARING_FLOOR, RANGE_FLOOR
 from pipistrelle.detection.faces import Heard, average_faces, same_echo, unlabelled
 from pipistrelle.detection.merging import scan_of
 from pipistrelle.detection.scans import COLUMNS, OWN, UNLABELLED, with_columns
@@ -101,7 +102,6 @@ def test_the_order_of_the_detections_does_not_matter(seed, averaging):
     two = heard_of(Detections(**columns), label[order], averaging)
     for name in COLUMNS:
         assert getattr(one.rows, name).tobytes() == getattr(two.rows, name).tobytes()
-    assert one.certainty.tobytes() == two.certainty.tobytes()
     assert one.clutter == two.clutter
 
 
@@ -112,15 +112,16 @@ def test_a_mean_is_as_sure_as_its_parts_and_their_weights_make_it(seed, averagin
     found, label = crowd(rng)
     found = sure(rng, found)
     heard = heard_of(found, label, averaging)
-    assert heard.certainty.shape == (2, heard.rows.landmark.size)
     for i, (landmark, tone) in enumerate(zip(heard.rows.landmark, heard.rows.caller, strict=True)):
         rows = strongest(found, label, landmark, tone)
         weight = np.cos(found.angle[rows]) ** 2 if averaging == "weighted" else np.ones(len(rows))
         weight /= weight.sum()
         across = np.sqrt(np.sum(np.square(weight * found.bearing_std[rows])))
-        assert heard.certainty[0, i] == pytest.approx(across, rel=1e-12)
+        floor = BEARING_FLOOR[min(tone, 1)]
+        assert heard.rows.bearing_std[i] == pytest.approx(np.hypot(across, floor), rel=1e-12)
         along = 0.5 * 343.0 * np.sqrt(np.sum(np.square(weight * found.delay_std[rows])))
-        assert heard.certainty[1, i] == pytest.approx(along if tone == OWN else NAN, nan_ok=True)
+        along = np.hypot(along, RANGE_FLOOR) if tone == OWN else NAN
+        assert heard.rows.range_std[i] == pytest.approx(along, nan_ok=True)
 
 
 def test_a_plain_mean_of_n_has_the_root_of_the_summed_variances_over_n():
@@ -129,15 +130,18 @@ def test_a_plain_mean_of_n_has_the_root_of_the_summed_variances_over_n():
         found, bearing_std=np.array([0.03, 0.04, 9.0]), delay_std=np.array([3e-6, 4e-6, 9.0])
     )
     heard = heard_of(found, [5, 5, 5])
-    np.testing.assert_allclose(heard.certainty, [[0.05 / 2], [343.0 / 2 * 5e-6 / 2]], rtol=1e-12)
+    expected = np.hypot(0.05 / 2, BEARING_FLOOR[OWN])
+    np.testing.assert_allclose(heard.rows.bearing_std, expected, rtol=1e-12)
+    expected = np.hypot(343.0 / 2 * 5e-6 / 2, RANGE_FLOOR)
+    np.testing.assert_allclose(heard.rows.range_std, expected, rtol=1e-12)
 
 
 def test_a_mean_of_which_one_part_says_nothing_says_nothing():
     found = detections((0, 0, 44, 0.02, 9), (1, 0, -46, 0.02, 8), (0, 0, 10, 0.03, 9))
     found = replace(found, bearing_std=np.array([0.03, NAN, 0.02]), delay_std=np.full(3, 1e-6))
     heard = heard_of(found, [5, 5, 6])
-    assert np.isnan(heard.certainty[0]).tolist() == [True, False]
-    assert np.isfinite(heard.certainty[1]).all()
+    assert np.isnan(heard.rows.bearing_std).tolist() == [True, False]
+    assert np.isfinite(heard.rows.range_std).all()
 
 
 def test_directions_either_side_of_straight_back_average_straight_back():
@@ -174,7 +178,7 @@ def test_silence_is_heard_as_nothing():
     heard = heard_of(found, nothing.astype(int))
     assert (heard.rows.landmark.size, heard.rows.bearing.size, heard.clutter) == (0, 0, 0)
     for strategy in ("active", "fused", "passive"):
-        assert scan_of(heard, strategy).landmark.size == 0
+        assert scan_of(heard.rows, strategy).landmark.size == 0
 
 
 def test_weights_make_two_faces_as_good_as_one_looked_straight_at_whatever_the_direction():
@@ -221,21 +225,21 @@ BOTH = heard_rows((1, 0.1, NAN, 3.0), (2, NAN, 0.2, NAN), (7, 3.1, -3.1, 9.0), (
 
 
 def test_active_takes_the_vehicles_tone_alone():
-    scan = scan_of(BOTH, "active")
+    scan = scan_of(BOTH.rows, "active")
     assert (scan.time, scan.landmark.tolist()) == (2.0, [1, 7, 9])
     assert scan.bearing.tolist() == [0.1, 3.1, -0.4]
     assert scan.range.tolist() == [3.0, 9.0, 5.0]
 
 
 def test_passive_takes_the_beacons_tone_alone_and_never_a_range():
-    scan = scan_of(BOTH, "passive")
+    scan = scan_of(BOTH.rows, "passive")
     assert scan.landmark.tolist() == [2, 7, 9]
     assert scan.bearing.tolist() == [0.2, -3.1, 0.2]
     assert np.isnan(scan.range).all()
 
 
 def test_fused_takes_both_and_the_mean_direction_where_both_are_there():
-    scan = scan_of(BOTH, "fused")
+    scan = scan_of(BOTH.rows, "fused")
     assert scan.landmark.tolist() == [1, 2, 7, 9]
     np.testing.assert_allclose(scan.bearing, [0.1, 0.2, -np.pi, -0.1], atol=1e-12)
     np.testing.assert_array_equal(scan.range, [3.0, NAN, 9.0, 5.0])
@@ -246,7 +250,7 @@ def test_fused_takes_both_and_the_mean_direction_where_both_are_there():
 def test_fused_sees_what_active_or_passive_see_and_measures_what_they_measure(seed, averaging):
     found, label = crowd(np.random.default_rng(seed), labels=14)
     heard = heard_of(found, label, averaging)
-    active, fused, passive = (scan_of(heard, s) for s in ("active", "fused", "passive"))
+    active, fused, passive = (scan_of(heard.rows, s) for s in ("active", "fused", "passive"))
     assert set(fused.landmark) == set(active.landmark) | set(passive.landmark)
     ranged = ~np.isnan(fused.range)
     assert fused.landmark[ranged].tolist() == active.landmark.tolist()
@@ -285,15 +289,8 @@ def test_without_labels_rows_are_what_they_were_and_nobodys():
     assert set(nobodys.rows.landmark.tolist()) == {UNLABELLED}
     for name in set(COLUMNS) - {"landmark"}:
         np.testing.assert_array_equal(getattr(nobodys.rows, name), getattr(heard.rows, name))
-    fused = scan_of(nobodys, "fused")
+    fused = scan_of(nobodys.rows, "fused")
     assert fused.landmark.size == nobodys.rows.landmark.size, "nothing is merged without a label"
-
-
-def test_without_labels_rows_are_as_sure_as_they_were():
-    rng = np.random.default_rng(3)
-    found, label = crowd(rng)
-    heard = heard_of(sure(rng, found), label)
-    np.testing.assert_array_equal(unlabelled(heard).certainty, heard.certainty)
 
 
 def test_rows_of_one_landmark_fuse_by_inverse_variances_where_all_are_told_and_plainly_else():
@@ -302,13 +299,13 @@ def test_rows_of_one_landmark_fuse_by_inverse_variances_where_all_are_told_and_p
         bearing_std=np.array([0.01, 0.02, 0.04]), range_std=0.3,
     )  # fmt: skip
     weight = np.array([16.0, 4.0, 1.0])
-    fused = scan_of(Heard(rows=rows, clutter=0), "fused")
+    fused = scan_of(rows, "fused")
     mean = wrap(3.1 + np.average(wrap(rows.bearing - 3.1), weights=weight))
     assert fused.bearing[0] == pytest.approx(mean, abs=1e-12)
     assert fused.bearing_std[0] == pytest.approx(0.04 / np.sqrt(21.0), rel=1e-12)
     assert fused.range_std.tolist() == [0.3]
     unsaid = with_columns(rows, bearing_std=np.array([0.01, NAN, 0.04]))
-    plain = scan_of(Heard(rows=unsaid, clutter=0), "fused")
+    plain = scan_of(unsaid, "fused")
     mean = wrap(3.1 + np.mean(wrap(rows.bearing - 3.1)))
     assert plain.bearing[0] == pytest.approx(mean, abs=1e-12)
     assert np.isnan(plain.bearing_std).all()
@@ -318,9 +315,9 @@ def test_three_callers_of_one_landmark_are_averaged_as_directions():
     rows = scan_with(
         [4, 4, 4], [3.1, -3.1, -3.0], [5.0, NAN, NAN], caller=np.arange(3), bearing_std=NAN
     )
-    (bearing,) = scan_of(Heard(rows=rows, clutter=0), "fused").bearing
+    (bearing,) = scan_of(rows, "fused").bearing
     assert bearing == pytest.approx(wrap(3.1 + np.mean(wrap(rows.bearing - 3.1))), abs=1e-12)
-    (bearing,) = scan_of(Heard(rows=rows, clutter=0), "passive").bearing
+    (bearing,) = scan_of(rows, "passive").bearing
     assert bearing == pytest.approx(-3.05, abs=1e-12)
 
 
@@ -330,4 +327,4 @@ def test_two_callers_fuse_to_the_bit_as_half_the_turn_from_one_to_the_other(seed
     own, other = np.random.default_rng(seed).uniform(-np.pi, np.pi, (2, 9))
     both = heard_rows(*zip(range(9), own, other, np.ones(9), strict=True))
     halfway = wrap(own + 0.5 * wrap(other - own))
-    assert scan_of(both, "fused").bearing.tobytes() == halfway.tobytes()
+    assert scan_of(both.rows, "fused").bearing.tobytes() == halfway.tobytes()

@@ -4,15 +4,11 @@ import numpy as np
 import pytest
 
 from pipistrelle.config import Config, FilterConfig
-from pipistrelle.detection.faces import Heard
-from pipistrelle.detection.noise import (
-    BEARING_FLOOR,
-    RANGE_FLOOR,
-    ConstantNoise,
-    measured,
-    noise_of,
-)
+from pipistrelle.detection.certainty import BEARING_FLOOR, RANGE_FLOOR
+from pipistrelle.detection.faces import Heard, average_faces
+from pipistrelle.detection.noise import ConstantNoise, as_told, noise_of
 from pipistrelle.detection.scans import COLUMNS, with_columns
+from pipistrelle.detection.snapshots import Detections
 from pipistrelle.experiments.runs.trial import scans_of
 from reference.missions import scan_with
 
@@ -54,69 +50,63 @@ def test_a_detour_is_told_to_be_off_by_the_way_of_what_a_range_is():
 
 # What the signal tells
 
-ROWS = scan_with(
-    [3, 3, 8, 9], [0.1, 0.14, 0.3, -1.0], [2.0, NAN, NAN, 5.0],
-    caller=np.array([0, 1, 2, 0]), bearing_std=NAN, range_std=NAN, level_db=12.0,
+TOLD = np.array([[0.003, 0.01, 0.02, 0.0], [0.004, NAN, NAN, 0.0]])
+HEARD = average_faces(
+    0.5,
+    Detections(
+        face=np.zeros(4, int), caller=np.array([0, 1, 2, 0]), angle=np.zeros(4),
+        bearing=np.array([0.1, 0.14, 0.3, -1.0]), delay=np.array([0.01, 0.02, 0.03, 0.04]),
+        power=np.full(4, 20.0), bearing_std=TOLD[0], delay_std=TOLD[1] / 171.5,
+    ),
+    np.array([3, 3, 8, 9]), averaging="plain", speed_of_sound=343.0,
 )  # fmt: skip
-CERTAINTY = np.array([[0.003, 0.01, 0.02, 0.0], [0.004, NAN, NAN, 0.0]])
-HEARD = Heard(rows=ROWS, clutter=2, certainty=CERTAINTY)
+ROWS = HEARD.rows
 
 
 def test_rows_are_as_sure_as_the_signal_tells_and_no_surer_than_the_floor_of_their_caller():
-    told = measured(HEARD)
     own, other = BEARING_FLOOR
-    expected = np.hypot(CERTAINTY[0], [own, other, other, own])
-    np.testing.assert_allclose(told.rows.bearing_std, expected, rtol=1e-15)
+    expected = np.hypot(TOLD[0], [own, other, other, own])
+    np.testing.assert_allclose(ROWS.bearing_std, expected, rtol=1e-12)
     expected = [np.hypot(0.004, RANGE_FLOOR), NAN, NAN, RANGE_FLOOR]
-    np.testing.assert_allclose(told.rows.range_std, expected, rtol=1e-15)
+    np.testing.assert_allclose(ROWS.range_std, expected, rtol=1e-12)
     assert own < other, "another's echoes come at all times, and overlap more"
-
-
-def test_what_the_signal_tells_changes_nothing_else():
-    told = measured(HEARD)
-    for name in set(COLUMNS) - {"bearing_std", "range_std"}:
-        np.testing.assert_array_equal(getattr(told.rows, name), getattr(ROWS, name))
-    assert (told.rows.time, told.clutter) == (ROWS.time, 2)
-    assert told.certainty is CERTAINTY
-    assert np.isnan(ROWS.bearing_std).all(), "the frame itself stays as it was"
-
-
-def test_a_frame_of_which_the_signal_tells_nothing_stays_as_it_is():
-    untold = replace(HEARD, certainty=None)
-    assert measured(untold) is untold
-    unsure = replace(HEARD, certainty=np.full((2, 4), NAN))
-    assert np.isnan(measured(unsure).rows.bearing_std).all()
 
 
 def settled(noise):
     return Config(filter=FilterConfig(noise=noise, range_std=0.2, bearing_std=0.15))
 
 
+def heard_with(**columns):
+    return [Heard(rows=with_columns(ROWS, **columns), clutter=2)]
+
+
 @pytest.mark.parametrize("strategy", ["active", "fused", "passive"])
 def test_with_constant_noise_scans_are_to_the_bit_those_of_a_detector_that_tells_nothing(strategy):
     sure = scans_of([HEARD], strategy, settled("constant"))
-    unsure = scans_of([replace(HEARD, certainty=None)], strategy, settled("constant"))
-    for one, other in zip(sure, unsure, strict=True):
+    unsure = heard_with(bearing_std=NAN, range_std=NAN, detour_std=NAN)
+    for one, other in zip(sure, scans_of(unsure, strategy, settled("constant")), strict=True):
         for name in COLUMNS:
             assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
         assert set(one.bearing_std.tolist()) == {0.15}
 
 
 def test_with_measured_noise_a_scan_is_as_sure_as_its_rows_and_constants_fill_what_is_left():
-    certainty = CERTAINTY.copy()
-    certainty[:, 3] = NAN
-    (scan,) = scans_of([replace(HEARD, certainty=certainty)], "fused", settled("measured"))
-    own, other = np.hypot(CERTAINTY[0, :2], BEARING_FLOOR)
+    unsure = np.array([False, False, False, True])
+    heard = heard_with(
+        bearing_std=np.where(unsure, NAN, ROWS.bearing_std),
+        range_std=np.where(unsure, NAN, ROWS.range_std),
+    )
+    (scan,) = scans_of(heard, "fused", settled("measured"))
+    own, other = np.hypot(TOLD[0, :2], BEARING_FLOOR)
     both = 1.0 / np.hypot(1.0 / own, 1.0 / other)
     assert scan.landmark.tolist() == [3, 8, 9]
     expected = [both, np.hypot(0.02, BEARING_FLOOR[1]), 0.15]
     np.testing.assert_allclose(scan.bearing_std, expected, rtol=1e-12)
-    np.testing.assert_allclose(scan.range_std, [np.hypot(0.004, RANGE_FLOOR), 0.2, 0.2], rtol=1e-15)
+    np.testing.assert_allclose(scan.range_std, [np.hypot(0.004, RANGE_FLOOR), 0.2, 0.2], rtol=1e-12)
 
 
 def test_measured_noise_merges_rows_by_their_inverse_variances_and_constant_noise_plainly():
-    variance = np.square(measured(HEARD).rows.bearing_std[:2])
-    mean = np.average(ROWS.bearing[:2], weights=1.0 / variance)
+    mean = np.average(ROWS.bearing[:2], weights=1.0 / np.square(ROWS.bearing_std[:2]))
     (scan,) = scans_of([HEARD], "fused", settled("measured"))
     assert scan.bearing[0] == pytest.approx(mean, rel=1e-12)
     assert abs(mean - 0.1) < 0.2 * abs(mean - 0.14), "the vehicle's own call is the surer one"
@@ -124,8 +114,17 @@ def test_measured_noise_merges_rows_by_their_inverse_variances_and_constant_nois
     assert scan.bearing[0] == pytest.approx(0.12, rel=1e-12)
 
 
+@pytest.mark.parametrize("timing", [False, True])
 @pytest.mark.parametrize("noise", ["constant", "measured"])
-def test_rows_that_state_their_own_noise_merge_by_it_where_the_signal_tells_nothing(noise):
-    rows = with_columns(ROWS, bearing_std=np.array([0.03, 0.01, 0.1, 0.1]))
-    (scan,) = scans_of([Heard(rows=rows, clutter=0)], "fused", settled(noise))
-    assert scan.bearing[0] == pytest.approx((0.1 / 9.0 + 0.14) / (1.0 / 9.0 + 1.0), rel=1e-12)
+def test_an_estimator_is_told_what_the_settings_let_it_know_and_all_else_as_it_was(noise, timing):
+    rows = replace(
+        with_columns(ROWS, detour=np.array([NAN, 4.0, NAN, NAN]), detour_std=0.1),
+        callers=np.array([-1, 51, 52]),
+    )
+    known = as_told(rows, FilterConfig(noise=noise), timing=timing)
+    hidden = {"bearing_std", "range_std", "detour_std"} if noise == "constant" else set()
+    hidden |= set() if timing else {"detour", "detour_std"}
+    for name in COLUMNS:
+        expected = np.full(4, NAN) if name in hidden else getattr(rows, name)
+        np.testing.assert_array_equal(getattr(known, name), expected)
+    assert known.callers.tolist() == ([-1, 51, 52] if timing else [])

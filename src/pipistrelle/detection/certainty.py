@@ -30,6 +30,15 @@ LOUDEST_NOISE = 0.999
 """Share of snapshots whose noise is no louder than what is taken for noise alone."""
 FAINTEST = 0.1
 """Least power over the noise that a deviation is told for."""
+BEARING_FLOOR = (0.002, 0.009)
+"""Error [rad] of a bearing that no level removes, by the vehicle's own call and by another's: what
+echoes that overlap do to each other and leave no trace beside the beam. With these the errors in
+the paper's worlds have the variances that are told; another's echoes come at all times, and overlap
+more."""
+RANGE_FLOOR = 0.01
+"""Error [m] of a range that no level removes, likewise."""
+DETOUR_FLOOR = 0.006
+"""Error [m] of a detour that no level removes, likewise."""
 
 
 def loudest_noise(elements: int) -> float:

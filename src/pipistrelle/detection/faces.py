@@ -6,21 +6,25 @@ echo (`same_echo`).
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipistrelle.detection.certainty import BEARING_FLOOR, DETOUR_FLOOR, RANGE_FLOOR
 from pipistrelle.detection.direct import DirectCalls
 from pipistrelle.detection.scans import (
     BEARING,
+    BEARING_STD,
     DETOUR,
+    DETOUR_STD,
     LEVEL,
     NOBODY,
     NUMBERS,
     OWN,
     RANGE,
+    RANGE_STD,
     UNLABELLED,
     Scan,
 )
@@ -36,27 +40,16 @@ class Heard:
     Attributes
     ----------
     rows : Scan
-        A row per label and caller, both rising; with UNLABELLED for a label, a row per echo.
+        All that was measured: a row per label and caller, both rising; with UNLABELLED for a label,
+        a row per echo.
     clutter : int or None
         Detections without a label; None where nobody tells labels.
-    certainty : (2, m) [rad], [m], or None
-        Standard deviations of the rows' bearings and ranges, as the signal tells; NaN where it does
-        not. They are kept beside the rows, and `pipistrelle.detection.noise` puts them in.
-    detour : (2, m) [m], or None
-        How much later than the direct call of its caller each row came, as a way of sound, and the
-        standard deviation of that; NaN where there is none. They are kept beside the rows too:
-        `timed` puts them in.
-    callers : (c)
-        Labels that the callers bear as landmarks, where somebody tells: whose the detours are.
     between : bool
         Whether it is a call that was heard between the vehicle's own.
     """
 
     rows: Scan
     clutter: int | None
-    certainty: Float[np.ndarray, "2 m"] | None = None
-    detour: Float[np.ndarray, "2 m"] | None = None
-    callers: Int[np.ndarray, " c"] = field(default_factory=lambda: NOBODY)
     between: bool = False
 
 
@@ -74,7 +67,10 @@ def average_faces(
     Bearings are averaged as directions, ``plain`` or ``weighted`` by the inverse variance at the
     array's angle, :math:`\cos^2\theta`. The range, of the vehicle's own call alone, is c/2 times
     the mean delay; the detour, of another's, c times what the mean delay has over that of its
-    direct call. What comes while the direct call still lasts has none: it was heard with it.
+    direct call. What comes while the direct call still lasts has none: it was heard with it. The
+    standard deviations are what the signal tells, and what no level removes:
+
+    .. math:: \sigma^2 = \sigma_{signal}^2 + \sigma_{floor}^2
 
     Parameters
     ----------
@@ -111,13 +107,11 @@ def average_faces(
     landmark, caller, numbers, certainty, detour = _average(
         labels, label, found, direct, averaging == "weighted", speed_of_sound
     )
-    return Heard(
-        rows=Scan(time=time, landmark=landmark, caller=caller, numbers=numbers),
-        clutter=int(clutter),
-        certainty=certainty,
-        detour=detour,
-        callers=callers,
-    )
+    numbers[BEARING_STD] = np.hypot(certainty[0], np.where(caller == OWN, *BEARING_FLOOR))
+    numbers[RANGE_STD] = np.hypot(certainty[1], RANGE_FLOOR)
+    numbers[DETOUR], numbers[DETOUR_STD] = detour[0], np.hypot(detour[1], DETOUR_FLOOR)
+    rows = Scan(time=time, landmark=landmark, caller=caller, numbers=numbers, callers=callers)
+    return Heard(rows=rows, clutter=int(clutter))
 
 
 def same_echo(
@@ -174,33 +168,6 @@ def unlabelled(heard: Heard) -> Heard:
     """
     nobody = np.full_like(heard.rows.landmark, UNLABELLED)
     return replace(heard, rows=replace(heard.rows, landmark=nobody), clutter=None)
-
-
-def timed(heard: Heard) -> Heard:
-    """Let the rows of a frame say how much later than their caller's direct call they came.
-
-    Parameters
-    ----------
-    heard : Heard
-
-    Returns
-    -------
-    Heard
-        The same where nobody listened for it.
-
-    Examples
-    --------
-    >>> from pipistrelle.detection.scans import make_scan
-    >>> rows = make_scan(0.5, np.array([4]), np.array([0.2]), caller=1)
-    >>> heard = Heard(rows=rows, clutter=0, detour=np.array([[3.0], [0.02]]))
-    >>> timed(heard).rows.detour
-    array([3.])
-    """
-    if heard.detour is None:
-        return heard
-    numbers = heard.rows.numbers.copy()
-    numbers[DETOUR] = heard.detour[0]
-    return replace(heard, rows=replace(heard.rows, numbers=numbers, callers=heard.callers))
 
 
 class _Found(NamedTuple):

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.config import InputError, Strategy
-from pipistrelle.detection.faces import Heard
 from pipistrelle.detection.scans import (
     BEARING,
     BEARING_STD,
@@ -31,7 +30,7 @@ LISTENS_TO = {"active": (True, False), "fused": (True, True), "passive": (False,
 """Whether a strategy takes what the vehicle's own call, and what the others' calls bring back."""
 
 
-def scan_of(heard: Heard, strategy: Strategy) -> Scan:
+def scan_of(rows: Scan, strategy: Strategy) -> Scan:
     """Take from a frame what a sensing strategy takes.
 
     Active takes what the vehicle's own call brings back, passive what those of others do, fused
@@ -39,7 +38,8 @@ def scan_of(heard: Heard, strategy: Strategy) -> Scan:
 
     Parameters
     ----------
-    heard : Heard
+    rows : Scan
+        All that was heard in a frame.
     strategy : "active", "fused" or "passive"
 
     Returns
@@ -51,14 +51,13 @@ def scan_of(heard: Heard, strategy: Strategy) -> Scan:
     >>> from pipistrelle.detection.scans import make_scan
     >>> rows = make_scan(0.5, np.array([2, 2, 5]), np.array([0.2, 0.4, 1.0]),
     ...                  caller=np.array([0, 1, 1]), range=np.array([4.0, np.nan, np.nan]))
-    >>> heard = Heard(rows=rows, clutter=0)
-    >>> scan_of(heard, "fused").bearing.round(9).tolist()
+    >>> scan_of(rows, "fused").bearing.round(9).tolist()
     [0.3, 1.0]
-    >>> scan_of(heard, "active").landmark.tolist()
+    >>> scan_of(rows, "active").landmark.tolist()
     [2]
     """
     own, others = LISTENS_TO[strategy]
-    return _fused(heard.rows, own=own, others=others, labels_only=False)
+    return _fused(rows, own=own, others=others, labels_only=False)
 
 
 def labelled(scan: Scan, label: Int[np.ndarray, " m"]) -> Scan:

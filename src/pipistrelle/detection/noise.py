@@ -1,4 +1,4 @@
-"""Measurement noise: how surely the rows of a scan were measured. Nowhere else is R stated.
+"""Measurement noise: how surely the rows of a scan were measured, as an estimator is told.
 
 It is stated of the rows that a filter is handed, after those of one landmark were merged.
 """
@@ -11,29 +11,18 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.config import FilterConfig
-from pipistrelle.detection.faces import Heard
 from pipistrelle.detection.scans import (
     BEARING_STD,
     DETOUR_STD,
-    OWN,
     RANGE_STD,
     Scan,
     with_columns,
+    without_detours,
 )
 from pipistrelle.jit import kernel
 
 Noise = Callable[[Scan], Scan]
 """Gives rows the standard deviations that they do not have."""
-
-BEARING_FLOOR = (0.002, 0.009)
-"""Error [rad] of a bearing that no level removes, by the vehicle's own call and by another's: what
-echoes that overlap do to each other and leave no trace beside the beam. With these the errors in
-the paper's worlds have the variances that are told; another's echoes come at all times, and overlap
-more."""
-RANGE_FLOOR = 0.01
-"""Error [m] of a range that no level removes, likewise."""
-DETOUR_FLOOR = 0.006
-"""Error [m] of a detour that no level removes, likewise."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,39 +68,6 @@ def _filled(
     return filled
 
 
-def measured(heard: Heard) -> Heard:
-    r"""Give the rows of a frame the standard deviations that the signal tells, before they merge.
-
-    .. math:: \sigma^2 = \sigma_{signal}^2 + \sigma_{floor}^2
-
-    Parameters
-    ----------
-    heard : Heard
-
-    Returns
-    -------
-    Heard
-        The same where the signal tells nothing.
-
-    Examples
-    --------
-    >>> from pipistrelle.detection.scans import make_scan
-    >>> rows = make_scan(0.5, np.array([3]), np.zeros(1), range=np.array([2.0]))
-    >>> heard = Heard(rows=rows, clutter=0, certainty=np.array([[0.003], [0.0]]))
-    >>> measured(heard).rows.bearing_std, measured(heard).rows.range_std
-    (array([0.00360555]), array([0.01]))
-    """
-    if heard.certainty is None:
-        return heard
-    rows, (across, along) = heard.rows, heard.certainty
-    numbers = rows.numbers.copy()
-    numbers[BEARING_STD] = np.hypot(across, np.where(rows.caller == OWN, *BEARING_FLOOR))
-    numbers[RANGE_STD] = np.hypot(along, RANGE_FLOOR)
-    if heard.detour is not None:
-        numbers[DETOUR_STD] = np.hypot(heard.detour[1], DETOUR_FLOOR)
-    return replace(heard, rows=replace(rows, numbers=numbers))
-
-
 def unstated(scan: Scan) -> Scan:
     """Forget how surely the rows of a scan say that they were measured.
 
@@ -130,6 +86,25 @@ def unstated(scan: Scan) -> Scan:
     array([nan])
     """
     return with_columns(scan, bearing_std=math.nan, range_std=math.nan, detour_std=math.nan)
+
+
+def as_told(scan: Scan, settings: FilterConfig, *, timing: bool) -> Scan:
+    """Leave of what was measured what an estimator is to know.
+
+    Parameters
+    ----------
+    scan : Scan
+    settings : FilterConfig
+        With "constant" noise the rows do not say how surely they were measured.
+    timing : bool
+        Whether it is to know how much later than the direct call of their caller echoes came.
+
+    Returns
+    -------
+    Scan
+    """
+    known = scan if timing else without_detours(scan)
+    return unstated(known) if settings.noise == "constant" else known
 
 
 def as_said(scan: Scan) -> Scan:

@@ -1,5 +1,6 @@
 """Scans: what one frame measured, a row per measurement, as associations and filters see it."""
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -217,3 +218,30 @@ def rows_of(scan: Scan, rows: Bool[np.ndarray, " m"] | Int[np.ndarray, " k"]) ->
         caller=scan.caller[rows],
         numbers=np.ascontiguousarray(scan.numbers[:, rows]),
     )
+
+
+def without_detours(scan: Scan) -> Scan:
+    """Forget of a scan how much later than direct calls echoes came, and rows that are but that.
+
+    Parameters
+    ----------
+    scan : Scan
+
+    Returns
+    -------
+    Scan
+
+    Examples
+    --------
+    >>> from pipistrelle.detection.scans import make_scan
+    >>> rows = np.array([8, 8]), np.array([0.4, np.nan])
+    >>> scan = make_scan(0.0, *rows, caller=np.array([1, 2]), detour=np.array([3.0, 5.0]))
+    >>> without_detours(scan).landmark, without_detours(scan).detour
+    (array([8]), array([nan]))
+    """
+    if scan.callers.size:
+        scan = replace(scan, callers=NOBODY)
+    if np.isnan(scan.detour).all() and np.isnan(scan.detour_std).all():
+        return scan
+    bearings = rows_of(scan, ~np.isnan(scan.bearing))
+    return with_columns(bearings, detour=math.nan, detour_std=math.nan)

@@ -14,6 +14,7 @@ from pipistrelle.config import (
 )
 from pipistrelle.detection.faces import unlabelled
 from pipistrelle.detection.merging import scan_of
+from pipistrelle.detection.noise import as_told
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.motion import Motion
@@ -477,7 +478,10 @@ def test_an_association_that_knows_what_the_oracle_knows_maps_as_the_oracle_does
     case, drive = Case(strategy="fused", filter="ekf"), drive_of(world, SHORT)
     told = run_trial(case, drive, scans_of(heard, "fused", SHORT), SHORT)
     labels = {frame.rows.time: frame.rows.landmark for frame in heard}
-    hidden = [scan_of(unlabelled(frame), "fused") for frame in heard]
+    hidden = [
+        scan_of(as_told(unlabelled(frame).rows, SHORT.filter, timing=False), "fused")
+        for frame in heard
+    ]
     found = run_trial(case, drive, hidden, SHORT, associate=lambda _, scan: labels[scan.time])
     assert contents(found.track) == contents(told.track)
     assert contents(found.scans) == contents(told.scans)

@@ -16,8 +16,8 @@ from pipistrelle.detection.logs.readers import (
 )
 from pipistrelle.detection.logs.recording import Log
 from pipistrelle.detection.merging import labelled
-from pipistrelle.detection.noise import noise_of, unstated
-from pipistrelle.detection.scans import Scan, rows_of, with_columns
+from pipistrelle.detection.noise import as_told, noise_of
+from pipistrelle.detection.scans import Scan, rows_of, with_columns, without_detours
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.drives import Drive, Truth
@@ -149,31 +149,6 @@ def as_heard_by(
         taken = rows_of(with_columns(scan, range=distance), kept)
         heard.append(without_detours(taken) if strategy == "active" else taken)
     return tuple(heard)
-
-
-def without_detours(scan: Scan) -> Scan:
-    """Forget of a scan how much later than direct calls echoes came, and rows that are but that.
-
-    Parameters
-    ----------
-    scan : Scan
-
-    Returns
-    -------
-    Scan
-
-    Examples
-    --------
-    >>> from pipistrelle.detection.scans import make_scan
-    >>> rows = np.array([8, 8]), np.array([0.4, np.nan])
-    >>> scan = make_scan(0.0, *rows, caller=np.array([1, 2]), detour=np.array([3.0, 5.0]))
-    >>> without_detours(scan).landmark, without_detours(scan).detour
-    (array([8]), array([nan]))
-    """
-    if np.isnan(scan.detour).all():
-        return scan
-    bearings = rows_of(scan, ~np.isnan(scan.bearing))
-    return with_columns(bearings, detour=math.nan, detour_std=math.nan)
 
 
 def motion_of(log: Log) -> Motion:
@@ -309,11 +284,8 @@ def replay(
         moving=moving_of(log),
     )
     check_filters(filters, drive.motion, config)
-    noise, scans = noise_of(config.filter), log.scans
-    if not config.listening.timing:
-        scans = list(map(without_detours, scans))
-    if config.filter.noise == "constant":
-        scans = list(map(unstated, scans))
+    noise = noise_of(config.filter)
+    scans = [as_told(one, config.filter, timing=config.listening.timing) for one in log.scans]
     heard = {
         strategy: tuple(
             noise(labelled(scan, scan.landmark)) for scan in as_heard_by(scans, strategy, beamwidth)

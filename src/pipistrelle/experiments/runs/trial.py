@@ -12,9 +12,9 @@ from jaxtyping import Float
 from pipistrelle import kernel_clock
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import Config, InputError, Strategy
-from pipistrelle.detection.faces import Heard, timed
+from pipistrelle.detection.faces import Heard
 from pipistrelle.detection.merging import scan_of
-from pipistrelle.detection.noise import measured, noise_of
+from pipistrelle.detection.noise import as_told, noise_of
 from pipistrelle.detection.scans import Scan, rows_of
 from pipistrelle.estimation.association import Associate, told
 from pipistrelle.estimation.beliefs import Belief, Gaussian, at_steps
@@ -129,10 +129,9 @@ def scans_of(heard: Sequence[Heard], strategy: Strategy, config: Config) -> tupl
     tuple of Scan
         As many.
     """
-    noise, said = noise_of(config.filter), config.filter.noise == "measured"
-    frames = map(timed, heard) if config.listening.timing else heard
-    frames = map(measured, frames) if said else frames
-    scans = ((frame, scan_of(frame, strategy)) for frame in frames)
+    noise, timing = noise_of(config.filter), config.listening.timing
+    rows = (as_told(frame.rows, config.filter, timing=timing) for frame in heard)
+    scans = zip(heard, (scan_of(scan, strategy) for scan in rows), strict=True)
     return tuple(noise(scan) for frame, scan in scans if scan.landmark.size or not frame.between)
 
 
