@@ -8,7 +8,7 @@ import pytest
 
 from pipistrelle.config import FastSlamConfig, InputError
 from pipistrelle.detection.scans import make_scan
-from pipistrelle.estimation.beliefs import Gaussian, Informed
+from pipistrelle.estimation.beliefs import AcceptsMap, Gaussian
 from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
 from pipistrelle.estimation.fastslam.filter import FastSlam
@@ -29,7 +29,7 @@ POSTS = map_with([7, 9], [[1.0, 3.0], [-6.0, 2.0]], [0.04 * np.eye(2), np.diag([
 
 def informed(kind, posts=POSTS):
     slam = kind(motion=BICYCLE, rays=ray_config())
-    assert isinstance(slam, Informed)
+    assert isinstance(slam, AcceptsMap)
     return slam, slam.knowing(slam.init(START), posts)
 
 
@@ -69,7 +69,7 @@ FASTSLAM = FastSlam(motion=BICYCLE, rays=ray_config(), settings=FastSlamConfig(p
 def test_fastslam_has_what_is_known_in_every_particle_as_surely():
     belief = FASTSLAM.knowing(FASTSLAM.init(START), POSTS)
     rows = belief.landmarks()
-    assert isinstance(FASTSLAM, Informed)
+    assert isinstance(FASTSLAM, AcceptsMap)
     assert rows.landmark.tolist() == [7, 9]
     np.testing.assert_array_equal(rows.mean, POSTS.mean)
     np.testing.assert_array_equal(rows.covariance, POSTS.covariance)

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipistrelle.config import RayConfig
-from pipistrelle.estimation.rays import ray_members, sensing_of, survivors, weigh_and_share
+from pipistrelle.estimation.rays import ray_members, survivors, update_params, weigh_and_share
 from reference.ekf_slam import ray_ranges
 
 configs = st.builds(
@@ -66,8 +66,8 @@ def test_however_sharp_the_shares_of_what_is_known_so_far_are_shares(least, powe
 
 
 def test_the_ray_that_filters_share_is_changed_by_none():
-    shared_by_all = sensing_of(RayConfig(), 0.999)
-    assert shared_by_all is sensing_of(RayConfig(), 0.999)
+    shared_by_all = update_params(RayConfig(), 0.999)
+    assert shared_by_all is update_params(RayConfig(), 0.999)
     for column in (shared_by_all.ray_ranges, shared_by_all.ray_stds):
         with pytest.raises(ValueError, match="read-only"):
             column[0] = 0.0

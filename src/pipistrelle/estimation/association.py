@@ -1,8 +1,8 @@
-"""Association: who is who, between prediction and correction.
+"""Data association: which landmark each row of a scan is of, between prediction and correction.
 
 An association is a function of the predicted belief and of a scan, and returns a label for each
 row: that of a landmark in the map, a new number for one that is not, or UNLABELLED for clutter.
-Rows of one label are merged, those without one are dropped
+Rows of one label are merged, rows without a label are dropped
 (`pipistrelle.detection.merging.labelled`), and the filter is corrected with the rest.
 """
 
@@ -18,8 +18,8 @@ Associate = Callable[[Belief, Scan], Int[np.ndarray, " m"]]
 """Takes the predicted belief and a scan of m rows; returns m labels. It must not change either."""
 
 
-def told(belief: Belief, scan: Scan) -> Int[np.ndarray, " m"]:
-    """Take the labels that whoever recorded the scan gave it: known association.
+def known_labels(belief: Belief, scan: Scan) -> Int[np.ndarray, " m"]:
+    """Return the labels that came with the scan: known association.
 
     Parameters
     ----------

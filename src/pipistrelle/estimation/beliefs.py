@@ -1,61 +1,47 @@
-"""What estimators believe and how they are asked: records, and the protocols of both."""
+"""What estimators believe and how they are called: records and protocols."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipistrelle.detection.scans import Scan
 
-LOST = 2.0
-"""Standard deviation [m] beyond which nobody can say where a caller is that moves."""
+MAX_CALLER_STD = 2.0
+"""Largest standard deviation [m] at which the place of a moving caller counts as known."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Gaussian:
-    """A mean and its covariance; leading axes, if any, count instances.
-
-    Attributes
-    ----------
-    mean : (*n, d)
-    covariance : (*n, d, d)
-        Of true value minus mean; to first order, where that is not what is normal.
-    invariant : bool
-        Of poses: whether the right-invariant error is normal (`estimation.ekf.invariant`).
-    """
+    """A mean and its covariance; leading axes, if any, count instances."""
 
     mean: Float[np.ndarray, "*n d"]
+    """(*n, d)."""
     covariance: Float[np.ndarray, "*n d d"]
+    """(*n, d, d), of true value minus mean; to first order where another error is normal."""
     invariant: bool = False
+    """Of poses: whether the right-invariant error is normal (`estimation.ekf.invariant`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Landmarks:
-    """The map: one row per hypothesis; a landmark with a single row is fully initialised.
-
-    Attributes
-    ----------
-    landmark : (h)
-        Label.
-    mean : (h, 2) [m]
-    covariance : (h, 2, 2) [m^2]
-    weight : (h)
-        Aggregated likelihood; sums to 1 over the rows of a landmark.
-    """
+    """The map: one row per hypothesis; a landmark with a single row is fully initialised."""
 
     landmark: Int[np.ndarray, " h"]
+    """Label."""
     mean: Float[np.ndarray, "h 2"]
+    """(h, 2) [m]."""
     covariance: Float[np.ndarray, "h 2 2"]
+    """(h, 2, 2) [m^2]."""
     weight: Float[np.ndarray, " h"]
+    """Aggregated likelihood; it sums to 1 over the rows of a landmark."""
 
 
 def no_landmarks() -> Landmarks:
-    """Return the map that knows no landmark.
+    """Return an empty map.
 
-    Examples
-    --------
     >>> no_landmarks().mean.shape
     (0, 2)
     """
@@ -68,22 +54,7 @@ def no_landmarks() -> Landmarks:
 
 
 def some_of(landmarks: Landmarks, rows: Bool[np.ndarray, " h"]) -> Landmarks:
-    """Take some rows of a map.
-
-    Parameters
-    ----------
-    landmarks : Landmarks of h rows
-    rows : (h)
-
-    Returns
-    -------
-    Landmarks
-
-    Examples
-    --------
-    >>> some_of(no_landmarks(), np.zeros(0, bool)).landmark.size
-    0
-    """
+    """Return the rows of a map that a mask selects."""
     return Landmarks(
         landmark=landmarks.landmark[rows],
         mean=landmarks.mean[rows],
@@ -93,21 +64,7 @@ def some_of(landmarks: Landmarks, rows: Bool[np.ndarray, " h"]) -> Landmarks:
 
 
 def joined(some: Landmarks, others: Landmarks) -> Landmarks:
-    """Put the rows of two maps together.
-
-    Parameters
-    ----------
-    some, others : Landmarks
-
-    Returns
-    -------
-    Landmarks
-
-    Examples
-    --------
-    >>> joined(no_landmarks(), no_landmarks()).weight
-    array([], dtype=float64)
-    """
+    """Return the rows of two maps, one after the other."""
     return Landmarks(
         landmark=np.concatenate((some.landmark, others.landmark)),
         mean=np.concatenate((some.mean, others.mean)),
@@ -117,24 +74,11 @@ def joined(some: Landmarks, others: Landmarks) -> Landmarks:
 
 
 def placed(landmarks: Landmarks) -> Bool[np.ndarray, " h"]:
-    """Tell which rows of a map are fully initialised landmarks, not members of a ray.
+    """Mask of the rows of a map that are fully initialised landmarks, not members of a ray.
 
-    A landmark with a single row is fully initialised, one with several partially.
+    A landmark with a single row is fully initialised, one with several partially (Bradley & Abaid,
+    Sec. V-A).
 
-    Parameters
-    ----------
-    landmarks : Landmarks of h rows
-
-    Returns
-    -------
-    (h)
-
-    Notes
-    -----
-    Bradley & Abaid, Sec. V-A, "fully and partially initialize".
-
-    Examples
-    --------
     >>> mean, covariance = np.zeros((3, 2)), np.zeros((3, 2, 2))
     >>> rows = dict(landmark=np.array([4, 9, 9]), weight=np.array([1.0, 0.5, 0.5]))
     >>> placed(Landmarks(mean=mean, covariance=covariance, **rows))
@@ -145,45 +89,27 @@ def placed(landmarks: Landmarks) -> Bool[np.ndarray, " h"]:
 
 
 def in_sight(moving: Landmarks) -> Landmarks:
-    """Take of callers that move those whose place is known.
+    """Return the moving callers whose place is known: one row each, std up to `MAX_CALLER_STD`.
 
-    Parameters
-    ----------
-    moving : Landmarks of h rows
-        As a `Following` belief has them.
-
-    Returns
-    -------
-    Landmarks
-        One row for each that has but one, no more than `LOST` unsure in any direction.
-
-    Examples
-    --------
     >>> rows = dict(landmark=np.array([4, 9, 9]), weight=np.array([1.0, 0.5, 0.5]))
     >>> spread = np.eye(2) * np.array([0.01, 1.0, 1.0])[:, None, None]
     >>> in_sight(Landmarks(mean=np.zeros((3, 2)), covariance=spread, **rows)).landmark
     array([4])
     """
     widest = np.linalg.eigvalsh(moving.covariance)[:, -1]
-    return some_of(moving, placed(moving) & (widest <= LOST * LOST))
+    return some_of(moving, placed(moving) & (widest <= MAX_CALLER_STD * MAX_CALLER_STD))
 
 
 class Innovations(NamedTuple):
-    """How far off measurements of placed landmarks were that a filter has used.
-
-    Attributes
-    ----------
-    squared : float
-        Sum of the normalised innovations squared, each in the variance that the filter expected.
-    degrees : float
-        Sum of their degrees of freedom: two of range and bearing, one of a bearing.
-    """
+    """Sums over the measurements of placed landmarks that a filter has used."""
 
     squared: float = 0.0
+    """Innovations squared, each divided by its expected variance."""
     degrees: float = 0.0
+    """Degrees of freedom: two of range and bearing, one of a bearing."""
 
     def plus(self, squared: float, degrees: float) -> "Innovations":
-        """Return the sums with some more added."""
+        """Return the sums with more added."""
         return Innovations(self.squared + squared, self.degrees + degrees)
 
 
@@ -192,41 +118,29 @@ NO_INNOVATIONS = Innovations()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
-    """What a filter made of one mission: the start, then one row per control step.
-
-    Attributes
-    ----------
-    time : (k) [s]
-    pose : Gaussian of (k, 3) and (k, 3, 3)
-        x, y [m], heading [rad]; at the steps that hold a scan, after its update. Of a filter that
-        revises its path, all as it believes them at the end.
-    landmarks : Landmarks
-        The final map.
-    gated : int
-        Measurements that the gate rejected.
-    innovations : Innovations
-        All zero where the filter does not count them.
-    cloud : (p, 3) [m, m, rad] or None
-        The particles' last poses, where the filter has particles.
-    full : float or None
-        Their weighted mean number of fully initialised landmarks.
-    online : Gaussian of (k, 3) and (k, 3, 3), or None
-        Of a filter that revises its path: each pose as it was believed at its time.
-    callers : dict of label to Gaussian of (k, 2) and (k, 2, 2)
-        Where callers that move were believed to be at their time: at the steps that hold a scan
-        and at which they were `in_sight`, else NaN. Of a filter that revises them
-        (`Retracing`), where it believes at the end that they were.
-    """
+    """The path and the map that a filter estimated: the start, then one row per control step."""
 
     time: Float[np.ndarray, " k"]
+    """(k) [s]."""
     pose: Gaussian
+    """x, y [m], heading [rad], (k, 3) and (k, 3, 3); with a scan, after its update. Of a filter
+    that revises its path, all as it believes them at the end."""
     landmarks: Landmarks
+    """The final map."""
     gated: int
+    """Measurements that the gate rejected."""
     innovations: Innovations = NO_INNOVATIONS
+    """All zero where the filter does not count them."""
     cloud: Float[np.ndarray, "p 3"] | None = None
+    """The particles' last poses [m, m, rad], where the filter has particles."""
     full: float | None = None
+    """The particles' weighted mean number of fully initialised landmarks."""
     online: Gaussian | None = None
+    """Of a filter that revises its path: each pose as it was believed at its time."""
     callers: Mapping[int, Gaussian] = field(default_factory=dict)
+    """Where moving callers were, by label, (k, 2) and (k, 2, 2): at their time, at steps with a
+    scan at which they were `in_sight`, else NaN; or as a filter that revises them believes at the
+    end."""
 
 
 def at_steps(track: Track, steps: Int[np.ndarray, " k"]) -> Track:
@@ -248,11 +162,19 @@ def at_steps(track: Track, steps: Int[np.ndarray, " k"]) -> Track:
 
 @runtime_checkable
 class Belief(Protocol):
-    """What an estimator knows; never changed once it is made."""
+    """What an estimator knows; a belief is never changed once it is made.
+
+    Some methods are optional (`answer`): ``moving()`` returns moving callers, which are no
+    landmarks of the map, as Landmarks of a row per hypothesis. ``path()`` returns the start and
+    every control step so far, (k + 1, 3) and (k + 1, 3, 3), of an estimator that revises its path,
+    and ``tracks()`` a Gaussian (k + 1, 2) and (k + 1, 2, 2) of each caller by its label, NaN where
+    unknown. ``cloud()`` returns the poses (p, 3) of particles, with ``full``, the weighted mean
+    number of fully initialised landmarks.
+    """
 
     @property
     def gated(self) -> int:
-        """Measurements rejected so far."""
+        """How many measurements were rejected so far."""
         ...
 
     def pose(self) -> Gaussian:
@@ -264,56 +186,17 @@ class Belief(Protocol):
         ...
 
 
-@runtime_checkable
-class Following(Protocol):
-    """A belief that follows callers that move, which are no landmarks of its map."""
-
-    def moving(self) -> Landmarks:
-        """Return where they are now, a row per hypothesis."""
-        ...
-
-
-@runtime_checkable
-class ParticleCloud(Protocol):
-    """A belief that is made of particles."""
-
-    @property
-    def full(self) -> float:
-        """Weighted mean number of fully initialised landmarks."""
-        ...
-
-    def cloud(self) -> Float[np.ndarray, "p 3"]:
-        """Return the particles' poses, (p, 3) [m, m, rad]."""
-        ...
-
-
-@runtime_checkable
-class Trajectory(Protocol):
-    """A belief that may revise its path: what is heard later changes where it was before."""
-
-    def path(self) -> Gaussian:
-        """Return the start and every control step so far, (k + 1, 3) and (k + 1, 3, 3)."""
-        ...
-
-
-@runtime_checkable
-class Retracing(Protocol):
-    """A belief that may revise where callers that move have been."""
-
-    def tracks(self) -> Mapping[int, Gaussian]:
-        """Return of each caller by its label (k + 1, 2) and (k + 1, 2, 2), NaN where not known.
-
-        A row for the start and one for every control step so far.
-        """
-        ...
+def answer(belief: Belief, question: str) -> Any:
+    """Return what a belief answers to a question of `Belief` that is optional; else None."""
+    return getattr(belief, question)() if hasattr(belief, question) else None
 
 
 B = TypeVar("B", bound=Belief)
 
 
 @runtime_checkable
-class Informed(Protocol[B]):
-    """An estimator that may be told of landmarks beforehand."""
+class AcceptsMap(Protocol[B]):
+    """An estimator that accepts a map of known landmarks beforehand."""
 
     def knowing(self, belief: B, known: Landmarks) -> B:
         """Return a first belief that has landmarks in its map, placed, each one's error its own."""

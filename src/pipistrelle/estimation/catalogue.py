@@ -1,14 +1,15 @@
-"""The estimators by name: one entry each, and no other list of them anywhere.
+"""All estimators by name, one entry each: the only list of them.
 
-Verbs, plans, memory checks, figures and reports take from here what they need to know of an
-estimator. To add one, write it (`pipistrelle.estimation.beliefs.Estimator`) and give it an entry.
-The estimators themselves are imported when one is built: the command line shows their names at
-once. One that is not listed here goes by ``module:Class`` (`entry`).
+Verbs, plans, memory checks, figures and reports read here what they need to know of an estimator.
+To add one, write it (`pipistrelle.estimation.beliefs.Estimator`) and give it an entry. Its module
+is imported when it is built, so the command line lists all names at once. An estimator that is not
+listed is named ``module:Class`` (`entry`).
 """
 
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
@@ -23,102 +24,61 @@ if TYPE_CHECKING:
 DOUBLE = 8
 """Bytes of a number."""
 GATE = 0.999
-"""Share of a measurement's predicted distribution that is accepted of real logs."""
+"""Default share of a measurement's predicted distribution that is accepted from a recorded log."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Entry:
-    """What the rest of the package knows of an estimator.
-
-    Attributes
-    ----------
-    name : str
-        As settings, tables and files have it.
-    title : str
-        As a reader knows it.
-    build : function of Config and Motion
-        Makes the estimator from the settings, for a vehicle that moves so.
-    sections : tuple of str
-        The sections of the settings that it reads; none of them changes what is heard.
-    nees_limit : float
-        A NEES above it means that the estimator has diverged.
-    memory : callable
-        Given the number of landmarks, that of each one's members, and a Config: the most bytes that
-        it holds at once, when all landmarks are there and all of them still rays.
-    follows : bool
-        Whether it is told of callers that move (`estimation.beliefs.Following`), or of what stands
-        alone.
-    gate : float
-        What ``filter.gate = "auto"`` means to it: the share of a measurement's predicted
-        distribution that it accepts of a log that says nothing of it; 1 drops nothing.
-    robust_gate : float
-        The same with ``filter.robust = "huber"``.
-    needs : str
-        A module that it cannot do without and that an extra of its name installs, or nothing.
-    """
+    """What the rest of the package knows of an estimator."""
 
     name: str
+    """As settings, tables and files have it."""
     title: str
+    """As a reader knows it."""
     build: "Callable[[Config, Motion], Estimator]"
+    """Makes the estimator from the settings, for a vehicle with this motion model."""
     sections: tuple[str, ...]
+    """The sections of the settings that it reads; none of them changes what is heard."""
     nees_limit: float
+    """A NEES above it means that the estimator has diverged."""
     memory: Callable[[int, int, Config], float]
+    """The most bytes that it holds at once, by the number of landmarks, that of each one's members,
+    and a Config."""
     follows: bool = False
+    """Whether scans give it moving callers (`beliefs.Belief.moving`), or rows of what stands
+    alone."""
     gate: float = GATE
+    """What ``filter.gate = "auto"`` means to it: the share of a measurement's predicted
+    distribution that it accepts of a log; 1 drops nothing."""
     robust_gate: float = GATE
+    """The same with ``filter.robust = "huber"``."""
     needs: str = ""
+    """A module that it needs, installed by the extra of its name; or nothing."""
 
 
 def gate_of(name: str, config: Config) -> float:
-    """Return the share of a measurement's predicted distribution that an estimator accepts.
+    """Share of a measurement's predicted distribution that an estimator accepts: ``filter.gate``.
 
-    Parameters
-    ----------
-    name : str
-    config : Config
-
-    Returns
-    -------
-    float
-        The setting ``filter.gate``; where it is "auto", the estimator's own.
-
-    Examples
-    --------
     >>> from pipistrelle.config import FilterConfig
     >>> gate_of("ekf", Config()), gate_of("ekf", Config(filter=FilterConfig(gate="auto")))
     (1.0, 0.999)
     """
-    told = config.filter
-    if told.gate != "auto":
-        return told.gate
+    settings = config.filter
+    if settings.gate != "auto":
+        return settings.gate
     known = CATALOGUE.get(name)
     if known is None:
         return GATE
-    return known.robust_gate if told.robust == "huber" else known.gate
+    return known.robust_gate if settings.robust == "huber" else known.gate
 
 
 def is_there(name: str) -> bool:
-    """Tell whether what an estimator of the catalogue needs is installed.
-
-    Examples
-    --------
-    >>> is_there("ekf")
-    True
-    """
+    """Tell whether the module that an estimator of the catalogue needs is installed."""
     return not CATALOGUE[name].needs or find_spec(CATALOGUE[name].needs) is not None
 
 
 def check_there(name: str) -> None:
-    """Refuse an estimator of the catalogue that needs what is not installed.
-
-    Parameters
-    ----------
-    name : str
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse an estimator of the catalogue that needs a module which is not installed."""
     if not is_there(name):
         raise InputError(
             f"filter {name}: needs {CATALOGUE[name].needs}, which is not installed; "
@@ -185,28 +145,11 @@ def entry(name: str) -> Entry:
 
 
 def check_name(name: str, *groups: str, where: str = "filter") -> str:
-    """Refuse what names no estimator, whether or not it is there.
+    """Return an estimator's name; refuse one neither listed nor of the form ``module:Class``.
 
-    Parameters
-    ----------
-    name : str
-    *groups : str
-        Names of several estimators that were allowed, too, for the refusal.
-    where : str
-        Where it is named.
+    ``groups`` are names of several estimators that were allowed, too, and ``where`` is where it is
+    named, for the refusal.
 
-    Returns
-    -------
-    str
-        The same.
-
-    Raises
-    ------
-    InputError
-        Where it is neither listed here nor of the form ``module:Class``.
-
-    Examples
-    --------
     >>> check_name("ikef")
     Traceback (most recent call last):
     pipistrelle.config.InputError: filter: found 'ikef', expected one of ekf, fastslam, iekf,
@@ -223,18 +166,8 @@ def check_name(name: str, *groups: str, where: str = "filter") -> str:
 
 
 def short_name(name: str) -> str:
-    """Return an estimator's name as files bear it: the class, of one from outside.
+    """Return an estimator's name as files bear it: of one from outside, the class.
 
-    Parameters
-    ----------
-    name : str
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
     >>> short_name("ekf"), short_name("mine.filters:DeadReckoning")
     ('ekf', 'DeadReckoning')
     """
@@ -244,19 +177,9 @@ def short_name(name: str) -> str:
 def title_of(name: str) -> str:
     """Return an estimator's name as a reader knows it, without loading it.
 
-    One from outside has its own title where it has been looked up before (`entry`) in this
-    process, as after a trial; else the name of its class.
+    One from outside has its own title once it has been looked up in this process (`entry`); before
+    that, the name of its class.
 
-    Parameters
-    ----------
-    name : str
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
     >>> title_of("ekf"), title_of("not.installed:Here")
     ('EKF', 'Here')
     """
@@ -266,21 +189,8 @@ def title_of(name: str) -> str:
 
 
 def check_distinct(names: Iterable[str], where: str = "filter") -> None:
-    """Refuse estimators whose files would have one name.
+    """Refuse estimators whose files would have the same name; ``where`` says where they are named.
 
-    Parameters
-    ----------
-    names : iterable of str
-    where : str
-        Where they are named.
-
-    Raises
-    ------
-    InputError
-        Where two have the same class name.
-
-    Examples
-    --------
     >>> check_distinct(["ekf", "a:Own", "b:Own"])
     Traceback (most recent call last):
     pipistrelle.config.InputError: filter: a:Own and b:Own would write the same files; rename one
@@ -292,56 +202,39 @@ def check_distinct(names: Iterable[str], where: str = "filter") -> None:
             raise InputError(f"{where}: {first} and {name} would write the same files; rename one")
 
 
-def _ekf(config: Config, motion: "Motion") -> "Estimator":
-    """Build EKF-SLAM."""
-    from pipistrelle.estimation.ekf.filter import EkfSlam
+def _builder(name: str, where: str) -> "Callable[[Config, Motion], Estimator]":
+    """Return what builds an EKF or the smoother, a class ``module:Class`` of this room."""
 
-    return EkfSlam(motion=motion, **_gaussian("ekf", config), **_of_callers(config))
+    def build(config: Config, motion: "Motion") -> "Estimator":
+        check_there(name)
+        module, _, kind = where.partition(":")
+        settings = config.filter
+        return getattr(import_module(f"pipistrelle.estimation.{module}"), kind)(
+            motion=motion,
+            rays=config.rays,
+            gate=gate_of(name, config),
+            robust=settings.robust == "huber",
+            speed_std=settings.caller_speed_std,
+            walk_std=settings.caller_walk_std,
+        )
 
-
-def _iekf(config: Config, motion: "Motion") -> "Estimator":
-    """Build right-invariant EKF-SLAM."""
-    from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
-
-    return InvariantEkfSlam(motion=motion, **_gaussian("iekf", config), **_of_callers(config))
-
-
-def _smoother(config: Config, motion: "Motion") -> "Estimator":
-    """Build the smoother."""
-    check_there("smoother")
-    from pipistrelle.estimation.smoother.filter import Smoother
-
-    return Smoother(motion=motion, **_gaussian("smoother", config), **_of_callers(config))
+    return build
 
 
 def _with_gate(name: str, config: Config) -> Config:
-    """Return the settings with a number for the gate, for an estimator from outside."""
-    told = config.filter.model_copy(update={"gate": gate_of(name, config)})
-    return config.model_copy(update={"filter": told})
-
-
-def _gaussian(name: str, config: Config) -> dict[str, Any]:
-    """Return the settings that both EKFs and the smoother take."""
-    gate, robust = gate_of(name, config), config.filter.robust == "huber"
-    return {"rays": config.rays, "gate": gate, "robust": robust}
-
-
-def _of_callers(config: Config) -> dict[str, Any]:
-    """Return what filters that follow callers are told of how they move."""
-    return {
-        "speed_std": config.filter.caller_speed_std,
-        "walk_std": config.filter.caller_walk_std,
-    }
+    """Return the settings with a number for the gate, as estimators from outside get them."""
+    settings = config.filter.model_copy(update={"gate": gate_of(name, config)})
+    return config.model_copy(update={"filter": settings})
 
 
 def _smoother_bytes(landmarks: int, _: int, config: Config) -> float:
-    """Count the factors, were every landmark heard from every pose; measured: a kilobyte each."""
+    """Estimate the memory of all factors, 1 kB each: every landmark heard from every pose."""
     poses = config.scenario.steps / config.scenario.steps_per_frame
     return poses * landmarks * 1e3
 
 
 def _ekf_bytes(landmarks: int, members: int, _: Config) -> float:
-    """Count the covariances: the one before, the one at work, the one after."""
+    """Estimate the memory of three covariances: before, during and after a correction."""
     return 3.0 * DOUBLE * (3 + 2 * landmarks * members) ** 2
 
 
@@ -354,9 +247,9 @@ def _fastslam(config: Config, motion: "Motion") -> "Estimator":
 
 
 def _fastslam_bytes(landmarks: int, members: int, config: Config) -> float:
-    """Count the particles: those before, the corrected ones, the resampled ones."""
-    ties = 4 if config.listening.timing else 0
-    each = 6 * landmarks * members + landmarks + ties * landmarks
+    """Estimate the memory of three sets of particles: before, corrected and resampled."""
+    slopes = 4 if config.listening.timing else 0
+    each = 6 * landmarks * members + landmarks + slopes * landmarks
     return 3.0 * DOUBLE * config.fastslam.particles * each
 
 
@@ -366,7 +259,7 @@ CATALOGUE = {
         Entry(
             name="ekf",
             title="EKF",
-            build=_ekf,
+            build=_builder("ekf", "ekf.filter:EkfSlam"),
             sections=("listening", "filter", "rays"),
             nees_limit=50.0,
             memory=_ekf_bytes,
@@ -383,7 +276,7 @@ CATALOGUE = {
         Entry(
             name="iekf",
             title="invariant EKF",
-            build=_iekf,
+            build=_builder("iekf", "ekf.invariant:InvariantEkfSlam"),
             sections=("listening", "filter", "rays"),
             nees_limit=50.0,
             memory=_ekf_bytes,
@@ -392,7 +285,7 @@ CATALOGUE = {
         Entry(
             name="smoother",
             title="smoother",
-            build=_smoother,
+            build=_builder("smoother", "smoother.filter:Smoother"),
             sections=("listening", "filter", "rays"),
             nees_limit=50.0,
             memory=_smoother_bytes,
@@ -404,6 +297,6 @@ CATALOGUE = {
 }
 """All estimators; the limits are those of Bradley & Abaid, Sec. V-A."""
 PAPERS = ("ekf", "fastslam")
-"""The two of Bradley & Abaid, of which its claims speak."""
+"""The two estimators of Bradley & Abaid."""
 SECTIONS = tuple(dict.fromkeys(name for known in CATALOGUE.values() for name in known.sections))
 """All sections of the settings that estimators read; none of them changes what is heard."""

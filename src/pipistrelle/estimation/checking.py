@@ -1,8 +1,8 @@
-"""Checks of a filter's inputs: a first pose, known landmarks, control steps, scans.
+"""Checks of a filter's inputs: first pose, known landmarks, control steps and scans.
 
-A kernel reads beyond an array that is shorter than it expects, and a NaN spreads through a belief
-without a word. So each call looks once at shapes, types and numbers. What is sound is handed on as
-it is; lists, and arrays of other types, become the arrays that kernels take.
+A kernel reads beyond an array that is too short, and a NaN spreads through a belief unnoticed. So
+each call checks shapes, types and numbers once. Sound input is returned as it is; lists, and
+arrays of other types, are converted.
 """
 
 import math
@@ -12,14 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.config import (
-    FARTHEST,
-    FASTEST,
-    LARGEST,
-    LONGEST_STEP,
-    WIDEST,
-    InputError,
-)
+from pipistrelle.config import FARTHEST, FASTEST, LARGEST, LONGEST_STEP, WIDEST, InputError
 from pipistrelle.detection.merging import labelled, settled
 from pipistrelle.detection.scans import (
     BEARING,
@@ -41,9 +34,9 @@ FLOAT, INTEGER = np.dtype(np.float64), np.dtype(np.int64)
 ARRAY = np.ndarray
 WHOLES = ("landmark", "caller", "callers", "moving")
 """Columns of a scan that hold whole numbers."""
-LEAST = 1e-12
-"""Least standard deviation [m] or [rad]: the square of a smaller one is lost beside any other."""
-MOST = {
+MIN_STD = 1e-12
+"""Least standard deviation [m] or [rad]: the square of a smaller one is lost in rounding."""
+MAX_CONTROLS = {
     "bicycle": ((FASTEST, WIDEST), f"a speed up to {FASTEST:g} m/s, an angle up to {WIDEST:g} rad"),
     "unicycle": (
         (FASTEST, WIDEST),
@@ -56,8 +49,8 @@ MOST = {
     ),
 }
 """Largest controls of each motion model, in numbers and in words."""
-MOST_LABELS = 2**53
-"""Labels are below it, as those of a log."""
+LABELS_END = 2**53
+"""Labels are below it, as in a log."""
 INDEFINITE = 1e-6
 """How far rounding may put a correlation matrix from being positive semidefinite."""
 
@@ -74,11 +67,11 @@ WORDS = {
     f"bearing_std up to {WIDEST:g} rad, and range_std and detour_std up to {FARTHEST:g} m where "
     "there are such, as pipistrelle.detection.noise states them",
 }
-"""What is wrong with rows of a scan; in place of {} stand their labels."""
+"""What is wrong with rows of a scan; their labels replace {}."""
 
 
 def check_gate(gate: Any) -> None:
-    """Refuse a filter's gate that is no share."""
+    """Refuse a filter's gate that is no share in (0, 1]."""
     if isinstance(gate, bool) or not isinstance(gate, (int, float)) or not 0.0 < gate <= 1.0:
         raise InputError(
             f"gate: found {shown(gate)}, expected above 0 and up to 1; 1 drops nothing"
@@ -86,7 +79,7 @@ def check_gate(gate: Any) -> None:
 
 
 def check_belief(belief: Any, kind: type) -> None:
-    """Refuse what is no belief of a filter."""
+    """Refuse a belief that is not one of this filter's."""
     if not isinstance(belief, kind):
         raise InputError(
             f"belief: found {shown(belief)}, expected one of this filter, {kind.__name__}; init "
@@ -95,7 +88,7 @@ def check_belief(belief: Any, kind: type) -> None:
 
 
 def usable_pose(pose: Gaussian) -> Gaussian:
-    """Return a copy of a first pose as filters take it, (3) and (3, 3); refuse what is none."""
+    """Return a copy of a first pose, (3) and (3, 3), as filters take it; refuse anything else."""
     if not isinstance(pose, Gaussian):
         raise InputError(
             f"init: found {shown(pose)}, expected a Gaussian of a pose, (3), and its covariance, "
@@ -119,7 +112,7 @@ def usable_pose(pose: Gaussian) -> Gaussian:
 
 
 def usable_known(known: Landmarks) -> Landmarks:
-    """Return landmarks known beforehand as filters take them; refuse what are none."""
+    """Return known landmarks as filters take them; refuse anything else."""
     if not isinstance(known, Landmarks):
         raise InputError(
             f"knowing: found {shown(known)}, expected Landmarks; they are in "
@@ -155,7 +148,7 @@ def usable_known(known: Landmarks) -> Landmarks:
 def usable_controls(
     motion: Motion, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]
 ) -> tuple[Float[np.ndarray, "k c"], Float[np.ndarray, " k"]]:
-    """Return control steps and their times [s] as filters take them; refuse what are none."""
+    """Return control steps and their times [s] as filters take them; refuse anything else."""
     steps, times = controls, dt
     if not (_is_plain(controls) and _is_plain(dt)):
         steps, times = _converted(controls, FLOAT), _converted(dt, FLOAT)
@@ -173,7 +166,7 @@ def usable_controls(
             f"expected numbers: a row of {' or '.join(map(str, widths))} controls for each step of "
             f"a {motion.model} model, and as many times"
         )
-    most, words = MOST[motion.model]
+    most, words = MAX_CONTROLS[motion.model]
     if not _are_steps(steps, times, most, poses):
         raise InputError(
             f"predict: found the controls {steps.tolist()} during {times.tolist()} s, expected "
@@ -183,16 +176,11 @@ def usable_controls(
 
 
 def usable_scan(scan: Scan) -> Scan:
-    """Return a scan as filters take it: one row of each landmark's, and none without a label.
+    """Return a scan as filters take it: one row per landmark, and none without a label.
 
-    The rows of a landmark that several callers lit up are merged (`detection.merging.labelled`).
-
-    Raises
-    ------
-    InputError
-        For arrays that are no columns of one scan, labels that are none, a landmark that has two
-        bearings by one call, a row that is neither bearing nor detour or of which nobody says how
-        sure it is.
+    Rows of a landmark that several callers lit up are merged (`detection.merging.labelled`). It
+    refuses arrays that do not fit, bad labels, two bearings of a landmark by one call, rows that
+    are neither bearing nor detour, and rows without standard deviations.
     """
     if not isinstance(scan, Scan):
         raise InputError(
@@ -227,7 +215,7 @@ def _is_laid_out(scan: Scan) -> bool:
 
 
 def _laid_out(scan: Scan) -> Scan:
-    """Return a scan of arrays as kernels take them, made of what can be such; refuse the rest."""
+    """Convert a scan's columns to arrays as kernels take them, or refuse them."""
     columns: dict[str, Any] = {name: _converted(getattr(scan, name), INTEGER) for name in WHOLES}
     columns["numbers"] = _converted(scan.numbers, FLOAT)
     if not any(column is None for column in columns.values()):
@@ -243,14 +231,14 @@ def _laid_out(scan: Scan) -> Scan:
 
 
 def _is_plain(values: Any) -> bool:
-    """Tell whether these are floats laid out as kernels take them."""
+    """Tell whether values are a float array as kernels take it."""
     return type(values) is ARRAY and values.dtype == FLOAT and values.flags.carray
 
 
 def _converted(values: Any, kind: np.dtype) -> np.ndarray | None:
     """Return a copy of values as an array that kernels take; None where they are no such numbers.
 
-    Of an empty list nobody can say of which kind it is.
+    An empty list passes as either type.
     """
     try:
         given = np.asarray(values)
@@ -262,7 +250,7 @@ def _converted(values: Any, kind: np.dtype) -> np.ndarray | None:
 
 
 def _shape_of(values: Any) -> str:
-    """Word what was found in place of an array."""
+    """Describe type and shape of what was given instead of an array."""
     try:
         given = np.asarray(values)
     except (TypeError, ValueError):
@@ -271,7 +259,7 @@ def _shape_of(values: Any) -> str:
 
 
 def _worded(scan: Scan, fault: int) -> str:
-    """Say what is wrong with a scan, and name the landmarks of which it is."""
+    """Describe what is wrong with a scan, and name its landmarks."""
     if fault == NO_CALLERS:
         return (
             f"the callers' labels {scan.callers.tolist()} and {scan.moving.tolist()} for who "
@@ -290,16 +278,16 @@ def _fault(
     callers: Int[np.ndarray, " c"],
     moving: Int[np.ndarray, " v"],
 ) -> int:
-    """Return what is wrong with the first row of a scan that is not sound; 0 where all are."""
+    """Return the number of the first fault in a scan; 0 where it is sound."""
     for m in range(landmark.size):
         fault = _fault_of_row(landmark, caller, numbers, m)
         if fault:
             return fault
     for label in callers:
-        if label < UNLABELLED or label >= MOST_LABELS:
+        if label < UNLABELLED or label >= LABELS_END:
             return NO_CALLERS
     for label in moving:
-        if label < 0 or label >= MOST_LABELS:
+        if label < 0 or label >= LABELS_END:
             return NO_CALLERS
     return 0 if settled(landmark, numbers[BEARING]) else UNSETTLED
 
@@ -311,8 +299,8 @@ def _fault_of_row(
     numbers: Float[np.ndarray, "7 m"],
     m: Whole,
 ) -> int:
-    """Return what is wrong with a row, or 0."""
-    if landmark[m] < UNLABELLED or landmark[m] >= MOST_LABELS:
+    """Return the number of a row's fault, or 0."""
+    if landmark[m] < UNLABELLED or landmark[m] >= LABELS_END:
         return NO_LABEL
     if caller[m] < 0:
         return NO_CALLER
@@ -322,11 +310,11 @@ def _fault_of_row(
         return NO_NUMBER
     if abs(bearing) > LARGEST or distance <= 0.0 or distance > FARTHEST or abs(detour) > FARTHEST:
         return NO_NUMBER
-    if not (silent or LEAST <= numbers[BEARING_STD, m] <= WIDEST):
+    if not (silent or MIN_STD <= numbers[BEARING_STD, m] <= WIDEST):
         return UNSTATED
-    if not (math.isnan(distance) or LEAST <= numbers[RANGE_STD, m] <= FARTHEST):
+    if not (math.isnan(distance) or MIN_STD <= numbers[RANGE_STD, m] <= FARTHEST):
         return UNSTATED
-    if not (math.isnan(detour) or LEAST <= numbers[DETOUR_STD, m] <= FARTHEST):
+    if not (math.isnan(detour) or MIN_STD <= numbers[DETOUR_STD, m] <= FARTHEST):
         return UNSTATED
     for other in range(0 if silent or landmark[m] == UNLABELLED else m):
         again = landmark[other] == landmark[m] and caller[other] == caller[m]
@@ -342,7 +330,7 @@ def _are_steps(
     most: tuple[float, ...],
     poses: Flag,
 ) -> Flag:
-    """Whether these are control steps."""
+    """Tell whether these are control steps."""
     for k in range(times.size):
         if not 0.0 < times[k] <= LONGEST_STEP:
             return False
@@ -357,7 +345,7 @@ def _are_steps(
 
 @kernel
 def is_covariance(entries: Float[np.ndarray, "6"]) -> Flag:
-    """Whether xx, xy, xh, yy, yh and hh are a covariance, up to rounding."""
+    """Tell whether xx, xy, xh, yy, yh and hh are a covariance, up to rounding."""
     xx, yy, hh = entries[0], entries[3], entries[5]
     if not (0.0 <= xx <= LARGEST**2 and 0.0 <= yy <= LARGEST**2 and 0.0 <= hh <= LARGEST**2):
         return False
@@ -371,7 +359,7 @@ def is_covariance(entries: Float[np.ndarray, "6"]) -> Flag:
 
 @kernel
 def _correlation(covariance: float, one: float, other: float) -> float:
-    """Correlation of two numbers; infinite where one of them has no variance to share."""
+    """Correlation of two numbers; infinite where one has no variance and they covary."""
     if covariance == 0.0:
         return 0.0
     return covariance / math.sqrt(one * other)

@@ -24,88 +24,50 @@ from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 NEAREST = 1e-3
-"""A measurement of a point nearer than this [m] says nothing that can be linearised."""
-SOME = 3.0
-"""Standard deviations that a detour must be above none to place anything. Of what stands straight
-between vehicle and caller, and has none, any error of it makes something near one of the two, and
-surely."""
-BELIEVED = 2.0
-"""Standard deviations that a measurement may be off before Huber's rule lets it count less."""
+"""Points nearer than this [m] are too near to linearise a measurement."""
+MIN_TDOA_SIGMAS = 3.0
+"""A detour places something only if it is above this many of its standard deviations: that of a
+point between vehicle and caller is 0, and an error would place the point near one of them,
+seemingly surely."""
+HUBER_K = 2.0
+"""Standard deviations beyond which Huber's rule lets a measurement count less."""
 
 
 class Measurements(NamedTuple):
-    """Rows of a scan, each of a landmark of its own, as the kernels take them.
-
-    Attributes
-    ----------
-    landmark : (m)
-        Label.
-    bearing : (m) [rad]
-    range : (m) [m]
-        NaN where passive.
-    bearing_variance, range_variance : (m) [rad^2], [m^2]
-        R, row by row.
-    """
+    """Rows of a scan, each of a landmark of its own, as the kernels take them."""
 
     landmark: Int[np.ndarray, " m"]
-    bearing: Float[np.ndarray, " m"]
-    range: Float[np.ndarray, " m"]
-    bearing_variance: Float[np.ndarray, " m"]
-    range_variance: Float[np.ndarray, " m"]
+    bearing: Float[np.ndarray, " m"]  # [rad]
+    range: Float[np.ndarray, " m"]  # [m], NaN where passive
+    bearing_variance: Float[np.ndarray, " m"]  # [rad^2]
+    range_variance: Float[np.ndarray, " m"]  # [m^2]
 
 
 class Detours(NamedTuple):
-    """Those rows of a scan that have a detour whose caller is known by its label.
+    """The rows of a scan that have a detour and a caller with a known label."""
 
-    Attributes
-    ----------
-    landmark, caller : (d)
-        Labels; no landmark is its own caller.
-    detour : (d) [m]
-    variance : (d) [m^2]
-    row : (d)
-        Where in the scan.
-    """
-
-    landmark: Int[np.ndarray, " d"]
+    landmark: Int[np.ndarray, " d"]  # no landmark is its own caller
     caller: Int[np.ndarray, " d"]
-    detour: Float[np.ndarray, " d"]
-    variance: Float[np.ndarray, " d"]
-    row: Int[np.ndarray, " d"]
+    detour: Float[np.ndarray, " d"]  # [m]
+    variance: Float[np.ndarray, " d"]  # [m^2]
+    row: Int[np.ndarray, " d"]  # index in the scan
 
 
 Columns = tuple[Int[np.ndarray, " m"], Float[np.ndarray, "7 m"]]
 """Labels and numbers of a scan's rows."""
 Timings = tuple[Int[np.ndarray, " m"], Int[np.ndarray, " callers"], Int[np.ndarray, " v"]]
-"""Callers of a scan's rows; the labels of the callers, and of who moves."""
+"""Callers of a scan's rows; the labels of the callers, and of those that move."""
 
 
 def columns_of(scan: Scan) -> Columns:
-    """Return of a scan what a filter's kernel is handed: it makes `Measurements` of it.
-
-    Parameters
-    ----------
-    scan : Scan
-
-    Returns
-    -------
-    tuple of labels and numbers
-        A plain tuple: a kernel takes one in no time, and a record in microseconds.
-    """
+    """Return a scan as kernels take it: a plain tuple is passed faster than a record."""
     return scan.landmark, np.ascontiguousarray(scan.numbers)
 
 
 def timings_of(scan: Scan) -> Timings | None:
-    """Return what says whose detours a scan holds, as kernels take it.
+    """Return caller columns of a scan as kernels take them; None where it names no caller.
 
-    Parameters
-    ----------
-    scan : Scan
-
-    Returns
-    -------
-    tuple of callers, callers' labels and labels of who moves, or None
-        Where it names no caller: a kernel that is given None is compiled without a word on detours.
+    A kernel that gets None is compiled without its code for detours.
     """
     if scan.callers.size == 0 and scan.moving.size == 0:
         return None
@@ -114,16 +76,9 @@ def timings_of(scan: Scan) -> Timings | None:
 
 @kernel
 def measurements(columns: Columns) -> Measurements:
-    """Return the rows of a scan as the kernels take them: standard deviations are squared here.
+    """Return the bearings and ranges of a scan, with variances.
 
-    What is but a further detour, without a bearing, stands at the end and is left out.
-
-    Examples
-    --------
-    >>> from pipistrelle.detection.scans import make_scan
-    >>> scan = make_scan(0.0, np.array([4]), np.zeros(1), range=2.0, bearing_std=0.5)
-    >>> measurements(columns_of(scan)).bearing_variance
-    array([0.25])
+    Rows of a detour without a bearing stand at the end and are left out.
     """
     landmark, numbers = columns
     rows = landmark.size
@@ -141,11 +96,7 @@ def measurements(columns: Columns) -> Measurements:
 
 @kernel
 def detours(columns: Columns, timings: Timings) -> Detours:
-    """Return the detours of a scan as the kernels take them.
-
-    Examples
-    --------
-    A caller's own row is no detour over itself.
+    """Return the detours of a scan. A caller's own row is no detour over itself.
 
     >>> from dataclasses import replace
     >>> from pipistrelle.detection.scans import make_scan
@@ -171,7 +122,7 @@ def detours(columns: Columns, timings: Timings) -> Detours:
 
 
 class Row(NamedTuple):
-    """One of `Measurements`: numbers alone, which a kernel hands on for less than the arrays."""
+    """One of `Measurements`, as numbers: a kernel passes it faster than the arrays."""
 
     landmark: Whole
     bearing: float
@@ -182,7 +133,7 @@ class Row(NamedTuple):
 
 @no_alloc
 def row_of(heard: Measurements, m: Whole) -> Row:
-    """Take measurement m."""
+    """Return measurement m."""
     return Row(
         heard.landmark[m],
         heard.bearing[m],
@@ -198,9 +149,9 @@ def observe(
 ) -> tuple[float, float, float, float, float]:
     """Range, bearing, direction cosines and inverse range of a point, for kernels.
 
-    Returns range [m], bearing [rad], cos and sin of the direction in the world, and k, the inverse
-    of the range, which `NEAREST` bounds. The Jacobians follow: d range = (-c, -s, 0; c, s) and
-    d bearing = (s k, -c k, -1; -s k, c k) by pose and point.
+    Returns range [m], bearing [rad], cos c and sin s of the direction in the world, and k, the
+    inverse of the range, bounded by `NEAREST`. The Jacobians follow: d range = (-c, -s, 0; c, s)
+    and d bearing = (s k, -c k, -1; -s k, c k) by pose and point.
     """
     dx, dy = px - x, py - y
     distance = math.sqrt(dx * dx + dy * dy)
@@ -246,10 +197,7 @@ def measurement_jacobians(
            [-0. ,  0.5]])
     """
     _, _, c, s, k = observe(pose[0], pose[1], pose[2], point[0], point[1])
-    return (
-        np.array([[-c, -s, 0.0], [s * k, -c * k, -1.0]]),
-        np.array([[c, s], [-s * k, c * k]]),
-    )
+    return (np.array([[-c, -s, 0.0], [s * k, -c * k, -1.0]]), np.array([[c, s], [-s * k, c * k]]))
 
 
 @kernel
@@ -258,9 +206,9 @@ def detour_slopes(
 ) -> tuple[float, float, float, float, float]:
     """Detour over a point and its slopes, for kernels.
 
-    Of the vehicle at (x, y), the point (px, py) and the caller at (bx, by). Returns the detour [m],
-    its derivatives by the point (2) and by the caller (2); those by the vehicle are the rest, for
-    the three together may be moved. Ways are bounded from below by `NEAREST`.
+    The vehicle is at (x, y), the point at (px, py) and the caller at (bx, by). Returns the detour
+    [m], its derivatives by the point (2) and by the caller (2); those by the vehicle are minus
+    their sum. Distances are bounded from below by `NEAREST`.
     """
     ux, uy, near = _away(x, y, px, py)
     wx, wy, onward = _away(bx, by, px, py)
@@ -281,7 +229,7 @@ def _away(x: float, y: float, px: float, py: float) -> tuple[float, float, float
 def range_by_detour(detour: float, dx: float, dy: float, c: float, s: float) -> float:
     """Range of a point in the direction (c, s) of the vehicle, the caller being (dx, dy) from it.
 
-    Infinite or negative where no point there has such a detour; see `landmark_range`.
+    It is infinite or negative where no point there has such a detour; see `landmark_range`.
     """
     if detour <= 0.0:
         return math.inf
@@ -293,7 +241,7 @@ def range_by_detour(detour: float, dx: float, dy: float, c: float, s: float) -> 
 def caller_range_by_detour(detour: float, dx: float, dy: float, c: float, s: float) -> float:
     """Range of a caller in the direction (c, s) of the vehicle, the point being (dx, dy) from it.
 
-    Infinite or negative where no caller there makes such a detour.
+    It is infinite or negative where no caller there makes such a detour.
     """
     if detour <= 0.0:
         return math.inf
@@ -304,19 +252,12 @@ def caller_range_by_detour(detour: float, dx: float, dy: float, c: float, s: flo
 def detour_of(
     vehicle: Float[np.ndarray, "2"], point: Float[np.ndarray, "2"], caller: Float[np.ndarray, "2"]
 ) -> float:
-    r"""How much longer the way of a caller's sound over a point is than the straight one.
+    """How much longer the path of a caller's sound over a point is than the straight one [m].
 
     .. math:: e = |b - l| + |l - p| - |b - p|
 
-    Points of one detour lie on an ellipse whose foci are the caller b and the vehicle p.
-
-    Parameters
-    ----------
-    vehicle, point, caller : (2) [m]
-
-    Returns
-    -------
-    [m]
+    Points of one detour lie on an ellipse whose foci are the caller b and the vehicle p; all are x,
+    y [m].
 
     Examples
     --------
@@ -329,27 +270,12 @@ def detour_of(
 def detour_jacobians(
     vehicle: Float[np.ndarray, "2"], point: Float[np.ndarray, "2"], caller: Float[np.ndarray, "2"]
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    r"""Derivatives of the detour by the vehicle's position, the point's and the caller's.
+    r"""Derivatives of the detour by the vehicle's position, the point's and the caller's, (2) each.
 
     .. math:: e_l = w + u, \quad e_b = -w - v, \quad e_p = v - u
 
     with the unit vectors u and w to the point from the vehicle and from the caller, and v from the
     vehicle to the caller.
-
-    Parameters
-    ----------
-    vehicle, point, caller : (2) [m]
-
-    Returns
-    -------
-    by vehicle, by point, by caller : (2)
-
-    Examples
-    --------
-    Beyond the vehicle, in line, every step away is two.
-
-    >>> detour_jacobians(np.zeros(2), np.array([-3.0, 0.0]), np.array([6.0, 0.0]))[1]
-    array([-2.,  0.])
     """
     _, *slopes = detour_slopes(*vehicle, *point, *caller)
     by_point, by_caller = np.array(slopes[:2]), np.array(slopes[2:])
@@ -357,14 +283,14 @@ def detour_jacobians(
 
 
 def landmark_range(detour: float, caller: Float[np.ndarray, "2"], bearing: float) -> float:
-    r"""Range of a point of which bearing and detour are known, and where the caller is.
+    r"""Range of a point by its bearing and its detour over a known caller.
 
     .. math:: r = \frac{(d + e)^2 - d^2}{2 (d + e - u \cdot v)}
 
-    with v the way from the vehicle to the caller, d its length and u the direction of the bearing:
-    where the ray from the vehicle crosses the ellipse of that detour. Between vehicle and caller
-    numerator and denominator vanish together: there a detour says nothing of the range, and where
-    it is none, or less, there is none.
+    with v the vector from the vehicle to the caller, d its length and u the direction of the
+    bearing: where the ray from the vehicle crosses the ellipse of that detour. Between vehicle and
+    caller numerator and denominator vanish together: there a detour says nothing about the range. A
+    detour of 0 or less gives no range.
 
     Parameters
     ----------

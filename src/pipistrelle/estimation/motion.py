@@ -1,16 +1,15 @@
 r"""Motion models with their Jacobians.
 
-What a vehicle's *controls* are is its model's business, a row for each step: two numbers of a
-bicycle or a unicycle. Of *poses*, as odometry tells them, they are the motion itself since the pose
-before, in the vehicle's axes there, forward, sideways and turn,
+The *controls* of a step are two numbers of a bicycle or a unicycle. Of *poses*, as odometry gives
+them, they are the motion since the previous pose in its axes, forward, sideways and turn,
 
 .. math:: (x, y)_k = (x, y)_{k-1} + R(\theta_{k-1}) \, (d_x, d_y), \quad
           \theta_k = \theta_{k-1} + d_\theta
 
-and, where a recorder says how sure it is, the six numbers of that motion's covariance besides.
+followed, where a recorder states it, by the six numbers of its covariance.
 
 The kernels return plain numbers, so that the filters can inline them; the functions beside them
-say the same in arrays. In the kernels a motion model is a number: 0 bicycle, 1 unicycle, 2 poses.
+return arrays. In the kernels a motion model is a number: 0 bicycle, 1 unicycle, 2 poses.
 """
 
 import math
@@ -28,34 +27,28 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 MOTION_MODELS = ("bicycle", "unicycle", "poses")
 BY_POSES = MOTION_MODELS.index("poses")
 MOVED = 3
-"""Numbers of a relative motion; those of its covariance follow: xx, xy, xh, yy, yh, hh."""
+"""How many numbers a relative motion has; those of its covariance follow: xx, xy, xh, yy, yh,
+hh."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Motion:
-    """A motion model and the noise of its controls.
-
-    Attributes
-    ----------
-    model : "bicycle", "unicycle" or "poses"
-        Controls are speed [m/s] and steering angle [rad], speed [m/s] and angular rate [rad/s], or
-        the motion since the pose before: forward, sideways (to the left) [m] and turn [rad],
-        perhaps with its covariance, xx, xy, xh, yy, yh, hh (x forward, h turn; NaN: not said).
-    control_std : one for each of these, (2) or (3)
-        Noise of one control step; of poses, of a motion that does not say its covariance.
-    wheelbase : [m]
-        Bicycle only.
-    noise_at_rest : bool
-        False: a step whose controls are zero, or whose motion is, is exact.
-    """
+    """A motion model and the noise of its controls."""
 
     model: Literal["bicycle", "unicycle", "poses"]
+    """Controls are speed [m/s] and steering angle [rad]; speed [m/s] and angular rate [rad/s]; or
+    the motion since the pose before: forward, sideways (to the left) [m] and turn [rad], perhaps
+    with its covariance xx, xy, xh, yy, yh, hh (x forward, h turn; NaN: not stated)."""
     control_std: tuple[float, ...]
+    """Noise of one control step, a number for each of these; of poses, of a motion that does not
+    state its covariance."""
     wheelbase: float = 1.0
+    """[m], of a bicycle."""
     noise_at_rest: bool = True
+    """False: a step without motion is exact."""
 
     def __post_init__(self) -> None:
-        """Refuse a model that there is not, and noise that is not one number for each control."""
+        """Refuse an unknown model, and noise that is not one number for each control."""
         if self.model not in MOTION_MODELS:
             known = ", ".join(MOTION_MODELS)
             raise InputError(f"motion: found the model {self.model!r}, expected one of {known}")
@@ -85,22 +78,7 @@ class MotionNumbers(NamedTuple):
 
 @lru_cache(maxsize=16)
 def motion_numbers(motion: Motion) -> MotionNumbers:
-    """Turn a motion model into numbers for the kernels, once.
-
-    Parameters
-    ----------
-    motion : Motion
-
-    Returns
-    -------
-    MotionNumbers
-
-    Examples
-    --------
-    >>> numbers = motion_numbers(Motion(model="unicycle", control_std=(0.5, 0.25)))
-    >>> numbers.model, numbers.speed_variance, numbers.turn_variance
-    (1, 0.25, 0.0625)
-    """
+    """Convert a motion model to numbers for the kernels."""
     return MotionNumbers(
         model=MOTION_MODELS.index(motion.model),
         wheelbase=float(motion.wheelbase),
@@ -117,9 +95,9 @@ def motion_increment(
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
     """One noise-free control step, for kernels.
 
-    Returns dx, dy, dheading; dx/dheading, dy/dheading are -dy, dx; then the six entries of the
-    Jacobian U by speed (x, y, heading) and by turn (x, y, heading). Of poses the column by what is
-    sideways is missing: it is a quarter turn of the first.
+    Returns dx, dy, dheading, then the Jacobian U by speed (x, y, heading) and by turn (x, y,
+    heading). The derivatives of x and y by heading are -dy and dx. Of poses the column by the
+    sideways motion is missing: it is the first, turned by 90 degrees.
     """
     if model == BY_POSES:
         c, s = math.cos(heading), math.sin(heading)
@@ -160,7 +138,7 @@ def motion_increment(
 def relative_noise(
     control: Float[np.ndarray, " c"], motion: MotionNumbers
 ) -> tuple[float, float, float, float, float, float]:
-    """Entries xx, xy, xh, yy, yh, hh of the covariance of a motion since a pose, in its axes."""
+    """Covariance xx, xy, xh, yy, yh, hh of a motion since the pose before, in its axes."""
     moves = control[0] != 0.0 or control[1] != 0.0 or control[2] != 0.0
     if not (motion.noise_at_rest or moves):
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -180,10 +158,9 @@ def propagate_pose(
     dt: float,
     motion: MotionNumbers,
 ) -> tuple[float, float]:
-    """Carry a pose (3) and its covariance (3, 3) through a control step, in place.
+    """Propagate a pose (3) and its covariance (3, 3) through a control step, in place.
 
-    F P F^T + U Q U^T (Bradley & Abaid, Eq. (10)); Q alone has rank 2, of poses 3. Returns dx and dy
-    [m].
+    F P F^T + U Q U^T (Bradley & Abaid, Eq. (10)); Q has rank 2, of poses 3. Returns dx and dy [m].
     """
     dx, dy, dheading, u00, u10, u20, u01, u11, u21 = motion_increment(
         motion.model, motion.wheelbase, pose[2], control, dt
@@ -302,22 +279,9 @@ def controls_between(
     r"""Controls that lead from each pose to the next, as nearly as the motion model can.
 
     A unicycle's arc has the turn of the heading, and a bicycle's front wheel the steering angle
-    that makes it, :math:`\sin\gamma = B \Delta\theta / (V \Delta_t)`; the speed is that along the
-    arc's chord, or the wheel's way. What the poses move sideways is lost.
+    that makes it, :math:`\sin\gamma = B \Delta\theta / (V \Delta_t)`; the speed is along the arc's
+    chord or the wheel's path. Sideways motion is lost. ``path`` (k + 1, 3) [m, m, rad], ``dt`` [s].
 
-    Parameters
-    ----------
-    path : (k + 1, 3) [m, m, rad]
-    dt : [s], or (k) of each step
-    motion : Motion
-        A bicycle or a unicycle.
-
-    Returns
-    -------
-    (k, 2)
-
-    Examples
-    --------
     >>> motion = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
     >>> there = motion_step(motion, np.zeros(3), np.array([0.75, 0.1]), 0.125)
     >>> controls_between(np.array([np.zeros(3), there]), 0.125, motion).round(9)
@@ -407,7 +371,7 @@ def motion_noise(motion: Motion, control: Float[np.ndarray, " c"]) -> Float[np.n
 def _increment(
     motion: Motion, pose: Float[np.ndarray, "3"], control: Float[np.ndarray, " c"], dt: float
 ) -> tuple[float, ...]:
-    """Call `motion_increment` from arrays."""
+    """Call `motion_increment` with arrays."""
     numbers = motion_numbers(motion)
     control = np.asarray(control, dtype=float)
     return motion_increment(numbers.model, numbers.wheelbase, pose[2], control, dt)

@@ -1,7 +1,7 @@
 """Estimators from outside: a class of another module, found, checked and built by its name.
 
-The module is one that is installed, or one in the current folder, which goes first, as it does for
-``python -m``. Whatever is wrong with it is said in a line.
+The module is an installed one, or one in the current folder, which goes first, as with
+``python -m``. Everything that can be wrong with it is refused in one line.
 """
 
 import sys
@@ -17,37 +17,20 @@ if TYPE_CHECKING:
     from pipistrelle.estimation.motion import Motion
 
 PARTS = ("init", "predict", "update")
-"""What every estimator does."""
+"""Methods that every estimator has."""
 
 
 def look_in(folder: Path) -> None:
-    """Have modules in a folder found, before all others, as ``python -m`` does with its own.
-
-    Parameters
-    ----------
-    folder : Path
-    """
+    """Put a folder first among those where modules are found, as ``python -m`` does."""
     if sys.path[:1] != [str(folder)]:
         sys.path[:] = [str(folder), *(place for place in sys.path if place != str(folder))]
     invalidate_caches()  # a module may be younger than the last look
 
 
 def class_of(name: str) -> type:
-    """Import a class from outside, and see that it has what an estimator must have.
+    """Import the class ``module:Class`` and check that it has what an estimator must have.
 
-    Parameters
-    ----------
-    name : str
-        ``module:Class``.
-
-    Returns
-    -------
-    type
-
-    Raises
-    ------
-    InputError
-        Where there is no such module or class, its import fails, or it is no estimator.
+    It raises InputError where module or class is missing, the import fails, or methods are missing.
     """
     module, _, wanted = name.partition(":")
     look_in(Path.cwd())
@@ -70,20 +53,10 @@ def class_of(name: str) -> type:
 
 
 def title_met(name: str) -> str | None:
-    """Return the title of a class from outside that this process has imported; import nothing.
+    """Return the title of a class from outside that is imported already; import nothing.
 
-    Parameters
-    ----------
-    name : str
-        ``module:Class``.
+    It is None where the class is not imported or has no title.
 
-    Returns
-    -------
-    str or None
-        None where it has not been imported, or has no title.
-
-    Examples
-    --------
     >>> title_met("never.imported:Here") is None
     True
     """
@@ -93,23 +66,9 @@ def title_met(name: str) -> str | None:
 
 
 def built(name: str, kind: Any, config: Config, motion: "Motion") -> "Estimator":
-    """Build an estimator from outside: by its ``from_config``, or from what its fields ask for.
+    """Build an estimator from outside: by its ``from_config``, or from the fields that it asks for.
 
-    Parameters
-    ----------
-    name : str
-    kind : type
-    config : Config
-    motion : Motion
-
-    Returns
-    -------
-    Estimator
-
-    Raises
-    ------
-    InputError
-        Where it cannot be built.
+    It raises InputError where it cannot be built.
     """
     try:
         if hasattr(kind, "from_config"):
@@ -120,7 +79,7 @@ def built(name: str, kind: Any, config: Config, motion: "Motion") -> "Estimator"
 
 
 def _arguments(kind: Any, config: Config, motion: "Motion") -> dict[str, Any]:
-    """Return what is known of the fields of a dataclass."""
+    """Return the values for the fields of a dataclass that have a known name."""
     if not is_dataclass(kind):
         raise InputError("it is no dataclass; make it one, or write from_config(config, motion)")
     known = {"motion": motion, "rays": config.rays, "gate": config.filter.gate, "config": config}
@@ -135,10 +94,8 @@ def _arguments(kind: Any, config: Config, motion: "Motion") -> dict[str, Any]:
 
 
 def worded(error: BaseException) -> str:
-    r"""Word an error that an estimator raised: its kind, and of its text the first line.
+    r"""Describe an error of an estimator: its kind, and the first line of its text.
 
-    Examples
-    --------
     >>> worded(ArithmeticError("\nno solution\nsee the manual"))
     'ArithmeticError: no solution'
     """

@@ -70,7 +70,7 @@ A member is a Gaussian in x and y, and a bearing is linear in them only nearly. 
 angle a member's far end is nearer by its share :math:`\alpha` than its middle, so its bearing is
 off by some :math:`\alpha^2/2`, 0.045 rad for 0.3: nothing beside the paper's R, all there is
 beside a bearing good to 0.003 rad. ``spacing = "auto"`` therefore lets bearings more precise than
-that wait until another crosses them (`estimation.ekf.crossing`). Finer members alone
+that wait until another crosses them (`estimation.ekf.delayed_initialization`). Finer members alone
 did not do: with :math:`\alpha` of 0.05 to 0.2 the filters still diverged on such bearings.
 
 Departures from the printed page: the paper prints :math:`\sigma_j = \alpha s_{j-1}`, which
@@ -84,7 +84,7 @@ Sources: Bradley & Abaid, Eqs. (17) to (21); Sola, Monin, Devy & Lemaire (2005).
 import math
 from functools import lru_cache
 from statistics import NormalDist
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -97,19 +97,14 @@ SMALLEST_SHARE = 1e-12
 UNDERFLOW = 1e-200
 FEDERATED, AS_PRINTED, EXACT, FITTED = range(4)
 ANEW, HEAVIEST, RESET, CORRECTED, BEARING, OTHERS, MOVED = range(7)
-RANGED = {
-    "anew": ANEW, "heaviest": HEAVIEST, "reset": RESET, "corrected": CORRECTED,
-    "bearing": BEARING, "others": OTHERS, "moved": MOVED,
-}  # fmt: skip
-"""Numbers of the readings of `rays.ranged`; from BEARING on a ray stays a ray."""
+RANGED = {name: k for k, name in enumerate(get_args(RayConfig.model_fields["ranged"].annotation))}
+"""Numbers of the readings of ``rays.ranged``, in its order; from BEARING on a ray stays a ray."""
 _SHARING = {
     ("paper", "normal"): FEDERATED, ("paper", "printed"): AS_PRINTED, ("auto", "normal"): FITTED,
 }  # fmt: skip
 
 
-def ray_members(
-    rays: RayConfig,
-) -> tuple[Float[np.ndarray, " h"], Float[np.ndarray, " h"]]:
+def ray_members(rays: RayConfig) -> tuple[Float[np.ndarray, " h"], Float[np.ndarray, " h"]]:
     """Ranges of a new ray's members and their standard deviations.
 
     Parameters
@@ -141,55 +136,29 @@ def ray_members(
     return ranges, rays.ratio * ranges
 
 
-class Sensing(NamedTuple):
-    """What the kernels need to know of gates and rays.
+class UpdateParams(NamedTuple):
+    """What kernels need to know of gates and rays."""
 
-    Attributes
-    ----------
-    passive_bound, active_bound : float
-        Largest squared Mahalanobis distances.
-    ray_ranges, ray_stds : (h) [m]
-        Read-only.
-    power, prune, merge : float
-    aggregated : bool
-    ranged : int
-        What a range does to a ray, one of the numbers of `RANGED`.
-    sharing : int
-        How members take a bearing: FEDERATED, AS_PRINTED (federated, by the other reading of the
-        likelihood), EXACT (all of it each, as in a Gaussian mixture) or FITTED (federated, and
-        ``spacing = "auto"``). One number, for the filter's speed hangs on how many there are in
-        this record.
-    robust : bool
-        Whether a measurement that surprises counts less.
-    """
-
-    passive_bound: float
-    active_bound: float
-    ray_ranges: Float[np.ndarray, " h"]
-    ray_stds: Float[np.ndarray, " h"]
+    passive_bound: float  # largest squared Mahalanobis distance of a bearing
+    active_bound: float  # the same of range and bearing
+    ray_ranges: Float[np.ndarray, " h"]  # [m], read-only
+    ray_stds: Float[np.ndarray, " h"]  # [m], read-only
     power: float
     prune: float
     merge: float
     aggregated: bool
-    ranged: int
+    ranged: int  # what a range does to a ray: a number of `RANGED`
     sharing: int
-    robust: bool
+    """How members take a bearing: FEDERATED, AS_PRINTED (federated, by the other reading of the
+    likelihood), EXACT (each takes all of it, as in a Gaussian mixture) or FITTED (federated, and
+    ``spacing = "auto"``). One number for all, as a shorter record makes the filter faster."""
+    robust: bool  # whether Huber's rule is used (`estimation.ekf.huber`)
 
 
 @lru_cache(maxsize=16)
 def gate_bounds(gate: float) -> tuple[float, float]:
     """Chi-square quantiles of one and of two degrees of freedom; infinite for a gate of 1.
 
-    Parameters
-    ----------
-    gate : (0, 1]
-
-    Returns
-    -------
-    one, two : squared Mahalanobis distances
-
-    Examples
-    --------
     >>> [round(bound, 2) for bound in gate_bounds(0.999)]
     [10.83, 13.82]
     """
@@ -199,30 +168,18 @@ def gate_bounds(gate: float) -> tuple[float, float]:
 
 
 @lru_cache(maxsize=16)
-def sensing_of(
+def update_params(
     rays: RayConfig, gate: float, *, robust: bool = False, exact: bool = False
-) -> Sensing:
-    """Gather what the kernels need to know of gates and rays, once per filter.
+) -> UpdateParams:
+    """Gather what kernels need to know of gates and rays, once per filter.
 
-    Parameters
-    ----------
-    rays : RayConfig
-    gate : (0, 1]
-    robust : bool
-        Whether a measurement that surprises counts less (`estimation.ekf.huber`).
-    exact : bool
-        Whether a bearing corrects every member by R itself, as in a Gaussian mixture (FastSLAM):
-        its weights are densities.
-
-    Returns
-    -------
-    Sensing
+    With ``exact`` a bearing corrects every member by R itself, as in a Gaussian mixture (FastSLAM).
     """
     passive_bound, active_bound = gate_bounds(gate)
     ray_ranges, ray_stds = ray_members(rays)
     ray_ranges.setflags(write=False)  # they are shared by whoever asks for the same
     ray_stds.setflags(write=False)
-    return Sensing(
+    return UpdateParams(
         passive_bound=passive_bound,
         active_bound=active_bound,
         ray_ranges=ray_ranges,
@@ -253,7 +210,7 @@ def log_likelihood(innovation: float, variance: float, printed: bool) -> float:
 def _weigh_in_logs(
     log_likelihoods: Float[np.ndarray, " m"], weights: Float[np.ndarray, " h"], count: Whole
 ) -> float:
-    """Multiply weights by likelihoods whose products underflow; returns the log of their sum."""
+    """Multiply weights by likelihoods whose products underflow; return the log of their sum."""
     largest, total = -np.inf, 0.0
     for j in range(count):
         log_weight = math.log(weights[j]) if weights[j] > 0.0 else -np.inf
@@ -269,7 +226,7 @@ def _weigh_in_logs(
 
 @no_alloc
 def heaviest_member(weights: Float[np.ndarray, " h"], count: Whole) -> Whole:
-    """Return the index of the largest of the first weights, the first of equals."""
+    """Return the index of the largest weight, the first of equals."""
     best = 0
     for j in range(1, count):
         if weights[j] > weights[best]:
@@ -279,7 +236,7 @@ def heaviest_member(weights: Float[np.ndarray, " h"], count: Whole) -> Whole:
 
 @no_alloc
 def renormalise(weights: Float[np.ndarray, " h"], count: Whole) -> None:
-    """Make the first weights sum to one; alike where all have underflown."""
+    """Make the first weights sum to one; all equal where their sum has underflown."""
     total = 0.0
     for j in range(count):
         total += weights[j]

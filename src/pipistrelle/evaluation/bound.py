@@ -4,7 +4,7 @@ The posterior Cramér-Rao bound along the true path is the covariance that an ex
 would have with every Jacobian taken at the truth: it hangs on what was heard and on how noisy
 controls and measurements are said to be, and on no estimate. The start is exact, and landmarks are
 not known before they are heard, but for a flat prior. A caller that moves strays as filters
-believe that it does (`estimation.ekf.roaming`), from the way that it truly went. It tells two
+believe that it does (`estimation.ekf.caller_motion`), from the way that it truly went. It tells two
 things:
 
 - how much of an estimator's error is its own fault;
@@ -29,6 +29,7 @@ from pipistrelle.detection.scans import (
     UNLABELLED,
     Scan,
 )
+from pipistrelle.estimation.ekf.caller_motion import propagate_callers, velocity_of
 from pipistrelle.estimation.ekf.gaussian import (
     LINEAR,
     WAITING,
@@ -38,8 +39,7 @@ from pipistrelle.estimation.ekf.gaussian import (
     flush,
     joint_of,
 )
-from pipistrelle.estimation.ekf.roaming import roam, velocity_of
-from pipistrelle.estimation.ekf.timing import tell_detour
+from pipistrelle.estimation.ekf.tdoa import correct_covariance_by_detour
 from pipistrelle.estimation.measurement import (
     NEAREST,
     columns_of,
@@ -287,7 +287,7 @@ def _hear(
     _correct(joint, size, 3 + 2 * slot, numbers, m)
     if timed is not None and timed[0][m] != UNLABELLED:
         i, ib, variance = 3 + 2 * slot, 3 + 2 * timed[0][m], numbers[DETOUR_STD, m] ** 2
-        tell_detour(joint, size, i, ib, variance)
+        correct_covariance_by_detour(joint, size, i, ib, variance)
     return size
 
 
@@ -326,7 +326,7 @@ def _bound(
         pose[:], noise[:] = path[k - 1], 0.0
         propagate_pose(pose, noise, controls[k - 1], dt[k - 1], motion)
         if timed is not None and moving > 0:
-            roam(joint.mean, joint.covariance, labels, dt[k - 1], timed[2][1])
+            propagate_callers(joint.mean, joint.covariance, labels, dt[k - 1], timed[2][1])
             _let_move(joint, timed[1], (k, dt[k - 1], dt[min(k, dt.size - 1)]))
         _carry(joint.covariance, path[k, 0] - path[k - 1, 0], path[k, 1] - path[k - 1, 1], noise)
         for a in range(3):

@@ -8,10 +8,8 @@ from jaxtyping import Float
 from pipistrelle.detection.scans import Scan, rows_of
 from pipistrelle.estimation.beliefs import (
     Belief,
-    Following,
     Landmarks,
-    ParticleCloud,
-    Trajectory,
+    answer,
     in_sight,
     no_landmarks,
 )
@@ -110,21 +108,21 @@ class MissionRecorder:
         """Keep a snapshot."""
         frames = self.snapshots.setdefault((strategy, estimator), [])
         path, landmarks = None, None
-        if self._rest is not None and isinstance(belief, Trajectory):
+        if self._rest is not None and hasattr(belief, "path"):
             asked = self._asked.setdefault((strategy, estimator), [])
             if asked and len(frames) - asked[-1] < max(self._rest, len(frames) // 60):
                 landmarks = frames[-1].landmarks
             else:
-                path = belief.path().mean[:, :2] if len(asked) % 5 == 0 else None
+                path = answer(belief, "path").mean[:, :2] if len(asked) % 5 == 0 else None
                 asked.append(len(frames))
-        pose = belief.pose()
+        pose, moving = belief.pose(), answer(belief, "moving")
         snapshot = Snapshot(
             scan=scan,
             pose=pose.mean,
             covariance=pose.covariance,
             landmarks=belief.landmarks() if landmarks is None else landmarks,
-            moving=in_sight(belief.moving()) if isinstance(belief, Following) else no_landmarks(),
-            cloud=belief.cloud() if isinstance(belief, ParticleCloud) else None,
+            moving=no_landmarks() if moving is None else in_sight(moving),
+            cloud=answer(belief, "cloud"),
             path=path,
         )
         frames.append(snapshot)

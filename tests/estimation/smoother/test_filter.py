@@ -9,9 +9,9 @@ from pipistrelle.detection.scans import DETOUR, rows_of, with_columns
 from pipistrelle.estimation.beliefs import Gaussian, placed
 from pipistrelle.estimation.measurement import detour_jacobians, detour_of
 from pipistrelle.estimation.motion import Motion
-from pipistrelle.estimation.smoother.detours import MOST
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.estimation.smoother.graph import Solver, landmark_key, links
+from pipistrelle.estimation.smoother.tdoa import MAX_WAITING
 from pipistrelle.evaluation.accuracy import alignment, moved
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.runs.filtering import run_filter
@@ -420,8 +420,8 @@ def test_detours_of_a_caller_that_nobody_hears_change_no_bit_and_few_wait():
     for now, then in zip(all_told(belief), all_told(deaf), strict=True):
         np.testing.assert_array_equal(now, then)
     heard = sum(np.count_nonzero(np.isfinite(scan.detour)) for scan in mission.scans)
-    assert heard > MOST
-    assert len(belief.detours) == MOST
+    assert heard > MAX_WAITING
+    assert len(belief.detours) == MAX_WAITING
     assert belief.detours[-1].node == 50
 
 

@@ -34,7 +34,7 @@ def solved(belief, drive):
 def test_a_log_of_precise_bearings_is_mapped_to_centimetres():
     """Aligned RMSE of seeds 0 to 3: smoothed 0.03 to 0.05 m, as believed online 0.04 to 0.07 m.
 
-    Online 0.04 to 0.16 m where `graph.ANEW` is 0.
+    Online 0.04 to 0.16 m where `graph.RELINEARISE_PASSES` is 0.
     """
     errors = []
     for seed in range(4):

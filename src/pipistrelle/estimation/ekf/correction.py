@@ -1,9 +1,9 @@
-"""A frame's correction of one Gaussian over a pose and the members of all landmarks.
+"""Correction of one Gaussian over a pose and the members of all landmarks by a scan.
 
-A frame is taken in measurement by measurement, each at the current mean: first the landmarks
-already mapped, in the order of the scan, then the new ones are placed from the corrected pose, then
-detours correct what both of its ends has placed, and weigh what one has (`detours`). A bearing that
-a detour places, with it, is not taken in besides.
+Measurements are used one by one, each at the current mean. Landmarks of the map come first, in
+the order of the scan. New landmarks are then placed from the corrected pose. Last, detours correct
+what is placed and weigh the members of rays (`tdoa_frame`). A bearing that has placed a landmark
+together with a detour is not used a second time.
 """
 
 import math
@@ -11,20 +11,13 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipistrelle.estimation.ekf.crossing import (
-    WAITS,
-    await_crossing,
-    curved,
+from pipistrelle.estimation.ekf.delayed_initialization import (
+    WAITING_WEIGHT,
+    add_waiting_bearing,
     is_precise,
-    linear_to,
-    place_crossing,
-)
-from pipistrelle.estimation.ekf.detours import (
-    Timed,
-    added_by_detour,
-    correct_by_detour,
-    placed_by_detour,
-    timed_of,
+    member_linearity,
+    place_at_crossing,
+    second_order_bearing,
 )
 from pipistrelle.estimation.ekf.gaussian import (
     APPLIED,
@@ -41,9 +34,16 @@ from pipistrelle.estimation.ekf.gaussian import (
     initialise,
     joint_of,
 )
-from pipistrelle.estimation.ekf.huber import tempered
+from pipistrelle.estimation.ekf.huber import inflated
 from pipistrelle.estimation.ekf.members import Scratch, members_of, scratch_for
 from pipistrelle.estimation.ekf.merging import merge_members
+from pipistrelle.estimation.ekf.tdoa_frame import (
+    FrameDetours,
+    added_by_detour,
+    correct_by_detour,
+    frame_detours,
+    placed_by_detour,
+)
 from pipistrelle.estimation.measurement import (
     Columns,
     Measurements,
@@ -61,7 +61,7 @@ from pipistrelle.estimation.rays import (
     MOVED,
     OTHERS,
     RESET,
-    Sensing,
+    UpdateParams,
     heaviest_member,
     log_likelihood,
     renormalise,
@@ -74,14 +74,9 @@ from pipistrelle.jit import Whole, kernel, no_alloc, no_alloc_inlined
 
 @no_alloc_inlined
 def _correct_ray(
-    state: State,
-    first: Whole,
-    count: Whole,
-    row: Row,
-    sensing: Sensing,
-    scratch: Scratch,
+    state: State, first: Whole, count: Whole, row: Row, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Weigh a ray's members by a bearing and share it among them; GATED when none expected it."""
+    """Weigh a ray's members by a bearing and share it among them; GATED if outside all gates."""
     joint, mean, size = state.joint, state.joint.mean, 3 + 2 * state.members[0]
     weight, outcome = state.weight[first:], GATED
     bearing, variance = row.bearing, row.bearing_variance
@@ -90,13 +85,13 @@ def _correct_ray(
         _, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
         innovation = wrap_angle(bearing - expected)
         S = bearing_variance(joint, size, i, c, s, k) + variance
-        scratch.likelihood[j] = log_likelihood(innovation, S, sensing.sharing == AS_PRINTED)
-        if innovation * innovation <= sensing.passive_bound * S:
+        scratch.likelihood[j] = log_likelihood(innovation, S, params.sharing == AS_PRINTED)
+        if innovation * innovation <= params.passive_bound * S:
             outcome = APPLIED
     if outcome == GATED:
         return GATED
     weigh_and_share(
-        scratch.likelihood, weight, count, sensing.power, sensing.aggregated, scratch.share
+        scratch.likelihood, weight, count, params.power, params.aggregated, scratch.share
     )
     for j in range(count):
         if scratch.share[j] > 0.0:
@@ -107,28 +102,23 @@ def _correct_ray(
 
 @no_alloc
 def _leave_one(
-    state: State,
-    first: Whole,
-    count: Whole,
-    row: Row,
-    sensing: Sensing,
-    scratch: Scratch,
+    state: State, first: Whole, count: Whole, row: Row, params: UpdateParams, scratch: Scratch
 ) -> None:
-    """Give a ray its range where that leaves one member: a full landmark."""
-    left = 0 if sensing.ranged == ANEW else heaviest_member(state.weight[first:], count)
+    """Give a ray its range, by a reading of `rays.ranged` that leaves one member."""
+    left = 0 if params.ranged == ANEW else heaviest_member(state.weight[first:], count)
     for j in range(count):
         scratch.keep[j] = j == left
     drop_members(state, first, count, scratch.keep, scratch.source)
     state.weight[first] = 1.0
     distance, bearing, variance = row.range, row.bearing, row.bearing_variance
     joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
-    if sensing.ranged == ANEW:
+    if params.ranged == ANEW:
         initialise(joint, size, i, distance, bearing, row.range_variance, variance)
         return
-    if sensing.ranged == CORRECTED:
+    if params.ranged == CORRECTED:
         correct_active(joint, size, i, distance, bearing, row.range_variance, variance, np.inf)
         return
-    if sensing.ranged == RESET:
+    if params.ranged == RESET:
         mean = joint.mean
         _, expected, _, _, _ = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
         initialise(joint, size, i, distance, expected, row.range_variance, variance)
@@ -139,7 +129,7 @@ def _leave_one(
 
 @no_alloc
 def _move_to_range(joint: Joint, i: Whole, distance: float) -> None:
-    """Put the mean of the member at state index i at a range, in the direction in which it is."""
+    """Move the mean of the member at state index i to a range, in its present direction."""
     mean = joint.mean
     _, _, c, s, _ = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     mean[i], mean[i + 1] = mean[0] + distance * c, mean[1] + distance * s
@@ -147,64 +137,54 @@ def _move_to_range(joint: Joint, i: Whole, distance: float) -> None:
 
 @no_alloc
 def _correct_ranged_ray(
-    state: State,
-    first: Whole,
-    count: Whole,
-    row: Row,
-    sensing: Sensing,
-    scratch: Scratch,
+    state: State, first: Whole, count: Whole, row: Row, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Correct a ray with range and bearing, as `rays` lists; tell whether it was gated."""
-    if sensing.ranged < BEARING:
-        _leave_one(state, first, count, row, sensing, scratch)
+    """Correct a ray with range and bearing as `rays.ranged` says; return GATED or APPLIED."""
+    if params.ranged < BEARING:
+        _leave_one(state, first, count, row, params, scratch)
         return APPLIED
     weight = state.weight[first:]
     heaviest = heaviest_member(weight, count)
-    if sensing.ranged == MOVED:
+    if params.ranged == MOVED:
         _move_to_range(state.joint, 3 + 2 * (first + heaviest), row.range)
-    if sensing.ranged == OTHERS:
+    if params.ranged == OTHERS:
         for j in range(count):
             scratch.keep[j] = j != heaviest
         drop_members(state, first, count, scratch.keep, scratch.source)
         count -= 1
         renormalise(weight, count)
-    return _correct_partial(state, first, count, row, sensing, scratch)
+    return _correct_partial(state, first, count, row, params, scratch)
 
 
 @no_alloc
 def _correct_partial(
-    state: State, first: Whole, count: Whole, row: Row, sensing: Sensing, scratch: Scratch
+    state: State, first: Whole, count: Whole, row: Row, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Correct a ray with a bearing, and prune it; tell whether it was gated."""
-    if _correct_ray(state, first, count, row, sensing, scratch) == GATED:
+    """Correct a ray with a bearing, prune and merge it; return GATED or APPLIED."""
+    if _correct_ray(state, first, count, row, params, scratch) == GATED:
         return GATED
-    kept = survivors(state.weight[first:], count, sensing.prune, scratch.keep)
+    kept = survivors(state.weight[first:], count, params.prune, scratch.keep)
     if kept < count:
         drop_members(state, first, count, scratch.keep, scratch.source)
-    if sensing.merge > 0.0 and kept > 1:
-        merge_members(state, first, kept, sensing.merge, scratch)
+    if params.merge > 0.0 and kept > 1:
+        merge_members(state, first, kept, params.merge, scratch)
     return APPLIED
 
 
 @no_alloc
 def _correct_precisely(
-    state: State,
-    first: Whole,
-    count: Whole,
-    row: Row,
-    sensing: Sensing,
-    scratch: Scratch,
+    state: State, first: Whole, count: Whole, row: Row, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Cross a bearing that waits, or correct a ray with a precise one; tell whether it was gated.
+    """Cross a waiting bearing, or correct a ray with a precise one; return GATED or APPLIED.
 
-    To the members of a ray, which an earlier, coarser one has cast, it is no more precise than they
-    are linear.
+    An earlier, coarser bearing made the ray: its members are not linear enough for the new one,
+    whose variance is raised to what they allow.
     """
-    if state.weight[first] != WAITS:
-        variance = linear_to(sensing) ** 2
+    if state.weight[first] != WAITING_WEIGHT:
+        variance = member_linearity(params) ** 2
         coarse = Row(row.landmark, row.bearing, row.range, variance, row.range_variance)
-        return _correct_partial(state, first, count, coarse, sensing, scratch)
-    if place_crossing(state, first, row, sensing.robust):
+        return _correct_partial(state, first, count, coarse, params, scratch)
+    if place_at_crossing(state, first, row, params.robust):
         scratch.keep[0], scratch.keep[1] = True, False
         drop_members(state, first, count, scratch.keep, scratch.source)
     return APPLIED
@@ -212,18 +192,18 @@ def _correct_precisely(
 
 @no_alloc_inlined
 def _correct_placed(
-    state: State, first: Whole, row: Row, sensing: Sensing, scratch: Scratch
+    state: State, first: Whole, row: Row, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Correct a placed landmark, and add up its innovations; tell whether it was gated."""
+    """Correct a placed landmark and add up its innovations; return GATED or APPLIED."""
     joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
     distance, bearing, variance = row.range, row.bearing, row.bearing_variance
     if math.isnan(distance):
-        if is_precise(row, sensing):
-            bearing, variance = curved(joint, size, i, row)
-        degrees, bound = 1.0, sensing.passive_bound
+        if is_precise(row, params):
+            bearing, variance = second_order_bearing(joint, size, i, row)
+        degrees, bound = 1.0, params.passive_bound
         squared = correct_bearing(joint, size, i, bearing, variance, bound)
     else:
-        degrees, bound, spread = 2.0, sensing.active_bound, row.range_variance
+        degrees, bound, spread = 2.0, params.active_bound, row.range_variance
         squared = correct_active(joint, size, i, distance, bearing, spread, variance, bound)
     if squared == BEYOND:
         return GATED
@@ -234,37 +214,38 @@ def _correct_placed(
 
 
 @no_alloc
-def _correct_known(state: State, row: Row, sensing: Sensing, scratch: Scratch) -> Whole:
-    """Correct with one measurement of a mapped landmark; tell whether it was gated."""
+def _correct_known(state: State, row: Row, params: UpdateParams, scratch: Scratch) -> Whole:
+    """Correct with one measurement of a mapped landmark; return GATED or APPLIED."""
     first, count = members_of(state.landmark, state.members[0], row.landmark)
-    if sensing.robust and state.weight[first] != WAITS:
-        row = tempered(state, first, count, row)
+    if params.robust and state.weight[first] != WAITING_WEIGHT:
+        row = inflated(state, first, count, row)
     if count == 1:
-        return _correct_placed(state, first, row, sensing, scratch)
-    passive = math.isnan(row.range) or sensing.ranged == BEARING
-    if passive and (state.weight[first] == WAITS or is_precise(row, sensing)):
-        return _correct_precisely(state, first, count, row, sensing, scratch)
+        return _correct_placed(state, first, row, params, scratch)
+    passive = math.isnan(row.range) or params.ranged == BEARING
+    if passive and (state.weight[first] == WAITING_WEIGHT or is_precise(row, params)):
+        return _correct_precisely(state, first, count, row, params, scratch)
     if not passive:
-        return _correct_ranged_ray(state, first, count, row, sensing, scratch)
-    return _correct_partial(state, first, count, row, sensing, scratch)
+        return _correct_ranged_ray(state, first, count, row, params, scratch)
+    return _correct_partial(state, first, count, row, params, scratch)
 
 
 @no_alloc
-def _add_new(state: State, row: Row, sensing: Sensing, moves: bool) -> None:
-    """Append a measurement's landmark, one member or a ray of them (Eqs. (16) to (18)).
+def _add_new(state: State, row: Row, params: UpdateParams, moves: bool) -> None:
+    """Append a measurement's landmark: one member, or a ray (Eqs. (16) to (18)).
 
-    Bearings of a caller that moves do not cross where it is: it is a ray, however precise they are.
+    Bearings of a moving caller come from different places, so it becomes a ray, however precise
+    they are.
     """
     joint, passive, across = state.joint, math.isnan(row.range), row.bearing_variance
-    if passive and is_precise(row, sensing):
+    if passive and is_precise(row, params):
         if not moves:
-            await_crossing(state, row, sensing)
+            add_waiting_bearing(state, row, params)
             return
-        across = linear_to(sensing) ** 2
-    count = sensing.ray_ranges.size if passive else 1
+        across = member_linearity(params) ** 2
+    count = params.ray_ranges.size if passive else 1
     for j in range(count):
-        far = sensing.ray_ranges[j] if passive else row.range
-        spread = sensing.ray_stds[j] ** 2 if passive else row.range_variance
+        far = params.ray_ranges[j] if passive else row.range
+        spread = params.ray_stds[j] ** 2 if passive else row.range_variance
         member = state.members[0]
         size = 3 + 2 * member
         initialise(joint, size, size, far, row.bearing, spread, across)
@@ -277,18 +258,18 @@ def _take_in(
     state: State,
     heard: Measurements,
     known: Bool[np.ndarray, " m"],
-    sensing: Sensing,
+    params: UpdateParams,
     scratch: Scratch,
 ) -> Whole:
-    """Correct with what is mapped, then append what is not; returns how many were gated."""
+    """Correct with landmarks of the map, then append new ones; return how many rows were gated."""
     gated = 0
     for m in range(heard.landmark.size):
         if known[m]:
-            gated += _correct_known(state, row_of(heard, m), sensing, scratch)
+            gated += _correct_known(state, row_of(heard, m), params, scratch)
     flush(state.joint, 3 + 2 * state.members[0])
     for m in range(heard.landmark.size):
         if not known[m]:
-            _add_new(state, row_of(heard, m), sensing, False)
+            _add_new(state, row_of(heard, m), params, False)
     return gated
 
 
@@ -297,26 +278,26 @@ def _take_in_timed(
     state: State,
     heard: Measurements,
     known: Bool[np.ndarray, " m"],
-    timed: Timed,
-    sensing: Sensing,
+    frame: FrameDetours,
+    params: UpdateParams,
     scratch: Scratch,
 ) -> Whole:
-    """Do the same with what a detour does not place, then take in all other detours."""
+    """Do the same where a scan has detours: they place landmarks first, the rest is used last."""
     gated = 0
     for m in range(heard.landmark.size):
         if known[m]:
             row = row_of(heard, m)
-            if not placed_by_detour(state, row, timed, sensing.robust, scratch):
-                gated += _correct_known(state, row, sensing, scratch)
+            if not placed_by_detour(state, row, frame, params.robust, scratch):
+                gated += _correct_known(state, row, params, scratch)
     flush(state.joint, 3 + 2 * state.members[0])
     for m in range(heard.landmark.size):
         if not known[m]:
             row = row_of(heard, m)
-            if not added_by_detour(state, row, timed, sensing.robust):
-                _add_new(state, row, sensing, row.landmark in timed.moving)
-    for d in range(timed.landmark.size):
-        if not timed.used[d]:
-            gated += correct_by_detour(state, timed, d, sensing, scratch)
+            if not added_by_detour(state, row, frame, params.robust):
+                _add_new(state, row, params, row.landmark in frame.moving)
+    for d in range(frame.landmark.size):
+        if not frame.used[d]:
+            gated += correct_by_detour(state, frame, d, params, scratch)
     flush(state.joint, 3 + 2 * state.members[0])
     return gated
 
@@ -329,14 +310,13 @@ def corrected(
     old_weight: Float[np.ndarray, " h"],
     columns: Columns,
     timings: Timings | None,
-    sensing: Sensing,
+    params: UpdateParams,
     turns: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Whole, float, float]:
-    """Correct, prune and extend a copy of the belief.
+    """Correct, prune and extend a copy of an `EkfBelief`.
 
-    Returns its arrays, the gated count, and the two numbers of `beliefs.Innovations`.
-
-    ``turns`` says of which error the covariance is, as in `Joint`.
+    Returns its four arrays, how many rows were gated, and the two numbers of `beliefs.Innovations`.
+    ``turns`` is LINEAR or INVARIANT, as in `Joint`.
     """
     heard = measurements(columns)
     members, rows = old_landmark.size, heard.landmark.size
@@ -344,16 +324,18 @@ def corrected(
     for m in range(rows):
         known[m] = members_of(old_landmark, members, heard.landmark[m])[1] > 0
         if not known[m]:
-            most += max(sensing.ray_ranges.size, 2) if math.isnan(heard.range[m]) else 1
+            most += max(params.ray_ranges.size, 2) if math.isnan(heard.range[m]) else 1
     joint, scratch = joint_of(old_mean, old_covariance, 3 + 2 * most, turns), scratch_for(most)
     landmark, weight = np.empty(most, dtype=np.int64), np.empty(most)
     state = State(joint, landmark, weight, np.full(1, members))
     for member in range(members):
         landmark[member], weight[member] = old_landmark[member], old_weight[member]
     if timings is None:
-        gated = _take_in(state, heard, known, sensing, scratch)
+        gated = _take_in(state, heard, known, params, scratch)
     else:
-        gated = _take_in_timed(state, heard, known, timed_of(columns, timings), sensing, scratch)
+        gated = _take_in_timed(
+            state, heard, known, frame_detours(columns, timings), params, scratch
+        )
     joint.mean[2], members = wrap_angle(joint.mean[2]), state.members[0]
     mean, covariance = gaussian_of(joint, 3 + 2 * members)
     squared, degrees = scratch.innovations

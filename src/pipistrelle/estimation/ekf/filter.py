@@ -6,12 +6,12 @@ The state is the pose and, two numbers each, the members of all landmarks,
           \hat x_h, \hat y_h]^T
    :label: eq-8
 
-(Eq. (8); the correspondence is constant and known and stays out of it). How a frame corrects it:
-`correction`. A caller that moves has its velocity there, too: `roaming`.
+(Eq. (8); the correspondence is constant and known, and no part of it). `correction` corrects it
+with a scan. A moving caller has its velocity there, too (`caller_motion`). The covariance is that
+of the linear or of the right-invariant error (`invariant_error`).
 """
 
-from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -27,13 +27,25 @@ from pipistrelle.estimation.checking import (
     usable_pose,
     usable_scan,
 )
+from pipistrelle.estimation.ekf.caller_motion import (
+    has_velocities,
+    is_standing,
+    is_velocity,
+    missing_velocities,
+    propagate_callers,
+)
 from pipistrelle.estimation.ekf.correction import corrected
-from pipistrelle.estimation.ekf.crossing import WAITS
-from pipistrelle.estimation.ekf.gaussian import LINEAR, propagate
-from pipistrelle.estimation.ekf.roaming import is_velocity, roam, roams, stands, velocities_missing
+from pipistrelle.estimation.ekf.delayed_initialization import WAITING_WEIGHT
+from pipistrelle.estimation.ekf.gaussian import INVARIANT, LINEAR, propagate
+from pipistrelle.estimation.ekf.invariant_error import (
+    linear_covariance_of_points,
+    propagate_invariant,
+    rotated_left,
+    shifted_covariance,
+)
 from pipistrelle.estimation.measurement import columns_of, timings_of
 from pipistrelle.estimation.motion import Motion, motion_numbers
-from pipistrelle.estimation.rays import Sensing, sensing_of
+from pipistrelle.estimation.rays import update_params
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,98 +54,70 @@ class EkfBelief:
 
     .. math:: P = \begin{bmatrix} P_{xx} & P_{xm} \\ P_{mx} & P_{mm} \end{bmatrix}
        :label: eq-9
-
-    Attributes
-    ----------
-    mean : (3 + 2h)
-        x, y [m], heading [rad]; then x, y [m] of each member.
-    covariance : (3 + 2h, 3 + 2h)
-    landmark : (h)
-        Label of each member; the members of a ray stand together, near to far. A caller that moves
-        has a member more, its velocity [m/s], by another label (`roaming.velocity_of`).
-    weight : (h)
-        Aggregated likelihood of each member within its landmark; `crossing.WAITS` of the two points
-        of a bearing that waits to be crossed.
-    gated : int
-        Measurements rejected so far.
-    innovations : Innovations
     """
 
     mean: Float[np.ndarray, " d"]
+    """(3 + 2h): x, y [m] from the origin, heading [rad]; then x, y [m] of each member."""
     covariance: Float[np.ndarray, "d d"]
+    """Of the error that `error` names, in the same order."""
     landmark: Int[np.ndarray, " h"]
+    """Label of each member; the members of a ray stand together, near to far. A moving caller has a
+    member more, its velocity [m/s], with another label (`caller_motion.velocity_of`)."""
     weight: Float[np.ndarray, " h"]
+    """Aggregated likelihood of each member within its landmark; `WAITING_WEIGHT` for the two points
+    of a bearing that waits to be crossed."""
     gated: int
+    """Measurements rejected so far."""
     innovations: Innovations = NO_INNOVATIONS
+    error: float = LINEAR
+    """`gaussian.LINEAR` or `gaussian.INVARIANT`."""
+    origin: Float[np.ndarray, "2"] = field(default_factory=lambda: np.zeros(2))
+    """Where the vehicle started [m], for the invariant error; (0, 0) for the linear one."""
 
     def pose(self) -> Gaussian:
-        """Return the vehicle's pose, (3) and (3, 3)."""
-        return Gaussian(mean=self.mean[:3].copy(), covariance=self.covariance[:3, :3].copy())
+        """Return the vehicle's pose, (3) and (3, 3), with the covariance of the linear error."""
+        mean, covariance = self.mean[:3].copy(), self.covariance[:3, :3].copy()
+        if self.error == LINEAR:
+            return Gaussian(mean=mean, covariance=covariance)
+        linear = np.empty((3, 3))
+        shifted_covariance(covariance, mean[0], mean[1], linear)
+        mean[:2] += self.origin
+        return Gaussian(mean=mean, covariance=linear, invariant=True)
 
     def landmarks(self) -> Landmarks:
         """Return the map, one row per member."""
-        return self.rows(stands(self.landmark))
+        return self._rows(is_standing(self.landmark))
 
     def moving(self) -> Landmarks:
         """Return the callers that move, one row per member."""
-        return self.rows(~stands(self.landmark) & ~is_velocity(self.landmark))
+        return self._rows(~is_standing(self.landmark) & ~is_velocity(self.landmark))
 
-    def rows(self, kept: Bool[np.ndarray, " h"]) -> Landmarks:
-        """Return some members by the linear error, those of a landmark together."""
-        at = numbers_of(kept)
+    def _rows(self, kept: Bool[np.ndarray, " h"]) -> Landmarks:
+        """Return some members with the covariance of the linear error, a landmark's together."""
+        at = (3 + 2 * np.flatnonzero(kept)[:, np.newaxis] + np.arange(2)).ravel()
         mean, covariance = self.mean[at].reshape(-1, 2), self.covariance[np.ix_(at, at)]
-        return map_rows(self.landmark[kept], self.weight[kept], mean, covariance)
+        if self.error == INVARIANT:
+            heading = self.covariance[2, at], self.covariance[2, 2]
+            covariance = linear_covariance_of_points(mean, covariance, *heading)
+            mean = mean + self.origin
+        return _map_of(self.landmark[kept], self.weight[kept], mean, covariance)
 
 
-def numbers_of(kept: Bool[np.ndarray, " h"]) -> Int[np.ndarray, " n"]:
-    """Return where the numbers of some members stand in the state.
-
-    Parameters
-    ----------
-    kept : (h)
-
-    Returns
-    -------
-    (n)
-
-    Examples
-    --------
-    >>> numbers_of(np.array([False, True]))
-    array([5, 6])
-    """
-    return (3 + 2 * np.flatnonzero(kept)[:, np.newaxis] + np.arange(2)).ravel()
-
-
-Kept = TypeVar("Kept", bound=EkfBelief)
-"""The same kind of belief as was given."""
-
-
-def map_rows(
+def _map_of(
     landmark: Int[np.ndarray, " h"],
     weights: Float[np.ndarray, " h"],
     mean: Float[np.ndarray, "h 2"],
     covariance: Float[np.ndarray, "d d"],
 ) -> Landmarks:
-    """Lay out a map, one row per member, from the linear error of all.
+    """Return a map, one row per member, from the joint covariance (2h, 2h) of all.
 
-    A bearing that waits is told as two members, equally likely, half as far as the point that it
-    was heard through and twice as far, and as unsure of their range.
-
-    Parameters
-    ----------
-    landmark, weights : (h)
-        As of an `EkfBelief`.
-    mean : (h, 2) [m]
-    covariance : (2h, 2h) [m^2]
-
-    Returns
-    -------
-    Landmarks
+    A waiting bearing becomes two members of equal weight, half and twice as far as the point in its
+    direction, with standard deviations of half their range.
     """
     members = len(mean)
     blocks, rows = covariance.reshape(members, 2, members, 2), np.arange(members)
     means, own, weight = mean.copy(), blocks[rows, :, rows, :], weights.copy()
-    for first in np.flatnonzero(weight == WAITS)[::2]:
+    for first in np.flatnonzero(weight == WAITING_WEIGHT)[::2]:
         ray = mean[first + 1] - mean[first]
         pair = covariance[2 * first : 2 * first + 4, 2 * first : 2 * first + 4]
         for member, share in ((first, 0.5), (first + 1, 2.0)):
@@ -144,21 +128,10 @@ def map_rows(
     return Landmarks(landmark=landmark.copy(), mean=means, covariance=own, weight=weight)
 
 
-def with_points(belief: Kept, known: Landmarks, by_state: Float[np.ndarray, "n d"]) -> Kept:
-    """Append members to a belief.
-
-    Parameters
-    ----------
-    belief : EkfBelief
-    known : Landmarks of n / 2 rows
-        Their covariances are of errors of their own.
-    by_state : (n, d)
-        How their errors hang on the state's besides.
-
-    Returns
-    -------
-    EkfBelief
-    """
+def _with_points(
+    belief: EkfBelief, known: Landmarks, by_state: Float[np.ndarray, "n d"]
+) -> EkfBelief:
+    """Append members, with errors of their own and ``by_state`` times the error of the state."""
     P, cross = belief.covariance, by_state @ belief.covariance
     own = np.zeros((len(by_state), len(by_state)))
     for row, covariance in enumerate(known.covariance):
@@ -172,34 +145,11 @@ def with_points(belief: Kept, known: Landmarks, by_state: Float[np.ndarray, "n d
     )
 
 
-def with_velocities(belief: Kept, moving: Int[np.ndarray, " v"], std: float) -> Kept:
-    """Give each caller that moves a velocity, once it has a place.
-
-    Parameters
-    ----------
-    belief : EkfBelief
-    moving : (v)
-        Labels of who moves.
-    std : [m/s]
-        Of a velocity of which nothing is known, along an axis.
-
-    Returns
-    -------
-    EkfBelief
-
-    Examples
-    --------
-    >>> belief = EkfBelief(
-    ...     mean=np.arange(5.0), covariance=np.eye(5), landmark=np.array([9]), weight=np.ones(1),
-    ...     gated=0,
-    ... )
-    >>> belief = with_velocities(belief, np.array([8, 9]), 2.0)
-    >>> belief.landmark, belief.mean, belief.covariance.diagonal()
-    (array([  9, -11]), array([0., 1., 2., 3., 4., 0., 0.]), array([1., 1., 1., 1., 1., 4., 4.]))
-    """
+def _with_velocities(belief: EkfBelief, moving: Int[np.ndarray, " v"], std: float) -> EkfBelief:
+    """Give each placed moving caller a velocity of 0, with a std [m/s] along each axis."""
     if moving.size == 0:
         return belief
-    labels = velocities_missing(belief.landmark, moving)
+    labels = missing_velocities(belief.landmark, moving)
     if labels.size == 0:
         return belief
     size = labels.size
@@ -209,25 +159,12 @@ def with_velocities(belief: Kept, moving: Int[np.ndarray, " v"], std: float) -> 
         covariance=np.tile(std * std * np.eye(2), (size, 1, 1)),
         weight=np.ones(size),
     )
-    return with_points(belief, unknown, np.zeros((2 * size, belief.mean.size)))
+    return _with_points(belief, unknown, np.zeros((2 * size, belief.mean.size)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EkfSlam:
     """EKF-SLAM (Bradley & Abaid, Sec. III-A) with rays (Sec. III-C).
-
-    Attributes
-    ----------
-    motion : Motion
-    rays : RayConfig
-    gate : float
-        A measurement outside this share of its predicted distribution (chi-square) is dropped;
-        1 drops none.
-    robust : bool
-        Whether a measurement that surprises counts less (`estimation.ekf.huber`).
-    speed_std, walk_std : float
-        Of callers that move: the velocity [m/s] along an axis before anything is known of it, and
-        how far it strays in a second (`estimation.ekf.roaming`).
 
     Examples
     --------
@@ -245,9 +182,16 @@ class EkfSlam:
     motion: Motion
     rays: RayConfig
     gate: float = 1.0
+    """A measurement outside this share of its predicted distribution (chi-square) is dropped; 1
+    drops none."""
     robust: bool = False
+    """Whether a measurement that surprises counts less (`estimation.ekf.huber`)."""
     speed_std: float = 1.0
+    """Velocity [m/s] along an axis of a moving caller, before anything is known of it."""
     walk_std: float = 0.2
+    """Random walk of that velocity: its standard deviation after 1 s [m/s]."""
+    error: float = LINEAR
+    """The error that a first belief has: `gaussian.LINEAR` or `gaussian.INVARIANT`."""
 
     def __post_init__(self) -> None:
         """Refuse a gate that is no share."""
@@ -256,27 +200,22 @@ class EkfSlam:
     def init(self, pose: Gaussian) -> EkfBelief:
         """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
         pose = usable_pose(pose)
+        origin = np.zeros(2) if self.error == LINEAR else pose.mean[:2]
         return EkfBelief(
-            mean=pose.mean,
+            mean=np.append(pose.mean[:2] - origin, pose.mean[2]),
             covariance=pose.covariance,
             landmark=np.empty(0, dtype=np.int64),
             weight=np.empty(0),
             gated=0,
+            error=self.error,
+            origin=origin,
         )
 
     def knowing(self, belief: EkfBelief, known: Landmarks) -> EkfBelief:
-        """Return a first belief that has landmarks in its map.
+        r"""Return a first belief that has landmarks in its map, one row each.
 
-        Parameters
-        ----------
-        belief : EkfBelief
-            Without landmarks.
-        known : Landmarks
-            One row each.
-
-        Returns
-        -------
-        EkfBelief
+        Their places do not depend on the heading of the vehicle: an invariant error is
+        :math:`\xi_l = e_l - J\hat l\,\xi_\theta`, with their own errors e.
 
         Examples
         --------
@@ -290,7 +229,11 @@ class EkfSlam:
         """
         check_belief(belief, EkfBelief)
         known = usable_known(known)
-        return with_points(belief, known, np.zeros((2 * known.landmark.size, 3)))
+        mean = known.mean - belief.origin
+        by_pose = np.zeros((mean.size, 3))
+        if belief.error == INVARIANT:
+            by_pose[:, 2] = -rotated_left(mean)
+        return _with_points(belief, replace(known, mean=mean), by_pose)
 
     def predict(
         self,
@@ -305,7 +248,8 @@ class EkfSlam:
                   \bar P_{xm} = \bar P_{mx}^T = F P_{xm}
            :label: eq-10
 
-        with F and U the derivatives of the motion by the pose and by the control.
+        with F and U the derivatives of the motion by the pose and by the control (Bradley & Abaid,
+        Eq. (10)).
 
         Parameters
         ----------
@@ -320,29 +264,22 @@ class EkfSlam:
         -------
         belief : EkfBelief
         poses : Gaussian of (k, 3) and (k, 3, 3)
-            After each step.
-
-        Notes
-        -----
-        Bradley & Abaid, Eq. (10).
+            After each step, with the covariance of the linear error.
         """
         check_belief(belief, EkfBelief)
         controls, dt = usable_controls(self.motion, controls, dt)
         mean, covariance = belief.mean.copy(), belief.covariance.copy()
-        poses = Gaussian(mean=np.empty((len(dt), 3)), covariance=np.empty((len(dt), 3, 3)))
+        means, covariances = np.empty((len(dt), 3)), np.empty((len(dt), 3, 3))
+        step = propagate if belief.error == LINEAR else propagate_invariant
         numbers = tuple(motion_numbers(self.motion))
-        propagate(mean, covariance, controls, dt, numbers, poses.mean, poses.covariance)
-        if roams(belief.landmark):
-            roam(mean, covariance, belief.landmark, dt.sum(), self.walk_std)
-        moved = EkfBelief(
-            mean=mean,
-            covariance=covariance,
-            landmark=belief.landmark,
-            weight=belief.weight,
-            gated=belief.gated,
-            innovations=belief.innovations,
-        )
-        return moved, poses
+        step(mean, covariance, controls, dt, numbers, means, covariances)
+        if has_velocities(belief.landmark):
+            propagate_callers(mean, covariance, belief.landmark, dt.sum(), self.walk_std)
+        invariant = belief.error == INVARIANT
+        if invariant:
+            means[:, :2] += belief.origin
+        poses = Gaussian(mean=means, covariance=covariances, invariant=invariant)
+        return replace(belief, mean=mean, covariance=covariance), poses
 
     def update(
         self, belief: EkfBelief, scan: Scan, rng: np.random.Generator | None = None
@@ -381,41 +318,23 @@ class EkfSlam:
         scan = usable_scan(scan)
         if scan.landmark.size == 0:
             return belief
-        sensing = sensing_of(self.rays, self.gate, robust=self.robust)
-        corrected = EkfBelief(**taken_in(belief, scan, sensing, LINEAR))
-        return with_velocities(corrected, scan.moving, self.speed_std)
-
-
-def taken_in(belief: EkfBelief, scan: Scan, sensing: Sensing, turns: float) -> dict[str, Any]:
-    """Return what a scan makes of the fields of an `EkfBelief`.
-
-    Parameters
-    ----------
-    belief : EkfBelief
-    scan : Scan
-    sensing : Sensing
-    turns : float
-        Of which error the covariance is: `gaussian.LINEAR` or `gaussian.INVARIANT`.
-
-    Returns
-    -------
-    dict of field to value
-    """
-    mean, covariance, landmark, weight, gated, squared, degrees = corrected(
-        belief.mean,
-        belief.covariance,
-        belief.landmark,
-        belief.weight,
-        columns_of(scan),
-        timings_of(scan),
-        sensing,
-        turns,
-    )
-    return {
-        "mean": mean,
-        "covariance": covariance,
-        "landmark": landmark,
-        "weight": weight,
-        "gated": belief.gated + gated,
-        "innovations": belief.innovations.plus(squared, degrees),
-    }
+        mean, covariance, landmark, weight, gated, squared, degrees = corrected(
+            belief.mean,
+            belief.covariance,
+            belief.landmark,
+            belief.weight,
+            columns_of(scan),
+            timings_of(scan),
+            update_params(self.rays, self.gate, robust=self.robust),
+            belief.error,
+        )
+        after = replace(
+            belief,
+            mean=mean,
+            covariance=covariance,
+            landmark=landmark,
+            weight=weight,
+            gated=belief.gated + gated,
+            innovations=belief.innovations.plus(squared, degrees),
+        )
+        return _with_velocities(after, scan.moving, self.speed_std)

@@ -10,17 +10,10 @@ others catch up together, many columns in one pass over memory. Every number is 
 order of the measurements, as if each had been taken off at once. ``size`` is the length of the
 state in arrays that may be longer, ``i`` the state index of a point.
 
-The covariance is that of one of two errors. The *linear* error is true state minus mean. In the
-*right-invariant* error :math:`\xi` the truth is the mean moved by one rigid motion, and each
-position shifted besides,
-
-.. math:: \theta = \hat\theta + \xi_\theta, \quad
-          p = R(\xi_\theta)\,\hat p + V(\xi_\theta)\,\xi_p, \quad
-          l = R(\xi_\theta)\,\hat l + V(\xi_\theta)\,\xi_l
-
-with V the integral of the rotation. An error of heading turns vehicle and landmarks alike, so what
-is measured from one to the other does not hang on it: it has no column in H, and ``turns`` is 0,
-which is 1 for the linear error.
+The covariance is that of the *linear* error, true state minus mean, or of the *right-invariant*
+error (`ekf.invariant_error`). An invariant error of heading turns vehicle and landmarks alike and
+changes no measurement: its column in H is multiplied by ``turns``, 0 there and 1 for the linear
+error.
 """
 
 import math
@@ -36,62 +29,43 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 
 GATED, APPLIED = 1, 0
 BEYOND, UNFORESEEN = -1.0, math.nan
-"""In place of a squared innovation: beyond the gate, or of a point too near to foresee anything."""
+"""Instead of a squared innovation: outside the gate, or of a point too near to predict a
+bearing."""
 LINEAR, INVARIANT = 1.0, 0.0
-"""How much an error of heading turns what is measured, by the error whose covariance is kept."""
+"""Factor by which an error of heading enters a measurement, for each of the two errors."""
 LANE = 8
-"""Doubles in a cache line: rows of a multiple of it all begin on one."""
-MOST_WAITING, WAITING = 32, 0
-"""How many columns may wait, and where ``taken`` has how many do: the pose has taken all."""
+"""Doubles in a cache line; a row of a multiple of it begins on one."""
+MAX_WAITING, WAITING = 32, 0
+"""How many columns may wait, and the index in ``taken`` of how many do: the pose has none
+waiting."""
 
 
 class Joint(NamedTuple):
-    """A Gaussian that is being corrected, in arrays with room for what a frame adds.
+    """A Gaussian that is being corrected, in arrays with room for what a frame adds."""
 
-    Attributes
-    ----------
-    mean : (n)
-    covariance : (n, m)
-        Columns beyond n fill the last cache line. Rows i and i + 1 of a point lack the columns of
-        W from ``taken[i]`` to ``taken[WAITING]``, those of the pose none.
-    W : (w, m)
-        The columns that wait, a row each.
-    taken : (n)
-        One array with the number that waits: a kernel is handed a record by its width.
-    turns : float
-        LINEAR or INVARIANT.
-    """
-
-    mean: Float[np.ndarray, " n"]
+    mean: Float[np.ndarray, " n"]  # (n)
     covariance: Float[np.ndarray, "n m"]
-    W: Float[np.ndarray, "w m"]
+    """Columns beyond n fill the last cache line. Rows i and i + 1 of a point still lack
+    the columns of W from ``taken[i]`` to ``taken[WAITING]``; those of the pose lack none."""
+    W: Float[np.ndarray, "w m"]  # the columns that wait, a row each
     taken: Int[np.ndarray, " n"]
-    turns: float
+    """one array, with the number that waits: a kernel takes a short record faster."""
+    turns: float  # LINEAR or INVARIANT
 
 
 class State(NamedTuple):
-    """What EKF-SLAM corrects: the Gaussian, and whose its points are.
-
-    Attributes
-    ----------
-    joint : Joint
-    landmark : (h)
-        Label of each member; the members of a ray stand together, near to far.
-    weight : (h)
-        Aggregated likelihood of each member within its landmark.
-    members : (1)
-        How many there are; the arrays have room for more.
-    """
+    """The Gaussian that EKF-SLAM corrects, and the labels of its points."""
 
     joint: Joint
     landmark: Int[np.ndarray, " h"]
-    weight: Float[np.ndarray, " h"]
-    members: Int[np.ndarray, "1"]
+    """label of each member; the members of a ray stand together, near to far."""
+    weight: Float[np.ndarray, " h"]  # aggregated likelihood of each member within its landmark
+    members: Int[np.ndarray, "1"]  # how many there are; the arrays have room for more
 
 
 @kernel
 def _lanes(size: Whole) -> Whole:
-    """Least multiple of a cache line's numbers that holds so many."""
+    """Round a size up to full cache lines."""
     return (size + LANE - 1) // LANE * LANE
 
 
@@ -107,10 +81,10 @@ def _on_cache_lines(rows: Whole, width: Whole) -> Float[np.ndarray, "rows width"
 def joint_of(
     mean: Float[np.ndarray, " d"], covariance: Float[np.ndarray, "d d"], room: Whole, turns: float
 ) -> Joint:
-    """Copy a mean (d) and a covariance (d, d) into a `Joint` with room for so many numbers."""
+    """Copy a mean (d) and a covariance (d, d) into a `Joint` with room for ``room`` numbers."""
     size, width = mean.size, _lanes(mean.size)
     longer, wider = np.empty(room), _on_cache_lines(room, _lanes(room))
-    W = _on_cache_lines(MOST_WAITING, _lanes(room))
+    W = _on_cache_lines(MAX_WAITING, _lanes(room))
     for a in range(size):
         longer[a] = mean[a]
         for b in range(size):
@@ -118,7 +92,7 @@ def joint_of(
     for b in range(size, width):
         for a in range(size):
             wider[a, b] = 0.0
-        for k in range(MOST_WAITING):
+        for k in range(MAX_WAITING):
             W[k, b] = 0.0
     return Joint(longer, wider, W, np.zeros(room, np.int64), turns)
 
@@ -127,7 +101,7 @@ def joint_of(
 def gaussian_of(
     joint: Joint, size: Whole
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
-    """Copy the mean (d) and the covariance (d, d) out of a `Joint` of which nothing waits."""
+    """Copy the mean (d) and covariance (d, d) out of a `Joint` in which nothing waits."""
     mean, covariance = np.empty(size), np.empty((size, size))
     for a in range(size):
         mean[a] = joint.mean[a]
@@ -163,7 +137,7 @@ def point_rows(
 
 @no_alloc
 def flush(joint: Joint, size: Whole) -> None:
-    """Let every row catch up: afterwards nothing waits."""
+    """Subtract all that waits from every row."""
     covariance = joint.covariance
     for i in range(3, size, 2):
         pi, pj = point_rows(joint, i + 2, i)
@@ -175,7 +149,7 @@ def flush(joint: Joint, size: Whole) -> None:
 
 @no_alloc
 def defer(joint: Joint, size: Whole, w: Float[np.ndarray, " m"], step: float) -> None:
-    """Add step w to the mean, subtract w w^T from the pose's rows, and let the points' wait."""
+    """Add step w to the mean, subtract w w^T from the pose's rows; the points' rows wait."""
     mean, p0, p1, p2 = joint.mean, joint.covariance[0], joint.covariance[1], joint.covariance[2]
     x, y, h = w[0], w[1], w[2]
     for a in range(size):
@@ -223,7 +197,7 @@ def propagate(
 ) -> None:
     """Advance mean and covariance in place; cross-covariances once, by the product of the F.
 
-    The motion is `MotionNumbers` as a plain tuple.
+    ``motion`` is `MotionNumbers` as a plain tuple.
     """
     pose, P, numbers = mean[:3], covariance[:3, :3].copy(), MotionNumbers(*motion)
     shift_x = shift_y = 0.0  # entries (0, 2) and (1, 2) of the product of the F
@@ -247,7 +221,7 @@ def propagate(
 
 @no_alloc
 def relative_covariance(joint: Joint, size: Whole, i: Whole) -> tuple[float, float, float]:
-    """Entries xx, xy, yy of the covariance of the member at index i less the vehicle's position."""
+    """Covariance xx, xy, yy of the member at index i minus the vehicle's position."""
     p0, p1 = joint.covariance[0], joint.covariance[1]
     pi, pj = point_rows(joint, size, i)
     return (
@@ -259,7 +233,7 @@ def relative_covariance(joint: Joint, size: Whole, i: Whole) -> tuple[float, flo
 
 @no_alloc
 def bearing_variance(joint: Joint, size: Whole, i: Whole, c: float, s: float, k: float) -> float:
-    """Innovation variance H P H^T of the bearing of the member at state index i, without R."""
+    """Innovation variance H P H^T of the bearing of the member at index i, without R."""
     h0, h1, turns = s * k, -c * k, joint.turns  # by pose: (h0, h1, -turns); by member: (-h0, -h1)
     p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
     pi, pj = point_rows(joint, size, i)
@@ -278,15 +252,15 @@ def bearing_variance(joint: Joint, size: Whole, i: Whole, c: float, s: float, k:
 def correct_bearing(
     joint: Joint, size: Whole, i: Whole, bearing: float, variance: float, bound: float
 ) -> float:
-    """Correct the state with the bearing of the member at index i, unless it is beyond the bound.
+    """Correct with the bearing of the member at index i, unless it is beyond the bound.
 
-    Returns the squared innovation in its variance, BEYOND or UNFORESEEN.
+    Returns the squared innovation divided by its variance, BEYOND or UNFORESEEN.
     """
     mean = joint.mean
     distance, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     if distance < NEAREST:
         return UNFORESEEN
-    if joint.taken[WAITING] == MOST_WAITING:
+    if joint.taken[WAITING] == MAX_WAITING:
         flush(joint, size)
     innovation = wrap_angle(bearing - expected)
     h0, h1, turns = s * k, -c * k, joint.turns
@@ -319,12 +293,12 @@ def correct_active(
     bearing_variance: float,
     bound: float,
 ) -> float:
-    """Do the same with range and bearing; returns their squared innovation in its variances."""
+    """Correct the state with range and bearing; return as `correct_bearing` does."""
     mean = joint.mean
     near, expected, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     if near < NEAREST:
         return UNFORESEEN
-    if joint.taken[WAITING] + 2 > MOST_WAITING:
+    if joint.taken[WAITING] + 2 > MAX_WAITING:
         flush(joint, size)
     nu0, nu1 = distance - near, wrap_angle(bearing - expected)
     h0, h1, turns = s * k, -c * k, joint.turns
@@ -365,10 +339,9 @@ def initialise(
     range_variance: float,
     bearing_variance: float,
 ) -> None:
-    """Put a member at state index i, at a range and bearing from the pose (Eq. (16)).
+    """Write a member at state index i, at a range and bearing from the pose (Eq. (16)).
 
-    The first ``size`` rows but the member's own are the rest of the state, with which it is
-    correlated through the pose.
+    The first ``size`` rows, without its own, are the rest of the state.
     """
     mean, covariance = joint.mean, joint.covariance
     direction = mean[2] + bearing
@@ -400,7 +373,7 @@ def drop_members(
     keep: Bool[np.ndarray, " h"],
     source: Int[np.ndarray, " n"],
 ) -> None:
-    """Close the gaps that dropped members of one landmark leave.
+    """Remove the members of one landmark that are not kept, and close the gaps.
 
     ``source`` is room for as many indices as the state has numbers.
     """

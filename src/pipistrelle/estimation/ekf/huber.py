@@ -1,13 +1,13 @@
-r"""Huber's rule: a measurement that surprises counts less, the more it does.
+r"""Huber's rule: the more a measurement surprises, the less it counts.
 
-Echoes that overlap make errors that no Gaussian has. With the innovation :math:`\nu`, of which S is
-the variance that the filter expects, and :math:`e = |\nu| / \sqrt S`,
+Overlapping echoes make errors that no Gaussian describes. With the innovation :math:`\nu`, its
+expected variance S and :math:`e = |\nu| / \sqrt S`,
 
 .. math:: R' = R + S\,(e / k - 1) \quad (e > k = 2)
 
-makes S' = S e / k, so that the correction grows no further with the surprise: it is that of a
-measurement off by k standard deviations in the direction in which it is. Range and bearing are
-asked each for itself, members of a ray by the one that the bearing surprises least.
+makes S' = S e / k: the correction is that of a measurement off by k standard deviations, and grows
+no further. Range and bearing are judged separately; a ray is judged by the member that the bearing
+surprises least.
 
 Source: Huber, Robust Statistics (1981), for the influence of a bounded psi; applied to innovations
 as by Karlgaard & Schaub, Journal of Guidance, Control, and Dynamics 30 (2007).
@@ -15,25 +15,21 @@ as by Karlgaard & Schaub, Journal of Guidance, Control, and Dynamics 30 (2007).
 
 import math
 
-from pipistrelle.estimation.ekf.gaussian import (
-    State,
-    bearing_variance,
-    relative_covariance,
-)
-from pipistrelle.estimation.measurement import BELIEVED, NEAREST, Row, observe
+from pipistrelle.estimation.ekf.gaussian import State, bearing_variance, relative_covariance
+from pipistrelle.estimation.measurement import HUBER_K, NEAREST, Row, observe
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, no_alloc
 
 
 @no_alloc
 def _excess(squared: float, S: float) -> float:
-    """How much larger the variance must be, that a squared innovation surprise no more than k."""
-    return S * max(math.sqrt(squared / S) / BELIEVED - 1.0, 0.0)
+    """Variance to add to S so that a squared innovation is at most `HUBER_K` deviations."""
+    return S * max(math.sqrt(squared / S) / HUBER_K - 1.0, 0.0)
 
 
 @no_alloc
-def tempered(state: State, first: Whole, count: Whole, row: Row) -> Row:
-    """A measurement of the members from ``first`` on, as surely as Huber's rule believes it."""
+def inflated(state: State, first: Whole, count: Whole, row: Row) -> Row:
+    """A measurement of ``count`` members, with its variances raised by Huber's rule."""
     joint, mean, size = state.joint, state.joint.mean, 3 + 2 * state.members[0]
     across, least, along = 0.0, math.inf, 0.0
     for j in range(count):

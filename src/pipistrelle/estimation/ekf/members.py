@@ -1,4 +1,4 @@
-"""The members of a landmark: where they stand in the state, and room to work on them."""
+"""The members of one landmark: their place in the state, and arrays to work on them."""
 
 from typing import NamedTuple
 
@@ -9,21 +9,18 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 
 
 class Scratch(NamedTuple):
-    """Room to work on the members of one landmark, and on the order of the state's numbers.
-
-    ``innovations`` (2) adds up what `beliefs.Innovations` holds.
-    """
+    """Arrays to work on the members of one landmark, and on the order of the state's numbers."""
 
     likelihood: Float[np.ndarray, " m"]
     share: Float[np.ndarray, " m"]
     keep: Bool[np.ndarray, " m"]
     source: Int[np.ndarray, " n"]
-    innovations: Float[np.ndarray, "2"]
+    innovations: Float[np.ndarray, "2"]  # adds up the two numbers of `beliefs.Innovations`
 
 
 @kernel
 def scratch_for(members: Whole) -> Scratch:
-    """Make room for so many members."""
+    """Allocate arrays for so many members."""
     return Scratch(
         np.empty(members),
         np.empty(members),
@@ -37,7 +34,7 @@ def scratch_for(members: Whole) -> Scratch:
 def members_of(
     landmark: Int[np.ndarray, " h"], members: Whole, label: Whole
 ) -> tuple[Whole, Whole]:
-    """Index of a landmark's first member and how many it has (0: not mapped)."""
+    """Index of a landmark's first member, and how many members it has (0: it is not in the map)."""
     for first in range(members):
         if landmark[first] == label:
             last = first + 1

@@ -1,12 +1,12 @@
-r"""Members of a ray that have become one.
+r"""Merging of ray members that agree.
 
-Two members that bearings have drawn to the same place explain all that follows alike: neither is
-ever pruned, and the landmark stays a ray however surely it is known. So neighbours whose distance
-d is within a limit of their mean covariance P,
+Bearings may draw two members of a ray to the same place. They then explain all that follows alike:
+neither is ever pruned, and the landmark stays a ray. So neighbours whose distance d is within a
+limit of their mean covariance P,
 
 .. math:: d^T P^{-1} d \le \text{limit}^2,
 
-become one, with mean and covariance of their mixture, and its covariances with all else:
+become one, with mean and covariance of their mixture and its covariances with all else:
 
 .. math:: m = w_a m_a + w_b m_b, \quad
           P_{mx} = w_a P_{ax} + w_b P_{bx}, \quad
@@ -36,7 +36,7 @@ def merge_members(state: State, first: Whole, count: Whole, limit: float, scratc
 
 @no_alloc
 def _agree(state: State, one: Whole, other: Whole, limit: float) -> Flag:
-    """Whether two members are within the limit of their mean covariance of each other."""
+    """Tell whether the distance of two members is within the limit of their mean covariance."""
     joint, size = state.joint, 3 + 2 * state.members[0]
     i, j = 3 + 2 * one, 3 + 2 * other
     ax, ay = point_rows(joint, size, i)
@@ -48,7 +48,7 @@ def _agree(state: State, one: Whole, other: Whole, limit: float) -> Flag:
 
 @no_alloc
 def _merge(state: State, one: Whole, other: Whole) -> None:
-    """Put the mixture of two members in the place of the first."""
+    """Replace the first of two members by their mixture."""
     joint, weight, size = state.joint, state.weight, 3 + 2 * state.members[0]
     flush(joint, size)
     mean, P, i, j = joint.mean, joint.covariance, 3 + 2 * one, 3 + 2 * other

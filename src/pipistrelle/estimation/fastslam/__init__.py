@@ -2,5 +2,6 @@
 
 `filter` is the method, `resampling` its last step. The kernels: `particles` walks over all of them,
 a `block` of 32 at a time, whose rays `block_rays` weighs and prunes. Where detours are heard,
-`ties` tells which landmarks are tied to whom, and `block_ties` corrects them with their callers.
+landmarks are Gaussians conditional on their caller (`conditional_landmarks`), and
+`block_conditional` corrects both together.
 """

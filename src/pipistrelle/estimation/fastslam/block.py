@@ -22,8 +22,8 @@ from pipistrelle.estimation.measurement import NEAREST
 from pipistrelle.jit import Flag, Whole, inlined, no_alloc
 
 LANES = 32
-"""Particles in a block. With half as many the compiler unrolls the loops instead of widening them;
-with more, a few particles fill no block."""
+"""Particles in a block. With half as many the compiler unrolls the loops instead of vectorising
+them; with more, a few particles fill no block."""
 X, Y, HEADING, PXX, PXY, PYY, PXH, PYH, PHH = range(0, 9 * LANES, LANES)
 XX, XY, YY, LOG_WEIGHT = range(2 * LANES, 6 * LANES, LANES)
 POSE, MEMBER = 9 * LANES, 6 * LANES
@@ -35,14 +35,14 @@ Counts = Int[np.ndarray, " lanes"]
 """Of a block: its poses, one member of each of its particles, a number of each, a count of each."""
 HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
 ROUNDING = 1e-12
-"""A pivot under this share of its variance is rounding: one control step has noise of rank 2."""
+"""A pivot under this share of its variance is rounding: noise of one control step has rank 2."""
 
 
 @inlined
 def _bearing(
     pose: Poses, member: Member, bearing: float, i: Whole
 ) -> tuple[float, float, float, Flag]:
-    """Innovation of a member's bearing; its slopes by x and y of the pose; whether it has any."""
+    """Innovation of a member's bearing; its slopes by x and y of the pose; if it is defined."""
     dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
     squared = dx * dx + dy * dy
     inverse = 1.0 / max(squared, NEAREST * NEAREST)
@@ -62,7 +62,7 @@ def _bearing_gain(pose: Poses, h0: float, h1: float, i: Whole) -> tuple[float, f
 
 @inlined
 def _spread(member: Member, h0: float, h1: float, i: Whole) -> float:
-    """Variance of the bearing that a member's own uncertainty causes."""
+    """Variance of the bearing due to a member's own uncertainty."""
     cross = 2.0 * h0 * h1 * member[XY + i]
     return h0 * h0 * member[XX + i] + cross + h1 * h1 * member[YY + i]
 
@@ -71,7 +71,7 @@ def _spread(member: Member, h0: float, h1: float, i: Whole) -> float:
 def _foreseen(
     pose: Poses, member: Member, bearing: float, variance: float, i: Whole
 ) -> tuple[float, float, Flag]:
-    """Innovation of a member's bearing, its variance, and whether it was foreseen at all."""
+    """Innovation of a member's bearing, its variance, and whether it is defined."""
     innovation, h0, h1, far = _bearing(pose, member, bearing, i)
     a0, a1, a2 = _bearing_gain(pose, h0, h1, i)
     return innovation, (h0 * a0 + h1 * a1 - a2 + _spread(member, h0, h1, i)) + variance, far
@@ -90,8 +90,9 @@ def expect_bearing(
 ) -> None:
     """Log likelihood, without its constant, of the bearing of each lane's member j (Eq. (19)).
 
-    Minus infinity where a lane has no member j. A member too near to foresee its bearing makes it
-    uniform over the circle; alone, it says nothing. ``printed`` is the formula's other reading.
+    It is minus infinity where a lane has no member j. A member too near to predict its bearing
+    makes it uniform over the circle; alone, it says nothing. ``printed`` is the formula's other
+    reading.
     """
     if printed:
         _expect_as_printed(pose, member, bearing, variance, count, j, log_likelihood)
@@ -132,7 +133,7 @@ def bearing_beyond(
     j: Whole,
     bound: float,
 ) -> bool:
-    """Whether the bearing is beyond the bound for member j of every lane that has one."""
+    """Tell whether the bearing is beyond the bound for member j of every lane that has one."""
     beyond = 0
     for i in range(LANES):
         innovation, S, far = _foreseen(pose, member, bearing, variance, i)
@@ -145,7 +146,7 @@ def bearing_beyond(
 def refine_by_bearing(
     pose: Poses, member: Member, bearing: float, variance: float, share: Lanes
 ) -> None:
-    """Correct the poses by the bearing of a member, of whose information each has a share."""
+    """Correct the poses by the bearing of a member, each by its share of the information."""
     for i in range(LANES):
         innovation, h0, h1, far = _bearing(pose, member, bearing, i)
         a0, a1, a2 = _bearing_gain(pose, h0, h1, i)
@@ -168,7 +169,7 @@ def refine_by_bearing(
 def correct_by_bearing(
     pose: Poses, member: Member, bearing: float, variance: float, share: Lanes
 ) -> None:
-    """Correct a member by its bearing from certain poses, of whose information each has a share."""
+    """Correct a member by its bearing from certain poses, each by its share of the information."""
     for i in range(LANES):
         innovation, h0, h1, far = _bearing(pose, member, bearing, i)
         a0 = -h0 * member[XX + i] - h1 * member[XY + i]
@@ -187,7 +188,7 @@ def correct_by_bearing(
 def _active(
     pose: Poses, member: Member, distance: float, bearing: float, i: Whole
 ) -> tuple[float, float, float, float, float, Flag]:
-    """Innovations of range and bearing, direction (c, s), inverse range, whether it is far."""
+    """Innovations of range and bearing, direction (c, s), inverse range, if they are defined."""
     dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
     near = math.sqrt(dx * dx + dy * dy)
     k = 1.0 / max(near, NEAREST)
@@ -199,7 +200,7 @@ def _active(
 def _whitened(
     nu0: float, nu1: float, S00: float, S01: float, S11: float
 ) -> tuple[float, float, float, float, float]:
-    """Innovations made independent and of variance one: they, and what makes them so."""
+    """Innovations made independent with variance one, and the factors that do so."""
     i0 = 1.0 / math.sqrt(S00)
     L10 = S01 * i0
     i1 = 1.0 / math.sqrt(S11 - L10 * L10)
@@ -246,8 +247,7 @@ def expect_active(
 ) -> None:
     """Log likelihood, without its constant, of range and bearing of each lane's member j.
 
-    Minus infinity where a lane has no member j. A member too near to foresee its bearing makes it
-    uniform over the circle; alone, it says nothing.
+    Minus infinity and too near: as `expect_bearing` has them.
     """
     for i in range(LANES):
         nu0, nu1, c, s, k, far = _active(pose, member, distance, bearing, i)
@@ -274,7 +274,7 @@ def active_beyond(
     count: Counts,
     bound: float,
 ) -> bool:
-    """Whether range and bearing are beyond the bound for every lane, each of one member."""
+    """Tell whether range and bearing are beyond the bound for every lane, each of one member."""
     beyond = 0
     for i in range(LANES):
         nu0, nu1, c, s, k, far = _active(pose, member, distance, bearing, i)
@@ -297,7 +297,7 @@ def squared_innovation(
     bearing_variance: float,
     i: Whole,
 ) -> float:
-    """Square of what surprises lane i, in its variance; not a number of what is too near."""
+    """Squared innovation of lane i divided by its variance; NaN for a member too near."""
     nu0, nu1, c, s, k, far = _active(pose, member, distance, bearing, i)
     _, _, _, _, _, _, S00, S01, S11 = _active_spread(
         pose, member, c, s, k, range_variance, bearing_variance, i
@@ -355,7 +355,7 @@ def correct_by_active(
     bearing_variance: float,
     count: Counts,
 ) -> None:
-    """Correct, where it is its landmark's only one, a member by range and bearing."""
+    """Correct a member by range and bearing, in lanes where it is its landmark's only one."""
     for i in range(LANES):
         nu0, nu1, c, s, k, far = _active(pose, member, distance, bearing, i)
         g0, g1 = -s * k, c * k
@@ -388,7 +388,7 @@ def initialise_member(
     log_weight: float,
     count: Counts,
 ) -> None:
-    """Put a member at a range and bearing, where a landmark has not one member (Eq. (16))."""
+    """Place a member at a range and bearing, where its landmark has not one member (Eq. (16))."""
     across = bearing_variance * distance * distance
     for i in range(LANES):
         c, s = cosine_and_sine(pose[HEADING + i] + bearing)
@@ -407,7 +407,7 @@ def initialise_member(
 
 @inlined
 def _lower(pose: Poses, i: Whole) -> tuple[float, float, float, float, float, float]:
-    """Lower factor of a pose's covariance of any rank, row by row: a flat pivot is zero."""
+    """Cholesky factor of a pose's covariance of any rank, row by row: a flat pivot is zero."""
     L00 = math.sqrt(max(pose[PXX + i], 0.0))
     i0 = 1.0 / L00 if L00 > 0.0 else 0.0
     L10, L20 = pose[PXY + i] * i0, pose[PXH + i] * i0
@@ -436,14 +436,14 @@ def _log_density(gaussian: Poses, pose: Poses, i: Whole) -> float:
 
 @no_alloc
 def weigh_sample(prior: Poses, proposal: Poses, pose: Poses, log_weight: Lanes) -> None:
-    """Weigh sampled poses by the density of the prior over that which they were drawn from."""
+    """Weigh sampled poses by the density of the prior divided by that of the proposal."""
     for i in range(LANES):
         log_weight[i] += _log_density(prior, pose, i) - _log_density(proposal, pose, i)
 
 
 @no_alloc
 def sample_pose(pose: Poses, normal: Lanes) -> None:
-    """Draw the poses from their Gaussians with three standard normals each; no spread is left."""
+    """Draw the poses from their Gaussians with three standard normals each; clear their spread."""
     for i in range(LANES):
         L00, L10, L11, L20, L21, L22 = _lower(pose, i)
         n0, n1, n2 = normal[X + i], normal[Y + i], normal[HEADING + i]

@@ -1,8 +1,9 @@
-"""Kernels on a block's rays: weigh, share, refine, correct and prune (`rays` tells the method).
+"""Kernels on a block's rays: weigh, share, refine, correct and prune (the method is in `rays`).
 
-A landmark of one member is a ray of one: its share is all, and it is never pruned. The weights
+A landmark of one member is a ray of one: its share is one, and it is never pruned. The weights
 stay logs, so that no product of likelihoods underflows. ``rows`` (h, 6 `LANES`) are the members of
-one landmark; lane i has the first ``count[i]`` of them.
+one landmark; lane i has the first ``count[i]`` of them. ``turn`` is 1 in the lanes that are
+corrected and 0 elsewhere.
 """
 
 import math
@@ -45,7 +46,7 @@ from pipistrelle.estimation.rays import (
     EXACT,
     SMALLEST_AGGREGATED_SHARE,
     SMALLEST_SHARE,
-    Sensing,
+    UpdateParams,
 )
 from pipistrelle.jit import Flag, Whole, inlined, kernel, no_alloc
 
@@ -54,34 +55,22 @@ Rows = Float[np.ndarray, "h numbers"]
 
 
 class Scratch(NamedTuple):
-    """Room to work.
+    """Arrays to work with; L is `LANES`."""
 
-    Attributes
-    ----------
-    likelihood, posterior, share : (h, `LANES`)
-        Of each member; the first two are logs.
-    largest, total : (`LANES`)
-    whole, alone, ray : (`LANES`)
-        One in all lanes, in those where a landmark has one member, in those where it has several
-        (`part_lanes`); else zero.
-    refined : (h, `POSE`)
-        Poses as each member alone would have them.
-    """
-
-    likelihood: Float[np.ndarray, "h lanes"]
-    posterior: Float[np.ndarray, "h lanes"]
+    likelihood: Float[np.ndarray, "h lanes"]  # log, of each member
+    posterior: Float[np.ndarray, "h lanes"]  # log, of each member
     share: Float[np.ndarray, "h lanes"]
     largest: Lanes
     total: Lanes
-    whole: Lanes
-    alone: Lanes
-    ray: Lanes
-    refined: Float[np.ndarray, "h rows"]
+    whole: Lanes  # 1 in all lanes
+    alone: Lanes  # 1 where a landmark has one member, else 0 (`part_lanes`)
+    ray: Lanes  # 1 where it has several
+    refined: Float[np.ndarray, "h rows"]  # poses as each member alone would correct them
 
 
 @kernel
 def scratch_for(members: Whole) -> Scratch:
-    """Return room to work with rays of so many members."""
+    """Allocate arrays for rays of so many members."""
     return Scratch(
         np.empty((members, LANES)),
         np.empty((members, LANES)),
@@ -97,7 +86,7 @@ def scratch_for(members: Whole) -> Scratch:
 
 @no_alloc
 def part_lanes(count: Counts, scratch: Scratch) -> None:
-    """Tell the lanes in which a landmark has one member from those in which it is a ray."""
+    """Separate the lanes in which a landmark has one member from those in which it is a ray."""
     for i in range(LANES):
         scratch.alone[i] = 1.0 if count[i] == 1 else 0.0
         scratch.ray[i] = 1.0 - scratch.alone[i]
@@ -116,10 +105,7 @@ def _largest(logs: Float[np.ndarray, "h lanes"], members: Whole, largest: Lanes)
 
 @no_alloc
 def _weigh(rows: Rows, members: Whole, scratch: Scratch) -> None:
-    """Aggregated likelihoods, in logs and normalised, into ``posterior`` (Eq. (18)).
-
-    Their sum before, in logs, goes to ``total``.
-    """
+    """Write normalised log weights (Eq. (18)) into ``posterior``, log sums into ``total``."""
     largest, total = scratch.largest, scratch.total
     for j in range(members):
         row, likelihood, posterior = rows[j], scratch.likelihood[j], scratch.posterior[j]
@@ -140,20 +126,17 @@ def _weigh(rows: Rows, members: Whole, scratch: Scratch) -> None:
 
 
 @no_alloc
-def _share(members: Whole, sensing: Sensing, turn: Lanes, scratch: Scratch) -> None:
-    """Divide the measurement: shares go with a power of the likelihoods, now or aggregated.
-
-    Lanes without a turn have no share.
-    """
-    logs = scratch.posterior if sensing.aggregated else scratch.likelihood
-    smallest = SMALLEST_AGGREGATED_SHARE if sensing.aggregated else SMALLEST_SHARE
+def _share(members: Whole, params: UpdateParams, turn: Lanes, scratch: Scratch) -> None:
+    """Divide the measurement by a power of the likelihoods, aggregated or not (Eq. (19))."""
+    logs = scratch.posterior if params.aggregated else scratch.likelihood
+    smallest = SMALLEST_AGGREGATED_SHARE if params.aggregated else SMALLEST_SHARE
     largest, total = scratch.largest, scratch.total
     _largest(logs, members, largest)
     total[:] = 0.0
     for j in range(members):
         row, share = logs[j], scratch.share[j]
         for i in range(LANES):
-            share[i] = exponential(sensing.power * (row[i] - largest[i]))
+            share[i] = exponential(params.power * (row[i] - largest[i]))
             total[i] += share[i]
     for j in range(members):
         share = scratch.share[j]
@@ -164,14 +147,14 @@ def _share(members: Whole, sensing: Sensing, turn: Lanes, scratch: Scratch) -> N
 
 @no_alloc
 def _add(log_likelihood: Lanes, numbers: Whole, turn: Lanes, log_weight: Lanes) -> None:
-    """Add log likelihoods of so many numbers, and their constants, to log weights."""
+    """Add log likelihoods of ``numbers`` measured numbers, with constants, to log weights."""
     for i in range(LANES):
         log_weight[i] += log_likelihood[i] - numbers * HALF_LOG_TAU if turn[i] > 0.0 else 0.0
 
 
 @no_alloc
-def most(count: Counts) -> Whole:
-    """Members of the lane that has most."""
+def most_members(count: Counts) -> Whole:
+    """Number of members of the lane that has most."""
     largest = 1
     for i in range(LANES):
         largest = max(largest, count[i])
@@ -188,8 +171,8 @@ def _expect_ray(
     printed: bool,
     scratch: Scratch,
 ) -> None:
-    """Log likelihoods of a bearing of all members, into ``likelihood``."""
-    for j in range(most(count)):
+    """Write log likelihoods of a bearing for all members into ``likelihood``."""
+    for j in range(most_members(count)):
         likelihood = scratch.likelihood[j]
         expect_bearing(pose, rows[j], bearing, variance, count, j, printed, likelihood)
 
@@ -205,15 +188,12 @@ def weigh_by_bearing(
     scratch: Scratch,
     log_weight: Lanes,
 ) -> None:
-    """Weigh the poses by the bearing of a landmark: the density of its members' mixture.
-
-    ``turn`` says whose turn it is (1 or 0), here and below.
-    """
+    """Weigh the poses by the bearing of a landmark: the density of its members' mixture."""
     _expect_ray(pose, rows, count, bearing, variance, False, scratch)
-    if most(count) == 1:
+    if most_members(count) == 1:
         _add(scratch.likelihood[0], 1, turn, log_weight)
         return
-    _weigh(rows, most(count), scratch)
+    _weigh(rows, most_members(count), scratch)
     _add(scratch.total, 1, turn, log_weight)
 
 
@@ -224,24 +204,24 @@ def refine_by_ray(
     count: Counts,
     bearing: float,
     variance: float,
-    sensing: Sensing,
+    params: UpdateParams,
     turn: Lanes,
     scratch: Scratch,
     log_weight: Lanes,
 ) -> None:
     """Correct the poses by the bearing of a landmark, and weigh them by its likelihood."""
-    members = most(count)
+    members = most_members(count)
     weigh_by_bearing(pose, rows, count, bearing, variance, turn, scratch, log_weight)
     if members == 1:
         refine_by_bearing(pose, rows[0], bearing, variance, turn)
         return
-    if sensing.sharing == EXACT:
+    if params.sharing == EXACT:
         _refine_to_mixture(pose, rows, members, bearing, variance, turn, scratch)
         return
-    if sensing.sharing == AS_PRINTED:
+    if params.sharing == AS_PRINTED:
         _expect_ray(pose, rows, count, bearing, variance, True, scratch)
         _weigh(rows, members, scratch)
-    _share(members, sensing, turn, scratch)
+    _share(members, params, turn, scratch)
     for j in range(members):
         refine_by_bearing(pose, rows[j], bearing, variance, scratch.share[j])
 
@@ -256,13 +236,12 @@ def weigh_by_active(
     scratch: Scratch,
     log_weight: Lanes,
 ) -> None:
-    """Weigh the poses by range and bearing of a landmark.
+    """Weigh the poses by range and bearing of a landmark: the density of its members' mixture.
 
-    By the members' mixture, of which one member is a case: a density over range and bearing for
-    all, so that weights do not hang on the units of either. ``heard`` are the two and their
-    variances.
+    One member is a mixture, too: all weights are densities over range and bearing, so that the
+    units do not matter. ``heard`` is range, bearing and their variances.
     """
-    members = most(count)
+    members = most_members(count)
     distance, bearing, range_variance, bearing_variance = heard
     for j in range(members):
         expect_active(
@@ -317,25 +296,25 @@ def correct_ray(
     count: Counts,
     bearing: float,
     variance: float,
-    sensing: Sensing,
+    params: UpdateParams,
     turn: Lanes,
     scratch: Scratch,
 ) -> None:
     """Weigh, correct and prune a landmark's members from certain poses, in place."""
-    members = most(count)
+    members = most_members(count)
     if members == 1:
         correct_by_bearing(pose, rows[0], bearing, variance, turn)
         return
-    _expect_ray(pose, rows, count, bearing, variance, sensing.sharing == AS_PRINTED, scratch)
+    _expect_ray(pose, rows, count, bearing, variance, params.sharing == AS_PRINTED, scratch)
     _weigh(rows, members, scratch)
-    if sensing.sharing != EXACT:
-        _share(members, sensing, turn, scratch)
+    if params.sharing != EXACT:
+        _share(members, params, turn, scratch)
     for j in range(members):
-        share = turn if sensing.sharing == EXACT else scratch.share[j]
+        share = turn if params.sharing == EXACT else scratch.share[j]
         correct_by_bearing(pose, rows[j], bearing, variance, share)
-    _prune(rows, count, members, sensing.prune, scratch)
-    if sensing.merge > 0.0:
-        _merge_members(rows, count, sensing.merge)
+    _prune(rows, count, members, params.prune, scratch)
+    if params.merge > 0.0:
+        _merge_members(rows, count, params.merge)
 
 
 @inlined
@@ -349,7 +328,7 @@ def _heaviest(rows: Rows, count: Counts, i: Whole) -> Whole:
 
 @no_alloc
 def keep_heaviest(rows: Rows, count: Counts) -> None:
-    """Leave each lane the heaviest of its members."""
+    """Keep the heaviest member of each lane."""
     for i in range(LANES):
         best = _heaviest(rows, count, i)
         for k in range(i, MEMBER, LANES):
@@ -359,7 +338,7 @@ def keep_heaviest(rows: Rows, count: Counts) -> None:
 
 @no_alloc
 def drop_heaviest(rows: Rows, count: Counts) -> None:
-    """Leave each lane that has several members all but the heaviest."""
+    """Drop the heaviest member of each lane that has several."""
     for i in range(LANES):
         if count[i] == 1:
             continue
@@ -377,7 +356,7 @@ def drop_heaviest(rows: Rows, count: Counts) -> None:
 
 @no_alloc
 def heaviest_to_range(pose: Poses, rows: Rows, count: Counts, distance: float, turn: Lanes) -> None:
-    """Move the heaviest member to a range, in the direction in which it is; its spread stays."""
+    """Move the heaviest member to a range, in its present direction; its covariance stays."""
     for i in range(LANES):
         if turn[i] > 0.0:
             member = rows[_heaviest(rows, count, i)]
@@ -445,7 +424,7 @@ def _merge_members(rows: Rows, count: Counts, limit: float) -> None:
 
 @no_alloc
 def _merged(one: Member, other: Member, limit: float, i: Whole) -> Flag:
-    """Put the mixture of a lane's two members in the place of the first, if they agree."""
+    """Replace the first of a lane's two members by their mixture, if they agree; tell if so."""
     x, y = other[X + i] - one[X + i], other[Y + i] - one[Y + i]
     xx, xy = 0.5 * (one[XX + i] + other[XX + i]), 0.5 * (one[XY + i] + other[XY + i])
     yy = 0.5 * (one[YY + i] + other[YY + i])
@@ -464,7 +443,7 @@ def _merged(one: Member, other: Member, limit: float, i: Whole) -> Flag:
 
 @no_alloc
 def _close_up(rows: Rows, count: Counts, keep: Float[np.ndarray, "_ lanes"]) -> None:
-    """Move the members that are kept to the front, lane by lane."""
+    """Move the kept members to the front, lane by lane."""
     for i in range(LANES):
         left = 0
         for j in range(count[i]):

@@ -27,11 +27,10 @@ A frame goes through five steps.
       :label: eq-14
 
    A particle's weight grows by each measurement's marginal likelihood
-   :math:`N(\nu_i; 0, S_i)`, the product of which is the likelihood of the frame given the
-   particle's past. Of a partial landmark it is the members' mixture,
-   :math:`\sum_j \Lambda_j N(\nu_j; 0, S_j)`, for a bearing and for a range with its bearing alike;
-   a new landmark adds no weight.
-2. **Sample** the pose, once, of what it was refined to:
+   :math:`N(\nu_i; 0, S_i)`. Their product is the likelihood of the frame given the particle's past.
+   Of a partial landmark it is the members' mixture, :math:`\sum_j \Lambda_j N(\nu_j; 0, S_j)`, with
+   or without a range; a new landmark adds no weight.
+2. **Sample** the pose, once, from this refined Gaussian:
 
    .. math:: \hat x_k^{[j]} \sim p(x_k \mid \hat x_{k-1}^{[j]}, u_k, z_k)
       :label: eq-13
@@ -49,27 +48,27 @@ proposal is refined to the mean and covariance of the mixture of its members' re
 A frame without measurements is not sampled: its motion goes on accumulating, which loses nothing.
 The start is not sampled either: its covariance P0 is the first that accumulates.
 
-**Detours** (`measurement.detour_of`) are of two landmarks, and given the path these are no longer
-independent, but they are given the caller's place, too: each landmark says how it moves with its
-caller's (`block_ties`), and that is the joint Gaussian of them all. Were the caller's error drawn
-anew for each detour, a map would grow sure of what nobody told it. With detours the steps change:
+**Detours** (`measurement.detour_of`) depend on two landmarks, which are then no longer independent
+given the path. They are independent given the path and the caller's place: each landmark is a
+Gaussian conditional on its caller (`block_conditional`), which is the joint Gaussian of them all.
+Were the caller's error drawn anew for each detour, the map would grow surer than it is. With
+detours the steps change:
 
-- *Propose*: detours neither refine nor weigh a pose, though they would be right to: in twelve
-  worlds a thousand particles then had a median NEES of 19 to 50 instead of 2, and positions off by
-  0.6 to 0.7 m instead of 0.4 to 0.5 m, for the swarm was rid within a few frames of all paths but
-  those that turned at the start as one of them happened to. What they tell reaches the weights by
-  the map that they make, and even that asks for more particles: over 115 worlds the mean NEES is 3
-  to 5 instead of 2 to 3. Bearings and ranges weigh with what each landmark is for itself; that
-  those of one caller share its error made no difference there.
+- *Propose*: detours neither refine nor weigh a pose, though theory allows it: in twelve worlds a
+  thousand particles then had a median NEES of 19 to 50 instead of 2, and positions off by 0.6 to
+  0.7 m instead of 0.4 to 0.5 m, because within a few frames only the paths survived whose first
+  turn was the same. Detours reach the weights through the map, and even that needs more particles:
+  over 115 worlds the mean NEES is 3 to 5 instead of 2 to 3. Bearings and ranges weigh with each
+  landmark's marginal; the error that landmarks of one caller share made no difference there.
 - *Correct*: range, bearing and detour of a landmark correct it and its caller.
-- *Place*: where bearing and detour tell the range to a fifth of itself, a landmark is placed at
-  once, or in place of its ray. Elsewhere (it stands between caller and vehicle, the angle at it is
+- *Place*: where bearing and detour give the range to a fifth of itself, a landmark is placed at
+  once, or replaces its ray. Elsewhere (it stands between caller and vehicle, or the angle at it is
   wide) it is, or stays, a ray.
 
-A caller that is a ray itself, or known less surely than a fifth of how far away it is, lights
-nothing up: its detours are let go until then, some 15 to 55 frames in the paper's worlds. So are
-those of a second caller, for a landmark is tied to one; to be tied to both were to tie everything
-to everything. And so is a detour of a landmark of which the frame has no bearing.
+Detours of a caller are ignored until it has one hypothesis with a standard deviation of at most a
+fifth of its distance: some 15 to 55 frames in the paper's worlds. So are those of a second caller
+of a landmark, as each landmark has one parent, and those of a landmark without a bearing in the
+frame.
 """
 
 import math
@@ -90,7 +89,8 @@ from pipistrelle.estimation.checking import (
     usable_scan,
 )
 from pipistrelle.estimation.fastslam.block import LANES, MEMBER
-from pipistrelle.estimation.fastslam.block_ties import TIE
+from pipistrelle.estimation.fastslam.block_conditional import SLOPES
+from pipistrelle.estimation.fastslam.conditional_landmarks import Parents, resample_slopes
 from pipistrelle.estimation.fastslam.particles import (
     Arrays,
     correct_particles,
@@ -103,10 +103,9 @@ from pipistrelle.estimation.fastslam.particles import (
 )
 from pipistrelle.estimation.fastslam.poses import SMALLEST_STD, propagate, summarise
 from pipistrelle.estimation.fastslam.resampling import effective_particles, normalised, stratified
-from pipistrelle.estimation.fastslam.ties import Tied, resample_ties
 from pipistrelle.estimation.measurement import Timings, columns_of, timings_of
 from pipistrelle.estimation.motion import Motion, motion_numbers
-from pipistrelle.estimation.rays import Sensing, sensing_of
+from pipistrelle.estimation.rays import UpdateParams, update_params
 
 _PAPER = FastSlamConfig()
 _PACKED = ([0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2])
@@ -115,57 +114,32 @@ _PACKED = ([0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2])
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FastSlamBelief:
-    """Particles, and what they amount to.
+    """Particles, and their summary.
 
-    Particles are kept in b blocks of L = `block.LANES`, number by number: a row of L numbers is
-    one number of each of a block's particles. Spare lanes of the last block repeat the last
-    particle.
-
-    Attributes
-    ----------
-    poses : (b, 9 L)
-        Rows x, y [m], heading [rad], and xx, xy, yy, xh, yh, hh of the covariance since the last
-        sample.
-    log_weight : (p)
-    landmark : (n)
-        Labels, in order of entry.
-    first : (n + 1)
-        First row of each landmark in ``member``, then their number.
-    count : (b, n, L)
-        Members of each particle's landmark.
-    member : (b, c, 6 L)
-        Rows x, y [m], xx, xy, yy [m^2] and log weight of each hypothesis.
-    estimate : Gaussian of (3) and (3, 3)
-        The mean of the poses and their covariance, before any resampling.
-    best_count, best_member : (n), (c, 6)
-        The map of the heaviest particle, before any resampling; the first of equals.
-    full : float
-        Weighted mean number of fully initialised landmarks.
-    gated : int
-        Measurements rejected so far.
-    innovations : Innovations
-        Of the heaviest particle of each time, before the scan.
-    hub : (k)
-        Number of the caller that each landmark is tied to, or -1 (`ties`): of those that were there
-        when detours came last.
-    tie : (b, n, 4 L)
-        How its place moves with that one's; no rows while nobody is tied.
+    Particles are kept in b blocks of L = `block.LANES`, number by number: a row of L numbers is one
+    number of each of a block's particles. Spare lanes of the last block repeat the last particle.
     """
 
     poses: Float[np.ndarray, "b rows"]
+    """(b, 9 L): x, y [m], heading [rad], and xx, xy, yy, xh, yh, hh of the covariance since the
+    last sample."""
     log_weight: Float[np.ndarray, " p"]
-    landmark: Int[np.ndarray, " n"]
-    first: Int[np.ndarray, " n+1"]
-    count: Int[np.ndarray, "b n lanes"]
+    landmark: Int[np.ndarray, " n"]  # label, in order of entry
+    first: Int[np.ndarray, " n+1"]  # first row of each landmark in ``member``, then their number
+    count: Int[np.ndarray, "b n lanes"]  # members of each particle's landmark
     member: Float[np.ndarray, "b c numbers"]
+    """(b, c, 6 L): x, y [m], xx, xy, yy [m^2] and log weight of each hypothesis."""
     estimate: Gaussian
-    best_count: Int[np.ndarray, " n"]
+    """Mean of the poses and their covariance, before any resampling."""
+    best_count: Int[np.ndarray, " n"]  # the map of the heaviest particle, before any resampling
     best_member: Float[np.ndarray, "c 6"]
-    full: float
+    full: float  # weighted mean number of fully initialised landmarks
     gated: int
-    innovations: Innovations = NO_INNOVATIONS
-    hub: Int[np.ndarray, " hubs"]
-    tie: Float[np.ndarray, "b tied slopes"]
+    innovations: Innovations = NO_INNOVATIONS  # of the heaviest particle before each scan
+    parent: Int[np.ndarray, " parents"]
+    """Number of each landmark's parent, or -1 (`conditional_landmarks`), when detours came last."""
+    slope: Float[np.ndarray, "b n slopes"]
+    """(b, n, 4 L), the slopes by the parent; no rows while no landmark has one."""
 
     def pose(self) -> Gaussian:
         """Return the vehicle's pose, (3) and (3, 3): of all particles."""
@@ -176,7 +150,7 @@ class FastSlamBelief:
         return _rows(self.landmark, self.first, self.best_count, self.best_member)
 
     def cloud(self) -> Float[np.ndarray, "p 3"]:
-        """Return the particles' poses, (p, 3)."""
+        """Return the particles' poses, (p, 3) [m, m, rad]."""
         rows = self.poses.reshape(len(self.poses), -1, LANES).swapaxes(1, 2)
         return rows[:, :, :3].reshape(-1, 3)[: self.log_weight.size]
 
@@ -231,31 +205,18 @@ class FastSlam:
             count=np.empty((blocks, 0, LANES), dtype=np.int64),
             member=np.empty((blocks, 0, MEMBER)),
             estimate=Gaussian(
-                mean=pose.mean,
-                covariance=pose.covariance + SMALLEST_STD**2 * np.eye(3),
+                mean=pose.mean, covariance=pose.covariance + SMALLEST_STD**2 * np.eye(3)
             ),
             best_count=np.empty(0, dtype=np.int64),
             best_member=np.empty((0, 6)),
             full=0.0,
             gated=0,
-            hub=np.empty(0, dtype=np.int64),
-            tie=np.empty((blocks, 0, TIE)),
+            parent=np.empty(0, dtype=np.int64),
+            slope=np.empty((blocks, 0, SLOPES)),
         )
 
     def knowing(self, belief: FastSlamBelief, known: Landmarks) -> FastSlamBelief:
-        """Return a first belief that has landmarks in its map, the same in every particle.
-
-        Parameters
-        ----------
-        belief : FastSlamBelief
-            As `init` gives it.
-        known : Landmarks
-            One row each.
-
-        Returns
-        -------
-        FastSlamBelief
-        """
+        """Return a first belief with landmarks in its map, the same in every particle."""
         check_belief(belief, FastSlamBelief)
         known = usable_known(known)
         blocks, n = len(belief.poses), known.landmark.size
@@ -279,26 +240,9 @@ class FastSlam:
         dt: Float[np.ndarray, " k"],
         rng: np.random.Generator | None = None,
     ) -> tuple[FastSlamBelief, Gaussian]:
-        """Carry every particle's pose and its covariance through the control steps of a frame.
+        """Carry every particle's pose and covariance through a frame's control steps (Eq. (10)).
 
-        Parameters
-        ----------
-        belief : FastSlamBelief
-        controls : (k, c)
-            As the motion model has them.
-        dt : (k) [s]
-        rng : Generator, optional
-            Not used: poses are drawn once a frame, by `update`.
-
-        Returns
-        -------
-        belief : FastSlamBelief
-        poses : Gaussian of (k, 3) and (k, 3, 3)
-            After each step.
-
-        Notes
-        -----
-        Bradley & Abaid, Eq. (10), per particle.
+        Returns the belief and the mean pose after each step, (k, 3) and (k, 3, 3); draws nothing.
         """
         check_belief(belief, FastSlamBelief)
         controls, dt = usable_controls(self.motion, controls, dt)
@@ -315,23 +259,10 @@ class FastSlam:
     def update(
         self, belief: FastSlamBelief, scan: Scan, rng: np.random.Generator
     ) -> FastSlamBelief:
-        """Refine, sample, correct, place and resample with a frame's measurements.
+        """Refine, sample, correct, place and resample with a scan (Eqs. (12) to (22)).
 
-        Parameters
-        ----------
-        belief : FastSlamBelief
-        scan : Scan
-        rng : Generator
-            Draws three normals per particle, then one uniform number per particle; nothing for a
-            scan without measurements, which a recorded log cannot hold.
-
-        Returns
-        -------
-        FastSlamBelief
-
-        Notes
-        -----
-        Bradley & Abaid, Eqs. (12) to (22).
+        It draws three normals per particle, then one uniform number per particle; nothing for an
+        empty scan, which a recorded log cannot hold.
         """
         check_belief(belief, FastSlamBelief)
         scan = usable_scan(scan)
@@ -341,13 +272,13 @@ class FastSlam:
             raise InputError("update: found no generator, expected one: FastSLAM draws poses by it")
         particles = self.settings.particles
         normal, uniform = rng.standard_normal((particles, 3)), rng.random(particles)
-        sensing = sensing_of(self.rays, self.gate, exact=self.settings.mixture == "exact")
+        params = update_params(self.rays, self.gate, exact=self.settings.mixture == "exact")
         sampled = self.settings.weights == "sampled"
-        inside, gated = self._inside(belief, scan, sensing)
+        inside, gated = self._inside(belief, scan, params)
         heaviest = int(np.argmax(belief.log_weight))
-        off = innovations_of(_held(belief)[0], columns_of(inside), heaviest)
-        corrected, (hub, tie), gained = correct_particles(
-            *_held(belief), columns_of(inside), _timings(belief, inside), normal, sensing, sampled
+        off = innovations_of(_arrays(belief)[0], columns_of(inside), heaviest)
+        corrected, (parent, slope), gained = correct_particles(
+            *_arrays(belief), columns_of(inside), _timings(belief, inside), normal, params, sampled
         )
         poses, landmark, first, count, member = corrected
         weight = normalised(belief.log_weight + gained)
@@ -366,47 +297,50 @@ class FastSlam:
             full=mean_full(count, weight),
             gated=belief.gated + gated,
             innovations=belief.innovations.plus(*off),
-            hub=hub,
-            tie=tie,
+            parent=parent,
+            slope=slope,
         )
         if effective_particles(weight) >= self.settings.resample_below * particles:
             return after
         restart = self.settings.resampled_rays == "restart"
         return _resampled(after, stratified(weight, uniform), restart)
 
-    def _inside(self, belief: FastSlamBelief, scan: Scan, sensing: Sensing) -> tuple[Scan, int]:
-        """Drop the measurements and detours that no particle expected; tell how many."""
+    def _inside(self, belief: FastSlamBelief, scan: Scan, params: UpdateParams) -> tuple[Scan, int]:
+        """Drop the measurements and detours that no particle expected; return how many."""
         if self.gate >= 1.0:
             return scan, 0
-        told = columns_of(scan), _timings(belief, scan)
-        dropped, deaf, gated = gated_by_all(*_held(belief), *told, sensing)
-        if deaf.any():
-            scan = with_columns(scan, detour=np.where(deaf, np.nan, scan.detour))
+        dropped, late, gated = gated_by_all(
+            *_arrays(belief), columns_of(scan), _timings(belief, scan), params
+        )
+        if late.any():
+            scan = with_columns(scan, detour=np.where(late, np.nan, scan.detour))
         return rows_of(scan, ~dropped), gated
 
 
-def _held(belief: FastSlamBelief) -> tuple[Arrays, Tied]:
-    """Return a belief's particles as the kernels take them, and their ties."""
+def _arrays(belief: FastSlamBelief) -> tuple[Arrays, Parents]:
+    """Return a belief's particles and parents as kernels take them."""
     arrays = belief.poses, belief.landmark, belief.first, belief.count, belief.member
-    return arrays, (belief.hub, belief.tie)
+    return arrays, (belief.parent, belief.slope)
 
 
 def _timings(belief: FastSlamBelief, scan: Scan) -> Timings | None:
-    """Return what says whose detours a scan holds; None where nobody's, and nothing is tied."""
-    return timings_of(scan) if belief.tie.size == 0 else (scan.caller, scan.callers, scan.moving)
+    """Caller columns of a scan; None if it has no detours and no landmark has a parent."""
+    return timings_of(scan) if belief.slope.size == 0 else (scan.caller, scan.callers, scan.moving)
 
 
 def _resampled(
     belief: FastSlamBelief, ancestor: Int[np.ndarray, " p"], restart: bool
 ) -> FastSlamBelief:
-    """Put copies of the ancestors in the particles' places, all of one weight."""
-    arrays, (_, tie) = _held(belief)
+    """Replace the particles by copies of the ancestors, with equal weights."""
+    arrays, (_, slope) = _arrays(belief)
     poses, count, member = resample_into(arrays, ancestor)
     if restart:
         restart_rays(belief.first, count, member)
     log_weight = np.full(ancestor.size, -math.log(ancestor.size))
-    tie = resample_ties(tie, ancestor) if tie.size else tie
-    return replace(belief, poses=poses, log_weight=log_weight, count=count, member=member, tie=tie)
+    slope = resample_slopes(slope, ancestor) if slope.size else slope
+    return replace(
+        belief, poses=poses, log_weight=log_weight, count=count, member=member, slope=slope
+    )
 
 
 def _rows(
@@ -415,7 +349,7 @@ def _rows(
     count: Int[np.ndarray, " n"],
     member: Float[np.ndarray, "c 6"],
 ) -> Landmarks:
-    """Lay out one particle's map, one row per member."""
+    """Return one particle's map, one row per member."""
     label = np.repeat(landmark, count)
     offset = np.arange(label.size) - np.repeat(np.cumsum(count) - count, count)
     rows = member[np.repeat(first[:-1], count) + offset]

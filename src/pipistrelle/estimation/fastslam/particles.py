@@ -1,6 +1,6 @@
 """Kernels on all particles: gate, correct, resample.
 
-A block's steps are in `block`, `block_rays` and, of what is tied to a caller, `ties`.
+The steps of a block are in `block`, `block_rays` and `conditional_landmarks`.
 
 Landmark n of a block has its members in the rows ``member[b, first[n] : first[n + 1]]``, of which
 lane i has the first ``count[b, n, i]``: the particles share the rows, not the members.
@@ -31,6 +31,11 @@ from pipistrelle.estimation.fastslam.block import (
     squared_innovation,
     weigh_sample,
 )
+from pipistrelle.estimation.fastslam.block_conditional import (
+    lanes_with_parent,
+    lanes_with_sure_parent,
+    place_by_detour,
+)
 from pipistrelle.estimation.fastslam.block_rays import (
     Rows,
     Scratch,
@@ -38,7 +43,7 @@ from pipistrelle.estimation.fastslam.block_rays import (
     drop_heaviest,
     heaviest_to_range,
     keep_heaviest,
-    most,
+    most_members,
     part_lanes,
     refine_by_ray,
     reset_member,
@@ -46,49 +51,25 @@ from pipistrelle.estimation.fastslam.block_rays import (
     weigh_by_active,
     weigh_by_bearing,
 )
-from pipistrelle.estimation.fastslam.block_ties import joined, known_surely, place_by_detour
-from pipistrelle.estimation.fastslam.ties import (
-    Tied,
-    TiedAfter,
-    Ties,
+from pipistrelle.estimation.fastslam.conditional_landmarks import (
+    Pairs,
+    Parents,
+    ParentsAfter,
+    assign_parents,
+    copy_lanes,
     copy_row,
+    correct_pair,
+    detours_of_parents,
     gated_detours,
-    heard_of,
-    put_row,
     shift_all,
-    take_tied,
-    tie_landmarks,
 )
-from pipistrelle.estimation.measurement import (
-    Columns,
-    Measurements,
-    Timings,
-    detours,
-    measurements,
-)
-from pipistrelle.estimation.rays import (
-    ANEW,
-    BEARING,
-    CORRECTED,
-    MOVED,
-    OTHERS,
-    RESET,
-    Sensing,
-)
+from pipistrelle.estimation.measurement import Columns, Measurements, Timings, detours, measurements
+from pipistrelle.estimation.rays import ANEW, BEARING, CORRECTED, MOVED, OTHERS, RESET, UpdateParams
 from pipistrelle.jit import Whole, kernel, no_alloc, no_alloc_inlined
 
 
 class Particles(NamedTuple):
-    """All particles, as the kernels take them; the arrays of a `FastSlamBelief`.
-
-    Attributes
-    ----------
-    pose : (b, 9 L)
-    landmark : (n)
-    first : (n + 1)
-    count : (b, n, L)
-    member : (b, c, 6 L)
-    """
+    """All particles: arrays of a `FastSlamBelief`."""
 
     pose: Float[np.ndarray, "b rows"]
     landmark: Int[np.ndarray, " n"]
@@ -104,7 +85,7 @@ Arrays = tuple[
     Int[np.ndarray, "b n lanes"],
     Float[np.ndarray, "b c numbers"],
 ]
-"""The same as a plain tuple, which a kernel takes in no time."""
+"""The same as a plain tuple, which is passed to a kernel faster."""
 Extended = tuple[
     Float[np.ndarray, "b rows"],
     Int[np.ndarray, " more"],
@@ -112,11 +93,11 @@ Extended = tuple[
     Int[np.ndarray, "b more lanes"],
     Float[np.ndarray, "b members numbers"],
 ]
-"""The same with the landmarks of a scan that were not there."""
+"""The same with the new landmarks of a scan."""
 
 
 class Block(NamedTuple):
-    """One block: poses, what their weights gain, the maps."""
+    """One block: poses, what their log weights gain, the maps."""
 
     pose: Poses
     gained: Lanes
@@ -141,7 +122,7 @@ def _slots(landmark: Int[np.ndarray, " n"], labels: Int[np.ndarray, " m"]) -> In
 def _active_gated(
     pose: Poses, member: Member, heard: Measurements, m: Whole, count: Counts, bound: float
 ) -> bool:
-    """Whether range and bearing of measurement m are beyond the bound for every lane."""
+    """Tell whether range and bearing of measurement m are beyond the bound for every lane."""
     return active_beyond(
         pose, member, heard.range[m], heard.bearing[m], heard.range_variance[m],
         heard.bearing_variance[m], count, bound,
@@ -150,16 +131,20 @@ def _active_gated(
 
 @kernel
 def gated_by_all(
-    arrays: Arrays, tied: Tied, columns: Columns, timings: Timings | None, sensing: Sensing
+    arrays: Arrays,
+    parents: Parents,
+    columns: Columns,
+    timings: Timings | None,
+    params: UpdateParams,
 ) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " m"], int]:
-    """Whether each row of a scan is beyond the gate of every particle that could use it.
+    """Tell of each row whether it, and whether its detour, is beyond the gate of every particle.
 
-    Then whether its detour is, and how many are.
+    Returns both masks, over the particles that could use it, and how many rows have either.
     """
     particles, heard = Particles(*arrays), measurements(columns)
     slot = _slots(particles.landmark, heard.landmark)
     gated, blocks = np.zeros(columns[0].size, dtype=np.bool_), particles.pose.shape[0]
-    deaf = np.zeros_like(gated)
+    late = np.zeros_like(gated)
     for m in range(slot.size):
         n = slot[m]
         gated[m] = n >= 0
@@ -168,29 +153,26 @@ def gated_by_all(
             rows = particles.member[b, particles.first[n] : particles.first[n + 1]]
             if not math.isnan(heard.range[m]):
                 gated[m] = gated[m] and _active_gated(
-                    pose, rows[0], heard, m, count, sensing.active_bound
+                    pose, rows[0], heard, m, count, params.active_bound
                 )
                 continue
             bearing, variance = heard.bearing[m], heard.bearing_variance[m]
-            for j in range(most(count)):
+            for j in range(most_members(count)):
                 gated[m] = gated[m] and bearing_beyond(
-                    pose, rows[j], bearing, variance, count, j, sensing.passive_bound
+                    pose, rows[j], bearing, variance, count, j, params.passive_bound
                 )
     if timings is not None:
-        told = detours(columns, timings)
-        deaf[told.row] = gated_detours(
+        timed = detours(columns, timings)
+        late[timed.row] = gated_detours(
             particles.pose, particles.first, particles.count, particles.member, particles.landmark,
-            tied, told, sensing.passive_bound,
+            parents, timed, params.passive_bound,
         )  # fmt: skip
-    return gated, deaf, int(np.count_nonzero(gated | deaf))
+    return gated, late, int(np.count_nonzero(gated | late))
 
 
 @kernel
 def innovations_of(arrays: Arrays, columns: Columns, particle: Whole) -> tuple[float, float]:
-    """Add up one particle's squared innovations of a scan's rows of landmarks that it has placed.
-
-    Returns their sum, and that of their degrees of freedom.
-    """
+    """Sum one particle's squared innovations over rows of placed landmarks, and their degrees."""
     particles, heard = Particles(*arrays), measurements(columns)
     slot, b, i = _slots(particles.landmark, heard.landmark), particle // LANES, particle % LANES
     squared, degrees = 0.0, 0.0
@@ -212,7 +194,7 @@ def innovations_of(arrays: Arrays, columns: Columns, particle: Whole) -> tuple[f
 def _initialise_active(
     pose: Poses, member: Member, heard: Measurements, m: Whole, count: Counts
 ) -> None:
-    """Put a member at range and bearing of measurement m, where a landmark has not one member."""
+    """Place a member at range and bearing of measurement m, where a landmark has not one member."""
     initialise_member(
         pose, member, heard.range[m], heard.bearing[m], heard.range_variance[m],
         heard.bearing_variance[m], 0.0, count,
@@ -226,17 +208,17 @@ def _correct_by_range(
     count: Counts,
     heard: Measurements,
     m: Whole,
-    sensing: Sensing,
+    params: UpdateParams,
     scratch: Scratch,
 ) -> None:
-    """Correct a landmark by range and bearing, a ray as `estimation.rays` lists, in place."""
-    ranged, bearing, variance = sensing.ranged, heard.bearing[m], heard.bearing_variance[m]
+    """Correct a landmark by range and bearing, a ray as `rays.ranged` says, in place."""
+    ranged, bearing, variance = params.ranged, heard.bearing[m], heard.bearing_variance[m]
     distance, range_variance = heard.range[m], heard.range_variance[m]
     if ranged == CORRECTED:
         keep_heaviest(rows, count)
     part_lanes(count, scratch)
     correct_by_active(pose, rows[0], distance, bearing, range_variance, variance, count)
-    if most(count) == 1:
+    if most_members(count) == 1:
         return
     if ranged == ANEW:
         _initialise_active(pose, rows[0], heard, m, count)
@@ -252,7 +234,7 @@ def _correct_by_range(
             heaviest_to_range(pose, rows, count, distance, scratch.ray)
         elif ranged == OTHERS:
             drop_heaviest(rows, count)
-        correct_ray(pose, rows, count, bearing, variance, sensing, scratch.ray, scratch)
+        correct_ray(pose, rows, count, bearing, variance, params, scratch.ray, scratch)
 
 
 @no_alloc
@@ -260,10 +242,10 @@ def _refine(
     block: Block,
     slot: Int[np.ndarray, " m"],
     heard: Measurements,
-    sensing: Sensing,
+    params: UpdateParams,
     scratch: Scratch,
 ) -> None:
-    """Refine a block's poses, and weigh them, by all measurements of their landmarks."""
+    """Refine and weigh a block's poses by all measurements of mapped landmarks."""
     for m in range(slot.size):
         n = slot[m]
         if n < 0:
@@ -272,13 +254,13 @@ def _refine(
         variance, count = heard.bearing_variance[m], block.count[n]
         if math.isnan(heard.range[m]):
             refine_by_ray(
-                block.pose, rows, count, bearing, variance, sensing, scratch.whole, scratch,
+                block.pose, rows, count, bearing, variance, params, scratch.whole, scratch,
                 block.gained,
             )  # fmt: skip
         else:
-            if most(count) > 1:
+            if most_members(count) > 1:
                 part_lanes(count, scratch)
-                _refine_by_ranged_ray(block, rows, count, heard, m, sensing, scratch)
+                _refine_by_ranged_ray(block, rows, count, heard, m, params, scratch)
             refine_by_active(
                 block.pose, rows[0], heard.range[m], bearing, heard.range_variance[m], variance,
                 count, block.gained,
@@ -292,17 +274,17 @@ def _refine_by_ranged_ray(
     count: Counts,
     heard: Measurements,
     m: Whole,
-    sensing: Sensing,
+    params: UpdateParams,
     scratch: Scratch,
 ) -> None:
-    """Weigh a block's poses by range and bearing where a landmark is a ray; or by its bearing.
+    """Weigh a block's poses by range and bearing of a ray, or by its bearing alone.
 
-    Where a range leaves it a ray, its bearing refines and weighs them as if it came alone.
+    Where a range leaves it a ray, the bearing refines and weighs the poses as if it came alone.
     """
     pose, gained, bearing = block.pose, block.gained, heard.bearing[m]
     variance, ray = heard.bearing_variance[m], scratch.ray
-    if sensing.ranged >= BEARING:
-        refine_by_ray(pose, rows, count, bearing, variance, sensing, ray, scratch, gained)
+    if params.ranged >= BEARING:
+        refine_by_ray(pose, rows, count, bearing, variance, params, ray, scratch, gained)
         return
     rho_beta = (heard.range[m], bearing, heard.range_variance[m], variance)
     weigh_by_active(pose, rows, rho_beta, count, ray, scratch, gained)
@@ -314,13 +296,13 @@ def _weigh_at_sample(
     slot: Int[np.ndarray, " m"],
     heard: Measurements,
     before: tuple[Poses, Poses],
-    sensing: Sensing,
+    params: UpdateParams,
     scratch: Scratch,
 ) -> None:
     """Weigh a block's sampled poses anew: prior x likelihood / proposal at the sample.
 
-    ``before`` are the poses of the prior and of the proposal. Where both filters are linear this
-    is the likelihood before the sample; elsewhere it tells how well the proposal fitted.
+    ``before`` are the poses of the prior and of the proposal. Where both filters are linear this is
+    the likelihood before the sample; elsewhere it corrects for a proposal that fits badly.
     """
     block.gained[:] = 0.0
     weigh_sample(before[0], before[1], block.pose, block.gained)
@@ -336,35 +318,37 @@ def _weigh_at_sample(
             weigh_by_bearing(pose, rows, count, bearing, variance, whole, scratch, gained)
             continue
         part_lanes(count, scratch)
-        by_range = scratch.alone if sensing.ranged >= BEARING else scratch.whole
+        by_range = scratch.alone if params.ranged >= BEARING else scratch.whole
         rho_beta = (heard.range[m], bearing, heard.range_variance[m], variance)
         weigh_by_active(pose, rows, rho_beta, count, by_range, scratch, gained)
-        if sensing.ranged >= BEARING and most(count) > 1:
+        if params.ranged >= BEARING and most_members(count) > 1:
             weigh_by_bearing(pose, rows, count, bearing, variance, scratch.ray, scratch, gained)
 
 
 @no_alloc_inlined
 def _correct_row(
-    block: Block, n: Whole, heard: Measurements, m: Whole, sensing: Sensing, scratch: Scratch
+    block: Block, n: Whole, heard: Measurements, m: Whole, params: UpdateParams, scratch: Scratch
 ) -> None:
     """Correct a block's landmark n from its sampled poses by measurement m, in place."""
     rows, bearing = block.member[block.first[n] : block.first[n + 1]], heard.bearing[m]
     pose, variance, count = block.pose, heard.bearing_variance[m], block.count[n]
     if math.isnan(heard.range[m]):
-        correct_ray(pose, rows, count, bearing, variance, sensing, scratch.whole, scratch)
+        correct_ray(pose, rows, count, bearing, variance, params, scratch.whole, scratch)
         return
-    _correct_by_range(pose, rows, count, heard, m, sensing, scratch)
+    _correct_by_range(pose, rows, count, heard, m, params, scratch)
 
 
 @no_alloc
-def _correct_tied(block: Block, n: Whole, heard: Measurements, m: Whole, ties: Ties) -> Whole:
-    """Correct landmark n, in the row of the ties, with its caller; tell in how many lanes."""
-    h, turns = ties.hub[n], 0
+def _correct_with_parent(
+    block: Block, n: Whole, heard: Measurements, m: Whole, pairs: Pairs
+) -> Whole:
+    """Correct landmark n, copied to ``pairs.row``, with its caller; return in how many lanes."""
+    h, turns = pairs.parent[n], 0
     if h >= 0:
-        turns = joined(block.count[n], block.count[h], ties.turn)
+        turns = lanes_with_parent(block.count[n], block.count[h], pairs.turn)
     if turns > 0:
-        copy_row(block.member[block.first[n]], ties.row)
-        take_tied(block.pose, block.member[block.first[h]], block.count[h], n, ties, heard, m)
+        copy_row(block.member[block.first[n]], pairs.row)
+        correct_pair(block.pose, block.member[block.first[h]], block.count[h], n, pairs, heard, m)
     return turns
 
 
@@ -373,54 +357,54 @@ def _correct(
     block: Block,
     slot: Int[np.ndarray, " m"],
     heard: Measurements,
-    ties: Ties | None,
-    sensing: Sensing,
+    pairs: Pairs | None,
+    params: UpdateParams,
     scratch: Scratch,
 ) -> None:
     """Correct a block's measured landmarks from its sampled poses, in place.
 
-    Those tied to a caller together with it, in lanes where both have one member.
+    Those with a parent are corrected together with it, in lanes where both have one member.
     """
     for m in range(slot.size):
         n, turns = slot[m], 0
         if n < 0:
             continue
-        if ties is not None:
-            turns = _correct_tied(block, n, heard, m, ties)
+        if pairs is not None:
+            turns = _correct_with_parent(block, n, heard, m, pairs)
         if turns < LANES:
-            _correct_row(block, n, heard, m, sensing, scratch)
-        if ties is not None and turns > 0:
-            put_row(ties.row, block.member[block.first[n]], ties.turn)
+            _correct_row(block, n, heard, m, params, scratch)
+        if pairs is not None and turns > 0:
+            copy_lanes(pairs.row, block.member[block.first[n]], pairs.turn)
 
 
 @no_alloc
 def _add_new(
-    pose: Poses, rows: Rows, count: Counts, heard: Measurements, m: Whole, sensing: Sensing
+    pose: Poses, rows: Rows, count: Counts, heard: Measurements, m: Whole, params: UpdateParams
 ) -> None:
-    """Place a block's new landmark, one member or a ray of them (Eqs. (16) to (18))."""
+    """Place a block's new landmark: one member, or a ray (Eqs. (16) to (18))."""
     if not math.isnan(heard.range[m]):
         _initialise_active(pose, rows[0], heard, m, count)
         count[:] = 1
         return
-    members = sensing.ray_ranges.size
+    members = params.ray_ranges.size
     for j in range(members):
         initialise_member(
-            pose, rows[j], sensing.ray_ranges[j], heard.bearing[m], sensing.ray_stds[j] ** 2,
+            pose, rows[j], params.ray_ranges[j], heard.bearing[m], params.ray_stds[j] ** 2,
             heard.bearing_variance[m], -math.log(members), count,
         )  # fmt: skip
     count[:] = members
 
 
 @no_alloc
-def _place_tied(block: Block, n: Whole, heard: Measurements, m: Whole, ties: Ties) -> None:
-    """Place landmark n where it is a ray and a detour tells its range."""
-    h = ties.hub[n]
-    if h < 0 or math.isnan(ties.detour[m]):
+def _place_by_parent(block: Block, n: Whole, heard: Measurements, m: Whole, pairs: Pairs) -> None:
+    """Place landmark n where it is a ray and a detour gives its range."""
+    h = pairs.parent[n]
+    if h < 0 or math.isnan(pairs.detour[m]):
         return
     caller, member = block.member[block.first[h]], block.member[block.first[n]]
-    said = heard.bearing[m], ties.detour[m], heard.bearing_variance[m], ties.variance[m]
-    known_surely(block.pose, caller, block.count[h], ties.timed)
-    place_by_detour(block.pose, caller, member, ties.tie[n], said, block.count[n], ties.timed)
+    said = heard.bearing[m], pairs.detour[m], heard.bearing_variance[m], pairs.variance[m]
+    lanes_with_sure_parent(block.pose, caller, block.count[h], pairs.usable)
+    place_by_detour(block.pose, caller, member, pairs.slope[n], said, block.count[n], pairs.usable)
 
 
 @no_alloc
@@ -429,19 +413,19 @@ def _place(
     slot: Int[np.ndarray, " m"],
     known: Whole,
     heard: Measurements,
-    ties: Ties | None,
-    sensing: Sensing,
+    pairs: Pairs | None,
+    params: UpdateParams,
 ) -> None:
-    """Place a block's new landmarks, and rays whose range a detour tells."""
+    """Place a block's new landmarks, and rays whose range a detour gives."""
     new = known
     for m in range(slot.size):
         n = slot[m]
         if n < 0:
             n, new = new, new + 1
             rows = block.member[block.first[n] : block.first[n + 1]]
-            _add_new(block.pose, rows, block.count[n], heard, m, sensing)
-        if ties is not None:
-            _place_tied(block, n, heard, m, ties)
+            _add_new(block.pose, rows, block.count[n], heard, m, params)
+        if pairs is not None:
+            _place_by_parent(block, n, heard, m, pairs)
 
 
 @kernel
@@ -457,7 +441,7 @@ def _rows(
     for n in range(known):
         wide = 1
         for b in range(particles.count.shape[0]):
-            wide = max(wide, most(particles.count[b, n]))
+            wide = max(wide, most_members(particles.count[b, n]))
         labels[n], first[n + 1] = particles.landmark[n], first[n] + wide
         widest = max(widest, wide)
     for m in range(slot.size):
@@ -472,7 +456,7 @@ def _rows(
 
 @no_alloc
 def _copy_members(particles: Particles, b: Whole, block: Block) -> None:
-    """Copy the members of a block into the rows that they now have."""
+    """Copy the members of a block into their new rows."""
     for n in range(particles.landmark.size):
         for j in range(block.first[n + 1] - block.first[n]):
             source = particles.member[b, particles.first[n] + j]
@@ -486,26 +470,26 @@ def _copy_members(particles: Particles, b: Whole, block: Block) -> None:
 @kernel
 def correct_particles(
     arrays: Arrays,
-    tied: Tied,
+    parents: Parents,
     columns: Columns,
     timings: Timings | None,
     normal: Float[np.ndarray, "p 3"],
-    sensing: Sensing,
+    params: UpdateParams,
     sampled: bool,
-) -> tuple[Extended, TiedAfter, Float[np.ndarray, " p"]]:
-    """Refine, sample, correct and extend a copy of all particles; returns it, ties, log weights.
+) -> tuple[Extended, ParentsAfter, Float[np.ndarray, " p"]]:
+    """Refine, sample, correct and extend a copy of all particles; return it, parents, log weights.
 
-    ``sampled``: they are weighed at the sample.
+    With ``sampled`` they are weighed at the sample.
     """
     old, heard = Particles(*arrays), measurements(columns)
     blocks, known, total = old.pose.shape[0], old.landmark.size, normal.shape[0]
     slot = _slots(old.landmark, heard.landmark)
-    landmark, first, widest = _rows(old, slot, heard, sensing.ray_ranges.size)
-    told_of = np.empty(0), np.empty(0)
+    landmark, first, widest = _rows(old, slot, heard, params.ray_ranges.size)
+    of_parents = np.empty(0), np.empty(0)
     if timings is not None:
-        told = detours(columns, timings)
-        tied = tie_landmarks(tied, landmark, old.count, total, told, timings[1])
-        told_of = heard_of(tied[0], landmark, heard.landmark, told)
+        timed = detours(columns, timings)
+        parents = assign_parents(parents, landmark, old.count, total, timed, timings[1])
+        of_parents = detours_of_parents(parents[0], landmark, heard.landmark, timed)
     pose, gained = old.pose.copy(), np.zeros((blocks, LANES))
     count = np.zeros((blocks, landmark.size, LANES), dtype=np.int64)
     member = np.empty((blocks, first[-1], MEMBER))
@@ -514,30 +498,30 @@ def correct_particles(
     for b in range(blocks):
         block = Block(pose[b], gained[b], first, count[b], member[b])
         _copy_members(old, b, block)
-        _refine(block, slot, heard, sensing, scratch)
+        _refine(block, slot, heard, params, scratch)
         proposal[:] = block.pose
         for k in range(draw.size):
             draw[k] = normal[min(b * LANES + k % LANES, total - 1), k // LANES]
         sample_pose(block.pose, draw)
         if sampled:
-            _weigh_at_sample(block, slot, heard, (old.pose[b], proposal), sensing, scratch)
+            _weigh_at_sample(block, slot, heard, (old.pose[b], proposal), params, scratch)
         if timings is None:
-            _correct(block, slot, heard, None, sensing, scratch)
-            _place(block, slot, known, heard, None, sensing)
+            _correct(block, slot, heard, None, params, scratch)
+            _place(block, slot, known, heard, None, params)
         else:
-            ties = Ties(tied[0], tied[1][b], *told_of, *room)
-            shift_all(ties, first, block.member, -1.0)
-            _correct(block, slot, heard, ties, sensing, scratch)
-            _place(block, slot, known, heard, ties, sensing)
-            shift_all(ties, first, block.member, 1.0)
-    return (pose, landmark, first, count, member), tied, gained.ravel()[:total]
+            pairs = Pairs(parents[0], parents[1][b], *of_parents, *room)
+            shift_all(pairs, first, block.member, -1.0)
+            _correct(block, slot, heard, pairs, params, scratch)
+            _place(block, slot, known, heard, pairs, params)
+            shift_all(pairs, first, block.member, 1.0)
+    return (pose, landmark, first, count, member), parents, gained.ravel()[:total]
 
 
 @kernel
 def particle_map(
     count: Int[np.ndarray, "b n lanes"], member: Float[np.ndarray, "b c numbers"], particle: Whole
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "c 6"]]:
-    """One particle's members, row by row: the number of each landmark's, and (c, 6) numbers."""
+    """One particle's map: the number of each landmark's members, and their rows."""
     b, i = particle // LANES, particle % LANES
     rows = np.empty((member.shape[1], MEMBER // LANES))
     for j in range(rows.shape[0]):
@@ -591,7 +575,7 @@ def restart_rays(
     count: Int[np.ndarray, "b n lanes"],
     member: Float[np.ndarray, "b c numbers"],
 ) -> None:
-    """Make the members of each ray alike again, in place."""
+    """Give the members of each ray equal weights, in place."""
     for b in range(count.shape[0]):
         for n in range(count.shape[1]):
             for j in range(first[n], first[n + 1]):

@@ -21,17 +21,12 @@ from pipistrelle.estimation.fastslam.block import (
     X,
     Y,
 )
-from pipistrelle.estimation.motion import (
-    BY_POSES,
-    MotionNumbers,
-    motion_increment,
-    relative_noise,
-)
+from pipistrelle.estimation.motion import BY_POSES, MotionNumbers, motion_increment, relative_noise
 from pipistrelle.jit import kernel, no_alloc
 
 SMALLEST_STD = 1e-6
-"""Added in quadrature to the pose estimate's x, y [m] and heading [rad]: particles that stand still
-or have one ancestor may have no spread, and their covariance no inverse."""
+"""Added in quadrature to x, y [m] and heading [rad] of the estimate: particles that stand still or
+share an ancestor have no spread, and their covariance no inverse."""
 
 
 LEAST = SMALLEST_STD**2
@@ -79,7 +74,7 @@ def _add_lanes(sums: Poses) -> Float[np.ndarray, "9"]:
 def summarise(
     pose: Float[np.ndarray, "b rows"], weight: Float[np.ndarray, " p"]
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Mean (circular in the heading) and covariance of all particles, their own included."""
+    """Mean (circular in the heading) and covariance of all particles, their own added."""
     blocks = pose.shape[0]
     lanes, sums = np.zeros((blocks, LANES)), np.zeros(POSE)
     for p in range(weight.size):
@@ -104,7 +99,7 @@ def summarise(
 
 @no_alloc
 def _propagate_block(pose: Poses, step: tuple[float, ...], q0: float, q1: float) -> None:
-    """Move a block's poses through a control step, known in the vehicle's frame (Eq. (10))."""
+    """Propagate a block's poses by a control step in the vehicle's frame (Eq. (10))."""
     ahead, aside, turn, u00, u10, u20, u01, u11, u21 = step
     for i in range(LANES):
         c, s = cosine_and_sine(pose[HEADING + i])
@@ -125,7 +120,7 @@ def _propagate_block(pose: Poses, step: tuple[float, ...], q0: float, q1: float)
 
 @no_alloc
 def _propagate_block_by(pose: Poses, step: tuple[float, ...], noise: tuple[float, ...]) -> None:
-    """Move a block's poses by a motion with a covariance, both in the vehicle's frame."""
+    """Propagate a block's poses by a motion with a covariance, both in the vehicle's frame."""
     ahead, aside, turn = step[0], step[1], step[2]
     qxx, qxy, qxh, qyy, qyh, qhh = noise
     for i in range(LANES):
@@ -156,7 +151,7 @@ def propagate(
     pose_means: Float[np.ndarray, "k 3"],
     pose_covariances: Float[np.ndarray, "k 3 3"],
 ) -> None:
-    """Move every particle through control steps, in place, and summarise after each."""
+    """Propagate all particles through control steps, in place, and summarise after each."""
     for k in range(dt.size):
         control = controls[k]
         step = motion_increment(motion.model, motion.wheelbase, 0.0, control, dt[k])

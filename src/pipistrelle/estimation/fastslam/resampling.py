@@ -1,13 +1,13 @@
 r"""Resampling: from weighted particles to equally weighted ones.
 
-Both steps of FastSLAM 2.0 that forget live here. The weights tell how many particles still count,
+The weights tell how many particles still count,
 
 .. math:: N_\mathrm{eff} = \left( \sum_j w_j^2 \right)^{-1}
 
 (Eq. (15)); below a threshold the particles are drawn anew, each as often as its weight says. The
 draw is *stratified*: one uniform number in each of N equal strata of [0, 1), so particle j gets
-:math:`N w_j` copies on average and differs from it by less than two. Weights are kept in logs: a
-frame's likelihoods, multiplied, underflow.
+:math:`N w_j` copies on average and differs from it by less than two. Weights are kept as logs,
+because the product of a frame's likelihoods underflows.
 """
 
 import math
@@ -25,16 +25,6 @@ def normalised(log_weight: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
     no log weight is finite the weights are equal: such a filter has lost the vehicle, which is a
     result and not an error.
 
-    Parameters
-    ----------
-    log_weight : (p)
-
-    Returns
-    -------
-    (p)
-
-    Examples
-    --------
     >>> normalised(np.array([-1000.0, -1000.0 + np.log(3.0)])).round(12)
     array([0.25, 0.75])
     """
@@ -57,24 +47,12 @@ def _shifted(log_weight):
 
 
 def effective_particles(weight: Float[np.ndarray, " p"]) -> float:
-    r"""Return how many equally weighted particles would be worth as much.
+    r"""Return how many equally weighted particles would be worth as much, in [1, p].
 
     .. math:: N_\mathrm{eff} = 1 / \sum_j w_j^2
        :label: eq-15
 
-    Parameters
-    ----------
-    weight : (p)
-        Sums to 1.
-
-    Returns
-    -------
-    float
-        In [1, p].
-
-    Notes
-    -----
-    Bradley & Abaid, Eq. (15).
+    Bradley & Abaid, Eq. (15); the weights sum to 1.
 
     Examples
     --------
@@ -89,24 +67,9 @@ def stratified(
 ) -> Int[np.ndarray, " p"]:
     """Draw each particle's ancestor, one from each stratum of the cumulated weights.
 
-    Parameters
-    ----------
-    weight : (p)
-        Sums to 1.
-    uniform : (p)
-        Uniform in [0, 1).
+    The weights sum to 1, ``uniform`` is in [0, 1); the indices rise. Bradley & Abaid, Sec. III-B;
+    Douc, Cappe & Moulines (2005).
 
-    Returns
-    -------
-    (p)
-        Indices, rising.
-
-    Notes
-    -----
-    Bradley & Abaid, Sec. III-B; Douc, Cappe & Moulines (2005).
-
-    Examples
-    --------
     >>> stratified(np.array([0.1, 0.6, 0.3]), np.array([0.2, 0.9, 0.5])).tolist()
     [0, 1, 2]
     """

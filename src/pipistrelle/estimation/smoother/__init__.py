@@ -1,1 +1,1 @@
-"""Smoothing: `filter` re-thinks the whole path, `graph` holds it, `legs` lead from pose to pose."""
+"""The smoother: `filter` is the method, `graph` the factor graph, `belief` what it answers."""

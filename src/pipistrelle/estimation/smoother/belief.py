@@ -1,7 +1,7 @@
 """What the smoother believes: the last link of its graph, and what waits to enter it.
 
-A belief is never changed. What comes next is a new one (`arrived`, `settled`) whose link has the
-old one's before it, and the solver, which all share, goes to whichever is asked (`graph`).
+A belief is never changed. Each new one (`with_new_pose`, `with_solved_pose`) has a link whose
+predecessor is the old one's. All share one solver, which goes to the link that is asked (`graph`).
 """
 
 import math
@@ -15,92 +15,75 @@ from jaxtyping import Float
 from pipistrelle.config import RayConfig
 from pipistrelle.estimation.beliefs import NO_INNOVATIONS, Gaussian, Innovations, Landmarks
 from pipistrelle.estimation.rays import ray_members
-from pipistrelle.estimation.smoother.crossing import Bearing
-from pipistrelle.estimation.smoother.detours import Detour
+from pipistrelle.estimation.smoother.caller_motion import (
+    Chains,
+    insert_state,
+    place_key,
+    propagated_caller,
+    state_of,
+    walk_factor,
+)
+from pipistrelle.estimation.smoother.delayed_initialization import Bearing
 from pipistrelle.estimation.smoother.graph import (
     Link,
     Solver,
     in_world,
-    leg_factor,
     links,
+    odometry_factor,
     pose_key,
     pose_of,
 )
-from pipistrelle.estimation.smoother.legs import NOWHERE, Leg, between, placed, symmetric, turned
-from pipistrelle.estimation.smoother.roaming import (
-    Chains,
-    gone_on,
-    insert_state,
-    place_key,
-    state_of,
-    walk_factor,
+from pipistrelle.estimation.smoother.preintegration import (
+    NO_ODOMETRY,
+    Odometry,
+    between,
+    placed,
+    symmetric,
+    turned,
 )
+from pipistrelle.estimation.smoother.tdoa import Detour
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SmootherBelief:
-    """A link of the graph's chain, and what waits to enter it.
-
-    Attributes
-    ----------
-    at : Gaussian of (3) and (3, 3)
-        The last pose of the graph, as it was believed when it entered.
-    leg : Leg
-        The steps since.
-    link : Link
-    mapped : tuple of int
-        Landmarks in the graph, in order of entry.
-    waiting : dict of label to tuple of Bearing
-    detours : tuple of Detour
-        Those that wait, for their landmark or for their caller.
-    chains : mapping of label to Chain
-        Callers that move and are in the graph.
-    states : mapping of label to Gaussian of (4) and (4, 4)
-        Their places and velocities at the last pose of the graph, as ``at``.
-    unplaced : mapping of label to Bearing
-        The last of each caller that moves and is not in the graph.
-    walk_std : float
-        How far a caller's velocity strays in a second [m/s].
-    gated : int
-    innovations : Innovations
-        Where there is a gate: without one nothing is foreseen.
-    rays : RayConfig
-    solver : Solver
-        Shared with the beliefs before and after.
-    """
+    """A link of the graph's chain, and what waits to enter it."""
 
     at: Gaussian
-    leg: Leg = NOWHERE
+    """The last pose of the graph, (3) and (3, 3), as it was believed when it entered."""
+    odometry: Odometry = NO_ODOMETRY  # the steps since
     link: Link
-    mapped: tuple[int, ...] = ()
+    mapped: tuple[int, ...] = ()  # landmarks in the graph, in order of entry
     waiting: Mapping[int, tuple[Bearing, ...]] = field(default_factory=dict)
-    detours: tuple[Detour, ...] = ()
-    chains: Chains = field(default_factory=dict)
+    """bearings of each landmark that is not in the graph."""
+    detours: tuple[Detour, ...] = ()  # those that wait for their landmark or caller
+    chains: Chains = field(default_factory=dict)  # moving callers in the graph, by label
     states: Mapping[int, Gaussian] = field(default_factory=dict)
+    """Their places and velocities, (4) and (4, 4), at the last pose of the graph."""
     unplaced: Mapping[int, Bearing] = field(default_factory=dict)
-    walk_std: float = 0.0
+    """last bearing of each moving caller that is not in the graph."""
+    walk_std: float = 0.0  # of a caller's velocity after 1 s [m/s]
     gated: int = 0
-    innovations: Innovations = NO_INNOVATIONS
+    innovations: Innovations = NO_INNOVATIONS  # counted only with a gate
     rays: RayConfig
-    solver: Solver
+    solver: Solver  # shared with the beliefs before and after
 
     def pose(self) -> Gaussian:
         """Return the vehicle's pose, (3) and (3, 3)."""
-        if not len(self.leg.mean):
+        if not len(self.odometry.mean):
             return self.at
-        steps = placed(self.at, self.leg)
+        steps = placed(self.at, self.odometry)
         return Gaussian(mean=steps.mean[-1], covariance=steps.covariance[-1])
 
     def path(self) -> Gaussian:
-        """Return the start and every control step so far, by all that is known now."""
+        """Return the start and every control step so far, given all measurements so far."""
         best = self.solver.solve(self.link)
         start = best.pose(0)
         parts = [Gaussian(mean=start.mean[None], covariance=start.covariance[None])]
         for link in links(self.link):
-            if link.leg:
+            if link.odometry:
                 ends = np.array([best.pose_mean(link.node - 1), best.pose_mean(link.node)])
-                parts.append(between(ends, best.joint(link.node - 1, link.node), link.leg))
-        parts.append(placed(best.pose(self.link.node), self.leg))
+                parts.append(between(ends, best.joint(link.node - 1, link.node), link.odometry))
+        parts.append(placed(best.pose(self.link.node), self.odometry))
         return Gaussian(
             mean=np.concatenate([part.mean for part in parts]),
             covariance=np.concatenate([part.covariance for part in parts]),
@@ -120,9 +103,9 @@ class SmootherBelief:
         return _rows(points, rays)
 
     def moving(self) -> Landmarks:
-        """Return callers that move: a row for each in the graph, a ray for each heard just now."""
+        """Return moving callers: a row for each in the graph, a ray for each heard just now."""
         now = {
-            label: gone_on(state, self.leg.seconds, self.walk_std)
+            label: propagated_caller(state, self.odometry.seconds, self.walk_std)
             for label, state in self.states.items()
         }
         points = [(label, _place_in(state), 1.0) for label, state in now.items()]
@@ -135,15 +118,15 @@ class SmootherBelief:
         return _rows(points, rays)
 
     def tracks(self) -> dict[int, Gaussian]:
-        """Return where callers that move were at the poses of the graph, by all that is known now.
+        """Return where moving callers were at the poses of the graph, by label.
 
-        Of each by its label (k + 1, 2) and (k + 1, 2, 2): a row for the start and every control
-        step so far, NaN where the graph has none.
+        A row (2) and (2, 2) for the start and every control step so far, NaN where the graph has
+        none.
         """
         best, found = self.solver.solve(self.link), {}
-        steps = [0, *(len(link.leg.mean) for link in links(self.link) if link.leg)]
+        steps = [0, *(len(link.odometry.mean) for link in links(self.link) if link.odometry)]
         rows = np.cumsum(steps)
-        size = rows[-1] + len(self.leg.mean) + 1
+        size = rows[-1] + len(self.odometry.mean) + 1
         for label, chain in self.chains.items():
             mean, covariance = np.full((size, 2), np.nan), np.full((size, 2, 2), np.nan)
             for node in range(chain.first, self.link.node + 1):
@@ -153,31 +136,28 @@ class SmootherBelief:
         return found
 
 
-def arrived(belief: SmootherBelief, *, roving: bool) -> SmootherBelief:
-    """Let the leg enter the graph and its end be the last pose, where any has moved.
-
-    The vehicle may have, and callers that rove, if time has passed.
-    """
-    leg, states = belief.leg, {}
-    if not (leg.moves() or (roving and leg.seconds > 0.0)):
+def with_new_pose(belief: SmootherBelief, *, roving: bool) -> SmootherBelief:
+    """Return a belief with a new pose in the graph, if the vehicle, or a caller, may have moved."""
+    odometry, states = belief.odometry, {}
+    if not (odometry.moves() or (roving and odometry.seconds > 0.0)):
         return belief
     node, pose = belief.link.node + 1, belief.pose()
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    factors.add(leg_factor(node, belief.leg))
+    factors.add(odometry_factor(node, belief.odometry))
     values.insert(pose_key(node), gtsam.Pose2(*pose.mean))
     for label, chain in belief.chains.items():
-        states[label] = gone_on(belief.states[label], leg.seconds, belief.walk_std)
+        states[label] = propagated_caller(belief.states[label], odometry.seconds, belief.walk_std)
         insert_state(values, chain, node, states[label].mean)
-        factors.add(walk_factor(chain, node, leg.seconds, belief.walk_std))
-    link = replace(_after(belief.link, factors, values), node=node, leg=leg)
-    return replace(belief, at=pose, leg=NOWHERE, link=link, states=states)
+        factors.add(walk_factor(chain, node, odometry.seconds, belief.walk_std))
+    link = replace(_after(belief.link, factors, values), node=node, odometry=odometry)
+    return replace(belief, at=pose, odometry=NO_ODOMETRY, link=link, states=states)
 
 
 def next_link(here: SmootherBelief) -> Link:
-    """Return a new link, still to be filled: in the place of the leg's, where none has asked it."""
+    """Return a new link to be filled; it replaces the last one if that is new and unsolved."""
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     last = here.link
-    if last.leg is None or here.solver.at is last:
+    if last.odometry is None or here.solver.at is last:
         return _after(last, factors, values)
     factors.push_back(last.factors)
     values.insert(last.values)
@@ -186,13 +166,13 @@ def next_link(here: SmootherBelief) -> Link:
 
 def _after(last: Link, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Link:
     """Return a link after another, of the same pose."""
-    return replace(last, before=last, leg=None, factors=factors, values=values, crossed=False)
+    return replace(last, before=last, odometry=None, factors=factors, values=values, crossed=False)
 
 
 def solved(belief: SmootherBelief) -> SmootherBelief:
-    """Return the belief when its graph is solved, thoroughly where it must be.
+    """Return the belief with its graph solved, by QR where Cholesky fails.
 
-    Raises RuntimeError where it cannot be solved.
+    It raises RuntimeError where the graph cannot be solved.
     """
     try:
         belief.solver.reach(belief.link)
@@ -204,8 +184,8 @@ def solved(belief: SmootherBelief) -> SmootherBelief:
     return belief
 
 
-def settled(belief: SmootherBelief) -> SmootherBelief:
-    """Return the belief with the last pose as the solver has it."""
+def with_solved_pose(belief: SmootherBelief) -> SmootherBelief:
+    """Return the belief with the last pose, and the callers, as the solver has them."""
     belief = solved(belief)
     isam, key = belief.solver.reach(belief.link), pose_key(belief.link.node)
     mean = pose_of(isam.calculateEstimatePose2(key))
@@ -216,13 +196,13 @@ def settled(belief: SmootherBelief) -> SmootherBelief:
 
 
 def last_solved(here: SmootherBelief) -> Link | None:
-    """Return the last link that has been solved."""
+    """Return the last link that is solved."""
     last = here.link
-    return last if last.leg is None or last is here.solver.at else last.before
+    return last if last.odometry is None or last is here.solver.at else last.before
 
 
 def poses_of(here: SmootherBelief) -> Float[np.ndarray, "n 3"]:
-    """Return the graph's poses by their numbers, the last as it is expected."""
+    """Return the graph's poses by their numbers; the last one is predicted."""
     last, known = here.link, last_solved(here)
     poses = np.empty((0, 3))
     if known is not None:
@@ -237,12 +217,12 @@ def ahead(pose: Float[np.ndarray, "3"], bearing: float, distance: float) -> np.n
 
 
 def _place_in(state: Gaussian) -> Gaussian:
-    """Return the place of a caller's place and velocity."""
+    """Return the place in a caller's place and velocity."""
     return Gaussian(mean=state.mean[:2], covariance=state.covariance[:2, :2])
 
 
 def _ray(pose: Gaussian, heard: Bearing, rays: RayConfig) -> list[tuple[Gaussian, float]]:
-    """Return the members of the ray that a landmark lies on which waits: two or more."""
+    """Return the members of the ray of a waiting landmark, two or more."""
     ranges, stds = ray_members(rays)
     if len(ranges) == 1:
         ranges, stds = np.repeat(ranges, 2), np.repeat(stds, 2)
@@ -263,7 +243,7 @@ def _ray(pose: Gaussian, heard: Bearing, rays: RayConfig) -> list[tuple[Gaussian
 
 
 def _rows(*parts: list[tuple[int, Gaussian, float]]) -> Landmarks:
-    """Lay out a map of labels, places and weights."""
+    """Return a map of labels, places and weights."""
     rows = [row for part in parts for row in part]
     return Landmarks(
         landmark=np.array([label for label, _, _ in rows], dtype=np.int64),

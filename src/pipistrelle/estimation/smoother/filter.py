@@ -1,24 +1,23 @@
-r"""The smoother: nothing is linearised for good, and the whole path is thought over again.
+"""The smoother: the whole path is estimated again with each frame, by relinearisation.
 
-A filter folds what it hears into one Gaussian, linearised where it then thought it was. Here all
-that was ever heard stays a *factor* between a pose and a landmark, and a sparse solver (GTSAM's
-iSAM2: Kaess et al., International Journal of Robotics Research 31, 2012) goes on to linearise what
-has moved. Poses are those from which something was heard (`legs` has the steps between).
+A filter folds what it hears into one Gaussian, linearised where it then was. Here every measurement
+stays a *factor* between a pose and a landmark, and a sparse solver (GTSAM's iSAM2: Kaess et al.,
+International Journal of Robotics Research 31, 2012) relinearises what has moved. Poses are those
+from which something was heard (`preintegration` has the steps between).
 
-A landmark enters with its first range, and else where two of its bearings cross clearly
-(`crossing`), with all its bearings so far: until then it waits, its bearings say nothing, and it
-counts as partial. Where the calls of another are timed, it enters with the first detour that makes
-its range sure (`placing`), for which its caller must be in the graph; a caller, likewise, by the
-detour over a landmark that is. A detour is a factor between pose, landmark and caller (`detours`),
-and waits, too, until both are there. What enters does so with a prior of `PRIOR_STD`, which says
-next to nothing and leaves no graph without a solution. What cannot be solved with new landmarks is
-solved without them: they go on waiting.
+A landmark enters with its first range, or where two of its bearings cross clearly
+(`delayed_initialization`), with all its bearings so far: until then it waits, its bearings are not
+used, and it counts as partial. With detours, it enters with the first one that makes its range sure
+(`tdoa_initialization`), for which its caller must be in the graph; a caller enters likewise, by the
+detour over a landmark that is. A detour is a factor between pose, landmark and caller (`tdoa`), and
+waits, too, until both are there. What enters gets a weak prior of `PRIOR_STD`, so that every graph
+has a solution. If a graph with new landmarks cannot be solved, they go on waiting.
 
-A caller that moves has a place and a velocity of each node (`roaming`), once a range or a detour
-places it: bearings that cross say nothing of what has moved between them. It is no landmark.
+A moving caller has a place and a velocity at each node (`caller_motion`), once a range or a detour
+places it: crossing bearings say nothing of what has moved between them. It is no landmark.
 
-``robust`` takes each measurement by Huber's loss. What is believed at a frame is the pose of iSAM2;
-path, tracks of callers and map are the optimum of everything so far (`belief`).
+``robust`` uses Huber's loss. The belief at a frame is the pose of iSAM2; path, tracks of callers
+and map are the optimum of everything so far (`belief`).
 """
 
 import math
@@ -40,38 +39,42 @@ from pipistrelle.estimation.checking import (
     usable_pose,
     usable_scan,
 )
-from pipistrelle.estimation.measurement import BELIEVED
+from pipistrelle.estimation.measurement import HUBER_K
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.smoother.belief import (
     SmootherBelief,
     ahead,
-    arrived,
     last_solved,
     next_link,
     poses_of,
-    settled,
     solved,
+    with_new_pose,
+    with_solved_pose,
 )
-from pipistrelle.estimation.smoother.crossing import Bearing, crossing
-from pipistrelle.estimation.smoother.detours import Detour, detour_factors, detours_of, parted
-from pipistrelle.estimation.smoother.gating import detours_inside, rows_inside
-from pipistrelle.estimation.smoother.graph import Link, Solver, landmark_key, pose_key, start_factor
-from pipistrelle.estimation.smoother.legs import longer, placed
-from pipistrelle.estimation.smoother.placing import Around, clues_of, placed_by
-from pipistrelle.estimation.smoother.roaming import (
+from pipistrelle.estimation.smoother.caller_motion import (
     Chain,
     Chains,
     insert_state,
-    known_of,
+    labels_in_graph,
     place_key,
     speed_factor,
 )
+from pipistrelle.estimation.smoother.delayed_initialization import Bearing, crossing
+from pipistrelle.estimation.smoother.gating import detours_inside, rows_inside
+from pipistrelle.estimation.smoother.graph import Link, Solver, landmark_key, pose_key, start_factor
+from pipistrelle.estimation.smoother.preintegration import extended, placed
+from pipistrelle.estimation.smoother.tdoa import Detour, detour_factors, detours_of, split_ready
+from pipistrelle.estimation.smoother.tdoa_initialization import (
+    LastPose,
+    place_by_detours,
+    usable_detours,
+)
 
 PRIOR_STD = 20.0
-"""Of a landmark about the place where it enters [m]."""
-MANY = 20
-"""Detours that had waited, beyond which all is linearised anew when they enter: they correct many
-poses at once, as do bearings that had waited (`graph.ANEW`)."""
+"""Prior of a landmark about the place where it enters [m]."""
+RELINEARISE_ABOVE = 20
+"""If more waiting detours than this enter, all is relinearised: they correct many poses at once, as
+do waiting bearings (`graph.RELINEARISE_PASSES`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,7 +93,7 @@ class Smoother:
         Whether a measurement that surprises counts less.
     speed_std, walk_std : float
         Of callers that move: the velocity [m/s] along an axis before anything is known of it, and
-        how far it strays in a second (`estimation.smoother.roaming`).
+        how far it strays in a second (`estimation.smoother.caller_motion`).
 
     Examples
     --------
@@ -123,26 +126,14 @@ class Smoother:
         values.insert(pose_key(0), gtsam.Pose2(*pose.mean))
         return SmootherBelief(
             at=pose,
-            link=Link(before=None, node=0, leg=None, factors=factors, values=values),
+            link=Link(before=None, node=0, odometry=None, factors=factors, values=values),
             rays=self.rays,
             walk_std=self.walk_std,
             solver=Solver(),
         )
 
     def knowing(self, belief: SmootherBelief, known: Landmarks) -> SmootherBelief:
-        """Return a first belief that has landmarks in its map.
-
-        Parameters
-        ----------
-        belief : SmootherBelief
-            As `init` gives it.
-        known : Landmarks
-            One row each.
-
-        Returns
-        -------
-        SmootherBelief
-        """
+        """Return a first belief with landmarks in its map; ``belief`` is that of `init`."""
         check_belief(belief, SmootherBelief)
         known = usable_known(known)
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values(belief.link.values)
@@ -163,46 +154,21 @@ class Smoother:
         dt: Float[np.ndarray, " k"],
         rng: np.random.Generator | None = None,
     ) -> tuple[SmootherBelief, Gaussian]:
-        """Carry the belief through the control steps of a frame.
+        """Carry the belief through the control steps of a frame; nothing is drawn.
 
-        Parameters
-        ----------
-        belief : SmootherBelief
-        controls : (k, c)
-            As the motion model has them.
-        dt : (k) [s]
-        rng : Generator, optional
-            Not used: nothing is drawn.
-
-        Returns
-        -------
-        belief : SmootherBelief
-        poses : Gaussian of (k, 3) and (k, 3, 3)
-            After each step.
+        Returns the belief and the pose after each step, (k, 3) and (k, 3, 3).
         """
         check_belief(belief, SmootherBelief)
         controls, dt = usable_controls(self.motion, controls, dt)
-        leg = longer(belief.leg, self.motion, controls, dt)
-        steps, new = placed(belief.at, leg), len(leg.mean) - len(dt)
+        odometry = extended(belief.odometry, self.motion, controls, dt)
+        steps, new = placed(belief.at, odometry), len(odometry.mean) - len(dt)
         poses = Gaussian(mean=steps.mean[new:], covariance=steps.covariance[new:])
-        return replace(belief, leg=leg), poses
+        return replace(belief, odometry=odometry), poses
 
     def update(
         self, belief: SmootherBelief, scan: Scan, rng: np.random.Generator | None = None
     ) -> SmootherBelief:
-        """Let a frame's measurements enter the graph, and what they place.
-
-        Parameters
-        ----------
-        belief : SmootherBelief
-        scan : Scan
-        rng : Generator, optional
-            Not used: nothing is drawn.
-
-        Returns
-        -------
-        SmootherBelief
-        """
+        """Add a frame's measurements to the graph, and the landmarks that they place."""
         check_belief(belief, SmootherBelief)
         scan = usable_scan(scan)
         if scan.landmark.size == 0:
@@ -214,24 +180,24 @@ class Smoother:
             return self._updated(solved(belief), scan)
 
     def _updated(self, belief: SmootherBelief, scan: Scan) -> SmootherBelief:
-        """Let a frame's measurements enter the graph, and what they place."""
-        here = arrived(belief, roving=bool(scan.moving.size or belief.chains))
+        """Add a frame's measurements to the graph, and the landmarks that they place."""
+        here = with_new_pose(belief, roving=bool(scan.moving.size or belief.chains))
         if self.gate < 1.0 and (belief.mapped or belief.chains):
             here, scan, detours = self._gated(solved(here), scan)
         else:
             detours = detours_of(scan, here.link.node)
-        for placing in (True, False):
-            heard = self._heard(here, scan, detours, placing=placing)
+        for initialize in (True, False):
+            heard = self._heard(here, scan, detours, initialize=initialize)
             try:
-                return settled(heard)
+                return with_solved_pose(heard)
             except RuntimeError:  # what entered cannot be solved
                 continue
-        return settled(here)
+        return with_solved_pose(here)
 
     def _gated(
         self, here: SmootherBelief, scan: Scan
     ) -> tuple[SmootherBelief, Scan, tuple[Detour, ...]]:
-        """Return what is inside the gate, and count what is not."""
+        """Return belief, scan and detours that pass the gate, and count what does not."""
         isam, node, rows = here.solver.reach(here.link), here.link.node, scan.landmark.size
         heard = detours_of(scan, node)  # of all rows: a bearing that is wrong is nothing to them
         inside, off_by = rows_inside(isam, node, here.mapped, scan, self.gate, here.chains)
@@ -242,14 +208,14 @@ class Smoother:
         return replace(here, gated=here.gated + dropped, innovations=innovations), scan, detours
 
     def _heard(
-        self, here: SmootherBelief, scan: Scan, detours: tuple[Detour, ...], *, placing: bool
+        self, here: SmootherBelief, scan: Scan, detours: tuple[Detour, ...], *, initialize: bool
     ) -> SmootherBelief:
-        """Add a frame's factors, and those of what it places, if it may, as a link."""
+        """Return the belief with a frame's factors; with ``initialize``, also what they place."""
         link = next_link(here)
         factors, values, node = link.factors, link.values, link.node
         mapped, waiting, crossed = list(here.mapped), dict(here.waiting), False
         poses, moving = poses_of(here), {*scan.moving.tolist(), *here.chains}
-        chains, unplaced = self._roving(here, link, scan, detours, moving, placing=placing)
+        chains, unplaced = self._roving(here, link, scan, detours, moving, initialize=initialize)
         for label, bearing, distance, across, along in _directions(scan):
             if label in moving:
                 continue
@@ -258,7 +224,7 @@ class Smoother:
                 place, sure = ahead(poses[node], bearing, distance), False
                 if passive:
                     waiting[label], place = (*waiting.get(label, ()), heard), None
-                    if placing:
+                    if initialize:
                         place, sure = _placed(here, poses, waiting[label], label, detours)
                 if place is None:
                     continue
@@ -270,8 +236,8 @@ class Smoother:
                     factors.add(self._bearing(earlier, landmark_key(label)))
                 if passive:
                     continue
-            told = (bearing, distance), (across, along)
-            factors.add(self._direction(node, landmark_key(label), *told))
+            row = (bearing, distance), (across, along)
+            factors.add(self._direction(node, landmark_key(label), *row))
         here = replace(here, link=replace(link, crossed=crossed), chains=chains, unplaced=unplaced)
         return self._timed(replace(here, mapped=tuple(mapped), waiting=waiting), detours, moving)
 
@@ -283,11 +249,11 @@ class Smoother:
         detours: tuple[Detour, ...],
         moving: Collection[int],
         *,
-        placing: bool,
+        initialize: bool,
     ) -> tuple[Chains, dict[int, Bearing]]:
-        """Add to a link what a frame tells of callers that move, and of those it places, if it may.
+        """Add to a link the factors of moving callers; with ``initialize``, new callers, too.
 
-        Returns those in the graph, and the bearings of those that are not.
+        Returns the callers in the graph, and the bearings of those that are not.
         """
         chains, unplaced = dict(here.chains), dict(here.unplaced)
         for label, bearing, distance, across, along in _directions(scan) if moving else ():
@@ -297,18 +263,20 @@ class Smoother:
                 place = ahead(here.at.mean, bearing, distance)
                 if math.isnan(distance):
                     unplaced[label] = Bearing(link.node, bearing, across)
-                    place = _by_detour(here, unplaced[label], label, detours) if placing else None
+                    place = (
+                        _by_detour(here, unplaced[label], label, detours) if initialize else None
+                    )
                 if place is None:
                     continue
                 unplaced.pop(label, None)
                 chains[label] = Chain(len(chains), link.node)
                 self._begin(link, chains[label], place)
-            told = (bearing, distance), (across, along)
-            link.factors.add(self._direction(link.node, place_key(chains[label], link.node), *told))
+            row = (bearing, distance), (across, along)
+            link.factors.add(self._direction(link.node, place_key(chains[label], link.node), *row))
         return chains, unplaced
 
     def _begin(self, link: Link, chain: Chain, place: Float[np.ndarray, "2"]) -> None:
-        """Add to a link where a caller enters that moves, how fast, nobody knows."""
+        """Add to a link a new moving caller, of unknown velocity."""
         insert_state(link.values, chain, link.node, np.append(place, np.zeros(2)))
         link.factors.add(_prior(place_key(chain, link.node), place))
         link.factors.add(speed_factor(chain, self.speed_std))
@@ -316,16 +284,16 @@ class Smoother:
     def _timed(
         self, here: SmootherBelief, detours: tuple[Detour, ...], moving: Collection[int]
     ) -> SmootherBelief:
-        """Add the detours to the last link whose ends are both in the graph; the others wait."""
+        """Add the detours whose ends are in the graph to the last link; the others wait."""
         link, known = here.link, set(here.mapped)
-        entering, late = parted((*here.detours, *detours), known, here.chains, moving)
+        entering, late = split_ready((*here.detours, *detours), known, here.chains, moving)
         for factor in detour_factors(entering, robust=self.robust, chains=here.chains):
             link.factors.add(factor)
-        many = sum(one.node < link.node for one in entering) > MANY
+        many = sum(one.node < link.node for one in entering) > RELINEARISE_ABOVE
         return replace(here, link=replace(link, crossed=link.crossed or many), detours=late)
 
     def _bearing(self, heard: Bearing, point: int) -> gtsam.BearingFactor2D:
-        """Return what a bearing says of what has this name in the graph."""
+        """Return the factor of a bearing of the point with this key."""
         noise = self._noise(gtsam.noiseModel.Isotropic.Sigma(1, heard.std))
         keys = pose_key(heard.node), point
         return gtsam.BearingFactor2D(*keys, gtsam.Rot2(heard.bearing), noise)
@@ -333,7 +301,7 @@ class Smoother:
     def _direction(
         self, node: int, point: int, heard: tuple[float, float], std: tuple[float, float]
     ) -> gtsam.BearingRangeFactor2D | gtsam.BearingFactor2D:
-        """Return what a bearing says, and a range, where there is one."""
+        """Return the factor of a bearing, and of its range, where there is one."""
         bearing, distance = heard
         if math.isnan(distance):
             return self._bearing(Bearing(node, bearing, std[0]), point)
@@ -343,15 +311,15 @@ class Smoother:
         )
 
     def _noise(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
-        """Return a noise model, with Huber's loss where that is asked for."""
+        """Return a noise model, with Huber's loss if ``robust``."""
         if not self.robust:
             return noise
-        huber = gtsam.noiseModel.mEstimator.Huber.Create(BELIEVED)
+        huber = gtsam.noiseModel.mEstimator.Huber.Create(HUBER_K)
         return gtsam.noiseModel.Robust.Create(huber, noise)
 
 
 def _directions(scan: Scan) -> Iterator[tuple[int, float, float, float, float]]:
-    """Walk through label, bearing, range and their deviations, but for what is a detour alone."""
+    """Iterate over label, bearing, range and their deviations of the rows that have a bearing."""
     columns = (scan.landmark, scan.bearing, scan.range, scan.bearing_std, scan.range_std)
     for row in zip(*map(np.ndarray.tolist, columns), strict=True):
         if not math.isnan(row[1]):
@@ -365,7 +333,7 @@ def _placed(
     label: int,
     detours: tuple[Detour, ...],
 ) -> tuple[Float[np.ndarray, "2"] | None, bool]:
-    """Return where one stands that was only ever heard, if it shows, and whether by a detour."""
+    """Return the place of a landmark without a range, if known, and whether a detour gave it."""
     place = _by_detour(here, waiting[-1], label, detours)
     return (crossing(poses, waiting), False) if place is None else (place, True)
 
@@ -373,22 +341,25 @@ def _placed(
 def _by_detour(
     here: SmootherBelief, heard: Bearing, label: int, detours: tuple[Detour, ...]
 ) -> Float[np.ndarray, "2"] | None:
-    """Return where one stands by its bearing and the surest of its detours, if any is sure."""
-    known, clues = last_solved(here), clues_of(label, detours, known_of(here.mapped, here.chains))
-    if not clues or known is None:
+    """Return the place of a landmark or caller by its bearing and surest detour, if sure."""
+    known, usable = (
+        last_solved(here),
+        usable_detours(label, detours, labels_in_graph(here.mapped, here.chains)),
+    )
+    if not usable or known is None:
         return None
-    around = Around(
+    last = LastPose(
         isam=here.solver.reach(known),
         node=known.node,
-        leg=None if known is here.link else here.link.leg,
+        odometry=None if known is here.link else here.link.odometry,
         pose=here.at.mean,
         chains=here.chains,
         walk_std=here.walk_std,
     )
-    return placed_by(around, heard, label, clues)
+    return place_by_detours(last, heard, label, usable)
 
 
 def _prior(point: int, place: Float[np.ndarray, "2"]) -> gtsam.PriorFactorPoint2:
-    """Return what is known beforehand of where one stands: next to nothing."""
+    """Return the weak prior of the place where a landmark enters."""
     noise = gtsam.noiseModel.Isotropic.Sigma(2, PRIOR_STD)
     return gtsam.PriorFactorPoint2(point, place, noise)

@@ -1,11 +1,11 @@
-"""The gate: what is outside a share of its predicted distribution is dropped."""
+"""The gate: measurements outside a share of their predicted distribution are dropped."""
 
 import math
 from collections.abc import Collection, Sequence
 
 import gtsam
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import NO_INNOVATIONS, Innovations
@@ -16,10 +16,15 @@ from pipistrelle.estimation.measurement import (
     observe,
 )
 from pipistrelle.estimation.rays import gate_bounds
-from pipistrelle.estimation.smoother.detours import Detour
-from pipistrelle.estimation.smoother.graph import pose_key, pose_of
-from pipistrelle.estimation.smoother.legs import turned
-from pipistrelle.estimation.smoother.roaming import NO_CHAINS, Chains, known_of, point_key
+from pipistrelle.estimation.smoother.caller_motion import (
+    NO_CHAINS,
+    Chains,
+    labels_in_graph,
+    point_key,
+)
+from pipistrelle.estimation.smoother.graph import joint_covariance, pose_key, pose_of
+from pipistrelle.estimation.smoother.preintegration import turned
+from pipistrelle.estimation.smoother.tdoa import Detour
 from pipistrelle.geometry import wrap_angle
 
 
@@ -31,30 +36,14 @@ def rows_inside(
     gate: float,
     chains: Chains = NO_CHAINS,
 ) -> tuple[Bool[np.ndarray, " m"], Innovations]:
-    """Tell of which rows bearing and range are inside, or are of what is new.
+    """Mask of rows that pass the gate or whose landmark is not in the graph; their innovations.
 
-    Parameters
-    ----------
-    isam : ISAM2
-    node : int
-        Number of the pose from which the scan was heard.
-    mapped : collection of int
-        Landmarks in the graph.
-    scan : Scan
-    gate : float
-    chains : mapping of label to Chain
-        Callers that move and are in the graph.
-
-    Returns
-    -------
-    (m)
-        True where a row is but a detour.
-    Innovations
-        Of the rows that are inside, and of nothing new.
+    ``node`` is the number of the pose from which the scan was heard. A row without a bearing
+    passes.
     """
     key = pose_key(node)
     pose = pose_of(isam.calculateEstimatePose2(key))
-    known, bounds = known_of(mapped, chains), gate_bounds(gate)
+    known, bounds = labels_in_graph(mapped, chains), gate_bounds(gate)
     M, inside, off_by = np.eye(5), np.ones(scan.landmark.size, bool), NO_INNOVATIONS
     M[:3, :3] = turned(pose[2])
     for m, label in enumerate(scan.landmark.tolist()):
@@ -62,7 +51,7 @@ def rows_inside(
             continue
         other = point_key(label, node, chains)
         point = np.array(isam.calculateEstimatePoint2(other))
-        joint = _joint(isam, key, other)
+        joint = joint_covariance(isam, key, other)
         near, expected, _, _, _ = observe(*pose, *point)
         H = np.hstack(measurement_jacobians(pose, point)) @ M
         off = np.array([scan.range[m] - near, wrap_angle(scan.bearing[m] - expected)])
@@ -83,27 +72,12 @@ def detours_inside(
     gate: float,
     chains: Chains = NO_CHAINS,
 ) -> tuple[Detour, ...]:
-    """Return those detours that are inside, or whose landmark or caller is new.
+    """Return the detours that pass the gate, or whose landmark or caller is not in the graph.
 
-    Each is judged by itself, not with the bearing of its row: what is wrong with one, a direct call
-    that was another sound, is nothing to the other.
-
-    Parameters
-    ----------
-    isam : ISAM2
-    mapped : collection of int
-        Landmarks in the graph.
-    heard : sequence of Detour
-        All from one pose.
-    gate : float
-    chains : mapping of label to Chain
-        Callers that move and are in the graph.
-
-    Returns
-    -------
-    tuple of Detour
+    Each is judged alone, not with the bearing of its row: an error of one, such as a wrong direct
+    call, says nothing about the other. All are heard from one pose.
     """
-    known, bound = known_of(mapped, chains), gate_bounds(gate)[0]
+    known, bound = labels_in_graph(mapped, chains), gate_bounds(gate)[0]
     return tuple(
         one
         for one in heard
@@ -113,7 +87,7 @@ def detours_inside(
 
 
 def _surprise(isam: gtsam.ISAM2, one: Detour, chains: Chains) -> float:
-    """Return the squared distance of a detour from what is expected, in its variances."""
+    """Return the squared innovation of a detour divided by its variance."""
     ends = [point_key(end, one.node, chains) for end in (one.landmark, one.caller)]
     keys = pose_key(one.node), *ends
     pose = pose_of(isam.calculateEstimatePose2(keys[0]))
@@ -121,10 +95,4 @@ def _surprise(isam: gtsam.ISAM2, one: Detour, chains: Chains) -> float:
     by_pose, *by_points = detour_jacobians(pose[:2], *points)
     H = np.concatenate([by_pose @ turned(pose[2])[:2, :2], [0.0], *by_points])
     off = one.detour - detour_of(pose[:2], *points)
-    return off**2 / float(H @ _joint(isam, *keys) @ H + one.std**2)
-
-
-def _joint(isam: gtsam.ISAM2, *keys: int) -> Float[np.ndarray, "d d"]:
-    """Return the covariance of some variables together, a pose's in its own axes."""
-    told = isam.jointMarginalCovariance(list(keys))
-    return np.block([[told.at(a, b) for b in keys] for a in keys])
+    return off**2 / float(H @ joint_covariance(isam, *keys) @ H + one.std**2)

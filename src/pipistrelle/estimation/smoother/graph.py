@@ -1,8 +1,8 @@
-"""The graph: poses and landmarks with all that is known of them, solved by GTSAM's iSAM2.
+"""The graph of poses and landmarks, with all factors, solved by GTSAM's iSAM2.
 
-What entered it is a chain, each link what one frame added to the one before, and never changed: a
-belief is a link. The solver itself changes; it stands at one link, goes on to the next as frames
-come, and is built anew where it is asked for a link that it has left behind.
+What entered it is a chain: each link holds what one frame added, and is never changed; a belief is
+a link. The solver does change: it is at one link, goes on to the next as frames come, and is built
+anew where it is asked for a link that it has passed.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -15,52 +15,37 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.estimation.beliefs import Gaussian
-from pipistrelle.estimation.smoother.legs import SMALLEST_STD, Leg, symmetric, turned
+from pipistrelle.estimation.smoother.preintegration import SMALLEST_STD, Odometry, symmetric, turned
 
 T = TypeVar("T")
-RELINEARIZE = 0.1
-"""Change of a variable [m, rad] beyond which iSAM2 linearises anew what hangs on it."""
-ANEW = 5
-"""Times that all is linearised anew where bearings enter that had waited: many of them enter at
-once, from poses that they correct, and a graph that was linearised before may never recover.
-Without it logs of bearings of 0.003 rad are lost (`test_recorded`); in twelve worlds heard by sound
-it changes nothing."""
+RELINEARISE_THRESHOLD = 0.1
+"""Change of a variable [m, rad] beyond which iSAM2 relinearises its factors."""
+RELINEARISE_PASSES = 5
+"""How often everything is relinearised where waiting bearings enter: many of them enter at once,
+from poses that they correct, and a graph that was linearised before may never recover. Without it
+logs of bearings of 0.003 rad are lost (`test_recorded`); in twelve worlds heard by sound it changes
+nothing."""
 CONVERGED = 1e-7
-"""Change of the squared error, and its share of it, under which the optimum is reached."""
+"""Change of the squared error, absolute and relative, under which the optimum is reached."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Link:
-    """What one frame added to a graph.
-
-    Attributes
-    ----------
-    before : Link or None
-    node : int
-        Number of the pose from which the frame was heard.
-    leg : Leg or None
-        The way to it, where it is new.
-    factors : NonlinearFactorGraph
-    values : Values
-        Where what is new is thought to be.
-    thorough : bool
-        Whether to solve by QR factors, which cost twice as much as Cholesky's, for these were too
-        coarse: some noise is so small beside another.
-    crossed : bool
-        Whether bearings entered that had waited, or many detours.
-    """
+    """What one frame added to a graph."""
 
     before: "Link | None"
-    node: int
-    leg: Leg | None
+    node: int  # number of the pose from which the frame was heard
+    odometry: Odometry | None  # the steps to it, where the pose is new
     factors: gtsam.NonlinearFactorGraph
-    values: gtsam.Values
+    values: gtsam.Values  # initial estimates of what is new
     thorough: bool = False
-    crossed: bool = False
+    """Whether to solve by QR, which costs twice as much as Cholesky and is needed where some noise
+    is very small beside another."""
+    crossed: bool = False  # whether waiting bearings entered, or many detours
 
 
 def links(last: Link) -> Iterator[Link]:
-    """Walk through a chain, the first link first."""
+    """Return a chain's links, the first one first."""
     chain: list[Link] = []
     link: Link | None = last
     while link:
@@ -80,10 +65,7 @@ class Solver:
     def reach(self, link: Link) -> gtsam.ISAM2:
         """Return iSAM2 as it is after a link.
 
-        Raises
-        ------
-        RuntimeError
-            Where the link makes a graph that cannot be solved; the solver then stands nowhere.
+        It raises RuntimeError where the graph cannot be solved; the solver is then at no link.
         """
         isam, at = self.isam, self.at
         if isam is None or at is not link:
@@ -93,7 +75,7 @@ class Solver:
             self.isam, self.at = isam, None
             for step in way:
                 isam.update(step.factors, step.values)
-                for _ in range(ANEW if step.crossed else 0):
+                for _ in range(RELINEARISE_PASSES if step.crossed else 0):
                     isam.update(force_relinearize=True)
                 isam.calculateEstimatePose2(pose_key(step.node))  # what is asked changes it
             self.at = link
@@ -110,37 +92,29 @@ class Solver:
 
 
 def _new(thorough: bool) -> gtsam.ISAM2:
-    """Return a solver that knows nothing."""
+    """Return an empty solver."""
     settings = gtsam.ISAM2Params()
-    settings.setRelinearizeThreshold(RELINEARIZE)
+    settings.setRelinearizeThreshold(RELINEARISE_THRESHOLD)
     settings.setFactorization(_factors(thorough))
     return gtsam.ISAM2(settings)
 
 
 def _factors(thorough: bool) -> str:
-    """Return what solves a linear system, as GTSAM names it."""
+    """Return GTSAM's name of the factorisation."""
     return "QR" if thorough else "CHOLESKY"
 
 
 @dataclass(kw_only=True)
 class Best:
-    """The most likely poses and landmarks, all linearised where they are, and their covariances.
-
-    Attributes
-    ----------
-    link : Link
-    graph : NonlinearFactorGraph
-    found : Values
-        Where iSAM2 thinks them: Levenberg and Marquardt begin there.
-    """
+    """The most likely poses and landmarks, linearised at the optimum, and their covariances."""
 
     link: Link
     graph: gtsam.NonlinearFactorGraph
-    found: gtsam.Values
+    found: gtsam.Values  # iSAM2's estimate, where Levenberg-Marquardt begins
 
     @cached_property
     def values(self) -> gtsam.Values:
-        """Return the optimum, or what iSAM2 found where none can be reached from there."""
+        """Return the optimum, or iSAM2's estimate where the optimiser fails."""
         settings = gtsam.LevenbergMarquardtParams()
         settings.setLinearSolverType(f"MULTIFRONTAL_{_factors(self.link.thorough)}")
         settings.setRelativeErrorTol(CONVERGED)
@@ -152,17 +126,17 @@ class Best:
 
     @cached_property
     def there(self) -> gtsam.ISAM2:
-        """Return what tells covariances at the optimum."""
+        """Return the solver for covariances at the optimum."""
         return self._solver(thorough=self.link.thorough)
 
     def _solver(self, *, thorough: bool) -> gtsam.ISAM2:
-        """Return all of the graph, linearised at the optimum."""
+        """Return a solver of the whole graph, linearised at the optimum."""
         isam = _new(thorough)
         isam.update(self.graph, self.values)
         return isam
 
     def _asked(self, question: Callable[[gtsam.ISAM2], T]) -> T:
-        """Ask for covariances, by QR factors where Cholesky's are too coarse (`Link.thorough`)."""
+        """Ask for covariances, by QR where Cholesky fails (`Link.thorough`)."""
         try:
             return question(self.there)
         except RuntimeError:
@@ -170,11 +144,11 @@ class Best:
             return question(self.there)
 
     def _covariance(self, key: int) -> Float[np.ndarray, "d d"]:
-        """Return the covariance of a pose or a point by its name in the graph."""
+        """Return the covariance of a pose or a point by its key."""
         return self._asked(lambda isam: isam.marginalCovariance(key))
 
     def pose_mean(self, node: int) -> Float[np.ndarray, "3"]:
-        """Return where a pose is."""
+        """Return the mean of a pose."""
         return pose_of(self.values.atPose2(pose_key(node)))
 
     def pose(self, node: int) -> Gaussian:
@@ -187,59 +161,65 @@ class Best:
         return self.place(landmark_key(label))
 
     def place(self, key: int) -> Gaussian:
-        """Return a landmark or a caller's place by its name in the graph, (2) and (2, 2)."""
+        """Return a landmark or a caller's place by its key, (2) and (2, 2)."""
         mean = np.array(self.values.atPoint2(key))
         return Gaussian(mean=mean, covariance=symmetric(self._covariance(key)))
 
     def joint(self, node: int, other: int) -> Float[np.ndarray, "6 6"]:
-        """Return the covariance of two poses."""
+        """Return the joint covariance of two poses."""
         keys = pose_key(node), pose_key(other)
-        joint = self._asked(lambda isam: isam.jointMarginalCovariance(list(keys)))
+        joint = self._asked(lambda isam: joint_covariance(isam, *keys))
         M = np.zeros((6, 6))
         for part, key in enumerate(keys):
             rows = slice(3 * part, 3 * part + 3)
             M[rows, rows] = turned(self.values.atPose2(key).theta())
-        return M @ np.block([[joint.at(a, b) for b in keys] for a in keys]) @ M.T
+        return M @ joint @ M.T
+
+
+def joint_covariance(isam: gtsam.ISAM2, *keys: int) -> Float[np.ndarray, "d d"]:
+    """Return the joint covariance of some variables, a pose's in its own axes."""
+    joint = isam.jointMarginalCovariance(list(keys))
+    return np.block([[joint.at(a, b) for b in keys] for a in keys])
 
 
 def pose_key(node: int) -> int:
-    """Name a pose in the graph."""
+    """Key of a pose in the graph."""
     return gtsam.symbol("x", node)
 
 
 def landmark_key(label: int) -> int:
-    """Name a landmark in the graph."""
+    """Key of a landmark in the graph."""
     return gtsam.symbol("l", label)
 
 
 def pose_of(pose: gtsam.Pose2) -> Float[np.ndarray, "3"]:
-    """Return GTSAM's pose as ours [m, m, rad]."""
+    """Return GTSAM's pose as an array [m, m, rad]."""
     return np.array([pose.x(), pose.y(), pose.theta()])
 
 
 def in_world(mean: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"]) -> Gaussian:
-    """Return a pose whose covariance is told in its own axes, as GTSAM does."""
+    """Return a pose whose covariance GTSAM gives in its own axes."""
     M = turned(mean[2])
     return Gaussian(mean=mean, covariance=symmetric(M @ covariance @ M.T))
 
 
 def start_factor(node: int, pose: Gaussian) -> gtsam.PriorFactorPose2:
-    """Return what is known of a pose (3) and (3, 3) beforehand."""
+    """Return the prior of a pose (3) and (3, 3)."""
     M = turned(pose.mean[2])
     return gtsam.PriorFactorPose2(
         pose_key(node), gtsam.Pose2(*pose.mean), _gaussian(M.T @ pose.covariance @ M)
     )
 
 
-def leg_factor(node: int, leg: Leg) -> gtsam.BetweenFactorPose2:
-    """Return what the controls say of the way from the pose before to this one."""
-    M = turned(leg.mean[-1, 2])
-    noise = _gaussian(M.T @ leg.covariance[-1] @ M)
+def odometry_factor(node: int, odometry: Odometry) -> gtsam.BetweenFactorPose2:
+    """Return the factor of the odometry between the pose before and this one."""
+    M = turned(odometry.mean[-1, 2])
+    noise = _gaussian(M.T @ odometry.covariance[-1] @ M)
     return gtsam.BetweenFactorPose2(
-        pose_key(node - 1), pose_key(node), gtsam.Pose2(*leg.mean[-1]), noise
+        pose_key(node - 1), pose_key(node), gtsam.Pose2(*odometry.mean[-1]), noise
     )
 
 
 def _gaussian(covariance: Float[np.ndarray, "3 3"]) -> gtsam.noiseModel.Gaussian:
-    """Return a noise model, which must have an inverse; GTSAM may not drop small correlations."""
+    """Return a noise model: it needs an inverse, and GTSAM must not drop small correlations."""
     return gtsam.noiseModel.Gaussian.Covariance(covariance + SMALLEST_STD**2 * np.eye(3), False)

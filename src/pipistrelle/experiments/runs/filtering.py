@@ -14,20 +14,17 @@ from pipistrelle.config import InputError
 from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.noise import Noise, as_said
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.association import Associate, told
+from pipistrelle.estimation.association import Associate, known_labels
 from pipistrelle.estimation.beliefs import (
     NO_INNOVATIONS,
+    AcceptsMap,
     B,
     Belief,
     Estimator,
-    Following,
     Gaussian,
-    Informed,
     Innovations,
-    ParticleCloud,
-    Retracing,
     Track,
-    Trajectory,
+    answer,
     in_sight,
 )
 from pipistrelle.estimation.checking import usable_scan
@@ -40,16 +37,16 @@ def run_filter(
     scans: Sequence[Scan],
     rng: np.random.Generator,
     *,
-    associate: Associate = told,
+    associate: Associate = known_labels,
     noise: Noise = as_said,
     progress: Callable[[int, int], None] | None = None,
     watch: Callable[[Scan, B], None] | None = None,
 ) -> Track:
     """Predict to each scan, say who is who in it, update with it, and keep the pose of every step.
 
-    Where the belief revises its path (`Trajectory`), the track is the path as it is believed at
+    Where the belief revises its path (it has ``path``), the track is the path as it is believed at
     the end, and the poses that were kept are beside it. Where it revises those of callers, too
-    (`Retracing`), they are likewise.
+    (``tracks``), they are likewise.
 
     Parameters
     ----------
@@ -87,7 +84,9 @@ def run_filter(
         if k > done:
             belief = _carried(estimator, belief, drive, slice(done, k), rng, path)
             done = k
-        named = usable_scan(scan if associate is told else _named(scan, belief, associate, noise))
+        named = usable_scan(
+            scan if associate is known_labels else _named(scan, belief, associate, noise)
+        )
         belief = estimator.update(belief, named, rng)
         pose = belief.pose()
         path.mean[k], path.covariance[k] = pose.mean, pose.covariance
@@ -100,16 +99,16 @@ def run_filter(
         left = slice(done, len(drive.controls))
         belief = _carried(estimator, belief, drive, left, rng, path)
     online = replace(path, invariant=belief.pose().invariant)
-    cloud = belief if isinstance(belief, ParticleCloud) else None
-    revised = _whole("path", belief.path(), time.size) if isinstance(belief, Trajectory) else None
+    revised, cloud = answer(belief, "path"), answer(belief, "cloud")
+    revised = _whole("path", revised, time.size) if revised is not None else None
     return Track(
         time=time,
         pose=revised or online,
         landmarks=belief.landmarks(),
         gated=belief.gated,
         innovations=_innovations(belief),
-        cloud=cloud.cloud() if cloud else None,
-        full=cloud.full if cloud else None,
+        cloud=cloud,
+        full=None if cloud is None else getattr(belief, "full", None),
         online=online if revised else None,
         callers=_retraced(callers, belief, time.size),
     )
@@ -151,16 +150,17 @@ def _first_belief(estimator: Estimator[B], drive: Drive, scans: Sequence[Scan]) 
         raise InputError(
             f"landmarks known beforehand: found {roving}, which move; expected some that stand"
         )
-    if drive.known.landmark.size and isinstance(estimator, Informed):
+    if drive.known.landmark.size and isinstance(estimator, AcceptsMap):
         belief = estimator.knowing(belief, drive.known)
     return belief
 
 
 def _follow(callers: dict[int, Gaussian], scan: Scan, belief: Belief, at: tuple[int, int]) -> None:
     """Note where callers that move are at step k of so many, those that are in sight."""
-    if scan.moving.size == 0 or not isinstance(belief, Following):
+    found, (k, steps) = answer(belief, "moving") if scan.moving.size else None, at
+    if found is None:
         return
-    moving, (k, steps) = in_sight(belief.moving()), at
+    moving = in_sight(found)
     for row in range(moving.landmark.size):
         nowhere = Gaussian(mean=np.full((steps, 2), nan), covariance=np.full((steps, 2, 2), nan))
         track = callers.setdefault(int(moving.landmark[row]), nowhere)
@@ -169,9 +169,10 @@ def _follow(callers: dict[int, Gaussian], scan: Scan, belief: Belief, at: tuple[
 
 def _retraced(callers: dict[int, Gaussian], belief: Belief, steps: int) -> Mapping[int, Gaussian]:
     """Return the tracks of callers as a belief has them at the end, where it revises them."""
-    if not callers or not isinstance(belief, Retracing):
+    revised = answer(belief, "tracks") if callers else None
+    if revised is None:
         return callers
-    tracks = dict(belief.tracks())
+    tracks = dict(revised)
     for label, track in tracks.items():
         found, expected = (np.shape(track.mean), np.shape(track.covariance)), (steps, 2)
         if found != (expected, (*expected, 2)):

@@ -16,7 +16,7 @@ from pipistrelle.detection.faces import Heard
 from pipistrelle.detection.merging import scan_of
 from pipistrelle.detection.noise import as_told, noise_of
 from pipistrelle.detection.scans import Scan, rows_of
-from pipistrelle.estimation.association import Associate, told
+from pipistrelle.estimation.association import Associate, known_labels
 from pipistrelle.estimation.beliefs import Belief, Gaussian, at_steps
 from pipistrelle.estimation.catalogue import CATALOGUE, entry, short_name
 from pipistrelle.evaluation.bound import bound_of_drawn_start
@@ -244,7 +244,7 @@ def run_trial(
     scans: Sequence[Scan],
     config: Config,
     *,
-    associate: Associate = told,
+    associate: Associate = known_labels,
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> TrialResult:
@@ -295,7 +295,7 @@ def run_trial(
     )
     wall_s = kernel_clock.wall_s() - began
     track = at_steps(track, steps)
-    truth = drive.truth if associate is told else replace(drive.truth, landmarks=None)
+    truth = drive.truth if associate is known_labels else replace(drive.truth, landmarks=None)
     scores = score(track, truth, had, known.nees_limit)
     return TrialResult(
         strategy=strategy,

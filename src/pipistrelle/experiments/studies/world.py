@@ -18,7 +18,7 @@ from pipistrelle.acoustics.emitter import beamwidth_of
 from pipistrelle.config import Config, FilterConfig, ListeningConfig, Strategy
 from pipistrelle.detection.faces import Heard
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.beliefs import Track, Trajectory
+from pipistrelle.estimation.beliefs import Track
 from pipistrelle.estimation.catalogue import SECTIONS
 from pipistrelle.evaluation.accuracy import (
     heaviest,
@@ -264,7 +264,7 @@ def _online_columns(plan: Plan) -> tuple[str, ...]:
     """Name the columns that a plan has only if one of its filters revises its path."""
     motion = motion_of(plan.config.motion)
     for name in plan.filters:
-        if isinstance(first_belief(name, motion, plan.config), Trajectory):
+        if hasattr(first_belief(name, motion, plan.config), "path"):
             return tuple(f"online_{score}" for score in ONLINE)
     return ()
 

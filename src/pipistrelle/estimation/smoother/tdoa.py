@@ -1,22 +1,22 @@
-r"""Detours in the graph: one factor for all that a frame tells of them, and detours that wait.
+r"""Detours in the graph: one factor for all detours of a frame, and detours that wait.
 
 A detour :math:`e = |b - l| + |l - p| - |b - p|` is a factor between the pose from which it was
-heard, the landmark l and the caller b, which is a landmark of the graph too. GTSAM has none such,
-so it calls us back. It does so once for a frame: a factor holds all its detours, and a kernel works
-out their misfits and slopes together. A factor for each detour says the same and calls back twenty
-times as often. Nothing is filled in that would be empty else: what was heard from one pose hangs
-together anyway once the solver has eliminated the pose.
+heard, the landmark l and the caller b, which is a landmark of the graph, too. GTSAM has no such
+factor, so it calls Python back. It does so once for a frame: a factor holds all its detours, and a
+kernel computes their errors and slopes together. A factor for each detour gives the same and calls
+back twenty times as often. The graph gets no denser: what was heard from one pose is connected
+anyway once the solver has eliminated the pose.
 
-Huber's loss is taken of each detour by itself, within the factor. As in GTSAM, an error is
-:math:`\sqrt{2 \rho(z)}` for whom asks how well all fits, and :math:`\sqrt{w} z` with
-:math:`\sqrt{w} J` for whom asks for slopes, with
+Huber's loss is taken of each detour alone, within the factor. As in GTSAM, an error is
+:math:`\sqrt{2 \rho(z)}` where the total error is asked, and :math:`\sqrt{w} z` with
+:math:`\sqrt{w} J` where slopes are asked, with
 
 .. math:: z = \frac{e - \hat e}{\sigma}, \quad w = \min(1, k / |z|), \quad
           \rho = \tfrac12 z^2 \text{ or } k |z| - \tfrac12 k^2 .
 
-A detour whose landmark or caller is not in the graph yet waits (`Detour`), and enters when both
-are. No more than `MOST` wait: beyond, the oldest are dropped. Where landmark or caller moves, the
-factor is of its place at that pose (`roaming`), and a detour from before it was placed is dropped.
+A detour waits until its landmark and its caller are in the graph (`Detour`). At most `MAX_WAITING`
+wait; the oldest are dropped. Where landmark or caller moves, the factor is of its place at that
+pose (`caller_motion`), and a detour from before it was placed is dropped.
 """
 
 import math
@@ -30,28 +30,28 @@ from jaxtyping import Float, Int
 
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.measurement import (
-    BELIEVED,
+    HUBER_K,
     columns_of,
     detour_slopes,
     detours,
     timings_of,
 )
-from pipistrelle.estimation.smoother.graph import pose_key
-from pipistrelle.estimation.smoother.roaming import (
+from pipistrelle.estimation.smoother.caller_motion import (
     NO_CHAINS,
     Chains,
     is_there,
-    known_of,
+    labels_in_graph,
     point_key,
 )
+from pipistrelle.estimation.smoother.graph import pose_key
 from pipistrelle.jit import kernel
 
-MOST = 1000
-"""Detours that may wait: those of some fifty frames."""
+MAX_WAITING = 1000
+"""How many detours may wait: those of some fifty frames."""
 
 
 class Detour(NamedTuple):
-    """What was heard of a detour: from which pose, over which landmark, of whose call [m]."""
+    """A detour: the pose from which it was heard, its landmark and caller, detour and std [m]."""
 
     node: int
     landmark: int
@@ -61,20 +61,8 @@ class Detour(NamedTuple):
 
 
 def detours_of(scan: Scan, node: int) -> tuple[Detour, ...]:
-    """Return the detours of a scan that was heard from a pose.
+    """Return the detours of a scan that was heard from pose number ``node``.
 
-    Parameters
-    ----------
-    scan : Scan
-    node : int
-        Number of the pose.
-
-    Returns
-    -------
-    tuple of Detour
-
-    Examples
-    --------
     >>> from dataclasses import replace
     >>> from pipistrelle.detection.scans import make_scan
     >>> timed = {"caller": 1, "detour": 3.0, "detour_std": 0.5}
@@ -90,82 +78,51 @@ def detours_of(scan: Scan, node: int) -> tuple[Detour, ...]:
     return tuple(Detour(node, *row) for row in zip(*map(np.ndarray.tolist, columns), strict=True))
 
 
-def parted(
+def split_ready(
     heard: Iterable[Detour],
     mapped: Collection[int],
     chains: Chains = NO_CHAINS,
     moving: Collection[int] = (),
 ) -> tuple[tuple[Detour, ...], tuple[Detour, ...]]:
-    """Part detours that may enter the graph from those that wait, of which the newest are kept.
+    """Separate detours that may enter the graph from those that wait, of which the newest are kept.
 
-    Parameters
-    ----------
-    heard : iterable of Detour
-        The newest last.
-    mapped : collection of int
-        Landmarks in the graph.
-    chains : mapping of label to Chain
-        Callers that move and are in the graph.
-    moving : collection of int
-        Labels of all who move; what tells of one when it was not in the graph is dropped.
+    The newest is the last. A detour of a caller in ``moving`` from before it was placed is dropped.
 
-    Returns
-    -------
-    entering, waiting : tuple of Detour
-        In the order in which they were heard.
-
-    Examples
-    --------
     >>> heard = [Detour(0, 4, 9, 3.0, 0.5), Detour(1, 5, 9, 2.0, 0.5)]
-    >>> [[one.landmark for one in part] for part in parted(heard, {4, 9})]
+    >>> [[one.landmark for one in part] for part in split_ready(heard, {4, 9})]
     [[4], [5]]
     """
-    entering, waiting, known = [], [], known_of(mapped, chains)
+    entering, waiting, known = [], [], labels_in_graph(mapped, chains)
     for one in heard:
         ends = one.landmark, one.caller
         if moving and any(end in moving and not is_there(end, one.node, chains) for end in ends):
             continue
         ready = one.landmark in known and one.caller in known
         (entering if ready else waiting).append(one)
-    return tuple(entering), tuple(waiting[-MOST:])
+    return tuple(entering), tuple(waiting[-MAX_WAITING:])
 
 
 def detour_factors(
     heard: Iterable[Detour], *, robust: bool, chains: Chains = NO_CHAINS
 ) -> list[gtsam.CustomFactor]:
-    """Return what detours say: a factor for those that were heard from one pose.
+    """Return a factor for all detours of each pose; those of one pose follow one another.
 
-    Parameters
-    ----------
-    heard : iterable of Detour
-        Those of one pose follow one another.
-    robust : bool
-        Whether one that surprises counts less.
-    chains : mapping of label to Chain
-        Callers that move.
-
-    Returns
-    -------
-    list of CustomFactor
-
-    Examples
-    --------
     >>> heard = [Detour(0, 4, 9, 3.0, 0.5), Detour(0, 5, 9, 2.0, 0.5), Detour(3, 4, 9, 2.0, 0.5)]
     >>> [len(factor.keys()) for factor in detour_factors(heard, robust=False)]
     [4, 3]
     """
     return [
-        _factor(node, list(rows), BELIEVED if robust else math.inf, chains)
+        _factor(node, list(rows), HUBER_K if robust else math.inf, chains)
         for node, rows in groupby(heard, key=lambda one: one.node)
     ]
 
 
 def _factor(node: int, rows: list[Detour], believed: float, chains: Chains) -> gtsam.CustomFactor:
-    """Return the factor of detours that were heard from one pose."""
+    """Return the factor of the detours that were heard from one pose."""
     points = sorted({one.landmark for one in rows} | {one.caller for one in rows})
     place = {label: k for k, label in enumerate(points)}
     ends = np.array([[place[one.landmark], place[one.caller]] for one in rows], dtype=np.int64)
-    told = np.array([[one.detour, one.std] for one in rows])
+    measured = np.array([[one.detour, one.std] for one in rows])
     vehicle, others = pose_key(node), [point_key(label, node, chains) for label in points]
 
     def misfit(
@@ -175,8 +132,8 @@ def _factor(node: int, rows: list[Detour], believed: float, chains: Chains) -> g
         places = np.concatenate(list(map(values.atPoint2, others))).reshape(-1, 2)
         at = pose.x(), pose.y(), pose.theta()
         if slopes is None:
-            return losses(at, places, ends, told, believed)
-        r, by_pose, by_place = misfits(at, places, ends, told, believed)
+            return huber_errors(at, places, ends, measured, believed)
+        r, by_pose, by_place = misfits(at, places, ends, measured, believed)
         slopes[:] = gtsam.JacobianVector([by_pose, *by_place])  # one by one takes twice as long
         return r
 
@@ -184,23 +141,23 @@ def _factor(node: int, rows: list[Detour], believed: float, chains: Chains) -> g
 
 
 @kernel
-def losses(
+def huber_errors(
     at: tuple[float, float, float],
     places: Float[np.ndarray, "n 2"],
     ends: Int[np.ndarray, "d 2"],
-    told: Float[np.ndarray, "d 2"],
+    measured: Float[np.ndarray, "d 2"],
     believed: float,
 ) -> Float[np.ndarray, " d"]:
-    """Roots of what detours lose, twice over, with the sign of their misfits.
+    """Roots of twice Huber's loss of each detour, with the sign of its error.
 
     ``at`` is the pose; the rows of ``ends`` number landmark and caller among the places, those of
-    ``told`` are the detour and its standard deviation.
+    ``measured`` are the detour and its standard deviation.
     """
     r = np.empty(len(ends))
     for i in range(len(ends)):
         (px, py), (bx, by) = places[ends[i, 0]], places[ends[i, 1]]
         expected, _, _, _, _ = detour_slopes(at[0], at[1], px, py, bx, by)
-        z = (expected - told[i, 0]) / told[i, 1]
+        z = (expected - measured[i, 0]) / measured[i, 1]
         far = abs(z)
         r[i] = z if far <= believed else z / far * math.sqrt(believed * (2.0 * far - believed))
     return r
@@ -211,10 +168,10 @@ def misfits(
     at: tuple[float, float, float],
     places: Float[np.ndarray, "n 2"],
     ends: Int[np.ndarray, "d 2"],
-    told: Float[np.ndarray, "d 2"],
+    measured: Float[np.ndarray, "d 2"],
     believed: float,
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d 3"], Float[np.ndarray, "n d 2"]]:
-    """Misfits of detours and their slopes, weighted as Huber's loss has it; see `losses`.
+    """Errors of detours and their slopes, weighted by Huber's rule; arguments as `huber_errors`.
 
     The slopes are by the pose, in its own axes, and by each place.
     """
@@ -224,9 +181,9 @@ def misfits(
         landmark, caller = ends[i]
         (px, py), (bx, by) = places[landmark], places[caller]
         expected, u, v, p, q = detour_slopes(at[0], at[1], px, py, bx, by)
-        z = (expected - told[i, 0]) / told[i, 1]
+        z = (expected - measured[i, 0]) / measured[i, 1]
         less = math.sqrt(believed / abs(z)) if abs(z) > believed else 1.0
-        r[i], scale = less * z, less / told[i, 1]
+        r[i], scale = less * z, less / measured[i, 1]
         u, v, p, q = scale * u, scale * v, scale * p, scale * q
         by_place[landmark, i], by_place[caller, i] = (u, v), (p, q)
         by_pose[i, 0] = -c * (u + p) - s * (v + q)

@@ -1,15 +1,15 @@
-r"""Detours in one Gaussian: when an echo of another's call came, not only whence.
+r"""Time difference of arrival: what one detour says about a Gaussian.
 
-A detour :math:`e = |b - l| + |l - p| - |b - p|` binds the vehicle p, the landmark l and the caller
-b, each a part of the state, and asks nothing of the heading. With :math:`e_l, e_b` its slopes by
-landmark and caller, and :math:`e_p = -e_l - e_b`,
+A detour :math:`e = |b - l| + |l - p| - |b - p|` links the vehicle p, the landmark l and the caller
+b, all parts of the state; the heading does not enter. With its slopes :math:`e_l, e_b` by landmark
+and caller, and :math:`e_p = -e_l - e_b`,
 
 - it **corrects** all three where landmark and caller are placed (`correct_detour`), to second
-  order: a way of length L of which the variance across is t is longer by :math:`t / 2L` than its
-  means say, which is known to the square of that (Bar-Shalom, Li & Kirubarajan 2001,
-  Sec. 10.3.2): what has just been placed is unsure of its ways;
-- it **places** one of the two that is new or a ray, x, by the other, y, which is placed: with the
-  bearing, whose direction is u, there is one range r in closed form
+  order: a path of length L with the variance t across it is longer by :math:`t / 2L` than that of
+  its means, with the square of that as variance (Bar-Shalom, Li & Kirubarajan 2001,
+  Sec. 10.3.2);
+- it **places** a new landmark or a ray x by the other end y, which is placed: with the direction u
+  of the bearing there is one range r in closed form
   (`pipistrelle.estimation.measurement.landmark_range`), and
 
   .. math:: dx = dp + u\, a^T (dy - dp) + q\,(d\theta + d\phi) + \frac{u}{k} de, \quad
@@ -17,11 +17,12 @@ landmark and caller, and :math:`e_p = -e_l - e_b`,
             q = r \left( u_\perp - u \frac{e_x \cdot u_\perp}{k} \right)
 
   correlates it with the caller as with the vehicle (`place_by_detour`). Between vehicle and caller
-  k vanishes, and the range is anybody's guess: it must be known to a tenth of itself, and the
-  detour be surely one (`SOME`), for any error of none has a range, and seems sure;
+  k vanishes and the range is undetermined. So its standard deviation must be at most a tenth of
+  it, and the detour must be clearly above 0 (`MIN_TDOA_SIGMAS`): a detour of 0 with an error has a
+  range, too, which only seems sure;
 - else it **weighs** the members of a ray (`weigh_by_detour`).
 
-Between two rays a detour says nothing: a pair of members fits any.
+Between two rays a detour is not used: some pair of members fits any value.
 """
 
 import math
@@ -32,7 +33,7 @@ from jaxtyping import Float
 from pipistrelle.estimation.ekf.gaussian import (
     APPLIED,
     GATED,
-    MOST_WAITING,
+    MAX_WAITING,
     WAITING,
     Joint,
     State,
@@ -42,9 +43,9 @@ from pipistrelle.estimation.ekf.gaussian import (
     retract,
 )
 from pipistrelle.estimation.measurement import (
-    BELIEVED,
+    HUBER_K,
+    MIN_TDOA_SIGMAS,
     NEAREST,
-    SOME,
     caller_range_by_detour,
     detour_slopes,
     range_by_detour,
@@ -52,13 +53,14 @@ from pipistrelle.estimation.measurement import (
 from pipistrelle.estimation.rays import log_likelihood
 from pipistrelle.jit import Flag, Whole, no_alloc
 
-SURE = 0.1
-"""Largest standard deviation of a range by which a detour places a point, as a share of it."""
+MAX_RELATIVE_RANGE_STD = 0.1
+"""A detour places a point if the range has at most this standard deviation, divided by the
+range."""
 
 
 @no_alloc
 def _bend(dx: float, dy: float, xx: float, xy: float, yy: float) -> float:
-    """Variance across a way of which the covariance is known, over its length."""
+    """Variance perpendicular to a segment (dx, dy), divided by its length."""
     square = dx * dx + dy * dy
     across = dy * dy * xx - 2.0 * dx * dy * xy + dx * dx * yy
     return max(across, 0.0) / max(square * math.sqrt(square), NEAREST**3)
@@ -85,7 +87,7 @@ def _expected(
 
 @no_alloc
 def _bends(joint: Joint, size: Whole, i: Whole, ib: Whole) -> tuple[float, float]:
-    """How much longer the detour is to second order, and how much larger its variance, at most."""
+    """Second-order bias of the detour, and an upper bound of the variance that goes with it."""
     mean, p0, p1 = joint.mean, joint.covariance[0], joint.covariance[1]
     li, lj = point_rows(joint, size, i)
     bi, bj = point_rows(joint, size, ib)
@@ -116,18 +118,18 @@ def correct_detour(
     bound: float,
     robust: bool,
 ) -> Whole:
-    """Correct with a detour over the point at index i, its caller at ib; GATED beyond the bound.
+    """Correct with a detour over the point at index i of the caller at ib; GATED or APPLIED.
 
-    ``robust``: one that surprises counts less, as `estimation.ekf.huber` says.
+    ``robust`` raises its variance by Huber's rule.
     """
-    if joint.taken[WAITING] == MOST_WAITING:
+    if joint.taken[WAITING] == MAX_WAITING:
         flush(joint, size)
     w = joint.W[joint.taken[WAITING]]
     expected, spread = _expected(joint, size, i, ib, w)
     longer, wider = _bends(joint, size, i, ib)
     innovation, S = detour - expected - longer, spread + wider + variance
     if robust:
-        S *= max(abs(innovation) / (BELIEVED * math.sqrt(S)), 1.0)
+        S *= max(abs(innovation) / (HUBER_K * math.sqrt(S)), 1.0)
     if innovation * innovation > bound * S:
         return GATED
     root = 1.0 / math.sqrt(S)
@@ -141,9 +143,11 @@ def correct_detour(
 
 
 @no_alloc
-def tell_detour(joint: Joint, size: Whole, i: Whole, ib: Whole, variance: float) -> None:
-    """Correct with a detour as expected, to first order: the covariance alone changes."""
-    if joint.taken[WAITING] == MOST_WAITING:
+def correct_covariance_by_detour(
+    joint: Joint, size: Whole, i: Whole, ib: Whole, variance: float
+) -> None:
+    """Correct with a detour that is as expected, to first order: only the covariance changes."""
+    if joint.taken[WAITING] == MAX_WAITING:
         flush(joint, size)
     w = joint.W[joint.taken[WAITING]]
     _, spread = _expected(joint, size, i, ib, w)
@@ -163,13 +167,13 @@ def weigh_by_detour(
     variance: float,
     likelihood: Float[np.ndarray, " m"],
 ) -> None:
-    """Write the log likelihoods of a detour by a ray's members, the other of the two being placed.
+    """Write the log likelihood of a detour for each member of a ray; the other end is placed.
 
-    ``ray`` is its first member and their number, ``other`` a member; ``of_caller``: the ray is the
-    caller's.
+    ``ray`` is its first member and their number, ``other`` a member; with ``of_caller`` the ray is
+    the caller's.
     """
     joint, size = state.joint, 3 + 2 * state.members[0]
-    if joint.taken[WAITING] == MOST_WAITING:
+    if joint.taken[WAITING] == MAX_WAITING:
         flush(joint, size)
     w, iy = joint.W[joint.taken[WAITING]], 3 + 2 * other
     for j in range(ray[1]):
@@ -185,9 +189,9 @@ def weigh_by_detour(
 def _leverage(
     joint: Joint, iy: Whole, of_caller: Flag, detour: float, direction: float
 ) -> tuple[float, float, float, float, float]:
-    """Where a detour and a direction place a point, by the one at index iy; r, a, k and e_x.u_perp.
+    """Range r of a point by a detour and a direction, with a, k and e_x . u_perp (module's head).
 
-    The range is 0 where there is none.
+    The point placed at index iy is the other end; the range is 0 where there is none.
     """
     mean = joint.mean
     c, s = math.cos(direction), math.sin(direction)
@@ -210,22 +214,22 @@ def _leverage(
 
 
 @no_alloc
-def unsure_by_detour(
+def relative_range_std(
     joint: Joint,
     size: Whole,
     iy: Whole,
     of_caller: Flag,
     measured: tuple[float, float, float, float],
 ) -> float:
-    """Standard deviation of the range by a detour and a bearing, as a share of it; or infinity.
+    """Standard deviation of the range by a detour and a bearing, divided by the range; or infinity.
 
-    ``measured`` are detour, its variance, bearing and its variance; ``of_caller``: the caller is
-    placed by a landmark at index iy, else a landmark by the caller there. Infinite where it is more
-    than `SURE`, and where the detour may be none (`SOME`).
+    ``measured`` is detour, its variance, bearing and its variance. With ``of_caller`` the caller's
+    range is asked, and a landmark is placed at index iy. It is infinite above
+    `MAX_RELATIVE_RANGE_STD` and where the detour may be 0 (`MIN_TDOA_SIGMAS`).
     """
     detour, along, bearing, across = measured
     mean, turns = joint.mean, joint.turns
-    if detour <= SOME * math.sqrt(along):
+    if detour <= MIN_TDOA_SIGMAS * math.sqrt(along):
         return math.inf
     r, ax, ay, k, side = _leverage(joint, iy, of_caller, detour, mean[2] + bearing)
     if r == 0.0:
@@ -242,7 +246,7 @@ def unsure_by_detour(
         + along / (k * k)
     )  # fmt: skip
     share = math.sqrt(max(spread, 0.0)) / r
-    return share if share <= SURE else math.inf
+    return share if share <= MAX_RELATIVE_RANGE_STD else math.inf
 
 
 @no_alloc
@@ -254,10 +258,10 @@ def place_by_detour(
     of_caller: Flag,
     measured: tuple[float, float, float, float],
 ) -> None:
-    """Put a member at index i, by a detour and a bearing, and by the point placed at index iy.
+    """Write a member at index i by a detour, a bearing and the point at index iy.
 
-    As `unsure_by_detour` has them, which has found it sure. Nothing may wait; the first ``size``
-    rows but the member's own are the rest of the state.
+    The arguments are those of `relative_range_std`, which has found the range sure. Nothing may
+    wait.
     """
     detour, along, bearing, across = measured
     mean, covariance, turns = joint.mean, joint.covariance, joint.turns

@@ -1,17 +1,17 @@
-r"""Kernels on a block's landmarks that are tied to a caller: correct, place, gate by a detour.
+r"""Kernels on a block's landmarks conditional on a caller: correct, place, gate by a detour.
 
-A detour is of two landmarks, the one that echoes and the caller. Given the path, the landmarks that
-one caller lights up are independent *given the caller*, too: a star. So a map stays as small as it
-was, where each of them says how it moves with the caller b,
+A detour depends on two landmarks, the one that echoes and the caller. Given the path, the landmarks
+that one caller lights up are independent *given the caller*. So each of them is kept as a Gaussian
+that is linear in the place b of the caller, its *parent*,
 
-.. math:: l \mid b \sim N(m + A b,\; C), \qquad b \sim N(\hat b, B).
+.. math:: l \mid b \sim N(m + A b,\; C), \qquad b \sim N(\hat b, B),
 
-``tie`` (4 rows) are the slopes A, row by row; where A is zero a landmark is as it ever was.
-``member`` holds what a landmark is for itself, :math:`m + A \hat b` and :math:`C + A B A^T`, but
-m and C while a frame corrects the map (`shift`): then what is measured of one landmark changes
-itself and the caller, and nothing need be written of the others. It is the joint Gaussian of all.
+which is the joint Gaussian of them all. ``slope`` (4 rows) is A, row by row; where it is zero, a
+landmark has no parent. ``member`` holds the marginal, :math:`m + A \hat b` and
+:math:`C + A B A^T`, but m and C while a frame corrects the map (`shift_by_parent`): then a
+measurement changes one landmark and the caller, and no other landmark need be written.
 
-``turn`` is one in the lanes that are meant and zero elsewhere, ``timed`` where detours count.
+``turn`` is one in the lanes that are corrected and zero elsewhere, ``usable`` where detours count.
 """
 
 import math
@@ -37,21 +37,26 @@ from pipistrelle.estimation.fastslam.block import (
     X,
     Y,
 )
-from pipistrelle.estimation.measurement import NEAREST, SOME, detour_slopes, range_by_detour
+from pipistrelle.estimation.measurement import (
+    MIN_TDOA_SIGMAS,
+    NEAREST,
+    detour_slopes,
+    range_by_detour,
+)
 from pipistrelle.jit import Flag, Whole, inlined, no_alloc
 
 AXX, AXY, AYX, AYY = range(0, 4 * LANES, LANES)
-TIE = 4 * LANES
-"""Numbers of a landmark's tie in a block."""
-SURE = 0.2
-"""A caller's detours count where its place is known to this share of how far away it is, and place
-a landmark where they tell its range to this share: beyond, no Gaussian has the ellipse's shape."""
-Tie = Float[np.ndarray, " slopes"]
+SLOPES = 4 * LANES
+"""Numbers of a landmark's slopes in a block."""
+MAX_RELATIVE_STD = 0.2
+"""Detours are used where the caller's standard deviation is at most this share of its distance, and
+place a landmark where that of the range is: beyond, no Gaussian has the ellipse's shape."""
+Slopes = Float[np.ndarray, " slopes"]
 
 
 @no_alloc
-def joined(count: Counts, callers: Counts, turn: Lanes) -> Whole:
-    """Tell lanes in which a landmark and its caller have one member each, and how many."""
+def lanes_with_parent(count: Counts, callers: Counts, turn: Lanes) -> Whole:
+    """Mark the lanes in which a landmark and its caller have one member each; return how many."""
     turns = 0
     for i in range(LANES):
         has = count[i] == 1 and callers[i] == 1
@@ -61,19 +66,21 @@ def joined(count: Counts, callers: Counts, turn: Lanes) -> Whole:
 
 
 @no_alloc
-def known_surely(pose: Poses, caller: Member, callers: Counts, timed: Lanes) -> None:
-    """Tell lanes in which a caller's detours count: it has one member, known surely enough."""
+def lanes_with_sure_parent(pose: Poses, caller: Member, callers: Counts, usable: Lanes) -> None:
+    """Mark the lanes in which a caller has one member, whose place is known well enough."""
     for i in range(LANES):
         dx, dy = caller[X + i] - pose[X + i], caller[Y + i] - pose[Y + i]
-        sure = caller[XX + i] + caller[YY + i] <= SURE * SURE * (dx * dx + dy * dy)
-        timed[i] = 1.0 if sure and callers[i] == 1 else 0.0
+        sure = caller[XX + i] + caller[YY + i] <= MAX_RELATIVE_STD * MAX_RELATIVE_STD * (
+            dx * dx + dy * dy
+        )
+        usable[i] = 1.0 if sure and callers[i] == 1 else 0.0
 
 
 @no_alloc
-def shift(caller: Member, member: Member, tie: Tie, sign: float) -> None:
-    """Add to a landmark given its caller what the caller adds; or, the sign being -1, take it."""
+def shift_by_parent(caller: Member, member: Member, slope: Slopes, sign: float) -> None:
+    """Add the parent's part to a landmark given its parent; with a sign of -1, subtract it."""
     for i in range(LANES):
-        Axx, Axy, Ayx, Ayy = tie[AXX + i], tie[AXY + i], tie[AYX + i], tie[AYY + i]
+        Axx, Axy, Ayx, Ayy = slope[AXX + i], slope[AXY + i], slope[AYX + i], slope[AYY + i]
         bx, by = sign * caller[X + i], sign * caller[Y + i]
         Bxx, Bxy, Byy = sign * caller[XX + i], sign * caller[XY + i], sign * caller[YY + i]
         t0, t1 = Bxx * Axx + Bxy * Axy, Bxy * Axx + Byy * Axy
@@ -86,12 +93,12 @@ def shift(caller: Member, member: Member, tie: Tie, sign: float) -> None:
 
 
 @inlined
-def _place(caller: Member, member: Member, tie: Tie, i: Whole) -> tuple[float, float]:
-    """Where a landmark is, its caller being where it is."""
+def _place(caller: Member, member: Member, slope: Slopes, i: Whole) -> tuple[float, float]:
+    """Place of a landmark when its caller is at its mean."""
     bx, by = caller[X + i], caller[Y + i]
     return (
-        member[X + i] + tie[AXX + i] * bx + tie[AXY + i] * by,
-        member[Y + i] + tie[AYX + i] * bx + tie[AYY + i] * by,
+        member[X + i] + slope[AXX + i] * bx + slope[AXY + i] * by,
+        member[Y + i] + slope[AYX + i] * bx + slope[AYY + i] * by,
     )
 
 
@@ -99,20 +106,20 @@ def _place(caller: Member, member: Member, tie: Tie, i: Whole) -> tuple[float, f
 def _take(
     caller: Member,
     member: Member,
-    tie: Tie,
+    slope: Slopes,
     measured: tuple[float, float, float],
     slopes: tuple[float, float, float, float],
     i: Whole,
 ) -> None:
     """Correct a landmark given its caller, and the caller, by one number.
 
-    ``measured`` are innovation, variance and a part, all or nothing; ``slopes`` are by landmark and
-    by caller.
+    ``measured`` is innovation, variance and 1 or 0: whether to use it. ``slopes`` are its
+    derivatives by landmark and by caller.
     """
     innovation, variance, part = measured
     q0, q1, f0, f1 = slopes
-    g0 = f0 + q0 * tie[AXX + i] + q1 * tie[AYX + i]
-    g1 = f1 + q0 * tie[AXY + i] + q1 * tie[AYY + i]
+    g0 = f0 + q0 * slope[AXX + i] + q1 * slope[AYX + i]
+    g1 = f1 + q0 * slope[AXY + i] + q1 * slope[AYY + i]
     u0 = member[XX + i] * q0 + member[XY + i] * q1
     u1 = member[XY + i] * q0 + member[YY + i] * q1
     t0 = caller[XX + i] * g0 + caller[XY + i] * g1
@@ -125,10 +132,10 @@ def _take(
     member[XX + i] -= k0 * u0
     member[XY + i] -= k0 * u1
     member[YY + i] -= k1 * u1
-    tie[AXX + i] -= k0 * g0
-    tie[AXY + i] -= k0 * g1
-    tie[AYX + i] -= k1 * g0
-    tie[AYY + i] -= k1 * g1
+    slope[AXX + i] -= k0 * g0
+    slope[AXY + i] -= k0 * g1
+    slope[AYX + i] -= k1 * g0
+    slope[AYY + i] -= k1 * g1
     whole = part / (g0 * t0 + g1 * t1 + inside)
     caller[X + i] += t0 * whole * innovation
     caller[Y + i] += t1 * whole * innovation
@@ -138,75 +145,75 @@ def _take(
 
 
 @no_alloc
-def take_bearing(
+def correct_pair_by_bearing(
     pose: Poses,
     caller: Member,
     member: Member,
-    tie: Tie,
+    slope: Slopes,
     bearing: float,
     variance: float,
     turn: Lanes,
 ) -> None:
     """Correct a landmark and its caller by the landmark's bearing from certain poses."""
     for i in range(LANES):
-        lx, ly = _place(caller, member, tie, i)
+        lx, ly = _place(caller, member, slope, i)
         dx, dy = lx - pose[X + i], ly - pose[Y + i]
         near = math.sqrt(dx * dx + dy * dy)
         k = 1.0 / max(near, NEAREST)
         innovation = wrapped(pose[HEADING + i] + bearing - arctangent(dy, dx))
         part = turn[i] if near >= NEAREST else 0.0
         slopes = -dy * k * k, dx * k * k, 0.0, 0.0
-        _take(caller, member, tie, (innovation, variance, part), slopes, i)
+        _take(caller, member, slope, (innovation, variance, part), slopes, i)
 
 
 @no_alloc
-def take_range(
+def correct_pair_by_range(
     pose: Poses,
     caller: Member,
     member: Member,
-    tie: Tie,
+    slope: Slopes,
     distance: float,
     variance: float,
     turn: Lanes,
 ) -> None:
     """Correct a landmark and its caller by the landmark's range from certain poses."""
     for i in range(LANES):
-        lx, ly = _place(caller, member, tie, i)
+        lx, ly = _place(caller, member, slope, i)
         dx, dy = lx - pose[X + i], ly - pose[Y + i]
         near = math.sqrt(dx * dx + dy * dy)
         k = 1.0 / max(near, NEAREST)
         part = turn[i] if near >= NEAREST else 0.0
         slopes = dx * k, dy * k, 0.0, 0.0
-        _take(caller, member, tie, (distance - near, variance, part), slopes, i)
+        _take(caller, member, slope, (distance - near, variance, part), slopes, i)
 
 
 @no_alloc
-def take_detour(
+def correct_pair_by_detour(
     pose: Poses,
     caller: Member,
     member: Member,
-    tie: Tie,
+    slope: Slopes,
     detour: float,
     variance: float,
     turn: Lanes,
-    timed: Lanes,
+    usable: Lanes,
 ) -> None:
-    """Correct a landmark and its caller by a detour to certain poses, where detours count."""
+    """Correct a landmark and its caller by a detour to certain poses, in lanes where it counts."""
     for i in range(LANES):
-        lx, ly = _place(caller, member, tie, i)
+        lx, ly = _place(caller, member, slope, i)
         e, q0, q1, f0, f1 = detour_slopes(
             pose[X + i], pose[Y + i], lx, ly, caller[X + i], caller[Y + i]
         )
-        part = turn[i] * timed[i]
-        _take(caller, member, tie, (detour - e, variance, part), (q0, q1, f0, f1), i)
+        part = turn[i] * usable[i]
+        _take(caller, member, slope, (detour - e, variance, part), (q0, q1, f0, f1), i)
 
 
 @inlined
 def _steady(
     dx: float, dy: float, direction: float, detour: float, off: tuple[float, float], distance: float
 ) -> Flag:
-    """Whether a range stays the same, but for a share `SURE`, where direction or detour is off."""
-    steady, most = True, SURE * distance
+    """Tell if errors of direction and detour change a range by at most `MAX_RELATIVE_STD`."""
+    steady, most = True, MAX_RELATIVE_STD * distance
     for sign in (-1.0, 1.0):
         c, s = cosine_and_sine(direction + sign * off[0])
         steady = steady and abs(range_by_detour(detour, dx, dy, c, s) - distance) <= most
@@ -221,23 +228,23 @@ def place_by_detour(
     pose: Poses,
     caller: Member,
     member: Member,
-    tie: Tie,
+    slope: Slopes,
     heard: tuple[float, float, float, float],
     count: Counts,
-    timed: Lanes,
+    usable: Lanes,
 ) -> None:
-    """Place landmarks of not one member by bearing and detour, where these are sure enough.
+    """Place landmarks that are rays by bearing and detour, where their range is sure enough.
 
-    ``heard`` are bearing and detour, then their variances. The landmark is tied to the caller; what
-    was known of its ray is let go. Where caller and landmark are in line a slope tells nothing, so
-    both errors are tried, too; and what may be no detour (`SOME`) places nothing.
+    ``heard`` is bearing and detour, then their variances. The landmark gets the caller as its
+    parent, and its ray is dropped. Where caller and landmark are in line a slope tells nothing, so
+    both errors are tried, too; a detour that may be 0 (`MIN_TDOA_SIGMAS`) places nothing.
     """
     bearing, detour, bearing_variance, detour_variance = heard
     off = math.sqrt(bearing_variance), math.sqrt(detour_variance)
-    if detour <= SOME * off[1]:
+    if detour <= MIN_TDOA_SIGMAS * off[1]:
         return
     for i in range(LANES):
-        if timed[i] == 0.0 or count[i] == 1:
+        if usable[i] == 0.0 or count[i] == 1:
             continue
         direction, x, y = pose[HEADING + i] + bearing, pose[X + i], pose[Y + i]
         c, s = cosine_and_sine(direction)
@@ -253,7 +260,7 @@ def place_by_detour(
         ax, ay = -f0 / steep, -f1 / steep
         spread = ax * ax * caller[XX + i] + 2.0 * ax * ay * caller[XY + i]
         spread += ay * ay * caller[YY + i] + along + turned * turned * bearing_variance
-        if spread > SURE * SURE * r * r:
+        if spread > MAX_RELATIVE_STD * MAX_RELATIVE_STD * r * r:
             continue
         count[i] = 1
         tx, ty, still = c * turned - s * r, s * turned + c * r, r - ax * bx - ay * by
@@ -262,7 +269,12 @@ def place_by_detour(
         member[XY + i] = c * s * along + tx * ty * bearing_variance
         member[YY + i] = s * s * along + ty * ty * bearing_variance
         member[LOG_WEIGHT + i] = 0.0
-        tie[AXX + i], tie[AXY + i], tie[AYX + i], tie[AYY + i] = c * ax, c * ay, s * ax, s * ay
+        slope[AXX + i], slope[AXY + i], slope[AYX + i], slope[AYY + i] = (
+            c * ax,
+            c * ay,
+            s * ax,
+            s * ay,
+        )
 
 
 @no_alloc
@@ -270,21 +282,21 @@ def detour_beyond(
     pose: Poses,
     caller: Member,
     member: Member,
-    tie: Tie,
+    slope: Slopes,
     detour: float,
     variance: float,
     turn: Lanes,
     bound: float,
 ) -> bool:
-    """Whether a detour is beyond the bound for every lane; one that has no turn lets it in."""
+    """Tell whether a detour is beyond the bound for every lane that has a turn, and all have."""
     beyond = 0
     for i in range(LANES):
         e, q0, q1, f0, f1 = detour_slopes(
             pose[X + i], pose[Y + i], member[X + i], member[Y + i], caller[X + i], caller[Y + i]
         )
         p0, p1 = -q0 - f0, -q1 - f1
-        g0 = f0 + 2.0 * (q0 * tie[AXX + i] + q1 * tie[AYX + i])
-        g1 = f1 + 2.0 * (q0 * tie[AXY + i] + q1 * tie[AYY + i])
+        g0 = f0 + 2.0 * (q0 * slope[AXX + i] + q1 * slope[AYX + i])
+        g1 = f1 + 2.0 * (q0 * slope[AXY + i] + q1 * slope[AYY + i])
         S = p0 * p0 * pose[PXX + i] + 2.0 * p0 * p1 * pose[PXY + i] + p1 * p1 * pose[PYY + i]
         S += q0 * q0 * member[XX + i] + 2.0 * q0 * q1 * member[XY + i] + q1 * q1 * member[YY + i]
         S += f0 * (caller[XX + i] * g0 + caller[XY + i] * g1)

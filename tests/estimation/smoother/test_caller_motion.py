@@ -9,17 +9,17 @@ from scipy import stats
 
 from pipistrelle.detection.scans import NOBODY, rows_of
 from pipistrelle.estimation.beliefs import Gaussian, placed
-from pipistrelle.estimation.ekf.roaming import roam, velocity_of
-from pipistrelle.estimation.smoother.filter import Smoother
-from pipistrelle.estimation.smoother.graph import Solver, links
-from pipistrelle.estimation.smoother.placing import Around
-from pipistrelle.estimation.smoother.roaming import (
+from pipistrelle.estimation.ekf.caller_motion import propagate_callers, velocity_of
+from pipistrelle.estimation.smoother.caller_motion import (
     Chain,
-    gone_on,
     place_key,
+    propagated_caller,
     velocity_key,
     walk_factor,
 )
+from pipistrelle.estimation.smoother.filter import Smoother
+from pipistrelle.estimation.smoother.graph import Solver, links
+from pipistrelle.estimation.smoother.tdoa_initialization import LastPose
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.runs.filtering import run_filter
 from reference.missions import followed, ray_config
@@ -55,8 +55,8 @@ def roaming():
 def test_a_state_goes_on_as_in_the_ekf():
     mean, covariance = np.append(np.zeros(3), STATE.mean), np.zeros((7, 7))
     covariance[3:, 3:] = STATE.covariance
-    roam(mean, covariance, np.array([9, velocity_of(9)]), 1.5, WALK)
-    later = gone_on(STATE, 1.5, WALK)
+    propagate_callers(mean, covariance, np.array([9, velocity_of(9)]), 1.5, WALK)
+    later = propagated_caller(STATE, 1.5, WALK)
     np.testing.assert_allclose(later.mean, mean[3:], rtol=0, atol=1e-12)
     np.testing.assert_allclose(later.covariance, covariance[3:, 3:], rtol=0, atol=1e-12)
 
@@ -69,7 +69,10 @@ def test_the_factor_says_of_two_states_what_the_law_has(seconds, walk_std):
     for node, state in enumerate(states, start=7):
         values.insert(place_key(chain, node), state[:2])
         values.insert(velocity_key(chain, node), state[2:])
-    off = states[1] - gone_on(Gaussian(mean=states[0], covariance=np.eye(4)), seconds, 0.0).mean
+    off = (
+        states[1]
+        - propagated_caller(Gaussian(mean=states[0], covariance=np.eye(4)), seconds, 0.0).mean
+    )
     loss = 0.5 * surprise(off, walk_covariance(seconds, walk_std))
     assert walk_factor(chain, 8, seconds, walk_std).error(values) == pytest.approx(loss, rel=1e-3)
 
@@ -137,9 +140,9 @@ def test_a_landmark_is_placed_by_the_call_of_one_that_moves(roaming):
     assert len(mapped) > 15
     seen = beliefs[chains[CALLER].first + 1]
     leg = smoother().predict(seen, roaming[0].controls[0], roaming[0].dt[0])[0]
-    around = Around(
-        isam=seen.solver.reach(seen.link), node=seen.link.node, leg=leg.leg, pose=leg.pose().mean,
-        chains=seen.chains, walk_std=WALK,
+    around = LastPose(
+        isam=seen.solver.reach(seen.link), node=seen.link.node, odometry=leg.odometry,
+        pose=leg.pose().mean, chains=seen.chains, walk_std=WALK,
     )  # fmt: skip
     told, there = around.joint(CALLER), around.place(CALLER)
     empty = rows_of(roaming[0].scans[0], np.array([0]))
@@ -147,9 +150,9 @@ def test_a_landmark_is_placed_by_the_call_of_one_that_moves(roaming):
     new = replace(new, numbers=np.where(np.arange(7)[:, None] == 0, 0.3, empty.numbers))
     new.numbers[[1, 2]] = np.nan
     gone = smoother().update(leg, new)
-    after = Around(
-        isam=gone.solver.reach(gone.link), node=gone.link.node, leg=None, pose=gone.pose().mean,
-        chains=gone.chains, walk_std=WALK,
+    after = LastPose(
+        isam=gone.solver.reach(gone.link), node=gone.link.node, odometry=None,
+        pose=gone.pose().mean, chains=gone.chains, walk_std=WALK,
     )  # fmt: skip
     assert gone.link.node == seen.link.node + 1
     np.testing.assert_allclose(there, after.place(CALLER), rtol=0, atol=1e-3)

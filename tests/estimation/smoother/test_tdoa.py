@@ -6,15 +6,14 @@ import gtsam
 import numpy as np
 import pytest
 
-from pipistrelle.estimation.measurement import BELIEVED, detour_of
-from pipistrelle.estimation.smoother.detours import (
-    MOST,
+from pipistrelle.estimation.measurement import HUBER_K, detour_of
+from pipistrelle.estimation.smoother.graph import landmark_key, pose_key
+from pipistrelle.estimation.smoother.tdoa import (
+    MAX_WAITING,
     Detour,
     detour_factors,
     detours_of,
-    parted,
 )
-from pipistrelle.estimation.smoother.graph import landmark_key, pose_key
 from reference.missions import scan_with
 
 CALLERS = (9, 3)
@@ -87,7 +86,7 @@ def test_what_is_lost_falls_as_the_slopes_say_on_either_side_of_hubers_bend(robu
 
 @pytest.mark.parametrize("off", [-30.0, -2.0, -1.0, 0.0, 1.9, 2.1, 7.0])
 def test_what_one_loses_is_what_gtsam_has_by_hubers_loss(off):
-    huber = gtsam.noiseModel.mEstimator.Huber.Create(BELIEVED)
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(HUBER_K)
     row = heard(off)[:1]
     factor = one_factor(row, robust=True)
     assert factor.error(graph_values()) == pytest.approx(huber.loss(off), rel=1e-9)
@@ -129,10 +128,10 @@ def test_detours_of_a_scan_are_those_of_callers_that_have_a_label():
 
 
 def test_no_more_wait_than_may_and_the_newest_are_kept():
-    rows = [Detour(node, 1, 9, 1.0, 0.1) for node in range(MOST + 7)]
-    entering, waiting = parted(rows, {1, 4})
+    rows = [Detour(node, 1, 9, 1.0, 0.1) for node in range(MAX_WAITING + 7)]
+    entering, waiting = split_ready(rows, {1, 4})
     assert not entering
-    assert [one.node for one in waiting] == list(range(7, MOST + 7))
+    assert [one.node for one in waiting] == list(range(7, MAX_WAITING + 7))
 
 
 @pytest.mark.parametrize(
@@ -140,6 +139,6 @@ def test_no_more_wait_than_may_and_the_newest_are_kept():
 )
 def test_a_detour_waits_for_its_landmark_and_its_caller(mapped, enter):
     rows = [Detour(0, 1, 9, 1.0, 0.1), Detour(2, 4, 9, 1.0, 0.1)]
-    entering, waiting = parted(rows, mapped)
+    entering, waiting = split_ready(rows, mapped)
     assert entering == tuple(rows[:enter])
     assert waiting == tuple(rows[enter:])

@@ -53,7 +53,7 @@ def slow_twin(slam, detour_std=0.2):
 def tie_of(belief, particle, label):
     """Return slopes of a landmark's place by its caller's, (2, 2)."""
     (block, lane), n = divmod(particle, LANES), belief.landmark.tolist().index(label)
-    return belief.tie[block, n].reshape(4, LANES)[:, lane].reshape(2, 2)
+    return belief.slope[block, n].reshape(4, LANES)[:, lane].reshape(2, 2)
 
 
 def gaussian(member):
@@ -64,9 +64,9 @@ def gaussian(member):
 def crossed(belief, particle, label):
     """Covariance of a landmark with its caller, both of one member; or None."""
     n = belief.landmark.tolist().index(label)
-    if belief.hub[n] < 0:
+    if belief.parent[n] < 0:
         return None
-    callers = members(belief, particle, belief.landmark[belief.hub[n]])
+    callers = members(belief, particle, belief.landmark[belief.parent[n]])
     if len(members(belief, particle, label)) > 1 or len(callers) > 1:
         return None
     return tie_of(belief, particle, label) @ gaussian(callers[0])[1]
@@ -86,7 +86,7 @@ def assert_same_particles(belief, particles):
             np.testing.assert_allclose(found, rows, **CLOSE)
             shared = crossed(belief, number, label)
             if shared is not None:
-                hub = belief.landmark[belief.hub[belief.landmark == label][0]]
+                hub = belief.landmark[belief.parent[belief.landmark == label][0]]
                 known = p.cross.get((label, hub), np.zeros((2, 2)))
                 np.testing.assert_allclose(shared, known, **CLOSE)
 
@@ -148,7 +148,7 @@ def test_a_star_of_ties_equals_the_joint_gaussian_of_all(
     strategy, callers, shares, mixture, weights, gate, frames
 ):
     belief = assert_equal_whole_run(frames, strategy, callers, shares, mixture, weights, gate)
-    assert np.abs(belief.tie).max() > 0.1
+    assert np.abs(belief.slope).max() > 0.1
 
 
 @pytest.mark.slow
@@ -181,7 +181,7 @@ def test_detours_of_a_caller_whose_place_is_not_known_change_nothing(caller):
     )
     belief = run(mission)
     assert_same(belief, run(without(mission, detour=np.nan)))
-    assert not belief.tie.any()
+    assert not belief.slope.any()
 
 
 def test_detours_of_whom_nobody_knows_change_nothing():
@@ -212,7 +212,7 @@ def test_further_detours_of_a_landmark_that_is_tied_already_are_let_go(gate):
     slam = swarm_filter(gate=gate)
     belief = run(mission, slam)
     assert_same(run(more, slam), belief)
-    assert belief.tie.any()
+    assert belief.slope.any()
     assert (belief.gated > 0) == (gate < 1.0)
 
 
@@ -223,7 +223,7 @@ def test_labels_are_only_names_where_detours_are_heard_too():
     ]
     belief, other = run(mission), run(replace(mission, scans=renamed))
     np.testing.assert_array_equal(other.landmark, 1000 - belief.landmark)
-    np.testing.assert_array_equal(other.tie, belief.tie)
+    np.testing.assert_array_equal(other.slope, belief.slope)
     np.testing.assert_array_equal(other.member[:, :, : 5 * LANES], belief.member[:, :, : 5 * LANES])
 
 
@@ -231,7 +231,7 @@ def test_whole_missions_with_detours_leave_sound_particles():
     for strategy in ("fused", "passive"):
         belief = run(timed_mission(strategy, [2], 60))
         assert_sound(belief)
-        assert np.isfinite(belief.tie).all()
+        assert np.isfinite(belief.slope).all()
 
 
 # One landmark, one caller
@@ -320,7 +320,7 @@ def test_a_landmark_at_its_caller_at_the_vehicle_or_between_them_takes_any_detou
     for detour in (0.0, 0.3, 4.0):
         after = slam.update(belief, heard(0.1, detour), drawing())
         assert_sound(after)
-        assert np.isfinite(after.tie).all()
+        assert np.isfinite(after.slope).all()
 
 
 def test_a_caller_that_is_hardly_known_places_nothing():
@@ -355,7 +355,7 @@ def test_the_gate_drops_a_detour_that_no_particle_expected_and_keeps_its_bearing
         belief, with_columns(heard(bearing, detour + off), detour=np.nan), drawing()
     )
     assert after.gated == gated
-    same = np.array_equal(after.member, plain.member) and np.array_equal(after.tie, plain.tie)
+    same = np.array_equal(after.member, plain.member) and np.array_equal(after.slope, plain.slope)
     assert same == bool(gated)
 
 
@@ -364,7 +364,7 @@ def test_the_gate_drops_a_detour_that_no_particle_expected_and_keeps_its_bearing
 
 def forgetful(belief):
     """The belief that takes every landmark for itself: its caller's error is drawn anew."""
-    return replace(belief, tie=np.zeros_like(belief.tie))
+    return replace(belief, slope=np.zeros_like(belief.slope))
 
 
 def map_nees(seed, forget):

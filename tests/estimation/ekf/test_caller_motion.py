@@ -5,9 +5,9 @@ import pytest
 
 from pipistrelle.config import CallerConfig, Config, FilterConfig, ListeningConfig, ScenarioConfig
 from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.ekf.caller_motion import is_velocity, propagate_callers, velocity_of
 from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
-from pipistrelle.estimation.ekf.roaming import is_velocity, roam, velocity_of
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.runs.trial import run_mission
 from reference.missions import (
@@ -49,7 +49,7 @@ def test_two_callers_and_a_ray_go_on_as_the_exact_solution_does():
     whole[3:, 3:], noise[3:, 3:] = F, Q
     expected = whole @ P @ whole.T + noise
     went, spread = mean.copy(), P.copy()
-    roam(went, spread, landmark, 1.7, 0.3)
+    propagate_callers(went, spread, landmark, 1.7, 0.3)
     np.testing.assert_allclose(went, whole @ mean, rtol=0, atol=1e-12)
     np.testing.assert_allclose(spread, expected, rtol=0, atol=1e-11)
 

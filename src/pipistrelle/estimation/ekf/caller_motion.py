@@ -27,15 +27,13 @@ from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.jit import Flag, Whole, kernel
 
 _NOBODY, _SUM = UNLABELLED, UNLABELLED - 1
-"""Labels are from 0 on; that of a caller and that of its velocity have one sum."""
+"""Labels are from 0 on; those of a caller and of its velocity add up to ``_SUM``."""
 
 
 @kernel
 def velocity_of(label: Whole) -> Whole:
-    """Return the label under which the velocity of a caller stands, and the other way round.
+    """Label of the velocity of a caller; of a velocity's label, the caller's.
 
-    Examples
-    --------
     >>> velocity_of(51), velocity_of(velocity_of(51))
     (-53, 51)
     """
@@ -43,53 +41,23 @@ def velocity_of(label: Whole) -> Whole:
 
 
 def is_velocity(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
-    """Tell which rows of a state are velocities, not places.
-
-    Parameters
-    ----------
-    landmark : (h)
-
-    Returns
-    -------
-    (h)
-
-    Examples
-    --------
-    >>> is_velocity(np.array([4, 51, -53]))
-    array([False, False,  True])
-    """
+    """Mask of the rows of a state that are velocities, not places."""
     return landmark < _NOBODY
 
 
 @kernel
-def roams(landmark: Int[np.ndarray, " h"]) -> Flag:
-    """Tell whether any row of a state is a velocity.
-
-    Examples
-    --------
-    >>> roams(np.array([4, 51])), roams(np.array([4, 51, -53]))
-    (False, True)
-    """
+def has_velocities(landmark: Int[np.ndarray, " h"]) -> Flag:
+    """Tell whether any row of a state is a velocity."""
     least = 0
     for label in landmark:
         least = min(least, label)
     return least < _NOBODY
 
 
-def stands(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
-    """Tell which rows of a state are of what stands, neither callers that move nor velocities.
+def is_standing(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
+    """Mask of the rows that are neither callers that move nor their velocities.
 
-    Parameters
-    ----------
-    landmark : (h)
-
-    Returns
-    -------
-    (h)
-
-    Examples
-    --------
-    >>> stands(np.array([4, 51, -53]))
+    >>> is_standing(np.array([4, 51, -53]))
     array([ True, False, False])
     """
     velocity = is_velocity(landmark)
@@ -98,26 +66,12 @@ def stands(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
     return ~velocity & ~np.isin(landmark, _SUM - landmark[velocity])
 
 
-def velocities_missing(
+def missing_velocities(
     landmark: Int[np.ndarray, " h"], moving: Int[np.ndarray, " v"]
 ) -> Int[np.ndarray, " n"]:
-    """Return the labels of the velocities that a state lacks: of who moves and has a place.
+    """Labels of the velocities that the moving callers of a state still lack.
 
-    Parameters
-    ----------
-    landmark : (h)
-    moving : (v)
-        Labels of who moves.
-
-    Returns
-    -------
-    (n)
-
-    Examples
-    --------
-    >>> velocities_missing(np.array([4, 51]), np.array([51, 52]))
-    array([-53])
-    >>> velocities_missing(np.array([51, 52, -53]), np.array([52]))
+    >>> missing_velocities(np.array([51, 52, -53]), np.array([52]))
     array([-54])
     """
     velocity = _SUM - moving
@@ -125,14 +79,14 @@ def velocities_missing(
 
 
 @kernel
-def roam(
+def propagate_callers(
     mean: Float[np.ndarray, " d"],
     covariance: Float[np.ndarray, "d room"],
     landmark: Int[np.ndarray, " h"],
     seconds: float,
     walk_std: float,
 ) -> None:
-    """Let every caller that moves go on for a time, in place, members of a ray together."""
+    """Move all callers through a time [s], in place; ``walk_std``: of a velocity after 1 s."""
     q, size = walk_std * walk_std, mean.size
     for velocity in range(landmark.size):
         if landmark[velocity] >= _NOBODY:

@@ -1,68 +1,62 @@
-r"""Precise bearings: what a Gaussian member of a ray is too coarse for.
+r"""Delayed initialization: precise bearings wait until a second one crosses them.
 
 **A bearing waits.** A landmark that is first heard by a bearing too precise for the members of a
-ray (`is_precise`) enters the state as the ray itself: the point :math:`p_0` from which it was heard
-and a point q that it was heard through, which the filter carries, correlated with all else, like
-any other point. No range is guessed. When a later bearing, in the direction u from p, crosses it,
+ray (`is_precise`) enters the state as two points: :math:`p_0`, from which it was heard, and q, a
+point in its direction. The filter keeps both, correlated with all else, like any other points. No
+range is guessed. When a later bearing, in the direction u from p, crosses the line,
 
 .. math:: l = p + r u, \quad r = \frac{n \cdot (p_0 - p)}{n \cdot u}, \quad n \perp q - p_0,
 
-the landmark is placed there, if the crossing is before both and r known to a fifth of itself: the
-position of a farther one would be no Gaussian. Until then its bearings say nothing to the filter.
-The covariance of l follows from the derivative
+the landmark is placed there, if the crossing is in front of both poses and the standard deviation
+of r is at most a fifth of r: the position of a farther landmark would be no Gaussian. Until then
+its bearings are not used. The covariance of l follows from the derivative
 
 .. math:: n \cdot u\, dr = n \cdot \left( (1 - t) dp_0 + t\, dq - dp \right)
           - r (n \cdot u_\perp)(d\theta + d\phi)
 
 with t the crossing's place on the first ray in units of :math:`|q - p_0|`.
 
-**Its curvature is noise.** A bearing of a landmark of which along and across the line of sight the
-relative covariance is :math:`P_{aa}, P_{cc}, P_{ac}` is, to second order, off by
-:math:`-P_{ac}/r^2` with the variance :math:`(P_{aa} P_{cc} + P_{ac}^2)/r^4` besides (Bar-Shalom,
-Li & Kirubarajan 2001, Sec. 10.3.2). A precise bearing is corrected for the one, and told the other
-beside its R: what has just been placed is not pulled by more than the line it lies on.
+**Second order.** Let :math:`P_{aa}, P_{cc}, P_{ac}` be the covariance of a landmark relative to
+the vehicle, along and across the line of sight. To second order its bearing is off by
+:math:`-P_{ac}/r^2`, with the additional variance :math:`(P_{aa} P_{cc} + P_{ac}^2)/r^4`
+(Bar-Shalom, Li & Kirubarajan 2001, Sec. 10.3.2). A precise bearing is corrected by the first, and
+its R is increased by the second.
 """
 
 import math
 
-from pipistrelle.estimation.ekf.gaussian import (
-    Joint,
-    State,
-    flush,
-    initialise,
-    relative_covariance,
-)
+from pipistrelle.estimation.ekf.gaussian import Joint, State, flush, initialise, relative_covariance
 from pipistrelle.estimation.measurement import NEAREST, Row, observe
-from pipistrelle.estimation.rays import FITTED, Sensing
+from pipistrelle.estimation.rays import FITTED, UpdateParams
 from pipistrelle.jit import Whole, no_alloc
 
-WAITS = -1.0
+WAITING_WEIGHT = -1.0
 """Weight of the two points of a bearing that waits."""
-SURE = 0.2
-"""Largest standard deviation of a placed landmark's range, as a share of it."""
-PARALLEL = 1e-9
-"""Sine under which two bearings do not cross."""
-PARALLAX = 0.35
-"""Least sine at which they do where some may be off by more than they say, by degrees at times: of
-many bearings those would seem to cross first, and two have nobody to surprise."""
+MAX_RELATIVE_RANGE_STD = 0.2
+"""A landmark is placed if its range has at most this standard deviation, divided by the range."""
+PARALLEL_SINE = 1e-9
+"""Two bearings with a smaller sine of their angle do not cross."""
+MIN_CROSSING_SINE = 0.35
+"""The same where bearings may be off by more than they say, by degrees at times: of many bearings
+such ones would seem to cross first."""
 
 
 @no_alloc
-def linear_to(sensing: Sensing) -> float:
-    """How far [rad] a bearing of a ray's member is off that is linear in it, seen from the side."""
-    share = sensing.ray_stds[0] / sensing.ray_ranges[0]
+def member_linearity(params: UpdateParams) -> float:
+    """Error [rad] of the linearised bearing of a ray's member that is seen from the side."""
+    share = params.ray_stds[0] / params.ray_ranges[0]
     return 0.5 * share * share
 
 
 @no_alloc
-def is_precise(row: Row, sensing: Sensing) -> bool:
-    """Whether a bearing is more precise than a ray's members are linear, and they are fitted."""
-    return sensing.sharing == FITTED and row.bearing_variance < linear_to(sensing) ** 2
+def is_precise(row: Row, params: UpdateParams) -> bool:
+    """Tell whether a bearing is too precise for ray members, if such bearings are to wait."""
+    return params.sharing == FITTED and row.bearing_variance < member_linearity(params) ** 2
 
 
 @no_alloc
-def curved(joint: Joint, size: Whole, i: Whole, row: Row) -> tuple[float, float]:
-    """A bearing of the member at state index i without its second-order bias; variance with it."""
+def second_order_bearing(joint: Joint, size: Whole, i: Whole, row: Row) -> tuple[float, float]:
+    """Bearing of the member at index i without its second-order bias, and its larger variance."""
     mean = joint.mean
     _, _, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     xx, xy, yy = relative_covariance(joint, size, i)
@@ -75,14 +69,14 @@ def curved(joint: Joint, size: Whole, i: Whole, row: Row) -> tuple[float, float]
 
 
 @no_alloc
-def await_crossing(state: State, row: Row, sensing: Sensing) -> None:
-    """Append where a bearing was heard from, and a point that it was heard through."""
-    through = sensing.ray_ranges[sensing.ray_ranges.size // 2]
+def add_waiting_bearing(state: State, row: Row, params: UpdateParams) -> None:
+    """Append two points: where a bearing was heard from, and a point in its direction."""
+    through = params.ray_ranges[params.ray_ranges.size // 2]
     for ahead in (0.0, through):
         member = state.members[0]
         size = 3 + 2 * member
         initialise(state.joint, size, size, ahead, row.bearing, 0.0, row.bearing_variance)
-        state.landmark[member], state.weight[member] = row.landmark, WAITS
+        state.landmark[member], state.weight[member] = row.landmark, WAITING_WEIGHT
         state.members[0] += 1
 
 
@@ -90,9 +84,10 @@ def await_crossing(state: State, row: Row, sensing: Sensing) -> None:
 def _from_vehicle(
     joint: Joint, i: Whole, direction: float
 ) -> tuple[float, float, float, float, float]:
-    """Where a direction crosses the ray through the points at i and i + 2.
+    """Crossing of a direction from the vehicle with the ray through the points at i and i + 2.
 
-    Returns the normal of that ray, the sine of the crossing, r, and t in units of |q - p0|.
+    Returns the normal (2) of that ray, the sine of the angle between them, r, and t in units of
+    |q - p0|.
     """
     mean = joint.mean
     x, y = mean[i + 2] - mean[i], mean[i + 3] - mean[i + 1]
@@ -101,7 +96,7 @@ def _from_vehicle(
     ux, uy = math.cos(direction), math.sin(direction)
     sine = nx * ux + ny * uy
     dx, dy = mean[i] - mean[0], mean[i + 1] - mean[1]
-    if abs(sine) < PARALLEL:
+    if abs(sine) < PARALLEL_SINE:
         return nx, ny, sine, -1.0, -1.0
     r = (nx * dx + ny * dy) / sine
     return nx, ny, sine, r, ((r * ux - dx) * x + (r * uy - dy) * y) / (length * length)
@@ -113,7 +108,7 @@ def _range_row(
 ) -> float:
     """Write covariances of r with the state into W[0]; return its variance without the bearing's.
 
-    ``normal`` is n and n . u, ``lever`` what r gains by a turn of the direction.
+    ``normal`` is n and n . u, ``lever`` is the derivative of r by the direction.
     """
     P, w, (nx, ny, sine) = joint.covariance, joint.W[0], normal
     turn = lever * joint.turns
@@ -127,18 +122,21 @@ def _range_row(
 
 
 @no_alloc
-def place_crossing(state: State, first: Whole, row: Row, robust: bool) -> bool:
-    """Place a landmark where a bearing crosses the one that waits, if that is sure enough.
+def place_at_crossing(state: State, first: Whole, row: Row, robust: bool) -> bool:
+    """Place a landmark where a bearing crosses the waiting one, if that is sure; tell if it was.
 
-    It takes the place of the first of the two points; the second is left to be dropped. ``robust``:
-    a bearing may be off by more than it says.
+    It replaces the first of the two points; the caller drops the second. With ``robust`` the two
+    bearings must cross at a larger angle.
     """
     joint, size, i = state.joint, 3 + 2 * state.members[0], 3 + 2 * first
     mean, direction = joint.mean, joint.mean[2] + row.bearing
     nx, ny, sine, r, t = _from_vehicle(joint, i, direction)
     ux, uy = math.cos(direction), math.sin(direction)
-    least = PARALLAX if robust else PARALLEL
-    lever, most = r * (nx * uy - ny * ux) / sine, SURE * SURE * r * r
+    least = MIN_CROSSING_SINE if robust else PARALLEL_SINE
+    lever, most = (
+        r * (nx * uy - ny * ux) / sine,
+        MAX_RELATIVE_RANGE_STD * MAX_RELATIVE_RANGE_STD * r * r,
+    )
     by_bearing = lever * lever * row.bearing_variance
     if abs(sine) < least or r < NEAREST or t <= 0.0 or by_bearing > most:
         return False
@@ -161,9 +159,9 @@ def _take_place(
     range_variance: float,
     bearing_variance: float,
 ) -> None:
-    """Write the rows of a landmark at p + r u into those of the point at i.
+    """Write the rows of a landmark at p + r u over those of the point at index i.
 
-    Of dl = dp + u dr + r u' (turns dtheta + dphi), where u' is u turned left.
+    They follow dl = dp + u dr + r u' (turns dtheta + dphi), where u' is u turned left.
     """
     P, (ux, uy, r, lever) = joint.covariance, crossing
     w, x, y = joint.W[0], joint.W[1], joint.W[2]

@@ -7,7 +7,11 @@ import pytest
 
 from pipistrelle.estimation.beliefs import Gaussian, placed
 from pipistrelle.estimation.motion import Motion
-from pipistrelle.estimation.smoother.crossing import PARALLAX, Bearing, crossing
+from pipistrelle.estimation.smoother.delayed_initialization import (
+    MIN_CROSSING_ANGLE,
+    Bearing,
+    crossing,
+)
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.runs.filtering import run_filter
@@ -49,7 +53,7 @@ def test_of_the_earlier_bearings_the_one_counts_that_crosses_most_squarely():
 
 @pytest.mark.parametrize(("more", "there"), [(1e-6, True), (-1e-6, False)])
 def test_bearings_cross_clearly_from_the_least_parallax_on(more, there):
-    heard = Bearing(0, 0.7, 1e-4), Bearing(1, 0.7 + PARALLAX + more, 1e-4)
+    heard = Bearing(0, 0.7, 1e-4), Bearing(1, 0.7 + MIN_CROSSING_ANGLE + more, 1e-4)
     assert (crossing(poses(2), heard) is not None) == there
 
 

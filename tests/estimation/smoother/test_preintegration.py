@@ -5,13 +5,13 @@ import pytest
 
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import Motion
-from pipistrelle.estimation.smoother.legs import (
-    NOWHERE,
+from pipistrelle.estimation.smoother.preintegration import (
+    NO_ODOMETRY,
     SMALLEST_STD,
     between,
-    carried,
-    longer,
+    extended,
     placed,
+    propagated,
     turned,
 )
 from pipistrelle.geometry import wrap
@@ -20,7 +20,7 @@ from reference.missions import BICYCLE, CIRCLE, STEP
 from reference.odometry import as_motions, by_poses
 
 STEPS = 6
-LEG = longer(NOWHERE, BICYCLE, np.tile([CIRCLE[0], 0.2], (STEPS, 1)), np.full(STEPS, STEP))
+LEG = extended(NO_ODOMETRY, BICYCLE, np.tile([CIRCLE[0], 0.2], (STEPS, 1)), np.full(STEPS, STEP))
 A = Gaussian(mean=np.array([2.0, -1.0, 2.5]), covariance=np.diag([0.04, 0.02, 0.01]))
 
 
@@ -46,15 +46,17 @@ def test_a_leg_step_by_step_is_the_slow_references_prediction():
 
 
 def test_a_leg_made_longer_is_the_leg_made_at_once():
-    one = longer(NOWHERE, BICYCLE, np.tile([CIRCLE[0], 0.2], (2, 1)), np.full(2, STEP))
-    both = longer(one, BICYCLE, np.tile([CIRCLE[0], 0.2], (STEPS - 2, 1)), np.full(STEPS - 2, STEP))
+    one = extended(NO_ODOMETRY, BICYCLE, np.tile([CIRCLE[0], 0.2], (2, 1)), np.full(2, STEP))
+    both = extended(
+        one, BICYCLE, np.tile([CIRCLE[0], 0.2], (STEPS - 2, 1)), np.full(STEPS - 2, STEP)
+    )
     np.testing.assert_array_equal(both.mean, LEG.mean)
     np.testing.assert_array_equal(both.covariance, LEG.covariance)
 
 
 def test_a_leg_by_poses_is_the_leg_of_the_controls_that_led_there():
     controls, dt = np.tile([CIRCLE[0], 0.2], (STEPS, 1)), np.full(STEPS, STEP)
-    told = longer(NOWHERE, by_poses(BICYCLE), as_motions(BICYCLE, controls, dt), dt)
+    told = extended(NO_ODOMETRY, by_poses(BICYCLE), as_motions(BICYCLE, controls, dt), dt)
     np.testing.assert_allclose(told.mean, LEG.mean, rtol=0, atol=1e-14)
     np.testing.assert_allclose(told.covariance, LEG.covariance, rtol=0, atol=1e-16)
 
@@ -72,7 +74,7 @@ def test_what_is_known_of_the_start_and_of_what_stands_is_carried_to_the_end():
     joint = L @ L.T
     start = Gaussian(mean=A.mean, covariance=joint[:3, :3])
     ends, expected = predicted_joint(start, LEG)
-    told = carried(A.mean, joint, LEG)
+    told = propagated(A.mean, joint, LEG)
     np.testing.assert_allclose(told[:3, :3], expected[3:, 3:], rtol=0, atol=1e-10)
     np.testing.assert_array_equal(told[3:, 3:], joint[3:, 3:])
     dx, dy = ends[1, :2] - A.mean[:2]
@@ -116,7 +118,7 @@ def test_covariances_are_symmetric_and_never_more_than_the_predictions():
 
 def test_a_leg_without_noise_is_itself_between_any_ends():
     exact = Motion(model="bicycle", control_std=(0.0, 0.0), wheelbase=0.2)
-    leg = longer(NOWHERE, exact, np.tile([CIRCLE[0], 0.2], (STEPS, 1)), np.full(STEPS, STEP))
+    leg = extended(NO_ODOMETRY, exact, np.tile([CIRCLE[0], 0.2], (STEPS, 1)), np.full(STEPS, STEP))
     ends, joint = predicted_joint(A, leg)
     told, steps = between(ends, joint, leg), placed(A, leg)
     np.testing.assert_allclose(told.mean, steps.mean, rtol=0, atol=1e-12)
@@ -126,12 +128,12 @@ def test_a_leg_without_noise_is_itself_between_any_ends():
 def test_a_leg_moves_unless_it_stands_without_noise():
     standing = Motion(model="unicycle", control_std=(0.1, 0.1), noise_at_rest=False)
     still = np.zeros((3, 2)), np.ones(3)
-    assert not NOWHERE.moves()
-    assert not longer(NOWHERE, standing, *still).moves()
+    assert not NO_ODOMETRY.moves()
+    assert not extended(NO_ODOMETRY, standing, *still).moves()
     restless = Motion(model="unicycle", control_std=(0.1, 0.1))
-    assert longer(NOWHERE, restless, *still).moves()
-    assert longer(NOWHERE, standing, np.array([[0.0, 0.3]]), np.ones(1)).moves()
+    assert extended(NO_ODOMETRY, restless, *still).moves()
+    assert extended(NO_ODOMETRY, standing, np.array([[0.0, 0.3]]), np.ones(1)).moves()
     told = np.zeros((3, 3))
-    assert longer(NOWHERE, by_poses(restless), told, np.ones(3)).moves()
-    assert not longer(NOWHERE, by_poses(standing), told, np.ones(3)).moves()
-    assert longer(NOWHERE, by_poses(standing), told + 1e-9, np.ones(3)).moves()
+    assert extended(NO_ODOMETRY, by_poses(restless), told, np.ones(3)).moves()
+    assert not extended(NO_ODOMETRY, by_poses(standing), told, np.ones(3)).moves()
+    assert extended(NO_ODOMETRY, by_poses(standing), told + 1e-9, np.ones(3)).moves()

@@ -8,10 +8,15 @@ import pytest
 from pipistrelle.estimation.beliefs import Gaussian, placed
 from pipistrelle.estimation.measurement import detour_of
 from pipistrelle.estimation.motion import Motion
-from pipistrelle.estimation.smoother.crossing import Bearing
-from pipistrelle.estimation.smoother.detours import Detour
+from pipistrelle.estimation.smoother.delayed_initialization import Bearing
 from pipistrelle.estimation.smoother.filter import Smoother
-from pipistrelle.estimation.smoother.placing import SHARE, Around, placed_by, sure_range
+from pipistrelle.estimation.smoother.tdoa import Detour
+from pipistrelle.estimation.smoother.tdoa_initialization import (
+    MAX_RELATIVE_RANGE_STD,
+    LastPose,
+    place_by_detours,
+    unscented_range,
+)
 from reference.missions import ray_config, scan_with
 
 UNICYCLE = Motion(model="unicycle", control_std=(0.05, 0.02), noise_at_rest=False)
@@ -34,11 +39,11 @@ def way_to(place, caller=CALLER):
 
 def test_the_range_by_a_detour_is_that_of_the_landmark_and_of_the_caller():
     no_noise = np.zeros((4, 4))
-    assert sure_range(way_to(BESIDE), no_noise, caller=False) == pytest.approx(
+    assert unscented_range(way_to(BESIDE), no_noise, caller=False) == pytest.approx(
         (np.hypot(*BESIDE), 0.0)
     )
     way = np.array([*BESIDE, bearing_of(CALLER), detour_of(HERE, BESIDE, CALLER)])
-    found = sure_range(way, no_noise, caller=True)
+    found = unscented_range(way, no_noise, caller=True)
     assert found == pytest.approx((np.hypot(*CALLER), 0.0))
 
 
@@ -50,9 +55,9 @@ def test_its_deviation_is_that_of_draws_where_noise_is_small(caller):
     way = way_to(BESIDE)
     if caller:
         way = np.array([*BESIDE, bearing_of(CALLER), way[3]])
-    distance, share = sure_range(way, spread, caller=caller)
+    distance, share = unscented_range(way, spread, caller=caller)
     draws = rng.multivariate_normal(way, spread, 4000)
-    ranges = [sure_range(one, np.zeros((4, 4)), caller=caller)[0] for one in draws]
+    ranges = [unscented_range(one, np.zeros((4, 4)), caller=caller)[0] for one in draws]
     assert share * distance == pytest.approx(np.std(ranges), rel=0.06)
 
 
@@ -61,14 +66,17 @@ def test_its_deviation_is_that_of_draws_where_noise_is_small(caller):
 def test_between_vehicle_and_caller_no_range_is_sure_whatever_the_detour_is_off(along, off):
     way = way_to(along * CALLER)
     way[3] += off
-    assert sure_range(way, np.diag([0.01, 0.01, 0.01, 0.05]) ** 2, caller=False)[1] > SHARE
+    assert (
+        unscented_range(way, np.diag([0.01, 0.01, 0.01, 0.05]) ** 2, caller=False)[1]
+        > MAX_RELATIVE_RANGE_STD
+    )
 
 
 def test_a_detour_that_may_be_none_tells_no_range():
     way = way_to(BESIDE)
     for std, known in ((way[3] / 2.99, False), (way[3] / 20.0, True)):
-        share = sure_range(way, np.diag([0.0, 0.0, 0.0, std**2]), caller=False)[1]
-        assert (share <= SHARE) == known
+        share = unscented_range(way, np.diag([0.0, 0.0, 0.0, std**2]), caller=False)[1]
+        assert (share <= MAX_RELATIVE_RANGE_STD) == known
 
 
 # In the graph
@@ -142,13 +150,16 @@ def test_one_between_them_that_is_known_by_its_range_is_left_where_it_is():
 
 def test_what_is_known_together_is_what_the_graph_says_when_the_vehicle_has_gone_on():
     belief = slam().predict(knowing(9, CALLER), np.array([[1.0, 0.3]] * 3), np.ones(3))[0]
-    around = Around(
-        isam=belief.solver.reach(belief.link), node=0, leg=belief.leg, pose=belief.pose().mean
+    around = LastPose(
+        isam=belief.solver.reach(belief.link),
+        node=0,
+        odometry=belief.odometry,
+        pose=belief.pose().mean,
     )
     told = around.joint(9)
     gone = slam().update(belief, scan((5, BESIDE, np.nan, np.nan)))
-    after = Around(
-        isam=gone.solver.reach(gone.link), node=gone.link.node, leg=None, pose=gone.pose().mean
+    after = LastPose(
+        isam=gone.solver.reach(gone.link), node=gone.link.node, odometry=None, pose=gone.pose().mean
     )
     assert gone.link.node == 1
     np.testing.assert_allclose(told, after.joint(9), rtol=0, atol=1e-9)
@@ -157,13 +168,17 @@ def test_what_is_known_together_is_what_the_graph_says_when_the_vehicle_has_gone
 
 def test_of_several_detours_the_surest_places():
     belief = knowing(9, CALLER)
-    around = Around(isam=belief.solver.reach(belief.link), node=0, leg=None, pose=np.zeros(3))
+    around = LastPose(
+        isam=belief.solver.reach(belief.link), node=0, odometry=None, pose=np.zeros(3)
+    )
     true = detour_of(HERE, BESIDE, CALLER)
     clues = [Detour(0, 4, 9, true + 0.5, 0.5), Detour(0, 4, 9, true, 0.02)]
     for order in (clues, clues[::-1]):
-        place = placed_by(around, Bearing(0, bearing_of(BESIDE), 0.01), 4, order)
+        place = place_by_detours(around, Bearing(0, bearing_of(BESIDE), 0.01), 4, order)
         np.testing.assert_allclose(place, BESIDE, rtol=0, atol=0.02)
-    vague = placed_by(around, Bearing(0, bearing_of(BESIDE), 0.01), 4, [Detour(0, 4, 9, true, 2.0)])
+    vague = place_by_detours(
+        around, Bearing(0, bearing_of(BESIDE), 0.01), 4, [Detour(0, 4, 9, true, 2.0)]
+    )
     assert vague is None
 
 

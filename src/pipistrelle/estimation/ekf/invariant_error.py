@@ -1,0 +1,117 @@
+r"""The right-invariant error: what is heard never tells which way is north.
+
+EKF-SLAM's covariance is that of the linear error, true state minus mean. It is linearised about
+means that change from frame to frame, so its corrections learn a little of the heading of vehicle
+and map together, though no measurement can tell it: the filter becomes sure of what it cannot know
+(Julier & Uhlmann, 2001; Huang et al., 2010). The right-invariant error :math:`\xi` moves the mean
+by one rigid motion and shifts each position besides,
+
+.. math:: \theta = \hat\theta + \xi_\theta, \quad
+          p = R(\xi_\theta)\,\hat p + V(\xi_\theta)\,\xi_p, \quad
+          l = R(\xi_\theta)\,\hat l + V(\xi_\theta)\,\xi_l
+
+for vehicle and every member of every landmark, with V the integral of the rotation. Then
+
+- the motion changes it by noise alone: F = I, and a control's noise (:math:`w_p, w_\theta` in x, y
+  and heading) enters the positions through the heading it turns,
+  :math:`\xi_p \mathrel{+}= w_p - J\hat p\,w_\theta`,
+  :math:`\xi_l \mathrel{-}= J\hat l\,w_\theta`, with J a rotation by 90 degrees; the noise of the
+  steps of a frame is summed first;
+- a measurement's Jacobian has no column of the heading, wherever it is linearised;
+- a new landmark has the row of the vehicle's position, and noise of its own;
+- a correction moves the whole mean by the exponential of its step.
+
+The velocity of a moving caller is rotated as points are (`ekf.caller_motion`). The origin of the
+frame is the start, so that levers are as short as the drive and no digits are lost to large
+coordinates.
+
+Sources: Barrau & Bonnabel, arXiv:1510.06263 (2015); Zhang, Wu, Song, Huang & Dissanayake, IEEE
+Robotics and Automation Letters 2 (2017).
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.estimation.motion import MotionNumbers, propagate_pose
+from pipistrelle.jit import kernel, no_alloc
+
+
+def rotated_left(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " m"]:
+    """Return J l of points l, one after the other: each rotated by 90 degrees to the left."""
+    return (points @ np.array([[0.0, 1.0], [-1.0, 0.0]])).ravel()
+
+
+def linear_covariance_of_points(
+    points: Float[np.ndarray, "n 2"],
+    covariance: Float[np.ndarray, "m m"],
+    with_heading: Float[np.ndarray, " m"],
+    heading_variance: float,
+) -> Float[np.ndarray, "m m"]:
+    """Turn the covariance of points' invariant errors into that of their linear errors."""
+    rotated = rotated_left(points)
+    lever = np.outer(rotated, with_heading)
+    return covariance + (lever + lever.T) + np.outer(rotated, rotated) * heading_variance
+
+
+@no_alloc
+def shifted_covariance(
+    P: Float[np.ndarray, "d d"], x: float, y: float, shifted: Float[np.ndarray, "3 3"]
+) -> None:
+    """Write M P M^T of the first three rows, M = [[1, 0, -y], [0, 1, x], [0, 0, 1]].
+
+    It turns the covariance of the invariant error of a pose at (x, y) into that of its linear
+    error; with (-x, -y), the other way round.
+    """
+    xh, yh, hh = P[0, 2], P[1, 2], P[2, 2]
+    shifted[0, 0] = P[0, 0] - 2.0 * y * xh + y * y * hh
+    shifted[1, 1] = P[1, 1] + 2.0 * x * yh + x * x * hh
+    shifted[0, 1] = shifted[1, 0] = P[0, 1] + x * xh - y * yh - x * y * hh
+    shifted[0, 2] = shifted[2, 0] = xh - y * hh
+    shifted[1, 2] = shifted[2, 1] = yh + x * hh
+    shifted[2, 2] = hh
+
+
+@kernel
+def propagate_invariant(
+    mean: Float[np.ndarray, " d"],
+    covariance: Float[np.ndarray, "d d"],
+    controls: Float[np.ndarray, "k c"],
+    dt: Float[np.ndarray, " k"],
+    motion: tuple[int, float, float, float, float, bool],
+    pose_means: Float[np.ndarray, "k 3"],
+    pose_covariances: Float[np.ndarray, "k 3 3"],
+) -> None:
+    """Propagate mean and covariance in place; the noise of all steps enters the landmarks once.
+
+    ``motion`` is `MotionNumbers` as a plain tuple; ``pose_covariances`` are of the linear error.
+    """
+    pose, P, numbers = mean[:3], covariance[:3, :3].copy(), MotionNumbers(*motion)
+    noise, gathered = np.zeros((3, 3)), np.empty((3, 3))
+    for k in range(controls.shape[0]):
+        propagate_pose(pose, noise, controls[k], dt[k], numbers)
+        shifted_covariance(P, pose[0], pose[1], pose_covariances[k])
+        for a in range(3):
+            pose_means[k, a] = pose[a]
+            for b in range(3):
+                pose_covariances[k, a, b] += noise[a, b]
+    shifted_covariance(noise, -pose[0], -pose[1], gathered)
+    turned, root = np.empty(mean.size), math.sqrt(gathered[2, 2])
+    for i in range(3, mean.size, 2):  # J l of each member
+        turned[i], turned[i + 1] = -mean[i + 1], mean[i]
+    for a in range(3):
+        for b in range(3):
+            covariance[a, b] += gathered[a, b]
+        for j in range(3, mean.size):
+            covariance[a, j] -= gathered[a, 2] * turned[j]
+            covariance[j, a] = covariance[a, j]
+    if controls.shape[0]:
+        shifted_covariance(
+            covariance, pose[0], pose[1], pose_covariances[-1]
+        )  # as `EkfBelief.pose`
+    for i in range(3, mean.size):
+        turned[i] *= root
+    for i in range(3, mean.size):
+        for j in range(3, mean.size):
+            covariance[i, j] += turned[i] * turned[j]
