@@ -6,7 +6,7 @@ import pytest
 from pipistrelle.config import InputError
 from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.scans import UNLABELLED, make_scan
-from pipistrelle.estimation.association import told
+from pipistrelle.estimation.association import known_labels
 from reference.missions import scan_of, scan_with
 
 NAN = np.nan
@@ -14,12 +14,12 @@ NAN = np.nan
 
 def test_what_was_told_is_taken_as_it_is_and_costs_no_copy():
     scan = scan_of((3, 5.0, 0.3), (8, NAN, 1.0))
-    assert labelled(scan, told(None, scan)) is scan
+    assert labelled(scan, known_labels(None, scan)) is scan
 
 
 def test_a_row_that_nobody_labelled_never_reaches_a_filter():
     scan = scan_of((3, 5.0, 0.3), (UNLABELLED, NAN, 1.0), (UNLABELLED, 2.0, 2.0))
-    assert labelled(scan, told(None, scan)).landmark.tolist() == [3]
+    assert labelled(scan, known_labels(None, scan)).landmark.tolist() == [3]
 
 
 def test_rows_of_one_label_become_one_whatever_their_order():
@@ -109,6 +109,6 @@ def test_the_level_of_merged_rows_is_the_highest_that_is_known():
 
 def test_a_scan_of_nothing_stays_one():
     empty = scan_of()
-    assert labelled(empty, told(None, empty)).landmark.size == 0
+    assert labelled(empty, known_labels(None, empty)).landmark.size == 0
     nobody = scan_of((UNLABELLED, 2.0, 0.1))
-    assert labelled(nobody, told(None, nobody)).landmark.size == 0
+    assert labelled(nobody, known_labels(None, nobody)).landmark.size == 0

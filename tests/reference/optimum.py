@@ -13,7 +13,7 @@ def from_the_truth(belief, path, places):
     """
     values, step = gtsam.Values(), 0
     for link in links(belief.link):
-        step += len(link.leg.mean) if link.leg else 0
+        step += len(link.odometry.mean) if link.odometry else 0
         if not values.exists(pose_key(link.node)):
             values.insert(pose_key(link.node), gtsam.Pose2(*path[step]))
     for label in belief.mapped:

@@ -76,7 +76,8 @@ def test_the_closed_forms_give_back_the_ranges_that_made_the_detour(vehicle, lan
     assert found == pytest.approx(np.hypot(*near), rel=1e-6)
     u = onward / np.hypot(*onward)
     found = caller_range_by_detour(e, *near, *u)
-    if np.hypot(*onward) < 100.0:
+    behind = near @ u < -(1.0 - 1e-6) * np.hypot(*near)  # all callers there make one detour
+    if np.hypot(*onward) < 100.0 and not behind:
         assert found == pytest.approx(np.hypot(*onward), rel=1e-5)
 
 

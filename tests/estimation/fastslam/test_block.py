@@ -25,7 +25,7 @@ from pipistrelle.estimation.fastslam.block import (
     refine_by_bearing,
 )
 from pipistrelle.estimation.fastslam.block_rays import part_lanes, scratch_for, weigh_by_active
-from pipistrelle.estimation.measurement import NEAREST
+from pipistrelle.estimation.measurement import NEAREST, Row
 
 
 def uncertain_pair(offset):
@@ -71,7 +71,7 @@ def test_what_stands_at_the_pose_refines_it_neither_by_its_bearing_nor_by_its_ra
         pose, member = uncertain_pair(offset * NEAREST)
         before, log_weight = pose.copy(), np.zeros(LANES)
         if by_range:
-            refine_by_active(pose, member, 0.01, 0.3, 0.04, 0.01, alone, log_weight)
+            refine_by_active(pose, member, Row(1, 0.3, 0.01, 0.01, 0.04), alone, log_weight)
             assert log_weight.any() == says
         else:
             refine_by_bearing(pose, member, 0.3, 0.01, whole)
@@ -83,7 +83,7 @@ def test_no_gate_drops_what_stands_at_the_pose_for_nothing_was_foreseen_of_it(of
     alone = np.ones(LANES, dtype=np.int64)
     pose, member = uncertain_pair(offset * NEAREST)
     assert bearing_beyond(pose, member, 3.0, 0.01, alone, 0, 1e-9) == beyond
-    assert active_beyond(pose, member, 50.0, 3.0, 0.04, 0.01, alone, 1e-9) == beyond
+    assert active_beyond(pose, member, Row(1, 3.0, 50.0, 0.01, 0.04), alone, 1e-9) == beyond
 
 
 def weighed(unit, distance=5.0):
@@ -102,12 +102,12 @@ def weighed(unit, distance=5.0):
         pose[places] *= unit**power
     rows[:, X:XX] *= unit
     rows[:, XX:LOG_WEIGHT] *= unit**2
-    log_weight, heard = np.zeros(LANES), (distance * unit, 0.1, 0.04 * unit**2, 0.01)
+    log_weight, row = np.zeros(LANES), Row(1, 0.1, distance * unit, 0.01, 0.04 * unit**2)
     scratch = scratch_for(3)
     part_lanes(count, scratch)
-    weigh_by_active(pose, rows, heard, count, scratch.ray, scratch, log_weight)
+    weigh_by_active(pose, rows, row, count, scratch.ray, scratch, log_weight)
     assert not log_weight[1::2].any()
-    refine_by_active(pose, rows[0], *heard, count, log_weight)
+    refine_by_active(pose, rows[0], row, count, log_weight)
     return log_weight[:2]
 
 

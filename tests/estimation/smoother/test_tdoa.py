@@ -13,6 +13,7 @@ from pipistrelle.estimation.smoother.tdoa import (
     Detour,
     detour_factors,
     detours_of,
+    split_ready,
 )
 from reference.missions import scan_with
 

@@ -258,47 +258,36 @@ def _take_in(
     state: State,
     heard: Measurements,
     known: Bool[np.ndarray, " m"],
+    frame: FrameDetours | None,
     params: UpdateParams,
     scratch: Scratch,
 ) -> Whole:
-    """Correct with landmarks of the map, then append new ones; return how many rows were gated."""
+    """Correct with landmarks of the map, then append new ones; return how many rows were gated.
+
+    Where a scan has detours, they place landmarks first, and the others are used last.
+    """
     gated = 0
     for m in range(heard.landmark.size):
         if known[m]:
-            gated += _correct_known(state, row_of(heard, m), params, scratch)
-    flush(state.joint, 3 + 2 * state.members[0])
-    for m in range(heard.landmark.size):
-        if not known[m]:
-            _add_new(state, row_of(heard, m), params, False)
-    return gated
-
-
-@no_alloc
-def _take_in_timed(
-    state: State,
-    heard: Measurements,
-    known: Bool[np.ndarray, " m"],
-    frame: FrameDetours,
-    params: UpdateParams,
-    scratch: Scratch,
-) -> Whole:
-    """Do the same where a scan has detours: they place landmarks first, the rest is used last."""
-    gated = 0
-    for m in range(heard.landmark.size):
-        if known[m]:
-            row = row_of(heard, m)
-            if not placed_by_detour(state, row, frame, params.robust, scratch):
+            row, placed = row_of(heard, m), False
+            if frame is not None:
+                placed = placed_by_detour(state, row, frame, params.robust, scratch)
+            if not placed:
                 gated += _correct_known(state, row, params, scratch)
     flush(state.joint, 3 + 2 * state.members[0])
     for m in range(heard.landmark.size):
         if not known[m]:
-            row = row_of(heard, m)
-            if not added_by_detour(state, row, frame, params.robust):
-                _add_new(state, row, params, row.landmark in frame.moving)
-    for d in range(frame.landmark.size):
-        if not frame.used[d]:
-            gated += correct_by_detour(state, frame, d, params, scratch)
-    flush(state.joint, 3 + 2 * state.members[0])
+            row, placed, moves = row_of(heard, m), False, False
+            if frame is not None:
+                placed = added_by_detour(state, row, frame, params.robust)
+                moves = row.landmark in frame.moving
+            if not placed:
+                _add_new(state, row, params, moves)
+    if frame is not None:
+        for d in range(frame.landmark.size):
+            if not frame.used[d]:
+                gated += correct_by_detour(state, frame, d, params, scratch)
+        flush(state.joint, 3 + 2 * state.members[0])
     return gated
 
 
@@ -331,11 +320,9 @@ def corrected(
     for member in range(members):
         landmark[member], weight[member] = old_landmark[member], old_weight[member]
     if timings is None:
-        gated = _take_in(state, heard, known, params, scratch)
+        gated = _take_in(state, heard, known, None, params, scratch)
     else:
-        gated = _take_in_timed(
-            state, heard, known, frame_detours(columns, timings), params, scratch
-        )
+        gated = _take_in(state, heard, known, frame_detours(columns, timings), params, scratch)
     joint.mean[2], members = wrap_angle(joint.mean[2]), state.members[0]
     mean, covariance = gaussian_of(joint, 3 + 2 * members)
     squared, degrees = scratch.innovations

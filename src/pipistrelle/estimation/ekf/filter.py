@@ -86,13 +86,13 @@ class EkfBelief:
 
     def landmarks(self) -> Landmarks:
         """Return the map, one row per member."""
-        return self._rows(is_standing(self.landmark))
+        return self.rows(is_standing(self.landmark))
 
     def moving(self) -> Landmarks:
         """Return the callers that move, one row per member."""
-        return self._rows(~is_standing(self.landmark) & ~is_velocity(self.landmark))
+        return self.rows(~is_standing(self.landmark) & ~is_velocity(self.landmark))
 
-    def _rows(self, kept: Bool[np.ndarray, " h"]) -> Landmarks:
+    def rows(self, kept: Bool[np.ndarray, " h"]) -> Landmarks:
         """Return some members with the covariance of the linear error, a landmark's together."""
         at = (3 + 2 * np.flatnonzero(kept)[:, np.newaxis] + np.arange(2)).ravel()
         mean, covariance = self.mean[at].reshape(-1, 2), self.covariance[np.ix_(at, at)]

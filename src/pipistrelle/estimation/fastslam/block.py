@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.arithmetic.elementary import arctangent, cosine_and_sine, logarithm, wrapped
-from pipistrelle.estimation.measurement import NEAREST
+from pipistrelle.estimation.measurement import NEAREST, Row
 from pipistrelle.jit import Flag, Whole, inlined, no_alloc
 
 LANES = 32
@@ -186,14 +186,14 @@ def correct_by_bearing(
 
 @inlined
 def _active(
-    pose: Poses, member: Member, distance: float, bearing: float, i: Whole
+    pose: Poses, member: Member, row: Row, i: Whole
 ) -> tuple[float, float, float, float, float, Flag]:
     """Innovations of range and bearing, direction (c, s), inverse range, if they are defined."""
     dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
     near = math.sqrt(dx * dx + dy * dy)
     k = 1.0 / max(near, NEAREST)
-    turn = wrapped(pose[HEADING + i] + bearing - arctangent(dy, dx))
-    return distance - near, turn, dx * k, dy * k, k, near >= NEAREST
+    turn = wrapped(pose[HEADING + i] + row.bearing - arctangent(dy, dx))
+    return row.range - near, turn, dx * k, dy * k, k, near >= NEAREST
 
 
 @inlined
@@ -210,14 +210,7 @@ def _whitened(
 
 @inlined
 def _active_spread(
-    pose: Poses,
-    member: Member,
-    c: float,
-    s: float,
-    k: float,
-    range_variance: float,
-    bearing_variance: float,
-    i: Whole,
+    pose: Poses, member: Member, c: float, s: float, k: float, row: Row, i: Whole
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
     """Covariance of range and bearing with x, y, heading, and of their innovations."""
     h0, h1 = s * k, -c * k
@@ -227,36 +220,26 @@ def _active_spread(
     b0, b1, b2 = _bearing_gain(pose, h0, h1, i)
     u0 = c * member[XX + i] + s * member[XY + i]
     u1 = c * member[XY + i] + s * member[YY + i]
-    S00 = -c * a0 - s * a1 + c * u0 + s * u1 + range_variance
+    S00 = -c * a0 - s * a1 + c * u0 + s * u1 + row.range_variance
     S01 = h0 * a0 + h1 * a1 - a2 - h0 * u0 - h1 * u1
-    S11 = h0 * b0 + h1 * b1 - b2 + _spread(member, h0, h1, i) + bearing_variance
+    S11 = h0 * b0 + h1 * b1 - b2 + _spread(member, h0, h1, i) + row.bearing_variance
     return a0, a1, a2, b0, b1, b2, S00, S01, S11
 
 
 @no_alloc
 def expect_active(
-    pose: Poses,
-    member: Member,
-    distance: float,
-    bearing: float,
-    range_variance: float,
-    bearing_variance: float,
-    count: Counts,
-    j: Whole,
-    log_likelihood: Lanes,
+    pose: Poses, member: Member, row: Row, count: Counts, j: Whole, log_likelihood: Lanes
 ) -> None:
     """Log likelihood, without its constant, of range and bearing of each lane's member j.
 
     Minus infinity and too near: as `expect_bearing` has them.
     """
     for i in range(LANES):
-        nu0, nu1, c, s, k, far = _active(pose, member, distance, bearing, i)
-        _, _, _, _, _, _, S00, S01, S11 = _active_spread(
-            pose, member, c, s, k, range_variance, bearing_variance, i
-        )
+        nu0, nu1, c, s, k, far = _active(pose, member, row, i)
+        _, _, _, _, _, _, S00, S01, S11 = _active_spread(pose, member, c, s, k, row, i)
         e0, e1, i0, i1, _ = _whitened(nu0, nu1, S00, S01, S11)
         value = -0.5 * (e0 * e0 + e1 * e1) + logarithm(i0 * i1)
-        S00 = member[XX + i] + member[YY + i] + range_variance
+        S00 = member[XX + i] + member[YY + i] + row.range_variance
         unforeseen = -0.5 * (nu0 * nu0 / S00 + logarithm(S00)) - HALF_LOG_TAU
         unforeseen = unforeseen if count[i] > 1 else 2.0 * HALF_LOG_TAU
         value = value if far else unforeseen
@@ -264,23 +247,12 @@ def expect_active(
 
 
 @no_alloc
-def active_beyond(
-    pose: Poses,
-    member: Member,
-    distance: float,
-    bearing: float,
-    range_variance: float,
-    bearing_variance: float,
-    count: Counts,
-    bound: float,
-) -> bool:
+def active_beyond(pose: Poses, member: Member, row: Row, count: Counts, bound: float) -> bool:
     """Tell whether range and bearing are beyond the bound for every lane, each of one member."""
     beyond = 0
     for i in range(LANES):
-        nu0, nu1, c, s, k, far = _active(pose, member, distance, bearing, i)
-        _, _, _, _, _, _, S00, S01, S11 = _active_spread(
-            pose, member, c, s, k, range_variance, bearing_variance, i
-        )
+        nu0, nu1, c, s, k, far = _active(pose, member, row, i)
+        _, _, _, _, _, _, S00, S01, S11 = _active_spread(pose, member, c, s, k, row, i)
         e0, e1, _, _, _ = _whitened(nu0, nu1, S00, S01, S11)
         within = not far or e0 * e0 + e1 * e1 <= bound
         beyond += 0 if within or count[i] > 1 else 1
@@ -288,23 +260,13 @@ def active_beyond(
 
 
 @no_alloc
-def squared_innovation(
-    pose: Poses,
-    member: Member,
-    distance: float,
-    bearing: float,
-    range_variance: float,
-    bearing_variance: float,
-    i: Whole,
-) -> float:
+def squared_innovation(pose: Poses, member: Member, row: Row, i: Whole) -> float:
     """Squared innovation of lane i divided by its variance; NaN for a member too near."""
-    nu0, nu1, c, s, k, far = _active(pose, member, distance, bearing, i)
-    _, _, _, _, _, _, S00, S01, S11 = _active_spread(
-        pose, member, c, s, k, range_variance, bearing_variance, i
-    )
+    nu0, nu1, c, s, k, far = _active(pose, member, row, i)
+    _, _, _, _, _, _, S00, S01, S11 = _active_spread(pose, member, c, s, k, row, i)
     if not far:
         return math.nan
-    if math.isnan(distance):
+    if math.isnan(row.range):
         return nu1 * nu1 / S11
     e0, e1, _, _, _ = _whitened(nu0, nu1, S00, S01, S11)
     return e0 * e0 + e1 * e1
@@ -312,21 +274,12 @@ def squared_innovation(
 
 @no_alloc
 def refine_by_active(
-    pose: Poses,
-    member: Member,
-    distance: float,
-    bearing: float,
-    range_variance: float,
-    bearing_variance: float,
-    count: Counts,
-    log_weight: Lanes,
+    pose: Poses, member: Member, row: Row, count: Counts, log_weight: Lanes
 ) -> None:
     """Correct the poses whose landmark has one member by range and bearing, and weigh them."""
     for i in range(LANES):
-        nu0, nu1, c, s, k, far = _active(pose, member, distance, bearing, i)
-        a0, a1, a2, b0, b1, b2, S00, S01, S11 = _active_spread(
-            pose, member, c, s, k, range_variance, bearing_variance, i
-        )
+        nu0, nu1, c, s, k, far = _active(pose, member, row, i)
+        a0, a1, a2, b0, b1, b2, S00, S01, S11 = _active_spread(pose, member, c, s, k, row, i)
         e0, e1, i0, i1, L10 = _whitened(nu0, nu1, S00, S01, S11)
         part = 1.0 if far and count[i] == 1 else 0.0
         value = -0.5 * (e0 * e0 + e1 * e1) + logarithm(i0 * i1) - 2.0 * HALF_LOG_TAU
@@ -346,25 +299,17 @@ def refine_by_active(
 
 
 @no_alloc
-def correct_by_active(
-    pose: Poses,
-    member: Member,
-    distance: float,
-    bearing: float,
-    range_variance: float,
-    bearing_variance: float,
-    count: Counts,
-) -> None:
+def correct_by_active(pose: Poses, member: Member, row: Row, count: Counts) -> None:
     """Correct a member by range and bearing, in lanes where it is its landmark's only one."""
     for i in range(LANES):
-        nu0, nu1, c, s, k, far = _active(pose, member, distance, bearing, i)
+        nu0, nu1, c, s, k, far = _active(pose, member, row, i)
         g0, g1 = -s * k, c * k
         a0 = c * member[XX + i] + s * member[XY + i]
         a1 = c * member[XY + i] + s * member[YY + i]
         b0 = g0 * member[XX + i] + g1 * member[XY + i]
         b1 = g0 * member[XY + i] + g1 * member[YY + i]
-        S00, S01 = c * a0 + s * a1 + range_variance, g0 * a0 + g1 * a1
-        S11 = g0 * b0 + g1 * b1 + bearing_variance
+        S00, S01 = c * a0 + s * a1 + row.range_variance, g0 * a0 + g1 * a1
+        S11 = g0 * b0 + g1 * b1 + row.bearing_variance
         e0, e1, i0, i1, L10 = _whitened(nu0, nu1, S00, S01, S11)
         part = 1.0 if far and count[i] == 1 else 0.0
         i0, i1 = part * i0, part * i1
@@ -379,19 +324,13 @@ def correct_by_active(
 
 @no_alloc
 def initialise_member(
-    pose: Poses,
-    member: Member,
-    distance: float,
-    bearing: float,
-    range_variance: float,
-    bearing_variance: float,
-    log_weight: float,
-    count: Counts,
+    pose: Poses, member: Member, row: Row, log_weight: float, count: Counts
 ) -> None:
     """Place a member at a range and bearing, where its landmark has not one member (Eq. (16))."""
-    across = bearing_variance * distance * distance
+    distance, range_variance = row.range, row.range_variance
+    across = row.bearing_variance * distance * distance
     for i in range(LANES):
-        c, s = cosine_and_sine(pose[HEADING + i] + bearing)
+        c, s = cosine_and_sine(pose[HEADING + i] + row.bearing)
         x, y = pose[X + i] + distance * c, pose[Y + i] + distance * s
         xx = range_variance * c * c + across * s * s
         xy = (range_variance - across) * c * s

@@ -15,9 +15,10 @@ measurement changes one landmark and the caller, and no other landmark need be w
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from pipistrelle.arithmetic.elementary import arctangent, cosine_and_sine, wrapped
 from pipistrelle.estimation.fastslam.block import (
@@ -40,10 +41,11 @@ from pipistrelle.estimation.fastslam.block import (
 from pipistrelle.estimation.measurement import (
     MIN_TDOA_SIGMAS,
     NEAREST,
+    Row,
     detour_slopes,
     range_by_detour,
 )
-from pipistrelle.jit import Flag, Whole, inlined, no_alloc
+from pipistrelle.jit import Flag, Whole, inlined, no_alloc, no_alloc_inlined
 
 AXX, AXY, AYX, AYY = range(0, 4 * LANES, LANES)
 SLOPES = 4 * LANES
@@ -52,6 +54,19 @@ MAX_RELATIVE_STD = 0.2
 """Detours are used where the caller's standard deviation is at most this share of its distance, and
 place a landmark where that of the range is: beyond, no Gaussian has the ellipse's shape."""
 Slopes = Float[np.ndarray, " slopes"]
+
+
+class Pairs(NamedTuple):
+    """Landmarks of one block with their parents, and the detours of a scan."""
+
+    parent: Int[np.ndarray, " n"]
+    slope: Float[np.ndarray, "n slopes"]  # (n, 4 L)
+    detour: Float[np.ndarray, " m"]
+    """of each measurement, by its landmark's parent; NaN where there is none."""
+    variance: Float[np.ndarray, " m"]
+    turn: Lanes  # array to work with, as are the next two
+    usable: Lanes
+    row: Member
 
 
 @no_alloc
@@ -144,68 +159,42 @@ def _take(
     caller[YY + i] -= t1 * t1 * whole
 
 
-@no_alloc
-def correct_pair_by_bearing(
-    pose: Poses,
-    caller: Member,
-    member: Member,
-    slope: Slopes,
-    bearing: float,
-    variance: float,
-    turn: Lanes,
+@inlined
+def _offset(
+    pose: Poses, caller: Member, member: Member, slope: Slopes, turn: Lanes, i: Whole
+) -> tuple[float, float, float, float, float]:
+    """Offset x, y, range and inverse range of a landmark; 1 or 0: whether to correct it."""
+    lx, ly = _place(caller, member, slope, i)
+    dx, dy = lx - pose[X + i], ly - pose[Y + i]
+    near = math.sqrt(dx * dx + dy * dy)
+    return dx, dy, near, 1.0 / max(near, NEAREST), turn[i] if near >= NEAREST else 0.0
+
+
+@no_alloc_inlined
+def correct_pair(
+    pose: Poses, caller: Member, callers: Counts, n: Whole, pairs: Pairs, row: Row, m: Whole
 ) -> None:
-    """Correct a landmark and its caller by the landmark's bearing from certain poses."""
+    """Correct landmark n, copied to ``pairs.row``, and its caller by all of measurement m."""
+    member, slope, turn = pairs.row, pairs.slope[n], pairs.turn
     for i in range(LANES):
-        lx, ly = _place(caller, member, slope, i)
-        dx, dy = lx - pose[X + i], ly - pose[Y + i]
-        near = math.sqrt(dx * dx + dy * dy)
-        k = 1.0 / max(near, NEAREST)
-        innovation = wrapped(pose[HEADING + i] + bearing - arctangent(dy, dx))
-        part = turn[i] if near >= NEAREST else 0.0
+        dx, dy, _, k, part = _offset(pose, caller, member, slope, turn, i)
+        innovation = wrapped(pose[HEADING + i] + row.bearing - arctangent(dy, dx))
         slopes = -dy * k * k, dx * k * k, 0.0, 0.0
-        _take(caller, member, slope, (innovation, variance, part), slopes, i)
-
-
-@no_alloc
-def correct_pair_by_range(
-    pose: Poses,
-    caller: Member,
-    member: Member,
-    slope: Slopes,
-    distance: float,
-    variance: float,
-    turn: Lanes,
-) -> None:
-    """Correct a landmark and its caller by the landmark's range from certain poses."""
-    for i in range(LANES):
-        lx, ly = _place(caller, member, slope, i)
-        dx, dy = lx - pose[X + i], ly - pose[Y + i]
-        near = math.sqrt(dx * dx + dy * dy)
-        k = 1.0 / max(near, NEAREST)
-        part = turn[i] if near >= NEAREST else 0.0
-        slopes = dx * k, dy * k, 0.0, 0.0
-        _take(caller, member, slope, (distance - near, variance, part), slopes, i)
-
-
-@no_alloc
-def correct_pair_by_detour(
-    pose: Poses,
-    caller: Member,
-    member: Member,
-    slope: Slopes,
-    detour: float,
-    variance: float,
-    turn: Lanes,
-    usable: Lanes,
-) -> None:
-    """Correct a landmark and its caller by a detour to certain poses, in lanes where it counts."""
-    for i in range(LANES):
-        lx, ly = _place(caller, member, slope, i)
-        e, q0, q1, f0, f1 = detour_slopes(
-            pose[X + i], pose[Y + i], lx, ly, caller[X + i], caller[Y + i]
-        )
-        part = turn[i] * usable[i]
-        _take(caller, member, slope, (detour - e, variance, part), (q0, q1, f0, f1), i)
+        _take(caller, member, slope, (innovation, row.bearing_variance, part), slopes, i)
+    if not math.isnan(row.range):
+        for i in range(LANES):
+            dx, dy, near, k, part = _offset(pose, caller, member, slope, turn, i)
+            measured = row.range - near, row.range_variance, part
+            _take(caller, member, slope, measured, (dx * k, dy * k, 0.0, 0.0), i)
+    if not math.isnan(pairs.detour[m]):
+        lanes_with_sure_parent(pose, caller, callers, pairs.usable)
+        for i in range(LANES):
+            lx, ly = _place(caller, member, slope, i)
+            e, q0, q1, f0, f1 = detour_slopes(
+                pose[X + i], pose[Y + i], lx, ly, caller[X + i], caller[Y + i]
+            )
+            measured = pairs.detour[m] - e, pairs.variance[m], turn[i] * pairs.usable[i]
+            _take(caller, member, slope, measured, (q0, q1, f0, f1), i)
 
 
 @inlined

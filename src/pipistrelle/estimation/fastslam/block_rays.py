@@ -40,7 +40,7 @@ from pipistrelle.estimation.fastslam.block import (
     expect_bearing,
     refine_by_bearing,
 )
-from pipistrelle.estimation.measurement import NEAREST
+from pipistrelle.estimation.measurement import NEAREST, Row
 from pipistrelle.estimation.rays import (
     AS_PRINTED,
     EXACT,
@@ -230,7 +230,7 @@ def refine_by_ray(
 def weigh_by_active(
     pose: Poses,
     rows: Rows,
-    heard: tuple[float, float, float, float],
+    row: Row,
     count: Counts,
     turn: Lanes,
     scratch: Scratch,
@@ -239,15 +239,11 @@ def weigh_by_active(
     """Weigh the poses by range and bearing of a landmark: the density of its members' mixture.
 
     One member is a mixture, too: all weights are densities over range and bearing, so that the
-    units do not matter. ``heard`` is range, bearing and their variances.
+    units do not matter.
     """
     members = most_members(count)
-    distance, bearing, range_variance, bearing_variance = heard
     for j in range(members):
-        expect_active(
-            pose, rows[j], distance, bearing, range_variance, bearing_variance, count, j,
-            scratch.likelihood[j],
-        )  # fmt: skip
+        expect_active(pose, rows[j], row, count, j, scratch.likelihood[j])
     _weigh(rows, members, scratch)
     _add(scratch.total, 2, turn, log_weight)
 

@@ -5,43 +5,25 @@ A landmark has the same parent in all particles: ``parent[n]`` is the number of 
 until a detour is used, and has no rows as long as no landmark has a parent.
 """
 
-import math
-from typing import NamedTuple
-
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipistrelle.estimation.fastslam.block import LANES, Counts, Lanes, Member, Poses
+from pipistrelle.estimation.fastslam.block import LANES, Lanes, Member
 from pipistrelle.estimation.fastslam.block_conditional import (
     SLOPES,
-    correct_pair_by_bearing,
-    correct_pair_by_detour,
-    correct_pair_by_range,
+    Pairs,
     detour_beyond,
     lanes_with_parent,
     lanes_with_sure_parent,
     shift_by_parent,
 )
-from pipistrelle.estimation.measurement import Detours, Measurements
-from pipistrelle.jit import Whole, kernel, no_alloc, no_alloc_inlined
+from pipistrelle.estimation.measurement import Detours
+from pipistrelle.jit import Whole, kernel, no_alloc
 
 Parents = tuple[Int[np.ndarray, " parents"], Float[np.ndarray, "b n slopes"]]
 """Number of each landmark's parent, and the slopes."""
 ParentsAfter = tuple[Int[np.ndarray, " reached"], Float[np.ndarray, "b more slopes"]]
 """The same, with the landmarks of a scan that are new."""
-
-
-class Pairs(NamedTuple):
-    """Landmarks of one block with their parents, and the detours of a scan."""
-
-    parent: Int[np.ndarray, " n"]
-    slope: Float[np.ndarray, "n slopes"]  # (n, 4 L)
-    detour: Float[np.ndarray, " m"]
-    """of each measurement, by its landmark's parent; NaN where there is none."""
-    variance: Float[np.ndarray, " m"]
-    turn: Lanes  # array to work with, as are the next two
-    usable: Lanes
-    row: Member
 
 
 @no_alloc
@@ -110,32 +92,6 @@ def shift_all(
         h = pairs.parent[n]
         if h >= 0:
             shift_by_parent(member[first[h]], member[first[n]], pairs.slope[n], sign)
-
-
-@no_alloc_inlined
-def correct_pair(
-    pose: Poses,
-    caller: Member,
-    callers: Counts,
-    n: Whole,
-    pairs: Pairs,
-    heard: Measurements,
-    m: Whole,
-) -> None:
-    """Correct landmark n, copied to ``pairs.row``, and its caller by all of measurement m."""
-    row, slope, turn = pairs.row, pairs.slope[n], pairs.turn
-    correct_pair_by_bearing(
-        pose, caller, row, slope, heard.bearing[m], heard.bearing_variance[m], turn
-    )
-    if not math.isnan(heard.range[m]):
-        correct_pair_by_range(
-            pose, caller, row, slope, heard.range[m], heard.range_variance[m], turn
-        )
-    if not math.isnan(pairs.detour[m]):
-        lanes_with_sure_parent(pose, caller, callers, pairs.usable)
-        correct_pair_by_detour(
-            pose, caller, row, slope, pairs.detour[m], pairs.variance[m], turn, pairs.usable
-        )
 
 
 @no_alloc

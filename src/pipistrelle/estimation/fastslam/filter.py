@@ -159,16 +159,6 @@ class FastSlamBelief:
 class FastSlam:
     """FastSLAM 2.0 (Bradley & Abaid, Sec. III-B) with rays (Sec. III-C).
 
-    Attributes
-    ----------
-    motion : Motion
-    rays : RayConfig
-    gate : float
-        A measurement that is outside this share of every particle's predicted distribution is
-        dropped; 1 drops none.
-    settings : FastSlamConfig
-        Number of particles, when to resample, how to treat rays.
-
     Examples
     --------
     >>> from pipistrelle.detection.scans import make_scan
@@ -185,6 +175,8 @@ class FastSlam:
     motion: Motion
     rays: RayConfig
     gate: float = 1.0
+    """A measurement that is outside this share of every particle's predicted distribution is
+    dropped; 1 drops none."""
     settings: FastSlamConfig = _PAPER
 
     def __post_init__(self) -> None:

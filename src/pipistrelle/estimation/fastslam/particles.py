@@ -19,7 +19,6 @@ from pipistrelle.estimation.fastslam.block import (
     POSE,
     Counts,
     Lanes,
-    Member,
     Poses,
     active_beyond,
     bearing_beyond,
@@ -32,6 +31,8 @@ from pipistrelle.estimation.fastslam.block import (
     weigh_sample,
 )
 from pipistrelle.estimation.fastslam.block_conditional import (
+    Pairs,
+    correct_pair,
     lanes_with_parent,
     lanes_with_sure_parent,
     place_by_detour,
@@ -52,18 +53,25 @@ from pipistrelle.estimation.fastslam.block_rays import (
     weigh_by_bearing,
 )
 from pipistrelle.estimation.fastslam.conditional_landmarks import (
-    Pairs,
     Parents,
     ParentsAfter,
     assign_parents,
     copy_lanes,
     copy_row,
-    correct_pair,
     detours_of_parents,
     gated_detours,
     shift_all,
+    slot_of,
 )
-from pipistrelle.estimation.measurement import Columns, Measurements, Timings, detours, measurements
+from pipistrelle.estimation.measurement import (
+    Columns,
+    Measurements,
+    Row,
+    Timings,
+    detours,
+    measurements,
+    row_of,
+)
 from pipistrelle.estimation.rays import ANEW, BEARING, CORRECTED, MOVED, OTHERS, RESET, UpdateParams
 from pipistrelle.jit import Whole, kernel, no_alloc, no_alloc_inlined
 
@@ -78,22 +86,8 @@ class Particles(NamedTuple):
     member: Float[np.ndarray, "b c numbers"]
 
 
-Arrays = tuple[
-    Float[np.ndarray, "b rows"],
-    Int[np.ndarray, " n"],
-    Int[np.ndarray, " n+1"],
-    Int[np.ndarray, "b n lanes"],
-    Float[np.ndarray, "b c numbers"],
-]
+Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """The same as a plain tuple, which is passed to a kernel faster."""
-Extended = tuple[
-    Float[np.ndarray, "b rows"],
-    Int[np.ndarray, " more"],
-    Int[np.ndarray, " more+1"],
-    Int[np.ndarray, "b more lanes"],
-    Float[np.ndarray, "b members numbers"],
-]
-"""The same with the new landmarks of a scan."""
 
 
 class Block(NamedTuple):
@@ -111,22 +105,8 @@ def _slots(landmark: Int[np.ndarray, " n"], labels: Int[np.ndarray, " m"]) -> In
     """Index of each label among the landmarks; -1 for a new one."""
     slot = np.empty(labels.size, dtype=np.int64)
     for m in range(labels.size):
-        slot[m] = -1
-        for n in range(landmark.size):
-            if landmark[n] == labels[m]:
-                slot[m] = n
+        slot[m] = slot_of(landmark, labels[m])
     return slot
-
-
-@no_alloc
-def _active_gated(
-    pose: Poses, member: Member, heard: Measurements, m: Whole, count: Counts, bound: float
-) -> bool:
-    """Tell whether range and bearing of measurement m are beyond the bound for every lane."""
-    return active_beyond(
-        pose, member, heard.range[m], heard.bearing[m], heard.range_variance[m],
-        heard.bearing_variance[m], count, bound,
-    )  # fmt: skip
 
 
 @kernel
@@ -152,8 +132,8 @@ def gated_by_all(
             pose, count = particles.pose[b], particles.count[b, n]
             rows = particles.member[b, particles.first[n] : particles.first[n + 1]]
             if not math.isnan(heard.range[m]):
-                gated[m] = gated[m] and _active_gated(
-                    pose, rows[0], heard, m, count, params.active_bound
+                gated[m] = gated[m] and active_beyond(
+                    pose, rows[0], row_of(heard, m), count, params.active_bound
                 )
                 continue
             bearing, variance = heard.bearing[m], heard.bearing_variance[m]
@@ -180,58 +160,38 @@ def innovations_of(arrays: Arrays, columns: Columns, particle: Whole) -> tuple[f
         n = slot[m]
         if n < 0 or particles.count[b, n, i] != 1:
             continue
-        one = squared_innovation(
-            particles.pose[b], particles.member[b, particles.first[n]], heard.range[m],
-            heard.bearing[m], heard.range_variance[m], heard.bearing_variance[m], i,
-        )  # fmt: skip
+        member = particles.member[b, particles.first[n]]
+        one = squared_innovation(particles.pose[b], member, row_of(heard, m), i)
         if not math.isnan(one):
             squared += one
             degrees += 1.0 if math.isnan(heard.range[m]) else 2.0
     return squared, degrees
 
 
-@no_alloc
-def _initialise_active(
-    pose: Poses, member: Member, heard: Measurements, m: Whole, count: Counts
-) -> None:
-    """Place a member at range and bearing of measurement m, where a landmark has not one member."""
-    initialise_member(
-        pose, member, heard.range[m], heard.bearing[m], heard.range_variance[m],
-        heard.bearing_variance[m], 0.0, count,
-    )  # fmt: skip
-
-
 @no_alloc_inlined
 def _correct_by_range(
-    pose: Poses,
-    rows: Rows,
-    count: Counts,
-    heard: Measurements,
-    m: Whole,
-    params: UpdateParams,
-    scratch: Scratch,
+    pose: Poses, rows: Rows, count: Counts, row: Row, params: UpdateParams, scratch: Scratch
 ) -> None:
     """Correct a landmark by range and bearing, a ray as `rays.ranged` says, in place."""
-    ranged, bearing, variance = params.ranged, heard.bearing[m], heard.bearing_variance[m]
-    distance, range_variance = heard.range[m], heard.range_variance[m]
+    ranged, bearing, variance = params.ranged, row.bearing, row.bearing_variance
     if ranged == CORRECTED:
         keep_heaviest(rows, count)
     part_lanes(count, scratch)
-    correct_by_active(pose, rows[0], distance, bearing, range_variance, variance, count)
+    correct_by_active(pose, rows[0], row, count)
     if most_members(count) == 1:
         return
     if ranged == ANEW:
-        _initialise_active(pose, rows[0], heard, m, count)
+        initialise_member(pose, rows[0], row, 0.0, count)
         count[:] = 1
     elif ranged < BEARING:
         keep_heaviest(rows, count)
-        heaviest_to_range(pose, rows, count, distance, scratch.ray)
+        heaviest_to_range(pose, rows, count, row.range, scratch.ray)
         if ranged == RESET:
-            reset_member(pose, rows[0], range_variance, variance, scratch.ray)
+            reset_member(pose, rows[0], row.range_variance, variance, scratch.ray)
         correct_by_bearing(pose, rows[0], bearing, variance, scratch.ray)
     else:
         if ranged == MOVED:
-            heaviest_to_range(pose, rows, count, distance, scratch.ray)
+            heaviest_to_range(pose, rows, count, row.range, scratch.ray)
         elif ranged == OTHERS:
             drop_heaviest(rows, count)
         correct_ray(pose, rows, count, bearing, variance, params, scratch.ray, scratch)
@@ -250,44 +210,34 @@ def _refine(
         n = slot[m]
         if n < 0:
             continue
-        rows, bearing = block.member[block.first[n] : block.first[n + 1]], heard.bearing[m]
-        variance, count = heard.bearing_variance[m], block.count[n]
-        if math.isnan(heard.range[m]):
+        rows, count = block.member[block.first[n] : block.first[n + 1]], block.count[n]
+        row = row_of(heard, m)
+        if math.isnan(row.range):
             refine_by_ray(
-                block.pose, rows, count, bearing, variance, params, scratch.whole, scratch,
-                block.gained,
+                block.pose, rows, count, row.bearing, row.bearing_variance, params, scratch.whole,
+                scratch, block.gained,
             )  # fmt: skip
         else:
             if most_members(count) > 1:
                 part_lanes(count, scratch)
-                _refine_by_ranged_ray(block, rows, count, heard, m, params, scratch)
-            refine_by_active(
-                block.pose, rows[0], heard.range[m], bearing, heard.range_variance[m], variance,
-                count, block.gained,
-            )  # fmt: skip
+                _refine_by_ranged_ray(block, rows, count, row, params, scratch)
+            refine_by_active(block.pose, rows[0], row, count, block.gained)
 
 
 @no_alloc
 def _refine_by_ranged_ray(
-    block: Block,
-    rows: Rows,
-    count: Counts,
-    heard: Measurements,
-    m: Whole,
-    params: UpdateParams,
-    scratch: Scratch,
+    block: Block, rows: Rows, count: Counts, row: Row, params: UpdateParams, scratch: Scratch
 ) -> None:
     """Weigh a block's poses by range and bearing of a ray, or by its bearing alone.
 
     Where a range leaves it a ray, the bearing refines and weighs the poses as if it came alone.
     """
-    pose, gained, bearing = block.pose, block.gained, heard.bearing[m]
-    variance, ray = heard.bearing_variance[m], scratch.ray
+    pose, gained, ray = block.pose, block.gained, scratch.ray
     if params.ranged >= BEARING:
+        bearing, variance = row.bearing, row.bearing_variance
         refine_by_ray(pose, rows, count, bearing, variance, params, ray, scratch, gained)
         return
-    rho_beta = (heard.range[m], bearing, heard.range_variance[m], variance)
-    weigh_by_active(pose, rows, rho_beta, count, ray, scratch, gained)
+    weigh_by_active(pose, rows, row, count, ray, scratch, gained)
 
 
 @no_alloc
@@ -311,31 +261,28 @@ def _weigh_at_sample(
         if n < 0:
             continue
         rows, count = block.member[block.first[n] : block.first[n + 1]], block.count[n]
-        bearing, variance = heard.bearing[m], heard.bearing_variance[m]
-        pose, gained = block.pose, block.gained
-        if math.isnan(heard.range[m]):
+        row, pose, gained = row_of(heard, m), block.pose, block.gained
+        bearing, variance = row.bearing, row.bearing_variance
+        if math.isnan(row.range):
             whole = scratch.whole
             weigh_by_bearing(pose, rows, count, bearing, variance, whole, scratch, gained)
             continue
         part_lanes(count, scratch)
         by_range = scratch.alone if params.ranged >= BEARING else scratch.whole
-        rho_beta = (heard.range[m], bearing, heard.range_variance[m], variance)
-        weigh_by_active(pose, rows, rho_beta, count, by_range, scratch, gained)
+        weigh_by_active(pose, rows, row, count, by_range, scratch, gained)
         if params.ranged >= BEARING and most_members(count) > 1:
             weigh_by_bearing(pose, rows, count, bearing, variance, scratch.ray, scratch, gained)
 
 
 @no_alloc_inlined
-def _correct_row(
-    block: Block, n: Whole, heard: Measurements, m: Whole, params: UpdateParams, scratch: Scratch
-) -> None:
-    """Correct a block's landmark n from its sampled poses by measurement m, in place."""
-    rows, bearing = block.member[block.first[n] : block.first[n + 1]], heard.bearing[m]
-    pose, variance, count = block.pose, heard.bearing_variance[m], block.count[n]
-    if math.isnan(heard.range[m]):
+def _correct_row(block: Block, n: Whole, row: Row, params: UpdateParams, scratch: Scratch) -> None:
+    """Correct a block's landmark n from its sampled poses by a measurement, in place."""
+    rows, pose = block.member[block.first[n] : block.first[n + 1]], block.pose
+    bearing, variance, count = row.bearing, row.bearing_variance, block.count[n]
+    if math.isnan(row.range):
         correct_ray(pose, rows, count, bearing, variance, params, scratch.whole, scratch)
         return
-    _correct_by_range(pose, rows, count, heard, m, params, scratch)
+    _correct_by_range(pose, rows, count, row, params, scratch)
 
 
 @no_alloc
@@ -348,7 +295,9 @@ def _correct_with_parent(
         turns = lanes_with_parent(block.count[n], block.count[h], pairs.turn)
     if turns > 0:
         copy_row(block.member[block.first[n]], pairs.row)
-        correct_pair(block.pose, block.member[block.first[h]], block.count[h], n, pairs, heard, m)
+        correct_pair(
+            block.pose, block.member[block.first[h]], block.count[h], n, pairs, row_of(heard, m), m
+        )
     return turns
 
 
@@ -372,26 +321,23 @@ def _correct(
         if pairs is not None:
             turns = _correct_with_parent(block, n, heard, m, pairs)
         if turns < LANES:
-            _correct_row(block, n, heard, m, params, scratch)
+            _correct_row(block, n, row_of(heard, m), params, scratch)
         if pairs is not None and turns > 0:
             copy_lanes(pairs.row, block.member[block.first[n]], pairs.turn)
 
 
 @no_alloc
-def _add_new(
-    pose: Poses, rows: Rows, count: Counts, heard: Measurements, m: Whole, params: UpdateParams
-) -> None:
+def _add_new(pose: Poses, rows: Rows, count: Counts, row: Row, params: UpdateParams) -> None:
     """Place a block's new landmark: one member, or a ray (Eqs. (16) to (18))."""
-    if not math.isnan(heard.range[m]):
-        _initialise_active(pose, rows[0], heard, m, count)
+    if not math.isnan(row.range):
+        initialise_member(pose, rows[0], row, 0.0, count)
         count[:] = 1
         return
     members = params.ray_ranges.size
     for j in range(members):
-        initialise_member(
-            pose, rows[j], params.ray_ranges[j], heard.bearing[m], params.ray_stds[j] ** 2,
-            heard.bearing_variance[m], -math.log(members), count,
-        )  # fmt: skip
+        far, spread = params.ray_ranges[j], params.ray_stds[j] ** 2
+        member = Row(row.landmark, row.bearing, far, row.bearing_variance, spread)
+        initialise_member(pose, rows[j], member, -math.log(members), count)
     count[:] = members
 
 
@@ -423,7 +369,7 @@ def _place(
         if n < 0:
             n, new = new, new + 1
             rows = block.member[block.first[n] : block.first[n + 1]]
-            _add_new(block.pose, rows, block.count[n], heard, m, params)
+            _add_new(block.pose, rows, block.count[n], row_of(heard, m), params)
         if pairs is not None:
             _place_by_parent(block, n, heard, m, pairs)
 
@@ -476,7 +422,7 @@ def correct_particles(
     normal: Float[np.ndarray, "p 3"],
     params: UpdateParams,
     sampled: bool,
-) -> tuple[Extended, ParentsAfter, Float[np.ndarray, " p"]]:
+) -> tuple[Arrays, ParentsAfter, Float[np.ndarray, " p"]]:
     """Refine, sample, correct and extend a copy of all particles; return it, parents, log weights.
 
     With ``sampled`` they are weighed at the sample.

@@ -81,20 +81,6 @@ do waiting bearings (`graph.RELINEARISE_PASSES`)."""
 class Smoother:
     """Incremental smoothing and mapping by iSAM2.
 
-    Attributes
-    ----------
-    motion : Motion
-    rays : RayConfig
-        How far a landmark may be that waits; nothing else is done with rays.
-    gate : float
-        A measurement outside this share of its predicted distribution (chi-square) is dropped;
-        1 drops none.
-    robust : bool
-        Whether a measurement that surprises counts less.
-    speed_std, walk_std : float
-        Of callers that move: the velocity [m/s] along an axis before anything is known of it, and
-        how far it strays in a second (`estimation.smoother.caller_motion`).
-
     Examples
     --------
     >>> from pipistrelle.detection.scans import make_scan
@@ -108,8 +94,8 @@ class Smoother:
     """
 
     motion: Motion
-    rays: RayConfig
-    gate: float = 1.0
+    rays: RayConfig  # how far a waiting landmark may be
+    gate: float = 1.0  # as those of `EkfSlam`, and all below
     robust: bool = False
     speed_std: float = 1.0
     walk_std: float = 0.2
