@@ -38,10 +38,15 @@ def uncertain_pair(offset):
     return pose, member
 
 
+def heard(bearing, distance=math.nan):
+    """A bearing, and perhaps a range, with the noise of these tests."""
+    return Row(1, bearing, distance, 0.01, 0.04)
+
+
 def expected(offset, count, j=0):
     """Log likelihood, with its constant, of a bearing of 0.3 to a member ahead, lane by lane."""
     (pose, member), said = uncertain_pair(offset), np.empty(LANES)
-    expect_bearing(pose, member, 0.3, 0.01, np.asarray(count, dtype=np.int64), j, False, said)
+    expect_bearing(pose, member, heard(0.3), np.asarray(count, dtype=np.int64), j, False, said)
     return said - 0.5 * math.log(2.0 * math.pi)
 
 
@@ -71,10 +76,10 @@ def test_what_stands_at_the_pose_refines_it_neither_by_its_bearing_nor_by_its_ra
         pose, member = uncertain_pair(offset * NEAREST)
         before, log_weight = pose.copy(), np.zeros(LANES)
         if by_range:
-            refine_by_active(pose, member, Row(1, 0.3, 0.01, 0.01, 0.04), alone, log_weight)
+            refine_by_active(pose, member, heard(0.3, 0.01), alone, log_weight)
             assert log_weight.any() == says
         else:
-            refine_by_bearing(pose, member, 0.3, 0.01, whole)
+            refine_by_bearing(pose, member, heard(0.3), whole)
         assert np.array_equal(pose, before) == (not says)
 
 
@@ -82,8 +87,8 @@ def test_what_stands_at_the_pose_refines_it_neither_by_its_bearing_nor_by_its_ra
 def test_no_gate_drops_what_stands_at_the_pose_for_nothing_was_foreseen_of_it(offset, beyond):
     alone = np.ones(LANES, dtype=np.int64)
     pose, member = uncertain_pair(offset * NEAREST)
-    assert bearing_beyond(pose, member, 3.0, 0.01, alone, 0, 1e-9) == beyond
-    assert active_beyond(pose, member, Row(1, 3.0, 50.0, 0.01, 0.04), alone, 1e-9) == beyond
+    assert bearing_beyond(pose, member, heard(3.0), alone, 0, 1e-9) == beyond
+    assert active_beyond(pose, member, heard(3.0, 50.0), alone, 1e-9) == beyond
 
 
 def weighed(unit, distance=5.0):

@@ -39,14 +39,12 @@ ROUNDING = 1e-12
 
 
 @inlined
-def _bearing(
-    pose: Poses, member: Member, bearing: float, i: Whole
-) -> tuple[float, float, float, Flag]:
+def _bearing(pose: Poses, member: Member, row: Row, i: Whole) -> tuple[float, float, float, Flag]:
     """Innovation of a member's bearing; its slopes by x and y of the pose; if it is defined."""
     dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
     squared = dx * dx + dy * dy
     inverse = 1.0 / max(squared, NEAREST * NEAREST)
-    innovation = wrapped(pose[HEADING + i] + bearing - arctangent(dy, dx))
+    innovation = wrapped(pose[HEADING + i] + row.bearing - arctangent(dy, dx))
     return innovation, dy * inverse, -dx * inverse, squared >= NEAREST * NEAREST
 
 
@@ -68,21 +66,19 @@ def _spread(member: Member, h0: float, h1: float, i: Whole) -> float:
 
 
 @inlined
-def _foreseen(
-    pose: Poses, member: Member, bearing: float, variance: float, i: Whole
-) -> tuple[float, float, Flag]:
+def _foreseen(pose: Poses, member: Member, row: Row, i: Whole) -> tuple[float, float, Flag]:
     """Innovation of a member's bearing, its variance, and whether it is defined."""
-    innovation, h0, h1, far = _bearing(pose, member, bearing, i)
+    innovation, h0, h1, far = _bearing(pose, member, row, i)
     a0, a1, a2 = _bearing_gain(pose, h0, h1, i)
-    return innovation, (h0 * a0 + h1 * a1 - a2 + _spread(member, h0, h1, i)) + variance, far
+    S = (h0 * a0 + h1 * a1 - a2 + _spread(member, h0, h1, i)) + row.bearing_variance
+    return innovation, S, far
 
 
 @no_alloc
 def expect_bearing(
     pose: Poses,
     member: Member,
-    bearing: float,
-    variance: float,
+    row: Row,
     count: Counts,
     j: Whole,
     printed: bool,
@@ -95,10 +91,10 @@ def expect_bearing(
     reading.
     """
     if printed:
-        _expect_as_printed(pose, member, bearing, variance, count, j, log_likelihood)
+        _expect_as_printed(pose, member, row, count, j, log_likelihood)
         return
     for i in range(LANES):
-        innovation, S, far = _foreseen(pose, member, bearing, variance, i)
+        innovation, S, far = _foreseen(pose, member, row, i)
         value = -0.5 * (innovation * innovation / S + logarithm(S))
         unforeseen = -HALF_LOG_TAU if count[i] > 1 else HALF_LOG_TAU
         value = value if far else unforeseen
@@ -107,17 +103,11 @@ def expect_bearing(
 
 @no_alloc
 def _expect_as_printed(
-    pose: Poses,
-    member: Member,
-    bearing: float,
-    variance: float,
-    count: Counts,
-    j: Whole,
-    log_likelihood: Lanes,
+    pose: Poses, member: Member, row: Row, count: Counts, j: Whole, log_likelihood: Lanes
 ) -> None:
     """Log of Eq. (19) with all of its root inside the exponent; zero for what is too near."""
     for i in range(LANES):
-        innovation, S, far = _foreseen(pose, member, bearing, variance, i)
+        innovation, S, far = _foreseen(pose, member, row, i)
         value = -0.5 * (innovation * innovation / S) / math.sqrt(2.0 * math.pi * S)
         value = value if far else 0.0
         log_likelihood[i] = value if j < count[i] else -np.inf
@@ -125,34 +115,26 @@ def _expect_as_printed(
 
 @no_alloc
 def bearing_beyond(
-    pose: Poses,
-    member: Member,
-    bearing: float,
-    variance: float,
-    count: Counts,
-    j: Whole,
-    bound: float,
+    pose: Poses, member: Member, row: Row, count: Counts, j: Whole, bound: float
 ) -> bool:
     """Tell whether the bearing is beyond the bound for member j of every lane that has one."""
     beyond = 0
     for i in range(LANES):
-        innovation, S, far = _foreseen(pose, member, bearing, variance, i)
+        innovation, S, far = _foreseen(pose, member, row, i)
         within = not far or innovation * innovation <= bound * S
         beyond += 0 if within and j < count[i] else 1
     return beyond == LANES
 
 
 @no_alloc
-def refine_by_bearing(
-    pose: Poses, member: Member, bearing: float, variance: float, share: Lanes
-) -> None:
+def refine_by_bearing(pose: Poses, member: Member, row: Row, share: Lanes) -> None:
     """Correct the poses by the bearing of a member, each by its share of the information."""
     for i in range(LANES):
-        innovation, h0, h1, far = _bearing(pose, member, bearing, i)
+        innovation, h0, h1, far = _bearing(pose, member, row, i)
         a0, a1, a2 = _bearing_gain(pose, h0, h1, i)
         spread = h0 * a0 + h1 * a1 - a2 + _spread(member, h0, h1, i)
         part = share[i] if far else 0.0
-        information = part / (part * spread + variance)  # of the innovation, noise variance / part
+        information = part / (part * spread + row.bearing_variance)  # noise variance / part
         k0, k1, k2 = a0 * information, a1 * information, a2 * information
         pose[X + i] += k0 * innovation
         pose[Y + i] += k1 * innovation
@@ -166,16 +148,14 @@ def refine_by_bearing(
 
 
 @no_alloc
-def correct_by_bearing(
-    pose: Poses, member: Member, bearing: float, variance: float, share: Lanes
-) -> None:
+def correct_by_bearing(pose: Poses, member: Member, row: Row, share: Lanes) -> None:
     """Correct a member by its bearing from certain poses, each by its share of the information."""
     for i in range(LANES):
-        innovation, h0, h1, far = _bearing(pose, member, bearing, i)
+        innovation, h0, h1, far = _bearing(pose, member, row, i)
         a0 = -h0 * member[XX + i] - h1 * member[XY + i]
         a1 = -h0 * member[XY + i] - h1 * member[YY + i]
         part = share[i] if far else 0.0
-        information = part / (part * (-h0 * a0 - h1 * a1) + variance)
+        information = part / (part * (-h0 * a0 - h1 * a1) + row.bearing_variance)
         k0, k1 = a0 * information, a1 * information
         member[X + i] += k0 * innovation
         member[Y + i] += k1 * innovation

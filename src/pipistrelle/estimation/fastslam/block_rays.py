@@ -163,18 +163,12 @@ def most_members(count: Counts) -> Whole:
 
 @no_alloc
 def _expect_ray(
-    pose: Poses,
-    rows: Rows,
-    count: Counts,
-    bearing: float,
-    variance: float,
-    printed: bool,
-    scratch: Scratch,
+    pose: Poses, rows: Rows, count: Counts, row: Row, printed: bool, scratch: Scratch
 ) -> None:
     """Write log likelihoods of a bearing for all members into ``likelihood``."""
     for j in range(most_members(count)):
         likelihood = scratch.likelihood[j]
-        expect_bearing(pose, rows[j], bearing, variance, count, j, printed, likelihood)
+        expect_bearing(pose, rows[j], row, count, j, printed, likelihood)
 
 
 @no_alloc
@@ -182,14 +176,13 @@ def weigh_by_bearing(
     pose: Poses,
     rows: Rows,
     count: Counts,
-    bearing: float,
-    variance: float,
+    row: Row,
     turn: Lanes,
     scratch: Scratch,
     log_weight: Lanes,
 ) -> None:
     """Weigh the poses by the bearing of a landmark: the density of its members' mixture."""
-    _expect_ray(pose, rows, count, bearing, variance, False, scratch)
+    _expect_ray(pose, rows, count, row, False, scratch)
     if most_members(count) == 1:
         _add(scratch.likelihood[0], 1, turn, log_weight)
         return
@@ -202,8 +195,7 @@ def refine_by_ray(
     pose: Poses,
     rows: Rows,
     count: Counts,
-    bearing: float,
-    variance: float,
+    row: Row,
     params: UpdateParams,
     turn: Lanes,
     scratch: Scratch,
@@ -211,19 +203,19 @@ def refine_by_ray(
 ) -> None:
     """Correct the poses by the bearing of a landmark, and weigh them by its likelihood."""
     members = most_members(count)
-    weigh_by_bearing(pose, rows, count, bearing, variance, turn, scratch, log_weight)
+    weigh_by_bearing(pose, rows, count, row, turn, scratch, log_weight)
     if members == 1:
-        refine_by_bearing(pose, rows[0], bearing, variance, turn)
+        refine_by_bearing(pose, rows[0], row, turn)
         return
     if params.sharing == EXACT:
-        _refine_to_mixture(pose, rows, members, bearing, variance, turn, scratch)
+        _refine_to_mixture(pose, rows, members, row, turn, scratch)
         return
     if params.sharing == AS_PRINTED:
-        _expect_ray(pose, rows, count, bearing, variance, True, scratch)
+        _expect_ray(pose, rows, count, row, True, scratch)
         _weigh(rows, members, scratch)
     _share(members, params, turn, scratch)
     for j in range(members):
-        refine_by_bearing(pose, rows[j], bearing, variance, scratch.share[j])
+        refine_by_bearing(pose, rows[j], row, scratch.share[j])
 
 
 @no_alloc
@@ -250,39 +242,33 @@ def weigh_by_active(
 
 @no_alloc
 def _refine_to_mixture(
-    pose: Poses,
-    rows: Rows,
-    members: Whole,
-    bearing: float,
-    variance: float,
-    turn: Lanes,
-    scratch: Scratch,
+    pose: Poses, rows: Rows, members: Whole, row: Row, turn: Lanes, scratch: Scratch
 ) -> None:
     """Set the poses to mean and covariance of the mixture of the members' refinements."""
     for j in range(members):
         refined, weight = scratch.refined[j], scratch.posterior[j]
         for k in range(POSE):
             refined[k] = pose[k]
-        refine_by_bearing(refined, rows[j], bearing, variance, turn)
+        refine_by_bearing(refined, rows[j], row, turn)
         for i in range(LANES):
             weight[i] = exponential(weight[i])
     pose[:] = 0.0
     for j in range(members):
         refined, weight = scratch.refined[j], scratch.posterior[j]
-        for row in range(0, POSE, LANES):
+        for k in range(0, POSE, LANES):
             for i in range(LANES):
-                pose[row + i] += weight[i] * refined[row + i]
+                pose[k + i] += weight[i] * refined[k + i]
     for j in range(members):
         refined, weight = scratch.refined[j], scratch.posterior[j]
         for i in range(LANES):
             x, y = refined[X + i] - pose[X + i], refined[Y + i] - pose[Y + i]
-            turn = refined[HEADING + i] - pose[HEADING + i]
+            h = refined[HEADING + i] - pose[HEADING + i]
             pose[PXX + i] += weight[i] * x * x
             pose[PXY + i] += weight[i] * x * y
             pose[PYY + i] += weight[i] * y * y
-            pose[PXH + i] += weight[i] * x * turn
-            pose[PYH + i] += weight[i] * y * turn
-            pose[PHH + i] += weight[i] * turn * turn
+            pose[PXH + i] += weight[i] * x * h
+            pose[PYH + i] += weight[i] * y * h
+            pose[PHH + i] += weight[i] * h * h
 
 
 @no_alloc
@@ -290,8 +276,7 @@ def correct_ray(
     pose: Poses,
     rows: Rows,
     count: Counts,
-    bearing: float,
-    variance: float,
+    row: Row,
     params: UpdateParams,
     turn: Lanes,
     scratch: Scratch,
@@ -299,15 +284,15 @@ def correct_ray(
     """Weigh, correct and prune a landmark's members from certain poses, in place."""
     members = most_members(count)
     if members == 1:
-        correct_by_bearing(pose, rows[0], bearing, variance, turn)
+        correct_by_bearing(pose, rows[0], row, turn)
         return
-    _expect_ray(pose, rows, count, bearing, variance, params.sharing == AS_PRINTED, scratch)
+    _expect_ray(pose, rows, count, row, params.sharing == AS_PRINTED, scratch)
     _weigh(rows, members, scratch)
     if params.sharing != EXACT:
         _share(members, params, turn, scratch)
     for j in range(members):
         share = turn if params.sharing == EXACT else scratch.share[j]
-        correct_by_bearing(pose, rows[j], bearing, variance, share)
+        correct_by_bearing(pose, rows[j], row, share)
     _prune(rows, count, members, params.prune, scratch)
     if params.merge > 0.0:
         _merge_members(rows, count, params.merge)
@@ -362,18 +347,16 @@ def heaviest_to_range(pose: Poses, rows: Rows, count: Counts, distance: float, t
 
 
 @no_alloc
-def reset_member(
-    pose: Poses, member: Member, range_variance: float, bearing_variance: float, turn: Lanes
-) -> None:
+def reset_member(pose: Poses, member: Member, row: Row, turn: Lanes) -> None:
     """Give a member the covariance that it would have if it were placed where it is."""
     for i in range(LANES):
         if turn[i] > 0.0:
             dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
             squared = max(dx * dx + dy * dy, NEAREST * NEAREST)
-            along = range_variance / squared
-            member[XX + i] = along * dx * dx + bearing_variance * dy * dy
-            member[XY + i] = (along - bearing_variance) * dx * dy
-            member[YY + i] = along * dy * dy + bearing_variance * dx * dx
+            along, across = row.range_variance / squared, row.bearing_variance
+            member[XX + i] = along * dx * dx + across * dy * dy
+            member[XY + i] = (along - across) * dx * dy
+            member[YY + i] = along * dy * dy + across * dx * dx
 
 
 @no_alloc

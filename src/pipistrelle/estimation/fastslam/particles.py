@@ -136,10 +136,9 @@ def gated_by_all(
                     pose, rows[0], row_of(heard, m), count, params.active_bound
                 )
                 continue
-            bearing, variance = heard.bearing[m], heard.bearing_variance[m]
             for j in range(most_members(count)):
                 gated[m] = gated[m] and bearing_beyond(
-                    pose, rows[j], bearing, variance, count, j, params.passive_bound
+                    pose, rows[j], row_of(heard, m), count, j, params.passive_bound
                 )
     if timings is not None:
         timed = detours(columns, timings)
@@ -173,7 +172,7 @@ def _correct_by_range(
     pose: Poses, rows: Rows, count: Counts, row: Row, params: UpdateParams, scratch: Scratch
 ) -> None:
     """Correct a landmark by range and bearing, a ray as `rays.ranged` says, in place."""
-    ranged, bearing, variance = params.ranged, row.bearing, row.bearing_variance
+    ranged = params.ranged
     if ranged == CORRECTED:
         keep_heaviest(rows, count)
     part_lanes(count, scratch)
@@ -187,14 +186,14 @@ def _correct_by_range(
         keep_heaviest(rows, count)
         heaviest_to_range(pose, rows, count, row.range, scratch.ray)
         if ranged == RESET:
-            reset_member(pose, rows[0], row.range_variance, variance, scratch.ray)
-        correct_by_bearing(pose, rows[0], bearing, variance, scratch.ray)
+            reset_member(pose, rows[0], row, scratch.ray)
+        correct_by_bearing(pose, rows[0], row, scratch.ray)
     else:
         if ranged == MOVED:
             heaviest_to_range(pose, rows, count, row.range, scratch.ray)
         elif ranged == OTHERS:
             drop_heaviest(rows, count)
-        correct_ray(pose, rows, count, bearing, variance, params, scratch.ray, scratch)
+        correct_ray(pose, rows, count, row, params, scratch.ray, scratch)
 
 
 @no_alloc
@@ -213,10 +212,8 @@ def _refine(
         rows, count = block.member[block.first[n] : block.first[n + 1]], block.count[n]
         row = row_of(heard, m)
         if math.isnan(row.range):
-            refine_by_ray(
-                block.pose, rows, count, row.bearing, row.bearing_variance, params, scratch.whole,
-                scratch, block.gained,
-            )  # fmt: skip
+            whole = scratch.whole
+            refine_by_ray(block.pose, rows, count, row, params, whole, scratch, block.gained)
         else:
             if most_members(count) > 1:
                 part_lanes(count, scratch)
@@ -234,8 +231,7 @@ def _refine_by_ranged_ray(
     """
     pose, gained, ray = block.pose, block.gained, scratch.ray
     if params.ranged >= BEARING:
-        bearing, variance = row.bearing, row.bearing_variance
-        refine_by_ray(pose, rows, count, bearing, variance, params, ray, scratch, gained)
+        refine_by_ray(pose, rows, count, row, params, ray, scratch, gained)
         return
     weigh_by_active(pose, rows, row, count, ray, scratch, gained)
 
@@ -262,25 +258,24 @@ def _weigh_at_sample(
             continue
         rows, count = block.member[block.first[n] : block.first[n + 1]], block.count[n]
         row, pose, gained = row_of(heard, m), block.pose, block.gained
-        bearing, variance = row.bearing, row.bearing_variance
         if math.isnan(row.range):
             whole = scratch.whole
-            weigh_by_bearing(pose, rows, count, bearing, variance, whole, scratch, gained)
+            weigh_by_bearing(pose, rows, count, row, whole, scratch, gained)
             continue
         part_lanes(count, scratch)
         by_range = scratch.alone if params.ranged >= BEARING else scratch.whole
         weigh_by_active(pose, rows, row, count, by_range, scratch, gained)
         if params.ranged >= BEARING and most_members(count) > 1:
-            weigh_by_bearing(pose, rows, count, bearing, variance, scratch.ray, scratch, gained)
+            weigh_by_bearing(pose, rows, count, row, scratch.ray, scratch, gained)
 
 
 @no_alloc_inlined
 def _correct_row(block: Block, n: Whole, row: Row, params: UpdateParams, scratch: Scratch) -> None:
     """Correct a block's landmark n from its sampled poses by a measurement, in place."""
     rows, pose = block.member[block.first[n] : block.first[n + 1]], block.pose
-    bearing, variance, count = row.bearing, row.bearing_variance, block.count[n]
+    count = block.count[n]
     if math.isnan(row.range):
-        correct_ray(pose, rows, count, bearing, variance, params, scratch.whole, scratch)
+        correct_ray(pose, rows, count, row, params, scratch.whole, scratch)
         return
     _correct_by_range(pose, rows, count, row, params, scratch)
 
@@ -348,9 +343,11 @@ def _place_by_parent(block: Block, n: Whole, heard: Measurements, m: Whole, pair
     if h < 0 or math.isnan(pairs.detour[m]):
         return
     caller, member = block.member[block.first[h]], block.member[block.first[n]]
-    said = heard.bearing[m], pairs.detour[m], heard.bearing_variance[m], pairs.variance[m]
+    measured = heard.bearing[m], pairs.detour[m], heard.bearing_variance[m], pairs.variance[m]
     lanes_with_sure_parent(block.pose, caller, block.count[h], pairs.usable)
-    place_by_detour(block.pose, caller, member, pairs.slope[n], said, block.count[n], pairs.usable)
+    place_by_detour(
+        block.pose, caller, member, pairs.slope[n], measured, block.count[n], pairs.usable
+    )
 
 
 @no_alloc
