@@ -170,8 +170,8 @@ def test_listening_gains_where_posts_are_few_and_not_where_they_are_many(play):
     assert many[1] > 0.05, "where there is little to gain, nothing is shown"
     assert (
         tried.answer[0]
-        == "A higher scenario.landmarks lowers the position error of active sensing, and lowers "
-        "the position gain over active."
+        == "A higher scenario.landmarks lowers the position RMSE of active sensing, and lowers "
+        "the gain in position RMSE over active."
     )
 
 

@@ -14,7 +14,7 @@ from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
 from pipistrelle.experiments.studies.store import open_store
 from pipistrelle.experiments.studies.world import world_schemas
 from pipistrelle.experiments.studies.world_files import TABLES, with_sums, world_file
-from pipistrelle.report.studied import COMMON, SCORES, Study, Trials
+from pipistrelle.report.studied import COMMON, READ, Study, Trials
 from pipistrelle.report.variables import beam_variable
 
 RADII = (
@@ -96,11 +96,11 @@ def trials_of(rng, world, name, strategy):
     scores["position_rmse_aligned_m"] = 0.2 * scores["position_rmse_m"]
     scores["map_rmse_aligned_m"] = scores["position_rmse_aligned_m"] + 0.01
     scores["position_bound_m"] = np.tile(0.23 + 0.05 * world[:, None], beams)
-    scores["online_position_rmse_m"] = np.full((worlds, beams), np.nan)
     scores["heading_bound_rad"] = 0.1 * scores["position_bound_m"]
     placed = {"active": 0.5, "fused": 0.52, "passive": 0.6}[strategy]
     scores[COMMON] = placed + 0.2 * world[:, None] + 0.05 * noise(rng, worlds, len(BEAMWIDTH))
     scores["map_rmse_m"] = np.tile(placed + 0.2 * world[:, None], beams)
+    scores |= {name: np.full((worlds, beams), np.nan) for name in READ if name not in scores}
     no = np.zeros((worlds, beams), dtype=bool)
     ideal = np.full((2, beams, FRAMES), 3.0)
     ideal[1] = 6.0
@@ -258,7 +258,7 @@ def world_tables_of(study, row, cases, broken, full, error):
         if case.number in broken:
             tables["trials"].append(trial | {"status": "failed", "error": ERROR})
             continue
-        for score in SCORES:
+        for score in READ:
             value = float(trials.scores[score][row, column])
             whole = score in ("landmarks_full", "landmarks_total")
             trial[score] = round(value) if whole else value

@@ -13,7 +13,7 @@ from pipistrelle.experiments.studies.world_files import TABLES, with_sums, world
 from pipistrelle.report.reading import read_study
 from pipistrelle.report.studied import (
     COMMON,
-    SCORES,
+    READ,
     Failure,
     along,
     case_name,
@@ -52,7 +52,7 @@ def test_what_was_written_is_read(written):
     for way, trials in read.trials.items():
         there = study.trials[way]
         good = ~trials.failed
-        for score in SCORES:
+        for score in READ:
             expected = there.scores[score]
             if score in ("landmarks_full", "landmarks_total"):
                 expected = expected.round()

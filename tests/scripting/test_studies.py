@@ -96,7 +96,7 @@ def test_its_report_is_a_page_and_answers_and_draws_as_it_does(monkeypatch):
     assert "<h1" in page.read_text()
     assert found.answer == json.loads(Path("page/summary.json").read_text())["answer"]
     assert found.answer[0] in html.unescape(page.read_text())
-    assert "position error" in [axes.get_title(loc="left") for axes in found.figure().axes]
+    assert "position RMSE" in [axes.get_title(loc="left") for axes in found.figure().axes]
 
 
 def test_shards_on_one_folder_and_a_cluster_do_the_whole(monkeypatch):

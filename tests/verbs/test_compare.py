@@ -119,13 +119,13 @@ def test_studies_are_compared_case_by_case(obey, studies):
     assert (status, said) == (0, "")
     blocks = printed.split("\n\n")
     assert blocks[0] == "A  one: 4 worlds\nB  two: 4 worlds"
-    assert rows(blocks[3])["active"][:3] == ["4.500", "4.000", "-0.500"]
-    assert rows(blocks[3])["fused"][:3] == ["5.500", "4.500", "-1.000"]
-    assert rows(blocks[6])["filters"] == ['["ekf"]', '["iekf"]']
-    assert blocks[7].startswith(
+    assert rows(blocks[2])["active"][:3] == ["4.500", "4.000", "-0.500"]
+    assert rows(blocks[2])["fused"][:3] == ["5.500", "4.500", "-1.000"]
+    assert rows(blocks[5])["filters"] == ['["ekf"]', '["iekf"]']
+    assert blocks[6].startswith(
         "Paired over the worlds that both have met.\n*: shown, as one of all cases"
     )
-    assert len(blocks) == 8
+    assert len(blocks) == 7
 
 
 def test_what_is_sure_is_marked_and_so_is_what_is_not_paired(obey, studies):

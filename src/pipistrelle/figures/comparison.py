@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipistrelle.estimation.catalogue import title_of
+from pipistrelle.evaluation.scores import heading, shown_in
 from pipistrelle.experiments.comparing.missions import ComparedEstimate, ComparedMissions
 from pipistrelle.experiments.comparing.studies import ComparedCase, ComparedStudies
 from pipistrelle.experiments.comparing.writing import lettered, spelt
@@ -21,13 +22,6 @@ RUNS = ("#0b6e69", "#c8501e", "#6a3fa0", "#7d8a12", "#b03a7a", "#2f6db3")
 DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.2, 1.4)), (0, (6, 2, 1.2, 2)))
 WIDTH, ROW, REST = 12.0, 3.7, 0.75
 """Of a figure of paths [inch]: its width, the height of an estimate, and what is left for words."""
-STUDY_PANELS = {
-    "position_rmse_m": "position RMSE [m]",
-    "heading_rmse_rad": "heading RMSE [rad]",
-    "map_rmse_aligned_m": "map RMSE, aligned [m]",
-    "landmarks_full": "landmarks placed",
-}
-"""Scores of studies that are drawn."""
 SURE = 0.05
 """A point is full where p is below, as one of all cases."""
 
@@ -37,8 +31,8 @@ def draw_comparison(compared: ComparedMissions | ComparedStudies) -> "Figure":
 
     Of missions a row for each estimate: the paths and the landmarks they place, as they are and
     each after the rigid motion that brings it nearest to its truth; beside them the distance from
-    there over time. Of studies a panel for each of `STUDY_PANELS`: a case's difference, thick its
-    interval by itself, thin that as one of all cases.
+    there over time. Of studies a panel for each score that is shown of them: a case's difference,
+    thick its interval by itself, thin that as one of all cases.
 
     Parameters
     ----------
@@ -186,14 +180,16 @@ def _draw_studies(compared: ComparedStudies) -> "Figure":
     others = len(compared.folders) - 1
     height = max(2.0, (0.1 + 0.12 * others) * len(labels)) + 1.4
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
-    panels = figure.subplots(1, len(STUDY_PANELS), sharey=True)
-    for axes, (score, title) in zip(panels, STUDY_PANELS.items(), strict=True):
-        mine = [case for case in compared.cases if case.score == score]
+    there = {case.score for case in compared.cases}
+    shown = {name: score for name, score in shown_in("studies").items() if name in there}
+    panels = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
+    for axes, (name, score) in zip(panels, shown.items(), strict=True):
+        mine = [case for case in compared.cases if case.score == name]
         axes.axvline(0.0, color=INK, lw=0.8, zorder=1)
         for k, case in enumerate(mine):
             place = k // others + (case.other - 1 - 0.5 * (others - 1)) * 0.6 / others
             _draw_case(axes, case, place)
-        axes.set_title(title, loc="left", weight="bold")
+        axes.set_title(heading(score), loc="left", weight="bold")
         axes.set_xlabel("other less A" if others > 1 else "B less A")
         axes.xaxis.set_major_locator(MaxNLocator(4))
         axes.grid(True, axis="x")

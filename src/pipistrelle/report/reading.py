@@ -31,8 +31,8 @@ from pipistrelle.experiments.studies.world_files import (
 from pipistrelle.files import read_file
 from pipistrelle.report.studied import (
     COMMON,
-    ONLINE_POSITION,
-    SCORES,
+    LATER,
+    READ,
     Failure,
     Study,
     Trials,
@@ -265,7 +265,7 @@ def _trials(
             at=np.argmax(mine[:, None] == c, axis=1),
             failed=scores["failed"][:, c],
             diverged=scores["diverged"][:, c],
-            scores={score: scores[score][:, c] for score in SCORES} | {COMMON: common[way]},
+            scores={score: scores[score][:, c] for score in READ} | {COMMON: common[way]},
             placed=maps[0][:, c],
             off=maps[1][:, c],
             nees=nees["nees"][:, c],
@@ -287,9 +287,9 @@ def _scores(
     }
     found["failed"][at] = (trials["status"] != "done").to_numpy()
     found["diverged"][at] = trials["diverged"].fill_null(value=False).to_numpy()
-    for score in SCORES:
+    for score in READ:
         found[score] = np.full(shape, np.nan)
-        if score == ONLINE_POSITION and score not in trials.columns:
+        if score in LATER and score not in trials.columns:
             continue
         found[score][at] = trials[score].cast(pl.Float64).fill_null(np.nan).to_numpy()
     return found

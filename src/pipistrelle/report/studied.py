@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.config import Config
 from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.evaluation.comparison import Finding
+from pipistrelle.evaluation.scores import NOT_MEANS, SCORES
 from pipistrelle.experiments.hearing.scenario import Scenario
 from pipistrelle.report.variables import BEAM, Variable
 
@@ -39,23 +40,17 @@ MAP = "map_rmse_m"
 """Of the landmarks that the case itself has placed."""
 POSITION_BOUND, HEADING_BOUND = "position_bound_m", "heading_bound_rad"
 """The least errors that the sound leaves to any estimator."""
+LANDMARKS, NEES = "landmarks_full", "nees_mean"
 ONLINE_POSITION = "online_position_rmse_m"
 """Of the path as it was believed at its time, where the filter revises it."""
-SCORES = (
-    POSITION,
+READ = (
+    *(name for name in SCORES if name not in NOT_MEANS),
     ONLINE_POSITION,
-    HEADING,
-    POSITION_ALIGNED,
-    MAP,
-    MAP_ALIGNED,
-    POSITION_BOUND,
-    HEADING_BOUND,
-    "nees_mean",
-    "nees_max",
-    "landmarks_full",
-    "landmarks_total",
     "landmarks_full_mean",
 )
+"""Columns of a study's table of trials that are read."""
+LATER = (ONLINE_POSITION, "caller_rmse_m", "caller_rmse_aligned_m")
+"""Those that some studies do not have: they revise no path, or are older than the score."""
 COMMON = "common_map_rmse_m"
 """Map RMSE over the landmarks that every strategy has placed."""
 
@@ -73,7 +68,7 @@ class Trials:
     diverged : (n, b)
         Its NEES is not finite or passes the filter's limit.
     scores : dict of (n, b)
-        By the names of `SCORES`; NaN where there is no number. `COMMON` is there too, one for each
+        By the names of `READ`; NaN where there is no number. `COMMON` is there too, one for each
         combination, for the landmarks in common change with the other strategies'.
     placed : (n, b, l)
         Which landmarks, by their labels, are fully initialised at the end.
@@ -189,6 +184,11 @@ class Selection:
     rule: Rule
     lost: Mapping[str, Bool[np.ndarray, " n"]]
     gains: Mapping[tuple[str, str], tuple[Finding, ...]]
+
+
+def has_numbers(study: Study, score: str) -> bool:
+    """Tell whether a score has a number anywhere in a study."""
+    return any(np.isfinite(trials.scores[score]).any() for trials in study.trials.values())
 
 
 def along(study: Study, variable: Variable) -> Int[np.ndarray, "k m"]:
@@ -337,7 +337,7 @@ def values(study: Study, score: str, cell: Cell) -> Float[np.ndarray, " n"]:
     Parameters
     ----------
     study : Study
-    score : one of `SCORES`, or `COMMON`
+    score : one of `READ`, or `COMMON`
     cell : Cell
 
     Returns
@@ -357,7 +357,7 @@ def samples(
     Parameters
     ----------
     selection : Selection
-    score : one of `SCORES`, or `COMMON`
+    score : one of `READ`, or `COMMON`
     cells : sequence of Cell
 
     Returns

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pipistrelle.config import InputError
 from pipistrelle.detection.logs.readers import Robot
+from pipistrelle.evaluation.scores import shown_in
 from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.machine import keep_freed_memory
 from pipistrelle.experiments.results.writing import run_entry, tables_of
@@ -51,9 +52,6 @@ if TYPE_CHECKING:
 Redo = Callable[[Watch | None], Done]
 """Does a mission once more, watched; the same settings give the same bits."""
 ALLOW = "overwrite=True"
-COLUMNS = ("strategy", "filter", "position_rmse_m", "position_rmse_aligned_m", "map_rmse_m",
-           "nees_mean", "landmarks_full", "landmarks_total")  # fmt: skip
-"""Of the table that a notebook shows."""
 TABLES = ("steps", "landmarks", "measurements")
 """That a result folder holds, each with its ending."""
 
@@ -207,9 +205,13 @@ class Results:
             ) from None
         return self.tracks.to_pandas().set_index(["strategy", "filter", "time_s"]).to_xarray()
 
+    def _scores_shown(self) -> "pl.DataFrame":
+        """Return the scores that a notebook shows."""
+        return self.summary.select("strategy", "filter", *shown_in("notebook"))
+
     def __repr__(self) -> str:
         """Show the scores as a table."""
-        return f"Results of a mission\n{self.summary.select(COLUMNS)}"
+        return f"Results of a mission\n{self._scores_shown()}"
 
     def _repr_html_(self) -> str:
         """Show the figure, and the scores beneath it."""
@@ -218,7 +220,7 @@ class Results:
         room = BytesIO()
         self.figure().savefig(room, format="png", dpi=80)
         picture = b64encode(room.getvalue()).decode()
-        table = self.summary.select(COLUMNS)._repr_html_()
+        table = self._scores_shown()._repr_html_()
         return f'<img alt="The mission" src="data:image/png;base64,{picture}"/>{table}'
 
 

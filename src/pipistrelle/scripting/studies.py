@@ -7,6 +7,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from pipistrelle.config import InputError
+from pipistrelle.evaluation.scores import NOT_MEANS, SCORES
 from pipistrelle.experiments.studies.plan import Plan
 from pipistrelle.experiments.studies.plan_file import FORMAT, find_plan, plan_of, read_plan
 from pipistrelle.experiments.studies.store import load_study
@@ -19,10 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from pipistrelle.report.page.summary import Answered
-
-SCORES = ("position_rmse_m", "position_rmse_aligned_m", "heading_rmse_rad", "map_rmse_m",
-          "nees_mean", "landmarks_full", "position_bound_m")  # fmt: skip
-"""Of the summary: means over the worlds."""
 
 
 class StudyResults:
@@ -72,7 +69,11 @@ class StudyResults:
         import polars as pl
 
         case = ["case", "strategy", "filter", *self.plan.grid, "beamwidth_deg"]
-        means = [pl.col(score).mean() for score in SCORES]
+        means = [
+            pl.col(score).mean()
+            for score in SCORES
+            if score in self.trials.columns and score not in NOT_MEANS
+        ]
         done = self.trials.filter(pl.col("status") == "done")
         return done.group_by(case, maintain_order=True).agg(pl.len().alias("worlds"), *means)
 

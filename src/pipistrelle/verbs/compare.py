@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from pipistrelle.verbs.console import TITLES, announced
+from pipistrelle.evaluation.scores import heading, shown_in
+from pipistrelle.verbs.console import announced
 from pipistrelle.verbs.streams import put
 from pipistrelle.verbs.text_tables import text_table
 
@@ -15,25 +16,6 @@ if TYPE_CHECKING:
     from pipistrelle.experiments.comparing.studies import ComparedCase, ComparedStudies
     from pipistrelle.experiments.comparing.writing import Compared
 
-MISSION_ROWS = TITLES | {
-    "landmarks_full": ("landmarks placed", 0),
-    "landmarks_total": ("landmarks heard", 0),
-    "measurements_per_frame": ("measurements per frame", 2),
-    "gated": ("rejected by the gate", 0),
-    "diverged": ("diverged", 0),
-    "wall_s": ("time of the filter [s]", 2),
-}
-"""Scores of a mission that are shown, and their digits; the files have all."""
-STUDY_TABLES = {
-    name: TITLES[name]
-    for name in (
-        "position_rmse_m",
-        "heading_rmse_rad",
-        "position_rmse_aligned_m",
-        "map_rmse_aligned_m",
-    )
-} | {"landmarks_full": ("landmarks placed", 2)}
-"""Scores of a study that are shown, a table each."""
 SURE = 0.05
 """A difference is marked whose p is below, as one of all cases."""
 
@@ -161,7 +143,8 @@ def _score_rows(estimate: "ComparedEstimate") -> Iterator[list[str]]:
     from pipistrelle.experiments.comparing.writing import less, scores_of
 
     told = [scores_of(scores) for scores in estimate.scores]
-    for name, (title, digits) in MISSION_ROWS.items():
+    for name, score in shown_in("missions").items():
+        title, digits = heading(score), score.digits
         values = [scores.get(name) for scores in told]
         if name == "diverged":
             if any(values):
@@ -175,8 +158,11 @@ def _score_rows(estimate: "ComparedEstimate") -> Iterator[list[str]]:
 def _study_tables(compared: "ComparedStudies") -> Iterator[str]:
     """Show the means of each score by case, and their differences with intervals."""
     several = len(compared.folders) > 2
-    for name, (title, digits) in STUDY_TABLES.items():
+    for name, score in shown_in("studies").items():
         cases = [case for case in compared.cases if case.score == name]
+        if not cases:
+            continue
+        title, digits = heading(score), score.mean_digits or score.digits
         rows = [_case_row(case, digits, several) for case in cases]
         other = "other" if several else "B"
         heads = [[title, "A", other, f"{other} - A", "95 %, all cases", "", "worlds", "diverged"]]

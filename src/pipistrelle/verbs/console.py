@@ -7,6 +7,7 @@ from threading import Timer
 from typing import TYPE_CHECKING
 
 from pipistrelle.estimation.catalogue import short_name
+from pipistrelle.evaluation.scores import heading, shown_in
 from pipistrelle.verbs.streams import say
 
 if TYPE_CHECKING:
@@ -14,20 +15,6 @@ if TYPE_CHECKING:
     from pipistrelle.experiments.runs.trial import Progress
 
 
-TITLES = {
-    "position_rmse_m": ("position RMSE [m]", 3),
-    "heading_rmse_rad": ("heading RMSE [rad]", 4),
-    "map_rmse_m": ("map RMSE [m]", 3),
-    "position_rmse_aligned_m": ("position RMSE, aligned [m]", 3),
-    "map_rmse_aligned_m": ("map RMSE, aligned [m]", 3),
-    "position_bound_m": ("position bound over worlds [m]", 3),
-    "heading_bound_rad": ("heading bound over worlds [rad]", 4),
-    "caller_rmse_m": ("moving callers' RMSE [m]", 3),
-    "caller_rmse_aligned_m": ("moving callers' RMSE, aligned [m]", 3),
-    "nees_mean": ("NEES, mean", 2),
-    "nees_max": ("NEES, largest", 1),
-}
-"""Scores as a person reads them, and their digits."""
 NIS_TITLE = "innovations, NIS"
 NIS = (
     "NIS: how large innovations are, squared, beside what the filter expects; 1 where it believes "
@@ -186,8 +173,8 @@ def _cells(
 ) -> Iterator[tuple[str, str]]:
     """Word what there is to say of an estimate, with titles; nothing of what it lacks."""
     s = trial.scores
-    for name, (title, digits) in TITLES.items():
-        yield title, _number(getattr(s, name), digits)
+    for name, score in shown_in("mission").items():
+        yield heading(score), _number(getattr(s, name), score.digits)
     yield "landmarks, placed / heard", f"{s.landmarks_full} / {s.landmarks_total}"
     yield "landmarks in the world", "" if there is None else str(there)
     yield "fully placed, particles' mean", _number(trial.track.full, 1)

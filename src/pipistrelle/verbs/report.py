@@ -5,6 +5,8 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
+from pipistrelle.verbs.text_tables import text_table
+
 
 def report(
     folder: Annotated[Path, Parameter(help="A study's folder, whole or partial.")],
@@ -40,7 +42,9 @@ def report(
         if not told["claims"]:
             for sentence in told["answer"]:
                 put(sentence)
-            put(INTERVALS)
+            for table in told["effect_tables"]:
+                put("\n" + _effects(table))
+            put(f"\n*: shown. {INTERVALS}")
             if (count := told["worlds_done"]) < FEW:
                 worlds = "1 world" if count == 1 else f"{count} worlds"
                 put(f"This is of {worlds}: so few may show what others would not.")
@@ -51,6 +55,30 @@ def report(
             if claim["verdict"] == "open":
                 put(f"{'':<18} {_why(claim)}")
     put(target / "index.html")
+
+
+_NOTHING: dict[str, Any] = {"text": "", "interval": "", "shown": False}
+
+
+def _effects(table: dict[str, Any]) -> str:
+    """Lay out what one variable changes: the position RMSE, and what else is shown to change."""
+    first, *others = table["measures"]
+    rows = []
+    for row in table["rows"]:
+        if not row["end"] or (row["below"] and not row["contrary"]):
+            continue
+        main, *rest = (cell or _NOTHING for cell in row["cells"])
+        also = [
+            f"{name} {cell['text']}"
+            for name, cell in zip(others, rest, strict=True)
+            if cell["shown"]
+        ]
+
+        rows.append([
+            "  " * row["below"] + row["label"], main["text"] + "*" * main["shown"],
+            main["interval"], "; ".join(also[:3]) + "; ..." * (len(also) > 3),
+        ])  # fmt: skip
+    return text_table("", [[table["title"], first, "95 %", "also shown"]], rows)
 
 
 def _why(claim: dict[str, Any]) -> str:

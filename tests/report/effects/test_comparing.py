@@ -9,7 +9,7 @@ import pytest
 from pipistrelle.evaluation.comparison import Statement, judge
 from pipistrelle.report.claims.contrasts import select, selections
 from pipistrelle.report.effects.comparing import contrasts_of, effects_of, record, resolvable
-from pipistrelle.report.effects.measures import GAINS, MEASURES
+from pipistrelle.report.effects.measures import gains_of, is_first, measures_of
 from pipistrelle.report.reading import read_study
 from pipistrelle.report.studied import RULES
 from report.invented import changed, invent, only
@@ -17,7 +17,6 @@ from report.planted import LEVELS, by_level, write_planted
 
 BOTH = 'strategies = ["fused", "passive"]\nfilters = ["ekf"]\n'
 TWO = LEVELS + '\n"rays.power" = [1.0, 3.0]'
-POSITION = MEASURES[0]
 
 
 def study_of(tmp_path, *args, **given):
@@ -27,18 +26,18 @@ def study_of(tmp_path, *args, **given):
 
 def position(effects, **asked):
     """Effects on the position's error of the contrasts asked for."""
-    found = [effect for effect in effects if effect.measure is POSITION]
+    found = [effect for effect in effects if is_first(effect.measure)]
     return [e for e in found if all(getattr(e.contrast, k) == v for k, v in asked.items())]
 
 
 def test_every_value_of_a_variable_is_compared_with_its_first_in_each_strategy(tmp_path):
     study = study_of(tmp_path, worlds=2, ways='filters = ["ekf", "fastslam"]\n')
     mine = [c for c in contrasts_of(study) if c.factor == "beacon.level_db"]
-    gains = [c for c in mine if c.measures == GAINS]
+    gains = [c for c in mine if c.measures == gains_of(study)]
     assert Counter((c.filter, c.strategy) for c in gains) == {
         (name, strategy): 2 for name in ("ekf", "fastslam") for strategy in ("fused", "passive")
     }
-    mine = [c for c in mine if c.measures == MEASURES]
+    mine = [c for c in mine if c.measures == measures_of(study)]
     assert Counter((c.filter, c.strategy, c.before, c.after, c.end) for c in mine) == {
         (name, strategy, "36.8", after, after == "48.8"): 1
         for name in ("ekf", "fastslam")
@@ -102,7 +101,11 @@ def test_strategies_and_filters_are_compared_with_the_first_of_them(tmp_path):
 
 def test_the_beam_does_nothing_to_passive_sensing_and_is_not_compared_in_it():
     study = invent(3)
-    mine = [c for c in contrasts_of(study) if c.factor == "beamwidth" and c.measures == MEASURES]
+    mine = [
+        c
+        for c in contrasts_of(study)
+        if c.factor == "beamwidth" and c.measures == measures_of(study)
+    ]
     assert {c.strategy for c in mine} == {"active", "fused"}
     assert len(mine) == 2 * 2 * 11
     (far,) = [c for c in contrasts_of(study) if (c.filter, c.after) == ("ekf", "passive")]
@@ -248,7 +251,7 @@ def test_what_a_variable_does_to_the_gain_of_listening_is_active_less_the_other_
     found = {
         effect.contrast.strategy: effect
         for effect in effects_of(select(study, "none"))
-        if effect.measure is GAINS[0]
+        if effect.measure == gains_of(study)[0]
         and (effect.contrast.factor, effect.contrast.end) == ("beacon.level_db", True)
     }
     table = {way: study.trials["ekf", way].scores["position_rmse_m"] for way in (
@@ -274,7 +277,7 @@ def test_a_gain_is_of_the_worlds_in_which_what_it_is_over_counts(tmp_path):
     ways = 'filters = ["ekf"]\nstrategies = ["active", "fused"]\n'
     study = study_of(tmp_path, ways=ways, diverged=diverged)
     for rule, left in (("case", 9), ("none", 12)):
-        mine = [e for e in effects_of(select(study, rule)) if e.measure is GAINS[0]]
+        mine = [e for e in effects_of(select(study, rule)) if e.measure == gains_of(study)[0]]
         assert {effect.finding.n for effect in mine} == {left}
 
 
@@ -282,8 +285,8 @@ def test_what_the_beam_does_to_the_gain_of_passive_sensing_is_what_it_does_to_ac
     study = only(invent(6), [("ekf", "active"), ("ekf", "passive")])
     effects = effects_of(select(study, "none"))
     mine = [e for e in effects if e.contrast.factor == "beamwidth" and e.contrast.end]
-    (error,) = (e for e in mine if e.measure is POSITION)
-    (gain,) = (e for e in mine if e.measure is GAINS[0])
+    (error,) = (e for e in mine if is_first(e.measure))
+    (gain,) = (e for e in mine if e.measure == gains_of(study)[0])
     assert (error.contrast.strategy, gain.contrast.strategy) == ("active", "passive")
     assert gain.finding.mean == pytest.approx(error.finding.mean)
 
@@ -295,7 +298,7 @@ def test_a_gain_at_one_level_is_over_active_at_every_beam(tmp_path):
     mine = [c for c in contrasts_of(study) if (c.factor, c.strategy) == (
         "beacon.level_db", "passive",
     )]  # fmt: skip
-    assert {c.measures: len(c.pairs) for c in mine} == {MEASURES: 1, GAINS: 2}
+    assert {c.measures: len(c.pairs) for c in mine} == {measures_of(study): 1, gains_of(study): 2}
 
 
 def test_a_world_counts_only_where_every_averaged_pair_has_a_number(tmp_path):
@@ -317,4 +320,4 @@ def test_gains_stand_in_the_record_beside_errors_under_names_of_their_own(tmp_pa
         "gain_map_rmse_m",
     }  # fmt: skip
     assert {row["strategy"] for row in gains} == {"fused", "passive"}
-    assert len(rows) - len(gains) == 3 * 2 * len(MEASURES)
+    assert len(rows) - len(gains) == 3 * 2 * len(measures_of(study))

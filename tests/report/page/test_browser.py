@@ -125,8 +125,7 @@ def test_figures_of_a_filter_alone_fill_the_page_side_by_side(browser, tmp_path,
     page.goto((tmp_path / "index.html").as_uri())
     whole = page.locator("main").bounding_box()["width"]
     left, right = (
-        page.locator(f"figure#{name}").bounding_box()
-        for name in ("position_rmse", "position_rmse_aligned")
+        page.locator(f"figure#{name}").bounding_box() for name in ("position_rmse", "heading_rmse")
     )
     assert left["y"] == right["y"]
     assert left["width"] + right["width"] > 0.95 * whole

@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 from pipistrelle.config import Config, InputError
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.evaluation.comparison import INTERVALS, Finding, Statement, judge
+from pipistrelle.evaluation.scores import NOT_MEANS, SCORES
 from pipistrelle.experiments.comparing.folders import LETTERS
 from pipistrelle.experiments.comparing.matching import (
     alike,
@@ -36,17 +37,7 @@ from pipistrelle.files import read_file
 if TYPE_CHECKING:
     import polars as pl
 
-SCORES = (
-    "position_rmse_m",
-    "heading_rmse_rad",
-    "map_rmse_m",
-    "position_rmse_aligned_m",
-    "map_rmse_aligned_m",
-    "nees_mean",
-    "landmarks_full",
-    "landmarks_total",
-)
-"""What is compared, as tables of trials have it."""
+POSITION = "position_rmse_m"
 _VERSION = re.compile(r"Written by Pipistrelle (\S+)\.\s")
 Key = tuple[str, str, tuple[str, ...]]
 
@@ -183,7 +174,9 @@ def compare_studies(folders: Sequence[Path], *, drop_diverged: bool = False) -> 
         versions=tuple(map(_version, folders)),
         done=tuple(one.worlds for one in told),
         planned=tuple(one.plan.planned for one in told),
-        cases=tuple(case for score in SCORES for case in _judged(pairs, score, drop_diverged)),
+        cases=tuple(
+            case for score in _scored(told) for case in _judged(pairs, score, drop_diverged)
+        ),
         alone=tuple((_label([case], varied, told[who[0]].trials), who) for case, who in left),
         settings=differing([plan_settings(one.plan) for one in told]),
         dropped_diverged=drop_diverged,
@@ -207,12 +200,23 @@ def _read(folder: Path) -> _Told:
         parted = trials.partition_by("case", as_dict=True)
         found = {case: table for (case,), table in parted.items()}
         for table in found.values():
-            table.select("iteration", "status", "diverged", "beamwidth_deg", *SCORES)
+            table.select("iteration", "status", "diverged", "beamwidth_deg", POSITION)
     except (OSError, pl.exceptions.PolarsError) as error:
         raise InputError(
             f"{folder}: its trials have not the columns of this version; run the study anew"
         ) from error
     return _Told(plan=stored.plan, worlds=len(worlds), trials=found)
+
+
+def _scored(told: Sequence[_Told]) -> list[str]:
+    """List the scores that all studies keep and of which there is any number."""
+    tables = [table for one in told for table in one.trials.values()]
+    return [
+        name
+        for name in SCORES
+        if name not in NOT_MEANS and all(name in table.columns for table in tables)
+        if name == POSITION or any(table[name].cast(float).is_finite().any() for table in tables)
+    ]
 
 
 def _nothing_in_common(folders: Sequence[Path], told: Sequence[_Told]) -> InputError:

@@ -16,7 +16,7 @@ from pipistrelle.report.charts.axes import (
     slug,
 )
 from pipistrelle.report.effects.comparing import Effect, effects_of, families_of, mean_change
-from pipistrelle.report.effects.measures import MEASURES, Measure
+from pipistrelle.report.effects.measures import Measure, measures_of
 from pipistrelle.report.effects.wording import the
 from pipistrelle.report.numbers import UNITS
 from pipistrelle.report.studied import (
@@ -60,7 +60,7 @@ def effect_charts(selection: Selection) -> list[Chart]:
                 name=f"effect_{slug(factor)}_{slug(whose)}",
                 title=f"What {'the ' * ('.' not in factor)}{factor} changes, {title}",
                 caption=_caption(family, first),
-                panels=tuple(_panel(measure, family, axis, at) for measure in MEASURES),
+                panels=tuple(_panel(measure, family, axis, at) for measure in measures_of(study)),
                 columns=(variable.column if variable else factor, "change"),
             )
         )
@@ -132,7 +132,7 @@ def _panel(
     """Chart what changes in one measure, a series per strategy."""
     mine: dict[str, list[Effect]] = {}
     for effect in family:
-        if effect.measure is measure:
+        if effect.measure == measure:
             mine.setdefault(effect.contrast.strategy, []).append(effect)
     series = [_changes(list(mine), strategy, axis, at, one) for strategy, one in mine.items()]
     sign = UNITS[measure.unit][1]

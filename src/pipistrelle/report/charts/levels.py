@@ -1,14 +1,16 @@
 """Charts of how large each error is, over a variable: the bound beside it, every combination shown.
 
-Of several variables each has charts of its own. `LEVELS` is the only list of what is charted.
+Of several variables each has charts of its own. Which scores are charted, `evaluation.scores` says.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from pipistrelle.evaluation.scores import Score, shown_in
 from pipistrelle.figures.chart import MARKS, Axis, Chart, Panel, Series, ends, linear_axis, log_axis
 from pipistrelle.report.charts.axes import (
     Facet,
@@ -20,17 +22,18 @@ from pipistrelle.report.charts.axes import (
     slug,
 )
 from pipistrelle.report.effects.wording import the
+from pipistrelle.report.numbers import UNITS
 from pipistrelle.report.studied import (
     COMMON,
-    HEADING,
-    HEADING_BOUND,
+    LANDMARKS,
+    MAP,
     MAP_ALIGNED,
-    POSITION,
+    NEES,
     POSITION_ALIGNED,
-    POSITION_BOUND,
     Selection,
     Study,
     filter_titles,
+    has_numbers,
     mean_std,
     samples,
 )
@@ -49,173 +52,110 @@ BOUND = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Level:
-    """What makes the chart of a score.
-
-    Attributes
-    ----------
-    name, title : str
-        Of the chart.
-    score : one of `studied.SCORES`, or `studied.COMMON`
-    label : str
-        Of the axis.
-    column : str
-        Of the CSV.
-    scale : float
-        From the score to the axis.
-    caption : str
-    more : str
-        Of the caption, at its end.
-    beside : one of `studied.SCORES`, or nothing
-        Whose mean is drawn dashed.
-    named : str
-        What that is, after the name of its line.
-    worlds : bool
-        Single worlds are shown.
-    log : bool
-        On a logarithmic axis, means and deviations of logarithms.
-    """
+    """A chart of a score over a variable."""
 
     name: str
+    """Of the chart and its files."""
     title: str
     score: str
+    """One of `studied.READ`, or `studied.COMMON`."""
     label: str
+    """Of the vertical axis."""
     column: str
+    """Of the CSV."""
     scale: float = 1.0
+    """From the score to the axis."""
     caption: str = WORLDS
     more: str = ""
+    """The caption's end."""
     beside: str = ""
+    """The score whose mean is drawn dashed, if any."""
     named: str = "bound"
+    """What that score is, after the name of its line."""
     worlds: bool = True
+    """Single worlds are shown."""
     log: bool = False
+    """The axis is logarithmic; means and deviations are those of logarithms."""
 
 
-ERRORS = (
-    Level(
-        name="position_rmse",
-        title="Vehicle position RMSE",
-        score=POSITION,
-        label="position RMSE [m]",
-        column="position_rmse_m",
-        more=BOUND,
-        beside=POSITION_BOUND,
-    ),
-    Level(
-        name="position_rmse_aligned",
-        title="Vehicle position RMSE after alignment",
-        score=POSITION_ALIGNED,
-        label="aligned position RMSE [m]",
-        column="position_rmse_aligned_m",
-        more=". Each path after the rigid motion that fits it best: without the one turn of "
+_OWN: dict[str, dict[str, Any]] = {
+    POSITION_ALIGNED: {
+        "more": ". Each path after the rigid motion that fits it best: without the one turn of "
         "everything that is most of the raw error",
-    ),
-    Level(
-        name="heading_rmse",
-        title="Vehicle heading RMSE",
-        score=HEADING,
-        label="heading RMSE [°]",
-        column="heading_rmse_deg",
-        scale=180.0 / np.pi,
-        more=BOUND,
-        beside=HEADING_BOUND,
-    ),
-    Level(
-        name="map_rmse",
-        title="Map RMSE of the landmarks that every strategy has placed",
-        score=COMMON,
-        label="map RMSE [m]",
-        column="map_rmse_m",
-    ),
-    Level(
-        name="map_rmse_aligned",
-        title="Map RMSE of each strategy's own landmarks after alignment",
-        score=MAP_ALIGNED,
-        label="aligned map RMSE [m]",
-        column="map_rmse_aligned_m",
-        more=". Each map after the rigid motion that fits it best; strategies place different "
+    },
+    MAP: {"score": COMMON, "title": "Map RMSE of the landmarks that every strategy has placed"},
+    MAP_ALIGNED: {
+        "title": "Map RMSE of each strategy's own landmarks, aligned",
+        "more": ". Each map after the rigid motion that fits it best; strategies place different "
         "landmarks",
-    ),
-)
-LANDMARKS = Level(
-    name="landmarks",
-    title="Landmarks initialised",
-    score="landmarks_full",
-    label="landmarks",
-    column="landmarks",
-    caption="Fully initialised landmarks at the end, mean ± σ over worlds; dashed: fully and "
-    "partially initialised, mean",
-    beside="landmarks_total",
-    named="total",
-    worlds=False,
-)
-NEES = Level(
-    name="nees",
-    title="NEES, mean over the mission",
-    score="nees_mean",
-    label="NEES",
-    column="nees",
-    caption="Geometric mean over worlds, within a factor of one σ either way; a consistent "
-    "filter's is 3, and less after a start that is exact and thought uncertain",
-    worlds=False,
-    log=True,
-)
-LEVELS = (*ERRORS, LANDMARKS, NEES)
+    },
+    LANDMARKS: {
+        "name": "landmarks",
+        "column": "landmarks",
+        "caption": "Fully initialised landmarks at the end, mean ± σ over worlds; dashed: fully "
+        "and partially initialised, mean",
+        "beside": "landmarks_total",
+        "named": "total",
+        "worlds": False,
+    },
+    NEES: {
+        "name": "nees",
+        "column": "nees",
+        "caption": "Geometric mean over worlds, within a factor of one σ either way; a consistent "
+        "filter's is 3, and less after a start that is exact and thought uncertain",
+        "worlds": False,
+    },
+}
+"""What a score's chart has that the table of scores does not say."""
+
+
+def levels() -> tuple[Level, ...]:
+    """List the charts of the scores that `evaluation.scores` shows over a variable."""
+    return tuple(_level(name, score) for name, score in shown_in("levels").items())
+
+
+def _level(name: str, score: Score) -> Level:
+    """Describe the chart of a score."""
+    factor, sign = UNITS[score.unit]
+    stem = name.removesuffix(f"_{score.unit}")
+    drawn: dict[str, Any] = {
+        "name": stem,
+        "title": score.title[0].upper() + score.title[1:],
+        "score": name,
+        "label": f"{score.title} [{sign}]" if sign else score.title,
+        "column": f"{stem}_deg" if score.unit == "rad" else name,
+        "scale": factor,
+        "more": BOUND if score.bound else "",
+        "beside": score.bound,
+        "log": score.ratio,
+    }
+    return Level(**drawn | _OWN.get(name, {}))
 
 
 def error_charts(selection: Selection) -> list[Chart]:
     """Chart each RMSE over the variables, a panel per filter, a colour per strategy.
 
-    Parameters
-    ----------
-    selection : Selection
-
-    Returns
-    -------
-    list of Chart
-        Worlds more than σ above the mean as single marks.
-
-    Notes
-    -----
-    Bradley & Abaid, Secs. V-C and V-D and Appendix A.
+    Worlds more than σ above the mean are single marks (Bradley & Abaid, Secs. V-C and V-D and
+    Appendix A).
     """
-    return _charts(selection, ERRORS)
+    return _charts(selection, [one for one in levels() if "RMSE" in one.label])
 
 
 def landmark_charts(selection: Selection) -> list[Chart]:
-    """Chart how many landmarks are initialised, over the variables.
-
-    Parameters
-    ----------
-    selection : Selection
-
-    Returns
-    -------
-    list of Chart
-
-    Notes
-    -----
-    Bradley & Abaid, Sec. V-E.
-    """
-    return _charts(selection, [LANDMARKS])
+    """Chart how many landmarks are initialised, over the variables (Bradley & Abaid, Sec. V-E)."""
+    return _charts(selection, [one for one in levels() if one.score == LANDMARKS])
 
 
 def level_charts(selection: Selection) -> list[Chart]:
-    """Chart all of them over each variable; without one, over the filters.
-
-    Parameters
-    ----------
-    selection : Selection
-
-    Returns
-    -------
-    list of Chart
-    """
-    return _charts(selection, LEVELS)
+    """Chart every level over each variable; without one, over the filters."""
+    return _charts(selection, levels())
 
 
 def _charts(selection: Selection, levels: Sequence[Level]) -> list[Chart]:
-    """Chart some levels over each variable."""
+    """Chart those levels that have numbers, over each variable."""
     axes = selection.study.variables or (None,)
-    return [_chart(selection, what, variable) for variable in axes for what in levels]
+    there = [what for what in levels if has_numbers(selection.study, what.score)]
+    return [_chart(selection, what, variable) for variable in axes for what in there]
 
 
 def _chart(selection: Selection, what: Level, variable: Variable | None) -> Chart:

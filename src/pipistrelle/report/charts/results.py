@@ -11,10 +11,10 @@ import numpy as np
 from pipistrelle.figures.chart import Axis, Chart, Panel, Series, ends, linear_axis
 from pipistrelle.report.charts.differences import about, effect_charts, gain_charts
 from pipistrelle.report.charts.levels import (
-    LEVELS,
     error_charts,
     landmark_charts,
     level_charts,
+    levels,
 )
 from pipistrelle.report.charts.timelines import anees_charts
 from pipistrelle.report.claims.published import (
@@ -77,10 +77,6 @@ PAPERS: tuple[Figure, ...] = (
 """What is charted instead where the question is the paper's."""
 
 
-ANSWERING = frozenset(level.name for level in LEVELS) - {"map_rmse_aligned"} | {"gain"}
-"""Of what the answer speaks; the others stand further down the page."""
-
-
 def answers(name: str) -> bool:
     """Tell whether a figure shows what the answer speaks of.
 
@@ -98,7 +94,8 @@ def answers(name: str) -> bool:
     >>> answers("gain"), answers("nees_by_rays_power"), answers("anees_ekf")
     (True, True, False)
     """
-    return name.partition("_by_")[0] in ANSWERING or name.startswith("effect_")
+    answering = {level.name for level in levels()} - {"map_rmse_aligned"} | {"gain"}
+    return name.partition("_by_")[0] in answering or name.startswith("effect_")
 
 
 def study_charts(selection: Selection, charts: Sequence[Figure] | None = None) -> list[Chart]:

@@ -4,66 +4,71 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pipistrelle.evaluation.bound import IN_ONE_WORLD
 from pipistrelle.evaluation.comparison import Finding
-from pipistrelle.experiments.hearing.scenario import landmark_count
 from pipistrelle.report.claims.verdicts import WITHOUT, JudgedClaim
-from pipistrelle.report.effects.levels import diverged, times_the_bound
+from pipistrelle.report.effects.levels import times_by_strategy
 from pipistrelle.report.numbers import number_word
 from pipistrelle.report.studied import (
     COMMON,
+    LANDMARKS,
     POSITION,
     POSITION_ALIGNED,
     POSITION_BOUND,
     Rule,
     Selection,
-    Study,
     filter_titles,
-    mean_std,
     samples,
 )
 from pipistrelle.report.variables import width_name
 
+COMPARED = {
+    COMMON: "map RMSE of shared landmarks",
+    POSITION: "position RMSE",
+    POSITION_ALIGNED: "position RMSE, aligned",
+}
+"""Scores in which fused sensing is held against active sensing; every strategy has placed the
+shared landmarks."""
+
 
 def answer(selections: Mapping[Rule, Selection], claims: Sequence[JudgedClaim]) -> list[str]:
-    """Answer the question, then say what of the paper's claims is left.
+    """Answer the question in a line, then count the verdicts on the paper's claims.
 
-    Numbers leave diverged worlds out, as the paper does, and beside each stands what it is with
-    everything counted; where that bears on the answer, it is given under every exclusion rule.
-
-    Parameters
-    ----------
-    selections : dict of Selection
-        Under each exclusion rule.
-    claims : sequence of JudgedClaim
-
-    Returns
-    -------
-    list of str
-        A line that stands alone, then sentences.
+    The line leaves out diverged worlds, as the paper does. Where another exclusion rule answers
+    otherwise, a sentence gives the answer under each.
     """
-    papers, everything = selections["world"], selections["none"]
     by_rule = {rule: _headline(selection) for rule, selection in selections.items()}
-    sentences = (
-        *_otherwise(by_rule),
-        _counted(papers, everything),
-        _compared(
-            "The landmarks that every strategy places are placed", papers, everything, COMMON
-        ),
-        _compared("The vehicle is located", papers, everything, POSITION),
-        _compared("After alignment its path is", papers, everything, POSITION_ALIGNED),
-        _allowed(everything),
-        *_reached(everything),
-        diverged(papers.study),
-        _verdicts(claims),
-    )
     headline = by_rule["world"]
     if len(set(by_rule.values())) > 1:
         fuller = all(map(_fuller, selections.values()))
         headline = "It depends on which worlds are counted."
         if fuller:
             headline = "A fuller map, yes; a more accurate one depends on which worlds are counted."
-    return [headline, *(sentence for sentence in sentences if sentence)]
+    return [headline, *_otherwise(by_rule), _verdicts(claims)]
+
+
+def findings(selections: Mapping[Rule, Selection]) -> list[dict[str, str]]:
+    """Lay out the numbers behind the answer: a row per filter and finding, in words.
+
+    Each row says what it is without diverged worlds, as the paper counts, and with everything.
+    """
+    papers, everything = selections["world"], selections["none"]
+    rows = []
+    for name, title in filter_titles(papers.study).items():
+        if {(name, "fused"), (name, "active")} <= papers.study.trials.keys():
+            both = [(_pairs(one, name), one.gains) for one in (papers, everything)]
+            for finding in dict.fromkeys(key for pairs, _ in both for key in pairs):
+                rows.append((finding, title, *(pairs.get(finding, "") for pairs, _ in both)))
+            for score, words in COMPARED.items():
+                where = [_where(gains[name, score]) for _, gains in both]
+                rows.append((f"{words}: fused beside active", title, *where))
+        both = [times_by_strategy(one, name) for one in (papers, everything)]
+        for strategy in dict.fromkeys(strategy for times in both for strategy in times):
+            times = [one.get(strategy, "") for one in both]
+            rows.append((f"position RMSE over its bound, {strategy}", title, *times))
+    keys = ("finding", "filter", "without_diverged_worlds", "with_everything")
+    order = list(dict.fromkeys(row[0] for row in rows))
+    rows.sort(key=lambda row: order.index(row[0]))
+    return [dict(zip(keys, row, strict=True)) for row in rows]
 
 
 def _headline(selection: Selection) -> str:
@@ -126,63 +131,24 @@ def _otherwise(by_rule: dict[Rule, str]) -> list[str]:
     return [line[0].upper() + line[1:] for line in said]
 
 
-def _counted(selection: Selection, everything: Selection) -> str:
-    """Say how many landmarks fused and active place, at the narrowest and at the widest beam."""
-    study = selection.study
-    for name, title in filter_titles(study).items():
-        if not {(name, "fused"), (name, "active")} <= study.trials.keys():
-            continue
-        if said := _placed(selection, name):
-            beside = _beside(study, said, _placed(everything, name))
-            return (
-                "Hearing the beacon as well as its own calls, the vehicle fully places"
-                f"{_of_all(study)} {said}{beside} ({title})."
-            )
-    return ""
-
-
-def _of_all(study: Study) -> str:
-    """Say how many landmarks there are, if that is known."""
-    return f", of {landmark_count(study.example)} landmarks," if study.example else ""
-
-
-def _placed(selection: Selection, name: str) -> str:
-    """Give the counts of fused and of active sensing with a filter, in words."""
-    said, study = [], selection.study
-    for i in dict.fromkeys((0, len(study.beamwidth) - 1)):
-        cells = [(name, "fused", i), (name, "active", i)]
-        fused, active = samples(selection, "landmarks_full", cells)
-        if len(fused):
-            beam = width_name(study.beamwidth[i])
-            said.append(f"{np.mean(fused):.0f} instead of {np.mean(active):.0f} at {beam}")
-    return " and ".join(said)
-
-
-def _beside(study: Study, said: str, counted: str) -> str:
-    """Put beside what was said what it is with everything counted, where anything diverged."""
-    diverged = any(trials.diverged.any() for trials in study.trials.values())
-    told = "the same" if said == counted else counted
-    return f" (with everything counted: {told})" if diverged else ""
-
-
-def _compared(subject: str, selection: Selection, everything: Selection, score: str) -> str:
-    """Say where fused is better than active, and where worse, with each filter."""
-    said, undecided = [], []
-    for name, title in filter_titles(selection.study).items():
-        findings = selection.gains[name, score]
-        if findings and max(finding.n for finding in findings) < 2:
-            what = subject[0].lower() + subject[1:]
-            undecided.append(
-                f"Whether {what} better or worse with {title} is not decided: {_left(findings)}."
-            )
-        elif findings:
-            here, there = _where(findings), _where(everything.gains[name, score])
-            said.append(f"with {title} {here}{_beside(selection.study, here, there)}")
-    return " ".join([f"{subject} {'; '.join(said)}."] * bool(said) + undecided)
+def _pairs(selection: Selection, name: str) -> dict[str, str]:
+    """Word the means of active and of fused sensing at the narrowest and the widest beam."""
+    study, words = selection.study, {}
+    scores = ((LANDMARKS, "landmarks placed", ".0f"), (POSITION_BOUND, "position bound [m]", ".3f"))
+    for score, title, digits in scores:
+        for i in dict.fromkeys((0, len(study.beamwidth) - 1)):
+            cells = [(name, "active", i), (name, "fused", i)]
+            active, fused = samples(selection, score, cells)
+            if len(fused):
+                at = f"{title}, active → fused, at {width_name(study.beamwidth[i])}"
+                words[at] = f"{np.mean(active):{digits}} → {np.mean(fused):{digits}}"
+    return words
 
 
 def _where(findings: Sequence[Finding]) -> str:
     """Say at which beamwidths fused is better, and at which worse."""
+    if max((finding.n for finding in findings), default=0) < 2:
+        return f"not decided: {_left(findings)}"
     parts = [
         f"{word} at {_beams(findings, holds)}"
         for word, holds in (("better", True), ("worse", False))
@@ -206,41 +172,6 @@ def _beams(findings: Sequence[Finding], holds: bool) -> str:
         return "every beamwidth"
     which = ", ".join(run[0] if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs)
     return f"{count} of {len(findings)} beamwidths ({which})"
-
-
-def _allowed(everything: Selection) -> str:
-    """Say what the bound makes of the question, whatever the estimator."""
-    study = everything.study
-    for name in filter_titles(study):
-        if not {(name, "fused"), (name, "active")} <= study.trials.keys():
-            continue
-        said = []
-        for i in dict.fromkeys((len(study.beamwidth) - 1, len(study.beamwidth) // 2, 0)):
-            cells = [(name, "active", i), (name, "fused", i)]
-            alone, both = (mean_std(one)[0] for one in samples(everything, POSITION_BOUND, cells))
-            if not both > 0.0:
-                return ""
-            beam = width_name(study.beamwidth[i])
-            said.append(f"{alone:.3f} m to {both:.3f} m at {beam} ({1.0 - both / alone:.0%})")
-        return (
-            "Whatever the estimator, listening may lower the least error that the sound leaves "
-            f"from {', '.join(said)}, in the mean over all worlds. {IN_ONE_WORLD}"
-        )
-    return ""
-
-
-def _reached(everything: Selection) -> list[str]:
-    """Say of each filter how near it comes to the least error that the sound leaves."""
-    sentences = []
-    for name, title in filter_titles(everything.study).items():
-        times, online = times_the_bound(everything, name)
-        if times:
-            beside = ", of the path as it was believed at each time" if online else ""
-            sentences.append(
-                f"{title[0].upper()}{title[1:]} has of that least error, root mean squares with "
-                f"everything counted{beside}, by strategy and over the beamwidths, {times} times."
-            )
-    return sentences
 
 
 def _verdicts(claims: Sequence[JudgedClaim]) -> str:

@@ -6,7 +6,7 @@ world by world, and looked at one by one besides. Strategies and filters are com
 way, the first of them with each other one. All contrasts of a variable with a filter are one
 family for each measure (`pipistrelle.evaluation.comparison`): of numbers the ends, which are what
 the answer speaks of, and the values between them another. What a variable does to the gain of
-listening is compared alike: a gain is a measure, too (`measures.GAINS`).
+listening is compared alike: a gain is a measure, too (`measures.gains_of`).
 """
 
 import math
@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from pipistrelle.config import STRATEGIES
 from pipistrelle.evaluation.comparison import Finding, Statement, judge
-from pipistrelle.report.effects.measures import GAINS, MEASURES, Measure, cells_of, change
+from pipistrelle.report.effects.measures import Measure, cells_of, change, gains_of, measures_of
 from pipistrelle.report.studied import (
     Cell,
     Rule,
@@ -57,7 +57,7 @@ class Contrast:
     names : tuple of str
         Of those combinations.
     measures : tuple of Measure
-        What is compared; `measures.GAINS` where it is what the strategy gains.
+        What is compared; `measures.gains_of` where it is what the strategy gains.
     """
 
     factor: str
@@ -68,7 +68,7 @@ class Contrast:
     end: bool = True
     pairs: tuple[Pair, ...]
     names: tuple[str, ...]
-    measures: tuple[Measure, ...] = MEASURES
+    measures: tuple[Measure, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -286,15 +286,16 @@ def _plain_apart(effect: Effect) -> list[dict[str, Any]]:
 
 def _of_variables(study: Study) -> Iterator[Contrast]:
     """Compare the values of each variable in every strategy, and in what each gains over active."""
+    measures, gains = measures_of(study), gains_of(study)
     for variable in study.variables:
         for name in filter_titles(study):
             ways = [(name, strategy) for strategy in STRATEGIES if (name, strategy) in study.trials]
             for way in ways:
-                yield from _of_values(study, variable, [way], MEASURES)
-            over = name, GAINS[0].over
+                yield from _of_values(study, variable, [way], measures)
+            over = name, "active"
             for way in ways:
                 if over in ways and way != over:
-                    yield from _of_values(study, variable, [way, over], GAINS)
+                    yield from _of_values(study, variable, [way, over], gains)
 
 
 def _of_values(
@@ -334,7 +335,8 @@ def _of_strategies(study: Study) -> Iterator[Contrast]:
         for other in others:
             pairs, names = _everywhere(study, (name, first), (name, other))
             yield Contrast(factor=STRATEGY, filter=name, strategy="", before=first, after=other,
-                           pairs=pairs, names=names)  # fmt: skip
+                           pairs=pairs, names=names,
+                           measures=measures_of(study))  # fmt: skip
 
 
 def _of_filters(study: Study) -> Iterator[Contrast]:
@@ -345,7 +347,8 @@ def _of_filters(study: Study) -> Iterator[Contrast]:
         for other in there[1:]:
             pairs, names = _everywhere(study, (there[0], strategy), (other, strategy))
             yield Contrast(factor=FILTER, filter="", strategy=strategy, before=titles[there[0]],
-                           after=titles[other], pairs=pairs, names=names)  # fmt: skip
+                           after=titles[other], pairs=pairs, names=names,
+                           measures=measures_of(study))  # fmt: skip
 
 
 def _everywhere(

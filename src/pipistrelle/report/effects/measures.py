@@ -1,7 +1,7 @@
-"""What is looked at in each trial: six numbers, each better or worse by itself, and gains.
+"""Scores in which two cases of a study are compared, and what listening gains in each.
 
-`MEASURES` is the only list of them: table, figures, sentences and summary follow. A gain is the
-error of active sensing less that of a strategy that listens, in the same world.
+The scores are those that `evaluation.scores` shows among a report's effects. A gain is the error of
+active sensing less that of a strategy that listens, in the same world.
 """
 
 from collections.abc import Sequence
@@ -10,63 +10,50 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.report.studied import (
-    HEADING,
-    HEADING_BOUND,
-    MAP,
-    POSITION,
-    POSITION_ALIGNED,
-    POSITION_BOUND,
-    Cell,
-    Study,
-    rmse_of,
-    values,
-)
+from pipistrelle.evaluation.scores import shown_in
+from pipistrelle.report.studied import MAP, POSITION, Cell, Study, has_numbers, rmse_of, values
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measure:
-    """One number of a trial.
-
-    Attributes
-    ----------
-    title : str
-        In a sentence.
-    score : one of `studied.SCORES`
-    unit : one of `numbers.UNITS`
-    ratio : bool
-        Two cases are compared by the ratio of their numbers, not by the difference.
-    bound : one of `studied.SCORES`, or nothing
-        The least that any estimator has.
-    over : strategy, or nothing
-        The number is a gain: this strategy's, less the case's own.
-    """
+    """A score that is compared, or the gain in it."""
 
     title: str
+    """As a sentence names it."""
     score: str
+    """One of `studied.READ`, or `studied.COMMON`."""
     unit: str
+    """One of `numbers.UNITS`."""
     ratio: bool = False
-    bound: str = ""
+    """Two cases are compared by the ratio of their numbers, not by the difference."""
     over: str = ""
+    """For a gain, the strategy whose score the case's own is subtracted from; else empty."""
 
 
-MEASURES = (
-    Measure(title="position error", score=POSITION, unit="m", bound=POSITION_BOUND),
-    Measure(title="aligned position error", score=POSITION_ALIGNED, unit="m"),
-    Measure(title="heading error", score=HEADING, unit="rad", bound=HEADING_BOUND),
-    Measure(title="map error", score=MAP, unit="m"),
-    Measure(title="number of landmarks placed", score="landmarks_full", unit="landmarks"),
-    Measure(title="NEES", score="nees_mean", unit="", ratio=True),
-)
-"""The first is what the answer speaks of."""
-GAINS = tuple(
-    replace(
-        one, title=f"{one.title.removesuffix(' error')} gain over active", bound="", over="active"
+def measures_of(study: Study) -> tuple[Measure, ...]:
+    """List the scores in which a study's cases are compared: the position's, and all with numbers.
+
+    The answer speaks of the first.
+    """
+    return tuple(
+        Measure(title=score.title, score=name, unit=score.unit, ratio=score.ratio)
+        for name, score in shown_in("effects").items()
+        if name == POSITION or has_numbers(study, name)
     )
-    for one in MEASURES
-    if one.unit in ("m", "rad")
-)
-"""What listening gains, of each error: above 0 where it helps."""
+
+
+def gains_of(study: Study) -> tuple[Measure, ...]:
+    """List the errors of which listening may gain some: above 0 where listening helps."""
+    return tuple(
+        replace(one, title=f"gain in {one.title} over active", over="active")
+        for one in measures_of(study)
+        if one.unit in ("m", "rad")
+    )
+
+
+def is_first(measure: Measure) -> bool:
+    """Tell whether the answer speaks of a measure: the position's error."""
+    return measure.score == POSITION and not measure.over
 
 
 def cells_of(measure: Measure, before: Cell, after: Cell) -> list[Cell]:

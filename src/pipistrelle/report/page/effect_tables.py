@@ -5,12 +5,15 @@ from typing import Any
 
 import numpy as np
 
+from pipistrelle.evaluation.comparison import Finding
+from pipistrelle.evaluation.scores import shown_in
 from pipistrelle.report.effects.comparing import STRATEGY, Contrast, Effect
-from pipistrelle.report.effects.measures import MEASURES
+from pipistrelle.report.effects.levels import times_the_bound
+from pipistrelle.report.effects.measures import measures_of
 from pipistrelle.report.effects.wording import direction, the, variable_of
 from pipistrelle.report.numbers import amount, interval, three_digits
 from pipistrelle.report.studied import (
-    POSITION_BOUND,
+    POSITION,
     Selection,
     Study,
     case_name,
@@ -21,69 +24,92 @@ from pipistrelle.report.studied import (
 )
 from pipistrelle.report.variables import two_sided
 
+FEW = 6
+"""Of so many combinations each has a row; of more, those at which the opposite is shown."""
 
-def effect_tables(study: Study, effects: Sequence[Effect]) -> list[dict[str, Any]]:
-    """Lay out what each variable changes, a row per filter, strategy and value.
 
-    Parameters
-    ----------
-    study : Study
-    effects : sequence of Effect
-        Under one exclusion rule.
+def effect_tables(
+    selection: Selection, effects: Sequence[Effect], otherwise: Sequence[Effect]
+) -> list[dict[str, Any]]:
+    """Lay out what each variable changes, then strategies and filters, where there are several.
 
-    Returns
-    -------
-    list of dict
-        Per variable, then of strategies and filters, where there are several: its name and what it
-        means, whether it is one of the study's variables, and the rows; those that are no `end`
-        stand between a number's ends.
+    `otherwise` holds the same effects without the cases that diverged. A table has a name, a title,
+    a meaning, whether it is one of the study's variables, and rows: a filter, strategy and value
+    each, with a cell per measure. Rows that are no `end` stand between a number's ends; a row
+    below another says what it is at one combination of the rest, or without diverged cases; it is
+    contrary where the position RMSE then changes in another direction.
     """
+    study = selection.study
+    titles = [measure.title for measure in measures_of(study)]
     tables: dict[str, dict[str, Any]] = {}
-    rows: dict[Contrast, list[Effect]] = {}
-    for effect in effects:
-        rows.setdefault(effect.contrast, []).append(effect)
-    for contrast, mine in rows.items():
+    rows: dict[Contrast, list[tuple[Effect, Effect]]] = {}
+    for pair in zip(effects, otherwise, strict=True):
+        rows.setdefault(pair[0].contrast, []).append(pair)
+    for contrast, pairs in rows.items():
+        first = pairs[0][0]
         if contrast.factor not in tables:
-            tables[contrast.factor] = _heading(study, mine[0]) | {"rows": []}
-        cells = {effect.measure.score: _cell(effect) for effect in mine}
-        row = {
-            "label": _label(study, mine[0]),
-            "strategy": contrast.strategy,
-            "end": contrast.end,
-            "cells": [cells.get(measure.score) for measure in MEASURES],
-            "apart": len(mine[0].apart),
+            tables[contrast.factor] = _heading(study, first) | {"measures": titles, "rows": []}
+        label, found = _label(study, first), [effect for effect, _ in pairs]
+        cells = [(label, {e.measure.score: _cell(e, e.finding, e.untouched) for e in found}, False)]
+        cells += _apart(found)
+        changed = {
+            kept.measure.score: _cell(kept, kept.finding, kept.untouched)
+            for effect, kept in pairs
+            if not effect.untouched and direction(kept.finding) != direction(effect.finding)
         }
-        tables[contrast.factor]["rows"].append(row)
+        cells += [("without diverged cases", changed, POSITION in changed)] if changed else []
+        tables[contrast.factor]["rows"] += [
+            {
+                "label": name,
+                "strategy": contrast.strategy,
+                "end": contrast.end,
+                "below": below > 0,
+                "contrary": contrary,
+                "cells": [by_score.get(measure.score) for measure in measures_of(study)],
+            }
+            for below, (name, by_score, contrary) in enumerate(cells)
+        ]
     return list(tables.values())
 
 
+def _apart(effects: Sequence[Effect]) -> list[tuple[str, dict[str, Any], bool]]:
+    """Lay out a contrast at combinations of the rest: each of a few, or where the opposite is."""
+    rows = []
+    for i, name in enumerate(effects[0].contrast.names if effects[0].apart else ()):
+        opposite = any(
+            direction(e.apart[i]) and direction(e.apart[i]) != direction(e.finding)
+            for e in effects
+            if e.measure.score == POSITION
+        )
+        if len(effects[0].apart) <= FEW or opposite:
+            cells = {e.measure.score: _cell(e, e.apart[i]) for e in effects}
+            rows.append((f"at {name}", cells, opposite))
+    return rows
+
+
 def case_rows(selection: Selection) -> list[dict[str, Any]]:
-    """Lay out where every case stands.
+    """Lay out where every case stands, as ``summary.json`` has it.
 
-    Parameters
-    ----------
-    selection : Selection
-
-    Returns
-    -------
-    list of dict
-        Per case: filter, strategy, values of the variables, worlds that count, mean and standard
-        deviation of each measure over them (of NEES those of its logarithm, as a number and a
-        factor), the mean bound of the position, and the share of trials that diverged.
+    A row has filter, strategy, values of the variables, the worlds that count, mean and standard
+    deviation of each measure over them (of NEES those of its logarithm, as a number and a factor),
+    the means of what is shown besides, how many times the bound the position RMSE is, and the
+    share of trials that diverged.
     """
     study, rows = selection.study, []
     for way, trials in study.trials.items():
         for column, i in enumerate(own_cases(trials).tolist()):
             cell = (*way, i)
             found: dict[str, Any] = {}
-            for measure in MEASURES:
+            for measure in measures_of(study):
                 (sample,) = samples(selection, measure.score, [cell])
                 found["n"] = found.get("n", len(sample))
                 found[measure.score] = _moments(sample, ratio=measure.ratio)
-            (least,) = samples(selection, POSITION_BOUND, [cell])
+            for name in shown_in("cases"):
+                (sample,) = samples(selection, name, [cell])
+                found[name] = float(np.mean(sample)) if len(sample) else None
             rows.append(
                 {"filter": way[0], "strategy": way[1], "at": case_name(study, way, i), **found}
-                | {POSITION_BOUND: float(np.mean(least)) if len(least) else None}
+                | {"times_the_bound": times_the_bound(selection, cell)}
                 | {"diverged": float(np.mean(trials.diverged[:, column]))}
             )
     return rows
@@ -136,20 +162,20 @@ def _label(study: Study, effect: Effect) -> str:
     return f"{whose}: {contrast.after} instead of {contrast.before}"
 
 
-def _cell(effect: Effect) -> dict[str, Any]:
-    """Word an effect in a measure, with its interval."""
-    finding, measure = effect.finding, effect.measure
+def _cell(effect: Effect, finding: Finding, untouched: bool = False) -> dict[str, Any]:
+    """Word a finding on an effect, with its interval."""
+    measure = effect.measure
     cell = {"shown": direction(finding) != 0, "n": finding.n, "interval": ""}
-    if effect.untouched:
+    if untouched:
         return cell | {"text": "same"}
     if finding.n < 2:
         return cell | {"text": "?"}
     low, high = finding.family
     if measure.ratio:
         mean, low, high = np.exp(np.clip([finding.mean, low, high], -700.0, 700.0)).tolist()
-        text, between = f"× {three_digits(mean)}", interval((low, high), "")
+        text, ends = f"× {three_digits(mean)}", interval((low, high), "")
     else:
         text = "+" * (finding.mean > 0.0) + amount(finding.mean, measure.unit)
-        between = interval((low, high), measure.unit)
+        ends = interval((low, high), measure.unit)
     alike = not finding.std > 0.0
-    return cell | {"text": text, "interval": "in every world" if alike else between}
+    return cell | {"text": text, "interval": "in every world" if alike else ends}

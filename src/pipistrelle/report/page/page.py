@@ -8,11 +8,13 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
+from pipistrelle.evaluation.bound import IN_ONE_WORLD
 from pipistrelle.evaluation.comparison import INTERVALS, Finding
+from pipistrelle.evaluation.scores import shown_in
 from pipistrelle.figures.chart import Chart, Panel, columns_of, csv_rows, csv_text
 from pipistrelle.figures.style import page_colours
 from pipistrelle.own_files import REPORT, claim, drawn_files
@@ -21,14 +23,23 @@ from pipistrelle.report.charts.setting import model_charts
 from pipistrelle.report.claims.published import FILTERS
 from pipistrelle.report.claims.statements import Claim
 from pipistrelle.report.claims.verdicts import WITHOUT, tally, with_everything
-from pipistrelle.report.effects.measures import MEASURES
+from pipistrelle.report.effects.measures import measures_of
 from pipistrelle.report.numbers import UNITS, number_word, three_digits
 from pipistrelle.report.page import overview
-from pipistrelle.report.page.effect_tables import effect_tables
 from pipistrelle.report.page.summary import Answered, answered, summary
 from pipistrelle.report.page.svg import legend, panel_svg, readings
-from pipistrelle.report.studied import RULES, Rule, Study, filter_titles
+from pipistrelle.report.studied import (
+    ONLINE_POSITION,
+    RULES,
+    Rule,
+    Study,
+    filter_titles,
+    has_numbers,
+)
 from pipistrelle.settings import to_toml
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 SPOKEN = {"reproduced": "Reproduced", "not-reproduced": "Not reproduced", "open": "Open"}
 FEW = 20
@@ -111,16 +122,9 @@ def page(
     str
         HTML.
     """
-    from jinja2 import Environment, StrictUndefined
-
     here, study = files("pipistrelle.report.page"), told.study
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters |= {"number": three_digits, "p": _p, "finding": _shown}
-    template = environment.from_string((here / "page.html").read_text(encoding="utf-8"))
     figures = [_figure(chart.name, found) for chart in _distinct(found)]
-    return template.render(
+    return _template().render(
         study=study,
         papers=told.papers,
         headline=told.rule,
@@ -129,8 +133,11 @@ def page(
         summary=numbers,
         few=FEW,
         intervals=INTERVALS,
-        tables=effect_tables(study, told.effects[told.rule]),
-        measures=MEASURES,
+        tables=numbers["effect_tables"],
+        means=shown_in("cases"),
+        in_one_world=IN_ONE_WORLD,
+        online=has_numbers(study, ONLINE_POSITION),
+        measures=measures_of(study),
         units=UNITS,
         figures=_side_by_side([figure for figure in figures if answers(figure["name"])]),
         further=_side_by_side([figure for figure in figures if not answers(figure["name"])]),
@@ -150,6 +157,18 @@ def page(
         consistency=overview.by_strategy(numbers["consistency"]),
         config=to_toml(study.config),
     )
+
+
+def _template() -> "Template":
+    """Read the page's template, which escapes every text."""
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters |= {"number": three_digits, "p": _p, "finding": _shown}
+    text = (files("pipistrelle.report.page") / "page.html").read_text(encoding="utf-8")
+    return environment.from_string(text)
 
 
 def _side_by_side(figures: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -12,15 +12,16 @@ from typing import Any
 
 from pipistrelle import __version__
 from pipistrelle.report.claims.answer import answer as papers_answer
+from pipistrelle.report.claims.answer import findings
 from pipistrelle.report.claims.contrasts import selections
 from pipistrelle.report.claims.published import papers_cases
 from pipistrelle.report.claims.statements import CLAIMS, Claim
 from pipistrelle.report.claims.verdicts import JudgedClaim, judge_claims, record
 from pipistrelle.report.effects import comparing
-from pipistrelle.report.effects.answer import HEADLINE, answer, question
+from pipistrelle.report.effects.answer import HEADLINE, OTHERWISE, answer, question
 from pipistrelle.report.effects.comparing import Effect, effects_of
 from pipistrelle.report.page import overview
-from pipistrelle.report.page.effect_tables import case_rows
+from pipistrelle.report.page.effect_tables import case_rows, effect_tables
 from pipistrelle.report.studied import RULES, Rule, Selection, Study
 
 FORMAT = 1
@@ -57,6 +58,8 @@ class Answered:
     effects: Mapping[Rule, tuple[Effect, ...]]
     claims: tuple[JudgedClaim, ...]
     answer: list[str]
+    findings: list[dict[str, str]]
+    """Rows below the answer to the paper's question; none of another's."""
 
 
 def answered(study: Study, claims: Sequence[Claim] | None = None) -> Answered:
@@ -76,7 +79,7 @@ def answered(study: Study, claims: Sequence[Claim] | None = None) -> Answered:
     effects = {rule: effects_of(selection) for rule, selection in by_rule.items()}
     asked = (CLAIMS if papers else ()) if claims is None else claims
     judged = judge_claims(by_rule, asked)
-    said = papers_answer(by_rule, judged) if papers else answer(by_rule[HEADLINE], effects)
+    lines = answer(by_rule[HEADLINE], effects[HEADLINE])
     return Answered(
         study=study,
         papers=papers,
@@ -85,7 +88,8 @@ def answered(study: Study, claims: Sequence[Claim] | None = None) -> Answered:
         selections=by_rule,
         effects=effects,
         claims=judged,
-        answer=said,
+        answer=papers_answer(by_rule, judged) if papers else lines,
+        findings=findings(by_rule) if papers else [],
     )
 
 
@@ -119,7 +123,9 @@ def summary(told: Answered) -> dict[str, Any]:
         "not_the_papers": overview.not_the_papers(study),
         "question": told.question,
         "answer": told.answer,
+        "findings": told.findings,
         "answered_by": told.rule,
+        "effect_tables": [] if told.papers else tables_of(told),
         "effects": comparing.record(told.effects, told.rule),
         "cases": case_rows(selection),
         "claims": [record(claim) for claim in told.claims],
@@ -130,6 +136,13 @@ def summary(told: Answered) -> dict[str, Any]:
         "consistency": overview.consistency_rows(selection),
         "failed": [asdict(failure) for failure in study.errors],
     }
+
+
+def tables_of(told: Answered) -> list[dict[str, Any]]:
+    """Lay out what each variable changes, in words."""
+    return effect_tables(
+        told.selections[told.rule], told.effects[told.rule], told.effects[OTHERWISE]
+    )
 
 
 def _versions() -> dict[str, str]:
