@@ -75,28 +75,12 @@ def animate_mission(
     dark dot where they cross. Callers are then marked where they are believed to be, too, as they
     are where there are several.
 
-    Parameters
-    ----------
-    snapshots : for each (strategy, filter), frames in the order of time
-        As a `MissionRecorder` keeps them.
-    path : Path
-        Ends in .gif, or in .mp4, which needs ffmpeg.
-    truth : Truth
-    callers : sequence of Caller, optional
-        Without the vehicle; one that moves is drawn as its path and a star on it.
-    beamwidth : [rad], optional
-    pictures : int, at least 1
-        At most so many frames are shown, evenly spaced, the last among them.
+    `snapshots`: as a `MissionRecorder` keeps them. `path`: ends in .gif, or in .mp4, which needs
+    ffmpeg. `callers`: without the vehicle; one that moves is drawn as its path and a star on it.
+    `beamwidth` [rad]. `pictures`: at most so many frames are shown, evenly spaced, the last among
+    them. Raises InputError where the path ends otherwise or cannot be written, or ffmpeg is
+    missing or fails. Raises ValueError without a single frame.
 
-    Raises
-    ------
-    InputError
-        Where the path ends otherwise or cannot be written, or ffmpeg is missing or fails.
-    ValueError
-        Without a single frame.
-
-    Notes
-    -----
     Bradley & Abaid, Sec. III-C, "ray of Gaussians", as it happens.
 
     Examples
@@ -390,15 +374,6 @@ class _Panel:
 
 def pruned(before: Landmarks, after: Landmarks) -> Bool[np.ndarray, " h"]:
     """Tell which rows of a map have no successor: none of the same landmark is nearest to them.
-
-    Parameters
-    ----------
-    before : Landmarks of h rows
-    after : Landmarks
-
-    Returns
-    -------
-    (h)
 
     Examples
     --------

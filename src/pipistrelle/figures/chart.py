@@ -21,40 +21,26 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mark:
-    """How the points of a series are shown.
-
-    Attributes
-    ----------
-    joined : bool
-        By a line.
-    spread : "band" or "bars"
-        What `low` and `high` are drawn as.
-    symbol : str
-        At each point, as matplotlib names it; none if empty.
-    size : of the symbol on paper [pt]
-    edge : of the white edge of the symbol on paper [pt]
-        0: it has none.
-    corners : tuple of x, y
-        Of the symbol on the page, about the point, y down; if there are none, it is a circle.
-    radius : of that circle
-    pinned : bool
-        Small and many, for single worlds: those above the panel stand at its edge.
-    written : bool
-        No symbol: what `tips` say stands at the points.
-    swatch : "line", "dashed", "dot" or "star"
-        Its sign in the page's legend.
-    """
+    """How the points of a series are shown."""
 
     joined: bool = False
+    """By a line."""
     spread: Literal["band", "bars"] = "band"
+    """What `low` and `high` are drawn as."""
     symbol: str = ""
+    """At each point, as matplotlib names it; none if empty."""
     size: float = 5.0
     edge: float = 0.0
+    """0: it has none."""
     corners: tuple[tuple[float, float], ...] = ()
+    """Of the symbol on the page, about the point, y down; if there are none, it is a circle."""
     radius: float = 3.2
     pinned: bool = False
+    """Small and many, for single worlds: those above the panel stand at its edge."""
     written: bool = False
+    """No symbol: what `tips` say stands at the points."""
     swatch: Literal["line", "dashed", "dot", "star"] = "line"
+    """Its sign in the page's legend."""
 
 
 def _star(outer: float, inner: float) -> tuple[tuple[float, float], ...]:
@@ -82,114 +68,71 @@ MOST_NAMES = 6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Series:
-    """Points that belong together.
-
-    Attributes
-    ----------
-    name : str
-    role : str
-        What colours it: a strategy, "ink", "truth" or "grid".
-    x, y : (n)
-        Not finite: a gap.
-    low, high : (n), optional
-        Ends of a band, or of bars, about y.
-    style : one of `MARKS`
-    filled : (n), optional
-        Which points are full; all of them if not said.
-    strength : 0 to 1
-        Opacity.
-    dashed : bool
-    tips : tuple of str
-        What to say of each point, where the axes alone do not.
-    listed : bool
-        Whether the legend and the CSV name it.
-    """
+    """Points that belong together."""
 
     name: str
     role: str
+    """What colours it: a strategy, "ink", "truth" or "grid"."""
     x: Float[np.ndarray, " n"]
     y: Float[np.ndarray, " n"]
+    """Not finite: a gap."""
     low: Float[np.ndarray, " n"] | None = None
     high: Float[np.ndarray, " n"] | None = None
+    """Ends of a band, or of bars, about y."""
     style: str = "line"
+    """One of `MARKS`."""
     filled: np.ndarray | None = None
+    """Which points are full; all of them if not said."""
     strength: float = 1.0
+    """Opacity."""
     dashed: bool = False
     tips: tuple[str, ...] = ()
+    """What to say of each point, where the axes alone do not."""
     listed: bool = True
+    """Whether the legend and the CSV name it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Axis:
-    """One direction of a panel.
-
-    Attributes
-    ----------
-    label : str
-    limits : low, high
-    log : bool
-    ticks : tuple of value and text
-    named : tuple of value and text
-        The places at which there is something to read out, as the page calls them; where there are
-        none, it takes the ticks.
-    words : bool
-        The numbers are no more than the order of those names: the CSV has the names.
-    """
+    """One direction of a panel."""
 
     label: str
     limits: tuple[float, float]
     log: bool = False
     ticks: tuple[tuple[float, str], ...]
     named: tuple[tuple[float, str], ...] = ()
+    """The places at which there is something to read out, as the page calls them; where there are
+    none, it takes the ticks."""
     words: bool = False
+    """The numbers are no more than the order of those names: the CSV has the names."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Panel:
-    """Series over two axes.
-
-    Attributes
-    ----------
-    title : str
-    role : str
-        Colours the title.
-    x, y : Axis
-    series : tuple of Series
-    span : low, high, name; optional
-        A band across the panel: where y should be.
-    rules : tuple of float
-        Where a thin line crosses the panel from left to right.
-    posts : tuple of float
-        Where one crosses it from bottom to top.
-    equal : bool
-        One unit is as long on both axes, which are not drawn.
-    """
+    """Series over two axes."""
 
     title: str
     role: str = "ink"
+    """Colours the title."""
     x: Axis
     y: Axis
     series: tuple[Series, ...]
     span: tuple[float, float, str] | None = None
+    """A band across the panel: where y should be."""
     rules: tuple[float, ...] = ()
+    """Where a thin line crosses the panel from left to right."""
     posts: tuple[float, ...] = ()
+    """Where one crosses it from bottom to top."""
     equal: bool = False
+    """One unit is as long on both axes, which are not drawn."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chart:
-    """Panels that make one figure.
-
-    Attributes
-    ----------
-    name : str
-        Of its files.
-    title, caption : str
-    panels : tuple of Panel
-    columns : names of x and y in the CSV, with their units
-    """
+    """Panels that make one figure."""
 
     name: str
+    """Of its files."""
     title: str
     caption: str
     panels: tuple[Panel, ...]
@@ -199,17 +142,9 @@ class Chart:
 def ticks(low: float, high: float, log: bool = False) -> tuple[tuple[float, str], ...]:
     """Round numbers along an axis, about five of them.
 
-    Parameters
-    ----------
-    low, high : float
-        low below high; above 0 where the axis is logarithmic.
-    log : bool
-        Powers of ten, with 3 in between where there are fewer than three; numbers as along a
-        linear axis where that would leave one or none.
-
-    Returns
-    -------
-    tuple of value and text
+    `low` and `high`: low below high; above 0 where the axis is logarithmic. `log`: powers of ten,
+    with 3 in between where there are fewer than three; numbers as along a linear axis where that
+    would leave one or none.
 
     Examples
     --------
@@ -263,15 +198,7 @@ def linear_axis(label: str, values: Iterable[float], *, floor: float | None = No
 def log_axis(label: str, values: Iterable[float]) -> Axis:
     """Logarithmic axis that holds some values.
 
-    Parameters
-    ----------
-    label : str
-    values : iterable of float
-        Those that are not finite and above 0 are left out.
-
-    Returns
-    -------
-    Axis
+    `values`: those that are not finite and above 0 are left out.
 
     Examples
     --------
@@ -285,14 +212,6 @@ def log_axis(label: str, values: Iterable[float]) -> Axis:
 
 def ends(found: Iterable[Series]) -> list[float]:
     """Numbers that an axis has to hold to show some series.
-
-    Parameters
-    ----------
-    found : iterable of Series
-
-    Returns
-    -------
-    list of float
 
     Examples
     --------
@@ -311,15 +230,8 @@ def ends(found: Iterable[Series]) -> list[float]:
 def columns_of(count: int) -> int:
     """Tell how many panels stand beside each other.
 
-    Parameters
-    ----------
-    count : int
-        Panels of the chart.
-
-    Returns
-    -------
-    int
-        All, up to `style.COLUMNS`; of more, as many as that if they fill their rows, else two.
+    `count`: panels of the chart. Returns: all, up to `style.COLUMNS`; of more, as many as that if
+    they fill their rows, else two.
 
     Examples
     --------
@@ -334,14 +246,7 @@ def columns_of(count: int) -> int:
 def legend_series(panels: Iterable[Panel]) -> dict[str, Series]:
     """List what a legend over some panels explains.
 
-    Parameters
-    ----------
-    panels : iterable of Panel
-
-    Returns
-    -------
-    dict of Series
-        By name, the last of each; empty where the names are many: there the caption tells.
+    Returns: by name, the last of each; empty where the names are many: there the caption tells.
 
     Examples
     --------
@@ -357,14 +262,7 @@ def legend_series(panels: Iterable[Panel]) -> dict[str, Series]:
 def explained(series: Series) -> bool:
     """Tell whether a series has a sign in the legend, and is read out by its name.
 
-    Parameters
-    ----------
-    series : Series
-
-    Returns
-    -------
-    bool
-        Not of single worlds, nor of what is written out.
+    Returns: not of single worlds, nor of what is written out.
     """
     mark = MARKS[series.style]
     return not (mark.pinned or mark.written)
@@ -373,15 +271,7 @@ def explained(series: Series) -> bool:
 def csv_rows(chart: Chart, **constant: str) -> list[list[str]]:
     """Lay the numbers of a chart out, one row per point, to nine digits.
 
-    Parameters
-    ----------
-    chart : Chart
-    constant : str
-        Further columns, the same in each row, put first.
-
-    Returns
-    -------
-    list of rows, the header first
+    `constant`: further columns, the same in each row, put first.
 
     Examples
     --------
@@ -418,14 +308,7 @@ def _place(axis: Axis, value: float) -> str:
 def csv_text(rows: Sequence[Sequence[str]]) -> str:
     r"""Write rows as CSV.
 
-    Parameters
-    ----------
-    rows : sequence of sequences of str
-
-    Returns
-    -------
-    str
-        Fields with a comma, a quote or a line break are quoted.
+    Returns: fields with a comma, a quote or a line break are quoted.
 
     Examples
     --------

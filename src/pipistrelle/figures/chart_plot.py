@@ -29,19 +29,7 @@ BAND = 0.15
 def draw_chart(chart: Chart) -> "Figure":
     """Draw a chart.
 
-    Parameters
-    ----------
-    chart : Chart
-
-    Returns
-    -------
-    Figure
-        Not known to pyplot.
-
-    Raises
-    ------
-    ValueError
-        Without panels.
+    Returns: not known to pyplot. Raises ValueError without panels.
 
     Examples
     --------

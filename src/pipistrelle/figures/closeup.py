@@ -71,13 +71,8 @@ class Closeup:
     ) -> None:
         """Look at the end of a path.
 
-        Parameters
-        ----------
-        cloud : (p, 3) [m, m, rad]
-        path : (k, 3) [m, m, rad]
-            Estimated, up to now.
-        true_path : (t, 3) [m, m, rad], optional
-            Up to now.
+        `cloud` [m, m, rad]. `path` [m, m, rad]: estimated, up to now. `true_path` [m, m, rad]: up
+        to now.
         """
         cloud, pose = cloud[np.isfinite(cloud).all(axis=1)], path[-1]
         if not np.isfinite(pose).all():
@@ -115,22 +110,10 @@ def add_closeups(
 ) -> list[Closeup | None]:
     """Give every map whose vehicle has particles a window, all of one scale and in one corner.
 
-    Parameters
-    ----------
-    maps : sequence of Axes
-        Of common limits.
-    colours, clouds, paths : one for each map
-        Of the clouds, (p, 3) [m, m, rad], those that the window is to show in turn, or none;
-        where a path (k, 3) [m, m, rad] ends is not covered.
-    landmarks : of (n, 2) [m]
-        Had better not be covered; nor had the paths.
-    true_landmarks : labels (n) and positions (n, 2) [m], or None
-        The same.
-
-    Returns
-    -------
-    list of Closeup or None
-        Still empty; None where there is no cloud.
+    `maps`: of common limits. `colours` and `clouds` and `paths`: of the clouds, (p, 3) [m, m, rad],
+    those that the window is to show in turn, or none; where a path (k, 3) [m, m, rad] ends is not
+    covered. `landmarks` [m]: had better not be covered; nor had the paths. `true_landmarks` [m]:
+    the same. Returns: still empty; None where there is no cloud.
 
     Examples
     --------

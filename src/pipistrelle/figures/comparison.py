@@ -34,14 +34,7 @@ def draw_comparison(compared: ComparedMissions | ComparedStudies) -> "Figure":
     there over time. Of studies a panel for each score that is shown of them: a case's difference,
     thick its interval by itself, thin that as one of all cases.
 
-    Parameters
-    ----------
-    compared : ComparedMissions or ComparedStudies
-
-    Returns
-    -------
-    Figure
-        Not known to pyplot: it is freed when it is let go.
+    Returns: not known to pyplot: it is freed when it is let go.
     """
     import matplotlib
 

@@ -26,16 +26,8 @@ there, wherever the vehicle goes."""
 def callers_believed(landmarks: Landmarks, labels: Int[np.ndarray, " c"]) -> Gaussian:
     """Where callers are believed to be: as the landmarks that they are, once they are placed.
 
-    Parameters
-    ----------
-    landmarks : Landmarks
-    labels : (c)
-        Of each caller, by its number, as `Scan.callers`.
-
-    Returns
-    -------
-    Gaussian of (c, 2) [m] and (c, 2, 2) [m^2]
-        NaN for the vehicle, and for who is not placed or no landmark of the map.
+    `labels`: of each caller, by its number, as `Scan.callers`. Returns [m]: NaN for the vehicle,
+    and for who is not placed or no landmark of the map.
 
     Examples
     --------
@@ -58,14 +50,7 @@ def callers_believed(landmarks: Landmarks, labels: Int[np.ndarray, " c"]) -> Gau
 def callers_at(frame: Snapshot) -> Gaussian:
     """Where callers are believed to be at a frame.
 
-    Parameters
-    ----------
-    frame : Snapshot
-
-    Returns
-    -------
-    Gaussian of (c, 2) [m] and (c, 2, 2) [m^2]
-        As `callers_believed`, by the callers' numbers.
+    Returns [m]: as `callers_believed`, by the callers' numbers.
     """
     return callers_believed(joined(frame.landmarks, frame.moving), frame.scan.callers)
 
@@ -73,15 +58,8 @@ def callers_at(frame: Snapshot) -> Gaussian:
 def callers_marked(scans: Sequence[Scan]) -> bool:
     """Tell whether a picture marks where callers are believed to be.
 
-    Parameters
-    ----------
-    scans : sequence of Scan
-
-    Returns
-    -------
-    bool
-        Where there are several, or where detours were heard, whose ellipses are about them. The
-        paper's one beacon is a landmark as any other.
+    Returns: where there are several, or where detours were heard, whose ellipses are about them.
+    The paper's one beacon is a landmark as any other.
     """
     several = any(np.sum(scan.callers != UNLABELLED) > 1 for scan in scans[-1:])
     return several or any(np.isfinite(scan.detour).any() for scan in scans)
@@ -90,15 +68,8 @@ def callers_marked(scans: Sequence[Scan]) -> bool:
 def detours_at(frame: Snapshot) -> dict[int, Int[np.ndarray, " k"]]:
     """Rows of a frame's scan whose detour makes an ellipse, by their landmark.
 
-    Parameters
-    ----------
-    frame : Snapshot
-
-    Returns
-    -------
-    dict of label to (k) rows
-        Of landmarks of the map, heard from callers that are placed. Of several the first two are
-        those whose ellipses cross most squarely there.
+    Returns: of landmarks of the map, heard from callers that are placed. Of several the first two
+    are those whose ellipses cross most squarely there.
     """
     scan, heard = frame.scan, np.isfinite(frame.scan.detour)
     heard &= (scan.caller < len(scan.callers)) & np.isin(scan.landmark, frame.landmarks.landmark)
@@ -143,15 +114,7 @@ def resolved(frames: Sequence[Snapshot]) -> list[int]:
     they weigh; else the one that they placed last, `RECENT` frames ago at most. Of several the one
     that was shown before, or that has two detours.
 
-    Parameters
-    ----------
-    frames : sequence of Snapshot
-        In the order of time.
-
-    Returns
-    -------
-    list of label
-        UNLABELLED where there is none.
+    `frames`: in the order of time. Returns: `UNLABELLED` where there is none.
 
     Examples
     --------
@@ -189,17 +152,8 @@ def drawn_detours(
 ) -> tuple[list[Float[np.ndarray, "121 2"]], list[Float[np.ndarray, "3 2"]]]:
     """Ellipses of a landmark's detours at a frame, and the ways of which they tell.
 
-    Parameters
-    ----------
-    frame : Snapshot
-    label : int
-
-    Returns
-    -------
-    ellipses : list of (121, 2) [m]
-        Two at most.
-    ways : list of (3, 2) [m]
-        From the caller to the likeliest place of the landmark and on to the vehicle.
+    Returns [m]: two at most. Returns [m]: from the caller to the likeliest place of the landmark
+    and on to the vehicle.
     """
     rows = detours_at(frame).get(label, ())[:MOST]
     here = frame.landmarks.landmark == label

@@ -28,19 +28,8 @@ HOLD = 2.0
 def film_writer(path: Path) -> Callable[[Pictures, Path], None]:
     """Choose how to write a film by the ending of its name.
 
-    Parameters
-    ----------
-    path : Path
-        Ends in .gif or .mp4.
-
-    Returns
-    -------
-    Function of the pictures and the path.
-
-    Raises
-    ------
-    InputError
-        With another ending, or for an MP4 where there is no ffmpeg.
+    `path`: ends in .gif or .mp4. Raises InputError with another ending, or for an MP4 where there
+    is no ffmpeg.
 
     Examples
     --------
@@ -66,11 +55,7 @@ def film_writer(path: Path) -> Callable[[Pictures, Path], None]:
 def write_gif(pictures: Pictures, path: Path) -> None:
     """Write a GIF that starts again after a rest, in one fixed palette so that nothing flickers.
 
-    Parameters
-    ----------
-    pictures : arrays (h, w, 3)
-        At least one.
-    path : Path
+    `pictures`: at least one.
 
     Examples
     --------
@@ -95,18 +80,8 @@ def write_gif(pictures: Pictures, path: Path) -> None:
 def write_mp4(pictures: Pictures, path: Path) -> None:
     """Write an MP4 (H.264) through ffmpeg.
 
-    Parameters
-    ----------
-    pictures : arrays (h, w, 3)
-        At least one; h and w even.
-    path : Path
-
-    Raises
-    ------
-    InputError
-        Where ffmpeg fails; in its own words.
-    ValueError
-        Without pictures.
+    `pictures`: at least one; h and w even. Raises InputError where ffmpeg fails; in its own words.
+    Raises ValueError without pictures.
 
     Examples
     --------

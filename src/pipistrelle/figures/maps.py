@@ -25,16 +25,7 @@ def shades(
 ) -> Float[np.ndarray, "h 4"]:
     """One colour, the more opaque the heavier.
 
-    Parameters
-    ----------
-    colour : str
-    weight : (h), between 0 and 1
-    least, most : opacities of weights 0 and 1
-
-    Returns
-    -------
-    (h, 4)
-        Red, green, blue, opacity.
+    Returns: red, green, blue, opacity.
 
     Examples
     --------
@@ -59,19 +50,9 @@ def view(
 
     The ellipses of placed landmarks, and of rays, widen it by at most half, a quarter to each side.
 
-    Parameters
-    ----------
-    truth : Truth
-    callers : sequence of Caller
-        Without the vehicle.
-    paths : estimated poses (k, 3) [m, m, rad]
-    maps : Landmarks
-        The places of those that are not fully initialised do not count, their ellipses do.
-
-    Returns
-    -------
-    (left, right), (bottom, top) [m]
-        At most twice as wide as high, at most 1.2 times as high as wide.
+    `callers` are all but the vehicle, `paths` are poses [m, m, rad]. Of `maps`, the places of those
+    that are not fully initialised do not count, their ellipses do. The result [m] is at most twice
+    as wide as high, and at most 1.2 times as high as wide.
 
     Examples
     --------
@@ -127,13 +108,7 @@ def draw_truth(
 
     Stars and paths bear their names, but for the paper's one beacon, which the legend names.
 
-    Parameters
-    ----------
-    axes : Axes
-    true_landmarks : labels (n) and positions (n, 2) [m], or None
-        Callers may be among them.
-    callers : sequence of Caller
-        Without the vehicle.
+    `true_landmarks` [m]: callers may be among them. `callers`: without the vehicle.
 
     Examples
     --------
@@ -163,15 +138,8 @@ def draw_truth(
 def callers_shown(callers: Sequence[Caller]) -> set[str]:
     """Names in the legend that some callers need.
 
-    Parameters
-    ----------
-    callers : sequence of Caller
-        Without the vehicle.
-
-    Returns
-    -------
-    set of str
-        Of those that stand ``beacon``, where it is one of that name, else ``caller``.
+    `callers`: without the vehicle. Returns: of those that stand ``beacon``, where it is one of that
+    name, else ``caller``.
 
     Examples
     --------
@@ -187,15 +155,8 @@ def callers_shown(callers: Sequence[Caller]) -> set[str]:
 def cells(cases: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
     """Place panels: a column for each strategy and a row for each filter, or line by line.
 
-    Parameters
-    ----------
-    cases : strategy and filter of each panel, no two alike
-
-    Returns
-    -------
-    row and column of each, from the top left
-        Line by line where there is one strategy or one filter, or where there are more
-        strategies than `COLUMNS`.
+    Returns: line by line where there is one strategy or one filter, or where there are more
+    strategies than `COLUMNS`.
 
     Examples
     --------
@@ -213,17 +174,7 @@ def cells(cases: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
 def head(axes: "Axes", strategy: str, estimator: str) -> "Annotation":
     """Write a panel's name above it, and leave a line below the name for what is to be said.
 
-    Parameters
-    ----------
-    axes : Axes
-    strategy : str
-    estimator : str
-        The filter.
-
-    Returns
-    -------
-    Annotation
-        The line below, still empty.
+    `estimator`: the filter. Returns: the line below, still empty.
 
     Examples
     --------
@@ -243,19 +194,8 @@ def head(axes: "Axes", strategy: str, estimator: str) -> "Annotation":
 def legend(figure: "Figure", names: Sequence[str], columns: int, left: float, right: float) -> None:
     """Explain symbols once for all panels, in neutral ink, at the bottom of a figure.
 
-    Parameters
-    ----------
-    figure : Figure
-    names : sequence of str
-        As they are to be read; without any there is no legend.
-    columns : int
-    left, right : [inch]
-        Margins.
-
-    Raises
-    ------
-    KeyError
-        A name without a symbol.
+    `names`: as they are to be read; without any there is no legend. `left` and `right` [inch]:
+    margins. Raises KeyError for a name without a symbol.
 
     Examples
     --------

@@ -62,32 +62,14 @@ def draw_mission(
     the root of the trace) and the NEES against the 95 % band of one run. All panels share their
     scales.
 
-    Parameters
-    ----------
-    trials : sequence of TrialResult, at least one
-        In the frame of the truth; each strategy and filter once. Several of both make a column
-        for each strategy and a row for each filter.
-    truth : Truth
-        At the times of the tracks; without a path there are no errors to show. Callers may be
-        among the landmarks.
-    callers : sequence of Caller, optional
-        Without the vehicle: a star where one stands, by its name where it is not the one beacon,
-        a line where one moves.
-    beamwidth : [rad], optional
-        Of the vehicle's call, for the strategies that use it; without it no beam is drawn.
+    `trials`: in the frame of the truth; each strategy and filter once. Several of both make a
+    column for each strategy and a row for each filter. `truth`: at the times of the tracks; without
+    a path there are no errors to show. Callers may be among the landmarks. `callers`: without the
+    vehicle: a star where one stands, by its name where it is not the one beacon, a line where one
+    moves. `beamwidth` [rad]: of the vehicle's call, for the strategies that use it; without it no
+    beam is drawn. Returns: not known to pyplot: it is freed when it is let go. Raises ValueError:
+    without trials.
 
-    Returns
-    -------
-    Figure
-        Not known to pyplot: it is freed when it is let go.
-
-    Raises
-    ------
-    ValueError
-        Without trials.
-
-    Notes
-    -----
     Bradley & Abaid, Eqs. (23) and (26), over the time of one run.
 
     Examples
@@ -342,17 +324,7 @@ def _title(axes: "Axes", trial: TrialResult, truth: Truth) -> None:
 
 
 def outcome(trial: TrialResult, truth: Truth) -> str:
-    """Say what came of an estimate: its error, if known, and how many landmarks of how many.
-
-    Parameters
-    ----------
-    trial : TrialResult
-    truth : Truth
-
-    Returns
-    -------
-    str
-    """
+    """Say what came of an estimate: its error, if known, and how many landmarks of how many."""
     scores = trial.scores
     there = scores.landmarks_total if truth.landmarks is None else len(truth.landmarks[0])
     parts = [f"{scores.landmarks_full} of {there} landmarks placed"]

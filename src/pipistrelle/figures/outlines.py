@@ -52,19 +52,9 @@ def ellipses(
 def beam(pose: Float[np.ndarray, "3"], beamwidth: float, length: float) -> Float[np.ndarray, "n 2"]:
     """Outline of the sector that the vehicle's call lights up, half the beamwidth to each side.
 
-    Parameters
-    ----------
-    pose : (3) [m, m, rad]
-    beamwidth : [rad]
-    length : [m]
+    `pose` [m, m, rad]. `beamwidth` [rad]. `length` [m]. Returns [m]: the vehicle first, then the
+    arc.
 
-    Returns
-    -------
-    (n, 2) [m]
-        The vehicle first, then the arc.
-
-    Notes
-    -----
     Half-power beamwidth of Bradley & Abaid, Eq. (1).
 
     Examples
@@ -82,15 +72,7 @@ def beam(pose: Float[np.ndarray, "3"], beamwidth: float, length: float) -> Float
 def vehicle(pose: Float[np.ndarray, "3"], length: float) -> Float[np.ndarray, "4 2"]:
     """Outline of the vehicle, a dart that points along its heading.
 
-    Parameters
-    ----------
-    pose : (3) [m, m, rad]
-    length : [m]
-
-    Returns
-    -------
-    (4, 2) [m]
-        The tip first.
+    `pose` [m, m, rad]. `length` [m]. Returns [m]: the tip first.
 
     Examples
     --------

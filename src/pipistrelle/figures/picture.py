@@ -20,13 +20,7 @@ class _Picture(Figure):
 def picture(width: float, height: float) -> Figure:
     r"""Return an empty figure that a notebook shows as it ends a cell.
 
-    Parameters
-    ----------
-    width, height : [inch]
-
-    Returns
-    -------
-    Figure
+    `width` and `height` [inch].
 
     Examples
     --------

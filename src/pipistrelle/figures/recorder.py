@@ -17,45 +17,26 @@ from pipistrelle.estimation.beliefs import (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Snapshot:
-    """One frame as a filter saw it.
-
-    Attributes
-    ----------
-    scan : Scan
-    pose : (3) [m, m, rad]
-        After the update.
-    covariance : (3, 3)
-        Of the pose.
-    landmarks : Landmarks
-        After the update.
-    moving : Landmarks
-        The callers that move and are in sight, of a filter that follows them.
-    cloud : (p, 3) [m, m, rad] or None
-        The poses of the particles, where there are any.
-    path : (k + 1, 2) [m] or None
-        Where the vehicle was at the start and after every control step so far, as it is believed
-        now: of a filter that revises its path, where it was asked.
-    """
+    """One frame as a filter saw it."""
 
     scan: Scan
     pose: Float[np.ndarray, "3"]
+    """[m, m, rad] After the update."""
     covariance: Float[np.ndarray, "3 3"]
+    """Of the pose."""
     landmarks: Landmarks
+    """After the update."""
     moving: Landmarks = field(default_factory=no_landmarks)
+    """The callers that move and are in sight, of a filter that follows them."""
     cloud: Float[np.ndarray, "p 3"] | None = None
+    """[m, m, rad] The poses of the particles, where there are any."""
     path: Float[np.ndarray, "t 2"] | None = None
+    """[m] Where the vehicle was at the start and after every control step so far, as it is believed
+    now: of a filter that revises its path, where it was asked."""
 
 
 def heard_from(scan: Scan) -> Scan:
     """Leave of a scan the rows that have a direction to draw: the others are further detours.
-
-    Parameters
-    ----------
-    scan : Scan
-
-    Returns
-    -------
-    Scan
 
     Examples
     --------

@@ -85,14 +85,6 @@ STYLE = {
 def strategy_colour(strategy: str) -> str:
     """Colour of a strategy, the same in every picture.
 
-    Parameters
-    ----------
-    strategy : str
-
-    Returns
-    -------
-    "#rrggbb"; `INK` for a strategy without a colour of its own.
-
     Examples
     --------
     >>> strategy_colour("fused")
@@ -104,10 +96,7 @@ def strategy_colour(strategy: str) -> str:
 def page_colours() -> str:
     """Write the colours of a page as a style sheet's variables.
 
-    Returns
-    -------
-    str
-        CSS: a variable for each name of `PAGE`, light unless the reader prefers dark.
+    Returns: CSS: a variable for each name of `PAGE`, light unless the reader prefers dark.
 
     Examples
     --------
@@ -125,17 +114,7 @@ def page_colours() -> str:
 def save_figure(figure: "Figure", folder: Path, name: str) -> tuple[Path, Path]:
     """Write a figure as ``name.png`` and ``name.pdf``, the same bytes for the same figure.
 
-    Parameters
-    ----------
-    figure : Figure
-    folder : Path
-        Made where it is missing.
-    name : str
-        Without ending.
-
-    Returns
-    -------
-    Path of the PNG (160 dots per inch), path of the PDF
+    `folder`: made where it is missing. `name`: without ending.
 
     Examples
     --------

@@ -14,14 +14,6 @@ NUMBERS = (
 def three_digits(value: float) -> str:
     """Write a number in three digits.
 
-    Parameters
-    ----------
-    value : float
-
-    Returns
-    -------
-    str
-
     Examples
     --------
     >>> [three_digits(value) for value in (0.12345, 43.71, -1234.5, float("inf"))]
@@ -38,15 +30,6 @@ def three_digits(value: float) -> str:
 def amount(value: float, unit: str) -> str:
     """Write a number with its unit, as a reader expects it.
 
-    Parameters
-    ----------
-    value : float
-    unit : one of `UNITS`
-
-    Returns
-    -------
-    str
-
     Examples
     --------
     >>> amount(0.34, "m"), amount(0.02, "rad"), amount(3.0, "landmarks")
@@ -58,15 +41,6 @@ def amount(value: float, unit: str) -> str:
 
 def interval(ends: Sequence[float], unit: str) -> str:
     """Write an interval without its unit, as it stands beside a number that has one.
-
-    Parameters
-    ----------
-    ends : low, high
-    unit : one of `UNITS`
-
-    Returns
-    -------
-    str
 
     Examples
     --------
@@ -80,14 +54,7 @@ def interval(ends: Sequence[float], unit: str) -> str:
 def number_word(count: int) -> str:
     """Write a count as a word, where it has one that is short.
 
-    Parameters
-    ----------
-    count : int
-        Not negative.
-
-    Returns
-    -------
-    str
+    `count`: not negative.
 
     Examples
     --------
@@ -100,15 +67,7 @@ def number_word(count: int) -> str:
 def listed(words: Sequence[str], last: str = "and") -> str:
     """List words as a sentence does.
 
-    Parameters
-    ----------
-    words : sequence of str
-    last : str
-        Before the last of them.
-
-    Returns
-    -------
-    str
+    `last`: before the last of them.
 
     Examples
     --------

@@ -57,19 +57,8 @@ SAME = 1e-4
 def read_study(folder: Path) -> Study:
     """Read what a study has done so far.
 
-    Parameters
-    ----------
-    folder : Path
-        As `pipistrelle study` fills it.
-
-    Returns
-    -------
-    Study
-
-    Raises
-    ------
-    InputError
-        No study, no world done, or a file that cannot be read.
+    `folder`: as `pipistrelle study` fills it. Raises InputError: no study, no world done, or a file
+    that cannot be read.
     """
     import polars as pl
 

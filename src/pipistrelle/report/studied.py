@@ -57,133 +57,88 @@ COMMON = "common_map_rmse_m"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trials:
-    """One filter's trials with one strategy, in n worlds, b cases in each.
-
-    Attributes
-    ----------
-    at : (c)
-        Which case is that of each combination: passive has one for all beamwidths.
-    failed : (n, b)
-        The trial raised an error, or is not there.
-    diverged : (n, b)
-        Its NEES is not finite or passes the filter's limit.
-    scores : dict of (n, b)
-        By the names of `READ`; NaN where there is no number. `COMMON` is there too, one for each
-        combination, for the landmarks in common change with the other strategies'.
-    placed : (n, b, l)
-        Which landmarks, by their labels, are fully initialised at the end.
-    off : (n, b, l) [m]
-        How far from the truth those are; of the others without meaning.
-    nees : (n, b, k)
-        At each frame.
-    consistent : (2, b, k)
-        Mean and variance of a consistent filter's NEES at each frame, averaged over the worlds.
-    """
+    """One filter's trials with one strategy, in n worlds, b cases in each."""
 
     at: Int[np.ndarray, " c"]
+    """Which case is that of each combination: passive has one for all beamwidths."""
     failed: Bool[np.ndarray, "n b"]
+    """The trial raised an error, or is not there."""
     diverged: Bool[np.ndarray, "n b"]
+    """Its NEES is not finite or passes the filter's limit."""
     scores: dict[str, Float[np.ndarray, "n _"]]
+    """By the names of `READ`; NaN where there is no number. `COMMON` is there too, one for each
+    combination, for the landmarks in common change with the other strategies'."""
     placed: Bool[np.ndarray, "n b l"]
+    """Which landmarks, by their labels, are fully initialised at the end."""
     off: Float[np.ndarray, "n b l"]
+    """[m] How far from the truth those are; of the others without meaning."""
     nees: Float[np.ndarray, "n b k"]
+    """At each frame."""
     consistent: Float[np.ndarray, "2 b k"]
+    """Mean and variance of a consistent filter's NEES at each frame, averaged over the worlds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Failure:
-    """A trial that failed.
-
-    Attributes
-    ----------
-    iteration : int
-        Its world.
-    strategy, filter : str
-    beamwidth_deg : float or None
-        None for passive.
-    settings : dict of str
-        What it had of the variables, but for the beam, as words.
-    error : str
-        The traceback.
-    """
+    """A trial that failed."""
 
     iteration: int
+    """Its world."""
     strategy: str
     filter: str
     beamwidth_deg: float | None
+    """None for passive."""
     settings: dict[str, str]
+    """What it had of the variables, but for the beam, as words."""
     error: str
+    """The traceback."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Study:
-    """A study, as far as it is done: n worlds, c combinations of its variables.
-
-    Attributes
-    ----------
-    name : str
-        The plan's; not to be trusted.
-    variables : tuple of Variable
-        In the plan's order, those with two values or more; none where the study varies strategies
-        and filters alone.
-    grid : dict
-        All dotted settings that the study varies, with their values, as the plan has them.
-    planned : int
-        Worlds asked for.
-    worlds : (n)
-        Numbers of those done.
-    config : Config
-        What holds where the variables say nothing.
-    configs : tuple of Config, one per combination
-        Without any filter's own.
-    beamwidth : (c) [deg]
-        Of the vehicle's call.
-    drawing : (c)
-        Combinations with one number meet the same landmarks, world by world.
-    example : Scenario or None
-        The first of the worlds where the variables have their first values, drawn anew; None where
-        it cannot be.
-    trials : dict
-        By filter and strategy.
-    errors : tuple of Failure
-    cpu_s : [s]
-        Of all filters.
-    """
+    """A study, as far as it is done: n worlds, c combinations of its variables."""
 
     name: str
+    """The plan's; not to be trusted."""
     variables: tuple[Variable, ...]
+    """In the plan's order, those with two values or more; none where the study varies strategies
+    and filters alone."""
     grid: dict[str, tuple[Any, ...]]
+    """All dotted settings that the study varies, with their values, as the plan has them."""
     planned: int
+    """Worlds asked for."""
     worlds: Int[np.ndarray, " n"]
+    """Numbers of those done."""
     config: Config
+    """What holds where the variables say nothing."""
     configs: tuple[Config, ...]
+    """Without any filter's own."""
     beamwidth: Float[np.ndarray, " c"]
+    """[deg] Of the vehicle's call."""
     drawing: Int[np.ndarray, " c"]
+    """Combinations with one number meet the same landmarks, world by world."""
     example: Scenario | None
+    """The first of the worlds where the variables have their first values, drawn anew; None where
+    it cannot be."""
     trials: dict[Way, Trials]
+    """By filter and strategy."""
     errors: tuple[Failure, ...]
     cpu_s: float
+    """[s] Of all filters."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Selection:
-    """A study under one exclusion rule, as `claims.contrasts.select` makes it.
-
-    Attributes
-    ----------
-    study : Study
-    rule : one of `RULES`
-    lost : dict of (n)
-        Per filter, the worlds in which any of its cases diverged or failed.
-    gains : dict of tuple of Finding
-        Active minus fused at each combination, judged as a family of its own, by filter and score:
-        `POSITION`, `POSITION_ALIGNED` and `COMMON`. Empty where the study lacks one of the two.
-    """
+    """A study under one exclusion rule, as `claims.contrasts.select` makes it."""
 
     study: Study
     rule: Rule
+    """One of `RULES`."""
     lost: Mapping[str, Bool[np.ndarray, " n"]]
+    """Per filter, the worlds in which any of its cases diverged or failed."""
     gains: Mapping[tuple[str, str], tuple[Finding, ...]]
+    """Active minus fused at each combination, judged as a family of its own, by filter and score:
+    `POSITION`, `POSITION_ALIGNED` and `COMMON`. Empty where the study lacks one of the two."""
 
 
 def has_numbers(study: Study, score: str) -> bool:
@@ -213,17 +168,7 @@ def along(study: Study, variable: Variable) -> Int[np.ndarray, "k m"]:
 def combination_name(study: Study, number: int, without: Sequence[Variable] = ()) -> str:
     """Name a combination by the values of its variables.
 
-    Parameters
-    ----------
-    study : Study
-    number : int
-    without : sequence of Variable
-        Left out.
-
-    Returns
-    -------
-    str
-        Empty where nothing is left to name.
+    `without`: left out. Returns: empty where nothing is left to name.
     """
     at = np.unravel_index(number, [len(one.given) for one in study.variables] or [1])
     return ", ".join(
@@ -236,16 +181,7 @@ def combination_name(study: Study, number: int, without: Sequence[Variable] = ()
 def case_name(study: Study, way: Way, number: int) -> str:
     """Name a combination by those of its variables that a way's cases depend on.
 
-    Parameters
-    ----------
-    study : Study
-    way : Way
-    number : int
-
-    Returns
-    -------
-    str
-        Empty for passive sensing where only the beam varies.
+    Returns: empty for passive sensing where only the beam varies.
     """
     at = study.trials[way].at
     idle = [v for v in study.variables if np.all(at[along(study, v)] == at[along(study, v)][:1])]
@@ -253,16 +189,7 @@ def case_name(study: Study, way: Way, number: int) -> str:
 
 
 def own_cases(trials: Trials) -> Int[np.ndarray, " b"]:
-    """Return the number of the first combination of each case.
-
-    Parameters
-    ----------
-    trials : Trials
-
-    Returns
-    -------
-    (b)
-    """
+    """Return the number of the first combination of each case."""
     return np.unique(trials.at, return_index=True)[1]
 
 
@@ -291,15 +218,7 @@ def filter_titles(study: Study) -> dict[str, str]:
 def lost_worlds(study: Study, name: str) -> Bool[np.ndarray, " n"]:
     """Tell in which worlds any of a filter's cases diverged or failed.
 
-    Parameters
-    ----------
-    study : Study
-    name : str
-        The filter.
-
-    Returns
-    -------
-    (n)
+    `name`: the filter.
     """
     mine = [trials for (other, _), trials in study.trials.items() if other == name]
     return np.any([np.any(t.failed | t.diverged, axis=1) for t in mine], axis=0)
@@ -308,15 +227,7 @@ def lost_worlds(study: Study, name: str) -> Bool[np.ndarray, " n"]:
 def kept(selection: Selection, cells: Sequence[Cell]) -> Bool[np.ndarray, " n"]:
     """Tell which worlds count where these cells are compared.
 
-    Parameters
-    ----------
-    selection : Selection
-    cells : sequence of Cell
-
-    Returns
-    -------
-    (n)
-        A failed trial counts as a diverged one, and where nothing is dropped it has no number.
+    Returns: a failed trial counts as a diverged one, and where nothing is dropped it has no number.
     """
     counts = np.ones(len(selection.study.worlds), dtype=bool)
     for name, strategy, column in cells:
@@ -332,18 +243,7 @@ def kept(selection: Selection, cells: Sequence[Cell]) -> Bool[np.ndarray, " n"]:
 
 
 def values(study: Study, score: str, cell: Cell) -> Float[np.ndarray, " n"]:
-    """Return a score of a cell in all worlds; NaN where there is none.
-
-    Parameters
-    ----------
-    study : Study
-    score : one of `READ`, or `COMMON`
-    cell : Cell
-
-    Returns
-    -------
-    (n)
-    """
+    """Return a score of a cell in all worlds; NaN where there is none."""
     name, strategy, number = cell
     trials = study.trials[name, strategy]
     return trials.scores[score][:, number if score == COMMON else trials.at[number]]
@@ -374,16 +274,7 @@ def rmse_of(
 ) -> Float[np.ndarray, "*n"]:
     """Root mean square over some landmarks.
 
-    Parameters
-    ----------
-    off : (*n, l) [m]
-    shared : (*n, l)
-        Which count.
-
-    Returns
-    -------
-    (*n) [m]
-        NaN where none counts.
+    `off` [m]. `shared`: which count. Returns [m]: NaN where none counts.
 
     Examples
     --------
@@ -399,14 +290,7 @@ def rmse_of(
 def mean_std(sample: Float[np.ndarray, " m"]) -> tuple[float, float]:
     """Mean and standard deviation over worlds.
 
-    Parameters
-    ----------
-    sample : (m)
-
-    Returns
-    -------
-    float, float
-        Of no world, NaN; the standard deviation of a single one is 0.
+    Returns: of no world, NaN; the standard deviation of a single one is 0.
 
     Examples
     --------

@@ -20,55 +20,33 @@ BEAMWIDTHS = (11.4, 14.2, 17.6, 21.8, 26.8, 33.2, 41.6, 51.4, 64.8, 83.0, 108.6,
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Variable:
-    """A setting that a study varies.
-
-    Attributes
-    ----------
-    name : str
-        As a reader calls it.
-    setting : str
-        Dotted.
-    given : tuple
-        Its values, as the plan has them: rising where they are numbers, else as they are listed.
-    words : tuple of str
-        How each is written.
-    numbers : tuple of float or None
-        Of the axis; None where the values are no numbers.
-    label : str
-        Of the axis, with the unit.
-    column : str
-        Of a CSV.
-    meaning : str
-        What the setting says of itself.
-    base : int
-        Which of the values the others are compared with: the truth, where the setting is what is
-        assumed of it and the truth is among them; else the first.
-    """
+    """A setting that a study varies."""
 
     name: str
+    """As a reader calls it."""
     setting: str
+    """Dotted."""
     given: tuple[Any, ...]
+    """Its values, as the plan has them: rising where they are numbers, else as they are listed."""
     words: tuple[str, ...]
+    """How each is written."""
     numbers: tuple[float, ...] | None
+    """Of the axis; None where the values are no numbers."""
     label: str
+    """Of the axis, with the unit."""
     column: str
+    """Of a CSV."""
     meaning: str
+    """What the setting says of itself."""
     base: int = 0
+    """Which of the values the others are compared with: the truth, where the setting is what is
+    assumed of it and the truth is among them; else the first."""
 
 
 def setting_variable(setting: str, values: Sequence[Any]) -> Variable:
     """Make a variable of a setting.
 
-    Parameters
-    ----------
-    setting : str
-        Dotted.
-    values : sequence
-        As a plan's grid has them.
-
-    Returns
-    -------
-    Variable
+    `setting`: dotted. `values`: as a plan's grid has them.
 
     Examples
     --------
@@ -96,17 +74,7 @@ def setting_variable(setting: str, values: Sequence[Any]) -> Variable:
 def beam_variable(setting: str, radii: Sequence[float], degrees: Sequence[float]) -> Variable:
     """Make a variable of the beamwidth, narrowest first.
 
-    Parameters
-    ----------
-    setting : str
-        Of the radius.
-    radii : sequence of [m]
-    degrees : sequence of [deg]
-        The half-power beamwidth of each.
-
-    Returns
-    -------
-    Variable
+    `setting`: of the radius. `radii` [m]. `degrees` [deg]: the half-power beamwidth of each.
 
     Examples
     --------
@@ -133,14 +101,7 @@ def beam_variable(setting: str, radii: Sequence[float], degrees: Sequence[float]
 def width_name(beamwidth: float) -> str:
     """Name a beamwidth of a study: by its three digits where it has no more, else as near.
 
-    Parameters
-    ----------
-    beamwidth : [deg]
-
-    Returns
-    -------
-    str
-        What a paper's radius makes has the paper's name.
+    `beamwidth` [deg]. Returns: what a paper's radius makes has the paper's name.
 
     Examples
     --------
@@ -156,13 +117,7 @@ def width_name(beamwidth: float) -> str:
 def beam_name(beamwidth: float) -> str:
     """Name a beamwidth: as the paper does where it is one of the paper's, within 0.2 degrees.
 
-    Parameters
-    ----------
-    beamwidth : [deg]
-
-    Returns
-    -------
-    str
+    `beamwidth` [deg].
 
     Examples
     --------
@@ -174,14 +129,6 @@ def beam_name(beamwidth: float) -> str:
 
 def written(values: Sequence[Any]) -> tuple[str, ...]:
     """Write values as short as tells them apart.
-
-    Parameters
-    ----------
-    values : sequence
-
-    Returns
-    -------
-    tuple of str
 
     Examples
     --------
@@ -205,15 +152,6 @@ def written(values: Sequence[Any]) -> tuple[str, ...]:
 def word_of(variable: Variable, value: Any) -> str:
     """Write a value as its variable does.
 
-    Parameters
-    ----------
-    variable : Variable
-    value : one of those given
-
-    Returns
-    -------
-    str
-
     Examples
     --------
     >>> word_of(setting_variable("rays.power", [3.0, 1.0]), 3.0)
@@ -225,14 +163,7 @@ def word_of(variable: Variable, value: Any) -> str:
 def places(variable: Variable) -> Float[np.ndarray, " k"]:
     """Return where the values stand along an axis.
 
-    Parameters
-    ----------
-    variable : Variable
-
-    Returns
-    -------
-    (k)
-        The numbers; of words, 0, 1, 2 and so on.
+    Returns: the numbers; of words, 0, 1, 2 and so on.
 
     Examples
     --------
@@ -247,14 +178,6 @@ def places(variable: Variable) -> Float[np.ndarray, " k"]:
 def two_sided(variable: Variable) -> bool:
     """Tell whether numbers lie on either side of the one that they are compared with.
 
-    Parameters
-    ----------
-    variable : Variable
-
-    Returns
-    -------
-    bool
-
     Examples
     --------
     >>> from dataclasses import replace
@@ -268,15 +191,8 @@ def two_sided(variable: Variable) -> bool:
 def geometric(numbers: Sequence[float]) -> bool:
     """Tell whether rising numbers are a geometric row rather than an arithmetic one.
 
-    Parameters
-    ----------
-    numbers : sequence of float
-        Rising.
-
-    Returns
-    -------
-    bool
-        Three or more, above 0, whose ratios vary less than their differences.
+    `numbers`: rising. Returns: three or more, above 0, whose ratios vary less than their
+    differences.
 
     Examples
     --------

@@ -15,18 +15,8 @@ Kind = Literal["missions", "studies"]
 def kind_of(folders: Sequence[Path]) -> Kind:
     """Tell what folders hold, by their names and by a look at what lies in them.
 
-    Parameters
-    ----------
-    folders : sequence of Path
-
-    Returns
-    -------
-    "missions" or "studies"
-
-    Raises
-    ------
-    InputError
-        Where they are too few or too many, one of them twice, or not all of one kind.
+    Raises InputError where they are too few or too many, one of them twice, or not all of one
+    kind.
 
     Examples
     --------

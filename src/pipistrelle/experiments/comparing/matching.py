@@ -15,14 +15,7 @@ def alike(folders: Sequence[Sequence[Estimate]]) -> tuple[bool, bool]:
     What does not is no part of an estimate's name: then a folder of one filter is compared with
     another of one, whichever they are, strategy by strategy.
 
-    Parameters
-    ----------
-    folders : sequence of sequences of estimates
-
-    Returns
-    -------
-    bool, bool
-        Of the strategy, of the filter.
+    Returns: of the strategy, of the filter.
 
     Examples
     --------
@@ -40,16 +33,7 @@ def alike(folders: Sequence[Sequence[Estimate]]) -> tuple[bool, bool]:
 def named(estimate: Estimate, parts: tuple[bool, bool] = (True, True)) -> Estimate:
     """Leave out of an estimate's name what tells nothing apart.
 
-    Parameters
-    ----------
-    estimate : Estimate
-    parts : bool, bool
-        As `alike` gives them.
-
-    Returns
-    -------
-    Estimate
-        Nothing in place of what is left out.
+    `parts`: as `alike` gives them. Returns: nothing in place of what is left out.
 
     Examples
     --------
@@ -62,14 +46,6 @@ def named(estimate: Estimate, parts: tuple[bool, bool] = (True, True)) -> Estima
 
 def worded(estimates: Sequence[Estimate]) -> str:
     """Word what estimates have in common.
-
-    Parameters
-    ----------
-    estimates : sequence of Estimate
-
-    Returns
-    -------
-    str
 
     Examples
     --------
@@ -111,14 +87,7 @@ def matched(keys: Sequence[Sequence[K]]) -> tuple[tuple[K, ...], dict[K, tuple[i
 def differing(settings: Sequence[Mapping[str, Any]]) -> dict[str, tuple[Any, ...]]:
     """Find the settings that are not the same everywhere.
 
-    Parameters
-    ----------
-    settings : sequence of mappings by dotted names
-
-    Returns
-    -------
-    dict of tuple
-        The value of each, by name; None where one says nothing of it.
+    Returns: the value of each, by name; None where one says nothing of it.
 
     Examples
     --------
@@ -135,14 +104,7 @@ def differing(settings: Sequence[Mapping[str, Any]]) -> dict[str, tuple[Any, ...
 def section(name: str) -> str:
     """Name the section of a setting; one that is in none is a section of its own.
 
-    Parameters
-    ----------
-    name : str
-        Dotted.
-
-    Returns
-    -------
-    str
+    `name`: dotted.
 
     Examples
     --------

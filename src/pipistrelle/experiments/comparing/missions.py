@@ -38,95 +38,57 @@ _ROUNDING = 1e-6  # [m, rad]: paths that differ by less are of one drive
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PathView:
-    """A path as it was recorded, and as near to its reference as a rigid motion brings it.
-
-    Attributes
-    ----------
-    time : (k) [s]
-        From the path's own start.
-    raw, aligned : (k, 2) [m]
-    placed, placed_aligned : (n, 2) [m]
-        The landmarks of its map that are placed, moved with the path.
-    error, error_aligned : (k) [m]
-        Distance from the reference; NaN where that is not known.
-    """
+    """A path as it was recorded, and as near to its reference as a rigid motion brings it."""
 
     time: Float[np.ndarray, " k"]
+    """[s] From the path's own start."""
     raw: Float[np.ndarray, "k 2"]
     aligned: Float[np.ndarray, "k 2"]
+    """[m]"""
     placed: Float[np.ndarray, "n 2"]
     placed_aligned: Float[np.ndarray, "n 2"]
+    """[m] The landmarks of its map that are placed, moved with the path."""
     error: Float[np.ndarray, " k"]
     error_aligned: Float[np.ndarray, " k"]
+    """[m] Distance from the reference; NaN where that is not known."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedEstimate:
-    """An estimate that all folders have.
-
-    Attributes
-    ----------
-    title : str
-        What the folders' estimates have in common.
-    estimates : tuple of Estimate
-        One of each folder.
-    scores : tuple of mapping
-        Under the names of ``summary.json``.
-    views : tuple of PathView
-    """
+    """An estimate that all folders have."""
 
     title: str
+    """What the folders' estimates have in common."""
     estimates: tuple[Estimate, ...]
+    """One of each folder."""
     scores: tuple[Mapping[str, Any], ...]
+    """Under the names of ``summary.json``."""
     views: tuple[PathView, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedMissions:
-    """Folders of `run` or `slam`, the first of which the others are held against.
-
-    Attributes
-    ----------
-    folders : tuple of Path
-    versions : tuple of str
-    compared : tuple of ComparedEstimate
-    alone : dict of tuple of int
-        Estimates that only some have, and which of the folders those are.
-    settings : dict of tuple
-        Those that differ, in the sections that all have.
-    sections_alone : dict of tuple of int
-        Sections that only some have, as a log has none of a world.
-    truths : tuple of StoredPath or None
-    one_drive : bool
-        Whether all drove the same way, as far as the folders tell.
-    """
+    """Folders of `run` or `slam`, the first of which the others are held against."""
 
     folders: tuple[Path, ...]
     versions: tuple[str, ...]
     compared: tuple[ComparedEstimate, ...]
     alone: Mapping[Estimate, tuple[int, ...]]
+    """Estimates that only some have, and which of the folders those are."""
     settings: Mapping[str, tuple[Any, ...]]
+    """Those that differ, in the sections that all have."""
     sections_alone: Mapping[str, tuple[int, ...]]
+    """Sections that only some have, as a log has none of a world."""
     truths: tuple[StoredPath | None, ...]
     one_drive: bool
+    """Whether all drove the same way, as far as the folders tell."""
 
 
 def compare_missions(folders: Sequence[Path]) -> ComparedMissions:
     """Compare what `run` or `slam` left in folders.
 
-    Parameters
-    ----------
-    folders : sequence of Path
-        Two or more, none twice (`folders.kind_of`).
-
-    Returns
-    -------
-    ComparedMissions
-
-    Raises
-    ------
-    InputError
-        Where a folder cannot be read, or they have no estimate in common.
+    `folders`: two or more, none twice (`folders.kind_of`). Raises InputError where a folder cannot
+    be read, or they have no estimate in common.
     """
     missions = [read_mission(folder) for folder in folders]
     parts = alike([tuple(mission.scores) for mission in missions])
@@ -185,19 +147,9 @@ def path_view(
 ) -> PathView:
     """See a path as it is, and as near to a reference as a rigid motion brings it.
 
-    Parameters
-    ----------
-    path : StoredPath
-    placed : (n, 2) [m]
-        Landmarks, moved with it.
-    reference : StoredPath
-        Compared where both have the same times.
-
-    Returns
-    -------
-    PathView
-        Where fewer than two poses can be compared, and where a path is not finite, nothing is
-        moved.
+    `placed` [m]: landmarks, moved with it. `reference`: compared where both have the same times.
+    Returns: where fewer than two poses can be compared, and where a path is not finite, nothing is
+    moved.
 
     Examples
     --------
@@ -244,16 +196,7 @@ def _same(path: StoredPath, other: StoredPath) -> bool:
 
 
 def notes_of(compared: ComparedMissions) -> tuple[str, ...]:
-    """Say what a reader must know of a comparison, a line each.
-
-    Parameters
-    ----------
-    compared : ComparedMissions
-
-    Returns
-    -------
-    tuple of str
-    """
+    """Say what a reader must know of a comparison, a line each."""
     notes = []
     for (strategy, name), who in compared.alone.items():
         notes.append(f"{strategy} {short_name(name)}: only in {_letters(who)}, not compared")

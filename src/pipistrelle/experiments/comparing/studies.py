@@ -44,74 +44,48 @@ Key = tuple[str, str, tuple[str, ...]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedCase:
-    """A score of one case, in the first study and in another.
-
-    Attributes
-    ----------
-    label : str
-    strategies, filters : of the first, of the other
-    values : dict
-        Of what either study varies.
-    beamwidth_deg : float or None
-        Of the vehicle's call, where it matters.
-    score : str
-    other : int
-        Which study it is held against the first.
-    paired : bool
-        Whether both met the same worlds.
-    worlds : (of the first, of the other)
-        Those that count; where they are paired, the same.
-    means : (of the first, of the other)
-        Over these; NaN of none.
-    diverged : (of the first, of the other)
-        Worlds in which it diverged or failed, of all that are done.
-    finding : Finding
-        Of the other less the first.
-    """
+    """A score of one case, in the first study and in another."""
 
     label: str
     strategies: tuple[str, str]
     filters: tuple[str, str]
     values: Mapping[str, Any]
+    """Of what either study varies."""
     beamwidth_deg: float | None
+    """Of the vehicle's call, where it matters."""
     score: str
     other: int
+    """Which study it is held against the first."""
     paired: bool
+    """Whether both met the same worlds."""
     worlds: tuple[int, int]
+    """Those that count; where they are paired, the same."""
     means: tuple[float, float]
+    """Over these; NaN of none."""
     diverged: tuple[int, int]
+    """Worlds in which it diverged or failed, of all that are done."""
     finding: Finding
+    """Of the other less the first."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedStudies:
-    """Folders of studies, the first of which the others are held against.
-
-    Attributes
-    ----------
-    folders : tuple of Path
-    versions : tuple of str
-        Empty where the folder's README does not say it.
-    done, planned : tuple of int
-        Worlds of each.
-    cases : tuple of ComparedCase
-        By score, then by case, then by study.
-    alone : tuple of (str, tuple of int)
-        Cases that only some have, by their labels, and which of the folders those are.
-    settings : dict of tuple
-        Those of the plans that differ.
-    dropped_diverged : bool
-        Whether worlds are left out in which either diverged.
-    """
+    """Folders of studies, the first of which the others are held against."""
 
     folders: tuple[Path, ...]
     versions: tuple[str, ...]
+    """Empty where the folder's README does not say it."""
     done: tuple[int, ...]
     planned: tuple[int, ...]
+    """Worlds of each."""
     cases: tuple[ComparedCase, ...]
+    """By score, then by case, then by study."""
     alone: tuple[tuple[str, tuple[int, ...]], ...]
+    """Cases that only some have, by their labels, and which of the folders those are."""
     settings: Mapping[str, tuple[Any, ...]]
+    """Those of the plans that differ."""
     dropped_diverged: bool
+    """Whether worlds are left out in which either diverged."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,22 +112,9 @@ class _Pair:
 def compare_studies(folders: Sequence[Path], *, drop_diverged: bool = False) -> ComparedStudies:
     """Compare what studies found.
 
-    Parameters
-    ----------
-    folders : sequence of Path
-        Two or more, none twice (`folders.kind_of`).
-    drop_diverged : bool
-        Leave out the worlds in which either of two cases diverged; else all count that have a
-        number.
-
-    Returns
-    -------
-    ComparedStudies
-
-    Raises
-    ------
-    InputError
-        Where a folder cannot be read, holds no world, or they have no case in common.
+    `folders`: two or more, none twice (`folders.kind_of`). `drop_diverged`: leave out the worlds in
+    which either of two cases diverged; else all count that have a number. Raises InputError: where
+    a folder cannot be read, holds no world, or they have no case in common.
     """
     told = [_read(folder) for folder in folders]
     varied = tuple(dict.fromkeys(name for one in told for name in one.plan.grid))
@@ -281,14 +242,7 @@ def _pair(
 def same_worlds(config: Config, other: Config) -> bool:
     """Tell whether settings draw the same worlds, number by number.
 
-    Parameters
-    ----------
-    config, other : Config
-
-    Returns
-    -------
-    bool
-        What is heard in them may differ, and who maps it.
+    Returns: what is heard in them may differ, and who maps it.
 
     Examples
     --------
@@ -378,16 +332,7 @@ def _version(folder: Path) -> str:
 
 
 def notes_of(compared: ComparedStudies) -> tuple[str, ...]:
-    """Say what a reader must know of a comparison, a line each.
-
-    Parameters
-    ----------
-    compared : ComparedStudies
-
-    Returns
-    -------
-    tuple of str
-    """
+    """Say what a reader must know of a comparison, a line each."""
     notes, paired = [], {case.paired for case in compared.cases}
     if paired == {True}:
         notes.append("Paired over the worlds that both have met.")

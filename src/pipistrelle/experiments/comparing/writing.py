@@ -63,22 +63,10 @@ def write_comparison(
 ) -> None:
     """Write a comparison into a folder, in place of an earlier one.
 
-    Parameters
-    ----------
-    own : OwnFiles
-        The folder, as `pipistrelle.own_files.claim` gives it.
-    compared : ComparedMissions or ComparedStudies
-    command : str
-        The command line, for the reader.
-    notes : sequence of str
-        What a reader must know of it.
-    draw : callable, optional
-        Given a folder to draw the figure into.
-
-    Raises
-    ------
-    InputError
-        Where a file cannot be written, or one that would be replaced is not as we wrote it.
+    `own`: the folder, as `pipistrelle.own_files.claim` gives it. `command`: the command line, for
+    the reader. `notes`: what a reader must know of it. `draw`: given a folder to draw the figure
+    into. Raises InputError where a file cannot be written, or one that would be replaced is not as
+    we wrote it.
     """
     buffer, table = io.BytesIO(), comparison_table(compared)
     table.write_parquet(buffer)
@@ -106,14 +94,6 @@ def write_comparison(
 def lettered(folders: Sequence[Path]) -> list[tuple[str, Path]]:
     """Give each folder its letter.
 
-    Parameters
-    ----------
-    folders : sequence of Path
-
-    Returns
-    -------
-    list of letter and Path
-
     Examples
     --------
     >>> [letter for letter, _ in lettered([Path("one"), Path("two")])]
@@ -124,14 +104,6 @@ def lettered(folders: Sequence[Path]) -> list[tuple[str, Path]]:
 
 def spelt(folder: Path) -> str:
     r"""Spell a folder's name, what is no character by its bytes or its number.
-
-    Parameters
-    ----------
-    folder : Path
-
-    Returns
-    -------
-    str
 
     Examples
     --------
@@ -145,14 +117,7 @@ def spelt(folder: Path) -> str:
 def scores_of(run: Mapping[str, Any]) -> dict[str, float | None]:
     """Return all numbers of an estimate's entry of ``summary.json``, those of its online path too.
 
-    Parameters
-    ----------
-    run : mapping
-
-    Returns
-    -------
-    dict
-        Whether it diverged is 0 or 1; None of what has no number.
+    Returns: whether it diverged is 0 or 1; None of what has no number.
 
     Examples
     --------
@@ -178,14 +143,7 @@ def less(value: float | None, first: float | None) -> float | None:
 def comparison_table(compared: Compared) -> "pl.DataFrame":
     """Lay out all numbers of a comparison.
 
-    Parameters
-    ----------
-    compared : ComparedMissions or ComparedStudies
-
-    Returns
-    -------
-    DataFrame
-        Null where there is no number.
+    Returns: null where there is no number.
     """
     import polars as pl
 
@@ -199,14 +157,7 @@ def comparison_table(compared: Compared) -> "pl.DataFrame":
 def settings_table(compared: Compared) -> "pl.DataFrame":
     """Lay out the settings that differ, the version of Pipistrelle among them.
 
-    Parameters
-    ----------
-    compared : ComparedMissions or ComparedStudies
-
-    Returns
-    -------
-    DataFrame of text
-        A row for each, a column for each folder.
+    Returns: a row for each, a column for each folder.
     """
     import polars as pl
 
@@ -216,16 +167,7 @@ def settings_table(compared: Compared) -> "pl.DataFrame":
 
 
 def settings_rows(compared: Compared) -> list[tuple[str | None, ...]]:
-    """Word the settings that differ: its name, then its value in each folder, None of none.
-
-    Parameters
-    ----------
-    compared : ComparedMissions or ComparedStudies
-
-    Returns
-    -------
-    list of tuples
-    """
+    """Word the settings that differ: its name, then its value in each folder, None of none."""
     told: dict[str, tuple[Any, ...]] = {}
     if len(set(compared.versions)) > 1:
         told["version of Pipistrelle"] = tuple(version or None for version in compared.versions)

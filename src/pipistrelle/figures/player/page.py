@@ -25,14 +25,7 @@ SCRIPTS = ("numbers.js", "drawing.js", "map.js", "charts.js", "player.js")
 def page(playback: Playback) -> str:
     """Write the page that plays a mission.
 
-    Parameters
-    ----------
-    playback : Playback
-
-    Returns
-    -------
-    str
-        HTML.
+    Returns: HTML.
     """
     from jinja2 import Environment, StrictUndefined
 

@@ -35,115 +35,78 @@ have seven digits."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rows:
-    """Rows of numbers, some for each frame.
-
-    Attributes
-    ----------
-    first : (n + 1)
-        Those of frame i are the rows first[i] to first[i + 1].
-    landmark : (h)
-        Label.
-    numbers : (h, c)
-    """
+    """Rows of numbers, some for each frame."""
 
     first: Int[np.ndarray, " n"]
+    """Those of frame i are the rows first[i] to first[i + 1]."""
     landmark: Int[np.ndarray, " h"]
+    """Label."""
     numbers: Float[np.ndarray, "h c"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """What one strategy and filter heard and believed.
-
-    Attributes
-    ----------
-    strategy, filter : str
-    outcome : str
-        What came of it, in a line.
-    start : (3) [m, m, rad]
-        Where it began.
-    pose : (n, 3) [m, m, rad]
-    spread : (n, 4) [m^2, m^2, m^2, rad^2]
-        Of the pose's covariance xx, xy, yy and that of the heading.
-    heard : Rows
-        Bearing [rad] and range [m], NaN where there is none.
-    mapped : Rows
-        x, y [m], xx, xy, yy [m^2] and weight of each member.
-    pruned : Rows
-        The same of what has no successor, at the frame that lacks it.
-    cloud : (n, p, 3) [m, m, rad] or None
-        The particles' poses.
-    revised_at : (j)
-        Frames at which the path so far was told anew.
-    revised : Rows
-        For each of these the start, and each frame so far: x, y [m].
-    callers : (n, c, 5) or None
-        Where each caller of the playback is believed to be: x, y [m], xx, xy, yy [m^2], NaN where
-        that is not known. None where no picture marks it.
-    detours : Rows
-        Those that make an ellipse, two of a landmark at most: whose call it was, by its place among
-        the callers, and how much longer its way [m].
-    resolved : (n)
-        Label of the landmark whose detours are shown, -1 for none.
-    """
+    """What one strategy and filter heard and believed."""
 
     strategy: str
     filter: str
     outcome: str
+    """What came of it, in a line."""
     start: Float[np.ndarray, "3"]
+    """[m, m, rad] Where it began."""
     pose: Float[np.ndarray, "n 3"]
+    """[m, m, rad]"""
     spread: Float[np.ndarray, "n 4"]
+    """Of the pose's covariance xx, xy, yy and that of the heading."""
     heard: Rows
+    """Bearing [rad] and range [m], NaN where there is none."""
     mapped: Rows
+    """x, y [m], xx, xy, yy [m^2] and weight of each member."""
     pruned: Rows
+    """The same of what has no successor, at the frame that lacks it."""
     cloud: Float[np.ndarray, "n p 3"] | None
+    """[m, m, rad] The particles' poses."""
     revised_at: Int[np.ndarray, " j"]
+    """Frames at which the path so far was told anew."""
     revised: Rows
+    """For each of these the start, and each frame so far: x, y [m]."""
     callers: Float[np.ndarray, "n c 5"] | None
+    """Where each caller of the playback is believed to be: x, y [m], xx, xy, yy [m^2], NaN where
+    that is not known. None where no picture marks it."""
     detours: Rows
+    """Those that make an ellipse, two of a landmark at most: whose call it was, by its place among
+    the callers, and how much longer its way [m]."""
     resolved: Int[np.ndarray, " n"]
+    """Label of the landmark whose detours are shown, -1 for none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Playback:
-    """A mission's truth, and all that was heard and believed of it, frame by frame.
-
-    Attributes
-    ----------
-    title : str
-        What the mission is.
-    facts : tuple of str
-        What else a reader should know of it.
-    time : (n) [s]
-        Of the frames, since the start.
-    origin : (2) [m]
-        Where the coordinates of everything here begin.
-    limits : (left, right), (bottom, top) [m]
-        Of a map that shows what matters.
-    true_start : (3) [m, m, rad] or None
-    true_pose : (n, 3) [m, m, rad] or None
-        NaN where it is not known.
-    landmarks : labels (m) and true positions (m, 2) [m], or None
-    callers : tuple
-        Label, name and places, (2) or (n, 2) [m], of each. The label of one that stands is that of
-        the landmark which it is. Places are NaN where they are not known: of a log.
-    beamwidth : [rad] or None
-    farthest : [m]
-        That a landmark may be of which a bearing alone is known.
-    estimates : tuple of Estimate
-    """
+    """A mission's truth, and all that was heard and believed of it, frame by frame."""
 
     title: str
+    """What the mission is."""
     facts: tuple[str, ...]
+    """What else a reader should know of it."""
     time: Float[np.ndarray, " n"]
+    """[s] Of the frames, since the start."""
     origin: Float[np.ndarray, "2"]
+    """[m] Where the coordinates of everything here begin."""
     limits: tuple[tuple[float, float], tuple[float, float]]
+    """[m] Of a map that shows what matters."""
     true_start: Float[np.ndarray, "3"] | None
+    """[m, m, rad]"""
     true_pose: Float[np.ndarray, "n 3"] | None
+    """[m, m, rad] NaN where it is not known."""
     landmarks: LabelledPoints | None
+    """[m]"""
     callers: tuple[tuple[int, str, np.ndarray], ...]
+    """Label, name and places, (2) or (n, 2) [m], of each. The label of one that stands is that of
+    the landmark which it is. Places are NaN where they are not known: of a log."""
     beamwidth: float | None
+    """[rad]"""
     farthest: float
+    """[m] That a landmark may be of which a bearing alone is known."""
     estimates: tuple[Estimate, ...]
 
 
@@ -152,23 +115,9 @@ def playback(
 ) -> Playback:
     """Lay out a mission that was done again while a recorder watched.
 
-    Parameters
-    ----------
-    done : Again
-    snapshots : for each (strategy, filter), frames in the order of time
-        As a `MissionRecorder` keeps them.
-    most : int, at least 1
-        Frames to be shown: evenly spaced, the last among them.
-
-    Returns
-    -------
-    Playback
-        Without the estimates that have no frame: of a filter that failed at once.
-
-    Raises
-    ------
-    InputError
-        Where no estimate has a frame.
+    `snapshots`: as a `MissionRecorder` keeps them. `most`: frames to be shown: evenly spaced, the
+    last among them. Returns: without the estimates that have no frame: of a filter that failed at
+    once. Raises InputError where no estimate has a frame.
     """
     trials = [t for t in done.trials if snapshots.get((t.strategy, t.filter))]
     if not trials:

@@ -36,9 +36,7 @@ LEGS = 150
 def check_there() -> None:
     """Refuse to write a recording where what writes it is not installed.
 
-    Raises
-    ------
-    InputError
+    Raises InputError.
     """
     if find_spec("rerun") is None:
         raise InputError(

@@ -24,45 +24,29 @@ ASIDE = {"active": 0.985, "fused": 1.015, "passive": 1.0}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Line:
-    """A way's cases along an axis.
-
-    Attributes
-    ----------
-    way : Way
-    name : str
-        The strategy; where a panel is of one alone, the combination of the rest.
-    strength : 0 to 1
-    x, aside : (k)
-        Their places, and those a little beside the other strategies'.
-    cells : (k)
-        The numbers of their combinations.
-    """
+    """A way's cases along an axis."""
 
     way: Way
     name: str
+    """The strategy; where a panel is of one alone, the combination of the rest."""
     strength: float
     x: Float[np.ndarray, " k"]
     aside: Float[np.ndarray, " k"]
+    """Their places, and those a little beside the other strategies'."""
     cells: Int[np.ndarray, " k"]
+    """The numbers of their combinations."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Facet:
-    """What one panel shows.
-
-    Attributes
-    ----------
-    title, role : str
-        Of the panel.
-    lines : tuple of Line
-    many : bool
-        Its lines are combinations of the rest, rather than strategies.
-    """
+    """What one panel shows."""
 
     title: str
     role: str = "ink"
+    """Of the panel."""
     lines: tuple[Line, ...]
     many: bool = False
+    """Its lines are combinations of the rest, rather than strategies."""
 
 
 def axis_of(variable: Variable) -> Axis:
@@ -102,14 +86,6 @@ def axis_of(variable: Variable) -> Axis:
 def axis_of_words(words: Sequence[str]) -> Axis:
     """Lay words out as an axis.
 
-    Parameters
-    ----------
-    words : sequence of str
-
-    Returns
-    -------
-    Axis
-
     Examples
     --------
     >>> axis_of_words(["EKF", "FastSLAM 2.0"]).ticks
@@ -129,18 +105,9 @@ def axis_of_words(words: Sequence[str]) -> Axis:
 def facets_of(study: Study, variable: Variable | None, axis: Axis) -> list[Facet]:
     """Part a study's cases into panels over one of its variables.
 
-    Parameters
-    ----------
-    study : Study
-    variable : Variable or None
-        Along the axis; none: the filters stand there.
-    axis : Axis
-
-    Returns
-    -------
-    list of Facet
-        A panel per filter and combination of the rest, the strategies in it; where these would be
-        many, a panel per filter and strategy, with the combinations in it.
+    `variable`: along the axis; none: the filters stand there. Returns: a panel per filter and
+    combination of the rest, the strategies in it; where these would be many, a panel per filter and
+    strategy, with the combinations in it.
     """
     titles = filter_titles(study)
     if variable is None:
@@ -172,19 +139,7 @@ def beside(
 ) -> Float[np.ndarray, " k"]:
     """Move a strategy a little aside from its place along an axis, so that all are about it.
 
-    Parameters
-    ----------
-    axis : Axis
-    x : (k)
-    strategy : str
-    among : sequence of str
-        The strategies there.
-    far : float
-        How many times as far as single worlds stand.
-
-    Returns
-    -------
-    (k)
+    `among`: the strategies there. `far`: how many times as far as single worlds stand.
     """
     middle = float(np.mean([ASIDE[one] for one in among if one in ASIDE] or [1.0]))
     share = far * (ASIDE.get(strategy, middle) - middle)
@@ -197,15 +152,7 @@ def beside(
 def each_combination(study: Study, variable: Variable) -> str:
     """Say of lines that they are the combinations of all but one variable.
 
-    Parameters
-    ----------
-    study : Study
-    variable : Variable
-        Along the axis.
-
-    Returns
-    -------
-    str
+    `variable`: along the axis.
     """
     others = [other for other in study.variables if other is not variable]
     first = combination_name(study, 0, [variable])
@@ -219,14 +166,6 @@ def each_combination(study: Study, variable: Variable) -> str:
 
 def slug(name: str) -> str:
     """Make part of a file's name.
-
-    Parameters
-    ----------
-    name : str
-
-    Returns
-    -------
-    str
 
     Examples
     --------

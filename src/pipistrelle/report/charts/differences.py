@@ -36,14 +36,7 @@ DIFFERENCE = "active minus fused; open: not significant"
 def effect_charts(selection: Selection) -> list[Chart]:
     """Chart what each variable changes with each filter, a panel per measure.
 
-    Parameters
-    ----------
-    selection : Selection
-
-    Returns
-    -------
-    list of Chart
-        Without variables, what strategies and filters change.
+    Returns: without variables, what strategies and filters change.
     """
     study, titles = selection.study, filter_titles(selection.study)
     charts = []
@@ -68,16 +61,7 @@ def effect_charts(selection: Selection) -> list[Chart]:
 
 
 def gain_charts(selection: Selection) -> list[Chart]:
-    """Chart how much better fused is than active over each variable, paired over worlds.
-
-    Parameters
-    ----------
-    selection : Selection
-
-    Returns
-    -------
-    list of Chart
-    """
+    """Chart how much better fused is than active over each variable, paired over worlds."""
     study = selection.study
     return [_gain_chart(selection, variable) for variable in study.variables]
 
@@ -92,17 +76,7 @@ def about(
 ) -> Series:
     """Return points with bars.
 
-    Parameters
-    ----------
-    name, role : str
-    x, mean : (n)
-    edges : (n, 2)
-        Ends of the bars.
-    filled : sequence of bool
-
-    Returns
-    -------
-    Series
+    `edges`: ends of the bars.
     """
     return Series(
         name=name,

@@ -30,16 +30,6 @@ from pipistrelle.report.studied import Selection, mean_std, samples
 def table_ii_charts(selection: Selection) -> list[Chart]:
     """Chart Table II, ours beside the paper's.
 
-    Parameters
-    ----------
-    selection : Selection
-
-    Returns
-    -------
-    list of Chart
-
-    Notes
-    -----
     Bradley & Abaid, Table II.
     """
     panels = []
@@ -80,14 +70,7 @@ PAPERS: tuple[Figure, ...] = (
 def answers(name: str) -> bool:
     """Tell whether a figure shows what the answer speaks of.
 
-    Parameters
-    ----------
-    name : str
-        Of the chart.
-
-    Returns
-    -------
-    bool
+    `name`: of the chart.
 
     Examples
     --------
@@ -101,17 +84,8 @@ def answers(name: str) -> bool:
 def study_charts(selection: Selection, charts: Sequence[Figure] | None = None) -> list[Chart]:
     """Charts of what the study found.
 
-    Parameters
-    ----------
-    selection : Selection
-    charts : sequence of functions of a Selection, optional
-        Each gives the charts of a figure; if not said, `PAPERS` of a study that holds the paper's
-        cases, else `CHARTS`.
-
-    Returns
-    -------
-    list of Chart
-        Without those that the study has nothing for.
+    `charts`: each gives the charts of a figure; if not said, `PAPERS` of a study that holds the
+    paper's cases, else `CHARTS`. Returns: without those that the study has nothing for.
     """
     if charts is None:
         charts = PAPERS if papers_cases(selection.study) else CHARTS

@@ -19,14 +19,7 @@ from pipistrelle.report.variables import width_name
 def model_charts(study: Study) -> list[Chart]:
     """Charts that no result changes.
 
-    Parameters
-    ----------
-    study : Study
-
-    Returns
-    -------
-    list of Chart
-        Without the map where the world cannot be drawn.
+    Returns: without the map where the world cannot be drawn.
     """
     maps = [] if study.example is None else [example_map(study, study.example)]
     return [piston(study), *maps]
@@ -35,16 +28,6 @@ def model_charts(study: Study) -> list[Chart]:
 def piston(study: Study) -> Chart:
     """Chart the beam patterns of the study's emitters.
 
-    Parameters
-    ----------
-    study : Study
-
-    Returns
-    -------
-    Chart
-
-    Notes
-    -----
     Bradley & Abaid, Eq. (1) and Appendix B.
     """
     series = _protractor()
@@ -74,18 +57,8 @@ def piston(study: Study) -> Chart:
 def example_map(study: Study, world: Scenario) -> Chart:
     """Chart a world of the study.
 
-    Parameters
-    ----------
-    study : Study
-    world : Scenario
-        Its example.
+    `world`: its example.
 
-    Returns
-    -------
-    Chart
-
-    Notes
-    -----
     Bradley & Abaid, Sec. IV.
     """
     setup, told, series = study.configs[0].scenario, "", _world(world)

@@ -25,16 +25,6 @@ from pipistrelle.report.variables import BEAM
 def anees_charts(selection: Selection) -> list[Chart]:
     """Chart each filter's ANEES over time, a panel per strategy, a line per beamwidth.
 
-    Parameters
-    ----------
-    selection : Selection
-
-    Returns
-    -------
-    list of Chart
-
-    Notes
-    -----
     Bradley & Abaid, Sec. V-B and Eqs. (24) and (25).
     """
     titles = filter_titles(selection.study)

@@ -40,30 +40,13 @@ from pipistrelle.report.studied import (
 def selections(study: Study) -> dict[Rule, Selection]:
     """Lay a study out under each exclusion rule.
 
-    Parameters
-    ----------
-    study : Study
-
-    Returns
-    -------
-    dict of Selection
-        By the names of `studied.RULES`.
+    Returns: by the names of `studied.RULES`.
     """
     return {rule: select(study, rule) for rule in RULES}
 
 
 def select(study: Study, rule: Rule) -> Selection:
-    """Lay a study out under an exclusion rule: the worlds lost, and the gains of fused sensing.
-
-    Parameters
-    ----------
-    study : Study
-    rule : one of `studied.RULES`
-
-    Returns
-    -------
-    Selection
-    """
+    """Lay a study out under an exclusion rule: the worlds lost, and the gains of fused sensing."""
     names = filter_titles(study)
     lost = {name: lost_worlds(study, name) for name in names}
     bare = Selection(study=study, rule=rule, lost=lost, gains={})
@@ -146,18 +129,8 @@ def approach(selection: Selection, score: str, name: str) -> Float[np.ndarray, "
 
     .. math:: |s_{fused} - s_{passive}| \approx a + b \log_2(\mathrm{HPBW})
 
-    Parameters
-    ----------
-    selection : Selection
-    score : one of `studied.SCORES`
-    name : str
-        The filter.
-
-    Returns
-    -------
-    (m) or None
-        b of each world, in the score's unit per doubling; None where the study lacks one of the
-        two or has a single beamwidth.
+    `name`: the filter. Returns: b of each world, in the score's unit per doubling; None where the
+    study lacks one of the two or has a single beamwidth.
     """
     fused, passive = (name, "fused"), (name, "passive")
     study = selection.study
@@ -172,17 +145,7 @@ def approach(selection: Selection, score: str, name: str) -> Float[np.ndarray, "
 
 
 def curves(selection: Selection, ways: Sequence[Way]) -> list[Float[np.ndarray, "m b k"]] | None:
-    """NEES over time, in the worlds where every case of these ways counts and has a number.
-
-    Parameters
-    ----------
-    selection : Selection
-    ways : sequence of filter and strategy
-
-    Returns
-    -------
-    list of (m, b, k), one per way, or None where the study lacks one
-    """
+    """NEES over time, in the worlds where every case of these ways counts and has a number."""
     trials = selection.study.trials
     if not set(ways) <= trials.keys():
         return None
@@ -199,17 +162,8 @@ def departure(
 ) -> Float[np.ndarray, " m"]:
     """How far ANEES is from that of a consistent filter, averaged over the beamwidths.
 
-    Parameters
-    ----------
-    nees : (m, b, k)
-    expected : (b, k)
-        Of a consistent filter.
-
-    Returns
-    -------
-    (m)
-        Jackknife pseudo-values of `anees_departure`, which is smooth where the jackknife has to
-        be; of a single world, its own.
+    `expected`: of a consistent filter. Returns: jackknife pseudo-values of `anees_departure`, which
+    is smooth where the jackknife has to be; of a single world, its own.
     """
     found = []
     for i, curve in enumerate(expected):
@@ -226,18 +180,8 @@ def anees_departure(
 
     .. math:: T = \frac{1}{K} \sum_k \ln^2(\bar\epsilon_k / E_k)
 
-    Parameters
-    ----------
-    anees : (*j, k)
-    expected : (k)
-        E, below 3 where the start is exact (`evaluation.bound.nees_of_exact_start`).
+    `expected`: E, below 3 where the start is exact (`evaluation.bound.nees_of_exact_start`).
 
-    Returns
-    -------
-    (*j)
-
-    Notes
-    -----
     Bradley & Abaid, Eq. (24) and Sec. V-B, who compare with 3: over-confident above,
     under-confident below.
 
@@ -259,17 +203,8 @@ def lap_fit(study: Study) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " 
     with tau the time in laps: b is the rise per lap, c the swing, low at the start of each lap
     and high half-way.
 
-    Parameters
-    ----------
-    study : Study
+    Returns: none for a drive of less than two laps.
 
-    Returns
-    -------
-    (k) for b and (k) for c, or None
-        None for a drive of less than two laps.
-
-    Notes
-    -----
     Bradley & Abaid, Sec. V-B.
     """
     frames = next(iter(study.trials.values())).nees.shape[2]
@@ -285,16 +220,7 @@ def lap_fit(study: Study) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " 
 def frame_time(study: Study, frames: int, number: int = 0) -> Float[np.ndarray, " k"]:
     """Times of the frames.
 
-    Parameters
-    ----------
-    study : Study
-    frames : int
-    number : int
-        Of the combination.
-
-    Returns
-    -------
-    (k) [s]
+    `number`: of the combination. Returns [s].
     """
     scenario = study.configs[number].scenario
     return np.arange(1, frames + 1) * (scenario.steps_per_frame * scenario.step)
@@ -305,19 +231,8 @@ def lap_time(study: Study, number: int = 0) -> float:
 
     .. math:: 2 \pi B / (V |\sin\gamma|)
 
-    Parameters
-    ----------
-    study : Study
-    number : int
-        Of the combination.
+    `number`: of the combination. Returns [s]: infinite for a straight drive.
 
-    Returns
-    -------
-    [s]
-        Infinite for a straight drive.
-
-    Notes
-    -----
     Bradley & Abaid, Eq. (5).
     """
     config = study.configs[number]

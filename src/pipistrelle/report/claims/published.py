@@ -15,21 +15,14 @@ FILTERS = {name: entry(name).title for name in PAPERS}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Printed:
-    """One row of Table II, for one filter: mean and standard deviation of landmarks.
-
-    Attributes
-    ----------
-    filter : "ekf" or "fastslam"
-    beamwidth : [deg]
-        0: passive sensing; else fused.
-    full, total : mean, standard deviation
-        Fully initialised; fully and partially.
-    """
+    """One row of Table II, for one filter: mean and standard deviation of landmarks."""
 
     filter: str
     beamwidth: float
+    """[deg] 0: passive sensing; else fused."""
     full: tuple[float, float]
     total: tuple[float, float]
+    """Fully initialised; fully and partially."""
 
 
 TABLE_II = (
@@ -67,15 +60,8 @@ NARROW = 64.0
 def papers_cases(study: Study) -> bool:
     """Tell whether a study holds the cases of which the paper speaks.
 
-    Parameters
-    ----------
-    study : Study
-
-    Returns
-    -------
-    bool
-        Both its filters with all three strategies, at its twelve beamwidths, and no other variable;
-        further filters and beamwidths may stand beside them.
+    Returns: both its filters with all three strategies, at its twelve beamwidths, and no other
+    variable; further filters and beamwidths may stand beside them.
     """
     ways = {(name, strategy) for name in FILTERS for strategy in STRATEGIES}
     beams = [variable.name for variable in study.variables] == [BEAM]
@@ -86,15 +72,7 @@ def papers_cases(study: Study) -> bool:
 def cell_of(study: Study, printed: Printed) -> Cell | None:
     """Find the cell of a study that a row of Table II speaks of.
 
-    Parameters
-    ----------
-    study : Study
-    printed : Printed
-
-    Returns
-    -------
-    Cell or None
-        None where the study has no such case within a quarter of a degree.
+    Returns: none where the study has no such case within a quarter of a degree.
     """
     strategy = "fused" if printed.beamwidth else "passive"
     if (printed.filter, strategy) not in study.trials:
@@ -107,14 +85,6 @@ def cell_of(study: Study, printed: Printed) -> Cell | None:
 
 def row_name(printed: Printed) -> str:
     """Word a row as the table does.
-
-    Parameters
-    ----------
-    printed : Printed
-
-    Returns
-    -------
-    str
 
     Examples
     --------

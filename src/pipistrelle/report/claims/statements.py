@@ -30,53 +30,30 @@ from pipistrelle.report.studied import COMMON, HEADING, POSITION, Selection, sam
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Part:
-    """Statements that together say one thing.
-
-    Attributes
-    ----------
-    sentence : str
-    unit : "m", "rad", "landmarks" or ""
-    need : "all" or "most"
-        How many statements must hold for the part to hold.
-    statements : tuple of Statement
-    """
+    """Statements that together say one thing."""
 
     sentence: str
     unit: str
     need: Literal["all", "most"] = "all"
+    """How many statements must hold for the part to hold."""
     statements: tuple[Statement, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Claim:
-    """What is claimed, before a study has been asked.
-
-    Attributes
-    ----------
-    sentence : str
-    parts : function of a Selection
-        Gives the parts of the claim, of the worlds that the selection counts.
-    """
+    """What is claimed, before a study has been asked."""
 
     sentence: str
     parts: Callable[[Selection], list[Part]]
+    """Gives the parts of the claim, of the worlds that the selection counts."""
 
 
 def counts_as_printed(selection: Selection) -> list[Part]:
     """Claim 1: our mean counts lie within the paper's standard deviation of the paper's.
 
-    Parameters
-    ----------
-    selection : Selection
+    Returns: fully initialised landmarks, and all; one statement per row of the table that the study
+    has a case of.
 
-    Returns
-    -------
-    list of Part
-        Fully initialised landmarks, and all; one statement per row of the table that the study has
-        a case of.
-
-    Notes
-    -----
     Bradley & Abaid, Table II.
     """
     parts = []
@@ -109,19 +86,10 @@ def ekf_more_consistent(selection: Selection) -> list[Part]:
     Per strategy, averaged over the beamwidths; the paper calls FastSLAM's fused ANEES anomalous
     and does not count it among the periodic ones.
 
-    Parameters
-    ----------
-    selection : Selection
+    Returns: nearer, a statement per strategy; swing and rise, one per filter and strategy, none
+    where a drive is less than two laps. A consistent filter's is not the paper's 3 but what it is
+    after an exact start.
 
-    Returns
-    -------
-    list of Part
-        Nearer, a statement per strategy; swing and rise, one per filter and strategy, none where a
-        drive is less than two laps. A consistent filter's is not the paper's 3 but what it is after
-        an exact start.
-
-    Notes
-    -----
     Bradley & Abaid, Sec. V-B.
     """
     nearer, swing, rise = [], [], []
@@ -157,17 +125,8 @@ def ekf_more_consistent(selection: Selection) -> list[Part]:
 def ekf_more_accurate(selection: Selection) -> list[Part]:
     """Claim 3: EKF's position RMSE is lower than FastSLAM's everywhere, and passive is worst.
 
-    Parameters
-    ----------
-    selection : Selection
+    Returns: each filter's beamwidths: EKF against FastSLAM by strategy, passive against the others.
 
-    Returns
-    -------
-    list of Part
-        Each filter's beamwidths: EKF against FastSLAM by strategy, passive against the others.
-
-    Notes
-    -----
     Bradley & Abaid, Sec. V-C.
     """
     lower, worst = [], []
@@ -195,17 +154,8 @@ def ekf_more_accurate(selection: Selection) -> list[Part]:
 def ekf_gains_by_fusing(selection: Selection) -> list[Part]:
     """Claim 4: with the EKF, fused beats active at narrow beams on average, in heading always.
 
-    Parameters
-    ----------
-    selection : Selection
+    Returns: position at the narrow beamwidths, heading at all of them.
 
-    Returns
-    -------
-    list of Part
-        Position at the narrow beamwidths, heading at all of them.
-
-    Notes
-    -----
     Bradley & Abaid, Sec. V-C and Appendix A.
     """
     pair, name = (("ekf", "active"), ("ekf", "fused")), "EKF"
@@ -230,17 +180,8 @@ def ekf_gains_by_fusing(selection: Selection) -> list[Part]:
 def fastslam_never_gains(selection: Selection) -> list[Part]:
     """Claim 5: with FastSLAM 2.0, fused never beats active in position.
 
-    Parameters
-    ----------
-    selection : Selection
+    Returns: one, a statement per beamwidth.
 
-    Returns
-    -------
-    list of Part
-        One, a statement per beamwidth.
-
-    Notes
-    -----
     Bradley & Abaid, Sec. V-C.
     """
     pair, name = (("fastslam", "active"), ("fastslam", "fused")), FILTERS["fastslam"]
@@ -252,17 +193,8 @@ def fastslam_never_gains(selection: Selection) -> list[Part]:
 def fused_tends_to_passive(selection: Selection) -> list[Part]:
     """Claim 6: the narrower the beam, the nearer fused comes to passive.
 
-    Parameters
-    ----------
-    selection : Selection
+    Returns: the slope, and the narrowest beam; a statement per filter in each.
 
-    Returns
-    -------
-    list of Part
-        The slope, and the narrowest beam; a statement per filter in each.
-
-    Notes
-    -----
     Bradley & Abaid, Sec. V-C.
     """
     slopes, ends = [], []
@@ -293,17 +225,8 @@ def maps_never_gain(selection: Selection) -> list[Part]:
 
     Over the landmarks seen by all strategies, "most of the time".
 
-    Parameters
-    ----------
-    selection : Selection
+    Returns: never better, and mostly near; a statement per filter and beamwidth in each.
 
-    Returns
-    -------
-    list of Part
-        Never better, and mostly near; a statement per filter and beamwidth in each.
-
-    Notes
-    -----
     Bradley & Abaid, Sec. V-D.
     """
     never, within = [], []
@@ -329,18 +252,9 @@ def maps_never_gain(selection: Selection) -> list[Part]:
 def passive_sees_more(selection: Selection) -> list[Part]:
     """Claim 8: passive sees more landmarks than active, by more than one sigma only below 65 deg.
 
-    Parameters
-    ----------
-    selection : Selection
+    Returns: at all beamwidths; at those below 65 degrees; and, which the paper's "below" says as
+    well, at the others. A statement per filter and beamwidth.
 
-    Returns
-    -------
-    list of Part
-        At all beamwidths; at those below 65 degrees; and, which the paper's "below" says as well,
-        at the others. A statement per filter and beamwidth.
-
-    Notes
-    -----
     Bradley & Abaid, Sec. V-E.
     """
     more, far, near, score = [], [], [], "landmarks_total"

@@ -30,14 +30,7 @@ WITHOUT: dict[Rule, str] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JudgedPart:
-    """A part of a claim, and what the worlds say of each of its statements.
-
-    Attributes
-    ----------
-    sentence, unit, need : of the part
-    findings : tuple of Finding
-    holds : True, False (the opposite is significant) or None (undecided)
-    """
+    """A part of a claim, and what the worlds say of each of its statements."""
 
     sentence: str
     unit: str
@@ -48,45 +41,28 @@ class JudgedPart:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judgement:
-    """What one exclusion rule makes of a claim.
-
-    Attributes
-    ----------
-    verdict : str
-    parts : tuple of JudgedPart
-    decisive : Finding or None
-        The statement that decides: the one farthest from holding, or nearest to failing.
-    unit : str
-        Of the decisive one.
-    """
+    """What one exclusion rule makes of a claim."""
 
     verdict: Verdict
     parts: tuple[JudgedPart, ...]
     decisive: Finding | None
+    """The statement that decides: the one farthest from holding, or nearest to failing."""
     unit: str
+    """Of the decisive one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JudgedClaim:
-    """A claim, what each exclusion rule makes of it, and its verdict.
-
-    Attributes
-    ----------
-    number : int
-        Its place in the list of claims, from 1.
-    sentence : str
-    verdict : str
-    reason : str
-        In a sentence.
-    by_rule : dict of Judgement
-        By the names of `studied.RULES`.
-    """
+    """A claim, what each exclusion rule makes of it, and its verdict."""
 
     number: int
+    """Its place in the list of claims, from 1."""
     sentence: str
     verdict: Verdict
     reason: str
+    """In a sentence."""
     by_rule: dict[Rule, Judgement]
+    """By the names of `studied.RULES`."""
 
 
 def judge_claims(
@@ -96,17 +72,8 @@ def judge_claims(
 ) -> tuple[JudgedClaim, ...]:
     """Judge claims, each as one family, under every exclusion rule.
 
-    Parameters
-    ----------
-    selections : dict of Selection
-        As `claims.contrasts.selections` gives them.
-    claims : sequence of Claim
-    confidence : between 0 and 1
-        That all intervals of a claim hold.
-
-    Returns
-    -------
-    tuple of JudgedClaim, one per claim
+    `selections`: as `claims.contrasts.selections` gives them. `confidence`: that all intervals of a
+    claim hold.
     """
     judged = []
     for number, claim in enumerate(claims, start=1):
@@ -131,14 +98,7 @@ def judge_claims(
 def with_everything(claim: JudgedClaim) -> Finding | None:
     """Find the statement that decides a claim as it is where nothing is left out.
 
-    Parameters
-    ----------
-    claim : JudgedClaim
-
-    Returns
-    -------
-    Finding or None
-        None where nothing decides.
+    Returns: none where nothing decides.
     """
     headline = claim.by_rule["world"]
     for part, same in zip(headline.parts, claim.by_rule["none"].parts, strict=True):
@@ -149,16 +109,7 @@ def with_everything(claim: JudgedClaim) -> Finding | None:
 
 
 def record(claim: JudgedClaim) -> dict[str, Any]:
-    """Lay a claim out for ``summary.json``; what is not finite becomes None.
-
-    Parameters
-    ----------
-    claim : JudgedClaim
-
-    Returns
-    -------
-    dict
-    """
+    """Lay a claim out for ``summary.json``; what is not finite becomes None."""
     by_rule = {
         rule: {
             "verdict": judgement.verdict,
@@ -188,16 +139,7 @@ def record(claim: JudgedClaim) -> dict[str, Any]:
 
 
 def tally(part: JudgedPart) -> tuple[int, int, int]:
-    """Count the statements of a part that hold, are undecided, and are refuted.
-
-    Parameters
-    ----------
-    part : JudgedPart
-
-    Returns
-    -------
-    int, int, int
-    """
+    """Count the statements of a part that hold, are undecided, and are refuted."""
     found = [finding.holds for finding in part.findings]
     return found.count(True), found.count(None), found.count(False)
 

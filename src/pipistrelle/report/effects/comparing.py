@@ -40,86 +40,50 @@ Pair = tuple[Cell, Cell]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contrast:
-    """Two values of one variable, all else alike.
-
-    Attributes
-    ----------
-    factor : str
-        The variable's name, `STRATEGY` or `FILTER`.
-    filter, strategy : str
-        With which they are compared; empty for the one that is itself compared.
-    before, after : str
-        The two values, as words.
-    end : bool
-        It is what the answer speaks of: of numbers the least or the greatest, of words any two.
-    pairs : tuple of pairs of Cell
-        One for each combination of the rest.
-    names : tuple of str
-        Of those combinations.
-    measures : tuple of Measure
-        What is compared; `measures.gains_of` where it is what the strategy gains.
-    """
+    """Two values of one variable, all else alike."""
 
     factor: str
+    """The variable's name, `STRATEGY` or `FILTER`."""
     filter: str
     strategy: str
+    """With which they are compared; empty for the one that is itself compared."""
     before: str
     after: str
+    """The two values, as words."""
     end: bool = True
+    """It is what the answer speaks of: of numbers the least or the greatest, of words any two."""
     pairs: tuple[Pair, ...]
+    """One for each combination of the rest."""
     names: tuple[str, ...]
+    """Of those combinations."""
     measures: tuple[Measure, ...]
+    """What is compared; `measures.gains_of` where it is what the strategy gains."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Effect:
-    """What the worlds say of a contrast in one measure.
-
-    Attributes
-    ----------
-    contrast : Contrast
-    measure : Measure
-    finding : Finding
-        Of the mean over the combinations of the rest; of a ratio, of its logarithm.
-    untouched : bool
-        The two are the same to the last digit, in every world.
-    apart : tuple of Finding
-        At each of those combinations, a family of their own; empty where there is one.
-    """
+    """What the worlds say of a contrast in one measure."""
 
     contrast: Contrast
     measure: Measure
     finding: Finding
+    """Of the mean over the combinations of the rest; of a ratio, of its logarithm."""
     untouched: bool
+    """The two are the same to the last digit, in every world."""
     apart: tuple[Finding, ...]
+    """At each of those combinations, a family of their own; empty where there is one."""
 
 
 def contrasts_of(study: Study) -> tuple[Contrast, ...]:
     """List what a study compares.
 
-    Parameters
-    ----------
-    study : Study
-
-    Returns
-    -------
-    tuple of Contrast
-        Those of the variables, in their order, then strategies, then filters.
+    Returns: those of the variables, in their order, then strategies, then filters.
     """
     return (*_of_variables(study), *_of_strategies(study), *_of_filters(study))
 
 
 def effects_of(selection: Selection) -> tuple[Effect, ...]:
-    """Judge everything that a study compares, in every measure.
-
-    Parameters
-    ----------
-    selection : Selection
-
-    Returns
-    -------
-    tuple of Effect
-    """
+    """Judge everything that a study compares, in every measure."""
     families: dict[tuple[Any, ...], list[Contrast]] = {}
     for one in contrasts_of(selection.study):
         family = one.factor, one.filter or one.strategy, one.end, one.measures
@@ -135,15 +99,7 @@ def effects_of(selection: Selection) -> tuple[Effect, ...]:
 def families_of(study: Study, effects: Sequence[Effect]) -> dict[tuple[str, str], list[Effect]]:
     """Group effects by what is compared, and by the filter or the strategy with which.
 
-    Parameters
-    ----------
-    study : Study
-    effects : sequence of Effect
-
-    Returns
-    -------
-    dict of list of Effect
-        Of a study that has variables, these alone: not strategies, nor filters.
+    Returns: of a study that has variables, these alone: not strategies, nor filters.
     """
     families: dict[tuple[str, str], list[Effect]] = {}
     for effect in effects:
@@ -159,16 +115,7 @@ def mean_change(
 ) -> Float[np.ndarray, " m"]:
     """Average a change over some pairs of cases, in the worlds that have all of them.
 
-    Parameters
-    ----------
-    selection : Selection
-    measure : Measure
-    pairs : sequence of pairs of Cell
-
-    Returns
-    -------
-    (m)
-        A number per world.
+    Returns: a number per world.
     """
     study = selection.study
     changes = np.array([change(study, measure, *pair) for pair in pairs])
@@ -180,15 +127,8 @@ def mean_change(
 def resolvable(finding: Finding) -> float:
     """Tell how small an effect would have been significant.
 
-    Parameters
-    ----------
-    finding : Finding
-        An undecided one.
-
-    Returns
-    -------
-    float
-        Half the width of its interval, in the sample's unit; infinite where nothing could be.
+    `finding`: an undecided one. Returns: half the width of its interval, in the sample's unit;
+    infinite where nothing could be.
     """
     low, high = finding.family
     return (high - low) / 2.0
@@ -197,17 +137,9 @@ def resolvable(finding: Finding) -> float:
 def record(by_rule: Mapping[Rule, Sequence[Effect]], headline: Rule) -> list[dict[str, Any]]:
     """Lay effects out for ``summary.json``.
 
-    Parameters
-    ----------
-    by_rule : dict of sequence of Effect
-        The same effects under each exclusion rule.
-    headline : one of `studied.RULES`
-        By which the study is answered: what an effect is at each combination is told of this alone.
-
-    Returns
-    -------
-    list of dict
-        A ratio's mean and intervals are ratios; what is not finite is None.
+    `by_rule`: the same effects under each exclusion rule. `headline`: by which the study is
+    answered: what an effect is at each combination is told of this alone. Returns: a ratio's mean
+    and intervals are ratios; what is not finite is None.
     """
     return [
         {
@@ -231,18 +163,9 @@ def record(by_rule: Mapping[Rule, Sequence[Effect]], headline: Rule) -> list[dic
 def plain(finding: Finding, *, effect: bool = False, ratio: bool = False) -> dict[str, Any]:
     """Lay a finding out as JSON can hold it.
 
-    Parameters
-    ----------
-    finding : Finding
-    effect : bool
-        Its interval is the one that shows its size; else the one by which a claim is judged.
-    ratio : bool
-        Its numbers are logarithms of ratios, and become these.
-
-    Returns
-    -------
-    dict
-        What is not finite is None.
+    `effect`: its interval is the one that shows its size; else the one by which a claim is judged.
+    `ratio`: its numbers are logarithms of ratios, and become these. Returns: what is not finite is
+    None.
     """
 
     def size(value: float) -> float | None:

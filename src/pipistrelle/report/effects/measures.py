@@ -57,17 +57,7 @@ def is_first(measure: Measure) -> bool:
 
 
 def cells_of(measure: Measure, before: Cell, after: Cell) -> list[Cell]:
-    """List the cases of which a change is made: two, and of a gain those that it is over.
-
-    Parameters
-    ----------
-    measure : Measure
-    before, after : Cell
-
-    Returns
-    -------
-    list of Cell
-    """
+    """List the cases of which a change is made: two, and of a gain those that it is over."""
     cells = [before, after]
     return cells + [(name, measure.over, number) for name, _, number in cells if measure.over]
 
@@ -75,18 +65,9 @@ def cells_of(measure: Measure, before: Cell, after: Cell) -> list[Cell]:
 def change(study: Study, measure: Measure, before: Cell, after: Cell) -> Float[np.ndarray, " n"]:
     """Return by how much a measure differs between two cases, world by world.
 
-    Parameters
-    ----------
-    study : Study
-    measure : Measure
-    before, after : Cell
-
-    Returns
-    -------
-    (n)
-        After minus before; of a ratio its logarithm; NaN or infinite where one of them has no
-        number. A map's error is that of the landmarks which all these cases have placed, as far as
-        they met the same ones; of those that only one has placed, nothing can be compared.
+    Returns: after minus before; of a ratio its logarithm; NaN or infinite where one of them has no
+    number. A map's error is that of the landmarks which all these cases have placed, as far as they
+    met the same ones; of those that only one has placed, nothing can be compared.
     """
     first, second, *over = _numbers(study, measure.score, cells_of(measure, before, after))
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -36,16 +36,9 @@ from pipistrelle.settings import known_settings
 def exclusion_rows(study: Study) -> list[dict[str, Any]]:
     """Count what each filter lost.
 
-    Parameters
-    ----------
-    study : Study
-
-    Returns
-    -------
-    list of dict
-        Per filter: worlds done, those with a diverged or failed case, the paper's count of such
-        among its worlds, trials that diverged per strategy, trials that failed, and the NEES limit.
-        What diverged is what was stored; None for a limit or a count that is not known here.
+    Returns: per filter: worlds done, those with a diverged or failed case, the paper's count of
+    such among its worlds, trials that diverged per strategy, trials that failed, and the NEES
+    limit. What diverged is what was stored; None for a limit or a count that is not known here.
     """
     rows = []
     for name in filter_titles(study):
@@ -67,31 +60,15 @@ def exclusion_rows(study: Study) -> list[dict[str, Any]]:
 
 
 def failed_trials(study: Study) -> int:
-    """Count the trials that failed.
-
-    Parameters
-    ----------
-    study : Study
-
-    Returns
-    -------
-    int
-    """
+    """Count the trials that failed."""
     return int(sum(np.sum(trials.failed) for trials in study.trials.values()))
 
 
 def not_the_papers(study: Study) -> list[dict[str, Any]]:
     """Name the settings that are not those of the plan `paper`.
 
-    Parameters
-    ----------
-    study : Study
-
-    Returns
-    -------
-    list of dict
-        Per setting, strategies and filters among them: its name, its value here and the paper's.
-        Seed and number of worlds are none.
+    Returns: per setting, strategies and filters among them: its name, its value here and the
+    paper's. Seed and number of worlds are none.
     """
     paper = read_plan(find_plan("paper"))
     theirs = _asked(paper.config, paper.grid) | {
@@ -112,14 +89,7 @@ def not_the_papers(study: Study) -> list[dict[str, Any]]:
 def not_the_papers_line(rows: list[dict[str, Any]]) -> str:
     """Say in a line what `not_the_papers` found.
 
-    Parameters
-    ----------
-    rows : list of dict
-
-    Returns
-    -------
-    str
-        Empty where there is nothing to say.
+    Returns: empty where there is nothing to say.
 
     Examples
     --------
@@ -133,20 +103,11 @@ def not_the_papers_line(rows: list[dict[str, Any]]) -> str:
 def table_ii_rows(selection: Selection) -> list[dict[str, Any]]:
     """Lay Table II out, ours beside the paper's.
 
-    Parameters
-    ----------
-    selection : Selection
+    Returns: per row of the table: the paper's mean and standard deviation, ours and the number of
+    worlds; None where the study has no such case. For FastSLAM 2.0 the fully initialised landmarks
+    are those of the particle of highest weight, and beside them stands the weighted mean over the
+    particles.
 
-    Returns
-    -------
-    list of dict
-        Per row of the table: the paper's mean and standard deviation, ours and the number of
-        worlds; None where the study has no such case. For FastSLAM 2.0 the fully initialised
-        landmarks are those of the particle of highest weight, and beside them stands the
-        weighted mean over the particles.
-
-    Notes
-    -----
     Bradley & Abaid, Table II.
     """
     rows = []
@@ -170,18 +131,9 @@ def table_ii_rows(selection: Selection) -> list[dict[str, Any]]:
 def consistency_rows(selection: Selection) -> list[dict[str, Any]]:
     """Say how consistent each case is.
 
-    Parameters
-    ----------
-    selection : Selection
+    Returns: per case: where it is, worlds, time mean of ANEES and of a consistent filter's, the
+    means of its 95 % bounds, shares of time inside and above them, and its `anees_departure`.
 
-    Returns
-    -------
-    list of dict
-        Per case: where it is, worlds, time mean of ANEES and of a consistent filter's, the means of
-        its 95 % bounds, shares of time inside and above them, and its `anees_departure`.
-
-    Notes
-    -----
     Bradley & Abaid, Eqs. (24) and (25).
     """
     rows, study = [], selection.study
@@ -217,16 +169,7 @@ def consistency_rows(selection: Selection) -> list[dict[str, Any]]:
 
 
 def by_strategy(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Average `consistency_rows` over the combinations.
-
-    Parameters
-    ----------
-    rows : list of dict
-
-    Returns
-    -------
-    list of dict
-    """
+    """Average `consistency_rows` over the combinations."""
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for row in rows:
         groups.setdefault((row["filter"], row["strategy"]), []).append(row)

@@ -56,29 +56,12 @@ def write_report(
 ) -> dict[str, Any]:
     """Answer a study's question and write its page, its figures and its summary.
 
-    Parameters
-    ----------
-    study : Study
-        As `reading.read_study` gives it.
-    folder : Path
-        Made where it is missing; ``index.html``, ``summary.json`` and ``figures``.
-    claims : sequence of Claim, optional
-        To be judged; if not said, the paper's where the study holds its cases, else none.
-    charts : sequence of functions of a Selection, optional
-        Each gives the charts of a figure; they have names of their own. If not said, as
-        `charts.results.study_charts` has it.
-    progress : callable, optional
-        Given the name of each figure before it is drawn.
-
-    Returns
-    -------
-    dict
-        As ``summary.json`` holds it.
-
-    Raises
-    ------
-    InputError
-        As `pipistrelle.own_files.claim`: an earlier report is replaced, and nothing else.
+    `study`: as `reading.read_study` gives it. `folder`: made where it is missing; ``index.html``,
+    ``summary.json`` and ``figures``. `claims`: to be judged; if not said, the paper's where the
+    study holds its cases, else none. `charts`: each gives the charts of a figure; they have names
+    of their own. If not said, as `charts.results.study_charts` has it. `progress`: given the name
+    of each figure before it is drawn. Returns: as ``summary.json`` holds it. Raises InputError: as
+    `pipistrelle.own_files.claim`: an earlier report is replaced, and nothing else.
     """
     own = claim(folder, REPORT, overwrite=True)
     told = answered(study, claims)
@@ -109,18 +92,7 @@ def page(
 ) -> str:
     """Write the page.
 
-    Parameters
-    ----------
-    told : Answered
-    found : charts by exclusion rule
-    models : charts that no exclusion changes
-    numbers : dict
-        As ``summary.json`` holds it.
-
-    Returns
-    -------
-    str
-        HTML.
+    `numbers`: as ``summary.json`` holds it. Returns: HTML.
     """
     here, study = files("pipistrelle.report.page"), told.study
     figures = [_figure(chart.name, found) for chart in _distinct(found)]

@@ -31,33 +31,21 @@ PAPERS_QUESTION = "Does listening to someone else’s calls as well as one’s o
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answered:
-    """A study and the question that it answers.
-
-    Attributes
-    ----------
-    study : Study
-    papers : bool
-        It holds the paper's cases and is asked the paper's question.
-    question : str
-    rule : one of `studied.RULES`
-        By which it is answered.
-    selections : dict of Selection
-        Under each rule.
-    effects : dict of tuple of Effect
-        Under each rule.
-    claims : tuple of JudgedClaim
-    answer : list of str
-        A line that stands alone, then sentences.
-    """
+    """A study and the question that it answers."""
 
     study: Study
     papers: bool
+    """It holds the paper's cases and is asked the paper's question."""
     question: str
     rule: Rule
+    """One of `studied.RULES`. By which it is answered."""
     selections: Mapping[Rule, Selection]
+    """Under each rule."""
     effects: Mapping[Rule, tuple[Effect, ...]]
+    """Under each rule."""
     claims: tuple[JudgedClaim, ...]
     answer: list[str]
+    """A line that stands alone, then sentences."""
     findings: list[dict[str, str]]
     """Rows below the answer to the paper's question; none of another's."""
 
@@ -65,15 +53,7 @@ class Answered:
 def answered(study: Study, claims: Sequence[Claim] | None = None) -> Answered:
     """Ask a study its question.
 
-    Parameters
-    ----------
-    study : Study
-    claims : sequence of Claim, optional
-        As `write_report` takes them.
-
-    Returns
-    -------
-    Answered
+    `claims`: as `write_report` takes them.
     """
     papers, by_rule = papers_cases(study), selections(study)
     effects = {rule: effects_of(selection) for rule, selection in by_rule.items()}
@@ -94,16 +74,7 @@ def answered(study: Study, claims: Sequence[Claim] | None = None) -> Answered:
 
 
 def summary(told: Answered) -> dict[str, Any]:
-    """Lay out everything that the page says, for programs.
-
-    Parameters
-    ----------
-    told : Answered
-
-    Returns
-    -------
-    dict
-    """
+    """Lay out everything that the page says, for programs."""
     study, selection = told.study, told.selections[told.rule]
     return {
         "format": FORMAT,

@@ -27,14 +27,7 @@ READINGS = 80
 def panel_svg(panel: Panel) -> Markup:
     """Draw a panel.
 
-    Parameters
-    ----------
-    panel : Panel
-
-    Returns
-    -------
-    Markup
-        An ``svg`` element, its texts escaped.
+    Returns: an ``svg`` element, its texts escaped.
 
     Examples
     --------
@@ -66,14 +59,6 @@ def panel_svg(panel: Panel) -> Markup:
 
 def readings(panel: Panel) -> list[tuple[float, str, list[tuple[str, str]]]]:
     """Say what a panel shows at each place along it.
-
-    Parameters
-    ----------
-    panel : Panel
-
-    Returns
-    -------
-    list of the place, its name and, per series, its name and its number
 
     Examples
     --------
@@ -313,14 +298,7 @@ def _number(series: Series, i: int) -> str:
 def legend(panels: Sequence[Panel]) -> list[tuple[str, str, str, float]]:
     """List what the panels' legend explains.
 
-    Parameters
-    ----------
-    panels : sequence of Panel
-
-    Returns
-    -------
-    list of name, role, "line", "dashed", "dot", "hollow" or "star", and opacity
-        Empty where the names are many: there the caption tells.
+    Returns: empty where the names are many: there the caption tells.
     """
     found = []
     for name, series in legend_series(panels).items():
