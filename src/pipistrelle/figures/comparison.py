@@ -71,7 +71,7 @@ def _draw_missions(compared: ComparedMissions) -> "Figure":
 def _limits(
     compared: ComparedMissions, estimate: ComparedEstimate
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return limits that hold what is true, or else all; and of the rest what is not far away."""
+    """Return axis limits around the truth (or all paths) and what lies near it."""
     truths = [truth.pose[:, :2] for truth in compared.truths if truth is not None]
     paths = [points for view in estimate.views for points in (view.raw, view.aligned)]
     marks = [points for view in estimate.views for points in (view.placed, view.placed_aligned)]
@@ -90,7 +90,7 @@ def _limits(
 def _draw_paths(
     axes: "Axes", compared: ComparedMissions, estimate: ComparedEstimate, *, fitted: bool
 ) -> None:
-    """Draw what is true, broad, and each path with the landmarks that it places."""
+    """Draw the true path as a broad line, and each estimated path with its landmarks."""
     axes.grid(True)
     axes.set_axisbelow(True)
     truths = {i: truth for i, truth in enumerate(compared.truths) if truth is not None}
@@ -128,7 +128,7 @@ def _draw_errors(
 
 
 def _highest(errors: Sequence[Any]) -> float:
-    """Return where an axis of errors ends: above all of them, but for those that are lost."""
+    """Return the upper end of an error axis; errors of diverged paths are cut."""
     most = [np.max(e[np.isfinite(e)], initial=0.0) for e in map(np.asarray, errors)]
     return float(1.08 * min(max(most), 20.0 * max(min(most), 0.5))) or 1.0
 
@@ -177,9 +177,9 @@ def _draw_studies(compared: ComparedStudies) -> "Figure":
     shown = {name: score for name, score in shown_in("studies").items() if name in there}
     panels = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
     for axes, (name, score) in zip(panels, shown.items(), strict=True):
-        mine = [case for case in compared.cases if case.score == name]
+        of_score = [case for case in compared.cases if case.score == name]
         axes.axvline(0.0, color=INK, lw=0.8, zorder=1)
-        for k, case in enumerate(mine):
+        for k, case in enumerate(of_score):
             place = k // others + (case.other - 1 - 0.5 * (others - 1)) * 0.6 / others
             _draw_case(axes, case, place)
         axes.set_title(heading(score), loc="left", weight="bold")

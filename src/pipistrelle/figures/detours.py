@@ -56,7 +56,7 @@ def callers_at(frame: Snapshot) -> Gaussian:
 
 
 def callers_marked(scans: Sequence[Scan]) -> bool:
-    """Tell whether a picture marks where callers are believed to be.
+    """Return whether a picture marks the estimated positions of callers.
 
     Returns: where there are several, or where detours were heard, whose ellipses are about them.
     The paper's one beacon is a landmark as any other.
@@ -66,7 +66,7 @@ def callers_marked(scans: Sequence[Scan]) -> bool:
 
 
 def detours_at(frame: Snapshot) -> dict[int, Int[np.ndarray, " k"]]:
-    """Rows of a frame's scan whose detour makes an ellipse, by their landmark.
+    """Rows of a scan with an excess path that defines an ellipse, by landmark.
 
     Returns: of landmarks of the map, heard from callers that are placed. Of several the first two
     are those whose ellipses cross most squarely there.
@@ -124,16 +124,16 @@ def resolved(frames: Sequence[Snapshot]) -> list[int]:
     members, since, timed, ranged = {}, {}, set(), set()
     shown, found = UNLABELLED, []
     for now, frame in enumerate(frames):
-        before, told, scan = members, detours_at(frame), frame.scan
+        before, ellipses_of, scan = members, detours_at(frame), frame.scan
         labels, counts = np.unique(frame.landmarks.landmark, return_counts=True)
         members = dict(zip(labels.tolist(), counts.tolist(), strict=True))
-        timed.update(told)
+        timed.update(ellipses_of)
         ranged.update(scan.landmark[np.isfinite(scan.range)].tolist())
         for label in timed - ranged:
             if members.get(label) == 1 and before.get(label) != 1:
                 since[label] = now
         ranks = {}
-        for label, rows in told.items():
+        for label, rows in ellipses_of.items():
             age = now - since.get(label, -RECENT - 1)
             if members[label] > 1:
                 rank = (1, members[label])

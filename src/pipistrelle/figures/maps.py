@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def shades(
     colour: str, weight: Float[np.ndarray, " h"], *, least: float = 0.05, most: float = 0.5
 ) -> Float[np.ndarray, "h 4"]:
-    """One colour, the more opaque the heavier.
+    """Return one colour per weight: the larger the weight, the more opaque.
 
     Returns: red, green, blue, opacity.
 

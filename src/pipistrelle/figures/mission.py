@@ -319,12 +319,12 @@ def _draw_clouds(maps: Sequence["Axes"], trials: Sequence[TrialResult], truth: T
 
 
 def _title(axes: "Axes", trial: TrialResult, truth: Truth) -> None:
-    """Say what the panel is and what came out."""
+    """Write the panel's title and its scores."""
     head(axes, trial.strategy, trial.filter).set_text(outcome(trial, truth))
 
 
 def outcome(trial: TrialResult, truth: Truth) -> str:
-    """Say what came of an estimate: its error, if known, and how many landmarks of how many."""
+    """Describe an estimate in a line: its error, if known, and its number of landmarks."""
     scores = trial.scores
     there = scores.landmarks_total if truth.landmarks is None else len(truth.landmarks[0])
     parts = [f"{scores.landmarks_full} of {there} landmarks placed"]

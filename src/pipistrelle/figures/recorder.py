@@ -17,7 +17,7 @@ from pipistrelle.estimation.beliefs import (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Snapshot:
-    """One frame as a filter saw it."""
+    """A filter's measurements and belief at one frame."""
 
     scan: Scan
     pose: Float[np.ndarray, "3"]
@@ -36,7 +36,7 @@ class Snapshot:
 
 
 def heard_from(scan: Scan) -> Scan:
-    """Leave of a scan the rows that have a direction to draw: the others are further detours.
+    """Return the rows of a scan that have a bearing.
 
     Examples
     --------

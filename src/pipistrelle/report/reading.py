@@ -148,10 +148,10 @@ def _numbers(
     found: dict[Way, Int[np.ndarray, ...]] = {}
     for case, name, strategy in cases.rows():
         numbers = found.setdefault((name, strategy), np.empty(list(map(len, given)), dtype=int))
-        mine = [values[case][variable.setting] for variable in variables]
+        wanted = [values[case][variable.setting] for variable in variables]
         at = tuple(
             slice(None) if value is None else known.index(repr(value))
-            for value, known in zip(mine, given, strict=True)
+            for value, known in zip(wanted, given, strict=True)
         )
         numbers[at] = case
     return {way: numbers.reshape(-1) for way, numbers in sorted(found.items())}
@@ -166,7 +166,7 @@ def _drawn(plan: Plan, config: Config, world: int) -> Scenario | None:
 
 
 def _drawings(plan: Plan, configs: Sequence[Config], world: int) -> Int[np.ndarray, " c"]:
-    """Tell by a world drawn anew which combinations meet the same landmarks."""
+    """Number the combinations so that those with the same landmarks share a number."""
     numbers: dict[Any, int] = {}
     known: dict[str, int] = {}
     found = []
@@ -222,7 +222,7 @@ def _study(
 def _failures(
     plan: Plan, broken: "pl.DataFrame", variables: Sequence[Variable]
 ) -> tuple[Failure, ...]:
-    """Tell which trials failed, with what and under which values."""
+    """List the failed trials with their errors and settings."""
     values = {case.number: case.values for case in cases_of(plan)}
     others = [variable for variable in variables if variable.name != BEAM]
     return tuple(
@@ -247,11 +247,11 @@ def _trials(
     """Give each filter and strategy its cases, in the order of the combinations."""
     common = _common(numbers, *maps)
     found = {}
-    for way, mine in numbers.items():
-        first = np.sort(np.unique(mine, return_index=True)[1])
-        c = mine[first]
+    for way, cases in numbers.items():
+        first = np.sort(np.unique(cases, return_index=True)[1])
+        c = cases[first]
         found[way] = Trials(
-            at=np.argmax(mine[:, None] == c, axis=1),
+            at=np.argmax(cases[:, None] == c, axis=1),
             failed=scores["failed"][:, c],
             diverged=scores["diverged"][:, c],
             scores={score: scores[score][:, c] for score in READ} | {COMMON: common[way]},
@@ -329,7 +329,7 @@ def _common(
     """Return the map RMSE over the landmarks that all strategies of a filter have placed."""
     found = {}
     for name in {name for name, _ in numbers}:
-        mine = {way: c for way, c in numbers.items() if way[0] == name}
-        shared = np.all([full[:, c] for c in mine.values()], axis=0)
-        found |= {way: rmse_of(error[:, c], shared) for way, c in mine.items()}
+        of_filter = {way: c for way, c in numbers.items() if way[0] == name}
+        shared = np.all([full[:, c] for c in of_filter.values()], axis=0)
+        found |= {way: rmse_of(error[:, c], shared) for way, c in of_filter.items()}
     return found

@@ -209,23 +209,23 @@ def filter_titles(study: Study) -> dict[str, str]:
     """
     there = {name for name, _ in study.trials}
     outside = sorted(there - CATALOGUE.keys())
-    plain = {name: name.rpartition(":")[2] for name in outside}
-    used = Counter([*plain.values(), *(known.title for known in CATALOGUE.values())])
+    classes = {name: name.rpartition(":")[2] for name in outside}
+    used = Counter([*classes.values(), *(known.title for known in CATALOGUE.values())])
     titles = {name: known.title for name, known in CATALOGUE.items() if name in there}
-    return titles | {name: name if used[plain[name]] > 1 else plain[name] for name in outside}
+    return titles | {name: name if used[classes[name]] > 1 else classes[name] for name in outside}
 
 
 def lost_worlds(study: Study, name: str) -> Bool[np.ndarray, " n"]:
-    """Tell in which worlds any of a filter's cases diverged or failed.
+    """Mask of the worlds in which any case of a filter diverged or failed.
 
     `name`: the filter.
     """
-    mine = [trials for (other, _), trials in study.trials.items() if other == name]
-    return np.any([np.any(t.failed | t.diverged, axis=1) for t in mine], axis=0)
+    of_filter = [trials for (other, _), trials in study.trials.items() if other == name]
+    return np.any([np.any(t.failed | t.diverged, axis=1) for t in of_filter], axis=0)
 
 
 def kept(selection: Selection, cells: Sequence[Cell]) -> Bool[np.ndarray, " n"]:
-    """Tell which worlds count where these cells are compared.
+    """Mask of the worlds that count when these cells are compared.
 
     Returns: a failed trial counts as a diverged one, and where nothing is dropped it has no number.
     """

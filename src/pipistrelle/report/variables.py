@@ -176,7 +176,7 @@ def places(variable: Variable) -> Float[np.ndarray, " k"]:
 
 
 def two_sided(variable: Variable) -> bool:
-    """Tell whether numbers lie on either side of the one that they are compared with.
+    """Return whether the reference value lies between smaller and larger values.
 
     Examples
     --------
@@ -189,7 +189,7 @@ def two_sided(variable: Variable) -> bool:
 
 
 def geometric(numbers: Sequence[float]) -> bool:
-    """Tell whether rising numbers are a geometric row rather than an arithmetic one.
+    """Return whether rising numbers are nearer to a geometric than to an arithmetic series.
 
     `numbers`: rising. Returns: three or more, above 0, whose ratios vary less than their
     differences.

@@ -13,7 +13,7 @@ Kind = Literal["missions", "studies"]
 
 
 def kind_of(folders: Sequence[Path]) -> Kind:
-    """Tell what folders hold, by their names and by a look at what lies in them.
+    """Return whether folders hold missions or studies, from their names and contents.
 
     Raises InputError where they are too few or too many, one of them twice, or not all of one
     kind.

@@ -10,7 +10,7 @@ K = TypeVar("K", bound=Hashable)
 
 
 def alike(folders: Sequence[Sequence[Estimate]]) -> tuple[bool, bool]:
-    """Tell whether strategy and filter tell estimates of one folder apart, in any of them.
+    """Return whether strategies and whether filters distinguish the estimates of any folder.
 
     What does not is no part of an estimate's name: then a folder of one filter is compared with
     another of one, whichever they are, strategy by strategy.
@@ -31,7 +31,7 @@ def alike(folders: Sequence[Sequence[Estimate]]) -> tuple[bool, bool]:
 
 
 def named(estimate: Estimate, parts: tuple[bool, bool] = (True, True)) -> Estimate:
-    """Leave out of an estimate's name what tells nothing apart.
+    """Drop the strategy or filter from an estimate's key if it distinguishes nothing.
 
     `parts`: as `alike` gives them. Returns: nothing in place of what is left out.
 
@@ -45,7 +45,7 @@ def named(estimate: Estimate, parts: tuple[bool, bool] = (True, True)) -> Estima
 
 
 def worded(estimates: Sequence[Estimate]) -> str:
-    """Word what estimates have in common.
+    """Name the strategy and filter that estimates share.
 
     Examples
     --------
@@ -58,7 +58,7 @@ def worded(estimates: Sequence[Estimate]) -> str:
 
 
 def matched(keys: Sequence[Sequence[K]]) -> tuple[tuple[K, ...], dict[K, tuple[int, ...]]]:
-    """Part keys into those that all have, and those that only some have.
+    """Split keys into those of all folders and those of some.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def matched(keys: Sequence[Sequence[K]]) -> tuple[tuple[K, ...], dict[K, tuple[i
     (('b',), {'a': (0,), 'c': (1,)})
     """
     owners = {
-        key: tuple(i for i, mine in enumerate(keys) if key in mine) for each in keys for key in each
+        key: tuple(i for i, own in enumerate(keys) if key in own) for each in keys for key in each
     }
     everywhere = tuple(key for key, who in owners.items() if len(who) == len(keys))
     return everywhere, {key: who for key, who in owners.items() if len(who) < len(keys)}

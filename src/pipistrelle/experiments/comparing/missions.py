@@ -97,7 +97,7 @@ def compare_missions(folders: Sequence[Path]) -> ComparedMissions:
     if not common:
         raise _nothing_in_common(missions)
     shared, lacking = matched([sorted(set(map(section, mission.settings))) for mission in missions])
-    told = [
+    settings_shared = [
         {name: value for name, value in mission.settings.items() if section(name) in shared}
         for mission in missions
     ]
@@ -106,7 +106,7 @@ def compare_missions(folders: Sequence[Path]) -> ComparedMissions:
         versions=tuple(mission.version for mission in missions),
         compared=tuple(_compared(missions, [keys[key] for keys in own]) for key in common),
         alone={own[who[0]][key]: who for key, who in alone.items()},
-        settings=differing(told),
+        settings=differing(settings_shared),
         sections_alone=lacking,
         truths=tuple(mission.truth for mission in missions),
         one_drive=_one_drive(missions),
@@ -115,12 +115,12 @@ def compare_missions(folders: Sequence[Path]) -> ComparedMissions:
 
 def _nothing_in_common(missions: Sequence[StoredMission]) -> InputError:
     """Say what each folder has, where nothing of it is in all."""
-    told = "; ".join(
+    estimates = "; ".join(
         f"{mission.folder} has {', '.join(f'{s} {short_name(f)}' for s, f in mission.scores)}"
         for mission in missions
     )
     return InputError(
-        f"compare: found no estimate that all folders have: {told}; expected one of the same "
+        f"compare: found no estimate that all folders have: {estimates}; expected one of the same "
         "--strategy and --filter, or folders of one strategy or one filter each"
     )
 
@@ -145,7 +145,7 @@ def _compared(missions: Sequence[StoredMission], estimates: Sequence[Estimate]) 
 def path_view(
     path: StoredPath, placed: Float[np.ndarray, "n 2"], reference: StoredPath
 ) -> PathView:
-    """See a path as it is, and as near to a reference as a rigid motion brings it.
+    """Align a path with a reference by a rigid motion; return it before and after.
 
     `placed` [m]: landmarks, moved with it. `reference`: compared where both have the same times.
     Returns: where fewer than two poses can be compared, and where a path is not finite, nothing is
@@ -160,9 +160,9 @@ def path_view(
     ([3.0, 3.0, 3.0, 3.0], [0.0, 0.0, 0.0, 0.0])
     """
     raw = path.pose[:, :2]
-    _, mine, its = np.intersect1d(path.time, reference.time, return_indices=True)
+    _, own_rows, other_rows = np.intersect1d(path.time, reference.time, return_indices=True)
     true = np.full_like(raw, np.nan)
-    true[mine] = reference.pose[its, :2]
+    true[own_rows] = reference.pose[other_rows, :2]
     counted = np.isfinite(true).all(axis=1) & np.isfinite(raw).all(axis=1)
     counted &= path.time > path.time[0]
     fit = alignment(raw[counted], true[counted]) if np.sum(counted) > 1 else np.zeros(3)
@@ -179,7 +179,7 @@ def path_view(
 
 
 def _one_drive(missions: Sequence[StoredMission]) -> bool:
-    """Tell whether folders are of one drive: by the truth, or where none says it by the times."""
+    """Return whether all folders hold the same drive, from their truths and times."""
     truths = [mission.truth for mission in missions if mission.truth is not None]
     paths = [path for mission in missions for path in mission.paths.values()]
     same = all(np.array_equal(path.time, paths[0].time) for path in paths)
@@ -187,7 +187,7 @@ def _one_drive(missions: Sequence[StoredMission]) -> bool:
 
 
 def _same(path: StoredPath, other: StoredPath) -> bool:
-    """Tell whether two paths are the same, but for rounding."""
+    """Return whether two paths are equal up to rounding."""
     if not np.array_equal(path.time, other.time):
         return False
     off = path.pose - other.pose

@@ -89,8 +89,8 @@ class ComparedStudies:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Told:
-    """A study as far as it is done, and of each of its cases what came of it."""
+class _ReadStudy:
+    """A study's plan, the number of finished worlds, and the trials of each case."""
 
     plan: Plan
     worlds: int
@@ -99,7 +99,7 @@ class _Told:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Pair:
-    """A case in the first study and in another, and what came of it in both."""
+    """A case in the first study and in another, with the trials of both."""
 
     label: str
     cases: tuple[PlannedCase, PlannedCase]
@@ -116,35 +116,35 @@ def compare_studies(folders: Sequence[Path], *, drop_diverged: bool = False) -> 
     which either of two cases diverged; else all count that have a number. Raises InputError: where
     a folder cannot be read, holds no world, or they have no case in common.
     """
-    told = [_read(folder) for folder in folders]
-    varied = tuple(dict.fromkeys(name for one in told for name in one.plan.grid))
-    planned = [cases_of(one.plan) for one in told]
+    studies = [_read(folder) for folder in folders]
+    varied = tuple(dict.fromkeys(name for one in studies for name in one.plan.grid))
+    planned = [cases_of(one.plan) for one in studies]
     parts = alike([[(case.strategy, case.filter) for case in cases] for cases in planned])
     keyed = [{_key(case, varied, parts): case for case in cases} for cases in planned]
     common, alone = matched([tuple(cases) for cases in keyed])
     if not common:
-        raise _nothing_in_common(folders, told)
+        raise _nothing_in_common(folders, studies)
     pairs = [
-        _pair(told, [cases[key] for cases in keyed], other, varied)
+        _pair(studies, [cases[key] for cases in keyed], other, varied)
         for key in common
-        for other in range(1, len(told))
+        for other in range(1, len(studies))
     ]
     left = [(keyed[who[0]][key], who) for key, who in alone.items()]
     return ComparedStudies(
         folders=tuple(folders),
         versions=tuple(map(_version, folders)),
-        done=tuple(one.worlds for one in told),
-        planned=tuple(one.plan.planned for one in told),
+        done=tuple(one.worlds for one in studies),
+        planned=tuple(one.plan.planned for one in studies),
         cases=tuple(
-            case for score in _scored(told) for case in _judged(pairs, score, drop_diverged)
+            case for score in _scored(studies) for case in _judged(pairs, score, drop_diverged)
         ),
-        alone=tuple((_label([case], varied, told[who[0]].trials), who) for case, who in left),
-        settings=differing([plan_settings(one.plan) for one in told]),
+        alone=tuple((_label([case], varied, studies[who[0]].trials), who) for case, who in left),
+        settings=differing([plan_settings(one.plan) for one in studies]),
         dropped_diverged=drop_diverged,
     )
 
 
-def _read(folder: Path) -> _Told:
+def _read(folder: Path) -> _ReadStudy:
     """Read a study's trials, if every file is as it was written."""
     import polars as pl
 
@@ -166,12 +166,12 @@ def _read(folder: Path) -> _Told:
         raise InputError(
             f"{folder}: its trials have not the columns of this version; run the study anew"
         ) from error
-    return _Told(plan=stored.plan, worlds=len(worlds), trials=found)
+    return _ReadStudy(plan=stored.plan, worlds=len(worlds), trials=found)
 
 
-def _scored(told: Sequence[_Told]) -> list[str]:
+def _scored(studies: Sequence[_ReadStudy]) -> list[str]:
     """List the scores that all studies keep and of which there is any number."""
-    tables = [table for one in told for table in one.trials.values()]
+    tables = [table for one in studies for table in one.trials.values()]
     return [
         name
         for name in SCORES
@@ -180,10 +180,10 @@ def _scored(told: Sequence[_Told]) -> list[str]:
     ]
 
 
-def _nothing_in_common(folders: Sequence[Path], told: Sequence[_Told]) -> InputError:
+def _nothing_in_common(folders: Sequence[Path], studies: Sequence[_ReadStudy]) -> InputError:
     """Say what each study tries, where no case is in all."""
     tried = []
-    for folder, one in zip(folders, told, strict=True):
+    for folder, one in zip(folders, studies, strict=True):
         ways = f"{', '.join(one.plan.strategies)} by {', '.join(map(short_name, one.plan.filters))}"
         varied = "; ".join(f"{name} {list(values)}" for name, values in one.plan.grid.items())
         tried.append(f"{folder} tries {ways}" + f" at {varied}" * bool(varied))
@@ -194,13 +194,13 @@ def _nothing_in_common(folders: Sequence[Path], told: Sequence[_Told]) -> InputE
 
 
 def _key(case: PlannedCase, varied: Sequence[str], parts: tuple[bool, bool]) -> Key:
-    """Name a case by what tells cases apart."""
+    """Return the key by which a case is matched between studies."""
     values = tuple(json.dumps(_value(case, name)) for name in varied)
     return *named((case.strategy, case.filter), parts), values
 
 
 def _value(case: PlannedCase, name: str) -> Any:
-    """Return a case's value of a setting; None of the beam's where it is not heard by it."""
+    """Return a case's value of a setting; None for the beam of passive sensing."""
     if name == RADIUS and case.strategy == "passive":
         return None
     value: Any = case.config.model_dump(mode="json")
@@ -212,35 +212,35 @@ def _value(case: PlannedCase, name: str) -> Any:
 def _label(
     cases: Sequence[PlannedCase], varied: Sequence[str], trials: "Mapping[int, pl.DataFrame]"
 ) -> str:
-    """Word what cases have in common; the first is the one whose trials these are."""
-    first, told = cases[0], [worded([(case.strategy, case.filter) for case in cases])]
+    """Name matched cases by what they share; `trials` are those of the first case."""
+    first, words = cases[0], [worded([(case.strategy, case.filter) for case in cases])]
     for name in varied:
         value = _value(first, name)
         if name == RADIUS and first.number in trials:
             value = trials[first.number]["beamwidth_deg"].drop_nulls()[:1].to_list()
-            told += [f"{width:.1f}°" for width in value]
+            words += [f"{width:.1f}°" for width in value]
         elif value is not None:
-            told.append(f"{name} {value if isinstance(value, str) else json.dumps(value)}")
-    return ", ".join(filter(None, told)) or "the case"
+            words.append(f"{name} {value if isinstance(value, str) else json.dumps(value)}")
+    return ", ".join(filter(None, words)) or "the case"
 
 
 def _pair(
-    told: Sequence[_Told], cases: Sequence[PlannedCase], other: int, varied: Sequence[str]
+    studies: Sequence[_ReadStudy], cases: Sequence[PlannedCase], other: int, varied: Sequence[str]
 ) -> _Pair:
     """Put a case of the first study beside that of another."""
     first, second = cases[0], cases[other]
     return _Pair(
-        label=_label(cases, varied, told[0].trials),
+        label=_label(cases, varied, studies[0].trials),
         cases=(first, second),
         values={name: _value(first, name) for name in varied},
         other=other,
         paired=same_worlds(first.config, second.config),
-        trials=(_trials(told[0], first), _trials(told[other], second)),
+        trials=(_trials(studies[0], first), _trials(studies[other], second)),
     )
 
 
 def same_worlds(config: Config, other: Config) -> bool:
-    """Tell whether settings draw the same worlds, number by number.
+    """Return whether two configurations draw the same worlds, number by number.
 
     Returns: what is heard in them may differ, and who maps it.
 
@@ -254,10 +254,10 @@ def same_worlds(config: Config, other: Config) -> bool:
     )
 
 
-def _trials(told: _Told, case: PlannedCase) -> "pl.DataFrame":
-    """Return the trials of a case; none, where worlds were done by a plan that lacked it."""
-    some = next(iter(told.trials.values()))
-    return told.trials.get(case.number, some.clear())
+def _trials(study: _ReadStudy, case: PlannedCase) -> "pl.DataFrame":
+    """Return the trials of a case; an empty table if no world has it."""
+    some = next(iter(study.trials.values()))
+    return study.trials.get(case.number, some.clear())
 
 
 def _judged(pairs: Sequence[_Pair], score: str, drop_diverged: bool) -> list[ComparedCase]:
@@ -295,14 +295,14 @@ def _numbers(
     (worlds, first), (others, second) = (_counted(t, score, drop_diverged) for t in pair.trials)
     if not pair.paired:
         return first, second
-    _, mine, its = np.intersect1d(worlds, others, return_indices=True)
-    return first[mine], second[its]
+    _, own_rows, other_rows = np.intersect1d(worlds, others, return_indices=True)
+    return first[own_rows], second[other_rows]
 
 
 def _counted(
     trials: "pl.DataFrame", score: str, drop_diverged: bool
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Return the worlds that have a number, and it."""
+    """Return the numbers of the worlds that have a score, and the scores."""
     values = trials[score].cast(float).fill_null(np.nan).to_numpy()
     counts = np.isfinite(values)
     if drop_diverged:

@@ -103,7 +103,7 @@ def lettered(folders: Sequence[Path]) -> list[tuple[str, Path]]:
 
 
 def spelt(folder: Path) -> str:
-    r"""Spell a folder's name, what is no character by its bytes or its number.
+    r"""Write a folder's name with unprintable characters escaped.
 
     Examples
     --------
@@ -124,13 +124,13 @@ def scores_of(run: Mapping[str, Any]) -> dict[str, float | None]:
     >>> scores_of({"filter": "ekf", "gated": 3, "diverged": False, "nees_max": None})
     {'gated': 3.0, 'diverged': 0.0, 'nees_max': None}
     """
-    told = {name: value for name, value in run.items() if name not in NOT_SCORES}
-    told |= {f"online_{name}": value for name, value in (run.get("online") or {}).items()}
-    return {name: None if value is None else float(value) for name, value in told.items()}
+    numbers = {name: value for name, value in run.items() if name not in NOT_SCORES}
+    numbers |= {f"online_{name}": value for name, value in (run.get("online") or {}).items()}
+    return {name: None if value is None else float(value) for name, value in numbers.items()}
 
 
 def less(value: float | None, first: float | None) -> float | None:
-    """Subtract, where both are there.
+    """Return the difference of two values; None if one is missing.
 
     Examples
     --------
@@ -167,17 +167,17 @@ def settings_table(compared: Compared) -> "pl.DataFrame":
 
 
 def settings_rows(compared: Compared) -> list[tuple[str | None, ...]]:
-    """Word the settings that differ: its name, then its value in each folder, None of none."""
-    told: dict[str, tuple[Any, ...]] = {}
+    """Return the settings that differ: name, then the value in each folder or None."""
+    unlike: dict[str, tuple[Any, ...]] = {}
     if len(set(compared.versions)) > 1:
-        told["version of Pipistrelle"] = tuple(version or None for version in compared.versions)
+        unlike["version of Pipistrelle"] = tuple(version or None for version in compared.versions)
     return [
-        (name, *map(_worded, values)) for name, values in (told | {**compared.settings}).items()
+        (name, *map(_worded, values)) for name, values in (unlike | {**compared.settings}).items()
     ]
 
 
 def _worded(value: Any) -> str | None:
-    """Word a setting's value."""
+    """Write a setting's value as text."""
     return value if value is None or isinstance(value, str) else json.dumps(value)
 
 
@@ -185,10 +185,10 @@ def _mission_rows(compared: ComparedMissions) -> list[dict[str, Any]]:
     """Lay out the scores of estimates."""
     rows = []
     for estimate in compared.compared:
-        told = [scores_of(scores) for scores in estimate.scores]
-        for score in dict.fromkeys(name for scores in told for name in scores):
+        by_folder = [scores_of(scores) for scores in estimate.scores]
+        for score in dict.fromkeys(name for scores in by_folder for name in scores):
             for (letter, folder), (strategy, name), scores in zip(
-                lettered(compared.folders), estimate.estimates, told, strict=True
+                lettered(compared.folders), estimate.estimates, by_folder, strict=True
             ):
                 value = scores.get(score)
                 rows.append(
@@ -200,7 +200,7 @@ def _mission_rows(compared: ComparedMissions) -> list[dict[str, Any]]:
                         "strategy": strategy,
                         "filter": short_name(name),
                         "value": value,
-                        "difference": less(value, told[0].get(score)),
+                        "difference": less(value, by_folder[0].get(score)),
                     }
                 )
     return rows

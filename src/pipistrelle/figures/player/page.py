@@ -73,12 +73,12 @@ def _numbers(playback: Playback) -> dict[str, Any]:
 def _estimate(estimate: Estimate) -> dict[str, Any]:
     """Lay out what the script is to know of an estimate."""
     known = estimate.strategy in STRATEGY_COLOURS
-    told = {}
+    optional = {}
     if estimate.callers is not None:
-        told["callers"] = _packed(estimate.callers)
+        optional["callers"] = _packed(estimate.callers)
     if len(estimate.detours.landmark):
-        told |= {"detours": _rows(estimate.detours), "resolved": _packed(estimate.resolved)}
-    return told | {
+        optional |= {"detours": _rows(estimate.detours), "resolved": _packed(estimate.resolved)}
+    return optional | {
         "name": _name(estimate),
         "role": estimate.strategy if known else "ink",
         "calls": estimate.strategy != "passive",

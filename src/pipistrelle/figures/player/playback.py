@@ -46,7 +46,7 @@ class Rows:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """What one strategy and filter heard and believed."""
+    """The measurements and beliefs of one strategy and filter, frame by frame."""
 
     strategy: str
     filter: str
@@ -310,7 +310,7 @@ def _mapped(maps: Sequence[Landmarks], origin: Float[np.ndarray, "2"]) -> Rows:
 
 
 def _gone(before: Landmarks | None, after: Landmarks) -> Landmarks:
-    """Return what of a map has no successor in the next."""
+    """Return the map members of a frame that the next frame does not have."""
     rows = after if before is None else before
     kept = np.zeros(len(rows.landmark), bool)
     if before is not None and before is not after:
@@ -337,8 +337,8 @@ def _revised(
     origin: Float[np.ndarray, "2"],
 ) -> tuple[Int[np.ndarray, " j"], Rows]:
     """Return the paths that were told anew, at which frames: the start and each frame so far."""
-    told = [(i, frame.path) for i, frame in enumerate(frames) if frame.path is not None]
-    found = [(int(np.searchsorted(at, i)), path) for i, path in told]
+    revised = [(i, frame.path) for i, frame in enumerate(frames) if frame.path is not None]
+    found = [(int(np.searchsorted(at, i)), path) for i, path in revised]
     found = [(shown, path) for shown, path in found if shown < len(at) - 1]
     if trial.track.online is not None:
         found.append((len(at) - 1, trial.track.pose.mean[:, :2]))

@@ -184,8 +184,8 @@ def _log_still(log: _Log, playback: Playback) -> None:
     log.stream.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     x, y = playback.origin.tolist()
     facts = [*playback.facts, *(e.outcome for e in playback.estimates), f"origin ({x:g}, {y:g}) m"]
-    told = "\n\n".join([f"# {playback.title}", *facts])
-    log.stream.log("about", rerun.TextDocument(told, media_type="text/markdown"), static=True)
+    about = "\n\n".join([f"# {playback.title}", *facts])
+    log.stream.log("about", rerun.TextDocument(about, media_type="text/markdown"), static=True)
     if playback.landmarks is not None:
         labels, places = playback.landmarks
         names = list(map(str, labels.tolist()))
@@ -222,8 +222,8 @@ def _log_estimate(log: _Log, playback: Playback, estimate: Estimate, frame: int)
     if estimate.cloud is not None:
         log.dots(f"{name}/particles", estimate.cloud[frame, :, :2], colour, size=THIN)
     if frame in estimate.revised_at:
-        told = int(np.searchsorted(estimate.revised_at, frame))
-        points = _rows_of(estimate.revised, told)[1]
+        revision = int(np.searchsorted(estimate.revised_at, frame))
+        points = _rows_of(estimate.revised, revision)[1]
         log.lines(f"{name}/revised", [_so_far(points)], colour)
     _log_heard(log, playback, estimate, frame)
     _log_detours(log, estimate, frame)

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from pipistrelle.config import STRATEGIES
 from pipistrelle.figures.chart import Axis
-from pipistrelle.report.effects.wording import the
+from pipistrelle.report.effects.wording import with_article
 from pipistrelle.report.numbers import listed
 from pipistrelle.report.studied import Study, Way, along, combination_name, filter_titles
 from pipistrelle.report.variables import BEAM, Variable, geometric, places
@@ -24,7 +24,7 @@ ASIDE = {"active": 0.985, "fused": 1.015, "passive": 1.0}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Line:
-    """A way's cases along an axis."""
+    """The cases of one filter and strategy along an axis."""
 
     way: Way
     name: str
@@ -50,7 +50,7 @@ class Facet:
 
 
 def axis_of(variable: Variable) -> Axis:
-    """Lay a variable out as an axis, a tick at each of its values.
+    """Return the axis of a variable, with a tick at each value.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def axis_of(variable: Variable) -> Axis:
 
 
 def axis_of_words(words: Sequence[str]) -> Axis:
-    """Lay words out as an axis.
+    """Return an axis whose ticks are words.
 
     Examples
     --------
@@ -103,7 +103,7 @@ def axis_of_words(words: Sequence[str]) -> Axis:
 
 
 def facets_of(study: Study, variable: Variable | None, axis: Axis) -> list[Facet]:
-    """Part a study's cases into panels over one of its variables.
+    """Split a study's cases into panels over one of its variables.
 
     `variable`: along the axis; none: the filters stand there. Returns: a panel per filter and
     combination of the rest, the strategies in it; where these would be many, a panel per filter and
@@ -137,7 +137,7 @@ def beside(
     among: Sequence[str] = STRATEGIES,
     far: float = 1.0,
 ) -> Float[np.ndarray, " k"]:
-    """Move a strategy a little aside from its place along an axis, so that all are about it.
+    """Shift a strategy's points a little along the axis, so that strategies do not overlap.
 
     `among`: the strategies there. `far`: how many times as far as single worlds stand.
     """
@@ -150,16 +150,16 @@ def beside(
 
 
 def each_combination(study: Study, variable: Variable) -> str:
-    """Say of lines that they are the combinations of all but one variable.
+    """Describe lines, one for each combination of all variables but one.
 
     `variable`: along the axis.
     """
     others = [other for other in study.variables if other is not variable]
     first = combination_name(study, 0, [variable])
     what = (
-        f"value of {the(others[0])}"
+        f"value of {with_article(others[0])}"
         if len(others) == 1
-        else (f"combination of {listed([the(other) for other in others])}")
+        else (f"combination of {listed([with_article(other) for other in others])}")
     )
     return f"a line for each {what}, that of {first} the strongest"
 

@@ -17,7 +17,7 @@ from pipistrelle.report.charts.axes import (
 )
 from pipistrelle.report.effects.comparing import Effect, effects_of, families_of, mean_change
 from pipistrelle.report.effects.measures import Measure, measures_of
-from pipistrelle.report.effects.wording import the
+from pipistrelle.report.effects.wording import with_article
 from pipistrelle.report.numbers import UNITS
 from pipistrelle.report.studied import (
     COMMON,
@@ -74,7 +74,7 @@ def about(
     edges: Float[np.ndarray, "n 2"],
     filled: Sequence[bool],
 ) -> Series:
-    """Return points with bars.
+    """Return a series of points with error bars.
 
     `edges`: ends of the bars.
     """
@@ -104,11 +104,11 @@ def _panel(
     measure: Measure, family: Sequence[Effect], axis: Axis, at: Mapping[str, float]
 ) -> Panel:
     """Chart what changes in one measure, a series per strategy."""
-    mine: dict[str, list[Effect]] = {}
+    ways: dict[str, list[Effect]] = {}
     for effect in family:
         if effect.measure == measure:
-            mine.setdefault(effect.contrast.strategy, []).append(effect)
-    series = [_changes(list(mine), strategy, axis, at, one) for strategy, one in mine.items()]
+            ways.setdefault(effect.contrast.strategy, []).append(effect)
+    series = [_changes(list(ways), strategy, axis, at, one) for strategy, one in ways.items()]
     sign = UNITS[measure.unit][1]
     label = "ratio" if measure.ratio else f"change{f' [{sign}]' if sign else ''}"
     still = 1.0 if measure.ratio else 0.0
@@ -129,7 +129,7 @@ def _changes(
     at: Mapping[str, float],
     effects: Sequence[Effect],
 ) -> Series:
-    """Return the differences of one strategy, none at the value that others are compared with."""
+    """Return the differences of one strategy; the difference is 0 at the reference value."""
     measure, findings = effects[0].measure, [effect.finding for effect in effects]
     mean, edges = _bars(findings)
     mean, edges = np.append(0.0, mean), np.vstack(([np.nan, np.nan], edges))
@@ -177,7 +177,7 @@ def _gain_chart(selection: Selection, variable: Variable) -> Chart:
     return Chart(
         name=f"gain_by_{slug(variable.name)}" if several else "gain",
         title="What listening to others adds to one's own calls"
-        + (f", over {the(variable)}" if several else ""),
+        + (f", over {with_article(variable)}" if several else ""),
         caption=f"RMSE of active minus that of fused in the same world, {spread}; "
         "above the line fused is better. Full: shown, by Holm's correction over the panel. Map: "
         "landmarks that every strategy has placed",
@@ -211,7 +211,7 @@ def _mean_gains(selection: Selection, name: str, score: str, variable: Variable)
         [((name, "fused", i), (name, "active", i)) for i in row]
         for row in along(selection.study, variable).tolist()
     ]
-    samples = [mean_change(selection, measure, mine) for mine in pairs]
+    samples = [mean_change(selection, measure, at_value) for at_value in pairs]
     findings = judge([Statement(label="", sample=sample) for sample in samples])
     shown = [finding.holds is not None for finding in findings]
     mean, edges = _bars(findings)

@@ -21,7 +21,7 @@ from pipistrelle.report.charts.axes import (
     facets_of,
     slug,
 )
-from pipistrelle.report.effects.wording import the
+from pipistrelle.report.effects.wording import with_article
 from pipistrelle.report.numbers import UNITS
 from pipistrelle.report.studied import (
     COMMON,
@@ -164,11 +164,11 @@ def _chart(selection: Selection, what: Level, variable: Variable | None) -> Char
     axis = axis_of(variable) if variable else axis_of_words([*filter_titles(study).values()])
     facets = facets_of(study, variable, axis)
     found = [_drawn(selection, what, facet, axis) for facet in facets]
-    lines = [s for mine in found for s in mine if not MARKS[s.style].pinned]
+    lines = [s for drawn in found for s in drawn if not MARKS[s.style].pinned]
     vertical = _vertical(what, lines)
     name, title = what.name, what.title
     if variable and len(study.variables) > 1:
-        name, title = f"{name}_by_{slug(variable.name)}", f"{title}, over {the(variable)}"
+        name, title = f"{name}_by_{slug(variable.name)}", f"{title}, over {with_article(variable)}"
     return Chart(
         name=name,
         title=title,
@@ -202,15 +202,15 @@ def _many(study: Study, what: Level, variable: Variable) -> str:
 
 def _caption(what: Level, variable: Variable | None) -> str:
     """Say what a chart shows."""
-    said = what.caption
+    words = what.caption
     if what.worlds:
-        said += PASSIVE if variable and variable.name == BEAM else ""
-        said += ", triangles: those beyond the panel"
-    return said + what.more
+        words += PASSIVE if variable and variable.name == BEAM else ""
+        words += ", triangles: those beyond the panel"
+    return words + what.more
 
 
 def _drawn(selection: Selection, what: Level, facet: Facet, axis: Axis) -> list[Series]:
-    """Draw the lines of a panel, single worlds above each, and what stands dashed beside it."""
+    """Draw the lines of a panel, single worlds above each, and the dashed bound."""
     found, apart = [], axis.words and not facet.many
     for line in facet.lines:
         at = selection.study.trials[line.way].at[line.cells]
@@ -279,7 +279,7 @@ def _worlds_above(
 
 
 def _dashed(selection: Selection, line: Line, what: Level, *, apart: bool) -> Series:
-    """Return the mean of what stands beside a level, over the worlds that count."""
+    """Return the dashed line beside a level: a mean over the worlds that count."""
     beneath = [what.scale * mean_std(one)[0] for one in _samples(selection, line, what.beside)]
     return Series(
         name=f"{line.name}, {what.named}",

@@ -35,7 +35,7 @@ def table_ii_charts(selection: Selection) -> list[Chart]:
     panels = []
     for kind, score in (("fully initialised", "landmarks_full"), ("total", "landmarks_total")):
         found = {title: _beside(selection, name, score) for name, title in FILTERS.items()}
-        axis = linear_axis("landmarks", ends(s for _, mine in found.values() for s in mine))
+        axis = linear_axis("landmarks", ends(s for _, drawn in found.values() for s in drawn))
         for title, (rows, series) in found.items():
             names = tuple((float(i), text) for i, text in enumerate(rows))
             limits = (-0.6, len(rows) - 0.4)
@@ -68,7 +68,7 @@ PAPERS: tuple[Figure, ...] = (
 
 
 def answers(name: str) -> bool:
-    """Tell whether a figure shows what the answer speaks of.
+    """Return whether a figure shows a score that the answer names.
 
     `name`: of the chart.
 

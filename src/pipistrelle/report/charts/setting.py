@@ -17,7 +17,7 @@ from pipistrelle.report.variables import width_name
 
 
 def model_charts(study: Study) -> list[Chart]:
-    """Charts that no result changes.
+    """Chart the study's emitters and an example world.
 
     Returns: without the map where the world cannot be drawn.
     """
@@ -55,15 +55,15 @@ def piston(study: Study) -> Chart:
 
 
 def example_map(study: Study, world: Scenario) -> Chart:
-    """Chart a world of the study.
+    """Chart one world of the study: path, landmarks and callers.
 
     `world`: its example.
 
     Bradley & Abaid, Sec. IV.
     """
-    setup, told, series = study.configs[0].scenario, "", _world(world)
+    setup, circle, series = study.configs[0].scenario, "", _world(world)
     if setup.field == "disc" and setup.world is None:
-        told = f"; the dashed circle has a radius of {setup.radius:g} m"
+        circle = f"; the dashed circle has a radius of {setup.radius:g} m"
         series = (_disc(setup.radius), *series)
     x, y = _square(series)
     count, others = len(world.landmarks), [caller.name for caller in world.callers[VEHICLE + 1 :]]
@@ -72,7 +72,7 @@ def example_map(study: Study, world: Scenario) -> Chart:
         name="example_map",
         title="A world of the study",
         caption=f"World {study.worlds[0]}{_where(study)}: {shown}, and the vehicle's true path of "
-        f"{world.time[-1]:g} s{told}",
+        f"{world.time[-1]:g} s{circle}",
         panels=(Panel(title="", x=x, y=y, series=series, equal=True),),
         columns=("x_m", "y_m"),
     )
@@ -88,7 +88,7 @@ def _square(series: Sequence[Series]) -> tuple[Axis, Axis]:
 
 
 def _where(study: Study) -> str:
-    """Say which of the study's worlds is drawn, where the combinations meet others."""
+    """Say which combination's world is drawn, if the worlds differ between combinations."""
     return f" where {combination_name(study, 0)}" if study.drawing.any() else ""
 
 
@@ -100,7 +100,7 @@ def _beam(config: Config, width: float, strength: float) -> list[Series]:
     name, angle = width_name(width), np.radians(np.linspace(-90.0, 90.0, 361))
     pressure, edge = (piston_directivity(at, radius=radius, **tone) for at in (angle, half))
     ka = HALF_POWER / float(np.sin(half[0]))
-    told = f"{name}\nradius: {1e3 * radius:.1f} mm\nka: {ka:.1f}"
+    tip = f"{name}\nradius: {1e3 * radius:.1f} mm\nka: {ka:.1f}"
     look = {"name": name, "role": "active", "strength": strength}
     return [
         Series(x=pressure * np.sin(angle), y=pressure * np.cos(angle), **look),
@@ -108,7 +108,7 @@ def _beam(config: Config, width: float, strength: float) -> list[Series]:
             x=edge * np.sin(half),
             y=edge * np.cos(half),
             style="marks",
-            tips=(told,),
+            tips=(tip,),
             listed=False,
             **look,
         ),

@@ -40,9 +40,9 @@ def _anees_chart(selection: Selection, name: str, title: str) -> Chart:
     runs = min((_runs(selection, way) for way in lines), default=0)
     alike = _drives_alike(study)
     if runs and alike:
-        for way, mine in lines.items():
-            mine.insert(0, _ideal(study, way, runs))
-    vertical = log_axis("ANEES", ends(s for mine in lines.values() for s in mine) or [1.0, 9.0])
+        for way, of_way in lines.items():
+            of_way.insert(0, _ideal(study, way, runs))
+    vertical = log_axis("ANEES", ends(s for of_way in lines.values() for s in of_way) or [1.0, 9.0])
     lap = lap_time(study) if alike else math.inf
     panels = [
         Panel(
@@ -66,22 +66,22 @@ def _anees_chart(selection: Selection, name: str, title: str) -> Chart:
 
 def _caption(study: Study, runs: int, *, alike: bool) -> str:
     """Say what the lines are, and what is grey and dotted."""
-    said = []
+    clauses = []
     if [variable.name for variable in study.variables] == [BEAM]:
-        said.append("The stronger a line, the narrower the beam")
+        clauses.append("The stronger a line, the narrower the beam")
     elif study.variables:
         which = "the lower" if study.variables[0].numbers else "the earlier listed"
         of = listed([variable.name for variable in study.variables])
-        said.append(f"A line for each combination of {of}; the stronger, {which}")
+        clauses.append(f"A line for each combination of {of}; the stronger, {which}")
     if alike:
         one = ", at one beamwidth or another" if BEAM in {v.name for v in study.variables} else ""
-        said.append(
+        clauses.append(
             "grey: where a consistent filter's ANEES over "
             f"{runs} world{'' if runs == 1 else 's'} lies with 95 %, after a start that is exact "
             f"and thought uncertain{one}"
         )
-        said.append("dotted: the vehicle is back at its start")
-    words = "; ".join(said)
+        clauses.append("dotted: the vehicle is back at its start")
+    words = "; ".join(clauses)
     return words[:1].upper() + words[1:]
 
 
@@ -93,7 +93,7 @@ def _runs(selection: Selection, way: Way) -> int:
 
 
 def _drives_alike(study: Study) -> bool:
-    """Tell whether all combinations drive the same laps at the same times."""
+    """Return whether all combinations drive the same laps at the same times."""
     frames = next(iter(study.trials.values())).nees.shape[2]
     drives = {
         (lap_time(study, i), *frame_time(study, frames, i)[-1:].tolist(), config.scenario.steps)

@@ -73,12 +73,12 @@ def findings(selections: Mapping[Rule, Selection]) -> list[dict[str, str]]:
 
 def _headline(selection: Selection) -> str:
     """Answer in a line."""
-    placed = [mine for (_, score), mine in selection.gains.items() if score == COMMON]
-    decided = [finding for mine in placed for finding in mine if finding.n > 1]
+    placed = [family for (_, score), family in selection.gains.items() if score == COMMON]
+    decided = [finding for family in placed for finding in family if finding.n > 1]
     if not any(placed):
         return "Not decided: the study has no pair of active and fused."
     if not decided:
-        return f"Not decided: {_left([finding for mine in placed for finding in mine])}."
+        return f"Not decided: {_left([finding for family in placed for finding in family])}."
     better = sum(finding.holds is True for finding in decided)
     worse = sum(finding.holds is False for finding in decided)
     fuller = _fuller(selection)
@@ -97,18 +97,18 @@ def _headline(selection: Selection) -> str:
 
 
 def _left(findings: Sequence[Finding]) -> str:
-    """Say how few worlds there are, where too few for any of these."""
+    """Say that one world or none is left for these findings."""
     one = max(finding.n for finding in findings) == 1
     return "a single world is left" if one else "no world is left"
 
 
 def _narrow(findings: Sequence[Finding]) -> bool:
-    """Tell whether what is better, if anything, is so in the narrower half of the beams alone."""
+    """Return whether fused is better only in the narrower half of the beamwidths."""
     return all(finding.holds is not True for finding in findings[len(findings) // 2 :])
 
 
 def _fuller(selection: Selection) -> bool:
-    """Tell whether fused places more landmarks than active on average wherever worlds are left."""
+    """Return whether fused places more landmarks than active, on average, in every case."""
     study = selection.study
     pairs = [
         samples(selection, "landmarks_full", [(name, "fused", i), (name, "active", i)])
@@ -121,18 +121,18 @@ def _fuller(selection: Selection) -> bool:
 
 
 def _otherwise(by_rule: dict[Rule, str]) -> list[str]:
-    """Give the answers under all exclusion rules, where they are not one."""
+    """Return the answer under each exclusion rule if the rules disagree."""
     answers: dict[str, list[str]] = {}
     for rule, answer in by_rule.items():
         answers.setdefault(answer, []).append(WITHOUT[rule])
     if len(answers) == 1:
         return []
-    said = (" and ".join(rules) + f": {answer}" for answer, rules in answers.items())
-    return [line[0].upper() + line[1:] for line in said]
+    lines = (" and ".join(rules) + f": {answer}" for answer, rules in answers.items())
+    return [line[0].upper() + line[1:] for line in lines]
 
 
 def _pairs(selection: Selection, name: str) -> dict[str, str]:
-    """Word the means of active and of fused sensing at the narrowest and the widest beam."""
+    """Describe the means of active and fused sensing at the narrowest and the widest beam."""
     study, words = selection.study, {}
     scores = ((LANDMARKS, "landmarks placed", ".0f"), (POSITION_BOUND, "position bound [m]", ".3f"))
     for score, title, digits in scores:

@@ -71,7 +71,7 @@ def differences(
     sigma: bool = False,
     fitted: Callable[[float], bool] = lambda width: False,
 ) -> list[Statement]:
-    """State something of one way's score minus another's, at each combination.
+    """Make a statement on the difference of two ways' scores for each combination.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def differences(
 
 
 def approach(selection: Selection, score: str, name: str) -> Float[np.ndarray, " m"] | None:
-    r"""How fast fused leaves passive as the beam widens.
+    r"""Return by how much fused departs from passive per doubling of the beamwidth.
 
     In each world, the distance of the two scores fitted by a line over the octaves of the
     beamwidth:
@@ -145,16 +145,16 @@ def approach(selection: Selection, score: str, name: str) -> Float[np.ndarray, "
 
 
 def curves(selection: Selection, ways: Sequence[Way]) -> list[Float[np.ndarray, "m b k"]] | None:
-    """NEES over time, in the worlds where every case of these ways counts and has a number."""
+    """Return the NEES over time in the worlds where all cases of these ways count."""
     trials = selection.study.trials
     if not set(ways) <= trials.keys():
         return None
     nees = [trials[way].nees for way in ways]
-    cells = [(*way, i) for way, mine in zip(ways, nees, strict=True) for i in range(mine.shape[1])]
+    cells = [(*way, i) for way, one in zip(ways, nees, strict=True) for i in range(one.shape[1])]
     counts = kept(selection, cells)
-    for mine in nees:
-        counts &= np.all(np.isfinite(mine), axis=(1, 2))
-    return [mine[counts] for mine in nees]
+    for one in nees:
+        counts &= np.all(np.isfinite(one), axis=(1, 2))
+    return [one[counts] for one in nees]
 
 
 def departure(
@@ -241,5 +241,5 @@ def lap_time(study: Study, number: int = 0) -> float:
 
 
 def _gain(name: str) -> tuple[Way, Way]:
-    """Name the two ways whose difference is what fused sensing gains with a filter."""
+    """Return the two ways whose difference is the gain of fused sensing with a filter."""
     return (name, "active"), (name, "fused")

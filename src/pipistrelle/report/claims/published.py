@@ -84,7 +84,7 @@ def cell_of(study: Study, printed: Printed) -> Cell | None:
 
 
 def row_name(printed: Printed) -> str:
-    """Word a row as the table does.
+    """Name a row as Table II does.
 
     Examples
     --------

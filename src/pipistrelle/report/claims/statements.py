@@ -30,7 +30,7 @@ from pipistrelle.report.studied import COMMON, HEADING, POSITION, Selection, sam
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Part:
-    """Statements that together say one thing."""
+    """Statements that are judged together as one part of a claim."""
 
     sentence: str
     unit: str
@@ -41,7 +41,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Claim:
-    """What is claimed, before a study has been asked."""
+    """A claim of the paper: its sentence, its parts and how they are made from a study."""
 
     sentence: str
     parts: Callable[[Selection], list[Part]]

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from pipistrelle.evaluation.comparison import Finding, judge
 from pipistrelle.report.claims.statements import CLAIMS, Claim, Part
-from pipistrelle.report.effects.comparing import plain
+from pipistrelle.report.effects.comparing import json_finding
 from pipistrelle.report.studied import Rule, Selection
 
 Verdict = Literal["reproduced", "not-reproduced", "open"]
@@ -96,7 +96,7 @@ def judge_claims(
 
 
 def with_everything(claim: JudgedClaim) -> Finding | None:
-    """Find the statement that decides a claim as it is where nothing is left out.
+    """Find the deciding statement of a claim with all worlds counted.
 
     Returns: none where nothing decides.
     """
@@ -149,14 +149,14 @@ def _judged(parts: Sequence[Part], confidence: float) -> Judgement:
     findings = iter(judge([s for part in parts for s in part.statements], confidence))
     judged = []
     for part in parts:
-        mine = tuple(next(findings) for _ in part.statements)
+        of_part = tuple(next(findings) for _ in part.statements)
         judged.append(
             JudgedPart(
                 sentence=part.sentence,
                 unit=part.unit,
                 need=part.need,
-                findings=mine,
-                holds=_holds([finding.holds for finding in mine], part.need),
+                findings=of_part,
+                holds=_holds([finding.holds for finding in of_part], part.need),
             )
         )
     pairs = [(finding, part) for part in judged for finding in part.findings]
@@ -170,7 +170,7 @@ def _judged(parts: Sequence[Part], confidence: float) -> Judgement:
 
 
 def _holds(found: Sequence[bool | None], need: str) -> bool | None:
-    """Decide a part; of nothing, nothing."""
+    """Decide a part from its statements; an empty part is undecided."""
     if not found:
         return None
     enough = len(found) // 2 + 1 if need == "most" else len(found)
@@ -188,7 +188,7 @@ def _verdict(parts: Sequence[bool | None]) -> Verdict:
 
 
 def _holds_throughout(part: Sequence[JudgedPart]) -> bool | None:
-    """Decide a part by what it is under every rule: what changes is undecided."""
+    """Decide a part over all exclusion rules; it is undecided if the rules disagree."""
     if all(judged.holds for judged in part):
         return True
     refuted = all(judged.holds is False for judged in part)
@@ -196,12 +196,12 @@ def _holds_throughout(part: Sequence[JudgedPart]) -> bool | None:
 
 
 def _failings(part: JudgedPart) -> set[float]:
-    """Tell in which directions the refuted statements of a part miss: too low, -1, or too high."""
+    """Return the directions in which refuted statements miss: too low (-1) or too high (1)."""
     return {_side(finding) for finding in part.findings if finding.holds is False}
 
 
 def _side(finding: Finding) -> float:
-    """Tell on which side of where it should be a mean lies."""
+    """Return the direction in which a refuted mean misses its claim: -1 too low, 1 too high."""
     if finding.relation in ("above", "not above"):
         return -1.0 if finding.relation == "above" else 1.0
     return math.copysign(1.0, finding.mean - (finding.relation != "within") * finding.margin)
@@ -260,26 +260,26 @@ def _statistic(judgement: Judgement) -> dict[str, Any]:
             "p": None,
             "n": 0,
         }
-    plain = _plain(finding)
+    json_finding = _plain(finding)
     return {
-        "statistic": plain["mean"],
+        "statistic": json_finding["mean"],
         "of": finding.label,
         "unit": judgement.unit,
-        "interval": plain["interval"],
-        "sigma": plain["sigma"],
-        "p": plain["p"],
+        "interval": json_finding["interval"],
+        "sigma": json_finding["sigma"],
+        "p": json_finding["p"],
         "n": finding.n,
     }
 
 
 def _plain(finding: Finding) -> dict[str, Any]:
-    """Lay a finding out as JSON can hold it, with what was claimed."""
+    """Return a finding and its claim as JSON values."""
     return {
         "label": finding.label,
         "relation": finding.relation,
         "margin": finding.margin if math.isfinite(finding.margin) else None,
         "sigma": finding.sigma if math.isfinite(finding.sigma) else None,
         "fitted": finding.fitted,
-        **plain(finding),
+        **json_finding(finding),
         "holds": finding.holds,
     }

@@ -10,7 +10,7 @@ from pipistrelle.config import STRATEGIES
 from pipistrelle.report.effects.comparing import FILTER, STRATEGY, Effect, families_of
 from pipistrelle.report.effects.levels import error_of
 from pipistrelle.report.effects.measures import is_first
-from pipistrelle.report.effects.wording import VERBS, direction, sentence, the
+from pipistrelle.report.effects.wording import VERBS, direction, sentence, with_article
 from pipistrelle.report.numbers import listed
 from pipistrelle.report.studied import POSITION, Rule, Selection, Study, filter_titles
 from pipistrelle.report.variables import BEAM, Variable, two_sided
@@ -22,10 +22,10 @@ OTHERWISE: Rule = "case"
 
 
 def question(study: Study) -> str:
-    """Put the question that a study asks."""
+    """Return the question that a study answers, in words."""
     if study.variables:
         verb = "do" if len(study.variables) > 1 else "does"
-        return f"What {verb} {listed([the(v) for v in study.variables])} change?"
+        return f"What {verb} {listed([with_article(v) for v in study.variables])} change?"
     titles = list(filter_titles(study).values())
     ways = [way for way in STRATEGIES if any(way == strategy for _, strategy in study.trials)]
     if len(ways) > 1:
@@ -78,23 +78,30 @@ def _headline(
 ) -> str:
     """Say in a line what a variable does to the position RMSE."""
     named = [family for (factor, _), family in families.items() if factor == variable.name]
-    mine = [effect for family in named for effect in family]
-    ends = [effect for effect in mine if effect.contrast.end and is_first(effect.measure)]
+    of_variable = [effect for family in named for effect in family]
+    ends = [effect for effect in of_variable if effect.contrast.end and is_first(effect.measure)]
     if not ends:
-        return f"nothing that was heard depends on {the(variable)}"
+        return f"nothing that was heard depends on {with_article(variable)}"
     if few := _few(ends):
         return few
     several = two_sided(variable) or (variable.numbers is None and len(variable.given) > 2)
-    if said := _by_value(variable, ends) if several else _by_direction(study, variable, ends):
-        return said + _of_gain(mine, several)
-    if any(is_first(effect.measure) and direction(effect.finding) for effect in mine):
-        words = f"{the(variable)} changes the position RMSE, but no effect from end to end is shown"
-        return words + _of_gain(mine, several)
-    moved = [effect.measure.title for effect in mine if direction(effect.finding)]
+    if (
+        words_found := _by_value(variable, ends)
+        if several
+        else _by_direction(study, variable, ends)
+    ):
+        return words_found + _of_gain(of_variable, several)
+    if any(is_first(effect.measure) and direction(effect.finding) for effect in of_variable):
+        words = (
+            f"{with_article(variable)} changes the position RMSE, but no effect from end to end is "
+            "shown"
+        )
+        return words + _of_gain(of_variable, several)
+    moved = [effect.measure.title for effect in of_variable if direction(effect.finding)]
     if others := list(dict.fromkeys(moved)):
-        of = f"no effect of {the(variable)} on the position RMSE is shown"
+        of = f"no effect of {with_article(variable)} on the position RMSE is shown"
         return f"{of}, but one on the {listed(others)}"
-    return f"no effect of {the(variable)} is shown"
+    return f"no effect of {with_article(variable)} is shown"
 
 
 def _of_gain(effects: Sequence[Effect], several: bool) -> str:
@@ -112,14 +119,14 @@ def _of_gain(effects: Sequence[Effect], several: bool) -> str:
 
 
 def _few(effects: Sequence[Effect]) -> str:
-    """Say that nothing is decided, where there are not two worlds to decide it."""
+    """Say that nothing is decided if fewer than two worlds are left."""
     most = max(effect.finding.n for effect in effects)
     left = "a single world is left" if most else "no world is left"
     return f"not decided: {left}" if most < 2 else ""
 
 
 def _by_direction(study: Study, variable: Variable, ends: Sequence[Effect]) -> str:
-    """Say what another number does, or the second of two words."""
+    """Describe the effect of a larger value, or of the second of two words."""
     if variable.name == BEAM:
         what = "a wider beam"
     elif variable.numbers is None:
@@ -128,18 +135,18 @@ def _by_direction(study: Study, variable: Variable, ends: Sequence[Effect]) -> s
         what = f"a {'lower' if variable.base else 'higher'} {variable.name}"
     moved = {sign: [e for e in ends if direction(e.finding) == sign] for sign in VERBS}
     parts = []
-    for sign, mine in moved.items():
-        if mine and len(mine) == len(ends):
+    for sign, some in moved.items():
+        if some and len(some) == len(ends):
             return f"{what} {VERBS[sign]} the position RMSE"
-        if mine:
+        if some:
             that = "that" if parts else "the position RMSE"
-            parts.append(f"{VERBS[sign]} {that} of {_whose(study, mine, len(ends))}")
+            parts.append(f"{VERBS[sign]} {that} of {_whose(study, some, len(ends))}")
     return f"{what} {listed(parts)}" if parts else ""
 
 
 def _by_value(variable: Variable, ends: Sequence[Effect]) -> str:
-    """Say which of several values raise or lower it, against the first or the truth."""
-    said = {}
+    """List the values that raise or lower the position RMSE against the reference value."""
+    clauses = {}
     for sign, verb in VERBS.items():
         moved = [effect for effect in ends if direction(effect.finding) == sign]
         found = {effect.contrast.after for effect in moved}
@@ -148,15 +155,15 @@ def _by_value(variable: Variable, ends: Sequence[Effect]) -> str:
             count = sum(effect.contrast.after in found for effect in ends)
             those = f"{verb[:-1] if len(values) > 1 else verb} the position RMSE"
             some = f" in {len(moved)} of {count} cases" if len(moved) < count else ""
-            said[verb] = f"{listed(values)} {those}{some}"
-    if not said:
+            clauses[verb] = f"{listed(values)} {those}{some}"
+    if not clauses:
         return ""
     first = variable.words[variable.base]
-    return f"{variable.name}: against {first}, {listed(list(said.values()))}"
+    return f"{variable.name}: against {first}, {listed(list(clauses.values()))}"
 
 
 def _whose(study: Study, effects: Sequence[Effect], count: int) -> str:
-    """Name whose errors change, where they are few."""
+    """Name the cases whose errors change, or count them if they are many."""
     if len(effects) > 4:
         return f"{len(effects)} of {count} cases"
     titles = filter_titles(study)
@@ -168,31 +175,31 @@ def _whose(study: Study, effects: Sequence[Effect], count: int) -> str:
 def _compared(families: Mapping[tuple[str, str], Sequence[Effect]]) -> list[str]:
     """Say in a line how strategies compare, or else filters."""
     for factor in (STRATEGY, FILTER):
-        mine = [
+        compared = [
             effect
             for (name, _), family in families.items()
             if name == factor
             for effect in family
             if is_first(effect.measure)
         ]
-        if not mine:
+        if not compared:
             continue
-        return [few] if (few := _few(mine)) else _decided(factor, mine)
+        return [few] if (few := _few(compared)) else _decided(factor, compared)
     return []
 
 
 def _decided(factor: str, effects: Sequence[Effect]) -> list[str]:
     """Say which of two strategies or filters is ahead, where that is shown."""
-    said = []
+    clauses = []
     sensing = " sensing" if factor == STRATEGY else ""
     pairs = dict.fromkeys((e.contrast.before, e.contrast.after) for e in effects)
     for before, after in pairs:
-        mine = [e for e in effects if (e.contrast.before, e.contrast.after) == (before, after)]
+        of_pair = [e for e in effects if (e.contrast.before, e.contrast.after) == (before, after)]
         for sign, verb in VERBS.items():
-            moved = sum(direction(effect.finding) == sign for effect in mine)
+            moved = sum(direction(effect.finding) == sign for effect in of_pair)
             if moved:
-                some = f" in {moved} of {len(mine)} cases" if moved < len(mine) else ""
+                some = f" in {moved} of {len(of_pair)} cases" if moved < len(of_pair) else ""
                 what = f"{after} instead of {before}{sensing}"
-                said.append(f"{what} {verb} the position RMSE{some}")
+                clauses.append(f"{what} {verb} the position RMSE{some}")
     names = list(dict.fromkeys(name for pair in pairs for name in pair))
-    return said or [f"no difference in position RMSE between {listed(names)}{sensing} is shown"]
+    return clauses or [f"no difference in position RMSE between {listed(names)}{sensing} is shown"]

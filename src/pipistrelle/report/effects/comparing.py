@@ -62,7 +62,7 @@ class Contrast:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Effect:
-    """What the worlds say of a contrast in one measure."""
+    """A contrast judged in one measure over the worlds."""
 
     contrast: Contrast
     measure: Measure
@@ -125,7 +125,7 @@ def mean_change(
 
 
 def resolvable(finding: Finding) -> float:
-    """Tell how small an effect would have been significant.
+    """Return the smallest effect that would have been significant.
 
     `finding`: an undecided one. Returns: half the width of its interval, in the sample's unit;
     infinite where nothing could be.
@@ -160,8 +160,8 @@ def record(by_rule: Mapping[Rule, Sequence[Effect]], headline: Rule) -> list[dic
     ]
 
 
-def plain(finding: Finding, *, effect: bool = False, ratio: bool = False) -> dict[str, Any]:
-    """Lay a finding out as JSON can hold it.
+def json_finding(finding: Finding, *, effect: bool = False, ratio: bool = False) -> dict[str, Any]:
+    """Return a finding as JSON values.
 
     `effect`: its interval is the one that shows its size; else the one by which a claim is judged.
     `ratio`: its numbers are logarithms of ratios, and become these. Returns: what is not finite is
@@ -190,7 +190,7 @@ def _plain_effect(effect: Effect) -> dict[str, Any]:
     would = math.nan if finding.holds is not None or effect.untouched else resolvable(finding)
     would = math.exp(would) if ratio and would < 700.0 else would
     return {
-        **plain(finding, effect=True, ratio=ratio),
+        **json_finding(finding, effect=True, ratio=ratio),
         "shown": finding.holds is not None,
         "untouched": effect.untouched,
         "would_have_shown": would if math.isfinite(would) else None,
@@ -198,10 +198,10 @@ def _plain_effect(effect: Effect) -> dict[str, Any]:
 
 
 def _plain_apart(effect: Effect) -> list[dict[str, Any]]:
-    """Lay out what an effect is at each combination of the rest."""
+    """Return the effect at each combination of the other variables, as JSON values."""
     return [
         {"at": name}
-        | plain(one, effect=True, ratio=effect.measure.ratio)
+        | json_finding(one, effect=True, ratio=effect.measure.ratio)
         | {"shown": one.holds is not None}
         for name, one in zip(effect.contrast.names, effect.apart, strict=False)
     ]
@@ -277,7 +277,7 @@ def _of_filters(study: Study) -> Iterator[Contrast]:
 def _everywhere(
     study: Study, before: tuple[str, str], after: tuple[str, str]
 ) -> tuple[tuple[Pair, ...], tuple[str, ...]]:
-    """Pair two ways at every combination at which one of them has a case of its own."""
+    """Pair the cases of two ways at every combination where they differ."""
     at = np.array([study.trials[way].at for way in (before, after)])
     numbers = np.sort(np.unique(at, axis=1, return_index=True)[1]).tolist()
     pairs = tuple(((*before, i), (*after, i)) for i in numbers)
@@ -285,7 +285,7 @@ def _everywhere(
 
 
 def _judged(selection: Selection, family: Sequence[Contrast], measure: Measure) -> Iterator[Effect]:
-    """Judge a family of contrasts in one measure; what nothing touches needs no judging."""
+    """Judge a family of contrasts in one measure; contrasts without any change are left out."""
     samples = [mean_change(selection, measure, contrast.pairs) for contrast in family]
     untouched = [len(sample) > 0 and not sample.any() for sample in samples]
     means = _findings(samples, untouched)
@@ -295,22 +295,22 @@ def _judged(selection: Selection, family: Sequence[Contrast], measure: Measure) 
         else []
         for contrast in family
     ]
-    flat = [sample for mine in apart for sample in mine]
+    flat = [sample for each in apart for sample in each]
     singles = iter(_findings(flat, [len(one) > 0 and not one.any() for one in flat]))
-    for contrast, finding, same, mine in zip(family, means, untouched, apart, strict=True):
+    for contrast, finding, same, each in zip(family, means, untouched, apart, strict=True):
         yield Effect(
             contrast=contrast,
             measure=measure,
             finding=finding,
             untouched=same,
-            apart=tuple(next(singles) for _ in mine),
+            apart=tuple(next(singles) for _ in each),
         )
 
 
 def _findings(
     samples: Sequence[Float[np.ndarray, " m"]], untouched: Sequence[bool]
 ) -> list[Finding]:
-    """Judge samples as a family, without those that are nothing but zeros."""
+    """Judge samples as one family; samples of zeros are left out."""
     statements = [Statement(label="", sample=sample) for sample in samples]
     touched = [one for one, same in zip(statements, untouched, strict=True) if not same]
     judged = iter(judge(touched))

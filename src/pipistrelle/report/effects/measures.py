@@ -80,11 +80,11 @@ def _numbers(study: Study, score: str, cells: Sequence[Cell]) -> list[Float[np.n
     """Return a score of cases; of maps, over the landmarks that all who met them have placed."""
     found: dict[Cell, Float[np.ndarray, " n"]] = {}
     for drawing in {study.drawing[number] for _, _, number in cells}:
-        mine = [cell for cell in cells if study.drawing[cell[2]] == drawing]
-        if score == MAP and len(mine) > 1:
-            found |= zip(mine, _shared_maps(study, mine), strict=True)
+        alike = [cell for cell in cells if study.drawing[cell[2]] == drawing]
+        if score == MAP and len(alike) > 1:
+            found |= zip(alike, _shared_maps(study, alike), strict=True)
         else:
-            found |= {cell: values(study, score, cell) for cell in mine}
+            found |= {cell: values(study, score, cell) for cell in alike}
     return [found[cell] for cell in cells]
 
 

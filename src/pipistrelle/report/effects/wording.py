@@ -19,7 +19,7 @@ def direction(finding: Finding) -> int:
     return {True: 1, False: -1, None: 0}[finding.holds]
 
 
-def the(variable: Variable) -> str:
+def with_article(variable: Variable) -> str:
     """Name a variable within a sentence: the beamwidth takes an article, a setting takes none."""
     return f"the {variable.name}" if variable.name == BEAM else variable.name
 
@@ -52,10 +52,10 @@ def _subject(study: Study, effect: Effect) -> str:
     if variable is None:
         sensing = " sensing" if contrast.factor == STRATEGY else ""
         return f"{contrast.after} instead of {contrast.before}{sensing}"
-    words = f"{the(variable)} from {contrast.before} to {contrast.after}"
+    words = f"{with_article(variable)} from {contrast.before} to {contrast.after}"
     if variable.numbers is None:
         words = f"{variable.name} = {contrast.after} instead of {contrast.before}"
-    others = [the(other) for other in study.variables if other is not variable]
+    others = [with_article(other) for other in study.variables if other is not variable]
     return f"{words}, on average over {listed(others)}," if len(contrast.pairs) > 1 else words
 
 

@@ -10,7 +10,7 @@ from pipistrelle.evaluation.scores import shown_in
 from pipistrelle.report.effects.comparing import STRATEGY, Contrast, Effect
 from pipistrelle.report.effects.levels import times_the_bound
 from pipistrelle.report.effects.measures import measures_of
-from pipistrelle.report.effects.wording import direction, the, variable_of
+from pipistrelle.report.effects.wording import direction, variable_of, with_article
 from pipistrelle.report.numbers import amount, interval, three_digits
 from pipistrelle.report.studied import (
     POSITION,
@@ -136,7 +136,7 @@ def _heading(study: Study, effect: Effect) -> dict[str, Any]:
         ends = f", from {contrast.before} to {variable.words[0 if variable.base else -1]}"
     if two_sided(variable):
         ends = f", against {contrast.before}"
-    title = the(variable) + ends
+    title = with_article(variable) + ends
     return {
         "name": variable.name,
         "title": title[0].upper() + title[1:] if title.startswith("the ") else title,

@@ -42,7 +42,7 @@ def exclusion_rows(study: Study) -> list[dict[str, Any]]:
     """
     rows = []
     for name in filter_titles(study):
-        mine = {strategy: t for (other, strategy), t in study.trials.items() if other == name}
+        ways = {strategy: t for (other, strategy), t in study.trials.items() if other == name}
         rows.append(
             {
                 "filter": name,
@@ -51,9 +51,9 @@ def exclusion_rows(study: Study) -> list[dict[str, Any]]:
                 "excluded": int(np.sum(lost_worlds(study, name))),
                 "paper": EXCLUDED.get(name),
                 "paper_worlds": WORLDS,
-                "diverged": {way: int(np.sum(t.diverged & ~t.failed)) for way, t in mine.items()},
-                "trials": {way: int(t.failed.size) for way, t in mine.items()},
-                "failed": int(sum(np.sum(t.failed) for t in mine.values())),
+                "diverged": {way: int(np.sum(t.diverged & ~t.failed)) for way, t in ways.items()},
+                "trials": {way: int(t.failed.size) for way, t in ways.items()},
+                "failed": int(sum(np.sum(t.failed) for t in ways.values())),
             }
         )
     return rows
@@ -96,8 +96,8 @@ def not_the_papers_line(rows: list[dict[str, Any]]) -> str:
     >>> not_the_papers_line([{"setting": "scenario.steps", "here": 200, "paper": 1500}])
     "Not the paper's study: scenario.steps 200 (paper 1500)"
     """
-    said = [f"{r['setting']} {_worded(r['here'])} (paper {_worded(r['paper'])})" for r in rows]
-    return f"Not the paper's study: {', '.join(said)}" if said else ""
+    parts = [f"{r['setting']} {_worded(r['here'])} (paper {_worded(r['paper'])})" for r in rows]
+    return f"Not the paper's study: {', '.join(parts)}" if parts else ""
 
 
 def table_ii_rows(selection: Selection) -> list[dict[str, Any]]:
@@ -175,9 +175,9 @@ def by_strategy(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         groups.setdefault((row["filter"], row["strategy"]), []).append(row)
     keys = ("anees", "expected", "inside", "above", "departure")
     return [
-        {"filter": name, "strategy": strategy, "n": min(row["n"] for row in mine)}
-        | {key: float(np.mean([row[key] for row in mine])) for key in keys}
-        for (name, strategy), mine in groups.items()
+        {"filter": name, "strategy": strategy, "n": min(row["n"] for row in group)}
+        | {key: float(np.mean([row[key] for row in group])) for key in keys}
+        for (name, strategy), group in groups.items()
     ]
 
 

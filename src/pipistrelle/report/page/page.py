@@ -64,28 +64,28 @@ def write_report(
     `pipistrelle.own_files.claim`: an earlier report is replaced, and nothing else.
     """
     own = claim(folder, REPORT, overwrite=True)
-    told = answered(study, claims)
-    rules = sorted(RULES, key=lambda rule: rule != told.rule)  # the one that answers is printed
-    found = {rule: study_charts(told.selections[rule], charts) for rule in rules}
+    result = answered(study, claims)
+    rules = sorted(RULES, key=lambda rule: rule != result.rule)  # the one that answers is printed
+    found = {rule: study_charts(result.selections[rule], charts) for rule in rules}
     models = model_charts(study)
-    drawn, texts = [*_distinct(found), *models], _csv_texts(told, found, models)
+    drawn, texts = [*_distinct(found), *models], _csv_texts(result, found, models)
 
     def draw(room: Path) -> None:
         for chart in drawn:
             progress(chart.name)
             _write_figure(chart, room)
 
-    numbers = summary(told)
+    numbers = summary(result)
     files = drawn_files(draw, "figures/")
     files |= {f"figures/{name}.csv": text.encode() for name, text in texts.items()}
-    files["index.html"] = page(told, found, models, numbers).encode()
+    files["index.html"] = page(result, found, models, numbers).encode()
     files["summary.json"] = (json.dumps(numbers, indent=1, allow_nan=False) + "\n").encode()
     own.replace(files)
     return numbers
 
 
 def page(
-    told: Answered,
+    result: Answered,
     found: dict[Rule, list[Chart]],
     models: list[Chart],
     numbers: dict[str, Any],
@@ -94,14 +94,14 @@ def page(
 
     `numbers`: as ``summary.json`` holds it. Returns: HTML.
     """
-    here, study = files("pipistrelle.report.page"), told.study
+    here, study = files("pipistrelle.report.page"), result.study
     figures = [_figure(chart.name, found) for chart in _distinct(found)]
     return _template().render(
         study=study,
-        papers=told.papers,
-        headline=told.rule,
-        question=told.question,
-        claims=told.claims,
+        papers=result.papers,
+        headline=result.rule,
+        question=result.question,
+        claims=result.claims,
         summary=numbers,
         few=FEW,
         intervals=INTERVALS,
@@ -125,7 +125,7 @@ def page(
         spoken=SPOKEN,
         tally=tally,
         with_everything=with_everything,
-        departures=overview.not_the_papers_line(numbers["not_the_papers"]) if told.papers else "",
+        departures=overview.not_the_papers_line(numbers["not_the_papers"]) if result.papers else "",
         consistency=overview.by_strategy(numbers["consistency"]),
         config=to_toml(study.config),
     )
@@ -156,15 +156,15 @@ def _side_by_side(figures: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def _distinct(found: Mapping[Any, list[Chart]]) -> list[Chart]:
     """Return each figure once: under the first rule under which there is one."""
     charts: dict[str, Chart] = {}
-    for mine in found.values():
-        for chart in mine:
+    for listed in found.values():
+        for chart in listed:
             charts.setdefault(chart.name, chart)
     return list(charts.values())
 
 
 def _figure(name: str, found: Mapping[Any, list[Chart]]) -> dict[str, Any]:
     """Gather one figure under all exclusion rules; None under those that leave nothing."""
-    named = {rule: chart for rule, mine in found.items() for chart in mine if chart.name == name}
+    named = {rule: chart for rule, some in found.items() for chart in some if chart.name == name}
     by_rule: dict[str, dict[str, Any] | None] = dict.fromkeys(found)
     for rule, chart in named.items():
         panels = [_panel(panel) for panel in chart.panels]
@@ -177,9 +177,9 @@ def _figure(name: str, found: Mapping[Any, list[Chart]]) -> dict[str, Any]:
 
 def _panel(panel: Panel) -> dict[str, Any]:
     """Gather a panel: its drawing, its numbers and their names."""
-    said = readings(panel)
-    names = list(dict.fromkeys(name for _, _, numbers in said for name, _ in numbers))
-    return {"panel": panel, "svg": panel_svg(panel), "readings": said, "names": names}
+    numbers_read = readings(panel)
+    names = list(dict.fromkeys(name for _, _, numbers in numbers_read for name, _ in numbers))
+    return {"panel": panel, "svg": panel_svg(panel), "readings": numbers_read, "names": names}
 
 
 def _write_figure(chart: Chart, folder: Path) -> None:
@@ -191,22 +191,22 @@ def _write_figure(chart: Chart, folder: Path) -> None:
 
 
 def _csv_texts(
-    told: Answered, found: dict[Rule, list[Chart]], models: list[Chart]
+    result: Answered, found: dict[Rule, list[Chart]], models: list[Chart]
 ) -> dict[str, str]:
     """Write the numbers behind each figure, under all exclusion rules."""
     texts = {chart.name: csv_text(csv_rows(chart)) for chart in models}
     for chart in _distinct(found):
         rows: list[list[str]] = []
-        for rule, mine in found.items():
-            for other in mine:
+        for rule, listed in found.items():
+            for other in listed:
                 if other.name == chart.name:
                     new = csv_rows(other, exclusion=rule)
                     rows += new[1:] if rows else new
         texts[chart.name] = csv_text(rows)
-    if not told.papers:
+    if not result.papers:
         return texts
     table = []
-    for rule, selection in told.selections.items():
+    for rule, selection in result.selections.items():
         for row in overview.table_ii_rows(selection):
             flat = {"exclusion": rule}
             for key, value in row.items():

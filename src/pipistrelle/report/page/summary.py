@@ -73,9 +73,9 @@ def answered(study: Study, claims: Sequence[Claim] | None = None) -> Answered:
     )
 
 
-def summary(told: Answered) -> dict[str, Any]:
+def summary(result: Answered) -> dict[str, Any]:
     """Lay out everything that the page says, for programs."""
-    study, selection = told.study, told.selections[told.rule]
+    study, selection = result.study, result.selections[result.rule]
     return {
         "format": FORMAT,
         "version": __version__,
@@ -92,27 +92,27 @@ def summary(told: Answered) -> dict[str, Any]:
             for v in study.variables
         ],
         "not_the_papers": overview.not_the_papers(study),
-        "question": told.question,
-        "answer": told.answer,
-        "findings": told.findings,
-        "answered_by": told.rule,
-        "effect_tables": [] if told.papers else tables_of(told),
-        "effects": comparing.record(told.effects, told.rule),
+        "question": result.question,
+        "answer": result.answer,
+        "findings": result.findings,
+        "answered_by": result.rule,
+        "effect_tables": [] if result.papers else tables_of(result),
+        "effects": comparing.record(result.effects, result.rule),
         "cases": case_rows(selection),
-        "claims": [record(claim) for claim in told.claims],
+        "claims": [record(claim) for claim in result.claims],
         "exclusion_rules": dict(RULES),
         "exclusions": overview.exclusion_rows(study),
         "trials_failed": overview.failed_trials(study),
-        "table_ii": overview.table_ii_rows(selection) if told.papers else [],
+        "table_ii": overview.table_ii_rows(selection) if result.papers else [],
         "consistency": overview.consistency_rows(selection),
         "failed": [asdict(failure) for failure in study.errors],
     }
 
 
-def tables_of(told: Answered) -> list[dict[str, Any]]:
+def tables_of(result: Answered) -> list[dict[str, Any]]:
     """Lay out what each variable changes, in words."""
     return effect_tables(
-        told.selections[told.rule], told.effects[told.rule], told.effects[OTHERWISE]
+        result.selections[result.rule], result.effects[result.rule], result.effects[OTHERWISE]
     )
 
 
