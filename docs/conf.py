@@ -25,7 +25,10 @@ author = "The Pipistrelle developers"
 release = pipistrelle.__version__
 version = release.partition("+")[0]
 
-suppress_warnings = ["config.cache"]  # the gallery is given a function
+suppress_warnings = [
+    "config.cache",  # the gallery is given a function
+    "ref.python",  # words of a type's description that are fields of several records
+]
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
