@@ -103,7 +103,7 @@ def bounds(kind):
         return " or ".join(f"`{choice}`" for choice in kind["enum"])
     if kind["type"] in WORDS:
         return WORDS[kind["type"]]
-    if "items" in kind and kind["items"]:
+    if kind.get("items"):
         return f"numbers, each {bounds(kind['items'])}"
     if kind["type"] == "array":
         inner = [bounds(part) for part in kind["prefixItems"]]

@@ -9,6 +9,7 @@ from pathlib import Path
 import numba
 import pytest
 
+from pipistrelle import kernel_clock
 from pipistrelle.__main__ import main
 from pipistrelle.experiments.runs import compiling
 from pipistrelle.experiments.studies import study, world
@@ -53,6 +54,7 @@ def failing(monkeypatch):
 
 @pytest.mark.parametrize(("words", "said"), [((), 1), (("--quiet",), 0)])
 def test_compiling_is_told_of_when_kernels_are_compiled(capsys, monkeypatch, words, said):
+    monkeypatch.setattr(kernel_clock._CLOCK, "said", False)  # as in a new process
     monkeypatch.setattr(compiling, "run_mission", lambda *_: numba.njit(lambda x: x + 1)(1.0))
     line = ("study", "small.toml", "--iterations", "1", "--workers", "1", "-o", "one")
     assert main([*line, *words]) == 0

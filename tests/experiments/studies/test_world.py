@@ -490,18 +490,17 @@ def test_hearing_more_never_raises_the_bound(bounded):
 def test_twice_the_noise_that_the_signal_tells_raises_the_bound_and_no_constant_does(
     plan, monkeypatch
 ):
-    def doubled(heard):
-        rows, stds = told(heard).rows, ("bearing_std", "range_std")
-        more = {name: 2.0 * getattr(rows, name) for name in stds}
-        return replace(heard, rows=with_columns(rows, **more))
+    def doubled(*given, **named):
+        rows, stds = known(*given, **named), ("bearing_std", "range_std")
+        return with_columns(rows, **{name: 2.0 * getattr(rows, name) for name in stds})
 
-    told, short = trial.measured, replace(plan, strategies=("active",), filters=("ekf",))
+    known, short = trial.as_told, replace(plan, strategies=("active",), filters=("ekf",))
     before = run_world(short, 0)
     coarse = short.config.filter.model_copy(update={"range_std": 0.4, "bearing_std": 0.3})
     stated = replace(short, config=short.config.model_copy(update={"filter": coarse}))
-    monkeypatch.setattr(trial, "measured", doubled)
+    monkeypatch.setattr(trial, "as_told", doubled)
     after = run_world(short, 0)
-    monkeypatch.setattr(trial, "measured", told)
+    monkeypatch.setattr(trial, "as_told", known)
     pairs = zip(before, after, strict=True)
     share = [b.scores.heading_bound_rad / a.scores.heading_bound_rad for a, b in pairs]
     assert max(share) > 1.03
