@@ -159,7 +159,8 @@ def test_layers_leave_alone_what_they_do_not_name(tmp_path):
         ),
         (
             "[[callers]]\nspeed = 1.0",
-            "callers.1: found speed, which a caller that stands has not; leave one of them out",
+            "callers.1: found speed, which a caller that stands has not; add way-points or "
+            'course = "circle", or leave it out',
         ),
         (
             "[[callers]]\ncourse = 'circle'\ndistance = 3",

@@ -257,7 +257,11 @@ class CallerConfig(Section):
         may, called = _WAYS[self.way]
         for key in given:
             if key not in may and key != ("course" if self.way == self.course else self.way):
-                raise ValueError(f"found {key}, which {called} has not; leave one of them out")
+                moving = [words for keys, words in _WAYS.values() if key in keys]
+                fix = "leave one of them out"
+                if self.way == "stand":
+                    fix = f"add {' or '.join(moving)}, or leave it out"
+                raise ValueError(f"found {key}, which {called} has not; {fix}")
         if self.place is not None and self.distance is not None:
             raise ValueError("found a place and a distance, expected one of them; leave one out")
         if self.speed == 0.0:

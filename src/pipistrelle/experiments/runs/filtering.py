@@ -88,6 +88,8 @@ def run_filter(
             scan if associate is known_labels else _named(scan, belief, associate, noise)
         )
         belief = estimator.update(belief, named, rng)
+        if not hasattr(belief, "pose"):
+            raise _wrong_return(estimator, "update", belief, "the belief after the scan")
         pose = belief.pose()
         path.mean[k], path.covariance[k] = pose.mean, pose.covariance
         _follow(callers, scan, belief, (k, time.size))
@@ -136,10 +138,20 @@ def _carried(
 ) -> B:
     """Carry a belief through steps of a drive, and write the poses after each into the path."""
     controls, dt = drive.controls[steps], np.diff(drive.time[steps.start : steps.stop + 1])
-    belief, poses = estimator.predict(belief, controls, dt, rng)
+    predicted = estimator.predict(belief, controls, dt, rng)
+    if not (isinstance(predicted, tuple) and len(predicted) == 2):
+        raise _wrong_return(estimator, "predict", predicted, "the belief and the pose of each step")
+    belief, poses = predicted
     poses, after = _whole("predict", poses, len(dt)), slice(steps.start + 1, steps.stop + 1)
     path.mean[after], path.covariance[after] = poses.mean, poses.covariance
     return belief
+
+
+def _wrong_return(estimator: Estimator[B], method: str, found: object, expected: str) -> InputError:
+    """Say what an estimator's method returned in place of what is expected."""
+    name = f"{type(estimator).__module__}.{type(estimator).__qualname__}.{method}"
+    fix = "does it lack its return?" if found is None else "correct it"
+    return InputError(f"{name}: found {type(found).__name__} returned, expected {expected}; {fix}")
 
 
 def _first_belief(estimator: Estimator[B], drive: Drive, scans: Sequence[Scan]) -> B:

@@ -31,8 +31,10 @@ def sentence(study: Study, effect: Effect) -> str:
     if effect.untouched:
         return f"{change} leaves {owner} as it is, to the last digit"
     if finding.n < 2:
-        return f"{change} has too few worlds to tell of {owner}"
-    sign = direction(finding)
+        return f"{change} has numbers of too few worlds to tell of {owner}"
+    sign, worlds = direction(finding), len(study.worlds)
+    if finding.n < worlds:
+        owner = f"{owner}, in the {finding.n} of {worlds} worlds that have a number,"
     if not finding.std > 0.0:
         return f"{change} changes {owner} by {amount(finding.mean, unit)} in every world alike"
     if sign:

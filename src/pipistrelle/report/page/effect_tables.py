@@ -69,6 +69,9 @@ def effect_tables(
             }
             for below, (name, by_score, contrary) in enumerate(cells)
         ]
+    for cell in (c for t in tables.values() for row in t["rows"] for c in row["cells"] if c):
+        if 1 < cell["n"] < len(study.worlds):
+            cell["text"] += f" ({cell['n']} of {len(study.worlds)} worlds)"
     return list(tables.values())
 
 
