@@ -105,6 +105,8 @@ class Axis:
     none, it takes the ticks."""
     words: bool = False
     """The numbers are no more than the order of those names: the CSV has the names."""
+    slanted: bool = False
+    """The ticks' words are written upwards, for they are too long to stand side by side."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -88,6 +88,9 @@ def _draw_panel(axes: "Axes", panel: Panel) -> None:
     for axis, given in ((axes.xaxis, panel.x), (axes.yaxis, panel.y)):
         axis.set_minor_locator(NullLocator())
         axis.set_ticks([value for value, _ in given.ticks], [text for _, text in given.ticks])
+        if given.slanted:
+            for label in axis.get_ticklabels():
+                label.set(rotation=35, ha="right", rotation_mode="anchor")
     if panel.span:
         axes.axhspan(*panel.span[:2], color="#d0d0d0", alpha=0.55, lw=0, zorder=0.5)
     for y in panel.rules:

@@ -509,17 +509,13 @@ def test_predictions_that_are_not_one_pose_for_each_step_are_refused(left):
 @pytest.mark.parametrize("method", ["predict", "update"])
 def test_a_method_that_returns_nothing_is_refused_by_its_name(method):
     forgetful = type("Forgetful", (Ledger,), {method: lambda self, *given: None})
-    with pytest.raises(
-        InputError, match=rf"Forgetful\.{method}: found NoneType returned"
-    ):
+    with pytest.raises(InputError, match=rf"Forgetful\.{method}: found NoneType returned"):
         run_filter(forgetful(), drive(5), [scan_with([3], [0.1], time=0.5)], RNG(7))
 
 
 def test_a_prediction_without_its_poses_is_refused():
     alone = type("Alone", (Ledger,), {"predict": lambda self, belief, *given: belief})
-    with pytest.raises(
-        InputError, match=r"Alone\.predict: found .* returned, expected"
-    ):
+    with pytest.raises(InputError, match=r"Alone\.predict: found .* returned, expected"):
         run_filter(alone(), drive(5), [scan_with([3], [0.1], time=0.5)], RNG(7))
 
 

@@ -31,12 +31,14 @@ def test_beams_stand_on_a_logarithmic_axis_in_degrees():
     assert [text for _, text in axis.ticks][::11] == ["11", "180"]
 
 
-def test_words_stand_side_by_side_and_long_ones_are_shortened_in_the_middle():
+def test_words_stand_side_by_side_or_slanted_and_long_ones_are_shortened_in_the_middle():
     axis = axis_of(setting_variable("rays.weights", ["instantaneous", "aggregated"]))
-    assert (axis.words, axis.log) == (True, False)
+    assert (axis.words, axis.log, axis.slanted) == (True, False, False)
     assert [text for _, text in axis.ticks] == ["instantaneous", "aggregated"]
+    few = axis_of_words([f"measurement number {k}" for k in range(6)])
+    assert (len(few.ticks[0][1]), few.slanted) == (8, False)
     many = axis_of_words([f"measurement number {k}" for k in range(8)])
-    assert all(len(text) <= 6 for _, text in many.ticks)
+    assert ({len(text) for _, text in many.ticks}, many.slanted) == ({12}, True)
     assert len({text for _, text in many.ticks}) == 8, "their ends tell them apart"
     assert many.named[3] == (3.0, "measurement number 3")
 

@@ -16,6 +16,10 @@ from pipistrelle.report.variables import BEAM, Variable, geometric, places
 
 MOST_PANELS = 6
 """Further combinations become lines of one panel for each filter and strategy."""
+SHORTEST = 8
+"""Letters to which words are cut that stand side by side; longer ones are slanted."""
+SLANTED_LETTERS = 12
+"""To which slanted words are cut."""
 MOST_LETTERS = 52
 """Of all that is written along an axis."""
 ASIDE = {"active": 0.985, "fused": 1.015, "passive": 1.0}
@@ -92,13 +96,16 @@ def axis_of_words(words: Sequence[str]) -> Axis:
     ((0.0, 'EKF'), (1.0, 'FastSLAM 2.0'))
     """
     named = tuple((float(i), word) for i, word in enumerate(words))
-    longest = max(MOST_LETTERS // len(named), 3)
+    longest = MOST_LETTERS // len(named)
+    slanted = longest < SHORTEST and max(map(len, words)) > longest
+    longest = SLANTED_LETTERS if slanted else max(longest, 3)
     return Axis(
         label="",
         limits=(-0.6, len(named) - 0.4),
         ticks=tuple((i, _shortened(word, longest)) for i, word in named),
         named=named,
         words=True,
+        slanted=slanted,
     )
 
 

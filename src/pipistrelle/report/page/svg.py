@@ -20,6 +20,8 @@ WIDTH, HEIGHT = 400.0, 280.0
 """Of a panel, in its own units, which are pixels on a small screen."""
 LEFT, RIGHT, TOP, BOTTOM = 54.0, 8.0, 10.0, 42.0
 """Margins."""
+SLANT = 34.0
+"""Further room for slanted words."""
 READINGS = 80
 """Most places along a panel where its numbers are read out."""
 
@@ -119,7 +121,8 @@ class _Frame(NamedTuple):
 def _frame(panel: Panel) -> _Frame:
     """Lay a panel out; one of equal axes fills its width and has no margins."""
     if not panel.equal:
-        return _Frame(panel, LEFT, WIDTH - RIGHT, TOP, HEIGHT - BOTTOM, HEIGHT)
+        bottom = HEIGHT - BOTTOM - (SLANT if panel.x.slanted else 0.0)
+        return _Frame(panel, LEFT, WIDTH - RIGHT, TOP, bottom, HEIGHT)
     (left, right), (low, high) = panel.x.limits, panel.y.limits
     height = WIDTH * (high - low) / (right - left)
     return _Frame(panel, 0.0, WIDTH, 0.0, height, height)
@@ -162,7 +165,12 @@ def _grid(panel: Panel, frame: _Frame) -> list[Markup]:
     for value, text in panel.x.ticks:
         x = float(_across(frame, value))
         parts.append(Markup(f'<path class="grid" d="M{x:.1f} {TOP:g}V{bottom:g}"/>'))
-        parts.append(_text(text, x, bottom + 16, "middle"))
+        if panel.x.slanted:
+            place = f"translate({x + 4.0:.1f} {bottom + 14.0:.1f}) rotate(-35)"
+            words = Markup('<text text-anchor="end" transform="{}">{}</text>')
+            parts.append(words.format(place, text))
+        else:
+            parts.append(_text(text, x, bottom + 16, "middle"))
     for value in panel.rules:
         y = float(_down(frame, value))
         parts.append(Markup(f'<path class="rule" d="M{LEFT:g} {y:.1f}H{right:g}"/>'))
