@@ -19,13 +19,6 @@ _PARTIAL = re.compile(r"(.+)\.[0-9a-f]{8}\.partial")
 def check_ordinary(path: Path) -> None:
     """Refuse to read what stands in a file's place and is none; a missing file passes.
 
-    Raises
-    ------
-    InputError
-        For a folder, a pipe or a device, also behind a link.
-
-    Examples
-    --------
     >>> check_ordinary(Path("/dev/null"))
     Traceback (most recent call last):
     pipistrelle.config.InputError: /dev/null: found a pipe or a device, expected a file; put what it
@@ -38,27 +31,13 @@ def check_ordinary(path: Path) -> None:
 
 
 def read_file(path: Path) -> bytes:
-    """Read a file as bytes.
-
-    Raises
-    ------
-    InputError
-        As `check_ordinary`.
-    OSError
-        Where it is missing or cannot be read.
-    """
+    """Read a file as bytes."""
     check_ordinary(path)
     return path.read_bytes()
 
 
 def read_text(path: Path) -> str:
-    """Read a file as UTF-8 text, without a byte order mark.
-
-    Raises
-    ------
-    InputError
-        Where it is missing, is no ordinary file, cannot be read, or is not text.
-    """
+    """Read a file as UTF-8 text, without a byte order mark."""
     try:
         return read_file(path).decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except InputError:
@@ -89,8 +68,6 @@ def partial_of(path: Path) -> Path:
 def whole_name(partial: str) -> str | None:
     """Return the name of the file that a partial one was to become; None of any other name.
 
-    Examples
-    --------
     >>> whole_name("mission.png.0f3a9c2e.partial"), whole_name("debian.iso.partial")
     ('mission.png', None)
     """
@@ -101,13 +78,6 @@ def whole_name(partial: str) -> str | None:
 def write_down(path: Path, data: bytes) -> None:
     """Write a new file down to the disk, so that a rename cannot outlive its content.
 
-    Raises
-    ------
-    OSError
-        Where it cannot be written; also where anything stands there, a link to nothing too.
-
-    Examples
-    --------
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as place:
     ...     write_down(Path(place) / "one.partial", b"word")
@@ -123,22 +93,8 @@ def write_down(path: Path, data: bytes) -> None:
 def write_whole(path: Path, data: bytes, *, replace: bool = True) -> None:
     """Write a file that is whole or not there, whatever stops the writing.
 
-    Parameters
-    ----------
-    path : Path
-    data : bytes
-    replace : bool
-        Whether what stands there is replaced; a link itself is, never what it points at.
+    `replace`: whether what stands there is replaced; a link itself is, never what it points at.
 
-    Raises
-    ------
-    OSError
-        Where it cannot be written; what stood there is then as it was.
-    FileExistsError
-        Where something stands there that is not to be replaced.
-
-    Examples
-    --------
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as parent:
     ...     write_whole(Path(parent) / "one.txt", b"word")
@@ -157,20 +113,9 @@ def write_whole(path: Path, data: bytes, *, replace: bool = True) -> None:
 def put_in_place(partial: Path, path: Path, *, replace: bool = True) -> None:
     """Rename a file that is whole, unless another process did so, and swept ours away.
 
-    Parameters
-    ----------
-    partial, path : Path
-        Its name so far, and the one that it is to have.
-    replace : bool
-        Whether what stands there is replaced.
+    `partial`, `path`: its name so far, and the one that it is to have; `replace`: whether what
+    stands there is replaced.
 
-    Raises
-    ------
-    OSError
-        Where it cannot be renamed; also where neither of the two is there.
-
-    Examples
-    --------
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as place:
     ...     partial, whole = Path(place) / "one.partial", Path(place) / "one"

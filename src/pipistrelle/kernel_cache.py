@@ -70,14 +70,7 @@ class CheckedFiles(IndexDataCacheFile):
 def checked(dispatcher: Any) -> Any:
     """Let a compiled function keep its code in checked files.
 
-    Parameters
-    ----------
-    dispatcher : what `numba.njit` returns
-        Where compilation is switched off, the function itself.
-
-    Returns
-    -------
-    The same.
+    Where compilation is switched off, the function itself takes the dispatcher's place.
     """
     if cache := getattr(dispatcher, "_cache", None):
         files = cache._cache_file

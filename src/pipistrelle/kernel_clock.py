@@ -63,10 +63,7 @@ def _say(line: str) -> None:
 def announce(tell: Callable[[str], object] | None = _say) -> None:
     """Name who is told when the first kernel of this process is compiled.
 
-    Parameters
-    ----------
-    tell : function of a line, optional
-        Called at most once in a process; None: nobody is told.
+    `tell`: called at most once in a process; None: there is no message.
     """
     _CLOCK.tell = tell
 

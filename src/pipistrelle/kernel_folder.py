@@ -46,10 +46,7 @@ def place_kernels() -> None:
 def sources_key() -> str:
     """Hash the interpreter's version and every source that compiles a kernel.
 
-    Returns
-    -------
-    str
-        Sixteen hexadecimal digits.
+    Returns sixteen hexadecimal digits.
     """
     digest = sha256(sys.version.encode())
     for source in sorted(Path(__file__).parent.rglob("*.py")):

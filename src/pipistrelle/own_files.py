@@ -94,24 +94,9 @@ def claim(
 
     Whether it can be written is tried; nothing is left there by that.
 
-    Parameters
-    ----------
-    folder : Path
-    kind : Kind
-        What is to stand there.
-    overwrite : bool
-        Whether what we wrote there may be replaced.
-    flags : str, str
-        How the user names another folder, and allows to replace.
+    `kind`: kind of result; `overwrite`: whether what we wrote there may be replaced;
+    `flags`: how the user names another folder, and allows to replace.
 
-    Raises
-    ------
-    InputError
-        Where the folder cannot be had or written, holds anything else, or where what would be
-        replaced is not as we wrote it.
-
-    Examples
-    --------
     >>> with TemporaryDirectory() as name:
     ...     own = claim(Path(name) / "new", LOG, overwrite=False)
     ...     own.replace({"log.toml": b"format = 1"})
@@ -152,13 +137,7 @@ def claim(
 
 
 def make_folder(folder: Path) -> list[Path]:
-    """Make a folder; return what of it and of those around it was missing, the innermost first.
-
-    Raises
-    ------
-    OSError
-        Where it cannot be made; nothing is left of it.
-    """
+    """Make a folder; return what of it and of those around it was missing, the innermost first."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -178,16 +157,7 @@ def remove_empty(folders: Iterable[Path]) -> None:
 def drawn_files(draw: Callable[[Path], None], under: str = "") -> dict[str, bytes]:
     """Return what is drawn into a folder that is lent for it, by names below another.
 
-    Parameters
-    ----------
-    draw : function of a folder
-    under : str
-        What stands before each name, as in "figures/".
-
-    Raises
-    ------
-    InputError
-        Where there is no room for it among the system's temporary files.
+    `under` is put before each name, as in "figures/".
     """
     try:
         with TemporaryDirectory(prefix="pipistrelle-") as place:
@@ -236,13 +206,7 @@ class OwnFiles:
         return name in self._sums
 
     def read(self, name: str) -> bytes:
-        """Read a file that is as we wrote it.
-
-        Raises
-        ------
-        InputError
-            Where it is missing, cannot be read, or is not as we wrote it.
-        """
+        """Read a file if it is unchanged since we wrote it."""
         path = self.folder / name
         try:
             data = read_file(path)
@@ -259,12 +223,7 @@ class OwnFiles:
         return data
 
     def check_kind(self) -> None:
-        """Refuse a folder in which another kind of ours stands.
-
-        Raises
-        ------
-        InputError
-        """
+        """Refuse a folder that holds results of another kind."""
         if self._there not in (None, self.kind.title):
             raise InputError(
                 f"{self.folder}: holds {self._there} of Pipistrelle, which {self.kind.title} does "
@@ -272,26 +231,14 @@ class OwnFiles:
             )
 
     def check(self) -> None:
-        """Refuse a folder in which what would be replaced is not as we wrote it.
-
-        Raises
-        ------
-        InputError
-            With the file.
-        """
+        """Refuse a folder that holds changed files under the names to be replaced."""
         self.check_kind()
         named = (name for name in _names_in(self.folder) if _matches(name, self.kind.names))
         for name in sorted({*named, *self._sums}):
             self.refuse(name)
 
     def refuse(self, name: str) -> None:
-        """Refuse to write a file where something stands that is not as we wrote it.
-
-        Raises
-        ------
-        InputError
-            With what stands there, or a link on the way to it.
-        """
+        """Refuse to replace a file that we did not write or that was changed since."""
         if "\n" in name:
             raise InputError(f"{name!r}: holds a line break; choose another name")
         if self._there is None and os.path.lexists(self.folder / SUMS):
@@ -337,13 +284,7 @@ class OwnFiles:
         self._write(files, keep=False)
 
     def add(self, name: str, content: bytes) -> None:
-        """Write one file beside the others, in place of what we wrote there before.
-
-        Raises
-        ------
-        InputError
-            As `replace`, of this file.
-        """
+        """Write one file beside the others, in place of what we wrote there before."""
         self.check_kind()
         self._write({name: content}, keep=True)
 

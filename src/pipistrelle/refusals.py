@@ -21,18 +21,8 @@ _IN_WORDS = {"bool_parsing": "true or false", "bool_type": "true or false", "tup
 def refusal(where: object, found: str, expected: str, fix: str) -> InputError:
     """Return the error that says where it is, what was found, what was expected and the fix.
 
-    Parameters
-    ----------
-    where : object
-        A path, perhaps with a line or a key, as text.
-    found, expected, fix : str
+    `where`: A path, perhaps with a line or a key, as text.
 
-    Returns
-    -------
-    InputError
-
-    Examples
-    --------
     >>> str(refusal("posts.csv, line 3", "x 'left'", "a finite number", "correct the field"))
     "posts.csv, line 3: found x 'left', expected a finite number; correct the field"
     """
@@ -62,17 +52,8 @@ def shown(value: Any) -> str:
 def expectation(fault: Any) -> str:
     """Say what a setting should have been.
 
-    Parameters
-    ----------
-    fault : ErrorDetails
-        One of the errors of pydantic's ValidationError.
+    `fault` is one of the errors of pydantic's ValidationError.
 
-    Returns
-    -------
-    str
-
-    Examples
-    --------
     >>> expectation({"msg": "Input should be greater than 0"})
     'greater than 0'
     """
@@ -85,18 +66,8 @@ def expectation(fault: Any) -> str:
 def values_expected(fault: Any, field: FieldInfo) -> int | None:
     """Count the values that a tuple should have had, where the fault is their number.
 
-    Parameters
-    ----------
-    fault : ErrorDetails
-    field : FieldInfo
-        The setting that was refused.
+    `field` is the setting that was refused.
 
-    Returns
-    -------
-    int or None
-
-    Examples
-    --------
     >>> from pipistrelle.config import FilterConfig
     >>> field = FilterConfig.model_fields["initial_pose_std"]
     >>> values_expected({"type": "missing", "loc": ("filter", "initial_pose_std", 2)}, field)
@@ -109,18 +80,8 @@ def values_expected(fault: Any, field: FieldInfo) -> int | None:
 def meant(name: str, known: Iterable[str]) -> str | None:
     """Find the name that was probably meant: one spelt alike, or one that ends in the same part.
 
-    Parameters
-    ----------
-    name : str
-        Its parts are parted by dots.
-    known : iterable of str
+    Dots separate the parts of the `name`.
 
-    Returns
-    -------
-    str or None
-
-    Examples
-    --------
     >>> meant("ray.powr", ["rays.power", "air.pressure_kpa"])
     'rays.power'
     >>> meant("filter.prune", ["rays.prune", "seed"])

@@ -53,12 +53,6 @@ Layer = dict[Key, Given]
 def known_settings() -> dict[Key, FieldInfo]:
     """Every setting by its key, in the order of `Config`.
 
-    Returns
-    -------
-    dict of the section's and the field's name to pydantic's description of the field
-
-    Examples
-    --------
     >>> known_settings()["air", "relative_humidity"].default
     0.5
     """
@@ -74,23 +68,6 @@ def known_settings() -> dict[Key, FieldInfo]:
 def from_file(path: Path) -> Layer:
     """Read the settings of a TOML file.
 
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    Layer
-
-    Raises
-    ------
-    InputError
-        Not TOML, or a key that is no setting.
-    OSError
-        The file cannot be read.
-
-    Examples
-    --------
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     file = Path(folder) / "sharp.toml"
@@ -110,19 +87,8 @@ def from_file(path: Path) -> Layer:
 def beside(path: Path, callers: Any) -> Any:
     """Let the routes of callers lead from where a file lies.
 
-    Parameters
-    ----------
-    path : Path
-        Of the file.
-    callers : object
-        What it gives as callers, sound or not.
+    `path`: of the file; `callers`: what it gives as callers, sound or not.
 
-    Returns
-    -------
-    object
-
-    Examples
-    --------
     >>> beside(Path("there/plan.toml"), [{"route": "boat.csv"}, {"place": [1, 2]}])
     [{'route': 'there/boat.csv'}, {'place': [1, 2]}]
     """
@@ -139,26 +105,9 @@ def beside(path: Path, callers: Any) -> Any:
 def from_table(values: Mapping[str, Any], where: str, above: str = "") -> Layer:
     """Name the settings of a table in a file.
 
-    Parameters
-    ----------
-    values : mapping
-        Settings, and sections of settings.
-    where : str
-        What a refusal says of the file.
-    above : str
-        What stands before a setting's name there.
+    `values`: settings, and sections of settings; `where`: name of the file in refusals;
+    `above`: prefix of a setting's name there.
 
-    Returns
-    -------
-    Layer
-
-    Raises
-    ------
-    InputError
-        A key that is no setting.
-
-    Examples
-    --------
     >>> from_table({"seed": 3}, "world.toml: ", "config.")
     {('seed',): Given(value=3, where='world.toml: config.seed')}
     """
@@ -169,22 +118,9 @@ def from_table(values: Mapping[str, Any], where: str, above: str = "") -> Layer:
 def from_environment(environment: Mapping[str, str]) -> Layer:
     """Read the settings among the variables of the environment.
 
-    Parameters
-    ----------
-    environment : mapping of str to str
-        ``PIPISTRELLE_SECTION__FIELD`` is spelled as in a file, save that text needs no quotes.
+    `environment`: ``PIPISTRELLE_SECTION__FIELD`` is spelled as in a file, save that text needs no
+    quotes.
 
-    Returns
-    -------
-    Layer
-
-    Raises
-    ------
-    InputError
-        A variable with the prefix ``PIPISTRELLE_`` that is no setting.
-
-    Examples
-    --------
     >>> layer = from_environment({"PIPISTRELLE_RAYS__RANGE_BOUNDS": "[1, 15]", "HOME": "/root"})
     >>> layer["rays", "range_bounds"].value
     [1, 15]
@@ -200,17 +136,8 @@ def from_environment(environment: Mapping[str, str]) -> Layer:
 def from_flags(values: Mapping[str, Any]) -> Layer:
     """Name the settings that were given as flags.
 
-    Parameters
-    ----------
-    values : mapping
-        Settings, and sections of settings.
+    `values`: settings, and sections of settings.
 
-    Returns
-    -------
-    Layer
-
-    Examples
-    --------
     >>> from_flags({"air": {"relative_humidity": 0.3}})
     {('air', 'relative_humidity'): Given(value=0.3, where='--air.relative-humidity')}
     """
@@ -221,24 +148,9 @@ def from_flags(values: Mapping[str, Any]) -> Layer:
 def from_keywords(values: Mapping[str, Any], others: Iterable[str] = ()) -> Layer:
     """Name the settings that were given as keywords of a call.
 
-    Parameters
-    ----------
-    values : mapping
-        Settings, and sections of settings; two underscores part a section from its settings.
-    others : iterable of str
-        What the call takes beside settings, which may have been meant.
+    `values`: settings, and sections of settings; two underscores part a section from its settings;
+    `others`: what the call takes beside settings, which may have been meant.
 
-    Returns
-    -------
-    Layer
-
-    Raises
-    ------
-    InputError
-        A keyword that is no setting.
-
-    Examples
-    --------
     >>> from_keywords({"rays__power": 8.0, "air": {"temperature_c": 5.0}})["rays", "power"]
     Given(value=8.0, where='rays__power')
     >>> from_keywords({"rays__powr": 8.0})
@@ -252,23 +164,8 @@ def from_keywords(values: Mapping[str, Any], others: Iterable[str] = ()) -> Laye
 def spread(table: Mapping[str, Any], parts: str) -> dict[str, Any]:
     """Spread names with parts over nested tables.
 
-    Parameters
-    ----------
-    table : mapping
-    parts : str
-        What stands between two parts of a name.
+    `parts` separates two parts of a name.
 
-    Returns
-    -------
-    dict
-
-    Raises
-    ------
-    InputError
-        A name that is a value and a section.
-
-    Examples
-    --------
     >>> spread({"seed": 3, "rays.power": 8.0, "rays": {"prune": 0.1}}, ".")
     {'seed': 3, 'rays': {'power': 8.0, 'prune': 0.1}}
     """
@@ -290,21 +187,6 @@ def spread(table: Mapping[str, Any], parts: str) -> dict[str, Any]:
 def resolve(layer: Layer) -> Config:
     """Check the settings and complete them with the defaults.
 
-    Parameters
-    ----------
-    layer : Layer
-
-    Returns
-    -------
-    Config
-
-    Raises
-    ------
-    InputError
-        A value that its setting does not take: where it stands, what was found and expected.
-
-    Examples
-    --------
     >>> resolve(from_flags({"seed": 3})).seed
     3
     >>> resolve(from_flags({"air": {"pressure_kpa": -1.0}}))
@@ -336,18 +218,9 @@ def _plain(value: Any) -> Any:
 def to_toml(config: Config) -> str:
     """Write all settings as a TOML file, each with its meaning and unit.
 
-    Parameters
-    ----------
-    config : Config
+    The text reads back as the same settings. A setting that is derived unless it is given, and
+    is not given, is a remark.
 
-    Returns
-    -------
-    str
-        Reads back as the same settings. One that is settled by others unless it is given, and is
-        not given, is a remark.
-
-    Examples
-    --------
     >>> tomllib.loads(to_toml(Config(seed=3)))["seed"]
     3
     """
@@ -382,44 +255,15 @@ def _remarked(assignment: str, field: FieldInfo) -> str:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file, or refuse it.
-
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    dict
-
-    Raises
-    ------
-    InputError
-        As `read_text` and `parse_toml`, with the file.
-    """
+    """Read a TOML file, or refuse it."""
     return parse_toml(read_text(path), path)
 
 
 def parse_toml(text: str, where: object) -> dict[str, Any]:
     """Read TOML of a few levels, whose integers have 64 bits, as the language says.
 
-    Parameters
-    ----------
-    text : str
-    where : object
-        What a refusal says of where the text stands, as text.
+    `where`: place of the text, for refusals.
 
-    Returns
-    -------
-    dict
-
-    Raises
-    ------
-    InputError
-        For anything else, with the line or the key.
-
-    Examples
-    --------
     >>> parse_toml("rays.power = 3", "here")
     {'rays': {'power': 3}}
     >>> parse_toml("seed = 0xffffffffffffffffff", "here")
@@ -456,20 +300,8 @@ def leaves(
 ) -> Iterator[tuple[Key, Any]]:
     """Walk through nested tables, down to what is no table, or an empty one.
 
-    Parameters
-    ----------
-    values : mapping
-    whole : container of keys
-        Values of these are taken as they are.
-    above : key
-        Of the table itself.
+    `whole`: values of these are taken as they are; `above`: of the table itself.
 
-    Yields
-    ------
-    key, value
-
-    Examples
-    --------
     >>> list(leaves({"seed": 3, "air": {"pressure_kpa": 90.0}, "rays": {}}))
     [(('seed',), 3), (('air', 'pressure_kpa'), 90.0), (('rays',), {})]
     """
@@ -510,16 +342,6 @@ def _layer(
 def from_text(text: str) -> Any:
     """Read a TOML value, or a number that TOML spells otherwise; anything else is text.
 
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    object
-
-    Examples
-    --------
     >>> from_text("[{ frequency = 25e3 }]"), from_text("left")
     ([{'frequency': 25000.0}], 'left')
     """

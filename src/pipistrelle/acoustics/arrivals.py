@@ -42,34 +42,23 @@ _DEEPEST_NULL = 1e-12
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Arrivals:
-    """Sound that reaches the vehicle after one emission.
-
-    Attributes
-    ----------
-    delay : (a) [s]
-        Since the emission.
-    level_db : (a) [dB]
-        On the scale of the source levels.
-    bearing : (a) [rad]
-        Where it comes from, relative to the heading, in [-pi, pi).
-    frequency : (a) [Hz]
-        As received, Doppler shift included.
-    caller : (a)
-        Whose call it is, an index into the list of callers: VEHICLE, or from 1 on.
-    landmark : (a)
-        Label of what it comes from: landmark i (from 0) bears i + 1, caller j (from 1) n + j.
-    departure : (a) [rad], or None
-        Where it left another vehicle, relative to that one's heading; NaN of who calls alike in all
-        directions. None where there is no other vehicle.
-    """
+    """Sound that reaches the vehicle after one emission."""
 
     delay: Float[np.ndarray, " a"]
+    """Since the emission [s]."""
     level_db: Float[np.ndarray, " a"]
+    """On the scale of the source levels [dB]."""
     bearing: Float[np.ndarray, " a"]
+    """Where it comes from, relative to the heading, in [-pi, pi) [rad]."""
     frequency: Float[np.ndarray, " a"]
+    """As received, Doppler shift included [Hz]."""
     caller: Int8[np.ndarray, " a"]
+    """Index into the list of callers: VEHICLE, or from 1 on."""
     landmark: Int[np.ndarray, " a"]
+    """Label of what it comes from: landmark i (from 0) bears i + 1, caller j (from 1) n + j."""
     departure: Float[np.ndarray, " a"] | None = None
+    """Where it left another vehicle, relative to that one's heading; NaN of a caller
+    without a beam [rad]. None where there is no other vehicle."""
 
 
 def arrivals_of_emission(
@@ -147,36 +136,16 @@ def arrivals_of_emissions(
 ) -> tuple[Arrivals, Int[np.ndarray, " k"]]:
     """Arrivals of several emissions in one world, emission after emission (`arrivals_of_emission`).
 
-    Parameters
-    ----------
-    poses : (k, 3) [m, m, rad]
-    velocities : (k, 2) [m/s]
-    landmarks : (n, 2) [m]
-    callers : sequence of c Caller
-        The vehicle first; paths and velocities (k, 2), a row for each emission (`callers_at`).
-    config : Config
-    bodies : Bodies, optional
-        Of the landmarks; as the settings have them, by default. Those whose radius is stated throw
-        sound from their surface (`reflecting_points`): delay, bearing, Doppler shift, absorption
-        and spreading are those of the way over it. The target strength stays that of the turn about
-        the centre, for which its far-field formula stands. At a distance d from the surface a
-        sphere's own echo would be 20 log10(1 + radius / d) fainter: 0.6 dB for 0.3 m at 4 m.
+    `poses` [m, m, rad]; `velocities` [m/s]; `landmarks` [m]; `callers`: the vehicle first; paths
+    and velocities (k, 2), a row for each emission (`callers_at`); `bodies`: of the landmarks; as
+    the settings have them, by default. Those whose radius is stated throw sound from their surface
+    (`reflecting_points`): delay, bearing, Doppler shift, absorption and spreading are those of the
+    way over it. The target strength stays that of the turn about the centre, for which its
+    far-field formula stands. At a distance d from the surface a sphere's own echo would be 20
+    log10(1 + radius / d) fainter: 0.6 dB for 0.3 m at 4 m. Arrivals are those of the first
+    emission, then those of the second, and so on, each in the order of `arrivals_of_emission`;
+    `count`: how many belong to each emission.
 
-    Returns
-    -------
-    Arrivals
-        Those of the first emission, then those of the second, and so on, each in the order of
-        `arrivals_of_emission`.
-    count : (k)
-        How many belong to each emission.
-
-    Raises
-    ------
-    InputError
-        As for one emission.
-
-    Examples
-    --------
     The vehicle turns round, and its next call meets the beacon instead of the landmark.
 
     >>> from pipistrelle.acoustics.callers import callers_of
@@ -285,17 +254,7 @@ def through_piston(
 
 
 def arrivals_at(arrivals: Arrivals, rows: Bool[np.ndarray, " a"] | slice) -> Arrivals:
-    """Take some of the arrivals.
-
-    Parameters
-    ----------
-    arrivals : Arrivals
-    rows : (a) bool or slice
-
-    Returns
-    -------
-    Arrivals
-    """
+    """Return some rows of the arrivals."""
     return Arrivals(
         delay=arrivals.delay[rows],
         level_db=arrivals.level_db[rows],
@@ -383,22 +342,11 @@ def through_pistons(
 ) -> Arrivals:
     """Give the calls of the vehicle and of other vehicles the beams of pistons of one radius.
 
-    Parameters
-    ----------
-    arrivals : Arrivals
-        Of `arrivals_of_emission`.
-    callers : sequence of Caller
-        Of the same emission.
-    beam : callable
-        Gives the vehicle's call its directivity, as `through_piston` does; of another vehicle it is
-        handed the sounds as if they were echoes where they departed to.
-    radius : [m]
-    speed_of_sound : [m/s]
-
-    Returns
-    -------
-    Arrivals
-        The same rows in the same order; those of who calls alike in all directions as they were.
+    `arrivals`: of `arrivals_of_emission`; `callers`: of the same emission; `beam`: gives the
+    vehicle's call its directivity, as `through_piston` does; of another vehicle it is handed the
+    sounds as if they were echoes where they departed to; `radius` [m]; `speed_of_sound` [m/s].
+    The rows keep their order; those of callers without a beam are
+    unchanged.
     """
     c, own = speed_of_sound, callers[VEHICLE].frequency
     heard = beam(arrivals, radius=radius, frequency=own, speed_of_sound=c)

@@ -26,41 +26,28 @@ MOST = 1 + MOST_OTHERS
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Caller:
-    """Someone whose calls the vehicle hears.
-
-    Attributes
-    ----------
-    name : str
-        In messages and figures.
-    frequency : [Hz]
-    level_db : [dB]
-        Source level at 1 m; of the vehicle, on its axis.
-    place : (2) or (t, 2) [m], or None
-        Where it calls from: one place, or one for each time (of a scenario) or emission; None for
-        the vehicle, which calls from where it is.
-    velocity : (2) or (t, 2) [m/s], or None
-        Of a caller that moves, where it calls; None where it stands, or where `callers_at` is to
-        take it from the path.
-    key : str
-        Its section of the settings, where it has one: a refusal then names that.
-    heading : (t) [rad], or None
-        Where another vehicle's piston points, for each of the places; None of one that calls alike
-        in all directions.
-    mission : (t, 3) [m, m, rad] and (t - 1, 2), or None
-        Of one that maps the world, too: its poses, and its controls as it knows them.
-    calls : (m) [s], or None
-        When it calls, rising; None of one that calls when the vehicle does.
-    """
+    """Someone whose calls the vehicle hears."""
 
     name: str
+    """Name in messages and figures."""
     frequency: float
+    """Frequency [Hz]."""
     level_db: float
+    """Source level at 1 m; of the vehicle, on its axis [dB]."""
     place: Float[np.ndarray, "2"] | Float[np.ndarray, "t 2"] | None = None
+    """Where it calls from: one place, or one for each time (of a scenario) or emission; None for
+    the vehicle, which calls from where it is [m]."""
     velocity: Float[np.ndarray, "2"] | Float[np.ndarray, "t 2"] | None = None
+    """Of a caller that moves, where it calls; None where it stands, or where `callers_at` is to
+    take it from the path [m/s]."""
     key: str = ""
+    """Its section of the settings, where it has one: a refusal then names that."""
     heading: Float[np.ndarray, " t"] | None = None
+    """Heading of another vehicle's piston at each place [rad]; None of a caller without a beam."""
     mission: tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 2"]] | None = None
+    """Poses [m, m, rad] and assumed controls of a caller that maps the world, too."""
     calls: Float[np.ndarray, " m"] | None = None
+    """Rising times of its calls [s]; None of one that calls when the vehicle does."""
 
 
 def callers_of(config: Config, beacon: Float[np.ndarray, "2"]) -> tuple[Caller, Caller]:
@@ -102,17 +89,6 @@ def callers_of(config: Config, beacon: Float[np.ndarray, "2"]) -> tuple[Caller, 
 def check_caller(caller: Caller) -> None:
     """Refuse a caller whose tone, level, places or velocities are no finite numbers of their shape.
 
-    Parameters
-    ----------
-    caller : Caller
-
-    Raises
-    ------
-    InputError
-        With what is wrong.
-
-    Examples
-    --------
     >>> check_caller(Caller(name="boat", frequency=30e3, level_db=42.8, place=np.zeros(3)))
     Traceback (most recent call last):
     pipistrelle.config.InputError: caller boat: place: found an array of shape (3,), expected finite
@@ -151,21 +127,6 @@ def _check(caller: Caller, part: str, unit: str, *, pairs: bool) -> None:
 def moves(caller: Caller) -> bool:
     """Whether a caller other than the vehicle calls along a path.
 
-    Parameters
-    ----------
-    caller : Caller
-
-    Returns
-    -------
-    bool
-
-    Raises
-    ------
-    InputError
-        As `check_caller`.
-
-    Examples
-    --------
     >>> [moves(caller) for caller in callers_of(Config(), np.zeros(2))]
     [False, False]
     """
@@ -181,28 +142,9 @@ def callers_at(
 
     Where no velocities are given, those of the steps that end there are taken, as for the vehicle.
 
-    Parameters
-    ----------
-    callers : sequence of Caller
-        The vehicle first.
-    time : (t) [s]
-        Of the paths.
-    steps : (k), from 1 on
-        Which of the times.
+    `callers`: the vehicle first; `time` [s]: of the paths; `steps`: which of the times. Returns
+    paths and velocities (k, 2); those that stand as they were.
 
-    Returns
-    -------
-    tuple of Caller
-        Paths and velocities (k, 2); those that stand as they were.
-
-    Raises
-    ------
-    InputError
-        Where the vehicle is not the first or not alone without a place, or has a velocity, a path
-        does not fit the times, or as `check_caller`.
-
-    Examples
-    --------
     >>> path = np.array([[0.0, 5.0], [0.5, 5.0], [1.5, 5.0]])
     >>> vehicle, _ = callers_of(Config(), path[0])
     >>> boat = Caller(name="boat", frequency=30e3, level_db=42.8, place=path)

@@ -19,18 +19,8 @@ def jinc(x: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
 
     .. math:: \operatorname{jinc}(x) = 2 J_1(x) / x
 
-    Parameters
-    ----------
-    x : (*n)
-        ka times the sine of the angle off the axis.
+    `x`: ka times the sine of the angle off the axis. The values lie in [-0.133, 1].
 
-    Returns
-    -------
-    (*n)
-        In [-0.133, 1].
-
-    Examples
-    --------
     >>> jinc(np.array([0.0, 1.0, 5.1356])).round(3)
     array([ 1.   ,  0.88 , -0.132])
     """
@@ -42,20 +32,10 @@ def jinc(x: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
 def in_front(bearing: Float[np.ndarray, "*n"] | float) -> Bool[np.ndarray, "*n"]:
     """Whether a back-baffled emitter can be heard there: within 90 degrees of its axis.
 
-    Parameters
-    ----------
-    bearing : (*n) [rad]
+    `bearing` [rad].
 
-    Returns
-    -------
-    (*n)
-
-    Notes
-    -----
     Bradley & Abaid, Sec. II-A.
 
-    Examples
-    --------
     >>> in_front(np.radians([0.0, -90.0, 91.0, 270.5]))
     array([ True,  True, False,  True])
     """
@@ -149,16 +129,8 @@ def beamwidth(
 def beamwidth_of(config: Config) -> float:
     """Half-power beamwidth of the vehicle's call, as the settings have it.
 
-    Parameters
-    ----------
-    config : Config
+    Returns [rad].
 
-    Returns
-    -------
-    [rad]
-
-    Examples
-    --------
     >>> round(float(np.degrees(beamwidth_of(Config()))), 1)
     33.3
     """
@@ -173,29 +145,11 @@ def piston_radius(
 
     .. math:: a = \frac{x}{k \sin(\text{beamwidth} / 2)}, \quad (2 J_1(x) / x)^2 = \tfrac12
 
-    Parameters
-    ----------
-    beamwidth : (*n) [rad]
-        Full width, in (0, pi].
-    frequency : [Hz]
-    speed_of_sound : [m/s]
+    `beamwidth` [rad]: full width, in (0, pi]; `frequency` [Hz]; `speed_of_sound` [m/s]. Returns
+    [m]: at pi, the largest of the pistons that are that wide.
 
-    Returns
-    -------
-    (*n) [m]
-        At pi, the largest of the pistons that are that wide.
-
-    Raises
-    ------
-    InputError
-        A beamwidth outside (0, pi].
-
-    Notes
-    -----
     Bradley & Abaid, Sec. II-A and Appendix B.
 
-    Examples
-    --------
     >>> wide = piston_radius(np.pi, frequency=35e3, speed_of_sound=343.0)
     >>> round(1e3 * float(wide), 2)
     2.52

@@ -56,31 +56,13 @@ def passive_spreading_loss_db(
     .. math:: \beta_\text{paper} = 20 \log_{10}(d_1 + d_2), \qquad
               \beta_\text{bistatic} = 20 \log_{10} d_1 + 20 \log_{10} d_2
 
-    Parameters
-    ----------
-    outward : (*n) [m]
-        From the source to the landmark, > 0.
-    homeward : (*n) [m]
-        From the landmark to the receiver, > 0.
-    law : "paper" or "bistatic"
-        A mirror, as the paper's r = 1 has it, or a point scatterer that sends the sound out anew.
+    `outward` [m]: from the source to the landmark, > 0; `homeward` [m]: from the landmark to the
+    receiver, > 0; `law`: A mirror, as the paper's r = 1 has it, or a point scatterer that sends the
+    sound out anew. Returns [dB].
 
-    Returns
-    -------
-    (*n) [dB]
-
-    Raises
-    ------
-    InputError
-        An unknown law.
-
-    Notes
-    -----
     Bradley & Abaid, Eq. (2) with r = 1; the bistatic law is a departure (physics, e.g. Urick's
     bistatic sonar equation).
 
-    Examples
-    --------
     Back at the source the bistatic law is that of an active echo; the mirror is far louder.
 
     >>> float(passive_spreading_loss_db(10.0, 10.0, law="bistatic"))
@@ -169,32 +151,12 @@ def doppler_frequency(
     its echo, has the receiver's alone, towards where the sound comes from. A reflector on the move
     receives and sends in turn.
 
-    Parameters
-    ----------
-    frequency : (*n) [Hz]
-        As emitted.
-    receiver_speed : (*n) [m/s]
-        Towards the sound.
-    source_speed : (*n) [m/s]
-        Along the sound.
-    speed_of_sound : [m/s]
+    `frequency` [Hz]: as emitted; `receiver_speed` [m/s]: towards the sound; `source_speed` [m/s]:
+    along the sound; `speed_of_sound` [m/s]. Returns [Hz].
 
-    Returns
-    -------
-    (*n) [Hz]
-
-    Raises
-    ------
-    InputError
-        A speed that is not below that of sound.
-
-    Notes
-    -----
     Bradley & Abaid, Sec. II-B, which calls the shift not appreciable: it is not negligible in a
     matched filter of 2.8 ms.
 
-    Examples
-    --------
     >>> echo = doppler_frequency(35e3, receiver_speed=0.75, source_speed=0.75, speed_of_sound=343.0)
     >>> round(float(echo) - 35e3)
     153

@@ -27,33 +27,18 @@ def reflecting_points(
               i(u; d) = \operatorname{atan2}(d \sin u, d \cos u - r)
 
     with a and b the distances of source and receiver from the centre, w the angle between them
-    there and r the radius. Both sides are monotonic in t. For a source at the receiver's place
-    t = 0: the echo is straight back, from the distance of the centre less the radius.
+    there and r the radius. Both sides are monotonic in t. For a source at the receiver's place t =
+    0: the echo is straight back, from the distance of the centre less the radius.
 
     Where the body stands between the two, the least way is the straight one, that of the wave which
     makes the shadow: its point is the one of the line that is nearest the centre. Where the line
     grazes the surface both points are the same, so nothing jumps.
 
-    Parameters
-    ----------
-    source : (1 or k, 1, 2) [m]
-    receiver : (k, 1, 2) [m]
-        Both outside the bodies.
-    centre : (1 or k, t, 2) [m]
-    radius : (t) [m]
-        0 of a point, which is its own.
+    `source` [m]; `receiver` [m]: both outside the bodies; `centre` [m]; `radius` [m]: 0 of a point,
+    which is its own. Returns [m]: to 1e-12 m.
 
-    Returns
-    -------
-    (k, t, 2) [m]
-        To 1e-12 m.
-
-    Notes
-    -----
     A departure: the landmarks of Bradley & Abaid are points.
 
-    Examples
-    --------
     Straight back, in a right angle, and in the shadow.
 
     >>> at, here = np.array([[[5.0, 0.0]]]), np.zeros((1, 1, 2))

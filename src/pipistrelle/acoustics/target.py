@@ -18,18 +18,13 @@ from pipistrelle.config import InputError, TargetConfig
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bodies:
-    """Sizes and shapes of things that reflect, each its own.
-
-    Attributes
-    ----------
-    radius : (n) [m]
-        NaN of a body whose size is not stated: it has the usual target's, and counts as a point.
-    sphere : (n)
-        Whether each is a sphere; else a cylinder.
-    """
+    """Sizes and shapes of things that reflect, each its own."""
 
     radius: Float[np.ndarray, " n"]
+    """NaN of a body whose size is not stated: it has the usual target's, and counts as a point
+    [m]."""
     sphere: Bool[np.ndarray, " n"]
+    """Whether each is a sphere; else a cylinder."""
 
 
 def target_strength_db(
@@ -106,29 +101,15 @@ def strength_of_bodies_db(
     r"""Scattered intensity relative to backscatter of the usual target.
 
     Backscatter grows with the radius as :math:`I(\pi) = r / 2` of a cylinder and :math:`r^2 / 4` of
-    a sphere, so a body of radius r throws back :math:`10 \log_{10} (r / r_0)` or
-    :math:`20 \log_{10} (r / r_0)` more than one of its shape with the usual radius :math:`r_0`,
-    for which the source levels stand.
+    a sphere, so a body of radius r throws back :math:`10 \log_{10} (r / r_0)` or :math:`20
+    \log_{10} (r / r_0)` more than one of its shape with the usual radius :math:`r_0`, for which the
+    source levels stand.
 
-    Parameters
-    ----------
-    angle : (*k, n) [rad]
-        By how much the sound is turned.
-    bodies : Bodies
-    usual : TargetConfig
-    frequency : [Hz]
-    speed_of_sound : [m/s]
+    `angle` [rad]: by how much the sound is turned; `frequency` [Hz]; `speed_of_sound` [m/s].
+    Returns [dB].
 
-    Returns
-    -------
-    (*k, n) [dB]
-
-    Notes
-    -----
     Bradley & Abaid, Eq. (4), of which only the relative part is theirs. See `target_strength_db`.
 
-    Examples
-    --------
     >>> posts = Bodies(radius=np.array([0.025, 0.25, 0.25]), sphere=np.array([False, False, True]))
     >>> heard = dict(usual=TargetConfig(), frequency=30e3, speed_of_sound=343.0)
     >>> strength_of_bodies_db(np.full((1, 3), np.pi), posts, **heard)
@@ -150,15 +131,7 @@ def strength_of_bodies_db(
 def backscatter_db(bodies: Bodies, usual: TargetConfig) -> Float[np.ndarray, " n"]:
     """How much more bodies throw back than one of their shape with the usual radius.
 
-    Parameters
-    ----------
-    bodies : Bodies
-    usual : TargetConfig
-
-    Returns
-    -------
-    (n) [dB]
-        As `strength_of_bodies_db` at an angle of pi.
+    Returns [dB]: as `strength_of_bodies_db` at an angle of pi.
     """
     return np.where(bodies.sphere, 20.0, 10.0) * np.log10(_radius(bodies, usual) / usual.radius)
 
@@ -171,16 +144,7 @@ def _radius(bodies: Bodies, usual: TargetConfig) -> Float[np.ndarray, " n"]:
 def with_usual(bodies: Bodies, count: int, usual: TargetConfig) -> Bodies:
     """Add bodies as the settings have them, which are points.
 
-    Parameters
-    ----------
-    bodies : Bodies
-    count : int
-    usual : TargetConfig
-
-    Returns
-    -------
-    Bodies
-        The others first.
+    The given bodies come first.
     """
     return Bodies(
         radius=np.append(bodies.radius, np.full(count, np.nan)),

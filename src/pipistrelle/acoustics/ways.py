@@ -20,38 +20,28 @@ from pipistrelle.geometry import wrap
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ways:
-    """From all targets, landmarks and then callers, to the vehicle at each of k emissions.
-
-    Attributes
-    ----------
-    poses : (k, 3) [m, m, rad]
-        Of the vehicle.
-    velocities : (k, 2) [m/s]
-    landmarks : int
-        How many of the targets are landmarks.
-    target : (1 or k, t, 2) [m]
-    offset : (k, t, 2) [m]
-        From the vehicle.
-    homeward : (k, t) [m]
-    bearing : (k, t) [rad]
-    closing : (k, t) [m/s]
-        The vehicle's speed towards each.
-    drift : (1 or k, t, 2) [m/s] or None
-        Velocities of the targets; None where all stand.
-    approach : (k, t) [m/s] or 0
-        The targets' speed towards the vehicle.
-    """
+    """From all targets, landmarks and then callers, to the vehicle at each of k emissions."""
 
     poses: Float[np.ndarray, "k 3"]
+    """Of the vehicle [m, m, rad]."""
     velocities: Float[np.ndarray, "k 2"]
+    """Velocities [m/s]."""
     landmarks: int
+    """How many of the targets are landmarks."""
     target: Float[np.ndarray, "_ t 2"]
+    """Target [m]."""
     offset: Float[np.ndarray, "k t 2"]
+    """From the vehicle [m]."""
     homeward: Float[np.ndarray, "k t"]
+    """Homeward [m]."""
     bearing: Float[np.ndarray, "k t"]
+    """Bearing [rad]."""
     closing: Float[np.ndarray, "k t"]
+    """The vehicle's speed towards each [m/s]."""
     drift: Float[np.ndarray, "_ t 2"] | None
+    """Velocities of the targets; None where all stand [m/s]."""
     approach: Float[np.ndarray, "k t"] | float
+    """The targets' speed towards the vehicle [m/s]."""
 
 
 def ways_home(
@@ -62,21 +52,9 @@ def ways_home(
 ) -> Ways:
     """Measure the ways from all targets to the vehicle, as they are when it calls.
 
-    Parameters
-    ----------
-    poses : (k, 3) [m, m, rad]
-        Of the vehicle at each emission.
-    velocities : (k, 2) [m/s]
-    landmarks : (n, 2) [m]
-    callers : sequence of Caller
-        The vehicle first; paths of k places.
+    `poses` [m, m, rad]: of the vehicle at each emission; `velocities` [m/s]; `landmarks` [m];
+    `callers`: the vehicle first; paths of k places.
 
-    Returns
-    -------
-    Ways
-
-    Examples
-    --------
     >>> from pipistrelle.acoustics.callers import callers_of
     >>> from pipistrelle.config import Config
     >>> ahead, beacon = np.array([[5.0, 0.0]]), np.array([0.0, 9.0])
@@ -100,22 +78,10 @@ def ways_by_surface(ways: Ways, caller: int, extent: Float[np.ndarray, " t"]) ->
     While all move these points move, too, but to first order no way changes by that, for it is the
     least one: the speeds along it are those of its ends.
 
-    Parameters
-    ----------
-    ways : Ways
-        From the targets' centres.
-    caller : int
-        Its number in the list of callers.
-    extent : (t) [m]
-        Radius of each target; 0 of a point.
+    `ways`: from the targets' centres; `caller`: its number in the list of callers; `extent` [m]:
+    radius of each target; 0 of a point. The paths are the same to the bit where all targets are
+    points.
 
-    Returns
-    -------
-    Ways
-        The same to the bit where all targets are points.
-
-    Examples
-    --------
     >>> from pipistrelle.acoustics.callers import callers_of
     >>> from pipistrelle.config import Config
     >>> trunk, callers = np.array([[5.0, 0.0]]), callers_of(Config(), np.array([0.0, 9.0]))
@@ -177,19 +143,9 @@ def turn_of_sound(
 ) -> Float[np.ndarray, "k t"]:
     """Angle from the way in to the way on to the vehicle: pi is straight back.
 
-    Parameters
-    ----------
-    incoming : (1 or k, t, 2) [m]
-        From the caller to each target.
-    offset : (k, t, 2) [m]
-        From the vehicle to each target.
+    `incoming` [m]: from the caller to each target; `offset` [m]: from the vehicle to each target.
+    Returns [rad].
 
-    Returns
-    -------
-    (k, t) [rad]
-
-    Examples
-    --------
     >>> there = np.array([[[3.0, 0.0], [0.0, 2.0]]])
     >>> turn_of_sound(there, there) / np.pi
     array([[1., 1.]])
@@ -204,18 +160,7 @@ def refuse_impossible(
 ) -> None:
     """Refuse points that coincide, coordinates that are not finite, and who is within a body.
 
-    Parameters
-    ----------
-    ways : Ways
-        From the targets' centres.
-    callers : sequence of Caller
-    extent : (t) [m]
-        Radius of each target; 0 of a point.
-
-    Raises
-    ------
-    InputError
-        With the two that coincide, or are nowhere, or the body and who is within it.
+    `ways`: from the targets' centres; `extent` [m]: radius of each target; 0 of a point.
     """
     between, within = [ways.homeward], [extent]
     for itself in range(ways.landmarks, ways.homeward.shape[1]):

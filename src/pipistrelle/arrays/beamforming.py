@@ -15,25 +15,11 @@ def steering_vector(
 
     .. math:: v_e(\theta) = e^{2\pi i f y_e \sin\theta / c}
 
-    Parameters
-    ----------
-    angle : (*n) [rad]
-        Off the array's normal.
-    position : (e) [m]
-        Elements along the array.
-    frequency : [Hz]
-    speed_of_sound : [m/s]
+    `angle` [rad]: off the array's normal; `position` [m]: elements along the array; `frequency`
+    [Hz]; `speed_of_sound` [m/s].
 
-    Returns
-    -------
-    (*n, e) complex
-
-    Notes
-    -----
     Bradley & Abaid, Sec. II-C; van Trees (2002), ch. 2.
 
-    Examples
-    --------
     >>> half_wave = {"position": np.array([0.0, 0.0049]), "frequency": 35e3}
     >>> steering_vector(np.pi / 2, **half_wave, speed_of_sound=343.0).round(9)
     array([ 1.+0.j, -1.+0.j])
@@ -54,21 +40,9 @@ def beampattern(
 
     .. math:: B(\theta) = \left| \frac{1}{N} v(\theta_0)^H v(\theta) \right|^2
 
-    Parameters
-    ----------
-    angle : (*n) [rad]
-    steered : [rad]
-    position : (e) [m]
-    frequency : [Hz]
-    speed_of_sound : [m/s]
+    `angle` [rad]; `steered` [rad]; `position` [m]; `frequency` [Hz]; `speed_of_sound` [m/s].
+    Returns [0, 1]: 1 at the steered angle.
 
-    Returns
-    -------
-    (*n), in [0, 1]
-        1 at the steered angle.
-
-    Examples
-    --------
     >>> ears = {"position": np.arange(10) * 0.0049, "frequency": 35e3, "speed_of_sound": 343.0}
     >>> null = np.arcsin(0.2)
     >>> beampattern(np.array([0.0, null]), steered=0.0, **ears).round(9)
@@ -91,25 +65,11 @@ def beamscan(
 
     .. math:: P(\theta) = \left| v(\theta)^H x \right|^2
 
-    Parameters
-    ----------
-    snapshot : (e) complex
-        One matched-filter output per element.
-    angle : (n) [rad]
-    position : (e) [m]
-    frequency : [Hz]
-    speed_of_sound : [m/s]
+    `snapshot`: one matched-filter output per element; `angle` [rad]; `position` [m]; `frequency`
+    [Hz]; `speed_of_sound` [m/s].
 
-    Returns
-    -------
-    (n)
-
-    Notes
-    -----
     Bradley & Abaid, Sec. II-D. The detector computes the same from ten lag sums.
 
-    Examples
-    --------
     >>> ears = {"position": np.arange(10) * 0.0049, "frequency": 35e3, "speed_of_sound": 343.0}
     >>> angles = np.radians([10.0, 20.0, 30.0])
     >>> int(beamscan(steering_vector(angles[1], **ears), angles, **ears).argmax())

@@ -14,17 +14,12 @@ class Layout:
 
     An element hears within 90 degrees of its face's normal. The faces' own offsets from the
     centre (some 25 mm) are left out: they would shift delays by less than 0.1 ms.
-
-    Attributes
-    ----------
-    normal : (f) [rad]
-        Direction of each face's normal, relative to the heading.
-    position : (e) [m]
-        Elements along a face, positive to the left of its normal, centred on 0.
     """
 
     normal: Float[np.ndarray, " f"]
+    """Direction of each face's normal, relative to the heading [rad]."""
     position: Float[np.ndarray, " e"]
+    """Elements along a face, positive to the left of its normal, centred on 0 [m]."""
 
 
 def square_of_four(receiver: ReceiverConfig) -> Layout:

@@ -42,20 +42,8 @@ def noise_blocks(
 ) -> Complex[np.ndarray, "b f c e"]:
     """Block sums of the microphones' noise.
 
-    Parameters
-    ----------
-    blocks : int
-    layout : Layout
-    sampling : Sampling
-    key : int
-        Of the random stream; a block's noise does not depend on how many are drawn.
-    out : (blocks, faces, tones, elements) complex, optional
-        Written and returned instead of a new array.
-
-    Returns
-    -------
-    (blocks, faces, tones, elements) complex
-        Independent, of variance 40 sigma^2.
+    `key`: of the random stream; a block's noise does not depend on how many are drawn; `out`:
+    written and returned instead of a new array. The sums are independent, of variance 40 sigma^2.
     """
     std = math.sqrt(sampling.block) * sampling.noise_std
     return complex_noise(block_shape(blocks, layout, sampling), std, key, out)
@@ -66,13 +54,7 @@ def add_echo_blocks(
 ) -> None:
     """Add the block sums of arrivals to a recording, in place.
 
-    Parameters
-    ----------
-    signal : (blocks, faces, tones, elements) complex
-        Its first block follows the vehicle's call.
-    arrivals : Arrivals
-    layout : Layout
-    sampling : Sampling
+    The first block of `signal` follows the vehicle's call.
     """
     amplitude, duration = 10.0 ** (arrivals.level_db / 20.0), _durations(arrivals, sampling)
     _add_echo_blocks(
@@ -142,71 +124,51 @@ def _durations(arrivals: Arrivals, sampling: Sampling) -> Float[np.ndarray, " a"
 
 
 class _Sounds(NamedTuple):
-    """Arrivals as the kernels take them.
-
-    Attributes
-    ----------
-    delay, duration : (a) [s]
-    amplitude : (a)
-    bearing : (a) [rad]
-    frequency : (a) [Hz]
-    """
+    """Arrivals as the kernels take them."""
 
     delay: Float[np.ndarray, " a"]
     amplitude: Float[np.ndarray, " a"]
     bearing: Float[np.ndarray, " a"]
+    """Bearing [rad]."""
     frequency: Float[np.ndarray, " a"]
+    """Frequency [Hz]."""
     duration: Float[np.ndarray, " a"]
+    """`delay` and `duration` [s]."""
 
 
 class _Grid(NamedTuple):
-    """The blocks and tones of a recording.
-
-    Attributes
-    ----------
-    tones : (c) [Hz]
-    rate : [Hz]
-    block : int
-        Samples per block.
-    blank : int
-        Blocks before the first that is heard.
-    """
+    """The blocks and tones of a recording."""
 
     tones: Float[np.ndarray, " c"]
+    """Tones [Hz]."""
     rate: float
+    """Rate [Hz]."""
     block: int
+    """Samples per block."""
     blank: int
+    """Blocks before the first that is heard."""
 
 
 class _Ears(NamedTuple):
-    """A layout in still air.
-
-    Attributes
-    ----------
-    normal : (f) [rad]
-    position : (e) [m]
-    speed_of_sound : [m/s]
-    """
+    """A layout of arrays, and the speed of sound around it."""
 
     normal: Float[np.ndarray, " f"]
+    """Normal [rad]."""
     position: Float[np.ndarray, " e"]
+    """Position [m]."""
     speed_of_sound: float
+    """Speed of sound [m/s]."""
 
 
 class _Room(NamedTuple):
-    """Room for one arrival: written and used anew for each.
-
-    Attributes
-    ----------
-    sums : (c, b) complex
-        Its envelope's block sums, per tone.
-    direct, turned : (2 e)
-        Its steering vector and i times that, real and imaginary parts neighbours.
-    """
+    """Room for one arrival: written and used anew for each."""
 
     sums: Complex[np.ndarray, "c b"]
+    """Its envelope's block sums, per tone."""
     direct: Float[np.ndarray, " i"]
     turned: Float[np.ndarray, " i"]
+    """`direct` and `turned`: its steering vector and i times that, real and imaginary parts
+    neighbours."""
 
 
 @kernel

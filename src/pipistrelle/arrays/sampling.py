@@ -18,28 +18,20 @@ BLOCK = 2e-4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sampling:
-    """How a frame is sampled; the receiver is blanked while the vehicle calls.
-
-    Attributes
-    ----------
-    rate : [Hz]
-    block : int
-        Samples per block.
-    pulse : int
-        Blocks per call; the first block heard is the one after it.
-    tones : (c) [Hz]
-        The callers' frequencies, the vehicle's first.
-    noise_std : float
-        Of one complex sample.
-    speed_of_sound : [m/s]
-    """
+    """How a frame is sampled; the receiver is blanked while the vehicle calls."""
 
     rate: float
+    """Rate [Hz]."""
     block: int
+    """Samples per block."""
     pulse: int
+    """Blocks per call; the first block heard is the one after it."""
     tones: Float[np.ndarray, " c"]
+    """The callers' frequencies, the vehicle's first [Hz]."""
     noise_std: float
+    """Of one complex sample."""
     speed_of_sound: float
+    """Speed of sound [m/s]."""
 
 
 def sampling(config: Config, callers: Sequence[Caller]) -> Sampling:
@@ -99,24 +91,14 @@ def clear_frequency(config: Config) -> float:
     r"""Highest tone that the arrays take for no other: not by its direction, not by its sampling.
 
     Elements a distance d apart cannot tell the angle :math:`\theta` off their normal from another,
-    the grating lobe, :math:`\sin\theta_g = \sin\theta - \lambda / d`: of a longer wave than d
-    times :math:`1 + \sin\theta`, with the largest angle that is kept, it lies outside. Half the
-    sampling rate is the highest that real samples hold.
+    the grating lobe, :math:`\sin\theta_g = \sin\theta - \lambda / d`: of a longer wave than d times
+    :math:`1 + \sin\theta`, with the largest angle that is kept, it lies outside. Half the sampling
+    rate is the highest that real samples hold.
 
-    Parameters
-    ----------
-    config : Config
+    Returns [Hz].
 
-    Returns
-    -------
-    [Hz]
-
-    Notes
-    -----
     Van Trees, Optimum Array Processing (2002), Sec. 2.4.
 
-    Examples
-    --------
     >>> round(clear_frequency(Config()))
     35607
     """
@@ -128,19 +110,8 @@ def clear_frequency(config: Config) -> float:
 def free_tones(config: Config, callers: Sequence[Caller], near: float) -> str:
     """Say which tones would do in place of one: clear ones that no caller has, the two nearest.
 
-    Parameters
-    ----------
-    config : Config
-    callers : sequence of Caller
-    near : [Hz]
+    `near` [Hz]. Returns for a refusal, in brackets; empty where there is none.
 
-    Returns
-    -------
-    str
-        For a refusal, in brackets; empty where there is none.
-
-    Examples
-    --------
     >>> from pipistrelle.acoustics.callers import callers_of
     >>> free_tones(Config(), callers_of(Config(), np.zeros(2)), 31e3)
     ' (the nearest that are free: 20000 and 25000 Hz)'
@@ -193,18 +164,6 @@ def blocks_to_hear(arrivals: Arrivals, sampling: Sampling) -> int:
 def block_shape(blocks: int, layout: Layout, sampling: Sampling) -> tuple[int, int, int, int]:
     """Shape of a recording in block sums.
 
-    Parameters
-    ----------
-    blocks : int
-    layout : Layout
-    sampling : Sampling
-
-    Returns
-    -------
-    blocks, faces, tones, elements : int
-
-    Examples
-    --------
     >>> from pipistrelle.acoustics.callers import callers_of
     >>> from pipistrelle.arrays.layout import square_of_four
     >>> config = Config()

@@ -44,17 +44,8 @@ DETOUR_FLOOR = 0.006
 def loudest_noise(elements: int) -> float:
     """Return what noise alone leaves beside a steered beam, but for the loudest thousandth.
 
-    Parameters
-    ----------
-    elements : int
+    In units of the noise's variance.
 
-    Returns
-    -------
-    float
-        In units of its variance.
-
-    Examples
-    --------
     >>> round(loudest_noise(10), 2)
     2.35
     """
@@ -67,8 +58,6 @@ def loudest_noise(elements: int) -> float:
 def over_noise(power: float, energy: float, elements: Whole, loudest: float) -> float:
     """Power of a steered beam over the noise, p, of the snapshot's energy.
 
-    Examples
-    --------
     >>> over_noise(101.0, 110.0, 10, 2.35), round(over_noise(101.0, 191.0, 10, 2.35), 2)
     (100.0, 9.1)
     """
@@ -92,8 +81,6 @@ def bearing_std(power: float, slope: float, elements: Whole) -> float:
 def delay_std(power: float, pulse: Whole) -> float:
     """Standard deviation of a delay, in lags; the call has so many.
 
-    Examples
-    --------
     >>> round(delay_std(100.0, 14), 3)
     0.259
     """

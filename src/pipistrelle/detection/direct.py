@@ -43,22 +43,15 @@ AFTER = 2
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DirectCalls:
-    """Where and when each caller was heard directly.
-
-    Attributes
-    ----------
-    detection : (c)
-        Number of a detection of it; -1 of the vehicle, and of whom nothing was heard.
-    delay, delay_std : (c) [s]
-        When it began; NaN likewise.
-    pulse : [s]
-        How long it lasts.
-    """
+    """Direct call of each caller: which detection it is, and when it began."""
 
     detection: Int[np.ndarray, " c"]
+    """Number of a detection of it; -1 for the vehicle and for callers not heard."""
     delay: Float[np.ndarray, " c"]
     delay_std: Float[np.ndarray, " c"]
+    """`delay` and `delay_std`: when it began; NaN likewise [s]."""
     pulse: float
+    """How long it lasts [s]."""
 
 
 def own_alone(

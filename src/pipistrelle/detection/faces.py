@@ -35,22 +35,14 @@ from pipistrelle.jit import Whole, kernel
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Heard:
-    """One frame, averaged over the faces.
-
-    Attributes
-    ----------
-    rows : Scan
-        All that was measured: a row per label and caller, both rising; with UNLABELLED for a label,
-        a row per echo.
-    clutter : int or None
-        Detections without a label; None where nobody tells labels.
-    between : bool
-        Whether it is a call that was heard between the vehicle's own.
-    """
+    """One frame, averaged over the faces."""
 
     rows: Scan
+    """One row per label and caller, both rising; without labels, one per echo."""
     clutter: int | None
+    """Number of detections without a label; None without the oracle."""
     between: bool = False
+    """Whether the call came between two calls of the vehicle."""
 
 
 def average_faces(
@@ -72,28 +64,11 @@ def average_faces(
 
     .. math:: \sigma^2 = \sigma_{signal}^2 + \sigma_{floor}^2
 
-    Parameters
-    ----------
-    time : [s]
-    detections : Detections
-        (d) rows.
-    label : (d)
-        Of each detection, or UNLABELLED.
-    averaging : "plain" or "weighted"
-    speed_of_sound : [m/s]
-    callers : (c)
-        Labels that the callers bear as landmarks, where somebody tells.
+    `time` [s]; `detections`: (d) rows; `label`: of each detection, or UNLABELLED; `speed_of_sound`
+    [m/s]; `callers`: labels of the callers as landmarks, where they are known.
 
-    Returns
-    -------
-    Heard
-
-    Notes
-    -----
     Bradley & Abaid, Sec. II-D.
 
-    Examples
-    --------
     >>> detections = Detections(
     ...     face=np.array([0, 1]), caller=np.array([0, 0]), angle=np.radians([40.0, -50.0]),
     ...     bearing=np.radians([40.0, 42.0]), delay=np.array([0.02, 0.02]), power=np.ones(2))
@@ -122,21 +97,9 @@ def same_echo(
     The strongest detection begins, and takes of every other face the strongest that agrees with it
     and is not taken.
 
-    Parameters
-    ----------
-    detections : Detections
-        (d) rows.
-    delay_gate : [s]
-    bearing_gate : [rad]
-        Largest differences within an echo.
+    `detections`: (d) rows; `delay_gate` [s]; `bearing_gate` [rad]: largest differences within an
+    echo. Returns numbers from 0, the strongest echo first.
 
-    Returns
-    -------
-    (d)
-        Numbers from 0, the strongest echo first.
-
-    Examples
-    --------
     >>> detections = Detections(
     ...     face=np.array([0, 1, 1]), caller=np.zeros(3, int), angle=np.radians([40.0, -50.0, 9.0]),
     ...     bearing=np.radians([40.0, 41.0, 99.0]), delay=np.full(3, 0.02), power=np.ones(3))
@@ -151,16 +114,6 @@ def same_echo(
 def unlabelled(heard: Heard) -> Heard:
     """Forget the labels.
 
-    Parameters
-    ----------
-    heard : Heard
-
-    Returns
-    -------
-    Heard
-
-    Examples
-    --------
     >>> from pipistrelle.detection.scans import make_scan
     >>> heard = Heard(rows=make_scan(0.5, np.array([4]), np.array([0.2])), clutter=0)
     >>> unlabelled(heard).rows.landmark

@@ -18,22 +18,9 @@ def filter_blocks(
 ) -> Complex[np.ndarray, "l f c e"]:
     """Matched filter on block sums: a boxcar as long as the call.
 
-    Parameters
-    ----------
-    blocks : (blocks, faces, tones, elements) complex
-    pulse : int
-        Blocks per call.
-    block : int
-        Samples per block.
-    noise_std : float
-        Of one complex sample.
-    out : (blocks - pulse + 1, faces, tones, elements) complex, optional
-        Written and returned instead of a new array.
-
-    Returns
-    -------
-    (lags, faces, tones, elements) complex
-        Lag i is a call that starts with block i; noise has unit variance.
+    `pulse`: blocks per call; `block`: samples per block; `noise_std`: of one complex sample; `out`:
+    written and returned instead of a new array. Lag i is a call that starts with block i;
+    noise has unit variance.
     """
     lags = max(blocks.shape[0] - pulse + 1, 0)
     matched = np.empty((lags, *blocks.shape[1:]), dtype=np.complex128) if out is None else out

@@ -72,23 +72,8 @@ def labelled(scan: Scan, label: Int[np.ndarray, " m"]) -> Scan:
     is among them, but that each detour stays: those after the first are rows without a bearing, at
     the end.
 
-    Parameters
-    ----------
-    scan : Scan
-    label : (m)
+    The log itself is returned where nothing is to be done.
 
-    Returns
-    -------
-    Scan
-        The very same where nothing is to be done.
-
-    Raises
-    ------
-    InputError
-        For labels that are no whole numbers from -1 on, one for each row.
-
-    Examples
-    --------
     >>> from pipistrelle.detection.scans import make_scan
     >>> scan = make_scan(0.5, np.full(3, UNLABELLED), np.array([0.2, 0.4, 1.0]), bearing_std=0.1)
     >>> told = labelled(scan, np.array([7, 7, UNLABELLED]))

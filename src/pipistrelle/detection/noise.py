@@ -29,10 +29,6 @@ Noise = Callable[[Scan], Scan]
 class ConstantNoise:
     """The same standard deviations for all rows (Bradley & Abaid, Table I).
 
-    Attributes
-    ----------
-    range_std, bearing_std, detour_std : [m], [rad], [m]
-
     Examples
     --------
     >>> from pipistrelle.detection.scans import make_scan
@@ -44,6 +40,7 @@ class ConstantNoise:
     range_std: float
     bearing_std: float
     detour_std: float
+    """`range_std`, `bearing_std` and `detour_std` [m], [rad], [m]."""
 
     def __call__(self, scan: Scan) -> Scan:
         """Give rows the standard deviations that they do not have."""
@@ -71,16 +68,6 @@ def _filled(
 def unstated(scan: Scan) -> Scan:
     """Forget how surely the rows of a scan say that they were measured.
 
-    Parameters
-    ----------
-    scan : Scan
-
-    Returns
-    -------
-    Scan
-
-    Examples
-    --------
     >>> from pipistrelle.detection.scans import make_scan
     >>> unstated(make_scan(0.5, np.array([3]), np.zeros(1), bearing_std=0.1)).bearing_std
     array([nan])
@@ -108,17 +95,7 @@ def as_told(scan: Scan, settings: FilterConfig, *, timing: bool) -> Scan:
 
 
 def as_said(scan: Scan) -> Scan:
-    """Leave it to the rows themselves.
-
-    Parameters
-    ----------
-    scan : Scan
-
-    Returns
-    -------
-    Scan
-        The same.
-    """
+    """Leave it to the rows themselves."""
     return scan
 
 

@@ -39,30 +39,22 @@ class Scan:
 
     What is measured is one array, a row of it for each column, so that kernels are handed one;
     each column has a name, too. Standard deviations are stated by `pipistrelle.detection.noise`.
-
-    Attributes
-    ----------
-    time : [s]
-    landmark : (m)
-        Label, as whoever recorded it says; UNLABELLED where nobody does.
-    caller : (m)
-        Whose call it is: OWN, or the number of another. Of several calls, the one that has a
-        detour, else the first of theirs.
-    numbers : (7, m)
-        The other columns, in the order of `COLUMNS`.
-    callers : (c)
-        Label that each caller bears as a landmark, by its number; UNLABELLED for the vehicle and
-        for whom nobody knows, as for those beyond.
-    moving : (v)
-        Labels of the callers that move.
     """
 
     time: float
+    """Time [s]."""
     landmark: Int[np.ndarray, " m"]
+    """Recorded label; UNLABELLED where none was recorded."""
     caller: Int[np.ndarray, " m"]
+    """OWN, or the number of another caller. Of several calls, the first with a detour, else the
+    first."""
     numbers: Float[np.ndarray, "7 m"]
+    """The other columns, in the order of `COLUMNS`."""
     callers: Int[np.ndarray, " c"] = field(default_factory=lambda: NOBODY)
+    """Label of each caller as a landmark, by its number; UNLABELLED for the vehicle and where it is
+    not known, as for numbers beyond the array."""
     moving: Int[np.ndarray, " v"] = field(default_factory=lambda: NOBODY)
+    """Labels of the callers that move."""
 
     @property
     def bearing(self) -> Float[np.ndarray, " m"]:
@@ -197,17 +189,6 @@ def _shape(name: str, values: np.ndarray | float) -> tuple[int, ...]:
 def rows_of(scan: Scan, rows: Bool[np.ndarray, " m"] | Int[np.ndarray, " k"]) -> Scan:
     """Take some rows of a scan.
 
-    Parameters
-    ----------
-    scan : Scan
-    rows : (m) bool, or (k) indices
-
-    Returns
-    -------
-    Scan
-
-    Examples
-    --------
     >>> scan = make_scan(0.5, np.array([3, 8]), np.array([0.2, 1.0]))
     >>> rows_of(scan, scan.bearing > 0.5).landmark
     array([8])
@@ -223,16 +204,6 @@ def rows_of(scan: Scan, rows: Bool[np.ndarray, " m"] | Int[np.ndarray, " k"]) ->
 def without_detours(scan: Scan) -> Scan:
     """Forget of a scan how much later than direct calls echoes came, and rows that are but that.
 
-    Parameters
-    ----------
-    scan : Scan
-
-    Returns
-    -------
-    Scan
-
-    Examples
-    --------
     >>> from pipistrelle.detection.scans import make_scan
     >>> rows = np.array([8, 8]), np.array([0.4, np.nan])
     >>> scan = make_scan(0.0, *rows, caller=np.array([1, 2]), detour=np.array([3.0, 5.0]))

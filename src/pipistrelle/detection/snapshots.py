@@ -44,37 +44,25 @@ _CHUNK = 256
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Detections:
-    """What one frame's samples hold; one row per face, caller, snapshot and peak.
-
-    Attributes
-    ----------
-    face : (m)
-    caller : (m)
-        Whose tone it is: 0 the vehicle's.
-    angle : (m) [rad]
-        Off the face's normal.
-    bearing : (m) [rad]
-        Relative to the heading.
-    delay : (m) [s]
-        Since the emission. Of another caller's tone it is nobody's to use but the label's.
-    power : (m)
-        Of the steered beam, divided by the elements: their number times the SNR of one.
-    bearing_std, delay_std : (m) [rad], [s]
-        How sure the detector is of each (`detection.certainty`); NaN, as by default, where it does
-        not say.
-    direct : DirectCalls or None
-        When the other callers were heard directly; None where the detector does not say.
-    """
+    """Calls found in one frame's samples; one row per face, caller, snapshot and peak."""
 
     face: Int[np.ndarray, " m"]
     caller: Int[np.ndarray, " m"]
+    """Number of the caller whose tone it is: 0 for the vehicle."""
     angle: Float[np.ndarray, " m"]
+    """Off the face's normal [rad]."""
     bearing: Float[np.ndarray, " m"]
+    """Relative to the heading [rad]."""
     delay: Float[np.ndarray, " m"]
+    """Since the emission [s]. For another caller's tone only the oracle uses it."""
     power: Float[np.ndarray, " m"]
+    """Of the steered beam, divided by the elements: their number times the SNR of one."""
     bearing_std: Float[np.ndarray, " m"] = field(default_factory=lambda: np.empty(0))
     delay_std: Float[np.ndarray, " m"] = field(default_factory=lambda: np.empty(0))
+    """`bearing_std` and `delay_std`: how sure the detector is of each (`detection.certainty`);
+    NaN, as by default, where it does not say [rad], [s]."""
     direct: DirectCalls | None = None
+    """When the other callers were heard directly; None where the detector does not say."""
 
     def __post_init__(self) -> None:
         """Say that a detector does not say how sure it is."""
@@ -88,39 +76,27 @@ _COLUMNS = ("face", "caller", "angle", "bearing", "delay", "power", "bearing_std
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Detector:
-    """Settled thresholds and tables of the detection stage; see `detector`.
-
-    Attributes
-    ----------
-    threshold : float
-        Of the energy of one face and tone, in units of the noise of one output.
-    runs : bool
-        Whether a run above the threshold is one snapshot, however long it is.
-    leakage, peak : float
-        Power ratios.
-    sine_limit : float
-        Sine of the largest angle off the normal that counts.
-    loudest_noise : float
-        Most that noise alone leaves beside a beam, in units of the noise of one output.
-    normal : (f) [rad]
-    wave : (c) [rad]
-        Phase between neighbours at 90 degrees, 2 pi f d / c, per tone.
-    scan : (c, n) [rad]
-        Scanned u, per tone.
-    table : (c, 2, e - 1, n)
-        Real and imaginary part of exp(-i l u), l = 1 ... e - 1, per tone.
-    """
+    """Thresholds and tables of the detection stage (`detector`)."""
 
     threshold: float
+    """Of the energy of one face and tone, in units of the noise of one output."""
     runs: bool
+    """Whether a run above the threshold is one snapshot, however long it is."""
     leakage: float
     peak: float
+    """`leakage` and `peak` are power ratios."""
     sine_limit: float
+    """Sine of the largest angle off the normal that counts."""
     loudest_noise: float
+    """0.999 quantile of the residual power of noise, in units of the noise of one output."""
     normal: Float[np.ndarray, " f"]
+    """Normal [rad]."""
     wave: Float[np.ndarray, " c"]
+    """Phase between neighbours at 90 degrees, 2 pi f d / c, per tone [rad]."""
     scan: Float[np.ndarray, "c n"]
+    """Scanned u, per tone [rad]."""
     table: Float[np.ndarray, "c 2 k n"]
+    """Real and imaginary part of exp(-i l u), l = 1 ... e - 1, per tone."""
 
 
 def detector(config: Config, layout: Layout, tones: Float[np.ndarray, " c"]) -> Detector:

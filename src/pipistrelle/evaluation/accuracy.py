@@ -11,22 +11,15 @@ from pipistrelle.geometry import wrap
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapEstimate:
-    """A map with one row per landmark, in the order in which the landmarks entered it.
-
-    Attributes
-    ----------
-    landmark : (n)
-        Label.
-    mean : (n, 2) [m]
-    covariance : (n, 2, 2) [m^2]
-    full : (n)
-        Whether the landmark is fully initialised.
-    """
+    """A map with one row per landmark, in the order in which the landmarks entered it."""
 
     landmark: Int[np.ndarray, " n"]
     mean: Float[np.ndarray, "n 2"]
+    """Mean [m]."""
     covariance: Float[np.ndarray, "n 2 2"]
+    """Covariance [m^2]."""
     full: Bool[np.ndarray, " n"]
+    """Whether the landmark is fully initialised."""
 
 
 def heaviest(landmarks: Landmarks) -> MapEstimate:
@@ -77,24 +70,10 @@ def scored_landmarks(
 
     A landmark whose true position is not known is left out.
 
-    Parameters
-    ----------
-    estimate : MapEstimate
-    true_landmark : (n)
-        Labels, each once.
-    true_position : (n, 2) [m]
+    `true_landmark`: labels, each once; `true_position` [m]. Returns `estimated` [m]; `true` [m].
 
-    Returns
-    -------
-    estimated : (m, 2) [m]
-    true : (m, 2) [m]
-
-    Notes
-    -----
     Bradley & Abaid, the sums of Eq. (27).
 
-    Examples
-    --------
     >>> estimate = MapEstimate(
     ...     landmark=np.array([7, 3, 9]),
     ...     mean=np.array([[1.0, 0.0], [2.0, 0.0], [6.0, 0.0]]),
@@ -121,20 +100,9 @@ def landmark_error(
 ) -> Float[np.ndarray, " h"]:
     """Distance of each estimated landmark from the true one of its label.
 
-    Parameters
-    ----------
-    estimate : MapEstimate of h landmarks
-    true_landmark : (n)
-        Labels, each once.
-    true_position : (n, 2) [m]
+    `true_landmark`: labels, each once; `true_position` [m]. Returns [m]: NaN where no true landmark
+    has the label.
 
-    Returns
-    -------
-    (h) [m]
-        NaN where no true landmark has the label.
-
-    Examples
-    --------
     >>> estimate = MapEstimate(
     ...     landmark=np.array([7, 9]),
     ...     mean=np.array([[4.0, 5.0], [6.0, 0.0]]),
@@ -158,20 +126,10 @@ def pose_error(
 
     .. math:: e_k = \hat x_k - x_k
 
-    Parameters
-    ----------
-    path, true_path : (k, 3) [m, m, rad]
+    `path`, `true_path` [m, m, rad]. Returns [m, m, rad].
 
-    Returns
-    -------
-    (k, 3) [m, m, rad]
-
-    Notes
-    -----
     Bradley & Abaid, the differences of Eqs. (23) and (26).
 
-    Examples
-    --------
     >>> pose_error(np.array([[1.0, 2.0, 3.1]]), np.array([[0.0, 2.0, 3.1 - 2 * np.pi]])).round(9)
     array([[1., 0., 0.]])
     """
@@ -187,21 +145,10 @@ def position_error(
 
     .. math:: d_i = \sqrt{(\hat x_i - x_i)^2 + (\hat y_i - y_i)^2}
 
-    Parameters
-    ----------
-    points, true_points : (n, 2 or more)
-        x, y [m]; further columns (a heading) are ignored.
+    `points`, `true_points`: x, y [m]; further columns (a heading) are ignored. Returns [m].
 
-    Returns
-    -------
-    (n) [m]
-
-    Notes
-    -----
     Bradley & Abaid, the terms of Eqs. (26) and (27).
 
-    Examples
-    --------
     >>> position_error(np.array([[3.0, 4.0, 0.1]]), np.zeros((1, 3)))
     array([5.])
     """
@@ -255,23 +202,12 @@ def alignment(
 
     with p' and q' the offsets from the means.
 
-    Parameters
-    ----------
-    points : (n, 2) [m]
-        At least one; the rotation is 0 where the points do not determine it.
-    reference : (n, 2) [m]
+    `points` [m]: at least one; the rotation is 0 where the points do not determine it; `reference`
+    [m]. Returns [m, m, rad]: t and theta: the pose that the origin of the points has in the
+    reference.
 
-    Returns
-    -------
-    (3) [m, m, rad]
-        t and theta: the pose that the origin of the points has in the reference.
-
-    Notes
-    -----
     The planar case of Umeyama (1991). In the plane a reflection cannot occur.
 
-    Examples
-    --------
     >>> square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
     >>> (alignment(square, np.array([[5.0, 0.0], [5.0, 1.0], [4.0, 1.0]])) / [1, 1, np.pi]).round(9)
     array([5. , 0. , 0.5])

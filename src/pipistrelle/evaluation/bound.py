@@ -95,37 +95,18 @@ def pose_bound(
 
     with J a quarter turn and :math:`\delta\theta` the error of the heading.
 
-    Parameters
-    ----------
-    motion : Motion
-    controls : (k, c)
-        As the motion model has them.
-    time : (k + 1) [s]
-    path : (k + 1, 3) [m, m, rad]
-        True poses, the start first.
-    landmarks : labels (n) and true positions (n, 2) [m]
-    scans : sequence of Scan
-        Who was heard when, with a range or a detour or without, and how surely: of the
-        measurements the standard deviations alone count. Rows of other labels are left out.
-    routes : dict of label to (k + 1, 2) [m], optional
-        True places of the callers that move.
-    wander : (2) [m/s], optional
-        What is known of their velocities: the standard deviation of each along an axis at the
-        start, and that of how far it strays in a second.
+    `controls`: as the motion model has them; `time` [s]; `path` [m, m, rad]: true poses, the start
+    first; `landmarks` [m]; `scans`: who was heard when, with a range or a detour or without, and
+    how surely: of the measurements the standard deviations alone count. Rows of other labels are
+    left out; `routes` [m]: true places of the callers that move; `wander` [m/s]: what is known of
+    their velocities: the standard deviation of each along an axis at the start, and that of how far
+    it strays in a second. Returns [m, rad, squared]: no estimator that is without bias along this
+    path has less. Zero at the start. One that knows what paths are like may be biased along each
+    and have less in the mean: a mean of such bounds over worlds is a measure to hold errors
+    against, no bound of their mean.
 
-    Returns
-    -------
-    (k + 1, 3, 3) [m, rad, squared]
-        No estimator that is without bias along this path has less. Zero at the start. One that
-        knows what paths are like may be biased along each and have less in the mean: a mean of
-        such bounds over worlds is a measure to hold errors against, no bound of their mean.
-
-    Notes
-    -----
     Source: Tichavsky, Muravchik & Nehorai, IEEE Transactions on Signal Processing 46, 1998.
 
-    Examples
-    --------
     A standing vehicle that hears nothing stays where it was.
 
     >>> motion = Motion(model="unicycle", control_std=(0.1, 0.1), noise_at_rest=False)
@@ -348,18 +329,9 @@ def path_bound(bound: Float[np.ndarray, "t 3 3"]) -> tuple[float, float]:
     .. math:: \sqrt{\tfrac1K \sum_k (B_k)_{xx} + (B_k)_{yy}}, \qquad
               \sqrt{\tfrac1K \sum_k (B_k)_{\theta\theta}}
 
-    Parameters
-    ----------
-    bound : (k + 1, 3, 3) [m, rad, squared]
-        As `pose_bound` gives it; the start is not counted.
+    `bound` [m, rad, squared]: as `pose_bound` gives it; the start is not counted. Returns
+    `position, heading` [m], [rad]: zero of a path without a step.
 
-    Returns
-    -------
-    position, heading : [m], [rad]
-        Zero of a path without a step.
-
-    Examples
-    --------
     >>> path_bound(np.stack([np.zeros((3, 3)), np.diag([9.0, 16.0, 1.0])]))
     (5.0, 1.0)
     """
@@ -383,21 +355,9 @@ def bound_of_drawn_start(
     What is heard is relative to the vehicle, so an error of the start is never noticed: it moves
     and turns the whole path.
 
-    Parameters
-    ----------
-    bound : (k + 1, 3, 3) [m, rad, squared]
-        B, as `pose_bound` gives it.
-    path : (k + 1, 3) [m, m, rad]
-        True poses.
-    start_covariance : (3, 3) [m, rad, squared]
-        P_0.
+    `bound` [m, rad, squared]: b, as `pose_bound` gives it; `path` [m, m, rad]: true poses;
+    `start_covariance` [m, rad, squared]: p_0. Returns [m, rad, squared].
 
-    Returns
-    -------
-    (k + 1, 3, 3) [m, rad, squared]
-
-    Examples
-    --------
     A heading that is off by 0.1 rad puts what is 10 m ahead a metre aside.
 
     >>> path, turned = np.array([[0.0, 0, 0], [10, 0, 0]]), np.diag([0.0, 0.0, 0.01])
@@ -426,26 +386,12 @@ def nees_of_exact_start(
     not 3 and 6, as where the start is drawn from P_0: the NEES is a sum of squares of normal
     numbers whose variances are the eigenvalues of :math:`P_k^{-1} B_k`, all below one.
 
-    Parameters
-    ----------
-    bound : (k + 1, 3, 3) [m, rad, squared]
-        B, as `pose_bound` gives it.
-    path : (k + 1, 3) [m, m, rad]
-        True poses.
-    start_covariance : (3, 3) [m, rad, squared]
-        P_0; zero, and the mean is the rank of B.
+    `bound` [m, rad, squared]: b, as `pose_bound` gives it; `path` [m, m, rad]: true poses;
+    `start_covariance` [m, rad, squared]: p_0; zero, and the mean is the rank of B.
 
-    Returns
-    -------
-    mean, variance : (k + 1)
-
-    Notes
-    -----
     Bradley & Abaid, Eq. (23), compare with 3, though their filters begin "matching the vehicle's
     initial state" with a P_0 (Sec. IV).
 
-    Examples
-    --------
     As uncertain as the start alone: half of each of three numbers.
 
     >>> mean, variance = nees_of_exact_start(np.eye(3)[None], np.zeros((1, 3)), np.eye(3))

@@ -54,58 +54,28 @@ INTERVALS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Statement:
-    """One mean over worlds, and what is claimed of it.
-
-    Attributes
-    ----------
-    label : str
-    sample : (n)
-        One number per world, in any unit.
-    relation : str
-        "above": the mean is above the margin. "not above": it is not seen to be.
-        "slightly above": it is above in this sample, but not seen to be. "within": it lies
-        between minus and plus the margin.
-    margin : float
-    sigma : float
-        How much one case varies over the worlds, in the sample's unit: a yardstick beside the
-        interval, which tells how surely a mean is known and not how large it is. NaN: none.
-    fitted : bool
-        Settings were fitted to this very number: that it holds proves little.
-    against : (m) or None
-        Numbers of other worlds: what is stated is the mean of ``sample`` less theirs.
-    """
+    """One mean over worlds, and what is claimed of it."""
 
     label: str
     sample: Float[np.ndarray, " n"]
+    """One number per world, in any unit."""
     relation: Relation = "above"
+    """"above": the mean is above the margin. "not above": it is not seen to be. "slightly
+    above": it is above in this sample, but not seen to be. "within": it lies between minus
+    and plus the margin."""
     margin: float = 0.0
     sigma: float = math.nan
+    """How much one case varies over the worlds, in the sample's unit: a yardstick beside the
+    interval, which tells how surely a mean is known and not how large it is. NaN: none."""
     fitted: bool = False
+    """Whether settings were fitted to this number: that it holds then proves little."""
     against: Float[np.ndarray, " m"] | None = None
+    """Numbers of other worlds: what is stated is the mean of ``sample`` less theirs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """What the worlds say of a statement, as one of a family.
-
-    Attributes
-    ----------
-    label, relation, margin, sigma, fitted : of the statement
-    n : int
-        Worlds; of two samples, those of the smaller.
-    mean, std : float
-        Of the sample; NaN where it is too small to have one. Of two samples the difference of the
-        means, and the standard deviation of one sample that would know it as surely.
-    alone : low, high
-        t interval of this mean by itself.
-    family : low, high
-        Bonferroni's interval: as wide as lets all of the family hold together.
-    interval : low, high
-        Simultaneous interval, as the module says.
-    p : float
-        Two-sided, Holm-adjusted: below 1 - confidence exactly where a bound passes its edge.
-    holds : True, False (its opposite is significant) or None (undecided)
-    """
+    """Test result of one statement, as one of a family."""
 
     label: str
     relation: Relation
@@ -113,12 +83,20 @@ class Finding:
     sigma: float
     fitted: bool
     n: int
+    """Worlds; of two samples, those of the smaller."""
     mean: float
     std: float
+    """`mean` and `std`: of the sample; NaN where it is too small to have one. Of two samples the
+    difference of the means, and the standard deviation of one sample that would know it as
+    surely."""
     alone: tuple[float, float]
+    """t interval of this mean by itself."""
     family: tuple[float, float]
+    """Bonferroni's interval: as wide as lets all of the family hold together."""
     interval: tuple[float, float]
+    """Simultaneous interval, as the module says."""
     p: float
+    """Two-sided, Holm-adjusted: below 1 - confidence exactly where a bound passes its edge."""
     holds: bool | None
 
 
@@ -127,28 +105,12 @@ def judge(statements: Sequence[Statement], confidence: float = 0.95) -> tuple[Fi
 
     A statement of absence ("not above", "slightly above") holds only where the family could have
     seen a mean of one standard deviation of the sample: where half the width of its widest
-    interval, t / sqrt(n), is at most 1. A statement "within" stands in the family twice, since
-    it has two opposites.
+    interval, t / sqrt(n), is at most 1. A statement "within" stands in the family twice, since it
+    has two opposites.
 
-    Parameters
-    ----------
-    statements : sequence of Statement
-    confidence : between 0 and 1
-        That all intervals hold their means.
+    `confidence`: that all intervals hold their means. Where a sample has fewer than two
+    numbers, or no spread to measure, nothing is decided and the interval is infinite.
 
-    Returns
-    -------
-    tuple of Finding, one per statement
-        Where a sample has fewer than two numbers, or no spread to measure, nothing is decided
-        and the interval is infinite.
-
-    Raises
-    ------
-    ValueError
-        A number that is not finite.
-
-    Examples
-    --------
     >>> worlds = np.array([1.0, 2.0, 3.0, 2.0])
     >>> ours, theirs = judge(
     ...     [Statement(label="gain", sample=worlds), Statement(label="loss", sample=-worlds)]
@@ -201,21 +163,11 @@ def holm(p: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
 
     .. math:: \tilde p_{(r)} = \min\bigl(1, \max_{s \le r} (m - s + 1) \, p_{(s)}\bigr)
 
-    Parameters
-    ----------
-    p : (m)
+    The p-values stand in the order given; rejecting those up to alpha keeps the family's error at
+    alpha.
 
-    Returns
-    -------
-    (m)
-        In the order given; rejecting those up to alpha keeps the family's error at alpha.
-
-    Notes
-    -----
     Source: Holm, Scandinavian Journal of Statistics 6, 1979.
 
-    Examples
-    --------
     >>> holm(np.array([0.04, 0.01, 0.03]))
     array([0.06, 0.03, 0.06])
     """
@@ -231,17 +183,8 @@ def pooled_std(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " m"]) 
 
     .. math:: \sigma = \sqrt{(s_1^2 + s_2^2) / 2}
 
-    Parameters
-    ----------
-    first, second : (n) and (m), in one unit
-        At least two numbers each.
+    `first`, `second`: at least two numbers each.
 
-    Returns
-    -------
-    In that unit.
-
-    Examples
-    --------
     >>> pooled_std(np.array([0.0, 2.0]), np.array([5.0, 5.0]))
     1.0
     """
@@ -259,23 +202,10 @@ def pseudovalues(
     Their mean is the statistic, freed of bias of order 1/n, and a t interval of theirs is one of
     it. A linear statistic gives back its value in each world.
 
-    Parameters
-    ----------
-    curves : (n, k)
-        One row per world, at least two.
-    statistic : function of (m, k) to (m)
-        T, of each row by itself.
+    `curves`: one row per world, at least two; `statistic`: t, of each row by itself.
 
-    Returns
-    -------
-    (n)
-
-    Notes
-    -----
     Source: Tukey, Annals of Mathematical Statistics 29, 1958.
 
-    Examples
-    --------
     >>> pseudovalues(np.array([[1.0], [3.0], [5.0]]), lambda mean: 2.0 * mean[:, 0])
     array([ 2.,  6., 10.])
     """

@@ -73,26 +73,14 @@ def track_nees(pose: Gaussian, true: Float[np.ndarray, "k 3"]) -> Float[np.ndarr
     After an exact start the noise of the first control step, of rank 2, leaves the covariance
     singular. That is no divergence: the NEES begins where the covariance is positive definite.
 
-    Parameters
-    ----------
-    pose : Gaussian of (k, 3) and (k, 3, 3) [m, m, rad]
-        Where it is ``invariant``, the error is the right-invariant one about the first position.
-    true : (k, 3) [m, m, rad]
-        NaN where it is not known.
+    `pose` [m, m, rad]: where it is ``invariant``, the error is the right-invariant one about the
+    first position; `true` [m, m, rad]: NaN where it is not known. Returns NaN where the truth is
+    not known and before the first positive definite covariance; elsewhere as `nees` says. Infinite
+    also where a covariance is not finite, becomes singular later, or is singular in a track that
+    has none that is positive definite.
 
-    Returns
-    -------
-    (k)
-        NaN where the truth is not known and before the first positive definite covariance;
-        elsewhere as `nees` says. Infinite also where a covariance is not finite, becomes singular
-        later, or is singular in a track that has none that is positive definite.
-
-    Notes
-    -----
     Bradley & Abaid, Eq. (23).
 
-    Examples
-    --------
     >>> exact_start = np.stack([np.zeros((3, 3)), np.diag([1.0, 0.0, 1.0]), np.eye(3)])
     >>> track_nees(Gaussian(mean=np.ones((3, 3)), covariance=exact_start), np.zeros((3, 3)))
     array([nan, nan,  3.])
@@ -198,28 +186,16 @@ def anees_bounds_about(
     r"""Interval of ANEES where a consistent filter's NEES has another mean than its states.
 
     As after an exact start (`evaluation.bound.nees_of_exact_start`). A weighted sum of chi-squares
-    is taken as the gamma distribution of the same mean m and variance v, which for equal weights
-    it is:
+    is taken as the gamma distribution of the same mean m and variance v, which for equal weights it
+    is:
 
     .. math:: \Gamma\left(\text{shape } \frac{N m^2}{v}, \text{scale } \frac{v}{N m}\right)
 
-    Parameters
-    ----------
-    mean, variance : (*k)
-        Of one run's NEES; 3 and 6 make `anees_bounds`. Of a mean of 0, nothing is between.
-    runs : N, at least 1
-    confidence : between 0 and 1
+    `mean`, `variance`: of one run's NEES; 3 and 6 make `anees_bounds`. Of a mean of 0, nothing is
+    between.
 
-    Returns
-    -------
-    low, high : (*k)
-
-    Notes
-    -----
     Source: Welch, Biometrika 29, 1938; Satterthwaite, Biometrics Bulletin 2, 1946.
 
-    Examples
-    --------
     >>> low, high = anees_bounds_about(np.array([2.24]), np.array([3.6]), 107)
     >>> low.round(2), high.round(2)
     (array([1.89]), array([2.61]))

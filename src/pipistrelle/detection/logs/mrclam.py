@@ -29,25 +29,9 @@ def read_mrclam(folder: Path, robot: int, span: tuple[float, float] = (-math.inf
     Odometry is merged into steps of 0.1 s. Rows that show another robot (subjects 1 to 5) or a
     barcode of nobody are dropped and counted.
 
-    Parameters
-    ----------
-    folder : Path
-    robot : 1 to 5
-    span : (start, end) [s]
-        The log is cut to it: where the truth begins and ends, for whoever knows.
+    `span` [s]: the log is cut to it: where the truth begins and ends, for whoever knows. Returns it
+    starts at the origin: these files do not say where the robot stood.
 
-    Returns
-    -------
-    Log
-        It starts at the origin: these files do not say where the robot stood.
-
-    Raises
-    ------
-    InputError
-        With the file and the line; also where more than 5 % of the barcodes are unknown.
-
-    Notes
-    -----
     Format and robots: Leung et al., IJRR 30(8), 2011.
     """
     columns = ("time", "velocity", "angular_rate")

@@ -36,28 +36,12 @@ _JUMP = (0.5, 0.5)  # [m], [rad]: less in one step is no jump
 def motions_between(odometry: Table, time: Float[np.ndarray, " t"]) -> Float[np.ndarray, "t-1 c"]:
     r"""How the vehicle moved from each time to the next, by rows of poses.
 
-    Parameters
-    ----------
-    odometry : Table
-        Of ``time``, ``x``, ``y`` and ``heading``, perhaps with the columns of `MOTION_COVARIANCE`.
-        Of rows of one time the last says where the vehicle is.
-    time : (k + 1) [s]
-        Rising, from the first row's time or later to the last row's or sooner.
+    `odometry` has the columns ``time``, ``x``, ``y`` and ``heading``, perhaps with the columns of
+    `MOTION_COVARIANCE`. Of rows of one time the last says where the vehicle is; `time` [s]: rising,
+    from the first row's time or later to the last row's or sooner. Returns forward, sideways [m]
+    and turn [rad] in [-pi, pi), then the covariance, NaN where it is not said for all of a step.
+    Zero to the bit where the vehicle stands.
 
-    Returns
-    -------
-    (k, 3), or (k, 9) where a row says how sure it is
-        Forward, sideways [m] and turn [rad] in [-pi, pi), then the covariance, NaN where it is not
-        said for all of a step. Zero to the bit where the vehicle stands.
-
-    Raises
-    ------
-    InputError
-        With the line: of a heading that can be no radians, a place too far from the one before,
-        a covariance that is none.
-
-    Examples
-    --------
     >>> from pathlib import Path
     >>> rows = {"time": np.array([0.0, 1.0]), "x": np.array([5.0, 5.0]), "y": np.array([0.0, 2.0])}
     >>> column = rows | {"heading": np.full(2, np.pi / 2)}
@@ -83,17 +67,8 @@ def motions_between(odometry: Table, time: Float[np.ndarray, " t"]) -> Float[np.
 def relative_motions(poses: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t-1 3"]:
     """How each pose lies as seen from the one before.
 
-    Parameters
-    ----------
-    poses : (k + 1, 3) [m, m, rad]
+    `poses` [m, m, rad]. Returns [m, m, rad]: forward, sideways, and the turn the shorter way.
 
-    Returns
-    -------
-    (k, 3) [m, m, rad]
-        Forward, sideways, and the turn the shorter way.
-
-    Examples
-    --------
     >>> relative_motions(np.array([[1.0, 1.0, 3.0], [1.0, 1.0, -3.0]])).round(3) + 0.0
     array([[0.   , 0.   , 0.283]])
     """
@@ -106,18 +81,9 @@ def relative_motions(poses: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t-1 
 def poses_along(motions: Float[np.ndarray, "k _"]) -> Float[np.ndarray, "k+1 3"]:
     """Where motions lead, one after another, from the origin on.
 
-    Parameters
-    ----------
-    motions : (k, 3 or more) [m, m, rad]
-        Forward, sideways, turn; what follows is not looked at.
+    `motions` [m, m, rad]: forward, sideways, turn; what follows is not looked at. Returns [m, m,
+    rad]: headings wrapped. `relative_motions` gives the motions again, but for rounding.
 
-    Returns
-    -------
-    (k + 1, 3) [m, m, rad]
-        Headings wrapped. `relative_motions` gives the motions again, but for rounding.
-
-    Examples
-    --------
     >>> poses_along(np.array([[1.0, 0.0, np.pi / 2], [1.0, 0.0, 0.0]])).round(3)[:, :2] + 0.0
     array([[0., 0.],
            [1., 0.],
@@ -131,19 +97,10 @@ def poses_along(motions: Float[np.ndarray, "k _"]) -> Float[np.ndarray, "k+1 3"]
 def jumps(motions: Float[np.ndarray, "k _"], dt: Float[np.ndarray, " k"]) -> Int[np.ndarray, " j"]:
     """Find the steps that are perhaps no motion, but a frame that was begun anew.
 
-    Parameters
-    ----------
-    motions : (k, 3 or more) [m, m, rad]
-    dt : (k) [s]
+    `motions` [m, m, rad]; `dt` [s]. Returns those in which the vehicle would go, or turn, more than
+    ten times as fast as in nine tenths of the steps in which it does so at all, and half a metre or
+    half a radian or more.
 
-    Returns
-    -------
-    (j)
-        Those in which the vehicle would go, or turn, more than ten times as fast as in nine tenths
-        of the steps in which it does so at all, and half a metre or half a radian or more.
-
-    Examples
-    --------
     >>> drive = np.tile([0.1, 0.0, 0.0], (20, 1))
     >>> drive[7] = [40.0, -3.0, 0.0]
     >>> jumps(drive, np.full(20, 0.1))

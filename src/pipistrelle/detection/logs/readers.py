@@ -28,53 +28,32 @@ Robot = int | str
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reader:
-    """What the rest of the package knows of a format.
-
-    Attributes
-    ----------
-    name : str
-    title : str
-        As refusals have it.
-    recognises : function of a folder
-        Tells by its files whether it holds such a log.
-    read : function of a folder and, where it may hold several robots' logs, the robot
-        Returns a `Log`.
-    robots : function of a folder, optional
-        Lists the robots whose logs it holds, by number or by name: ``read`` is given one of these.
-        Without it there is one, and it needs no name.
-    files : tuple of str
-        Patterns of what it may read in the folder, by which a log is known to be the same again.
-    help, robot_help : str
-        What the command line says of the folder, and of whom ``--robot`` chooses from.
-    """
+    """How logs of one format are recognised and read."""
 
     name: str
     title: str
+    """Name in refusals."""
     recognises: Callable[[Path], bool]
+    """Tells by its files whether it holds such a log."""
     read: "Callable[..., Log]"
+    """Reads the folder, of one robot where it holds several, as a `Log`."""
     robots: Callable[[Path], Sequence[Robot]] | None = None
+    """Lists the robots whose logs it holds, by number or by name: ``read`` is given one of
+    these. Without it there is one, and it needs no name."""
     files: tuple[str, ...] = ("*",)
+    """Patterns of what it may read in the folder, by which a log is known to be the same again."""
     help: str = ""
     robot_help: str = ""
+    """`help` and `robot_help`: what the command line says of the folder, and of whom ``--robot``
+    chooses from."""
 
 
 def reader_of(folder: Path, readers: Sequence[Reader] = ()) -> Reader:
     """Find the reader of a folder: the first that recognises it.
 
-    Parameters
-    ----------
-    folder : Path
-    readers : sequence of Reader
-        Asked before the package's own.
+    `readers`: asked before the package's own. A folder that none recognises goes to the reader of
+    the package's own log folders, which says what is missing.
 
-    Returns
-    -------
-    Reader
-        Of a folder that none recognises that of the package's log folders, who will say what is
-        missing.
-
-    Examples
-    --------
     >>> reader_of(Path("/nowhere")).name
     'folder'
     >>> tape = Reader(name="tape", title="a tape", recognises=lambda folder: True, read=print)
@@ -88,17 +67,7 @@ def reader_of(folder: Path, readers: Sequence[Reader] = ()) -> Reader:
 def recording_of(path: Path) -> str | None:
     """Say what a recording is that no reader takes, by its name or by what a folder holds.
 
-    Parameters
-    ----------
-    path : Path
 
-    Returns
-    -------
-    str or None
-        What it is, and what can be done with it.
-
-    Examples
-    --------
     >>> recording_of(Path("walk.mcap"))[:30], recording_of(Path("walk"))
     ('a ROS bag, which is not read; ', None)
     """

@@ -40,87 +40,62 @@ _UNITS = (1e-3, 1e-6, 1e-9)  # [s], of other clocks
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogCaller:
-    """Someone else whose calls were recorded.
-
-    Attributes
-    ----------
-    name : str
-        As rows have it.
-    landmark : int
-        The label that it bears as a landmark.
-    moves : bool
-        Then it is no landmark of the map; filters that follow callers are told of it.
-    place, place_std : (2) [m] or None
-        Where it stands, and how surely that is known, if it is: 1e-3 m where nobody says.
-    """
+    """Someone else whose calls were recorded."""
 
     name: str
+    """Number that its rows have."""
     landmark: int
+    """The label that it bears as a landmark."""
     moves: bool = False
+    """Whether it moves: it is then no landmark of the map, and filters may follow it."""
     place: tuple[float, float] | None = None
     place_std: tuple[float, float] | None = None
+    """`place` and `place_std`: where it stands, and the standard deviation of that: 1e-3 m where
+    none is stated [m]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Log:
-    """A recorded drive: what the vehicle did and heard, and how far to trust it.
-
-    Attributes
-    ----------
-    name : str
-    time : (k + 1) [s]
-        The start, then the end of each step.
-    controls : (k, 2), of poses (k, 3) or (k, 9)
-        Velocity [m/s] and angular rate [rad/s] (bicycle: speed and steering angle [rad]); of poses
-        the motion in the step, forward, sideways [m] and turn [rad], perhaps with its covariance
-        (`pipistrelle.estimation.motion`).
-    dt : (k) [s]
-        Length of each step.
-    scans : tuple of Scan
-        In order; each bears exactly the ``time`` entry at which it is used.
-    motion : "unicycle", "bicycle" or "poses"
-    wheelbase : [m]
-        Bicycle only.
-    control_std : (2), of poses (3)
-        Noise of the controls in one step, constant over it; of a motion that does not say its own.
-    noise_at_rest : bool
-        False: a step whose controls are zero, or whose motion is, is exact.
-    initial_pose, initial_pose_std : (3) [m, m, rad]
-    range_std : [m]
-    bearing_std : [rad]
-    detour_std : [m] or None
-        None: not said.
-    range_bounds : (2) [m]
-        Nearest and farthest range of a passive landmark.
-    callers : tuple of LogCaller
-        Whoever else called; the first is number 1 of the scans' callers.
-    gate : float or None
-        Share of a measurement's predicted distribution that is accepted; None: not said.
-    ignored_rows : dict of str to int
-        Rows that were dropped, by reason.
-    turned : int
-        Bearings beyond a whole turn, which are wrapped as any.
-    """
+    """A recorded drive: what the vehicle did and heard, and how far to trust it."""
 
     name: str
     time: Float[np.ndarray, " t"]
+    """The start, then the end of each step [s]."""
     controls: Float[np.ndarray, "t-1 c"]
+    """Velocity [m/s] and angular rate [rad/s] (bicycle: speed and steering angle [rad]); of
+    poses the motion in the step, forward, sideways [m] and turn [rad], perhaps with its
+    covariance (`pipistrelle.estimation.motion`)."""
     dt: Float[np.ndarray, " t-1"]
+    """Length of each step [s]."""
     scans: tuple[Scan, ...]
+    """In order; each bears exactly the ``time`` entry at which it is used."""
     motion: Literal["unicycle", "bicycle", "poses"]
     wheelbase: float = 1.0
+    """Bicycle only [m]."""
     control_std: tuple[float, ...]
+    """Noise of the controls in one step, constant over it; of a motion that does not say its
+    own."""
     noise_at_rest: bool = True
+    """Whether a step of zero controls or zero motion has noise; if not, it is exact."""
     initial_pose: tuple[float, float, float]
     initial_pose_std: tuple[float, float, float]
+    """`initial_pose` and `initial_pose_std` [m, m, rad]."""
     range_std: float
+    """Range std [m]."""
     bearing_std: float
+    """Bearing std [rad]."""
     detour_std: float | None = None
+    """None: not said [m]."""
     range_bounds: tuple[float, float]
+    """Nearest and farthest range of a passive landmark [m]."""
     callers: tuple[LogCaller, ...] = ()
+    """Whoever else called; the first is number 1 of the scans' callers."""
     gate: float | None = None
+    """Share of a measurement's predicted distribution that is accepted; None: not said."""
     ignored_rows: dict[str, int]
+    """Rows that were dropped, by reason."""
     turned: int = 0
+    """Bearings beyond a whole turn, which are wrapped as any."""
 
 
 def assemble(
@@ -206,17 +181,7 @@ def assemble(
 def check_seconds(table: Table, longest_gap: float = _LONGEST_GAP) -> None:
     """Refuse times that can be no seconds, and say which unit they may have.
 
-    Parameters
-    ----------
-    table : Table
-        With a column ``time``.
-    longest_gap : [s]
-        Typically between two rows.
-
-    Raises
-    ------
-    InputError
-        With the factor that fits.
+    `table`: with a column ``time``; `longest_gap` [s]: typically between two rows.
     """
     time = table.column["time"]
     gaps = np.diff(time)

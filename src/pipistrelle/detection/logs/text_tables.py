@@ -39,20 +39,13 @@ _BOUNDS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
-    """The rows of a text file, sound on their own: finite numbers, times that never run back.
-
-    Attributes
-    ----------
-    path : Path
-    line : (n)
-        Line of each row in the file, from 1.
-    column : dict of str to (n)
-        Values by column; labels are integers, what is missing is NaN.
-    """
+    """The rows of a text file, sound on their own: finite numbers, times that never run back."""
 
     path: Path
     line: Int[np.ndarray, " n"]
+    """Line of each row in the file, from 1."""
     column: dict[str, np.ndarray]
+    """Values by column; labels are integers, what is missing is NaN."""
 
 
 def read_table(
@@ -136,18 +129,8 @@ def read_table(
 def table_text(columns: tuple[str, ...], *values: np.ndarray) -> str:
     r"""Lay out columns with a header: floats exactly, NaN as an empty field.
 
-    Parameters
-    ----------
-    columns : names
-    values : one (n) for each name
-        Numbers, or words without commas.
+    `values`: numbers, or words without commas.
 
-    Returns
-    -------
-    str
-
-    Examples
-    --------
     >>> table_text(("landmark", "range"), np.array([4, 7]), np.array([0.1, np.nan]))
     'landmark,range\n4,0.1\n7,\n'
     """
@@ -164,17 +147,7 @@ def _field(value: float | str) -> str:
 
 
 def rows_kept(table: Table, kept: Bool[np.ndarray, " n"]) -> Table:
-    """Return a table of some of its rows.
-
-    Parameters
-    ----------
-    table : Table
-    kept : (n)
-
-    Returns
-    -------
-    Table
-    """
+    """Return a table of some of its rows."""
     column = {name: values[kept] for name, values in table.column.items()}
     return replace(table, line=table.line[kept], column=column)
 
@@ -182,20 +155,8 @@ def rows_kept(table: Table, kept: Bool[np.ndarray, " n"]) -> Table:
 def check_unique(table: Table, *names: str, besides: str | None = None) -> None:
     """Refuse a table of which two rows agree in all of these columns.
 
-    Parameters
-    ----------
-    table : Table
-    names : one or more columns
-    besides : str, optional
-        One more, of whole numbers, that a refusal does not tell.
+    `besides` is one more column of whole numbers, which refusals do not name.
 
-    Raises
-    ------
-    InputError
-        With both lines.
-
-    Examples
-    --------
     >>> column = {"landmark": np.array([4, 7, 4])}
     >>> check_unique(Table(path=Path("x.csv"), line=np.array([2, 3, 4]), column=column), "landmark")
     Traceback (most recent call last):

@@ -30,49 +30,33 @@ EIGHT = 96
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Commands:
-    """What is commanded, whatever comes of it; the vehicle starts where the settings say.
-
-    Attributes
-    ----------
-    time : (n) [s]
-        Since the start, rising: a row holds until the next one's, the last only ends the drive.
-    rows : (n, 2)
-        Speed [m/s], and steering angle [rad] of a bicycle or angular rate [rad/s] of a unicycle.
-    """
+    """Commanded controls; the vehicle starts where the settings say."""
 
     time: Float[np.ndarray, " n"]
+    """Since the start, rising: a row holds until the next one's, the last only ends the drive
+    [s]."""
     rows: Float[np.ndarray, "n 2"]
+    """Speed [m/s], and steering angle [rad] of a bicycle or angular rate [rad/s] of a unicycle."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Waypoints:
-    """A line through points, and from the last to the first as often as there is time.
-
-    Attributes
-    ----------
-    points : (n, 2) [m]
-        At least two; the vehicle starts at the first.
-    """
+    """A line through points, and from the last to the first as often as there is time."""
 
     points: Float[np.ndarray, "n 2"]
+    """At least two; the vehicle starts at the first [m]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Poses:
-    """Where the vehicle is, and what its filters are told that it was commanded.
-
-    Attributes
-    ----------
-    time : (n) [s]
-        Since the start, rising; poses in between are interpolated.
-    path : (n, 3) [m, m, rad]
-    commands : Commands or None
-        None: what would have led along the path, less noise.
-    """
+    """Poses of the vehicle, and the controls that its filters assume."""
 
     time: Float[np.ndarray, " n"]
+    """Since the start, rising; poses in between are interpolated [s]."""
     path: Float[np.ndarray, "n 3"]
+    """Path [m, m, rad]."""
     commands: Commands | None = None
+    """None: what would have led along the path, less noise."""
 
 
 Course = Commands | Waypoints | Poses
@@ -81,20 +65,8 @@ Course = Commands | Waypoints | Poses
 def motion_of(motion: MotionConfig) -> Motion:
     """Return the settings' motion model, as the filters take it.
 
-    Parameters
-    ----------
-    motion : MotionConfig
-
-    Returns
-    -------
-    Motion
-
-    Notes
-    -----
     Bradley & Abaid, Eq. (5).
 
-    Examples
-    --------
     >>> motion_of(MotionConfig(speed_std=0.2)).control_std
     (0.2, 0.03)
     """
@@ -109,22 +81,11 @@ def motion_of(motion: MotionConfig) -> Motion:
 def course_of(setup: ScenarioConfig, motion: Motion) -> Course:
     """Return the course that the settings name.
 
-    Parameters
-    ----------
-    setup : ScenarioConfig
-    motion : Motion
+    A circle gives its constant controls; a unicycle turns as the bicycle of its wheelbase
+    does.
 
-    Returns
-    -------
-    Course
-        Of a circle its constant controls; a unicycle turns as the bicycle of its wheelbase does.
-
-    Notes
-    -----
     Bradley & Abaid, Sec. IV: the circle.
 
-    Examples
-    --------
     >>> unicycle = Motion(model="unicycle", control_std=(0.1, 0.1))
     >>> course_of(ScenarioConfig(course="corridor", extent=9.0, lane=4.0), unicycle).points
     array([[-9., -1.],
@@ -151,24 +112,9 @@ def course_of(setup: ScenarioConfig, motion: Motion) -> Course:
 def steps_of(course: Course, setup: ScenarioConfig) -> int:
     """Count the control steps of a course that ends somewhere.
 
-    Parameters
-    ----------
-    course : Course
-    setup : ScenarioConfig
-        Its step, and the speed between way-points.
+    `setup`: its step, and the speed between way-points. Way-points give as many steps as the line
+    takes, from the first to the last.
 
-    Returns
-    -------
-    int
-        Of way-points as many as the line takes, from the first to the last.
-
-    Raises
-    ------
-    InputError
-        Way-points without a speed.
-
-    Examples
-    --------
     >>> steps_of(Waypoints(points=np.array([[0.0, 0.0], [7.5, 0.0]])), ScenarioConfig())
     80
     """
@@ -188,35 +134,13 @@ def driven(
 ) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 2"]]:
     """Drive a course, with noise on both controls.
 
-    Parameters
-    ----------
-    course : Course
-    setup : ScenarioConfig
-        Its steps, their length, and the speed between way-points.
-    motion : Motion
-    rng : Generator
-    bias : two numbers
-        What the vehicle does beyond what it is told, noise apart: of speed [m/s], and of steering
-        angle [rad] or angular rate [rad/s].
+    `setup`: its steps, their length, and the speed between way-points; `bias`: what the vehicle
+    does beyond what it is told, noise apart: of speed [m/s], and of steering angle [rad] or angular
+    rate [rad/s]. Returns `path` [m, m, rad]: true poses, the start first; `controls`: as the
+    filters know them.
 
-    Returns
-    -------
-    path : (k + 1, 3) [m, m, rad]
-        True poses, the start first.
-    controls : (k, 2)
-        As the filters know them.
-
-    Raises
-    ------
-    InputError
-        Way-points without a speed, or a course that ends before the drive.
-
-    Notes
-    -----
     Bradley & Abaid, Eq. (5).
 
-    Examples
-    --------
     Straight on without noise, then round the first corner of a corridor:
 
     >>> still = Motion(model="unicycle", control_std=(0.0, 0.0))

@@ -25,31 +25,11 @@ def landmarks_in(
 ) -> Points:
     """Draw the landmarks of a world, clear of what is there already.
 
-    Parameters
-    ----------
-    setup : ScenarioConfig
-    path : (k, 2) [m]
-        Of the vehicle.
-    callers : (m, 2) [m]
-        That stand.
-    rng : Generator
+    `path` [m]: of the vehicle; `callers` [m]: that stand. Returns [m]: of an orchard or of rooms
+    those nearest the centre, from there on.
 
-    Returns
-    -------
-    (n, 2) [m]
-        Of an orchard or of rooms those nearest the centre, from there on.
-
-    Raises
-    ------
-    InputError
-        When they find no place.
-
-    Notes
-    -----
     Bradley & Abaid, Sec. IV: the disc.
 
-    Examples
-    --------
     >>> setup, nowhere = ScenarioConfig(field="rows", lane=4.0, landmarks=8), np.empty((0, 2))
     >>> trees = landmarks_in(setup, nowhere, nowhere, np.random.default_rng(7))
     >>> np.unique(np.rint(trees[:, 1]))
@@ -74,14 +54,7 @@ def landmarks_in(
 def nearest(points: Points, place: Float[np.ndarray, "2"]) -> float:
     """Return the distance of the nearest of the points [m]; infinite where there is none.
 
-    Parameters
-    ----------
-    points : (n, 2) [m]
-    place : (2) [m]
-
-    Returns
-    -------
-    float
+    `points` [m]; `place` [m].
     """
     offset = points - place
     return math.sqrt(np.min(np.sum(offset * offset, axis=1), initial=math.inf))

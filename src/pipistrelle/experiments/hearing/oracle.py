@@ -93,23 +93,9 @@ def faintest_level_db(
 ) -> float:
     """Level of an arrival that is expected a margin under the detection threshold.
 
-    Parameters
-    ----------
-    threshold : float
-        Of the energy over a face's elements, each of unit noise variance.
-    elements : int
-    samples : int
-        Per call.
-    noise_std : float
-        Of one sample.
-    margin_db : [dB]
+    `threshold`: of the energy over a face's elements, each of unit noise variance; `samples`: per
+    call; `noise_std`: of one sample; `margin_db` [dB]. Returns [dB].
 
-    Returns
-    -------
-    [dB]
-
-    Examples
-    --------
     >>> settled = {"elements": 10, "samples": 560, "noise_std": 1.0}
     >>> round(faintest_level_db(32.7, margin_db=6.0, **settled), 1)
     -29.9

@@ -41,22 +41,8 @@ Points = Float[np.ndarray, "_ 2"]
 def with_routes(layer: Layer) -> Layer:
     r"""Put the rows of callers' routes in place of the files that hold them.
 
-    Parameters
-    ----------
-    layer : Layer
+    The settings returned need no other file.
 
-    Returns
-    -------
-    Layer
-        Settings that are whole wherever they are taken.
-
-    Raises
-    ------
-    InputError
-        What is wrong with a file, by its line.
-
-    Examples
-    --------
     >>> from tempfile import TemporaryDirectory
     >>> from pipistrelle.settings import from_flags
     >>> with TemporaryDirectory() as place:
@@ -75,20 +61,7 @@ def with_routes(layer: Layer) -> Layer:
 def routes_read(callers: Any, where: str) -> Any:
     """Put rows in place of files, as `with_routes`, in what is given as callers, sound or not.
 
-    Parameters
-    ----------
-    callers : object
-    where : str
-        They were given, for a refusal.
-
-    Returns
-    -------
-    object
-
-    Raises
-    ------
-    InputError
-        As `with_routes`.
+    `where` they were given is named in refusals.
     """
     if not isinstance(callers, (list, tuple)):
         return callers
@@ -126,24 +99,17 @@ def _rows(path: str, where: str) -> list[list[float]]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Around:
-    """What callers are put into.
-
-    Attributes
-    ----------
-    config : Config
-    time : (t) [s]
-    path : (t, 2) [m]
-        Of the vehicle.
-    landmarks : (n, 2) [m]
-    course : Course, optional
-        Of the vehicle, where it is not the one that the settings name.
-    """
+    """World and settings into which callers are put."""
 
     config: Config
     time: Float[np.ndarray, " t"]
+    """Time [s]."""
     path: Float[np.ndarray, "t 2"]
+    """Of the vehicle [m]."""
     landmarks: Points
+    """Landmarks [m]."""
     course: Course | None = None
+    """Of the vehicle, where it is not the one that the settings name."""
 
 
 def callers_among(
@@ -154,27 +120,9 @@ def callers_among(
 ) -> tuple[Caller, ...]:
     """Put callers where they say that they are, and draw what they leave open.
 
-    Parameters
-    ----------
-    around : Around
-    told : sequence of CallerConfig
-    rng : Generator
-        Its children are used, one for each caller.
-    first : Generator, optional
-        In place of the first child: as it was before the beacon was drawn.
+    `first`: stands in for the first child: as it was before the beacon was drawn. Callers have
+    a place, or one for each time; the vehicle is not among them.
 
-    Returns
-    -------
-    tuple of Caller
-        With a place, or one for each time; without the vehicle.
-
-    Raises
-    ------
-    InputError
-        For a tone that nobody tells, or a caller that finds no place.
-
-    Examples
-    --------
     >>> still = Around(
     ...     config=Config(), time=np.arange(3.0), path=np.zeros((3, 2)), landmarks=np.empty((0, 2))
     ... )
@@ -229,21 +177,8 @@ def place_at(
 ) -> Float[np.ndarray, "2"] | None:
     """Draw a place at a distance from the centre, clear of points.
 
-    Parameters
-    ----------
-    distance : [m]
-    setup : ScenarioConfig
-        Its clearance.
-    rng : Generator
-    clear_of : sequence of (k, 2) [m]
+    `distance` [m]; `setup` gives the clearance; `clear_of` [m]. None where no place was found.
 
-    Returns
-    -------
-    (2) [m] or None
-        None where none was found.
-
-    Examples
-    --------
     >>> place = place_at(3.0, ScenarioConfig(), np.random.default_rng(7), [np.zeros((1, 2))])
     >>> round(float(np.hypot(*place)), 9)
     3.0

@@ -22,28 +22,20 @@ from pipistrelle.experiments.hearing.worlds import ANY, World
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
-    """A true world. Landmark i (from 0) bears the label i + 1, caller j (from 1) the label n + j.
-
-    Attributes
-    ----------
-    time : (k + 1) [s]
-    path : (k + 1, 3) [m, m, rad]
-        True poses, the start first.
-    controls : (k, 2)
-        Nominal speed [m/s] and steering angle [rad] of each step, as the filters know them.
-    landmarks : (n, 2) [m]
-    callers : tuple of Caller
-        The vehicle first; paths have a place for each of the times.
-    bodies : Bodies or None
-        Of the landmarks, where they are not as the settings have them.
-    """
+    """A true world: landmark i (from 0) has the label i + 1, caller j (from 1) the label n + j."""
 
     time: Float[np.ndarray, " t"]
+    """Time [s]."""
     path: Float[np.ndarray, "t 3"]
+    """True poses, the start first [m, m, rad]."""
     controls: Float[np.ndarray, "t-1 2"]
+    """Nominal speed [m/s] and steering angle [rad] of each step, as the filters know them."""
     landmarks: Float[np.ndarray, "n 2"]
+    """Landmarks [m]."""
     callers: tuple[Caller, ...]
+    """The vehicle first; paths have a place for each of the times."""
     bodies: Bodies | None = None
+    """Of the landmarks, where they are not as the settings have them."""
 
 
 def world_of(config: Config, iteration: int = 0, world: World = ANY) -> Scenario:
@@ -81,29 +73,10 @@ def draw_scenario(config: Config, rng: np.random.Generator, world: World = ANY) 
     Where callers are listed, they are drawn last: path and landmarks are those of the paper's
     beacon, whoever calls. Landmarks keep clear of callers that a world's folder puts somewhere.
 
-    Parameters
-    ----------
-    config : Config
-    rng : Generator
-    world : World
-        What it knows is not drawn.
+    What the `world` already knows is not drawn.
 
-    Returns
-    -------
-    Scenario
-
-    Raises
-    ------
-    InputError
-        When landmarks, the beacon or a caller find no place, the world's path is too short, or as
-        `callers_among`.
-
-    Notes
-    -----
     Bradley & Abaid, Sec. IV.
 
-    Examples
-    --------
     >>> world = draw_scenario(Config(), np.random.default_rng(7))
     >>> world.path.shape, world.landmarks.shape
     ((1501, 3), (50, 2))
@@ -178,17 +151,8 @@ def _mission_of(world: Scenario, vehicle: int) -> Scenario:
 def landmark_count(scenario: Scenario) -> int:
     """Count what a world has to map: the landmarks, and all callers but one.
 
-    Parameters
-    ----------
-    scenario : Scenario
+    The vehicle is no landmark of its own map; each other caller is one.
 
-    Returns
-    -------
-    int
-        The vehicle is no landmark of its own map; each other caller is one.
-
-    Examples
-    --------
     >>> landmark_count(world_of(Config(scenario=ScenarioConfig(landmarks=12))))
     13
     """
@@ -198,17 +162,8 @@ def landmark_count(scenario: Scenario) -> int:
 def standing_landmarks(scenario: Scenario) -> LabelledPoints:
     """Label what stands: the landmarks, then the callers that do not move.
 
-    Parameters
-    ----------
-    scenario : Scenario
+    Labels rise; positions are in metres.
 
-    Returns
-    -------
-    labels (m) and positions (m, 2) [m]
-        Labels rising.
-
-    Examples
-    --------
     >>> labels, places = standing_landmarks(world_of(Config()))
     >>> labels[[0, -1]], places.shape
     (array([ 1, 51]), (51, 2))
@@ -223,17 +178,8 @@ def standing_landmarks(scenario: Scenario) -> LabelledPoints:
 def moving_callers(scenario: Scenario) -> dict[int, Caller]:
     """Label the callers that move, which are no landmarks of a map.
 
-    Parameters
-    ----------
-    scenario : Scenario
+    Labels rise.
 
-    Returns
-    -------
-    dict of label to Caller
-        Labels rising.
-
-    Examples
-    --------
     >>> moving_callers(world_of(Config()))
     {}
     """
@@ -248,17 +194,8 @@ def _others(scenario: Scenario) -> dict[int, Caller]:
 def caller_labels(scenario: Scenario) -> Int[np.ndarray, " c"]:
     """List the labels that the callers bear as landmarks, by their numbers.
 
-    Parameters
-    ----------
-    scenario : Scenario
+    The vehicle's is UNLABELLED.
 
-    Returns
-    -------
-    (c)
-        UNLABELLED for the vehicle.
-
-    Examples
-    --------
     >>> caller_labels(world_of(Config()))
     array([-1, 51])
     """
@@ -270,17 +207,6 @@ def caller_labels(scenario: Scenario) -> Int[np.ndarray, " c"]:
 def assumed_motion(config: Config) -> Motion:
     """Return the motion model that the filters believe in.
 
-    Parameters
-    ----------
-    config : Config
-        Its sections motion and assumed.
-
-    Returns
-    -------
-    Motion
-
-    Examples
-    --------
     >>> from pipistrelle.config import AssumedConfig
     >>> assumed_motion(Config(assumed=AssumedConfig(wheelbase=0.25))).wheelbase
     0.25

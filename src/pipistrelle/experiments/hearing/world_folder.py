@@ -82,19 +82,7 @@ class _WorldTable(Section):
 def named_world(layer: Layer) -> World | None:
     """Read the world that settings name.
 
-    Parameters
-    ----------
-    layer : Layer
-
-    Returns
-    -------
-    World or None
-        None where they name none.
-
-    Raises
-    ------
-    InputError
-        As `read_world`.
+    None where they name none.
     """
     given = layer.get(WORLD_KEY)
     return None if given is None or given.value is None else read_world(Path(str(given.value)))
@@ -103,20 +91,8 @@ def named_world(layer: Layer) -> World | None:
 def settled(world: World, layer: Layer) -> Layer:
     """Lay a world's settings beneath others.
 
-    Parameters
-    ----------
-    world : World
-    layer : Layer
-
-    Returns
-    -------
-    Layer
-        With the number of its landmarks, and of the steps that its path takes unless that is given.
-
-    Raises
-    ------
-    InputError
-        Where the layer says otherwise than the world.
+    They have the number of its landmarks, and of the steps that its path takes unless that
+    is given.
     """
     beneath = world.settings | _decided(world, layer) | layer
     if world.course is not None and _STEPS not in beneath:
@@ -128,23 +104,8 @@ def settled(world: World, layer: Layer) -> Layer:
 def laid_over(world: World, layer: Layer, values: Layer) -> Layer:
     """Lay a world's settings over others, as one value of a grid.
 
-    Parameters
-    ----------
-    world : World
-    layer : Layer
-        Settings that hold where neither the world nor the values say anything else.
-    values : Layer
-        Of the rest of the grid.
-
-    Returns
-    -------
-    Layer
-        The drive ends with the world's path, if that is shorter.
-
-    Raises
-    ------
-    InputError
-        Where the values say otherwise than the world.
+    `layer`: settings that hold where neither the world nor the values say anything else; `values`:
+    of the rest of the grid. The drive ends with the world's path if that is shorter.
     """
     over = layer | world.settings | _decided(world, values) | values
     if world.callers is not None and CALLERS not in values:
@@ -173,22 +134,8 @@ def _decided(world: World, layer: Layer) -> Layer:
 def read_world(folder: Path) -> World:
     r"""Read what a folder says of a world.
 
-    Parameters
-    ----------
-    folder : Path
+    The world has the folder's name.
 
-    Returns
-    -------
-    World
-        Named as the folder.
-
-    Raises
-    ------
-    InputError
-        With the file and the line or key, what was found, what was expected and the fix.
-
-    Examples
-    --------
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as place:
     ...     _ = (Path(place) / "landmarks.csv").write_text("landmark,x,y\n1,2.5,0\n2,-1,4\n")
@@ -235,17 +182,7 @@ def read_world(folder: Path) -> World:
 def kept_world(config: Config, world: World) -> tuple[Config, dict[str, bytes]]:
     """Return what a folder of results keeps of the world that they are of.
 
-    Parameters
-    ----------
-    config : Config
-    world : World
-
-    Returns
-    -------
-    Config
-        It names the folder's own copy.
-    dict of name to content
-        The copy's files, relative to the folder.
+    Returns the settings that name the copy, and the copy's files, relative to the folder.
     """
     place = f"worlds/{world.name}"
     scenario = config.scenario.model_copy(update={"world": place})

@@ -14,30 +14,20 @@ from pipistrelle.settings import Layer
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class World:
-    """What is known of a world beforehand; the rest is drawn.
-
-    Attributes
-    ----------
-    name : str
-    landmarks : (n, 2) [m], or None
-    bodies : Bodies or None
-        Of these landmarks.
-    course : Course or None
-    callers : tuple of CallerConfig, or None
-        Whoever calls but the vehicle, unless settings list them.
-    settings : Layer
-        Those that belong to the world, beneath all others.
-    files : dict of name to content
-        What the folder held that said so.
-    """
+    """Known parts of a world; the rest is drawn."""
 
     name: str
     landmarks: Float[np.ndarray, "n 2"] | None = None
+    """Landmarks [m]."""
     bodies: Bodies | None = None
+    """Of these landmarks."""
     course: Course | None = None
     callers: tuple[CallerConfig, ...] | None = None
+    """Callers besides the vehicle, unless the settings list them."""
     settings: Layer = field(default_factory=dict)
+    """Settings of the world, which all others override."""
     files: Mapping[str, bytes] = field(default_factory=dict)
+    """Files that the world was read from."""
 
 
 ANY = World(name="any")
