@@ -21,7 +21,7 @@ from pipistrelle.detection.matched import filter_samples
 from pipistrelle.figures.style import STRATEGY_COLOURS, STYLE, TRUTH
 
 config = Config()
-tone, c = config.emitter.frequency, config.air.celerity
+tone, c = config.emitter.frequency, config.air.sound_speed
 distance, angle, speed = 8.0, np.radians(10.0), 0.75
 
 # %%

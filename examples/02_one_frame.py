@@ -21,7 +21,7 @@ from pipistrelle.detection.snapshots import detect, detector
 from pipistrelle.figures.style import STRATEGY_COLOURS, STYLE
 
 config = Config()
-own, c = config.emitter, config.air.celerity
+own, c = config.emitter, config.air.sound_speed
 
 # %%
 # The vehicle is at the origin and heads along x, among three landmarks and the beacon. An *arrival*

@@ -137,8 +137,8 @@ def test_the_guides_second_caller_is_mapped_and_its_moving_one_is_not(guide):
 def test_the_guides_filter_drives_a_mission(guide):
     from pipistrelle.config import Config, ScenarioConfig
     from pipistrelle.estimation.catalogue import entry
-    from pipistrelle.experiments.hearing.courses import motion_of
     from pipistrelle.experiments.hearing.scenario import draw_scenario
+    from pipistrelle.experiments.hearing.trajectories import motion_of
     from pipistrelle.experiments.runs.filtering import run_filter
     from pipistrelle.experiments.runs.trial import drive_of
 

@@ -320,12 +320,12 @@ def test_written_settings_name_each_setting_once_with_its_meaning():
 
 
 def test_the_speed_of_sound_is_that_of_the_temperature_unless_it_is_given():
-    assert Config().air.celerity == 343.0
+    assert Config().air.sound_speed == 343.0
     for temperature in (-40.0, 5.0, 35.0):
         air = AirConfig(temperature_c=temperature)
         ideal_gas = math.sqrt(1.4 * 8.314462 * (temperature + 273.15) / 28.9652e-3)
-        assert air.celerity == pytest.approx(ideal_gas, rel=1e-3)
-        assert AirConfig(temperature_c=temperature, speed_of_sound=340.0).celerity == 340.0
+        assert air.sound_speed == pytest.approx(ideal_gas, rel=1e-3)
+        assert AirConfig(temperature_c=temperature, speed_of_sound=340.0).sound_speed == 340.0
 
 
 def test_the_speed_of_sound_that_was_not_given_follows_a_grid_of_temperatures(tmp_path):
@@ -336,5 +336,5 @@ def test_the_speed_of_sound_that_was_not_given_follows_a_grid_of_temperatures(tm
     plan = read_plan(tmp_path / "air.toml")
     (tmp_path / "plan.toml").write_text(plan_text(plan))
     for each in (plan, read_plan(tmp_path / "plan.toml")):
-        speeds = [case.config.air.celerity for case in cases_of(each)]
+        speeds = [case.config.air.sound_speed for case in cases_of(each)]
         assert speeds == [pytest.approx(334.1, abs=0.05), 343.0]

@@ -34,7 +34,7 @@ from readings import (
 
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import Config
-from pipistrelle.detection.faces import Heard
+from pipistrelle.detection.faces import FrameMeasurements
 from pipistrelle.detection.scans import BEARING, RANGE
 from pipistrelle.estimation.catalogue import PAPERS
 from pipistrelle.experiments.cases import Case
@@ -73,7 +73,9 @@ def tried(level: float, run: Run) -> pl.DataFrame:
     return pl.DataFrame([trial | {"tau": tau} for trials in found for trial in trials])
 
 
-def noisy(heard: Sequence[Heard], world: int, *, level: float) -> tuple[Heard, ...]:
+def noisy(
+    heard: Sequence[FrameMeasurements], world: int, *, level: float
+) -> tuple[FrameMeasurements, ...]:
     """Add white noise to every row, keyed by the world and the frame alone."""
     if level == 0.0:
         return tuple(heard)

@@ -57,7 +57,7 @@ import polars as pl
 from calibration import PAPER_FULL, SEED, Run, at_least, changed, fit_levels, in_worlds
 
 from pipistrelle.config import STRATEGIES, Config, Strategy
-from pipistrelle.detection.faces import Heard
+from pipistrelle.detection.faces import FrameMeasurements
 from pipistrelle.estimation.rays import RANGED as RANGE_READINGS
 from pipistrelle.evaluation.accuracy import rmse
 from pipistrelle.evaluation.comparison import pooled_std
@@ -71,7 +71,7 @@ from pipistrelle.report.claims.published import EXCLUDED, FITTED, TABLE_II, WORL
 Change = dict[str, Any]
 Levels = tuple[str, ...]
 """Of each factor, one."""
-Changing = Callable[[Sequence[Heard], int], Sequence[Heard]]
+Changing = Callable[[Sequence[FrameMeasurements], int], Sequence[FrameMeasurements]]
 """Takes what was heard in a world, and its number; returns what is to be mapped."""
 SNAPSHOTS: dict[str, Change] = {
     "maxima": {"detection.snapshots": "maxima", "detection.peak_db": -8.0},
@@ -208,7 +208,7 @@ def settings(**levels: str) -> Config:
     return config
 
 
-def as_heard(heard: Sequence[Heard], world: int) -> Sequence[Heard]:
+def as_heard(heard: Sequence[FrameMeasurements], world: int) -> Sequence[FrameMeasurements]:
     """Change nothing."""
     return heard
 

@@ -17,7 +17,7 @@ from statistics import fmean
 import numpy as np
 
 from pipistrelle.config import Config, FastSlamConfig, Strategy
-from pipistrelle.detection.faces import Heard
+from pipistrelle.detection.faces import FrameMeasurements
 from pipistrelle.detection.scans import Scan
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.listening import listen
@@ -62,7 +62,9 @@ def world_rows(
     scenario = world_of(config)
     drive = drive_of(scenario, config)
     beams = dict(zip(RADII, listen(scenario, config, tuple(RADII.values())), strict=True))
-    cases: list[tuple[str, Strategy, tuple[Heard, ...]]] = [("passive", "passive", beams["11"])]
+    cases: list[tuple[str, Strategy, tuple[FrameMeasurements, ...]]] = [
+        ("passive", "passive", beams["11"])
+    ]
     for name, heard in beams.items():
         cases += [(f"fused {name}", "fused", heard), (f"active {name}", "active", heard)]
     rows = {}

@@ -140,7 +140,7 @@ class AirConfig(Section):
     """Passive echoes lose 20 log10(d1 + d2), the paper's mirror law, or 20 log10(d1 d2) [dB]."""
 
     @property
-    def celerity(self) -> float:
+    def sound_speed(self) -> float:
         """The speed of sound [m/s]: as it was given, or that of an ideal gas at the temperature."""
         if self.speed_of_sound is not None:
             return self.speed_of_sound
@@ -515,7 +515,7 @@ class Config(Section):
         return callers
 
     @property
-    def believed_celerity(self) -> float:
+    def assumed_sound_speed(self) -> float:
         """The speed of sound that the front end counts with [m/s]."""
         assumed = self.assumed.speed_of_sound
-        return self.air.celerity if assumed is None else assumed
+        return self.air.sound_speed if assumed is None else assumed

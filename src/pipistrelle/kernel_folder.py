@@ -15,9 +15,9 @@ from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
 
-_STATES = 3
+_MAX_STATES = 3
 """How many states of the sources keep their kernels."""
-_ROOM = 64_000_000
+_MIN_ROOM = 64_000_000
 """Bytes that all kernels of a state have room in, several times over."""
 
 
@@ -69,7 +69,7 @@ def _unfit(folder: Path) -> str | None:
         return "cannot be written"
     if not _is_mine(folder):
         return "can be written by others"
-    return "has too little room" if empty and free < _ROOM else None
+    return "has too little room" if empty and free < _MIN_ROOM else None
 
 
 def _is_mine(folder: Path) -> bool:
@@ -115,5 +115,5 @@ def _drop_old(folder: Path) -> None:
         states.sort(key=lambda state: state.stat().st_mtime)
     except OSError:  # another process removes them just now
         return
-    for old in states[:-_STATES]:
+    for old in states[:-_MAX_STATES]:
         shutil.rmtree(old, ignore_errors=True)

@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 
 from pipistrelle.config import InputError
 
-_LONGEST = 80
+_MAX_LENGTH = 80
 _PREFIXES = ("Value error, ", "Input should be ", "Value should ")
 _IN_WORDS = {"bool_parsing": "true or false", "bool_type": "true or false", "tuple_type": "a list"}
 """What pydantic says of these kinds of fault is about Python."""
@@ -46,7 +46,7 @@ def shown(value: Any) -> str:
     ("'left'", '1, 1, 1...')
     """
     text = repr(value)
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
+    return text if len(text) <= _MAX_LENGTH else f"{text[: _MAX_LENGTH - 3]}..."
 
 
 def expectation(fault: Any) -> str:

@@ -35,7 +35,7 @@ FOLDERS: frozenset[Key] = frozenset({("scenario", "world")})
 CALLERS: Key = ("callers",)
 """The setting that is a list of tables."""
 
-_DEEPEST = 8
+_MAX_DEPTH = 8
 """Levels of tables and lists that a file may have."""
 
 
@@ -271,7 +271,11 @@ def parse_toml(text: str, where: object) -> dict[str, Any]:
     pipistrelle.config.InputError: here: seed: found an integer of 72 bits, expected at most 64;
     correct it
     """
-    deep = (f"more than {_DEEPEST} levels", "tables of settings, or lists of them", "mend the file")
+    deep = (
+        f"more than {_MAX_DEPTH} levels",
+        "tables of settings, or lists of them",
+        "mend the file",
+    )
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -283,7 +287,7 @@ def parse_toml(text: str, where: object) -> dict[str, Any]:
     waiting: list[tuple[Key, Any]] = [((), table)]
     while waiting:
         key, value = waiting.pop()
-        if len(key) > _DEEPEST:
+        if len(key) > _MAX_DEPTH:
             raise refusal(f"{where}: {'.'.join(key[:3])}", *deep)
         if isinstance(value, dict):
             waiting += [((*key, name), inner) for name, inner in value.items()]

@@ -18,7 +18,7 @@ law = settings(deadline=None, max_examples=40)
 SEEDS = st.integers(0, 2**32 - 1)
 COLUMNS = [name for name in Arrivals.__slots__ if name != "departure"]
 CONFIG = Config()
-C = CONFIG.air.celerity
+C = CONFIG.air.sound_speed
 TONES = (30e3, 25e3, 20e3)
 
 

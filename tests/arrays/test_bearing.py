@@ -63,7 +63,7 @@ def errors(face, angle, tone, snr_db, count=COUNT, *, config=CONFIG, ears=SQUARE
 
 
 def bound(angle, tone, snr_db):
-    wavelength = CONFIG.air.celerity / SETTLED.tones[tone]
+    wavelength = CONFIG.air.sound_speed / SETTLED.tones[tone]
     return bearing_bound(
         10.0 ** (snr_db / 10.0), angle, elements=10, spacing=0.0049, wavelength=wavelength
     )

@@ -97,7 +97,7 @@ def found(table):
 
 
 def range_rms(table):
-    return np.sqrt(np.nanmean(table[..., 1] ** 2, axis=-1)) * CONFIG.air.celerity / 2.0
+    return np.sqrt(np.nanmean(table[..., 1] ** 2, axis=-1)) * CONFIG.air.sound_speed / 2.0
 
 
 @pytest.mark.parametrize("noisy", [False, True])

@@ -15,7 +15,7 @@ def test_four_faces_look_to_the_front_left_back_and_right():
 
 def test_ten_elements_stand_half_a_wavelength_of_the_vehicles_call_apart_around_the_middle():
     config = Config()
-    half = config.air.celerity / config.emitter.frequency / 2.0
+    half = config.air.sound_speed / config.emitter.frequency / 2.0
     np.testing.assert_allclose(np.diff(LAYOUT.position), [half] * 9, rtol=1e-12)
     assert LAYOUT.position.sum() == pytest.approx(0.0, abs=1e-15)
 

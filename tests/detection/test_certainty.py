@@ -16,7 +16,7 @@ from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import BLOCK, sampling
 from pipistrelle.config import Config, DetectionConfig
 from pipistrelle.detection.certainty import (
-    FAINTEST,
+    MIN_POWER_OVER_NOISE,
     bearing_std,
     delay_std,
     loudest_noise,
@@ -123,7 +123,7 @@ def in_pairs(apart_deg, tone, snr_db, count):
 def by_noise_alone(told, tone, noise=1.0):
     """Return what the bearings' deviations were, had the receiver's noise so much power."""
     slope = FINDER.wave[tone] * np.cos(told.angle)
-    over = np.maximum(told.power / noise - 1.0, FAINTEST)
+    over = np.maximum(told.power / noise - 1.0, MIN_POWER_OVER_NOISE)
     pairs = zip(over, slope, strict=True)
     return np.array([bearing_std(power, across, ELEMENTS) for power, across in pairs])
 
@@ -289,7 +289,7 @@ def test_what_is_left_counts_only_where_noise_alone_hardly_explains_it():
     assert over_noise(100.0, louder, ELEMENTS, loudest) == pytest.approx(100.0 / loudest - 1.0)
     ten = over_noise(100.0, 400.0, ELEMENTS, loudest)
     assert over_noise(1e4, 4e4, ELEMENTS, loudest) == pytest.approx(ten), "there is no other scale"
-    assert over_noise(1.0, 400.0, ELEMENTS, loudest) == FAINTEST
+    assert over_noise(1.0, 400.0, ELEMENTS, loudest) == MIN_POWER_OVER_NOISE
 
 
 @pytest.mark.parametrize("elements", [2, 10, 31])

@@ -23,7 +23,7 @@ from reference.delays import cramer_rao, least_mean_square
 CONFIG = Config()
 SETTLED, SQUARE = sampling(CONFIG, callers_of(CONFIG, np.zeros(2))), square_of_four(CONFIG.receiver)
 FINDER = detector(CONFIG, SQUARE, SETTLED.tones)
-C, PULSE, ELEMENTS = CONFIG.air.celerity, SETTLED.pulse, SQUARE.position.size
+C, PULSE, ELEMENTS = CONFIG.air.sound_speed, SETTLED.pulse, SQUARE.position.size
 CALLER, DIRECT, ECHO = 1, 51, 4
 FIRST, APART, BLOCKS = 32, 34, 75
 """Blocks until the direct call, from it to the echo, and of the recording."""

@@ -26,7 +26,7 @@ from pipistrelle.experiments.hearing.scenario import caller_labels, world_of
 CONFIG = Config()
 SETTLED, SQUARE = sampling(CONFIG, callers_of(CONFIG, np.zeros(2))), square_of_four(CONFIG.receiver)
 FINDER = detector(CONFIG, SQUARE, SETTLED.tones)
-C, PULSE = CONFIG.air.celerity, CONFIG.emitter.pulse
+C, PULSE = CONFIG.air.sound_speed, CONFIG.emitter.pulse
 GAIN_DB = 10.0 * np.log10(SETTLED.pulse * SETTLED.block)
 OWN, BEACON = 0, 1
 SAMPLED = BLOCK / SETTLED.block / np.sqrt(3.0)

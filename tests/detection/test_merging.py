@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipistrelle.detection.certainty import BEARING_FLOOR, RANGE_FLOOR
-from pipistrelle.detection.faces import Heard, average_faces, same_echo, unlabelled
+from pipistrelle.detection.faces import FrameMeasurements, average_faces, same_echo, unlabelled
 from pipistrelle.detection.merging import scan_of
 from pipistrelle.detection.scans import COLUMNS, OWN, UNLABELLED, with_columns
 from pipistrelle.detection.snapshots import Detections
@@ -218,7 +218,7 @@ def heard_rows(*rows):
     scan = scan_with(
         landmark, bearing, distance, time=2.0, caller=np.array(caller), bearing_std=NAN
     )
-    return Heard(rows=scan, clutter=0)
+    return FrameMeasurements(rows=scan, clutter=0)
 
 
 BOTH = heard_rows((1, 0.1, NAN, 3.0), (2, NAN, 0.2, NAN), (7, 3.1, -3.1, 9.0), (9, -0.4, 0.2, 5.0))

@@ -5,7 +5,7 @@ import pytest
 
 from pipistrelle.config import Config, FilterConfig
 from pipistrelle.detection.certainty import BEARING_FLOOR, RANGE_FLOOR
-from pipistrelle.detection.faces import Heard, average_faces
+from pipistrelle.detection.faces import FrameMeasurements, average_faces
 from pipistrelle.detection.noise import ConstantNoise, as_told, noise_of
 from pipistrelle.detection.scans import COLUMNS, with_columns
 from pipistrelle.detection.snapshots import Detections
@@ -77,7 +77,7 @@ def settled(noise):
 
 
 def heard_with(**columns):
-    return [Heard(rows=with_columns(ROWS, **columns), clutter=2)]
+    return [FrameMeasurements(rows=with_columns(ROWS, **columns), clutter=2)]
 
 
 @pytest.mark.parametrize("strategy", ["active", "fused", "passive"])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.config import Config, FastSlamConfig, InputError
-from pipistrelle.detection.scans import NOBODY, make_scan, with_columns
+from pipistrelle.detection.scans import NO_CALLERS, make_scan, with_columns
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.catalogue import CATALOGUE, entry
 from pipistrelle.estimation.motion import Motion
@@ -188,7 +188,7 @@ def test_lists_and_other_arrays_are_taken_as_they_are_meant(build):
     rows = {name: getattr(SCAN, name).tolist() for name in ("landmark", "caller", "numbers")}
     wide = np.repeat(SCAN.numbers, 2, axis=1)[:, ::2]
     heard = slam.update(started, SCAN, np.random.default_rng(7))
-    for scan in (raw(**rows, callers=[], moving=[]), raw(numbers=wide, callers=NOBODY)):
+    for scan in (raw(**rows, callers=[], moving=[]), raw(numbers=wide, callers=NO_CALLERS)):
         other = slam.update(started, scan, np.random.default_rng(7))
         for one, two in zip(answers(other), answers(heard), strict=True):
             np.testing.assert_array_equal(one, two)

@@ -13,7 +13,7 @@ from fuzz.judging import Tried, kind_of
 from fuzz.mutations import one_of
 from fuzz.running import end_of
 from pipistrelle.config import Config, InputError
-from pipistrelle.detection.scans import NOBODY, NUMBERS, Scan, make_scan
+from pipistrelle.detection.scans import NO_CALLERS, NUMBERS, Scan, make_scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.catalogue import CATALOGUE, entry
 from pipistrelle.estimation.motion import Motion
@@ -115,8 +115,8 @@ def scan(rng: Generator) -> Scan:
         detour=detour,
         detour_std=10.0 ** rng.uniform(-3, 0),
     )
-    labels = one_of(rng, [NOBODY, np.array([-1, 3, 4]), np.array([-1, 3, 4])])
-    moving = one_of(rng, [NOBODY, NOBODY, np.array([4])])
+    labels = one_of(rng, [NO_CALLERS, np.array([-1, 3, 4]), np.array([-1, 3, 4])])
+    moving = one_of(rng, [NO_CALLERS, NO_CALLERS, np.array([4])])
     return replace(drawn, callers=labels, moving=moving)
 
 
@@ -221,6 +221,8 @@ def prepare(_: Path) -> None:
         for model in STDS:
             sound = [("predict", "", tuple(steps(rng, model))), ("update", "", (scan(rng),))]
             obey([(name, model, (pose(rng),)), *sound * 4], config)
-        for callers, moving in product((NOBODY, np.array([-1, 3, 4])), (NOBODY, np.array([4]))):
+        for callers, moving in product(
+            (NO_CALLERS, np.array([-1, 3, 4])), (NO_CALLERS, np.array([4]))
+        ):
             heard = [replace(scan(rng), callers=callers, moving=moving) for _ in range(4)]
             obey([(name, model, (pose(rng),)), *(("update", "", (one,)) for one in heard)], config)

@@ -64,7 +64,7 @@ def test_the_defaults_that_the_help_names_are_those_of_the_settings(obey):
     width = beamwidth(
         config.emitter.radius,
         frequency=config.emitter.frequency,
-        speed_of_sound=config.air.celerity,
+        speed_of_sound=config.air.sound_speed,
     )
     assert told["beamwidth"] == f"{degrees(width):.1f}"
     assert told["landmarks"] == str(config.scenario.landmarks)

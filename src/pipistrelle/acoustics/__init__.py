@@ -3,7 +3,7 @@
 `emitter` shapes the vehicle's call by the aperture that sends it; `propagation` takes from it what
 distance and air take, and shifts its tone by the motion; `target` says how much of it a landmark
 throws in each direction. `callers` lists who calls: the vehicle, the beacon. `arrivals` puts all
-together, over the `ways` that sound takes: every echo and call that one emission brings to the
+together, over the `paths` that sound takes: every echo and call that one emission brings to the
 vehicle, as plain arrays for the ears of `arrays`.
 """
 

@@ -14,6 +14,13 @@ from jaxtyping import Bool, Float, Int, Int8
 
 from pipistrelle.acoustics.callers import VEHICLE, Caller
 from pipistrelle.acoustics.emitter import in_front, piston_directivity
+from pipistrelle.acoustics.paths import (
+    SoundPaths,
+    paths_over_surfaces,
+    paths_to_vehicle,
+    refuse_impossible,
+    turn_of_sound,
+)
 from pipistrelle.acoustics.propagation import (
     absorption_db_per_m,
     doppler_frequency,
@@ -26,13 +33,6 @@ from pipistrelle.acoustics.target import (
     strength_of_bodies_db,
     target_strength_db,
     with_usual,
-)
-from pipistrelle.acoustics.ways import (
-    Ways,
-    refuse_impossible,
-    turn_of_sound,
-    ways_by_surface,
-    ways_home,
 )
 from pipistrelle.config import AirConfig, Config
 from pipistrelle.geometry import wrap
@@ -156,22 +156,22 @@ def arrivals_of_emissions(
     >>> count, heard.landmark
     (array([3, 3]), array([1, 1, 2, 2, 1, 2]))
     """
-    ways = ways_home(poses, velocities, landmarks, callers)
-    extent = np.zeros(ways.homeward.shape[1])
+    paths = paths_to_vehicle(poses, velocities, landmarks, callers)
+    extent = np.zeros(paths.homeward.shape[1])
     if bodies is not None:
         bodies = with_usual(bodies, len(callers) - 1, config.target)
         extent = np.nan_to_num(bodies.radius)
-    refuse_impossible(ways, callers, extent)
-    surface = ways_by_surface(ways, VEHICLE, extent)
+    refuse_impossible(paths, callers, extent)
+    surface = paths_over_surfaces(paths, VEHICLE, extent)
     own, emission = _own_echoes(surface, callers[VEHICLE], config, bodies)
     parts, emissions = [own], [emission]
     for j in range(1, len(callers)):
-        place = ways.target[:, ways.landmarks + j - 1, np.newaxis]
-        turn = turn_of_sound(ways.target - place, ways.offset)
+        place = paths.target[:, paths.landmarks + j - 1, np.newaxis]
+        turn = turn_of_sound(paths.target - place, paths.offset)
         strength_db = _strength_db(turn, callers[j], config, bodies)
-        surface = ways_by_surface(ways, j, extent)
+        surface = paths_over_surfaces(paths, j, extent)
         parts.append(_sounds_of(j, surface, callers[j], config, strength_db))
-        emissions.append(np.repeat(np.arange(len(poses)), ways.homeward.shape[1]))
+        emissions.append(np.repeat(np.arange(len(poses)), paths.homeward.shape[1]))
         if (heading := callers[j].heading) is not None:
             departure = _departures(j, surface, heading)
             sent = in_front(departure)
@@ -273,28 +273,28 @@ def arrivals_together(parts: Sequence[Arrivals]) -> Arrivals:
 
 
 def _own_echoes(
-    ways: Ways, caller: Caller, config: Config, bodies: Bodies | None
+    paths: SoundPaths, caller: Caller, config: Config, bodies: Bodies | None
 ) -> tuple[Arrivals, Int[np.ndarray, " a"]]:
     """Return the echoes of the vehicle's call from all ahead, and the emission of each."""
-    c = config.air.celerity
-    ahead = np.flatnonzero(in_front(ways.bearing))
-    back, closing = ways.homeward.ravel()[ahead], ways.closing.ravel()[ahead]
-    emission, target = np.divmod(ahead, ways.homeward.shape[1])
+    c = config.air.sound_speed
+    ahead = np.flatnonzero(in_front(paths.bearing))
+    back, closing = paths.homeward.ravel()[ahead], paths.closing.ravel()[ahead]
+    emission, target = np.divmod(ahead, paths.homeward.shape[1])
     path, loss_db = back + back, spreading_loss_db(2.0 * back, ways=2)
     if bodies is not None:
         loss_db = loss_db - backscatter_db(bodies, config.target)[target]
     frequency = doppler_frequency(
         caller.frequency, receiver_speed=closing, source_speed=closing, speed_of_sound=c
     )
-    if isinstance(ways.approach, np.ndarray):
-        moved = ways.approach.ravel()[ahead]
+    if isinstance(paths.approach, np.ndarray):
+        moved = paths.approach.ravel()[ahead]
         frequency = doppler_frequency(
             frequency, receiver_speed=moved, source_speed=moved, speed_of_sound=c
         )
     heard = Arrivals(
         delay=path / c,
         level_db=caller.level_db - loss_db - _absorption(config.air, caller.frequency) * path,
-        bearing=ways.bearing.ravel()[ahead],
+        bearing=paths.bearing.ravel()[ahead],
         frequency=frequency,
         caller=np.full(ahead.size, VEHICLE, dtype=np.int8),
         landmark=target + 1,
@@ -303,32 +303,34 @@ def _own_echoes(
 
 
 def _sounds_of(
-    j: int, ways: Ways, caller: Caller, config: Config, strength_db: Float[np.ndarray, "k t"]
+    j: int, paths: SoundPaths, caller: Caller, config: Config, strength_db: Float[np.ndarray, "k t"]
 ) -> Arrivals:
     """Return another caller's sounds at all emissions, by label: its echoes and its direct call."""
-    c, (emissions, targets) = config.air.celerity, ways.homeward.shape
-    itself = ways.landmarks + j - 1
-    incoming = ways.target - ways.target[:, itself : itself + 1]
+    c, (emissions, targets) = config.air.sound_speed, paths.homeward.shape
+    itself = paths.landmarks + j - 1
+    incoming = paths.target - paths.target[:, itself : itself + 1]
     outward = np.hypot(incoming[..., 0], incoming[..., 1])
-    path = ways.homeward + outward
-    loss_db = _loss_db(itself, ways, outward, strength_db, config.air)
-    frequency = _shifted(itself, ways, incoming, outward, caller.frequency, c)
+    path = paths.homeward + outward
+    loss_db = _loss_db(itself, paths, outward, strength_db, config.air)
+    frequency = _shifted(itself, paths, incoming, outward, caller.frequency, c)
     absorption = _absorption(config.air, caller.frequency)
     return Arrivals(
         delay=(path / c).ravel(),
         level_db=(caller.level_db - loss_db - absorption * path).ravel(),
-        bearing=ways.bearing.ravel(),
+        bearing=paths.bearing.ravel(),
         frequency=frequency.ravel(),
         caller=np.full(path.size, j, dtype=np.int8),
         landmark=np.tile(np.arange(1, targets + 1), emissions),
     )
 
 
-def _departures(j: int, ways: Ways, heading: Float[np.ndarray, " k"]) -> Float[np.ndarray, " a"]:
+def _departures(
+    j: int, paths: SoundPaths, heading: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, " a"]:
     """Return where the sounds of another vehicle left it, relative to its heading, by label."""
-    itself = ways.landmarks + j - 1
-    way = ways.target - ways.target[:, itself : itself + 1]
-    way[:, itself] = -ways.offset[:, itself]  # the direct call goes to the vehicle
+    itself = paths.landmarks + j - 1
+    way = paths.target - paths.target[:, itself : itself + 1]
+    way[:, itself] = -paths.offset[:, itself]  # the direct call goes to the vehicle
     return wrap(np.arctan2(way[..., 1], way[..., 0]) - heading[:, np.newaxis]).ravel()
 
 
@@ -364,37 +366,37 @@ def through_pistons(
 
 def _shifted(
     itself: int,
-    ways: Ways,
+    paths: SoundPaths,
     incoming: Float[np.ndarray, "_ t 2"],
     outward: Float[np.ndarray, "_ t"],
     frequency: float,
     c: float,
 ) -> Float[np.ndarray, "k t"]:
     """Frequency of another caller's sounds: shifted by all who move, the vehicle last."""
-    if ways.drift is None:
-        return doppler_frequency(frequency, receiver_speed=ways.closing, speed_of_sound=c)
-    echo = np.arange(ways.closing.shape[1]) != itself
+    if paths.drift is None:
+        return doppler_frequency(frequency, receiver_speed=paths.closing, speed_of_sound=c)
+    echo = np.arange(paths.closing.shape[1]) != itself
     with np.errstate(divide="ignore", invalid="ignore"):  # the caller's way to itself is not used
         unit = incoming / outward[..., np.newaxis]
-    sent = np.sum(ways.drift[:, itself : itself + 1] * unit, axis=-1)
-    met = -np.sum(ways.drift * unit, axis=-1)
+    sent = np.sum(paths.drift[:, itself : itself + 1] * unit, axis=-1)
+    met = -np.sum(paths.drift * unit, axis=-1)
     heard = doppler_frequency(
         frequency,
-        receiver_speed=ways.closing,
-        source_speed=np.where(echo, sent, ways.approach),
+        receiver_speed=paths.closing,
+        source_speed=np.where(echo, sent, paths.approach),
         speed_of_sound=c,
     )
     return doppler_frequency(
         heard,
         receiver_speed=np.where(echo, met, 0.0),
-        source_speed=np.where(echo, ways.approach, 0.0),
+        source_speed=np.where(echo, paths.approach, 0.0),
         speed_of_sound=c,
     )
 
 
 def _loss_db(
     itself: int,
-    ways: Ways,
+    paths: SoundPaths,
     outward: Float[np.ndarray, "_ t"],
     strength_db: Float[np.ndarray, "k t"],
     air: AirConfig,
@@ -402,8 +404,8 @@ def _loss_db(
     """Spreading less target strength of a caller's echoes; of its direct call, spreading alone."""
     sent = np.broadcast_to(outward, strength_db.shape).copy()
     sent[:, itself] = 1.0  # no echo of itself: any distance will do
-    loss_db = passive_spreading_loss_db(sent, ways.homeward, law=air.spreading) - strength_db
-    loss_db[:, itself] = spreading_loss_db(ways.homeward[:, itself])
+    loss_db = passive_spreading_loss_db(sent, paths.homeward, law=air.spreading) - strength_db
+    loss_db[:, itself] = spreading_loss_db(paths.homeward[:, itself])
     return loss_db
 
 
@@ -411,7 +413,7 @@ def _strength_db(
     turn: Float[np.ndarray, "k t"], caller: Caller, config: Config, bodies: Bodies | None
 ) -> Float[np.ndarray, "k t"]:
     """Target strength of all that reflects a caller's sound."""
-    usual, tone, c = config.target, caller.frequency, config.air.celerity
+    usual, tone, c = config.target, caller.frequency, config.air.sound_speed
     if bodies is not None:
         return strength_of_bodies_db(turn, bodies, usual=usual, frequency=tone, speed_of_sound=c)
     return target_strength_db(

@@ -20,7 +20,7 @@ from pipistrelle.config import MOST_OTHERS, Config, InputError
 
 VEHICLE = 0
 """Where the vehicle stands in every list of callers."""
-MOST = 1 + MOST_OTHERS
+MAX_CALLERS = 1 + MOST_OTHERS
 """Callers that one recording can tell apart."""
 
 

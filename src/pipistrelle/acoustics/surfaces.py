@@ -6,9 +6,9 @@ In the plane of the map a body is a circle: a vertical cylinder, or a sphere at 
 import numpy as np
 from jaxtyping import Float
 
-_TRIES = 60
+_MAX_NEWTON_STEPS = 60
 """Newton steps at most; a dozen do, even from 1e-6 m before a surface."""
-_CLOSE = 1e-13
+_MAX_LAST_STEP = 1e-13
 """Length of the last Newton step, along the surface [m]."""
 
 
@@ -76,7 +76,7 @@ def _mirror_points(
     near_out, near_home = out / (out - radius), home / (home - radius)  # slopes at an angle of 0
     angle = span * near_out / (near_out + near_home)
     going = np.ones(span.shape, dtype=bool)  # each by itself: its bits hang on no other
-    for _ in range(_TRIES):
+    for _ in range(_MAX_NEWTON_STEPS):
         here, rise = _incidence(angle, home, radius)
         there, fall = _incidence(span - angle, out, radius)
         short = here < there
@@ -86,7 +86,7 @@ def _mirror_points(
         better = np.where(inside, step, 0.5 * (low + high))
         moved = radius * np.abs(better - angle)
         angle = np.where(going, better, angle)
-        going &= moved > _CLOSE
+        going &= moved > _MAX_LAST_STEP
         if not going.any():
             break
     unit = receiver / home[..., np.newaxis]

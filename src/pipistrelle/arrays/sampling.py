@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.acoustics.callers import MOST, Caller, check_caller
+from pipistrelle.acoustics.callers import MAX_CALLERS, Caller, check_caller
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config, InputError
 
@@ -74,8 +74,10 @@ def sampling(config: Config, callers: Sequence[Caller]) -> Sampling:
             step = f"{BLOCK:g} s" if unit == "s" else f"{1 / BLOCK:g} Hz"
             free = free_tones(config, callers, value) if key in keys else ""
             raise InputError(f"{key}: found {value:g} {unit}, expected a multiple of {step}{free}")
-    if not 1 <= len(callers) <= MOST:
-        raise InputError(f"callers: found {len(callers)}, expected 1 to {MOST}; leave some out")
+    if not 1 <= len(callers) <= MAX_CALLERS:
+        raise InputError(
+            f"callers: found {len(callers)}, expected 1 to {MAX_CALLERS}; leave some out"
+        )
     _refuse_alike(config, callers, keys)
     return Sampling(
         rate=rate,
@@ -83,7 +85,7 @@ def sampling(config: Config, callers: Sequence[Caller]) -> Sampling:
         pulse=round(pulse / BLOCK),
         tones=tones,
         noise_std=10.0 ** (config.receiver.noise_level_db / 20.0),
-        speed_of_sound=config.air.celerity,
+        speed_of_sound=config.air.sound_speed,
     )
 
 
@@ -103,7 +105,7 @@ def clear_frequency(config: Config) -> float:
     35607
     """
     limit = math.radians(min(config.detection.angle_limit_deg, config.detection.scan_limit_deg))
-    longest = config.air.celerity / (config.receiver.spacing * (1.0 + math.sin(limit)))
+    longest = config.air.sound_speed / (config.receiver.spacing * (1.0 + math.sin(limit)))
     return min(longest, config.receiver.sample_rate / 2.0)
 
 

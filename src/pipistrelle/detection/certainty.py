@@ -26,9 +26,9 @@ import math
 
 from pipistrelle.jit import Whole, kernel
 
-LOUDEST_NOISE = 0.999
+NOISE_QUANTILE = 0.999
 """Share of snapshots whose noise is no louder than what is taken for noise alone."""
-FAINTEST = 0.1
+MIN_POWER_OVER_NOISE = 0.1
 """Least power over the noise that a deviation is told for."""
 BEARING_FLOOR = (0.002, 0.009)
 """Error [rad] of a bearing that no level removes, by the vehicle's own call and by another's: what
@@ -51,7 +51,7 @@ def loudest_noise(elements: int) -> float:
     """
     from scipy.special import gammaincinv
 
-    return float(gammaincinv(elements - 1, LOUDEST_NOISE)) / (elements - 1)
+    return float(gammaincinv(elements - 1, NOISE_QUANTILE)) / (elements - 1)
 
 
 @kernel
@@ -62,7 +62,7 @@ def over_noise(power: float, energy: float, elements: Whole, loudest: float) -> 
     (100.0, 9.1)
     """
     noise = (energy - power) / (elements - 1)
-    return max(power / (noise if noise > loudest else 1.0) - 1.0, FAINTEST)
+    return max(power / (noise if noise > loudest else 1.0) - 1.0, MIN_POWER_OVER_NOISE)
 
 
 @kernel

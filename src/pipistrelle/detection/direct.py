@@ -29,15 +29,15 @@ from jaxtyping import Bool, Complex, Float, Int
 from pipistrelle.detection.onset import reach_of
 from pipistrelle.jit import Whole, kernel, no_alloc
 
-FAINTER = 0.1
+MIN_RELATIVE_POWER = 0.1
 """Least power of the direct call, as a share of the loudest of its tone."""
-RISE = 0.3
+MIN_EDGE_AMPLITUDE = 0.3
 """Least amplitude of its front edge, as a share of what the loudest lag near makes expect."""
-LEAKAGE = 0.005
+MAX_LEAKAGE = 0.005
 """Power, as a share of a detection's of another tone at the same time, that may be its leakage."""
-CLEAR = 3.0
+MIN_EDGE_ENERGY = 3.0
 """Least energy of its front edge, in means of that of the noise."""
-AFTER = 2
+EDGE_BLOCKS = 2
 """Blocks behind the edge that tell the amplitude: what sets in later does not matter."""
 
 
@@ -114,7 +114,7 @@ def loudest_first(
             loudest = max(loudest, power[d])
     for d in range(caller.size):
         earlier = first < 0 or delay[d] < delay[first]
-        if caller[d] == p and power[d] >= FAINTER * loudest and earlier:
+        if caller[d] == p and power[d] >= MIN_RELATIVE_POWER * loudest and earlier:
             first = d
     return first
 
@@ -143,11 +143,11 @@ def front_edge(
             level += y.real**2 + y.imag**2
         loudest = max(loudest, level)
     noise = 2.0 * stride / pulse
-    faintest = CLEAR * noise * elements
-    least, first = max((RISE * stride / pulse) ** 2 * loudest, faintest), count
-    for k in range(count - AFTER):
+    faintest = MIN_EDGE_ENERGY * noise * elements
+    least, first = max((MIN_EDGE_AMPLITUDE * stride / pulse) ** 2 * loudest, faintest), count
+    for k in range(count - EDGE_BLOCKS):
         first = min(first, k) if energy[k] >= faintest else first
-        if energy[k : k + 1 + AFTER].min() >= least:
+        if energy[k : k + 1 + EDGE_BLOCKS].min() >= least:
             if first < k - 1:
                 break
             lag, std = _fitted(gain, k, noise)
@@ -159,9 +159,9 @@ def front_edge(
 def _mean_after(gain: Complex[np.ndarray, "k e"], begin: Whole, e: Whole) -> complex:
     """Mean of the blocks behind one, at an element."""
     total = 0.0j
-    for a in range(begin + 1, begin + 1 + AFTER):
+    for a in range(begin + 1, begin + 1 + EDGE_BLOCKS):
         total += gain[a, e]
-    return total / AFTER
+    return total / EDGE_BLOCKS
 
 
 @no_alloc
@@ -182,12 +182,12 @@ def _fitted(gain: Complex[np.ndarray, "k e"], k: Whole, noise: float) -> tuple[f
             A = _mean_after(gain, begin, e)
             misfit += abs(gain[begin, e] - share * A) ** 2
             misfit += abs(gain[begin - 1, e]) ** 2 if begin > 0 else 0.0
-            for a in range(begin + 1, begin + 1 + AFTER):
+            for a in range(begin + 1, begin + 1 + EDGE_BLOCKS):
                 misfit += abs(gain[a, e] - A) ** 2
         if square > 0.0 and misfit < least:
             left = max(noise, misfit / elements)
             least, best = misfit, begin + 1.0 - share
-            std = math.sqrt(0.5 * left * (1.0 + share * share / AFTER) / square)
+            std = math.sqrt(0.5 * left * (1.0 + share * share / EDGE_BLOCKS) / square)
     return best, std
 
 
@@ -230,10 +230,11 @@ def _may_leak(
 ) -> bool:
     """Whether detection d is so faint beside one at the same time that it may be its leakage.
 
-    That one is of another tone, for no direct call is so faint beside its own (`FAINTER`). It may
-    be at any face: what reaches a face from behind its endfire leaks there and is not listed.
+    The loud one has another tone, as no direct call is so faint beside its own tone
+    (`MIN_RELATIVE_POWER`). It may be at any face: sound from behind a face leaks into it, too, and
+    is not listed there.
     """
     for other in range(delay.size):
-        if abs(delay[other] - delay[d]) <= within and power[d] < LEAKAGE * power[other]:
+        if abs(delay[other] - delay[d]) <= within and power[d] < MAX_LEAKAGE * power[other]:
             return True
     return False

@@ -20,7 +20,7 @@ from pipistrelle.detection.scans import (
     DETOUR,
     DETOUR_STD,
     LEVEL,
-    NOBODY,
+    NO_CALLERS,
     NUMBERS,
     OWN,
     RANGE,
@@ -34,7 +34,7 @@ from pipistrelle.jit import Whole, kernel
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Heard:
+class FrameMeasurements:
     """One frame, averaged over the faces."""
 
     rows: Scan
@@ -52,8 +52,8 @@ def average_faces(
     *,
     averaging: str,
     speed_of_sound: float,
-    callers: Int[np.ndarray, " c"] = NOBODY,
-) -> Heard:
+    callers: Int[np.ndarray, " c"] = NO_CALLERS,
+) -> FrameMeasurements:
     r"""Average what the faces say of each label, per caller: the strongest detection of each face.
 
     Bearings are averaged as directions, ``plain`` or ``weighted`` by the inverse variance at the
@@ -86,7 +86,7 @@ def average_faces(
     numbers[RANGE_STD] = np.hypot(certainty[1], RANGE_FLOOR)
     numbers[DETOUR], numbers[DETOUR_STD] = detour[0], np.hypot(detour[1], DETOUR_FLOOR)
     rows = Scan(time=time, landmark=landmark, caller=caller, numbers=numbers, callers=callers)
-    return Heard(rows=rows, clutter=int(clutter))
+    return FrameMeasurements(rows=rows, clutter=int(clutter))
 
 
 def same_echo(
@@ -111,11 +111,11 @@ def same_echo(
     return _number(order, found, delay_gate, bearing_gate)
 
 
-def unlabelled(heard: Heard) -> Heard:
+def unlabelled(heard: FrameMeasurements) -> FrameMeasurements:
     """Forget the labels.
 
     >>> from pipistrelle.detection.scans import make_scan
-    >>> heard = Heard(rows=make_scan(0.5, np.array([4]), np.array([0.2])), clutter=0)
+    >>> heard = FrameMeasurements(rows=make_scan(0.5, np.array([4]), np.array([0.2])), clutter=0)
     >>> unlabelled(heard).rows.landmark
     array([-1])
     """

@@ -13,7 +13,7 @@ UNLABELLED = -1
 """Label of a measurement of which nobody says whose it is."""
 OWN = 0
 """Number of the vehicle among the callers, as in `pipistrelle.acoustics.callers`."""
-NOBODY = np.empty(0, dtype=np.int64)
+NO_CALLERS = np.empty(0, dtype=np.int64)
 """Of no caller is it known which landmark it is, or that it moves."""
 
 COLUMNS = (
@@ -50,10 +50,10 @@ class Scan:
     first."""
     numbers: Float[np.ndarray, "7 m"]
     """The other columns, in the order of `COLUMNS`."""
-    callers: Int[np.ndarray, " c"] = field(default_factory=lambda: NOBODY)
+    callers: Int[np.ndarray, " c"] = field(default_factory=lambda: NO_CALLERS)
     """Label of each caller as a landmark, by its number; UNLABELLED for the vehicle and where it is
     not known, as for numbers beyond the array."""
-    moving: Int[np.ndarray, " v"] = field(default_factory=lambda: NOBODY)
+    moving: Int[np.ndarray, " v"] = field(default_factory=lambda: NO_CALLERS)
     """Labels of the callers that move."""
 
     @property
@@ -211,7 +211,7 @@ def without_detours(scan: Scan) -> Scan:
     (array([8]), array([nan]))
     """
     if scan.callers.size:
-        scan = replace(scan, callers=NOBODY)
+        scan = replace(scan, callers=NO_CALLERS)
     if np.isnan(scan.detour).all() and np.isnan(scan.detour_std).all():
         return scan
     bearings = rows_of(scan, ~np.isnan(scan.bearing))

@@ -36,7 +36,7 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 SCAN_STEP = 0.05
 """Distance of the scan's beams in u [rad]: the parabola's bias stays under 2 % of a beam step."""
 
-WIDEST = 100
+MAX_SPACING = 100
 """Most waves between two elements; their bearings have long been anybody's guess."""
 
 _CHUNK = 256
@@ -130,10 +130,10 @@ def detector(config: Config, layout: Layout, tones: Float[np.ndarray, " c"]) -> 
 
     settings, elements = config.detection, layout.position.size
     spacing = _spacing(layout)
-    wave = 2.0 * np.pi * tones * spacing / config.believed_celerity
-    if wave.max() > 2.0 * np.pi * WIDEST:
+    wave = 2.0 * np.pi * tones * spacing / config.assumed_sound_speed
+    if wave.max() > 2.0 * np.pi * MAX_SPACING:
         found = f"receiver.spacing: found {spacing:g} m, {wave.max() / (2.0 * np.pi):g} waves"
-        raise InputError(f"{found}; expected at most {WIDEST}, half a wave for a plain beam")
+        raise InputError(f"{found}; expected at most {MAX_SPACING}, half a wave for a plain beam")
     edge = wave * math.sin(math.radians(settings.scan_limit_deg))
     count = 2 * math.ceil(edge.max() / SCAN_STEP) + 1
     scan = np.linspace(-1.0, 1.0, count) * edge[:, None]

@@ -26,7 +26,7 @@ from pipistrelle.settings import (
 )
 
 if TYPE_CHECKING:
-    from pipistrelle.experiments.hearing.worlds import World
+    from pipistrelle.experiments.hearing.world import World
 
 Base = Config | Mapping[str, Any] | str | Path | None
 """Settings to start from: as they were resolved, as a table, or the file that holds it."""
@@ -149,7 +149,7 @@ def mission_settings(
     layer = beneath | flags | short_names(short, flags)
     world = None
     if CALLERS in layer:
-        from pipistrelle.experiments.hearing.others import with_routes
+        from pipistrelle.experiments.hearing.caller_paths import with_routes
 
         layer = with_routes(layer)
     if WORLD in layer:
@@ -310,6 +310,6 @@ def _radius(beamwidth: float, config: Config) -> float:
         piston_radius(
             radians(beamwidth),
             frequency=config.emitter.frequency,
-            speed_of_sound=config.air.celerity,
+            speed_of_sound=config.air.sound_speed,
         )
     )

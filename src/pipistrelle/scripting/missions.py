@@ -16,8 +16,8 @@ from pipistrelle.detection.logs.recording import Log
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.hearing.listening import Progress
+from pipistrelle.experiments.hearing.world import ANY, World
 from pipistrelle.experiments.hearing.world_folder import kept_world
-from pipistrelle.experiments.hearing.worlds import ANY, World
 from pipistrelle.experiments.results.scores import TrialResult, is_placed
 from pipistrelle.experiments.results.writing import write_results
 from pipistrelle.experiments.runs.again import log_entry

@@ -44,7 +44,7 @@ def _as_written(_: Any, tokens: Sequence[Any]) -> Any:
 
 
 if TYPE_CHECKING:
-    from pipistrelle.experiments.hearing.worlds import World
+    from pipistrelle.experiments.hearing.world import World
 
     ChosenFilter = str
 else:  # the help names those that are listed

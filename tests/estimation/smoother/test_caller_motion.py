@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pipistrelle.detection.scans import NOBODY, rows_of
+from pipistrelle.detection.scans import NO_CALLERS, rows_of
 from pipistrelle.estimation.beliefs import Gaussian, placed
 from pipistrelle.estimation.ekf.caller_motion import propagate_callers, velocity_of
 from pipistrelle.estimation.smoother.caller_motion import (
@@ -108,7 +108,7 @@ def test_until_it_is_placed_it_is_a_ray_and_only_when_just_heard():
 def test_bearings_that_cross_place_what_stands_and_never_what_moves():
     mission, _ = roaming_mission(np.random.default_rng(4), 40, speed_std=1e-9, walk_std=0.0)
     callers = [rows_of(scan, scan.landmark == CALLER) for scan in mission.scans]
-    standing = [replace(scan, moving=NOBODY) for scan in callers]
+    standing = [replace(scan, moving=NO_CALLERS) for scan in callers]
     *_, (stands, _) = followed(smoother(), replace(mission, scans=standing), START)
     *_, (moves, _) = followed(smoother(), replace(mission, scans=callers), START)
     assert stands.mapped == (CALLER,)
@@ -170,7 +170,7 @@ def test_it_goes_on_while_the_vehicle_surely_stands():
     assert [belief.link.node for belief in beliefs] == [1, 2, 3, 4]
     assert np.isfinite(beliefs[-1].tracks()[CALLER].mean[4::4]).all()
     alone = [rows_of(scan, scan.landmark != CALLER) for scan in mission.scans]
-    alone = replace(still, scans=[replace(scan, moving=NOBODY) for scan in alone])
+    alone = replace(still, scans=[replace(scan, moving=NO_CALLERS) for scan in alone])
     assert [belief.link.node for belief, _ in followed(slam, alone, START)] == [0] * 4
 
 
@@ -181,7 +181,7 @@ def test_one_that_stands_is_a_landmark():
     mission, _ = roaming_mission(
         np.random.default_rng(8), 16, ranges=2, speed_std=1e-9, walk_std=0.0
     )
-    standing = [replace(scan, moving=NOBODY) for scan in mission.scans]
+    standing = [replace(scan, moving=NO_CALLERS) for scan in mission.scans]
     *_, (moves, _) = followed(smoother(speed_std=1e-4, walk_std=0.0), mission, START)
     *_, (stands, _) = followed(smoother(), replace(mission, scans=standing), START)
     rows, track = stands.landmarks(), moves.tracks()[CALLER]

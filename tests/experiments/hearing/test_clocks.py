@@ -32,7 +32,7 @@ def heard_calls(config, world=None):
 
 
 def direct_times(world, config):
-    return [call.time for call in calls_heard(world, config.scenario, config.air.celerity)]
+    return [call.time for call in calls_heard(world, config.scenario, config.air.sound_speed)]
 
 
 def test_a_call_is_heard_when_its_sound_has_come_straight_to_where_the_vehicle_is_then():
@@ -42,7 +42,7 @@ def test_a_call_is_heard_when_its_sound_has_come_straight_to_where_the_vehicle_i
     assert np.diff(beacon.calls) == pytest.approx(0.37)
     called = beacon.calls[beacon.calls > 0.46][: times.size]
     way = np.hypot(*(path_at(times, world.time, world.path)[:, :2] - beacon.place).T)
-    assert times - way / config.air.celerity == pytest.approx(called, abs=2e-6)
+    assert times - way / config.air.sound_speed == pytest.approx(called, abs=2e-6)
     assert times.min() >= 0.5
     assert times.max() <= 10.0
 
@@ -126,7 +126,7 @@ def test_what_arrives_as_the_vehicle_calls_is_drowned():
     config = config_of({"distance": 9.0})
     world = world_of(config)
     still = replace(world, path=np.tile(world.path[0], (81, 1)))
-    straight = np.hypot(*(world.callers[1].place - world.path[0, :2])) / config.air.celerity
+    straight = np.hypot(*(world.callers[1].place - world.path[0, :2])) / config.air.sound_speed
     for after, heard_once in ((0.4975, False), (0.49, True)):
         own = replace(world.callers[1], calls=np.array([1.0 + after - straight]))
         alone = replace(still, callers=(world.callers[0], own))

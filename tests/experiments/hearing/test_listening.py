@@ -458,7 +458,7 @@ def test_a_mission_hears_the_doppler_shift_of_the_speed_that_it_drives_at():
 
     listen(world, config, [0.0088], beam=watched)
     (arrivals,) = heard  # of all six frames
-    own, c = arrivals.caller == VEHICLE, config.air.celerity
+    own, c = arrivals.caller == VEHICLE, config.air.sound_speed
     closing = straight.speed * np.cos(arrivals.bearing)
     shifted = np.where(own, 35e3 * (c + closing) / (c - closing), 30e3 * (c + closing) / c)
     np.testing.assert_allclose(arrivals.frequency, shifted, rtol=1e-12)

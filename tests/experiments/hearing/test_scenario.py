@@ -5,13 +5,13 @@ import pytest
 from scipy.stats import kstest
 
 from pipistrelle.config import Config, InputError, MotionConfig, ScenarioConfig
-from pipistrelle.experiments.hearing.courses import motion_of
 from pipistrelle.experiments.hearing.scenario import (
     Scenario,
     draw_scenario,
     landmark_count,
     standing_landmarks,
 )
+from pipistrelle.experiments.hearing.trajectories import motion_of
 
 SEEDS = range(12)
 

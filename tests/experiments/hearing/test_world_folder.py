@@ -15,8 +15,9 @@ from pipistrelle.config import (
     ScenarioConfig,
     caller_names,
 )
-from pipistrelle.experiments.hearing.courses import Commands, Poses, Waypoints
 from pipistrelle.experiments.hearing.scenario import Scenario, world_of
+from pipistrelle.experiments.hearing.trajectories import Commands, Poses, Waypoints
+from pipistrelle.experiments.hearing.world import ANY, World
 from pipistrelle.experiments.hearing.world_folder import (
     laid_over,
     named_world,
@@ -24,7 +25,6 @@ from pipistrelle.experiments.hearing.world_folder import (
     settled,
     world_files,
 )
-from pipistrelle.experiments.hearing.worlds import ANY, World
 from pipistrelle.experiments.runs.preparing import prepared
 from pipistrelle.own_files import WORLD, OwnFiles
 from pipistrelle.settings import from_flags, resolve

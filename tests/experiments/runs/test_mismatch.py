@@ -6,8 +6,8 @@ import pytest
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import AssumedConfig, Config, FilterConfig, MotionConfig, ScenarioConfig
 from pipistrelle.evaluation.bound import bound_of_drawn_start, pose_bound
-from pipistrelle.experiments.hearing.courses import motion_of
 from pipistrelle.experiments.hearing.scenario import assumed_motion, standing_landmarks, world_of
+from pipistrelle.experiments.hearing.trajectories import motion_of
 from pipistrelle.experiments.runs.trial import drive_of, run_mission, scans_of
 from pipistrelle.experiments.studies.plan import Plan
 from pipistrelle.experiments.studies.world import heard_together, run_world
@@ -22,7 +22,7 @@ def with_(**sections):
 def test_what_is_not_assumed_otherwise_is_the_truth():
     config = with_(motion=MotionConfig(wheelbase=0.4, speed_std=0.2))
     assert assumed_motion(config) == motion_of(config.motion)
-    assert config.believed_celerity == config.air.celerity
+    assert config.assumed_sound_speed == config.air.sound_speed
 
 
 @pytest.mark.parametrize(

@@ -20,9 +20,9 @@ from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive
-from pipistrelle.experiments.hearing.courses import motion_of
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import draw_scenario
+from pipistrelle.experiments.hearing.trajectories import motion_of
 from pipistrelle.experiments.results.scores import score_path
 from pipistrelle.experiments.runs.filtering import run_filter
 from pipistrelle.experiments.runs.trial import drive_of, run_mission, run_trial, scans_of

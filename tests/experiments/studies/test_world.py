@@ -118,7 +118,7 @@ def test_the_beamwidth_is_that_of_the_call_and_the_air_of_the_case():
         ("air.speed_of_sound", (343.0, 320.0)),
     ):
         for record in failed_records(plan_with(Config(), setting, values), "gone\n"):
-            emitter, c = record.case.config.emitter, record.case.config.air.celerity
+            emitter, c = record.case.config.emitter, record.case.config.air.sound_speed
             half_power = 1.6163399 / (2.0 * np.pi * emitter.frequency / c * emitter.radius)
             width = 2.0 * np.degrees(np.arcsin(half_power))
             assert record.beamwidth_deg == pytest.approx(width, rel=1e-6)

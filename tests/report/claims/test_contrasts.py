@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.estimation.motion import motion_step
-from pipistrelle.experiments.hearing.courses import motion_of
+from pipistrelle.experiments.hearing.trajectories import motion_of
 from pipistrelle.report.claims.contrasts import (
     approach,
     curves,

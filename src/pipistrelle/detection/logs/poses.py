@@ -29,8 +29,8 @@ MOTION_COVARIANCE = ("motion_xx", "motion_xy", "motion_xh", "motion_yy", "motion
 _RESOLUTION = 1e-6  # [s], within which a step ends with a row
 _INDEFINITE = 1e-6  # how far below 0 an eigenvalue may be by the rounding of a file's numbers
 _FULL = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
-_UNUSUAL = 10.0  # times what is usual
-_JUMP = (0.5, 0.5)  # [m], [rad]: less in one step is no jump
+_JUMP_RATIO = 10.0  # times what is usual
+_MIN_JUMP = (0.5, 0.5)  # [m], [rad]: less in one step is no jump
 
 
 def motions_between(odometry: Table, time: Float[np.ndarray, " t"]) -> Float[np.ndarray, "t-1 c"]:
@@ -107,10 +107,12 @@ def jumps(motions: Float[np.ndarray, "k _"], dt: Float[np.ndarray, " k"]) -> Int
     array([7])
     """
     found = np.zeros(len(dt), dtype=bool)
-    for size, least in zip((np.hypot(*motions.T[:2]), np.abs(motions[:, 2])), _JUMP, strict=True):
+    for size, least in zip(
+        (np.hypot(*motions.T[:2]), np.abs(motions[:, 2])), _MIN_JUMP, strict=True
+    ):
         speed = size / dt
         usual = np.percentile(speed[size > 0.0], 90.0) if np.any(size > 0.0) else 0.0
-        found |= (size >= least) & (speed > _UNUSUAL * usual)
+        found |= (size >= least) & (speed > _JUMP_RATIO * usual)
     return np.flatnonzero(found)
 
 

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from pipistrelle.config import LONGEST_STEP
 from pipistrelle.detection.logs.poses import motions_between
 from pipistrelle.detection.logs.text_tables import Table, check_unique, rows_kept
-from pipistrelle.detection.scans import NOBODY, OWN, UNLABELLED, Scan, make_scan
+from pipistrelle.detection.scans import NO_CALLERS, OWN, UNLABELLED, Scan, make_scan
 from pipistrelle.geometry import wrap
 from pipistrelle.refusals import refusal
 
@@ -32,9 +32,9 @@ CALLER = "caller"
 """Whose call it was, where it was not the vehicle's own: a number, from 1 on."""
 
 _RESOLUTION = 1e-6  # [s], of the boundaries of merged steps
-_STEPS_MAX = 10_000_000
-_LATEST = 1e11  # [s], beyond the year 5000 if counted from 1970
-_LONGEST_GAP = 10.0  # [s], typically between two rows of odometry, or of the truth
+_MAX_STEPS = 10_000_000
+_MAX_TIME = 1e11  # [s], beyond the year 5000 if counted from 1970
+_MAX_GAP = 10.0  # [s], typically between two rows of odometry, or of the truth
 _UNITS = (1e-3, 1e-6, 1e-9)  # [s], of other clocks
 
 
@@ -178,7 +178,7 @@ def assemble(
     )
 
 
-def check_seconds(table: Table, longest_gap: float = _LONGEST_GAP) -> None:
+def check_seconds(table: Table, longest_gap: float = _MAX_GAP) -> None:
     """Refuse times that can be no seconds, and say which unit they may have.
 
     `table`: with a column ``time``; `longest_gap` [s]: typically between two rows.
@@ -187,10 +187,10 @@ def check_seconds(table: Table, longest_gap: float = _LONGEST_GAP) -> None:
     gaps = np.diff(time)
     typical = float(np.median(gaps[gaps > 0.0])) if np.any(gaps > 0.0) else 0.0
     latest = float(np.max(np.abs(time), initial=0.0))
-    if typical <= longest_gap and latest <= _LATEST:
+    if typical <= longest_gap and latest <= _MAX_TIME:
         return
-    if latest > _LATEST:
-        factor = next((unit for unit in _UNITS if latest * unit <= _LATEST / 10.0), _UNITS[-1])
+    if latest > _MAX_TIME:
+        factor = next((unit for unit in _UNITS if latest * unit <= _MAX_TIME / 10.0), _UNITS[-1])
     else:  # of 1 ms, 1 us and 1 ns, that which makes it likeliest 0.1 s
         factor = min(_UNITS, key=lambda unit: abs(math.log10(typical * unit / 0.1)))
     found = f"times from {time[0].item():g} to {time[-1].item():g}, typically {typical:g} apart"
@@ -224,9 +224,9 @@ def _single(odometry: Table, time: np.ndarray) -> np.ndarray:
 def _merged(path: Path, time: np.ndarray, step: float) -> np.ndarray:
     """Times of the start and of the ends of steps of one length."""
     count = max(1.0, np.ceil((time[-1] - time[0] - _RESOLUTION) / step))
-    if count > _STEPS_MAX:
+    if count > _MAX_STEPS:
         found = f"{time[-1] - time[0]:g} s in steps of {step:g} s"
-        raise refusal(path, found, f"at most {_STEPS_MAX} steps", "correct the times or the step")
+        raise refusal(path, found, f"at most {_MAX_STEPS} steps", "correct the times or the step")
     return np.append(time[0] + step * np.arange(count), time[-1])
 
 
@@ -291,7 +291,9 @@ def _scans(
     stamp = measured["time"]
     order = np.lexsort((np.isnan(measured["bearing"]), stamp))
     measured = {name: column[order] for name, column in measured.items()}
-    labels = np.array([UNLABELLED, *(caller.landmark for caller in callers)]) if callers else NOBODY
+    labels = (
+        np.array([UNLABELLED, *(caller.landmark for caller in callers)]) if callers else NO_CALLERS
+    )
     stamp, bearing = measured["time"], measured["bearing"]
     said = measured | {
         "time": time[np.searchsorted(time, stamp - resolution)],

@@ -23,7 +23,7 @@ from pipistrelle.config import Config
 from pipistrelle.experiments.hearing.clocks import Call, calls_heard, with_times
 from pipistrelle.experiments.hearing.scenario import Scenario
 
-TOGETHER = 25
+EMISSIONS_AT_ONCE = 25
 """Emissions whose arrivals are computed at a time: arrays of a few thousand keep NumPy busy."""
 
 
@@ -56,7 +56,7 @@ def frames_of(
     scenario: Scenario, radii: Sequence[float], config: Config, beam: Callable[..., Arrivals]
 ) -> Iterator[Frame]:
     """Yield what sounds in each frame of a path, through pistons of several radii [m]."""
-    setup, c = config.scenario, config.air.celerity
+    setup, c = config.scenario, config.air.sound_speed
     calls = calls_heard(scenario, setup, c)
     begin = scenario.time[setup.steps_per_frame :: setup.steps_per_frame]
     world = with_times(scenario, [call.time for call in calls]) if calls else scenario
@@ -112,7 +112,7 @@ def _calls_heard(
     ):
         place = np.asarray(world.callers[call.caller].place)
         place = place if place.ndim == 1 else place[steps[number]]
-        straight = np.hypot(*(place - world.path[steps[number], :2])) / config.air.celerity
+        straight = np.hypot(*(place - world.path[steps[number], :2])) / config.air.sound_speed
         heard.append(
             CallHeard(
                 number=number,
@@ -138,8 +138,8 @@ def _emissions(
 
     Many steps are computed at a time.
     """
-    for first in range(0, len(steps), TOGETHER):
-        now = steps[first : first + TOGETHER]
+    for first in range(0, len(steps), EMISSIONS_AT_ONCE):
+        now = steps[first : first + EMISSIONS_AT_ONCE]
         poses, took = scenario.path[now], scenario.time[now] - scenario.time[now - 1]
         velocities = (poses[:, :2] - scenario.path[now - 1, :2]) / took[:, np.newaxis]
         callers = callers_at(scenario.callers, scenario.time, now)
@@ -148,7 +148,7 @@ def _emissions(
         )
         aimed = [
             through_pistons(
-                emission, callers, beam, radius=radius, speed_of_sound=config.air.celerity
+                emission, callers, beam, radius=radius, speed_of_sound=config.air.sound_speed
             )
             for radius in radii
         ]

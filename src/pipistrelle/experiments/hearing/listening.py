@@ -26,9 +26,9 @@ from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_sa
 from pipistrelle.arrays.sampling import BLOCK, Sampling, block_shape, blocks_to_hear, sampling
 from pipistrelle.config import Config
 from pipistrelle.detection.direct import own_alone
-from pipistrelle.detection.faces import Heard, average_faces, same_echo, unlabelled
+from pipistrelle.detection.faces import FrameMeasurements, average_faces, same_echo, unlabelled
 from pipistrelle.detection.matched import filter_blocks, filter_samples
-from pipistrelle.detection.scans import NOBODY
+from pipistrelle.detection.scans import NO_CALLERS
 from pipistrelle.detection.snapshots import (
     Detections,
     Detector,
@@ -57,7 +57,7 @@ def listen(
     find: Callable[..., Detections] = detect,
     oracle: Callable[..., Int[np.ndarray, " d"]] | None = label_detections,
     progress: Progress | None = None,
-) -> tuple[tuple[Heard, ...], ...]:
+) -> tuple[tuple[FrameMeasurements, ...], ...]:
     """Hear every frame of a path, once for all beamwidths.
 
     Parameters
@@ -84,7 +84,7 @@ def listen(
 
     Returns
     -------
-    tuple, one per radius, of tuples of Heard
+    tuple, one per radius, of tuples of FrameMeasurements
         One per frame, and one per call that brings something of those who have clocks of their own.
 
     Raises
@@ -111,7 +111,7 @@ def listen(
     rig = _rig(config, scenario, ears, find, oracle)
     purpose = "noise" if setup.vehicle == 1 else f"noise of {setup.vehicle}"
     engine = _dense if config.receiver.engine == "dense" else _blocks
-    beams: tuple[list[Heard], ...] = tuple([] for _ in radii)
+    beams: tuple[list[FrameMeasurements], ...] = tuple([] for _ in radii)
     beam = beam or partial(through_piston, off_axis=config.emitter.off_axis)
     calls: dict[int, tuple[CallHeard, list[list[Detections]]]] = {}
     for number, frame in enumerate(frames_of(scenario, radii, config, beam), start=1):
@@ -208,7 +208,7 @@ def _rig(
             noise_std=settled.noise_std,
             margin_db=config.association.margin_db,
         ),
-        callers=caller_labels(scenario) if oracle else NOBODY,
+        callers=caller_labels(scenario) if oracle else NO_CALLERS,
         missable=own_clock | [caller.heading is not None for caller in scenario.callers],
         own_clock=own_clock,
         workspace=Workspace(),
@@ -224,7 +224,7 @@ def _of_call(call: CallHeard, time: float, record: "_Record", found: Detections)
     return replace(part, delay=part.delay - after, direct=direct)
 
 
-def _heard(time: float, detections: Detections, arrivals: Arrivals, rig: _Rig) -> Heard:
+def _heard(time: float, detections: Detections, arrivals: Arrivals, rig: _Rig) -> FrameMeasurements:
     """Average a frame's detections over the faces, by the truth's labels where it tells them."""
     config, gates = rig.config, rig.config.association
     if rig.oracle is None:
@@ -247,7 +247,7 @@ def _heard(time: float, detections: Detections, arrivals: Arrivals, rig: _Rig) -
         detections,
         label,
         averaging=config.detection.averaging,
-        speed_of_sound=config.believed_celerity,
+        speed_of_sound=config.assumed_sound_speed,
         callers=rig.callers,
     )
     return unlabelled(heard) if rig.oracle is None else heard

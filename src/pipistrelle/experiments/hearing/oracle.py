@@ -20,7 +20,7 @@ from pipistrelle.detection.snapshots import Detections
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel
 
-_TOGETHER = 1e-9
+_SAME_TIME = 1e-9
 """Candidates as near as this, in squared gates, arrive together."""
 
 
@@ -158,7 +158,7 @@ def _label(
             if abs(wrap_angle(true.bearing[a] - normal[face[d]])) > 0.5 * np.pi:
                 continue
             off = abs(wrap_angle(bearing[d] - true.bearing[a])) / gates.bearing
-            if off <= 1.0 and late * late + off * off < best + _TOGETHER:
+            if off <= 1.0 and late * late + off * off < best + _SAME_TIME:
                 nearest, best = a, late * late + off * off
         if nearest >= 0:
             label[d] = true.landmark[nearest]

@@ -14,10 +14,10 @@ from pipistrelle.config import CallerConfig, Config, InputError, ScenarioConfig
 from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.drives import LabelledPoints
-from pipistrelle.experiments.hearing.courses import course_of, driven, motion_of
-from pipistrelle.experiments.hearing.fields import landmarks_in
-from pipistrelle.experiments.hearing.others import Around, callers_among, place_at
-from pipistrelle.experiments.hearing.worlds import ANY, World
+from pipistrelle.experiments.hearing.caller_paths import Surroundings, callers_among, place_at
+from pipistrelle.experiments.hearing.landmark_fields import landmarks_in
+from pipistrelle.experiments.hearing.trajectories import course_of, driven, motion_of
+from pipistrelle.experiments.hearing.world import ANY, World
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,7 +95,7 @@ def draw_scenario(config: Config, rng: np.random.Generator, world: World = ANY) 
         landmarks = landmarks_in(setup, path[:, :2], callers, rng)
     vehicle, *others = callers_of(config, beacon)
     if told is not None:
-        around = Around(
+        around = Surroundings(
             config=config, time=time, path=path[:, :2], landmarks=landmarks, course=course
         )
         others = callers_among(around, told, rng, None if given else first)

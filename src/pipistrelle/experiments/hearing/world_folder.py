@@ -25,10 +25,16 @@ from pipistrelle.detection.logs.text_tables import (
     table_text,
 )
 from pipistrelle.estimation.catalogue import SECTIONS
-from pipistrelle.experiments.hearing.courses import Commands, Course, Poses, Waypoints, steps_of
-from pipistrelle.experiments.hearing.others import routes_read
+from pipistrelle.experiments.hearing.caller_paths import routes_read
 from pipistrelle.experiments.hearing.scenario import Scenario
-from pipistrelle.experiments.hearing.worlds import World
+from pipistrelle.experiments.hearing.trajectories import (
+    Commands,
+    Course,
+    Poses,
+    Waypoints,
+    steps_of,
+)
+from pipistrelle.experiments.hearing.world import World
 from pipistrelle.files import read_file, read_text
 from pipistrelle.refusals import expectation, refusal, shown
 from pipistrelle.settings import (

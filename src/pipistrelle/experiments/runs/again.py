@@ -21,8 +21,8 @@ from pipistrelle.detection.logs.recording import Log
 from pipistrelle.estimation.catalogue import CATALOGUE, short_name
 from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.hearing.listening import Progress
+from pipistrelle.experiments.hearing.world import ANY
 from pipistrelle.experiments.hearing.world_folder import read_world
-from pipistrelle.experiments.hearing.worlds import ANY
 from pipistrelle.experiments.results.reading import SUMMARY, Summary, read_summary
 from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.results.tables import tum_text

@@ -14,7 +14,7 @@ from pipistrelle.arrays.sampling import sampling
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.snapshots import detector
 from pipistrelle.experiments.hearing.scenario import Scenario, world_of
-from pipistrelle.experiments.hearing.worlds import ANY, World
+from pipistrelle.experiments.hearing.world import ANY, World
 from pipistrelle.experiments.machine import check_length, check_recording
 from pipistrelle.kernel_clock import judging
 
@@ -107,7 +107,7 @@ def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ..
     said = []
     for caller in callers or callers_of(config, np.zeros(2)):
         frequency, key = caller.frequency, caller.key or caller.name
-        tone, wave = f"{key}.frequency ({frequency:g} Hz)", config.air.celerity / frequency
+        tone, wave = f"{key}.frequency ({frequency:g} Hz)", config.air.sound_speed / frequency
         nearest = wave / spacing - math.sin(math.radians(limit))  # its lobe lies at the limit
         if nearest < 1.0:
             said.append(
@@ -130,7 +130,7 @@ def _refuse_supersonic(scenario: Scenario, config: Config) -> None:
     def fastest(path: np.ndarray) -> float:
         return np.hypot(*np.diff(path, axis=0).T).max(initial=0.0) / config.scenario.step
 
-    speed, c = fastest(scenario.path[:, :2]), config.air.celerity
+    speed, c = fastest(scenario.path[:, :2]), config.air.sound_speed
     for caller in scenario.callers[VEHICLE + 1 :]:
         if moves(caller) and not (his := fastest(np.asarray(caller.place))) < c:
             raise InputError(

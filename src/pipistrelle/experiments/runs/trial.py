@@ -12,7 +12,7 @@ from jaxtyping import Float
 from pipistrelle import kernel_clock
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import Config, InputError, Strategy
-from pipistrelle.detection.faces import Heard
+from pipistrelle.detection.faces import FrameMeasurements
 from pipistrelle.detection.merging import scan_of
 from pipistrelle.detection.noise import as_told, noise_of
 from pipistrelle.detection.scans import Scan, rows_of
@@ -22,7 +22,6 @@ from pipistrelle.estimation.catalogue import CATALOGUE, entry, short_name
 from pipistrelle.evaluation.bound import bound_of_drawn_start
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive, Truth, split_at
-from pipistrelle.experiments.hearing.courses import motion_of
 from pipistrelle.experiments.hearing.listening import Progress, listen
 from pipistrelle.experiments.hearing.scenario import (
     Scenario,
@@ -30,7 +29,8 @@ from pipistrelle.experiments.hearing.scenario import (
     moving_callers,
     standing_landmarks,
 )
-from pipistrelle.experiments.hearing.worlds import ANY, World
+from pipistrelle.experiments.hearing.trajectories import motion_of
+from pipistrelle.experiments.hearing.world import ANY, World
 from pipistrelle.experiments.machine import check_memory
 from pipistrelle.experiments.results.scores import (
     TrialResult,
@@ -56,7 +56,7 @@ class Mission:
     config: Config
     scenario: Scenario
     drive: Drive
-    heard: tuple[Heard, ...]
+    heard: tuple[FrameMeasurements, ...]
     trials: tuple[TrialResult, ...]
 
 
@@ -115,12 +115,14 @@ def run_mission(
     return Mission(config=config, scenario=scenario, drive=drive, heard=heard, trials=trials)
 
 
-def scans_of(heard: Sequence[Heard], strategy: Strategy, config: Config) -> tuple[Scan, ...]:
+def scans_of(
+    heard: Sequence[FrameMeasurements], strategy: Strategy, config: Config
+) -> tuple[Scan, ...]:
     """Tell what a strategy takes of each frame, and how surely the settings say it was measured.
 
     Parameters
     ----------
-    heard : sequence of Heard
+    heard : sequence of FrameMeasurements
     strategy : "active", "fused" or "passive"
     config : Config
 
@@ -136,7 +138,7 @@ def scans_of(heard: Sequence[Heard], strategy: Strategy, config: Config) -> tupl
 
 
 def _bounds(
-    drive: Drive, heard: Sequence[Heard], strategies: Sequence[Strategy], config: Config
+    drive: Drive, heard: Sequence[FrameMeasurements], strategies: Sequence[Strategy], config: Config
 ) -> dict[str, Float[np.ndarray, "t 3 3"] | None]:
     """Work out the bound of each strategy, of who knows the motion, and the noise by the signal."""
     noise = config.filter.model_copy(update={"noise": "measured"})

@@ -12,8 +12,8 @@ from typing import Any, cast
 
 from pipistrelle.config import Config, Strategy
 from pipistrelle.experiments.cases import Case
+from pipistrelle.experiments.hearing.world import ANY, World
 from pipistrelle.experiments.hearing.world_folder import laid_over
-from pipistrelle.experiments.hearing.worlds import ANY, World
 from pipistrelle.settings import Given, Key, Layer, from_flags, resolve
 
 RADIUS = "emitter.radius"

@@ -19,14 +19,14 @@ from pipistrelle.estimation.catalogue import (
     check_distinct,
     check_name,
 )
-from pipistrelle.experiments.hearing.others import routes_read, with_routes
+from pipistrelle.experiments.hearing.caller_paths import routes_read, with_routes
+from pipistrelle.experiments.hearing.world import World
 from pipistrelle.experiments.hearing.world_folder import (
     WORLD_KEY,
     named_world,
     read_world,
     settled,
 )
-from pipistrelle.experiments.hearing.worlds import World
 from pipistrelle.experiments.studies.beamwidths import BEAMWIDTH, with_radii
 from pipistrelle.experiments.studies.plan import (
     MOST_CASES,
@@ -381,7 +381,7 @@ def plan_settings(plan: Plan) -> dict[str, Any]:
     """
     told = {".".join(key): value for key, value in leaves(_as_table(plan)) if key != ("planned",)}
     worlds = {f"worlds/{name}": _digest(world) for name, world in plan.worlds.items()}
-    return told | worlds | {"config.air.speed_of_sound": plan.config.air.celerity}
+    return told | worlds | {"config.air.speed_of_sound": plan.config.air.sound_speed}
 
 
 def _worded(table: Mapping[str, Any], name: str) -> str:

@@ -17,8 +17,8 @@ from pathlib import Path
 from pipistrelle.config import InputError
 from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.estimation.outside import look_in
-from pipistrelle.experiments.hearing.courses import motion_of
 from pipistrelle.experiments.hearing.scenario import standing_landmarks
+from pipistrelle.experiments.hearing.trajectories import motion_of
 from pipistrelle.experiments.machine import check_memory, keep_freed_memory
 from pipistrelle.experiments.runs.checking import check_filters
 from pipistrelle.experiments.runs.preparing import prepared, warnings_of

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle import kernel_clock
 from pipistrelle.acoustics.emitter import beamwidth_of
 from pipistrelle.config import Config, FilterConfig, ListeningConfig, Strategy
-from pipistrelle.detection.faces import Heard
+from pipistrelle.detection.faces import FrameMeasurements
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Track
 from pipistrelle.estimation.catalogue import SECTIONS
@@ -31,10 +31,10 @@ from pipistrelle.evaluation.bound import (
     nees_of_exact_start,
 )
 from pipistrelle.evaluation.consistency import track_nees
-from pipistrelle.experiments.hearing.courses import motion_of
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import Scenario, standing_landmarks, world_of
-from pipistrelle.experiments.hearing.worlds import World
+from pipistrelle.experiments.hearing.trajectories import motion_of
+from pipistrelle.experiments.hearing.world import World
 from pipistrelle.experiments.results.scores import PathScores, Scores, drive_bound, with_bound
 from pipistrelle.experiments.runs.checking import failure_text, first_belief
 from pipistrelle.experiments.runs.trial import drive_of, run_trial, scans_of
@@ -273,7 +273,7 @@ def _heard_settings(case: PlannedCase) -> str:
     """Return as text all settings that bear on a case's world and on what is heard in it."""
     settings = case.config.model_dump(mode="json", exclude=set(SECTIONS))
     del settings["emitter"]["radius"]
-    settings["assumed"] = case.config.believed_celerity  # the rest is the filters' alone
+    settings["assumed"] = case.config.assumed_sound_speed  # the rest is the filters' alone
     return json.dumps(settings)
 
 
@@ -302,7 +302,7 @@ class _Shared:
     """What the cases of a world share: each is worked out once."""
 
     def __init__(
-        self, scenario: Scenario, config: Config, beams: Mapping[float, Sequence[Heard]]
+        self, scenario: Scenario, config: Config, beams: Mapping[float, Sequence[FrameMeasurements]]
     ) -> None:
         self.scenario, self.beams, self._config = scenario, beams, config
         self._drive = drive_of(scenario, config)

@@ -220,7 +220,7 @@ def _plan_sum(plan: Plan) -> str:
     """Sum up what a plan's worlds depend on; a setting that is new has its default in old plans."""
     config = plan.config.model_dump(mode="json", exclude_defaults=True)
     air = config.pop("air", {})
-    air["speed_of_sound"] = plan.config.air.celerity  # given or not
+    air["speed_of_sound"] = plan.config.air.sound_speed  # given or not
     grid = {name: list(values) for name, values in plan.grid.items()}
     own = {name: dict(settings) for name, settings in plan.own.items()}
     parts = [plan.strategies, plan.filters, config, air, grid, *([own] if own else [])]

@@ -190,7 +190,7 @@ def _asked(config: Config, grid: Mapping[str, Sequence[Any]]) -> dict[str, Any]:
         for part in key:
             value = value[part]
         found[".".join(key)] = value
-    found["air.speed_of_sound"] = config.air.celerity
+    found["air.speed_of_sound"] = config.air.sound_speed
     del found["seed"]
     varied = {name: setting_variable(name, values).given for name, values in grid.items()}
     return found | {RADIUS: [found[RADIUS]]} | {name: [*given] for name, given in varied.items()}

@@ -8,13 +8,13 @@ from jaxtyping import Float
 
 from pipistrelle.config import InputError, ScenarioConfig
 
-TRIES = 2000
+MAX_DRAWS = 2000
 """Draws of one landmark before the request counts as impossible."""
-DENSEST = math.pi / math.sqrt(12.0)
+MAX_COVERAGE = math.pi / math.sqrt(12.0)
 """Largest share of the plane that equal discs can cover."""
-OFF = 0.1
+MAX_ROW_OFFSET = 0.1
 """Of its distance to the next, how far a tree may stand off its row, or along it."""
-ROOM = (0.75, 1.5)
+ROOM_SIZE = (0.75, 1.5)
 """Width and depth of rooms, in widths of the corridor: drawn between these."""
 
 Points = Float[np.ndarray, "_ 2"]
@@ -66,7 +66,7 @@ def _scattered(
     """Draw landmarks one by one, uniformly over the disc, until each keeps its distances."""
     placed = np.empty((setup.landmarks, 2))
     for i in range(setup.landmarks):
-        for _ in range(TRIES):
+        for _ in range(MAX_DRAWS):
             distance = setup.radius * math.sqrt(rng.uniform())
             direction = rng.uniform(-math.pi, math.pi)
             place = distance * np.array([math.cos(direction), math.sin(direction)])
@@ -90,7 +90,7 @@ def _rows(setup: ScenarioConfig, rng: np.random.Generator) -> Iterator[tuple[flo
     along = np.arange(-setup.radius, setup.radius, setup.spacing) + rng.uniform() * setup.spacing
     for y in across.tolist():
         for x in along.tolist():
-            off = OFF * setup.spacing * rng.uniform(-1.0, 1.0, 2)
+            off = MAX_ROW_OFFSET * setup.spacing * rng.uniform(-1.0, 1.0, 2)
             yield x + off[0], y + off[1]
 
 
@@ -99,7 +99,7 @@ def _corners(setup: ScenarioConfig, rng: np.random.Generator) -> Iterator[tuple[
     for side in (-1.0, 1.0):
         x, wall = -setup.radius, 0.5 * side * setup.lane
         while x < setup.radius:
-            width, depth = setup.lane * rng.uniform(*ROOM, 2)
+            width, depth = setup.lane * rng.uniform(*ROOM_SIZE, 2)
             yield from ((x, wall), (x, wall + side * depth), (x + width, wall + side * depth))
             x += width
 
@@ -118,7 +118,7 @@ def _is_clear(
 def _refuse_crowd(setup: ScenarioConfig) -> None:
     """Refuse what no drawing could place."""
     half = 0.5 * setup.spacing
-    most = DENSEST * ((setup.radius + half) / max(half, 1e-100)) ** 2
+    most = MAX_COVERAGE * ((setup.radius + half) / max(half, 1e-100)) ** 2
     if setup.field == "disc" and setup.landmarks > max(most, 1.0):
         raise _too_many(setup, f"at most {max(int(most), 1)} fit")
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.config import InputError, ScenarioConfig
-from pipistrelle.experiments.hearing.fields import OFF, landmarks_in, nearest
+from pipistrelle.experiments.hearing.landmark_fields import MAX_ROW_OFFSET, landmarks_in, nearest
 
 NOWHERE = np.empty((0, 2))
 
@@ -17,9 +17,9 @@ def field(kind, seed=7, path=NOWHERE, callers=NOWHERE, **settings):
 def test_an_orchard_stands_in_rows_between_the_lanes():
     trees = field("rows", landmarks=60, lane=4.0, extent=12.0, spacing=3.0)
     row = (trees[:, 1] + 12.0) / 4.0 - 0.5
-    assert np.abs(row - np.rint(row)).max() <= OFF * 3.0 / 4.0
+    assert np.abs(row - np.rint(row)).max() <= MAX_ROW_OFFSET * 3.0 / 4.0
     one = np.sort(trees[np.rint(row) == np.rint(row[0])][:, 0])
-    assert np.abs(np.diff(one) - 3.0).max() <= 2.0 * OFF * 3.0
+    assert np.abs(np.diff(one) - 3.0).max() <= 2.0 * MAX_ROW_OFFSET * 3.0
 
 
 def test_rooms_have_their_corners_at_the_corridors_walls_or_behind_them():

@@ -18,13 +18,13 @@ from pipistrelle.config import InputError, MotionConfig, ScenarioConfig
 from pipistrelle.estimation.motion import Motion, controls_between, motion_step
 from pipistrelle.geometry import path_at, wrap_angle
 
-AHEAD = 1.0
+LOOK_AHEAD = 1.0
 """How far ahead of the vehicle the driver aims [m]."""
-LOCK = 0.6
+MAX_STEERING = 0.6
 """Largest angle to which he turns a front wheel [rad]."""
-SLACK = 1e-6
+TIME_TOLERANCE = 1e-6
 """By how much two times may differ that are one, in steps or seconds."""
-EIGHT = 96
+EIGHT_POINTS = 96
 """Way-points of a figure of eight."""
 
 
@@ -95,7 +95,7 @@ def course_of(setup: ScenarioConfig, motion: Motion) -> Course:
     """
     a = setup.extent
     if setup.course == "eight":
-        t = np.linspace(0.0, 2.0 * np.pi, EIGHT, endpoint=False)
+        t = np.linspace(0.0, 2.0 * np.pi, EIGHT_POINTS, endpoint=False)
         return Waypoints(points=a * np.column_stack((np.sin(t), np.sin(t) * np.cos(t))))
     if setup.course == "corridor":
         side = 0.25 * setup.lane
@@ -121,8 +121,8 @@ def steps_of(course: Course, setup: ScenarioConfig) -> int:
     if isinstance(course, Waypoints):
         _check_speed(setup)
         seconds = float(np.hypot(*np.diff(course.points, axis=0).T).sum()) / setup.speed
-        return max(math.ceil(seconds / setup.step - SLACK), 1)
-    return math.floor(float(course.time[-1]) / setup.step + SLACK)
+        return max(math.ceil(seconds / setup.step - TIME_TOLERANCE), 1)
+    return math.floor(float(course.time[-1]) / setup.step + TIME_TOLERANCE)
 
 
 def driven(
@@ -183,7 +183,7 @@ def _noise(
 
 def _held(time: Float[np.ndarray, " t"], commands: Commands) -> Float[np.ndarray, "t-1 2"]:
     """Return what is commanded at the start of each step."""
-    rows = np.searchsorted(commands.time, time[:-1] + SLACK, side="right") - 1
+    rows = np.searchsorted(commands.time, time[:-1] + TIME_TOLERANCE, side="right") - 1
     return commands.rows[rows]
 
 
@@ -222,11 +222,11 @@ def _ahead(
     along: Float[np.ndarray, " n"],
 ) -> float:
     """Move the aim on along a line until it is far enough ahead, or a round further [m]."""
-    for _ in range(math.ceil(10.0 * along[-1] / AHEAD)):
+    for _ in range(math.ceil(10.0 * along[-1] / LOOK_AHEAD)):
         x, y = _at(aim, line, along)
-        if math.hypot(x - pose[0], y - pose[1]) >= AHEAD:
+        if math.hypot(x - pose[0], y - pose[1]) >= LOOK_AHEAD:
             break
-        aim += 0.1 * AHEAD
+        aim += 0.1 * LOOK_AHEAD
     return aim
 
 
@@ -244,9 +244,9 @@ def _towards(
     """Return the controls that bring the vehicle to a point ahead, as far as they can."""
     off = wrap_angle(math.atan2(point[1] - pose[1], point[0] - pose[0]) - pose[2])
     if motion.model == "bicycle":
-        return speed, min(max(off, -LOCK), LOCK)
+        return speed, min(max(off, -MAX_STEERING), MAX_STEERING)
     off = min(max(off, -0.5 * math.pi), 0.5 * math.pi)
-    return speed, 2.0 * speed * math.sin(off) / AHEAD
+    return speed, 2.0 * speed * math.sin(off) / LOOK_AHEAD
 
 
 def _check_speed(setup: ScenarioConfig) -> None:
@@ -260,7 +260,7 @@ def _check_speed(setup: ScenarioConfig) -> None:
 
 def _check_length(course: Commands | Poses, setup: ScenarioConfig) -> None:
     """Refuse a course that ends before the drive."""
-    if course.time[-1] < setup.steps * setup.step - SLACK:
+    if course.time[-1] < setup.steps * setup.step - TIME_TOLERANCE:
         raise InputError(
             f"scenario.steps: found {setup.steps}, but the path of {setup.world} ends after "
             f"{steps_of(course, setup)} steps of {setup.step:g} s; expected as many, or fewer"

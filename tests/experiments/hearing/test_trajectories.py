@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from pipistrelle.config import InputError, ScenarioConfig
 from pipistrelle.estimation.motion import Motion, controls_between, motion_step
-from pipistrelle.experiments.hearing.courses import (
-    AHEAD,
-    LOCK,
+from pipistrelle.experiments.hearing.trajectories import (
+    LOOK_AHEAD,
+    MAX_STEERING,
     Commands,
     Poses,
     Waypoints,
@@ -49,7 +49,7 @@ def test_a_driver_keeps_near_the_line_whatever_the_noise(shape, motion):
     points = course_of(ScenarioConfig(course=shape), motion).points
     for seed in range(3):
         path, controls = drive(None, motion, seed, course=shape, steps=1500)
-        assert off_line(path[:, :2], points).max() < AHEAD
+        assert off_line(path[:, :2], points).max() < LOOK_AHEAD
         assert np.hypot(*np.diff(path[:, :2], axis=0).T).sum() == pytest.approx(140.6, rel=0.03)
         assert np.all(controls[:, 0] == 0.75)
     # A vehicle that drives blindly is soon elsewhere.
@@ -57,14 +57,14 @@ def test_a_driver_keeps_near_the_line_whatever_the_noise(shape, motion):
         time=np.append(np.arange(1500) * 0.125, 187.5), rows=np.vstack((controls, [0, 0]))
     )
     lost, _ = drive(blind, motion, 9, start=tuple(path[0]))
-    assert off_line(lost[:, :2], points).max() > 3.0 * AHEAD
+    assert off_line(lost[:, :2], points).max() > 3.0 * LOOK_AHEAD
 
 
 def test_a_front_wheel_turns_no_further_than_its_lock():
     to_and_fro = Waypoints(points=np.array([[0.0, 0.0], [5.0, 0.0]]))
     path, controls = drive(to_and_fro, BICYCLE, steps=200)
-    assert np.abs(controls[:, 1]).max() == LOCK
-    assert off_line(path[:, :2], to_and_fro.points).max() < AHEAD
+    assert np.abs(controls[:, 1]).max() == MAX_STEERING
+    assert off_line(path[:, :2], to_and_fro.points).max() < LOOK_AHEAD
 
 
 @pytest.mark.parametrize("motion", MODELS, ids=lambda m: m.model)
@@ -159,4 +159,4 @@ def test_way_points_all_within_the_drivers_reach_are_circled_for_ever():
     points = Waypoints(points=np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 0.3]]))
     path, _ = drive(points, BICYCLE, steps=400)
     assert np.isfinite(path).all()
-    assert np.hypot(*path[:, :2].T).max() < 3.0 * AHEAD
+    assert np.hypot(*path[:, :2].T).max() < 3.0 * LOOK_AHEAD

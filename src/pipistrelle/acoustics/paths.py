@@ -1,8 +1,7 @@
-"""The ways of sound: from every target to the vehicle, how long, from where, how fast they shrink.
+"""Paths of sound from every target to the vehicle: length, direction and rate of change.
 
-Targets are the landmarks, which stand, and then the callers but the vehicle, which may move. Ways
-are those of the moment of emission, frozen while sound is on them; of motion the speeds along them
-are kept.
+Targets are the landmarks, which stand still, followed by all callers but the vehicle, which may
+move. Paths are frozen at the moment of emission; of the motion only the speeds along them are kept.
 """
 
 import math
@@ -19,38 +18,38 @@ from pipistrelle.geometry import wrap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Ways:
-    """From all targets, landmarks and then callers, to the vehicle at each of k emissions."""
+class SoundPaths:
+    """Paths from t targets, landmarks and then callers, to the vehicle at each of k emissions."""
 
     poses: Float[np.ndarray, "k 3"]
-    """Of the vehicle [m, m, rad]."""
+    """Poses of the vehicle [m, m, rad]."""
     velocities: Float[np.ndarray, "k 2"]
-    """Velocities [m/s]."""
+    """Velocities of the vehicle [m/s]."""
     landmarks: int
-    """How many of the targets are landmarks."""
+    """Number of landmarks among the targets."""
     target: Float[np.ndarray, "_ t 2"]
-    """Target [m]."""
+    """Positions of the targets [m]."""
     offset: Float[np.ndarray, "k t 2"]
-    """From the vehicle [m]."""
+    """From the vehicle to the target [m]."""
     homeward: Float[np.ndarray, "k t"]
-    """Homeward [m]."""
+    """Length from the target to the vehicle [m]."""
     bearing: Float[np.ndarray, "k t"]
-    """Bearing [rad]."""
+    """Direction of the target, relative to the heading [rad]."""
     closing: Float[np.ndarray, "k t"]
-    """The vehicle's speed towards each [m/s]."""
+    """Speed of the vehicle towards each target [m/s]."""
     drift: Float[np.ndarray, "_ t 2"] | None
     """Velocities of the targets; None where all stand [m/s]."""
     approach: Float[np.ndarray, "k t"] | float
-    """The targets' speed towards the vehicle [m/s]."""
+    """Speed of the targets towards the vehicle [m/s]."""
 
 
-def ways_home(
+def paths_to_vehicle(
     poses: Float[np.ndarray, "k 3"],
     velocities: Float[np.ndarray, "k 2"],
     landmarks: Float[np.ndarray, "n 2"],
     callers: Sequence[Caller],
-) -> Ways:
-    """Measure the ways from all targets to the vehicle, as they are when it calls.
+) -> SoundPaths:
+    """Measure the paths from all targets to the vehicle, as they are when it calls.
 
     `poses` [m, m, rad]: of the vehicle at each emission; `velocities` [m/s]; `landmarks` [m];
     `callers`: the vehicle first; paths of k places.
@@ -59,8 +58,8 @@ def ways_home(
     >>> from pipistrelle.config import Config
     >>> ahead, beacon = np.array([[5.0, 0.0]]), np.array([0.0, 9.0])
     >>> drive = {"poses": np.zeros((1, 3)), "velocities": np.array([[2.0, 0.0]])}
-    >>> ways = ways_home(**drive, landmarks=ahead, callers=callers_of(Config(), beacon))
-    >>> ways.homeward, ways.closing
+    >>> paths = paths_to_vehicle(**drive, landmarks=ahead, callers=callers_of(Config(), beacon))
+    >>> paths.homeward, paths.closing
     (array([[5., 9.]]), array([[2., 0.]]))
     """
     others = callers[VEHICLE + 1 :]
@@ -72,30 +71,32 @@ def ways_home(
     return _measured(poses, velocities, len(landmarks), target, drift)
 
 
-def ways_by_surface(ways: Ways, caller: int, extent: Float[np.ndarray, " t"]) -> Ways:
-    """Measure the ways anew, from the points of the targets' surfaces that throw a caller's sound.
+def paths_over_surfaces(
+    paths: SoundPaths, caller: int, extent: Float[np.ndarray, " t"]
+) -> SoundPaths:
+    """Measure the paths from the points of the targets' surfaces that reflect a caller's sound.
 
-    While all move these points move, too, but to first order no way changes by that, for it is the
-    least one: the speeds along it are those of its ends.
+    The points move with caller and vehicle, but the path is the shortest one, so that to first
+    order its length changes with its ends alone.
 
-    `ways`: from the targets' centres; `caller`: its number in the list of callers; `extent` [m]:
+    `paths`: from the targets' centres; `caller`: its number in the list of callers; `extent` [m]:
     radius of each target; 0 of a point. The paths are the same to the bit where all targets are
     points.
 
     >>> from pipistrelle.acoustics.callers import callers_of
     >>> from pipistrelle.config import Config
     >>> trunk, callers = np.array([[5.0, 0.0]]), callers_of(Config(), np.array([0.0, 9.0]))
-    >>> centre = ways_home(np.zeros((1, 3)), np.zeros((1, 2)), trunk, callers)
-    >>> ways_by_surface(centre, VEHICLE, np.array([0.3, 0.0])).homeward
+    >>> centre = paths_to_vehicle(np.zeros((1, 3)), np.zeros((1, 2)), trunk, callers)
+    >>> paths_over_surfaces(centre, VEHICLE, np.array([0.3, 0.0])).homeward
     array([[4.7, 9. ]])
     """
     if not extent.any():
-        return ways
-    vehicle = ways.poses[:, np.newaxis, :2]
-    itself = ways.landmarks + caller - 1
-    source = vehicle if caller == VEHICLE else ways.target[:, itself : itself + 1]
-    target = reflecting_points(source, vehicle, ways.target, extent)
-    return _measured(ways.poses, ways.velocities, ways.landmarks, target, ways.drift)
+        return paths
+    vehicle = paths.poses[:, np.newaxis, :2]
+    itself = paths.landmarks + caller - 1
+    source = vehicle if caller == VEHICLE else paths.target[:, itself : itself + 1]
+    target = reflecting_points(source, vehicle, paths.target, extent)
+    return _measured(paths.poses, paths.velocities, paths.landmarks, target, paths.drift)
 
 
 def _measured(
@@ -104,8 +105,8 @@ def _measured(
     landmarks: int,
     target: Float[np.ndarray, "_ t 2"],
     drift: Float[np.ndarray, "_ t 2"] | None,
-) -> Ways:
-    """Measure the ways from all targets, the first of which are landmarks, to the vehicle."""
+) -> SoundPaths:
+    """Measure the paths from all targets, the first of which are landmarks, to the vehicle."""
     offset = target - poses[:, np.newaxis, :2]
     homeward = np.hypot(offset[..., 0], offset[..., 1])
     east, north = velocities[:, :1], velocities[:, 1:]
@@ -114,7 +115,7 @@ def _measured(
         closing = (offset[..., 0] * east + offset[..., 1] * north) / homeward
         if drift is not None:
             approach = -np.sum(drift * offset, axis=-1) / homeward
-    return Ways(
+    return SoundPaths(
         poses=poses,
         velocities=velocities,
         landmarks=landmarks,
@@ -131,7 +132,7 @@ def _measured(
 def _joined(
     landmarks: Float[np.ndarray, "n 2"], callers: Sequence[np.ndarray | None]
 ) -> Float[np.ndarray, "_ t 2"]:
-    """Put the callers' rows, of one emission or of each, behind the landmarks'."""
+    """Append the callers' positions (or velocities) to those of the landmarks."""
     rows = [np.reshape(np.asarray(caller), (-1, 1, 2)) for caller in callers]
     parts = [landmarks[np.newaxis], *rows]
     count = max(len(part) for part in parts)
@@ -141,7 +142,7 @@ def _joined(
 def turn_of_sound(
     incoming: Float[np.ndarray, "_ t 2"], offset: Float[np.ndarray, "k t 2"]
 ) -> Float[np.ndarray, "k t"]:
-    """Angle from the way in to the way on to the vehicle: pi is straight back.
+    """Angle between the directions of the sound before and after a target; pi is straight back.
 
     `incoming` [m]: from the caller to each target; `offset` [m]: from the vehicle to each target.
     Returns [rad].
@@ -156,32 +157,32 @@ def turn_of_sound(
 
 
 def refuse_impossible(
-    ways: Ways, callers: Sequence[Caller], extent: Float[np.ndarray, " t"]
+    paths: SoundPaths, callers: Sequence[Caller], extent: Float[np.ndarray, " t"]
 ) -> None:
     """Refuse points that coincide, coordinates that are not finite, and who is within a body.
 
-    `ways`: from the targets' centres; `extent` [m]: radius of each target; 0 of a point.
+    `paths`: from the targets' centres; `extent` [m]: radius of each target; 0 of a point.
     """
-    between, within = [ways.homeward], [extent]
-    for itself in range(ways.landmarks, ways.homeward.shape[1]):
-        before = ways.target[:, :itself] - ways.target[:, itself : itself + 1]
+    between, within = [paths.homeward], [extent]
+    for itself in range(paths.landmarks, paths.homeward.shape[1]):
+        before = paths.target[:, :itself] - paths.target[:, itself : itself + 1]
         apart = np.hypot(before[..., 0], before[..., 1])
-        between.append(np.broadcast_to(apart, (len(ways.poses), itself)))
+        between.append(np.broadcast_to(apart, (len(paths.poses), itself)))
         within.append(extent[:itself])
-    paths, least = np.hstack(between), np.concatenate(within)
-    farthest, heading = paths.max(axis=1, initial=0.0), ways.poses[:, 2]
-    good = (paths > least).all(axis=1) & (farthest < math.inf) & np.isfinite(heading)
+    lengths, least = np.hstack(between), np.concatenate(within)
+    farthest, heading = lengths.max(axis=1, initial=0.0), paths.poses[:, 2]
+    good = (lengths > least).all(axis=1) & (farthest < math.inf) & np.isfinite(heading)
     if good.all():
         return
     bad, others = int(np.argmin(good)), [caller.name for caller in callers[VEHICLE + 1 :]]
-    pose = ways.poses[bad]
-    names = [f"landmark {i}" for i in range(1, ways.landmarks + 1)] + others
+    pose = paths.poses[bad]
+    names = [f"landmark {i}" for i in range(1, paths.landmarks + 1)] + others
     ends = [f"vehicle to {name}" for name in names]
-    for itself, name in enumerate(others, start=ways.landmarks):
+    for itself, name in enumerate(others, start=paths.landmarks):
         ends += [f"{name} to {other}" for other in names[:itself]]
     found = [
         f"{end}: {path} m" + (f", within its radius of {radius} m" if radius else "")
-        for end, path, radius in zip(ends, paths[bad], least, strict=True)
+        for end, path, radius in zip(ends, lengths[bad], least, strict=True)
         if not radius < path < math.inf
     ]
     raise InputError(

@@ -15,17 +15,17 @@ from pipistrelle.config import (
     MotionConfig,
     ScenarioConfig,
 )
-from pipistrelle.experiments.hearing import others
-from pipistrelle.experiments.hearing.courses import course_of, driven, motion_of
-from pipistrelle.experiments.hearing.fields import TRIES, landmarks_in, nearest
+from pipistrelle.experiments.hearing import caller_paths
+from pipistrelle.experiments.hearing.caller_paths import WALK_MEMORY, WALK_STD, with_routes
+from pipistrelle.experiments.hearing.landmark_fields import MAX_DRAWS, landmarks_in, nearest
 from pipistrelle.experiments.hearing.listening import listen
-from pipistrelle.experiments.hearing.others import WALK_MEMORY, WALK_STD, with_routes
 from pipistrelle.experiments.hearing.scenario import (
     caller_labels,
     moving_callers,
     standing_landmarks,
     world_of,
 )
+from pipistrelle.experiments.hearing.trajectories import course_of, driven, motion_of
 from pipistrelle.experiments.runs.trial import drive_of, scans_of
 from pipistrelle.geometry import wrap
 from pipistrelle.settings import from_flags, resolve
@@ -51,7 +51,7 @@ def world_as_ever(config, iteration):
     setup, motion = config.scenario, motion_of(config.motion)
     rng = np.random.default_rng(stream_key(config.seed, iteration, "scenario"))
     path, _ = driven(course_of(setup, motion), setup, motion, rng)
-    for _ in range(TRIES):
+    for _ in range(MAX_DRAWS):
         direction = rng.uniform(-np.pi, np.pi)
         beacon = setup.beacon_distance * np.array([np.cos(direction), np.sin(direction)])
         if nearest(path[:, :2], beacon) >= setup.clearance:
@@ -204,7 +204,7 @@ def test_a_walk_from_beyond_the_disc_goes_no_further_away_and_jumps_nowhere():
 def test_the_first_caller_keeps_clear_of_landmarks_unless_it_is_the_papers_beacon():
     """The beacon was drawn before the landmarks: it is they that keep clear."""
     angle = np.linspace(0.0, np.pi, 100)
-    half = others.Around(
+    half = caller_paths.Surroundings(
         config=Config(),
         time=np.arange(3.0),
         path=np.zeros((3, 2)),
@@ -212,7 +212,8 @@ def test_the_first_caller_keeps_clear_of_landmarks_unless_it_is_the_papers_beaco
     )
     for told, clear in ((CallerConfig(distance=15.0), True), (CallerConfig(), False)):
         beside = [
-            others.callers_among(half, [told], np.random.default_rng(1), first)[0].place[1] < 0.0
+            caller_paths.callers_among(half, [told], np.random.default_rng(1), first)[0].place[1]
+            < 0.0
             for first in map(np.random.default_rng, range(20))
         ]
         assert all(beside) == clear
@@ -313,7 +314,7 @@ def heard_at(world, radius, k=4):
     speed = (world.path[k] - world.path[k - 1])[None, :2] / PAIR.scenario.step
     poses = world.path[k][None]
     heard, _ = arrivals_of_emissions(poses, speed, world.landmarks, callers, PAIR)
-    c = PAIR.air.celerity
+    c = PAIR.air.sound_speed
     return through_pistons(heard, callers, through_piston, radius=radius, speed_of_sound=c)
 
 
@@ -397,7 +398,7 @@ def test_a_direct_call_comes_through_the_piston_that_sends_it():
     assert direct[heard.caller == 1].any() == (abs(off) < np.pi / 2)
     assert np.any(heard.caller == 1)
     gain = 20 * np.log10(
-        piston_directivity(off, frequency=30e3, radius=0.0088, speed_of_sound=PAIR.air.celerity)
+        piston_directivity(off, frequency=30e3, radius=0.0088, speed_of_sound=PAIR.air.sound_speed)
     )
     gained = (heard.level_db - plain.level_db)[direct & (heard.caller == 1)]
     np.testing.assert_allclose(gained, gain, atol=1e-6)
@@ -439,7 +440,7 @@ def test_a_vehicle_that_has_no_mission_is_refused_by_its_number():
 
 
 def test_a_mission_that_finds_no_way_is_refused_with_its_key(monkeypatch):
-    monkeypatch.setattr(others, "TRIES", 3)
+    monkeypatch.setattr(caller_paths, "MAX_DRAWS", 3)
     wild = PAIR.model_copy(update={"motion": MotionConfig(speed_std=1.0)})
     crowd = ScenarioConfig(steps=1500, landmarks=60, radius=12.0, clearance=0.6, spacing=0.7)
     wild = wild.model_copy(update={"scenario": crowd})

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from pipistrelle.acoustics.target import Bodies
 from pipistrelle.config import CallerConfig
-from pipistrelle.experiments.hearing.courses import Course
+from pipistrelle.experiments.hearing.trajectories import Course
 from pipistrelle.settings import Layer
 
 

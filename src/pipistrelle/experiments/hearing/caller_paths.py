@@ -27,8 +27,8 @@ from pipistrelle.acoustics.callers import Caller, callers_of, moves
 from pipistrelle.arrays.sampling import free_tones
 from pipistrelle.config import CallerConfig, Config, InputError, ScenarioConfig, caller_names
 from pipistrelle.detection.logs.text_tables import check_unique, read_table
-from pipistrelle.experiments.hearing.courses import Course, course_of, driven, motion_of
-from pipistrelle.experiments.hearing.fields import TRIES, nearest
+from pipistrelle.experiments.hearing.landmark_fields import MAX_DRAWS, nearest
+from pipistrelle.experiments.hearing.trajectories import Course, course_of, driven, motion_of
 from pipistrelle.geometry import wrap
 from pipistrelle.settings import CALLERS, Layer
 
@@ -98,7 +98,7 @@ def _rows(path: str, where: str) -> list[list[float]]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Around:
+class Surroundings:
     """World and settings into which callers are put."""
 
     config: Config
@@ -113,7 +113,7 @@ class Around:
 
 
 def callers_among(
-    around: Around,
+    around: Surroundings,
     told: Sequence[CallerConfig],
     rng: np.random.Generator,
     first: np.random.Generator | None = None,
@@ -123,7 +123,7 @@ def callers_among(
     `first`: stands in for the first child: as it was before the beacon was drawn. Callers have
     a place, or one for each time; the vehicle is not among them.
 
-    >>> still = Around(
+    >>> still = Surroundings(
     ...     config=Config(), time=np.arange(3.0), path=np.zeros((3, 2)), landmarks=np.empty((0, 2))
     ... )
     >>> boat = CallerConfig(course="circle", radius=4.0, speed=1.0, centre=(9.0, 0.0))
@@ -184,7 +184,7 @@ def place_at(
     3.0
     """
     clear_of = [*clear_of]
-    for _ in range(TRIES):
+    for _ in range(MAX_DRAWS):
         direction = rng.uniform(-math.pi, math.pi)
         place = distance * np.array([math.cos(direction), math.sin(direction)])
         if all(nearest(points, place) >= setup.clearance for points in clear_of):
@@ -193,7 +193,7 @@ def place_at(
 
 
 def _stand(
-    one: CallerConfig, around: Around, taken: Sequence[Points], rng: np.random.Generator
+    one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "2"] | None:
     """Stand where it is told, or at a distance, clear of the path and of what stands there."""
     if one.place is not None:
@@ -203,7 +203,7 @@ def _stand(
 
 
 def _circle(
-    one: CallerConfig, around: Around, taken: Sequence[Points], rng: np.random.Generator
+    one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "t 2"] | None:
     """Circle at constant speed, from anywhere on the circle."""
     setup = around.config.scenario
@@ -219,7 +219,7 @@ def _circle(
 
 
 def _walk(
-    one: CallerConfig, around: Around, taken: Sequence[Points], rng: np.random.Generator
+    one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "t 2"] | None:
     """Walk at random over the disc of the landmarks."""
     setup = around.config.scenario
@@ -246,7 +246,7 @@ def _walk(
 
 
 def _line(
-    one: CallerConfig, around: Around, taken: Sequence[Points], rng: np.random.Generator
+    one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "t 2"]:
     """Go along the closed line through way-points at constant speed."""
     speed = around.config.scenario.speed if one.speed is None else one.speed
@@ -259,7 +259,7 @@ def _line(
 
 
 def _route(
-    one: CallerConfig, around: Around, taken: Sequence[Points], rng: np.random.Generator
+    one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "t 2"]:
     """Be where the route says, and stand before its first time and after its last."""
     time, *place = np.array(_route_rows(one)).T
@@ -271,7 +271,7 @@ def _route_rows(one: CallerConfig) -> Any:
     return _rows(one.route, "callers") if isinstance(one.route, str) else one.route
 
 
-def _heading(one: CallerConfig, around: Around) -> Float[np.ndarray, " t"] | None:
+def _heading(one: CallerConfig, around: Surroundings) -> Float[np.ndarray, " t"] | None:
     """Return where a route says that its vehicle points, if it does."""
     rows = np.array(_route_rows(one)) if one.way == "route" else np.empty((0, 0))
     if rows.shape[1] < 4:
@@ -280,13 +280,13 @@ def _heading(one: CallerConfig, around: Around) -> Float[np.ndarray, " t"] | Non
 
 
 def _mission(
-    around: Around, taken: Sequence[Points], rng: np.random.Generator
+    around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 2"]] | None:
     """Drive as the vehicle does, elsewhere: poses and controls, or None where all is in the way."""
     setup, told = around.config.scenario, around.config.motion
     motion, bias = motion_of(told), (told.speed_bias, told.turn_bias)
     course = around.course or course_of(setup, motion)
-    for _ in range(TRIES):
+    for _ in range(MAX_DRAWS):
         angle = rng.uniform(-math.pi, math.pi)
         path, controls = driven(course, setup, motion, rng, bias)
         c, s = math.cos(angle), math.sin(angle)
@@ -313,7 +313,7 @@ def _distance(one: CallerConfig, setup: ScenarioConfig) -> float:
 
 
 def _times(
-    key: str, one: CallerConfig, around: Around, rng: np.random.Generator
+    key: str, one: CallerConfig, around: Surroundings, rng: np.random.Generator
 ) -> Float[np.ndarray, " m"] | None:
     """Return when a caller with a clock of its own calls; None of one that has none."""
     if not one.own_clock:
@@ -332,7 +332,7 @@ def _times(
     return np.unique((times + jitter * rng.standard_normal(len(times))).clip(0.0))
 
 
-def _check_apart(callers: Sequence[Caller], around: Around, where: str) -> None:
+def _check_apart(callers: Sequence[Caller], around: Surroundings, where: str) -> None:
     """Refuse the last caller where it is at another's place, or the vehicle's, at a call."""
     *others, last = callers
     calls = slice(
@@ -354,7 +354,7 @@ def _check_apart(callers: Sequence[Caller], around: Around, where: str) -> None:
 
 def _check_speed(key: str, one: CallerConfig, config: Config) -> None:
     """Refuse a caller that would outrun its own sound."""
-    c = config.air.celerity
+    c = config.air.sound_speed
     for name, most in (("speed", c), ("speed_std", c / 5.0)):
         speed = getattr(one, name)
         if speed is not None and not abs(speed) < most:
@@ -370,10 +370,10 @@ def _standing(callers: Sequence[Caller]) -> Points:
 
 
 def _away_from_vehicle(
-    drawn: Callable[[], Float[np.ndarray, "t 2"]], around: Around
+    drawn: Callable[[], Float[np.ndarray, "t 2"]], around: Surroundings
 ) -> Float[np.ndarray, "t 2"] | None:
     """Draw a way until it keeps its distance from the vehicle at all times."""
-    for _ in range(TRIES):
+    for _ in range(MAX_DRAWS):
         path = drawn()
         offset = path - around.path
         if np.hypot(*offset.T).min() >= around.config.scenario.clearance:
@@ -381,7 +381,7 @@ def _away_from_vehicle(
     return None
 
 
-def _no_place(key: str, one: CallerConfig, around: Around) -> InputError:
+def _no_place(key: str, one: CallerConfig, around: Surroundings) -> InputError:
     """Say that a caller was given no place, and what to change."""
     setup = around.config.scenario
     if one.way == "mission":
