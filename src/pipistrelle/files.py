@@ -17,7 +17,7 @@ _PARTIAL = re.compile(r"(.+)\.[0-9a-f]{8}\.partial")
 
 
 def check_ordinary(path: Path) -> None:
-    """Refuse to read what stands in a file's place and is none; a missing file passes.
+    """Refuse a path that exists but is no ordinary file.
 
     >>> check_ordinary(Path("/dev/null"))
     Traceback (most recent call last):
@@ -55,7 +55,7 @@ def read_text(path: Path) -> str:
 
 
 def _printable(path: Path) -> str:
-    """Return a path as it is, or shown, where it is of no file's length or letters."""
+    """Path as text; shortened or escaped if no file can have such a name."""
     text = str(path)
     return text if text.isprintable() and len(text) < 4096 else shown(text)
 
@@ -91,7 +91,7 @@ def write_down(path: Path, data: bytes) -> None:
 
 
 def write_whole(path: Path, data: bytes, *, replace: bool = True) -> None:
-    """Write a file that is whole or not there, whatever stops the writing.
+    """Write a file completely or not at all, even if writing is interrupted.
 
     `replace`: whether what stands there is replaced; a link itself is, never what it points at.
 
@@ -111,7 +111,7 @@ def write_whole(path: Path, data: bytes, *, replace: bool = True) -> None:
 
 
 def put_in_place(partial: Path, path: Path, *, replace: bool = True) -> None:
-    """Rename a file that is whole, unless another process did so, and swept ours away.
+    """Rename a complete file, unless another process has already put it in place.
 
     `partial`, `path`: its name so far, and the one that it is to have; `replace`: whether what
     stands there is replaced.
@@ -135,7 +135,7 @@ def put_in_place(partial: Path, path: Path, *, replace: bool = True) -> None:
 
 
 def _put_where_nothing_is(partial: Path, path: Path) -> None:
-    """Rename a file, unless anything stands there, even since a moment ago."""
+    """Rename a file without replacing anything, even if it appeared a moment ago."""
     try:
         os.link(partial, path, follow_symlinks=False)
     except FileExistsError:

@@ -33,7 +33,7 @@ class CheckedFiles(IndexDataCacheFile):
             )
 
     def _load_index(self) -> dict[Any, str]:
-        """Return what is kept where: nothing, where the index is not sound."""
+        """Load the index of kernels; it is empty where the file is damaged."""
         return super()._load_index() if self._is_sound(Path(self._index_path)) else {}
 
     def _load_data(self, name: str) -> Any:
@@ -80,7 +80,7 @@ def checked(dispatcher: Any) -> Any:
 
 
 def _say(line: str) -> None:
-    """Say something once."""
+    """Print a message once."""
     if line not in _said:
         _said.add(line)
         with suppress(OSError, AttributeError):  # nobody can read it

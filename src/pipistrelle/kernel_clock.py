@@ -61,7 +61,7 @@ def _say(line: str) -> None:
 
 
 def announce(tell: Callable[[str], object] | None = _say) -> None:
-    """Name who is told when the first kernel of this process is compiled.
+    """Set the function that is called when the first kernel of this process is compiled.
 
     `tell`: called at most once in a process; None: there is no message.
     """
@@ -70,7 +70,7 @@ def announce(tell: Callable[[str], object] | None = _say) -> None:
 
 @contextmanager
 def judging() -> Iterator[None]:
-    """Announce nothing meanwhile: input is judged, and its few kernels are compiled soon."""
+    """Suppress the announcement while input is checked; its few kernels compile quickly."""
     _CLOCK.judging += 1
     try:
         yield

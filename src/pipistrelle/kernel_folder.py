@@ -57,7 +57,7 @@ def sources_key() -> str:
 
 
 def _unfit(folder: Path) -> str | None:
-    """Make a folder for kernels, and tell why they cannot be kept there."""
+    """Make a folder for kernels; return the reason if they cannot be kept there."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         folder.mkdir(mode=0o700, exist_ok=True)
@@ -73,14 +73,14 @@ def _unfit(folder: Path) -> str | None:
 
 
 def _is_mine(folder: Path) -> bool:
-    """Whether nobody else can write a folder."""
+    """Whether no other user can write to a folder."""
     state = folder.stat()
     mine = not hasattr(os, "getuid") or state.st_uid == os.getuid()
     return mine and not (os.name == "posix" and state.st_mode & 0o022)
 
 
 def _temporary() -> Path:
-    """Return a temporary folder that nobody else can write: what lies there is run."""
+    """Temporary folder that no other user can write to, as its files are executed."""
     user = os.getuid() if hasattr(os, "getuid") else ""
     folder = Path(tempfile.gettempdir()) / f"pipistrelle-{user}"
     try:

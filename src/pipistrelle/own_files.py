@@ -90,7 +90,7 @@ COMMAND_LINE = ("-o DIR", "--overwrite")
 def claim(
     folder: Path, kind: Kind, *, overwrite: bool, flags: tuple[str, str] = COMMAND_LINE
 ) -> "OwnFiles":
-    """Accept a folder to write into: one that is new or empty, or holds the like of ours.
+    """Accept a folder to write into: a new or empty one, or one with our results.
 
     Whether it can be written is tried; nothing is left there by that.
 
@@ -155,7 +155,7 @@ def remove_empty(folders: Iterable[Path]) -> None:
 
 
 def drawn_files(draw: Callable[[Path], None], under: str = "") -> dict[str, bytes]:
-    """Return what is drawn into a folder that is lent for it, by names below another.
+    """Files that a function draws into a temporary folder, by name.
 
     `under` is put before each name, as in "figures/".
     """
@@ -323,7 +323,7 @@ class OwnFiles:
     def _list_again(
         self, sums: Mapping[str, set[str]], partials: Iterable[Path], made: Iterable[Path]
     ) -> None:
-        """Leave a folder as it was, when what was to be written found no room in it."""
+        """Restore a folder's list after files could not be written."""
         with contextlib.suppress(OSError):
             _remove(partials)
             if sums:
@@ -356,7 +356,7 @@ class OwnFiles:
 
 
 def _in_the_way(path: Path, what: str) -> InputError:
-    """Say that something is not replaced."""
+    """Error for a file or folder that is not replaced."""
     return InputError(
         f"{path}: {what}, so it is not replaced; move it away, or name another folder"
     )

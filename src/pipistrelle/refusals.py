@@ -30,7 +30,7 @@ def refusal(where: object, found: str, expected: str, fix: str) -> InputError:
 
 
 def shown(value: Any) -> str:
-    """Show what was found, as much of it as a line bears.
+    """Text of a found value, shortened to one line.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def shown(value: Any) -> str:
 
 
 def expectation(fault: Any) -> str:
-    """Say what a setting should have been.
+    """Describe the expected value of a setting.
 
     `fault` is one of the errors of pydantic's ValidationError.
 
@@ -64,7 +64,7 @@ def expectation(fault: Any) -> str:
 
 
 def values_expected(fault: Any, field: FieldInfo) -> int | None:
-    """Count the values that a tuple should have had, where the fault is their number.
+    """Expected number of values of a tuple, if the number is the fault.
 
     `field` is the setting that was refused.
 

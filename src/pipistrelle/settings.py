@@ -85,7 +85,7 @@ def from_file(path: Path) -> Layer:
 
 
 def beside(path: Path, callers: Any) -> Any:
-    """Let the routes of callers lead from where a file lies.
+    """Resolve the routes of callers relative to a file.
 
     `path`: of the file; `callers`: what it gives as callers, sound or not.
 
@@ -162,7 +162,7 @@ def from_keywords(values: Mapping[str, Any], others: Iterable[str] = ()) -> Laye
 
 
 def spread(table: Mapping[str, Any], parts: str) -> dict[str, Any]:
-    """Spread names with parts over nested tables.
+    """Convert names with parts to nested tables.
 
     `parts` separates two parts of a name.
 
@@ -209,7 +209,7 @@ def resolve(layer: Layer) -> Config:
 
 
 def _plain(value: Any) -> Any:
-    """Return what JSON has not as what it has: settings, NumPy's numbers, all else as text."""
+    """Convert settings and NumPy's numbers to values that JSON has, all else to text."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", exclude_none=True)
     return value.tolist() if hasattr(value, "tolist") else str(value)
@@ -249,7 +249,7 @@ def to_toml(config: Config) -> str:
 
 
 def _remarked(assignment: str, field: FieldInfo) -> str:
-    """Write beside a setting what it means."""
+    """Append a setting's meaning as a comment."""
     meaning = " ".join((field.description or "").split())
     return f"{assignment:<39} # {meaning}" if meaning else assignment
 
@@ -302,7 +302,7 @@ def parse_toml(text: str, where: object) -> dict[str, Any]:
 def leaves(
     values: Mapping[str, Any], whole: Container[Key] = (), above: Key = ()
 ) -> Iterator[tuple[Key, Any]]:
-    """Walk through nested tables, down to what is no table, or an empty one.
+    """Iterate over the values of nested tables; an empty table counts as a value.
 
     `whole`: values of these are taken as they are; `above`: of the table itself.
 
@@ -323,7 +323,7 @@ def _layer(
     prefix: str = "",
     others: Iterable[str] = (),
 ) -> Layer:
-    """Say of each value where it was given; refuse what is no setting."""
+    """Attach to each value where it was given; refuse names that are no settings."""
     layer = {}
     for key, value in given:
         where = prefix + spell(key)
@@ -360,7 +360,7 @@ def from_text(text: str) -> Any:
 
 
 def _problem(error: Any, layer: Layer) -> str:
-    """Say where a refused value stands, what was found and what was expected."""
+    """Describe a refused value: where it stands, what was found and what was expected."""
     if error["loc"][:1] == CALLERS and CALLERS in layer:
         return _caller_problem(error, layer[CALLERS])
     key = tuple(part for part in error["loc"] if isinstance(part, str))
@@ -378,7 +378,7 @@ def _problem(error: Any, layer: Layer) -> str:
 
 
 def _caller_problem(error: Any, given: Given) -> str:
-    """Say the same of a list of callers, which are counted from 1 on."""
+    """Describe a refused value in the list of callers, which are counted from 1."""
     _, *inner = error["loc"]
     expected, where = expectation(error), given.where
     if not inner:

@@ -134,7 +134,7 @@ def arrivals_of_emissions(
     config: Config,
     bodies: Bodies | None = None,
 ) -> tuple[Arrivals, Int[np.ndarray, " k"]]:
-    """Arrivals of several emissions in one world, emission after emission (`arrivals_of_emission`).
+    """Arrivals of several emissions in one world, one emission after the other.
 
     `poses` [m, m, rad]; `velocities` [m/s]; `landmarks` [m]; `callers`: the vehicle first; paths
     and velocities (k, 2), a row for each emission (`callers_at`); `bodies`: of the landmarks; as
@@ -267,7 +267,7 @@ def arrivals_at(arrivals: Arrivals, rows: Bool[np.ndarray, " a"] | slice) -> Arr
 
 
 def arrivals_together(parts: Sequence[Arrivals]) -> Arrivals:
-    """Put arrivals of the same callers after one another."""
+    """Concatenate arrivals of the same callers."""
     names = [name for name in Arrivals.__slots__ if getattr(parts[0], name) is not None]
     return Arrivals(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
 
@@ -275,7 +275,7 @@ def arrivals_together(parts: Sequence[Arrivals]) -> Arrivals:
 def _own_echoes(
     paths: SoundPaths, caller: Caller, config: Config, bodies: Bodies | None
 ) -> tuple[Arrivals, Int[np.ndarray, " a"]]:
-    """Return the echoes of the vehicle's call from all ahead, and the emission of each."""
+    """Echoes of the vehicle's call from all targets ahead, and the emission of each echo."""
     c = config.air.sound_speed
     ahead = np.flatnonzero(in_front(paths.bearing))
     back, closing = paths.homeward.ravel()[ahead], paths.closing.ravel()[ahead]
@@ -327,7 +327,7 @@ def _sounds_of(
 def _departures(
     j: int, paths: SoundPaths, heading: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, " a"]:
-    """Return where the sounds of another vehicle left it, relative to its heading, by label."""
+    """Angles at which sound leaves another vehicle, relative to its heading [rad], by label."""
     itself = paths.landmarks + j - 1
     way = paths.target - paths.target[:, itself : itself + 1]
     way[:, itself] = -paths.offset[:, itself]  # the direct call goes to the vehicle
@@ -401,7 +401,7 @@ def _loss_db(
     strength_db: Float[np.ndarray, "k t"],
     air: AirConfig,
 ) -> Float[np.ndarray, "k t"]:
-    """Spreading less target strength of a caller's echoes; of its direct call, spreading alone."""
+    """Spreading loss of a caller's sounds, less the target strength of its echoes."""
     sent = np.broadcast_to(outward, strength_db.shape).copy()
     sent[:, itself] = 1.0  # no echo of itself: any distance will do
     loss_db = passive_spreading_loss_db(sent, paths.homeward, law=air.spreading) - strength_db
@@ -412,7 +412,7 @@ def _loss_db(
 def _strength_db(
     turn: Float[np.ndarray, "k t"], caller: Caller, config: Config, bodies: Bodies | None
 ) -> Float[np.ndarray, "k t"]:
-    """Target strength of all that reflects a caller's sound."""
+    """Target strength of every body that reflects a caller's sound."""
     usual, tone, c = config.target, caller.frequency, config.air.sound_speed
     if bodies is not None:
         return strength_of_bodies_db(turn, bodies, usual=usual, frequency=tone, speed_of_sound=c)

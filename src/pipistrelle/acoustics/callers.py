@@ -51,7 +51,7 @@ class Caller:
 
 
 def callers_of(config: Config, beacon: Float[np.ndarray, "2"]) -> tuple[Caller, Caller]:
-    """List the paper's two callers, as the settings have them.
+    """List the paper's two callers, vehicle and beacon, with the settings' tones and levels.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def callers_of(config: Config, beacon: Float[np.ndarray, "2"]) -> tuple[Caller, 
 
 
 def check_caller(caller: Caller) -> None:
-    """Refuse a caller whose tone, level, places or velocities are no finite numbers of their shape.
+    """Refuse a caller with a tone, level, place or velocity that is not finite or of wrong shape.
 
     >>> check_caller(Caller(name="boat", frequency=30e3, level_db=42.8, place=np.zeros(3)))
     Traceback (most recent call last):
@@ -103,7 +103,7 @@ def check_caller(caller: Caller) -> None:
 
 
 def _check(caller: Caller, part: str, unit: str, *, pairs: bool) -> None:
-    """Refuse a part of a caller that is not one finite number, or else x and y or rows of them."""
+    """Refuse a value of a caller that is neither one finite number nor x and y or rows of them."""
     value = getattr(caller, part)
     try:
         numbers = np.asarray(value, dtype=np.float64)
@@ -138,7 +138,7 @@ def moves(caller: Caller) -> bool:
 def callers_at(
     callers: Sequence[Caller], time: Float[np.ndarray, " t"], steps: Int[np.ndarray, " k"]
 ) -> tuple[Caller, ...]:
-    """Take the callers as they are at some times: of a path, the places and the velocities there.
+    """Callers with their places and velocities at some times.
 
     Where no velocities are given, those of the steps that end there are taken, as for the vehicle.
 
@@ -166,7 +166,7 @@ def callers_at(
 
 
 def _at(caller: Caller, time: Float[np.ndarray, " t"], steps: Int[np.ndarray, " k"]) -> Caller:
-    """Take the places and velocities of a path at some of its times."""
+    """Places and velocities of a path at some of its times."""
     path, velocity = np.asarray(caller.place), caller.velocity
     shapes = {path.shape, path.shape if velocity is None else np.shape(velocity)}
     if shapes != {(len(time), 2)}:

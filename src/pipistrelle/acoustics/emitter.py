@@ -30,7 +30,7 @@ def jinc(x: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
 
 
 def in_front(bearing: Float[np.ndarray, "*n"] | float) -> Bool[np.ndarray, "*n"]:
-    """Whether a back-baffled emitter can be heard there: within 90 degrees of its axis.
+    """Whether a direction is within 90 degrees of a back-baffled emitter's axis.
 
     `bearing` [rad].
 

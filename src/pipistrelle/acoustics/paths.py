@@ -159,7 +159,7 @@ def turn_of_sound(
 def refuse_impossible(
     paths: SoundPaths, callers: Sequence[Caller], extent: Float[np.ndarray, " t"]
 ) -> None:
-    """Refuse points that coincide, coordinates that are not finite, and who is within a body.
+    """Refuse points that coincide, coordinates that are not finite, and points within a body.
 
     `paths`: from the targets' centres; `extent` [m]: radius of each target; 0 of a point.
     """

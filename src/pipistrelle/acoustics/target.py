@@ -142,7 +142,7 @@ def _radius(bodies: Bodies, usual: TargetConfig) -> Float[np.ndarray, " n"]:
 
 
 def with_usual(bodies: Bodies, count: int, usual: TargetConfig) -> Bodies:
-    """Add bodies as the settings have them, which are points.
+    """Append point bodies of the settings' shape.
 
     The given bodies come first.
     """

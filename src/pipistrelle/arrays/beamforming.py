@@ -11,7 +11,7 @@ def steering_vector(
     frequency: float,
     speed_of_sound: float,
 ) -> Complex[np.ndarray, "*n e"]:
-    r"""What a unit plane wave from an angle does to the elements.
+    r"""Phases of a unit plane wave from an angle at the elements.
 
     .. math:: v_e(\theta) = e^{2\pi i f y_e \sin\theta / c}
 

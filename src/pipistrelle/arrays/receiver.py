@@ -161,7 +161,7 @@ class _Ears(NamedTuple):
 
 
 class _Room(NamedTuple):
-    """Room for one arrival: written and used anew for each."""
+    """Work arrays of one arrival, overwritten by the next."""
 
     sums: Complex[np.ndarray, "c b"]
     """Its envelope's block sums, per tone."""

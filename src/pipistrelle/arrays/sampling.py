@@ -90,7 +90,7 @@ def sampling(config: Config, callers: Sequence[Caller]) -> Sampling:
 
 
 def clear_frequency(config: Config) -> float:
-    r"""Highest tone that the arrays take for no other: not by its direction, not by its sampling.
+    r"""Highest tone without ambiguity in direction (grating lobes) or in sampling (aliases).
 
     Elements a distance d apart cannot tell the angle :math:`\theta` off their normal from another,
     the grating lobe, :math:`\sin\theta_g = \sin\theta - \lambda / d`: of a longer wave than d times
@@ -110,7 +110,7 @@ def clear_frequency(config: Config) -> float:
 
 
 def free_tones(config: Config, callers: Sequence[Caller], near: float) -> str:
-    """Say which tones would do in place of one: clear ones that no caller has, the two nearest.
+    """The two free unambiguous tones that are nearest to a tone, for a refusal.
 
     `near` [Hz]. Returns for a refusal, in brackets; empty where there is none.
 
@@ -130,7 +130,7 @@ def free_tones(config: Config, callers: Sequence[Caller], near: float) -> str:
 
 
 def _refuse_alike(config: Config, callers: Sequence[Caller], keys: Sequence[str]) -> None:
-    """Refuse tones that are one bin of a block: equal, or the sampling rate apart."""
+    """Refuse tones that fall into one bin of a block: equal ones, or ones a sampling rate apart."""
     rate = config.receiver.sample_rate
     for j, (key, caller) in enumerate(zip(keys, callers, strict=True)):
         for other in callers[:j]:

@@ -42,7 +42,7 @@ DETOUR_FLOOR = 0.006
 
 
 def loudest_noise(elements: int) -> float:
-    """Return what noise alone leaves beside a steered beam, but for the loudest thousandth.
+    """0.999 quantile of the residual power of a steered beam in noise.
 
     In units of the noise's variance.
 
@@ -56,7 +56,7 @@ def loudest_noise(elements: int) -> float:
 
 @kernel
 def over_noise(power: float, energy: float, elements: Whole, loudest: float) -> float:
-    """Power of a steered beam over the noise, p, of the snapshot's energy.
+    """Ratio p of the power of a steered beam to the noise, from the snapshot's energy.
 
     >>> over_noise(101.0, 110.0, 10, 2.35), round(over_noise(101.0, 191.0, 10, 2.35), 2)
     (100.0, 9.1)

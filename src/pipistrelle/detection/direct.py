@@ -60,7 +60,7 @@ def own_alone(
     own: Int[np.ndarray, " c"],
     missable: Bool[np.ndarray, " c"],
 ) -> DirectCalls:
-    """Keep of callers that may be missed the direct calls that bear their own label alone.
+    """Drop direct calls with another label than the caller's own, of callers that may be missed.
 
     One that calls when the vehicle does, alike in all directions, is always heard first. One with a
     beam may point away, and one with a clock of its own may call while the vehicle does: the first
@@ -107,7 +107,7 @@ def loudest_first(
     power: Float[np.ndarray, " d"],
     p: Whole,
 ) -> Whole:
-    """Number of the detection that is the direct call of caller p; -1 where none was heard."""
+    """Index of the detection that is the direct call of caller p; -1 if there is none."""
     loudest, first = 0.0, -1
     for d in range(caller.size):
         if caller[d] == p:
@@ -157,7 +157,7 @@ def front_edge(
 
 @no_alloc
 def _mean_after(gain: Complex[np.ndarray, "k e"], begin: Whole, e: Whole) -> complex:
-    """Mean of the blocks behind one, at an element."""
+    """Mean of the `EDGE_BLOCKS` blocks after one block, at an element."""
     total = 0.0j
     for a in range(begin + 1, begin + 1 + EDGE_BLOCKS):
         total += gain[a, e]
@@ -166,7 +166,7 @@ def _mean_after(gain: Complex[np.ndarray, "k e"], begin: Whole, e: Whole) -> com
 
 @no_alloc
 def _fitted(gain: Complex[np.ndarray, "k e"], k: Whole, noise: float) -> tuple[float, float]:
-    """Where in the blocks before k and at k the call begins that fits what follows best.
+    """Best fitting start of a call in block k or the one before, and its standard deviation.
 
     In blocks from the first. What the fit leaves is noise, where it is more than that.
     """
@@ -228,7 +228,7 @@ def direct_calls(
 def _may_leak(
     delay: Float[np.ndarray, " d"], power: Float[np.ndarray, " d"], d: Whole, within: float
 ) -> bool:
-    """Whether detection d is so faint beside one at the same time that it may be its leakage.
+    """Whether detection d is faint enough to be the leakage of another at the same time.
 
     The loud one has another tone, as no direct call is so faint beside its own tone
     (`MIN_RELATIVE_POWER`). It may be at any face: sound from behind a face leaks into it, too, and

@@ -54,7 +54,7 @@ def average_faces(
     speed_of_sound: float,
     callers: Int[np.ndarray, " c"] = NO_CALLERS,
 ) -> FrameMeasurements:
-    r"""Average what the faces say of each label, per caller: the strongest detection of each face.
+    r"""Average the strongest detections of the faces, for each label and caller.
 
     Bearings are averaged as directions, ``plain`` or ``weighted`` by the inverse variance at the
     array's angle, :math:`\cos^2\theta`. The range, of the vehicle's own call alone, is c/2 times
@@ -112,7 +112,7 @@ def same_echo(
 
 
 def unlabelled(heard: FrameMeasurements) -> FrameMeasurements:
-    """Forget the labels.
+    """Return a frame without its labels.
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> heard = FrameMeasurements(rows=make_scan(0.5, np.array([4]), np.array([0.2])), clutter=0)
@@ -162,7 +162,7 @@ def _direct(calls: DirectCalls | None) -> tuple:
 
 @kernel
 def _distinct(label: Int[np.ndarray, " d"]) -> tuple[Int[np.ndarray, " n"], Whole]:
-    """Labels that occur, rising, and how often none was given."""
+    """Sorted distinct labels, and the number of detections without one."""
     labels, count, clutter = np.empty_like(label), 0, 0
     for d in range(label.size):
         if label[d] == UNLABELLED:
@@ -249,7 +249,7 @@ def _take_strongest(
     detections: tuple,
     strongest: Int[np.ndarray, " f"],
 ) -> None:
-    """Write which detection of a label and a caller is the strongest of each face; -1 for none."""
+    """Write the index of each face's strongest detection of a label and a caller; -1 for none."""
     found, strongest[:] = _Found(*detections), -1
     for d in range(label.size):
         if label[d] == wanted and found.caller[d] == caller:
@@ -260,7 +260,7 @@ def _take_strongest(
 
 @kernel
 def _after(calls: tuple, caller: Whole, delay: float, std: float) -> tuple[float, float]:
-    """How long after a caller's direct call a sound came, and the standard deviation of that.
+    """Delay of a sound after the caller's direct call [s], and its standard deviation.
 
     NaN where nobody knows, or where the call still lasted.
     """

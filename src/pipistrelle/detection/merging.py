@@ -31,7 +31,7 @@ LISTENS_TO = {"active": (True, False), "fused": (True, True), "passive": (False,
 
 
 def scan_of(rows: Scan, strategy: Strategy) -> Scan:
-    """Take from a frame what a sensing strategy takes.
+    """Select the measurements of a frame that a sensing strategy uses.
 
     Active takes what the vehicle's own call brings back, passive what those of others do, fused
     both: of the rows of one landmark it makes one (`fused`).
@@ -61,7 +61,7 @@ def scan_of(rows: Scan, strategy: Strategy) -> Scan:
 
 
 def labelled(scan: Scan, label: Int[np.ndarray, " m"]) -> Scan:
-    r"""Give a scan's rows their labels: one row of each landmark's, and none that has no label.
+    r"""Label a scan's rows: one row for each landmark remains; rows without a label are dropped.
 
     The bearing of several is their mean, weighted by the inverse variances where all are stated,
 
@@ -87,14 +87,14 @@ def labelled(scan: Scan, label: Int[np.ndarray, " m"]) -> Scan:
 
 
 def _fused(scan: Scan, *, own: bool, others: bool, labels_only: bool) -> Scan:
-    """Take the rows of some callers and make one row of those of each landmark."""
+    """Select the rows of some callers and merge those of each landmark into one."""
     numbers = np.ascontiguousarray(scan.numbers)
     landmark, caller, numbers = _fuse(scan.landmark, scan.caller, numbers, own, others, labels_only)
     return replace(scan, landmark=landmark, caller=caller, numbers=numbers)
 
 
 def _checked(scan: Scan, label: np.ndarray) -> Int[np.ndarray, " m"]:
-    """Refuse what cannot be the labels of a scan's rows."""
+    """Check the labels of a scan's rows."""
     whole = label.dtype.kind in "iu" or not label.size
     if label.shape != scan.landmark.shape or not whole or label.min(initial=0) < UNLABELLED:
         raise InputError(
@@ -127,7 +127,7 @@ def _fuse(
     others: bool,
     labels_only: bool,
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"], Float[np.ndarray, "7 k"]]:
-    """Take the rows of some callers and make one row of those of each landmark.
+    """Select the rows of some callers and merge those of each landmark into one.
 
     Rows without a label stay as they are, or are left out. Detours after a landmark's first are
     rows of their own, at the end.
@@ -199,7 +199,7 @@ def _average(
 def _take(
     numbers: Float[np.ndarray, "7 k"], k: Whole, given: Float[np.ndarray, "7 m"], m: Whole
 ) -> None:
-    """Take of a row what its landmark does not have yet, and the level where it is higher."""
+    """Fill the missing numbers of a landmark's row from another row; keep the higher level."""
     for number in (BEARING, RANGE, DETOUR):
         if math.isnan(numbers[number, k]):
             spread = number + BEARING_STD

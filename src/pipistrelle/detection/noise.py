@@ -53,7 +53,7 @@ class ConstantNoise:
 def _filled(
     numbers: Float[np.ndarray, "7 m"], bearing_std: float, range_std: float, detour_std: float
 ) -> Float[np.ndarray, "7 m"]:
-    """Copy numbers, with constants where they say nothing of how surely a row was measured."""
+    """Copy numbers, with constants in place of missing standard deviations."""
     filled = numbers.copy()
     for m in range(filled.shape[1]):
         if math.isnan(filled[BEARING_STD, m]):
@@ -66,7 +66,7 @@ def _filled(
 
 
 def unstated(scan: Scan) -> Scan:
-    """Forget how surely the rows of a scan say that they were measured.
+    """Return a scan without its standard deviations.
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> unstated(make_scan(0.5, np.array([3]), np.zeros(1), bearing_std=0.1)).bearing_std
@@ -76,7 +76,7 @@ def unstated(scan: Scan) -> Scan:
 
 
 def as_told(scan: Scan, settings: FilterConfig, *, timing: bool) -> Scan:
-    """Leave of what was measured what an estimator is to know.
+    """Drop columns of a scan that the settings hide from an estimator.
 
     Parameters
     ----------
@@ -95,12 +95,12 @@ def as_told(scan: Scan, settings: FilterConfig, *, timing: bool) -> Scan:
 
 
 def as_said(scan: Scan) -> Scan:
-    """Leave it to the rows themselves."""
+    """Return a scan unchanged: its rows state their own noise."""
     return scan
 
 
 def noise_of(settings: FilterConfig) -> Noise:
-    """Return the noise that the settings state.
+    """Noise model that the settings name.
 
     Parameters
     ----------

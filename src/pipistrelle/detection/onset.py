@@ -30,7 +30,7 @@ def steer(
 
 @kernel
 def _best_fraction(z0: complex, z1: complex, pulse: Whole) -> tuple[float, float]:
-    """Where between two lags the call starts most likely, and how well it fits there.
+    """Most likely start of the call between two lags, as a fraction, and the quality of the fit.
 
     A call that starts the fraction q into block 0 weighs the blocks 1 - q, 1, ..., 1, q; its
     likelihood grows with abs((1 - q) z0 + q z1)^2 / (pulse - 2 q + 2 q^2), whose stationary

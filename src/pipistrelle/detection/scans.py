@@ -156,7 +156,7 @@ def with_columns(scan: Scan, **columns: np.ndarray | float) -> Scan:
 
 
 def _made_of(time: float, shape: tuple[int, ...], given: dict[str, np.ndarray | float]) -> Scan:
-    """Make a scan of columns, and of what a column that is not given says."""
+    """Make a scan of columns; a column that is not given has its default."""
     if unknown := sorted(given.keys() - set(COLUMNS)):
         raise InputError(f"scan: no such column {unknown[0]}; expected one of {', '.join(COLUMNS)}")
     shapes = {name: _shape(name, value) for name, value in given.items()}
@@ -202,7 +202,7 @@ def rows_of(scan: Scan, rows: Bool[np.ndarray, " m"] | Int[np.ndarray, " k"]) ->
 
 
 def without_detours(scan: Scan) -> Scan:
-    """Forget of a scan how much later than direct calls echoes came, and rows that are but that.
+    """Return a scan without detours and without rows that hold nothing else.
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> rows = np.array([8, 8]), np.array([0.4, np.nan])

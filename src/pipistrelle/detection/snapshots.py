@@ -223,7 +223,7 @@ def detect(
 
 
 def detections_at(found: Detections, rows: Bool[np.ndarray, " m"]) -> Detections:
-    """Take some rows; direct calls that are not among them are forgotten."""
+    """Select some rows; direct calls that are not among them are dropped."""
     direct = found.direct
     if direct is not None:
         kept = np.append(rows, False)  # the last stands for none
@@ -243,7 +243,7 @@ def call_in(
     interval: float,
     pulse: int,
 ) -> Detections:
-    """Take what is of one call of a caller that calls at its own times, and find its direct call.
+    """Select the detections of one call of a caller with its own clock, and its direct call.
 
     It is all of the caller's tone in a stretch of the frame [s]; the other arguments are as those
     of `detect`.
@@ -262,13 +262,13 @@ def call_in(
 
 
 def joined(parts: Sequence[Detections]) -> Detections:
-    """Put what two frames hold of one call after one another; the first has its direct call."""
+    """Concatenate the detections of one call from several frames; the first has its direct call."""
     columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _COLUMNS}
     return Detections(**columns, direct=parts[0].direct)
 
 
 class _Rules(NamedTuple):
-    """What the kernels need to know of a detector: its columns of these names."""
+    """The fields of a `Detector` that the kernels need."""
 
     threshold: float
     runs: bool
@@ -332,7 +332,7 @@ def _candidates(
 def _is_loudest(
     energy: Float[np.ndarray, " t"], test: Whole, row: Whole, reach: Whole, floor: float
 ) -> bool:
-    """Whether a test's lag is the loudest as far as so many lags away, or until one falls so low.
+    """Whether a lag is the loudest within a number of lags, or until the energy falls low enough.
 
     A row of tests is a lag's: its neighbour in time is a row away, its other tones next to it.
     """
@@ -359,7 +359,7 @@ def _is_leakage(
     pulse: Whole,
     leakage: float,
 ) -> bool | np.bool_:
-    """Whether what is heard of a tone is no more than what leaks from another nearby."""
+    """Whether the energy of a tone is explained by leakage from another tone nearby."""
     own, strongest = test % tones, 0.0
     for p in range(tones):
         if p != own:
@@ -486,7 +486,7 @@ def _peaks(power: Float[np.ndarray, " n"], ratio: float, place: Int[np.ndarray, 
 
 @kernel
 def _grown(columns: Shaped[np.ndarray, "k m"]) -> Shaped[np.ndarray, "k 2*m"]:
-    """Copy of columns with twice the room."""
+    """Copy of columns with twice the capacity."""
     wide = np.empty((columns.shape[0], 2 * columns.shape[1]), dtype=columns.dtype)
     for k in range(columns.shape[0]):
         for i in range(columns.shape[1]):

@@ -154,7 +154,7 @@ def true_controls(
     time: Float[np.ndarray, " t"],
     path: Float[np.ndarray, "t 3"],
 ) -> Float[np.ndarray, "k c"]:
-    """Return the controls that led along the path; of a step that commands nothing, that.
+    """Controls that lead along the true path; a step of zero controls keeps them.
 
     Of poses the noise does not hang on how far they were apart, and they are as they are.
     """
@@ -170,7 +170,7 @@ def _slots(slot: Mapping[int, int], label: Int[np.ndarray, " m"]) -> Int[np.ndar
 
 
 def _whose(scan: Scan) -> Int[np.ndarray, " m"]:
-    """Return the label of the caller of each row's detour, UNLABELLED of a row without one."""
+    """Label of the caller of each row's detour; UNLABELLED for a row without one."""
     who, timings = np.full(len(scan.landmark), UNLABELLED), timings_of(scan)
     if timings is not None:
         heard = detours(columns_of(scan), timings)
@@ -182,7 +182,7 @@ def _whose(scan: Scan) -> Int[np.ndarray, " m"]:
 def _correct(
     joint: Joint, size: Whole, i: Whole, numbers: Float[np.ndarray, "7 m"], m: Whole
 ) -> None:
-    """Correct with measurement m as if it had been what the state at index i makes expect."""
+    """Correct with measurement m, at its expected value, of the landmark at state index i."""
     if math.isnan(numbers[BEARING, m]):
         return
     mean, across = joint.mean, numbers[BEARING_STD, m] ** 2
@@ -227,7 +227,7 @@ def _let_move(
     ways: Float[np.ndarray, "v t 2"],
     step: tuple[Whole, float, float],
 ) -> None:
-    """Put those who move where they are at step k, and turn what the walk has added.
+    """Put moving callers where they are at step k, and add their walk's covariance.
 
     Their velocities are the first of the state, each that of the step which follows, and then their
     places; ``step`` is k with the length of the step to it and of the next.
@@ -245,7 +245,7 @@ def _let_move(
 
 @no_alloc
 def _grown(joint: Joint, size: Whole, slot: Whole) -> Whole:
-    """Let the state reach the place of a number; returns its size."""
+    """Extend the state to include a slot; returns its size."""
     if 3 + 2 * slot < size:
         return size
     flush(joint, size)
@@ -324,7 +324,7 @@ def _bound(
 
 
 def path_bound(bound: Float[np.ndarray, "t 3 3"]) -> tuple[float, float]:
-    r"""Least RMSE of position and heading over a path, of which the bound is known at every step.
+    r"""Least RMSE of position and heading over a path, from the bound at every step.
 
     .. math:: \sqrt{\tfrac1K \sum_k (B_k)_{xx} + (B_k)_{yy}}, \qquad
               \sqrt{\tfrac1K \sum_k (B_k)_{\theta\theta}}
@@ -375,7 +375,7 @@ def nees_of_exact_start(
     path: Float[np.ndarray, "t 3"],
     start_covariance: Float[np.ndarray, "3 3"],
 ) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, " t"]]:
-    r"""Mean and variance of a consistent filter's NEES where a start thought uncertain is exact.
+    r"""Mean and variance of a consistent filter's NEES if its uncertain start is in fact exact.
 
     A filter that allows for an error of the start with P_0 has the covariance P_k of
     `bound_of_drawn_start` at step k; that of its errors, here, is the B_k of an exact start. So

@@ -216,7 +216,7 @@ def pseudovalues(
 
 
 def _worlds(statement: Statement) -> int:
-    """Count the worlds of a statement, of two samples the fewer."""
+    """Number of worlds of a statement; of two samples the smaller number."""
     both = [statement.sample, *([] if statement.against is None else [statement.against])]
     return min(map(len, both))
 

@@ -68,7 +68,7 @@ def _eliminated(
 
 @np.errstate(over="ignore", invalid="ignore")
 def track_nees(pose: Gaussian, true: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
-    """NEES of each pose of a track, NaN where there is none to speak of.
+    """NEES of each pose of a track; NaN where it is not defined.
 
     After an exact start the noise of the first control step, of rank 2, leaves the covariance
     singular. That is no divergence: the NEES begins where the covariance is positive definite.
@@ -183,7 +183,7 @@ def anees_bounds_about(
     runs: int,
     confidence: float = 0.95,
 ) -> tuple[Float[np.ndarray, "*k"], Float[np.ndarray, "*k"]]:
-    r"""Interval of ANEES where a consistent filter's NEES has another mean than its states.
+    r"""Interval of a consistent filter's ANEES for a given mean and variance of its NEES.
 
     As after an exact start (`evaluation.bound.nees_of_exact_start`). A weighted sum of chi-squares
     is taken as the gamma distribution of the same mean m and variance v, which for equal weights it

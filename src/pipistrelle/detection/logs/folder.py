@@ -343,7 +343,7 @@ def _caller_refusal(path: Path, fault: Any) -> InputError:
 
 
 def _odometry_columns(log: Log) -> dict[str, np.ndarray]:
-    """Columns of ``odometry.csv``: controls from each time on, or poses, and how they were told."""
+    """Columns of ``odometry.csv``: controls from each time on, or poses with their covariance."""
     if log.motion != "poses":
         rows = np.vstack((log.controls, np.zeros(2)))
         return {"time": log.time} | dict(zip(_ODOMETRY[log.motion], rows.T, strict=True))

@@ -34,7 +34,7 @@ _MIN_JUMP = (0.5, 0.5)  # [m], [rad]: less in one step is no jump
 
 
 def motions_between(odometry: Table, time: Float[np.ndarray, " t"]) -> Float[np.ndarray, "t-1 c"]:
-    r"""How the vehicle moved from each time to the next, by rows of poses.
+    r"""Motions of the vehicle from each time to the next, interpolated from rows of poses.
 
     `odometry` has the columns ``time``, ``x``, ``y`` and ``heading``, perhaps with the columns of
     `MOTION_COVARIANCE`. Of rows of one time the last says where the vehicle is; `time` [s]: rising,
@@ -65,7 +65,7 @@ def motions_between(odometry: Table, time: Float[np.ndarray, " t"]) -> Float[np.
 
 
 def relative_motions(poses: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t-1 3"]:
-    """How each pose lies as seen from the one before.
+    """Each pose relative to the one before.
 
     `poses` [m, m, rad]. Returns [m, m, rad]: forward, sideways, and the turn the shorter way.
 
@@ -79,7 +79,7 @@ def relative_motions(poses: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t-1 
 
 
 def poses_along(motions: Float[np.ndarray, "k _"]) -> Float[np.ndarray, "k+1 3"]:
-    """Where motions lead, one after another, from the origin on.
+    """Poses that motions lead to, one after another, from the origin.
 
     `motions` [m, m, rad]: forward, sideways, turn; what follows is not looked at. Returns [m, m,
     rad]: headings wrapped. `relative_motions` gives the motions again, but for rounding.
@@ -95,7 +95,7 @@ def poses_along(motions: Float[np.ndarray, "k _"]) -> Float[np.ndarray, "k+1 3"]
 
 
 def jumps(motions: Float[np.ndarray, "k _"], dt: Float[np.ndarray, " k"]) -> Int[np.ndarray, " j"]:
-    """Find the steps that are perhaps no motion, but a frame that was begun anew.
+    """Find steps that may be a restart of the odometry's frame instead of motion.
 
     `motions` [m, m, rad]; `dt` [s]. Returns those in which the vehicle would go, or turn, more than
     ten times as fast as in nine tenths of the steps in which it does so at all, and half a metre or
@@ -127,7 +127,7 @@ def _turned(
 def _at_rows(
     time: Float[np.ndarray, " t"], rows: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " t"]:
-    """Put times that are a row's but for rounding where the row is."""
+    """Snap times to rows that differ from them by rounding alone."""
     after = np.clip(np.searchsorted(rows, time), 1, len(rows) - 1)
     nearest = np.where(time - rows[after - 1] < rows[after] - time, rows[after - 1], rows[after])
     return np.where(np.abs(nearest - time) <= _RESOLUTION, nearest, time)
@@ -150,7 +150,7 @@ def _poses_at(
 def _across_arc(
     points: Float[np.ndarray, "k 2"], turn: Float[np.ndarray, " k"], *, back: bool = False
 ) -> Float[np.ndarray, "k 2"]:
-    """Lead velocities times time along turns to where they end; or back from there."""
+    """Convert arc lengths along turns to displacements, or back."""
     half = 0.5 * turn
     chord = np.sinc(half / np.pi)[:, None]
     return _turned(points / chord, -half) if back else _turned(points * chord, half)
@@ -163,7 +163,7 @@ def _step_covariances(
     poses: Float[np.ndarray, "n 3"],
     stated: Float[np.ndarray, "n 3 3"],
 ) -> Float[np.ndarray, "t-1 3 3"]:
-    """Add up what the rows say of their ways, in the axes at the start of each step.
+    """Sum the covariances of the rows' motions, in the axes at the start of each step.
 
     Rows, those of one time too, and the ends of steps cut the drive into parts, each of one way.
     """
@@ -191,7 +191,7 @@ def _step_covariances(
 
 
 def _check_ways(odometry: Table, poses: Float[np.ndarray, "n 3"]) -> None:
-    """Refuse poses of which one is more than a turn, or too far, from the one before."""
+    """Refuse poses more than a whole turn or too far from the one before."""
     turn = np.abs(np.diff(odometry.column["heading"]))
     far = np.flatnonzero(turn > 2.0 * np.pi * 1.001)
     if far.size:
@@ -210,7 +210,7 @@ def _check_ways(odometry: Table, poses: Float[np.ndarray, "n 3"]) -> None:
 
 
 def _covariances(odometry: Table) -> Float[np.ndarray, "n 3 3"]:
-    """Return what each row says of the way that led to it, NaN where it says nothing."""
+    """Covariance of the motion that led to each row; NaN where the row states none."""
     absent = np.full(len(odometry.line), np.nan)
     column = [odometry.column.get(name, absent) for name in MOTION_COVARIANCE]
     values = np.column_stack(column)
@@ -232,7 +232,7 @@ def _covariances(odometry: Table) -> Float[np.ndarray, "n 3 3"]:
 def _definite(
     odometry: Table, covariance: Float[np.ndarray, "n 3 3"], rows: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3 3"]:
-    """Refuse what is no covariance; lift eigenvalues that rounding has put below zero."""
+    """Refuse a matrix that is no covariance; set eigenvalues to 0 that rounding made negative."""
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     std = np.sqrt(np.maximum(variance, 0.0))
     unit = np.where(std > 0.0, std, 1.0)[:, :, None]

@@ -65,7 +65,7 @@ def reader_of(folder: Path, readers: Sequence[Reader] = ()) -> Reader:
 
 
 def recording_of(path: Path) -> str | None:
-    """Say what a recording is that no reader takes, by its name or by what a folder holds.
+    """Name the kind of a recording that no reader takes, and say what can be done with it.
 
 
     >>> recording_of(Path("walk.mcap"))[:30], recording_of(Path("walk"))
@@ -85,12 +85,12 @@ def _read_log_folder(folder: Path) -> "Log":
 
 
 def _is_mrclam(folder: Path) -> bool:
-    """Tell a MRCLAM set by its barcodes, or by anybody's odometry."""
+    """Whether a folder is a MRCLAM set: it has barcodes, or odometry of a robot."""
     return (folder / "Barcodes.dat").exists() or any(folder.glob("Robot*_Odometry.dat"))
 
 
 def _mrclam_robots(folder: Path) -> list[Robot]:
-    """List the robots whose odometry is there: their numbers, or what stands in their place."""
+    """List the robots whose odometry is there, by number or by the text in its place."""
     files = sorted(path.name for path in folder.glob("Robot*_Odometry.dat"))
     names = [name.removeprefix("Robot").removesuffix("_Odometry.dat") for name in files]
     numbers = {str(number): number for number in range(1, 6)}

@@ -179,7 +179,7 @@ def assemble(
 
 
 def check_seconds(table: Table, longest_gap: float = _MAX_GAP) -> None:
-    """Refuse times that can be no seconds, and say which unit they may have.
+    """Refuse times that are not plausible as seconds; name the unit they may have.
 
     `table`: with a column ``time``; `longest_gap` [s]: typically between two rows.
     """
@@ -210,7 +210,7 @@ def _cut(path: Path, time: np.ndarray, span: tuple[float, float]) -> np.ndarray:
 
 
 def _single(odometry: Table, time: np.ndarray) -> np.ndarray:
-    """Return the times of rows that are a step each; refuse one that holds too long."""
+    """Times of rows that are one step each; a row that holds too long is refused."""
     long = np.flatnonzero(np.diff(time) > LONGEST_STEP)
     if long.size:
         row = int(np.searchsorted(odometry.column["time"], time[long[0] + 1]))
@@ -245,7 +245,7 @@ def _mean_controls(
 
 
 def _of_callers(measurements: Table, callers: tuple[LogCaller, ...]) -> Table:
-    """Number the callers of all rows; refuse a detour that is none, and rows of nothing."""
+    """Caller numbers of all rows; invalid detours and empty rows are refused."""
     column, nothing = measurements.column, np.full(len(measurements.line), np.nan)
     caller, detour = column.get(CALLER, nothing), column.get("detour", nothing)
     own = np.array([UNLABELLED, *(one.landmark for one in callers)])

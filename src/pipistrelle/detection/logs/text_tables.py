@@ -39,7 +39,7 @@ _BOUNDS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
-    """The rows of a text file, sound on their own: finite numbers, times that never run back."""
+    """The checked rows of a text file: numbers are finite, and times never decrease."""
 
     path: Path
     line: Int[np.ndarray, " n"]
@@ -140,7 +140,7 @@ def table_text(columns: tuple[str, ...], *values: np.ndarray) -> str:
 
 
 def _field(value: float | str) -> str:
-    """Write a field: NaN empty, words as they are."""
+    """Format a field: NaN is empty, words are unchanged."""
     if isinstance(value, str):
         return value
     return "" if value != value else repr(value)
@@ -153,7 +153,7 @@ def rows_kept(table: Table, kept: Bool[np.ndarray, " n"]) -> Table:
 
 
 def check_unique(table: Table, *names: str, besides: str | None = None) -> None:
-    """Refuse a table of which two rows agree in all of these columns.
+    """Refuse a table in which two rows agree in all of these columns.
 
     `besides` is one more column of whole numbers, which refusals do not name.
 
@@ -179,7 +179,7 @@ def check_unique(table: Table, *names: str, besides: str | None = None) -> None:
 def _numbered(
     where: str, line: str, columns: tuple[str, ...], words: Mapping[str, tuple[str, ...]]
 ) -> str:
-    """Put numbers for words in a row of fields between commas."""
+    """Replace words by numbers in a row of comma-separated fields."""
     fields = line.split(",") if words else []
     if len(fields) != len(columns):
         return line
@@ -197,7 +197,7 @@ def _numbered(
 def _read_at_once(
     lines: list[str], columns: int, separator: str | None
 ) -> Float[np.ndarray, "n c"] | None:
-    """Return all rows, or None where one of them is not plainly as many finite numbers."""
+    """Parse all rows at once; None if one is not the right number of finite numbers."""
     try:
         values = np.loadtxt(lines, delimiter=separator, comments=None, ndmin=2)
     except ValueError:
@@ -235,7 +235,7 @@ def _read_row(
 
 
 def _check_columns(table: Table) -> None:
-    """Check times, labels and what has bounds, and make the labels integers."""
+    """Check times, labels and bounded columns; convert labels to integers."""
     for name, values in table.column.items():
         if name == "time":
             wrong = np.diff(values, prepend=-np.inf) < 0

@@ -39,7 +39,7 @@ Points = Float[np.ndarray, "_ 2"]
 
 
 def with_routes(layer: Layer) -> Layer:
-    r"""Put the rows of callers' routes in place of the files that hold them.
+    r"""Replace the file names of callers' routes by the rows in the files.
 
     The settings returned need no other file.
 
@@ -59,7 +59,7 @@ def with_routes(layer: Layer) -> Layer:
 
 
 def routes_read(callers: Any, where: str) -> Any:
-    """Put rows in place of files, as `with_routes`, in what is given as callers, sound or not.
+    """Replace route files by their rows in a list of callers that is not validated yet.
 
     `where` they were given is named in refusals.
     """
@@ -118,7 +118,7 @@ def callers_among(
     rng: np.random.Generator,
     first: np.random.Generator | None = None,
 ) -> tuple[Caller, ...]:
-    """Put callers where they say that they are, and draw what they leave open.
+    """Make callers at their given places, and draw what the settings leave open.
 
     `first`: stands in for the first child: as it was before the beacon was drawn. Callers have
     a place, or one for each time; the vehicle is not among them.
@@ -195,7 +195,7 @@ def place_at(
 def _stand(
     one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "2"] | None:
-    """Stand where it is told, or at a distance, clear of the path and of what stands there."""
+    """Place of a standing caller: the given one, or one drawn clear of path and bodies."""
     if one.place is not None:
         return np.array(one.place)
     setup = around.config.scenario
@@ -205,7 +205,7 @@ def _stand(
 def _circle(
     one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "t 2"] | None:
-    """Circle at constant speed, from anywhere on the circle."""
+    """Path on a circle at constant speed; the start is drawn."""
     setup = around.config.scenario
     radius = setup.beacon_distance if one.radius is None else one.radius
     turned = (setup.speed if one.speed is None else one.speed) / radius * around.time
@@ -221,7 +221,7 @@ def _circle(
 def _walk(
     one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "t 2"] | None:
-    """Walk at random over the disc of the landmarks."""
+    """Path of a random walk over the disc of the landmarks."""
     setup = around.config.scenario
     std = WALK_STD if one.speed_std is None else one.speed_std
     kept = math.exp(-setup.step / (WALK_MEMORY if one.memory is None else one.memory))
@@ -248,7 +248,7 @@ def _walk(
 def _line(
     one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "t 2"]:
-    """Go along the closed line through way-points at constant speed."""
+    """Path along the closed line through way-points at constant speed."""
     speed = around.config.scenario.speed if one.speed is None else one.speed
     points = np.array([*(one.waypoints or ()), *(one.waypoints or ())[:1]])
     along = np.append(0.0, np.hypot(*np.diff(points, axis=0).T).cumsum())
@@ -261,7 +261,7 @@ def _line(
 def _route(
     one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "t 2"]:
-    """Be where the route says, and stand before its first time and after its last."""
+    """Path of a route; the caller stands before its first time and after its last."""
     time, *place = np.array(_route_rows(one)).T
     return np.column_stack([np.interp(around.time, time, column) for column in place[:2]])
 
@@ -272,7 +272,7 @@ def _route_rows(one: CallerConfig) -> Any:
 
 
 def _heading(one: CallerConfig, around: Surroundings) -> Float[np.ndarray, " t"] | None:
-    """Return where a route says that its vehicle points, if it does."""
+    """Headings that a route states, if it does."""
     rows = np.array(_route_rows(one)) if one.way == "route" else np.empty((0, 0))
     if rows.shape[1] < 4:
         return None
@@ -282,7 +282,7 @@ def _heading(one: CallerConfig, around: Surroundings) -> Float[np.ndarray, " t"]
 def _mission(
     around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 2"]] | None:
-    """Drive as the vehicle does, elsewhere: poses and controls, or None where all is in the way."""
+    """Poses and controls of a second vehicle's drive; None if no clear place was found."""
     setup, told = around.config.scenario, around.config.motion
     motion, bias = motion_of(told), (told.speed_bias, told.turn_bias)
     course = around.course or course_of(setup, motion)
@@ -372,7 +372,7 @@ def _standing(callers: Sequence[Caller]) -> Points:
 def _away_from_vehicle(
     drawn: Callable[[], Float[np.ndarray, "t 2"]], around: Surroundings
 ) -> Float[np.ndarray, "t 2"] | None:
-    """Draw a way until it keeps its distance from the vehicle at all times."""
+    """Draw a path until it keeps its distance from the vehicle at all times."""
     for _ in range(MAX_DRAWS):
         path = drawn()
         offset = path - around.path
@@ -382,7 +382,7 @@ def _away_from_vehicle(
 
 
 def _no_place(key: str, one: CallerConfig, around: Surroundings) -> InputError:
-    """Say that a caller was given no place, and what to change."""
+    """Error for a caller without a possible place, with the fix."""
     setup = around.config.scenario
     if one.way == "mission":
         what = "it comes nearer than that to the vehicle, a landmark or a caller in every drive"

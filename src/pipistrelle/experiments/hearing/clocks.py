@@ -23,7 +23,7 @@ MICROSECOND = 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Call:
-    """A call of somebody with a clock of its own."""
+    """One call of a caller with its own clock."""
 
     caller: int
     """Its number among the callers."""
@@ -32,7 +32,7 @@ class Call:
 
 
 def calls_heard(scenario: Scenario, setup: ScenarioConfig, speed_of_sound: float) -> list[Call]:
-    """List the calls of those with a clock of their own, in the order in which they are heard.
+    """List the calls of callers with their own clocks, in the order in which they are heard.
 
     Nothing is heard before the vehicle's first call, which begins the first frame, and after the
     path's end.
@@ -52,7 +52,7 @@ def calls_heard(scenario: Scenario, setup: ScenarioConfig, speed_of_sound: float
 
 
 def with_times(scenario: Scenario, times: Sequence[float]) -> Scenario:
-    """Return a world whose paths have poses and places at further times, too; not its controls."""
+    """Return a world with its paths interpolated at further times; controls are unchanged."""
     time = np.union1d(scenario.time, np.array(times))
 
     path = path_at(time, scenario.time, scenario.path)
@@ -66,7 +66,7 @@ def with_times(scenario: Scenario, times: Sequence[float]) -> Scenario:
 def _with_times(
     caller: Caller, time: Float[np.ndarray, " t"], clock: Float[np.ndarray, " n"]
 ) -> Caller:
-    """Return a caller whose path had places at a clock's times with places at others."""
+    """Return a caller with its path interpolated at other times."""
     heading, velocity = caller.heading, caller.velocity
     return replace(
         caller,
@@ -79,7 +79,7 @@ def _with_times(
 def _on_clock(
     times: Float[np.ndarray, " m"], clock: Float[np.ndarray, " t"]
 ) -> Float[np.ndarray, " m"]:
-    """Round times to microseconds, and to a clock's time where one is as near as that."""
+    """Round times to microseconds, or to a time of the clock within a microsecond."""
     near = clock[np.abs(clock[:, np.newaxis] - times).argmin(axis=0)]
     return np.where(np.abs(near - times) <= MICROSECOND, near, times.round(6))
 
@@ -87,7 +87,7 @@ def _on_clock(
 def _places_at(
     times: Float[np.ndarray, " m"], clock: Float[np.ndarray, " t"], place: np.ndarray
 ) -> Float[np.ndarray, "m 2"]:
-    """Return where a caller is at some times, between two times of its path on the line."""
+    """Places of a caller at some times, by linear interpolation."""
     if place.ndim == 1:
         return np.tile(place, (len(times), 1))
     return np.column_stack([np.interp(times, clock, column) for column in place.T])

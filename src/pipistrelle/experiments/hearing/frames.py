@@ -29,7 +29,7 @@ EMISSIONS_AT_ONCE = 25
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CallHeard:
-    """What a call of somebody with a clock of its own brings to the vehicle."""
+    """Arrivals that one call of a caller with its own clock brings to the vehicle."""
 
     number: int
     """Among all such calls of the world."""
@@ -42,7 +42,7 @@ class CallHeard:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frame:
-    """All that sounds from one call of the vehicle to the next."""
+    """All arrivals from one call of the vehicle to the next."""
 
     time: float
     """Of the vehicle's call [s]."""
@@ -55,7 +55,7 @@ class Frame:
 def frames_of(
     scenario: Scenario, radii: Sequence[float], config: Config, beam: Callable[..., Arrivals]
 ) -> Iterator[Frame]:
-    """Yield what sounds in each frame of a path, through pistons of several radii [m]."""
+    """Yield the arrivals in each frame of a path, for pistons of several radii [m]."""
     setup, c = config.scenario, config.air.sound_speed
     calls = calls_heard(scenario, setup, c)
     begin = scenario.time[setup.steps_per_frame :: setup.steps_per_frame]
@@ -84,7 +84,7 @@ def _together(
     calls: Sequence[tuple[float, Arrivals]],
     span: float,
 ) -> Arrivals:
-    """Put the sounds of calls, each so long [s] after the vehicle's, in place of those in step."""
+    """Replace the arrivals of callers with own clocks by those of their calls, delayed by [s]."""
     parts = [arrivals_at(sounds, ~np.isin(sounds.caller, own_clock))]
     for after, heard in calls:
         shifted = replace(heard, delay=heard.delay + after)
@@ -99,7 +99,7 @@ def _calls_heard(
     config: Config,
     beam: Callable[..., Arrivals],
 ) -> list[CallHeard]:
-    """Work out what each call brings to the vehicle."""
+    """Arrivals of each call at the vehicle."""
     following = dict.fromkeys(range(len(world.callers)), np.inf)
     until = []
     for call in reversed(calls):
@@ -134,7 +134,7 @@ def _emissions(
     config: Config,
     beam: Callable[..., Arrivals],
 ) -> Iterator[list[Arrivals]]:
-    """Yield what would arrive if all called at once at a step, one for each piston.
+    """Yield the arrivals of a simultaneous call of all at a step, for each piston.
 
     Many steps are computed at a time.
     """

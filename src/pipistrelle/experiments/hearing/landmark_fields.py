@@ -63,7 +63,7 @@ def nearest(points: Points, place: Float[np.ndarray, "2"]) -> float:
 def _scattered(
     setup: ScenarioConfig, path: Points, callers: Points, rng: np.random.Generator
 ) -> Points:
-    """Draw landmarks one by one, uniformly over the disc, until each keeps its distances."""
+    """Draw landmarks uniformly over the disc, each until it keeps its distances."""
     placed = np.empty((setup.landmarks, 2))
     for i in range(setup.landmarks):
         for _ in range(MAX_DRAWS):
@@ -116,7 +116,7 @@ def _is_clear(
 
 
 def _refuse_crowd(setup: ScenarioConfig) -> None:
-    """Refuse what no drawing could place."""
+    """Refuse more landmarks than the area can hold."""
     half = 0.5 * setup.spacing
     most = MAX_COVERAGE * ((setup.radius + half) / max(half, 1e-100)) ** 2
     if setup.field == "disc" and setup.landmarks > max(most, 1.0):
@@ -124,7 +124,7 @@ def _refuse_crowd(setup: ScenarioConfig) -> None:
 
 
 def _too_many(setup: ScenarioConfig, limit: str) -> InputError:
-    """Say that the landmarks do not fit, and what to change."""
+    """Error for landmarks that do not fit, with the fix."""
     return InputError(
         f"scenario.landmarks: found {setup.landmarks}, but {limit} at {setup.spacing:g} m from "
         f"each other within {setup.radius:g} m of the centre; expected fewer landmarks, a smaller "

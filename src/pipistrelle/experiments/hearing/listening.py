@@ -136,7 +136,7 @@ def listen(
 
 
 class _Record(NamedTuple):
-    """The matched filter's output of a frame; it holds until the next is made."""
+    """The matched filter's output of a frame; the next frame overwrites it."""
 
     matched: Complex[np.ndarray, "l f c e"]
     start: float
@@ -148,7 +148,7 @@ class _Record(NamedTuple):
 
     @property
     def lags(self) -> dict[str, Any]:
-        """What a detector is told of the lags."""
+        """The lags as keyword arguments of a detector."""
         return {"start": self.start, "interval": self.interval, "pulse": self.pulse}
 
 
@@ -159,7 +159,7 @@ class Workspace:
         self._flat: dict[str, np.ndarray] = {}
 
     def array(self, name: str, shape: tuple[int, ...]) -> Complex[np.ndarray, "..."]:
-        """Return the array of a name, in a shape; what it held is anybody's guess."""
+        """Return the array of a name in a shape; its content is undefined."""
         size = math.prod(shape)
         if name not in self._flat or self._flat[name].size < size:
             self._flat[name] = np.empty(size + size // 4, dtype=np.complex128)
@@ -168,7 +168,7 @@ class Workspace:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Rig:
-    """What every frame of a path is heard with."""
+    """Everything that is the same for all frames of a path."""
 
     config: Config
     layout: Layout
@@ -190,7 +190,7 @@ def _rig(
     find: Callable[..., Detections],
     oracle: Callable[..., Int[np.ndarray, " d"]] | None,
 ) -> _Rig:
-    """Settle what every frame of a path is heard with."""
+    """Make what is the same for all frames of a path."""
     settled = sampling(config, scenario.callers)
     finder = detector(config, layout, settled.tones)
     own_clock = np.array([caller.calls is not None for caller in scenario.callers])
@@ -216,7 +216,7 @@ def _rig(
 
 
 def _of_call(call: CallHeard, time: float, record: "_Record", found: Detections) -> Detections:
-    """Take what a frame that began at a time holds of a call; delays as those of its sounds."""
+    """Detections of one call in a frame; delays count from the call."""
     after, early = call.call.time - time, 0.5 * record.interval * record.pulse
     stretch = after - early, call.until - time - early
     part = call_in(record.matched, found, call.call.caller, stretch, **record.lags)
@@ -225,7 +225,7 @@ def _of_call(call: CallHeard, time: float, record: "_Record", found: Detections)
 
 
 def _heard(time: float, detections: Detections, arrivals: Arrivals, rig: _Rig) -> FrameMeasurements:
-    """Average a frame's detections over the faces, by the truth's labels where it tells them."""
+    """Label a frame's detections and average them over the faces."""
     config, gates = rig.config, rig.config.association
     if rig.oracle is None:
         delay_gate = gates.delay_gate * config.emitter.pulse
@@ -254,7 +254,7 @@ def _heard(time: float, detections: Detections, arrivals: Arrivals, rig: _Rig) -
 
 
 def _blocks(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]:
-    """Yield what is recorded of each beam's arrivals, from block sums."""
+    """Yield the record of each beam's arrivals, from block sums."""
     layout, settled, space, pulse = rig.layout, rig.sampling, rig.workspace, rig.sampling.pulse
     own, others = _parted(aimed[0])
     shape = block_shape(blocks_to_hear(aimed[0], settled), layout, settled)
@@ -278,7 +278,7 @@ def _blocks(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]
 
 
 def _parted(arrivals: Arrivals) -> tuple[slice | np.ndarray, slice | np.ndarray]:
-    """Tell the rows that go through a piston from those that all beamwidths share."""
+    """Split rows into those through a piston and those that all beamwidths share."""
     if arrivals.departure is None:
         own = np.count_nonzero(arrivals.caller == VEHICLE)  # they come first
         return slice(own), slice(own, None)
@@ -287,7 +287,7 @@ def _parted(arrivals: Arrivals) -> tuple[slice | np.ndarray, slice | np.ndarray]
 
 
 def _dense(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]:
-    """Yield the same from every sample until the next call, in single precision."""
+    """Yield the record of each beam's arrivals, from every sample, in single precision."""
     settled, setup = rig.sampling, rig.config.scenario
     length = settled.pulse * settled.block
     period = math.floor(setup.steps_per_frame * setup.step / BLOCK) - settled.pulse

@@ -39,7 +39,7 @@ class Scenario:
 
 
 def world_of(config: Config, iteration: int = 0, world: World = ANY) -> Scenario:
-    """Draw one of the worlds that the settings' seed stands for.
+    """Draw the world of the settings' seed.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def draw_scenario(config: Config, rng: np.random.Generator, world: World = ANY) 
 
 
 def _mission_of(world: Scenario, vehicle: int) -> Scenario:
-    """Return a world as another vehicle in it has it, by its number: the first is its caller.
+    """Return a world from the view of another vehicle; the first becomes its caller.
 
     Each keeps its own tone and level.
     """
@@ -149,7 +149,7 @@ def _mission_of(world: Scenario, vehicle: int) -> Scenario:
 
 
 def landmark_count(scenario: Scenario) -> int:
-    """Count what a world has to map: the landmarks, and all callers but one.
+    """Number of landmarks to map: the landmarks and all callers but the vehicle.
 
     The vehicle is no landmark of its own map; each other caller is one.
 
@@ -160,7 +160,7 @@ def landmark_count(scenario: Scenario) -> int:
 
 
 def standing_landmarks(scenario: Scenario) -> LabelledPoints:
-    """Label what stands: the landmarks, then the callers that do not move.
+    """Labels and positions of the landmarks and of the callers that do not move.
 
     Labels rise; positions are in metres.
 
@@ -176,7 +176,7 @@ def standing_landmarks(scenario: Scenario) -> LabelledPoints:
 
 
 def moving_callers(scenario: Scenario) -> dict[int, Caller]:
-    """Label the callers that move, which are no landmarks of a map.
+    """Callers that move, by label; they are no landmarks of a map.
 
     Labels rise.
 
@@ -187,12 +187,12 @@ def moving_callers(scenario: Scenario) -> dict[int, Caller]:
 
 
 def _others(scenario: Scenario) -> dict[int, Caller]:
-    """Label all callers but the vehicle, as landmarks."""
+    """All callers but the vehicle, by their labels as landmarks."""
     return dict(enumerate(scenario.callers[VEHICLE + 1 :], start=len(scenario.landmarks) + 1))
 
 
 def caller_labels(scenario: Scenario) -> Int[np.ndarray, " c"]:
-    """List the labels that the callers bear as landmarks, by their numbers.
+    """Label of each caller as a landmark, by its number.
 
     The vehicle's is UNLABELLED.
 
@@ -216,13 +216,13 @@ def assumed_motion(config: Config) -> Motion:
 
 
 def _places(callers: Sequence[CallerConfig]) -> Float[np.ndarray, "n 2"]:
-    """Return where those callers stand that say it."""
+    """Places of the callers whose place is given."""
     places = [caller.place for caller in callers if caller.way == "stand" and caller.place]
     return np.array(places, dtype=float).reshape(-1, 2)
 
 
 def _sized(world: World) -> Float[np.ndarray, "n 2"]:
-    """Return where a world has bodies whose size is stated."""
+    """Positions of a world's bodies whose size is stated."""
     if world.landmarks is None or world.bodies is None:
         return np.empty((0, 2))
     return world.landmarks[np.isfinite(world.bodies.radius)]

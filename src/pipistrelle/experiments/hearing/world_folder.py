@@ -95,7 +95,7 @@ def named_world(layer: Layer) -> World | None:
 
 
 def settled(world: World, layer: Layer) -> Layer:
-    """Lay a world's settings beneath others.
+    """Combine a world's settings with others, which override them.
 
     They have the number of its landmarks, and of the steps that its path takes unless that
     is given.
@@ -108,7 +108,7 @@ def settled(world: World, layer: Layer) -> Layer:
 
 
 def laid_over(world: World, layer: Layer, values: Layer) -> Layer:
-    """Lay a world's settings over others, as one value of a grid.
+    """Combine settings with those of a world, which override them, as one value of a grid.
 
     `layer`: settings that hold where neither the world nor the values say anything else; `values`:
     of the rest of the grid. The drive ends with the world's path if that is shorter.
@@ -124,7 +124,7 @@ def laid_over(world: World, layer: Layer, values: Layer) -> Layer:
 
 
 def _decided(world: World, layer: Layer) -> Layer:
-    """Return the settings in which a world leaves no choice; refuse a layer that makes one."""
+    """Settings that a world fixes; a layer that contradicts them is refused."""
     decided: Layer = {}
     if world.landmarks is not None:
         decided[_COUNT] = Given(len(world.landmarks), f"{world.name}: landmarks.csv")
@@ -138,7 +138,7 @@ def _decided(world: World, layer: Layer) -> Layer:
 
 
 def read_world(folder: Path) -> World:
-    r"""Read what a folder says of a world.
+    r"""Read a world from its folder.
 
     The world has the folder's name.
 
@@ -186,7 +186,7 @@ def read_world(folder: Path) -> World:
 
 
 def kept_world(config: Config, world: World) -> tuple[Config, dict[str, bytes]]:
-    """Return what a folder of results keeps of the world that they are of.
+    """Files of the world that a folder of results keeps.
 
     Returns the settings that name the copy, and the copy's files, relative to the folder.
     """
@@ -197,7 +197,7 @@ def kept_world(config: Config, world: World) -> tuple[Config, dict[str, bytes]]:
 
 
 def world_files(scenario: Scenario, config: Config) -> dict[str, str]:
-    """Return the files of a world as it was drawn, so that it can be heard again, or changed.
+    """Files of a drawn world, from which it can be simulated again or changed.
 
     Settings that are not at their defaults, and no filter's, stand in ``world.toml``.
     """
@@ -235,7 +235,7 @@ def world_files(scenario: Scenario, config: Config) -> dict[str, str]:
 
 
 def _refuse_misspelt(folder: Path, there: Sequence[str]) -> None:
-    """Refuse a file whose name is nearly that of one that is missing: it would be passed over."""
+    """Refuse a file whose name is nearly that of a missing one: it would be ignored."""
     missing = [name for name in FILES if name not in there]
     for path in sorted(folder.iterdir()):
         near = get_close_matches(path.name.lower(), missing, n=1, cutoff=0.85)
@@ -288,7 +288,7 @@ def _read_head(path: Path) -> _WorldTable:
 def _read_landmarks(
     path: Path, usual: TargetConfig
 ) -> tuple[Float[np.ndarray, "n 2"], Bodies | None]:
-    """Read places of landmarks by their numbers, and bodies where there are columns for them."""
+    """Read the positions of landmarks, and their bodies if there are columns for them."""
     words = {"shape": _SHAPES}
     more = ("radius", "shape")
     if _is_header_alone(path):
@@ -325,7 +325,7 @@ def _refuse_coincident(table: Table, places: Float[np.ndarray, "n 2"]) -> None:
 
 
 def _read_course(path: Path, config: Config) -> Course:
-    """Read the vehicle's way, as its columns say."""
+    """Read the vehicle's course; the columns decide its kind."""
     columns = _columns(path, config.motion.model)
     table = read_table(path, columns)
     column = table.column
@@ -386,7 +386,7 @@ def _check_rising(table: Table) -> None:
 
 
 def _callers(path: Path, told: Any) -> tuple[tuple[CallerConfig, ...] | None, list[str]]:
-    """Return who calls, by the rules of settings, and the files that hold routes."""
+    """Validated callers of a world, and the files of their routes."""
     if told is None:
         return None, []
     files = []
