@@ -21,7 +21,7 @@ fit:
 """
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
@@ -41,8 +41,18 @@ EDGE_BLOCKS = 2
 """Blocks behind the edge that tell the amplitude: what sets in later does not matter."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DirectCalls:
+class Lags(NamedTuple):
+    """Lags of a matched filter's output."""
+
+    start: float
+    """Delay of lag 0 [s]."""
+    interval: float
+    """Between two lags [s]."""
+    pulse: int
+    """Lags in a call."""
+
+
+class DirectCalls(NamedTuple):
     """Direct call of each caller: which detection it is, and when it began."""
 
     detection: Int[np.ndarray, " c"]
@@ -197,7 +207,7 @@ def direct_calls(
     whole: Int[np.ndarray, "2 d"],
     numbers: Float[np.ndarray, "5 d"],
     tones: Whole,
-    lags: tuple[float, float, Whole],
+    lags: Lags,
 ) -> tuple[Int[np.ndarray, " c"], Float[np.ndarray, "2 c"]]:
     """Find the direct call of every caller but the vehicle, by loudness and order, and its edge.
 

@@ -7,7 +7,6 @@ echo (`same_echo`).
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -28,7 +27,7 @@ from pipistrelle.detection.scans import (
     UNLABELLED,
     Scan,
 )
-from pipistrelle.detection.snapshots import Detections
+from pipistrelle.detection.snapshots import Columns, Detections, columns_of
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel
 
@@ -78,7 +77,7 @@ def average_faces(
     (array([41.]), array([3.43]))
     """
     labels, clutter = _distinct(label)
-    found, direct = _found(detections), _direct(detections.direct)
+    found, direct = tuple(columns_of(detections)), tuple(detections.direct or _NO_DIRECT)
     landmark, caller, numbers, certainty, detour = _average(
         labels, label, found, direct, averaging == "weighted", speed_of_sound
     )
@@ -107,7 +106,7 @@ def same_echo(
     array([0, 0, 1])
     """
     order = np.argsort(-detections.power, kind="stable")
-    found = _found(detections)
+    found = columns_of(detections)
     return _number(order, found, delay_gate, bearing_gate)
 
 
@@ -123,41 +122,7 @@ def unlabelled(heard: FrameMeasurements) -> FrameMeasurements:
     return replace(heard, rows=replace(heard.rows, landmark=nobody), clutter=None)
 
 
-class _Found(NamedTuple):
-    """Detections, as the kernels take them."""
-
-    face: Int[np.ndarray, " d"]
-    caller: Int[np.ndarray, " d"]
-    angle: Float[np.ndarray, " d"]
-    bearing: Float[np.ndarray, " d"]
-    delay: Float[np.ndarray, " d"]
-    power: Float[np.ndarray, " d"]
-    bearing_std: Float[np.ndarray, " d"]
-    delay_std: Float[np.ndarray, " d"]
-
-
-def _found(detections: Detections) -> tuple[np.ndarray, ...]:
-    """Return the columns of a `_Found`, a plain tuple, which a kernel is handed faster."""
-    return (
-        detections.face, detections.caller, detections.angle, detections.bearing, detections.delay,
-        detections.power, detections.bearing_std, detections.delay_std,
-    )  # fmt: skip
-
-
-class _Direct(NamedTuple):
-    """Direct calls, as the kernels take them."""
-
-    detection: Int[np.ndarray, " c"]
-    delay: Float[np.ndarray, " c"]
-    delay_std: Float[np.ndarray, " c"]
-    pulse: float
-
-
-def _direct(calls: DirectCalls | None) -> tuple:
-    """Return the columns of a `_Direct`."""
-    if calls is None:
-        return np.empty(0, np.int64), np.empty(0), np.empty(0), 0.0
-    return calls.detection, calls.delay, calls.delay_std, calls.pulse
+_NO_DIRECT = DirectCalls(np.empty(0, np.int64), np.empty(0), np.empty(0), 0.0)
 
 
 @kernel
@@ -199,7 +164,7 @@ def _average(
 
     Returns label, caller, numbers, certainty and detour of each pair that occurs.
     """
-    found, metres = _Found(*detections), 0.5 * speed_of_sound
+    found, direct, metres = Columns(*detections), DirectCalls(*calls), 0.5 * speed_of_sound
     faces = callers = 0
     for d in range(label.size):
         faces, callers = max(faces, found.face[d] + 1), max(callers, found.caller[d] + 1)
@@ -210,7 +175,7 @@ def _average(
     strongest = np.empty(faces, dtype=np.int64)
     for i in range(labels.size):
         for p in range(callers):
-            _take_strongest(label, labels[i], p, detections, strongest)
+            _take_strongest(label, labels[i], p, found, strongest)
             total = east = north = late = loudest = across = along = 0.0
             for f in range(faces):
                 d = strongest[f]
@@ -231,7 +196,7 @@ def _average(
                     numbers[RANGE, row] = metres * (late / total)
                     certainty[1, row] = metres * (math.sqrt(along) / total)
                 else:
-                    apart, spread = _after(calls, p, late / total, math.sqrt(along) / total)
+                    apart, spread = _after(direct, p, late / total, math.sqrt(along) / total)
                     detour[0, row], detour[1, row] = speed_of_sound * apart, speed_of_sound * spread
                 numbers[LEVEL, row] = 10.0 * math.log10(loudest)
                 row += 1
@@ -246,11 +211,11 @@ def _take_strongest(
     label: Int[np.ndarray, " d"],
     wanted: Whole,
     caller: Whole,
-    detections: tuple,
+    found: Columns,
     strongest: Int[np.ndarray, " f"],
 ) -> None:
     """Write the index of each face's strongest detection of a label and a caller; -1 for none."""
-    found, strongest[:] = _Found(*detections), -1
+    strongest[:] = -1
     for d in range(label.size):
         if label[d] == wanted and found.caller[d] == caller:
             best = strongest[found.face[d]]
@@ -259,12 +224,11 @@ def _take_strongest(
 
 
 @kernel
-def _after(calls: tuple, caller: Whole, delay: float, std: float) -> tuple[float, float]:
+def _after(direct: DirectCalls, caller: Whole, delay: float, std: float) -> tuple[float, float]:
     """Delay of a sound after the caller's direct call [s], and its standard deviation.
 
     NaN where nobody knows, or where the call still lasted.
     """
-    direct = _Direct(*calls)
     if caller >= direct.delay.size or not delay - direct.delay[caller] >= direct.pulse:
         return math.nan, math.nan
     return delay - direct.delay[caller], math.hypot(std, direct.delay_std[caller])
@@ -272,10 +236,9 @@ def _after(calls: tuple, caller: Whole, delay: float, std: float) -> tuple[float
 
 @kernel
 def _number(
-    order: Int[np.ndarray, " d"], detections: tuple, delay_gate: float, bearing_gate: float
+    order: Int[np.ndarray, " d"], found: Columns, delay_gate: float, bearing_gate: float
 ) -> Int[np.ndarray, " d"]:
     """Number the echoes, greedily, in an order of the detections."""
-    found = _Found(*detections)
     number, count = np.full(order.size, UNLABELLED, dtype=np.int64), 0
     for first in order:
         if number[first] != UNLABELLED:

@@ -28,7 +28,7 @@ from jaxtyping import Bool, Complex, Float, Int, Shaped
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.certainty import bearing_std, delay_std, loudest_noise, over_noise
-from pipistrelle.detection.direct import DirectCalls, direct_calls
+from pipistrelle.detection.direct import DirectCalls, Lags, direct_calls
 from pipistrelle.detection.onset import arrival_lag, reach_of, steer
 from pipistrelle.geometry import wrap
 from pipistrelle.jit import Whole, kernel, no_alloc
@@ -71,11 +71,28 @@ class Detections:
                 object.__setattr__(self, name, np.full(len(self.power), np.nan))
 
 
-_COLUMNS = ("face", "caller", "angle", "bearing", "delay", "power", "bearing_std", "delay_std")
+class Columns(NamedTuple):
+    """The columns of `Detections`, as kernels take them."""
+
+    face: Int[np.ndarray, " m"]
+    caller: Int[np.ndarray, " m"]
+    angle: Float[np.ndarray, " m"]
+    bearing: Float[np.ndarray, " m"]
+    delay: Float[np.ndarray, " m"]
+    power: Float[np.ndarray, " m"]
+    bearing_std: Float[np.ndarray, " m"]
+    delay_std: Float[np.ndarray, " m"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Detector:
+def columns_of(detections: Detections) -> Columns:
+    """Columns of detections, for kernels."""
+    d = detections
+    return Columns(
+        d.face, d.caller, d.angle, d.bearing, d.delay, d.power, d.bearing_std, d.delay_std
+    )  # faster than by their names
+
+
+class Detector(NamedTuple):
     """Thresholds and tables of the detection stage (`detector`)."""
 
     threshold: float
@@ -191,19 +208,8 @@ def detect(
     Detections
     """
     energy = _energy(matched.reshape(-1).view(matched.real.dtype), matched.shape[3])
-    rules = (
-        detector.threshold,
-        detector.runs,
-        detector.leakage,
-        detector.peak,
-        detector.sine_limit,
-        detector.loudest_noise,
-        detector.wave,
-        detector.scan,
-        detector.table,
-    )
-    lags = (start, interval, pulse)
-    whole, numbers = _find_peaks(matched, energy, rules, lags)
+    lags = Lags(start, interval, pulse)
+    whole, numbers = _find_peaks(matched, energy, tuple(detector), lags)
     found, (began, began_std) = direct_calls(matched, whole, numbers, matched.shape[2], lags)
     (face, caller), (delay, sine, power, bearing_std, delay_std) = whole, numbers
     angle = np.arcsin(sine)
@@ -228,8 +234,8 @@ def detections_at(found: Detections, rows: Bool[np.ndarray, " m"]) -> Detections
     if direct is not None:
         kept = np.append(rows, False)  # the last stands for none
         number = np.where(kept, np.cumsum(kept) - 1, -1)[direct.detection]
-        direct = replace(direct, detection=number)
-    columns = {name: getattr(found, name)[rows] for name in _COLUMNS}
+        direct = direct._replace(detection=number)
+    columns = {name: getattr(found, name)[rows] for name in Columns._fields}
     return Detections(**columns, direct=direct)
 
 
@@ -254,7 +260,7 @@ def call_in(
     if found.direct is not None:
         whole = np.stack((near.face, near.caller))
         numbers = np.stack((near.delay, near.angle, near.power, near.bearing_std, near.delay_std))
-        lags, tones = (start, interval, pulse), matched.shape[2]
+        lags, tones = Lags(start, interval, pulse), matched.shape[2]
         first, (began, std) = direct_calls(matched, whole, numbers, tones, lags)
         heard = DirectCalls(detection=first, delay=began, delay_std=std, pulse=pulse * interval)
         near = replace(near, direct=heard)
@@ -263,30 +269,8 @@ def call_in(
 
 def joined(parts: Sequence[Detections]) -> Detections:
     """Concatenate the detections of one call from several frames; the first has its direct call."""
-    columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _COLUMNS}
+    columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in Columns._fields}
     return Detections(**columns, direct=parts[0].direct)
-
-
-class _Rules(NamedTuple):
-    """The fields of a `Detector` that the kernels need."""
-
-    threshold: float
-    runs: bool
-    leakage: float
-    peak: float
-    sine_limit: float
-    loudest_noise: float
-    wave: Float[np.ndarray, " c"]
-    scan: Float[np.ndarray, "c n"]
-    table: Float[np.ndarray, "c 2 k n"]
-
-
-class _Lags(NamedTuple):
-    """Delay of lag 0 [s], distance of two lags [s], lags per call."""
-
-    start: float
-    interval: float
-    pulse: int
 
 
 @kernel
@@ -499,15 +483,15 @@ def _find_peaks(
     matched: Complex[np.ndarray, "l f c e"],
     energy: Float[np.ndarray, " t"],
     rules: tuple,
-    lags: tuple,
+    lag: Lags,
 ) -> tuple[Int[np.ndarray, "2 m"], Float[np.ndarray, "5 m"]]:
     """Every peak of every snapshot.
 
     Returns face and caller; delay, sine of the angle, power, and the standard deviations of bearing
-    and delay. The last arguments are the columns of a `_Rules` and a `_Lags`.
+    and delay.
     """
-    rule, lag = _Rules(*rules), _Lags(*lags)
     _, faces, tones, elements = matched.shape
+    rule = Detector(*rules)
     scan, wave, pulse = rule.scan, rule.wave, lag.pulse
     whole, numbers = np.empty((2, 128), dtype=np.int64), np.empty((5, 128))
     power, place = np.empty(scan.shape[1]), np.empty(scan.shape[1], dtype=np.int64)

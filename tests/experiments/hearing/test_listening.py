@@ -355,7 +355,7 @@ def with_echoes(blocks, arrivals, rows):
 
 def census(worlds, every):
     """Count per frame what the beacon's direct call and the guard against leakage do."""
-    count, deaf = Counter(), replace(FINDER, leakage=0.0)
+    count, deaf = Counter(), FINDER._replace(leakage=0.0)
     for seed in range(worlds):
         for arrivals, noise in frames(seed, every):
             call = (arrivals.caller != VEHICLE) & (arrivals.landmark == BEACON)

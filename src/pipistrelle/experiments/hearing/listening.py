@@ -220,7 +220,7 @@ def _of_call(call: CallHeard, time: float, record: "_Record", found: Detections)
     after, early = call.call.time - time, 0.5 * record.interval * record.pulse
     stretch = after - early, call.until - time - early
     part = call_in(record.matched, found, call.call.caller, stretch, **record.lags)
-    direct = part.direct and replace(part.direct, delay=part.direct.delay - after)
+    direct = part.direct and part.direct._replace(delay=part.direct.delay - after)
     return replace(part, delay=part.delay - after, direct=direct)
 
 

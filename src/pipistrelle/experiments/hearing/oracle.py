@@ -16,7 +16,7 @@ from pipistrelle.acoustics.arrivals import Arrivals
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import AssociationConfig
 from pipistrelle.detection.scans import UNLABELLED
-from pipistrelle.detection.snapshots import Detections
+from pipistrelle.detection.snapshots import Columns, Detections, columns_of
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel
 
@@ -82,10 +82,11 @@ def label_detections(
     array([ 7, -1])
     """
     order = np.argsort(-detections.power, kind="stable")
-    found = (detections.face, detections.caller, detections.delay, detections.bearing)
-    true = (arrivals.caller, arrivals.delay, arrivals.bearing, arrivals.level_db, arrivals.landmark)
-    within = (gates.delay_gate * pulse, gates.bearing_gate, faintest_db)
-    return _label(order, found, true, layout.normal, within)
+    true = _True(
+        arrivals.caller, arrivals.delay, arrivals.bearing, arrivals.level_db, arrivals.landmark
+    )
+    within = _Gates(gates.delay_gate * pulse, gates.bearing_gate, faintest_db)
+    return _label(order, tuple(columns_of(detections)), tuple(true), layout.normal, within)
 
 
 def faintest_level_db(
@@ -102,15 +103,6 @@ def faintest_level_db(
     """
     per_sample = (threshold - elements) / elements / samples * noise_std**2
     return float(10.0 * np.log10(per_sample) - margin_db)
-
-
-class _Found(NamedTuple):
-    """Detections, (d) rows, as the kernel takes them."""
-
-    face: Int[np.ndarray, " d"]
-    caller: Int[np.ndarray, " d"]
-    delay: Float[np.ndarray, " d"]
-    bearing: Float[np.ndarray, " d"]
 
 
 class _True(NamedTuple):
@@ -137,13 +129,10 @@ def _label(
     detections: tuple,
     arrivals: tuple,
     normal: Float[np.ndarray, " f"],
-    within: tuple,
+    gates: _Gates,
 ) -> Int[np.ndarray, " d"]:
-    """Greedy one-to-one matching, the strongest detection first.
-
-    The tuples are the columns of a `_Found`, a `_True` and a `_Gates`.
-    """
-    found, true, gates = _Found(*detections), _True(*arrivals), _Gates(*within)
+    """Greedy one-to-one matching, the strongest detection first."""
+    found, true = Columns(*detections), _True(*arrivals)
     face, bearing = found.face, found.bearing
     label = np.full(face.size, UNLABELLED, dtype=np.int64)
     taken = np.zeros((normal.size, true.delay.size), dtype=np.bool_)
