@@ -30,7 +30,8 @@ NOT_SETTINGS = frozenset({"PIPISTRELLE_DATA"})
 """Variables of the environment that share the prefix and set nothing."""
 
 Key = tuple[str, ...]
-FOLDERS: frozenset[Key] = frozenset({("scenario", "world")})
+WORLD_KEY: Key = ("scenario", "world")
+FOLDERS: frozenset[Key] = frozenset({WORLD_KEY})
 """Settings that are paths: in a file, from where the file lies."""
 CALLERS: Key = ("callers",)
 """The setting that is a list of tables."""

@@ -39,6 +39,7 @@ from pipistrelle.files import read_file, read_text
 from pipistrelle.refusals import expectation, refusal, shown
 from pipistrelle.settings import (
     CALLERS,
+    WORLD_KEY,
     Given,
     Key,
     Layer,
@@ -48,7 +49,6 @@ from pipistrelle.settings import (
     resolve,
 )
 
-WORLD_KEY: Key = ("scenario", "world")
 _COUNT: Key = ("scenario", "landmarks")
 _STEPS: Key = ("scenario", "steps")
 FILES = ("world.toml", "landmarks.csv", "path.csv")

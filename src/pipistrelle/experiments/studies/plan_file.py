@@ -22,7 +22,6 @@ from pipistrelle.estimation.catalogue import (
 from pipistrelle.experiments.hearing.caller_paths import routes_read, with_routes
 from pipistrelle.experiments.hearing.world import World
 from pipistrelle.experiments.hearing.world_folder import (
-    WORLD_KEY,
     named_world,
     read_world,
     settled,
@@ -40,6 +39,7 @@ from pipistrelle.files import check_ordinary
 from pipistrelle.refusals import expectation, meant, shown
 from pipistrelle.settings import (
     CALLERS,
+    WORLD_KEY,
     Given,
     Key,
     Layer,
