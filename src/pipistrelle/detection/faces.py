@@ -78,12 +78,9 @@ def average_faces(
     """
     labels, clutter = _distinct(label)
     found, direct = tuple(columns_of(detections)), tuple(detections.direct or _NO_DIRECT)
-    landmark, caller, numbers, certainty, detour = _average(
+    landmark, caller, numbers = _average(
         labels, label, found, direct, averaging == "weighted", speed_of_sound
     )
-    numbers[BEARING_STD] = np.hypot(certainty[0], np.where(caller == OWN, *BEARING_FLOOR))
-    numbers[RANGE_STD] = np.hypot(certainty[1], RANGE_FLOOR)
-    numbers[DETOUR], numbers[DETOUR_STD] = detour[0], np.hypot(detour[1], DETOUR_FLOOR)
     rows = Scan(time=time, landmark=landmark, caller=caller, numbers=numbers, callers=callers)
     return FrameMeasurements(rows=rows, clutter=int(clutter))
 
@@ -153,16 +150,10 @@ def _average(
     calls: tuple,
     weighted: bool,
     speed_of_sound: float,
-) -> tuple[
-    Int[np.ndarray, " m"],
-    Int[np.ndarray, " m"],
-    Float[np.ndarray, "7 m"],
-    Float[np.ndarray, "2 m"],
-    Float[np.ndarray, "2 m"],
-]:
+) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, "7 m"]]:
     """Mean direction and delay of each label and caller over its strongest rows per face.
 
-    Returns label, caller, numbers, certainty and detour of each pair that occurs.
+    Returns label, caller and numbers of each pair that occurs.
     """
     found, direct, metres = Columns(*detections), DirectCalls(*calls), 0.5 * speed_of_sound
     faces = callers = 0
@@ -171,7 +162,6 @@ def _average(
     landmark = np.empty(labels.size * callers, dtype=np.int64)
     caller, row = np.empty(landmark.size, dtype=np.int64), 0
     numbers = np.full((NUMBERS, landmark.size), np.nan)
-    certainty, detour = np.full((2, landmark.size), np.nan), np.full((2, landmark.size), np.nan)
     strongest = np.empty(faces, dtype=np.int64)
     for i in range(labels.size):
         for p in range(callers):
@@ -191,19 +181,19 @@ def _average(
             if total > 0.0:
                 landmark[row], caller[row] = labels[i], p
                 numbers[BEARING, row] = wrap_angle(math.atan2(north, east))
-                certainty[0, row] = math.sqrt(across) / total
+                floor = BEARING_FLOOR[0] if p == OWN else BEARING_FLOOR[1]
+                numbers[BEARING_STD, row] = math.hypot(math.sqrt(across) / total, floor)
+                delay, spread = late / total, math.sqrt(along) / total
                 if p == OWN:
-                    numbers[RANGE, row] = metres * (late / total)
-                    certainty[1, row] = metres * (math.sqrt(along) / total)
+                    numbers[RANGE, row] = metres * delay
+                    numbers[RANGE_STD, row] = math.hypot(metres * spread, RANGE_FLOOR)
                 else:
-                    apart, spread = _after(direct, p, late / total, math.sqrt(along) / total)
-                    detour[0, row], detour[1, row] = speed_of_sound * apart, speed_of_sound * spread
+                    apart, spread = _after(direct, p, delay, spread)
+                    numbers[DETOUR, row] = speed_of_sound * apart
+                    numbers[DETOUR_STD, row] = math.hypot(speed_of_sound * spread, DETOUR_FLOOR)
                 numbers[LEVEL, row] = 10.0 * math.log10(loudest)
                 row += 1
-    return (
-        landmark[:row], caller[:row], numbers[:, :row].copy(), certainty[:, :row].copy(),
-        detour[:, :row].copy(),
-    )  # fmt: skip
+    return landmark[:row], caller[:row], numbers[:, :row].copy()
 
 
 @kernel
