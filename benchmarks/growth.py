@@ -70,7 +70,8 @@ def _heard(landmarks: int) -> dict[str, float]:
     from pipistrelle.config import Config, ScenarioConfig
     from pipistrelle.experiments.cases import Case
     from pipistrelle.experiments.hearing.listening import listen
-    from pipistrelle.experiments.runs.trial import drive_of, run_trial
+    from pipistrelle.experiments.runs.heard_world import drive_of
+    from pipistrelle.experiments.runs.trial import run_trial
 
     config = Config(scenario=ScenarioConfig(landmarks=landmarks, spacing=0.5))
     world, radii = world_of(config), (config.emitter.radius,)

@@ -29,7 +29,8 @@ from pipistrelle.estimation.motion import Motion, motion_jacobians, motion_step
 from pipistrelle.evaluation.accuracy import position_error, rmse
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive
-from pipistrelle.experiments.runs.trial import drive_of, run_trial
+from pipistrelle.experiments.runs.heard_world import drive_of
+from pipistrelle.experiments.runs.trial import run_trial
 
 PARALLAX = 0.5
 """Least angle between two bearings that place a landmark [rad]."""

@@ -18,7 +18,8 @@ from pipistrelle.estimation.catalogue import is_there
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.machine import keep_freed_memory
-from pipistrelle.experiments.runs.trial import drive_of, run_trial
+from pipistrelle.experiments.runs.heard_world import drive_of
+from pipistrelle.experiments.runs.trial import run_trial
 from reference.drives import turn_and_drive
 
 keep_freed_memory()  # as the commands do

@@ -8,7 +8,7 @@ from pipistrelle.config import Config
 from pipistrelle.detection.scans import Scan
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import Scenario, world_of
-from pipistrelle.experiments.runs import trial
+from pipistrelle.experiments.runs import heard_world
 from pipistrelle.experiments.studies.plan_file import find_plan, read_plan
 
 RADII = tuple(read_plan(find_plan("paper")).grid["emitter.radius"])
@@ -33,4 +33,4 @@ def some_frames(world: Scenario, every: int) -> Scenario:
 def scans_of(config: Config, strategy: str) -> tuple[Scan, ...]:
     """Listen through a whole world and take a strategy's measurements."""
     (heard,) = listen(world_of(config), config, (config.emitter.radius,))
-    return trial.scans_of(heard, strategy, config)
+    return heard_world.scans_of(heard, strategy, config)

@@ -90,7 +90,7 @@ AT_THE_DISK = {
     "experiments/machine.py": {"read_text"},  # of the system: how much memory a process may have
     "experiments/results/folder.py": {"symlink_to", "unlink"},  # runs/latest
     "experiments/results/stored.py": {"loadtxt"},  # of bytes that were read
-    "experiments/runs/again.py": {"open"},  # sums of a log's files, of ordinary ones alone
+    "experiments/runs/rerun.py": {"open"},  # sums of a log's files, of ordinary ones alone
     "experiments/studies/store.py": {"unlink"},  # what a killed writer left, by its name
     "experiments/studies/world_files.py": {"scan_parquet", "unlink"},  # checked; left by a kill
     "detection/logs/text_tables.py": {"loadtxt"},  # of lines that were read

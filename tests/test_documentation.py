@@ -140,7 +140,7 @@ def test_the_guides_filter_drives_a_mission(guide):
     from pipistrelle.experiments.hearing.scenario import draw_scenario
     from pipistrelle.experiments.hearing.trajectories import motion_of
     from pipistrelle.experiments.runs.filtering import run_filter
-    from pipistrelle.experiments.runs.trial import drive_of
+    from pipistrelle.experiments.runs.heard_world import drive_of
 
     config = Config(scenario=ScenarioConfig(steps=40, landmarks=3))
     world = draw_scenario(config, np.random.default_rng(7))
@@ -157,7 +157,7 @@ def heard_and_drive(steps=120):
     from pipistrelle.config import Config, ScenarioConfig
     from pipistrelle.experiments.hearing.listening import listen
     from pipistrelle.experiments.hearing.scenario import world_of
-    from pipistrelle.experiments.runs.trial import drive_of
+    from pipistrelle.experiments.runs.heard_world import drive_of
 
     config = Config(scenario=ScenarioConfig(steps=steps))
     world = world_of(config)
@@ -170,7 +170,8 @@ def test_the_guides_association_finds_again_what_the_oracle_knew(guide):
     from pipistrelle.detection.merging import scan_of
     from pipistrelle.detection.noise import as_told
     from pipistrelle.experiments.cases import Case
-    from pipistrelle.experiments.runs.trial import run_trial, scans_of
+    from pipistrelle.experiments.runs.heard_world import scans_of
+    from pipistrelle.experiments.runs.trial import run_trial
 
     config, heard, drive = heard_and_drive()
     case = Case(strategy="active", filter="ekf")
@@ -196,7 +197,8 @@ def test_the_guides_noise_reaches_the_filter_row_by_row(guide):
     from pipistrelle.detection.merging import scan_of
     from pipistrelle.detection.noise import as_told
     from pipistrelle.experiments.cases import Case
-    from pipistrelle.experiments.runs.trial import run_trial, scans_of
+    from pipistrelle.experiments.runs.heard_world import scans_of
+    from pipistrelle.experiments.runs.trial import run_trial
 
     config, heard, drive = heard_and_drive(40)
     scans = [

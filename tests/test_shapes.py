@@ -55,5 +55,5 @@ def test_a_mission_that_times_callers_keeps_to_its_annotations(name):
 @pytest.mark.parametrize("name", ["unicycle_log", "bicycle_log", "poses_log"])
 def test_a_recorded_log_keeps_to_its_annotations(name):
     log, truth = load(LOGS / name)
-    trials = replay(log, truth, STRATEGIES, ("ekf", "iekf", "fastslam"), 0.6, Config())
+    trials = replay(log, truth, STRATEGIES, ("ekf", "iekf", "fastslam"), 0.6, Config()).trials
     assert len(trials) == 9

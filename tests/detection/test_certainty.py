@@ -27,7 +27,7 @@ from pipistrelle.detection.scans import OWN
 from pipistrelle.detection.snapshots import Detections, detect, detector
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import standing_landmarks
-from pipistrelle.experiments.runs.preparing import world_of
+from pipistrelle.experiments.runs.validate_mission import world_of
 from pipistrelle.geometry import range_and_bearing, wrap
 
 CONFIG = Config()

@@ -473,7 +473,7 @@ def test_the_dense_engine_times_as_the_block_engine_does():
 
 
 def test_with_timing_off_scans_are_to_the_bit_those_of_old():
-    from pipistrelle.experiments.runs.trial import scans_of
+    from pipistrelle.experiments.runs.heard_world import scans_of
 
     config = Config.model_validate({"scenario": {"steps": 40}})
     (frames,) = listen(world_of(config), config, (0.0088,))

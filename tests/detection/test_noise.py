@@ -9,7 +9,7 @@ from pipistrelle.detection.faces import FrameMeasurements, average_faces
 from pipistrelle.detection.noise import ConstantNoise, as_told, noise_of
 from pipistrelle.detection.scans import COLUMNS, with_columns
 from pipistrelle.detection.snapshots import Detections
-from pipistrelle.experiments.runs.trial import scans_of
+from pipistrelle.experiments.runs.heard_world import scans_of
 from reference.missions import scan_with
 
 NAN = np.nan

@@ -11,7 +11,7 @@ from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks, Track
 from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.results.scores import Scores, TrialResult
-from pipistrelle.experiments.runs.again import Again
+from pipistrelle.experiments.runs import mission as missions
 from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.figures.recorder import MissionRecorder
 from pipistrelle.geometry import range_and_bearing, wrap
@@ -237,7 +237,7 @@ def mission() -> Mission:
 
 
 @pytest.fixture(scope="session")
-def timed() -> tuple[Again, dict]:
+def timed() -> tuple[missions.Mission, dict]:
     """A short mission that hears when, among three callers of which one moves; and its frames."""
     callers = (
         CallerConfig(place=(10.0, -5.0)),
@@ -252,14 +252,4 @@ def timed() -> tuple[Again, dict]:
     )
     watch = MissionRecorder()
     done = run_mission(config, ("active", "fused"), ("ekf",), watch=watch)
-    again = Again(
-        config=config,
-        trials=done.trials,
-        truth=done.drive.truth,
-        callers=done.scenario.callers[1:],
-        beamwidth=2.0 * HALF_BEAM,
-        mission=done,
-        log=None,
-        difference="",
-    )
-    return again, watch.snapshots
+    return replace(done, beamwidth=2.0 * HALF_BEAM), watch.snapshots

@@ -217,7 +217,7 @@ def test_a_film_of_nothing_but_a_drive_needs_no_legend(tmp_path):
 
 def test_a_panel_shows_the_detour_ellipses_of_its_frame_two_at_most(timed):
     again, snapshots = timed
-    scene = {"truth": again.truth, "callers": again.callers, "beamwidth": again.beamwidth}
+    scene = {"truth": again.drive.truth, "callers": again.callers, "beamwidth": again.beamwidth}
     figure, panels = _stage(snapshots, **scene)
     named = [text.get_text() for text in figure.legends[0].texts]
     assert {"detour ellipse and its way", "caller as estimated"} <= set(named)
@@ -258,17 +258,19 @@ def test_a_mission_without_timing_has_neither_ellipses_nor_marks_nor_a_word_of_t
 def test_a_caller_that_moves_is_a_star_where_it_is_at_the_time(timed):
     again, snapshots = timed
     boat = again.callers[2].place
-    _, panels = _stage(snapshots, truth=again.truth, callers=again.callers, beamwidth=None)
+    _, panels = _stage(snapshots, truth=again.drive.truth, callers=again.callers, beamwidth=None)
     frame = panels[0].frames[20]
     panels[0]._show_vehicle(frame.pose, frame.scan.time, 20)
-    step = np.searchsorted(again.truth.time, frame.scan.time - 1e-9)
+    step = np.searchsorted(again.drive.truth.time, frame.scan.time - 1e-9)
     assert 0 < step < len(boat) - 1
     np.testing.assert_array_equal(panels[0].movers.get_xydata(), boat[[step]])
 
 
 def test_a_caller_that_moves_trails_where_it_was_followed(timed):
     again, snapshots = timed
-    figure, panels = _stage(snapshots, truth=again.truth, callers=again.callers, beamwidth=None)
+    figure, panels = _stage(
+        snapshots, truth=again.drive.truth, callers=again.callers, beamwidth=None
+    )
     assert "its estimated track" in [text.get_text() for text in figure.legends[0].texts]
     panel = panels[1]
     panel._show_moving(panel.frames[30].moving, 30)

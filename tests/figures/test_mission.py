@@ -303,7 +303,7 @@ print("matplotlib.pyplot" in sys.modules)
 
 def test_callers_are_marked_where_they_are_believed_to_be_where_detours_were_heard(timed, three):
     again, _ = timed
-    figure = draw_mission(again.trials, truth=again.truth, callers=again.callers)
+    figure = draw_mission(again.trials, truth=again.drive.truth, callers=again.callers)
     named = [text.get_text() for text in figure.legends[0].texts]
     assert named.index("caller as estimated") == named.index("caller") + 2, "a moving one between"
     for axes, trial in zip(maps(figure), again.trials, strict=True):
@@ -323,7 +323,7 @@ def test_callers_are_marked_where_they_are_believed_to_be_where_detours_were_hea
 def test_the_last_scans_detours_are_ellipses_about_vehicle_and_caller(timed, three, mission):
     again, _ = timed
     trial = next(trial for trial in again.trials if trial.strategy == "fused")
-    figure = draw_mission([trial], truth=again.truth, callers=again.callers)
+    figure = draw_mission([trial], truth=again.drive.truth, callers=again.callers)
     assert "detour ellipse and its way" in [text.get_text() for text in figure.legends[0].texts]
     (axes,), scan = maps(figure), trial.scans[-1]
     lines = [part for part in axes.collections if isinstance(part, LineCollection)]
@@ -339,7 +339,7 @@ def test_the_last_scans_detours_are_ellipses_about_vehicle_and_caller(timed, thr
 
 def test_a_caller_that_moves_is_drawn_as_it_was_followed(timed, mission):
     again, _ = timed
-    figure = draw_mission(again.trials, truth=again.truth, callers=again.callers)
+    figure = draw_mission(again.trials, truth=again.drive.truth, callers=again.callers)
     assert "its estimated track" in [text.get_text() for text in figure.legends[0].texts]
     fused = next(trial for trial in again.trials if trial.strategy == "fused")
     (track,) = fused.track.callers.values()
@@ -359,7 +359,9 @@ def test_a_caller_that_is_out_of_sight_at_the_end_is_not_drawn_there(timed):
     lost = fused.track.callers[label]
     mean = np.where(np.arange(len(lost.mean))[:, None] < 100, lost.mean, np.nan)
     track = replace(fused.track, callers={label: replace(lost, mean=mean)})
-    figure = draw_mission([replace(fused, track=track)], truth=again.truth, callers=again.callers)
+    figure = draw_mission(
+        [replace(fused, track=track)], truth=again.drive.truth, callers=again.callers
+    )
     known = mean[np.isfinite(mean).all(axis=1)]
     lines = [line.get_xydata() for line in maps(figure)[0].lines]
     assert any(np.array_equal(line, known) for line in lines)

@@ -16,8 +16,8 @@ from pipistrelle.config import Config
 from pipistrelle.detection.logs.folder import read_log
 from pipistrelle.detection.scans import COLUMNS
 from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS
-from pipistrelle.experiments.runs import again as once_more
 from pipistrelle.experiments.runs import replay
+from pipistrelle.experiments.runs import rerun as once_more
 from pipistrelle.experiments.runs.replay import motion_of
 from pipistrelle.settings import from_text
 from reference.command_line import SHORT, summary, table, track
@@ -61,7 +61,7 @@ def test_a_log_keeps_detours_and_whose_they_are_to_the_bit(obey, noise, undrawn)
         strategies="fused", duration=4, landmarks=10, **settings, **timing
     )  # the same again: its scans are in no file
     solved = pipistrelle.slam("log", **settings)
-    (one,), (two,) = ran._done.trials, solved._done.trials
+    (one,), (two,) = ran._mission.trials, solved._mission.trials
     assert [scan.time for scan in one.scans if scan.landmark.size] == [s.time for s in two.scans]
     rows = 0
     for scan, again in zip((s for s in one.scans if s.landmark.size), two.scans, strict=True):
@@ -439,4 +439,4 @@ def test_several_filters_side_by_side_have_each_the_gate_that_suits_it(obey, log
     for name, gate in (("iekf", "0.999"), ("smoother", "1")):
         obey("slam", log, "--filter.robust", "huber", "--filter", name, "--gate", gate, "-o", name)
         np.testing.assert_array_equal(track("both", f"fused_{name}"), track(name, f"fused_{name}"))
-    assert once_more.again(Path("both")).difference == ""
+    assert once_more.rerun(Path("both")).difference == ""

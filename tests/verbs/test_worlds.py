@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from pipistrelle.__main__ import main
-from pipistrelle.experiments.runs.again import again
+from pipistrelle.experiments.runs.rerun import rerun
 from reference.command_line import SHORT, contents, summary
 
 pytestmark = pytest.mark.usefixtures("undrawn")
@@ -213,6 +213,6 @@ def test_a_study_in_one_world_differs_by_noise_alone(capsys):
 def test_a_mission_in_ones_own_world_is_done_again_from_its_folder(obey, here):
     assert obey("run", "--world", here / "posts [1]", "--strategy", "fused", "-o", "two")[0] == 0
     shutil.rmtree(here)
-    done = again(Path("two"))
+    done = rerun(Path("two"))
     assert done.difference == ""
     assert [caller.name for caller in done.callers] == ["mate"]

@@ -1,4 +1,4 @@
-"""What this machine has: cores, and memory, asked for before a drive or a filter starts."""
+"""Cores and memory of this machine, and refusals of missions that need more memory."""
 
 import math
 import os
@@ -25,7 +25,7 @@ BLOCK_SUM = 40
 SAMPLE, SAMPLE_TONE = 16, 24
 """Bytes of a sample, face and element, as measured: of itself, and of each tone's filter."""
 LIMIT = Path("/sys/fs/cgroup/memory.max")
-"""What a container may have: a number of bytes, or a word."""
+"""The file with the memory limit of a container: a number of bytes, or a word."""
 MALLOPT = ((-3, 32 << 20), (-1, 256 << 20))
 """Of the GNU C library: arrays up to 32 MB come from the heap; it shrinks when 256 MB are free."""
 
@@ -45,60 +45,32 @@ def check_memory(
     passive: bool,
     workers: int = 1,
 ) -> None:
-    """Refuse what may need more memory than this machine has.
+    """Refuse landmarks whose estimate may need more memory than this machine has.
 
-    Parameters
-    ----------
-    filters : sequence of str
-        The names of estimators.
-    landmarks : int
-    config : Config
-        Its sections that they read.
-    passive : bool
-        Whether a landmark may be heard by its bearing alone: it is a whole ray then.
-    workers : int
-        Processes here that each need as much, at the same time; 0 if they are elsewhere.
+    With passive rows a landmark may be a whole ray. So many workers on this machine (0: elsewhere)
+    each need as much.
 
-    Raises
-    ------
-    InputError
-        With the estimate.
-
-    Examples
-    --------
     >>> check_memory(["ekf", "fastslam"], 51, Config(), passive=True)
     """
     each_ray = ray_members(config.rays)[0].size if passive else 1
     for name in filters:
-        known = entry(name)
-        need, have = known.memory(landmarks, each_ray, config), installed()
+        estimator = entry(name)
+        need, have = estimator.memory(landmarks, each_ray, config), installed()
         if need * workers > have:
             ray = f" of {each_ray:,} members each (rays.density)" if passive else ""
             particles = f" and {config.fastslam.particles} particles (fastslam.particles)"
-            held = particles if "fastslam" in known.sections else ""
+            held = particles if "fastslam" in estimator.sections else ""
             raise _too_large(f"{name}: {landmarks} landmarks{ray}{held}", need, have, workers)
 
 
 def check_length(
     setup: ScenarioConfig, *, strategies: int = 1, filters: int = 1, workers: int = 1
 ) -> None:
-    """Refuse a drive whose steps and frames may need more memory than this machine has.
+    """Refuse a drive whose scans and tracks may need more memory than this machine has.
 
-    Parameters
-    ----------
-    setup : ScenarioConfig
-    strategies, filters : int
-        Number of each; the scans of every strategy and the tracks of all trials are kept.
-    workers : int
-        Processes here that each need as much, at the same time; 0 if they are elsewhere.
+    Those of so many strategies and filters are kept, by each of so many workers on this machine (0:
+    elsewhere).
 
-    Raises
-    ------
-    InputError
-        With the estimate.
-
-    Examples
-    --------
     >>> check_length(ScenarioConfig(), strategies=3, filters=2)
     """
     need = float(setup.steps) * (DRAWN + TRACKED * strategies * filters)
@@ -111,21 +83,9 @@ def check_length(
 def check_recording(
     scenario: Scenario, config: Config, layout: Layout, settled: Sampling, *, workers: int = 1
 ) -> None:
-    """Refuse a world in which a frame's recording may need more memory than this machine has.
+    """Refuse a world of which one frame's recording may need more memory than this machine has.
 
-    Parameters
-    ----------
-    scenario : Scenario
-    config : Config
-    layout : Layout
-    settled : Sampling
-    workers : int
-        Processes here that each need as much, at the same time; 0 if they are elsewhere.
-
-    Raises
-    ------
-    InputError
-        With the setting that makes the recording long, and the estimate.
+    So many workers on this machine (0: elsewhere) each need as much.
     """
     setup, path = config.scenario, _farthest(scenario.path[:, :2])
     driven = "scenario.start" if math.hypot(*setup.start[:2]) > path / 2.0 else "scenario.step"
@@ -168,7 +128,7 @@ def _period(setup: ScenarioConfig) -> float:
 
 
 def _too_large(what: str, need: float, have: float, workers: int) -> InputError:
-    """Say what would be needed, and what is there."""
+    """Return the refusal of a mission that needs more memory than there is."""
     each = f" in each of {workers} workers" if workers > 1 else ""
     return InputError(
         f"{what} may need {need / 1e9:.1f} GB of memory{each}, but this machine has "
@@ -187,7 +147,7 @@ def installed() -> float:
 
 
 def keep_freed_memory() -> None:
-    """Let this process keep what it frees, where the C library can be told to.
+    """Let this process keep freed memory, where the C library allows it.
 
     A filter makes its arrays anew in every frame. Those above a megabyte, such as the covariance
     of 200 landmarks, would be given back to the system and asked for again each time, and cleared

@@ -1,7 +1,7 @@
-"""What a person asks for, from Python: `run`, `slam`, `study`, `load`, and what comes of it.
+"""The Python interface: `run`, `slam`, `study`, `load`, and the results that they return.
 
-`asking` reads the words, `missions` does what they say, `recorded` is what a log decides of it;
-`results` and `studies` are what is handed back. The command line (`verbs`) asks in the same words.
+`arguments` reads settings and names, `log_settings` is what a log decides of them, `missions` runs
+them, `results` and `studies` are what is returned. The command line (`verbs`) calls the same.
 """
 
 from lazy_loader import attach

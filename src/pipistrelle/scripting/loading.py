@@ -3,12 +3,11 @@
 import warnings
 from pathlib import Path
 
-from pipistrelle.experiments.hearing.world_folder import read_world
 from pipistrelle.experiments.results.reading import read_summary
-from pipistrelle.experiments.runs.again import again
+from pipistrelle.experiments.runs.mission import Mission
+from pipistrelle.experiments.runs.rerun import rerun
 from pipistrelle.experiments.runs.trial import Watch
-from pipistrelle.scripting.asking import Filters, folder_named, named_filters
-from pipistrelle.scripting.missions import Done, done_of, done_of_log
+from pipistrelle.scripting.arguments import Filters, folder_named, named_filters
 from pipistrelle.scripting.results import Results
 from pipistrelle.scripting.studies import StudyResults
 
@@ -47,18 +46,13 @@ def load(folder: Path | str, /, *, filters: Filters = ()) -> Results | StudyResu
     place = folder_named(folder, "load")
     if (place / "plan.toml").is_file():
         return StudyResults(place)
-    summary = read_summary(place)
+    read_summary(place)
     trusted = named_filters(filters) if filters else ()
 
-    def redo(watch: Watch | None) -> Done:
-        found = again(place, trusted=trusted, watch=watch)
-        if found.difference:
-            warnings.warn(found.difference, stacklevel=3)
-        if found.log is not None and summary.log is not None:
-            entry = summary.log.model_dump()
-            return done_of_log(found.log, found.truth, found.config, found.trials, entry)
-        assert found.mission is not None
-        world = found.config.scenario.world
-        return done_of(found.mission, None if world is None else read_world(Path(world)))
+    def redo(watch: Watch | None) -> Mission:
+        mission = rerun(place, trusted=trusted, watch=watch)
+        if mission.difference:
+            warnings.warn(mission.difference, stacklevel=3)
+        return mission
 
     return Results(redo, folder=place)

@@ -1,11 +1,10 @@
-"""What comes of a mission, as a notebook likes it: frames, pictures, and the mission once more."""
+"""The results of a mission for Python: data frames, figures, films."""
 
 import json
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from io import BytesIO
-from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -15,13 +14,13 @@ from pipistrelle.evaluation.scores import shown_in
 from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.machine import keep_freed_memory
 from pipistrelle.experiments.results.writing import run_entry, tables_of
-from pipistrelle.experiments.runs.replay import load as load_log
+from pipistrelle.experiments.runs.mission import Mission
 from pipistrelle.experiments.runs.trial import Watch
 from pipistrelle.files import read_file
 from pipistrelle.kernel_clock import announce
 from pipistrelle.own_files import RESULTS, claim
 from pipistrelle.refusals import refusal, shown
-from pipistrelle.scripting.asking import (
+from pipistrelle.scripting.arguments import (
     WORLD,
     Base,
     Filters,
@@ -30,30 +29,28 @@ from pipistrelle.scripting.asking import (
     mission_settings,
     named_filters,
     named_strategies,
-    number,
-    short_names,
 )
 from pipistrelle.scripting.missions import (
-    Done,
+    Conduct,
+    caller_names,
     drawn,
     failures,
     filmed,
     keep,
+    prepare_slam,
     simulated,
-    solved,
 )
-from pipistrelle.scripting.recorded import beforehand, check_open, check_room, with_log
 from pipistrelle.settings import Given, Layer, from_keywords
 
 if TYPE_CHECKING:
     import polars as pl
     from matplotlib.figure import Figure
 
-Redo = Callable[[Watch | None], Done]
-"""Does a mission once more, watched; the same settings give the same bits."""
+Redo = Callable[[Watch | None], Mission]
+"""Does a mission again, watched; the same settings give the same bits."""
 ALLOW = "overwrite=True"
 TABLES = ("steps", "landmarks", "measurements")
-"""That a result folder holds, each with its ending."""
+"""Tables of a result folder, each a Parquet file."""
 
 
 class Results:
@@ -75,18 +72,18 @@ class Results:
     def __init__(
         self,
         redo: Redo,
-        done: Done | None = None,
+        mission: Mission | None = None,
         folder: Path | None = None,
         command: str = "pipistrelle",
     ) -> None:
         self.folder = folder
         """Where the results are kept, if anywhere."""
         self._redo, self._command = redo, command
-        if done is not None:
-            self._done = done
+        if mission is not None:
+            self._mission = mission
 
     @cached_property
-    def _done(self) -> Done:
+    def _mission(self) -> Mission:
         """The mission itself, done once more where only its folder is known."""
         return self._redo(None)
 
@@ -98,7 +95,9 @@ class Results:
         if self.folder is not None:
             rows = json.loads(read_file(self.folder / "summary.json"))["runs"]
         else:
-            rows = [run_entry(trial, self._done.ignored_rows) for trial in self._done.trials]
+            mission = self._mission
+            ignored = {} if mission.log is None else mission.log.ignored_rows
+            rows = [run_entry(trial, ignored) for trial in mission.trials]
         nested = ("ignored_rows", "online")
         flat = [{name: row[name] for name in row if name not in nested} for row in rows]
         return pl.DataFrame(flat, infer_schema_length=None)
@@ -124,7 +123,8 @@ class Results:
         import polars as pl
 
         if self.folder is None:
-            return tables_of(self._done.trials, self._done.truth, self._done.names)
+            mission = self._mission
+            return tables_of(mission.trials, mission.drive.truth, caller_names(mission))
         paths = {name: self.folder / f"{name}.parquet" for name in TABLES}
         tables = {}
         for name, path in paths.items():
@@ -137,7 +137,7 @@ class Results:
 
     def figure(self) -> "Figure":
         """Draw maps and errors side by side, as ``mission.png`` has them."""
-        return drawn(self._done)
+        return drawn(self._mission)
 
     def animate(self, path: Path | str = "mission.gif") -> Path:
         """Film the mission, which is done once more for it.
@@ -184,7 +184,7 @@ class Results:
             Where the folder cannot be had.
         """
         own = claim(Path(folder), RESULTS, overwrite=overwrite, flags=("save(DIR)", ALLOW))
-        keep(self._done, own, self._command)
+        keep(self._mission, own, self._command)
         return own.folder
 
     def to_xarray(self) -> Any:
@@ -292,7 +292,7 @@ def run(
         WORLD: Given(None if world is None else str(world), "world"),
         ("scenario", "landmarks"): Given(landmarks, "landmarks"),
     }
-    asked, known = mission_settings(
+    resolved, own_world = mission_settings(
         base_layer(config),
         from_keywords(settings, run.__kwdefaults__ or ()),
         short,
@@ -301,11 +301,8 @@ def run(
     )
     chosen, ways = named_strategies(strategies), named_filters(filters)
 
-    def redo(watch: Watch | None) -> Done:
-        done, _ = simulated(asked, chosen, ways, known, progress=progress, watch=watch)
-        return done
-
-    return _finished(redo, output, overwrite, "pipistrelle.run(...)")
+    conduct = partial(simulated, resolved, chosen, ways, own_world)
+    return _finished(conduct, progress, output, overwrite, "pipistrelle.run(...)")
 
 
 def slam(
@@ -357,34 +354,31 @@ def slam(
         What is wrong in the log, by line or key; as `run`.
     """
     place, flags = folder_named(log, "log"), from_keywords(settings, slam.__kwdefaults__ or ())
-    check_open(flags)
-    short = short_names({("filter", "gate"): Given(gate, "gate")}, flags)
-    if beamwidth is not None and not 0 < number(Given(beamwidth, "beamwidth")) <= 360:
-        raise InputError(f"beamwidth: found {beamwidth:g}, expected above 0 and up to 360 [deg]")
-    recorded, truth = load_log(place, robot)
-    settled, overruled = with_log(base_layer(config) | flags | short, recorded, place)
+    short: Layer = {("filter", "gate"): Given(gate, "gate")}
+    layers = base_layer(config), flags, short
     chosen, ways = named_strategies(strategies), named_filters(filters)
-    check_room(recorded, ways, settled)
-    for line in (*overruled, *beforehand(recorded, truth, place)):
+    conduct, notes = prepare_slam(place, layers, robot, chosen, ways, Given(beamwidth, "beamwidth"))
+    for line in notes:
         warnings.warn(line, stacklevel=2)
-    asked = (settled, chosen, ways, None if beamwidth is None else radians(beamwidth))
-
-    def redo(watch: Watch | None) -> Done:
-        return solved(place, robot, (recorded, truth), *asked, progress=progress, watch=watch)
-
-    return _finished(redo, output, overwrite, f"pipistrelle.slam({str(log)!r}, ...)")
+    return _finished(conduct, progress, output, overwrite, f"pipistrelle.slam({str(log)!r}, ...)")
 
 
-def _finished(redo: Redo, output: Path | str | None, overwrite: bool, command: str) -> Results:
+def _finished(
+    conduct: Conduct,
+    progress: Progress | None,
+    output: Path | str | None,
+    overwrite: bool,
+    command: str,
+) -> Results:
     """Do a mission, and keep it where that is asked for."""
     keep_freed_memory()
     announce()
     place = None if output is None else Path(output)
     flags = ("output=DIR", ALLOW)
     own = None if place is None else claim(place, RESULTS, overwrite=overwrite, flags=flags)
-    done = redo(None)
-    for line in (*done.said, *failures(done)):
+    mission = conduct(progress=progress)
+    for line in (*mission.notes, *failures(mission)):
         warnings.warn(line, stacklevel=3)
     if own is not None:
-        keep(done, own, command)
-    return Results(redo, done, place, command)
+        keep(mission, own, command)
+    return Results(lambda watch: conduct(progress=progress, watch=watch), mission, place, command)

@@ -1,4 +1,4 @@
-"""A study, as a notebook likes it: its tables as frames, its report as a page."""
+"""The results of a study for Python: its tables as data frames, its report as a page."""
 
 from collections.abc import Callable, Mapping
 from functools import cached_property
@@ -80,18 +80,18 @@ class StudyResults:
     @property
     def answer(self) -> list[str]:
         """What the report answers to the study's question: a line, then sentences."""
-        return list(self._told.answer)
+        return list(self._answered.answer)
 
     def figure(self) -> "Figure":
         """Draw the first figure of the report: what is asked, by what is varied."""
         from pipistrelle.figures.chart_plot import draw_chart
         from pipistrelle.report.charts.results import study_charts
 
-        told = self._told
-        return draw_chart(study_charts(told.selections[told.rule])[0])
+        answered_study = self._answered
+        return draw_chart(study_charts(answered_study.selections[answered_study.rule])[0])
 
     @cached_property
-    def _told(self) -> "Answered":
+    def _answered(self) -> "Answered":
         """The study, as the report reads it."""
         from pipistrelle.report.page.summary import answered
         from pipistrelle.report.reading import read_study
@@ -199,7 +199,7 @@ def study(
 
 
 def _listed(value: Any) -> Any:
-    """Write arrays and tuples as lists, as a file would."""
+    """Convert arrays and tuples to lists, as in a file."""
     if isinstance(value, Mapping):
         return {name: _listed(inner) for name, inner in value.items()}
     if hasattr(value, "tolist"):
@@ -208,7 +208,7 @@ def _listed(value: Any) -> Any:
 
 
 def _share(given: object) -> tuple[int, int]:
-    """Check which share of the worlds is asked for."""
+    """Check the share (i, n) of the worlds."""
     match given:
         case (int(i), int(n)) if 0 <= i < n:
             return i, n

@@ -1,1 +1,1 @@
-"""What a person asks for at the command line, one module per verb, imported when it is called."""
+"""The command line: one module per verb, imported when it is called."""

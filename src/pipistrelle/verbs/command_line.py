@@ -1,4 +1,4 @@
-"""The verbs and what they are for; a command line obeyed, and a mistake in it worded."""
+"""The verbs of the command line, how one is run, and how mistakes in it are reported."""
 
 from collections.abc import Sequence
 from errno import ENOSPC
@@ -90,18 +90,9 @@ app.command(
 
 
 def obey(words: Sequence[str], heard: Sequence[int] = ()) -> int:
-    """Obey a command line, and say what of it was a mistake.
+    """Run a command line and return its exit status; report mistakes of the user in a line.
 
-    Parameters
-    ----------
-    words : sequence of str
-    heard : sequence of int
-        Signals that ask for an end, as they are heard: after one, an error is no mistake.
-
-    Returns
-    -------
-    int
-        Exit status.
+    `heard` collects the signals that ask for an end: after one, an error is no mistake of the user.
     """
     try:
         _refuse_empty(words)
@@ -121,7 +112,7 @@ def obey(words: Sequence[str], heard: Sequence[int] = ()) -> int:
 
 
 def _refuse_empty(words: Sequence[str]) -> None:
-    """Refuse an empty word, which as a path would be the folder that one is in."""
+    """Refuse an empty argument, which as a path would be the current folder."""
     for before, word in pairwise(("pipistrelle", *words)):
         flag, given, value = word.partition("=")
         if not word or (flag.startswith("-") and given and not value):
@@ -167,7 +158,7 @@ def _completed(words: Sequence[str]) -> list[str]:
 
 
 def _explained(error: Exception, words: Sequence[str]) -> str | None:
-    """Word a user's mistake; None for a bug."""
+    """Return the message for a user's mistake; None for a bug."""
     from pipistrelle.config import InputError
 
     if isinstance(error, MemoryError):
@@ -204,7 +195,7 @@ def _unknown(error: UnknownOptionError) -> str:
 
 
 def _too_many(error: UnusedCliTokensError, word: str, words: Sequence[str]) -> str:
-    """Say of a word that is left over where it stands."""
+    """Return the message for an argument that no option takes."""
     if ("--animate", word) in pairwise(words):
         return f"--animate: found {word!r}, expected {' or '.join(FILMS)}"
     verb, kinds = " ".join(error.command_chain or ()), signature(error.target or obey).parameters

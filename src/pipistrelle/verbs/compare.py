@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pipistrelle.experiments.comparing.writing import Compared
 
 SURE = 0.05
-"""A difference is marked whose p is below, as one of all cases."""
+"""A difference is marked if its p, corrected for all cases, is below."""
 
 
 def compare(
@@ -95,14 +95,14 @@ def _names(compared: "Compared") -> str:
     from pipistrelle.experiments.comparing.studies import ComparedStudies
     from pipistrelle.experiments.comparing.writing import lettered, spelt
 
-    told = [f"{letter}  {spelt(folder)}" for letter, folder in lettered(compared.folders)]
+    lines = [f"{letter}  {spelt(folder)}" for letter, folder in lettered(compared.folders)]
     if isinstance(compared, ComparedStudies):
         counts = zip(compared.done, compared.planned, strict=True)
-        told = [
+        lines = [
             f"{line}: {done} worlds" + f" of {planned}" * (done < planned)
-            for line, (done, planned) in zip(told, counts, strict=True)
+            for line, (done, planned) in zip(lines, counts, strict=True)
         ]
-    return "\n".join(told)
+    return "\n".join(lines)
 
 
 def _settings(compared: "Compared") -> str:
@@ -130,7 +130,7 @@ def _mission_tables(compared: "ComparedMissions") -> Iterator[str]:
 
 
 def _unlike(estimate: "ComparedEstimate", i: int) -> str:
-    """Word what of a folder's estimate is not in the title."""
+    """Return the parts of an estimate's name that the title lacks."""
     from pipistrelle.estimation.catalogue import short_name
 
     title = estimate.title.split()
@@ -139,13 +139,13 @@ def _unlike(estimate: "ComparedEstimate", i: int) -> str:
 
 
 def _score_rows(estimate: "ComparedEstimate") -> Iterator[list[str]]:
-    """Word the scores that any folder has."""
+    """Return the rows of the scores that any folder has."""
     from pipistrelle.experiments.comparing.writing import less, scores_of
 
-    told = [scores_of(scores) for scores in estimate.scores]
+    folders = [scores_of(scores) for scores in estimate.scores]
     for name, score in shown_in("missions").items():
         title, digits = heading(score), score.digits
-        values = [scores.get(name) for scores in told]
+        values = [scores.get(name) for scores in folders]
         if name == "diverged":
             if any(values):
                 words = ("-" if v is None else "yes" if v else "no" for v in values)
@@ -170,7 +170,7 @@ def _study_tables(compared: "ComparedStudies") -> Iterator[str]:
 
 
 def _case_row(case: "ComparedCase", digits: int, several: bool) -> list[str]:
-    """Word a score of a case."""
+    """Return the row of a case for a score."""
     from pipistrelle.experiments.comparing.folders import LETTERS
 
     finding, means = case.finding, case.means

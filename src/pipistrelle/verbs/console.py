@@ -1,4 +1,4 @@
-"""What a person reads while a verb works and when it is done; results go to standard output."""
+"""Progress and tables for the terminal; results go to standard output."""
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -25,16 +25,8 @@ NIS = (
 
 @contextmanager
 def announced(message: str, after: float = 3.0) -> Iterator[None]:
-    """Say what is being waited for, if it takes long.
+    """Print a message if what follows takes longer than `after` seconds.
 
-    Parameters
-    ----------
-    message : str
-    after : float
-        Wait this long first [s].
-
-    Examples
-    --------
     >>> with announced("Drawing mission.gif ..."):
     ...     pass
     """
@@ -51,19 +43,9 @@ def announced(message: str, after: float = 3.0) -> Iterator[None]:
 def progress(quiet: bool) -> "Iterator[Progress]":
     """Show one line per stage, with its frames per second.
 
-    On a terminal the line moves; elsewhere it is printed when the stage is done.
+    Yields a function of the stage's name, the frames done and their number. On a terminal the line
+    moves; elsewhere it is printed when the stage is done.
 
-    Parameters
-    ----------
-    quiet : bool
-        Show nothing.
-
-    Yields
-    ------
-    function of a stage's name, the frames done and their number
-
-    Examples
-    --------
     >>> with progress(quiet=True) as show:
     ...     show("fused ekf", 375, 375)
     """
@@ -109,7 +91,7 @@ def _bars() -> "Iterator[Progress]":
 
 
 def _stopwatch() -> Callable[[str], float]:
-    """Return what times stages [s]: each from the last word of the one before it.
+    """Return a function that times stages [s], each from the end of the one before it.
 
     Time in which kernels are compiled is not counted.
     """
@@ -127,7 +109,7 @@ def _stopwatch() -> Callable[[str], float]:
 
 
 def _rate(frames: int, elapsed: float) -> str:
-    """Word how many frames are done, and how fast."""
+    """Return the frames done and their rate as text."""
     speed = f", {frames / elapsed:.0f} frames/s" if elapsed > 0 and frames else ""
     return f"{frames:>5} frames{speed}"
 
@@ -135,22 +117,11 @@ def _rate(frames: int, elapsed: float) -> str:
 def closing_table(
     trials: "Sequence[TrialResult]", there: int | None = None, driven: float | None = None
 ) -> str:
-    """Compare the estimates of one world, a column each; what no estimate has is left out.
+    """Lay out the scores of a mission, a column per estimate; rows that nobody has are left out.
 
     Six columns fit into 100 characters. Of particles, landmarks are those of the heaviest particle.
-    Under the table stands what a bound says, and the NIS, where there is one.
-
-    Parameters
-    ----------
-    trials : sequence of TrialResult, at least one
-    there : int, optional
-        Landmarks of the world, where that is known.
-    driven : [m], optional
-        By the odometry.
-
-    Returns
-    -------
-    str
+    Under the table stands what a bound says, and the NIS, where there is one. `driven` is the way
+    by the odometry [m].
     """
     from pipistrelle.evaluation.bound import IN_ONE_WORLD
 
@@ -171,7 +142,7 @@ def closing_table(
 def _cells(
     trial: "TrialResult", there: int | None, driven: float | None
 ) -> Iterator[tuple[str, str]]:
-    """Word what there is to say of an estimate, with titles; nothing of what it lacks."""
+    """Return the cells of an estimate by title, without those that it lacks."""
     s = trial.scores
     for name, score in shown_in("mission").items():
         yield heading(score), _number(getattr(s, name), score.digits)
@@ -185,17 +156,17 @@ def _cells(
 
 
 def _without_truth(trial: "TrialResult", driven: float | None) -> Iterator[tuple[str, str]]:
-    """Word what an estimate tells of itself; nothing where the truth tells more."""
+    """Return cells of what an estimate states of itself, if there is no truth to score it."""
     from math import sqrt
 
     pose, rows = trial.track.pose, sum(len(scan.landmark) for scan in trial.scans)
-    known = trial.scores.position_rmse_m is not None
-    share = None if known or not rows else 100.0 * trial.scores.gated / rows
+    scored = trial.scores.position_rmse_m is not None
+    share = None if scored or not rows else 100.0 * trial.scores.gated / rows
     spread = float(pose.covariance[-1, 0, 0] + pose.covariance[-1, 1, 1])
-    yield NIS_TITLE, _number(None if known else trial.scores.nis_mean, 2)
+    yield NIS_TITLE, _number(None if scored else trial.scores.nis_mean, 2)
     yield "rejected by the gate [%]", _number(share, 2)
-    yield "final position, 1 sigma [m]", _number(None if known else sqrt(max(spread, 0.0)), 3)
-    yield "driven, by the odometry [m]", _number(None if known else driven, 1)
+    yield "final position, 1 sigma [m]", _number(None if scored else sqrt(max(spread, 0.0)), 3)
+    yield "driven, by the odometry [m]", _number(None if scored else driven, 1)
 
 
 def _number(value: float | None, digits: int) -> str:

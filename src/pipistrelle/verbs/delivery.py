@@ -1,18 +1,20 @@
-"""What every mission ends in: a folder that is filled, a picture, a table, a place to look."""
+"""Doing a mission on the command line: its folder, figure, film and table."""
 
 import contextlib
 import os
 import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipistrelle.experiments.results import folder
+from pipistrelle.experiments.runs.mission import Mission
 from pipistrelle.own_files import OwnFiles
-from pipistrelle.scripting.missions import Done, failures, filmed, keep
-from pipistrelle.verbs.console import announced, closing_table
+from pipistrelle.scripting.log_settings import distance_driven
+from pipistrelle.scripting.missions import Conduct, failures, filmed, keep
+from pipistrelle.verbs.console import announced, closing_table, progress
 from pipistrelle.verbs.options import OutputOptions
 from pipistrelle.verbs.streams import put, say, warn
 
@@ -32,7 +34,7 @@ def result_folder(options: OutputOptions, name: str) -> Iterator[OwnFiles]:
 
 
 def recorder(options: OutputOptions) -> "MissionRecorder | None":
-    """Return what watches the filters, if a film is wanted."""
+    """Return a recorder of the filters, if a film is wanted."""
     if options.animate is None:
         return None
     from pipistrelle.figures.recorder import MissionRecorder
@@ -49,25 +51,35 @@ def get_ready(options: OutputOptions) -> None:
     announce(None if options.quiet else say)
 
 
+def conduct(
+    mission_of: Conduct,
+    options: OutputOptions,
+    name: str,
+    save: Callable[[Mission], None] = lambda _: None,
+) -> int:
+    """Do a mission, watched as the options say, and deliver it; return the exit status.
+
+    `save` writes what else was asked for, before the results.
+    """
+    with result_folder(options, name) as own:
+        get_ready(options)
+        watch = recorder(options)
+        with progress(options.quiet) as show:
+            mission = mission_of(progress=show, watch=watch)
+        warn(*mission.notes)
+        save(mission)
+        return deliver(own, mission, options, watch)
+
+
 def deliver(
-    own: OwnFiles, done: Done, options: OutputOptions, watch: "MissionRecorder | None" = None
+    own: OwnFiles,
+    mission: Mission,
+    options: OutputOptions,
+    watch: "MissionRecorder | None" = None,
 ) -> int:
     """Write results, figure and film in place of earlier ones, print the table, the folder last.
 
-    Parameters
-    ----------
-    own : OwnFiles
-        The folder.
-    done : Done
-        Of at least one trial.
-    options : OutputOptions
-    watch : MissionRecorder, optional
-        What it saw becomes the film.
-
-    Returns
-    -------
-    int
-        Exit status: 1 if an estimate is not finite or a filter failed, else 0.
+    Returns the exit status: 1 if an estimate is not finite or a filter failed, else 0.
     """
 
     def film(room: Path) -> None:
@@ -75,24 +87,20 @@ def deliver(
             path = room / f"mission.{options.animate}"
             message = f"Drawing {path.name} ..."
             with contextlib.nullcontext() if options.quiet else announced(message):
-                filmed(done, watch, path)
+                filmed(mission, watch, path)
 
-    keep(done, own, command_line(), film)
+    keep(mission, own, command_line(), film)
     if not options.quiet:
-        known = done.truth.landmarks
-        put(closing_table(done.trials, None if known is None else len(known[0]), done.driven))
-    failed = failures(done)
+        landmarks, log = mission.drive.truth.landmarks, mission.log
+        there = None if landmarks is None else len(landmarks[0])
+        put(closing_table(mission.trials, there, None if log is None else distance_driven(log)))
+    failed = failures(mission)
     warn(*failed)
     put(own.folder)
     return 1 if failed else 0
 
 
 def command_line() -> str:
-    """Return the command line as text, names that are no text by their bytes.
-
-    Returns
-    -------
-    str
-    """
+    """Return the command line as text, with names that are not valid text as their bytes."""
     words = shlex.join(["pipistrelle", *sys.argv[1:]])
     return os.fsencode(words).decode(errors="backslashreplace")

@@ -11,7 +11,7 @@ from cyclopts import Group, Parameter
 
 from pipistrelle.config import Config, InputError
 from pipistrelle.estimation.catalogue import CATALOGUE, entry
-from pipistrelle.scripting.asking import GROUPS, WORLD, mission_settings, named_filters
+from pipistrelle.scripting.arguments import GROUPS, WORLD, mission_settings, named_filters
 from pipistrelle.settings import (
     CALLERS,
     Given,
@@ -60,20 +60,9 @@ def setting_flags(
 ) -> Any:
     """Make the type from which the command line builds a flag for every setting.
 
-    Parameters
-    ----------
-    shown : function of a setting's key
-        Whether the help names the setting; its flag works either way.
-    own : mapping of keys
-        Defaults that a verb has of its own, for the help.
+    `shown` says whether the help lists a setting; its flag works either way. `own` holds defaults
+    that a verb has of its own, for the help.
 
-    Returns
-    -------
-    type
-        Nested typed dictionary without required keys: what a flag does not give, is not there.
-
-    Examples
-    --------
     >>> sorted(setting_flags().__annotations__)[:3]
     ['air', 'association', 'assumed']
     """
@@ -82,8 +71,8 @@ def setting_flags(
     for key, field in known_settings().items():
         value = own.get(key, field.default)
         default = value if isinstance(value, tuple) else (value,)
-        told = [str(one).lower() if isinstance(one, bool) else str(one) for one in default]
-        settled = "" if value is None else f"[default: {' '.join(told)}]"
+        texts = [str(item).lower() if isinstance(item, bool) else str(item) for item in default]
+        settled = "" if value is None else f"[default: {' '.join(texts)}]"
         words = f"{field.description or ''} {settled}"
         flag = Parameter(help=" ".join(words.split()), show=shown(key), negative=())
         kind: Any = Whole if field.annotation is int else _unbounded(field.annotation)
@@ -116,7 +105,7 @@ def _unbounded(kind: Any) -> Any:
 
 
 def _section_group(section: str) -> Group:
-    """Title a section of settings in the help, in the order of `Config`."""
+    """Return the heading of a section of settings in the help, in the order of `Config`."""
     order = list(Config.model_fields).index(section)
     meaning = type(getattr(Config(), section)).__doc__ or ""
     return Group(f"Settings: {section}", help=" ".join(meaning.split()), sort_key=order)
@@ -130,7 +119,7 @@ else:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutputOptions:
-    """Where the results go, and what else is made of them."""
+    """Options for the output of a mission."""
 
     output: Annotated[
         Path | None,
@@ -152,7 +141,7 @@ class OutputOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MissionOptions:
-    """What a simulated mission is made of."""
+    """Options for the world of a simulated mission."""
 
     config: Annotated[
         Path | None,
@@ -196,23 +185,6 @@ class MissionOptions:
 def mission_config(options: MissionOptions) -> tuple[Config, "World | None"]:
     """Resolve the settings of a mission: defaults < world < file < environment < flags.
 
-    Parameters
-    ----------
-    options : MissionOptions
-
-    Returns
-    -------
-    Config
-    World or None
-        The one that the settings name.
-
-    Raises
-    ------
-    InputError
-        An unknown setting or a refused value, a setting given twice, less than one frame.
-
-    Examples
-    --------
     >>> config, _ = mission_config(MissionOptions(duration=60.0))
     >>> config.scenario.steps
     480
@@ -235,17 +207,6 @@ def mission_config(options: MissionOptions) -> tuple[Config, "World | None"]:
 def layers(config: Path | None, settings: SettingFlags | None) -> Layer:
     """Lay file, environment and flags over each other.
 
-    Parameters
-    ----------
-    config : Path, optional
-    settings : nested dict, optional
-
-    Returns
-    -------
-    Layer
-
-    Examples
-    --------
     >>> layers(None, {"seed": 3})["seed",].value
     3
     """
@@ -256,25 +217,8 @@ def layers(config: Path | None, settings: SettingFlags | None) -> Layer:
 
 
 def filters(chosen: ChosenFilter, particles: int | None) -> tuple[str, ...]:
-    """Name the filters of a choice.
+    """Return the names of the estimators of a choice; refuse particles for filters without them.
 
-    Parameters
-    ----------
-    chosen : names of estimators, parted by commas, or that of a group
-    particles : int, optional
-        As asked for by the short name.
-
-    Returns
-    -------
-    tuple of str
-
-    Raises
-    ------
-    InputError
-        Particles for a filter that has none, or an estimator from outside that is not there.
-
-    Examples
-    --------
     >>> filters("both", 300), filters("ekf", None)
     (('ekf', 'fastslam'), ('ekf',))
     """

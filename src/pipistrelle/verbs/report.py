@@ -31,26 +31,26 @@ def report(
 
     target = folder / "report" if output is None else output
     study = read_study(folder)
-    told = write_report(
+    summary = write_report(
         study, target, progress=lambda name: None if quiet else say(f"Drawing {name} ...")
     )
     if not quiet:
-        if told["partial"]:
-            put(f"partial: {told['worlds_done']} of {told['worlds_planned']} worlds")
-        if count := told["trials_failed"]:
+        if summary["partial"]:
+            put(f"partial: {summary['worlds_done']} of {summary['worlds_planned']} worlds")
+        if count := summary["trials_failed"]:
             put(f"failed: {count} trial{'' if count == 1 else 's'}; see the page")
-        if not told["claims"]:
-            for sentence in told["answer"]:
+        if not summary["claims"]:
+            for sentence in summary["answer"]:
                 put(sentence)
-            for table in told["effect_tables"]:
+            for table in summary["effect_tables"]:
                 put("\n" + _effects(table))
             put(f"\n*: shown. {INTERVALS}")
-            if (count := told["worlds_done"]) < FEW:
+            if (count := summary["worlds_done"]) < FEW:
                 worlds = "1 world" if count == 1 else f"{count} worlds"
                 put(f"This is of {worlds}: so few may show what others would not.")
-        elif line := not_the_papers_line(told["not_the_papers"]):
+        elif line := not_the_papers_line(summary["not_the_papers"]):
             put(line)
-        for claim in told["claims"]:
+        for claim in summary["claims"]:
             put(f"{claim['claim']}  {claim['verdict'].replace('-', ' '):<15} {claim['sentence']}")
             if claim["verdict"] == "open":
                 put(f"{'':<18} {_why(claim)}")
@@ -84,5 +84,5 @@ def _effects(table: dict[str, Any]) -> str:
 def _why(claim: dict[str, Any]) -> str:
     """Say why a claim is open, and how much of it is undecided."""
     parts = claim["by_exclusion"]["world"]["parts"]
-    found = [finding["holds"] for part in parts for finding in part["findings"]]
-    return f"{claim['rule']} Undecided: {found.count(None)} of {len(found)} statements."
+    answers = [finding["holds"] for part in parts for finding in part["findings"]]
+    return f"{claim['rule']} Undecided: {answers.count(None)} of {len(answers)} statements."

@@ -1,6 +1,7 @@
 """`pipistrelle run`: one random world, by sound, to a map."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -8,7 +9,7 @@ from cyclopts import Parameter
 
 from pipistrelle.config import InputError
 from pipistrelle.own_files import LOG, WORLD, Kind, OwnFiles, claim
-from pipistrelle.scripting.asking import named_strategies
+from pipistrelle.scripting.arguments import named_strategies
 from pipistrelle.verbs.options import (
     Chosen,
     ChosenFilter,
@@ -21,7 +22,7 @@ from pipistrelle.verbs.options import (
 if TYPE_CHECKING:
     from pipistrelle.detection.logs.recording import Log, LogCaller
     from pipistrelle.detection.scans import Scan
-    from pipistrelle.experiments.runs.trial import Mission
+    from pipistrelle.experiments.runs.mission import Mission
 
 
 def run(
@@ -54,7 +55,7 @@ def run(
 ) -> int:
     """Drive through one random world and map it, the three strategies side by side."""
     mission, output = mission or MissionOptions(), output or OutputOptions()
-    config, known = mission_config(mission)
+    config, own_world = mission_config(mission)
     ways = filters(estimator, mission.particles)
     _check_apart(output=output.output, save_log=save_log, save_world=save_world)
     log = _claimed("--save-log", save_log, LOG, output.overwrite)
@@ -62,32 +63,28 @@ def run(
     from pipistrelle.experiments.hearing.world_folder import world_files
     from pipistrelle.scripting.missions import simulated
     from pipistrelle.verbs import delivery
-    from pipistrelle.verbs.console import progress
-    from pipistrelle.verbs.streams import warn
 
-    with delivery.result_folder(output, "run") as own:
-        delivery.get_ready(output)
-        watch, chosen = delivery.recorder(output), named_strategies(strategy)
-        with progress(output.quiet) as show:
-            done, heard = simulated(config, chosen, ways, known, progress=show, watch=watch)
-        warn(*done.said)
+    def save(mission: "Mission") -> None:
         if world is not None:
-            world.replace(world_files(heard.scenario, config))
+            assert mission.scenario is not None
+            world.replace(world_files(mission.scenario, config))
         if log is not None:
-            scans = {trial.strategy: trial.heard for trial in done.trials}
-            log.replace(_log_files(heard, scans.get("fused", done.trials[0].heard)))
-        return delivery.deliver(own, done, output, watch)
+            scans = {trial.strategy: trial.heard for trial in mission.trials}
+            log.replace(_log_files(mission, scans.get("fused", mission.trials[0].heard)))
+
+    conduct = partial(simulated, config, named_strategies(strategy), ways, own_world)
+    return delivery.conduct(conduct, output, "run", save)
 
 
 def _claimed(flag: str, folder: Path | None, kind: Kind, overwrite: bool) -> OwnFiles | None:
-    """Accept a folder that a flag names besides that of the results."""
+    """Claim the folder that a flag names beside that of the results."""
     if folder is None:
         return None
     return claim(folder, kind, overwrite=overwrite, flags=(f"{flag} DIR", "--overwrite"))
 
 
 def _check_apart(**folders: Path | None) -> None:
-    """Refuse to write two things into one folder, by the flags that name it."""
+    """Refuse flags that name the same folder."""
     seen: dict[Path, str] = {}
     for name, folder in folders.items():
         flag = f"--{name.replace('_', '-')}"
@@ -141,12 +138,13 @@ def _log(mission: "Mission", scans: "Sequence[Scan]") -> "Log":
 
 
 def _log_callers(mission: "Mission") -> "tuple[LogCaller, ...]":
-    """Return whoever else called, as a log names them."""
+    """Return the callers besides the vehicle, as a log lists them."""
     from pipistrelle.acoustics.callers import moves
     from pipistrelle.detection.logs.recording import LogCaller
     from pipistrelle.experiments.hearing.scenario import caller_labels
 
     world = mission.scenario
+    assert world is not None
     labelled = zip(world.callers[1:], caller_labels(world)[1:].tolist(), strict=True)
     return tuple(
         LogCaller(name=caller.name, landmark=label, moves=moves(caller))

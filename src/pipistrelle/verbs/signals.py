@@ -1,4 +1,4 @@
-"""Signals that ask for an end: Ctrl-C, and what a scheduler of jobs sends before it kills."""
+"""Signals that ask for an end: Ctrl-C, and those that a job scheduler sends before it kills."""
 
 import signal
 from collections.abc import Iterator
@@ -18,20 +18,11 @@ class Interrupted(KeyboardInterrupt):
 
 @contextmanager
 def heard_signals(*, last: bool = False) -> Iterator[list[int]]:
-    """Let signals that ask for an end interrupt what is done, so that it is ended in order.
+    """Let signals that ask for an end interrupt the work, so that it ends in order.
 
-    Parameters
-    ----------
-    last : bool
-        Whether nothing is left to be interrupted afterwards: signals are then ignored.
+    Yields the signals so far: a library may hide the interruption behind an error of its own. If
+    this is the last work, signals are ignored afterwards.
 
-    Yields
-    ------
-    list of int
-        Those that were heard. A library may hide the interruption behind an error of its own.
-
-    Examples
-    --------
     >>> from contextlib import suppress
     >>> with suppress(KeyboardInterrupt), heard_signals() as heard:
     ...     signal.raise_signal(signal.SIGTERM)

@@ -1,4 +1,4 @@
-"""Standard output and error, which may be closed, full, or left by their reader.
+"""Standard output and error, which may be closed, be full, or have no reader any more.
 
 What a person reads never decides what becomes of the work: a word that cannot be said is not said,
 and the exit status tells what was done.
@@ -13,13 +13,11 @@ from typing import TextIO
 
 
 def hold_streams() -> None:
-    """Put something in the place of streams that are closed; let names be printed by their bytes.
+    """Open something in place of standard streams that are closed; print odd names by their bytes.
 
-    A file that is opened gets the number of a stream that is closed, and what is meant for the
-    stream would be written into it.
+    Otherwise the next file that is opened would get the number of a closed stream, and what is
+    meant for the stream would be written into it.
 
-    Examples
-    --------
     >>> hold_streams()
     """
     for number in range(3):
@@ -36,7 +34,7 @@ def hold_streams() -> None:
 
 
 def _as_bytes(error: UnicodeError) -> tuple[str | bytes, int]:
-    """Print a name by its bytes, and a character that the stream has not by its number."""
+    """Encode a name as its bytes, and a character that the stream lacks as its number."""
     try:
         return codecs.lookup_error("surrogateescape")(error)
     except UnicodeError:
@@ -44,14 +42,8 @@ def _as_bytes(error: UnicodeError) -> tuple[str | bytes, int]:
 
 
 def say(message: str) -> None:
-    """Write a line to standard error at once, if anybody can read it; no character commands.
+    """Write a line to standard error at once, if it is open, without control characters.
 
-    Parameters
-    ----------
-    message : str
-
-    Examples
-    --------
     >>> say("Drawing mission.gif ...")
     """
     text = "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in message)
@@ -63,14 +55,8 @@ def say(message: str) -> None:
 
 
 def warn(*messages: str) -> None:
-    """Say what a user should know of a result, though there is one.
+    """Print warnings about a result that was written nevertheless.
 
-    Parameters
-    ----------
-    messages : str
-
-    Examples
-    --------
     >>> warn("the beam is wider than the world")
     """
     for message in messages:
@@ -78,13 +64,7 @@ def warn(*messages: str) -> None:
 
 
 def flush_results() -> None:
-    """Write to standard output what waits there, unless its reader has left.
-
-    Raises
-    ------
-    OSError
-        Where there is no room for it.
-    """
+    """Write out what standard output still holds, unless its reader has left."""
     try:
         sys.stdout.flush()
     except OSError as error:
@@ -96,18 +76,6 @@ def flush_results() -> None:
 def put(*values: object, end: str = "\n") -> None:
     """Write a result to standard output, unless its reader has left.
 
-    Parameters
-    ----------
-    values : object
-    end : str
-
-    Raises
-    ------
-    OSError
-        Where there is no room for it.
-
-    Examples
-    --------
     >>> put("runs/one")
     runs/one
     """
@@ -118,7 +86,7 @@ def put(*values: object, end: str = "\n") -> None:
 
 
 def _silence(stream: TextIO) -> None:
-    """Send what a stream still holds, and all that is to come, nowhere."""
+    """Discard what a stream still holds, and all that follows."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, stream.fileno())
     os.close(nowhere)

@@ -1,4 +1,4 @@
-"""`pipistrelle study`: many worlds, and in each all that a plan varies."""
+"""`pipistrelle study`: all cases of a plan in many worlds."""
 
 import shlex
 import sys
@@ -136,7 +136,7 @@ def _close(so_far: "StudyProgress", folder: Path, quiet: bool) -> int:
 
 
 def _share(text: str | None) -> tuple[int, int]:
-    """Read which share of the worlds to do."""
+    """Read the share I/N of the worlds."""
     i, slash, n = (text or "0/1").partition("/")
     if slash and i.isdecimal() and n.isdecimal() and int(i) < int(n):
         return int(i), int(n)
@@ -208,12 +208,12 @@ def _lines() -> Show:
         left = pace(so_far)
         if perf_counter() >= due or so_far.done == so_far.worlds:
             due = perf_counter() + EVERY
-            told = [
+            trials = [
                 f"{name} {ended}/{so_far.trials[name]}{_failures(so_far.failed[name])}"
                 for name, ended in so_far.ended.items()
             ]
             worlds = f"{so_far.done}/{so_far.worlds} worlds"
-            say(", ".join([worlds, *([left] if left else [])]) + "; trials: " + ", ".join(told))
+            say(", ".join([worlds, *([left] if left else [])]) + "; trials: " + ", ".join(trials))
 
     return show
 
@@ -247,12 +247,12 @@ def _bars() -> Iterator[Show]:
 
 
 def _failures(number: int) -> str:
-    """Word how many trials failed, if any did."""
+    """Return the number of failed trials as text, if any failed."""
     return f" ({number} failed)" if number else ""
 
 
 def _pace() -> Callable[["StudyProgress"], str]:
-    """Return what words the speed since the first call, and the time left."""
+    """Return a function that words the speed since its first call, and the time left."""
     began: tuple[float, int] | None = None
 
     def pace(so_far: "StudyProgress") -> str:
@@ -268,7 +268,7 @@ def _pace() -> Callable[["StudyProgress"], str]:
 
 
 def _span(seconds: float) -> str:
-    """Word a length of time."""
+    """Return a duration as text."""
     minutes = round(seconds / 60.0)
     if seconds < 100.0:
         return f"{seconds:.0f} s"

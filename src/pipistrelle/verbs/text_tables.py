@@ -1,4 +1,4 @@
-"""Tables for a person: drawn on a terminal, plain columns everywhere else."""
+"""Tables as text: with lines on a terminal, in plain columns elsewhere."""
 
 import io
 import shutil
@@ -7,22 +7,8 @@ from collections.abc import Sequence
 
 
 def text_table(title: str, heads: Sequence[Sequence[str]], rows: Sequence[Sequence[str]]) -> str:
-    """Lay out a table, its first column to the left and all others to the right.
+    """Lay out a table as text, its first column to the left and all others to the right.
 
-    Parameters
-    ----------
-    title : str
-    heads : sequence of rows of text
-        One line or more, as long as the rows.
-    rows : sequence of rows of text
-
-    Returns
-    -------
-    str
-        Without a line's end.
-
-    Examples
-    --------
     >>> print(text_table("", [["", "A", "B"]], [["NEES", "2.1", "10.0"]]))
             A     B
     NEES  2.1  10.0

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 PAGE = "view.html"
 """Name of the page in a result folder."""
 REST = 3
-"""Frames for which a smoother, which solves all anew for it, is not asked for its map."""
+"""Of a smoother, the map is asked for once in so many frames, as each takes a full solution."""
 
 
 def view(
@@ -91,10 +91,10 @@ def _play_again(
     folder: Path, log: Path | None, trusted: tuple[str, ...], quiet: bool
 ) -> "Playback":
     """Do the mission again, and lay out what was seen of it."""
-    from pipistrelle.experiments.runs.again import again
+    from pipistrelle.experiments.runs.rerun import rerun
     from pipistrelle.figures.player.playback import playback
     from pipistrelle.figures.recorder import MissionRecorder
-    from pipistrelle.scripting.asking import named_filters
+    from pipistrelle.scripting.arguments import named_filters
     from pipistrelle.verbs import delivery
     from pipistrelle.verbs.console import progress
     from pipistrelle.verbs.options import OutputOptions
@@ -104,10 +104,10 @@ def _play_again(
     watch = MissionRecorder(rest=REST)
     with progress(quiet) as show:
         named = named_filters(trusted, "--filter") if trusted else ()
-        done = again(folder, log=log, trusted=named, progress=show, watch=watch)
-    if done.difference:
-        warn(f"{done.difference}; what is shown is found now")
-    return playback(done, watch.snapshots)
+        mission = rerun(folder, log=log, trusted=named, progress=show, watch=watch)
+    if mission.difference:
+        warn(f"{mission.difference}; what is shown is found now")
+    return playback(mission, watch.snapshots)
 
 
 def _check_place(path: Path, folder: Path, ending: str, option: str, overwrite: bool) -> None:

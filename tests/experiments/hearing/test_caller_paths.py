@@ -26,7 +26,7 @@ from pipistrelle.experiments.hearing.scenario import (
     world_of,
 )
 from pipistrelle.experiments.hearing.trajectories import course_of, driven, motion_of
-from pipistrelle.experiments.runs.trial import drive_of, scans_of
+from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
 from pipistrelle.geometry import wrap
 from pipistrelle.settings import from_flags, resolve
 

@@ -11,7 +11,7 @@ from pipistrelle.experiments.hearing.clocks import calls_heard, with_times
 from pipistrelle.experiments.hearing.frames import frames_of
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
-from pipistrelle.experiments.runs.trial import drive_of, scans_of
+from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
 from pipistrelle.geometry import path_at, wrap
 from pipistrelle.settings import from_flags, resolve
 

@@ -25,7 +25,7 @@ from pipistrelle.experiments.hearing.world_folder import (
     settled,
     world_files,
 )
-from pipistrelle.experiments.runs.preparing import prepared
+from pipistrelle.experiments.runs.validate_mission import checked_scenario
 from pipistrelle.own_files import WORLD, OwnFiles
 from pipistrelle.settings import from_flags, resolve
 
@@ -257,7 +257,7 @@ def test_there_may_be_nobody_else_who_calls(tmp_path):
     config = Config(scenario=ScenarioConfig(steps=8, landmarks=5))
     scenario = heard(config, world)
     assert [caller.name for caller in scenario.callers] == ["vehicle"]
-    assert len(prepared(config, world=world).callers) == 1
+    assert len(checked_scenario(config, world=world).callers) == 1
 
 
 def test_a_header_alone_says_that_nothing_reflects(tmp_path):

@@ -12,7 +12,8 @@ from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import NO_TRUTH, Truth
 from pipistrelle.experiments.hearing.scenario import world_of
 from pipistrelle.experiments.results.scores import drive_bound, position_floor, with_bound
-from pipistrelle.experiments.runs.trial import drive_of, run_trial
+from pipistrelle.experiments.runs.heard_world import drive_of
+from pipistrelle.experiments.runs.trial import run_trial
 from reference.ekf_slam import moved as driven
 from reference.missions import scan_with
 

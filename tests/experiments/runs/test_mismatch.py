@@ -8,7 +8,8 @@ from pipistrelle.config import AssumedConfig, Config, FilterConfig, MotionConfig
 from pipistrelle.evaluation.bound import bound_of_drawn_start, pose_bound
 from pipistrelle.experiments.hearing.scenario import assumed_motion, standing_landmarks, world_of
 from pipistrelle.experiments.hearing.trajectories import motion_of
-from pipistrelle.experiments.runs.trial import drive_of, run_mission, scans_of
+from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
+from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.experiments.studies.plan import Plan
 from pipistrelle.experiments.studies.world import heard_together, run_world
 

@@ -339,7 +339,7 @@ def test_what_is_not_listened_for_is_as_if_it_had_not_been_recorded():
     log = replace(log, scans=(timed,))
     for timing, rows in ((True, 4), (False, 3)):
         config = Config(listening=ListeningConfig(timing=timing))
-        (trial,) = replay(log, NO_TRUTH, ["fused"], ["ekf"], None, config)
+        (trial,) = replay(log, NO_TRUTH, ["fused"], ["ekf"], None, config).trials
         (scan,) = trial.scans
         assert scan.landmark.size == rows
         assert np.isnan(scan.detour).all() != timing
@@ -410,7 +410,7 @@ def replayed(log, noise, estimator="ekf"):
     """Replay a log as `pipistrelle slam` does, which takes the constants from it."""
     constants = {"range_std": log.range_std, "bearing_std": log.bearing_std}
     config = Config(filter=FilterConfig(noise=noise, **constants))
-    (trial,) = replay(log, NO_TRUTH, ["fused"], [estimator], None, config)
+    (trial,) = replay(log, NO_TRUTH, ["fused"], [estimator], None, config).trials
     return trial
 
 
@@ -483,7 +483,7 @@ def test_the_place_of_a_logs_caller_places_what_it_lights_up(estimator):
     for known in (True, False):
         callers = (caller if known else replace(caller, place=None),)
         log = replace(looks((0.0, 0.1, 0.1)), callers=callers, scans=(scan,))
-        (trial,) = replay(log, NO_TRUTH, ["fused"], [estimator], None, config)
+        (trial,) = replay(log, NO_TRUTH, ["fused"], [estimator], None, config).trials
         rows = trial.track.landmarks
         assert (9 in rows.landmark) == known
         for label, post in zip((1, 2, 3), posts, strict=True):

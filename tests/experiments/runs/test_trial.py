@@ -25,7 +25,8 @@ from pipistrelle.experiments.hearing.scenario import draw_scenario
 from pipistrelle.experiments.hearing.trajectories import motion_of
 from pipistrelle.experiments.results.scores import score_path
 from pipistrelle.experiments.runs.filtering import run_filter
-from pipistrelle.experiments.runs.trial import drive_of, run_mission, run_trial, scans_of
+from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
+from pipistrelle.experiments.runs.trial import run_mission, run_trial
 from reference.missions import map_with, scan_with
 
 SHORT = Config(scenario=ScenarioConfig(steps=80))

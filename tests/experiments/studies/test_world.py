@@ -12,8 +12,9 @@ from pipistrelle.evaluation.bound import nees_of_exact_start, pose_bound
 from pipistrelle.evaluation.consistency import nees
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
-from pipistrelle.experiments.runs import trial
-from pipistrelle.experiments.runs.trial import drive_of, run_mission, run_trial, scans_of
+from pipistrelle.experiments.runs import heard_world
+from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
+from pipistrelle.experiments.runs.trial import run_mission, run_trial
 from pipistrelle.experiments.studies import world
 from pipistrelle.experiments.studies.plan import Plan, cases_of
 from pipistrelle.experiments.studies.world import failed_records, run_world, world_tables
@@ -490,17 +491,18 @@ def test_hearing_more_never_raises_the_bound(bounded):
 def test_twice_the_noise_that_the_signal_tells_raises_the_bound_and_no_constant_does(
     plan, monkeypatch
 ):
-    def doubled(*given, **named):
-        rows, stds = known(*given, **named), ("bearing_std", "range_std")
-        return with_columns(rows, **{name: 2.0 * getattr(rows, name) for name in stds})
+    def doubled(rows, settings, *, timing):
+        rows = as_told(rows, settings, timing=timing)
+        more = {name: 2.0 * getattr(rows, name) for name in ("bearing_std", "range_std")}
+        return with_columns(rows, **more)
 
-    known, short = trial.as_told, replace(plan, strategies=("active",), filters=("ekf",))
+    as_told, short = heard_world.as_told, replace(plan, strategies=("active",), filters=("ekf",))
     before = run_world(short, 0)
     coarse = short.config.filter.model_copy(update={"range_std": 0.4, "bearing_std": 0.3})
     stated = replace(short, config=short.config.model_copy(update={"filter": coarse}))
-    monkeypatch.setattr(trial, "as_told", doubled)
+    monkeypatch.setattr(heard_world, "as_told", doubled)
     after = run_world(short, 0)
-    monkeypatch.setattr(trial, "as_told", known)
+    monkeypatch.setattr(heard_world, "as_told", as_told)
     pairs = zip(before, after, strict=True)
     share = [b.scores.heading_bound_rad / a.scores.heading_bound_rad for a, b in pairs]
     assert max(share) > 1.03

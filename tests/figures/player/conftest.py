@@ -6,7 +6,7 @@ import pytest
 
 from pipistrelle.config import Config, ScenarioConfig
 from pipistrelle.experiments.results.writing import write_results
-from pipistrelle.experiments.runs.again import again
+from pipistrelle.experiments.runs.rerun import rerun
 from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.figures.player.playback import playback
 from pipistrelle.figures.recorder import MissionRecorder
@@ -26,7 +26,7 @@ def watched(tmp_path_factory):
         truth=first.drive.truth, ignored_rows={},
     )  # fmt: skip
     watch = MissionRecorder(rest=3)
-    return again(folder, watch=watch), watch.snapshots
+    return rerun(folder, watch=watch), watch.snapshots
 
 
 @pytest.fixture(scope="session")

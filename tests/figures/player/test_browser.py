@@ -342,7 +342,8 @@ def test_a_landmarks_life_is_a_line_that_grows_thick_when_it_is_placed(desk, pla
 
 def test_without_truth_no_error_is_told(browser, watched, tmp_path):
     done, snapshots = watched
-    blind = replace(done, truth=NO_TRUTH, callers=(), beamwidth=None)
+    drive = replace(done.drive, truth=NO_TRUTH)
+    blind = replace(done, drive=drive, callers=(), beamwidth=None)
     fused = {("fused", "ekf"): snapshots["fused", "ekf"]}
     path = tmp_path / "view.html"
     path.write_text(written_page(playback(blind, fused)), encoding="utf-8")

@@ -68,13 +68,13 @@ def with_detour(scan):
 def test_times_are_those_since_the_start_and_the_truth_is_that_of_the_frames(watched, played):
     done, _ = watched
     np.testing.assert_allclose(played.time, 0.5 * np.arange(1, 41))
-    np.testing.assert_array_equal(played.true_pose, done.truth.path[4::4])
-    np.testing.assert_array_equal(played.true_start, done.truth.path[0])
+    np.testing.assert_array_equal(played.true_pose, done.drive.truth.path[4::4])
+    np.testing.assert_array_equal(played.true_start, done.drive.truth.path[0])
     assert played.title == "Mission of seed 7"
     assert played.facts == ("20.0 s", "40 frames", "beam 33°", "21 landmarks")
     ((label, name, place),) = played.callers
     assert (label, name) == (21, "beacon")
-    np.testing.assert_array_equal(place, done.truth.landmarks[1][-1])
+    np.testing.assert_array_equal(place, done.drive.truth.landmarks[1][-1])
 
 
 def test_the_spread_is_that_of_the_pose(watched, played):
@@ -118,7 +118,7 @@ def test_of_a_long_recording_frames_are_chosen_evenly_and_the_last_is_among_them
     chosen = [round(2 * t) - 1 for t in few.time]
     expected = [frames[i].pose for i in chosen]
     np.testing.assert_array_equal(of(few, "fused", "ekf").pose, expected)
-    np.testing.assert_array_equal(few.true_pose, done.truth.path[[4 * i + 4 for i in chosen]])
+    np.testing.assert_array_equal(few.true_pose, done.drive.truth.path[[4 * i + 4 for i in chosen]])
 
 
 def test_an_estimate_that_ended_early_stays_where_it_was(watched):
@@ -140,7 +140,9 @@ def test_estimates_without_a_frame_are_left_out_and_none_at_all_is_refused(watch
 
 def test_without_truth_there_is_none_and_the_map_is_around_what_is_estimated(watched):
     done, snapshots = watched
-    blind = playback(replace(done, truth=NO_TRUTH, callers=()), snapshots)
+    blind = playback(
+        replace(done, drive=replace(done.drive, truth=NO_TRUTH), callers=()), snapshots
+    )
     assert (blind.true_pose, blind.true_start, blind.landmarks) == (None, None, None)
     assert "no truth known" in blind.facts
     (left, right), (bottom, top) = blind.limits
@@ -158,9 +160,9 @@ def far_away(done, snapshots, shift):
         return shifted
 
     truth = replace(
-        done.truth,
-        path=moved(done.truth.path),
-        landmarks=(done.truth.landmarks[0], moved(done.truth.landmarks[1])),
+        done.drive.truth,
+        path=moved(done.drive.truth.path),
+        landmarks=(done.drive.truth.landmarks[0], moved(done.drive.truth.landmarks[1])),
     )
     callers = tuple(replace(caller, place=moved(caller.place)) for caller in done.callers)
     trials = []
@@ -180,7 +182,9 @@ def far_away(done, snapshots, shift):
         ]
         for key, frames in snapshots.items()
     }
-    return replace(done, truth=truth, callers=callers, trials=tuple(trials)), seen
+    return replace(
+        done, drive=replace(done.drive, truth=truth), callers=callers, trials=tuple(trials)
+    ), seen
 
 
 def test_a_world_far_from_where_coordinates_begin_is_shown_about_another_origin(watched, played):
@@ -302,7 +306,7 @@ def test_a_logs_callers_have_names_and_no_true_place(watched):
     done, snapshots = watched
     log = SimpleNamespace(name="own", callers=(LogCaller(name="mate", landmark=21),))
     ((label, name, place),) = playback(
-        replace(done, log=log, mission=None, callers=()), snapshots
+        replace(done, log=log, scenario=None, callers=()), snapshots
     ).callers
     assert (label, name) == (21, "mate")
     assert np.isnan(place).all()

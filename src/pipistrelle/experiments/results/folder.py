@@ -1,4 +1,4 @@
-"""The folder that results go to: the one that was named, or a new one under ``runs``."""
+"""The folder for results: the one that the user named, or a new one under ``runs``."""
 
 import contextlib
 import os
@@ -21,28 +21,12 @@ _OURS = re.compile(r"\d{8}-\d{6}-(run|slam)(-\d+)?")
 def result_folder(
     path: Path | None, name: str, *, overwrite: bool, flags: tuple[str, str] = COMMAND_LINE
 ) -> Iterator[OwnFiles]:
-    """Lend the folder that the results go to; nothing is left of it if there come to be none.
+    """Lend the folder for the results; if there are none in the end, nothing is left of it.
 
     Without a path it is ``runs/<time>-<name>``, and once it is whole ``runs/latest`` points at it,
-    where the file system has symbolic links and nobody else's file has that name.
+    where the file system has symbolic links and no other file has that name. Earlier results stay
+    until the new ones are whole.
 
-    Parameters
-    ----------
-    path : Path, optional
-    name : "run" or "slam"
-        What runs.
-    overwrite : bool
-        Whether earlier results may be replaced. They stay until the new ones are whole.
-    flags : str, str
-        As of `pipistrelle.own_files.claim`.
-
-    Raises
-    ------
-    InputError
-        As `pipistrelle.own_files.claim`.
-
-    Examples
-    --------
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as parent:
     ...     with result_folder(Path(parent) / "one", "run", overwrite=False) as own:
@@ -81,7 +65,7 @@ def _new_folder(name: str) -> list[Path]:
 
 
 def _point_latest_at(folder: Path) -> None:
-    """Have ``runs/latest`` point at a folder, unless it is somebody else's."""
+    """Let ``runs/latest`` point at a folder, unless a file that is not ours has that name."""
     latest = folder.parent / "latest"
     if os.path.lexists(latest) and not (
         latest.is_symlink() and _OURS.fullmatch(str(latest.readlink()))

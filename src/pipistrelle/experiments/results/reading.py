@@ -1,4 +1,4 @@
-"""What a result folder says of itself, and what a folder is that is no such folder."""
+"""The summary of a result folder, read and checked; any other folder is refused."""
 
 from pathlib import Path
 from typing import Literal
@@ -15,80 +15,41 @@ SUMMARY = "summary.json"
 
 
 class RunEntry(BaseModel):
-    """An estimate of the summary, under the keys of ``summary.json``.
-
-    Attributes
-    ----------
-    strategy : "active", "fused" or "passive"
-    filter : str
-        The estimator's name.
-    """
+    """An estimate of the summary, under the keys of ``summary.json``."""
 
     strategy: Strategy
     filter: str
+    """The estimator's name."""
 
 
 class LogEntry(BaseModel):
-    """Which log was solved.
-
-    Attributes
-    ----------
-    path : str
-        The folder.
-    robot : int or str, or None
-        Whose of several.
-    beamwidth_rad : [rad] or None
-        Outside which ranges were hidden.
-    files : dict of str to str
-        The SHA-256 of each file that was read, or might have been.
-    """
+    """The recorded log that was solved."""
 
     path: str
+    """The folder."""
     robot: Robot | None
+    """The robot, where the log is of several."""
     beamwidth_rad: float | None
+    """Ranges outside a beam of this width were hidden [rad]."""
     files: dict[str, str]
+    """The SHA-256 of each file that was read, or might have been."""
 
 
 class Summary(BaseModel):
-    """What must be known of a mission for it to be done again.
-
-    Attributes
-    ----------
-    format : int
-    version : str
-        Of the package that wrote it.
-    config_hash : str
-    runs : list of RunEntry
-    log : LogEntry or None
-        None where the mission was simulated.
-    """
+    """What ``summary.json`` says that is needed to do a mission again."""
 
     format: Literal[1]
     version: str
+    """The version of the package that wrote it."""
     config_hash: str
     runs: list[RunEntry]
     log: LogEntry | None = None
+    """None where the mission was simulated."""
 
 
 def read_summary(folder: Path) -> Summary:
-    """Read what a result folder says of itself.
+    """Read the summary of a result folder; refuse a folder that is none, and say what it is.
 
-    Parameters
-    ----------
-    folder : Path
-
-    Returns
-    -------
-    Summary
-
-    Raises
-    ------
-    InputError
-        Where it is no folder of results, with what it is; where its summary lacks something or
-        holds no estimate.
-
-    Examples
-    --------
     >>> read_summary(Path("nowhere"))
     Traceback (most recent call last):
     pipistrelle.config.InputError: nowhere: found no such folder, expected the result folder of
@@ -117,7 +78,7 @@ def read_summary(folder: Path) -> Summary:
 
 
 def _no_results(folder: Path) -> InputError:
-    """Say what a folder is, if not that of a mission's results, and what to do."""
+    """Return the refusal of a folder without results: what it is, and what to do."""
     expected = "the result folder of `pipistrelle run` or `pipistrelle slam`"
     if not folder.is_dir():
         found = "a file" if folder.exists() else "no such folder"

@@ -100,72 +100,40 @@ class Scores:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrialResult:
-    """One estimate: what a strategy heard, what a filter made of it, and how good that is.
-
-    Attributes
-    ----------
-    strategy : "active", "fused" or "passive"
-    filter : str
-        The estimator's name.
-    track : Track
-    heard : tuple of Scan
-        Of its strategy, one per frame, empty ones included: the same whatever the filter.
-    scans : tuple of Scan
-        As the filter had them, likewise: perhaps without callers that move.
-    scores : Scores
-    wall_s : [s]
-        Time that the estimate took.
-    online : PathScores or None
-        Of the path as it was believed at its time, where the filter revises it.
-    error : str or None
-        What the filter failed with; then its path is not a number anywhere.
-    """
+    """One estimate: the scans of a strategy, the track and map of a filter, and their scores."""
 
     strategy: str
     filter: str
+    """The estimator's name."""
     track: Track
     heard: tuple[Scan, ...]
+    """Scans of the strategy, one per frame, empty ones included; the same for every filter."""
     scans: tuple[Scan, ...]
+    """The scans as the filter had them, perhaps without callers that move."""
     scores: Scores
     wall_s: float
+    """Time that the estimate took."""
     online: PathScores | None = None
+    """Scores of the path as it was believed at its time, where the filter revises it."""
     error: str | None = None
+    """The error with which the filter failed; its path is then NaN."""
 
 
 def is_placed(trial: TrialResult) -> bool:
-    """Whether a trial's path is somewhere, all along; else its failure says enough."""
+    """Return whether the path of a trial is finite everywhere."""
     return bool(np.isfinite(trial.track.pose.mean).all())
 
 
 @np.errstate(over="ignore", invalid="ignore")
 def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Scores:
-    """Score a track and its map against the truth.
+    """Score a track and its map against the truth, at the same times.
 
-    Parameters
-    ----------
-    track : Track of k poses, the start first
-    truth : Truth
-        At the times of the track; what is not known is not scored.
-    scans : sequence of Scan
-        What the filter was given: one per frame, empty ones included.
-    limit : float
-        A NEES above it means divergence.
-
-    Returns
-    -------
-    Scores
-
-    Raises
-    ------
-    ValueError
-        Where track and truth differ in length.
+    The scans are those that the filter was given. A NEES above the limit means divergence.
 
     Notes
     -----
     Bradley & Abaid, Eqs. (23), (26) and (27) and Sec. V-A.
 
-    Examples
-    --------
     >>> from pipistrelle.estimation.beliefs import Gaussian, no_landmarks
     >>> pose = Gaussian(mean=np.zeros((2, 3)), covariance=np.tile(np.eye(3), (2, 1, 1)))
     >>> still = Track(time=np.arange(2.0), pose=pose, landmarks=no_landmarks(), gated=0)
@@ -207,7 +175,7 @@ def score(track: Track, truth: Truth, scans: Sequence[Scan], limit: float) -> Sc
 def _followed(
     track: Track, truth: Truth
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-    """Return where callers that move were believed to be, all together, and where they were."""
+    """Return the estimated and the true positions of all callers that move, row by row [m]."""
     both = [
         np.hstack((believed.mean, truth.callers[label]))
         for label, believed in track.callers.items()
@@ -219,7 +187,7 @@ def _followed(
 
 
 def position_floor(drive: Drive, scans: Sequence[Scan]) -> float | None:
-    r"""RMSE of position that no estimator avoids, but by luck.
+    r"""RMSE of position [m] that remains if all after the first scan is estimated without error.
 
     What is heard tells where things are relative to the vehicle, and never where the vehicle was
     before it heard anything. Until then it reckons from its controls; by the first scan that holds
@@ -228,22 +196,12 @@ def position_floor(drive: Drive, scans: Sequence[Scan]) -> float | None:
     .. math:: \hat x_k = T x_k, \quad T = \hat x_j \circ x_j^{-1} \quad (k \ge j), \qquad
               \hat x_k \text{ by the controls alone} \quad (k < j)
 
-    Parameters
-    ----------
-    drive : Drive
-    scans : sequence of Scan
-
-    Returns
-    -------
-    [m] or None
-        Over the steps, the start excluded. None where the truth is not known at step j.
+    The start is excluded; None where the truth is not known at step j.
 
     Notes
     -----
     The error that is left is one turn and shift of everything: alignment removes it.
 
-    Examples
-    --------
     A metre ahead unseen, then a straight drive.
 
     >>> from pipistrelle.detection.scans import make_scan
@@ -273,32 +231,22 @@ def position_floor(drive: Drive, scans: Sequence[Scan]) -> float | None:
     turned = np.array([lost[0], lost[1], lost[2] - was[2]])
     after = moved(true[first:, :2] - was[:2], turned)
     error = position_error(np.concatenate([np.array(reckoned)[:first, :2], after]), true[:, :2])[1:]
-    known = error[np.isfinite(error)]
-    return rmse(known) if known.size else None
+    finite = error[np.isfinite(error)]
+    return rmse(finite) if finite.size else None
 
 
 def drive_bound(
     drive: Drive, scans: Sequence[Scan], config: Config
 ) -> Float[np.ndarray, "t 3 3"] | None:
-    """Return the bound of the pose at every step of a drive whose truth is known.
+    """Return the bound of the pose at every step, its covariance in [m, rad], squared.
 
-    Parameters
-    ----------
-    drive : Drive
-    scans : sequence of Scan
-        With their standard deviations.
-    config : Config
-        It says whether callers that move are followed, and what is known of how they move.
-
-    Returns
-    -------
-    (k + 1, 3, 3) [m, rad, squared], or None
-        None where the truth is not known at every step, or no landmark's is.
+    None where the truth is not known at every step, or no landmark is. The scans bear their
+    standard deviations; the settings say how callers move, and whether they are followed.
     """
     path, landmarks = drive.truth.path, drive.truth.landmarks
     if path is None or landmarks is None or not np.isfinite(path).all():
         return None
-    told = config.filter
+    settings = config.filter
     controls = true_controls(drive.motion, drive.controls, drive.time, path)
     parted, steps = split_at(replace(drive, controls=controls), [scan.time for scan in scans])
     return pose_bound(
@@ -309,23 +257,12 @@ def drive_bound(
         landmarks,
         scans,
         parted.truth.callers if config.listening.timing else NO_ROUTES,
-        (told.caller_speed_std, told.caller_walk_std),
+        (settings.caller_speed_std, settings.caller_walk_std),
     )[steps]
 
 
 def with_bound(scores: Scores, bound: Float[np.ndarray, "t 3 3"] | None) -> Scores:
-    """Return scores with the least errors beside them.
-
-    Parameters
-    ----------
-    scores : Scores
-    bound : (k + 1, 3, 3) or None
-        As `drive_bound` gives it.
-
-    Returns
-    -------
-    Scores
-    """
+    """Return scores with the bounds of position and heading filled in."""
     if bound is None:
         return scores
     position, heading = path_bound(bound)
@@ -336,39 +273,23 @@ def with_bound(scores: Scores, bound: Float[np.ndarray, "t 3 3"] | None) -> Scor
 def score_path(pose: Gaussian, true_path: Float[np.ndarray, "k 3"] | None) -> PathScores:
     """Score a path against the truth, its start excluded.
 
-    Parameters
-    ----------
-    pose : Gaussian of (k, 3) and (k, 3, 3)
-        The start first.
-    true_path : (k, 3) [m, m, rad], optional
-        NaN where it is not known, which is not scored.
-
-    Returns
-    -------
-    PathScores
-
-    Raises
-    ------
-    ValueError
-        Where path and truth differ in length.
+    Poses of the truth that are NaN are not scored.
 
     Notes
     -----
     Bradley & Abaid, Eqs. (23) and (26).
 
-    Examples
-    --------
     >>> pose = Gaussian(mean=np.zeros((2, 3)), covariance=np.tile(np.eye(3), (2, 1, 1)))
     >>> score_path(pose, np.array([[0.0, 0, 0], [3, 4, 0]])).position_rmse_m
     5.0
     """
-    known = np.full_like(pose.mean, np.nan) if true_path is None else true_path
-    if len(known) != len(pose.mean):
-        raise ValueError(f"{len(pose.mean)} poses, but {len(known)} true ones")
-    rows = np.isfinite(known).all(axis=1) & (np.arange(len(known)) > 0)
-    path, truth = pose.mean[rows], known[rows]
+    true_poses = np.full_like(pose.mean, np.nan) if true_path is None else true_path
+    if len(true_poses) != len(pose.mean):
+        raise ValueError(f"{len(pose.mean)} poses, but {len(true_poses)} true ones")
+    rows = np.isfinite(true_poses).all(axis=1) & (np.arange(len(true_poses)) > 0)
+    path, truth = pose.mean[rows], true_poses[rows]
     error = pose_error(path, truth)
-    epsilon = track_nees(pose, known)[1:]
+    epsilon = track_nees(pose, true_poses)[1:]
     epsilon = epsilon[~np.isnan(epsilon)]
     return PathScores(
         position_rmse_m=_rmse(position_error(path, truth)),
@@ -380,12 +301,12 @@ def score_path(pose: Gaussian, true_path: Float[np.ndarray, "k 3"] | None) -> Pa
 
 
 def _rmse(error: Float[np.ndarray, " n"]) -> float | None:
-    """Return the RMSE, None of no errors."""
+    """Return the RMSE; None without errors."""
     return rmse(error) if len(error) else None
 
 
 def _aligned_rmse(points: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "n 2"]) -> float | None:
-    """Return the RMSE after the best rigid motion, None of fewer than two points."""
+    """Return the RMSE after the best rigid motion; None for fewer than two points."""
     if len(points) < 2:
         return None
     return rmse(position_error(moved(points, alignment(points, true)), true))

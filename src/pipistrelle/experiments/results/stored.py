@@ -29,64 +29,34 @@ Estimate = tuple[str, str]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredPath:
-    """A path as a folder has it.
-
-    Attributes
-    ----------
-    time : (k) [s]
-    pose : (k, 3) [m, m, rad]
-    """
+    """A path as it was read from a result folder."""
 
     time: Float[np.ndarray, " k"]
+    """Seconds."""
     pose: Float[np.ndarray, "k 3"]
+    """Position and heading [m, m, rad]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredMission:
-    """What `run` or `slam` left in a folder.
-
-    Attributes
-    ----------
-    folder : Path
-    version : str
-        Of Pipistrelle.
-    settings : dict
-        By their dotted names.
-    scores : dict of a mapping by estimate
-        Under the names of ``summary.json``; None where there is none.
-    paths : dict of StoredPath by estimate
-    maps : dict of (n, 2) [m] by estimate
-        The landmarks that are placed.
-    truth : StoredPath or None
-    """
+    """What `run` or `slam` wrote into a folder, as `compare` reads it, without doing it again."""
 
     folder: Path
     version: str
+    """The version of Pipistrelle that wrote it."""
     settings: Mapping[str, Any]
+    """All settings, by their dotted names."""
     scores: Mapping[Estimate, Mapping[str, Any]]
+    """Scores under the names of ``summary.json``; None where there is none."""
     paths: Mapping[Estimate, StoredPath]
     maps: Mapping[Estimate, Float[np.ndarray, "n 2"]]
+    """Positions of the landmarks that are placed [m]."""
     truth: StoredPath | None
 
 
 def read_mission(folder: Path) -> StoredMission:
-    """Read what `run` or `slam` left in a folder.
+    """Read the results in a folder; refuse a file that is not as it was written.
 
-    Parameters
-    ----------
-    folder : Path
-
-    Returns
-    -------
-    StoredMission
-
-    Raises
-    ------
-    InputError
-        Where the folder holds no results, not all of them, or a file that is not as it was written.
-
-    Examples
-    --------
     >>> read_mission(Path("nowhere"))
     Traceback (most recent call last):
     pipistrelle.config.InputError: nowhere: found no such folder, expected the result folder of
@@ -115,7 +85,7 @@ def read_mission(folder: Path) -> StoredMission:
 
 
 def _log_settings(told: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Name which log was solved and how it was looked at, beside the settings."""
+    """Return the log that was solved and the options it was solved with, as settings."""
     if told is None:
         return {}
     asked = {f"log.{name}": told[name] for name in ("path", "robot", "beamwidth_rad")}
@@ -126,16 +96,6 @@ def _log_settings(told: Mapping[str, Any] | None) -> dict[str, Any]:
 def flattened(table: Mapping[str, Any]) -> dict[str, Any]:
     """Name each value of nested tables by its dotted name.
 
-    Parameters
-    ----------
-    table : mapping
-
-    Returns
-    -------
-    dict
-
-    Examples
-    --------
     >>> flattened({"seed": 3, "air": {"pressure_kpa": 90.0}})
     {'seed': 3, 'air.pressure_kpa': 90.0}
     """
@@ -143,20 +103,7 @@ def flattened(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def results_in(folder: Path) -> OwnFiles:
-    """Return our files in a folder of whole results, or say what it is instead.
-
-    Parameters
-    ----------
-    folder : Path
-
-    Returns
-    -------
-    OwnFiles
-
-    Raises
-    ------
-    InputError
-    """
+    """Return the files of a result folder; refuse a folder without whole results."""
     own = OwnFiles(folder, RESULTS)
     if own.there == RESULTS.title and (folder / SUMMARY).exists() and SUMMARY in own:
         own.read(SUMMARY)
@@ -175,7 +122,7 @@ def _path(text: bytes) -> StoredPath:
 
 
 def _placed(text: bytes) -> Float[np.ndarray, "n 2"]:
-    """Read where the landmarks of a map are that are placed."""
+    """Read the positions of the fully initialised landmarks of a map [m]."""
     rows = csv.DictReader(io.StringIO(text.decode()))
     places = [(float(row["x"]), float(row["y"])) for row in rows if row["status"] == "full"]
     return np.array(places).reshape(-1, 2)

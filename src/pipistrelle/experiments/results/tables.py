@@ -27,19 +27,8 @@ def tum_text(time: Float[np.ndarray, " k"], path: Float[np.ndarray, "k 3"]) -> s
 
     .. math:: q = (0, 0, \sin(\theta / 2), \cos(\theta / 2))
 
-    Parameters
-    ----------
-    time : (k) [s]
-        Kept to 1e-6 s.
-    path : (k, 3) [m, m, rad]
-        Kept to 1e-12.
+    Times are kept to 1e-6 s, poses to 1e-12.
 
-    Returns
-    -------
-    str
-
-    Examples
-    --------
     >>> print(tum_text(np.array([0.125]), np.array([[1.0, 2.0, -np.pi]])), end="")
     0.125000 1.000000000000 2.000000000000 0 0 0 -1.000000000000 0.000000000000
     """
@@ -51,41 +40,20 @@ def tum_text(time: Float[np.ndarray, " k"], path: Float[np.ndarray, "k 3"]) -> s
 
 
 def place_text(time: Float[np.ndarray, " k"], place: Float[np.ndarray, "k 2"]) -> str:
-    """Write the places of one whose heading is not known as `tum_text`, with none.
+    """Write positions without a heading as `tum_text` does; rows that are NaN are left out.
 
-    Parameters
-    ----------
-    time : (k) [s]
-    place : (k, 2) [m]
-        Rows that are NaN are left out.
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
     >>> print(place_text(np.arange(2.0), np.array([[np.nan, np.nan], [1.0, 2.0]])), end="")
     1.000000 1.000000000000 2.000000000000 0 0 0 0.000000000000 1.000000000000
     """
-    known = ~np.isnan(place).any(axis=1)
-    return tum_text(time[known], np.column_stack((place[known], np.zeros(known.sum()))))
+    finite = ~np.isnan(place).any(axis=1)
+    return tum_text(time[finite], np.column_stack((place[finite], np.zeros(finite.sum()))))
 
 
 def map_text(landmarks: Landmarks) -> str:
     """Write a map as one line per landmark: mean, covariance and status.
 
-    Parameters
-    ----------
-    landmarks : Landmarks
-        A partially initialised landmark is represented by its heaviest hypothesis.
+    A partially initialised landmark is represented by its heaviest hypothesis.
 
-    Returns
-    -------
-    str
-
-    Examples
-    --------
     >>> covariance = np.array([[[0.04, 0.01], [0.01, 0.09]]])
     >>> landmarks = Landmarks(
     ...     landmark=np.array([7]),
@@ -109,25 +77,14 @@ def map_text(landmarks: Landmarks) -> str:
 
 @np.errstate(over="ignore", invalid="ignore")
 def step_table(track: Track, true_path: Float[np.ndarray, "k 3"] | None) -> "pl.DataFrame":
-    """Lay out a track, its errors and its NEES, one row per pose.
+    """Lay out a track, its standard deviations, errors and NEES, one row per pose.
 
-    Parameters
-    ----------
-    track : Track of k poses
-    true_path : (k, 3) [m, m, rad], optional
-        Without it the columns that need it are null.
-
-    Returns
-    -------
-    DataFrame of k rows
-        Estimate, its standard deviations, truth, errors and NEES.
+    Columns that need the truth are null without it.
 
     Notes
     -----
     Bradley & Abaid, the terms of Eqs. (23) and (26).
 
-    Examples
-    --------
     >>> from pipistrelle.estimation.beliefs import Gaussian, no_landmarks
     >>> pose = Gaussian(mean=np.zeros((1, 3)), covariance=4 * np.eye(3)[None])
     >>> track = Track(time=np.zeros(1), pose=pose, landmarks=no_landmarks(), gated=0)
@@ -139,7 +96,7 @@ def step_table(track: Track, true_path: Float[np.ndarray, "k 3"] | None) -> "pl.
 
     mean, covariance = track.pose.mean, track.pose.covariance
     std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    known = {"time_s": track.time, **_pose_columns("{}", mean), **_pose_columns("{}_std", std)}
+    columns = {"time_s": track.time, **_pose_columns("{}", mean), **_pose_columns("{}_std", std)}
     true = np.full_like(mean, np.nan) if true_path is None else true_path
     error = pose_error(mean, true)
     scored = {
@@ -149,7 +106,7 @@ def step_table(track: Track, true_path: Float[np.ndarray, "k 3"] | None) -> "pl.
         "nees": track_nees(track.pose, true),
     }
     truth = pl.DataFrame(scored)
-    return pl.DataFrame(known).hstack(truth if true_path is not None else truth.clear(len(mean)))
+    return pl.DataFrame(columns).hstack(truth if true_path is not None else truth.clear(len(mean)))
 
 
 def _pose_columns(name: str, poses: Float[np.ndarray, "k 3"]) -> dict[str, np.ndarray]:
@@ -159,24 +116,14 @@ def _pose_columns(name: str, poses: Float[np.ndarray, "k 3"]) -> dict[str, np.nd
 
 
 def landmark_table(landmarks: Landmarks, true_landmarks: LabelledPoints | None) -> "pl.DataFrame":
-    """Lay out a map, one row per hypothesis, and beside it where the landmarks are.
+    """Lay out a map, one row per hypothesis, with the true positions beside it.
 
-    Parameters
-    ----------
-    landmarks : Landmarks
-    true_landmarks : labels (n) and positions (n, 2) [m], optional
-
-    Returns
-    -------
-    DataFrame
-        ``status`` is full, partial or, for a true landmark that is not in the map, unseen.
+    ``status`` is full, partial or, for a true landmark that is not in the map, unseen.
 
     Notes
     -----
     Bradley & Abaid, the terms of Eq. (27).
 
-    Examples
-    --------
     >>> landmarks = Landmarks(
     ...     landmark=np.array([7]),
     ...     mean=np.array([[3.0, 4.0]]),
@@ -219,23 +166,11 @@ def landmark_table(landmarks: Landmarks, true_landmarks: LabelledPoints | None) 
 
 
 def measurement_table(scans: Sequence[Scan], callers: Sequence[str] = ()) -> "pl.DataFrame":
-    """Lay out scans, one row per measurement.
+    """Lay out scans, one row per measurement; null is what was not measured.
 
-    Parameters
-    ----------
-    scans : sequence of Scan
-    callers : sequence of str
-        Names of those who call besides the vehicle; the first is number 1.
+    ``caller`` is the name of the caller whose echo it is, number 1 being the first name; it is null
+    for an echo of the vehicle's own call.
 
-    Returns
-    -------
-    DataFrame
-        ``range_m`` is null where the measurement is passive, ``detour_m`` where nothing is known of
-        when it came, ``bearing_rad`` where a row is but a further detour, ``caller`` where it was
-        the vehicle's own call, or nobody says whose.
-
-    Examples
-    --------
     >>> from pipistrelle.detection.scans import make_scan
     >>> scan = make_scan(1.0, np.array([7]), np.array([0.5]))
     >>> measurement_table([scan]).rows()
@@ -265,7 +200,7 @@ def measurement_table(scans: Sequence[Scan], callers: Sequence[str] = ()) -> "pl
 
 
 def _name(number: int, callers: Sequence[str]) -> str | None:
-    """Return the name of a caller other than the vehicle; unless it is told, its number."""
+    """Return the name of a caller other than the vehicle, or its number if it has none."""
     if number == OWN:
         return None
     return callers[number - 1] if number <= len(callers) else f"caller{number}"

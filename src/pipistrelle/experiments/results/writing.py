@@ -1,4 +1,4 @@
-"""Results: how good each estimate is, and the folder that keeps them for other tools.
+"""Writing a result folder: scores, tracks, maps and tables, for Pipistrelle and other tools.
 
 ``summary.json`` is written last: its presence means that the folder is complete.
 """
@@ -96,39 +96,9 @@ def write_results(
 ) -> None:
     """Write everything into a result folder, in place of earlier results: all of it, or nothing.
 
-    Parameters
-    ----------
-    own : OwnFiles
-        The folder, as `result_folder` lends it.
-    config : pydantic model
-        All settings; those that are None are left out of ``config.toml``.
-    command : str
-        The command line, for the reader.
-    seed : int
-    trials : sequence of TrialResult
-        Each strategy and filter once.
-    truth : Truth
-        At the times of the tracks; ``truth.tum`` leaves out what is not known.
-    ignored_rows : dict
-        Number of dropped log rows by reason.
-    callers : sequence of str
-        Names of those who call besides the vehicle.
-    moving : mapping of label to str, optional
-        Names of those that move.
-    beside : dict of name to content, optional
-        Other files, relative to the folder.
-    log : mapping, optional
-        Which recorded log was solved, and how it was heard (`runs.again.log_entry`).
-    draw : callable, optional
-        Given a folder to draw the pictures into.
+    Settings that are None are left out of ``config.toml``; `beside` holds other files, by their
+    names in the folder, and `draw` is given a folder to draw the pictures into.
 
-    Raises
-    ------
-    InputError
-        Where a file cannot be written, or one that would be replaced is not as we wrote it.
-
-    Examples
-    --------
     >>> import tempfile
     >>> from pipistrelle.config import Config
     >>> from pipistrelle.experiments.drives import NO_TRUTH
@@ -183,8 +153,8 @@ def _texts(
             text = place_text(track.time, believed.mean)
             texts[f"caller_{moving[label]}_{name}.tum"] = text
     if truth.path is not None:
-        known = np.isfinite(truth.path).all(axis=1)
-        texts["truth.tum"] = tum_text(truth.time[known], truth.path[known])
+        finite = np.isfinite(truth.path).all(axis=1)
+        texts["truth.tum"] = tum_text(truth.time[finite], truth.path[finite])
     for label, path in truth.callers.items():
         texts[f"truth_{moving[label]}.tum"] = place_text(truth.time, path)
     return texts
@@ -193,19 +163,9 @@ def _texts(
 def tables_of(
     trials: Sequence[TrialResult], truth: Truth, callers: Sequence[str] = ()
 ) -> "dict[str, pl.DataFrame]":
-    """Lay out the tables of a mission; trials of one strategy share their measurements.
+    """Lay out ``steps``, ``landmarks`` and ``measurements`` of a mission, as their files hold them.
 
-    Parameters
-    ----------
-    trials : sequence of TrialResult
-    truth : Truth
-    callers : sequence of str
-        Names of those who call besides the vehicle.
-
-    Returns
-    -------
-    dict of DataFrame
-        ``steps``, ``landmarks`` and ``measurements``, as the files of these names hold them.
+    Trials of one strategy share their measurements.
     """
     import polars as pl
 
@@ -227,20 +187,10 @@ def tables_of(
 
 
 def config_hash(config: BaseModel) -> str:
-    """Sixteen hexadecimal digits that stand for a configuration.
+    """Return 16 hexadecimal digits that identify a configuration.
 
-    The head of the SHA-256 of its JSON with sorted keys and no spaces.
+    They are the head of the SHA-256 of its JSON with sorted keys and no spaces.
 
-    Parameters
-    ----------
-    config : pydantic model
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
     >>> from pipistrelle.config import Config
     >>> config_hash(Config(seed=7)) == config_hash(Config()), len(config_hash(Config()))
     (True, 16)
@@ -249,18 +199,8 @@ def config_hash(config: BaseModel) -> str:
 
 
 def settings_hash(settings: Mapping[str, object]) -> str:
-    """Sixteen hexadecimal digits that stand for settings, as ``config.toml`` has them.
+    """Return 16 hexadecimal digits that identify settings, as ``config.toml`` has them.
 
-    Parameters
-    ----------
-    settings : nested mapping
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
     >>> settings_hash({"seed": 7, "rays": {}}) == settings_hash({"rays": {}, "seed": 7})
     True
     """
@@ -269,18 +209,7 @@ def settings_hash(settings: Mapping[str, object]) -> str:
 
 
 def run_entry(trial: TrialResult, ignored_rows: Mapping[str, int]) -> dict[str, object]:
-    """Return a trial's entry of the summary.
-
-    Parameters
-    ----------
-    trial : TrialResult
-    ignored_rows : dict
-
-    Returns
-    -------
-    dict
-        What is not finite becomes None.
-    """
+    """Return a trial's entry of the summary; numbers that are not finite become None."""
     run: dict[str, object] = {
         "strategy": trial.strategy,
         "filter": trial.filter,
@@ -292,7 +221,7 @@ def run_entry(trial: TrialResult, ignored_rows: Mapping[str, int]) -> dict[str, 
 
 
 def _finite(scores: Mapping[str, object]) -> dict[str, object]:
-    """Put null for what is not finite."""
+    """Return None for a number that is not finite."""
     return {
         key: None if isinstance(value, float) and not math.isfinite(value) else value
         for key, value in scores.items()

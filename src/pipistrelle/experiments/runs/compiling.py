@@ -12,14 +12,8 @@ def compile_kernels(
 ) -> None:
     """Compile kernels, or load them from the cache, by missions of two frames.
 
-    Nothing depends on it: what it leaves undone is compiled where it is needed.
-
-    Parameters
-    ----------
-    filters : iterable of str
-        Those that are not of the catalogue, or lack what they need, are left out.
-    timings : iterable of bool
-        The values of ``listening.timing``.
+    The timings are the values of ``listening.timing``. Filters that are not of the catalogue, or
+    lack what they need, are left out: their kernels are compiled when they are needed.
     """
     there = [name for name in filters if name in CATALOGUE and is_there(name)]
     tiny = ScenarioConfig(steps=8, landmarks=4, radius=10.0)

@@ -1,4 +1,4 @@
-"""One filter driven over one drive: predict, say who is who, correct, and keep every pose.
+"""One filter runs over one drive: it predicts, associates, updates, and every pose is kept.
 
 What could not be used, whoever made it, is refused here, before or after a filter has it.
 """
@@ -42,7 +42,7 @@ def run_filter(
     progress: Callable[[int, int], None] | None = None,
     watch: Callable[[Scan, B], None] | None = None,
 ) -> Track:
-    """Predict to each scan, say who is who in it, update with it, and keep the pose of every step.
+    """Predict to each scan, associate its rows, update with it, and keep the pose of every step.
 
     Where the belief revises its path (it has ``path``), the track is the path as it is believed at
     the end, and the poses that were kept are beside it. Where it revises those of callers, too
@@ -117,13 +117,13 @@ def run_filter(
 
 
 def _innovations(belief: Belief) -> Innovations:
-    """Return the innovations that a belief has added up; none where it does not."""
-    found = getattr(belief, "innovations", None)
-    return found if isinstance(found, Innovations) else NO_INNOVATIONS
+    """Return the sum of innovations of a belief, or none if it does not keep one."""
+    innovations = getattr(belief, "innovations", None)
+    return innovations if isinstance(innovations, Innovations) else NO_INNOVATIONS
 
 
 def _named(scan: Scan, belief: B, associate: Associate, noise: Noise) -> Scan:
-    """Return a scan with the labels of an association, and with the noise of merged rows."""
+    """Return a scan labelled by an association, with the noise of the rows that it merged."""
     named = labelled(scan, associate(belief, scan))
     return named if named is scan else noise(named)
 
@@ -136,7 +136,7 @@ def _carried(
     rng: np.random.Generator,
     path: Gaussian,
 ) -> B:
-    """Carry a belief through steps of a drive, and write the poses after each into the path."""
+    """Predict a belief through steps of a drive, and write the pose after each into the path."""
     controls, dt = drive.controls[steps], np.diff(drive.time[steps.start : steps.stop + 1])
     predicted = estimator.predict(belief, controls, dt, rng)
     if not (isinstance(predicted, tuple) and len(predicted) == 2):
@@ -155,10 +155,10 @@ def _wrong_return(estimator: Estimator[B], method: str, found: object, expected:
 
 
 def _first_belief(estimator: Estimator[B], drive: Drive, scans: Sequence[Scan]) -> B:
-    """Return what an estimator believes at the start, with what is known beforehand."""
-    belief, known = estimator.init(drive.start), drive.known.landmark.tolist()
+    """Return the belief at the start, with the landmarks that are known beforehand."""
+    belief, placed = estimator.init(drive.start), drive.known.landmark.tolist()
     moving = {*drive.moving, *(label for scan in scans for label in scan.moving.tolist())}
-    if roving := sorted(moving.intersection(known)):
+    if roving := sorted(moving.intersection(placed)):
         raise InputError(
             f"landmarks known beforehand: found {roving}, which move; expected some that stand"
         )
@@ -168,7 +168,7 @@ def _first_belief(estimator: Estimator[B], drive: Drive, scans: Sequence[Scan]) 
 
 
 def _follow(callers: dict[int, Gaussian], scan: Scan, belief: Belief, at: tuple[int, int]) -> None:
-    """Note where callers that move are at step k of so many, those that are in sight."""
+    """Write where moving callers in sight are at step k of so many into their tracks."""
     found, (k, steps) = answer(belief, "moving") if scan.moving.size else None, at
     if found is None:
         return
@@ -180,7 +180,7 @@ def _follow(callers: dict[int, Gaussian], scan: Scan, belief: Belief, at: tuple[
 
 
 def _retraced(callers: dict[int, Gaussian], belief: Belief, steps: int) -> Mapping[int, Gaussian]:
-    """Return the tracks of callers as a belief has them at the end, where it revises them."""
+    """Return the tracks of callers, as the last belief revises them where it does."""
     revised = answer(belief, "tracks") if callers else None
     if revised is None:
         return callers
@@ -198,7 +198,7 @@ def _retraced(callers: dict[int, Gaussian], belief: Belief, steps: int) -> Mappi
 
 
 def _filled_up(track: Gaussian, online: Gaussian) -> Gaussian:
-    """Return a caller's track, where it has none at a scan as it was believed then."""
+    """Fill the gaps of a caller's revised track with its position as believed at that time."""
     none = np.isnan(track.mean[:, :1])
     return Gaussian(
         mean=np.where(none, online.mean, track.mean),
@@ -223,9 +223,9 @@ def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]
     """Find the step that ends at each scan; refuse scans that a filter could not use."""
     heard = np.array([scan.time for scan in scans], dtype=float)
     steps = np.searchsorted(time, heard)
-    known = time[np.minimum(steps, time.size - 1)] == heard
-    if not known.all():
-        stray = scans[int(np.argmin(known))]
+    on_time = time[np.minimum(steps, time.size - 1)] == heard
+    if not on_time.all():
+        stray = scans[int(np.argmin(on_time))]
         raise InputError(f"scan at {stray.time} s: expected the time of the end of a step")
     if np.any(np.diff(steps) < 0):
         late = int(np.argmax(np.diff(steps) < 0))

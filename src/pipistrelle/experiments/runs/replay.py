@@ -1,4 +1,4 @@
-"""Recorded logs on trial: the log, the truth beside it, and what a strategy may hear of it."""
+"""Recorded logs: read with their truth, reduced to what a strategy hears, and solved."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -22,17 +22,17 @@ from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.experiments.hearing.listening import Progress
-from pipistrelle.experiments.results.scores import TrialResult
-from pipistrelle.experiments.runs.checking import check_filters
+from pipistrelle.experiments.runs.mission import Mission
 from pipistrelle.experiments.runs.trial import Watch, run_trials
 from pipistrelle.experiments.runs.truth_files import TRUTHS, WithTruth, with_files_beside
+from pipistrelle.experiments.runs.validate_filters import check_filters
 from pipistrelle.own_files import LOG, OwnFiles
 from pipistrelle.refusals import refusal
 
 KNOWN_STD = (1e-3, 1e-3)
-"""How surely a caller's place is known of which a log does not say it [m]."""
+"""Std of a caller's given position if the log states none [m]."""
 LEAST_STD = 1e-6
-"""That a place is told to be off [m]: below it nothing is left to solve with."""
+"""Least std of a given position [m]; a smaller one makes the covariance singular."""
 
 
 def load(
@@ -84,9 +84,9 @@ def load(
     >>> log.name, truth.path
     ('bee', None)
     """
-    known = (*readers, *READERS)
-    titles = " or ".join(reader.title for reader in known)
-    if not any(reader.recognises(folder) for reader in known) and folder.exists():
+    formats = (*readers, *READERS)
+    titles = " or ".join(reader.title for reader in formats)
+    if not any(reader.recognises(folder) for reader in formats) and folder.exists():
         what, _, fix = (recording_of(folder) or "").partition("; ")
         if what:
             raise refusal(folder, what, titles, f"{fix} (docs/log_format.md)")
@@ -97,13 +97,13 @@ def load(
     if not reader.recognises(folder) and (what := _of_ours(folder)):
         fix = "name the log itself; `pipistrelle view` plays results, `report` is for studies"
         raise refusal(folder, f"{what} of Pipistrelle", titles, fix)
-    whose = _whose(reader, folder, robot, known)
+    whose = _whose(reader, folder, robot, formats)
     with_truth = {**TRUTHS, **truths}.get(reader.name, with_files_beside)
     return with_truth(reader.read, folder, *whose)
 
 
 def _of_ours(folder: Path) -> str | None:
-    """Tell what a folder of ours holds, by its list of sums, or a study by its plan."""
+    """Name the kind of a folder that Pipistrelle wrote; None for any other."""
     if (folder / "plan.toml").is_file() and (folder / "trials").is_dir():
         return "a study"
     return OwnFiles(folder, LOG).there
@@ -112,27 +112,13 @@ def _of_ours(folder: Path) -> str | None:
 def as_heard_by(
     scans: Sequence[Scan], strategy: Strategy, beamwidth: float | None = None
 ) -> tuple[Scan, ...]:
-    """Leave of recorded scans what a strategy would have heard.
+    """Return what a strategy would have heard of recorded scans, one scan for each.
 
-    Inside the beam, where the absolute bearing is at most half its width, range and bearing are
-    heard actively. Outside it only the bearing is heard, passively, and detours everywhere. Fused
-    takes both, active what has a range and no detours, passive all bearings and no range. Without a
-    beam nothing is outside it.
+    The beam has a full width about the heading [rad]. Inside it, where the absolute bearing is at
+    most half the width, range and bearing are heard actively. Outside it only the bearing is heard,
+    passively; detours are heard everywhere. Fused takes both, active only rows with a range and no
+    detours, passive all bearings and no range. Without a beam all ranges are kept.
 
-    Parameters
-    ----------
-    scans : sequence of Scan
-    strategy : "active", "fused" or "passive"
-    beamwidth : [rad], optional
-        Full width of the beam about the heading.
-
-    Returns
-    -------
-    tuple of Scan
-        As many; some may be empty.
-
-    Examples
-    --------
     >>> from pipistrelle.detection.scans import make_scan
     >>> scan = make_scan(0.0, np.array([3, 8]), np.array([0.1, 0.4]), range=np.array([2.0, 5.0]))
     >>> as_heard_by([scan], "fused", 0.5)[0].range
@@ -154,16 +140,6 @@ def as_heard_by(
 def motion_of(log: Log) -> Motion:
     """Return the motion model of a log, as the filters take it.
 
-    Parameters
-    ----------
-    log : Log
-
-    Returns
-    -------
-    Motion
-
-    Examples
-    --------
     >>> log = Log(
     ...     name="walk", time=np.array([0.0, 1.0]), controls=np.array([[1.0, 0.0]]),
     ...     dt=np.array([1.0]), scans=(), motion="unicycle", control_std=(0.1, 0.15),
@@ -182,19 +158,8 @@ def motion_of(log: Log) -> Motion:
 
 
 def start_of(log: Log) -> Gaussian:
-    """Return the pose at which a log starts, as the filters take it.
+    """Return the pose at which a log starts; its errors in x, y and heading are independent.
 
-    Parameters
-    ----------
-    log : Log
-
-    Returns
-    -------
-    Gaussian of (3) [m, m, rad] and (3, 3)
-        The errors of x, y and heading are independent.
-
-    Examples
-    --------
     >>> log = Log(
     ...     name="walk", time=np.array([0.0, 1.0]), controls=np.array([[1.0, 0.0]]),
     ...     dt=np.array([1.0]), scans=(), motion="unicycle", control_std=(0.1, 0.15),
@@ -208,20 +173,6 @@ def start_of(log: Log) -> Gaussian:
     return Gaussian(mean=np.array(log.initial_pose, dtype=float), covariance=np.diag(variance))
 
 
-def moving_of(log: Log) -> dict[int, str]:
-    """Name the callers of a log that move, by their labels.
-
-    Parameters
-    ----------
-    log : Log
-
-    Returns
-    -------
-    dict of label to str
-    """
-    return {caller.landmark: caller.name for caller in log.callers if caller.moves}
-
-
 def replay(
     log: Log,
     truth: Truth,
@@ -232,7 +183,7 @@ def replay(
     *,
     progress: Progress | None = None,
     watch: Watch | None = None,
-) -> tuple[TrialResult, ...]:
+) -> Mission:
     """Let each filter map a recorded log by each strategy.
 
     Parameters
@@ -251,7 +202,7 @@ def replay(
 
     Returns
     -------
-    tuple of TrialResult
+    Mission
 
     Raises
     ------
@@ -270,7 +221,8 @@ def replay(
     ...     initial_pose=(0.0, 0.0, 0.0), initial_pose_std=(0.0, 0.0, 0.0), range_std=0.2,
     ...     bearing_std=0.06, range_bounds=(0.5, 20.0), ignored_rows={},
     ... )
-    >>> (trial,) = replay(log, Truth(time=log.time), ["active"], ["ekf"], None, Config())
+    >>> mission = replay(log, Truth(time=log.time), ["active"], ["ekf"], None, Config())
+    >>> (trial,) = mission.trials
     >>> trial.track.landmarks.landmark, trial.track.landmarks.mean
     (array([7]), array([[3., 0.]]))
     """
@@ -281,41 +233,42 @@ def replay(
         controls=log.controls,
         truth=truth,
         known=_known_callers(log),
-        moving=moving_of(log),
+        moving={who.landmark: who.name for who in log.callers if who.moves},
     )
     check_filters(filters, drive.motion, config)
     noise = noise_of(config.filter)
-    scans = [as_told(one, config.filter, timing=config.listening.timing) for one in log.scans]
+    scans = [as_told(rows, config.filter, timing=config.listening.timing) for rows in log.scans]
     heard = {
         strategy: tuple(
             noise(labelled(scan, scan.landmark)) for scan in as_heard_by(scans, strategy, beamwidth)
         )
         for strategy in strategies
     }
-    return run_trials(filters, drive, heard, config, progress=progress, watch=watch)
+    trials = run_trials(filters, drive, heard, config, progress=progress, watch=watch)
+    return Mission(config=config, drive=drive, trials=trials, beamwidth=beamwidth, log=log)
 
 
 def _known_callers(log: Log) -> Landmarks:
-    """Return where callers stand of which the log says it."""
-    told = [caller for caller in log.callers if caller.place is not None]
-    stds = [np.maximum(caller.place_std or KNOWN_STD, LEAST_STD) for caller in told]
+    """Return the callers whose positions the log gives, as landmarks known beforehand."""
+    placed = [caller for caller in log.callers if caller.place is not None]
+    stds = [np.maximum(caller.place_std or KNOWN_STD, LEAST_STD) for caller in placed]
     return Landmarks(
-        landmark=np.array([caller.landmark for caller in told], dtype=np.int64),
-        mean=np.array([caller.place for caller in told], dtype=float).reshape(-1, 2),
+        landmark=np.array([caller.landmark for caller in placed], dtype=np.int64),
+        mean=np.array([caller.place for caller in placed], dtype=float).reshape(-1, 2),
         covariance=np.array([np.eye(2) * std**2 for std in stds]).reshape(-1, 2, 2),
-        weight=np.ones(len(told)),
+        weight=np.ones(len(placed)),
     )
 
 
 def _whose(
-    reader: Reader, folder: Path, robot: Robot | None, known: Sequence[Reader]
+    reader: Reader, folder: Path, robot: Robot | None, formats: Sequence[Reader]
 ) -> tuple[Robot, ...]:
-    """Return the robot for a reader that must be told, and nothing for one that must not."""
+    """Return the robot as arguments for the reader: one if the format holds several, else none."""
     if reader.robots is None:
         if robot is None:
             return ()
         found = f"a log of one vehicle, but robot {robot} was asked for"
-        expected = " or ".join(other.title for other in known if other.robots is not None)
+        expected = " or ".join(other.title for other in formats if other.robots is not None)
         raise refusal(folder, found, expected, "leave out --robot")
     robots = {str(there): there for there in reader.robots(folder)}
     if robot is None or str(robot) not in robots:

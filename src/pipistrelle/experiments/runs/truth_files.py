@@ -1,4 +1,4 @@
-"""The truth of a recorded log, for scoring alone: beside it, or as its format has it.
+"""The truth of a recorded log, read from files beside it or from its own format.
 
 A format's reader (`pipistrelle.detection.logs.readers`) never sees the truth. Its other half is a
 function here, found by the same name: it is given the reader, and what tells it which log to read,
@@ -30,49 +30,13 @@ Read = Callable[..., Log]
 
 
 def with_files_beside(read: Read, folder: Path, *robot: Robot) -> tuple[Log, Truth]:
-    """Read a log, and ``truth.csv`` and ``landmarks.csv`` of its folder.
-
-    Parameters
-    ----------
-    read : callable
-    folder : Path
-    robot : int or str, where the folder holds several
-
-    Returns
-    -------
-    Log
-    Truth
-
-    Raises
-    ------
-    InputError
-        As `read_truth`, and what the reader refuses.
-    """
+    """Read a log, and the truth from ``truth.csv`` and ``landmarks.csv`` in its folder."""
     log = read(folder, *robot)
     return log, read_truth(folder, log.time)
 
 
 def with_mrclam_truth(read: Read, folder: Path, robot: int) -> tuple[Log, Truth]:
-    """Read one robot's log from where the truth begins to where it ends, and the truth.
-
-    Parameters
-    ----------
-    read : callable
-        Takes ``span``, too.
-    folder : Path
-    robot : 1 to 5
-
-    Returns
-    -------
-    Log
-        It starts at the true pose.
-    Truth
-
-    Raises
-    ------
-    InputError
-        With the file and the line.
-    """
+    """Read one robot's log where the truth is known, starting at the true pose, and the truth."""
     time, path = read_path(folder / f"Robot{robot}_Groundtruth.dat", None)
     columns = ("subject", "x", "y", "x_std", "y_std")
     landmarks = read_landmarks(folder / "Landmark_Groundtruth.dat", columns, None)
@@ -85,28 +49,14 @@ def with_mrclam_truth(read: Read, folder: Path, robot: int) -> tuple[Log, Truth]
 
 WithTruth = Callable[..., tuple[Log, Truth]]
 TRUTHS: Mapping[str, WithTruth] = {"mrclam": with_mrclam_truth}
-"""By the reader's name; of all other formats the truth lies in files beside the log."""
+"""Functions that read the truth, by the reader's name; others use files beside the log."""
 
 
 def read_truth(folder: Path, time: Float[np.ndarray, " k"]) -> Truth:
-    """Read ``truth.csv`` and ``landmarks.csv`` of a log folder, where they are.
+    """Read ``truth.csv`` and ``landmarks.csv`` of a log folder, where they exist.
 
-    Parameters
-    ----------
-    folder : Path
-    time : (k) [s]
-        Times of the track.
-
-    Returns
-    -------
-    Truth
-        Its path is linear between the recorded poses, the heading unwrapped, and NaN before the
-        first and after the last of them; None of what has no file.
-
-    Raises
-    ------
-    InputError
-        With the file and the line; also where no true pose lies within the track.
+    The path is linear between the recorded poses, the heading unwrapped, and NaN before the first
+    and after the last of them. `time` holds the times of the track [s].
     """
     path_file, landmark_file = folder / "truth.csv", folder / "landmarks.csv"
     path = landmarks = None
@@ -152,7 +102,7 @@ def write_truth(folder: Path, truth: Truth) -> None:
 
 
 def truth_files(truth: Truth) -> dict[str, str]:
-    """Return the files of the truth that stand beside a log's; of what is unknown there is none."""
+    """Return the files of the truth that belong beside a log, as far as the truth is known."""
     files = {}
     if truth.path is not None:
         rows = np.column_stack((truth.time, truth.path))[np.isfinite(truth.path).all(axis=1)]
@@ -166,28 +116,11 @@ def truth_files(truth: Truth) -> dict[str, str]:
 def read_path(
     path: Path, separator: str | None
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    r"""Read times and poses, the heading unwrapped; of two rows with one time the later wins.
+    r"""Read times [s] and poses [m, m, rad], the heading unwrapped, from a table.
 
-    Parameters
-    ----------
-    path : Path
-        Of a table of ``time``, ``x``, ``y`` and ``heading``.
-    separator : str or None
-        Between columns; None: spaces, and no header.
+    Of two rows with one time the later wins. Without a separator, columns are split at spaces and
+    there is no header.
 
-    Returns
-    -------
-    time : (n) [s]
-        Rising.
-    poses : (n, 3) [m, m, rad]
-
-    Raises
-    ------
-    InputError
-        With the file and the line.
-
-    Examples
-    --------
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as place:
     ...     file = Path(place) / "truth.csv"

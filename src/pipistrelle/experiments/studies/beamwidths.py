@@ -16,39 +16,18 @@ from pipistrelle.settings import Given, Layer, resolve
 
 BEAMWIDTH = "beamwidth"
 MAKERS = ("emitter.frequency", "air.speed_of_sound", "air.temperature_c")
-"""Settings that decide, beside the radius, how wide a beam is; the last where it sets the speed."""
+"""Settings that change the beamwidth; the last one unless the speed of sound is set."""
 DIGITS = Context(prec=12, rounding=ROUND_FLOOR)
-"""Of a radius: what machines agree on; downwards, so that the widest beam stays the widest."""
+"""Digits of a radius on which machines agree; rounded down, so that no beam exceeds the widest."""
 
 
 def with_radii(
     where: str, grid: Mapping[str, Any], strategies: Sequence[str], layer: Layer
 ) -> dict[str, Any]:
-    """Put radii in the place of a grid's beamwidths.
+    """Replace the beamwidths of a grid by piston radii, in the same order.
 
-    Parameters
-    ----------
-    where : str
-        The grid, as a refusal names it.
-    grid : dict
-        As the plan's file has it.
-    strategies : sequence of str
-        Of the plan.
-    layer : Layer
-        The plan's settings, which give the tone and the speed of sound.
+    The layer holds the plan's settings, which give the tone and the speed of sound.
 
-    Returns
-    -------
-    dict
-        In the same order; as it was where it has no beamwidths.
-
-    Raises
-    ------
-    InputError
-        A value that is no beamwidth, radii beside it, or nothing that it could be the width of.
-
-    Examples
-    --------
     >>> with_radii("grid", {"beamwidth": [180, 11.4], "seed": []}, ["active"], {})
     {'emitter.radius': [0.0025210352264, 0.0253830203249], 'seed': []}
     """
@@ -74,7 +53,7 @@ def with_radii(
 def _check_alone(
     where: str, grid: Mapping[str, Any], strategies: Sequence[str], layer: Layer
 ) -> None:
-    """Refuse beamwidths beside what decides them too, or where nobody calls."""
+    """Refuse beamwidths beside radii or settings that decide them, or if all is passive."""
     emitter = grid.get("emitter")
     if RADIUS in grid or (isinstance(emitter, dict) and "radius" in emitter):
         raise InputError(f"{where}.{BEAMWIDTH}: is {RADIUS} in other words; vary one of them")

@@ -23,40 +23,23 @@ AHEAD = 1000
 """Worlds handed to a cluster before the first of them is done."""
 
 _NO_PAGES = {f"distributed.{who}.http.routes": [] for who in ("scheduler", "worker")}
-"""Of a cluster that is started here: Dask's servers of web pages have nothing to show."""
+"""Settings of a local cluster: Dask's web pages are off."""
 
 
 Task = Callable[[int], list[EndedTrial]]
 """Computes a world, writes its results, and tells how its trials ended."""
 Ended = tuple[int, "Future[list[EndedTrial]]"]
-"""A world that is no longer running, and what came of it."""
+"""A world that has ended, and the future of its trials."""
 Results = Generator[list[EndedTrial], None, None]
 """The trials of one world after another, in the order in which they end."""
 
 
 def ended(executor: Executor, task: Task, waiting: deque[int], ahead: int) -> Iterator[Ended]:
-    """Keep an executor busy; tell of each world when it has ended.
+    """Keep an executor busy, and yield each world that has ended, with the future of its trials.
 
-    Once the executor is broken, no more is handed to it, and what is left stays in ``waiting``.
+    At most `ahead` worlds are handed over before the first of them has ended. Once the executor is
+    broken, no more is handed to it, and what is left stays in ``waiting``.
 
-    Parameters
-    ----------
-    executor : Executor
-    task : function of a world's number
-    waiting : deque of int
-        Worlds; what is handed to the executor is taken out.
-    ahead : int
-        Worlds handed to it before the first of them has ended.
-
-    Yields
-    ------
-    int
-        The world.
-    Future
-        Of its trials, or of what ended it.
-
-    Examples
-    --------
     >>> from concurrent.futures import ThreadPoolExecutor
     >>> def task(world):
     ...     return [EndedTrial("fused", None if world else "at sea")]
@@ -81,28 +64,10 @@ def ended(executor: Executor, task: Task, waiting: deque[int], ahead: int) -> It
 
 
 def in_processes(task: Task, give_up: Task, waiting: deque[int], workers: int) -> Results:
-    """Run worlds in processes; those in processes that die are tried again, one at a time.
+    """Run worlds in spawned processes, and yield the ended trials of one world after another.
 
-    Parameters
-    ----------
-    task : function of a world's number
-        It must survive pickling, as the processes are spawned.
-    give_up : function of a world's number
-        Called here for a world that has taken its process with it twice.
-    waiting : deque of int
-        Worlds.
-    workers : int
-        Processes at the same time.
-
-    Yields
-    ------
-    list of EndedTrial
-        Of one world after another.
-
-    Raises
-    ------
-    InputError
-        Where no process lives to the end of a world.
+    Worlds in processes that die are tried again, one at a time; `give_up` is called for a world
+    whose process has died twice.
     """
     alive = False
     while waiting:
@@ -122,7 +87,7 @@ def in_processes(task: Task, give_up: Task, waiting: deque[int], workers: int) -
 def _in_pool(
     task: Task, waiting: deque[int], workers: int, broken: deque[int]
 ) -> Generator[list[EndedTrial], None, bool]:
-    """Run worlds until a process dies, and tell which were running then; return if any ended."""
+    """Run worlds until a process dies; yield those that were running then, return if any ended."""
     alive = False
     with _pool(min(workers, len(waiting))) as pool:
         for iteration, future in ended(pool, task, waiting, workers):
@@ -141,7 +106,7 @@ def _pool(workers: int) -> Iterator[Executor]:
     from multiprocessing import active_children, get_context
 
     class Pool(ProcessPoolExecutor):
-        """Starts its processes as tasks come, deaf to Ctrl-C from their first moment."""
+        """A pool whose processes ignore Ctrl-C from their start, and start as tasks come."""
 
         def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
             with _held_interrupt():
@@ -161,7 +126,7 @@ def _pool(workers: int) -> Iterator[Executor]:
 
 @contextmanager
 def _held_interrupt() -> Iterator[None]:
-    """Put Ctrl-C off; a process that is started meanwhile never hears it."""
+    """Defer Ctrl-C; a process that is started meanwhile ignores it."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -173,7 +138,7 @@ def _held_interrupt() -> Iterator[None]:
 
 
 def _become_worker() -> None:
-    """Leave Ctrl-C to the process that started this one, and end when that is gone."""
+    """Ignore Ctrl-C in a worker, and end it when its parent process is gone."""
     from multiprocessing import parent_process
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -191,30 +156,11 @@ def _become_worker() -> None:
 def on_cluster(
     task: Task, give_up: Task, waiting: deque[int], workers: int, address: str
 ) -> Results:
-    """Run worlds on Dask's workers; Dask itself tries again what a dead worker leaves.
+    """Run worlds on Dask's workers, and yield the ended trials of one world after another.
 
-    Parameters
-    ----------
-    task : function of a world's number
-        It must survive pickling.
-    give_up : function of a world's number
-        Called here for a world that Dask no longer tries.
-    waiting : deque of int
-        Worlds.
-    workers : int
-        Of a cluster that is started here; another has its own.
-    address : str
-        "local": a cluster on this machine; else that of a scheduler.
-
-    Yields
-    ------
-    list of EndedTrial
-        Of one world after another.
-
-    Raises
-    ------
-    InputError
-        Where Dask is not installed, no scheduler answers, or the cluster goes away.
+    The address is that of a scheduler, or "local" for a cluster of so many workers on this machine.
+    Dask itself tries again what a dead worker leaves; `give_up` is called for a world that it no
+    longer tries.
     """
     with _client(address, workers) as client:
         from distributed import KilledWorker
@@ -237,12 +183,7 @@ def on_cluster(
 
 
 def check_cluster(address: str) -> None:
-    """Refuse a cluster where Dask is not installed.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse a cluster where Dask is not installed."""
     try:
         import cryptography  # noqa: F401  (Dask asks for it when it makes certificates)
         import dask  # noqa: F401
@@ -286,7 +227,7 @@ def _client(address: str, workers: int) -> Iterator[Any]:
 
 @contextmanager
 def _started_deaf() -> Iterator[None]:
-    """Start processes that leave Ctrl-C to this one."""
+    """Start processes that ignore Ctrl-C."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,4 +1,4 @@
-"""A study's plan: what to vary, as a file, and the cases that it stands for.
+"""A study's plan: the settings that it varies, and the cases that result.
 
 The cases are the product of the grid, the strategies and the filters. A passive case does not
 depend on the vehicle's beam: there is one for all radii, heard beside the narrowest beam.
@@ -19,84 +19,54 @@ from pipistrelle.settings import Given, Key, Layer, from_flags, resolve
 RADIUS = "emitter.radius"
 WORLD = "scenario.world"
 MOST_CASES = 2**15 - 1
-"""What their numbers have room for in the tables."""
+"""Largest number of cases, so that their numbers fit the column of the tables."""
 MOST_WORLDS = 1_000_000
-"""Each is a file in every folder of tables."""
+"""Largest number of worlds; each is one file for every table."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """What a study tries, in how many worlds.
-
-    Attributes
-    ----------
-    name : str
-    iterations : int
-        Number of worlds.
-    strategies : tuple of "active", "fused", "passive"
-    filters : tuple of str
-        The names of estimators.
-    config : Config
-        What holds where the grid says nothing else.
-    grid : dict
-        Settings by their dotted name, with the values that each takes.
-    own : dict
-        Settings of one filter alone by its name, each by its dotted name; they change nothing that
-        is heard.
-    worlds : dict
-        Worlds that ``scenario.world`` names, by their names.
-    planned : int
-        Number of worlds of a whole study, as the plan's file names it, though fewer were asked for;
-        at least ``iterations`` in what is read.
-    """
+    """What a study varies, and in how many worlds."""
 
     name: str
     iterations: int
+    """Number of worlds."""
     strategies: tuple[Strategy, ...]
     filters: tuple[str, ...]
+    """The names of estimators."""
     config: Config
+    """Settings of every case, unless the grid says otherwise."""
     grid: Mapping[str, tuple[Any, ...]]
+    """Settings by their dotted name, with the values that each takes."""
     own: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Settings of one filter alone by its name, each by its dotted name; they change nothing that
+    is heard."""
     worlds: Mapping[str, World] = field(default_factory=dict)
+    """Worlds that ``scenario.world`` names, by their names."""
     planned: int = 0
+    """Number of worlds of a whole study, as the plan's file names it, though fewer were asked for;
+    at least ``iterations`` in what is read."""
 
     def world(self, config: Config) -> World:
-        """Return what is known beforehand of the worlds of some settings."""
+        """Return the user's own world that settings name, or the one of which all is drawn."""
         return ANY if config.scenario.world is None else self.worlds[config.scenario.world]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlannedCase(Case):
-    """One combination of a plan: a case, whatever the world, with its settings.
-
-    Attributes
-    ----------
-    number : int
-        From 0, in the order of the plan.
-    values : dict
-        Of the grid's settings; None for the radius of a passive case.
-    config : Config
-        With these values, and what is the filter's own.
-    """
+    """One combination of a plan: a case, in any world, with its settings."""
 
     number: int
+    """Number of the case, from 0, in the order of the plan."""
     values: Mapping[str, Any]
+    """Values of the grid's settings; None for the radius of a passive case."""
     config: Config
+    """Settings with these values, and with those of the filter alone."""
 
 
 def cases_of(plan: Plan) -> tuple[PlannedCase, ...]:
     """Lay out the cases of a plan, in the order of their numbers.
 
-    Parameters
-    ----------
-    plan : Plan
-
-    Returns
-    -------
-    tuple of PlannedCase
-
-    Examples
-    --------
     >>> grid = {"emitter.radius": (0.0025, 0.025)}
     >>> ways = {"strategies": ("active", "passive"), "filters": ("ekf",)}
     >>> plan = Plan(name="two", iterations=1, config=Config(), grid=grid, **ways)
@@ -123,26 +93,8 @@ def cases_of(plan: Plan) -> tuple[PlannedCase, ...]:
 
 
 def own_config(plan: Plan, name: str, config: Config) -> Config:
-    """Return settings with those that are one filter's own.
+    """Return settings with those of one filter's own laid over them.
 
-    Parameters
-    ----------
-    plan : Plan
-    name : str
-        Of the filter.
-    config : Config
-
-    Returns
-    -------
-    Config
-
-    Raises
-    ------
-    InputError
-        For a value that its setting does not take.
-
-    Examples
-    --------
     >>> own = {"iekf": {"filter.noise": "measured"}}
     >>> ways = {"strategies": ("fused",), "filters": ("ekf", "iekf")}
     >>> plan = Plan(name="two", iterations=1, config=Config(), grid={}, own=own, **ways)
@@ -159,20 +111,8 @@ def own_config(plan: Plan, name: str, config: Config) -> Config:
 
 
 def common(plan: Plan, values: Mapping[str, Any]) -> Config:
-    """Return a plan's settings with some values of its grid, and no filter's own.
+    """Return a plan's settings with some values of its grid, without those of one filter alone.
 
-    Parameters
-    ----------
-    plan : Plan
-    values : dict
-        By their dotted names.
-
-    Returns
-    -------
-    Config
-
-    Examples
-    --------
     >>> ways = {"strategies": ("fused",), "filters": ("ekf",), "config": Config()}
     >>> plan = Plan(name="one", iterations=1, grid={"filter.gate": (0.9,)}, **ways)
     >>> common(plan, {"filter.gate": 0.9}).filter.gate
@@ -190,33 +130,10 @@ def combinations(
     prefix: str,
     worlds: Mapping[str, World] = MappingProxyType({}),
 ) -> Iterator[tuple[dict[str, Any], Config]]:
-    """Walk through the product of a grid.
+    """Yield each combination of a grid, its values by name, and the settings with these values.
 
-    Parameters
-    ----------
-    layer : Layer
-        Settings that hold where the grid says nothing else.
-    grid : dict of tuple
-        Settings by their dotted name, with the values that each takes.
-    prefix : str
-        Before such a name, where a refusal says which value is wrong.
-    worlds : dict
-        Those that the grid names.
+    The values of the last name change fastest. The prefix stands before a name in a refusal.
 
-    Yields
-    ------
-    dict
-        The values of one combination, by their names; those of the last name change fastest.
-    Config
-        With these values.
-
-    Raises
-    ------
-    InputError
-        For a value that its setting does not take.
-
-    Examples
-    --------
     >>> grid = {"seed": (1, 2), "filter.gate": (0.9,)}
     >>> [(named["seed"], config.filter.gate) for named, config in combinations({}, grid, "grid.")]
     [(1, 0.9), (2, 0.9)]

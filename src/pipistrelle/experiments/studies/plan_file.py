@@ -55,7 +55,7 @@ FORMAT = 1
 
 
 def _named(found: Any) -> str:
-    """Take the name of an estimator; one from outside need not be there to read a plan."""
+    """Accept the name of an estimator; one from outside need not be installed to read a plan."""
     try:
         return check_name(str(found))
     except InputError:
@@ -85,24 +85,8 @@ hear when, too; who calls, and from where; and two vehicles that hear each other
 
 
 def find_plan(word: str) -> Path:
-    """Find a plan by the word that names it.
+    """Return the path of a plan that is named by a word of `PLANS` or by its path.
 
-    Parameters
-    ----------
-    word : str
-        One of `PLANS`, or the path of a file.
-
-    Returns
-    -------
-    Path
-
-    Raises
-    ------
-    InputError
-        Where there is none.
-
-    Examples
-    --------
     >>> find_plan("paper").name
     'paper.toml'
     """
@@ -120,25 +104,8 @@ def find_plan(word: str) -> Path:
 def read_plan(path: Path, over: Layer | None = None, iterations: int | None = None) -> Plan:
     """Read a plan, lay settings over its own, and check every combination.
 
-    Parameters
-    ----------
-    path : Path
-    over : Layer, optional
-        Settings from the environment and from flags.
-    iterations : int, optional
-        Number of worlds, in place of the plan's.
+    Iterations replace the plan's number of worlds.
 
-    Returns
-    -------
-    Plan
-
-    Raises
-    ------
-    InputError
-        Where the file cannot be read or is no plan: the key, what was found, what was expected.
-
-    Examples
-    --------
     >>> from pipistrelle.experiments.studies.plan import cases_of
     >>> plan = read_plan(find_plan("paper"))
     >>> plan.iterations, len(cases_of(plan))
@@ -155,27 +122,8 @@ def plan_of(
 ) -> Plan:
     """Make a plan of what its file would hold, and check every combination.
 
-    Parameters
-    ----------
-    table : mapping
-    path : Path
-        What it is called in a refusal, and from whose folder its paths lead.
-    over : Layer, optional
-        Settings from the environment and from flags.
-    iterations : int, optional
-        Number of worlds, in place of the plan's.
+    The path is the file's name in refusals, and its relative paths lead from there.
 
-    Returns
-    -------
-    Plan
-
-    Raises
-    ------
-    InputError
-        Where the table is no plan: the key, what was found, what was expected.
-
-    Examples
-    --------
     >>> levels = {"beacon.level_db": [36.8, 42.8]}
     >>> plan_of({"format": 1, "iterations": 6, "grid": levels}).grid
     {'beacon.level_db': (36.8, 42.8)}
@@ -223,7 +171,7 @@ def plan_of(
 
 
 def _laid(path: Path, table: Mapping[str, Any], over: Layer, worlds: dict[str, World]) -> Layer:
-    """Lay a plan's settings over those of the world that they name, and others over them."""
+    """Return a plan's settings over those of the world that they name, below the given ones."""
     layer: Layer = {
         key: Given(value, f"{path}: config.{name}")
         for key, name, value in _settings(path, "config", table)
@@ -255,14 +203,14 @@ def _read(path: Path, key: Key, values: Any, worlds: dict[str, World]) -> Any:
     return values
 
 
-def _worlds(path: Path, folders: Any, known: dict[str, World]) -> Any:
+def _worlds(path: Path, folders: Any, worlds: dict[str, World]) -> Any:
     """Read the worlds of a grid, and return their names."""
     if not isinstance(folders, list) or not all(isinstance(one, str) for one in folders):
         return folders  # refused with all other values
     names = []
     for folder in folders:
         world = read_world(Path(_beside(path, folder)))
-        if world.files != known.setdefault(world.name, world).files:
+        if world.files != worlds.setdefault(world.name, world).files:
             raise InputError(
                 f"{path}: grid.{WORLD}: found two worlds called {world.name}; rename a folder"
             )
@@ -279,15 +227,17 @@ def _own(
     worlds: Mapping[str, World],
 ) -> dict[str, dict[str, Any]]:
     """Check the settings that are one filter's own: none of them changes what is heard."""
-    if not isinstance(table, dict) or not all(isinstance(mine, dict) for mine in table.values()):
+    if not isinstance(table, dict) or not all(
+        isinstance(settings, dict) for settings in table.values()
+    ):
         raise InputError(f"{path}: own: found {shown(table)}, expected a table for each filter")
     own: dict[str, dict[str, Any]] = {}
-    for name, mine in table.items():
+    for name, settings in table.items():
         where = f"{path}: own.{name}"
         if name not in filters:
             raise InputError(f"{where}: no filter of this plan; {_meant(name, filters)}")
         given: Layer = {}
-        for key, setting, value in _settings(path, f"own.{name}", mine):
+        for key, setting, value in _settings(path, f"own.{name}", settings):
             if key[0] not in SECTIONS:
                 sections = ", ".join(SECTIONS)
                 why = f"this setting changes what is heard; expected one of the sections {sections}"
@@ -305,19 +255,8 @@ def _own(
 
 
 def plan_text(plan: Plan) -> str:
-    """Write a plan as a file that names every setting.
+    """Write a plan as TOML that names every setting and reads back as the same plan.
 
-    Parameters
-    ----------
-    plan : Plan
-
-    Returns
-    -------
-    str
-        TOML; reads back as the same plan.
-
-    Examples
-    --------
     >>> print(plan_text(read_plan(find_plan("paper"), iterations=3)).splitlines()[2])
     iterations = 3
     """
@@ -327,19 +266,8 @@ def plan_text(plan: Plan) -> str:
 
 
 def changed_settings(there: Plan, asked: Plan) -> list[str]:
-    """Name what differs between two plans, but for the number of worlds.
+    """Name what differs between two plans, except the number of worlds.
 
-    Parameters
-    ----------
-    there, asked : Plan
-        Those of a folder and of a command.
-
-    Returns
-    -------
-    list of str
-
-    Examples
-    --------
     >>> plans = [
     ...     read_plan(find_plan("paper"), from_flags({"seed": seed}), seed) for seed in (1, 2)
     ... ]
@@ -355,37 +283,30 @@ def changed_settings(there: Plan, asked: Plan) -> list[str]:
 
 
 def _digest(world: World) -> str:
-    """Return some letters that stand for what a world's folder holds."""
-    told = sha256()
+    """Return 16 hexadecimal digits that identify the files of a world."""
+    digest = sha256()
     for name in sorted(world.files):
-        told.update(f"{name}\n{len(world.files[name])}\n".encode() + world.files[name])
-    return told.hexdigest()[:16]
+        digest.update(f"{name}\n{len(world.files[name])}\n".encode() + world.files[name])
+    return digest.hexdigest()[:16]
 
 
 def plan_settings(plan: Plan) -> dict[str, Any]:
-    """Name all that a plan says by dotted names.
+    """Return all that a plan says, by dotted names.
 
-    Parameters
-    ----------
-    plan : Plan
+    The speed of sound is among it, given or not, and of each world a sum of its files.
 
-    Returns
-    -------
-    dict
-        The speed of sound too, given or not, and of each world what stands for its files.
-
-    Examples
-    --------
     >>> plan_settings(read_plan(find_plan("paper")))["iterations"]
     115
     """
-    told = {".".join(key): value for key, value in leaves(_as_table(plan)) if key != ("planned",)}
+    settings = {
+        ".".join(key): value for key, value in leaves(_as_table(plan)) if key != ("planned",)
+    }
     worlds = {f"worlds/{name}": _digest(world) for name, world in plan.worlds.items()}
-    return told | worlds | {"config.air.speed_of_sound": plan.config.air.sound_speed}
+    return settings | worlds | {"config.air.speed_of_sound": plan.config.air.sound_speed}
 
 
 def _worded(table: Mapping[str, Any], name: str) -> str:
-    """Word a plan's value."""
+    """Return a plan's value as text."""
     return json.dumps(table[name]) if name in table else "nothing"
 
 
@@ -413,11 +334,11 @@ def _as_table(plan: Plan) -> dict[str, Any]:
 
 
 def _head(path: Path, table: Mapping[str, Any], iterations: int | None) -> _Head:
-    """Check what a plan holds beside settings and grid."""
-    known = (*_Head.model_fields, "config", "grid", "own")
+    """Check the keys of a plan other than its settings and grid."""
+    keys = (*_Head.model_fields, "config", "grid", "own")
     for name in table:
-        if name not in known:
-            raise InputError(f"{path}: {name}: no such key of a plan; {_meant(name, known)}")
+        if name not in keys:
+            raise InputError(f"{path}: {name}: no such key of a plan; {_meant(name, keys)}")
     given = {"name": path.stem} | {k: v for k, v in table.items() if k in _Head.model_fields}
     if iterations is not None:
         if isinstance(given.get("iterations"), int):
@@ -451,13 +372,13 @@ def _settings(
     path: Path, table: str, settings: Mapping[str, Any]
 ) -> Iterator[tuple[Key, str, Any]]:
     """Walk through a table's settings: key, dotted name and value of each."""
-    known = {".".join(key): key for key in known_settings()}
+    keys_by_name = {".".join(key): key for key in known_settings()}
     for key, value in leaves(settings, (CALLERS,)):
         name = ".".join(key)
-        if name in known:
-            yield known[name], name, value
-        elif value != {} or not any(other.startswith(f"{name}.") for other in known):
-            names = [*known, BEAMWIDTH] if table == "grid" else known
+        if name in keys_by_name:
+            yield keys_by_name[name], name, value
+        elif value != {} or not any(other.startswith(f"{name}.") for other in keys_by_name):
+            names = [*keys_by_name, BEAMWIDTH] if table == "grid" else keys_by_name
             raise InputError(f"{path}: {table}.{name}: no such setting; {_meant(name, names)}")
 
 
@@ -479,25 +400,25 @@ def _values(path: Path, name: str, key: Key, values: Any, layer: Layer) -> tuple
 
 
 def _stated(callers: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return of callers what is said of them."""
-    return [{k: v for k, v in one.items() if v is not None} for one in callers]
+    """Return the tables of callers without the keys that are None."""
+    return [{k: v for k, v in caller.items() if v is not None} for caller in callers]
 
 
 def _check_distinct(where: str, values: Sequence[Any]) -> None:
-    """Refuse what is named twice."""
-    known = set()
+    """Refuse values that occur twice."""
+    seen = set()
     for value in values:
-        before = len(known)
-        known.add(json.dumps(value) if isinstance(value, list) else value)
-        if len(known) == before:
+        before = len(seen)
+        seen.add(json.dumps(value) if isinstance(value, list) else value)
+        if len(seen) == before:
             raise InputError(f"{where}: found {shown(value)} twice, expected each value once")
 
 
-def _meant(name: str, known: Iterable[str]) -> str:
+def _meant(name: str, names: Iterable[str]) -> str:
     """Suggest the name that was probably meant."""
-    known = list(known)
-    near = meant(name, known)
-    return f"did you mean {near}?" if near else f"expected one of {_some(known)}"
+    names = list(names)
+    near = meant(name, names)
+    return f"did you mean {near}?" if near else f"expected one of {_some(names)}"
 
 
 def _some(names: Sequence[str]) -> str:

@@ -67,21 +67,8 @@ class StoredStudy:
 
 
 def open_store(folder: Path, plan: Plan) -> None:
-    """Make a study's folder, or accept one of the same plan.
+    """Make a study's folder, or accept one of the same plan, perhaps with fewer iterations.
 
-    Parameters
-    ----------
-    folder : Path
-    plan : Plan
-        With more iterations than the folder's it goes on beyond them.
-
-    Raises
-    ------
-    InputError
-        Where the folder holds another plan or something else, or cannot be written.
-
-    Examples
-    --------
     >>> import tempfile
     >>> from pipistrelle.experiments.studies.plan_file import find_plan
     >>> with tempfile.TemporaryDirectory() as name:
@@ -99,10 +86,10 @@ def open_store(folder: Path, plan: Plan) -> None:
         kept_first = [folder / "worlds"]  # a plan names what must be there
         strange = [path.name for path in seen if path not in [*left, *kept_first]]
         _refuse_strange(folder, there, strange)
-        if there is not None and (found := changed_settings(there, plan)):
-            told = "".join(f"\n  {line}" for line in found)
+        if there is not None and (changes := changed_settings(there, plan)):
+            differences = "".join(f"\n  {line}" for line in changes)
             raise InputError(
-                f"{kept}: is the plan of another study; name a new folder with -o DIR{told}"
+                f"{kept}: is the plan of another study; name a new folder with -o DIR{differences}"
             )
         if there is None or there.iterations < plan.iterations or there.planned < plan.planned:
             _keep_plan(folder, there, plan)
@@ -168,26 +155,12 @@ def _refuse_strange(folder: Path, there: Plan | None, strange: Sequence[str]) ->
 
 
 def _is_ours(kept: Path, plan: Plan) -> bool:
-    """Whether a plan stands as we write it."""
+    """Return whether a plan file is as Pipistrelle writes it."""
     return read_file(kept) == plan_text(plan).encode()
 
 
 def load_study(folder: Path) -> StoredStudy:
-    """Open what a study has done so far; worlds that are not done are left out.
-
-    Parameters
-    ----------
-    folder : Path
-
-    Returns
-    -------
-    StoredStudy
-
-    Raises
-    ------
-    InputError
-        Where the folder holds no plan.
-    """
+    """Open what a study has done so far; worlds that are not done are left out."""
     import polars as pl
 
     if not (folder / "plan.toml").is_file():

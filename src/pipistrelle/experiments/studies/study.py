@@ -1,4 +1,4 @@
-"""A study: a plan's worlds, wherever there is room to compute them.
+"""A study: it runs a plan's worlds in this process, in others, or on a cluster.
 
 The unit of work is a world. Whoever computes it writes its results (`studies.store`) and reports
 back how its trials ended, so that a study needs little memory, loses nothing that is done, and may
@@ -20,8 +20,8 @@ from pipistrelle.estimation.outside import look_in
 from pipistrelle.experiments.hearing.scenario import standing_landmarks
 from pipistrelle.experiments.hearing.trajectories import motion_of
 from pipistrelle.experiments.machine import check_memory, keep_freed_memory
-from pipistrelle.experiments.runs.checking import check_filters
-from pipistrelle.experiments.runs.preparing import prepared, warnings_of
+from pipistrelle.experiments.runs.validate_filters import check_filters
+from pipistrelle.experiments.runs.validate_mission import checked_scenario, warnings_of
 from pipistrelle.experiments.studies.executors import (
     AHEAD,
     Results,
@@ -43,31 +43,25 @@ from pipistrelle.experiments.studies.world_files import (
 )
 
 KILLED = "its process ended without a word, twice: killed, or out of memory\n"
-"""Recorded for every trial of a world that takes its process with it."""
+"""Error of every trial of a world whose process died."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StudyProgress:
-    """How far a study is.
-
-    Attributes
-    ----------
-    worlds, done : int
-        Asked for, and done, those of earlier runs included.
-    trials : dict
-        Number asked for, by strategy.
-    ended, failed : dict
-        Number that ended and, of these, failed; by strategy.
-    first_error : str or None
-        What the first failure seen says of itself.
-    """
+    """The state of a study: the worlds and trials that are done."""
 
     worlds: int
+    """Number of worlds that were asked for."""
     done: int
+    """Number of worlds that are done, those of earlier runs included."""
     trials: dict[str, int]
+    """Number of trials that were asked for, by strategy."""
     ended: dict[str, int]
+    """Number of trials that ended, by strategy."""
     failed: dict[str, int]
+    """Number of trials that failed, by strategy."""
     first_error: str | None
+    """The message of the first trial that failed."""
 
 
 def run_study(
@@ -83,39 +77,11 @@ def run_study(
 ) -> StudyProgress:
     """Run the worlds of a plan that are not done yet.
 
-    Parameters
-    ----------
-    plan : Plan
-    folder : Path
-        As `open_store` makes it, or makes of it; it must be the same folder for all workers.
-    workers : int
-        Processes; 1: this one. More are spawned, so a script that calls this function must be
-        guarded by ``if __name__ == "__main__"``.
-    shard : i, n
-        Run only each n-th world, from world i on.
-    scheduler : str, optional
-        "local", or the address of a Dask scheduler, whose workers then do the work.
-    executor : Executor, optional
-        Whatever else has a ``submit``; it must be able to import this package.
-    retry_failed : bool
-        Run the worlds again that hold failed trials.
-    progress : callable, optional
-        Given how far the study is, first as it is found, then whenever a world is done.
+    All workers must see the same folder. More than one worker are spawned, so a script that calls
+    this must be guarded by ``if __name__ == "__main__"``. A shard (i, n) is each n-th world, from
+    world i on; the scheduler is "local" or the address of one of Dask's; an executor is anything
+    else that has ``submit``. `progress` is called with the state at the start and after each world.
 
-    Returns
-    -------
-    StudyProgress
-        Of the shard.
-
-    Raises
-    ------
-    InputError
-        Where the folder holds another plan, or somebody's files in the place of tables, results
-        cannot be written, or workers, memory for them on this machine, or an estimator, cannot be
-        had.
-
-    Examples
-    --------
     >>> import tempfile
     >>> from pipistrelle.config import Config, ScenarioConfig
     >>> ways = {"strategies": ("fused",), "filters": ("ekf",)}
@@ -167,38 +133,20 @@ def run_study(
 
 
 def warnings_of_plan(plan: Plan) -> tuple[str, ...]:
-    """Tell what the receivers of a plan confuse, as `warnings_of` does; each once.
-
-    Parameters
-    ----------
-    plan : Plan
-
-    Returns
-    -------
-    tuple of str
-    """
-    said = (line for cases in heard_together(plan) for line in warnings_of(cases[0].config))
-    return tuple(dict.fromkeys(said))
+    """Return the warnings on the receivers of a plan (`warnings_of`), each once."""
+    warnings = (line for cases in heard_together(plan) for line in warnings_of(cases[0].config))
+    return tuple(dict.fromkeys(warnings))
 
 
 def check_cases(plan: Plan, workers: int) -> None:
-    """Refuse a plan of which a case would be refused, or so many worlds at once have no room.
+    """Refuse a plan with a case that would be refused, or with more workers than memory allows.
 
-    Parameters
-    ----------
-    plan : Plan
-    workers : int
-        On this machine; 0 if they are elsewhere.
-
-    Raises
-    ------
-    InputError
-        With the setting, and the values of the grid.
+    The workers are those on this machine; 0 if they are elsewhere.
     """
     for cases in heard_together(plan):
         with _named(cases[0]):
             config = cases[0].config
-            scenario = prepared(config, world=plan.world(config), workers=workers)
+            scenario = checked_scenario(config, world=plan.world(config), workers=workers)
             here = len(standing_landmarks(scenario)[0])
         for case in cases:
             heard = {"passive": case.strategy != "active", "workers": workers}
@@ -209,7 +157,7 @@ def check_cases(plan: Plan, workers: int) -> None:
 
 @contextmanager
 def _named(case: PlannedCase) -> Iterator[None]:
-    """Say in a refusal which values of the grid it is about."""
+    """Add the values of the grid to a refusal."""
     try:
         yield
     except InputError as error:
@@ -220,7 +168,7 @@ def _named(case: PlannedCase) -> Iterator[None]:
 
 
 def _nothing_done(plan: Plan, worlds: int) -> StudyProgress:
-    """Return how far a study is at the very start."""
+    """Return the state of a study before its first world."""
     cases = Counter[str](case.strategy for case in cases_of(plan))
     return StudyProgress(
         worlds=worlds,
@@ -233,17 +181,17 @@ def _nothing_done(plan: Plan, worlds: int) -> StudyProgress:
 
 
 def _advanced(so_far: StudyProgress, trials: Sequence[EndedTrial]) -> StudyProgress:
-    """Return how far a study is with one more world done."""
+    """Return the state of a study with one more world done."""
     errors = [trial.error for trial in trials if trial.error is not None]
     ended = Counter(trial.strategy for trial in trials)
     failed = Counter(trial.strategy for trial in trials if trial.error is not None)
-    told = errors[0].strip().splitlines()[-1] if errors else None
+    error = errors[0].strip().splitlines()[-1] if errors else None
     return replace(
         so_far,
         done=so_far.done + 1,
         ended={strategy: n + ended[strategy] for strategy, n in so_far.ended.items()},
         failed={strategy: n + failed[strategy] for strategy, n in so_far.failed.items()},
-        first_error=so_far.first_error or told,
+        first_error=so_far.first_error or error,
     )
 
 
@@ -258,7 +206,7 @@ def _work(folder: Path, plan: Plan, here: Path, iteration: int) -> list[EndedTri
 
 
 def _give_up(folder: Path, plan: Plan, iteration: int) -> list[EndedTrial]:
-    """Record a world that cannot be had as failed."""
+    """Record a world that could not be computed as failed."""
     records = failed_records(plan, KILLED)
     write_world(folder, plan, iteration, records)
     return [EndedTrial(record.case.strategy, record.error) for record in records]

@@ -5,7 +5,7 @@ What a case is: `studies.plan`. Cases whose settings differ in nothing that is s
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from math import degrees
 from typing import TYPE_CHECKING, Any
@@ -15,9 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle import kernel_clock
 from pipistrelle.acoustics.emitter import beamwidth_of
-from pipistrelle.config import Config, FilterConfig, ListeningConfig, Strategy
-from pipistrelle.detection.faces import FrameMeasurements
-from pipistrelle.detection.scans import Scan
+from pipistrelle.config import Config
 from pipistrelle.estimation.beliefs import Track
 from pipistrelle.estimation.catalogue import SECTIONS
 from pipistrelle.evaluation.accuracy import (
@@ -27,7 +25,6 @@ from pipistrelle.evaluation.accuracy import (
     position_error,
 )
 from pipistrelle.evaluation.bound import (
-    bound_of_drawn_start,
     nees_of_exact_start,
 )
 from pipistrelle.evaluation.consistency import track_nees
@@ -35,67 +32,52 @@ from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import Scenario, standing_landmarks, world_of
 from pipistrelle.experiments.hearing.trajectories import motion_of
 from pipistrelle.experiments.hearing.world import World
-from pipistrelle.experiments.results.scores import PathScores, Scores, drive_bound, with_bound
-from pipistrelle.experiments.runs.checking import failure_text, first_belief
-from pipistrelle.experiments.runs.trial import drive_of, run_trial, scans_of
+from pipistrelle.experiments.results.scores import PathScores, Scores, with_bound
+from pipistrelle.experiments.runs.heard_world import HeardWorld, drive_of
+from pipistrelle.experiments.runs.trial import run_trial
+from pipistrelle.experiments.runs.validate_filters import failure_text, first_belief
 from pipistrelle.experiments.studies.plan import Plan, PlannedCase, cases_of
 
 if TYPE_CHECKING:
     import polars as pl
 
 ONLINE = ("position_rmse_m", "heading_rmse_rad", "nees_mean", "nees_max")
-"""Scores that a table has of the path as it was believed at its time, too, if it was revised."""
+"""Scores that a table also has for the path as it was believed at its time, if it was revised."""
 
 NEES_OF_DRAWN_START = (3.0, 6.0)
 """Mean and variance of a consistent filter's NEES: chi-square of three numbers."""
 STEPS = ("position_error_m", "heading_error_rad", "nees", "nees_expected", "nees_variance")
-"""What a table has of each frame: errors and NEES; of a consistent filter, mean and variance."""
+"""Columns for each frame: errors, NEES, and mean and variance of a consistent filter's NEES."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrialRecord:
-    """What is kept of a trial.
-
-    Attributes
-    ----------
-    case : PlannedCase
-    beamwidth_deg : float or None
-        Of the vehicle's call; None for passive.
-    error : str or None
-        The traceback and, last, what it says in a line, if it failed; then there are neither
-        scores nor rows of the other tables.
-    scores : Scores or None
-    online : PathScores or None
-        Of the path as it was believed at its time, where the filter revises it.
-    landmarks_full_mean : float or None
-        Over the particles, where the filter has some.
-    clutter_per_frame : float or None
-        Detections without a label.
-    wall_s, cpu_s : [s]
-        Time that the filter took.
-    steps : (k, 5) [m, rad, 1, 1, 1]
-        Position error, heading error and NEES at each frame; of a consistent filter's NEES the
-        mean and the variance.
-    landmark : (n)
-        Labels.
-    full : (n)
-        Whether each is fully initialised.
-    landmark_error : (n) [m]
-    """
+    """What a study keeps of one trial."""
 
     case: PlannedCase
     beamwidth_deg: float | None
+    """Half-power width of the vehicle's call; None for passive."""
     error: str | None = None
+    """The traceback and, last, what it says in a line, if it failed; then there are neither scores
+    nor rows of the other tables."""
     scores: Scores | None = None
     online: PathScores | None = None
+    """Scores of the path as it was believed at its time, where the filter revises it."""
     landmarks_full_mean: float | None = None
+    """Mean over the particles, where the filter has some."""
     clutter_per_frame: float | None = None
+    """Mean number of detections without a label."""
     wall_s: float = 0.0
     cpu_s: float = 0.0
     steps: Float[np.ndarray, "k 5"]
+    """Position error, heading error and NEES at each frame; of a consistent filter's NEES the mean
+    and the variance [m, rad, 1, 1, 1]."""
     landmark: Int[np.ndarray, " n"]
+    """Labels of the landmarks on the map."""
     full: Bool[np.ndarray, " n"]
+    """Whether each is fully initialised."""
     landmark_error: Float[np.ndarray, " n"]
+    """Distance from the true position [m]."""
 
 
 def run_world(plan: Plan, iteration: int) -> tuple[TrialRecord, ...]:
@@ -103,18 +85,6 @@ def run_world(plan: Plan, iteration: int) -> tuple[TrialRecord, ...]:
 
     A trial that raises an exception, and every trial of a world that does, is a failed record.
 
-    Parameters
-    ----------
-    plan : Plan
-    iteration : int
-        Number of the world.
-
-    Returns
-    -------
-    tuple of TrialRecord, one per case, in their order
-
-    Examples
-    --------
     >>> from pipistrelle.config import ScenarioConfig
     >>> ways = {"strategies": ("fused",), "filters": ("ekf",)}
     >>> config = Config(scenario=ScenarioConfig(steps=8, landmarks=12))
@@ -133,16 +103,6 @@ def run_world(plan: Plan, iteration: int) -> tuple[TrialRecord, ...]:
 def heard_together(plan: Plan) -> tuple[tuple[PlannedCase, ...], ...]:
     """Group the cases of a plan that share the drawing and the recording of a world.
 
-    Parameters
-    ----------
-    plan : Plan
-
-    Returns
-    -------
-    tuple of tuples of PlannedCase
-
-    Examples
-    --------
     >>> grid = {"filter.gate": (0.9, 1.0), "emitter.radius": (0.0025, 0.025)}
     >>> ways = {"strategies": ("fused",), "filters": ("ekf",)}
     >>> plan = Plan(name="four", iterations=1, config=Config(), grid=grid, **ways)
@@ -156,36 +116,14 @@ def heard_together(plan: Plan) -> tuple[tuple[PlannedCase, ...], ...]:
 
 
 def failed_records(plan: Plan, error: str) -> tuple[TrialRecord, ...]:
-    """Record that a world could not be tried.
-
-    Parameters
-    ----------
-    plan : Plan
-    error : str
-
-    Returns
-    -------
-    tuple of TrialRecord, one per case
-    """
+    """Return a failed record for every case of a world that could not be tried."""
     return tuple(_failed(case, error) for case in cases_of(plan))
 
 
 def world_tables(
     plan: Plan, iteration: int, records: Sequence[TrialRecord]
 ) -> "dict[str, pl.DataFrame]":
-    """Lay out a world's tables.
-
-    Parameters
-    ----------
-    plan : Plan
-    iteration : int
-    records : sequence of TrialRecord
-
-    Returns
-    -------
-    dict of DataFrame
-        By the names of `world_schemas`.
-    """
+    """Lay out a world's tables, by the names of `world_schemas`."""
     import polars as pl
 
     schemas = world_schemas(plan)
@@ -215,16 +153,7 @@ def world_tables(
 
 
 def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
-    """Name the columns of each table and what they hold.
-
-    Parameters
-    ----------
-    plan : Plan
-
-    Returns
-    -------
-    dict of table to dict of column to polars type
-    """
+    """Return the columns of each table and their polars types."""
     import polars as pl
 
     world = {"iteration": pl.Int32, "case": pl.Int16}
@@ -270,7 +199,7 @@ def _online_columns(plan: Plan) -> tuple[str, ...]:
 
 
 def _heard_settings(case: PlannedCase) -> str:
-    """Return as text all settings that bear on a case's world and on what is heard in it."""
+    """Return as text all settings on which a case's world and its recording depend."""
     settings = case.config.model_dump(mode="json", exclude=set(SECTIONS))
     del settings["emitter"]["radius"]
     settings["assumed"] = case.config.assumed_sound_speed  # the rest is the filters' alone
@@ -287,96 +216,31 @@ def _run_cases(cases: Sequence[PlannedCase], iteration: int, world: World) -> li
     except Exception as failure:
         error = failure_text(failure)
         return [_failed(case, error) for case in cases]
-    shared = _Shared(scenario, config, dict(zip(radii, heard, strict=True)))
+    shared = HeardWorld(scenario, config, dict(zip(radii, heard, strict=True)))
     return [_try_case(case, shared, iteration) for case in cases]
 
 
-_NOISE = ("noise", "range_std", "bearing_std", "detour_std")
-_CALLERS = ("caller_speed_std", "caller_walk_std")
-"""Settings of a filter that state noise, of what is heard and of how callers move."""
-_Told = tuple[float, Strategy, FilterConfig, ListeningConfig]
-"""Of which beam, by which strategy, with which noise, and what is listened for."""
+def _consistent(case: PlannedCase, shared: HeardWorld) -> Float[np.ndarray, "k 2"]:
+    """Return mean and variance of a consistent filter's NEES at each frame."""
+    config, settings = case.config, case.config.filter
+    frames = slice(None, None, config.scenario.steps_per_frame)
+    path = shared.scenario.path[frames]
+    if settings.first_pose == "drawn":
+        return np.tile(np.array(NEES_OF_DRAWN_START, np.float32), (len(path) - 1, 1))
+    bound = shared.stated_bound(config, case.strategy)[frames]
+    start_covariance = np.diag(np.square(settings.initial_pose_std))
+    expected = nees_of_exact_start(bound, path, start_covariance)
+    return np.column_stack(expected)[1:].astype(np.float32)
 
 
-class _Shared:
-    """What the cases of a world share: each is worked out once."""
-
-    def __init__(
-        self, scenario: Scenario, config: Config, beams: Mapping[float, Sequence[FrameMeasurements]]
-    ) -> None:
-        self.scenario, self.beams, self._config = scenario, beams, config
-        self._drive = drive_of(scenario, config)
-        # No `cache` of a method: it would hold what holds it, and a world's sound for long.
-        self._scans_known: dict[_Told, tuple[Scan, ...]] = {}
-        self._bound_known: dict[_Told, Float[np.ndarray, "t 3 3"]] = {}
-
-    def scans(self, case: PlannedCase) -> tuple[Scan, ...]:
-        """Return what a strategy takes of a beam's frames, and how surely, as a filter is told."""
-        return self._scans(_told(case))
-
-    def consistent(self, case: PlannedCase) -> Float[np.ndarray, "k 2"]:
-        """Return mean and variance of a consistent filter's NEES at each frame."""
-        frames = slice(None, None, self._config.scenario.steps_per_frame)
-        path, told = self.scenario.path[frames], case.config.filter
-        if told.first_pose == "drawn":
-            return np.tile(np.array(NEES_OF_DRAWN_START, np.float32), (len(path) - 1, 1))
-        bound = self._bound(_told(case))[frames]
-        expected = nees_of_exact_start(bound, path, _start_covariance(told))
-        return np.column_stack(expected)[1:].astype(np.float32)
-
-    def bound(self, case: PlannedCase) -> Float[np.ndarray, "t 3 3"]:
-        """Return the bound of the pose at every step, the noise as the signal tells it."""
-        radius, strategy, noise, listening = _told(case)
-        measured, told = noise.model_copy(update={"noise": "measured"}), case.config.filter
-        bound = self._bound((radius, strategy, measured, listening))
-        if told.first_pose == "drawn":
-            return bound_of_drawn_start(bound, self.scenario.path, _start_covariance(told))
-        return bound
-
-    def _scans(self, told: _Told) -> tuple[Scan, ...]:
-        """Take the scans of a beam, which nothing that is told of callers changes."""
-        radius, strategy, told_of, listening = told
-        noise = _alone(told_of, _NOISE)
-        key = (radius, strategy, noise, listening)
-        if key not in self._scans_known:
-            config = self._config.model_copy(update={"filter": noise, "listening": listening})
-            self._scans_known[key] = scans_of(self.beams[radius], strategy, config)
-        return self._scans_known[key]
-
-    def _bound(self, told: _Told) -> Float[np.ndarray, "t 3 3"]:
-        """Work out the bound of the pose at every step."""
-        if told not in self._bound_known:
-            _, _, noise, listening = told
-            config = self._config.model_copy(update={"filter": noise, "listening": listening})
-            known = replace(self._drive, motion=motion_of(config.motion))
-            bound = drive_bound(known, self._scans(told), config)
-            assert bound is not None, "the truth of a world is known"
-            self._bound_known[told] = bound
-        return self._bound_known[told]
-
-
-def _start_covariance(told: FilterConfig) -> Float[np.ndarray, "3 3"]:
-    """Return how surely a filter is told the first pose."""
-    return np.diag(np.square(told.initial_pose_std))
-
-
-def _told(case: PlannedCase) -> _Told:
-    """Return what tells a case's scans from those of others in its world."""
-    config = case.config
-    told = _alone(config.filter, _NOISE + _CALLERS)
-    return config.emitter.radius, case.strategy, told, config.listening
-
-
-def _alone(told: FilterConfig, names: Sequence[str]) -> FilterConfig:
-    """Return some of a filter's settings, and of the others the defaults."""
-    return FilterConfig(**{name: getattr(told, name) for name in names})
-
-
-def _try_case(case: PlannedCase, shared: _Shared, iteration: int) -> TrialRecord:
-    """Run a trial, whatever comes of it; filters share what a beam and a strategy bring."""
+def _try_case(case: PlannedCase, shared: HeardWorld, iteration: int) -> TrialRecord:
+    """Run a trial; an error becomes a failed record."""
     try:
         scenario = shared.scenario
-        drive, scans = drive_of(scenario, case.config, iteration), shared.scans(case)
+        drive, scans = (
+            drive_of(scenario, case.config, iteration),
+            shared.scans(case.config, case.strategy),
+        )
         heard = shared.beams[case.config.emitter.radius]
         began = kernel_clock.cpu_s()
         result = run_trial(replace(case, iteration=iteration), drive, scans, case.config)
@@ -387,13 +251,13 @@ def _try_case(case: PlannedCase, shared: _Shared, iteration: int) -> TrialRecord
         return TrialRecord(
             case=case,
             beamwidth_deg=_beamwidth_deg(case),
-            scores=with_bound(result.scores, shared.bound(case)),
+            scores=with_bound(result.scores, shared.bound(case.config, case.strategy)),
             online=result.online,
             landmarks_full_mean=float(result.scores.landmarks_full if full is None else full),
             clutter_per_frame=sum(h.clutter or 0 for h in heard) / len(heard) if heard else None,
             wall_s=result.wall_s,
             cpu_s=cpu_s,
-            steps=np.column_stack([frames, shared.consistent(case)]),
+            steps=np.column_stack([frames, _consistent(case, shared)]),
             landmark=estimate.landmark,
             full=estimate.full,
             landmark_error=landmark_error(estimate, *standing_landmarks(scenario)),
@@ -427,7 +291,7 @@ def _failed(case: PlannedCase, error: str) -> TrialRecord:
 
 
 def _beamwidth_deg(case: PlannedCase) -> float | None:
-    """Return the half-power beamwidth of the vehicle's call, where it matters."""
+    """Return the half-power beamwidth of the vehicle's call [deg]; None for passive."""
     if case.strategy == "passive":
         return None
     return degrees(beamwidth_of(case.config))

@@ -36,44 +36,26 @@ if TYPE_CHECKING:
     import polars as pl
 
 TABLES = ("steps", "landmarks", "trials")
-"""In the order in which a world's are put in place."""
+"""Tables, in the order in which a world's are put in place."""
 _SUM = "pipistrelle.sha256.{}"
-"""Where a table's sum stands among what the file of trials says of itself."""
+"""Key of a table's sum in the metadata of the trials' file."""
 _NO_SUM = "-" * 64
-"""In place of the sum of the file of trials, when that is taken."""
+"""Placeholder for the sum of the trials' file while that sum is computed."""
 _WORLD, _PLAN = "pipistrelle.iteration", "pipistrelle.plan"
-"""Which world it is, and the sum of the plan by which it was computed."""
+"""Keys of the world's number and of the plan's sum in the metadata."""
 
 
 class EndedTrial(NamedTuple):
-    """How a trial ended, as a worker reports it.
-
-    Attributes
-    ----------
-    strategy : "active", "fused" or "passive"
-    error : str or None
-        What is recorded of a trial that failed.
-    """
+    """How a trial ended, as a worker reports it."""
 
     strategy: str
     error: str | None
+    """What is recorded of a trial that failed."""
 
 
 def world_file(folder: Path, table: str, iteration: int) -> Path:
-    """Return the place of one world's table.
+    """Return the path of one world's table.
 
-    Parameters
-    ----------
-    folder : Path
-    table : one of `TABLES`
-    iteration : int
-
-    Returns
-    -------
-    Path
-
-    Examples
-    --------
     >>> world_file(Path("study"), "trials", 7).as_posix()
     'study/trials/iteration_00007.parquet'
     """
@@ -81,16 +63,7 @@ def world_file(folder: Path, table: str, iteration: int) -> Path:
 
 
 def done_worlds(folder: Path) -> set[int]:
-    """Return the numbers of the worlds that are done.
-
-    Parameters
-    ----------
-    folder : Path
-
-    Returns
-    -------
-    set of int
-    """
+    """Return the numbers of the worlds that are done."""
     names = (
         path.stem.partition("_")[2] for path in (folder / "trials").glob("iteration_*.parquet")
     )
@@ -98,21 +71,9 @@ def done_worlds(folder: Path) -> set[int]:
 
 
 def write_world(folder: Path, plan: Plan, iteration: int, records: Sequence[TrialRecord]) -> None:
-    """Write a world's tables, in place of earlier ones, and sweep up after killed writers.
+    """Write a world's tables, in place of earlier ones, and delete what killed writers left.
 
-    Parameters
-    ----------
-    folder : Path
-        As `open_store` made it.
-    plan : Plan
-    iteration : int
-    records : sequence of TrialRecord
-        One per case.
-
-    Raises
-    ------
-    InputError
-        Where they cannot be written; earlier ones are then as they were.
+    Where they cannot be written, the earlier ones are as they were.
     """
     files = with_sums(world_tables(plan, iteration, records), plan, iteration)
     paths = [world_file(folder, name, iteration) for name in TABLES]
@@ -133,20 +94,9 @@ def write_world(folder: Path, plan: Plan, iteration: int, records: Sequence[Tria
 
 
 def refuse_strange(folder: Path, plan: Plan, iterations: Iterable[int]) -> None:
-    """Refuse to compute worlds in whose tables' place somebody else's files stand.
+    """Refuse to compute worlds where files that are not ours stand in their tables' place.
 
-    What a killed writer left without its trials is whole and ours, known by its columns.
-
-    Parameters
-    ----------
-    folder : Path
-    plan : Plan
-    iterations : iterable of int
-
-    Raises
-    ------
-    InputError
-        With the file.
+    Tables that a killed writer left without its trials are ours; their columns show it.
     """
     schemas = world_schemas(plan)
     for iteration, name in product(iterations, TABLES[:-1]):
@@ -159,7 +109,7 @@ def refuse_strange(folder: Path, plan: Plan, iterations: Iterable[int]) -> None:
 
 
 def _is_table(path: Path, schema: "Mapping[str, pl.DataType]") -> bool:
-    """Whether a file is a whole table of these columns, and no link."""
+    """Return whether a file is a whole table of these columns, and no link."""
     import polars as pl
 
     with contextlib.suppress(OSError, pl.exceptions.PolarsError):
@@ -170,36 +120,24 @@ def _is_table(path: Path, schema: "Mapping[str, pl.DataType]") -> bool:
 
 
 def with_sums(tables: "Mapping[str, pl.DataFrame]", plan: Plan, iteration: int) -> dict[str, bytes]:
-    """Make files of a world's tables; that of the trials bears the sums of all, and of the plan.
-
-    Parameters
-    ----------
-    tables : mapping of DataFrame
-        By the names in `TABLES`.
-    plan : Plan
-    iteration : int
-
-    Returns
-    -------
-    dict of bytes
-    """
+    """Return the files of a world's tables; that of the trials bears the sums of all."""
     files = {name: _parquet(tables[name]) for name in TABLES[:-1]}
-    said = {_SUM.format(name): sha256(file).hexdigest() for name, file in files.items()}
-    said |= {_SUM.format("trials"): _NO_SUM, _WORLD: str(iteration), _PLAN: _plan_sum(plan)}
-    trials = _parquet(tables["trials"], said)
+    metadata = {_SUM.format(name): sha256(file).hexdigest() for name, file in files.items()}
+    metadata |= {_SUM.format("trials"): _NO_SUM, _WORLD: str(iteration), _PLAN: _plan_sum(plan)}
+    trials = _parquet(tables["trials"], metadata)
     own = sha256(trials).hexdigest()
     return files | {"trials": trials.replace(_NO_SUM.encode(), own.encode())}
 
 
-def _parquet(table: "pl.DataFrame", said: dict[str, str] | None = None) -> bytes:
-    """Return a table as a Parquet file, with what it says of itself."""
+def _parquet(table: "pl.DataFrame", metadata: dict[str, str] | None = None) -> bytes:
+    """Return a table as a Parquet file with this metadata."""
     buffer = io.BytesIO()
-    table.write_parquet(buffer, metadata=said)
+    table.write_parquet(buffer, metadata=metadata)
     return buffer.getvalue()
 
 
 def _make_way(folder: Path, iteration: int, files: dict[str, bytes]) -> None:
-    """Declare a world not done whose other tables are about to change under its trials."""
+    """Delete a world's trials if its other tables are about to change: it is then not done."""
     trials = world_file(folder, "trials", iteration)
     for name in TABLES[:-1]:
         with contextlib.suppress(FileNotFoundError):
@@ -217,36 +155,19 @@ def sweep(folder: Path, iterations: Iterable[int]) -> None:
 
 
 def _plan_sum(plan: Plan) -> str:
-    """Sum up what a plan's worlds depend on; a setting that is new has its default in old plans."""
+    """Return the SHA-256 of all on which a plan's worlds depend; defaults are left out."""
     config = plan.config.model_dump(mode="json", exclude_defaults=True)
     air = config.pop("air", {})
     air["speed_of_sound"] = plan.config.air.sound_speed  # given or not
     grid = {name: list(values) for name, values in plan.grid.items()}
     own = {name: dict(settings) for name, settings in plan.own.items()}
     parts = [plan.strategies, plan.filters, config, air, grid, *([own] if own else [])]
-    said = json.dumps(parts, sort_keys=True)
-    return sha256(said.encode()).hexdigest()
+    text = json.dumps(parts, sort_keys=True)
+    return sha256(text.encode()).hexdigest()
 
 
 def read_ended_trials(folder: Path, plan: Plan, iteration: int) -> list[EndedTrial]:
-    """Tell how the trials of a world that is done ended.
-
-    Parameters
-    ----------
-    folder : Path
-    plan : Plan
-        By which it should have been computed.
-    iteration : int
-
-    Returns
-    -------
-    list of EndedTrial
-
-    Raises
-    ------
-    InputError
-        Where one of the world's files is not as it was written.
-    """
+    """Return how the trials of a finished world ended; refuse files that were changed."""
     import polars as pl
 
     file = check_world(folder, plan, iteration)
@@ -259,54 +180,27 @@ def read_ended_trials(folder: Path, plan: Plan, iteration: int) -> list[EndedTri
 
 
 def check_world(folder: Path, plan: Plan, iteration: int) -> bytes:
-    """Refuse a world that is done, but of which a file is not as it was written.
+    """Refuse a finished world whose files are not as the plan's study wrote them.
 
-    Parameters
-    ----------
-    folder : Path
-    plan : Plan
-        By which it should have been computed.
-    iteration : int
-
-    Returns
-    -------
-    bytes
-        The file of trials.
-
-    Raises
-    ------
-    InputError
-        With the file, and how to have the world anew.
+    Returns the file of trials.
     """
-    found: dict[str, bytes] = {}
+    files: dict[str, bytes] = {}
     for name in reversed(TABLES):
         path = world_file(folder, name, iteration)
         try:
-            found[name] = read_file(path)
-            flaw = _flaw(name, found, plan, iteration)
+            files[name] = read_file(path)
+            flaw = _flaw(name, files, plan, iteration)
         except FileNotFoundError:
             flaw = "is missing"
         except OSError as error:
             flaw = f"could not be read ({error.strerror})"
         if flaw:
             raise damaged(folder, name, iteration, flaw)
-    return found["trials"]
+    return files["trials"]
 
 
 def damaged(folder: Path, table: str, iteration: int, flaw: str) -> InputError:
-    """Say what is wrong with a world's file, and how to have the world anew.
-
-    Parameters
-    ----------
-    folder : Path
-    table : one of `TABLES`
-    iteration : int
-    flaw : str
-
-    Returns
-    -------
-    InputError
-    """
+    """Return the refusal of a world's damaged file, with the way to compute the world again."""
     return InputError(
         f"{world_file(folder, table, iteration)}: {flaw}; remove "
         f"{world_file(Path(), 'trials', iteration)} from {folder} and run the study again: its "
@@ -315,39 +209,27 @@ def damaged(folder: Path, table: str, iteration: int, flaw: str) -> InputError:
 
 
 def _flaw(name: str, found: dict[str, bytes], plan: Plan, iteration: int) -> str | None:
-    """Tell what is wrong with a file, by what that of the trials says; the trials come first."""
+    """Return what is wrong with a file by the metadata of the trials' file, which comes first."""
     import polars as pl
 
     try:
-        said = pl.read_parquet_metadata(io.BytesIO(found["trials"]))
+        metadata = pl.read_parquet_metadata(io.BytesIO(found["trials"]))
     except (OSError, pl.exceptions.PolarsError):
         return "could not be read: it is no whole Parquet file"
-    if _WORLD not in said:
+    if _WORLD not in metadata:
         return "bears no sums: it is of an earlier version, or not Pipistrelle's"
-    if said[_WORLD] != str(iteration):
-        return f"is the file of world {said[_WORLD]}"
-    if name == "trials" and _PLAN in said and said[_PLAN] != _plan_sum(plan):
+    if metadata[_WORLD] != str(iteration):
+        return f"is the file of world {metadata[_WORLD]}"
+    if name == "trials" and _PLAN in metadata and metadata[_PLAN] != _plan_sum(plan):
         return "was computed by another plan than the plan.toml that is here now"
-    expected, file = said.get(_SUM.format(name), _NO_SUM), found[name]
+    expected, file = metadata.get(_SUM.format(name), _NO_SUM), found[name]
     if name == "trials":
         file = file.replace(expected.encode(), _NO_SUM.encode())
     return None if sha256(file).hexdigest() == expected else "is not as it was written"
 
 
 def scan_tables(folder: Path, table: str, worlds: Sequence[int]) -> "pl.LazyFrame":
-    """Open one table of some worlds, one after another.
-
-    Parameters
-    ----------
-    folder : Path
-    table : one of `TABLES`
-    worlds : sequence of int
-        At least one.
-
-    Returns
-    -------
-    LazyFrame
-    """
+    """Open one table of some worlds, at least one, as one lazy frame."""
     import polars as pl
 
     paths = [world_file(folder, table, world).absolute() for world in worlds]
@@ -361,17 +243,7 @@ def scan_tables(folder: Path, table: str, worlds: Sequence[int]) -> "pl.LazyFram
 
 
 def unusable(folder: Path, error: OSError) -> InputError:
-    """Say that a study's folder cannot be written, and that nothing is lost.
-
-    Parameters
-    ----------
-    folder : Path
-    error : OSError
-
-    Returns
-    -------
-    InputError
-    """
+    """Return the refusal of a study's folder that cannot be written; nothing is lost."""
     return InputError(
         f"{error.filename or folder}: could not be written ({error.strerror}); worlds that are "
         "done are kept: mend this, or copy the folder elsewhere, and run the same command again"

@@ -15,7 +15,7 @@ from pipistrelle.config import InputError
 from pipistrelle.estimation.beliefs import Landmarks, some_of
 from pipistrelle.experiments.drives import LabelledPoints
 from pipistrelle.experiments.results.scores import TrialResult
-from pipistrelle.experiments.runs.again import Again
+from pipistrelle.experiments.runs.mission import Mission
 from pipistrelle.figures.animation import pruned
 from pipistrelle.figures.detours import MOST, callers_at, callers_marked, detours_at, resolved
 from pipistrelle.figures.maps import view
@@ -111,7 +111,7 @@ class Playback:
 
 
 def playback(
-    done: Again, snapshots: Mapping[tuple[str, str], Sequence[Snapshot]], most: int = MOST_FRAMES
+    done: Mission, snapshots: Mapping[tuple[str, str], Sequence[Snapshot]], most: int = MOST_FRAMES
 ) -> Playback:
     """Lay out a mission that was done again while a recorder watched.
 
@@ -134,7 +134,7 @@ def playback(
     for trial in trials:
         frames = snapshots[trial.strategy, trial.filter]
         estimates.append(_estimate(trial, frames, time, steps, done, origin))
-    true = done.truth.path
+    true = done.drive.truth.path
     title, facts = _told(done, len(longest), len(time))
     return Playback(
         title=title,
@@ -144,7 +144,7 @@ def playback(
         limits=_limits(done, trials, origin),
         true_start=None if true is None else _moved(true[0], origin),
         true_pose=None if true is None else _moved(true[steps], origin),
-        landmarks=_landmarks(done.truth.landmarks, origin),
+        landmarks=_landmarks(done.drive.truth.landmarks, origin),
         callers=_callers(done, steps, origin),
         beamwidth=done.beamwidth,
         farthest=done.config.rays.range_bounds[1],
@@ -152,7 +152,7 @@ def playback(
     )
 
 
-def _told(done: Again, frames: int, shown: int) -> tuple[str, tuple[str, ...]]:
+def _told(done: Mission, frames: int, shown: int) -> tuple[str, tuple[str, ...]]:
     """Say what a mission is, and what a reader should know of it."""
     time = done.trials[0].track.time
     facts = [f"{time[-1] - time[0]:.1f} s", f"{frames} frames"]
@@ -160,10 +160,10 @@ def _told(done: Again, frames: int, shown: int) -> tuple[str, tuple[str, ...]]:
         facts[-1] += f", of which {shown} are shown"
     if done.beamwidth is not None:
         width = f"{np.degrees(done.beamwidth):.0f}°"
-        facts.append(f"beam {width}" if done.mission else f"ranges within {width}")
-    if done.truth.landmarks is not None:
-        facts.append(f"{len(done.truth.landmarks[0])} landmarks")
-    if done.truth.path is None:
+        facts.append(f"beam {width}" if done.scenario else f"ranges within {width}")
+    if done.drive.truth.landmarks is not None:
+        facts.append(f"{len(done.drive.truth.landmarks[0])} landmarks")
+    if done.drive.truth.path is None:
         facts.append("no truth known")
     return f"Log {done.log.name}" if done.log else f"Mission of seed {done.config.seed}", tuple(
         facts
@@ -185,12 +185,12 @@ def _moved(poses: Float[np.ndarray, "*n d"], origin: Float[np.ndarray, "2"]) -> 
 
 
 def _limits(
-    done: Again, trials: Sequence[TrialResult], origin: Float[np.ndarray, "2"]
+    done: Mission, trials: Sequence[TrialResult], origin: Float[np.ndarray, "2"]
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the limits of the mission's figure."""
     paths = [trial.track.pose.mean for trial in trials]
     (left, right), (bottom, top) = view(
-        done.truth, done.callers, paths, [trial.track.landmarks for trial in trials]
+        done.drive.truth, done.callers, paths, [trial.track.landmarks for trial in trials]
     )
     x, y = origin.tolist()
     return (left - x, right - x), (bottom - y, top - y)
@@ -204,13 +204,13 @@ def _landmarks(
 
 
 def _callers(
-    done: Again, steps: Int[np.ndarray, " n"], origin: Float[np.ndarray, "2"]
+    done: Mission, steps: Int[np.ndarray, " n"], origin: Float[np.ndarray, "2"]
 ) -> tuple[tuple[int, str, np.ndarray], ...]:
     """Return the callers with their labels, and of a path the places at the frames."""
     if done.log is not None:
         unknown = np.full(2, np.nan)
         return tuple((caller.landmark, caller.name, unknown) for caller in done.log.callers)
-    count = 0 if done.mission is None else len(done.mission.scenario.landmarks)
+    count = 0 if done.scenario is None else len(done.scenario.landmarks)
     places = [np.asarray(caller.place, dtype=float) for caller in done.callers]
     return tuple(
         (label, caller.name, (place[steps] if moves(caller) else place) - origin)
@@ -225,7 +225,7 @@ def _estimate(
     frames: Sequence[Snapshot],
     time: Float[np.ndarray, " n"],
     steps: Int[np.ndarray, " n"],
-    done: Again,
+    done: Mission,
     origin: Float[np.ndarray, "2"],
 ) -> Estimate:
     """Lay out one estimate; at each time by the latest of its frames."""
@@ -244,7 +244,7 @@ def _estimate(
     return Estimate(
         strategy=trial.strategy,
         filter=trial.filter,
-        outcome=f"failed: {trial.error}" if trial.error else outcome(trial, done.truth),
+        outcome=f"failed: {trial.error}" if trial.error else outcome(trial, done.drive.truth),
         start=_moved(first.mean[0], origin),
         pose=_moved(np.array([frame.pose for frame in shown]), origin),
         spread=covariance[:, (0, 0, 1, 2), (0, 1, 1, 2)],

@@ -7,19 +7,15 @@ of a recorded log, which it was and how it was heard (`log_entry`).
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from hashlib import file_digest
 from pathlib import Path
 
 import numpy as np
 
-from pipistrelle.acoustics.callers import Caller
-from pipistrelle.acoustics.emitter import beamwidth_of
-from pipistrelle.config import Config, InputError
+from pipistrelle.config import InputError
 from pipistrelle.detection.logs.readers import Robot, reader_of
-from pipistrelle.detection.logs.recording import Log
 from pipistrelle.estimation.catalogue import CATALOGUE, short_name
-from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.hearing.world import ANY
 from pipistrelle.experiments.hearing.world_folder import read_world
@@ -28,82 +24,30 @@ from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.results.tables import tum_text
 from pipistrelle.experiments.results.writing import settings_hash
 from pipistrelle.experiments.runs import truth_files
+from pipistrelle.experiments.runs.mission import Mission
 from pipistrelle.experiments.runs.replay import load, replay
-from pipistrelle.experiments.runs.trial import Mission, Watch, run_mission
+from pipistrelle.experiments.runs.trial import Watch, run_mission
 from pipistrelle.files import read_file
 from pipistrelle.refusals import refusal
 from pipistrelle.settings import from_file, read_toml, resolve
 from pipistrelle.version import find_version
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Again:
-    """A mission, simulated or recorded, that was done again.
-
-    Attributes
-    ----------
-    config : Config
-        Of a log, its sections that estimators read.
-    trials : tuple of TrialResult
-        As `run_mission` or `replay` gives them.
-    truth : Truth
-    callers : tuple of Caller
-        Who was heard besides the vehicle, as far as that is known.
-    beamwidth : [rad] or None
-        Of the vehicle's call; of a log, that outside which ranges were hidden.
-    mission : Mission or None
-    log : Log or None
-        One of the two: simulated, or recorded.
-    difference : str
-        How its tracks are not those of the folder, in a line; empty where they are, bit for bit.
-    """
-
-    config: Config
-    trials: tuple[TrialResult, ...]
-    truth: Truth
-    callers: tuple[Caller, ...]
-    beamwidth: float | None
-    mission: Mission | None
-    log: Log | None
-    difference: str
-
-
-def again(
+def rerun(
     folder: Path,
     *,
     log: Path | None = None,
     trusted: Collection[str] = (),
     progress: Progress | None = None,
     watch: Watch | None = None,
-) -> Again:
+) -> Mission:
     """Do a mission again from its result folder, and compare its tracks with those there.
 
-    Parameters
-    ----------
-    folder : Path
-        As `pipistrelle run` or `pipistrelle slam` has filled it.
-    log : Path, optional
-        Where the log is that was solved, if no longer where it was.
-    trusted : collection of str
-        Estimators from outside, ``module:Class``, whose code may be run. The folder may come from
-        anybody, and their modules may lie in it.
-    progress, watch : callable, optional
-        As of `run_mission`.
+    `log` says where the log is, if it was moved. The folder may come from anybody, so estimators
+    from outside, ``module:Class``, are run only if they are trusted.
 
-    Returns
-    -------
-    Again
-
-    Raises
-    ------
-    InputError
-        Where the folder is no such folder or lacks what this takes, where it names an estimator
-        from outside that is not trusted, or where the log is gone or is not what it was.
-
-    Examples
-    --------
     >>> from tempfile import TemporaryDirectory
-    >>> from pipistrelle.config import ScenarioConfig
+    >>> from pipistrelle.config import Config, ScenarioConfig
     >>> from pipistrelle.experiments.drives import NO_TRUTH
     >>> from pipistrelle.experiments.results.writing import write_results
     >>> from pipistrelle.own_files import RESULTS, OwnFiles
@@ -113,7 +57,7 @@ def again(
     >>> with TemporaryDirectory() as name:
     ...     own = OwnFiles(Path(name), RESULTS)
     ...     write_results(own, config=config, trials=done.trials, truth=NO_TRUTH, **kept)
-    ...     same = again(Path(name))
+    ...     same = rerun(Path(name))
     >>> same.difference, np.array_equal(*(it.trials[0].track.pose.mean for it in (done, same)))
     ('', True)
     """
@@ -127,48 +71,26 @@ def again(
         )
     config = resolve(from_file(folder / "config.toml"))
     strategies = list(dict.fromkeys(run.strategy for run in summary.runs))
-    tried = strategies, list(dict.fromkeys(run.filter for run in summary.runs))
+    filters = list(dict.fromkeys(run.filter for run in summary.runs))
     if summary.log is None:
         _check_simulated(folder, log)
         world = ANY if (kept := config.scenario.world) is None else read_world(Path(kept))
-        looking = {"progress": progress, "watch": watch}
-        mission, recorded = run_mission(config, *tried, world=world, **looking), None
-        trials, truth = mission.trials, mission.drive.truth
-        callers, beam = mission.scenario.callers[1:], beamwidth_of(config)
+        mission = run_mission(
+            config, strategies, filters, world=world, progress=progress, watch=watch
+        )
     else:
         recorded, truth = load(_log_of(folder, summary, log), summary.log.robot)
-        mission, callers, beam = None, (), summary.log.beamwidth_rad
-        trials = replay(recorded, truth, *tried, beam, config, progress=progress, watch=watch)
-    return Again(
-        config=config,
-        trials=trials,
-        truth=truth,
-        callers=callers,
-        beamwidth=beam,
-        mission=mission,
-        log=recorded,
-        difference=_difference(folder, summary, trials),
-    )
+        beam, asked = summary.log.beamwidth_rad, (strategies, filters)
+        mission = replay(recorded, truth, *asked, beam, config, progress=progress, watch=watch)
+        mission = replace(mission, source=summary.log.model_dump())
+    return replace(mission, difference=_difference(folder, summary, mission.trials))
 
 
 def log_entry(log: Path, robot: Robot | None, beamwidth: float | None) -> dict[str, object]:
-    """Say which log is solved, and how it is heard, so that it can be done again.
+    """Return the entry of ``summary.json`` of a log: its folder and the SHA-256 of its files.
 
-    Parameters
-    ----------
-    log : Path
-    robot : int or str, optional
-        Whose of several.
-    beamwidth : [rad], optional
-        Outside which ranges are hidden.
+    The beamwidth outside which ranges were hidden is in radians.
 
-    Returns
-    -------
-    dict
-        For ``summary.json``: the folder, and the SHA-256 of each file that may be read of it.
-
-    Examples
-    --------
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as name:
     ...     _ = (Path(name) / "log.toml").write_text("format = 1")
@@ -181,7 +103,7 @@ def log_entry(log: Path, robot: Robot | None, beamwidth: float | None) -> dict[s
 
 
 def _sums(log: Path) -> dict[str, str]:
-    """Return the sum of each file that may be read of a log or of its truth."""
+    """Return the SHA-256 of each file of a log and of its truth, by name."""
     patterns = (*reader_of(log).files, *truth_files.FILES)
     found = {path.name: path for pattern in patterns for path in log.glob(pattern)}
     sums = {}
@@ -193,7 +115,7 @@ def _sums(log: Path) -> dict[str, str]:
 
 
 def _check_simulated(folder: Path, log: Path | None) -> None:
-    """Refuse a folder that does not say which log was solved in it, and a log where none was."""
+    """Refuse a result folder that names no log but lacks a world, and a log for a simulated one."""
     if "scenario" not in read_toml(folder / "config.toml"):
         raise refusal(
             f"{folder / SUMMARY}: log",
@@ -238,8 +160,8 @@ def _log_of(folder: Path, summary: Summary, log: Path | None) -> Path:
 
 
 def _difference(folder: Path, summary: Summary, trials: Sequence[TrialResult]) -> str:
-    """Say in a line how tracks are not those of the folder."""
-    found = {}
+    """Describe in a line how tracks differ from those of the folder; empty if they do not."""
+    differences = {}
     for trial in trials:
         track = trial.track
         name = f"track_{trial.strategy}_{short_name(trial.filter)}.tum"
@@ -247,19 +169,19 @@ def _difference(folder: Path, summary: Summary, trials: Sequence[TrialResult]) -
         try:
             there = read_file(folder / name).decode()
         except (OSError, UnicodeDecodeError, InputError):
-            found[name] = "cannot be read"
+            differences[name] = "cannot be read"
             continue
         if here != there:
-            found[name] = f"is not as it is found now{_apart(here, there)}"
-    if not found:
+            differences[name] = f"is not as it is found now{_apart(here, there)}"
+    if not differences:
         return ""
-    name, how = next(iter(found.items()))
-    others = f", nor are {len(found) - 1} more" if len(found) > 1 else ""
+    name, how = next(iter(differences.items()))
+    others = f", nor are {len(differences) - 1} more" if len(differences) > 1 else ""
     return f"{folder / name}: {how}{others}{_reason(folder, summary)}"
 
 
 def _reason(folder: Path, summary: Summary) -> str:
-    """Say why a mission may not be what it was, where that is known."""
+    """Give the reason for a difference, where it is known: other settings or another version."""
     if settings_hash(read_toml(folder / "config.toml")) != summary.config_hash:
         return "; config.toml was changed since"
     if summary.version != find_version():
@@ -268,7 +190,7 @@ def _reason(folder: Path, summary: Summary) -> str:
 
 
 def _apart(here: str, there: str) -> str:
-    """Say how far apart two tracks are, where they can be compared."""
+    """Word the largest distance between two tracks, where they can be compared."""
     try:
         paths = [
             np.array([line.split()[1:3] for line in text.splitlines()], dtype=float)

@@ -1,4 +1,4 @@
-"""What a recorded log decides, what it leaves to be asked for, and what looks odd in it."""
+"""Settings that a recorded log decides, settings that it leaves open, and warnings on it."""
 
 from collections.abc import Sequence
 from math import hypot, inf, sqrt
@@ -22,17 +22,17 @@ OWN: dict[Key, str] = {
     ("rays", "spacing"): "auto",
     ("filter", "noise"): "measured",
 }
-"""Settings that a recorded log has others of than a simulated mission: its sensor is anyone's."""
+"""Defaults of a recorded log that differ from those of a simulated mission."""
 TIMING: Key = ("listening", "timing")
-"""Is on where a log has detours, or a caller that moves: it is followed by whom it is timed."""
+"""Key that is on where a log has detours, or a caller that moves."""
 SUSPECT = 0.2
-"""Share of a log's rows that may not fit before its units are asked about."""
+"""Share of a log's rows that do not fit above which a warning asks about its units."""
 GATED = 0.01
-"""Share of a log's rows that the gate may reject beyond its own before that is said."""
+"""Share of rows that the gate rejects, beyond what it should, above which a warning is given."""
 SURPRISING = 2.0
-"""NIS above which that is said; below 1 a filter is careful, as any is with the paper's noise."""
+"""NIS above which a warning is given; below 1 a filter is cautious, as with the paper's noise."""
 SHORT = 0.2
-"""A detour that few have [m]: it is none of a sound that lasts, and in seconds most are less."""
+"""Detours in metres are rarely smaller [m]; in seconds most are."""
 LOGGED = frozenset(
     {
         ("filter", "range_std"),
@@ -49,22 +49,12 @@ _REPLAYED: dict[str, Any] = {
     name: (Config.model_fields[name].annotation, ...) for name in ("seed", *SECTIONS)
 }
 SlamConfig = create_model("SlamConfig", __base__=Section, **_REPLAYED)
-"""What a log's replay depends on, beside the log; a file for ``--config``."""
+"""All settings on which the solution of a log depends; its folder's ``config.toml`` holds them."""
 
 
 def is_open(key: Key) -> bool:
-    """Tell whether a log leaves a setting open.
+    """Return whether a log leaves a setting open.
 
-    Parameters
-    ----------
-    key : Key
-
-    Returns
-    -------
-    bool
-
-    Examples
-    --------
     >>> is_open(("rays", "power")), is_open(("filter", "range_std")), is_open(("air", "spreading"))
     (True, False, False)
     """
@@ -72,19 +62,8 @@ def is_open(key: Key) -> bool:
 
 
 def check_open(flags: Layer) -> None:
-    """Refuse settings that were asked for and that a log does not leave open.
+    """Refuse settings that a log decides, or that mean nothing to it.
 
-    Parameters
-    ----------
-    flags : Layer
-
-    Raises
-    ------
-    InputError
-        With the first of them.
-
-    Examples
-    --------
     >>> check_open({("filter", "range_std"): Given(0.1, "filter__range_std")})
     Traceback (most recent call last):
     pipistrelle.config.InputError: filter__range_std: the log decides this; leave it out
@@ -96,22 +75,7 @@ def check_open(flags: Layer) -> None:
 
 
 def with_log(layer: Layer, recorded: "Log", log: Path) -> tuple[Config, list[str]]:
-    """Settle what a log decides.
-
-    Parameters
-    ----------
-    layer : Layer
-        What is asked for.
-    recorded : Log
-    log : Path
-        Where it lies.
-
-    Returns
-    -------
-    Config
-    list of str
-        A line for each setting of which the layer says otherwise.
-    """
+    """Resolve settings with those that a log decides; warn of each that asked for another value."""
     decided = {key: Given(getattr(recorded, key[1]), f"{log}: {key[1]}") for key in LOGGED}
     own = {key: Given(value, "slam") for key, value in OWN.items()}
     if recorded.gate is not None:
@@ -122,59 +86,29 @@ def with_log(layer: Layer, recorded: "Log", log: Path) -> tuple[Config, list[str
         own["filter", "detour_std"] = Given(recorded.detour_std, f"{log}: detour_std")
     if ("rays", "likelihood") in layer:  # another reading of the paper is of the paper's rays
         del own["rays", "spacing"]
-    wished, settled, told = resolve(layer), resolve(own | layer | decided), []
+    wished, settled, notes = resolve(layer), resolve(own | layer | decided), []
     for section, name in sorted(LOGGED & layer.keys()):
         value = getattr(getattr(settled, section), name)
         if getattr(getattr(wished, section), name) != value:
             where = layer[section, name].where
-            told.append(f"{where}: the log decides this, and says {value}")
-    return settled, told
+            notes.append(f"{where}: the log decides this, and says {value}")
+    return settled, notes
 
 
 def has_detours(recorded: "Log") -> bool:
-    """Tell whether any row of a log has a detour.
-
-    Parameters
-    ----------
-    recorded : Log
-
-    Returns
-    -------
-    bool
-    """
+    """Return whether any row of a log has a detour."""
     return any((scan.detour == scan.detour).any() for scan in recorded.scans)
 
 
-def driven(recorded: "Log") -> float:
-    """Return how far the vehicle drove by its odometry [m], forwards and backwards.
-
-    Parameters
-    ----------
-    recorded : Log
-
-    Returns
-    -------
-    float
-    """
+def distance_driven(recorded: "Log") -> float:
+    """Return how far the vehicle drove by its odometry, forwards and backwards [m]."""
     if recorded.motion == "poses":
         return sum(hypot(*step) for step in recorded.controls[:, :2].tolist())
     return float(abs(recorded.controls[:, 0] * recorded.dt).sum())
 
 
 def check_room(recorded: "Log", filters: Sequence[str], config: Config) -> None:
-    """Refuse a log whose landmarks may need more memory than there is.
-
-    Parameters
-    ----------
-    recorded : Log
-    filters : sequence of str
-    config : Config
-
-    Raises
-    ------
-    InputError
-        With the estimate.
-    """
+    """Refuse a log whose landmarks may need more memory than there is."""
     from pipistrelle.experiments.machine import check_memory
 
     check_memory(filters, len(_labels(recorded)), config, passive=True)
@@ -185,46 +119,37 @@ def _labels(recorded: "Log") -> set[int]:
     return {label for scan in recorded.scans for label in scan.landmark.tolist()}
 
 
-def beforehand(recorded: "Log", truth: "Truth", log: Path) -> list[str]:
-    """Tell what was left out of a log and of its truth, and where its odometry jumps.
-
-    Parameters
-    ----------
-    recorded : Log
-    truth : Truth
-    log : Path
-
-    Returns
-    -------
-    list of str
-    """
-    told = []
+def log_warnings(recorded: "Log", truth: "Truth", log: Path) -> list[str]:
+    """Warn of rows that were left out of a log or its truth, and of jumps in its odometry."""
+    notes = []
     if recorded.ignored_rows:
         reasons = (
             f"{count} {reason.replace('_', ' ')}" for reason, count in recorded.ignored_rows.items()
         )
-        told.append(f"{log}: rows left out: {', '.join(reasons)}")
-    told += [*_jumps(recorded, log), *_unheard(recorded, log)]
+        notes.append(f"{log}: rows left out: {', '.join(reasons)}")
+    notes += [*_jumps(recorded, log), *_unheard(recorded, log)]
     if truth.path is not None:
         steps = len(truth.time) - 1
-        known = sum(1 for pose in truth.path[1:] if pose[0] == pose[0])
-        if known < steps:
-            told.append(f"{log}: the truth covers {known} of {steps} steps; only these are scored")
-    return told
+        known_steps = sum(1 for pose in truth.path[1:] if pose[0] == pose[0])
+        if known_steps < steps:
+            notes.append(
+                f"{log}: the truth covers {known_steps} of {steps} steps; only these are scored"
+            )
+    return notes
 
 
 def _jumps(recorded: "Log", log: Path) -> list[str]:
-    """Ask whether poses are of one frame, where a step goes much farther than others."""
+    """Warn of poses that may change their frame: a step goes much farther than others."""
     if recorded.motion != "poses":
         return []
     from pipistrelle.detection.logs.poses import jumps
 
-    found = jumps(recorded.controls, recorded.dt)
-    if not found.size:
+    far_steps = jumps(recorded.controls, recorded.dt)
+    if not far_steps.size:
         return []
-    step = int(found[0])
+    step = int(far_steps[0])
     ahead, aside, turn = recorded.controls[step, :3].tolist()
-    others = f", and {found.size - 1} more such steps" * (found.size > 1)
+    others = f", and {far_steps.size - 1} more such steps" * (far_steps.size > 1)
     return [
         f"{log}: the odometry moves by {hypot(ahead, aside):.3g} m and turns by {turn:.3g} rad "
         f"in the {recorded.dt[step]:.3g} s from {recorded.time[step]:.15g} s on{others}; "
@@ -233,7 +158,7 @@ def _jumps(recorded: "Log", log: Path) -> list[str]:
 
 
 def _unheard(recorded: "Log", log: Path) -> list[str]:
-    """Say which callers that nobody hears are not placed: their detours say nothing."""
+    """Warn of timed callers that no row and no position places: their detours are useless."""
     heard = _labels(recorded)
     timed = {
         number
@@ -248,66 +173,44 @@ def _unheard(recorded: "Log", log: Path) -> list[str]:
     ]
 
 
-def afterwards(
+def fit_warnings(
     recorded: "Log", trials: "Sequence[TrialResult]", log: Path, config: Config
 ) -> list[str]:
-    """Ask whether a log has the units that are expected, where much of it does not fit.
-
-    Parameters
-    ----------
-    recorded : Log
-    trials : sequence of TrialResult
-    log : Path
-    config : Config
-        Of the estimators.
-
-    Returns
-    -------
-    list of str
-    """
+    """Warn where much of a log does not fit, as with wrong units or labels."""
     from pipistrelle.experiments.results.scores import is_placed
 
-    rows, turned, told = sum(len(scan.landmark) for scan in recorded.scans), recorded.turned, []
+    rows, turned, notes = sum(len(scan.landmark) for scan in recorded.scans), recorded.turned, []
     metric = "ranges and detours" if has_detours(recorded) else "ranges"
     angles = "bearings and headings" if recorded.motion == "poses" else "bearings"
     for trial in trials:
         heard, name = sum(len(scan.landmark) for scan in trial.scans), short_name(trial.filter)
         if not heard:
-            told.append(
+            notes.append(
                 f"{log}: nothing in it is heard by {trial.strategy} sensing, so it maps nothing"
             )
         elif turned <= SUSPECT * rows and is_placed(trial):
             gated, who = trial.scores.gated, f"{trial.strategy} {name}"
             if SUSPECT * heard < gated:
-                told.append(
+                notes.append(
                     f"{log}: {gated} of {heard} measurements do not fit what was expected ({who}); "
                     f"are {angles} in radians and {metric} in metres, and all labels right?"
                 )
             elif (GATED + (expected := 1.0 - gate_of(trial.filter, config))) * heard < gated:
-                told.append(
+                notes.append(
                     f"{log}: the gate rejects {gated / heard:.1%} of the measurements ({who}), "
                     f"expected {expected:.1%}: they are less sure than they say, or something was "
                     "placed wrong before; larger standard deviations help, or a gate of 1 with "
                     'filter.robust = "huber"'
                 )
-            elif surprised := surprise(trial):
-                told.append(f"{log}: {surprised}")
+            elif surprised := nis_warning(trial):
+                notes.append(f"{log}: {surprised}")
     if turned > SUSPECT * rows:
-        told.append(f"{log}: {turned} of {rows} bearings are beyond a turn; are they in radians?")
-    return told + _out_of_bounds(recorded, log)
+        notes.append(f"{log}: {turned} of {rows} bearings are beyond a turn; are they in radians?")
+    return notes + _out_of_bounds(recorded, log)
 
 
-def surprise(trial: "TrialResult") -> str:
-    """Say that innovations are much larger than a filter expects; nothing where they are not.
-
-    Parameters
-    ----------
-    trial : TrialResult
-
-    Returns
-    -------
-    str
-    """
+def nis_warning(trial: "TrialResult") -> str:
+    """Warn that innovations are much larger than a filter expects; empty where they are not."""
     nis = trial.scores.nis_mean
     if nis is None or not SURPRISING < nis < inf:
         return ""
@@ -319,7 +222,7 @@ def surprise(trial: "TrialResult") -> str:
 
 
 def _out_of_bounds(recorded: "Log", log: Path) -> list[str]:
-    """Ask whether ranges and detours are in metres, where many cannot be.
+    """Warn of ranges and detours that are probably not in metres.
 
     A detour is no more than twice the range of its landmark.
     """

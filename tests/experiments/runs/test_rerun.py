@@ -11,7 +11,7 @@ import pytest
 
 from pipistrelle.__main__ import main
 from pipistrelle.config import InputError
-from pipistrelle.experiments.runs.again import again
+from pipistrelle.experiments.runs.rerun import rerun
 from reference.command_line import SHORT
 
 OWN = Path(__file__).parents[2] / "data"
@@ -50,13 +50,13 @@ def folders(made, tmp_path, monkeypatch):
 
 def refused(folder, **options):
     with pytest.raises(InputError) as refusal:
-        again(Path(folder), **options)
+        rerun(Path(folder), **options)
     return str(refusal.value)
 
 
 @pytest.mark.parametrize("name", ["run", "slam", "robot"])
 def test_the_tracks_are_those_of_the_folder_bit_for_bit(made, name):
-    done = again(made / name)
+    done = rerun(made / name)
     assert done.difference == ""
     kept = json.loads((made / name / "summary.json").read_text())["runs"]
     assert [(t.strategy, t.filter) for t in done.trials] == [
@@ -69,30 +69,29 @@ def test_the_tracks_are_those_of_the_folder_bit_for_bit(made, name):
 
 
 def test_a_simulated_mission_comes_with_its_world(made):
-    done = again(made / "run")
+    done = rerun(made / "run")
     assert done.log is None
-    assert done.mission is not None
-    assert done.mission.trials == done.trials
+    assert done.scenario is not None
     assert [caller.name for caller in done.callers] == ["beacon"]
     assert np.degrees(done.beamwidth) == pytest.approx(60.0)
-    assert len(done.truth.landmarks[0]) == 11
+    assert len(done.drive.truth.landmarks[0]) == 11
     assert done.config.filter.gate == 0.99
 
 
 def test_a_recorded_one_comes_with_its_log_and_the_beam_that_hid_its_ranges(made):
-    done = again(made / "slam")
-    assert done.mission is None
+    done = rerun(made / "slam")
+    assert done.scenario is None
     assert done.log is not None
     assert done.log.name == "log"
     assert done.callers == ()
     assert np.degrees(done.beamwidth) == pytest.approx(70.0)
     assert done.config.filter.gate == 0.9
-    assert again(made / "robot").beamwidth is None
+    assert rerun(made / "robot").beamwidth is None
 
 
 def test_whoever_watches_sees_every_frame(made):
     seen, told = [], []
-    done = again(
+    done = rerun(
         made / "run",
         watch=lambda *frame: seen.append(frame[:2]),
         progress=lambda *stage: told.append(stage[0]),
@@ -106,21 +105,21 @@ def test_a_folder_in_which_a_track_was_changed_is_told_by_how_much(folders):
     first, *others = path.read_text().splitlines()
     time, x, *rest = first.split()
     path.write_text("\n".join([" ".join([time, str(float(x) + 0.25), *rest]), *others]) + "\n")
-    found = again(Path("run")).difference
+    found = rerun(Path("run")).difference
     assert found == f"{path}: is not as it is found now, by up to 0.25 m"
 
 
 def test_a_track_that_is_gone_and_one_of_other_rows_are_told(folders):
     Path("run/track_active_ekf.tum").unlink()
     Path("run/track_fused_fastslam.tum").write_text("not a track\n")
-    found = again(Path("run")).difference
+    found = rerun(Path("run")).difference
     assert found == "run/track_active_ekf.tum: cannot be read, nor are 1 more"
 
 
 def test_settings_that_were_changed_are_told_and_followed(folders):
     path = Path("run/config.toml")
     path.write_text(re.sub(r"(?m)^bearing_std = .*$", "bearing_std = 0.5", path.read_text()))
-    done = again(Path("run"))
+    done = rerun(Path("run"))
     assert done.config.filter.bearing_std == 0.5
     assert re.fullmatch(
         r"run/track_active_ekf.tum: is not as it is found now, by up to [\d.e-]+ m, nor are 5 "
@@ -132,9 +131,9 @@ def test_settings_that_were_changed_are_told_and_followed(folders):
 def test_another_version_is_told(folders):
     summary = json.loads(Path("run/summary.json").read_text())
     Path("run/summary.json").write_text(json.dumps({**summary, "version": "0.0.9"}))
-    assert again(Path("run")).difference == "", "what is the same is the same"
+    assert rerun(Path("run")).difference == "", "what is the same is the same"
     Path("run/track_fused_ekf.tum").write_text("0 0 0 0 0 0 0 1\n")
-    assert "; it was written by version 0.0.9, this is " in again(Path("run")).difference
+    assert "; it was written by version 0.0.9, this is " in rerun(Path("run")).difference
 
 
 def test_a_log_that_is_gone_is_asked_for_and_may_be_elsewhere(folders):
@@ -142,7 +141,7 @@ def test_a_log_that_is_gone_is_asked_for_and_may_be_elsewhere(folders):
     said = refused("slam")
     assert said.startswith("slam/summary.json: log.path: found ")
     assert "which is not there, expected the folder of the log that was solved; put it back" in said
-    assert again(Path("slam"), log=Path("moved [1] away")).difference == ""
+    assert rerun(Path("slam"), log=Path("moved [1] away")).difference == ""
     assert "option --log: found nowhere, which is not there" in refused("slam", log=Path("nowhere"))
 
 
@@ -168,7 +167,7 @@ def test_a_truth_that_came_later_is_a_change(folders):
     shutil.copytree(OWN / "unicycle_log", "other")
     Path("other/truth.csv").unlink()
     assert main(["slam", "other", "--quiet", "-o", "solved"]) == 0
-    assert again(Path("solved")).difference == ""
+    assert rerun(Path("solved")).difference == ""
     shutil.copy(OWN / "unicycle_log" / "truth.csv", "other/truth.csv")
     assert "(truth.csv is new)" in refused("solved")
 
@@ -176,7 +175,7 @@ def test_a_truth_that_came_later_is_a_change(folders):
 def test_what_does_not_belong_to_a_log_may_change(folders):
     Path("log/notes.txt").write_text("a user's")
     Path("log/README.md").write_text("a user's")
-    assert again(Path("slam")).difference == ""
+    assert rerun(Path("slam")).difference == ""
 
 
 def test_a_folder_that_does_not_say_which_log_it_was_is_refused(folders):
@@ -210,4 +209,4 @@ def test_a_device_in_place_of_a_file_is_refused_by_name(folders, name):
 def test_a_device_in_place_of_a_track_is_told(folders):
     Path("run/track_fused_ekf.tum").unlink()
     Path("run/track_fused_ekf.tum").symlink_to("/dev/null")
-    assert again(Path("run")).difference.startswith("run/track_fused_ekf.tum: cannot be read")
+    assert rerun(Path("run")).difference.startswith("run/track_fused_ekf.tum: cannot be read")

@@ -17,9 +17,9 @@ from pipistrelle.config import (
     ReceiverConfig,
 )
 from pipistrelle.experiments import machine
-from pipistrelle.experiments.runs import preparing
-from pipistrelle.experiments.runs.preparing import prepared, warnings_of
+from pipistrelle.experiments.runs import validate_mission
 from pipistrelle.experiments.runs.trial import run_mission
+from pipistrelle.experiments.runs.validate_mission import checked_scenario, warnings_of
 from pipistrelle.settings import from_flags, resolve
 
 
@@ -74,7 +74,7 @@ def test_a_tone_that_real_samples_cannot_hold_is_named_with_what_they_hold():
 
 def test_without_room_for_a_recording_the_setting_that_makes_it_long_is_named(monkeypatch):
     monkeypatch.setattr(machine, "installed", lambda: 50e6)
-    prepared(Config())
+    checked_scenario(Config())
     for section, pair, key in (
         ("scenario", ("beacon_distance", 15e3), "scenario.beacon_distance"),
         ("scenario", ("radius", 15e3), "scenario.radius"),
@@ -82,21 +82,23 @@ def test_without_room_for_a_recording_the_setting_that_makes_it_long_is_named(mo
         ("emitter", ("pulse", 60.0), "emitter.pulse"),
     ):
         with pytest.raises(InputError, match=rf"^{key}: a recording of \d+ s may need .* GB"):
-            prepared(settings(**{section: pair}))
-        prepared(settings(**{section: pair}), workers=0)
+            checked_scenario(settings(**{section: pair}))
+        checked_scenario(settings(**{section: pair}), workers=0)
     with pytest.raises(InputError, match=r"^scenario\.step: a recording of 5 s may need"):
-        prepared(resolve(from_flags({"scenario": {"step": 1.25}, "receiver": {"engine": "dense"}})))
+        checked_scenario(
+            resolve(from_flags({"scenario": {"step": 1.25}, "receiver": {"engine": "dense"}}))
+        )
 
 
 def test_a_mission_is_refused_at_the_same_door(monkeypatch):
-    monkeypatch.setattr(preparing, "check_recording", lambda *_, **__: pytest.fail("asked"))
+    monkeypatch.setattr(validate_mission, "check_recording", lambda *_, **__: pytest.fail("asked"))
     with pytest.raises(pytest.fail.Exception, match="asked"):
         run_mission(Config(), ["fused"])
 
 
 def test_a_vehicle_faster_than_sound_is_refused_by_what_makes_it_so():
     with pytest.raises(InputError, match=r"^scenario\.speed: the vehicle reaches 3[45]\d m/s"):
-        prepared(settings(scenario=("speed", -345.0)))
+        checked_scenario(settings(scenario=("speed", -345.0)))
     with pytest.raises(InputError, match=r"^motion\.speed_std: the vehicle reaches"):
-        prepared(settings(motion=("speed_std", 300.0)))
-    prepared(settings(scenario=("speed", 30.0)))
+        checked_scenario(settings(motion=("speed_std", 300.0)))
+    checked_scenario(settings(scenario=("speed", 30.0)))

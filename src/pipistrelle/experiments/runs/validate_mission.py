@@ -1,4 +1,4 @@
-"""What a mission by sound is refused for before anything is heard, and what a user is warned of.
+"""Checks of the settings of a simulated mission before anything is heard, and warnings on them.
 
 `run` asks for one mission, a study for every combination of its plan: through the same door.
 """
@@ -20,7 +20,7 @@ from pipistrelle.kernel_clock import judging
 
 
 @judging()
-def prepared(
+def checked_scenario(
     config: Config,
     *,
     world: World = ANY,
@@ -28,33 +28,15 @@ def prepared(
     filters: int = 1,
     workers: int = 1,
 ) -> Scenario:
-    """Draw the first world of a mission's settings, when all is sound that it is heard with.
+    """Draw the first world of a mission, and refuse settings with which it cannot be heard.
 
-    Parameters
-    ----------
-    config : Config
-    world : World
-        What is known of it beforehand.
-    strategies, filters : int
-        Number of each that are kept in memory.
-    workers : int
-        Processes on this machine that each run such a mission; 0 if they are elsewhere.
+    Memory is estimated for so many strategies and filters, and for so many workers on this machine
+    (0 if they are elsewhere).
 
-    Returns
-    -------
-    Scenario
-
-    Raises
-    ------
-    InputError
-        When it cannot be had, or memory for it; with the setting.
-
-    Examples
-    --------
     >>> from pipistrelle.config import EmitterConfig
-    >>> len(prepared(Config()).landmarks)
+    >>> len(checked_scenario(Config()).landmarks)
     50
-    >>> prepared(Config(emitter=EmitterConfig(frequency=36e3)))
+    >>> checked_scenario(Config(emitter=EmitterConfig(frequency=36e3)))
     Traceback (most recent call last):
     pipistrelle.config.InputError: emitter.frequency: found 36000 Hz, expected a multiple of 5000 Hz
     (the nearest that are free: 25000 and 35000 Hz)
@@ -70,30 +52,17 @@ def prepared(
 
 
 def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ...]:
-    r"""Tell what a receiver confuses: bearings by its spacing, tones by its sampling.
+    r"""Warn of a receiver whose spacing makes bearings ambiguous, or whose sampling aliases tones.
 
     Elements a distance d apart cannot tell the angle :math:`\theta` off their normal from another,
     the grating lobe,
 
     .. math:: \sin\theta_g = \sin\theta - \lambda / d .
 
-    Parameters
-    ----------
-    config : Config
-    callers : sequence of Caller
-        Of the world; by default the paper's two.
-
-    Returns
-    -------
-    tuple of str
-        Empty, unless a lobe lies among the angles that are kept, or a tone above half the rate.
-
     Notes
     -----
     Van Trees, Optimum Array Processing (2002), Sec. 2.4.
 
-    Examples
-    --------
     >>> from pipistrelle.config import ReceiverConfig
     >>> warnings_of(Config())
     ()
@@ -104,28 +73,28 @@ def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ..
     """
     spacing, rate = config.receiver.spacing, config.receiver.sample_rate
     limit = min(config.detection.angle_limit_deg, config.detection.scan_limit_deg)
-    said = []
+    warnings = []
     for caller in callers or callers_of(config, np.zeros(2)):
         frequency, key = caller.frequency, caller.key or caller.name
         tone, wave = f"{key}.frequency ({frequency:g} Hz)", config.air.sound_speed / frequency
         nearest = wave / spacing - math.sin(math.radians(limit))  # its lobe lies at the limit
         if nearest < 1.0:
-            said.append(
+            warnings.append(
                 f"receiver.spacing: {spacing:g} m is {spacing / wave:.2f} of a wave at {tone}: "
                 f"echoes {math.degrees(math.asin(max(nearest, 0.0))):.0f} degrees off a face's "
                 f"normal or more look as if from the other side, as from {-limit:.0f} degrees; "
                 f"expected half a wave ({wave / 2.0:.2g} m)"
             )
         if frequency > rate / 2.0:
-            said.append(
+            warnings.append(
                 f"receiver.sample_rate: {rate:g} Hz is less than twice {tone}: real samples would "
                 f"hold it as {abs(frequency - rate * round(frequency / rate)):g} Hz; expected more"
             )
-    return tuple(said)
+    return tuple(warnings)
 
 
 def _refuse_supersonic(scenario: Scenario, config: Config) -> None:
-    """Refuse a vehicle, or a caller, that outruns its own sound."""
+    """Refuse a vehicle or a caller that is faster than sound."""
 
     def fastest(path: np.ndarray) -> float:
         return np.hypot(*np.diff(path, axis=0).T).max(initial=0.0) / config.scenario.step

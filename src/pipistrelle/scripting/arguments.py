@@ -1,4 +1,4 @@
-"""What is asked for in words: settings by keyword, strategies and estimators by name.
+"""Arguments of Python and the command line: settings, strategies and estimators by name.
 
 Words come from a command line or from Python; where each was given is said in its refusal.
 """
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 Base = Config | Mapping[str, Any] | str | Path | None
 """Settings to start from: as they were resolved, as a table, or the file that holds it."""
 Filters = str | type | Sequence[str | type]
-"""Estimators: by name, or one's own as classes."""
+"""Estimators: by name, or classes of the user."""
 GROUPS = {"both": PAPERS, "all": tuple(CATALOGUE)}
 """Names that stand for several estimators."""
 STEPS: Key = ("scenario", "steps")
@@ -40,23 +40,8 @@ WORLD: Key = ("scenario", "world")
 
 
 def base_layer(base: Base) -> Layer:
-    """Name the settings to start from.
+    """Return the settings to start from, by their keys.
 
-    Parameters
-    ----------
-    base : Config, mapping, path or None
-
-    Returns
-    -------
-    Layer
-
-    Raises
-    ------
-    InputError
-        A key that is no setting, a file that cannot be read, and what is none of these.
-
-    Examples
-    --------
     >>> base_layer({"rays.power": 3.0})["rays", "power"]
     Given(value=3.0, where='config: rays.power')
     """
@@ -83,26 +68,10 @@ def folder_named(place: object, name: str) -> Path:
 
 
 def short_names(short: Layer, flags: Layer) -> Layer:
-    """Keep the short names that were given.
+    """Return the settings that were given by short names (their value is not None).
 
-    Parameters
-    ----------
-    short : Layer
-        Of the value None where the name was not given.
-    flags : Layer
-        What was given by its own name.
+    A setting that was given by its own name too, in `flags`, is refused.
 
-    Returns
-    -------
-    Layer
-
-    Raises
-    ------
-    InputError
-        Where a setting was given by both names.
-
-    Examples
-    --------
     >>> short_names({("seed",): Given(3, "-s")}, {("seed",): Given(4, "--seed")})
     Traceback (most recent call last):
     pipistrelle.config.InputError: -s and --seed are one setting; give one of them
@@ -119,27 +88,9 @@ def mission_settings(
 ) -> tuple[Config, "World | None"]:
     """Resolve the settings of a mission: defaults < world < beneath < flags.
 
-    Parameters
-    ----------
-    beneath, flags : Layer
-    short : Layer
-        Settings by their short names.
-    beamwidth, duration : Given
-        Half-power beamwidth of the vehicle's call [deg], length of the drive [s], or None.
+    The beamwidth is the half-power width of the vehicle's call [deg], the duration in seconds;
+    either may be None. The world is the one that the settings name.
 
-    Returns
-    -------
-    Config
-    World or None
-        The one that the settings name.
-
-    Raises
-    ------
-    InputError
-        An unknown setting or a refused value, a setting given twice, less than one frame.
-
-    Examples
-    --------
     >>> nothing = Given(None, "")
     >>> minute = Given(60.0, "duration")
     >>> config, _ = mission_settings({}, {}, {}, beamwidth=nothing, duration=minute)
@@ -166,23 +117,8 @@ def mission_settings(
 
 
 def number(given: Given) -> float:
-    """Return a value that is a number.
+    """Return a value that is a number; refuse anything else, even text that spells one.
 
-    Parameters
-    ----------
-    given : Given
-
-    Returns
-    -------
-    float
-
-    Raises
-    ------
-    InputError
-        For anything else, text that spells a number among it.
-
-    Examples
-    --------
     >>> number(Given("60", "duration"))
     Traceback (most recent call last):
     pipistrelle.config.InputError: duration: found '60', expected a number
@@ -193,60 +129,29 @@ def number(given: Given) -> float:
 
 
 def named_strategies(chosen: str | Sequence[str]) -> tuple[Strategy, ...]:
-    """Name the strategies of a choice.
+    """Return the strategies of a choice, in their usual order.
 
-    Parameters
-    ----------
-    chosen : one strategy, several, or "all"
-
-    Returns
-    -------
-    tuple of str
-
-    Raises
-    ------
-    InputError
-        For anything else.
-
-    Examples
-    --------
     >>> named_strategies("all"), named_strategies(["fused"])
     (('active', 'fused', 'passive'), ('fused',))
     """
     if isinstance(chosen, str):
         chosen = STRATEGIES if chosen == "all" else (chosen,)
     chosen = tuple(chosen) if isinstance(chosen, Iterable) else (chosen,)
-    for one in chosen or (chosen,):
-        if one not in get_args(Strategy):
-            near = meant(str(one), STRATEGIES)
+    for strategy in chosen or (chosen,):
+        if strategy not in get_args(Strategy):
+            near = meant(str(strategy), STRATEGIES)
             fix = f"did you mean {near!r}?" if near else "choose"
             expected = "'active', 'fused', 'passive' or 'all'"
-            raise InputError(f"strategies: found {shown(one)}, expected {expected}; {fix}")
-    return tuple(one for one in STRATEGIES if one in chosen)
+            raise InputError(f"strategies: found {shown(strategy)}, expected {expected}; {fix}")
+    return tuple(strategy for strategy in STRATEGIES if strategy in chosen)
 
 
 def named_filters(chosen: Filters, where: str = "filters") -> tuple[str, ...]:
-    """Name the filters of a choice.
+    """Return the names of the estimators of a choice; of a class, ``module:Class``.
 
-    Parameters
-    ----------
-    chosen : the name of an estimator or its class, several of them, or the name of a group
-        Text may hold several, parted by commas. Groups are "both", the paper's two, and "all".
-    where : str
-        What the choice is called in a refusal.
+    Text may hold several names, separated by commas. The groups are "both", the paper's two, and
+    "all".
 
-    Returns
-    -------
-    tuple of str
-
-    Raises
-    ------
-    InputError
-        For an estimator that is not there, a class that others would not find, or two of one short
-        name.
-
-    Examples
-    --------
     >>> named_filters("both"), named_filters("ekf,iekf"), named_filters(["ekf", "iekf"])
     (('ekf', 'fastslam'), ('ekf', 'iekf'), ('ekf', 'iekf'))
     >>> from pipistrelle.estimation.ekf.filter import EkfSlam
@@ -257,8 +162,8 @@ def named_filters(chosen: Filters, where: str = "filters") -> tuple[str, ...]:
         chosen = GROUPS.get(chosen) or (chosen,)
     elif isinstance(chosen, type) or not isinstance(chosen, Iterable):
         chosen = (chosen,)
-    parted = (each for one in chosen for each in _parted(one))
-    names = tuple(dict.fromkeys(_name_of(one, where) for one in parted))
+    parted = (each for choice in chosen for each in _parted(choice))
+    names = tuple(dict.fromkeys(_name_of(choice, where) for choice in parted))
     if not names:
         raise InputError(f"{where}: found none, expected an estimator's name or its class")
     for name in names:
@@ -271,7 +176,7 @@ def named_filters(chosen: Filters, where: str = "filters") -> tuple[str, ...]:
 
 
 def _parted(chosen: str | type) -> Sequence[str | type]:
-    """Part names at their commas; a class is one."""
+    """Split names at commas; a class is one."""
     return [name.strip() for name in chosen.split(",")] if isinstance(chosen, str) else (chosen,)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.config import Config
-from pipistrelle.scripting.recorded import afterwards
+from pipistrelle.scripting.log_settings import fit_warnings
 from reference.missions import scan_with
 
 
@@ -28,7 +28,7 @@ def trial_of(scan, gated):
 @pytest.mark.parametrize(("gated", "asked"), [(1, False), (2, True)])
 def test_units_are_asked_about_by_the_share_of_what_a_strategy_heard(gated, asked):
     heard = scan_with(np.arange(5), np.zeros(5), np.ones(5))
-    lines = afterwards(
+    lines = fit_warnings(
         log_of(distance=np.ones(10)), [trial_of(heard, gated)], Path("log"), Config()
     )
     assert any(f"{gated} of 5 measurements do not fit" in line for line in lines) == asked
@@ -38,5 +38,5 @@ def test_units_are_asked_about_by_the_share_of_what_a_strategy_heard(gated, aske
 @pytest.mark.parametrize(("short", "asked"), [(8, False), (9, True)])
 def test_short_detours_are_asked_about_where_nearly_all_are(short, asked):
     detour = np.where(np.arange(10) < short, 0.19, 3.0)
-    lines = afterwards(log_of(detour=detour, detour_std=0.1, caller=1), [], Path("log"), Config())
+    lines = fit_warnings(log_of(detour=detour, detour_std=0.1, caller=1), [], Path("log"), Config())
     assert [f"{short} of 10 detours are below 0.2 m" in line for line in lines] == [True] * asked

@@ -1,4 +1,4 @@
-"""Estimators that fail: those from outside are tried before anything is heard, all are recorded.
+"""Checks of estimators before anything is heard, and records of those that fail later.
 
 A trial that fails costs its own estimate; what the others found is kept.
 """
@@ -22,21 +22,7 @@ from pipistrelle.kernel_clock import judging
 
 
 def check_filters(filters: Sequence[str], motion: Motion, config: Config) -> None:
-    """Refuse estimators from outside that cannot begin, before anything is heard.
-
-    Parameters
-    ----------
-    filters : sequence of str
-        The names of estimators.
-    motion : Motion
-    config : Config
-
-    Raises
-    ------
-    InputError
-        Where one cannot be had or built, does not begin with a belief, begins with one whose
-        methods are none, or would have the files of another.
-    """
+    """Refuse estimators of the user that cannot be built or begun, before anything is heard."""
     check_distinct(filters)
     for name in filters:
         if name in CATALOGUE:
@@ -68,25 +54,8 @@ def _nothing() -> None:
 
 @judging()
 def first_belief(name: str, motion: Motion, config: Config) -> Belief:
-    """Return what an estimator believes before it has moved or heard anything.
+    """Return the belief of an estimator before the vehicle has moved or heard anything.
 
-    Parameters
-    ----------
-    name : str
-    motion : Motion
-    config : Config
-
-    Returns
-    -------
-    Belief
-
-    Raises
-    ------
-    InputError
-        Where the estimator cannot be had or built.
-
-    Examples
-    --------
     >>> still = Motion(model="unicycle", control_std=(0.1, 0.1))
     >>> first_belief("fastslam", still, Config()).landmarks().landmark.size
     0
@@ -95,7 +64,7 @@ def first_belief(name: str, motion: Motion, config: Config) -> Belief:
 
 
 def failed_trial(case: Case, drive: Drive, scans: Sequence[Scan], error: Exception) -> TrialResult:
-    """Return the estimate of a filter that failed with an error: nowhere, and no map.
+    """Return the result of a filter that failed: its poses are NaN, and it has no map.
 
     An interruption that a library hid behind the error is raised (`let_interruptions_pass`).
     """
@@ -116,7 +85,7 @@ def failed_trial(case: Case, drive: Drive, scans: Sequence[Scan], error: Excepti
 
 
 def failure_text(error: Exception) -> str:
-    """Return the traceback of an error that is being handled and, as its last line, its words.
+    """Return the traceback of the current error, with its message as the last line.
 
     An interruption that a library hid behind the error is raised (`let_interruptions_pass`).
     """
@@ -125,7 +94,7 @@ def failure_text(error: Exception) -> str:
 
 
 def let_interruptions_pass(error: Exception) -> None:
-    """Raise the interruption that a library hid behind an error of its own: no trial failed."""
+    """Raise an interruption that a library hid behind an error of its own."""
     behind: BaseException | None = error
     while behind is not None:
         if isinstance(behind, KeyboardInterrupt):
@@ -134,6 +103,6 @@ def let_interruptions_pass(error: Exception) -> None:
 
 
 def _placed(error: Exception) -> str:
-    """Word an error that a filter raised, and say where."""
+    """Return the message of an error that a filter raised, with file and line."""
     place = extract_tb(error.__traceback__)[-1]
     return f"{worded(error)} ({Path(place.filename).name}, line {place.lineno})"

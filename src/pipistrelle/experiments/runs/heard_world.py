@@ -1,0 +1,154 @@
+"""A world as it was heard: what each strategy takes of it, and the bound on any estimate of it.
+
+A mission and the cases of a study ask the same `HeardWorld`, so both have the same scans and bound.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.arithmetic.random_stream import stream_key
+from pipistrelle.config import Config, FilterConfig, ListeningConfig, Strategy
+from pipistrelle.detection.faces import FrameMeasurements
+from pipistrelle.detection.merging import scan_of
+from pipistrelle.detection.noise import as_told, noise_of
+from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.evaluation.bound import bound_of_drawn_start
+from pipistrelle.experiments.drives import Drive, Truth
+from pipistrelle.experiments.hearing.scenario import (
+    Scenario,
+    assumed_motion,
+    moving_callers,
+    standing_landmarks,
+)
+from pipistrelle.experiments.hearing.trajectories import motion_of
+from pipistrelle.experiments.results.scores import drive_bound
+from pipistrelle.geometry import wrap_angle
+
+_NOISE = ("noise", "range_std", "bearing_std", "detour_std")
+_CALLERS = ("caller_speed_std", "caller_walk_std")
+"""Settings of a filter that state noise: of what is heard, and of how callers move."""
+_Key = tuple[float, Strategy, FilterConfig, ListeningConfig]
+"""Piston radius [m], strategy, noise settings, listening settings."""
+
+
+def scans_of(
+    heard: Sequence[FrameMeasurements], strategy: Strategy, config: Config
+) -> tuple[Scan, ...]:
+    """Return what a strategy takes of each frame, with the noise that the settings state.
+
+    Parameters
+    ----------
+    heard : sequence of FrameMeasurements
+    strategy : "active", "fused" or "passive"
+    config : Config
+
+    Returns
+    -------
+    tuple of Scan
+        A scan between frames that holds nothing for the strategy is left out.
+    """
+    noise, timing = noise_of(config.filter), config.listening.timing
+    rows = (as_told(frame.rows, config.filter, timing=timing) for frame in heard)
+    scans = zip(heard, (scan_of(scan, strategy) for scan in rows), strict=True)
+    return tuple(noise(scan) for frame, scan in scans if scan.landmark.size or not frame.between)
+
+
+def drive_of(scenario: Scenario, config: Config, iteration: int = 0) -> Drive:
+    """Return what a filter may know of a world, and the truth to score it by.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    config : Config
+    iteration : int
+        Number of the world, part of the key of a start that is drawn.
+
+    Returns
+    -------
+    Drive
+        Its true landmarks are the landmarks and then the callers that stand: the beacon is last.
+    """
+    start, covariance = scenario.path[0], _start_covariance(config)
+    if config.filter.first_pose == "drawn":
+        rng = np.random.default_rng(stream_key(config.seed, iteration, "start"))
+        start = start + np.array(config.filter.initial_pose_std) * rng.standard_normal(3)
+        start[2] = wrap_angle(start[2])
+    moving = moving_callers(scenario)
+    return Drive(
+        motion=assumed_motion(config),
+        start=Gaussian(mean=start, covariance=covariance),
+        time=scenario.time,
+        controls=scenario.controls,
+        truth=Truth(
+            time=scenario.time,
+            path=scenario.path,
+            landmarks=standing_landmarks(scenario),
+            callers={label: np.asarray(caller.place) for label, caller in moving.items()},
+        ),
+        moving={label: caller.name for label, caller in moving.items()},
+    )
+
+
+class HeardWorld:
+    """A world, the frames heard with each beam, and what follows from both, worked out once.
+
+    Configurations that are given to its methods may differ in what is neither drawn nor recorded.
+    """
+
+    def __init__(
+        self, scenario: Scenario, config: Config, beams: Mapping[float, Sequence[FrameMeasurements]]
+    ) -> None:
+        self.scenario = scenario
+        self.beams = beams
+        """Frames by the radius of the vehicle's piston [m]."""
+        self._config = config
+        self._drive = replace(drive_of(scenario, config), motion=motion_of(config.motion))
+        # No `cache` of a method: it would hold what holds it, and a world's sound for long.
+        self._scans: dict[_Key, tuple[Scan, ...]] = {}
+        self._bounds: dict[_Key, Float[np.ndarray, "t 3 3"]] = {}
+
+    def scans(self, config: Config, strategy: Strategy) -> tuple[Scan, ...]:
+        """Return the scans of a strategy (`scans_of`)."""
+        radius, noise = config.emitter.radius, _only(config.filter, _NOISE)
+        key = (radius, strategy, noise, config.listening)
+        if key not in self._scans:
+            self._scans[key] = scans_of(self.beams[radius], strategy, self._with(key))
+        return self._scans[key]
+
+    def bound(self, config: Config, strategy: Strategy) -> Float[np.ndarray, "t 3 3"]:
+        """Return the bound of the pose at every step, for the noise that the signal tells."""
+        noise = config.filter.model_copy(update={"noise": "measured"})
+        bound = self.stated_bound(config.model_copy(update={"filter": noise}), strategy)
+        if config.filter.first_pose == "drawn":
+            return bound_of_drawn_start(bound, self.scenario.path, _start_covariance(config))
+        return bound
+
+    def stated_bound(self, config: Config, strategy: Strategy) -> Float[np.ndarray, "t 3 3"]:
+        """Return the bound of the pose at every step from an exact start, for the stated noise."""
+        noise = _only(config.filter, _NOISE + _CALLERS)
+        key = (config.emitter.radius, strategy, noise, config.listening)
+        if key not in self._bounds:
+            scans = self.scans(config, strategy)
+            bound = drive_bound(self._drive, scans, self._with(key))
+            assert bound is not None, "the truth of a world is known"
+            self._bounds[key] = bound
+        return self._bounds[key]
+
+    def _with(self, key: _Key) -> Config:
+        """Return the world's settings with a key's noise and listening."""
+        _, _, noise, listening = key
+        return self._config.model_copy(update={"filter": noise, "listening": listening})
+
+
+def _start_covariance(config: Config) -> Float[np.ndarray, "3 3"]:
+    """Return the covariance of the first pose, as a filter is given it."""
+    return np.diag(np.square(np.array(config.filter.initial_pose_std)))
+
+
+def _only(settings: FilterConfig, names: Sequence[str]) -> FilterConfig:
+    """Return some of a filter's settings, and of the others the defaults."""
+    return FilterConfig(**{name: getattr(settings, name) for name in names})
