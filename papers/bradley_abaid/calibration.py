@@ -36,7 +36,8 @@ from pipistrelle.detection.merging import scan_of
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
-from pipistrelle.experiments.runs.trial import drive_of, run_trial, scans_of
+from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
+from pipistrelle.experiments.runs.trial import run_trial
 from pipistrelle.experiments.studies.plan_file import PLANS, find_plan, read_plan
 
 SEED = 1000

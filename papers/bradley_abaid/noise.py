@@ -40,7 +40,8 @@ from pipistrelle.estimation.catalogue import PAPERS
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
-from pipistrelle.experiments.runs.trial import drive_of, run_trial, scans_of
+from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
+from pipistrelle.experiments.runs.trial import run_trial
 from pipistrelle.geometry import wrap
 
 LEVELS = (0.0, 0.05, 0.10, 0.15)

@@ -64,7 +64,8 @@ from pipistrelle.evaluation.comparison import pooled_std
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
-from pipistrelle.experiments.runs.trial import drive_of, run_trial, scans_of
+from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
+from pipistrelle.experiments.runs.trial import run_trial
 from pipistrelle.files import write_whole
 from pipistrelle.report.claims.published import EXCLUDED, FITTED, TABLE_II, WORLDS
 

@@ -26,7 +26,8 @@ from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import world_of
 from pipistrelle.experiments.results.scores import Scores
-from pipistrelle.experiments.runs.trial import drive_of, run_trial, scans_of
+from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
+from pipistrelle.experiments.runs.trial import run_trial
 
 AIR: dict[str, dict[str, Any]] = {
     "humidity 20 %": {"air.relative_humidity": 0.2},

@@ -22,7 +22,8 @@ from pipistrelle.detection.scans import Scan
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import Scenario, standing_landmarks, world_of
-from pipistrelle.experiments.runs.trial import drive_of, run_trial, scans_of
+from pipistrelle.experiments.runs.heard_world import drive_of, scans_of
+from pipistrelle.experiments.runs.trial import run_trial
 from pipistrelle.geometry import range_and_bearing, wrap
 
 RADII = {"180": 0.0025, "33": 0.0088, "11": 0.025}
