@@ -194,7 +194,7 @@ _WAYS = {
 
 
 _CLOCK = ("period", "offset", "jitter", "times")
-"""What may be said of when a caller calls."""
+"""Settings of a caller's own clock."""
 
 
 class CallerConfig(Section):

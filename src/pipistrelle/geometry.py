@@ -136,3 +136,10 @@ def path_at(
     poses = poses_at(time, known, np.column_stack((x, y, np.unwrap(heading))))
     poses[:, 2] = wrap(poses[:, 2])
     return poses
+
+
+def points_at(
+    time: Float[np.ndarray, " k"], known: Float[np.ndarray, " n"], points: Float[np.ndarray, "n d"]
+) -> Float[np.ndarray, "k d"]:
+    """Points at other times, linear in between; before and after they stay where they are."""
+    return np.column_stack([np.interp(time, known, column) for column in points.T])

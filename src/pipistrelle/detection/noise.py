@@ -1,4 +1,4 @@
-"""Measurement noise: how surely the rows of a scan were measured, as an estimator is told.
+"""Measurement noise: the standard deviations of a scan's rows, as an estimator is given them.
 
 It is stated of the rows that a filter is handed, after those of one landmark were merged.
 """

@@ -210,7 +210,6 @@ def detect(
     energy = _energy(matched.reshape(-1).view(matched.real.dtype), matched.shape[3])
     lags = Lags(start, interval, pulse)
     whole, numbers = _find_peaks(matched, energy, tuple(detector), lags)
-    found, (began, began_std) = direct_calls(matched, whole, numbers, matched.shape[2], lags)
     (face, caller), (delay, sine, power, bearing_std, delay_std) = whole, numbers
     angle = np.arcsin(sine)
     return Detections(
@@ -222,10 +221,20 @@ def detect(
         power=power,
         bearing_std=bearing_std,
         delay_std=delay_std,
-        direct=DirectCalls(
-            detection=found, delay=began, delay_std=began_std, pulse=pulse * interval
-        ),
+        direct=_direct(matched, whole, numbers, lags),
     )
+
+
+def _direct(
+    matched: Complex[np.ndarray, "l f c e"],
+    whole: Int[np.ndarray, "2 m"],
+    numbers: Float[np.ndarray, "5 m"],
+    lags: Lags,
+) -> DirectCalls:
+    """Find the direct calls among detections, given as `direct_calls` takes them."""
+    found, (began, began_std) = direct_calls(matched, whole, numbers, matched.shape[2], lags)
+    pulse = lags.pulse * lags.interval
+    return DirectCalls(detection=found, delay=began, delay_std=began_std, pulse=pulse)
 
 
 def detections_at(found: Detections, rows: Bool[np.ndarray, " m"]) -> Detections:
@@ -260,10 +269,8 @@ def call_in(
     if found.direct is not None:
         whole = np.stack((near.face, near.caller))
         numbers = np.stack((near.delay, near.angle, near.power, near.bearing_std, near.delay_std))
-        lags, tones = Lags(start, interval, pulse), matched.shape[2]
-        first, (began, std) = direct_calls(matched, whole, numbers, tones, lags)
-        heard = DirectCalls(detection=first, delay=began, delay_std=std, pulse=pulse * interval)
-        near = replace(near, direct=heard)
+        direct = _direct(matched, whole, numbers, Lags(start, interval, pulse))
+        near = replace(near, direct=direct)
     return detections_at(near, near.caller == caller)
 
 

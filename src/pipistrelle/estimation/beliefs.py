@@ -1,4 +1,4 @@
-"""What estimators believe and how they are called: records and protocols."""
+"""Records of what estimators compute, and the protocols of estimators and their beliefs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

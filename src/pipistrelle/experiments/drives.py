@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks, no_landmarks
 from pipistrelle.estimation.motion import Motion, relative_motions
-from pipistrelle.geometry import path_at
+from pipistrelle.geometry import path_at, points_at
 
 LabelledPoints = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]
 """Labels and positions [m] of landmarks."""
@@ -109,8 +109,7 @@ def split_at(drive: Drive, times: Sequence[float]) -> tuple[Drive, Int[np.ndarra
     rows, columns = np.triu_indices(3)
     path = drive.truth.path
     callers = {
-        label: np.column_stack([np.interp(fine, time, column) for column in way.T])
-        for label, way in drive.truth.callers.items()
+        label: points_at(fine, time, places) for label, places in drive.truth.callers.items()
     }
     path = None if path is None else path_at(fine, time, path)
     truth = replace(drive.truth, time=fine, path=path, callers=callers)

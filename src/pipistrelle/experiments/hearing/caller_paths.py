@@ -29,7 +29,7 @@ from pipistrelle.config import CallerConfig, Config, InputError, ScenarioConfig,
 from pipistrelle.detection.logs.text_tables import check_unique, read_table
 from pipistrelle.experiments.hearing.landmark_fields import MAX_DRAWS, nearest
 from pipistrelle.experiments.hearing.trajectories import Course, course_of, driven, motion_of
-from pipistrelle.geometry import wrap
+from pipistrelle.geometry import points_at, wrap
 from pipistrelle.settings import CALLERS, Layer
 
 WALK_STD, WALK_MEMORY = 0.5, 10.0
@@ -255,7 +255,7 @@ def _line(
     if along[-1] == 0.0:
         return np.tile(points[0], (around.time.size, 1))
     here = np.mod(speed * around.time, along[-1])
-    return np.column_stack([np.interp(here, along, column) for column in points.T])
+    return points_at(here, along, points)
 
 
 def _route(
@@ -263,7 +263,7 @@ def _route(
 ) -> Float[np.ndarray, "t 2"]:
     """Path of a route; the caller stands before its first time and after its last."""
     time, *place = np.array(_route_rows(one)).T
-    return np.column_stack([np.interp(around.time, time, column) for column in place[:2]])
+    return points_at(around.time, time, np.array(place[:2]).T)
 
 
 def _route_rows(one: CallerConfig) -> Any:

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from pipistrelle.acoustics.callers import VEHICLE, Caller, moves
 from pipistrelle.config import ScenarioConfig
 from pipistrelle.experiments.hearing.scenario import Scenario
-from pipistrelle.geometry import path_at, wrap
+from pipistrelle.geometry import path_at, points_at, wrap
 
 MICROSECOND = 1e-6
 """Two times that are no farther apart are one [s]."""
@@ -54,7 +54,6 @@ def calls_heard(scenario: Scenario, setup: ScenarioConfig, speed_of_sound: float
 def with_times(scenario: Scenario, times: Sequence[float]) -> Scenario:
     """Return a world with its paths interpolated at further times; controls are unchanged."""
     time = np.union1d(scenario.time, np.array(times))
-
     path = path_at(time, scenario.time, scenario.path)
     callers = tuple(
         _with_times(caller, time, scenario.time) if moves(caller) else caller
@@ -90,4 +89,4 @@ def _places_at(
     """Places of a caller at some times, by linear interpolation."""
     if place.ndim == 1:
         return np.tile(place, (len(times), 1))
-    return np.column_stack([np.interp(times, clock, column) for column in place.T])
+    return points_at(times, clock, place)

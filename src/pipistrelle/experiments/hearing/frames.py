@@ -33,7 +33,9 @@ class CallHeard:
 
     number: int
     """Among all such calls of the world."""
-    call: Call
+    caller: int
+    time: float
+    """When it is heard directly [s]."""
     until: float
     """When the next call of the same caller is heard directly [s]."""
     sounds: list[Arrivals]
@@ -63,7 +65,7 @@ def frames_of(
     own_clock = [j for j, caller in enumerate(scenario.callers) if caller.calls is not None]
     heard = _calls_heard(world, calls, radii, config, beam)
     span = setup.steps_per_frame * setup.step - config.emitter.pulse
-    last = np.array([one.call.time + one.sounds[0].delay.max() for one in heard])
+    last = np.array([one.time + one.sounds[0].delay.max() for one in heard])
     first = np.array([call.time for call in calls])
     steps = np.searchsorted(world.time, begin)
     for time, aimed in zip(
@@ -72,7 +74,7 @@ def frames_of(
         near = [heard[i] for i in np.flatnonzero((first < time + span) & (last >= time))]
         if own_clock:
             aimed = [
-                _together(one, own_clock, [(h.call.time - time, h.sounds[r]) for h in near], span)
+                _together(one, own_clock, [(h.time - time, h.sounds[r]) for h in near], span)
                 for r, one in enumerate(aimed)
             ]
         yield Frame(time=time, aimed=aimed, calls=near)
@@ -116,7 +118,8 @@ def _calls_heard(
         heard.append(
             CallHeard(
                 number=number,
-                call=call,
+                caller=call.caller,
+                time=call.time,
                 until=until[-1 - number],
                 sounds=[
                     replace(sounds, delay=sounds.delay - straight)

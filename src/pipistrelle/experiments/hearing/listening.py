@@ -129,7 +129,7 @@ def listen(
             progress("listening", number, setup.steps // setup.steps_per_frame)
     for call, parts in calls.values():
         for heard, part, sounds in zip(beams, parts, call.sounds, strict=True):
-            between = _heard(call.call.time, joined(part), sounds, rig)
+            between = _heard(call.time, joined(part), sounds, rig)
             if between.rows.landmark.size:
                 heard.append(replace(between, between=True))
     return tuple(tuple(sorted(heard, key=lambda one: one.rows.time)) for heard in beams)
@@ -217,9 +217,9 @@ def _rig(
 
 def _of_call(call: CallHeard, time: float, record: "_Record", found: Detections) -> Detections:
     """Detections of one call in a frame; delays count from the call."""
-    after, early = call.call.time - time, 0.5 * record.interval * record.pulse
+    after, early = call.time - time, 0.5 * record.interval * record.pulse
     stretch = after - early, call.until - time - early
-    part = call_in(record.matched, found, call.call.caller, stretch, **record.lags)
+    part = call_in(record.matched, found, call.caller, stretch, **record.lags)
     direct = part.direct and part.direct._replace(delay=part.direct.delay - after)
     return replace(part, delay=part.delay - after, direct=direct)
 
