@@ -4,7 +4,7 @@ When, not only where
 
 Someone else's echo tells a bearing and no range, for nobody knows when he called. But his call also
 comes straight, before all its echoes, and how much later an echo is tells how much longer its way
-was: a *detour*. No clock is asked.
+was: an *excess path*. No clock is asked.
 """
 
 from dataclasses import replace
@@ -16,9 +16,9 @@ from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import make_scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
-from pipistrelle.estimation.measurement import detour_of
+from pipistrelle.estimation.measurement import excess_path_of
 from pipistrelle.estimation.motion import Motion
-from pipistrelle.figures.outlines import RAY, detour_ellipse, ellipses
+from pipistrelle.figures.outlines import RAY, ellipses, excess_path_ellipse
 from pipistrelle.figures.style import INK, STRATEGY_COLOURS, STYLE
 from pipistrelle.geometry import range_and_bearing
 
@@ -32,22 +32,22 @@ motion = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
 slam = InvariantEkfSlam(motion=motion, rays=RayConfig())
 start = slam.init(Gaussian(mean=vehicle, covariance=np.diag([0.05, 0.05, 0.02]) ** 2))
 ranges, bearings = range_and_bearing(vehicle, callers)
-stds = {"range_std": 0.2, "bearing_std": 0.05, "detour_std": 0.05}
+stds = {"range_std": 0.2, "bearing_std": 0.05, "excess_path_std": 0.05}
 known = slam.update(start, make_scan(0.0, np.array([1, 2]), bearings, range=ranges, **stds))
 
 # %%
-# A bearing alone makes a ray: members, any of which may be the landmark. The first detour, e, draws
-# an ellipse about the vehicle and the caller. It crosses the bearing in one place: there the
+# A bearing alone makes a ray: members, any of which may be the landmark. The first excess path, e,
+# draws an ellipse about the vehicle and the caller. It crosses the bearing in one place: there the
 # landmark is, as surely as the caller is. The ellipse of the second caller crosses there, too.
 
-detours = np.array([detour_of(vehicle[:2], landmark, caller) for caller in callers])
+excess_paths = np.array([excess_path_of(vehicle[:2], landmark, caller) for caller in callers])
 _, bearing = range_and_bearing(vehicle, landmark[None])
 labels = np.array([-1, 1, 2])  # of the vehicle, and of the callers by their numbers
 beliefs = []
 for count in range(3):
-    rows = max(count, 1)  # a further detour is a row without a bearing
-    said = np.where(np.arange(2) < count, detours, np.nan)[:rows]
-    who = {"caller": np.array([1, 2])[:rows], "detour": said}
+    rows = max(count, 1)  # a further excess path is a row without a bearing
+    heard = np.where(np.arange(2) < count, excess_paths, np.nan)[:rows]
+    who = {"caller": np.array([1, 2])[:rows], "excess_path": heard}
     scan = make_scan(0.5, np.full(rows, 3), np.append(bearing, np.nan)[:rows], **who, **stds)
     beliefs.append(slam.update(known, replace(scan, callers=labels)))
 
@@ -64,14 +64,14 @@ for outline in ellipses(ray.mean, ray.covariance, RAY)[ray.landmark == 3]:
     panels[0].plot(*outline.T, color=colour, lw=1.1)
 panels[0].plot(*np.outer([0.0, 2.0], landmark).T, color=colour, lw=1.1, ls=":")
 panels[0].fill(*ellipses(one.mean, one.covariance, RAY)[2].T, fc=colour, ec=INK, zorder=3)
-for mean, spread, detour in zip(one.mean, one.covariance, detours, strict=False):
+for mean, spread, path in zip(one.mean, one.covariance, excess_paths, strict=False):
     for caller in rng.multivariate_normal(mean, spread, 40):
-        panels[1].plot(*detour_ellipse(vehicle[:2], caller, detour).T, color=colour, alpha=0.1)
+        panels[1].plot(*excess_path_ellipse(vehicle[:2], caller, path).T, color=colour, alpha=0.1)
 panels[1].plot(*landmark, "o", mfc="none", mec=INK, ms=9)
 panels[1].annotate("or here", (-1.2, -4.4), (15, -16), **at)
-for axes, title, count in zip(panels, ("bearing and detour", "two detours"), (1, 2), strict=True):
+for axes, title, count in zip(panels, ("by bearing", "by two callers"), (1, 2), strict=True):
     for k, caller in enumerate(callers[:count]):
-        axes.plot(*detour_ellipse(vehicle[:2], caller, detours[k]).T, color=INK, lw=0.9)
+        axes.plot(*excess_path_ellipse(vehicle[:2], caller, excess_paths[k]).T, color=INK, lw=0.9)
         axes.plot(*np.stack([caller, landmark]).T, "--", color=INK, lw=0.8)
         axes.plot(*caller, "*", color=INK, ms=11)
         axes.annotate(f"caller {k + 1}", caller, (9, -17), **at)
@@ -83,7 +83,7 @@ panels[0].set_ylabel("y [m]")
 plt.show()
 
 # %%
-# How surely is the landmark's place known, with two detours?
+# How surely is the landmark's place known, with two excess paths?
 
 spread = beliefs[-1].landmarks().covariance[2]
 answer = float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))

@@ -196,16 +196,16 @@ def test_one_process_shards_and_a_cluster_find_the_same(play, tmp_path_factory, 
     assert not other.equals(done["tables"][0]), "another seed finds something else"
 
 
-def test_two_detours_place_a_landmark_as_surely_as_the_information_of_all_says(play):
-    """Bearings, ranges and detours by differences, about what they came from: all are exact."""
+def test_two_excess_paths_place_a_landmark_as_surely_as_the_information_of_all_says(play):
+    """Bearings, ranges and excess paths by differences about what made them: all are exact."""
     done = play("10_when_not_only_where")
     places = np.concatenate([done["vehicle"], done["callers"].ravel(), done["landmark"]])
 
     def said(x):
         pose, one, two, landmark = x[:3], x[3:5], x[5:7], x[7:]
         ranges, bearings = done["range_and_bearing"](pose, np.array([one, two, landmark]))
-        detours = [done["detour_of"](pose[:2], landmark, caller) for caller in (one, two)]
-        return np.array([*pose, *ranges[:2], *bearings, *detours])
+        excess_paths = [done["excess_path_of"](pose[:2], landmark, caller) for caller in (one, two)]
+        return np.array([*pose, *ranges[:2], *bearings, *excess_paths])
 
     slopes = [(said(places + d) - said(places - d)) / 2e-6 for d in 1e-6 * np.eye(9)]
     std = [0.05, 0.05, 0.02, 0.2, 0.2, 0.05, 0.05, 0.05, 0.05, 0.05]

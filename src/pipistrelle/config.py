@@ -22,7 +22,7 @@ from pydantic import (
 LARGEST = 1e9
 """No setting needs more of its unit, nor its inverse less: what is squared stays a number."""
 FARTHEST = 1e6
-"""No range, detour or step of a vehicle is longer [m], nor any less sure."""
+"""No range, excess path or step of a vehicle is longer [m], nor any less sure."""
 FASTEST = 1e4
 """No vehicle is faster [m/s]."""
 WIDEST = 1e4
@@ -412,8 +412,8 @@ class FilterConfig(Section):
     """Noise of a range [m]."""
     bearing_std: AngleStd = 0.15
     """Noise of a bearing [rad]."""
-    detour_std: DistanceStd = 0.4
-    """Noise of a detour [m]: of a way, twice what the same delay is of a range."""
+    excess_path_std: DistanceStd = 0.4
+    """Noise of an excess path [m]: of a way, twice what the same delay is of a range."""
     caller_speed_std: Positive = 1.0
     """Velocity along an axis of a caller that moves, before anything is known of it [m/s]."""
     caller_walk_std: NonNegative = 0.2

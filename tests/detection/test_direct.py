@@ -1,4 +1,4 @@
-"""The direct call: what recognises it, when it began, and what a detour is worth."""
+"""The direct call: what recognises it, when it began, and what an excess path is worth."""
 
 from dataclasses import replace
 from functools import cache
@@ -13,7 +13,7 @@ from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import BLOCK, sampling
 from pipistrelle.config import AssociationConfig, Config
-from pipistrelle.detection.certainty import DETOUR_FLOOR
+from pipistrelle.detection.certainty import EXCESS_PATH_FLOOR
 from pipistrelle.detection.direct import DirectCalls, direct_calls, front_edge, loudest_first
 from pipistrelle.detection.faces import average_faces
 from pipistrelle.detection.matched import filter_blocks
@@ -133,14 +133,14 @@ def test_rows_say_how_much_later_than_the_direct_call_they_came_and_how_surely()
     label = np.where(found.caller == OWN, 7, np.where(near == 0, 51, 4))
     heard = average_faces(0.5, found, label, averaging="plain", speed_of_sound=C)
     rows = heard.rows
-    told = dict(zip(rows.landmark.tolist(), rows.detour, strict=True))
+    told = dict(zip(rows.landmark.tolist(), rows.excess_path, strict=True))
     assert told[4] == pytest.approx(C * 0.011, abs=0.05)
     assert np.isnan([told[7], told[51]]).all(), "an own echo, and the direct call itself"
-    stds = dict(zip(rows.landmark.tolist(), rows.detour_std, strict=True))
-    assert DETOUR_FLOOR < stds[4] < 0.1
+    stds = dict(zip(rows.landmark.tolist(), rows.excess_path_std, strict=True))
+    assert EXCESS_PATH_FLOOR < stds[4] < 0.1
 
 
-def test_a_detour_is_as_unsure_as_echo_and_direct_call_together():
+def test_an_excess_path_is_as_unsure_as_echo_and_direct_call_together():
     one, nan = np.ones(1), np.nan
     direct = DirectCalls(
         detection=np.array([-1, -1]), pulse=PULSE,
@@ -151,18 +151,18 @@ def test_a_detour_is_as_unsure_as_echo_and_direct_call_together():
         delay=np.array([0.03]), delay_std=np.array([3e-5]), bearing_std=one, direct=direct,
     )  # fmt: skip
     heard = average_faces(0.5, echo, np.array([4]), averaging="plain", speed_of_sound=C)
-    spread = np.hypot(C * 5e-5, DETOUR_FLOOR)
-    np.testing.assert_allclose(heard.rows.detour, C * 0.01, rtol=1e-12)
-    np.testing.assert_allclose(heard.rows.detour_std, spread, rtol=1e-12)
+    spread = np.hypot(C * 5e-5, EXCESS_PATH_FLOOR)
+    np.testing.assert_allclose(heard.rows.excess_path, C * 0.01, rtol=1e-12)
+    np.testing.assert_allclose(heard.rows.excess_path_std, spread, rtol=1e-12)
 
 
-def test_what_comes_while_the_direct_call_lasts_has_no_detour():
+def test_what_comes_while_the_direct_call_lasts_has_no_excess_path():
     for apart, heard_apart in ((0.8 * PULSE, False), (1.3 * PULSE, True)):
         found = detected((0.02, 0.0, BEACON, 26.0), (0.02 + apart, 3.1, BEACON, 20.0))
         late = found.delay > 0.02 + 0.5 * apart
         label = np.where(late, 4, 51)
         rows = average_faces(0.5, found, label, averaging="plain", speed_of_sound=C).rows
-        assert np.isfinite(rows.detour[rows.landmark == 4]).tolist() == [heard_apart]
+        assert np.isfinite(rows.excess_path[rows.landmark == 4]).tolist() == [heard_apart]
 
 
 # By planted sounds: amplitudes block by block, the same at ten elements but for their phase
@@ -373,9 +373,9 @@ def test_a_louder_call_of_another_tone_ten_milliseconds_away_changes_nothing():
 
 @cache
 def in_worlds(radius=0.0088, worlds=3, delay_gate=0.25):
-    """Errors of direct calls, of the strongest detections, and of detours with their deviations.
+    """Errors of direct calls, of strongest detections, and of excess paths with their deviations.
 
-    NaN of a passive row without a detour. The oracle labels what is within a share of a call.
+    NaN of a passive row without an excess path. The oracle labels what is within a share of a call.
     """
     direct, strongest, rows = [], [], []
     for world in range(worlds):
@@ -398,8 +398,8 @@ def in_worlds(radius=0.0088, worlds=3, delay_gate=0.25):
             echoes = (told.caller == BEACON) & (told.landmark != beacon)
             for label, e, std in zip(
                 told.landmark[echoes].tolist(),
-                told.detour[echoes],
-                told.detour_std[echoes],
+                told.excess_path[echoes],
+                told.excess_path_std[echoes],
                 strict=True,
             ):
                 rows.append((e - C * (delays[label] - delays[beacon]), std))
@@ -407,7 +407,7 @@ def in_worlds(radius=0.0088, worlds=3, delay_gate=0.25):
 
 
 def of_those_that_have_one(off, std):
-    """Leave out passive rows without a detour."""
+    """Leave out passive rows without an excess path."""
     told = np.isfinite(off)
     return off[told], std[told]
 
@@ -421,7 +421,7 @@ def test_in_the_papers_worlds_the_direct_call_is_hardly_ever_another():
     assert np.mean(np.abs(strongest) > 0.15) > 0.03, "the strongest alone is not enough"
 
 
-def test_in_the_papers_worlds_detours_are_as_good_as_they_say():
+def test_in_the_papers_worlds_excess_paths_are_as_good_as_they_say():
     off, std = of_those_that_have_one(*in_worlds()[2])
     assert off.size > 15000
     assert np.median(np.abs(off)) < 0.015
@@ -435,10 +435,10 @@ def test_in_the_papers_worlds_detours_are_as_good_as_they_say():
     ("radius", "delay_gate", "least_share", "most_rms"),
     [(0.0088, 0.25, 0.9, 0.06), (0.0025, 0.25, 0.85, 0.06), (0.0088, 1.0, 0.9, 0.13)],
 )
-def test_in_many_of_the_papers_worlds_detours_are_as_good(
+def test_in_many_of_the_papers_worlds_excess_paths_are_as_good(
     radius, delay_gate, least_share, most_rms
 ):
-    """An oracle that takes what is off by a whole call for an echo lets wrong detours in."""
+    """An oracle that takes what is off by a whole call for an echo lets wrong excess paths in."""
     direct, _, (off, std) = in_worlds(radius, 24, delay_gate)
     share, told = np.mean(np.isfinite(off)), np.mean(np.isfinite(direct))
     off, std = of_those_that_have_one(off, std)
@@ -446,7 +446,7 @@ def test_in_many_of_the_papers_worlds_detours_are_as_good(
     far, wrong = np.mean(np.abs(off) > 3.0 * std), np.mean(np.abs(off) > 0.24)
     print(
         f"piston {radius} m, gate {delay_gate}: a direct call in {told:.1%} of frames; {off.size} "
-        f"detours, of {share:.1%} of passive rows: {rms:.3f} m rms, {median:.4f} m in the median, "
+        f"excess paths, of {share:.1%} of passive rows: {rms:.3f} m rms, {median:.4f} m median, "
         f"{far:.1%} beyond three told deviations, {wrong:.1%} beyond 0.24 m"
     )
     assert share > least_share
@@ -462,7 +462,9 @@ def test_the_dense_engine_times_as_the_block_engine_does():
             "seed": 1000, "scenario": {"steps": 40}, "receiver": {"engine": engine},
         })  # fmt: skip
         (frames,) = listen(world_of(config, 0), config, (0.0088,))
-        told = [dict(zip(f.rows.landmark.tolist(), f.rows.detour, strict=True)) for f in frames]
+        told = [
+            dict(zip(f.rows.landmark.tolist(), f.rows.excess_path, strict=True)) for f in frames
+        ]
         off[engine] = [
             (n, label, e) for n, f in enumerate(told) for label, e in f.items() if e == e
         ]
@@ -479,7 +481,7 @@ def test_with_timing_off_scans_are_to_the_bit_those_of_old():
     (frames,) = listen(world_of(config), config, (0.0088,))
     for strategy in ("active", "fused", "passive"):
         scans = scans_of(frames, strategy, config)
-        untimed = [replace(f, rows=with_columns(f.rows, detour=np.nan)) for f in frames]
+        untimed = [replace(f, rows=with_columns(f.rows, excess_path=np.nan)) for f in frames]
         old = scans_of(untimed, strategy, config)
         assert [s.numbers.tobytes() for s in scans] == [s.numbers.tobytes() for s in old]
-        assert all(np.isnan(s.detour).all() for s in scans)
+        assert all(np.isnan(s.excess_path).all() for s in scans)

@@ -19,33 +19,33 @@ def test_rows_that_say_nothing_get_the_constant_and_those_that_do_keep_what_they
     scan = scan_with(
         [3, 8, 9], [0.1, 0.2, 0.3], [2.0, NAN, 4.0],
         bearing_std=np.array([NAN, 0.02, NAN]), range_std=np.array([0.5, NAN, NAN]),
-        detour_std=np.array([NAN, NAN, 0.1]),
+        excess_path_std=np.array([NAN, NAN, 0.1]),
     )  # fmt: skip
-    noisy = ConstantNoise(range_std=0.2, bearing_std=0.15, detour_std=0.3)(scan)
+    noisy = ConstantNoise(range_std=0.2, bearing_std=0.15, excess_path_std=0.3)(scan)
     assert noisy.bearing_std.tolist() == [0.15, 0.02, 0.15]
     assert noisy.range_std.tolist() == [0.5, 0.2, 0.2]
-    assert noisy.detour_std.tolist() == [0.3, 0.3, 0.1]
+    assert noisy.excess_path_std.tolist() == [0.3, 0.3, 0.1]
 
 
 def test_noise_changes_nothing_but_the_standard_deviations():
     scan = scan_with([3, 8], [0.1, 0.2], [2.0, NAN], bearing_std=NAN, range_std=NAN, level_db=7.0)
-    noisy = ConstantNoise(range_std=0.2, bearing_std=0.15, detour_std=0.3)(scan)
-    for name in set(COLUMNS) - {"bearing_std", "range_std", "detour_std"}:
+    noisy = ConstantNoise(range_std=0.2, bearing_std=0.15, excess_path_std=0.3)(scan)
+    for name in set(COLUMNS) - {"bearing_std", "range_std", "excess_path_std"}:
         np.testing.assert_array_equal(getattr(noisy, name), getattr(scan, name))
     assert np.isnan(scan.bearing_std).all(), "the scan itself stays as it was"
 
 
 @pytest.mark.parametrize("stds", [(0.2, 0.15, 0.4), (1.0, 0.01, 0.03)])
 def test_the_noise_of_the_settings_is_theirs(stds):
-    told = dict(zip(("range_std", "bearing_std", "detour_std"), stds, strict=True))
+    told = dict(zip(("range_std", "bearing_std", "excess_path_std"), stds, strict=True))
     noise = noise_of(FilterConfig(**told))
     assert noise == ConstantNoise(**told)
     assert hash(noise) == hash(noise_of(FilterConfig(**told)))
 
 
-def test_a_detour_is_told_to_be_off_by_the_way_of_what_a_range_is():
+def test_an_excess_path_is_told_to_be_off_by_the_way_of_what_a_range_is():
     noise = noise_of(FilterConfig())
-    assert noise.detour_std == 2.0 * noise.range_std
+    assert noise.excess_path_std == 2.0 * noise.range_std
 
 
 # What the signal tells
@@ -83,7 +83,7 @@ def heard_with(**columns):
 @pytest.mark.parametrize("strategy", ["active", "fused", "passive"])
 def test_with_constant_noise_scans_are_to_the_bit_those_of_a_detector_that_tells_nothing(strategy):
     sure = scans_of([HEARD], strategy, settled("constant"))
-    unsure = heard_with(bearing_std=NAN, range_std=NAN, detour_std=NAN)
+    unsure = heard_with(bearing_std=NAN, range_std=NAN, excess_path_std=NAN)
     for one, other in zip(sure, scans_of(unsure, strategy, settled("constant")), strict=True):
         for name in COLUMNS:
             assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
@@ -118,12 +118,12 @@ def test_measured_noise_merges_rows_by_their_inverse_variances_and_constant_nois
 @pytest.mark.parametrize("noise", ["constant", "measured"])
 def test_an_estimator_is_told_what_the_settings_let_it_know_and_all_else_as_it_was(noise, timing):
     rows = replace(
-        with_columns(ROWS, detour=np.array([NAN, 4.0, NAN, NAN]), detour_std=0.1),
+        with_columns(ROWS, excess_path=np.array([NAN, 4.0, NAN, NAN]), excess_path_std=0.1),
         callers=np.array([-1, 51, 52]),
     )
     known = as_told(rows, FilterConfig(noise=noise), timing=timing)
-    hidden = {"bearing_std", "range_std", "detour_std"} if noise == "constant" else set()
-    hidden |= set() if timing else {"detour", "detour_std"}
+    hidden = {"bearing_std", "range_std", "excess_path_std"} if noise == "constant" else set()
+    hidden |= set() if timing else {"excess_path", "excess_path_std"}
     for name in COLUMNS:
         expected = np.full(4, NAN) if name in hidden else getattr(rows, name)
         np.testing.assert_array_equal(getattr(known, name), expected)

@@ -61,6 +61,6 @@ def test_columns_are_replaced_in_a_copy_and_checked_as_those_of_a_new_scan():
 def test_how_the_numbers_lie_in_memory_makes_no_difference():
     scan = make_scan(0.5, np.array([3, 4, 3]), np.array([0.1, 0.2, 0.3]), bearing_std=0.1)
     other = replace(scan, numbers=np.asfortranarray(scan.numbers))
-    noise = ConstantNoise(range_std=0.2, bearing_std=0.15, detour_std=0.3)
+    noise = ConstantNoise(range_std=0.2, bearing_std=0.15, excess_path_std=0.3)
     for change in (noise, lambda scan: labelled(scan, np.array([1, 2, 1]))):
         np.testing.assert_array_equal(change(other).numbers, change(scan).numbers)

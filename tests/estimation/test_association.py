@@ -36,8 +36,8 @@ def test_rows_of_one_label_become_one_whatever_their_order():
 def test_rows_without_a_bearing_stand_at_the_end_whatever_their_order():
     rows = [(4, 0.3, 3.0, 1), (4, NAN, 3.0, 2), (5, 0.9, 2.0, 1)]
     for order in permutations(rows):
-        label, bearing, detour, caller = map(np.array, zip(*order, strict=True))
-        scan = make_scan(0.0, label, bearing, caller=caller, detour=detour)
+        label, bearing, excess_path, caller = map(np.array, zip(*order, strict=True))
+        scan = make_scan(0.0, label, bearing, caller=caller, excess_path=excess_path)
         one = labelled(scan, scan.landmark)
         assert np.isnan(one.bearing).tolist() == [False, False, True]
         assert (one.landmark[2], one.caller[2]) == (4, 2)
@@ -80,17 +80,20 @@ def test_what_cannot_be_labels_is_refused_before_a_kernel_sees_it(label):
     assert labelled(scan, [4, UNLABELLED, 4]).landmark.tolist() == [4]
 
 
-def test_ranges_come_with_their_own_noise_from_the_first_row_that_has_them_and_detours_all_stay():
+def test_ranges_come_with_their_own_noise_from_the_first_row_that_has_them_and_excess_paths_stay():
     scan = make_scan(
         0.0, np.full(4, 4), np.full(4, 0.1), bearing_std=0.01, caller=np.array([3, 0, 1, 2]),
         range=np.array([NAN, 5.0, 9.0, NAN]), range_std=np.array([0.9, 0.2, 0.3, 0.4]),
-        detour=np.array([NAN, NAN, 7.0, 6.0]), detour_std=np.array([0.8, 0.7, 0.5, 0.6]),
+        excess_path=np.array([NAN, NAN, 7.0, 6.0]), excess_path_std=np.array([0.8, 0.7, 0.5, 0.6]),
     )  # fmt: skip
     merged = labelled(scan, scan.landmark)
     assert merged.landmark.tolist() == [4, 4]
     assert (merged.range[0], merged.range_std[0], merged.bearing[0]) == (5.0, 0.2, 0.1)
     assert np.isnan([merged.range[1], merged.bearing[1]]).all()
-    assert (merged.detour.tolist(), merged.detour_std.tolist()) == ([7.0, 6.0], [0.5, 0.6])
+    assert (merged.excess_path.tolist(), merged.excess_path_std.tolist()) == (
+        [7.0, 6.0],
+        [0.5, 0.6],
+    )
     assert merged.caller.tolist() == [1, 2]
     assert labelled(merged, merged.landmark) is merged
 

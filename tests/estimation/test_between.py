@@ -1,4 +1,4 @@
-"""What stands between vehicle and caller: any error of its detour makes a range that seems sure."""
+"""What stands between vehicle and caller: an excess path's error makes ranges that seem sure."""
 
 from contextlib import suppress
 from dataclasses import replace
@@ -12,7 +12,7 @@ from pipistrelle.estimation.beliefs import Gaussian, placed
 from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
 from pipistrelle.estimation.fastslam.filter import FastSlam
-from pipistrelle.estimation.measurement import detour_of, landmark_range
+from pipistrelle.estimation.measurement import excess_path_of, landmark_range
 from reference.missions import BICYCLE, map_with, ray_config
 
 ESTIMATORS = [
@@ -25,18 +25,19 @@ with suppress(ImportError):  # an extra
 
     ESTIMATORS.append(Smoother(motion=BICYCLE, rays=ray_config()))
 HERE, CALLER = np.zeros(2), np.array([10.0, 0.0])
-BEARING_STD, DETOUR_STD = 0.02, 0.05
+BEARING_STD, EXCESS_PATH_STD = 0.02, 0.05
 COMMON = 13.8
 """Squared deviation of two numbers that one in a thousand exceeds."""
 
 
-def told(slam, bearing, detours):
+def told(slam, bearing, excess_paths):
     """The map of who knows where it and the caller are, by echoes that came once."""
     known = map_with([99], [CALLER], [1e-6 * np.eye(2)])
     start = Gaussian(mean=np.zeros(3), covariance=1e-6 * np.eye(3))
     scan = make_scan(
         0.0, np.arange(len(bearing)), bearing,
-        caller=1, detour=detours, detour_std=DETOUR_STD, bearing_std=BEARING_STD,
+        caller=1, excess_path=excess_paths, excess_path_std=EXCESS_PATH_STD,
+        bearing_std=BEARING_STD,
     )  # fmt: skip
     scan = replace(scan, callers=np.array([-1, 99]))
     belief = slam.update(slam.knowing(slam.init(start), known), scan, np.random.default_rng(7))
@@ -44,9 +45,9 @@ def told(slam, bearing, detours):
 
 
 @pytest.mark.parametrize("slam", ESTIMATORS, ids=lambda slam: type(slam).__name__)
-@pytest.mark.parametrize("detour", [-0.03, 0.0, 0.04, 0.14])
-def test_a_detour_that_may_be_none_places_nothing(slam, detour):
-    rows = told(slam, np.array([0.003]), np.array([detour]))
+@pytest.mark.parametrize("excess_path", [-0.03, 0.0, 0.04, 0.14])
+def test_an_excess_path_that_may_be_none_places_nothing(slam, excess_path):
+    rows = told(slam, np.array([0.003]), np.array([excess_path]))
     assert np.sum(rows.landmark == 0) > 1, "a ray"
 
 
@@ -56,8 +57,8 @@ def test_what_is_placed_about_the_line_is_where_it_is_thought_to_be(slam):
     places = np.column_stack([rng.uniform(2, 8, most), rng.uniform(0.5, 3.0, most)])
     places[::3, 1] *= 0.1
     bearing = np.arctan2(places[:, 1], places[:, 0]) + BEARING_STD * rng.normal(size=most)
-    true = np.array([detour_of(HERE, place, CALLER) for place in places])
-    rows = told(slam, bearing, np.maximum(true + DETOUR_STD * rng.normal(size=most), 0.0))
+    true = np.array([excess_path_of(HERE, place, CALLER) for place in places])
+    rows = told(slam, bearing, np.maximum(true + EXCESS_PATH_STD * rng.normal(size=most), 0.0))
     full = placed(rows) & (rows.landmark < most)
     off = rows.mean[full] - places[rows.landmark[full]]
     squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(rows.covariance[full]), off)
@@ -66,6 +67,6 @@ def test_what_is_placed_about_the_line_is_where_it_is_thought_to_be(slam):
     assert np.median(squared) < 3.0, "1.4 where all is linear"
 
 
-@pytest.mark.parametrize("detour", [-0.03, 0.0])
-def test_no_detour_has_no_range(detour):
-    assert landmark_range(detour, CALLER, 0.05) == np.inf
+@pytest.mark.parametrize("excess_path", [-0.03, 0.0])
+def test_no_excess_path_has_no_range(excess_path):
+    assert landmark_range(excess_path, CALLER, 0.05) == np.inf

@@ -19,7 +19,7 @@ POSES = Motion(model="poses", control_std=(0.005, 0.003, 0.006))
 SCAN = scan_of((3, 5.0, 0.3), (8, np.nan, 1.0))
 TIMED = make_scan(
     0.5, np.array([3, 8]), np.array([0.3, np.nan]), caller=np.array([1, 2]), bearing_std=0.1,
-    detour=np.array([3.0, 5.0]), detour_std=0.1,
+    excess_path=np.array([3.0, 5.0]), excess_path_std=0.1,
 )  # fmt: skip
 
 
@@ -125,12 +125,12 @@ def raw(**columns):
         (with_columns(SCAN, bearing=np.array([np.inf, 1.0])), "numbers that no filter can use"),
         (with_columns(SCAN, range=0.0), r"can use, for the landmarks \[3, 8\]"),
         (with_columns(SCAN, range=2e6), "numbers that no filter can use"),
-        (with_columns(TIMED, detour=np.nan), r"can use, for the landmarks \[8\]"),
+        (with_columns(TIMED, excess_path=np.nan), r"can use, for the landmarks \[8\]"),
         (with_columns(SCAN, bearing_std=np.nan), r"no standard deviations .* \[3, 8\]"),
         (with_columns(SCAN, range_std=1e-13), r"deviations above 0 for .* \[3\]"),
         (with_columns(SCAN, bearing_std=2e4), "bearing_std up to 10000 rad"),
-        (with_columns(SCAN, range_std=2e6), r"detour_std up to 1e\+06 m"),
-        (with_columns(TIMED, detour_std=np.inf), "no standard deviations"),
+        (with_columns(SCAN, range_std=2e6), r"excess_path_std up to 1e\+06 m"),
+        (with_columns(TIMED, excess_path_std=np.inf), "no standard deviations"),
     ],
 )
 def test_scans_that_no_filter_can_use_are_refused(refused, scan, said):

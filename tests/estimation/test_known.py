@@ -12,7 +12,7 @@ from pipistrelle.estimation.beliefs import AcceptsMap, Gaussian
 from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
 from pipistrelle.estimation.fastslam.filter import FastSlam
-from pipistrelle.estimation.measurement import detour_of, measurement_jacobians
+from pipistrelle.estimation.measurement import excess_path_of, measurement_jacobians
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.runs.filtering import run_filter
 from pipistrelle.geometry import range_and_bearing
@@ -98,7 +98,8 @@ def test_fastslam_lights_landmarks_up_by_a_caller_whose_place_is_known():
     over = np.hypot(*(spot - known.mean[0])) + np.hypot(*(spot - START.mean[:2]))
     e = over - np.hypot(*(known.mean[0] - START.mean[:2]))
     scan = make_scan(
-        0.0, np.array([20]), bearing, caller=1, detour=e, detour_std=0.02, bearing_std=0.01,
+        0.0, np.array([20]), bearing,
+        caller=1, excess_path=e, excess_path_std=0.02, bearing_std=0.01,
     )  # fmt: skip
     scan = replace(scan, callers=np.array([-1, 7]))
     rows = FASTSLAM.update(belief, scan, np.random.default_rng(7)).landmarks()
@@ -123,7 +124,7 @@ def test_who_moves_is_not_known_beforehand(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_gate_drops_a_bearing_that_cannot_be_and_keeps_its_detour(kind):
+def test_the_gate_drops_a_bearing_that_cannot_be_and_keeps_its_excess_path(kind):
     slam = kind(motion=BICYCLE, rays=ray_config(), gate=0.999)
     still = replace(START, covariance=1e-6 * np.eye(3))
     post, caller = POSTS.mean
@@ -131,7 +132,8 @@ def test_the_gate_drops_a_bearing_that_cannot_be_and_keeps_its_detour(kind):
     (bearing,) = range_and_bearing(START.mean, post[None])[1]
     scan = make_scan(
         0.0, np.array([7]), np.array([bearing + 1.0]),
-        caller=1, detour=detour_of(START.mean[:2], post, caller), detour_std=0.02, bearing_std=0.01,
+        caller=1, excess_path=excess_path_of(START.mean[:2], post, caller), excess_path_std=0.02,
+        bearing_std=0.01,
     )  # fmt: skip
     scan = replace(scan, callers=np.array([-1, 9]))
     after = slam.update(slam.knowing(slam.init(still), known), scan)

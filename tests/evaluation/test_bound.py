@@ -266,22 +266,26 @@ def test_bounds_about_another_mean_are_chi_squares_where_the_weights_are_equal()
 # Callers that move
 
 
-def with_boat(scans, route, detour_std=0.05):
-    """Scans in which label 12 is a caller on a route, heard in every frame with its detours."""
+def with_boat(scans, route, excess_path_std=0.05):
+    """Scans in which label 12 is a caller on a route, heard always and with its excess paths."""
     timed, labels = [], PLACES[0]
     for scan in scans:
         rows = rows_of(scan, scan.landmark != 12)
-        e = {"detour": np.ones(len(rows.landmark)), "detour_std": detour_std, "caller": 1}
+        e = {
+            "excess_path": np.ones(len(rows.landmark)),
+            "excess_path_std": excess_path_std,
+            "caller": 1,
+        }
         timed.append(replace(with_columns(rows, **e), callers=np.array([-1, 12])))
     assert 12 in labels
     return timed
 
 
-def bound_with_boat(route, wander, detour_std=0.05):
+def bound_with_boat(route, wander, excess_path_std=0.05):
     rest = PLACES[0] != 12
     return pose_bound(
         DRIVE.motion, DRIVE.controls, DRIVE.time, WORLD.path, (PLACES[0][rest], PLACES[1][rest]),
-        with_boat(heard("fused"), route, detour_std), {12: route}, wander,
+        with_boat(heard("fused"), route, excess_path_std), {12: route}, wander,
     )  # fmt: skip
 
 
@@ -296,8 +300,8 @@ def test_the_more_a_caller_strays_the_less_its_calls_tell():
     bounds = [path_bound(bound_with_boat(route, (1.0, walk)))[0] for walk in (0.0, 0.3, 3.0, 1e4)]
     assert bounds == sorted(bounds)
     assert bounds[0] < bounds[-1] - 1e-6
-    deaf = path_bound(bound_with_boat(route, (1.0, 0.3), detour_std=1e6))[0]
-    assert bounds[-1] < deaf, "many detours at once place even one that may be anywhere"
+    deaf = path_bound(bound_with_boat(route, (1.0, 0.3), excess_path_std=1e6))[0]
+    assert bounds[-1] < deaf, "many excess paths at once place even one that may be anywhere"
 
 
 @pytest.mark.parametrize("odd_step", [STEP, 1.5 * STEP])
@@ -331,7 +335,7 @@ def test_a_caller_that_is_first_heard_late_is_bounded_by_what_was_heard():
     ]
     world = DRIVE.motion, DRIVE.controls, DRIVE.time, WORLD.path, known
     vague = [
-        with_columns(scan, detour_std=1e9) if i < len(scans) - 3 else scan
+        with_columns(scan, excess_path_std=1e9) if i < len(scans) - 3 else scan
         for i, scan in enumerate(scans)
     ]
     last, same, ever = (

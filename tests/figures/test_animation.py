@@ -6,11 +6,11 @@ import pytest
 from PIL import Image
 
 from pipistrelle.config import InputError
-from pipistrelle.detection.scans import DETOUR, make_scan
+from pipistrelle.detection.scans import EXCESS_PATH, make_scan
 from pipistrelle.detection.scans import rows_of as rows_of_scan
 from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.figures.animation import _stage, animate_mission, pruned
-from pipistrelle.figures.detours import callers_at, drawn_detours
+from pipistrelle.figures.excess_paths import callers_at, drawn_excess_paths
 from pipistrelle.figures.recorder import MissionRecorder, Snapshot
 from pipistrelle.geometry import range_and_bearing
 from reference.missions import map_with
@@ -128,12 +128,12 @@ def test_a_panel_shows_measurements_along_their_bearings_as_far_as_their_ranges(
     assert range_and_bearing(frame.pose, tips)[1] == pytest.approx(frame.scan.bearing[~ranged])
 
 
-def test_a_further_detour_of_a_landmark_has_no_direction_to_draw(recorder, mission):
+def test_a_further_excess_path_of_a_landmark_has_no_direction_to_draw(recorder, mission):
     frame = recorder.snapshots["fused", "ekf"][100]
     old, k = frame.scan, len(frame.scan.landmark)
     rows = np.append(np.arange(k), 0)
     more = rows_of_scan(old, rows)
-    more.numbers[:2, k], more.numbers[DETOUR, k] = np.nan, 3.0
+    more.numbers[:2, k], more.numbers[EXCESS_PATH, k] = np.nan, 3.0
     panels = []
     for scan in (old, more):
         _, (panel, *_) = _stage({("fused", "ekf"): [replace(frame, scan=scan)]}, **mission.scene)
@@ -215,40 +215,40 @@ def test_a_film_of_nothing_but_a_drive_needs_no_legend(tmp_path):
     assert (tmp_path / "empty.gif").read_bytes().startswith(b"GIF89a")
 
 
-def test_a_panel_shows_the_detour_ellipses_of_its_frame_two_at_most(timed):
+def test_a_panel_shows_the_excess_path_ellipses_of_its_frame_two_at_most(timed):
     again, snapshots = timed
     scene = {"truth": again.drive.truth, "callers": again.callers, "beamwidth": again.beamwidth}
     figure, panels = _stage(snapshots, **scene)
     named = [text.get_text() for text in figure.legends[0].texts]
-    assert {"detour ellipse and its way", "caller as estimated"} <= set(named)
+    assert {"excess-path ellipse and its way", "caller as estimated"} <= set(named)
     active, fused = panels
     counts = set()
     for frame, label in zip(fused.frames, fused.resolved, strict=True):
         for panel in panels:
-            panel._show_detours(frame, label if panel is fused else -1)
-        outlines, ways = fused.detours.get_paths(), fused.ways.get_segments()
-        expected = drawn_detours(frame, label)[0]
+            panel._show_excess_paths(frame, label if panel is fused else -1)
+        outlines, ways = fused.excess_paths.get_paths(), fused.ways.get_segments()
+        expected = drawn_excess_paths(frame, label)[0]
         assert len(outlines) == len(ways) == len(fused.spot.get_xdata()) + (len(outlines) > 1)
         for outline, ellipse in zip(outlines, expected, strict=True):
             np.testing.assert_array_equal(outline.vertices[:121], ellipse)
         counts.add(len(outlines))
         stars = callers_at(frame).mean
         np.testing.assert_array_equal(fused.callers.get_xydata(), stars)
-        assert active.detours.get_paths() == []
+        assert active.excess_paths.get_paths() == []
     assert {1, 2} <= counts <= {0, 1, 2}
-    assert fused.detours.get_clip_on()
+    assert fused.excess_paths.get_clip_on()
 
 
 def test_a_mission_without_timing_has_neither_ellipses_nor_marks_nor_a_word_of_them(
     recorder, mission
 ):
     figure, panels = _stage(recorder.snapshots, **mission.scene)
-    assert "detour ellipse and its way" not in [t.get_text() for t in figure.legends[0].texts]
+    assert "excess-path ellipse and its way" not in [t.get_text() for t in figure.legends[0].texts]
     for panel in panels:
         frame = panel.frames[200]
-        panel._show_detours(frame, panel.resolved[200])
+        panel._show_excess_paths(frame, panel.resolved[200])
         panel._show_vehicle(frame.pose, frame.scan.time, 200)
-        drawn = (panel.detours.get_paths(), panel.ways.get_segments())
+        drawn = (panel.excess_paths.get_paths(), panel.ways.get_segments())
         assert drawn == ([], [])
         assert [len(one.get_xdata()) for one in (panel.callers, panel.spot, panel.movers)] == [
             0

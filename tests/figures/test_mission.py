@@ -301,7 +301,9 @@ print("matplotlib.pyplot" in sys.modules)
     assert run.stdout.split() == ["False", "False"]
 
 
-def test_callers_are_marked_where_they_are_believed_to_be_where_detours_were_heard(timed, three):
+def test_callers_are_marked_where_they_are_believed_to_be_where_excess_paths_were_heard(
+    timed, three
+):
     again, _ = timed
     figure = draw_mission(again.trials, truth=again.drive.truth, callers=again.callers)
     named = [text.get_text() for text in figure.legends[0].texts]
@@ -320,11 +322,13 @@ def test_callers_are_marked_where_they_are_believed_to_be_where_detours_were_hea
         ]
 
 
-def test_the_last_scans_detours_are_ellipses_about_vehicle_and_caller(timed, three, mission):
+def test_the_last_scans_excess_paths_are_ellipses_about_vehicle_and_caller(timed, three, mission):
     again, _ = timed
     trial = next(trial for trial in again.trials if trial.strategy == "fused")
     figure = draw_mission([trial], truth=again.drive.truth, callers=again.callers)
-    assert "detour ellipse and its way" in [text.get_text() for text in figure.legends[0].texts]
+    assert "excess-path ellipse and its way" in [
+        text.get_text() for text in figure.legends[0].texts
+    ]
     (axes,), scan = maps(figure), trial.scans[-1]
     lines = [part for part in axes.collections if isinstance(part, LineCollection)]
     ways = [way for part in lines for way in part.get_segments() if way.shape == (3, 2)]
@@ -333,8 +337,10 @@ def test_the_last_scans_detours_are_ellipses_about_vehicle_and_caller(timed, thr
     for caller, spot, vehicle in ways:
         np.testing.assert_array_equal(vehicle, trial.track.pose.mean[k, :2])
         e = np.hypot(*(spot - caller)) + np.hypot(*(spot - vehicle)) - np.hypot(*(caller - vehicle))
-        assert np.nanmin(np.abs(scan.detour - e)) < 0.5
-    assert "detour ellipse and its way" not in named(mission.trials["passive"], **mission.scene)
+        assert np.nanmin(np.abs(scan.excess_path - e)) < 0.5
+    assert "excess-path ellipse and its way" not in named(
+        mission.trials["passive"], **mission.scene
+    )
 
 
 def test_a_caller_that_moves_is_drawn_as_it_was_followed(timed, mission):

@@ -103,7 +103,7 @@ def scan(rng: Generator) -> Scan:
     """Draw a scan, of echoes of one's own call and of others', perhaps timed."""
     m = int(rng.integers(0, 8))
     caller = rng.integers(0, 3, m)
-    detour = np.where((caller > 0) & (rng.random(m) < 0.7), rng.uniform(0.5, 9.0, m), np.nan)
+    excess_path = np.where((caller > 0) & (rng.random(m) < 0.7), rng.uniform(0.5, 9.0, m), np.nan)
     drawn = make_scan(
         float(rng.random()),
         rng.permutation(12)[:m],
@@ -112,8 +112,8 @@ def scan(rng: Generator) -> Scan:
         range=np.where((caller == 0) & (rng.random(m) < 0.7), rng.uniform(1, 9, m), np.nan),
         bearing_std=10.0 ** rng.uniform(-3, 0),
         range_std=10.0 ** rng.uniform(-3, 0),
-        detour=detour,
-        detour_std=10.0 ** rng.uniform(-3, 0),
+        excess_path=excess_path,
+        excess_path_std=10.0 ** rng.uniform(-3, 0),
     )
     labels = one_of(rng, [NO_CALLERS, np.array([-1, 3, 4]), np.array([-1, 3, 4])])
     moving = one_of(rng, [NO_CALLERS, NO_CALLERS, np.array([4])])

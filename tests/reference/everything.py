@@ -20,14 +20,14 @@ class Everything:
     `legs` holds pairs of controls (k, 2) and durations (k); `rows` holds, of what was heard, the
     number of the leg at whose end it was (0: before any), label, bearing, range or NaN, and their
     deviations; `priors` the place of each landmark about which it may be next to anywhere;
-    `detours`, of each, the number of the leg, the labels of landmark and caller, itself and its
-    deviation.
+    `excess_paths`, of each, the number of the leg, the labels of landmark and caller, itself and
+    its deviation.
     """
 
-    def __init__(self, motion, start, legs, rows, priors, *, detours=(), robust=False):
+    def __init__(self, motion, start, legs, rows, priors, *, excess_paths=(), robust=False):
         self.start, self.robust, self.labels = start, robust, list(priors)
         self.rows = [row for row in rows if row[1] in priors]
-        self.detours = [one for one in detours if one[1] in priors and one[2] in priors]
+        self.excess_paths = [one for one in excess_paths if one[1] in priors and one[2] in priors]
         self.priors = np.array([priors[label] for label in self.labels]).reshape(-1, 2)
         self.legs, column = [], 3
         for controls, dt in legs:
@@ -82,14 +82,14 @@ class Everything:
                 J.append(np.array([dx, dy]) / d @ D / along)
             less = np.sqrt(min(1.0, BELIEVED / np.linalg.norm(r))) if self.robust else 1.0
             yield less * np.array(r), less * np.array(J)
-        for leg, label, caller, detour, along in self.detours:
+        for leg, label, caller, excess_path, along in self.excess_paths:
             pose, by_pose = mean[ends[leg]][:2], slope[ends[leg]][:2]
             places = [self.first + 2 * self.labels.index(one) for one in (label, caller)]
             (point, D), (call, E) = [(x[i : i + 2], np.eye(2, self.size, i)) for i in places]
             over, by_over = length(call - point, E - D)
             back, by_back = length(point - pose, D - by_pose)
             straight, by_straight = length(call - pose, E - by_pose)
-            r = np.array([over + back - straight - detour]) / along
+            r = np.array([over + back - straight - excess_path]) / along
             J = (by_over + by_back - by_straight)[None] / along
             less = np.sqrt(min(1.0, BELIEVED / np.linalg.norm(r))) if self.robust else 1.0
             yield less * r, less * J

@@ -45,8 +45,8 @@ def wandering(rng, frames, start, speed_std, walk_std):
     return np.array(path)
 
 
-def with_boat(mission, path, rng, *, bearing_std=0.05, detour_std=0.05, direct=1.0):
-    """Return the mission with a caller at a place for each frame, and the detours of its calls.
+def with_boat(mission, path, rng, *, bearing_std=0.05, excess_path_std=0.05, direct=1.0):
+    """Return the mission with a caller at a place for each frame, and its excess paths.
 
     It is heard to call from a bearing, in a share of the frames; what it lights up is what the
     scan holds.
@@ -56,7 +56,7 @@ def with_boat(mission, path, rng, *, bearing_std=0.05, detour_std=0.05, direct=1
         scan = rows_of(scan, scan.landmark != BOAT)
         points = mission.landmarks[scan.landmark - 1]
         over = np.hypot(*(points - boat).T) + np.hypot(*(points - pose[:2]).T)
-        e = over - np.hypot(*(boat - pose[:2])) + rng.normal(0.0, detour_std, len(points))
+        e = over - np.hypot(*(boat - pose[:2])) + rng.normal(0.0, excess_path_std, len(points))
         towards = np.arctan2(*(boat - pose[:2])[::-1]) - pose[2] + rng.normal(0.0, bearing_std)
         called = rng.random() < direct
         columns = {name: getattr(scan, name) for name in ("range", "range_std", "bearing_std")}
@@ -67,8 +67,8 @@ def with_boat(mission, path, rng, *, bearing_std=0.05, detour_std=0.05, direct=1
             np.append(scan.landmark, BOAT),
             np.append(scan.bearing, (towards + np.pi) % (2 * np.pi) - np.pi),
             caller=1,
-            detour=np.append(np.where(e > 0.5, e, np.nan), np.nan),
-            detour_std=detour_std,
+            excess_path=np.append(np.where(e > 0.5, e, np.nan), np.nan),
+            excess_path_std=excess_path_std,
             **columns,
         )
         made = rows_of(made, np.arange(len(made.landmark)) < len(points) + called)

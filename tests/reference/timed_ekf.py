@@ -1,4 +1,4 @@
-"""Detours in the slow EKFs: Jacobians by differences, closed forms by a search along the ray."""
+"""Excess paths in the slow EKFs: Jacobians by differences, ranges by a search along the ray."""
 
 import math
 
@@ -15,7 +15,7 @@ TINY = 1e-6
 FARTHEST = 1e4
 
 
-def detour(vehicle, landmark, caller):
+def excess_path(vehicle, landmark, caller):
     """How much longer the way over the landmark is than the straight one."""
     return math.dist(caller, landmark) + math.dist(landmark, vehicle) - math.dist(caller, vehicle)
 
@@ -32,13 +32,13 @@ def slopes(function, z):
 
 
 def range_on_ray(vehicle, direction, other, e, *, of_caller):
-    """Where on a ray a point has a detour, by search; NaN where none has."""
+    """Where on a ray a point has an excess path, by search; NaN where none has."""
     u = np.array([math.cos(direction), math.sin(direction)])
 
     def off(r):
         point = vehicle + r * u
         ends = (other, point) if of_caller else (point, other)
-        return detour(vehicle, *ends) - e
+        return excess_path(vehicle, *ends) - e
 
     if off(NEAREST) * off(FARTHEST) >= 0:
         return math.nan
@@ -46,9 +46,9 @@ def range_on_ray(vehicle, direction, other, e, *, of_caller):
 
 
 class Timed:
-    """What a slow EKF does with detours, besides the rest."""
+    """What a slow EKF does with excess paths, besides the rest."""
 
-    detour_variance = math.nan
+    excess_path_variance = math.nan
 
     def update(self, scan):
         at = dict(zip(scan.caller.tolist(), [-1] * len(scan.caller), strict=True))
@@ -60,16 +60,16 @@ class Timed:
         self.timed = [
             (label, at[caller], e)
             for label, caller, e in zip(
-                scan.landmark.tolist(), scan.caller.tolist(), scan.detour, strict=True
+                scan.landmark.tolist(), scan.caller.tolist(), scan.excess_path, strict=True
             )
             if np.isfinite(e) and at[caller] not in (-1, label)
         ]
         known = set(self.landmark.tolist())
         for label, distance, bearing in rows:
-            if label in known and not self.placed_by_detour(label, distance, bearing):
+            if label in known and not self.placed_by_excess_path(label, distance, bearing):
                 self.measure(label, distance, bearing)
         for label, distance, bearing in rows:
-            if label not in known and not self.placed_by_detour(label, distance, bearing):
+            if label not in known and not self.placed_by_excess_path(label, distance, bearing):
                 self.initialise(label, distance, bearing)
         for told in self.timed:
             self.take(*told)
@@ -77,8 +77,8 @@ class Timed:
 
     # Placing
 
-    def placed_by_detour(self, label, distance, bearing):
-        """Place what has not one member by the detour that tells its range most surely."""
+    def placed_by_excess_path(self, label, distance, bearing):
+        """Place what has not one member by the excess path that tells its range most surely."""
         members = self.members(label)
         if len(members) == 1 or not math.isnan(distance):
             return False
@@ -86,7 +86,7 @@ class Timed:
             (*self.where(other, e, bearing, of_caller=caller == label), told)
             for told in self.timed
             for landmark, caller, e in [told]
-            if label in (landmark, caller) and e > SOME * math.sqrt(self.detour_variance)
+            if label in (landmark, caller) and e > SOME * math.sqrt(self.excess_path_variance)
             for other in self.members(landmark if caller == label else caller)
             if len(self.members(other[1])) == 1
         ]
@@ -122,7 +122,7 @@ class Timed:
         r = ranged(z)
         if not math.isfinite(r) or not np.isfinite(slopes(ranged, z)).all():
             return math.inf, None, None, None
-        R = np.diag([self.bearing_variance, self.detour_variance])
+        R = np.diag([self.bearing_variance, self.excess_path_variance])
         by_state, noise = np.zeros((3, self.X.size)), np.zeros((3, 2))
         both = np.vstack([slopes(pointed, z), slopes(ranged, z)])
         by_state[:, pose], by_state[:, place], noise = both[:, :3], both[:, 3:5], both[:, 5:]
@@ -176,13 +176,17 @@ class Timed:
         z = np.concatenate([self.X[part] for part in where])
         H = np.zeros((1, self.X.size))
         for i, part in enumerate(where):
-            H[0, part] = slopes(lambda z: detour(z[:2], z[2:4], z[4:]), z)[2 * i : 2 * i + 2]
+            H[0, part] = slopes(lambda z: excess_path(z[:2], z[2:4], z[4:]), z)[2 * i : 2 * i + 2]
         near, onward, straight = (
             self.bend(a, b)
             for a, b in [(where[1], where[0]), (where[1], where[2]), (where[2], where[0])]
         )
-        S = (H @ self.P @ H.T).item() + self.detour_variance + (near + onward + straight) ** 2 / 2
-        nu = e - detour(z[:2], z[2:4], z[4:]) - (near + onward - straight) / 2
+        S = (
+            (H @ self.P @ H.T).item()
+            + self.excess_path_variance
+            + (near + onward + straight) ** 2 / 2
+        )
+        nu = e - excess_path(z[:2], z[2:4], z[4:]) - (near + onward - straight) / 2
         return nu, H, S
 
     def bend(self, a, b):

@@ -1,4 +1,4 @@
-"""FastSLAM with detours, slowly: the joint Gaussian of a caller and all that it lights up.
+"""FastSLAM with excess paths, slowly: the joint Gaussian of a caller and all that it lights up.
 
 Nothing here knows that landmarks are independent given their caller: each particle keeps the
 covariances of all of them, in one matrix, and corrects them all by every measurement.
@@ -31,11 +31,11 @@ class Tied(Particle):
 
 
 class SlowTimedFastSlam(SlowFastSlam):
-    """The filter for scans with detours, none of which weighs or refines a pose."""
+    """The filter for scans with excess paths, none of which weighs or refines a pose."""
 
-    def __init__(self, *args, detour_std, **options):
+    def __init__(self, *args, excess_path_std, **options):
         super().__init__(*args, **options)
-        self.detour_variance, self.hub = detour_std**2, {}
+        self.excess_path_variance, self.hub = excess_path_std**2, {}
 
     def start(self, mean, covariance):
         super().start(mean, covariance)
@@ -45,24 +45,30 @@ class SlowTimedFastSlam(SlowFastSlam):
     # What is tied to whom
 
     def said_of(self, scan):
-        """Landmark, caller and detour, where the caller is known by its label."""
+        """Landmark, caller and excess path, where the caller is known by its label."""
         callers = scan.callers.tolist()
-        rows = zip(scan.landmark.tolist(), scan.caller.tolist(), scan.detour.tolist(), strict=True)
+        rows = zip(
+            scan.landmark.tolist(), scan.caller.tolist(), scan.excess_path.tolist(), strict=True
+        )
         named = [
-            (label, callers[whose] if whose < len(callers) else -1, detour)
-            for label, whose, detour in rows
-            if not math.isnan(detour)
+            (label, callers[whose] if whose < len(callers) else -1, excess_path)
+            for label, whose, excess_path in rows
+            if not math.isnan(excess_path)
         ]
         return [row for row in named if row[1] not in (-1, row[0])]
 
     def tie(self, scan, said):
-        """Tie landmarks to callers; detours of each landmark by its own, by label."""
+        """Tie landmarks to callers; excess paths of each landmark by its own, by label."""
         seen, callers = {*self.particles[0].map, *scan.landmark.tolist()}, scan.callers.tolist()
         for label, caller, _ in said:
             free = label in seen and label not in callers and label not in self.hub
             if free and 2 * self.knowing(caller) > len(self.particles):
                 self.hub[label] = caller
-        return {label: detour for label, caller, detour in said if self.hub.get(label) == caller}
+        return {
+            label: excess_path
+            for label, caller, excess_path in said
+            if self.hub.get(label) == caller
+        }
 
     def knowing(self, label):
         """How many particles know a landmark as one place."""
@@ -106,15 +112,15 @@ class SlowTimedFastSlam(SlowFastSlam):
 
     # All that was heard of a landmark
 
-    def detour_rows(self, pose, landmark, caller, detour):
+    def excess_path_rows(self, pose, landmark, caller, excess_path):
         """Innovation, Jacobians by pose, landmark and caller, and variance."""
         u, w, v = landmark - pose[:2], landmark - caller, caller - pose[:2]
         near, onward, straight = (np.linalg.norm(way) for way in (u, w, v))
         u, w, v = u / near, w / onward, v / straight
-        nu = detour - (onward + near - straight)
-        return nu, np.append(v - u, 0), u + w, -w - v, self.detour_variance
+        nu = excess_path - (onward + near - straight)
+        return nu, np.append(v - u, 0), u + w, -w - v, self.excess_path_variance
 
-    def taken(self, p, label, distance, bearing, detour):
+    def taken(self, p, label, distance, bearing, excess_path):
         """Correct the whole by a landmark's numbers one by one, by a caller's own together."""
         hub = self.hub.get(label, label)
         numbers = [(math.nan, bearing), (distance, None)] if hub != label else [(distance, bearing)]
@@ -132,11 +138,11 @@ class SlowTimedFastSlam(SlowFastSlam):
             H = np.zeros((len(nu), len(mean)))
             H[:, own] = Hm
             self.put_back(p, labels, *kalman(mean, P, nu, H, H @ P @ H.T + R))
-        if detour is not None and self.sure(p, hub):
+        if excess_path is not None and self.sure(p, hub):
             labels, mean, P = self.whole(p, hub)
             own, H = 2 * labels.index(label), np.zeros((1, len(mean)))
-            nu, _, H[0, own : own + 2], H[0, :2], R = self.detour_rows(
-                p.pose, mean[own : own + 2], mean[:2], detour
+            nu, _, H[0, own : own + 2], H[0, :2], R = self.excess_path_rows(
+                p.pose, mean[own : own + 2], mean[:2], excess_path
             )
             self.put_back(p, labels, *kalman(mean, P, np.array([nu]), H, H @ P @ H.T + R))
 
@@ -149,13 +155,13 @@ class SlowTimedFastSlam(SlowFastSlam):
         inside = {row[0] for row in rows if not math.isnan(row[2]) and self.inside_any(*row)}
         kept = rows_of(scan, np.isnan(scan.bearing) | np.isin(scan.landmark, list(inside)))
         told = self.said_of(kept)
-        said = [one for one in told if self.detour_inside_any(*one)]
+        said = [one for one in told if self.excess_path_inside_any(*one)]
         self.gated += len(told) - len(said)
         self.heard = self.tie(kept, said)
         super().update(rows_of(scan, ~np.isnan(scan.bearing)), rng)
 
-    def detour_inside_any(self, label, caller, detour):
-        """Whether a particle expected a detour; one that cannot judge lets it in."""
+    def excess_path_inside_any(self, label, caller, excess_path):
+        """Whether a particle expected an excess path; one that cannot judge lets it in."""
         if self.gate == 1 or self.hub.get(label) != caller:
             return True
         for p in self.particles:
@@ -163,8 +169,8 @@ class SlowTimedFastSlam(SlowFastSlam):
                 return True
             labels, mean, P = self.whole(p, caller)
             own, H = 2 * labels.index(label), np.zeros(len(mean))
-            nu, by_pose, H[own : own + 2], H[:2], R = self.detour_rows(
-                p.pose, mean[own : own + 2], mean[:2], detour
+            nu, by_pose, H[own : own + 2], H[:2], R = self.excess_path_rows(
+                p.pose, mean[own : own + 2], mean[:2], excess_path
             )
             S = by_pose @ p.P @ by_pose + H @ P @ H + R
             if nu**2 <= chi2.ppf(self.gate, 1) * S:
@@ -197,31 +203,31 @@ class SlowTimedFastSlam(SlowFastSlam):
                 p.map[label] = new
             heard = label in self.heard and len(p.map[label]) > 1
             if heard and self.sure(p, self.hub[label]):
-                self.place_by_detour(p, label, bearing, self.heard[label])
+                self.place_by_excess_path(p, label, bearing, self.heard[label])
 
-    def place_by_detour(self, p, label, bearing, detour):
+    def place_by_excess_path(self, p, label, bearing, excess_path):
         """Place a ray's landmark, with all its covariances, where that is sure enough."""
-        if detour <= SOME * math.sqrt(self.detour_variance):
+        if excess_path <= SOME * math.sqrt(self.excess_path_variance):
             return
         hub = self.hub[label]
         caller, angle = p.map[hub][0], p.pose[2] + bearing
         u, v = np.array([math.cos(angle), math.sin(angle)]), caller.mean - p.pose[:2]
-        r = crossing(v, angle, detour)
-        dz = math.sqrt(self.bearing_variance), math.sqrt(self.detour_variance)
-        tried = [crossing(v, angle + sign * dz[0], detour) for sign in (-1, 1)]
-        tried += [crossing(v, angle, detour + sign * dz[1]) for sign in (-1, 1)]
+        r = crossing(v, angle, excess_path)
+        dz = math.sqrt(self.bearing_variance), math.sqrt(self.excess_path_variance)
+        tried = [crossing(v, angle + sign * dz[0], excess_path) for sign in (-1, 1)]
+        tried += [crossing(v, angle, excess_path + sign * dz[1]) for sign in (-1, 1)]
         if r == 0 or any(abs(other - r) > SURE * r for other in tried):
             return
         across = r * np.array([-u[1], u[0]])
-        _, _, by_landmark, by_caller, _ = self.detour_rows(
-            p.pose, p.pose[:2] + r * u, caller.mean, detour
+        _, _, by_landmark, by_caller, _ = self.excess_path_rows(
+            p.pose, p.pose[:2] + r * u, caller.mean, excess_path
         )
         steep = by_landmark @ u
         if r <= NEAREST or steep <= NEAREST:
             return
         G = np.column_stack([u / steep, across - u * (by_landmark @ across) / steep])
         A = -np.outer(u, by_caller) / steep
-        C = G @ np.diag([self.detour_variance, self.bearing_variance]) @ G.T
+        C = G @ np.diag([self.excess_path_variance, self.bearing_variance]) @ G.T
         P = C + A @ caller.covariance @ A.T
         if math.sqrt(u @ P @ u) > SURE * r:
             return
@@ -232,9 +238,9 @@ class SlowTimedFastSlam(SlowFastSlam):
         p.map[label] = [Member(p.pose[:2] + r * u, P)]
 
 
-def crossing(v, angle, detour):
+def crossing(v, angle, excess_path):
     """Range at which a ray crosses the ellipse about the vehicle and a caller at v; or 0."""
     d, along = np.linalg.norm(v), v @ [math.cos(angle), math.sin(angle)]
-    if d + detour - along <= 0:
+    if d + excess_path - along <= 0:
         return 0.0
-    return max(0.0, ((d + detour) ** 2 - d**2) / 2 / (d + detour - along))
+    return max(0.0, ((d + excess_path) ** 2 - d**2) / 2 / (d + excess_path - along))

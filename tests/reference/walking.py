@@ -17,7 +17,7 @@ from reference.missions import (
     scattered,
     steady,
 )
-from reference.timing import detours_to
+from reference.timing import excess_paths_to
 
 CALLER = 99
 """The label of the caller that moves; it calls as number 1."""
@@ -65,11 +65,11 @@ def roaming_mission(
     """Draw a mission with one caller that moves; returns it and the caller's places, by frames.
 
     The caller's bearing is heard at each frame, and its range at the first few. Whatever is heard
-    of the landmarks has a detour. All noise but the caller's own is scaled, the controls' and the
-    start's, too (`scaled`).
+    of the landmarks has an excess path. All noise but the caller's own is scaled, the controls' and
+    the start's, too (`scaled`).
     """
     motion, begin = scaled(scale)
-    bearing_std, range_std, detour_std = (scale * std for std in (0.05, 0.2, 0.5))
+    bearing_std, range_std, excess_path_std = (scale * std for std in (0.05, 0.2, 0.5))
     field, drive = scattered(rng, count, radius=15.0), steady(CIRCLE, frames)
     mission = draw_mission(
         rng, motion, begin, field, drive,
@@ -81,15 +81,15 @@ def roaming_mission(
         place = places[frame + 1]
         distance, bearing = range_and_bearing(pose, place[None])
         far = distance + rng.normal(0.0, range_std, 1) if frame < ranges else [np.nan]
-        over = detours_to(field[scan.landmark - 1], pose[:2], place)
+        over = excess_paths_to(field[scan.landmark - 1], pose[:2], place)
         told = {
             "bearing": np.append(scan.bearing, wrap(bearing + rng.normal(0.0, bearing_std, 1))),
             "range": np.append(scan.range, far),
-            "detour": np.append(over + rng.normal(0.0, detour_std, over.size), np.nan),
+            "excess_path": np.append(over + rng.normal(0.0, excess_path_std, over.size), np.nan),
             "caller": np.ones(over.size + 1, np.int64),
             "bearing_std": np.append(np.full(over.size, bearing_std), bearing_std),
             "range_std": np.full(over.size + 1, range_std),
-            "detour_std": np.full(over.size + 1, detour_std),
+            "excess_path_std": np.full(over.size + 1, excess_path_std),
         }
         told = {name: told[name] for name in COLUMNS if name in told}
         made = make_scan(scan.time, np.append(scan.landmark, CALLER), **told)

@@ -36,7 +36,11 @@ def test_units_are_asked_about_by_the_share_of_what_a_strategy_heard(gated, aske
 
 
 @pytest.mark.parametrize(("short", "asked"), [(8, False), (9, True)])
-def test_short_detours_are_asked_about_where_nearly_all_are(short, asked):
-    detour = np.where(np.arange(10) < short, 0.19, 3.0)
-    lines = fit_warnings(log_of(detour=detour, detour_std=0.1, caller=1), [], Path("log"), Config())
-    assert [f"{short} of 10 detours are below 0.2 m" in line for line in lines] == [True] * asked
+def test_short_excess_paths_are_asked_about_where_nearly_all_are(short, asked):
+    excess_path = np.where(np.arange(10) < short, 0.19, 3.0)
+    lines = fit_warnings(
+        log_of(excess_path=excess_path, excess_path_std=0.1, caller=1), [], Path("log"), Config()
+    )
+    assert [f"{short} of 10 excess paths are below 0.2 m" in line for line in lines] == [
+        True
+    ] * asked

@@ -51,7 +51,7 @@ CHORUS = (
 
 
 @pytest.mark.parametrize("noise", ["constant", "measured"])
-def test_a_log_keeps_detours_and_whose_they_are_to_the_bit(obey, noise, undrawn):
+def test_a_log_keeps_excess_paths_and_whose_they_are_to_the_bit(obey, noise, undrawn):
     told = ("--filter.noise", noise, "--filter.gate", "0.99")
     words = ("--callers", CHORUS, "--listening.timing", "true", "--strategy", "fused")
     obey("run", *SHORT, *words, *told, "--save-log", "log", "-o", "one")
@@ -75,20 +75,20 @@ def test_a_log_keeps_detours_and_whose_they_are_to_the_bit(obey, noise, undrawn)
     assert {*solved.measurements["caller"].drop_nulls()} == {"beacon", "caller2", "boat"}
 
 
-def test_slam_listens_for_detours_where_there_are_some_unless_told_otherwise(obey, undrawn):
+def test_slam_listens_for_excess_paths_where_there_are_some_unless_told_otherwise(obey, undrawn):
     words = ("--listening.timing", "true", "--strategy", "fused")
     obey("run", *SHORT, *words, "--save-log", "log", "-o", "one")
     for more, timing in (((), True), (("--listening.timing", "false"), False)):
         obey("slam", "log", *more, "--quiet", "-o", "two", "--overwrite")
         heard = pl.read_parquet("two/measurements.parquet")
-        assert (heard["detour_m"].null_count() < heard.height) == timing
+        assert (heard["excess_path_m"].null_count() < heard.height) == timing
         config = tomllib.loads(Path("two/config.toml").read_text())
         assert config["listening"]["timing"] is timing
     obey("slam", str(DATA / "unicycle_log"), "--quiet", "-o", "two", "--overwrite")
     assert tomllib.loads(Path("two/config.toml").read_text())["listening"]["timing"] is False
 
 
-def test_a_caller_that_moves_is_followed_in_a_log_without_a_detour(obey, undrawn):
+def test_a_caller_that_moves_is_followed_in_a_log_without_an_excess_path(obey, undrawn):
     ahead = "[{waypoints = [[5, -6], [5, -5]]}]"
     words = ("--callers", ahead, "--listening.timing", "true", "--strategy", "active")
     obey("run", *SHORT, *words, "--filter.gate", "0.99", "--save-log", "log", "-o", "one")
@@ -323,26 +323,36 @@ def test_ranges_in_millimetres_are_asked_about(obey, log, undrawn):
     assert "ranges are not within range_bounds (0.5 to 20 m); are ranges in metres?\n" in said
 
 
-DETOURS = ("--callers", CHORUS, "--listening.timing", "true", "--strategy", "fused")
+EXCESS_PATHS = ("--callers", CHORUS, "--listening.timing", "true", "--strategy", "fused")
 
 
 @pytest.mark.parametrize(
     ("factor", "said"),
     [
-        (1.0 / 343.0, r"(\d+) of \1 detours are below 0.2 m; are detours in metres\?\n"),
-        (1000.0, r"detours are more than twice the far end of range_bounds \(0.5 to 20 m\)"),
+        (1.0 / 343.0, r"(\d+) of \1 excess paths are below 0.2 m; are excess paths in metres\?\n"),
+        (1000.0, r"excess paths are more than twice the far end of range_bounds \(0.5 to 20 m\)"),
     ],
 )
-def test_detours_in_seconds_or_millimetres_are_asked_about(obey, factor, said, undrawn):
-    obey("run", *SHORT, *DETOURS, "--save-log", "log", "-o", "one")
-    column = Path("log/measurements.csv").read_text().splitlines()[0].split(",").index("detour")
+def test_excess_paths_in_seconds_or_millimetres_are_asked_about(obey, factor, said, undrawn):
+    obey("run", *SHORT, *EXCESS_PATHS, "--save-log", "log", "-o", "one")
+    column = (
+        Path("log/measurements.csv").read_text().splitlines()[0].split(",").index("excess_path")
+    )
     assert "metres" not in obey("slam", "log", "-o", "two", "--quiet")[2]
     scaled(Path("log"), column, factor)
     assert re.search(said, obey("slam", "log", "-o", "three", "--quiet")[2])
 
 
+def test_a_former_name_of_excess_paths_is_told_in_a_line(obey, undrawn):
+    obey("run", *SHORT, *EXCESS_PATHS, "--save-log", "log", "-o", "one")
+    table = Path("log/measurements.csv")
+    table.write_text(table.read_text().replace("excess_path", "detour"))
+    words = "slam", "log", "-o", "two", "--quiet"
+    assert "log: detour is read as excess_path, as it is called now\n" in obey(*words)[2]
+
+
 def test_a_caller_that_no_row_measures_is_named_unless_its_place_is(obey, undrawn):
-    obey("run", *SHORT, *DETOURS, "--save-log", "log", "-o", "one")
+    obey("run", *SHORT, *EXCESS_PATHS, "--save-log", "log", "-o", "one")
     path = Path("log/log.toml")
     wrong = path.read_text().replace("landmark = 12", "landmark = 99")
     for place, said in (
@@ -354,8 +364,10 @@ def test_a_caller_that_no_row_measures_is_named_unless_its_place_is(obey, undraw
         assert (said in told) if said else "no row measures" not in told
 
 
-def test_a_caller_that_no_row_measures_is_not_missed_where_there_is_no_detour(obey, undrawn):
-    obey("run", *SHORT, *DETOURS[:-2], "--strategy", "active", "--save-log", "log", "-o", "one")
+def test_a_caller_that_no_row_measures_is_not_missed_where_there_is_no_excess_path(obey, undrawn):
+    obey(
+        "run", *SHORT, *EXCESS_PATHS[:-2], "--strategy", "active", "--save-log", "log", "-o", "one"
+    )
     assert 'name = "boat"' in Path("log/log.toml").read_text()
     assert obey("slam", "log", "-o", "two", "--quiet")[2] == ""
 

@@ -37,8 +37,8 @@ the paper's worlds have the variances that are told; another's echoes come at al
 more."""
 RANGE_FLOOR = 0.01
 """Error [m] of a range that no level removes, likewise."""
-DETOUR_FLOOR = 0.006
-"""Error [m] of a detour that no level removes, likewise."""
+EXCESS_PATH_FLOOR = 0.006
+"""Error [m] of an excess path that no level removes, likewise."""
 
 
 def loudest_noise(elements: int) -> float:

@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.detection.certainty import BEARING_FLOOR, DETOUR_FLOOR, RANGE_FLOOR
+from pipistrelle.detection.certainty import BEARING_FLOOR, EXCESS_PATH_FLOOR, RANGE_FLOOR
 from pipistrelle.detection.direct import DirectCalls
 from pipistrelle.detection.scans import (
     BEARING,
     BEARING_STD,
-    DETOUR,
-    DETOUR_STD,
+    EXCESS_PATH,
+    EXCESS_PATH_STD,
     LEVEL,
     NO_CALLERS,
     NUMBERS,
@@ -57,7 +57,7 @@ def average_faces(
 
     Bearings are averaged as directions, ``plain`` or ``weighted`` by the inverse variance at the
     array's angle, :math:`\cos^2\theta`. The range, of the vehicle's own call alone, is c/2 times
-    the mean delay; the detour, of another's, c times what the mean delay has over that of its
+    the mean delay; the excess path, of another's, c times what the mean delay has over that of its
     direct call. What comes while the direct call still lasts has none: it was heard with it. The
     standard deviations are what the signal tells, and what no level removes:
 
@@ -189,8 +189,9 @@ def _average(
                     numbers[RANGE_STD, row] = math.hypot(metres * spread, RANGE_FLOOR)
                 else:
                     apart, spread = _after(direct, p, delay, spread)
-                    numbers[DETOUR, row] = speed_of_sound * apart
-                    numbers[DETOUR_STD, row] = math.hypot(speed_of_sound * spread, DETOUR_FLOOR)
+                    apart, spread = speed_of_sound * apart, speed_of_sound * spread
+                    numbers[EXCESS_PATH, row] = apart
+                    numbers[EXCESS_PATH_STD, row] = math.hypot(spread, EXCESS_PATH_FLOOR)
                 numbers[LEVEL, row] = 10.0 * math.log10(loudest)
                 row += 1
     return landmark[:row], caller[:row], numbers[:, :row].copy()

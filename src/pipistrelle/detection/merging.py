@@ -14,8 +14,8 @@ from pipistrelle.config import InputError, Strategy
 from pipistrelle.detection.scans import (
     BEARING,
     BEARING_STD,
-    DETOUR,
-    DETOUR_STD,
+    EXCESS_PATH,
+    EXCESS_PATH_STD,
     LEVEL,
     NUMBERS,
     OWN,
@@ -69,8 +69,8 @@ def labelled(scan: Scan, label: Int[np.ndarray, " m"]) -> Scan:
               \bar\sigma^{-2} = \sum_i \sigma_i^{-2} ,
 
     and else the plain mean, of which nobody says how sure it is. The rest is the first that there
-    is among them, but that each detour stays: those after the first are rows without a bearing, at
-    the end.
+    is among them, but that each excess path stays: those after the first are rows without a
+    bearing, at the end.
 
     The log itself is returned where nothing is to be done.
 
@@ -129,20 +129,20 @@ def _fuse(
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"], Float[np.ndarray, "7 k"]]:
     """Select the rows of some callers and merge those of each landmark into one.
 
-    Rows without a label stay as they are, or are left out. Detours after a landmark's first are
-    rows of their own, at the end.
+    Rows without a label stay as they are, or are left out. Excess paths after a landmark's first
+    are rows of their own, at the end.
     """
     most = label.size
     landmark, caller = np.empty(most, np.int64), np.empty(most, np.int64)
     numbers, merged = np.full((NUMBERS, most), np.nan), np.zeros(most, np.int64)
     turn, weighted, weight = np.zeros(most), np.zeros(most), np.zeros(most)
     bearing, std, count = given[BEARING], given[BEARING_STD], 0
-    further, detours = np.empty(most, np.int64), 0
+    further, excess_paths = np.empty(most, np.int64), 0
     for m in range(most):
         if not (own if whose[m] == OWN else others) or (labels_only and label[m] == UNLABELLED):
             continue
         if math.isnan(bearing[m]):
-            further[detours], detours = m, detours + 1
+            further[excess_paths], excess_paths = m, excess_paths + 1
             continue
         k = count
         while k > 0 and label[m] != UNLABELLED and landmark[k - 1] != label[m]:
@@ -152,11 +152,11 @@ def _fuse(
         else:
             k, count = count, count + 1
             landmark[k], caller[k] = label[m], whose[m]
-        if not math.isnan(given[DETOUR, m]):
-            if math.isnan(numbers[DETOUR, k]):
+        if not math.isnan(given[EXCESS_PATH, m]):
+            if math.isnan(numbers[EXCESS_PATH, k]):
                 caller[k] = whose[m]
             else:
-                further[detours], detours = m, detours + 1
+                further[excess_paths], excess_paths = m, excess_paths + 1
         _take(numbers, k, given, m)
         off = wrap_angle(bearing[m] - numbers[BEARING, k])  # from the first row's
         merged[k] += 1
@@ -164,9 +164,9 @@ def _fuse(
         weighted[k] += off / (std[m] * std[m])
         weight[k] += 1.0 / (std[m] * std[m])
     _average(numbers[:, :count], merged, turn, weighted, weight)
-    for m in further[:detours]:
+    for m in further[:excess_paths]:
         landmark[count], caller[count] = label[m], whose[m]
-        for number in (DETOUR, DETOUR_STD, LEVEL):
+        for number in (EXCESS_PATH, EXCESS_PATH_STD, LEVEL):
             numbers[number, count] = given[number, m]
         count += 1
     return landmark[:count], caller[:count], numbers[:, :count].copy()
@@ -200,7 +200,7 @@ def _take(
     numbers: Float[np.ndarray, "7 k"], k: Whole, given: Float[np.ndarray, "7 m"], m: Whole
 ) -> None:
     """Fill the missing numbers of a landmark's row from another row; keep the higher level."""
-    for number in (BEARING, RANGE, DETOUR):
+    for number in (BEARING, RANGE, EXCESS_PATH):
         if math.isnan(numbers[number, k]):
             spread = number + BEARING_STD
             numbers[number, k], numbers[spread, k] = given[number, m], given[spread, m]

@@ -13,11 +13,11 @@ from jaxtyping import Float
 from pipistrelle.config import FilterConfig
 from pipistrelle.detection.scans import (
     BEARING_STD,
-    DETOUR_STD,
+    EXCESS_PATH_STD,
     RANGE_STD,
     Scan,
     with_columns,
-    without_detours,
+    without_excess_paths,
 )
 from pipistrelle.jit import kernel
 
@@ -33,25 +33,25 @@ class ConstantNoise:
     --------
     >>> from pipistrelle.detection.scans import make_scan
     >>> scan = make_scan(0.5, np.array([3, 8]), np.zeros(2), bearing_std=np.array([0.02, np.nan]))
-    >>> ConstantNoise(range_std=0.2, bearing_std=0.15, detour_std=0.4)(scan).bearing_std
+    >>> ConstantNoise(range_std=0.2, bearing_std=0.15, excess_path_std=0.4)(scan).bearing_std
     array([0.02, 0.15])
     """
 
     range_std: float
     bearing_std: float
-    detour_std: float
-    """`range_std`, `bearing_std` and `detour_std` [m], [rad], [m]."""
+    excess_path_std: float
+    """`range_std`, `bearing_std` and `excess_path_std` [m], [rad], [m]."""
 
     def __call__(self, scan: Scan) -> Scan:
         """Give rows the standard deviations that they do not have."""
-        stds = self.bearing_std, self.range_std, self.detour_std
+        stds = self.bearing_std, self.range_std, self.excess_path_std
         numbers = _filled(np.ascontiguousarray(scan.numbers), *stds)
         return replace(scan, numbers=numbers)
 
 
 @kernel
 def _filled(
-    numbers: Float[np.ndarray, "7 m"], bearing_std: float, range_std: float, detour_std: float
+    numbers: Float[np.ndarray, "7 m"], bearing_std: float, range_std: float, excess_path_std: float
 ) -> Float[np.ndarray, "7 m"]:
     """Copy numbers, with constants in place of missing standard deviations."""
     filled = numbers.copy()
@@ -60,8 +60,8 @@ def _filled(
             filled[BEARING_STD, m] = bearing_std
         if math.isnan(filled[RANGE_STD, m]):
             filled[RANGE_STD, m] = range_std
-        if math.isnan(filled[DETOUR_STD, m]):
-            filled[DETOUR_STD, m] = detour_std
+        if math.isnan(filled[EXCESS_PATH_STD, m]):
+            filled[EXCESS_PATH_STD, m] = excess_path_std
     return filled
 
 
@@ -72,7 +72,7 @@ def unstated(scan: Scan) -> Scan:
     >>> unstated(make_scan(0.5, np.array([3]), np.zeros(1), bearing_std=0.1)).bearing_std
     array([nan])
     """
-    return with_columns(scan, bearing_std=math.nan, range_std=math.nan, detour_std=math.nan)
+    return with_columns(scan, bearing_std=math.nan, range_std=math.nan, excess_path_std=math.nan)
 
 
 def as_told(scan: Scan, settings: FilterConfig, *, timing: bool) -> Scan:
@@ -90,7 +90,7 @@ def as_told(scan: Scan, settings: FilterConfig, *, timing: bool) -> Scan:
     -------
     Scan
     """
-    known = scan if timing else without_detours(scan)
+    known = scan if timing else without_excess_paths(scan)
     return unstated(known) if settings.noise == "constant" else known
 
 
@@ -113,5 +113,5 @@ def noise_of(settings: FilterConfig) -> Noise:
     return ConstantNoise(
         range_std=settings.range_std,
         bearing_std=settings.bearing_std,
-        detour_std=settings.detour_std,
+        excess_path_std=settings.excess_path_std,
     )

@@ -21,15 +21,15 @@ COLUMNS = (
     "caller",
     "bearing",
     "range",
-    "detour",
+    "excess_path",
     "bearing_std",
     "range_std",
-    "detour_std",
+    "excess_path_std",
     "level_db",
 )
 """Names of a scan's columns."""
 NUMBERS = len(COLUMNS) - 2
-BEARING, RANGE, DETOUR, BEARING_STD, RANGE_STD, DETOUR_STD, LEVEL = range(NUMBERS)
+BEARING, RANGE, EXCESS_PATH, BEARING_STD, RANGE_STD, EXCESS_PATH_STD, LEVEL = range(NUMBERS)
 """Where each stands among the numbers: label and caller stand apart."""
 
 
@@ -46,7 +46,7 @@ class Scan:
     landmark: Int[np.ndarray, " m"]
     """Recorded label; UNLABELLED where none was recorded."""
     caller: Int[np.ndarray, " m"]
-    """OWN, or the number of another caller. Of several calls, the first with a detour, else the
+    """OWN, or the number of another caller. Of several, the first with an excess path, else the
     first."""
     numbers: Float[np.ndarray, "7 m"]
     """The other columns, in the order of `COLUMNS`."""
@@ -58,7 +58,7 @@ class Scan:
 
     @property
     def bearing(self) -> Float[np.ndarray, " m"]:
-        """Relative to the heading, counter-clockwise [rad]; NaN where a row is but a detour."""
+        """From the heading, counter-clockwise [rad]; NaN where a row is only an excess path."""
         return self.numbers[BEARING]
 
     @property
@@ -67,9 +67,9 @@ class Scan:
         return self.numbers[RANGE]
 
     @property
-    def detour(self) -> Float[np.ndarray, " m"]:
+    def excess_path(self) -> Float[np.ndarray, " m"]:
         """How much longer than the direct way that over the landmark is [m], or NaN."""
-        return self.numbers[DETOUR]
+        return self.numbers[EXCESS_PATH]
 
     @property
     def bearing_std(self) -> Float[np.ndarray, " m"]:
@@ -82,9 +82,9 @@ class Scan:
         return self.numbers[RANGE_STD]
 
     @property
-    def detour_std(self) -> Float[np.ndarray, " m"]:
-        """Standard deviation of the detour [m]; NaN where nobody says yet."""
-        return self.numbers[DETOUR_STD]
+    def excess_path_std(self) -> Float[np.ndarray, " m"]:
+        """Standard deviation of the excess path [m]; NaN where nobody says yet."""
+        return self.numbers[EXCESS_PATH_STD]
 
     @property
     def level_db(self) -> Float[np.ndarray, " m"]:
@@ -201,18 +201,18 @@ def rows_of(scan: Scan, rows: Bool[np.ndarray, " m"] | Int[np.ndarray, " k"]) ->
     )
 
 
-def without_detours(scan: Scan) -> Scan:
-    """Return a scan without detours and without rows that hold nothing else.
+def without_excess_paths(scan: Scan) -> Scan:
+    """Return a scan without excess paths and without rows that hold nothing else.
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> rows = np.array([8, 8]), np.array([0.4, np.nan])
-    >>> scan = make_scan(0.0, *rows, caller=np.array([1, 2]), detour=np.array([3.0, 5.0]))
-    >>> without_detours(scan).landmark, without_detours(scan).detour
+    >>> scan = make_scan(0.0, *rows, caller=np.array([1, 2]), excess_path=np.array([3.0, 5.0]))
+    >>> without_excess_paths(scan).landmark, without_excess_paths(scan).excess_path
     (array([8]), array([nan]))
     """
     if scan.callers.size:
         scan = replace(scan, callers=NO_CALLERS)
-    if np.isnan(scan.detour).all() and np.isnan(scan.detour_std).all():
+    if np.isnan(scan.excess_path).all() and np.isnan(scan.excess_path_std).all():
         return scan
     bearings = rows_of(scan, ~np.isnan(scan.bearing))
-    return with_columns(bearings, detour=math.nan, detour_std=math.nan)
+    return with_columns(bearings, excess_path=math.nan, excess_path_std=math.nan)

@@ -17,8 +17,8 @@ from pipistrelle.detection.merging import labelled, settled
 from pipistrelle.detection.scans import (
     BEARING,
     BEARING_STD,
-    DETOUR,
-    DETOUR_STD,
+    EXCESS_PATH,
+    EXCESS_PATH_STD,
     NUMBERS,
     RANGE,
     RANGE_STD,
@@ -62,9 +62,10 @@ WORDS = {
     TWICE: "two bearings by one call for the landmarks {}; expected one",
     NO_NUMBER: "numbers that no filter can use, for the landmarks {}; expected finite bearings "
     f"[rad] and ranges above 0 [m], NaN where passive, up to {FARTHEST:g}; a row without a bearing "
-    "has a detour [m] alone",
+    "has an excess path [m] alone",
     UNSTATED: "no standard deviations above 0 for the landmarks {}; expected "
-    f"bearing_std up to {WIDEST:g} rad, and range_std and detour_std up to {FARTHEST:g} m where "
+    f"bearing_std up to {WIDEST:g} rad, and range_std and excess_path_std up to {FARTHEST:g} m "
+    "where "
     "there are such, as pipistrelle.detection.noise states them",
 }
 """What is wrong with rows of a scan; their labels replace {}."""
@@ -180,7 +181,7 @@ def usable_scan(scan: Scan) -> Scan:
 
     Rows of a landmark that several callers lit up are merged (`detection.merging.labelled`). It
     refuses arrays that do not fit, bad labels, two bearings of a landmark by one call, rows that
-    are neither bearing nor detour, and rows without standard deviations.
+    are neither bearing nor excess path, and rows without standard deviations.
     """
     if not isinstance(scan, Scan):
         raise InputError(
@@ -304,17 +305,22 @@ def _fault_of_row(
         return NO_LABEL
     if caller[m] < 0:
         return NO_CALLER
-    bearing, distance, detour = numbers[BEARING, m], numbers[RANGE, m], numbers[DETOUR, m]
+    bearing, distance, excess_path = numbers[BEARING, m], numbers[RANGE, m], numbers[EXCESS_PATH, m]
     silent = math.isnan(bearing)
-    if silent and (math.isnan(detour) or not math.isnan(distance)):
+    if silent and (math.isnan(excess_path) or not math.isnan(distance)):
         return NO_NUMBER
-    if abs(bearing) > LARGEST or distance <= 0.0 or distance > FARTHEST or abs(detour) > FARTHEST:
+    if (
+        abs(bearing) > LARGEST
+        or distance <= 0.0
+        or distance > FARTHEST
+        or abs(excess_path) > FARTHEST
+    ):
         return NO_NUMBER
     if not (silent or MIN_STD <= numbers[BEARING_STD, m] <= WIDEST):
         return UNSTATED
     if not (math.isnan(distance) or MIN_STD <= numbers[RANGE_STD, m] <= FARTHEST):
         return UNSTATED
-    if not (math.isnan(detour) or MIN_STD <= numbers[DETOUR_STD, m] <= FARTHEST):
+    if not (math.isnan(excess_path) or MIN_STD <= numbers[EXCESS_PATH_STD, m] <= FARTHEST):
         return UNSTATED
     for other in range(0 if silent or landmark[m] == UNLABELLED else m):
         again = landmark[other] == landmark[m] and caller[other] == caller[m]

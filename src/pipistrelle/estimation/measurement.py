@@ -1,7 +1,7 @@
-"""The measurement model with its Jacobians: range, bearing and detour of a point.
+"""The measurement model with its Jacobians: range, bearing and excess path of a point.
 
-`Measurements` and `Detours` are the rows of a scan as the filters' kernels take them. A filter that
-weighs what else a scan may hold (its levels) adds a field here.
+`Measurements` and `ExcessPaths` are the rows of a scan as the filters' kernels take them. A filter
+that weighs what else a scan may hold (its levels) adds a field here.
 """
 
 import math
@@ -13,8 +13,8 @@ from jaxtyping import Float, Int
 from pipistrelle.detection.scans import (
     BEARING,
     BEARING_STD,
-    DETOUR,
-    DETOUR_STD,
+    EXCESS_PATH,
+    EXCESS_PATH_STD,
     RANGE,
     RANGE_STD,
     UNLABELLED,
@@ -26,7 +26,7 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 NEAREST = 1e-3
 """Points nearer than this [m] are too near to linearise a measurement."""
 MIN_TDOA_SIGMAS = 3.0
-"""A detour places something only if it is above this many of its standard deviations: that of a
+"""An excess path places something only if it is above so many of its standard deviations: that of a
 point between vehicle and caller is 0, and an error would place the point near one of them,
 seemingly surely."""
 HUBER_K = 2.0
@@ -43,12 +43,12 @@ class Measurements(NamedTuple):
     range_variance: Float[np.ndarray, " m"]  # [m^2]
 
 
-class Detours(NamedTuple):
-    """The rows of a scan that have a detour and a caller with a known label."""
+class ExcessPaths(NamedTuple):
+    """The rows of a scan that have an excess path and a caller with a known label."""
 
     landmark: Int[np.ndarray, " d"]  # no landmark is its own caller
     caller: Int[np.ndarray, " d"]
-    detour: Float[np.ndarray, " d"]  # [m]
+    excess_path: Float[np.ndarray, " d"]  # [m]
     variance: Float[np.ndarray, " d"]  # [m^2]
     row: Int[np.ndarray, " d"]  # index in the scan
 
@@ -67,7 +67,7 @@ def columns_of(scan: Scan) -> Columns:
 def timings_of(scan: Scan) -> Timings | None:
     """Return caller columns of a scan as kernels take them; None where it names no caller.
 
-    A kernel that gets None is compiled without its code for detours.
+    A kernel that gets None is compiled without its code for excess paths.
     """
     if scan.callers.size == 0 and scan.moving.size == 0:
         return None
@@ -78,7 +78,7 @@ def timings_of(scan: Scan) -> Timings | None:
 def measurements(columns: Columns) -> Measurements:
     """Return the bearings and ranges of a scan, with variances.
 
-    Rows of a detour without a bearing stand at the end and are left out.
+    Rows of an excess path without a bearing stand at the end and are left out.
     """
     landmark, numbers = columns
     rows = landmark.size
@@ -95,30 +95,30 @@ def measurements(columns: Columns) -> Measurements:
 
 
 @kernel
-def detours(columns: Columns, timings: Timings) -> Detours:
-    """Return the detours of a scan. A caller's own row is no detour over itself.
+def excess_paths(columns: Columns, timings: Timings) -> ExcessPaths:
+    """Return the excess paths of a scan. A caller's own row is no excess path over itself.
 
     >>> from dataclasses import replace
     >>> from pipistrelle.detection.scans import make_scan
-    >>> timed = {"detour": np.array([3.0, np.nan, 2.0]), "detour_std": 0.5}
+    >>> timed = {"excess_path": np.array([3.0, np.nan, 2.0]), "excess_path_std": 0.5}
     >>> scan = make_scan(0.0, np.array([4, 5, 9]), np.zeros(3), caller=1, **timed)
     >>> scan = replace(scan, callers=np.array([-1, 9]))
-    >>> of = detours(columns_of(scan), timings_of(scan))
+    >>> of = excess_paths(columns_of(scan), timings_of(scan))
     >>> of.landmark, of.caller, of.variance
     (array([4]), array([9]), array([0.25]))
     """
     (landmark, numbers), (caller, callers, _) = columns, timings
     count, rows, whose = 0, np.empty(landmark.size, np.int64), np.empty(landmark.size, np.int64)
     for m in range(landmark.size):
-        if math.isnan(numbers[DETOUR, m]) or caller[m] >= callers.size:
+        if math.isnan(numbers[EXCESS_PATH, m]) or caller[m] >= callers.size:
             continue
         label = callers[caller[m]]
         if label != UNLABELLED and label != landmark[m]:
             rows[count], whose[count] = m, label
             count += 1
     kept = rows[:count]
-    std = numbers[DETOUR_STD][kept]
-    return Detours(landmark[kept], whose[:count], numbers[DETOUR][kept], std * std, kept)
+    std = numbers[EXCESS_PATH_STD][kept]
+    return ExcessPaths(landmark[kept], whose[:count], numbers[EXCESS_PATH][kept], std * std, kept)
 
 
 class Row(NamedTuple):
@@ -201,13 +201,13 @@ def measurement_jacobians(
 
 
 @kernel
-def detour_slopes(
+def excess_path_slopes(
     x: float, y: float, px: float, py: float, bx: float, by: float
 ) -> tuple[float, float, float, float, float]:
-    """Detour over a point and its slopes, for kernels.
+    """Excess path over a point and its slopes, for kernels.
 
-    The vehicle is at (x, y), the point at (px, py) and the caller at (bx, by). Returns the detour
-    [m], its derivatives by the point (2) and by the caller (2); those by the vehicle are minus
+    The vehicle is at (x, y), the point at (px, py) and the caller at (bx, by). Returns the excess
+    path [m], its derivatives by the point (2) and by the caller (2); those by the vehicle are minus
     their sum. Distances are bounded from below by `NEAREST`.
     """
     ux, uy, near = _away(x, y, px, py)
@@ -226,75 +226,82 @@ def _away(x: float, y: float, px: float, py: float) -> tuple[float, float, float
 
 
 @kernel
-def range_by_detour(detour: float, dx: float, dy: float, c: float, s: float) -> float:
+def range_by_excess_path(excess_path: float, dx: float, dy: float, c: float, s: float) -> float:
     """Range of a point in the direction (c, s) of the vehicle, the caller being (dx, dy) from it.
 
-    It is infinite or negative where no point there has such a detour; see `landmark_range`.
+    It is infinite or negative where no point there has such an excess path; see `landmark_range`.
     """
-    if detour <= 0.0:
+    if excess_path <= 0.0:
         return math.inf
     straight = math.sqrt(dx * dx + dy * dy)
-    return 0.5 * detour * (2.0 * straight + detour) / (straight + detour - c * dx - s * dy)
+    return (
+        0.5
+        * excess_path
+        * (2.0 * straight + excess_path)
+        / (straight + excess_path - c * dx - s * dy)
+    )
 
 
 @kernel
-def caller_range_by_detour(detour: float, dx: float, dy: float, c: float, s: float) -> float:
+def caller_range_by_excess_path(
+    excess_path: float, dx: float, dy: float, c: float, s: float
+) -> float:
     """Range of a caller in the direction (c, s) of the vehicle, the point being (dx, dy) from it.
 
-    It is infinite or negative where no caller there makes such a detour.
+    It is infinite or negative where no caller there makes such an excess path.
     """
-    if detour <= 0.0:
+    if excess_path <= 0.0:
         return math.inf
     near = math.sqrt(dx * dx + dy * dy)
-    return 0.5 * detour * (2.0 * near - detour) / (c * dx + s * dy + detour - near)
+    return 0.5 * excess_path * (2.0 * near - excess_path) / (c * dx + s * dy + excess_path - near)
 
 
-def detour_of(
+def excess_path_of(
     vehicle: Float[np.ndarray, "2"], point: Float[np.ndarray, "2"], caller: Float[np.ndarray, "2"]
 ) -> float:
     """How much longer the path of a caller's sound over a point is than the straight one [m].
 
     .. math:: e = |b - l| + |l - p| - |b - p|
 
-    Points of one detour lie on an ellipse whose foci are the caller b and the vehicle p; all are x,
-    y [m].
+    Points of one excess path lie on an ellipse whose foci are the caller b and the vehicle p; all
+    are x, y [m].
 
     Examples
     --------
-    >>> detour_of(np.zeros(2), np.array([3.0, 4.0]), np.array([6.0, 0.0]))
+    >>> excess_path_of(np.zeros(2), np.array([3.0, 4.0]), np.array([6.0, 0.0]))
     4.0
     """
-    return detour_slopes(*vehicle, *point, *caller)[0]
+    return excess_path_slopes(*vehicle, *point, *caller)[0]
 
 
-def detour_jacobians(
+def excess_path_jacobians(
     vehicle: Float[np.ndarray, "2"], point: Float[np.ndarray, "2"], caller: Float[np.ndarray, "2"]
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    r"""Derivatives of the detour by the vehicle's position, the point's and the caller's, (2) each.
+    r"""Derivatives of the excess path by the places of vehicle, point and caller, (2) each.
 
     .. math:: e_l = w + u, \quad e_b = -w - v, \quad e_p = v - u
 
     with the unit vectors u and w to the point from the vehicle and from the caller, and v from the
     vehicle to the caller.
     """
-    _, *slopes = detour_slopes(*vehicle, *point, *caller)
+    _, *slopes = excess_path_slopes(*vehicle, *point, *caller)
     by_point, by_caller = np.array(slopes[:2]), np.array(slopes[2:])
     return -by_point - by_caller, by_point, by_caller
 
 
-def landmark_range(detour: float, caller: Float[np.ndarray, "2"], bearing: float) -> float:
-    r"""Range of a point by its bearing and its detour over a known caller.
+def landmark_range(excess_path: float, caller: Float[np.ndarray, "2"], bearing: float) -> float:
+    r"""Range of a point by its bearing and its excess path over a known caller.
 
     .. math:: r = \frac{(d + e)^2 - d^2}{2 (d + e - u \cdot v)}
 
     with v the vector from the vehicle to the caller, d its length and u the direction of the
-    bearing: where the ray from the vehicle crosses the ellipse of that detour. Between vehicle and
-    caller numerator and denominator vanish together: there a detour says nothing about the range. A
-    detour of 0 or less gives no range.
+    bearing: where the ray from the vehicle crosses the ellipse of that excess path. Between vehicle
+    and caller numerator and denominator vanish together: there an excess path says nothing about
+    the range. An excess path of 0 or less gives no range.
 
     Parameters
     ----------
-    detour : [m]
+    excess path : [m]
     caller : (2) [m]
         From the vehicle, in its axes.
     bearing : [rad]
@@ -309,4 +316,4 @@ def landmark_range(detour: float, caller: Float[np.ndarray, "2"], bearing: float
     5.0
     """
     dx, dy = caller
-    return range_by_detour(detour, dx, dy, math.cos(bearing), math.sin(bearing))
+    return range_by_excess_path(excess_path, dx, dy, math.cos(bearing), math.sin(bearing))

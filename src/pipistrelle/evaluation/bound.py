@@ -22,7 +22,7 @@ from jaxtyping import Float, Int
 from pipistrelle.detection.scans import (
     BEARING,
     BEARING_STD,
-    DETOUR_STD,
+    EXCESS_PATH_STD,
     NUMBERS,
     RANGE,
     RANGE_STD,
@@ -39,11 +39,11 @@ from pipistrelle.estimation.ekf.gaussian import (
     flush,
     joint_of,
 )
-from pipistrelle.estimation.ekf.tdoa import correct_covariance_by_detour
+from pipistrelle.estimation.ekf.tdoa import correct_covariance_by_excess_path
 from pipistrelle.estimation.measurement import (
     NEAREST,
     columns_of,
-    detours,
+    excess_paths,
     observe,
     timings_of,
 )
@@ -96,13 +96,13 @@ def pose_bound(
     with J a quarter turn and :math:`\delta\theta` the error of the heading.
 
     `controls`: as the motion model has them; `time` [s]; `path` [m, m, rad]: true poses, the start
-    first; `landmarks` [m]; `scans`: who was heard when, with a range or a detour or without, and
-    how surely: of the measurements the standard deviations alone count. Rows of other labels are
-    left out; `routes` [m]: true places of the callers that move; `wander` [m/s]: what is known of
-    their velocities: the standard deviation of each along an axis at the start, and that of how far
-    it strays in a second. Returns [m, rad, squared]: no estimator that is without bias along this
-    path has less. Zero at the start. One that knows what paths are like may be biased along each
-    and have less in the mean: a mean of such bounds over worlds is a measure to hold errors
+    first; `landmarks` [m]; `scans`: who was heard when, with a range or an excess path or without,
+    and how surely: of the measurements the standard deviations alone count. Rows of other labels
+    are left out; `routes` [m]: true places of the callers that move; `wander` [m/s]: what is known
+    of their velocities: the standard deviation of each along an axis at the start, and that of how
+    far it strays in a second. Returns [m, rad, squared]: no estimator that is without bias along
+    this path has less. Zero at the start. One that knows what paths are like may be biased along
+    each and have less in the mean: a mean of such bounds over worlds is a measure to hold errors
     against, no bound of their mean.
 
     Source: Tichavsky, Muravchik & Nehorai, IEEE Transactions on Signal Processing 46, 1998.
@@ -170,10 +170,10 @@ def _slots(slot: Mapping[int, int], label: Int[np.ndarray, " m"]) -> Int[np.ndar
 
 
 def _whose(scan: Scan) -> Int[np.ndarray, " m"]:
-    """Label of the caller of each row's detour; UNLABELLED for a row without one."""
+    """Label of the caller of each row's excess path; UNLABELLED for a row without one."""
     who, timings = np.full(len(scan.landmark), UNLABELLED), timings_of(scan)
     if timings is not None:
-        heard = detours(columns_of(scan), timings)
+        heard = excess_paths(columns_of(scan), timings)
         who[heard.row] = heard.caller
     return who
 
@@ -261,14 +261,14 @@ def _hear(
     m: Whole,
     timed: _Timed | None,
 ) -> Whole:
-    """Correct with measurement m of a place, and its detour; returns the size of the state."""
+    """Correct with measurement m of a place, and its excess path; returns the size of the state."""
     size = _grown(joint, size, slot)
     if timed is not None:
         size = _grown(joint, size, timed[0][m])
     _correct(joint, size, 3 + 2 * slot, numbers, m)
     if timed is not None and timed[0][m] != UNLABELLED:
-        i, ib, variance = 3 + 2 * slot, 3 + 2 * timed[0][m], numbers[DETOUR_STD, m] ** 2
-        correct_covariance_by_detour(joint, size, i, ib, variance)
+        i, ib, variance = 3 + 2 * slot, 3 + 2 * timed[0][m], numbers[EXCESS_PATH_STD, m] ** 2
+        correct_covariance_by_excess_path(joint, size, i, ib, variance)
     return size
 
 

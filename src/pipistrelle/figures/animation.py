@@ -18,11 +18,11 @@ from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.experiments.drives import NO_TRUTH, LabelledPoints, Truth
 from pipistrelle.figures.closeup import Closeup, add_closeups
-from pipistrelle.figures.detours import (
+from pipistrelle.figures.excess_paths import (
     callers_at,
     callers_believed,
     callers_marked,
-    drawn_detours,
+    drawn_excess_paths,
     resolved,
 )
 from pipistrelle.figures.film import film_writer
@@ -70,9 +70,9 @@ def animate_mission(
     landmarks that are fully initialised in their 95 % ellipses, ringed when they have just become
     so. Particles, if there are any, are enlarged in a corner that follows the vehicle.
 
-    Where detours were heard, those of the landmark that they place, weigh or have placed last are
-    thin ellipses, two at most, about the vehicle and the caller, with the way of the sound and a
-    dark dot where they cross. Callers are then marked where they are believed to be, too, as they
+    Where excess paths were heard, those of the landmark that they place, weigh or have placed last
+    are thin ellipses, two at most, about the vehicle and the caller, with the way of the sound and
+    a dark dot where they cross. Callers are then marked where they are believed to be, too, as they
     are where there are several.
 
     `snapshots`: as a `MissionRecorder` keeps them. `path`: ends in .gif, or in .mp4, which needs
@@ -129,7 +129,9 @@ def _symbols(snapshots: Mapping[tuple[str, str], Sequence[Snapshot]]) -> list[st
         "ray, 1σ, darker: likelier": rays,
         "just pruned": rays,
         "placed landmark, 95 %": any(rows.any() for rows in full),
-        "detour ellipse and its way": any(set(resolved(seen)) - {UNLABELLED} for seen in recorded),
+        "excess-path ellipse and its way": any(
+            set(resolved(seen)) - {UNLABELLED} for seen in recorded
+        ),
         "caller as estimated": any(
             callers_marked([frame.scan for frame in seen])
             and any(np.isfinite(callers_at(frame).mean).any() for frame in seen)
@@ -274,7 +276,7 @@ class _Panel:
         self.members = areas(lw=0.8)
         self.pruned = areas(fc="none", ec=INK, lw=0.8, ls=":")
         self.true = points(color=TRUTH, lw=3.2, alpha=0.45)
-        self.detours = areas(fc="none", ec=INK, lw=0.9, alpha=0.7)
+        self.excess_paths = areas(fc="none", ec=INK, lw=0.9, alpha=0.7)
         self.ways = lines(colors=INK, lw=0.9, alpha=0.7)
         self.bearings = lines(colors=colour, lw=0.7, ls=(0, (4, 3)), alpha=0.6)
         self.ranges = lines(colors=colour, lw=1.4)
@@ -297,7 +299,7 @@ class _Panel:
         self._show_vehicle(frame.pose, time, now)
         self._show_scan(frame)
         self._show_map(frame.landmarks, picture)
-        self._show_detours(frame, self.resolved[now])
+        self._show_excess_paths(frame, self.resolved[now])
         self._show_moving(frame.moving, now)
         for artist in self.artists:
             self.axes.draw_artist(artist)
@@ -327,10 +329,10 @@ class _Panel:
         self.ranges.set_segments([np.stack([origin, end]) for end in tip[ranged]])
         self.bearings.set_segments([np.stack([origin, end]) for end in tip[~ranged]])
 
-    def _show_detours(self, frame: Snapshot, landmark: int) -> None:
-        """Show a landmark's detours, and where callers are believed to be."""
-        outlines, ways = drawn_detours(frame, landmark)
-        self.detours.set_verts(outlines)
+    def _show_excess_paths(self, frame: Snapshot, landmark: int) -> None:
+        """Show a landmark's excess paths, and where callers are believed to be."""
+        outlines, ways = drawn_excess_paths(frame, landmark)
+        self.excess_paths.set_verts(outlines)
         self.ways.set_segments(ways)
         self.spot.set_data(*np.reshape([way[1] for way in ways[:1]], (-1, 2)).T)
         if self.marked:

@@ -10,7 +10,7 @@ from pipistrelle.acoustics.callers import Caller, moves
 from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.estimation.catalogue import title_of
 from pipistrelle.experiments.drives import LabelledPoints, Truth
-from pipistrelle.figures.outlines import PLACED, RAY, beam, detour_ellipse, ellipses, vehicle
+from pipistrelle.figures.outlines import PLACED, RAY, beam, ellipses, excess_path_ellipse, vehicle
 from pipistrelle.figures.style import COLUMNS, INK, TRUTH, strategy_colour
 
 if TYPE_CHECKING:
@@ -234,7 +234,7 @@ def _symbols() -> dict[str, "Artist | tuple[Artist, ...]"]:
 
     dart, sector = Path(vehicle(np.zeros(3), 1.0)), Path(beam(np.array([-0.5, 0, 0]), 0.8, 1.0))
     member = Path(ellipses(np.zeros((1, 2)), np.array([[[1.0, 0.4], [0.4, 0.4]]]), RAY)[0])
-    oval = Path(detour_ellipse(np.array([-0.4, 0.0]), np.array([0.4, 0.0]), 0.2))
+    oval = Path(excess_path_ellipse(np.array([-0.4, 0.0]), np.array([0.4, 0.0]), 0.2))
     full, tie = mark("o", 7.5, "#33333330", INK), line(lw=0.7)
     return {
         "true path": line(TRUTH, lw=3.2, alpha=0.45),
@@ -248,7 +248,7 @@ def _symbols() -> dict[str, "Artist | tuple[Artist, ...]"]:
         "moving caller": line(lw=1.0, ls="-."),
         "caller as estimated": mark("*", 11.0, "none", INK),
         "its estimated track": line(lw=1.2, ls=":"),
-        "detour ellipse and its way": mark(oval, 16.0, "none", "#33333399"),
+        "excess-path ellipse and its way": mark(oval, 16.0, "none", "#33333399"),
         "vehicle at the end": mark(dart, 10.0, INK),
         "its beam": mark(sector, 14.0, "#33333338"),
         "particles": mark(dart, 10.0, "#33333350"),

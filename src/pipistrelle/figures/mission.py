@@ -13,10 +13,10 @@ from pipistrelle.evaluation.consistency import anees_bounds, track_nees
 from pipistrelle.experiments.drives import NO_TRUTH, LabelledPoints, Truth
 from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.figures.closeup import add_closeups
-from pipistrelle.figures.detours import (
+from pipistrelle.figures.excess_paths import (
     callers_believed,
     callers_marked,
-    drawn_detours,
+    drawn_excess_paths,
     resolved,
 )
 from pipistrelle.figures.maps import (
@@ -56,11 +56,11 @@ def draw_mission(
     A map shows the true and the estimated path, true landmarks (open circles) tied to their
     estimates (dots in their 95 % ellipses), the rays that are still unresolved (members at one
     standard deviation, the heavier the darker), who else calls, and the vehicle at the end with
-    its beam and, enlarged in a corner, its particles if it has any. Where detours were heard, those
-    of one landmark in the last scan are ellipses about the vehicle and who called. Below, position
-    and heading errors stand against three standard deviations of the filter's own (in position, of
-    the root of the trace) and the NEES against the 95 % band of one run. All panels share their
-    scales.
+    its beam and, enlarged in a corner, its particles if it has any. Where excess paths were heard,
+    those of one landmark in the last scan are ellipses about the vehicle and who called. Below,
+    position and heading errors stand against three standard deviations of the filter's own (in
+    position, of the root of the trace) and the NEES against the 95 % band of one run. All panels
+    share their scales.
 
     `trials`: in the frame of the truth; each strategy and filter once. Several of both make a
     column for each strategy and a row for each filter. `truth`: at the times of the tracks; without
@@ -126,7 +126,7 @@ def _symbols(
         **{name: name in shown for name in ("beacon", "caller", "moving caller")},
         "caller as estimated": any(len(_callers(t)) or t.track.callers for t in trials),
         "its estimated track": any(trial.track.callers for trial in trials),
-        "detour ellipse and its way": any(_detours(trial)[0] for trial in trials),
+        "excess-path ellipse and its way": any(_excess_paths(trial)[0] for trial in trials),
         "vehicle at the end": bool(ending),
         "its beam": beamwidth is not None and bool(calling),
         "particles": any(trial.track.cloud is not None for trial in ending),
@@ -207,7 +207,7 @@ def _draw_estimate(axes: "Axes", trial: TrialResult, true_landmarks: LabelledPoi
         x, y = callers.T
         axes.plot(x, y, "*", ms=12, mfc="none", mec=colour, mew=1.1, zorder=5.5)
     _draw_followed(axes, trial)
-    _draw_detours(axes, trial)
+    _draw_excess_paths(axes, trial)
     outline = ellipses(rows.mean[~full], rows.covariance[~full], RAY)
     weight = rows.weight[~full]
     style = {"fc": shades(colour, weight), "ec": shades(colour, weight, most=1.0), "lw": 0.8}
@@ -242,21 +242,21 @@ def _callers(trial: TrialResult) -> Float[np.ndarray, "c 2"]:
     return mean[np.isfinite(mean).all(axis=1)]
 
 
-def _draw_detours(axes: "Axes", trial: TrialResult) -> None:
-    """Draw the ellipses of a landmark's detours, and the ways of its sound."""
+def _draw_excess_paths(axes: "Axes", trial: TrialResult) -> None:
+    """Draw the ellipses of a landmark's excess paths, and the ways of its sound."""
     from matplotlib.collections import LineCollection, PolyCollection
 
-    outlines, ways = _detours(trial)
+    outlines, ways = _excess_paths(trial)
     if outlines:
         style = {"lw": 0.9, "alpha": 0.7, "zorder": 3.5}
         axes.add_collection(PolyCollection(outlines, fc="none", ec=INK, **style))
         axes.add_collection(LineCollection(ways, colors=INK, **style))
 
 
-def _detours(trial: TrialResult) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return ellipses and ways of a landmark's detours in the last scan, as the film has them."""
+def _excess_paths(trial: TrialResult) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return ellipses and ways of a landmark's excess paths in the last scan, as in the film."""
     track, scan = trial.track, trial.scans[-1] if trial.scans else None
-    if scan is None or not np.isfinite(scan.detour).any():
+    if scan is None or not np.isfinite(scan.excess_path).any():
         return [], []
     k = int(np.searchsorted(track.time, scan.time))
     seen = {n: one for n, one in track.callers.items() if np.isfinite(one.mean[k]).all()}
@@ -273,7 +273,7 @@ def _detours(trial: TrialResult) -> tuple[list[np.ndarray], list[np.ndarray]]:
         landmarks=track.landmarks,
         moving=moving,
     )
-    return drawn_detours(end, resolved([end])[0])
+    return drawn_excess_paths(end, resolved([end])[0])
 
 
 def _ties(trial: TrialResult, true_landmarks: LabelledPoints | None) -> list[np.ndarray]:

@@ -84,10 +84,10 @@ def vehicle(pose: Float[np.ndarray, "3"], length: float) -> Float[np.ndarray, "4
     return pose[:2] + shape @ np.array([[cos, sin], [-sin, cos]])
 
 
-def detour_ellipse(
-    vehicle: Float[np.ndarray, "2"], caller: Float[np.ndarray, "2"], detour: float
+def excess_path_ellipse(
+    vehicle: Float[np.ndarray, "2"], caller: Float[np.ndarray, "2"], excess_path: float
 ) -> Float[np.ndarray, "121 2"]:
-    r"""Where all points lie that have a detour: an ellipse about vehicle and caller.
+    r"""Where all points lie that have an excess path: an ellipse about vehicle and caller.
 
     .. math:: |b - l| + |l - p| = d + e, \qquad d = |b - p|
 
@@ -97,7 +97,7 @@ def detour_ellipse(
     ----------
     vehicle, caller : (2) [m]
         The foci.
-    detour : [m]
+    excess path : [m]
 
     Returns
     -------
@@ -106,13 +106,13 @@ def detour_ellipse(
 
     Examples
     --------
-    >>> outline = detour_ellipse(np.zeros(2), np.array([6.0, 0.0]), 4.0)
+    >>> outline = excess_path_ellipse(np.zeros(2), np.array([6.0, 0.0]), 4.0)
     >>> outline.min(axis=0), outline.max(axis=0)
     (array([-2., -4.]), array([8., 4.]))
     """
     across = caller - vehicle
     straight = np.hypot(*across)
-    long = 0.5 * (straight + detour)
+    long = 0.5 * (straight + excess_path)
     short = np.sqrt(np.maximum(long**2 - 0.25 * straight**2, 0.0))
     angle = np.linspace(0.0, 2.0 * np.pi, 121)
     c, s = across / straight if straight > 0.0 else np.array([1.0, 0.0])

@@ -42,7 +42,7 @@ def heard_from(scan: Scan) -> Scan:
     --------
     >>> from pipistrelle.detection.scans import make_scan
     >>> rows = np.array([8, 8]), np.array([0.4, np.nan])
-    >>> heard_from(make_scan(0.0, *rows, detour=np.array([3.0, 5.0]))).landmark
+    >>> heard_from(make_scan(0.0, *rows, excess_path=np.array([3.0, 5.0]))).landmark
     array([8])
     """
     return rows_of(scan, ~np.isnan(scan.bearing))

@@ -24,7 +24,7 @@ OWN: dict[Key, str] = {
 }
 """Defaults of a recorded log that differ from those of a simulated mission."""
 TIMING: Key = ("listening", "timing")
-"""Key that is on where a log has detours, or a caller that moves."""
+"""Key that is on where a log has excess paths, or a caller that moves."""
 SUSPECT = 0.2
 """Share of a log's rows that do not fit above which a warning asks about its units."""
 GATED = 0.01
@@ -32,7 +32,7 @@ GATED = 0.01
 SURPRISING = 2.0
 """NIS above which a warning is given; below 1 a filter is cautious, as with the paper's noise."""
 SHORT = 0.2
-"""Detours in metres are rarely smaller [m]; in seconds most are."""
+"""Excess paths in metres are rarely smaller [m]; in seconds most are."""
 LOGGED = frozenset(
     {
         ("filter", "range_std"),
@@ -81,9 +81,11 @@ def with_log(layer: Layer, recorded: "Log", log: Path) -> tuple[Config, list[str
     if recorded.gate is not None:
         own[GATE_KEY] = Given(recorded.gate, str(log))
     moves = any(caller.moves for caller in recorded.callers)
-    own[TIMING] = Given(moves or has_detours(recorded), str(log))
-    if recorded.detour_std is not None:
-        own["filter", "detour_std"] = Given(recorded.detour_std, f"{log}: detour_std")
+    own[TIMING] = Given(moves or has_excess_paths(recorded), str(log))
+    if recorded.excess_path_std is not None:
+        own["filter", "excess_path_std"] = Given(
+            recorded.excess_path_std, f"{log}: excess_path_std"
+        )
     if ("rays", "likelihood") in layer:  # another reading of the paper is of the paper's rays
         del own["rays", "spacing"]
     wished, settled, notes = resolve(layer), resolve(own | layer | decided), []
@@ -95,9 +97,9 @@ def with_log(layer: Layer, recorded: "Log", log: Path) -> tuple[Config, list[str
     return settled, notes
 
 
-def has_detours(recorded: "Log") -> bool:
-    """Return whether any row of a log has a detour."""
-    return any((scan.detour == scan.detour).any() for scan in recorded.scans)
+def has_excess_paths(recorded: "Log") -> bool:
+    """Return whether any row of a log has an excess path."""
+    return any((scan.excess_path == scan.excess_path).any() for scan in recorded.scans)
 
 
 def distance_driven(recorded: "Log") -> float:
@@ -121,12 +123,18 @@ def _labels(recorded: "Log") -> set[int]:
 
 def log_warnings(recorded: "Log", truth: "Truth", log: Path) -> list[str]:
     """Warn of rows that were left out of a log or its truth, and of jumps in its odometry."""
+    from pipistrelle.detection.logs.text_tables import FORMER_NAMES
+
     notes = []
     if recorded.ignored_rows:
         reasons = (
             f"{count} {reason.replace('_', ' ')}" for reason, count in recorded.ignored_rows.items()
         )
         notes.append(f"{log}: rows left out: {', '.join(reasons)}")
+    notes += [
+        f"{log}: {name} is read as {FORMER_NAMES[name]}, as it is called now"
+        for name in dict.fromkeys(recorded.former_names)
+    ]
     notes += [*_jumps(recorded, log), *_unheard(recorded, log)]
     if truth.path is not None:
         steps = len(truth.time) - 1
@@ -158,16 +166,16 @@ def _jumps(recorded: "Log", log: Path) -> list[str]:
 
 
 def _unheard(recorded: "Log", log: Path) -> list[str]:
-    """Warn of timed callers that no row and no position places: their detours are useless."""
+    """Warn of timed callers that no row and no position places: their excess paths are useless."""
     heard = _labels(recorded)
     timed = {
         number
         for scan in recorded.scans
-        for number in scan.caller[scan.detour == scan.detour].tolist()
+        for number in scan.caller[scan.excess_path == scan.excess_path].tolist()
     }
     return [
         f"{log}: no row measures landmark {caller.landmark}, the caller {caller.name!r}, so its "
-        "detours say nothing; correct its number, or say its place"
+        "excess paths say nothing; correct its number, or say its place"
         for number, caller in enumerate(recorded.callers, start=1)
         if number in timed and caller.landmark not in heard and caller.place is None
     ]
@@ -180,7 +188,7 @@ def fit_warnings(
     from pipistrelle.experiments.results.scores import is_placed
 
     rows, turned, notes = sum(len(scan.landmark) for scan in recorded.scans), recorded.turned, []
-    metric = "ranges and detours" if has_detours(recorded) else "ranges"
+    metric = "ranges and excess paths" if has_excess_paths(recorded) else "ranges"
     angles = "bearings and headings" if recorded.motion == "poses" else "bearings"
     for trial in trials:
         heard, name = sum(len(scan.landmark) for scan in trial.scans), short_name(trial.filter)
@@ -222,21 +230,26 @@ def nis_warning(trial: "TrialResult") -> str:
 
 
 def _out_of_bounds(recorded: "Log", log: Path) -> list[str]:
-    """Warn of ranges and detours that are probably not in metres.
+    """Warn of ranges and excess paths that are probably not in metres.
 
-    A detour is no more than twice the range of its landmark.
+    An excess path is no more than twice the range of its landmark.
     """
     import numpy as np
 
     near, far = recorded.range_bounds
     bounds = f"range_bounds ({near:g} to {far:g} m)"
     ranges = np.concatenate([scan.range for scan in recorded.scans])
-    detours = np.concatenate([scan.detour for scan in recorded.scans])
-    ranges, detours = ranges[~np.isnan(ranges)], detours[~np.isnan(detours)]
+    excess_paths = np.concatenate([scan.excess_path for scan in recorded.scans])
+    ranges, excess_paths = ranges[~np.isnan(ranges)], excess_paths[~np.isnan(excess_paths)]
     odd = (
         ("ranges", (ranges < near) | (ranges > far), SUSPECT, f"not within {bounds}"),
-        ("detours", detours > 2.0 * far, SUSPECT, f"more than twice the far end of {bounds}"),
-        ("detours", detours < SHORT, 1.0 - SUSPECT, f"below {SHORT:g} m"),
+        (
+            "excess paths",
+            excess_paths > 2.0 * far,
+            SUSPECT,
+            f"more than twice the far end of {bounds}",
+        ),
+        ("excess paths", excess_paths < SHORT, 1.0 - SUSPECT, f"below {SHORT:g} m"),
     )
     return [
         f"{log}: {np.count_nonzero(rows)} of {rows.size} {what} are {where}; are {what} in metres?"

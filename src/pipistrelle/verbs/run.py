@@ -129,7 +129,7 @@ def _log(mission: "Mission", scans: "Sequence[Scan]") -> "Log":
         initial_pose_std=config.filter.initial_pose_std,
         range_std=config.filter.range_std,
         bearing_std=config.filter.bearing_std,
-        detour_std=config.filter.detour_std if timing else None,
+        excess_path_std=config.filter.excess_path_std if timing else None,
         callers=_log_callers(mission) if timing else (),
         range_bounds=config.rays.range_bounds,
         gate=None if config.filter.gate == "auto" else config.filter.gate,

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 else:
     SlamFlags = setting_flags(
         lambda key: is_open(key) and key != GATE_KEY,
-        OWN | {TIMING: "where the log has detours, or a caller that moves"},
+        OWN | {TIMING: "where the log has excess paths, or a caller that moves"},
     )
 
 

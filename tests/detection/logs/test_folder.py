@@ -461,7 +461,7 @@ def test_a_wrong_header_is_refused(folder, name, header):
     [
         ",bearing_std,bearing_std",
         ",bearing_std,range_std,level_db",
-        ",detour,range,detour_std",
+        ",excess_path,range,excess_path_std",
         ",bearing_sdt",
         ";bearing_std",
         ",",
@@ -472,7 +472,7 @@ def test_a_header_with_columns_that_are_unknown_or_misplaced_names_those_that_ma
 ):
     header = f"time,landmark,bearing,range{more}"
     folder = recorded(tmp_path, measurements=f"{header}\n0.1,7,0.5,4,0.1,0.1\n")
-    may = "'time,landmark,bearing,range', perhaps followed by bearing_std, range_std, detour,"
+    may = "'time,landmark,bearing,range', perhaps followed by bearing_std, range_std, excess_path,"
     refused(folder, "measurements.csv, line 1", repr(header), may)
 
 
@@ -564,13 +564,13 @@ def test_the_columns_on_the_pages_of_the_documentation_are_sound(tmp_path):
     assert np.isnan(second.bearing_std).all()
 
 
-def test_the_detours_on_the_pages_of_the_documentation_are_sound(tmp_path):
+def test_the_excess_paths_on_the_pages_of_the_documentation_are_sound(tmp_path):
     page = (Path(__file__).parents[3] / "docs" / "log_format.md").read_text()
     (text,) = re.findall(r"^```text\n(time,[^\n]+caller\n.+?)^```", page, re.M | re.S)
     (callers,) = re.findall(r"^```toml\n(\[\[callers\]\]\n.+?)^```", page, re.M | re.S)
     (scan,) = read_log(recorded(tmp_path, UNICYCLE + callers, measurements=text)).scans
     assert scan.landmark.tolist() == [7, 3, 20, 7]
-    np.testing.assert_array_equal(scan.detour, [NAN, 6.21, NAN, 4.08])
+    np.testing.assert_array_equal(scan.excess_path, [NAN, 6.21, NAN, 4.08])
     assert scan.callers.tolist() == [-1, 20]
 
 
@@ -673,7 +673,7 @@ landmark = 52
 place = [1, 2.5]
 place_std = [0.1, 0.2]
 """
-TIMED = ",detour,detour_std,caller"
+TIMED = ",excess_path,excess_path_std,caller"
 
 
 def timed(folder, *rows, settings=UNICYCLE + CALLERS, stated=TIMED):
@@ -693,9 +693,9 @@ def test_rows_may_say_how_much_later_than_whose_direct_call_they_came(tmp_path):
     assert first.landmark.tolist() == [7, 51, 8, 7]
     assert first.caller.tolist() == [2, 1, 0, 1]
     np.testing.assert_array_equal(first.bearing, [0.5, 0.2, 0.1, NAN])
-    np.testing.assert_array_equal(first.detour, [3.25, NAN, NAN, 6.5])
-    np.testing.assert_array_equal(first.detour_std, [0.01, NAN, NAN, NAN])
-    assert second.detour.tolist() == [0.0]
+    np.testing.assert_array_equal(first.excess_path, [3.25, NAN, NAN, 6.5])
+    np.testing.assert_array_equal(first.excess_path_std, [0.01, NAN, NAN, NAN])
+    assert second.excess_path.tolist() == [0.0]
     assert first.callers.tolist() == second.callers.tolist() == [-1, 51, 52]
     assert [(c.name, c.landmark, c.moves) for c in log.callers] == [
         ("boat", 51, False),
@@ -704,44 +704,63 @@ def test_rows_may_say_how_much_later_than_whose_direct_call_they_came(tmp_path):
     assert [(c.place, c.place_std) for c in log.callers] == [(None, None), ((1, 2.5), (0.1, 0.2))]
 
 
+def test_a_log_that_calls_excess_paths_by_their_former_name_is_read_and_says_so(tmp_path):
+    row, settings = "0.1,7,0.5,4.0,3.25,0.01,mate", UNICYCLE + "detour_std = 0.05\n" + CALLERS
+    former = ",detour,detour_std,caller"
+    log = read_log(timed(tmp_path / "former", row, settings=settings, stated=former))
+    now = read_log(timed(tmp_path / "now", row))
+    assert log.scans[0].numbers.tobytes() == now.scans[0].numbers.tobytes()
+    assert log.excess_path_std == 0.05
+    assert (log.former_names, now.former_names) == (("detour", "detour_std", "detour_std"), ())
+    both = settings + "excess_path_std = 0.05\n"
+    refused(timed(tmp_path / "both", row, settings=both.replace(CALLERS, "") + CALLERS), "log.toml")
+
+
 @pytest.mark.parametrize("order", [(0, 1, 2, 3, 4), (4, 3, 2, 1, 0), (2, 4, 0, 3, 1)])
 def test_columns_after_the_four_may_stand_in_any_order(tmp_path, order):
-    names, row = ("bearing_std", "range_std", "detour", "detour_std", "caller"), "0.1,7,0.5,4.0"
+    names, row = (
+        ("bearing_std", "range_std", "excess_path", "excess_path_std", "caller"),
+        "0.1,7,0.5,4.0",
+    )
     fields = ("0.01", "0.2", "3.5", "0.03", "mate")
     stated = "".join(f",{names[i]}" for i in order)
     text = row + "".join(f",{fields[i]}" for i in order)
     (scan,) = read_log(timed(tmp_path, text, stated=stated)).scans
-    told = (scan.bearing_std, scan.range_std, scan.detour, scan.detour_std, scan.caller)
+    told = (scan.bearing_std, scan.range_std, scan.excess_path, scan.excess_path_std, scan.caller)
     assert [part.item() for part in told] == [0.01, 0.2, 3.5, 0.03, 2]
 
 
 def test_a_log_without_callers_says_nothing_of_them(folder):
     log = read_log(folder)
     assert log.callers == ()
-    assert log.detour_std is None
+    assert log.excess_path_std is None
     assert all(scan.callers.size == 0 and not scan.caller.any() for scan in log.scans)
 
 
 TIMED_WRONG = {
-    "nobody's": ("0.1,7,0.5,4.0,3.5,,", "line 2", "a detour of nobody's call"),
+    "nobody's": ("0.1,7,0.5,4.0,3.5,,", "line 2", "an excess path of nobody's call"),
     "unknown": ("0.1,7,0.5,4.0,3.5,,bat", "line 2", "caller 'bat'", "expected boat or mate"),
     "the vehicle": ("0.1,7,0.5,4.0,3.5,,vehicle", "caller 'vehicle'"),
     "a number": ("0.1,7,0.5,4.0,3.5,,1", "caller '1'"),
-    "negative": ("0.1,7,0.5,4.0,-0.1,,boat", "detour -0.1", "from 0 m"),
-    "no number": ("0.1,7,0.5,4.0,far,,boat", "detour 'far'", "a finite number"),
-    "infinite": ("0.1,7,0.5,4.0,inf,,boat", "detour 'inf'", "a finite number"),
-    "too far": ("0.1,7,0.5,4.0,2e9,,boat", "detour 2000000000.0"),
-    "std 0": ("0.1,7,0.5,4.0,3,0,boat", "detour_std 0.0", "from 1e-06 m"),
+    "negative": ("0.1,7,0.5,4.0,-0.1,,boat", "excess_path -0.1", "from 0 m"),
+    "no number": ("0.1,7,0.5,4.0,far,,boat", "excess_path 'far'", "a finite number"),
+    "infinite": ("0.1,7,0.5,4.0,inf,,boat", "excess_path 'inf'", "a finite number"),
+    "too far": ("0.1,7,0.5,4.0,2e9,,boat", "excess_path 2000000000.0"),
+    "std 0": ("0.1,7,0.5,4.0,3,0,boat", "excess_path_std 0.0", "from 1e-06 m"),
     "no bearing": ("0.1,7,,4.0,3,,boat", "bearing ''", "without a range"),
-    "nothing": ("0.1,7,,,,,boat", "bearing ''", "a further detour alone"),
-    "over itself": ("0.1,52,0.5,,3,,mate", "line 2", "a detour of a call over the caller itself"),
+    "nothing": ("0.1,7,,,,,boat", "bearing ''", "a further excess path alone"),
+    "over itself": (
+        "0.1,52,0.5,,3,,mate",
+        "line 2",
+        "an excess path of a call over the caller itself",
+    ),
     "twice": ("0.1,7,0.5,,3,,boat\n0.1,7,,,4,,boat", "line 3", "landmark 7 again", "line 2"),
     "twice unheard": ("0.1,7,0.5,,,,\n0.1,7,0.4,,,,", "line 3", "landmark 7 again"),
 }
 
 
 @pytest.mark.parametrize("case", TIMED_WRONG)
-def test_a_bad_detour_is_refused_by_its_line(tmp_path, case):
+def test_a_bad_excess_path_is_refused_by_its_line(tmp_path, case):
     row, *parts = TIMED_WRONG[case]
     refused(timed(tmp_path, row), "measurements.csv", *parts)
 
@@ -790,16 +809,16 @@ def test_a_bad_caller_of_a_log_is_refused_by_its_key(tmp_path, old, new, parts):
     refused(timed(tmp_path, "0.1,7,0.5,4.0,3.5,,boat", settings=settings), "log.toml", *parts)
 
 
-def test_detours_and_callers_survive_being_written(tmp_path):
+def test_excess_paths_and_callers_survive_being_written(tmp_path):
     rows = ("0.1,7,0.5,4.0,3.25,0.01,mate", "0.1,7,,,6.5,,boat", "0.25,8,0.1,2.0,,,")
-    settings = UNICYCLE + "detour_std = 0.05\n" + CALLERS + "\n[[callers]]\nname = 'c'\n"
+    settings = UNICYCLE + "excess_path_std = 0.05\n" + CALLERS + "\n[[callers]]\nname = 'c'\n"
     settings += "landmark = 9\nmoves = true\n"
     log = read_log(timed(tmp_path / "drive", *rows, settings=settings))
-    assert log.detour_std == 0.05
+    assert log.excess_path_std == 0.05
     assert log.callers[2].moves
     write_log(tmp_path / "again" / "drive", log)
     assert same(read_log(tmp_path / "again" / "drive"), log)
-    assert "A detour [m] is" in (tmp_path / "again" / "drive" / "README.md").read_text()
+    assert "An excess path [m] is" in (tmp_path / "again" / "drive" / "README.md").read_text()
 
 
 NUMBER = st.floats(-1e4, 1e4)

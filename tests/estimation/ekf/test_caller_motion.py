@@ -70,7 +70,7 @@ def test_a_run_with_a_caller_that_moves_equals_the_slow_reference(
     mission = boat_mission(strategy, frames)
     slam = paper_filter(kind, range_std=0.2, bearing_std=0.15)
     slow = reference(BICYCLE, 0.2, 0.15, slam.rays, 1.0)
-    slow.detour_variance = 0.05**2
+    slow.excess_path_variance = 0.05**2
     slow.start(START.mean, START.covariance)
     placed = 0
     for frame, (belief, _) in enumerate(followed(slam, mission)):
@@ -153,7 +153,7 @@ def caller_nees(kind, told, runs=40):
             beamwidth=np.pi, hearing=30.0, **noise,
         )  # fmt: skip
         path = wandering(rng, 40, [5.0, 3.0], 0.5, walk_std)
-        mission = with_boat(mission, path, rng, bearing_std=0.02, detour_std=0.1, direct=0.5)
+        mission = with_boat(mission, path, rng, bearing_std=0.02, excess_path_std=0.1, direct=0.5)
         slam = paper_filter(
             kind, motion=STEADY, rays=ray_config(power=8.0, prune=1e-9), speed_std=0.5,
             walk_std=told * walk_std, **noise,

@@ -1,4 +1,4 @@
-"""Detours: against the slow references, by their slopes, where they place, and what they spare."""
+"""Excess paths: against the slow references, by their slopes, and where they place."""
 
 from dataclasses import replace
 
@@ -12,9 +12,9 @@ from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
 from pipistrelle.estimation.measurement import (
-    caller_range_by_detour,
-    detour_jacobians,
-    detour_of,
+    caller_range_by_excess_path,
+    excess_path_jacobians,
+    excess_path_of,
     landmark_range,
 )
 from pipistrelle.estimation.motion import Motion
@@ -38,7 +38,7 @@ KINDS = [EkfSlam, InvariantEkfSlam]
 PAIRS = [(EkfSlam, SlowTimedEkfSlam), (InvariantEkfSlam, SlowTimedInvariantEkfSlam)]
 NAN = np.nan
 SOME = {"share": 0.7, "least": 0.5, "direct": False}
-"""Which detours are heard: so many of those that are not about zero, of callers heard or not."""
+"""Which excess paths are heard: a share of those not about zero, of callers heard or not."""
 law = settings(deadline=None, max_examples=100)
 coordinates = st.floats(-20.0, 20.0)
 points = st.tuples(coordinates, coordinates).map(np.array)
@@ -53,30 +53,30 @@ def apart(*places):
 
 @law
 @given(points, points, points)
-def test_slopes_of_a_detour_are_its_differences(vehicle, landmark, caller):
+def test_slopes_of_an_excess_path_are_its_differences(vehicle, landmark, caller):
     if not apart(vehicle, landmark, caller):
         return
-    for place, slope in enumerate(detour_jacobians(vehicle, landmark, caller)):
+    for place, slope in enumerate(excess_path_jacobians(vehicle, landmark, caller)):
         for axis in range(2):
             ends = [np.array([vehicle, landmark, caller]) for _ in range(2)]
             ends[0][place, axis] += 1e-6
             ends[1][place, axis] -= 1e-6
-            found = (detour_of(*ends[0]) - detour_of(*ends[1])) / 2e-6
+            found = (excess_path_of(*ends[0]) - excess_path_of(*ends[1])) / 2e-6
             assert slope[axis] == pytest.approx(found, abs=1e-7)
 
 
 @law
 @given(points, points, points)
-def test_the_closed_forms_give_back_the_ranges_that_made_the_detour(vehicle, landmark, caller):
-    e = detour_of(vehicle, landmark, caller)
+def test_the_closed_forms_give_back_the_ranges_that_made_the_excess_path(vehicle, landmark, caller):
+    e = excess_path_of(vehicle, landmark, caller)
     if not apart(vehicle, landmark, caller) or e < 0.1:
         return
     near, onward = landmark - vehicle, caller - vehicle
     found = landmark_range(e, onward, np.arctan2(near[1], near[0]))
     assert found == pytest.approx(np.hypot(*near), rel=1e-6)
     u = onward / np.hypot(*onward)
-    found = caller_range_by_detour(e, *near, *u)
-    behind = near @ u < -(1.0 - 1e-6) * np.hypot(*near)  # all callers there make one detour
+    found = caller_range_by_excess_path(e, *near, *u)
+    behind = near @ u < -(1.0 - 1e-6) * np.hypot(*near)  # all callers there make one excess path
     if np.hypot(*onward) < 100.0 and not behind:
         assert found == pytest.approx(np.hypot(*onward), rel=1e-5)
 
@@ -95,7 +95,7 @@ def check_reference(
     known = {"range_std": 0.2, "bearing_std": 0.15}
     slam = paper_filter(kind, rays=ray_config(**rays), gate=gate, robust=robust, **known)
     slow = reference(BICYCLE, 0.2, 0.15, slam.rays, gate, robust=robust)
-    slow.detour_variance = 0.05**2
+    slow.excess_path_variance = 0.05**2
     slow.start(START.mean, START.covariance)
     for frame, (belief, _) in enumerate(followed(slam, mission)):
         slow.predict(mission.controls[frame], mission.dt[frame])
@@ -113,13 +113,13 @@ def check_reference(
 @pytest.mark.parametrize(("kind", "reference"), PAIRS)
 @pytest.mark.parametrize("strategy", ["fused", "passive"])
 @pytest.mark.parametrize("callers", ONE_OR_THREE)
-def test_a_run_with_detours_equals_the_slow_reference(kind, reference, strategy, callers):
+def test_a_run_with_excess_paths_equals_the_slow_reference(kind, reference, strategy, callers):
     check_reference(kind, reference, strategy, callers=callers)
 
 
 @pytest.mark.parametrize(("kind", "reference"), PAIRS)
 @pytest.mark.parametrize("callers", ONE_OR_THREE)
-def test_a_robust_gated_run_with_detours_equals_the_slow_reference(kind, reference, callers):
+def test_a_robust_gated_run_with_excess_paths_equals_the_slow_reference(kind, reference, callers):
     known = {"callers": callers, "robust": True, "weights": "aggregated"}
     check_reference(kind, reference, "fused", gate=0.99, **known)
 
@@ -138,9 +138,11 @@ def standing(kind, robust=False):
 
 
 def heard(place, e, label=7, caller=1):
-    """A scan of one echo from a place, with a detour."""
+    """A scan of one echo from a place, with an excess path."""
     _, bearing = range_and_bearing(np.zeros(3), place[None])
-    scan = make_scan(0.0, np.array([label]), bearing, caller=caller, detour=e, detour_std=0.05)
+    scan = make_scan(
+        0.0, np.array([label]), bearing, caller=caller, excess_path=e, excess_path_std=0.05
+    )
     return replace(scan, callers=np.array([-1, 2]))
 
 
@@ -152,22 +154,22 @@ def mapped(belief, label):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_landmark_heard_once_is_placed_by_its_detour(kind):
+def test_a_landmark_heard_once_is_placed_by_its_excess_path(kind):
     slam, belief = standing(kind)
-    belief = slam.update(belief, heard(LANDMARK, detour_of(np.zeros(2), LANDMARK, CALLER)))
+    belief = slam.update(belief, heard(LANDMARK, excess_path_of(np.zeros(2), LANDMARK, CALLER)))
     mean, covariance = mapped(belief, 7)
     np.testing.assert_allclose(mean, [LANDMARK], atol=1e-3)
     assert 0.01 < np.sqrt(np.linalg.eigvalsh(covariance[0])[-1]) < 0.3
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_where_bearings_may_be_far_off_a_detour_places_what_is_sure_all_the_same(kind):
-    e, members = detour_of(np.zeros(2), LANDMARK, CALLER), {}
+def test_where_bearings_may_be_far_off_an_excess_path_places_what_is_sure_all_the_same(kind):
+    e, members = excess_path_of(np.zeros(2), LANDMARK, CALLER), {}
     for robust in (False, True):
         slam, belief = standing(kind, robust)
         for std in (0.02, 0.07, 0.3):
             _, bearing = range_and_bearing(np.zeros(3), LANDMARK[None])
-            timed = {"caller": 1, "detour": e, "detour_std": 0.05, "bearing_std": std}
+            timed = {"caller": 1, "excess_path": e, "excess_path_std": 0.05, "bearing_std": std}
             scan = make_scan(0.0, np.array([7]), bearing, **timed)
             after = slam.update(belief, replace(scan, callers=np.array([-1, 2])))
             members[robust, std] = len(mapped(after, 7)[0])
@@ -179,7 +181,7 @@ def test_where_bearings_may_be_far_off_a_detour_places_what_is_sure_all_the_same
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_placed_landmark_is_as_unsure_as_many_draws_of_what_places_it(kind):
     slam, belief = standing(kind)
-    e, rng = detour_of(np.zeros(2), LANDMARK, CALLER), np.random.default_rng(3)
+    e, rng = excess_path_of(np.zeros(2), LANDMARK, CALLER), np.random.default_rng(3)
     _, covariance = mapped(slam.update(belief, heard(LANDMARK, e)), 7)
     spread = np.sqrt(np.linalg.eigvalsh(mapped(belief, 2)[1][0]).mean())
     bearing = np.arctan2(LANDMARK[1], LANDMARK[0])
@@ -193,10 +195,10 @@ def test_a_placed_landmark_is_as_unsure_as_many_draws_of_what_places_it(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_detour_between_vehicle_and_caller_places_nothing_and_moves_nothing_far(kind):
+def test_an_excess_path_between_vehicle_and_caller_places_nothing_and_moves_nothing_far(kind):
     slam, belief = standing(kind)
     between = 0.5 * CALLER + [0.02, 0.05]
-    after = slam.update(belief, heard(between, detour_of(np.zeros(2), between, CALLER)))
+    after = slam.update(belief, heard(between, excess_path_of(np.zeros(2), between, CALLER)))
     assert len(mapped(after, 7)[0]) > 1, "a ray"
     np.testing.assert_allclose(after.pose().mean, belief.pose().mean, atol=1e-6)
     np.testing.assert_allclose(mapped(after, 2)[0], [CALLER], atol=0.05)
@@ -204,7 +206,9 @@ def test_a_detour_between_vehicle_and_caller_places_nothing_and_moves_nothing_fa
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("stds", "members"), [(2.9, 2), (3.1, 1)])
-def test_in_line_with_the_caller_a_detour_that_may_be_none_places_nothing(kind, stds, members):
+def test_in_line_with_the_caller_an_excess_path_that_may_be_none_places_nothing(
+    kind, stds, members
+):
     """Else its error would place what is between the two behind the caller, and surely."""
     slam, belief = standing(kind)
     after = slam.update(belief, heard(0.5 * CALLER, stds * 0.05))
@@ -212,9 +216,9 @@ def test_in_line_with_the_caller_a_detour_that_may_be_none_places_nothing(kind, 
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_detour_of_a_caller_that_nobody_knows_is_a_bearing_alone(kind):
+def test_an_excess_path_of_a_caller_that_nobody_knows_is_a_bearing_alone(kind):
     slam, belief = standing(kind)
-    e = detour_of(np.zeros(2), LANDMARK, CALLER)
+    e = excess_path_of(np.zeros(2), LANDMARK, CALLER)
     known = heard(LANDMARK, e)
     plain = slam.update(belief, replace(known, numbers=heard(LANDMARK, NAN).numbers))
     for callers in (np.array([-1]), np.array([-1, -1]), np.array([-1, 7]), np.array([-1, 30])):
@@ -230,8 +234,8 @@ def test_a_caller_that_is_a_ray_is_placed_by_a_landmark_that_is_known(kind):
     known = make_scan(0.0, np.array([7]), both[1][:1], range=both[0][:1])
     belief = slam.update(slam.update(belief, known), make_scan(0.0, np.array([2]), both[1][1:]))
     assert len(mapped(belief, 2)[0]) > 1
-    e = np.array([detour_of(np.zeros(2), LANDMARK, CALLER), NAN])
-    scan = make_scan(0.0, np.array([7, 2]), both[1], caller=1, detour=e, detour_std=0.05)
+    e = np.array([excess_path_of(np.zeros(2), LANDMARK, CALLER), NAN])
+    scan = make_scan(0.0, np.array([7, 2]), both[1], caller=1, excess_path=e, excess_path_std=0.05)
     after = slam.update(belief, replace(scan, callers=np.array([-1, 2])))
     np.testing.assert_allclose(mapped(after, 2)[0], [CALLER], atol=0.01)
 
@@ -240,7 +244,7 @@ STEADY = Motion(model="bicycle", control_std=(0.05, 0.005), wheelbase=0.2)
 
 
 def final_nees(factor, runs=40):
-    """Mean NEES of the pose after twenty seconds, the detours' noise told as a factor of itself."""
+    """Mean NEES of the pose after twenty seconds, the excess paths' noise given times a factor."""
     nees = []
     for seed in range(runs):
         rng, noise = np.random.default_rng([7, seed]), {"range_std": 0.05, "bearing_std": 0.02}
@@ -261,6 +265,6 @@ def final_nees(factor, runs=40):
     return np.mean(nees)
 
 
-def test_the_invariant_filter_with_detours_is_consistent_and_not_if_told_a_tenth_of_their_noise():
+def test_the_invariant_filter_with_excess_paths_is_consistent_and_not_with_a_tenth_of_their_noise():
     assert 1.5 < final_nees(1.0) < 5.0, "3, with the chance of 40 draws"
     assert final_nees(0.1) > 7.0

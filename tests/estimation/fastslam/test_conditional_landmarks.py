@@ -1,4 +1,4 @@
-"""Detours in the particle filter: the star of a caller against the joint Gaussian of all."""
+"""Excess paths in the particle filter: the star of a caller against the joint Gaussian of all."""
 
 import copy
 import itertools
@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipistrelle.detection.scans import BEARING, DETOUR, DETOUR_STD, RANGE, with_columns
+from pipistrelle.detection.scans import BEARING, EXCESS_PATH, EXCESS_PATH_STD, RANGE, with_columns
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.fastslam.block import LANES
-from pipistrelle.estimation.measurement import detour_of
+from pipistrelle.estimation.measurement import excess_path_of
 from pipistrelle.estimation.motion import Motion
 from reference.missions import (
     BICYCLE,
@@ -41,11 +41,11 @@ CALLER, ECHO = 1, 2
 PLACE, POINT = np.array([6.0, 0.0]), np.array([3.0, 4.0])
 
 
-def slow_twin(slam, detour_std=0.2):
+def slow_twin(slam, excess_path_std=0.2):
     """Return the slow reference with a filter's settings, started."""
     stds = slam.range_std, slam.bearing_std
     slow = SlowTimedFastSlam(
-        slam.motion, *stds, slam.rays, slam.gate, slam.settings, detour_std=detour_std
+        slam.motion, *stds, slam.rays, slam.gate, slam.settings, excess_path_std=excess_path_std
     )
     return slow.start(START.mean, START.covariance)
 
@@ -159,7 +159,7 @@ def test_a_star_of_ties_equals_the_joint_gaussian_of_all_with_every_option(
     assert_equal_whole_run(60, strategy, callers, shares, mixture, weights, gate)
 
 
-# Where nothing is to be learnt from detours
+# Where nothing is to be learnt from excess paths
 
 
 def run(mission, slam=None):
@@ -168,34 +168,34 @@ def run(mission, slam=None):
 
 
 def without(mission, **columns):
-    """The mission with other detours."""
+    """The mission with other excess paths."""
     scans = [with_columns(scan, **columns) for scan in mission.scans]
     return replace(mission, scans=scans)
 
 
 @pytest.mark.parametrize("caller", [99, 1], ids=["not in the map", "never surely known"])
-def test_detours_of_a_caller_whose_place_is_not_known_change_nothing(caller):
+def test_excess_paths_of_a_caller_whose_place_is_not_known_change_nothing(caller):
     mission = timed_mission("passive", [1], 8)
     mission = replace(
         mission, scans=[replace(s, callers=np.array([-1, caller])) for s in mission.scans]
     )
     belief = run(mission)
-    assert_same(belief, run(without(mission, detour=np.nan)))
+    assert_same(belief, run(without(mission, excess_path=np.nan)))
     assert not belief.slope.any()
 
 
-def test_detours_of_whom_nobody_knows_change_nothing():
+def test_excess_paths_of_whom_nobody_knows_change_nothing():
     mission = timed_mission("fused", [2], 20)
     unknown = replace(
         mission, scans=[replace(s, callers=np.array([-1, -1])) for s in mission.scans]
     )
-    assert_same(run(unknown), run(without(mission, detour=np.nan)))
+    assert_same(run(unknown), run(without(mission, excess_path=np.nan)))
 
 
 def doubled(scan):
-    """Return the scan with a further detour of each landmark, by a caller of whom nobody knows."""
+    """Return the scan with a further excess path of each landmark, by an unknown caller."""
     numbers = scan.numbers.copy()
-    numbers[[BEARING, RANGE]], numbers[DETOUR], numbers[DETOUR_STD] = np.nan, 7.0, 0.05
+    numbers[[BEARING, RANGE]], numbers[EXCESS_PATH], numbers[EXCESS_PATH_STD] = np.nan, 7.0, 0.05
     return replace(
         scan,
         landmark=np.tile(scan.landmark, 2),
@@ -206,7 +206,7 @@ def doubled(scan):
 
 
 @pytest.mark.parametrize("gate", [0.95, 1.0])
-def test_further_detours_of_a_landmark_that_is_tied_already_are_let_go(gate):
+def test_further_excess_paths_of_a_landmark_that_is_tied_already_are_let_go(gate):
     mission = timed_mission("fused", [2], 20, outliers=0.05)
     more = replace(mission, scans=[doubled(scan) for scan in mission.scans])
     slam = swarm_filter(gate=gate)
@@ -216,7 +216,7 @@ def test_further_detours_of_a_landmark_that_is_tied_already_are_let_go(gate):
     assert (belief.gated > 0) == (gate < 1.0)
 
 
-def test_labels_are_only_names_where_detours_are_heard_too():
+def test_labels_are_only_names_where_excess_paths_are_heard_too():
     mission = timed_mission("fused", [2], 20)
     renamed = [
         replace(s, landmark=1000 - s.landmark, callers=np.array([-1, 998])) for s in mission.scans
@@ -227,7 +227,7 @@ def test_labels_are_only_names_where_detours_are_heard_too():
     np.testing.assert_array_equal(other.member[:, :, : 5 * LANES], belief.member[:, :, : 5 * LANES])
 
 
-def test_whole_missions_with_detours_leave_sound_particles():
+def test_whole_missions_with_excess_paths_leave_sound_particles():
     for strategy in ("fused", "passive"):
         belief = run(timed_mission(strategy, [2], 60))
         assert_sound(belief)
@@ -250,18 +250,20 @@ def known(spread=0.04, particles=3, **changes):
     return slam, replace(belief, member=member)
 
 
-def heard(bearing, detour, distance=np.nan):
+def heard(bearing, excess_path, distance=np.nan):
     """An echo of the caller's call, over ECHO."""
-    scan = scan_with([ECHO], [bearing], [distance], detour=detour, detour_std=0.2, caller=1)
+    scan = scan_with(
+        [ECHO], [bearing], [distance], excess_path=excess_path, excess_path_std=0.2, caller=1
+    )
     return replace(scan, callers=np.array([-1, CALLER]))
 
 
-def placed(bearing, detour, place=PLACE):
+def placed(bearing, excess_path, place=PLACE):
     """Where a first echo places a landmark, its own C and A; the caller being certainly there."""
     slam, belief = known(1e-9)
     member = belief.member.copy()
     member[:, 0, :LANES], member[:, 0, LANES : 2 * LANES] = place[0], place[1]
-    belief = slam.update(replace(belief, member=member), heard(bearing, detour), drawing())
+    belief = slam.update(replace(belief, member=member), heard(bearing, excess_path), drawing())
     rows = members(belief, 0, ECHO)
     assert len(rows) == 1
     A = tie_of(belief, 0, ECHO)
@@ -275,21 +277,21 @@ def slopes(f, x, step=1e-5):
 
 
 def test_an_echo_places_its_landmark_where_ray_and_ellipse_cross_with_the_slopes_of_that_place():
-    bearing, detour = np.arctan2(*POINT[::-1]), detour_of(np.zeros(2), POINT, PLACE)
-    place, C, A = placed(bearing, detour)
+    bearing, excess_path = np.arctan2(*POINT[::-1]), excess_path_of(np.zeros(2), POINT, PLACE)
+    place, C, A = placed(bearing, excess_path)
     np.testing.assert_allclose(place, POINT, atol=1e-12)
-    by_both = slopes(lambda z: placed(*z)[0], np.array([bearing, detour]))
-    by_caller = slopes(lambda b: placed(bearing, detour, b)[0], PLACE)
+    by_both = slopes(lambda z: placed(*z)[0], np.array([bearing, excess_path]))
+    by_caller = slopes(lambda b: placed(bearing, excess_path, b)[0], PLACE)
     np.testing.assert_allclose(A, by_caller, atol=1e-8)
     R = np.diag([0.15**2, 0.2**2])
     np.testing.assert_allclose(C, by_both @ R @ by_both.T, atol=1e-8)
 
 
-ALONG = detour_of(np.zeros(2), np.array([3.0, 0.0]), PLACE)
+ALONG = excess_path_of(np.zeros(2), np.array([3.0, 0.0]), PLACE)
 
 
 @pytest.mark.parametrize(
-    ("bearing", "detour"),
+    ("bearing", "excess_path"),
     [
         (0.0, ALONG),
         (0.0, 0.05),
@@ -300,45 +302,49 @@ ALONG = detour_of(np.zeros(2), np.array([3.0, 0.0]), PLACE)
         (np.pi, 2e-12),
     ],
 )
-def test_where_a_detour_tells_no_range_a_landmark_enters_as_its_ray(bearing, detour):
+def test_where_an_excess_path_tells_no_range_a_landmark_enters_as_its_ray(bearing, excess_path):
     slam, belief = known()
-    after = slam.update(belief, heard(bearing, detour), drawing())
+    after = slam.update(belief, heard(bearing, excess_path), drawing())
     assert_sound(after)
-    plain = slam.update(belief, with_columns(heard(bearing, detour), detour=np.nan), drawing())
+    plain = slam.update(
+        belief, with_columns(heard(bearing, excess_path), excess_path=np.nan), drawing()
+    )
     np.testing.assert_array_equal(members(after, 0, ECHO), members(plain, 0, ECHO))
     assert len(members(after, 0, ECHO)) > 1
 
 
 @pytest.mark.parametrize("point", [PLACE, np.zeros(2), 0.5 * PLACE, PLACE + 1e-5])
-def test_a_landmark_at_its_caller_at_the_vehicle_or_between_them_takes_any_detour_unharmed(point):
+def test_a_landmark_at_its_caller_at_the_vehicle_or_between_them_takes_any_excess_path_unharmed(
+    point,
+):
     slam, belief = known()
-    echo = heard(np.arctan2(*POINT[::-1]), detour_of(np.zeros(2), POINT, PLACE))
+    echo = heard(np.arctan2(*POINT[::-1]), excess_path_of(np.zeros(2), POINT, PLACE))
     belief = slam.update(belief, echo, drawing())
     member = belief.member.copy()
     member[:, 1, :LANES], member[:, 1, LANES : 2 * LANES] = point[:, None]
     belief = replace(belief, member=member)
-    for detour in (0.0, 0.3, 4.0):
-        after = slam.update(belief, heard(0.1, detour), drawing())
+    for excess_path in (0.0, 0.3, 4.0):
+        after = slam.update(belief, heard(0.1, excess_path), drawing())
         assert_sound(after)
         assert np.isfinite(after.slope).all()
 
 
 def test_a_caller_that_is_hardly_known_places_nothing():
-    echo = heard(np.arctan2(*POINT[::-1]), detour_of(np.zeros(2), POINT, PLACE))
+    echo = heard(np.arctan2(*POINT[::-1]), excess_path_of(np.zeros(2), POINT, PLACE))
     for spread, alone in ((0.04, True), (0.6, False)):
         slam, belief = known(spread)
         belief = slam.update(belief, echo, drawing())
         assert (len(members(belief, 0, ECHO)) == 1) == alone
 
 
-def test_detours_correct_a_map_and_neither_weigh_a_particle_nor_move_it():
+def test_excess_paths_correct_a_map_and_neither_weigh_a_particle_nor_move_it():
     slam, belief = known(particles=40)
-    echo = heard(np.arctan2(*POINT[::-1]), detour_of(np.zeros(2), POINT, PLACE))
+    echo = heard(np.arctan2(*POINT[::-1]), excess_path_of(np.zeros(2), POINT, PLACE))
     belief = slam.update(belief, echo, drawing())
     normal, uniform = drawing().standard_normal((40, 3)), np.full(40, 0.5)
-    far = heard(np.arctan2(*POINT[::-1]), detour_of(np.zeros(2), POINT, PLACE) + 0.4)
+    far = heard(np.arctan2(*POINT[::-1]), excess_path_of(np.zeros(2), POINT, PLACE) + 0.4)
     told = slam.update(belief, far, Drawn(normal, uniform))
-    plain = slam.update(belief, with_columns(far, detour=np.nan), Drawn(normal, uniform))
+    plain = slam.update(belief, with_columns(far, excess_path=np.nan), Drawn(normal, uniform))
     np.testing.assert_array_equal(told.log_weight, plain.log_weight)
     np.testing.assert_array_equal(told.cloud(), plain.cloud())
     moved = members(told, 0, ECHO) - members(plain, 0, ECHO)
@@ -346,13 +352,13 @@ def test_detours_correct_a_map_and_neither_weigh_a_particle_nor_move_it():
 
 
 @pytest.mark.parametrize(("off", "gated"), [(0.0, 0), (0.5, 0), (5.0, 1)])
-def test_the_gate_drops_a_detour_that_no_particle_expected_and_keeps_its_bearing(off, gated):
+def test_the_gate_drops_an_excess_path_that_no_particle_expected_and_keeps_its_bearing(off, gated):
     slam, belief = known(gate=0.99)
-    bearing, detour = np.arctan2(*POINT[::-1]), detour_of(np.zeros(2), POINT, PLACE)
-    belief = slam.update(belief, heard(bearing, detour), drawing())
-    after = slam.update(belief, heard(bearing, detour + off), drawing())
+    bearing, excess_path = np.arctan2(*POINT[::-1]), excess_path_of(np.zeros(2), POINT, PLACE)
+    belief = slam.update(belief, heard(bearing, excess_path), drawing())
+    after = slam.update(belief, heard(bearing, excess_path + off), drawing())
     plain = slam.update(
-        belief, with_columns(heard(bearing, detour + off), detour=np.nan), drawing()
+        belief, with_columns(heard(bearing, excess_path + off), excess_path=np.nan), drawing()
     )
     assert after.gated == gated
     same = np.array_equal(after.member, plain.member) and np.array_equal(after.slope, plain.slope)

@@ -115,14 +115,14 @@ def test_bearings_that_cross_place_what_stands_and_never_what_moves():
     assert not moves.chains
 
 
-def test_detours_from_before_it_was_placed_are_dropped_and_those_of_others_wait(roaming):
+def test_excess_paths_from_before_it_was_placed_are_dropped_and_those_of_others_wait(roaming):
     mission, _, beliefs = roaming
     entered = next(k for k, belief in enumerate(beliefs) if belief.chains)
     first = beliefs[-1].chains[CALLER].first
     assert 1 <= entered == first - 1
-    assert np.isfinite(mission.scans[0].detour).any()
-    assert not any(one.node < first for belief in beliefs for one in belief.detours)
-    waited = [one for belief in beliefs for one in belief.detours]
+    assert np.isfinite(mission.scans[0].excess_path).any()
+    assert not any(one.node < first for belief in beliefs for one in belief.excess_paths)
+    waited = [one for belief in beliefs for one in belief.excess_paths]
     assert all(one.landmark not in beliefs[-1].mapped[:1] for one in waited)
 
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipistrelle.detection.scans import DETOUR, rows_of, with_columns
+from pipistrelle.detection.scans import EXCESS_PATH, rows_of, with_columns
 from pipistrelle.estimation.beliefs import Gaussian, placed
-from pipistrelle.estimation.measurement import detour_jacobians, detour_of
+from pipistrelle.estimation.measurement import excess_path_jacobians, excess_path_of
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.estimation.smoother.graph import Solver, landmark_key, links
@@ -83,13 +83,13 @@ def at_once(belief, mission, motion, start, *, robust=False):
         )
         if np.isfinite(row[1])
     ]  # fmt: skip
-    detours = [
-        (leg, label, scan.callers[caller], detour, along)
+    excess_paths = [
+        (leg, label, scan.callers[caller], excess_path, along)
         for leg, scan in enumerate(mission.scans, start=1)
-        for label, caller, detour, along in zip(
-            scan.landmark.tolist(), scan.caller, scan.detour, scan.detour_std, strict=True
+        for label, caller, excess_path, along in zip(
+            scan.landmark.tolist(), scan.caller, scan.excess_path, scan.excess_path_std, strict=True
         )
-        if np.isfinite(detour)
+        if np.isfinite(excess_path)
     ]
     entered = {
         label: np.array(link.values.atPoint2(landmark_key(label)))
@@ -98,7 +98,7 @@ def at_once(belief, mission, motion, start, *, robust=False):
         if link.values.exists(landmark_key(label))
     }
     legs = list(zip(mission.controls, mission.dt, strict=True))
-    every = Everything(motion, start, legs, rows, entered, detours=detours, robust=robust)
+    every = Everything(motion, start, legs, rows, entered, excess_paths=excess_paths, robust=robust)
     x = every.solved(every.begun({label: mission.landmarks[label - 1] for label in entered}))
     return every.labels, *every.told(x)
 
@@ -123,10 +123,10 @@ def differences(belief, labels, path, spread, places, known):
     )
 
 
-def without_detours(mission):
+def without_excess_paths(mission):
     """The mission as it is heard without timing."""
     bare = [rows_of(scan, np.isfinite(scan.bearing)) for scan in mission.scans]
-    return replace(mission, scans=[with_columns(scan, detour=np.nan) for scan in bare])
+    return replace(mission, scans=[with_columns(scan, excess_path=np.nan) for scan in bare])
 
 
 def spread_of(belief):
@@ -184,34 +184,36 @@ def test_covariances_of_all_steps_are_those_of_everything_at_once_where_nothing_
 
 @pytest.mark.parametrize("strategy", ["fused", "passive"])
 @pytest.mark.parametrize("callers", [(13,), (13, 45, 31)], ids=["one caller", "three callers"])
-def test_with_detours_they_are_still_the_best_there_are_of_everything_at_once(strategy, callers):
+def test_with_excess_paths_they_are_still_the_best_there_are_of_everything_at_once(
+    strategy, callers
+):
     mission, motion, start = scaled_mission(strategy, 1e-2, callers=callers)
     *_, (belief, _) = followed(smoother(motion), mission, start)
     nodes, every, places = differences(belief, *at_once(belief, mission, motion, start))
     assert max(*nodes, *places) < 1e-4
     assert every[0] < 1e-3
-    *_, (deaf, _) = followed(smoother(motion), without_detours(mission), start)
+    *_, (deaf, _) = followed(smoother(motion), without_excess_paths(mission), start)
     assert set(belief.mapped) > set(deaf.mapped)
     assert spread_of(belief) < 0.98 * spread_of(deaf)
 
 
-def test_without_their_detours_they_are_not():
+def test_without_their_excess_paths_they_are_not():
     mission, motion, start = scaled_mission("passive", 1e-2, callers=(13,))
     *_, (belief, _) = followed(smoother(motion), mission, start)
-    bare = without_detours(mission)
+    bare = without_excess_paths(mission)
     nodes, *_ = differences(belief, *at_once(belief, bare, motion, start))
     assert max(nodes) > 0.1
 
 
-def test_detours_that_wait_enter_with_their_landmark_and_their_caller():
+def test_excess_paths_that_wait_enter_with_their_landmark_and_their_caller():
     mission, motion, start = scaled_mission("passive", 1e-2, callers=(13,), frames=12)
     heard, entered = 0, []
     for (belief, _), scan in zip(
         followed(smoother(motion), mission, start), mission.scans, strict=True
     ):
-        heard += np.count_nonzero(np.isfinite(scan.detour))
-        entered.append(heard - len(belief.detours))
-        for one in belief.detours:
+        heard += np.count_nonzero(np.isfinite(scan.excess_path))
+        entered.append(heard - len(belief.excess_paths))
+        for one in belief.excess_paths:
             assert not {one.landmark, one.caller} <= set(belief.mapped)
     assert entered[0] == 0
     assert max(np.diff(entered)) > 100
@@ -220,11 +222,11 @@ def test_detours_that_wait_enter_with_their_landmark_and_their_caller():
 
 
 @pytest.mark.parametrize("callers", [(13,), (13, 45)], ids=["one caller", "two callers"])
-def test_detours_that_are_off_by_far_count_by_hubers_loss(callers):
-    """A direct call in ten is another sound: all the detours of its frame are off alike."""
+def test_excess_paths_that_are_off_by_far_count_by_hubers_loss(callers):
+    """A direct call in ten is another sound: all the excess paths of its frame are off alike."""
     mission, motion, start = scaled_mission("passive", 1.0, callers=callers)
     for scan in mission.scans[4::10]:
-        scan.numbers[DETOUR] += 3.0
+        scan.numbers[EXCESS_PATH] += 3.0
     *_, (belief, _) = followed(smoother(motion, robust=True), mission, start)
     best = at_once(belief, mission, motion, start, robust=True)
     nodes, _, places = differences(belief, *best)
@@ -251,7 +253,7 @@ def test_what_is_off_by_far_counts_by_hubers_loss(strategy):
 
 
 def nees(seed, off):
-    """Of the last pose and, the median, of a landmark, when detours are so much worse than told."""
+    """Errors of last pose and median landmark when excess paths are so much worse than said."""
     mission, motion, start = scaled_mission("passive", 0.1, frames=24, seed=seed)
     labels = [scan.landmark for scan in mission.scans]
     caller = sorted(set.intersection(*map(set, labels)))[0]
@@ -266,7 +268,7 @@ def nees(seed, off):
     return own @ np.linalg.solve(pose.covariance, own), np.median(of_map)
 
 
-def test_pose_and_map_are_off_by_what_they_say_with_detours_as_good_as_told():
+def test_pose_and_map_are_off_by_what_they_say_with_excess_paths_as_good_as_told():
     """Chi-square of 72, within 0.1 %; landmarks of a world are off together, so of 48 in all."""
     pose, of_map = np.transpose([nees(seed, 1.0) for seed in range(24)])
     assert 39.0 < pose.sum() < 116.0
@@ -399,7 +401,7 @@ def test_a_belief_kept_aside_answers_to_the_same_bits_after_others_went_on():
             np.testing.assert_array_equal(now, then)
 
 
-def test_a_belief_left_behind_goes_on_to_the_same_bits_with_detours():
+def test_a_belief_left_behind_goes_on_to_the_same_bits_with_excess_paths():
     mission, motion, start = scaled_mission("passive", 1.0, callers=(13, 45))
     slam = smoother(motion)
     beliefs = [belief for belief, _ in followed(slam, mission, start)]
@@ -412,17 +414,17 @@ def test_a_belief_left_behind_goes_on_to_the_same_bits_with_detours():
             np.testing.assert_array_equal(now, then)
 
 
-def test_detours_of_a_caller_that_nobody_hears_change_no_bit_and_few_wait():
+def test_excess_paths_of_a_caller_that_nobody_hears_change_no_bit_and_few_wait():
     mission, motion, start = scaled_mission("passive", 1.0, callers=(13,), frames=50)
     silent = [replace(scan, callers=np.array([-1, 99])) for scan in mission.scans]
     *_, (belief, _) = followed(smoother(motion), replace(mission, scans=silent), start)
-    *_, (deaf, _) = followed(smoother(motion), without_detours(mission), start)
+    *_, (deaf, _) = followed(smoother(motion), without_excess_paths(mission), start)
     for now, then in zip(all_told(belief), all_told(deaf), strict=True):
         np.testing.assert_array_equal(now, then)
-    heard = sum(np.count_nonzero(np.isfinite(scan.detour)) for scan in mission.scans)
+    heard = sum(np.count_nonzero(np.isfinite(scan.excess_path)) for scan in mission.scans)
     assert heard > MAX_WAITING
-    assert len(belief.detours) == MAX_WAITING
-    assert belief.detours[-1].node == 50
+    assert len(belief.excess_paths) == MAX_WAITING
+    assert belief.excess_paths[-1].node == 50
 
 
 def test_two_ways_on_from_one_belief_do_not_know_of_each_other():
@@ -459,9 +461,9 @@ def two_landmarks(gate):
 
 
 def timed_scan(rows, caller):
-    """A scan of rows (label, bearing, detour), of the call of a landmark."""
-    label, bearing, detour = zip(*rows, strict=True)
-    told = {"caller": 1, "detour": np.array(detour), "detour_std": 0.1}
+    """A scan of rows (label, bearing, excess path), of the call of a landmark."""
+    label, bearing, excess_path = zip(*rows, strict=True)
+    told = {"caller": 1, "excess_path": np.array(excess_path), "excess_path_std": 0.1}
     return replace(scan_with(label, bearing, **told), callers=np.array([-1, caller]))
 
 
@@ -502,18 +504,18 @@ def test_the_gate_of_a_bearing_alone_is_that_of_one_number():
 
 @pytest.mark.parametrize(("share", "dropped"), [(0.99, 0), (1.01, 1)])
 @pytest.mark.parametrize("further", [False, True], ids=["beside a bearing", "alone"])
-def test_a_detour_is_dropped_alone_where_the_distribution_of_what_is_expected_has_it(
+def test_an_excess_path_is_dropped_alone_where_the_distribution_of_what_is_expected_has_it(
     share, dropped, further
 ):
-    """Landmarks 1 and 2 are known three times over; the detour is off by their spread and R."""
+    """Landmarks 1 and 2 are known thrice over; the excess path is off by their spread and R."""
     slam, belief, places = two_landmarks(0.99)
     C = np.zeros((4, 4))
     rows = belief.landmarks()
     C[:2, :2], C[2:, 2:] = rows.covariance
-    J = np.concatenate(detour_jacobians(np.zeros(2), *places)[1:])
+    J = np.concatenate(excess_path_jacobians(np.zeros(2), *places)[1:])
     edge = np.sqrt(6.6348966 * (J @ C @ J + 0.1**2))
-    detour = detour_of(np.zeros(2), *places) + share * edge
-    scan = timed_scan([(1, 0.3, detour)], caller=2)
+    excess_path = excess_path_of(np.zeros(2), *places) + share * edge
+    scan = timed_scan([(1, 0.3, excess_path)], caller=2)
     if further:
         scan = with_columns(scan, bearing=np.nan)
     after = slam.update(belief, scan)

@@ -1,4 +1,4 @@
-"""Detours in the graph: their factor by differences and one by one, and those that wait."""
+"""Excess paths in the graph: their factor by differences and one by one, and those that wait."""
 
 from dataclasses import replace
 
@@ -6,13 +6,13 @@ import gtsam
 import numpy as np
 import pytest
 
-from pipistrelle.estimation.measurement import HUBER_K, detour_of
+from pipistrelle.estimation.measurement import HUBER_K, excess_path_of
 from pipistrelle.estimation.smoother.graph import landmark_key, pose_key
 from pipistrelle.estimation.smoother.tdoa import (
     MAX_WAITING,
-    Detour,
-    detour_factors,
-    detours_of,
+    ExcessPath,
+    excess_path_factors,
+    excess_paths_of,
     split_ready,
 )
 from reference.missions import scan_with
@@ -31,17 +31,17 @@ def graph_values(node=5, pose=(0.3, -0.8, 2.1)):
 
 
 def heard(off, node=5, pose=(0.3, -0.8, 2.1)):
-    """All detours over all landmarks, each off by so many deviations."""
+    """All excess paths over all landmarks, each off by so many deviations."""
     pairs = [(one, call) for call in CALLERS for one in PLACES if one != call]
     rows = []
     for (one, call), z in zip(pairs, np.broadcast_to(off, len(pairs)), strict=True):
-        true = detour_of(np.array(pose[:2]), np.array(PLACES[one]), np.array(PLACES[call]))
-        rows.append(Detour(node, one, call, true - z * 0.07, 0.07))
+        true = excess_path_of(np.array(pose[:2]), np.array(PLACES[one]), np.array(PLACES[call]))
+        rows.append(ExcessPath(node, one, call, true - z * 0.07, 0.07))
     return rows
 
 
 def one_factor(rows, **settings):
-    (factor,) = detour_factors(rows, **settings)
+    (factor,) = excess_path_factors(rows, **settings)
     return factor
 
 
@@ -99,7 +99,7 @@ def test_what_one_loses_is_what_gtsam_has_by_hubers_loss(off):
 
 
 @pytest.mark.parametrize("robust", [False, True])
-def test_a_frame_says_at_once_what_its_detours_say_one_by_one(robust):
+def test_a_frame_says_at_once_what_its_excess_paths_say_one_by_one(robust):
     values, rows = graph_values(), heard([-9.0, -2.1, -1.9, -0.3, 0.4, 1.9, 2.1, 30.0])
     ones = gtsam.NonlinearFactorGraph()
     for row in rows:
@@ -113,14 +113,14 @@ def test_a_frame_says_at_once_what_its_detours_say_one_by_one(robust):
         np.testing.assert_allclose(*told, rtol=1e-12, atol=1e-9)
 
 
-def test_detours_of_a_scan_are_those_of_callers_that_have_a_label():
+def test_excess_paths_of_a_scan_are_those_of_callers_that_have_a_label():
     told = {
-        "detour": np.array([3.0, np.nan, 2.0, 5.0]),
-        "detour_std": np.array([0.1, 0.2, 0.3, 0.4]),
+        "excess_path": np.array([3.0, np.nan, 2.0, 5.0]),
+        "excess_path_std": np.array([0.1, 0.2, 0.3, 0.4]),
     }
     scan = scan_with([4, 1, 9, 7], np.zeros(4), caller=np.array([1, 1, 1, 2]), **told)
-    assert detours_of(scan, 8) == ()
-    rows = detours_of(replace(scan, callers=np.array([-1, 9, -1])), 8)
+    assert excess_paths_of(scan, 8) == ()
+    rows = excess_paths_of(replace(scan, callers=np.array([-1, 9, -1])), 8)
     assert [row[:4] for row in rows] == [(8, 4, 9, 3.0)]
     assert rows[0].std == pytest.approx(0.1)
 
@@ -129,7 +129,7 @@ def test_detours_of_a_scan_are_those_of_callers_that_have_a_label():
 
 
 def test_no_more_wait_than_may_and_the_newest_are_kept():
-    rows = [Detour(node, 1, 9, 1.0, 0.1) for node in range(MAX_WAITING + 7)]
+    rows = [ExcessPath(node, 1, 9, 1.0, 0.1) for node in range(MAX_WAITING + 7)]
     entering, waiting = split_ready(rows, {1, 4})
     assert not entering
     assert [one.node for one in waiting] == list(range(7, MAX_WAITING + 7))
@@ -138,8 +138,8 @@ def test_no_more_wait_than_may_and_the_newest_are_kept():
 @pytest.mark.parametrize(
     ("mapped", "enter"), [((), 0), ((1,), 0), ((9,), 0), ((1, 9), 1), ((1, 4, 9), 2)]
 )
-def test_a_detour_waits_for_its_landmark_and_its_caller(mapped, enter):
-    rows = [Detour(0, 1, 9, 1.0, 0.1), Detour(2, 4, 9, 1.0, 0.1)]
+def test_an_excess_path_waits_for_its_landmark_and_its_caller(mapped, enter):
+    rows = [ExcessPath(0, 1, 9, 1.0, 0.1), ExcessPath(2, 4, 9, 1.0, 0.1)]
     entering, waiting = split_ready(rows, mapped)
     assert entering == tuple(rows[:enter])
     assert waiting == tuple(rows[enter:])

@@ -1,4 +1,4 @@
-"""Placing by a detour: how sure a range is, and that what is not sure places nothing."""
+"""Placing by an excess path: how sure a range is, and that what is not sure places nothing."""
 
 from dataclasses import replace
 
@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from pipistrelle.estimation.beliefs import Gaussian, placed
-from pipistrelle.estimation.measurement import detour_of
+from pipistrelle.estimation.measurement import excess_path_of
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.smoother.delayed_initialization import Bearing
 from pipistrelle.estimation.smoother.filter import Smoother
-from pipistrelle.estimation.smoother.tdoa import Detour
+from pipistrelle.estimation.smoother.tdoa import ExcessPath
 from pipistrelle.estimation.smoother.tdoa_initialization import (
     MAX_RELATIVE_RANGE_STD,
     LastPose,
-    place_by_detours,
+    place_by_excess_paths,
     unscented_range,
 )
 from reference.missions import ray_config, scan_with
@@ -30,19 +30,19 @@ def bearing_of(place):
 
 
 def way_to(place, caller=CALLER):
-    """The way to the caller, the landmark's direction, and its detour."""
-    return np.array([*caller, bearing_of(place), detour_of(HERE, place, caller)])
+    """The way to the caller, the landmark's direction, and its excess path."""
+    return np.array([*caller, bearing_of(place), excess_path_of(HERE, place, caller)])
 
 
 # How sure
 
 
-def test_the_range_by_a_detour_is_that_of_the_landmark_and_of_the_caller():
+def test_the_range_by_an_excess_path_is_that_of_the_landmark_and_of_the_caller():
     no_noise = np.zeros((4, 4))
     assert unscented_range(way_to(BESIDE), no_noise, caller=False) == pytest.approx(
         (np.hypot(*BESIDE), 0.0)
     )
-    way = np.array([*BESIDE, bearing_of(CALLER), detour_of(HERE, BESIDE, CALLER)])
+    way = np.array([*BESIDE, bearing_of(CALLER), excess_path_of(HERE, BESIDE, CALLER)])
     found = unscented_range(way, no_noise, caller=True)
     assert found == pytest.approx((np.hypot(*CALLER), 0.0))
 
@@ -63,7 +63,7 @@ def test_its_deviation_is_that_of_draws_where_noise_is_small(caller):
 
 @pytest.mark.parametrize("along", [0.2, 0.5, 0.8])
 @pytest.mark.parametrize("off", [-0.04, 0.0, 0.04, 0.14])
-def test_between_vehicle_and_caller_no_range_is_sure_whatever_the_detour_is_off(along, off):
+def test_between_vehicle_and_caller_no_range_is_sure_whatever_the_excess_path_is_off(along, off):
     way = way_to(along * CALLER)
     way[3] += off
     assert (
@@ -72,7 +72,7 @@ def test_between_vehicle_and_caller_no_range_is_sure_whatever_the_detour_is_off(
     )
 
 
-def test_a_detour_that_may_be_none_tells_no_range():
+def test_an_excess_path_that_may_be_none_tells_no_range():
     way = way_to(BESIDE)
     for std, known in ((way[3] / 2.99, False), (way[3] / 20.0, True)):
         share = unscented_range(way, np.diag([0.0, 0.0, 0.0, std**2]), caller=False)[1]
@@ -87,9 +87,14 @@ def slam():
 
 
 def scan(*rows, caller=9, std=0.02):
-    """A scan of rows (label, place, range or NaN, detour or NaN) as they are from the origin."""
-    label, place, distance, detour = zip(*rows, strict=True)
-    told = {"detour": np.array(detour), "detour_std": std, "bearing_std": 0.01, "range_std": 0.05}
+    """A scan of rows (label, place, range or NaN, excess path or NaN) seen from the origin."""
+    label, place, distance, excess_path = zip(*rows, strict=True)
+    told = {
+        "excess_path": np.array(excess_path),
+        "excess_path_std": std,
+        "bearing_std": 0.01,
+        "range_std": 0.05,
+    }
     heard = scan_with(label, [bearing_of(one) for one in place], distance, caller=1, **told)
     return replace(heard, callers=np.array([-1, caller]))
 
@@ -103,12 +108,12 @@ def knowing(label, place, times=3):
     return belief
 
 
-def test_a_landmark_is_placed_at_once_by_bearing_and_detour_of_a_caller_that_is_known():
-    row = (4, BESIDE, np.nan, detour_of(HERE, BESIDE, CALLER))
+def test_a_landmark_is_placed_at_once_by_bearing_and_excess_path_of_a_caller_that_is_known():
+    row = (4, BESIDE, np.nan, excess_path_of(HERE, BESIDE, CALLER))
     belief = slam().update(knowing(9, CALLER), scan(row))
     assert belief.mapped == (9, 4)
     assert not belief.waiting
-    assert not belief.detours
+    assert not belief.excess_paths
     rows = belief.landmarks()
     assert placed(rows).all()
     np.testing.assert_allclose(rows.mean[1], BESIDE, rtol=0, atol=0.02)
@@ -116,22 +121,22 @@ def test_a_landmark_is_placed_at_once_by_bearing_and_detour_of_a_caller_that_is_
     assert deaf.mapped == (9,)
 
 
-def test_a_caller_is_placed_at_once_by_bearing_and_the_detour_over_a_landmark_that_is_known():
-    over = (4, BESIDE, np.hypot(*BESIDE), detour_of(HERE, BESIDE, CALLER))
+def test_a_caller_is_placed_at_once_by_bearing_and_the_excess_path_over_a_landmark_that_is_known():
+    over = (4, BESIDE, np.hypot(*BESIDE), excess_path_of(HERE, BESIDE, CALLER))
     belief = slam().update(knowing(4, BESIDE), scan(over, (9, CALLER, np.nan, np.nan)))
     assert belief.mapped == (4, 9)
     np.testing.assert_allclose(belief.landmarks().mean[1], CALLER, rtol=0, atol=0.02)
-    assert not belief.detours
+    assert not belief.excess_paths
 
 
 @pytest.mark.parametrize("off", [-0.1, -0.03, 0.0, 0.03, 0.1])
 def test_a_landmark_between_vehicle_and_caller_is_not_placed_and_does_no_harm(off):
     before = knowing(9, CALLER)
     between = 0.4 * CALLER
-    row = (4, between, np.nan, detour_of(HERE, between, CALLER) + off)
+    row = (4, between, np.nan, excess_path_of(HERE, between, CALLER) + off)
     belief = slam().update(before, scan(row, std=0.05))
     assert belief.mapped == (9,)
-    assert len(belief.detours) == len(belief.waiting) == 1
+    assert len(belief.excess_paths) == len(belief.waiting) == 1
     np.testing.assert_array_equal(belief.pose().mean, before.pose().mean)
 
 
@@ -166,25 +171,25 @@ def test_what_is_known_together_is_what_the_graph_says_when_the_vehicle_has_gone
     np.testing.assert_allclose(told[:3, :3], belief.pose().covariance, rtol=0, atol=1e-9)
 
 
-def test_of_several_detours_the_surest_places():
+def test_of_several_excess_paths_the_surest_places():
     belief = knowing(9, CALLER)
     around = LastPose(
         isam=belief.solver.reach(belief.link), node=0, odometry=None, pose=np.zeros(3)
     )
-    true = detour_of(HERE, BESIDE, CALLER)
-    clues = [Detour(0, 4, 9, true + 0.5, 0.5), Detour(0, 4, 9, true, 0.02)]
+    true = excess_path_of(HERE, BESIDE, CALLER)
+    clues = [ExcessPath(0, 4, 9, true + 0.5, 0.5), ExcessPath(0, 4, 9, true, 0.02)]
     for order in (clues, clues[::-1]):
-        place = place_by_detours(around, Bearing(0, bearing_of(BESIDE), 0.01), 4, order)
+        place = place_by_excess_paths(around, Bearing(0, bearing_of(BESIDE), 0.01), 4, order)
         np.testing.assert_allclose(place, BESIDE, rtol=0, atol=0.02)
-    vague = place_by_detours(
-        around, Bearing(0, bearing_of(BESIDE), 0.01), 4, [Detour(0, 4, 9, true, 2.0)]
+    vague = place_by_excess_paths(
+        around, Bearing(0, bearing_of(BESIDE), 0.01), 4, [ExcessPath(0, 4, 9, true, 2.0)]
     )
     assert vague is None
 
 
 def test_how_sure_the_caller_is_counts():
-    """The same bearing and detour: a caller known by a range of 2 m's deviation places nothing."""
-    row = (4, BESIDE, np.nan, detour_of(HERE, BESIDE, CALLER))
+    """The same bearing and excess path: a caller whose range has a std of 2 m places nothing."""
+    row = (4, BESIDE, np.nan, excess_path_of(HERE, BESIDE, CALLER))
     vague = slam().init(SURE)
     told = {"range_std": 4.0, "bearing_std": 0.3}
     vague = slam().update(vague, scan_with([9], [bearing_of(CALLER)], [np.hypot(*CALLER)], **told))

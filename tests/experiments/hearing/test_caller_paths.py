@@ -372,7 +372,7 @@ def test_a_vehicles_call_is_the_same_to_itself_and_to_the_other(hearing):
 
 def test_of_a_vehicle_that_points_away_no_echo_is_taken_for_its_direct_call():
     config = PAIR.model_copy(update={"listening": ListeningConfig(timing=True)})
-    frames, detours = {True: 0, False: 0}, {True: 0, False: 0}
+    frames, excess_paths = {True: 0, False: 0}, {True: 0, False: 0}
     for number in range(3):
         world = world_of(config, number)
         (heard,) = listen(world, config, (0.0088,), iteration=number)
@@ -382,10 +382,10 @@ def test_of_a_vehicle_that_points_away_no_echo_is_taken_for_its_direct_call():
             x, y = world.path[k, :2] - mate.place[k]
             away = bool(abs(wrap(np.arctan2(y, x) - mate.heading[k])) > np.pi / 2)
             frames[away] += 1
-            detours[away] += int(np.isfinite(scan.detour).sum())
+            excess_paths[away] += int(np.isfinite(scan.excess_path).sum())
     assert min(frames.values()) > 20
-    assert detours[True] == 0
-    assert detours[False] > 100
+    assert excess_paths[True] == 0
+    assert excess_paths[False] > 100
 
 
 def test_a_direct_call_comes_through_the_piston_that_sends_it():

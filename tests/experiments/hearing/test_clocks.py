@@ -77,8 +77,8 @@ def test_excess_paths_and_bearings_are_those_of_the_moment_at_which_a_call_is_he
         places = np.vstack((world.landmarks, caller))[heard.rows.landmark - 1]
         away, back = places - pose[:2], caller - places
         ways = np.hypot(*away.T) + np.hypot(*back.T) - np.hypot(*(caller - pose[:2]))
-        timed = np.isfinite(heard.rows.detour) & (heard.rows.landmark != label)
-        off += (heard.rows.detour - ways)[timed].tolist()
+        timed = np.isfinite(heard.rows.excess_path) & (heard.rows.landmark != label)
+        off += (heard.rows.excess_path - ways)[timed].tolist()
         turned += wrap(heard.rows.bearing - np.arctan2(*away.T[::-1]) + pose[2]).tolist()
         straight += label in heard.rows.landmark
     assert len(off) > 8 * least
@@ -113,7 +113,7 @@ def unaimed(arrivals, **_):
 def test_echoes_that_come_after_the_vehicle_has_called_again_are_those_of_their_call():
     _, between, _ = heard_calls(config_of({"distance": 9.0, "offset": 0.44}))
     late = [
-        heard.rows.time % 0.5 + (np.nan_to_num(heard.rows.detour) / 343.0).max()
+        heard.rows.time % 0.5 + (np.nan_to_num(heard.rows.excess_path) / 343.0).max()
         for heard in between
     ]
     whole = [len(heard.rows.landmark) for heard in between]

@@ -164,9 +164,9 @@ def test_scores_count_full_and_partial_landmarks_and_measurements_per_frame():
     assert (scores.landmarks_full, scores.landmarks_total) == (3, 4)
     assert scores.measurements_per_frame == 1.0
     assert scores.gated == 6
-    more = scan_with([3, 3], [-1.0, np.nan], caller=np.array([1, 2]), detour=4.0, time=TIME[8])
+    more = scan_with([3, 3], [-1.0, np.nan], caller=np.array([1, 2]), excess_path=4.0, time=TIME[8])
     timed = score(drifting_track(), TRUTH, (*SCANS[:2], more), EKF_LIMIT)
-    assert timed.measurements_per_frame == 1.0, "a further detour is no measurement of its own"
+    assert timed.measurements_per_frame == 1.0, "a further excess path is no measurement of its own"
 
 
 def test_the_map_error_is_that_of_full_landmarks_with_known_positions():
@@ -301,7 +301,14 @@ def test_two_filters_of_one_strategy_share_their_measurements(tmp_path):
     track = drifting_track()
     write(tmp_path, trial(track), trial(track, name="fastslam"), trial(track, "active"))
     measurements = pl.read_parquet(tmp_path / "measurements.parquet")
-    measured = ["landmark", "bearing_rad", "range_m", "detour_m", "detour_std_m", "caller"]
+    measured = [
+        "landmark",
+        "bearing_rad",
+        "range_m",
+        "excess_path_m",
+        "excess_path_std_m",
+        "caller",
+    ]
     assert measurements.columns == ["strategy", "time_s", *measured]
     assert measurements["strategy"].to_list() == ["fused"] * 3 + ["active"] * 3
     assert measurements["range_m"].to_list() == [4.0, None, 2.0] * 2

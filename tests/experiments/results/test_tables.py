@@ -146,18 +146,18 @@ def test_a_passive_measurement_has_no_range_in_the_table():
     assert table.schema["landmark"] == pl.Int64
 
 
-def test_detours_stand_beside_whose_call_it_was_and_are_null_where_there_are_none():
+def test_excess_paths_stand_beside_whose_call_it_was_and_are_null_where_there_are_none():
     timed = make_scan(
         1.0,
         np.array([4, 4, 5]),
         np.array([0.5, np.nan, 0.1]),
         caller=np.array([1, 2, 0]),
-        detour=np.array([3.0, 7.0, np.nan]),
-        detour_std=0.2,
+        excess_path=np.array([3.0, 7.0, np.nan]),
+        excess_path_std=0.2,
     )
     told = measurement_table([timed], ["beacon"])
     assert told.schema == measurement_table([]).schema
-    assert told.select("bearing_rad", "detour_m", "detour_std_m", "caller").rows() == [
+    assert told.select("bearing_rad", "excess_path_m", "excess_path_std_m", "caller").rows() == [
         (0.5, 3.0, 0.2, "beacon"),
         (None, 7.0, 0.2, "caller2"),
         (0.1, None, None, None),

@@ -14,7 +14,7 @@ from pipistrelle.detection.logs.readers import Reader
 from pipistrelle.detection.logs.recording import LogCaller
 from pipistrelle.detection.scans import COLUMNS, make_scan, with_columns
 from pipistrelle.estimation.catalogue import is_there
-from pipistrelle.estimation.measurement import detour_of
+from pipistrelle.estimation.measurement import excess_path_of
 from pipistrelle.experiments.drives import NO_TRUTH
 from pipistrelle.experiments.runs.replay import as_heard_by, load, motion_of, replay, start_of
 from pipistrelle.experiments.runs.truth_files import read_truth, write_truth
@@ -312,23 +312,23 @@ TIMED = make_scan(
     np.array([0.1, 0.2, 0.3, np.nan]),
     range=np.array([4.0, np.nan, 5.0, np.nan]),
     caller=np.array([1, 1, 0, 2]),
-    detour=np.array([3.0, 4.0, np.nan, 7.0]),
-    detour_std=0.1,
+    excess_path=np.array([3.0, 4.0, np.nan, 7.0]),
+    excess_path_std=0.1,
 )
 
 
 @pytest.mark.parametrize(
-    ("strategy", "landmark", "detour"),
+    ("strategy", "landmark", "excess_path"),
     [
         ("fused", [1, 2, 3, 1], [3.0, 4.0, np.nan, 7.0]),
         ("passive", [1, 2, 3, 1], [3.0, 4.0, np.nan, 7.0]),
         ("active", [1, 3], [np.nan, np.nan]),
     ],
 )
-def test_detours_are_heard_by_who_listens_to_others(strategy, landmark, detour):
+def test_excess_paths_are_heard_by_who_listens_to_others(strategy, landmark, excess_path):
     (heard,) = as_heard_by([TIMED], strategy)
     assert heard.landmark.tolist() == landmark
-    np.testing.assert_array_equal(heard.detour, detour)
+    np.testing.assert_array_equal(heard.excess_path, excess_path)
 
 
 def test_what_is_not_listened_for_is_as_if_it_had_not_been_recorded():
@@ -342,7 +342,7 @@ def test_what_is_not_listened_for_is_as_if_it_had_not_been_recorded():
         (trial,) = replay(log, NO_TRUTH, ["fused"], ["ekf"], None, config).trials
         (scan,) = trial.scans
         assert scan.landmark.size == rows
-        assert np.isnan(scan.detour).all() != timing
+        assert np.isnan(scan.excess_path).all() != timing
 
 
 def test_rows_of_a_caller_that_moves_are_left_out():
@@ -474,11 +474,11 @@ def test_the_place_of_a_logs_caller_places_what_it_lights_up(estimator):
         pytest.skip(f"needs the extra {estimator}")
     posts, boat = np.array([[3.0, 4.0], [-2.0, 6.0], [5.0, -1.0]]), np.array([8.0, 5.0])
     _, bearing = range_and_bearing(np.zeros(3), posts)
-    e = np.array([detour_of(np.zeros(2), post, boat) for post in posts])
-    made = scan_with([1, 2, 3], bearing, time=1.0, caller=1, detour=e, detour_std=0.02)
+    e = np.array([excess_path_of(np.zeros(2), post, boat) for post in posts])
+    made = scan_with([1, 2, 3], bearing, time=1.0, caller=1, excess_path=e, excess_path_std=0.02)
     scan = replace(made, callers=np.array([-1, 9]))
     caller = LogCaller(name="boat", landmark=9, place=(8.0, 5.0))
-    told = FilterConfig(bearing_std=0.01, detour_std=0.02)
+    told = FilterConfig(bearing_std=0.01, excess_path_std=0.02)
     config = Config(listening=ListeningConfig(timing=True), filter=told)
     for known in (True, False):
         callers = (caller if known else replace(caller, place=None),)

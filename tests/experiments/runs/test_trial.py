@@ -167,12 +167,16 @@ def test_an_association_is_asked_with_the_belief_that_was_predicted_to_its_scan(
 
 
 def further(**columns):
-    """Return a scan whose second row is but a further detour of the first's landmark."""
-    known = {"caller": np.array([1, 2]), "detour": np.array([3.0, 5.0]), "detour_std": 0.1}
+    """Return a scan whose second row is but a further excess path of the first's landmark."""
+    known = {
+        "caller": np.array([1, 2]),
+        "excess_path": np.array([3.0, 5.0]),
+        "excess_path_std": 0.1,
+    }
     return scan_with([4, 4], [0.5, np.nan], time=1.5, **(known | columns))
 
 
-def test_a_row_may_be_but_a_further_detour():
+def test_a_row_may_be_but_a_further_excess_path():
     ledger = Ledger()
     run_filter(ledger, drive(5), [further()], RNG(7))
     assert 1.5 in ledger.log
@@ -181,14 +185,16 @@ def test_a_row_may_be_but_a_further_detour():
 @pytest.mark.parametrize(
     ("columns", "said"),
     [
-        ({"detour": np.array([3.0, np.nan])}, "numbers that no filter can use"),
-        ({"detour": np.array([3.0, np.inf])}, "numbers that no filter can use"),
+        ({"excess_path": np.array([3.0, np.nan])}, "numbers that no filter can use"),
+        ({"excess_path": np.array([3.0, np.inf])}, "numbers that no filter can use"),
         ({"distance": [np.nan, 4.0]}, "numbers that no filter can use"),
-        ({"detour_std": np.array([0.1, np.nan])}, "no standard deviations above 0"),
-        ({"detour_std": np.array([0.0, 0.1])}, "no standard deviations above 0"),
+        ({"excess_path_std": np.array([0.1, np.nan])}, "no standard deviations above 0"),
+        ({"excess_path_std": np.array([0.0, 0.1])}, "no standard deviations above 0"),
     ],
 )
-def test_a_row_of_nothing_and_a_detour_of_which_nobody_says_how_sure_are_refused(columns, said):
+def test_a_row_of_nothing_and_an_excess_path_of_which_nobody_says_how_sure_are_refused(
+    columns, said
+):
     with pytest.raises(InputError, match=rf"scan at 1\.5 s: found {said}.*\[4\]"):
         run_filter(Ledger(), drive(5), [further(**columns)], RNG(7))
 

@@ -428,7 +428,7 @@ def test_text_stands_out_from_its_ground(opened):
     ids=lambda screen: "-".join(screen),
 )
 def timing(browser, timed, request, tmp_path_factory):
-    """A page of a mission with detours, the one in front that has them, and its numbers."""
+    """A page of a mission with excess paths, the one in front that has them, and its numbers."""
     shown_now = playback(*timed)
     path = tmp_path_factory.mktemp("timed") / "view.html"
     path.write_text(written_page(shown_now), encoding="utf-8")
@@ -440,9 +440,9 @@ def timing(browser, timed, request, tmp_path_factory):
     page.context.close()
 
 
-def detours_of(estimate, frame, label):
-    rows = slice(*estimate.detours.first[frame - 1 : frame + 1])
-    return estimate.detours.numbers[rows][estimate.detours.landmark[rows] == label]
+def excess_paths_of(estimate, frame, label):
+    rows = slice(*estimate.excess_paths.first[frame - 1 : frame + 1])
+    return estimate.excess_paths.numbers[rows][estimate.excess_paths.landmark[rows] == label]
 
 
 def test_the_ellipses_of_a_frame_are_those_of_the_landmark_that_it_resolves(timing):
@@ -450,11 +450,11 @@ def test_the_ellipses_of_a_frame_are_those_of_the_landmark_that_it_resolves(timi
     counts = set()
     for frame in range(1, 41, 3):
         go(page, frame)
-        told = detours_of(estimate, frame, estimate.resolved[frame - 1])
+        told = excess_paths_of(estimate, frame, estimate.resolved[frame - 1])
         counts.add(len(told))
-        assert shapes(page, "detours") == shapes(page, "detour-ways") == len(told)
-        assert shapes(page, "detour-spot") == min(len(told), 1)
-        assert shapes(page, "detours", 1) == 0, "active sensing takes no detours"
+        assert shapes(page, "excess-paths") == shapes(page, "excess-ways") == len(told)
+        assert shapes(page, "excess-spot") == min(len(told), 1)
+        assert shapes(page, "excess-paths", 1) == 0, "active sensing takes no excess paths"
         *standing, boat = np.isfinite(estimate.callers[frame - 1, :, 0])
         stars, ellipse = np.sum([*standing, boat]), boat
         assert shapes(page, "believed-callers") == stars + ellipse
@@ -463,36 +463,36 @@ def test_the_ellipses_of_a_frame_are_those_of_the_landmark_that_it_resolves(timi
 
 def test_an_ellipse_is_about_vehicle_and_caller_and_as_long_as_the_way(timing):
     page, _, estimate = timing
-    told = [detours_of(estimate, i, estimate.resolved[i - 1]) for i in range(1, 41)]
+    told = [excess_paths_of(estimate, i, estimate.resolved[i - 1]) for i in range(1, 41)]
     frame = next(i for i, rows in enumerate(told, start=1) if len(rows) == 1)
     go(page, frame)
-    ((caller, detour),) = told[frame - 1]
+    ((caller, excess_path),) = told[frame - 1]
     place, vehicle = estimate.callers[frame - 1, int(caller), :2], estimate.pose[frame - 1, :2]
-    points = page.locator(".panel >> nth=0 >> svg.map >> nth=0 >> path.detours").evaluate(
+    points = page.locator(".panel >> nth=0 >> svg.map >> nth=0 >> path.excess-paths").evaluate(
         "path => Array.from({ length: 12 }, (_, i) =>"
         " path.getPointAtLength(i * path.getTotalLength() / 12)).map(({ x, y }) => [x, -y])"
     )
     for point in np.array(points):
         way = np.hypot(*(point - place)) + np.hypot(*(point - vehicle))
-        assert way == pytest.approx(np.hypot(*(place - vehicle)) + detour, rel=5e-3)
+        assert way == pytest.approx(np.hypot(*(place - vehicle)) + excess_path, rel=5e-3)
 
 
-def test_a_chosen_landmark_shows_its_own_detours(timing):
+def test_a_chosen_landmark_shows_its_own_excess_paths(timing):
     page, _, estimate = timing
-    labels = estimate.detours.landmark[slice(*estimate.detours.first[29:31])]
+    labels = estimate.excess_paths.landmark[slice(*estimate.excess_paths.first[29:31])]
     other = next(label for label in labels if label != estimate.resolved[29])
     go(page, 30)
     page.evaluate(f"() => choose({other})")
-    assert shapes(page, "detours") == len(detours_of(estimate, 30, other))
+    assert shapes(page, "excess-paths") == len(excess_paths_of(estimate, 30, other))
     ends = page.evaluate(f"() => panels[0].estimate.maps[29].get({other})[0].x")
-    assert middle(page, "detour-spot")[0] == pytest.approx(ends, abs=1e-2)
+    assert middle(page, "excess-spot")[0] == pytest.approx(ends, abs=1e-2)
     page.keyboard.press("Escape")
 
 
 def test_ellipses_are_hidden_and_shown_by_key_and_button(timing):
     page, _, _ = timing
     go(page, 40)
-    there, button = shapes(page, "detours"), page.locator("#ellipses")
+    there, button = shapes(page, "excess-paths"), page.locator("#ellipses")
     assert there > 0
 
     def press():
@@ -500,10 +500,12 @@ def test_ellipses_are_hidden_and_shown_by_key_and_button(timing):
 
     for hide, show in ((press, button.click), (button.click, press)):
         hide()
-        assert [shapes(page, name) for name in ("detours", "detour-ways", "detour-spot")] == [0] * 3
+        assert [shapes(page, name) for name in ("excess-paths", "excess-ways", "excess-spot")] == [
+            0
+        ] * 3
         assert button.get_attribute("aria-pressed") == "false"
         show()
-        assert shapes(page, "detours") == there
+        assert shapes(page, "excess-paths") == there
         assert button.get_attribute("aria-pressed") == "true"
 
 
@@ -513,7 +515,7 @@ def test_with_ellipses_nothing_is_wider_than_the_screen_and_all_callers_have_nam
     assert page.evaluate("document.documentElement.scrollWidth") <= inner
     names = page.locator("svg.map >> nth=0 >> text.name").all_text_contents()
     assert names == ["beacon", "mate", "boat"]
-    assert page.locator(".reading li b").nth(3).inner_text() == "A detour ellipse"
+    assert page.locator(".reading li b").nth(3).inner_text() == "An ellipse of an excess path"
     ratios = contrasts(page, ".reading b, .reading small, footer p, header button")
     assert [(ratio, what) for ratio, what in ratios if ratio < 4.5] == []
 

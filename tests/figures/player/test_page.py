@@ -46,17 +46,21 @@ def test_the_numbers_are_the_missions(played):
     assert held["farthest"] == 20.0
 
 
-def test_a_page_speaks_of_detours_only_where_some_were_heard(played, timed):
+def test_a_page_speaks_of_excess_paths_only_where_some_were_heard(played, timed):
     silent, told = page(played), page(playback(*timed))
-    for word in ('ellipses" type', "A detour ellipse", "E hides the detour ellipses"):
+    for word in (
+        'ellipses" type',
+        "An ellipse of an excess path",
+        "E hides the ellipses of excess paths",
+    ):
         assert word not in silent
         assert word in told
     for one in numbers(silent)["estimates"]:
-        assert not {"callers", "detours", "resolved"} & one.keys(), "no number more than before"
+        assert not {"callers", "excessPaths", "resolved"} & one.keys(), "no number more than before"
     active, fused = numbers(told)["estimates"]
     assert "callers" in active
-    assert {"callers", "detours", "resolved"} <= fused.keys()
-    assert "detours" not in active
+    assert {"callers", "excessPaths", "resolved"} <= fused.keys()
+    assert "excessPaths" not in active
 
 
 def test_the_same_mission_gives_the_same_bytes(played):

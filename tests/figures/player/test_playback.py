@@ -12,7 +12,7 @@ from pipistrelle.detection.scans import rows_of as rows_of_scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.experiments.drives import NO_TRUTH
 from pipistrelle.figures.animation import pruned
-from pipistrelle.figures.detours import callers_at, resolved
+from pipistrelle.figures.excess_paths import callers_at, resolved
 from pipistrelle.figures.player.playback import MOST_PARTICLES, playback
 from pipistrelle.figures.recorder import MissionRecorder
 
@@ -47,10 +47,10 @@ def test_every_frame_of_every_estimate_is_there(watched, played):
             np.testing.assert_array_equal(numbers[:, 5], believed.weight)
 
 
-def test_further_detours_are_not_drawn_and_leave_nothing_that_is_no_number(watched, played):
+def test_further_excess_paths_are_not_drawn_and_leave_nothing_that_is_no_number(watched, played):
     done, snapshots = watched
     timed = {
-        key: [replace(frame, scan=with_detour(frame.scan)) for frame in frames]
+        key: [replace(frame, scan=with_excess_path(frame.scan)) for frame in frames]
         for key, frames in snapshots.items()
     }
     for one, other in zip(playback(done, timed).estimates, played.estimates, strict=True):
@@ -58,8 +58,8 @@ def test_further_detours_are_not_drawn_and_leave_nothing_that_is_no_number(watch
         assert np.isfinite(one.heard.numbers[:, 0]).all()
 
 
-def with_detour(scan):
-    """Return a scan with one row more, if it has any, which is but a detour."""
+def with_excess_path(scan):
+    """Return a scan with one row more, if it has any, which is but an excess path."""
     more = rows_of_scan(scan, np.append(np.arange(scan.landmark.size), 0)[: scan.landmark.size * 2])
     more.numbers[:, scan.landmark.size :] = np.nan
     return more
@@ -271,12 +271,12 @@ def test_paths_as_they_were_revised_stand_at_their_frames_and_the_last_is_the_tr
     assert estimate.start[0] == trial.track.pose.mean[0, 0]
 
 
-def test_detours_are_laid_out_with_where_their_callers_are_believed_to_be(timed):
+def test_excess_paths_are_laid_out_with_where_their_callers_are_believed_to_be(timed):
     again, snapshots = timed
     shown = playback(again, snapshots)
     assert [place.ndim for *_, place in shown.callers] == [1, 1, 2]
     active, fused = shown.estimates
-    assert len(active.detours.landmark) == 0
+    assert len(active.excess_paths.landmark) == 0
     frames = snapshots["fused", "ekf"]
     assert fused.resolved.tolist() == resolved(frames)
     assert fused.callers.shape == (40, 3, 5)
@@ -287,18 +287,18 @@ def test_detours_are_laid_out_with_where_their_callers_are_believed_to_be(timed)
         believed = callers_at(frames[i])
         np.testing.assert_array_equal(fused.callers[i, :, :2], believed.mean[1:])
         np.testing.assert_array_equal(fused.callers[i, :, 3], believed.covariance[1:, 0, 1])
-        labels, numbers = rows_of(fused.detours, i)
+        labels, numbers = rows_of(fused.excess_paths, i)
         assert np.unique(labels, return_counts=True)[1].max() <= 2
         scan = frames[i].scan
-        for label, (caller, detour) in zip(labels, numbers, strict=True):
-            (row,) = np.flatnonzero((scan.landmark == label) & (scan.detour == detour))
+        for label, (caller, excess_path) in zip(labels, numbers, strict=True):
+            (row,) = np.flatnonzero((scan.landmark == label) & (scan.excess_path == excess_path))
             assert scan.caller[row] - 1 == caller
 
 
-def test_without_detours_nothing_is_laid_out_for_them(played):
+def test_without_excess_paths_nothing_is_laid_out_for_them(played):
     for estimate in played.estimates:
         assert estimate.callers is None
-        assert len(estimate.detours.landmark) == 0
+        assert len(estimate.excess_paths.landmark) == 0
         assert set(estimate.resolved) == {-1}
 
 

@@ -57,13 +57,13 @@ def test_a_recording_tells_of_all_that_the_page_shows(played, tmp_path):
     assert {"/fused_fastslam/particles", "/fused_ekf/beam"} <= found
     assert "/passive_ekf/beam" not in found
     assert {"/truth/path", "/truth/vehicle", "/truth/landmarks", "/truth/beacon"} <= found
-    assert not {name for name in found if name.endswith(("/detours", "/callers"))}
+    assert not {name for name in found if name.endswith(("/excess_paths", "/callers"))}
     errors = {f"/{what}/active_ekf/{part}" for what in ("position", "heading")
               for part in ("error", "bound")}  # fmt: skip
     assert errors <= found
 
 
-def test_a_recording_tells_of_detours_where_some_were_heard(timed, tmp_path):
+def test_a_recording_tells_of_excess_paths_where_some_were_heard(timed, tmp_path):
     rerun = pytest.importorskip(
         "rerun", reason="rerun-sdk is not installed: pip install 'pipistrelle[view]'"
     )
@@ -73,5 +73,5 @@ def test_a_recording_tells_of_detours_where_some_were_heard(timed, tmp_path):
     file = tmp_path / "mission.rrd"
     file.write_bytes(recording(replace(told, callers=(*nowhere, *told.callers[1:]))))
     found = entities(file)
-    assert {"/fused_ekf/detours", "/fused_ekf/callers", "/truth/mate", "/truth/boat"} <= found
+    assert {"/fused_ekf/excess_paths", "/fused_ekf/callers", "/truth/mate", "/truth/boat"} <= found
     assert "/truth/beacon" not in found, "nobody knows where"

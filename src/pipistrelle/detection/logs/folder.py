@@ -32,7 +32,7 @@ from pipistrelle.detection.logs.recording import (
     LogCaller,
     assemble,
 )
-from pipistrelle.detection.logs.text_tables import read_table, table_text
+from pipistrelle.detection.logs.text_tables import FORMER_NAMES, read_table, table_text
 from pipistrelle.files import read_text
 from pipistrelle.own_files import LOG, OwnFiles
 from pipistrelle.refusals import expectation, meant, refusal, shown, values_expected
@@ -65,9 +65,10 @@ SHA256SUMS        what was written here: nothing else is ever overwritten
 Bearings are relative to the heading, counter-clockwise. Where a measurement has no bearing_std or
 range_std of its own, that of log.toml holds.
 """
-_DETOURS = """
-A detour [m] is how much longer the way of a caller's sound over the landmark is than the straight
-one; log.toml says which landmark each caller is. A row without a bearing is one detour more.
+_EXCESS_PATHS = """
+An excess path [m] is how much longer the way of a caller's sound over the landmark is than the
+straight one; log.toml says which landmark each caller is. A row without a bearing is one excess
+path more.
 """
 _HELD = "a row holds until the next one's time, the last only ends the log"
 _FOLLOWED = "what counts is the way from row to row, wherever they begin"
@@ -106,7 +107,7 @@ class _Settings(Section):
     initial_pose_std: _Triple_std
     range_std: DistanceStd
     bearing_std: AngleStd
-    detour_std: DistanceStd | None = None
+    excess_path_std: DistanceStd | None = None
     range_bounds: _Bounds
     step: Annotated[Positive, Field(le=LONGEST_STEP)] | None = None
     gate: Probability | None = None
@@ -203,7 +204,7 @@ def read_log(folder: Path) -> Log:
     >>> log.scans[0].time, log.scans[0].landmark, log.scans[0].range
     (0.5, array([7]), array([nan]))
     """
-    settings = _read_settings(folder / "log.toml")
+    settings, former = _read_settings(folder / "log.toml")
     columns, stds = ("time", *_ODOMETRY[settings.motion]), _NOISY[settings.motion]
     optional = MOTION_COVARIANCE if settings.motion == "poses" else ()
     names = tuple(caller.name for caller in settings.callers)
@@ -222,6 +223,7 @@ def read_log(folder: Path) -> Log:
         measured,
         step=settings.step,
         name=folder.resolve().name,
+        former_names=(*measured.former, *former),
         wheelbase=getattr(settings, "wheelbase", 1.0),
         control_std=tuple(getattr(settings, f"{name}_std") for name in stds),
         **told,
@@ -282,7 +284,7 @@ def log_files(log: Log) -> dict[str, str]:
     measured = _measurement_columns(log)
     columns = {"odometry": ",".join(driven), "measurements": ",".join(measured)}
     held = _FOLLOWED if log.motion == "poses" else _HELD
-    more = _DETOURS if "detour" in measured else ""
+    more = _EXCESS_PATHS if "excess_path" in measured else ""
     return {
         "odometry.csv": table_text(tuple(driven), *driven.values()),
         "measurements.csv": table_text(tuple(measured), *measured.values()),
@@ -291,12 +293,17 @@ def log_files(log: Log) -> dict[str, str]:
     }
 
 
-def _read_settings(path: Path) -> _Settings:
-    """Settings of ``log.toml``; the first error, unknown keys before missing ones."""
+def _read_settings(path: Path) -> tuple[_Settings, tuple[str, ...]]:
+    """Return the settings of ``log.toml``, and which keys it calls by former names.
+
+    Of several errors the first is told, unknown keys before missing ones.
+    """
     raw = parse_toml(read_text(path), path)
+    former = tuple(key for key in raw if FORMER_NAMES.get(key, key) not in raw)
+    raw |= {FORMER_NAMES[key]: raw.pop(key) for key in former}
     model = _SETTINGS.get(str(raw.get("motion")), _UnicycleSettings)
     try:
-        return model.model_validate(raw)
+        return model.model_validate(raw), former
     except ValidationError as error:
         faults = error.errors(include_url=False)
     rank = {"format": 0, "motion": 1}

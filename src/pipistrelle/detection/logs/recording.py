@@ -25,7 +25,7 @@ from pipistrelle.refusals import refusal
 
 MEASUREMENT = ("time", "landmark", "bearing", "range")
 """What is said of a measurement: when it was made, and the columns of its scan."""
-STATED = ("bearing_std", "range_std", "detour", "detour_std")
+STATED = ("bearing_std", "range_std", "excess_path", "excess_path_std")
 """What may be said besides: how surely it was measured, and how much later than the direct call it
 came, as a way of sound."""
 CALLER = "caller"
@@ -84,7 +84,7 @@ class Log:
     """Range std [m]."""
     bearing_std: float
     """Bearing std [rad]."""
-    detour_std: float | None = None
+    excess_path_std: float | None = None
     """None: not said [m]."""
     range_bounds: tuple[float, float]
     """Nearest and farthest range of a passive landmark [m]."""
@@ -96,6 +96,8 @@ class Log:
     """Rows that were dropped, by reason."""
     turned: int = 0
     """Bearings beyond a whole turn, which are wrapped as any."""
+    former_names: tuple[str, ...] = ()
+    """Columns and keys that the log calls by former names (`text_tables.FORMER_NAMES`)."""
 
 
 def assemble(
@@ -114,8 +116,9 @@ def assemble(
     odometry : Table of ``time`` and two controls, or of poses
         Of ``motion = "poses"`` as `motions_between` takes them.
     measurements : Table of ``time``, ``landmark``, ``bearing`` and ``range``
-        Perhaps with ``bearing_std``, ``range_std``, ``detour``, ``detour_std`` and ``caller``, its
-        number, NaN where nobody says. A row without a bearing is a further detour of a landmark.
+        Perhaps with ``bearing_std``, ``range_std``, ``excess_path``, ``excess_path_std`` and
+        ``caller``, its number, NaN where nobody says. A row without a bearing is a further excess
+        path of a landmark.
     step : [s]
         Length of the steps into which rows are merged; None: one step each.
     span : (start, end) [s]
@@ -133,8 +136,8 @@ def assemble(
     ------
     InputError
         If nothing of the odometry or of the measurements is left, a landmark is measured twice at
-        one time by the same call, a detour is of nobody's call, or times can be no seconds; what
-        `motions_between` refuses.
+        one time by the same call, an excess path is of nobody's call, or times can be no seconds;
+        what `motions_between` refuses.
     """
     check_seconds(odometry)
     check_seconds(measurements, math.inf)
@@ -245,29 +248,29 @@ def _mean_controls(
 
 
 def _of_callers(measurements: Table, callers: tuple[LogCaller, ...]) -> Table:
-    """Caller numbers of all rows; invalid detours and empty rows are refused."""
+    """Caller numbers of all rows; invalid excess paths and empty rows are refused."""
     column, nothing = measurements.column, np.full(len(measurements.line), np.nan)
-    caller, detour = column.get(CALLER, nothing), column.get("detour", nothing)
+    caller, excess_path = column.get(CALLER, nothing), column.get("excess_path", nothing)
     own = np.array([UNLABELLED, *(one.landmark for one in callers)])
     whose = own[np.where(np.isnan(caller), OWN, caller).astype(np.int64)]
-    unheard = np.isnan(column["bearing"]) & (np.isnan(detour) | ~np.isnan(column["range"]))
+    unheard = np.isnan(column["bearing"]) & (np.isnan(excess_path) | ~np.isnan(column["range"]))
     for wrong, found, expected, fix in (
         (
             unheard,
             "bearing ''",
-            "a finite number, or a further detour alone, without a range",
+            "a finite number, or a further excess path alone, without a range",
             "correct the field",
         ),
         (
-            ~np.isnan(detour) & np.isnan(caller),
-            "a detour of nobody's call",
+            ~np.isnan(excess_path) & np.isnan(caller),
+            "an excess path of nobody's call",
             "the name of a caller beside it",
             "add it in the column 'caller', and to [[callers]] of log.toml",
         ),
         (
-            ~np.isnan(detour) & ~np.isnan(caller) & (whose == column["landmark"]),
-            "a detour of a call over the caller itself",
-            "detours over other landmarks",
+            ~np.isnan(excess_path) & ~np.isnan(caller) & (whose == column["landmark"]),
+            "an excess path of a call over the caller itself",
+            "excess paths over other landmarks",
             "leave the field of one that came straight empty",
         ),
     ):

@@ -26,8 +26,8 @@ _BOUNDS = {
     "range": ("m", 1.0 / LARGEST, FARTHEST),
     "bearing_std": ("rad", LEAST_STD, WIDEST),
     "range_std": ("m", LEAST_STD, FARTHEST),
-    "detour": ("m", 0.0, FARTHEST),
-    "detour_std": ("m", LEAST_STD, FARTHEST),
+    "excess_path": ("m", 0.0, FARTHEST),
+    "excess_path_std": ("m", LEAST_STD, FARTHEST),
     "radius": ("m", 1.0 / LARGEST, LARGEST),
     "velocity": ("m/s", -FASTEST, FASTEST),
     "speed": ("m/s", -FASTEST, FASTEST),
@@ -35,6 +35,8 @@ _BOUNDS = {
     "steering": ("rad", -WIDEST, WIDEST),
 }
 """Unit, least and most of a column's numbers."""
+FORMER_NAMES = MappingProxyType({"detour": "excess_path", "detour_std": "excess_path_std"})
+"""What columns and keys of logs were called, and what they are called now."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,6 +48,8 @@ class Table:
     """Line of each row in the file, from 1."""
     column: dict[str, np.ndarray]
     """Values by column; labels are integers, what is missing is NaN."""
+    former: tuple[str, ...] = ()
+    """Columns that the file calls by a former name (`FORMER_NAMES`)."""
 
 
 def read_table(
@@ -98,9 +102,12 @@ def read_table(
     """
     lines = read_text(path).splitlines()
     content = [(i, line) for i, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]
+    former: tuple[str, ...] = ()
     if content and separator:
         line, header = content.pop(0)
-        names = [name.strip().strip('"') for name in header.split(separator)]
+        found = [name.strip().strip('"') for name in header.split(separator)]
+        former = tuple(name for name in found if name in FORMER_NAMES)
+        names = [FORMER_NAMES.get(name, name) for name in found]
         more = tuple(name for name in optional if name not in columns)
         extra, there = names[len(columns) :], [name for name in more if name in names]
         sound = extra == there if in_order else sorted(extra) == sorted(there)
@@ -121,7 +128,9 @@ def read_table(
         values = np.array(rows)
     column = dict(zip(columns, values.T.copy(), strict=True))
     column |= {name: np.full(len(values), np.nan) for name in optional if name not in column}
-    table = Table(path=path, line=np.array([line for line, _ in content]), column=column)
+    table = Table(
+        path=path, line=np.array([line for line, _ in content]), column=column, former=former
+    )
     _check_columns(table)
     return table
 

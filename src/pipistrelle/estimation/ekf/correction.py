@@ -1,9 +1,9 @@
 """Correction of one Gaussian over a pose and the members of all landmarks by a scan.
 
 Measurements are used one by one, each at the current mean. Landmarks of the map come first, in
-the order of the scan. New landmarks are then placed from the corrected pose. Last, detours correct
-what is placed and weigh the members of rays (`tdoa_frame`). A bearing that has placed a landmark
-together with a detour is not used a second time.
+the order of the scan. New landmarks are then placed from the corrected pose. Last, excess paths
+correct what is placed and weigh the members of rays (`tdoa_frame`). A bearing that has placed a
+landmark together with an excess path is not used a second time.
 """
 
 import math
@@ -38,11 +38,11 @@ from pipistrelle.estimation.ekf.huber import inflated
 from pipistrelle.estimation.ekf.members import Scratch, members_of, scratch_for
 from pipistrelle.estimation.ekf.merging import merge_members
 from pipistrelle.estimation.ekf.tdoa_frame import (
-    FrameDetours,
-    added_by_detour,
-    correct_by_detour,
-    frame_detours,
-    placed_by_detour,
+    FrameExcessPaths,
+    added_by_excess_path,
+    correct_by_excess_path,
+    frame_excess_paths,
+    placed_by_excess_path,
 )
 from pipistrelle.estimation.measurement import (
     Columns,
@@ -258,20 +258,20 @@ def _take_in(
     state: State,
     heard: Measurements,
     known: Bool[np.ndarray, " m"],
-    frame: FrameDetours | None,
+    frame: FrameExcessPaths | None,
     params: UpdateParams,
     scratch: Scratch,
 ) -> Whole:
     """Correct with landmarks of the map, then append new ones; return how many rows were gated.
 
-    Where a scan has detours, they place landmarks first, and the others are used last.
+    Where a scan has excess paths, they place landmarks first, and the others are used last.
     """
     gated = 0
     for m in range(heard.landmark.size):
         if known[m]:
             row, placed = row_of(heard, m), False
             if frame is not None:
-                placed = placed_by_detour(state, row, frame, params.robust, scratch)
+                placed = placed_by_excess_path(state, row, frame, params.robust, scratch)
             if not placed:
                 gated += _correct_known(state, row, params, scratch)
     flush(state.joint, 3 + 2 * state.members[0])
@@ -279,14 +279,14 @@ def _take_in(
         if not known[m]:
             row, placed, moves = row_of(heard, m), False, False
             if frame is not None:
-                placed = added_by_detour(state, row, frame, params.robust)
+                placed = added_by_excess_path(state, row, frame, params.robust)
                 moves = row.landmark in frame.moving
             if not placed:
                 _add_new(state, row, params, moves)
     if frame is not None:
         for d in range(frame.landmark.size):
             if not frame.used[d]:
-                gated += correct_by_detour(state, frame, d, params, scratch)
+                gated += correct_by_excess_path(state, frame, d, params, scratch)
         flush(state.joint, 3 + 2 * state.members[0])
     return gated
 
@@ -322,7 +322,7 @@ def corrected(
     if timings is None:
         gated = _take_in(state, heard, known, None, params, scratch)
     else:
-        gated = _take_in(state, heard, known, frame_detours(columns, timings), params, scratch)
+        gated = _take_in(state, heard, known, frame_excess_paths(columns, timings), params, scratch)
     joint.mean[2], members = wrap_angle(joint.mean[2]), state.members[0]
     mean, covariance = gaussian_of(joint, 3 + 2 * members)
     squared, degrees = scratch.innovations

@@ -1,10 +1,10 @@
-r"""Time difference of arrival: what one detour says about a Gaussian.
+r"""Time difference of arrival: what one excess path says about a Gaussian.
 
-A detour :math:`e = |b - l| + |l - p| - |b - p|` links the vehicle p, the landmark l and the caller
-b, all parts of the state; the heading does not enter. With its slopes :math:`e_l, e_b` by landmark
-and caller, and :math:`e_p = -e_l - e_b`,
+An excess path :math:`e = |b - l| + |l - p| - |b - p|` links the vehicle p, the landmark l and the
+caller b, all parts of the state; the heading does not enter. With its slopes :math:`e_l, e_b` by
+landmark and caller, and :math:`e_p = -e_l - e_b`,
 
-- it **corrects** all three where landmark and caller are placed (`correct_detour`), to second
+- it **corrects** all three where landmark and caller are placed (`correct_excess_path`), to second
   order: a path of length L with the variance t across it is longer by :math:`t / 2L` than that of
   its means, with the square of that as variance (Bar-Shalom, Li & Kirubarajan 2001,
   Sec. 10.3.2);
@@ -16,13 +16,13 @@ and caller, and :math:`e_p = -e_l - e_b`,
             k = e_x \cdot u, \quad a = -\frac{e_y}{k}, \quad
             q = r \left( u_\perp - u \frac{e_x \cdot u_\perp}{k} \right)
 
-  correlates it with the caller as with the vehicle (`place_by_detour`). Between vehicle and caller
-  k vanishes and the range is undetermined. So its standard deviation must be at most a tenth of
-  it, and the detour must be clearly above 0 (`MIN_TDOA_SIGMAS`): a detour of 0 with an error has a
-  range, too, which only seems sure;
-- else it **weighs** the members of a ray (`weigh_by_detour`).
+  correlates it with the caller as with the vehicle (`place_by_excess_path`). Between vehicle and
+  caller k vanishes and the range is undetermined. So its standard deviation must be at most a tenth
+  of it, and the excess path must be clearly above 0 (`MIN_TDOA_SIGMAS`): an excess path of 0 with
+  an error has a range, too, which only seems sure;
+- else it **weighs** the members of a ray (`weigh_by_excess_path`).
 
-Between two rays a detour is not used: some pair of members fits any value.
+Between two rays an excess path is not used: some pair of members fits any value.
 """
 
 import math
@@ -46,15 +46,15 @@ from pipistrelle.estimation.measurement import (
     HUBER_K,
     MIN_TDOA_SIGMAS,
     NEAREST,
-    caller_range_by_detour,
-    detour_slopes,
-    range_by_detour,
+    caller_range_by_excess_path,
+    excess_path_slopes,
+    range_by_excess_path,
 )
 from pipistrelle.estimation.rays import log_likelihood
 from pipistrelle.jit import Flag, Whole, no_alloc
 
 MAX_RELATIVE_RANGE_STD = 0.1
-"""A detour places a point if the range has at most this standard deviation, divided by the
+"""An excess path places a point if the range has at most this standard deviation, divided by the
 range."""
 
 
@@ -70,9 +70,9 @@ def _bend(dx: float, dy: float, xx: float, xy: float, yy: float) -> float:
 def _expected(
     joint: Joint, size: Whole, i: Whole, ib: Whole, w: Float[np.ndarray, " m"]
 ) -> tuple[float, float]:
-    """Detour over the point at index i of the caller at ib, and its variance; P H^T goes into w."""
+    """Excess path over the point at i of the caller at ib, and its variance; P H^T goes into w."""
     mean = joint.mean
-    detour, lx, ly, bx, by = detour_slopes(
+    excess_path, lx, ly, bx, by = excess_path_slopes(
         mean[0], mean[1], mean[i], mean[i + 1], mean[ib], mean[ib + 1]
     )
     px, py = -lx - bx, -ly - by
@@ -82,12 +82,12 @@ def _expected(
     for a in range(size):
         w[a] = px * p0[a] + py * p1[a] + lx * li[a] + ly * lj[a] + bx * bi[a] + by * bj[a]
     variance = px * w[0] + py * w[1] + lx * w[i] + ly * w[i + 1] + bx * w[ib] + by * w[ib + 1]
-    return detour, variance
+    return excess_path, variance
 
 
 @no_alloc
 def _bends(joint: Joint, size: Whole, i: Whole, ib: Whole) -> tuple[float, float]:
-    """Second-order bias of the detour, and an upper bound of the variance that goes with it."""
+    """Second-order bias of the excess path, and an upper bound of its variance."""
     mean, p0, p1 = joint.mean, joint.covariance[0], joint.covariance[1]
     li, lj = point_rows(joint, size, i)
     bi, bj = point_rows(joint, size, ib)
@@ -108,17 +108,17 @@ def _bends(joint: Joint, size: Whole, i: Whole, ib: Whole) -> tuple[float, float
 
 
 @no_alloc
-def correct_detour(
+def correct_excess_path(
     joint: Joint,
     size: Whole,
     i: Whole,
     ib: Whole,
-    detour: float,
+    excess_path: float,
     variance: float,
     bound: float,
     robust: bool,
 ) -> Whole:
-    """Correct with a detour over the point at index i of the caller at ib; GATED or APPLIED.
+    """Correct with an excess path over the point at index i of the caller at ib; GATED or APPLIED.
 
     ``robust`` raises its variance by Huber's rule.
     """
@@ -127,7 +127,7 @@ def correct_detour(
     w = joint.W[joint.taken[WAITING]]
     expected, spread = _expected(joint, size, i, ib, w)
     longer, wider = _bends(joint, size, i, ib)
-    innovation, S = detour - expected - longer, spread + wider + variance
+    innovation, S = excess_path - expected - longer, spread + wider + variance
     if robust:
         S *= max(abs(innovation) / (HUBER_K * math.sqrt(S)), 1.0)
     if innovation * innovation > bound * S:
@@ -143,10 +143,10 @@ def correct_detour(
 
 
 @no_alloc
-def correct_covariance_by_detour(
+def correct_covariance_by_excess_path(
     joint: Joint, size: Whole, i: Whole, ib: Whole, variance: float
 ) -> None:
-    """Correct with a detour that is as expected, to first order: only the covariance changes."""
+    """Correct only the covariance, with an excess path that is as expected to first order."""
     if joint.taken[WAITING] == MAX_WAITING:
         flush(joint, size)
     w = joint.W[joint.taken[WAITING]]
@@ -158,16 +158,16 @@ def correct_covariance_by_detour(
 
 
 @no_alloc
-def weigh_by_detour(
+def weigh_by_excess_path(
     state: State,
     ray: tuple[Whole, Whole],
     other: Whole,
     of_caller: Flag,
-    detour: float,
+    excess_path: float,
     variance: float,
     likelihood: Float[np.ndarray, " m"],
 ) -> None:
-    """Write the log likelihood of a detour for each member of a ray; the other end is placed.
+    """Write the log likelihood of an excess path for each member of a ray; the other end is placed.
 
     ``ray`` is its first member and their number, ``other`` a member; with ``of_caller`` the ray is
     the caller's.
@@ -181,15 +181,15 @@ def weigh_by_detour(
         i, ib = (iy, ix) if of_caller else (ix, iy)
         expected, spread = _expected(joint, size, i, ib, w)
         longer, wider = _bends(joint, size, i, ib)
-        off, S = detour - expected - longer, spread + wider + variance
+        off, S = excess_path - expected - longer, spread + wider + variance
         likelihood[j] = log_likelihood(off, S, False)
 
 
 @no_alloc
 def _leverage(
-    joint: Joint, iy: Whole, of_caller: Flag, detour: float, direction: float
+    joint: Joint, iy: Whole, of_caller: Flag, excess_path: float, direction: float
 ) -> tuple[float, float, float, float, float]:
-    """Range r of a point by a detour and a direction, with a, k and e_x . u_perp (module's head).
+    """Range r of a point by excess path and direction, with a, k and e_x . u_perp (module's head).
 
     The point placed at index iy is the other end; the range is 0 where there is none.
     """
@@ -197,16 +197,16 @@ def _leverage(
     c, s = math.cos(direction), math.sin(direction)
     dx, dy = mean[iy] - mean[0], mean[iy + 1] - mean[1]
     if of_caller:
-        r = caller_range_by_detour(detour, dx, dy, c, s)
+        r = caller_range_by_excess_path(excess_path, dx, dy, c, s)
     else:
-        r = range_by_detour(detour, dx, dy, c, s)
+        r = range_by_excess_path(excess_path, dx, dy, c, s)
     if not NEAREST < r < math.inf:
         return 0.0, 0.0, 0.0, 0.0, 0.0
     x, y = mean[0] + r * c, mean[1] + r * s
     if of_caller:
-        _, yx, yy, xx, xy = detour_slopes(mean[0], mean[1], mean[iy], mean[iy + 1], x, y)
+        _, yx, yy, xx, xy = excess_path_slopes(mean[0], mean[1], mean[iy], mean[iy + 1], x, y)
     else:
-        _, xx, xy, yx, yy = detour_slopes(mean[0], mean[1], x, y, mean[iy], mean[iy + 1])
+        _, xx, xy, yx, yy = excess_path_slopes(mean[0], mean[1], x, y, mean[iy], mean[iy + 1])
     k = xx * c + xy * s
     if k == 0.0:
         return 0.0, 0.0, 0.0, 0.0, 0.0
@@ -221,17 +221,17 @@ def relative_range_std(
     of_caller: Flag,
     measured: tuple[float, float, float, float],
 ) -> float:
-    """Standard deviation of the range by a detour and a bearing, divided by the range; or infinity.
+    """Relative standard deviation of a range by excess path and bearing; or infinity.
 
-    ``measured`` is detour, its variance, bearing and its variance. With ``of_caller`` the caller's
-    range is asked, and a landmark is placed at index iy. It is infinite above
-    `MAX_RELATIVE_RANGE_STD` and where the detour may be 0 (`MIN_TDOA_SIGMAS`).
+    ``measured`` is excess path, its variance, bearing and its variance. With ``of_caller`` the
+    caller's range is asked, and a landmark is placed at index iy. It is infinite above
+    `MAX_RELATIVE_RANGE_STD` and where the excess path may be 0 (`MIN_TDOA_SIGMAS`).
     """
-    detour, along, bearing, across = measured
+    excess_path, along, bearing, across = measured
     mean, turns = joint.mean, joint.turns
-    if detour <= MIN_TDOA_SIGMAS * math.sqrt(along):
+    if excess_path <= MIN_TDOA_SIGMAS * math.sqrt(along):
         return math.inf
-    r, ax, ay, k, side = _leverage(joint, iy, of_caller, detour, mean[2] + bearing)
+    r, ax, ay, k, side = _leverage(joint, iy, of_caller, excess_path, mean[2] + bearing)
     if r == 0.0:
         return math.inf
     p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
@@ -250,7 +250,7 @@ def relative_range_std(
 
 
 @no_alloc
-def place_by_detour(
+def place_by_excess_path(
     joint: Joint,
     size: Whole,
     i: Whole,
@@ -258,16 +258,16 @@ def place_by_detour(
     of_caller: Flag,
     measured: tuple[float, float, float, float],
 ) -> None:
-    """Write a member at index i by a detour, a bearing and the point at index iy.
+    """Write a member at index i by an excess path, a bearing and the point at index iy.
 
     The arguments are those of `relative_range_std`, which has found the range sure. Nothing may
     wait.
     """
-    detour, along, bearing, across = measured
+    excess_path, along, bearing, across = measured
     mean, covariance, turns = joint.mean, joint.covariance, joint.turns
     direction = mean[2] + bearing
     c, s = math.cos(direction), math.sin(direction)
-    r, ax, ay, k, side = _leverage(joint, iy, of_caller, detour, direction)
+    r, ax, ay, k, side = _leverage(joint, iy, of_caller, excess_path, direction)
     qx, qy = r * (-s - c * side / k), r * (c - s * side / k)
     mean[i], mean[i + 1] = mean[0] + r * c, mean[1] + r * s
     for b in range(size):

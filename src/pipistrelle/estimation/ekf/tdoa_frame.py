@@ -1,6 +1,6 @@
-"""The detours of one scan: each places a landmark, corrects what is placed, or weighs a ray.
+"""The excess paths of one scan: each places a landmark, corrects what is placed, or weighs a ray.
 
-What one detour says about a Gaussian is in `tdoa`.
+What one excess path says about a Gaussian is in `tdoa`.
 """
 
 import math
@@ -13,12 +13,12 @@ from pipistrelle.estimation.ekf.delayed_initialization import WAITING_WEIGHT
 from pipistrelle.estimation.ekf.gaussian import APPLIED, State, drop_members
 from pipistrelle.estimation.ekf.members import Scratch, members_of
 from pipistrelle.estimation.ekf.tdoa import (
-    correct_detour,
-    place_by_detour,
+    correct_excess_path,
+    place_by_excess_path,
     relative_range_std,
-    weigh_by_detour,
+    weigh_by_excess_path,
 )
-from pipistrelle.estimation.measurement import Columns, Row, Timings, detours
+from pipistrelle.estimation.measurement import Columns, Row, Timings, excess_paths
 from pipistrelle.estimation.rays import UpdateParams, survivors, weigh_and_share
 from pipistrelle.jit import Flag, Whole, kernel, no_alloc
 
@@ -27,24 +27,24 @@ ROBUST_BEARING_FACTOR = 3.0
 place that is wrong but seems sure makes all others wrong."""
 
 
-class FrameDetours(NamedTuple):
-    """The detours of a scan, and the labels of callers that move."""
+class FrameExcessPaths(NamedTuple):
+    """The excess paths of a scan, and the labels of callers that move."""
 
     landmark: Int[np.ndarray, " d"]
     caller: Int[np.ndarray, " d"]
-    detour: Float[np.ndarray, " d"]  # [m]
+    excess_path: Float[np.ndarray, " d"]  # [m]
     variance: Float[np.ndarray, " d"]  # [m^2]
-    used: Bool[np.ndarray, " d"]  # whether a detour has placed something
+    used: Bool[np.ndarray, " d"]  # whether an excess path has placed something
     moving: Int[np.ndarray, " v"]
 
 
 @kernel
-def frame_detours(columns: Columns, timings: Timings) -> FrameDetours:
-    """Return the detours of a scan, none of them used."""
-    heard = detours(columns, timings)
+def frame_excess_paths(columns: Columns, timings: Timings) -> FrameExcessPaths:
+    """Return the excess paths of a scan, none of them used."""
+    heard = excess_paths(columns, timings)
     used = np.zeros(heard.landmark.size, dtype=np.bool_)
-    return FrameDetours(
-        heard.landmark, heard.caller, heard.detour, heard.variance, used, timings[2]
+    return FrameExcessPaths(
+        heard.landmark, heard.caller, heard.excess_path, heard.variance, used, timings[2]
     )
 
 
@@ -56,8 +56,8 @@ def _single(state: State, label: Whole) -> Whole:
 
 
 @no_alloc
-def _surest(state: State, row: Row, frame: FrameDetours, robust: bool) -> Whole:
-    """Return the detour that gives the range of a row's landmark most surely; -1 where none does.
+def _surest(state: State, row: Row, frame: FrameExcessPaths, robust: bool) -> Whole:
+    """Return the excess path that gives the range of a row's landmark most surely, or -1.
 
     It is over this landmark, of a placed caller, or of this landmark's own call, over a placed one.
     ``robust``: it must be sure even if the bearing's std is larger by `ROBUST_BEARING_FACTOR`.
@@ -73,7 +73,7 @@ def _surest(state: State, row: Row, frame: FrameDetours, robust: bool) -> Whole:
         other = _single(state, frame.landmark[d] if of_caller else frame.caller[d])
         if other < 0:
             continue
-        measured = (frame.detour[d], frame.variance[d], row.bearing, across)
+        measured = (frame.excess_path[d], frame.variance[d], row.bearing, across)
         share = relative_range_std(state.joint, size, 3 + 2 * other, of_caller, measured)
         if share < least:
             best, least = d, share
@@ -81,21 +81,21 @@ def _surest(state: State, row: Row, frame: FrameDetours, robust: bool) -> Whole:
 
 
 @no_alloc
-def _place(state: State, member: Whole, row: Row, frame: FrameDetours, d: Whole) -> None:
-    """Place a landmark, of which there is one member, by detour d and the bearing of its row."""
+def _place(state: State, member: Whole, row: Row, frame: FrameExcessPaths, d: Whole) -> None:
+    """Place a landmark of one member by excess path d and the bearing of its row."""
     of_caller = frame.caller[d] == row.landmark
     other = _single(state, frame.landmark[d] if of_caller else frame.caller[d])
-    measured = (frame.detour[d], frame.variance[d], row.bearing, row.bearing_variance)
+    measured = (frame.excess_path[d], frame.variance[d], row.bearing, row.bearing_variance)
     size = 3 + 2 * state.members[0]
-    place_by_detour(state.joint, size, 3 + 2 * member, 3 + 2 * other, of_caller, measured)
+    place_by_excess_path(state.joint, size, 3 + 2 * member, 3 + 2 * other, of_caller, measured)
     frame.used[d] = True
 
 
 @no_alloc
-def placed_by_detour(
-    state: State, row: Row, frame: FrameDetours, robust: bool, scratch: Scratch
+def placed_by_excess_path(
+    state: State, row: Row, frame: FrameExcessPaths, robust: bool, scratch: Scratch
 ) -> bool:
-    """Place a ray or a waiting bearing by a detour that gives its range; tell if it was done."""
+    """Place a ray or a waiting bearing by an excess path that gives its range; tell if done."""
     first, count = members_of(state.landmark, state.members[0], row.landmark)
     if count == 1 or not math.isnan(row.range):
         return False
@@ -111,8 +111,8 @@ def placed_by_detour(
 
 
 @no_alloc
-def added_by_detour(state: State, row: Row, frame: FrameDetours, robust: bool) -> bool:
-    """Append the landmark of a bearing whose range a detour gives; tell if it was done."""
+def added_by_excess_path(state: State, row: Row, frame: FrameExcessPaths, robust: bool) -> bool:
+    """Append the landmark of a bearing whose range an excess path gives; tell if it was done."""
     d = _surest(state, row, frame, robust) if math.isnan(row.range) else -1
     if d < 0:
         return False
@@ -126,21 +126,21 @@ def added_by_detour(state: State, row: Row, frame: FrameDetours, robust: bool) -
 @no_alloc
 def _weigh(
     state: State,
-    frame: FrameDetours,
+    frame: FrameExcessPaths,
     d: Whole,
     of_caller: Flag,
     params: UpdateParams,
     scratch: Scratch,
 ) -> None:
-    """Weigh the members of a ray by detour d, and prune it."""
+    """Weigh the members of a ray by excess path d, and prune it."""
     label = frame.caller[d] if of_caller else frame.landmark[d]
     other = _single(state, frame.landmark[d] if of_caller else frame.caller[d])
     ray = members_of(state.landmark, state.members[0], label)
     first, count = ray
     if state.weight[first] == WAITING_WEIGHT:
         return
-    weigh_by_detour(
-        state, ray, other, of_caller, frame.detour[d], frame.variance[d], scratch.likelihood
+    weigh_by_excess_path(
+        state, ray, other, of_caller, frame.excess_path[d], frame.variance[d], scratch.likelihood
     )
     weight = state.weight[first:]
     weigh_and_share(
@@ -151,15 +151,15 @@ def _weigh(
 
 
 @no_alloc
-def correct_by_detour(
-    state: State, frame: FrameDetours, d: Whole, params: UpdateParams, scratch: Scratch
+def correct_by_excess_path(
+    state: State, frame: FrameExcessPaths, d: Whole, params: UpdateParams, scratch: Scratch
 ) -> Whole:
-    """Correct landmark, caller and vehicle by detour d, or weigh a ray; return GATED or APPLIED."""
+    """Correct landmark, caller and vehicle by excess path d, or weigh a ray; GATED or APPLIED."""
     member, caller = _single(state, frame.landmark[d]), _single(state, frame.caller[d])
     if member >= 0 and caller >= 0:
         size, i, ib = 3 + 2 * state.members[0], 3 + 2 * member, 3 + 2 * caller
-        return correct_detour(
-            state.joint, size, i, ib, frame.detour[d], frame.variance[d],
+        return correct_excess_path(
+            state.joint, size, i, ib, frame.excess_path[d], frame.variance[d],
             params.passive_bound, params.robust,
         )  # fmt: skip
     ray = frame.landmark[d] if caller >= 0 else frame.caller[d]

@@ -1,8 +1,8 @@
-r"""Kernels on a block's landmarks conditional on a caller: correct, place, gate by a detour.
+r"""Kernels on a block's landmarks conditional on a caller: correct, place, gate by an excess path.
 
-A detour depends on two landmarks, the one that echoes and the caller. Given the path, the landmarks
-that one caller lights up are independent *given the caller*. So each of them is kept as a Gaussian
-that is linear in the place b of the caller, its *parent*,
+An excess path depends on two landmarks, the one that echoes and the caller. Given the path, the
+landmarks that one caller lights up are independent *given the caller*. So each of them is kept as a
+Gaussian that is linear in the place b of the caller, its *parent*,
 
 .. math:: l \mid b \sim N(m + A b,\; C), \qquad b \sim N(\hat b, B),
 
@@ -11,7 +11,8 @@ landmark has no parent. ``member`` holds the marginal, :math:`m + A \hat b` and
 :math:`C + A B A^T`, but m and C while a frame corrects the map (`shift_by_parent`): then a
 measurement changes one landmark and the caller, and no other landmark need be written.
 
-``turn`` is one in the lanes that are corrected and zero elsewhere, ``usable`` where detours count.
+``turn`` is one in the lanes that are corrected and zero elsewhere, ``usable`` where excess paths
+count.
 """
 
 import math
@@ -42,8 +43,8 @@ from pipistrelle.estimation.measurement import (
     MIN_TDOA_SIGMAS,
     NEAREST,
     Row,
-    detour_slopes,
-    range_by_detour,
+    excess_path_slopes,
+    range_by_excess_path,
 )
 from pipistrelle.jit import Flag, Whole, inlined, no_alloc, no_alloc_inlined
 
@@ -51,17 +52,18 @@ AXX, AXY, AYX, AYY = range(0, 4 * LANES, LANES)
 SLOPES = 4 * LANES
 """Numbers of a landmark's slopes in a block."""
 MAX_RELATIVE_STD = 0.2
-"""Detours are used where the caller's standard deviation is at most this share of its distance, and
-place a landmark where that of the range is: beyond, no Gaussian has the ellipse's shape."""
+"""Excess paths are used where the caller's standard deviation is at most this share of its
+distance, and place a landmark where that of the range is: beyond, no Gaussian has the ellipse's
+shape."""
 Slopes = Float[np.ndarray, " slopes"]
 
 
 class Pairs(NamedTuple):
-    """Landmarks of one block with their parents, and the detours of a scan."""
+    """Landmarks of one block with their parents, and the excess paths of a scan."""
 
     parent: Int[np.ndarray, " n"]
     slope: Float[np.ndarray, "n slopes"]  # (n, 4 L)
-    detour: Float[np.ndarray, " m"]
+    excess_path: Float[np.ndarray, " m"]
     """of each measurement, by its landmark's parent; NaN where there is none."""
     variance: Float[np.ndarray, " m"]
     turn: Lanes  # array to work with, as are the next two
@@ -186,34 +188,39 @@ def correct_pair(
             dx, dy, near, k, part = _offset(pose, caller, member, slope, turn, i)
             measured = row.range - near, row.range_variance, part
             _take(caller, member, slope, measured, (dx * k, dy * k, 0.0, 0.0), i)
-    if not math.isnan(pairs.detour[m]):
+    if not math.isnan(pairs.excess_path[m]):
         lanes_with_sure_parent(pose, caller, callers, pairs.usable)
         for i in range(LANES):
             lx, ly = _place(caller, member, slope, i)
-            e, q0, q1, f0, f1 = detour_slopes(
+            e, q0, q1, f0, f1 = excess_path_slopes(
                 pose[X + i], pose[Y + i], lx, ly, caller[X + i], caller[Y + i]
             )
-            measured = pairs.detour[m] - e, pairs.variance[m], turn[i] * pairs.usable[i]
+            measured = pairs.excess_path[m] - e, pairs.variance[m], turn[i] * pairs.usable[i]
             _take(caller, member, slope, measured, (q0, q1, f0, f1), i)
 
 
 @inlined
 def _steady(
-    dx: float, dy: float, direction: float, detour: float, off: tuple[float, float], distance: float
+    dx: float,
+    dy: float,
+    direction: float,
+    excess_path: float,
+    off: tuple[float, float],
+    distance: float,
 ) -> Flag:
-    """Tell if errors of direction and detour change a range by at most `MAX_RELATIVE_STD`."""
+    """Tell if errors of direction and excess path change a range by at most `MAX_RELATIVE_STD`."""
     steady, most = True, MAX_RELATIVE_STD * distance
     for sign in (-1.0, 1.0):
         c, s = cosine_and_sine(direction + sign * off[0])
-        steady = steady and abs(range_by_detour(detour, dx, dy, c, s) - distance) <= most
+        steady = steady and abs(range_by_excess_path(excess_path, dx, dy, c, s) - distance) <= most
         c, s = cosine_and_sine(direction)
-        later = range_by_detour(detour + sign * off[1], dx, dy, c, s)
+        later = range_by_excess_path(excess_path + sign * off[1], dx, dy, c, s)
         steady = steady and abs(later - distance) <= most
     return steady
 
 
 @no_alloc
-def place_by_detour(
+def place_by_excess_path(
     pose: Poses,
     caller: Member,
     member: Member,
@@ -222,15 +229,15 @@ def place_by_detour(
     count: Counts,
     usable: Lanes,
 ) -> None:
-    """Place landmarks that are rays by bearing and detour, where their range is sure enough.
+    """Place landmarks that are rays by bearing and excess path, where their range is sure enough.
 
-    ``heard`` is bearing and detour, then their variances. The landmark gets the caller as its
+    ``heard`` is bearing and excess path, then their variances. The landmark gets the caller as its
     parent, and its ray is dropped. Where caller and landmark are in line a slope tells nothing, so
-    both errors are tried, too; a detour that may be 0 (`MIN_TDOA_SIGMAS`) places nothing.
+    both errors are tried, too; an excess path that may be 0 (`MIN_TDOA_SIGMAS`) places nothing.
     """
-    bearing, detour, bearing_variance, detour_variance = heard
-    off = math.sqrt(bearing_variance), math.sqrt(detour_variance)
-    if detour <= MIN_TDOA_SIGMAS * off[1]:
+    bearing, excess_path, bearing_variance, excess_path_variance = heard
+    off = math.sqrt(bearing_variance), math.sqrt(excess_path_variance)
+    if excess_path <= MIN_TDOA_SIGMAS * off[1]:
         return
     for i in range(LANES):
         if usable[i] == 0.0 or count[i] == 1:
@@ -238,14 +245,14 @@ def place_by_detour(
         direction, x, y = pose[HEADING + i] + bearing, pose[X + i], pose[Y + i]
         c, s = cosine_and_sine(direction)
         bx, by = caller[X + i], caller[Y + i]
-        r = range_by_detour(detour, bx - x, by - y, c, s)
-        if not (NEAREST < r < math.inf and _steady(bx - x, by - y, direction, detour, off, r)):
+        r = range_by_excess_path(excess_path, bx - x, by - y, c, s)
+        if not (NEAREST < r < math.inf and _steady(bx - x, by - y, direction, excess_path, off, r)):
             continue
-        _, q0, q1, f0, f1 = detour_slopes(x, y, x + r * c, y + r * s, bx, by)
-        steep = q0 * c + q1 * s  # of the detour along the ray: none between vehicle and caller
+        _, q0, q1, f0, f1 = excess_path_slopes(x, y, x + r * c, y + r * s, bx, by)
+        steep = q0 * c + q1 * s  # of the excess path along the ray: none between vehicle and caller
         if steep <= NEAREST:
             continue
-        turned, along = r * (q0 * s - q1 * c) / steep, detour_variance / (steep * steep)
+        turned, along = r * (q0 * s - q1 * c) / steep, excess_path_variance / (steep * steep)
         ax, ay = -f0 / steep, -f1 / steep
         spread = ax * ax * caller[XX + i] + 2.0 * ax * ay * caller[XY + i]
         spread += ay * ay * caller[YY + i] + along + turned * turned * bearing_variance
@@ -267,20 +274,20 @@ def place_by_detour(
 
 
 @no_alloc
-def detour_beyond(
+def excess_path_beyond(
     pose: Poses,
     caller: Member,
     member: Member,
     slope: Slopes,
-    detour: float,
+    excess_path: float,
     variance: float,
     turn: Lanes,
     bound: float,
 ) -> bool:
-    """Tell whether a detour is beyond the bound for every lane that has a turn, and all have."""
+    """Tell whether an excess path is beyond the bound for every lane, and all have a turn."""
     beyond = 0
     for i in range(LANES):
-        e, q0, q1, f0, f1 = detour_slopes(
+        e, q0, q1, f0, f1 = excess_path_slopes(
             pose[X + i], pose[Y + i], member[X + i], member[Y + i], caller[X + i], caller[Y + i]
         )
         p0, p1 = -q0 - f0, -q1 - f1
@@ -290,5 +297,5 @@ def detour_beyond(
         S += q0 * q0 * member[XX + i] + 2.0 * q0 * q1 * member[XY + i] + q1 * q1 * member[YY + i]
         S += f0 * (caller[XX + i] * g0 + caller[XY + i] * g1)
         S += f1 * (caller[XY + i] * g0 + caller[YY + i] * g1) + variance
-        beyond += 0 if turn[i] == 0.0 or (detour - e) * (detour - e) <= bound * S else 1
+        beyond += 0 if turn[i] == 0.0 or (excess_path - e) * (excess_path - e) <= bound * S else 1
     return beyond == LANES

@@ -2,7 +2,7 @@
 
 A landmark has the same parent in all particles: ``parent[n]`` is the number of that landmark, or
 -1. ``slope[b, n]`` says how it depends on its parent in each lane (`block_conditional`); it is zero
-until a detour is used, and has no rows as long as no landmark has a parent.
+until an excess path is used, and has no rows as long as no landmark has a parent.
 """
 
 import numpy as np
@@ -12,12 +12,12 @@ from pipistrelle.estimation.fastslam.block import LANES, Lanes, Member
 from pipistrelle.estimation.fastslam.block_conditional import (
     SLOPES,
     Pairs,
-    detour_beyond,
+    excess_path_beyond,
     lanes_with_parent,
     lanes_with_sure_parent,
     shift_by_parent,
 )
-from pipistrelle.estimation.measurement import Detours
+from pipistrelle.estimation.measurement import ExcessPaths
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 Parents = tuple[Int[np.ndarray, " parents"], Float[np.ndarray, "b n slopes"]]
@@ -41,13 +41,13 @@ def assign_parents(
     landmark: Int[np.ndarray, " n"],
     count: Int[np.ndarray, "b k lanes"],
     particles: Whole,
-    heard: Detours,
+    heard: ExcessPaths,
     callers: Int[np.ndarray, " c"],
 ) -> ParentsAfter:
     """Give landmarks of a scan a parent, new landmarks included.
 
-    It is the first caller that they have a detour by and that most particles have placed. A caller
-    has no parent: its landmarks would depend on that, too.
+    It is the first caller that they have an excess path by and that most particles have placed. A
+    caller has no parent: its landmarks would depend on that, too.
     """
     parent, before = np.full(landmark.size, -1, dtype=np.int64), parents[1].shape[1]
     parent[: parents[0].size] = parents[0]
@@ -65,19 +65,19 @@ def assign_parents(
 
 
 @kernel
-def detours_of_parents(
+def excess_paths_of_parents(
     parent: Int[np.ndarray, " n"],
     landmark: Int[np.ndarray, " n"],
     labels: Int[np.ndarray, " m"],
-    heard: Detours,
+    heard: ExcessPaths,
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Detour of each measurement by its landmark's parent, and its variance; or NaN."""
-    detour, variance = np.full(labels.size, np.nan), np.full(labels.size, np.nan)
+    """Excess path of each measurement by its landmark's parent, and its variance; or NaN."""
+    excess_path, variance = np.full(labels.size, np.nan), np.full(labels.size, np.nan)
     for d in range(heard.landmark.size):
         n, m = slot_of(landmark, heard.landmark[d]), slot_of(labels, heard.landmark[d])
         if n >= 0 and m >= 0 and parent[n] >= 0 and landmark[parent[n]] == heard.caller[d]:
-            detour[m], variance[m] = heard.detour[d], heard.variance[d]
-    return detour, variance
+            excess_path[m], variance[m] = heard.excess_path[d], heard.variance[d]
+    return excess_path, variance
 
 
 @no_alloc
@@ -110,17 +110,17 @@ def copy_lanes(source: Member, target: Member, turn: Lanes) -> None:
 
 
 @kernel
-def gated_detours(
+def gated_excess_paths(
     pose: Float[np.ndarray, "b rows"],
     first: Int[np.ndarray, " ends"],
     count: Int[np.ndarray, "b n lanes"],
     member: Float[np.ndarray, "b c numbers"],
     landmark: Int[np.ndarray, " n"],
     parents: Parents,
-    heard: Detours,
+    heard: ExcessPaths,
     bound: float,
 ) -> Bool[np.ndarray, " d"]:
-    """Tell of each detour whether it is beyond the bound for every particle that could use it."""
+    """Tell which excess paths are beyond the bound for every particle that could use them."""
     (parent, slope), turn, usable = parents, np.empty(LANES), np.empty(LANES)
     gated = np.zeros(heard.landmark.size, dtype=np.bool_)
     for d in range(gated.size):
@@ -130,8 +130,8 @@ def gated_detours(
             caller = member[b, first[h]]
             lanes_with_parent(count[b, n], count[b, h], turn)
             lanes_with_sure_parent(pose[b], caller, count[b, h], usable)
-            gated[d] = gated[d] and detour_beyond(
-                pose[b], caller, member[b, first[n]], slope[b, n], heard.detour[d],
+            gated[d] = gated[d] and excess_path_beyond(
+                pose[b], caller, member[b, first[n]], slope[b, n], heard.excess_path[d],
                 heard.variance[d], turn * usable, bound,
             )  # fmt: skip
     return gated

@@ -48,27 +48,28 @@ proposal is refined to the mean and covariance of the mixture of its members' re
 A frame without measurements is not sampled: its motion goes on accumulating, which loses nothing.
 The start is not sampled either: its covariance P0 is the first that accumulates.
 
-**Detours** (`measurement.detour_of`) depend on two landmarks, which are then no longer independent
-given the path. They are independent given the path and the caller's place: each landmark is a
-Gaussian conditional on its caller (`block_conditional`), which is the joint Gaussian of them all.
-Were the caller's error drawn anew for each detour, the map would grow surer than it is. With
-detours the steps change:
+**Excess paths** (`measurement.excess_path_of`) depend on two landmarks, which are then no longer
+independent given the path. They are independent given the path and the caller's place: each
+landmark is a Gaussian conditional on its caller (`block_conditional`), which is the joint Gaussian
+of them all. Were the caller's error drawn anew for each excess path, the map would grow surer than
+it is. With excess paths the steps change:
 
-- *Propose*: detours neither refine nor weigh a pose, though theory allows it: in twelve worlds a
-  thousand particles then had a median NEES of 19 to 50 instead of 2, and positions off by 0.6 to
+- *Propose*: excess paths neither refine nor weigh a pose, though theory allows it: in twelve worlds
+  a thousand particles then had a median NEES of 19 to 50 instead of 2, and positions off by 0.6 to
   0.7 m instead of 0.4 to 0.5 m, because within a few frames only the paths survived whose first
-  turn was the same. Detours reach the weights through the map, and even that needs more particles:
-  over 115 worlds the mean NEES is 3 to 5 instead of 2 to 3. Bearings and ranges weigh with each
-  landmark's marginal; the error that landmarks of one caller share made no difference there.
-- *Correct*: range, bearing and detour of a landmark correct it and its caller.
-- *Place*: where bearing and detour give the range to a fifth of itself, a landmark is placed at
-  once, or replaces its ray. Elsewhere (it stands between caller and vehicle, or the angle at it is
-  wide) it is, or stays, a ray.
+  turn was the same. Excess paths reach the weights through the map, and even that needs more
+  particles: over 115 worlds the mean NEES is 3 to 5 instead of 2 to 3. Bearings and ranges weigh
+  with each landmark's marginal; the error that landmarks of one caller share made no difference
+  there.
+- *Correct*: range, bearing and excess path of a landmark correct it and its caller.
+- *Place*: where bearing and excess path give the range to a fifth of itself, a landmark is placed
+  at once, or replaces its ray. Elsewhere (it stands between caller and vehicle, or the angle at it
+  is wide) it is, or stays, a ray.
 
-Detours of a caller are ignored until it has one hypothesis with a standard deviation of at most a
-fifth of its distance: some 15 to 55 frames in the paper's worlds. So are those of a second caller
-of a landmark, as each landmark has one parent, and those of a landmark without a bearing in the
-frame.
+Excess paths of a caller are ignored until it has one hypothesis with a standard deviation of at
+most a fifth of its distance: some 15 to 55 frames in the paper's worlds. So are those of a second
+caller of a landmark, as each landmark has one parent, and those of a landmark without a bearing in
+the frame.
 """
 
 import math
@@ -137,7 +138,7 @@ class FastSlamBelief:
     gated: int
     innovations: Innovations = NO_INNOVATIONS  # of the heaviest particle before each scan
     parent: Int[np.ndarray, " parents"]
-    """Number of each landmark's parent, or -1 (`conditional_landmarks`), when detours came last."""
+    """Each landmark's parent, or -1 (`conditional_landmarks`), when excess paths came last."""
     slope: Float[np.ndarray, "b n slopes"]
     """(b, n, 4 L), the slopes by the parent; no rows while no landmark has one."""
 
@@ -298,14 +299,14 @@ class FastSlam:
         return _resampled(after, stratified(weight, uniform), restart)
 
     def _inside(self, belief: FastSlamBelief, scan: Scan, params: UpdateParams) -> tuple[Scan, int]:
-        """Drop the measurements and detours that no particle expected; return how many."""
+        """Drop the measurements and excess paths that no particle expected; return how many."""
         if self.gate >= 1.0:
             return scan, 0
         dropped, late, gated = gated_by_all(
             *_arrays(belief), columns_of(scan), _timings(belief, scan), params
         )
         if late.any():
-            scan = with_columns(scan, detour=np.where(late, np.nan, scan.detour))
+            scan = with_columns(scan, excess_path=np.where(late, np.nan, scan.excess_path))
         return rows_of(scan, ~dropped), gated
 
 
@@ -316,7 +317,7 @@ def _arrays(belief: FastSlamBelief) -> tuple[Arrays, Parents]:
 
 
 def _timings(belief: FastSlamBelief, scan: Scan) -> Timings | None:
-    """Caller columns of a scan; None if it has no detours and no landmark has a parent."""
+    """Caller columns of a scan; None if it has no excess paths and no landmark has a parent."""
     return timings_of(scan) if belief.slope.size == 0 else (scan.caller, scan.callers, scan.moving)
 
 

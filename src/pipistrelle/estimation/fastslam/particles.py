@@ -35,7 +35,7 @@ from pipistrelle.estimation.fastslam.block_conditional import (
     correct_pair,
     lanes_with_parent,
     lanes_with_sure_parent,
-    place_by_detour,
+    place_by_excess_path,
 )
 from pipistrelle.estimation.fastslam.block_rays import (
     Rows,
@@ -58,8 +58,8 @@ from pipistrelle.estimation.fastslam.conditional_landmarks import (
     assign_parents,
     copy_lanes,
     copy_row,
-    detours_of_parents,
-    gated_detours,
+    excess_paths_of_parents,
+    gated_excess_paths,
     shift_all,
     slot_of,
 )
@@ -68,7 +68,7 @@ from pipistrelle.estimation.measurement import (
     Measurements,
     Row,
     Timings,
-    detours,
+    excess_paths,
     measurements,
     row_of,
 )
@@ -117,7 +117,7 @@ def gated_by_all(
     timings: Timings | None,
     params: UpdateParams,
 ) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " m"], int]:
-    """Tell of each row whether it, and whether its detour, is beyond the gate of every particle.
+    """Tell which rows, and which excess paths, are beyond the gate of every particle.
 
     Returns both masks, over the particles that could use it, and how many rows have either.
     """
@@ -141,8 +141,8 @@ def gated_by_all(
                     pose, rows[j], row_of(heard, m), count, j, params.passive_bound
                 )
     if timings is not None:
-        timed = detours(columns, timings)
-        late[timed.row] = gated_detours(
+        timed = excess_paths(columns, timings)
+        late[timed.row] = gated_excess_paths(
             particles.pose, particles.first, particles.count, particles.member, particles.landmark,
             parents, timed, params.passive_bound,
         )  # fmt: skip
@@ -338,14 +338,14 @@ def _add_new(pose: Poses, rows: Rows, count: Counts, row: Row, params: UpdatePar
 
 @no_alloc
 def _place_by_parent(block: Block, n: Whole, heard: Measurements, m: Whole, pairs: Pairs) -> None:
-    """Place landmark n where it is a ray and a detour gives its range."""
+    """Place landmark n where it is a ray and an excess path gives its range."""
     h = pairs.parent[n]
-    if h < 0 or math.isnan(pairs.detour[m]):
+    if h < 0 or math.isnan(pairs.excess_path[m]):
         return
     caller, member = block.member[block.first[h]], block.member[block.first[n]]
-    measured = heard.bearing[m], pairs.detour[m], heard.bearing_variance[m], pairs.variance[m]
+    measured = heard.bearing[m], pairs.excess_path[m], heard.bearing_variance[m], pairs.variance[m]
     lanes_with_sure_parent(block.pose, caller, block.count[h], pairs.usable)
-    place_by_detour(
+    place_by_excess_path(
         block.pose, caller, member, pairs.slope[n], measured, block.count[n], pairs.usable
     )
 
@@ -359,7 +359,7 @@ def _place(
     pairs: Pairs | None,
     params: UpdateParams,
 ) -> None:
-    """Place a block's new landmarks, and rays whose range a detour gives."""
+    """Place a block's new landmarks, and rays whose range an excess path gives."""
     new = known
     for m in range(slot.size):
         n = slot[m]
@@ -430,9 +430,9 @@ def correct_particles(
     landmark, first, widest = _rows(old, slot, heard, params.ray_ranges.size)
     of_parents = np.empty(0), np.empty(0)
     if timings is not None:
-        timed = detours(columns, timings)
+        timed = excess_paths(columns, timings)
         parents = assign_parents(parents, landmark, old.count, total, timed, timings[1])
-        of_parents = detours_of_parents(parents[0], landmark, heard.landmark, timed)
+        of_parents = excess_paths_of_parents(parents[0], landmark, heard.landmark, timed)
     pose, gained = old.pose.copy(), np.zeros((blocks, LANES))
     count = np.zeros((blocks, landmark.size, LANES), dtype=np.int64)
     member = np.empty((blocks, first[-1], MEMBER))

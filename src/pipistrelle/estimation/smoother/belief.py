@@ -41,7 +41,7 @@ from pipistrelle.estimation.smoother.preintegration import (
     symmetric,
     turned,
 )
-from pipistrelle.estimation.smoother.tdoa import Detour
+from pipistrelle.estimation.smoother.tdoa import ExcessPath
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,7 +55,7 @@ class SmootherBelief:
     mapped: tuple[int, ...] = ()  # landmarks in the graph, in order of entry
     waiting: Mapping[int, tuple[Bearing, ...]] = field(default_factory=dict)
     """bearings of each landmark that is not in the graph."""
-    detours: tuple[Detour, ...] = ()  # those that wait for their landmark or caller
+    excess_paths: tuple[ExcessPath, ...] = ()  # those that wait for their landmark or caller
     chains: Chains = field(default_factory=dict)  # moving callers in the graph, by label
     states: Mapping[int, Gaussian] = field(default_factory=dict)
     """Their places and velocities, (4) and (4, 4), at the last pose of the graph."""

@@ -7,14 +7,15 @@ from which something was heard (`preintegration` has the steps between).
 
 A landmark enters with its first range, or where two of its bearings cross clearly
 (`delayed_initialization`), with all its bearings so far: until then it waits, its bearings are not
-used, and it counts as partial. With detours, it enters with the first one that makes its range sure
-(`tdoa_initialization`), for which its caller must be in the graph; a caller enters likewise, by the
-detour over a landmark that is. A detour is a factor between pose, landmark and caller (`tdoa`), and
-waits, too, until both are there. What enters gets a weak prior of `PRIOR_STD`, so that every graph
-has a solution. If a graph with new landmarks cannot be solved, they go on waiting.
+used, and it counts as partial. With excess paths, it enters with the first one that makes its range
+sure (`tdoa_initialization`), for which its caller must be in the graph; a caller enters likewise,
+by the excess path over a landmark that is. An excess path is a factor between pose, landmark and
+caller (`tdoa`), and waits, too, until both are there. What enters gets a weak prior of `PRIOR_STD`,
+so that every graph has a solution. If a graph with new landmarks cannot be solved, they go on
+waiting.
 
-A moving caller has a place and a velocity at each node (`caller_motion`), once a range or a detour
-places it: crossing bearings say nothing of what has moved between them. It is no landmark.
+A moving caller has a place and a velocity at each node (`caller_motion`), once a range or an excess
+path places it: crossing bearings say nothing of what has moved between them. It is no landmark.
 
 ``robust`` uses Huber's loss. The belief at a frame is the pose of iSAM2; path, tracks of callers
 and map are the optimum of everything so far (`belief`).
@@ -60,21 +61,26 @@ from pipistrelle.estimation.smoother.caller_motion import (
     speed_factor,
 )
 from pipistrelle.estimation.smoother.delayed_initialization import Bearing, crossing
-from pipistrelle.estimation.smoother.gating import detours_inside, rows_inside
+from pipistrelle.estimation.smoother.gating import excess_paths_inside, rows_inside
 from pipistrelle.estimation.smoother.graph import Link, Solver, landmark_key, pose_key, start_factor
 from pipistrelle.estimation.smoother.preintegration import extended, placed
-from pipistrelle.estimation.smoother.tdoa import Detour, detour_factors, detours_of, split_ready
+from pipistrelle.estimation.smoother.tdoa import (
+    ExcessPath,
+    excess_path_factors,
+    excess_paths_of,
+    split_ready,
+)
 from pipistrelle.estimation.smoother.tdoa_initialization import (
     LastPose,
-    place_by_detours,
-    usable_detours,
+    place_by_excess_paths,
+    usable_excess_paths,
 )
 
 PRIOR_STD = 20.0
 """Prior of a landmark about the place where it enters [m]."""
 RELINEARISE_ABOVE = 20
-"""If more waiting detours than this enter, all is relinearised: they correct many poses at once, as
-do waiting bearings (`graph.RELINEARISE_PASSES`)."""
+"""If more waiting excess paths than this enter, all is relinearised: they correct many poses at
+once, as do waiting bearings (`graph.RELINEARISE_PASSES`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,11 +175,11 @@ class Smoother:
         """Add a frame's measurements to the graph, and the landmarks that they place."""
         here = with_new_pose(belief, roving=bool(scan.moving.size or belief.chains))
         if self.gate < 1.0 and (belief.mapped or belief.chains):
-            here, scan, detours = self._gated(solved(here), scan)
+            here, scan, excess_paths = self._gated(solved(here), scan)
         else:
-            detours = detours_of(scan, here.link.node)
+            excess_paths = excess_paths_of(scan, here.link.node)
         for initialize in (True, False):
-            heard = self._heard(here, scan, detours, initialize=initialize)
+            heard = self._heard(here, scan, excess_paths, initialize=initialize)
             try:
                 return with_solved_pose(heard)
             except RuntimeError:  # what entered cannot be solved
@@ -182,26 +188,39 @@ class Smoother:
 
     def _gated(
         self, here: SmootherBelief, scan: Scan
-    ) -> tuple[SmootherBelief, Scan, tuple[Detour, ...]]:
-        """Return belief, scan and detours that pass the gate, and count what does not."""
+    ) -> tuple[SmootherBelief, Scan, tuple[ExcessPath, ...]]:
+        """Return belief, scan and excess paths that pass the gate, and count what does not."""
         isam, node, rows = here.solver.reach(here.link), here.link.node, scan.landmark.size
-        heard = detours_of(scan, node)  # of all rows: a bearing that is wrong is nothing to them
+        heard = excess_paths_of(
+            scan, node
+        )  # of all rows: a bearing that is wrong is nothing to them
         inside, off_by = rows_inside(isam, node, here.mapped, scan, self.gate, here.chains)
         scan = rows_of(scan, inside)
-        detours = detours_inside(isam, here.mapped, heard, self.gate, here.chains)
-        dropped = rows - scan.landmark.size + len(heard) - len(detours)
+        excess_paths = excess_paths_inside(isam, here.mapped, heard, self.gate, here.chains)
+        dropped = rows - scan.landmark.size + len(heard) - len(excess_paths)
         innovations = here.innovations.plus(*off_by)
-        return replace(here, gated=here.gated + dropped, innovations=innovations), scan, detours
+        return (
+            replace(here, gated=here.gated + dropped, innovations=innovations),
+            scan,
+            excess_paths,
+        )
 
     def _heard(
-        self, here: SmootherBelief, scan: Scan, detours: tuple[Detour, ...], *, initialize: bool
+        self,
+        here: SmootherBelief,
+        scan: Scan,
+        excess_paths: tuple[ExcessPath, ...],
+        *,
+        initialize: bool,
     ) -> SmootherBelief:
         """Return the belief with a frame's factors; with ``initialize``, also what they place."""
         link = next_link(here)
         factors, values, node = link.factors, link.values, link.node
         mapped, waiting, crossed = list(here.mapped), dict(here.waiting), False
         poses, moving = poses_of(here), {*scan.moving.tolist(), *here.chains}
-        chains, unplaced = self._roving(here, link, scan, detours, moving, initialize=initialize)
+        chains, unplaced = self._roving(
+            here, link, scan, excess_paths, moving, initialize=initialize
+        )
         for label, bearing, distance, across, along in _directions(scan):
             if label in moving:
                 continue
@@ -211,7 +230,7 @@ class Smoother:
                 if passive:
                     waiting[label], place = (*waiting.get(label, ()), heard), None
                     if initialize:
-                        place, sure = _placed(here, poses, waiting[label], label, detours)
+                        place, sure = _placed(here, poses, waiting[label], label, excess_paths)
                 if place is None:
                     continue
                 mapped.append(label)
@@ -225,14 +244,16 @@ class Smoother:
             row = (bearing, distance), (across, along)
             factors.add(self._direction(node, landmark_key(label), *row))
         here = replace(here, link=replace(link, crossed=crossed), chains=chains, unplaced=unplaced)
-        return self._timed(replace(here, mapped=tuple(mapped), waiting=waiting), detours, moving)
+        return self._timed(
+            replace(here, mapped=tuple(mapped), waiting=waiting), excess_paths, moving
+        )
 
     def _roving(
         self,
         here: SmootherBelief,
         link: Link,
         scan: Scan,
-        detours: tuple[Detour, ...],
+        excess_paths: tuple[ExcessPath, ...],
         moving: Collection[int],
         *,
         initialize: bool,
@@ -250,7 +271,9 @@ class Smoother:
                 if math.isnan(distance):
                     unplaced[label] = Bearing(link.node, bearing, across)
                     place = (
-                        _by_detour(here, unplaced[label], label, detours) if initialize else None
+                        _by_excess_path(here, unplaced[label], label, excess_paths)
+                        if initialize
+                        else None
                     )
                 if place is None:
                     continue
@@ -268,15 +291,17 @@ class Smoother:
         link.factors.add(speed_factor(chain, self.speed_std))
 
     def _timed(
-        self, here: SmootherBelief, detours: tuple[Detour, ...], moving: Collection[int]
+        self, here: SmootherBelief, excess_paths: tuple[ExcessPath, ...], moving: Collection[int]
     ) -> SmootherBelief:
-        """Add the detours whose ends are in the graph to the last link; the others wait."""
+        """Add the excess paths whose ends are in the graph to the last link; the others wait."""
         link, known = here.link, set(here.mapped)
-        entering, late = split_ready((*here.detours, *detours), known, here.chains, moving)
-        for factor in detour_factors(entering, robust=self.robust, chains=here.chains):
+        entering, late = split_ready(
+            (*here.excess_paths, *excess_paths), known, here.chains, moving
+        )
+        for factor in excess_path_factors(entering, robust=self.robust, chains=here.chains):
             link.factors.add(factor)
         many = sum(one.node < link.node for one in entering) > RELINEARISE_ABOVE
-        return replace(here, link=replace(link, crossed=link.crossed or many), detours=late)
+        return replace(here, link=replace(link, crossed=link.crossed or many), excess_paths=late)
 
     def _bearing(self, heard: Bearing, point: int) -> gtsam.BearingFactor2D:
         """Return the factor of a bearing of the point with this key."""
@@ -317,20 +342,20 @@ def _placed(
     poses: Float[np.ndarray, "n 3"],
     waiting: tuple[Bearing, ...],
     label: int,
-    detours: tuple[Detour, ...],
+    excess_paths: tuple[ExcessPath, ...],
 ) -> tuple[Float[np.ndarray, "2"] | None, bool]:
-    """Return the place of a landmark without a range, if known, and whether a detour gave it."""
-    place = _by_detour(here, waiting[-1], label, detours)
+    """Return a landmark's place without a range, if known, and whether an excess path gave it."""
+    place = _by_excess_path(here, waiting[-1], label, excess_paths)
     return (crossing(poses, waiting), False) if place is None else (place, True)
 
 
-def _by_detour(
-    here: SmootherBelief, heard: Bearing, label: int, detours: tuple[Detour, ...]
+def _by_excess_path(
+    here: SmootherBelief, heard: Bearing, label: int, excess_paths: tuple[ExcessPath, ...]
 ) -> Float[np.ndarray, "2"] | None:
-    """Return the place of a landmark or caller by its bearing and surest detour, if sure."""
+    """Return the place of a landmark or caller by its bearing and surest excess path, if sure."""
     known, usable = (
         last_solved(here),
-        usable_detours(label, detours, labels_in_graph(here.mapped, here.chains)),
+        usable_excess_paths(label, excess_paths, labels_in_graph(here.mapped, here.chains)),
     )
     if not usable or known is None:
         return None
@@ -342,7 +367,7 @@ def _by_detour(
         chains=here.chains,
         walk_std=here.walk_std,
     )
-    return place_by_detours(last, heard, label, usable)
+    return place_by_excess_paths(last, heard, label, usable)
 
 
 def _prior(point: int, place: Float[np.ndarray, "2"]) -> gtsam.PriorFactorPoint2:

@@ -10,8 +10,8 @@ from jaxtyping import Bool
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.beliefs import NO_INNOVATIONS, Innovations
 from pipistrelle.estimation.measurement import (
-    detour_jacobians,
-    detour_of,
+    excess_path_jacobians,
+    excess_path_of,
     measurement_jacobians,
     observe,
 )
@@ -24,7 +24,7 @@ from pipistrelle.estimation.smoother.caller_motion import (
 )
 from pipistrelle.estimation.smoother.graph import joint_covariance, pose_key, pose_of
 from pipistrelle.estimation.smoother.preintegration import turned
-from pipistrelle.estimation.smoother.tdoa import Detour
+from pipistrelle.estimation.smoother.tdoa import ExcessPath
 from pipistrelle.geometry import wrap_angle
 
 
@@ -65,14 +65,14 @@ def rows_inside(
     return inside, off_by
 
 
-def detours_inside(
+def excess_paths_inside(
     isam: gtsam.ISAM2,
     mapped: Collection[int],
-    heard: Sequence[Detour],
+    heard: Sequence[ExcessPath],
     gate: float,
     chains: Chains = NO_CHAINS,
-) -> tuple[Detour, ...]:
-    """Return the detours that pass the gate, or whose landmark or caller is not in the graph.
+) -> tuple[ExcessPath, ...]:
+    """Return the excess paths that pass the gate, or whose landmark or caller is not in the graph.
 
     Each is judged alone, not with the bearing of its row: an error of one, such as a wrong direct
     call, says nothing about the other. All are heard from one pose.
@@ -86,13 +86,13 @@ def detours_inside(
     )
 
 
-def _surprise(isam: gtsam.ISAM2, one: Detour, chains: Chains) -> float:
-    """Return the squared innovation of a detour divided by its variance."""
+def _surprise(isam: gtsam.ISAM2, one: ExcessPath, chains: Chains) -> float:
+    """Return the squared innovation of an excess path divided by its variance."""
     ends = [point_key(end, one.node, chains) for end in (one.landmark, one.caller)]
     keys = pose_key(one.node), *ends
     pose = pose_of(isam.calculateEstimatePose2(keys[0]))
     points = [np.array(isam.calculateEstimatePoint2(key)) for key in keys[1:]]
-    by_pose, *by_points = detour_jacobians(pose[:2], *points)
+    by_pose, *by_points = excess_path_jacobians(pose[:2], *points)
     H = np.concatenate([by_pose @ turned(pose[2])[:2, :2], [0.0], *by_points])
-    off = one.detour - detour_of(pose[:2], *points)
+    off = one.excess_path - excess_path_of(pose[:2], *points)
     return off**2 / float(H @ joint_covariance(isam, *keys) @ H + one.std**2)

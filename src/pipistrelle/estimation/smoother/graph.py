@@ -41,7 +41,7 @@ class Link:
     thorough: bool = False
     """Whether to solve by QR, which costs twice as much as Cholesky and is needed where some noise
     is very small beside another."""
-    crossed: bool = False  # whether waiting bearings entered, or many detours
+    crossed: bool = False  # whether waiting bearings entered, or many excess paths
 
 
 def links(last: Link) -> Iterator[Link]:

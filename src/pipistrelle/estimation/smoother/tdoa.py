@@ -1,22 +1,22 @@
-r"""Detours in the graph: one factor for all detours of a frame, and detours that wait.
+r"""Excess paths in the graph: one factor for all those of a frame, and those that wait.
 
-A detour :math:`e = |b - l| + |l - p| - |b - p|` is a factor between the pose from which it was
-heard, the landmark l and the caller b, which is a landmark of the graph, too. GTSAM has no such
-factor, so it calls Python back. It does so once for a frame: a factor holds all its detours, and a
-kernel computes their errors and slopes together. A factor for each detour gives the same and calls
-back twenty times as often. The graph gets no denser: what was heard from one pose is connected
-anyway once the solver has eliminated the pose.
+An excess path :math:`e = |b - l| + |l - p| - |b - p|` is a factor between the pose from which it
+was heard, the landmark l and the caller b, which is a landmark of the graph, too. GTSAM has no such
+factor, so it calls Python back. It does so once for a frame: a factor holds all its excess paths,
+and a kernel computes their errors and slopes together. A factor for each excess path gives the same
+and calls back twenty times as often. The graph gets no denser: what was heard from one pose is
+connected anyway once the solver has eliminated the pose.
 
-Huber's loss is taken of each detour alone, within the factor. As in GTSAM, an error is
+Huber's loss is taken of each excess path alone, within the factor. As in GTSAM, an error is
 :math:`\sqrt{2 \rho(z)}` where the total error is asked, and :math:`\sqrt{w} z` with
 :math:`\sqrt{w} J` where slopes are asked, with
 
 .. math:: z = \frac{e - \hat e}{\sigma}, \quad w = \min(1, k / |z|), \quad
           \rho = \tfrac12 z^2 \text{ or } k |z| - \tfrac12 k^2 .
 
-A detour waits until its landmark and its caller are in the graph (`Detour`). At most `MAX_WAITING`
-wait; the oldest are dropped. Where landmark or caller moves, the factor is of its place at that
-pose (`caller_motion`), and a detour from before it was placed is dropped.
+An excess path waits until its landmark and its caller are in the graph (`ExcessPath`). At most
+`MAX_WAITING` wait; the oldest are dropped. Where landmark or caller moves, the factor is of its
+place at that pose (`caller_motion`), and an excess path from before it was placed is dropped.
 """
 
 import math
@@ -32,8 +32,8 @@ from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.measurement import (
     HUBER_K,
     columns_of,
-    detour_slopes,
-    detours,
+    excess_path_slopes,
+    excess_paths,
     timings_of,
 )
 from pipistrelle.estimation.smoother.caller_motion import (
@@ -47,48 +47,51 @@ from pipistrelle.estimation.smoother.graph import pose_key
 from pipistrelle.jit import kernel
 
 MAX_WAITING = 1000
-"""How many detours may wait: those of some fifty frames."""
+"""How many excess paths may wait: those of some fifty frames."""
 
 
-class Detour(NamedTuple):
-    """A detour: the pose from which it was heard, its landmark and caller, detour and std [m]."""
+class ExcessPath(NamedTuple):
+    """An excess path [m]: the pose that heard it, its landmark and caller, and its deviation."""
 
     node: int
     landmark: int
     caller: int
-    detour: float
+    excess_path: float
     std: float
 
 
-def detours_of(scan: Scan, node: int) -> tuple[Detour, ...]:
-    """Return the detours of a scan that was heard from pose number ``node``.
+def excess_paths_of(scan: Scan, node: int) -> tuple[ExcessPath, ...]:
+    """Return the excess paths of a scan that was heard from pose number ``node``.
 
     >>> from dataclasses import replace
     >>> from pipistrelle.detection.scans import make_scan
-    >>> timed = {"caller": 1, "detour": 3.0, "detour_std": 0.5}
+    >>> timed = {"caller": 1, "excess_path": 3.0, "excess_path_std": 0.5}
     >>> scan = make_scan(0.0, np.array([4]), np.zeros(1), **timed)
-    >>> detours_of(replace(scan, callers=np.array([-1, 9])), 7)
-    (Detour(node=7, landmark=4, caller=9, detour=3.0, std=0.5),)
+    >>> excess_paths_of(replace(scan, callers=np.array([-1, 9])), 7)
+    (ExcessPath(node=7, landmark=4, caller=9, excess_path=3.0, std=0.5),)
     """
     timings = timings_of(scan)
     if timings is None:
         return ()
-    found = detours(columns_of(scan), timings)
-    columns = found.landmark, found.caller, found.detour, np.sqrt(found.variance)
-    return tuple(Detour(node, *row) for row in zip(*map(np.ndarray.tolist, columns), strict=True))
+    found = excess_paths(columns_of(scan), timings)
+    columns = found.landmark, found.caller, found.excess_path, np.sqrt(found.variance)
+    return tuple(
+        ExcessPath(node, *row) for row in zip(*map(np.ndarray.tolist, columns), strict=True)
+    )
 
 
 def split_ready(
-    heard: Iterable[Detour],
+    heard: Iterable[ExcessPath],
     mapped: Collection[int],
     chains: Chains = NO_CHAINS,
     moving: Collection[int] = (),
-) -> tuple[tuple[Detour, ...], tuple[Detour, ...]]:
-    """Separate detours that may enter the graph from those that wait, of which the newest are kept.
+) -> tuple[tuple[ExcessPath, ...], tuple[ExcessPath, ...]]:
+    """Separate excess paths that may enter the graph from those that wait (the newest are kept).
 
-    The newest is the last. A detour of a caller in ``moving`` from before it was placed is dropped.
+    The newest is the last. An excess path of a caller in ``moving`` from before it was placed is
+    dropped.
 
-    >>> heard = [Detour(0, 4, 9, 3.0, 0.5), Detour(1, 5, 9, 2.0, 0.5)]
+    >>> heard = [ExcessPath(0, 4, 9, 3.0, 0.5), ExcessPath(1, 5, 9, 2.0, 0.5)]
     >>> [[one.landmark for one in part] for part in split_ready(heard, {4, 9})]
     [[4], [5]]
     """
@@ -102,13 +105,14 @@ def split_ready(
     return tuple(entering), tuple(waiting[-MAX_WAITING:])
 
 
-def detour_factors(
-    heard: Iterable[Detour], *, robust: bool, chains: Chains = NO_CHAINS
+def excess_path_factors(
+    heard: Iterable[ExcessPath], *, robust: bool, chains: Chains = NO_CHAINS
 ) -> list[gtsam.CustomFactor]:
-    """Return a factor for all detours of each pose; those of one pose follow one another.
+    """Return a factor for all excess paths of each pose; those of one pose follow one another.
 
-    >>> heard = [Detour(0, 4, 9, 3.0, 0.5), Detour(0, 5, 9, 2.0, 0.5), Detour(3, 4, 9, 2.0, 0.5)]
-    >>> [len(factor.keys()) for factor in detour_factors(heard, robust=False)]
+    >>> rows = (0, 4, 3.0), (0, 5, 2.0), (3, 4, 2.0)
+    >>> heard = [ExcessPath(node, label, 9, d, 0.5) for node, label, d in rows]
+    >>> [len(factor.keys()) for factor in excess_path_factors(heard, robust=False)]
     [4, 3]
     """
     return [
@@ -117,12 +121,14 @@ def detour_factors(
     ]
 
 
-def _factor(node: int, rows: list[Detour], believed: float, chains: Chains) -> gtsam.CustomFactor:
-    """Return the factor of the detours that were heard from one pose."""
+def _factor(
+    node: int, rows: list[ExcessPath], believed: float, chains: Chains
+) -> gtsam.CustomFactor:
+    """Return the factor of the excess paths that were heard from one pose."""
     points = sorted({one.landmark for one in rows} | {one.caller for one in rows})
     place = {label: k for k, label in enumerate(points)}
     ends = np.array([[place[one.landmark], place[one.caller]] for one in rows], dtype=np.int64)
-    measured = np.array([[one.detour, one.std] for one in rows])
+    measured = np.array([[one.excess_path, one.std] for one in rows])
     vehicle, others = pose_key(node), [point_key(label, node, chains) for label in points]
 
     def misfit(
@@ -148,15 +154,15 @@ def huber_errors(
     measured: Float[np.ndarray, "d 2"],
     believed: float,
 ) -> Float[np.ndarray, " d"]:
-    """Roots of twice Huber's loss of each detour, with the sign of its error.
+    """Roots of twice Huber's loss of each excess path, with the sign of its error.
 
     ``at`` is the pose; the rows of ``ends`` number landmark and caller among the places, those of
-    ``measured`` are the detour and its standard deviation.
+    ``measured`` are the excess path and its standard deviation.
     """
     r = np.empty(len(ends))
     for i in range(len(ends)):
         (px, py), (bx, by) = places[ends[i, 0]], places[ends[i, 1]]
-        expected, _, _, _, _ = detour_slopes(at[0], at[1], px, py, bx, by)
+        expected, _, _, _, _ = excess_path_slopes(at[0], at[1], px, py, bx, by)
         z = (expected - measured[i, 0]) / measured[i, 1]
         far = abs(z)
         r[i] = z if far <= believed else z / far * math.sqrt(believed * (2.0 * far - believed))
@@ -171,7 +177,7 @@ def misfits(
     measured: Float[np.ndarray, "d 2"],
     believed: float,
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d 3"], Float[np.ndarray, "n d 2"]]:
-    """Errors of detours and their slopes, weighted by Huber's rule; arguments as `huber_errors`.
+    """Errors of excess paths and their slopes, weighted by Huber's rule; see `huber_errors`.
 
     The slopes are by the pose, in its own axes, and by each place.
     """
@@ -180,7 +186,7 @@ def misfits(
     for i in range(count):
         landmark, caller = ends[i]
         (px, py), (bx, by) = places[landmark], places[caller]
-        expected, u, v, p, q = detour_slopes(at[0], at[1], px, py, bx, by)
+        expected, u, v, p, q = excess_path_slopes(at[0], at[1], px, py, bx, by)
         z = (expected - measured[i, 0]) / measured[i, 1]
         less = math.sqrt(believed / abs(z)) if abs(z) > believed else 1.0
         r[i], scale = less * z, less / measured[i, 1]

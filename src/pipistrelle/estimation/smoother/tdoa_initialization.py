@@ -1,13 +1,14 @@
-"""Initialization by a detour: the range of a landmark, or of a caller, along its bearing.
+"""Initialization by an excess path: the range of a landmark, or of a caller, along its bearing.
 
-The range of a landmark follows from its bearing and a detour over a caller in the graph; that of a
-caller from a detour over a landmark in the graph (`estimation.measurement.range_by_detour`,
-`caller_range_by_detour`). Its uncertainty depends on vehicle and other point together, and on the
-geometry: between vehicle and caller a detour says nothing of the range, and close to that line the
-range is far from linear, so that slopes would deceive. So the range is evaluated at eight sigma
-points, two standard deviations to either side along the principal axes of (offset, bearing,
-detour): their spread is that of the range (an unscented transform; Julier & Uhlmann 1997). Where
-one of them has no range, or the detour may be 0, nothing is known.
+The range of a landmark follows from its bearing and an excess path over a caller in the graph; that
+of a caller from an excess path over a landmark in the graph
+(`estimation.measurement.range_by_excess_path`, `caller_range_by_excess_path`). Its uncertainty
+depends on vehicle and other point together, and on the geometry: between vehicle and caller an
+excess path says nothing of the range, and close to that line the range is far from linear, so that
+slopes would deceive. So the range is evaluated at eight sigma points, two standard deviations to
+either side along the principal axes of (offset, bearing, excess path): their spread is that of the
+range (an unscented transform; Julier & Uhlmann 1997). Where one of them has no range, or the excess
+path may be 0, nothing is known.
 """
 
 import math
@@ -20,8 +21,8 @@ from jaxtyping import Float
 
 from pipistrelle.estimation.measurement import (
     MIN_TDOA_SIGMAS,
-    caller_range_by_detour,
-    range_by_detour,
+    caller_range_by_excess_path,
+    range_by_excess_path,
 )
 from pipistrelle.estimation.smoother.caller_motion import (
     Chains,
@@ -32,10 +33,10 @@ from pipistrelle.estimation.smoother.caller_motion import (
 from pipistrelle.estimation.smoother.delayed_initialization import Bearing
 from pipistrelle.estimation.smoother.graph import joint_covariance, pose_key, pose_of
 from pipistrelle.estimation.smoother.preintegration import Odometry, propagated, turned
-from pipistrelle.estimation.smoother.tdoa import Detour
+from pipistrelle.estimation.smoother.tdoa import ExcessPath
 
 MAX_RELATIVE_RANGE_STD = 0.2
-"""A detour places a point if the range has at most this standard deviation, divided by the
+"""An excess path places a point if the range has at most this standard deviation, divided by the
 range."""
 MAX_RANGE = 1e6
 """A larger range [m] counts as none."""
@@ -81,13 +82,13 @@ class LastPose:
         return (point,)
 
 
-def usable_detours(
-    label: int, heard: Iterable[Detour], mapped: Collection[int]
-) -> tuple[Detour, ...]:
-    """Return the detours of a landmark, or of a caller, whose other end is in the graph.
+def usable_excess_paths(
+    label: int, heard: Iterable[ExcessPath], mapped: Collection[int]
+) -> tuple[ExcessPath, ...]:
+    """Return the excess paths of a landmark, or of a caller, whose other end is in the graph.
 
-    >>> heard = [Detour(0, 4, 9, 3.0, 0.5), Detour(0, 5, 9, 2.0, 0.5)]
-    >>> [[one.landmark for one in usable_detours(label, heard, {4})] for label in (4, 5, 9)]
+    >>> heard = [ExcessPath(0, 4, 9, 3.0, 0.5), ExcessPath(0, 5, 9, 2.0, 0.5)]
+    >>> [[one.landmark for one in usable_excess_paths(label, heard, {4})] for label in (4, 5, 9)]
     [[], [], [4]]
     """
     return tuple(
@@ -98,19 +99,19 @@ def usable_detours(
     )
 
 
-def place_by_detours(
-    last: LastPose, heard: Bearing, label: int, usable: Iterable[Detour]
+def place_by_excess_paths(
+    last: LastPose, heard: Bearing, label: int, usable: Iterable[ExcessPath]
 ) -> Float[np.ndarray, "2"] | None:
-    """Return where a landmark or a caller is, by its bearing and the surest detour; None if unsure.
+    """Return where a landmark or a caller is by bearing and surest excess path; None if unsure.
 
-    The bearing is from the last pose, ``detours`` are one or more of `usable_detours`.
+    The bearing is from the last pose, ``excess_paths`` are one or more of `usable_excess_paths`.
     """
     angle, found = last.pose[2] + heard.bearing, []
     for clue in usable:
         caller = clue.caller == label
         other = clue.landmark if caller else clue.caller
         own = np.diag([0.0, 0.0, heard.std**2, clue.std**2])
-        way = np.array([*(last.place(other) - last.pose[:2]), angle, clue.detour])
+        way = np.array([*(last.place(other) - last.pose[:2]), angle, clue.excess_path])
         _, share = unscented_range(way, own, caller=caller)
         found.append((share, other, caller, way, own))
     share, other, caller, way, own = min(found, key=lambda one: one[:2])
@@ -127,10 +128,11 @@ def place_by_detours(
 def unscented_range(
     way: Float[np.ndarray, "4"], spread: Float[np.ndarray, "4 4"], *, caller: bool
 ) -> tuple[float, float]:
-    """Return a range by detour, and its standard deviation divided by it: infinite where unknown.
+    """Return a range by excess path and its relative standard deviation, infinite where unknown.
 
     ``way`` (4) is the offset to the other point (2), the direction of the asked one, and the
-    detour; ``spread`` (4, 4) is their covariance. With ``caller`` the range of the caller is asked.
+    excess path; ``spread`` (4, 4) is their covariance. With ``caller`` the range of the caller is
+    asked.
 
     The landmark is at (3, 4), the caller at (6, 0).
 
@@ -147,9 +149,9 @@ def unscented_range(
         return math.nan, math.inf
     size, axes = np.linalg.eigh(spread)
     off = 2.0 * np.sqrt(np.maximum(size, 0.0)) * axes
-    by_detour = caller_range_by_detour if caller else range_by_detour
+    by_excess_path = caller_range_by_excess_path if caller else range_by_excess_path
     ranges = [
-        by_detour(e, dx, dy, math.cos(angle), math.sin(angle))
+        by_excess_path(e, dx, dy, math.cos(angle), math.sin(angle))
         for dx, dy, angle, e in (way, *(way + off.T), *(way - off.T))
     ]
     if not all(0.0 < one < MAX_RANGE for one in ranges):

@@ -187,15 +187,17 @@ def measurement_table(scans: Sequence[Scan], callers: Sequence[str] = ()) -> "pl
             "landmark": joined([s.landmark for s in scans], np.int64),
             "bearing_rad": joined([s.bearing for s in scans], np.float64),
             "range_m": joined([s.range for s in scans], np.float64),
-            "detour_m": joined([s.detour for s in scans], np.float64),
-            "detour_std_m": joined([s.detour_std for s in scans], np.float64),
+            "excess_path_m": joined([s.excess_path for s in scans], np.float64),
+            "excess_path_std_m": joined([s.excess_path_std for s in scans], np.float64),
             "caller": [_name(j, callers) for s in scans for j in s.caller.tolist()],
         },
         schema_overrides={"caller": pl.String},
     ).with_columns(
-        pl.col("bearing_rad", "range_m", "detour_m").fill_nan(None),
-        # Noise is stated of every row, whether it has a detour or not.
-        detour_std_m=pl.when(pl.col("detour_m").is_not_nan()).then("detour_std_m").fill_nan(None),
+        pl.col("bearing_rad", "range_m", "excess_path_m").fill_nan(None),
+        # Noise is stated of every row, whether it has an excess path or not.
+        excess_path_std_m=pl.when(pl.col("excess_path_m").is_not_nan())
+        .then("excess_path_std_m")
+        .fill_nan(None),
     )
 
 

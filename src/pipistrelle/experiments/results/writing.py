@@ -52,7 +52,7 @@ bearings counter-clockwise from the heading. S is the sensing strategy, F the fi
 | steps.parquet | estimated and true poses, standard deviations, errors, NEES |
 | landmarks.parquet | every hypothesis of every landmark, beside the true positions |
 | measurements.parquet | what each strategy measured; no range where it was passive; of echoes of \
-another's call the detour, where it is known |
+another's call the excess path, where it is known |
 | mission.* | pictures |
 | worlds/ | the world that was heard, where it was one of your own |
 | view.html | the mission frame by frame, once `pipistrelle view` on this folder has made it |

@@ -70,9 +70,9 @@ def run_filter(
     Raises
     ------
     InputError
-        For a row that is neither bearing nor detour, or no number, one of which nobody says how
-        sure it is, scans out of order or at a time that is not one of the drive's, labels that are
-        none, landmarks known beforehand that move, or poses that are not one for each step.
+        For a row that is neither bearing nor excess path, or no number, one of which nobody says
+        how sure it is, scans out of order or at a time that is not one of the drive's, labels that
+        are none, landmarks known beforehand that move, or poses that are not one for each step.
     """
     time = drive.time
     steps = _steps_of(scans, time)

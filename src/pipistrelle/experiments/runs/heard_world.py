@@ -28,7 +28,7 @@ from pipistrelle.experiments.hearing.trajectories import motion_of
 from pipistrelle.experiments.results.scores import drive_bound
 from pipistrelle.geometry import wrap_angle
 
-_NOISE = ("noise", "range_std", "bearing_std", "detour_std")
+_NOISE = ("noise", "range_std", "bearing_std", "excess_path_std")
 _CALLERS = ("caller_speed_std", "caller_walk_std")
 """Settings of a filter that state noise: of what is heard, and of how callers move."""
 _Key = tuple[float, Strategy, FilterConfig, ListeningConfig]

@@ -17,7 +17,7 @@ from pipistrelle.detection.logs.readers import (
 from pipistrelle.detection.logs.recording import Log
 from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.noise import as_told, noise_of
-from pipistrelle.detection.scans import Scan, rows_of, with_columns, without_detours
+from pipistrelle.detection.scans import Scan, rows_of, with_columns, without_excess_paths
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.drives import Drive, Truth
@@ -116,8 +116,8 @@ def as_heard_by(
 
     The beam has a full width about the heading [rad]. Inside it, where the absolute bearing is at
     most half the width, range and bearing are heard actively. Outside it only the bearing is heard,
-    passively; detours are heard everywhere. Fused takes both, active only rows with a range and no
-    detours, passive all bearings and no range. Without a beam all ranges are kept.
+    passively; excess paths are heard everywhere. Fused takes both, active only rows with a range
+    and no excess paths, passive all bearings and no range. Without a beam all ranges are kept.
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> scan = make_scan(0.0, np.array([3, 8]), np.array([0.1, 0.4]), range=np.array([2.0, 5.0]))
@@ -133,7 +133,7 @@ def as_heard_by(
         distance = np.where(hidden, np.nan, scan.range)
         kept = np.isfinite(distance) | (strategy != "active")
         taken = rows_of(with_columns(scan, range=distance), kept)
-        heard.append(without_detours(taken) if strategy == "active" else taken)
+        heard.append(without_excess_paths(taken) if strategy == "active" else taken)
     return tuple(heard)
 
 

@@ -34,9 +34,9 @@ const outline = ({ x, y, xx, xy, yy }, scale) => {
 };
 
 // Where all stand whose way over them is so much longer: half the foci's distance along, and b across.
-const detourEllipse = (vehicle, caller, detour) => {
+const excessPathEllipse = (vehicle, caller, excessPath) => {
   const [dx, dy] = [caller.x - vehicle.x, caller.y - vehicle.y];
-  const b2 = (detour * (2 * Math.hypot(dx, dy) + detour)) / 4;
+  const b2 = (excessPath * (2 * Math.hypot(dx, dy) + excessPath)) / 4;
   const middle = { x: vehicle.x + dx / 2, y: vehicle.y + dy / 2 };
   return outline({ ...middle, xx: b2 + (dx * dx) / 4, xy: (dx * dy) / 4, yy: b2 + (dy * dy) / 4 }, 1);
 };

@@ -2,8 +2,8 @@
 
 const LAYERS = [
   "grid", "beam", "member-1", "member-2", "member-3", "member-4", "member-5", "member-6", "spines",
-  "pruned-3", "pruned-2", "pruned-1", "true-path", "places", "detours", "detour-ways", "way", "bearings", "ranges", "tips",
-  "ties", "placed", "dots", "detour-spot", "fresh", "caller-path", "callers", "believed-callers", "path", "revised", "cloud", "spread",
+  "pruned-3", "pruned-2", "pruned-1", "true-path", "places", "excess-paths", "excess-ways", "way", "bearings", "ranges", "tips",
+  "ties", "placed", "dots", "excess-spot", "fresh", "caller-path", "callers", "believed-callers", "path", "revised", "cloud", "spread",
   "true-vehicle", "vehicle", "chosen",
 ];
 const OPACITIES = 6;
@@ -47,7 +47,7 @@ const drawMap = (map, estimate, frame, chosen) => {
   drawRays(d, estimate, frame, believed);
   drawPlaced(map, d, estimate, frame, believed);
   drawCallers(map, d, estimate, frame);
-  drawDetours(d, estimate, frame, pose, believed, chosen);
+  drawExcessPaths(d, estimate, frame, pose, believed, chosen);
   drawVehicle(map, d, estimate, frame, pose);
   drawChosen(map, d, estimate, frame, believed, chosen);
   for (const name of LAYERS) map.layers[name].setAttribute("d", d[name] || "");
@@ -152,20 +152,20 @@ const drawCallers = (map, d, estimate, frame) => {
     + (one.moves ? outline(one, mission.scales.placed) : "")).join("");
 };
 
-// The detours of the chosen landmark, or of that which they resolve: ellipses about the vehicle and
+// The excess paths of the chosen landmark, or of that which they resolve: ellipses about the vehicle and
 // the caller, and the ways of which they tell.
-const drawDetours = (d, estimate, frame, pose, believed, chosen) => {
+const drawExcessPaths = (d, estimate, frame, pose, believed, chosen) => {
   if (!state.ellipses || !isKnown(pose)) return;
-  const heard = detoursShown(estimate, frame, chosen), ellipses = [], ways = [], spots = [];
-  for (const { landmark, caller, detour } of heard) {
+  const heard = excessPathsShown(estimate, frame, chosen), ellipses = [], ways = [], spots = [];
+  for (const { landmark, caller, excessPath } of heard) {
     const from = callerAt(estimate, caller, frame), spot = heaviest(believed.get(landmark));
-    ellipses.push(detourEllipse(pose, from, detour));
+    ellipses.push(excessPathEllipse(pose, from, excessPath));
     ways.push(polyline([from, spot, pose]));
     spots.push(dot(spot));
   }
-  d.detours = ellipses.join("");
-  d["detour-ways"] = ways.join("");
-  d["detour-spot"] = spots.slice(0, 1).join("");
+  d["excess-paths"] = ellipses.join("");
+  d["excess-ways"] = ways.join("");
+  d["excess-spot"] = spots.slice(0, 1).join("");
 };
 
 // The path told last, where the estimator revises it, and the frames since.

@@ -64,11 +64,11 @@ const callerAt = ({ callers }, caller, frame) => {
   return { x, y, xx, xy, yy };
 };
 
-// The detours of a frame that are shown: two at most, of the chosen landmark or of one they resolve.
-const detoursShown = ({ detours, resolved }, frame, chosen) => {
-  if (!detours) return [];
-  const heard = rowsOf(detours, frame).map(({ landmark, numbers: [caller, detour] }) =>
-    ({ landmark, caller, detour }));
+// The excess paths of a frame that are shown: two at most, of the chosen landmark or of one they resolve.
+const excessPathsShown = ({ excessPaths, resolved }, frame, chosen) => {
+  if (!excessPaths) return [];
+  const heard = rowsOf(excessPaths, frame).map(({ landmark, numbers: [caller, excessPath] }) =>
+    ({ landmark, caller, excessPath }));
   const own = heard.filter(({ landmark }) => landmark === chosen);
   return own.length ? own : heard.filter(({ landmark }) => landmark === resolved[frame]);
 };

@@ -37,7 +37,7 @@ def page(playback: Playback) -> str:
     script = "".join((here / name).read_text(encoding="utf-8") for name in SCRIPTS)
     return template.render(
         title=playback.title,
-        detours=any(len(estimate.detours.landmark) for estimate in playback.estimates),
+        excess_paths=any(len(estimate.excess_paths.landmark) for estimate in playback.estimates),
         facts=playback.facts,
         version=__version__,
         colours=Markup(page_colours()),
@@ -76,8 +76,11 @@ def _estimate(estimate: Estimate) -> dict[str, Any]:
     optional = {}
     if estimate.callers is not None:
         optional["callers"] = _packed(estimate.callers)
-    if len(estimate.detours.landmark):
-        optional |= {"detours": _rows(estimate.detours), "resolved": _packed(estimate.resolved)}
+    if len(estimate.excess_paths.landmark):
+        optional |= {
+            "excessPaths": _rows(estimate.excess_paths),
+            "resolved": _packed(estimate.resolved),
+        }
     return optional | {
         "name": _name(estimate),
         "role": estimate.strategy if known else "ink",

@@ -17,7 +17,13 @@ from pipistrelle.experiments.drives import LabelledPoints
 from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.runs.mission import Mission
 from pipistrelle.figures.animation import pruned
-from pipistrelle.figures.detours import MOST, callers_at, callers_marked, detours_at, resolved
+from pipistrelle.figures.excess_paths import (
+    MOST,
+    callers_at,
+    callers_marked,
+    excess_paths_at,
+    resolved,
+)
 from pipistrelle.figures.maps import view
 from pipistrelle.figures.mission import outcome
 from pipistrelle.figures.recorder import Snapshot, heard_from
@@ -73,11 +79,11 @@ class Estimate:
     callers: Float[np.ndarray, "n c 5"] | None
     """Where each caller of the playback is believed to be: x, y [m], xx, xy, yy [m^2], NaN where
     that is not known. None where no picture marks it."""
-    detours: Rows
+    excess_paths: Rows
     """Those that make an ellipse, two of a landmark at most: whose call it was, by its place among
     the callers, and how much longer its way [m]."""
     resolved: Int[np.ndarray, " n"]
-    """Label of the landmark whose detours are shown, -1 for none."""
+    """Label of the landmark whose excess paths are shown, -1 for none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -255,7 +261,7 @@ def _estimate(
         revised_at=revised_at,
         revised=revised,
         callers=_callers_believed(shown, origin) if callers_marked(trial.scans) else None,
-        detours=_detours(shown),
+        excess_paths=_excess_paths(shown),
         resolved=np.array(resolved(frames), dtype=int)[at],
     )
 
@@ -289,14 +295,14 @@ def _callers_believed(
     )
 
 
-def _detours(frames: Sequence[Snapshot]) -> Rows:
-    """Lay out the detours that make ellipses: callers are counted without the vehicle."""
+def _excess_paths(frames: Sequence[Snapshot]) -> Rows:
+    """Lay out the excess paths that make ellipses: callers are counted without the vehicle."""
     labels, numbers = [], []
     for frame in frames:
-        rows = [row for found in detours_at(frame).values() for row in found[:MOST].tolist()]
+        rows = [row for found in excess_paths_at(frame).values() for row in found[:MOST].tolist()]
         scan = frame.scan
         labels.append(scan.landmark[rows].astype(int))
-        numbers.append(np.column_stack([scan.caller[rows] - 1, scan.detour[rows]]))
+        numbers.append(np.column_stack([scan.caller[rows] - 1, scan.excess_path[rows]]))
     return _rows(labels, numbers, 2)
 
 

@@ -213,7 +213,7 @@ const play = () => {
 const toggle = () => (state.playing ? pause() : play());
 const step = (frames) => { pause(); seek(state.frame + frames); };
 
-const ellipses = document.getElementById("ellipses"); // only where detours were heard
+const ellipses = document.getElementById("ellipses"); // only where excess paths were heard
 const toggleEllipses = () => {
   state.ellipses = !state.ellipses;
   ellipses.setAttribute("aria-pressed", state.ellipses);

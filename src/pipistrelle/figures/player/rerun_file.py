@@ -17,7 +17,7 @@ from pipistrelle.config import InputError
 from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.estimation.catalogue import short_name, title_of
 from pipistrelle.figures.maps import shades
-from pipistrelle.figures.outlines import PLACED, RAY, beam, detour_ellipse, ellipses, vehicle
+from pipistrelle.figures.outlines import PLACED, RAY, beam, ellipses, excess_path_ellipse, vehicle
 from pipistrelle.figures.player.playback import POSE_STDS, Estimate, Playback, Rows
 from pipistrelle.figures.style import INK, PAGE, TRUTH, strategy_colour
 from pipistrelle.geometry import wrap
@@ -226,7 +226,7 @@ def _log_estimate(log: _Log, playback: Playback, estimate: Estimate, frame: int)
         points = _rows_of(estimate.revised, revision)[1]
         log.lines(f"{name}/revised", [_so_far(points)], colour)
     _log_heard(log, playback, estimate, frame)
-    _log_detours(log, estimate, frame)
+    _log_excess_paths(log, estimate, frame)
     _log_map(log, estimate, frame)
     _log_errors(log, playback, estimate, frame)
 
@@ -244,17 +244,20 @@ def _log_heard(log: _Log, playback: Playback, estimate: Estimate, frame: int) ->
         log.lines(f"{_name(estimate)}/{part}", lines, shade, 0.5 * THIN)
 
 
-def _log_detours(log: _Log, estimate: Estimate, frame: int) -> None:
+def _log_excess_paths(log: _Log, estimate: Estimate, frame: int) -> None:
     """Log where callers are believed to be, and the ellipses of the landmark that is resolved."""
     if estimate.callers is None:
         return
     name, places = _name(estimate), estimate.callers[frame, :, :2]
     log.dots(f"{name}/callers", places, _rgba(strategy_colour(estimate.strategy)))
-    labels, rows = _rows_of(estimate.detours, frame)
+    labels, rows = _rows_of(estimate.excess_paths, frame)
     shown = rows[labels == estimate.resolved[frame]]
     vehicle = estimate.pose[frame, :2]
-    outlines = [detour_ellipse(vehicle, places[int(caller)], detour) for caller, detour in shown]
-    log.lines(f"{name}/detours", outlines, _rgba(INK), 0.5 * THIN)
+    outlines = [
+        excess_path_ellipse(vehicle, places[int(caller)], excess_path)
+        for caller, excess_path in shown
+    ]
+    log.lines(f"{name}/excess_paths", outlines, _rgba(INK), 0.5 * THIN)
 
 
 def _log_map(log: _Log, estimate: Estimate, frame: int) -> None:

@@ -1,4 +1,4 @@
-"""Which detours a picture shows, and that their ellipses go through what they tell of."""
+"""Which excess paths a picture shows, and that their ellipses go through what they tell of."""
 
 from dataclasses import replace
 
@@ -7,15 +7,15 @@ import pytest
 
 from pipistrelle.detection.scans import UNLABELLED, make_scan
 from pipistrelle.estimation.beliefs import some_of
-from pipistrelle.estimation.measurement import detour_of
-from pipistrelle.figures.detours import (
+from pipistrelle.estimation.measurement import excess_path_of
+from pipistrelle.figures.excess_paths import (
     MOST,
     RECENT,
     callers_at,
     callers_believed,
     callers_marked,
-    detours_at,
-    drawn_detours,
+    drawn_excess_paths,
+    excess_paths_at,
     resolved,
 )
 from pipistrelle.figures.recorder import Snapshot
@@ -33,10 +33,12 @@ def frame_of(members, heard, ranged=()):
     label, mean = zip(*rows, strict=True)
     weight = [1.0 / members.get(one, 1) for one in label]
     landmark, caller = (np.array(column, dtype=int) for column in zip(*heard, strict=True))
-    detour = [detour_of(np.zeros(2), SPOT, CALLERS[one]) for one in caller.tolist()]
+    excess_path = [excess_path_of(np.zeros(2), SPOT, CALLERS[one]) for one in caller.tolist()]
     distance = np.where(np.isin(landmark, ranged), 8.0, np.nan)
-    scan = make_scan(0.0, landmark, np.zeros(len(heard)), range=distance, detour=np.array(detour),
-                     caller=caller)  # fmt: skip
+    scan = make_scan(
+        0.0, landmark, np.zeros(len(heard)),
+        range=distance, excess_path=np.array(excess_path), caller=caller,
+    )  # fmt: skip
     return Snapshot(
         scan=replace(scan, callers=LABELS),
         pose=np.zeros(3),
@@ -55,8 +57,8 @@ def test_callers_are_believed_where_their_landmark_is_once_it_is_placed():
     assert np.isnan(known.mean[[0, 2, 3]]).all(), "the vehicle, a ray, and one never heard"
 
 
-def test_an_ellipse_goes_through_the_landmark_that_its_detour_tells_of():
-    (ellipse,), (way,) = drawn_detours(frame_of({5: 1}, [(5, 1)]), 5)
+def test_an_ellipse_goes_through_the_landmark_that_its_excess_path_tells_of():
+    (ellipse,), (way,) = drawn_excess_paths(frame_of({5: 1}, [(5, 1)]), 5)
     caller = CALLERS[1]
     length = np.hypot(*(ellipse - caller).T) + np.hypot(*ellipse.T)
     expected = np.hypot(*(SPOT - caller)) + np.hypot(*SPOT)
@@ -65,27 +67,29 @@ def test_an_ellipse_goes_through_the_landmark_that_its_detour_tells_of():
     np.testing.assert_array_equal(way, [caller, SPOT, [0.0, 0.0]])
 
 
-def test_of_three_detours_two_are_drawn_that_cross_most_squarely():
+def test_of_three_excess_paths_two_are_drawn_that_cross_most_squarely():
     frame = frame_of({5: 1}, [(5, 2), (5, 3), (5, 1)])
-    rows = detours_at(frame)[5]
+    rows = excess_paths_at(frame)[5]
     assert len(rows) == 3
     assert 1 in frame.scan.caller[rows[:MOST]], "two and three stand beside each other"
-    assert len(drawn_detours(frame, 5)[0]) == MOST == 2
-    assert len(drawn_detours(frame_of({5: 1}, [(5, 2), (5, 3)]), 5)[0]) == 2
+    assert len(drawn_excess_paths(frame, 5)[0]) == MOST == 2
+    assert len(drawn_excess_paths(frame_of({5: 1}, [(5, 2), (5, 3)]), 5)[0]) == 2
 
 
-def test_a_detour_of_a_caller_that_is_not_placed_makes_no_ellipse():
+def test_an_excess_path_of_a_caller_that_is_not_placed_makes_no_ellipse():
     frame = frame_of({5: 1}, [(5, 1), (5, 2)])
     some = frame.landmarks.landmark != 92
     rows = {name: getattr(frame.landmarks, name)[some] for name in ("landmark", "mean", "weight")}
     blind = replace(
         frame, landmarks=map_with(rows["landmark"], rows["mean"], weight=rows["weight"])
     )
-    assert frame.scan.caller[detours_at(blind)[5]].tolist() == [1]
+    assert frame.scan.caller[excess_paths_at(blind)[5]].tolist() == [1]
     unknown = replace(frame, scan=replace(frame.scan, callers=LABELS[:2]))
-    assert frame.scan.caller[detours_at(unknown)[5]].tolist() == [1], "a number beyond the labels"
-    assert detours_at(replace(frame, pose=np.full(3, np.nan))) == {}
-    assert drawn_detours(frame, 77) == ([], []), "a landmark that nobody knows"
+    assert frame.scan.caller[excess_paths_at(unknown)[5]].tolist() == [1], (
+        "a number beyond the labels"
+    )
+    assert excess_paths_at(replace(frame, pose=np.full(3, np.nan))) == {}
+    assert drawn_excess_paths(frame, 77) == ([], []), "a landmark that nobody knows"
 
 
 def test_what_is_placed_now_goes_before_a_ray_and_a_ray_before_what_was_placed():
@@ -101,19 +105,19 @@ def test_what_is_placed_now_goes_before_a_ray_and_a_ray_before_what_was_placed()
     assert resolved(frames) == [6, 5, 7, 7, 7, 5]
 
 
-def test_a_landmark_is_shown_for_a_while_after_detours_have_placed_it():
+def test_a_landmark_is_shown_for_a_while_after_excess_paths_have_placed_it():
     frames = [frame_of({5: 4}, [(5, 1)])] + [frame_of({5: 1}, [(5, 1)])] * (RECENT + 9)
     shown = [label == 5 for label in resolved(frames)]
     assert shown == [True] * (RECENT + 2) + [False] * 8
 
 
-def test_a_landmark_that_a_range_has_placed_is_none_that_detours_resolve():
+def test_a_landmark_that_a_range_has_placed_is_none_that_excess_paths_resolve():
     frames = [frame_of({5: 1}, [(5, 1)], ranged) for ranged in ((5,), ())]
     assert resolved(frames) == [UNLABELLED, UNLABELLED]
     assert resolved(frames[1:]) == [5], "else it is"
 
 
-def test_of_two_landmarks_alike_the_one_stays_that_was_shown_or_has_two_detours():
+def test_of_two_landmarks_alike_the_one_stays_that_was_shown_or_has_two_excess_paths():
     one, both = [(5, 1), (6, 1)], [(5, 1), (6, 1), (6, 2)]
     assert resolved([frame_of({5: 2, 6: 2}, both), frame_of({5: 2, 6: 2}, one)]) == [6, 6]
     assert resolved([frame_of({5: 2, 6: 2}, one), frame_of({5: 2, 6: 2}, both)]) == [5, 5]
@@ -133,10 +137,10 @@ def test_ellipses_of_a_mission_pass_near_their_landmark(timed, strategy):
     _, snapshots = timed
     frames = snapshots[strategy, "ekf"]
     chosen = resolved(frames)
-    assert (set(chosen) == {UNLABELLED}) == (strategy == "active"), "active takes no detours"
+    assert (set(chosen) == {UNLABELLED}) == (strategy == "active"), "active takes no excess paths"
     counts = []
     for frame, label in zip(frames, chosen, strict=True):
-        outlines, ways = drawn_detours(frame, label)
+        outlines, ways = drawn_excess_paths(frame, label)
         counts.append(len(outlines))
         for outline, way in zip(outlines, ways, strict=True):
             near = np.hypot(*(outline - way[1]).T).min()
@@ -153,6 +157,6 @@ def test_one_that_moves_is_believed_where_it_is_followed():
     assert np.isnan(callers_at(still).mean[1]).all()
     followed = replace(still, moving=boat)
     np.testing.assert_array_equal(callers_at(followed).mean[1], [2.0, -1.0])
-    (ellipse,), _ = drawn_detours(followed, 5)
+    (ellipse,), _ = drawn_excess_paths(followed, 5)
     length = np.hypot(*(ellipse - [2.0, -1.0]).T) + np.hypot(*ellipse.T)
     np.testing.assert_allclose(length, length[0], rtol=1e-9)

@@ -1,7 +1,7 @@
-"""Which detours a picture shows: those that resolve a ray, by ellipses about caller and vehicle.
+"""Which excess paths a picture shows: those that resolve a ray, by ellipses.
 
 Both stand where they are believed to be at that frame. Of a frame one landmark is shown so, and
-of its detours two at most: with its bearing, or with each other, they cross where it is.
+of its excess paths two at most: with its bearing, or with each other, they cross where it is.
 """
 
 from collections import defaultdict
@@ -13,13 +13,13 @@ from jaxtyping import Float, Int
 
 from pipistrelle.detection.scans import UNLABELLED, Scan
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks, joined, placed
-from pipistrelle.figures.outlines import detour_ellipse
+from pipistrelle.figures.outlines import excess_path_ellipse
 from pipistrelle.figures.recorder import Snapshot
 
 MOST = 2
 """Ellipses that are shown at a time."""
 RECENT = 40
-"""Frames for which a landmark is shown so that detours have placed: each frame's ellipses cross
+"""Frames for which a landmark is shown that excess paths have placed: each frame's ellipses cross
 there, wherever the vehicle goes."""
 
 
@@ -58,20 +58,20 @@ def callers_at(frame: Snapshot) -> Gaussian:
 def callers_marked(scans: Sequence[Scan]) -> bool:
     """Return whether a picture marks the estimated positions of callers.
 
-    Returns: where there are several, or where detours were heard, whose ellipses are about them.
-    The paper's one beacon is a landmark as any other.
+    Returns: where there are several, or where excess paths were heard, whose ellipses are about
+    them. The paper's one beacon is a landmark as any other.
     """
     several = any(np.sum(scan.callers != UNLABELLED) > 1 for scan in scans[-1:])
-    return several or any(np.isfinite(scan.detour).any() for scan in scans)
+    return several or any(np.isfinite(scan.excess_path).any() for scan in scans)
 
 
-def detours_at(frame: Snapshot) -> dict[int, Int[np.ndarray, " k"]]:
+def excess_paths_at(frame: Snapshot) -> dict[int, Int[np.ndarray, " k"]]:
     """Rows of a scan with an excess path that defines an ellipse, by landmark.
 
     Returns: of landmarks of the map, heard from callers that are placed. Of several the first two
     are those whose ellipses cross most squarely there.
     """
-    scan, heard = frame.scan, np.isfinite(frame.scan.detour)
+    scan, heard = frame.scan, np.isfinite(frame.scan.excess_path)
     heard &= (scan.caller < len(scan.callers)) & np.isin(scan.landmark, frame.landmarks.landmark)
     if not heard.any() or not np.isfinite(frame.pose).all():
         return {}
@@ -108,11 +108,11 @@ def _squarest(
 
 
 def resolved(frames: Sequence[Snapshot]) -> list[int]:
-    """Choose for each frame the landmark whose detours are shown.
+    """Choose for each frame the landmark whose excess paths are shown.
 
-    The one that the frame's detours have just placed; else the ray of the fewest members that
+    The one that the frame's excess paths have just placed; else the ray of the fewest members that
     they weigh; else the one that they placed last, `RECENT` frames ago at most. Of several the one
-    that was shown before, or that has two detours.
+    that was shown before, or that has two excess paths.
 
     `frames`: in the order of time. Returns: `UNLABELLED` where there is none.
 
@@ -124,7 +124,7 @@ def resolved(frames: Sequence[Snapshot]) -> list[int]:
     members, since, timed, ranged = {}, {}, set(), set()
     shown, found = UNLABELLED, []
     for now, frame in enumerate(frames):
-        before, ellipses_of, scan = members, detours_at(frame), frame.scan
+        before, ellipses_of, scan = members, excess_paths_at(frame), frame.scan
         labels, counts = np.unique(frame.landmarks.landmark, return_counts=True)
         members = dict(zip(labels.tolist(), counts.tolist(), strict=True))
         timed.update(ellipses_of)
@@ -147,21 +147,21 @@ def resolved(frames: Sequence[Snapshot]) -> list[int]:
     return found
 
 
-def drawn_detours(
+def drawn_excess_paths(
     frame: Snapshot, label: int
 ) -> tuple[list[Float[np.ndarray, "121 2"]], list[Float[np.ndarray, "3 2"]]]:
-    """Ellipses of a landmark's detours at a frame, and the ways of which they tell.
+    """Ellipses of a landmark's excess paths at a frame, and the ways of which they tell.
 
     Returns [m]: two at most. Returns [m]: from the caller to the likeliest place of the landmark
     and on to the vehicle.
     """
-    rows = detours_at(frame).get(label, ())[:MOST]
+    rows = excess_paths_at(frame).get(label, ())[:MOST]
     here = frame.landmarks.landmark == label
     callers, vehicle = callers_at(frame).mean, frame.pose[:2]
     outlines, ways = [], []
     for row in rows:
         spot = frame.landmarks.mean[here][np.argmax(frame.landmarks.weight[here])]
         caller = callers[frame.scan.caller[row]]
-        outlines.append(detour_ellipse(vehicle, caller, float(frame.scan.detour[row])))
+        outlines.append(excess_path_ellipse(vehicle, caller, float(frame.scan.excess_path[row])))
         ways.append(np.stack([caller, spot, vehicle]))
     return outlines, ways

@@ -1,11 +1,13 @@
-"""Make `images/detours.png` anew, a tutorial's figure: `.venv/bin/python docs/detours.py`."""
+"""Make `images/excess_paths.png` anew, by
+`.venv/bin/python docs/excess_paths.py`.
+"""
 
 import runpy
 from pathlib import Path
 
 import matplotlib
 
-PLACE = Path(__file__).parent / "images" / "detours.png"
+PLACE = Path(__file__).parent / "images" / "excess_paths.png"
 TUTORIAL = Path(__file__).parents[1] / "examples" / "10_when_not_only_where.py"
 
 

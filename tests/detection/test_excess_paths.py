@@ -1,4 +1,4 @@
-"""How near detours of isolated echoes come to the least error that any estimator has."""
+"""How near excess paths of isolated echoes come to the least error that any estimator has."""
 
 import math
 from functools import cache
@@ -13,7 +13,7 @@ from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import BLOCK, sampling
 from pipistrelle.config import Config
-from pipistrelle.detection.certainty import DETOUR_FLOOR
+from pipistrelle.detection.certainty import EXCESS_PATH_FLOOR
 from pipistrelle.detection.faces import average_faces
 from pipistrelle.detection.matched import filter_blocks
 from pipistrelle.detection.scans import UNLABELLED
@@ -49,8 +49,8 @@ def sounds(delays, snr_db, angles):
     )
 
 
-def detour_off(snr_db, key, heels=None):
-    """How much too long a detour is thought, and its told deviation [m]; NaN of none.
+def excess_path_off(snr_db, key, heels=None):
+    """How much too long an excess path is thought, and its told deviation [m]; NaN of none.
 
     A second echo may be so many blocks behind the first.
     """
@@ -58,7 +58,7 @@ def detour_off(snr_db, key, heels=None):
     direct = (FIRST + rng.random()) * BLOCK
     echo = direct + (APART + rng.random()) * BLOCK
     times = [direct, echo] if heels is None else [direct, echo, echo + heels * BLOCK]
-    heard = noise_blocks(BLOCKS, SQUARE, SETTLED, stream_key(7, key, f"detours {snr_db}"))
+    heard = noise_blocks(BLOCKS, SQUARE, SETTLED, stream_key(7, key, f"excess_paths {snr_db}"))
     arrivals = sounds(times, snr_db, rng.uniform(-0.15, 0.15, len(times)))
     add_echo_blocks(heard, arrivals, SQUARE, SETTLED)
     matched = filter_blocks(heard, pulse=PULSE, block=SETTLED.block, noise_std=1.0)
@@ -69,20 +69,20 @@ def detour_off(snr_db, key, heels=None):
     row = np.flatnonzero(frame.rows.landmark == ECHO)
     if row.size == 0:
         return np.nan, np.nan
-    e, std = frame.rows.detour[row[0]], frame.rows.detour_std[row[0]]
-    return e - C * (echo - direct), math.sqrt(std**2 - DETOUR_FLOOR**2)
+    e, std = frame.rows.excess_path[row[0]], frame.rows.excess_path_std[row[0]]
+    return e - C * (echo - direct), math.sqrt(std**2 - EXCESS_PATH_FLOOR**2)
 
 
 @cache
 def alone(snr_db, count, heels=None):
-    """Errors of detours and their told deviations [m], and how many echoes had none."""
-    rows = np.array([detour_off(snr_db, key, heels) for key in range(count)])
+    """Errors of excess paths and their told deviations [m], and how many echoes had none."""
+    rows = np.array([excess_path_off(snr_db, key, heels) for key in range(count)])
     heard = np.isfinite(rows[:, 0])
     return *rows[heard].T, count - int(heard.sum())
 
 
 def bound(snr_db, of):
-    """The rms of a detour [m] that a bound of the delays' variances leaves.
+    """The rms of an excess path [m] that a bound of the delays' variances leaves.
 
     A call is heard from the next sample on: each is late by up to one, and nothing tells.
     """
@@ -134,11 +134,11 @@ def test_of_a_call_that_is_not_heard_the_least_mean_square_is_that_of_any_delay(
     assert least_mean_square(1e-9, PULSE) == pytest.approx(8.0**2 / 12.0, rel=0.01)
 
 
-# Detours
+# Excess paths
 
 
 @pytest.mark.parametrize("snr_db", [8.0, 13.0, 20.0, 30.0])
-def test_a_detour_is_within_a_tenth_of_the_least_error(snr_db):
+def test_an_excess_path_is_within_a_tenth_of_the_least_error(snr_db):
     off, _, missed = alone(snr_db, FEW)
     assert missed < 0.01 * FEW
     assert is_near(off, snr_db)
@@ -146,7 +146,7 @@ def test_a_detour_is_within_a_tenth_of_the_least_error(snr_db):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("snr_db", LEVELS)
-def test_every_detour_is_within_a_tenth_of_the_least_error(snr_db):
+def test_every_excess_path_is_within_a_tenth_of_the_least_error(snr_db):
     off, std, missed = alone(snr_db, MANY)
     regular = ratio(off, snr_db, cramer_rao)
     rms, told = (1e3 * np.sqrt(np.mean(x**2)) for x in (off, std))
@@ -160,7 +160,7 @@ def test_every_detour_is_within_a_tenth_of_the_least_error(snr_db):
 
 
 @pytest.mark.parametrize("snr_db", [8.0, 20.0, 30.0])
-def test_a_detour_from_a_whole_block_on_is_not_within_a_tenth(snr_db):
+def test_an_excess_path_from_a_whole_block_on_is_not_within_a_tenth(snr_db):
     off, *_ = alone(snr_db, FEW)
     assert is_near(off, snr_db)
     rng, block = np.random.default_rng(1), C * BLOCK
@@ -170,6 +170,6 @@ def test_a_detour_from_a_whole_block_on_is_not_within_a_tenth(snr_db):
 
 
 @pytest.mark.parametrize("snr_db", [8.0, 20.0, 30.0])
-def test_a_detour_of_an_echo_with_another_at_its_heels_is_not_within_a_tenth(snr_db):
+def test_an_excess_path_of_an_echo_with_another_at_its_heels_is_not_within_a_tenth(snr_db):
     off, *_ = alone(snr_db, 200, heels=3.0)
     assert not is_near(off, snr_db)
