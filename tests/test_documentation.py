@@ -166,43 +166,63 @@ def heard_and_drive(steps=120):
 
 
 def test_the_guides_association_finds_again_what_the_oracle_knew(guide):
-    from pipistrelle.detection.faces import unlabelled
     from pipistrelle.detection.merging import scan_of
-    from pipistrelle.detection.noise import as_told
+    from pipistrelle.detection.noise import without_hidden
+    from pipistrelle.detection.scans import NO_CALLERS, without_labels
+    from pipistrelle.estimation.association import Assignment
     from pipistrelle.experiments.cases import Case
     from pipistrelle.experiments.runs.heard_world import scans_of
     from pipistrelle.experiments.runs.trial import run_trial
 
+    class Anyone:
+        """Takes all rows for one landmark."""
+
+        def start(self):
+            return None
+
+        def associate(self, memory, belief, scan):
+            return memory, Assignment(label=np.ones(scan.landmark.size, int))
+
     config, heard, drive = heard_and_drive()
     case = Case(strategy="active", filter="ekf")
-    told = run_trial(case, drive, scans_of(heard, "active", config), config).track
-    hidden = [
-        scan_of(as_told(unlabelled(frame).rows, config.filter, timing=False), "active")
-        for frame in heard
-    ]
-    trial = run_trial(case, drive, hidden, config, associate=guide["nearest"])
+    known = run_trial(case, drive, scans_of(heard, "active", config), config).track
+    rows = (without_labels(frame.rows, NO_CALLERS) for frame in heard)
+    hidden = [scan_of(without_hidden(scan, config.filter, timing=False), "active") for scan in rows]
+    trial = run_trial(case, drive, hidden, config, association=guide["Nearest"]())
     found = trial.track
-    np.testing.assert_array_equal(found.pose.mean, told.pose.mean)
-    np.testing.assert_array_equal(found.landmarks.mean, told.landmarks.mean)
-    assert found.landmarks.landmark.tolist() == list(range(1, 1 + len(told.landmarks.landmark)))
+    np.testing.assert_array_equal(found.pose.mean, known.pose.mean)
+    np.testing.assert_array_equal(found.landmarks.mean, known.landmarks.mean)
+    assert found.landmarks.landmark.tolist() == list(range(1, 1 + len(known.landmarks.landmark)))
     assert (trial.scores.map_rmse_m, trial.scores.map_rmse_aligned_m) == (None, None)
     assert all((scan.landmark > 0).all() for scan in trial.scans), "as the filter had them"
-    anyone = run_trial(
-        case, drive, hidden, config, associate=lambda _, scan: np.ones(scan.landmark.size, int)
-    )
-    assert not np.allclose(anyone.track.pose.mean, told.pose.mean, atol=0.1)
+    anyone = run_trial(case, drive, hidden, config, association=Anyone())
+    assert not np.allclose(anyone.track.pose.mean, known.pose.mean, atol=0.1)
+
+
+def test_the_guides_session_ends_where_a_filter_of_the_whole_drive_does(guide):
+    from dataclasses import replace
+
+    from pipistrelle.experiments.runs.trial import run_trial
+
+    trial = run_trial(
+        replace(guide["case"], filter="iekf"), guide["drive"], guide["scans"], guide["config"],
+        association=guide["Nearest"](),
+    )  # fmt: skip
+    np.testing.assert_array_equal(trial.track.pose.mean[-1], guide["where"])
 
 
 def test_the_guides_noise_reaches_the_filter_row_by_row(guide):
     from pipistrelle.detection.merging import scan_of
-    from pipistrelle.detection.noise import as_told
+    from pipistrelle.detection.noise import without_hidden
     from pipistrelle.experiments.cases import Case
     from pipistrelle.experiments.runs.heard_world import scans_of
     from pipistrelle.experiments.runs.trial import run_trial
 
     config, heard, drive = heard_and_drive(40)
     scans = [
-        guide["by_level"](scan_of(as_told(frame.rows, config.filter, timing=False), "active"))
+        guide["by_level"](
+            scan_of(without_hidden(frame.rows, config.filter, timing=False), "active")
+        )
         for frame in heard
     ]
     said = np.concatenate([scan.bearing_std for scan in scans])

@@ -351,8 +351,8 @@ class DetectionConfig(Section):
     """Mean over the faces: plain (the paper's) or by inverse variance at the array's angle."""
 
 
-class AssociationConfig(Section):
-    """Known association: how near the truth a detection must be to bear its label."""
+class MatchingConfig(Section):
+    """When a detection is of an arrival (known labels), or of the same echo as another face's."""
 
     delay_gate: Positive = 0.25
     """Largest error of the delay, as a share of the pulse."""
@@ -360,6 +360,14 @@ class AssociationConfig(Section):
     """Largest error of the bearing [rad]."""
     margin_db: NonNegative = 6.0
     """Arrivals expected further than this under the threshold cannot be matched [dB]."""
+
+
+class AssociationConfig(Section):
+    """Who says which landmark an echo is of."""
+
+    method: str = "known"
+    """The labels that came with the scans, in a simulation an oracle's (the paper's); or
+    module:Class, an association of your own."""
 
 
 class ListeningConfig(Section):
@@ -496,8 +504,9 @@ class Config(Section):
     beacon: BeaconConfig = BeaconConfig()
     receiver: ReceiverConfig = ReceiverConfig()
     detection: DetectionConfig = DetectionConfig()
-    association: AssociationConfig = AssociationConfig()
+    matching: MatchingConfig = MatchingConfig()
     listening: ListeningConfig = ListeningConfig()
+    association: AssociationConfig = AssociationConfig()
     motion: MotionConfig = MotionConfig()
     assumed: AssumedConfig = AssumedConfig()
     filter: FilterConfig = FilterConfig()

@@ -12,7 +12,7 @@ from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import BLOCK, sampling
-from pipistrelle.config import AssociationConfig, Config
+from pipistrelle.config import Config, MatchingConfig
 from pipistrelle.detection.certainty import EXCESS_PATH_FLOOR
 from pipistrelle.detection.direct import DirectCalls, direct_calls, front_edge, loudest_first
 from pipistrelle.detection.faces import average_faces
@@ -379,7 +379,7 @@ def in_worlds(radius=0.0088, worlds=3, delay_gate=0.25):
     """
     direct, strongest, rows = [], [], []
     for world in range(worlds):
-        config = Config(seed=1000, association=AssociationConfig(delay_gate=delay_gate))
+        config = Config(seed=1000, matching=MatchingConfig(delay_gate=delay_gate))
         scenario, true = world_of(config, world), []
         beacon = int(caller_labels(scenario)[BEACON])
 

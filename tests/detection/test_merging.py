@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipistrelle.detection.certainty import BEARING_FLOOR, RANGE_FLOOR
-from pipistrelle.detection.faces import FrameMeasurements, average_faces, same_echo, unlabelled
+from pipistrelle.detection.faces import FrameMeasurements, average_faces, same_echo
 from pipistrelle.detection.merging import scan_of
-from pipistrelle.detection.scans import COLUMNS, OWN, UNLABELLED, with_columns
+from pipistrelle.detection.scans import COLUMNS, OWN, UNLABELLED, with_columns, without_labels
 from pipistrelle.detection.snapshots import Detections
 from pipistrelle.geometry import circular_mean, wrap
 from reference.missions import scan_with
@@ -285,12 +285,12 @@ def test_detections_that_could_be_of_one_echo_are():
 def test_without_labels_rows_are_what_they_were_and_nobodys():
     found, label = crowd(np.random.default_rng(3))
     heard = heard_of(found, label)
-    nobodys = unlabelled(heard)
-    assert set(nobodys.rows.landmark.tolist()) == {UNLABELLED}
+    hidden = without_labels(heard.rows, np.array([UNLABELLED, 4]))
+    assert set(hidden.landmark.tolist()) == {UNLABELLED}
     for name in set(COLUMNS) - {"landmark"}:
-        np.testing.assert_array_equal(getattr(nobodys.rows, name), getattr(heard.rows, name))
-    fused = scan_of(nobodys.rows, "fused")
-    assert fused.landmark.size == nobodys.rows.landmark.size, "nothing is merged without a label"
+        np.testing.assert_array_equal(getattr(hidden, name), getattr(heard.rows, name))
+    fused = scan_of(hidden, "fused")
+    assert fused.landmark.size == hidden.landmark.size, "nothing is merged without a label"
 
 
 def test_rows_of_one_landmark_fuse_by_inverse_variances_where_all_are_told_and_plainly_else():

@@ -6,7 +6,7 @@ import pytest
 from pipistrelle.config import Config, FilterConfig
 from pipistrelle.detection.certainty import BEARING_FLOOR, RANGE_FLOOR
 from pipistrelle.detection.faces import FrameMeasurements, average_faces
-from pipistrelle.detection.noise import ConstantNoise, as_told, noise_of
+from pipistrelle.detection.noise import ConstantNoise, noise_of, without_hidden
 from pipistrelle.detection.scans import COLUMNS, with_columns
 from pipistrelle.detection.snapshots import Detections
 from pipistrelle.experiments.runs.heard_world import scans_of
@@ -121,7 +121,7 @@ def test_an_estimator_is_told_what_the_settings_let_it_know_and_all_else_as_it_w
         with_columns(ROWS, excess_path=np.array([NAN, 4.0, NAN, NAN]), excess_path_std=0.1),
         callers=np.array([-1, 51, 52]),
     )
-    known = as_told(rows, FilterConfig(noise=noise), timing=timing)
+    known = without_hidden(rows, FilterConfig(noise=noise), timing=timing)
     hidden = {"bearing_std", "range_std", "excess_path_std"} if noise == "constant" else set()
     hidden |= set() if timing else {"excess_path", "excess_path_std"}
     for name in COLUMNS:

@@ -1,25 +1,31 @@
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
 import pytest
 
-from pipistrelle.config import InputError
+from pipistrelle.config import AssociationConfig, Config, InputError, RayConfig
 from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.scans import UNLABELLED, make_scan
-from pipistrelle.estimation.association import known_labels
+from pipistrelle.estimation.association import Assignment, association_of, edited, expected
+from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.ekf.filter import EkfSlam
+from pipistrelle.estimation.ekf.gaussian import INVARIANT, LINEAR
+from pipistrelle.estimation.motion import Motion
+from pipistrelle.geometry import wrap
 from reference.missions import scan_of, scan_with
 
-NAN = np.nan
+NAN, RNG = np.nan, np.random.default_rng
 
 
-def test_what_was_told_is_taken_as_it_is_and_costs_no_copy():
+def test_labels_that_came_with_a_scan_are_taken_as_they_are_and_cost_no_copy():
     scan = scan_of((3, 5.0, 0.3), (8, NAN, 1.0))
-    assert labelled(scan, known_labels(None, scan)) is scan
+    assert labelled(scan, scan.landmark) is scan
 
 
-def test_a_row_that_nobody_labelled_never_reaches_a_filter():
+def test_a_row_without_a_label_never_reaches_a_filter():
     scan = scan_of((3, 5.0, 0.3), (UNLABELLED, NAN, 1.0), (UNLABELLED, 2.0, 2.0))
-    assert labelled(scan, known_labels(None, scan)).landmark.tolist() == [3]
+    assert labelled(scan, scan.landmark).landmark.tolist() == [3]
 
 
 def test_rows_of_one_label_become_one_whatever_their_order():
@@ -112,6 +118,165 @@ def test_the_level_of_merged_rows_is_the_highest_that_is_known():
 
 def test_a_scan_of_nothing_stays_one():
     empty = scan_of()
-    assert labelled(empty, known_labels(None, empty)).landmark.size == 0
+    assert labelled(empty, empty.landmark).landmark.size == 0
     nobody = scan_of((UNLABELLED, 2.0, 0.1))
-    assert labelled(nobody, known_labels(None, nobody)).landmark.size == 0
+    assert labelled(nobody, nobody.landmark).landmark.size == 0
+
+
+def mapped(error, seed=5):
+    """Return an EKF's belief of a drive past three landmarks and a caller, all placed."""
+    motion = Motion(model="unicycle", control_std=(0.1, 0.05))
+    slam = EkfSlam(motion=motion, rays=RayConfig(), error=error)
+    start = Gaussian(mean=np.array([3.0, -2.0, 0.4]), covariance=1e-4 * np.eye(3))
+    points, rng = {2: (7.0, 1.0), 4: (7.03, 1.02), 7: (6.0, -5.0), 9: (12.0, 3.0)}, RNG(seed)
+    belief = slam.init(start)
+    pose = start.mean
+    for _ in range(4):
+        belief, poses = slam.predict(belief, np.array([[1.0, 0.2]]), np.array([0.5]))
+        pose = poses.mean[-1]
+        seen = [measured(pose, points[label]) for label in points]
+        bearing, distance = np.array(seen).T + rng.normal(0.0, 0.01, (2, len(seen)))
+        stds = {"bearing_std": 0.05, "range_std": 0.1}
+        scan = make_scan(0.0, np.array([*points]), bearing, range=distance, **stds)
+        belief = slam.update(belief, scan)
+    return slam, belief
+
+
+def measured(pose, point):
+    """Return bearing and range of a point."""
+    east, north = np.subtract(point, pose[:2])
+    return wrap(np.arctan2(north, east) - pose[2]), np.hypot(east, north)
+
+
+@pytest.mark.parametrize("error", [LINEAR, INVARIANT])
+def test_what_is_expected_has_the_slopes_of_the_measurements_themselves(error):
+    """Each number is linear in the joint mean, and S its covariance, by finite differences."""
+    _, belief = mapped(error)
+    joint = belief.joint()
+    row, landmark = np.repeat(np.arange(4), 3), np.tile([2, 4, 7], 4)
+    bearing = {"bearing_std": 0.05, "range": np.array([5.0, 6.0, NAN, NAN]), "range_std": 0.1}
+    timed = {"excess_path": np.array([NAN, NAN, 3.0, 2.0]), "excess_path_std": 0.2}
+    scan = make_scan(
+        0.0, np.full(4, UNLABELLED), RNG(7).normal(0.0, 1.0, 4), caller=np.array([0, 0, 1, 1]),
+        **bearing, **timed,
+    )  # fmt: skip
+    callers = np.array([UNLABELLED, 9])
+    found = expected(joint, scan, row, landmark, callers)
+    slopes = np.empty((12, 3, joint.mean.size))
+    for column in range(joint.mean.size):
+        step = np.zeros(joint.mean.size)
+        step[column] = 1e-6
+        up, down = (
+            expected(replace(joint, mean=joint.mean + side), scan, row, landmark, callers)
+            for side in (step, -step)
+        )
+        slopes[:, :, column] = -(up.difference - down.difference) / 2e-6
+    there = ~np.isnan(found.difference)
+    assert there.sum() == 12 + 2 * 3 + 2 * 3
+    H = slopes[there]
+    R = np.stack([scan.bearing_std, scan.range_std, scan.excess_path_std], axis=-1)[row][there]
+    S = H @ joint.covariance @ H.T + np.diag(R**2)
+    np.testing.assert_allclose(found.covariance[there][:, there], S, rtol=1e-6, atol=1e-9)
+    assert np.isnan(found.covariance[~there]).all()
+
+
+@pytest.mark.parametrize("error", [LINEAR, INVARIANT])
+def test_the_joint_gaussian_has_the_pose_and_the_map_of_the_belief(error):
+    _, belief = mapped(error)
+    joint, pose, points = belief.joint(), belief.pose(), belief.landmarks()
+    assert joint.landmark.tolist() == points.landmark.tolist()
+    np.testing.assert_array_equal(joint.mean, np.concatenate((pose.mean, points.mean.ravel())))
+    np.testing.assert_allclose(joint.covariance[:3, :3], pose.covariance, rtol=0, atol=1e-15)
+    for row, own in enumerate(points.covariance):
+        block = slice(3 + 2 * row, 5 + 2 * row)
+        np.testing.assert_allclose(joint.covariance[block, block], own, rtol=0, atol=1e-15)
+    assert np.linalg.eigvalsh(joint.covariance)[0] > 0.0
+
+
+@pytest.mark.parametrize("error", [LINEAR, INVARIANT])
+def test_landmarks_that_are_one_meet_as_the_kalman_filter_has_it_and_others_are_forgotten(error):
+    _, belief = mapped(error)
+    joint, edited_belief = belief.joint(), belief.edited((7,), ((2, 4),))
+    assert edited_belief.landmarks().landmark.tolist() == [2, 9]
+    H = np.zeros((2, joint.mean.size))
+    H[:, 3:5], H[:, 5:7] = np.eye(2), -np.eye(2)
+    S = H @ joint.covariance @ H.T + 1e-6 * np.eye(2)
+    gain = joint.covariance @ H.T @ np.linalg.inv(S)
+    mean = joint.mean - gain @ (H @ joint.mean)
+    covariance = joint.covariance - gain @ S @ gain.T
+    kept = [0, 1, 2, 3, 4, 9, 10]
+    after = edited_belief.joint()
+    # The invariant error moves the map by an exponential, equal to first order.
+    near = 1e-9 if error == LINEAR else 5e-4
+    np.testing.assert_allclose(after.mean, mean[kept], rtol=0, atol=near)
+    if error == LINEAR:
+        np.testing.assert_allclose(after.covariance, covariance[np.ix_(kept, kept)], atol=1e-12)
+    assert np.linalg.eigvalsh(after.covariance)[0] > 0.0
+
+
+def test_a_merge_says_nothing_of_the_heading_to_the_invariant_error():
+    _, belief = mapped(INVARIANT)
+    far = replace(belief, covariance=belief.covariance + np.diag([0, 0, 1.0] + [0.0] * 8))
+    after = far.edited((), ((2, 4),))
+    assert after.covariance[2, 2] > far.covariance[2, 2] - belief.covariance[2, 2] - 1e-9
+
+
+def test_of_a_ray_and_a_placed_landmark_the_placed_one_stays_and_of_two_rays_the_first():
+    slam, belief = mapped(LINEAR)
+    rays = make_scan(0.0, np.array([20, 21]), np.array([0.1, 0.9]), bearing_std=0.05)
+    belief = slam.update(belief, rays)
+    place = belief.landmarks().mean[belief.landmarks().landmark == 2]
+    for pair in ((2, 20), (20, 2)):
+        points = belief.edited((), (pair,)).landmarks()
+        assert sorted(points.landmark.tolist()).count(pair[0]) == 1
+        assert pair[1] not in points.landmark
+        np.testing.assert_array_equal(points.mean[points.landmark == pair[0]], place)
+    both = belief.edited((), ((20, 21),)).landmarks()
+    assert 21 not in both.landmark
+    assert (both.landmark == 20).sum() == (belief.landmarks().landmark == 20).sum()
+
+
+@pytest.mark.parametrize(
+    ("remove", "merge"), [((5,), ()), ((), ((2, 5),)), ((), ((2, 2),)), ((-1,), ())]
+)
+def test_landmarks_that_cannot_be_changed_are_refused(remove, merge):
+    _, belief = mapped(LINEAR)
+    with pytest.raises(InputError, match="association: found"):
+        belief.edited(remove, merge)
+
+
+def test_a_moving_caller_goes_with_its_velocity_and_is_never_merged():
+    slam, belief = mapped(LINEAR)
+    heard = {"range": np.array([6.0]), "range_std": 0.1, "bearing_std": 0.05}
+    scan = make_scan(0.0, np.array([51]), np.array([0.3]), **heard)
+    chased = slam.update(belief, replace(scan, moving=np.array([51])))
+    assert chased.mean.size == belief.mean.size + 4
+    assert 51 in chased.joint().landmark
+    assert chased.edited((51,), ()).mean.size == belief.mean.size
+    with pytest.raises(InputError, match="51 to merge; expected two that stand"):
+        chased.edited((), ((2, 51),))
+
+
+def test_a_belief_that_cannot_be_edited_is_refused():
+    with pytest.raises(InputError, match=r"a Gaussian cannot; expected a belief with edited"):
+        edited(Gaussian(mean=np.zeros(3), covariance=np.eye(3)), assignment(remove=(4,)))
+    belief = mapped(LINEAR)[1]
+    assert edited(belief, assignment()) is belief
+
+
+def assignment(**changes):
+    """Return an assignment of no rows."""
+    return Assignment(label=np.empty(0, np.int64), **changes)
+
+
+def test_a_landmark_that_nobody_holds_is_not_expected():
+    _, belief = mapped(LINEAR)
+    with pytest.raises(InputError, match=r"expected: found the landmarks \[5\]"):
+        expected(belief.joint(), scan_of((3, 5.0, 0.3)), np.array([0]), np.array([5]))
+
+
+@pytest.mark.parametrize("name", ["jcbb", "a:", ":B", "a b:C"])
+def test_a_method_that_is_no_name_is_refused(name):
+    config = Config(association=AssociationConfig(method=name))
+    with pytest.raises(InputError, match="expected 'known' or module:Class"):
+        association_of(config)

@@ -50,6 +50,7 @@ def test_the_help_of_slam_leaves_out_what_a_log_decides(obey):
     swarm = ("particles", "resample-below", "mixture", "weights", "resampled-rays")
     assert found == {
         "--listening.timing",
+        "--association.method",
         *(f"--filter.{name}" for name in ("noise", "excess-path-std", "robust")),
         *(f"--filter.caller-{name}-std" for name in ("speed", "walk")),
         *(f"--rays.{name}" for name in rays),

@@ -101,11 +101,15 @@ def own_alone(
     """
     heard = calls.detection >= 0
     of = np.where(heard, label[np.where(heard, calls.detection, 0)], own) if label.size else own
-    wrong = missable & (of != own)
+    return without_calls(calls, missable & (of != own))
+
+
+def without_calls(calls: DirectCalls, dropped: Bool[np.ndarray, " c"]) -> DirectCalls:
+    """Return direct calls without those of some callers, as if these had not been heard."""
     return DirectCalls(
-        detection=np.where(wrong, -1, calls.detection),
-        delay=np.where(wrong, np.nan, calls.delay),
-        delay_std=np.where(wrong, np.nan, calls.delay_std),
+        detection=np.where(dropped, -1, calls.detection),
+        delay=np.where(dropped, np.nan, calls.delay),
+        delay_std=np.where(dropped, np.nan, calls.delay_std),
         pulse=calls.pulse,
     )
 

@@ -6,7 +6,7 @@ echo (`same_echo`).
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -37,9 +37,11 @@ class FrameMeasurements:
     """One frame, averaged over the faces."""
 
     rows: Scan
-    """One row per label and caller, both rising; without labels, one per echo."""
-    clutter: int | None
-    """Number of detections without a label; None without the oracle."""
+    """One row per label and caller, both rising, as the oracle labels detections."""
+    clutter: int
+    """Number of detections without a label."""
+    unlabelled: Scan | None = None
+    """The same frame as a robot hears it, a row per echo and no label; None if not asked for."""
     between: bool = False
     """Whether the call came between two calls of the vehicle."""
 
@@ -105,18 +107,6 @@ def same_echo(
     order = np.argsort(-detections.power, kind="stable")
     found = columns_of(detections)
     return _number(order, found, delay_gate, bearing_gate)
-
-
-def unlabelled(heard: FrameMeasurements) -> FrameMeasurements:
-    """Return a frame without its labels.
-
-    >>> from pipistrelle.detection.scans import make_scan
-    >>> heard = FrameMeasurements(rows=make_scan(0.5, np.array([4]), np.array([0.2])), clutter=0)
-    >>> unlabelled(heard).rows.landmark
-    array([-1])
-    """
-    nobody = np.full_like(heard.rows.landmark, UNLABELLED)
-    return replace(heard, rows=replace(heard.rows, landmark=nobody), clutter=None)
 
 
 _NO_DIRECT = DirectCalls(np.empty(0, np.int64), np.empty(0), np.empty(0), 0.0)

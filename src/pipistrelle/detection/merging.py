@@ -17,11 +17,13 @@ from pipistrelle.detection.scans import (
     EXCESS_PATH,
     EXCESS_PATH_STD,
     LEVEL,
+    NO_CALLERS,
     NUMBERS,
     OWN,
     RANGE,
     UNLABELLED,
     Scan,
+    rows_of,
 )
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel
@@ -57,6 +59,8 @@ def scan_of(rows: Scan, strategy: Strategy) -> Scan:
     [2]
     """
     own, others = LISTENS_TO[strategy]
+    if rows.direct.size:  # rows without labels: nothing is merged
+        return rows_of(rows, np.where(rows.caller == OWN, own, others))
     return _fused(rows, own=own, others=others, labels_only=False)
 
 
@@ -68,21 +72,25 @@ def labelled(scan: Scan, label: Int[np.ndarray, " m"]) -> Scan:
     .. math:: \bar\phi = \sum_i \phi_i \sigma_i^{-2} \Big/ \sum_i \sigma_i^{-2}, \qquad
               \bar\sigma^{-2} = \sum_i \sigma_i^{-2} ,
 
-    and else the plain mean, of which nobody says how sure it is. The rest is the first that there
-    is among them, but that each excess path stays: those after the first are rows without a
-    bearing, at the end.
+    and else the plain mean, whose deviation is not stated. Range and excess path are the first
+    among the rows; further excess paths become rows without a bearing, at the end. The label of a
+    caller's direct call (`Scan.direct`) becomes that of the caller.
 
-    The log itself is returned where nothing is to be done.
+    A scan that is labelled and merged already is returned as it is.
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> scan = make_scan(0.5, np.full(3, UNLABELLED), np.array([0.2, 0.4, 1.0]), bearing_std=0.1)
-    >>> told = labelled(scan, np.array([7, 7, UNLABELLED]))
-    >>> told.landmark, told.bearing.round(9), told.bearing_std.round(4)
+    >>> merged = labelled(scan, np.array([7, 7, UNLABELLED]))
+    >>> merged.landmark, merged.bearing.round(9), merged.bearing_std.round(4)
     (array([7]), array([0.3]), array([0.0707]))
     """
     if label is scan.landmark and settled(label, scan.bearing):
         return scan
-    named = replace(scan, landmark=_checked(scan, np.asarray(label)))
+    label = _checked(scan, np.asarray(label))
+    named = replace(scan, landmark=label)
+    if scan.direct.size:
+        callers = np.append(label, UNLABELLED)[scan.direct]  # -1: not heard
+        named = replace(named, callers=callers, direct=NO_CALLERS)
     return _fused(named, own=True, others=True, labels_only=True)
 
 

@@ -75,28 +75,23 @@ def unstated(scan: Scan) -> Scan:
     return with_columns(scan, bearing_std=math.nan, range_std=math.nan, excess_path_std=math.nan)
 
 
-def as_told(scan: Scan, settings: FilterConfig, *, timing: bool) -> Scan:
-    """Drop columns of a scan that the settings hide from an estimator.
+def without_hidden(scan: Scan, settings: FilterConfig, *, timing: bool) -> Scan:
+    """Return a scan without the columns that the settings hide from an estimator.
 
     Parameters
     ----------
     scan : Scan
     settings : FilterConfig
-        With "constant" noise the rows do not say how surely they were measured.
+        With "constant" noise standard deviations are hidden.
     timing : bool
-        Whether it is to know how much later than the direct call of their caller echoes came.
+        False: excess paths are hidden.
 
     Returns
     -------
     Scan
     """
-    known = scan if timing else without_excess_paths(scan)
-    return unstated(known) if settings.noise == "constant" else known
-
-
-def as_said(scan: Scan) -> Scan:
-    """Return a scan unchanged: its rows state their own noise."""
-    return scan
+    seen = scan if timing else without_excess_paths(scan)
+    return unstated(seen) if settings.noise == "constant" else seen
 
 
 def noise_of(settings: FilterConfig) -> Noise:

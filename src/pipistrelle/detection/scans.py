@@ -14,7 +14,7 @@ UNLABELLED = -1
 OWN = 0
 """Number of the vehicle among the callers, as in `pipistrelle.acoustics.callers`."""
 NO_CALLERS = np.empty(0, dtype=np.int64)
-"""Of no caller is it known which landmark it is, or that it moves."""
+"""An empty array of labels: no caller's label is known, or no caller moves."""
 
 COLUMNS = (
     "landmark",
@@ -55,6 +55,9 @@ class Scan:
     not known, as for numbers beyond the array."""
     moving: Int[np.ndarray, " v"] = field(default_factory=lambda: NO_CALLERS)
     """Labels of the callers that move."""
+    direct: Int[np.ndarray, " c"] = field(default_factory=lambda: NO_CALLERS)
+    """Of rows without labels: the row of each caller's direct call, by the caller's number; -1
+    where none was heard. Whoever labels that row says which landmark calls (`merging.labelled`)."""
 
     @property
     def bearing(self) -> Float[np.ndarray, " m"]:
@@ -152,7 +155,7 @@ def with_columns(scan: Scan, **columns: np.ndarray | float) -> Scan:
     """
     own = {name: getattr(scan, name) for name in COLUMNS}
     made = _made_of(scan.time, scan.landmark.shape, own | columns)
-    return replace(made, callers=scan.callers, moving=scan.moving)
+    return replace(made, callers=scan.callers, moving=scan.moving, direct=scan.direct)
 
 
 def _made_of(time: float, shape: tuple[int, ...], given: dict[str, np.ndarray | float]) -> Scan:
@@ -198,7 +201,38 @@ def rows_of(scan: Scan, rows: Bool[np.ndarray, " m"] | Int[np.ndarray, " k"]) ->
         landmark=scan.landmark[rows],
         caller=scan.caller[rows],
         numbers=np.ascontiguousarray(scan.numbers[:, rows]),
+        direct=_moved(scan.direct, scan.landmark.size, rows),
     )
+
+
+def _moved(
+    direct: Int[np.ndarray, " c"], size: int, rows: Bool[np.ndarray, " m"] | Int[np.ndarray, " k"]
+) -> Int[np.ndarray, " c"]:
+    """Return where the direct calls are after some of `size` rows were taken; -1: left out."""
+    if direct.size == 0:
+        return direct
+    kept, place = np.arange(size)[rows], np.full(size + 1, -1)
+    place[kept] = np.arange(kept.size)
+    return place[direct]
+
+
+def without_labels(scan: Scan, callers: Int[np.ndarray, " c"]) -> Scan:
+    """Return a scan without labels that knows which rows are direct calls (`Scan.direct`).
+
+    `callers`: the label that the direct call of each caller has, by its number; UNLABELLED of none.
+
+    >>> scan = make_scan(0.5, np.array([4, 9]), np.array([0.2, 1.0]), caller=1)
+    >>> hidden = without_labels(scan, np.array([-1, 9]))
+    >>> hidden.landmark, hidden.direct
+    (array([-1, -1]), array([-1,  1]))
+    """
+    direct = np.full(callers.size, UNLABELLED)
+    for number, label in enumerate(callers):
+        rows = np.flatnonzero((scan.landmark == label) & (scan.caller == number))
+        if label != UNLABELLED and rows.size:
+            direct[number] = rows[0]
+    landmark = np.full_like(scan.landmark, UNLABELLED)
+    return replace(scan, landmark=landmark, callers=NO_CALLERS, direct=direct)
 
 
 def without_excess_paths(scan: Scan) -> Scan:
@@ -210,8 +244,8 @@ def without_excess_paths(scan: Scan) -> Scan:
     >>> without_excess_paths(scan).landmark, without_excess_paths(scan).excess_path
     (array([8]), array([nan]))
     """
-    if scan.callers.size:
-        scan = replace(scan, callers=NO_CALLERS)
+    if scan.callers.size or scan.direct.size:
+        scan = replace(scan, callers=NO_CALLERS, direct=NO_CALLERS)
     if np.isnan(scan.excess_path).all() and np.isnan(scan.excess_path_std).all():
         return scan
     bearings = rows_of(scan, ~np.isnan(scan.bearing))

@@ -100,6 +100,17 @@ def in_sight(moving: Landmarks) -> Landmarks:
     return some_of(moving, placed(moving) & (widest <= MAX_CALLER_STD * MAX_CALLER_STD))
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JointGaussian:
+    """Pose and placed landmarks of a belief together, n of them, with the linear error."""
+
+    landmark: Int[np.ndarray, " n"]
+    """Labels."""
+    mean: Float[np.ndarray, " d"]
+    """(3 + 2n): x, y [m], heading [rad]; then x, y [m] of each landmark."""
+    covariance: Float[np.ndarray, "d d"]
+
+
 class Innovations(NamedTuple):
     """Sums over the measurements of placed landmarks that a filter has used."""
 
@@ -169,7 +180,9 @@ class Belief(Protocol):
     every control step so far, (k + 1, 3) and (k + 1, 3, 3), of an estimator that revises its path,
     and ``tracks()`` a Gaussian (k + 1, 2) and (k + 1, 2, 2) of each caller by its label, NaN where
     unknown. ``cloud()`` returns the poses (p, 3) of particles, with ``full``, the weighted mean
-    number of fully initialised landmarks.
+    number of fully initialised landmarks. An association asks for two more: ``joint()`` returns a
+    `JointGaussian`, and ``edited(remove, merge)`` the belief without the landmarks of the labels
+    ``remove``, and with the two of each pair ``merge`` as one, under the first label.
     """
 
     @property
@@ -187,7 +200,7 @@ class Belief(Protocol):
 
 
 def answer(belief: Belief, question: str) -> Any:
-    """Return what a belief answers to a question of `Belief` that is optional; else None."""
+    """Return what a belief's optional method returns (`Belief`); None where it has no such."""
     return getattr(belief, question)() if hasattr(belief, question) else None
 
 

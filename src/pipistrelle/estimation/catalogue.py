@@ -14,13 +14,21 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from pipistrelle.config import Config, InputError
-from pipistrelle.estimation.outside import built, class_of, title_met
+from pipistrelle.estimation.outside import (
+    ESTIMATOR,
+    build,
+    class_of,
+    names_class,
+    title_met,
+)
 from pipistrelle.refusals import meant
 
 if TYPE_CHECKING:
     from pipistrelle.estimation.beliefs import Estimator
     from pipistrelle.estimation.motion import Motion
 
+READ = ("listening", "association", "filter", "rays")
+"""Sections of the settings that every estimator reads."""
 DOUBLE = 8
 """Bytes of a number."""
 GATE = 0.999
@@ -127,7 +135,7 @@ def entry(name: str) -> Entry:
     """
     if name in CATALOGUE:
         return CATALOGUE[name]
-    kind: Any = class_of(check_name(name))
+    kind: Any = class_of(ESTIMATOR, check_name(name))
     title, limit = getattr(kind, "title", kind.__name__), getattr(kind, "nees_limit", math.inf)
     if not isinstance(title, str):
         raise InputError(f"filter {name}: title: found {title!r}, expected text")
@@ -136,8 +144,8 @@ def entry(name: str) -> Entry:
     return Entry(
         name=name,
         title=title,
-        build=lambda config, motion: built(name, kind, _with_gate(name, config), motion),
-        sections=("listening", "filter", "rays"),
+        build=lambda config, motion: _built(name, kind, _with_gate(name, config), motion),
+        sections=READ,
         nees_limit=float(limit),
         memory=lambda landmarks, members, config: 0.0,
         follows=bool(getattr(kind, "follows", False)),
@@ -155,9 +163,7 @@ def check_name(name: str, *groups: str, where: str = "filter") -> str:
     pipistrelle.config.InputError: filter: found 'ikef', expected one of ekf, fastslam, iekf,
     smoother, module:Class; did you mean 'iekf'?
     """
-    module, colon, kind = name.partition(":")
-    dotted = all(part.isidentifier() for part in module.split("."))
-    if name not in CATALOGUE and not (colon and dotted and kind.isidentifier()):
+    if name not in CATALOGUE and not names_class(name):
         known, near = (*CATALOGUE, *groups), meant(name, (*CATALOGUE, *groups))
         fix = f"; did you mean {near!r}?" if near else ""
         expected = f"one of {', '.join(known)}, module:Class"
@@ -221,6 +227,12 @@ def _builder(name: str, where: str) -> "Callable[[Config, Motion], Estimator]":
     return build
 
 
+def _built(name: str, kind: Any, config: Config, motion: "Motion") -> "Estimator":
+    """Build an estimator from outside."""
+    values = {"motion": motion, "rays": config.rays, "gate": config.filter.gate, "config": config}
+    return build(ESTIMATOR, name, kind, (config, motion), values)
+
+
 def _with_gate(name: str, config: Config) -> Config:
     """Return the settings with a number for the gate, as estimators from outside get them."""
     settings = config.filter.model_copy(update={"gate": gate_of(name, config)})
@@ -260,7 +272,7 @@ CATALOGUE = {
             name="ekf",
             title="EKF",
             build=_builder("ekf", "ekf.filter:EkfSlam"),
-            sections=("listening", "filter", "rays"),
+            sections=READ,
             nees_limit=50.0,
             memory=_ekf_bytes,
             follows=True,
@@ -269,7 +281,7 @@ CATALOGUE = {
             name="fastslam",
             title="FastSLAM 2.0",
             build=_fastslam,
-            sections=("listening", "filter", "rays", "fastslam"),
+            sections=(*READ, "fastslam"),
             nees_limit=2750.0,
             memory=_fastslam_bytes,
         ),
@@ -277,7 +289,7 @@ CATALOGUE = {
             name="iekf",
             title="invariant EKF",
             build=_builder("iekf", "ekf.invariant:InvariantEkfSlam"),
-            sections=("listening", "filter", "rays"),
+            sections=READ,
             nees_limit=50.0,
             memory=_ekf_bytes,
             follows=True,
@@ -286,7 +298,7 @@ CATALOGUE = {
             name="smoother",
             title="smoother",
             build=_builder("smoother", "smoother.filter:Smoother"),
-            sections=("listening", "filter", "rays"),
+            sections=READ,
             nees_limit=50.0,
             memory=_smoother_bytes,
             follows=True,

@@ -19,12 +19,12 @@ from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import BLOCK, blocks_to_hear, sampling
 from pipistrelle.config import (
     AirConfig,
-    AssociationConfig,
     BeaconConfig,
     Config,
     DetectionConfig,
     EmitterConfig,
     InputError,
+    MatchingConfig,
     MotionConfig,
     ReceiverConfig,
     ScenarioConfig,
@@ -47,7 +47,7 @@ FAINTEST = faintest_level_db(
     elements=10,
     samples=SETTLED.pulse * SETTLED.block,
     noise_std=SETTLED.noise_std,
-    margin_db=CONFIG.association.margin_db,
+    margin_db=CONFIG.matching.margin_db,
 )
 RADII = (2.5, 3.1, 3.8, 4.7, 5.8, 7.1, 8.8, 10.8, 13.3, 16.4, 20.3, 25.0)  # [mm]
 BEACON = 51
@@ -135,18 +135,41 @@ def test_the_truth_labels_detections_and_enters_nowhere_else():
     assert sum(heard.clutter for heard in deaf) > sum(heard.clutter for heard in as_is)
 
 
-def test_without_an_oracle_as_much_is_heard_and_nothing_has_a_label():
+def test_without_labels_as_much_is_heard_and_what_is_labelled_stays_as_it_was():
     world, config = short(40)
-    (told,) = listen(world, config, [0.0088])
-    (untold,) = listen(world, config, [0.0088], oracle=None)
-    for one, other in zip(told, untold, strict=True):
-        assert set(other.rows.landmark.tolist()) <= {UNLABELLED}
-        assert other.clutter is None
+    (labelled,) = listen(world, config, [0.0088])
+    (both,) = listen(world, config, [0.0088], labels=False)
+    assert [heard.unlabelled for heard in labelled] == [None] * len(labelled)
+    assert bits([replace(heard, unlabelled=None) for heard in both]) == bits(labelled)
+    for one, other in zip(labelled, both, strict=True):
+        rows = other.unlabelled
+        assert set(rows.landmark.tolist()) <= {UNLABELLED}
+        assert rows.callers.size == 0
         # What the oracle names is among what is heard: to the bit where one face heard it alone.
-        heard = set(zip(other.rows.caller.tolist(), other.rows.bearing.tolist(), strict=True))
+        heard = set(zip(rows.caller.tolist(), rows.bearing.tolist(), strict=True))
         named = list(zip(one.rows.caller.tolist(), one.rows.bearing.tolist(), strict=True))
         assert sum(row in heard for row in named) > 0.6 * len(named)
-        assert other.rows.landmark.size >= one.rows.landmark.size
+        assert rows.landmark.size >= one.rows.landmark.size
+
+
+def test_without_labels_the_direct_call_is_marked_and_excess_paths_are_those_that_labels_have():
+    world, config = short(40)
+    (heard,) = listen(world, config, [0.0088], labels=False)
+    beacon, marked, same, paths = world.callers[1], 0, 0, 0
+    for frame in heard:
+        rows, named = frame.unlabelled, frame.rows
+        assert rows.direct[0] == -1, "the vehicle hears no direct call of its own"
+        if rows.direct[1] >= 0:
+            marked += 1
+            x, y, heading = world.path[np.searchsorted(world.time, rows.time)]
+            east, north = np.asarray(beacon.place) - (x, y)
+            bearing = wrap(np.arctan2(north, east) - heading)
+            assert abs(wrap(rows.bearing[rows.direct[1]] - bearing)) < 0.1
+        known = set(np.round(named.excess_path[~np.isnan(named.excess_path)], 9).tolist())
+        found = set(np.round(rows.excess_path[~np.isnan(rows.excess_path)], 9).tolist())
+        same, paths = same + len(known & found), paths + len(known)
+    assert marked == len(heard)
+    assert same > 0.6 * paths > 30
 
 
 def found_by_two_faces(late, off=0.0):
@@ -160,21 +183,21 @@ def found_by_two_faces(late, off=0.0):
 
 
 @pytest.mark.parametrize(("pulse", "share"), [(2.8e-3, 0.25), (2.0e-3, 0.25), (2.8e-3, 0.1)])
-def test_without_an_oracle_two_faces_hear_one_echo_within_the_gates_share_of_a_call(pulse, share):
-    gates = AssociationConfig(delay_gate=share)
-    world, config = short(4, association=gates, emitter=EmitterConfig(pulse=pulse))
+def test_without_labels_two_faces_hear_one_echo_within_the_gates_share_of_a_call(pulse, share):
+    gates = MatchingConfig(delay_gate=share)
+    world, config = short(4, matching=gates, emitter=EmitterConfig(pulse=pulse))
     for late, echoes in ((0.99 * share * pulse, 1), (1.01 * share * pulse, 2)):
-        ((heard,),) = listen(world, config, [0.0088], oracle=None, find=found_by_two_faces(late))
-        assert heard.rows.landmark.size == echoes
+        ((heard,),) = listen(world, config, [0.0088], labels=False, find=found_by_two_faces(late))
+        assert heard.unlabelled.landmark.size == echoes
 
 
 @pytest.mark.parametrize("gate", [0.02, 0.1, 0.3])
-def test_without_an_oracle_two_faces_hear_one_echo_within_the_gate_of_its_bearing(gate):
-    world, config = short(4, association=AssociationConfig(bearing_gate=gate))
+def test_without_labels_two_faces_hear_one_echo_within_the_gate_of_its_bearing(gate):
+    world, config = short(4, matching=MatchingConfig(bearing_gate=gate))
     for off, echoes in ((0.99 * gate, 1), (1.01 * gate, 2)):
         finder = found_by_two_faces(0.0, off)
-        ((heard,),) = listen(world, config, [0.0088], oracle=None, find=finder)
-        assert heard.rows.landmark.size == echoes
+        ((heard,),) = listen(world, config, [0.0088], labels=False, find=finder)
+        assert heard.unlabelled.landmark.size == echoes
 
 
 @pytest.mark.parametrize("averaging", ["plain", "weighted"])
@@ -196,9 +219,9 @@ def test_faces_are_averaged_as_the_settings_ask(averaging):
 def test_the_oracle_is_told_the_gates_the_call_and_the_faintest_level_of_the_settings(
     margin_db, noise_db, blocks
 ):
-    gates = AssociationConfig(margin_db=margin_db, delay_gate=0.2)
+    gates = MatchingConfig(margin_db=margin_db, delay_gate=0.2)
     settings = {
-        "association": gates,
+        "matching": gates,
         "receiver": ReceiverConfig(noise_level_db=noise_db),
         "emitter": EmitterConfig(pulse=blocks * BLOCK),
     }
@@ -342,7 +365,7 @@ def landmarks(blocks, arrivals, tone, finder=FINDER):
     """Return the landmarks that a tone shows in a recording, the beacon apart."""
     found = detected(blocks, finder)
     label = label_detections(
-        found, arrivals, LAYOUT, CONFIG.association, pulse=2.8e-3, faintest_db=FAINTEST
+        found, arrivals, LAYOUT, CONFIG.matching, pulse=2.8e-3, faintest_db=FAINTEST
     )
     return set(label[(found.caller == tone) & (label != UNLABELLED)].tolist()) - {BEACON}
 

@@ -10,7 +10,7 @@ from pipistrelle.acoustics.callers import callers_of
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks
 from pipistrelle.arrays.sampling import sampling
-from pipistrelle.config import AssociationConfig, Config
+from pipistrelle.config import Config, MatchingConfig
 from pipistrelle.detection.matched import filter_blocks
 from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.detection.snapshots import Detections, detector
@@ -20,7 +20,7 @@ from pipistrelle.geometry import wrap
 law = settings(deadline=None, max_examples=100)
 SEEDS = st.integers(0, 2**32 - 1)
 LAYOUT = square_of_four(Config().receiver)
-GATES = AssociationConfig()
+GATES = MatchingConfig()
 PULSE = 2.8e-3
 FAINTEST = -30.0
 
@@ -149,7 +149,7 @@ def test_gates_hold_in_delay_and_in_bearing_both():
         (0.0, 0.101, UNLABELLED), (0.0, -0.101, UNLABELLED),
     ):  # fmt: skip
         assert labels(detections((10.0 + late, 0.2 + off, 1, 0, 9)), ONE) == [label]
-    wide = AssociationConfig(delay_gate=0.5, bearing_gate=0.2)
+    wide = MatchingConfig(delay_gate=0.5, bearing_gate=0.2)
     assert labels(detections((11.3, 0.39, 1, 0, 9)), ONE, wide) == [7]
 
 

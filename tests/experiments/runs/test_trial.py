@@ -9,12 +9,14 @@ from pipistrelle.config import (
     Config,
     FilterConfig,
     InputError,
+    ListeningConfig,
     ReceiverConfig,
     ScenarioConfig,
 )
-from pipistrelle.detection.faces import unlabelled
 from pipistrelle.detection.merging import scan_of
-from pipistrelle.detection.noise import as_told
+from pipistrelle.detection.noise import without_hidden
+from pipistrelle.detection.scans import without_labels
+from pipistrelle.estimation.association import Assignment
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.motion import Motion
@@ -154,14 +156,19 @@ def test_steps_and_scans_reach_the_filter_in_the_order_of_time():
 
 
 def test_an_association_is_asked_with_the_belief_that_was_predicted_to_its_scan():
+    class Noting:
+        """Takes the labels as they are, and remembers when it was asked and by which belief."""
+
+        def start(self):
+            return []
+
+        def associate(self, memory, belief, scan):
+            asked[:] = [*memory, (scan.time, belief.mean.tolist())]
+            return list(asked), Assignment(label=scan.landmark)
+
     asked = []
-
-    def noted(belief, scan):
-        asked.append((scan.time, belief.mean.tolist()))
-        return scan.landmark
-
     scans = [scan_with(time=0.0), scan_with(time=1.5), scan_with(time=1.5), scan_with(time=4.5)]
-    run_filter(Ledger(), drive(5), scans, RNG(7), associate=noted)
+    run_filter(Ledger(), drive(5), scans, RNG(7), association=Noting())
     # x counts the steps, y the scans that the filter was corrected with before.
     assert asked == [(0.0, [0, 0, 0]), (1.5, [2, 1, 0]), (1.5, [2, 2, 0]), (4.5, [5, 3, 0])]
 
@@ -479,20 +486,35 @@ def test_the_dense_engine_finds_about_the_same_landmarks():
         assert max(len(first), len(second)) >= 5
 
 
-def test_an_association_that_knows_what_the_oracle_knows_maps_as_the_oracle_does():
-    world = draw_scenario(SHORT, RNG(3))
-    (heard,) = listen(world, SHORT, (SHORT.emitter.radius,))
-    case, drive = Case(strategy="fused", filter="ekf"), drive_of(world, SHORT)
-    told = run_trial(case, drive, scans_of(heard, "fused", SHORT), SHORT)
+@pytest.mark.parametrize("timing", [False, True])
+def test_an_association_that_knows_what_the_oracle_knows_maps_as_the_oracle_does(timing):
+    listening = {"listening": ListeningConfig(timing=timing)}
+    config = SHORT.model_copy(update=listening)
+    world = draw_scenario(config, RNG(3))
+    (heard,) = listen(world, config, (config.emitter.radius,))
+    case, drive = Case(strategy="fused", filter="ekf"), drive_of(world, config)
+    known = run_trial(case, drive, scans_of(heard, "fused", config), config)
     labels = {frame.rows.time: frame.rows.landmark for frame in heard}
-    hidden = [
-        scan_of(as_told(unlabelled(frame).rows, SHORT.filter, timing=False), "fused")
-        for frame in heard
-    ]
-    found = run_trial(case, drive, hidden, SHORT, associate=lambda _, scan: labels[scan.time])
-    assert contents(found.track) == contents(told.track)
-    assert contents(found.scans) == contents(told.scans)
-    assert found.scores == replace(told.scores, map_rmse_m=None, map_rmse_aligned_m=None)
+    rows = (without_labels(frame.rows, frame.rows.callers) for frame in heard)
+    hidden = [scan_of(without_hidden(scan, config.filter, timing=timing), "fused") for scan in rows]
+
+    class Oracle:
+        """Labels rows by the time of their scan."""
+
+        def start(self):
+            return None
+
+        def associate(self, memory, belief, scan):
+            return None, Assignment(label=labels[scan.time])
+
+    found = run_trial(case, drive, hidden, config, association=Oracle())
+    assert contents(found.track) == contents(known.track)
+    assert contents(found.scans) == contents(known.scans)
+    assert found.scores == replace(known.scores, map_rmse_m=None, map_rmse_aligned_m=None)
+    assert (
+        any(scan.excess_path.size > np.isnan(scan.excess_path).sum() for scan in found.scans)
+        is timing
+    )
 
 
 def test_scans_out_of_order_are_refused():

@@ -370,7 +370,7 @@ def test_a_plan_without_them_is_written_as_ever(tmp_path):
         (
             "[own.ekf]\nemitter.radius = 0.01\n",
             "PLAN: own.ekf.emitter.radius: this setting changes what is heard; expected one of the "
-            "sections listening, filter, rays, fastslam",
+            "sections listening, association, filter, rays, fastslam",
         ),
         ("[own.ekf]\nseed = 1\n", "PLAN: own.ekf.seed: this setting changes what is heard"),
         (

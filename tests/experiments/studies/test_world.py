@@ -186,9 +186,9 @@ OTHERS = {
     "detection.scan_limit_deg": 76.0,
     "detection.angle_limit_deg": 40.0,
     "detection.averaging": "weighted",
-    "association.delay_gate": 0.01,
-    "association.bearing_gate": 0.01,
-    "association.margin_db": 0.0,
+    "matching.delay_gate": 0.01,
+    "matching.bearing_gate": 0.01,
+    "matching.margin_db": 0.0,
     "listening.timing": True,
     "motion.model": "unicycle",
     "motion.wheelbase": 0.3,
@@ -230,16 +230,17 @@ OTHERS = {
 }
 """Another value of every setting, far enough from its default to be heard or believed."""
 FEW = ("air.spreading", "target.shape", "emitter.radius", "beacon.level_db", "receiver.elements",
-       "detection.peak_db", "association.bearing_gate", "motion.speed_std", "scenario.landmarks",
+       "detection.peak_db", "matching.bearing_gate", "motion.speed_std", "scenario.landmarks",
        "assumed.wheelbase", "listening.timing", "callers",
        "filter.range_std", "rays.power", "fastslam.particles", "seed")  # fmt: skip
 """One of each section."""
 
 
 def test_the_settings_that_are_varied_here_are_all_there_are():
-    elsewhere = {"scenario.world"}  # its values are folders: see test_worlds_of_ones_own
+    # Folders (test_worlds_of_ones_own) and classes (contracts/test_associations).
+    elsewhere = {"scenario.world", "association.method"}
     assert set(OTHERS) == {".".join(key) for key in known_settings()} - elsewhere
-    assert {name.split(".")[0] for name in FEW} == set(Config.model_fields)
+    assert {name.split(".")[0] for name in FEW} == set(Config.model_fields) - {"association"}
 
 
 ROAMING = {"listening": {"timing": True}, "callers": [{"course": "circle", "radius": 5.0}]}
@@ -492,17 +493,20 @@ def test_twice_the_noise_that_the_signal_tells_raises_the_bound_and_no_constant_
     plan, monkeypatch
 ):
     def doubled(rows, settings, *, timing):
-        rows = as_told(rows, settings, timing=timing)
+        rows = without_hidden(rows, settings, timing=timing)
         more = {name: 2.0 * getattr(rows, name) for name in ("bearing_std", "range_std")}
         return with_columns(rows, **more)
 
-    as_told, short = heard_world.as_told, replace(plan, strategies=("active",), filters=("ekf",))
+    without_hidden, short = (
+        heard_world.without_hidden,
+        replace(plan, strategies=("active",), filters=("ekf",)),
+    )
     before = run_world(short, 0)
     coarse = short.config.filter.model_copy(update={"range_std": 0.4, "bearing_std": 0.3})
     stated = replace(short, config=short.config.model_copy(update={"filter": coarse}))
-    monkeypatch.setattr(heard_world, "as_told", doubled)
+    monkeypatch.setattr(heard_world, "without_hidden", doubled)
     after = run_world(short, 0)
-    monkeypatch.setattr(heard_world, "as_told", as_told)
+    monkeypatch.setattr(heard_world, "without_hidden", without_hidden)
     pairs = zip(before, after, strict=True)
     share = [b.scores.heading_bound_rad / a.scores.heading_bound_rad for a, b in pairs]
     assert max(share) > 1.03

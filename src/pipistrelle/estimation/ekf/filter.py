@@ -11,6 +11,7 @@ with a scan. A moving caller has its velocity there, too (`caller_motion`). The 
 of the linear or of the right-invariant error (`invariant_error`).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,7 +19,13 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.beliefs import NO_INNOVATIONS, Gaussian, Innovations, Landmarks
+from pipistrelle.estimation.beliefs import (
+    NO_INNOVATIONS,
+    Gaussian,
+    Innovations,
+    JointGaussian,
+    Landmarks,
+)
 from pipistrelle.estimation.checking import (
     check_belief,
     check_gate,
@@ -36,9 +43,10 @@ from pipistrelle.estimation.ekf.caller_motion import (
 )
 from pipistrelle.estimation.ekf.correction import corrected
 from pipistrelle.estimation.ekf.delayed_initialization import WAITING_WEIGHT
+from pipistrelle.estimation.ekf.editing import is_placed, merged, removed
 from pipistrelle.estimation.ekf.gaussian import INVARIANT, LINEAR, propagate
 from pipistrelle.estimation.ekf.invariant_error import (
-    linear_covariance_of_points,
+    linear_covariance,
     propagate_invariant,
     rotated_left,
     shifted_covariance,
@@ -98,9 +106,31 @@ class EkfBelief:
         mean, covariance = self.mean[at].reshape(-1, 2), self.covariance[np.ix_(at, at)]
         if self.error == INVARIANT:
             heading = self.covariance[2, at], self.covariance[2, 2]
-            covariance = linear_covariance_of_points(mean, covariance, *heading)
+            covariance = linear_covariance(rotated_left(mean), covariance, *heading)
             mean = mean + self.origin
         return _map_of(self.landmark[kept], self.weight[kept], mean, covariance)
+
+    def joint(self) -> JointGaussian:
+        """Return pose and placed landmarks together, callers that move among them."""
+        placed = np.flatnonzero(is_placed(self.landmark))
+        at = np.concatenate(([0, 1, 2], (3 + 2 * placed[:, np.newaxis] + np.arange(2)).ravel()))
+        mean, covariance = self.mean[at], self.covariance[np.ix_(at, at)]
+        if self.error == INVARIANT:
+            points = np.concatenate((mean[:2], mean[3:])).reshape(-1, 2)
+            rotated = np.insert(rotated_left(points), 2, 0.0)
+            covariance = linear_covariance(rotated, covariance, covariance[2], covariance[2, 2])
+            mean = mean + np.insert(np.tile(self.origin, 1 + placed.size), 2, 0.0)
+        return JointGaussian(landmark=self.landmark[placed], mean=mean, covariance=covariance)
+
+    def edited(self, remove: Sequence[int], merge: Sequence[tuple[int, int]]) -> "EkfBelief":
+        """Return the belief without some landmarks, and with others as one (`editing`)."""
+        state = (self.mean, self.covariance, self.landmark, self.weight)
+        for kept, gone in merge:
+            state = merged(state, kept, gone, self.error)
+        for label in remove:
+            state = removed(state, label)
+        mean, covariance, landmark, weight = state
+        return replace(self, mean=mean, covariance=covariance, landmark=landmark, weight=weight)
 
 
 def _map_of(

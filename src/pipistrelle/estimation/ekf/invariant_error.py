@@ -43,14 +43,17 @@ def rotated_left(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " m"]:
     return (points @ np.array([[0.0, 1.0], [-1.0, 0.0]])).ravel()
 
 
-def linear_covariance_of_points(
-    points: Float[np.ndarray, "n 2"],
+def linear_covariance(
+    rotated: Float[np.ndarray, " m"],
     covariance: Float[np.ndarray, "m m"],
     with_heading: Float[np.ndarray, " m"],
     heading_variance: float,
 ) -> Float[np.ndarray, "m m"]:
-    """Turn the covariance of points' invariant errors into that of their linear errors."""
-    rotated = rotated_left(points)
+    """Turn a covariance of invariant errors into that of the linear errors.
+
+    `rotated`: of positions as `rotated_left` gives them, 0 of a heading; `with_heading`: the
+    covariance of each number with the heading.
+    """
     lever = np.outer(rotated, with_heading)
     return covariance + (lever + lever.T) + np.outer(rotated, rotated) * heading_variance
 

@@ -25,10 +25,10 @@ from pipistrelle.arrays.layout import Layout, square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
 from pipistrelle.arrays.sampling import BLOCK, Sampling, block_shape, blocks_to_hear, sampling
 from pipistrelle.config import Config
-from pipistrelle.detection.direct import own_alone
-from pipistrelle.detection.faces import FrameMeasurements, average_faces, same_echo, unlabelled
+from pipistrelle.detection.direct import own_alone, without_calls
+from pipistrelle.detection.faces import FrameMeasurements, average_faces, same_echo
 from pipistrelle.detection.matched import filter_blocks, filter_samples
-from pipistrelle.detection.scans import NO_CALLERS
+from pipistrelle.detection.scans import UNLABELLED, Scan, without_labels
 from pipistrelle.detection.snapshots import (
     Detections,
     Detector,
@@ -55,7 +55,8 @@ def listen(
     beam: Callable[..., Arrivals] | None = None,
     layout: Layout | None = None,
     find: Callable[..., Detections] = detect,
-    oracle: Callable[..., Int[np.ndarray, " d"]] | None = label_detections,
+    oracle: Callable[..., Int[np.ndarray, " d"]] = label_detections,
+    labels: bool = True,
     progress: Progress | None = None,
 ) -> tuple[tuple[FrameMeasurements, ...], ...]:
     """Hear every frame of a path, once for all beamwidths.
@@ -76,10 +77,11 @@ def listen(
         The arrays; those of the settings by default.
     find : callable
         Finds calls in the matched filter's output, as `detect` does.
-    oracle : callable, optional
-        Tells whose echo each detection is, as `label_detections` does, by the truth. None: nobody
-        tells, rows bear no label, and a stage of association has to find one
-        (`pipistrelle.estimation.association`).
+    oracle : callable
+        Tells by the truth whose echo each detection is, as `label_detections` does.
+    labels : bool
+        False: frames also hold their echoes without labels, for a stage of association to find
+        them (`pipistrelle.estimation.association`).
     progress : callable, optional
 
     Returns
@@ -108,7 +110,7 @@ def listen(
     """
     setup = config.scenario
     ears = layout or square_of_four(config.receiver)
-    rig = _rig(config, scenario, ears, find, oracle)
+    rig = _rig(config, scenario, ears, find, oracle, labels)
     purpose = "noise" if setup.vehicle == 1 else f"noise of {setup.vehicle}"
     engine = _dense if config.receiver.engine == "dense" else _blocks
     beams: tuple[list[FrameMeasurements], ...] = tuple([] for _ in radii)
@@ -175,7 +177,8 @@ class _Rig:
     sampling: Sampling
     detector: Detector
     find: Callable[..., Detections]
-    oracle: Callable[..., Int[np.ndarray, " d"]] | None
+    oracle: Callable[..., Int[np.ndarray, " d"]]
+    labels: bool
     faintest_db: float
     callers: Int[np.ndarray, " c"]
     missable: Bool[np.ndarray, " c"]
@@ -188,7 +191,8 @@ def _rig(
     scenario: Scenario,
     layout: Layout,
     find: Callable[..., Detections],
-    oracle: Callable[..., Int[np.ndarray, " d"]] | None,
+    oracle: Callable[..., Int[np.ndarray, " d"]],
+    labels: bool,
 ) -> _Rig:
     """Make what is the same for all frames of a path."""
     settled = sampling(config, scenario.callers)
@@ -201,14 +205,15 @@ def _rig(
         detector=finder,
         find=find,
         oracle=oracle,
+        labels=labels,
         faintest_db=faintest_level_db(
             finder.threshold,
             elements=layout.position.size,
             samples=settled.pulse * settled.block,
             noise_std=settled.noise_std,
-            margin_db=config.association.margin_db,
+            margin_db=config.matching.margin_db,
         ),
-        callers=caller_labels(scenario) if oracle else NO_CALLERS,
+        callers=caller_labels(scenario),
         missable=own_clock | [caller.heading is not None for caller in scenario.callers],
         own_clock=own_clock,
         workspace=Workspace(),
@@ -226,31 +231,53 @@ def _of_call(call: CallHeard, time: float, record: "_Record", found: Detections)
 
 def _heard(time: float, detections: Detections, arrivals: Arrivals, rig: _Rig) -> FrameMeasurements:
     """Label a frame's detections and average them over the faces."""
-    config, gates = rig.config, rig.config.association
-    if rig.oracle is None:
-        delay_gate = gates.delay_gate * config.emitter.pulse
-        label = same_echo(detections, delay_gate=delay_gate, bearing_gate=gates.bearing_gate)
-    else:
-        label = rig.oracle(
-            detections,
-            arrivals,
-            rig.layout,
-            gates,
-            pulse=config.emitter.pulse,
-            faintest_db=rig.faintest_db,
-        )
-        if detections.direct is not None and rig.missable.any():
-            direct = own_alone(detections.direct, label, rig.callers, rig.missable)
-            detections = replace(detections, direct=direct)
-    heard = average_faces(
+    label = rig.oracle(
+        detections,
+        arrivals,
+        rig.layout,
+        rig.config.matching,
+        pulse=rig.config.emitter.pulse,
+        faintest_db=rig.faintest_db,
+    )
+    direct = detections.direct
+    if direct is not None and rig.missable.any():
+        direct = own_alone(direct, label, rig.callers, rig.missable)
+    heard = _averaged(time, replace(detections, direct=direct), label, rig)
+    return heard if rig.labels else replace(heard, unlabelled=_echoes(time, detections, rig))
+
+
+def _averaged(
+    time: float, detections: Detections, label: Int[np.ndarray, " d"], rig: _Rig
+) -> FrameMeasurements:
+    """Average a frame's detections over the faces, by label and caller."""
+    return average_faces(
         time,
         detections,
         label,
-        averaging=config.detection.averaging,
-        speed_of_sound=config.assumed_sound_speed,
+        averaging=rig.config.detection.averaging,
+        speed_of_sound=rig.config.assumed_sound_speed,
         callers=rig.callers,
     )
-    return unlabelled(heard) if rig.oracle is None else heard
+
+
+def _echoes(time: float, detections: Detections, rig: _Rig) -> Scan:
+    """Average a frame's detections over the faces, by echo: one call, one time, one direction.
+
+    The direct call of a caller with a beam or a clock of its own may not be heard: the first of its
+    tone is then an echo, which labels alone tell. Without them it has no excess paths.
+    """
+    gates, direct = rig.config.matching, detections.direct
+    echo = same_echo(
+        detections,
+        delay_gate=gates.delay_gate * rig.config.emitter.pulse,
+        bearing_gate=gates.bearing_gate,
+    )
+    callers = np.full(rig.callers.size, UNLABELLED)
+    if direct is not None:
+        direct = without_calls(direct, rig.missable)
+        detections = replace(detections, direct=direct)
+        callers = np.append(echo, UNLABELLED)[direct.detection]
+    return without_labels(_averaged(time, detections, echo, rig).rows, callers)
 
 
 def _blocks(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]:

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int, Int8
 
 from pipistrelle.acoustics.arrivals import Arrivals
 from pipistrelle.arrays.layout import Layout
-from pipistrelle.config import AssociationConfig
+from pipistrelle.config import MatchingConfig
 from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.detection.snapshots import Columns, Detections, columns_of
 from pipistrelle.geometry import wrap_angle
@@ -28,7 +28,7 @@ def label_detections(
     detections: Detections,
     arrivals: Arrivals,
     layout: Layout,
-    gates: AssociationConfig,
+    gates: MatchingConfig,
     *,
     pulse: float,
     faintest_db: float,
@@ -47,7 +47,7 @@ def label_detections(
         (d) rows.
     arrivals : Arrivals
     layout : Layout
-    gates : AssociationConfig
+    gates : MatchingConfig
     pulse : [s]
     faintest_db : [dB]
         Arrivals below this level cannot be matched.
@@ -77,7 +77,7 @@ def label_detections(
     ...     delay=np.array([0.0302, 0.050]), power=np.array([90.0, 60.0]),
     ... )
     >>> layout = square_of_four(Config().receiver)
-    >>> gates = AssociationConfig()
+    >>> gates = MatchingConfig()
     >>> label_detections(heard, echoes, layout, gates, pulse=2.8e-3, faintest_db=-30.0)
     array([ 7, -1])
     """

@@ -11,13 +11,11 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.config import InputError
-from pipistrelle.detection.merging import labelled
-from pipistrelle.detection.noise import Noise, as_said
+from pipistrelle.detection.noise import Noise
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.association import Associate, known_labels
+from pipistrelle.estimation.association import Association
 from pipistrelle.estimation.beliefs import (
     NO_INNOVATIONS,
-    AcceptsMap,
     B,
     Belief,
     Estimator,
@@ -27,7 +25,7 @@ from pipistrelle.estimation.beliefs import (
     answer,
     in_sight,
 )
-from pipistrelle.estimation.checking import usable_scan
+from pipistrelle.estimation.session import Session, check_poses
 from pipistrelle.experiments.drives import Drive
 
 
@@ -37,12 +35,12 @@ def run_filter(
     scans: Sequence[Scan],
     rng: np.random.Generator,
     *,
-    associate: Associate = known_labels,
-    noise: Noise = as_said,
+    association: Association | None = None,
+    noise: Noise | None = None,
     progress: Callable[[int, int], None] | None = None,
     watch: Callable[[Scan, B], None] | None = None,
 ) -> Track:
-    """Predict to each scan, associate its rows, update with it, and keep the pose of every step.
+    """Conduct a `Session` over a drive: predict to each scan, correct with it, keep every pose.
 
     Where the belief revises its path (it has ``path``), the track is the path as it is believed at
     the end, and the poses that were kept are beside it. Where it revises those of callers, too
@@ -55,9 +53,8 @@ def run_filter(
     scans : sequence of Scan
         In order; the time of each is one of the drive's.
     rng : Generator
-    associate : Associate
-    noise : Noise
-        States how surely the rows were measured that an association has merged.
+    association, noise : optional
+        See `Session`.
     progress : callable, optional
         Given the scans done and their number.
     watch : callable, optional
@@ -70,39 +67,42 @@ def run_filter(
     Raises
     ------
     InputError
-        For a row that is neither bearing nor excess path, or no number, one of which nobody says
-        how sure it is, scans out of order or at a time that is not one of the drive's, labels that
-        are none, landmarks known beforehand that move, or poses that are not one for each step.
+        For a row that is neither bearing nor excess path, or no number, or has no standard
+        deviation, scans out of order or at a time that is not one of the drive's, labels that are
+        none, landmarks known beforehand that move, or poses that are not one for each step.
     """
     time = drive.time
     steps = _steps_of(scans, time)
+    _check_known(drive, scans)
+    session = Session(
+        estimator, drive.start, rng, known=drive.known, association=association, noise=noise
+    )
     path = Gaussian(mean=np.empty((time.size, 3)), covariance=np.empty((time.size, 3, 3)))
     path.mean[0], path.covariance[0] = drive.start.mean, drive.start.covariance
-    belief, done = _first_belief(estimator, drive, scans), 0
     callers: dict[int, Gaussian] = {}
+    done = 0
     for number, (k, scan) in enumerate(zip(steps, scans, strict=True), start=1):
-        if k > done:
-            belief = _carried(estimator, belief, drive, slice(done, k), rng, path)
-            done = k
-        named = usable_scan(
-            scan if associate is known_labels else _named(scan, belief, associate, noise)
-        )
-        belief = estimator.update(belief, named, rng)
-        if not hasattr(belief, "pose"):
-            raise _wrong_return(estimator, "update", belief, "the belief after the scan")
-        pose = belief.pose()
+        _move(session, drive, done, k, path)
+        done, used = k, session.hear(scan)
+        pose = session.belief.pose()
         path.mean[k], path.covariance[k] = pose.mean, pose.covariance
-        _follow(callers, scan, belief, (k, time.size))
+        _follow(callers, scan, session.belief, (k, time.size))
         if watch:
-            watch(named, belief)
+            watch(used, session.belief)
         if progress:
             progress(number, len(scans))
-    if done < len(drive.controls):
-        left = slice(done, len(drive.controls))
-        belief = _carried(estimator, belief, drive, left, rng, path)
+    _move(session, drive, done, len(drive.controls), path)
+    return _track_of(session.belief, time, path, callers)
+
+
+def _track_of(
+    belief: Belief, time: Float[np.ndarray, " k"], path: Gaussian, callers: dict[int, Gaussian]
+) -> Track:
+    """Return a drive as its last belief has it; `path`, `callers`: as believed at their time."""
     online = replace(path, invariant=belief.pose().invariant)
     revised, cloud = answer(belief, "path"), answer(belief, "cloud")
-    revised = _whole("path", revised, time.size) if revised is not None else None
+    if revised is not None:
+        check_poses("path", revised, time.size)
     return Track(
         time=time,
         pose=revised or online,
@@ -116,55 +116,28 @@ def run_filter(
     )
 
 
+def _move(session: Session[B], drive: Drive, first: int, last: int, path: Gaussian) -> None:
+    """Move a session through some steps of a drive, and write the pose after each into the path."""
+    if last == first:
+        return
+    dt = np.diff(drive.time[first : last + 1])
+    poses, after = session.move(drive.controls[first:last], dt), slice(first + 1, last + 1)
+    path.mean[after], path.covariance[after] = poses.mean, poses.covariance
+
+
+def _check_known(drive: Drive, scans: Sequence[Scan]) -> None:
+    """Refuse landmarks that are known beforehand and move."""
+    moving = {*drive.moving, *(label for scan in scans for label in scan.moving.tolist())}
+    if roving := sorted(moving.intersection(drive.known.landmark.tolist())):
+        raise InputError(
+            f"landmarks known beforehand: found {roving}, which move; expected some that stand"
+        )
+
+
 def _innovations(belief: Belief) -> Innovations:
     """Return the sum of innovations of a belief, or none if it does not keep one."""
     innovations = getattr(belief, "innovations", None)
     return innovations if isinstance(innovations, Innovations) else NO_INNOVATIONS
-
-
-def _named(scan: Scan, belief: B, associate: Associate, noise: Noise) -> Scan:
-    """Return a scan labelled by an association, with the noise of the rows that it merged."""
-    named = labelled(scan, associate(belief, scan))
-    return named if named is scan else noise(named)
-
-
-def _carried(
-    estimator: Estimator[B],
-    belief: B,
-    drive: Drive,
-    steps: slice,
-    rng: np.random.Generator,
-    path: Gaussian,
-) -> B:
-    """Predict a belief through steps of a drive, and write the pose after each into the path."""
-    controls, dt = drive.controls[steps], np.diff(drive.time[steps.start : steps.stop + 1])
-    predicted = estimator.predict(belief, controls, dt, rng)
-    if not (isinstance(predicted, tuple) and len(predicted) == 2):
-        raise _wrong_return(estimator, "predict", predicted, "the belief and the pose of each step")
-    belief, poses = predicted
-    poses, after = _whole("predict", poses, len(dt)), slice(steps.start + 1, steps.stop + 1)
-    path.mean[after], path.covariance[after] = poses.mean, poses.covariance
-    return belief
-
-
-def _wrong_return(estimator: Estimator[B], method: str, found: object, expected: str) -> InputError:
-    """Say what an estimator's method returned in place of what is expected."""
-    name = f"{type(estimator).__module__}.{type(estimator).__qualname__}.{method}"
-    fix = "does it lack its return?" if found is None else "correct it"
-    return InputError(f"{name}: found {type(found).__name__} returned, expected {expected}; {fix}")
-
-
-def _first_belief(estimator: Estimator[B], drive: Drive, scans: Sequence[Scan]) -> B:
-    """Return the belief at the start, with the landmarks that are known beforehand."""
-    belief, placed = estimator.init(drive.start), drive.known.landmark.tolist()
-    moving = {*drive.moving, *(label for scan in scans for label in scan.moving.tolist())}
-    if roving := sorted(moving.intersection(placed)):
-        raise InputError(
-            f"landmarks known beforehand: found {roving}, which move; expected some that stand"
-        )
-    if drive.known.landmark.size and isinstance(estimator, AcceptsMap):
-        belief = estimator.knowing(belief, drive.known)
-    return belief
 
 
 def _follow(callers: dict[int, Gaussian], scan: Scan, belief: Belief, at: tuple[int, int]) -> None:
@@ -204,19 +177,6 @@ def _filled_up(track: Gaussian, online: Gaussian) -> Gaussian:
         mean=np.where(none, online.mean, track.mean),
         covariance=np.where(none[..., np.newaxis], online.covariance, track.covariance),
     )
-
-
-def _whole(who: str, path: Gaussian, poses: int) -> Gaussian:
-    """Refuse poses of an estimator that are not one for each step, or lack their covariances."""
-    found = np.shape(path.mean), np.shape(path.covariance)
-    expected = (poses, 3), (poses, 3, 3)
-    if found != expected:
-        which = "the start and every control step" if who == "path" else "one after each step"
-        raise InputError(
-            f"{who}: found arrays of {found[0]} and {found[1]}, expected {expected[0]} and "
-            f"{expected[1]}: {which}"
-        )
-    return path
 
 
 def _steps_of(scans: Sequence[Scan], time: Float[np.ndarray, " t"]) -> list[int]:

@@ -10,11 +10,19 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.arithmetic.random_stream import stream_key
-from pipistrelle.config import Config, FilterConfig, ListeningConfig, Strategy
+from pipistrelle.config import (
+    AssociationConfig,
+    Config,
+    FilterConfig,
+    InputError,
+    ListeningConfig,
+    Strategy,
+)
 from pipistrelle.detection.faces import FrameMeasurements
 from pipistrelle.detection.merging import scan_of
-from pipistrelle.detection.noise import as_told, noise_of
+from pipistrelle.detection.noise import noise_of, without_hidden
 from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.evaluation.bound import bound_of_drawn_start
 from pipistrelle.experiments.drives import Drive, Truth
@@ -31,8 +39,9 @@ from pipistrelle.geometry import wrap_angle
 _NOISE = ("noise", "range_std", "bearing_std", "excess_path_std")
 _CALLERS = ("caller_speed_std", "caller_walk_std")
 """Settings of a filter that state noise: of what is heard, and of how callers move."""
-_Key = tuple[float, Strategy, FilterConfig, ListeningConfig]
-"""Piston radius [m], strategy, noise settings, listening settings."""
+_Key = tuple[float, Strategy, FilterConfig, ListeningConfig, AssociationConfig]
+"""Piston radius [m], strategy, and settings of noise, listening and association."""
+_LABELS = {"association": AssociationConfig(method=KNOWN)}
 
 
 def scans_of(
@@ -49,12 +58,32 @@ def scans_of(
     Returns
     -------
     tuple of Scan
-        A scan between frames that holds nothing for the strategy is left out.
+        A scan between frames that holds nothing for the strategy is left out. With an association
+        (``association.method``) scans bear no labels, and rows state their own noise alone: that of
+        the settings is stated after rows of one landmark were merged.
     """
-    noise, timing = noise_of(config.filter), config.listening.timing
-    rows = (as_told(frame.rows, config.filter, timing=timing) for frame in heard)
+    known = config.association.method == KNOWN
+    noise = noise_of(config.filter) if known else (lambda scan: scan)
+    rows = (
+        without_hidden(
+            frame.rows if known else _unlabelled(frame),
+            config.filter,
+            timing=config.listening.timing,
+        )
+        for frame in heard
+    )
     scans = zip(heard, (scan_of(scan, strategy) for scan in rows), strict=True)
     return tuple(noise(scan) for frame, scan in scans if scan.landmark.size or not frame.between)
+
+
+def _unlabelled(frame: FrameMeasurements) -> Scan:
+    """Return a frame's rows without labels; refuse a frame that was heard without them."""
+    if frame.unlabelled is None:
+        raise InputError(
+            "association.method: found frames that were heard with labels alone; expected some of "
+            "listen(..., labels=False)"
+        )
+    return frame.unlabelled
 
 
 def drive_of(scenario: Scenario, config: Config, iteration: int = 0) -> Drive:
@@ -114,7 +143,7 @@ class HeardWorld:
     def scans(self, config: Config, strategy: Strategy) -> tuple[Scan, ...]:
         """Return the scans of a strategy (`scans_of`)."""
         radius, noise = config.emitter.radius, _only(config.filter, _NOISE)
-        key = (radius, strategy, noise, config.listening)
+        key = (radius, strategy, noise, config.listening, config.association)
         if key not in self._scans:
             self._scans[key] = scans_of(self.beams[radius], strategy, self._with(key))
         return self._scans[key]
@@ -128,20 +157,24 @@ class HeardWorld:
         return bound
 
     def stated_bound(self, config: Config, strategy: Strategy) -> Float[np.ndarray, "t 3 3"]:
-        """Return the bound of the pose at every step from an exact start, for the stated noise."""
+        """Return the bound of the pose at every step from an exact start, for the stated noise.
+
+        It is that of known labels, whoever gives them to the filter.
+        """
         noise = _only(config.filter, _NOISE + _CALLERS)
-        key = (config.emitter.radius, strategy, noise, config.listening)
+        key = (config.emitter.radius, strategy, noise, config.listening, _LABELS["association"])
         if key not in self._bounds:
-            scans = self.scans(config, strategy)
+            scans = self.scans(config.model_copy(update=_LABELS), strategy)
             bound = drive_bound(self._drive, scans, self._with(key))
             assert bound is not None, "the truth of a world is known"
             self._bounds[key] = bound
         return self._bounds[key]
 
     def _with(self, key: _Key) -> Config:
-        """Return the world's settings with a key's noise and listening."""
-        _, _, noise, listening = key
-        return self._config.model_copy(update={"filter": noise, "listening": listening})
+        """Return the world's settings with those of a key."""
+        _, _, *sections = key
+        names = ("filter", "listening", "association")
+        return self._config.model_copy(update=dict(zip(names, sections, strict=True)))
 
 
 def _start_covariance(config: Config) -> Float[np.ndarray, "3 3"]:

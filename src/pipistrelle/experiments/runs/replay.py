@@ -16,8 +16,15 @@ from pipistrelle.detection.logs.readers import (
 )
 from pipistrelle.detection.logs.recording import Log
 from pipistrelle.detection.merging import labelled
-from pipistrelle.detection.noise import as_told, noise_of
-from pipistrelle.detection.scans import Scan, rows_of, with_columns, without_excess_paths
+from pipistrelle.detection.noise import noise_of, without_hidden
+from pipistrelle.detection.scans import (
+    Scan,
+    rows_of,
+    with_columns,
+    without_excess_paths,
+    without_labels,
+)
+from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.experiments.drives import Drive, Truth
@@ -197,7 +204,7 @@ def replay(
         See `as_heard_by`.
     config : Config
         Its sections that estimators read; what the log decides must agree with it. With "constant"
-        noise, what the rows themselves say of it is ignored.
+        noise, what the rows themselves say of it is ignored; with an association, their labels are.
     progress, watch : callable, optional
 
     Returns
@@ -235,13 +242,22 @@ def replay(
         known=_known_callers(log),
         moving={who.landmark: who.name for who in log.callers if who.moves},
     )
-    check_filters(filters, drive.motion, config)
-    noise = noise_of(config.filter)
-    scans = [as_told(rows, config.filter, timing=config.listening.timing) for rows in log.scans]
-    heard = {
-        strategy: tuple(
-            noise(labelled(scan, scan.landmark)) for scan in as_heard_by(scans, strategy, beamwidth)
+    check_filters(filters, drive.motion, config, drive.moving.values())
+    noise, known = noise_of(config.filter), config.association.method == KNOWN
+
+    def taken(scan: Scan) -> Scan:
+        return noise(labelled(scan, scan.landmark)) if known else scan
+
+    scans = [
+        without_hidden(
+            rows if known else without_labels(rows, rows.callers),
+            config.filter,
+            timing=config.listening.timing,
         )
+        for rows in log.scans
+    ]
+    heard = {
+        strategy: tuple(map(taken, as_heard_by(scans, strategy, beamwidth)))
         for strategy in strategies
     }
     trials = run_trials(filters, drive, heard, config, progress=progress, watch=watch)

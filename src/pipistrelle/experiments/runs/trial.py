@@ -5,6 +5,7 @@ Read this file first: each call is a box of the paper's workflow.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +17,7 @@ from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import Config, InputError, Strategy
 from pipistrelle.detection.noise import noise_of
 from pipistrelle.detection.scans import Scan, rows_of
-from pipistrelle.estimation.association import Associate, known_labels
+from pipistrelle.estimation.association import KNOWN, Association, association_of
 from pipistrelle.estimation.beliefs import Belief, at_steps
 from pipistrelle.estimation.catalogue import CATALOGUE, entry, short_name
 from pipistrelle.experiments.cases import Case
@@ -35,7 +36,11 @@ from pipistrelle.experiments.results.scores import (
 from pipistrelle.experiments.runs.filtering import run_filter
 from pipistrelle.experiments.runs.heard_world import HeardWorld, drive_of
 from pipistrelle.experiments.runs.mission import Mission
-from pipistrelle.experiments.runs.validate_filters import check_filters, failed_trial
+from pipistrelle.experiments.runs.validate_filters import (
+    check_filters,
+    check_standing,
+    failed_trial,
+)
 from pipistrelle.experiments.runs.validate_mission import checked_scenario
 
 Watch = Callable[[str, str, Scan, Belief], None]
@@ -70,9 +75,9 @@ def run_mission(
         passive=any(strategy != "active" for strategy in strategies),
     )
     drive = drive_of(scenario, config)
-    check_filters(filters, drive.motion, config)
-    radius = config.emitter.radius
-    (heard,) = listen(scenario, config, (radius,), progress=progress)
+    check_filters(filters, drive.motion, config, drive.moving.values())
+    radius, labels = config.emitter.radius, config.association.method == KNOWN
+    (heard,) = listen(scenario, config, (radius,), labels=labels, progress=progress)
     there = HeardWorld(scenario, config, {radius: heard})
     scans = {strategy: there.scans(config, strategy) for strategy in strategies}
     trials = run_trials(filters, drive, scans, config, progress=progress, watch=watch)
@@ -126,7 +131,7 @@ def run_trial(
     scans: Sequence[Scan],
     config: Config,
     *,
-    associate: Associate = known_labels,
+    association: Association | None = None,
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> TrialResult:
@@ -140,9 +145,10 @@ def run_trial(
         As `scans_of` gives them. What is labelled as a caller that moves is left out, unless the
         settings have timing and the estimator follows.
     config : Config
-    associate : Associate
-        Says who is who, between prediction and correction. Of rows that it merges, the settings say
-        how surely they were measured. Its labels are not the truth's, so the map is not scored.
+    association : Association, optional
+        Labels the rows of scans; that of the settings by default, where they have one. The noise of
+        rows that it merges is the settings'. Its labels are not the truth's, so the map is not
+        scored.
     progress, watch : callable, optional
 
     Returns
@@ -150,11 +156,9 @@ def run_trial(
     TrialResult
     """
     strategy, name, heard, estimator = case.strategy, case.filter, tuple(scans), entry(case.filter)
+    association = association or association_of(config)
+    check_standing(drive.moving.values() if association else ())
     scans = _with_moving(scans, drive, follows=estimator.follows and config.listening.timing)
-
-    def report(done: int, total: int) -> None:
-        if progress:
-            progress(f"{strategy} {short_name(name)}", done, total)
 
     used: list[Scan] = []
 
@@ -165,19 +169,19 @@ def run_trial(
 
     began = kernel_clock.wall_s()
     parted, steps = split_at(drive, [scan.time for scan in scans])
-    track = run_filter(
+    whole = run_filter(
         estimator.build(config, parted.motion),
         parted,
         scans,
         np.random.default_rng(stream_key(config.seed, case.iteration, name)),
-        associate=associate,
+        association=association,
         noise=noise_of(config.filter),
-        progress=report,
+        progress=partial(progress, f"{strategy} {short_name(name)}") if progress else None,
         watch=look,
     )
     wall_s = kernel_clock.wall_s() - began
-    track = at_steps(track, steps)
-    truth = drive.truth if associate is known_labels else replace(drive.truth, landmarks=None)
+    track = at_steps(whole, steps)
+    truth = replace(drive.truth, landmarks=None) if association else drive.truth
     scores = score(track, truth, used, estimator.nees_limit)
     return TrialResult(
         strategy=strategy,

@@ -3,7 +3,7 @@
 A trial that fails costs its own estimate; what the others found is kept.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from traceback import extract_tb, format_exc
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.association import association_of
 from pipistrelle.estimation.beliefs import Belief, Gaussian, Track, no_landmarks
 from pipistrelle.estimation.catalogue import CATALOGUE, check_distinct, check_there, entry
 from pipistrelle.estimation.motion import Motion
@@ -21,9 +22,16 @@ from pipistrelle.experiments.results.scores import TrialResult, score
 from pipistrelle.kernel_clock import judging
 
 
-def check_filters(filters: Sequence[str], motion: Motion, config: Config) -> None:
-    """Refuse estimators of the user that cannot be built or begun, before anything is heard."""
+def check_filters(
+    filters: Sequence[str], motion: Motion, config: Config, moving: Iterable[str] = ()
+) -> None:
+    """Refuse estimators and associations that cannot be built or begun, before anything is heard.
+
+    `moving`: names of the callers that move.
+    """
     check_distinct(filters)
+    if association_of(config):
+        check_standing(moving)
     for name in filters:
         if name in CATALOGUE:
             check_there(name)
@@ -46,6 +54,15 @@ def check_filters(filters: Sequence[str], motion: Motion, config: Config) -> Non
                 f"filter {name}: init returns a belief whose {', '.join(fixed)} cannot be called; "
                 f"of a belief {', '.join(methods)} are methods, the last two where it has them"
             )
+
+
+def check_standing(moving: Iterable[str]) -> None:
+    """Refuse callers that move where an association is to label them: none can yet."""
+    if names := ", ".join(moving):
+        raise InputError(
+            f"association.method: found callers that move ({names}); expected callers that stand: "
+            "without labels none is followed yet"
+        )
 
 
 def _nothing() -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from pipistrelle.config import InputError
 from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.estimation.outside import look_in
-from pipistrelle.experiments.hearing.scenario import standing_landmarks
+from pipistrelle.experiments.hearing.scenario import moving_callers, standing_landmarks
 from pipistrelle.experiments.hearing.trajectories import motion_of
 from pipistrelle.experiments.machine import check_memory, keep_freed_memory
 from pipistrelle.experiments.runs.validate_filters import check_filters
@@ -148,11 +148,13 @@ def check_cases(plan: Plan, workers: int) -> None:
             config = cases[0].config
             scenario = checked_scenario(config, world=plan.world(config), workers=workers)
             here = len(standing_landmarks(scenario)[0])
+            moving = [caller.name for caller in moving_callers(scenario).values()]
         for case in cases:
             heard = {"passive": case.strategy != "active", "workers": workers}
             with _named(case):
                 check_memory([case.filter], here, case.config, **heard)
-                check_filters([case.filter], motion_of(case.config.motion), case.config)
+                motion = motion_of(case.config.motion)
+                check_filters([case.filter], motion, case.config, moving)
 
 
 @contextmanager

@@ -16,9 +16,11 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle import kernel_clock
 from pipistrelle.acoustics.emitter import beamwidth_of
 from pipistrelle.config import Config
+from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.beliefs import Track
 from pipistrelle.estimation.catalogue import SECTIONS
 from pipistrelle.evaluation.accuracy import (
+    MapEstimate,
     heaviest,
     landmark_error,
     pose_error,
@@ -212,7 +214,8 @@ def _run_cases(cases: Sequence[PlannedCase], iteration: int, world: World) -> li
     radii = sorted({case.config.emitter.radius for case in cases})
     try:
         scenario = world_of(config, iteration, world)
-        heard = listen(scenario, config, radii, iteration=iteration)
+        labels = all(case.config.association.method == KNOWN for case in cases)
+        heard = listen(scenario, config, radii, iteration=iteration, labels=labels)
     except Exception as failure:
         error = failure_text(failure)
         return [_failed(case, error) for case in cases]
@@ -254,16 +257,25 @@ def _try_case(case: PlannedCase, shared: HeardWorld, iteration: int) -> TrialRec
             scores=with_bound(result.scores, shared.bound(case.config, case.strategy)),
             online=result.online,
             landmarks_full_mean=float(result.scores.landmarks_full if full is None else full),
-            clutter_per_frame=sum(h.clutter or 0 for h in heard) / len(heard) if heard else None,
+            clutter_per_frame=sum(h.clutter for h in heard) / len(heard) if heard else None,
             wall_s=result.wall_s,
             cpu_s=cpu_s,
             steps=np.column_stack([frames, _consistent(case, shared)]),
             landmark=estimate.landmark,
             full=estimate.full,
-            landmark_error=landmark_error(estimate, *standing_landmarks(scenario)),
+            landmark_error=_landmark_error(estimate, scenario, case.config),
         )
     except Exception as failure:
         return _failed(case, failure_text(failure))
+
+
+def _landmark_error(
+    estimate: MapEstimate, scenario: Scenario, config: Config
+) -> Float[np.ndarray, " n"]:
+    """Return how far landmarks are off [m]; NaN where an association gave labels of its own."""
+    if config.association.method == KNOWN:
+        return landmark_error(estimate, *standing_landmarks(scenario))
+    return np.full(estimate.landmark.size, np.nan)
 
 
 @np.errstate(over="ignore", invalid="ignore")

@@ -1,0 +1,227 @@
+"""Associations that are not in the package: a class in the folder labels what nobody labelled."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pipistrelle.__main__ import main
+from pipistrelle.config import (
+    AssociationConfig,
+    Config,
+    FilterConfig,
+    InputError,
+    ListeningConfig,
+    ScenarioConfig,
+)
+from pipistrelle.experiments.runs.trial import run_mission
+from pipistrelle.experiments.studies.store import load_study
+from reference.studies import SMALL
+
+SHORT = ("--duration", "10", "--seed", "7", "--quiet", "--strategy", "fused", "--filter", "iekf")
+JOINT = '''
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pipistrelle.detection.scans import UNLABELLED
+from pipistrelle.estimation.association import Assignment, expected
+
+CALLER = 1000
+
+@dataclass(frozen=True)
+class Memory:
+    """The last label, and of each landmark in how many scans it was heard, and when last."""
+    scan: int = 0
+    last: int = 0
+    heard: dict = field(default_factory=dict)
+
+@dataclass(frozen=True)
+class Joint:
+    """Nearest by joint innovations; what was heard once is forgotten, and doubles are merged."""
+    gate: float = 11.0
+    patience: int = 4
+    nearest: float = 0.3
+
+    def start(self):
+        return Memory()
+
+    def associate(self, memory, belief, scan):
+        joint, last, heard = belief.joint(), memory.last, dict(memory.heard)
+        label = np.full(scan.landmark.size, UNLABELLED)
+        rows, there = np.meshgrid(np.arange(label.size), joint.landmark, indexing="ij")
+        if joint.landmark.size:
+            callers = np.where(scan.direct >= 0, CALLER, -1)
+            pairs = expected(joint, scan, rows.ravel(), there.ravel(), callers)
+            d2 = [self.distance(pairs, n) for n in range(rows.size)]
+            d2 = np.reshape(d2, rows.shape)
+            best = d2.argmin(axis=1)
+            near = d2.min(axis=1) < self.gate
+            label[near] = joint.landmark[best[near]]
+        for m in np.flatnonzero((label == UNLABELLED) & ~np.isnan(scan.range)):
+            last += 1
+            label[m] = last
+        label[scan.direct[scan.direct >= 0]] = CALLER
+        for name in set(label.tolist()) - {UNLABELLED, CALLER}:
+            heard[name] = (heard.get(name, (0, 0))[0] + 1, memory.scan)
+        remove = tuple(
+            name for name, (count, when) in heard.items()
+            if count == 1 and memory.scan - when > self.patience and name in joint.landmark
+        )
+        merge = self.doubles(joint, {*remove, CALLER})
+        for name in (*remove, *(gone for _, gone in merge)):
+            heard.pop(name, None)
+        label[np.isin(label, [gone for _, gone in merge])] = UNLABELLED
+        return Memory(memory.scan + 1, last, heard), Assignment(
+            label=label, remove=remove, merge=merge
+        )
+
+    def distance(self, pairs, n):
+        difference, covariance = pairs.difference[n], pairs.covariance[n, :, n]
+        known = ~np.isnan(difference)
+        if known.sum() < 2:
+            return np.inf  # a bearing alone fits many
+        nu, S = difference[known], covariance[np.ix_(known, known)]
+        return nu @ np.linalg.solve(S, nu)
+
+    def doubles(self, joint, others):
+        points, taken, pairs = joint.mean[3:].reshape(-1, 2), set(others), []
+        for a in range(len(points)):
+            for b in range(a):
+                labels = int(joint.landmark[b]), int(joint.landmark[a])
+                if np.hypot(*(points[a] - points[b])) < self.nearest and not taken & {*labels}:
+                    pairs.append(labels)
+                    taken |= {*labels}
+        return tuple(pairs)
+'''
+
+
+@pytest.fixture
+def written(tmp_path, monkeypatch):
+    """Write a module into the current folder and return its name, a new one each time."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+
+    def written(text):
+        name = f"own_{tmp_path.name}_{len(list(tmp_path.glob('*.py')))}".replace("-", "_")
+        Path(f"{name}.py").write_text(text)
+        return name
+
+    return written
+
+
+def config_of(method, **sections):
+    """Return the settings of a mission of 20 frames with timing, and an association."""
+    return Config(
+        scenario=ScenarioConfig(steps=160),
+        listening=ListeningConfig(timing=True),
+        filter=FilterConfig(noise="measured"),
+        association=AssociationConfig(method=method),
+        **sections,
+    )
+
+
+def test_without_labels_excess_paths_reach_the_filter_with_the_caller_as_it_was_labelled(written):
+    method = f"{written(JOINT)}:Joint"
+    labelled, found = (
+        run_mission(config_of(name), ["passive", "fused"], ["iekf"]) for name in ("known", method)
+    )
+    for one, other in zip(labelled.trials, found.trials, strict=True):
+        assert other.error is None
+        named = {label for scan in other.scans for label in scan.callers.tolist()}
+        assert named == {-1, 1000}
+        assert all((scan.landmark >= 0).all() for scan in other.scans)
+        assert other.scores.position_bound_m == one.scores.position_bound_m
+        assert (other.scores.map_rmse_m, one.scores.map_rmse_m is None) == (None, False)
+    paths = [
+        sum(int((~np.isnan(scan.excess_path)).sum()) for scan in trial.scans)
+        for trial in (labelled.trials[1], found.trials[1])
+    ]
+    assert paths[1] > 0.3 * paths[0] > 100, "of those that a landmark was born for"
+
+
+def test_an_association_of_a_class_maps_a_mission_a_study_and_its_log(written):
+    method = ("--association.method", f"{written(JOINT)}:Joint")
+    timed = ("--listening.timing", "true", "--filter.noise", "measured")
+    words = ("run", *SHORT, *timed)
+    assert main([*words, "-o", "known", "--save-log", "log"]) == 0
+    assert main([*words, *method, "-o", "own"]) == 0
+    assert main(["slam", "log", "--quiet", "--filter", "iekf", *method, "-o", "again"]) == 0
+    (known,), (own,), (again,) = (
+        json.loads(Path(folder, "summary.json").read_text())["runs"]
+        for folder in ("known", "own", "again")
+    )
+    assert own["position_bound_m"] == known["position_bound_m"]
+    assert own["map_rmse_m"] is again["map_rmse_m"] is None
+    assert "own_" in Path("own/config.toml").read_text()
+    for folder in ("own", "again"):
+        drawn = pl.read_csv(f"{folder}/map_fused_iekf.csv", comment_prefix="#")
+        assert 1000 in drawn["landmark"].to_list(), "the caller is on the map by its direct call"
+    small = SMALL.replace("iterations = 3", "iterations = 1").replace("0.0025, 0.025", "0.0088")
+    Path("small.toml").write_text(
+        f'filters = ["iekf"]\nstrategies = ["active", "fused"]\n{small}'
+        f'"association.method" = ["known", "{method[1]}"]\n'
+    )
+    assert main(("study", "small.toml", "-o", "study", "--quiet")) == 0
+    trials = load_study(Path("study")).trials.collect()
+    assert trials["status"].to_list() == ["done"] * 4
+    for strategy in ("active", "fused"):
+        known, own = trials.filter(pl.col("strategy") == strategy).iter_rows(named=True)
+        assert known["position_bound_m"] == own["position_bound_m"]
+        assert known["landmarks_total"] != own["landmarks_total"]
+        assert (known["map_rmse_m"] is None, own["map_rmse_m"]) == (False, None)
+        assert known["clutter_per_frame"] == own["clutter_per_frame"]
+
+
+WRONG = {
+    "nothing": ("", "found no class Own in NAME; expected an association"),
+    "no start": (
+        "class Own:\n    def associate(self, *_): ...",
+        "lacks start; an association has start, associate",
+    ),
+    "no record": (
+        "class Own:\n    def start(self): ...\n    def associate(self, *_): ...",
+        "cannot be built: it is no dataclass; make it one, or write from_config(config)",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_cannot_be_had_or_built_is_refused_before_anything_is_heard(written, case, capsys):
+    text, expected = WRONG[case]
+    name = written(text)
+    assert main(["run", *SHORT, "--association.method", f"{name}:Own", "-o", "one"]) == 2
+    error = capsys.readouterr().err
+    where = f"pipistrelle: error: association.method {name}:Own: "
+    assert error.startswith(where + expected.replace("NAME", name))
+    assert error.count("\n") == 1
+    assert not Path("one").exists()
+
+
+def test_an_answer_that_is_no_assignment_is_refused_by_name(written):
+    text = (
+        "from dataclasses import dataclass\n@dataclass(frozen=True)\nclass Own:\n"
+        "    def start(self): ...\n    def associate(self, *_): return [1, 2]"
+    )
+    config = Config(
+        scenario=ScenarioConfig(steps=8),
+        association=AssociationConfig(method=f"{written(text)}:Own"),
+    )
+    with pytest.raises(InputError, match=r"Own\.associate: found list returned, expected the mem"):
+        run_mission(config, ["fused"], ["ekf"])
+
+
+def test_callers_that_move_are_refused_with_an_association(written, capsys):
+    method = f"{written(JOINT)}:Joint"
+    Path("boat.toml").write_text(
+        '[[callers]]\nname = "boat"\nfrequency = 25e3\ncourse = "circle"\n'
+        f'[association]\nmethod = "{method}"\n'
+    )
+    assert main(["run", *SHORT, "--config", "boat.toml", "-o", "one"]) == 2
+    error = capsys.readouterr().err
+    assert (
+        "association.method: found callers that move (boat); expected callers that stand" in error
+    )
