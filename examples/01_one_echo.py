@@ -62,8 +62,7 @@ settled, rng = sampling(config, [vehicle]), np.random.default_rng(7)
 blocks, layout = blocks_to_hear(echo, settled) + 30, square_of_four(config.receiver)
 samples = record_samples(blocks, echo, layout, settled, rng)
 length, rate = settled.pulse * settled.block, settled.rate
-call = {"tones": settled.tones, "rate": rate, "length": length}
-matched = filter_samples(samples, **call, noise_std=settled.noise_std)
+matched = filter_samples(samples, calls=settled.calls, rate=rate, noise_std=settled.noise_std)
 heard = {"microphone": samples[:, 0, 0], "matched filter": matched[:, 0, 0, 0]}
 
 plt.rcParams.update(STYLE)

@@ -53,8 +53,9 @@ rng = np.random.default_rng(config.seed)
 blocks = blocks_to_hear(arrivals, settled)
 samples = record_samples(blocks, arrivals, layout, settled, rng)
 length, start = settled.pulse * settled.block, settled.pulse * BLOCK
-call = {"tones": settled.tones, "rate": settled.rate, "length": length}
-matched = filter_samples(samples, **call, noise_std=settled.noise_std)
+matched = filter_samples(
+    samples, calls=settled.calls, rate=settled.rate, noise_std=settled.noise_std
+)
 finder = detector(config, layout, settled.tones)
 found = detect(matched, finder, start=start, interval=1.0 / settled.rate, pulse=length)
 

@@ -80,7 +80,7 @@ def test_a_change_touches_three_files_at_most_and_its_proof_exists():
     page = (DOCS / "extending.md").read_text()
     rows = re.findall(r"^\| (an? [^|]*|measurement[^|]*) \|[^|]*\|([^|]*)\|([^|]*)\|$", page, re.M)
     everywhere = "\n".join(path.read_text() for path in (ROOT / "tests").rglob("test_*.py"))
-    assert len(rows) == 12
+    assert len(rows) == 17
     for change, files, proofs in rows:
         named = re.findall(r"`([\w/]+\.py)`", files)
         assert 1 <= len(named) <= 3, change
@@ -124,6 +124,27 @@ def test_the_guides_array_finds_a_bearing(guide):
     power = beamscan(steering_vector(angles[75], **ears), angles, **ears)
     assert np.argmax(power) == 75
     assert guide["hexagon"].normal.size == 6
+
+
+def test_the_guides_shape_call_and_medium_are_heard(guide):
+    from pipistrelle.acoustics.arrivals import arrivals_of_emissions
+    from pipistrelle.acoustics.callers import callers_of
+    from pipistrelle.acoustics.target import SHAPES
+    from pipistrelle.config import Config, ReceiverConfig, ScenarioConfig
+    from pipistrelle.experiments.hearing.listening import listen
+    from pipistrelle.experiments.hearing.scenario import world_of
+
+    pose, still = np.zeros((1, 3)), np.zeros((1, 2))
+    posts, callers = np.array([[6.0, 1.0], [6.0, -1.0]]), callers_of(Config(), np.array([0.0, 9.0]))
+    heard, _ = arrivals_of_emissions(
+        pose, still, posts, callers, Config(), guide["pebbles"], guide["water"]
+    )
+    own = heard.level_db[heard.caller == 0]
+    assert own[1] - own[0] > 20.0 * np.log10(0.05 / 0.02)
+    del SHAPES["pebble"]
+    config = Config(scenario=ScenarioConfig(steps=8), receiver=ReceiverConfig(engine="dense"))
+    (frames,) = listen(world_of(config), config, (0.0025,), call=guide["Sweep"])
+    assert sum(frame.rows.landmark.size for frame in frames) > 20
 
 
 def test_the_guides_second_caller_is_mapped_and_its_moving_one_is_not(guide):

@@ -340,7 +340,7 @@ def through(bodies, config, pose=ORIGIN):
 @pytest.mark.parametrize("shape", ["cylinder", "sphere"])
 def test_bodies_whose_size_is_not_stated_are_the_usual_points_to_the_bit(shape):
     config = Config(target=TargetConfig(shape=shape, radius=0.04))
-    usual = Bodies(radius=np.full(3, np.nan), sphere=np.full(3, shape == "sphere"))
+    usual = Bodies(radius=np.full(3, np.nan), shape=np.full(3, shape))
     for name in ("delay", "bearing", "frequency", "landmark"):
         found, expected = (getattr(through(b, config), name) for b in (usual, None))
         assert found.tobytes() == expected.tobytes()
@@ -349,7 +349,7 @@ def test_bodies_whose_size_is_not_stated_are_the_usual_points_to_the_bit(shape):
 
 
 def test_an_own_echo_of_a_body_has_its_bearing_and_the_way_to_its_surface():
-    trunks = Bodies(radius=np.array([0.3, 0.15, np.nan]), sphere=np.zeros(3, dtype=bool))
+    trunks = Bodies(radius=np.array([0.3, 0.15, np.nan]), shape=np.full(3, "cylinder"))
     centre, surface = through(None, CONFIG), through(trunks, CONFIG)
     own = surface.caller == VEHICLE
     nearer = 343.0 / 2.0 * (centre.delay - surface.delay)[own]
@@ -361,10 +361,10 @@ def test_an_own_echo_of_a_body_has_its_bearing_and_the_way_to_its_surface():
 def test_a_larger_body_is_louder_by_its_shapes_law_and_its_nearer_surface_and_only_that_one():
     usual, reach = through(None, CONFIG), math.hypot(5.0, 0.5)
     nearer = 40.0 * math.log10(reach / (reach - 0.25)) + 0.5 * 1.1329
-    for sphere, gain in ((False, 10.0), (True, 20.0)):
-        target = TargetConfig(shape="sphere" if sphere else "cylinder", radius=0.025)
+    for shape, gain in (("cylinder", 10.0), ("sphere", 20.0)):
+        target = TargetConfig(shape=shape, radius=0.025)
         like = CONFIG.model_copy(update={"target": target})
-        large = Bodies(radius=np.array([0.25, np.nan, np.nan]), sphere=np.full(3, sphere))
+        large = Bodies(radius=np.array([0.25, np.nan, np.nan]), shape=np.full(3, shape))
         more = through(large, like).level_db - through(None, like).level_db
         own, other = usual.caller == VEHICLE, usual.landmark != 1
         np.testing.assert_allclose(more[own & ~other], gain + nearer, atol=1e-4)
@@ -377,7 +377,7 @@ def test_a_larger_body_is_louder_by_its_shapes_law_and_its_nearer_surface_and_on
 def test_spheres_among_cylinders_throw_as_spheres_do():
     cylinders = Config()
     spheres = Config(target=TargetConfig(shape="sphere"))
-    mixed = Bodies(radius=np.full(3, np.nan), sphere=np.array([True, False, True]))
+    mixed = Bodies(radius=np.full(3, np.nan), shape=np.array(["sphere", "cylinder", "sphere"]))
     levels = through(mixed, cylinders).level_db
     label = through(None, cylinders).landmark
     alone = [through(None, config).level_db for config in (cylinders, spheres)]
@@ -396,7 +396,10 @@ def orchard(seed, count):
     vehicle, beacon = callers_of(CONFIG, STILL)
     speeds = rng.uniform(-1.0, 1.0, (2, count, 2))
     callers = (vehicle, replace(beacon, place=boat, velocity=speeds[1]))
-    bodies = Bodies(radius=radius[free], sphere=rng.uniform(size=free.sum()) < 0.5)
+    bodies = Bodies(
+        radius=radius[free],
+        shape=np.where(rng.uniform(size=free.sum()) < 0.5, "sphere", "cylinder"),
+    )
     return poses, speeds[0], places[free], callers, CONFIG, bodies
 
 
@@ -461,7 +464,7 @@ def test_nothing_jumps_where_a_body_comes_between_beacon_and_vehicle():
     poses = np.column_stack((0.0 * sideways, sideways, 0.0 * sideways))
     config = as_by_hand("bistatic").model_copy(update={"target": TargetConfig(radius=0.3)})
     callers, place = callers_of(config, np.array([-9.0, 0.0])), np.array([[-4.0, 0.0]])
-    trunk = Bodies(radius=np.array([0.3]), sphere=np.array([False]))
+    trunk = Bodies(radius=np.array([0.3]), shape=np.array(["cylinder"]))
     heard, _ = arrivals_of_emissions(poses, still, place, callers, config, trunk)
     centre, _ = arrivals_of_emissions(poses, still, place, callers, config)
     passive, direct = ((heard.caller == BEACON) & (heard.landmark == label) for label in (1, 2))
@@ -486,7 +489,7 @@ def test_nothing_jumps_where_a_body_comes_between_beacon_and_vehicle():
 )
 def test_nobody_may_be_within_a_body_or_touch_it(landmark, beacon, found):
     landmarks, callers = np.array([[3.0, 3.0], landmark]), callers_of(CONFIG, np.array(beacon))
-    sized = Bodies(radius=np.array([np.nan, 0.3]), sphere=np.zeros(2, dtype=bool))
+    sized = Bodies(radius=np.array([np.nan, 0.3]), shape=np.full(2, "cylinder"))
     world = ORIGIN[None], STILL[None], landmarks, callers, CONFIG
     with pytest.raises(InputError, match=rf"world .*{found}.* move them apart"):
         arrivals_of_emissions(*world, sized)

@@ -43,9 +43,7 @@ def echo(delay, tone, snr_db, shift=1.0):
 
 
 def matched_samples(samples):
-    return filter_samples(
-        samples, tones=SETTLED.tones, rate=SETTLED.rate, length=SAMPLES, noise_std=1.0
-    )
+    return filter_samples(samples, calls=SETTLED.calls, rate=SETTLED.rate, noise_std=1.0)
 
 
 def matched_blocks(sums):

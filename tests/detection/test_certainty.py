@@ -125,7 +125,7 @@ def by_noise_alone(told, tone, noise=1.0):
     slope = FINDER.wave[tone] * np.cos(told.angle)
     over = np.maximum(told.power / noise - 1.0, MIN_POWER_OVER_NOISE)
     pairs = zip(over, slope, strict=True)
-    return np.array([bearing_std(power, across, ELEMENTS) for power, across in pairs])
+    return np.array([bearing_std(power, across, ELEMENTS**2 - 1.0) for power, across in pairs])
 
 
 def near(z):
@@ -271,7 +271,7 @@ def test_a_loud_bearing_is_as_sure_as_the_cramer_rao_bound_allows(angle, element
         bound = bearing_bound(
             power / elements, angle, elements=elements, spacing=0.4, wavelength=1.0
         )
-        said = bearing_std(power, slope, elements)
+        said = bearing_std(power, slope, elements**2 - 1.0)
         assert said == pytest.approx(bound * np.sqrt(1.0 + 1.0 / power), rel=1e-12)
         assert bound <= said
 

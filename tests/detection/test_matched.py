@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from pipistrelle.acoustics.call import ToneBurst
 from pipistrelle.detection.matched import filter_blocks, filter_samples
 
 
@@ -21,7 +22,8 @@ def test_blocks_are_summed_over_the_call_in_units_of_the_noise(pulse):
 
 def test_samples_are_correlated_with_the_call_of_each_tone():
     samples, tones, length = drawn(300, 2, 3), np.array([35e3, 50e3]), 40
-    matched = filter_samples(samples, tones=tones, rate=200e3, length=length, noise_std=2.0)
+    calls = [ToneBurst(tone, length / 200e3) for tone in tones]
+    matched = filter_samples(samples, calls=calls, rate=200e3, noise_std=2.0)
     assert matched.shape == (261, 2, 2, 3)
     call = np.exp(2j * np.pi * tones[:, None] * np.arange(length) / 200e3)
     for lag in (0, 100, 260):
@@ -30,7 +32,7 @@ def test_samples_are_correlated_with_the_call_of_each_tone():
 
 
 def test_real_samples_are_heard_as_complex_ones():
-    settled = {"tones": np.array([35e3]), "rate": 200e3, "length": 40, "noise_std": 1.0}
+    settled = {"calls": [ToneBurst(35e3, 2e-4)], "rate": 200e3, "noise_std": 1.0}
     samples = drawn(300, 2, 3).real
     expected = filter_samples(samples.astype(complex), **settled)
     np.testing.assert_allclose(filter_samples(samples, **settled), expected, atol=1e-12)

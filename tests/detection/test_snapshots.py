@@ -197,7 +197,7 @@ def test_detections_of_very_short_calls_are_those_of_a_slow_second_version(pulse
 def test_detections_at_the_full_rate_are_those_of_a_slow_second_version():
     heard = echoes((5.01e-3, 20, OWN, 9, 1.0), (6.8e-3, -30, BEACON, 6, 1.0))
     samples = record_samples(44, heard, LAYOUT, SETTLED, np.random.default_rng(7))
-    matched = filter_samples(samples, tones=SETTLED.tones, rate=200e3, length=SAMPLES, noise_std=1)
+    matched = filter_samples(samples, calls=SETTLED.calls, rate=200e3, noise_std=1)
     timing = {"start": START, "interval": 5e-6, "pulse": SAMPLES}
     found = detect(matched, FINDER, **timing)
     assert set(zip(found.face.tolist(), found.caller.tolist(), strict=True)) >= {(0, 0), (0, 1)}

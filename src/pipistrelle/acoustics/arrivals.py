@@ -7,13 +7,13 @@ shift is kept.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int8
 
 from pipistrelle.acoustics.callers import VEHICLE, Caller
 from pipistrelle.acoustics.emitter import in_front, piston_directivity
+from pipistrelle.acoustics.medium import Medium, medium_of
 from pipistrelle.acoustics.paths import (
     SoundPaths,
     paths_over_surfaces,
@@ -22,7 +22,6 @@ from pipistrelle.acoustics.paths import (
     turn_of_sound,
 )
 from pipistrelle.acoustics.propagation import (
-    absorption_db_per_m,
     doppler_frequency,
     passive_spreading_loss_db,
     spreading_loss_db,
@@ -34,7 +33,7 @@ from pipistrelle.acoustics.target import (
     target_strength_db,
     with_usual,
 )
-from pipistrelle.config import AirConfig, Config
+from pipistrelle.config import Config, TargetConfig
 from pipistrelle.geometry import wrap
 
 _DEEPEST_NULL = 1e-12
@@ -133,6 +132,7 @@ def arrivals_of_emissions(
     callers: Sequence[Caller],
     config: Config,
     bodies: Bodies | None = None,
+    medium: Medium | None = None,
 ) -> tuple[Arrivals, Int[np.ndarray, " k"]]:
     """Arrivals of several emissions in one world, one emission after the other.
 
@@ -144,7 +144,7 @@ def arrivals_of_emissions(
     far-field formula stands. At a distance d from the surface a sphere's own echo would be 20
     log10(1 + radius / d) fainter: 0.6 dB for 0.3 m at 4 m. Arrivals are those of the first
     emission, then those of the second, and so on, each in the order of `arrivals_of_emission`;
-    `count`: how many belong to each emission.
+    `count`: how many belong to each emission. `medium`: the air of the settings by default.
 
     The vehicle turns round, and its next call meets the beacon instead of the landmark.
 
@@ -156,21 +156,22 @@ def arrivals_of_emissions(
     >>> count, heard.landmark
     (array([3, 3]), array([1, 1, 2, 2, 1, 2]))
     """
+    medium, usual = medium or medium_of(config.air), config.target
     paths = paths_to_vehicle(poses, velocities, landmarks, callers)
     extent = np.zeros(paths.homeward.shape[1])
     if bodies is not None:
-        bodies = with_usual(bodies, len(callers) - 1, config.target)
+        bodies = with_usual(bodies, len(callers) - 1, usual)
         extent = np.nan_to_num(bodies.radius)
     refuse_impossible(paths, callers, extent)
     surface = paths_over_surfaces(paths, VEHICLE, extent)
-    own, emission = _own_echoes(surface, callers[VEHICLE], config, bodies)
+    own, emission = _own_echoes(surface, callers[VEHICLE], medium, usual, bodies)
     parts, emissions = [own], [emission]
     for j in range(1, len(callers)):
         place = paths.target[:, paths.landmarks + j - 1, np.newaxis]
         turn = turn_of_sound(paths.target - place, paths.offset)
-        strength_db = _strength_db(turn, callers[j], config, bodies)
+        strength_db = _strength_db(turn, callers[j].frequency, medium, usual, bodies)
         surface = paths_over_surfaces(paths, j, extent)
-        parts.append(_sounds_of(j, surface, callers[j], config, strength_db))
+        parts.append(_sounds_of(j, surface, callers[j], medium, strength_db))
         emissions.append(np.repeat(np.arange(len(poses)), paths.homeward.shape[1]))
         if (heading := callers[j].heading) is not None:
             departure = _departures(j, surface, heading)
@@ -273,16 +274,16 @@ def arrivals_together(parts: Sequence[Arrivals]) -> Arrivals:
 
 
 def _own_echoes(
-    paths: SoundPaths, caller: Caller, config: Config, bodies: Bodies | None
+    paths: SoundPaths, caller: Caller, medium: Medium, usual: TargetConfig, bodies: Bodies | None
 ) -> tuple[Arrivals, Int[np.ndarray, " a"]]:
     """Echoes of the vehicle's call from all targets ahead, and the emission of each echo."""
-    c = config.air.sound_speed
+    c, absorption = medium.speed_of_sound, medium.absorption_db_per_m(caller.frequency)
     ahead = np.flatnonzero(in_front(paths.bearing))
     back, closing = paths.homeward.ravel()[ahead], paths.closing.ravel()[ahead]
     emission, target = np.divmod(ahead, paths.homeward.shape[1])
     path, loss_db = back + back, spreading_loss_db(2.0 * back, ways=2)
     if bodies is not None:
-        loss_db = loss_db - backscatter_db(bodies, config.target)[target]
+        loss_db = loss_db - backscatter_db(bodies, usual)[target]
     frequency = doppler_frequency(
         caller.frequency, receiver_speed=closing, source_speed=closing, speed_of_sound=c
     )
@@ -293,7 +294,7 @@ def _own_echoes(
         )
     heard = Arrivals(
         delay=path / c,
-        level_db=caller.level_db - loss_db - _absorption(config.air, caller.frequency) * path,
+        level_db=caller.level_db - loss_db - absorption * path,
         bearing=paths.bearing.ravel()[ahead],
         frequency=frequency,
         caller=np.full(ahead.size, VEHICLE, dtype=np.int8),
@@ -303,17 +304,17 @@ def _own_echoes(
 
 
 def _sounds_of(
-    j: int, paths: SoundPaths, caller: Caller, config: Config, strength_db: Float[np.ndarray, "k t"]
+    j: int, paths: SoundPaths, caller: Caller, medium: Medium, strength_db: Float[np.ndarray, "k t"]
 ) -> Arrivals:
     """Return another caller's sounds at all emissions, by label: its echoes and its direct call."""
-    c, (emissions, targets) = config.air.sound_speed, paths.homeward.shape
+    c, (emissions, targets) = medium.speed_of_sound, paths.homeward.shape
     itself = paths.landmarks + j - 1
     incoming = paths.target - paths.target[:, itself : itself + 1]
     outward = np.hypot(incoming[..., 0], incoming[..., 1])
     path = paths.homeward + outward
-    loss_db = _loss_db(itself, paths, outward, strength_db, config.air)
+    loss_db = _loss_db(itself, paths, outward, strength_db, medium)
     frequency = _shifted(itself, paths, incoming, outward, caller.frequency, c)
-    absorption = _absorption(config.air, caller.frequency)
+    absorption = medium.absorption_db_per_m(caller.frequency)
     return Arrivals(
         delay=(path / c).ravel(),
         level_db=(caller.level_db - loss_db - absorption * path).ravel(),
@@ -399,36 +400,27 @@ def _loss_db(
     paths: SoundPaths,
     outward: Float[np.ndarray, "_ t"],
     strength_db: Float[np.ndarray, "k t"],
-    air: AirConfig,
+    medium: Medium,
 ) -> Float[np.ndarray, "k t"]:
     """Spreading loss of a caller's sounds, less the target strength of its echoes."""
     sent = np.broadcast_to(outward, strength_db.shape).copy()
     sent[:, itself] = 1.0  # no echo of itself: any distance will do
-    loss_db = passive_spreading_loss_db(sent, paths.homeward, law=air.spreading) - strength_db
+    loss_db = passive_spreading_loss_db(sent, paths.homeward, law=medium.spreading) - strength_db
     loss_db[:, itself] = spreading_loss_db(paths.homeward[:, itself])
     return loss_db
 
 
 def _strength_db(
-    turn: Float[np.ndarray, "k t"], caller: Caller, config: Config, bodies: Bodies | None
+    turn: Float[np.ndarray, "k t"],
+    tone: float,
+    medium: Medium,
+    usual: TargetConfig,
+    bodies: Bodies | None,
 ) -> Float[np.ndarray, "k t"]:
-    """Target strength of every body that reflects a caller's sound."""
-    usual, tone, c = config.target, caller.frequency, config.air.sound_speed
+    """Target strength of every body that reflects a tone [Hz]."""
+    c = medium.speed_of_sound
     if bodies is not None:
         return strength_of_bodies_db(turn, bodies, usual=usual, frequency=tone, speed_of_sound=c)
     return target_strength_db(
         turn, radius=usual.radius, frequency=tone, shape=usual.shape, speed_of_sound=c
-    )
-
-
-@lru_cache(maxsize=64)
-def _absorption(air: AirConfig, frequency: float) -> float:
-    """Absorption of one tone in this air [dB/m], computed once."""
-    return float(
-        absorption_db_per_m(
-            frequency,
-            temperature_c=air.temperature_c,
-            relative_humidity=air.relative_humidity,
-            pressure_kpa=air.pressure_kpa,
-        )
     )

@@ -1,19 +1,56 @@
 """What a landmark throws in each direction, relative to what it throws back.
 
-Both shapes are Morse's short-wave limit of a rigid body: sound that mirrors off the lit side, and
-around the forward direction the shadow, which radiates as the body's outline would. Interference
-of the two is left out, so the formulae are near the exact series (0.1 to 0.9 dB) at 90 to 180
-degrees and a smooth version of it nearer to the forward direction.
+`SHAPES` lists the shapes by name; another one is another `Shape` in it. The two here are Morse's
+short-wave limit of a rigid body: sound that mirrors off the lit side, and around the forward
+direction the shadow, which radiates as the body's outline would. Interference of the two is left
+out, so the formulae are near the exact series (0.1 to 0.9 dB) at 90 to 180 degrees and a smooth
+version of it nearer to the forward direction.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Shaped
 
 from pipistrelle.acoustics.emitter import jinc
 from pipistrelle.config import InputError, TargetConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shape:
+    """How bodies of a shape scatter sound."""
+
+    intensity: Callable[
+        [Float[np.ndarray, "*n"] | float, float | Float[np.ndarray, " m"]], Float[np.ndarray, "*n"]
+    ]
+    """Scattered intensity relative to backscatter, I(angle) / I(pi), by the angle [rad] by which
+    the sound is turned and by kr, the wavenumber times the radius."""
+    growth: float
+    """Backscatter grows with the radius to this power."""
+
+
+def _cylinder(
+    angle: Float[np.ndarray, "*n"] | float, kr: float | Float[np.ndarray, " m"]
+) -> Float[np.ndarray, "*n"]:
+    """Return the intensity of a cylinder, Eq. (4)."""
+    lit = np.abs(np.sin(np.asarray(angle) / 2.0))
+    shadow = 1.0 - lit**2  # cos^2 of half the angle
+    return lit + 4.0 * kr / np.pi * (shadow * np.sinc(kr * np.sin(angle) / np.pi)) ** 2
+
+
+def _sphere(
+    angle: Float[np.ndarray, "*n"] | float, kr: float | Float[np.ndarray, " m"]
+) -> Float[np.ndarray, "*n"]:
+    """Return the intensity of a sphere."""
+    shadow = 1.0 - np.abs(np.sin(np.asarray(angle) / 2.0)) ** 2
+    return 1.0 + (kr * shadow * jinc(kr * np.sin(angle))) ** 2
+
+
+SHAPES = {
+    "cylinder": Shape(intensity=_cylinder, growth=1.0),
+    "sphere": Shape(intensity=_sphere, growth=2.0),
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,8 +60,8 @@ class Bodies:
     radius: Float[np.ndarray, " n"]
     """NaN of a body whose size is not stated: it has the usual target's, and counts as a point
     [m]."""
-    sphere: Bool[np.ndarray, " n"]
-    """Whether each is a sphere; else a cylinder."""
+    shape: Shaped[np.ndarray, " n"]
+    """Name of each one's shape, of `SHAPES`."""
 
 
 def target_strength_db(
@@ -32,7 +69,7 @@ def target_strength_db(
     *,
     radius: float | Float[np.ndarray, " m"],
     frequency: float,
-    shape: Literal["cylinder", "sphere"],
+    shape: str,
     speed_of_sound: float,
 ) -> Float[np.ndarray, "*n"]:
     r"""Scattered intensity relative to backscatter: 10 log10(I(angle) / I(pi)).
@@ -53,7 +90,8 @@ def target_strength_db(
     radius : [m]
         Or one for each of the last axis of the angles.
     frequency : [Hz]
-    shape : "cylinder" or "sphere"
+    shape : str
+        Of `SHAPES`.
     speed_of_sound : [m/s]
 
     Returns
@@ -79,15 +117,15 @@ def target_strength_db(
     array([ 0.  , -1.39, 12.43])
     """
     kr = 2.0 * np.pi * frequency / speed_of_sound * radius
-    lit = np.abs(np.sin(np.asarray(angle) / 2.0))
-    shadow = 1.0 - lit**2  # cos^2 of half the angle
-    if shape == "cylinder":
-        intensity = lit + 4.0 * kr / np.pi * (shadow * np.sinc(kr * np.sin(angle) / np.pi)) ** 2
-    elif shape == "sphere":
-        intensity = 1.0 + (kr * shadow * jinc(kr * np.sin(angle))) ** 2
-    else:
-        raise InputError(f"target.shape: found {shape!r}, expected 'cylinder' or 'sphere'; choose")
-    return np.asarray(10.0 * np.log10(intensity))
+    return np.asarray(10.0 * np.log10(shape_of(shape).intensity(angle, kr)))
+
+
+def shape_of(name: str) -> Shape:
+    """Return the shape of a name; refuse one that is not there."""
+    if name not in SHAPES:
+        expected = " or ".join(map(repr, SHAPES))
+        raise InputError(f"target.shape: found {name!r}, expected {expected}; choose")
+    return SHAPES[name]
 
 
 def strength_of_bodies_db(
@@ -110,7 +148,8 @@ def strength_of_bodies_db(
 
     Bradley & Abaid, Eq. (4), of which only the relative part is theirs. See `target_strength_db`.
 
-    >>> posts = Bodies(radius=np.array([0.025, 0.25, 0.25]), sphere=np.array([False, False, True]))
+    >>> shapes = np.array(["cylinder", "cylinder", "sphere"])
+    >>> posts = Bodies(radius=np.array([0.025, 0.25, 0.25]), shape=shapes)
     >>> heard = dict(usual=TargetConfig(), frequency=30e3, speed_of_sound=343.0)
     >>> strength_of_bodies_db(np.full((1, 3), np.pi), posts, **heard)
     array([[ 0., 10., 20.]])
@@ -120,11 +159,10 @@ def strength_of_bodies_db(
         "frequency": frequency,
         "speed_of_sound": speed_of_sound,
     }
-    relative = np.where(
-        bodies.sphere,
-        target_strength_db(angle, shape="sphere", **of),
-        target_strength_db(angle, shape="cylinder", **of),
-    )
+    relative = np.empty(np.shape(angle))
+    for name in np.unique(bodies.shape).tolist():
+        of_shape = bodies.shape == name
+        relative[..., of_shape] = target_strength_db(angle, shape=name, **of)[..., of_shape]
     return relative + backscatter_db(bodies, usual)
 
 
@@ -133,7 +171,8 @@ def backscatter_db(bodies: Bodies, usual: TargetConfig) -> Float[np.ndarray, " n
 
     Returns [dB]: as `strength_of_bodies_db` at an angle of pi.
     """
-    return np.where(bodies.sphere, 20.0, 10.0) * np.log10(_radius(bodies, usual) / usual.radius)
+    growth = np.array([shape_of(name).growth for name in bodies.shape.tolist()])
+    return 10.0 * growth * np.log10(_radius(bodies, usual) / usual.radius)
 
 
 def _radius(bodies: Bodies, usual: TargetConfig) -> Float[np.ndarray, " n"]:
@@ -148,5 +187,5 @@ def with_usual(bodies: Bodies, count: int, usual: TargetConfig) -> Bodies:
     """
     return Bodies(
         radius=np.append(bodies.radius, np.full(count, np.nan)),
-        sphere=np.append(bodies.sphere, np.full(count, usual.shape == "sphere")),
+        shape=np.append(bodies.shape, np.full(count, usual.shape)),
     )

@@ -27,9 +27,11 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from pipistrelle.acoustics.arrivals import Arrivals
+from pipistrelle.acoustics.call import ToneBurst
 from pipistrelle.arithmetic.random_stream import complex_noise
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.arrays.sampling import BLOCK, Sampling, block_shape
+from pipistrelle.config import InputError
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 
@@ -56,6 +58,12 @@ def add_echo_blocks(
 
     The first block of `signal` follows the vehicle's call.
     """
+    for call in sampling.calls:
+        if not isinstance(call, ToneBurst):
+            raise InputError(
+                f"receiver.engine: found 'block', whose sums are those of tone bursts, for a "
+                f"{type(call).__name__}; expected 'dense'"
+            )
     amplitude, duration = 10.0 ** (arrivals.level_db / 20.0), _durations(arrivals, sampling)
     _add_echo_blocks(
         signal.view(np.float64),
@@ -106,14 +114,14 @@ def record_samples(
         start = max(math.ceil(delay * sampling.rate), first)
         stop = min(math.ceil((delay + duration[a]) * sampling.rate), first + shape[0])
         n = np.arange(start, max(stop, start))
-        pulse = 10.0 ** (arrivals.level_db[a] / 20.0) * np.exp(
-            2j * np.pi * frequency * (n / sampling.rate - delay)
-        )
+        call = sampling.calls[arrivals.caller[a]]
+        sound = call.waveform(n / sampling.rate - delay, frequency)
+        pulse = 10.0 ** (arrivals.level_db[a] / 20.0) * sound
         for f in range(layout.normal.size):
             angle = arrivals.bearing[a] - layout.normal[f]
             if math.cos(angle) >= 0.0:
-                lead = layout.position * math.sin(angle) / sampling.speed_of_sound
-                signal[n - first, f] += np.outer(pulse, np.exp(2j * np.pi * frequency * lead))
+                phases = layout.phases(angle, frequency, sampling.speed_of_sound)
+                signal[n - first, f] += np.outer(pulse, np.exp(1j * phases))
     return signal
 
 

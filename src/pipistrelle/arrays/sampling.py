@@ -1,14 +1,16 @@
 """Sampling: the rate, the blocks and the tones of a recording, and how long one is."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.acoustics.arrivals import Arrivals
+from pipistrelle.acoustics.call import Call, ToneBurst
 from pipistrelle.acoustics.callers import MAX_CALLERS, Caller, check_caller
+from pipistrelle.acoustics.medium import Medium, medium_of
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config, InputError
 
@@ -26,15 +28,23 @@ class Sampling:
     """Samples per block."""
     pulse: int
     """Blocks per call; the first block heard is the one after it."""
+    calls: tuple[Call, ...]
+    """What each caller sends, the vehicle first."""
     tones: Float[np.ndarray, " c"]
-    """The callers' frequencies, the vehicle's first [Hz]."""
+    """Their frequencies [Hz]."""
     noise_std: float
     """Of one complex sample."""
     speed_of_sound: float
     """Speed of sound [m/s]."""
 
 
-def sampling(config: Config, callers: Sequence[Caller]) -> Sampling:
+def sampling(
+    config: Config,
+    callers: Sequence[Caller],
+    *,
+    call: Callable[[float, float], Call] = ToneBurst,
+    medium: Medium | None = None,
+) -> Sampling:
     """Settle how a frame is sampled.
 
     Parameters
@@ -42,6 +52,10 @@ def sampling(config: Config, callers: Sequence[Caller]) -> Sampling:
     config : Config
     callers : sequence of c Caller, up to 8
         The vehicle first. What they call at counts, not the settings' frequencies.
+    call : callable
+        Makes each one's `Call` of its frequency [Hz] and duration [s].
+    medium : Medium, optional
+        The air of the settings by default.
 
     Returns
     -------
@@ -83,9 +97,10 @@ def sampling(config: Config, callers: Sequence[Caller]) -> Sampling:
         rate=rate,
         block=round(rate * BLOCK),
         pulse=round(pulse / BLOCK),
+        calls=tuple(call(caller.frequency, pulse) for caller in callers),
         tones=tones,
         noise_std=10.0 ** (config.receiver.noise_level_db / 20.0),
-        speed_of_sound=config.air.sound_speed,
+        speed_of_sound=(medium or medium_of(config.air)).speed_of_sound,
     )
 
 

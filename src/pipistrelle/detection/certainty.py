@@ -66,15 +66,16 @@ def over_noise(power: float, energy: float, elements: Whole, loudest: float) -> 
 
 
 @kernel
-def bearing_std(power: float, slope: float, elements: Whole) -> float:
-    """Standard deviation of a bearing [rad]; the slope is the phase between neighbours per radian.
+def bearing_std(power: float, slope: float, spread: float) -> float:
+    """Standard deviation of a bearing [rad].
 
-    Examples
-    --------
-    >>> round(bearing_std(100.0, math.pi, 10), 4)
+    `slope`: phase between neighbours per radian; `spread`: twelve times the mean square of the
+    elements' places, in spacings, about their mean: N^2 - 1 of equally spaced ones.
+
+    >>> round(bearing_std(100.0, math.pi, 99.0), 4)
     0.0079
     """
-    return math.sqrt(6.0 * (1.0 + 1.0 / power) / (power * (elements * elements - 1))) / slope
+    return math.sqrt(6.0 * (1.0 + 1.0 / power) / (power * spread)) / slope
 
 
 @kernel

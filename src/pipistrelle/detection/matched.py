@@ -1,10 +1,12 @@
 """Matched filter: what a call would leave of each lag's samples, in units of the noise."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Complex, Float
 
+from pipistrelle.acoustics.call import Call
 from pipistrelle.jit import Whole, kernel
 
 
@@ -38,34 +40,33 @@ def filter_blocks(
 def filter_samples(
     samples: Complex[np.ndarray, "t f e"],
     *,
-    tones: Float[np.ndarray, " c"],
+    calls: Sequence[Call],
     rate: float,
-    length: int,
     noise_std: float,
 ) -> Complex[np.ndarray, "l f c e"]:
-    """Matched filter at the full rate, one per tone, by fast convolution.
+    """Matched filter at the full rate, one per call, by fast convolution.
 
     Parameters
     ----------
     samples : (samples, faces, elements) complex
         Real ones, as a recording has them, are taken as such.
-    tones : (c) [Hz]
+    calls : sequence of c Call
+        Equally long.
     rate : [Hz]
-    length : int
-        Samples per call.
     noise_std : float
         Of one complex sample.
 
     Returns
     -------
-    (samples - length + 1, faces, tones, elements) complex
-        Lag i is a call that starts with sample i; noise has unit variance. As precise as the
-        samples.
+    (samples - length + 1, faces, calls, elements) complex
+        With the length of a call in samples. Lag i is a call that starts with sample i; noise has
+        unit variance. As precise as the samples.
     """
     from scipy.signal import oaconvolve
 
-    n = np.arange(length)[::-1, None]
-    replica = np.exp(-2j * np.pi * tones * n / rate) / (noise_std * math.sqrt(length))
+    time = np.arange(round(calls[0].duration * rate)) / rate
+    sent = np.stack([call.waveform(time, call.frequency) for call in calls], axis=1)
+    replica = sent[::-1].conj() / (noise_std * np.linalg.norm(sent, axis=0))
     return oaconvolve(
         samples[:, :, None, :],
         replica.astype(np.result_type(samples, np.complex64))[:, None, :, None],

@@ -3,9 +3,25 @@
 import math
 
 import numpy as np
-from jaxtyping import Complex
+from jaxtyping import Complex, Float
 
 from pipistrelle.jit import Whole, kernel, no_alloc
+
+
+@no_alloc
+def steering_phases(
+    u: float, place: Float[np.ndarray, " e"], phases: Complex[np.ndarray, " e"]
+) -> None:
+    """Write what turns each element's output to that of the first, for a wave of phase u a spacing.
+
+    `place`: of the elements, in spacings; empty for equally spaced ones.
+    """
+    turn, phase = complex(math.cos(u), -math.sin(u)), 1.0 + 0.0j
+    for e in range(phases.size):
+        phases[e] = phase
+        phase *= turn
+    for e in range(place.size):
+        phases[e] = complex(math.cos(u * place[e]), -math.sin(u * place[e]))
 
 
 @no_alloc
@@ -15,17 +31,15 @@ def steer(
     lags: Whole,
     f: Whole,
     p: Whole,
-    u: float,
+    phases: Complex[np.ndarray, " e"],
     beam: Complex[np.ndarray, " r"],
 ) -> None:
-    """Write the output of the phase-shift beamformer steered to u, so many lags from low on."""
-    turn, phase = complex(math.cos(u), -math.sin(u)), 1.0 + 0.0j
+    """Write the output of a beamformer of these phases, so many lags from low on."""
     for k in range(lags):
         beam[k] = 0.0
     for e in range(matched.shape[3]):
         for k in range(lags):
-            beam[k] += matched[low + k, f, p, e] * phase
-        phase *= turn
+            beam[k] += matched[low + k, f, p, e] * phases[e]
 
 
 @kernel
@@ -69,18 +83,18 @@ def arrival_lag(
     b: Whole,
     f: Whole,
     p: Whole,
-    u: float,
+    phases: Complex[np.ndarray, " e"],
     pulse: Whole,
     beam: Complex[np.ndarray, " r"],
 ) -> float:
-    """Lag at which the call starts in the beam steered to u, near lag b, to a fraction.
+    """Lag at which the call starts in the beam of these phases, near lag b, to a fraction.
 
     ``beam`` is room for the beam: the lags within reach and one to either side.
     """
     reach, last = reach_of(pulse), matched.shape[0] - 1
     low, high = max(b - reach, 0), min(b + reach, last)
     first = max(low - 1, 0)
-    steer(matched, first, min(high + 1, last) - first + 1, f, p, u, beam)
+    steer(matched, first, min(high + 1, last) - first + 1, f, p, phases, beam)
     centre, largest = b, -1.0
     for near in range(low, high + 1):
         z = abs(beam[near - first])

@@ -29,7 +29,7 @@ from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.certainty import bearing_std, delay_std, loudest_noise, over_noise
 from pipistrelle.detection.direct import DirectCalls, Lags, direct_calls
-from pipistrelle.detection.onset import arrival_lag, reach_of, steer
+from pipistrelle.detection.onset import arrival_lag, reach_of, steer, steering_phases
 from pipistrelle.geometry import wrap
 from pipistrelle.jit import Whole, kernel, no_alloc
 
@@ -113,7 +113,11 @@ class Detector(NamedTuple):
     scan: Float[np.ndarray, "c n"]
     """Scanned u, per tone [rad]."""
     table: Float[np.ndarray, "c 2 k n"]
-    """Real and imaginary part of exp(-i l u), l = 1 ... e - 1, per tone."""
+    """Real and imaginary part of exp(-i l u), per tone; l: 1 ... e - 1, or the elements' places."""
+    place: Float[np.ndarray, " e"]
+    """Of the elements, in spacings; empty for equally spaced ones."""
+    spread: float
+    """See `certainty.bearing_std`."""
 
 
 def detector(config: Config, layout: Layout, tones: Float[np.ndarray, " c"]) -> Detector:
@@ -123,7 +127,8 @@ def detector(config: Config, layout: Layout, tones: Float[np.ndarray, " c"]) -> 
     ----------
     config : Config
     layout : Layout
-        Two equally spaced elements or more.
+        Two elements or more; of some that are not equally spaced the smallest gap counts as the
+        spacing, and the scan takes longer.
     tones : (c) [Hz]
         Of the calls.
 
@@ -134,7 +139,7 @@ def detector(config: Config, layout: Layout, tones: Float[np.ndarray, " c"]) -> 
     Raises
     ------
     InputError
-        When the elements are not equally spaced, or too far apart.
+        When the elements do not rise, or are too far apart.
 
     Examples
     --------
@@ -146,15 +151,17 @@ def detector(config: Config, layout: Layout, tones: Float[np.ndarray, " c"]) -> 
     from scipy.special import gammainccinv
 
     settings, elements = config.detection, layout.position.size
-    spacing = _spacing(layout)
+    spacing, place = _spaced(layout)
     wave = 2.0 * np.pi * tones * spacing / config.assumed_sound_speed
     if wave.max() > 2.0 * np.pi * MAX_SPACING:
         found = f"receiver.spacing: found {spacing:g} m, {wave.max() / (2.0 * np.pi):g} waves"
         raise InputError(f"{found}; expected at most {MAX_SPACING}, half a wave for a plain beam")
     edge = wave * math.sin(math.radians(settings.scan_limit_deg))
-    count = 2 * math.ceil(edge.max() / SCAN_STEP) + 1
+    step = SCAN_STEP * ((elements - 1) / place[-1] if place.size else 1.0)
+    count = 2 * math.ceil(edge.max() / step) + 1
     scan = np.linspace(-1.0, 1.0, count) * edge[:, None]
-    turns = np.exp(-1j * np.arange(1, elements)[None, :, None] * scan[:, None, :])
+    apart = place if place.size else np.arange(1, elements)
+    turns = np.exp(-1j * apart[None, :, None] * scan[:, None, :])
     return Detector(
         threshold=float(gammainccinv(elements, settings.false_alarm)),
         runs=settings.snapshots == "runs",
@@ -166,19 +173,23 @@ def detector(config: Config, layout: Layout, tones: Float[np.ndarray, " c"]) -> 
         wave=wave,
         scan=scan,
         table=np.stack((turns.real, turns.imag), axis=1),
+        place=place,
+        spread=12.0 * float(np.var(place)) if place.size else float(elements * elements - 1),
     )
 
 
-def _spacing(layout: Layout) -> float:
-    """Distance of two neighbours [m], which must be that of all."""
-    place = layout.position
-    spacing = float(place[-1] - place[0]) / (place.size - 1) if place.size > 1 else 0.0
-    if spacing <= 0.0 or not np.allclose(np.diff(place), spacing, rtol=1e-6, atol=0.0):
+def _spaced(layout: Layout) -> tuple[float, Float[np.ndarray, " e"]]:
+    """Return the spacing of elements [m] and, unless all have it, their places in spacings."""
+    position = layout.position
+    gaps = np.diff(position)
+    if position.size < 2 or not gaps.min() > 0.0:
         raise InputError(
-            f"layout: found elements at {place.tolist()} m, expected two or more, equally spaced "
-            "and rising: the detector scans a uniform line array"
+            f"layout: found elements at {position.tolist()} m, expected two or more, rising"
         )
-    return spacing
+    spacing = float(position[-1] - position[0]) / (position.size - 1)
+    if np.allclose(gaps, spacing, rtol=1e-6, atol=0.0):
+        return spacing, np.empty(0)
+    return float(gaps.min()), (position - position[0]) / gaps.min()
 
 
 def detect(
@@ -400,6 +411,25 @@ def _snapshot(
 
 
 @no_alloc
+def _steered_power(
+    matched: Complex[np.ndarray, "l f c e"],
+    lags: tuple[Whole, Whole],
+    f: Whole,
+    p: Whole,
+    table: Float[np.ndarray, "2 e n"],
+    power: Float[np.ndarray, " n"],
+) -> None:
+    """Write what `_scan_power` does, for elements at any places, from their steering vectors."""
+    for i in range(power.size):
+        power[i] = 0.0
+        for b in range(lags[0], lags[1]):
+            x, total = matched[b, f, p], 0.0j
+            for e in range(matched.shape[3]):
+                total += x[e] * complex(table[0, e, i], table[1, e, i])
+            power[i] += total.real * total.real + total.imag * total.imag
+
+
+@no_alloc
 def _scan_power(
     matched: Complex[np.ndarray, "l f c e"],
     lags: tuple[Whole, Whole],
@@ -413,6 +443,9 @@ def _scan_power(
     That of the lags from the first to before the last is summed.
     """
     elements, beams = matched.shape[3], power.size
+    if table.shape[1] == elements:
+        _steered_power(matched, lags, f, p, table, power)
+        return
     r0 = 0.0
     for b in range(lags[0], lags[1]):
         x = matched[b, f, p]
@@ -439,15 +472,15 @@ def _loudest_lag(
     lags: tuple[Whole, Whole],
     f: Whole,
     p: Whole,
-    u: float,
+    phases: Complex[np.ndarray, " e"],
     beam: Complex[np.ndarray, " r"],
 ) -> tuple[Whole, float]:
-    """Lag, of those from the first to before the last, loudest in the beam steered to u; power.
+    """Lag, of those from the first to before the last, loudest in the beam of these phases; power.
 
     ``beam`` is room for so many lags.
     """
     loudest, highest = lags[0], -1.0
-    steer(matched, lags[0], lags[1] - lags[0], f, p, u, beam)
+    steer(matched, lags[0], lags[1] - lags[0], f, p, phases, beam)
     for k in range(lags[1] - lags[0]):
         power = beam[k].real * beam[k].real + beam[k].imag * beam[k].imag
         if power > highest:
@@ -504,6 +537,7 @@ def _find_peaks(
     power, place = np.empty(scan.shape[1]), np.empty(scan.shape[1], dtype=np.int64)
     room = 2 * reach_of(pulse) + 3
     beam = np.empty(max(room, matched.shape[0]) if rule.runs else room, dtype=np.complex128)
+    phases = np.empty(elements, dtype=np.complex128)
     row, count = faces * tones, 0
     for test in _candidates(energy, rule.threshold, row if pulse > 1 else energy.size):
         within = _snapshot(energy, test, row, tones, pulse, rule.runs, rule.threshold, rule.leakage)
@@ -519,19 +553,20 @@ def _find_peaks(
             if abs(u / wave[p]) > rule.sine_limit:
                 continue
             b, top = within[0], power[i] + 0.125 * slope * slope / bend
+            steering_phases(u, rule.place, phases)
             if rule.runs:
-                b, top = _loudest_lag(matched, within, f, p, u, beam)
+                b, top = _loudest_lag(matched, within, f, p, phases, beam)
                 if _is_leakage(energy, b * row + test % row, row, tones, pulse, rule.leakage):
                     continue
             if count == whole.shape[1]:
                 whole, numbers = _grown(whole), _grown(numbers)
             whole[0, count], whole[1, count] = f, p
-            late = arrival_lag(matched, b, f, p, u, pulse, beam)
+            late = arrival_lag(matched, b, f, p, phases, pulse, beam)
             sine, top = u / wave[p], top / elements
             over = over_noise(top, energy[b * row + test % row], elements, rule.loudest_noise)
             across = wave[p] * math.sqrt(1.0 - sine * sine)
             numbers[0, count], numbers[1, count] = lag.start + lag.interval * late, sine
-            numbers[2, count], numbers[3, count] = top, bearing_std(over, across, elements)
+            numbers[2, count], numbers[3, count] = top, bearing_std(over, across, rule.spread)
             numbers[4, count] = lag.interval * delay_std(over, pulse)
             count += 1
     return whole[:, :count], numbers[:, :count]

@@ -94,12 +94,12 @@ def test_bodies_and_routes_are_read_back_too(tmp_path):
             Caller(name="vehicle", frequency=35e3, level_db=49.7),
             Caller(name="boat", frequency=25e3, level_db=40.0, place=boat),
         ),
-        bodies=Bodies(radius=np.array([0.1, 0.3]), sphere=np.array([True, False])),
+        bodies=Bodies(radius=np.array([0.1, 0.3]), shape=np.array(["sphere", "cylinder"])),
     )
     OwnFiles(tmp_path / "w", WORLD).replace(world_files(drawn, Config()))
     again = heard(Config(scenario=ScenarioConfig(steps=8)), read_world(tmp_path / "w"))
     np.testing.assert_array_equal(again.bodies.radius, [0.1, 0.3])
-    assert again.bodies.sphere.tolist() == [True, False]
+    assert again.bodies.shape.tolist() == ["sphere", "cylinder"]
     np.testing.assert_array_equal(again.callers[1].place, boat)
     assert again.callers[1].level_db == 40.0
 
@@ -123,7 +123,7 @@ def test_bodies_go_with_the_numbers_of_their_landmarks(tmp_path):
     rows = "landmark,x,y,radius,shape\n2,0,2,0.2,sphere\n1,0,1,0.1,cylinder\n"
     bodies = read_world(folder_with(tmp_path, landmarks_csv=rows)).bodies
     assert bodies.radius.tolist() == [0.1, 0.2]
-    assert bodies.sphere.tolist() == [False, True]
+    assert bodies.shape.tolist() == ["cylinder", "sphere"]
 
 
 def test_only_a_body_whose_radius_is_stated_has_a_size_and_is_written_with_it(tmp_path):
@@ -135,7 +135,7 @@ def test_only_a_body_whose_radius_is_stated_has_a_size_and_is_written_with_it(tm
     )
     world = read_world(folder)
     np.testing.assert_array_equal(world.bodies.radius, [0.2, np.nan, np.nan])
-    assert world.bodies.sphere.tolist() == [False, True, False]
+    assert world.bodies.shape.tolist() == ["cylinder", "sphere", "cylinder"]
     drawn = world_of(Config(scenario=ScenarioConfig(steps=8)), 0, world)
     written = world_files(drawn, Config())["landmarks.csv"].splitlines()
     assert written[1:] == ["1,0.0,1.0,0.2,cylinder", "2,0.0,2.0,,sphere", "3,0.0,3.0,,cylinder"]

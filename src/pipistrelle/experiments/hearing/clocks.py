@@ -22,7 +22,7 @@ MICROSECOND = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Call:
+class TimedCall:
     """One call of a caller with its own clock."""
 
     caller: int
@@ -31,7 +31,9 @@ class Call:
     """When it is heard directly [s]."""
 
 
-def calls_heard(scenario: Scenario, setup: ScenarioConfig, speed_of_sound: float) -> list[Call]:
+def calls_heard(
+    scenario: Scenario, setup: ScenarioConfig, speed_of_sound: float
+) -> list[TimedCall]:
     """List the calls of callers with their own clocks, in the order in which they are heard.
 
     Nothing is heard before the vehicle's first call, which begins the first frame, and after the
@@ -47,7 +49,7 @@ def calls_heard(scenario: Scenario, setup: ScenarioConfig, speed_of_sound: float
                 away = place - path_at(heard.clip(0.0, last), scenario.time, scenario.path)[:, :2]
                 heard = caller.calls + np.hypot(*away.T) / speed_of_sound
             heard = _on_clock(heard, scenario.time)
-            calls += [Call(caller=j, time=t) for t in heard.tolist() if first <= t <= last]
+            calls += [TimedCall(caller=j, time=t) for t in heard.tolist() if first <= t <= last]
     return sorted(calls, key=lambda call: call.time)
 
 

@@ -19,8 +19,9 @@ from pipistrelle.acoustics.arrivals import (
     through_pistons,
 )
 from pipistrelle.acoustics.callers import callers_at
+from pipistrelle.acoustics.medium import Medium, medium_of
 from pipistrelle.config import Config
-from pipistrelle.experiments.hearing.clocks import Call, calls_heard, with_times
+from pipistrelle.experiments.hearing.clocks import TimedCall, calls_heard, with_times
 from pipistrelle.experiments.hearing.scenario import Scenario
 
 EMISSIONS_AT_ONCE = 25
@@ -55,21 +56,28 @@ class Frame:
 
 
 def frames_of(
-    scenario: Scenario, radii: Sequence[float], config: Config, beam: Callable[..., Arrivals]
+    scenario: Scenario,
+    radii: Sequence[float],
+    config: Config,
+    beam: Callable[..., Arrivals],
+    medium: Medium | None = None,
 ) -> Iterator[Frame]:
-    """Yield the arrivals in each frame of a path, for pistons of several radii [m]."""
-    setup, c = config.scenario, config.air.sound_speed
-    calls = calls_heard(scenario, setup, c)
+    """Yield the arrivals in each frame of a path, for pistons of several radii [m].
+
+    `medium`: the air of the settings by default.
+    """
+    setup, medium = config.scenario, medium or medium_of(config.air)
+    calls = calls_heard(scenario, setup, medium.speed_of_sound)
     begin = scenario.time[setup.steps_per_frame :: setup.steps_per_frame]
     world = with_times(scenario, [call.time for call in calls]) if calls else scenario
     own_clock = [j for j, caller in enumerate(scenario.callers) if caller.calls is not None]
-    heard = _calls_heard(world, calls, radii, config, beam)
+    heard = _calls_heard(world, calls, radii, config, beam, medium)
     span = setup.steps_per_frame * setup.step - config.emitter.pulse
     last = np.array([one.time + one.sounds[0].delay.max() for one in heard])
     first = np.array([call.time for call in calls])
     steps = np.searchsorted(world.time, begin)
     for time, aimed in zip(
-        begin.tolist(), _emissions(world, steps, radii, config, beam), strict=True
+        begin.tolist(), _emissions(world, steps, radii, config, beam, medium), strict=True
     ):
         near = [heard[i] for i in np.flatnonzero((first < time + span) & (last >= time))]
         if own_clock:
@@ -96,10 +104,11 @@ def _together(
 
 def _calls_heard(
     world: Scenario,
-    calls: Sequence[Call],
+    calls: Sequence[TimedCall],
     radii: Sequence[float],
     config: Config,
     beam: Callable[..., Arrivals],
+    medium: Medium,
 ) -> list[CallHeard]:
     """Arrivals of each call at the vehicle."""
     following = dict.fromkeys(range(len(world.callers)), np.inf)
@@ -110,11 +119,11 @@ def _calls_heard(
     steps = np.searchsorted(world.time, [call.time for call in calls])
     heard = []
     for number, (call, aimed) in enumerate(
-        zip(calls, _emissions(world, steps, radii, config, beam), strict=True)
+        zip(calls, _emissions(world, steps, radii, config, beam, medium), strict=True)
     ):
         place = np.asarray(world.callers[call.caller].place)
         place = place if place.ndim == 1 else place[steps[number]]
-        straight = np.hypot(*(place - world.path[steps[number], :2])) / config.air.sound_speed
+        straight = np.hypot(*(place - world.path[steps[number], :2])) / medium.speed_of_sound
         heard.append(
             CallHeard(
                 number=number,
@@ -136,6 +145,7 @@ def _emissions(
     radii: Sequence[float],
     config: Config,
     beam: Callable[..., Arrivals],
+    medium: Medium,
 ) -> Iterator[list[Arrivals]]:
     """Yield the arrivals of a simultaneous call of all at a step, for each piston.
 
@@ -147,11 +157,11 @@ def _emissions(
         velocities = (poses[:, :2] - scenario.path[now - 1, :2]) / took[:, np.newaxis]
         callers = callers_at(scenario.callers, scenario.time, now)
         emission, count = arrivals_of_emissions(
-            poses, velocities, scenario.landmarks, callers, config, scenario.bodies
+            poses, velocities, scenario.landmarks, callers, config, scenario.bodies, medium
         )
         aimed = [
             through_pistons(
-                emission, callers, beam, radius=radius, speed_of_sound=config.air.sound_speed
+                emission, callers, beam, radius=radius, speed_of_sound=medium.speed_of_sound
             )
             for radius in radii
         ]

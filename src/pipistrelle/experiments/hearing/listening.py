@@ -19,9 +19,11 @@ import numpy as np
 from jaxtyping import Bool, Complex, Int
 
 from pipistrelle.acoustics.arrivals import Arrivals, arrivals_at, through_piston
+from pipistrelle.acoustics.call import Call, ToneBurst
 from pipistrelle.acoustics.callers import VEHICLE
+from pipistrelle.acoustics.medium import Medium
 from pipistrelle.arithmetic.random_stream import stream_key
-from pipistrelle.arrays.layout import Layout, square_of_four
+from pipistrelle.arrays.layout import Layout, layout_of
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
 from pipistrelle.arrays.sampling import BLOCK, Sampling, block_shape, blocks_to_hear, sampling
 from pipistrelle.config import Config
@@ -54,6 +56,8 @@ def listen(
     iteration: int = 0,
     beam: Callable[..., Arrivals] | None = None,
     layout: Layout | None = None,
+    call: Callable[[float, float], Call] = ToneBurst,
+    medium: Medium | None = None,
     find: Callable[..., Detections] = detect,
     oracle: Callable[..., Int[np.ndarray, " d"]] = label_detections,
     labels: bool = True,
@@ -75,6 +79,12 @@ def listen(
         with the off-axis loss of the settings.
     layout : Layout, optional
         The arrays; those of the settings by default.
+    call : callable
+        Makes each caller's `Call` of its frequency [Hz] and duration [s]; other than tone bursts
+        are for the dense engine.
+    medium : Medium, optional
+        What the sound travels through; the air of the settings by default. The front end goes on
+        assuming ``assumed.speed_of_sound``.
     find : callable
         Finds calls in the matched filter's output, as `detect` does.
     oracle : callable
@@ -109,29 +119,29 @@ def listen(
     (2, 1.0)
     """
     setup = config.scenario
-    ears = layout or square_of_four(config.receiver)
-    rig = _rig(config, scenario, ears, find, oracle, labels)
+    settled = sampling(config, scenario.callers, call=call, medium=medium)
+    rig = _rig(config, scenario, layout or layout_of(config), settled, find, oracle, labels)
     purpose = "noise" if setup.vehicle == 1 else f"noise of {setup.vehicle}"
     engine = _dense if config.receiver.engine == "dense" else _blocks
     beams: tuple[list[FrameMeasurements], ...] = tuple([] for _ in radii)
     beam = beam or partial(through_piston, off_axis=config.emitter.off_axis)
     calls: dict[int, tuple[CallHeard, list[list[Detections]]]] = {}
-    for number, frame in enumerate(frames_of(scenario, radii, config, beam), start=1):
+    for number, frame in enumerate(frames_of(scenario, radii, config, beam, medium), start=1):
         key = stream_key(config.seed, iteration, purpose, number)
-        for call in frame.calls:
-            calls.setdefault(call.number, (call, [[] for _ in radii]))
+        for timed in frame.calls:
+            calls.setdefault(timed.number, (timed, [[] for _ in radii]))
         for r, record in enumerate(engine(frame.aimed, rig, key)):
             found = rig.find(record.matched, rig.detector, **record.lags)
-            for call in frame.calls:
-                calls[call.number][1][r].append(_of_call(call, frame.time, record, found))
+            for timed in frame.calls:
+                calls[timed.number][1][r].append(_of_call(timed, frame.time, record, found))
             if rig.own_clock.any():
                 found = detections_at(found, ~rig.own_clock[found.caller])
             beams[r].append(_heard(frame.time, found, frame.aimed[r], rig))
         if progress:
             progress("listening", number, setup.steps // setup.steps_per_frame)
-    for call, parts in calls.values():
-        for heard, part, sounds in zip(beams, parts, call.sounds, strict=True):
-            between = _heard(call.time, joined(part), sounds, rig)
+    for timed, parts in calls.values():
+        for heard, part, sounds in zip(beams, parts, timed.sounds, strict=True):
+            between = _heard(timed.time, joined(part), sounds, rig)
             if between.rows.landmark.size:
                 heard.append(replace(between, between=True))
     return tuple(tuple(sorted(heard, key=lambda one: one.rows.time)) for heard in beams)
@@ -146,7 +156,7 @@ class _Record(NamedTuple):
     interval: float
     """Between two lags [s]."""
     pulse: int
-    """Lags in a call."""
+    """Lags in which the matched filter's answer falls off to either side."""
 
     @property
     def lags(self) -> dict[str, Any]:
@@ -190,12 +200,12 @@ def _rig(
     config: Config,
     scenario: Scenario,
     layout: Layout,
+    settled: Sampling,
     find: Callable[..., Detections],
     oracle: Callable[..., Int[np.ndarray, " d"]],
     labels: bool,
 ) -> _Rig:
     """Make what is the same for all frames of a path."""
-    settled = sampling(config, scenario.callers)
     finder = detector(config, layout, settled.tones)
     own_clock = np.array([caller.calls is not None for caller in scenario.callers])
     return _Rig(
@@ -316,7 +326,7 @@ def _parted(arrivals: Arrivals) -> tuple[slice | np.ndarray, slice | np.ndarray]
 def _dense(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]:
     """Yield the record of each beam's arrivals, from every sample, in single precision."""
     settled, setup = rig.sampling, rig.config.scenario
-    length = settled.pulse * settled.block
+    width = round(max(call.resolution for call in settled.calls) * settled.rate)
     period = math.floor(setup.steps_per_frame * setup.step / BLOCK) - settled.pulse
     for arrivals in aimed:
         samples = record_samples(
@@ -328,11 +338,7 @@ def _dense(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]:
             single=True,
         )
         matched = filter_samples(
-            samples,
-            tones=settled.tones,
-            rate=settled.rate,
-            length=length,
-            noise_std=settled.noise_std,
+            samples, calls=settled.calls, rate=settled.rate, noise_std=settled.noise_std
         )
         start, interval = settled.pulse * BLOCK, 1.0 / settled.rate
-        yield _Record(matched, start=start, interval=interval, pulse=length)
+        yield _Record(matched, start=start, interval=interval, pulse=width)

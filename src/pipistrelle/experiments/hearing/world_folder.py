@@ -16,7 +16,7 @@ from jaxtyping import Float
 from pydantic import ConfigDict, Field, ValidationError
 
 from pipistrelle.acoustics.callers import VEHICLE, moves
-from pipistrelle.acoustics.target import Bodies
+from pipistrelle.acoustics.target import SHAPES, Bodies
 from pipistrelle.config import CallerConfig, Config, InputError, Section, TargetConfig
 from pipistrelle.detection.logs.text_tables import (
     Table,
@@ -62,7 +62,6 @@ _HEADERS = {
     **{(*_POSE, *names): "poses and controls" for names in _CONTROLS.values()},
 }
 """What a path's columns say of it."""
-_SHAPES = ("cylinder", "sphere")
 _README = """\
 A world of Pipistrelle. Hear it with: pipistrelle run --world FOLDER
 
@@ -264,8 +263,8 @@ def _landmark_text(scenario: Scenario) -> str:
         return text
     head, *rows = text.splitlines()
     radii = ["" if np.isnan(radius) else repr(radius) for radius in bodies.radius.tolist()]
-    kinds = zip(rows, radii, bodies.sphere.tolist(), strict=True)
-    lines = [f"{row},{radius},{_SHAPES[sphere]}" for row, radius, sphere in kinds]
+    kinds = zip(rows, radii, bodies.shape.tolist(), strict=True)
+    lines = [f"{row},{radius},{shape}" for row, radius, shape in kinds]
     return "\n".join([f"{head},radius,shape", *lines, ""])
 
 
@@ -289,7 +288,7 @@ def _read_landmarks(
     path: Path, usual: TargetConfig
 ) -> tuple[Float[np.ndarray, "n 2"], Bodies | None]:
     """Read the positions of landmarks, and their bodies if there are columns for them."""
-    words = {"shape": _SHAPES}
+    words = {"shape": tuple(SHAPES)}
     more = ("radius", "shape")
     if _is_header_alone(path):
         return np.empty((0, 2)), None
@@ -304,11 +303,11 @@ def _read_landmarks(
     order = np.argsort(label)
     places = np.column_stack((table.column["x"], table.column["y"]))[order]
     _refuse_coincident(table, places[label - 1])
-    radius, shape = (table.column[name][order] for name in more)
-    if np.isnan(radius).all() and np.isnan(shape).all():
+    radius, word = (table.column[name][order] for name in more)
+    if np.isnan(radius).all() and np.isnan(word).all():
         return places, None
-    sphere = np.where(np.isnan(shape), usual.shape == "sphere", shape == _SHAPES.index("sphere"))
-    return places, Bodies(radius=radius, sphere=sphere)
+    shape = [usual.shape if np.isnan(w) else words["shape"][int(w)] for w in word.tolist()]
+    return places, Bodies(radius=radius, shape=np.array(shape))
 
 
 def _is_header_alone(path: Path) -> bool:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of, moves
-from pipistrelle.arrays.layout import square_of_four
+from pipistrelle.arrays.layout import layout_of
 from pipistrelle.arrays.sampling import sampling
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.snapshots import detector
@@ -44,7 +44,7 @@ def checked_scenario(
     check_length(config.scenario, strategies=strategies, filters=filters, workers=workers)
     scenario = world_of(config, world=world)
     settled = sampling(config, scenario.callers)
-    layout = square_of_four(config.receiver)
+    layout = layout_of(config)
     detector(config, layout, settled.tones)
     check_recording(scenario, config, layout, settled, workers=workers)
     _refuse_supersonic(scenario, config)
