@@ -55,7 +55,7 @@ def read_text(path: Path) -> str:
 
 
 def _printable(path: Path) -> str:
-    """Path as text; shortened or escaped if no file can have such a name."""
+    """Return the path as text; shortened or escaped if no file can have such a name."""
     text = str(path)
     return text if text.isprintable() and len(text) < 4096 else shown(text)
 

@@ -44,7 +44,7 @@ def wrap(angle: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
 def range_and_bearing(
     pose: Float[np.ndarray, "3"], points: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    r"""Distance and bearing of points as seen from a pose.
+    r"""Return the distance and bearing of points as seen from a pose.
 
     .. math:: d_i = \lVert m_i - x_v \rVert, \qquad
               \phi_i = \operatorname{atan2}(y_i - y_v, x_i - x_v) - \theta_v
@@ -79,7 +79,7 @@ def range_and_bearing(
 def circular_mean(
     angle: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"] | None = None
 ) -> float:
-    """Weighted mean direction of angles.
+    """Return the weighted mean direction of angles.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def circular_mean(
 def poses_at(
     time: Float[np.ndarray, " k"], known: Float[np.ndarray, " n"], path: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "k 3"]:
-    """Poses at other times, linear in between, NaN outside.
+    """Return the poses at other times, linear in between, NaN outside.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def poses_at(
 def path_at(
     time: Float[np.ndarray, " k"], known: Float[np.ndarray, " n"], path: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "k 3"]:
-    """Poses at other times as `poses_at`, of a path whose headings are wrapped, and stay so."""
+    """Return poses at other times as `poses_at`, of a path with wrapped headings, which stay so."""
     x, y, heading = path.T
     poses = poses_at(time, known, np.column_stack((x, y, np.unwrap(heading))))
     poses[:, 2] = wrap(poses[:, 2])
@@ -141,5 +141,5 @@ def path_at(
 def points_at(
     time: Float[np.ndarray, " k"], known: Float[np.ndarray, " n"], points: Float[np.ndarray, "n d"]
 ) -> Float[np.ndarray, "k d"]:
-    """Points at other times, linear in between; before and after they stay where they are."""
+    """Return points at other times, linear in between; before and after they stand."""
     return np.column_stack([np.interp(time, known, column) for column in points.T])

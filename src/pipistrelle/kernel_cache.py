@@ -43,7 +43,7 @@ class CheckedFiles(IndexDataCacheFile):
         return super()._load_data(name)
 
     def _is_sound(self, path: Path) -> bool:
-        """Whether a file is as it was written, or is not there; remove it if not."""
+        """Tell whether a file is as it was written, or is not there; remove any other."""
         try:
             found = path.read_bytes()
         except FileNotFoundError:

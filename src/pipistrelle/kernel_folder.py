@@ -73,14 +73,14 @@ def _unfit(folder: Path) -> str | None:
 
 
 def _is_mine(folder: Path) -> bool:
-    """Whether no other user can write to a folder."""
+    """Tell whether no other user can write to a folder."""
     state = folder.stat()
     mine = not hasattr(os, "getuid") or state.st_uid == os.getuid()
     return mine and not (os.name == "posix" and state.st_mode & 0o022)
 
 
 def _temporary() -> Path:
-    """Temporary folder that no other user can write to, as its files are executed."""
+    """Make a temporary folder that no other user can write to, as its files are executed."""
     user = os.getuid() if hasattr(os, "getuid") else ""
     folder = Path(tempfile.gettempdir()) / f"pipistrelle-{user}"
     try:

@@ -46,14 +46,14 @@ class Kind:
     """Patterns of names that are checked one by one, when they are written."""
 
     def writes(self, name: str) -> bool:
-        """Whether we write a file of this name, relative to the folder."""
+        """Tell whether we write a file of this name, relative to the folder."""
         path = PurePosixPath(name)
         inside = not path.is_absolute() and ".." not in path.parts and path.as_posix() == name
         return inside and _matches(name, (*self.names, *self.more))
 
 
 def _matches(name: str, patterns: Iterable[str]) -> bool:
-    """Whether a name is like one of some patterns, in letters of any case."""
+    """Tell whether a name is like one of some patterns, in letters of any case."""
     return any(fnmatchcase(name.lower(), pattern.lower()) for pattern in patterns)
 
 
@@ -155,7 +155,7 @@ def remove_empty(folders: Iterable[Path]) -> None:
 
 
 def drawn_files(draw: Callable[[Path], None], under: str = "") -> dict[str, bytes]:
-    """Files that a function draws into a temporary folder, by name.
+    """Return the files that a function draws, by name.
 
     `under` is put before each name, as in "figures/".
     """
@@ -202,7 +202,7 @@ class OwnFiles:
         return self._there
 
     def __contains__(self, name: str) -> bool:
-        """Whether a file is on the list: we wrote it, or began to."""
+        """Tell whether a file is on the list: we wrote it, or began to."""
         return name in self._sums
 
     def read(self, name: str) -> bytes:
@@ -252,7 +252,7 @@ class OwnFiles:
             raise _in_the_way(self.folder / name, changed if name in self._sums else strange)
 
     def _is_ours(self, name: str) -> bool:
-        """Whether a file is as we wrote it."""
+        """Tell whether a file is as we wrote it."""
         path = self.folder / name
         if name not in self._sums or path.is_symlink() or not path.is_file():
             return False
@@ -342,7 +342,7 @@ class OwnFiles:
             put_in_place(partial, self.folder / name, replace=self._is_ours(name))
 
     def _is_left(self, name: str) -> bool:
-        """Whether a file is what a killed process left of one of ours."""
+        """Tell whether a file is what a killed process left of one of ours."""
         path = self.folder / name
         return whole_name(name) in (*self._sums, SUMS) and path.is_file() and not path.is_symlink()
 
@@ -356,7 +356,7 @@ class OwnFiles:
 
 
 def _in_the_way(path: Path, what: str) -> InputError:
-    """Error for a file or folder that is not replaced."""
+    """Return the error for a file or folder that is not replaced."""
     return InputError(
         f"{path}: {what}, so it is not replaced; move it away, or name another folder"
     )

@@ -30,7 +30,7 @@ def refusal(where: object, found: str, expected: str, fix: str) -> InputError:
 
 
 def shown(value: Any) -> str:
-    """Text of a found value, shortened to one line.
+    """Return the text of a found value, shortened to one line.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def expectation(fault: Any) -> str:
 
 
 def values_expected(fault: Any, field: FieldInfo) -> int | None:
-    """Expected number of values of a tuple, if the number is the fault.
+    """Return the expected number of values of a tuple, if the number is the fault.
 
     `field` is the setting that was refused.
 

@@ -52,7 +52,7 @@ Layer = dict[Key, Given]
 
 @cache
 def known_settings() -> dict[Key, FieldInfo]:
-    """Every setting by its key, in the order of `Config`.
+    """Return every setting by its key, in the order of `Config`.
 
     >>> known_settings()["air", "relative_humidity"].default
     0.5

@@ -67,7 +67,7 @@ def arrivals_of_emission(
     callers: Sequence[Caller],
     config: Config,
 ) -> Arrivals:
-    r"""Echoes and calls that reach the vehicle after all callers have called at once.
+    r"""Return the echoes and calls that reach the vehicle after all callers have called at once.
 
     .. math:: L = L_0 - \beta - \alpha d + TS(\gamma), \qquad t = d / c, \qquad
               f' = f \, \frac{c + v}{c - s}
@@ -134,7 +134,7 @@ def arrivals_of_emissions(
     bodies: Bodies | None = None,
     medium: Medium | None = None,
 ) -> tuple[Arrivals, Int[np.ndarray, " k"]]:
-    """Arrivals of several emissions in one world, one emission after the other.
+    """Return the arrivals of several emissions in one world, one emission after the other.
 
     `poses` [m, m, rad]; `velocities` [m/s]; `landmarks` [m]; `callers`: the vehicle first; paths
     and velocities (k, 2), a row for each emission (`callers_at`); `bodies`: of the landmarks; as
@@ -202,7 +202,7 @@ def through_piston(
     speed_of_sound: float,
     off_axis: str = "pressure",
 ) -> Arrivals:
-    r"""What arrives when a piston sends the vehicle's call.
+    r"""Return what arrives when a piston sends the vehicle's call.
 
     .. math:: L_\text{active} \leftarrow L_\text{active} + 20 \log_{10} p(\phi)
 
@@ -276,7 +276,7 @@ def arrivals_together(parts: Sequence[Arrivals]) -> Arrivals:
 def _own_echoes(
     paths: SoundPaths, caller: Caller, medium: Medium, usual: TargetConfig, bodies: Bodies | None
 ) -> tuple[Arrivals, Int[np.ndarray, " a"]]:
-    """Echoes of the vehicle's call from all targets ahead, and the emission of each echo."""
+    """Return the echoes of the vehicle's call from all targets ahead, and each one's emission."""
     c, absorption = medium.speed_of_sound, medium.absorption_db_per_m(caller.frequency)
     ahead = np.flatnonzero(in_front(paths.bearing))
     back, closing = paths.homeward.ravel()[ahead], paths.closing.ravel()[ahead]
@@ -328,7 +328,7 @@ def _sounds_of(
 def _departures(
     j: int, paths: SoundPaths, heading: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, " a"]:
-    """Angles at which sound leaves another vehicle, relative to its heading [rad], by label."""
+    """Return the angles, off its heading, at which sound leaves another vehicle [rad], by label."""
     itself = paths.landmarks + j - 1
     way = paths.target - paths.target[:, itself : itself + 1]
     way[:, itself] = -paths.offset[:, itself]  # the direct call goes to the vehicle
@@ -373,7 +373,7 @@ def _shifted(
     frequency: float,
     c: float,
 ) -> Float[np.ndarray, "k t"]:
-    """Frequency of another caller's sounds: shifted by all who move, the vehicle last."""
+    """Shift the frequency of another caller's sounds by all who move, the vehicle last."""
     if paths.drift is None:
         return doppler_frequency(frequency, receiver_speed=paths.closing, speed_of_sound=c)
     echo = np.arange(paths.closing.shape[1]) != itself
@@ -402,7 +402,7 @@ def _loss_db(
     strength_db: Float[np.ndarray, "k t"],
     medium: Medium,
 ) -> Float[np.ndarray, "k t"]:
-    """Spreading loss of a caller's sounds, less the target strength of its echoes."""
+    """Return the spreading loss of a caller's sounds, less the target strength of its echoes."""
     sent = np.broadcast_to(outward, strength_db.shape).copy()
     sent[:, itself] = 1.0  # no echo of itself: any distance will do
     loss_db = passive_spreading_loss_db(sent, paths.homeward, law=medium.spreading) - strength_db
@@ -417,7 +417,7 @@ def _strength_db(
     usual: TargetConfig,
     bodies: Bodies | None,
 ) -> Float[np.ndarray, "k t"]:
-    """Target strength of every body that reflects a tone [Hz]."""
+    """Return the target strength of every body that reflects a tone [Hz]."""
     c = medium.speed_of_sound
     if bodies is not None:
         return strength_of_bodies_db(turn, bodies, usual=usual, frequency=tone, speed_of_sound=c)

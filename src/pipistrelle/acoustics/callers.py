@@ -125,7 +125,7 @@ def _check(caller: Caller, part: str, unit: str, *, pairs: bool) -> None:
 
 
 def moves(caller: Caller) -> bool:
-    """Whether a caller other than the vehicle calls along a path.
+    """Tell whether a caller other than the vehicle calls along a path.
 
     >>> [moves(caller) for caller in callers_of(Config(), np.zeros(2))]
     [False, False]
@@ -138,7 +138,7 @@ def moves(caller: Caller) -> bool:
 def callers_at(
     callers: Sequence[Caller], time: Float[np.ndarray, " t"], steps: Int[np.ndarray, " k"]
 ) -> tuple[Caller, ...]:
-    """Callers with their places and velocities at some times.
+    """Return the callers with their places and velocities at some times.
 
     Where no velocities are given, those of the steps that end there are taken, as for the vehicle.
 
@@ -166,7 +166,7 @@ def callers_at(
 
 
 def _at(caller: Caller, time: Float[np.ndarray, " t"], steps: Int[np.ndarray, " k"]) -> Caller:
-    """Places and velocities of a path at some of its times."""
+    """Return the places and velocities of a path at some of its times."""
     path, velocity = np.asarray(caller.place), caller.velocity
     shapes = {path.shape, path.shape if velocity is None else np.shape(velocity)}
     if shapes != {(len(time), 2)}:

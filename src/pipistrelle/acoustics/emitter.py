@@ -15,7 +15,7 @@ HALF_POWER = 1.6163399483107033
 
 
 def jinc(x: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-    r"""Far field of a uniform disc, 1 on its axis.
+    r"""Return the far field of a uniform disc, 1 on its axis.
 
     .. math:: \operatorname{jinc}(x) = 2 J_1(x) / x
 
@@ -30,7 +30,7 @@ def jinc(x: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
 
 
 def in_front(bearing: Float[np.ndarray, "*n"] | float) -> Bool[np.ndarray, "*n"]:
-    """Whether a direction is within 90 degrees of a back-baffled emitter's axis.
+    """Tell whether a direction is within 90 degrees of a back-baffled emitter's axis.
 
     `bearing` [rad].
 
@@ -49,7 +49,7 @@ def piston_directivity(
     radius: float,
     speed_of_sound: float,
 ) -> Float[np.ndarray, "*n"]:
-    r"""Pressure of a back-baffled circular piston, relative to its axis.
+    r"""Return the pressure of a back-baffled circular piston, relative to its axis.
 
     .. math:: p(\phi) = \left| \frac{2 J_1(ka\sin\phi)}{ka\sin\phi} \right|
               \text{ for } |\phi| \le 90°, \text{ else } 0, \qquad k = 2\pi f / c
@@ -90,7 +90,7 @@ def piston_directivity(
 def beamwidth(
     radius: Float[np.ndarray, "*n"] | float, *, frequency: float, speed_of_sound: float
 ) -> Float[np.ndarray, "*n"]:
-    r"""Half-power beamwidth of a back-baffled piston.
+    r"""Return the half-power beamwidth of a back-baffled piston.
 
     .. math:: 2 \arcsin \frac{x}{ka}, \quad (2 J_1(x) / x)^2 = \tfrac12, \quad x = 1.6163...
 
@@ -127,7 +127,7 @@ def beamwidth(
 
 
 def beamwidth_of(config: Config) -> float:
-    """Half-power beamwidth of the vehicle's call, as the settings have it.
+    """Return the half-power beamwidth of the vehicle's call, as the settings have it.
 
     Returns [rad].
 
@@ -141,7 +141,7 @@ def beamwidth_of(config: Config) -> float:
 def piston_radius(
     beamwidth: Float[np.ndarray, "*n"] | float, *, frequency: float, speed_of_sound: float
 ) -> Float[np.ndarray, "*n"]:
-    r"""Radius of the piston that makes a half-power beamwidth.
+    r"""Return the radius of the piston that makes a half-power beamwidth.
 
     .. math:: a = \frac{x}{k \sin(\text{beamwidth} / 2)}, \quad (2 J_1(x) / x)^2 = \tfrac12
 

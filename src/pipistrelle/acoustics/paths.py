@@ -142,7 +142,7 @@ def _joined(
 def turn_of_sound(
     incoming: Float[np.ndarray, "_ t 2"], offset: Float[np.ndarray, "k t 2"]
 ) -> Float[np.ndarray, "k t"]:
-    """Angle between the directions of the sound before and after a target; pi is straight back.
+    """Return the angle by which a target turns sound; pi is straight back.
 
     `incoming` [m]: from the caller to each target; `offset` [m]: from the vehicle to each target.
     Returns [rad].

@@ -14,7 +14,7 @@ from pipistrelle.config import InputError
 def spreading_loss_db(
     path: Float[np.ndarray, "*n"] | float, *, ways: Literal[1, 2] = 1
 ) -> Float[np.ndarray, "*n"]:
-    r"""Spherical spreading over a path, re 1 m.
+    r"""Return the spherical spreading over a path, re 1 m.
 
     .. math:: \beta = r \, 20 \log_{10} \frac{d}{r}
        :label: eq-2
@@ -51,7 +51,7 @@ def passive_spreading_loss_db(
     *,
     law: Literal["paper", "bistatic"],
 ) -> Float[np.ndarray, "*n"]:
-    r"""Spreading of someone else's call on its way over a landmark, re 1 m.
+    r"""Return the spreading of someone else's call on its way over a landmark, re 1 m.
 
     .. math:: \beta_\text{paper} = 20 \log_{10}(d_1 + d_2), \qquad
               \beta_\text{bistatic} = 20 \log_{10} d_1 + 20 \log_{10} d_2
@@ -84,7 +84,7 @@ def absorption_db_per_m(
     relative_humidity: float,
     pressure_kpa: float,
 ) -> Float[np.ndarray, "*n"]:
-    r"""Absorption of a pure tone by moist air.
+    r"""Return the absorption of a pure tone by moist air.
 
     .. math:: \alpha = 8.686 f^2 \left[ 1.84 \cdot 10^{-11} \frac{\tau^{1/2}}{p}
               + \tau^{-5/2} \left( 0.01275 e^{-2239.1/T} \frac{f_{rO}}{f_{rO}^2 + f^2}
@@ -143,7 +143,7 @@ def doppler_frequency(
     source_speed: Float[np.ndarray, "*n"] | float = 0.0,
     speed_of_sound: float,
 ) -> Float[np.ndarray, "*n"]:
-    r"""Frequency that a receiver hears, source and receiver moving through still air.
+    r"""Return the frequency that a receiver hears, source and receiver moving through still air.
 
     .. math:: f' = f \frac{c + v_r}{c - v_s}
 

@@ -18,7 +18,7 @@ def reflecting_points(
     centre: Float[np.ndarray, "_ t 2"],
     radius: Float[np.ndarray, " t"],
 ) -> Float[np.ndarray, "k t 2"]:
-    r"""Points of bodies on the shortest path of sound from a source to a receiver.
+    r"""Return the points of bodies on the shortest path of sound from a source to a receiver.
 
     On the lit side it is the mirror's point (Alhazen's problem): at the angle t along the surface,
     from below the receiver, that makes both angles of incidence the same,
@@ -104,7 +104,7 @@ def _incidence(
     distance: Float[np.ndarray, "k t"],
     radius: Float[np.ndarray, " t"],
 ) -> tuple[Float[np.ndarray, "k t"], Float[np.ndarray, "k t"]]:
-    """Angle of incidence of sound from a place on a body's surface, and its slope (above 0)."""
+    """Return the angle of incidence on a body's surface, and its slope (above 0)."""
     cos = np.cos(angle)
     along, across = distance * cos - radius, distance * np.sin(angle)
     slope = distance * (distance - radius * cos) / (along * along + across * across)

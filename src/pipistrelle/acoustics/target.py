@@ -72,7 +72,7 @@ def target_strength_db(
     shape: str,
     speed_of_sound: float,
 ) -> Float[np.ndarray, "*n"]:
-    r"""Scattered intensity relative to backscatter: 10 log10(I(angle) / I(pi)).
+    r"""Return the scattered intensity relative to backscatter: 10 log10(I(angle) / I(pi)).
 
     .. math:: I_\text{cylinder}(\gamma) &= \frac r2 \sin\frac\gamma2
               + \frac1{2\pi k} \cot^2\frac\gamma2 \, \sin^2(kr\sin\gamma) \\
@@ -136,7 +136,7 @@ def strength_of_bodies_db(
     frequency: float,
     speed_of_sound: float,
 ) -> Float[np.ndarray, "*k n"]:
-    r"""Scattered intensity relative to backscatter of the usual target.
+    r"""Return the scattered intensity relative to backscatter of the usual target.
 
     Backscatter grows with the radius as :math:`I(\pi) = r / 2` of a cylinder and :math:`r^2 / 4` of
     a sphere, so a body of radius r throws back :math:`10 \log_{10} (r / r_0)` or :math:`20
@@ -167,7 +167,7 @@ def strength_of_bodies_db(
 
 
 def backscatter_db(bodies: Bodies, usual: TargetConfig) -> Float[np.ndarray, " n"]:
-    """How much more bodies throw back than one of their shape with the usual radius.
+    """Return how much more bodies throw back than one of their shape with the usual radius.
 
     Returns [dB]: as `strength_of_bodies_db` at an angle of pi.
     """

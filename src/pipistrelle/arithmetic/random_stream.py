@@ -26,7 +26,7 @@ _QUARTER_TURN = _F(0.5 * math.pi)
 
 
 def stream_key(seed: int, iteration: int, purpose: str, frame: int = 0) -> int:
-    """Key of a random stream: the same four arguments always give the same 64-bit number.
+    """Return the key of a random stream: four arguments always give the same 64-bit number.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def stream_key(seed: int, iteration: int, purpose: str, frame: int = 0) -> int:
 def complex_noise(
     shape: tuple[int, ...], std: float, key: int, out: Complex[np.ndarray, "..."] | None = None
 ) -> Complex[np.ndarray, "..."]:
-    """Circular complex normal noise.
+    """Draw circular complex normal noise.
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ def steering_vector(
     frequency: float,
     speed_of_sound: float,
 ) -> Complex[np.ndarray, "*n e"]:
-    r"""Phases of a unit plane wave from an angle at the elements.
+    r"""Return the phases of a unit plane wave from an angle at the elements.
 
     .. math:: v_e(\theta) = e^{2\pi i f y_e \sin\theta / c}
 
@@ -36,7 +36,7 @@ def beampattern(
     frequency: float,
     speed_of_sound: float,
 ) -> Float[np.ndarray, "*n"]:
-    r"""Power response of the phase-shift beamformer steered to one angle, to waves from others.
+    r"""Return the power response of a beamformer steered to one angle to waves from others.
 
     .. math:: B(\theta) = \left| \frac{1}{N} v(\theta_0)^H v(\theta) \right|^2
 
@@ -61,7 +61,7 @@ def beamscan(
     frequency: float,
     speed_of_sound: float,
 ) -> Float[np.ndarray, " n"]:
-    r"""Power of a conventional beam over angles: where a snapshot's sound comes from.
+    r"""Return the power of a conventional beam over angles: where a snapshot's sound comes from.
 
     .. math:: P(\theta) = \left| v(\theta)^H x \right|^2
 
@@ -82,7 +82,7 @@ def beamscan(
 def bearing_bound(
     snr: float, angle: float, *, elements: int, spacing: float, wavelength: float
 ) -> float:
-    r"""Smallest standard deviation of an unbiased bearing (Cramer-Rao), one echo, one snapshot.
+    r"""Return the least standard deviation of an unbiased bearing (Cramer-Rao) of one snapshot.
 
     .. math:: \sigma_\theta \ge \sqrt{\frac{6}{\mathrm{SNR}\, N (N^2 - 1)}}
               \Big/ \left( \frac{2\pi d}{\lambda} \cos\theta \right)

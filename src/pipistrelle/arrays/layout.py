@@ -27,7 +27,7 @@ class Layout:
         frequency: float,
         speed_of_sound: float,
     ) -> Float[np.ndarray, "*n e"]:
-        r"""Phases at the elements of a plane wave from an angle off a face's normal.
+        r"""Return the phases at the elements of a plane wave from an angle off a face's normal.
 
         .. math:: \varphi_e(\theta) = 2\pi f \, y_e \sin\theta / c
 
@@ -47,7 +47,7 @@ def layout_of(config: Config) -> Layout:
 
 
 def square_of_four(receiver: ReceiverConfig) -> Layout:
-    """Four faces, to the front, left, back and right.
+    """Return four faces, to the front, left, back and right.
 
     Parameters
     ----------

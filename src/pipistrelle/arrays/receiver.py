@@ -42,7 +42,7 @@ def noise_blocks(
     key: int,
     out: Complex[np.ndarray, "b f c e"] | None = None,
 ) -> Complex[np.ndarray, "b f c e"]:
-    """Block sums of the microphones' noise.
+    """Draw the block sums of the microphones' noise.
 
     `key`: of the random stream; a block's noise does not depend on how many are drawn; `out`:
     written and returned instead of a new array. The sums are independent, of variance 40 sigma^2.
@@ -82,7 +82,7 @@ def record_samples(
     *,
     single: bool = False,
 ) -> Complex[np.ndarray, "t f e"]:
-    """Every sample of a frame at the full rate: the reference engine.
+    """Record every sample of a frame at the full rate: the reference engine.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def record_samples(
 
 
 def _durations(arrivals: Arrivals, sampling: Sampling) -> Float[np.ndarray, " a"]:
-    """Length of each arrival [s]: the Doppler shift compresses the call."""
+    """Return the length of each arrival [s]: the Doppler shift compresses the call."""
     nominal = sampling.tones[arrivals.caller]
     return sampling.pulse * BLOCK * nominal / arrivals.frequency
 
@@ -181,7 +181,7 @@ class _Room(NamedTuple):
 
 @kernel
 def _geometric_sum(omega: float, start: Whole, stop: Whole) -> complex:
-    """Sum of exp(i omega n) over start <= n < stop."""
+    """Return the sum of exp(i omega n) over start <= n < stop."""
     count = stop - start
     half = 0.5 * omega
     gain = float(count) if half == 0.0 else math.sin(half * count) / math.sin(half)

@@ -105,7 +105,7 @@ def sampling(
 
 
 def clear_frequency(config: Config) -> float:
-    r"""Highest tone without ambiguity in direction (grating lobes) or in sampling (aliases).
+    r"""Return the highest tone without grating lobes and without aliases.
 
     Elements a distance d apart cannot tell the angle :math:`\theta` off their normal from another,
     the grating lobe, :math:`\sin\theta_g = \sin\theta - \lambda / d`: of a longer wave than d times
@@ -125,7 +125,7 @@ def clear_frequency(config: Config) -> float:
 
 
 def free_tones(config: Config, callers: Sequence[Caller], near: float) -> str:
-    """The two free unambiguous tones that are nearest to a tone, for a refusal.
+    """Return the two free unambiguous tones that are nearest to a tone, for a refusal.
 
     `near` [Hz]. Returns for a refusal, in brackets; empty where there is none.
 
@@ -162,7 +162,7 @@ def _refuse_alike(config: Config, callers: Sequence[Caller], keys: Sequence[str]
 
 
 def blocks_to_hear(arrivals: Arrivals, sampling: Sampling) -> int:
-    """Blocks from the end of the vehicle's call to the end of the last arrival.
+    """Count the blocks from the end of the vehicle's call to the end of the last arrival.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def blocks_to_hear(arrivals: Arrivals, sampling: Sampling) -> int:
 
 
 def block_shape(blocks: int, layout: Layout, sampling: Sampling) -> tuple[int, int, int, int]:
-    """Shape of a recording in block sums.
+    """Return the shape of a recording in block sums.
 
     >>> from pipistrelle.acoustics.callers import callers_of
     >>> from pipistrelle.arrays.layout import square_of_four

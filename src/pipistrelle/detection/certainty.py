@@ -42,7 +42,7 @@ EXCESS_PATH_FLOOR = 0.006
 
 
 def loudest_noise(elements: int) -> float:
-    """0.999 quantile of the residual power of a steered beam in noise.
+    """Return the 0.999 quantile of the residual power of a steered beam in noise.
 
     In units of the noise's variance.
 
@@ -56,7 +56,7 @@ def loudest_noise(elements: int) -> float:
 
 @kernel
 def over_noise(power: float, energy: float, elements: Whole, loudest: float) -> float:
-    """Ratio p of the power of a steered beam to the noise, from the snapshot's energy.
+    """Return the ratio p of the power of a steered beam to the noise, from the snapshot's energy.
 
     >>> over_noise(101.0, 110.0, 10, 2.35), round(over_noise(101.0, 191.0, 10, 2.35), 2)
     (100.0, 9.1)
@@ -67,7 +67,7 @@ def over_noise(power: float, energy: float, elements: Whole, loudest: float) -> 
 
 @kernel
 def bearing_std(power: float, slope: float, spread: float) -> float:
-    """Standard deviation of a bearing [rad].
+    """Return the standard deviation of a bearing [rad].
 
     `slope`: phase between neighbours per radian; `spread`: twelve times the mean square of the
     elements' places, in spacings, about their mean: N^2 - 1 of equally spaced ones.
@@ -80,7 +80,7 @@ def bearing_std(power: float, slope: float, spread: float) -> float:
 
 @kernel
 def delay_std(power: float, pulse: Whole) -> float:
-    """Standard deviation of a delay, in lags; the call has so many.
+    """Return the standard deviation of a delay, in lags; the call has so many.
 
     >>> round(delay_std(100.0, 14), 3)
     0.259

@@ -121,7 +121,7 @@ def loudest_first(
     power: Float[np.ndarray, " d"],
     p: Whole,
 ) -> Whole:
-    """Index of the detection that is the direct call of caller p; -1 if there is none."""
+    """Find the detection that is the direct call of caller p; -1 if there is none."""
     loudest, first = 0.0, -1
     for d in range(caller.size):
         if caller[d] == p:
@@ -137,7 +137,7 @@ def loudest_first(
 def front_edge(
     matched: Complex[np.ndarray, "l f c e"], b: Whole, f: Whole, p: Whole, pulse: Whole
 ) -> tuple[float, float]:
-    """Lag at which the first call of a tone begins, and its standard deviation.
+    """Return the lag at which the first call of a tone begins, and its standard deviation.
 
     Sought from two calls before lag b to it. NaN where none stands out; and with an infinite
     deviation where something stood out that did not last: a call that an echo at its heels has all
@@ -171,7 +171,7 @@ def front_edge(
 
 @no_alloc
 def _mean_after(gain: Complex[np.ndarray, "k e"], begin: Whole, e: Whole) -> complex:
-    """Mean of the `EDGE_BLOCKS` blocks after one block, at an element."""
+    """Return the mean of the `EDGE_BLOCKS` blocks after one block, at an element."""
     total = 0.0j
     for a in range(begin + 1, begin + 1 + EDGE_BLOCKS):
         total += gain[a, e]
@@ -180,7 +180,7 @@ def _mean_after(gain: Complex[np.ndarray, "k e"], begin: Whole, e: Whole) -> com
 
 @no_alloc
 def _fitted(gain: Complex[np.ndarray, "k e"], k: Whole, noise: float) -> tuple[float, float]:
-    """Best fitting start of a call in block k or the one before, and its standard deviation.
+    """Fit the start of a call in block k or the one before; return it with its deviation.
 
     In blocks from the first. What the fit leaves is noise, where it is more than that.
     """
@@ -242,7 +242,7 @@ def direct_calls(
 def _may_leak(
     delay: Float[np.ndarray, " d"], power: Float[np.ndarray, " d"], d: Whole, within: float
 ) -> bool:
-    """Whether detection d is faint enough to be the leakage of another at the same time.
+    """Tell whether detection d is faint enough to be the leakage of another at the same time.
 
     The loud one has another tone, as no direct call is so faint beside its own tone
     (`MIN_RELATIVE_POWER`). It may be at any face: sound from behind a face leaks into it, too, and

@@ -114,7 +114,7 @@ _NO_DIRECT = DirectCalls(np.empty(0, np.int64), np.empty(0), np.empty(0), 0.0)
 
 @kernel
 def _distinct(label: Int[np.ndarray, " d"]) -> tuple[Int[np.ndarray, " n"], Whole]:
-    """Sorted distinct labels, and the number of detections without one."""
+    """Return the sorted distinct labels, and the number of detections without one."""
     labels, count, clutter = np.empty_like(label), 0, 0
     for d in range(label.size):
         if label[d] == UNLABELLED:
@@ -141,7 +141,7 @@ def _average(
     weighted: bool,
     speed_of_sound: float,
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, "7 m"]]:
-    """Mean direction and delay of each label and caller over its strongest rows per face.
+    """Average direction and delay of each label and caller over its strongest rows per face.
 
     Returns label, caller and numbers of each pair that occurs.
     """
@@ -206,7 +206,7 @@ def _take_strongest(
 
 @kernel
 def _after(direct: DirectCalls, caller: Whole, delay: float, std: float) -> tuple[float, float]:
-    """Delay of a sound after the caller's direct call [s], and its standard deviation.
+    """Return the delay of a sound after the caller's direct call [s], and its standard deviation.
 
     NaN where nobody knows, or where the call still lasted.
     """

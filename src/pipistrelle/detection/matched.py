@@ -18,7 +18,7 @@ def filter_blocks(
     noise_std: float,
     out: Complex[np.ndarray, "l f c e"] | None = None,
 ) -> Complex[np.ndarray, "l f c e"]:
-    """Matched filter on block sums: a boxcar as long as the call.
+    """Filter block sums by a boxcar as long as the call: the matched filter.
 
     `pulse`: blocks per call; `block`: samples per block; `noise_std`: of one complex sample; `out`:
     written and returned instead of a new array. Lag i is a call that starts with block i;
@@ -44,7 +44,7 @@ def filter_samples(
     rate: float,
     noise_std: float,
 ) -> Complex[np.ndarray, "l f c e"]:
-    """Matched filter at the full rate, one per call, by fast convolution.
+    """Filter samples by each call, by fast convolution: the matched filter.
 
     Parameters
     ----------

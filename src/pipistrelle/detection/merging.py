@@ -115,7 +115,7 @@ def _checked(scan: Scan, label: np.ndarray) -> Int[np.ndarray, " m"]:
 
 @kernel
 def settled(label: Int[np.ndarray, " m"], bearing: Float[np.ndarray, " m"]) -> bool:
-    """Whether every row has a label, and those with a bearing, one each, stand before the rest."""
+    """Tell whether every row has a label, and those with a bearing stand first, one a label."""
     for m in range(label.size):
         bare = math.isnan(bearing[m])
         if label[m] == UNLABELLED or (m > 0 and math.isnan(bearing[m - 1]) and not bare):

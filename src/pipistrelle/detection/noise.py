@@ -95,7 +95,7 @@ def without_hidden(scan: Scan, settings: FilterConfig, *, timing: bool) -> Scan:
 
 
 def noise_of(settings: FilterConfig) -> Noise:
-    """Noise model that the settings name.
+    """Return the noise model that the settings name.
 
     Parameters
     ----------

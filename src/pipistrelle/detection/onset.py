@@ -44,7 +44,7 @@ def steer(
 
 @kernel
 def _best_fraction(z0: complex, z1: complex, pulse: Whole) -> tuple[float, float]:
-    """Most likely start of the call between two lags, as a fraction, and the quality of the fit.
+    """Return the likeliest start of the call between two lags, a fraction, and its fit.
 
     A call that starts the fraction q into block 0 weighs the blocks 1 - q, 1, ..., 1, q; its
     likelihood grows with abs((1 - q) z0 + q z1)^2 / (pulse - 2 q + 2 q^2), whose stationary
@@ -73,7 +73,7 @@ def _best_fraction(z0: complex, z1: complex, pulse: Whole) -> tuple[float, float
 
 @kernel
 def reach_of(pulse: Whole) -> Whole:
-    """How many lags around a snapshot's the call may start."""
+    """Return how many lags around a snapshot's the call may start."""
     return max(pulse // 7, 1)
 
 
@@ -87,7 +87,7 @@ def arrival_lag(
     pulse: Whole,
     beam: Complex[np.ndarray, " r"],
 ) -> float:
-    """Lag at which the call starts in the beam of these phases, near lag b, to a fraction.
+    """Return the lag, to a fraction, at which the call starts in a beam, near lag b.
 
     ``beam`` is room for the beam: the lags within reach and one to either side.
     """

@@ -85,7 +85,7 @@ class Columns(NamedTuple):
 
 
 def columns_of(detections: Detections) -> Columns:
-    """Columns of detections, for kernels."""
+    """Return the columns of detections, for kernels."""
     d = detections
     return Columns(
         d.face, d.caller, d.angle, d.bearing, d.delay, d.power, d.bearing_std, d.delay_std
@@ -200,7 +200,7 @@ def detect(
     interval: float,
     pulse: int,
 ) -> Detections:
-    """Bearings and delays of everything that stands out of the noise.
+    """Find bearings and delays of everything that stands out of the noise.
 
     Parameters
     ----------
@@ -293,7 +293,7 @@ def joined(parts: Sequence[Detections]) -> Detections:
 
 @kernel
 def _energy(parts: Float[np.ndarray, " i"], elements: Whole) -> Float[np.ndarray, " t"]:
-    """Sums of squares over the elements, real and imaginary parts neighbours, of every output."""
+    """Sum squares over the elements of every output, real and imaginary parts neighbours."""
     energy = np.empty(parts.size // (2 * elements))
     square = np.empty(_CHUNK * elements)  # stays in the cache
     for start in range(0, energy.size, _CHUNK):
@@ -313,7 +313,7 @@ def _energy(parts: Float[np.ndarray, " i"], elements: Whole) -> Float[np.ndarray
 def _candidates(
     energy: Float[np.ndarray, " t"], threshold: float, row: Whole
 ) -> Int[np.ndarray, " k"]:
-    """Tests over the threshold that beat both their neighbours a row away.
+    """Find the tests over the threshold that beat both their neighbours a row away.
 
     Every test is written and few are kept: a branch on each could not be predicted.
     """
@@ -334,7 +334,7 @@ def _candidates(
 def _is_loudest(
     energy: Float[np.ndarray, " t"], test: Whole, row: Whole, reach: Whole, floor: float
 ) -> bool:
-    """Whether a lag is the loudest within a number of lags, or until the energy falls low enough.
+    """Tell whether a lag is the loudest within a reach, or until the energy falls low enough.
 
     A row of tests is a lag's: its neighbour in time is a row away, its other tones next to it.
     """
@@ -361,7 +361,7 @@ def _is_leakage(
     pulse: Whole,
     leakage: float,
 ) -> bool | np.bool_:
-    """Whether the energy of a tone is explained by leakage from another tone nearby."""
+    """Tell whether the energy of a tone is explained by leakage from another tone nearby."""
     own, strongest = test % tones, 0.0
     for p in range(tones):
         if p != own:
@@ -376,7 +376,7 @@ def _is_leakage(
 def _run_of(
     energy: Float[np.ndarray, " t"], test: Whole, row: Whole, floor: float
 ) -> tuple[Whole, Whole]:
-    """First lag, and the one after the last, of the run above a level that a test lies in."""
+    """Return the first lag, and the one after the last, of a test's run above a level."""
     first = last = test
     while first >= row and energy[first - row] > floor:
         first -= row
@@ -396,7 +396,7 @@ def _snapshot(
     threshold: float,
     leakage: float,
 ) -> tuple[Whole, Whole]:
-    """First lag, and the one after the last, of the snapshot whose loudest is a test's; or none.
+    """Return the first lag, and the one after the last, of a test's snapshot; equal if none.
 
     A run may hold other echoes beside what leaks into it: each of its peaks is asked, at its lag.
     """
@@ -475,7 +475,7 @@ def _loudest_lag(
     phases: Complex[np.ndarray, " e"],
     beam: Complex[np.ndarray, " r"],
 ) -> tuple[Whole, float]:
-    """Lag, of those from the first to before the last, loudest in the beam of these phases; power.
+    """Find which lag, from the first to before the last, is loudest in a beam; and its power.
 
     ``beam`` is room for so many lags.
     """
@@ -525,7 +525,7 @@ def _find_peaks(
     rules: tuple,
     lag: Lags,
 ) -> tuple[Int[np.ndarray, "2 m"], Float[np.ndarray, "5 m"]]:
-    """Every peak of every snapshot.
+    """Find every peak of every snapshot.
 
     Returns face and caller; delay, sine of the angle, power, and the standard deviations of bearing
     and delay.

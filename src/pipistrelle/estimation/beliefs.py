@@ -74,7 +74,7 @@ def joined(some: Landmarks, others: Landmarks) -> Landmarks:
 
 
 def placed(landmarks: Landmarks) -> Bool[np.ndarray, " h"]:
-    """Mask of the rows of a map that are fully initialised landmarks, not members of a ray.
+    """Return a mask of the rows of a map that are fully initialised landmarks.
 
     A landmark with a single row is fully initialised, one with several partially (Bradley & Abaid,
     Sec. V-A).

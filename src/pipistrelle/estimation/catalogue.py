@@ -65,7 +65,7 @@ class Entry:
 
 
 def gate_of(name: str, config: Config) -> float:
-    """Share of a measurement's predicted distribution that an estimator accepts: ``filter.gate``.
+    """Return the share of a predicted distribution that an estimator accepts: ``filter.gate``.
 
     >>> from pipistrelle.config import FilterConfig
     >>> gate_of("ekf", Config()), gate_of("ekf", Config(filter=FilterConfig(gate="auto")))

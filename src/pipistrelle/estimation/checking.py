@@ -365,7 +365,7 @@ def is_covariance(entries: Float[np.ndarray, "6"]) -> Flag:
 
 @kernel
 def _correlation(covariance: float, one: float, other: float) -> float:
-    """Correlation of two numbers; infinite where one has no variance and they covary."""
+    """Return the correlation of two numbers; infinite where one has no variance and they covary."""
     if covariance == 0.0:
         return 0.0
     return covariance / math.sqrt(one * other)

@@ -147,7 +147,7 @@ def row_of(heard: Measurements, m: Whole) -> Row:
 def observe(
     x: float, y: float, heading: float, px: float, py: float
 ) -> tuple[float, float, float, float, float]:
-    """Range, bearing, direction cosines and inverse range of a point, for kernels.
+    """Return range, bearing, direction cosines and inverse range of a point, for kernels.
 
     Returns range [m], bearing [rad], cos c and sin s of the direction in the world, and k, the
     inverse of the range, bounded by `NEAREST`. The Jacobians follow: d range = (-c, -s, 0; c, s)
@@ -163,7 +163,7 @@ def observe(
 def measurement_jacobians(
     pose: Float[np.ndarray, "3"], point: Float[np.ndarray, "2"]
 ) -> tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "2 2"]]:
-    r"""Derivatives of range and bearing by the pose and by the landmark's position.
+    r"""Return the derivatives of range and bearing by the pose and by the landmark's position.
 
     .. math:: H_x = \begin{bmatrix} -c & -s & 0 \\ s/d & -c/d & -1 \end{bmatrix}, \qquad
               H_m = \begin{bmatrix} c & s \\ -s/d & c/d \end{bmatrix}
@@ -204,7 +204,7 @@ def measurement_jacobians(
 def excess_path_slopes(
     x: float, y: float, px: float, py: float, bx: float, by: float
 ) -> tuple[float, float, float, float, float]:
-    """Excess path over a point and its slopes, for kernels.
+    """Return the excess path over a point and its slopes, for kernels.
 
     The vehicle is at (x, y), the point at (px, py) and the caller at (bx, by). Returns the excess
     path [m], its derivatives by the point (2) and by the caller (2); those by the vehicle are minus
@@ -218,7 +218,7 @@ def excess_path_slopes(
 
 @kernel
 def _away(x: float, y: float, px: float, py: float) -> tuple[float, float, float]:
-    """Direction cosines and distance from (x, y) to (px, py)."""
+    """Return the direction cosines and distance from (x, y) to (px, py)."""
     dx, dy = px - x, py - y
     distance = math.sqrt(dx * dx + dy * dy)
     inverse = 1.0 / max(distance, NEAREST)
@@ -227,7 +227,7 @@ def _away(x: float, y: float, px: float, py: float) -> tuple[float, float, float
 
 @kernel
 def range_by_excess_path(excess_path: float, dx: float, dy: float, c: float, s: float) -> float:
-    """Range of a point in the direction (c, s) of the vehicle, the caller being (dx, dy) from it.
+    """Return the range of a point in direction (c, s) of the vehicle, the caller at (dx, dy).
 
     It is infinite or negative where no point there has such an excess path; see `landmark_range`.
     """
@@ -246,7 +246,7 @@ def range_by_excess_path(excess_path: float, dx: float, dy: float, c: float, s: 
 def caller_range_by_excess_path(
     excess_path: float, dx: float, dy: float, c: float, s: float
 ) -> float:
-    """Range of a caller in the direction (c, s) of the vehicle, the point being (dx, dy) from it.
+    """Return the range of a caller in direction (c, s) of the vehicle, the point at (dx, dy).
 
     It is infinite or negative where no caller there makes such an excess path.
     """
@@ -259,7 +259,7 @@ def caller_range_by_excess_path(
 def excess_path_of(
     vehicle: Float[np.ndarray, "2"], point: Float[np.ndarray, "2"], caller: Float[np.ndarray, "2"]
 ) -> float:
-    """How much longer the path of a caller's sound over a point is than the straight one [m].
+    """Return how much longer the path of a sound over a point is than the straight one [m].
 
     .. math:: e = |b - l| + |l - p| - |b - p|
 
@@ -277,7 +277,7 @@ def excess_path_of(
 def excess_path_jacobians(
     vehicle: Float[np.ndarray, "2"], point: Float[np.ndarray, "2"], caller: Float[np.ndarray, "2"]
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    r"""Derivatives of the excess path by the places of vehicle, point and caller, (2) each.
+    r"""Return the derivatives of the excess path by vehicle, point and caller, (2) each.
 
     .. math:: e_l = w + u, \quad e_b = -w - v, \quad e_p = v - u
 
@@ -290,7 +290,7 @@ def excess_path_jacobians(
 
 
 def landmark_range(excess_path: float, caller: Float[np.ndarray, "2"], bearing: float) -> float:
-    r"""Range of a point by its bearing and its excess path over a known caller.
+    r"""Return the range of a point by its bearing and its excess path over a known caller.
 
     .. math:: r = \frac{(d + e)^2 - d^2}{2 (d + e - u \cdot v)}
 

@@ -93,7 +93,7 @@ def motion_numbers(motion: Motion) -> MotionNumbers:
 def motion_increment(
     model: Whole, wheelbase: float, heading: float, control: Float[np.ndarray, " c"], dt: float
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """One noise-free control step, for kernels.
+    """Take one noise-free control step, for kernels.
 
     Returns dx, dy, dheading, then the Jacobian U by speed (x, y, heading) and by turn (x, y,
     heading). The derivatives of x and y by heading are -dy and dx. Of poses the column by the
@@ -138,7 +138,7 @@ def motion_increment(
 def relative_noise(
     control: Float[np.ndarray, " c"], motion: MotionNumbers
 ) -> tuple[float, float, float, float, float, float]:
-    """Covariance xx, xy, xh, yy, yh, hh of a motion since the pose before, in its axes."""
+    """Return xx, xy, xh, yy, yh, hh of a motion's covariance, in the axes of the pose before."""
     moves = control[0] != 0.0 or control[1] != 0.0 or control[2] != 0.0
     if not (motion.noise_at_rest or moves):
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -196,7 +196,7 @@ def propagate_pose(
 def motion_step(
     motion: Motion, pose: Float[np.ndarray, "3"], control: Float[np.ndarray, " c"], dt: float
 ) -> Float[np.ndarray, "3"]:
-    r"""The pose after one noise-free control step.
+    r"""Return the pose after one noise-free control step.
 
     .. math:: x_k = x_{k-1} + V\Delta_t \cos(\theta_{k-1} + \gamma), \quad
               y_k = y_{k-1} + V\Delta_t \sin(\theta_{k-1} + \gamma), \quad
@@ -237,7 +237,7 @@ def motion_step(
 def relative_motions(
     motion: Motion, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3 3"]]:
-    """The motion of each control step in the vehicle's axes before it, and its covariance.
+    """Return the motion of each control step in the vehicle's axes before it, and its covariance.
 
     Parameters
     ----------
@@ -276,7 +276,7 @@ def _relative_motions(
 def controls_between(
     path: Float[np.ndarray, "t 3"], dt: float | Float[np.ndarray, " t-1"], motion: Motion
 ) -> Float[np.ndarray, "t-1 2"]:
-    r"""Controls that lead from each pose to the next, as nearly as the motion model can.
+    r"""Return the controls that lead from each pose to the next, as nearly as the motion model can.
 
     A unicycle's arc has the turn of the heading, and a bicycle's front wheel the steering angle
     that makes it, :math:`\sin\gamma = B \Delta\theta / (V \Delta_t)`; the speed is along the arc's
@@ -302,7 +302,7 @@ def controls_between(
 def motion_jacobians(
     motion: Motion, pose: Float[np.ndarray, "3"], control: Float[np.ndarray, " c"], dt: float
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 n"]]:
-    """Derivatives F and U of `motion_step` by the pose and by what of the control is noisy.
+    """Return the derivatives of `motion_step` by the pose, F, and by the noisy control, U.
 
     Parameters
     ----------
@@ -338,7 +338,7 @@ def motion_jacobians(
 
 
 def motion_noise(motion: Motion, control: Float[np.ndarray, " c"]) -> Float[np.ndarray, "n n"]:
-    """Covariance Q of a control step's noise: what of the control is noisy, as the model has it.
+    """Return the covariance Q of a control step's noise, in the order of the motion model.
 
     Parameters
     ----------

@@ -105,7 +105,7 @@ _SHARING = {
 
 
 def ray_members(rays: RayConfig) -> tuple[Float[np.ndarray, " h"], Float[np.ndarray, " h"]]:
-    """Ranges of a new ray's members and their standard deviations.
+    """Return the ranges of a new ray's members and their standard deviations.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ class UpdateParams(NamedTuple):
 
 @lru_cache(maxsize=16)
 def gate_bounds(gate: float) -> tuple[float, float]:
-    """Chi-square quantiles of one and of two degrees of freedom; infinite for a gate of 1.
+    """Return the chi-square quantiles of one and two degrees of freedom; infinite of a gate of 1.
 
     >>> [round(bound, 2) for bound in gate_bounds(0.999)]
     [10.83, 13.82]

@@ -98,7 +98,7 @@ def landmark_error(
     true_landmark: Int[np.ndarray, " n"],
     true_position: Float[np.ndarray, "n 2"],
 ) -> Float[np.ndarray, " h"]:
-    """Distance of each estimated landmark from the true one of its label.
+    """Return the distance of each estimated landmark from the true one of its label.
 
     `true_landmark`: labels, each once; `true_position` [m]. Returns [m]: NaN where no true landmark
     has the label.
@@ -122,7 +122,7 @@ def landmark_error(
 def pose_error(
     path: Float[np.ndarray, "k 3"], true_path: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "k 3"]:
-    r"""Estimated minus true poses, the heading wrapped.
+    r"""Return the estimated minus true poses, the heading wrapped.
 
     .. math:: e_k = \hat x_k - x_k
 
@@ -141,7 +141,7 @@ def pose_error(
 def position_error(
     points: Float[np.ndarray, "n _"], true_points: Float[np.ndarray, "n _"]
 ) -> Float[np.ndarray, " n"]:
-    r"""Distances between estimated and true positions.
+    r"""Return the distances between estimated and true positions.
 
     .. math:: d_i = \sqrt{(\hat x_i - x_i)^2 + (\hat y_i - y_i)^2}
 
@@ -157,7 +157,7 @@ def position_error(
 
 
 def rmse(error: Float[np.ndarray, " n"]) -> float:
-    r"""Root mean square of errors, in their unit.
+    r"""Return the root mean square of errors, in their unit.
 
     .. math:: \mathrm{RMSE} = \sqrt{\frac{1}{N} \sum_{i=1}^{N} e_i^2}
        :label: eq-26-27
@@ -194,7 +194,7 @@ def rmse(error: Float[np.ndarray, " n"]) -> float:
 def alignment(
     points: Float[np.ndarray, "n 2"], reference: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "3"]:
-    r"""Rigid motion, without scale, that brings points closest to a reference.
+    r"""Return the rigid motion, without scale, that brings points closest to a reference.
 
     .. math:: \min_{\theta, t} \sum_i \lVert R(\theta) p_i + t - q_i \rVert^2: \quad
               \theta = \operatorname{atan2}\Bigl(\sum_i p'_i \times q'_i,

@@ -80,7 +80,7 @@ def pose_bound(
     routes: Mapping[int, Float[np.ndarray, "t 2"]] = NO_ROUTES,
     wander: tuple[float, float] = (1.0, 0.2),
 ) -> Float[np.ndarray, "t 3 3"]:
-    r"""Posterior Cramér-Rao bound of the pose at every step, after an exact start.
+    r"""Return the posterior Cramér-Rao bound of the pose at every step, after an exact start.
 
     .. math:: \bar P = F P F^T + U Q U^T, \qquad P^{-1} = \bar P^{-1} + H^T R^{-1} H
 
@@ -154,7 +154,7 @@ def true_controls(
     time: Float[np.ndarray, " t"],
     path: Float[np.ndarray, "t 3"],
 ) -> Float[np.ndarray, "k c"]:
-    """Controls that lead along the true path; a step of zero controls keeps them.
+    """Return the controls that lead along the true path; a step of zero controls keeps them.
 
     Of poses the noise does not hang on how far they were apart, and they are as they are.
     """
@@ -324,7 +324,7 @@ def _bound(
 
 
 def path_bound(bound: Float[np.ndarray, "t 3 3"]) -> tuple[float, float]:
-    r"""Least RMSE of position and heading over a path, from the bound at every step.
+    r"""Return the least RMSE of position and heading over a path, from the bound at every step.
 
     .. math:: \sqrt{\tfrac1K \sum_k (B_k)_{xx} + (B_k)_{yy}}, \qquad
               \sqrt{\tfrac1K \sum_k (B_k)_{\theta\theta}}
@@ -346,7 +346,7 @@ def bound_of_drawn_start(
     path: Float[np.ndarray, "t 3"],
     start_covariance: Float[np.ndarray, "3 3"],
 ) -> Float[np.ndarray, "t 3 3"]:
-    r"""Bound of the pose where the start is not exact, but drawn.
+    r"""Return the bound of the pose where the start is not exact, but drawn.
 
     .. math:: P_k = B_k + G_k P_0 G_k^T, \qquad
               G_k = \begin{pmatrix} 1 & 0 & y_0 - y_k \\ 0 & 1 & x_k - x_0 \\ 0 & 0 & 1
@@ -375,7 +375,7 @@ def nees_of_exact_start(
     path: Float[np.ndarray, "t 3"],
     start_covariance: Float[np.ndarray, "3 3"],
 ) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, " t"]]:
-    r"""Mean and variance of a consistent filter's NEES if its uncertain start is in fact exact.
+    r"""Return mean and variance of a consistent filter's NEES if its start is in fact exact.
 
     A filter that allows for an error of the start with P_0 has the covariance P_k of
     `bound_of_drawn_start` at step k; that of its errors, here, is the B_k of an exact start. So

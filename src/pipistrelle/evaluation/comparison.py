@@ -159,7 +159,7 @@ def judge(statements: Sequence[Statement], confidence: float = 0.95) -> tuple[Fi
 
 
 def holm(p: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-    r"""Holm-adjusted p values of a family.
+    r"""Return the Holm-adjusted p values of a family.
 
     .. math:: \tilde p_{(r)} = \min\bigl(1, \max_{s \le r} (m - s + 1) \, p_{(s)}\bigr)
 
@@ -179,7 +179,7 @@ def holm(p: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
 
 
 def pooled_std(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " m"]) -> float:
-    r"""Standard deviation common to two samples: the yardstick of a difference between them.
+    r"""Return the standard deviation common to two samples, by which they are compared.
 
     .. math:: \sigma = \sqrt{(s_1^2 + s_2^2) / 2}
 
@@ -195,7 +195,7 @@ def pseudovalues(
     curves: Float[np.ndarray, "n k"],
     statistic: Callable[[Float[np.ndarray, "m k"]], Float[np.ndarray, " m"]],
 ) -> Float[np.ndarray, " n"]:
-    r"""Jackknife: what each world contributes to a statistic of the mean curve.
+    r"""Return what each world contributes to a statistic of the mean curve: the jackknife.
 
     .. math:: \theta_i = n \, T(\bar c) - (n - 1) \, T(\bar c_{-i})
 
@@ -216,7 +216,7 @@ def pseudovalues(
 
 
 def _worlds(statement: Statement) -> int:
-    """Number of worlds of a statement; of two samples the smaller number."""
+    """Return the number of worlds of a statement; of two samples the smaller number."""
     both = [statement.sample, *([] if statement.against is None else [statement.against])]
     return min(map(len, both))
 

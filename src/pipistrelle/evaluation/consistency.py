@@ -10,7 +10,7 @@ from pipistrelle.evaluation.accuracy import pose_error
 def nees(
     error: Float[np.ndarray, "*n d"], covariance: Float[np.ndarray, "*n d d"]
 ) -> Float[np.ndarray, "*n"]:
-    r"""Normalised estimation error squared.
+    r"""Return the normalised estimation error squared.
 
     .. math:: \epsilon_k = (\hat x_k - x_k)^T P_k^{-1} (\hat x_k - x_k)
        :label: eq-23
@@ -68,7 +68,7 @@ def _eliminated(
 
 @np.errstate(over="ignore", invalid="ignore")
 def track_nees(pose: Gaussian, true: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
-    """NEES of each pose of a track; NaN where it is not defined.
+    """Return the NEES of each pose of a track; NaN where it is not defined.
 
     After an exact start the noise of the first control step, of rank 2, leaves the covariance
     singular. That is no divergence: the NEES begins where the covariance is positive definite.
@@ -141,7 +141,7 @@ def anees(nees: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " k"]:
 
 
 def anees_bounds(runs: int, confidence: float = 0.95, states: int = 3) -> tuple[float, float]:
-    r"""Interval that holds the ANEES of a consistent filter with a given probability.
+    r"""Return the interval that holds the ANEES of a consistent filter with a given probability.
 
     .. math:: \epsilon_1 = \chi^2_{N N_x}(C / 2) / N, \qquad
               \epsilon_2 = \chi^2_{N N_x}(1 - C / 2) / N, \qquad C = 1 - \mathrm{confidence}
@@ -183,7 +183,7 @@ def anees_bounds_about(
     runs: int,
     confidence: float = 0.95,
 ) -> tuple[Float[np.ndarray, "*k"], Float[np.ndarray, "*k"]]:
-    r"""Interval of a consistent filter's ANEES for a given mean and variance of its NEES.
+    r"""Return the interval of a consistent filter's ANEES by mean and variance of its NEES.
 
     As after an exact start (`evaluation.bound.nees_of_exact_start`). A weighted sum of chi-squares
     is taken as the gamma distribution of the same mean m and variance v, which for equal weights it

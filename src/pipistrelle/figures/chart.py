@@ -169,7 +169,7 @@ def ticks(low: float, high: float, log: bool = False) -> tuple[tuple[float, str]
 
 
 def linear_axis(label: str, values: Iterable[float], *, floor: float | None = None) -> Axis:
-    """Axis that holds some values, with a little room.
+    """Return an axis that holds some values, with a little room.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ def linear_axis(label: str, values: Iterable[float], *, floor: float | None = No
 
 
 def log_axis(label: str, values: Iterable[float]) -> Axis:
-    """Logarithmic axis that holds some values.
+    """Return a logarithmic axis that holds some values.
 
     `values`: those that are not finite and above 0 are left out.
 
@@ -213,7 +213,7 @@ def log_axis(label: str, values: Iterable[float]) -> Axis:
 
 
 def ends(found: Iterable[Series]) -> list[float]:
-    """Numbers that an axis has to hold to show some series.
+    """Return the numbers that an axis has to hold to show some series.
 
     Examples
     --------

@@ -133,7 +133,7 @@ def add_closeups(
 
 
 def _reach(clouds: Sequence[Float[np.ndarray, "p 3"]]) -> float:
-    """How far [m] a window reaches from its centre: a typical finite cloud fills half of it.
+    """Return how far [m] a window reaches from its centre: a typical finite cloud fills half of it.
 
     Typical: the median, over the clouds, of what 19 of 20 particles keep from their mean.
     """
@@ -145,7 +145,7 @@ def _reach(clouds: Sequence[Float[np.ndarray, "p 3"]]) -> float:
 def _free_corner(
     axes: "Axes", *covered: Sequence[Float[np.ndarray, "_ d"]]
 ) -> tuple[float, float, float, float]:
-    """Box, in shares of the map, in the corner that hides the fewest points.
+    """Return the box, in shares of the map, in the corner that hides the fewest points.
 
     The first kind of points counts before the second, that before the third.
     """

@@ -24,7 +24,7 @@ there, wherever the vehicle goes."""
 
 
 def callers_believed(landmarks: Landmarks, labels: Int[np.ndarray, " c"]) -> Gaussian:
-    """Where callers are believed to be: as the landmarks that they are, once they are placed.
+    """Return where callers are believed to be: as landmarks, once they are placed.
 
     `labels`: of each caller, by its number, as `Scan.callers`. Returns [m]: NaN for the vehicle,
     and for who is not placed or no landmark of the map.
@@ -48,7 +48,7 @@ def callers_believed(landmarks: Landmarks, labels: Int[np.ndarray, " c"]) -> Gau
 
 
 def callers_at(frame: Snapshot) -> Gaussian:
-    """Where callers are believed to be at a frame.
+    """Return where callers are believed to be at a frame.
 
     Returns [m]: as `callers_believed`, by the callers' numbers.
     """
@@ -66,7 +66,7 @@ def callers_marked(scans: Sequence[Scan]) -> bool:
 
 
 def excess_paths_at(frame: Snapshot) -> dict[int, Int[np.ndarray, " k"]]:
-    """Rows of a scan with an excess path that defines an ellipse, by landmark.
+    """Return the rows of a scan with an excess path that defines an ellipse, by landmark.
 
     Returns: of landmarks of the map, heard from callers that are placed. Of several the first two
     are those whose ellipses cross most squarely there.
@@ -150,7 +150,7 @@ def resolved(frames: Sequence[Snapshot]) -> list[int]:
 def drawn_excess_paths(
     frame: Snapshot, label: int
 ) -> tuple[list[Float[np.ndarray, "121 2"]], list[Float[np.ndarray, "3 2"]]]:
-    """Ellipses of a landmark's excess paths at a frame, and the ways of which they tell.
+    """Return the ellipses of a landmark's excess paths at a frame, and the ways of which they tell.
 
     Returns [m]: two at most. Returns [m]: from the caller to the likeliest place of the landmark
     and on to the vehicle.

@@ -46,7 +46,7 @@ def view(
     paths: Sequence[Float[np.ndarray, "_ 3"]],
     maps: Sequence[Landmarks],
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Limits of a map that shows what is true or, without truth, what is estimated, and ellipses.
+    """Return the limits of a map of the truth or, without it, of the estimate, and ellipses.
 
     The ellipses of placed landmarks, and of rays, widen it by at most half, a quarter to each side.
 
@@ -136,7 +136,7 @@ def draw_truth(
 
 
 def callers_shown(callers: Sequence[Caller]) -> set[str]:
-    """Names in the legend that some callers need.
+    """Return the names that some callers need in the legend.
 
     `callers`: without the vehicle. Returns: of those that stand ``beacon``, where it is one of that
     name, else ``caller``.

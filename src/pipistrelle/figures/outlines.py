@@ -12,7 +12,7 @@ RAY = 0.3935
 def ellipses(
     mean: Float[np.ndarray, "h 2"], covariance: Float[np.ndarray, "h 2 2"], probability: float
 ) -> Float[np.ndarray, "h 49 2"]:
-    r"""Closed outlines that hold a share of each Gaussian.
+    r"""Return the closed outlines that hold a share of each Gaussian.
 
     .. math:: (x - \mu)^T P^{-1} (x - \mu) = -2 \ln(1 - p)
 
@@ -87,7 +87,7 @@ def vehicle(pose: Float[np.ndarray, "3"], length: float) -> Float[np.ndarray, "4
 def excess_path_ellipse(
     vehicle: Float[np.ndarray, "2"], caller: Float[np.ndarray, "2"], excess_path: float
 ) -> Float[np.ndarray, "121 2"]:
-    r"""Where all points lie that have an excess path: an ellipse about vehicle and caller.
+    r"""Return where all points lie that have an excess path: an ellipse about vehicle and caller.
 
     .. math:: |b - l| + |l - p| = d + e, \qquad d = |b - p|
 

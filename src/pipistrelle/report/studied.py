@@ -194,7 +194,7 @@ def own_cases(trials: Trials) -> Int[np.ndarray, " b"]:
 
 
 def filter_titles(study: Study) -> dict[str, str]:
-    """Titles of the filters that a study has, in the order in which they are shown.
+    """Return the titles of the filters that a study has, in the order in which they are shown.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ def filter_titles(study: Study) -> dict[str, str]:
 
 
 def lost_worlds(study: Study, name: str) -> Bool[np.ndarray, " n"]:
-    """Mask of the worlds in which any case of a filter diverged or failed.
+    """Return a mask of the worlds in which any case of a filter diverged or failed.
 
     `name`: the filter.
     """
@@ -225,7 +225,7 @@ def lost_worlds(study: Study, name: str) -> Bool[np.ndarray, " n"]:
 
 
 def kept(selection: Selection, cells: Sequence[Cell]) -> Bool[np.ndarray, " n"]:
-    """Mask of the worlds that count when these cells are compared.
+    """Return a mask of the worlds that count when these cells are compared.
 
     Returns: a failed trial counts as a diverged one, and where nothing is dropped it has no number.
     """
@@ -272,7 +272,7 @@ def samples(
 def rmse_of(
     off: Float[np.ndarray, "*n l"], shared: Bool[np.ndarray, "*n l"]
 ) -> Float[np.ndarray, "*n"]:
-    """Root mean square over some landmarks.
+    """Return the root mean square over some landmarks.
 
     `off` [m]. `shared`: which count. Returns [m]: NaN where none counts.
 
@@ -288,7 +288,7 @@ def rmse_of(
 
 
 def mean_std(sample: Float[np.ndarray, " m"]) -> tuple[float, float]:
-    """Mean and standard deviation over worlds.
+    """Return the mean and standard deviation over worlds.
 
     Returns: of no world, NaN; the standard deviation of a single one is 0.
 

@@ -350,7 +350,7 @@ def _caller_refusal(path: Path, fault: Any) -> InputError:
 
 
 def _odometry_columns(log: Log) -> dict[str, np.ndarray]:
-    """Columns of ``odometry.csv``: controls from each time on, or poses with their covariance."""
+    """Return the columns of ``odometry.csv``: controls, or poses with their covariance."""
     if log.motion != "poses":
         rows = np.vstack((log.controls, np.zeros(2)))
         return {"time": log.time} | dict(zip(_ODOMETRY[log.motion], rows.T, strict=True))
@@ -361,7 +361,7 @@ def _odometry_columns(log: Log) -> dict[str, np.ndarray]:
 
 
 def _measurement_columns(log: Log) -> dict[str, np.ndarray]:
-    """Columns of ``measurements.csv``; scans of one step lie spread over it, in their order.
+    """Return the columns of ``measurements.csv``; scans lie spread over their step, in order.
 
     Of how surely it was measured there are those of which any row says something.
     """

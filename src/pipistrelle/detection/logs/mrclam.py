@@ -56,7 +56,7 @@ def read_mrclam(folder: Path, robot: int, span: tuple[float, float] = (-math.inf
 
 
 def _seen_landmarks(folder: Path, robot: int) -> tuple[Table, dict[str, int]]:
-    """Measurements of landmarks, labelled by their subjects, and the rows dropped."""
+    """Return the measurements of landmarks, labelled by their subjects, and the rows dropped."""
     columns = ("time", "barcode", "range", "bearing")
     table = read_table(folder / f"Robot{robot}_Measurement.dat", columns, separator=None)
     subject = _subjects(folder / "Barcodes.dat", table.column["barcode"])
@@ -77,7 +77,7 @@ def _seen_landmarks(folder: Path, robot: int) -> tuple[Table, dict[str, int]]:
 
 
 def _subjects(path: Path, barcode: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """Subjects that wear the barcodes, 0 for an unknown one."""
+    """Return the subjects that wear the barcodes, 0 for an unknown one."""
     table = read_table(path, ("subject", "barcode"), separator=None)
     check_unique(table, "barcode")
     subject = dict(zip(table.column["barcode"].tolist(), table.column["subject"], strict=True))

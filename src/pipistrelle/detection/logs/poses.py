@@ -34,7 +34,7 @@ _MIN_JUMP = (0.5, 0.5)  # [m], [rad]: less in one step is no jump
 
 
 def motions_between(odometry: Table, time: Float[np.ndarray, " t"]) -> Float[np.ndarray, "t-1 c"]:
-    r"""Motions of the vehicle from each time to the next, interpolated from rows of poses.
+    r"""Return the vehicle's motions from each time to the next, interpolated from poses.
 
     `odometry` has the columns ``time``, ``x``, ``y`` and ``heading``, perhaps with the columns of
     `MOTION_COVARIANCE`. Of rows of one time the last says where the vehicle is; `time` [s]: rising,
@@ -65,7 +65,7 @@ def motions_between(odometry: Table, time: Float[np.ndarray, " t"]) -> Float[np.
 
 
 def relative_motions(poses: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t-1 3"]:
-    """Each pose relative to the one before.
+    """Return each pose relative to the one before.
 
     `poses` [m, m, rad]. Returns [m, m, rad]: forward, sideways, and the turn the shorter way.
 
@@ -79,7 +79,7 @@ def relative_motions(poses: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t-1 
 
 
 def poses_along(motions: Float[np.ndarray, "k _"]) -> Float[np.ndarray, "k+1 3"]:
-    """Poses that motions lead to, one after another, from the origin.
+    """Return the poses that motions lead to, one after another, from the origin.
 
     `motions` [m, m, rad]: forward, sideways, turn; what follows is not looked at. Returns [m, m,
     rad]: headings wrapped. `relative_motions` gives the motions again, but for rounding.
@@ -136,7 +136,7 @@ def _at_rows(
 def _poses_at(
     time: Float[np.ndarray, " t"], rows: Float[np.ndarray, " n"], poses: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "t 3"]:
-    """Poses at other times: at the rows' own, and on the curves of constant velocity between."""
+    """Return the poses at other times, on curves of constant velocity between the rows."""
     ways = np.vstack([relative_motions(poses), np.zeros((1, 3))])
     lengths = np.append(np.diff(rows), 1.0)
     row = np.searchsorted(rows, time, side="right") - 1
@@ -210,7 +210,7 @@ def _check_ways(odometry: Table, poses: Float[np.ndarray, "n 3"]) -> None:
 
 
 def _covariances(odometry: Table) -> Float[np.ndarray, "n 3 3"]:
-    """Covariance of the motion that led to each row; NaN where the row states none."""
+    """Return the covariance of the motion that led to each row; NaN where the row states none."""
     absent = np.full(len(odometry.line), np.nan)
     column = [odometry.column.get(name, absent) for name in MOTION_COVARIANCE]
     values = np.column_stack(column)

@@ -85,7 +85,7 @@ def _read_log_folder(folder: Path) -> "Log":
 
 
 def _is_mrclam(folder: Path) -> bool:
-    """Whether a folder is a MRCLAM set: it has barcodes, or odometry of a robot."""
+    """Tell whether a folder is a MRCLAM set: it has barcodes, or odometry of a robot."""
     return (folder / "Barcodes.dat").exists() or any(folder.glob("Robot*_Odometry.dat"))
 
 

@@ -201,7 +201,7 @@ def check_seconds(table: Table, longest_gap: float = _MAX_GAP) -> None:
 
 
 def _cut(path: Path, time: np.ndarray, span: tuple[float, float]) -> np.ndarray:
-    """Times (k + 1) of the rows within a span, its ends among them."""
+    """Return the times (k + 1) of the rows within a span, its ends among them."""
     start, end = max(time[0], span[0]), min(time[-1], span[1])
     if start >= end:
         found = f"times from {time[0].item()!r} to {time[-1].item()!r}"
@@ -213,7 +213,7 @@ def _cut(path: Path, time: np.ndarray, span: tuple[float, float]) -> np.ndarray:
 
 
 def _single(odometry: Table, time: np.ndarray) -> np.ndarray:
-    """Times of rows that are one step each; a row that holds too long is refused."""
+    """Return the times of rows that are one step each; refuse a row that holds too long."""
     long = np.flatnonzero(np.diff(time) > LONGEST_STEP)
     if long.size:
         row = int(np.searchsorted(odometry.column["time"], time[long[0] + 1]))
@@ -225,7 +225,7 @@ def _single(odometry: Table, time: np.ndarray) -> np.ndarray:
 
 
 def _merged(path: Path, time: np.ndarray, step: float) -> np.ndarray:
-    """Times of the start and of the ends of steps of one length."""
+    """Return the times of the start and of the ends of steps of one length."""
     count = max(1.0, np.ceil((time[-1] - time[0] - _RESOLUTION) / step))
     if count > _MAX_STEPS:
         found = f"{time[-1] - time[0]:g} s in steps of {step:g} s"
@@ -236,7 +236,7 @@ def _merged(path: Path, time: np.ndarray, step: float) -> np.ndarray:
 def _mean_controls(
     stamp: np.ndarray, controls: np.ndarray, rows: np.ndarray, time: np.ndarray
 ) -> np.ndarray:
-    """Controls of each step: the time-weighted mean of those of the rows that it spans."""
+    """Average the controls of the rows that each step spans, weighted by time."""
     held = controls[np.searchsorted(stamp, rows[:-1], side="right") - 1]
     if time is rows:
         return held
@@ -248,7 +248,7 @@ def _mean_controls(
 
 
 def _of_callers(measurements: Table, callers: tuple[LogCaller, ...]) -> Table:
-    """Caller numbers of all rows; invalid excess paths and empty rows are refused."""
+    """Return the caller numbers of all rows; refuse invalid excess paths and empty rows."""
     column, nothing = measurements.column, np.full(len(measurements.line), np.nan)
     caller, excess_path = column.get(CALLER, nothing), column.get("excess_path", nothing)
     own = np.array([UNLABELLED, *(one.landmark for one in callers)])
@@ -287,7 +287,7 @@ def _scans(
     resolution: float,
     callers: tuple[LogCaller, ...],
 ) -> tuple[Scan, ...]:
-    """One scan for each time of measurement, at the end of the step that holds it.
+    """Return one scan for each time of measurement, at the end of the step that holds it.
 
     Rows without a bearing go to its end.
     """

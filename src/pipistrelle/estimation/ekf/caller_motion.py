@@ -41,7 +41,7 @@ def velocity_of(label: Whole) -> Whole:
 
 
 def is_velocity(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
-    """Mask of the rows of a state that are velocities, not places."""
+    """Return a mask of the rows of a state that are velocities, not places."""
     return landmark < _NOBODY
 
 
@@ -55,7 +55,7 @@ def has_velocities(landmark: Int[np.ndarray, " h"]) -> Flag:
 
 
 def is_standing(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
-    """Mask of the rows that are neither callers that move nor their velocities.
+    """Return a mask of the rows that are neither callers that move nor their velocities.
 
     >>> is_standing(np.array([4, 51, -53]))
     array([ True, False, False])
@@ -69,7 +69,7 @@ def is_standing(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
 def missing_velocities(
     landmark: Int[np.ndarray, " h"], moving: Int[np.ndarray, " v"]
 ) -> Int[np.ndarray, " n"]:
-    """Labels of the velocities that the moving callers of a state still lack.
+    """Return the labels of the velocities that the moving callers of a state still lack.
 
     >>> missing_velocities(np.array([51, 52, -53]), np.array([52]))
     array([-54])

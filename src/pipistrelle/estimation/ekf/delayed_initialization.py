@@ -43,7 +43,7 @@ such ones would seem to cross first."""
 
 @no_alloc
 def member_linearity(params: UpdateParams) -> float:
-    """Error [rad] of the linearised bearing of a ray's member that is seen from the side."""
+    """Return the error [rad] of the linearised bearing of a ray's member seen from the side."""
     share = params.ray_stds[0] / params.ray_ranges[0]
     return 0.5 * share * share
 
@@ -56,7 +56,7 @@ def is_precise(row: Row, params: UpdateParams) -> bool:
 
 @no_alloc
 def second_order_bearing(joint: Joint, size: Whole, i: Whole, row: Row) -> tuple[float, float]:
-    """Bearing of the member at index i without its second-order bias, and its larger variance."""
+    """Return the bearing of the member at i without second-order bias, and its larger variance."""
     mean = joint.mean
     _, _, c, s, k = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
     xx, xy, yy = relative_covariance(joint, size, i)
@@ -84,7 +84,7 @@ def add_waiting_bearing(state: State, row: Row, params: UpdateParams) -> None:
 def _from_vehicle(
     joint: Joint, i: Whole, direction: float
 ) -> tuple[float, float, float, float, float]:
-    """Crossing of a direction from the vehicle with the ray through the points at i and i + 2.
+    """Cross a direction from the vehicle with the ray through the points at i and i + 2.
 
     Returns the normal (2) of that ray, the sine of the angle between them, r, and t in units of
     |q - p0|.

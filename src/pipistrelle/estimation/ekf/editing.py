@@ -33,7 +33,7 @@ them."""
 
 
 def is_placed(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
-    """Mask of the members that are a landmark's or a caller's only one.
+    """Return a mask of the members that are a landmark's or a caller's only one.
 
     >>> is_placed(np.array([4, 7, 7, 51, -53]))
     array([ True, False, False,  True, False])

@@ -114,7 +114,7 @@ def gaussian_of(
 def point_rows(
     joint: Joint, size: Whole, i: Whole
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Rows i and i + 1 of the covariance, with all that waits subtracted from them."""
+    """Return the rows i and i + 1 of the covariance, with all that waits subtracted from them."""
     pi, pj, W = joint.covariance[i], joint.covariance[i + 1], joint.W
     first, last, width = joint.taken[i], joint.taken[WAITING], _lanes(size)
     joint.taken[i] = last
@@ -221,7 +221,7 @@ def propagate(
 
 @no_alloc
 def relative_covariance(joint: Joint, size: Whole, i: Whole) -> tuple[float, float, float]:
-    """Covariance xx, xy, yy of the member at index i minus the vehicle's position."""
+    """Return the covariance xx, xy, yy of the member at index i minus the vehicle's position."""
     p0, p1 = joint.covariance[0], joint.covariance[1]
     pi, pj = point_rows(joint, size, i)
     return (
@@ -233,7 +233,7 @@ def relative_covariance(joint: Joint, size: Whole, i: Whole) -> tuple[float, flo
 
 @no_alloc
 def bearing_variance(joint: Joint, size: Whole, i: Whole, c: float, s: float, k: float) -> float:
-    """Innovation variance H P H^T of the bearing of the member at index i, without R."""
+    """Return the innovation variance H P H^T of the bearing of the member at index i, without R."""
     h0, h1, turns = s * k, -c * k, joint.turns  # by pose: (h0, h1, -turns); by member: (-h0, -h1)
     p0, p1, p2 = joint.covariance[0], joint.covariance[1], joint.covariance[2]
     pi, pj = point_rows(joint, size, i)

@@ -23,13 +23,13 @@ from pipistrelle.jit import Whole, no_alloc
 
 @no_alloc
 def _excess(squared: float, S: float) -> float:
-    """Variance to add to S so that a squared innovation is at most `HUBER_K` deviations."""
+    """Return what to add to S so that an innovation is at most `HUBER_K` deviations."""
     return S * max(math.sqrt(squared / S) / HUBER_K - 1.0, 0.0)
 
 
 @no_alloc
 def inflated(state: State, first: Whole, count: Whole, row: Row) -> Row:
-    """A measurement of ``count`` members, with its variances raised by Huber's rule."""
+    """Return a measurement of ``count`` members, with its variances raised by Huber's rule."""
     joint, mean, size = state.joint, state.joint.mean, 3 + 2 * state.members[0]
     across, least, along = 0.0, math.inf, 0.0
     for j in range(count):

@@ -34,7 +34,7 @@ def scratch_for(members: Whole) -> Scratch:
 def members_of(
     landmark: Int[np.ndarray, " h"], members: Whole, label: Whole
 ) -> tuple[Whole, Whole]:
-    """Index of a landmark's first member, and how many members it has (0: it is not in the map)."""
+    """Return the index of a landmark's first member, and how many it has (0: not in the map)."""
     for first in range(members):
         if landmark[first] == label:
             last = first + 1

@@ -60,7 +60,7 @@ range."""
 
 @no_alloc
 def _bend(dx: float, dy: float, xx: float, xy: float, yy: float) -> float:
-    """Variance perpendicular to a segment (dx, dy), divided by its length."""
+    """Return the variance perpendicular to a segment (dx, dy), divided by its length."""
     square = dx * dx + dy * dy
     across = dy * dy * xx - 2.0 * dx * dy * xy + dx * dx * yy
     return max(across, 0.0) / max(square * math.sqrt(square), NEAREST**3)
@@ -70,7 +70,7 @@ def _bend(dx: float, dy: float, xx: float, xy: float, yy: float) -> float:
 def _expected(
     joint: Joint, size: Whole, i: Whole, ib: Whole, w: Float[np.ndarray, " m"]
 ) -> tuple[float, float]:
-    """Excess path over the point at i of the caller at ib, and its variance; P H^T goes into w."""
+    """Predict the excess path over the point at i of the caller at ib; write P H^T into w."""
     mean = joint.mean
     excess_path, lx, ly, bx, by = excess_path_slopes(
         mean[0], mean[1], mean[i], mean[i + 1], mean[ib], mean[ib + 1]
@@ -87,7 +87,7 @@ def _expected(
 
 @no_alloc
 def _bends(joint: Joint, size: Whole, i: Whole, ib: Whole) -> tuple[float, float]:
-    """Second-order bias of the excess path, and an upper bound of its variance."""
+    """Return the second-order bias of the excess path, and an upper bound of its variance."""
     mean, p0, p1 = joint.mean, joint.covariance[0], joint.covariance[1]
     li, lj = point_rows(joint, size, i)
     bi, bj = point_rows(joint, size, ib)
@@ -189,7 +189,7 @@ def weigh_by_excess_path(
 def _leverage(
     joint: Joint, iy: Whole, of_caller: Flag, excess_path: float, direction: float
 ) -> tuple[float, float, float, float, float]:
-    """Range r of a point by excess path and direction, with a, k and e_x . u_perp (module's head).
+    """Return the range of a point by excess path and direction, with a, k and e_x . u_perp.
 
     The point placed at index iy is the other end; the range is 0 where there is none.
     """
@@ -221,7 +221,7 @@ def relative_range_std(
     of_caller: Flag,
     measured: tuple[float, float, float, float],
 ) -> float:
-    """Relative standard deviation of a range by excess path and bearing; or infinity.
+    """Return the relative standard deviation of a range by excess path and bearing; or infinity.
 
     ``measured`` is excess path, its variance, bearing and its variance. With ``of_caller`` the
     caller's range is asked, and a landmark is placed at index iy. It is infinite above

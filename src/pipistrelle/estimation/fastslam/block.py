@@ -40,7 +40,7 @@ ROUNDING = 1e-12
 
 @inlined
 def _bearing(pose: Poses, member: Member, row: Row, i: Whole) -> tuple[float, float, float, Flag]:
-    """Innovation of a member's bearing; its slopes by x and y of the pose; if it is defined."""
+    """Return the innovation of a member's bearing, its slopes by x and y, if it is defined."""
     dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
     squared = dx * dx + dy * dy
     inverse = 1.0 / max(squared, NEAREST * NEAREST)
@@ -50,7 +50,7 @@ def _bearing(pose: Poses, member: Member, row: Row, i: Whole) -> tuple[float, fl
 
 @inlined
 def _bearing_gain(pose: Poses, h0: float, h1: float, i: Whole) -> tuple[float, float, float]:
-    """Covariance of x, y and heading with the bearing, whose slopes are (h0, h1, -1)."""
+    """Return the covariance of x, y and heading with the bearing, whose slopes are (h0, h1, -1)."""
     return (
         h0 * pose[PXX + i] + h1 * pose[PXY + i] - pose[PXH + i],
         h0 * pose[PXY + i] + h1 * pose[PYY + i] - pose[PYH + i],
@@ -60,14 +60,14 @@ def _bearing_gain(pose: Poses, h0: float, h1: float, i: Whole) -> tuple[float, f
 
 @inlined
 def _spread(member: Member, h0: float, h1: float, i: Whole) -> float:
-    """Variance of the bearing due to a member's own uncertainty."""
+    """Return the variance of the bearing due to a member's own uncertainty."""
     cross = 2.0 * h0 * h1 * member[XY + i]
     return h0 * h0 * member[XX + i] + cross + h1 * h1 * member[YY + i]
 
 
 @inlined
 def _foreseen(pose: Poses, member: Member, row: Row, i: Whole) -> tuple[float, float, Flag]:
-    """Innovation of a member's bearing, its variance, and whether it is defined."""
+    """Return the innovation of a member's bearing, its variance, and whether it is defined."""
     innovation, h0, h1, far = _bearing(pose, member, row, i)
     a0, a1, a2 = _bearing_gain(pose, h0, h1, i)
     S = (h0 * a0 + h1 * a1 - a2 + _spread(member, h0, h1, i)) + row.bearing_variance
@@ -168,7 +168,7 @@ def correct_by_bearing(pose: Poses, member: Member, row: Row, share: Lanes) -> N
 def _active(
     pose: Poses, member: Member, row: Row, i: Whole
 ) -> tuple[float, float, float, float, float, Flag]:
-    """Innovations of range and bearing, direction (c, s), inverse range, if they are defined."""
+    """Return innovations of range and bearing, direction, inverse range, if they are defined."""
     dx, dy = member[X + i] - pose[X + i], member[Y + i] - pose[Y + i]
     near = math.sqrt(dx * dx + dy * dy)
     k = 1.0 / max(near, NEAREST)
@@ -180,7 +180,7 @@ def _active(
 def _whitened(
     nu0: float, nu1: float, S00: float, S01: float, S11: float
 ) -> tuple[float, float, float, float, float]:
-    """Innovations made independent with variance one, and the factors that do so."""
+    """Return the innovations made independent with variance one, and the factors that do so."""
     i0 = 1.0 / math.sqrt(S00)
     L10 = S01 * i0
     i1 = 1.0 / math.sqrt(S11 - L10 * L10)
@@ -192,7 +192,7 @@ def _whitened(
 def _active_spread(
     pose: Poses, member: Member, c: float, s: float, k: float, row: Row, i: Whole
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """Covariance of range and bearing with x, y, heading, and of their innovations."""
+    """Return the covariance of range and bearing with x, y, heading, and of their innovations."""
     h0, h1 = s * k, -c * k
     a0 = -c * pose[PXX + i] - s * pose[PXY + i]
     a1 = -c * pose[PXY + i] - s * pose[PYY + i]
@@ -241,7 +241,7 @@ def active_beyond(pose: Poses, member: Member, row: Row, count: Counts, bound: f
 
 @no_alloc
 def squared_innovation(pose: Poses, member: Member, row: Row, i: Whole) -> float:
-    """Squared innovation of lane i divided by its variance; NaN for a member too near."""
+    """Return the squared innovation of lane i over its variance; NaN of a member too near."""
     nu0, nu1, c, s, k, far = _active(pose, member, row, i)
     _, _, _, _, _, _, S00, S01, S11 = _active_spread(pose, member, c, s, k, row, i)
     if not far:
@@ -326,7 +326,7 @@ def initialise_member(
 
 @inlined
 def _lower(pose: Poses, i: Whole) -> tuple[float, float, float, float, float, float]:
-    """Cholesky factor of a pose's covariance of any rank, row by row: a flat pivot is zero."""
+    """Factor a pose's covariance of any rank by Cholesky, row by row: a flat pivot is zero."""
     L00 = math.sqrt(max(pose[PXX + i], 0.0))
     i0 = 1.0 / L00 if L00 > 0.0 else 0.0
     L10, L20 = pose[PXY + i] * i0, pose[PXH + i] * i0

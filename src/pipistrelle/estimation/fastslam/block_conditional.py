@@ -165,7 +165,7 @@ def _take(
 def _offset(
     pose: Poses, caller: Member, member: Member, slope: Slopes, turn: Lanes, i: Whole
 ) -> tuple[float, float, float, float, float]:
-    """Offset x, y, range and inverse range of a landmark; 1 or 0: whether to correct it."""
+    """Return offset, range and inverse range of a landmark; 1 or 0: whether to correct it."""
     lx, ly = _place(caller, member, slope, i)
     dx, dy = lx - pose[X + i], ly - pose[Y + i]
     near = math.sqrt(dx * dx + dy * dy)

@@ -94,7 +94,7 @@ def part_lanes(count: Counts, scratch: Scratch) -> None:
 
 @no_alloc
 def _largest(logs: Float[np.ndarray, "h lanes"], members: Whole, largest: Lanes) -> None:
-    """Largest of each lane's logs."""
+    """Write the largest of each lane's logs."""
     for i in range(LANES):
         largest[i] = -np.inf
     for j in range(members):
@@ -154,7 +154,7 @@ def _add(log_likelihood: Lanes, numbers: Whole, turn: Lanes, log_weight: Lanes) 
 
 @no_alloc
 def most_members(count: Counts) -> Whole:
-    """Number of members of the lane that has most."""
+    """Return the number of members of the lane that has most."""
     largest = 1
     for i in range(LANES):
         largest = max(largest, count[i])
@@ -300,7 +300,7 @@ def correct_ray(
 
 @inlined
 def _heaviest(rows: Rows, count: Counts, i: Whole) -> Whole:
-    """Index of the heaviest member of a lane, the first of equals."""
+    """Return the index of the heaviest member of a lane, the first of equals."""
     best = 0
     for j in range(1, count[i]):
         best = j if rows[j, LOG_WEIGHT + i] > rows[best, LOG_WEIGHT + i] else best

@@ -28,7 +28,7 @@ ParentsAfter = tuple[Int[np.ndarray, " reached"], Float[np.ndarray, "b more slop
 
 @no_alloc
 def slot_of(landmark: Int[np.ndarray, " n"], label: Whole) -> Whole:
-    """Number of a landmark; -1 for one that is not in the map."""
+    """Return the number of a landmark; -1 for one that is not in the map."""
     for n in range(landmark.size):
         if landmark[n] == label:
             return n
@@ -71,7 +71,7 @@ def excess_paths_of_parents(
     labels: Int[np.ndarray, " m"],
     heard: ExcessPaths,
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Excess path of each measurement by its landmark's parent, and its variance; or NaN."""
+    """Return each measurement's excess path by its landmark's parent, with variance; or NaN."""
     excess_path, variance = np.full(labels.size, np.nan), np.full(labels.size, np.nan)
     for d in range(heard.landmark.size):
         n, m = slot_of(landmark, heard.landmark[d]), slot_of(labels, heard.landmark[d])

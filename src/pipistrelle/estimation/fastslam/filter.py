@@ -317,7 +317,7 @@ def _arrays(belief: FastSlamBelief) -> tuple[Arrays, Parents]:
 
 
 def _timings(belief: FastSlamBelief, scan: Scan) -> Timings | None:
-    """Caller columns of a scan; None if it has no excess paths and no landmark has a parent."""
+    """Return a scan's caller columns; None without excess paths where no landmark has a parent."""
     return timings_of(scan) if belief.slope.size == 0 else (scan.caller, scan.callers, scan.moving)
 
 

@@ -102,7 +102,7 @@ class Block(NamedTuple):
 
 @kernel
 def _slots(landmark: Int[np.ndarray, " n"], labels: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
-    """Index of each label among the landmarks; -1 for a new one."""
+    """Return the index of each label among the landmarks; -1 for a new one."""
     slot = np.empty(labels.size, dtype=np.int64)
     for m in range(labels.size):
         slot[m] = slot_of(landmark, labels[m])
@@ -375,7 +375,7 @@ def _place(
 def _rows(
     particles: Particles, slot: Int[np.ndarray, " m"], heard: Measurements, rays: Whole
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n+1"], Whole]:
-    """Labels with the new ones, each landmark's first row, and the most rows that one needs."""
+    """Return all labels, each landmark's first row, and the most rows that one needs."""
     known, fresh, widest = particles.landmark.size, 0, 1
     for m in range(slot.size):
         fresh += slot[m] < 0
@@ -464,7 +464,7 @@ def correct_particles(
 def particle_map(
     count: Int[np.ndarray, "b n lanes"], member: Float[np.ndarray, "b c numbers"], particle: Whole
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "c 6"]]:
-    """One particle's map: the number of each landmark's members, and their rows."""
+    """Return one particle's map: the number of each landmark's members, and their rows."""
     b, i = particle // LANES, particle % LANES
     rows = np.empty((member.shape[1], MEMBER // LANES))
     for j in range(rows.shape[0]):
@@ -475,7 +475,7 @@ def particle_map(
 
 @kernel
 def mean_full(count: Int[np.ndarray, "b n lanes"], weight: Float[np.ndarray, " p"]) -> float:
-    """Weighted mean number of landmarks of one member: exact where all particles agree."""
+    """Average over particles how many landmarks have one member: exact where all agree."""
     first, more = 0, 0.0
     for p in range(weight.size):
         full = 0

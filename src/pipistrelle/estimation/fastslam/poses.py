@@ -60,7 +60,7 @@ def _add_spread(
 
 @kernel
 def _add_lanes(sums: Poses) -> Float[np.ndarray, "9"]:
-    """Sum of each row over its lanes."""
+    """Return the sum of each row over its lanes."""
     total = np.empty(POSE // LANES)
     for row in range(total.size):
         so_far = 0.0
@@ -74,7 +74,7 @@ def _add_lanes(sums: Poses) -> Float[np.ndarray, "9"]:
 def summarise(
     pose: Float[np.ndarray, "b rows"], weight: Float[np.ndarray, " p"]
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Mean (circular in the heading) and covariance of all particles, their own added."""
+    """Return mean (circular in the heading) and covariance of all particles, their own added."""
     blocks = pose.shape[0]
     lanes, sums = np.zeros((blocks, LANES)), np.zeros(POSE)
     for p in range(weight.size):

@@ -19,7 +19,7 @@ from pipistrelle.jit import kernel
 
 
 def normalised(log_weight: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-    """Weights that sum to one, from their logs.
+    """Return the weights that sum to one, from their logs.
 
     The sum is rounded once, so the order of the particles does not matter, to the last bit. Where
     no log weight is finite the weights are equal: such a filter has lost the vehicle, which is a
@@ -35,7 +35,7 @@ def normalised(log_weight: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
 
 @kernel
 def _shifted(log_weight):
-    """Exponentials relative to the largest; zero where the log is not finite."""
+    """Return the exponentials relative to the largest; zero where the log is not finite."""
     weight, largest = np.zeros(log_weight.size), -np.inf
     for j in range(log_weight.size):
         if math.isfinite(log_weight[j]):

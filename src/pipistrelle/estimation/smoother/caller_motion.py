@@ -48,17 +48,17 @@ _WAY = gtsam.symbol("u", 0)
 
 
 def place_key(chain: Chain, node: int) -> int:
-    """Key of a caller's place in the graph."""
+    """Return the key of a caller's place in the graph."""
     return gtsam.symbol("c", (chain.number << _NODES) + node)
 
 
 def velocity_key(chain: Chain, node: int) -> int:
-    """Key of a caller's velocity in the graph."""
+    """Return the key of a caller's velocity in the graph."""
     return gtsam.symbol("v", (chain.number << _NODES) + node)
 
 
 def point_key(label: int, node: int, chains: Chains) -> int:
-    """Key of a landmark, or of the place of a moving caller at a node.
+    """Return the key of a landmark, or of the place of a moving caller at a node.
 
     >>> chains = {9: Chain(number=0, first=3)}
     >>> point_key(4, 7, chains) == landmark_key(4), point_key(9, 7, chains) == landmark_key(9)

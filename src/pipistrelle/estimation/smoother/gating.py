@@ -36,7 +36,7 @@ def rows_inside(
     gate: float,
     chains: Chains = NO_CHAINS,
 ) -> tuple[Bool[np.ndarray, " m"], Innovations]:
-    """Mask of rows that pass the gate or whose landmark is not in the graph; their innovations.
+    """Find rows that pass the gate or whose landmark is new, and return their innovations, too.
 
     ``node`` is the number of the pose from which the scan was heard. A row without a bearing
     passes.

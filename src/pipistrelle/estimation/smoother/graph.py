@@ -183,12 +183,12 @@ def joint_covariance(isam: gtsam.ISAM2, *keys: int) -> Float[np.ndarray, "d d"]:
 
 
 def pose_key(node: int) -> int:
-    """Key of a pose in the graph."""
+    """Return the key of a pose in the graph."""
     return gtsam.symbol("x", node)
 
 
 def landmark_key(label: int) -> int:
-    """Key of a landmark in the graph."""
+    """Return the key of a landmark in the graph."""
     return gtsam.symbol("l", label)
 
 

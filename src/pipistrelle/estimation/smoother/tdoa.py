@@ -154,7 +154,7 @@ def huber_errors(
     measured: Float[np.ndarray, "d 2"],
     believed: float,
 ) -> Float[np.ndarray, " d"]:
-    """Roots of twice Huber's loss of each excess path, with the sign of its error.
+    """Return the roots of twice Huber's loss of each excess path, with the sign of its error.
 
     ``at`` is the pose; the rows of ``ends`` number landmark and caller among the places, those of
     ``measured`` are the excess path and its standard deviation.
@@ -177,7 +177,7 @@ def misfits(
     measured: Float[np.ndarray, "d 2"],
     believed: float,
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d 3"], Float[np.ndarray, "n d 2"]]:
-    """Errors of excess paths and their slopes, weighted by Huber's rule; see `huber_errors`.
+    """Return the errors of excess paths and their slopes, weighted by Huber's rule.
 
     The slopes are by the pose, in its own axes, and by each place.
     """

@@ -205,7 +205,7 @@ def _stand(
 def _circle(
     one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "t 2"] | None:
-    """Path on a circle at constant speed; the start is drawn."""
+    """Return the path on a circle at constant speed; the start is drawn."""
     setup = around.config.scenario
     radius = setup.beacon_distance if one.radius is None else one.radius
     turned = (setup.speed if one.speed is None else one.speed) / radius * around.time
@@ -221,7 +221,7 @@ def _circle(
 def _walk(
     one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "t 2"] | None:
-    """Path of a random walk over the disc of the landmarks."""
+    """Return the path of a random walk over the disc of the landmarks."""
     setup = around.config.scenario
     std = WALK_STD if one.speed_std is None else one.speed_std
     kept = math.exp(-setup.step / (WALK_MEMORY if one.memory is None else one.memory))
@@ -248,7 +248,7 @@ def _walk(
 def _line(
     one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "t 2"]:
-    """Path along the closed line through way-points at constant speed."""
+    """Return the path along the closed line through way-points at constant speed."""
     speed = around.config.scenario.speed if one.speed is None else one.speed
     points = np.array([*(one.waypoints or ()), *(one.waypoints or ())[:1]])
     along = np.append(0.0, np.hypot(*np.diff(points, axis=0).T).cumsum())
@@ -261,7 +261,7 @@ def _line(
 def _route(
     one: CallerConfig, around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> Float[np.ndarray, "t 2"]:
-    """Path of a route; the caller stands before its first time and after its last."""
+    """Return the path of a route; the caller stands before its first time and after its last."""
     time, *place = np.array(_route_rows(one)).T
     return points_at(around.time, time, np.array(place[:2]).T)
 
@@ -272,7 +272,7 @@ def _route_rows(one: CallerConfig) -> Any:
 
 
 def _heading(one: CallerConfig, around: Surroundings) -> Float[np.ndarray, " t"] | None:
-    """Headings that a route states, if it does."""
+    """Return the headings that a route states, if it does."""
     rows = np.array(_route_rows(one)) if one.way == "route" else np.empty((0, 0))
     if rows.shape[1] < 4:
         return None
@@ -282,7 +282,7 @@ def _heading(one: CallerConfig, around: Surroundings) -> Float[np.ndarray, " t"]
 def _mission(
     around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 2"]] | None:
-    """Poses and controls of a second vehicle's drive; None if no clear place was found."""
+    """Return the poses and controls of a second vehicle's drive; None without a clear place."""
     setup, told = around.config.scenario, around.config.motion
     motion, bias = motion_of(told), (told.speed_bias, told.turn_bias)
     course = around.course or course_of(setup, motion)
@@ -382,7 +382,7 @@ def _away_from_vehicle(
 
 
 def _no_place(key: str, one: CallerConfig, around: Surroundings) -> InputError:
-    """Error for a caller without a possible place, with the fix."""
+    """Return the error for a caller without a possible place, with the fix."""
     setup = around.config.scenario
     if one.way == "mission":
         what = "it comes nearer than that to the vehicle, a landmark or a caller in every drive"

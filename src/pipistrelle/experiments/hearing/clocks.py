@@ -88,7 +88,7 @@ def _on_clock(
 def _places_at(
     times: Float[np.ndarray, " m"], clock: Float[np.ndarray, " t"], place: np.ndarray
 ) -> Float[np.ndarray, "m 2"]:
-    """Places of a caller at some times, by linear interpolation."""
+    """Return the places of a caller at some times, by linear interpolation."""
     if place.ndim == 1:
         return np.tile(place, (len(times), 1))
     return points_at(times, clock, place)

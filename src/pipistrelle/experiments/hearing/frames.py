@@ -110,7 +110,7 @@ def _calls_heard(
     beam: Callable[..., Arrivals],
     medium: Medium,
 ) -> list[CallHeard]:
-    """Arrivals of each call at the vehicle."""
+    """Return the arrivals of each call at the vehicle."""
     following = dict.fromkeys(range(len(world.callers)), np.inf)
     until = []
     for call in reversed(calls):

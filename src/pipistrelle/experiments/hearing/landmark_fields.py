@@ -124,7 +124,7 @@ def _refuse_crowd(setup: ScenarioConfig) -> None:
 
 
 def _too_many(setup: ScenarioConfig, limit: str) -> InputError:
-    """Error for landmarks that do not fit, with the fix."""
+    """Return the error for landmarks that do not fit, with the fix."""
     return InputError(
         f"scenario.landmarks: found {setup.landmarks}, but {limit} at {setup.spacing:g} m from "
         f"each other within {setup.radius:g} m of the centre; expected fewer landmarks, a smaller "

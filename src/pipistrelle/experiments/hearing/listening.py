@@ -231,7 +231,7 @@ def _rig(
 
 
 def _of_call(call: CallHeard, time: float, record: "_Record", found: Detections) -> Detections:
-    """Detections of one call in a frame; delays count from the call."""
+    """Return the detections of one call in a frame; delays count from the call."""
     after, early = call.time - time, 0.5 * record.interval * record.pulse
     stretch = after - early, call.until - time - early
     part = call_in(record.matched, found, call.caller, stretch, **record.lags)

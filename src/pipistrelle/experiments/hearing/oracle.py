@@ -92,7 +92,7 @@ def label_detections(
 def faintest_level_db(
     threshold: float, *, elements: int, samples: int, noise_std: float, margin_db: float
 ) -> float:
-    """Level of an arrival that is expected a margin under the detection threshold.
+    """Return the level of an arrival that is expected a margin under the detection threshold.
 
     `threshold`: of the energy over a face's elements, each of unit noise variance; `samples`: per
     call; `noise_std`: of one sample; `margin_db` [dB]. Returns [dB].
@@ -131,7 +131,7 @@ def _label(
     normal: Float[np.ndarray, " f"],
     gates: _Gates,
 ) -> Int[np.ndarray, " d"]:
-    """Greedy one-to-one matching, the strongest detection first."""
+    """Match detections and arrivals one to one, greedily, the strongest detection first."""
     found, true = Columns(*detections), _True(*arrivals)
     face, bearing = found.face, found.bearing
     label = np.full(face.size, UNLABELLED, dtype=np.int64)

@@ -149,7 +149,7 @@ def _mission_of(world: Scenario, vehicle: int) -> Scenario:
 
 
 def landmark_count(scenario: Scenario) -> int:
-    """Number of landmarks to map: the landmarks and all callers but the vehicle.
+    """Return the number of landmarks to map: the landmarks and all callers but the vehicle.
 
     The vehicle is no landmark of its own map; each other caller is one.
 
@@ -160,7 +160,7 @@ def landmark_count(scenario: Scenario) -> int:
 
 
 def standing_landmarks(scenario: Scenario) -> LabelledPoints:
-    """Labels and positions of the landmarks and of the callers that do not move.
+    """Return the labels and positions of the landmarks and of the callers that do not move.
 
     Labels rise; positions are in metres.
 
@@ -176,7 +176,7 @@ def standing_landmarks(scenario: Scenario) -> LabelledPoints:
 
 
 def moving_callers(scenario: Scenario) -> dict[int, Caller]:
-    """Callers that move, by label; they are no landmarks of a map.
+    """Return the callers that move, by label; they are no landmarks of a map.
 
     Labels rise.
 
@@ -187,7 +187,7 @@ def moving_callers(scenario: Scenario) -> dict[int, Caller]:
 
 
 def _others(scenario: Scenario) -> dict[int, Caller]:
-    """All callers but the vehicle, by their labels as landmarks."""
+    """Return all callers but the vehicle, by their labels as landmarks."""
     return dict(enumerate(scenario.callers[VEHICLE + 1 :], start=len(scenario.landmarks) + 1))
 
 
@@ -216,13 +216,13 @@ def assumed_motion(config: Config) -> Motion:
 
 
 def _places(callers: Sequence[CallerConfig]) -> Float[np.ndarray, "n 2"]:
-    """Places of the callers whose place is given."""
+    """Return the places of the callers whose place is given."""
     places = [caller.place for caller in callers if caller.way == "stand" and caller.place]
     return np.array(places, dtype=float).reshape(-1, 2)
 
 
 def _sized(world: World) -> Float[np.ndarray, "n 2"]:
-    """Positions of a world's bodies whose size is stated."""
+    """Return the positions of a world's bodies whose size is stated."""
     if world.landmarks is None or world.bodies is None:
         return np.empty((0, 2))
     return world.landmarks[np.isfinite(world.bodies.radius)]

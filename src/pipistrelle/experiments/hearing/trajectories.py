@@ -110,7 +110,7 @@ def course_of(setup: ScenarioConfig, motion: Motion) -> Course:
 
 
 def steps_of(course: Course, setup: ScenarioConfig) -> int:
-    """Number of control steps of a course that ends.
+    """Return the number of control steps of a course that ends.
 
     `setup`: its step, and the speed between way-points. Way-points give as many steps as the line
     takes, from the first to the last.
@@ -168,7 +168,7 @@ def driven(
 
 
 def _lanes(extent: float, lane: float) -> Float[np.ndarray, "n 2"]:
-    """Corners of parallel lanes from one side of a square to the other."""
+    """Return the corners of parallel lanes from one side of a square to the other."""
     across = np.arange(-extent, extent + 0.5 * lane, lane)
     ends = np.tile([[-extent, extent], [extent, -extent]], (len(across), 1))[: len(across)]
     return np.column_stack((ends.ravel(), np.repeat(across, 2)))
@@ -182,7 +182,7 @@ def _noise(
 
 
 def _held(time: Float[np.ndarray, " t"], commands: Commands) -> Float[np.ndarray, "t-1 2"]:
-    """Controls commanded at the start of each step."""
+    """Return the controls commanded at the start of each step."""
     rows = np.searchsorted(commands.time, time[:-1] + TIME_TOLERANCE, side="right") - 1
     return commands.rows[rows]
 
@@ -200,7 +200,7 @@ def _steered(
     setup: ScenarioConfig,
     motion: Motion,
 ) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "k 2"]]:
-    """Controls that follow the closed line through the way-points, by pure pursuit."""
+    """Return the controls that follow the closed line through the way-points, by pure pursuit."""
     _check_speed(setup)
     line = np.vstack((points, points[:1]))
     along = np.append(0.0, np.hypot(*np.diff(line, axis=0).T).cumsum())
@@ -233,7 +233,7 @@ def _ahead(
 def _at(
     aim: float, line: Float[np.ndarray, "n 2"], along: Float[np.ndarray, " n"]
 ) -> tuple[float, float]:
-    """Point at a length along a closed line."""
+    """Return the point at a length along a closed line."""
     here = aim % along[-1]
     return float(np.interp(here, along, line[:, 0])), float(np.interp(here, along, line[:, 1]))
 
@@ -241,7 +241,7 @@ def _at(
 def _towards(
     pose: Float[np.ndarray, "3"], point: tuple[float, float], speed: float, motion: Motion
 ) -> tuple[float, float]:
-    """Controls that turn the vehicle towards a point ahead, within the steering limit."""
+    """Return controls that turn the vehicle towards a point ahead, within the steering limit."""
     off = wrap_angle(math.atan2(point[1] - pose[1], point[0] - pose[0]) - pose[2])
     if motion.model == "bicycle":
         return speed, min(max(off, -MAX_STEERING), MAX_STEERING)

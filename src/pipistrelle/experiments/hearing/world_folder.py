@@ -123,7 +123,7 @@ def laid_over(world: World, layer: Layer, values: Layer) -> Layer:
 
 
 def _decided(world: World, layer: Layer) -> Layer:
-    """Settings that a world fixes; a layer that contradicts them is refused."""
+    """Return the settings that a world fixes; refuse a layer that contradicts them."""
     decided: Layer = {}
     if world.landmarks is not None:
         decided[_COUNT] = Given(len(world.landmarks), f"{world.name}: landmarks.csv")
@@ -185,7 +185,7 @@ def read_world(folder: Path) -> World:
 
 
 def kept_world(config: Config, world: World) -> tuple[Config, dict[str, bytes]]:
-    """Files of the world that a folder of results keeps.
+    """Return the files of the world that a folder of results keeps.
 
     Returns the settings that name the copy, and the copy's files, relative to the folder.
     """
@@ -196,7 +196,7 @@ def kept_world(config: Config, world: World) -> tuple[Config, dict[str, bytes]]:
 
 
 def world_files(scenario: Scenario, config: Config) -> dict[str, str]:
-    """Files of a drawn world, from which it can be simulated again or changed.
+    """Return the files of a drawn world, from which it can be simulated again or changed.
 
     Settings that are not at their defaults, and no filter's, stand in ``world.toml``.
     """
@@ -385,7 +385,7 @@ def _check_rising(table: Table) -> None:
 
 
 def _callers(path: Path, told: Any) -> tuple[tuple[CallerConfig, ...] | None, list[str]]:
-    """Validated callers of a world, and the files of their routes."""
+    """Return the validated callers of a world, and the files of their routes."""
     if told is None:
         return None, []
     files = []

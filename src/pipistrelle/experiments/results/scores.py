@@ -187,7 +187,7 @@ def _followed(
 
 
 def position_floor(drive: Drive, scans: Sequence[Scan]) -> float | None:
-    r"""RMSE of position [m] that remains if all after the first scan is estimated without error.
+    r"""Return the RMSE of position [m] if all after the first scan is estimated without error.
 
     What is heard tells where things are relative to the vehicle, and never where the vehicle was
     before it heard anything. Until then it reckons from its controls; by the first scan that holds

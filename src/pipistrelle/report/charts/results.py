@@ -82,7 +82,7 @@ def answers(name: str) -> bool:
 
 
 def study_charts(selection: Selection, charts: Sequence[Figure] | None = None) -> list[Chart]:
-    """Charts of what the study found.
+    """Chart what the study found.
 
     `charts`: each gives the charts of a figure; if not said, `PAPERS` of a study that holds the
     paper's cases, else `CHARTS`. Returns: without those that the study has nothing for.

@@ -160,7 +160,7 @@ def curves(selection: Selection, ways: Sequence[Way]) -> list[Float[np.ndarray, 
 def departure(
     nees: Float[np.ndarray, "m b k"], expected: Float[np.ndarray, "b k"]
 ) -> Float[np.ndarray, " m"]:
-    """How far ANEES is from that of a consistent filter, averaged over the beamwidths.
+    """Return how far ANEES is from that of a consistent filter, averaged over the beamwidths.
 
     `expected`: of a consistent filter. Returns: jackknife pseudo-values of `anees_departure`, which
     is smooth where the jackknife has to be; of a single world, its own.
@@ -176,7 +176,7 @@ def departure(
 def anees_departure(
     anees: Float[np.ndarray, "*j k"], expected: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, "*j"]:
-    r"""How far ANEES is from that of a consistent filter, over all frames.
+    r"""Return how far ANEES is from that of a consistent filter, over all frames.
 
     .. math:: T = \frac{1}{K} \sum_k \ln^2(\bar\epsilon_k / E_k)
 
@@ -194,7 +194,7 @@ def anees_departure(
 
 
 def lap_fit(study: Study) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]] | None:
-    r"""Weights that read the rise and the swing off a curve over time.
+    r"""Return the weights that read the rise and the swing off a curve over time.
 
     Least squares of
 
@@ -218,7 +218,7 @@ def lap_fit(study: Study) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " 
 
 
 def frame_time(study: Study, frames: int, number: int = 0) -> Float[np.ndarray, " k"]:
-    """Times of the frames.
+    """Return the times of the frames.
 
     `number`: of the combination. Returns [s].
     """
@@ -227,7 +227,7 @@ def frame_time(study: Study, frames: int, number: int = 0) -> Float[np.ndarray, 
 
 
 def lap_time(study: Study, number: int = 0) -> float:
-    r"""Time of one round of the drive without noise.
+    r"""Return the time of one round of the drive without noise.
 
     .. math:: 2 \pi B / (V |\sin\gamma|)
 
