@@ -224,7 +224,7 @@ class CallerConfig(Section):
     speed_std: Positive | None = None
     """Of a walk: standard deviation of the velocity along each axis [m/s]; else 0.5."""
     memory: Positive | None = None
-    """Of a walk: time after which a velocity is forgotten, but for 1/e [s]; else 10."""
+    """Of a walk: time after which 1/e of a velocity is left [s]; else 10."""
     route: str | Annotated[tuple[RouteRow, ...], Field(min_length=2)] | None = None
     """Or where it is when: a CSV file of `time,x,y`, or its rows [s, m, m]; else it stands. With a
     fourth column, `heading` [rad], it is another vehicle, which calls through a piston."""
@@ -296,7 +296,7 @@ def _check_rows(route: tuple[tuple[float, ...], ...]) -> None:
 
 
 def caller_names(callers: tuple[CallerConfig, ...]) -> tuple[str, ...]:
-    """Name callers: as they are told, else by their place in the list.
+    """Name callers: as the settings do, else by their place in the list.
 
     Parameters
     ----------
@@ -429,7 +429,7 @@ class FilterConfig(Section):
     initial_pose_std: tuple[NonNegative, NonNegative, NonNegative] = (0.05, 0.05, 0.0436)
     """How unsure the start is: x, y [m], heading [rad]."""
     first_pose: Literal["exact", "drawn"] = "exact"
-    """What they are told of the start: the true pose (the paper's), or one drawn with these."""
+    """The start that they are given: the true pose (the paper's), or one drawn with these."""
     gate: Gate = 1.0
     """Measurements outside this share of their predicted distribution are dropped; 1: none; "auto":
     as suits the estimator."""
@@ -496,7 +496,7 @@ class Config(Section):
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 7
     """Seed of every random stream."""
     callers: Annotated[tuple[CallerConfig, ...], Field(max_length=MOST_OTHERS)] | None = None
-    """Whoever calls besides the vehicle, a table each; the paper's beacon unless they are given."""
+    """The callers besides the vehicle, a table each; the paper's beacon by default."""
     scenario: ScenarioConfig = ScenarioConfig()
     air: AirConfig = AirConfig()
     target: TargetConfig = TargetConfig()

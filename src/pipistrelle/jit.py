@@ -2,7 +2,7 @@
 
 A division by zero makes infinity, as in NumPy, and no exception. Nothing is reordered or fused
 (no ``fastmath``): a result does not depend on how many numbers the processor takes at a time.
-Nobody calls a kernel from C, so none has a wrapper for it: a sixth of the time to compile them.
+No kernel is called from C, so none has a wrapper for it: a sixth of the time to compile them.
 
 A kernel takes eight arguments at most; what belongs together is a record, a NamedTuple. At its door
 a record costs a microsecond and a plain tuple nothing, so a kernel that is called for every frame

@@ -83,5 +83,5 @@ def _say(line: str) -> None:
     """Print a message once."""
     if line not in _said:
         _said.add(line)
-        with suppress(OSError, AttributeError):  # nobody can read it
+        with suppress(OSError, AttributeError):  # there is no reader
             print(f"pipistrelle: {line}", file=sys.stderr)

@@ -30,7 +30,7 @@ def place_kernels() -> None:
     folder = wanted = _wanted()
     if why := _unfit(wanted):
         folder = _temporary() / sources_key()
-        with suppress(OSError, AttributeError):  # nobody can read it
+        with suppress(OSError, AttributeError):  # there is no reader
             print(
                 f"pipistrelle: {wanted} {why}: compiled kernels are kept in {folder}; set "
                 "NUMBA_CACHE_DIR to a folder of your own that lasts",

@@ -96,10 +96,10 @@ def beside(path: Path, callers: Any) -> Any:
     if not isinstance(callers, list):
         return callers
     return [
-        told | {"route": (path.parent / told["route"]).as_posix()}
-        if isinstance(told, dict) and isinstance(told.get("route"), str)
-        else told
-        for told in callers
+        caller | {"route": (path.parent / caller["route"]).as_posix()}
+        if isinstance(caller, dict) and isinstance(caller.get("route"), str)
+        else caller
+        for caller in callers
     ]
 
 
@@ -239,12 +239,12 @@ def to_toml(config: Config) -> str:
         assignment = f"# {leaf} =" if value is None else f"{leaf} = {json.dumps(value)}"
         lines.append(_remarked(assignment, known_settings()[key]))
     for caller in config.callers or ():
-        told = caller.model_dump(mode="json", exclude_none=True)
+        table = caller.model_dump(mode="json", exclude_none=True)
         fields = type(caller).model_fields
         lines += ["", f"# {type(caller).__doc__}", "[[callers]]"]
         lines += [
-            _remarked(f"{leaf} = {json.dumps(told[leaf], ensure_ascii=False)}", fields[leaf])
-            for leaf in told
+            _remarked(f"{leaf} = {json.dumps(table[leaf], ensure_ascii=False)}", fields[leaf])
+            for leaf in table
         ]
     return "\n".join(lines) + "\n"
 
@@ -390,11 +390,11 @@ def _caller_problem(error: Any, given: Given) -> str:
             return f"{where}: found {found}, expected at most {MOST_OTHERS} besides the vehicle"
         tables = "a list of tables, one for each caller, as [{frequency = 30e3}]"
         return f"{where}: found {shown(error['input'])}, expected {tables}"
-    where, told = f"{where}.{inner[0] + 1}", given.value[inner[0]]
+    where, caller = f"{where}.{inner[0] + 1}", given.value[inner[0]]
     if len(inner) == 1:
         if error["type"] == "value_error":
             return f"{where}: {expected}"
-        return f"{where}: found {shown(told)}, expected a table that says who calls"
+        return f"{where}: found {shown(caller)}, expected a table that says who calls"
     name = inner[1]
     if error["type"] == "extra_forbidden":
         near = meant(name, CallerConfig.model_fields)
@@ -408,5 +408,5 @@ def _caller_problem(error: Any, given: Given) -> str:
         expected = "a list of points [x, y], two at least"
     elif name in ("place", "centre"):
         expected = "x and y"
-    found = told.get(name) if isinstance(told, dict) else getattr(told, name)
+    found = caller.get(name) if isinstance(caller, dict) else getattr(caller, name)
     return f"{where}.{name}: found {shown(found)}, expected {expected}"

@@ -1,4 +1,4 @@
-r"""Calls: what a caller sends, and how finely its echoes are told apart.
+r"""Calls: what a caller sends, and how near two echoes may be and still be two.
 
 A `Call` is all that recorder and matched filter know of a waveform. The engine ``block`` has closed
 forms for a `ToneBurst` alone; ``dense`` takes any.

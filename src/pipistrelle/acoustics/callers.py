@@ -1,8 +1,8 @@
-"""Who calls: the vehicle itself, and whoever else it listens to.
+"""Callers: the vehicle itself, and all others that it listens to.
 
 Callers are a list. The first is the vehicle, the only one that moves with the ears. Its call is
 given a beam, and so is that of other vehicles, which have a heading; the others call alike in all
-directions, from a place or along a path. All call when the vehicle does, but for those that have a
+directions, from a place or along a path. All call when the vehicle does, except those that have a
 clock of their own. Each has a tone of its own, by which its call is told from the rest. The paper's
 list is of two: the vehicle and the beacon.
 

@@ -29,12 +29,12 @@ from pipistrelle.jit import Whole, kernel
 NOISE_QUANTILE = 0.999
 """Share of snapshots whose noise is no louder than what is taken for noise alone."""
 MIN_POWER_OVER_NOISE = 0.1
-"""Least power over the noise that a deviation is told for."""
+"""Least power over the noise for which a deviation is stated."""
 BEARING_FLOOR = (0.002, 0.009)
 """Error [rad] of a bearing that no level removes, by the vehicle's own call and by another's: what
 echoes that overlap do to each other and leave no trace beside the beam. With these the errors in
-the paper's worlds have the variances that are told; another's echoes come at all times, and overlap
-more."""
+the paper's worlds have the variances that are stated; another's echoes come at all times, and
+overlap more."""
 RANGE_FLOOR = 0.01
 """Error [m] of a range that no level removes, likewise."""
 EXCESS_PATH_FLOOR = 0.006

@@ -1,7 +1,7 @@
 """Faces: what the arrays on the vehicle's faces heard of one echo becomes one row.
 
 A face may hear an echo that its neighbour hears too. Detections are averaged per label and caller,
-whether the label is a landmark's or, where nobody tells whose an echo is, just a number for the
+whether the label is a landmark's or, without labels, just a number for the
 echo (`same_echo`).
 """
 
@@ -208,7 +208,7 @@ def _take_strongest(
 def _after(direct: DirectCalls, caller: Whole, delay: float, std: float) -> tuple[float, float]:
     """Return the delay of a sound after the caller's direct call [s], and its standard deviation.
 
-    NaN where nobody knows, or where the call still lasted.
+    NaN where the direct call is not known, or still lasts.
     """
     if caller >= direct.delay.size or not delay - direct.delay[caller] >= direct.pulse:
         return math.nan, math.nan

@@ -10,7 +10,7 @@ from pipistrelle.config import InputError
 from pipistrelle.refusals import shown
 
 UNLABELLED = -1
-"""Label of a measurement of which nobody says whose it is."""
+"""Label of a measurement whose landmark is not known."""
 OWN = 0
 """Number of the vehicle among the callers, as in `pipistrelle.acoustics.callers`."""
 NO_CALLERS = np.empty(0, dtype=np.int64)
@@ -57,7 +57,7 @@ class Scan:
     """Labels of the callers that move."""
     direct: Int[np.ndarray, " c"] = field(default_factory=lambda: NO_CALLERS)
     """Of rows without labels: the row of each caller's direct call, by the caller's number; -1
-    where none was heard. Whoever labels that row says which landmark calls (`merging.labelled`)."""
+    where none was heard. Its label is that of the caller (`merging.labelled`)."""
 
     @property
     def bearing(self) -> Float[np.ndarray, " m"]:
@@ -76,17 +76,17 @@ class Scan:
 
     @property
     def bearing_std(self) -> Float[np.ndarray, " m"]:
-        """Standard deviation of the bearing [rad]; NaN where nobody says yet."""
+        """Standard deviation of the bearing [rad]; NaN where it is not stated."""
         return self.numbers[BEARING_STD]
 
     @property
     def range_std(self) -> Float[np.ndarray, " m"]:
-        """Standard deviation of the range [m]; NaN where nobody says yet."""
+        """Standard deviation of the range [m]; NaN where it is not stated."""
         return self.numbers[RANGE_STD]
 
     @property
     def excess_path_std(self) -> Float[np.ndarray, " m"]:
-        """Standard deviation of the excess path [m]; NaN where nobody says yet."""
+        """Standard deviation of the excess path [m]; NaN where it is not stated."""
         return self.numbers[EXCESS_PATH_STD]
 
     @property

@@ -37,7 +37,7 @@ SCAN_STEP = 0.05
 """Distance of the scan's beams in u [rad]: the parabola's bias stays under 2 % of a beam step."""
 
 MAX_SPACING = 100
-"""Most waves between two elements; their bearings have long been anybody's guess."""
+"""Most waves between two elements; their bearings are ambiguous long before."""
 
 _CHUNK = 256
 

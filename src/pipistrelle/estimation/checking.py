@@ -264,7 +264,7 @@ def _worded(scan: Scan, fault: int) -> str:
     if fault == NO_CALLERS:
         return (
             f"the callers' labels {scan.callers.tolist()} and {scan.moving.tolist()} for who "
-            "moves; expected whole numbers from 0 on, or -1 for a caller whom nobody knows"
+            "moves; expected whole numbers from 0 on, or -1 for an unknown caller"
         )
     columns = scan.landmark, scan.caller, scan.numbers
     rows = [m for m in range(scan.landmark.size) if _fault_of_row(*columns, m) == fault]

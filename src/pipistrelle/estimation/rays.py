@@ -177,7 +177,7 @@ def update_params(
     """
     passive_bound, active_bound = gate_bounds(gate)
     ray_ranges, ray_stds = ray_members(rays)
-    ray_ranges.setflags(write=False)  # they are shared by whoever asks for the same
+    ray_ranges.setflags(write=False)  # all who ask for the same share them
     ray_stds.setflags(write=False)
     return UpdateParams(
         passive_bound=passive_bound,

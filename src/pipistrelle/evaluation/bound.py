@@ -1,9 +1,9 @@
-r"""The bound: how surely any estimator can know the vehicle's pose, from what it was told.
+r"""The bound: how surely any estimator can know the vehicle's pose, from what it is given.
 
 The posterior Cramér-Rao bound along the true path is the covariance that an extended Kalman filter
 would have with every Jacobian taken at the truth: it hangs on what was heard and on how noisy
 controls and measurements are said to be, and on no estimate. The start is exact, and landmarks are
-not known before they are heard, but for a flat prior. A caller that moves strays as filters
+not known before they are heard (a flat prior). A caller that moves strays as filters
 believe that it does (`estimation.ekf.caller_motion`), from the way that it truly went. It tells two
 things:
 
@@ -63,7 +63,7 @@ IN_ONE_WORLD = (
 PRIOR_STD = 20.0
 """Of a landmark before it is heard [m]."""
 NO_ROUTES: Mapping[int, np.ndarray] = MappingProxyType({})
-"""Nobody moves."""
+"""No caller moves."""
 
 
 _Timed = tuple[Int[np.ndarray, " m"], Float[np.ndarray, "v t 2"], tuple[float, float]]

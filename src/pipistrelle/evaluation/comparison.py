@@ -22,7 +22,7 @@ So a bound passes its edge exactly where Holm rejects, and all lower bounds hold
 probability 1 - alpha / 2, whatever the dependence (Source: Strassburger & Bretz, Statistics in
 Medicine 27, 2008; Guilbaud, Biometrical Journal 50, 2008). Upper bounds are built alike, and
 both sides together hold with probability 1 - alpha. The price: of a rejected mean, while others
-stand, the bound says which side of the edge it is on, and no more. How large a mean is, is told
+stand, the bound says which side of the edge it is on, and no more. How large a mean is, is said
 by a wider interval, Bonferroni's,
 
 .. math:: \bar d_i \pm t_{1 - \alpha / 2m} \, s_i / \sqrt{n_i},
@@ -49,7 +49,7 @@ INTERVALS = (
     "difference of half an interval's width would have been shown in any case. Holm's correction "
     "decides what is shown, now and then one whose interval just reaches zero."
 )
-"""What a reader is told wherever `Finding.family` is printed beside a mean."""
+"""Sentence for readers wherever `Finding.family` is printed beside a mean."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

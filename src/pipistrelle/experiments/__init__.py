@@ -1,7 +1,7 @@
 """Missions and logs on trial: worlds drawn, heard, mapped, scored and kept.
 
 `runs.trial` is the file to read first: a mission on one screen (Bradley & Abaid, Sec. IV).
-`hearing` draws its world and hears it; a drive (`drives`) is what a filter is told; `runs` puts
+`hearing` draws its world and hears it; a drive (`drives`) is what a filter is given; `runs` puts
 it, or a recorded log, to the filters; `results` scores and keeps what came of it; `studies` does
 so in many worlds.
 """

@@ -1,4 +1,4 @@
-"""A drive: what a filter is told of it, simulated or recorded, and the truth to score it by.
+"""A drive, simulated or recorded: what a filter is given, and the truth to score it by.
 
 No filter is handed a `Truth`: a trial takes it from the drive when the estimate is made.
 """
@@ -44,7 +44,7 @@ NO_TRUTH = Truth(time=np.empty(0))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drive:
-    """What a filter is told of a drive, simulated or recorded, and the truth to score it by.
+    """What a filter is given of a drive, simulated or recorded, and the truth to score it by.
 
     Attributes
     ----------

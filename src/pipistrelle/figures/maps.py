@@ -106,7 +106,7 @@ def draw_truth(
 ) -> None:
     """Draw the true landmarks as open circles, each caller as a star or, where it moves, its path.
 
-    Stars and paths bear their names, but for the paper's one beacon, which the legend names.
+    Stars and paths bear their names; the legend names the paper's one beacon.
 
     `true_landmarks` [m]: callers may be among them. `callers`: without the vehicle.
 

@@ -5,7 +5,7 @@ fastest. In the paper's study, whose one variable is the beamwidth, their number
 beamwidths.
 
 And what of it counts: a `Selection` is a study under one exclusion rule, and everything that is
-claimed, charted or told is taken from one.
+claimed, charted or written is taken from one.
 """
 
 from collections import Counter
@@ -89,7 +89,7 @@ class Failure:
     beamwidth_deg: float | None
     """None for passive."""
     settings: dict[str, str]
-    """What it had of the variables, but for the beam, as words."""
+    """Its values of the variables, the beam left out, as words."""
     error: str
     """The traceback."""
 

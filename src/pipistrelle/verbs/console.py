@@ -117,7 +117,7 @@ def _rate(frames: int, elapsed: float) -> str:
 def closing_table(
     trials: "Sequence[TrialResult]", there: int | None = None, driven: float | None = None
 ) -> str:
-    """Lay out the scores of a mission, a column per estimate; rows that nobody has are left out.
+    """Lay out the scores of a mission, a column per estimate; rows without any number are left out.
 
     Six columns fit into 100 characters. Of particles, landmarks are those of the heaviest particle.
     Under the table stands what a bound says, and the NIS, where there is one. `driven` is the way

@@ -12,7 +12,7 @@ class Interrupted(KeyboardInterrupt):
     """An interruption that is caught.
 
     Of a plain one that reaches a text run by ``exec``, as libraries do when they are imported,
-    Python remembers that nobody caught it, and ends by that signal even if somebody did.
+    Python remembers that it was not caught, and ends by that signal even if it was.
     """
 
 

@@ -356,7 +356,7 @@ ROWS = {
     "no range": ("0.1,7,0.5,0", "line 3", "range 0.0", "above 0 m"),
     "negative range": ("0.1,7,0.5,-2", "line 3", "range -2.0", "above 0 m"),
     "label": ("0.1,7.5,0.5,1", "line 3", "landmark 7.5", "an integer"),
-    "no label": ("0.1,,0.5,1", "line 3", "landmark ''", "clutter -1; landmarks that nobody has"),
+    "no label": ("0.1,,0.5,1", "line 3", "landmark ''", "clutter -1; landmarks without"),
     "name": ("0.1,tree,0.5,1", "line 3", "landmark 'tree'", "a finite number"),
     "backwards": ("0.05,7,0.5,1", "line 3", "time 0.05 after 0.06", "backwards"),
     "twice": ("0.06,1,0.5,1", "line 3", "time 0.06, landmark 1 again", "line 2"),
@@ -738,7 +738,7 @@ def test_a_log_without_callers_says_nothing_of_them(folder):
 
 
 TIMED_WRONG = {
-    "nobody's": ("0.1,7,0.5,4.0,3.5,,", "line 2", "an excess path of nobody's call"),
+    "nobody's": ("0.1,7,0.5,4.0,3.5,,", "line 2", "an excess path without a caller"),
     "unknown": ("0.1,7,0.5,4.0,3.5,,bat", "line 2", "caller 'bat'", "expected boat or mate"),
     "the vehicle": ("0.1,7,0.5,4.0,3.5,,vehicle", "caller 'vehicle'"),
     "a number": ("0.1,7,0.5,4.0,3.5,,1", "caller '1'"),

@@ -216,8 +216,8 @@ def read_log(folder: Path) -> Log:
         words={CALLER: names or ("a name that [[callers]] of log.toml have",)},
     )
     measured.column[CALLER] += 1.0  # the vehicle is number 0
-    told = {name: getattr(settings, name) for name in _SHARED}
-    told["callers"] = tuple(LogCaller(**caller.model_dump()) for caller in settings.callers)
+    values = {name: getattr(settings, name) for name in _SHARED}
+    values["callers"] = tuple(LogCaller(**caller.model_dump()) for caller in settings.callers)
     return assemble(
         read_table(folder / "odometry.csv", columns, optional=optional),
         measured,
@@ -226,16 +226,16 @@ def read_log(folder: Path) -> Log:
         former_names=(*measured.former, *former),
         wheelbase=getattr(settings, "wheelbase", 1.0),
         control_std=tuple(getattr(settings, f"{name}_std") for name in stds),
-        **told,
+        **values,
     )
 
 
 def write_log(folder: Path, log: Log) -> None:
-    """Write a log folder that `read_log` reads back exactly, motions of poses but for rounding.
+    """Write a log folder that `read_log` reads back exactly, motions of poses up to rounding.
 
     Steps become rows, at the precision of the numbers; poses begin at the origin. Scans that share
     a step are spread over it in their order; empty scans leave no row. How surely it was measured
-    is told row by row, if any row states it. An earlier log that we wrote is replaced, its truth
+    is written row by row, if any row states it. An earlier log that we wrote is replaced, its truth
     removed (`pipistrelle.files`); ``log.toml`` comes last.
 
     Parameters
@@ -296,7 +296,7 @@ def log_files(log: Log) -> dict[str, str]:
 def _read_settings(path: Path) -> tuple[_Settings, tuple[str, ...]]:
     """Return the settings of ``log.toml``, and which keys it calls by former names.
 
-    Of several errors the first is told, unknown keys before missing ones.
+    Of several errors the first is named, unknown keys before missing ones.
     """
     raw = parse_toml(read_text(path), path)
     former = tuple(key for key in raw if FORMER_NAMES.get(key, key) not in raw)

@@ -27,9 +27,9 @@ def read_mrclam(folder: Path, robot: int, span: tuple[float, float] = (-math.inf
     """Read what one robot drove and saw; the labels of landmarks are their subjects, 6 to 20.
 
     Odometry is merged into steps of 0.1 s. Rows that show another robot (subjects 1 to 5) or a
-    barcode of nobody are dropped and counted.
+    barcode that no subject wears are dropped and counted.
 
-    `span` [s]: the log is cut to it: where the truth begins and ends, for whoever knows. Returns it
+    `span` [s]: the log is cut to it: where the truth begins and ends. Returns it
     starts at the origin: these files do not say where the robot stood.
 
     Format and robots: Leung et al., IJRR 30(8), 2011.

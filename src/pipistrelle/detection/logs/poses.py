@@ -1,7 +1,7 @@
 r"""Poses as odometry: from where the vehicle stood to how it moved in each step.
 
 A recorder's frame begins anywhere and drifts away. What it is right about is the way from one pose
-to the next, told in the vehicle's axes at the first of them:
+to the next, in the vehicle's axes at the first of them:
 
 .. math:: (d_x, d_y) = R(\theta_k)^T (p_{k+1} - p_k), \quad d_\theta = \theta_{k+1} - \theta_k
 
@@ -82,7 +82,7 @@ def poses_along(motions: Float[np.ndarray, "k _"]) -> Float[np.ndarray, "k+1 3"]
     """Return the poses that motions lead to, one after another, from the origin.
 
     `motions` [m, m, rad]: forward, sideways, turn; what follows is not looked at. Returns [m, m,
-    rad]: headings wrapped. `relative_motions` gives the motions again, but for rounding.
+    rad]: headings wrapped. `relative_motions` gives the motions again, up to rounding.
 
     >>> poses_along(np.array([[1.0, 0.0, np.pi / 2], [1.0, 0.0, 0.0]])).round(3)[:, :2] + 0.0
     array([[0., 0.],

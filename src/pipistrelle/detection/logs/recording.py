@@ -89,7 +89,7 @@ class Log:
     range_bounds: tuple[float, float]
     """Nearest and farthest range of a passive landmark [m]."""
     callers: tuple[LogCaller, ...] = ()
-    """Whoever else called; the first is number 1 of the scans' callers."""
+    """The other callers; the first is number 1 of the scans' callers."""
     gate: float | None = None
     """Share of a measurement's predicted distribution that is accepted; None: not said."""
     ignored_rows: dict[str, int]
@@ -117,8 +117,8 @@ def assemble(
         Of ``motion = "poses"`` as `motions_between` takes them.
     measurements : Table of ``time``, ``landmark``, ``bearing`` and ``range``
         Perhaps with ``bearing_std``, ``range_std``, ``excess_path``, ``excess_path_std`` and
-        ``caller``, its number, NaN where nobody says. A row without a bearing is a further excess
-        path of a landmark.
+        ``caller``, its number, NaN where it is not known. A row without a bearing is a further
+        excess path of a landmark.
     step : [s]
         Length of the steps into which rows are merged; None: one step each.
     span : (start, end) [s]
@@ -136,7 +136,7 @@ def assemble(
     ------
     InputError
         If nothing of the odometry or of the measurements is left, a landmark is measured twice at
-        one time by the same call, an excess path is of nobody's call, or times can be no seconds;
+        one time by the same call, an excess path has no caller, or times can be no seconds;
         what `motions_between` refuses.
     """
     check_seconds(odometry)
@@ -263,7 +263,7 @@ def _of_callers(measurements: Table, callers: tuple[LogCaller, ...]) -> Table:
         ),
         (
             ~np.isnan(excess_path) & np.isnan(caller),
-            "an excess path of nobody's call",
+            "an excess path without a caller",
             "the name of a caller beside it",
             "add it in the column 'caller', and to [[callers]] of log.toml",
         ),

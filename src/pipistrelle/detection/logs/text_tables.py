@@ -20,7 +20,7 @@ from pipistrelle.refusals import refusal
 _LABELS = ("landmark", "subject", "barcode")
 _LABEL_IT = (
     "number what your sensor tells apart, the same whenever it is seen, and clutter "
-    f"{UNLABELLED}; landmarks that nobody has labelled are not yet told apart in a log"
+    f"{UNLABELLED}; landmarks without a label are not yet told apart in a log"
 )
 _BOUNDS = {
     "range": ("m", 1.0 / LARGEST, FARTHEST),
@@ -172,8 +172,8 @@ def check_unique(table: Table, *names: str, besides: str | None = None) -> None:
     pipistrelle.config.InputError: x.csv, line 4: found landmark 4 again, expected it once, as in
     line 2; remove one of the rows
     """
-    told = [table.column[name] for name in (*names, *([besides] if besides else []))]
-    key = np.column_stack(told)
+    columns = [table.column[name] for name in (*names, *([besides] if besides else []))]
+    key = np.column_stack(columns)
     order = np.lexsort(key.T[::-1])
     same = ~np.diff(key[order], axis=0).any(axis=1)
     if same.any():

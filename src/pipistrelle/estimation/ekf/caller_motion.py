@@ -1,6 +1,6 @@
 r"""Callers that move, in the state of an EKF: a place, or a ray of them, and a velocity.
 
-Nobody tells how a caller drives. Its velocity is taken for a random walk of spectral density
+How a caller drives is not known. Its velocity is taken for a random walk of spectral density
 :math:`q = \sigma^2`, along each axis alike: in a time T
 
 .. math:: \begin{bmatrix} b \\ v \end{bmatrix} \leftarrow

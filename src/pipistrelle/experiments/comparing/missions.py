@@ -1,7 +1,7 @@
 """Missions side by side: the scores of each estimate that all folders have, and its paths.
 
 A path is seen in two ways: as it was recorded, and after the rigid motion that brings it nearest to
-its reference, which is the truth beside it, else another folder's truth, and where nobody knows it
+its reference, which is the truth beside it, else another folder's truth, and without either
 the path of the first folder. The start is not counted in the fit, as in the scores.
 """
 

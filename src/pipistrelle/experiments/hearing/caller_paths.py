@@ -114,7 +114,7 @@ class Surroundings:
 
 def callers_among(
     around: Surroundings,
-    told: Sequence[CallerConfig],
+    settings: Sequence[CallerConfig],
     rng: np.random.Generator,
     first: np.random.Generator | None = None,
 ) -> tuple[Caller, ...]:
@@ -131,12 +131,12 @@ def callers_among(
     >>> one.name, one.frequency, np.hypot(*(one.place - [9.0, 0.0]).T)
     ('beacon', 30000.0, array([4., 4., 4.]))
     """
-    streams: list[np.random.Generator] = rng.spawn(len(told))
+    streams: list[np.random.Generator] = rng.spawn(len(settings))
     if first is not None:
-        streams[:1] = [first] * len(told[:1])
+        streams[:1] = [first] * len(settings[:1])
     callers: list[Caller] = []
-    names, beacon = caller_names(tuple(told)), around.config.beacon
-    for j, (one, name, stream) in enumerate(zip(told, names, streams, strict=True), start=1):
+    names, beacon = caller_names(tuple(settings)), around.config.beacon
+    for j, (one, name, stream) in enumerate(zip(settings, names, streams, strict=True), start=1):
         frequency = beacon.frequency if one.frequency is None and j == 1 else one.frequency
         if frequency is None:
             known = (*callers_of(around.config, np.zeros(2))[:1], *callers)
@@ -283,8 +283,8 @@ def _mission(
     around: Surroundings, taken: Sequence[Points], rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t-1 2"]] | None:
     """Return the poses and controls of a second vehicle's drive; None without a clear place."""
-    setup, told = around.config.scenario, around.config.motion
-    motion, bias = motion_of(told), (told.speed_bias, told.turn_bias)
+    setup, drive = around.config.scenario, around.config.motion
+    motion, bias = motion_of(drive), (drive.speed_bias, drive.turn_bias)
     course = around.course or course_of(setup, motion)
     for _ in range(MAX_DRAWS):
         angle = rng.uniform(-math.pi, math.pi)

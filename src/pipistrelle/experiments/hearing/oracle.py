@@ -2,9 +2,9 @@
 
 The paper assumes that a measurement's landmark is known. A label is therefore attached from the
 true arrivals, after detection: by delay and bearing both, because a gate in bearing alone lets
-clutter match something most of the time. Without the oracle rows have no label, and who is who is
-for the stage between prediction and correction to say (`pipistrelle.estimation.association`), which
-sees beliefs and scans, never the truth.
+clutter match something most of the time. Without the oracle rows have no label, and an
+association (`pipistrelle.estimation.association`), which sees beliefs and scans, never the truth,
+decides which landmark each is of.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""The true world: a noisy drive, landmarks around it, and whoever calls there."""
+"""The true world: a noisy drive, landmarks around it, and the callers."""
 
 from collections.abc import Sequence
 from copy import deepcopy
@@ -87,18 +87,18 @@ def draw_scenario(config: Config, rng: np.random.Generator, world: World = ANY) 
     course = world.course or course_of(setup, motion)
     path, controls = driven(course, setup, motion, rng, bias)
     given = config.callers is None and world.callers is not None
-    told, first = world.callers if given else config.callers, deepcopy(rng)
+    settings, first = world.callers if given else config.callers, deepcopy(rng)
     beacon = np.zeros(2) if given else _place_beacon(setup, [path[:, :2], _sized(world)], rng)
     landmarks = world.landmarks
     if landmarks is None:
-        callers = _places(told or ()) if given else beacon[np.newaxis]
+        callers = _places(settings or ()) if given else beacon[np.newaxis]
         landmarks = landmarks_in(setup, path[:, :2], callers, rng)
     vehicle, *others = callers_of(config, beacon)
-    if told is not None:
+    if settings is not None:
         around = Surroundings(
             config=config, time=time, path=path[:, :2], landmarks=landmarks, course=course
         )
-        others = callers_among(around, told, rng, None if given else first)
+        others = callers_among(around, settings, rng, None if given else first)
     drawn = Scenario(
         time=time,
         path=path,

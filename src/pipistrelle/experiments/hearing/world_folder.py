@@ -127,11 +127,11 @@ def _decided(world: World, layer: Layer) -> Layer:
     decided: Layer = {}
     if world.landmarks is not None:
         decided[_COUNT] = Given(len(world.landmarks), f"{world.name}: landmarks.csv")
-    for key, told in decided.items():
-        if key in layer and layer[key].value != told.value:
+    for key, given in decided.items():
+        if key in layer and layer[key].value != given.value:
             raise InputError(
                 f"{layer[key].where}: found {shown(layer[key].value)}, but the world's "
-                f"landmarks.csv has {told.value}; leave it out"
+                f"landmarks.csv has {given.value}; leave it out"
             )
     return decided
 
@@ -384,12 +384,12 @@ def _check_rising(table: Table) -> None:
     check_unique(table, "time")
 
 
-def _callers(path: Path, told: Any) -> tuple[tuple[CallerConfig, ...] | None, list[str]]:
+def _callers(path: Path, tables: Any) -> tuple[tuple[CallerConfig, ...] | None, list[str]]:
     """Return the validated callers of a world, and the files of their routes."""
-    if told is None:
+    if tables is None:
         return None, []
     files = []
-    for number, one in enumerate(told if isinstance(told, list) else (), start=1):
+    for number, one in enumerate(tables if isinstance(tables, list) else (), start=1):
         route = one.get("route") if isinstance(one, dict) else None
         if isinstance(route, str):
             if Path(route).name != route:
@@ -398,5 +398,5 @@ def _callers(path: Path, told: Any) -> tuple[tuple[CallerConfig, ...] | None, li
                 raise refusal(where, shown(route), expected, "put it there")
             files.append(route)
     where = f"{path}: callers"
-    given = Given(routes_read(beside(path, told), where), where)
+    given = Given(routes_read(beside(path, tables), where), where)
     return resolve({CALLERS: given}).callers, files

@@ -56,7 +56,7 @@ class Scores:
     position_rmse_aligned_m, map_rmse_aligned_m : float or None
         The same, path and map each after its own rigid motion; at least two points.
     position_floor_m : float or None
-        Of a path that is right but for what was lost before the first scan (`position_floor`).
+        Of a path that is right after the first scan (`position_floor`).
     position_bound_m, heading_bound_rad : float or None
         Least that any estimator without bias has in the mean over such drives, the start exact and
         the noise as the signal tells it (`evaluation.bound.path_bound`).

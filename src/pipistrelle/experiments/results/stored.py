@@ -84,12 +84,12 @@ def read_mission(folder: Path) -> StoredMission:
         raise refusal(folder, found, "results of it", "run again what wrote them") from error
 
 
-def _log_settings(told: Mapping[str, Any] | None) -> dict[str, Any]:
+def _log_settings(log: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the log that was solved and the options it was solved with, as settings."""
-    if told is None:
+    if log is None:
         return {}
-    asked = {f"log.{name}": told[name] for name in ("path", "robot", "beamwidth_rad")}
-    sums = json.dumps(told["files"], sort_keys=True).encode()
+    asked = {f"log.{name}": log[name] for name in ("path", "robot", "beamwidth_rad")}
+    sums = json.dumps(log["files"], sort_keys=True).encode()
     return {**asked, "log.files": sha256(sums).hexdigest()[:8]}
 
 

@@ -1,6 +1,6 @@
 """One filter runs over one drive: it predicts, associates, updates, and every pose is kept.
 
-What could not be used, whoever made it, is refused here, before or after a filter has it.
+What cannot be used is refused here, before or after a filter has it.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -159,7 +159,7 @@ class HeardWorld:
     def stated_bound(self, config: Config, strategy: Strategy) -> Float[np.ndarray, "t 3 3"]:
         """Return the bound of the pose at every step from an exact start, for the stated noise.
 
-        It is that of known labels, whoever gives them to the filter.
+        It is that of known labels, with an association, too.
         """
         noise = _only(config.filter, _NOISE + _CALLERS)
         key = (config.emitter.radius, strategy, noise, config.listening, _LABELS["association"])

@@ -1,8 +1,8 @@
 """A mission done again from its result folder.
 
-The same settings give the same bits, so a result folder keeps no belief of every frame: whoever
-wants to look at one has the mission done again. The folder holds what that takes, its settings and,
-of a recorded log, which it was and how it was heard (`log_entry`).
+The same settings give the same bits, so a result folder keeps no belief of every frame: to look at
+one, the mission is done again. The folder holds what that takes, its settings and, of a recorded
+log, which it was and how it was heard (`log_entry`).
 """
 
 import math
@@ -43,7 +43,7 @@ def rerun(
 ) -> Mission:
     """Do a mission again from its result folder, and compare its tracks with those there.
 
-    `log` says where the log is, if it was moved. The folder may come from anybody, so estimators
+    `log` says where the log is, if it was moved. The folder may come from elsewhere, so estimators
     from outside, ``module:Class``, are run only if they are trusted.
 
     >>> from tempfile import TemporaryDirectory

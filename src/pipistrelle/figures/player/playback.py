@@ -73,7 +73,7 @@ class Estimate:
     cloud: Float[np.ndarray, "n p 3"] | None
     """[m, m, rad] The particles' poses."""
     revised_at: Int[np.ndarray, " j"]
-    """Frames at which the path so far was told anew."""
+    """Frames at which the whole path so far is shown as revised."""
     revised: Rows
     """For each of these the start, and each frame so far: x, y [m]."""
     callers: Float[np.ndarray, "n c 5"] | None
@@ -342,7 +342,7 @@ def _revised(
     steps: Int[np.ndarray, " n"],
     origin: Float[np.ndarray, "2"],
 ) -> tuple[Int[np.ndarray, " j"], Rows]:
-    """Return the paths that were told anew, at which frames: the start and each frame so far."""
+    """Return the revised paths, from the start to each such frame, and these frames."""
     revised = [(i, frame.path) for i, frame in enumerate(frames) if frame.path is not None]
     found = [(int(np.searchsorted(at, i)), path) for i, path in revised]
     found = [(shown, path) for shown, path in found if shown < len(at) - 1]

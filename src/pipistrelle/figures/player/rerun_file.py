@@ -197,7 +197,7 @@ def _log_still(log: _Log, playback: Playback) -> None:
 
 
 def _log_truth(log: _Log, playback: Playback, frame: int) -> None:
-    """Log where the vehicle truly is, and whoever else moves."""
+    """Log where the vehicle and the callers that move truly are."""
     for _, name, place in playback.callers:
         if place.ndim == 2:
             log.dots(f"truth/{name}", place[[frame]], _rgba(INK), size=2.0 * DOT, labels=[name])

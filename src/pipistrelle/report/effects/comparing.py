@@ -138,7 +138,7 @@ def record(by_rule: Mapping[Rule, Sequence[Effect]], headline: Rule) -> list[dic
     """Lay effects out for ``summary.json``.
 
     `by_rule`: the same effects under each exclusion rule. `headline`: by which the study is
-    answered: what an effect is at each combination is told of this alone. Returns: a ratio's mean
+    answered: the effect at each combination is given of this alone. Returns: a ratio's mean
     and intervals are ratios; what is not finite is None.
     """
     return [

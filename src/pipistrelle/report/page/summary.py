@@ -1,4 +1,4 @@
-"""A study read as the question that it asks, and everything that is told of it, for programs.
+"""A study read as the question that it asks, and all that a report says of it, for programs.
 
 A study that holds the paper's cases is asked the paper's question, and its claims are judged; any
 other is asked what its variables do.

@@ -187,7 +187,7 @@ def _grid(panel: Panel, frame: _Frame) -> list[Markup]:
 
 
 def _series(series: Series, frame: _Frame) -> list[Markup]:
-    """Draw one series as its mark says, but for its band."""
+    """Draw one series as its mark says, without its band."""
     mark = MARKS[series.style]
     x, y = _across(frame, series.x), _down(frame, series.y)
     known = np.flatnonzero(np.isfinite(x) & np.isfinite(y)).tolist()
