@@ -1,9 +1,9 @@
 """A study: it runs a plan's worlds in this process, in others, or on a cluster.
 
 The unit of work is a world. The process that computes it writes its results (`studies.store`) and
-reports back how its trials ended, so that a study needs little memory, loses nothing that is done,
-and may run in this process, in several, or on a Dask cluster (`studies.executors`): on whatever has a
-``submit`` as the executors of ``concurrent.futures`` have. The results are the same.
+reports back how its trials ended, so that a study needs little memory and loses nothing that is
+done. It may run in this process, in several, or on a Dask cluster (`studies.executors`): on
+whatever has a ``submit`` as the executors of ``concurrent.futures`` have. The results are the same.
 """
 
 from collections import Counter, deque
