@@ -14,6 +14,7 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    JsonValue,
     PlainValidator,
     field_validator,
     model_validator,
@@ -86,10 +87,19 @@ MOST_OTHERS = 7
 """Callers besides the vehicle that a recording can tell apart."""
 
 
+Mark = dict[str, JsonValue]
+FOLDER: Mark = {"is": "folder"}
+BEAM: Mark = {"is": "beam"}
+TABLES: Mark = {"is": "tables"}
+"""Marks of settings that are treated in their own way, read by `settings.marked`: a folder, in a
+file from where the file lies; what makes the vehicle's beam; and a list of tables. ``derived``
+names the property that has a setting's value where it is not given."""
+
+
 class ScenarioConfig(Section):
     """The true world: a noisy drive, round the paper's circle, among random landmarks."""
 
-    world: Annotated[str, Field(min_length=1)] | None = None
+    world: Annotated[str, Field(min_length=1)] | None = Field(None, json_schema_extra=FOLDER)
     """Folder of a world of one's own; what it leaves open is drawn as the rest says."""
     steps: Count = 1500
     """Control steps."""
@@ -128,7 +138,9 @@ class ScenarioConfig(Section):
 class AirConfig(Section):
     """The medium. Humidity is unreported in the paper."""
 
-    speed_of_sound: Annotated[float, Field(ge=10, le=10_000)] | None = None
+    speed_of_sound: Annotated[float, Field(ge=10, le=10_000)] | None = Field(
+        None, json_schema_extra={"derived": "sound_speed"}
+    )
     """Speed of sound [m/s]; unless given, that of the temperature T: 343 sqrt(T / 293.15 K)."""
     temperature_c: Annotated[float, Field(gt=-50, lt=60)] = 20.0
     """Temperature [degrees Celsius]."""
@@ -161,7 +173,7 @@ class EmitterConfig(Section):
 
     frequency: Positive = 35e3
     """Tone of the call [Hz]."""
-    radius: Positive = 0.0088
+    radius: Positive = Field(0.0088, json_schema_extra=BEAM)
     """Radius of the piston [m]; 8.8 mm makes a half-power beamwidth of 33 degrees."""
     level_db: Level = 49.7
     """Source level on the axis at 1 m [dB]; unreported, fitted."""
@@ -495,7 +507,9 @@ class Config(Section):
 
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 7
     """Seed of every random stream."""
-    callers: Annotated[tuple[CallerConfig, ...], Field(max_length=MOST_OTHERS)] | None = None
+    callers: Annotated[tuple[CallerConfig, ...], Field(max_length=MOST_OTHERS)] | None = Field(
+        None, json_schema_extra=TABLES
+    )
     """The callers besides the vehicle, a table each; the paper's beacon by default."""
     scenario: ScenarioConfig = ScenarioConfig()
     air: AirConfig = AirConfig()

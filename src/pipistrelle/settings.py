@@ -21,7 +21,17 @@ from typing import Any, NamedTuple
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from pipistrelle.config import MOST_OTHERS, CallerConfig, Config, InputError, Section
+from pipistrelle.config import (
+    BEAM,
+    FOLDER,
+    MOST_OTHERS,
+    TABLES,
+    CallerConfig,
+    Config,
+    InputError,
+    Mark,
+    Section,
+)
 from pipistrelle.files import read_text
 from pipistrelle.refusals import expectation, meant, refusal, shown, values_expected
 
@@ -30,11 +40,6 @@ NOT_SETTINGS = frozenset({"PIPISTRELLE_DATA"})
 """Variables of the environment that share the prefix and set nothing."""
 
 Key = tuple[str, ...]
-WORLD_KEY: Key = ("scenario", "world")
-FOLDERS: frozenset[Key] = frozenset({WORLD_KEY})
-"""Settings that are paths: in a file, from where the file lies."""
-CALLERS: Key = ("callers",)
-"""The setting that is a list of tables."""
 
 _MAX_DEPTH = 8
 """Levels of tables and lists that a file may have."""
@@ -66,6 +71,30 @@ def known_settings() -> dict[Key, FieldInfo]:
     return found
 
 
+def _marked(mark: Mark) -> Key:
+    """Return the key of the setting that has a mark."""
+    (key,) = (key for key, field in known_settings().items() if field.json_schema_extra == mark)
+    return key
+
+
+WORLD_KEY, RADIUS_KEY, CALLERS = (_marked(mark) for mark in (FOLDER, BEAM, TABLES))
+"""Settings that are treated in their own way: the world's folder, the piston, the callers."""
+
+
+def derived(config: Config) -> dict[Key, Any]:
+    """Return the values of the settings that are derived unless given.
+
+    >>> derived(Config())
+    {('air', 'speed_of_sound'): 343.0}
+    """
+    sources = {
+        key: field.json_schema_extra["derived"]
+        for key, field in known_settings().items()
+        if isinstance(field.json_schema_extra, dict) and "derived" in field.json_schema_extra
+    }
+    return {key: getattr(getattr(config, key[0]), str(name)) for key, name in sources.items()}
+
+
 def from_file(path: Path) -> Layer:
     """Read the settings of a TOML file.
 
@@ -77,9 +106,9 @@ def from_file(path: Path) -> Layer:
     3.0
     """
     layer = from_table(read_toml(path), f"{path}: ")
-    for key in FOLDERS & layer.keys():
-        if isinstance(layer[key].value, str):
-            layer[key] = layer[key]._replace(value=str(path.parent / layer[key].value))
+    if WORLD_KEY in layer and isinstance(layer[WORLD_KEY].value, str):
+        from_there = str(path.parent / layer[WORLD_KEY].value)
+        layer[WORLD_KEY] = layer[WORLD_KEY]._replace(value=from_there)
     if CALLERS in layer:
         layer[CALLERS] = layer[CALLERS]._replace(value=beside(path, layer[CALLERS].value))
     return layer

@@ -15,6 +15,8 @@ from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, check_distinct, 
 from pipistrelle.refusals import meant, refusal, shown
 from pipistrelle.settings import (
     CALLERS,
+    RADIUS_KEY,
+    WORLD_KEY,
     Given,
     Key,
     Layer,
@@ -35,8 +37,6 @@ Filters = str | type | Sequence[str | type]
 GROUPS = {"both": PAPERS, "all": tuple(CATALOGUE)}
 """Names that stand for several estimators."""
 STEPS: Key = ("scenario", "steps")
-RADIUS: Key = ("emitter", "radius")
-WORLD: Key = ("scenario", "world")
 
 
 def base_layer(base: Base) -> Layer:
@@ -103,7 +103,7 @@ def mission_settings(
         from pipistrelle.experiments.hearing.caller_paths import with_routes
 
         layer = with_routes(layer)
-    if WORLD in layer:
+    if WORLD_KEY in layer:
         from pipistrelle.experiments.hearing.world_folder import named_world, settled
 
         world = named_world(layer)
@@ -112,7 +112,7 @@ def mission_settings(
     if duration.value is not None:
         more[STEPS] = Given(_steps(duration, base), f"{duration.where} {duration.value:g}")
     if beamwidth.value is not None:
-        more[RADIUS] = Given(_radius(number(beamwidth), base), beamwidth.where)
+        more[RADIUS_KEY] = Given(_radius(number(beamwidth), base), beamwidth.where)
     return resolve(layer | short_names(more, flags)), world
 
 

@@ -21,7 +21,7 @@ from pipistrelle.kernel_clock import announce
 from pipistrelle.own_files import RESULTS, claim
 from pipistrelle.refusals import refusal, shown
 from pipistrelle.scripting.arguments import (
-    WORLD,
+    WORLD_KEY,
     Base,
     Filters,
     base_layer,
@@ -289,7 +289,7 @@ def run(
         fix = "places of your own are a world's: write them into one, and name it by world="
         raise refusal("landmarks", shown(landmarks), "the number of landmarks", fix)
     short: Layer = {
-        WORLD: Given(None if world is None else str(world), "world"),
+        WORLD_KEY: Given(None if world is None else str(world), "world"),
         ("scenario", "landmarks"): Given(landmarks, "landmarks"),
     }
     resolved, own_world = mission_settings(

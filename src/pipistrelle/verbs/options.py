@@ -11,9 +11,10 @@ from cyclopts import Group, Parameter
 
 from pipistrelle.config import Config, InputError
 from pipistrelle.estimation.catalogue import CATALOGUE, entry
-from pipistrelle.scripting.arguments import GROUPS, WORLD, mission_settings, named_filters
+from pipistrelle.scripting.arguments import GROUPS, mission_settings, named_filters
 from pipistrelle.settings import (
     CALLERS,
+    WORLD_KEY,
     Given,
     Key,
     Layer,
@@ -190,7 +191,7 @@ def mission_config(options: MissionOptions) -> tuple[Config, "World | None"]:
     480
     """
     short: Layer = {
-        WORLD: Given(options.world and str(options.world), "--world"),
+        WORLD_KEY: Given(options.world and str(options.world), "--world"),
         ("scenario", "landmarks"): Given(options.landmarks, "--landmarks"),
         ("receiver", "engine"): Given(options.engine, "--engine"),
         ("fastslam", "particles"): Given(options.particles, "--particles"),

@@ -14,10 +14,9 @@ from pipistrelle.config import Config, Strategy
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.hearing.world import ANY, World
 from pipistrelle.experiments.hearing.world_folder import laid_over
-from pipistrelle.settings import Given, Key, Layer, from_flags, resolve
+from pipistrelle.settings import RADIUS_KEY, WORLD_KEY, Given, Key, Layer, from_flags, resolve
 
-RADIUS = "emitter.radius"
-WORLD = "scenario.world"
+RADIUS, WORLD = ".".join(RADIUS_KEY), ".".join(WORLD_KEY)
 MOST_CASES = 2**15 - 1
 """Largest number of cases, so that their numbers fit the column of the tables."""
 MOST_WORLDS = 1_000_000

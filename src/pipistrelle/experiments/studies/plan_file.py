@@ -44,6 +44,7 @@ from pipistrelle.settings import (
     Key,
     Layer,
     beside,
+    derived,
     from_flags,
     known_settings,
     leaves,
@@ -298,11 +299,10 @@ def plan_settings(plan: Plan) -> dict[str, Any]:
     >>> plan_settings(read_plan(find_plan("paper")))["iterations"]
     115
     """
-    settings = {
-        ".".join(key): value for key, value in leaves(_as_table(plan)) if key != ("planned",)
-    }
+    table = {".".join(key): value for key, value in leaves(_as_table(plan)) if key != ("planned",)}
     worlds = {f"worlds/{name}": _digest(world) for name, world in plan.worlds.items()}
-    return settings | worlds | {"config.air.speed_of_sound": plan.config.air.sound_speed}
+    values = {f"config.{'.'.join(key)}": value for key, value in derived(plan.config).items()}
+    return table | worlds | values
 
 
 def _worded(table: Mapping[str, Any], name: str) -> str:

@@ -30,7 +30,7 @@ from pipistrelle.report.studied import (
     samples,
 )
 from pipistrelle.report.variables import setting_variable, width_name
-from pipistrelle.settings import known_settings
+from pipistrelle.settings import derived, known_settings
 
 
 def exclusion_rows(study: Study) -> list[dict[str, Any]]:
@@ -190,7 +190,7 @@ def _asked(config: Config, grid: Mapping[str, Sequence[Any]]) -> dict[str, Any]:
         for part in key:
             value = value[part]
         found[".".join(key)] = value
-    found["air.speed_of_sound"] = config.air.sound_speed
+    found |= {".".join(key): value for key, value in derived(config).items()}
     del found["seed"]
     varied = {name: setting_variable(name, values).given for name, values in grid.items()}
     return found | {RADIUS: [found[RADIUS]]} | {name: [*given] for name, given in varied.items()}
