@@ -245,11 +245,11 @@ def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
-def to_toml(config: Config) -> str:
-    """Write all settings as a TOML file, each with its meaning and unit.
+def to_toml(config: BaseModel) -> str:
+    """Write settings as a TOML file, each with its meaning and unit.
 
-    The text reads back as the same settings. A setting that is derived unless it is given, and
-    is not given, is a remark.
+    `config`: all settings, or some sections of them. The text reads back as the same settings. A
+    setting that is derived unless it is given, and is not given, is a remark.
 
     >>> tomllib.loads(to_toml(Config(seed=3)))["seed"]
     3
@@ -257,6 +257,8 @@ def to_toml(config: Config) -> str:
     lines: list[str] = []
     for key in known_settings():
         *sections, leaf = key
+        if key[0] not in type(config).model_fields:
+            continue
         table: Any = config
         for section in sections:
             table = getattr(table, section)
@@ -267,7 +269,7 @@ def to_toml(config: Config) -> str:
             continue  # a table each, at the end
         assignment = f"# {leaf} =" if value is None else f"{leaf} = {json.dumps(value)}"
         lines.append(_remarked(assignment, known_settings()[key]))
-    for caller in config.callers or ():
+    for caller in getattr(config, "callers", None) or ():
         table = caller.model_dump(mode="json", exclude_none=True)
         fields = type(caller).model_fields
         lines += ["", f"# {type(caller).__doc__}", "[[callers]]"]

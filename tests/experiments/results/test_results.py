@@ -13,7 +13,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipistrelle.config import Config, InputError, Section
+from pipistrelle.config import AirConfig, Config, InputError, Section
 from pipistrelle.estimation.beliefs import Gaussian, Track
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.evaluation.accuracy import alignment, moved, position_error, rmse
@@ -269,13 +269,18 @@ def test_the_settings_come_back_from_the_folder(tmp_path):
     assert summary["config_hash"] == config_hash(again) != config_hash(Config())
 
 
-def test_settings_that_are_none_are_left_out(tmp_path):
+def test_settings_that_are_none_and_sections_that_are_not_there_are_left_out(tmp_path):
     class Recorded(Section):
-        beamwidth_deg: float | None = None
-        gate: float = 0.999
+        seed: int = 5
+        air: AirConfig = AirConfig(relative_humidity=0.3)
 
     write(tmp_path, trial(drifting_track()), config=Recorded())
-    assert tomllib.loads((tmp_path / "config.toml").read_text()) == {"gate": 0.999}
+    text = (tmp_path / "config.toml").read_text()
+    kept = tomllib.loads(text)
+    assert list(kept) == ["seed", "air"]
+    assert kept["air"]["relative_humidity"] == 0.3
+    assert "speed_of_sound" not in kept["air"]
+    assert "# speed_of_sound =" in text
 
 
 def test_the_scores_follow_from_the_tables(tmp_path):

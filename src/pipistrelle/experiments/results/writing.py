@@ -28,6 +28,7 @@ from pipistrelle.experiments.results.tables import (
     tum_text,
 )
 from pipistrelle.own_files import OwnFiles, drawn_files
+from pipistrelle.settings import to_toml
 from pipistrelle.version import find_version
 
 if TYPE_CHECKING:
@@ -96,7 +97,7 @@ def write_results(
 ) -> None:
     """Write everything into a result folder, in place of earlier results: all of it, or nothing.
 
-    Settings that are None are left out of ``config.toml``; `beside` holds other files, by their
+    `beside` holds other files, by their
     names in the folder, and `draw` is given a folder to draw the pictures into.
 
     >>> import tempfile
@@ -109,16 +110,13 @@ def write_results(
     ...     sorted(path.name for path in Path(name).iterdir())
     ['README.md', 'SHA256SUMS', 'config.toml', 'summary.json']
     """
-    import tomli_w
-
-    settings = config.model_dump(mode="json", exclude_none=True)
     parts = {
         "online": ONLINE if any(trial.online for trial in trials) else "",
         "log": "" if log is None else LOG,
         "callers": CALLERS if any(trial.track.callers for trial in trials) else "",
     }
     readme = README.format(command=command, version=find_version(), seed=seed, **parts)
-    files: dict[str, str | bytes] = {"config.toml": tomli_w.dumps(settings), "README.md": readme}
+    files: dict[str, str | bytes] = {"config.toml": to_toml(config), "README.md": readme}
     files |= _texts(trials, truth, moving)
     for name, table in tables_of(trials, truth, callers).items():
         buffer = io.BytesIO()
