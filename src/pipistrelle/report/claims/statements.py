@@ -4,16 +4,17 @@ A claim falls into parts, each part into statements, and all statements of a cla
 one family (`pipistrelle.evaluation.comparison`). So a claim speaks of the paper's two filters and
 of no other that a study has: each further statement would make the paper's own harder to prove.
 What a study has no cases for, it says nothing of: such a part is empty. `CLAIMS`, at the end, is
-the only list of them; to add a claim, write its parts and give it its sentence there.
+the only list of them; to add a claim, give it there its sentence and its parts, most of which are
+differences of a score between two ways (`_compare`).
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from pipistrelle.config import STRATEGIES
+from pipistrelle.config import STRATEGIES, Strategy
 from pipistrelle.evaluation.comparison import Statement
 from pipistrelle.report.claims.contrasts import approach, curves, departure, differences, lap_fit
 from pipistrelle.report.claims.published import (
@@ -25,7 +26,9 @@ from pipistrelle.report.claims.published import (
     cell_of,
     row_name,
 )
-from pipistrelle.report.studied import COMMON, HEADING, POSITION, Selection, samples
+from pipistrelle.report.studied import COMMON, HEADING, POSITION, Selection, Way, samples
+
+SEEN = "landmarks_total"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,8 +47,8 @@ class Claim:
     """A claim of the paper: its sentence, its parts and how they are made from a study."""
 
     sentence: str
-    parts: Callable[[Selection], list[Part]]
-    """Gives the parts of the claim, of the worlds that the selection counts."""
+    parts: tuple[Callable[[Selection], list[Part]], ...]
+    """Each gives parts of the claim, of the worlds that the selection counts."""
 
 
 def counts_as_printed(selection: Selection) -> list[Part]:
@@ -122,205 +125,152 @@ def ekf_more_consistent(selection: Selection) -> list[Part]:
     ]
 
 
-def ekf_more_accurate(selection: Selection) -> list[Part]:
-    """Claim 3: EKF's position RMSE is lower than FastSLAM's everywhere, and passive is worst.
-
-    Returns: each filter's beamwidths: EKF against FastSLAM by strategy, passive against the others.
-
-    Bradley & Abaid, Sec. V-C.
-    """
-    lower, worst = [], []
-    for way in STRATEGIES:
-        pair = ("fastslam", way), ("ekf", way)
-        lower += differences(selection, POSITION, *pair, name=way)
-    for name in FILTERS:
-        for way in ("active", "fused"):
-            label = f"{FILTERS[name]}, {way}"
-            worst += differences(selection, POSITION, (name, "passive"), (name, way), name=label)
-    return [
-        Part(
-            sentence="Position RMSE: FastSLAM 2.0 minus EKF is above 0",
-            unit="m",
-            statements=tuple(lower),
-        ),
-        Part(
-            sentence="Position RMSE: passive minus active, and minus fused, is above 0",
-            unit="m",
-            statements=tuple(worst),
-        ),
-    ]
-
-
-def ekf_gains_by_fusing(selection: Selection) -> list[Part]:
-    """Claim 4: with the EKF, fused beats active at narrow beams on average, in heading always.
-
-    Returns: position at the narrow beamwidths, heading at all of them.
-
-    Bradley & Abaid, Sec. V-C and Appendix A.
-    """
-    pair, name = (("ekf", "active"), ("ekf", "fused")), "EKF"
-    position = differences(
-        selection, POSITION, *pair, name=name, relation="slightly above", below=CROSSING
-    )
-    heading = differences(selection, HEADING, *pair, name=name)
-    return [
-        Part(
-            sentence="Position RMSE below 42°: active minus fused is above 0, not significantly",
-            unit="m",
-            statements=tuple(position),
-        ),
-        Part(
-            sentence="Heading RMSE: active minus fused is above 0",
-            unit="rad",
-            statements=tuple(heading),
-        ),
-    ]
-
-
-def fastslam_never_gains(selection: Selection) -> list[Part]:
-    """Claim 5: with FastSLAM 2.0, fused never beats active in position.
-
-    Returns: one, a statement per beamwidth.
-
-    Bradley & Abaid, Sec. V-C.
-    """
-    pair, name = (("fastslam", "active"), ("fastslam", "fused")), FILTERS["fastslam"]
-    never = differences(selection, POSITION, *pair, name=name, relation="not above")
-    sentence = "Position RMSE: active minus fused is not significantly above 0"
-    return [Part(sentence=sentence, unit="m", statements=tuple(never))]
-
-
-def fused_tends_to_passive(selection: Selection) -> list[Part]:
-    """Claim 6: the narrower the beam, the nearer fused comes to passive.
-
-    Returns: the slope, and the narrowest beam; a statement per filter in each.
-
-    Bradley & Abaid, Sec. V-C.
-    """
-    slopes, ends = [], []
-    for name, label in FILTERS.items():
-        if (slope := approach(selection, POSITION, name)) is not None:
-            slopes.append(Statement(label=label, sample=slope))
-        pair = (name, "passive"), (name, "fused")
-        ends += differences(selection, POSITION, *pair, name=label, relation="within", sigma=True)[
-            :1
-        ]
+def _nears_passive(selection: Selection) -> list[Part]:
+    """Return the part on how the distance from fused to passive grows with the beamwidth."""
+    slopes = {label: approach(selection, POSITION, name) for name, label in FILTERS.items()}
     return [
         Part(
             sentence="Position RMSE: the distance between fused and passive grows with the "
             "beamwidth; its slope per doubling is above 0",
             unit="m",
-            statements=tuple(slopes),
-        ),
-        Part(
-            sentence="Position RMSE at the narrowest beam: passive minus fused lies within σ",
-            unit="m",
-            statements=tuple(ends),
-        ),
-    ]
-
-
-def maps_never_gain(selection: Selection) -> list[Part]:
-    """Claim 7: fused never beats active in map RMSE, and is within about one sigma.
-
-    Over the landmarks seen by all strategies, "most of the time".
-
-    Returns: never better, and mostly near; a statement per filter and beamwidth in each.
-
-    Bradley & Abaid, Sec. V-D.
-    """
-    never, within = [], []
-    for name, label in FILTERS.items():
-        pair = (name, "active"), (name, "fused")
-        never += differences(selection, COMMON, *pair, name=label, relation="not above")
-        within += differences(selection, COMMON, *pair, name=label, relation="within", sigma=True)
-    return [
-        Part(
-            sentence="Map RMSE: active minus fused is not significantly above 0",
-            unit="m",
-            statements=tuple(never),
-        ),
-        Part(
-            sentence="Map RMSE: at most beamwidths, active minus fused lies within σ",
-            unit="m",
-            need="most",
-            statements=tuple(within),
-        ),
-    ]
-
-
-def passive_sees_more(selection: Selection) -> list[Part]:
-    """Claim 8: passive sees more landmarks than active, by more than one sigma only below 65 deg.
-
-    Returns: at all beamwidths; at those below 65 degrees; and, which the paper's "below" says as
-    well, at the others. A statement per filter and beamwidth.
-
-    Bradley & Abaid, Sec. V-E.
-    """
-    more, far, near, score = [], [], [], "landmarks_total"
-    for name, label in FILTERS.items():
-        pair = (name, "passive"), (name, "active")
-        more += differences(selection, score, *pair, name=label, fitted=lambda width: width > 179.0)
-        far += differences(selection, score, *pair, name=label, below=NARROW, sigma=True)
-        near += differences(
-            selection, score, *pair, name=label, relation="not above", above=NARROW, sigma=True
+            statements=tuple(
+                Statement(label=label, sample=slope)
+                for label, slope in slopes.items()
+                if slope is not None
+            ),
         )
-    return [
-        Part(
-            sentence="Landmarks seen: passive minus active is above 0",
-            unit="landmarks",
-            statements=tuple(more),
-        ),
-        Part(
-            sentence="Landmarks seen below 65°: passive minus active is above σ",
-            unit="landmarks",
-            statements=tuple(far),
-        ),
-        Part(
-            sentence="Landmarks seen from 65° on: passive minus active is not significantly "
-            "above σ",
-            unit="landmarks",
-            statements=tuple(near),
-        ),
     ]
 
+
+Pairs = tuple[tuple[str, Way, Way], ...]
+
+
+def _by_filter(first: Strategy, second: Strategy) -> Pairs:
+    """Pair two strategies with each filter, under the filter's title."""
+    return tuple((label, (name, first), (name, second)) for name, label in FILTERS.items())
+
+
+def _compare(
+    sentence: str,
+    unit: str,
+    score: str,
+    pairs: Pairs,
+    *,
+    need: Literal["all", "most"] = "all",
+    narrowest: bool = False,
+    **options: Any,
+) -> Callable[[Selection], list[Part]]:
+    """Return the part whose statements are differences of a score, first minus second of each pair.
+
+    `narrowest`: of each pair only the narrowest beam; `options`: of `contrasts.differences`.
+    """
+    most = 1 if narrowest else None
+
+    def part(selection: Selection) -> list[Part]:
+        statements = [
+            statement
+            for label, *pair in pairs
+            for statement in differences(selection, score, *pair, name=label, **options)[:most]
+        ]
+        return [Part(sentence=sentence, unit=unit, need=need, statements=tuple(statements))]
+
+    return part
+
+
+_EKF = (("EKF", ("ekf", "active"), ("ekf", "fused")),)
+_FASTSLAM = ((FILTERS["fastslam"], ("fastslam", "active"), ("fastslam", "fused")),)
+_TWO_FILTERS = tuple((way, ("fastslam", way), ("ekf", way)) for way in STRATEGIES)
+_OVER_PASSIVE = tuple(
+    (f"{label}, {way}", (name, "passive"), (name, way))
+    for name, label in FILTERS.items()
+    for way in ("active", "fused")
+)
+_OVER_FUSED, _OVER_ACTIVE = _by_filter("passive", "fused"), _by_filter("passive", "active")
+_GAINS = _by_filter("active", "fused")
 
 CLAIMS = (
     Claim(
         sentence="Landmarks, in total and fully initialised, number as in Table II, within its σ.",
-        parts=counts_as_printed,
+        parts=(counts_as_printed,),
     ),
     Claim(
         sentence="EKF-SLAM is more consistent than FastSLAM 2.0; ANEES swings with the laps and "
         "rises.",
-        parts=ekf_more_consistent,
+        parts=(ekf_more_consistent,),
     ),
     Claim(
         sentence="EKF-SLAM has the lower position RMSE everywhere; passive sensing has the "
         "highest.",
-        parts=ekf_more_accurate,
+        parts=(
+            _compare(
+                "Position RMSE: FastSLAM 2.0 minus EKF is above 0", "m", POSITION, _TWO_FILTERS
+            ),
+            _compare(
+                "Position RMSE: passive minus active, and minus fused, is above 0",
+                "m", POSITION, _OVER_PASSIVE,
+            ),
+        ),
     ),
     Claim(
         sentence="With EKF-SLAM, fused beats active in position below about 42°, on average but "
         "not significantly, and in heading at every beamwidth.",
-        parts=ekf_gains_by_fusing,
+        parts=(
+            _compare(
+                "Position RMSE below 42°: active minus fused is above 0, not significantly",
+                "m", POSITION, _EKF, relation="slightly above", below=CROSSING,
+            ),
+            _compare("Heading RMSE: active minus fused is above 0", "rad", HEADING, _EKF),
+        ),
     ),
     Claim(
         sentence="With FastSLAM 2.0, fused never beats active in position.",
-        parts=fastslam_never_gains,
+        parts=(
+            _compare(
+                "Position RMSE: active minus fused is not significantly above 0",
+                "m", POSITION, _FASTSLAM, relation="not above",
+            ),
+        ),
     ),
     Claim(
         sentence="Fused tends to passive as the beam narrows.",
-        parts=fused_tends_to_passive,
+        parts=(
+            _nears_passive,
+            _compare(
+                "Position RMSE at the narrowest beam: passive minus fused lies within σ",
+                "m", POSITION, _OVER_FUSED, narrowest=True, relation="within", sigma=True,
+            ),
+        ),
     ),
     Claim(
         sentence="In map RMSE, fused never beats active, and is within about one σ.",
-        parts=maps_never_gain,
+        parts=(
+            _compare(
+                "Map RMSE: active minus fused is not significantly above 0",
+                "m", COMMON, _GAINS, relation="not above",
+            ),
+            _compare(
+                "Map RMSE: at most beamwidths, active minus fused lies within σ",
+                "m", COMMON, _GAINS, need="most", relation="within", sigma=True,
+            ),
+        ),
     ),
     Claim(
         sentence="Passive sees more landmarks than active at every beamwidth, by more than σ "
         "only below 65°.",
-        parts=passive_sees_more,
+        parts=(
+            _compare(
+                "Landmarks seen: passive minus active is above 0",
+                "landmarks", SEEN, _OVER_ACTIVE, fitted=lambda width: width > 179.0,
+            ),
+            _compare(
+                "Landmarks seen below 65°: passive minus active is above σ",
+                "landmarks", SEEN, _OVER_ACTIVE, below=NARROW, sigma=True,
+            ),
+            _compare(
+                "Landmarks seen from 65° on: passive minus active is not significantly above σ",
+                "landmarks", SEEN, _OVER_ACTIVE, relation="not above", above=NARROW, sigma=True,
+            ),
+        ),
     ),
-)
+)  # fmt: skip
 """Those of Bradley & Abaid, Sec. V, in its order, which numbers them."""

@@ -78,7 +78,7 @@ def judge_claims(
     judged = []
     for number, claim in enumerate(claims, start=1):
         by_rule = {
-            rule: _judged(claim.parts(selection), confidence)
+            rule: _judged([part for make in claim.parts for part in make(selection)], confidence)
             for rule, selection in selections.items()
         }
         parts = zip(*(judgement.parts for judgement in by_rule.values()), strict=True)
