@@ -1,7 +1,6 @@
 """Associations that are not in the package: a class in the folder labels what nobody labelled."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -99,20 +98,6 @@ class Joint:
 '''
 
 
-@pytest.fixture
-def written(tmp_path, monkeypatch):
-    """Write a module into the current folder and return its name, a new one each time."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [*sys.path])
-
-    def written(text):
-        name = f"own_{tmp_path.name}_{len(list(tmp_path.glob('*.py')))}".replace("-", "_")
-        Path(f"{name}.py").write_text(text)
-        return name
-
-    return written
-
-
 def config_of(method, **sections):
     """Return the settings of a mission of 20 frames with timing, and an association."""
     return Config(
@@ -156,7 +141,7 @@ def test_an_association_of_a_class_maps_a_mission_a_study_and_its_log(written):
     )
     assert own["position_bound_m"] == known["position_bound_m"]
     assert own["map_rmse_m"] is again["map_rmse_m"] is None
-    assert "own_" in Path("own/config.toml").read_text()
+    assert method[1] in Path("own/config.toml").read_text()
     for folder in ("own", "again"):
         drawn = pl.read_csv(f"{folder}/map_fused_iekf.csv", comment_prefix="#")
         assert 1000 in drawn["landmark"].to_list(), "the caller is on the map by its direct call"
