@@ -83,7 +83,7 @@ class Section(BaseModel):
     )
 
 
-MOST_OTHERS = 7
+MAX_OTHERS = 7
 """Callers besides the vehicle that a recording can tell apart."""
 
 
@@ -113,7 +113,7 @@ class ScenarioConfig(Section):
     """Nominal steering angle [rad]."""
     start: tuple[Real, Real, Real] = (0.0, -7.408, 0.0)
     """True start: x, y [m], heading [rad]; unreported: the noise-free path circles the centre."""
-    vehicle: Annotated[int, Field(ge=1, le=1 + MOST_OTHERS)] = 1
+    vehicle: Annotated[int, Field(ge=1, le=1 + MAX_OTHERS)] = 1
     """Whose mission it is: of 2 on, callers with `course = "mission"`, in their order."""
     course: Literal["circle", "eight", "corridor", "lawn-mower"] = "circle"
     """A circle by constant controls, or another shape, for which a driver steers."""
@@ -507,7 +507,7 @@ class Config(Section):
 
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 7
     """Seed of every random stream."""
-    callers: Annotated[tuple[CallerConfig, ...], Field(max_length=MOST_OTHERS)] | None = Field(
+    callers: Annotated[tuple[CallerConfig, ...], Field(max_length=MAX_OTHERS)] | None = Field(
         None, json_schema_extra=TABLES
     )
     """The callers besides the vehicle, a table each; the paper's beacon by default."""

@@ -24,7 +24,7 @@ from pydantic.fields import FieldInfo
 from pipistrelle.config import (
     BEAM,
     FOLDER,
-    MOST_OTHERS,
+    MAX_OTHERS,
     TABLES,
     CallerConfig,
     Config,
@@ -418,7 +418,7 @@ def _caller_problem(error: Any, given: Given) -> str:
             return f"{where}: {expected}"
         if error["type"] == "too_long":
             found = f"{len(error['input'])} callers"
-            return f"{where}: found {found}, expected at most {MOST_OTHERS} besides the vehicle"
+            return f"{where}: found {found}, expected at most {MAX_OTHERS} besides the vehicle"
         tables = "a list of tables, one for each caller, as [{frequency = 30e3}]"
         return f"{where}: found {shown(error['input'])}, expected {tables}"
     where, caller = f"{where}.{inner[0] + 1}", given.value[inner[0]]

@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 
 from pipistrelle.figures.closeup import (
     MARGIN,
-    NARROWEST,
+    MIN_REACH,
+    PATH_POSES,
     SIDE,
-    TAIL,
     Closeup,
     _free_corner,
     _reach,
@@ -51,11 +51,11 @@ def test_one_wild_or_infinite_cloud_does_not_change_the_window():
     lost = np.full_like(CLOUD, np.nan)
     assert _reach([*ordinary, lost]) == _reach(ordinary)
     assert _reach([*ordinary, 1e6 * CLOUD]) < 1.01 * _reach(ordinary)
-    assert _reach([lost]) == NARROWEST
+    assert _reach([lost]) == MIN_REACH
 
 
 def test_particles_in_one_place_have_a_window_that_can_be_drawn():
-    assert _reach([np.tile(CLOUD[0], (5, 1)), CLOUD[:1]]) == NARROWEST
+    assert _reach([np.tile(CLOUD[0], (5, 1)), CLOUD[:1]]) == MIN_REACH
 
 
 @pytest.mark.parametrize("size", [WIDE, TALL])
@@ -104,12 +104,12 @@ def test_particles_that_are_lost_are_not_drawn_and_a_lost_vehicle_changes_nothin
 
 
 def test_true_pose_and_path_are_shown_where_they_are_known():
-    path = np.cumsum(np.full((2 * TAIL, 3), 0.01), axis=0)
+    path = np.cumsum(np.full((2 * PATH_POSES, 3), 0.01), axis=0)
     true = path + np.array([0.0, 0.1, 0.0])
     closeup = closeup_of(CLOUD, path, true)
     assert len(darts(closeup._vehicles)) == 2
-    assert np.array_equal(closeup._path.get_xydata(), path[-TAIL:, :2])
-    assert np.array_equal(closeup._true.get_xydata(), true[-TAIL:, :2])
+    assert np.array_equal(closeup._path.get_xydata(), path[-PATH_POSES:, :2])
+    assert np.array_equal(closeup._true.get_xydata(), true[-PATH_POSES:, :2])
     true[-1] = np.nan
     assert len(darts(closeup_of(CLOUD, path, true)._vehicles)) == 1
     assert len(darts(closeup_of(CLOUD, path, true[:0])._vehicles)) == 1

@@ -9,8 +9,8 @@ from pipistrelle.detection.scans import UNLABELLED, make_scan
 from pipistrelle.estimation.beliefs import some_of
 from pipistrelle.estimation.measurement import excess_path_of
 from pipistrelle.figures.excess_paths import (
-    MOST,
-    RECENT,
+    MAX_ELLIPSES,
+    RECENT_FRAMES,
     callers_at,
     callers_believed,
     callers_marked,
@@ -71,8 +71,8 @@ def test_of_three_excess_paths_two_are_drawn_that_cross_most_squarely():
     frame = frame_of({5: 1}, [(5, 2), (5, 3), (5, 1)])
     rows = excess_paths_at(frame)[5]
     assert len(rows) == 3
-    assert 1 in frame.scan.caller[rows[:MOST]], "two and three stand beside each other"
-    assert len(drawn_excess_paths(frame, 5)[0]) == MOST == 2
+    assert 1 in frame.scan.caller[rows[:MAX_ELLIPSES]], "two and three stand beside each other"
+    assert len(drawn_excess_paths(frame, 5)[0]) == MAX_ELLIPSES == 2
     assert len(drawn_excess_paths(frame_of({5: 1}, [(5, 2), (5, 3)]), 5)[0]) == 2
 
 
@@ -106,9 +106,9 @@ def test_what_is_placed_now_goes_before_a_ray_and_a_ray_before_what_was_placed()
 
 
 def test_a_landmark_is_shown_for_a_while_after_excess_paths_have_placed_it():
-    frames = [frame_of({5: 4}, [(5, 1)])] + [frame_of({5: 1}, [(5, 1)])] * (RECENT + 9)
+    frames = [frame_of({5: 4}, [(5, 1)])] + [frame_of({5: 1}, [(5, 1)])] * (RECENT_FRAMES + 9)
     shown = [label == 5 for label in resolved(frames)]
-    assert shown == [True] * (RECENT + 2) + [False] * 8
+    assert shown == [True] * (RECENT_FRAMES + 2) + [False] * 8
 
 
 def test_a_landmark_that_a_range_has_placed_is_none_that_excess_paths_resolve():

@@ -62,7 +62,7 @@ def test_compiling_is_told_of_when_kernels_are_compiled(obey, undrawn, monkeypat
 def test_an_estimate_far_from_its_bound_is_told_of_once(obey, undrawn, monkeypatch):
     words = ("run", *SHORT, "--strategy", "fused", "--filter", "ekf,iekf", "--quiet", "-o")
     assert "times the bound" not in obey(*words, "one")[2]
-    monkeypatch.setattr(missions, "FAR", 0.0)
+    monkeypatch.setattr(missions, "MAX_TIMES_BOUND", 0.0)
     said = obey(*words, "two")[2].splitlines()
     runs = summary("two")["runs"]
     assert [run["filter"] for run in runs] == ["ekf", "iekf"]

@@ -16,11 +16,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.config import MOST_OTHERS, Config, InputError
+from pipistrelle.config import MAX_OTHERS, Config, InputError
 
 VEHICLE = 0
 """Where the vehicle stands in every list of callers."""
-MAX_CALLERS = 1 + MOST_OTHERS
+MAX_CALLERS = 1 + MAX_OTHERS
 """Callers that one recording can tell apart."""
 
 

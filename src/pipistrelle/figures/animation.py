@@ -49,7 +49,7 @@ WIDTH, LEFT, RIGHT, TOP, BOTTOM, GAP, LINE = 3.66, 0.58, 0.12, 0.58, 0.54, 0.16,
 """Of a panel; margins, the space between panels and a line of the legend [inch]."""
 DPI = 100
 """Pixels per inch."""
-FLASH = 4
+RINGED_PICTURES = 4
 """Pictures during which a landmark that has turned full is ringed."""
 
 
@@ -362,12 +362,12 @@ class _Panel:
                 for i in rows.landmark[full].tolist()
             ]
         )
-        young = age < FLASH
+        young = age < RINGED_PICTURES
         radius = 0.016 * self.size * (1.0 + 0.6 * age[young])
         circles = radius[:, None, None] ** 2 * np.eye(2)
         self.rings.set(
             verts=ellipses(rows.mean[full][young], circles, RAY),
-            edgecolor=shades(self.colour, 1.0 - age[young] / FLASH, most=1.0),
+            edgecolor=shades(self.colour, 1.0 - age[young] / RINGED_PICTURES, most=1.0),
         )
         rays = len(np.unique(rows.landmark[~full]))
         self.line.set_text(f"{np.sum(full)} placed · {rays} unresolved")

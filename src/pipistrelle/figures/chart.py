@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.figures.style import COLUMNS
+from pipistrelle.figures.style import MAX_COLUMNS
 
 if TYPE_CHECKING:
     from matplotlib.ticker import Locator
@@ -232,17 +232,17 @@ def ends(found: Iterable[Series]) -> list[float]:
 def columns_of(count: int) -> int:
     """Tell how many panels stand beside each other.
 
-    `count`: panels of the chart. Returns: all, up to `style.COLUMNS`; of more, as many as that if
-    they fill their rows, else two.
+    `count`: panels of the chart. Returns: all, up to `style.MAX_COLUMNS`; of more, as many
+    as that if they fill their rows, else two.
 
     Examples
     --------
     >>> [columns_of(count) for count in (1, 3, 4, 6)]
     [1, 3, 2, 3]
     """
-    if count <= COLUMNS:
+    if count <= MAX_COLUMNS:
         return count
-    return 2 if count % COLUMNS else COLUMNS
+    return 2 if count % MAX_COLUMNS else MAX_COLUMNS
 
 
 def legend_series(panels: Iterable[Panel]) -> dict[str, Series]:

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 SIDE, MARGIN = 0.25, 0.015
 """Of the window, and its distance from the corner, as shares of the map's width."""
-NARROWEST = 0.05
+MIN_REACH = 0.05
 """Least reach of a window [m]: particles may coincide."""
-TAIL = 60
+PATH_POSES = 60
 """Poses of a path that a window shows."""
 
 
@@ -82,9 +82,9 @@ class Closeup:
         self._leader.set_data(*np.stack([pose[:2], corner]).T)
         for axis, middle in zip("xy", pose, strict=False):
             self._window.set(**{f"{axis}lim": (middle - self._reach, middle + self._reach)})
-        self._path.set_data(*path[-TAIL:, :2].T)
+        self._path.set_data(*path[-PATH_POSES:, :2].T)
         self._darts.set_verts([vehicle(particle, 0.24 * self._reach) for particle in cloud])
-        true = path[:0] if true_path is None else true_path[-TAIL:]
+        true = path[:0] if true_path is None else true_path[-PATH_POSES:]
         self._true.set_data(*true[:, :2].T)
         seen = [pose, *(last for last in true[-1:] if np.isfinite(last).all())]
         self._vehicles.set_verts([vehicle(dart, 0.34 * self._reach) for dart in seen])
@@ -139,7 +139,7 @@ def _reach(clouds: Sequence[Float[np.ndarray, "p 3"]]) -> float:
     """
     points = [cloud[:, :2] for cloud in clouds if np.isfinite(cloud).all()]
     extents = [np.quantile(np.abs(p - p.mean(axis=0)).max(axis=1), 0.95) for p in points]
-    return max(2.0 * float(np.median(extents)), NARROWEST) if extents else NARROWEST
+    return max(2.0 * float(np.median(extents)), MIN_REACH) if extents else MIN_REACH
 
 
 def _free_corner(

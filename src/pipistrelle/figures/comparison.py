@@ -22,7 +22,7 @@ RUNS = ("#0b6e69", "#c8501e", "#6a3fa0", "#7d8a12", "#b03a7a", "#2f6db3")
 DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.2, 1.4)), (0, (6, 2, 1.2, 2)))
 WIDTH, ROW, REST = 12.0, 3.7, 0.75
 """Of a figure of paths [inch]: its width, the height of an estimate, and what is left for words."""
-SURE = 0.05
+SIGNIFICANCE = 0.05
 """A point is full where p is below, as one of all cases."""
 
 
@@ -201,7 +201,7 @@ def _draw_case(axes: "Axes", case: ComparedCase, place: float) -> None:
     for bounds, width in ((finding.family, 0.9), (finding.alone, 2.6)):
         if np.isfinite(bounds).all():
             axes.hlines(place, *bounds, color=colour, lw=width, zorder=2)
-    face = colour if finding.p < SURE else "white"
+    face = colour if finding.p < SIGNIFICANCE else "white"
     axes.plot(finding.mean, place, "o", ms=4.6, mfc=face, mec=colour, zorder=3)
 
 

@@ -16,9 +16,9 @@ from pipistrelle.estimation.beliefs import Gaussian, Landmarks, joined, placed
 from pipistrelle.figures.outlines import excess_path_ellipse
 from pipistrelle.figures.recorder import Snapshot
 
-MOST = 2
+MAX_ELLIPSES = 2
 """Ellipses that are shown at a time."""
-RECENT = 40
+RECENT_FRAMES = 40
 """Frames for which a landmark is shown that excess paths have placed: each frame's ellipses cross
 there, wherever the vehicle goes."""
 
@@ -90,7 +90,7 @@ def _squarest(
     An ellipse's normal there halves the angle between the ways to its foci:
     :math:`(l - b)/|l - b| + (l - p)/|l - p|`.
     """
-    if len(rows) <= MOST:
+    if len(rows) <= MAX_ELLIPSES:
         return np.array(rows)
     here = frame.landmarks.landmark == label
     spot = frame.landmarks.mean[here][np.argmax(frame.landmarks.weight[here])]
@@ -111,8 +111,8 @@ def resolved(frames: Sequence[Snapshot]) -> list[int]:
     """Choose for each frame the landmark whose excess paths are shown.
 
     The one that the frame's excess paths have just placed; else the ray of the fewest members that
-    they weigh; else the one that they placed last, `RECENT` frames ago at most. Of several the one
-    that was shown before, or that has two excess paths.
+    they weigh; else the one that they placed last, `RECENT_FRAMES` frames ago at most. Of several
+    the one that was shown before, or that has two excess paths.
 
     `frames`: in the order of time. Returns: `UNLABELLED` where there is none.
 
@@ -134,14 +134,14 @@ def resolved(frames: Sequence[Snapshot]) -> list[int]:
                 since[label] = now
         ranks = {}
         for label, rows in ellipses_of.items():
-            age = now - since.get(label, -RECENT - 1)
+            age = now - since.get(label, -RECENT_FRAMES - 1)
             if members[label] > 1:
                 rank = (1, members[label])
-            elif age <= RECENT:
+            elif age <= RECENT_FRAMES:
                 rank = (2 if age else 0, age)
             else:
                 continue
-            ranks[label] = (*rank, label != shown, -min(len(rows), MOST), label)
+            ranks[label] = (*rank, label != shown, -min(len(rows), MAX_ELLIPSES), label)
         shown = min(ranks, key=lambda label: ranks[label], default=UNLABELLED)
         found.append(shown)
     return found
@@ -155,7 +155,7 @@ def drawn_excess_paths(
     Returns [m]: two at most. Returns [m]: from the caller to the likeliest place of the landmark
     and on to the vehicle.
     """
-    rows = excess_paths_at(frame).get(label, ())[:MOST]
+    rows = excess_paths_at(frame).get(label, ())[:MAX_ELLIPSES]
     here = frame.landmarks.landmark == label
     callers, vehicle = callers_at(frame).mean, frame.pose[:2]
     outlines, ways = [], []

@@ -11,7 +11,7 @@ from pipistrelle.estimation.beliefs import Landmarks, placed
 from pipistrelle.estimation.catalogue import title_of
 from pipistrelle.experiments.drives import LabelledPoints, Truth
 from pipistrelle.figures.outlines import PLACED, RAY, beam, ellipses, excess_path_ellipse, vehicle
-from pipistrelle.figures.style import COLUMNS, INK, TRUTH, strategy_colour
+from pipistrelle.figures.style import INK, MAX_COLUMNS, TRUTH, strategy_colour
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -156,7 +156,7 @@ def cells(cases: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
     """Place panels: a column for each strategy and a row for each filter, or line by line.
 
     Returns: line by line where there is one strategy or one filter, or where there are more
-    strategies than `COLUMNS`.
+    strategies than `MAX_COLUMNS`.
 
     Examples
     --------
@@ -166,9 +166,9 @@ def cells(cases: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
     [(0, 0), (0, 1)]
     """
     strategies, filters = (list(dict.fromkeys(names)) for names in zip(*cases, strict=True))
-    if 1 < len(strategies) <= COLUMNS and len(filters) > 1:
+    if 1 < len(strategies) <= MAX_COLUMNS and len(filters) > 1:
         return [(filters.index(name), strategies.index(strategy)) for strategy, name in cases]
-    return [divmod(i, COLUMNS) for i in range(len(cases))]
+    return [divmod(i, MAX_COLUMNS) for i in range(len(cases))]
 
 
 def head(axes: "Axes", strategy: str, estimator: str) -> "Annotation":

@@ -53,7 +53,7 @@ PAGE = {
     },
 }
 """Colours of a page, by the scheme that its reader prefers."""
-COLUMNS = 3
+MAX_COLUMNS = 3
 """Most panels beside each other; further ones start a new row."""
 
 STYLE = {

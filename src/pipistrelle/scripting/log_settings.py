@@ -25,13 +25,13 @@ OWN: dict[Key, str] = {
 """Defaults of a recorded log that differ from those of a simulated mission."""
 TIMING: Key = ("listening", "timing")
 """Key that is on where a log has excess paths, or a caller that moves."""
-SUSPECT = 0.2
+MAX_IGNORED_SHARE = 0.2
 """Share of a log's rows that do not fit above which a warning asks about its units."""
-GATED = 0.01
+MAX_GATED_SHARE = 0.01
 """Share of rows that the gate rejects, beyond what it should, above which a warning is given."""
-SURPRISING = 2.0
+MAX_NIS = 2.0
 """NIS above which a warning is given; below 1 a filter is cautious, as with the paper's noise."""
-SHORT = 0.2
+MIN_EXCESS_PATH = 0.2
 """Excess paths in metres are rarely smaller [m]; in seconds most are."""
 LOGGED = frozenset(
     {
@@ -196,14 +196,16 @@ def fit_warnings(
             notes.append(
                 f"{log}: nothing in it is heard by {trial.strategy} sensing, so it maps nothing"
             )
-        elif turned <= SUSPECT * rows and is_placed(trial):
+        elif turned <= MAX_IGNORED_SHARE * rows and is_placed(trial):
             gated, who = trial.scores.gated, f"{trial.strategy} {name}"
-            if SUSPECT * heard < gated:
+            if MAX_IGNORED_SHARE * heard < gated:
                 notes.append(
                     f"{log}: {gated} of {heard} measurements do not fit what was expected ({who}); "
                     f"are {angles} in radians and {metric} in metres, and all labels right?"
                 )
-            elif (GATED + (expected := 1.0 - gate_of(trial.filter, config))) * heard < gated:
+            elif (
+                MAX_GATED_SHARE + (expected := 1.0 - gate_of(trial.filter, config))
+            ) * heard < gated:
                 notes.append(
                     f"{log}: the gate rejects {gated / heard:.1%} of the measurements ({who}), "
                     f"expected {expected:.1%}: they are less sure than they say, or something was "
@@ -212,7 +214,7 @@ def fit_warnings(
                 )
             elif surprised := nis_warning(trial):
                 notes.append(f"{log}: {surprised}")
-    if turned > SUSPECT * rows:
+    if turned > MAX_IGNORED_SHARE * rows:
         notes.append(f"{log}: {turned} of {rows} bearings are beyond a turn; are they in radians?")
     return notes + _out_of_bounds(recorded, log)
 
@@ -220,7 +222,7 @@ def fit_warnings(
 def nis_warning(trial: "TrialResult") -> str:
     """Warn that innovations are much larger than a filter expects; empty where they are not."""
     nis = trial.scores.nis_mean
-    if nis is None or not SURPRISING < nis < inf:
+    if nis is None or not MAX_NIS < nis < inf:
         return ""
     return (
         f"{trial.strategy} {short_name(trial.filter)}: its innovations are {sqrt(nis):.1f} times "
@@ -242,14 +244,19 @@ def _out_of_bounds(recorded: "Log", log: Path) -> list[str]:
     excess_paths = np.concatenate([scan.excess_path for scan in recorded.scans])
     ranges, excess_paths = ranges[~np.isnan(ranges)], excess_paths[~np.isnan(excess_paths)]
     odd = (
-        ("ranges", (ranges < near) | (ranges > far), SUSPECT, f"not within {bounds}"),
+        ("ranges", (ranges < near) | (ranges > far), MAX_IGNORED_SHARE, f"not within {bounds}"),
         (
             "excess paths",
             excess_paths > 2.0 * far,
-            SUSPECT,
+            MAX_IGNORED_SHARE,
             f"more than twice the far end of {bounds}",
         ),
-        ("excess paths", excess_paths < SHORT, 1.0 - SUSPECT, f"below {SHORT:g} m"),
+        (
+            "excess paths",
+            excess_paths < MIN_EXCESS_PATH,
+            1.0 - MAX_IGNORED_SHARE,
+            f"below {MIN_EXCESS_PATH:g} m",
+        ),
     )
     return [
         f"{log}: {np.count_nonzero(rows)} of {rows.size} {what} are {where}; are {what} in metres?"

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from pipistrelle.figures.recorder import MissionRecorder
 
 
-FAR = 4.0
+MAX_TIMES_BOUND = 4.0
 """Ratio of position error to bound above which a warning is given."""
 Conduct = Callable[..., Mission]
 """Does a mission, given `progress` and `watch`; the same settings give the same bits."""
@@ -78,7 +78,7 @@ def _far_off(trials: Sequence[TrialResult]) -> list[str]:
         f"{error / bound:.1f} times the bound, {bound:.3g} m; what serves each estimator is in "
         "docs/estimators.md"
         for trial, error, bound in pairs
-        if error is not None and bound is not None and FAR * bound < error < inf
+        if error is not None and bound is not None and MAX_TIMES_BOUND * bound < error < inf
     ]
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pipistrelle.experiments.comparing.studies import ComparedCase, ComparedStudies
     from pipistrelle.experiments.comparing.writing import Compared
 
-SURE = 0.05
+SIGNIFICANCE = 0.05
 """A difference is marked if its p, corrected for all cases, is below."""
 
 
@@ -182,7 +182,7 @@ def _case_row(case: "ComparedCase", digits: int, several: bool) -> list[str]:
         *(_number(_known(mean), digits) for mean in means),
         _signed(_known(finding.mean), digits),
         f"{low} to {high}" if known else "-",
-        "*" * (finding.p < SURE) + "~" * (not case.paired),
+        "*" * (finding.p < SIGNIFICANCE) + "~" * (not case.paired),
         " / ".join(map(str, worlds)),
         " / ".join(map(str, case.diverged)) if any(case.diverged) else "",
     ]

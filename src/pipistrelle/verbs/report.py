@@ -25,7 +25,7 @@ def report(
     """Answer a study's question on one page, with its figures; judge the paper's claims by it."""
     from pipistrelle.evaluation.comparison import INTERVALS
     from pipistrelle.report.page.overview import not_the_papers_line
-    from pipistrelle.report.page.page import FEW, write_report
+    from pipistrelle.report.page.page import MIN_WORLDS, write_report
     from pipistrelle.report.reading import read_study
     from pipistrelle.verbs.streams import put, say
 
@@ -45,7 +45,7 @@ def report(
             for table in summary["effect_tables"]:
                 put("\n" + _effects(table))
             put(f"\n*: shown. {INTERVALS}")
-            if (count := summary["worlds_done"]) < FEW:
+            if (count := summary["worlds_done"]) < MIN_WORLDS:
                 worlds = "1 world" if count == 1 else f"{count} worlds"
                 put(f"This is of {worlds}: so few may show what others would not.")
         elif line := not_the_papers_line(summary["not_the_papers"]):

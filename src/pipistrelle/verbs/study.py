@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pipistrelle.experiments.studies.study import StudyProgress
 
 Show = Callable[["StudyProgress"], None]
-EVERY = 10.0
+PROGRESS_INTERVAL = 10.0
 """Least time between two lines of progress [s]."""
 SHARDS = 16
 SLURM = """\
@@ -207,7 +207,7 @@ def _lines() -> Show:
         nonlocal due
         left = pace(so_far)
         if perf_counter() >= due or so_far.done == so_far.worlds:
-            due = perf_counter() + EVERY
+            due = perf_counter() + PROGRESS_INTERVAL
             trials = [
                 f"{name} {ended}/{so_far.trials[name]}{_failures(so_far.failed[name])}"
                 for name, ended in so_far.ended.items()

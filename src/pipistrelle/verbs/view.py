@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 PAGE = "view.html"
 """Name of the page in a result folder."""
-REST = 3
+FRAMES_PER_MAP = 3
 """Of a smoother, the map is asked for once in so many frames, as each takes a full solution."""
 
 
@@ -101,7 +101,7 @@ def _play_again(
     from pipistrelle.verbs.streams import warn
 
     delivery.get_ready(OutputOptions(quiet=quiet))
-    watch = MissionRecorder(rest=REST)
+    watch = MissionRecorder(rest=FRAMES_PER_MAP)
     with progress(quiet) as show:
         named = named_filters(trusted, "--filter") if trusted else ()
         mission = rerun(folder, log=log, trusted=named, progress=show, watch=watch)

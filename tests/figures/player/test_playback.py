@@ -13,7 +13,7 @@ from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.experiments.drives import NO_TRUTH
 from pipistrelle.figures.animation import pruned
 from pipistrelle.figures.excess_paths import callers_at, resolved
-from pipistrelle.figures.player.playback import MOST_PARTICLES, playback
+from pipistrelle.figures.player.playback import MAX_PARTICLES, playback
 from pipistrelle.figures.recorder import MissionRecorder
 
 
@@ -105,7 +105,7 @@ def test_particles_are_shown_and_of_many_a_part(watched, played):
     many = {key: [replace(f, cloud=np.tile(f.cloud, (5, 1))) for f in snapshots[key]]}
     (estimate,) = playback(done, many).estimates
     assert estimate.cloud.shape == (40, 167, 3)
-    assert estimate.cloud.shape[1] <= MOST_PARTICLES
+    assert estimate.cloud.shape[1] <= MAX_PARTICLES
 
 
 def test_of_a_long_recording_frames_are_chosen_evenly_and_the_last_is_among_them(watched):

@@ -25,7 +25,7 @@ def test_what_is_not_installed_is_said_with_its_fix(played, monkeypatch):
 def test_a_path_so_far_has_few_legs_and_its_ends():
     path = np.random.default_rng(1).normal(size=(4001, 3))
     few = rerun_file._so_far(path)
-    assert len(few) <= rerun_file.LEGS + 2
+    assert len(few) <= rerun_file.MAX_LEGS + 2
     np.testing.assert_array_equal(few[[0, -1]], path[[0, -1], :2])
 
 

@@ -13,7 +13,7 @@ from pydantic import ConfigDict, Field, ValidationError, field_validator
 
 from pipistrelle.config import (
     LONGEST_STEP,
-    MOST_OTHERS,
+    MAX_OTHERS,
     AngleStd,
     DistanceStd,
     InputError,
@@ -112,7 +112,7 @@ class _Settings(Section):
     step: Annotated[Positive, Field(le=LONGEST_STEP)] | None = None
     gate: Probability | None = None
     noise_at_rest: bool = True
-    callers: Annotated[tuple[_CallerTable, ...], Field(strict=False, max_length=MOST_OTHERS)] = ()
+    callers: Annotated[tuple[_CallerTable, ...], Field(strict=False, max_length=MAX_OTHERS)] = ()
 
     @field_validator("callers")
     @classmethod
@@ -318,7 +318,7 @@ def _key_refusal(path: Path, fault: Any, model: type[_Settings]) -> InputError:
         return _caller_refusal(path, fault)
     if name == "callers" and fault["type"] == "too_long":
         found = f"{len(fault['input'])} callers"
-        return refusal(f"{path}, key 'callers'", found, f"at most {MOST_OTHERS}", "leave some out")
+        return refusal(f"{path}, key 'callers'", found, f"at most {MAX_OTHERS}", "leave some out")
     if name in known and (count := values_expected(fault, known[name])) is not None:
         found = f"{len(fault['input'])} values"
         return refusal(f"{path}, key {name!r}", found, f"{count}", "mend the list")

@@ -18,7 +18,7 @@ from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.runs.mission import Mission
 from pipistrelle.figures.animation import pruned
 from pipistrelle.figures.excess_paths import (
-    MOST,
+    MAX_ELLIPSES,
     callers_at,
     callers_marked,
     excess_paths_at,
@@ -28,13 +28,13 @@ from pipistrelle.figures.maps import view
 from pipistrelle.figures.mission import outcome
 from pipistrelle.figures.recorder import Snapshot, heard_from
 
-MOST_FRAMES = 3000
+MAX_FRAMES = 3000
 """Of a longer recording so many are shown, evenly spaced."""
-MOST_PARTICLES = 200
+MAX_PARTICLES = 200
 """Of more particles every second, third, ... is shown."""
 POSE_STDS = 3.0
 """Standard deviations of a pose that are shown."""
-FAR = 1000.0
+MAX_COORDINATE = 1000.0
 """Farther from where coordinates begin [m], they are shown about another origin: packed numbers
 have seven digits."""
 
@@ -117,7 +117,7 @@ class Playback:
 
 
 def playback(
-    done: Mission, snapshots: Mapping[tuple[str, str], Sequence[Snapshot]], most: int = MOST_FRAMES
+    done: Mission, snapshots: Mapping[tuple[str, str], Sequence[Snapshot]], most: int = MAX_FRAMES
 ) -> Playback:
     """Lay out a mission that was done again while a recorder watched.
 
@@ -179,7 +179,7 @@ def _told(done: Mission, frames: int, shown: int) -> tuple[str, tuple[str, ...]]
 def _origin(trials: Sequence[TrialResult]) -> Float[np.ndarray, "2"]:
     """Choose where coordinates begin: where they do, unless all is far from there."""
     start = trials[0].track.pose.mean[0, :2]
-    far = np.isfinite(start) & (np.abs(start) > FAR)
+    far = np.isfinite(start) & (np.abs(start) > MAX_COORDINATE)
     return np.where(far, np.round(start, -2), 0.0)
 
 
@@ -299,7 +299,11 @@ def _excess_paths(frames: Sequence[Snapshot]) -> Rows:
     """Lay out the excess paths that make ellipses: callers are counted without the vehicle."""
     labels, numbers = [], []
     for frame in frames:
-        rows = [row for found in excess_paths_at(frame).values() for row in found[:MOST].tolist()]
+        rows = [
+            row
+            for found in excess_paths_at(frame).values()
+            for row in found[:MAX_ELLIPSES].tolist()
+        ]
         scan = frame.scan
         labels.append(scan.landmark[rows].astype(int))
         numbers.append(np.column_stack([scan.caller[rows] - 1, scan.excess_path[rows]]))
@@ -331,7 +335,7 @@ def _cloud(
     clouds = [frame.cloud for frame in frames if frame.cloud is not None]
     if len(clouds) < len(frames) or len({len(cloud) for cloud in clouds}) != 1:
         return None
-    every = -(-len(clouds[0]) // MOST_PARTICLES)
+    every = -(-len(clouds[0]) // MAX_PARTICLES)
     return _moved(np.array([cloud[::every] for cloud in clouds]), origin)
 
 

@@ -29,7 +29,7 @@ VEHICLE, BEAM, THIN, THICK, DOT = 1.8, 14.0, 0.06, 0.2, 0.2
 """Length of the vehicle and of its beam, breadth of lines and dots [m]."""
 HEIGHT = 1.1
 """From which the map is seen, in its widths."""
-LEGS = 150
+MAX_LEGS = 150
 """Most legs of a path so far."""
 
 
@@ -321,5 +321,5 @@ def _dart(pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "5 2"]:
 
 def _so_far(path: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "_ 2"]:
     """Return a path of so many legs at most, its end included."""
-    every = -(-len(path) // LEGS)
+    every = -(-len(path) // MAX_LEGS)
     return np.vstack([path[::every, :2], path[-1:, :2]])

@@ -20,7 +20,7 @@ SHORTEST = 8
 """Letters to which words are cut that stand side by side; longer ones are slanted."""
 SLANTED_LETTERS = 12
 """To which slanted words are cut."""
-MOST_LETTERS = 52
+MAX_LETTERS = 52
 """Of all that is written along an axis."""
 ASIDE = {"active": 0.985, "fused": 1.015, "passive": 1.0}
 """Where a strategy stands beside its place along a logarithmic axis, as a share of it."""
@@ -96,7 +96,7 @@ def axis_of_words(words: Sequence[str]) -> Axis:
     ((0.0, 'EKF'), (1.0, 'FastSLAM 2.0'))
     """
     named = tuple((float(i), word) for i, word in enumerate(words))
-    longest = MOST_LETTERS // len(named)
+    longest = MAX_LETTERS // len(named)
     slanted = longest < SHORTEST and max(map(len, words)) > longest
     longest = SLANTED_LETTERS if slanted else max(longest, 3)
     return Axis(
@@ -241,7 +241,7 @@ def _thinned(
             ends = np.array([kept[-1][0], value])
             share = np.diff(np.log(ends) if log else ends)[0]
             share /= np.diff(np.log(limits) if log else limits)[0]
-            if share * MOST_LETTERS < 0.5 * (len(word) + len(kept[-1][1])) + 1.0:
+            if share * MAX_LETTERS < 0.5 * (len(word) + len(kept[-1][1])) + 1.0:
                 continue
         kept.append((value, word))
     return tuple(kept)

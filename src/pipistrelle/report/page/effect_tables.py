@@ -24,7 +24,7 @@ from pipistrelle.report.studied import (
 )
 from pipistrelle.report.variables import two_sided
 
-FEW = 6
+MAX_COMBINATIONS = 6
 """Of so many combinations each has a row; of more, those at which the opposite is shown."""
 
 
@@ -84,7 +84,7 @@ def _apart(effects: Sequence[Effect]) -> list[tuple[str, dict[str, Any], bool]]:
             for e in effects
             if e.measure.score == POSITION
         )
-        if len(effects[0].apart) <= FEW or opposite:
+        if len(effects[0].apart) <= MAX_COMBINATIONS or opposite:
             cells = {e.measure.score: _cell(e, e.apart[i]) for e in effects}
             rows.append((f"at {name}", cells, opposite))
     return rows

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from jinja2 import Template
 
 SPOKEN = {"reproduced": "Reproduced", "not-reproduced": "Not reproduced", "open": "Open"}
-FEW = 20
+MIN_WORLDS = 20
 """Worlds under which a reader is warned: a few agree by chance on what many do not show."""
 
 
@@ -103,7 +103,7 @@ def page(
         question=result.question,
         claims=result.claims,
         summary=numbers,
-        few=FEW,
+        few=MIN_WORLDS,
         intervals=INTERVALS,
         tables=numbers["effect_tables"],
         means=shown_in("cases"),

@@ -22,7 +22,7 @@ LEFT, RIGHT, TOP, BOTTOM = 54.0, 8.0, 10.0, 42.0
 """Margins."""
 SLANT = 34.0
 """Further room for slanted words."""
-READINGS = 80
+MAX_READINGS = 80
 """Most places along a panel where its numbers are read out."""
 
 
@@ -81,7 +81,7 @@ def readings(panel: Panel) -> list[tuple[float, str, list[tuple[str, str]]]]:
     every = np.unique(np.concatenate([s.x for s in named]))
     near = np.abs(every[:, None] - ticks).min(axis=1, initial=math.inf) if len(ticks) else every + 1
     at_ticks = bool(np.all(near <= 0.03 * span)) and len(every) > 0
-    places = ticks if at_ticks else every[:: -(-len(every) // READINGS)]
+    places = ticks if at_ticks else every[:: -(-len(every) // MAX_READINGS)]
     names = [t for _, t in panel.x.ticks] if at_ticks else [f"{value:g}" for value in places]
     found = []
     for place, name in zip(places, names, strict=True):
