@@ -1,12 +1,14 @@
 """Associations that are not in the package: a class in the folder labels what nobody labelled."""
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
 
+import pipistrelle
 from pipistrelle.__main__ import main
 from pipistrelle.config import (
     AssociationConfig,
@@ -159,6 +161,21 @@ def test_an_association_of_a_class_maps_a_mission_a_study_and_its_log(written):
         assert known["landmarks_total"] != own["landmarks_total"]
         assert (known["map_rmse_m"] is None, own["map_rmse_m"]) == (False, None)
         assert known["clutter_per_frame"] == own["clutter_per_frame"]
+
+
+def test_an_association_that_a_folder_names_is_run_only_if_its_reader_names_it_too(written, capsys):
+    method = f"{written(JOINT)}:Joint"
+    assert main(["run", *SHORT, "--association.method", method, "-o", "own"]) == 0
+    said = f"config.toml: association.method: found '{method}', whose code is not Pipistrelle's"
+    sys.modules.pop(method.partition(":")[0])
+    assert main(["view", "own", "--quiet"]) == 2
+    assert said in capsys.readouterr().err
+    assert method.partition(":")[0] not in sys.modules, "not even imported"
+    with pytest.raises(InputError, match="whose code is not"):
+        pipistrelle.load("own").figure()
+    assert not Path("own/view.html").exists()
+    assert main(["view", "own", "--quiet", "--association.method", method]) == 0
+    assert Path("own/view.html").exists()
 
 
 WRONG = {

@@ -12,7 +12,9 @@ from pipistrelle.scripting.results import Results
 from pipistrelle.scripting.studies import StudyResults
 
 
-def load(folder: Path | str, /, *, filters: Filters = ()) -> Results | StudyResults:
+def load(
+    folder: Path | str, /, *, filters: Filters = (), association: str = ""
+) -> Results | StudyResults:
     """Open what a folder holds; a mission is done again only where it must be drawn.
 
     Parameters
@@ -22,6 +24,8 @@ def load(folder: Path | str, /, *, filters: Filters = ()) -> Results | StudyResu
     filters : str or class, or several of them, optional
         Estimators of your own, by name or class, that a mission was done with. Code that a folder
         names is not run unless you name it, too.
+    association : str, optional
+        An association of your own, ``module:Class``, likewise.
 
     Returns
     -------
@@ -30,8 +34,8 @@ def load(folder: Path | str, /, *, filters: Filters = ()) -> Results | StudyResu
     Raises
     ------
     InputError
-        Where it is no such folder; when a mission is done again, where it names an estimator that
-        is neither Pipistrelle's nor named here.
+        Where it is no such folder; when a mission is done again, where it names an estimator or an
+        association that is neither Pipistrelle's nor named here.
 
     Examples
     --------
@@ -47,7 +51,7 @@ def load(folder: Path | str, /, *, filters: Filters = ()) -> Results | StudyResu
     if (place / "plan.toml").is_file():
         return StudyResults(place)
     read_summary(place)
-    trusted = named_filters(filters) if filters else ()
+    trusted = (*(named_filters(filters) if filters else ()), association)
 
     def redo(watch: Watch | None) -> Mission:
         mission = rerun(place, trusted=trusted, watch=watch)

@@ -57,6 +57,14 @@ def view(
             "that a folder names is not run unless you name it, too. [default: none]",
         ),
     ] = (),
+    association: Annotated[
+        str | None,
+        Parameter(
+            name="--association.method",
+            metavar="MODULE:CLASS",
+            help="Run this code, an association of your own, likewise. [default: none]",
+        ),
+    ] = None,
     overwrite: Annotated[
         bool, Parameter(negative=(), help="Replace a FILE that is there already.")
     ] = False,
@@ -74,9 +82,11 @@ def view(
         check_there()
         _check_place(rerun, folder, ".rrd", "--rerun", overwrite)
     from pipistrelle.figures.player.page import page
+    from pipistrelle.scripting.arguments import named_filters
     from pipistrelle.verbs.streams import put
 
-    played = _play_again(folder, log, estimator, quiet)
+    trusted = (*(named_filters(estimator, "--filter") if estimator else ()), association or "")
+    played = _play_again(folder, log, trusted, quiet)
     if rerun is not None:
         from pipistrelle.figures.player.rerun_file import recording
 
@@ -94,7 +104,6 @@ def _play_again(
     from pipistrelle.experiments.runs.rerun import rerun
     from pipistrelle.figures.player.playback import playback
     from pipistrelle.figures.recorder import MissionRecorder
-    from pipistrelle.scripting.arguments import named_filters
     from pipistrelle.verbs import delivery
     from pipistrelle.verbs.console import progress
     from pipistrelle.verbs.options import OutputOptions
@@ -103,8 +112,7 @@ def _play_again(
     delivery.get_ready(OutputOptions(quiet=quiet))
     watch = MissionRecorder(rest=FRAMES_PER_MAP)
     with progress(quiet) as show:
-        named = named_filters(trusted, "--filter") if trusted else ()
-        mission = rerun(folder, log=log, trusted=named, progress=show, watch=watch)
+        mission = rerun(folder, log=log, trusted=trusted, progress=show, watch=watch)
     if mission.difference:
         warn(f"{mission.difference}; what is shown is found now")
     return playback(mission, watch.snapshots)

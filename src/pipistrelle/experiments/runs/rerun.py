@@ -15,6 +15,7 @@ import numpy as np
 
 from pipistrelle.config import InputError
 from pipistrelle.detection.logs.readers import Robot, reader_of
+from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.catalogue import CATALOGUE, short_name
 from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.hearing.world import ANY
@@ -44,7 +45,7 @@ def rerun(
     """Do a mission again from its result folder, and compare its tracks with those there.
 
     `log` says where the log is, if it was moved. The folder may come from elsewhere, so estimators
-    from outside, ``module:Class``, are run only if they are trusted.
+    and associations from outside, ``module:Class``, are run only if they are trusted.
 
     >>> from tempfile import TemporaryDirectory
     >>> from pipistrelle.config import Config, ScenarioConfig
@@ -63,13 +64,12 @@ def rerun(
     """
     summary = read_summary(folder)
     for name in {run.filter for run in summary.runs} - {*CATALOGUE, *trusted}:
-        raise refusal(
-            f"{folder / SUMMARY}: runs.filter",
-            f"{name!r}, whose code is not Pipistrelle's",
-            "one that you trust",
-            f"add --filter {name} (in Python: filters={name!r}) to run it",
-        )
+        fix = f"add --filter {name} (in Python: filters={name!r}) to run it"
+        raise _not_ours(f"{folder / SUMMARY}: runs.filter", name, fix)
     config = resolve(from_file(folder / "config.toml"))
+    if (method := config.association.method) not in (KNOWN, *trusted):
+        fix = f"add --association.method {method} (in Python: association={method!r}) to run it"
+        raise _not_ours(f"{folder / 'config.toml'}: association.method", method, fix)
     strategies = list(dict.fromkeys(run.strategy for run in summary.runs))
     filters = list(dict.fromkeys(run.filter for run in summary.runs))
     if summary.log is None:
@@ -84,6 +84,12 @@ def rerun(
         mission = replay(recorded, truth, *asked, beam, config, progress=progress, watch=watch)
         mission = replace(mission, source=summary.log.model_dump())
     return replace(mission, difference=_difference(folder, summary, mission.trials))
+
+
+def _not_ours(where: str, name: str, fix: str) -> InputError:
+    """Return the refusal of code from outside that a folder names and nobody else."""
+    found = f"{name!r}, whose code is not Pipistrelle's"
+    return refusal(where, found, "one that you trust", fix)
 
 
 def log_entry(log: Path, robot: Robot | None, beamwidth: float | None) -> dict[str, object]:
