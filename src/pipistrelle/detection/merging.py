@@ -27,6 +27,7 @@ from pipistrelle.detection.scans import (
 )
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel
+from pipistrelle.refusals import shown
 
 LISTENS_TO = {"active": (True, False), "fused": (True, True), "passive": (False, True)}
 """Whether a strategy takes what the vehicle's own call, and what the others' calls bring back."""
@@ -106,7 +107,7 @@ def _checked(scan: Scan, label: np.ndarray) -> Int[np.ndarray, " m"]:
     whole = label.dtype.kind in "iu" or not label.size
     if label.shape != scan.landmark.shape or not whole or label.min(initial=0) < UNLABELLED:
         raise InputError(
-            f"association at {scan.time} s: found labels {label.tolist()}, expected "
+            f"association at {scan.time} s: found labels {shown(label.tolist())}, expected "
             f"{scan.landmark.size} whole numbers, one for each row: from 0 on, or {UNLABELLED} "
             "for clutter"
         )
