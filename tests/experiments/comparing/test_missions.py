@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from pipistrelle.config import Config, FilterConfig, InputError
+from pipistrelle.config import Config, FilterConfig, InputError, Section
 from pipistrelle.evaluation.accuracy import rmse
 from pipistrelle.experiments.comparing.folders import kind_of
 from pipistrelle.experiments.comparing.missions import compare_missions, notes_of, path_view
@@ -159,9 +159,14 @@ def test_settings_that_differ_are_named_with_all_values_and_sections_of_some_apa
     assert compare_missions(folders(paths, paths)).settings == {}
     compared = compare_missions(folders(paths, paths, config=(Config(), sharp)))
     assert compared.settings == {"filter.noise": ("constant", "measured")}
-    compared = compare_missions(folders(paths, paths, config=(sharp.filter, sharp)))
-    assert "seed" in compared.sections_alone
-    assert "robust" in compared.sections_alone
+
+    class OfALog(Section):
+        seed: int = 7
+        filter: FilterConfig = sharp.filter
+
+    compared = compare_missions(folders(paths, paths, config=(OfALog(), sharp)))
+    assert compared.sections_alone["air"] == (1,)
+    assert not {"seed", "filter"} & set(compared.sections_alone)
     assert compared.settings == {}
     assert any(note.startswith("Settings of ") for note in notes_of(compared))
 
