@@ -9,7 +9,15 @@ import tracemalloc
 import pytest
 
 from pipistrelle.__main__ import main
-from pipistrelle.config import Config, FastSlamConfig, InputError, RayConfig, ScenarioConfig
+from pipistrelle.config import (
+    Config,
+    FastSlamConfig,
+    InputError,
+    RayConfig,
+    ReceiverConfig,
+    ScenarioConfig,
+)
+from pipistrelle.estimation.catalogue import COPIES
 from pipistrelle.experiments import machine
 from pipistrelle.experiments.machine import check_length, check_memory
 from pipistrelle.experiments.runs import validate_mission
@@ -67,7 +75,7 @@ def test_too_many_steps_are_refused_before_a_path_is_drawn(monkeypatch):
 
 def test_steps_count_for_every_trial_frame_and_worker(monkeypatch):
     setup = ScenarioConfig(steps=1000)
-    need = 1000 * (430 + 96 * 6) + 250 * (900 + 600 * 3)
+    need = 8 * (1000 * (3 * 18 + 12 * 6) + 250 * 50 * (1 + 3) * 9)
     monkeypatch.setattr(machine, "installed", lambda: need)
     check_length(setup, strategies=3, filters=2)
     for more in ({"strategies": 4, "filters": 2}, {"strategies": 3, "filters": 3}):
@@ -88,7 +96,24 @@ def test_what_a_step_is_said_to_need_is_what_it_needs():
 
     peak(8)
     step = (peak(20_000) - peak(10_000)) / 10_000
-    assert step == pytest.approx(machine.DRAWN + machine.TRACKED, rel=0.2)
+    said = 8 * (COPIES * machine.STEP_NUMBERS + machine.TRACK_NUMBERS)
+    assert step == pytest.approx(said, rel=0.2)
+
+
+@pytest.mark.parametrize("engine", ["block", "dense"])
+def test_what_a_recording_is_said_to_need_is_what_it_needs(engine, monkeypatch):
+    config = Config(
+        scenario=ScenarioConfig(steps=4, landmarks=2), receiver=ReceiverConfig(engine=engine)
+    )
+    said = {}
+    monkeypatch.setattr(machine, "_refuse_beyond", lambda what, need, _: said.update({what: need}))
+    run_mission(config, ["active"])
+    tracemalloc.start()
+    run_mission(config, ["active"])
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    (recording,) = (need for what, need in said.items() if "recording" in what)
+    assert 0.3 * recording < most < 2.0 * recording
 
 
 @pytest.mark.parametrize(("limit", "have"), [("1000000\n", 1e6), ("max\n", None), (None, None)])

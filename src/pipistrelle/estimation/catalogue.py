@@ -31,6 +31,8 @@ READ = ("listening", "association", "filter", "rays")
 """Sections of the settings that every estimator reads."""
 DOUBLE = 8
 """Bytes of a number."""
+COPIES = 3.0
+"""How many times arrays that are worked on are held: before, during and after, as measured."""
 GATE = 0.999
 """Default share of a measurement's predicted distribution that is accepted from a recorded log."""
 
@@ -247,7 +249,7 @@ def _smoother_bytes(landmarks: int, _: int, config: Config) -> float:
 
 def _ekf_bytes(landmarks: int, members: int, _: Config) -> float:
     """Estimate the memory of three covariances: before, during and after a correction."""
-    return 3.0 * DOUBLE * (3 + 2 * landmarks * members) ** 2
+    return COPIES * DOUBLE * (3 + 2 * landmarks * members) ** 2
 
 
 def _fastslam(config: Config, motion: "Motion") -> "Estimator":
@@ -262,7 +264,7 @@ def _fastslam_bytes(landmarks: int, members: int, config: Config) -> float:
     """Estimate the memory of three sets of particles: before, corrected and resampled."""
     slopes = 4 if config.listening.timing else 0
     each = 6 * landmarks * members + landmarks + slopes * landmarks
-    return 3.0 * DOUBLE * config.fastslam.particles * each
+    return COPIES * DOUBLE * config.fastslam.particles * each
 
 
 CATALOGUE = {

@@ -12,18 +12,13 @@ import numpy as np
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.arrays.sampling import BLOCK, Sampling
 from pipistrelle.config import Config, InputError, ScenarioConfig
-from pipistrelle.estimation.catalogue import entry
+from pipistrelle.estimation.catalogue import COPIES, DOUBLE, entry
 from pipistrelle.estimation.rays import ray_members
 from pipistrelle.experiments.hearing.scenario import Scenario
 
-DRAWN, TRACKED = 430, 96
-"""Bytes of a step, as measured: of the path and of the work on it, and of each track."""
-HEARD, SCANNED = 900, 600
-"""Bytes of a frame, as measured among 12 landmarks: what is heard, and each strategy's scan."""
-BLOCK_SUM = 40
-"""Bytes of a block, tone, face and element, as measured, with what beams share."""
-SAMPLE, SAMPLE_TONE = 16, 24
-"""Bytes of a sample, face and element, as measured: of itself, and of each tone's filter."""
+STEP_NUMBERS, TRACK_NUMBERS, ROW_NUMBERS = 18, 12, 9
+"""Numbers of a step (true and noisy pose, controls, time, bound), of a step of each track (pose and
+covariance), and of a row that is heard (`detection.scans.Scan`)."""
 LIMIT = Path("/sys/fs/cgroup/memory.max")
 """The file with the memory limit of a container: a number of bytes, or a word."""
 MALLOPT = ((-3, 32 << 20), (-1, 256 << 20))
@@ -55,12 +50,11 @@ def check_memory(
     each_ray = ray_members(config.rays)[0].size if passive else 1
     for name in filters:
         estimator = entry(name)
-        need, have = estimator.memory(landmarks, each_ray, config), installed()
-        if need * workers > have:
-            ray = f" of {each_ray:,} members each (rays.density)" if passive else ""
-            particles = f" and {config.fastslam.particles} particles (fastslam.particles)"
-            held = particles if "fastslam" in estimator.sections else ""
-            raise _too_large(f"{name}: {landmarks} landmarks{ray}{held}", need, have, workers)
+        ray = f" of {each_ray:,} members each (rays.density)" if passive else ""
+        particles = f" and {config.fastslam.particles} particles (fastslam.particles)"
+        held = particles if "fastslam" in estimator.sections else ""
+        need = estimator.memory(landmarks, each_ray, config)
+        _refuse_beyond(f"{name}: {landmarks} landmarks{ray}{held}", need, workers)
 
 
 def check_length(
@@ -73,11 +67,11 @@ def check_length(
 
     >>> check_length(ScenarioConfig(), strategies=3, filters=2)
     """
-    need = float(setup.steps) * (DRAWN + TRACKED * strategies * filters)
-    need += float(setup.steps // setup.steps_per_frame) * (HEARD + SCANNED * strategies)
-    have = installed()
-    if need * workers > have:
-        raise _too_large(f"scenario.steps: {setup.steps:,} steps", need, have, workers)
+    step = COPIES * STEP_NUMBERS + TRACK_NUMBERS * strategies * filters
+    frames = setup.steps // setup.steps_per_frame
+    rows = frames * setup.landmarks * (1 + strategies)
+    need = DOUBLE * (float(setup.steps) * step + float(rows) * ROW_NUMBERS)
+    _refuse_beyond(f"scenario.steps: {setup.steps:,} steps", need, workers)
 
 
 def check_recording(
@@ -106,15 +100,14 @@ def check_recording(
         key: 4.0 * reach[key] / settled.speed_of_sound,
         "emitter.pulse": settled.pulse * BLOCK,
     }
-    tones, each = settled.tones.size, BLOCK_SUM * settled.tones.size
-    if config.receiver.engine == "dense":
+    numbers = 2 * settled.tones.size  # complex, of each tone's sums
+    if config.receiver.engine == "dense":  # samples and each tone's filter, in single precision
         length |= {"scenario.step": max(length.get("scenario.step", 0.0), _period(setup))}
-        each = (SAMPLE + SAMPLE_TONE * tones) * settled.block
+        numbers = (1 + settled.tones.size) * settled.block
     key = max(length, key=length.__getitem__)
-    each *= layout.normal.size * layout.position.size
-    need, have = length[key] / BLOCK * each, installed()
-    if need * workers > have:
-        raise _too_large(f"{key}: a recording of {length[key]:.3g} s", need, have, workers)
+    numbers *= layout.normal.size * layout.position.size
+    need = COPIES * DOUBLE * length[key] / BLOCK * numbers
+    _refuse_beyond(f"{key}: a recording of {length[key]:.3g} s", need, workers)
 
 
 def _farthest(places: Any) -> float:
@@ -127,10 +120,12 @@ def _period(setup: ScenarioConfig) -> float:
     return setup.step * setup.steps_per_frame
 
 
-def _too_large(what: str, need: float, have: float, workers: int) -> InputError:
-    """Return the refusal of a mission that needs more memory than there is."""
+def _refuse_beyond(what: str, need: float, workers: int) -> None:
+    """Refuse what may need more memory [bytes], in each of so many workers, than there is."""
+    if need * workers <= (have := installed()):
+        return
     each = f" in each of {workers} workers" if workers > 1 else ""
-    return InputError(
+    raise InputError(
         f"{what} may need {need / 1e9:.1f} GB of memory{each}, but this machine has "
         f"{have / 1e9:.1f} GB; ask for less"
     )
