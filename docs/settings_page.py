@@ -10,7 +10,7 @@ from pipistrelle.settings import CALLERS, PREFIX, from_flags, known_settings
 
 PLACE = "<!-- settings -->"
 CALLER = "<!-- callers -->"
-ANY = "any number"
+ALL_DRAWN = "any number"
 WORDS = {"string": "a folder", "boolean": "`true` or `false`"}
 """Settings that are no numbers; the only text that is free is the folder of a world."""
 SIGN = re.compile("([≥>≤<]) ")
@@ -107,7 +107,7 @@ def bounds(kind):
         return f"numbers, each {bounds(kind['items'])}"
     if kind["type"] == "array":
         inner = [bounds(part) for part in kind["prefixItems"]]
-        return f"{len(inner)} numbers" + ("" if inner[0] == ANY else f", each {inner[0]}")
+        return f"{len(inner)} numbers" + ("" if inner[0] == ALL_DRAWN else f", each {inner[0]}")
     if {"minimum", "maximum"} <= kind.keys() and kind["maximum"] < LARGEST:
         return whole + f"{number(kind['minimum'])} to {number(kind['maximum'])}"
     told = [
@@ -120,7 +120,7 @@ def bounds(kind):
         )
         if name in kind and abs(kind[name]) < LARGEST
     ]
-    return whole + (", ".join(told) or ANY)
+    return whole + (", ".join(told) or ALL_DRAWN)
 
 
 def number(value):

@@ -129,7 +129,7 @@ worse than active and fused; FastSLAM is worse than EKF in every case. In mean N
 above EKF with each strategy; EKF's active below passive, and fused lower at 11 than at 180 degrees;
 FastSLAM's fused above active and passive."""
 DRAWS = 1000
-ANY = "any"
+ALL_DRAWN = "any"
 """Stands where a level makes no difference."""
 VARIED = {"weights": WEIGHTS, "ranged": ALL_RANGED, "resampled": RESAMPLED}
 WHOLE = 60
@@ -321,16 +321,16 @@ def trials_in(fits: Mapping[str, Change], world: int) -> Iterator[dict[str, Any]
 
 def varied(chosen: Mapping[str, str], strategy: Strategy) -> Iterator[tuple[str, dict[str, str]]]:
     """List filters with their levels of the last three factors, where these make a difference."""
-    ranges = RANGED if strategy == "fused" else [ANY]
-    restarts = [ANY] if strategy == "active" else RESAMPLED
+    ranges = RANGED if strategy == "fused" else [ALL_DRAWN]
+    restarts = [ALL_DRAWN] if strategy == "active" else RESAMPLED
     for ranged in ranges:
-        yield "ekf", {"weights": ANY, "ranged": ranged, "resampled": ANY}
+        yield "ekf", {"weights": ALL_DRAWN, "ranged": ranged, "resampled": ALL_DRAWN}
         for weights, resampled in product(WEIGHTS, restarts):
             yield "fastslam", {"weights": weights, "ranged": ranged, "resampled": resampled}
     more = [name for name in ALL_RANGED if name not in RANGED]
     plans = chosen in PLANS.values()
     for ranged in (more if plans else ["moved"]) if strategy == "fused" else []:
-        yield "ekf", {"weights": ANY, "ranged": ranged, "resampled": ANY}
+        yield "ekf", {"weights": ALL_DRAWN, "ranged": ranged, "resampled": ALL_DRAWN}
         for resampled in RESAMPLED if plans else ["kept"]:
             yield "fastslam", {"weights": "marginal", "ranged": ranged, "resampled": resampled}
 
@@ -344,7 +344,7 @@ class Reading:
     def __init__(self, trials: pl.DataFrame, levels: Mapping[str, str]) -> None:
         chosen = trials
         for factor, level in levels.items():
-            chosen = chosen.filter(pl.col(factor).is_in([level, ANY]))
+            chosen = chosen.filter(pl.col(factor).is_in([level, ALL_DRAWN]))
         self.worlds = trials["world"].n_unique()
         self.columns = {
             (name, score): self._columns(chosen.filter(pl.col("filter") == name), score)

@@ -10,7 +10,7 @@ from pipistrelle.config import Config, InputError, Strategy
 from pipistrelle.detection.logs.readers import Robot
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.hearing.listening import Progress
-from pipistrelle.experiments.hearing.world import ANY, World
+from pipistrelle.experiments.hearing.world import ALL_DRAWN, World
 from pipistrelle.experiments.hearing.world_folder import kept_world
 from pipistrelle.experiments.results.scores import TrialResult, is_placed
 from pipistrelle.experiments.results.writing import write_results
@@ -55,7 +55,7 @@ def simulated(
 ) -> Mission:
     """Drive through a world by sound and map it, with notes on what looks odd (`run_mission`)."""
     mission = run_mission(
-        config, strategies, filters, world=world or ANY, progress=progress, watch=watch
+        config, strategies, filters, world=world or ALL_DRAWN, progress=progress, watch=watch
     )
     assert mission.scenario is not None
     return replace(

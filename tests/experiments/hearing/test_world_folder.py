@@ -17,7 +17,7 @@ from pipistrelle.config import (
 )
 from pipistrelle.experiments.hearing.scenario import Scenario, world_of
 from pipistrelle.experiments.hearing.trajectories import Commands, Poses, Waypoints
-from pipistrelle.experiments.hearing.world import ANY, World
+from pipistrelle.experiments.hearing.world import ALL_DRAWN, World
 from pipistrelle.experiments.hearing.world_folder import (
     laid_over,
     named_world,
@@ -261,7 +261,7 @@ def test_there_may_be_nobody_else_who_calls(tmp_path):
 
 
 def test_a_header_alone_says_that_nothing_reflects(tmp_path):
-    bare = world_of(Config(scenario=ScenarioConfig(steps=8, landmarks=0)), 0, ANY)
+    bare = world_of(Config(scenario=ScenarioConfig(steps=8, landmarks=0)), 0, ALL_DRAWN)
     OwnFiles(tmp_path / "bare", WORLD).replace(world_files(bare, Config()))
     assert len(read_world(tmp_path / "bare").landmarks) == 0
 

@@ -17,7 +17,7 @@ from pipistrelle.experiments.drives import LabelledPoints
 from pipistrelle.experiments.hearing.caller_paths import Surroundings, callers_among, place_at
 from pipistrelle.experiments.hearing.landmark_fields import landmarks_in
 from pipistrelle.experiments.hearing.trajectories import course_of, driven, motion_of
-from pipistrelle.experiments.hearing.world import ANY, World
+from pipistrelle.experiments.hearing.world import ALL_DRAWN, World
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,7 +38,7 @@ class Scenario:
     """Of the landmarks, where they are not as the settings have them."""
 
 
-def world_of(config: Config, iteration: int = 0, world: World = ANY) -> Scenario:
+def world_of(config: Config, iteration: int = 0, world: World = ALL_DRAWN) -> Scenario:
     """Draw the world of the settings' seed.
 
     Parameters
@@ -67,7 +67,7 @@ def world_of(config: Config, iteration: int = 0, world: World = ANY) -> Scenario
     return draw_scenario(config, np.random.default_rng(key), world)
 
 
-def draw_scenario(config: Config, rng: np.random.Generator, world: World = ANY) -> Scenario:
+def draw_scenario(config: Config, rng: np.random.Generator, world: World = ALL_DRAWN) -> Scenario:
     """Draw a world: the path first, then the beacon and the landmarks clear of it.
 
     Where callers are listed, they are drawn last: path and landmarks are those of the paper's

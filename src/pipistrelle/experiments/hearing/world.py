@@ -30,5 +30,5 @@ class World:
     """Files that the world was read from."""
 
 
-ANY = World(name="any")
-"""Nothing is known: all is drawn."""
+ALL_DRAWN = World(name="any")
+"""A world of which nothing is known beforehand: all is drawn."""

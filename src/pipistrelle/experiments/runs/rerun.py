@@ -18,7 +18,7 @@ from pipistrelle.detection.logs.readers import Robot, reader_of
 from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.catalogue import CATALOGUE, short_name
 from pipistrelle.experiments.hearing.listening import Progress
-from pipistrelle.experiments.hearing.world import ANY
+from pipistrelle.experiments.hearing.world import ALL_DRAWN
 from pipistrelle.experiments.hearing.world_folder import read_world
 from pipistrelle.experiments.results.reading import SUMMARY, Summary, read_summary
 from pipistrelle.experiments.results.scores import TrialResult
@@ -74,7 +74,7 @@ def rerun(
     filters = list(dict.fromkeys(run.filter for run in summary.runs))
     if summary.log is None:
         _check_simulated(folder, log)
-        world = ANY if (kept := config.scenario.world) is None else read_world(Path(kept))
+        world = ALL_DRAWN if (kept := config.scenario.world) is None else read_world(Path(kept))
         mission = run_mission(
             config, strategies, filters, world=world, progress=progress, watch=watch
         )

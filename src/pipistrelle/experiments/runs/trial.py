@@ -24,7 +24,7 @@ from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive, split_at
 from pipistrelle.experiments.hearing.listening import Progress, listen
 from pipistrelle.experiments.hearing.scenario import standing_landmarks
-from pipistrelle.experiments.hearing.world import ANY, World
+from pipistrelle.experiments.hearing.world import ALL_DRAWN, World
 from pipistrelle.experiments.machine import check_memory
 from pipistrelle.experiments.results.scores import (
     TrialResult,
@@ -52,7 +52,7 @@ def run_mission(
     strategies: Sequence[Strategy],
     filters: Sequence[str] = ("ekf",),
     *,
-    world: World = ANY,
+    world: World = ALL_DRAWN,
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> Mission:
@@ -91,7 +91,7 @@ def run_mission(
         beamwidth=beamwidth_of(config),
         callers=scenario.callers[VEHICLE + 1 :],
         scenario=scenario,
-        world=None if world is ANY else world,
+        world=None if world is ALL_DRAWN else world,
         heard=heard,
     )
 

@@ -14,7 +14,7 @@ from pipistrelle.arrays.sampling import sampling
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.snapshots import detector
 from pipistrelle.experiments.hearing.scenario import Scenario, world_of
-from pipistrelle.experiments.hearing.world import ANY, World
+from pipistrelle.experiments.hearing.world import ALL_DRAWN, World
 from pipistrelle.experiments.machine import check_length, check_recording
 from pipistrelle.kernel_clock import judging
 
@@ -23,7 +23,7 @@ from pipistrelle.kernel_clock import judging
 def checked_scenario(
     config: Config,
     *,
-    world: World = ANY,
+    world: World = ALL_DRAWN,
     strategies: int = 1,
     filters: int = 1,
     workers: int = 1,

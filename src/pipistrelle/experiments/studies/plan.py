@@ -12,7 +12,7 @@ from typing import Any, cast
 
 from pipistrelle.config import Config, Strategy
 from pipistrelle.experiments.cases import Case
-from pipistrelle.experiments.hearing.world import ANY, World
+from pipistrelle.experiments.hearing.world import ALL_DRAWN, World
 from pipistrelle.experiments.hearing.world_folder import laid_over
 from pipistrelle.settings import RADIUS_KEY, WORLD_KEY, Given, Key, Layer, from_flags, resolve
 
@@ -48,7 +48,7 @@ class Plan:
 
     def world(self, config: Config) -> World:
         """Return the user's own world that settings name, or the one of which all is drawn."""
-        return ANY if config.scenario.world is None else self.worlds[config.scenario.world]
+        return ALL_DRAWN if config.scenario.world is None else self.worlds[config.scenario.world]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
