@@ -236,7 +236,7 @@ class CallerConfig(Section):
     speed_std: Positive | None = None
     """Of a walk: standard deviation of the velocity along each axis [m/s]; else 0.5."""
     memory: Positive | None = None
-    """Of a walk: time after which 1/e of a velocity is left [s]; else 10."""
+    """Time after which 1/e of a walk's velocity is left [s]; else 10."""
     route: str | Annotated[tuple[RouteRow, ...], Field(min_length=2)] | None = None
     """Or where it is when: a CSV file of `time,x,y`, or its rows [s, m, m]; else it stands. With a
     fourth column, `heading` [rad], it is another vehicle, which calls through a piston."""
@@ -375,7 +375,7 @@ class MatchingConfig(Section):
 
 
 class AssociationConfig(Section):
-    """Who says which landmark an echo is of."""
+    """Data association: how the rows of a scan get the labels of landmarks."""
 
     method: str = "known"
     """The labels that came with the scans, in a simulation an oracle's (the paper's); or

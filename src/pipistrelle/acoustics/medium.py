@@ -1,4 +1,4 @@
-"""What sound travels through: how fast, and what it loses on the way."""
+"""Medium: the speed of sound, and the losses on a path."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

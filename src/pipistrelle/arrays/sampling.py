@@ -29,7 +29,7 @@ class Sampling:
     pulse: int
     """Blocks per call; the first block heard is the one after it."""
     calls: tuple[Call, ...]
-    """What each caller sends, the vehicle first."""
+    """The call of each caller, the vehicle first."""
     tones: Float[np.ndarray, " c"]
     """Their frequencies [Hz]."""
     noise_std: float

@@ -56,8 +56,8 @@ class Scan:
     moving: Int[np.ndarray, " v"] = field(default_factory=lambda: NO_CALLERS)
     """Labels of the callers that move."""
     direct: Int[np.ndarray, " c"] = field(default_factory=lambda: NO_CALLERS)
-    """Of rows without labels: the row of each caller's direct call, by the caller's number; -1
-    where none was heard. Its label is that of the caller (`merging.labelled`)."""
+    """Row of each caller's direct call, by the caller's number, in a scan without labels; -1 where
+    none was heard. The row's label becomes that of the caller (`merging.labelled`)."""
 
     @property
     def bearing(self) -> Float[np.ndarray, " m"]:

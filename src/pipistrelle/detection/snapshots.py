@@ -115,7 +115,7 @@ class Detector(NamedTuple):
     table: Float[np.ndarray, "c 2 k n"]
     """Real and imaginary part of exp(-i l u), per tone; l: 1 ... e - 1, or the elements' places."""
     place: Float[np.ndarray, " e"]
-    """Of the elements, in spacings; empty for equally spaced ones."""
+    """Places of the elements, in spacings; empty for equally spaced ones."""
     spread: float
     """See `certainty.bearing_std`."""
 

@@ -30,11 +30,11 @@ M = TypeVar("M")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Assignment:
-    """What an association decides about one scan."""
+    """Labels of one scan's rows, and changes of the map."""
 
     label: Int[np.ndarray, " m"]
-    """Of each row: a landmark of the map, a new number for one that is not in it, or UNLABELLED for
-    clutter."""
+    """Label of each row: a landmark of the map, a new number for one that is not in it, or
+    UNLABELLED for clutter."""
     remove: tuple[int, ...] = ()
     """Landmarks to remove from the map, before the correction."""
     merge: tuple[tuple[int, int], ...] = ()
@@ -64,7 +64,7 @@ class Candidates:
     difference: Float[np.ndarray, "n 3"]
     """Measured minus expected."""
     covariance: Float[np.ndarray, "n 3 n 3"]
-    """Of all differences together: of pose and map, and in its diagonal of the measurements."""
+    """Joint covariance of all differences: of pose and map, and, in the diagonal, of the rows."""
 
 
 def expected(

@@ -14,7 +14,7 @@ from pipistrelle.config import InputError
 
 
 class Role(NamedTuple):
-    """What a class from outside is for."""
+    """Kind of a class from outside: its name in refusals, and its methods."""
 
     key: str
     """As a refusal begins: the option or setting that names the class."""

@@ -49,7 +49,7 @@ class Session(Generic[B]):
     """
 
     belief: B
-    """What the estimator knows now."""
+    """The present belief of the estimator."""
 
     def __init__(
         self,

@@ -36,7 +36,7 @@ _BOUNDS = {
 }
 """Unit, least and most of a column's numbers."""
 FORMER_NAMES = MappingProxyType({"detour": "excess_path", "detour_std": "excess_path_std"})
-"""What columns and keys of logs were called, and what they are called now."""
+"""Former names of columns and keys of logs, and their present names."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
