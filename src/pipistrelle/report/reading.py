@@ -3,7 +3,6 @@
 Only worlds that are whole are read: those whose file of trials stands.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
@@ -16,12 +15,11 @@ from jaxtyping import Bool, Float, Int
 
 from pipistrelle.acoustics.emitter import beamwidth
 from pipistrelle.config import Config, InputError
-from pipistrelle.estimation.catalogue import SECTIONS
 from pipistrelle.experiments.hearing.scenario import Scenario, standing_landmarks, world_of
 from pipistrelle.experiments.studies.beamwidths import MAKERS
 from pipistrelle.experiments.studies.plan import RADIUS, Plan, cases_of, common
 from pipistrelle.experiments.studies.store import load_study
-from pipistrelle.experiments.studies.world import STEPS, world_schemas
+from pipistrelle.experiments.studies.world import STEPS, heard_settings, world_schemas
 from pipistrelle.experiments.studies.world_files import (
     check_world,
     damaged,
@@ -171,9 +169,7 @@ def _drawings(plan: Plan, configs: Sequence[Config], world: int) -> Int[np.ndarr
     known: dict[str, int] = {}
     found = []
     for number, config in enumerate(configs):
-        table = config.model_dump(mode="json", exclude=set(SECTIONS))
-        del table["emitter"]["radius"]
-        if (same := json.dumps(table)) not in known:
+        if (same := heard_settings(config)) not in known:
             key: Any = number
             if drawn := _drawn(plan, config, world):
                 key = tuple(part.tobytes() for part in standing_landmarks(drawn))

@@ -39,6 +39,7 @@ from pipistrelle.experiments.runs.heard_world import HeardWorld, drive_of
 from pipistrelle.experiments.runs.trial import run_trial
 from pipistrelle.experiments.runs.validate_filters import failure_text, first_belief
 from pipistrelle.experiments.studies.plan import Plan, PlannedCase, cases_of
+from pipistrelle.settings import RADIUS_KEY
 
 if TYPE_CHECKING:
     import polars as pl
@@ -113,7 +114,7 @@ def heard_together(plan: Plan) -> tuple[tuple[PlannedCase, ...], ...]:
     """
     together: dict[str, list[PlannedCase]] = {}
     for case in cases_of(plan):
-        together.setdefault(_heard_settings(case), []).append(case)
+        together.setdefault(heard_settings(case.config), []).append(case)
     return tuple(map(tuple, together.values()))
 
 
@@ -200,11 +201,12 @@ def _online_columns(plan: Plan) -> tuple[str, ...]:
     return ()
 
 
-def _heard_settings(case: PlannedCase) -> str:
-    """Return as text all settings on which a case's world and its recording depend."""
-    settings = case.config.model_dump(mode="json", exclude=set(SECTIONS))
-    del settings["emitter"]["radius"]
-    settings["assumed"] = case.config.assumed_sound_speed  # the rest is the filters' alone
+def heard_settings(config: Config) -> str:
+    """Return as text all settings on which a world and its recording depend."""
+    settings = config.model_dump(mode="json", exclude=set(SECTIONS))
+    section, radius = RADIUS_KEY
+    del settings[section][radius]
+    settings["assumed"] = config.assumed_sound_speed  # the rest is the filters' alone
     return json.dumps(settings)
 
 
