@@ -16,7 +16,7 @@ from pipistrelle.config import (
     ReceiverConfig,
     ScenarioConfig,
 )
-from pipistrelle.estimation.catalogue import CATALOGUE, is_there
+from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.experiments.runs.replay import load, replay
 from pipistrelle.experiments.runs.trial import run_mission
 
@@ -40,8 +40,6 @@ def test_a_short_mission_keeps_to_its_annotations(engine):
 
 @pytest.mark.parametrize("name", CATALOGUE)
 def test_a_mission_that_times_callers_keeps_to_its_annotations(name):
-    if not is_there(name):
-        pytest.skip(f"needs the extra {name}")
     config = Config(
         scenario=ScenarioConfig(steps=24, landmarks=12, radius=12.0),
         callers=(CallerConfig(), CallerConfig(frequency=25e3, course="circle", radius=9.0)),

@@ -1,6 +1,5 @@
 """What stands between vehicle and caller: an excess path's error makes ranges that seem sure."""
 
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -13,17 +12,15 @@ from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
 from pipistrelle.estimation.fastslam.filter import FastSlam
 from pipistrelle.estimation.measurement import excess_path_of, landmark_range
+from pipistrelle.estimation.smoother.filter import Smoother
 from reference.missions import BICYCLE, map_with, ray_config
 
 ESTIMATORS = [
     EkfSlam(motion=BICYCLE, rays=ray_config()),
     InvariantEkfSlam(motion=BICYCLE, rays=ray_config()),
     FastSlam(motion=BICYCLE, rays=ray_config(), settings=FastSlamConfig(particles=64)),
+    Smoother(motion=BICYCLE, rays=ray_config()),
 ]
-with suppress(ImportError):  # an extra
-    from pipistrelle.estimation.smoother.filter import Smoother
-
-    ESTIMATORS.append(Smoother(motion=BICYCLE, rays=ray_config()))
 HERE, CALLER = np.zeros(2), np.array([10.0, 0.0])
 BEARING_STD, EXCESS_PATH_STD = 0.02, 0.05
 COMMON = 13.8

@@ -1,6 +1,5 @@
 """Landmarks that are known beforehand: they are in the map, and what is heard of them places us."""
 
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -13,16 +12,13 @@ from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.ekf.invariant import InvariantEkfSlam
 from pipistrelle.estimation.fastslam.filter import FastSlam
 from pipistrelle.estimation.measurement import excess_path_of, measurement_jacobians
+from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.runs.filtering import run_filter
 from pipistrelle.geometry import range_and_bearing
 from reference.missions import BICYCLE, map_with, ray_config, scan_with
 
-KINDS = [EkfSlam, InvariantEkfSlam]
-with suppress(ImportError):  # an extra
-    from pipistrelle.estimation.smoother.filter import Smoother
-
-    KINDS.append(Smoother)
+KINDS = [EkfSlam, InvariantEkfSlam, Smoother]
 START = Gaussian(mean=np.array([4.0, -7.0, 0.3]), covariance=np.diag([0.2, 0.3, 0.25]) ** 2)
 POSTS = map_with([7, 9], [[1.0, 3.0], [-6.0, 2.0]], [0.04 * np.eye(2), np.diag([0.01, 0.09])])
 

@@ -23,7 +23,7 @@ from pipistrelle.geometry import range_and_bearing, wrap
 from reference.ekf_slam import moved
 from reference.missions import BICYCLE, CIRCLE, START, scan_with, scattered
 from reference.odometry import as_poses
-from reference.optimum import from_the_truth
+from reference.optimum import from_the_truth, poses_of
 
 STEPS, EVERY, STEP = 60, 4, 0.125
 SETTINGS = Config(scenario=ScenarioConfig(steps=STEPS, landmarks=12, radius=12.0))
@@ -242,7 +242,7 @@ def test_the_smoother_online_and_the_best_from_the_truth_have_the_errors_of_the_
         track = run_filter(slam, drive, scans, None, watch=lambda *seen, to=last: to.append(seen))
         _, best = from_the_truth(last[0][1], true, places)
         bound = pose_bound(BICYCLE, drive.controls, drive.time, true, drive.truth.landmarks, scans)
-        for estimate in (track.online.mean[-1], best.pose_mean(len(scans))):
+        for estimate in (track.online.mean[-1], poses_of(best)[-1].copy()):
             error = estimate - true[-1]
             error[2] = wrap(error[2])
             squares.append(error @ np.linalg.solve(bound[-1], error))

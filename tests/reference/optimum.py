@@ -1,8 +1,8 @@
-"""The smoother's graph solved from the truth: what it should have found from its own poses."""
+"""The smoother's problem solved from the truth: what it should have found from its own poses."""
 
-import gtsam
+import numpy as np
 
-from pipistrelle.estimation.smoother.graph import Best, landmark_key, links, pose_key
+from pipistrelle.estimation.smoother.chain import converged, eliminated
 
 
 def from_the_truth(belief, path, places):
@@ -11,12 +11,15 @@ def from_the_truth(belief, path, places):
     `path` (k + 1, 3) holds the true pose at the start and after each step, `places` the true
     place of each landmark by its label.
     """
-    values, step = gtsam.Values(), 0
-    for link in links(belief.link):
-        step += len(link.odometry.mean) if link.odometry else 0
-        if not values.exists(pose_key(link.node)):
-            values.insert(pose_key(link.node), gtsam.Pose2(*path[step]))
-    for label in belief.mapped:
-        values.insert(landmark_key(label), places[label])
-    best = belief.solver.solve(belief.link)
-    return best, Best(link=belief.link, graph=best.graph, found=values)
+    history, (_, border) = belief.history, belief.solution.points()
+    steps = np.append(0, history.legs.entries(4)[1:, 1])
+    there = np.zeros_like(border)
+    for number, label in enumerate(history.placed):
+        there[1 + 2 * number : 3 + 2 * number] = places[label]
+    other = eliminated(history, belief.noise, np.ascontiguousarray(path[steps]), there)
+    return belief.best(), converged(other, history, belief.noise)
+
+
+def poses_of(solution):
+    """Return the poses of the nodes at a solution."""
+    return solution.trail.entries(0)[:, :3]

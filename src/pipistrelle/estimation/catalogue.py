@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from pipistrelle.config import Config, InputError
@@ -62,8 +61,6 @@ class Entry:
     distribution that it accepts of a log; 1 drops nothing."""
     robust_gate: float = GATE
     """The same with ``filter.robust = "huber"``."""
-    needs: str = ""
-    """A module that it needs, installed by the extra of its name; or nothing."""
 
 
 def gate_of(name: str, config: Config) -> float:
@@ -80,20 +77,6 @@ def gate_of(name: str, config: Config) -> float:
     if known is None:
         return GATE
     return known.robust_gate if settings.robust == "huber" else known.gate
-
-
-def is_there(name: str) -> bool:
-    """Tell whether the module that an estimator of the catalogue needs is installed."""
-    return not CATALOGUE[name].needs or find_spec(CATALOGUE[name].needs) is not None
-
-
-def check_there(name: str) -> None:
-    """Refuse an estimator of the catalogue that needs a module which is not installed."""
-    if not is_there(name):
-        raise InputError(
-            f"filter {name}: needs {CATALOGUE[name].needs}, which is not installed; "
-            f"python -m pip install 'pipistrelle[{name}]' installs it"
-        )
 
 
 def entry(name: str) -> Entry:
@@ -214,7 +197,6 @@ def _builder(name: str, where: str) -> "Callable[[Config, Motion], Estimator]":
     """Return what builds an EKF or the smoother, a class ``module:Class`` of this room."""
 
     def build(config: Config, motion: "Motion") -> "Estimator":
-        check_there(name)
         module, _, kind = where.partition(":")
         settings = config.filter
         return getattr(import_module(f"pipistrelle.estimation.{module}"), kind)(
@@ -242,9 +224,14 @@ def _with_gate(name: str, config: Config) -> Config:
 
 
 def _smoother_bytes(landmarks: int, _: int, config: Config) -> float:
-    """Estimate the memory of all factors, 1 kB each: every landmark heard from every pose."""
+    """Estimate the memory of what the elimination leaves at each pose, and of all measurements.
+
+    Three rows of the border at each pose, held twice where all is linearised anew; every landmark
+    heard from every pose.
+    """
     poses = config.scenario.steps / config.scenario.steps_per_frame
-    return poses * landmarks * 1e3
+    each = 2.0 * COPIES * 3 * (1 + 2 * landmarks) + 12 * landmarks
+    return DOUBLE * (poses * each + COPIES * (1 + 2 * landmarks) ** 2)
 
 
 def _ekf_bytes(landmarks: int, members: int, _: Config) -> float:
@@ -305,7 +292,6 @@ CATALOGUE = {
             memory=_smoother_bytes,
             follows=True,
             robust_gate=1.0,
-            needs="gtsam",
         ),
     )
 }

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 PAGE = "view.html"
 """Name of the page in a result folder."""
 FRAMES_PER_MAP = 3
-"""Of a smoother, the map is asked for once in so many frames, as each takes a full solution."""
+"""Of a smoother, the map is asked for once in so many frames, as each takes the optimum."""
 
 
 def view(

@@ -1,6 +1,7 @@
 """Bearings that wait: where they cross, and that nothing they do ends a mission."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -9,9 +10,9 @@ from pipistrelle.estimation.beliefs import Gaussian, placed
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.smoother.delayed_initialization import (
     MIN_CROSSING_ANGLE,
-    Bearing,
-    crossing,
+    range_by_crossing,
 )
+from pipistrelle.estimation.smoother.elimination import Rows
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.runs.filtering import run_filter
@@ -21,6 +22,30 @@ UNICYCLE = Motion(model="unicycle", control_std=(0.05, 0.02), noise_at_rest=Fals
 EXACT = Gaussian(mean=np.zeros(3), covariance=np.zeros((3, 3)))
 SURE = Gaussian(mean=np.zeros(3), covariance=1e-6 * np.eye(3))
 AHEAD, STILL = (1.0, 0.0), (0.0, 0.0)
+
+
+class Bearing(NamedTuple):
+    """A bearing that waits: the number of the node it was heard from, itself, its deviation."""
+
+    node: int
+    bearing: float
+    std: float
+
+
+def crossing(poses, heard):
+    """The place where the last of these bearings crosses an earlier one, or None."""
+    rows = len(heard)
+    ends, numbers = np.zeros((rows, 4), np.int64), np.full((rows, 7), np.nan)
+    ends[:, 2], ends[:, 3] = [one.node for one in heard], np.arange(rows) - 1
+    numbers[:, 0], numbers[:, 3] = np.array(heard)[:, 1:].T
+    away = range_by_crossing(Rows(ends, numbers), rows - 1, poses)
+    x, y, heading = poses[heard[-1].node]
+    angle = heading + heard[-1].bearing
+    return (
+        None
+        if np.isnan(away)
+        else np.array([x, y]) + away * np.array([np.cos(angle), np.sin(angle)])
+    )
 
 
 def seen_from(x, place, std=0.01, heading=0.0):

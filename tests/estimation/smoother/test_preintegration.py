@@ -8,19 +8,40 @@ from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.smoother.preintegration import (
     NO_ODOMETRY,
     SMALLEST_STD,
-    between,
     extended,
     placed,
-    propagated,
-    turned,
+    poses_between,
 )
 from pipistrelle.geometry import wrap
 from reference.ekf_slam import moved
+from reference.factor_graph import turned
 from reference.missions import BICYCLE, CIRCLE, STEP
 from reference.odometry import as_motions, by_poses
 
+HERE = Gaussian(mean=np.zeros(3), covariance=np.zeros((3, 3)))
+
+
+def leg_of(motion, controls, dt, before=NO_ODOMETRY):
+    """The odometry of control steps."""
+    return extended(before, HERE, motion, np.array(controls, float), dt)[0]
+
+
+def between(ends, joint, leg):
+    """The poses after each step of a leg, when those at both ends are known."""
+    noise = np.stack([np.zeros((3, 3)), leg.covariance[-1] + SMALLEST_STD**2 * np.eye(3)])
+    if not leg.moves():
+        noise[1] = 0.0
+    rows = np.zeros((2, 2), np.int64)
+    legs = np.stack([np.zeros(3), leg.mean[-1]]), noise, np.zeros(2), rows
+    count = np.array([[0, 0], [0, len(leg.mean)]])
+    nodes = ends.copy(), np.stack([joint[:3, :3], joint[3:, 3:]])
+    cross = np.stack([np.zeros((3, 3)), joint[3:, :3]])
+    mean, covariance = poses_between(legs, count, (leg.mean, leg.covariance), nodes, cross)
+    return Gaussian(mean=mean[1:], covariance=covariance[1:])
+
+
 STEPS = 6
-LEG = extended(NO_ODOMETRY, BICYCLE, np.tile([CIRCLE[0], 0.2], (STEPS, 1)), np.full(STEPS, STEP))
+LEG = leg_of(BICYCLE, np.tile([CIRCLE[0], 0.2], (STEPS, 1)), np.full(STEPS, STEP))
 A = Gaussian(mean=np.array([2.0, -1.0, 2.5]), covariance=np.diag([0.04, 0.02, 0.01]))
 
 
@@ -46,17 +67,16 @@ def test_a_leg_step_by_step_is_the_slow_references_prediction():
 
 
 def test_a_leg_made_longer_is_the_leg_made_at_once():
-    one = extended(NO_ODOMETRY, BICYCLE, np.tile([CIRCLE[0], 0.2], (2, 1)), np.full(2, STEP))
-    both = extended(
-        one, BICYCLE, np.tile([CIRCLE[0], 0.2], (STEPS - 2, 1)), np.full(STEPS - 2, STEP)
-    )
+    one = leg_of(BICYCLE, np.tile([CIRCLE[0], 0.2], (2, 1)), np.full(2, STEP))
+    rest = np.tile([CIRCLE[0], 0.2], (STEPS - 2, 1))
+    both = leg_of(BICYCLE, rest, np.full(STEPS - 2, STEP), one)
     np.testing.assert_array_equal(both.mean, LEG.mean)
     np.testing.assert_array_equal(both.covariance, LEG.covariance)
 
 
 def test_a_leg_by_poses_is_the_leg_of_the_controls_that_led_there():
     controls, dt = np.tile([CIRCLE[0], 0.2], (STEPS, 1)), np.full(STEPS, STEP)
-    told = extended(NO_ODOMETRY, by_poses(BICYCLE), as_motions(BICYCLE, controls, dt), dt)
+    told = leg_of(by_poses(BICYCLE), as_motions(BICYCLE, controls, dt), dt)
     np.testing.assert_allclose(told.mean, LEG.mean, rtol=0, atol=1e-14)
     np.testing.assert_allclose(told.covariance, LEG.covariance, rtol=0, atol=1e-16)
 
@@ -66,20 +86,6 @@ def test_ends_as_the_controls_have_them_leave_the_prediction():
     told, steps = between(ends, joint, LEG), placed(A, LEG)
     np.testing.assert_allclose(told.mean, steps.mean, rtol=0, atol=1e-12)
     np.testing.assert_allclose(told.covariance, steps.covariance, rtol=0, atol=2e-12)
-
-
-def test_what_is_known_of_the_start_and_of_what_stands_is_carried_to_the_end():
-    rng = np.random.default_rng(2)
-    L = rng.normal(size=(5, 5))
-    joint = L @ L.T
-    start = Gaussian(mean=A.mean, covariance=joint[:3, :3])
-    ends, expected = predicted_joint(start, LEG)
-    told = propagated(A.mean, joint, LEG)
-    np.testing.assert_allclose(told[:3, :3], expected[3:, 3:], rtol=0, atol=1e-10)
-    np.testing.assert_array_equal(told[3:, 3:], joint[3:, 3:])
-    dx, dy = ends[1, :2] - A.mean[:2]
-    F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
-    np.testing.assert_allclose(told[:3, 3:], F @ joint[:3, 3:], rtol=0, atol=1e-12)
 
 
 def test_an_end_that_is_known_is_gone_through_and_what_led_to_it_is_moved_less():
@@ -118,7 +124,7 @@ def test_covariances_are_symmetric_and_never_more_than_the_predictions():
 
 def test_a_leg_without_noise_is_itself_between_any_ends():
     exact = Motion(model="bicycle", control_std=(0.0, 0.0), wheelbase=0.2)
-    leg = extended(NO_ODOMETRY, exact, np.tile([CIRCLE[0], 0.2], (STEPS, 1)), np.full(STEPS, STEP))
+    leg = leg_of(exact, np.tile([CIRCLE[0], 0.2], (STEPS, 1)), np.full(STEPS, STEP))
     ends, joint = predicted_joint(A, leg)
     told, steps = between(ends, joint, leg), placed(A, leg)
     np.testing.assert_allclose(told.mean, steps.mean, rtol=0, atol=1e-12)
@@ -129,11 +135,11 @@ def test_a_leg_moves_unless_it_stands_without_noise():
     standing = Motion(model="unicycle", control_std=(0.1, 0.1), noise_at_rest=False)
     still = np.zeros((3, 2)), np.ones(3)
     assert not NO_ODOMETRY.moves()
-    assert not extended(NO_ODOMETRY, standing, *still).moves()
+    assert not leg_of(standing, *still).moves()
     restless = Motion(model="unicycle", control_std=(0.1, 0.1))
-    assert extended(NO_ODOMETRY, restless, *still).moves()
-    assert extended(NO_ODOMETRY, standing, np.array([[0.0, 0.3]]), np.ones(1)).moves()
+    assert leg_of(restless, *still).moves()
+    assert leg_of(standing, np.array([[0.0, 0.3]]), np.ones(1)).moves()
     told = np.zeros((3, 3))
-    assert extended(NO_ODOMETRY, by_poses(restless), told, np.ones(3)).moves()
-    assert not extended(NO_ODOMETRY, by_poses(standing), told, np.ones(3)).moves()
-    assert extended(NO_ODOMETRY, by_poses(standing), told + 1e-9, np.ones(3)).moves()
+    assert leg_of(by_poses(restless), told, np.ones(3)).moves()
+    assert not leg_of(by_poses(standing), told, np.ones(3)).moves()
+    assert leg_of(by_poses(standing), told + 1e-9, np.ones(3)).moves()

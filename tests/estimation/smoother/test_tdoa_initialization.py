@@ -5,16 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipistrelle.detection.scans import with_columns
 from pipistrelle.estimation.beliefs import Gaussian, placed
 from pipistrelle.estimation.measurement import excess_path_of
 from pipistrelle.estimation.motion import Motion
-from pipistrelle.estimation.smoother.delayed_initialization import Bearing
 from pipistrelle.estimation.smoother.filter import Smoother
-from pipistrelle.estimation.smoother.tdoa import ExcessPath
 from pipistrelle.estimation.smoother.tdoa_initialization import (
     MAX_RELATIVE_RANGE_STD,
-    LastPose,
-    place_by_excess_paths,
     unscented_range,
 )
 from reference.missions import ray_config, scan_with
@@ -39,11 +36,11 @@ def way_to(place, caller=CALLER):
 
 def test_the_range_by_an_excess_path_is_that_of_the_landmark_and_of_the_caller():
     no_noise = np.zeros((4, 4))
-    assert unscented_range(way_to(BESIDE), no_noise, caller=False) == pytest.approx(
+    assert unscented_range(way_to(BESIDE), no_noise, False) == pytest.approx(
         (np.hypot(*BESIDE), 0.0)
     )
     way = np.array([*BESIDE, bearing_of(CALLER), excess_path_of(HERE, BESIDE, CALLER)])
-    found = unscented_range(way, no_noise, caller=True)
+    found = unscented_range(way, no_noise, True)
     assert found == pytest.approx((np.hypot(*CALLER), 0.0))
 
 
@@ -55,9 +52,9 @@ def test_its_deviation_is_that_of_draws_where_noise_is_small(caller):
     way = way_to(BESIDE)
     if caller:
         way = np.array([*BESIDE, bearing_of(CALLER), way[3]])
-    distance, share = unscented_range(way, spread, caller=caller)
+    distance, share = unscented_range(way, spread, caller)
     draws = rng.multivariate_normal(way, spread, 4000)
-    ranges = [unscented_range(one, np.zeros((4, 4)), caller=caller)[0] for one in draws]
+    ranges = [unscented_range(one, np.zeros((4, 4)), caller)[0] for one in draws]
     assert share * distance == pytest.approx(np.std(ranges), rel=0.06)
 
 
@@ -67,7 +64,7 @@ def test_between_vehicle_and_caller_no_range_is_sure_whatever_the_excess_path_is
     way = way_to(along * CALLER)
     way[3] += off
     assert (
-        unscented_range(way, np.diag([0.01, 0.01, 0.01, 0.05]) ** 2, caller=False)[1]
+        unscented_range(way, np.diag([0.01, 0.01, 0.01, 0.05]) ** 2, False)[1]
         > MAX_RELATIVE_RANGE_STD
     )
 
@@ -75,7 +72,7 @@ def test_between_vehicle_and_caller_no_range_is_sure_whatever_the_excess_path_is
 def test_an_excess_path_that_may_be_none_tells_no_range():
     way = way_to(BESIDE)
     for std, known in ((way[3] / 2.99, False), (way[3] / 20.0, True)):
-        share = unscented_range(way, np.diag([0.0, 0.0, 0.0, std**2]), caller=False)[1]
+        share = unscented_range(way, np.diag([0.0, 0.0, 0.0, std**2]), False)[1]
         assert (share <= MAX_RELATIVE_RANGE_STD) == known
 
 
@@ -111,22 +108,19 @@ def knowing(label, place, times=3):
 def test_a_landmark_is_placed_at_once_by_bearing_and_excess_path_of_a_caller_that_is_known():
     row = (4, BESIDE, np.nan, excess_path_of(HERE, BESIDE, CALLER))
     belief = slam().update(knowing(9, CALLER), scan(row))
-    assert belief.mapped == (9, 4)
-    assert not belief.waiting
-    assert not belief.excess_paths
+    assert belief.history.placed == (9, 4)
     rows = belief.landmarks()
     assert placed(rows).all()
     np.testing.assert_allclose(rows.mean[1], BESIDE, rtol=0, atol=0.02)
     deaf = slam().update(knowing(9, CALLER), scan((4, BESIDE, np.nan, np.nan)))
-    assert deaf.mapped == (9,)
+    assert deaf.history.placed == (9,)
 
 
 def test_a_caller_is_placed_at_once_by_bearing_and_the_excess_path_over_a_landmark_that_is_known():
     over = (4, BESIDE, np.hypot(*BESIDE), excess_path_of(HERE, BESIDE, CALLER))
     belief = slam().update(knowing(4, BESIDE), scan(over, (9, CALLER, np.nan, np.nan)))
-    assert belief.mapped == (4, 9)
+    assert belief.history.placed == (4, 9)
     np.testing.assert_allclose(belief.landmarks().mean[1], CALLER, rtol=0, atol=0.02)
-    assert not belief.excess_paths
 
 
 @pytest.mark.parametrize("off", [-0.1, -0.03, 0.0, 0.03, 0.1])
@@ -135,8 +129,8 @@ def test_a_landmark_between_vehicle_and_caller_is_not_placed_and_does_no_harm(of
     between = 0.4 * CALLER
     row = (4, between, np.nan, excess_path_of(HERE, between, CALLER) + off)
     belief = slam().update(before, scan(row, std=0.05))
-    assert belief.mapped == (9,)
-    assert len(belief.excess_paths) == len(belief.waiting) == 1
+    assert belief.history.placed == (9,)
+    assert not placed(belief.landmarks())[1:].any()
     np.testing.assert_array_equal(belief.pose().mean, before.pose().mean)
 
 
@@ -153,38 +147,23 @@ def test_one_between_them_that_is_known_by_its_range_is_left_where_it_is():
     assert np.isfinite(with_it.path().covariance).all()
 
 
-def test_what_is_known_together_is_what_the_graph_says_when_the_vehicle_has_gone_on():
-    belief = slam().predict(knowing(9, CALLER), np.array([[1.0, 0.3]] * 3), np.ones(3))[0]
-    around = LastPose(
-        isam=belief.solver.reach(belief.link),
-        node=0,
-        odometry=belief.odometry,
-        pose=belief.pose().mean,
-    )
-    told = around.joint(9)
-    gone = slam().update(belief, scan((5, BESIDE, np.nan, np.nan)))
-    after = LastPose(
-        isam=gone.solver.reach(gone.link), node=gone.link.node, odometry=None, pose=gone.pose().mean
-    )
-    assert gone.link.node == 1
-    np.testing.assert_allclose(told, after.joint(9), rtol=0, atol=1e-9)
-    np.testing.assert_allclose(told[:3, :3], belief.pose().covariance, rtol=0, atol=1e-9)
-
-
 def test_of_several_excess_paths_the_surest_places():
-    belief = knowing(9, CALLER)
-    around = LastPose(
-        isam=belief.solver.reach(belief.link), node=0, odometry=None, pose=np.zeros(3)
-    )
+    """Two calls are heard by way of a landmark; one excess path is off, and says so."""
     true = excess_path_of(HERE, BESIDE, CALLER)
-    clues = [ExcessPath(0, 4, 9, true + 0.5, 0.5), ExcessPath(0, 4, 9, true, 0.02)]
-    for order in (clues, clues[::-1]):
-        place = place_by_excess_paths(around, Bearing(0, bearing_of(BESIDE), 0.01), 4, order)
-        np.testing.assert_allclose(place, BESIDE, rtol=0, atol=0.02)
-    vague = place_by_excess_paths(
-        around, Bearing(0, bearing_of(BESIDE), 0.01), 4, [ExcessPath(0, 4, 9, true, 2.0)]
-    )
-    assert vague is None
+    before = slam().update(knowing(9, CALLER), scan((8, CALLER, np.hypot(*CALLER), np.nan)))
+    row = scan_with([4, 4], [bearing_of(BESIDE), np.nan], bearing_std=0.01)
+    for order in ([9, 8], [8, 9]):
+        off = np.where(np.array(order) == 9, 0.0, 0.5)
+        std = np.where(np.array(order) == 9, 0.02, 0.5)
+        told = with_columns(
+            row, excess_path=true + off, excess_path_std=std, caller=np.array([1, 2])
+        )
+        after = slam().update(before, replace(told, callers=np.array([-1, *order])))
+        assert after.history.placed == (9, 8, 4)
+        np.testing.assert_allclose(after.history.known[0][-1], BESIDE, rtol=0, atol=0.02)
+    vague = with_columns(row, excess_path=true, excess_path_std=2.0, caller=np.array([1, 1]))
+    vague = slam().update(before, replace(vague, callers=np.array([-1, 9])))
+    assert vague.history.placed == (9, 8)
 
 
 def test_how_sure_the_caller_is_counts():
@@ -193,5 +172,5 @@ def test_how_sure_the_caller_is_counts():
     vague = slam().init(SURE)
     told = {"range_std": 4.0, "bearing_std": 0.3}
     vague = slam().update(vague, scan_with([9], [bearing_of(CALLER)], [np.hypot(*CALLER)], **told))
-    assert slam().update(vague, scan(row)).mapped == (9,)
-    assert slam().update(knowing(9, CALLER), scan(row)).mapped == (9, 4)
+    assert slam().update(vague, scan(row)).history.placed == (9,)
+    assert slam().update(knowing(9, CALLER), scan(row)).history.placed == (9, 4)

@@ -12,7 +12,7 @@ from numba.core.event import install_timer
 
 from pipistrelle import kernel_clock
 from pipistrelle.config import Config, InputError, ScenarioConfig
-from pipistrelle.estimation.catalogue import CATALOGUE, is_there
+from pipistrelle.estimation.catalogue import CATALOGUE
 from pipistrelle.experiments.runs import compiling, trial, validate_mission
 
 TINY = Config(scenario=ScenarioConfig(steps=8, landmarks=4, radius=10.0))
@@ -115,7 +115,7 @@ def test_what_is_compiled_while_a_filter_runs_is_no_part_of_its_time(monkeypatch
 
 @pytest.mark.slow
 def test_an_empty_cache_costs_no_filter_time_with_timing_or_without(tmp_path):
-    names = list(filter(is_there, CATALOGUE))
+    names = list(CATALOGUE)
     done = subprocess.run(
         [sys.executable, "-c", COLD, *names],
         env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")},
@@ -155,4 +155,4 @@ def test_kernels_are_compiled_for_the_filters_and_timings_that_are_named(monkeyp
     compiling.compile_kernels(["iekf", "my.own:Filter"], [True])
     assert tried == [(True, "iekf")]
     compiling.compile_kernels()
-    assert tried[1:] == [(timing, *filter(is_there, CATALOGUE)) for timing in (False, True)]
+    assert tried[1:] == [(timing, *CATALOGUE) for timing in (False, True)]

@@ -13,7 +13,6 @@ from pipistrelle.detection.logs.folder import read_log, write_log
 from pipistrelle.detection.logs.readers import Reader
 from pipistrelle.detection.logs.recording import LogCaller
 from pipistrelle.detection.scans import COLUMNS, make_scan, with_columns
-from pipistrelle.estimation.catalogue import is_there
 from pipistrelle.estimation.measurement import excess_path_of
 from pipistrelle.experiments.drives import NO_TRUTH
 from pipistrelle.experiments.runs.replay import as_heard_by, load, motion_of, replay, start_of
@@ -470,8 +469,6 @@ def test_what_rows_state_is_heard_by_every_strategy():
 
 @pytest.mark.parametrize("estimator", ["ekf", "iekf", "smoother"])
 def test_the_place_of_a_logs_caller_places_what_it_lights_up(estimator):
-    if not is_there(estimator):
-        pytest.skip(f"needs the extra {estimator}")
     posts, boat = np.array([[3.0, 4.0], [-2.0, 6.0], [5.0, -1.0]]), np.array([8.0, 5.0])
     _, bearing = range_and_bearing(np.zeros(3), posts)
     e = np.array([excess_path_of(np.zeros(2), post, boat) for post in posts])

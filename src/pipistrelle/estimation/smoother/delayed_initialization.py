@@ -1,9 +1,21 @@
-"""Delayed initialization: a landmark is placed where two of its waiting bearings cross."""
+"""Delayed initialization: where a landmark or a caller enters, once what is heard of it places it.
 
-from typing import NamedTuple
+A range places what it is of. A landmark without one is placed by an excess path (`tdoa`), or where
+two of its bearings cross clearly: of the earlier ones, the newest is crossed with the one that it
+crosses most squarely, in front of both poses. The uncertainty along the newest bearing is that of
+the other line, and its own, over the sine of their angle. Bearings of a moving caller are not
+crossed: they say nothing of where it has gone between them.
+"""
+
+import math
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+
+from pipistrelle.detection.scans import BEARING, BEARING_STD, RANGE
+from pipistrelle.estimation.smoother.records import Arrays, Front, Places, Points, Rows
+from pipistrelle.estimation.smoother.tdoa_initialization import place_by_excess_path
+from pipistrelle.jit import Whole, kernel, no_alloc
 
 MIN_CROSSING_ANGLE = 0.5
 """Least angle [rad] at which two bearings place a landmark."""
@@ -11,47 +23,57 @@ MAX_RELATIVE_PLACE_STD = 0.5
 """Largest standard deviation of the place, divided by the range."""
 
 
-class Bearing(NamedTuple):
-    """A waiting bearing: the number of the pose it was heard from, bearing and deviation [rad]."""
+@kernel
+def entering_places(
+    rows: Arrays,
+    span: tuple[Whole, Whole, Whole],
+    moves: Int[np.ndarray, " s"],
+    places: Arrays,
+    estimate: Points,
+    front: Arrays,
+    R: Float[np.ndarray, "n n"],
+) -> Float[np.ndarray, "m 2"]:
+    """Return where the landmarks and callers of a frame's rows enter; NaN of those that do not.
 
-    node: int
-    bearing: float
-    std: float
-
-
-def crossing(
-    poses: Float[np.ndarray, "n 3"], waiting: tuple[Bearing, ...]
-) -> Float[np.ndarray, "2"] | None:
-    r"""Place where the newest bearing of a landmark clearly crosses an earlier one; or None.
-
-    Of the earlier bearings, the one that crosses most squarely, in front of both poses (n, 3), is
-    taken; the newest is the last. The uncertainty along the newest bearing is that of the other
-    line, :math:`r_1 \sigma_1`, and its own, :math:`r_2 \sigma_2`, over the sine of their angle.
-
-    >>> poses = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
-    >>> crossing(poses, (Bearing(0, np.pi / 4, 0.02), Bearing(1, np.pi / 2, 0.02))).round(9)
-    array([2., 2.])
-    >>> crossing(poses, (Bearing(0, 0.0, 0.02), Bearing(1, 0.1, 0.02))) is None
-    True
+    ``span``: the frame's node, its first row and the one after its last. ``estimate``: states of
+    all nodes and the border. ``front``: at this node, and the factor of its information.
     """
-    *earlier, last = waiting
-    if not earlier:
-        return None
-    node = np.array([bearing.node for bearing in earlier])
-    x, y, heading = poses[last.node]
-    angle = heading + last.bearing
-    other = poses[node, 2] + [bearing.bearing for bearing in earlier]
-    sine = np.sin(other - angle)
-    clear = np.abs(sine) >= np.sin(MIN_CROSSING_ANGLE)
-    sine[~clear] = 1.0
-    dx, dy = poses[node, 0] - x, poses[node, 1] - y
-    near = (dx * np.sin(other) - dy * np.cos(other)) / sine
-    far = (dx * np.sin(angle) - dy * np.cos(angle)) / sine
-    off = np.hypot(far * [bearing.std for bearing in earlier], near * last.std)
-    good = (
-        clear & (near > 0.0) & (far > 0.0) & (off <= MAX_RELATIVE_PLACE_STD * near * np.abs(sine))
-    )
-    if not good.any():
-        return None
-    best = np.argmax(np.where(good, np.abs(sine), 0.0))
-    return np.array([x, y]) + near[best] * np.array([np.cos(angle), np.sin(angle)])
+    rows, places, front = Rows(*rows), Places(*places), Front(*front)
+    k, first, last = span
+    pose, found = estimate[0][k], np.full((last - first, 2), np.nan)
+    for m in range(first, last):
+        slot, numbers = rows.ends[m, 0], rows.numbers[m]
+        if places.index[slot] != 0 or math.isnan(numbers[BEARING]):
+            continue
+        away = numbers[RANGE]
+        if math.isnan(away):
+            heard = m, first, last
+            away = place_by_excess_path(rows, heard, k, places, estimate, front, R)
+        if math.isnan(away) and not moves[slot]:
+            away = range_by_crossing(rows, m, estimate[0])
+        found[m - first, 0] = pose[0] + away * math.cos(pose[2] + numbers[BEARING])
+        found[m - first, 1] = pose[1] + away * math.sin(pose[2] + numbers[BEARING])
+    return found
+
+
+@no_alloc
+def range_by_crossing(rows: Rows, m: Whole, poses: Float[np.ndarray, "k d"]) -> float:
+    """Return the range where the bearing of row m clearly crosses an earlier one, or NaN."""
+    numbers, pose = rows.numbers[m], poses[rows.ends[m, 2]]
+    angle, best, found = pose[2] + numbers[BEARING], math.sin(MIN_CROSSING_ANGLE), math.nan
+    earlier = rows.ends[m, 3]
+    while earlier >= 0:
+        there = poses[rows.ends[earlier, 2]]
+        other = there[2] + rows.numbers[earlier, BEARING]
+        sine = math.sin(other - angle)
+        if abs(sine) >= best:
+            dx, dy = there[0] - pose[0], there[1] - pose[1]
+            near = (dx * math.sin(other) - dy * math.cos(other)) / sine
+            far = (dx * math.sin(angle) - dy * math.cos(angle)) / sine
+            along = far * rows.numbers[earlier, BEARING_STD]
+            across = near * numbers[BEARING_STD]
+            off = math.sqrt(along * along + across * across)
+            if near > 0.0 and far > 0.0 and off <= MAX_RELATIVE_PLACE_STD * near * abs(sine):
+                best, found = abs(sine), near
+        earlier = rows.ends[earlier, 3]
+    return found

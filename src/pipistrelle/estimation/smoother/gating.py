@@ -1,98 +1,128 @@
-"""The gate: measurements outside a share of their predicted distribution are dropped."""
+"""The gate: measurements outside a share of their predicted distribution are dropped.
+
+Bearing and range of a row are judged together. An excess path is judged alone: an error of one,
+such as a wrong direct call, says nothing about the other.
+"""
 
 import math
-from collections.abc import Collection, Sequence
 
-import gtsam
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Float
 
-from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.beliefs import NO_INNOVATIONS, Innovations
-from pipistrelle.estimation.measurement import (
-    excess_path_jacobians,
-    excess_path_of,
-    measurement_jacobians,
-    observe,
+from pipistrelle.detection.scans import (
+    BEARING,
+    BEARING_STD,
+    EXCESS_PATH,
+    EXCESS_PATH_STD,
+    RANGE,
+    RANGE_STD,
 )
-from pipistrelle.estimation.rays import gate_bounds
-from pipistrelle.estimation.smoother.caller_motion import (
-    NO_CHAINS,
-    Chains,
-    labels_in_graph,
-    point_key,
-)
-from pipistrelle.estimation.smoother.graph import joint_covariance, pose_key, pose_of
-from pipistrelle.estimation.smoother.preintegration import turned
-from pipistrelle.estimation.smoother.tdoa import ExcessPath
+from pipistrelle.estimation.measurement import excess_path_slopes, observe
+from pipistrelle.estimation.smoother.records import Arrays, Front, Places, Points, Rows
+from pipistrelle.estimation.smoother.rows import point_of
+from pipistrelle.estimation.smoother.solution import joint
 from pipistrelle.geometry import wrap_angle
+from pipistrelle.jit import Whole, kernel, no_alloc
 
 
-def rows_inside(
-    isam: gtsam.ISAM2,
-    node: int,
-    mapped: Collection[int],
-    scan: Scan,
-    gate: float,
-    chains: Chains = NO_CHAINS,
-) -> tuple[Bool[np.ndarray, " m"], Innovations]:
-    """Find rows that pass the gate or whose landmark is new, and return their innovations, too.
+@kernel
+def drop_outside(
+    rows: Arrays,
+    span: tuple[Whole, Whole, Whole],
+    places: Arrays,
+    estimate: Points,
+    front: Arrays,
+    R: Float[np.ndarray, "n n"],
+    bounds: tuple[float, float],
+) -> tuple[Whole, float, float]:
+    """Make what is outside the gate NaN, in place: a row's bearing and range, or its excess path.
 
-    ``node`` is the number of the pose from which the scan was heard. A row without a bearing
-    passes.
+    Returns how many were dropped, and of the directions that passed the sum of squared innovations,
+    in deviations, and their degrees of freedom. What is new passes. See `entering_places`.
     """
-    key = pose_key(node)
-    pose = pose_of(isam.calculateEstimatePose2(key))
-    known, bounds = labels_in_graph(mapped, chains), gate_bounds(gate)
-    M, inside, off_by = np.eye(5), np.ones(scan.landmark.size, bool), NO_INNOVATIONS
-    M[:3, :3] = turned(pose[2])
-    for m, label in enumerate(scan.landmark.tolist()):
-        if label not in known or math.isnan(scan.bearing[m]):
+    rows, places, front = Rows(*rows), Places(*places), Front(*front)
+    (k, first, last), (dropped, squared, degrees) = span, (0, 0.0, 0.0)
+    for m in range(first, last):
+        point = point_of(rows.ends[m, 0], k, places, estimate)
+        if point[0] == 0:
             continue
-        other = point_key(label, node, chains)
-        point = np.array(isam.calculateEstimatePoint2(other))
-        joint = joint_covariance(isam, key, other)
-        near, expected, _, _, _ = observe(*pose, *point)
-        H = np.hstack(measurement_jacobians(pose, point)) @ M
-        off = np.array([scan.range[m] - near, wrap_angle(scan.bearing[m] - expected)])
-        R = np.square([scan.range_std[m], scan.bearing_std[m]])
-        rows = slice(1, 2) if math.isnan(scan.range[m]) else slice(0, 2)
-        S = (H @ joint @ H.T + np.diag(R))[rows, rows]
-        squared = float(off[rows] @ np.linalg.solve(S, off[rows]))
-        inside[m] = squared <= bounds[len(off[rows]) - 1]
-        if inside[m]:
-            off_by = off_by.plus(squared, float(len(off[rows])))
-    return inside, off_by
+        numbers = rows.numbers[m]
+        if rows.ends[m, 1] >= 0:
+            caller = point_of(rows.ends[m, 1], k, places, estimate)
+            if caller[0] != 0:
+                off = _surprise_of_excess_path(numbers, estimate[0][k], (point, caller), front, R)
+                if off > bounds[0]:
+                    rows.ends[m, 1] = -1
+                    dropped += 1
+        if math.isnan(numbers[BEARING]):
+            continue
+        off, size = _surprise_of_direction(numbers, estimate[0][k], point, front, R)
+        if off > bounds[size - 1]:
+            numbers[BEARING] = numbers[RANGE] = np.nan
+            dropped += 1
+        else:
+            squared += off
+            degrees += size
+    return dropped, squared, degrees
 
 
-def excess_paths_inside(
-    isam: gtsam.ISAM2,
-    mapped: Collection[int],
-    heard: Sequence[ExcessPath],
-    gate: float,
-    chains: Chains = NO_CHAINS,
-) -> tuple[ExcessPath, ...]:
-    """Return the excess paths that pass the gate, or whose landmark or caller is not in the graph.
-
-    Each is judged alone, not with the bearing of its row: an error of one, such as a wrong direct
-    call, says nothing about the other. All are heard from one pose.
-    """
-    known, bound = labels_in_graph(mapped, chains), gate_bounds(gate)[0]
-    return tuple(
-        one
-        for one in heard
-        if not (one.landmark in known and one.caller in known)
-        or _surprise(isam, one, chains) <= bound
-    )
+@no_alloc
+def _write(
+    by_chain: Float[np.ndarray, " d"],
+    by_border: Float[np.ndarray, " n"],
+    i: Whole,
+    x: float,
+    y: float,
+) -> None:
+    """Write slopes by a place where it stands."""
+    if i > 0:
+        by_border[i], by_border[i + 1] = x, y
+    else:
+        by_chain[-i], by_chain[1 - i] = x, y
 
 
-def _surprise(isam: gtsam.ISAM2, one: ExcessPath, chains: Chains) -> float:
-    """Return the squared innovation of an excess path divided by its variance."""
-    ends = [point_key(end, one.node, chains) for end in (one.landmark, one.caller)]
-    keys = pose_key(one.node), *ends
-    pose = pose_of(isam.calculateEstimatePose2(keys[0]))
-    points = [np.array(isam.calculateEstimatePoint2(key)) for key in keys[1:]]
-    by_pose, *by_points = excess_path_jacobians(pose[:2], *points)
-    H = np.concatenate([by_pose @ turned(pose[2])[:2, :2], [0.0], *by_points])
-    off = one.excess_path - excess_path_of(pose[:2], *points)
-    return off**2 / float(H @ joint_covariance(isam, *keys) @ H + one.std**2)
+@kernel
+def _surprise_of_direction(
+    numbers: Float[np.ndarray, " 7"],
+    pose: Float[np.ndarray, " d"],
+    point: tuple[Whole, float, float],
+    front: Front,
+    R: Float[np.ndarray, "n n"],
+) -> tuple[float, Whole]:
+    """Return the squared innovation of a bearing, with a range if any, and how many they are."""
+    (i, px, py), d, n = point, front.P.shape[0], R.shape[0]
+    distance, bearing, c, s, inverse = observe(pose[0], pose[1], pose[2], px, py)
+    off, across = wrap_angle(numbers[BEARING] - bearing), numbers[BEARING_STD]
+    size = 1 if math.isnan(numbers[RANGE]) else 2
+    by_chain, by_border = np.zeros((size, d)), np.zeros((size, n))
+    by_chain[0, 0], by_chain[0, 1], by_chain[0, 2] = s * inverse, -c * inverse, -1.0
+    _write(by_chain[0], by_border[0], i, -s * inverse, c * inverse)
+    if size == 2:
+        by_chain[1, 0], by_chain[1, 1] = -c, -s
+        _write(by_chain[1], by_border[1], i, c, s)
+    S = joint(front, R, n, by_chain, by_border)
+    bb = S[0, 0] + across * across
+    if size == 1:
+        return off * off / bb, 1
+    rr, far = S[1, 1] + numbers[RANGE_STD] ** 2, numbers[RANGE] - distance
+    det = bb * rr - S[1, 0] * S[1, 0]
+    return (rr * off * off - 2.0 * S[1, 0] * off * far + bb * far * far) / det, 2
+
+
+@kernel
+def _surprise_of_excess_path(
+    numbers: Float[np.ndarray, " 7"],
+    pose: Float[np.ndarray, " d"],
+    ends: tuple[tuple[Whole, float, float], tuple[Whole, float, float]],
+    front: Front,
+    R: Float[np.ndarray, "n n"],
+) -> float:
+    """Return the squared innovation of an excess path, divided by its variance."""
+    ((i, px, py), (j, bx, by)), d, n = ends, front.P.shape[0], R.shape[0]
+    path, lx, ly, cx, cy = excess_path_slopes(pose[0], pose[1], px, py, bx, by)
+    by_chain, by_border = np.zeros((1, d)), np.zeros((1, n))
+    by_chain[0, 0], by_chain[0, 1] = -lx - cx, -ly - cy
+    _write(by_chain[0], by_border[0], i, lx, ly)
+    _write(by_chain[0], by_border[0], j, cx, cy)
+    variance = joint(front, R, n, by_chain, by_border)[0, 0] + numbers[EXCESS_PATH_STD] ** 2
+    return (numbers[EXCESS_PATH] - path) ** 2 / variance

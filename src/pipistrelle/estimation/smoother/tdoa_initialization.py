@@ -1,39 +1,31 @@
 """Initialization by an excess path: the range of a landmark, or of a caller, along its bearing.
 
-The range of a landmark follows from its bearing and an excess path over a caller in the graph; that
-of a caller from an excess path over a landmark in the graph
-(`estimation.measurement.range_by_excess_path`, `caller_range_by_excess_path`). Its uncertainty
-depends on vehicle and other point together, and on the geometry: between vehicle and caller an
-excess path says nothing of the range, and close to that line the range is far from linear, so that
-slopes would deceive. So the range is evaluated at eight sigma points, two standard deviations to
-either side along the principal axes of (offset, bearing, excess path): their spread is that of the
-range (an unscented transform; Julier & Uhlmann 1997). Where one of them has no range, or the excess
-path may be 0, nothing is known.
+The range of a landmark follows from its bearing and an excess path over a caller that is placed;
+that of a caller from an excess path over a landmark that is (`estimation.measurement`). Its
+uncertainty depends on vehicle and other point together, and on the geometry: between vehicle and
+caller an excess path says nothing of the range, and close to that line the range is far from
+linear, so that slopes would deceive. So the range is evaluated at eight sigma points, two standard
+deviations to either side along the columns of the factor of the covariance of offset, bearing and
+excess path: their spread is that of the range (an unscented transform; Julier & Uhlmann 1997).
+Where one of them has no range, or the excess path may be 0, nothing is known.
 """
 
 import math
-from collections.abc import Collection, Iterable
-from dataclasses import dataclass, field
 
-import gtsam
 import numpy as np
 from jaxtyping import Float
 
+from pipistrelle.detection.scans import BEARING, BEARING_STD, EXCESS_PATH, EXCESS_PATH_STD
 from pipistrelle.estimation.measurement import (
     MIN_TDOA_SIGMAS,
     caller_range_by_excess_path,
     range_by_excess_path,
 )
-from pipistrelle.estimation.smoother.caller_motion import (
-    Chains,
-    point_key,
-    propagated_covariance,
-    velocity_key,
-)
-from pipistrelle.estimation.smoother.delayed_initialization import Bearing
-from pipistrelle.estimation.smoother.graph import joint_covariance, pose_key, pose_of
-from pipistrelle.estimation.smoother.preintegration import Odometry, propagated, turned
-from pipistrelle.estimation.smoother.tdoa import ExcessPath
+from pipistrelle.estimation.smoother.records import Front, Places, Points, Rows
+from pipistrelle.estimation.smoother.rows import point_of
+from pipistrelle.estimation.smoother.small_matrices import cholesky
+from pipistrelle.estimation.smoother.solution import joint
+from pipistrelle.jit import Whole, kernel
 
 MAX_RELATIVE_RANGE_STD = 0.2
 """An excess path places a point if the range has at most this standard deviation, divided by the
@@ -42,91 +34,70 @@ MAX_RANGE = 1e6
 """A larger range [m] counts as none."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class LastPose:
-    """The last pose, and the landmarks and callers relative to it."""
+@kernel
+def place_by_excess_path(
+    rows: Rows,
+    heard: tuple[Whole, Whole, Whole],
+    k: Whole,
+    places: Places,
+    estimate: Points,
+    front: Front,
+    R: Float[np.ndarray, "n n"],
+) -> float:
+    """Return the range of a row's landmark or caller by its surest excess path; NaN if unsure.
 
-    isam: gtsam.ISAM2  # after the last pose that it has solved
-    node: int  # number of that pose
-    odometry: Odometry | None  # from there to the last pose, where that is another
-    pose: Float[np.ndarray, "3"]  # the last, as predicted [m, m, rad]
-    chains: Chains = field(default_factory=dict)  # moving callers in the graph, by label
-    walk_std: float = 0.0  # of a caller's velocity after 1 s [m/s]
-
-    def place(self, label: int) -> Float[np.ndarray, "2"]:
-        """Return the place of a landmark, or the predicted place of a moving caller."""
-        place = np.array(self.isam.calculateEstimatePoint2(self._keys(label)[0]))
-        if self.odometry and label in self.chains:
-            velocity = self.isam.calculateEstimatePoint2(self._keys(label)[1])
-            place += self.odometry.seconds * velocity
-        return place
-
-    def joint(self, label: int) -> Float[np.ndarray, "5 5"]:
-        """Return the covariance of the last pose and a landmark's, or a caller's, place."""
-        keys = pose_key(self.node), *self._keys(label)
-        M = np.eye(2 * len(keys) + 1)
-        start = pose_of(self.isam.calculateEstimatePose2(keys[0]))
-        M[:3, :3] = turned(start[2])
-        P = M @ joint_covariance(self.isam, *keys) @ M.T
-        if self.odometry:
-            P = propagated(start, P, self.odometry)
-            if label in self.chains:
-                P = propagated_covariance(P, self.odometry.seconds, self.walk_std)
-        return P[:5, :5]
-
-    def _keys(self, label: int) -> tuple[int, ...]:
-        """Return the key of a landmark, or the keys of a caller's place and velocity."""
-        point = point_key(label, self.node, self.chains)
-        if label in self.chains:
-            return point, velocity_key(self.chains[label], self.node)
-        return (point,)
-
-
-def usable_excess_paths(
-    label: int, heard: Iterable[ExcessPath], mapped: Collection[int]
-) -> tuple[ExcessPath, ...]:
-    """Return the excess paths of a landmark, or of a caller, whose other end is in the graph.
-
-    >>> heard = [ExcessPath(0, 4, 9, 3.0, 0.5), ExcessPath(0, 5, 9, 2.0, 0.5)]
-    >>> [[one.landmark for one in usable_excess_paths(label, heard, {4})] for label in (4, 5, 9)]
-    [[], [], [4]]
+    ``heard``: the row, and the first and the one after the last of its frame, from node k.
     """
-    return tuple(
-        one
-        for one in heard
-        if (one.landmark == label and one.caller in mapped)
-        or (one.caller == label and one.landmark in mapped)
-    )
+    m, first, last = heard
+    slot, pose = rows.ends[m, 0], estimate[0][k]
+    angle, across = pose[2] + rows.numbers[m, BEARING], rows.numbers[m, BEARING_STD]
+    spread, way, best, other = np.zeros((4, 4)), np.zeros(4), math.inf, -1
+    clue, caller = -1, False
+    for e in range(first, last):
+        asked, ends = rows.ends[e, 1] == slot, (rows.ends[e, 0], rows.ends[e, 1])
+        if ends[1] < 0 or not (asked or ends[0] == slot):
+            continue
+        i, x, y = point_of(ends[0] if asked else ends[1], k, places, estimate)
+        if i == 0:
+            continue
+        way[0], way[1], way[2] = x - pose[0], y - pose[1], angle
+        way[3] = rows.numbers[e, EXCESS_PATH]
+        spread[2, 2], spread[3, 3] = across * across, rows.numbers[e, EXCESS_PATH_STD] ** 2
+        share = unscented_range(way, spread, asked)[1]
+        if share < best:
+            best, other, clue, caller = share, ends[0] if asked else ends[1], e, asked
+    if best > MAX_RELATIVE_RANGE_STD:
+        return math.nan
+    i, x, y = point_of(other, k, places, estimate)
+    way[0], way[1], way[3] = x - pose[0], y - pose[1], rows.numbers[clue, EXCESS_PATH]
+    spread = _offset_covariance(i, front, R)
+    spread[2, 2] += across * across
+    spread[3, 3] = rows.numbers[clue, EXCESS_PATH_STD] ** 2
+    found, share = unscented_range(way, spread, caller)
+    return found if share <= MAX_RELATIVE_RANGE_STD else math.nan
 
 
-def place_by_excess_paths(
-    last: LastPose, heard: Bearing, label: int, usable: Iterable[ExcessPath]
-) -> Float[np.ndarray, "2"] | None:
-    """Return where a landmark or a caller is by bearing and surest excess path; None if unsure.
-
-    The bearing is from the last pose, ``excess_paths`` are one or more of `usable_excess_paths`.
-    """
-    angle, found = last.pose[2] + heard.bearing, []
-    for clue in usable:
-        caller = clue.caller == label
-        other = clue.landmark if caller else clue.caller
-        own = np.diag([0.0, 0.0, heard.std**2, clue.std**2])
-        way = np.array([*(last.place(other) - last.pose[:2]), angle, clue.excess_path])
-        _, share = unscented_range(way, own, caller=caller)
-        found.append((share, other, caller, way, own))
-    share, other, caller, way, own = min(found, key=lambda one: one[:2])
-    if share > MAX_RELATIVE_RANGE_STD:
-        return None
-    G = np.zeros((4, 5))
-    G[:2, :2], G[:2, 3:], G[2, 2] = -np.eye(2), np.eye(2), 1.0
-    distance, share = unscented_range(way, own + G @ last.joint(other) @ G.T, caller=caller)
-    if share > MAX_RELATIVE_RANGE_STD:
-        return None
-    return last.pose[:2] + distance * np.array([math.cos(angle), math.sin(angle)])
+@kernel
+def _offset_covariance(
+    i: Whole, front: Front, R: Float[np.ndarray, "n n"]
+) -> Float[np.ndarray, "4 4"]:
+    """Return the covariance of the offset to a place and of the heading; the last row is 0."""
+    by_chain, by_border = np.zeros((3, front.P.shape[0])), np.zeros((3, R.shape[0]))
+    for a in range(2):
+        by_chain[a, a] = -1.0
+        if i > 0:
+            by_border[a, i + a] = 1.0
+        else:
+            by_chain[a, a - i] = 1.0
+    by_chain[2, 2] = 1.0
+    spread = np.zeros((4, 4))
+    spread[:3, :3] = joint(front, R, R.shape[0], by_chain, by_border)
+    return spread
 
 
+@kernel
 def unscented_range(
-    way: Float[np.ndarray, "4"], spread: Float[np.ndarray, "4 4"], *, caller: bool
+    way: Float[np.ndarray, "4"], spread: Float[np.ndarray, "4 4"], caller: bool
 ) -> tuple[float, float]:
     """Return a range by excess path and its relative standard deviation, infinite where unknown.
 
@@ -137,24 +108,36 @@ def unscented_range(
     The landmark is at (3, 4), the caller at (6, 0).
 
     >>> way, spread = np.array([6.0, 0.0, np.arctan2(4.0, 3.0), 4.0]), np.diag([0, 0, 0, 0.01])
-    >>> [round(float(number), 3) for number in unscented_range(way, spread, caller=False)]
+    >>> [round(float(number), 3) for number in unscented_range(way, spread, False)]
     [5.0, 0.016]
 
     Were it midway between the two:
 
-    >>> unscented_range(np.array([6.0, 0.0, 0.0, 0.0]), spread, caller=False)[1]
+    >>> unscented_range(np.array([6.0, 0.0, 0.0, 0.0]), spread, False)[1]
     inf
     """
     if way[3] <= MIN_TDOA_SIGMAS * math.sqrt(spread[3, 3]):
         return math.nan, math.inf
-    size, axes = np.linalg.eigh(spread)
-    off = 2.0 * np.sqrt(np.maximum(size, 0.0)) * axes
-    by_excess_path = caller_range_by_excess_path if caller else range_by_excess_path
-    ranges = [
-        by_excess_path(e, dx, dy, math.cos(angle), math.sin(angle))
-        for dx, dy, angle, e in (way, *(way + off.T), *(way - off.T))
-    ]
-    if not all(0.0 < one < MAX_RANGE for one in ranges):
+    L, at, total = np.zeros((4, 4)), np.empty(4), 0.0
+    cholesky(spread, L)
+    first = _range(way, caller)
+    for e in range(4):
+        for side in (-2.0, 2.0):
+            for a in range(4):
+                at[a] = way[a] + side * L[a, e]
+            other = _range(at, caller)
+            if not (0.0 < other < MAX_RANGE):
+                return math.nan, math.inf
+            total += (other - first) ** 2
+    if not (0.0 < first < MAX_RANGE):
         return math.nan, math.inf
-    first, *others = ranges
-    return first, math.sqrt(sum((one - first) ** 2 for one in others) / 8.0) / first
+    return first, math.sqrt(total / 8.0) / first
+
+
+@kernel
+def _range(way: Float[np.ndarray, "4"], caller: bool) -> float:
+    """Return the range of a landmark, or of a caller, by its excess path."""
+    c, s = math.cos(way[2]), math.sin(way[2])
+    if caller:
+        return caller_range_by_excess_path(way[3], way[0], way[1], c, s)
+    return range_by_excess_path(way[3], way[0], way[1], c, s)

@@ -13,7 +13,7 @@ from pipistrelle.config import Config, InputError
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.association import association_of
 from pipistrelle.estimation.beliefs import Belief, Gaussian, Track, no_landmarks
-from pipistrelle.estimation.catalogue import CATALOGUE, check_distinct, check_there, entry
+from pipistrelle.estimation.catalogue import CATALOGUE, check_distinct, entry
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.outside import worded
 from pipistrelle.experiments.cases import Case
@@ -34,7 +34,6 @@ def check_filters(
         check_standing(moving)
     for name in filters:
         if name in CATALOGUE:
-            check_there(name)
             continue
         try:
             belief = first_belief(name, motion, config)

@@ -1,0 +1,273 @@
+"""Rows of the normal equations: what a node's measurements say of its state and of the border.
+
+A row of slopes and a misfit is divided by the measurement's standard deviation, and by the root of
+Huber's weight. Bearing and range of a landmark have one weight together, an excess path its own.
+Rows are gathered (T, G and the border's own information), or, where they know the state far better
+than it was known, correct the front one by one.
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.detection.scans import (
+    BEARING,
+    BEARING_STD,
+    EXCESS_PATH,
+    EXCESS_PATH_STD,
+    RANGE,
+    RANGE_STD,
+)
+from pipistrelle.estimation.measurement import NEAREST, excess_path_slopes, observe
+from pipistrelle.estimation.smoother.records import (
+    CALLER,
+    POSE,
+    Front,
+    Noise,
+    Places,
+    Points,
+    Rows,
+    Work,
+)
+from pipistrelle.estimation.smoother.small_matrices import add_multiple, write
+from pipistrelle.geometry import wrap_angle
+from pipistrelle.jit import Whole, no_alloc
+
+LEAST_DEVIATION = 1e-6
+"""A measurement counts as no surer [rad, m]."""
+ALONE_ABOVE = 1e4
+"""Information of a node's rows, over that of its state before, above which each row corrects alone.
+All at once they cost a tenth of that, but lose the square of this number in precision."""
+
+
+@no_alloc
+def hear(
+    work: Work,
+    front: Front,
+    span: tuple[Whole, Whole, Whole],
+    rows: Rows,
+    places: Places,
+    points: Points,
+    noise: Noise,
+) -> float:
+    """Gather T, G and the direct information of the rows of a node; return twice their cost.
+
+    ``span``: the node, its first row and the one after its last.
+    """
+    (k, begin, end), believed = span, noise.believed
+    work.T[:] = 0.0
+    cost, pose, G = 0.0, points[0][k], work.G
+    for a in range(G.shape[0]):
+        for j in range(G.shape[1]):
+            G[a, j] = 0.0
+    work.alone[0] = _is_sure(front, span, rows, places, points, noise.damping)
+    write(front.C, work.C)
+    if noise.damping > 0.0:
+        _hold(work, front, noise.damping)
+    for m in range(begin, end):
+        numbers, landmark = rows.numbers[m], point_of(rows.ends[m, 0], k, places, points)
+        if landmark[0] == 0:
+            continue
+        if not math.isnan(numbers[BEARING]):
+            cost += _hear_direction(work, front, numbers, pose, landmark, believed)
+        if rows.ends[m, 1] >= 0:
+            caller = point_of(rows.ends[m, 1], k, places, points)
+            if caller[0] != 0:
+                ends = (landmark, caller)
+                cost += _hear_excess_path(work, front, numbers, pose, ends, believed)
+    return cost
+
+
+@no_alloc
+def _hear_direction(
+    work: Work,
+    front: Front,
+    numbers: Float[np.ndarray, " 7"],
+    pose: Float[np.ndarray, " d"],
+    point: tuple[Whole, float, float],
+    believed: float,
+) -> float:
+    """Add a bearing, and its range if there is one; return what they cost, times two."""
+    i, px, py = point
+    distance, bearing, c, s, inverse = observe(pose[0], pose[1], pose[2], px, py)
+    across = 1.0 / max(numbers[BEARING_STD], LEAST_DEVIATION)
+    off = wrap_angle(bearing - numbers[BEARING]) * across
+    ranged = not math.isnan(numbers[RANGE])
+    along = 1.0 / max(numbers[RANGE_STD], LEAST_DEVIATION) if ranged else 0.0
+    far = (distance - numbers[RANGE]) * along if ranged else 0.0
+    less, cost = _huber(off * off + far * far, believed)
+    k = less * across * inverse
+    write_pose(work, k * s, -k * c, -less * across)
+    work.at[3], work.slope[3] = 0, less * off
+    chain, size = write_point(work, 3, 4, i, -k * s, k * c)
+    _add(work, front, chain, size)
+    if ranged:
+        k = less * along
+        write_pose(work, -k * c, -k * s, 0.0)
+        work.at[3], work.slope[3] = 0, less * far
+        chain, size = write_point(work, 3, 4, i, k * c, k * s)
+        _add(work, front, chain, size)
+    return cost
+
+
+@no_alloc
+def _hear_excess_path(
+    work: Work,
+    front: Front,
+    numbers: Float[np.ndarray, " 7"],
+    pose: Float[np.ndarray, " d"],
+    ends: tuple[tuple[Whole, float, float], tuple[Whole, float, float]],
+    believed: float,
+) -> float:
+    """Add an excess path over a landmark, from a caller; return what it costs, times two."""
+    (i, px, py), (j, bx, by) = ends
+    path, lx, ly, cx, cy = excess_path_slopes(pose[0], pose[1], px, py, bx, by)
+    k = 1.0 / max(numbers[EXCESS_PATH_STD], LEAST_DEVIATION)
+    off = (path - numbers[EXCESS_PATH]) * k
+    less, cost = _huber(off * off, believed)
+    k *= less
+    write_pose(work, -k * (lx + cx), -k * (ly + cy), 0.0)
+    work.at[3], work.slope[3] = 0, less * off
+    chain, size = write_point(work, 3, 4, i, k * lx, k * ly)
+    chain, size = write_point(work, chain, size, j, k * cx, k * cy)
+    _add(work, front, chain, size)
+    return cost
+
+
+@no_alloc
+def point_of(slot: Whole, k: Whole, places: Places, points: Points) -> tuple[Whole, float, float]:
+    """Return where a slot stands among the unknowns (`Places`) and its place, from node k.
+
+    A moving caller is nowhere before it joined the chain.
+    """
+    i, (at, border) = places.index[slot], points
+    if i > 0:
+        return i, border[i], border[i + 1]
+    if i < 0 and k >= places.first[(-i - POSE) // CALLER]:
+        return i, at[k, -i], at[k, -i + 1]
+    return 0, 0.0, 0.0
+
+
+@no_alloc
+def write_pose(work: Work, by_x: float, by_y: float, by_heading: float) -> None:
+    """Write the first three entries of a row: its slopes by the pose."""
+    for a in range(POSE):
+        work.at[a] = a
+    work.slope[0], work.slope[1], work.slope[2] = by_x, by_y, by_heading
+
+
+@no_alloc
+def write_point(
+    work: Work, chain: Whole, size: Whole, i: Whole, by_x: float, by_y: float
+) -> tuple[Whole, Whole]:
+    """Append the slopes by a place to a row of so many entries, the first of them of the chain.
+
+    Returns how many of the entries are of the chain, and how many there are.
+    """
+    if i > 0:
+        work.at[size], work.at[size + 1] = i, i + 1
+        work.slope[size], work.slope[size + 1] = by_x, by_y
+        return chain, size + 2
+    for e in range(size - 1, chain - 1, -1):
+        work.at[e + 2], work.slope[e + 2] = work.at[e], work.slope[e]
+    work.at[chain], work.at[chain + 1] = -i, 1 - i
+    work.slope[chain], work.slope[chain + 1] = by_x, by_y
+    return chain + 2, size + 2
+
+
+@no_alloc
+def _huber(squared: float, believed: float) -> tuple[float, float]:
+    """Return the root of the weight of a misfit in deviations, and its loss, times two."""
+    if squared <= believed * believed:
+        return 1.0, squared
+    size = math.sqrt(squared)
+    return math.sqrt(believed / size), believed * (2.0 * size - believed)
+
+
+@no_alloc
+def _add(work: Work, front: Front, chain: Whole, size: Whole) -> None:
+    """Add a row to T, to G and to the information about the border; or correct by it alone."""
+    at, slope, T, G, information = work.at, work.slope, work.T, work.G, front.information
+    for a in range(chain):
+        for b in range(chain):
+            T[at[a], at[b]] += slope[a] * slope[b]
+        for b in range(chain, size):
+            G[at[a], at[b]] += slope[a] * slope[b]
+    if work.alone[0]:
+        _correct_by_row(work, front, chain, size)
+        return
+    for a in range(chain, size):
+        for b in range(chain, size):
+            if at[a] >= at[b]:
+                information[at[a], at[b]] += slope[a] * slope[b]
+
+
+@no_alloc
+def _correct_by_row(work: Work, front: Front, chain: Whole, size: Whole) -> None:
+    """Correct the front by a row alone: a Kalman filter's correction, without any difference.
+
+    With w the row's slopes by the border, S its variance: the information gains w w^T / S.
+    """
+    at, slope, P, C, w, gain = work.at, work.slope, front.P, front.C, work.w, work.u
+    w[:] = 0.0
+    for b in range(chain, size):
+        w[at[b]] += slope[b]
+    gain[:], S = 0.0, 1.0
+    for b in range(chain):
+        for a in range(P.shape[0]):
+            gain[a] += P[a, at[b]] * slope[b]
+        add_multiple(C[at[b]], slope[b], w)
+    for b in range(chain):
+        S += slope[b] * gain[at[b]]
+    for a in range(P.shape[0]):
+        share = gain[a] / S
+        add_multiple(gain, -share, P[a])
+        add_multiple(w, -share, C[a, : w.size])
+    for i in range(w.size):
+        share = w[i] / S
+        if share != 0.0:
+            add_multiple(w, share, front.information[i, : i + 1])
+
+
+@no_alloc
+def _hold(work: Work, front: Front, damping: float) -> None:
+    """Hold each number of the state at its point, by a row of its own."""
+    for a in range(front.P.shape[0]):
+        work.at[0], work.slope[0] = a, math.sqrt(damping)
+        _add(work, front, 1, 1)
+
+
+@no_alloc
+def _is_sure(
+    front: Front,
+    span: tuple[Whole, Whole, Whole],
+    rows: Rows,
+    places: Places,
+    points: Points,
+    damping: float,
+) -> bool:
+    """Tell whether a node's rows know its state far better than it is known (`ALONE_ABOVE`)."""
+    (k, begin, end), x, y = span, points[0][span[0], 0], points[0][span[0], 1]
+    turns, moves = damping, damping
+    for m in range(begin, end):
+        numbers, (i, px, py) = rows.numbers[m], point_of(rows.ends[m, 0], k, places, points)
+        if i != 0 and not math.isnan(numbers[BEARING]):
+            sure = 1.0 / max(numbers[BEARING_STD], LEAST_DEVIATION) ** 2
+            turns += sure
+            moves += sure / max((px - x) ** 2 + (py - y) ** 2, NEAREST * NEAREST)
+            if not math.isnan(numbers[RANGE]):
+                moves += 1.0 / max(numbers[RANGE_STD], LEAST_DEVIATION) ** 2
+        if i != 0 and rows.ends[m, 1] >= 0:
+            moves += 4.0 / max(numbers[EXCESS_PATH_STD], LEAST_DEVIATION) ** 2
+    P = front.P
+    return turns * P[2, 2] > ALONE_ABOVE or moves * (P[0, 0] + P[1, 1]) > ALONE_ABOVE
+
+
+@no_alloc
+def is_far_surer(T: Float[np.ndarray, "d d"], P: Float[np.ndarray, "d d"]) -> bool:
+    """Tell whether a node's rows know its state far better than it is known (`ALONE_ABOVE`)."""
+    most = 0.0
+    for a in range(P.shape[0]):
+        most = max(most, T[a, a] * P[a, a])
+    return most > ALONE_ABOVE

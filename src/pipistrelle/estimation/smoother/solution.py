@@ -1,0 +1,175 @@
+r"""The solution of the arrow: the border by a factor of its information, then back along the chain.
+
+The information is factored from its last row to its first, :math:`\Lambda = R^T R` with R lower
+triangular, so that every loop runs along a row. The first column of R is then the right-hand side.
+Back along the chain goes the adjoint of Bryson & Frazier, which inverts nothing: with
+:math:`e_k = E_k \beta` what the measurements of a node pull at its predicted state,
+
+.. math:: \lambda_k = F_{k+1}^T \lambda_{k+1} - e_k - T_k (\hat x_k - \bar x_k), \qquad
+          \hat x_k = x_{k|k} + M_k F_{k+1}^T \lambda_{k+1} .
+
+Source: Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, ch. X.
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.estimation.smoother.records import (
+    POSE,
+    Arrays,
+    Legs,
+    Noise,
+    Places,
+    Points,
+    Trail,
+    work_of,
+)
+from pipistrelle.estimation.smoother.rows import is_far_surer
+from pipistrelle.estimation.smoother.small_matrices import add_image, cholesky, solve_with
+from pipistrelle.estimation.smoother.transition import predicted, transition, write_start
+from pipistrelle.jit import Whole, kernel, no_alloc
+
+
+@no_alloc
+def factor(R: Float[np.ndarray, "n n"], n: Whole) -> None:
+    """Factor an information of n columns, R^T R, in place; its first column becomes R b."""
+    for i in range(n - 1, 0, -1):
+        row = R[i]
+        inverse = 1.0 / math.sqrt(row[i])
+        for j in range(i + 1):
+            row[j] *= inverse
+        for r in range(i):
+            share, other = row[r], R[r]
+            for j in range(r + 1):
+                other[j] -= share * row[j]
+
+
+@no_alloc
+def minimise(R: Float[np.ndarray, "n n"], n: Whole, beta: Float[np.ndarray, " n"]) -> None:
+    """Write (1, b) of the least cost, from the factor."""
+    beta[0] = 1.0
+    for i in range(1, n):
+        total = 0.0
+        for j in range(i):
+            total += R[i, j] * beta[j]
+        beta[i] = -total / R[i, i]
+
+
+@no_alloc
+def rooted(R: Float[np.ndarray, "n n"], w: Float[np.ndarray, " n"], n: Whole) -> None:
+    """Replace a slope w by the border by R^-T w, whose square is the variance of w b."""
+    w[0] = 0.0
+    for i in range(n - 1, 0, -1):
+        if w[i] != 0.0:
+            w[i] /= R[i, i]
+            for j in range(i):
+                w[j] -= w[i] * R[i, j]
+    w[0] = 0.0
+
+
+@kernel
+def solve(
+    front: Arrays, n: Whole, R: Float[np.ndarray, "n n"], beta: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
+    """Solve for the border; return the state's difference from its point, and its covariance.
+
+    R and ``beta`` are written: the factor, and (1, b).
+    """
+    C, P, information = front
+    d = P.shape[0]
+    for i in range(n):
+        for j in range(i + 1):
+            R[i, j] = information[i, j]
+    factor(R, n)
+    minimise(R, n, beta)
+    state, covariance, Z = np.zeros(d), P.copy(), np.empty((d, n))
+    for a in range(d):
+        for j in range(n):
+            state[a] += C[a, j] * beta[j]
+            Z[a, j] = C[a, j]
+        rooted(R, Z[a], n)
+        for b in range(a + 1):
+            total = 0.0
+            for j in range(n):
+                total += Z[a, j] * Z[b, j]
+            covariance[a, b] += total
+            covariance[b, a] = covariance[a, b]
+    return state, covariance
+
+
+@kernel
+def joint(
+    front: Arrays,
+    R: Float[np.ndarray, "n n"],
+    n: Whole,
+    by_chain: Float[np.ndarray, "q d"],
+    by_border: Float[np.ndarray, "q n"],
+) -> Float[np.ndarray, "q q"]:
+    """Return the covariance of linear functions of the last state and the border together."""
+    C, P, _ = front
+    q, d = by_chain.shape
+    Z, covariance = by_border.copy(), np.empty((q, q))
+    for e in range(q):
+        for a in range(d):
+            if by_chain[e, a] != 0.0:
+                for j in range(n):
+                    Z[e, j] += by_chain[e, a] * C[a, j]
+        rooted(R, Z[e], n)
+        for f in range(e + 1):
+            total = 0.0
+            for j in range(n):
+                total += Z[e, j] * Z[f, j]
+            for a in range(d):
+                for b in range(d):
+                    total += by_chain[e, a] * P[a, b] * by_chain[f, b]
+            covariance[e, f] = covariance[f, e] = total
+    return covariance
+
+
+@kernel
+def retrace(
+    legs: Arrays,
+    places: Arrays,
+    points: Points,
+    trail: Arrays,
+    noise: tuple[float, ...],
+    beta: Float[np.ndarray, " n"],
+    nodes: Whole,
+) -> Float[np.ndarray, "k d"]:
+    """Return the states of so many nodes at the least cost."""
+    legs, places, trail, noise = Legs(*legs), Places(*places), Trail(*trail), Noise(*noise)
+    at, d = points[0], trail.T.shape[1]
+    work, before, pull = work_of(d, 1), np.zeros((nodes, d)), np.zeros((nodes, d))
+    x, y, back = np.zeros(d), np.zeros(d), np.zeros(d)
+    write_start(work, legs, at)
+    x[:POSE] = work.u[:POSE]
+    for k in range(nodes):
+        if k > 0:
+            transition(work, k, legs, places, at, noise)
+            y[:] = work.u
+            add_image(work.F, x, y, 1.0)
+            x[:] = y
+        before[k] = x
+        add_image(trail.E[k], beta, pull[k], 1.0)
+        add_image(trail.M[k], pull[k], x, -1.0)
+    states = np.empty((nodes, d))
+    for k in range(nodes - 1, -1, -1):
+        back -= pull[k]
+        x[:] = 0.0
+        add_image(trail.M[k], back, x, 1.0)
+        states[k] = at[k] + before[k] + x
+        if k == 0:
+            break
+        add_image(trail.T[k], x, back, -1.0)
+        transition(work, k, legs, places, at, noise)
+        predicted(work, trail.M[k - 1], work.T)
+        if is_far_surer(trail.T[k], work.T):  # what pulls is lost in rounding
+            cholesky(work.T, work.B)
+            solve_with(work.B, x)
+            back[:] = x
+        y[:] = 0.0
+        add_image(work.F.T.copy(), back, y, 1.0)
+        back[:] = y
+    return states
