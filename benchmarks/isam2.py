@@ -1,4 +1,4 @@
-"""The peer of the EKF: GTSAM's iSAM2 on the same fused mission, frame by frame.
+"""The peers: GTSAM's iSAM2 and its batch optimiser on a mission of the EKF and the smoother.
 
     python -m benchmarks.isam2 ROUNDS     # CPU seconds and errors as JSON; needs gtsam
 
@@ -8,14 +8,18 @@ the timing. Each measurement is a factor, each frame one incremental update, aft
 pose is read. A landmark enters the graph with its first range; a passive one when two of its
 bearings cross at `PARALLAX` or more, where they cross, with all its bearings so far. The peer's
 time is what it spends in its own calls, not in the Python around them, and it is not asked for
-covariances; the EKF's time is that of the whole trial, which has them.
+covariances; the times of the EKF and the smoother are those of the whole trials, which have them.
+
+In a batch all is linearised first at the EKF's poses and map: GTSAM's optimiser by Levenberg and
+Marquardt has the factors of its graph, the smoother what it has heard. Both go on until the cost
+falls by less than 1e-7 of it; the smoother's time includes the covariance of every pose.
 """
 
 import json
 import math
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from statistics import median
 
 import gtsam
@@ -25,10 +29,15 @@ from benchmarks.calibration import calibrate
 from benchmarks.worlds import scans_of, world_of
 from pipistrelle.config import Config
 from pipistrelle.detection.scans import Scan
+from pipistrelle.estimation.beliefs import Track, placed
+from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.motion import Motion, motion_jacobians, motion_step
+from pipistrelle.estimation.smoother.belief import SmootherBelief
+from pipistrelle.estimation.smoother.chain import eliminated
 from pipistrelle.evaluation.accuracy import position_error, rmse
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive
+from pipistrelle.experiments.runs.filtering import run_filter
 from pipistrelle.experiments.runs.heard_world import drive_of
 from pipistrelle.experiments.runs.trial import run_trial
 
@@ -165,27 +174,82 @@ def crossing(poses: np.ndarray, bearings: list[tuple[int, float]]) -> np.ndarray
     return place
 
 
+def whole_belief(config: Config, drive: Drive, scans: tuple[Scan, ...]) -> SmootherBelief:
+    """Return the smoother's belief after a whole mission."""
+    beliefs: list[SmootherBelief] = []
+    slam = entry("smoother").build(config, drive.motion)
+    run_filter(
+        slam, drive, scans, np.random.default_rng(0), watch=lambda _, now: beliefs.append(now)
+    )
+    return beliefs[-1]
+
+
+def smooth_at_once(belief: SmootherBelief, track: Track, every: int) -> float:
+    """Solve all that a belief has heard from an EKF's track, and return the time it takes [s]."""
+    began = time.process_time()
+    history, border = belief.history, belief.solution.border.copy()
+    at = np.ascontiguousarray(track.pose.mean[::every])
+    for label, place in places_of(track).items():
+        if label in history.placed:
+            column = 1 + 2 * history.placed.index(label)
+            border[column : column + 2] = place
+    solution = eliminated(history, belief.noise, at, border)
+    replace(belief, solution=solution).path()
+    return time.process_time() - began
+
+
+def optimise_at_once(graph: Graph, track: Track, every: int) -> float:
+    """Solve a graph of GTSAM's from an EKF's track, and return the time it takes [s]."""
+    factors, values = graph.isam.getFactorsUnsafe(), graph.isam.calculateEstimate()
+    for k, pose in enumerate(track.pose.mean[::every]):
+        values.update(k, gtsam.Pose2(*pose))
+    for label, place in places_of(track).items():
+        if label in graph.mapped:
+            values.update(landmark_key(label), place)
+    settings = gtsam.LevenbergMarquardtParams()
+    settings.setRelativeErrorTol(1e-7)
+    began = time.process_time()
+    gtsam.LevenbergMarquardtOptimizer(factors, values, settings).optimize()
+    return time.process_time() - began
+
+
+def places_of(track: Track) -> dict[int, np.ndarray]:
+    """Return where a track has placed its landmarks."""
+    sure = placed(track.landmarks)
+    labels = track.landmarks.landmark[sure].tolist()
+    return dict(zip(labels, track.landmarks.mean[sure], strict=True))
+
+
 def compare(rounds: int) -> dict[str, float]:
     """Time both on one mission, in turns; errors over the frames [m], CPU time [s]."""
     config = Config()
     world, scans = world_of(config), scans_of(config, "fused")
     drive, every = drive_of(world, config), config.scenario.steps_per_frame
     frames, case = odometry(drive.motion, drive, every), Case(strategy="fused", filter="ekf")
-    ours, peer, around = [], [], []
+    last = whole_belief(config, drive, scans)
+    ours, smoothed, batch, peer, around, peers_batch = [], [], [], [], [], []
     for _ in range(rounds + 1):
         began = time.process_time()
         trial = run_trial(case, drive, scans, config)
         ours.append(time.process_time() - began)
         began = time.process_time()
+        run_trial(replace(case, filter="smoother"), drive, scans, config)
+        smoothed.append(time.process_time() - began)
+        batch.append(smooth_at_once(last, trial.track, every))
+        began = time.process_time()
         online, graph = smooth(config, drive, frames, scans)
         around.append(time.process_time() - began)
         peer.append(graph.seconds)
+        peers_batch.append(optimise_at_once(graph, trial.track, every))
     known = np.array([graph.pose(k) for k in range(1, len(online))])
     true, found = world.path[every::every], trial.track.pose.mean[every::every]
     return {
         "isam2_s": median(peer[1:]),
         "isam2_with_python_s": median(around[1:]),
+        "isam2_batch_s": median(peers_batch[1:]),
         "ekf_s": median(ours[1:]),
+        "smoother_s": median(smoothed[1:]),
+        "batch_s": median(batch[1:]),
         "calibration_s": calibrate(time.process_time),
         "ekf_m": rmse(position_error(found, true)),
         "isam2_m": rmse(position_error(online[1:], true)),

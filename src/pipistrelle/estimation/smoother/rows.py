@@ -97,6 +97,10 @@ def _hear_direction(
     along = 1.0 / max(numbers[RANGE_STD], LEAST_DEVIATION) if ranged else 0.0
     far = (distance - numbers[RANGE]) * along if ranged else 0.0
     less, cost = _huber(off * off + far * far, believed)
+    if i > 0 and not work.alone[0]:
+        slopes = less * across * inverse, less * along, less * across
+        _add_direction(work, front, i, (c, s), slopes, (less * off, less * far))
+        return cost
     k = less * across * inverse
     write_pose(work, k * s, -k * c, -less * across)
     work.at[3], work.slope[3] = 0, less * off
@@ -109,6 +113,50 @@ def _hear_direction(
         chain, size = write_point(work, 3, 4, i, k * c, k * s)
         _add(work, front, chain, size)
     return cost
+
+
+@no_alloc
+def _add_direction(
+    work: Work,
+    front: Front,
+    i: Whole,
+    cosines: tuple[float, float],
+    slopes: tuple[float, float, float],
+    off: tuple[float, float],
+) -> None:
+    """Add the rows of a bearing and a range, of a place at column i of the border: as `_add` does.
+
+    ``slopes``: of the bearing by a move across, of the range by one along, of minus the bearing by
+    the heading; ``off``: what they are off.
+    """
+    (c, s), (q, p, h), (b, r), T, G = cosines, slopes, off, work.T, work.G
+    xx, xy, yy = q * q * s * s + p * p * c * c, (p * p - q * q) * c * s, q * q * c * c + p * p * s * s
+    xh, yh, xr, yr = -h * q * s, h * q * c, p * c * r - q * s * b, p * s * r + q * c * b
+    T[0, 0] += xx
+    T[0, 1] += xy
+    T[1, 0] += xy
+    T[1, 1] += yy
+    T[0, 2] += xh
+    T[2, 0] += xh
+    T[1, 2] += yh
+    T[2, 1] += yh
+    T[2, 2] += h * h
+    G[0, 0] -= xr
+    G[1, 0] -= yr
+    G[2, 0] -= h * b
+    G[0, i] -= xx
+    G[0, i + 1] -= xy
+    G[1, i] -= xy
+    G[1, i + 1] -= yy
+    G[2, i] -= xh
+    G[2, i + 1] -= yh
+    upper, lower = front.information[i], front.information[i + 1]
+    upper[0] += xr
+    lower[0] += yr
+    upper[i] += xx
+    lower[i] += xy
+    lower[i + 1] += yy
+    front.information[0, 0] += b * b + r * r
 
 
 @no_alloc
