@@ -67,10 +67,7 @@ def eliminated(
     points = trail.arrays[0], border
     cost = begin(front, history.legs.arrays[:4], history.known, points, noise[4])
     cost += _run(history, noise, points, trail, front, 0)
-    return _solved(history, Solution(
-        trail=trail, border=border, front=front, factor=front[2], beta=border, state=at[-1],
-        covariance=front[1], cost=cost,
-    ))  # fmt: skip
+    return _solved(history, trail, border, front, cost)
 
 
 def _trail(nodes: int, d: int, w: int) -> Stack:
@@ -91,14 +88,24 @@ def _run(
     )  # fmt: skip
 
 
-def _solved(history: History, solution: Solution) -> Solution:
+def _solved(
+    history: History, trail: Stack, border: np.ndarray, front: Arrays, cost: float
+) -> Solution:
     """Return the solution at the last node of a chain that is eliminated."""
     n = history.columns
     factor, beta = np.empty((n, n)), np.empty(n)
-    off, covariance = solve(solution.front, n, factor, beta)
+    off, covariance = solve(front, n, factor, beta)
     beta[0] = 0.0
-    state = solution.trail.arrays[0][history.nodes - 1] + off
-    return replace(solution, factor=factor, beta=beta, state=state, covariance=covariance)
+    return Solution(
+        trail=trail,
+        border=border,
+        front=front,
+        factor=factor,
+        beta=beta,
+        state=trail.arrays[0][history.nodes - 1] + off,
+        covariance=covariance,
+        cost=cost,
+    )
 
 
 def stepped(solution: Solution, history: History, noise: Noise, guess: np.ndarray) -> Solution:
@@ -109,8 +116,16 @@ def stepped(solution: Solution, history: History, noise: Noise, guess: np.ndarra
     front = tuple(map(np.copy, solution.front))
     places, at = history.places(), trail.arrays[0]
     cost = step_to(front, history.legs.arrays[:4], places, at, noise, (k, history.columns))
-    cost += solution.cost
-    return replace(solution, trail=trail, front=front, state=guess, cost=cost)
+    return Solution(
+        trail=trail,
+        border=solution.border,
+        front=front,
+        factor=solution.factor,
+        beta=solution.beta,
+        state=guess,
+        covariance=solution.covariance,
+        cost=solution.cost + cost,
+    )
 
 
 def joined(solution: Solution, before: History, history: History, noise: Noise) -> Solution:
@@ -129,9 +144,9 @@ def joined(solution: Solution, before: History, history: History, noise: Noise) 
 
 def waited(before: History, history: History) -> bool:
     """Tell whether measurements from before the last node count now, and did not before."""
-    new = np.flatnonzero(history.index[: before.index.size] != before.index)
-    if not new.size:
+    if history is before:
         return False
+    new = np.flatnonzero(history.index != before.index)
     earlier = history.rows.arrays[0][: history.legs.arrays[3][history.nodes - 1, 0], :2]
     return bool(np.isin(earlier, new[history.index[new] > 0]).any())
 
@@ -146,9 +161,9 @@ def off_line(solution: Solution, history: History) -> float:
 
 def heard(solution: Solution, history: History, noise: Noise) -> Solution:
     """Return the chain solved with what is heard from the last node; its front is used up."""
-    first = history.nodes - 1
-    cost = _run(history, noise, solution.points(), solution.trail, solution.front, first)
-    return _solved(history, replace(solution, cost=solution.cost + cost))
+    trail, border, front = solution.trail, solution.border, solution.front
+    cost = _run(history, noise, solution.points(), trail, front, history.nodes - 1)
+    return _solved(history, trail, border, front, solution.cost + cost)
 
 
 def relinearised(solution: Solution, history: History, noise: Noise) -> Solution:

@@ -54,10 +54,9 @@ from pipistrelle.estimation.smoother.gating import drop_outside
 from pipistrelle.estimation.smoother.history import (
     History,
     begun,
+    heard_more,
     with_caller,
-    with_leg,
     with_places,
-    with_scan,
 )
 from pipistrelle.estimation.smoother.preintegration import NO_ODOMETRY, SMALLEST_STD, extended
 from pipistrelle.estimation.smoother.records import Arrays, Points
@@ -159,7 +158,7 @@ class Smoother:
         scan = usable_scan(scan)
         if scan.landmark.size == 0:
             return belief
-        history = with_scan(with_leg(belief.history, belief.odometry), scan)
+        history = heard_more(belief.history, belief.odometry, scan)
         here = stepped(belief.solution, history, self.noise, belief.guess())
         gated, innovations = belief.gated, belief.innovations
         if self.gate < 1.0:

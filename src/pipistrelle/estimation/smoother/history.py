@@ -19,6 +19,7 @@ from pipistrelle.estimation.measurement import columns_of, excess_paths, timings
 from pipistrelle.estimation.smoother.preintegration import SMALLEST_STD, Odometry
 from pipistrelle.estimation.smoother.records import CALLER, POSE, Arrays
 from pipistrelle.estimation.smoother.stack import Stack
+from pipistrelle.jit import Whole, kernel
 
 Slot = tuple[int, bool]
 """A label, and whether it is that of a caller that moves."""
@@ -83,53 +84,64 @@ def begun(pose: Gaussian) -> History:
     return History(legs=legs, steps=steps, rows=rows, known=known)
 
 
-def with_leg(history: History, odometry: Odometry) -> History:
-    """Return a history with a node more, at which odometry ends."""
-    legs, count = history.legs.extended(1), len(odometry.mean)
-    steps, k, row = history.steps.extended(count), history.nodes, history.rows.size
-    legs.arrays[0][k], legs.arrays[1][k] = 0.0, 0.0
+def heard_more(history: History, odometry: Odometry, scan: Scan) -> History:
+    """Return a history with a node more, at which odometry ends, and a scan heard from there."""
+    landmarks, callers, history = _slots_of(history, scan)
+    size, latest = len(landmarks), history.latest.copy()
+    legs, rows = history.legs.extended(1), history.rows.extended(size)
+    k, row, step = history.legs.size, history.rows.size, history.steps.size
+    steps = history.steps.extended(len(odometry.mean))
+    mean, noise, seconds, heard, ends = legs.arrays
+    mean[k], noise[k], seconds[k] = 0.0, 0.0, odometry.seconds
+    heard[k], ends[k] = (row, rows.size), (step, steps.size)
     if odometry.moves():
-        legs.arrays[0][k] = odometry.mean[-1]
-        legs.arrays[1][k] = _sure(odometry.covariance[-1])
-    legs.arrays[2][k], legs.arrays[3][k] = odometry.seconds, row
-    legs.arrays[4][k] = history.steps.size, steps.size
-    steps.arrays[0][history.steps.size : steps.size] = odometry.mean
-    steps.arrays[1][history.steps.size : steps.size] = odometry.covariance
-    return replace(history, legs=legs, steps=steps)
+        mean[k], noise[k] = odometry.mean[-1], _sure(odometry.covariance[-1])
+    steps.arrays[0][step : steps.size] = odometry.mean
+    steps.arrays[1][step : steps.size] = odometry.covariance
+    which, numbers = rows.arrays[0][row : rows.size], rows.arrays[1][row : rows.size]
+    which[:, 0], which[:, 1], which[:, 2] = landmarks, callers, k
+    numbers[:] = scan.numbers.T
+    _link(which, numbers, latest, row)
+    return replace(history, legs=legs, steps=steps, rows=rows, latest=latest)
 
 
-def with_scan(history: History, scan: Scan) -> History:
-    """Return a history with a scan, heard from the last node."""
-    moving = {*scan.moving.tolist(), *history.callers}
-    labels, callers = scan.landmark.tolist(), [-1] * scan.landmark.size
+@kernel
+def _link(
+    ends: Int[np.ndarray, "m 4"],
+    numbers: Float[np.ndarray, "m 7"],
+    latest: Int[np.ndarray, " s"],
+    first: Whole,
+) -> None:
+    """Write of each row the row of its landmark's bearing before, and which is the latest."""
+    for m in range(ends.shape[0]):
+        ends[m, 3] = -1
+        if not math.isnan(numbers[m, BEARING]):
+            ends[m, 3] = latest[ends[m, 0]]
+            latest[ends[m, 0]] = first + m
+
+
+def _slots_of(history: History, scan: Scan) -> tuple[list[int], list[int], History]:
+    """Return the slots of landmarks and callers (-1: none) of a scan, and a history with them."""
+    labels, callers, slots = scan.landmark.tolist(), [-1] * scan.landmark.size, history.slots
     if (timings := timings_of(scan)) is not None:
         found = excess_paths(columns_of(scan), timings)
         for row, caller in zip(found.row.tolist(), found.caller.tolist(), strict=True):
             callers[row] = caller
-    slots = dict(history.slots)
-    landmark = [slots.setdefault((label, label in moving), len(slots)) for label in labels]
-    caller = [
-        -1 if label < 0 else slots.setdefault((label, label in moving), len(slots))
-        for label in callers
-    ]
-    history = _with_slots(history, slots)
-    rows, latest = history.rows.extended(len(labels)), history.latest.copy()
-    new = slice(history.rows.size, rows.size)
-    ends, numbers = rows.arrays[0][new], rows.arrays[1][new]
-    ends[:, 0], ends[:, 1], ends[:, 2], ends[:, 3] = landmark, caller, history.nodes - 1, -1
-    numbers[:] = scan.numbers.T
-    for row, slot in enumerate(landmark, start=new.start):
-        if not math.isnan(numbers[row - new.start, BEARING]):
-            ends[row - new.start, 3], latest[slot] = latest[slot], row
-    history.legs.arrays[3][history.nodes - 1, 1] = new.stop
-    return replace(history, rows=rows, latest=latest)
+    moving = {*scan.moving.tolist(), *history.callers}
+    wanted = {(label, label in moving) for label in (*labels, *callers) if label >= 0}
+    if new := sorted(wanted.difference(slots)):
+        slots = {**slots, **{slot: len(slots) + n for n, slot in enumerate(new)}}
+        history = _with_slots(history, slots)
+    return (
+        [slots[label, label in moving] for label in labels],
+        [-1 if label < 0 else slots[label, label in moving] for label in callers],
+        history,
+    )
 
 
 def _with_slots(history: History, slots: Mapping[Slot, int]) -> History:
     """Return a history with slots more, which are nowhere yet."""
     count = len(slots) - len(history.slots)
-    if not count:
-        return history
     more = np.array([moves for _, moves in slots], np.int64)[-count:]
     return replace(
         history,
@@ -150,7 +162,8 @@ def with_places(
     slots, index = dict(history.slots), history.index
     for label in labels:
         slots.setdefault((label, False), len(slots))
-    history = _with_slots(history, slots)
+    if len(slots) > len(history.slots):
+        history = _with_slots(history, slots)
     index = history.index.copy()
     for number, label in enumerate(labels):
         index[slots[label, False]] = history.columns + 2 * number

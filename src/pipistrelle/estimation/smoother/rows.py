@@ -130,7 +130,11 @@ def _add_direction(
     the heading; ``off``: what they are off.
     """
     (c, s), (q, p, h), (b, r), T, G = cosines, slopes, off, work.T, work.G
-    xx, xy, yy = q * q * s * s + p * p * c * c, (p * p - q * q) * c * s, q * q * c * c + p * p * s * s
+    xx, xy, yy = (
+        q * q * s * s + p * p * c * c,
+        (p * p - q * q) * c * s,
+        q * q * c * c + p * p * s * s,
+    )
     xh, yh, xr, yr = -h * q * s, h * q * c, p * c * r - q * s * b, p * s * r + q * c * b
     T[0, 0] += xx
     T[0, 1] += xy
