@@ -312,7 +312,7 @@ def slam(
     config: Base = None,
     robot: Robot | None = None,
     strategies: str | Sequence[str] = "fused",
-    filters: Filters = "ekf",
+    filters: Filters = "smoother",
     beamwidth: float | None = None,
     gate: float | Literal["auto"] | None = None,
     output: Path | str | None = None,

@@ -50,7 +50,7 @@ def slam(
             name="--filter",
             help="What draws the map; several, parted by commas, side by side.",
         ),
-    ] = "ekf",
+    ] = "smoother",
     particles: Particles = None,
     beamwidth: Annotated[
         float | None,
