@@ -74,8 +74,8 @@ def test_the_defaults_that_the_help_names_are_those_of_the_settings(obey):
     assert told["particles"] == str(config.fastslam.particles)
 
 
-@pytest.mark.parametrize("verb", ["run", "slam"])
-def test_the_help_names_the_filters_there_are(obey, verb):
+@pytest.mark.parametrize(("verb", "default"), [("run", "ekf"), ("slam", "smoother")])
+def test_the_help_names_the_filters_there_are(obey, verb, default):
     words = " ".join(re.sub("[│╭╮╰╯─]", " ", obey(verb, "--help")[1]).split())
-    assert "[choices: ekf, fastslam, iekf, smoother, both, all] [default: ekf]" in words
+    assert f"[choices: ekf, fastslam, iekf, smoother, both, all] [default: {default}]" in words
     assert "sets fastslam.particles" in words

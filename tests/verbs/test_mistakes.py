@@ -112,7 +112,7 @@ import pytest
         ("slam . --filter.range-std 3", "--filter.range-std: the log decides this"),
         ("slam . --gate 2", '--gate: found 2.0, expected above 0 and up to 1, or "auto"'),
         ("slam . --gate 0.9 --filter.gate 0.9", "--gate and --filter.gate are one setting"),
-        ("slam . --particles 9", "--particles: found 9, but --filter is ekf, which has none; add"),
+        ("slam . --particles 9", "--particles: found 9, but --filter is smoother, which has"),
         ("slam . --filter both --particles 0", "--particles: found 0, expected greater than or"),
         (
             "slam . --filter both --particles 3 --fastslam.particles 3",

@@ -1,1 +1,1 @@
-"""The smoother: `filter` is the method, `graph` the factor graph, `belief` what it answers."""
+"""The smoother: `filter` is the method, `elimination` the solver, `belief` what it answers."""
