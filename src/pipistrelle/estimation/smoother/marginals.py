@@ -30,11 +30,15 @@ from pipistrelle.estimation.smoother.records import (
 )
 from pipistrelle.estimation.smoother.rows import is_far_surer
 from pipistrelle.estimation.smoother.small_matrices import (
+    add,
     add_product,
     cholesky,
+    congruent,
     multiply,
     solve_with,
+    transpose,
     write,
+    write_identity,
 )
 from pipistrelle.estimation.smoother.solution import rooted
 from pipistrelle.estimation.smoother.transition import predicted, transition
@@ -56,44 +60,71 @@ def marginals(
     at, n, d = points[0], R.shape[0], trail.T.shape[1]
     work, before = work_of(d, n), np.zeros((nodes, d, n))
     _go_forward(work, legs, places, at, noise, trail, before)
-    own, cross = np.zeros((nodes, d, d)), np.zeros((nodes, d, d))
-    A, N, P, link = np.zeros((d, n)), np.zeros((d, d)), np.zeros((d, d)), np.zeros((d, d))
-    slopes, following = np.zeros((d, n)), np.zeros((d, n))
+    own, cross, small = np.zeros((nodes, d, d)), np.zeros((nodes, d, d)), np.zeros((6, d, d))
+    A, slopes, following = np.zeros((d, n)), np.zeros((d, n)), np.zeros((d, n))
+    N, link, given, Z = small[0], small[1], small[2], work.C
     for k in range(nodes - 1, -1, -1):
-        M, Z = trail.M[k], work.C
         _corrected(before[k], trail, k, slopes)
-        add_product(M, A, slopes, 1.0)
-        given = M - _of(_of(M, N), M)
+        add_product(trail.M[k], A, slopes, 1.0)
+        multiply(trail.M[k], N, work.A)
+        write(trail.M[k], given)
+        add_product(work.A, trail.M[k], given, -1.0)
         write(slopes, Z)
         for a in range(d):
             rooted(R, Z[a], n)
+        write(given, own[k])
         _add_products(Z, Z, own[k])
-        own[k] += given
         if k + 1 < nodes:
+            transpose(link, cross[k + 1])
             _add_products(following, Z, cross[k + 1])
-            cross[k + 1] += link.T
-        if k == 0:
-            break
-        write(Z, following)
-        transition(work, k, legs, places, at, noise)
-        predicted(work, trail.M[k - 1], P)
-        slopes -= before[k]
-        if is_far_surer(trail.T[k], P):
-            N = _known_after(P, given, slopes, A)
-        else:
-            left = np.eye(d) - _of(M, trail.T[k])
-            N = _of(trail.T[k], left) + _of(_of(left.T.copy(), N), left)
-            add_product(np.eye(d), trail.E[k], A, -1.0)
-            add_product(trail.T[k], slopes, A, -1.0)
-        turned = work.F.T.copy()
-        link = _of(_of(trail.M[k - 1], turned), np.eye(d) - _of(N, P))
-        write(A, slopes)
-        multiply(turned, slopes, A)
-        N = _of(_of(turned, N), work.F)
+        if k > 0:
+            write(Z, following)
+            transition(work, k, legs, places, at, noise)
+            add(before[k], slopes, -1.0)
+            _step_back(work, trail, k, small, slopes, A)
     return own, cross
 
 
-@kernel
+@no_alloc
+def _step_back(
+    work: Work,
+    trail: Trail,
+    k: Whole,
+    small: Float[np.ndarray, "6 d d"],
+    off: Float[np.ndarray, "d n"],
+    A: Float[np.ndarray, "d n"],
+) -> None:
+    """Write N and A of the node before k, and the covariance of both given the border.
+
+    ``small``: N, that covariance, P_s, and arrays to work in; ``off``: C_s - C.
+    """
+    N, link, given, P, B, D = small[0], small[1], small[2], small[3], small[4], small[5]
+    T, M = trail.T[k], trail.M[k]
+    predicted(work, trail.M[k - 1], P)
+    if is_far_surer(T, P):
+        _know_after(work, P, given, N, off, A)
+    else:
+        write_identity(B)
+        add_product(M, T, B, -1.0)
+        multiply(T, B, D)
+        transpose(B, work.B)
+        congruent(work.B, N, work.A, D)
+        write(D, N)
+        add(trail.E[k], A, -1.0)
+        add_product(T, off, A, -1.0)
+    transpose(work.F, work.B)
+    write_identity(B)
+    add_product(N, P, B, -1.0)
+    multiply(trail.M[k - 1], work.B, D)
+    multiply(D, B, link)
+    write(A, off)
+    multiply(work.B, off, A)
+    write(N, B)
+    multiply(work.B, B, D)
+    multiply(D, work.F, N)
+
+
+@no_alloc
 def _go_forward(
     work: Work,
     legs: Legs,
@@ -110,32 +141,40 @@ def _go_forward(
         multiply(work.F, work.C, before[k])
 
 
-@kernel
-def _known_after(
+@no_alloc
+def _know_after(
+    work: Work,
     P: Float[np.ndarray, "d d"],
     given: Float[np.ndarray, "d d"],
+    N: Float[np.ndarray, "d d"],
     off: Float[np.ndarray, "d n"],
     A: Float[np.ndarray, "d n"],
-) -> Float[np.ndarray, "d d"]:
-    """Return N from what a node's covariances are before, P, and given all; write A likewise.
+) -> None:
+    """Write N and A from what a node's covariances are before, P, and given all.
 
     P^-1 (P - P_s) P^-1 and P^-1 (C_s - C): the same as by T and E, which are lost in rounding where
     a node's rows know its state far better than it was known.
     """
-    d, N = P.shape[0], P - given
-    L, x = np.zeros((d, d)), np.empty(d)
-    cholesky(P, L)
-    for j in range(off.shape[1]):
-        x[:] = off[:, j]
-        solve_with(L, x)
-        A[:, j] = x
+    cholesky(P, work.B)
+    write(off, A)
+    _solve_columns(work, A)
+    write(P, N)
+    add(given, N, -1.0)
     for _ in range(2):
-        for j in range(d):
-            x[:] = N[:, j]
-            solve_with(L, x)
-            N[:, j] = x
-        N = N.T.copy()
-    return N
+        _solve_columns(work, N)
+        transpose(N, work.A)
+        write(work.A, N)
+
+
+@no_alloc
+def _solve_columns(work: Work, A: Float[np.ndarray, "d n"]) -> None:
+    """Solve each column of A by the factor in B."""
+    for j in range(A.shape[1]):
+        for a in range(A.shape[0]):
+            work.u[a] = A[a, j]
+        solve_with(work.B, work.u)
+        for a in range(A.shape[0]):
+            A[a, j] = work.u[a]
 
 
 @no_alloc
@@ -156,11 +195,3 @@ def _corrected(
     """Write C - M E of node k."""
     write(before, C)
     add_product(trail.M[k], trail.E[k], C, -1.0)
-
-
-@kernel
-def _of(A: Float[np.ndarray, "d d"], B: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
-    """Return A B."""
-    product = np.empty(A.shape)
-    multiply(A, B, product)
-    return product

@@ -20,7 +20,17 @@ from jaxtyping import Float
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import Motion, MotionNumbers, motion_numbers, propagate_pose
 from pipistrelle.estimation.smoother.records import Arrays, Legs
-from pipistrelle.estimation.smoother.small_matrices import cholesky
+from pipistrelle.estimation.smoother.small_matrices import (
+    add,
+    add_product,
+    cholesky,
+    congruent,
+    multiply,
+    solve_with,
+    transpose,
+    write,
+    write_identity,
+)
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel, no_alloc
 
@@ -111,11 +121,14 @@ def _extended(
     poses, spreads = np.empty((size, 3)), np.empty((size, 3, 3))
     pose, P = np.zeros(3), np.zeros((3, 3))
     for j in range(before):
-        mean[j], covariance[j] = steps[0][j], steps[1][j]
-        pose[:], P[:] = mean[j], covariance[j]
+        pose[:] = steps[0][j]
+        write(steps[1][j], P)
+        mean[j] = pose
+        write(P, covariance[j])
     for k in range(size):
         propagate_pose(pose, P, controls[k], dt[k], motion)
-        mean[before + k], covariance[before + k] = pose, P
+        mean[before + k] = pose
+        write(P, covariance[before + k])
         place(start, pose, P, poses[k], spreads[k])
     return (mean, covariance), (poses, spreads)
 
@@ -166,78 +179,85 @@ def poses_between(
     legs, count = Legs(*legs), ends[-1, 1]
     mean, covariance = np.empty((1 + count, 3)), np.empty((1 + count, 3, 3))
     mean[0], covariance[0] = nodes[0][0], nodes[1][0]
-    by_a, by_b, left = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    work = np.zeros((6, 3, 3))
     for k in range(1, ends.shape[0]):
-        a, b, N = nodes[0][k - 1], nodes[0][k], legs.noise[k]
         for j in range(ends[k, 0], ends[k, 1]):
-            mean[1 + j], covariance[1 + j] = b, nodes[1][k]
-            if N[2, 2] == 0.0 or j + 1 == ends[k, 1]:
-                continue
-            slopes, step = (by_a, by_b, left), (steps[0][j], steps[1][j])
-            _inside(a, b, legs.mean[k], N, step, mean[1 + j], slopes)
-            both = _product(by_b, cross[k], by_a)
-            left += _product(by_a, nodes[1][k - 1], by_a) + _product(by_b, nodes[1][k], by_b)
-            covariance[1 + j] = 0.5 * (left + left.T) + (both + both.T)
+            for a in range(3):
+                mean[1 + j, a] = nodes[0][k, a]
+            write(nodes[1][k], covariance[1 + j])
+            if legs.noise[k, 2, 2] > 0.0 and j + 1 < ends[k, 1]:
+                step = steps[0][j], steps[1][j]
+                poses = nodes[0][k - 1], nodes[0][k]
+                _place_between(poses, (legs.mean[k], legs.noise[k]), step, mean[1 + j], work)
+                spreads = nodes[1][k - 1], nodes[1][k], cross[k]
+                _spread_between(spreads, work, covariance[1 + j])
     return mean, covariance
 
 
-@kernel
-def _product(
-    A: Float[np.ndarray, "3 3"], P: Float[np.ndarray, "3 3"], B: Float[np.ndarray, "3 3"]
-) -> Float[np.ndarray, "3 3"]:
-    """Return A P B^T."""
-    product, row = np.zeros((3, 3)), np.empty(3)
-    for a in range(3):
-        for e in range(3):
-            row[e] = A[a, 0] * P[0, e] + A[a, 1] * P[1, e] + A[a, 2] * P[2, e]
-        for b in range(3):
-            product[a, b] = row[0] * B[b, 0] + row[1] * B[b, 1] + row[2] * B[b, 2]
-    return product
-
-
-@kernel
-def _inside(
-    a: Float[np.ndarray, " d"],
-    b: Float[np.ndarray, " d"],
-    leg: Float[np.ndarray, "3"],
-    N: Float[np.ndarray, "3 3"],
+@no_alloc
+def _place_between(
+    poses: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]],
+    leg: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]],
     step: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]],
     pose: Float[np.ndarray, "3"],
-    slopes: tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]],
+    work: Float[np.ndarray, "6 3 3"],
 ) -> None:
-    """Write a pose between two nodes, its slopes by both, and what is left if both are known.
+    """Write a pose between two nodes a and b; in ``work``: its slopes by both, and what is left.
 
-    ``leg``, N: the motion from a to b and its noise; ``step``: that from a to the pose.
+    ``leg``: the motion from a to b and its noise; ``step``: that from a to the pose. Left is what
+    covariance the pose has where both are known.
     """
-    (by_a, by_b, left), (d, P) = slopes, step
+    (a, b), (way, N), (d, P) = poses, leg, step
+    by_a, by_b, left, G, R, L = work[0], work[1], work[2], work[3], work[4], work[5]
     c, s = math.cos(a[2]), math.sin(a[2])
-    dx, dy = b[0] - a[0], b[1] - a[1]
-    off = np.array([c * dx + s * dy, c * dy - s * dx, b[2] - a[2]]) - leg
-    off[2] = wrap_angle(off[2])
-    G, H, R, L = np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
-    for e in range(3):  # H = P ahead^T
-        H[e, 0] = P[e, 0] - (leg[1] - d[1]) * P[e, 2]
-        H[e, 1] = P[e, 1] + (leg[0] - d[0]) * P[e, 2]
-        H[e, 2] = P[e, 2]
+    dx, dy, turn = b[0] - a[0], b[1] - a[1], wrap_angle(b[2] - a[2] - way[2])
+    ahead, aside = c * dx + s * dy - way[0], c * dy - s * dx - way[1]
+    write(P, G)  # G = P Phi^T N^-1
+    for e in range(3):
+        G[e, 0] -= (way[1] - d[1]) * P[e, 2]
+        G[e, 1] += (way[0] - d[0]) * P[e, 2]
     cholesky(N, L)
     for e in range(3):
-        y0 = H[e, 0] / L[0, 0]
-        y1 = (H[e, 1] - L[1, 0] * y0) / L[1, 1]
-        y2 = (H[e, 2] - L[2, 0] * y0 - L[2, 1] * y1) / L[2, 2]
-        G[e, 2] = y2 / L[2, 2]
-        G[e, 1] = (y1 - L[2, 1] * G[e, 2]) / L[1, 1]
-        G[e, 0] = (y0 - L[1, 0] * G[e, 1] - L[2, 0] * G[e, 2]) / L[0, 0]
-    at = d.copy()
+        solve_with(L, G[e])
+    x = d[0] + G[0, 0] * ahead + G[0, 1] * aside + G[0, 2] * turn
+    y = d[1] + G[1, 0] * ahead + G[1, 1] * aside + G[1, 2] * turn
+    h = d[2] + G[2, 0] * ahead + G[2, 1] * aside + G[2, 2] * turn
+    x, y = c * x - s * y, s * x + c * y
+    pose[0], pose[1], pose[2] = a[0] + x, a[1] + y, wrap_angle(a[2] + h)
+    write(P, by_a)
+    multiply(G, N, L)
+    transpose(G, by_b)
+    add_product(L, by_b, by_a, -1.0)  # P - G N G^T
+    write_identity(R)
+    R[0, 0], R[0, 1], R[1, 0], R[1, 1] = c, -s, s, c
+    multiply(R, by_a, L)
+    transpose(R, by_b)
+    multiply(L, by_b, left)
+    multiply(R, G, L)
+    multiply(L, by_b, R)
+    write(R, by_b)
+    write_identity(by_a)
+    add(by_b, by_a, -1.0)
     for e in range(3):
-        at[e] += G[e, 0] * off[0] + G[e, 1] * off[1] + G[e, 2] * off[2]
-    x, y = c * at[0] - s * at[1], s * at[0] + c * at[1]
-    pose[0], pose[1], pose[2] = a[0] + x, a[1] + y, wrap_angle(a[2] + at[2])
-    R[0, 0], R[0, 1], R[1, 0], R[1, 1], R[2, 2] = c, -s, s, c, 1.0
-    by_b[:] = _product(R, G, R)
-    left[:] = _product(R, P - _product(G, N, G), R)
-    by_a[:] = -by_b
-    for e in range(3):
-        by_a[e, e] += 1.0
         by_a[e, 2] += by_b[e, 0] * dy - by_b[e, 1] * dx
     by_a[0, 2] -= y
     by_a[1, 2] += x
+
+
+@no_alloc
+def _spread_between(
+    spreads: tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]],
+    work: Float[np.ndarray, "6 3 3"],
+    covariance: Float[np.ndarray, "3 3"],
+) -> None:
+    """Write the covariance of a pose between two nodes, from theirs and that of both (b, a)."""
+    (own_a, own_b, both), by_a, by_b, left = spreads, work[0], work[1], work[2]
+    turned, half, cross = work[3], work[4], work[5]
+    congruent(by_a, own_a, half, left)
+    congruent(by_b, own_b, half, left)
+    transpose(by_a, turned)
+    multiply(by_b, both, half)
+    multiply(half, turned, cross)
+    for a in range(3):
+        for b in range(3):
+            covariance[a, b] = 0.5 * (left[a, b] + left[b, a]) + (cross[a, b] + cross[b, a])

@@ -17,6 +17,40 @@ def write(A: Float[np.ndarray, "d n"], B: Float[np.ndarray, "d n"]) -> None:
 
 
 @no_alloc
+def add(A: Float[np.ndarray, "d n"], B: Float[np.ndarray, "d n"], sign: float) -> None:
+    """Add A, times a sign, to B, as many columns as both have."""
+    for a in range(B.shape[0]):
+        for j in range(min(A.shape[1], B.shape[1])):
+            B[a, j] += sign * A[a, j]
+
+
+@no_alloc
+def transpose(A: Float[np.ndarray, "d e"], B: Float[np.ndarray, "e d"]) -> None:
+    """Write the transposed of A to B."""
+    for a in range(A.shape[0]):
+        for b in range(A.shape[1]):
+            B[b, a] = A[a, b]
+
+
+@no_alloc
+def write_identity(A: Float[np.ndarray, "d d"]) -> None:
+    """Write the identity."""
+    for a in range(A.shape[0]):
+        for b in range(A.shape[0]):
+            A[a, b] = 1.0 if a == b else 0.0
+
+
+@no_alloc
+def write_image(
+    A: Float[np.ndarray, "d e"], x: Float[np.ndarray, " e"], image: Float[np.ndarray, " d"]
+) -> None:
+    """Write A x."""
+    for a in range(image.size):
+        image[a] = 0.0
+    add_image(A, x, image, 1.0)
+
+
+@no_alloc
 def multiply(
     A: Float[np.ndarray, "d e"], B: Float[np.ndarray, "e n"], product: Float[np.ndarray, "d n"]
 ) -> None:

@@ -27,7 +27,14 @@ from pipistrelle.estimation.smoother.records import (
     work_of,
 )
 from pipistrelle.estimation.smoother.rows import is_far_surer
-from pipistrelle.estimation.smoother.small_matrices import add_image, cholesky, solve_with
+from pipistrelle.estimation.smoother.small_matrices import (
+    add_image,
+    add_multiple,
+    cholesky,
+    solve_with,
+    transpose,
+    write_image,
+)
 from pipistrelle.estimation.smoother.transition import predicted, transition, write_start
 from pipistrelle.jit import Whole, kernel, no_alloc
 
@@ -144,32 +151,34 @@ def retrace(
     work, before, pull = work_of(d, 1), np.zeros((nodes, d)), np.zeros((nodes, d))
     x, y, back = np.zeros(d), np.zeros(d), np.zeros(d)
     write_start(work, legs, at)
-    x[:POSE] = work.u[:POSE]
+    add_multiple(work.u, 1.0, x[:POSE])
     for k in range(nodes):
         if k > 0:
             transition(work, k, legs, places, at, noise)
-            y[:] = work.u
-            add_image(work.F, x, y, 1.0)
-            x[:] = y
-        before[k] = x
+            write_image(work.F, x, y)
+            for a in range(d):
+                x[a] = y[a] + work.u[a]
+        add_multiple(x, 1.0, before[k])
         add_image(trail.E[k], beta, pull[k], 1.0)
         add_image(trail.M[k], pull[k], x, -1.0)
     states = np.empty((nodes, d))
     for k in range(nodes - 1, -1, -1):
-        back -= pull[k]
-        x[:] = 0.0
-        add_image(trail.M[k], back, x, 1.0)
-        states[k] = at[k] + before[k] + x
+        add_multiple(pull[k], -1.0, back)
+        write_image(trail.M[k], back, x)
+        for a in range(d):
+            states[k, a] = at[k, a] + before[k, a] + x[a]
         if k == 0:
             break
         add_image(trail.T[k], x, back, -1.0)
         transition(work, k, legs, places, at, noise)
         predicted(work, trail.M[k - 1], work.T)
+        transpose(work.F, work.A)
         if is_far_surer(trail.T[k], work.T):  # what pulls is lost in rounding
             cholesky(work.T, work.B)
             solve_with(work.B, x)
-            back[:] = x
-        y[:] = 0.0
-        add_image(work.F.T.copy(), back, y, 1.0)
-        back[:] = y
+            write_image(work.A, x, back)
+        else:
+            write_image(work.A, back, y)
+            for a in range(d):
+                back[a] = y[a]
     return states

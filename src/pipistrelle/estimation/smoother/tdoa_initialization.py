@@ -91,7 +91,10 @@ def _offset_covariance(
             by_chain[a, a - i] = 1.0
     by_chain[2, 2] = 1.0
     spread = np.zeros((4, 4))
-    spread[:3, :3] = joint(front, R, R.shape[0], by_chain, by_border)
+    known = joint(front, R, R.shape[0], by_chain, by_border)
+    for a in range(3):
+        for b in range(3):
+            spread[a, b] = known[a, b]
     return spread
 
 
