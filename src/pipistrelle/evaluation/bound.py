@@ -19,34 +19,8 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.detection.scans import (
-    BEARING,
-    BEARING_STD,
-    EXCESS_PATH_STD,
-    NUMBERS,
-    RANGE,
-    RANGE_STD,
-    UNLABELLED,
-    Scan,
-)
-from pipistrelle.estimation.ekf.caller_motion import propagate_callers, velocity_of
-from pipistrelle.estimation.ekf.gaussian import (
-    LINEAR,
-    WAITING,
-    Joint,
-    correct_active,
-    correct_bearing,
-    flush,
-    joint_of,
-)
-from pipistrelle.estimation.ekf.tdoa import correct_covariance_by_excess_path
-from pipistrelle.estimation.measurement import (
-    NEAREST,
-    columns_of,
-    excess_paths,
-    observe,
-    timings_of,
-)
+from pipistrelle.detection.scans import NUMBERS, UNLABELLED, Scan
+from pipistrelle.estimation.measurement import columns_of, excess_paths, timings_of
 from pipistrelle.estimation.motion import (
     Motion,
     MotionNumbers,
@@ -54,6 +28,23 @@ from pipistrelle.estimation.motion import (
     motion_numbers,
     propagate_pose,
 )
+from pipistrelle.estimation.smoother.elimination import advance, correct
+from pipistrelle.estimation.smoother.records import (
+    CALLER,
+    POSE,
+    Arrays,
+    Front,
+    Noise,
+    Places,
+    Rows,
+    Trail,
+    Work,
+    work_of,
+)
+from pipistrelle.estimation.smoother.rows import hear
+from pipistrelle.estimation.smoother.small_matrices import write, write_identity
+from pipistrelle.estimation.smoother.solution import factor, spread, write_lower
+from pipistrelle.estimation.smoother.transition import predicted
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 IN_ONE_WORLD = (
@@ -64,10 +55,6 @@ PRIOR_STD = 20.0
 """Of a landmark before it is heard [m]."""
 NO_ROUTES: Mapping[int, np.ndarray] = MappingProxyType({})
 """No caller moves."""
-
-
-_Timed = tuple[Int[np.ndarray, " m"], Float[np.ndarray, "v t 2"], tuple[float, float]]
-"""The place of each row's caller, the ways of those who move, and what is known of these."""
 
 
 def pose_bound(
@@ -127,25 +114,41 @@ def pose_bound(
     met = np.column_stack([label[known], np.where(caller == UNLABELLED, label[known], caller)])
     heard, first = np.unique(met, return_index=True)
     heard = heard[np.argsort(first)]  # whom it hears first stands first, as in a filter's state
-    moving = [one for one in heard.tolist() if one in routes]
-    velocities = np.array([velocity_of(one) for one in moving], np.int64)
-    state = np.concatenate((velocities, moving, heard[~np.isin(heard, moving)])).astype(np.int64)
-    slot = {one: number for number, one in enumerate(state.tolist())} | {UNLABELLED: UNLABELLED}
+    moving, border = heard[np.isin(heard, [*routes])].tolist(), heard[~np.isin(heard, [*routes])]
+    slot = {one: number for number, one in enumerate([*border.tolist(), *moving])}
+    index = np.append(
+        1 + 2 * np.arange(border.size), -POSE - CALLER * np.arange(len(moving))
+    ).astype(np.int64)
+    ends = np.zeros((len(met), 4), np.int64)
+    ends[:, 0] = [slot[one] for one in label[known].tolist()]
+    ends[:, 1] = [slot.get(one, -1) for one in caller.tolist()]
+    rows = np.searchsorted(step[known], np.arange(len(path) + 1))
+    reached = np.maximum.accumulate(np.append(0, index[ends[:, :2]].max(axis=1, initial=0)))
     place = dict(zip(fixed.tolist(), places, strict=True))
-    place |= {one: routes[one][0] for one in moving}
-    place |= {velocity_of(one): np.zeros(2) for one in moving}
-    ways = np.array([routes[one] for one in moving]).reshape(-1, len(path), 2)
-    timed = bool(moving) or np.any(caller != UNLABELLED)
+    points = [np.zeros(1), *(place[one] for one in border.tolist())]
     return _bound(
-        path,
-        true_controls(motion, controls, time, path),
-        np.diff(time),
+        _states(time, path, [routes[one] for one in moving]),
+        np.concatenate(points),
+        (true_controls(motion, controls, time, path), np.diff(time)),
         motion_numbers(motion),
-        (state, np.array([place[one] for one in state.tolist()]).reshape(-1, 2)),
-        (step[known], _slots(slot, label[known])),
-        np.ascontiguousarray(numbers[:, known]),
-        (_slots(slot, caller), ways, wander) if timed else None,
+        wander,
+        (index, np.zeros(len(moving), np.int64), np.zeros((len(moving), 2))),
+        (ends, np.ascontiguousarray(numbers[:, known].T)),
+        np.column_stack([rows[:-1], rows[1:], reached[rows[1:]] + 2]),
     )
+
+
+def _states(
+    time: Float[np.ndarray, " t"],
+    path: Float[np.ndarray, "t 3"],
+    routes: Sequence[Float[np.ndarray, "t 2"]],
+) -> Float[np.ndarray, "t d"]:
+    """Return pose, and place and velocity of each moving caller, that of the step that follows."""
+    states = [path]
+    for route in routes:
+        velocity = np.diff(route, axis=0) / np.diff(time)[:, np.newaxis]
+        states += [route, np.concatenate([velocity, velocity[-1:]])]
+    return np.concatenate(states, axis=1)
 
 
 def true_controls(
@@ -164,11 +167,6 @@ def true_controls(
     return np.where(commanded, controls_between(path, np.diff(time), motion), controls)
 
 
-def _slots(slot: Mapping[int, int], label: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
-    """Look up where labels stand in the state."""
-    return np.array([slot[one] for one in label.tolist()], dtype=np.int64)
-
-
 def _whose(scan: Scan) -> Int[np.ndarray, " m"]:
     """Label of the caller of each row's excess path; UNLABELLED for a row without one."""
     who, timings = np.full(len(scan.landmark), UNLABELLED), timings_of(scan)
@@ -179,147 +177,81 @@ def _whose(scan: Scan) -> Int[np.ndarray, " m"]:
 
 
 @no_alloc
-def _correct(
-    joint: Joint, size: Whole, i: Whole, numbers: Float[np.ndarray, "7 m"], m: Whole
+def _write_transition(
+    work: Work,
+    at: Float[np.ndarray, "t d"],
+    k: Whole,
+    control: tuple[Float[np.ndarray, " c"], float],
+    motion: MotionNumbers,
+    walk_std: float,
 ) -> None:
-    """Correct with measurement m, at its expected value, of the landmark at state index i."""
-    if math.isnan(numbers[BEARING, m]):
-        return
-    mean, across = joint.mean, numbers[BEARING_STD, m] ** 2
-    near, angle, _, _, _ = observe(mean[0], mean[1], mean[2], mean[i], mean[i + 1])
-    if near >= NEAREST and not math.isnan(numbers[RANGE, m]):
-        along = numbers[RANGE_STD, m] ** 2
-        correct_active(joint, size, i, near, angle, along, across, np.inf)
-    elif near >= NEAREST:
-        correct_bearing(joint, size, i, angle, across, np.inf)
+    """Write F and Q of the true step to k: of the pose, and of moving callers.
 
-
-@no_alloc
-def _carry(
-    covariance: Float[np.ndarray, "n _"], dx: float, dy: float, noise: Float[np.ndarray, "3 3"]
-) -> None:
-    """Carry a covariance through a step of (dx, dy), in place: F C F^T, and the noise."""
-    for j in range(covariance.shape[0]):
-        covariance[0, j] -= dy * covariance[2, j]
-        covariance[1, j] += dx * covariance[2, j]
-    for i in range(covariance.shape[0]):
-        covariance[i, 0] -= dy * covariance[i, 2]
-        covariance[i, 1] += dx * covariance[i, 2]
-    for a in range(3):
-        for b in range(3):
-            covariance[a, b] += noise[a, b]
-
-
-@no_alloc
-def _turn_with(covariance: Float[np.ndarray, "n _"], i: Whole, x: float, y: float) -> None:
-    """Let the point at index i turn by (x, y) with the heading: its error gains J (x, y) dtheta."""
-    for j in range(covariance.shape[0]):
-        covariance[i, j] -= y * covariance[2, j]
-        covariance[i + 1, j] += x * covariance[2, j]
-    for j in range(covariance.shape[0]):
-        covariance[j, i] -= y * covariance[j, 2]
-        covariance[j, i + 1] += x * covariance[j, 2]
-
-
-@kernel
-def _let_move(
-    joint: Joint,
-    ways: Float[np.ndarray, "v t 2"],
-    step: tuple[Whole, float, float],
-) -> None:
-    """Put moving callers where they are at step k, and add their walk's covariance.
-
-    Their velocities are the first of the state, each that of the step which follows, and then their
-    places; ``step`` is k with the length of the step to it and of the next.
+    A caller's velocity turns with the heading, as far as it truly changed.
     """
-    k, before, after = step
-    onward = min(k + 1, ways.shape[1] - 1)
-    for v in range(ways.shape[0]):
-        gone, going = ways[v, k] - ways[v, k - 1], ways[v, onward] - ways[v, k]
-        dx = going[0] / after - gone[0] / before if onward > k else 0.0
-        dy = going[1] / after - gone[1] / before if onward > k else 0.0
-        _turn_with(joint.covariance, 3 + 2 * v, dx, dy)
-        i = 3 + 2 * (ways.shape[0] + v)
-        joint.mean[i], joint.mean[i + 1] = ways[v, k, 0], ways[v, k, 1]
-
-
-@no_alloc
-def _grown(joint: Joint, size: Whole, slot: Whole) -> Whole:
-    """Extend the state to include a slot; returns its size."""
-    if 3 + 2 * slot < size:
-        return size
-    flush(joint, size)
-    return 5 + 2 * slot
-
-
-@no_alloc
-def _hear(
-    joint: Joint,
-    size: Whole,
-    slot: Whole,
-    numbers: Float[np.ndarray, "7 m"],
-    m: Whole,
-    timed: _Timed | None,
-) -> Whole:
-    """Correct with measurement m of a place, and its excess path; returns the size of the state."""
-    size = _grown(joint, size, slot)
-    if timed is not None:
-        size = _grown(joint, size, timed[0][m])
-    _correct(joint, size, 3 + 2 * slot, numbers, m)
-    if timed is not None and timed[0][m] != UNLABELLED:
-        i, ib, variance = 3 + 2 * slot, 3 + 2 * timed[0][m], numbers[EXCESS_PATH_STD, m] ** 2
-        correct_covariance_by_excess_path(joint, size, i, ib, variance)
-    return size
+    F, Q, (steered, seconds) = work.F, work.Q, control
+    write_identity(F)
+    Q[:] = 0.0
+    F[0, 2], F[1, 2] = at[k - 1, 1] - at[k, 1], at[k, 0] - at[k - 1, 0]
+    for a in range(POSE):
+        work.u[a] = at[k - 1, a]
+    propagate_pose(work.u[:POSE], Q, steered, seconds, motion)
+    q = walk_std * walk_std
+    for i in range(POSE, work.u.size, CALLER):
+        dx, dy = at[k, i + 2] - at[k - 1, i + 2], at[k, i + 3] - at[k - 1, i + 3]
+        F[i + 2, 2], F[i + 3, 2] = -dy, dx
+        for a in range(i, i + 2):
+            F[a, a + 2] = seconds
+            Q[a, a], Q[a + 2, a + 2] = q * seconds**3 / 3.0, q * seconds
+            Q[a, a + 2] = Q[a + 2, a] = 0.5 * q * seconds * seconds
+    work.u[:] = 0.0
 
 
 @kernel
 def _bound(
-    path: Float[np.ndarray, "t 3"],
-    controls: Float[np.ndarray, "k c"],
-    dt: Float[np.ndarray, " k"],
+    at: Float[np.ndarray, "t d"],
+    border: Float[np.ndarray, " n"],
+    driven: tuple[Float[np.ndarray, "k c"], Float[np.ndarray, " k"]],
     motion: MotionNumbers,
-    world: tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]],
-    row: tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]],
-    numbers: Float[np.ndarray, "7 m"],
-    timed: _Timed | None,
+    wander: tuple[float, float],
+    places: Arrays,
+    rows: Arrays,
+    heard: Int[np.ndarray, "t 3"],
 ) -> Float[np.ndarray, "t 3 3"]:
-    """Carry the covariance along the true path; of each row step and place.
+    """Eliminate along the true path, as the smoother does along its own; return each pose's bound.
 
-    ``world``: labels and places of the state, first the velocities and then the places of those who
-    move, which hang together before they are heard.
+    ``driven``: true controls and their durations; ``heard``: of each step the first row, the one
+    after the last, and how many columns of the border have been heard.
     """
-    (labels, places), moving = world, 0
-    room = 3 + 2 * places.shape[0]
-    mean, prior = np.zeros(room), np.zeros((room, room))
-    mean[3:] = places.ravel()
-    for n in range(3, room):
-        prior[n, n] = PRIOR_STD**2
-    if timed is not None:
-        moving = timed[1].shape[0]
-        for n in range(3, 3 + 2 * moving):
-            prior[n, n] = timed[2][0] ** 2
-    joint, size, m = joint_of(mean, prior, room, LINEAR), 3 + 4 * moving, 0
-    joint.W[:] = 0.0  # the state grows into columns that wait
-    bound = np.zeros((path.shape[0], 3, 3))
-    steps, slots = row
-    pose, noise = np.empty(3), np.empty((3, 3))
-    for k in range(1, path.shape[0]):
-        pose[:], noise[:] = path[k - 1], 0.0
-        propagate_pose(pose, noise, controls[k - 1], dt[k - 1], motion)
-        if timed is not None and moving > 0:
-            propagate_callers(joint.mean, joint.covariance, labels, dt[k - 1], timed[2][1])
-            _let_move(joint, timed[1], (k, dt[k - 1], dt[min(k, dt.size - 1)]))
-        _carry(joint.covariance, path[k, 0] - path[k - 1, 0], path[k, 1] - path[k - 1, 1], noise)
-        for a in range(3):
-            joint.mean[a] = path[k, a]
-        while m < steps.size and steps[m] <= k:
-            size = _hear(joint, size, slots[m], numbers, m, timed)
-            m += 1
-        if joint.taken[WAITING] > 0:
-            flush(joint, size)
+    (steps, d), n = at.shape, border.size
+    places, rows, work = Places(*places), Rows(*rows), work_of(d, n)
+    front = Front(np.zeros((d, n)), np.zeros((d, d)), np.zeros((n, n)))
+    trail = Trail(np.zeros((1, d, n)), np.zeros((1, d, d)), np.zeros((1, d, d)))
+    noise = Noise(math.inf, PRIOR_STD, wander[0], wander[1], 0.0)
+    R, Z = np.zeros((n, n)), np.zeros((d, n))
+    for j in range(1, n):
+        front.information[j, j] = 1.0 / PRIOR_STD**2
+    for i in range(POSE, d):
+        std = PRIOR_STD if (i - POSE) % CALLER < 2 else wander[0]
+        front.P[i, i] = std * std
+    bound, total, before = np.zeros((steps, 3, 3)), front.P.copy(), np.zeros((d, d))
+    for k in range(steps):
+        if k > 0:
+            driven_here = driven[0][k - 1], driven[1][k - 1]
+            _write_transition(work, at, k, driven_here, motion, wander[1])
+            advance(front, work, n)
+            write(total, before)
+            predicted(work, before, total)
+        if heard[k, 1] > heard[k, 0]:
+            span = k, heard[k, 0], heard[k, 1]
+            hear(work, front, span, rows, places, (at, border), noise)
+            correct(front, work, trail, 0, heard[k, 2])
+            write_lower(front.information, heard[k, 2], R)
+            factor(R, heard[k, 2])
+            spread(front.C, front.P, R, heard[k, 2], Z, total)
         for a in range(3):
             for b in range(3):
-                bound[k, a, b] = joint.covariance[a, b]
+                bound[k, a, b] = total[a, b]
     return bound
 
 

@@ -41,16 +41,42 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 
 @no_alloc
 def factor(R: Float[np.ndarray, "n n"], n: Whole) -> None:
-    """Factor an information of n columns, R^T R, in place; its first column becomes R b."""
-    for i in range(n - 1, 0, -1):
-        row = R[i]
-        inverse = 1.0 / math.sqrt(row[i])
-        for j in range(i + 1):
-            row[j] *= inverse
-        for r in range(i):
+    """Factor an information of n columns, R^T R, in place; its first column becomes R b.
+
+    Four rows at a time: that reads and writes the rows above a quarter as often.
+    """
+    i = n - 1
+    while i >= 4:
+        _factor_rows(R, i, 4)
+        a, b, c, d = R[i], R[i - 1], R[i - 2], R[i - 3]
+        for r in range(i - 3):
+            other, w, x, y, z = R[r], a[r], b[r], c[r], d[r]
+            for j in range(r + 1):
+                other[j] -= (w * a[j] + x * b[j]) + (y * c[j] + z * d[j])
+        i -= 4
+    _factor_rows(R, i, i)
+    for row in R[1 : i + 1]:
+        R[0, 0] -= row[0] * row[0]
+
+
+@no_alloc
+def _factor_rows(R: Float[np.ndarray, "n n"], i: Whole, count: Whole) -> None:
+    """Factor so many rows from row i up, and take each from those of them that are above it."""
+    for p in range(i, i - count, -1):
+        row = R[p]
+        _divide(row, p)
+        for r in range(i - count + 1, p):
             share, other = row[r], R[r]
             for j in range(r + 1):
                 other[j] -= share * row[j]
+
+
+@no_alloc
+def _divide(row: Float[np.ndarray, " n"], i: Whole) -> None:
+    """Divide a row by the root of its pivot at i."""
+    inverse = 1.0 / math.sqrt(row[i])
+    for j in range(i + 1):
+        row[j] *= inverse
 
 
 @no_alloc
@@ -86,24 +112,44 @@ def solve(
     """
     C, P, information = front
     d = P.shape[0]
+    state, covariance, Z = np.zeros(d), np.empty((d, d)), np.empty((d, n))
+    write_lower(information, n, R)
+    factor(R, n)
+    minimise(R, n, beta)
+    add_image(C, beta, state, 1.0)
+    spread(C, P, R, n, Z, covariance)
+    return state, covariance
+
+
+@no_alloc
+def write_lower(
+    information: Float[np.ndarray, "w w"], n: Whole, R: Float[np.ndarray, "n n"]
+) -> None:
+    """Write the lower triangle of an information of n columns to R."""
     for i in range(n):
         for j in range(i + 1):
             R[i, j] = information[i, j]
-    factor(R, n)
-    minimise(R, n, beta)
-    state, covariance, Z = np.zeros(d), P.copy(), np.empty((d, n))
-    for a in range(d):
+
+
+@no_alloc
+def spread(
+    C: Float[np.ndarray, "d w"],
+    P: Float[np.ndarray, "d d"],
+    R: Float[np.ndarray, "n n"],
+    n: Whole,
+    Z: Float[np.ndarray, "d n"],
+    covariance: Float[np.ndarray, "d d"],
+) -> None:
+    """Write the covariance of a state, P given the border and with slopes C by it."""
+    for a in range(P.shape[0]):
         for j in range(n):
-            state[a] += C[a, j] * beta[j]
             Z[a, j] = C[a, j]
         rooted(R, Z[a], n)
         for b in range(a + 1):
-            total = 0.0
-            for j in range(n):
+            total = P[a, b]
+            for j in range(1, n):
                 total += Z[a, j] * Z[b, j]
-            covariance[a, b] += total
-            covariance[b, a] = covariance[a, b]
-    return state, covariance
+            covariance[a, b] = covariance[b, a] = total
 
 
 @kernel
