@@ -143,21 +143,6 @@ def correct_excess_path(
 
 
 @no_alloc
-def correct_covariance_by_excess_path(
-    joint: Joint, size: Whole, i: Whole, ib: Whole, variance: float
-) -> None:
-    """Correct only the covariance, with an excess path that is as expected to first order."""
-    if joint.taken[WAITING] == MAX_WAITING:
-        flush(joint, size)
-    w = joint.W[joint.taken[WAITING]]
-    _, spread = _expected(joint, size, i, ib, w)
-    root = 1.0 / math.sqrt(spread + variance)
-    for a in range(size):
-        w[a] *= root
-    defer(joint, size, w, 0.0)
-
-
-@no_alloc
 def weigh_by_excess_path(
     state: State,
     ray: tuple[Whole, Whole],
