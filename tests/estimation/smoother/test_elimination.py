@@ -9,6 +9,7 @@ import pytest
 from pipistrelle.estimation.smoother.chain import converged, relinearised
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.geometry import wrap
+from reference import dense_smoothing
 from reference.factor_graph import graph_of, optimum, pose_key, turned
 from reference.missions import (
     BICYCLE,
@@ -70,6 +71,23 @@ def assert_gtsam_agrees(belief, within=1e-6):
 @pytest.mark.parametrize("robust", [False, True])
 def test_the_optimum_is_that_of_a_general_solver(strategy, robust):
     assert_gtsam_agrees(last_belief(strategy, 5, frames=120 if robust else 60, robust=robust))
+
+
+@pytest.mark.parametrize("strategy", SENSING)
+@pytest.mark.parametrize("callers", [(), (13, 45)], ids=["without timing", "with timing"])
+def test_the_optimum_is_that_of_dense_normal_equations(strategy, callers):
+    """A step that no longer lowers the cost by what can be told is not taken: landmarks show it."""
+    belief = last_belief(strategy, 4, frames=30, callers=callers)
+    ours = settled(belief)
+    poses, places, cost = dense_smoothing.solved(belief)
+    off = ours.trail.entries(0)[:, :3] - poses
+    off[:, 2] = wrap(off[:, 2])
+    assert np.abs(off).max() < 1e-9
+    off = ours.border[1 : belief.history.columns].reshape(-1, 2) - places
+    rows = belief.landmarks()
+    spread = rows.covariance[[rows.landmark.tolist().index(one) for one in belief.history.placed]]
+    assert np.abs(off / np.sqrt(np.diagonal(spread, axis1=1, axis2=2))).max() < 1e-6
+    assert ours.cost == pytest.approx(cost, rel=1e-12)
 
 
 @pytest.mark.parametrize("strategy", ["passive", "fused"])
