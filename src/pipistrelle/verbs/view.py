@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 PAGE = "view.html"
 """Name of the page in a result folder."""
 FRAMES_PER_MAP = 3
-"""Of a smoother, the map is asked for once in so many frames, as each takes the optimum."""
+"""A smoother is asked for its map once in so many frames, as each time takes the optimum."""
 
 
 def view(

@@ -1,4 +1,4 @@
-"""What the smoother believes: its chain, solved, and what it has heard."""
+"""The smoother's belief: the solution of all that was heard, and path and map from it."""
 
 from dataclasses import dataclass, field
 

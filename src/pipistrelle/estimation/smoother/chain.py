@@ -39,7 +39,7 @@ class Solution:
     factor: Float[np.ndarray, "n n"]
     beta: Float[np.ndarray, " n"]
     state: Float[np.ndarray, " d"]
-    """Of the last node: pose, and place and velocity of each moving caller."""
+    """State of the last node: pose, then place and velocity of each moving caller."""
     covariance: Float[np.ndarray, "d d"]
     cost: float = np.inf  # twice that at the points, where all was linearised there
 

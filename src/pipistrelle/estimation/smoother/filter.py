@@ -100,7 +100,7 @@ class Smoother:
 
     @property
     def noise(self) -> Noise:
-        """What is assumed of measurements and moving callers, for the kernels."""
+        """Assumptions about measurements and moving callers, for the kernels."""
         believed = HUBER_K if self.robust else math.inf
         return believed, PRIOR_STD, float(self.speed_std), float(self.walk_std), 0.0
 

@@ -1,4 +1,4 @@
-"""What a drive has heard so far, and how its unknowns are numbered.
+"""The history of a drive: motion, measurements, and the numbers of the unknowns.
 
 Every label has a *slot*, one as a landmark and another as a caller that moves. A slot that is
 placed is a pair of columns of the border, or a part of the chain's state (`records.Places`).
@@ -40,7 +40,7 @@ class History:
     placed: tuple[int, ...] = ()
     """Labels of the landmarks in the border, in the order of their columns."""
     known: Arrays
-    """What is known of them beforehand (`records.Columns`)."""
+    """Prior knowledge of them (`records.Columns`)."""
     callers: tuple[int, ...] = ()
     """Labels of the moving callers in the chain, in order."""
     first: Int[np.ndarray, " v"] = field(default_factory=lambda: np.empty(0, np.int64))

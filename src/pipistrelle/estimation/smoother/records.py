@@ -1,4 +1,4 @@
-"""What the smoother's kernels take: records of arrays, and where each number stands."""
+"""Records of arrays that the smoother's kernels take, and where each number stands."""
 
 from typing import NamedTuple
 
@@ -31,7 +31,7 @@ class Legs(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """What was heard: measurements in the order of their nodes."""
+    """Measurements in the order of their nodes."""
 
     ends: Int[np.ndarray, "m 4"]
     """Slots of the landmark, and of the excess path's caller or -1; the node; the row of the
@@ -48,14 +48,14 @@ class Places(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """What is known beforehand of each place of the border, from the second column on."""
+    """Prior knowledge of each place of the border, from the second column on."""
 
     mean: Float[np.ndarray, "l 2"]
     information: Float[np.ndarray, "l 3"]  # xx, xy, yy
 
 
 class Noise(NamedTuple):
-    """What is assumed of measurements and moving callers."""
+    """Assumptions about measurements and moving callers."""
 
     believed: float  # Huber's bound in standard deviations, or infinity
     place_std: float  # of a moving caller when it joins the chain [m]
@@ -65,7 +65,7 @@ class Noise(NamedTuple):
 
 
 class Trail(NamedTuple):
-    """What the elimination leaves at each node, for the way back."""
+    """Factors that the elimination leaves at each node, for the way back."""
 
     E: Float[np.ndarray, "k d n"]
     T: Float[np.ndarray, "k d d"]
