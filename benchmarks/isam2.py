@@ -11,8 +11,9 @@ time is what it spends in its own calls, not in the Python around them, and it i
 covariances; the times of the EKF and the smoother are those of the whole trials, which have them.
 
 In a batch all is linearised first at the EKF's poses and map: GTSAM's optimiser by Levenberg and
-Marquardt has the factors of its graph, the smoother what it has heard. Both go on until the cost
-falls by less than 1e-7 of it; the smoother's time includes the covariance of every pose.
+Marquardt has the factors of its graph, the smoother what it has heard. GTSAM's goes on
+until the cost falls by less than 1e-7 of it, the smoother until 1e-10 (`chain.CONVERGED`), and its
+time includes the covariance of every pose.
 """
 
 import json

@@ -66,7 +66,7 @@ class SmootherBelief:
         nodes = np.ascontiguousarray(mean[:, :3]), np.ascontiguousarray(covariance[:, :3, :3])
         cross = np.ascontiguousarray(cross[:, :3, :3])
         ends = legs.entries(4)
-        poses, spread = poses_between(legs.arrays[:4], ends, steps.arrays, nodes, cross)
+        poses, spread = poses_between(self.history.motion, ends, steps.arrays, nodes, cross)
         last = Gaussian(mean=nodes[0][-1], covariance=nodes[1][-1])
         since = placed(last, self.odometry)
         return Gaussian(
@@ -80,10 +80,10 @@ class SmootherBelief:
         mean = best.trail.entries(0).copy()
         mean[:, 2] = wrap(mean[:, 2])
         covariance, cross = marginals(
-            history.legs.arrays[:4], history.places(), best.points(), best.trail.arrays[1:],
+            history.motion, history.places(), best.points(), best.trail.arrays[1:],
             self.noise, best.factor, history.nodes,
         )  # fmt: skip
-        return mean, 0.5 * (covariance + np.swapaxes(covariance, 1, 2)), cross
+        return mean, covariance, cross
 
     def landmarks(self) -> Landmarks:
         """Return the map: a row for each landmark in the border, a ray for each that waits."""

@@ -47,10 +47,6 @@ class Solution:
         """Return the points of linearisation of the chain and of the border."""
         return self.trail.arrays[0], self.border
 
-    def points_of(self, history: History) -> tuple[np.ndarray, np.ndarray]:
-        """Return them without room for more nodes."""
-        return self.trail.arrays[0][: history.nodes], self.border
-
     def places(self) -> Float[np.ndarray, " n"]:
         """Return the border as it is believed; its first number means nothing."""
         return self.border[: self.beta.size] + self.beta
@@ -65,7 +61,7 @@ def eliminated(
     trail.arrays[0][:k] = at
     front = np.empty((d, w)), np.empty((d, d)), np.empty((w, w))
     points = trail.arrays[0], border
-    cost = begin(front, history.legs.arrays[:4], history.known, points, noise[4])
+    cost = begin(front, history.motion, history.known, points, noise[4])
     cost += _run(history, noise, points, trail, front, 0)
     return _solved(history, trail, border, front, cost)
 
@@ -83,7 +79,7 @@ def _run(
     """Eliminate from a node on, in place; return twice the cost."""
     span = first, history.nodes, history.columns
     return eliminate(
-        front, history.legs.arrays[:4], history.rows.arrays, history.places(), points,
+        front, history.motion, history.rows.arrays, history.places(), points,
         trail.arrays[1:], noise, span,
     )  # fmt: skip
 
@@ -115,7 +111,7 @@ def stepped(solution: Solution, history: History, noise: Noise, guess: np.ndarra
     trail.arrays[0][k] = guess
     front = tuple(map(np.copy, solution.front))
     places, at = history.places(), trail.arrays[0]
-    cost = step_to(front, history.legs.arrays[:4], places, at, noise, (k, history.columns))
+    cost = step_to(front, history.motion, places, at, noise, (k, history.columns))
     return Solution(
         trail=trail,
         border=solution.border,
@@ -147,16 +143,14 @@ def waited(before: History, history: History) -> bool:
     if history is before:
         return False
     new = np.flatnonzero(history.index != before.index)
-    earlier = history.rows.arrays[0][: history.legs.arrays[3][history.nodes - 1, 0], :2]
+    earlier = history.rows.arrays[0][: history.span[1], :2]
     return bool(np.isin(earlier, new[history.index[new] > 0]).any())
 
 
 def off_line(solution: Solution, history: History) -> float:
     """Return how far the lines of the last node's measurements are off (`linearity`)."""
-    k = history.nodes - 1
-    span = k, *history.legs.arrays[3][k].tolist()
-    estimate = solution.state, solution.places()
-    return nonlinearity(history.rows.arrays, span, history.places(), solution.points(), estimate)
+    estimate, places = (solution.state, solution.places()), history.places()
+    return nonlinearity(history.rows.arrays, history.span, places, solution.points(), estimate)
 
 
 def heard(solution: Solution, history: History, noise: Noise) -> Solution:
@@ -174,7 +168,9 @@ def relinearised(solution: Solution, history: History, noise: Noise) -> Solution
     """
     further, damping = _at_solution(solution, history, noise), LEAST_DAMPING
     while not further.cost <= solution.cost and damping <= MOST_DAMPING:
-        damped = eliminated(history, (*noise[:4], damping), *solution.points_of(history))
+        damped = eliminated(
+            history, (*noise[:4], damping), solution.trail.entries(0), solution.border
+        )
         further, damping = _at_solution(damped, history, noise), 10.0 * damping
     return further if further.cost <= solution.cost else solution
 
@@ -184,7 +180,7 @@ def _at_solution(solution: Solution, history: History, noise: Noise) -> Solution
     beta, n = solution.beta.copy(), history.columns
     beta[0] = 1.0
     states = retrace(
-        history.legs.arrays[:4], history.places(), solution.points(), solution.trail.arrays[1:],
+        history.motion, history.places(), solution.points(), solution.trail.arrays[1:],
         noise, beta, history.nodes,
     )  # fmt: skip
     border = solution.border.copy()
@@ -207,16 +203,14 @@ def _with_room(solution: Solution, history: History) -> Solution:
     if d == len(solution.state) and history.columns <= w:
         return solution
     w = -(-history.columns // COLUMNS) * COLUMNS
-    at, *rest = solution.trail.arrays
-    k, size = len(at), solution.trail.size
+    k, size = len(solution.trail.arrays[0]), solution.trail.size
     arrays = tuple(
         _padded(array, shape)
-        for array, shape in zip((at, *rest), ((k, d), (k, d, w), (k, d, d), (k, d, d)), strict=True)
+        for array, shape in zip(
+            solution.trail.arrays, ((k, d), (k, d, w), (k, d, d), (k, d, d)), strict=True
+        )
     )
-    front = tuple(
-        _padded(array, shape)
-        for array, shape in zip(solution.front, ((d, w), (d, d), (w, w)), strict=True)
-    )
+    front = tuple(map(_padded, solution.front, ((d, w), (d, d), (w, w))))
     return replace(
         solution,
         trail=Stack(arrays, size, [size]),

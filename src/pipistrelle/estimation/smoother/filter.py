@@ -185,7 +185,7 @@ class Smoother:
             here = joined(here, before, history, self.noise)
         late = waited(before, history)
         if late:
-            solution = eliminated(history, self.noise, *here.points_of(history))
+            solution = eliminated(history, self.noise, here.trail.entries(0), here.border)
         else:
             solution = heard(here, history, self.noise)
         for _ in range(ENTERING_PASSES if late else 1):
@@ -199,11 +199,8 @@ def _frame(
     history: History, here: Solution
 ) -> tuple[Arrays, tuple[int, int, int], Arrays, Points, Arrays, np.ndarray]:
     """Return what kernels need to judge the rows of the last node."""
-    k = history.nodes - 1
-    first, last = history.legs.arrays[3][k].tolist()
-    span = k, first, last
     estimate = here.trail.arrays[0], here.places()
-    return history.rows.arrays, span, history.places(), estimate, here.front, here.factor
+    return history.rows.arrays, history.span, history.places(), estimate, here.front, here.factor
 
 
 def _placed(history: History, here: Solution) -> History:

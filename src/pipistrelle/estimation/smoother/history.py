@@ -61,6 +61,18 @@ class History:
         """How many numbers a state of the chain has."""
         return POSE + CALLER * len(self.callers)
 
+    @property
+    def motion(self) -> Arrays:
+        """How the vehicle came to each node, as `records.Legs`."""
+        return self.legs.arrays[:4]
+
+    @property
+    def span(self) -> tuple[int, int, int]:
+        """The last node, its first row and the one after its last."""
+        k = self.nodes - 1
+        first, last = self.legs.arrays[3][k].tolist()
+        return k, first, last
+
     def places(self) -> Arrays:
         """Return where each slot stands, as `records.Places` are."""
         return self.index, self.first, self.begun

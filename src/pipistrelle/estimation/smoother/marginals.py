@@ -40,7 +40,7 @@ from pipistrelle.estimation.smoother.small_matrices import (
     write,
     write_identity,
 )
-from pipistrelle.estimation.smoother.solution import rooted
+from pipistrelle.estimation.smoother.solution import spread
 from pipistrelle.estimation.smoother.transition import predicted, transition
 from pipistrelle.jit import Whole, kernel, no_alloc
 
@@ -69,11 +69,7 @@ def marginals(
         multiply(trail.M[k], N, work.A)
         write(trail.M[k], given)
         add_product(work.A, trail.M[k], given, -1.0)
-        write(slopes, Z)
-        for a in range(d):
-            rooted(R, Z[a], n)
-        write(given, own[k])
-        _add_products(Z, Z, own[k])
+        spread(slopes, given, R, n, Z, own[k])
         if k + 1 < nodes:
             transpose(link, cross[k + 1])
             _add_products(following, Z, cross[k + 1])
