@@ -11,9 +11,8 @@ from pipistrelle.geometry import wrap
 
 def solved(belief, passes=30):
     """Return poses (k, 3) and landmarks (l, 2) of the least cost, and that cost, times two."""
-    at, border = (part.copy() for part in belief.solution.points())
-    nodes, placed = belief.history.nodes, len(belief.history.placed)
-    x = np.concatenate([at[:nodes].ravel(), border[1 : 1 + 2 * placed]])
+    points, nodes = belief.solution.points, belief.history.nodes
+    x = np.concatenate([points.at.entries(0).ravel(), points.spots.ravel()])
     for _ in range(passes):
         r, J = misfits(belief.history, x)
         x = x - np.linalg.lstsq(J, r, rcond=None)[0]
@@ -23,7 +22,7 @@ def solved(belief, passes=30):
 
 def misfits(history, x):
     """Return all misfits in standard deviations, and their derivatives."""
-    mean, noise, _, rows, _ = map(history.legs.entries, range(5))
+    mean, noise, _, rows = map(history.legs.entries, range(4))
     misfit, slope, size = [], [], x.size
     for k in range(history.nodes):
         at = slice(3 * max(k - 1, 0), 3 * k + 3)
@@ -69,7 +68,7 @@ def hear(history, x, k, m, into):
 
 def place_of(history, slot):
     """Return where a slot's place stands among the unknowns."""
-    first = 3 * history.nodes + history.index[slot] - 1
+    first = 3 * history.nodes + 2 * (history.index[slot] - 1)
     return slice(first, first + 2)
 
 

@@ -18,8 +18,8 @@ def pose_key(node):
 def graph_of(belief):
     """Return the factors of all that a belief has heard, and the points where it is linearised."""
     history, (believed, place_std, speed_std, walk_std, _) = belief.history, belief.noise
-    at, border = belief.solution.points()
-    mean, noise, seconds, rows, _ = map(history.legs.entries, range(5))
+    at, spots = belief.solution.points.at.entries(0), belief.solution.points.spots
+    mean, noise, seconds, rows = map(history.legs.entries, range(4))
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k in range(history.nodes):
         values.insert(pose_key(k), gtsam.Pose2(*at[k, :3]))
@@ -35,8 +35,7 @@ def graph_of(belief):
     for number, (label, place, (xx, xy, yy)) in enumerate(
         zip(history.placed, *history.known, strict=True)
     ):
-        column = 1 + 2 * number
-        values.insert(gtsam.symbol("l", label), border[column : column + 2])
+        values.insert(gtsam.symbol("l", label), spots[number])
         model = gtsam.noiseModel.Gaussian.Information(np.array([[xx, xy], [xy, yy]]), False)
         graph.add(gtsam.PriorFactorPoint2(gtsam.symbol("l", label), place, model))
     for v, first in enumerate(history.first.tolist()):

@@ -1,8 +1,11 @@
 """The smoother's problem solved from the truth: what it should have found from its own poses."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from pipistrelle.estimation.smoother.chain import converged, eliminated
+from pipistrelle.estimation.smoother.stack import Stack
 
 
 def from_the_truth(belief, path, places):
@@ -11,15 +14,14 @@ def from_the_truth(belief, path, places):
     `path` (k + 1, 3) holds the true pose at the start and after each step, `places` the true
     place of each landmark by its label.
     """
-    history, (_, border) = belief.history, belief.solution.points()
+    history = belief.history
     steps = np.append(0, history.legs.entries(4)[1:, 1])
-    there = np.zeros_like(border)
-    for number, label in enumerate(history.placed):
-        there[1 + 2 * number : 3 + 2 * number] = places[label]
-    other = eliminated(history, belief.noise, np.ascontiguousarray(path[steps]), there)
+    there = np.array([places[label] for label in history.placed]).reshape(-1, 2)
+    at = Stack((np.ascontiguousarray(path[steps]),), len(steps), [len(steps)])
+    other = eliminated(history, belief.noise, replace(belief.solution.points, at=at, spots=there))
     return belief.best(), converged(other, history, belief.noise)
 
 
 def poses_of(solution):
     """Return the poses of the nodes at a solution."""
-    return solution.trail.entries(0)[:, :3]
+    return solution.points.at.entries(0)[:, :3]

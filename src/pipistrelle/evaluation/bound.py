@@ -28,6 +28,7 @@ from pipistrelle.estimation.motion import (
     motion_numbers,
     propagate_pose,
 )
+from pipistrelle.estimation.smoother.calibration import NOTHING
 from pipistrelle.estimation.smoother.elimination import advance, correct
 from pipistrelle.estimation.smoother.records import (
     CALLER,
@@ -37,7 +38,6 @@ from pipistrelle.estimation.smoother.records import (
     Noise,
     Places,
     Rows,
-    Trail,
     Work,
     work_of,
 )
@@ -132,7 +132,7 @@ def pose_bound(
         (true_controls(motion, controls, time, path), np.diff(time)),
         motion_numbers(motion),
         wander,
-        (index, np.zeros(len(moving), np.int64), np.zeros((len(moving), 2))),
+        (index, np.zeros(len(moving), np.int64), np.zeros((len(moving), 2)), NOTHING.sensor),
         (ends, np.ascontiguousarray(numbers[:, known].T)),
         np.column_stack([rows[:-1], rows[1:], reached[rows[1:]] + 2]),
     )
@@ -224,9 +224,8 @@ def _bound(
     after the last, and how many columns of the border have been heard.
     """
     (steps, d), n = at.shape, border.size
-    places, rows, work = Places(*places), Rows(*rows), work_of(d, n)
+    places, rows, work = Places(*places), Rows(*rows), work_of(d, n, 0)
     front = Front(np.zeros((d, n)), np.zeros((d, d)), np.zeros((n, n)))
-    trail = Trail(np.zeros((1, d, n)), np.zeros((1, d, d)), np.zeros((1, d, d)))
     noise = Noise(math.inf, PRIOR_STD, wander[0], wander[1], 0.0)
     R, Z = np.zeros((n, n)), np.zeros((d, n))
     for j in range(1, n):
@@ -245,7 +244,7 @@ def _bound(
         if heard[k, 1] > heard[k, 0]:
             span = k, heard[k, 0], heard[k, 1]
             hear(work, front, span, rows, places, (at, border), noise)
-            correct(front, work, trail, 0, heard[k, 2])
+            correct(front, work, heard[k, 2])
             write_lower(front.information, heard[k, 2], R)
             factor(R, heard[k, 2])
             spread(front.C, front.P, R, heard[k, 2], Z, total)

@@ -38,7 +38,9 @@ def crossing(poses, heard):
     ends, numbers = np.zeros((rows, 4), np.int64), np.full((rows, 7), np.nan)
     ends[:, 2], ends[:, 3] = [one.node for one in heard], np.arange(rows) - 1
     numbers[:, 0], numbers[:, 3] = np.array(heard)[:, 1:].T
-    away = range_by_crossing(Rows(ends, numbers), rows - 1, poses)
+    away = range_by_crossing(
+        Rows(ends, numbers), rows - 1, (poses, np.zeros(1)), np.zeros(3, np.int64)
+    )
     x, y, heading = poses[heard[-1].node]
     angle = heading + heard[-1].bearing
     return (

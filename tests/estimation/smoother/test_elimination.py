@@ -8,6 +8,7 @@ import pytest
 
 from pipistrelle.estimation.smoother.chain import converged, relinearised
 from pipistrelle.estimation.smoother.filter import Smoother
+from pipistrelle.estimation.smoother.history import in_hindsight
 from pipistrelle.geometry import wrap
 from reference import dense_smoothing
 from reference.factor_graph import graph_of, optimum, pose_key, turned
@@ -19,6 +20,7 @@ from reference.missions import (
     paper_mission,
     ray_config,
 )
+from reference.optimum import poses_of
 from reference.timing import timed
 from reference.walking import roaming_mission, scaled
 
@@ -39,7 +41,7 @@ def settled(belief):
     """Its optimum to the last bits: Huber's weights converge slowly."""
     solution = converged(belief.solution, belief.history, belief.noise)
     for _ in range(30):
-        solution = relinearised(solution, belief.history, belief.noise)
+        solution = relinearised(solution, in_hindsight(belief.history), belief.noise, 0.0)
     return solution
 
 
@@ -49,14 +51,14 @@ def assert_gtsam_agrees(belief, within=1e-6):
     graph, points = graph_of(belief)
     values = optimum(graph, points)
     assert ours.cost == pytest.approx(2.0 * graph.error(values), rel=1e-6)
-    at = ours.trail.entries(0)
+    at = poses_of(ours)
     there = gtsam.utilities.extractPose2(values)
-    off = at[:, :3] - there
+    off = at - there
     off[:, 2] = wrap(off[:, 2])
     assert np.abs(off).max() < within
     for number, label in enumerate(belief.history.placed):
         place = values.atPoint2(gtsam.symbol("l", label))
-        assert np.hypot(*(ours.places()[1 + 2 * number : 3 + 2 * number] - place)) < 10 * within
+        assert np.hypot(*(ours.points.spots[number] - place)) < 10 * within
     marginals = gtsam.Marginals(graph, values)
     path = belief.path()
     for node in (belief.history.nodes // 2, belief.history.nodes - 1):
@@ -80,10 +82,10 @@ def test_the_optimum_is_that_of_dense_normal_equations(strategy, callers):
     belief = last_belief(strategy, 4, frames=30, callers=callers)
     ours = settled(belief)
     poses, places, cost = dense_smoothing.solved(belief)
-    off = ours.trail.entries(0)[:, :3] - poses
+    off = poses_of(ours) - poses
     off[:, 2] = wrap(off[:, 2])
     assert np.abs(off).max() < 1e-9
-    off = ours.border[1 : belief.history.columns].reshape(-1, 2) - places
+    off = ours.points.spots - places
     rows = belief.landmarks()
     spread = rows.covariance[[rows.landmark.tolist().index(one) for one in belief.history.placed]]
     assert np.abs(off / np.sqrt(np.diagonal(spread, axis1=1, axis2=2))).max() < 1e-6

@@ -1,6 +1,7 @@
 """The smoother's belief: the solution of all that was heard, and path and map from it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -9,17 +10,13 @@ from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import BEARING, BEARING_STD
 from pipistrelle.estimation.beliefs import NO_INNOVATIONS, Gaussian, Innovations, Landmarks
 from pipistrelle.estimation.rays import ray_members
-from pipistrelle.estimation.smoother.chain import Noise, Solution, converged
+from pipistrelle.estimation.smoother.calibration import SIZES
+from pipistrelle.estimation.smoother.chain import Smoothed, converged, smoothed
 from pipistrelle.estimation.smoother.history import History
-from pipistrelle.estimation.smoother.marginals import marginals
-from pipistrelle.estimation.smoother.preintegration import (
-    NO_ODOMETRY,
-    Odometry,
-    placed,
-    poses_between,
-)
+from pipistrelle.estimation.smoother.preintegration import Odometry, placed, poses_between
 from pipistrelle.estimation.smoother.records import CALLER, POSE
 from pipistrelle.estimation.smoother.solution import joint
+from pipistrelle.estimation.smoother.sweep import Noise, Solution
 from pipistrelle.geometry import wrap
 
 
@@ -31,21 +28,28 @@ class SmootherBelief:
     """The pose at the last node of the chain, (3) and (3, 3)."""
     ahead: Gaussian
     """The same after the steps since."""
-    odometry: Odometry = NO_ODOMETRY  # these steps
+    odometry: Odometry
+    """The control steps since, by what is assumed."""
     history: History
     solution: Solution
     noise: Noise
     rays: RayConfig
     gated: int = 0
     innovations: Innovations = NO_INNOVATIONS  # counted only with a gate
-    found: dict[str, Solution] = field(init=False, repr=False, default_factory=dict)
-    """The optimum, once it has been asked for."""
+    found: dict[str, Any] = field(init=False, repr=False, default_factory=dict)
+    """The optimum, once it has been asked for, and all covariances there."""
 
     def best(self) -> Solution:
         """Return the optimum of all that was heard so far."""
         if "best" not in self.found:
             self.found["best"] = converged(self.solution, self.history, self.noise)
         return self.found["best"]
+
+    def smoothed(self) -> Smoothed:
+        """Return all states and places at the optimum, with their covariances."""
+        if "smoothed" not in self.found:
+            self.found["smoothed"] = smoothed(self.best(), self.history)
+        return self.found["smoothed"]
 
     def guess(self) -> Float[np.ndarray, " d"]:
         """Return the pose, and where moving callers are, after the steps since the last node."""
@@ -59,14 +63,35 @@ class SmootherBelief:
         """Return the vehicle's pose, (3) and (3, 3)."""
         return self.ahead
 
+    def placed(self, odometry: Odometry, first: int) -> Gaussian:
+        """Return the poses after the steps of odometry from number ``first`` on."""
+        parameters = self.history.calibration.odometry.size
+        if not parameters:
+            return placed(self.at, odometry, first)
+        estimate = self.solution.border[1 : 1 + parameters] + self.solution.beta[1 : 1 + parameters]
+        poses = placed(self.at, _corrected(odometry, estimate), first)
+        d, n = len(self.solution.state), self.solution.beta.size
+        by_chain, by_border = np.zeros((3 + parameters, d)), np.zeros((3 + parameters, n))
+        by_chain[:3, :3], by_border[3:, 1 : 1 + parameters] = np.eye(3), np.eye(parameters)
+        about = joint(self.solution.front, self.solution.factor, n, by_chain, by_border)
+        spread = poses.covariance + _by_parameters(
+            poses.mean, self.at.mean, odometry.slopes[first:], about
+        )
+        return replace(poses, covariance=spread)
+
     def path(self) -> Gaussian:
         """Return the start and every control step so far, given all measurements so far."""
-        mean, covariance, cross = self._nodes()
-        legs, steps = self.history.legs, self.history.steps
-        nodes = np.ascontiguousarray(mean[:, :3]), np.ascontiguousarray(covariance[:, :3, :3])
-        cross = np.ascontiguousarray(cross[:, :3, :3])
-        ends = legs.entries(4)
-        poses, spread = poses_between(self.history.motion, ends, steps.arrays, nodes, cross)
+        known, legs, steps = self.smoothed(), self.history.legs, self.history.steps
+        mean = np.ascontiguousarray(known.states[:, :3])
+        mean[:, 2] = wrap(mean[:, 2])
+        nodes = mean, np.ascontiguousarray(known.covariance[:, :3, :3])
+        cross, ends = np.ascontiguousarray(known.cross[:, :3, :3]), legs.entries(4)
+        motion, led = self.history.motion, (steps.arrays[0], steps.arrays[1])
+        if parameters := self.history.calibration.odometry.size:
+            known_now = known.parameters[:parameters]
+            motion = motion[0] + (motion[4] * known_now).sum(axis=-1), *motion[1:]
+            led = led[0] + (steps.arrays[2] * known_now).sum(axis=-1), led[1]
+        poses, spread = poses_between(motion, ends, led, nodes, cross)
         last = Gaussian(mean=nodes[0][-1], covariance=nodes[1][-1])
         since = placed(last, self.odometry)
         return Gaussian(
@@ -74,31 +99,25 @@ class SmootherBelief:
             covariance=np.concatenate([spread, since.covariance]),
         )
 
-    def _nodes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the states of all nodes at the optimum, and their covariances (`marginals`)."""
-        best, history = self.best(), self.history
-        mean = best.trail.entries(0).copy()
-        mean[:, 2] = wrap(mean[:, 2])
-        covariance, cross = marginals(
-            history.motion, history.places(), best.points(), best.trail.arrays[1:],
-            self.noise, best.factor, history.nodes,
-        )  # fmt: skip
-        return mean, covariance, cross
-
     def landmarks(self) -> Landmarks:
-        """Return the map: a row for each landmark in the border, a ray for each that waits."""
-        history, best = self.history, self.best()
-        count, n = len(history.placed), history.columns
-        mean = best.border[1 : history.columns].reshape(-1, 2).copy()
-        by_border = np.eye(n)[1:]
-        spread = joint(best.front, best.factor, n, np.zeros((n - 1, len(best.state))), by_border)
-        own = np.arange(count)
-        covariance = spread.reshape(count, 2, count, 2)[own, :, own]
+        """Return the map: a row for each landmark of the border, a ray for each that waits."""
+        known = self.smoothed()
         points = [
             (label, Gaussian(mean=place, covariance=about), 1.0)
-            for label, place, about in zip(history.placed, mean, covariance, strict=True)
+            for label, place, about in zip(
+                self.history.placed, known.places, known.place_covariance, strict=True
+            )
         ]
         return _rows(points, self._rays(moving=False))
+
+    def calibration(self) -> dict[str, Gaussian]:
+        """Return what was calibrated, by name, as known by all measurements so far."""
+        known, found = self.smoothed(), {}
+        for name, first in self.history.calibration.column.items():
+            at = slice(first - 1, first - 1 + SIZES[name])
+            mean, about = known.parameters[at].copy(), known.parameter_covariance[at, at].copy()
+            found[name] = Gaussian(mean=mean, covariance=about)
+        return found
 
     def moving(self) -> Landmarks:
         """Return moving callers: a row for each in the chain, a ray for each heard just now."""
@@ -116,7 +135,7 @@ class SmootherBelief:
         history = self.history
         if not history.callers:
             return {}
-        mean, covariance, _ = self._nodes()
+        mean, covariance = self.smoothed().states, self.smoothed().covariance
         rows = np.append(0, history.legs.entries(4)[1:, 1])
         size, found = history.steps.size + len(self.odometry.mean) + 1, {}
         for (label, i), first in zip(self._callers(), history.first.tolist(), strict=True):
@@ -138,24 +157,45 @@ class SmootherBelief:
         history, rays = self.history, []
         waits = (history.index == 0) & (history.latest >= 0) & (history.moves == moving)
         labels = list(history.slots)
-        nodes = None
         for slot in np.flatnonzero(waits).tolist():
             row = history.latest[slot]
             node, numbers = history.rows.arrays[0][row, 2], history.rows.arrays[1][row]
             if moving and node != history.nodes - 1:
                 continue
-            if nodes is None:
-                nodes = self._nodes()
-            pose = (
-                self.at
-                if moving
-                else Gaussian(mean=nodes[0][node, :3], covariance=nodes[1][node, :3, :3])
-            )
+            pose = self.at
+            if not moving:
+                known = self.smoothed()
+                pose = Gaussian(
+                    mean=known.states[node, :3], covariance=known.covariance[node, :3, :3]
+                )
             rays += [
                 (labels[slot][0], member, weight)
                 for member, weight in _ray(pose, numbers[BEARING], numbers[BEARING_STD], self.rays)
             ]
         return rays
+
+
+def _corrected(odometry: Odometry, parameters: Float[np.ndarray, " q"]) -> Odometry:
+    """Return odometry by its parameters, not by what was assumed."""
+    return replace(odometry, mean=odometry.mean + (odometry.slopes * parameters).sum(axis=-1))
+
+
+def _by_parameters(
+    poses: Float[np.ndarray, "m 3"],
+    start: Float[np.ndarray, "3"],
+    slopes: Float[np.ndarray, "m 3 q"],
+    about: Float[np.ndarray, "e e"],
+) -> Float[np.ndarray, "m 3 3"]:
+    """Return what parameters add to the covariances of poses after a start.
+
+    ``about``: covariance of start and parameters.
+    """
+    c, s, count = np.cos(start[2]), np.sin(start[2]), len(poses)
+    by_start, by = np.tile(np.eye(3), (count, 1, 1)), slopes.copy()
+    by_start[:, 0, 2], by_start[:, 1, 2] = start[1] - poses[:, 1], poses[:, 0] - start[0]
+    by[:, 0], by[:, 1] = c * slopes[:, 0] - s * slopes[:, 1], s * slopes[:, 0] + c * slopes[:, 1]
+    mixed = np.einsum("mae,ef,mbf->mab", by, about[3:, :3], by_start)
+    return mixed + np.swapaxes(mixed, 1, 2) + np.einsum("mae,ef,mbf->mab", by, about[3:, 3:], by)
 
 
 def _propagated(solution: Solution, i: int, seconds: float, walk_std: float) -> Gaussian:

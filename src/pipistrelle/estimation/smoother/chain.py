@@ -1,226 +1,216 @@
-"""The chain solved: points of linearisation, the front at its last node, and the solution there.
+"""The chain solved, and solved again: what has moved is linearised anew.
 
-A `Solution` is never changed. Each frame steps to a new node (`stepped`) and hears there
-(`heard`). All is linearised at points that stay, so that what is believed is consistent, until
-something has moved too far from them: then all is eliminated anew (`relinearised`).
+All is linearised at points that stay, so that what is believed is consistent, until something has
+moved too far from them. Then the chain is eliminated anew at its solution, from the first stretch
+on in which anything has moved (`relinearised`); at the end, all of it, until nothing moves any more
+(`converged`).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from pipistrelle.estimation.smoother.elimination import begin, eliminate, step_to
-from pipistrelle.estimation.smoother.history import History
+from pipistrelle.estimation.smoother.history import STRETCH, History, in_hindsight
 from pipistrelle.estimation.smoother.linearity import nonlinearity
-from pipistrelle.estimation.smoother.records import CALLER, POSE, Arrays, Points
-from pipistrelle.estimation.smoother.solution import retrace, solve
+from pipistrelle.estimation.smoother.records import Arrays
+from pipistrelle.estimation.smoother.smoothing import (
+    places_left,
+    spread_back,
+    spread_left,
+    spread_with_border,
+    trace_back,
+)
+from pipistrelle.estimation.smoother.solution import border_covariance
 from pipistrelle.estimation.smoother.stack import Stack
+from pipistrelle.estimation.smoother.sweep import Noise, Points, Solution, Stretch, Sweep
 
-Noise = tuple[float, ...]
-"""As `records.Noise`."""
-COLUMNS = 32
-"""The border has room for a multiple of so many columns."""
 CONVERGED = 1e-10
 """Change of the cost, absolute and relative, under which the optimum is reached."""
 LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e9
 """The least and the most information that holds every unknown at its point [1/m^2, 1/rad^2]."""
 PASSES = 30
 """How often all is linearised anew, at most."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Solution:
-    """A chain that is solved up to its last node."""
-
-    trail: Stack  # points of the chain's states; then E, T, M (`records.Trail`)
-    border: Float[np.ndarray, " w"]  # points of the border's columns
-    front: Arrays  # `records.Front`
-    factor: Float[np.ndarray, "n n"]
-    beta: Float[np.ndarray, " n"]
-    state: Float[np.ndarray, " d"]
-    """State of the last node: pose, then place and velocity of each moving caller."""
-    covariance: Float[np.ndarray, "d d"]
-    cost: float = np.inf  # twice that at the points, where all was linearised there
-
-    def points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the points of linearisation of the chain and of the border."""
-        return self.trail.arrays[0], self.border
-
-    def places(self) -> Float[np.ndarray, " n"]:
-        """Return the border as it is believed; its first number means nothing."""
-        return self.border[: self.beta.size] + self.beta
+STILL = 1e-4
+"""What has moved by less than this [m, rad] stays where it is linearised."""
 
 
 def eliminated(
-    history: History, noise: Noise, at: Float[np.ndarray, "k d"], border: Float[np.ndarray, " w"]
+    history: History, noise: Noise, points: Points, kept: Sequence[Stretch] = (), first: int = 0
 ) -> Solution:
-    """Return the chain linearised at points, eliminated from its start and solved."""
-    (k, d), w = at.shape, border.size
-    trail = _trail(k, d, w)
-    trail.arrays[0][:k] = at
-    front = np.empty((d, w)), np.empty((d, d)), np.empty((w, w))
-    points = trail.arrays[0], border
-    cost = begin(front, history.motion, history.known, points, noise[4])
-    cost += _run(history, noise, points, trail, front, 0)
-    return _solved(history, trail, border, front, cost)
+    """Return the chain linearised at points, eliminated and solved.
+
+    Of the stretches ``kept`` those before number ``first`` stay.
+    """
+    sweep = Sweep(history, noise, points)
+    if first:
+        sweep.take_up(kept, first)
+    else:
+        sweep.begin()
+    sweep.go_to_the_end()
+    return sweep.solved()
 
 
-def _trail(nodes: int, d: int, w: int) -> Stack:
-    """Return a trail of so many nodes, to be written."""
-    room = max(2 * nodes, 64)
-    shapes = (room, d), (room, d, w), (room, d, d), (room, d, d)
-    return Stack(tuple(map(np.zeros, shapes)), nodes, [nodes])
-
-
-def _run(
-    history: History, noise: Noise, points: Points, trail: Stack, front: Arrays, first: int
-) -> float:
-    """Eliminate from a node on, in place; return twice the cost."""
-    span = first, history.nodes, history.columns
-    return eliminate(
-        front, history.motion, history.rows.arrays, history.places(), points,
-        trail.arrays[1:], noise, span,
-    )  # fmt: skip
-
-
-def _solved(
-    history: History, trail: Stack, border: np.ndarray, front: Arrays, cost: float
-) -> Solution:
-    """Return the solution at the last node of a chain that is eliminated."""
-    n = history.columns
-    factor, beta = np.empty((n, n)), np.empty(n)
-    off, covariance = solve(front, n, factor, beta)
-    beta[0] = 0.0
-    return Solution(
-        trail=trail,
-        border=border,
-        front=front,
-        factor=factor,
-        beta=beta,
-        state=trail.arrays[0][history.nodes - 1] + off,
-        covariance=covariance,
-        cost=cost,
-    )
-
-
-def stepped(solution: Solution, history: History, noise: Noise, guess: np.ndarray) -> Solution:
+def stepped(
+    solution: Solution, history: History, noise: Noise, guess: Float[np.ndarray, " d"]
+) -> Sweep:
     """Return the chain with a node more, before anything is heard there, linearised at a guess."""
-    solution = _with_room(solution, history)
-    trail, k = solution.trail.extended(1), history.nodes - 1
-    trail.arrays[0][k] = guess
-    front = tuple(map(np.copy, solution.front))
-    places, at = history.places(), trail.arrays[0]
-    cost = step_to(front, history.motion, places, at, noise, (k, history.columns))
-    return Solution(
-        trail=trail,
-        border=solution.border,
-        front=front,
-        factor=solution.factor,
-        beta=solution.beta,
-        state=guess,
-        covariance=solution.covariance,
-        cost=solution.cost + cost,
-    )
-
-
-def joined(solution: Solution, before: History, history: History, noise: Noise) -> Solution:
-    """Return the chain with the places that enter at its last node; its front is used up."""
-    solution, k = _with_room(solution, history), history.nodes - 1
-    border, (_, P, information) = solution.border.copy(), solution.front
-    border[before.columns : history.columns] = history.known[0][len(before.placed) :].ravel()
-    for i in range(before.columns, history.columns):
-        information[i, i] += noise[1] ** -2
-    for v in range(len(before.callers), len(history.callers)):
-        i = POSE + CALLER * v
-        solution.trail.arrays[0][k, i : i + 2] = history.begun[v]
-        P[range(i, i + 4), range(i, i + 4)] = np.square(np.repeat(noise[1:3], 2))
-    return replace(solution, border=border)
-
-
-def waited(before: History, history: History) -> bool:
-    """Tell whether measurements from before the last node count now, and did not before."""
-    if history is before:
-        return False
-    new = np.flatnonzero(history.index != before.index)
-    earlier = history.rows.arrays[0][: history.span[1], :2]
-    return bool(np.isin(earlier, new[history.index[new] > 0]).any())
+    at = solution.points.at.extended(1)
+    at.arrays[0][history.nodes - 1] = guess
+    sweep = Sweep(history, noise, replace(solution.points, at=at))
+    sweep.go_on(solution)
+    sweep.step()
+    return sweep
 
 
 def off_line(solution: Solution, history: History) -> float:
     """Return how far the lines of the last node's measurements are off (`linearity`)."""
-    estimate, places = (solution.state, solution.places()), history.places()
-    return nonlinearity(history.rows.arrays, history.span, places, solution.points(), estimate)
+    points, k = (solution.points.at.arrays[0], solution.border), history.nodes - 1
+    off = solution.state - points[0][k], solution.beta
+    places = history.places(solution.columns)
+    return nonlinearity(history.rows.arrays, history.span, places, points, off)
 
 
-def heard(solution: Solution, history: History, noise: Noise) -> Solution:
-    """Return the chain solved with what is heard from the last node; its front is used up."""
-    trail, border, front = solution.trail, solution.border, solution.front
-    cost = _run(history, noise, solution.points(), trail, front, history.nodes - 1)
-    return _solved(history, trail, border, front, solution.cost + cost)
-
-
-def relinearised(solution: Solution, history: History, noise: Noise) -> Solution:
+def relinearised(
+    solution: Solution, history: History, noise: Noise, still: float = STILL
+) -> Solution:
     """Return the chain linearised at its solution, or on the way there, where that costs less.
 
-    Where the solution costs more than its points, steps are damped as Levenberg's are. Where no
-    step leads to less, the chain stays as it is.
+    What has moved by less than ``still``, and all before, stays. Where the solution costs more than
+    its points, steps are damped as Levenberg's are. Where no step leads to less, the chain stays as
+    it is.
     """
-    further, damping = _at_solution(solution, history, noise), LEAST_DAMPING
+    further, damping = _at_solution(solution, history, noise, still), LEAST_DAMPING
     while not further.cost <= solution.cost and damping <= MOST_DAMPING:
-        damped = eliminated(
-            history, (*noise[:4], damping), solution.trail.entries(0), solution.border
-        )
-        further, damping = _at_solution(damped, history, noise), 10.0 * damping
+        damped = eliminated(history, (*noise[:4], damping), solution.points)
+        further, damping = _at_solution(damped, history, noise, 0.0), 10.0 * damping
     return further if further.cost <= solution.cost else solution
 
 
-def _at_solution(solution: Solution, history: History, noise: Noise) -> Solution:
+def _at_solution(solution: Solution, history: History, noise: Noise, still: float) -> Solution:
     """Return the chain linearised at its solution, eliminated and solved anew."""
-    beta, n = solution.beta.copy(), history.columns
-    beta[0] = 1.0
-    states = retrace(
-        history.motion, history.places(), solution.points(), solution.trail.arrays[1:],
-        noise, beta, history.nodes,
-    )  # fmt: skip
-    border = solution.border.copy()
-    border[1:n] += beta[1:]
-    return eliminated(history, noise, states, border)
+    points, first = solved_points(solution, history, still)
+    return eliminated(history, noise, points, solution.stretches, first)
 
 
 def converged(solution: Solution, history: History, noise: Noise) -> Solution:
-    """Return the chain at its optimum."""
+    """Return the chain at its optimum; landmarks leave the border once they are heard no more."""
+    history = in_hindsight(history)
+    solution = eliminated(history, noise, solution.points)
     for _ in range(PASSES):
-        before, solution = solution.cost, relinearised(solution, history, noise)
+        before, solution = solution.cost, relinearised(solution, history, noise, 0.0)
         if before - solution.cost <= CONVERGED * (1.0 + solution.cost):
             break
     return solution
 
 
-def _with_room(solution: Solution, history: History) -> Solution:
-    """Return a solution whose arrays have room for all columns and callers."""
-    d, w = history.dimension, solution.border.size
-    if d == len(solution.state) and history.columns <= w:
-        return solution
-    w = -(-history.columns // COLUMNS) * COLUMNS
-    k, size = len(solution.trail.arrays[0]), solution.trail.size
-    arrays = tuple(
-        _padded(array, shape)
-        for array, shape in zip(
-            solution.trail.arrays, ((k, d), (k, d, w), (k, d, d), (k, d, d)), strict=True
+def solved_points(solution: Solution, history: History, still: float) -> tuple[Points, int]:
+    """Return the solution as points of linearisation, and the first stretch that they change.
+
+    Points before that stretch are as they were, and so are those of landmarks that entered before.
+    """
+    spots, parameters = solution.points.spots.copy(), solution.points.parameters.size
+    beta = np.zeros(len(solution.border))
+    beta[: solution.beta.size] = solution.beta
+    beta[0] = 1.0
+    states = solution.points.at.entries(0).copy()
+    state, moved = solution.state - states[-1], spots - solution.points.spots
+    there = np.flatnonzero(solution.columns)
+    for e in range(2):
+        moved[there, e] = beta[solution.columns[there] + e]
+    first = 0 if np.any(np.abs(beta[1 : 1 + parameters]) > still) else len(solution.stretches) - 1
+    entering = history.entering
+    first = _earliest(entering, moved, there, still, first)
+    off = np.zeros_like(states)
+    for number in range(len(solution.stretches) - 1, -1, -1):
+        stretch = solution.stretches[number]
+        if stretch.gone.size:
+            width = stretch.left[0].shape[2]
+            places_left(stretch.left, stretch.freed, beta[:width], state)
+            for e in range(2):
+                moved[stretch.gone, e] = beta[stretch.freed + e]
+            first = _earliest(entering, moved, stretch.gone, still, first)
+        a, links, count = stretch.first, *_links_of(stretch)
+        back = trace_back(links, beta[: links[0].shape[2]], state, count)
+        off[stretch.last - count : stretch.last + 1], state = back, back[0]
+        if np.any(np.abs(off[a : stretch.last + 1]) > still):
+            first = min(first, number)
+        if number <= first and not np.any(np.abs(state) > still):
+            break
+    changed = STRETCH * first
+    states[changed:] += off[changed:]
+    again = entering >= first
+    spots[again] += moved[again]
+    at, parameters = Stack((states,), len(states), [len(states)]), solution.points.parameters
+    if first == 0:
+        parameters = parameters + beta[1 : 1 + parameters.size]
+    return Points(at=at, spots=spots, parameters=parameters), first
+
+
+def _earliest(
+    entering: Int[np.ndarray, " l"], moved: Float[np.ndarray, "l 2"],
+    among: Int[np.ndarray, " g"], still: float, first: int,
+) -> int:  # fmt: skip
+    """Return the first stretch in which landmarks have entered that have moved, or an earlier."""
+    far = among[np.any(np.abs(moved[among]) > still, axis=1)]
+    return min(first, int(entering[far].min(initial=first)))
+
+
+def _links_of(stretch: Stretch) -> tuple[Arrays, int]:
+    """Return the links of a stretch, and how many there are: the start has none."""
+    arrays, size = stretch.links.arrays, stretch.links.size
+    return (arrays, size) if stretch.first else (tuple(one[1:] for one in arrays), size - 1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Smoothed:
+    """All states and places, as known by all that was heard."""
+
+    states: Float[np.ndarray, "k d"]
+    covariance: Float[np.ndarray, "k d d"]
+    cross: Float[np.ndarray, "k d d"]
+    """Of each state with the one before."""
+    places: Float[np.ndarray, "l 2"]
+    place_covariance: Float[np.ndarray, "l 2 2"]
+    parameters: Float[np.ndarray, " p"]
+    parameter_covariance: Float[np.ndarray, "p p"]
+
+
+def smoothed(best: Solution, history: History) -> Smoothed:
+    """Return means and covariances at the optimum."""
+    size, n, w = history.nodes, best.beta.size, len(best.border)
+    border, P = np.zeros((w, w)), best.covariance.copy()
+    border[:n, :n] = border_covariance(best.factor)
+    covariances = P, spread_with_border(best.front[0], border), border
+    covariance, cross = np.zeros((2, size, *P.shape))
+    covariance[-1], own = P, _known_beforehand(history)
+    there, parameters = np.flatnonzero(best.columns), slice(1, 1 + best.points.parameters.size)
+    for number in there.tolist():
+        at = slice(best.columns[number], best.columns[number] + 2)
+        own[number] = border[at, at]
+    about = border[parameters, parameters].copy()
+    for stretch in reversed(best.stretches):
+        if stretch.gone.size:
+            own[stretch.gone] = spread_left(stretch.left, stretch.freed, covariances)
+        links, count = _links_of(stretch)
+        before = stretch.last - count
+        covariance[before : stretch.last], cross[before + 1 : stretch.last + 1] = spread_back(
+            links, covariances, count
         )
-    )
-    front = tuple(map(_padded, solution.front, ((d, w), (d, d), (w, w))))
-    return replace(
-        solution,
-        trail=Stack(arrays, size, [size]),
-        border=_padded(solution.border, (w,)),
-        front=front,
+    return Smoothed(
+        states=best.points.at.entries(0),
+        covariance=covariance,
+        cross=cross,
+        places=best.points.spots,
+        place_covariance=own,
+        parameters=best.points.parameters,
+        parameter_covariance=about,
     )
 
 
-def _padded(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return an array in the corner of a larger one of zeros."""
-    padded = np.zeros(shape)
-    padded[tuple(map(slice, array.shape))] = array
-    return padded
+def _known_beforehand(history: History) -> Float[np.ndarray, "l 2 2"]:
+    """Return the prior covariances of the landmarks of the border."""
+    xx, xy, yy = history.known[1].T
+    det = xx * yy - xy * xy
+    return np.stack([yy, -xy, -xy, xx], axis=1).reshape(-1, 2, 2) / det[:, None, None]

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.detection.scans import BEARING, BEARING_STD, RANGE
+from pipistrelle.estimation.smoother.observations import view_of
 from pipistrelle.estimation.smoother.records import Arrays, Front, Places, Points, Rows
 from pipistrelle.estimation.smoother.tdoa_initialization import place_by_excess_path
 from pipistrelle.jit import Whole, kernel, no_alloc
@@ -40,34 +41,40 @@ def entering_places(
     """
     rows, places, front = Rows(*rows), Places(*places), Front(*front)
     k, first, last = span
-    pose, found = estimate[0][k], np.full((last - first, 2), np.nan)
+    view, found = (
+        view_of(estimate[0][k], estimate[1], places.sensor),
+        np.full((last - first, 2), np.nan),
+    )
     for m in range(first, last):
         slot, numbers = rows.ends[m, 0], rows.numbers[m]
         if places.index[slot] != 0 or math.isnan(numbers[BEARING]):
             continue
-        away = numbers[RANGE]
+        away = numbers[RANGE] * view.scale
         if math.isnan(away):
             heard = m, first, last
-            away = place_by_excess_path(rows, heard, k, places, estimate, front, R)
+            away = place_by_excess_path(rows, heard, view, k, places, estimate, front, R)
         if math.isnan(away) and not moves[slot]:
-            away = range_by_crossing(rows, m, estimate[0])
-        found[m - first, 0] = pose[0] + away * math.cos(pose[2] + numbers[BEARING])
-        found[m - first, 1] = pose[1] + away * math.sin(pose[2] + numbers[BEARING])
+            away = range_by_crossing(rows, m, estimate, places.sensor)
+        found[m - first, 0] = view.x + away * math.cos(view.heading + numbers[BEARING])
+        found[m - first, 1] = view.y + away * math.sin(view.heading + numbers[BEARING])
     return found
 
 
 @no_alloc
-def range_by_crossing(rows: Rows, m: Whole, poses: Float[np.ndarray, "k d"]) -> float:
+def range_by_crossing(
+    rows: Rows, m: Whole, estimate: Points, sensor: Int[np.ndarray, "3"]
+) -> float:
     """Return the range where the bearing of row m clearly crosses an earlier one, or NaN."""
-    numbers, pose = rows.numbers[m], poses[rows.ends[m, 2]]
-    angle, best, found = pose[2] + numbers[BEARING], math.sin(MIN_CROSSING_ANGLE), math.nan
+    numbers, (poses, border) = rows.numbers[m], estimate
+    view = view_of(poses[rows.ends[m, 2]], border, sensor)
+    angle, best, found = view.heading + numbers[BEARING], math.sin(MIN_CROSSING_ANGLE), math.nan
     earlier = rows.ends[m, 3]
     while earlier >= 0:
-        there = poses[rows.ends[earlier, 2]]
-        other = there[2] + rows.numbers[earlier, BEARING]
+        there = view_of(poses[rows.ends[earlier, 2]], border, sensor)
+        other = there.heading + rows.numbers[earlier, BEARING]
         sine = math.sin(other - angle)
         if abs(sine) >= best:
-            dx, dy = there[0] - pose[0], there[1] - pose[1]
+            dx, dy = there.x - view.x, there.y - view.y
             near = (dx * math.sin(other) - dy * math.cos(other)) / sine
             far = (dx * math.sin(angle) - dy * math.cos(angle)) / sine
             along = far * rows.numbers[earlier, BEARING_STD]

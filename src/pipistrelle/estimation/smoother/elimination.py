@@ -1,48 +1,61 @@
 r"""The arrow: poses eliminated along their chain, with landmarks as a border.
 
 The normal equations of a drive have the shape of an arrow. Poses form a chain, each linked to the
-next by odometry; landmarks and resting callers border it. Given the border b, the chain is a linear
-Gaussian process, so a Kalman filter runs along it whose mean is affine in b: with all unknowns as
-differences from the points of linearisation and :math:`\beta = (1, b)`,
+next by odometry; landmarks, resting callers and unknown parameters border it. Given the border b,
+the chain is a linear Gaussian process, so a Kalman filter runs along it whose mean is affine in b:
+with all unknowns as differences from the points of linearisation and :math:`\beta = (1, b)`,
 
 .. math:: x_k \mid b \sim N(C_k \beta,\, P_k), \qquad
-          C_k \leftarrow F C_k + u, \quad P_k \leftarrow F P_k F^T + Q .
+          \bar C = F C_k + u, \quad \bar P = F P_k F^T + Q .
 
 What a frame measures, :math:`r = H x + G \beta` in standard deviations, corrects both and leaves
-its evidence about the border behind (:math:`T = H^T H`, :math:`E = T C + H^T G`):
+its evidence about the border behind (:math:`T = H^T H`, :math:`E = T \bar C + H^T G`):
 
-.. math:: M = (P^{-1} + T)^{-1}, \quad C \leftarrow C - M E, \quad
-          \Lambda \leftarrow \Lambda + G^T G + G^T H C + (C - M E)^T E .
+.. math:: P = (\bar P^{-1} + T)^{-1}, \quad C = \bar C - P E, \quad
+          \Lambda \leftarrow \Lambda + G^T G + G^T H \bar C + C^T E .
 
 :math:`\tfrac12 \beta^T \Lambda \beta` is the least that poses so far cost, as a function of the
 border: exact elimination, in 3 x 3 blocks and rank-3 updates of one small matrix. Neither Q nor the
 prior is inverted, so both may be singular. `solution` solves for the border.
 
+A step leaves behind what the state before it is, given the state after it and the border, from
+which `smoothing` goes back along the chain:
+
+.. math:: x_k \mid x_{k+1}, b \sim N(D_k \beta + G_k x_{k+1},\, S_k), \qquad
+          G_k = P_k F^T \bar P^{-1}, \quad D_k = C_k - G_k \bar C .
+
+A landmark stands in the border while it is heard. One that is heard no more may leave: it is
+eliminated as a pose is, given the state and what stays (`leave`), so that the border is as wide as
+what is around the vehicle, not as what it has ever met.
+
 A moving caller joins the chain: place and velocity follow the pose in its state.
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from pipistrelle.estimation.smoother.records import (
     POSE,
     Arrays,
-    Columns,
     Front,
     Legs,
+    Links,
     Noise,
     Places,
     Points,
     Rows,
-    Trail,
     Work,
     work_of,
 )
 from pipistrelle.estimation.smoother.rows import hear
 from pipistrelle.estimation.smoother.small_matrices import (
+    add,
     add_product,
+    cholesky,
+    congruent,
     multiply,
     posterior,
+    solve_with,
     write,
 )
 from pipistrelle.estimation.smoother.transition import predicted, transition, write_start
@@ -56,72 +69,26 @@ def eliminate(
     rows: Arrays,
     places: Arrays,
     points: Points,
-    trail: Arrays,
+    links: Arrays,
     noise: tuple[float, ...],
-    span: tuple[Whole, Whole, Whole],
+    span: tuple[Whole, Whole, Whole, Whole, Whole],
 ) -> float:
     """Carry a front on along the chain, in place; return twice what nodes and steps cost.
 
-    ``span``: the node at which nothing is heard yet, the one after the last, and the columns. The
-    front stands at the first node.
+    ``span``: the node at which the front stands, the first of which the rows are heard, that or the
+    next, and the one after the last; the columns; the node whose link is the first of ``links``.
     """
     front, legs, rows, places = Front(*front), Legs(*legs), Rows(*rows), Places(*places)
-    trail, noise, (first, last, n), cost = Trail(*trail), Noise(*noise), span, 0.0
-    work = work_of(front.C.shape[0], n)
+    links, noise, (stands, first, last, n, base) = Links(*links), Noise(*noise), span
+    work, cost = work_of(front.C.shape[0], n, legs.slopes.shape[2]), 0.0
     for k in range(first, last):
-        if k > first:
-            cost += transition(work, k, legs, places, points[0], noise)
-            advance(front, work, n)
+        if k > stands:
+            cost += transition(work, k, legs, places, points, noise)
+            step(front, work, links, k - base, n)
         heard = k, legs.rows[k, 0], legs.rows[k, 1]
         cost += hear(work, front, heard, rows, places, points, noise)
-        correct(front, work, trail, k, n)
+        correct(front, work, n)
     return cost
-
-
-@kernel
-def begin(
-    front: Arrays,
-    legs: Arrays,
-    columns: Arrays,
-    points: Points,
-    damping: float,
-) -> float:
-    """Begin a front at the start, with what is known of the border; return twice its cost."""
-    legs, columns = Legs(*legs), Columns(*columns)
-    at, border = points
-    front[0][:], front[1][:], front[2][:] = 0.0, 0.0, 0.0
-    work = work_of(POSE, 1)
-    cost = write_start(work, legs, at)
-    for a in range(POSE):
-        front[0][a, 0] = work.u[a]
-        for b in range(POSE):
-            front[1][a, b] = work.Q[a, b]
-    for i in range(columns.mean.shape[0]):
-        n = 1 + 2 * i
-        cost += add_prior(front[2], n, columns.mean[i], columns.information[i], border)
-        front[2][n, n] += damping
-        front[2][n + 1, n + 1] += damping
-    return cost
-
-
-@no_alloc
-def add_prior(
-    information: Float[np.ndarray, "n n"],
-    i: Whole,
-    mean: Float[np.ndarray, "2"],
-    known: Float[np.ndarray, "3"],
-    border: Float[np.ndarray, " n"],
-) -> float:
-    """Add what is known of a place of the border: xx, xy, yy; return twice what it costs."""
-    x, y = border[i] - mean[0], border[i + 1] - mean[1]
-    by_x, by_y = known[0] * x + known[1] * y, known[1] * x + known[2] * y
-    information[i, i] += known[0]
-    information[i + 1, i] += known[1]
-    information[i + 1, i + 1] += known[2]
-    information[i, 0] += by_x
-    information[i + 1, 0] += by_y
-    information[0, 0] += x * by_x + y * by_y
-    return x * by_x + y * by_y
 
 
 @kernel
@@ -129,46 +96,205 @@ def step_to(
     front: Arrays,
     legs: Arrays,
     places: Arrays,
-    at: Float[np.ndarray, "k d"],
+    points: Points,
+    links: Arrays,
     noise: tuple[float, ...],
-    span: tuple[Whole, Whole],
+    span: tuple[Whole, Whole, Whole],
 ) -> float:
     """Carry a front to a node, before anything is heard there; return twice what the step costs.
 
-    ``span``: the node, the columns.
+    ``span``: the node, the columns, and the node of the first link.
     """
-    front, (k, n) = Front(*front), span
-    work = work_of(front.C.shape[0], n)
-    cost = transition(work, k, Legs(*legs), Places(*places), at, Noise(*noise))
-    advance(front, work, n)
+    front, legs, (k, n, base) = Front(*front), Legs(*legs), span
+    work = work_of(front.C.shape[0], n, legs.slopes.shape[2])
+    cost = transition(work, k, legs, Places(*places), points, Noise(*noise))
+    step(front, work, Links(*links), k - base, n)
     return cost
+
+
+@kernel
+def begin(
+    front: Arrays, legs: Arrays, at: Float[np.ndarray, "k d"], border: Float[np.ndarray, " n"],
+    parameters: Float[np.ndarray, " p"], damping: float,
+) -> float:  # fmt: skip
+    """Begin a front at the start, with the deviations of the parameters; return twice its cost."""
+    front[0][:], front[1][:], front[2][:] = 0.0, 0.0, 0.0
+    work = work_of(POSE, 1, 0)
+    cost = write_start(work, Legs(*legs), at)
+    for a in range(POSE):
+        front[0][a, 0] = work.u[a]
+        for b in range(POSE):
+            front[1][a, b] = work.Q[a, b]
+    for i in range(1, 1 + parameters.size):
+        sure, information = parameters[i - 1] ** -2, front[2]
+        information[i, i] = sure + damping
+        information[i, 0] = sure * border[i]
+        information[0, 0] += sure * border[i] ** 2
+        cost += sure * border[i] ** 2
+    return cost
+
+
+@kernel
+def enter(
+    information: Float[np.ndarray, "n n"],
+    column: Int[np.ndarray, " l"],
+    known: tuple[Float[np.ndarray, "l 2"], Float[np.ndarray, "l 3"]],
+    border: Float[np.ndarray, " n"],
+    damping: float,
+) -> float:
+    """Add places to the border: what is known of them (xx, xy, yy); return what it costs, twice."""
+    cost = 0.0
+    for number in range(column.size):
+        i, mean, by = column[number], known[0][number], known[1][number]
+        x, y = border[i] - mean[0], border[i + 1] - mean[1]
+        by_x, by_y = by[0] * x + by[1] * y, by[1] * x + by[2] * y
+        information[i, i] += by[0] + damping
+        information[i + 1, i] += by[1]
+        information[i + 1, i + 1] += by[2] + damping
+        information[i, 0] += by_x
+        information[i + 1, 0] += by_y
+        information[0, 0] += x * by_x + y * by_y
+        cost += x * by_x + y * by_y
+    return cost
+
+
+@kernel
+def leave(
+    front: Arrays,
+    column: Int[np.ndarray, " g"],
+    left: tuple[Float[np.ndarray, "g 2 n"], Float[np.ndarray, "g 2 d"], Float[np.ndarray, "g 2 2"]],
+) -> None:
+    r"""Eliminate places from the border, one after the other, in place.
+
+    With c the columns of one, :math:`V = \Lambda_{cc}^{-1}`, :math:`H = -V \Lambda_c` and
+    :math:`C_c` the slopes of the state by it,
+
+    .. math:: C \leftarrow C + C_c H, \quad P \leftarrow P + C_c V C_c^T, \quad
+              \Lambda \leftarrow \Lambda + \Lambda_c^T H,
+
+    and the place is :math:`(H - K C)\beta + K x` with :math:`K = V C_c^T P^{-1}`, and a covariance
+    of what x does not say of V; ``left`` gets all three.
+    """
+    C, P, information = front
+    d, n = C.shape
+    L, V, by = np.zeros((d, d)), np.zeros((2, 2)), np.zeros((2, n))
+    aside, own = np.zeros((2, n)), np.zeros((d, 2))
+    for g in range(column.size):
+        i, H, K = column[g], left[0][g], left[1][g]
+        _take_out(information, i, by)
+        _take_slopes(C, i, own)
+        det = by[0, i] * by[1, i + 1] - by[0, i + 1] * by[0, i + 1]
+        V[0, 0], V[1, 1] = by[1, i + 1] / det, by[0, i] / det
+        V[0, 1] = V[1, 0] = -by[0, i + 1] / det
+        by[:, i : i + 2], H[:] = 0.0, 0.0
+        add_product(V, by, H, -1.0)
+        for j in range(n):
+            for e in range(j + 1):
+                information[j, e] += by[0, j] * H[0, e] + by[1, j] * H[1, e]
+        add_product(own, H, C, 1.0)
+        for e in range(2):
+            for a in range(d):
+                K[e, a] = V[e, 0] * own[a, 0] + V[e, 1] * own[a, 1]
+        add_product(own, K, P, 1.0)
+        cholesky(P, L)
+        for e in range(2):
+            solve_with(L, K[e])
+        _write_rest(V, own, K, left[2][g])
+        multiply(K, C, aside)
+        add(aside, H, -1.0)
+
+
+@no_alloc
+def _take_out(
+    information: Float[np.ndarray, "n n"], i: Whole, by: Float[np.ndarray, "2 n"]
+) -> None:
+    """Write the rows of a place at column i, and make them 0, of a lower triangle."""
+    for e in range(2):
+        for j in range(by.shape[1]):
+            by[e, j] = information[max(i + e, j), min(i + e, j)]
+    for e in range(2):
+        for j in range(by.shape[1]):
+            information[max(i + e, j), min(i + e, j)] = 0.0
+
+
+@no_alloc
+def _take_slopes(C: Float[np.ndarray, "d n"], i: Whole, own: Float[np.ndarray, "d 2"]) -> None:
+    """Write the slopes by a place at column i, and make them 0."""
+    for a in range(C.shape[0]):
+        own[a, 0], own[a, 1] = C[a, i], C[a, i + 1]
+        C[a, i] = C[a, i + 1] = 0.0
+
+
+@no_alloc
+def _write_rest(
+    V: Float[np.ndarray, "2 2"],
+    own: Float[np.ndarray, "d 2"],
+    K: Float[np.ndarray, "2 d"],
+    W: Float[np.ndarray, "2 2"],
+) -> None:
+    """Write V - K C_c V."""
+    for e in range(2):
+        for f in range(e + 1):
+            W[e, f] = V[e, f]
+            for a in range(own.shape[0]):
+                W[e, f] -= K[e, a] * (own[a, 0] * V[0, f] + own[a, 1] * V[1, f])
+            W[f, e] = W[e, f]
 
 
 @no_alloc
 def advance(front: Front, work: Work, n: Whole) -> None:
-    """Carry the front through a transition, in place."""
-    multiply(work.F, front.C, work.C)
+    """Carry the front through a transition, in place; what it was stays in the work's C and M."""
+    write(front.P, work.M)
     for a in range(work.u.size):
         for j in range(n):
-            front.C[a, j] = work.C[a, j]
-        front.C[a, 0] += work.u[a]
-    predicted(work, front.P, work.B)
-    write(work.B, front.P)
+            work.C[a, j] = front.C[a, j]
+    for a in range(work.u.size):
+        row = front.C[a]
+        row[:n] = 0.0
+        for e in range(work.u.size):
+            share = work.F[a, e]
+            if share != 0.0:
+                for j in range(n):
+                    row[j] += share * work.C[e, j]
+        row[0] += work.u[a]
+        for e in range(work.by.shape[1]):
+            row[1 + e] += work.by[a, e]
+    predicted(work, work.M, front.P)
 
 
 @no_alloc
-def correct(front: Front, work: Work, trail: Trail, k: Whole, n: Whole) -> None:
-    """Correct the front with what was gathered at node k, and leave its trail."""
-    C, T, G, E, M = front.C, work.T, work.G, trail.E[k], trail.M[k]
-    before, d = work.C, C.shape[0]
+def step(front: Front, work: Work, links: Links, k: Whole, n: Whole) -> None:
+    """Carry the front through a transition, and write what it leaves of the state before."""
+    advance(front, work, n)
+    D, G, S, d = links.D[k], links.G[k], links.S[k], front.P.shape[0]
+    multiply(work.F, work.M, work.A)
+    cholesky(front.P, work.B)
     for a in range(d):
+        for b in range(d):
+            G[a, b] = work.A[b, a]
+        solve_with(work.B, G[a])
         for j in range(n):
-            E[a, j] = G[a, j]
-    add_product(T, before, E, 1.0)
-    write(T, trail.T[k])
+            D[a, j] = work.C[a, j]
+    add_product(G, front.C, D, -1.0)
+    multiply(G, work.F, work.A)
+    for a in range(d):
+        for b in range(d):
+            work.A[a, b] = (1.0 if a == b else 0.0) - work.A[a, b]
+            S[a, b] = 0.0
+    congruent(work.A, work.M, work.B, S)
+    congruent(G, work.Q, work.B, S)
+
+
+@no_alloc
+def correct(front: Front, work: Work, n: Whole) -> None:
+    """Correct the front with what was gathered at a node."""
     if work.alone[0]:
-        write(front.P, M)
         return
+    C, T, E, M = front.C, work.T, work.E, work.M
+    for a in range(C.shape[0]):
+        for j in range(n):
+            E[a, j] = work.G[a, j]
+    add_product(T, work.C, E, 1.0)
     posterior(front.P, T, (work.F, work.A, work.B), M)
     write(M, front.P)
     add_product(M, E, C, -1.0)

@@ -38,28 +38,25 @@ from pipistrelle.estimation.measurement import HUBER_K
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.rays import gate_bounds
 from pipistrelle.estimation.smoother.belief import SmootherBelief
-from pipistrelle.estimation.smoother.chain import (
-    Noise,
-    Solution,
-    eliminated,
-    heard,
-    joined,
-    off_line,
-    relinearised,
-    stepped,
-    waited,
-)
+from pipistrelle.estimation.smoother.calibration import NOTHING, Calibration
+from pipistrelle.estimation.smoother.chain import eliminated, off_line, relinearised, stepped
 from pipistrelle.estimation.smoother.delayed_initialization import entering_places
 from pipistrelle.estimation.smoother.gating import drop_outside
 from pipistrelle.estimation.smoother.history import (
+    NEVER,
+    STRETCH,
     History,
     begun,
     heard_more,
+    numbers_heard,
     with_caller,
+    with_leaving,
     with_places,
 )
-from pipistrelle.estimation.smoother.preintegration import NO_ODOMETRY, SMALLEST_STD, extended
-from pipistrelle.estimation.smoother.records import Arrays, Points
+from pipistrelle.estimation.smoother.preintegration import SMALLEST_STD, extended, no_odometry
+from pipistrelle.estimation.smoother.records import Arrays
+from pipistrelle.estimation.smoother.stack import Stack
+from pipistrelle.estimation.smoother.sweep import Noise, Points, Solution, Sweep
 
 PRIOR_STD = 20.0
 """Prior of a landmark about the place where it enters [m]."""
@@ -93,6 +90,9 @@ class Smoother:
     robust: bool = False
     speed_std: float = 1.0
     walk_std: float = 0.2
+    calibration: Calibration = NOTHING
+    window: float = math.inf
+    """For how long a landmark stays in the border that is not heard [s]."""
 
     def __post_init__(self) -> None:
         """Refuse a gate that is no share."""
@@ -107,13 +107,15 @@ class Smoother:
     def init(self, pose: Gaussian) -> SmootherBelief:
         """Return the belief that knows a pose, (3) and (3, 3), and no landmark."""
         pose = usable_pose(pose)
-        history = begun(pose)
-        solution = eliminated(history, self.noise, pose.mean[None].copy(), np.zeros(1))
+        history, parameters = begun(pose, self.calibration), np.zeros(self.calibration.stds.size)
+        at = Stack((pose.mean[None].copy(),), 1, [1])
+        points = Points(at=at, spots=np.empty((0, 2)), parameters=parameters)
         return SmootherBelief(
             at=pose,
             ahead=pose,
+            odometry=no_odometry(self.calibration.odometry.size),
             history=history,
-            solution=solution,
+            solution=eliminated(history, self.noise, points),
             rays=self.rays,
             noise=self.noise,
         )
@@ -127,9 +129,8 @@ class Smoother:
         information = np.stack([C[:, 1, 1], -C[:, 0, 1], C[:, 0, 0]], axis=1) / det[:, None]
         labels = known.landmark.tolist()
         history = with_places(belief.history, labels, known.mean, information)
-        border = np.concatenate([belief.solution.border, known.mean.ravel()])
-        solution = eliminated(history, self.noise, belief.at.mean[None].copy(), border)
-        return replace(belief, history=history, solution=solution)
+        points = replace(belief.solution.points, spots=known.mean.copy())
+        return replace(belief, history=history, solution=eliminated(history, self.noise, points))
 
     def predict(
         self,
@@ -144,8 +145,9 @@ class Smoother:
         """
         check_belief(belief, SmootherBelief)
         controls, dt = usable_controls(self.motion, controls, dt)
-        odometry, poses = extended(belief.odometry, belief.at, self.motion, controls, dt)
-        ahead = belief.ahead
+        parameters = belief.history.calibration.odometry
+        odometry = extended(belief.odometry, self.motion, controls, dt, parameters)
+        poses, ahead = belief.placed(odometry, len(belief.odometry.mean)), belief.ahead
         if len(dt):
             ahead = Gaussian(mean=poses.mean[-1], covariance=poses.covariance[-1])
         return replace(belief, odometry=odometry, ahead=ahead), poses
@@ -158,36 +160,67 @@ class Smoother:
         scan = usable_scan(scan)
         if scan.landmark.size == 0:
             return belief
-        history = heard_more(belief.history, belief.odometry, scan)
-        here = stepped(belief.solution, history, self.noise, belief.guess())
+        history, solution = self._awake(
+            heard_more(belief.history, belief.odometry, scan), belief.history, belief.solution
+        )
+        history = self._forgetting(history, solution)
+        here = stepped(solution, history, self.noise, belief.guess())
         gated, innovations = belief.gated, belief.innovations
         if self.gate < 1.0:
             bounds = gate_bounds(self.gate)
-            dropped, squared, degrees = drop_outside(*_frame(history, here), bounds)
+            dropped, squared, degrees = drop_outside(*_frame(history, here, solution), bounds)
             gated, innovations = gated + dropped, innovations.plus(squared, degrees)
-        history, solution = self._heard(history, here)
+        history, solution = self._heard(history, here, solution)
         pose = Gaussian(mean=solution.state[:3], covariance=solution.covariance[:3, :3])
         return replace(
             belief,
             at=pose,
             ahead=pose,
-            odometry=NO_ODOMETRY,
+            odometry=no_odometry(history.calibration.odometry.size),
             history=history,
             solution=solution,
             gated=gated,
             innovations=innovations,
         )
 
-    def _heard(self, before: History, here: Solution) -> tuple[History, Solution]:
+    def _awake(
+        self, history: History, before: History, solution: Solution
+    ) -> tuple[History, Solution]:
+        """Return history and solution with those in the border that left and are heard again."""
+        heard = np.zeros(len(history.placed), np.bool_)
+        heard[numbers_heard(history)] = True
+        again = heard & (history.leaves != NEVER)
+        if not again.any():
+            return history, solution
+        first = int(history.entering[again].min())
+        history, before = with_leaving(history, again, NEVER), with_leaving(before, again, NEVER)
+        kept = solution.stretches
+        return history, eliminated(before, self.noise, solution.points, kept, first)
+
+    def _forgetting(self, history: History, solution: Solution) -> History:
+        """Return a history in which what was not heard within the window leaves the border."""
+        k = history.nodes - 1
+        if k % STRETCH or math.isinf(self.window):
+            return history
+        since = history.silent_for()
+        leaving = (since > self.window) & (solution.columns > 0)
+        return with_leaving(history, leaving, k // STRETCH - 1) if leaving.any() else history
+
+    def _heard(self, before: History, here: Sweep, estimate: Solution) -> tuple[History, Solution]:
         """Return history and solution with the last frame's measurements and what they place."""
-        history = _placed(before, here)
+        history, k = _placed(before, here, estimate), before.nodes - 1
         if history is not before:
-            here = joined(here, before, history, self.noise)
-        late = waited(before, history)
+            here.admit(history)
+        heard = numbers_heard(history)
+        new = np.unique(heard[here.columns[heard] == 0])
+        first = int(history.entering[new].min(initial=NEVER))
+        late = bool(new.size) and bool((history.met[new] < k).any())
         if late:
-            solution = eliminated(history, self.noise, here.trail.entries(0), here.border)
+            solution = eliminated(history, self.noise, here.points, here.stretches, first)
         else:
-            solution = heard(here, history, self.noise)
+            here.join(new)
+            here.hear()
+            solution = here.solved()
         for _ in range(ENTERING_PASSES if late else 1):
             if off_line(solution, history) <= RELINEARISE_ABOVE:
                 break
@@ -196,19 +229,23 @@ class Smoother:
 
 
 def _frame(
-    history: History, here: Solution
-) -> tuple[Arrays, tuple[int, int, int], Arrays, Points, Arrays, np.ndarray]:
+    history: History, here: Sweep, estimate: Solution
+) -> tuple[Arrays, tuple[int, int, int], Arrays, tuple[np.ndarray, np.ndarray], Arrays, np.ndarray]:
     """Return what kernels need to judge the rows of the last node."""
-    estimate = here.trail.arrays[0], here.places()
-    return history.rows.arrays, history.span, history.places(), estimate, here.front, here.factor
+    border = here.border.copy()
+    border[1 : estimate.beta.size] += estimate.beta[1:]
+    points = here.points.at.arrays[0], border
+    places = history.places(here.columns)
+    return history.rows.arrays, history.span, places, points, here.front, estimate.factor
 
 
-def _placed(history: History, here: Solution) -> History:
+def _placed(history: History, here: Sweep, estimate: Solution) -> History:
     """Return a history with the landmarks and callers that the last node's rows place."""
-    rows, span, places, estimate, front, factor = _frame(history, here)
-    ends = rows[0][span[1] : span[2], 0]
+    _, first, last = history.span
+    ends = history.rows.arrays[0][first:last, 0]
     if history.index[ends].all():
         return history
+    rows, span, places, estimate, front, factor = _frame(history, here, estimate)
     found = entering_places(rows, span, history.moves, places, estimate, front, factor)
     label_of, new = list(history.slots), {}
     for slot, place in zip(ends.tolist(), found, strict=True):

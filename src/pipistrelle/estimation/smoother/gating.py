@@ -17,9 +17,25 @@ from pipistrelle.detection.scans import (
     RANGE,
     RANGE_STD,
 )
-from pipistrelle.estimation.measurement import excess_path_slopes, observe
-from pipistrelle.estimation.smoother.records import Arrays, Front, Places, Points, Rows
-from pipistrelle.estimation.smoother.rows import point_of
+from pipistrelle.estimation.measurement import observe
+from pipistrelle.estimation.smoother.observations import (
+    Point,
+    View,
+    point_of,
+    view_of,
+    write_bearing,
+    write_excess_path,
+    write_range,
+)
+from pipistrelle.estimation.smoother.records import (
+    Arrays,
+    Front,
+    Places,
+    Points,
+    Rows,
+    Work,
+    work_of,
+)
 from pipistrelle.estimation.smoother.solution import joint
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
@@ -42,6 +58,8 @@ def drop_outside(
     """
     rows, places, front = Rows(*rows), Places(*places), Front(*front)
     (k, first, last), (dropped, squared, degrees) = span, (0, 0.0, 0.0)
+    work = work_of(front.P.shape[0], 1, 0)
+    view = view_of(estimate[0][k], estimate[1], places.sensor)
     for m in range(first, last):
         point = point_of(rows.ends[m, 0], k, places, estimate)
         if point[0] == 0:
@@ -50,13 +68,13 @@ def drop_outside(
         if rows.ends[m, 1] >= 0:
             caller = point_of(rows.ends[m, 1], k, places, estimate)
             if caller[0] != 0:
-                off = _surprise_of_excess_path(numbers, estimate[0][k], (point, caller), front, R)
+                off = _surprise_of_excess_path(work, numbers, view, (point, caller), front, R)
                 if off > bounds[0]:
                     rows.ends[m, 1] = -1
                     dropped += 1
         if math.isnan(numbers[BEARING]):
             continue
-        off, size = _surprise_of_direction(numbers, estimate[0][k], point, front, R)
+        off, size = _surprise_of_direction(work, numbers, view, point, front, R)
         if off > bounds[size - 1]:
             numbers[BEARING] = numbers[RANGE] = np.nan
             dropped += 1
@@ -67,62 +85,60 @@ def drop_outside(
 
 
 @no_alloc
-def _write(
+def _part(
+    work: Work,
+    written: tuple[Whole, Whole],
     by_chain: Float[np.ndarray, " d"],
     by_border: Float[np.ndarray, " n"],
-    i: Whole,
-    x: float,
-    y: float,
 ) -> None:
-    """Write slopes by a place where it stands."""
-    if i > 0:
-        by_border[i], by_border[i + 1] = x, y
-    else:
-        by_chain[-i], by_chain[1 - i] = x, y
+    """Part a row of slopes in those by the chain and those by the border."""
+    chain, size = written
+    for e in range(chain):
+        by_chain[work.at[e]] += work.slope[e]
+    for e in range(chain, size):
+        by_border[work.at[e]] += work.slope[e]
 
 
 @kernel
 def _surprise_of_direction(
+    work: Work,
     numbers: Float[np.ndarray, " 7"],
-    pose: Float[np.ndarray, " d"],
-    point: tuple[Whole, float, float],
+    view: View,
+    point: Point,
     front: Front,
     R: Float[np.ndarray, "n n"],
 ) -> tuple[float, Whole]:
     """Return the squared innovation of a bearing, with a range if any, and how many they are."""
     (i, px, py), d, n = point, front.P.shape[0], R.shape[0]
-    distance, bearing, c, s, inverse = observe(pose[0], pose[1], pose[2], px, py)
-    off, across = wrap_angle(numbers[BEARING] - bearing), numbers[BEARING_STD]
+    seen = observe(view.x, view.y, view.heading, px, py)
+    off, across = wrap_angle(numbers[BEARING] - seen[1]), numbers[BEARING_STD]
     size = 1 if math.isnan(numbers[RANGE]) else 2
     by_chain, by_border = np.zeros((size, d)), np.zeros((size, n))
-    by_chain[0, 0], by_chain[0, 1], by_chain[0, 2] = s * inverse, -c * inverse, -1.0
-    _write(by_chain[0], by_border[0], i, -s * inverse, c * inverse)
+    _part(work, write_bearing(work, view, seen, i), by_chain[0], by_border[0])
     if size == 2:
-        by_chain[1, 0], by_chain[1, 1] = -c, -s
-        _write(by_chain[1], by_border[1], i, c, s)
+        _part(work, write_range(work, view, seen, i), by_chain[1], by_border[1])
     S = joint(front, R, n, by_chain, by_border)
     bb = S[0, 0] + across * across
     if size == 1:
         return off * off / bb, 1
-    rr, far = S[1, 1] + numbers[RANGE_STD] ** 2, numbers[RANGE] - distance
+    rr, far = S[1, 1] + numbers[RANGE_STD] ** 2, numbers[RANGE] - seen[0] / view.scale
     det = bb * rr - S[1, 0] * S[1, 0]
     return (rr * off * off - 2.0 * S[1, 0] * off * far + bb * far * far) / det, 2
 
 
 @kernel
 def _surprise_of_excess_path(
+    work: Work,
     numbers: Float[np.ndarray, " 7"],
-    pose: Float[np.ndarray, " d"],
-    ends: tuple[tuple[Whole, float, float], tuple[Whole, float, float]],
+    view: View,
+    ends: tuple[Point, Point],
     front: Front,
     R: Float[np.ndarray, "n n"],
 ) -> float:
     """Return the squared innovation of an excess path, divided by its variance."""
-    ((i, px, py), (j, bx, by)), d, n = ends, front.P.shape[0], R.shape[0]
-    path, lx, ly, cx, cy = excess_path_slopes(pose[0], pose[1], px, py, bx, by)
+    d, n = front.P.shape[0], R.shape[0]
     by_chain, by_border = np.zeros((1, d)), np.zeros((1, n))
-    by_chain[0, 0], by_chain[0, 1] = -lx - cx, -ly - cy
-    _write(by_chain[0], by_border[0], i, lx, ly)
-    _write(by_chain[0], by_border[0], j, cx, cy)
+    path, chain, size = write_excess_path(work, view, ends)
+    _part(work, (chain, size), by_chain[0], by_border[0])
     variance = joint(front, R, n, by_chain, by_border)[0, 0] + numbers[EXCESS_PATH_STD] ** 2
     return (numbers[EXCESS_PATH] - path) ** 2 / variance

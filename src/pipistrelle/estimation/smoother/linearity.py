@@ -12,12 +12,20 @@ from jaxtyping import Float
 
 from pipistrelle.detection.scans import BEARING, BEARING_STD, EXCESS_PATH_STD, RANGE, RANGE_STD
 from pipistrelle.estimation.measurement import excess_path_slopes, observe
-from pipistrelle.estimation.smoother.records import Arrays, Places, Points, Rows
-from pipistrelle.estimation.smoother.rows import point_of
+from pipistrelle.estimation.smoother.observations import (
+    Point,
+    point_of,
+    view_of,
+    write_bearing,
+    write_excess_path,
+    write_range,
+)
+from pipistrelle.estimation.smoother.records import Arrays, Places, Points, Rows, Work, work_of
 from pipistrelle.geometry import wrap_angle
-from pipistrelle.jit import Whole, kernel
+from pipistrelle.jit import Whole, kernel, no_alloc
 
-Point = tuple[Whole, float, float]
+Off = tuple[Float[np.ndarray, " d"], Float[np.ndarray, " n"]]
+"""How far the state of a node and the border are from their points."""
 
 
 @kernel
@@ -26,70 +34,63 @@ def nonlinearity(
     span: tuple[Whole, Whole, Whole],
     places: Arrays,
     points: Points,
-    estimate: Points,
+    off: Off,
 ) -> float:
     """Return how far the lines of a node's rows are off at an estimate, the most [deviations].
 
-    ``span``: the node, its first row and the one after its last. Of ``estimate`` the state is that
-    of this node alone.
+    ``span``: the node, its first row and the one after its last.
     """
     rows, places, (k, first, last), most = Rows(*rows), Places(*places), span, 0.0
-    at, state = points[0][k], estimate[0]
+    work, border = work_of(off[0].size, 1, 0), points[1].copy()
+    for i in range(1, off[1].size):
+        border[i] += off[1][i]
+    state = points[0][k] + off[0]
+    then, now = (
+        view_of(points[0][k], points[1], places.sensor),
+        view_of(state, border, places.sensor),
+    )
     for m in range(first, last):
         numbers, there = rows.numbers[m], point_of(rows.ends[m, 0], k, places, points)
         if there[0] == 0:
             continue
-        here = _estimated(there[0], state, estimate[1])
+        here = _moved(there, off)
         if not math.isnan(numbers[BEARING]):
-            most = max(most, _off_direction(numbers, at, state, there, here))
+            seen = observe(then.x, then.y, then.heading, there[1], there[2])
+            far, angle, _, _, _ = observe(now.x, now.y, now.heading, here[1], here[2])
+            line = seen[1] + _along(work, write_bearing(work, then, seen, there[0]), off)
+            most = max(most, abs(wrap_angle(angle - line)) / numbers[BEARING_STD])
+            if not math.isnan(numbers[RANGE]):
+                line = seen[0] / then.scale + _along(
+                    work, write_range(work, then, seen, there[0]), off
+                )
+                most = max(most, abs(far / now.scale - line) / numbers[RANGE_STD])
         if rows.ends[m, 1] >= 0:
             caller = point_of(rows.ends[m, 1], k, places, points)
             if caller[0] != 0:
-                call = _estimated(caller[0], state, estimate[1])
-                off = _off_excess_path(at, state, (there, caller), (here, call))
-                most = max(most, abs(off) / numbers[EXCESS_PATH_STD])
+                path, chain, size = write_excess_path(work, then, (there, caller))
+                line, call = path + _along(work, (chain, size), off), _moved(caller, off)
+                far = excess_path_slopes(now.x, now.y, here[1], here[2], call[1], call[2])[0]
+                most = max(most, abs(far / now.scale - line) / numbers[EXCESS_PATH_STD])
     return most
 
 
-@kernel
-def _estimated(
-    i: Whole, state: Float[np.ndarray, " d"], border: Float[np.ndarray, " n"]
-) -> tuple[float, float]:
-    """Return the place that stands at an index (`Places`)."""
-    return (border[i], border[i + 1]) if i > 0 else (state[-i], state[1 - i])
+@no_alloc
+def _moved(point: Point, off: Off) -> Point:
+    """Return a place where it is believed to be."""
+    i, x, y = point
+    if i > 0:
+        return i, x + off[1][i], y + off[1][i + 1]
+    return i, x + off[0][-i], y + off[0][1 - i]
 
 
-@kernel
-def _off_direction(
-    numbers: Float[np.ndarray, " 7"],
-    at: Float[np.ndarray, " d"],
-    state: Float[np.ndarray, " d"],
-    there: Point,
-    here: tuple[float, float],
-) -> float:
-    """Return how far the line of a bearing is off, or that of its range, the greater."""
-    distance, bearing, c, s, inverse = observe(at[0], at[1], at[2], there[1], there[2])
-    far, angle, _, _, _ = observe(state[0], state[1], state[2], here[0], here[1])
-    dx, dy = here[0] - there[1] - state[0] + at[0], here[1] - there[2] - state[1] + at[1]
-    line = bearing + inverse * (c * dy - s * dx) - wrap_angle(state[2] - at[2])
-    off = abs(wrap_angle(angle - line)) / numbers[BEARING_STD]
-    if math.isnan(numbers[RANGE]):
-        return off
-    return max(off, abs(far - distance - c * dx - s * dy) / numbers[RANGE_STD])
-
-
-@kernel
-def _off_excess_path(
-    at: Float[np.ndarray, " d"],
-    state: Float[np.ndarray, " d"],
-    there: tuple[Point, Point],
-    here: tuple[tuple[float, float], tuple[float, float]],
-) -> float:
-    """Return how far the line of an excess path is off [m]."""
-    (_, px, py), (_, bx, by) = there
-    path, lx, ly, cx, cy = excess_path_slopes(at[0], at[1], px, py, bx, by)
-    (qx, qy), (ax, ay) = here
-    now = excess_path_slopes(state[0], state[1], qx, qy, ax, ay)[0]
-    dx, dy = state[0] - at[0], state[1] - at[1]
-    line = lx * (qx - px - dx) + ly * (qy - py - dy) + cx * (ax - bx - dx) + cy * (ay - by - dy)
-    return now - path - line
+@no_alloc
+def _along(work: Work, written: tuple[Whole, Whole], off: Off) -> float:
+    """Return how far a row of slopes leads from its point."""
+    chain, size = written
+    total = 0.0
+    for e in range(chain):
+        total += work.slope[e] * off[0][work.at[e]]
+    for e in range(chain, size):
+        if work.at[e] > 0:
+            total += work.slope[e] * off[1][work.at[e]]
+    return total

@@ -15,10 +15,17 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from pipistrelle.estimation.beliefs import Gaussian
-from pipistrelle.estimation.motion import Motion, MotionNumbers, motion_numbers, propagate_pose
+from pipistrelle.estimation.motion import (
+    BY_POSES,
+    Motion,
+    MotionNumbers,
+    motion_increment,
+    motion_numbers,
+    propagate_pose,
+)
 from pipistrelle.estimation.smoother.records import Arrays, Legs
 from pipistrelle.estimation.smoother.small_matrices import (
     add,
@@ -38,8 +45,13 @@ SMALLEST_STD = 1e-6
 """Added in quadrature to x, y [m] and heading [rad] of the start and of a motion: what is known
 exactly would make all that is heard worthless."""
 
+NO_PARAMETERS = np.empty(0, np.int64)
+"""No parameter of odometry is estimated."""
+
 Steps = tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3 3"]]
 """Means and covariances of control steps, since the node before them."""
+Led = tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3 3"], Float[np.ndarray, "s 3 q"]]
+"""The same, with slopes of the means by parameters."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,6 +60,7 @@ class Odometry:
 
     mean: Float[np.ndarray, "m 3"]  # after each step, in the axes of that pose [m, m, rad]
     covariance: Float[np.ndarray, "m 3 3"]  # of x, y and heading in those axes
+    slopes: Float[np.ndarray, "m 3 q"]  # of the mean by the parameters of odometry
     seconds: float = 0.0  # how long they took
 
     def moves(self) -> bool:
@@ -55,46 +68,45 @@ class Odometry:
         return bool(np.any(self.mean[-1:]) or np.any(self.covariance[-1:]))
 
 
-NO_ODOMETRY = Odometry(mean=np.empty((0, 3)), covariance=np.empty((0, 3, 3)))
-"""Odometry without a step."""
+def no_odometry(parameters: int = 0) -> Odometry:
+    """Return odometry without a step, and with so many parameters."""
+    return Odometry(
+        mean=np.empty((0, 3)),
+        covariance=np.empty((0, 3, 3)),
+        slopes=np.empty((0, 3, parameters)),
+    )
 
 
 def extended(
     odometry: Odometry,
-    at: Gaussian,
     motion: Motion,
     controls: Float[np.ndarray, "k c"],
     dt: Float[np.ndarray, " k"],
-) -> tuple[Odometry, Gaussian]:
-    """Return odometry with more control steps, and the poses after these in the world.
-
-    ``at`` is the pose before the odometry, (3) and (3, 3).
+    parameters: Int[np.ndarray, " q"] = NO_PARAMETERS,
+) -> Odometry:
+    """Return odometry with more control steps; ``parameters``: codes of `calibration.OF_ODOMETRY`.
 
     >>> motion = Motion(model="unicycle", control_std=(0.1, 0.1))
-    >>> north = Gaussian(mean=np.array([0.0, 1.0, np.pi / 2]), covariance=np.zeros((3, 3)))
-    >>> ahead = np.ones((2, 2)) * [1.0, 0.0]
-    >>> odometry, poses = extended(NO_ODOMETRY, north, motion, ahead, np.ones(2))
-    >>> odometry.mean[:, 0], poses.mean[:, 1]
-    (array([1., 2.]), array([2., 3.]))
+    >>> extended(no_odometry(), motion, np.ones((2, 2)) * [1.0, 0.0], np.ones(2)).mean[:, 0]
+    array([1., 2.])
     """
-    steps, start = (odometry.mean, odometry.covariance), (at.mean, at.covariance)
-    (mean, covariance), poses = _extended(steps, start, controls, dt, motion_numbers(motion))
+    steps = odometry.mean, odometry.covariance, odometry.slopes
+    numbers = motion_numbers(motion)
+    mean, covariance, slopes = _extended(steps, controls, dt, numbers, parameters)
     seconds = odometry.seconds + float(dt.sum())
-    return (
-        Odometry(mean=mean, covariance=covariance, seconds=seconds),
-        Gaussian(mean=poses[0], covariance=poses[1]),
-    )
+    return Odometry(mean=mean, covariance=covariance, slopes=slopes, seconds=seconds)
 
 
-def placed(start: Gaussian, odometry: Odometry) -> Gaussian:
-    """Return the poses after each step in the world, (m, 3) and (m, 3, 3), from the node before.
+def placed(start: Gaussian, odometry: Odometry, first: int = 0) -> Gaussian:
+    """Return the poses after each step from ``first`` on, (m, 3) and (m, 3, 3), in the world.
 
     >>> north = Gaussian(mean=np.array([0.0, 1.0, np.pi / 2]), covariance=np.zeros((3, 3)))
-    >>> ahead = Odometry(mean=np.array([[2.0, 0.0, 0.1]]), covariance=np.zeros((1, 3, 3)))
-    >>> placed(north, ahead).mean.round(9) + 0.0
+    >>> way = {"covariance": np.zeros((1, 3, 3)), "slopes": np.zeros((1, 3, 0))}
+    >>> placed(north, Odometry(mean=np.array([[2.0, 0.0, 0.1]]), **way)).mean.round(9) + 0.0
     array([[0.        , 3.        , 1.67079633]])
     """
-    poses, spreads = _placed((start.mean, start.covariance), (odometry.mean, odometry.covariance))
+    steps = odometry.mean[first:], odometry.covariance[first:]
+    poses, spreads = _placed((start.mean, start.covariance), steps)
     return Gaussian(mean=poses, covariance=spreads)
 
 
@@ -109,28 +121,62 @@ def _placed(start: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]], step
 
 @kernel
 def _extended(
-    steps: Steps,
-    start: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]],
+    steps: Led,
     controls: Float[np.ndarray, "k c"],
     dt: Float[np.ndarray, " k"],
     motion: MotionNumbers,
-) -> tuple[Steps, Steps]:
-    """Append control steps to others; return all, and the new ones from a start in the world."""
-    before, size = steps[0].shape[0], dt.size
+    parameters: Int[np.ndarray, " q"],
+) -> Led:
+    """Append control steps to others."""
+    (before, _, q), size = steps[2].shape, dt.size
     mean, covariance = np.empty((before + size, 3)), np.empty((before + size, 3, 3))
-    poses, spreads = np.empty((size, 3)), np.empty((size, 3, 3))
-    pose, P = np.zeros(3), np.zeros((3, 3))
+    slopes = np.empty((before + size, 3, q))
+    pose, P, J = np.zeros(3), np.zeros((3, 3)), np.zeros((3, q))
     for j in range(before):
         pose[:] = steps[0][j]
         write(steps[1][j], P)
+        write(steps[2][j], J)
         mean[j] = pose
         write(P, covariance[j])
+        write(J, slopes[j])
     for k in range(size):
+        if q > 0:
+            _lead_on(J, pose, (controls[k], dt[k]), motion, parameters)
         propagate_pose(pose, P, controls[k], dt[k], motion)
         mean[before + k] = pose
         write(P, covariance[before + k])
-        place(start, pose, P, poses[k], spreads[k])
-    return (mean, covariance), (poses, spreads)
+        write(J, slopes[before + k])
+    return mean, covariance, slopes
+
+
+@no_alloc
+def _lead_on(
+    J: Float[np.ndarray, "3 q"],
+    pose: Float[np.ndarray, "3"],
+    control: tuple[Float[np.ndarray, " c"], float],
+    motion: MotionNumbers,
+    parameters: Int[np.ndarray, " q"],
+) -> None:
+    """Carry slopes of a pose by parameters (`calibration.OF_ODOMETRY`) through a control step."""
+    controls, dt = control
+    dx, dy, turn, _, _, sh, tx, ty, th = motion_increment(
+        motion.model, motion.wheelbase, pose[2], controls, dt
+    )
+    for e in range(parameters.size):
+        J[0, e] -= dy * J[2, e]
+        J[1, e] += dx * J[2, e]
+        if parameters[e] == 0:
+            J[0, e] += dx
+            J[1, e] += dy
+            J[2, e] += 0.0 if motion.model == BY_POSES else sh * controls[0]
+        elif parameters[e] == 1 and motion.model == BY_POSES:
+            J[2, e] += dt
+        elif parameters[e] == 1:
+            J[0, e] += tx
+            J[1, e] += ty
+            J[2, e] += th
+        else:
+            J[2, e] -= turn / motion.wheelbase
 
 
 @no_alloc

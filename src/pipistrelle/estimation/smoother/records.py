@@ -28,6 +28,8 @@ class Legs(NamedTuple):
     noise: Float[np.ndarray, "k 3 3"]
     seconds: Float[np.ndarray, " k"]
     rows: Int[np.ndarray, "k 2"]  # what was heard from it: first row, and the one after the last
+    slopes: Float[np.ndarray, "k 3 q"]
+    """Of the motion, by the parameters of odometry, which stand first in the border."""
 
 
 class Rows(NamedTuple):
@@ -40,18 +42,13 @@ class Rows(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Where each slot, a landmark or a caller, stands among the unknowns."""
+    """Where each slot, a landmark or a caller, stands among the unknowns, and the parameters."""
 
     index: Int[np.ndarray, " s"]  # column of the border; minus the index in the chain; 0: nowhere
     first: Int[np.ndarray, " v"]  # node at which each moving caller joins the chain
     begun: Float[np.ndarray, "v 2"]  # where it was placed then
-
-
-class Columns(NamedTuple):
-    """Prior knowledge of each place of the border, from the second column on."""
-
-    mean: Float[np.ndarray, "l 2"]
-    information: Float[np.ndarray, "l 3"]  # xx, xy, yy
+    sensor: Int[np.ndarray, "3"]
+    """Columns of the speed of sound, of the sensor's heading and of its place; 0: not estimated."""
 
 
 class Noise(NamedTuple):
@@ -64,12 +61,12 @@ class Noise(NamedTuple):
     damping: float = 0.0  # information that holds every unknown at its point (Levenberg)
 
 
-class Trail(NamedTuple):
-    """Factors that the elimination leaves at each node, for the way back."""
+class Links(NamedTuple):
+    """What elimination leaves of each node's predecessor: D beta + G x, with the covariance S."""
 
-    E: Float[np.ndarray, "k d n"]
-    T: Float[np.ndarray, "k d d"]
-    M: Float[np.ndarray, "k d d"]
+    D: Float[np.ndarray, "k d n"]
+    G: Float[np.ndarray, "k d d"]
+    S: Float[np.ndarray, "k d d"]
 
 
 class Work(NamedTuple):
@@ -78,9 +75,12 @@ class Work(NamedTuple):
     F: Float[np.ndarray, "d d"]
     u: Float[np.ndarray, " d"]
     Q: Float[np.ndarray, "d d"]
+    by: Float[np.ndarray, "d q"]  # slopes of a transition by the parameters of odometry
     T: Float[np.ndarray, "d d"]
     G: Float[np.ndarray, "d n"]
     C: Float[np.ndarray, "d n"]
+    E: Float[np.ndarray, "d n"]
+    M: Float[np.ndarray, "d d"]
     A: Float[np.ndarray, "d d"]
     B: Float[np.ndarray, "d d"]
     at: Int[np.ndarray, " e"]  # entries of one row: where they stand in the chain, then the border
@@ -96,19 +96,22 @@ Points = tuple[Float[np.ndarray, "k d"], Float[np.ndarray, " n"]]
 
 
 @kernel
-def work_of(d: Whole, n: Whole) -> Work:
-    """Return arrays to work in, for a state of d numbers and a border of n."""
+def work_of(d: Whole, n: Whole, q: Whole) -> Work:
+    """Return arrays to work in: a state of d numbers, a border of n, q parameters of odometry."""
     return Work(
         np.zeros((d, d)),
         np.zeros(d),
         np.zeros((d, d)),
+        np.zeros((d, q)),
         np.zeros((d, d)),
         np.zeros((d, n)),
         np.zeros((d, n)),
+        np.zeros((d, n)),
         np.zeros((d, d)),
         np.zeros((d, d)),
-        np.zeros(16, np.int64),
-        np.zeros(16),
+        np.zeros((d, d)),
+        np.zeros(24, np.int64),
+        np.zeros(24),
         np.zeros(1, np.bool_),
         np.zeros(n),
     )

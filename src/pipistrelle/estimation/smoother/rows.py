@@ -19,17 +19,17 @@ from pipistrelle.detection.scans import (
     RANGE,
     RANGE_STD,
 )
-from pipistrelle.estimation.measurement import NEAREST, excess_path_slopes, observe
-from pipistrelle.estimation.smoother.records import (
-    CALLER,
-    POSE,
-    Front,
-    Noise,
-    Places,
-    Points,
-    Rows,
-    Work,
+from pipistrelle.estimation.measurement import NEAREST, observe
+from pipistrelle.estimation.smoother.observations import (
+    Point,
+    View,
+    point_of,
+    view_of,
+    write_bearing,
+    write_excess_path,
+    write_range,
 )
+from pipistrelle.estimation.smoother.records import Front, Noise, Places, Points, Rows, Work
 from pipistrelle.estimation.smoother.small_matrices import add_multiple, write
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, no_alloc
@@ -55,9 +55,8 @@ def hear(
 
     ``span``: the node, its first row and the one after its last.
     """
-    (k, begin, end), believed = span, noise.believed
+    (k, begin, end), believed, cost, G = span, noise.believed, 0.0, work.G
     work.T[:] = 0.0
-    cost, pose, G = 0.0, points[0][k], work.G
     for a in range(G.shape[0]):
         for j in range(G.shape[1]):
             G[a, j] = 0.0
@@ -65,17 +64,18 @@ def hear(
     write(front.C, work.C)
     if noise.damping > 0.0:
         _hold(work, front, noise.damping)
+    view = view_of(points[0][k], points[1], places.sensor)
     for m in range(begin, end):
         numbers, landmark = rows.numbers[m], point_of(rows.ends[m, 0], k, places, points)
         if landmark[0] == 0:
             continue
         if not math.isnan(numbers[BEARING]):
-            cost += _hear_direction(work, front, numbers, pose, landmark, believed)
+            cost += _hear_direction(work, front, numbers, view, landmark, believed)
         if rows.ends[m, 1] >= 0:
             caller = point_of(rows.ends[m, 1], k, places, points)
             if caller[0] != 0:
                 ends = (landmark, caller)
-                cost += _hear_excess_path(work, front, numbers, pose, ends, believed)
+                cost += _hear_excess_path(work, front, numbers, view, ends, believed)
     return cost
 
 
@@ -84,34 +84,28 @@ def _hear_direction(
     work: Work,
     front: Front,
     numbers: Float[np.ndarray, " 7"],
-    pose: Float[np.ndarray, " d"],
-    point: tuple[Whole, float, float],
+    view: View,
+    point: Point,
     believed: float,
 ) -> float:
     """Add a bearing, and its range if there is one; return what they cost, times two."""
     i, px, py = point
-    distance, bearing, c, s, inverse = observe(pose[0], pose[1], pose[2], px, py)
+    seen = observe(view.x, view.y, view.heading, px, py)
     across = 1.0 / max(numbers[BEARING_STD], LEAST_DEVIATION)
-    off = wrap_angle(bearing - numbers[BEARING]) * across
+    off = wrap_angle(seen[1] - numbers[BEARING]) * across
     ranged = not math.isnan(numbers[RANGE])
     along = 1.0 / max(numbers[RANGE_STD], LEAST_DEVIATION) if ranged else 0.0
-    far = (distance - numbers[RANGE]) * along if ranged else 0.0
+    far = (seen[0] / view.scale - numbers[RANGE]) * along if ranged else 0.0
     less, cost = _huber(off * off + far * far, believed)
-    if i > 0 and not work.alone[0]:
-        slopes = less * across * inverse, less * along, less * across
-        _add_direction(work, front, i, (c, s), slopes, (less * off, less * far))
+    if i > 0 and not work.alone[0] and view.columns[0] + view.columns[1] + view.columns[2] == 0:
+        slopes = less * across * seen[4], less * along, less * across
+        _add_direction(work, front, i, seen[2:4], slopes, (less * off, less * far))
         return cost
-    k = less * across * inverse
-    write_pose(work, k * s, -k * c, -less * across)
-    work.at[3], work.slope[3] = 0, less * off
-    chain, size = write_point(work, 3, 4, i, -k * s, k * c)
-    _add(work, front, chain, size)
+    chain, size = write_bearing(work, view, seen, i)
+    _add(work, front, chain, size, (less * across, less * off))
     if ranged:
-        k = less * along
-        write_pose(work, -k * c, -k * s, 0.0)
-        work.at[3], work.slope[3] = 0, less * far
-        chain, size = write_point(work, 3, 4, i, k * c, k * s)
-        _add(work, front, chain, size)
+        chain, size = write_range(work, view, seen, i)
+        _add(work, front, chain, size, (less * along, less * far))
     return cost
 
 
@@ -168,64 +162,17 @@ def _hear_excess_path(
     work: Work,
     front: Front,
     numbers: Float[np.ndarray, " 7"],
-    pose: Float[np.ndarray, " d"],
-    ends: tuple[tuple[Whole, float, float], tuple[Whole, float, float]],
+    view: View,
+    ends: tuple[Point, Point],
     believed: float,
 ) -> float:
     """Add an excess path over a landmark, from a caller; return what it costs, times two."""
-    (i, px, py), (j, bx, by) = ends
-    path, lx, ly, cx, cy = excess_path_slopes(pose[0], pose[1], px, py, bx, by)
-    k = 1.0 / max(numbers[EXCESS_PATH_STD], LEAST_DEVIATION)
-    off = (path - numbers[EXCESS_PATH]) * k
+    path, chain, size = write_excess_path(work, view, ends)
+    sure = 1.0 / max(numbers[EXCESS_PATH_STD], LEAST_DEVIATION)
+    off = (path - numbers[EXCESS_PATH]) * sure
     less, cost = _huber(off * off, believed)
-    k *= less
-    write_pose(work, -k * (lx + cx), -k * (ly + cy), 0.0)
-    work.at[3], work.slope[3] = 0, less * off
-    chain, size = write_point(work, 3, 4, i, k * lx, k * ly)
-    chain, size = write_point(work, chain, size, j, k * cx, k * cy)
-    _add(work, front, chain, size)
+    _add(work, front, chain, size, (less * sure, less * off))
     return cost
-
-
-@no_alloc
-def point_of(slot: Whole, k: Whole, places: Places, points: Points) -> tuple[Whole, float, float]:
-    """Return where a slot stands among the unknowns (`Places`) and its place, from node k.
-
-    A moving caller is nowhere before it joined the chain.
-    """
-    i, (at, border) = places.index[slot], points
-    if i > 0:
-        return i, border[i], border[i + 1]
-    if i < 0 and k >= places.first[(-i - POSE) // CALLER]:
-        return i, at[k, -i], at[k, -i + 1]
-    return 0, 0.0, 0.0
-
-
-@no_alloc
-def write_pose(work: Work, by_x: float, by_y: float, by_heading: float) -> None:
-    """Write the first three entries of a row: its slopes by the pose."""
-    for a in range(POSE):
-        work.at[a] = a
-    work.slope[0], work.slope[1], work.slope[2] = by_x, by_y, by_heading
-
-
-@no_alloc
-def write_point(
-    work: Work, chain: Whole, size: Whole, i: Whole, by_x: float, by_y: float
-) -> tuple[Whole, Whole]:
-    """Append the slopes by a place to a row of so many entries, the first of them of the chain.
-
-    Returns how many of the entries are of the chain, and how many there are.
-    """
-    if i > 0:
-        work.at[size], work.at[size + 1] = i, i + 1
-        work.slope[size], work.slope[size + 1] = by_x, by_y
-        return chain, size + 2
-    for e in range(size - 1, chain - 1, -1):
-        work.at[e + 2], work.slope[e + 2] = work.at[e], work.slope[e]
-    work.at[chain], work.at[chain + 1] = -i, 1 - i
-    work.slope[chain], work.slope[chain + 1] = by_x, by_y
-    return chain + 2, size + 2
 
 
 @no_alloc
@@ -238,9 +185,16 @@ def _huber(squared: float, believed: float) -> tuple[float, float]:
 
 
 @no_alloc
-def _add(work: Work, front: Front, chain: Whole, size: Whole) -> None:
-    """Add a row to T, to G and to the information about the border; or correct by it alone."""
+def _add(work: Work, front: Front, chain: Whole, size: Whole, weight: tuple[float, float]) -> None:
+    """Add a row to T, to G and to the information about the border; or correct by it alone.
+
+    ``weight``: by which its slopes are multiplied, and its misfit.
+    """
     at, slope, T, G, information = work.at, work.slope, work.T, work.G, front.information
+    for e in range(size):
+        slope[e] *= weight[0]
+        if e >= chain and at[e] == 0:
+            slope[e] = weight[1]
     for a in range(chain):
         for b in range(chain):
             T[at[a], at[b]] += slope[a] * slope[b]
@@ -287,7 +241,7 @@ def _hold(work: Work, front: Front, damping: float) -> None:
     """Hold each number of the state at its point, by a row of its own."""
     for a in range(front.P.shape[0]):
         work.at[0], work.slope[0] = a, math.sqrt(damping)
-        _add(work, front, 1, 1)
+        _add(work, front, 1, 1, (1.0, 0.0))
 
 
 @no_alloc
@@ -314,12 +268,3 @@ def _is_sure(
             moves += 4.0 / max(numbers[EXCESS_PATH_STD], LEAST_DEVIATION) ** 2
     P = front.P
     return turns * P[2, 2] > ALONE_ABOVE or moves * (P[0, 0] + P[1, 1]) > ALONE_ABOVE
-
-
-@no_alloc
-def is_far_surer(T: Float[np.ndarray, "d d"], P: Float[np.ndarray, "d d"]) -> bool:
-    """Tell whether a node's rows know its state far better than it is known (`ALONE_ABOVE`)."""
-    most = 0.0
-    for a in range(P.shape[0]):
-        most = max(most, T[a, a] * P[a, a])
-    return most > ALONE_ABOVE

@@ -1,14 +1,8 @@
-r"""The solution of the arrow: the border by a factor of its information, then back along the chain.
+r"""The border of the arrow, solved by a factor of its information, and joint covariances.
 
 The information is factored from its last row to its first, :math:`\Lambda = R^T R` with R lower
 triangular, so that every loop runs along a row. The first column of R is then the right-hand side.
-Back along the chain goes the adjoint of Bryson & Frazier, which inverts nothing: with
-:math:`e_k = E_k \beta` what the measurements of a node pull at its predicted state,
-
-.. math:: \lambda_k = F_{k+1}^T \lambda_{k+1} - e_k - T_k (\hat x_k - \bar x_k), \qquad
-          \hat x_k = x_{k|k} + M_k F_{k+1}^T \lambda_{k+1} .
-
-Source: Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, ch. X.
+Columns in which nothing stands have a pivot of 1, and are 0.
 """
 
 import math
@@ -16,26 +10,8 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.estimation.smoother.records import (
-    POSE,
-    Arrays,
-    Legs,
-    Noise,
-    Places,
-    Points,
-    Trail,
-    work_of,
-)
-from pipistrelle.estimation.smoother.rows import is_far_surer
-from pipistrelle.estimation.smoother.small_matrices import (
-    add_image,
-    add_multiple,
-    cholesky,
-    solve_with,
-    transpose,
-    write_image,
-)
-from pipistrelle.estimation.smoother.transition import predicted, transition, write_start
+from pipistrelle.estimation.smoother.records import Arrays
+from pipistrelle.estimation.smoother.small_matrices import add_image
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 
@@ -125,10 +101,12 @@ def solve(
 def write_lower(
     information: Float[np.ndarray, "w w"], n: Whole, R: Float[np.ndarray, "n n"]
 ) -> None:
-    """Write the lower triangle of an information of n columns to R."""
+    """Write the lower triangle of an information of n columns to R, 1 where nothing stands."""
     for i in range(n):
         for j in range(i + 1):
             R[i, j] = information[i, j]
+        if i > 0 and R[i, i] == 0.0:
+            R[i, i] = 1.0
 
 
 @no_alloc
@@ -182,49 +160,16 @@ def joint(
 
 
 @kernel
-def retrace(
-    legs: Arrays,
-    places: Arrays,
-    points: Points,
-    trail: Arrays,
-    noise: tuple[float, ...],
-    beta: Float[np.ndarray, " n"],
-    nodes: Whole,
-) -> Float[np.ndarray, "k d"]:
-    """Return the states of so many nodes at the least cost."""
-    legs, places, trail, noise = Legs(*legs), Places(*places), Trail(*trail), Noise(*noise)
-    at, d = points[0], trail.T.shape[1]
-    work, before, pull = work_of(d, 1), np.zeros((nodes, d)), np.zeros((nodes, d))
-    x, y, back = np.zeros(d), np.zeros(d), np.zeros(d)
-    write_start(work, legs, at)
-    add_multiple(work.u, 1.0, x[:POSE])
-    for k in range(nodes):
-        if k > 0:
-            transition(work, k, legs, places, at, noise)
-            write_image(work.F, x, y)
-            for a in range(d):
-                x[a] = y[a] + work.u[a]
-        add_multiple(x, 1.0, before[k])
-        add_image(trail.E[k], beta, pull[k], 1.0)
-        add_image(trail.M[k], pull[k], x, -1.0)
-    states = np.empty((nodes, d))
-    for k in range(nodes - 1, -1, -1):
-        add_multiple(pull[k], -1.0, back)
-        write_image(trail.M[k], back, x)
-        for a in range(d):
-            states[k, a] = at[k, a] + before[k, a] + x[a]
-        if k == 0:
-            break
-        add_image(trail.T[k], x, back, -1.0)
-        transition(work, k, legs, places, at, noise)
-        predicted(work, trail.M[k - 1], work.T)
-        transpose(work.F, work.A)
-        if is_far_surer(trail.T[k], work.T):  # what pulls is lost in rounding
-            cholesky(work.T, work.B)
-            solve_with(work.B, x)
-            write_image(work.A, x, back)
-        else:
-            write_image(work.A, back, y)
-            for a in range(d):
-                back[a] = y[a]
-    return states
+def border_covariance(R: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """Return the covariance of the border from its factor; row and column of the constant are 0."""
+    n = R.shape[0]
+    Z, covariance = np.zeros((n, n)), np.zeros((n, n))
+    for i in range(1, n):
+        Z[i, i] = 1.0
+        rooted(R, Z[i], i + 1)
+        for j in range(1, i + 1):
+            total = 0.0
+            for e in range(1, j + 1):
+                total += Z[i, e] * Z[j, e]
+            covariance[i, j] = covariance[j, i] = total
+    return covariance

@@ -21,8 +21,8 @@ from pipistrelle.estimation.measurement import (
     caller_range_by_excess_path,
     range_by_excess_path,
 )
+from pipistrelle.estimation.smoother.observations import View, point_of
 from pipistrelle.estimation.smoother.records import Front, Places, Points, Rows
-from pipistrelle.estimation.smoother.rows import point_of
 from pipistrelle.estimation.smoother.small_matrices import cholesky
 from pipistrelle.estimation.smoother.solution import joint
 from pipistrelle.jit import Whole, kernel
@@ -38,6 +38,7 @@ MAX_RANGE = 1e6
 def place_by_excess_path(
     rows: Rows,
     heard: tuple[Whole, Whole, Whole],
+    view: View,
     k: Whole,
     places: Places,
     estimate: Points,
@@ -46,11 +47,12 @@ def place_by_excess_path(
 ) -> float:
     """Return the range of a row's landmark or caller by its surest excess path; NaN if unsure.
 
-    ``heard``: the row, and the first and the one after the last of its frame, from node k.
+    ``heard``: the row, and the first and the one after the last of its frame, from node k; what is
+    not known of the sensor counts as known.
     """
     m, first, last = heard
-    slot, pose = rows.ends[m, 0], estimate[0][k]
-    angle, across = pose[2] + rows.numbers[m, BEARING], rows.numbers[m, BEARING_STD]
+    slot, scale = rows.ends[m, 0], view.scale
+    angle, across = view.heading + rows.numbers[m, BEARING], rows.numbers[m, BEARING_STD]
     spread, way, best, other = np.zeros((4, 4)), np.zeros(4), math.inf, -1
     clue, caller = -1, False
     for e in range(first, last):
@@ -60,8 +62,8 @@ def place_by_excess_path(
         i, x, y = point_of(ends[0] if asked else ends[1], k, places, estimate)
         if i == 0:
             continue
-        way[0], way[1], way[2] = x - pose[0], y - pose[1], angle
-        way[3] = rows.numbers[e, EXCESS_PATH]
+        way[0], way[1], way[2] = x - view.x, y - view.y, angle
+        way[3] = scale * rows.numbers[e, EXCESS_PATH]
         spread[2, 2], spread[3, 3] = across * across, rows.numbers[e, EXCESS_PATH_STD] ** 2
         share = unscented_range(way, spread, asked)[1]
         if share < best:
@@ -69,7 +71,8 @@ def place_by_excess_path(
     if best > MAX_RELATIVE_RANGE_STD:
         return math.nan
     i, x, y = point_of(other, k, places, estimate)
-    way[0], way[1], way[3] = x - pose[0], y - pose[1], rows.numbers[clue, EXCESS_PATH]
+    way[0], way[1] = x - view.x, y - view.y
+    way[3] = scale * rows.numbers[clue, EXCESS_PATH]
     spread = _offset_covariance(i, front, R)
     spread[2, 2] += across * across
     spread[3, 3] = rows.numbers[clue, EXCESS_PATH_STD] ** 2

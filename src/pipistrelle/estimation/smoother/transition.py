@@ -5,7 +5,15 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.estimation.smoother.records import CALLER, POSE, Legs, Noise, Places, Work
+from pipistrelle.estimation.smoother.records import (
+    CALLER,
+    POSE,
+    Legs,
+    Noise,
+    Places,
+    Points,
+    Work,
+)
 from pipistrelle.estimation.smoother.small_matrices import congruent, write
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, no_alloc
@@ -20,24 +28,40 @@ def transition(
     k: Whole,
     legs: Legs,
     places: Places,
-    at: Float[np.ndarray, "k d"],
+    points: Points,
     noise: Noise,
 ) -> float:
-    """Write F, u and Q of the step to node k; return what it costs at the points, times two."""
-    F, u, Q = work.F, work.u, work.Q
+    """Write F, u, Q and the slopes by parameters of the step to node k.
+
+    Returns what the step costs at the points, times two.
+    """
+    F, u, Q, at, (mx, my, mh) = work.F, work.u, work.Q, points[0], _motion(legs, k, points[1])
     F[:], Q[:] = 0.0, 0.0
     x, y, heading = at[k - 1, 0], at[k - 1, 1], at[k - 1, 2]
     dx, dy, c, s = at[k, 0] - x, at[k, 1] - y, math.cos(heading), math.sin(heading)
     for a in range(POSE):
         F[a, a] = 1.0
     F[0, 2], F[1, 2] = -dy, dx
-    ahead = c * dx + s * dy - legs.mean[k, 0]
-    aside = c * dy - s * dx - legs.mean[k, 1]
-    turn = wrap_angle(at[k, 2] - heading - legs.mean[k, 2])
-    cost = _odometry(legs.noise[k], (ahead, aside, turn), (c, s), u, Q)
+    off = c * dx + s * dy - mx, c * dy - s * dx - my, wrap_angle(at[k, 2] - heading - mh)
+    cost = _odometry(legs.noise[k], off, (c, s), u, Q)
+    for e in range(work.by.shape[1]):
+        ahead, aside = legs.slopes[k, 0, e], legs.slopes[k, 1, e]
+        work.by[0, e], work.by[1, e] = c * ahead - s * aside, s * ahead + c * aside
+        work.by[2, e] = legs.slopes[k, 2, e]
     for v in range(places.first.size):
         cost += _transition_of_caller(work, k, v, legs.seconds[k], places, at, noise)
     return cost
+
+
+@no_alloc
+def _motion(legs: Legs, k: Whole, border: Float[np.ndarray, " n"]) -> tuple[float, float, float]:
+    """Return the motion to node k by the parameters at their points."""
+    x, y, turn = legs.mean[k, 0], legs.mean[k, 1], legs.mean[k, 2]
+    for e in range(legs.slopes.shape[2]):
+        x += legs.slopes[k, 0, e] * border[1 + e]
+        y += legs.slopes[k, 1, e] * border[1 + e]
+        turn += legs.slopes[k, 2, e] * border[1 + e]
+    return x, y, turn
 
 
 @no_alloc

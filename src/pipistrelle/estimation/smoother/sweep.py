@@ -1,0 +1,310 @@
+"""A front on its way along the chain: landmarks enter and leave the border, stretches are left.
+
+A `Sweep` is worked on by one frame, or by one elimination of all or of the end of the chain, and
+ends as a `Solution`, which is never changed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipistrelle.estimation.smoother.elimination import begin, eliminate, enter, leave, step_to
+from pipistrelle.estimation.smoother.history import STRETCH, History
+from pipistrelle.estimation.smoother.records import CALLER, POSE, Arrays
+from pipistrelle.estimation.smoother.smoothing import Left
+from pipistrelle.estimation.smoother.solution import solve
+from pipistrelle.estimation.smoother.stack import Stack
+
+Noise = tuple[float, ...]
+"""As `records.Noise`."""
+COLUMNS = 32
+"""The border has room for a multiple of so many columns."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Points:
+    """Where all unknowns are linearised."""
+
+    at: Stack
+    """States of the chain."""
+    spots: Float[np.ndarray, "l 2"]
+    """Landmarks of the border, by their numbers [m]."""
+    parameters: Float[np.ndarray, " p"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stretch:
+    """Some nodes of the chain in a row: what they began with, and what elimination left of them."""
+
+    first: int
+    """The first node."""
+    front: Arrays
+    """`records.Front` at the node before, after what left there; of the start, one of zeros."""
+    columns: Int[np.ndarray, " l"]
+    """Columns of the landmarks then; 0 of those that are not in the border."""
+    cost: float
+    """Of all before, times two."""
+    links: Stack
+    """`records.Links` to each of its nodes from the one before."""
+    gone: Int[np.ndarray, " g"]
+    """Numbers of the landmarks that left the border after its last node, in order."""
+    freed: Int[np.ndarray, " g"]
+    """Their columns."""
+    left: Left
+    """What is left of them."""
+
+    @property
+    def last(self) -> int:
+        """The last node."""
+        return self.first + self.links.size - 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Solution:
+    """A chain that is solved up to its last node."""
+
+    points: Points
+    columns: Int[np.ndarray, " l"]
+    """Columns of the landmarks that stand in the border now; 0: not yet, or no more."""
+    border: Float[np.ndarray, " w"]
+    """Points of the border's columns."""
+    stretches: tuple[Stretch, ...]
+    front: Arrays
+    """`records.Front`."""
+    factor: Float[np.ndarray, "n n"]
+    beta: Float[np.ndarray, " n"]
+    state: Float[np.ndarray, " d"]
+    """State of the last node: pose, then place and velocity of each moving caller."""
+    covariance: Float[np.ndarray, "d d"]
+    cost: float
+    """Twice that at the points, where all was linearised there."""
+
+
+class Sweep:
+    """A front, and the columns of the border, at a node of the chain."""
+
+    def __init__(self, history: History, noise: Noise, points: Points) -> None:
+        """Make a border of parameters alone."""
+        self.history, self.noise, self.points = history, noise, points
+        self.columns = np.zeros(len(history.placed), np.int64)
+        w, d = _room(1 + points.parameters.size), history.dimension
+        self.front: Arrays = np.zeros((d, w)), np.zeros((d, d)), np.zeros((w, w))
+        self.border = _padded(np.append(0.0, points.parameters), (w,))
+        self.cost, self.stretches = 0.0, list[Stretch]()
+
+    @property
+    def n(self) -> int:
+        """How many columns of the border there are, with that of the constant."""
+        return max(1 + self.points.parameters.size, 2 + int(self.columns.max(initial=0)))
+
+    def begin(self) -> None:
+        """Begin at the start."""
+        self.cost = begin(
+            self.front, self.history.motion, self.points.at.arrays[0], self.border,
+            self.history.calibration.stds, self.noise[4],
+        )  # fmt: skip
+
+    def take_up(self, kept: Sequence[Stretch], first: int) -> None:
+        """Keep the stretches before one, and begin as that has begun."""
+        self.stretches, begun = list(kept[:first]), kept[first]
+        self.columns[: begun.columns.size] = begun.columns
+        self.front, self.cost = tuple(map(np.copy, begun.front)), begun.cost
+        self.border = np.zeros(len(self.front[2]))
+        self.border[1 : 1 + self.points.parameters.size] = self.points.parameters
+        self._write_spots(np.flatnonzero(self.columns))
+
+    def go_on(self, solution: Solution) -> None:
+        """Begin where a solution is."""
+        self.stretches, self.cost = list(solution.stretches), solution.cost
+        self.columns[: solution.columns.size] = solution.columns
+        self.front, self.border = tuple(map(np.copy, solution.front)), solution.border.copy()
+        self._widen(self.history.dimension, len(self.border))
+
+    def go_to_the_end(self) -> None:
+        """Go through all further stretches."""
+        for number in range(len(self.stretches), 1 + (self.history.nodes - 1) // STRETCH):
+            self._open()
+            self.join(np.flatnonzero((self.history.entering == number) & (self.columns == 0)))
+            first = self.stretches[-1].first
+            last = min(first + STRETCH, self.history.nodes)
+            self._extend(last - first)
+            self._eliminate(max(first - 1, 0), first, last)
+            if last < self.history.nodes:
+                self.part()
+
+    def step(self) -> None:
+        """Step to the last node, before anything is heard there."""
+        k = self.history.nodes - 1
+        if k % STRETCH == 0:
+            self.part()
+            self._open()
+        self._extend(1)
+        span = k, self.n, self.stretches[-1].first
+        links = self.stretches[-1].links.arrays
+        self.cost += step_to(
+            self.front, self.history.motion, self._places(), self._linearised(), links,
+            self.noise, span,
+        )  # fmt: skip
+
+    def hear(self) -> None:
+        """Hear what the last node has heard."""
+        k = self.history.nodes - 1
+        self._eliminate(k, k, k + 1)
+
+    def join(self, numbers: Int[np.ndarray, " l"]) -> None:
+        """Let landmarks enter the border, with what is known of them."""
+        if not numbers.size:
+            return
+        taken, column = {*self.columns.tolist()}, 1 + self.points.parameters.size
+        for number in numbers.tolist():
+            while column in taken:
+                column += 2
+            self.columns[number], column = column, column + 2
+        self._write_spots(numbers)
+        known = self.history.known[0][numbers], self.history.known[1][numbers]
+        at = self.columns[numbers]
+        self.cost += enter(self.front[2], at, known, self.border, self.noise[4])
+
+    def admit(self, history: History) -> None:
+        """Take a history with more landmarks, which may join, and moving callers, which do now."""
+        before, self.history = self.history, history
+        more = len(history.placed) - len(before.placed)
+        self.columns = np.append(self.columns, np.zeros(more, np.int64))
+        spots = np.concatenate([self.points.spots, history.known[0][len(before.placed) :]])
+        self.points = replace(self.points, spots=spots)
+        self._widen(history.dimension, len(self.border))
+        k, (_, P, _) = history.nodes - 1, self.front
+        for v in range(len(before.callers), len(history.callers)):
+            i = POSE + CALLER * v
+            self.points.at.arrays[0][k, i : i + 2] = history.begun[v]
+            P[range(i, i + 4), range(i, i + 4)] = np.square(np.repeat(self.noise[1:3], 2))
+
+    def part(self) -> None:
+        """Let landmarks leave the border that leave after the last stretch."""
+        stretch = self.history.leaves == len(self.stretches) - 1
+        gone = np.flatnonzero(stretch & (self.columns > 0))
+        if not gone.size:
+            return
+        freed, (d, w) = self.columns[gone], self.front[0].shape
+        left = np.empty((gone.size, 2, w)), np.empty((gone.size, 2, d)), np.empty((gone.size, 2, 2))
+        leave(self.front, freed, left)
+        self.columns[gone] = 0
+        self.stretches[-1] = replace(self.stretches[-1], gone=gone, freed=freed, left=left)
+
+    def solved(self) -> Solution:
+        """Return the solution at the last node."""
+        n = self.n
+        factor, beta = np.zeros((n, n)), np.empty(n)
+        off, covariance = solve(self.front, n, factor, beta)
+        beta[0] = 0.0
+        return Solution(
+            points=self.points,
+            columns=self.columns,
+            border=self.border,
+            stretches=tuple(self.stretches),
+            front=self.front,
+            factor=factor,
+            beta=beta,
+            state=self.points.at.arrays[0][self.history.nodes - 1] + off,
+            covariance=covariance,
+            cost=self.cost,
+        )
+
+    def _open(self) -> None:
+        """Open a stretch."""
+        d, w = self.front[0].shape
+        none = np.empty(0, np.int64)
+        self.stretches.append(
+            Stretch(
+                first=STRETCH * len(self.stretches),
+                front=tuple(map(np.copy, self.front)),
+                columns=self.columns.copy(),
+                cost=self.cost,
+                links=_links(STRETCH, d, w),
+                gone=none,
+                freed=none,
+                left=(np.empty((0, 2, w)), np.empty((0, 2, d)), np.empty((0, 2, 2))),
+            )
+        )
+
+    def _extend(self, count: int) -> None:
+        """Let the last stretch have so many nodes more."""
+        last = self.stretches[-1]
+        self.stretches[-1] = replace(last, links=last.links.extended(count))
+
+    def _eliminate(self, stands: int, first: int, last: int) -> None:
+        """Carry the front on, in the last stretch."""
+        stretch = self.stretches[-1]
+        span = stands, first, last, self.n, stretch.first
+        self.cost += eliminate(
+            self.front, self.history.motion, self.history.rows.arrays, self._places(),
+            self._linearised(), stretch.links.arrays, self.noise, span,
+        )  # fmt: skip
+
+    def _places(self) -> Arrays:
+        """Return where each slot stands (`records.Places`)."""
+        return self.history.places(self.columns)
+
+    def _linearised(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the points of the chain's states and of the border's columns."""
+        return self.points.at.arrays[0], self.border
+
+    def _write_spots(self, numbers: Int[np.ndarray, " l"]) -> None:
+        """Write the points of landmarks to their columns; make room where there is none."""
+        if self.n > len(self.border):
+            self._widen(self.history.dimension, _room(self.n))
+        for e in range(2):
+            self.border[self.columns[numbers] + e] = self.points.spots[numbers, e]
+
+    def _widen(self, d: int, w: int) -> None:
+        """Make room for states of d numbers and a border of w columns."""
+        if self.front[0].shape == (d, w):
+            return
+        if d > len(self.front[0]):
+            self.stretches = [_wider(stretch, d) for stretch in self.stretches]
+        self.front = tuple(map(_padded, self.front, ((d, w), (d, d), (w, w))))
+        self.border = _padded(self.border, (w,))
+        if self.stretches:
+            last = self.stretches[-1]
+            shapes = (STRETCH, d, w), (STRETCH, d, d), (STRETCH, d, d)
+            links = tuple(map(_padded, last.links.arrays, shapes))
+            size = last.links.size
+            self.stretches[-1] = replace(last, links=Stack(links, size, [size]))
+        at = self.points.at
+        if d > at.arrays[0].shape[1]:
+            wider = _padded(at.arrays[0], (len(at.arrays[0]), d))
+            self.points = replace(self.points, at=Stack((wider,), at.size, [at.size]))
+
+
+def _wider(stretch: Stretch, d: int) -> Stretch:
+    """Return a stretch with states of d numbers."""
+    D, G, S = stretch.links.arrays
+    by_border, by_state, own = stretch.left
+    (k, _, w), size = D.shape, stretch.links.size
+    links = _padded(D, (k, d, w)), _padded(G, (k, d, d)), _padded(S, (k, d, d))
+    C, P, information = stretch.front
+    return replace(
+        stretch,
+        links=Stack(links, size, [size]),
+        front=(_padded(C, (d, C.shape[1])), _padded(P, (d, d)), information),
+        left=(by_border, _padded(by_state, (*by_state.shape[:2], d)), own),
+    )
+
+
+def _links(k: int, d: int, w: int) -> Stack:
+    """Return room for so many links."""
+    return Stack((np.zeros((k, d, w)), np.zeros((k, d, d)), np.zeros((k, d, d))))
+
+
+def _room(columns: int) -> int:
+    """Return a multiple of `COLUMNS` that has room for so many."""
+    return -(-columns // COLUMNS) * COLUMNS
+
+
+def _padded(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return an array in the corner of a larger one of zeros."""
+    padded = np.zeros(shape)
+    padded[tuple(map(slice, array.shape))] = array
+    return padded
