@@ -25,6 +25,7 @@ from pipistrelle.estimation.smoother.smoothing import (
 from pipistrelle.estimation.smoother.solution import border_covariance
 from pipistrelle.estimation.smoother.stack import Stack
 from pipistrelle.estimation.smoother.sweep import Noise, Points, Solution, Stretch, Sweep
+from pipistrelle.jit import kernel
 
 CONVERGED = 1e-10
 """Change of the cost, absolute and relative, under which the optimum is reached."""
@@ -32,6 +33,8 @@ LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e9
 """The least and the most information that holds every unknown at its point [1/m^2, 1/rad^2]."""
 PASSES = 30
 """How often all is linearised anew, at most."""
+LEAST_SHARE, MOST_SHARE = 0.2, 0.95
+"""Share of a step before at which the next goes further."""
 STILL = 1e-4
 """What has moved by less than this [m, rad] stays where it is linearised."""
 
@@ -68,8 +71,7 @@ def off_line(solution: Solution, history: History) -> float:
     """Return how far the lines of the last node's measurements are off (`linearity`)."""
     points, k = (solution.points.at.arrays[0], solution.border), history.nodes - 1
     off = solution.state - points[0][k], solution.beta
-    places = history.places(solution.columns)
-    return nonlinearity(history.rows.arrays, history.span, places, points, off)
+    return nonlinearity(history.rows.arrays, history.span, solution.places, points, off)
 
 
 def relinearised(
@@ -95,14 +97,56 @@ def _at_solution(solution: Solution, history: History, noise: Noise, still: floa
 
 
 def converged(solution: Solution, history: History, noise: Noise) -> Solution:
-    """Return the chain at its optimum; landmarks leave the border once they are heard no more."""
+    """Return the chain at its optimum; landmarks leave the border once they are heard no more.
+
+    Huber's weights converge by steps of which each is the same share of the one before. Once two
+    steps have told that share, the next goes as far as all that would follow it together (Aitken).
+    """
     history = in_hindsight(history)
-    solution = eliminated(history, noise, solution.points)
+    solution, before = eliminated(history, noise, solution.points), None
     for _ in range(PASSES):
-        before, solution = solution.cost, relinearised(solution, history, noise, 0.0)
-        if before - solution.cost <= CONVERGED * (1.0 + solution.cost):
+        points, _ = solved_points(solution, history, 0.0)
+        step, share = _between(solution.points, points), 0.0
+        if before is not None and before.size == step.size:
+            share = share_of(step, before)
+        before = step if share == 0.0 else None
+        further = eliminated(history, noise, _beyond(points, step, share / (1.0 - share)))
+        if not further.cost <= solution.cost:
+            further, before = relinearised(solution, history, noise, 0.0), None
+        gain, solution = solution.cost - further.cost, further
+        if gain <= CONVERGED * (1.0 + solution.cost):
             break
     return solution
+
+
+def _between(points: Points, others: Points) -> Float[np.ndarray, " u"]:
+    """Return how far points are from others, in one array."""
+    parts = (points.at.entries(0), points.spots, points.parameters)
+    there = (others.at.entries(0), others.spots, others.parameters)
+    return np.concatenate([(b - a).ravel() for a, b in zip(parts, there, strict=True)])
+
+
+def _beyond(points: Points, step: Float[np.ndarray, " u"], times: float) -> Points:
+    """Return points that are moved on along a step."""
+    if times == 0.0:
+        return points
+    states, size = points.at.entries(0), points.spots.size
+    first = step[: states.size].reshape(states.shape)
+    spots = step[states.size : states.size + size].reshape(points.spots.shape)
+    at = Stack((states + times * first,), len(states), [len(states)])
+    parameters = points.parameters + times * step[states.size + size :]
+    return Points(at=at, spots=points.spots + times * spots, parameters=parameters)
+
+
+@kernel
+def share_of(step: Float[np.ndarray, " u"], before: Float[np.ndarray, " u"]) -> float:
+    """Return which share of the step before a step is; 0 where going further would not help."""
+    along, size = 0.0, 0.0
+    for i in range(step.size):
+        along += step[i] * before[i]
+        size += before[i] * before[i]
+    share = along / size if size > 0.0 else 0.0
+    return share if LEAST_SHARE < share < MOST_SHARE else 0.0
 
 
 def solved_points(solution: Solution, history: History, still: float) -> tuple[Points, int]:

@@ -248,14 +248,10 @@ def advance(front: Front, work: Work, n: Whole) -> None:
     for a in range(work.u.size):
         for j in range(n):
             work.C[a, j] = front.C[a, j]
+            front.C[a, j] = 0.0
+    add_product(work.F, work.C, front.C, 1.0)
     for a in range(work.u.size):
         row = front.C[a]
-        row[:n] = 0.0
-        for e in range(work.u.size):
-            share = work.F[a, e]
-            if share != 0.0:
-                for j in range(n):
-                    row[j] += share * work.C[e, j]
         row[0] += work.u[a]
         for e in range(work.by.shape[1]):
             row[1 + e] += work.by[a, e]

@@ -48,7 +48,7 @@ from pipistrelle.estimation.smoother.history import (
     History,
     begun,
     heard_more,
-    numbers_heard,
+    slots_heard,
     with_caller,
     with_leaving,
     with_places,
@@ -187,9 +187,12 @@ class Smoother:
         self, history: History, before: History, solution: Solution
     ) -> tuple[History, Solution]:
         """Return history and solution with those in the border that left and are heard again."""
-        heard = np.zeros(len(history.placed), np.bool_)
-        heard[numbers_heard(history)] = True
-        again = heard & (history.leaves != NEVER)
+        if math.isinf(self.window):
+            return history, solution
+        number = history.index[slots_heard(history)] - 1
+        again = np.zeros(len(history.placed), np.bool_)
+        again[number[number >= 0]] = True
+        again &= history.leaves != NEVER
         if not again.any():
             return history, solution
         first = int(history.entering[again].min())
@@ -208,17 +211,18 @@ class Smoother:
 
     def _heard(self, before: History, here: Sweep, estimate: Solution) -> tuple[History, Solution]:
         """Return history and solution with the last frame's measurements and what they place."""
-        history, k = _placed(before, here, estimate), before.nodes - 1
+        history, heard, late = before, slots_heard(before), False
+        if (here.places[0][heard] == 0).any():
+            history = _placed(before, here, estimate)
         if history is not before:
             here.admit(history)
-        heard = numbers_heard(history)
-        new = np.unique(heard[here.columns[heard] == 0])
-        first = int(history.entering[new].min(initial=NEVER))
-        late = bool(new.size) and bool((history.met[new] < k).any())
+            new = np.arange(len(before.placed), len(history.placed))
+            late = bool((history.met[new] < history.nodes - 1).any())
         if late:
+            first = int(history.entering[new].min())
             solution = eliminated(history, self.noise, here.points, here.stretches, first)
         else:
-            here.join(new)
+            here.join(np.arange(len(before.placed), len(history.placed)))
             here.hear()
             solution = here.solved()
         for _ in range(ENTERING_PASSES if late else 1):
@@ -235,18 +239,14 @@ def _frame(
     border = here.border.copy()
     border[1 : estimate.beta.size] += estimate.beta[1:]
     points = here.points.at.arrays[0], border
-    places = history.places(here.columns)
-    return history.rows.arrays, history.span, places, points, here.front, estimate.factor
+    return history.rows.arrays, history.span, here.places, points, here.front, estimate.factor
 
 
 def _placed(history: History, here: Sweep, estimate: Solution) -> History:
     """Return a history with the landmarks and callers that the last node's rows place."""
-    _, first, last = history.span
-    ends = history.rows.arrays[0][first:last, 0]
-    if history.index[ends].all():
-        return history
-    rows, span, places, estimate, front, factor = _frame(history, here, estimate)
-    found = entering_places(rows, span, history.moves, places, estimate, front, factor)
+    rows, span, places, points, front, factor = _frame(history, here, estimate)
+    found = entering_places(rows, span, history.moves, places, points, front, factor)
+    ends = rows[0][span[1] : span[2], 0]
     label_of, new = list(history.slots), {}
     for slot, place in zip(ends.tolist(), found, strict=True):
         if not math.isnan(place[0]):

@@ -17,12 +17,12 @@ from pipistrelle.detection.scans import BEARING, NUMBERS, Scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.measurement import columns_of, excess_paths, timings_of
 from pipistrelle.estimation.smoother.calibration import NOTHING, Calibration
-from pipistrelle.estimation.smoother.preintegration import SMALLEST_STD, Odometry
+from pipistrelle.estimation.smoother.preintegration import SMALLEST_STD, Led, Odometry
 from pipistrelle.estimation.smoother.records import CALLER, POSE, Arrays
 from pipistrelle.estimation.smoother.stack import Stack
 from pipistrelle.jit import Whole, kernel
 
-STRETCH = 32
+STRETCH = 64
 """Nodes that are eliminated in one go: between stretches landmarks leave the border, and from the
 start of any all can be linearised anew."""
 NEVER = np.iinfo(np.int64).max
@@ -140,63 +140,87 @@ def begun(pose: Gaussian, calibration: Calibration) -> History:
 def heard_more(history: History, odometry: Odometry, scan: Scan) -> History:
     """Return a history with a node more, at which odometry ends, and a scan heard from there."""
     landmarks, callers, history = _slots_of(history, scan)
-    size, latest, heard = len(landmarks), history.latest.copy(), history.heard.copy()
-    legs, rows = history.legs.extended(1), history.rows.extended(size)
-    k, row, step = history.legs.size, history.rows.size, history.steps.size
+    legs, rows = history.legs.extended(1), history.rows.extended(landmarks.size)
     steps = history.steps.extended(len(odometry.mean))
-    mean, noise, seconds, spans, ends, slopes = legs.arrays
-    mean[k], noise[k], slopes[k], seconds[k] = 0.0, 0.0, 0.0, odometry.seconds
-    spans[k], ends[k] = (row, rows.size), (step, steps.size)
-    if odometry.moves():
-        mean[k], noise[k] = odometry.mean[-1], _sure(odometry.covariance[-1])
-        slopes[k] = odometry.slopes[-1]
-    steps.arrays[0][step : steps.size] = odometry.mean
-    steps.arrays[1][step : steps.size] = odometry.covariance
-    steps.arrays[2][step : steps.size] = odometry.slopes
-    which, numbers = rows.arrays[0][row : rows.size], rows.arrays[1][row : rows.size]
-    which[:, 0], which[:, 1], which[:, 2] = landmarks, callers, k
-    numbers[:] = scan.numbers.T
-    _link(which, numbers, latest, heard, row)
+    latest, heard = history.latest.copy(), history.heard.copy()
+    led = odometry.mean, odometry.covariance, odometry.slopes
+    _write_leg(legs.arrays, steps.arrays, led, (legs.size - 1, steps.size, odometry.seconds))
+    _write_rows(
+        (legs.arrays[3], *rows.arrays), (landmarks, callers, scan.numbers), (latest, heard),
+        (legs.size - 1, rows.size - landmarks.size),
+    )  # fmt: skip
     return replace(history, legs=legs, steps=steps, rows=rows, latest=latest, heard=heard)
 
 
 @kernel
-def _link(
-    ends: Int[np.ndarray, "m 4"],
-    numbers: Float[np.ndarray, "m 7"],
-    latest: Int[np.ndarray, " s"],
-    heard: Int[np.ndarray, "s 2"],
-    first: Whole,
+def _write_leg(legs: Arrays, steps: Arrays, led: Led, span: tuple[Whole, Whole, float]) -> None:
+    """Write the leg to a node by its control steps; ``span``: the node, the steps then, seconds."""
+    (mean, noise, seconds, _, ends, slopes), (k, last, took) = legs, span
+    count = led[0].shape[0]
+    first, moved = last - count, False
+    for j in range(count):
+        steps[0][first + j], steps[1][first + j], steps[2][first + j] = (
+            led[0][j],
+            led[1][j],
+            led[2][j],
+        )
+    ends[k, 0], ends[k, 1], seconds[k] = first, last, took
+    mean[k], noise[k], slopes[k] = 0.0, 0.0, 0.0
+    if count:
+        way, about = led[0][count - 1], led[1][count - 1]
+        for a in range(3):
+            moved = moved or way[a] != 0.0
+            for b in range(3):
+                moved = moved or about[a, b] != 0.0
+    if moved:
+        mean[k], noise[k], slopes[k] = way, about, led[2][count - 1]
+        for a in range(3):
+            noise[k, a, a] += SMALLEST_STD * SMALLEST_STD
+
+
+@kernel
+def _write_rows(
+    rows: Arrays,
+    scan: tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, "7 m"]],
+    seen: tuple[Int[np.ndarray, " s"], Int[np.ndarray, "s 2"]],
+    span: tuple[Whole, Whole],
 ) -> None:
-    """Write of each row the row of its landmark's bearing before, and when its slots were heard."""
-    for m in range(ends.shape[0]):
-        ends[m, 3] = -1
-        if not math.isnan(numbers[m, BEARING]):
-            ends[m, 3] = latest[ends[m, 0]]
-            latest[ends[m, 0]] = first + m
-        for end in range(2):
-            if ends[m, end] >= 0:
-                slot, k = ends[m, end], ends[m, 2]
-                heard[slot, 0], heard[slot, 1] = min(heard[slot, 0], k), k
+    """Write the rows of a node, each with the row of its landmark's bearing before.
+
+    ``seen``: the latest row of each slot, and when it was heard; ``span``: the node, its first row.
+    """
+    (spans, ends, values), (landmarks, callers, numbers) = rows, scan
+    (latest, heard), (k, first) = seen, span
+    spans[k, 0], spans[k, 1] = first, first + landmarks.size
+    for m in range(landmarks.size):
+        slot, row = landmarks[m], first + m
+        ends[row, 0], ends[row, 1], ends[row, 2], ends[row, 3] = slot, callers[m], k, -1
+        for e in range(numbers.shape[0]):
+            values[row, e] = numbers[e, m]
+        if not math.isnan(numbers[BEARING, m]):
+            ends[row, 3], latest[slot] = latest[slot], row
+        for end in (slot, callers[m]):
+            if end >= 0:
+                heard[end, 0], heard[end, 1] = min(heard[end, 0], k), k
 
 
-def _slots_of(history: History, scan: Scan) -> tuple[list[int], list[int], History]:
+def _slots_of(
+    history: History, scan: Scan
+) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], History]:
     """Return the slots of landmarks and callers (-1: none) of a scan, and a history with them."""
-    labels, callers, slots = scan.landmark.tolist(), [-1] * scan.landmark.size, history.slots
+    labels, callers = scan.landmark.tolist(), np.full(scan.landmark.size, -1)
     if (timings := timings_of(scan)) is not None:
         found = excess_paths(columns_of(scan), timings)
-        for row, caller in zip(found.row.tolist(), found.caller.tolist(), strict=True):
-            callers[row] = caller
+        callers[found.row] = found.caller
     moving = {*scan.moving.tolist(), *history.callers}
-    wanted = {(label, label in moving) for label in (*labels, *callers) if label >= 0}
-    if new := sorted(wanted.difference(slots)):
+    named = [(label, label in moving) for label in labels]
+    calling = [(label, label in moving) for label in callers.tolist()]
+    slots = history.slots
+    if new := sorted(slot for slot in {*named, *calling} if slot[0] >= 0 and slot not in slots):
         slots = {**slots, **{slot: len(slots) + n for n, slot in enumerate(new)}}
         history = _with_slots(history, slots)
-    return (
-        [slots[label, label in moving] for label in labels],
-        [-1 if label < 0 else slots[label, label in moving] for label in callers],
-        history,
-    )
+    landmarks = np.array([slots[one] for one in named], np.int64)
+    return landmarks, np.array([slots.get(one, -1) for one in calling], np.int64), history
 
 
 def _with_slots(history: History, slots: Mapping[Slot, int]) -> History:
@@ -237,9 +261,7 @@ def with_places(
     known = tuple(map(np.concatenate, zip(history.known, (mean, information), strict=True)))
     leaves = np.append(history.leaves, np.full(len(labels), NEVER))
     placed = (*history.placed, *labels)
-    return replace(
-        history, index=index, heard=heard, placed=placed, known=known, leaves=leaves
-    )
+    return replace(history, index=index, heard=heard, placed=placed, known=known, leaves=leaves)
 
 
 def with_caller(history: History, label: int, place: Float[np.ndarray, "2"]) -> History:
@@ -266,12 +288,11 @@ def in_hindsight(history: History) -> History:
     return replace(history, leaves=np.where(last < (history.nodes - 1) // STRETCH, last, NEVER))
 
 
-def numbers_heard(history: History) -> Int[np.ndarray, " u"]:
-    """Return the numbers of the landmarks of the border that the last node heard."""
+def slots_heard(history: History) -> Int[np.ndarray, " u"]:
+    """Return the slots that the last node heard, as landmarks or as callers."""
     _, first, last = history.span
-    ends = history.rows.arrays[0][first:last, :2]
-    index = history.index[ends[ends >= 0]]
-    return index[index > 0] - 1
+    ends = history.rows.arrays[0][first:last, :2].ravel()
+    return ends[ends >= 0]
 
 
 def _sure(covariance: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:

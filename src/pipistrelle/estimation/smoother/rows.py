@@ -32,7 +32,7 @@ from pipistrelle.estimation.smoother.observations import (
 from pipistrelle.estimation.smoother.records import Front, Noise, Places, Points, Rows, Work
 from pipistrelle.estimation.smoother.small_matrices import add_multiple, write
 from pipistrelle.geometry import wrap_angle
-from pipistrelle.jit import Whole, no_alloc
+from pipistrelle.jit import Whole, no_alloc, no_alloc_inlined
 
 LEAST_DEVIATION = 1e-6
 """A measurement counts as no surer [rad, m]."""
@@ -79,7 +79,7 @@ def hear(
     return cost
 
 
-@no_alloc
+@no_alloc_inlined
 def _hear_direction(
     work: Work,
     front: Front,
@@ -109,7 +109,7 @@ def _hear_direction(
     return cost
 
 
-@no_alloc
+@no_alloc_inlined
 def _add_direction(
     work: Work,
     front: Front,

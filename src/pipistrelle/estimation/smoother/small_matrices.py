@@ -66,14 +66,24 @@ def add_product(
     total: Float[np.ndarray, "d n"],
     sign: float,
 ) -> None:
-    """Add A B, times a sign, to what stands there, as many columns as both have."""
+    """Add A B, times a sign, to what stands there, as many columns as both have.
+
+    Three rows of B, those of a pose, are read at once.
+    """
     columns = min(B.shape[1], total.shape[1])
     for a in range(A.shape[0]):
-        for e in range(A.shape[1]):
+        first = 0
+        row = total[a]
+        if A.shape[1] >= 3:
+            x, y, z, first = sign * A[a, 0], sign * A[a, 1], sign * A[a, 2], 3
+            B0, B1, B2 = B[0], B[1], B[2]
+            for j in range(columns):
+                row[j] = ((row[j] + x * B0[j]) + y * B1[j]) + z * B2[j]
+        for e in range(first, A.shape[1]):
             share = sign * A[a, e]
             if share != 0.0:
                 for j in range(columns):
-                    total[a, j] += share * B[e, j]
+                    row[j] += share * B[e, j]
 
 
 @no_alloc

@@ -144,23 +144,27 @@ def spread_left(
         multiply(D, border, by_border)
         add_product(G, X, by_border, 1.0)
         multiply(G, P, by_state)
+        _add_by_slopes(D, X, by_state)
+        write(left[2][g], own[g])
+        _add_by_slopes(D, by_border, own[g])
         for e in range(2):
-            for a in range(d):
-                for j in range(1, D.shape[1]):
-                    by_state[e, a] += D[e, j] * X[a, j]
-            for f in range(2):
-                own[g, e, f] = left[2][g, e, f]
-                for j in range(1, D.shape[1]):
-                    own[g, e, f] += by_border[e, j] * D[f, j]
-                for a in range(d):
-                    own[g, e, f] += by_state[e, a] * G[f, a]
+            add_image(by_state, G[e], own[g, e], 1.0)
         _make_symmetric(own[g])
         for e in range(2):
             for j in range(1, n):
                 border[i + e, j] = border[j, i + e] = by_border[e, j]
             for a in range(d):
                 X[a, i + e] = by_state[e, a]
-        for e in range(2):
-            for f in range(2):
-                border[i + e, i + f] = own[g, e, f]
+        write(own[g], border[i : i + 2, i : i + 2])
     return own
+
+
+@no_alloc
+def _add_by_slopes(
+    D: Float[np.ndarray, "e n"], X: Float[np.ndarray, "d n"], total: Float[np.ndarray, "e d"]
+) -> None:
+    """Add D X^T, without the first column."""
+    for e in range(total.shape[0]):
+        for a in range(total.shape[1]):
+            for j in range(1, D.shape[1]):
+                total[e, a] += D[e, j] * X[a, j]

@@ -80,6 +80,8 @@ class Solution:
     covariance: Float[np.ndarray, "d d"]
     cost: float
     """Twice that at the points, where all was linearised there."""
+    places: Arrays
+    """Where each slot stands (`records.Places`)."""
 
 
 class Sweep:
@@ -89,18 +91,15 @@ class Sweep:
         """Make a border of parameters alone."""
         self.history, self.noise, self.points = history, noise, points
         self.columns = np.zeros(len(history.placed), np.int64)
-        w, d = _room(1 + points.parameters.size), history.dimension
-        self.front: Arrays = np.zeros((d, w)), np.zeros((d, d)), np.zeros((w, w))
-        self.border = _padded(np.append(0.0, points.parameters), (w,))
-        self.cost, self.stretches = 0.0, list[Stretch]()
-
-    @property
-    def n(self) -> int:
-        """How many columns of the border there are, with that of the constant."""
-        return max(1 + self.points.parameters.size, 2 + int(self.columns.max(initial=0)))
+        self.stretches: list[Stretch] = []
+        self.cost = 0.0
 
     def begin(self) -> None:
         """Begin at the start."""
+        w, d = _room(1 + self.points.parameters.size), self.history.dimension
+        self.front: Arrays = np.zeros((d, w)), np.zeros((d, d)), np.zeros((w, w))
+        self.border = _padded(np.append(0.0, self.points.parameters), (w,))
+        self._settle()
         self.cost = begin(
             self.front, self.history.motion, self.points.at.arrays[0], self.border,
             self.history.calibration.stds, self.noise[4],
@@ -113,6 +112,7 @@ class Sweep:
         self.front, self.cost = tuple(map(np.copy, begun.front)), begun.cost
         self.border = np.zeros(len(self.front[2]))
         self.border[1 : 1 + self.points.parameters.size] = self.points.parameters
+        self._settle()
         self._write_spots(np.flatnonzero(self.columns))
 
     def go_on(self, solution: Solution) -> None:
@@ -120,13 +120,14 @@ class Sweep:
         self.stretches, self.cost = list(solution.stretches), solution.cost
         self.columns[: solution.columns.size] = solution.columns
         self.front, self.border = tuple(map(np.copy, solution.front)), solution.border.copy()
-        self._widen(self.history.dimension, len(self.border))
+        self._settle()
 
     def go_to_the_end(self) -> None:
         """Go through all further stretches."""
+        entering = self.history.entering
         for number in range(len(self.stretches), 1 + (self.history.nodes - 1) // STRETCH):
             self._open()
-            self.join(np.flatnonzero((self.history.entering == number) & (self.columns == 0)))
+            self.join(np.flatnonzero((entering == number) & (self.columns == 0)))
             first = self.stretches[-1].first
             last = min(first + STRETCH, self.history.nodes)
             self._extend(last - first)
@@ -141,10 +142,10 @@ class Sweep:
             self.part()
             self._open()
         self._extend(1)
-        span = k, self.n, self.stretches[-1].first
+        span = k, self.size, self.stretches[-1].first
         links = self.stretches[-1].links.arrays
         self.cost += step_to(
-            self.front, self.history.motion, self._places(), self._linearised(), links,
+            self.front, self.history.motion, self.places, self._linearised(), links,
             self.noise, span,
         )  # fmt: skip
 
@@ -162,6 +163,7 @@ class Sweep:
             while column in taken:
                 column += 2
             self.columns[number], column = column, column + 2
+        self._settle()
         self._write_spots(numbers)
         known = self.history.known[0][numbers], self.history.known[1][numbers]
         at = self.columns[numbers]
@@ -172,6 +174,7 @@ class Sweep:
         before, self.history = self.history, history
         more = len(history.placed) - len(before.placed)
         self.columns = np.append(self.columns, np.zeros(more, np.int64))
+        self._settle()
         spots = np.concatenate([self.points.spots, history.known[0][len(before.placed) :]])
         self.points = replace(self.points, spots=spots)
         self._widen(history.dimension, len(self.border))
@@ -191,11 +194,12 @@ class Sweep:
         left = np.empty((gone.size, 2, w)), np.empty((gone.size, 2, d)), np.empty((gone.size, 2, 2))
         leave(self.front, freed, left)
         self.columns[gone] = 0
+        self._settle()
         self.stretches[-1] = replace(self.stretches[-1], gone=gone, freed=freed, left=left)
 
     def solved(self) -> Solution:
         """Return the solution at the last node."""
-        n = self.n
+        n = self.size
         factor, beta = np.zeros((n, n)), np.empty(n)
         off, covariance = solve(self.front, n, factor, beta)
         beta[0] = 0.0
@@ -210,6 +214,7 @@ class Sweep:
             state=self.points.at.arrays[0][self.history.nodes - 1] + off,
             covariance=covariance,
             cost=self.cost,
+            places=self.places,
         )
 
     def _open(self) -> None:
@@ -237,15 +242,17 @@ class Sweep:
     def _eliminate(self, stands: int, first: int, last: int) -> None:
         """Carry the front on, in the last stretch."""
         stretch = self.stretches[-1]
-        span = stands, first, last, self.n, stretch.first
+        span = stands, first, last, self.size, stretch.first
         self.cost += eliminate(
-            self.front, self.history.motion, self.history.rows.arrays, self._places(),
+            self.front, self.history.motion, self.history.rows.arrays, self.places,
             self._linearised(), stretch.links.arrays, self.noise, span,
         )  # fmt: skip
 
-    def _places(self) -> Arrays:
-        """Return where each slot stands (`records.Places`)."""
-        return self.history.places(self.columns)
+    def _settle(self) -> None:
+        """Note where each slot stands (`records.Places`), and how many columns there are."""
+        self.places = self.history.places(self.columns)
+        last = int(self.columns.max()) + 2 if self.columns.size else 0
+        self.size = max(1 + self.points.parameters.size, last)
 
     def _linearised(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the points of the chain's states and of the border's columns."""
@@ -253,8 +260,8 @@ class Sweep:
 
     def _write_spots(self, numbers: Int[np.ndarray, " l"]) -> None:
         """Write the points of landmarks to their columns; make room where there is none."""
-        if self.n > len(self.border):
-            self._widen(self.history.dimension, _room(self.n))
+        if self.size > len(self.border):
+            self._widen(self.history.dimension, _room(self.size))
         for e in range(2):
             self.border[self.columns[numbers] + e] = self.points.spots[numbers, e]
 
