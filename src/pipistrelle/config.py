@@ -423,6 +423,17 @@ class AssumedConfig(Section):
     """By which delays become ranges, and phases bearings [m/s]."""
 
 
+Parameter = Literal[
+    "speed_scale",
+    "turn_bias",
+    "wheelbase",
+    "speed_of_sound",
+    "sensor_heading",
+    "sensor_place",
+]
+"""What the smoother may estimate of the vehicle itself."""
+
+
 class FilterConfig(Section):
     """What the filters assume."""
 
@@ -447,6 +458,28 @@ class FilterConfig(Section):
     as suits the estimator."""
     robust: Literal["none", "huber"] = "none"
     """Huber's, by EKFs and smoother: what surprises by more than 2 sigma counts less."""
+    calibrate: tuple[Parameter, ...] = ()
+    """What the vehicle does not know of itself, and the smoother estimates (`calibration`)."""
+    window: Positive | None = None
+    """Of the smoother: a landmark not heard for so long leaves what each scan works on, until it is
+    heard again [s]; else none does. For drives that lead on and on."""
+
+
+class CalibrationConfig(Section):
+    """How unsure is what `filter.calibrate` names: standard deviations about what is assumed."""
+
+    speed_scale_std: Positive = 0.1
+    """Of the true speed over the commanded one, or of the true way over that by the odometry."""
+    turn_bias_std: Positive = 0.02
+    """Of what is added to every steering angle [rad] or angular rate [rad/s]."""
+    wheelbase_std: Positive = 0.1
+    """Of a bicycle, as a share of what is assumed."""
+    speed_of_sound_std: Positive = 10.0
+    """[m/s]; ranges and excess paths grow with it."""
+    sensor_heading_std: AngleStd = 0.1
+    """Of the sensor's zero bearing from the vehicle's heading [rad]."""
+    sensor_place_std: DistanceStd = 0.1
+    """Of the sensor, ahead and to the left of the vehicle's point, each [m]."""
 
 
 class RayConfig(Section):
@@ -524,6 +557,7 @@ class Config(Section):
     motion: MotionConfig = MotionConfig()
     assumed: AssumedConfig = AssumedConfig()
     filter: FilterConfig = FilterConfig()
+    calibration: CalibrationConfig = CalibrationConfig()
     rays: RayConfig = RayConfig()
     fastslam: FastSlamConfig = FastSlamConfig()
 

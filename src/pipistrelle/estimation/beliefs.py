@@ -148,6 +148,8 @@ class Track:
     """The particles' weighted mean number of fully initialised landmarks."""
     online: Gaussian | None = None
     """Of a filter that revises its path: each pose as it was believed at its time."""
+    calibration: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """What the filter estimated of the vehicle itself: value and standard deviation, by name."""
     callers: Mapping[int, Gaussian] = field(default_factory=dict)
     """Where moving callers were, by label, (k, 2) and (k, 2, 2): at their time, at steps with a
     scan at which they were `in_sight`, else NaN; or as a filter that revises them believes at the
@@ -179,10 +181,11 @@ class Belief(Protocol):
     landmarks of the map, as Landmarks of a row per hypothesis. ``path()`` returns the start and
     every control step so far, (k + 1, 3) and (k + 1, 3, 3), of an estimator that revises its path,
     and ``tracks()`` a Gaussian (k + 1, 2) and (k + 1, 2, 2) of each caller by its label, NaN where
-    unknown. ``cloud()`` returns the poses (p, 3) of particles, with ``full``, the weighted mean
-    number of fully initialised landmarks. An association asks for two more: ``joint()`` returns a
-    `JointGaussian`, and ``edited(remove, merge)`` the belief without the landmarks of the labels
-    ``remove``, and with the two of each pair ``merge`` as one, under the first label.
+    unknown. ``calibration()`` returns value and standard deviation of what it estimates of the
+    vehicle itself, by name. ``cloud()`` returns the poses (p, 3) of particles, with ``full``, the
+    weighted mean number of fully initialised landmarks. An association asks for two more:
+    ``joint()`` returns a `JointGaussian`, and ``edited(remove, merge)`` the belief without the
+    landmarks of the labels ``remove``, and with the two of each pair ``merge`` as one, under the first label.
     """
 
     @property

@@ -53,6 +53,8 @@ class Entry:
     memory: Callable[[int, int, Config], float]
     """The most bytes that it holds at once, by the number of landmarks, that of each one's members,
     and a Config."""
+    calibrates: bool = False
+    """Whether it estimates what ``filter.calibrate`` names."""
     follows: bool = False
     """Whether scans give it moving callers (`beliefs.Belief.moving`), or rows of what stands
     alone."""
@@ -198,17 +200,35 @@ def _builder(name: str, where: str) -> "Callable[[Config, Motion], Estimator]":
 
     def build(config: Config, motion: "Motion") -> "Estimator":
         module, _, kind = where.partition(":")
-        settings = config.filter
-        return getattr(import_module(f"pipistrelle.estimation.{module}"), kind)(
-            motion=motion,
-            rays=config.rays,
-            gate=gate_of(name, config),
-            robust=settings.robust == "huber",
-            speed_std=settings.caller_speed_std,
-            walk_std=settings.caller_walk_std,
-        )
+        made = getattr(import_module(f"pipistrelle.estimation.{module}"), kind)
+        return made(**_settings(name, config, motion))
 
     return build
+
+
+def _settings(name: str, config: Config, motion: "Motion") -> dict[str, Any]:
+    """Return what an EKF or the smoother is made with."""
+    settings = config.filter
+    return {
+        "motion": motion,
+        "rays": config.rays,
+        "gate": gate_of(name, config),
+        "robust": settings.robust == "huber",
+        "speed_std": settings.caller_speed_std,
+        "walk_std": settings.caller_walk_std,
+    }
+
+
+def _smoother(config: Config, motion: "Motion") -> "Estimator":
+    """Build the smoother."""
+    from pipistrelle.estimation.smoother.calibration import calibration_of
+    from pipistrelle.estimation.smoother.filter import Smoother
+
+    return Smoother(
+        **_settings("smoother", config, motion),
+        calibration=calibration_of(config, motion),
+        window=config.filter.window or math.inf,
+    )
 
 
 def _built(name: str, kind: Any, config: Config, motion: "Motion") -> "Estimator":
@@ -286,10 +306,11 @@ CATALOGUE = {
         Entry(
             name="smoother",
             title="smoother",
-            build=_builder("smoother", "smoother.filter:Smoother"),
-            sections=READ,
+            build=_smoother,
+            sections=(*READ, "calibration"),
             nees_limit=50.0,
             memory=_smoother_bytes,
+            calibrates=True,
             follows=True,
             robust_gate=1.0,
         ),

@@ -129,8 +129,8 @@ def closing_table(
     filters = [short_name(trial.filter) for trial in trials]
     lines = [("", *(trial.strategy for trial in trials)), ("", *filters)]
     width = max(11, 1 + max(map(len, filters)))
-    for title in columns[0]:
-        cells = [column[title] for column in columns]
+    for title in dict.fromkeys(title for column in columns for title in column):
+        cells = [column.get(title, "") for column in columns]
         if any(cells):
             lines.append((title, *(text or "-" for text in cells)))
     rows = [f"{line[0]:<32}" + "".join(f"{c:>{width}}" for c in line[1:]) for line in lines]
@@ -152,6 +152,9 @@ def _cells(
     yield "measurements per frame", _number(s.measurements_per_frame, 2)
     yield "rejected by the gate", str(s.gated or "")
     yield from _without_truth(trial, driven)
+    for name, (value, std) in trial.track.calibration.items():
+        yield name.replace("_", " "), f"{value:.5g}"
+        yield f"{name.replace('_', ' ')}, 1 sigma", f"{std:.2g}"
     yield "diverged", "yes" if s.diverged else ""
 
 

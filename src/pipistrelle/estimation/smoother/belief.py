@@ -10,7 +10,6 @@ from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import BEARING, BEARING_STD
 from pipistrelle.estimation.beliefs import NO_INNOVATIONS, Gaussian, Innovations, Landmarks
 from pipistrelle.estimation.rays import ray_members
-from pipistrelle.estimation.smoother.calibration import SIZES
 from pipistrelle.estimation.smoother.chain import Smoothed, converged, smoothed
 from pipistrelle.estimation.smoother.history import History
 from pipistrelle.estimation.smoother.preintegration import Odometry, placed, poses_between
@@ -110,14 +109,13 @@ class SmootherBelief:
         ]
         return _rows(points, self._rays(moving=False))
 
-    def calibration(self) -> dict[str, Gaussian]:
-        """Return what was calibrated, by name, as known by all measurements so far."""
-        known, found = self.smoothed(), {}
-        for name, first in self.history.calibration.column.items():
-            at = slice(first - 1, first - 1 + SIZES[name])
-            mean, about = known.parameters[at].copy(), known.parameter_covariance[at, at].copy()
-            found[name] = Gaussian(mean=mean, covariance=about)
-        return found
+    def calibration(self) -> dict[str, tuple[float, float]]:
+        """Return value and standard deviation of what was calibrated, by name."""
+        known, made = self.smoothed(), self.history.calibration
+        values = made.assumed + made.unit * known.parameters
+        stds = made.unit * np.sqrt(known.parameter_covariance.diagonal())
+        both = zip(values.tolist(), stds.tolist(), strict=True)
+        return dict(zip(made.names, both, strict=True))
 
     def moving(self) -> Landmarks:
         """Return moving callers: a row for each in the chain, a ray for each heard just now."""

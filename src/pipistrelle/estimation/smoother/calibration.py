@@ -3,7 +3,8 @@
 Each parameter is a number or two, constant over the drive, with a normal prior about what is
 assumed. Those of odometry change the motion between two nodes (`preintegration`), to first order
 about what is assumed, which is exact but for products of errors within one leg; those of the sensor
-change what it measures (`observations`).
+change what it measures (`observations`). In the border stands how far a number is from what is
+assumed, in its unit: the speed of sound as a share of the assumed one.
 """
 
 from collections.abc import Iterable
@@ -12,15 +13,18 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-SIZES = {
-    "speed_scale": 1,
-    "turn_bias": 1,
-    "wheelbase": 1,
-    "speed_of_sound": 1,
-    "sensor_heading": 1,
-    "sensor_place": 2,
+from pipistrelle.config import Config, InputError
+from pipistrelle.estimation.motion import Motion
+
+NUMBERS = {
+    "speed_scale": ("speed_scale",),
+    "turn_bias": ("turn_bias",),
+    "wheelbase": ("wheelbase",),
+    "speed_of_sound": ("speed_of_sound",),
+    "sensor_heading": ("sensor_heading",),
+    "sensor_place": ("sensor_place_x", "sensor_place_y"),
 }
-"""How many numbers each parameter is. They stand in the border in this order."""
+"""The names of the numbers of each parameter. They stand in the border in this order."""
 OF_ODOMETRY = ("speed_scale", "turn_bias", "wheelbase")
 """Parameters of odometry, by the codes that kernels have for them."""
 OF_SENSOR = ("speed_of_sound", "sensor_heading", "sensor_place")
@@ -31,33 +35,74 @@ OF_SENSOR = ("speed_of_sound", "sensor_heading", "sensor_place")
 class Calibration:
     """The parameters that are estimated."""
 
-    column: dict[str, int]
-    """The first column of each in the border."""
+    names: tuple[str, ...]
+    """Of their numbers."""
+    assumed: Float[np.ndarray, " p"]
+    """What is assumed of each number."""
+    unit: Float[np.ndarray, " p"]
+    """By which a number in the border is multiplied before it is added to that."""
     stds: Float[np.ndarray, " p"]
-    """Standard deviation of the prior of each number."""
+    """Standard deviation of the prior of each, in the border."""
     odometry: Int[np.ndarray, " q"]
     """Codes of those of odometry (`OF_ODOMETRY`), which stand first."""
     sensor: Int[np.ndarray, "3"]
     """Columns of those of the sensor (`OF_SENSOR`); 0 where one is not estimated."""
 
+    def scale_is_free(self, ranged: bool) -> bool:
+        """Tell whether nothing but the speed's scale tells how large the world is.
 
-def calibration_of(stds: Iterable[tuple[str, float]]) -> Calibration:
-    """Return what is estimated, from the names of parameters and the deviations of their priors.
+        Bearings do not, nor do ranges of an unknown speed of sound. The motion is then compared
+        with the odometry in the odometry's scale: in its own, the smaller a world, the less its
+        odometry would seem to be off.
+        """
+        return "speed_scale" in self.names and (not ranged or "speed_of_sound" in self.names)
 
-    >>> calibration_of([("sensor_place", 0.1), ("wheelbase", 0.02)]).column
-    {'wheelbase': 1, 'sensor_place': 2}
+
+def numbers_of(parameters: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of the numbers of some parameters, in the order of the border.
+
+    >>> numbers_of(["sensor_place", "wheelbase"])
+    ('wheelbase', 'sensor_place_x', 'sensor_place_y')
     """
-    known, column, after = dict(stds), {}, 1
-    names = [name for name in SIZES if name in known]
-    for name in names:
-        column[name], after = after, after + SIZES[name]
+    asked = set(parameters)
+    return tuple(one for name, parts in NUMBERS.items() if name in asked for one in parts)
+
+
+def calibration_of(config: Config, motion: Motion) -> Calibration:
+    """Return what ``filter.calibrate`` asks for, of a vehicle with a motion model.
+
+    >>> from pipistrelle.config import FilterConfig
+    >>> config = Config(filter=FilterConfig(calibrate=("sensor_place", "speed_of_sound")))
+    >>> calibration_of(config, Motion(model="unicycle", control_std=(0.1, 0.1))).sensor
+    array([1, 0, 2])
+    """
+    asked, about, sound = (
+        set(config.filter.calibrate),
+        config.calibration,
+        config.assumed_sound_speed,
+    )
+    if "wheelbase" in asked and motion.model != "bicycle":
+        raise InputError(
+            f'filter.calibrate: found "wheelbase" for a {motion.model} model of motion, which has '
+            "none; leave it out"
+        )
+    names = [name for name in NUMBERS if name in asked]
+    units = {"speed_of_sound": sound, "wheelbase": motion.wheelbase}
+    assumed = units | {"speed_scale": 1.0}
+    stds = {name: getattr(about, f"{name}_std") for name in names}
+    if "speed_of_sound" in stds:
+        stds["speed_of_sound"] /= sound
+    each = [name for name in names for _ in NUMBERS[name]]
+    column = {name: 1 + each.index(name) for name in names}
     return Calibration(
-        column=column,
-        stds=np.array([known[name] for name in names for _ in range(SIZES[name])]),
-        odometry=np.array([OF_ODOMETRY.index(one) for one in names if one in OF_ODOMETRY], int),
+        names=numbers_of(names),
+        assumed=np.array([assumed.get(name, 0.0) for name in each]),
+        unit=np.array([units.get(name, 1.0) for name in each]),
+        stds=np.array([stds[name] for name in each]),
+        odometry=np.array([OF_ODOMETRY.index(name) for name in names if name in OF_ODOMETRY], int),
         sensor=np.array([column.get(name, 0) for name in OF_SENSOR]),
     )
 
 
-NOTHING = calibration_of(())
+NOTHING = calibration_of(Config(), Motion(model="unicycle", control_std=(0.0, 0.0)))
 """Nothing is calibrated."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipistrelle.detection.scans import BEARING, NUMBERS, Scan
+from pipistrelle.detection.scans import BEARING, NUMBERS, RANGE, Scan
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.measurement import columns_of, excess_paths, timings_of
 from pipistrelle.estimation.smoother.calibration import NOTHING, Calibration
@@ -27,6 +27,8 @@ STRETCH = 64
 start of any all can be linearised anew."""
 NEVER = np.iinfo(np.int64).max
 """Number of a stretch that never comes."""
+FREE, GIVEN = np.ones(1, np.int64), np.zeros(1, np.int64)
+"""Column of the speed's scale, which is the first, or none (`records.Legs.scale`)."""
 Slot = tuple[int, bool]
 """A label, and whether it is that of a caller that moves."""
 
@@ -55,6 +57,8 @@ class History:
     """Prior knowledge of them: mean (l, 2), information xx, xy, yy (l, 3)."""
     leaves: Int[np.ndarray, " l"] = field(default_factory=lambda: np.empty(0, np.int64))
     """Stretches after which they leave the border, or NEVER."""
+    ranged: bool = False
+    """Whether a range or an excess path was heard."""
     callers: tuple[int, ...] = ()
     """Labels of the moving callers in the chain, in order."""
     first: Int[np.ndarray, " v"] = field(default_factory=lambda: np.empty(0, np.int64))
@@ -74,7 +78,8 @@ class History:
     def motion(self) -> Arrays:
         """How the vehicle came to each node, as `records.Legs`."""
         mean, noise, seconds, rows, _, slopes = self.legs.arrays
-        return mean, noise, seconds, rows, slopes
+        free = self.calibration.scale_is_free(self.ranged)
+        return mean, noise, seconds, rows, slopes, FREE if free else GIVEN
 
     @property
     def span(self) -> tuple[int, int, int]:
@@ -145,11 +150,19 @@ def heard_more(history: History, odometry: Odometry, scan: Scan) -> History:
     latest, heard = history.latest.copy(), history.heard.copy()
     led = odometry.mean, odometry.covariance, odometry.slopes
     _write_leg(legs.arrays, steps.arrays, led, (legs.size - 1, steps.size, odometry.seconds))
-    _write_rows(
+    ranged = _write_rows(
         (legs.arrays[3], *rows.arrays), (landmarks, callers, scan.numbers), (latest, heard),
         (legs.size - 1, rows.size - landmarks.size),
     )  # fmt: skip
-    return replace(history, legs=legs, steps=steps, rows=rows, latest=latest, heard=heard)
+    return replace(
+        history,
+        legs=legs,
+        steps=steps,
+        rows=rows,
+        latest=latest,
+        heard=heard,
+        ranged=history.ranged or ranged,
+    )
 
 
 @kernel
@@ -184,14 +197,14 @@ def _write_rows(
     scan: tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, "7 m"]],
     seen: tuple[Int[np.ndarray, " s"], Int[np.ndarray, "s 2"]],
     span: tuple[Whole, Whole],
-) -> None:
+) -> bool:
     """Write the rows of a node, each with the row of its landmark's bearing before.
 
-    ``seen``: the latest row of each slot, and when it was heard; ``span``: the node, its first row.
+    Returns whether any has a range or an excess path. ``seen``: the latest row of each slot, and when it was heard; ``span``: the node, its first row.
     """
     (spans, ends, values), (landmarks, callers, numbers) = rows, scan
     (latest, heard), (k, first) = seen, span
-    spans[k, 0], spans[k, 1] = first, first + landmarks.size
+    spans[k, 0], spans[k, 1], ranged = first, first + landmarks.size, False
     for m in range(landmarks.size):
         slot, row = landmarks[m], first + m
         ends[row, 0], ends[row, 1], ends[row, 2], ends[row, 3] = slot, callers[m], k, -1
@@ -202,6 +215,8 @@ def _write_rows(
         for end in (slot, callers[m]):
             if end >= 0:
                 heard[end, 0], heard[end, 1] = min(heard[end, 0], k), k
+        ranged = ranged or callers[m] >= 0 or not math.isnan(numbers[RANGE, m])
+    return ranged
 
 
 def _slots_of(

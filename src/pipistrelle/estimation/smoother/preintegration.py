@@ -176,7 +176,7 @@ def _lead_on(
             J[1, e] += ty
             J[2, e] += th
         else:
-            J[2, e] -= turn / motion.wheelbase
+            J[2, e] -= turn
 
 
 @no_alloc

@@ -30,6 +30,8 @@ class Legs(NamedTuple):
     rows: Int[np.ndarray, "k 2"]  # what was heard from it: first row, and the one after the last
     slopes: Float[np.ndarray, "k 3 q"]
     """Of the motion, by the parameters of odometry, which stand first in the border."""
+    scale: Int[np.ndarray, "1"]
+    """Column of the speed's scale where nothing else tells how large the world is, or 0."""
 
 
 class Rows(NamedTuple):

@@ -43,14 +43,30 @@ def transition(
         F[a, a] = 1.0
     F[0, 2], F[1, 2] = -dy, dx
     off = c * dx + s * dy - mx, c * dy - s * dx - my, wrap_angle(at[k, 2] - heading - mh)
-    cost = _odometry(legs.noise[k], off, (c, s), u, Q)
     for e in range(work.by.shape[1]):
         ahead, aside = legs.slopes[k, 0, e], legs.slopes[k, 1, e]
         work.by[0, e], work.by[1, e] = c * ahead - s * aside, s * ahead + c * aside
         work.by[2, e] = legs.slopes[k, 2, e]
+    if legs.scale[0] > 0:
+        scale = 1.0 + points[1][legs.scale[0]]
+        work.by[0, 0], work.by[1, 0] = dx / scale, dy / scale
+        _stretch(legs.noise[k], scale, work.A)
+        cost = _odometry(work.A, off, (c, s), u, Q)
+    else:
+        cost = _odometry(legs.noise[k], off, (c, s), u, Q)
     for v in range(places.first.size):
         cost += _transition_of_caller(work, k, v, legs.seconds[k], places, at, noise)
     return cost
+
+
+@no_alloc
+def _stretch(
+    N: Float[np.ndarray, "3 3"], scale: float, stretched: Float[np.ndarray, "d d"]
+) -> None:
+    """Write the noise of a motion of which x and y are multiplied by a scale."""
+    for a in range(POSE):
+        for b in range(POSE):
+            stretched[a, b] = N[a, b] * (scale if a < 2 else 1.0) * (scale if b < 2 else 1.0)
 
 
 @no_alloc

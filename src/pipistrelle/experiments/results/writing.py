@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import BaseModel
 
+from pipistrelle.estimation.beliefs import Track
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.results.scores import TrialResult
@@ -212,10 +213,28 @@ def run_entry(trial: TrialResult, ignored_rows: Mapping[str, int]) -> dict[str, 
         "strategy": trial.strategy,
         "filter": trial.filter,
         **_finite(asdict(trial.scores)),
+        **({"calibration": calibrated} if (calibrated := calibration_of(trial.track)) else {}),
         "ignored_rows": dict(ignored_rows),
         "wall_s": trial.wall_s,
     }
     return run if trial.online is None else run | {"online": _finite(asdict(trial.online))}
+
+
+def calibration_of(track: Track) -> dict[str, float]:
+    """Return what a filter estimated of the vehicle, and ``NAME_std`` of each number.
+
+    >>> from pipistrelle.estimation.beliefs import Gaussian, no_landmarks
+    >>> pose = Gaussian(mean=np.zeros((1, 3)), covariance=np.zeros((1, 3, 3)))
+    >>> known = {"landmarks": no_landmarks(), "gated": 0, "calibration": {"wheelbase": (0.2, 0.01)}}
+    >>> calibration_of(Track(time=np.zeros(1), pose=pose, **known))
+    {'wheelbase': 0.2, 'wheelbase_std': 0.01}
+    """
+    both = track.calibration.items()
+    return {
+        key: one
+        for name, (value, std) in both
+        for key, one in ((name, value), (f"{name}_std", std))
+    }
 
 
 def _finite(scores: Mapping[str, object]) -> dict[str, object]:

@@ -112,6 +112,7 @@ def _track_of(
         cloud=cloud,
         full=None if cloud is None else getattr(belief, "full", None),
         online=online if revised else None,
+        calibration=answer(belief, "calibration") or {},
         callers=_retraced(callers, belief, time.size),
     )
 

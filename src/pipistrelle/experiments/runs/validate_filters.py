@@ -34,6 +34,7 @@ def check_filters(
         check_standing(moving)
     for name in filters:
         if name in CATALOGUE:
+            check_calibrates(name, config)
             continue
         try:
             belief = first_belief(name, motion, config)
@@ -53,6 +54,17 @@ def check_filters(
                 f"filter {name}: init returns a belief whose {', '.join(fixed)} cannot be called; "
                 f"of a belief {', '.join(methods)} are methods, the last two where it has them"
             )
+
+
+def check_calibrates(name: str, config: Config) -> None:
+    """Refuse ``filter.calibrate`` with a listed estimator that calibrates nothing."""
+    asked = config.filter.calibrate
+    if asked and not CATALOGUE[name].calibrates:
+        able = ", ".join(known.name for known in CATALOGUE.values() if known.calibrates)
+        raise InputError(
+            f"filter.calibrate: found {', '.join(asked)} with the filter {name}, which calibrates "
+            f"nothing; take {able}, or leave it out (in a plan, name it under [own.{able}])"
+        )
 
 
 def check_standing(moving: Iterable[str]) -> None:

@@ -5,8 +5,8 @@ What a case is: `studies.plan`. Cases whose settings differ in nothing that is s
 """
 
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from math import degrees
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +19,7 @@ from pipistrelle.config import Config
 from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.beliefs import Track
 from pipistrelle.estimation.catalogue import SECTIONS
+from pipistrelle.estimation.smoother.calibration import numbers_of
 from pipistrelle.evaluation.accuracy import (
     MapEstimate,
     heaviest,
@@ -35,6 +36,7 @@ from pipistrelle.experiments.hearing.scenario import Scenario, standing_landmark
 from pipistrelle.experiments.hearing.trajectories import motion_of
 from pipistrelle.experiments.hearing.world import World
 from pipistrelle.experiments.results.scores import PathScores, Scores, with_bound
+from pipistrelle.experiments.results.writing import calibration_of
 from pipistrelle.experiments.runs.heard_world import HeardWorld, drive_of
 from pipistrelle.experiments.runs.trial import run_trial
 from pipistrelle.experiments.runs.validate_filters import failure_text, first_belief
@@ -65,6 +67,7 @@ class TrialRecord:
     nor rows of the other tables."""
     scores: Scores | None = None
     online: PathScores | None = None
+    calibration: Mapping[str, float] = field(default_factory=dict)
     """Scores of the path as it was believed at its time, where the filter revises it."""
     landmarks_full_mean: float | None = None
     """Mean over the particles, where the filter has some."""
@@ -182,6 +185,7 @@ def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
             **(scores | counts | {"diverged": pl.Boolean}),
             **dict.fromkeys(last, pl.Float64),
             **dict.fromkeys(_online_columns(plan), pl.Float64),
+            **dict.fromkeys(_calibration_columns(plan), pl.Float64),
         },
         "steps": {
             **world,
@@ -199,6 +203,12 @@ def _online_columns(plan: Plan) -> tuple[str, ...]:
         if hasattr(first_belief(name, motion, plan.config), "path"):
             return tuple(f"online_{score}" for score in ONLINE)
     return ()
+
+
+def _calibration_columns(plan: Plan) -> tuple[str, ...]:
+    """Name the columns of what the filters of a plan estimate of the vehicle itself."""
+    asked = {name for case in cases_of(plan) for name in case.config.filter.calibrate}
+    return tuple(column for name in numbers_of(asked) for column in (name, f"{name}_std"))
 
 
 def heard_settings(config: Config) -> str:
@@ -258,6 +268,7 @@ def _try_case(case: PlannedCase, shared: HeardWorld, iteration: int) -> TrialRec
             beamwidth_deg=_beamwidth_deg(case),
             scores=with_bound(result.scores, shared.bound(case.config, case.strategy)),
             online=result.online,
+            calibration=calibration_of(result.track),
             landmarks_full_mean=float(result.scores.landmarks_full if full is None else full),
             clutter_per_frame=sum(h.clutter for h in heard) / len(heard) if heard else None,
             wall_s=result.wall_s,
@@ -331,8 +342,9 @@ def _row(iteration: int, record: TrialRecord, columns: Sequence[str]) -> dict[st
         "wall_s": record.wall_s,
         "cpu_s": record.cpu_s,
         **{f"online_{name}": online and getattr(online, name) for name in ONLINE},
+        **record.calibration,
     }
-    return {column: row[column] for column in columns}
+    return {column: row.get(column) for column in columns}
 
 
 def _cell(value: Any) -> Any:
