@@ -24,6 +24,7 @@ from pipistrelle.detection.scans import (
     OWN,
     RANGE,
     RANGE_STD,
+    SLOPE,
     UNLABELLED,
     Scan,
 )
@@ -61,9 +62,12 @@ def average_faces(
     array's angle, :math:`\cos^2\theta`. The range, of the vehicle's own call alone, is c/2 times
     the mean delay; the excess path, of another's, c times what the mean delay has over that of its
     direct call. What comes while the direct call still lasts has none: it was heard with it. The
-    standard deviations are what the signal tells, and what no level removes:
+    standard deviations are what the signal tells, and what no level removes (first line). The
+    slope of a bearing by the speed of sound is the mean over the faces that heard it (second line;
+    a face hears :math:`\sin\theta` as c times a phase):
 
-    .. math:: \sigma^2 = \sigma_{signal}^2 + \sigma_{floor}^2
+    .. math:: \sigma^2 &= \sigma_{signal}^2 + \sigma_{floor}^2 \\
+              d\phi / d \ln c &= \overline{\tan\theta}
 
     `time` [s]; `detections`: (d) rows; `label`: of each detection, or UNLABELLED; `speed_of_sound`
     [m/s]; `callers`: labels of the callers as landmarks, where they are known.
@@ -140,7 +144,7 @@ def _average(
     calls: tuple,
     weighted: bool,
     speed_of_sound: float,
-) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, "7 m"]]:
+) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, "8 m"]]:
     """Average direction and delay of each label and caller over its strongest rows per face.
 
     Returns label, caller and numbers of each pair that occurs.
@@ -156,7 +160,7 @@ def _average(
     for i in range(labels.size):
         for p in range(callers):
             _take_strongest(label, labels[i], p, found, strongest)
-            total = east = north = late = loudest = across = along = 0.0
+            total = east = north = late = loudest = across = along = slope = 0.0
             for f in range(faces):
                 d = strongest[f]
                 if d >= 0:
@@ -165,6 +169,7 @@ def _average(
                     east += weight * math.cos(found.bearing[d])
                     north += weight * math.sin(found.bearing[d])
                     late += weight * found.delay[d]
+                    slope += weight * math.tan(found.angle[d])
                     across += (weight * found.bearing_std[d]) ** 2
                     along += (weight * found.delay_std[d]) ** 2
                     loudest = max(loudest, found.power[d])
@@ -182,6 +187,7 @@ def _average(
                     apart, spread = speed_of_sound * apart, speed_of_sound * spread
                     numbers[EXCESS_PATH, row] = apart
                     numbers[EXCESS_PATH_STD, row] = math.hypot(spread, EXCESS_PATH_FLOOR)
+                numbers[SLOPE, row] = slope / total
                 numbers[LEVEL, row] = 10.0 * math.log10(loudest)
                 row += 1
     return landmark[:row], caller[:row], numbers[:, :row].copy()

@@ -21,6 +21,7 @@ from pipistrelle.detection.scans import (
     NUMBERS,
     OWN,
     RANGE,
+    SLOPE,
     UNLABELLED,
     Scan,
     rows_of,
@@ -131,11 +132,11 @@ def settled(label: Int[np.ndarray, " m"], bearing: Float[np.ndarray, " m"]) -> b
 def _fuse(
     label: Int[np.ndarray, " m"],
     whose: Int[np.ndarray, " m"],
-    given: Float[np.ndarray, "7 m"],
+    given: Float[np.ndarray, "8 m"],
     own: bool,
     others: bool,
     labels_only: bool,
-) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"], Float[np.ndarray, "7 k"]]:
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"], Float[np.ndarray, "8 k"]]:
     """Select the rows of some callers and merge those of each landmark into one.
 
     Rows without a label stay as they are, or are left out. Excess paths after a landmark's first
@@ -144,8 +145,7 @@ def _fuse(
     most = label.size
     landmark, caller = np.empty(most, np.int64), np.empty(most, np.int64)
     numbers, merged = np.full((NUMBERS, most), np.nan), np.zeros(most, np.int64)
-    turn, weighted, weight = np.zeros(most), np.zeros(most), np.zeros(most)
-    bearing, std, count = given[BEARING], given[BEARING_STD], 0
+    sums, bearing, std, count = np.zeros((5, most)), given[BEARING], given[BEARING_STD], 0
     further, excess_paths = np.empty(most, np.int64), 0
     for m in range(most):
         if not (own if whose[m] == OWN else others) or (labels_only and label[m] == UNLABELLED):
@@ -169,10 +169,10 @@ def _fuse(
         _take(numbers, k, given, m)
         off = wrap_angle(bearing[m] - numbers[BEARING, k])  # from the first row's
         merged[k] += 1
-        turn[k] += off
-        weighted[k] += off / (std[m] * std[m])
-        weight[k] += 1.0 / (std[m] * std[m])
-    _average(numbers[:, :count], merged, turn, weighted, weight)
+        sure, slope = 1.0 / (std[m] * std[m]), given[SLOPE, m]
+        for e, part in enumerate((off, off * sure, slope, slope * sure, sure)):
+            sums[e, k] += part
+    _average(numbers[:, :count], merged, sums)
     for m in further[:excess_paths]:
         landmark[count], caller[count] = label[m], whose[m]
         for number in (EXCESS_PATH, EXCESS_PATH_STD, LEVEL):
@@ -183,36 +183,40 @@ def _fuse(
 
 @kernel
 def _average(
-    numbers: Float[np.ndarray, "7 k"],
+    numbers: Float[np.ndarray, "8 k"],
     merged: Int[np.ndarray, " m"],
-    turn: Float[np.ndarray, " m"],
-    weighted: Float[np.ndarray, " m"],
-    weight: Float[np.ndarray, " m"],
+    sums: Float[np.ndarray, "5 m"],
 ) -> None:
     """Turn the first bearing of each row to the mean of all that were merged.
 
-    They are so far from it in sum, plainly and weighted, with so much weight; room may be left.
+    ``sums``: how far they are from it, plainly and weighted; their slopes likewise; their weight.
+    Room may be left.
     """
+    turn, weighted, slope, weighted_slope, weight = sums
     for k in range(numbers.shape[1]):
         if merged[k] > 1:
             first = numbers[BEARING, k]
             if math.isnan(weight[k]):
                 numbers[BEARING, k] = wrap_angle(first + turn[k] * (1.0 / merged[k]))
+                numbers[SLOPE, k] = slope[k] * (1.0 / merged[k])
                 numbers[BEARING_STD, k] = np.nan
             else:
                 numbers[BEARING, k] = wrap_angle(first + weighted[k] / weight[k])
+                numbers[SLOPE, k] = weighted_slope[k] / weight[k]
                 numbers[BEARING_STD, k] = 1.0 / math.sqrt(weight[k])
 
 
 @kernel
 def _take(
-    numbers: Float[np.ndarray, "7 k"], k: Whole, given: Float[np.ndarray, "7 m"], m: Whole
+    numbers: Float[np.ndarray, "8 k"], k: Whole, given: Float[np.ndarray, "8 m"], m: Whole
 ) -> None:
     """Fill the missing numbers of a landmark's row from another row; keep the higher level."""
     for number in (BEARING, RANGE, EXCESS_PATH):
         if math.isnan(numbers[number, k]):
             spread = number + BEARING_STD
             numbers[number, k], numbers[spread, k] = given[number, m], given[spread, m]
+            if number == BEARING:
+                numbers[SLOPE, k] = given[SLOPE, m]
     level = given[LEVEL, m]
     if math.isnan(numbers[LEVEL, k]) or level > numbers[LEVEL, k]:
         numbers[LEVEL, k] = level

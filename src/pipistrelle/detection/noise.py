@@ -51,8 +51,8 @@ class ConstantNoise:
 
 @kernel
 def _filled(
-    numbers: Float[np.ndarray, "7 m"], bearing_std: float, range_std: float, excess_path_std: float
-) -> Float[np.ndarray, "7 m"]:
+    numbers: Float[np.ndarray, "8 m"], bearing_std: float, range_std: float, excess_path_std: float
+) -> Float[np.ndarray, "8 m"]:
     """Copy numbers, with constants in place of missing standard deviations."""
     filled = numbers.copy()
     for m in range(filled.shape[1]):

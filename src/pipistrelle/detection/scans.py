@@ -26,10 +26,11 @@ COLUMNS = (
     "range_std",
     "excess_path_std",
     "level_db",
+    "bearing_slope",
 )
 """Names of a scan's columns."""
 NUMBERS = len(COLUMNS) - 2
-BEARING, RANGE, EXCESS_PATH, BEARING_STD, RANGE_STD, EXCESS_PATH_STD, LEVEL = range(NUMBERS)
+BEARING, RANGE, EXCESS_PATH, BEARING_STD, RANGE_STD, EXCESS_PATH_STD, LEVEL, SLOPE = range(NUMBERS)
 """Where each stands among the numbers: label and caller stand apart."""
 
 
@@ -48,7 +49,7 @@ class Scan:
     caller: Int[np.ndarray, " m"]
     """OWN, or the number of another caller. Of several, the first with an excess path, else the
     first."""
-    numbers: Float[np.ndarray, "7 m"]
+    numbers: Float[np.ndarray, "8 m"]
     """The other columns, in the order of `COLUMNS`."""
     callers: Int[np.ndarray, " c"] = field(default_factory=lambda: NO_CALLERS)
     """Label of each caller as a landmark, by its number; UNLABELLED for the vehicle and where it is
@@ -93,6 +94,11 @@ class Scan:
     def level_db(self) -> Float[np.ndarray, " m"]:
         """Of the strongest detection behind a row, over a steered beam's noise [dB], or NaN."""
         return self.numbers[LEVEL]
+
+    @property
+    def bearing_slope(self) -> Float[np.ndarray, " m"]:
+        """Derivative of the bearing by the logarithm of the speed of sound [rad], or NaN."""
+        return self.numbers[SLOPE]
 
 
 def make_scan(

@@ -185,7 +185,8 @@ class Belief(Protocol):
     vehicle itself, by name. ``cloud()`` returns the poses (p, 3) of particles, with ``full``, the
     weighted mean number of fully initialised landmarks. An association asks for two more:
     ``joint()`` returns a `JointGaussian`, and ``edited(remove, merge)`` the belief without the
-    landmarks of the labels ``remove``, and with the two of each pair ``merge`` as one, under the first label.
+    landmarks of the labels ``remove``, and with the two of each pair ``merge`` as one, under the
+    first label.
     """
 
     @property

@@ -275,7 +275,7 @@ def _worded(scan: Scan, fault: int) -> str:
 def _fault(
     landmark: Int[np.ndarray, " m"],
     caller: Int[np.ndarray, " m"],
-    numbers: Float[np.ndarray, "7 m"],
+    numbers: Float[np.ndarray, "8 m"],
     callers: Int[np.ndarray, " c"],
     moving: Int[np.ndarray, " v"],
 ) -> int:
@@ -297,7 +297,7 @@ def _fault(
 def _fault_of_row(
     landmark: Int[np.ndarray, " m"],
     caller: Int[np.ndarray, " m"],
-    numbers: Float[np.ndarray, "7 m"],
+    numbers: Float[np.ndarray, "8 m"],
     m: Whole,
 ) -> int:
     """Return the number of a row's fault, or 0."""

@@ -53,7 +53,7 @@ class ExcessPaths(NamedTuple):
     row: Int[np.ndarray, " d"]  # index in the scan
 
 
-Columns = tuple[Int[np.ndarray, " m"], Float[np.ndarray, "7 m"]]
+Columns = tuple[Int[np.ndarray, " m"], Float[np.ndarray, "8 m"]]
 """Labels and numbers of a scan's rows."""
 Timings = tuple[Int[np.ndarray, " m"], Int[np.ndarray, " callers"], Int[np.ndarray, " v"]]
 """Callers of a scan's rows; the labels of the callers, and of those that move."""

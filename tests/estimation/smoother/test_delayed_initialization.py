@@ -35,7 +35,7 @@ class Bearing(NamedTuple):
 def crossing(poses, heard):
     """The place where the last of these bearings crosses an earlier one, or None."""
     rows = len(heard)
-    ends, numbers = np.zeros((rows, 4), np.int64), np.full((rows, 7), np.nan)
+    ends, numbers = np.zeros((rows, 4), np.int64), np.full((rows, 8), np.nan)
     ends[:, 2], ends[:, 3] = [one.node for one in heard], np.arange(rows) - 1
     numbers[:, 0], numbers[:, 3] = np.array(heard)[:, 1:].T
     away = range_by_crossing(

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.detection.scans import BEARING, BEARING_STD, RANGE
-from pipistrelle.estimation.smoother.observations import view_of
+from pipistrelle.estimation.smoother.observations import direction_of, view_of
 from pipistrelle.estimation.smoother.records import Arrays, Front, Places, Points, Rows
 from pipistrelle.estimation.smoother.tdoa_initialization import place_by_excess_path
 from pipistrelle.jit import Whole, kernel, no_alloc
@@ -55,8 +55,9 @@ def entering_places(
             away = place_by_excess_path(rows, heard, view, k, places, estimate, front, R)
         if math.isnan(away) and not moves[slot]:
             away = range_by_crossing(rows, m, estimate, places.sensor)
-        found[m - first, 0] = view.x + away * math.cos(view.heading + numbers[BEARING])
-        found[m - first, 1] = view.y + away * math.sin(view.heading + numbers[BEARING])
+        angle = direction_of(view, numbers)
+        found[m - first, 0] = view.x + away * math.cos(angle)
+        found[m - first, 1] = view.y + away * math.sin(angle)
     return found
 
 
@@ -67,11 +68,11 @@ def range_by_crossing(
     """Return the range where the bearing of row m clearly crosses an earlier one, or NaN."""
     numbers, (poses, border) = rows.numbers[m], estimate
     view = view_of(poses[rows.ends[m, 2]], border, sensor)
-    angle, best, found = view.heading + numbers[BEARING], math.sin(MIN_CROSSING_ANGLE), math.nan
+    angle, best, found = direction_of(view, numbers), math.sin(MIN_CROSSING_ANGLE), math.nan
     earlier = rows.ends[m, 3]
     while earlier >= 0:
         there = view_of(poses[rows.ends[earlier, 2]], border, sensor)
-        other = there.heading + rows.numbers[earlier, BEARING]
+        other = direction_of(there, rows.numbers[earlier])
         sine = math.sin(other - angle)
         if abs(sine) >= best:
             dx, dy = there.x - view.x, there.y - view.y

@@ -16,11 +16,13 @@ from pipistrelle.detection.scans import (
     EXCESS_PATH_STD,
     RANGE,
     RANGE_STD,
+    SLOPE,
 )
 from pipistrelle.estimation.measurement import observe
 from pipistrelle.estimation.smoother.observations import (
     Point,
     View,
+    bearing_of,
     point_of,
     view_of,
     write_bearing,
@@ -102,7 +104,7 @@ def _part(
 @kernel
 def _surprise_of_direction(
     work: Work,
-    numbers: Float[np.ndarray, " 7"],
+    numbers: Float[np.ndarray, " 8"],
     view: View,
     point: Point,
     front: Front,
@@ -111,10 +113,13 @@ def _surprise_of_direction(
     """Return the squared innovation of a bearing, with a range if any, and how many they are."""
     (i, px, py), d, n = point, front.P.shape[0], R.shape[0]
     seen = observe(view.x, view.y, view.heading, px, py)
-    off, across = wrap_angle(numbers[BEARING] - seen[1]), numbers[BEARING_STD]
+    off, across = (
+        wrap_angle(numbers[BEARING] - bearing_of(view, seen, numbers[SLOPE])),
+        numbers[BEARING_STD],
+    )
     size = 1 if math.isnan(numbers[RANGE]) else 2
     by_chain, by_border = np.zeros((size, d)), np.zeros((size, n))
-    _part(work, write_bearing(work, view, seen, i), by_chain[0], by_border[0])
+    _part(work, write_bearing(work, view, seen, numbers[SLOPE], i), by_chain[0], by_border[0])
     if size == 2:
         _part(work, write_range(work, view, seen, i), by_chain[1], by_border[1])
     S = joint(front, R, n, by_chain, by_border)
@@ -129,7 +134,7 @@ def _surprise_of_direction(
 @kernel
 def _surprise_of_excess_path(
     work: Work,
-    numbers: Float[np.ndarray, " 7"],
+    numbers: Float[np.ndarray, " 8"],
     view: View,
     ends: tuple[Point, Point],
     front: Front,

@@ -194,13 +194,14 @@ def _write_leg(legs: Arrays, steps: Arrays, led: Led, span: tuple[Whole, Whole, 
 @kernel
 def _write_rows(
     rows: Arrays,
-    scan: tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, "7 m"]],
+    scan: tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, "8 m"]],
     seen: tuple[Int[np.ndarray, " s"], Int[np.ndarray, "s 2"]],
     span: tuple[Whole, Whole],
 ) -> bool:
     """Write the rows of a node, each with the row of its landmark's bearing before.
 
-    Returns whether any has a range or an excess path. ``seen``: the latest row of each slot, and when it was heard; ``span``: the node, its first row.
+    Returns whether any has a range or an excess path. ``seen``: the latest row of each slot, and
+    when it was heard; ``span``: the node, its first row.
     """
     (spans, ends, values), (landmarks, callers, numbers) = rows, scan
     (latest, heard), (k, first) = seen, span

@@ -10,10 +10,18 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.detection.scans import BEARING, BEARING_STD, EXCESS_PATH_STD, RANGE, RANGE_STD
+from pipistrelle.detection.scans import (
+    BEARING,
+    BEARING_STD,
+    EXCESS_PATH_STD,
+    RANGE,
+    RANGE_STD,
+    SLOPE,
+)
 from pipistrelle.estimation.measurement import excess_path_slopes, observe
 from pipistrelle.estimation.smoother.observations import (
     Point,
+    bearing_of,
     point_of,
     view_of,
     write_bearing,
@@ -56,8 +64,10 @@ def nonlinearity(
         here = _moved(there, off)
         if not math.isnan(numbers[BEARING]):
             seen = observe(then.x, then.y, then.heading, there[1], there[2])
-            far, angle, _, _, _ = observe(now.x, now.y, now.heading, here[1], here[2])
-            line = seen[1] + _along(work, write_bearing(work, then, seen, there[0]), off)
+            sight = observe(now.x, now.y, now.heading, here[1], here[2])
+            row = write_bearing(work, then, seen, numbers[SLOPE], there[0])
+            line = bearing_of(then, seen, numbers[SLOPE]) + _along(work, row, off)
+            angle, far = bearing_of(now, sight, numbers[SLOPE]), sight[0]
             most = max(most, abs(wrap_angle(angle - line)) / numbers[BEARING_STD])
             if not math.isnan(numbers[RANGE]):
                 line = seen[0] / then.scale + _along(

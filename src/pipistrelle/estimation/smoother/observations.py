@@ -5,7 +5,8 @@ one that is left for the misfit, and those by the border. What the vehicle does 
 sensor stands there, too: with an offset l and a turn :math:`\delta` in the axes of a pose
 (p, :math:`\theta`), the sensor is at :math:`p + R(\theta) l` and looks along
 :math:`\theta + \delta`. Where the true speed of sound is k times the one that ranges r and excess
-paths were computed with, these measure r / k.
+paths were computed with, these measure r / k, and a bearing is off by its slope (`Scan`) times
+k - 1 and what else leans on that slope.
 """
 
 import math
@@ -14,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipistrelle.detection.scans import BEARING, SLOPE
 from pipistrelle.estimation.measurement import excess_path_slopes
 from pipistrelle.estimation.smoother.records import CALLER, POSE, Places, Points, Work
 from pipistrelle.jit import Whole, no_alloc
@@ -36,7 +38,8 @@ class View(NamedTuple):
     s: float
     away_x: float  # of the sensor from the vehicle, in the world's axes
     away_y: float
-    scale: float  # true speed of sound over the one that was assumed
+    scale: float  # true speed of sound over the one that was assumed, k
+    lean: float  # by which slopes of bearings are multiplied, about k - 1
     columns: tuple[Whole, Whole, Whole]  # as `Places.sensor`
 
 
@@ -51,8 +54,10 @@ def view_of(
         x = c * border[place] - s * border[place + 1]
         y = s * border[place] + c * border[place + 1]
     heading = pose[2] + (border[turned] if turned > 0 else 0.0)
-    scale = 1.0 + (border[sound] if sound > 0 else 0.0)
-    return View(pose[0] + x, pose[1] + y, heading, c, s, x, y, scale, (sound, turned, place))
+    off = border[sound] if sound > 0 else 0.0
+    lean = off + border[sound + 1] if sound > 0 else 0.0
+    at = pose[0] + x, pose[1] + y, heading
+    return View(*at, c, s, x, y, 1.0 + off, lean, (sound, turned, place))
 
 
 @no_alloc
@@ -70,13 +75,29 @@ def point_of(slot: Whole, k: Whole, places: Places, points: Points) -> Point:
 
 
 @no_alloc
-def write_bearing(work: Work, view: View, seen: Seen, i: Whole) -> tuple[Whole, Whole]:
+def bearing_of(view: View, seen: Seen, slope: float) -> float:
+    """Return the bearing that is measured of a point; ``slope``: that by the speed of sound."""
+    return seen[1] if math.isnan(slope) else seen[1] - slope * view.lean
+
+
+@no_alloc
+def direction_of(view: View, numbers: Float[np.ndarray, " 8"]) -> float:
+    """Return the direction in the world from which a row's bearing was heard."""
+    angle = view.heading + numbers[BEARING]
+    return angle if math.isnan(numbers[SLOPE]) else angle + numbers[SLOPE] * view.lean
+
+
+@no_alloc
+def write_bearing(
+    work: Work, view: View, seen: Seen, slope: float, i: Whole
+) -> tuple[Whole, Whole]:
     """Write the slopes of the bearing of a point that stands at i.
 
     Returns how many of the entries are of the chain, and how many there are; so do the others.
     """
     _, _, c, s, inverse = seen
-    size = _write_view(work, view, s * inverse, -c * inverse, -1.0, 0.0)
+    lean = 0.0 if math.isnan(slope) else -slope
+    size = _write_view(work, view, (s * inverse, -c * inverse, -1.0), lean, lean)
     return _write_point(work, POSE, size, i, -s * inverse, c * inverse)
 
 
@@ -85,7 +106,7 @@ def write_range(work: Work, view: View, seen: Seen, i: Whole) -> tuple[Whole, Wh
     """Write the slopes of the range of a point that stands at i."""
     distance, _, c, s, _ = seen
     k = 1.0 / view.scale
-    size = _write_view(work, view, -k * c, -k * s, 0.0, -distance * k * k)
+    size = _write_view(work, view, (-k * c, -k * s, 0.0), -distance * k * k, 0.0)
     return _write_point(work, POSE, size, i, k * c, k * s)
 
 
@@ -97,7 +118,7 @@ def write_excess_path(
     (i, px, py), (j, bx, by) = ends
     path, lx, ly, cx, cy = excess_path_slopes(view.x, view.y, px, py, bx, by)
     k = 1.0 / view.scale
-    size = _write_view(work, view, -k * (lx + cx), -k * (ly + cy), 0.0, -path * k * k)
+    size = _write_view(work, view, (-k * (lx + cx), -k * (ly + cy), 0.0), -path * k * k, 0.0)
     chain, size = _write_point(work, POSE, size, i, k * lx, k * ly)
     chain, size = _write_point(work, chain, size, j, k * cx, k * cy)
     return path * k, chain, size
@@ -105,13 +126,13 @@ def write_excess_path(
 
 @no_alloc
 def _write_view(
-    work: Work, view: View, by_x: float, by_y: float, by_heading: float, by_scale: float
+    work: Work, view: View, by_pose: tuple[float, float, float], by_scale: float, by_lean: float
 ) -> Whole:
     """Write slopes by the sensor's pose as those by the vehicle's and by what is not known of it.
 
     Returns how many entries there are.
     """
-    at, slope, size = work.at, work.slope, MISFIT + 1
+    at, slope, size, (by_x, by_y, by_heading) = work.at, work.slope, MISFIT + 1, by_pose
     sound, turned, place = view.columns
     for a in range(POSE):
         at[a] = a
@@ -119,8 +140,9 @@ def _write_view(
     slope[2] = by_heading + (by_y * view.away_x - by_x * view.away_y)
     at[MISFIT], slope[MISFIT] = 0, 0.0
     if sound > 0:
-        at[size], slope[size] = sound, by_scale
-        size += 1
+        at[size], at[size + 1] = sound, sound + 1
+        slope[size], slope[size + 1] = by_scale, by_lean
+        size += 2
     if turned > 0:
         at[size], slope[size] = turned, by_heading
         size += 1

@@ -40,7 +40,7 @@ class Rows(NamedTuple):
     ends: Int[np.ndarray, "m 4"]
     """Slots of the landmark, and of the excess path's caller or -1; the node; the row of the
     landmark's bearing before, or -1."""
-    numbers: Float[np.ndarray, "m 7"]  # as those of a scan
+    numbers: Float[np.ndarray, "m 8"]  # as those of a scan
 
 
 class Places(NamedTuple):

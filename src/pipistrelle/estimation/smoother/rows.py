@@ -18,11 +18,13 @@ from pipistrelle.detection.scans import (
     EXCESS_PATH_STD,
     RANGE,
     RANGE_STD,
+    SLOPE,
 )
 from pipistrelle.estimation.measurement import NEAREST, observe
 from pipistrelle.estimation.smoother.observations import (
     Point,
     View,
+    bearing_of,
     point_of,
     view_of,
     write_bearing,
@@ -83,7 +85,7 @@ def hear(
 def _hear_direction(
     work: Work,
     front: Front,
-    numbers: Float[np.ndarray, " 7"],
+    numbers: Float[np.ndarray, " 8"],
     view: View,
     point: Point,
     believed: float,
@@ -92,7 +94,7 @@ def _hear_direction(
     i, px, py = point
     seen = observe(view.x, view.y, view.heading, px, py)
     across = 1.0 / max(numbers[BEARING_STD], LEAST_DEVIATION)
-    off = wrap_angle(seen[1] - numbers[BEARING]) * across
+    off = wrap_angle(bearing_of(view, seen, numbers[SLOPE]) - numbers[BEARING]) * across
     ranged = not math.isnan(numbers[RANGE])
     along = 1.0 / max(numbers[RANGE_STD], LEAST_DEVIATION) if ranged else 0.0
     far = (seen[0] / view.scale - numbers[RANGE]) * along if ranged else 0.0
@@ -101,7 +103,7 @@ def _hear_direction(
         slopes = less * across * seen[4], less * along, less * across
         _add_direction(work, front, i, seen[2:4], slopes, (less * off, less * far))
         return cost
-    chain, size = write_bearing(work, view, seen, i)
+    chain, size = write_bearing(work, view, seen, numbers[SLOPE], i)
     _add(work, front, chain, size, (less * across, less * off))
     if ranged:
         chain, size = write_range(work, view, seen, i)
@@ -161,7 +163,7 @@ def _add_direction(
 def _hear_excess_path(
     work: Work,
     front: Front,
-    numbers: Float[np.ndarray, " 7"],
+    numbers: Float[np.ndarray, " 8"],
     view: View,
     ends: tuple[Point, Point],
     believed: float,

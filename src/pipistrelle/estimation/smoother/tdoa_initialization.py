@@ -15,13 +15,13 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.detection.scans import BEARING, BEARING_STD, EXCESS_PATH, EXCESS_PATH_STD
+from pipistrelle.detection.scans import BEARING_STD, EXCESS_PATH, EXCESS_PATH_STD
 from pipistrelle.estimation.measurement import (
     MIN_TDOA_SIGMAS,
     caller_range_by_excess_path,
     range_by_excess_path,
 )
-from pipistrelle.estimation.smoother.observations import View, point_of
+from pipistrelle.estimation.smoother.observations import View, direction_of, point_of
 from pipistrelle.estimation.smoother.records import Front, Places, Points, Rows
 from pipistrelle.estimation.smoother.small_matrices import cholesky
 from pipistrelle.estimation.smoother.solution import joint
@@ -52,7 +52,7 @@ def place_by_excess_path(
     """
     m, first, last = heard
     slot, scale = rows.ends[m, 0], view.scale
-    angle, across = view.heading + rows.numbers[m, BEARING], rows.numbers[m, BEARING_STD]
+    angle, across = direction_of(view, rows.numbers[m]), rows.numbers[m, BEARING_STD]
     spread, way, best, other = np.zeros((4, 4)), np.zeros(4), math.inf, -1
     clue, caller = -1, False
     for e in range(first, last):
