@@ -104,7 +104,8 @@ def bounds(kind):
     if kind["type"] in WORDS:
         return WORDS[kind["type"]]
     if kind.get("items"):
-        return f"numbers, each {bounds(kind['items'])}"
+        each = bounds(kind["items"])
+        return f"any of {each}" if "enum" in kind["items"] else f"numbers, each {each}"
     if kind["type"] == "array":
         inner = [bounds(part) for part in kind["prefixItems"]]
         return f"{len(inner)} numbers" + ("" if inner[0] == ALL_DRAWN else f", each {inner[0]}")

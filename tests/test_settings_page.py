@@ -37,7 +37,7 @@ def test_an_entry_spells_the_setting_as_it_can_be_given(key):
     field = known_settings()[key]
     if field.default is None:
         assert default == "None by default"
-        takes = re.sub(r" (m|m/s|rad|rad/s)$", "", takes)  # the unit, else beside the default
+        takes = re.sub(r" (s|m|m/s|rad|rad/s)$", "", takes)  # the unit, else beside the default
     else:
         assert tomllib.loads("it = " + default.split("`")[1])["it"] == (
             list(field.default) if isinstance(field.default, tuple) else field.default

@@ -7,7 +7,7 @@ so. This module needs pydantic alone, so that the command line can show its help
 
 import math
 from itertools import pairwise
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import (
     AfterValidator,
@@ -432,6 +432,7 @@ Parameter = Literal[
     "sensor_place",
 ]
 """What the smoother may estimate of the vehicle itself."""
+PARAMETERS: tuple[Parameter, ...] = get_args(Parameter)
 
 
 class FilterConfig(Section):
@@ -459,13 +460,13 @@ class FilterConfig(Section):
     robust: Literal["none", "huber"] = "none"
     """Huber's, by EKFs and smoother: what surprises by more than 2 sigma counts less."""
     calibrate: tuple[Parameter, ...] = ()
-    """What the vehicle does not know of itself, and the smoother estimates (`calibration`)."""
+    """What the vehicle does not know of itself, and the smoother estimates (`prior`)."""
     window: Positive | None = None
     """Of the smoother: a landmark not heard for so long leaves what each scan works on, until it is
     heard again [s]; else none does. For drives that lead on and on."""
 
 
-class CalibrationConfig(Section):
+class PriorConfig(Section):
     """How unsure is what `filter.calibrate` names: standard deviations about what is assumed."""
 
     speed_scale_std: Positive = 0.1
@@ -557,7 +558,7 @@ class Config(Section):
     motion: MotionConfig = MotionConfig()
     assumed: AssumedConfig = AssumedConfig()
     filter: FilterConfig = FilterConfig()
-    calibration: CalibrationConfig = CalibrationConfig()
+    prior: PriorConfig = PriorConfig()
     rays: RayConfig = RayConfig()
     fastslam: FastSlamConfig = FastSlamConfig()
 

@@ -118,11 +118,15 @@ def test_measured_noise_merges_rows_by_their_inverse_variances_and_constant_nois
 @pytest.mark.parametrize("noise", ["constant", "measured"])
 def test_an_estimator_is_told_what_the_settings_let_it_know_and_all_else_as_it_was(noise, timing):
     rows = replace(
-        with_columns(ROWS, excess_path=np.array([NAN, 4.0, NAN, NAN]), excess_path_std=0.1),
+        with_columns(
+            ROWS, bearing_slope=0.5, excess_path=np.array([NAN, 4.0, NAN, NAN]), excess_path_std=0.1
+        ),
         callers=np.array([-1, 51, 52]),
     )
-    known = without_hidden(rows, FilterConfig(noise=noise), timing=timing)
+    calibrate = ("speed_of_sound",) if timing else ("speed_scale",)
+    known = without_hidden(rows, FilterConfig(noise=noise, calibrate=calibrate), timing=timing)
     hidden = {"bearing_std", "range_std", "excess_path_std"} if noise == "constant" else set()
+    hidden |= set() if timing else {"bearing_slope"}
     hidden |= set() if timing else {"excess_path", "excess_path_std"}
     for name in COLUMNS:
         expected = np.full(4, NAN) if name in hidden else getattr(rows, name)

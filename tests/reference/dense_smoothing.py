@@ -1,7 +1,6 @@
 """The smoother's problem by dense normal equations: all nodes, all landmarks, one matrix, numpy.
 
-No Huber's loss, no caller that moves. Steps of Gauss and Newton, the derivatives of odometry by
-differences.
+No Huber's loss, no caller that moves. Steps of Gauss and Newton, all derivatives by differences.
 """
 
 import numpy as np
@@ -10,26 +9,39 @@ from pipistrelle.geometry import wrap
 
 
 def solved(belief, passes=30):
-    """Return poses (k, 3) and landmarks (l, 2) of the least cost, and that cost, times two."""
+    """Return poses (k, 3), landmarks (l, 2) and parameters of the least cost, and it, times two."""
     points, nodes = belief.solution.points, belief.history.nodes
-    x = np.concatenate([points.at.entries(0).ravel(), points.spots.ravel()])
+    parts = points.at.entries(0), points.spots, points.parameters
+    x = np.concatenate([part.ravel() for part in parts])
     for _ in range(passes):
         r, J = misfits(belief.history, x)
         x = x - np.linalg.lstsq(J, r, rcond=None)[0]
     r, _ = misfits(belief.history, x)
-    return x[: 3 * nodes].reshape(-1, 3), x[3 * nodes :].reshape(-1, 2), r @ r
+    first, last = 3 * nodes, 3 * nodes + points.spots.size
+    return x[:first].reshape(-1, 3), x[first:last].reshape(-1, 2), x[last:], r @ r
 
 
 def misfits(history, x):
     """Return all misfits in standard deviations, and their derivatives."""
-    mean, noise, _, rows = map(history.legs.entries, range(4))
+    mean, noise, _, rows, _, slopes = map(history.legs.entries, range(6))
     misfit, slope, size = [], [], x.size
+    first, asked = 3 * history.nodes, history.calibration
+    theta = slice(first + 2 * len(history.placed), size)
     for k in range(history.nodes):
         at = slice(3 * max(k - 1, 0), 3 * k + 3)
-        root = np.linalg.inv(np.linalg.cholesky(noise[k]))
-        by = [(at, root @ differences(x[at], mean[k], k))]
-        add(misfit, slope, size, root @ odometry(x[at], mean[k], k), by)
-    first = 3 * history.nodes
+
+        def off(ends, parameters, k=k):
+            scale = np.ones(3)
+            if k and asked.scale_is_free(history.ranged):
+                scale[:2] = 1.0 + parameters[0]
+            root = np.linalg.inv(np.linalg.cholesky(noise[k])) / scale
+            led = mean[k] + slopes[k] @ parameters[: asked.odometry.size]
+            return root @ odometry(ends, led, k)
+
+        both = x[at], x[theta]
+        by = [(at, differences(off, both, 0)), (theta, differences(off, both, 1))]
+        add(misfit, slope, size, off(*both), by)
+    add(misfit, slope, size, x[theta] / asked.stds, [(theta, np.diag(1.0 / asked.stds))])
     for number, (place, (xx, xy, yy)) in enumerate(zip(*history.known, strict=True)):
         at = slice(first + 2 * number, first + 2 * number + 2)
         root = np.linalg.cholesky(np.array([[xx, xy], [xy, yy]])).T
@@ -45,25 +57,46 @@ def hear(history, x, k, m, into):
     (slot, caller, *_), numbers = history.rows.entries(0)[m], history.rows.entries(1)[m]
     if history.index[slot] == 0:
         return
-    pose = slice(3 * k, 3 * k + 3)
-    point, (dx, dy) = place_of(history, slot), x[place_of(history, slot)] - x[pose][:2]
-    bearing, distance, excess_path, across, along, sure = numbers[:6]
-    d = np.hypot(dx, dy)
+    bearing, distance, excess_path, across, along, sure, _, lean = numbers
+    theta = slice(3 * history.nodes + 2 * len(history.placed), x.size)
+    ends = [slice(3 * k, 3 * k + 3), place_of(history, slot), theta]
+
+    def seen(pose, point, parameters):
+        at, heading, scale, leaning = sensor(history.calibration, pose, parameters)
+        dx, dy = point - at
+        turned = np.arctan2(dy, dx) - heading - np.nan_to_num(lean) * leaning
+        off = [wrap(turned - bearing) / across, (np.hypot(dx, dy) / scale - distance) / along]
+        return np.array(off)[[np.isfinite(bearing), np.isfinite(bearing) and np.isfinite(distance)]]
+
+    def further(pose, point, parameters, call):
+        at, _, scale, _ = sensor(history.calibration, pose, parameters)
+        way = np.hypot(*(call - point)) + np.hypot(*(point - at)) - np.hypot(*(call - at))
+        return np.array([(way / scale - excess_path) / sure])
+
     if np.isfinite(bearing):
-        off = wrap(np.arctan2(dy, dx) - x[pose][2] - bearing) / across
-        by = np.array([-dy, dx]) / d**2 / across
-        add(*into, x.size, [off], [(point, by[None]), (pose, np.append(-by, -1.0 / across)[None])])
-    if np.isfinite(bearing) and np.isfinite(distance):
-        by = np.array([dx, dy]) / d / along
-        parts = [(point, by[None]), (pose, np.append(-by, 0.0)[None])]
-        add(*into, x.size, [(d - distance) / along], parts)
+        by_all(seen, x, ends, into)
     if caller >= 0 and history.index[caller] != 0:
-        call = place_of(history, caller)
-        onward, straight = x[call] - x[point], x[call] - x[pose][:2]
-        w, v, u = onward / np.hypot(*onward), straight / np.hypot(*straight), np.array([dx, dy]) / d
-        off = (np.hypot(*onward) + d - np.hypot(*straight) - excess_path) / sure
-        by = (point, u - w), (call, w - v), (pose, np.append(v - u, 0.0))
-        add(*into, x.size, [off], [(at, part[None] / sure) for at, part in by])
+        by_all(further, x, [*ends, place_of(history, caller)], into)
+
+
+def sensor(calibration, pose, parameters):
+    """Return place and heading of the sensor, the sound's scale, and what bearings lean by."""
+    (sound, turned, place), (c, s) = calibration.sensor - 1, (np.cos(pose[2]), np.sin(pose[2]))
+    off, heading, scale, lean = np.zeros(2), pose[2], 1.0, 0.0
+    if place >= 0:
+        off = np.array([[c, -s], [s, c]]) @ parameters[place : place + 2]
+    if turned >= 0:
+        heading = heading + parameters[turned]
+    if sound >= 0:
+        scale, lean = 1.0 + parameters[sound], parameters[sound] + parameters[sound + 1]
+    return pose[:2] + off, heading, scale, lean
+
+
+def by_all(function, x, ends, into):
+    """Add what a function of parts of the unknowns is off, and its derivatives by each."""
+    values = [x[at] for at in ends]
+    by = [(at, differences(function, values, e)) for e, at in enumerate(ends)]
+    add(*into, x.size, function(*values), by)
 
 
 def place_of(history, slot):
@@ -94,11 +127,15 @@ def odometry(ends, mean, k):
     return np.array([along * x + half * y, along * y - half * x, 2.0 * half])
 
 
-def differences(ends, mean, k, h=1e-3):
-    """Return the derivatives of `odometry`, to the fourth power of h."""
+def differences(function, values, which, h=1e-3):
+    """Return the derivatives of a function by one of its arguments, to the fourth power of h."""
 
     def apart(step):
-        return odometry(ends + step, mean, k) - odometry(ends - step, mean, k)
+        there, back = list(values), list(values)
+        there[which], back[which] = values[which] + step, values[which] - step
+        return function(*there) - function(*back)
 
-    steps = h * np.eye(len(ends))
+    if not values[which].size:
+        return np.zeros((len(function(*values)), 0))
+    steps = h * np.eye(values[which].size)
     return np.array([(8.0 * apart(e) - apart(2.0 * e)) / (12.0 * h) for e in steps]).T

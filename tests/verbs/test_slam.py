@@ -212,7 +212,7 @@ def test_slam_takes_the_settings_of_fastslam_from_flags_and_files_and_keeps_them
     stages = [line[:17].strip() for line in said.splitlines() if "frames/s" in line]
     assert stages == ["fused ekf", "fused fastslam"]
     kept = tomllib.loads(Path("2/config.toml").read_text())
-    assert list(kept) == ["seed", "listening", "association", "filter", "rays", "fastslam"]
+    assert list(kept) == ["seed", "listening", "association", "filter", "prior", "rays", "fastslam"]
     swarm = {"particles": 9, "resample_below": 0.5, "mixture": "exact", "weights": "marginal"}
     assert kept["fastslam"] == swarm | {"resampled_rays": "kept"}
     words = ("--filter", "both", "--config", "2/config.toml", "--quiet")

@@ -63,11 +63,11 @@ def average_faces(
     the mean delay; the excess path, of another's, c times what the mean delay has over that of its
     direct call. What comes while the direct call still lasts has none: it was heard with it. The
     standard deviations are what the signal tells, and what no level removes (first line). The
-    slope of a bearing by the speed of sound is the mean over the faces that heard it (second line;
-    a face hears :math:`\sin\theta` as c times a phase):
+    slope of a bearing by the speed of sound is the mean of the faces' own (second line; a face
+    hears :math:`\sin\theta` as c times a phase):
 
     .. math:: \sigma^2 &= \sigma_{signal}^2 + \sigma_{floor}^2 \\
-              d\phi / d \ln c &= \overline{\tan\theta}
+              d\phi / d \ln c &= \sum w \tan\theta / \sum w
 
     `time` [s]; `detections`: (d) rows; `label`: of each detection, or UNLABELLED; `speed_of_sound`
     [m/s]; `callers`: labels of the callers as landmarks, where they are known.
@@ -149,7 +149,7 @@ def _average(
 
     Returns label, caller and numbers of each pair that occurs.
     """
-    found, direct, metres = Columns(*detections), DirectCalls(*calls), 0.5 * speed_of_sound
+    found, direct = Columns(*detections), DirectCalls(*calls)
     faces = callers = 0
     for d in range(label.size):
         faces, callers = max(faces, found.face[d] + 1), max(callers, found.caller[d] + 1)
@@ -179,18 +179,31 @@ def _average(
                 floor = BEARING_FLOOR[0] if p == OWN else BEARING_FLOOR[1]
                 numbers[BEARING_STD, row] = math.hypot(math.sqrt(across) / total, floor)
                 delay, spread = late / total, math.sqrt(along) / total
-                if p == OWN:
-                    numbers[RANGE, row] = metres * delay
-                    numbers[RANGE_STD, row] = math.hypot(metres * spread, RANGE_FLOOR)
-                else:
-                    apart, spread = _after(direct, p, delay, spread)
-                    apart, spread = speed_of_sound * apart, speed_of_sound * spread
-                    numbers[EXCESS_PATH, row] = apart
-                    numbers[EXCESS_PATH_STD, row] = math.hypot(spread, EXCESS_PATH_FLOOR)
+                delay = _after(direct, p, delay, spread) if p != OWN else (delay, spread)
+                _write_way(numbers, row, p == OWN, delay, speed_of_sound)
                 numbers[SLOPE, row] = slope / total
                 numbers[LEVEL, row] = 10.0 * math.log10(loudest)
                 row += 1
     return landmark[:row], caller[:row], numbers[:, :row].copy()
+
+
+@kernel
+def _write_way(
+    numbers: Float[np.ndarray, "8 m"],
+    row: Whole,
+    own: bool,
+    delay: tuple[float, float],
+    speed_of_sound: float,
+) -> None:
+    """Write the range of the vehicle's own call by its delay, the excess path of another's."""
+    late, spread = delay
+    if own:
+        metres = 0.5 * speed_of_sound
+        numbers[RANGE, row] = metres * late
+        numbers[RANGE_STD, row] = math.hypot(metres * spread, RANGE_FLOOR)
+    else:
+        numbers[EXCESS_PATH, row] = speed_of_sound * late
+        numbers[EXCESS_PATH_STD, row] = math.hypot(speed_of_sound * spread, EXCESS_PATH_FLOOR)
 
 
 @kernel

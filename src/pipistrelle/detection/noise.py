@@ -15,6 +15,7 @@ from pipistrelle.detection.scans import (
     BEARING_STD,
     EXCESS_PATH_STD,
     RANGE_STD,
+    SLOPE,
     Scan,
     with_columns,
     without_excess_paths,
@@ -82,7 +83,8 @@ def without_hidden(scan: Scan, settings: FilterConfig, *, timing: bool) -> Scan:
     ----------
     scan : Scan
     settings : FilterConfig
-        With "constant" noise standard deviations are hidden.
+        With "constant" noise standard deviations are hidden, and the slopes of bearings unless the
+        speed of sound is to be calibrated.
     timing : bool
         False: excess paths are hidden.
 
@@ -91,6 +93,10 @@ def without_hidden(scan: Scan, settings: FilterConfig, *, timing: bool) -> Scan:
     Scan
     """
     seen = scan if timing else without_excess_paths(scan)
+    if "speed_of_sound" not in settings.calibrate:
+        numbers = seen.numbers.copy()
+        numbers[SLOPE] = math.nan
+        seen = replace(seen, numbers=numbers)
     return unstated(seen) if settings.noise == "constant" else seen
 
 

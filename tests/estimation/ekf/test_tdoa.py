@@ -254,7 +254,7 @@ def final_nees(factor, runs=40):
             beamwidth=0.0, hearing=30.0, **noise,
         )  # fmt: skip
         mission = timed(mission, (1,), rng, std=0.1, **SOME)
-        told = np.array([1, 1, 1, 1, 1, factor, 1])[:, None]
+        told = np.array([1, 1, 1, 1, 1, factor, 1, 1])[:, None]
         scans = [replace(scan, numbers=scan.numbers * told) for scan in mission.scans]
         rays = ray_config(power=8.0, prune=1e-9)
         slam = paper_filter(InvariantEkfSlam, motion=STEADY, rays=rays, **noise)

@@ -99,7 +99,7 @@ def test_where_it_will_be_is_where_it_is_believed_once_the_vehicle_has_gone_on(r
     leg = smoother().predict(beliefs[first + 1], mission.controls[0], mission.dt[0])[0]
     unknown = rows_of(mission.scans[0], np.array([0]))
     new = replace(unknown, landmark=np.array([77]))  # it waits, and only the leg enters
-    new = replace(new, numbers=np.where(np.arange(7)[:, None] == 0, 0.3, unknown.numbers))
+    new = replace(new, numbers=np.where(np.arange(8)[:, None] == 0, 0.3, unknown.numbers))
     new.numbers[[1, 2]] = np.nan
     gone = smoother().update(leg, new)
     before, after = leg.moving(), gone.moving()

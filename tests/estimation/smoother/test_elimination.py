@@ -81,7 +81,7 @@ def test_the_optimum_is_that_of_dense_normal_equations(strategy, callers):
     """A step that no longer lowers the cost by what can be told is not taken: landmarks show it."""
     belief = last_belief(strategy, 4, frames=30, callers=callers)
     ours = settled(belief)
-    poses, places, cost = dense_smoothing.solved(belief)
+    poses, places, _, cost = dense_smoothing.solved(belief)
     off = poses_of(ours) - poses
     off[:, 2] = wrap(off[:, 2])
     assert np.abs(off).max() < 1e-9

@@ -19,7 +19,6 @@ from reference.missions import BICYCLE, CIRCLE, STEP
 from reference.odometry import as_motions, by_poses
 
 
-
 def leg_of(motion, controls, dt, before=None):
     """The odometry of control steps."""
     return extended(before or no_odometry(), motion, np.array(controls, float), dt)
@@ -31,7 +30,8 @@ def between(ends, joint, leg):
     if not leg.moves():
         noise[1] = 0.0
     rows = np.zeros((2, 2), np.int64)
-    legs = np.stack([np.zeros(3), leg.mean[-1]]), noise, np.zeros(2), rows, np.zeros((2, 3, 0))
+    legs = np.stack([np.zeros(3), leg.mean[-1]]), noise, np.zeros(2), rows
+    legs = *legs, np.zeros((2, 3, 0)), np.zeros(1, np.int64)
     count = np.array([[0, 0], [0, len(leg.mean)]])
     nodes = ends.copy(), np.stack([joint[:3, :3], joint[3:, 3:]])
     cross = np.stack([np.zeros((3, 3)), joint[3:, :3]])

@@ -212,6 +212,14 @@ OTHERS = {
     "filter.initial_pose_std": [0.1, 0.1, 0.1],
     "filter.first_pose": "drawn",
     "filter.gate": 0.05,
+    "filter.calibrate": ["speed_scale", "turn_bias"],
+    "filter.window": 3.0,
+    "prior.speed_scale_std": 0.01,
+    "prior.turn_bias_std": 0.001,
+    "prior.wheelbase_std": 0.3,
+    "prior.speed_of_sound_std": 1.0,
+    "prior.sensor_heading_std": 0.01,
+    "prior.sensor_place_std": 0.5,
     "rays.ratio": 0.2,
     "rays.density": 2.0,
     "rays.range_bounds": [1.0, 15.0],
@@ -232,7 +240,7 @@ OTHERS = {
 FEW = ("air.spreading", "target.shape", "emitter.radius", "beacon.level_db", "receiver.elements",
        "detection.peak_db", "matching.bearing_gate", "motion.speed_std", "scenario.landmarks",
        "assumed.wheelbase", "listening.timing", "callers",
-       "filter.range_std", "rays.power", "fastslam.particles", "seed")  # fmt: skip
+       "filter.range_std", "prior.wheelbase_std", "rays.power", "fastslam.particles", "seed")  # fmt: skip
 """One of each section."""
 
 
@@ -253,6 +261,13 @@ NEEDS = {
     "filter.caller_speed_std": ROAMING,
     "filter.caller_walk_std": ROAMING,
     "filter.robust": {"filter": {"noise": "measured"}},
+    "filter.window": {"scenario": {"steps": 640}},
+    "prior.speed_scale_std": {"filter": {"calibrate": ["speed_scale"]}},
+    "prior.turn_bias_std": {"filter": {"calibrate": ["turn_bias"]}},
+    "prior.wheelbase_std": {"filter": {"calibrate": ["wheelbase"]}},
+    "prior.speed_of_sound_std": {"filter": {"calibrate": ["speed_of_sound"]}},
+    "prior.sensor_heading_std": {"filter": {"calibrate": ["sensor_heading"]}},
+    "prior.sensor_place_std": {"filter": {"calibrate": ["sensor_place"]}},
     "rays.spacing": {"filter": {"bearing_std": 0.003}},
     "rays.merge": {"scenario": {"steps": 80}},
     "assumed.angular_rate_std": {"motion": {"model": "unicycle"}},
@@ -260,11 +275,11 @@ NEEDS = {
 """What a setting means something with."""
 
 
-def plan_with(config, setting="", values=()):
+def plan_with(config, setting="", values=(), filters=("ekf", "fastslam")):
     """A plan of one world, in which a setting may vary."""
     grid, ways = (
         {setting: values} if setting else {},
-        {"strategies": ("fused",), "filters": ("ekf", "fastslam")},
+        {"strategies": ("fused",), "filters": filters},
     )
     return Plan(name="one", iterations=1, config=config, grid=grid, **ways)
 
@@ -295,8 +310,13 @@ def test_values_of_a_grid_are_heard_and_tried_as_they_are_alone(setting):
     for name in key:
         usual = usual[name]
     values = (usual, OTHERS[setting])
-    alone = [found_in(plan_with(resolve(short | {key: Given(value, setting)}))) for value in values]
-    assert found_in(plan_with(resolve(short), setting, values)) == alone[0] + alone[1]
+    smoothers = key[0] == "prior" or key[1:] in (("calibrate",), ("window",))
+    tried = {"filters": ("smoother",) if smoothers else ("ekf", "fastslam")}
+    alone = [
+        found_in(plan_with(resolve(short | {key: Given(value, setting)}), **tried))
+        for value in values
+    ]
+    assert found_in(plan_with(resolve(short), setting, values, **tried)) == alone[0] + alone[1]
     assert alone[0] != alone[1], "or nothing is proved"
 
 

@@ -25,9 +25,9 @@ from pipistrelle.refusals import refusal
 
 MEASUREMENT = ("time", "landmark", "bearing", "range")
 """What is said of a measurement: when it was made, and the columns of its scan."""
-STATED = ("bearing_std", "range_std", "excess_path", "excess_path_std")
-"""What may be said besides: how surely it was measured, and how much later than the direct call it
-came, as a way of sound."""
+STATED = ("bearing_std", "range_std", "excess_path", "excess_path_std", "bearing_slope")
+"""What may be said besides: how surely it was measured, how much later than the direct call it
+came, as a way of sound, and how the bearing hangs on the speed of sound."""
 CALLER = "caller"
 """Whose call it was, where it was not the vehicle's own: a number, from 1 on."""
 

@@ -28,6 +28,7 @@ _BOUNDS = {
     "range_std": ("m", LEAST_STD, FARTHEST),
     "excess_path": ("m", 0.0, FARTHEST),
     "excess_path_std": ("m", LEAST_STD, FARTHEST),
+    "bearing_slope": ("rad", -FASTEST, FASTEST),
     "radius": ("m", 1.0 / LARGEST, LARGEST),
     "velocity": ("m/s", -FASTEST, FASTEST),
     "speed": ("m/s", -FASTEST, FASTEST),

@@ -82,7 +82,7 @@ def calibration_of(config: Config, motion: Motion) -> Calibration:
     """
     asked, about, sound = (
         set(config.filter.calibrate),
-        config.calibration,
+        config.prior,
         config.assumed_sound_speed,
     )
     if "wheelbase" in asked and motion.model != "bicycle":

@@ -49,7 +49,8 @@ def transition(
         work.by[2, e] = legs.slopes[k, 2, e]
     if legs.scale[0] > 0:
         scale = 1.0 + points[1][legs.scale[0]]
-        work.by[0, 0], work.by[1, 0] = dx / scale, dy / scale
+        work.by[0, 0] += (c * off[0] - s * off[1]) / scale
+        work.by[1, 0] += (s * off[0] + c * off[1]) / scale
         _stretch(legs.noise[k], scale, work.A)
         cost = _odometry(work.A, off, (c, s), u, Q)
     else:

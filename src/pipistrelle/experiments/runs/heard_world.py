@@ -36,9 +36,9 @@ from pipistrelle.experiments.hearing.trajectories import motion_of
 from pipistrelle.experiments.results.scores import drive_bound
 from pipistrelle.geometry import wrap_angle
 
-_NOISE = ("noise", "range_std", "bearing_std", "excess_path_std")
+_NOISE = ("noise", "range_std", "bearing_std", "excess_path_std", "calibrate")
 _CALLERS = ("caller_speed_std", "caller_walk_std")
-"""Settings of a filter that state noise: of what is heard, and of how callers move."""
+"""Settings of a filter that say what it is told: of what is heard, and of how callers move."""
 _Key = tuple[float, Strategy, FilterConfig, ListeningConfig, AssociationConfig]
 """Piston radius [m], strategy, and settings of noise, listening and association."""
 _LABELS = {"association": AssociationConfig(method=KNOWN)}

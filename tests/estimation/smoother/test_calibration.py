@@ -1,0 +1,186 @@
+"""What a vehicle does not know of itself: against dense normal equations, and found from drives."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipistrelle.config import PARAMETERS, Config, FilterConfig, InputError, PriorConfig
+from pipistrelle.detection.scans import with_columns
+from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.motion import Motion, motion_step
+from pipistrelle.estimation.smoother.calibration import NOTHING, calibration_of
+from pipistrelle.estimation.smoother.chain import converged, relinearised, smoothed
+from pipistrelle.estimation.smoother.filter import Smoother
+from pipistrelle.estimation.smoother.history import in_hindsight
+from pipistrelle.estimation.smoother.preintegration import extended, no_odometry
+from pipistrelle.geometry import wrap
+from reference import dense_smoothing
+from reference.missions import (
+    BICYCLE,
+    CIRCLE,
+    SENSING,
+    START,
+    draw_mission,
+    followed,
+    measured_to,
+    paper_mission,
+    ray_config,
+    scattered,
+    steady,
+)
+from reference.odometry import by_poses
+from reference.timing import timed
+
+MOTIONS = [BICYCLE, Motion(model="unicycle", control_std=(0.1, 0.1)), by_poses(BICYCLE)]
+
+
+def asking(*names, motion=BICYCLE, **stds):
+    """A calibration of parameters."""
+    config = Config(filter=FilterConfig(calibrate=names), prior=PriorConfig(**stds))
+    return calibration_of(config, motion)
+
+
+def smoother(*names, motion=BICYCLE, **changes):
+    return Smoother(
+        motion=motion, rays=ray_config(), calibration=asking(*names, motion=motion), **changes
+    )
+
+
+def mission_of(strategy, seed=4, frames=30, callers=(13, 45), std=1.0):
+    """A drive with excess paths, and bearings that lean with the speed of sound."""
+    rng, stds = np.random.default_rng(seed), {"range_std": 0.05 * std, "bearing_std": 0.01 * std}
+    mission = draw_mission(
+        rng, BICYCLE, START, scattered(rng, 50), steady(CIRCLE, frames), **SENSING[strategy], **stds
+    )
+    mission = replace(mission, scans=[measured_to(scan, **stds) for scan in mission.scans])
+    if callers:
+        mission = timed(mission, callers, rng, std=0.05 * std)
+    scans = [
+        with_columns(scan, bearing_slope=rng.uniform(-2.0, 2.0, scan.landmark.size))
+        for scan in mission.scans
+    ]
+    return replace(mission, scans=scans)
+
+
+@pytest.mark.parametrize("strategy", SENSING)
+@pytest.mark.parametrize(
+    "names",
+    [PARAMETERS, ("speed_scale", "speed_of_sound"), ("speed_scale",), ("sensor_place",)],
+    ids=lambda names: "+".join(names),
+)
+def test_the_optimum_is_that_of_dense_normal_equations(strategy, names):
+    slam = smoother(*names)
+    *_, (belief, _) = followed(slam, mission_of(strategy, frames=20))
+    history = in_hindsight(belief.history)
+    ours = converged(belief.solution, belief.history, belief.noise)
+    for _ in range(30):
+        ours = relinearised(ours, history, belief.noise, 0.0)
+    poses, places, parameters, cost = dense_smoothing.solved(belief)
+    known = smoothed(ours, belief.history)
+    off = known.states - poses
+    off[:, 2] = wrap(off[:, 2])
+    about = np.sqrt(np.diagonal(known.covariance, axis1=1, axis2=2))
+    assert np.abs(off / about).max() < 1e-5
+    assert ours.cost == pytest.approx(cost, rel=1e-9)
+    assert np.abs(known.places - places).max() < 1e-4
+    stds = np.sqrt(known.parameter_covariance.diagonal())
+    assert np.abs((known.parameters - parameters) / stds).max() < 1e-5
+    x = np.concatenate([poses.ravel(), places.ravel(), parameters])
+    _, J = dense_smoothing.misfits(belief.history, x)
+    expected = np.linalg.inv(J.T @ J)[-stds.size :, -stds.size :]
+    np.testing.assert_allclose(known.parameter_covariance, expected, rtol=1e-4, atol=1e-12)
+
+
+@pytest.mark.parametrize("motion", MOTIONS, ids=lambda motion: motion.model)
+def test_slopes_of_a_leg_are_its_derivatives(motion):
+    """By differences of steps that are led otherwise."""
+    names = [name for name in PARAMETERS[:3] if name != "wheelbase" or motion is BICYCLE]
+    codes = asking(*names, motion=motion).odometry
+    controls, dt = np.tile([0.7, 0.3, 0.2][: len(motion.control_std)], (5, 1)), np.full(5, 0.3)
+    slopes = extended(no_odometry(codes.size), motion, controls, dt, codes).slopes[-1]
+
+    def led(name, size):
+        other, steered = motion, controls.copy()
+        if name == "speed_scale":
+            steered[:, : 2 if motion.model == "poses" else 1] *= 1.0 + size
+        elif name == "turn_bias":
+            steered[:, -1] += size * (0.3 if motion.model == "poses" else 1.0)
+        else:
+            other = replace(motion, wheelbase=motion.wheelbase * (1.0 + size))
+        pose = np.zeros(3)
+        for control in steered:
+            pose = motion_step(other, pose, control, 0.3)
+        return pose
+
+    for e, name in enumerate(names):
+        expected = (led(name, 1e-6) - led(name, -1e-6)) / 2e-6
+        np.testing.assert_allclose(slopes[:, e], expected, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("strategy", ["active", "fused"])
+def test_a_sensor_that_is_turned_and_stands_aside_is_found(strategy):
+    """Odometry tells where the vehicle heads; an arc tells how far the sensor is from its point."""
+    mission = mission_of(strategy, frames=120, std=0.2)
+    turned = [with_columns(scan, bearing=wrap(scan.bearing - 0.05)) for scan in mission.scans]
+    slam = smoother("sensor_heading", "sensor_place")
+    *_, (belief, _) = followed(slam, replace(mission, scans=turned))
+    found = belief.calibration()
+    value, std = found["sensor_heading"]
+    assert abs(value - 0.05) < 3.0 * std
+    assert std < 0.02
+    for name in ("sensor_place_x", "sensor_place_y"):
+        value, std = found[name]
+        assert abs(value) < 3.0 * std
+
+
+def test_a_speed_of_sound_is_found_by_odometry_and_by_bearings():
+    mission = mission_of("active", frames=100, callers=(), std=0.2)
+    scale = 345.0 / 340.0
+    heard = [
+        with_columns(
+            scan,
+            range=scan.range / scale,
+            bearing=wrap(scan.bearing - scan.bearing_slope * (scale - 1.0)),
+        )
+        for scan in mission.scans
+    ]
+    config = Config(
+        filter=FilterConfig(calibrate=("speed_of_sound",)), assumed={"speed_of_sound": 340.0}
+    )
+    slam = replace(smoother(), calibration=calibration_of(config, BICYCLE))
+    *_, (belief, _) = followed(slam, replace(mission, scans=heard))
+    value, std = belief.calibration()["speed_of_sound"]
+    assert abs(value - 345.0) < 3.0 * std
+    assert std < 1.5
+
+
+def test_what_says_nothing_of_a_parameter_leaves_its_prior():
+    *_, (belief, _) = followed(smoother("speed_of_sound"), paper_mission("passive", frames=20))
+    value, std = belief.calibration()["speed_of_sound"]
+    assert (value, std) == (pytest.approx(343.0, abs=0.2), pytest.approx(10.0, rel=1e-3))
+
+
+def test_predicted_poses_know_that_the_odometry_is_calibrated():
+    """With a wide prior of the turn's bias, the heading after a way without a scan is unsure."""
+    start = Gaussian(mean=np.zeros(3), covariance=1e-6 * np.eye(3))
+    ahead = np.tile([0.75, 0.0], (40, 1)), np.full(40, 0.125)
+    slam, plain = smoother("turn_bias"), smoother()
+    _, unsure = slam.predict(slam.init(start), *ahead)
+    _, sure = plain.predict(plain.init(start), *ahead)
+    np.testing.assert_allclose(unsure.mean, sure.mean, rtol=0, atol=1e-12)
+    turn = 0.02 * 0.75 / BICYCLE.wheelbase * 5.0  # after 5 s
+    more = unsure.covariance[-1, 2, 2] - sure.covariance[-1, 2, 2]
+    assert more == pytest.approx(turn**2, rel=1e-6)
+
+
+def test_without_parameters_nothing_is_calibrated():
+    *_, (belief, _) = followed(smoother(), paper_mission("fused", frames=5))
+    assert belief.calibration() == {}
+    assert belief.history.calibration is not None
+    assert NOTHING.stds.size == 0
+
+
+def test_a_wheelbase_of_what_has_none_is_refused():
+    with pytest.raises(InputError, match=r"filter.calibrate: found \"wheelbase\" for a unicycle"):
+        asking("wheelbase", motion=MOTIONS[1])
