@@ -13,11 +13,12 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numpy as np
-from numba import njit
+from numba import config
 
 from pipistrelle import kernel_clock  # noqa: F401 - which listens from the first kernel on
 from pipistrelle.kernel_cache import checked
 from pipistrelle.kernel_folder import place_kernels
+from pipistrelle.kernel_linking import Kernel
 
 place_kernels()
 
@@ -32,8 +33,16 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 def _compiler(**options: bool | str) -> Callable[[_Function], _Function]:
     """Return a decorator that compiles, and keeps what it compiled in checked files."""
-    compiled: Any = njit(cache=True, error_model="numpy", no_cfunc_wrapper=True, **options)  # pyrefly: ignore[no-matching-overload]
-    return lambda function: checked(compiled(function))
+    options |= {"nopython": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+
+    def compiled(function: Any) -> Any:
+        if config.DISABLE_JIT:  # pyrefly: ignore[missing-attribute]
+            return function
+        dispatcher = Kernel(function, options)
+        dispatcher.enable_caching()
+        return checked(dispatcher)
+
+    return compiled
 
 
 kernel = _compiler()
