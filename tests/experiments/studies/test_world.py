@@ -240,7 +240,8 @@ OTHERS = {
 FEW = ("air.spreading", "target.shape", "emitter.radius", "beacon.level_db", "receiver.elements",
        "detection.peak_db", "matching.bearing_gate", "motion.speed_std", "scenario.landmarks",
        "assumed.wheelbase", "listening.timing", "callers",
-       "filter.range_std", "prior.wheelbase_std", "rays.power", "fastslam.particles", "seed")  # fmt: skip
+       "filter.range_std", "prior.wheelbase_std", "rays.power", "fastslam.particles",
+       "seed")  # fmt: skip
 """One of each section."""
 
 
