@@ -3,6 +3,8 @@
 from pathlib import Path
 
 import numpy as np
+import polars
+import pytest
 
 from reference.command_line import SHORT, summary, track
 
@@ -38,3 +40,44 @@ def test_a_filter_that_revises_nothing_has_one_track(obey, undrawn):
     obey("run", *SHORT, "--filter", "ekf", "--strategy", "fused", "--quiet", "-o", "one")
     assert not list(Path("one").glob("*_online.tum"))
     assert "online" not in summary("one")["runs"][0]
+
+
+def test_what_is_calibrated_is_told_in_the_table_and_in_the_summary(obey, undrawn):
+    words = ("--filter", "smoother", "--strategy", "active", "--scenario.steps", "80")
+    asked = ("--filter.calibrate", "speed_scale", "sensor_place")
+    status, printed, _ = obey("run", *words, *asked, "-o", "out")
+    assert status == 0
+    (run,) = summary("out")["runs"]
+    numbers = ("speed_scale", "sensor_place_x", "sensor_place_y")
+    assert [*run["calibration"]] == [one for name in numbers for one in (name, f"{name}_std")]
+    assert run["calibration"]["speed_scale"] == pytest.approx(1.0, abs=0.3)
+    rows = {line[:32].strip(): line[32:].split() for line in printed.splitlines()}
+    assert rows["speed scale"] == [f"{run['calibration']['speed_scale']:.5g}"]
+    assert rows["sensor place x, 1 sigma"] == [f"{run['calibration']['sensor_place_x_std']:.2g}"]
+
+
+def test_a_filter_that_calibrates_nothing_refuses_to(obey):
+    status, _, said = obey("run", "--filter", "ekf", "--filter.calibrate", "speed_scale")
+    assert status == 2
+    assert "filter.calibrate: found speed_scale with the filter ekf" in said
+    assert "take smoother" in said
+
+
+def test_a_parameter_that_there_is_not_is_refused(obey):
+    status, _, said = obey("run", "--filter", "smoother", "--filter.calibrate", "gravity")
+    assert status == 2
+    assert "gravity" in said
+    assert "speed_scale" in said
+
+
+def test_a_study_has_columns_of_what_is_calibrated(obey):
+    Path("plan.toml").write_text(
+        'format = 1\nname = "own"\niterations = 1\nfilters = ["smoother", "ekf"]\n'
+        'strategies = ["active"]\n[config]\nscenario.steps = 40\n'
+        '[own.smoother]\nfilter.calibrate = ["turn_bias"]\n'
+    )
+    status, *_ = obey("study", "plan.toml", "-o", "out")
+    assert status == 0
+    trials = polars.read_parquet("out/trials/*.parquet").sort("case")
+    assert trials["turn_bias_std"].is_null().to_list() == [False, True]
+    assert 0.0 < trials["turn_bias_std"][0] <= 0.02
