@@ -73,9 +73,9 @@ def setting_flags(
         value = own.get(key, field.default)
         default = value if isinstance(value, tuple) else (value,)
         texts = [str(item).lower() if isinstance(item, bool) else str(item) for item in default]
-        settled = "" if value is None else f"[default: {' '.join(texts)}]"
-        words = f"{field.description or ''} {settled}"
-        flag = Parameter(help=" ".join(words.split()), show=shown(key), negative=())
+        settled = "" if value is None else f"[default: {' '.join(texts) or 'none'}]"
+        words = " ".join(f"{field.description or ''} {settled}".split())
+        flag = Parameter(help=words, show=shown(key), negative=(), consume_multiple=True)
         kind: Any = Whole if field.annotation is int else _unbounded(field.annotation)
         if key == CALLERS:
             kind = Annotated[Any, Parameter(converter=_as_written, n_tokens=1, metavar="TABLES")]
