@@ -211,18 +211,18 @@ class Smoother:
 
     def _heard(self, before: History, here: Sweep, estimate: Solution) -> tuple[History, Solution]:
         """Return history and solution with the last frame's measurements and what they place."""
-        history, heard, late = before, slots_heard(before), False
-        if (here.places[0][heard] == 0).any():
+        history = before
+        if (here.places[0][slots_heard(before)] == 0).any():
             history = _placed(before, here, estimate)
         if history is not before:
             here.admit(history)
-            new = np.arange(len(before.placed), len(history.placed))
-            late = bool((history.met[new] < history.nodes - 1).any())
+        new = np.arange(len(before.placed), len(history.placed))
+        late = bool((history.met[new] < history.nodes - 1).any()) if new.size else False
         if late:
             first = int(history.entering[new].min())
             solution = eliminated(history, self.noise, here.points, here.stretches, first)
         else:
-            here.join(np.arange(len(before.placed), len(history.placed)))
+            here.join(new)
             here.hear()
             solution = here.solved()
         for _ in range(ENTERING_PASSES if late else 1):

@@ -179,14 +179,12 @@ def _write_leg(legs: Arrays, steps: Arrays, led: Led, span: tuple[Whole, Whole, 
         )
     ends[k, 0], ends[k, 1], seconds[k] = first, last, took
     mean[k], noise[k], slopes[k] = 0.0, 0.0, 0.0
-    if count:
-        way, about = led[0][count - 1], led[1][count - 1]
-        for a in range(3):
-            moved = moved or way[a] != 0.0
-            for b in range(3):
-                moved = moved or about[a, b] != 0.0
+    for a in range(3 if count else 0):
+        moved = moved or led[0][count - 1, a] != 0.0
+        for b in range(3):
+            moved = moved or led[1][count - 1, a, b] != 0.0
     if moved:
-        mean[k], noise[k], slopes[k] = way, about, led[2][count - 1]
+        mean[k], noise[k], slopes[k] = led[0][count - 1], led[1][count - 1], led[2][count - 1]
         for a in range(3):
             noise[k, a, a] += SMALLEST_STD * SMALLEST_STD
 
