@@ -34,7 +34,7 @@ from pipistrelle.estimation.beliefs import Track, placed
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.motion import Motion, motion_jacobians, motion_step
 from pipistrelle.estimation.smoother.belief import SmootherBelief
-from pipistrelle.estimation.smoother.chain import eliminated
+from pipistrelle.estimation.smoother.stack import Stack
 from pipistrelle.evaluation.accuracy import position_error, rmse
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive
@@ -188,13 +188,13 @@ def whole_belief(config: Config, drive: Drive, scans: tuple[Scan, ...]) -> Smoot
 def smooth_at_once(belief: SmootherBelief, track: Track, every: int) -> float:
     """Solve all that a belief has heard from an EKF's track, and return the time it takes [s]."""
     began = time.process_time()
-    history, border = belief.history, belief.solution.border.copy()
+    history, points = belief.history, belief.solution.points
     at = np.ascontiguousarray(track.pose.mean[::every])
-    for label, place in places_of(track).items():
-        if label in history.placed:
-            column = 1 + 2 * history.placed.index(label)
-            border[column : column + 2] = place
-    solution = eliminated(history, belief.noise, at, border)
+    there = places_of(track)
+    known = zip(history.placed, points.spots, strict=True)
+    spots = np.array([there.get(label, spot) for label, spot in known])
+    start = replace(points, at=Stack((at,), len(at), [len(at)]), spots=spots)
+    solution = replace(belief.solution, points=start)
     replace(belief, solution=solution).path()
     return time.process_time() - began
 

@@ -11,7 +11,7 @@ import numpy as np
 from pipistrelle.geometry import wrap
 from reference.ekf_slam import moved
 
-SLACK, PRIOR_STD, BELIEVED = 1e-6, 20.0, 2.0
+SLACK, BELIEVED = 1e-6, 2.0
 
 
 class Everything:
@@ -19,7 +19,7 @@ class Everything:
 
     `legs` holds pairs of controls (k, 2) and durations (k); `rows` holds, of what was heard, the
     number of the leg at whose end it was (0: before any), label, bearing, range or NaN, and their
-    deviations; `priors` the place of each landmark about which it may be next to anywhere;
+    deviations; `priors` the place of each landmark and the deviation about it;
     `excess_paths`, of each, the number of the leg, the labels of landmark and caller, itself and
     its deviation.
     """
@@ -28,7 +28,9 @@ class Everything:
         self.start, self.robust, self.labels = start, robust, list(priors)
         self.rows = [row for row in rows if row[1] in priors]
         self.excess_paths = [one for one in excess_paths if one[1] in priors and one[2] in priors]
-        self.priors = np.array([priors[label] for label in self.labels]).reshape(-1, 2)
+        both = [priors[label] for label in self.labels]
+        self.priors = np.array([place for place, _ in both]).reshape(-1, 2)
+        self.widths = np.repeat([std for _, std in both], 2)
         self.legs, column = [], 3
         for controls, dt in legs:
             columns = slice(column, column + 2 * len(dt) + 3)
@@ -67,7 +69,7 @@ class Everything:
         yield root @ x[:3], root @ np.eye(3, self.size)
         yield x[3 : self.first], np.eye(self.size)[3 : self.first]
         far = x[self.first :] - self.priors.ravel()
-        yield far / PRIOR_STD, np.eye(self.size)[self.first :] / PRIOR_STD
+        yield far / self.widths, np.eye(self.size)[self.first :] / self.widths[:, None]
         mean, slope, ends = self.poses(x)
         for leg, label, bearing, distance, across, along in self.rows:
             pose, by_pose = mean[ends[leg]], slope[ends[leg]]

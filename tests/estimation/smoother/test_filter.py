@@ -89,7 +89,9 @@ def at_once(belief, mission, motion, start, *, robust=False):
         )
         if np.isfinite(excess_path)
     ]
-    entered = dict(zip(belief.history.placed, belief.history.known[0], strict=True))
+    places, information = belief.history.known
+    priors = zip(places, information[:, 0] ** -0.5, strict=True)
+    entered = dict(zip(belief.history.placed, priors, strict=True))
     legs = list(zip(mission.controls, mission.dt, strict=True))
     every = Everything(motion, start, legs, rows, entered, excess_paths=excess_paths, robust=robust)
     x = every.solved(every.begun({label: mission.landmarks[label - 1] for label in entered}))

@@ -58,8 +58,9 @@ from pipistrelle.estimation.smoother.records import Arrays
 from pipistrelle.estimation.smoother.stack import Stack
 from pipistrelle.estimation.smoother.sweep import Noise, Points, Solution, Sweep
 
-PRIOR_STD = 20.0
-"""Prior of a landmark about the place where it enters [m]."""
+PRIOR_STD, PRIOR_SHARE = 20.0, 0.1
+"""Prior of a landmark about the place where it enters [m]; or, if that is more, this share of the
+way so far: it must not hold the map of a long drive where dead reckoning has put it."""
 RELINEARISE_ABOVE = 0.1
 """How far the lines of a frame's measurements may be off, in standard deviations, before all is
 linearised anew (`linearity`)."""
@@ -257,5 +258,6 @@ def _placed(history: History, here: Sweep, estimate: Solution) -> History:
     standing = {label: place for (label, moves), place in new.items() if not moves}
     if not standing:
         return history
-    weak = np.tile([PRIOR_STD**-2, 0.0, PRIOR_STD**-2], (len(standing), 1))
+    known = max(PRIOR_STD, PRIOR_SHARE * history.way) ** -2
+    weak = np.tile([known, 0.0, known], (len(standing), 1))
     return with_places(history, [*standing], np.array([*standing.values()]), weak)

@@ -57,6 +57,8 @@ class History:
     """Prior knowledge of them: mean (l, 2), information xx, xy, yy (l, 3)."""
     leaves: Int[np.ndarray, " l"] = field(default_factory=lambda: np.empty(0, np.int64))
     """Stretches after which they leave the border, or NEVER."""
+    way: float = 0.0
+    """How far the vehicle has gone from node to node, by the odometry [m]."""
     ranged: bool = False
     """Whether a range or an excess path was heard."""
     callers: tuple[int, ...] = ()
@@ -161,6 +163,7 @@ def heard_more(history: History, odometry: Odometry, scan: Scan) -> History:
         rows=rows,
         latest=latest,
         heard=heard,
+        way=history.way + (math.hypot(*odometry.mean[-1, :2]) if len(odometry.mean) else 0.0),
         ranged=history.ranged or ranged,
     )
 
