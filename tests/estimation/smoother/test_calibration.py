@@ -174,6 +174,20 @@ def test_predicted_poses_know_that_the_odometry_is_calibrated():
     assert more == pytest.approx(turn**2, rel=1e-6)
 
 
+def test_steps_after_the_last_scan_are_led_by_what_was_calibrated_too():
+    """The path goes on from its last node as the belief predicts it, but for other points."""
+    slam, mission = smoother("speed_scale", "turn_bias"), mission_of("active", frames=60, std=0.2)
+    *_, (belief, _) = followed(slam, mission)
+    belief, ahead = slam.predict(belief, *(np.tile([0.75, 0.1], (8, 1)), np.full(8, 0.125)))
+    path = belief.path()
+    size = len(ahead.mean)
+    np.testing.assert_allclose(path.mean[-size:], ahead.mean, rtol=0, atol=2e-3)
+    scale = np.abs(ahead.covariance).max()
+    np.testing.assert_allclose(path.covariance[-size:], ahead.covariance, rtol=0, atol=0.03 * scale)
+    plain = replace(belief.odometry, slopes=0.0 * belief.odometry.slopes)
+    assert np.abs(belief.placed(plain, 0).mean - ahead.mean).max() > 5e-3
+
+
 def test_without_parameters_nothing_is_calibrated():
     *_, (belief, _) = followed(smoother(), paper_mission("fused", frames=5))
     assert belief.calibration() == {}

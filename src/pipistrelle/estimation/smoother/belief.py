@@ -65,18 +65,7 @@ class SmootherBelief:
     def placed(self, odometry: Odometry, first: int) -> Gaussian:
         """Return the poses after the steps of odometry from number ``first`` on."""
         parameters = self.history.calibration.odometry.size
-        if not parameters:
-            return placed(self.at, odometry, first)
-        estimate = self.solution.border[1 : 1 + parameters] + self.solution.beta[1 : 1 + parameters]
-        poses = placed(self.at, _corrected(odometry, estimate), first)
-        d, n = len(self.solution.state), self.solution.beta.size
-        by_chain, by_border = np.zeros((3 + parameters, d)), np.zeros((3 + parameters, n))
-        by_chain[:3, :3], by_border[3:, 1 : 1 + parameters] = np.eye(3), np.eye(parameters)
-        about = joint(self.solution.front, self.solution.factor, n, by_chain, by_border)
-        spread = poses.covariance + _by_parameters(
-            poses.mean, self.at.mean, odometry.slopes[first:], about
-        )
-        return replace(poses, covariance=spread)
+        return _placed(self.solution, self.at, odometry, first, parameters)
 
     def path(self) -> Gaussian:
         """Return the start and every control step so far, given all measurements so far."""
@@ -86,13 +75,14 @@ class SmootherBelief:
         nodes = mean, np.ascontiguousarray(known.covariance[:, :3, :3])
         cross, ends = np.ascontiguousarray(known.cross[:, :3, :3]), legs.entries(4)
         motion, led = self.history.motion, (steps.arrays[0], steps.arrays[1])
-        if parameters := self.history.calibration.odometry.size:
+        parameters = self.history.calibration.odometry.size
+        if parameters:
             known_now = known.parameters[:parameters]
             motion = motion[0] + (motion[4] * known_now).sum(axis=-1), *motion[1:]
             led = led[0] + (steps.arrays[2] * known_now).sum(axis=-1), led[1]
         poses, spread = poses_between(motion, ends, led, nodes, cross)
         last = Gaussian(mean=nodes[0][-1], covariance=nodes[1][-1])
-        since = placed(last, self.odometry)
+        since = _placed(self.best(), last, self.odometry, 0, parameters)
         return Gaussian(
             mean=np.concatenate([poses, since.mean]),
             covariance=np.concatenate([spread, since.covariance]),
@@ -171,6 +161,22 @@ class SmootherBelief:
                 for member, weight in _ray(pose, numbers[BEARING], numbers[BEARING_STD], self.rays)
             ]
         return rays
+
+
+def _placed(
+    solution: Solution, at: Gaussian, odometry: Odometry, first: int, parameters: int
+) -> Gaussian:
+    """Return the poses after steps of odometry from a solution's last pose, by its parameters."""
+    if not parameters:
+        return placed(at, odometry, first)
+    estimate = solution.border[1 : 1 + parameters] + solution.beta[1 : 1 + parameters]
+    poses = placed(at, _corrected(odometry, estimate), first)
+    d, n = len(solution.state), solution.beta.size
+    by_chain, by_border = np.zeros((3 + parameters, d)), np.zeros((3 + parameters, n))
+    by_chain[:3, :3], by_border[3:, 1 : 1 + parameters] = np.eye(3), np.eye(parameters)
+    about = joint(solution.front, solution.factor, n, by_chain, by_border)
+    more = _by_parameters(poses.mean, at.mean, odometry.slopes[first:], about)
+    return replace(poses, covariance=poses.covariance + more)
 
 
 def _corrected(odometry: Odometry, parameters: Float[np.ndarray, " q"]) -> Odometry:
