@@ -176,7 +176,8 @@ def test_predicted_poses_know_that_the_odometry_is_calibrated():
 
 def test_steps_after_the_last_scan_are_led_by_what_was_calibrated_too():
     """The path goes on from its last node as the belief predicts it, but for other points."""
-    slam, mission = smoother("speed_scale", "turn_bias"), mission_of("active", frames=60, std=0.2)
+    long = replace(BICYCLE, wheelbase=0.22)
+    slam, mission = smoother("wheelbase", motion=long), mission_of("active", frames=60, std=0.2)
     *_, (belief, _) = followed(slam, mission)
     belief, ahead = slam.predict(belief, *(np.tile([0.75, 0.1], (8, 1)), np.full(8, 0.125)))
     path = belief.path()
