@@ -6,7 +6,8 @@ No kernel is called from C, so none has a wrapper for it: a sixth of the time to
 
 A kernel takes eight arguments at most; what belongs together is a record, a NamedTuple. At its door
 a record costs a microsecond and a plain tuple nothing, so a kernel that is called for every frame
-is handed the columns as a tuple and makes the record of them itself, which is free.
+is handed the columns as a tuple and makes the record of them itself, which is free. None calls
+itself: those that are called are linked (`kernel_linking`), which recursion prevents.
 """
 
 from collections.abc import Callable

@@ -1,0 +1,114 @@
+"""Kernels that kernels call are linked: the same numbers as by Numba alone, and no code twice."""
+
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from numba import njit
+
+from pipistrelle.jit import kernel
+
+LINES = """
+import numpy as np
+from pipistrelle.jit import kernel
+
+@kernel
+def halved(x):
+    return 0.5 * x if x > 1.0 else x
+
+@kernel
+def rows(array):
+    found = np.empty(len(array))
+    for i in range(len(array)):
+        found[i] = halved(array[i]) + halved(array[i] * array[i])
+    return found
+"""
+SHOW = "print(rows(np.array([0.1, 3.0, np.inf])).tobytes().hex(), rows.stats.cache_hits)"
+
+
+@kernel
+def power(x: float, n: int) -> float:
+    """Be compiled for two types."""
+    product = 1.0
+    for _ in range(n):
+        product *= x
+    return product
+
+
+@kernel
+def filled(n: int, value: float) -> np.ndarray:
+    """Allocate, which needs Numba's counting of references."""
+    return np.full(n, value)
+
+
+@kernel
+def mixed(values: np.ndarray) -> tuple[float, np.ndarray]:
+    """Call the others."""
+    total, many = 0.0, filled(values.size, 0.1)
+    for i in range(values.size):
+        many[i] += math.sin(values[i]) / power(values[i], 3) + power(1, i)
+        total += many[i]
+    return total, many
+
+
+@kernel
+def refuses(n: int) -> int:
+    """Raise, which needs the kernel's own constants."""
+    if n < 0:
+        raise ValueError("a negative count")
+    return n
+
+
+@kernel
+def asks(n: int) -> int:
+    """Call what raises."""
+    return refuses(n) + 1
+
+
+def by_numba_alone(function):
+    """Compile a kernel's function and all that it calls as Numba does by itself."""
+    python = function.py_func
+    called = {
+        name: by_numba_alone(value)
+        for name, value in python.__globals__.items()
+        if name in python.__code__.co_names and hasattr(value, "py_func")
+    }
+    own = type(python)(python.__code__, {**python.__globals__, **called}, python.__name__)
+    return njit(error_model="numpy")(own)
+
+
+def test_linked_kernels_give_the_bits_that_numba_alone_gives():
+    values = np.random.default_rng(0).standard_normal(1000)
+    values[::50], values[7] = 0.0, np.nan
+    ours, alone = mixed(values), by_numba_alone(mixed)(values)
+    assert np.float64(ours[0]).tobytes() == np.float64(alone[0]).tobytes()
+    assert ours[1].tobytes() == alone[1].tobytes()
+
+
+def test_an_error_within_a_linked_kernel_reaches_python():
+    assert asks(3) == 4
+    with pytest.raises(ValueError, match="a negative count"):
+        asks(-1)
+
+
+def test_a_kernel_that_is_called_has_no_machine_code_but_within_its_caller():
+    mixed(np.ones(3))
+    assert not filled.signatures
+    assert filled.linked.signatures
+    assert filled(2, 0.5).tolist() == [0.5, 0.5]
+    assert filled.signatures
+
+
+def test_linked_kernels_are_the_same_from_the_cache_of_another_process(tmp_path):
+    (tmp_path / "kernels_of_a_test.py").write_text(LINES)
+    command = [sys.executable, "-c", f"from kernels_of_a_test import *; {SHOW}"]
+    environment = {"NUMBA_CACHE_DIR": str(tmp_path / "kept"), "PYTHONPATH": str(tmp_path)}
+    first, second = (
+        subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+        for _ in range(2)
+    )
+    assert first.split()[0] == second.split()[0]
+    assert first.split(maxsplit=1)[1].strip() == "Counter()"
+    assert second.split(maxsplit=1)[1].count(": 1") == 1
