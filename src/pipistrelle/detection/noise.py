@@ -17,11 +17,13 @@ from pipistrelle.detection.scans import (
     RANGE_STD,
     SLOPE,
     Scan,
-    with_columns,
+    without,
     without_excess_paths,
 )
 from pipistrelle.jit import kernel
 
+STDS = BEARING_STD, RANGE_STD, EXCESS_PATH_STD
+"""Where the standard deviations stand among the numbers."""
 Noise = Callable[[Scan], Scan]
 """Gives rows the standard deviations that they do not have."""
 
@@ -73,7 +75,7 @@ def unstated(scan: Scan) -> Scan:
     >>> unstated(make_scan(0.5, np.array([3]), np.zeros(1), bearing_std=0.1)).bearing_std
     array([nan])
     """
-    return with_columns(scan, bearing_std=math.nan, range_std=math.nan, excess_path_std=math.nan)
+    return without(scan, *STDS)
 
 
 def without_hidden(scan: Scan, settings: FilterConfig, *, timing: bool) -> Scan:
@@ -92,12 +94,9 @@ def without_hidden(scan: Scan, settings: FilterConfig, *, timing: bool) -> Scan:
     -------
     Scan
     """
-    seen = scan if timing else without_excess_paths(scan)
-    if "speed_of_sound" not in settings.calibrate:
-        numbers = seen.numbers.copy()
-        numbers[SLOPE] = math.nan
-        seen = replace(seen, numbers=numbers)
-    return unstated(seen) if settings.noise == "constant" else seen
+    hidden = () if "speed_of_sound" in settings.calibrate else (SLOPE,)
+    hidden += STDS if settings.noise == "constant" else ()
+    return without(scan, *hidden) if timing else without_excess_paths(scan, *hidden)
 
 
 def noise_of(settings: FilterConfig) -> Noise:

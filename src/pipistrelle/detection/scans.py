@@ -241,8 +241,10 @@ def without_labels(scan: Scan, callers: Int[np.ndarray, " c"]) -> Scan:
     return replace(scan, landmark=landmark, callers=NO_CALLERS, direct=direct)
 
 
-def without_excess_paths(scan: Scan) -> Scan:
+def without_excess_paths(scan: Scan, *numbers: int) -> Scan:
     """Return a scan without excess paths and without rows that hold nothing else.
+
+    `numbers`: what becomes unknown besides.
 
     >>> from pipistrelle.detection.scans import make_scan
     >>> rows = np.array([8, 8]), np.array([0.4, np.nan])
@@ -250,9 +252,20 @@ def without_excess_paths(scan: Scan) -> Scan:
     >>> without_excess_paths(scan).landmark, without_excess_paths(scan).excess_path
     (array([8]), array([nan]))
     """
-    if scan.callers.size or scan.direct.size:
-        scan = replace(scan, callers=NO_CALLERS, direct=NO_CALLERS)
-    if np.isnan(scan.excess_path).all() and np.isnan(scan.excess_path_std).all():
-        return scan
-    bearings = rows_of(scan, ~np.isnan(scan.bearing))
-    return with_columns(bearings, excess_path=math.nan, excess_path_std=math.nan)
+    untimed, bare = without(scan, EXCESS_PATH, EXCESS_PATH_STD, *numbers), np.isnan(scan.bearing)
+    kept = rows_of(untimed, ~bare) if bare.any() else untimed
+    known = scan.callers.size or scan.direct.size
+    return replace(kept, callers=NO_CALLERS, direct=NO_CALLERS) if known else kept
+
+
+def without(scan: Scan, *numbers: int) -> Scan:
+    """Return a scan with some of its numbers unknown.
+
+    >>> scan = make_scan(0.5, np.array([3]), np.zeros(1), range=2.0, range_std=0.1)
+    >>> without(scan, RANGE_STD).range_std
+    array([nan])
+    """
+    left = scan.numbers.copy()
+    for number in numbers:
+        left[number] = math.nan
+    return replace(scan, numbers=left)
