@@ -378,8 +378,17 @@ class AssociationConfig(Section):
     """Data association: how the rows of a scan get the labels of landmarks."""
 
     method: str = "known"
-    """The labels that came with the scans, in a simulation an oracle's (the paper's); or
+    """The labels that came with the scans, in a simulation an oracle's (the paper's); "nearest",
+    the likeliest assignment of a scan's rows; "marginal", what is sure over all assignments; or
     module:Class, an association of your own."""
+    detection: Probability = 0.8
+    """Assumed probability that a landmark which can be heard is heard."""
+    clutter: Positive = 0.06
+    """Assumed rows of clutter in a scan, per radian and metre."""
+    bearing_std: Positive = 0.08
+    """Rows whose bearing is measured less surely than this are left out [rad]."""
+    way_std: Positive = 0.35
+    """The same of ranges and excess paths [m]."""
 
 
 class ListeningConfig(Section):

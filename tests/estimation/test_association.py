@@ -7,8 +7,9 @@ import pytest
 from pipistrelle.config import AssociationConfig, Config, InputError, RayConfig
 from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.scans import UNLABELLED, make_scan
-from pipistrelle.estimation.association import Assignment, association_of, edited, expected
+from pipistrelle.estimation.association import Assignment, edited, expected
 from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.estimation.data_association.methods import association_of
 from pipistrelle.estimation.ekf.filter import EkfSlam
 from pipistrelle.estimation.ekf.gaussian import INVARIANT, LINEAR
 from pipistrelle.estimation.motion import Motion
@@ -259,9 +260,9 @@ def test_a_moving_caller_goes_with_its_velocity_and_is_never_merged():
 
 def test_a_belief_that_cannot_be_edited_is_refused():
     with pytest.raises(InputError, match=r"a Gaussian cannot; expected a belief with edited"):
-        edited(Gaussian(mean=np.zeros(3), covariance=np.eye(3)), assignment(remove=(4,)))
+        edited(Gaussian(mean=np.zeros(3), covariance=np.eye(3)), remove=(4,))
     belief = mapped(LINEAR)[1]
-    assert edited(belief, assignment()) is belief
+    assert edited(belief) is belief
 
 
 def assignment(**changes):
@@ -278,5 +279,5 @@ def test_a_landmark_that_nobody_holds_is_not_expected():
 @pytest.mark.parametrize("name", ["jcbb", "a:", ":B", "a b:C"])
 def test_a_method_that_is_no_name_is_refused(name):
     config = Config(association=AssociationConfig(method=name))
-    with pytest.raises(InputError, match="expected 'known' or module:Class"):
+    with pytest.raises(InputError, match="expected 'known', 'nearest', 'marginal' or module:Class"):
         association_of(config)

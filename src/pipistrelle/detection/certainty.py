@@ -39,6 +39,9 @@ RANGE_FLOOR = 0.01
 """Error [m] of a range that no level removes, likewise."""
 EXCESS_PATH_FLOOR = 0.006
 """Error [m] of an excess path that no level removes, likewise."""
+DIRECT_FLOOR = 0.04
+"""Error [rad] of the bearing of a caller's direct call: while it lasts, echoes begin of what stands
+near the line from the caller."""
 
 
 def loudest_noise(elements: int) -> float:

@@ -9,17 +9,17 @@ What a row ought to be, were it of a landmark, and how surely, the belief's join
 (`expected`): of several rows at once, since all share the error of the pose.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.config import Config, InputError
+from pipistrelle.config import InputError
 from pipistrelle.detection.scans import NO_CALLERS, Scan
 from pipistrelle.estimation.beliefs import B, Belief, JointGaussian
 from pipistrelle.estimation.measurement import excess_path_slopes, observe
-from pipistrelle.estimation.outside import ASSOCIATION, build, class_of, names_class
 from pipistrelle.geometry import wrap_angle
 
 KNOWN = "known"
@@ -36,13 +36,25 @@ class Assignment:
     """Label of each row: a landmark of the map, a new number for one that is not in it, or
     UNLABELLED for clutter."""
     remove: tuple[int, ...] = ()
-    """Landmarks to remove from the map, before the correction."""
+    """Landmarks that are none, to remove from the map before the correction, where it holds them:
+    their rows are taken back, as far as the session remembers."""
     merge: tuple[tuple[int, int], ...] = ()
     """Pairs of landmarks that are one: the first label stays, the second goes."""
+    scan: Scan | None = None
+    """The scan as the association states it, where it states more than came: the labels of callers,
+    or how far away one is. With as many rows."""
+    again: Any = None
+    """What has become known, for which all scans that the session remembers are to be associated
+    anew (`informed`), or None."""
 
 
 class Association(Protocol[M]):
-    """A stage that decides which landmark each row of a scan is of; a frozen record of settings."""
+    """A stage that decides which landmark each row of a scan is of; a frozen record of settings.
+
+    Two methods are optional. ``informed(memory, news)`` returns an earlier memory with what has
+    become known (`Assignment.again`). ``tentative(memory)`` returns the labels of landmarks that
+    may be none, and are left out of the map.
+    """
 
     def start(self) -> M:
         """Return the memory before the first scan."""
@@ -146,32 +158,16 @@ def expected(
     return Candidates(difference=difference, covariance=S)
 
 
-def edited(belief: B, assignment: Assignment) -> B:
-    """Return a belief without the landmarks that an assignment removes or merges.
+def edited(belief: B, remove: Sequence[int] = (), merge: Sequence[tuple[int, int]] = ()) -> B:
+    """Return a belief without some landmarks, and with the two of each pair as one.
 
     It raises InputError for a belief that has no ``edited``.
     """
-    if not (assignment.remove or assignment.merge):
+    if not (remove or merge):
         return belief
     if not hasattr(belief, "edited"):
         raise InputError(
             f"association: found landmarks to remove or to merge, but a {type(belief).__name__} "
-            "cannot; expected a belief with edited(remove, merge), as ekf and iekf have"
+            "cannot; expected a belief with edited(remove, merge) and labels(), as the EKFs' have"
         )
-    return belief.edited(assignment.remove, assignment.merge)
-
-
-def association_of(config: Config) -> Association | None:
-    """Return the association that ``association.method`` names; None for known labels.
-
-    A class from outside, ``module:Class``, is built by its ``from_config(config)`` where it has
-    one; else it is a dataclass, and may have a field ``config``, all settings.
-
-    It raises InputError for a class that is not there, is no `Association` or cannot be built.
-    """
-    name = config.association.method
-    if name == KNOWN:
-        return None
-    if not names_class(name):
-        raise InputError(f"association.method: found {name!r}, expected {KNOWN!r} or module:Class")
-    return build(ASSOCIATION, name, class_of(ASSOCIATION, name), (config,), {"config": config})
+    return belief.edited(remove, merge)

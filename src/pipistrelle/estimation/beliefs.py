@@ -183,10 +183,10 @@ class Belief(Protocol):
     and ``tracks()`` a Gaussian (k + 1, 2) and (k + 1, 2, 2) of each caller by its label, NaN where
     unknown. ``calibration()`` returns value and standard deviation of what it estimates of the
     vehicle itself, by name. ``cloud()`` returns the poses (p, 3) of particles, with ``full``, the
-    weighted mean number of fully initialised landmarks. An association asks for two more:
-    ``joint()`` returns a `JointGaussian`, and ``edited(remove, merge)`` the belief without the
-    landmarks of the labels ``remove``, and with the two of each pair ``merge`` as one, under the
-    first label.
+    weighted mean number of fully initialised landmarks. An association asks for three more:
+    ``joint()`` returns a `JointGaussian`, ``labels()`` those of all landmarks and callers, and
+    ``edited(remove, merge)`` the belief without the landmarks of the labels ``remove``, and with
+    the two of each pair ``merge`` as one, under the first label.
     """
 
     @property

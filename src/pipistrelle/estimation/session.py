@@ -1,17 +1,55 @@
-"""An estimator at work: it is carried by controls, and corrected by scans as they come."""
+"""An estimator at work: it is carried by controls, and corrected by scans as they come.
 
-from typing import Generic
+Beliefs are never changed, so an association may change its mind: the session remembers the last
+`REMEMBERED` scans with the beliefs before them, goes back and hears them again.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Generic
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from pipistrelle.config import InputError
 from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.noise import Noise
-from pipistrelle.detection.scans import Scan
+from pipistrelle.detection.scans import UNLABELLED, Scan
 from pipistrelle.estimation.association import Assignment, Association, edited
-from pipistrelle.estimation.beliefs import AcceptsMap, B, Estimator, Gaussian, Landmarks
+from pipistrelle.estimation.beliefs import (
+    AcceptsMap,
+    B,
+    Belief,
+    Estimator,
+    Gaussian,
+    Landmarks,
+    some_of,
+)
 from pipistrelle.estimation.checking import usable_scan
+
+REMEMBERED = 40
+"""How many scans an association may think of again."""
+Leg = tuple[Float[np.ndarray, "k c"], Float[np.ndarray, " k"]]
+"""Control steps and how long they take [s]."""
+
+
+@dataclass(slots=True, kw_only=True)
+class _Heard:
+    """A scan that an association may think of again."""
+
+    number: int
+    legs: Sequence[Leg]
+    """The way since the scan before."""
+    belief: Any
+    """Before the scan, after the way."""
+    memory: Any
+    """The association's, before the scan."""
+    came: Scan
+    scan: Scan
+    """As the association stated it (`Assignment.scan`)."""
+    label: Int[np.ndarray, " m"]
+    merge: tuple[tuple[int, int], ...]
 
 
 class Session(Generic[B]):
@@ -50,6 +88,8 @@ class Session(Generic[B]):
 
     belief: B
     """The present belief of the estimator."""
+    labels: list[Int[np.ndarray, " m"]]
+    """Of each scan so far the labels of its rows, as an association has them now."""
 
     def __init__(
         self,
@@ -64,6 +104,9 @@ class Session(Generic[B]):
         self._estimator, self._rng = estimator, rng
         self._association, self._noise = association, noise
         self._memory = association.start() if association else None
+        self._past: deque[_Heard] = deque(maxlen=REMEMBERED)
+        self._legs: list[Leg] = []
+        self.labels: list[Int[np.ndarray, " m"]] = []
         self.belief = estimator.init(start)
         if known is not None and known.landmark.size and isinstance(estimator, AcceptsMap):
             self.belief = estimator.knowing(self.belief, known)
@@ -73,6 +116,31 @@ class Session(Generic[B]):
 
         `controls`: as the estimator's motion model has them; `dt` [s].
         """
+        poses = self._move(controls, dt)
+        if self._association:
+            self._legs.append((controls, dt))
+        return poses
+
+    def hear(self, scan: Scan) -> Scan:
+        """Associate a scan's rows and correct the belief; return the scan as it was used."""
+        if self._association is None:
+            return self._correct(scan)
+        memory, assignment = self._associate(scan)
+        if assignment.again is not None and self._past:
+            self._hear_again(assignment.again)
+            memory, assignment = self._associate(scan)
+        return self._hear(scan, memory, assignment)
+
+    def landmarks(self) -> Landmarks:
+        """Return the map, without what the association holds for tentative."""
+        landmarks = self.belief.landmarks()
+        if not hasattr(self._association, "tentative"):
+            return landmarks
+        tentative = self._association.tentative(self._memory)
+        return some_of(landmarks, ~np.isin(landmarks.landmark, list(tentative)))
+
+    def _move(self, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]) -> Gaussian:
+        """Predict through control steps."""
         predicted = self._estimator.predict(self.belief, controls, dt, self._rng)
         if not (isinstance(predicted, tuple) and len(predicted) == 2):
             expected = "the belief and the pose of each step"
@@ -81,29 +149,107 @@ class Session(Generic[B]):
         check_poses("predict", poses, len(dt))
         return poses
 
-    def hear(self, scan: Scan) -> Scan:
-        """Associate a scan's rows and correct the belief; return the scan as it was used."""
-        used = usable_scan(self._labelled(scan))
+    def _correct(self, scan: Scan) -> Scan:
+        """Correct the belief with a scan that is labelled."""
+        used = usable_scan(scan)
         belief = self._estimator.update(self.belief, used, self._rng)
         if not hasattr(belief, "pose"):
             raise _wrong_return(self._estimator, "update", belief, "the belief after the scan")
         self.belief = belief
         return used
 
-    def _labelled(self, scan: Scan) -> Scan:
-        """Return a scan as the association labels it; the belief is edited as that asks for."""
-        if self._association is None:
-            return scan
+    def _associate(self, scan: Scan) -> tuple[Any, Assignment]:
+        """Return the association's memory after a scan, and what it decides."""
+        assert self._association is not None, "hear asks only where there is one"
         stated = self._noise(scan) if self._noise else scan
         answer = self._association.associate(self._memory, self.belief, stated)
         if not (isinstance(answer, tuple) and len(answer) == 2 and type(answer[1]) is Assignment):
             raise _wrong_return(
                 self._association, "associate", answer, "the memory and an Assignment"
             )
-        self._memory, assignment = answer
-        self.belief = edited(self.belief, assignment)
-        merged = labelled(scan, assignment.label)
-        return self._noise(merged) if self._noise else merged
+        return answer
+
+    def _hear(self, scan: Scan, memory: Any, assignment: Assignment) -> Scan:
+        """Correct the belief with a scan, as an association labels it."""
+        if assignment.remove:
+            self._take_back(assignment.remove)
+        heard = _Heard(
+            number=len(self.labels),
+            legs=self._legs,
+            belief=self.belief,
+            memory=self._memory,
+            came=scan,
+            scan=assignment.scan or scan,
+            label=assignment.label,
+            merge=assignment.merge,
+        )
+        self._past.append(heard)
+        self._memory, self._legs = memory, []
+        return self._use(heard)
+
+    def _use(self, heard: _Heard) -> Scan:
+        """Correct the belief with a scan that an association has labelled."""
+        self.labels[heard.number :] = [heard.label]
+        self.belief = edited(self.belief, merge=heard.merge)
+        merged = labelled(heard.scan, heard.label)
+        return self._correct(self._noise(merged) if self._noise else merged)
+
+    def _take_back(self, labels: tuple[int, ...]) -> None:
+        """Remove landmarks, with all of their rows that are remembered."""
+        past = list(self._past)
+        again = past[next((n for n, one in enumerate(past) if _names(one, labels)), len(past)) :]
+        before = again[0].belief if again else self.belief
+        self.belief = edited(before, remove=_held(before, labels))
+        for one in again:
+            if one is not again[0]:
+                self._go(one.legs)
+            one.belief, one.label = self.belief, _without(one.label, labels)
+            one.scan = replace(one.scan, callers=_without(one.scan.callers, labels))
+            self._use(one)
+        if again:
+            self._go(self._legs)
+
+    def _hear_again(self, news: Any) -> None:
+        """Associate all scans that are remembered anew, by what has become known."""
+        past, legs = list(self._past), self._legs
+        self._past.clear()
+        del self.labels[past[0].number :]
+        self.belief = past[0].belief
+        informed = getattr(self._association, "informed", None)
+        if informed is None:
+            raise InputError(
+                f"association: found scans to be associated again, but a "
+                f"{type(self._association).__name__} has no informed(memory, news)"
+            )
+        self._memory = informed(past[0].memory, news)
+        for one in past:
+            if one is not past[0]:
+                self._go(one.legs)
+            self._legs = list(one.legs)
+            self._hear(one.came, *self._associate(one.came))
+        self._go(legs)
+        self._legs = legs
+
+    def _go(self, legs: Sequence[Leg]) -> None:
+        """Predict through what was gone already."""
+        for controls, dt in legs:
+            self._move(controls, dt)
+
+
+def _names(heard: _Heard, labels: Sequence[int]) -> bool:
+    """Tell whether a scan has rows, or a caller, of some labels."""
+    return bool(np.isin(heard.label, labels).any() or np.isin(heard.scan.callers, labels).any())
+
+
+def _held(belief: Belief, labels: Sequence[int]) -> list[int]:
+    """Return which of some landmarks a belief holds; all, where it does not say."""
+    held = {*belief.labels()} if hasattr(belief, "labels") else {*labels}
+    return [label for label in labels if label in held]
+
+
+def _without(label: Int[np.ndarray, " m"], labels: Sequence[int]) -> Int[np.ndarray, " m"]:
+    """Return labels without some."""
+    return np.where(np.isin(label, labels), UNLABELLED, label)
 
 
 def check_poses(method: str, poses: Gaussian, size: int) -> None:

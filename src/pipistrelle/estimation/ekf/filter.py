@@ -122,6 +122,10 @@ class EkfBelief:
             mean = mean + np.insert(np.tile(self.origin, 1 + placed.size), 2, 0.0)
         return JointGaussian(landmark=self.landmark[placed], mean=mean, covariance=covariance)
 
+    def labels(self) -> list[int]:
+        """Return the labels of all landmarks and callers, placed or not."""
+        return np.unique(self.landmark[~is_velocity(self.landmark)]).tolist()
+
     def edited(self, remove: Sequence[int], merge: Sequence[tuple[int, int]]) -> "EkfBelief":
         """Return the belief without some landmarks, and with others as one (`editing`)."""
         state = (self.mean, self.covariance, self.landmark, self.weight)

@@ -27,10 +27,11 @@ from pipistrelle.arrays.layout import Layout, layout_of
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
 from pipistrelle.arrays.sampling import BLOCK, Sampling, block_shape, blocks_to_hear, sampling
 from pipistrelle.config import Config
+from pipistrelle.detection.certainty import DIRECT_FLOOR
 from pipistrelle.detection.direct import own_alone, without_calls
 from pipistrelle.detection.faces import FrameMeasurements, average_faces, same_echo
 from pipistrelle.detection.matched import filter_blocks, filter_samples
-from pipistrelle.detection.scans import UNLABELLED, Scan, without_labels
+from pipistrelle.detection.scans import BEARING_STD, UNLABELLED, Scan, without_labels
 from pipistrelle.detection.snapshots import (
     Detections,
     Detector,
@@ -287,7 +288,14 @@ def _echoes(time: float, detections: Detections, rig: _Rig) -> Scan:
         direct = without_calls(direct, rig.missable)
         detections = replace(detections, direct=direct)
         callers = np.append(echo, UNLABELLED)[direct.detection]
-    return without_labels(_averaged(time, detections, echo, rig).rows, callers)
+    return _with_unsure_calls(without_labels(_averaged(time, detections, echo, rig).rows, callers))
+
+
+def _with_unsure_calls(scan: Scan) -> Scan:
+    """Return a scan whose direct calls have bearings as unsure as they are (`DIRECT_FLOOR`)."""
+    rows, numbers = scan.direct[scan.direct >= 0], scan.numbers.copy()
+    numbers[BEARING_STD, rows] = np.hypot(numbers[BEARING_STD, rows], DIRECT_FLOOR)
+    return replace(scan, numbers=numbers)
 
 
 def _blocks(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]:

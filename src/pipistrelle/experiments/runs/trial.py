@@ -17,9 +17,10 @@ from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.config import Config, InputError, Strategy
 from pipistrelle.detection.noise import noise_of
 from pipistrelle.detection.scans import Scan, rows_of
-from pipistrelle.estimation.association import KNOWN, Association, association_of
+from pipistrelle.estimation.association import KNOWN, Association
 from pipistrelle.estimation.beliefs import Belief, at_steps
 from pipistrelle.estimation.catalogue import CATALOGUE, entry, short_name
+from pipistrelle.estimation.data_association.methods import association_of
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive, split_at
 from pipistrelle.experiments.hearing.listening import Progress, listen

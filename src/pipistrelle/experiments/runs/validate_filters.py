@@ -11,9 +11,9 @@ import numpy as np
 
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.association import association_of
 from pipistrelle.estimation.beliefs import Belief, Gaussian, Track, no_landmarks
 from pipistrelle.estimation.catalogue import CATALOGUE, check_distinct, entry
+from pipistrelle.estimation.data_association.methods import association_of
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.outside import worded
 from pipistrelle.experiments.cases import Case

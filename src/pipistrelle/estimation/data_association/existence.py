@@ -1,0 +1,176 @@
+r"""Whether a landmark exists: by how often it was heard, and was not where it should have been.
+
+Each landmark has log odds. They rise when it is heard. They fall when it is not, though it should
+have been: its level, as it was heard before, is expected at its present distance (spherical
+spreading, there and back of the vehicle's own call) well above what is detected; the vehicle's own
+call was sent towards it as before; and nothing as loud came at the same time. Of rows without a
+level nothing is expected.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from pipistrelle.detection.scans import OWN
+from pipistrelle.estimation.measurement import excess_path_slopes
+from pipistrelle.geometry import wrap_angle
+from pipistrelle.jit import Whole, kernel, no_alloc
+
+HEARD, MISSED = 2.0, 1.3
+"""What is added when a landmark is heard, and taken when it should have been: a detection
+probability of 0.75, and a chance of 0.1 that clutter is where it is."""
+MOST, CONFIRMED, GONE = 8.0, 3.5, -2.0
+"""Odds rise no further; a landmark is one; a landmark is none."""
+LEAST_SCANS, PATIENCE = 3, 25
+"""In how many scans it takes a landmark to be one; scans of silence after which a landmark that is
+not yet one is none."""
+FAINTEST = 18.0
+"""A landmark is expected from this level on [dB]."""
+AS_LOUD = 3.0
+"""What is at most so much fainter may hide it [dB]."""
+TOGETHER = 1.0
+"""What comes within such a way hides it: the length of a call [m]."""
+AIMED = 0.3
+"""The vehicle's own call is as loud up to so much from the bearing at which it was heard [rad]."""
+FORGETTING = 0.2
+"""Share of the newest level in the mean."""
+
+
+class Known(NamedTuple):
+    """Landmarks as the association knows them, l of them."""
+
+    label: Int[np.ndarray, " l"]
+    born: Int[np.ndarray, " l"]
+    """Number of the first scan, and of the last."""
+    heard: Int[np.ndarray, " l"]
+    count: Int[np.ndarray, " l"]
+    """Scans in which it was heard."""
+    odds: Float[np.ndarray, " l"]
+    confirmed: Bool[np.ndarray, " l"]
+    source: Float[np.ndarray, "l c"]
+    """Level that it would have at 1 m, by caller [dB], or NaN."""
+    aim: Float[np.ndarray, " l"]
+    """Bearing at which the vehicle's own call was last heard of it [rad]."""
+
+
+def nobody(callers: int) -> Known:
+    """Return no landmarks."""
+    whole, number = np.empty(0, np.int64), np.empty(0)
+    none = np.empty((0, callers))
+    return Known(whole, whole, whole, whole, number, np.empty(0, np.bool_), none, number)
+
+
+def with_new(known: Known, labels: list[int], scan: int, callers: int) -> Known:
+    """Return known landmarks with new ones, that are heard in a scan for the first time."""
+    size, more = len(labels), callers - known.source.shape[1]
+    source = known.source
+    if more > 0:
+        source = np.hstack([source, np.full((len(source), more), np.nan)])
+    now = np.full(size, scan)
+    return Known(
+        label=np.append(known.label, np.array(labels, np.int64)),
+        born=np.append(known.born, now),
+        heard=np.append(known.heard, now),
+        count=np.append(known.count, np.zeros(size, np.int64)),
+        odds=np.append(known.odds, np.full(size, -HEARD)),
+        confirmed=np.append(known.confirmed, np.zeros(size, np.bool_)),
+        source=np.vstack([source, np.full((size, source.shape[1]), np.nan)]),
+        aim=np.append(known.aim, np.full(size, np.nan)),
+    )
+
+
+def some(known: Known, kept: Bool[np.ndarray, " l"]) -> Known:
+    """Return some of the known landmarks."""
+    return Known(*(column[kept] for column in known))
+
+
+Heard = tuple[
+    Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, " m"], Float[np.ndarray, " m"]
+]
+"""Label, caller, range or excess path and level of each row."""
+Place = tuple[Float[np.ndarray, " d"], Int[np.ndarray, " l"], Int[np.ndarray, " c"]]
+"""Joint mean, where each known landmark stands in it, and each caller; -1: nowhere."""
+
+
+def judged(known: Known, rows: Heard, place: Place, scan: int) -> Known:
+    """Return landmarks after a scan, as known by what was heard and what was not."""
+    after = Known(*(column.copy() for column in known))
+    _judge(tuple(after), rows, place, scan)
+    return after
+
+
+@kernel
+def _judge(columns: tuple[np.ndarray, ...], rows: Heard, place: Place, scan: Whole) -> None:
+    """Write odds, counts and levels after a scan."""
+    known, (label, caller, _, level), (mean, at, callers) = Known(*columns), rows, place
+    for n in range(known.label.size):
+        far, bearing, here = math.nan, math.nan, False
+        if at[n] >= 0:
+            dx, dy = mean[at[n]] - mean[0], mean[at[n] + 1] - mean[1]
+            far, bearing = math.hypot(dx, dy), wrap_angle(math.atan2(dy, dx) - mean[2])
+        for m in range(label.size):
+            if label[m] != known.label[n]:
+                continue
+            here = True
+            if math.isnan(far) or math.isnan(level[m]):
+                continue
+            source, before = level[m] + _spreading(caller[m], far), known.source[n, caller[m]]
+            gain = 1.0 if math.isnan(before) else FORGETTING
+            known.source[n, caller[m]] = (
+                source if gain == 1.0 else before + gain * (source - before)
+            )
+            if caller[m] == OWN:
+                known.aim[n] = bearing
+        if here:
+            known.odds[n] = min(known.odds[n] + HEARD, MOST)
+            known.count[n] += 1
+            known.heard[n] = scan
+        else:
+            for c in range(callers.size):
+                if _expected(known, n, c, far, bearing, rows, (mean, at, callers)):
+                    known.odds[n] -= MISSED
+                    break
+            if not known.confirmed[n] and scan - known.heard[n] > PATIENCE:
+                known.odds[n] = -MOST
+        if known.odds[n] >= CONFIRMED and known.count[n] >= LEAST_SCANS:
+            known.confirmed[n] = True
+
+
+@no_alloc
+def _spreading(caller: Whole, far: float) -> float:
+    """Return what a level loses on the way from a landmark, there and back of the own call [dB]."""
+    return (40.0 if caller == OWN else 20.0) * math.log10(max(far, 0.3))
+
+
+@no_alloc
+def _expected(
+    known: Known, n: Whole, c: Whole, far: float, bearing: float, rows: Heard, place: Place
+) -> bool:
+    """Tell whether a landmark should have been heard of a caller's call, and nothing hides it."""
+    (_, caller, way, level), (mean, at, callers) = rows, place
+    if math.isnan(far) or math.isnan(known.source[n, c]):
+        return False
+    loud = known.source[n, c] - _spreading(c, far)
+    if loud < FAINTEST or (c == OWN and abs(wrap_angle(bearing - known.aim[n])) > AIMED):
+        return False
+    ahead = far
+    if c != OWN:
+        i, j = at[n], callers[c]
+        if j < 0:
+            return False
+        ahead = excess_path_slopes(mean[0], mean[1], mean[i], mean[i + 1], mean[j], mean[j + 1])[0]
+        if ahead < 1.2 * TOGETHER:
+            return False
+    ahead, factor = (2.0 * ahead, 2.0) if c == OWN else (ahead, 1.0)
+    called = False
+    for m in range(caller.size):
+        if caller[m] != c:
+            continue
+        called = True
+        if level[m] > loud - AS_LOUD:
+            other = 0.0 if math.isnan(way[m]) else factor * way[m]
+            if abs(other - ahead) < TOGETHER:
+                return False
+    return called or c == OWN

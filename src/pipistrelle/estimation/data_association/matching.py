@@ -1,0 +1,102 @@
+r"""From costs of pairs to decisions: which row is of which landmark.
+
+`nearest` takes the assignment that costs least, each landmark once. `marginal` takes what is sure
+over all assignments: the probability that a row is of a landmark, by message passing. With
+:math:`w_{ij} = e^{-c_{ij} / 2}` messages between rows i and landmarks j are
+
+.. math:: \mu_{ij} = \frac{w_{ij}}{1 + \sum_{k \ne j} w_{ik} \nu_{ki}}, \qquad
+          \nu_{ji} = \frac{1}{1 + \sum_{k \ne i} \mu_{kj}}
+
+until they stay, and the probability is
+:math:`w_{ij} \nu_{ji} / (1 + \sum_k w_{ik} \nu_{ki})`.
+
+Williams & Lau, IEEE Transactions on Aerospace and Electronic Systems 50 (2014).
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.optimize import linear_sum_assignment
+
+from pipistrelle.jit import kernel
+
+NOTHING = -1
+"""A row of no landmark."""
+SURE = 0.95
+"""Probability from which on a row that is of a landmark is taken to be of one of them."""
+MESSAGES, STAY = 50, 1e-6
+"""How often messages are passed, at most, and by how much they may still change."""
+LARGEST = 30.0
+"""Of a weight's logarithm: what is likelier is as sure, and sums keep the others' digits."""
+FARTHEST = 1e6
+"""In place of an infinite cost."""
+
+
+def nearest(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
+    """Return the landmark of each row by the assignment that costs least, or NOTHING.
+
+    >>> nearest(np.array([[-5.0, -4.0], [-4.5, np.inf], [3.0, np.inf]]))
+    array([ 1,  0, -1])
+    """
+    rows, landmarks = costs.shape
+    bare = np.full((rows, rows), FARTHEST)
+    np.fill_diagonal(bare, 0.0)
+    taken, chosen = linear_sum_assignment(np.hstack([np.minimum(costs, FARTHEST), bare]))
+    found = np.full(rows, NOTHING)
+    found[taken] = np.where(chosen < landmarks, chosen, NOTHING)
+    return found
+
+
+def marginal(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
+    """Return the landmark of each row where that is sure, or NOTHING.
+
+    A row is of a landmark if it is likelier than clutter, and of which is sure by `SURE`. Here the
+    first row is of either: neither is sure.
+
+    >>> marginal(np.array([[-9.0, -9.0], [np.inf, np.inf]]))
+    array([-1, -1])
+    >>> marginal(np.array([[-9.0, -9.0], [np.inf, -20.0]]))
+    array([0, 1])
+    """
+    if not costs.size:
+        return np.full(len(costs), NOTHING)
+    shares = probabilities(costs)
+    best, of_any = shares.argmax(axis=1), shares.sum(axis=1)
+    share = shares[np.arange(len(costs)), best]
+    return np.where((of_any > 0.5) & (share >= SURE * of_any), best, NOTHING)
+
+
+@kernel
+def probabilities(costs: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
+    """Return the probability of each pair, of clutter what is left to 1.
+
+    >>> probabilities(np.array([[0.0]]))
+    array([[0.5]])
+    """
+    weight, (rows, landmarks) = np.exp(np.minimum(-0.5 * costs, LARGEST)), costs.shape
+    to_row = np.ones((landmarks, rows))
+    for _ in range(MESSAGES):
+        moved, total = 0.0, np.ones(landmarks)
+        to_landmark = np.empty((rows, landmarks))
+        for i in range(rows):
+            sum_ = 1.0
+            for j in range(landmarks):
+                sum_ += weight[i, j] * to_row[j, i]
+            for j in range(landmarks):
+                others = max(sum_ - weight[i, j] * to_row[j, i], 1.0)
+                to_landmark[i, j] = weight[i, j] / others
+                total[j] += to_landmark[i, j]
+        for i in range(rows):
+            for j in range(landmarks):
+                message = 1.0 / max(total[j] - to_landmark[i, j], 1.0)
+                moved = max(moved, abs(message - to_row[j, i]))
+                to_row[j, i] = message
+        if moved < STAY:
+            break
+    shares = np.empty((rows, landmarks))
+    for i in range(rows):
+        sum_ = 1.0
+        for j in range(landmarks):
+            sum_ += weight[i, j] * to_row[j, i]
+        for j in range(landmarks):
+            shares[i, j] = weight[i, j] * to_row[j, i] / sum_
+    return shares

@@ -1,0 +1,45 @@
+"""The methods of association by name."""
+
+import math
+
+from pipistrelle.config import Config, InputError
+from pipistrelle.estimation.association import KNOWN, Association
+from pipistrelle.estimation.data_association.matching import marginal, nearest
+from pipistrelle.estimation.data_association.pairs import Chances
+from pipistrelle.estimation.data_association.sequential import Limits, Sequential
+from pipistrelle.estimation.outside import ASSOCIATION, build, class_of, names_class
+
+METHODS = {"nearest": nearest, "marginal": marginal}
+"""How rows of a scan are matched with landmarks, by ``association.method``."""
+GATE = 25.0
+"""Largest squared distance of a row from its landmark: 0.5 to 1 % of right rows are beyond."""
+
+
+def association_of(config: Config) -> Association | None:
+    """Return the association that ``association.method`` names; None for known labels.
+
+    A class from outside, ``module:Class``, is built by its ``from_config(config)`` where it has
+    one; else it is a dataclass, and may have a field ``config``, all settings.
+
+    It raises InputError for a class that is not there, is no `Association` or cannot be built.
+    """
+    name, settings = config.association.method, config.association
+    if name == KNOWN:
+        return None
+    if name in METHODS:
+        chances = Chances(
+            gate=GATE,
+            clutter=settings.clutter,
+            bearing_clutter=20.0 * settings.clutter,
+            detection=settings.detection,
+        )
+        constant = config.filter.noise == "constant"
+        limits = Limits(
+            bearing_std=math.inf if constant else settings.bearing_std,
+            way_std=math.inf if constant else settings.way_std,
+        )
+        return Sequential(match=METHODS[name], chances=tuple(chances), limits=limits)
+    if not names_class(name):
+        expected = ", ".join(map(repr, [KNOWN, *METHODS]))
+        raise InputError(f"association.method: found {name!r}, expected {expected} or module:Class")
+    return build(ASSOCIATION, name, class_of(ASSOCIATION, name), (config,), {"config": config})

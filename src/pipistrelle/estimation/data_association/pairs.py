@@ -1,0 +1,165 @@
+r"""Rows of a scan against landmarks of the map: how far off, and how surely.
+
+A row of the vehicle's own call has a bearing and a range, one of another caller a bearing and, once
+the caller is on the map, an excess path. Of each pair of a row and a landmark
+
+.. math:: d^2 = \nu^T S^{-1} \nu, \qquad S = H P H^T + R
+
+with the joint covariance P of pose, landmark and caller. The cost of a pair compares what the row
+would be of that landmark with what it would be of clutter of a density :math:`\lambda`:
+
+.. math:: c = d^2 + \ln |2 \pi S| + 2 \ln (\lambda / p_D)
+
+A pair of a cost below 0 is likelier than clutter.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipistrelle.estimation.beliefs import JointGaussian
+from pipistrelle.estimation.measurement import excess_path_slopes, observe
+from pipistrelle.geometry import wrap_angle
+from pipistrelle.jit import Whole, kernel, no_alloc
+
+
+class Rows(NamedTuple):
+    """Rows of one caller."""
+
+    bearing: Float[np.ndarray, " m"]
+    bearing_std: Float[np.ndarray, " m"]
+    way: Float[np.ndarray, " m"]
+    """Range of the vehicle's own call, excess path of another's [m], or NaN."""
+    way_std: Float[np.ndarray, " m"]
+    level_db: Float[np.ndarray, " m"]
+
+
+class Chances(NamedTuple):
+    """What is assumed of detections."""
+
+    gate: float
+    """Largest squared distance."""
+    clutter: float
+    """Rows of clutter per radian and metre."""
+    bearing_clutter: float
+    """The same of rows that have a bearing alone, per radian."""
+    detection: float
+    """Probability that a landmark which can be heard is."""
+
+
+OWN_CALL, UNPLACED = -1, -2
+"""In place of a caller's index in the joint mean: the vehicle, and one that is not on the map."""
+
+
+@kernel
+def pair_costs(
+    rows: tuple[np.ndarray, ...],
+    mean: Float[np.ndarray, " d"],
+    covariance: Float[np.ndarray, "d d"],
+    at: Int[np.ndarray, " n"],
+    caller: Whole,
+    chances: tuple[float, float, float, float],
+) -> Float[np.ndarray, "m n"]:
+    """Return the cost of each pair of a row and a landmark; infinite beyond the gate.
+
+    ``at``: where the landmarks stand in the mean; ``caller``: where that of the rows stands.
+    """
+    heard, made = Rows(*rows), Chances(*chances)
+    costs = np.full((heard.bearing.size, at.size), np.inf)
+    H, index, S = np.zeros((2, 7)), np.zeros(7, np.int64), np.zeros((2, 2))
+    for n in range(at.size):
+        if at[n] == caller:
+            continue
+        bearing, way = _expected(mean, at[n], caller, H, index)
+        _spread(covariance, H, index, 5 if caller < 0 else 7, S)
+        for m in range(heard.bearing.size):
+            nu = wrap_angle(heard.bearing[m] - bearing)
+            a = S[0, 0] + heard.bearing_std[m] ** 2
+            if math.isnan(heard.way[m]) or caller == UNPLACED:
+                squared, size = nu * nu / a, 2.0 * math.pi * a
+                density = made.bearing_clutter
+            else:
+                off = heard.way[m] - way
+                b, c = S[0, 1], S[1, 1] + heard.way_std[m] ** 2
+                det = a * c - b * b
+                squared = (c * nu * nu - 2.0 * b * nu * off + a * off * off) / det
+                size, density = (2.0 * math.pi) ** 2 * det, made.clutter
+            if squared < made.gate:
+                costs[m, n] = squared + math.log(size) + 2.0 * math.log(density / made.detection)
+    return costs
+
+
+@no_alloc
+def _expected(
+    mean: Float[np.ndarray, " d"],
+    i: Whole,
+    caller: Whole,
+    H: Float[np.ndarray, "2 7"],
+    index: Int[np.ndarray, "7"],
+) -> tuple[float, float]:
+    """Return bearing and way of a landmark; write the slopes, and by what they are."""
+    x, y = mean[0], mean[1]
+    distance, bearing, c, s, k = observe(x, y, mean[2], mean[i], mean[i + 1])
+    for e, column in enumerate((0, 1, 2, i, i + 1, max(caller, 0), max(caller, 0) + 1)):
+        index[e] = column
+    for e, slope in enumerate((s * k, -c * k, -1.0, -s * k, c * k, 0.0, 0.0)):
+        H[0, e] = slope
+    if caller < 0:
+        for e, slope in enumerate((-c, -s, 0.0, c, s, 0.0, 0.0)):
+            H[1, e] = slope
+        return bearing, distance
+    bx, by = mean[caller], mean[caller + 1]
+    path, lx, ly, cx, cy = excess_path_slopes(x, y, mean[i], mean[i + 1], bx, by)
+    for e, slope in enumerate((-lx - cx, -ly - cy, 0.0, lx, ly, cx, cy)):
+        H[1, e] = slope
+    return bearing, path
+
+
+@no_alloc
+def _spread(
+    P: Float[np.ndarray, "d d"],
+    H: Float[np.ndarray, "2 7"],
+    index: Int[np.ndarray, "7"],
+    size: Whole,
+    S: Float[np.ndarray, "2 2"],
+) -> None:
+    """Write H P H^T."""
+    S[:] = 0.0
+    for a in range(size):
+        for b in range(size):
+            covariance = P[index[a], index[b]]
+            S[0, 0] += H[0, a] * covariance * H[0, b]
+            S[0, 1] += H[0, a] * covariance * H[1, b]
+            S[1, 1] += H[1, a] * covariance * H[1, b]
+    S[1, 0] = S[0, 1]
+
+
+def with_point(
+    joint: JointGaussian, label: int, bearing: float, distance: float, stds: tuple[float, float]
+) -> JointGaussian:
+    """Return a joint Gaussian with a landmark at a bearing and a range more.
+
+    ``stds``: of bearing [rad] and range [m].
+
+    >>> here = JointGaussian(
+    ...     landmark=np.empty(0, int), mean=np.zeros(3), covariance=np.diag([0.0, 0.0, 0.01]))
+    >>> there = with_point(here, 7, 0.0, 2.0, (0.1, 0.2))
+    >>> there.mean[3:], there.covariance[3:, 3:].round(9)
+    (array([2., 0.]), array([[0.04, 0.  ],
+           [0.  , 0.08]]))
+    """
+    x, y, heading = joint.mean[:3]
+    c, s = math.cos(heading + bearing), math.sin(heading + bearing)
+    G = np.zeros((2, joint.mean.size))
+    G[0, 0] = G[1, 1] = 1.0
+    G[0, 2], G[1, 2] = -distance * s, distance * c
+    W = np.array([[-distance * s, c], [distance * c, s]]) * np.array(stds)
+    cross = np.einsum("ad,de->ae", G, joint.covariance)
+    own = np.einsum("ad,bd->ab", cross, G) + np.einsum("ae,be->ab", W, W)
+    return JointGaussian(
+        landmark=np.append(joint.landmark, label),
+        mean=np.append(joint.mean, (x + distance * c, y + distance * s)),
+        covariance=np.block([[joint.covariance, cross.T], [cross, own]]),
+    )

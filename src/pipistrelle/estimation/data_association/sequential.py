@@ -1,0 +1,402 @@
+"""The package's association: scan by scan, with births, deaths, callers and changes of mind.
+
+A row is held against the landmarks of the map with the joint covariance of pose and map (`pairs`),
+the rows of each caller by themselves, and is given to one of them or to none (`matching`). A sure
+row that is near none begins a landmark at once, with all that it says, so that nothing of the first
+scans is lost; whether there is one is told later, by how often it is heard (`existence`). What was
+none is removed, and its rows are taken back.
+
+A caller is known by its direct call, and its place is found by the excess paths themselves
+(`caller_search`). Until then its rows are followed, and not used; then the session hears again all
+that it remembers.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from pipistrelle.detection.scans import (
+    BEARING,
+    BEARING_STD,
+    NO_CALLERS,
+    OWN,
+    RANGE,
+    RANGE_STD,
+    UNLABELLED,
+    Scan,
+)
+from pipistrelle.estimation.association import Assignment
+from pipistrelle.estimation.beliefs import Belief, JointGaussian
+from pipistrelle.estimation.data_association.caller_search import find_caller
+from pipistrelle.estimation.data_association.existence import (
+    GONE,
+    Known,
+    judged,
+    nobody,
+    some,
+    with_new,
+)
+from pipistrelle.estimation.data_association.pairs import (
+    OWN_CALL,
+    UNPLACED,
+    Rows,
+    pair_costs,
+    with_point,
+)
+from pipistrelle.estimation.data_association.tracks import Tracks, followed
+from pipistrelle.geometry import wrap_angle
+
+FIRST_SEARCH = 8
+"""Scans of a caller after which its place is searched for, at every second one."""
+PLACE_SHARE, PLACE_BEARING_STD = 0.2, 0.03
+"""Deviation of a caller's place that was found: of its range, as a share, and of its bearing."""
+REFINED_AFTER, REFINED_SHARE = 24, 0.06
+"""Scans after which the place on the map is taken instead, once, and the share of its range."""
+DIRECT_GATE = 9.0
+"""Largest squared distance of a caller's direct call."""
+PROBATION = 40
+"""Scans in which a caller may turn out not to be where it was found."""
+TRIAL, SETTLING, LEAST_SHARE, LEAST_ROWS = 9, 3, 0.5, 10
+"""A caller is where it was found if of the sure rows of so many scans, the first left out, this
+share is of landmarks, new ones not counted; at least so many rows must tell."""
+BESIDE, ASIDE = 0.96, 0.5
+"""A row begins no landmark beside a louder one, within such a way [m] and bearing [rad]."""
+
+
+News = Mapping[int, tuple[float, float, bool]]
+"""Where callers are, by number: x, y [m], and whether that is from the map."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Caller:
+    """What is known of a caller."""
+
+    label: int
+    place: tuple[float, float] | None = None
+    """Where it was found [m], until that was told."""
+    told: bool = False
+    tracks: Tracks = field(default_factory=Tracks)
+    trial: tuple[tuple[int, int], ...] = ()
+    """Rows that were of landmarks, and all, of the scans since it is on the map."""
+    since: int = 0
+    """Number of the scan in which it was placed."""
+    refined: bool = False
+    """Whether its place is that of a map."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Memory:
+    """What the association remembers."""
+
+    scan: int = 0
+    labels: int = 0
+    """Labels given so far."""
+    known: Known = field(default_factory=lambda: nobody(1))
+    callers: Mapping[int, Caller] = field(default_factory=dict)
+    """By number."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """How sure a row must be to be used, and to begin a landmark."""
+
+    bearing_std: float = 0.08
+    """[rad]"""
+    way_std: float = 0.35
+    """Of range or excess path [m]."""
+    birth_bearing_std: float = 0.05
+    birth_way_std: float = 0.25
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sequential:
+    """An association that works scan by scan.
+
+    Examples
+    --------
+    Two rows of an empty map are two landmarks; the next scan's are the same.
+
+    >>> from pipistrelle.config import Config
+    >>> from pipistrelle.detection.scans import make_scan
+    >>> from pipistrelle.estimation.beliefs import Gaussian
+    >>> from pipistrelle.estimation.catalogue import entry
+    >>> from pipistrelle.estimation.data_association.matching import nearest
+    >>> from pipistrelle.estimation.motion import Motion
+    >>> from pipistrelle.estimation.session import Session
+    >>> motion = Motion(model="unicycle", control_std=(0.1, 0.1))
+    >>> start = Gaussian(mean=np.zeros(3), covariance=1e-6 * np.eye(3))
+    >>> session = Session(
+    ...     entry("iekf").build(Config(), motion), start, np.random.default_rng(7),
+    ...     association=Sequential(match=nearest, chances=(25.0, 0.06, 1.3, 0.8)))
+    >>> stds = {"bearing_std": 0.01, "range_std": 0.02}
+    >>> heard = make_scan(0.0, np.full(2, -1), np.array([0.1, 1.0]), range=np.ones(2), **stds)
+    >>> for _ in range(3):
+    ...     used = session.hear(heard)
+    >>> [label.tolist() for label in session.labels]
+    [[1, 2], [1, 2], [1, 2]]
+    """
+
+    match: Callable[[Float[np.ndarray, "m n"]], Int[np.ndarray, " m"]]
+    """From costs of rows and landmarks to the landmark of each row (`matching`)."""
+    chances: tuple[float, float, float, float]
+    """`pairs.Chances`."""
+    limits: Limits = Limits()
+
+    def start(self) -> Memory:
+        """Return the memory before the first scan."""
+        return Memory()
+
+    def informed(self, memory: Memory, news: News) -> Memory:
+        """Return a memory that knows where callers are, by their numbers."""
+        known = dict(memory.callers)
+        for number, place in news.items():
+            label = known[number].label if number in known else memory.labels + 1
+            memory = replace(memory, labels=max(memory.labels, label))
+            x, y, refined = place
+            known[number] = Caller(label=label, place=(x, y), refined=refined)
+        return replace(memory, callers=known)
+
+    def tentative(self, memory: Memory) -> list[int]:
+        """Return the labels of what may be no landmark."""
+        return memory.known.label[~memory.known.confirmed].tolist()
+
+    def associate(self, memory: Memory, belief: Belief, scan: Scan) -> tuple[Memory, Assignment]:
+        """Return the memory after a scan, and what is decided."""
+        work = _Work(self, memory, belief, scan)
+        if news := work.search_callers():
+            return memory, Assignment(label=work.label, again=news)
+        for number in sorted({*scan.caller.tolist()}):
+            work.match(number)
+        return work.finished()
+
+
+class _Work:
+    """One scan being associated."""
+
+    def __init__(self, stage: Sequential, memory: Memory, belief: Belief, scan: Scan) -> None:
+        self.stage, self.memory, self.scan = stage, memory, scan
+        self.joint: JointGaussian = belief.joint()  # pyrefly: ignore[missing-attribute]
+        self.pose, self.size = self.joint.mean[:3], scan.landmark.size
+        self.label = np.full(self.size, UNLABELLED)
+        self.labels, self.callers = memory.labels, dict(memory.callers)
+        self.numbers, self.named = scan.numbers, np.full(scan.direct.size, UNLABELLED)
+        self.new: list[int] = []
+
+    def search_callers(self) -> News:
+        """Follow the rows of callers that are not found, and return where some now are."""
+        news: dict[int, tuple[float, float, bool]] = {}
+        for number, row in enumerate(self.scan.direct.tolist()):
+            if number == OWN or (row < 0 and number not in self.callers):
+                continue
+            caller = self.callers.get(number) or Caller(label=self._another())
+            self.callers[number] = caller
+            if caller.told:
+                news |= self._refined(number, caller)
+            elif caller.place is None:
+                news |= self._searched(number, caller, row)
+        return news
+
+    def _refined(self, number: int, caller: Caller) -> News:
+        """Return the place of a caller on the map, once that is worth more than what was found."""
+        at = self._where(caller.label)
+        if caller.refined or self.memory.scan != caller.since + REFINED_AFTER or at < 0:
+            return {}
+        x, y = self.joint.mean[at : at + 2].tolist()
+        return {number: (x, y, True)}
+
+    def _searched(self, number: int, caller: Caller, row: int) -> News:
+        """Follow a caller's rows, and return its place if that is found."""
+        rows = self._rows(number, self._usable(number, with_way=True))
+        direct = self.scan.bearing[row] if row >= 0 else math.nan
+        tracks = followed(caller.tracks, self.pose, direct, rows)
+        self.callers[number] = replace(caller, tracks=tracks)
+        if len(tracks.poses) < FIRST_SEARCH or len(tracks.poses) % 2:
+            return {}
+        found = find_caller(tracks)
+        return {number: (found.x, found.y, False)} if found is not None and found.sure else {}
+
+    def match(self, number: int) -> None:
+        """Label the rows of one caller."""
+        at = OWN_CALL
+        if number != OWN:
+            caller = self.callers.get(number)
+            if caller is not None:
+                if not caller.told:
+                    self._tell(number, caller)
+                    return
+                self.named[number] = caller.label
+                at = self._where(caller.label)
+                self._match_direct(number, caller.label, at)
+                at = UNPLACED if at < 0 else at
+            else:
+                at = UNPLACED
+        usable = self._usable(number)
+        rows, there = np.flatnonzero(usable & (self.label == UNLABELLED)), self._places()
+        if number != OWN and number < self.scan.direct.size:
+            rows = rows[rows != self.scan.direct[number]]
+        costs = self._costs(number, rows, there, at, self.stage.chances)
+        found = self.stage.match(costs)
+        self.label[rows[found >= 0]] = self.joint.landmark[found[found >= 0]]
+        near = np.isfinite(costs).any(axis=1)
+        self._judge_caller(number, rows, found >= 0)
+        if at != UNPLACED:
+            self._bear(number, rows[~near])
+
+    def finished(self) -> tuple[Memory, Assignment]:
+        """Return the memory after the scan, and the assignment."""
+        memory, scan = self.memory, self.scan
+        size = max(1 + scan.caller.max(initial=0), scan.direct.size, memory.known.source.shape[1])
+        known = with_new(memory.known, self.new, memory.scan, size)
+        at = np.array([self._where(label) for label in known.label.tolist()], np.int64)
+        callers = np.full(size, UNPLACED)
+        for number, caller in self.callers.items():
+            callers[number] = self._where(caller.label)
+        way = np.where(scan.caller == OWN, scan.range, scan.excess_path)
+        heard = self.label, scan.caller, way, scan.level_db
+        known = judged(known, heard, (self.joint.mean, at, callers), memory.scan)
+        gone = {*known.label[known.odds < GONE].tolist(), *self._lost(known)}
+        kept = ~np.isin(known.label, list(gone))
+        self.label[np.isin(self.label, list(gone))] = UNLABELLED
+        self.named[np.isin(self.named, list(gone))] = UNLABELLED
+        after = Memory(
+            scan=memory.scan + 1, labels=self.labels, known=some(known, kept), callers=self.callers
+        )
+        stated = replace(scan, numbers=self.numbers, callers=self.named, direct=NO_CALLERS)
+        before = {*memory.known.label.tolist(), *(c.label for c in memory.callers.values())}
+        return after, Assignment(
+            label=self.label,
+            remove=tuple(sorted(gone & before)),
+            scan=stated if scan.direct.size else None,
+        )
+
+    def _another(self) -> int:
+        """Return a new label."""
+        self.labels += 1
+        return self.labels
+
+    def _where(self, label: int) -> int:
+        """Return where a landmark stands in the joint mean, or -1."""
+        found = np.flatnonzero(self.joint.landmark == label)
+        return 3 + 2 * int(found[0]) if found.size else -1
+
+    def _places(self) -> Int[np.ndarray, " n"]:
+        """Return where all landmarks stand in the joint mean."""
+        return 3 + 2 * np.arange(self.joint.landmark.size)
+
+    def _ways(self, number: int) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+        """Return ranges or excess paths, with their deviations."""
+        scan = self.scan
+        if number == OWN:
+            return scan.range, scan.range_std
+        return scan.excess_path, scan.excess_path_std
+
+    def _usable(self, number: int, *, with_way: bool = False) -> Bool[np.ndarray, " m"]:
+        """Return a mask of the rows of a caller that are sure enough."""
+        (way, std), limits = self._ways(number), self.stage.limits
+        sure = (self.scan.caller == number) & (self.scan.bearing_std <= limits.bearing_std)
+        bare = np.isnan(way)
+        return sure & (~bare if with_way else True) & (bare | (std <= limits.way_std))
+
+    def _rows(self, number: int, rows: np.ndarray) -> Rows:
+        """Return rows of a caller."""
+        way, std = self._ways(number)
+        scan = self.scan
+        return Rows(scan.bearing[rows], scan.bearing_std[rows], way[rows], std[rows],
+                    scan.level_db[rows])  # fmt: skip
+
+    def _costs(
+        self,
+        number: int,
+        rows: Int[np.ndarray, " r"],
+        there: Int[np.ndarray, " n"],
+        caller: int,
+        chances: tuple[float, float, float, float],
+    ) -> Float[np.ndarray, "r n"]:
+        """Return the costs of rows of a caller and landmarks (`pair_costs`)."""
+        joint = self.joint
+        columns = tuple(self._rows(number, rows))
+        return pair_costs(columns, joint.mean, joint.covariance, there, caller, chances)
+
+    def _tell(self, number: int, caller: Caller) -> None:
+        """State the place of a caller that was found as a range of its direct call."""
+        row = self.scan.direct[number] if number < self.scan.direct.size else -1
+        if caller.place is None or row < 0:
+            return
+        dx, dy = caller.place[0] - self.pose[0], caller.place[1] - self.pose[1]
+        far = math.hypot(dx, dy)
+        self.numbers = self.numbers.copy()
+        if not caller.refined:
+            self.numbers[BEARING, row] = wrap_angle(math.atan2(dy, dx) - self.pose[2])
+            self.numbers[BEARING_STD, row] = PLACE_BEARING_STD
+        self.numbers[RANGE, row], self.numbers[RANGE_STD, row] = (
+            far,
+            (REFINED_SHARE if caller.refined else PLACE_SHARE) * far,
+        )
+        self.label[row] = self.named[number] = caller.label
+        told = replace(caller, told=True, tracks=Tracks(), since=self.memory.scan)
+        self.callers[number] = told
+
+    def _match_direct(self, number: int, label: int, at: int) -> None:
+        """Label a caller's direct call, where its bearing agrees."""
+        row = self.scan.direct[number] if number < self.scan.direct.size else -1
+        if row < 0:
+            return
+        chances = (DIRECT_GATE, *self.stage.chances[1:])
+        if (
+            at < 0
+            or np.isfinite(
+                self._costs(number, np.array([row]), np.array([at]), UNPLACED, chances)
+            ).all()
+        ):
+            self.label[row] = label
+
+    def _bear(self, number: int, rows: Int[np.ndarray, " r"]) -> None:
+        """Begin landmarks with rows that are sure and near no other."""
+        (way, std), limits, scan = self._ways(number), self.stage.limits, self.scan
+        sure = scan.bearing_std[rows] <= limits.birth_bearing_std
+        sure &= std[rows] <= limits.birth_way_std
+        factor, same = (2.0 if number == OWN else 1.0), scan.caller == number
+        for row in sorted(rows[sure].tolist(), key=lambda row: -scan.level_db[row]):
+            beside = same & (factor * np.abs(way - way[row]) < BESIDE)
+            beside &= np.abs(_wrapped(scan.bearing - scan.bearing[row])) < ASIDE
+            if np.any(beside & (scan.level_db > scan.level_db[row])):
+                continue
+            label = self._another()
+            self.label[row] = label
+            self.new.append(label)
+            if number == OWN:
+                stds = scan.bearing_std[row], std[row]
+                self.joint = with_point(self.joint, label, scan.bearing[row], way[row], stds)
+
+    def _judge_caller(
+        self, number: int, rows: Int[np.ndarray, " r"], found: Bool[np.ndarray, " r"]
+    ) -> None:
+        """Count how many of a caller's sure rows are of landmarks."""
+        if number not in self.callers or self._where(self.callers[number].label) < 0:
+            return
+        (_, std), limits, caller = self._ways(number), self.stage.limits, self.callers[number]
+        sure = self.scan.bearing_std[rows] <= limits.birth_bearing_std
+        sure &= std[rows] <= limits.birth_way_std
+        told = (int(found[sure].sum()), int(sure.sum()))
+        self.callers[number] = replace(caller, trial=(*caller.trial[1 - TRIAL :], told))
+
+    def _lost(self, known: Known) -> list[int]:
+        """Return callers that are not where they were found, with what they alone have placed."""
+        lost: list[int] = []
+        for number, caller in [*self.callers.items()]:
+            if len(caller.trial) < TRIAL or self.memory.scan > caller.since + PROBATION:
+                continue
+            right, rows = np.sum(caller.trial[SETTLING:], axis=0)
+            if rows >= LEAST_ROWS and right < LEAST_SHARE * rows:
+                alone = np.isnan(known.source[:, OWN]) & (known.born >= caller.since)
+                lost += [caller.label, *known.label[alone].tolist()]
+                del self.callers[number]
+        return lost
+
+
+def _wrapped(angle: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+    """Return angles within half a turn."""
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
