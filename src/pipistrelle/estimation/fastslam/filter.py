@@ -73,6 +73,7 @@ the frame.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -80,7 +81,13 @@ from jaxtyping import Float, Int
 
 from pipistrelle.config import FastSlamConfig, InputError, RayConfig
 from pipistrelle.detection.scans import Scan, rows_of, with_columns
-from pipistrelle.estimation.beliefs import NO_INNOVATIONS, Gaussian, Innovations, Landmarks
+from pipistrelle.estimation.beliefs import (
+    NO_INNOVATIONS,
+    Gaussian,
+    Innovations,
+    JointGaussian,
+    Landmarks,
+)
 from pipistrelle.estimation.checking import (
     check_belief,
     check_gate,
@@ -92,6 +99,7 @@ from pipistrelle.estimation.checking import (
 from pipistrelle.estimation.fastslam.block import LANES, MEMBER
 from pipistrelle.estimation.fastslam.block_conditional import SLOPES
 from pipistrelle.estimation.fastslam.conditional_landmarks import Parents, resample_slopes
+from pipistrelle.estimation.fastslam.editing import edits, joint_of
 from pipistrelle.estimation.fastslam.particles import (
     Arrays,
     correct_particles,
@@ -149,6 +157,18 @@ class FastSlamBelief:
     def landmarks(self) -> Landmarks:
         """Return the heaviest particle's map, one row per member."""
         return _rows(self.landmark, self.first, self.best_count, self.best_member)
+
+    def labels(self) -> list[int]:
+        """Return the labels of all landmarks, placed or not."""
+        return self.landmark.tolist()
+
+    def joint(self) -> JointGaussian:
+        """Return pose and placed landmarks of all particles together (`editing`)."""
+        return joint_of(self)
+
+    def edited(self, remove: Sequence[int], merge: Sequence[tuple[int, int]]) -> "FastSlamBelief":
+        """Return the belief without some landmarks, and with others as one (`editing`)."""
+        return replace(self, **edits(self, remove, merge))
 
     def cloud(self) -> Float[np.ndarray, "p 3"]:
         """Return the particles' poses, (p, 3) [m, m, rad]."""

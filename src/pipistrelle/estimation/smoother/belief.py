@@ -1,5 +1,6 @@
 """The smoother's belief: the solution of all that was heard, and path and map from it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -8,9 +9,16 @@ from jaxtyping import Float
 
 from pipistrelle.config import RayConfig
 from pipistrelle.detection.scans import BEARING, BEARING_STD
-from pipistrelle.estimation.beliefs import NO_INNOVATIONS, Gaussian, Innovations, Landmarks
+from pipistrelle.estimation.beliefs import (
+    NO_INNOVATIONS,
+    Gaussian,
+    Innovations,
+    JointGaussian,
+    Landmarks,
+)
 from pipistrelle.estimation.rays import ray_members
-from pipistrelle.estimation.smoother.chain import Smoothed, converged, smoothed
+from pipistrelle.estimation.smoother.chain import Smoothed, converged, eliminated, smoothed
+from pipistrelle.estimation.smoother.editing import edited
 from pipistrelle.estimation.smoother.history import History
 from pipistrelle.estimation.smoother.preintegration import Odometry, placed, poses_between
 from pipistrelle.estimation.smoother.records import CALLER, POSE
@@ -106,6 +114,49 @@ class SmootherBelief:
         stds = made.unit * np.sqrt(known.parameter_covariance.diagonal())
         both = zip(values.tolist(), stds.tolist(), strict=True)
         return dict(zip(made.names, both, strict=True))
+
+    def labels(self) -> list[int]:
+        """Return the labels of all landmarks and callers, placed or not."""
+        return [label for label, _ in self.history.slots if label >= 0]
+
+    def joint(self) -> JointGaussian:
+        """Return pose and placed landmarks together, callers that move among them."""
+        solution, steps = self.solution, self.ahead.mean[:2] - self.at.mean[:2]
+        columns, d, n = solution.columns, len(solution.state), solution.beta.size
+        there = np.flatnonzero(columns)
+        labels = [self.history.placed[number] for number in there.tolist()]
+        border, size = (
+            solution.border[:n] + solution.beta,
+            3 + 2 * len(there) + 2 * len(self._callers()),
+        )
+        by_chain, by_border = np.zeros((size, d)), np.zeros((size, n))
+        by_chain[:3, :3] = np.eye(3)
+        by_chain[0, 2], by_chain[1, 2] = -steps[1], steps[0]
+        mean, i = [*self.ahead.mean], 3
+        for column in columns[there].tolist():
+            by_border[i, column] = by_border[i + 1, column + 1] = 1.0
+            mean, i = [*mean, *border[column : column + 2]], i + 2
+        for label, at in self._callers():
+            by_chain[i, at] = by_chain[i + 1, at + 1] = 1.0
+            mean, i, labels = [*mean, *solution.state[at : at + 2]], i + 2, [*labels, label]
+        covariance = joint(solution.front, solution.factor, n, by_chain, by_border)
+        covariance[:3, :3] = self.ahead.covariance
+        return JointGaussian(
+            landmark=np.array(labels, np.int64), mean=np.array(mean), covariance=covariance
+        )
+
+    def edited(self, remove: Sequence[int], merge: Sequence[tuple[int, int]]) -> "SmootherBelief":
+        """Return the belief without some landmarks, and with others as one (`editing`)."""
+        history, kept = edited(self.history, remove, merge)
+        points = replace(self.solution.points, spots=self.solution.points.spots[kept])
+        solution = eliminated(history, self.noise, points)
+        at = Gaussian(mean=solution.state[:3], covariance=solution.covariance[:3, :3])
+        belief = replace(self, at=at, ahead=at, history=history, solution=solution)
+        if not len(self.odometry.mean):
+            return belief
+        poses = belief.placed(self.odometry, len(self.odometry.mean) - 1)
+        ahead = Gaussian(mean=poses.mean[-1], covariance=poses.covariance[-1])
+        return replace(belief, ahead=ahead)
 
     def moving(self) -> Landmarks:
         """Return moving callers: a row for each in the chain, a ray for each heard just now."""
