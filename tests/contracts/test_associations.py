@@ -122,7 +122,9 @@ def test_without_labels_excess_paths_reach_the_filter_with_the_caller_as_it_was_
         assert named == {-1, 1000}
         assert all((scan.landmark >= 0).all() for scan in other.scans)
         assert other.scores.position_bound_m == one.scores.position_bound_m
-        assert (other.scores.map_rmse_m, one.scores.map_rmse_m is None) == (None, False)
+        assert one.scores.associated_right is None
+        assert 0.5 < other.scores.associated_right <= 1.0
+        assert np.isfinite(other.scores.map_rmse_m)
     paths = [
         sum(int((~np.isnan(scan.excess_path)).sum()) for scan in trial.scans)
         for trial in (labelled.trials[1], found.trials[1])
@@ -142,7 +144,10 @@ def test_an_association_of_a_class_maps_a_mission_a_study_and_its_log(written):
         for folder in ("known", "own", "again")
     )
     assert own["position_bound_m"] == known["position_bound_m"]
-    assert own["map_rmse_m"] is again["map_rmse_m"] is None
+    assert "associated_right" not in known
+    for one in (own, again):
+        assert one["map_rmse_m"] is not None
+        assert 0.5 < one["associated_right"] <= 1.0
     assert method[1] in Path("own/config.toml").read_text()
     for folder in ("own", "again"):
         drawn = pl.read_csv(f"{folder}/map_fused_iekf.csv", comment_prefix="#")
@@ -159,7 +164,8 @@ def test_an_association_of_a_class_maps_a_mission_a_study_and_its_log(written):
         known, own = trials.filter(pl.col("strategy") == strategy).iter_rows(named=True)
         assert known["position_bound_m"] == own["position_bound_m"]
         assert known["landmarks_total"] != own["landmarks_total"]
-        assert (known["map_rmse_m"] is None, own["map_rmse_m"]) == (False, None)
+        assert known["associated_right"] is None
+        assert 0.5 < own["associated_right"] <= 1.0
         assert known["clutter_per_frame"] == own["clutter_per_frame"]
 
 

@@ -50,7 +50,8 @@ def test_the_help_of_slam_leaves_out_what_a_log_decides(obey):
     swarm = ("particles", "resample-below", "mixture", "weights", "resampled-rays")
     assert found == {
         "--listening.timing",
-        "--association.method",
+        *(f"--association.{name}" for name in ("method", "detection", "clutter", "bearing-std")),
+        "--association.way-std",
         *(f"--filter.{name}" for name in ("noise", "excess-path-std", "robust")),
         *(f"--filter.{name}" for name in ("calibrate", "window")),
         *(f"--prior.{name}-std" for name in ("speed-scale", "turn-bias", "wheelbase")),

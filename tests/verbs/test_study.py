@@ -44,7 +44,7 @@ def failing(monkeypatch):
     """Make each passive FastSLAM trial fail."""
     run_trial = world.run_trial
 
-    def moody(case, drive, scans, config):
+    def moody(case, drive, scans, config, **_):
         if (case.strategy, case.filter) == ("passive", "fastslam"):
             raise FloatingPointError("weights: all zero")
         return run_trial(case, drive, scans, config)

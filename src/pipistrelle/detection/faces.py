@@ -6,7 +6,7 @@ echo (`same_echo`).
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -43,6 +43,8 @@ class FrameMeasurements:
     """Number of detections without a label."""
     unlabelled: Scan | None = None
     """The same frame as a robot hears it, a row per echo and no label; None if not asked for."""
+    causes: Int[np.ndarray, " e"] = field(default_factory=lambda: NO_CALLERS)
+    """What caused each of those rows: a landmark, by the oracle, or UNLABELLED."""
     between: bool = False
     """Whether the call came between two calls of the vehicle."""
 

@@ -148,6 +148,8 @@ class Track:
     """The particles' weighted mean number of fully initialised landmarks."""
     online: Gaussian | None = None
     """Of a filter that revises its path: each pose as it was believed at its time."""
+    labels: tuple[Int[np.ndarray, " m"], ...] = ()
+    """Of each scan the labels of its rows, as an association has them at the end."""
     calibration: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """What the filter estimated of the vehicle itself: value and standard deviation, by name."""
     callers: Mapping[int, Gaussian] = field(default_factory=dict)

@@ -87,6 +87,25 @@ SCORES = {
         title="landmarks heard", unit="landmarks", digits=0, mean_digits=2,
         shown=_in("missions", "notebook"),
     ),
+    "associated_right": Score(
+        title="rows rightly associated", digits=3,
+        shown=_in("mission", "missions", "studies", "effects", "levels"),
+    ),
+    "landmarks_missed": Score(
+        title="landmarks missed", unit="landmarks", digits=0, mean_digits=2,
+        shown=_in("mission", "missions", "studies", "levels"),
+    ),
+    "landmarks_false": Score(
+        title="landmarks false", unit="landmarks", digits=0, mean_digits=2,
+        shown=_in("mission", "missions", "studies", "levels"),
+    ),
+    "landmarks_twice": Score(
+        title="landmarks twice", unit="landmarks", digits=0, mean_digits=2,
+        shown=_in("mission", "missions", "studies", "levels"),
+    ),
+    "gospa_m": Score(
+        title="GOSPA of the map", unit="m", digits=2, shown=_in("mission", "missions", "levels")
+    ),
     "measurements_per_frame": Score(
         title="measurements per frame", digits=2, shown=_in("missions")
     ),

@@ -34,7 +34,7 @@ def moody(monkeypatch):
     """Make passive FastSLAM fail in world 1, until this is called."""
     run_trial = world.run_trial
 
-    def failing(case, drive, scans, config):
+    def failing(case, drive, scans, config, **_):
         if (case.strategy, case.filter, case.iteration) == ("passive", "fastslam", 1):
             raise FloatingPointError("weights: all zero")
         return run_trial(case, drive, scans, config)
@@ -74,7 +74,7 @@ def test_the_progress_counts_worlds_and_trials_by_strategy(plan, tmp_path):
 
 
 def test_of_several_failures_the_first_is_told(plan, tmp_path, monkeypatch):
-    def failing(case, drive, scans, config):
+    def failing(case, drive, scans, config, **_):
         raise FloatingPointError(f"\nweights of world {case.iteration}\nsee the manual")
 
     monkeypatch.setattr(world, "run_trial", failing)

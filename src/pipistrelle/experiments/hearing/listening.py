@@ -254,7 +254,7 @@ def _heard(time: float, detections: Detections, arrivals: Arrivals, rig: _Rig) -
     if direct is not None and rig.missable.any():
         direct = own_alone(direct, label, rig.callers, rig.missable)
     heard = _averaged(time, replace(detections, direct=direct), label, rig)
-    return heard if rig.labels else replace(heard, unlabelled=_echoes(time, detections, rig))
+    return heard if rig.labels else _unlabelled(time, detections, label, heard, rig)
 
 
 def _averaged(
@@ -271,8 +271,16 @@ def _averaged(
     )
 
 
-def _echoes(time: float, detections: Detections, rig: _Rig) -> Scan:
+def _unlabelled(
+    time: float,
+    detections: Detections,
+    label: Int[np.ndarray, " d"],
+    heard: FrameMeasurements,
+    rig: _Rig,
+) -> FrameMeasurements:
     """Average a frame's detections over the faces, by echo: one call, one time, one direction.
+
+    An echo's cause is that of its strongest detection that has one; of a direct call its caller.
 
     The direct call of a caller with a beam or a clock of its own may not be heard: the first of its
     tone is then an echo, which labels alone tell. Without them it has no excess paths.
@@ -288,7 +296,13 @@ def _echoes(time: float, detections: Detections, rig: _Rig) -> Scan:
         direct = without_calls(direct, rig.missable)
         detections = replace(detections, direct=direct)
         callers = np.append(echo, UNLABELLED)[direct.detection]
-    return _with_unsure_calls(without_labels(_averaged(time, detections, echo, rig).rows, callers))
+    causes = np.full(int(echo.max(initial=-1)) + 1, UNLABELLED)
+    for d in np.argsort(detections.power, kind="stable").tolist():
+        causes[echo[d]] = causes[echo[d]] if label[d] == UNLABELLED else label[d]
+    scan = without_labels(_averaged(time, detections, echo, rig).rows, callers)
+    known = np.flatnonzero(scan.direct >= 0)
+    causes[scan.direct[known]] = rig.callers[known]
+    return replace(heard, unlabelled=_with_unsure_calls(scan), causes=causes)
 
 
 def _with_unsure_calls(scan: Scan) -> Scan:

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from pipistrelle.config import Config
 from pipistrelle.detection.scans import Scan
-from pipistrelle.estimation.beliefs import Gaussian, Track
+from pipistrelle.estimation.beliefs import Gaussian, Landmarks, Track, placed
 from pipistrelle.estimation.motion import motion_step
 from pipistrelle.evaluation.accuracy import (
     alignment,
@@ -19,9 +19,16 @@ from pipistrelle.evaluation.accuracy import (
     rmse,
     scored_landmarks,
 )
+from pipistrelle.evaluation.association import Associated, gospa, map_counts
 from pipistrelle.evaluation.bound import NO_ROUTES, path_bound, pose_bound, true_controls
 from pipistrelle.evaluation.consistency import diverged, track_nees
 from pipistrelle.experiments.drives import Drive, Truth, split_at
+
+OF_ASSOCIATION = (
+    "associated_right", "landmarks_missed", "landmarks_false", "landmarks_twice",
+    "gospa_m", "gospa_error_m", "gospa_missed", "gospa_false",
+)  # fmt: skip
+"""Scores that known labels do not have."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,6 +80,13 @@ class Scores:
         Mean over the scans.
     gated : int
         Measurements that the gate rejected.
+    associated_right : float or None
+        Share of the rows that an association gave a label which are of the landmark that the label
+        stands for (`evaluation.association`); None of known labels, as are those that follow.
+    landmarks_missed, landmarks_false, landmarks_twice : int or None
+        Heard in three scans or more and not on the map; on the map and none; there twice.
+    gospa_m, gospa_error_m, gospa_missed, gospa_false
+        Metric of the map against the landmarks that were heard in three scans or more, and parts.
     nis_mean : float or None
         Normalised innovation squared per degree of freedom of what was used of placed landmarks:
         about 1 where the filter believes rightly. None where it does not say (`Innovations`).
@@ -96,6 +110,14 @@ class Scores:
     measurements_per_frame: float | None
     gated: int
     nis_mean: float | None = None
+    associated_right: float | None = None
+    landmarks_missed: int | None = None
+    landmarks_false: int | None = None
+    landmarks_twice: int | None = None
+    gospa_m: float | None = None
+    gospa_error_m: float | None = None
+    gospa_missed: int | None = None
+    gospa_false: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,6 +135,8 @@ class TrialResult:
     scores: Scores
     wall_s: float
     """Time that the estimate took."""
+    mapped: Landmarks | None = None
+    """The map under the names of the true landmarks, where an association has labels of its own."""
     online: PathScores | None = None
     """Scores of the path as it was believed at its time, where the filter revises it."""
     error: str | None = None
@@ -184,6 +208,32 @@ def _followed(
     rows = np.concatenate([np.empty((0, 4)), *both])
     rows = rows[~np.isnan(rows).any(axis=1)]
     return rows[:, :2], rows[:, 2:]
+
+
+def with_association(
+    scores: Scores, landmarks: Landmarks, found: Associated, truth: Truth
+) -> Scores:
+    """Return scores with those of an association filled in; ``landmarks``: under its own labels."""
+    counts = map_counts(landmarks, found)
+    scores = replace(
+        scores,
+        associated_right=found.right,
+        landmarks_missed=counts.missed,
+        landmarks_false=counts.false,
+        landmarks_twice=counts.twice,
+    )
+    if truth.landmarks is None:
+        return scores
+    labels, positions = truth.landmarks
+    there = positions[np.isin(labels, list(found.heard))]
+    metric = gospa(landmarks.mean[placed(landmarks)], there)
+    return replace(
+        scores,
+        gospa_m=metric.distance,
+        gospa_error_m=metric.error,
+        gospa_missed=metric.missed,
+        gospa_false=metric.false,
+    )
 
 
 def position_floor(drive: Drive, scans: Sequence[Scan]) -> float | None:

@@ -19,7 +19,7 @@ from pydantic import BaseModel
 from pipistrelle.estimation.beliefs import Track
 from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.drives import Truth
-from pipistrelle.experiments.results.scores import TrialResult
+from pipistrelle.experiments.results.scores import OF_ASSOCIATION, Scores, TrialResult
 from pipistrelle.experiments.results.tables import (
     landmark_table,
     map_text,
@@ -212,7 +212,7 @@ def run_entry(trial: TrialResult, ignored_rows: Mapping[str, int]) -> dict[str, 
     run: dict[str, object] = {
         "strategy": trial.strategy,
         "filter": trial.filter,
-        **_finite(asdict(trial.scores)),
+        **_finite(_told(trial.scores)),
         **({"calibration": calibrated} if (calibrated := calibration_of(trial.track)) else {}),
         "ignored_rows": dict(ignored_rows),
         "wall_s": trial.wall_s,
@@ -235,6 +235,13 @@ def calibration_of(track: Track) -> dict[str, float]:
         for name, (value, std) in both
         for key, one in ((name, value), (f"{name}_std", std))
     }
+
+
+def _told(scores: Scores) -> dict[str, object]:
+    """Return scores by name, without those of an association where there is none."""
+    told = asdict(scores)
+    known = told["associated_right"] is None
+    return {name: v for name, v in told.items() if not (known and name in OF_ASSOCIATION)}
 
 
 def _finite(scores: Mapping[str, object]) -> dict[str, object]:

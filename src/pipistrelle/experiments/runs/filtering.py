@@ -92,7 +92,10 @@ def run_filter(
         if progress:
             progress(number, len(scans))
     _move(session, drive, done, len(drive.controls), path)
-    return _track_of(session.belief, time, path, callers)
+    track = _track_of(session.belief, time, path, callers)
+    if association is None:
+        return track
+    return replace(track, landmarks=session.landmarks(), labels=tuple(session.labels))
 
 
 def _track_of(

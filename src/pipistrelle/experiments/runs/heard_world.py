@@ -24,6 +24,7 @@ from pipistrelle.detection.noise import noise_of, without_hidden
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.beliefs import Gaussian
+from pipistrelle.evaluation.association import Causes, causes_of
 from pipistrelle.evaluation.bound import bound_of_drawn_start
 from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.experiments.hearing.scenario import (
@@ -74,6 +75,14 @@ def scans_of(
     )
     scans = zip(heard, (scan_of(scan, strategy) for scan in rows), strict=True)
     return tuple(noise(scan) for frame, scan in scans if scan.landmark.size or not frame.between)
+
+
+def frame_causes(heard: Sequence[FrameMeasurements], scans: Sequence[Scan]) -> Causes:
+    """Return what caused the rows of scans without labels that `scans_of` took of frames."""
+    frames = {frame.rows.time: frame for frame in heard}
+    return tuple(
+        causes_of(scan, _unlabelled(frames[scan.time]), frames[scan.time].causes) for scan in scans
+    )
 
 
 def _unlabelled(frame: FrameMeasurements) -> Scan:
@@ -147,6 +156,12 @@ class HeardWorld:
         if key not in self._scans:
             self._scans[key] = scans_of(self.beams[radius], strategy, self._with(key))
         return self._scans[key]
+
+    def causes(self, config: Config, strategy: Strategy) -> Causes | None:
+        """Return what caused the rows of a strategy's scans; None where labels are known."""
+        if config.association.method == KNOWN:
+            return None
+        return frame_causes(self.beams[config.emitter.radius], self.scans(config, strategy))
 
     def bound(self, config: Config, strategy: Strategy) -> Float[np.ndarray, "t 3 3"]:
         """Return the bound of the pose at every step, for the noise that the signal tells."""

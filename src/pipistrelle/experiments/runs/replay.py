@@ -18,6 +18,7 @@ from pipistrelle.detection.logs.recording import Log
 from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.noise import noise_of, without_hidden
 from pipistrelle.detection.scans import (
+    UNLABELLED,
     Scan,
     rows_of,
     with_columns,
@@ -27,6 +28,7 @@ from pipistrelle.detection.scans import (
 from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.motion import Motion
+from pipistrelle.evaluation.association import Causes, causes_of
 from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.runs.mission import Mission
@@ -260,8 +262,24 @@ def replay(
         strategy: tuple(map(taken, as_heard_by(scans, strategy, beamwidth)))
         for strategy in strategies
     }
-    trials = run_trials(filters, drive, heard, config, progress=progress, watch=watch)
+    causes = {} if known else _log_causes(log, heard)
+    trials = run_trials(
+        filters, drive, heard, config, causes=causes, progress=progress, watch=watch
+    )
     return Mission(config=config, drive=drive, trials=trials, beamwidth=beamwidth, log=log)
+
+
+def _log_causes(
+    log: Log, heard: Mapping[Strategy, Sequence[Scan]]
+) -> dict[Strategy, Causes | None]:
+    """Return the labels that a log's rows bear, as what caused them; None where none bears one."""
+    rows = {scan.time: scan for scan in log.scans}
+    if all((scan.landmark == UNLABELLED).all() for scan in log.scans):
+        return dict.fromkeys(heard)
+    return {
+        strategy: [causes_of(s, rows[s.time], rows[s.time].landmark) for s in scans]
+        for strategy, scans in heard.items()
+    }
 
 
 def _known_callers(log: Log) -> Landmarks:

@@ -18,20 +18,23 @@ from pipistrelle.config import Config, InputError, Strategy
 from pipistrelle.detection.noise import noise_of
 from pipistrelle.detection.scans import Scan, rows_of
 from pipistrelle.estimation.association import KNOWN, Association
-from pipistrelle.estimation.beliefs import Belief, at_steps
+from pipistrelle.estimation.beliefs import Belief, Landmarks, Track, at_steps
 from pipistrelle.estimation.catalogue import CATALOGUE, entry, short_name
 from pipistrelle.estimation.data_association.methods import association_of
+from pipistrelle.evaluation.association import Causes, associated, renamed
 from pipistrelle.experiments.cases import Case
-from pipistrelle.experiments.drives import Drive, split_at
+from pipistrelle.experiments.drives import Drive, Truth, split_at
 from pipistrelle.experiments.hearing.listening import Progress, listen
 from pipistrelle.experiments.hearing.scenario import standing_landmarks
 from pipistrelle.experiments.hearing.world import ALL_DRAWN, World
 from pipistrelle.experiments.machine import check_memory
 from pipistrelle.experiments.results.scores import (
+    Scores,
     TrialResult,
     position_floor,
     score,
     score_path,
+    with_association,
     with_bound,
 )
 from pipistrelle.experiments.runs.filtering import run_filter
@@ -44,6 +47,8 @@ from pipistrelle.experiments.runs.validate_filters import (
 )
 from pipistrelle.experiments.runs.validate_mission import checked_scenario
 
+NOT_KNOWN: Mapping[Strategy, None] = {}
+"""What caused rows, where nobody tells."""
 Watch = Callable[[str, str, Scan, Belief], None]
 """Called with strategy, filter, scan and the belief after it."""
 
@@ -81,7 +86,10 @@ def run_mission(
     (heard,) = listen(scenario, config, (radius,), labels=labels, progress=progress)
     there = HeardWorld(scenario, config, {radius: heard})
     scans = {strategy: there.scans(config, strategy) for strategy in strategies}
-    trials = run_trials(filters, drive, scans, config, progress=progress, watch=watch)
+    causes = {strategy: there.causes(config, strategy) for strategy in strategies}
+    trials = run_trials(
+        filters, drive, scans, config, causes=causes, progress=progress, watch=watch
+    )
     bounds: dict[str, Float[np.ndarray, "t 3 3"]] = {
         strategy: there.bound(config, strategy) for strategy in strategies
     }
@@ -103,17 +111,23 @@ def run_trials(
     heard: Mapping[Strategy, Sequence[Scan]],
     config: Config,
     *,
+    causes: Mapping[Strategy, Causes | None] = NOT_KNOWN,
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> tuple[TrialResult, ...]:
     """Let each filter map the scans of each strategy; one result for each pair, by strategy.
+
+    `causes`: see `run_trial`.
 
     A filter of the user's may fail: its path is then NaN, and the result says why.
     """
 
     def tried(case: Case, scans: Sequence[Scan]) -> TrialResult:
         try:
-            return run_trial(case, drive, scans, config, progress=progress, watch=watch)
+            return run_trial(
+                case, drive, scans, config, causes=causes.get(case.strategy), progress=progress,
+                watch=watch,
+            )  # fmt: skip
         except Exception as error:
             if isinstance(error, InputError) and case.filter in CATALOGUE:
                 raise  # a user's mistake
@@ -133,6 +147,7 @@ def run_trial(
     config: Config,
     *,
     association: Association | None = None,
+    causes: Causes | None = None,
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> TrialResult:
@@ -148,7 +163,9 @@ def run_trial(
     config : Config
     association : Association, optional
         Labels the rows of scans; that of the settings by default, where they have one. The noise of
-        rows that it merges is the settings'. Its labels are not the truth's, so the map is not
+        rows that it merges is the settings'. Its labels are not the truth's.
+    causes : sequence of (m), optional
+        What caused the rows of each scan, to score an association by; without them the map is not
         scored.
     progress, watch : callable, optional
 
@@ -182,8 +199,7 @@ def run_trial(
     )
     wall_s = kernel_clock.wall_s() - began
     track = at_steps(whole, steps)
-    truth = replace(drive.truth, landmarks=None) if association else drive.truth
-    scores = score(track, truth, used, estimator.nees_limit)
+    scores, mapped = _scored(track, drive.truth, used, estimator.nees_limit, causes, association)
     return TrialResult(
         strategy=strategy,
         filter=name,
@@ -191,9 +207,29 @@ def run_trial(
         heard=heard,
         scans=tuple(used),
         scores=replace(scores, position_floor_m=position_floor(drive, used)),
+        mapped=mapped,
         wall_s=wall_s,
         online=None if track.online is None else score_path(track.online, drive.truth.path),
     )
+
+
+def _scored(
+    track: Track,
+    truth: Truth,
+    used: Sequence[Scan],
+    limit: float,
+    causes: Causes | None,
+    association: Association | None,
+) -> tuple[Scores, Landmarks | None]:
+    """Return the scores of a track, and its map by the names of the truth where it has others."""
+    if association is None:
+        return score(track, truth, used, limit), None
+    if causes is None:
+        return score(track, replace(truth, landmarks=None), used, limit), None
+    found = associated(track.labels, causes)
+    mapped = renamed(track.landmarks, found)
+    scores = score(replace(track, landmarks=mapped), truth, used, limit)
+    return with_association(scores, track.landmarks, found, truth), mapped
 
 
 def _with_moving(scans: Sequence[Scan], drive: Drive, *, follows: bool) -> Sequence[Scan]:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from pipistrelle.config import InputError
 from pipistrelle.experiments.hearing.world_folder import kept_world
+from pipistrelle.experiments.results.scores import OF_ASSOCIATION
 from pipistrelle.experiments.studies.plan import Plan
 from pipistrelle.experiments.studies.plan_file import changed_settings, plan_text, read_plan
 from pipistrelle.experiments.studies.world import world_schemas
@@ -174,4 +175,8 @@ def load_study(folder: Path) -> StoredStudy:
         else pl.LazyFrame(schema=world_schemas(plan)[name])
         for name in TABLES
     }
+    # Without an association in the plan, its scores have no columns.
+    there = frames["trials"].collect_schema().names()
+    none = [pl.lit(None, pl.Float64).alias(n) for n in OF_ASSOCIATION if n not in there]
+    frames["trials"] = frames["trials"].with_columns(none)
     return StoredStudy(plan=plan, **frames)

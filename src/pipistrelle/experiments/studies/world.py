@@ -21,7 +21,6 @@ from pipistrelle.estimation.beliefs import Track
 from pipistrelle.estimation.catalogue import SECTIONS
 from pipistrelle.estimation.smoother.calibration import numbers_of
 from pipistrelle.evaluation.accuracy import (
-    MapEstimate,
     heaviest,
     landmark_error,
     pose_error,
@@ -35,7 +34,12 @@ from pipistrelle.experiments.hearing.listening import listen
 from pipistrelle.experiments.hearing.scenario import Scenario, standing_landmarks, world_of
 from pipistrelle.experiments.hearing.trajectories import motion_of
 from pipistrelle.experiments.hearing.world import World
-from pipistrelle.experiments.results.scores import PathScores, Scores, with_bound
+from pipistrelle.experiments.results.scores import (
+    OF_ASSOCIATION,
+    PathScores,
+    Scores,
+    with_bound,
+)
 from pipistrelle.experiments.results.writing import calibration_of
 from pipistrelle.experiments.runs.heard_world import HeardWorld, drive_of
 from pipistrelle.experiments.runs.trial import run_trial
@@ -167,8 +171,10 @@ def world_schemas(plan: Plan) -> "dict[str, dict[str, Any]]":
         name: pl.Float64 if isinstance(_cell(values[0]), (int, float)) else pl.String
         for name, values in plan.grid.items()
     }
-    # Worlds of a study that was begun before have no such column, and go on being read.
-    kept = (field.name for field in fields(Scores) if field.name != "nis_mean")
+    # Worlds of a study that was begun before have no such columns, and go on being read.
+    known = all(case.config.association.method == KNOWN for case in cases_of(plan))
+    left = {"nis_mean", *(OF_ASSOCIATION if known else ())}
+    kept = (field.name for field in fields(Scores) if field.name not in left)
     scores = dict.fromkeys(kept, pl.Float64)
     counts = dict.fromkeys(("landmarks_full", "landmarks_total", "gated"), pl.Int32)
     last = ("landmarks_full_mean", "clutter_per_frame", "wall_s", "cpu_s")
@@ -258,9 +264,12 @@ def _try_case(case: PlannedCase, shared: HeardWorld, iteration: int) -> TrialRec
         )
         heard = shared.beams[case.config.emitter.radius]
         began = kernel_clock.cpu_s()
-        result = run_trial(replace(case, iteration=iteration), drive, scans, case.config)
+        causes = shared.causes(case.config, case.strategy)
+        result = run_trial(
+            replace(case, iteration=iteration), drive, scans, case.config, causes=causes
+        )
         cpu_s = kernel_clock.cpu_s() - began
-        estimate = heaviest(result.track.landmarks)
+        estimate = heaviest(result.mapped or result.track.landmarks)
         full = result.track.full
         frames = _frame_errors(result.track, scenario, case.config)
         return TrialRecord(
@@ -276,19 +285,10 @@ def _try_case(case: PlannedCase, shared: HeardWorld, iteration: int) -> TrialRec
             steps=np.column_stack([frames, _consistent(case, shared)]),
             landmark=estimate.landmark,
             full=estimate.full,
-            landmark_error=_landmark_error(estimate, scenario, case.config),
+            landmark_error=landmark_error(estimate, *standing_landmarks(scenario)),
         )
     except Exception as failure:
         return _failed(case, failure_text(failure))
-
-
-def _landmark_error(
-    estimate: MapEstimate, scenario: Scenario, config: Config
-) -> Float[np.ndarray, " n"]:
-    """Return how far landmarks are off [m]; NaN where an association gave labels of its own."""
-    if config.association.method == KNOWN:
-        return landmark_error(estimate, *standing_landmarks(scenario))
-    return np.full(estimate.landmark.size, np.nan)
 
 
 @np.errstate(over="ignore", invalid="ignore")
