@@ -106,6 +106,7 @@ class Session(Generic[B]):
         self._memory = association.start() if association else None
         self._past: deque[_Heard] = deque(maxlen=REMEMBERED)
         self._legs: list[Leg] = []
+        self._dropped: set[int] = set()
         self.labels: list[Int[np.ndarray, " m"]] = []
         self.belief = estimator.init(start)
         if known is not None and known.landmark.size and isinstance(estimator, AcceptsMap):
@@ -197,9 +198,17 @@ class Session(Generic[B]):
     def _take_back(self, labels: tuple[int, ...]) -> None:
         """Remove landmarks, with all of their rows that are remembered."""
         past = list(self._past)
-        again = past[next((n for n, one in enumerate(past) if _names(one, labels)), len(past)) :]
+        heard = [n for n, one in enumerate(past) if _names(one, labels)]
+        again = past[heard[0] if heard else len(past) :]
         before = again[0].belief if again else self.belief
-        self.belief = edited(before, remove=_held(before, labels))
+        if len(heard) == 1 and not _held(before, labels) and _rows(again[0], labels) == len(labels):
+            # What was heard once has told nothing of anything else.
+            self.belief = edited(self.belief, remove=_held(self.belief, labels))
+            again[0].label = _without(again[0].label, labels)
+            self.labels[again[0].number] = again[0].label
+            self._dropped.update(labels)
+            return
+        self.belief = edited(before, remove=_held(before, [*labels, *self._dropped]))
         for one in again:
             if one is not again[0]:
                 self._go(one.legs)
@@ -214,7 +223,8 @@ class Session(Generic[B]):
         past, legs = list(self._past), self._legs
         self._past.clear()
         del self.labels[past[0].number :]
-        self.belief = past[0].belief
+        dropped = _held(past[0].belief, [*self._dropped])
+        self.belief = edited(past[0].belief, remove=dropped)
         informed = getattr(self._association, "informed", None)
         if informed is None:
             raise InputError(
@@ -238,7 +248,7 @@ class Session(Generic[B]):
 
 def _names(heard: _Heard, labels: Sequence[int]) -> bool:
     """Tell whether a scan has rows, or a caller, of some labels."""
-    return bool(np.isin(heard.label, labels).any() or np.isin(heard.scan.callers, labels).any())
+    return any((heard.label == a).any() or (heard.scan.callers == a).any() for a in labels)
 
 
 def _held(belief: Belief, labels: Sequence[int]) -> list[int]:
@@ -247,9 +257,17 @@ def _held(belief: Belief, labels: Sequence[int]) -> list[int]:
     return [label for label in labels if label in held]
 
 
+def _rows(heard: _Heard, labels: Sequence[int]) -> int:
+    """Return how many rows of a scan have some labels."""
+    return sum(int(np.count_nonzero(heard.label == label)) for label in labels)
+
+
 def _without(label: Int[np.ndarray, " m"], labels: Sequence[int]) -> Int[np.ndarray, " m"]:
     """Return labels without some."""
-    return np.where(np.isin(label, labels), UNLABELLED, label)
+    left = label.copy()
+    for one in labels:
+        left[left == one] = UNLABELLED
+    return left
 
 
 def check_poses(method: str, poses: Gaussian, size: int) -> None:

@@ -179,8 +179,9 @@ class _Work:
     def __init__(self, stage: Sequential, memory: Memory, belief: Belief, scan: Scan) -> None:
         self.stage, self.memory, self.scan = stage, memory, scan
         self.joint: JointGaussian = belief.joint()  # pyrefly: ignore[missing-attribute]
-        self.pose, self.size = self.joint.mean[:3], scan.landmark.size
-        self.label = np.full(self.size, UNLABELLED)
+        self.pose, there = self.joint.mean[:3], self.joint.landmark.tolist()
+        self.place = {label: 3 + 2 * n for n, label in enumerate(there)}
+        self.label = np.full(scan.landmark.size, UNLABELLED)
         self.labels, self.callers = memory.labels, dict(memory.callers)
         self.numbers, self.named = scan.numbers, np.full(scan.direct.size, UNLABELLED)
         self.new: list[int] = []
@@ -279,8 +280,7 @@ class _Work:
 
     def _where(self, label: int) -> int:
         """Return where a landmark stands in the joint mean, or -1."""
-        found = np.flatnonzero(self.joint.landmark == label)
-        return 3 + 2 * int(found[0]) if found.size else -1
+        return self.place.get(label, -1)
 
     def _places(self) -> Int[np.ndarray, " n"]:
         """Return where all landmarks stand in the joint mean."""
@@ -369,6 +369,7 @@ class _Work:
             self.new.append(label)
             if number == OWN:
                 stds = scan.bearing_std[row], std[row]
+                self.place[label] = self.joint.mean.size
                 self.joint = with_point(self.joint, label, scan.bearing[row], way[row], stds)
 
     def _judge_caller(
