@@ -201,14 +201,14 @@ class Session(Generic[B]):
         heard = [n for n, one in enumerate(past) if _names(one, labels)]
         again = past[heard[0] if heard else len(past) :]
         before = again[0].belief if again else self.belief
+        self._dropped.update(labels)
         if len(heard) == 1 and not _held(before, labels) and _rows(again[0], labels) == len(labels):
             # What was heard once has told nothing of anything else.
             self.belief = edited(self.belief, remove=_held(self.belief, labels))
             again[0].label = _without(again[0].label, labels)
             self.labels[again[0].number] = again[0].label
-            self._dropped.update(labels)
             return
-        self.belief = edited(before, remove=_held(before, [*labels, *self._dropped]))
+        self.belief = edited(before, remove=_held(before, [*self._dropped]))
         for one in again:
             if one is not again[0]:
                 self._go(one.legs)

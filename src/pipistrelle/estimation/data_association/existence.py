@@ -32,7 +32,7 @@ AS_LOUD = 3.0
 """What is at most so much fainter may hide it [dB]."""
 TOGETHER = 1.0
 """What comes within such a way hides it: the length of a call [m]."""
-AIMED = 0.3
+AIMED = 0.1
 """The vehicle's own call is as loud up to so much from the bearing at which it was heard [rad]."""
 FORGETTING = 0.2
 """Share of the newest level in the mean."""
@@ -94,15 +94,26 @@ Place = tuple[Float[np.ndarray, " d"], Int[np.ndarray, " l"], Int[np.ndarray, " 
 """Joint mean, where each known landmark stands in it, and each caller; -1: nowhere."""
 
 
-def judged(known: Known, rows: Heard, place: Place, scan: int) -> Known:
-    """Return landmarks after a scan, as known by what was heard and what was not."""
+def judged(
+    known: Known, rows: Heard, place: Place, near: Bool[np.ndarray, " l"], scan: int
+) -> Known:
+    """Return landmarks after a scan, as known by what was heard and what was not.
+
+    ``near``: whether a row may have been of the landmark; then it was not missed.
+    """
     after = Known(*(column.copy() for column in known))
-    _judge(tuple(after), rows, place, scan)
+    _judge(tuple(after), rows, place, near, scan)
     return after
 
 
 @kernel
-def _judge(columns: tuple[np.ndarray, ...], rows: Heard, place: Place, scan: Whole) -> None:
+def _judge(
+    columns: tuple[np.ndarray, ...],
+    rows: Heard,
+    place: Place,
+    near: Bool[np.ndarray, " l"],
+    scan: Whole,
+) -> None:
     """Write odds, counts and levels after a scan."""
     known, (label, caller, _, level), (mean, at, callers) = Known(*columns), rows, place
     for n in range(known.label.size):
@@ -128,7 +139,7 @@ def _judge(columns: tuple[np.ndarray, ...], rows: Heard, place: Place, scan: Who
             known.count[n] += 1
             known.heard[n] = scan
         else:
-            for c in range(callers.size):
+            for c in range(0 if near[n] else callers.size):
                 if _expected(known, n, c, far, bearing, rows, (mean, at, callers)):
                     known.odds[n] -= MISSED
                     break

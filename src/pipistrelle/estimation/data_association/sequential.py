@@ -185,6 +185,7 @@ class _Work:
         self.labels, self.callers = memory.labels, dict(memory.callers)
         self.numbers, self.named = scan.numbers, np.full(scan.direct.size, UNLABELLED)
         self.new: list[int] = []
+        self.near: set[int] = set()
 
     def search_callers(self) -> News:
         """Follow the rows of callers that are not found, and return where some now are."""
@@ -234,17 +235,19 @@ class _Work:
                 at = UNPLACED if at < 0 else at
             else:
                 at = UNPLACED
-        usable = self._usable(number)
-        rows, there = np.flatnonzero(usable & (self.label == UNLABELLED)), self._places()
+        rows, there = np.flatnonzero(self.scan.caller == number), self._places()
         if number != OWN and number < self.scan.direct.size:
             rows = rows[rows != self.scan.direct[number]]
         costs = self._costs(number, rows, there, at, self.stage.chances)
-        found = self.stage.match(costs)
-        self.label[rows[found >= 0]] = self.joint.landmark[found[found >= 0]]
-        near = np.isfinite(costs).any(axis=1)
-        self._judge_caller(number, rows, found >= 0)
+        gated, usable = np.isfinite(costs), self._usable(number)[rows]
+        telling = self.scan.bearing_std[rows] <= 2.0 * self.stage.limits.bearing_std
+        self.near |= {*self.joint.landmark[gated[telling].any(axis=0)].tolist()}
+        found = self.stage.match(costs[usable])
+        label = np.append(self.joint.landmark, UNLABELLED)[found]
+        self.label[rows[usable]] = label
+        self._judge_caller(number, rows[usable], label != UNLABELLED)
         if at != UNPLACED:
-            self._bear(number, rows[~near])
+            self._bear(number, rows[usable & ~gated.any(axis=1)])
 
     def finished(self) -> tuple[Memory, Assignment]:
         """Return the memory after the scan, and the assignment."""
@@ -257,7 +260,8 @@ class _Work:
             callers[number] = self._where(caller.label)
         way = np.where(scan.caller == OWN, scan.range, scan.excess_path)
         heard = self.label, scan.caller, way, scan.level_db
-        known = judged(known, heard, (self.joint.mean, at, callers), memory.scan)
+        near = np.isin(known.label, list(self.near))
+        known = judged(known, heard, (self.joint.mean, at, callers), near, memory.scan)
         gone = {*known.label[known.odds < GONE].tolist(), *self._lost(known)}
         kept = ~np.isin(known.label, list(gone))
         self.label[np.isin(self.label, list(gone))] = UNLABELLED
