@@ -1,0 +1,86 @@
+"""A caller is found by excess paths alone: in worlds that are made, with the truth beside them."""
+
+import math
+
+import numpy as np
+import pytest
+
+from pipistrelle.estimation.data_association.caller_search import find_caller, misfit
+from pipistrelle.estimation.data_association.pairs import Rows
+from pipistrelle.estimation.data_association.tracks import Tracks, followed, in_window
+from pipistrelle.estimation.measurement import excess_path_slopes
+
+CALLER = np.array([9.0, -7.0])
+
+
+def heard(seed, *, scans=12, landmarks=20, turn_std=0.0, clutter=0):
+    """Return the tracks of a drive along an arc, and the poses it truly had."""
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(-10.0, 10.0, (landmarks, 2))
+    tracks, poses, lost = Tracks(), [], 0.0
+    for k in range(scans):
+        angle = 0.05 * k
+        pose = np.array([8.0 * math.sin(angle), 8.0 * (1.0 - math.cos(angle)), angle])
+        lost += rng.normal(0.0, turn_std)
+        off = places - pose[:2]
+        bearing = np.arctan2(off[:, 1], off[:, 0]) - pose[2]
+        way = np.array([excess_path_slopes(*pose[:2], *p, *CALLER)[0] for p in places])
+        bearing = np.append(bearing, rng.uniform(-math.pi, math.pi, clutter))
+        way = np.append(way, rng.uniform(1.0, 25.0, clutter))
+        size = bearing.size
+        rows = Rows(
+            bearing + rng.normal(0.0, 0.01, size), np.full(size, 0.01),
+            way + rng.normal(0.0, 0.03, size), np.full(size, 0.03), np.full(size, 20.0),
+        )  # fmt: skip
+        towards = math.atan2(*(CALLER - pose[:2])[::-1]) - pose[2]
+        believed = pose + np.array([0.0, 0.0, lost])
+        direct = towards + rng.normal(0.0, 0.04)
+        tracks = followed(tracks, believed, direct, rows)
+        poses.append(believed)
+    return tracks, np.array(poses)
+
+
+def test_the_caller_is_found_though_headings_are_lost_and_clutter_is_heard():
+    sure = 0
+    for seed in range(16):
+        tracks, poses = heard(seed, turn_std=0.01, clutter=3)
+        found = find_caller(tracks)
+        if found is None or not found.sure:
+            continue
+        sure += 1
+        far = math.hypot(found.x - poses[-1, 0], found.y - poses[-1, 1])
+        assert far == pytest.approx(np.hypot(*(CALLER - poses[-1, :2])), rel=0.4), seed
+    assert sure >= 10
+
+
+def test_without_errors_the_misfit_is_least_where_the_caller_is():
+    tracks, _ = heard(3)
+    table, poses, direct = in_window(tracks, 14, 4)
+    here = misfit(CALLER, poses, table, direct)
+    for step in ([2.0, 0.0], [-2.0, 0.0], [0.0, 2.0], [0.0, -2.0], [5.0, -4.0]):
+        assert misfit(CALLER + step, poses, table, direct) > here + 10.0
+
+
+def test_a_vehicle_that_stands_still_finds_no_caller():
+    rng, tracks = np.random.default_rng(0), Tracks()
+    bearing, way = rng.uniform(-3.0, 3.0, 15), rng.uniform(2.0, 20.0, 15)
+    for _ in range(12):
+        rows = Rows(
+            bearing + rng.normal(0.0, 0.01, 15), np.full(15, 0.01),
+            way + rng.normal(0.0, 0.03, 15), np.full(15, 0.03), np.full(15, 20.0),
+        )  # fmt: skip
+        tracks = followed(tracks, np.zeros(3), 0.5, rows)
+    found = find_caller(tracks)
+    assert found is None or not found.sure
+
+
+def test_tracks_follow_landmarks_and_break_at_none():
+    tracks, _ = heard(5)
+    table, _, _ = in_window(tracks, 14, 12)
+    assert len(table) >= 15, "of 20 landmarks, two may be too near each other to tell"
+
+
+def test_too_few_tracks_or_no_direct_call_say_nothing():
+    assert find_caller(Tracks()) is None
+    tracks, _ = heard(1, landmarks=5)
+    assert find_caller(tracks) is None

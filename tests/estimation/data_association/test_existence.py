@@ -1,0 +1,82 @@
+"""Log odds of landmarks: what is heard, and what should have been."""
+
+import numpy as np
+import pytest
+
+from pipistrelle.estimation.data_association.existence import (
+    CONFIRMED,
+    GONE,
+    HEARD,
+    MISSED,
+    PATIENCE,
+    judged,
+    nobody,
+    with_new,
+)
+
+NONE = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0)
+AHEAD = np.array([0.0, 0.0, 0.0, 4.0, 0.0])
+THERE = (AHEAD, np.array([3]), np.array([-2]))
+
+
+def row(label=1, way=4.0, level=40.0):
+    """Return one row of the vehicle's own call."""
+    return np.array([label]), np.zeros(1, np.int64), np.array([way]), np.array([level])
+
+
+def heard_so_often(times):
+    known = with_new(nobody(1), [1], 0, 1)
+    for scan in range(times):
+        known = judged(known, row(), THERE, np.array([False]), scan)
+    return known
+
+
+def test_odds_rise_with_each_scan_and_confirm_at_the_third():
+    for times, confirmed in ((1, False), (2, False), (3, True)):
+        known = heard_so_often(times)
+        assert known.odds[0] == min(HEARD * (times - 1), 8.0)
+        assert bool(known.confirmed[0]) is confirmed
+        assert known.count[0] == times
+    assert HEARD * 2 >= CONFIRMED
+
+
+def test_a_landmark_that_should_have_been_heard_and_was_not_is_given_up():
+    known = heard_so_often(3)
+    missed = judged(known, NONE, THERE, np.array([False]), 3)
+    assert missed.odds[0] == pytest.approx(known.odds[0] - MISSED)
+    scan = 4
+    while missed.odds[0] >= GONE:
+        missed, scan = judged(missed, NONE, THERE, np.array([False]), scan), scan + 1
+    assert scan < 12
+
+
+@pytest.mark.parametrize(
+    ("why", "rows", "there", "near"),
+    [
+        ("a row may have been its own", NONE, THERE, True),
+        ("too far to be loud", NONE, (np.array([0, 0, 0, 20.0, 0]), *THERE[1:]), False),
+        ("the call went elsewhere", NONE, (np.array([0, 0, 0, 0.0, 4.0]), *THERE[1:]), False),
+        ("something as loud came with it", row(label=-1, way=4.2), THERE, False),
+        ("it is not on the map", NONE, (AHEAD, np.array([-1]), np.array([-2])), False),
+    ],
+)  # fmt: skip
+def test_nothing_is_expected_where(why, rows, there, near):
+    known = heard_so_often(3)
+    after = judged(known, rows, there, np.array([near]), 3)
+    assert after.odds[0] == known.odds[0], why
+
+
+def test_what_is_not_yet_one_is_none_after_a_long_silence():
+    known = heard_so_often(1)
+    nowhere = (AHEAD, np.array([-1]), np.array([-2]))
+    for scan in range(1, PATIENCE + 2):
+        known = judged(known, NONE, nowhere, np.array([False]), scan)
+    assert known.odds[0] < GONE
+
+
+def test_what_is_given_is_not_changed():
+    known = heard_so_often(2)
+    before = [column.copy() for column in known]
+    judged(known, row(), THERE, np.array([False]), 2)
+    for one, other in zip(known, before, strict=True):
+        np.testing.assert_array_equal(one, other)

@@ -1,0 +1,92 @@
+"""Rows against landmarks: the kernel's costs are those of the formula, written out."""
+
+import math
+
+import numpy as np
+import pytest
+
+from pipistrelle.detection.scans import make_scan
+from pipistrelle.estimation.association import expected
+from pipistrelle.estimation.beliefs import JointGaussian
+from pipistrelle.estimation.data_association.pairs import (
+    OWN_CALL,
+    UNPLACED,
+    Rows,
+    pair_costs,
+    with_point,
+)
+
+CHANCES = (1e9, 0.06, 1.2, 0.8)
+CALLER = 5
+
+
+def joint_of(seed, std=0.05):
+    """Return a pose and four landmarks, the last of them the caller, all correlated."""
+    rng = np.random.default_rng(seed)
+    root = std * rng.standard_normal((11, 11))
+    mean = np.concatenate([rng.normal(0.0, 1.0, 3), rng.uniform(-9.0, 9.0, 8)])
+    return JointGaussian(landmark=np.array([2, 3, 4, CALLER]), mean=mean, covariance=root @ root.T)
+
+
+def rows_of(scan, way, std):
+    return Rows(scan.bearing, scan.bearing_std, way, std, scan.level_db)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("own", [True, False])
+def test_costs_are_those_of_the_joint_innovations(seed, own):
+    joint, rng = joint_of(seed), np.random.default_rng(seed + 100)
+    way = rng.uniform(1.0, 9.0, 6)
+    columns = (
+        {"range": way, "range_std": 0.1}
+        if own
+        else {"excess_path": way, "excess_path_std": 0.2, "caller": 1}
+    )
+    bearing = rng.uniform(-math.pi, math.pi, 6)
+    scan = make_scan(0.0, np.full(6, -1), bearing, bearing_std=0.05, **columns)
+    std = scan.range_std if own else scan.excess_path_std
+    at = 3 + 2 * np.arange(4)
+    caller = OWN_CALL if own else int(at[3])
+    found = pair_costs(
+        tuple(rows_of(scan, way, std)), joint.mean, joint.covariance, at, caller, CHANCES
+    )
+    labels = joint.landmark if own else joint.landmark[:3]
+    row, landmark = np.meshgrid(np.arange(6), labels, indexing="ij")
+    callers = np.array([-1, CALLER])
+    pairs = expected(joint, scan, row.ravel(), landmark.ravel(), callers)
+    used = [0, 1] if own else [0, 2]
+    for n, (m, label) in enumerate(zip(row.ravel(), landmark.ravel(), strict=True)):
+        nu = pairs.difference[n, used]
+        S = pairs.covariance[n, :, n][np.ix_(used, used)]
+        squared = nu @ np.linalg.solve(S, nu)
+        cost = squared + math.log(np.linalg.det(2.0 * math.pi * S)) + 2.0 * math.log(0.06 / 0.8)
+        column = joint.landmark.tolist().index(label)
+        assert found[m, column] == pytest.approx(cost, rel=1e-9)
+    if not own:
+        assert np.isinf(found[:, 3]).all(), "a caller is no echo of its own call"
+
+
+def test_a_bearing_is_compared_across_the_cut_behind():
+    here = JointGaussian(
+        landmark=np.array([7]), mean=np.array([0.0, 0.0, 0.0, -5.0, 0.1]),
+        covariance=np.zeros((5, 5)),
+    )  # fmt: skip
+    none = np.full(1, np.nan)
+    row = Rows(np.array([-math.pi + 0.01]), np.array([0.05]), none, none, none)
+    costs = pair_costs(
+        tuple(row), here.mean, here.covariance, np.array([3]), UNPLACED, (25.0, 0.06, 1.2, 0.8)
+    )
+    assert np.isfinite(costs[0, 0])
+
+
+def test_a_new_point_is_correlated_with_the_pose_as_the_filter_makes_it():
+    joint = joint_of(3, std=0.01)
+    more = with_point(joint, 9, 0.4, 3.0, (0.02, 0.1))
+    rng = np.random.default_rng(0)
+    drawn = rng.multivariate_normal(joint.mean, joint.covariance, 200_000)
+    bearing, far = rng.normal(0.4, 0.02, 200_000), rng.normal(3.0, 0.1, 200_000)
+    angle = drawn[:, 2] + bearing
+    x, y = drawn[:, 0] + far * np.cos(angle), drawn[:, 1] + far * np.sin(angle)
+    sampled = np.cov(np.column_stack([drawn, x, y]).T)
+    np.testing.assert_allclose(more.covariance, sampled, atol=2e-4)
+    assert more.landmark.tolist() == [*joint.landmark.tolist(), 9]

@@ -1,0 +1,178 @@
+"""The stage as a whole: missions without labels against those with, and what is hard for it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipistrelle.config import AssociationConfig, Config
+from pipistrelle.detection.scans import UNLABELLED, make_scan
+from pipistrelle.estimation.beliefs import Gaussian, placed
+from pipistrelle.estimation.catalogue import entry
+from pipistrelle.estimation.data_association.existence import PATIENCE
+from pipistrelle.estimation.data_association.methods import association_of
+from pipistrelle.estimation.motion import Motion
+from pipistrelle.estimation.session import Session
+from pipistrelle.experiments.runs.trial import run_mission
+
+MOTION = Motion(model="unicycle", control_std=(0.02, 0.01))
+STDS = {"bearing_std": 0.01, "range_std": 0.02}
+PLACES = np.array([[4.0, 1.0], [6.0, -3.0], [2.0, 5.0], [9.0, 0.5]])
+BEST = {
+    "emitter": {"level_db": 49.7},
+    "beacon": {"level_db": 42.8},
+    "listening": {"timing": True},
+    "filter": {"noise": "measured", "robust": "huber"},
+    "rays": {"power": 8.0, "prune": 1e-9, "spacing": "auto"},
+}
+
+
+def session_of(name="iekf", method="marginal"):
+    """Return a session of a vehicle at rest at the origin that is told no labels."""
+    config = Config.model_validate(
+        {"association": {"method": method}, "filter": {"noise": "measured"}}
+    )
+    start = Gaussian(mean=np.zeros(3), covariance=1e-8 * np.eye(3))
+    slam = entry(name).build(config, MOTION)
+    return Session(slam, start, np.random.default_rng(7), association=association_of(config))
+
+
+def scan_of(places, pose=(0.0, 0.0, 0.0), rng=None, time=0.0, level=40.0):
+    """Return what is heard of places, without labels."""
+    off = np.atleast_2d(places) - np.array(pose[:2])
+    noise = rng.standard_normal((2, len(off))) if rng else np.zeros((2, len(off)))
+    bearing = np.arctan2(off[:, 1], off[:, 0]) - pose[2] + 0.01 * noise[0]
+    far = np.hypot(off[:, 0], off[:, 1]) + 0.02 * noise[1]
+    bearing = (bearing + np.pi) % (2.0 * np.pi) - np.pi
+    labels = np.full(len(off), UNLABELLED)
+    return make_scan(time, labels, bearing, range=far, level_db=level, **STDS)
+
+
+@pytest.mark.parametrize("method", ["nearest", "marginal"])
+@pytest.mark.parametrize("name", ["ekf", "iekf", "smoother", "fastslam"])
+def test_landmarks_that_are_apart_keep_their_labels_while_the_vehicle_drives(name, method):
+    session, rng = session_of(name, method), np.random.default_rng(3)
+    for k in range(12):
+        session.move(np.array([[0.5, 0.1]]), np.array([0.5]))
+        angle = 0.05 * (k + 1)
+        pose = 5.0 * np.sin(angle), 5.0 * (1.0 - np.cos(angle)), angle
+        session.hear(scan_of(PLACES, pose, rng, time=float(k)))
+    assert all(label.tolist() == [1, 2, 3, 4] for label in session.labels)
+    found = session.landmarks()
+    error = np.hypot(*(found.mean[np.argsort(found.landmark)] - PLACES).T)
+    assert error.max() < 0.2
+    assert {*session.belief.labels()} == {1, 2, 3, 4}
+
+
+def test_what_is_heard_once_is_on_no_map_and_is_forgotten():
+    session = session_of()
+    session.hear(scan_of(np.vstack([PLACES, [[-5.0, -5.0]]])))
+    assert session.landmarks().landmark.size == 0, "nothing is sure yet"
+    for _ in range(PATIENCE + 2):
+        session.hear(scan_of(PLACES))
+    assert sorted(session.landmarks().landmark.tolist()) == [1, 2, 3, 4]
+    assert 5 not in session.belief.labels()
+    assert session.labels[0].tolist() == [1, 2, 3, 4, UNLABELLED], "its row is taken back"
+
+
+def test_a_landmark_that_vanishes_is_removed_and_one_that_appears_is_born():
+    session, there = session_of(), np.vstack([PLACES, [[1.5, -2.5]]])
+    for _ in range(8):
+        session.hear(scan_of(there))
+    for _ in range(12):
+        session.hear(scan_of(PLACES))
+    assert sorted(session.landmarks().landmark.tolist()) == [1, 2, 3, 4]
+    for _ in range(4):
+        session.hear(scan_of(np.vstack([PLACES, [[-3.0, -4.0]]])))
+    assert len(session.landmarks().landmark) == 5
+
+
+def test_two_landmarks_within_a_call_of_each_other_are_told_apart_once_both_are_heard():
+    near = np.vstack([PLACES, PLACES[0] + [0.0, 1.2]])
+    session, rng = session_of(), np.random.default_rng(0)
+    for _ in range(10):
+        session.hear(scan_of(near, rng=rng))
+    assert len(session.landmarks().landmark) == 5
+    assert len({tuple(label.tolist()) for label in session.labels[3:]}) == 1
+
+
+def test_bearings_about_the_cut_behind_are_one_landmarks():
+    session = session_of()
+    for y in (-0.05, 0.05, -0.05, 0.05):
+        session.hear(scan_of(np.array([[-5.0, y]])))
+    assert [label.tolist() for label in session.labels] == [[1]] * 4
+
+
+def test_what_is_taken_back_leaves_the_belief_as_if_it_had_never_been_heard():
+    ghost, beliefs = np.array([[-6.0, 2.0]]), []
+    for haunted in (False, True):
+        session = session_of()
+        for k in range(PATIENCE + 6):
+            places = np.vstack([PLACES, ghost + 0.02 * k]) if haunted and k in (2, 3) else PLACES
+            session.move(np.array([[0.2, 0.0]]), np.array([0.1]))
+            session.hear(scan_of(places, (0.02 * (k + 1), 0.0, 0.0), time=float(k)))
+        beliefs.append(session.belief)
+    np.testing.assert_allclose(beliefs[1].mean, beliefs[0].mean, atol=1e-12)
+    np.testing.assert_allclose(beliefs[1].covariance, beliefs[0].covariance, atol=1e-14)
+
+
+def test_a_scan_without_rows_is_no_harm():
+    session = session_of()
+    none = replace(
+        scan_of(PLACES[:1]), landmark=np.empty(0, np.int64), caller=np.empty(0, np.int64)
+    )
+    session.hear(replace(none, numbers=np.empty((8, 0))))
+    session.hear(scan_of(PLACES))
+    assert session.labels[0].size == 0
+
+
+def test_associate_changes_nothing_that_it_is_given():
+    session, stage = (
+        session_of(),
+        association_of(Config(association=AssociationConfig(method="nearest"))),
+    )
+    session.hear(scan_of(PLACES))
+    memory = stage.start()
+    scan = scan_of(PLACES)
+    numbers = scan.numbers.copy()
+    first = stage.associate(memory, session.belief, scan)[1]
+    again = stage.associate(memory, session.belief, scan)[1]
+    assert first.label.tolist() == again.label.tolist()
+    np.testing.assert_array_equal(scan.numbers, numbers)
+    assert (memory.scan, memory.labels, memory.known.label.size) == (0, 0, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("strategy", ["active", "fused", "passive"])
+def test_missions_without_labels_are_about_as_good_as_with_them(strategy):
+    raw, aligned, right = [], [], []
+    for seed in range(900, 908):
+        known, found = (
+            run_mission(
+                Config.model_validate(BEST | {"seed": seed, "association": {"method": method}}),
+                [strategy], ["iekf"],
+            ).trials[0].scores
+            for method in ("known", "marginal")
+        )  # fmt: skip
+        raw.append((found.position_rmse_m, known.position_rmse_m))
+        aligned.append((found.position_rmse_aligned_m, known.position_rmse_aligned_m))
+        right.append(found.associated_right)
+    assert np.mean(right) > 0.96
+    found, known = np.median(np.array(aligned), axis=0)
+    assert found < 1.6 * known
+    found, known = np.median(np.array(raw), axis=0)
+    assert found < 1.5 * known
+
+
+def test_a_mission_without_labels_finds_its_caller_and_names_most_rows_rightly():
+    config = Config.model_validate(
+        BEST | {"scenario": {"steps": 480}, "seed": 7, "association": {"method": "marginal"}}
+    )
+    (trial,) = run_mission(config, ["fused"], ["iekf"]).trials
+    assert trial.scores.associated_right > 0.95
+    assert trial.scores.position_rmse_aligned_m < 0.1
+    assert trial.scores.landmarks_missed <= 4
+    named = {label for scan in trial.scans for label in scan.callers.tolist()} - {UNLABELLED}
+    assert len(named) == 1, "the caller has one name"
+    sure = placed(trial.track.landmarks)
+    assert {*trial.track.landmarks.landmark[sure].tolist()} & named
