@@ -239,7 +239,7 @@ class _Work:
         if number != OWN and number < self.scan.direct.size:
             rows = rows[rows != self.scan.direct[number]]
         costs = self._costs(number, rows, there, at, self.stage.chances)
-        gated, usable = np.isfinite(costs), self._usable(number)[rows]
+        gated, usable = np.isfinite(costs), self._usable(number, with_way=at != UNPLACED)[rows]
         telling = self.scan.bearing_std[rows] <= 2.0 * self.stage.limits.bearing_std
         self.near |= {*self.joint.landmark[gated[telling].any(axis=0)].tolist()}
         found = self.stage.match(costs[usable])
