@@ -148,8 +148,9 @@ def study(
 
     Parameters
     ----------
-    plan : "paper", "physics", "beyond", "timing", "callers", "pair", the path of a plan, or a table
-        A table holds what the file would; paths in it lead from the folder where Python works.
+    plan : str or mapping
+        "paper", "physics", "beyond", "timing", "association", "callers" or "pair", the path of a
+        plan, or a table. A table holds what the file would; paths in it lead from the folder where Python works.
     iterations : int, optional
         Number of worlds; the plan's by default.
     workers : int

@@ -79,10 +79,11 @@ class _Head(Section):
     )
 
 
-PLANS = ("paper", "physics", "beyond", "timing", "callers", "pair")
+PLANS = ("paper", "physics", "beyond", "timing", "association", "callers", "pair")
 """Plans that ship with the package: the paper's study as its words may be read, and as physics has
 it where they leave a choice; the same question asked of estimators at their best, and of those who
-hear when, too; who calls, and from where; and two vehicles that hear each other."""
+hear when, too; of those to whom nobody tells who is who; who calls, and from where; and two
+vehicles that hear each other."""
 
 
 def find_plan(word: str) -> Path:
