@@ -150,7 +150,8 @@ def study(
     ----------
     plan : str or mapping
         "paper", "physics", "beyond", "timing", "association", "callers" or "pair", the path of a
-        plan, or a table. A table holds what the file would; paths in it lead from the folder where Python works.
+        plan, or a table. A table holds what the file would; paths in it lead from the folder where
+        Python works.
     iterations : int, optional
         Number of worlds; the plan's by default.
     workers : int

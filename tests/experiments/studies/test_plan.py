@@ -276,7 +276,7 @@ def test_a_flag_with_a_refused_value_is_named(refused):
 
 
 def test_a_plan_that_is_not_there_is_refused():
-    plans = "paper, physics, beyond, timing, callers, pair"
+    plans = "paper, physics, beyond, timing, association, callers, pair"
     said = rf"^none\.toml: found no such file; expected {plans} or the path"
     with pytest.raises(InputError, match=said):
         find_plan("none.toml")

@@ -1,7 +1,5 @@
 """The methods of association by name."""
 
-import math
-
 from pipistrelle.config import Config, InputError
 from pipistrelle.estimation.association import KNOWN, Association
 from pipistrelle.estimation.data_association.matching import marginal, nearest
@@ -33,10 +31,11 @@ def association_of(config: Config) -> Association | None:
             bearing_clutter=20.0 * settings.clutter,
             detection=settings.detection,
         )
-        constant = config.filter.noise == "constant"
+        told = config.filter
         limits = Limits(
-            bearing_std=math.inf if constant else settings.bearing_std,
-            way_std=math.inf if constant else settings.way_std,
+            bearing_std=settings.bearing_std,
+            way_std=settings.way_std,
+            assumed=(told.bearing_std, told.range_std, told.excess_path_std),
         )
         return Sequential(match=METHODS[name], chances=tuple(chances), limits=limits)
     if not names_class(name):

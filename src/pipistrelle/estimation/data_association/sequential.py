@@ -109,6 +109,8 @@ class Limits:
     """Of range or excess path [m]."""
     birth_bearing_std: float = 0.05
     birth_way_std: float = 0.25
+    assumed: tuple[float, ...] = ()
+    """Deviations that are assumed of rows which state none: they are as sure as any can be."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -300,9 +302,13 @@ class _Work:
     def _usable(self, number: int, *, with_way: bool = False) -> Bool[np.ndarray, " m"]:
         """Return a mask of the rows of a caller that are sure enough."""
         (way, std), limits = self._ways(number), self.stage.limits
-        sure = (self.scan.caller == number) & (self.scan.bearing_std <= limits.bearing_std)
-        bare = np.isnan(way)
-        return sure & (~bare if with_way else True) & (bare | (std <= limits.way_std))
+        bare, rows = np.isnan(way), self.scan.caller == number
+        sure = rows & self._within(self.scan.bearing_std, limits.bearing_std)
+        return sure & (~bare if with_way else True) & (bare | self._within(std, limits.way_std))
+
+    def _within(self, std: Float[np.ndarray, " r"], limit: float) -> Bool[np.ndarray, " r"]:
+        """Return a mask of deviations that are within a limit, or that were only assumed."""
+        return (std <= limit) | np.isin(std, self.stage.limits.assumed)
 
     def _rows(self, number: int, rows: np.ndarray) -> Rows:
         """Return rows of a caller."""
@@ -360,8 +366,8 @@ class _Work:
     def _bear(self, number: int, rows: Int[np.ndarray, " r"]) -> None:
         """Begin landmarks with rows that are sure and near no other."""
         (way, std), limits, scan = self._ways(number), self.stage.limits, self.scan
-        sure = scan.bearing_std[rows] <= limits.birth_bearing_std
-        sure &= std[rows] <= limits.birth_way_std
+        sure = self._within(scan.bearing_std[rows], limits.birth_bearing_std)
+        sure &= self._within(std[rows], limits.birth_way_std)
         factor, same = (2.0 if number == OWN else 1.0), scan.caller == number
         for row in sorted(rows[sure].tolist(), key=lambda row: -scan.level_db[row]):
             beside = same & (factor * np.abs(way - way[row]) < BESIDE)
@@ -383,8 +389,8 @@ class _Work:
         if number not in self.callers or self._where(self.callers[number].label) < 0:
             return
         (_, std), limits, caller = self._ways(number), self.stage.limits, self.callers[number]
-        sure = self.scan.bearing_std[rows] <= limits.birth_bearing_std
-        sure &= std[rows] <= limits.birth_way_std
+        sure = self._within(self.scan.bearing_std[rows], limits.birth_bearing_std)
+        sure &= self._within(std[rows], limits.birth_way_std)
         told = (int(found[sure].sum()), int(sure.sum()))
         self.callers[number] = replace(caller, trial=(*caller.trial[1 - TRIAL :], told))
 
