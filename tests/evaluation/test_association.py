@@ -1,0 +1,97 @@
+"""What an association decided, by the truth: GOSPA by brute force, names by most rows."""
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from pipistrelle.detection.scans import UNLABELLED, make_scan, rows_of
+from pipistrelle.estimation.beliefs import Landmarks
+from pipistrelle.evaluation.association import (
+    associated,
+    causes_of,
+    gospa,
+    map_counts,
+    renamed,
+)
+
+
+def best_of_all(points, true, cutoff):
+    """Return GOSPA by trying every set of pairs."""
+    if len(points) > len(true):
+        points, true = true, points
+    best = np.inf
+    for order in permutations(range(len(true)), len(points)):
+        off = np.array([np.hypot(*(p - true[j])) for p, j in zip(points, order, strict=True)])
+        near = off < cutoff
+        unpaired = len(points) + len(true) - 2 * near.sum()
+        best = min(best, np.sum(off[near] ** 2) + 0.5 * cutoff**2 * unpaired)
+    return np.sqrt(best)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_gospa_is_the_least_over_all_sets_of_pairs(seed):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0.0, 5.0, (rng.integers(0, 5), 2))
+    true = rng.uniform(0.0, 5.0, (rng.integers(0, 5), 2))
+    found = gospa(points, true)
+    assert found.distance == pytest.approx(best_of_all(points, true, 2.0))
+    parts = found.error**2 + 2.0 * (found.missed + found.false)
+    assert found.distance**2 == pytest.approx(parts)
+    assert found.missed - found.false == len(true) - len(points)
+
+
+def test_gospa_is_a_metric():
+    rng = np.random.default_rng(1)
+    for _ in range(50):
+        a, b, c = (rng.uniform(0.0, 4.0, (rng.integers(0, 5), 2)) for _ in range(3))
+        assert gospa(a, b).distance == pytest.approx(gospa(b, a).distance)
+        assert gospa(a, a).distance == 0.0
+        assert gospa(a, c).distance <= gospa(a, b).distance + gospa(b, c).distance + 1e-9
+
+
+def map_of(labels):
+    """Return a map of placed landmarks, each a metre further."""
+    size = len(labels)
+    return Landmarks(
+        landmark=np.array(labels), mean=np.arange(2.0 * size).reshape(-1, 2),
+        covariance=np.tile(np.eye(2), (size, 1, 1)), weight=np.ones(size),
+    )  # fmt: skip
+
+
+LABELS = [np.array([1, 2, 3]), np.array([1, 2, UNLABELLED]), np.array([1, 4, 5])]
+CAUSES = [np.array([7, 9, UNLABELLED]), np.array([7, 7, 8]), np.array([7, 9, 8])]
+
+
+def test_a_label_stands_for_what_caused_most_of_its_rows():
+    found = associated(LABELS, CAUSES)
+    assert found.names == {1: 7, 2: 9, 3: UNLABELLED, 4: 9, 5: 8}
+    assert found.rows == {1: 3, 2: 2, 3: 1, 4: 1, 5: 1}
+    assert found.right == pytest.approx(6 / 8)
+    assert found.heard == {7}, "three scans or more"
+
+
+def test_missed_false_and_doubled_landmarks_are_counted():
+    found = associated(LABELS * 2, CAUSES * 2)
+    counts = map_counts(map_of([2, 3, 4]), found)
+    assert (counts.missed, counts.false, counts.twice) == (2, 1, 1)
+
+
+def test_of_labels_that_stand_for_one_landmark_that_with_most_rows_has_its_name():
+    named = renamed(map_of([4, 2, 3, 1]), associated(LABELS, CAUSES))
+    assert named.landmark[1] == 9
+    assert named.landmark[3] == 7
+    assert (named.landmark[[0, 2]] < UNLABELLED).all()
+    assert len({*named.landmark.tolist()}) == 4
+
+
+def test_what_caused_a_row_is_found_again_after_rows_were_left_out():
+    frame = make_scan(0.0, np.full(3, -1), np.array([0.1, 0.1, 0.4]), caller=np.array([0, 1, 1]))
+    taken = rows_of(frame, np.array([2, 1]))
+    assert causes_of(taken, frame, np.array([7, 8, 9])).tolist() == [9, 8]
+
+
+def test_nothing_associated_is_no_score():
+    found = associated([np.empty(0, np.int64)], [np.empty(0, np.int64)])
+    assert found.right is None
+    assert found.names == {}
