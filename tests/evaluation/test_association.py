@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from pipistrelle.detection.scans import UNLABELLED, make_scan, rows_of
-from pipistrelle.estimation.beliefs import Landmarks
 from pipistrelle.evaluation.association import (
     associated,
     causes_of,
@@ -14,6 +13,7 @@ from pipistrelle.evaluation.association import (
     map_counts,
     renamed,
 )
+from reference.missions import map_with
 
 
 def best_of_all(points, true, cutoff):
@@ -52,11 +52,8 @@ def test_gospa_is_a_metric():
 
 def map_of(labels):
     """Return a map of placed landmarks, each a metre further."""
-    size = len(labels)
-    return Landmarks(
-        landmark=np.array(labels), mean=np.arange(2.0 * size).reshape(-1, 2),
-        covariance=np.tile(np.eye(2), (size, 1, 1)), weight=np.ones(size),
-    )  # fmt: skip
+    places = np.arange(2.0 * len(labels)).reshape(-1, 2)
+    return map_with(labels, places, np.tile(np.eye(2), (len(labels), 1, 1)))
 
 
 LABELS = [np.array([1, 2, 3]), np.array([1, 2, UNLABELLED]), np.array([1, 4, 5])]

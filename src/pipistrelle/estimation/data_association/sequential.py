@@ -64,8 +64,6 @@ TRIAL, SETTLING, LEAST_SHARE, LEAST_ROWS = 9, 3, 0.5, 10
 share is of landmarks, new ones not counted; at least so many rows must tell."""
 BESIDE, ASIDE = 0.96, 0.5
 """A row begins no landmark beside a louder one, within such a way [m] and bearing [rad]."""
-
-
 News = Mapping[int, tuple[float, float, bool]]
 """Where callers are, by number: x, y [m], and whether that is from the map."""
 
@@ -176,7 +174,7 @@ class Sequential:
 
 
 class _Work:
-    """One scan being associated."""
+    """The association of one scan."""
 
     def __init__(self, stage: Sequential, memory: Memory, belief: Belief, scan: Scan) -> None:
         self.stage, self.memory, self.scan = stage, memory, scan
@@ -224,19 +222,9 @@ class _Work:
 
     def match(self, number: int) -> None:
         """Label the rows of one caller."""
-        at = OWN_CALL
-        if number != OWN:
-            caller = self.callers.get(number)
-            if caller is not None:
-                if not caller.told:
-                    self._tell(number, caller)
-                    return
-                self.named[number] = caller.label
-                at = self._where(caller.label)
-                self._match_direct(number, caller.label, at)
-                at = UNPLACED if at < 0 else at
-            else:
-                at = UNPLACED
+        at = OWN_CALL if number == OWN else self._heard_from(number)
+        if at is None:
+            return
         rows, there = np.flatnonzero(self.scan.caller == number), self._places()
         if number != OWN and number < self.scan.direct.size:
             rows = rows[rows != self.scan.direct[number]]
@@ -250,6 +238,19 @@ class _Work:
         self._judge_caller(number, rows[usable], label != UNLABELLED)
         if at != UNPLACED:
             self._bear(number, rows[usable & ~gated.any(axis=1)])
+
+    def _heard_from(self, number: int) -> int | None:
+        """Return where a caller stands in the joint mean; None where its rows have to wait."""
+        caller = self.callers.get(number)
+        if caller is None:
+            return UNPLACED
+        if not caller.told:
+            self._tell(number, caller)
+            return None
+        self.named[number] = caller.label
+        at = self._where(caller.label)
+        self._match_direct(number, caller.label, at)
+        return UNPLACED if at < 0 else at
 
     def finished(self) -> tuple[Memory, Assignment]:
         """Return the memory after the scan, and the assignment."""
