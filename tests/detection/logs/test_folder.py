@@ -321,16 +321,11 @@ def test_a_link_to_no_file_is_told_from_a_file_that_is_not_there(folder):
     refused(folder, "odometry.csv", "found a link to no file")
 
 
-@pytest.mark.parametrize(
-    ("rows", "left_out"),
-    [
-        (["9.0,7,0.5,4.0", "9.5,3,0.5,"], "2 outside odometry), expected some of landmarks"),
-        (["0.1,-1,0.5,4.0"], "1 clutter), expected some of landmarks"),
-    ],
-)
-def test_measurements_of_which_no_row_is_left_are_refused(tmp_path, rows, left_out):
-    folder = recorded(tmp_path, measurements=measured(*rows))
-    refused(folder, "measurements.csv", f"left out: {left_out}", "0.0 s and 0.4 s")
+def test_measurements_of_which_no_row_is_left_are_refused(tmp_path):
+    rows = measured("9.0,7,0.5,4.0", "9.5,3,0.5,", "0.1,-1,0.5,4.0")
+    folder = recorded(tmp_path, measurements=rows)
+    left_out = "left out: 1 clutter, 2 outside odometry), expected some of landmarks"
+    refused(folder, "measurements.csv", left_out, "0.0 s and 0.4 s", "use the odometry's clock")
 
 
 def test_rows_of_clutter_may_be_of_one_time(tmp_path):
@@ -356,7 +351,7 @@ ROWS = {
     "no range": ("0.1,7,0.5,0", "line 3", "range 0.0", "above 0 m"),
     "negative range": ("0.1,7,0.5,-2", "line 3", "range -2.0", "above 0 m"),
     "label": ("0.1,7.5,0.5,1", "line 3", "landmark 7.5", "an integer"),
-    "no label": ("0.1,,0.5,1", "line 3", "landmark ''", "clutter -1; landmarks without"),
+    "no label": ("0.1,,0.5,1", "line 3", "landmark ''", "clutter -1; or leave the field empty"),
     "name": ("0.1,tree,0.5,1", "line 3", "landmark 'tree'", "a finite number"),
     "backwards": ("0.05,7,0.5,1", "line 3", "time 0.05 after 0.06", "backwards"),
     "twice": ("0.06,1,0.5,1", "line 3", "time 0.06, landmark 1 again", "line 2"),
@@ -367,7 +362,15 @@ ROWS = {
 def test_measurements_without_a_column_of_labels_are_told_that_labels_must_be_known(tmp_path):
     rows = "time,bearing,range\n0.1,0.5,1\n"
     folder = recorded(tmp_path, measurements=rows)
-    refused(folder, "line 1", "the same whenever it is seen", "are not yet told apart in a log")
+    refused(folder, "line 1", "the same whenever it is seen", "for --association.method to decide")
+
+
+@pytest.mark.parametrize("label", ["", "-1"])
+def test_a_log_without_any_label_keeps_all_its_rows(tmp_path, label):
+    rows = measured(f"0.1,{label},0.5,4.0", f"0.1,{label},-0.5,2.0", f"0.25,{label},0.4,3.5")
+    log = read_log(recorded(tmp_path / "bare", measurements=rows))
+    assert [scan.landmark.tolist() for scan in log.scans] == [[-1, -1], [-1]]
+    assert log.ignored_rows == {}
 
 
 STATING_ROWS = {

@@ -8,7 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipistrelle.config import Config, FilterConfig, InputError, ListeningConfig
+from pipistrelle.config import (
+    AssociationConfig,
+    Config,
+    FilterConfig,
+    InputError,
+    ListeningConfig,
+)
 from pipistrelle.detection.logs.folder import read_log, write_log
 from pipistrelle.detection.logs.readers import Reader
 from pipistrelle.detection.logs.recording import LogCaller
@@ -488,3 +494,14 @@ def test_the_place_of_a_logs_caller_places_what_it_lights_up(estimator):
             assert (len(mine) == 1) == known, "a ray, else"
             if known:
                 np.testing.assert_allclose(mine[0], post, rtol=0, atol=0.05)
+
+
+def test_a_log_without_labels_is_refused_with_the_option_that_solves_it():
+    log = read_log(DATA / "unicycle_log")
+    bare = replace(log, scans=tuple(with_columns(scan, landmark=-1) for scan in log.scans))
+    with pytest.raises(InputError, match="rows without labels.*--association.method marginal"):
+        replay(bare, NO_TRUTH, ["fused"], ["ekf"], None, Config())
+    config = Config(association=AssociationConfig(method="nearest"))
+    (trial,) = replay(bare, NO_TRUTH, ["fused"], ["ekf"], None, config).trials
+    assert sum((label > 0).sum() for label in trial.track.labels) > 0
+    assert trial.scores.associated_right is None, "nobody knows"

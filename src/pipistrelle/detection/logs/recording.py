@@ -151,9 +151,12 @@ def assemble(
         _, *columns = odometry.column.values()
         controls = _mean_controls(stamp[last], np.column_stack(columns)[last], rows, time)
     clutter = measurements.column["landmark"] == UNLABELLED
+    unlabelled = bool(clutter.all())
+    clutter &= not unlabelled
     measurements = rows_kept(measurements, ~clutter)
     measurements = _of_callers(measurements, settings.get("callers", ()))
-    check_unique(measurements, "time", "landmark", besides=CALLER)
+    if not unlabelled:
+        check_unique(measurements, "time", "landmark", besides=CALLER)
     stamp = measurements.column["time"]
     inside = (stamp >= time[0]) & (stamp <= time[-1])
     ignored = Counter(ignored_rows or {})
@@ -164,8 +167,7 @@ def assemble(
         reasons = ", ".join(f"{n} {why.replace('_', ' ')}" for why, n in ignored.items() if n)
         found = f"no row to use (left out: {reasons})"
         expected = f"some of landmarks, between {time[0].item()!r} s and {time[-1].item()!r} s"
-        fix = "use the odometry's clock" if len(stamp) else "label rows of landmarks"
-        raise refusal(measurements.path, found, expected, fix)
+        raise refusal(measurements.path, found, expected, "use the odometry's clock")
     said = (*MEASUREMENT, CALLER, *(name for name in STATED if name in measurements.column))
     measured = {name: measurements.column[name][inside] for name in said}
     return Log(

@@ -20,7 +20,7 @@ from pipistrelle.refusals import refusal
 _LABELS = ("landmark", "subject", "barcode")
 _LABEL_IT = (
     "number what your sensor tells apart, the same whenever it is seen, and clutter "
-    f"{UNLABELLED}; landmarks without a label are not yet told apart in a log"
+    f"{UNLABELLED}; or leave the field empty in every row, for --association.method to decide"
 )
 _BOUNDS = {
     "range": ("m", 1.0 / LARGEST, FARTHEST),
@@ -230,7 +230,7 @@ def _read_row(
         raise refusal(where, f"{len(fields)} fields in {text[:80]!r}", expected, "correct the row")
     row = []
     for name, field in zip(columns, fields, strict=True):
-        if name in optional and not field.strip():
+        if not field.strip() and (name in optional or name == "landmark"):
             row.append(math.nan)
             continue
         try:
@@ -239,7 +239,6 @@ def _read_row(
             row.append(math.nan)
         if not math.isfinite(row[-1]):
             fix = "correct the field" + " or leave it empty" * (name in optional)
-            fix = _LABEL_IT if name == "landmark" and not field.strip() else fix
             raise refusal(where, f"{name} {field.strip()[:80]!r}", "a finite number", fix)
     return row
 
@@ -256,6 +255,8 @@ def _check_columns(table: Table) -> None:
             from_here = "above 0" if least == 1.0 / LARGEST else f"from {least:g}"
             promise = f"a {name} {from_here} {unit}, up to {most:g} {unit}"
         elif name in _LABELS:
+            if np.isnan(values).all():  # nobody has labelled anything
+                values[:] = UNLABELLED
             wrong = (values != np.rint(values)) | (values < UNLABELLED) | (values >= 2**53)
             promise = f"an integer, from 0 on, or {UNLABELLED} for clutter"
         else:
@@ -264,9 +265,15 @@ def _check_columns(table: Table) -> None:
         if wrong.any():
             row = int(np.argmax(wrong))
             where = f"{table.path}, line {table.line[row]}"
-            found = f"{name} {values[row].item()!r}"
+            found = f"{name} {_written(values[row].item())}"
             if name == "time":
                 found += f" after {values[row - 1].item()!r}"
-            raise refusal(where, found, promise, "correct or remove the row")
+            fix = _LABEL_IT if np.isnan(values[row]) else "correct or remove the row"
+            raise refusal(where, found, promise, fix)
         if name in _LABELS:
             table.column[name] = values.astype(np.int64)
+
+
+def _written(value: float) -> str:
+    """Return a number as a message shows it; quotes around nothing for an empty field."""
+    return "''" if math.isnan(value) else repr(value)

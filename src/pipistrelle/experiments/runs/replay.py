@@ -246,6 +246,8 @@ def replay(
     )
     check_filters(filters, drive.motion, config, drive.moving.values())
     noise, known = noise_of(config.filter), config.association.method == KNOWN
+    if known and all((scan.landmark == UNLABELLED).all() for scan in log.scans):
+        raise refusal(log.name, "rows without labels", LABELS, "add --association.method marginal")
 
     def taken(scan: Scan) -> Scan:
         return noise(labelled(scan, scan.landmark)) if known else scan
@@ -267,6 +269,9 @@ def replay(
         filters, drive, heard, config, causes=causes, progress=progress, watch=watch
     )
     return Mission(config=config, drive=drive, trials=trials, beamwidth=beamwidth, log=log)
+
+
+LABELS = "labels of landmarks, or an association"
 
 
 def _log_causes(
