@@ -322,7 +322,7 @@ def test_a_link_to_no_file_is_told_from_a_file_that_is_not_there(folder):
 
 
 def test_measurements_of_which_no_row_is_left_are_refused(tmp_path):
-    rows = measured("9.0,7,0.5,4.0", "9.5,3,0.5,", "0.1,-1,0.5,4.0")
+    rows = measured("0.1,-1,0.5,4.0", "9.0,7,0.5,4.0", "9.5,3,0.5,")
     folder = recorded(tmp_path, measurements=rows)
     left_out = "left out: 1 clutter, 2 outside odometry), expected some of landmarks"
     refused(folder, "measurements.csv", left_out, "0.0 s and 0.4 s", "use the odometry's clock")

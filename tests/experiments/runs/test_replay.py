@@ -499,7 +499,7 @@ def test_the_place_of_a_logs_caller_places_what_it_lights_up(estimator):
 def test_a_log_without_labels_is_refused_with_the_option_that_solves_it():
     log = read_log(DATA / "unicycle_log")
     bare = replace(log, scans=tuple(with_columns(scan, landmark=-1) for scan in log.scans))
-    with pytest.raises(InputError, match="rows without labels.*--association.method marginal"):
+    with pytest.raises(InputError, match=r"rows without labels.*--association.method marginal"):
         replay(bare, NO_TRUTH, ["fused"], ["ekf"], None, Config())
     config = Config(association=AssociationConfig(method="nearest"))
     (trial,) = replay(bare, NO_TRUTH, ["fused"], ["ekf"], None, config).trials
