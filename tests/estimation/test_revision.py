@@ -141,3 +141,27 @@ def test_all_that_is_remembered_is_associated_again_by_what_has_become_known(nam
 def test_an_association_that_cannot_be_informed_is_refused():
     with pytest.raises(InputError, match=r"a Script has no informed\(memory, news\)"):
         driven("ekf", Script({}, again={GONE_AT: 5}))
+
+
+class Renamed(Informed):
+    """Removes a landmark, then is informed, and gives its label to another."""
+
+    def associate(self, memory, belief, scan):
+        number, name = memory
+        if name == 5:
+            return (number + 1, name), Assignment(label=np.array([1, GHOST, 3]))
+        ghost = [1, 2, 3, GHOST][: scan.landmark.size]
+        remove = (GHOST,) if number == 4 else ()
+        again = 5 if number == GONE_AT else None
+        return (number + 1, name), Assignment(label=np.array(ghost), remove=remove, again=again)
+
+
+def test_a_label_that_was_taken_back_may_be_given_again():
+    session = driven("iekf", Renamed({}), ghosts=())
+    assert sorted(session.belief.labels()) == [1, 3, GHOST]
+    haunted = driven("iekf", Renamed({}), scans=6, ghosts=(2,))
+    assert sorted(haunted.belief.labels()) == [1, 2, 3]
+    last = session.labels[-1].copy()
+    session._take_back((3,))
+    assert sorted(session.belief.labels()) == [1, GHOST], "and no more goes than is asked for"
+    assert last.tolist() == [1, GHOST, 3]

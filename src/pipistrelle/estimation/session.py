@@ -225,6 +225,7 @@ class Session(Generic[B]):
         del self.labels[past[0].number :]
         dropped = _held(past[0].belief, [*self._dropped])
         self.belief = edited(past[0].belief, remove=dropped)
+        self._dropped = set()  # a label may be given again
         informed = getattr(self._association, "informed", None)
         if informed is None:
             raise InputError(
