@@ -233,3 +233,10 @@ def test_callers_that_move_are_refused_with_an_association(written, capsys):
     assert (
         "association.method: found callers that move (boat); expected callers that stand" in error
     )
+
+
+def test_a_folder_of_the_packages_own_method_is_done_again_without_being_asked_for_trust(written):
+    assert main(["run", *SHORT, "--association.method", "marginal", "-o", "own"]) == 0
+    assert main(["view", "own", "--quiet"]) == 0
+    assert Path("own/view.html").exists()
+    assert pipistrelle.load("own").figure() is not None

@@ -17,6 +17,7 @@ from pipistrelle.config import InputError
 from pipistrelle.detection.logs.readers import Robot, reader_of
 from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.catalogue import CATALOGUE, short_name
+from pipistrelle.estimation.data_association.methods import METHODS
 from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.hearing.world import ALL_DRAWN
 from pipistrelle.experiments.hearing.world_folder import read_world
@@ -67,7 +68,7 @@ def rerun(
         fix = f"add --filter {name} (in Python: filters={name!r}) to run it"
         raise _not_ours(f"{folder / SUMMARY}: runs.filter", name, fix)
     config = resolve(from_file(folder / "config.toml"))
-    if (method := config.association.method) not in (KNOWN, *trusted):
+    if (method := config.association.method) not in (KNOWN, *METHODS, *trusted):
         fix = f"add --association.method {method} (in Python: association={method!r}) to run it"
         raise _not_ours(f"{folder / 'config.toml'}: association.method", method, fix)
     strategies = list(dict.fromkeys(run.strategy for run in summary.runs))
