@@ -278,10 +278,10 @@ def _excess_paths(trial: TrialResult) -> tuple[list[np.ndarray], list[np.ndarray
 
 def _ties(trial: TrialResult, true_landmarks: LabelledPoints | None) -> list[np.ndarray]:
     """Return a line from each landmark that is fully initialised to where it truly is."""
-    if true_landmarks is None:
+    if true_landmarks is None or (trial.track.labels and trial.mapped is None):
         return []
     true = dict(zip(true_landmarks[0].tolist(), true_landmarks[1], strict=True))
-    estimate = heaviest(trial.track.landmarks)
+    estimate = heaviest(trial.mapped or trial.track.landmarks)
     return [
         np.stack([mean, true[label]])
         for label, mean, full in zip(

@@ -14,6 +14,7 @@ from pipistrelle.estimation.data_association.methods import association_of
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.session import Session
 from pipistrelle.experiments.runs.trial import run_mission
+from pipistrelle.figures.mission import _ties
 
 MOTION = Motion(model="unicycle", control_std=(0.02, 0.01))
 STDS = {"bearing_std": 0.01, "range_std": 0.02}
@@ -168,7 +169,8 @@ def test_a_mission_without_labels_finds_its_caller_and_names_most_rows_rightly()
     config = Config.model_validate(
         BEST | {"scenario": {"steps": 480}, "seed": 7, "association": {"method": "marginal"}}
     )
-    (trial,) = run_mission(config, ["fused"], ["iekf"]).trials
+    mission = run_mission(config, ["fused"], ["iekf"])
+    (trial,) = mission.trials
     assert trial.scores.associated_right > 0.95
     assert trial.scores.position_rmse_aligned_m < 0.1
     assert trial.scores.landmarks_missed <= 4
@@ -176,3 +178,6 @@ def test_a_mission_without_labels_finds_its_caller_and_names_most_rows_rightly()
     assert len(named) == 1, "the caller has one name"
     sure = placed(trial.track.landmarks)
     assert {*trial.track.landmarks.landmark[sure].tolist()} & named
+    lines = _ties(trial, mission.drive.truth.landmarks)
+    assert len(lines) > 20
+    assert np.median([np.hypot(*(a - b)) for a, b in lines]) < 1.0, "each to its own landmark"
