@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.optimize import linear_sum_assignment
 
 from pipistrelle.detection.scans import UNLABELLED, Scan
 from pipistrelle.estimation.beliefs import Landmarks, placed
@@ -148,6 +147,8 @@ def gospa(
     >>> round(found.distance**2, 9), found.error, found.missed, found.false
     (3.0, 1.0, 0, 1)
     """
+    from scipy.optimize import linear_sum_assignment  # a quarter of a second, if not needed
+
     off = points[:, np.newaxis] - true
     squared = np.minimum(np.einsum("nke,nke->nk", off, off), cutoff**2)
     rows, columns = linear_sum_assignment(squared)

@@ -15,7 +15,6 @@ Williams & Lau, IEEE Transactions on Aerospace and Electronic Systems 50 (2014).
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.optimize import linear_sum_assignment
 
 from pipistrelle.jit import kernel
 
@@ -37,6 +36,8 @@ def nearest(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
     >>> nearest(np.array([[-5.0, -4.0], [-4.5, np.inf], [3.0, np.inf]]))
     array([ 1,  0, -1])
     """
+    from scipy.optimize import linear_sum_assignment  # a quarter of a second, if not needed
+
     rows, landmarks = costs.shape
     bare = np.full((rows, rows), FARTHEST)
     np.fill_diagonal(bare, 0.0)
