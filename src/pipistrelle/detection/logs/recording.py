@@ -150,18 +150,12 @@ def assemble(
     else:
         _, *columns = odometry.column.values()
         controls = _mean_controls(stamp[last], np.column_stack(columns)[last], rows, time)
-    clutter = measurements.column["landmark"] == UNLABELLED
-    unlabelled = bool(clutter.all())
-    clutter &= not unlabelled
-    measurements = rows_kept(measurements, ~clutter)
-    measurements = _of_callers(measurements, settings.get("callers", ()))
-    if not unlabelled:
-        check_unique(measurements, "time", "landmark", besides=CALLER)
+    measurements, clutter = _labelled(measurements, settings.get("callers", ()))
     stamp = measurements.column["time"]
     inside = (stamp >= time[0]) & (stamp <= time[-1])
     ignored = Counter(ignored_rows or {})
     ignored["same_time_odometry"] += int(np.sum(~last))
-    ignored["clutter"] += int(np.sum(clutter))
+    ignored["clutter"] += clutter
     ignored["outside_odometry"] += int(np.sum(~inside))
     if not inside.any():
         reasons = ", ".join(f"{n} {why.replace('_', ' ')}" for why, n in ignored.items() if n)
@@ -181,6 +175,16 @@ def assemble(
         turned=int(np.sum(np.abs(measured["bearing"]) > 2.0 * np.pi)),
         **settings,
     )
+
+
+def _labelled(measurements: Table, callers: tuple[LogCaller, ...]) -> tuple[Table, int]:
+    """Return the rows that have a label, or all where none has; how many were left out."""
+    clutter = measurements.column["landmark"] == UNLABELLED
+    if clutter.all():  # nobody has labelled anything
+        return _of_callers(measurements, callers), 0
+    kept = _of_callers(rows_kept(measurements, ~clutter), callers)
+    check_unique(kept, "time", "landmark", besides=CALLER)
+    return kept, int(np.sum(clutter))
 
 
 def check_seconds(table: Table, longest_gap: float = _MAX_GAP) -> None:
