@@ -44,7 +44,7 @@ class FrameMeasurements:
     unlabelled: Scan | None = None
     """The same frame as a robot hears it, a row per echo and no label; None if not asked for."""
     causes: Int[np.ndarray, " e"] = field(default_factory=lambda: NO_CALLERS)
-    """What caused each of those rows: a landmark, by the oracle, or UNLABELLED."""
+    """Label of the landmark that caused each of those rows, by the oracle, or UNLABELLED."""
     between: bool = False
     """Whether the call came between two calls of the vehicle."""
 

@@ -44,8 +44,8 @@ class Assignment:
     """The scan as the association states it, where it states more than came: the labels of callers,
     or how far away one is. With as many rows."""
     again: Any = None
-    """What has become known, for which all scans that the session remembers are to be associated
-    anew (`informed`), or None."""
+    """News about earlier scans, or None: all scans that the session remembers are associated again
+    with memories that have it (`informed`)."""
 
 
 class Association(Protocol[M]):

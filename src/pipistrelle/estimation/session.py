@@ -220,18 +220,18 @@ class Session(Generic[B]):
 
     def _hear_again(self, news: Any) -> None:
         """Associate all scans that are remembered anew, by what has become known."""
-        past, legs = list(self._past), self._legs
-        self._past.clear()
-        del self.labels[past[0].number :]
-        dropped = _held(past[0].belief, [*self._dropped])
-        self.belief = edited(past[0].belief, remove=dropped)
-        self._dropped = set()  # a label may be given again
         informed = getattr(self._association, "informed", None)
         if informed is None:
             raise InputError(
                 f"association: found scans to be associated again, but a "
                 f"{type(self._association).__name__} has no informed(memory, news)"
             )
+        past, legs = list(self._past), self._legs
+        self._past.clear()
+        del self.labels[past[0].number :]
+        dropped = _held(past[0].belief, [*self._dropped])
+        self.belief = edited(past[0].belief, remove=dropped)
+        self._dropped = set()  # a label may be given again
         self._memory = informed(past[0].memory, news)
         for one in past:
             if one is not past[0]:

@@ -1,1 +1,1 @@
-"""Who is who: the package's own associations. `sequential` is the stage, file by file below it."""
+"""Data association, as the package does it: `sequential` is the stage, the others are its steps."""

@@ -1,4 +1,4 @@
-r"""Where a caller is, by the excess paths of landmarks that nobody knows.
+r"""The search for a caller's place by excess paths over landmarks that are not known either.
 
 Given the caller's place, a row's bearing and excess path are a point; those of one landmark are one
 point at all times only where the caller truly is. The search takes a grid of ranges and bearings
@@ -29,7 +29,7 @@ ANOTHER, CLEARLY, WELL = math.log(1.5), 25.0, 2.6
 DIRECT_STD, LEAST_BEARING_STD, LEAST_WAY_STD = 0.05, 0.01, 0.05
 """Least deviations: of the direct call, of other bearings [rad], and of excess paths [m]."""
 FARTHEST, NEAREST = 80.0, 0.05
-"""Of a landmark [m]."""
+"""Largest range of a landmark, and least distance from the caller [m]."""
 CAP = 9.0
 """A row's misfit counts no more."""
 PASSES, WEIGHINGS = 3, 2

@@ -19,8 +19,8 @@ from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 HEARD, MISSED = 2.0, 1.3
-"""What is added when a landmark is heard, and taken when it should have been: a detection
-probability of 0.75, and a chance of 0.1 that clutter is where it is."""
+"""Rise of the log odds when a landmark is heard, and their fall when it should have been: a
+detection probability of 0.75, and a chance of 0.1 that clutter is where it is."""
 MOST, CONFIRMED, GONE = 8.0, 3.5, -2.0
 """Odds rise no further; a landmark is one; a landmark is none."""
 LEAST_SCANS, PATIENCE = 3, 25
@@ -29,9 +29,9 @@ not yet one is none."""
 FAINTEST = 18.0
 """A landmark is expected from this level on [dB]."""
 AS_LOUD = 3.0
-"""What is at most so much fainter may hide it [dB]."""
+"""A row may hide a landmark that is at most so much louder [dB]."""
 TOGETHER = 1.0
-"""What comes within such a way hides it: the length of a call [m]."""
+"""A row hides a landmark whose path differs by less: the length of a call [m]."""
 AIMED = 0.1
 """The vehicle's own call is as loud up to so much from the bearing at which it was heard [rad]."""
 FORGETTING = 0.2
@@ -128,10 +128,8 @@ def _judge(
             if math.isnan(far) or math.isnan(level[m]):
                 continue
             source, before = level[m] + _spreading(caller[m], far), known.source[n, caller[m]]
-            gain = 1.0 if math.isnan(before) else FORGETTING
-            known.source[n, caller[m]] = (
-                source if gain == 1.0 else before + gain * (source - before)
-            )
+            mean_source = before + FORGETTING * (source - before)
+            known.source[n, caller[m]] = source if math.isnan(before) else mean_source
             if caller[m] == OWN:
                 known.aim[n] = bearing
         if here:

@@ -25,7 +25,7 @@ SURE = 0.95
 MESSAGES, STAY = 50, 1e-6
 """How often messages are passed, at most, and by how much they may still change."""
 LARGEST = 30.0
-"""Of a weight's logarithm: what is likelier is as sure, and sums keep the others' digits."""
+"""Largest logarithm of a weight: beyond it a pair is as sure, and sums would lose digits."""
 FARTHEST = 1e6
 """In place of an infinite cost."""
 

@@ -47,7 +47,7 @@ from pipistrelle.estimation.data_association.pairs import (
     with_point,
 )
 from pipistrelle.estimation.data_association.tracks import Tracks, followed
-from pipistrelle.geometry import wrap_angle
+from pipistrelle.geometry import wrap, wrap_angle
 
 FIRST_SEARCH = 8
 """Scans of a caller after which its place is searched for, at every second one."""
@@ -225,9 +225,9 @@ class _Work:
         at = OWN_CALL if number == OWN else self._heard_from(number)
         if at is None:
             return
-        rows, there = np.flatnonzero(self.scan.caller == number), self._places()
-        if number != OWN and number < self.scan.direct.size:
-            rows = rows[rows != self.scan.direct[number]]
+        rows = np.flatnonzero(self.scan.caller == number)
+        rows = rows[rows != self._direct(number)]
+        there = 3 + 2 * np.arange(self.joint.landmark.size)
         costs = self._costs(number, rows, there, at, self.stage.chances)
         gated, usable = np.isfinite(costs), self._usable(number, with_way=at != UNPLACED)[rows]
         telling = self.scan.bearing_std[rows] <= 2.0 * self.stage.limits.bearing_std
@@ -289,9 +289,9 @@ class _Work:
         """Return where a landmark stands in the joint mean, or -1."""
         return self.place.get(label, -1)
 
-    def _places(self) -> Int[np.ndarray, " n"]:
-        """Return where all landmarks stand in the joint mean."""
-        return 3 + 2 * np.arange(self.joint.landmark.size)
+    def _direct(self, number: int) -> int:
+        """Return the row of a caller's direct call, or -1."""
+        return int(self.scan.direct[number]) if number < self.scan.direct.size else -1
 
     def _ways(self, number: int) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """Return ranges or excess paths, with their deviations."""
@@ -306,6 +306,12 @@ class _Work:
         bare, rows = np.isnan(way), self.scan.caller == number
         sure = rows & self._within(self.scan.bearing_std, limits.bearing_std)
         return sure & (~bare if with_way else True) & (bare | self._within(std, limits.way_std))
+
+    def _sure(self, number: int, rows: Int[np.ndarray, " r"]) -> Bool[np.ndarray, " r"]:
+        """Return a mask of rows of a caller that are sure enough to begin a landmark."""
+        (_, std), limits = self._ways(number), self.stage.limits
+        sure = self._within(self.scan.bearing_std[rows], limits.birth_bearing_std)
+        return sure & self._within(std[rows], limits.birth_way_std)
 
     def _within(self, std: Float[np.ndarray, " r"], limit: float) -> Bool[np.ndarray, " r"]:
         """Return a mask of deviations that are within a limit, or that were only assumed."""
@@ -333,7 +339,7 @@ class _Work:
 
     def _tell(self, number: int, caller: Caller) -> None:
         """State the place of a caller that was found as a range of its direct call."""
-        row = self.scan.direct[number] if number < self.scan.direct.size else -1
+        row = self._direct(number)
         if caller.place is None or row < 0:
             return
         dx, dy = caller.place[0] - self.pose[0], caller.place[1] - self.pose[1]
@@ -342,37 +348,31 @@ class _Work:
         if not caller.refined:
             self.numbers[BEARING, row] = wrap_angle(math.atan2(dy, dx) - self.pose[2])
             self.numbers[BEARING_STD, row] = PLACE_BEARING_STD
-        self.numbers[RANGE, row], self.numbers[RANGE_STD, row] = (
-            far,
-            (REFINED_SHARE if caller.refined else PLACE_SHARE) * far,
-        )
+        share = REFINED_SHARE if caller.refined else PLACE_SHARE
+        self.numbers[RANGE, row], self.numbers[RANGE_STD, row] = far, share * far
         self.label[row] = self.named[number] = caller.label
         told = replace(caller, told=True, tracks=Tracks(), since=self.memory.scan)
         self.callers[number] = told
 
     def _match_direct(self, number: int, label: int, at: int) -> None:
         """Label a caller's direct call, where its bearing agrees."""
-        row = self.scan.direct[number] if number < self.scan.direct.size else -1
+        row = self._direct(number)
         if row < 0:
             return
-        chances = (DIRECT_GATE, *self.stage.chances[1:])
-        if (
-            at < 0
-            or np.isfinite(
-                self._costs(number, np.array([row]), np.array([at]), UNPLACED, chances)
-            ).all()
-        ):
-            self.label[row] = label
+        if at >= 0:
+            chances = (DIRECT_GATE, *self.stage.chances[1:])
+            cost = self._costs(number, np.array([row]), np.array([at]), UNPLACED, chances)
+            if np.isinf(cost[0, 0]):
+                return
+        self.label[row] = label
 
     def _bear(self, number: int, rows: Int[np.ndarray, " r"]) -> None:
         """Begin landmarks with rows that are sure and near no other."""
-        (way, std), limits, scan = self._ways(number), self.stage.limits, self.scan
-        sure = self._within(scan.bearing_std[rows], limits.birth_bearing_std)
-        sure &= self._within(std[rows], limits.birth_way_std)
+        (way, std), scan, sure = self._ways(number), self.scan, self._sure(number, rows)
         factor, same = (2.0 if number == OWN else 1.0), scan.caller == number
         for row in sorted(rows[sure].tolist(), key=lambda row: -scan.level_db[row]):
             beside = same & (factor * np.abs(way - way[row]) < BESIDE)
-            beside &= np.abs(_wrapped(scan.bearing - scan.bearing[row])) < ASIDE
+            beside &= np.abs(wrap(scan.bearing - scan.bearing[row])) < ASIDE
             if np.any(beside & (scan.level_db > scan.level_db[row])):
                 continue
             label = self._another()
@@ -389,9 +389,7 @@ class _Work:
         """Count how many of a caller's sure rows are of landmarks."""
         if number not in self.callers or self._where(self.callers[number].label) < 0:
             return
-        (_, std), limits, caller = self._ways(number), self.stage.limits, self.callers[number]
-        sure = self._within(self.scan.bearing_std[rows], limits.birth_bearing_std)
-        sure &= self._within(std[rows], limits.birth_way_std)
+        caller, sure = self.callers[number], self._sure(number, rows)
         told = (int(found[sure].sum()), int(sure.sum()))
         self.callers[number] = replace(caller, trial=(*caller.trial[1 - TRIAL :], told))
 
@@ -407,8 +405,3 @@ class _Work:
                 lost += [caller.label, *known.label[alone].tolist()]
                 del self.callers[number]
         return lost
-
-
-def _wrapped(angle: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-    """Return angles within half a turn."""
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi

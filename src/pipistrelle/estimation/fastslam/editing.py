@@ -101,14 +101,13 @@ def _without(
     number = np.where(kept, np.cumsum(kept) - 1, -1)
     parents, slopes = belief.parent.size, belief.slope.shape[1]
     parent = belief.parent[kept[:parents]]
-    best = np.repeat(kept, rows)
     return {
         "landmark": landmark[kept],
         "first": np.append(0, np.cumsum(rows[kept])),
         "count": np.ascontiguousarray(belief.count[:, kept]),
         "member": np.ascontiguousarray(belief.member[:, members]),
         "best_count": belief.best_count[kept],
-        "best_member": belief.best_member[best],
+        "best_member": belief.best_member[members],
         "parent": np.where(parent >= 0, number[parent], -1),
         "slope": np.ascontiguousarray(belief.slope[:, kept[:slopes]]),
     }

@@ -246,7 +246,7 @@ def replay(
     )
     check_filters(filters, drive.motion, config, drive.moving.values())
     noise, known = noise_of(config.filter), config.association.method == KNOWN
-    if known and all((scan.landmark == UNLABELLED).all() for scan in log.scans):
+    if known and _is_bare(log):
         raise refusal(log.name, "rows without labels", LABELS, "add --association.method marginal")
 
     def taken(scan: Scan) -> Scan:
@@ -274,12 +274,17 @@ def replay(
 LABELS = "labels of landmarks, or an association"
 
 
+def _is_bare(log: Log) -> bool:
+    """Tell whether no row of a log has a label."""
+    return all((scan.landmark == UNLABELLED).all() for scan in log.scans)
+
+
 def _log_causes(
     log: Log, heard: Mapping[Strategy, Sequence[Scan]]
 ) -> dict[Strategy, Causes | None]:
     """Return the labels that a log's rows bear, as what caused them; None where none bears one."""
     rows = {scan.time: scan for scan in log.scans}
-    if all((scan.landmark == UNLABELLED).all() for scan in log.scans):
+    if _is_bare(log):
         return dict.fromkeys(heard)
     return {
         strategy: [causes_of(s, rows[s.time], rows[s.time].landmark) for s in scans]

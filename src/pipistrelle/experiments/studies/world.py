@@ -263,8 +263,8 @@ def _try_case(case: PlannedCase, shared: HeardWorld, iteration: int) -> TrialRec
             shared.scans(case.config, case.strategy),
         )
         heard = shared.beams[case.config.emitter.radius]
-        began = kernel_clock.cpu_s()
         causes = shared.causes(case.config, case.strategy)
+        began = kernel_clock.cpu_s()
         result = run_trial(
             replace(case, iteration=iteration), drive, scans, case.config, causes=causes
         )
