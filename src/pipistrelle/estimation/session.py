@@ -191,6 +191,8 @@ class Session(Generic[B]):
     def _use(self, heard: _Heard) -> Scan:
         """Correct the belief with a scan that an association has labelled."""
         self.labels[heard.number :] = [heard.label]
+        for kept, gone in heard.merge:
+            self.labels = [np.where(label == gone, kept, label) for label in self.labels]
         self.belief = edited(self.belief, merge=heard.merge)
         merged = labelled(heard.scan, heard.label)
         return self._correct(self._noise(merged) if self._noise else merged)
@@ -198,6 +200,7 @@ class Session(Generic[B]):
     def _take_back(self, labels: tuple[int, ...]) -> None:
         """Remove landmarks, with all of their rows that are remembered."""
         past = list(self._past)
+        labels = (*labels, *(gone for one in past for kept, gone in one.merge if kept in labels))
         heard = [n for n, one in enumerate(past) if _names(one, labels)]
         again = past[heard[0] if heard else len(past) :]
         before = again[0].belief if again else self.belief
@@ -214,6 +217,8 @@ class Session(Generic[B]):
                 self._go(one.legs)
             one.belief, one.label = self.belief, _without(one.label, labels)
             one.scan = replace(one.scan, callers=_without(one.scan.callers, labels))
+            held = _held(self.belief, [label for pair in one.merge for label in pair])
+            one.merge = tuple(pair for pair in one.merge if {*pair} <= {*held})
             self._use(one)
         if again:
             self._go(self._legs)

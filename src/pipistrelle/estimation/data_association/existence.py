@@ -8,10 +8,11 @@ level nothing is expected.
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from pipistrelle.detection.scans import OWN
 from pipistrelle.estimation.measurement import excess_path_slopes
@@ -23,7 +24,7 @@ HEARD, MISSED = 2.0, 1.3
 detection probability of 0.75, and a chance of 0.1 that clutter is where it is."""
 MOST, CONFIRMED, GONE = 8.0, 3.5, -2.0
 """Odds rise no further; a landmark is one; a landmark is none."""
-LEAST_SCANS, PATIENCE = 3, 25
+LEAST_SCANS, PATIENCE = 4, 25
 """In how many scans it takes a landmark to be one; scans of silence after which a landmark that is
 not yet one is none."""
 FAINTEST = 18.0
@@ -36,6 +37,8 @@ AIMED = 0.1
 """The vehicle's own call is as loud up to so much from the bearing at which it was heard [rad]."""
 FORGETTING = 0.2
 """Share of the newest level in the mean."""
+OFTEN = 255
+"""Scans in which two landmarks were heard together are counted up to so many."""
 
 
 class Known(NamedTuple):
@@ -53,13 +56,15 @@ class Known(NamedTuple):
     """Level that it would have at 1 m, by caller [dB], or NaN."""
     aim: Float[np.ndarray, " l"]
     """Bearing at which the vehicle's own call was last heard of it [rad]."""
+    together: UInt8[np.ndarray, "l l"]
+    """Scans in which one caller was heard of two landmarks: then they are two."""
 
 
 def nobody(callers: int) -> Known:
     """Return no landmarks."""
     whole, number = np.empty(0, np.int64), np.empty(0)
-    none = np.empty((0, callers))
-    return Known(whole, whole, whole, whole, number, np.empty(0, np.bool_), none, number)
+    none, together = np.empty((0, callers)), np.empty((0, 0), np.uint8)
+    return Known(whole, whole, whole, whole, number, np.empty(0, np.bool_), none, number, together)
 
 
 def with_new(known: Known, labels: list[int], scan: int, callers: int) -> Known:
@@ -78,12 +83,30 @@ def with_new(known: Known, labels: list[int], scan: int, callers: int) -> Known:
         confirmed=np.append(known.confirmed, np.zeros(size, np.bool_)),
         source=np.vstack([source, np.full((size, source.shape[1]), np.nan)]),
         aim=np.append(known.aim, np.full(size, np.nan)),
+        together=np.pad(known.together, (0, size)),
     )
 
 
 def some(known: Known, kept: Bool[np.ndarray, " l"]) -> Known:
     """Return some of the known landmarks."""
-    return Known(*(column[kept] for column in known))
+    left = Known(*(column[kept] for column in known))
+    return left._replace(together=left.together[:, kept])
+
+
+def merged(known: Known, pairs: Sequence[tuple[int, int]]) -> Known:
+    """Return known landmarks in which the second of each pair of labels is the first, too."""
+    if not pairs:
+        return known
+    after = Known(*(column.copy() for column in known))
+    place = {label: n for n, label in enumerate(known.label.tolist())}
+    for kept, gone in pairs:
+        a, b = place[kept], place[gone]
+        after.count[a] += after.count[b]
+        for column in (after.odds, after.heard, after.confirmed):
+            column[a] = max(column[a], column[b])
+        both = np.maximum(after.together[a], after.together[b])
+        after.together[a], after.together[:, a] = both, both
+    return some(after, ~np.isin(after.label, [gone for _, gone in pairs]))
 
 
 Heard = tuple[
@@ -110,12 +133,13 @@ def judged(
 def _judge(
     columns: tuple[np.ndarray, ...],
     rows: Heard,
-    place: Place,
+    there: Place,
     near: Bool[np.ndarray, " l"],
     scan: Whole,
 ) -> None:
     """Write odds, counts and levels after a scan."""
-    known, (label, caller, _, level), (mean, at, callers) = Known(*columns), rows, place
+    known, (label, caller, _, level), (mean, at, callers) = Known(*columns), rows, there
+    place = np.full(label.size, -1)
     for n in range(known.label.size):
         far, bearing, here = math.nan, math.nan, False
         if at[n] >= 0:
@@ -124,7 +148,7 @@ def _judge(
         for m in range(label.size):
             if label[m] != known.label[n]:
                 continue
-            here = True
+            here, place[m] = True, n
             if math.isnan(far) or math.isnan(level[m]):
                 continue
             source, before = level[m] + _spreading(caller[m], far), known.source[n, caller[m]]
@@ -145,6 +169,21 @@ def _judge(
                 known.odds[n] = -MOST
         if known.odds[n] >= CONFIRMED and known.count[n] >= LEAST_SCANS:
             known.confirmed[n] = True
+    _count_together(known.together, place, caller)
+
+
+@no_alloc
+def _count_together(
+    together: UInt8[np.ndarray, "l l"],
+    place: Int[np.ndarray, " m"],
+    caller: Int[np.ndarray, " m"],
+) -> None:
+    """Count landmarks of which one caller was heard in a scan; of each row where its own stands."""
+    for a in range(place.size):
+        for b in range(place.size):
+            i, j = place[a], place[b]
+            if 0 <= i != j >= 0 and caller[a] == caller[b] and together[i, j] < OFTEN:
+                together[i, j] += 1
 
 
 @no_alloc

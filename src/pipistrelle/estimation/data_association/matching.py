@@ -20,8 +20,8 @@ from pipistrelle.jit import kernel
 
 NOTHING = -1
 """A row of no landmark."""
-SURE = 0.95
-"""Probability from which on a row that is of a landmark is taken to be of one of them."""
+LIKELY, SURE = 0.9, 0.99
+"""Probabilities from which on a row is taken to be of a landmark, and, if it is, of which."""
 MESSAGES, STAY = 50, 1e-6
 """How often messages are passed, at most, and by how much they may still change."""
 LARGEST = 30.0
@@ -50,8 +50,7 @@ def nearest(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
 def marginal(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
     """Return the landmark of each row where that is sure, or NOTHING.
 
-    A row is of a landmark if it is likelier than clutter, and of which is sure by `SURE`. Here the
-    first row is of either: neither is sure.
+    Here the first row is of either (`LIKELY`), but neither is sure (`SURE`).
 
     >>> marginal(np.array([[-9.0, -9.0], [np.inf, np.inf]]))
     array([-1, -1])
@@ -63,7 +62,7 @@ def marginal(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
     shares = probabilities(costs)
     best, of_any = shares.argmax(axis=1), shares.sum(axis=1)
     share = shares[np.arange(len(costs)), best]
-    return np.where((of_any > 0.5) & (share >= SURE * of_any), best, NOTHING)
+    return np.where((of_any > LIKELY) & (share >= SURE * of_any), best, NOTHING)
 
 
 @kernel

@@ -10,7 +10,10 @@ would be of that landmark with what it would be of clutter of a density :math:`\
 
 .. math:: c = d^2 + \ln |2 \pi S| + 2 \ln (\lambda / p_D)
 
-A pair of a cost below 0 is likelier than clutter.
+A pair of a cost below 0 is likelier than clutter. After a long way among other landmarks pose and
+landmark may be so unsure of each other that a row of the vehicle's own call tells nothing of the
+pair, however well it fits (`VAGUE`): such a row is of something new, until it is seen to be one
+with what is known (`doubles`).
 """
 
 import math
@@ -49,6 +52,8 @@ class Chances(NamedTuple):
     """Probability that a landmark which can be heard is."""
 
 
+VAGUE = 0.06
+"""Largest root of the determinant of H P H^T, of bearing and range [rad m]."""
 OWN_CALL, UNPLACED = -1, -2
 """In place of a caller's index in the joint mean: the vehicle, and one that is not on the map."""
 
@@ -62,7 +67,7 @@ def pair_costs(
     caller: Whole,
     chances: tuple[float, float, float, float],
 ) -> Float[np.ndarray, "m n"]:
-    """Return the cost of each pair of a row and a landmark; infinite beyond the gate.
+    """Return the cost of each pair of a row and a landmark; infinite beyond the gate, or if vague.
 
     ``at``: where the landmarks stand in the mean; ``caller``: where that of the rows stands.
     """
@@ -74,6 +79,8 @@ def pair_costs(
             continue
         bearing, way = _expected(mean, at[n], caller, H, index)
         _spread(covariance, H, index, 5 if caller < 0 else 7, S)
+        if caller == OWN_CALL and S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0] > VAGUE * VAGUE:
+            continue
         for m in range(heard.bearing.size):
             nu = wrap_angle(heard.bearing[m] - bearing)
             a = S[0, 0] + heard.bearing_std[m] ** 2

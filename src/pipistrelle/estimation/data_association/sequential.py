@@ -4,7 +4,8 @@ A row is held against the landmarks of the map with the joint covariance of pose
 the rows of each caller by themselves, and is given to one of them or to none (`matching`). A sure
 row that is near none begins a landmark at once, with all that it says, so that nothing of the first
 scans is lost; whether there is one is told later, by how often it is heard (`existence`). What was
-none is removed, and its rows are taken back.
+none is removed, and its rows are taken back; what turns out to be on the map twice is merged
+(`doubles`).
 
 A caller is known by its direct call, and its place is found by the excess paths themselves
 (`caller_search`). Until then its rows are followed, and not used; then the session hears again all
@@ -13,7 +14,7 @@ that it remembers.
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -31,14 +32,16 @@ from pipistrelle.detection.scans import (
 from pipistrelle.estimation.association import Assignment
 from pipistrelle.estimation.beliefs import Belief, JointGaussian
 from pipistrelle.estimation.data_association.caller_search import find_caller
+from pipistrelle.estimation.data_association.doubles import doubles
 from pipistrelle.estimation.data_association.existence import (
     GONE,
     Known,
     judged,
-    nobody,
+    merged,
     some,
     with_new,
 )
+from pipistrelle.estimation.data_association.memory import Caller, Memory
 from pipistrelle.estimation.data_association.pairs import (
     OWN_CALL,
     UNPLACED,
@@ -59,42 +62,19 @@ DIRECT_GATE = 9.0
 """Largest squared distance of a caller's direct call."""
 PROBATION = 40
 """Scans in which a caller may turn out not to be where it was found."""
-TRIAL, SETTLING, LEAST_SHARE, LEAST_ROWS = 9, 3, 0.5, 10
+TRIAL, SETTLING, LEAST_SHARE, LEAST_ROWS = 9, 3, 0.4, 10
 """A caller is where it was found if of the sure rows of so many scans, the first left out, this
 share is of landmarks, new ones not counted; at least so many rows must tell."""
 BESIDE, ASIDE = 0.96, 0.5
 """A row begins no landmark beside a louder one, within such a way [m] and bearing [rad]."""
+OVERLAP_STD, OVERLAP_GATE = 0.7, 9.0
+"""Deviation of the way of an echo that overlaps with another [m], and largest squared distance."""
+ASKED = np.array([4, 6, 8, 12, 16, 24, 32, 64])
+"""In how many scans a landmark was heard when it is asked whether it is on the map twice."""
+BOTH = 0.1
+"""Two landmarks are two if in more than this share of the scans of either both were heard."""
 News = Mapping[int, tuple[float, float, bool]]
 """Where callers are, by number: x, y [m], and whether that is from the map."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Caller:
-    """What is known of a caller."""
-
-    label: int
-    place: tuple[float, float] | None = None
-    """Where it was found [m], until that was told."""
-    told: bool = False
-    tracks: Tracks = field(default_factory=Tracks)
-    trial: tuple[tuple[int, int], ...] = ()
-    """Rows that were of landmarks, and all, of the scans since it is on the map."""
-    since: int = 0
-    """Number of the scan in which it was placed."""
-    refined: bool = False
-    """Whether its place is that of a map."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Memory:
-    """What the association remembers."""
-
-    scan: int = 0
-    labels: int = 0
-    """Labels given so far."""
-    known: Known = field(default_factory=lambda: nobody(1))
-    callers: Mapping[int, Caller] = field(default_factory=dict)
-    """By number."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -237,7 +217,7 @@ class _Work:
         self.label[rows[usable]] = label
         self._judge_caller(number, rows[usable], label != UNLABELLED)
         if at != UNPLACED:
-            self._bear(number, rows[usable & ~gated.any(axis=1)])
+            self._bear(number, rows[usable & ~gated.any(axis=1)], at)
 
     def _heard_from(self, number: int) -> int | None:
         """Return where a caller stands in the joint mean; None where its rows have to wait."""
@@ -254,31 +234,59 @@ class _Work:
 
     def finished(self) -> tuple[Memory, Assignment]:
         """Return the memory after the scan, and the assignment."""
-        memory, scan = self.memory, self.scan
-        size = max(1 + scan.caller.max(initial=0), scan.direct.size, memory.known.source.shape[1])
-        known = with_new(memory.known, self.new, memory.scan, size)
-        at = np.array([self._where(label) for label in known.label.tolist()], np.int64)
-        callers = np.full(size, UNPLACED)
-        for number, caller in self.callers.items():
-            callers[number] = self._where(caller.label)
-        way = np.where(scan.caller == OWN, scan.range, scan.excess_path)
-        heard = self.label, scan.caller, way, scan.level_db
-        near = np.isin(known.label, list(self.near))
-        known = judged(known, heard, (self.joint.mean, at, callers), near, memory.scan)
+        memory, scan, known = self.memory, self.scan, self._judged()
         gone = {*known.label[known.odds < GONE].tolist(), *self._lost(known)}
-        kept = ~np.isin(known.label, list(gone))
+        known = some(known, ~np.isin(known.label, list(gone)))
         self.label[np.isin(self.label, list(gone))] = UNLABELLED
         self.named[np.isin(self.named, list(gone))] = UNLABELLED
+        merge = () if gone else self._doubles(known)
+        for kept, other in merge:
+            self.label[self.label == other] = kept
         after = Memory(
-            scan=memory.scan + 1, labels=self.labels, known=some(known, kept), callers=self.callers
+            scan=memory.scan + 1,
+            labels=self.labels,
+            known=merged(known, merge),
+            callers=self.callers,
         )
         stated = replace(scan, numbers=self.numbers, callers=self.named, direct=NO_CALLERS)
         before = {*memory.known.label.tolist(), *(c.label for c in memory.callers.values())}
         return after, Assignment(
             label=self.label,
             remove=tuple(sorted(gone & before)),
+            merge=merge,
             scan=stated if scan.direct.size else None,
         )
+
+    def _judged(self) -> Known:
+        """Return all landmarks, new ones too, after what was heard of them and what was not."""
+        memory, scan = self.memory, self.scan
+        size = max(1 + scan.caller.max(initial=0), scan.direct.size, memory.known.source.shape[1])
+        known = with_new(memory.known, self.new, memory.scan, size)
+        callers = np.full(size, UNPLACED)
+        for number, caller in self.callers.items():
+            callers[number] = self._where(caller.label)
+        way = np.where(scan.caller == OWN, scan.range, scan.excess_path)
+        heard = self.label, scan.caller, way, scan.level_db
+        there, near = self._places(known), np.isin(known.label, list(self.near))
+        return judged(known, heard, (self.joint.mean, there, callers), near, memory.scan)
+
+    def _doubles(self, known: Known) -> tuple[tuple[int, int], ...]:
+        """Return pairs of landmarks that are one, the older first; asked now and then."""
+        now = self.memory.scan
+        there = np.flatnonzero((self._places(known) >= 0) & (known.born < now))
+        known = some(known, np.isin(np.arange(known.label.size), there))
+        asked = np.flatnonzero((known.heard == now) & np.isin(known.count, ASKED))
+        if not asked.size:
+            return ()
+        rarer = np.minimum(known.count[:, np.newaxis], known.count)
+        apart = (known.together > BOTH * rarer) | np.eye(len(rarer), dtype=bool)
+        label = known.label.tolist()
+        pairs = doubles(self.joint, self._places(known), apart, asked)
+        return tuple((label[a], label[b]) for a, b in pairs)
+
+    def _places(self, known: Known) -> Int[np.ndarray, " l"]:
+        """Return where known landmarks stand in the joint mean; -1: nowhere."""
+        return np.array([self._where(label) for label in known.label.tolist()], np.int64)
 
     def _another(self) -> int:
         """Return a new label."""
@@ -366,11 +374,12 @@ class _Work:
                 return
         self.label[row] = label
 
-    def _bear(self, number: int, rows: Int[np.ndarray, " r"]) -> None:
+    def _bear(self, number: int, rows: Int[np.ndarray, " r"], at: int) -> None:
         """Begin landmarks with rows that are sure and near no other."""
-        (way, std), scan, sure = self._ways(number), self.scan, self._sure(number, rows)
+        (way, std), scan, rows = self._ways(number), self.scan, rows[self._sure(number, rows)]
+        rows = rows[~self._overlapped(number, rows, at)]
         factor, same = (2.0 if number == OWN else 1.0), scan.caller == number
-        for row in sorted(rows[sure].tolist(), key=lambda row: -scan.level_db[row]):
+        for row in sorted(rows.tolist(), key=lambda row: -scan.level_db[row]):
             beside = same & (factor * np.abs(way - way[row]) < BESIDE)
             beside &= np.abs(wrap(scan.bearing - scan.bearing[row])) < ASIDE
             if np.any(beside & (scan.level_db > scan.level_db[row])):
@@ -382,6 +391,23 @@ class _Work:
                 stds = scan.bearing_std[row], std[row]
                 self.place[label] = self.joint.mean.size
                 self.joint = with_point(self.joint, label, scan.bearing[row], way[row], stds)
+
+    def _overlapped(
+        self, number: int, rows: Int[np.ndarray, " r"], at: int
+    ) -> Bool[np.ndarray, " r"]:
+        """Return a mask of rows that may be of a landmark which was not heard by itself.
+
+        Of two echoes that overlap comes one row, with the bearing of one and the way of the other.
+        """
+        known, joint = self.memory.known, self.joint
+        silent = known.label[known.confirmed & ~np.isin(known.label, self.label)].tolist()
+        there = np.array([self.place[label] for label in silent if label in self.place], np.int64)
+        heard = self._rows(number, rows)
+        spread = OVERLAP_STD / (2.0 if number == OWN else 1.0)
+        columns = tuple(heard._replace(way_std=np.hypot(heard.way_std, spread)))
+        chances = (OVERLAP_GATE, *self.stage.chances[1:])
+        costs = pair_costs(columns, joint.mean, joint.covariance, there, at, chances)
+        return np.any(np.isfinite(costs), axis=1)
 
     def _judge_caller(
         self, number: int, rows: Int[np.ndarray, " r"], found: Bool[np.ndarray, " r"]
