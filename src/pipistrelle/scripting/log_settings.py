@@ -86,8 +86,9 @@ def check_open(flags: Layer) -> None:
 def check_bag(flags: Layer, log: Path) -> None:
     """Refuse settings of bags beside a log that is none."""
     given = [given for key, given in flags.items() if key[0] == "bag"]
-    if given and not reader_of(log).configured:
-        raise InputError(f"{given[0].where}: means nothing to {reader_of(log).title}; leave it out")
+    reader = reader_of(log)
+    if given and reader.recognises(log) and not reader.configured:
+        raise InputError(f"{given[0].where}: means nothing to {reader.title}; leave it out")
 
 
 def with_log(layer: Layer, recorded: "Log", log: Path) -> tuple[Config, list[str]]:

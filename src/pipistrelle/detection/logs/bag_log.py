@@ -50,7 +50,8 @@ class _Heard:
     def add(self, message: Message, settings: BagConfig) -> None:
         content = message.content
         time = _time(message, settings)
-        echoes = ECHOES[self.type](content, settings.speed_of_sound)
+        with np.errstate(all="ignore"):  # what is no number is left out, or refused
+            echoes = ECHOES[self.type](content, settings.speed_of_sound)
         self.time.append(time)
         self.lag.append(message.received - time)
         self.number.append(message.number)
