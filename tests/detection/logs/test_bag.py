@@ -363,6 +363,14 @@ def test_what_cannot_be_used_is_refused_by_topic_and_message(tmp_path, told, par
     refused(path, *parts)
 
 
+def test_messages_that_a_folder_counts_and_its_file_lacks_are_missed(tmp_path):
+    path = write_bag(tmp_path / "walk", sorted([*drive(), seen(0.2)], key=lambda one: one[2]))
+    told = (path / "metadata.yaml").read_text()
+    assert told.count("message_count: 5") == 1
+    (path / "metadata.yaml").write_text(told.replace("message_count: 5", "message_count: 9"))
+    refused(path, "topic /odom", "found 5 messages, expected the 9")
+
+
 def test_a_message_whose_bytes_end_early_is_refused_by_its_topic(tmp_path):
     from rosbags.rosbag2 import StoragePlugin, Writer
 

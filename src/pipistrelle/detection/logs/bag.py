@@ -78,6 +78,7 @@ class Bag:
             for connection, stamp, _ in self._reader.messages():
                 count, first, last = found.get(connection.topic, (0, stamp, stamp))
                 found[connection.topic] = (count + 1, min(first, stamp), max(last, stamp))
+        self._check_whole({name: found.get(name, (0,))[0] for name in self._by_topic})
         return [
             Topic(name=name, type=topic.type, count=count, span=(first / 1e9, last / 1e9))
             for name, topic in self.topics.items()
@@ -97,14 +98,27 @@ class Bag:
         raw = iter(self._reader.messages(connections=wanted))
         while True:
             with faults_named(str(self.path)):
-                if (item := next(raw, None)) is None:
-                    return
+                item = next(raw, None)
+            if item is None:
+                return self._check_whole(count)
             connection, stamp, data = item
             topic = connection.topic
             count[topic] += 1
             with faults_named(f"{self.path}, topic {topic}, message {count[topic]}"):
                 content = decoders[topic, connection.msgtype](data)
             yield Message(topic, count[topic], stamp / 1e9, content)
+
+    def _check_whole(self, count: dict[str, int]) -> None:
+        """Refuse a bag in which fewer messages were found than it says.
+
+        rosbags passes over those whose topic a folder's metadata and files describe in unlike ways.
+        """
+        for name, found in count.items():
+            said = sum(one.msgcount for one in self._by_topic[name])
+            if found < said:
+                fix = "name its file (.mcap, .db3) in place of the folder, or mend it"
+                where = f"{self.path}, topic {name}"
+                raise refusal(where, f"{found} messages", f"the {said} that the bag counts", fix)
 
     def checked(self, name: str, types: Iterable[str], option: str) -> str:
         """Return a topic that an option names; refuse one that is not there or of no use."""
