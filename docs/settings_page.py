@@ -12,7 +12,7 @@ PLACE = "<!-- settings -->"
 CALLER = "<!-- callers -->"
 ALL_DRAWN = "any number"
 WORDS = {"string": "a folder", "boolean": "`true` or `false`"}
-"""Settings that are no numbers; the only text that is free is the folder of a world."""
+"""Settings that are no numbers; text that is free is the folder of a world, or names topics."""
 SIGN = re.compile("([≥>≤<]) ")
 UNIT = re.compile(r" ?\[((?!0 to 1)[^]]+)\]")
 

@@ -492,6 +492,12 @@ class PriorConfig(Section):
     """Of the sensor, ahead and to the left of the vehicle's point, each [m]."""
 
 
+def _check_rising(near: float, far: float) -> None:
+    """Refuse bounds that do not rise."""
+    if near >= far:
+        raise ValueError(f"range_bounds must rise, found [{near}, {far}]")
+
+
 class RayConfig(Section):
     """Passive landmarks as a ray of Gaussians (Table I; pruning and power unreported)."""
 
@@ -518,9 +524,7 @@ class RayConfig(Section):
 
     @model_validator(mode="after")
     def _ordered(self) -> "RayConfig":
-        near, far = self.range_bounds
-        if near >= far:
-            raise ValueError(f"range_bounds must rise, found [{near}, {far}]")
+        _check_rising(*self.range_bounds)
         if self.spacing == "auto" and self.likelihood == "printed":
             raise ValueError('spacing "auto" needs likelihood "normal", found "printed"')
         if self.spacing == "auto" and self.ranged not in ("anew", "bearing"):
@@ -543,6 +547,55 @@ class FastSlamConfig(Section):
     """Weigh by the likelihood before the sample, or at it by prior x likelihood / proposal."""
     resampled_rays: Literal["kept", "restart"] = "kept"
     """Whether rays keep their members' weights at a resampling, or restart with equal ones."""
+
+
+Topic = Annotated[str, Field(min_length=1)]
+
+
+class BagConfig(Section):
+    """How `slam` reads a ROS bag; nothing else reads these."""
+
+    odometry: Topic | None = None
+    """Topic of the odometry; else the only one there is."""
+    echoes: tuple[Topic, ...] = ()
+    """Topics of the echoes; else all whose type is known."""
+    truth: Topic | None = None
+    """Topic that tells where the vehicle truly was, for scoring and for the start; else none."""
+    motion: Literal["poses", "twist"] = "poses"
+    """The ways between odometry's poses, or its velocities as controls."""
+    covariances: bool = True
+    """Whether the ways are as sure as the twist's covariance says, where it says something."""
+    stamps: Literal["header", "received"] = "header"
+    """The times of messages: those of their headers, or when they were received."""
+    sensor_pose: tuple[Real, Real, Real] | None = None
+    """Of every sensor on the vehicle, x, y [m], heading [rad]; else as the bag says."""
+    speed_of_sound: Annotated[float, Field(ge=10, le=10_000)] | None = None
+    """Where pings that tell travel times do not say it [m/s]."""
+    step: Annotated[NonNegative, Field(le=LONGEST_STEP)] = 0.1
+    """Odometry is merged into steps of this length; 0: each message is one [s]."""
+    initial_pose_std: tuple[NonNegative, NonNegative, NonNegative] = (0.05, 0.05, 0.0436)
+    """How unsure the start is: x, y [m], heading [rad]."""
+    forward_std: NonNegative = 0.01
+    """Noise of the way of a step forwards, of poses [m]."""
+    sideways_std: NonNegative = 0.005
+    """The same to the left [m]."""
+    turn_std: NonNegative = 0.015
+    """The same of its turn [rad]."""
+    velocity_std: NonNegative = 0.1
+    """Noise of a twist's velocity in a step [m/s]."""
+    angular_rate_std: NonNegative = 0.15
+    """The same of its angular rate [rad/s]."""
+    range_std: DistanceStd = 0.2
+    """Noise of a range that does not say its own [m]."""
+    bearing_std: AngleStd = 0.06
+    """The same of a bearing [rad]."""
+    range_bounds: tuple[Positive, Positive] = (0.5, 20.0)
+    """Nearest and farthest range of a passive landmark [m]."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "BagConfig":
+        _check_rising(*self.range_bounds)
+        return self
 
 
 class Config(Section):
@@ -570,6 +623,7 @@ class Config(Section):
     prior: PriorConfig = PriorConfig()
     rays: RayConfig = RayConfig()
     fastslam: FastSlamConfig = FastSlamConfig()
+    bag: BagConfig = BagConfig()
 
     @field_validator("callers", mode="after")
     @classmethod

@@ -20,7 +20,7 @@ app = App(
 @app.default
 def fuzz(
     target: Literal[
-        "logs", "settings", "studies", "kills", "steps", "ownership", "results", "worlds"
+        "logs", "settings", "studies", "kills", "steps", "ownership", "results", "worlds", "bags"
     ],
     /,
     *,

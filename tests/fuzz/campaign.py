@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fuzz import kills, logs, ownership, results, settings, steps, studies, worlds
+from fuzz import bags, kills, logs, ownership, results, settings, steps, studies, worlds
 from fuzz.judging import Tried
 from fuzz.running import load_all
 
@@ -25,6 +25,7 @@ TARGETS: dict[str, ModuleType] = {
     "ownership": ownership,
     "results": results,
     "worlds": worlds,
+    "bags": bags,
 }
 """Each has `prepare`, for all tries, and `attempt`. A number in the order keys their randomness."""
 EVERY = 30.0

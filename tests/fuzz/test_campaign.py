@@ -25,6 +25,7 @@ TESTS = Path(__file__).resolve().parents[1]
         ("ownership", 60),
         ("results", 40),
         ("worlds", 60),
+        ("bags", 60),
     ],
 )
 def test_nothing_odd_is_answered_by_a_fault(target, tries):

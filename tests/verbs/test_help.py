@@ -8,7 +8,7 @@ from math import degrees
 import pytest
 
 from pipistrelle.acoustics.emitter import beamwidth
-from pipistrelle.config import Config
+from pipistrelle.config import BagConfig, Config
 from pipistrelle.settings import known_settings
 
 
@@ -59,6 +59,7 @@ def test_the_help_of_slam_leaves_out_what_a_log_decides(obey):
         *(f"--filter.caller-{name}-std" for name in ("speed", "walk")),
         *(f"--rays.{name}" for name in rays),
         *(f"--fastslam.{name}" for name in swarm),
+        *(f"--bag.{name.replace('_', '-')}" for name in BagConfig.model_fields),
     }
 
 

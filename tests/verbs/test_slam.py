@@ -1,5 +1,6 @@
 """`pipistrelle slam`: the log of a run gives the run's track, and decides what a log decides."""
 
+import json
 import re
 import shutil
 import sys
@@ -12,7 +13,7 @@ import pytest
 
 import pipistrelle
 from pipistrelle.__main__ import main
-from pipistrelle.config import Config
+from pipistrelle.config import Config, InputError
 from pipistrelle.detection.logs.folder import read_log
 from pipistrelle.detection.scans import COLUMNS
 from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS
@@ -20,6 +21,7 @@ from pipistrelle.experiments.runs import replay
 from pipistrelle.experiments.runs import rerun as once_more
 from pipistrelle.experiments.runs.replay import motion_of
 from pipistrelle.settings import from_text
+from reference.bags import LABELLED, ODOMETRY, RANGES, header, labelled, odometry, write_bag
 from reference.command_line import SHORT, summary, table, track
 from reference.odometry import as_motions, poses_file
 
@@ -464,3 +466,68 @@ def test_several_filters_side_by_side_have_each_the_gate_that_suits_it(obey, log
         obey("slam", log, "--filter.robust", "huber", "--filter", name, "--gate", gate, "-o", name)
         np.testing.assert_array_equal(track("both", f"fused_{name}"), track(name, f"fused_{name}"))
     assert once_more.rerun(Path("both")).difference == ""
+
+
+def bagged(path, **more):
+    """Write a bag of a drive past three posts, with its truth on a topic."""
+    posts, told = np.array([[2.0, 1.0], [3.0, -1.5], [5.0, 0.5]]), []
+    for time in (0.1 * np.arange(40)).round(3).tolist():
+        told.append(("/odom", ODOMETRY, time, odometry(time, time, 0.0, 0.0, 1.0)))
+        told.append(("/true", ODOMETRY, time, odometry(time, 7.0, 1.0 + time, np.pi / 2.0)))
+        seen = [
+            (i, np.arctan2(y, x - time), np.hypot(y, x - time)) for i, (x, y) in enumerate(posts)
+        ]
+        told.append(("/seen", LABELLED, time, labelled(time, seen)))
+    return write_bag(Path(path), told, **more)
+
+
+def test_slam_solves_a_bag_scores_it_by_a_topic_and_does_it_again(obey, undrawn):
+    bagged("walk.mcap")
+    status, printed, said = obey("slam", "walk.mcap", "--truth", "/true", "-o", "one")
+    assert (status, printed.splitlines()[-1]) == (0, "one")
+    assert "warning: walk.mcap: /odom is the odometry" in said
+    (run,) = json.loads(Path("one/summary.json").read_text())["runs"]
+    assert run["position_rmse_m"] < 0.02
+    kept = tomllib.loads(Path("one/config.toml").read_text())
+    assert kept["bag"]["truth"] == "/true"
+    with pytest.warns(UserWarning, match="/odom is the odometry"):
+        done = pipistrelle.slam("walk.mcap", bag={"truth": "/true"})
+    assert done.summary["position_rmse_m"].item() == pytest.approx(run["position_rmse_m"])
+    assert pipistrelle.load("one").figure() is None  # drawn by nobody here, but done again
+    Path("walk.mcap").write_bytes(b"")
+    with pytest.raises(InputError, match=r"walk.mcap was changed"):
+        pipistrelle.load("one").figure()
+
+
+def test_a_bags_topics_are_listed_with_what_they_are_taken_for(obey, refused):
+    bagged("walk", late=0.5)
+    status, printed, _ = obey("slam", "walk", "--topics", "--truth", "/true")
+    assert status == 0
+    rows = {line.split()[0]: line.split()[1:] for line in printed.splitlines()[1:]}
+    assert rows["/odom"] == ["nav_msgs/msg/Odometry", "40", "0.500", "4.400", "10", "odometry"]
+    assert rows["/true"][-1] == "truth"
+    assert rows["/seen"][-1] == "echoes"
+    assert "several topics of odometry" in refused("slam", "walk", "-o", "one")
+    assert "--bag.odometry names it" in obey("slam", "walk", "--topics")[1]
+
+
+def test_what_is_of_bags_is_refused_beside_a_log_folder(log, refused):
+    assert refused("slam", log, "--truth", "/true").startswith("--truth: means nothing to a log")
+    assert "no ROS bag" in refused("slam", log, "--topics")
+
+
+def test_a_bag_without_labels_is_solved_by_an_association(obey, undrawn):
+    told = []
+    for time in (0.1 * np.arange(40)).round(3).tolist():
+        told.append(("/odom", ODOMETRY, time, odometry(time, time, 0.0, 0.0, 1.0)))
+        ways = np.array([[2.0, 1.0], [3.0, -1.5], [9.0, 0.5]]) - [time, 0.0]
+        far = np.hypot(*ways.T)
+        beams = [{"x": x, "y": y} for x, y in ways / far[:, None]]
+        beams = {"header": header(time, "base_link"), "beam_unit_vec": beams, "ranges": far}
+        told.append(("/beams", RANGES, time, beams))
+    write_bag(Path("walk.db3"), told)
+    status, _, said = obey("slam", "walk.db3", "-o", "one")
+    assert (status, "rows without labels" in said) == (2, True)
+    words = ("--association.method", "marginal", "--quiet", "-o", "one")
+    assert obey("slam", "walk.db3", *words, "--bag.bearing-std", "0.02")[0] == 0
+    assert len(Path("one/map_fused_smoother.csv").read_text().splitlines()) == 4

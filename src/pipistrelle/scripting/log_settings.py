@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import create_model
 
-from pipistrelle.config import Config, InputError, Section
+from pipistrelle.config import BagConfig, Config, InputError, Section
+from pipistrelle.detection.logs.readers import reader_of
 from pipistrelle.estimation.catalogue import SECTIONS, gate_of, short_name
 from pipistrelle.settings import Given, Key, Layer, resolve
 
@@ -50,6 +51,14 @@ _REPLAYED: dict[str, Any] = {
 }
 SlamConfig = create_model("SlamConfig", __base__=Section, **_REPLAYED)
 """All settings on which the solution of a log depends; its folder's ``config.toml`` holds them."""
+BagSlamConfig = create_model("BagSlamConfig", __base__=SlamConfig, bag=(BagConfig, ...))
+"""The same of a ROS bag that is not read as all are."""
+
+
+def replayed(config: Config) -> Section:
+    """Return the settings on which the solution of a log depends."""
+    kind = SlamConfig if config.bag == BagConfig() else BagSlamConfig
+    return kind(**{name: getattr(config, name) for name in kind.model_fields})
 
 
 def is_open(key: Key) -> bool:
@@ -58,7 +67,7 @@ def is_open(key: Key) -> bool:
     >>> is_open(("rays", "power")), is_open(("filter", "range_std")), is_open(("air", "spreading"))
     (True, False, False)
     """
-    return key[0] in SlamConfig.model_fields and key not in LOGGED | OF_WORLDS
+    return key[0] in BagSlamConfig.model_fields and key not in LOGGED | OF_WORLDS
 
 
 def check_open(flags: Layer) -> None:
@@ -72,6 +81,14 @@ def check_open(flags: Layer) -> None:
         if not is_open(key):
             why = "the log decides this" if key in LOGGED else "means nothing to a recorded log"
             raise InputError(f"{given.where}: {why}; leave it out")
+
+
+def check_bag(flags: Layer, log: Path) -> None:
+    """Refuse settings of bags beside a log that is none."""
+    given = [given for key, given in flags.items() if key[0] == "bag"]
+    reader = reader_of(log)
+    if given and reader.recognises(log) and not reader.configured:
+        raise InputError(f"{given[0].where}: means nothing to {reader.title}; leave it out")
 
 
 def with_log(layer: Layer, recorded: "Log", log: Path) -> tuple[Config, list[str]]:
@@ -125,7 +142,7 @@ def log_warnings(recorded: "Log", truth: "Truth", log: Path) -> list[str]:
     """Warn of rows that were left out of a log or its truth, and of jumps in its odometry."""
     from pipistrelle.detection.logs.text_tables import FORMER_NAMES
 
-    notes = []
+    notes = [f"{log}: {note}" for note in recorded.notes]
     if recorded.ignored_rows:
         reasons = (
             f"{count} {reason.replace('_', ' ')}" for reason, count in recorded.ignored_rows.items()

@@ -22,12 +22,13 @@ from pipistrelle.experiments.runs.validate_mission import warnings_of
 from pipistrelle.own_files import OwnFiles
 from pipistrelle.scripting.arguments import number, short_names
 from pipistrelle.scripting.log_settings import (
-    SlamConfig,
+    check_bag,
     check_open,
     check_room,
     fit_warnings,
     log_warnings,
     nis_warning,
+    replayed,
     with_log,
 )
 from pipistrelle.settings import Given, Layer, resolve
@@ -97,13 +98,15 @@ def prepare_slam(
     """
     beneath, flags, short = layers
     check_open(flags)
-    layer = beneath | flags | short_names(short, flags)
-    resolve(layer)
+    given = flags | short_names(short, flags)
+    layer = beneath | given
+    asked = resolve(layer)
     if beamwidth.value is not None and not 0 < number(beamwidth) <= 360:
         raise InputError(
             f"{beamwidth.where}: found {beamwidth.value:g}, expected above 0 and up to 360 [deg]"
         )
-    recorded, truth = load(place, robot)
+    check_bag(given, place)
+    recorded, truth = load(place, robot, bag=asked.bag)
     config, overruled = with_log(layer, recorded, place)
     check_room(recorded, filters, config)
     beam = None if beamwidth.value is None else radians(beamwidth.value)
@@ -168,7 +171,7 @@ def keep(
 
     figure, config, files = drawn(mission), mission.config, {}
     if mission.log is not None:
-        kept = SlamConfig(**{name: getattr(config, name) for name in SlamConfig.model_fields})
+        kept = replayed(config)
     elif mission.world is not None:
         kept, files = kept_world(config, mission.world)
     else:

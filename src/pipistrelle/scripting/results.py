@@ -322,12 +322,12 @@ def slam(
 ) -> Results:
     """Solve a recorded log, as `pipistrelle slam` does.
 
-    What looks odd in it is a warning.
+    What looks odd in it is a warning, and what was chosen in reading a ROS bag.
 
     Parameters
     ----------
     log : Path
-        Its folder.
+        Its folder, or a ROS bag; ``bag={"odometry": "/odom", "truth": "/pose"}`` names topics.
     config : Config, mapping, or path of a TOML file, optional
         Settings to start from.
     robot : int or str, optional

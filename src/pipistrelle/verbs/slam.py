@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from pipistrelle.detection.logs.readers import READERS
-from pipistrelle.scripting.arguments import named_strategies
+from pipistrelle.scripting.arguments import named_strategies, short_names
 from pipistrelle.scripting.log_settings import GATE_KEY, OWN, TIMING, is_open
 from pipistrelle.settings import Given, Layer, from_flags
 from pipistrelle.verbs.options import (
@@ -72,6 +72,17 @@ def slam(
         Path | None,
         Parameter(metavar="FILE.toml", help="Settings as `pipistrelle config show` prints them."),
     ] = None,
+    truth: Annotated[
+        str | None,
+        Parameter(
+            metavar="TOPIC",
+            help="The topic of a ROS bag that tells where the vehicle truly was; sets bag.truth.",
+        ),
+    ] = None,
+    topics: Annotated[
+        bool,
+        Parameter(negative=(), help="List what is in a ROS bag, and what is taken for what; end."),
+    ] = False,
     settings: Annotated[SlamFlags | None, Parameter(name="*")] = None,
     output: Annotated[OutputOptions | None, Parameter(name="*")] = None,
 ) -> int:
@@ -79,13 +90,19 @@ def slam(
     short: Layer = {
         GATE_KEY: Given(gate, "--gate"),
         ("fastslam", "particles"): Given(particles, "--particles"),
+        ("bag", "truth"): Given(truth, "--truth"),
     }
+    beneath, flags = layers(config, None), from_flags(settings or {})
+    if topics:
+        from pipistrelle.verbs.bag_topics import list_topics
+
+        return list_topics(log, beneath | flags | short_names(short, flags))
     from pipistrelle.scripting.missions import prepare_slam
     from pipistrelle.verbs import delivery
 
     conduct, notes = prepare_slam(
         log,
-        (layers(config, None), from_flags(settings or {}), short),
+        (beneath, flags, short),
         robot,
         named_strategies(strategy),
         filters(estimator, particles),

@@ -150,13 +150,7 @@ def test_a_folder_that_is_not_there_is_refused(tmp_path):
     ("names", "what", "fix"),
     [
         (["walk.WAV"], "an audio recording, which is not read", "detect the echoes"),
-        (["walk.mcap"], "a ROS bag, which is not read", "pip install rosbags"),
-        (["walk.bag"], "a ROS bag, which is not read", "pip install rosbags"),
-        (
-            ["bag/metadata.yaml", "bag/walk_0.db3"],
-            "a ROS bag, which is not read",
-            "into a log fold",
-        ),
+        (["tape/walk.flac", "tape/notes.txt"], "an audio recording", "into a log fold"),
         (["walk.txt"], "a file", "check the path"),
     ],
 )
@@ -217,7 +211,10 @@ def test_the_truth_of_ones_own_format_may_say_how_the_log_begins(folder):
     assert (log.initial_pose, log.name) == ((1.0, 2.0, 3.0), "7")
     assert truth is NO_TRUTH
     refused(lambda: load(folder, **known), "found no robot", "(7)")
-    refused(lambda: load(folder / "gone", **known), "a tape or a log folder or a MRCLAM set;")
+    refused(
+        lambda: load(folder / "gone", **known),
+        "a tape or a log folder or a MRCLAM set or a ROS bag;",
+    )
 
 
 def test_a_robot_goes_by_its_name_where_its_format_has_names(folder):

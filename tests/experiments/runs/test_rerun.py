@@ -140,7 +140,7 @@ def test_a_log_that_is_gone_is_asked_for_and_may_be_elsewhere(folders):
     Path("log").rename("moved [1] away")
     said = refused("slam")
     assert said.startswith("slam/summary.json: log.path: found ")
-    assert "which is not there, expected the folder of the log that was solved; put it back" in said
+    assert "which is not there, expected the log that was solved; put it back" in said
     assert rerun(Path("slam"), log=Path("moved [1] away")).difference == ""
     assert "option --log: found nowhere, which is not there" in refused("slam", log=Path("nowhere"))
 

@@ -14,7 +14,13 @@ import numpy as np
 from jaxtyping import Int
 
 from pipistrelle.detection.logs.recording import Log, assemble
-from pipistrelle.detection.logs.text_tables import Table, check_unique, read_table, rows_kept
+from pipistrelle.detection.logs.text_tables import (
+    Table,
+    check_unique,
+    place_of,
+    read_table,
+    rows_kept,
+)
 from pipistrelle.refusals import refusal
 
 ROBOTS = range(1, 6)
@@ -65,7 +71,7 @@ def _seen_landmarks(folder: Path, robot: int) -> tuple[Table, dict[str, int]]:
     if unknown.mean() > _UNKNOWN_MAX:
         first = int(np.argmax(unknown))
         raise refusal(
-            f"{table.path}, line {table.line[first]}",
+            place_of(table, first),
             f"barcode {table.column['barcode'][first]}, and {unknown.sum()} unknown barcodes "
             f"in {len(unknown)} rows",
             f"at most {_UNKNOWN_MAX:.0%} that Barcodes.dat does not know",

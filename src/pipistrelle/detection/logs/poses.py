@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.config import FARTHEST
-from pipistrelle.detection.logs.text_tables import Table
+from pipistrelle.detection.logs.text_tables import Table, place_of
 from pipistrelle.geometry import wrap
 from pipistrelle.refusals import refusal
 
@@ -197,16 +197,16 @@ def _check_ways(odometry: Table, poses: Float[np.ndarray, "n 3"]) -> None:
     if far.size:
         row = int(far[0]) + 1
         before, after = odometry.column["heading"][row - 1 : row + 1].tolist()
-        where = f"{odometry.path}, line {odometry.line[row]}"
         expected = "at most a turn between two rows"
-        raise refusal(where, f"heading {after!r} after {before!r}", expected, "write radians")
+        found = f"heading {after!r} after {before!r}"
+        raise refusal(place_of(odometry, row), found, expected, "write radians")
     far = np.flatnonzero(np.hypot(*np.diff(poses[:, :2], axis=0).T) > FARTHEST)
     if far.size:
         row = int(far[0]) + 1
         before, after = poses[row - 1 : row + 1, :2].tolist()
         expected = f"at most {FARTHEST:g} m between two rows"
         fix = "write metres, or begin the log where the frame does"
-        raise refusal(_line(odometry, row), f"x, y {after} after {before}", expected, fix)
+        raise refusal(place_of(odometry, row), f"x, y {after} after {before}", expected, fix)
 
 
 def _covariances(odometry: Table) -> Float[np.ndarray, "n 3 3"]:
@@ -220,7 +220,7 @@ def _covariances(odometry: Table) -> Float[np.ndarray, "n 3 3"]:
         row = int(np.argmax(some))
         missing = ", ".join(np.array(MOTION_COVARIANCE)[lacks[row]])
         fix = "complete the row, or leave all six empty"
-        raise refusal(_line(odometry, row), f"no {missing}", "all of a covariance, or none", fix)
+        raise refusal(place_of(odometry, row), f"no {missing}", "all of a covariance, or none", fix)
     full = np.empty((len(values), 3, 3))
     full[:, *_FULL] = values
     full[:, *_FULL[::-1]] = values
@@ -244,12 +244,8 @@ def _definite(
         numbers = ", ".join(f"{x:g}" for x in covariance[found][_FULL])
         expected = "variances of 0 or more and correlations between -1 and 1"
         fix = f"correct {MOTION_COVARIANCE[0]} to {MOTION_COVARIANCE[-1]}, or write more digits"
-        raise refusal(_line(odometry, int(rows[found])), f"the covariance {numbers}", expected, fix)
+        where = place_of(odometry, int(rows[found]))
+        raise refusal(where, f"the covariance {numbers}", expected, fix)
     lifted = vector * np.maximum(value, 0.0)[:, None, :] @ np.swapaxes(vector, 1, 2) * unit
     low = value[:, 0] < 0.0
     return np.where(low[:, None, None], 0.5 * (lifted + np.swapaxes(lifted, 1, 2)), covariance)
-
-
-def _line(odometry: Table, row: int) -> str:
-    """Say where a row stands."""
-    return f"{odometry.path}, line {odometry.line[row]}"

@@ -15,13 +15,12 @@ if TYPE_CHECKING:
 
 
 _OTHERS = {
-    frozenset({".bag", ".db3", ".mcap"}): "a ROS bag, which is not read; write its odometry, and "
-    "bearings and ranges of its landmarks, into a log folder; `pip install rosbags` reads bags "
-    "without ROS",
     frozenset({".wav", ".flac", ".aif", ".aiff", ".ogg", ".mp3"}): "an audio recording, which is "
     "not read; detect the echoes in it, and write their bearings and ranges into a log folder",
 }
 """Recordings that have no reader, by the endings of their files."""
+BAGS = (".bag", ".mcap", ".db3")
+"""Endings of ROS bags: of ROS 1, and of ROS 2."""
 Robot = int | str
 """Whose log of several: by number or by name, as the format has it."""
 
@@ -36,7 +35,9 @@ class Reader:
     recognises: Callable[[Path], bool]
     """Tells by its files whether it holds such a log."""
     read: "Callable[..., Log]"
-    """Reads the folder, of one robot where it holds several, as a `Log`."""
+    """Reads the folder or file, of one robot where it holds several, as a `Log`."""
+    configured: bool = False
+    """Whether ``read`` is given the settings of the section ``bag``, after the path."""
     robots: Callable[[Path], Sequence[Robot]] | None = None
     """Lists the robots whose logs it holds, by number or by name: ``read`` is given one of
     these. Without it there is one, and it needs no name."""
@@ -68,8 +69,8 @@ def recording_of(path: Path) -> str | None:
     """Name the kind of a recording that no reader takes, and say what can be done with it.
 
 
-    >>> recording_of(Path("walk.mcap"))[:30], recording_of(Path("walk"))
-    ('a ROS bag, which is not read; ', None)
+    >>> recording_of(Path("walk.wav"))[:36], recording_of(Path("walk"))
+    ('an audio recording, which is not rea', None)
     """
     endings = {path.suffix.lower()}
     if path.is_dir():
@@ -82,6 +83,25 @@ def _read_log_folder(folder: Path) -> "Log":
     from pipistrelle.detection.logs.folder import read_log
 
     return read_log(folder)
+
+
+def _is_bag(path: Path) -> bool:
+    """Tell whether a path is named as a ROS bag, or is a folder of ROS 2."""
+    if not path.is_dir():
+        return path.suffix in BAGS
+    return (path / "metadata.yaml").exists() or bool(storages(path))
+
+
+def storages(folder: Path) -> list[Path]:
+    """List the files of a bag of ROS 2 in its folder."""
+    return sorted(path for path in folder.iterdir() if path.suffix in BAGS[1:])
+
+
+def _read_bag(path: Path, settings: Any, **framed: Any) -> "Log":
+    """Read a ROS bag."""
+    from pipistrelle.detection.logs.bag_log import read_bag
+
+    return read_bag(path, settings, **framed)
 
 
 def _is_mrclam(folder: Path) -> bool:
@@ -122,5 +142,14 @@ MRCLAM = Reader(
     robots=_mrclam_robots,
     files=("*.dat",),
 )
-READERS = (LOG_FOLDER, MRCLAM)
+ROS_BAG = Reader(
+    name="bag",
+    title="a ROS bag",
+    help="a ROS bag (.mcap, .db3, .bag, a folder of ROS 2)",
+    recognises=_is_bag,
+    read=_read_bag,
+    configured=True,
+    files=("metadata.yaml", "*.db3*", "*.mcap*"),
+)
+READERS = (LOG_FOLDER, MRCLAM, ROS_BAG)
 """All formats, in the order in which they are asked."""

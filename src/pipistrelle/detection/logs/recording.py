@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from pipistrelle.config import LONGEST_STEP
 from pipistrelle.detection.logs.poses import motions_between
-from pipistrelle.detection.logs.text_tables import Table, check_unique, rows_kept
+from pipistrelle.detection.logs.text_tables import Table, check_unique, place_of, rows_kept
 from pipistrelle.detection.scans import NO_CALLERS, OWN, UNLABELLED, Scan, make_scan
 from pipistrelle.geometry import wrap
 from pipistrelle.refusals import refusal
@@ -98,6 +98,8 @@ class Log:
     """Bearings beyond a whole turn, which are wrapped as any."""
     former_names: tuple[str, ...] = ()
     """Columns and keys that the log calls by former names (`text_tables.FORMER_NAMES`)."""
+    notes: tuple[str, ...] = ()
+    """What its reader chose or converted, for the user, a line each."""
 
 
 def assemble(
@@ -206,7 +208,7 @@ def check_seconds(table: Table, longest_gap: float = _MAX_GAP) -> None:
     raise refusal(table.path, found, "seconds", f"multiply them by {factor:g}")
 
 
-def _cut(path: Path, time: np.ndarray, span: tuple[float, float]) -> np.ndarray:
+def _cut(path: Path | str, time: np.ndarray, span: tuple[float, float]) -> np.ndarray:
     """Return the times (k + 1) of the rows within a span, its ends among them."""
     start, end = max(time[0], span[0]), min(time[-1], span[1])
     if start >= end:
@@ -226,11 +228,11 @@ def _single(odometry: Table, time: np.ndarray) -> np.ndarray:
         found = f"time {time[long[0] + 1].item()!r} after {time[long[0]].item()!r}"
         expected = f"rows at most {LONGEST_STEP:g} s apart"
         fix = "part the log there, or merge rows into steps by `step` in log.toml"
-        raise refusal(f"{odometry.path}, line {odometry.line[row]}", found, expected, fix)
+        raise refusal(place_of(odometry, row), found, expected, fix)
     return time
 
 
-def _merged(path: Path, time: np.ndarray, step: float) -> np.ndarray:
+def _merged(path: Path | str, time: np.ndarray, step: float) -> np.ndarray:
     """Return the times of the start and of the ends of steps of one length."""
     count = max(1.0, np.ceil((time[-1] - time[0] - _RESOLUTION) / step))
     if count > _MAX_STEPS:
@@ -281,7 +283,7 @@ def _of_callers(measurements: Table, callers: tuple[LogCaller, ...]) -> Table:
         ),
     ):
         if wrong.any():
-            where = f"{measurements.path}, line {measurements.line[int(np.argmax(wrong))]}"
+            where = place_of(measurements, int(np.argmax(wrong)))
             raise refusal(where, found, expected, fix)
     number = np.where(np.isnan(caller), OWN, caller).astype(np.int64)
     return replace(measurements, column=column | {CALLER: number})

@@ -44,9 +44,12 @@ FORMER_NAMES = MappingProxyType({"detour": "excess_path", "detour_std": "excess_
 class Table:
     """The checked rows of a text file: numbers are finite, and times never decrease."""
 
-    path: Path
+    path: Path | str
+    """The file; of a bag, with the topic."""
     line: Int[np.ndarray, " n"]
-    """Line of each row in the file, from 1."""
+    """Line of each row in the file, from 1; of a bag, its message in the topic."""
+    unit: str = "line"
+    """What `line` counts, in refusals."""
     column: dict[str, np.ndarray]
     """Values by column; labels are integers, what is missing is NaN."""
     former: tuple[str, ...] = ()
@@ -132,7 +135,7 @@ def read_table(
     table = Table(
         path=path, line=np.array([line for line, _ in content]), column=column, former=former
     )
-    _check_columns(table)
+    check_columns(table)
     return table
 
 
@@ -154,6 +157,11 @@ def _field(value: float | str) -> str:
     if isinstance(value, str):
         return value
     return "" if value != value else repr(value)
+
+
+def place_of(table: Table, row: int) -> str:
+    """Say where a row stands."""
+    return f"{table.path}, {table.unit} {table.line[row]}"
 
 
 def rows_kept(table: Table, kept: Bool[np.ndarray, " n"]) -> Table:
@@ -181,9 +189,9 @@ def check_unique(table: Table, *names: str, besides: str | None = None) -> None:
         pairs = np.column_stack((order[:-1], order[1:]))[same]
         earlier, later = pairs[np.argmin(pairs[:, 1])]
         values = (f"{name} {table.column[name][later].item()!r}" for name in names)
-        where = f"{table.path}, line {table.line[later]}"
-        expected = f"it once, as in line {table.line[earlier]}"
-        raise refusal(where, f"{', '.join(values)} again", expected, "remove one of the rows")
+        found, fix = f"{', '.join(values)} again", "remove one of the rows"
+        expected = f"it once, as in {table.unit} {table.line[earlier]}"
+        raise refusal(place_of(table, later), found, expected, fix)
 
 
 def _numbered(
@@ -243,7 +251,7 @@ def _read_row(
     return row
 
 
-def _check_columns(table: Table) -> None:
+def check_columns(table: Table) -> None:
     """Check times, labels and bounded columns; convert labels to integers."""
     for name, values in table.column.items():
         if name == "time":
@@ -264,7 +272,7 @@ def _check_columns(table: Table) -> None:
             promise = f"a number between -{LARGEST:g} and {LARGEST:g}"
         if wrong.any():
             row = int(np.argmax(wrong))
-            where = f"{table.path}, line {table.line[row]}"
+            where = place_of(table, row)
             found = f"{name} {_written(values[row].item())}"
             if name == "time":
                 found += f" after {values[row - 1].item()!r}"

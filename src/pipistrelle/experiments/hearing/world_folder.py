@@ -245,7 +245,7 @@ def _refuse_misspelt(folder: Path, there: Sequence[str]) -> None:
 def _own_settings(config: Config) -> dict[str, Any]:
     """Return the settings of a world that are not at their defaults."""
     decides = {"world", "landmarks", "steps", "vehicle"}
-    others = {"seed", *CALLERS, *SECTIONS}
+    others = {"seed", "bag", *CALLERS, *SECTIONS}
     said = config.model_dump(mode="json", exclude_defaults=True, exclude=others)
     return {
         section: kept

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipistrelle.config import Config, Strategy
+from pipistrelle.config import BagConfig, Config, Strategy
 from pipistrelle.detection.logs.readers import (
     READERS,
     Reader,
@@ -38,6 +38,7 @@ from pipistrelle.experiments.runs.validate_filters import check_filters
 from pipistrelle.own_files import LOG, OwnFiles
 from pipistrelle.refusals import refusal
 
+NO_BAG = BagConfig()
 KNOWN_STD = (1e-3, 1e-3)
 """Std of a caller's given position if the log states none [m]."""
 LEAST_STD = 1e-6
@@ -48,6 +49,7 @@ def load(
     folder: Path,
     robot: Robot | None = None,
     *,
+    bag: BagConfig = NO_BAG,
     readers: Sequence[Reader] = (),
     truths: Mapping[str, WithTruth] = {},
 ) -> tuple[Log, Truth]:
@@ -56,9 +58,12 @@ def load(
     Parameters
     ----------
     folder : Path
+        Or a file, where the format is one.
     robot : int or str
         Where the format holds the logs of several, as a MRCLAM set does, and only there: its
         number or its name.
+    bag : BagConfig
+        How a ROS bag is read.
     readers : sequence of Reader
         Of formats that the package does not know; they are asked before its own.
     truths : mapping of a reader's name to the function that reads its log with the truth
@@ -95,20 +100,26 @@ def load(
     """
     formats = (*readers, *READERS)
     titles = " or ".join(reader.title for reader in formats)
-    if not any(reader.recognises(folder) for reader in formats) and folder.exists():
+    reader = reader_of(folder, readers)
+    if not reader.recognises(folder) or not (folder.exists() or reader.configured):
+        _refuse_unknown(folder, titles)
+    whose = (*((bag,) if reader.configured else ()), *_whose(reader, folder, robot, formats))
+    with_truth = {**TRUTHS, **truths}.get(reader.name, with_files_beside)
+    return with_truth(reader.read, folder, *whose)
+
+
+def _refuse_unknown(folder: Path, titles: str) -> None:
+    """Refuse what no reader recognises, by what it is; a folder of nothing known passes."""
+    if folder.exists():
         what, _, fix = (recording_of(folder) or "").partition("; ")
         if what:
             raise refusal(folder, what, titles, f"{fix} (docs/log_format.md)")
     if not folder.is_dir():
         found = "a file" if folder.is_file() else "no such folder"
         raise refusal(folder, found, titles, "check the path")
-    reader = reader_of(folder, readers)
-    if not reader.recognises(folder) and (what := _of_ours(folder)):
+    if what := _of_ours(folder):
         fix = "name the log itself; `pipistrelle view` plays results, `report` is for studies"
         raise refusal(folder, f"{what} of Pipistrelle", titles, fix)
-    whose = _whose(reader, folder, robot, formats)
-    with_truth = {**TRUTHS, **truths}.get(reader.name, with_files_beside)
-    return with_truth(reader.read, folder, *whose)
 
 
 def _of_ours(folder: Path) -> str | None:

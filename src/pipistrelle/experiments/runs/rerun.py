@@ -80,7 +80,7 @@ def rerun(
             config, strategies, filters, world=world, progress=progress, watch=watch
         )
     else:
-        recorded, truth = load(_log_of(folder, summary, log), summary.log.robot)
+        recorded, truth = load(_log_of(folder, summary, log), summary.log.robot, bag=config.bag)
         beam, asked = summary.log.beamwidth_rad, (strategies, filters)
         mission = replay(recorded, truth, *asked, beam, config, progress=progress, watch=watch)
         mission = replace(mission, source=summary.log.model_dump())
@@ -113,6 +113,7 @@ def _sums(log: Path) -> dict[str, str]:
     """Return the SHA-256 of each file of a log and of its truth, by name."""
     patterns = (*reader_of(log).files, *truth_files.FILES)
     found = {path.name: path for pattern in patterns for path in log.glob(pattern)}
+    found |= {log.name: log} if log.is_file() else {}
     sums = {}
     for name, path in sorted(found.items()):
         if path.is_file():
@@ -144,12 +145,12 @@ def _log_of(folder: Path, summary: Summary, log: Path | None) -> Path:
     assert summary.log
     path = Path(summary.log.path) if log is None else log
     where = f"{folder / SUMMARY}: log.path" if log is None else f"{folder}, option --log"
-    if not path.is_dir():
+    if not path.exists():
         raise refusal(
             where,
             f"{path}, which is not there",
-            "the folder of the log that was solved",
-            "put it back, or say with --log DIR where it is",
+            "the log that was solved",
+            "put it back, or say with --log where it is",
         )
     then, now = summary.log.files, _sums(path)
     changed = [name for name in sorted({*then, *now}) if then.get(name) != now.get(name)]

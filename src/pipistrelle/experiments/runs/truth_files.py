@@ -6,6 +6,7 @@ and returns the log with its truth. So it may tell the reader what files that ho
 not say, when a drive began and where.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from os.path import lexists
@@ -14,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from pipistrelle.config import BagConfig
 from pipistrelle.detection.logs.readers import Robot
 from pipistrelle.detection.logs.recording import Log, check_seconds
 from pipistrelle.detection.logs.text_tables import check_unique, read_table, table_text
@@ -47,8 +49,29 @@ def with_mrclam_truth(read: Read, folder: Path, robot: int) -> tuple[Log, Truth]
     return replace(log, initial_pose=(x, y, heading)), truth
 
 
+def with_bag_truth(read: Read, path: Path, settings: BagConfig) -> tuple[Log, Truth]:
+    """Read a ROS bag, and the topic that tells the truth, where one is named; it starts there.
+
+    What was driven before the truth is known is left out.
+    """
+    from pipistrelle.detection.logs.bag_log import read_poses
+
+    if (known := read_poses(path, settings)) is None:
+        log = read(path, settings)
+        return log, Truth(time=log.time)
+    time, path_there = known
+    log = read(path, settings, span=(time[0].item(), math.inf))
+    there = poses_at(log.time, time, path_there)
+    if np.isnan(there).all():
+        expected = f"poses between the log's times {log.time[0]!r} and {log.time[-1]!r}"
+        where = f"{path}, topic {settings.truth}"
+        raise refusal(where, "none", expected, "name another topic, or --bag.stamps received")
+    x, y, heading = there[0].tolist()
+    return replace(log, initial_pose=(x, y, heading)), Truth(time=log.time, path=there)
+
+
 WithTruth = Callable[..., tuple[Log, Truth]]
-TRUTHS: Mapping[str, WithTruth] = {"mrclam": with_mrclam_truth}
+TRUTHS: Mapping[str, WithTruth] = {"mrclam": with_mrclam_truth, "bag": with_bag_truth}
 """Functions that read the truth, by the reader's name; others use files beside the log."""
 
 

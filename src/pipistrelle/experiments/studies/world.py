@@ -219,7 +219,7 @@ def _calibration_columns(plan: Plan) -> tuple[str, ...]:
 
 def heard_settings(config: Config) -> str:
     """Return as text all settings on which a world and its recording depend."""
-    settings = config.model_dump(mode="json", exclude=set(SECTIONS))
+    settings = config.model_dump(mode="json", exclude={*SECTIONS, "bag"})
     section, radius = RADIUS_KEY
     del settings[section][radius]
     settings["assumed"] = config.assumed_sound_speed  # the rest is the filters' alone

@@ -1,0 +1,223 @@
+"""ROS bags, opened without ROS: which topics they hold, and the messages of some.
+
+ROS 1 files (.bag) and those of ROS 2 (.mcap, .db3, and their folders) are read by the package
+rosbags, of the extra ``ros``. A type is read as the bag defines it, else as rosbags or
+`DEFINITIONS` do. What parses somebody's bytes may fail in any way, and each is refused with the
+file and topic.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from pipistrelle.config import InputError
+from pipistrelle.detection.logs.bag_messages import DEFINITIONS
+from pipistrelle.detection.logs.readers import storages
+from pipistrelle.files import check_ordinary
+from pipistrelle.refusals import meant, refusal, shown
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+
+_IDL = "=" * 80 + "\n"
+"""What parts the files of a definition in IDL, each under a line with its name."""
+
+
+class Message(NamedTuple):
+    """A message of a bag."""
+
+    topic: str
+    number: int
+    """Its place in the topic, from 1 on."""
+    received: float
+    """When it was received, or written [s]."""
+    content: Any
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Topic:
+    """A topic of a bag."""
+
+    name: str
+    type: str
+    """The name of its messages' type, with ``/msg/``; of several types, all of them."""
+    count: int
+    """How many messages it has."""
+    span: tuple[float, float] | None = None
+    """When the first and the last were received [s], where that was looked at."""
+
+
+class Bag:
+    """A bag that is open."""
+
+    def __init__(self, path: Path, reader: Any) -> None:
+        self.path = path
+        self._reader = reader
+        self._by_topic: dict[str, list[Connection]] = {}
+        for connection in reader.connections:
+            self._by_topic.setdefault(connection.topic, []).append(connection)
+
+    @property
+    def topics(self) -> dict[str, Topic]:
+        """The topics, by name."""
+        return {
+            name: Topic(
+                name=name,
+                type=", ".join(sorted({one.msgtype for one in known})),
+                count=sum(one.msgcount for one in known),
+            )
+            for name, known in sorted(self._by_topic.items())
+        }
+
+    def seen(self) -> list[Topic]:
+        """List the topics with what is in the bag of each, all messages passed once."""
+        found: dict[str, tuple[int, int, int]] = {}
+        with faults_named(str(self.path)):
+            for connection, stamp, _ in self._reader.messages():
+                count, first, last = found.get(connection.topic, (0, stamp, stamp))
+                found[connection.topic] = (count + 1, min(first, stamp), max(last, stamp))
+        self._check_whole({name: found.get(name, (0,))[0] for name in self._by_topic})
+        return [
+            Topic(name=name, type=topic.type, count=count, span=(first / 1e9, last / 1e9))
+            for name, topic in self.topics.items()
+            for count, first, last in (found.get(name, (0, 0, 0)),)
+        ]
+
+    def messages(self, names: Iterable[str]) -> Iterator[Message]:
+        """Read the messages of some topics as they were received, one at a time."""
+        wanted = [one for name in names for one in self._by_topic.get(name, ())]
+        if not wanted:
+            return
+        decoders = {}
+        for one in wanted:
+            with faults_named(f"{self.path}, topic {one.topic}"):
+                decoders[one.topic, one.msgtype] = _decoder(one)
+        count = dict.fromkeys((one.topic for one in wanted), 0)
+        raw = iter(self._reader.messages(connections=wanted))
+        while True:
+            with faults_named(str(self.path)):
+                item = next(raw, None)
+            if item is None:
+                return self._check_whole(count)
+            connection, stamp, data = item
+            topic = connection.topic
+            count[topic] += 1
+            with faults_named(f"{self.path}, topic {topic}, message {count[topic]}"):
+                content = decoders[topic, connection.msgtype](data)
+            yield Message(topic, count[topic], stamp / 1e9, content)
+
+    def _check_whole(self, count: dict[str, int]) -> None:
+        """Refuse a bag in which fewer messages were found than it says.
+
+        rosbags passes over those whose topic a folder's metadata and files describe in unlike ways.
+        """
+        for name, found in count.items():
+            said = sum(one.msgcount for one in self._by_topic[name])
+            if found < said:
+                fix = "name its file (.mcap, .db3) in place of the folder, or mend it"
+                where = f"{self.path}, topic {name}"
+                raise refusal(where, f"{found} messages", f"the {said} that the bag counts", fix)
+
+    def checked(self, name: str, types: Iterable[str], option: str) -> str:
+        """Return a topic that an option names; refuse one that is not there or of no use."""
+        topics, where = self.topics, f"{self.path}, option {option}"
+        if name not in topics:
+            near = meant(name, topics)
+            fix = f"did you mean {near}?" if near else "--topics lists them"
+            raise refusal(where, f"no topic {shown(name)}", "one of the bag's", fix)
+        if topics[name].type not in types:
+            found = f"{name} of the type {topics[name].type}"
+            raise refusal(where, found, " or ".join(types), "name another; --topics lists them")
+        return name
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Bag]:
+    """Open a bag, or refuse what is none.
+
+    >>> with opened(Path("nowhere.mcap")):
+    ...     pass
+    Traceback (most recent call last):
+    pipistrelle.config.InputError: nowhere.mcap: found no such file, expected a ROS bag; check the
+    path
+    """
+    whole = _storage(path)
+    try:
+        from rosbags.rosbag1 import Reader as Reader1
+        from rosbags.rosbag2 import Reader as Reader2
+    except ImportError:
+        raise InputError(
+            f"{path}: needs rosbags, which is not installed; "
+            "python -m pip install 'pipistrelle[ros]' installs it"
+        ) from None
+    kind: Any = Reader1 if whole.suffix == ".bag" and whole.is_file() else Reader2
+    with ExitStack() as stack:
+        with faults_named(str(path)):
+            bag = Bag(path, stack.enter_context(kind(whole)))
+        yield bag
+
+
+def _storage(path: Path) -> Path:
+    """Return what is to be opened: the path, or the only file of a folder without metadata."""
+    if not path.exists():
+        found = "a link to no file" if path.is_symlink() else "no such file"
+        raise refusal(path, found, "a ROS bag", "check the path")
+    if not path.is_dir():
+        check_ordinary(path)
+        return path
+    inside = storages(path)
+    for one in (path / "metadata.yaml", *inside):
+        check_ordinary(one)
+    if (path / "metadata.yaml").exists():
+        return path
+    if len(inside) > 1:
+        fix = "make it with `ros2 bag reindex`, or name one of the files"
+        raise refusal(path, f"{len(inside)} files without metadata.yaml", "metadata.yaml", fix)
+    return inside[0]
+
+
+@contextmanager
+def faults_named(where: str) -> Iterator[None]:
+    """Refuse whatever fails in here, which reads what somebody else wrote, and say where."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    except MemoryError:
+        raise refusal(where, "more than there is memory for", "a sound bag", _MEND) from None
+    except Exception as error:
+        words = " ".join(str(error).split()) or "nothing said"
+        found = f"bytes that cannot be read ({type(error).__name__}: {words[:160]})"
+        raise refusal(where, found, "a sound bag", _MEND) from None
+
+
+_MEND = "mend it (`ros2 bag reindex`, `mcap recover`, `rosbag reindex`), or record it anew"
+
+
+def _decoder(connection: "Connection") -> Callable[[bytes], Any]:
+    """Return what reads the messages of a connection, by the bag's own definition if it has one."""
+    from rosbags.interfaces import ConnectionExtRosbag1, MessageDefinitionFormat
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+    first, name, told = isinstance(connection.ext, ConnectionExtRosbag1), connection.msgtype, {}
+    text = connection.msgdef.data
+    if text.strip() and connection.msgdef.format == MessageDefinitionFormat.MSG:
+        told = get_types_from_msg(text, name)
+    elif text.strip() and connection.msgdef.format == MessageDefinitionFormat.IDL:
+        parts = [part.partition("\n")[2] for part in text.split(_IDL) if part.startswith("IDL: ")]
+        for part in parts or [text]:
+            told |= get_types_from_idl(part)
+    if told:
+        store = get_typestore(Stores.EMPTY)
+        store.register(told)
+    else:
+        store = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
+        for known, fields in DEFINITIONS.items():
+            store.register(get_types_from_msg(fields, known))
+    form = getattr(connection.ext, "serialization_format", "cdr")
+    if form != "cdr":
+        raise InputError(f"found messages as {form}, expected CDR; convert the bag")
+    read = store.deserialize_ros1 if first else store.deserialize_cdr
+    return lambda data: read(data, name)

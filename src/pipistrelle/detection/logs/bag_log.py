@@ -1,0 +1,294 @@
+"""A log of a ROS bag: rows of odometry and of echoes, made of its messages.
+
+Memory holds the rows, never the bag: messages of the chosen topics are read one at a time. What was
+chosen and what was converted is told in the log's `notes`.
+"""
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.config import BagConfig
+from pipistrelle.detection.logs.bag import Message, faults_named, opened
+from pipistrelle.detection.logs.bag_frames import TRANSFORMS, Frames, along_axis, bare, planar
+from pipistrelle.detection.logs.bag_messages import ANGLES, CONES, ECHOES, POSES, Echoes, Pose
+from pipistrelle.detection.logs.bag_topics import echoes_of, odometry_of, truth_of
+from pipistrelle.detection.logs.poses import MOTION_COVARIANCE, POSE
+from pipistrelle.detection.logs.recording import Log, assemble
+from pipistrelle.detection.logs.text_tables import Table, check_columns, place_of
+from pipistrelle.refusals import refusal
+
+_TWIST = ("velocity", "angular_rate")
+_UPPER = (0, 1, 5, 7, 11, 35)
+"""Where x, y and the turn about z stand in a covariance of six, its upper triangle row by row."""
+_UNKNOWN = 100.0
+"""Variance of a velocity from which on nothing is known of it [m^2/s^2], [rad^2/s^2]."""
+_STEEP = 0.1
+"""Least level part of an echo's direction that has a bearing."""
+_LATE = 1e-3
+"""A difference between clocks that is told [s]."""
+
+
+@dataclass(slots=True)
+class _Heard:
+    """The echoes of a topic, message by message."""
+
+    type: str
+    time: list[float] = field(default_factory=list)
+    """Those of the messages [s]."""
+    lag: list[float] = field(default_factory=list)
+    """How much later each was received [s]."""
+    number: list[int] = field(default_factory=list)
+    frame: list[str] = field(default_factory=list)
+    echoes: list[Echoes] = field(default_factory=list)
+
+    def add(self, message: Message, settings: BagConfig) -> None:
+        content = message.content
+        time = _time(message, settings)
+        with np.errstate(all="ignore"):  # what is no number is left out, or refused
+            echoes = ECHOES[self.type](content, settings.speed_of_sound)
+        self.time.append(time)
+        self.lag.append(message.received - time)
+        self.number.append(message.number)
+        self.frame.append(bare(content.header.frame_id))
+        self.echoes.append(echoes)
+
+
+def read_bag(
+    path: Path, settings: BagConfig, span: tuple[float, float] = (-math.inf, math.inf)
+) -> Log:
+    """Read what a vehicle drove and heard; it starts at the first pose of its odometry.
+
+    `span` [s]: the log is cut to it.
+    """
+    frames, driven, lags, base = Frames(), [], [], ""
+    with opened(path) as bag:
+        odometry = odometry_of(bag, settings)
+        heard = {name: _Heard(bag.topics[name].type) for name in echoes_of(bag, settings)}
+        for message in bag.messages(dict.fromkeys([odometry, TRANSFORMS, *heard])):
+            with faults_named(f"{path}, topic {message.topic}, message {message.number}"):
+                if message.topic == odometry:
+                    driven.append((message.number, *_driven(message, settings)))
+                    lags.append(message.received - driven[-1][1])
+                    base = base or bare(message.content.child_frame_id)
+                elif message.topic in heard:
+                    heard[message.topic].add(message, settings)
+                else:
+                    frames.add(message.content)
+    table, notes = _odometry(path, odometry, driven, settings)
+    notes += _clock(odometry, lags, settings)
+    measured, ignored = [], Counter[str]()
+    for topic, rows in heard.items():
+        mounts = _mounts(path, topic, rows, frames, base, settings)
+        measured.append(_measured(f"{path}, topic {topic}", rows, mounts, ignored))
+        notes += [*_clock(topic, rows.lag, settings), *_converted(topic, rows, mounts, base)]
+    twist = settings.motion == "twist"
+    noise = ("velocity", "angular_rate") if twist else ("forward", "sideways", "turn")
+    return assemble(
+        table,
+        _merged(f"{path}, topic {', '.join(heard)}", measured),
+        step=settings.step or None,
+        span=span,
+        ignored_rows=dict(ignored),
+        name=path.resolve().stem,
+        motion="unicycle" if twist else "poses",
+        control_std=tuple(getattr(settings, f"{name}_std") for name in noise),
+        initial_pose=tuple(driven[0][2:5]),
+        initial_pose_std=settings.initial_pose_std,
+        range_std=settings.range_std,
+        bearing_std=settings.bearing_std,
+        range_bounds=settings.range_bounds,
+        notes=tuple(notes),
+    )
+
+
+def read_poses(
+    path: Path, settings: BagConfig
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]] | None:
+    """Read times [s] and poses [m, m, rad] of the truth, the heading unwrapped; None without one.
+
+    Of two poses of one time the later wins.
+    """
+    rows = []
+    with opened(path) as bag:
+        if (topic := truth_of(bag, settings)) is None:
+            return None
+        pose = POSES[bag.topics[topic].type]
+        for message in bag.messages([topic]):
+            with faults_named(f"{path}, topic {topic}, message {message.number}"):
+                rows.append((message.number, _time(message, settings), *pose(message.content)))
+    column = _table(f"{path}, topic {topic}", ("time", *POSE), rows).column
+    last = np.append(np.diff(column["time"]) > 0.0, True)
+    heading = np.unwrap(column["heading"][last])
+    return column["time"][last], np.column_stack([column["x"][last], column["y"][last], heading])
+
+
+def _time(message: Message, settings: BagConfig) -> float:
+    """Return the time of a message [s]."""
+    if settings.stamps == "received":
+        return message.received
+    stamp = message.content.header.stamp
+    return stamp.sec + stamp.nanosec / 1e9
+
+
+def _driven(message: Message, settings: BagConfig) -> tuple[float, ...]:
+    """Return time, pose, velocities ahead and to the left, angular rate and their covariance."""
+    content = message.content
+    twist = content.twist.twist
+    stated = np.asarray(content.twist.covariance, dtype=float)[list(_UPPER)]
+    known = stated[0] > 0.0 and stated[5] > 0.0 and (np.abs(stated) < _UNKNOWN).all()
+    pose = POSES["nav_msgs/msg/Odometry"](content)
+    velocity = twist.linear.x, twist.linear.y, twist.angular.z
+    said = stated.tolist() if known and settings.covariances else [math.nan] * len(_UPPER)
+    return _time(message, settings), *pose, *velocity, *said
+
+
+def _table(where: str, columns: tuple[str, ...], rows: list[Any], stated: int = 0) -> Table:
+    """Return rows as a table, a message's number before each; the last columns may be empty."""
+    if not rows:
+        raise refusal(where, "no messages", "some", "name another topic; --topics lists them")
+    number, *values = np.array(rows, dtype=float).T
+    column = dict(zip(columns, values, strict=True))
+    table = Table(path=where, line=number.astype(np.int64), unit="message", column=column)
+    for name in columns[: len(columns) - stated]:
+        if (wrong := ~np.isfinite(column[name])).any():
+            row = int(np.argmax(wrong))
+            found = f"{name} {column[name][row]:g}"
+            raise refusal(place_of(table, row), found, "a finite number", "leave the message out")
+    check_columns(table)
+    return table
+
+
+def _odometry(
+    path: Path, topic: str, rows: list[Any], settings: BagConfig
+) -> tuple[Table, list[str]]:
+    """Return the table of the odometry, and what is told of it."""
+    where, steps = f"{path}, topic {topic}", f"in steps of {settings.step:g} s"
+    steps = steps if settings.step else "each a step"
+    names = ("time", *POSE, "velocity", "sideways", "angular_rate", *MOTION_COVARIANCE)
+    table = _table(where, names, rows, stated=len(MOTION_COVARIANCE))
+    column = table.column
+    if settings.motion == "twist":
+        aside = float(np.abs(column["sideways"]).max())
+        notes = [f"{topic} is the odometry, its velocities as controls {steps}"]
+        if aside > 0.0:
+            notes.append(f"{topic}: velocities to the side, up to {aside:.3g} m/s, are left out")
+        used: tuple[str, ...] = ("time", *_TWIST)
+    else:
+        lasted = np.diff(column["time"], prepend=column["time"][0])
+        for name in MOTION_COVARIANCE:
+            column[name] = column[name] * lasted**2
+        known = int(np.isfinite(column[MOTION_COVARIANCE[0]]).sum())
+        sure = f", {known} of {len(lasted)} as sure as its twist says" * bool(known)
+        notes = [f"{topic} is the odometry, the ways between its poses {steps}{sure}"]
+        used = ("time", *POSE, *MOTION_COVARIANCE)
+    kept = {name: column[name] for name in used}
+    return Table(path=where, line=table.line, unit="message", column=kept), notes
+
+
+def _mounts(
+    path: Path, topic: str, rows: _Heard, frames: Frames, base: str, settings: BagConfig
+) -> dict[str, Pose]:
+    """Return where the sensor is on the vehicle, by the frames of a topic's messages."""
+    found: dict[str, Pose] = {}
+    for frame, echoes in zip(rows.frame, rows.echoes, strict=True):
+        if frame in found:
+            continue
+        pose = echoes.mount
+        if settings.sensor_pose is not None:
+            pose = planar(*settings.sensor_pose)
+        elif pose is None and frame in ("", base):
+            pose = planar(0.0, 0.0, 0.0)
+        elif pose is None:
+            pose = frames.pose(frame, base)
+        if pose is None:
+            what = f"the frame {frame!r}, which {TRANSFORMS} does not tie to {base!r}"
+            fix = "say it: --bag.sensor-pose X Y HEADING [m, m, rad]"
+            raise refusal(f"{path}, topic {topic}", what, "where it is on the vehicle", fix)
+        found[frame] = pose
+    return found
+
+
+def _measured(where: str, rows: _Heard, mounts: dict[str, Pose], ignored: Counter[str]) -> Table:
+    """Return the echoes of a topic as bearings and ranges from the vehicle.
+
+    `ignored`: what is left out is counted in it, by reason.
+    """
+    check_columns(
+        Table(
+            path=where,
+            line=np.array(rows.number, dtype=np.int64),
+            unit="message",
+            column={"time": np.array(rows.time)},
+        )
+    )
+    parts = []
+    for time, number, frame, echoes in zip(
+        rows.time, rows.number, rows.frame, rows.echoes, strict=True
+    ):
+        mount, point = mounts[frame], echoes.point
+        ways = (along_axis(point, mount) if rows.type == ANGLES else point) @ mount[0].T
+        flat = np.hypot(*ways[:, :2].T) >= _STEEP * np.linalg.norm(ways, axis=1)
+        x, y, _ = (ways[flat] + mount[1]).T
+        ignored.update(echoes.ignored, steep=int((~flat).sum()))
+        stated = echoes.bearing_std[flat], echoes.range_std[flat]
+        label = echoes.landmark[flat].astype(float)
+        at = [np.full(x.size, number), time + echoes.delay[flat], label]
+        parts.append(np.column_stack([*at, np.arctan2(y, x), np.hypot(x, y), *stated]))
+    names = ("time", "landmark", "bearing", "range", "bearing_std", "range_std")
+    number, *values = np.vstack([np.empty((0, 7)), *parts]).T
+    column = dict(zip(names, values, strict=True))
+    stamp = column.pop("time")
+    table = Table(path=where, line=number.astype(np.int64), unit="message", column=column)
+    if stamp.size:
+        check_columns(table)
+    table.column["time"] = stamp
+    return table
+
+
+def _merged(where: str, parts: list[Table]) -> Table:
+    """Return the rows of all topics in order of time."""
+    names = parts[0].column
+    column = {name: np.concatenate([part.column[name] for part in parts]) for name in names}
+    order = np.argsort(column["time"], kind="stable")
+    line = np.concatenate([part.line for part in parts])[order]
+    column = {name: values[order] for name, values in column.items()}
+    if not line.size:
+        raise refusal(where, "no echo to use", "some", "--topics lists what there is")
+    return Table(path=where, line=line, unit="message", column=column)
+
+
+def _clock(topic: str, lags: list[float], settings: BagConfig) -> list[str]:
+    """Tell by how much headers and reception differ."""
+    if settings.stamps == "received":
+        return [f"{topic}: times are those at which messages were received"]
+    late = float(np.median(lags)) if lags else 0.0
+    when = "after" if late > 0.0 else "before"
+    told = f"{topic}: times are of headers; messages were received {abs(late):.3g} s {when} them"
+    return [told] if abs(late) > _LATE else []
+
+
+def _converted(topic: str, rows: _Heard, mounts: dict[str, Pose], base: str) -> list[str]:
+    """Tell what was converted in the echoes of a topic."""
+    notes = []
+    if rows.type == ANGLES:
+        notes.append(f"{topic}: its angles are positive to starboard, bearings to the left")
+    delay = max((float(echoes.delay.max(initial=0.0)) for echoes in rows.echoes), default=0.0)
+    if delay > 0.0:
+        notes.append(f"{topic}: beams are timed by their delays, up to {delay:.3g} s")
+    if rows.type == CONES:
+        notes.append(f"{topic}: a cone is a bearing, anywhere in its width (std width / sqrt 12)")
+    for frame, (turned, place) in mounts.items():
+        if np.any(place) or not np.array_equal(turned, np.eye(3)):
+            x, y, z = place
+            toward = math.atan2(turned[1, 0], turned[0, 0])
+            notes.append(
+                f"{topic}: {frame or 'its sensor'} is at ({x:.3g}, {y:.3g}, {z:.3g}) m and "
+                f"{toward:.3g} rad on {base or 'the vehicle'}"
+            )
+    return notes

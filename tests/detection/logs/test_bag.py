@@ -1,0 +1,430 @@
+"""ROS bags: each message type, frames, clocks, and what is no bag; written by rosbags."""
+
+import math
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipistrelle.config import BagConfig, Config, InputError
+from pipistrelle.detection.logs.folder import read_log
+from pipistrelle.detection.logs.poses import poses_along
+from pipistrelle.detection.scans import rows_of
+from pipistrelle.experiments.drives import Truth
+from pipistrelle.experiments.runs.replay import load, replay
+from reference.bags import (
+    DETECTIONS,
+    LABELLED,
+    ODOMETRY,
+    RANGE,
+    RANGES,
+    TRANSFORMS,
+    header,
+    labelled,
+    odometry,
+    of_log,
+    quaternion,
+    static,
+    write_bag,
+)
+
+DATA = Path(__file__).parents[2] / "data"
+POST = np.array([4.0, 3.0])
+"""Where a post stands."""
+PLAIN = BagConfig()
+KINDS = ("walk.mcap", "walk.db3", "walk.bag", "walk")
+
+
+def drive(count=5):
+    """Tell a drive straight ahead along x, 1 m/s, ten poses a second."""
+    return [
+        ("/odom", ODOMETRY, 0.1 * i, odometry(0.1 * i, 0.1 * i, 0.0, 0.0, 1.0))
+        for i in range(count)
+    ]
+
+
+def pinged(time=0.2, frame="base_link", **told):
+    """Tell what a ping of a sonar begins with."""
+    return {"header": header(time, frame)} | told
+
+
+def read(path, *messages, count=5, **settings):
+    """Write a bag of a drive and these messages, and read it."""
+    told = sorted([*drive(count), *messages], key=lambda one: one[2])
+    return load(write_bag(path, told), bag=BagConfig(step=0.0, **settings))[0]
+
+
+def only(log):
+    """Return the only row of a log."""
+    (scan,) = log.scans
+    assert scan.landmark.size == 1
+    return scan
+
+
+def refused(path, *parts, bag=PLAIN):
+    """Check that a bag is refused in words that hold these."""
+    with pytest.raises(InputError) as error:
+        load(Path(path), bag=bag)
+    for part in (str(path), *parts):
+        assert part in str(error.value)
+
+
+# A saved log again
+
+
+@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("kind", ["unicycle", "poses"])
+def test_a_log_written_as_a_bag_is_solved_as_the_log_is(tmp_path, kind, name):
+    log = read_log(DATA / f"{kind}_log")
+    scans = [rows_of(scan, np.isfinite(scan.range)) for scan in log.scans]
+    log = replace(log, scans=tuple(scan for scan in scans if scan.landmark.size), gate=None)
+    log = replace(log, controls=log.controls[:, :3], noise_at_rest=True, initial_pose=(0.0,) * 3)
+    poses = poses_along(log.controls) if kind == "poses" else None
+    assert len(log.scans) > 3
+    stds = dict(zip(STDS[kind], log.control_std, strict=True)) | {
+        name: getattr(log, name)
+        for name in ("initial_pose_std", "range_std", "bearing_std", "range_bounds")
+    }
+    bag = BagConfig(step=0.0, motion="twist" if poses is None else "poses", **stds)
+    again = load(write_bag(tmp_path / name, of_log(log, poses=poses)), bag=bag)[0]
+    tracks = [
+        replay(one, Truth(time=one.time), ["fused"], ["smoother"], None, Config()).trials[0].track
+        for one in (log, again)
+    ]
+    np.testing.assert_allclose(tracks[1].time, tracks[0].time, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(tracks[1].pose.mean, tracks[0].pose.mean, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        tracks[1].landmarks.mean, tracks[0].landmarks.mean, rtol=0, atol=1e-9
+    )
+
+
+STDS = {
+    "unicycle": ("velocity_std", "angular_rate_std"),
+    "poses": ("forward_std", "sideways_std", "turn_std"),
+}
+
+
+# Echoes
+
+
+@pytest.mark.parametrize("definitions", [True, False])
+def test_detections_are_travel_times_by_angles_to_starboard(tmp_path, definitions):
+    told = pinged(
+        ping_info={"sound_speed": 1500.0, "rx_beamwidths": [0.12]},
+        flags=[{"flag": 0}, {"flag": 1}, {"flag": 0}],
+        two_way_travel_times=[0.01, 0.01, math.nan],
+        tx_delays=[0.05, 0.0, 0.0],
+        rx_angles=[0.3, 0.1, 0.2],
+    )
+    path = tmp_path / "walk.mcap"
+    messages = [*drive(), ("/sonar", DETECTIONS, 0.2, told)]
+    messages.sort(key=lambda one: one[2])
+    log = load(
+        write_bag(path, messages, definitions=definitions),
+        bag=BagConfig(step=0.0),
+    )[0]
+    row = only(log)
+    assert row.bearing[0] == pytest.approx(-0.3, abs=1e-6)
+    assert row.range[0] == pytest.approx(7.5, rel=1e-6)
+    assert row.bearing_std[0] == pytest.approx(0.12 / math.sqrt(12.0), rel=1e-6)
+    assert row.time == pytest.approx(0.3)  # sent at 0.25 s, in the step that ends at 0.3 s
+    assert log.ignored_rows == {"flagged": 1, "nothing_heard": 1}
+    assert any("starboard" in note for note in log.notes)
+    assert any("delays, up to 0.05 s" in note for note in log.notes)
+
+
+def test_a_travel_time_needs_a_speed_of_sound(tmp_path):
+    told = pinged(two_way_travel_times=[0.02], rx_angles=[0.0])
+    log = read(tmp_path / "one.mcap", ("/sonar", DETECTIONS, 0.2, told), speed_of_sound=340.0)
+    assert only(log).range[0] == pytest.approx(3.4, rel=1e-6)
+    refused(tmp_path / "one.mcap", "topic /sonar, message 1", "--bag.speed-of-sound")
+
+
+def test_ranges_lie_along_their_unit_vectors(tmp_path):
+    vectors = [{"x": 0.6, "y": 0.8}, {"x": 0.48, "y": 0.64, "z": 0.6}, {"z": 1.0}]
+    told = pinged(beam_unit_vec=vectors, ranges=[5.0, 5.0, 3.0])
+    log = read(tmp_path / "one.db3", ("/beams", RANGES, 0.2, told))
+    (scan,) = log.scans
+    np.testing.assert_allclose(scan.range, [5.0, 4.0], rtol=1e-6)
+    np.testing.assert_allclose(scan.bearing, math.atan2(0.8, 0.6), rtol=1e-6)
+    assert np.isnan(scan.range_std).all()
+    assert log.ignored_rows == {"steep": 1}
+
+
+@pytest.mark.parametrize("name", KINDS[:3])
+def test_a_cone_is_a_bearing_anywhere_in_its_width(tmp_path, name):
+    cone = {"field_of_view": 0.26, "min_range": 0.1, "max_range": 6.0}
+    messages = [
+        ("/front", RANGE, 0.1 * i, pinged(0.1 * i, "front", **cone, range=far))
+        for i, far in enumerate([2.5, math.inf, math.nan, 7.0, 0.05])
+    ]
+    tie = ("/tf_static", TRANSFORMS, 0.0, static("base_link", "front", 0.3, 0.2, math.pi / 2.0))
+    log = read(tmp_path / name, *messages, tie)
+    row = only(log)
+    assert row.bearing[0] == pytest.approx(math.atan2(2.7, 0.3), abs=1e-6)
+    assert row.range[0] == pytest.approx(math.hypot(2.7, 0.3), rel=1e-6)
+    assert row.bearing_std[0] == pytest.approx(0.26 / math.sqrt(12.0), rel=1e-6)
+    assert log.ignored_rows == {"nothing_heard": 4}
+
+
+def test_ranges_and_bearings_keep_labels_and_deviations_and_are_of_where_the_sensor_is(tmp_path):
+    told = labelled(0.2, [(7, 0.5, 3.0), (-1, 0.1, 2.0)], at=(0.2, 0.0, 0.1), stds=(0.05, 0.01))
+    row = only(read(tmp_path / "one.bag", ("/seen", LABELLED, 0.2, told)))
+    x, y = 0.2 + 3.0 * math.cos(0.6), 3.0 * math.sin(0.6)
+    assert row.landmark[0] == 7
+    assert row.bearing[0] == pytest.approx(math.atan2(y, x), abs=1e-12)
+    assert row.range[0] == pytest.approx(math.hypot(x, y), abs=1e-12)
+    assert (row.range_std[0], row.bearing_std[0]) == (0.05, 0.01)
+
+
+def test_the_sensor_sees_the_same_post_wherever_it_is_mounted(tmp_path):
+    def seen(name, at, **more):
+        x, y, heading = at
+        far = POST - [0.2 + x, y]
+        yaw = math.atan2(far[1], far[0]) - heading
+        told = pinged(
+            0.2, "sonar", beam_unit_vec=[{"x": math.cos(yaw), "y": math.sin(yaw)}],
+            ranges=[float(np.hypot(*far))],
+        )  # fmt: skip
+        return read(tmp_path / name, ("/beams", RANGES, 0.2, told), **more)
+
+    there = (0.4, -0.3, 1.2)
+    row = only(seen("set.mcap", there, sensor_pose=there))
+    want = POST - [0.2, 0.0]
+    assert row.bearing[0] == pytest.approx(math.atan2(want[1], want[0]), abs=1e-6)
+    assert row.range[0] == pytest.approx(np.hypot(*want), rel=1e-6)
+    refused(tmp_path / "set.mcap", "topic /beams", "'sonar'", "'base_link'", "--bag.sensor-pose")
+
+
+def test_transforms_are_followed_from_frame_to_frame_either_way(tmp_path):
+    told = pinged(0.2, "/sonar", beam_unit_vec=[{"x": 1.0}], ranges=[2.0])
+    ties = [
+        ("/tf_static", TRANSFORMS, 0.0, static("mast", "base_link", -0.5, 0.0)),
+        ("/tf_static", TRANSFORMS, 0.01, static("mast", "sonar", 0.0, 0.25)),
+    ]
+    row = only(read(tmp_path / "one.mcap", ("/beams", RANGES, 0.2, told), *ties))
+    assert row.range[0] == pytest.approx(math.hypot(2.5, 0.25), rel=1e-6)
+    assert row.bearing[0] == pytest.approx(math.atan2(0.25, 2.5), abs=1e-6)
+
+
+@pytest.mark.parametrize("profiling", [True, False])
+def test_angles_are_about_the_axis_of_either_convention(tmp_path, profiling):
+    # x up, y to starboard, z ahead, or x ahead, y left, z up
+    half = math.sqrt(0.5)
+    q = {"x": 0.0, "y": -half, "z": 0.0, "w": half} if profiling else {"w": 1.0}
+    if profiling:  # turn about y by -90 degrees takes x up and z to -x; half a turn about z, ahead
+        q = {"x": half, "y": 0.0, "z": half, "w": 0.0}
+    tie = ("/tf_static", TRANSFORMS, 0.0, static("base_link", "sonar", 0.0, 0.0, q=q))
+    told = pinged(
+        0.2, "sonar", ping_info={"sound_speed": 1500.0},
+        two_way_travel_times=[0.01], rx_angles=[0.3],
+    )  # fmt: skip
+    row = only(read(tmp_path / "one.mcap", ("/sonar", DETECTIONS, 0.2, told), tie))
+    assert row.bearing[0] == pytest.approx(-0.3, abs=1e-6)
+
+
+# Odometry and clocks
+
+
+def seen(time, far=3.0):
+    """Tell a post that is seen."""
+    return ("/seen", LABELLED, time, labelled(time, [(7, 0.0, far)]))
+
+
+def test_a_twist_covariance_is_that_of_the_way_since_the_row_before(tmp_path):
+    covariance = np.zeros(36)
+    covariance[[0, 7, 35]] = 0.04, 0.01, 0.09
+    rows = [
+        ("/odom", ODOMETRY, t, odometry(t, t, 0.0, 0.0, covariance=covariance)) for t in (0.0, 0.5)
+    ]
+    path = write_bag(tmp_path / "one.mcap", [*rows, seen(0.5)])
+    (controls,) = load(path, bag=BagConfig(step=0.0))[0].controls
+    np.testing.assert_allclose(controls[[3, 6, 8]], np.array([0.04, 0.01, 0.09]) * 0.25)
+    assert load(path, bag=BagConfig(step=0.0, covariances=False))[0].controls.shape == (1, 3)
+
+
+def test_steps_merge_what_comes_more_often(tmp_path):
+    assert len(read(tmp_path / "one.mcap", seen(0.2), count=21).dt) == 20
+    assert len(load(tmp_path / "one.mcap", bag=BagConfig(step=0.5))[0].dt) == 4
+
+
+def test_messages_are_timed_by_their_headers_unless_reception_is_asked_for(tmp_path):
+    told = [*drive(), seen(0.2)]
+    path = write_bag(tmp_path / "one.mcap", sorted(told, key=lambda one: one[2]), late=0.25)
+    log = load(path, bag=BagConfig(step=0.0))[0]
+    assert log.time[0] == 0.0
+    assert any("/odom" in note and "received 0.25 s after" in note for note in log.notes)
+    assert load(path, bag=BagConfig(step=0.0, stamps="received"))[0].time[0] == 0.25
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["Odometry", "PoseStamped", "PoseWithCovarianceStamped", "TransformStamped"],
+)
+def test_the_truth_is_a_topic_that_is_named_and_the_log_begins_there(tmp_path, name):
+    def truth(time):
+        place = {"x": 5.0 + time, "y": -1.0}
+        pose = {"position": place, "orientation": quaternion(0.25)}
+        told = {
+            "Odometry": {"pose": {"pose": pose}},
+            "PoseStamped": {"pose": pose},
+            "PoseWithCovarianceStamped": {"pose": {"pose": pose}},
+            "TransformStamped": {
+                "transform": {"translation": place, "rotation": pose["orientation"]}
+            },
+        }[name]
+        package = "nav_msgs" if name == "Odometry" else "geometry_msgs"
+        return ("/true", f"{package}/msg/{name}", time, {"header": header(time)} | told)
+
+    told = [*drive(), *(truth(0.15 + 0.1 * i) for i in range(4)), seen(0.3)]
+    path = write_bag(tmp_path / "one.mcap", sorted(told, key=lambda one: one[2]))
+    log, true = load(path, bag=BagConfig(step=0.0, truth="/true"))
+    assert log.time[0] == pytest.approx(0.15)
+    np.testing.assert_allclose(log.initial_pose, [5.15, -1.0, 0.25])
+    np.testing.assert_allclose(true.path[:3, 0], 5.0 + true.time[:3])
+    assert load(path, bag=BagConfig(odometry="/odom", step=0.0))[1].path is None
+
+
+def test_two_odometries_are_told_apart_by_a_name(tmp_path):
+    other = [("/visual", *row[1:]) for row in drive()]
+    path = write_bag(
+        tmp_path / "one.mcap", sorted([*drive(), *other, seen(0.2)], key=lambda one: one[2])
+    )
+    refused(path, "several topics of odometry: /odom, /visual", "--bag.odometry")
+    log, truth = load(path, bag=BagConfig(truth="/visual"))
+    assert truth.path is not None
+    assert "/odom is the odometry" in log.notes[0]
+    refused(path, "no topic '/odm'", "did you mean /odom?", bag=BagConfig(odometry="/odm"))
+    refused(path, "/seen of the type mrpt", "nav_msgs", bag=BagConfig(odometry="/seen"))
+
+
+# What is wrong in a bag
+
+
+def test_what_is_no_sound_bag_is_refused_by_its_name(tmp_path):
+    told = sorted([*drive(), seen(0.2)], key=lambda one: one[2])
+    for name in KINDS[:3]:
+        whole = write_bag(tmp_path / name, told).read_bytes()
+        for i, data in enumerate((b"", whole[: len(whole) // 2], b"\0" * 200, whole[1:])):
+            path = tmp_path / f"{i}{name}"
+            path.write_bytes(data)
+            refused(path)
+    refused(tmp_path / "gone.mcap", "no such file")
+    (tmp_path / "link.mcap").symlink_to(tmp_path / "nowhere.mcap")
+    refused(tmp_path / "link.mcap", "a link to no file")
+    (tmp_path / "there.mcap").symlink_to(tmp_path / "walk.mcap")
+    assert load(tmp_path / "there.mcap")[0].scans
+    os.mkfifo(tmp_path / "pipe.mcap")
+    refused(tmp_path / "pipe.mcap", "a pipe or a device")
+    (tmp_path / "folder.mcap").mkdir()
+    refused(tmp_path / "folder.mcap", "log.toml")
+    (tmp_path / "bare").mkdir()
+    for name in ("a.mcap", "b.mcap"):
+        (tmp_path / "bare" / name).touch()
+    refused(tmp_path / "bare", "2 files without metadata.yaml", "reindex")
+
+
+@pytest.mark.parametrize(
+    ("told", "parts"),
+    [
+        ([seen(0.2)], ("no odometry",)),
+        (drive(), ("no echoes",)),
+        ([], ("no odometry",)),
+        ([*drive(), seen(0.2, math.nan)], ("topic /seen, message 1", "the range nan")),
+        ([*drive(), seen(0.2, 2e6)], ("topic /seen, message 1", "range 2000000.0")),
+        (
+            [*drive(), ("/odom", ODOMETRY, 0.5, odometry(0.5, math.nan, 0.0, 0.0)), seen(0.2)],
+            ("topic /odom, message 6", "x nan"),
+        ),
+        (
+            [*drive(), ("/odom", ODOMETRY, 0.5, odometry(0.2, 0.0, 0.0, 0.0)), seen(0.2)],
+            ("topic /odom, message 6", "run backwards"),
+        ),
+        (
+            [*drive(), seen(0.2), ("/seen", LABELLED, 0.3, labelled(0.1, [(7, 0.0, 1.0)]))],
+            ("topic /seen, message 2", "run backwards"),
+        ),
+        (
+            [*drive(), ("/odom", ODOMETRY, 0.5, {"header": header(0.5)}), seen(0.2)],
+            ("topic /odom, message 6", "quaternion (0, 0, 0, 0)"),
+        ),
+        (
+            [*drive(), ("/seen", LABELLED, 0.2, labelled(0.2, [(7, 0.0, 1.0), (7, 0.2, 1.0)]))],
+            ("topic /seen, message 1", "landmark 7"),
+        ),
+        ([*drive(), seen(9.0)], ("topic /seen", "1 outside odometry")),
+    ],
+)
+def test_what_cannot_be_used_is_refused_by_topic_and_message(tmp_path, told, parts):
+    path = write_bag(tmp_path / "one.mcap", sorted(told, key=lambda one: one[2]))
+    refused(path, *parts)
+
+
+def test_messages_that_a_folder_counts_and_its_file_lacks_are_missed(tmp_path):
+    path = write_bag(tmp_path / "walk", sorted([*drive(), seen(0.2)], key=lambda one: one[2]))
+    told = (path / "metadata.yaml").read_text()
+    assert told.count("message_count: 5") == 1
+    (path / "metadata.yaml").write_text(told.replace("message_count: 5", "message_count: 9"))
+    refused(path, "topic /odom", "found 5 messages, expected the 9")
+
+
+def test_a_message_whose_bytes_end_early_is_refused_by_its_topic(tmp_path):
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    from reference.bags import made, store_of
+
+    store = store_of()
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topic = writer.add_connection("/odom", ODOMETRY, typestore=store)
+        seen_topic = writer.add_connection("/seen", LABELLED, typestore=store)
+        data = store.serialize_cdr(made(store, ODOMETRY, odometry(0.0, 0.0, 0.0, 0.0)), ODOMETRY)
+        writer.write(topic, 0, data)
+        writer.write(topic, 1, bytes(data)[:60])
+        writer.write(seen_topic, 2, b"")
+    refused(tmp_path / "bag", "topic /odom, message 2")
+
+
+@pytest.mark.parametrize(
+    ("name", "how"),
+    [("walk", "FILE"), ("walk", "MESSAGE"), ("walk.mcap", "STORAGE"), ("walk.bag", "LZ4")],
+)
+def test_compressed_bags_are_read(tmp_path, name, how):
+    told = sorted([*drive(), seen(0.2)], key=lambda one: one[2])
+    path = write_bag(tmp_path / name, told, compression=how)
+    assert only(load(path)[0]).landmark[0] == 7
+
+
+def ending(path):
+    """Tell how reading a bag ends."""
+    try:
+        load(path)
+    except InputError as error:
+        return "refused" if str(path) in str(error) else f"refused without its name: {error}"
+    return "read"
+
+
+@pytest.mark.parametrize("name", KINDS[:3])
+def test_bytes_that_are_changed_at_random_end_in_a_log_or_a_refusal(tmp_path, name):
+    whole = write_bag(
+        tmp_path / name, sorted([*drive(), seen(0.2)], key=lambda one: one[2])
+    ).read_bytes()
+    rng, ends = np.random.default_rng(5), set()
+    path = tmp_path / f"odd{Path(name).suffix}"
+    for _ in range(60):
+        data = bytearray(whole)
+        for at in rng.integers(len(data), size=int(rng.integers(1, 6))):
+            data[at] = int(rng.integers(256))
+        path.write_bytes(data)
+        ends.add(ending(path))
+    assert ends == {"read", "refused"}
+
+
+def test_without_rosbags_a_bag_is_refused_with_what_installs_it(tmp_path, monkeypatch):
+    path = write_bag(tmp_path / "one.mcap", sorted([*drive(), seen(0.2)], key=lambda one: one[2]))
+    for name in [name for name in sys.modules if name.split(".")[0] == "rosbags"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    refused(path, "needs rosbags", "pip install 'pipistrelle[ros]'")
