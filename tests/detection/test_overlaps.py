@@ -17,9 +17,8 @@ from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import BLOCK, sampling
 from pipistrelle.config import Config, DetectionConfig, ScenarioConfig
-from pipistrelle.detection.certainty import EDGE_FLOOR, NOISE_QUANTILE, bearing_std, delay_std
+from pipistrelle.detection.certainty import EDGE_FLOOR, NOISE_QUANTILE, bearing_std
 from pipistrelle.detection.matched import filter_blocks
-from pipistrelle.detection.onset import arrival_lag, bend_lag
 from pipistrelle.detection.overlaps import MOST, deviation, most_left, resolve, room_for
 from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.detection.snapshots import Detections, detect, detector
@@ -191,61 +190,6 @@ def test_a_few_elements_tell_few_sources_apart(elements, most):
     assert limits.size == most
     assert np.isfinite(limits).all()
     assert (np.diff(limits) < 0.0).all()
-
-
-# Calls that overlap in one beam
-
-
-def beam_of(rng, starts, amplitudes, noise=1.0):
-    """Return a beam's outputs, calls that start at these blocks; noise of unit variance."""
-    sums = np.zeros(80, complex)
-    for start, amplitude in zip(starts, amplitudes, strict=True):
-        first, part = int(start), start % 1.0
-        weights = np.concatenate(([1.0 - part], np.ones(PULSE - 1), [part]))
-        sums[first : first + PULSE + 1] += amplitude * weights / np.sqrt(PULSE)
-    draws = rng.standard_normal((2, 80)) * np.sqrt(0.5)
-    sums += noise * (draws[0] + 1j * draws[1])
-    matched = np.convolve(sums, np.ones(PULSE), "valid") / np.sqrt(PULSE)
-    return matched[:, None, None, None]
-
-
-ONE, WORK = np.ones(1, complex), np.empty(40, complex)
-
-
-def test_where_two_calls_of_one_direction_overlap_each_bends_the_beam_where_it_starts():
-    matched = beam_of(np.random.default_rng(1), (25.3, 31.6), (10.0, 12.0j), noise=0.0)
-    for start in (25.3, 31.6):
-        bend, _ = bend_lag(matched, round(start), 0, 0, ONE, PULSE, WORK, 1e-6)
-        whole = arrival_lag(matched, round(start), 0, 0, ONE, PULSE, WORK)
-        assert bend == pytest.approx(start, abs=1e-9)
-        assert abs(whole - start) > 0.05
-
-
-@cache
-def bends(first, second, count):
-    """Return errors and deviations of the bend where a call starts, and how often there is one."""
-    rng, rows = np.random.default_rng(4), []
-    for _ in range(count):
-        start = 25.0 + rng.random()
-        matched = beam_of(rng, (start, start + 6.0), (first, second))
-        bend, std = bend_lag(matched, round(start), 0, 0, ONE, PULSE, WORK, 1.0)
-        if not np.isnan(bend):
-            rows.append((bend - start, max(std, delay_std(first**2 - 1.0, PULSE))))
-    return np.array(rows).reshape(-1, 2).T, len(rows) / count
-
-
-@pytest.mark.parametrize("first", [10.0, 100.0])
-def test_bends_of_two_calls_are_off_by_as_much_as_they_say(first):
-    (off, std), share = bends(first, 1.5j * first, 1500)
-    assert share > 0.99
-    assert np.sqrt(np.mean((off / std) ** 2)) == pytest.approx(1.0, abs=0.15)
-    assert np.mean(std) < 1.5 * np.sqrt(PULSE / 4.0) / first, "the bound of one call is near"
-
-
-def test_one_call_alone_is_no_bend_but_in_a_thousandth_of_cases():
-    few = 4000
-    _, share = bends(10.0, 0.0, few)
-    assert share * few <= binom.isf(1e-6, few, SPLIT)
 
 
 # Frames

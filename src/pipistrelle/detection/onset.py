@@ -1,37 +1,11 @@
-r"""Time of arrival: where, to a fraction of a lag, a call starts in a steered beam.
-
-**One call** of M lags makes a triangle of the matched filter's output, whose top is where the call
-starts. The likeliest place between two lags has a closed form (`arrival_lag`).
-
-**Calls that overlap** from one direction are in one beam, and pull its top aside. But each of them
-is straight, except where its call begins and at its ends: where none of the others does, the sum of
-all bends as that one call alone. With the steps :math:`s_k = y_{k+1} - y_k`, whose noise is
-independent and of variance 2 / M, the mean g of the two before and the mean h of the two after,
-a call that begins the share q into step k makes
-
-.. math:: s_k = q\,g + (1 - q)\,h, \qquad
-          \hat q = \operatorname{Re} \frac{(s_k - h)^* (g - h)}{|g - h|^2}, \qquad
-          \sigma_q^2 = \frac{1}{M |g - h|^2} \left(1 + \frac{q^2 + (1 - q)^2}{2}\right) ,
-
-whatever the others add, for of a whole call alone with power p it is :math:`|g - h|^2 = 4 p / M^2`
-and the first term the M / 4p of `certainty`: the information lies in the steps that hold the edges.
-A call alone rises as steeply as it falls: that g + h is more than noise makes it in all but a
-thousandth of cases says that it is not alone, and only then the bend is asked for (`bend_lag`). A
-Doppler shift turns the phase from edge to edge, and says so, too.
-
-The same of a first edge, at which nothing is straight before: `pipistrelle.detection.direct`.
-"""
+"""Time of arrival: where, to a fraction of a lag, a call starts in a steered beam."""
 
 import math
 
 import numpy as np
 from jaxtyping import Complex, Float
 
-from pipistrelle.detection.certainty import NOISE_QUANTILE
 from pipistrelle.jit import Whole, kernel, no_alloc
-
-UNEVEN = -math.log(1.0 - NOISE_QUANTILE)
-"""Largest power, in units of the noise's, by which a call alone rises and falls unevenly."""
 
 
 @no_alloc
@@ -132,46 +106,3 @@ def arrival_lag(
         if score > fit:
             best, fit = left + q, score
     return best
-
-
-@no_alloc
-def bend_lag(
-    matched: Complex[np.ndarray, "l f c e"],
-    b: Whole,
-    f: Whole,
-    p: Whole,
-    phases: Complex[np.ndarray, " e"],
-    pulse: Whole,
-    beam: Complex[np.ndarray, " r"],
-    noise: float,
-) -> tuple[float, float]:
-    """Return the lag, to a fraction, at which a beam bends near lag b, and its standard deviation.
-
-    NaN where one call alone explains the beam, or its record ends. ``beam`` is room for seven lags
-    of unit norm; ``noise``: its power.
-    """
-    stride = max(pulse // 14, 1)
-    low, step_noise, least = b - 3 * stride, 2.0 * stride / pulse * noise, math.inf
-    lag = std = math.nan
-    if low < 0 or b + 3 * stride >= matched.shape[0]:
-        return lag, std
-    for k in range(7):
-        steer(matched, low + k * stride, 1, f, p, phases, beam[k:])
-    for k in range(6):
-        beam[k] = beam[k + 1] - beam[k]
-    for k in (2, 3):
-        rise, fall = 0.5 * (beam[k - 2] + beam[k - 1]), 0.5 * (beam[k + 1] + beam[k + 2])
-        bend, there = rise - fall, beam[k] - fall
-        square = bend.real * bend.real + bend.imag * bend.imag
-        share = (there.real * bend.real + there.imag * bend.imag) / square
-        share = min(max(share, 0.0), 1.0)
-        misfit = abs(there - share * bend) ** 2
-        misfit += 0.5 * abs(beam[k - 1] - beam[k - 2]) ** 2
-        misfit += 0.5 * abs(beam[k + 2] - beam[k + 1]) ** 2
-        if misfit < least:
-            least, lag, std = misfit, math.nan, math.nan
-            if abs(rise + fall) ** 2 > UNEVEN * step_noise:
-                spread = 1.0 + 0.5 * (share * share + (1.0 - share) * (1.0 - share))
-                lag = low + stride * (k + share)
-                std = stride * math.sqrt(0.5 * max(step_noise, 0.4 * misfit) * spread / square)
-    return lag, std

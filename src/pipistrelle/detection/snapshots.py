@@ -37,7 +37,7 @@ from pipistrelle.detection.certainty import (
 )
 from pipistrelle.detection.direct import DirectCalls, Lags, direct_calls
 from pipistrelle.detection.loudness import candidates, energy_of, is_leakage, snapshot
-from pipistrelle.detection.onset import arrival_lag, bend_lag, reach_of, steer, steering_phases
+from pipistrelle.detection.onset import arrival_lag, reach_of, steer, steering_phases
 from pipistrelle.detection.overlaps import (
     SAME_TIME,
     deviation,
@@ -472,31 +472,6 @@ def _find_peaks(
     return whole[:, :count], numbers[:, :count]
 
 
-@no_alloc
-def _timed(
-    matched: Complex[np.ndarray, "l f c e"],
-    near: tuple[Whole, Whole],
-    f: Whole,
-    p: Whole,
-    phases: Complex[np.ndarray, " e"],
-    pulse: Whole,
-    noise: float,
-    beam: Complex[np.ndarray, " r"],
-) -> tuple[Whole, float, float, float]:
-    """Return the loudest lag of a beam near one, its power, the lag of arrival and its deviation.
-
-    ``near``: a lag, and how far the loudest may be from it.
-    """
-    within = max(near[0] - near[1], 0), min(near[0] + near[1] + 1, matched.shape[0])
-    loudest, power = _loudest_lag(matched, within, f, p, phases, beam)
-    late = arrival_lag(matched, loudest, f, p, phases, pulse, beam)
-    std = delay_std(max(power / noise - 1.0, MIN_POWER_OVER_NOISE), pulse)
-    bend, bend_std = bend_lag(matched, int(late + 0.5), f, p, phases, pulse, beam, noise)
-    if not math.isnan(bend):
-        late, std = bend, max(std, bend_std)
-    return loudest, power, late, std
-
-
 @kernel
 def _find_sources(
     matched: Complex[np.ndarray, "l f c e"],
@@ -512,7 +487,7 @@ def _find_sources(
     rule, pulse, row, count = Detector(*rules), lag.pulse, faces * tones, 0
     whole, numbers = np.empty((3, 128), dtype=np.int64), np.empty((5, 128))
     found = room_for(rule.most_left.size, elements)
-    beam = np.empty(pulse + 7, dtype=np.complex128)
+    beam = np.empty(pulse + 5, dtype=np.complex128)
     for test in candidates(energy, rule.threshold, row if pulse > 1 else energy.size):
         b, end = snapshot(energy, test, row, tones, pulse, False, rule.threshold, rule.leakage)
         if b == end:
@@ -521,21 +496,22 @@ def _find_sources(
         x = matched[b, f, p]
         sources, left = resolve(x, rule.scan[p, ::2], rule.place, rule.most_left, found)
         noise = left / (elements - 1.5 * sources) if left > rule.most_left[sources - 1] else 1.0
-        near = b, pulse // 2 if sources > 1 else 0
+        reach = pulse // 2 if sources > 1 else 0
+        within = max(b - reach, 0), min(b + reach + 1, matched.shape[0])
         for k in range(sources):
             sine, std = found.u[k] / rule.wave[p], deviation(x, found, k, noise)
             if not (abs(sine) <= rule.sine_limit and std < math.inf):
                 continue
             if count == whole.shape[1]:
                 whole, numbers = _grown(whole), _grown(numbers)
-            loudest, power, late, late_std = _timed(
-                matched, near, f, p, found.beam[k], pulse, noise, beam
-            )
+            loudest, power = _loudest_lag(matched, within, f, p, found.beam[k], beam)
+            late = arrival_lag(matched, loudest, f, p, found.beam[k], pulse, beam)
+            over = max(power / noise - 1.0, MIN_POWER_OVER_NOISE)
             whole[0, count], whole[1, count], whole[2, count] = f, p, b
             numbers[0, count], numbers[1, count] = lag.start + lag.interval * late, sine
             numbers[2, count] = min(power / found.gain[k], energy[loudest * row + test % row])
             numbers[3, count] = std / (rule.wave[p] * math.sqrt(1.0 - sine * sine))
-            numbers[4, count] = lag.interval * late_std
+            numbers[4, count] = lag.interval * delay_std(over, pulse)
             count += 1
     best = surest(whole[:, :count], numbers[:, :count], SAME_TIME * pulse * lag.interval)
     return whole[:2, :count][:, best], numbers[:, :count][:, best]
