@@ -351,6 +351,9 @@ class DetectionConfig(Section):
     """Probability that noise alone passes one test of one tone."""
     snapshots: Literal["maxima", "runs"] = "maxima"
     """A snapshot: the loudest lag within half a call, or a whole run above the threshold."""
+    overlaps: Literal["merge", "resolve"] = "merge"
+    """Echoes that overlap in a snapshot: the peaks of one scan, or as many sources, up to three, as
+    explain it, each with its own deviations and time of arrival."""
     leakage_db: Level = -28.0
     """A tone counts only above this level relative to the other tone's maximum nearby [dB]."""
     peak_db: Annotated[float, Field(ge=-300, le=0)] = -8.0
@@ -361,6 +364,14 @@ class DetectionConfig(Section):
     """Largest angle off a face's normal that is kept [deg]."""
     averaging: Literal["plain", "weighted"] = "plain"
     """Mean over the faces: plain (the paper's) or by inverse variance at the array's angle."""
+
+    @model_validator(mode="after")
+    def _of_one_lag(self) -> "DetectionConfig":
+        if self.overlaps == "resolve" and self.snapshots != "maxima":
+            raise ValueError(
+                f'overlaps "resolve" needs snapshots "maxima", found "{self.snapshots}"'
+            )
+        return self
 
 
 class MatchingConfig(Section):

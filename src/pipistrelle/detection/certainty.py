@@ -43,6 +43,11 @@ DIRECT_FLOOR = 0.04
 """Error [rad] of the bearing of a caller's direct call: while it lasts, echoes begin of what stands
 near the line from the caller."""
 
+EDGE_FLOOR = 0.015
+"""Error [m] of where a caller's direct call begins that no level removes: what stands near the line
+adds to its first edge. It counts where overlaps are resolved, whose rows are sure enough to show
+it; it is the same for all rows of a frame."""
+
 
 def loudest_noise(elements: int) -> float:
     """Return the 0.999 quantile of the residual power of a steered beam in noise.

@@ -13,7 +13,8 @@ conventional beam, whose power, summed over a run's lags, needs only the sums ov
 
 Each peak near the strongest's height is refined by a parabola, the beamformer is steered to it,
 and the time of arrival is where a triangle, the matched filter's answer to the call, fits best; in
-a run, near the lag at which that beam is loudest.
+a run, near the lag at which that beam is loudest. With the setting ``overlaps = "resolve"`` there
+are as many sources as explain the snapshot in place of peaks (`pipistrelle.detection.overlaps`).
 Bradley & Abaid, Sec. II-D; what the paper leaves open is settled in the settings' defaults.
 """
 
@@ -27,9 +28,24 @@ from jaxtyping import Bool, Complex, Float, Int, Shaped
 
 from pipistrelle.arrays.layout import Layout
 from pipistrelle.config import Config, InputError
-from pipistrelle.detection.certainty import bearing_std, delay_std, loudest_noise, over_noise
+from pipistrelle.detection.certainty import (
+    MIN_POWER_OVER_NOISE,
+    bearing_std,
+    delay_std,
+    loudest_noise,
+    over_noise,
+)
 from pipistrelle.detection.direct import DirectCalls, Lags, direct_calls
+from pipistrelle.detection.loudness import candidates, energy_of, is_leakage, snapshot
 from pipistrelle.detection.onset import arrival_lag, reach_of, steer, steering_phases
+from pipistrelle.detection.overlaps import (
+    SAME_TIME,
+    deviation,
+    most_left,
+    resolve,
+    room_for,
+    surest,
+)
 from pipistrelle.geometry import wrap
 from pipistrelle.jit import Whole, kernel, no_alloc
 
@@ -38,8 +54,6 @@ SCAN_STEP = 0.05
 
 MAX_SPACING = 100
 """Most waves between two elements; their bearings are ambiguous long before."""
-
-_CHUNK = 256
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,6 +132,9 @@ class Detector(NamedTuple):
     """Places of the elements, in spacings; empty for equally spaced ones."""
     spread: float
     """See `certainty.bearing_std`."""
+    most_left: Float[np.ndarray, " k"]
+    """Most that 1, 2, ... sources may leave of a snapshot (`overlaps.most_left`); empty where
+    overlaps are not resolved."""
 
 
 def detector(config: Config, layout: Layout, tones: Float[np.ndarray, " c"]) -> Detector:
@@ -175,6 +192,7 @@ def detector(config: Config, layout: Layout, tones: Float[np.ndarray, " c"]) -> 
         table=np.stack((turns.real, turns.imag), axis=1),
         place=place,
         spread=12.0 * float(np.var(place)) if place.size else float(elements * elements - 1),
+        most_left=most_left(elements) if settings.overlaps == "resolve" else np.empty(0),
     )
 
 
@@ -218,9 +236,10 @@ def detect(
     -------
     Detections
     """
-    energy = _energy(matched.reshape(-1).view(matched.real.dtype), matched.shape[3])
+    energy = energy_of(matched.reshape(-1).view(matched.real.dtype), matched.shape[3])
     lags = Lags(start, interval, pulse)
-    whole, numbers = _find_peaks(matched, energy, tuple(detector), lags)
+    find = _find_sources if detector.most_left.size else _find_peaks
+    whole, numbers = find(matched, energy, tuple(detector), lags)
     (face, caller), (delay, sine, power, bearing_std, delay_std) = whole, numbers
     angle = np.arcsin(sine)
     return Detections(
@@ -289,125 +308,6 @@ def joined(parts: Sequence[Detections]) -> Detections:
     """Concatenate the detections of one call from several frames; the first has its direct call."""
     columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in Columns._fields}
     return Detections(**columns, direct=parts[0].direct)
-
-
-@kernel
-def _energy(parts: Float[np.ndarray, " i"], elements: Whole) -> Float[np.ndarray, " t"]:
-    """Sum squares over the elements of every output, real and imaginary parts neighbours."""
-    energy = np.empty(parts.size // (2 * elements))
-    square = np.empty(_CHUNK * elements)  # stays in the cache
-    for start in range(0, energy.size, _CHUNK):
-        done = energy[start : start + _CHUNK]
-        part = parts[2 * elements * start :]
-        for i in range(done.size * elements):
-            square[i] = part[2 * i] * part[2 * i] + part[2 * i + 1] * part[2 * i + 1]
-        for g in range(done.size):
-            total = 0.0
-            for e in range(elements):
-                total += square[g * elements + e]
-            done[g] = total
-    return energy
-
-
-@kernel
-def _candidates(
-    energy: Float[np.ndarray, " t"], threshold: float, row: Whole
-) -> Int[np.ndarray, " k"]:
-    """Find the tests over the threshold that beat both their neighbours a row away.
-
-    Every test is written and few are kept: a branch on each could not be predicted.
-    """
-    test, count, kept = np.empty(energy.size + 1, dtype=np.int64), 0, 0
-    for t in range(energy.size):
-        test[count] = t
-        count += energy[t] > threshold
-    for k in range(count):
-        t = test[k]
-        before = energy[t - row] if t >= row else -1.0
-        after = energy[t + row] if t + row < energy.size else -1.0
-        test[kept] = t
-        kept += (energy[t] > before) & (energy[t] >= after)
-    return test[:kept]
-
-
-@no_alloc
-def _is_loudest(
-    energy: Float[np.ndarray, " t"], test: Whole, row: Whole, reach: Whole, floor: float
-) -> bool:
-    """Tell whether a lag is the loudest within a reach, or until the energy falls low enough.
-
-    A row of tests is a lag's: its neighbour in time is a row away, its other tones next to it.
-    """
-    level, size = energy[test], energy.size
-    for away in range(row, (reach + 1) * row, row):
-        if test < away or energy[test - away] <= floor:
-            break
-        if energy[test - away] >= level:
-            return False
-    for away in range(row, (reach + 1) * row, row):
-        if test + away >= size or energy[test + away] <= floor:
-            break
-        if energy[test + away] > level:
-            return False
-    return True
-
-
-@no_alloc
-def _is_leakage(
-    energy: Float[np.ndarray, " t"],
-    test: Whole,
-    row: Whole,
-    tones: Whole,
-    pulse: Whole,
-    leakage: float,
-) -> bool | np.bool_:
-    """Tell whether the energy of a tone is explained by leakage from another tone nearby."""
-    own, strongest = test % tones, 0.0
-    for p in range(tones):
-        if p != own:
-            other = test - own + p
-            for away in range(-pulse * row, (pulse + 1) * row, row):
-                if 0 <= other + away < energy.size:
-                    strongest = max(strongest, energy[other + away])
-    return energy[test] <= leakage * strongest
-
-
-@no_alloc
-def _run_of(
-    energy: Float[np.ndarray, " t"], test: Whole, row: Whole, floor: float
-) -> tuple[Whole, Whole]:
-    """Return the first lag, and the one after the last, of a test's run above a level."""
-    first = last = test
-    while first >= row and energy[first - row] > floor:
-        first -= row
-    while last + row < energy.size and energy[last + row] > floor:
-        last += row
-    return first // row, last // row + 1
-
-
-@no_alloc
-def _snapshot(
-    energy: Float[np.ndarray, " t"],
-    test: Whole,
-    row: Whole,
-    tones: Whole,
-    pulse: Whole,
-    runs: bool,
-    threshold: float,
-    leakage: float,
-) -> tuple[Whole, Whole]:
-    """Return the first lag, and the one after the last, of a test's snapshot; equal if none.
-
-    A run may hold other echoes beside what leaks into it: each of its peaks is asked, at its lag.
-    """
-    if runs:
-        if _is_loudest(energy, test, row, energy.size, threshold):
-            return _run_of(energy, test, row, threshold)
-    elif _is_loudest(energy, test, row, pulse // 2, -1.0) and not _is_leakage(
-        energy, test, row, tones, pulse, leakage
-    ):
-        return test // row, test // row + 1
-    return 0, 0
 
 
 @no_alloc
@@ -539,8 +439,8 @@ def _find_peaks(
     beam = np.empty(max(room, matched.shape[0]) if rule.runs else room, dtype=np.complex128)
     phases = np.empty(elements, dtype=np.complex128)
     row, count = faces * tones, 0
-    for test in _candidates(energy, rule.threshold, row if pulse > 1 else energy.size):
-        within = _snapshot(energy, test, row, tones, pulse, rule.runs, rule.threshold, rule.leakage)
+    for test in candidates(energy, rule.threshold, row if pulse > 1 else energy.size):
+        within = snapshot(energy, test, row, tones, pulse, rule.runs, rule.threshold, rule.leakage)
         if within[0] == within[1]:
             continue
         f, p = test // tones % faces, test % tones
@@ -556,7 +456,7 @@ def _find_peaks(
             steering_phases(u, rule.place, phases)
             if rule.runs:
                 b, top = _loudest_lag(matched, within, f, p, phases, beam)
-                if _is_leakage(energy, b * row + test % row, row, tones, pulse, rule.leakage):
+                if is_leakage(energy, b * row + test % row, row, tones, pulse, rule.leakage):
                     continue
             if count == whole.shape[1]:
                 whole, numbers = _grown(whole), _grown(numbers)
@@ -570,3 +470,48 @@ def _find_peaks(
             numbers[4, count] = lag.interval * delay_std(over, pulse)
             count += 1
     return whole[:, :count], numbers[:, :count]
+
+
+@kernel
+def _find_sources(
+    matched: Complex[np.ndarray, "l f c e"],
+    energy: Float[np.ndarray, " t"],
+    rules: tuple,
+    lag: Lags,
+) -> tuple[Int[np.ndarray, "2 m"], Float[np.ndarray, "5 m"]]:
+    """Find every source of every snapshot (`overlaps`); returns what `_find_peaks` does.
+
+    No echo is louder than its snapshot.
+    """
+    _, faces, tones, elements = matched.shape
+    rule, pulse, row, count = Detector(*rules), lag.pulse, faces * tones, 0
+    whole, numbers = np.empty((3, 128), dtype=np.int64), np.empty((5, 128))
+    found = room_for(rule.most_left.size, elements)
+    beam = np.empty(pulse + 5, dtype=np.complex128)
+    for test in candidates(energy, rule.threshold, row if pulse > 1 else energy.size):
+        b, end = snapshot(energy, test, row, tones, pulse, False, rule.threshold, rule.leakage)
+        if b == end:
+            continue
+        f, p = test // tones % faces, test % tones
+        x = matched[b, f, p]
+        sources, left = resolve(x, rule.scan[p, ::2], rule.place, rule.most_left, found)
+        noise = left / (elements - 1.5 * sources) if left > rule.most_left[sources - 1] else 1.0
+        reach = pulse // 2 if sources > 1 else 0
+        within = max(b - reach, 0), min(b + reach + 1, matched.shape[0])
+        for k in range(sources):
+            sine, std = found.u[k] / rule.wave[p], deviation(x, found, k, noise)
+            if not (abs(sine) <= rule.sine_limit and std < math.inf):
+                continue
+            if count == whole.shape[1]:
+                whole, numbers = _grown(whole), _grown(numbers)
+            loudest, power = _loudest_lag(matched, within, f, p, found.beam[k], beam)
+            late = arrival_lag(matched, loudest, f, p, found.beam[k], pulse, beam)
+            over = max(power / noise - 1.0, MIN_POWER_OVER_NOISE)
+            whole[0, count], whole[1, count], whole[2, count] = f, p, b
+            numbers[0, count], numbers[1, count] = lag.start + lag.interval * late, sine
+            numbers[2, count] = min(power / found.gain[k], energy[loudest * row + test % row])
+            numbers[3, count] = std / (rule.wave[p] * math.sqrt(1.0 - sine * sine))
+            numbers[4, count] = lag.interval * delay_std(over, pulse)
+            count += 1
+    best = surest(whole[:, :count], numbers[:, :count], SAME_TIME * pulse * lag.interval)
+    return whole[:2, :count][:, best], numbers[:, :count][:, best]

@@ -27,7 +27,7 @@ from pipistrelle.arrays.layout import Layout, layout_of
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
 from pipistrelle.arrays.sampling import BLOCK, Sampling, block_shape, blocks_to_hear, sampling
 from pipistrelle.config import Config
-from pipistrelle.detection.certainty import DIRECT_FLOOR
+from pipistrelle.detection.certainty import DIRECT_FLOOR, EDGE_FLOOR
 from pipistrelle.detection.direct import own_alone, without_calls
 from pipistrelle.detection.faces import FrameMeasurements, average_faces, same_echo
 from pipistrelle.detection.matched import filter_blocks, filter_samples
@@ -251,6 +251,10 @@ def _heard(time: float, detections: Detections, arrivals: Arrivals, rig: _Rig) -
         faintest_db=rig.faintest_db,
     )
     direct = detections.direct
+    if direct is not None and rig.config.detection.overlaps == "resolve":
+        floor = EDGE_FLOOR / rig.config.assumed_sound_speed
+        direct = direct._replace(delay_std=np.hypot(direct.delay_std, floor))
+        detections = replace(detections, direct=direct)
     if direct is not None and rig.missable.any():
         direct = own_alone(direct, label, rig.callers, rig.missable)
     heard = _averaged(time, replace(detections, direct=direct), label, rig)
