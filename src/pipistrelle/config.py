@@ -389,6 +389,10 @@ class AssociationConfig(Section):
     """Rows whose bearing is measured less surely than this are left out [rad]."""
     way_std: Positive = 0.35
     """The same of ranges and excess paths [m]."""
+    max_range: Positive | None = None
+    """How far a sensor that tells no levels sees; unless it is known, nothing is missed [m]."""
+    field_of_view: Annotated[Positive, Field(le=2.0 * math.pi)] = 2.0 * math.pi
+    """Full angle that such a sensor sees, about its heading [rad]."""
 
 
 class ListeningConfig(Section):

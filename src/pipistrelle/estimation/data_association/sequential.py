@@ -109,6 +109,8 @@ class Limits:
     birth_way_std: float = 0.25
     assumed: tuple[float, ...] = ()
     """Deviations that are assumed of rows which state none: they are as sure as any can be."""
+    sight: tuple[float, float] = (0.0, 0.0)
+    """`existence.Sight`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -262,9 +264,11 @@ class _Work:
         for number, caller in self.callers.items():
             callers[number] = self._where(caller.label)
         way = np.where(scan.caller == OWN, scan.range, scan.excess_path)
-        heard = self.label, scan.caller, way, scan.level_db
+        heard = self.label, scan.caller, way, scan.level_db, scan.bearing
         near = np.isin(known.label, list(self.near))
-        known = judged(known, heard, (self.joint.mean, at, callers), near, memory.scan)
+        known = judged(
+            known, heard, (self.joint.mean, at, callers), near, memory.scan, self.stage.limits.sight
+        )
         gone = {*known.label[known.odds < GONE].tolist(), *self._lost(known)}
         kept = ~np.isin(known.label, list(gone))
         self.label[np.isin(self.label, list(gone))] = UNLABELLED
