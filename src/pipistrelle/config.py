@@ -28,6 +28,8 @@ FASTEST = 1e4
 """No vehicle is faster [m/s]."""
 WIDEST = 1e4
 """No vehicle steers by more [rad] or turns faster [rad/s], nor is a bearing less sure [rad]."""
+STEEPEST = 1.1
+"""No car's front wheels steer by more [rad]."""
 LONGEST_STEP = 1e5
 """No control step is longer [s]: more than a day."""
 LEAST_STD = 1e-6
