@@ -56,6 +56,7 @@ def test_the_score_is_of_the_lidar_after_alignment(park, tmp_path, capsys):
     result = tmp_path / "result"
     result.mkdir()
     np.savetxt(result / "track_fused_iekf.tum", path)
+    (result / "track_fused_iekf_online.tum").write_text("a smoother's\n")
     (result / "map_fused_iekf.csv").write_text("landmark,x,y\n1,2.0,3.0\n2,4.0,5.0\n")
     functions("victoria_park")["score"](files, result, tmp_path / "picture.png")
     said = capsys.readouterr().out

@@ -90,7 +90,8 @@ def drawn(rng: np.random.Generator, pose: np.ndarray, posts: np.ndarray) -> np.n
 def score(files: Path, result: Path) -> None:
     """Print position error and GOSPA of the final map, neither of them aligned."""
     world = loadmat(files / "Environment_SLAM.mat")
-    (tracked,), (mapped,) = (sorted(result.glob(name)) for name in ("track_*.tum", "map_*.csv"))
+    (mapped,) = result.glob("map_*.csv")
+    tracked = result / f"track_{mapped.stem.removeprefix('map_')}.tum"
     off = np.loadtxt(tracked)[:, 1:3] - world["Robot_Groundtruth"][:2].T
     points = np.loadtxt(mapped, delimiter=",", skiprows=1, usecols=(1, 2))
     found = gospa(points, world["Landmark_Groundtruth"][:, 1:3], CUTOFF)

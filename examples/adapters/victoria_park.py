@@ -73,7 +73,8 @@ def log(files: Path, folder: Path) -> None:
 
 def score(files: Path, result: Path, picture: Path | None = None) -> None:
     """Print how far the lidar's track is from the GPS, after their alignment."""
-    (tracked,), (mapped,) = (sorted(result.glob(name)) for name in ("track_*.tum", "map_*.csv"))
+    (mapped,) = result.glob("map_*.csv")
+    tracked = result / f"track_{mapped.stem.removeprefix('map_')}.tum"
     fixes = read_table(files / "gps.dat", ("time", "x", "y"), separator=None).column
     time, x, y, _, _, _, z, w = np.loadtxt(tracked).T
     poses = np.column_stack((x, y, 2.0 * np.arctan2(z, w)))
