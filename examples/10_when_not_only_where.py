@@ -83,7 +83,7 @@ panels[0].set_ylabel("y [m]")
 plt.show()
 
 # %%
-# How surely is the landmark's place known, with two excess paths?
+# How surely is its place known, with two excess paths? (:doc:`11_without_labels`: which is it?)
 
 spread = beliefs[-1].landmarks().covariance[2]
 answer = float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))

@@ -42,7 +42,7 @@ def scripts():
 def test_every_tutorial_is_tested():
     names = {path.stem for path in scripts()}
     here = Path(__file__).read_text(encoding="utf-8")
-    assert len(names) == 10
+    assert len(names) == 11
     assert {name for name in names if f'play("{name}")' not in here} == set()
 
 
@@ -214,3 +214,14 @@ def test_two_excess_paths_place_a_landmark_as_surely_as_the_information_of_all_s
     expected = np.sqrt(np.linalg.eigvalsh(covariance)[-1])
     assert done["answer"] == pytest.approx(expected, rel=0.1), "but for what is bent"
     assert [len(belief.landmarks().landmark) for belief in done["beliefs"]] == [6, 3, 3]
+
+
+def test_without_labels_all_posts_are_found_and_nothing_else(play):
+    done = play("11_without_labels")
+    assert (done["score"].missed, done["score"].false) == (0, 0)
+    assert done["answer"] < 0.15, "what dead reckoning and the start's heading leave"
+    rows = [row.split(",") for row in done["measured"]]
+    assert {row[1] for row in rows} == {""}, "no row has a label"
+    posts, far = done["posts"], np.array([float(row[3]) for row in rows])
+    assert len(rows) > 3 * len(posts)
+    assert far.max() < 6.5

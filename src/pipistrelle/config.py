@@ -28,6 +28,8 @@ FASTEST = 1e4
 """No vehicle is faster [m/s]."""
 WIDEST = 1e4
 """No vehicle steers by more [rad] or turns faster [rad/s], nor is a bearing less sure [rad]."""
+STEEPEST = 1.1
+"""No car's front wheels steer by more [rad]."""
 LONGEST_STEP = 1e5
 """No control step is longer [s]: more than a day."""
 LEAST_STD = 1e-6
@@ -400,6 +402,10 @@ class AssociationConfig(Section):
     """Rows whose bearing is measured less surely than this are left out [rad]."""
     way_std: Positive = 0.35
     """The same of ranges and excess paths [m]."""
+    max_range: Positive | None = None
+    """How far a sensor that tells no levels sees; unless it is known, nothing is missed [m]."""
+    field_of_view: Annotated[Positive, Field(le=2.0 * math.pi)] = 2.0 * math.pi
+    """Full angle that such a sensor sees, about its heading [rad]."""
 
 
 class ListeningConfig(Section):

@@ -21,6 +21,7 @@ from reference.odometry import as_motions, by_poses, wandering
 
 BICYCLE = Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2)
 UNICYCLE = Motion(model="unicycle", control_std=(0.1, 0.15))
+CAR = Motion(model="ackermann", control_std=(0.1, 0.03), wheelbase=2.8, speed_offset=0.76)
 POSES = Motion(model="poses", control_std=(0.02, 0.01, 0.03))
 
 # Central differences with this step: the rounding error is about 10 m * 2e-16 / 1e-5 = 2e-10,
@@ -31,9 +32,10 @@ TOLERANCE = 1e-8
 angles = st.floats(-np.pi, np.pi)
 lengths = st.floats(-10, 10)
 poses = st.tuples(lengths, lengths, angles).map(np.array)
-controls = st.tuples(st.floats(-2, 2), st.floats(-1.2, 1.2)).map(np.array)
+controls = st.tuples(st.floats(-2, 2), st.floats(-1.1, 1.1)).map(np.array)
 ways = st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(-1.2, 1.2)).map(np.array)
-steps = st.tuples(st.sampled_from([BICYCLE, UNICYCLE]), controls) | st.tuples(st.just(POSES), ways)
+wheeled = st.tuples(st.sampled_from([BICYCLE, UNICYCLE, CAR]), controls)
+steps = wheeled | st.tuples(st.just(POSES), ways)
 durations = st.floats(0.01, 0.5)
 
 
@@ -55,6 +57,32 @@ def test_motion_jacobians_are_the_finite_differences_of_the_step(step, pose, dt)
     by_control = differences(lambda u: motion_step(motion, pose, u, dt), control, 2)
     np.testing.assert_allclose(F, by_pose, atol=TOLERANCE)
     np.testing.assert_allclose(U, by_control, atol=TOLERANCE)
+
+
+@given(st.floats(0.1, 2), st.floats(-1.1, 1.1))
+def test_the_wheels_of_a_car_go_about_one_centre(speed, steering):
+    # Rear wheels at h to the left and right, the front in the middle: each goes along a circle
+    # about the same point on the rear axle's line, as far as the angle of its turn says.
+    offset, base = CAR.speed_offset, CAR.wheelbase
+    after = motion_step(CAR, np.zeros(3), np.array([speed, steering]), 0.1)
+    heading = after[2]
+    wheel = after[:2] + offset * np.array([-np.sin(heading), np.cos(heading)]) - [0.0, offset]
+    chord = np.hypot(*wheel) / np.sinc(heading / (2 * np.pi))
+    assert chord == pytest.approx(speed * 0.1, rel=1e-9)
+    if abs(steering) > 1e-3:
+        centre = base / np.tan(steering)
+        assert np.hypot(after[0], after[1] - centre) == pytest.approx(abs(centre), rel=1e-9)
+        assert np.arctan2(base, centre) % np.pi == pytest.approx(steering % np.pi)
+
+
+@pytest.mark.parametrize(("offset", "fits"), [(1.4, True), (-1.5, False), (np.nan, False)])
+def test_a_speed_is_measured_within_the_car(offset, fits):
+    told = {"model": "ackermann", "control_std": (0.1, 0.1), "wheelbase": 2.8}
+    if fits:
+        assert Motion(**told, speed_offset=offset).speed_offset == offset
+    else:
+        with pytest.raises(InputError, match=r"speed_offset .*half"):
+            Motion(**told, speed_offset=offset)
 
 
 @given(steps, poses, durations)
@@ -125,7 +153,7 @@ def test_the_motion_since_a_pose_is_forward_then_to_the_left_and_its_length_of_t
         np.testing.assert_allclose(after, [1.5, 4.0, np.pi / 2 + 0.25], rtol=1e-15)
 
 
-@given(poses, controls, durations, st.sampled_from([BICYCLE, UNICYCLE]))
+@given(poses, controls, durations, st.sampled_from([BICYCLE, UNICYCLE, CAR]))
 def test_controls_told_as_motions_lead_to_the_same_pose(pose, control, dt, motion):
     (way,) = as_motions(motion, [control], [dt])
     change = motion_step(by_poses(motion), pose, way, dt) - motion_step(motion, pose, control, dt)

@@ -1,5 +1,7 @@
 """Drives whose steps are split where something is heard between their ends."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,14 +12,16 @@ from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.motion import Motion, motion_step
 from pipistrelle.experiments.cases import Case
-from pipistrelle.experiments.drives import Drive, Truth, split_at
+from pipistrelle.experiments.drives import Drive, Truth, at_sensor, at_vehicle, carried, split_at
 from pipistrelle.experiments.runs.trial import run_trial
 from pipistrelle.settings import from_flags, resolve
+from reference.missions import scan_with
 
 MOTIONS = [
     Motion(model="bicycle", control_std=(0.1, 0.03), wheelbase=0.2),
     Motion(model="unicycle", control_std=(0.1, 0.2)),
     Motion(model="poses", control_std=(0.02, 0.01, 0.03)),
+    Motion(model="ackermann", control_std=(0.1, 0.03), wheelbase=1.0, speed_offset=0.3),
 ]
 
 
@@ -101,3 +105,109 @@ def test_every_estimator_hears_between_the_steps_and_tracks_at_their_ends(name):
     off = trial.track.pose.mean - drive.truth.path
     assert np.hypot(*off[:, :2].T).max() < 0.2
     assert trial.track.landmarks.landmark.tolist() == [4, 9]
+
+
+SENSOR = (0.7, -0.3, 0.4)
+
+
+def composed(pose, place):
+    """Return where a place in the axes of a pose is, by complex numbers."""
+    turn = np.exp(1j * pose[2])
+    z = complex(*pose[:2]) + turn * complex(*place[:2])
+    return np.array([z.real, z.imag, np.angle(turn * np.exp(1j * place[2]))])
+
+
+@pytest.mark.parametrize("motion", MOTIONS, ids=lambda motion: motion.model)
+def test_a_sensor_goes_where_the_vehicle_carries_it(motion):
+    drive = replace(driven(motion), sensor=SENSOR)
+    there = at_sensor(drive)
+    pose = there.start.mean
+    for k, (control, dt) in enumerate(zip(there.controls, np.diff(drive.time), strict=True)):
+        np.testing.assert_allclose(pose, composed(drive.truth.path[k], SENSOR), atol=1e-12)
+        pose = motion_step(there.motion, pose, control, dt)
+    np.testing.assert_allclose(pose, composed(drive.truth.path[-1], SENSOR), atol=1e-12)
+
+
+@pytest.mark.parametrize("motion", MOTIONS, ids=lambda motion: motion.model)
+def test_a_sensor_is_as_uncertain_as_the_vehicle_makes_it(motion):
+    # The vehicle's covariance, carried to the sensor, is that of the sensor's own drive: to first
+    # order both are the same linear map of the same noise.
+    drive = replace(driven(motion), sensor=SENSOR)
+    config, estimator = resolve({}), entry("ekf")
+
+    def ends(one):
+        built = estimator.build(config, one.motion)
+        begun = built.init(one.start)
+        return built.predict(begun, one.controls, np.diff(one.time), np.random.default_rng(1))[1]
+
+    whole, there = carried(ends(drive), SENSOR), ends(at_sensor(drive))
+    np.testing.assert_allclose(there.mean, whole.mean, atol=1e-12)
+    np.testing.assert_allclose(there.covariance, whole.covariance, atol=1e-12)
+
+
+def test_covariances_are_carried_by_the_slopes_of_the_pose():
+    rng = np.random.default_rng(3)
+    pose, root = np.array([1.0, -2.0, 2.5]), rng.normal(size=(3, 3))
+    slopes = np.column_stack(
+        [(composed(pose + h, SENSOR) - composed(pose - h, SENSOR)) / 2e-6 for h in 1e-6 * np.eye(3)]
+    )
+    found = carried(Gaussian(mean=pose, covariance=root @ root.T), SENSOR)
+    np.testing.assert_allclose(found.covariance, slopes @ root @ root.T @ slopes.T, rtol=1e-8)
+
+
+FOUR = ("ekf", "iekf", "fastslam", "smoother")
+POSTS = np.array([[2.0, 3.0], [6.0, -2.0], [9.0, 4.0], [5.0, 7.0], [-2.0, 2.0], [1.0, -3.0]])
+
+
+def seen_from(sensor, seed=5):
+    """Return a drive of a car with a sensor, exact but for a little noise, and its scans."""
+    rng = np.random.default_rng(seed)
+    motion = Motion(model="ackermann", control_std=(0.1, 0.02), wheelbase=1.0, speed_offset=0.3)
+    time, path = 0.25 * np.arange(161.0), [np.zeros(3)]
+    told = np.column_stack((np.full(160, 0.8), 0.22 + 0.1 * np.sin(time[1:])))
+    done = told + rng.normal(size=told.shape) * motion.control_std
+    scans = []
+    for control in done:
+        path.append(motion_step(motion, path[-1], control, 0.25))
+        eye = composed(path[-1], sensor)
+        way = (POSTS - eye[:2]) @ [1, 1j] * np.exp(-1j * eye[2])
+        near = np.abs(np.angle(way)) < 1.4
+        stds = {"range_std": 0.03, "bearing_std": 0.01}
+        scans.append(
+            scan_with(
+                np.flatnonzero(near),
+                np.angle(way[near]) + rng.normal(0, 0.01, near.sum()),
+                np.abs(way[near]) + rng.normal(0, 0.03, near.sum()),
+                time=time[len(scans) + 1],
+                **stds,
+            )
+        )
+    start = Gaussian(mean=np.zeros(3), covariance=1e-6 * np.eye(3))
+    truth = Truth(time=time, path=np.array(path), landmarks=(np.arange(len(POSTS)), POSTS))
+    return Drive(
+        motion=motion, start=start, time=time, controls=told, truth=truth, sensor=sensor
+    ), scans
+
+
+@pytest.mark.parametrize("name", FOUR)
+def test_a_sensor_aside_of_a_car_finds_track_and_map(name):
+    drive, scans = seen_from((1.2, 0.4, 0.3))
+    config = resolve(from_flags({"fastslam": {"particles": 60}}))
+    case = Case(strategy="fused", filter=name)
+    right = run_trial(case, drive, scans, config)
+    assert right.scores.position_rmse_aligned_m < 0.1
+    assert right.scores.map_rmse_aligned_m < 0.1
+    wrong = run_trial(case, replace(drive, sensor=(0.0, 0.0, 0.0)), scans, config)
+    assert wrong.scores.position_rmse_aligned_m > 3.0 * right.scores.position_rmse_aligned_m
+
+
+def test_a_track_is_the_vehicles_again_and_a_sensor_at_home_changes_no_bit():
+    drive, scans = seen_from((1.2, 0.4, 0.3))
+    track = run_trial(Case(strategy="fused", filter="smoother"), drive, scans, resolve({})).track
+    there = replace(track, pose=carried(track.pose, drive.sensor), online=None)
+    back = at_vehicle(there, drive.sensor)
+    np.testing.assert_allclose(back.pose.mean, track.pose.mean, atol=1e-12)
+    np.testing.assert_allclose(back.pose.covariance, track.pose.covariance, atol=1e-12)
+    assert at_vehicle(track, (0.0, 0.0, 0.0)) is track
+    home = replace(drive, sensor=(0.0, 0.0, 0.0))
+    assert at_sensor(home) is home

@@ -30,7 +30,7 @@ def wrapped(angle):
 
 def moved(motion, pose, control, dt):
     """Pose after one step, and the Jacobians by pose F (3, 3) and by what is noisy U (3, n)."""
-    models = {"bicycle": bicycle, "unicycle": unicycle, "poses": poses}
+    models = {"bicycle": bicycle, "unicycle": unicycle, "poses": poses, "ackermann": car}
     return models[motion.model](motion, pose, control, dt)
 
 
@@ -73,6 +73,22 @@ def unicycle(_, pose, control, dt):
     by_rate = [v * dt * (slope * c - sinc * s) * dt / 2, v * dt * (slope * s + sinc * c) * dt / 2]
     U = [[dt * sinc * c, by_rate[0]], [dt * sinc * s, by_rate[1]], [0, dt]]
     return np.array(after), np.array(F), np.array(U)
+
+
+def car(motion, pose, control, dt):
+    """The unicycle of the middle of the rear axle, and the chain rule.
+
+    The speed is measured h to the left of it: there it is that of the middle less the rate times h.
+    """
+    (v, g), b, h = control, motion.wheelbase, motion.speed_offset
+    bend = math.tan(g) / b
+    middle = v / (1 - h * bend)
+    after, F, by_middle = unicycle(motion, pose, (middle, middle * bend), dt)
+    bend_by_g = 1 / (b * math.cos(g) ** 2)
+    middle_by_g = v * h * bend_by_g / (1 - h * bend) ** 2
+    inner = [[middle / v if v else 1 / (1 - h * bend), middle_by_g], [0, 0]]
+    inner[1] = [inner[0][0] * bend, middle_by_g * bend + middle * bend_by_g]
+    return after, F, by_middle @ np.array(inner)
 
 
 def poses(_, pose, control, dt):

@@ -12,7 +12,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.config import FARTHEST, FASTEST, LARGEST, LONGEST_STEP, WIDEST, InputError
+from pipistrelle.config import (
+    FARTHEST,
+    FASTEST,
+    LARGEST,
+    LONGEST_STEP,
+    STEEPEST,
+    WIDEST,
+    InputError,
+)
 from pipistrelle.detection.merging import labelled, settled
 from pipistrelle.detection.scans import (
     BEARING,
@@ -41,6 +49,10 @@ MAX_CONTROLS = {
     "unicycle": (
         (FASTEST, WIDEST),
         f"a speed up to {FASTEST:g} m/s, a rate up to {WIDEST:g} rad/s",
+    ),
+    "ackermann": (
+        (FASTEST, STEEPEST),
+        f"a speed up to {FASTEST:g} m/s, a steering angle up to {STEEPEST:g} rad",
     ),
     "poses": (
         (FARTHEST, FARTHEST, WIDEST),

@@ -1,7 +1,7 @@
 r"""Motion models with their Jacobians.
 
-The *controls* of a step are two numbers of a bicycle or a unicycle. Of *poses*, as odometry gives
-them, they are the motion since the previous pose in its axes, forward, sideways and turn,
+The *controls* of a step are two numbers of a bicycle, a unicycle or a car. Of *poses*, as odometry
+gives them, they are the motion since the previous pose in its axes, forward, sideways and turn,
 
 .. math:: (x, y)_k = (x, y)_{k-1} + R(\theta_{k-1}) \, (d_x, d_y), \quad
           \theta_k = \theta_{k-1} + d_\theta
@@ -9,7 +9,8 @@ them, they are the motion since the previous pose in its axes, forward, sideways
 followed, where a recorder states it, by the six numbers of its covariance.
 
 The kernels return plain numbers, so that the filters can inline them; the functions beside them
-return arrays. In the kernels a motion model is a number: 0 bicycle, 1 unicycle, 2 poses.
+return arrays. In the kernels a motion model is a number: 0 bicycle, 1 unicycle, 2 poses,
+3 Ackermann.
 """
 
 import math
@@ -22,10 +23,11 @@ from jaxtyping import Float
 
 from pipistrelle.config import LARGEST, InputError
 from pipistrelle.geometry import wrap, wrap_angle
-from pipistrelle.jit import Whole, kernel, no_alloc
+from pipistrelle.jit import kernel, no_alloc
 
-MOTION_MODELS = ("bicycle", "unicycle", "poses")
+MOTION_MODELS = ("bicycle", "unicycle", "poses", "ackermann")
 BY_POSES = MOTION_MODELS.index("poses")
+ACKERMANN = MOTION_MODELS.index("ackermann")
 MOVED = 3
 """How many numbers a relative motion has; those of its covariance follow: xx, xy, xh, yy, yh,
 hh."""
@@ -35,15 +37,19 @@ hh."""
 class Motion:
     """A motion model and the noise of its controls."""
 
-    model: Literal["bicycle", "unicycle", "poses"]
-    """Controls are speed [m/s] and steering angle [rad]; speed [m/s] and angular rate [rad/s]; or
-    the motion since the pose before: forward, sideways (to the left) [m] and turn [rad], perhaps
-    with its covariance xx, xy, xh, yy, yh, hh (x forward, h turn; NaN: not stated)."""
+    model: Literal["bicycle", "unicycle", "poses", "ackermann"]
+    """Controls are speed [m/s] and steering angle [rad], of a bicycle, whose pose is the front
+    wheel's, or of a car (Ackermann), whose pose is that of the middle of the rear axle; speed [m/s]
+    and angular rate [rad/s]; or the motion since the pose before: forward, sideways (to the left)
+    [m] and turn [rad], perhaps with its covariance xx, xy, xh, yy, yh, hh (x forward, h turn; NaN:
+    not stated)."""
     control_std: tuple[float, ...]
     """Noise of one control step, a number for each of these; of poses, of a motion that does not
     state its covariance."""
     wheelbase: float = 1.0
-    """[m], of a bicycle."""
+    """[m], of a bicycle or a car."""
+    speed_offset: float = 0.0
+    """How far left of the middle of its rear axle a car's speed is measured [m]."""
     noise_at_rest: bool = True
     """False: a step without motion is exact."""
 
@@ -62,6 +68,11 @@ class Motion:
             )
         if not 0.0 < self.wheelbase <= LARGEST:
             raise InputError(f"motion: found wheelbase {self.wheelbase!r}, expected one above 0 m")
+        if not abs(self.speed_offset) <= 0.5 * self.wheelbase:
+            raise InputError(
+                f"motion: found speed_offset {self.speed_offset!r} beside wheelbase "
+                f"{self.wheelbase!r}, expected half of it at most"
+            )
         object.__setattr__(self, "control_std", tuple(stds.tolist()))
 
 
@@ -74,6 +85,7 @@ class MotionNumbers(NamedTuple):
     sideways_variance: float
     turn_variance: float
     noise_at_rest: bool
+    speed_offset: float
 
 
 @lru_cache(maxsize=16)
@@ -86,12 +98,13 @@ def motion_numbers(motion: Motion) -> MotionNumbers:
         sideways_variance=float(motion.control_std[1]) ** 2 if motion.model == "poses" else 0.0,
         turn_variance=float(motion.control_std[-1]) ** 2,
         noise_at_rest=motion.noise_at_rest,
+        speed_offset=float(motion.speed_offset),
     )
 
 
 @no_alloc
 def motion_increment(
-    model: Whole, wheelbase: float, heading: float, control: Float[np.ndarray, " c"], dt: float
+    motion: MotionNumbers, heading: float, control: Float[np.ndarray, " c"], dt: float
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
     """Take one noise-free control step, for kernels.
 
@@ -99,7 +112,7 @@ def motion_increment(
     heading). The derivatives of x and y by heading are -dy and dx. Of poses the column by the
     sideways motion is missing: it is the first, turned by 90 degrees.
     """
-    if model == BY_POSES:
+    if motion.model == BY_POSES:
         c, s = math.cos(heading), math.sin(heading)
         ahead, aside = control[0], control[1]
         return (
@@ -108,15 +121,25 @@ def motion_increment(
             0.0, 0.0, 1.0,
         )  # fmt: skip
     speed, turn = control[0], control[1]
-    if model == 0:
+    if motion.model == 0:
         c, s = math.cos(heading + turn), math.sin(heading + turn)
         dx, dy = speed * dt * c, speed * dt * s
-        yaw = dt / wheelbase
+        yaw = dt / motion.wheelbase
         return (
             dx, dy, speed * yaw * math.sin(turn),
             dt * c, dt * s, yaw * math.sin(turn),
             -dy, dx, speed * yaw * math.cos(turn),
         )  # fmt: skip
+    if motion.model == ACKERMANN:
+        return _car_increment(motion, heading, control, dt)
+    return _arc(heading, speed, turn, dt)
+
+
+@no_alloc
+def _arc(
+    heading: float, speed: float, turn: float, dt: float
+) -> tuple[float, float, float, float, float, float, float, float, float]:
+    """Go along the arc of a speed and an angular rate; returns what `motion_increment` does."""
     half = 0.5 * turn * dt
     if abs(half) < 1e-4:
         sinc, slope = 1.0 - half * half / 6.0, -half / 3.0
@@ -131,6 +154,26 @@ def motion_increment(
         dx, dy, turn * dt,
         chord * c, chord * s, 0.0,
         bend * (slope * c - sinc * s), bend * (slope * s + sinc * c), dt,
+    )  # fmt: skip
+
+
+@no_alloc
+def _car_increment(
+    motion: MotionNumbers, heading: float, control: Float[np.ndarray, " c"], dt: float
+) -> tuple[float, float, float, float, float, float, float, float, float]:
+    """Go as a car does; returns what `motion_increment` does."""
+    bend = math.tan(control[1]) / motion.wheelbase
+    share = 1.0 / (1.0 - motion.speed_offset * bend)
+    speed = control[0] * share
+    dx, dy, turn, xs, ys, _, xr, yr, _ = _arc(heading, speed, speed * bend, dt)
+    steer = (1.0 + (motion.wheelbase * bend) ** 2) / motion.wheelbase
+    by_steering = speed * motion.speed_offset * share * steer
+    rate_by_steering = speed * share * steer
+    return (
+        dx, dy, turn,
+        share * (xs + bend * xr), share * (ys + bend * yr), share * bend * dt,
+        by_steering * xs + rate_by_steering * xr, by_steering * ys + rate_by_steering * yr,
+        rate_by_steering * dt,
     )  # fmt: skip
 
 
@@ -162,9 +205,7 @@ def propagate_pose(
 
     F P F^T + U Q U^T (Bradley & Abaid, Eq. (10)); Q has rank 2, of poses 3. Returns dx and dy [m].
     """
-    dx, dy, dheading, u00, u10, u20, u01, u11, u21 = motion_increment(
-        motion.model, motion.wheelbase, pose[2], control, dt
-    )
+    dx, dy, dheading, u00, u10, u20, u01, u11, u21 = motion_increment(motion, pose[2], control, dt)
     pose[0] += dx
     pose[1] += dy
     pose[2] = wrap_angle(pose[2] + dheading)
@@ -205,7 +246,9 @@ def motion_step(
 
     for the bicycle's front wheel; for the unicycle the exact arc of speed V and angular rate
     omega, written by its chord :math:`V\Delta_t \operatorname{sinc}(\omega\Delta_t/2)`; of poses
-    the motion as it is.
+    the motion as it is. A car's middle of the rear axle goes along the arc of the speed
+    :math:`V / (1 - h \tan(\gamma) / B)` and of that times :math:`\tan(\gamma) / B`, where V is
+    measured h to the left of it.
 
     Parameters
     ----------
@@ -374,4 +417,4 @@ def _increment(
     """Call `motion_increment` with arrays."""
     numbers = motion_numbers(motion)
     control = np.asarray(control, dtype=float)
-    return motion_increment(numbers.model, numbers.wheelbase, pose[2], control, dt)
+    return motion_increment(numbers, pose[2], control, dt)

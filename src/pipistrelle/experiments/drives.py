@@ -9,12 +9,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.estimation.beliefs import Gaussian, Landmarks, no_landmarks
+from pipistrelle.estimation.beliefs import Gaussian, Landmarks, Track, no_landmarks
 from pipistrelle.estimation.motion import Motion, relative_motions
-from pipistrelle.geometry import path_at, points_at
+from pipistrelle.geometry import path_at, points_at, wrap
 
 LabelledPoints = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]
 """Labels and positions [m] of landmarks."""
+Pose = tuple[float, float, float]
+"""x, y [m] and heading [rad]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,6 +62,8 @@ class Drive:
         Where landmarks stand that are known beforehand, and how surely.
     moving : dict of label to str
         Names of the callers that move: no landmarks, though heard.
+    sensor : (3) [m, m, rad]
+        Where the sensor is in the vehicle: ahead, to the left, and turned to the left.
     """
 
     motion: Motion
@@ -69,6 +73,7 @@ class Drive:
     truth: Truth = NO_TRUTH
     known: Landmarks = field(default_factory=no_landmarks)
     moving: Mapping[int, str] = field(default_factory=dict)
+    sensor: Pose = (0.0, 0.0, 0.0)
 
 
 def split_at(drive: Drive, times: Sequence[float]) -> tuple[Drive, Int[np.ndarray, " t"]]:
@@ -117,3 +122,91 @@ def split_at(drive: Drive, times: Sequence[float]) -> tuple[Drive, Int[np.ndarra
     parts = np.column_stack((moved, spread[:, rows, columns]))
     split = replace(drive, motion=motion, time=fine, controls=parts, truth=truth)
     return split, np.searchsorted(fine, time)
+
+
+def at_sensor(drive: Drive) -> Drive:
+    r"""Return the drive of the sensor itself, in place of the vehicle that carries it.
+
+    Where the sensor sits at :math:`S` in the vehicle, the motion D of the vehicle is that of
+    :math:`S^{-1} D S` of the sensor, whatever the motion model. Controls are then motions from
+    pose to pose with their covariances (`pipistrelle.estimation.motion`), and estimators need not
+    know where a sensor sits.
+
+    Parameters
+    ----------
+    drive : Drive
+
+    Returns
+    -------
+    Drive
+        The same where the sensor is where the vehicle is.
+
+    Examples
+    --------
+    A sensor 2 m ahead of a vehicle that turns on the spot goes sideways.
+
+    >>> motion = Motion(model="unicycle", control_std=(0.1, 0.1))
+    >>> start = Gaussian(mean=np.zeros(3), covariance=np.zeros((3, 3)))
+    >>> drive = Drive(motion=motion, start=start, time=np.array([0.0, 1.0]),
+    ...               controls=np.array([[0.0, 0.01]]), sensor=(2.0, 0.0, 0.0))
+    >>> at_sensor(drive).controls[0, :3].round(3) + 0.0, at_sensor(drive).start.mean
+    (array([0.  , 0.02, 0.01]), array([2., 0., 0.]))
+    """
+    if not any(drive.sensor):
+        return drive
+    way, covariance = relative_motions(drive.motion, drive.controls, np.diff(drive.time))
+    moved, turned = (
+        carried(Gaussian(mean=way, covariance=covariance), drive.sensor),
+        drive.sensor[2],
+    )
+    c, s = np.cos(turned), np.sin(turned)
+    back = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    ways = np.einsum("ij,kj->ki", back, moved.mean - np.array(drive.sensor))
+    ways[:, 2] = way[:, 2]  # turns are not wrapped
+    spread = np.einsum("ij,kjl,ml->kim", back, moved.covariance, back)
+    rows, columns = np.triu_indices(3)
+    return replace(
+        drive,
+        motion=Motion(model="poses", control_std=(0.0, 0.0, 0.0)),
+        start=carried(drive.start, drive.sensor),
+        controls=np.column_stack((ways, spread[:, rows, columns])),
+        sensor=(0.0, 0.0, 0.0),
+    )
+
+
+def at_vehicle(track: Track, sensor: Pose) -> Track:
+    """Return the track of a vehicle by that of the sensor that it carries at `sensor`."""
+    if not any(sensor):
+        return track
+    x, y, turned = sensor
+    c, s = np.cos(turned), np.sin(turned)
+    vehicle = (-c * x - s * y, s * x - c * y, -turned)
+    cloud, online = track.cloud, track.online
+    if cloud is not None:
+        none = np.zeros((len(cloud), 3, 3))
+        cloud = carried(Gaussian(mean=cloud, covariance=none), vehicle).mean
+    return replace(
+        track,
+        pose=carried(track.pose, vehicle),
+        cloud=cloud,
+        online=None if online is None else carried(online, vehicle),
+    )
+
+
+def carried(path: Gaussian, place: Pose) -> Gaussian:
+    """Return where something is that poses carry at a place in their axes.
+
+    The right-invariant error of a pose is that of whatever it carries.
+    """
+    x, y, turned = place
+    heading = path.mean[..., 2]
+    c, s = np.cos(heading), np.sin(heading)
+    offset = np.stack((c * x - s * y, s * x + c * y, np.full_like(c, turned)), axis=-1)
+    mean = path.mean + offset
+    mean[..., 2] = wrap(mean[..., 2])
+    if path.invariant:
+        return replace(path, mean=mean)
+    slopes = np.broadcast_to(np.eye(3), path.covariance.shape).copy()
+    slopes[..., 0, 2], slopes[..., 1, 2] = -offset[..., 1], offset[..., 0]
+    spread = np.einsum("...ij,...jk,...lk->...il", slopes, path.covariance, slopes)
+    return replace(path, mean=mean, covariance=0.5 * (spread + np.swapaxes(spread, -1, -2)))

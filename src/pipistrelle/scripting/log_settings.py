@@ -95,6 +95,8 @@ def with_log(layer: Layer, recorded: "Log", log: Path) -> tuple[Config, list[str
     """Resolve settings with those that a log decides; warn of each that asked for another value."""
     decided = {key: Given(getattr(recorded, key[1]), f"{log}: {key[1]}") for key in LOGGED}
     own = {key: Given(value, "slam") for key, value in OWN.items()}
+    for name, value in recorded.association.items():
+        own["association", name] = Given(value, f"{log}: association.{name}")
     if recorded.gate is not None:
         own[GATE_KEY] = Given(recorded.gate, str(log))
     moves = any(caller.moves for caller in recorded.callers)

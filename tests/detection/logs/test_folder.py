@@ -498,7 +498,7 @@ def test_no_column_goes_before_the_four(tmp_path, stated):
         ("velocity_std", "velocity_sdt", ("unknown key 'velocity_sdt'", "mean 'velocity_std'?")),
         ("range_std = 0.2", "range_std = 0.2\ncolour = 3", ("unknown key 'colour'", "remove it")),
         ("format = 1", "format = 2", ("key 'format': found 2", "expected 1")),
-        ('"unicycle"', '"tricycle"', ("'tricycle'", "expected 'unicycle', 'bicycle' or 'poses'")),
+        ('"unicycle"', '"tricycle"', ("'tricycle'", "'unicycle', 'bicycle', 'ackermann' or")),
         ("range_std = 0.2", "range_std = -0.2", ("'range_std': found -0.2", "equal to 0.000001")),
         ("range_std = 0.2", "range_std = nan", ("'range_std': found nan", "finite number")),
         ("range_std = 0.2", 'range_std = "0.2"', ("'range_std': found '0.2'", "valid number")),
@@ -512,6 +512,22 @@ def test_no_column_goes_before_the_four(tmp_path, stated):
         ("[0.5, 20.0]", "[0.0, 20.0]", ("'range_bounds[0]': found 0.0", "greater than 0")),
         ("range_std = 0.2", "range_std = 0.2\nstep = 0", ("'step': found 0", "greater than 0")),
         ("range_std = 0.2", "range_std = 0.2\ngate = 1.5", ("'gate': found 1.5", "equal to 1")),
+        ("range_std = 0.2", "range_std = 0.2\nsensor_pose = [1.0, 2.0]", ("2 values, expected 3",)),
+        (
+            "range_std = 0.2",
+            "range_std = 0.2\nsensor_pose = [nan, 2.0, 0.0]",
+            ("'sensor_pose[0]': found nan", "finite"),
+        ),
+        (
+            "[0.5, 20.0]",
+            "[0.5, 20.0]\n[association]\nfield_of_view = 180.0",
+            ("'association.field_of_view': found 180.0", "6.28"),
+        ),
+        (
+            "[0.5, 20.0]",
+            "[0.5, 20.0]\n[association]\nrange = 7.0",
+            ("unknown key 'association.range'", "max_range"),
+        ),
         ("range_std = 0.2", "range_std = ", ("TOML", "line 7")),
         ("range_std = 0.2", "range_std = 1e155", ("'range_std': found 1e+155", "less than")),
         (
@@ -535,6 +551,34 @@ def test_the_settings_of_the_other_vehicle_are_refused(tmp_path):
     settings = UNICYCLE.replace('"unicycle"', '"bicycle"')
     message = refused(recorded(tmp_path, settings), "unknown key 'velocity_std'", "speed_std")
     assert "angular" not in message
+
+
+CAR = BICYCLE.replace("bicycle", "ackermann") + "speed_offset = -0.1\n"
+STEERED = "time,speed,steering\n0.0,1.0,0.1\n0.1,2.0,{}\n0.3,3.0,0.3\n0.4,9.0,0.9\n"
+
+
+def test_a_car_says_where_its_speed_is_measured(tmp_path):
+    log = read_log(recorded(tmp_path, CAR, STEERED.format(-1.0)))
+    assert (log.motion, log.wheelbase, log.speed_offset) == ("ackermann", 0.3, -0.1)
+    assert log.controls[1].tolist() == [2.0, -1.0]
+
+
+def test_a_car_that_measures_its_speed_outside_itself_is_refused(tmp_path):
+    settings = CAR.replace("-0.1\n", "0.16\n")
+    refused(recorded(tmp_path, settings, STEERED.format(0)), "speed_offset", "half the wheelbase")
+
+
+@pytest.mark.parametrize("steering", [1.2, -30.0])
+def test_a_car_that_steers_across_is_asked_for_radians(tmp_path, steering):
+    folder = recorded(tmp_path, CAR, STEERED.format(steering))
+    refused(folder, "odometry.csv, line 3", f"steering {steering}", "radians")
+
+
+def test_a_log_may_say_where_its_sensor_is_and_what_it_sees(tmp_path):
+    more = "sensor_pose = [3.8, 0.5, 0.1]\n[association]\nmax_range = 50\nclutter = 0.01\n"
+    log = read_log(recorded(tmp_path, UNICYCLE + more))
+    assert log.sensor_pose == (3.8, 0.5, 0.1)
+    assert log.association == {"max_range": 50.0, "clutter": 0.01}
 
 
 def test_steps_without_number_are_refused_before_they_fill_the_memory(tmp_path):
@@ -623,6 +667,13 @@ def test_a_clock_of_this_century_in_seconds_is_welcome(tmp_path):
 
 def test_every_setting_survives_being_written(tmp_path, folder):
     log = replace(read_log(folder), gate=0.97, noise_at_rest=False, initial_pose=(0.1, 1e-7, 3.0))
+    log = replace(log, sensor_pose=(0.1, 0.2, -3.0), association={"detection": 0.5})
+    write_log(tmp_path / "again" / "drive", log)
+    assert same(read_log(tmp_path / "again" / "drive"), log)
+
+
+def test_a_car_survives_being_written(tmp_path):
+    log = read_log(recorded(tmp_path / "drive", CAR, STEERED.format(0.2)))
     write_log(tmp_path / "again" / "drive", log)
     assert same(read_log(tmp_path / "again" / "drive"), log)
 

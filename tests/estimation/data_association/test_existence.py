@@ -14,14 +14,15 @@ from pipistrelle.estimation.data_association.existence import (
     with_new,
 )
 
-NONE = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0)
+NONE = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0), np.empty(0)
 AHEAD = np.array([0.0, 0.0, 0.0, 4.0, 0.0])
 THERE = (AHEAD, np.array([3]), np.array([-2]))
 
 
-def row(label=1, way=4.0, level=40.0):
+def row(label=1, way=4.0, level=40.0, bearing=0.0):
     """Return one row of the vehicle's own call."""
-    return np.array([label]), np.zeros(1, np.int64), np.array([way]), np.array([level])
+    own = np.zeros(1, np.int64)
+    return np.array([label]), own, np.array([way]), np.array([level]), np.array([bearing])
 
 
 def heard_so_often(times):
@@ -63,6 +64,44 @@ def test_a_landmark_that_should_have_been_heard_and_was_not_is_given_up():
 def test_nothing_is_expected_where(why, rows, there, near):
     known = heard_so_often(3)
     after = judged(known, rows, there, np.array([near]), 3)
+    assert after.odds[0] == known.odds[0], why
+
+
+LIDAR = (5.0, 2.0)
+UNSEEN = row(label=-1, way=4.9, level=np.nan)
+
+
+def seen_so_often(times, sight=LIDAR):
+    """Return a landmark that a sensor without levels saw."""
+    known = with_new(nobody(1), [1], 0, 1)
+    for scan in range(times):
+        known = judged(known, row(level=np.nan), THERE, np.array([False]), scan, sight)
+    return known
+
+
+def test_a_sensor_without_levels_misses_what_is_within_its_sight():
+    known = seen_so_often(3)
+    for rows in (NONE, UNSEEN):
+        missed = judged(known, rows, THERE, np.array([False]), 3, LIDAR)
+        assert missed.odds[0] == pytest.approx(known.odds[0] - MISSED)
+
+
+@pytest.mark.parametrize(
+    ("why", "rows", "where", "sight", "near"),
+    [
+        ("its sight is not known", NONE, (4.0, 0.0), (0.0, 7.0), False),
+        ("it is too far", NONE, (4.6, 0.0), LIDAR, False),
+        ("it is aside of the field of view", NONE, (2.2, 3.3), LIDAR, False),
+        ("it is behind", NONE, (-4.0, 0.1), LIDAR, False),
+        ("a row may have been its own", UNSEEN, (4.0, 0.0), LIDAR, True),
+        ("something stands before it", row(-1, 2.0, np.nan, 0.03), (4.0, 0.0), LIDAR, False),
+        ("others have levels", row(-1, 4.9, 30.0), (4.0, 0.0), LIDAR, False),
+    ],
+)
+def test_a_sensor_without_levels_misses_nothing_where(why, rows, where, sight, near):
+    known = seen_so_often(3)
+    there = (np.array([0.0, 0.0, 0.0, *where]), *THERE[1:])
+    after = judged(known, rows, there, np.array([near]), 3, sight)
     assert after.odds[0] == known.odds[0], why
 
 

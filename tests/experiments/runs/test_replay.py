@@ -17,13 +17,15 @@ from pipistrelle.config import (
 )
 from pipistrelle.detection.logs.folder import read_log, write_log
 from pipistrelle.detection.logs.readers import Reader
-from pipistrelle.detection.logs.recording import LogCaller
+from pipistrelle.detection.logs.recording import Log, LogCaller
 from pipistrelle.detection.scans import COLUMNS, make_scan, with_columns
 from pipistrelle.estimation.measurement import excess_path_of
 from pipistrelle.experiments.drives import NO_TRUTH
 from pipistrelle.experiments.runs.replay import as_heard_by, load, motion_of, replay, start_of
 from pipistrelle.experiments.runs.truth_files import read_truth, write_truth
 from pipistrelle.geometry import range_and_bearing
+from pipistrelle.scripting.log_settings import with_log
+from pipistrelle.settings import from_flags
 from reference.missions import scan_with
 
 DATA = Path(__file__).parents[2] / "data"
@@ -502,3 +504,48 @@ def test_a_log_without_labels_is_refused_with_the_option_that_solves_it():
     (trial,) = replay(bare, NO_TRUTH, ["fused"], ["ekf"], None, config).trials
     assert sum((label > 0).sum() for label in trial.track.labels) > 0
     assert trial.scores.associated_right is None, "nobody knows"
+
+
+def test_a_post_stands_where_a_sensor_aside_of_the_vehicle_sees_it():
+    # The sensor is 1 m ahead and 2 m to the left and looks to the left: 3 m ahead of it is (1, 5).
+    log = replace(a_log(), sensor_pose=(1.0, 2.0, np.pi / 2))
+    log = replace(log, scans=(scan_with([7], [0.0], [3.0], time=0.0),))
+    for name in ("ekf", "iekf", "fastslam", "smoother"):
+        (trial,) = replay(log, NO_TRUTH, ["active"], [name], None, Config()).trials
+        np.testing.assert_allclose(trial.track.landmarks.mean, [[1.0, 5.0]], atol=0.1)
+        np.testing.assert_allclose(trial.track.pose.mean[0], 0.0, atol=0.05)
+
+
+@pytest.mark.parametrize("asked", ["speed_scale", "turn_bias"])
+def test_odometry_is_not_calibrated_beside_a_sensor_that_is_elsewhere(asked):
+    config = Config(filter=FilterConfig(calibrate=(asked,)))
+    log = replace(a_log(), sensor_pose=(1.0, 0.0, 0.0))
+    with pytest.raises(InputError, match=rf"filter\.calibrate: found '{asked}'.*sensor_pose"):
+        replay(log, NO_TRUTH, ["active"], ["smoother"], None, config)
+
+
+def test_what_a_log_says_of_its_sensor_is_the_default_of_the_settings():
+    log = replace(a_log(), association={"clutter": 0.01, "max_range": 50.0})
+    settled, _ = with_log({}, log, Path("log"))
+    assert (settled.association.clutter, settled.association.max_range) == (0.01, 50.0)
+    asked, _ = with_log(from_flags({"association": {"clutter": 0.5}}), log, Path("log"))
+    assert asked.association.clutter == 0.5
+
+
+def a_log():
+    """A vehicle that stands."""
+    return Log(
+        name="stand",
+        time=np.array([0.0, 1.0]),
+        controls=np.zeros((1, 2)),
+        dt=np.ones(1),
+        scans=(scan_with([7], [0.0], [3.0], time=0.0),),
+        motion="unicycle",
+        control_std=(0.01, 0.01),
+        initial_pose=(0.0, 0.0, 0.0),
+        initial_pose_std=(0.001, 0.001, 0.001),
+        range_std=0.01,
+        bearing_std=0.01,
+        range_bounds=(0.5, 20.0),
+        ignored_rows={},
+    )

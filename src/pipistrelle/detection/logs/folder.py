@@ -5,6 +5,7 @@ measurements scans.
 """
 
 from dataclasses import asdict
+from math import inf, pi
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,6 +15,7 @@ from pydantic import ConfigDict, Field, ValidationError, field_validator
 from pipistrelle.config import (
     LONGEST_STEP,
     MAX_OTHERS,
+    STEEPEST,
     AngleStd,
     DistanceStd,
     InputError,
@@ -32,7 +34,7 @@ from pipistrelle.detection.logs.recording import (
     LogCaller,
     assemble,
 )
-from pipistrelle.detection.logs.text_tables import FORMER_NAMES, read_table, table_text
+from pipistrelle.detection.logs.text_tables import FORMER_NAMES, Table, read_table, table_text
 from pipistrelle.files import read_text
 from pipistrelle.own_files import LOG, OwnFiles
 from pipistrelle.refusals import expectation, meant, refusal, shown, values_expected
@@ -41,12 +43,14 @@ from pipistrelle.settings import parse_toml
 _Triple = Annotated[tuple[Real, Real, Real], Field(strict=False)]
 _Triple_std = Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(strict=False)]
 _Bounds = Annotated[tuple[Positive, Positive], Field(strict=False)]
+_Turn = Annotated[Positive, Field(le=2.0 * pi)]
 _Point = Annotated[tuple[Real, Real], Field(strict=False)]
 _Point_std = Annotated[tuple[NonNegative, NonNegative], Field(strict=False)]
 
 _NOISY = {
     "unicycle": ("velocity", "angular_rate"),
     "bicycle": ("speed", "steering"),
+    "ackermann": ("speed", "steering"),
     "poses": ("forward", "sideways", "turn"),
 }
 """What of a row of odometry has a standard deviation in ``log.toml``."""
@@ -98,11 +102,22 @@ class _CallerTable(Section):
         return std
 
 
+class _AssociationTable(Section):
+    """What is known of the sensor; settings of the same names."""
+
+    model_config = ConfigDict(strict=True)
+
+    detection: Probability | None = None
+    clutter: Positive | None = None
+    max_range: Positive | None = None
+    field_of_view: _Turn | None = None
+
+
 class _Settings(Section):
     model_config = ConfigDict(strict=True)
 
     format: Literal[1]
-    motion: Literal["unicycle", "bicycle", "poses"]
+    motion: Literal["unicycle", "bicycle", "ackermann", "poses"]
     initial_pose: _Triple
     initial_pose_std: _Triple_std
     range_std: DistanceStd
@@ -112,6 +127,8 @@ class _Settings(Section):
     step: Annotated[Positive, Field(le=LONGEST_STEP)] | None = None
     gate: Probability | None = None
     noise_at_rest: bool = True
+    sensor_pose: _Triple = (0.0, 0.0, 0.0)
+    association: _AssociationTable = _AssociationTable()
     callers: Annotated[tuple[_CallerTable, ...], Field(strict=False, max_length=MAX_OTHERS)] = ()
 
     @field_validator("callers")
@@ -143,6 +160,17 @@ class _BicycleSettings(_Settings):
     wheelbase: Positive
 
 
+class _AckermannSettings(_BicycleSettings):
+    speed_offset: Real = 0.0
+
+    @field_validator("speed_offset")
+    @classmethod
+    def _within_the_car(cls, offset: float, known: Any) -> float:
+        if abs(offset) > 0.5 * known.data.get("wheelbase", inf):
+            raise ValueError("at most half the wheelbase")
+        return offset
+
+
 class _PosesSettings(_Settings):
     forward_std: NonNegative
     sideways_std: NonNegative
@@ -152,6 +180,7 @@ class _PosesSettings(_Settings):
 _SETTINGS: dict[str, type[_Settings]] = {
     "unicycle": _UnicycleSettings,
     "bicycle": _BicycleSettings,
+    "ackermann": _AckermannSettings,
     "poses": _PosesSettings,
 }
 _SHARED = tuple(name for name in _Settings.model_fields if name not in ("format", "step"))
@@ -217,17 +246,33 @@ def read_log(folder: Path) -> Log:
     )
     measured.column[CALLER] += 1.0  # the vehicle is number 0
     values = {name: getattr(settings, name) for name in _SHARED}
+    values["association"] = settings.association.model_dump(exclude_none=True)
     values["callers"] = tuple(LogCaller(**caller.model_dump()) for caller in settings.callers)
+    odometry = read_table(folder / "odometry.csv", columns, optional=optional)
+    if settings.motion == "ackermann":
+        _check_steering(odometry)
     return assemble(
-        read_table(folder / "odometry.csv", columns, optional=optional),
+        odometry,
         measured,
         step=settings.step,
         name=folder.resolve().name,
         former_names=(*measured.former, *former),
         wheelbase=getattr(settings, "wheelbase", 1.0),
+        speed_offset=getattr(settings, "speed_offset", 0.0),
         control_std=tuple(getattr(settings, f"{name}_std") for name in stds),
         **values,
     )
+
+
+def _check_steering(odometry: Table) -> None:
+    """Refuse what no car's front wheels do."""
+    steering = odometry.column["steering"]
+    wrong = np.abs(steering) > STEEPEST
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        where = f"{odometry.path}, line {odometry.line[row]}"
+        expected = f"an angle from -{STEEPEST:g} to {STEEPEST:g} rad"
+        raise refusal(where, f"steering {steering[row].item()!r}", expected, "is it in radians?")
 
 
 def write_log(folder: Path, log: Log) -> None:
@@ -276,8 +321,11 @@ def log_files(log: Log) -> dict[str, str]:
     settings["callers"] = [asdict(caller) for caller in log.callers]
     stds = zip(_NOISY[log.motion], log.control_std, strict=True)
     settings |= {f"{name}_std": std for name, std in stds}
-    if log.motion == "bicycle":
+    if log.motion in ("bicycle", "ackermann"):
         settings["wheelbase"] = log.wheelbase
+    if log.motion == "ackermann":
+        settings["speed_offset"] = log.speed_offset
+    settings["association"] = dict(log.association)
     model = _SETTINGS[log.motion].model_validate(settings)
     text = tomli_w.dumps(model.model_dump(mode="json", exclude_defaults=True, exclude_none=True))
     driven = _odometry_columns(log)
@@ -322,11 +370,14 @@ def _key_refusal(path: Path, fault: Any, model: type[_Settings]) -> InputError:
     if name in known and (count := values_expected(fault, known[name])) is not None:
         found = f"{len(fault['input'])} values"
         return refusal(f"{path}, key {name!r}", found, f"{count}", "mend the list")
-    key = "".join(f"[{p}]" if isinstance(p, int) else str(p) for p in fault["loc"])
+    if name == "association" and len(fault["loc"]) > 1:
+        known = _AssociationTable.model_fields
+    parts = (f"[{p}]" if isinstance(p, int) else f".{p}" for p in fault["loc"])
+    key = "".join(parts).removeprefix(".")
     if fault["type"] == "missing":
         return refusal(path, f"no key {key!r}", f"the keys {', '.join(known)}", f"add {key!r}")
     if fault["type"] == "extra_forbidden":
-        near = meant(key, known)
+        near = meant(str(fault["loc"][-1]), known)
         fix = f"did you mean {near!r}?" if near else "remove it"
         return refusal(path, f"the unknown key {key!r}", f"one of {', '.join(known)}", fix)
     found = shown(fault["input"])

@@ -9,7 +9,8 @@ all formats, and here alone do recorded measurements become scans.
 
 import math
 from collections import Counter
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -62,16 +63,20 @@ class Log:
     time: Float[np.ndarray, " t"]
     """The start, then the end of each step [s]."""
     controls: Float[np.ndarray, "t-1 c"]
-    """Velocity [m/s] and angular rate [rad/s] (bicycle: speed and steering angle [rad]); of
+    """Velocity [m/s] and angular rate [rad/s] (bicycle, car: speed and steering angle [rad]); of
     poses the motion in the step, forward, sideways [m] and turn [rad], perhaps with its
     covariance (`pipistrelle.estimation.motion`)."""
     dt: Float[np.ndarray, " t-1"]
     """Length of each step [s]."""
     scans: tuple[Scan, ...]
     """In order; each bears exactly the ``time`` entry at which it is used."""
-    motion: Literal["unicycle", "bicycle", "poses"]
+    motion: Literal["unicycle", "bicycle", "poses", "ackermann"]
     wheelbase: float = 1.0
-    """Bicycle only [m]."""
+    """Bicycle and car only [m]."""
+    speed_offset: float = 0.0
+    """How far left of the middle of the rear axle a car's speed is measured [m]."""
+    sensor_pose: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the sensor is in the vehicle: ahead, to the left [m] and turned to the left [rad]."""
     control_std: tuple[float, ...]
     """Noise of the controls in one step, constant over it; of a motion that does not say its
     own."""
@@ -90,6 +95,8 @@ class Log:
     """Nearest and farthest range of a passive landmark [m]."""
     callers: tuple[LogCaller, ...] = ()
     """The other callers; the first is number 1 of the scans' callers."""
+    association: Mapping[str, float] = field(default_factory=dict)
+    """What the log says of its sensor for an association, by the names of settings."""
     gate: float | None = None
     """Share of a measurement's predicted distribution that is accepted; None: not said."""
     ignored_rows: dict[str, int]

@@ -3,8 +3,9 @@ r"""Whether a landmark exists: by how often it was heard, and was not where it s
 Each landmark has log odds. They rise when it is heard. They fall when it is not, though it should
 have been: its level, as it was heard before, is expected at its present distance (spherical
 spreading, there and back of the vehicle's own call) well above what is detected; the vehicle's own
-call was sent towards it as before; and nothing as loud came at the same time. Of rows without a
-level nothing is expected.
+call was sent towards it as before; and nothing as loud came at the same time. Of a sensor that
+tells no levels, a lidar or a camera, a landmark is expected within its range and field of view, if
+these are known, unless something nearer stands before it.
 """
 
 import math
@@ -35,6 +36,9 @@ TOGETHER = 1.0
 """A row hides a landmark whose path differs by less: the length of a call [m]."""
 AIMED = 0.1
 """The vehicle's own call is as loud up to so much from the bearing at which it was heard [rad]."""
+WITHIN, BEFORE = 0.9, 0.05
+"""Without levels a landmark is expected within this share of the sensor's range, so far inside its
+field of view, and where no nearer row is within such a bearing of it [rad]."""
 FORGETTING = 0.2
 """Share of the newest level in the mean."""
 OFTEN = 255
@@ -110,22 +114,33 @@ def merged(known: Known, pairs: Sequence[tuple[int, int]]) -> Known:
 
 
 Heard = tuple[
-    Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, " m"], Float[np.ndarray, " m"]
+    Int[np.ndarray, " m"],
+    Int[np.ndarray, " m"],
+    Float[np.ndarray, " m"],
+    Float[np.ndarray, " m"],
+    Float[np.ndarray, " m"],
 ]
-"""Label, caller, range or excess path and level of each row."""
+"""Label, caller, range or excess path, level and bearing of each row."""
+Sight = tuple[float, float]
+"""Range [m] and field of view [rad] of a sensor that tells no levels; a range of 0: not known."""
 Place = tuple[Float[np.ndarray, " d"], Int[np.ndarray, " l"], Int[np.ndarray, " c"]]
 """Joint mean, where each known landmark stands in it, and each caller; -1: nowhere."""
 
 
 def judged(
-    known: Known, rows: Heard, place: Place, near: Bool[np.ndarray, " l"], scan: int
+    known: Known,
+    rows: Heard,
+    place: Place,
+    near: Bool[np.ndarray, " l"],
+    scan: int,
+    sight: Sight = (0.0, 0.0),
 ) -> Known:
     """Return landmarks after a scan, as known by what was heard and what was not.
 
     ``near``: whether a row may have been of the landmark; then it was not missed.
     """
     after = Known(*(column.copy() for column in known))
-    _judge(tuple(after), rows, place, near, scan)
+    _judge(tuple(after), rows, place, near, scan, sight)
     return after
 
 
@@ -136,9 +151,10 @@ def _judge(
     there: Place,
     near: Bool[np.ndarray, " l"],
     scan: Whole,
+    sight: Sight,
 ) -> None:
     """Write odds, counts and levels after a scan."""
-    known, (label, caller, _, level), (mean, at, callers) = Known(*columns), rows, there
+    known, (label, caller, _, level, _), (mean, at, callers) = Known(*columns), rows, there
     place = np.full(label.size, -1)
     for n in range(known.label.size):
         far, bearing, here = math.nan, math.nan, False
@@ -162,7 +178,7 @@ def _judge(
             known.heard[n] = scan
         else:
             for c in range(0 if near[n] else callers.size):
-                if _expected(known, n, c, far, bearing, rows, (mean, at, callers)):
+                if _expected(known, n, c, far, bearing, rows, (mean, at, callers), sight):
                     known.odds[n] -= MISSED
                     break
             if not known.confirmed[n] and scan - known.heard[n] > PATIENCE:
@@ -194,12 +210,21 @@ def _spreading(caller: Whole, far: float) -> float:
 
 @no_alloc
 def _expected(
-    known: Known, n: Whole, c: Whole, far: float, bearing: float, rows: Heard, place: Place
+    known: Known,
+    n: Whole,
+    c: Whole,
+    far: float,
+    bearing: float,
+    rows: Heard,
+    place: Place,
+    sight: Sight,
 ) -> bool:
     """Tell whether a landmark should have been heard of a caller's call, and nothing hides it."""
-    (_, caller, way, level), (mean, at, callers) = rows, place
-    if math.isnan(far) or math.isnan(known.source[n, c]):
+    (_, caller, way, level, _), (mean, at, callers) = rows, place
+    if math.isnan(far):
         return False
+    if math.isnan(known.source[n, c]):
+        return c == OWN and _in_sight(far, bearing, rows, sight)
     loud = known.source[n, c] - _spreading(c, far)
     if loud < FAINTEST or (c == OWN and abs(wrap_angle(bearing - known.aim[n])) > AIMED):
         return False
@@ -222,3 +247,17 @@ def _expected(
             if abs(other - ahead) < TOGETHER:
                 return False
     return called or c == OWN
+
+
+@no_alloc
+def _in_sight(far: float, bearing: float, rows: Heard, sight: Sight) -> bool:
+    """Tell whether a sensor without levels should have seen a landmark, and nothing hides it."""
+    _, caller, way, level, seen = rows
+    if far > WITHIN * sight[0] or abs(bearing) > 0.5 * sight[1] - BEFORE:
+        return False
+    for m in range(caller.size):
+        if not math.isnan(level[m]):
+            return False
+        if way[m] < far and abs(wrap_angle(seen[m] - bearing)) < BEFORE:
+            return False
+    return True

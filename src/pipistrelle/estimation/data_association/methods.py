@@ -36,6 +36,7 @@ def association_of(config: Config) -> Association | None:
             bearing_std=settings.bearing_std,
             way_std=settings.way_std,
             assumed=(told.bearing_std, told.range_std, told.excess_path_std),
+            sight=(settings.max_range or 0.0, settings.field_of_view),
         )
         return Sequential(match=METHODS[name], chances=tuple(chances), limits=limits)
     if not names_class(name):

@@ -89,6 +89,8 @@ class Limits:
     birth_way_std: float = 0.25
     assumed: tuple[float, ...] = ()
     """Deviations that are assumed of rows which state none: they are as sure as any can be."""
+    sight: tuple[float, float] = (0.0, 0.0)
+    """`existence.Sight`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -266,9 +268,10 @@ class _Work:
         for number, caller in self.callers.items():
             callers[number] = self._where(caller.label)
         way = np.where(scan.caller == OWN, scan.range, scan.excess_path)
-        heard = self.label, scan.caller, way, scan.level_db
-        there, near = self._places(known), np.isin(known.label, list(self.near))
-        return judged(known, heard, (self.joint.mean, there, callers), near, memory.scan)
+        heard = self.label, scan.caller, way, scan.level_db, scan.bearing
+        place = self.joint.mean, self._places(known), callers
+        near = np.isin(known.label, list(self.near))
+        return judged(known, heard, place, near, memory.scan, self.stage.limits.sight)
 
     def _doubles(self, known: Known) -> tuple[tuple[int, int], ...]:
         """Return pairs of landmarks that are one, the older first; asked now and then."""

@@ -82,7 +82,7 @@ def propagate_invariant(
     covariance: Float[np.ndarray, "d d"],
     controls: Float[np.ndarray, "k c"],
     dt: Float[np.ndarray, " k"],
-    motion: tuple[int, float, float, float, float, bool],
+    motion: tuple[int, float, float, float, float, bool, float],
     pose_means: Float[np.ndarray, "k 3"],
     pose_covariances: Float[np.ndarray, "k 3 3"],
 ) -> None:

@@ -154,7 +154,7 @@ def propagate(
     """Propagate all particles through control steps, in place, and summarise after each."""
     for k in range(dt.size):
         control = controls[k]
-        step = motion_increment(motion.model, motion.wheelbase, 0.0, control, dt[k])
+        step = motion_increment(motion, 0.0, control, dt[k])
         if motion.model == BY_POSES:
             noise = relative_noise(control, motion)
             for b in range(pose.shape[0]):

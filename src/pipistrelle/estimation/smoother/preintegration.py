@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 
 from pipistrelle.estimation.beliefs import Gaussian
 from pipistrelle.estimation.motion import (
+    ACKERMANN,
     BY_POSES,
     Motion,
     MotionNumbers,
@@ -159,15 +160,14 @@ def _lead_on(
 ) -> None:
     """Carry slopes of a pose by parameters (`calibration.OF_ODOMETRY`) through a control step."""
     controls, dt = control
-    dx, dy, turn, _, _, sh, tx, ty, th = motion_increment(
-        motion.model, motion.wheelbase, pose[2], controls, dt
-    )
+    dx, dy, turn, sx, sy, sh, tx, ty, th = motion_increment(motion, pose[2], controls, dt)
     for e in range(parameters.size):
         J[0, e] -= dy * J[2, e]
         J[1, e] += dx * J[2, e]
         if parameters[e] == 0:
-            J[0, e] += dx
-            J[1, e] += dy
+            bent = motion.model == ACKERMANN  # its way is not in proportion to its speed
+            J[0, e] += sx * controls[0] if bent else dx
+            J[1, e] += sy * controls[0] if bent else dy
             J[2, e] += 0.0 if motion.model == BY_POSES else sh * controls[0]
         elif parameters[e] == 1 and motion.model == BY_POSES:
             J[2, e] += dt

@@ -28,6 +28,7 @@ from pipistrelle.detection.scans import (
 from pipistrelle.estimation.association import KNOWN
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks
 from pipistrelle.estimation.motion import Motion
+from pipistrelle.estimation.smoother.calibration import OF_ODOMETRY
 from pipistrelle.evaluation.association import Causes, causes_of
 from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.experiments.hearing.listening import Progress
@@ -173,6 +174,7 @@ def motion_of(log: Log) -> Motion:
         model=log.motion,
         control_std=log.control_std,
         wheelbase=log.wheelbase,
+        speed_offset=log.speed_offset,
         noise_at_rest=log.noise_at_rest,
     )
 
@@ -254,8 +256,10 @@ def replay(
         truth=truth,
         known=_known_callers(log),
         moving={who.landmark: who.name for who in log.callers if who.moves},
+        sensor=log.sensor_pose,
     )
     check_filters(filters, drive.motion, config, drive.moving.values())
+    _check_calibrated(log, config)
     noise, known = noise_of(config.filter), config.association.method == KNOWN
     if known and _is_bare(log):
         raise refusal(log.name, "rows without labels", LABELS, "add --association.method marginal")
@@ -280,6 +284,14 @@ def replay(
         filters, drive, heard, config, causes=causes, progress=progress, watch=watch
     )
     return Mission(config=config, drive=drive, trials=trials, beamwidth=beamwidth, log=log)
+
+
+def _check_calibrated(log: Log, config: Config) -> None:
+    """Refuse to calibrate the odometry of a vehicle whose sensor is elsewhere."""
+    asked = [name for name in config.filter.calibrate if name in OF_ODOMETRY]
+    if asked and any(log.sensor_pose):
+        expected = f"none of {', '.join(OF_ODOMETRY)} beside a sensor_pose"
+        raise refusal("filter.calibrate", repr(asked[0]), expected, "leave it out")
 
 
 LABELS = "labels of landmarks, or an association"

@@ -23,7 +23,7 @@ from pipistrelle.estimation.catalogue import CATALOGUE, entry, short_name
 from pipistrelle.estimation.data_association.methods import association_of
 from pipistrelle.evaluation.association import Causes, associated, renamed
 from pipistrelle.experiments.cases import Case
-from pipistrelle.experiments.drives import Drive, Truth, split_at
+from pipistrelle.experiments.drives import Drive, Truth, at_sensor, at_vehicle, split_at
 from pipistrelle.experiments.hearing.listening import Progress, listen
 from pipistrelle.experiments.hearing.scenario import standing_landmarks
 from pipistrelle.experiments.hearing.world import ALL_DRAWN, World
@@ -187,6 +187,7 @@ def run_trial(
 
     began = kernel_clock.wall_s()
     parted, steps = split_at(drive, [scan.time for scan in scans])
+    parted = at_sensor(parted)
     whole = run_filter(
         estimator.build(config, parted.motion),
         parted,
@@ -198,7 +199,7 @@ def run_trial(
         watch=look,
     )
     wall_s = kernel_clock.wall_s() - began
-    track = at_steps(whole, steps)
+    track = at_vehicle(at_steps(whole, steps), drive.sensor)
     scores, mapped = _scored(track, drive.truth, used, estimator.nees_limit, causes, association)
     return TrialResult(
         strategy=strategy,
