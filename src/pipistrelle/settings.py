@@ -370,7 +370,9 @@ def _layer(
             names = {".".join(known): spell(known) for known in known_settings()}
             names |= {name: name for name in others}
             near = meant(".".join(key), names)
-            fix = f"did you mean {names[near]}?" if near else "see `pipistrelle config show`"
+            same = [spell(known) for known in known_settings() if key == known[1:]]
+            fit = " or ".join(same) or (names[near] if near else "")
+            fix = f"did you mean {fit}?" if fit else "see `pipistrelle config show`"
             raise InputError(f"{where}: no such setting; {fix}")
     return layer
 

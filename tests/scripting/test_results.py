@@ -96,7 +96,11 @@ def test_settings_to_start_from_may_be_settings_a_table_or_a_file(done):
     ("words", "asked", "said"),
     [
         ((), {"rays__powr": 8.0}, "rays__powr: no such setting; did you mean rays__power?"),
-        ((), {"bearing_std": 8.0}, "bearing_std: no such setting; did you mean filter__bearing"),
+        (
+            (),
+            {"bearing_std": 8.0},
+            "did you mean association__bearing_std or filter__bearing_std or bag__bearing",
+        ),
         ((), {"rays__power": -1.0}, "rays__power: found -1.0, expected greater than 0"),
         ((), {"seed": 1.5}, "seed: found 1.5, expected a valid integer"),
         ((), {"rays": 3}, "rays: found 3, expected a section of settings"),

@@ -78,7 +78,7 @@ def test_runs_and_their_log_are_compared_from_the_command_line(obey, undrawn):
     status, printed, said = obey("compare", "one", "two")
     assert (status, said) == (0, "")
     assert "The drives are not the same" not in printed
-    assert "Settings of air, assumed, beacon" in printed
+    assert "Settings of air, assumed, bag, beacon" in printed
     assert "rays.spacing" in printed
     assert printed.splitlines()[4].split() == ["ekf", "iekf"]
 

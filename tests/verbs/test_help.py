@@ -51,7 +51,7 @@ def test_the_help_of_slam_leaves_out_what_a_log_decides(obey):
     assert found == {
         "--listening.timing",
         *(f"--association.{name}" for name in ("method", "detection", "clutter", "bearing-std")),
-        "--association.way-std",
+        *(f"--association.{name}" for name in ("way-std", "max-range", "field-of-view")),
         *(f"--filter.{name}" for name in ("noise", "excess-path-std", "robust")),
         *(f"--filter.{name}" for name in ("calibrate", "window")),
         *(f"--prior.{name}-std" for name in ("speed-scale", "turn-bias", "wheelbase")),

@@ -249,7 +249,7 @@ def test_a_log_that_was_solved_is_played_too_and_may_be_moved(obey, refused, und
     assert "<h1>Log log</h1>" in page
     assert "ranges within 60°" in page
     Path("log").rename("moved")
-    assert "put it back, or say with --log DIR where it is" in refused("view", "two")
+    assert "put it back, or say with --log where it is" in refused("view", "two")
     assert obey("view", "two", "--quiet", "--log", "moved") == (0, "two/view.html\n", "")
     assert "option --log: found moved, expected none" in refused("view", "one", "--log", "moved")
 

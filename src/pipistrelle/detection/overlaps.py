@@ -90,7 +90,7 @@ def most_left(elements: int) -> Float[np.ndarray, " k"]:
     In units of the noise of one output; for fewer than `MOST` where the elements tell no more.
 
     >>> most_left(10).round(1)
-    array([20.1, 17.6, 15. ])
+    array([20.4, 18.1, 15.6])
     """
     from scipy.special import gammaincinv
 

@@ -188,6 +188,7 @@ OTHERS = {
     "detection.angle_limit_deg": 40.0,
     "detection.averaging": "weighted",
     "matching.delay_gate": 0.01,
+    "detection.overlaps": "resolve",
     "matching.bearing_gate": 0.01,
     "matching.margin_db": 0.0,
     "listening.timing": True,
@@ -247,11 +248,14 @@ FEW = ("air.spreading", "target.shape", "emitter.radius", "beacon.level_db", "re
 
 
 def test_the_settings_that_are_varied_here_are_all_there_are():
-    # Folders (test_worlds_of_ones_own), and associations (estimation/data_association).
+    # Folders (test_worlds_of_ones_own), associations (estimation/data_association), bags.
     known = {".".join(key) for key in known_settings()}
-    elsewhere = {"scenario.world", *(key for key in known if key.startswith("association."))}
+    elsewhere = {
+        "scenario.world",
+        *(key for key in known if key.startswith(("association.", "bag."))),
+    }
     assert set(OTHERS) == known - elsewhere
-    assert {name.split(".")[0] for name in FEW} == set(Config.model_fields) - {"association"}
+    assert {name.split(".")[0] for name in FEW} == set(Config.model_fields) - {"association", "bag"}
 
 
 ROAMING = {"listening": {"timing": True}, "callers": [{"course": "circle", "radius": 5.0}]}
