@@ -74,6 +74,8 @@ def nobody(callers: int) -> Known:
 def with_new(known: Known, labels: list[int], scan: int, callers: int) -> Known:
     """Return known landmarks with new ones, that are heard in a scan for the first time."""
     size, more = len(labels), callers - known.source.shape[1]
+    if size == 0 and more <= 0:
+        return known
     source = known.source
     if more > 0:
         source = np.hstack([source, np.full((len(source), more), np.nan)])

@@ -69,7 +69,7 @@ BESIDE, ASIDE = 0.96, 0.5
 """A row begins no landmark beside a louder one, within such a way [m] and bearing [rad]."""
 OVERLAP_STD, OVERLAP_GATE = 0.7, 9.0
 """Deviation of the way of an echo that overlaps with another [m], and largest squared distance."""
-ASKED = np.array([4, 6, 8, 12, 16, 24, 32, 64])
+ASKED = frozenset((4, 6, 8, 12, 16, 24, 32, 64))
 """In how many scans a landmark was heard when it is asked whether it is on the map twice."""
 BOTH = 0.1
 """Two landmarks are two if in more than this share of the scans of either both were heard."""
@@ -238,9 +238,10 @@ class _Work:
         """Return the memory after the scan, and the assignment."""
         memory, scan, known = self.memory, self.scan, self._judged()
         gone = {*known.label[known.odds < GONE].tolist(), *self._lost(known)}
-        known = some(known, ~np.isin(known.label, list(gone)))
-        self.label[np.isin(self.label, list(gone))] = UNLABELLED
-        self.named[np.isin(self.named, list(gone))] = UNLABELLED
+        if gone:
+            known = some(known, ~np.isin(known.label, list(gone)))
+            self.label[np.isin(self.label, list(gone))] = UNLABELLED
+            self.named[np.isin(self.named, list(gone))] = UNLABELLED
         merge = () if gone else self._doubles(known)
         for kept, other in merge:
             self.label[self.label == other] = kept
@@ -270,20 +271,22 @@ class _Work:
         way = np.where(scan.caller == OWN, scan.range, scan.excess_path)
         heard = self.label, scan.caller, way, scan.level_db, scan.bearing
         place = self.joint.mean, self._places(known), callers
-        near = np.isin(known.label, list(self.near))
+        near = np.array([label in self.near for label in known.label.tolist()], np.bool_)
         return judged(known, heard, place, near, memory.scan, self.stage.limits.sight)
 
     def _doubles(self, known: Known) -> tuple[tuple[int, int], ...]:
         """Return pairs of landmarks that are one, the older first; asked now and then."""
         now = self.memory.scan
-        there = np.flatnonzero((self._places(known) >= 0) & (known.born < now))
-        known = some(known, np.isin(np.arange(known.label.size), there))
-        asked = np.flatnonzero((known.heard == now) & np.isin(known.count, ASKED))
-        if not asked.size:
+        heard = (known.heard == now) & (known.born < now)
+        counted = zip(known.label[heard].tolist(), known.count[heard].tolist(), strict=True)
+        due = {label for label, count in counted if count in ASKED}
+        if not due:
             return ()
+        known = some(known, (self._places(known) >= 0) & (known.born < now))
+        label = known.label.tolist()
+        asked = np.array([n for n, a in enumerate(label) if a in due], np.int64)
         rarer = np.minimum(known.count[:, np.newaxis], known.count)
         apart = (known.together > BOTH * rarer) | np.eye(len(rarer), dtype=bool)
-        label = known.label.tolist()
         pairs = doubles(self.joint, self._places(known), apart, asked)
         return tuple((label[a], label[b]) for a, b in pairs)
 
@@ -326,7 +329,10 @@ class _Work:
 
     def _within(self, std: Float[np.ndarray, " r"], limit: float) -> Bool[np.ndarray, " r"]:
         """Return a mask of deviations that are within a limit, or that were only assumed."""
-        return (std <= limit) | np.isin(std, self.stage.limits.assumed)
+        within = std <= limit
+        for assumed in self.stage.limits.assumed:
+            within |= std == assumed
+        return within
 
     def _rows(self, number: int, rows: np.ndarray) -> Rows:
         """Return rows of a caller."""
@@ -380,7 +386,7 @@ class _Work:
     def _bear(self, number: int, rows: Int[np.ndarray, " r"], at: int) -> None:
         """Begin landmarks with rows that are sure and near no other."""
         (way, std), scan, rows = self._ways(number), self.scan, rows[self._sure(number, rows)]
-        rows = rows[~self._overlapped(number, rows, at)]
+        rows = rows[~self._overlapped(number, rows, at)] if rows.size else rows
         factor, same = (2.0 if number == OWN else 1.0), scan.caller == number
         for row in sorted(rows.tolist(), key=lambda row: -scan.level_db[row]):
             beside = same & (factor * np.abs(way - way[row]) < BESIDE)

@@ -38,8 +38,8 @@ def is_placed(landmark: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " h"]:
     >>> is_placed(np.array([4, 7, 7, 51, -53]))
     array([ True, False, False,  True, False])
     """
-    _, row, count = np.unique(landmark, return_inverse=True, return_counts=True)
-    return (count[row] == 1) & (landmark >= 0)
+    another = landmark[1:] != landmark[:-1]  # the members of a landmark are neighbours
+    return np.append(True, another) & np.append(another, True) & (landmark >= 0)
 
 
 def removed(state: State, label: int) -> State:

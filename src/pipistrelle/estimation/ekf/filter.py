@@ -117,9 +117,11 @@ class EkfBelief:
         mean, covariance = self.mean[at], self.covariance[np.ix_(at, at)]
         if self.error == INVARIANT:
             points = np.concatenate((mean[:2], mean[3:])).reshape(-1, 2)
-            rotated = np.insert(rotated_left(points), 2, 0.0)
+            left = rotated_left(points)
+            rotated = np.concatenate((left[:2], [0.0], left[2:]))
             covariance = linear_covariance(rotated, covariance, covariance[2], covariance[2, 2])
-            mean = mean + np.insert(np.tile(self.origin, 1 + placed.size), 2, 0.0)
+            points += self.origin
+            mean = np.concatenate((points[0], mean[2:3], points[1:].ravel()))
         return JointGaussian(landmark=self.landmark[placed], mean=mean, covariance=covariance)
 
     def labels(self) -> list[int]:
