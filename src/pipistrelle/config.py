@@ -392,8 +392,8 @@ class AssociationConfig(Section):
 
     method: str = "known"
     """The labels that came with the scans, in a simulation an oracle's (the paper's); "nearest",
-    the likeliest assignment of a scan's rows; "marginal", what is sure over all assignments; or
-    module:Class, an association of your own."""
+    the likeliest assignment of a scan's rows; "joint", the most that fit together; "marginal",
+    what is sure over all assignments; or module:Class, an association of your own."""
     detection: Probability = 0.8
     """Assumed probability that a landmark which can be heard is heard."""
     clutter: Positive = 0.06

@@ -49,7 +49,7 @@ def scan_of(places, pose=(0.0, 0.0, 0.0), rng=None, time=0.0, level=40.0):
     return make_scan(time, labels, bearing, range=far, level_db=level, **STDS)
 
 
-@pytest.mark.parametrize("method", ["nearest", "marginal"])
+@pytest.mark.parametrize("method", ["nearest", "joint", "marginal"])
 @pytest.mark.parametrize("name", ["ekf", "iekf", "smoother", "fastslam"])
 def test_landmarks_that_are_apart_keep_their_labels_while_the_vehicle_drives(name, method):
     session, rng = session_of(name, method), np.random.default_rng(3)

@@ -13,6 +13,8 @@ until they stay, and the probability is
 Williams & Lau, IEEE Transactions on Aerospace and Electronic Systems 50 (2014).
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -20,6 +22,12 @@ from pipistrelle.jit import kernel
 
 NOTHING = -1
 """A row of no landmark."""
+Innovations = tuple[Float[np.ndarray, " e"], Float[np.ndarray, "e e"], Int[np.ndarray, " p"]]
+"""Of pairs, two numbers each: their innovation, its covariance, and how many of the two count."""
+Innovate = Callable[[Int[np.ndarray, " p"], Int[np.ndarray, " p"]], Innovations]
+"""From rows and landmarks of pairs to their innovations together."""
+Match = Callable[[Float[np.ndarray, "m n"], Innovate | None], Int[np.ndarray, " m"]]
+"""From costs of rows and landmarks to the landmark of each row, or NOTHING."""
 LIKELY, SURE = 0.9, 0.99
 """Probabilities from which on a row is taken to be of a landmark, and, if it is, of which."""
 MESSAGES, STAY = 50, 1e-6
@@ -30,8 +38,12 @@ FARTHEST = 1e6
 """In place of an infinite cost."""
 
 
-def nearest(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
+def nearest(
+    costs: Float[np.ndarray, "m n"], innovate: Innovate | None = None
+) -> Int[np.ndarray, " m"]:
     """Return the landmark of each row by the assignment that costs least, or NOTHING.
+
+    ``innovate``: what all methods are given, and only joint compatibility needs.
 
     >>> nearest(np.array([[-5.0, -4.0], [-4.5, np.inf], [3.0, np.inf]]))
     array([ 1,  0, -1])
@@ -47,7 +59,9 @@ def nearest(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
     return found
 
 
-def marginal(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
+def marginal(
+    costs: Float[np.ndarray, "m n"], innovate: Innovate | None = None
+) -> Int[np.ndarray, " m"]:
     """Return the landmark of each row where that is sure, or NOTHING.
 
     Here the first row is of either (`LIKELY`), but neither is sure (`SURE`).

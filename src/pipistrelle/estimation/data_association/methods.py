@@ -2,12 +2,13 @@
 
 from pipistrelle.config import Config, InputError
 from pipistrelle.estimation.association import KNOWN, Association
+from pipistrelle.estimation.data_association.compatibility import jointly_compatible
 from pipistrelle.estimation.data_association.matching import marginal, nearest
 from pipistrelle.estimation.data_association.pairs import Chances
 from pipistrelle.estimation.data_association.sequential import Limits, Sequential
 from pipistrelle.estimation.outside import ASSOCIATION, build, class_of, names_class
 
-METHODS = {"nearest": nearest, "marginal": marginal}
+METHODS = {"nearest": nearest, "joint": jointly_compatible, "marginal": marginal}
 """How rows of a scan are matched with landmarks, by ``association.method``."""
 GATE = 25.0
 """Largest squared distance of a row from its landmark: 0.5 to 1 % of right rows are beyond."""

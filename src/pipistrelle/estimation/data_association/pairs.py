@@ -98,6 +98,46 @@ def pair_costs(
     return costs
 
 
+@kernel
+def pair_innovations(
+    rows: tuple[np.ndarray, ...],
+    mean: Float[np.ndarray, " d"],
+    covariance: Float[np.ndarray, "d d"],
+    at: Int[np.ndarray, " n"],
+    caller: Whole,
+    pairs: tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]],
+) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, "e e"], Int[np.ndarray, " p"]]:
+    """Return the joint innovation of pairs of a row and a landmark, and its covariance.
+
+    Each pair has two numbers, bearing and way, and how many of them count is returned, too: what a
+    row does not have is 0 of variance 1, and correlated with nothing.
+    """
+    heard, (row, landmark) = Rows(*rows), pairs
+    nu, S, numbers = np.zeros(2 * row.size), np.zeros((2 * row.size, 2 * row.size)), row.copy()
+    H, index = np.zeros((row.size, 2, 7)), np.zeros((row.size, 7), np.int64)
+    for p in range(row.size):
+        m, k = row[p], 2 * p
+        bearing, way = _expected(mean, at[landmark[p]], caller, H[p], index[p])
+        nu[k], S[k, k] = wrap_angle(heard.bearing[m] - bearing), heard.bearing_std[m] ** 2
+        if math.isnan(heard.way[m]) or caller == UNPLACED:
+            H[p, 1], S[k + 1, k + 1], numbers[p] = 0.0, 1.0, 1
+        else:
+            nu[k + 1], S[k + 1, k + 1] = heard.way[m] - way, heard.way_std[m] ** 2
+            numbers[p] = 2
+        for q in range(p + 1):
+            for a in range(2):
+                for b in range(2):
+                    both = 0.0
+                    for i in range(7):
+                        for j in range(7):
+                            spread = covariance[index[p, i], index[q, j]]
+                            both += H[p, a, i] * spread * H[q, b, j]
+                    S[k + a, 2 * q + b] += both
+                    if q < p:
+                        S[2 * q + b, k + a] += both
+    return nu, S, numbers
+
+
 @no_alloc
 def _expected(
     mean: Float[np.ndarray, " d"],

@@ -13,7 +13,7 @@ that it remembers.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,12 +41,14 @@ from pipistrelle.estimation.data_association.existence import (
     some,
     with_new,
 )
+from pipistrelle.estimation.data_association.matching import Innovate, Match
 from pipistrelle.estimation.data_association.memory import Caller, Memory
 from pipistrelle.estimation.data_association.pairs import (
     OWN_CALL,
     UNPLACED,
     Rows,
     pair_costs,
+    pair_innovations,
     with_point,
 )
 from pipistrelle.estimation.data_association.tracks import Tracks, followed
@@ -121,8 +123,8 @@ class Sequential:
     [[1, 2], [1, 2], [1, 2]]
     """
 
-    match: Callable[[Float[np.ndarray, "m n"]], Int[np.ndarray, " m"]]
-    """From costs of rows and landmarks to the landmark of each row (`matching`)."""
+    match: Match
+    """How rows are matched with landmarks (`matching`, `compatibility`)."""
     chances: tuple[float, float, float, float]
     """`pairs.Chances`."""
     limits: Limits = Limits()
@@ -214,7 +216,7 @@ class _Work:
         gated, usable = np.isfinite(costs), self._usable(number, with_way=at != UNPLACED)[rows]
         telling = self.scan.bearing_std[rows] <= 2.0 * self.stage.limits.bearing_std
         self.near |= {*self.joint.landmark[gated[telling].any(axis=0)].tolist()}
-        found = self.stage.match(costs[usable])
+        found = self.stage.match(costs[usable], self._innovate(number, rows[usable], there, at))
         label = np.append(self.joint.landmark, UNLABELLED)[found]
         self.label[rows[usable]] = label
         self._judge_caller(number, rows[usable], label != UNLABELLED)
@@ -353,6 +355,15 @@ class _Work:
         joint = self.joint
         columns = tuple(self._rows(number, rows))
         return pair_costs(columns, joint.mean, joint.covariance, there, caller, chances)
+
+    def _innovate(
+        self, number: int, rows: Int[np.ndarray, " r"], there: Int[np.ndarray, " n"], caller: int
+    ) -> Innovate:
+        """Return what tells the innovations of pairs of these rows and landmarks."""
+        joint, columns = self.joint, tuple(self._rows(number, rows))
+        return lambda row, landmark: pair_innovations(
+            columns, joint.mean, joint.covariance, there, caller, (row, landmark)
+        )
 
     def _tell(self, number: int, caller: Caller) -> None:
         """State the place of a caller that was found as a range of its direct call."""
