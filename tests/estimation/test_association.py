@@ -279,5 +279,6 @@ def test_a_landmark_that_nobody_holds_is_not_expected():
 @pytest.mark.parametrize("name", ["jcbb", "a:", ":B", "a b:C"])
 def test_a_method_that_is_no_name_is_refused(name):
     config = Config(association=AssociationConfig(method=name))
-    with pytest.raises(InputError, match="expected 'known', 'nearest', 'joint', 'marginal' or module:Class"):
+    expected = "expected 'known', 'nearest', 'joint', 'marginal' or module:Class"
+    with pytest.raises(InputError, match=expected):
         association_of(config)
