@@ -4,7 +4,7 @@ Two landmarks a and b are one at a cost
 
 .. math:: c = d^2 + \ln |2 \pi S| + 2 \ln \lambda, \qquad d^2 = (l_a - l_b)^T S^{-1} (l_a - l_b)
 
-with the covariance S of their difference, of the whole map's, and a density :math:`\lambda` of
+with the covariance S of their difference, of the whole map's, and the density :math:`\lambda` of
 landmarks. Of a group each pair is judged given those before it: where the pose is lost to a metre
 the first pair of a closed loop tells little, those after it, which the same drift has moved, tell
 all. So from each pair a group is grown by what costs least, and the group that costs least is
@@ -23,8 +23,8 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.estimation.beliefs import JointGaussian
 from pipistrelle.jit import Whole, kernel, no_alloc
 
-DENSITY = 0.05
-"""Landmarks per square metre."""
+DENSEST = 0.05
+"""Landmarks per square metre, at most: of a few the map's extent tells nothing."""
 GAIN = 1.0
 """How much less at least each further pair makes its group cost."""
 SURE = (8.0, 15.0, 6.0)
@@ -59,8 +59,9 @@ def doubles(
         Numbers of landmarks of which a pair must hold one, for a group to be grown from it.
     """
     best: tuple[float, list[list[int]]] = 0.0, []
+    prior = 2.0 * math.log(_density(joint, at))
     for number in asked.tolist():
-        groups = _groups(joint, at, apart, number)
+        groups = _groups(joint, at, apart, number, prior)
         if not groups:
             continue
         cost, group = min(groups)
@@ -71,14 +72,24 @@ def doubles(
     return _lower_first(best[1])
 
 
+def _density(joint: JointGaussian, at: Int[np.ndarray, " l"]) -> float:
+    """Return landmarks per square metre of the map."""
+    area = float(np.ptp(joint.mean[at]) * np.ptp(joint.mean[at + 1]))
+    return at.size / max(area, at.size / DENSEST)
+
+
 def _groups(
-    joint: JointGaussian, at: Int[np.ndarray, " l"], apart: Bool[np.ndarray, "l l"], number: int
+    joint: JointGaussian,
+    at: Int[np.ndarray, " l"],
+    apart: Bool[np.ndarray, "l l"],
+    number: int,
+    prior: float,
 ) -> list[tuple[float, list[list[int]]]]:
     """Return the cost and the pairs of each group that grows from a pair of one landmark."""
     pairs, groups = np.empty((at.size, 2), np.int64), []
     for other in np.flatnonzero(~apart[number]).tolist():
         first = max(number, other), min(number, other)
-        cost, size = grown(joint.mean, joint.covariance, at, apart, first, pairs)
+        cost, size = grown(joint.mean, joint.covariance, at, apart, first, prior, pairs)
         if size:
             groups.append((cost, pairs[:size].tolist()))
     return groups
@@ -106,11 +117,15 @@ def grown(
     at: Int[np.ndarray, " l"],
     apart: Bool[np.ndarray, "l l"],
     pair: tuple[Whole, Whole],
+    prior: float,
     pairs: Int[np.ndarray, "l 2"],
 ) -> tuple[float, Whole]:
-    """Write the group that grows from a pair; return what it costs and how many pairs it has."""
+    """Write the group that grows from a pair; return what it costs and how many pairs it has.
+
+    ``prior``: what the density adds to the cost of each pair.
+    """
     a, b = pair
-    cost = _cost(mean, covariance, at[a], at[b])
+    cost = _cost(mean, covariance, at[a], at[b], prior)
     if math.isinf(cost):
         return cost, 0
     mean, P, apart = mean.copy(), covariance.copy(), apart.copy()
@@ -124,7 +139,7 @@ def grown(
         cost = -GAIN
         for i in range(at.size):
             for j in range(i):
-                other = math.inf if apart[i, j] else _cost(mean, P, at[i], at[j])
+                other = math.inf if apart[i, j] else _cost(mean, P, at[i], at[j], prior)
                 if other < cost:
                     cost, a, b = other, i, j
         if cost == -GAIN:
@@ -132,7 +147,9 @@ def grown(
 
 
 @no_alloc
-def _cost(mean: Float[np.ndarray, " d"], P: Float[np.ndarray, "d d"], a: Whole, b: Whole) -> float:
+def _cost(
+    mean: Float[np.ndarray, " d"], P: Float[np.ndarray, "d d"], a: Whole, b: Whole, prior: float
+) -> float:
     """Return what it costs that the landmarks at two indices are one; infinite beyond the gate."""
     dx, dy, least = mean[a] - mean[b], mean[a + 1] - mean[b + 1], LEAST_STD * LEAST_STD
     xx = P[a, a] + P[b, b] - 2.0 * P[a, b] + least
@@ -144,7 +161,7 @@ def _cost(mean: Float[np.ndarray, " d"], P: Float[np.ndarray, "d d"], a: Whole, 
     squared = (yy * dx * dx - 2.0 * xy * dx * dy + xx * dy * dy) / det
     if squared > GATE:
         return math.inf
-    return squared + math.log((2.0 * math.pi) ** 2 * det) + 2.0 * math.log(DENSITY)
+    return squared + math.log((2.0 * math.pi) ** 2 * det) + prior
 
 
 @kernel
