@@ -5,9 +5,9 @@ Beliefs are never changed, so an association may change its mind: the session re
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Generic
+from typing import Any, Generic, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -30,6 +30,8 @@ from pipistrelle.estimation.checking import usable_scan
 
 REMEMBERED = 40
 """How many scans an association may think of again."""
+MOST_STEPS = 64
+"""How many steps are predicted at once: an EKF's last bits hang on it."""
 Leg = tuple[Float[np.ndarray, "k c"], Float[np.ndarray, " k"]]
 """Control steps and how long they take [s]."""
 
@@ -52,6 +54,24 @@ class _Heard:
     merge: tuple[tuple[int, int], ...]
 
 
+class SessionState(NamedTuple):
+    """All that a session knows."""
+
+    belief: Any
+    draws: Mapping[str, Any]
+    """State of the random generator."""
+    memory: Any
+    """The association's."""
+    past: Sequence[_Heard]
+    legs: Sequence[Leg]
+    open: Any
+    """Belief and random state before the last leg, while steps may still join it."""
+    dropped: Collection[int]
+    labels: Sequence[Int[np.ndarray, " m"]]
+    first: int
+    """Number of the scan whose labels are the first of `labels`."""
+
+
 class Session(Generic[B]):
     """A vehicle's estimate while it drives and listens.
 
@@ -68,6 +88,9 @@ class Session(Generic[B]):
         Labels the rows of scans; without one they bear labels already.
     noise : callable, optional
         States the noise of rows that an association has merged (`pipistrelle.detection.noise`).
+    live : bool
+        Steps come one by one, to the same bits as all of them since a scan at once; labels are kept
+        of the last `REMEMBERED` scans alone.
 
     Examples
     --------
@@ -89,7 +112,7 @@ class Session(Generic[B]):
     belief: B
     """The present belief of the estimator."""
     labels: list[Int[np.ndarray, " m"]]
-    """Of each scan so far the labels of its rows, as an association has them now."""
+    """Of each scan that is kept the labels of its rows, as an association has them now."""
 
     def __init__(
         self,
@@ -100,6 +123,7 @@ class Session(Generic[B]):
         known: Landmarks | None = None,
         association: Association | None = None,
         noise: Noise | None = None,
+        live: bool = False,
     ) -> None:
         self._estimator, self._rng = estimator, rng
         self._association, self._noise = association, noise
@@ -108,6 +132,8 @@ class Session(Generic[B]):
         self._legs: list[Leg] = []
         self._dropped: set[int] = set()
         self.labels: list[Int[np.ndarray, " m"]] = []
+        self._live, self._first = live, 0
+        self._open: tuple[B, Mapping[str, Any]] | None = None
         self.belief = estimator.init(start)
         if known is not None and known.landmark.size and isinstance(estimator, AcceptsMap):
             self.belief = estimator.knowing(self.belief, known)
@@ -117,14 +143,22 @@ class Session(Generic[B]):
 
         `controls`: as the estimator's motion model has them; `dt` [s].
         """
-        poses = self._move(controls, dt)
-        if self._association:
-            self._legs.append((controls, dt))
-        return poses
+        if not self._live and len(dt) <= MOST_STEPS:
+            if self._association:
+                self._legs.append((controls, dt))
+            return self._move(controls, dt)
+        poses, done = [], 0
+        while done < len(dt):
+            size = MOST_STEPS - (len(self._legs[-1][1]) if self._open else 0)
+            poses.append(self._go_on(controls[done : done + size], dt[done : done + size]))
+            done += size
+        return joined_poses(poses)
 
     def hear(self, scan: Scan) -> Scan:
         """Associate a scan's rows and correct the belief; return the scan as it was used."""
+        self._open = None
         if self._association is None:
+            self._legs = []
             return self._correct(scan)
         memory, assignment = self._associate(scan)
         if assignment.again is not None and self._past:
@@ -140,6 +174,28 @@ class Session(Generic[B]):
         tentative = self._association.tentative(self._memory)
         return some_of(landmarks, ~np.isin(landmarks.landmark, list(tentative)))
 
+    def state(self) -> SessionState:
+        """Return all that the session knows now; what it hears later does not change it."""
+        return SessionState(
+            belief=self.belief,
+            draws=self._rng.bit_generator.state,
+            memory=self._memory,
+            past=tuple(self._past),
+            legs=tuple(self._legs),
+            open=self._open,
+            dropped=frozenset(self._dropped),
+            labels=tuple(self.labels),
+            first=self._first,
+        )
+
+    def go_on_from(self, state: SessionState) -> None:
+        """Know what a session of the same settings knew."""
+        self.belief, self._memory, self._first = state.belief, state.memory, state.first
+        self._rng.bit_generator.state = state.draws
+        self._past = deque(state.past, maxlen=REMEMBERED)
+        self._legs, self._open, self._dropped = [*state.legs], state.open, {*state.dropped}
+        self.labels = [*state.labels]
+
     def _move(self, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]) -> Gaussian:
         """Predict through control steps."""
         predicted = self._estimator.predict(self.belief, controls, dt, self._rng)
@@ -149,6 +205,20 @@ class Session(Generic[B]):
         self.belief, poses = predicted
         check_poses("predict", poses, len(dt))
         return poses
+
+    def _go_on(self, controls: Float[np.ndarray, "k c"], dt: Float[np.ndarray, " k"]) -> Gaussian:
+        """Predict through a leg once more that has become longer; return its last k poses."""
+        if self._open:
+            self.belief, self._rng.bit_generator.state = self._open
+            before, took = self._legs.pop()
+            self._legs.append((np.concatenate((before, controls)), np.concatenate((took, dt))))
+        else:
+            self._open = self.belief, self._rng.bit_generator.state
+            self._legs.append((controls, dt))
+        poses, new = self._move(*self._legs[-1]), slice(-len(dt), None)
+        if len(self._legs[-1][1]) == MOST_STEPS:
+            self._open = None
+        return replace(poses, mean=poses.mean[new], covariance=poses.covariance[new])
 
     def _correct(self, scan: Scan) -> Scan:
         """Correct the belief with a scan that is labelled."""
@@ -175,7 +245,7 @@ class Session(Generic[B]):
         if assignment.remove:
             self._take_back(assignment.remove)
         heard = _Heard(
-            number=len(self.labels),
+            number=self._first + len(self.labels),
             legs=self._legs,
             belief=self.belief,
             memory=self._memory,
@@ -186,11 +256,15 @@ class Session(Generic[B]):
         )
         self._past.append(heard)
         self._memory, self._legs = memory, []
-        return self._use(heard)
+        used = self._use(heard)
+        if self._live and (old := len(self.labels) - REMEMBERED) > 0:
+            del self.labels[:old]
+            self._first += old
+        return used
 
     def _use(self, heard: _Heard) -> Scan:
         """Correct the belief with a scan that an association has labelled."""
-        self.labels[heard.number :] = [heard.label]
+        self.labels[heard.number - self._first :] = [heard.label]
         for kept, gone in heard.merge:
             self.labels = [np.where(label == gone, kept, label) for label in self.labels]
         self.belief = edited(self.belief, merge=heard.merge)
@@ -199,7 +273,8 @@ class Session(Generic[B]):
 
     def _take_back(self, labels: tuple[int, ...]) -> None:
         """Remove landmarks, with all of their rows that are remembered."""
-        past = list(self._past)
+        past = [replace(one) for one in self._past]
+        self._past = deque(past, maxlen=REMEMBERED)
         labels = (*labels, *(gone for one in past for kept, gone in one.merge if kept in labels))
         heard = [n for n, one in enumerate(past) if _names(one, labels)]
         again = past[heard[0] if heard else len(past) :]
@@ -209,7 +284,7 @@ class Session(Generic[B]):
             # What was heard once has told nothing of anything else.
             self.belief = edited(self.belief, remove=_held(self.belief, labels))
             again[0].label = _without(again[0].label, labels)
-            self.labels[again[0].number] = again[0].label
+            self.labels[again[0].number - self._first] = again[0].label
             return
         self.belief = edited(before, remove=_held(before, [*self._dropped]))
         for one in again:
@@ -233,7 +308,7 @@ class Session(Generic[B]):
             )
         past, legs = list(self._past), self._legs
         self._past.clear()
-        del self.labels[past[0].number :]
+        del self.labels[past[0].number - self._first :]
         dropped = _held(past[0].belief, [*self._dropped])
         self.belief = edited(past[0].belief, remove=dropped)
         self._dropped = set()  # a label may be given again
@@ -250,6 +325,16 @@ class Session(Generic[B]):
         """Predict through what was gone already."""
         for controls, dt in legs:
             self._move(controls, dt)
+
+
+def joined_poses(parts: Sequence[Gaussian]) -> Gaussian:
+    """Return poses one after the other."""
+    if len(parts) == 1:
+        return parts[0]
+    mean = np.concatenate([poses.mean for poses in parts])
+    return replace(
+        parts[0], mean=mean, covariance=np.concatenate([poses.covariance for poses in parts])
+    )
 
 
 def _names(heard: _Heard, labels: Sequence[int]) -> bool:

@@ -178,9 +178,7 @@ def at_vehicle(track: Track, sensor: Pose) -> Track:
     """Return the track of a vehicle by that of the sensor that it carries at `sensor`."""
     if not any(sensor):
         return track
-    x, y, turned = sensor
-    c, s = np.cos(turned), np.sin(turned)
-    vehicle = (-c * x - s * y, s * x - c * y, -turned)
+    vehicle = vehicle_in(sensor)
     cloud, online = track.cloud, track.online
     if cloud is not None:
         none = np.zeros((len(cloud), 3, 3))
@@ -193,19 +191,21 @@ def at_vehicle(track: Track, sensor: Pose) -> Track:
     )
 
 
-def carried(path: Gaussian, place: Pose) -> Gaussian:
-    """Return where something is that poses carry at a place in their axes.
+def vehicle_in(sensor: Pose) -> Pose:
+    """Return where the vehicle is in the axes of a sensor that it carries."""
+    x, y, turned = sensor
+    c, s = np.cos(turned), np.sin(turned)
+    return -c * x - s * y, s * x - c * y, -turned
 
-    The right-invariant error of a pose is that of whatever it carries.
-    """
+
+def carried(path: Gaussian, place: Pose) -> Gaussian:
+    """Return where something is that poses carry at a place in their axes."""
     x, y, turned = place
     heading = path.mean[..., 2]
     c, s = np.cos(heading), np.sin(heading)
     offset = np.stack((c * x - s * y, s * x + c * y, np.full_like(c, turned)), axis=-1)
     mean = path.mean + offset
     mean[..., 2] = wrap(mean[..., 2])
-    if path.invariant:
-        return replace(path, mean=mean)
     slopes = np.broadcast_to(np.eye(3), path.covariance.shape).copy()
     slopes[..., 0, 2], slopes[..., 1, 2] = -offset[..., 1], offset[..., 0]
     spread = np.einsum("...ij,...jk,...lk->...il", slopes, path.covariance, slopes)

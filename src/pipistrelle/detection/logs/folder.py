@@ -5,57 +5,24 @@ measurements scans.
 """
 
 from dataclasses import asdict
-from math import inf, pi
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import ConfigDict, Field, ValidationError, field_validator
 
-from pipistrelle.config import (
-    LONGEST_STEP,
-    MAX_OTHERS,
-    STEEPEST,
-    AngleStd,
-    DistanceStd,
-    InputError,
-    NonNegative,
-    Positive,
-    Probability,
-    Real,
-    Section,
-)
+from pipistrelle.config import STEEPEST
 from pipistrelle.detection.logs.poses import MOTION_COVARIANCE, POSE, poses_along
 from pipistrelle.detection.logs.recording import (
     CALLER,
     MEASUREMENT,
     STATED,
     Log,
-    LogCaller,
     assemble,
 )
-from pipistrelle.detection.logs.text_tables import FORMER_NAMES, Table, read_table, table_text
-from pipistrelle.files import read_text
+from pipistrelle.detection.logs.text_tables import Table, read_table, table_text
+from pipistrelle.detection.logs.vehicle import KINDS, NOISY, ODOMETRY, SHARED, read_vehicle
 from pipistrelle.own_files import LOG, OwnFiles
-from pipistrelle.refusals import expectation, meant, refusal, shown, values_expected
-from pipistrelle.settings import parse_toml
-
-_Triple = Annotated[tuple[Real, Real, Real], Field(strict=False)]
-_Triple_std = Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(strict=False)]
-_Bounds = Annotated[tuple[Positive, Positive], Field(strict=False)]
-_Turn = Annotated[Positive, Field(le=2.0 * pi)]
-_Point = Annotated[tuple[Real, Real], Field(strict=False)]
-_Point_std = Annotated[tuple[NonNegative, NonNegative], Field(strict=False)]
-
-_NOISY = {
-    "unicycle": ("velocity", "angular_rate"),
-    "bicycle": ("speed", "steering"),
-    "ackermann": ("speed", "steering"),
-    "poses": ("forward", "sideways", "turn"),
-}
-"""What of a row of odometry has a standard deviation in ``log.toml``."""
-_ODOMETRY = _NOISY | {"poses": POSE}
-"""Columns of a row of odometry, besides its time."""
+from pipistrelle.refusals import refusal
 
 _README = """A recorded log of Pipistrelle. Replay it with: pipistrelle slam FOLDER
 
@@ -76,114 +43,6 @@ path more.
 """
 _HELD = "a row holds until the next one's time, the last only ends the log"
 _FOLLOWED = "what counts is the way from row to row, wherever they begin"
-
-
-class _CallerTable(Section):
-    model_config = ConfigDict(strict=True)
-
-    name: Annotated[str, Field(pattern=r"^\w[\w-]*$", max_length=40)]
-    landmark: Annotated[int, Field(ge=0, lt=2**53)]
-    moves: bool = False
-    place: _Point | None = None
-    place_std: _Point_std | None = None
-
-    @field_validator("place")
-    @classmethod
-    def _of_what_stands(cls, place: Any, known: Any) -> Any:
-        if place is not None and known.data.get("moves"):
-            raise ValueError("no place of a caller that moves")
-        return place
-
-    @field_validator("place_std")
-    @classmethod
-    def _of_a_place(cls, std: Any, known: Any) -> Any:
-        if std is not None and known.data.get("place") is None:
-            raise ValueError("a place beside it")
-        return std
-
-
-class _AssociationTable(Section):
-    """What is known of the sensor; settings of the same names."""
-
-    model_config = ConfigDict(strict=True)
-
-    detection: Probability | None = None
-    clutter: Positive | None = None
-    max_range: Positive | None = None
-    field_of_view: _Turn | None = None
-
-
-class _Settings(Section):
-    model_config = ConfigDict(strict=True)
-
-    format: Literal[1]
-    motion: Literal["unicycle", "bicycle", "ackermann", "poses"]
-    initial_pose: _Triple
-    initial_pose_std: _Triple_std
-    range_std: DistanceStd
-    bearing_std: AngleStd
-    excess_path_std: DistanceStd | None = None
-    range_bounds: _Bounds
-    step: Annotated[Positive, Field(le=LONGEST_STEP)] | None = None
-    gate: Probability | None = None
-    noise_at_rest: bool = True
-    sensor_pose: _Triple = (0.0, 0.0, 0.0)
-    association: _AssociationTable = _AssociationTable()
-    callers: Annotated[tuple[_CallerTable, ...], Field(strict=False, max_length=MAX_OTHERS)] = ()
-
-    @field_validator("callers")
-    @classmethod
-    def _apart(cls, callers: tuple[_CallerTable, ...]) -> tuple[_CallerTable, ...]:
-        names = {"vehicle", *(caller.name.casefold() for caller in callers)}
-        if len(names) <= len(callers):
-            raise ValueError('a name of its own for each caller, not "vehicle", a or A alike')
-        if len({caller.landmark for caller in callers}) < len(callers):
-            raise ValueError("a landmark of its own for each caller")
-        return callers
-
-    @field_validator("range_bounds")
-    @classmethod
-    def _rising(cls, bounds: tuple[float, float]) -> tuple[float, float]:
-        if bounds[0] >= bounds[1]:
-            raise ValueError("a near range below a far one")
-        return bounds
-
-
-class _UnicycleSettings(_Settings):
-    velocity_std: NonNegative
-    angular_rate_std: NonNegative
-
-
-class _BicycleSettings(_Settings):
-    speed_std: NonNegative
-    steering_std: NonNegative
-    wheelbase: Positive
-
-
-class _AckermannSettings(_BicycleSettings):
-    speed_offset: Real = 0.0
-
-    @field_validator("speed_offset")
-    @classmethod
-    def _within_the_car(cls, offset: float, known: Any) -> float:
-        if abs(offset) > 0.5 * known.data.get("wheelbase", inf):
-            raise ValueError("at most half the wheelbase")
-        return offset
-
-
-class _PosesSettings(_Settings):
-    forward_std: NonNegative
-    sideways_std: NonNegative
-    turn_std: NonNegative
-
-
-_SETTINGS: dict[str, type[_Settings]] = {
-    "unicycle": _UnicycleSettings,
-    "bicycle": _BicycleSettings,
-    "ackermann": _AckermannSettings,
-    "poses": _PosesSettings,
-}
-_SHARED = tuple(name for name in _Settings.model_fields if name not in ("format", "step"))
 
 
 def read_log(folder: Path) -> Log:
@@ -233,10 +92,10 @@ def read_log(folder: Path) -> Log:
     >>> log.scans[0].time, log.scans[0].landmark, log.scans[0].range
     (0.5, array([7]), array([nan]))
     """
-    settings, former = _read_settings(folder / "log.toml")
-    columns, stds = ("time", *_ODOMETRY[settings.motion]), _NOISY[settings.motion]
-    optional = MOTION_COVARIANCE if settings.motion == "poses" else ()
-    names = tuple(caller.name for caller in settings.callers)
+    vehicle, former = read_vehicle(folder / "log.toml")
+    columns = ("time", *ODOMETRY[vehicle.motion])
+    optional = MOTION_COVARIANCE if vehicle.motion == "poses" else ()
+    names = tuple(caller.name for caller in vehicle.callers)
     measured = read_table(
         folder / "measurements.csv",
         MEASUREMENT,
@@ -245,22 +104,16 @@ def read_log(folder: Path) -> Log:
         words={CALLER: names or ("a name that [[callers]] of log.toml have",)},
     )
     measured.column[CALLER] += 1.0  # the vehicle is number 0
-    values = {name: getattr(settings, name) for name in _SHARED}
-    values["association"] = settings.association.model_dump(exclude_none=True)
-    values["callers"] = tuple(LogCaller(**caller.model_dump()) for caller in settings.callers)
     odometry = read_table(folder / "odometry.csv", columns, optional=optional)
-    if settings.motion == "ackermann":
+    if vehicle.motion == "ackermann":
         _check_steering(odometry)
     return assemble(
         odometry,
         measured,
-        step=settings.step,
+        step=vehicle.step,
         name=folder.resolve().name,
         former_names=(*measured.former, *former),
-        wheelbase=getattr(settings, "wheelbase", 1.0),
-        speed_offset=getattr(settings, "speed_offset", 0.0),
-        control_std=tuple(getattr(settings, f"{name}_std") for name in stds),
-        **values,
+        **vehicle.told(),
     )
 
 
@@ -317,16 +170,16 @@ def log_files(log: Log) -> dict[str, str]:
     """Return the files of a log's folder; ``log.toml`` is the last."""
     import tomli_w
 
-    settings: dict[str, Any] = {"format": 1} | {name: getattr(log, name) for name in _SHARED}
+    settings: dict[str, Any] = {"format": 1} | {name: getattr(log, name) for name in SHARED}
     settings["callers"] = [asdict(caller) for caller in log.callers]
-    stds = zip(_NOISY[log.motion], log.control_std, strict=True)
+    stds = zip(NOISY[log.motion], log.control_std, strict=True)
     settings |= {f"{name}_std": std for name, std in stds}
     if log.motion in ("bicycle", "ackermann"):
         settings["wheelbase"] = log.wheelbase
     if log.motion == "ackermann":
         settings["speed_offset"] = log.speed_offset
     settings["association"] = dict(log.association)
-    model = _SETTINGS[log.motion].model_validate(settings)
+    model = KINDS[log.motion].model_validate(settings)
     text = tomli_w.dumps(model.model_dump(mode="json", exclude_defaults=True, exclude_none=True))
     driven = _odometry_columns(log)
     measured = _measurement_columns(log)
@@ -341,70 +194,11 @@ def log_files(log: Log) -> dict[str, str]:
     }
 
 
-def _read_settings(path: Path) -> tuple[_Settings, tuple[str, ...]]:
-    """Return the settings of ``log.toml``, and which keys it calls by former names.
-
-    Of several errors the first is named, unknown keys before missing ones.
-    """
-    raw = parse_toml(read_text(path), path)
-    former = tuple(key for key in raw if FORMER_NAMES.get(key, key) not in raw)
-    raw |= {FORMER_NAMES[key]: raw.pop(key) for key in former}
-    model = _SETTINGS.get(str(raw.get("motion")), _UnicycleSettings)
-    try:
-        return model.model_validate(raw), former
-    except ValidationError as error:
-        faults = error.errors(include_url=False)
-    rank = {"format": 0, "motion": 1}
-    other = {"extra_forbidden": 2}
-    fault = min(faults, key=lambda f: rank.get(str(f["loc"][0]), other.get(f["type"], 3)))
-    raise _key_refusal(path, fault, model)
-
-
-def _key_refusal(path: Path, fault: Any, model: type[_Settings]) -> InputError:
-    known, name = model.model_fields, fault["loc"][0]
-    if name == "callers" and len(fault["loc"]) > 2:
-        return _caller_refusal(path, fault)
-    if name == "callers" and fault["type"] == "too_long":
-        found = f"{len(fault['input'])} callers"
-        return refusal(f"{path}, key 'callers'", found, f"at most {MAX_OTHERS}", "leave some out")
-    if name in known and (count := values_expected(fault, known[name])) is not None:
-        found = f"{len(fault['input'])} values"
-        return refusal(f"{path}, key {name!r}", found, f"{count}", "mend the list")
-    if name == "association" and len(fault["loc"]) > 1:
-        known = _AssociationTable.model_fields
-    parts = (f"[{p}]" if isinstance(p, int) else f".{p}" for p in fault["loc"])
-    key = "".join(parts).removeprefix(".")
-    if fault["type"] == "missing":
-        return refusal(path, f"no key {key!r}", f"the keys {', '.join(known)}", f"add {key!r}")
-    if fault["type"] == "extra_forbidden":
-        near = meant(str(fault["loc"][-1]), known)
-        fix = f"did you mean {near!r}?" if near else "remove it"
-        return refusal(path, f"the unknown key {key!r}", f"one of {', '.join(known)}", fix)
-    found = shown(fault["input"])
-    return refusal(f"{path}, key {key!r}", found, expectation(fault), "correct the value")
-
-
-def _caller_refusal(path: Path, fault: Any) -> InputError:
-    """Refuse a caller by its number, from 1 on, and key."""
-    _, number, name, *_ = fault["loc"]
-    key, known = f"callers.{number + 1}.{name}", _CallerTable.model_fields
-    if fault["type"] == "missing":
-        return refusal(path, f"no key {key!r}", "a name and a landmark", f"add {key!r}")
-    if fault["type"] == "extra_forbidden":
-        near = meant(name, known)
-        fix = f"did you mean {near!r}?" if near else "remove it"
-        return refusal(path, f"the unknown key {key!r}", f"one of {', '.join(known)}", fix)
-    expected = expectation(fault)
-    if name == "name" and fault["type"] in ("string_pattern_mismatch", "string_too_long"):
-        expected = "letters, digits, _ and -, 40 at most"
-    return refusal(f"{path}, key {key!r}", shown(fault["input"]), expected, "correct the value")
-
-
 def _odometry_columns(log: Log) -> dict[str, np.ndarray]:
     """Return the columns of ``odometry.csv``: controls, or poses with their covariance."""
     if log.motion != "poses":
         rows = np.vstack((log.controls, np.zeros(2)))
-        return {"time": log.time} | dict(zip(_ODOMETRY[log.motion], rows.T, strict=True))
+        return {"time": log.time} | dict(zip(ODOMETRY[log.motion], rows.T, strict=True))
     column = dict(zip(POSE, poses_along(log.controls).T, strict=True))
     stated = log.controls[:, len(POSE) :]
     rows = np.vstack((np.full(stated.shape[1], np.nan), stated))

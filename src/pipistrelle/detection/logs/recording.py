@@ -19,7 +19,13 @@ from jaxtyping import Float
 
 from pipistrelle.config import LONGEST_STEP
 from pipistrelle.detection.logs.poses import motions_between
-from pipistrelle.detection.logs.text_tables import Table, check_unique, place_of, rows_kept
+from pipistrelle.detection.logs.text_tables import (
+    Table,
+    check_columns,
+    check_unique,
+    place_of,
+    rows_kept,
+)
 from pipistrelle.detection.scans import NO_CALLERS, OWN, UNLABELLED, Scan, make_scan
 from pipistrelle.geometry import wrap
 from pipistrelle.refusals import refusal
@@ -194,6 +200,35 @@ def _labelled(measurements: Table, callers: tuple[LogCaller, ...]) -> tuple[Tabl
     kept = _of_callers(rows_kept(measurements, ~clutter), callers)
     check_unique(kept, "time", "landmark", besides=CALLER)
     return kept, int(np.sum(clutter))
+
+
+def scan_at(time: float, rows: Table, callers: tuple[LogCaller, ...]) -> Scan:
+    """Make a scan of the rows of one time, as `assemble` does of a table.
+
+    Parameters
+    ----------
+    time : [s]
+    rows : Table of ``landmark``, ``bearing``, ``range`` and ``caller``
+        And of what else a log may say of a measurement; at least one row.
+    callers : tuple of LogCaller
+
+    Returns
+    -------
+    Scan
+        Rows without a bearing stand at its end.
+
+    Raises
+    ------
+    InputError
+        For a row that no log may have.
+    """
+    check_columns(rows)
+    rows = _of_callers(rows, callers)
+    labelled = rows_kept(rows, rows.column["landmark"] != UNLABELLED)
+    check_unique(labelled, "landmark", besides=CALLER)
+    measured = rows.column | {"time": np.full(len(rows.line), time)}
+    (scan,) = _scans(np.array([time]), measured, 0.0, callers)
+    return scan
 
 
 def check_seconds(table: Table, longest_gap: float = _MAX_GAP) -> None:

@@ -91,15 +91,16 @@ def propagate_invariant(
     ``motion`` is `MotionNumbers` as a plain tuple; ``pose_covariances`` are of the linear error.
     """
     pose, P, numbers = mean[:3], covariance[:3, :3].copy(), MotionNumbers(*motion)
-    noise, gathered = np.zeros((3, 3)), np.empty((3, 3))
+    noise, gathered, together = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
     for k in range(controls.shape[0]):
         propagate_pose(pose, noise, controls[k], dt[k], numbers)
-        shifted_covariance(P, pose[0], pose[1], pose_covariances[k])
+        shifted_covariance(noise, -pose[0], -pose[1], gathered)
+        for a in range(3):
+            for b in range(3):
+                together[a, b] = P[a, b] + gathered[a, b]
         for a in range(3):
             pose_means[k, a] = pose[a]
-            for b in range(3):
-                pose_covariances[k, a, b] += noise[a, b]
-    shifted_covariance(noise, -pose[0], -pose[1], gathered)
+        shifted_covariance(together, pose[0], pose[1], pose_covariances[k])  # as `EkfBelief.pose`
     turned, root = np.empty(mean.size), math.sqrt(gathered[2, 2])
     for i in range(3, mean.size, 2):  # J l of each member
         turned[i], turned[i + 1] = -mean[i + 1], mean[i]
@@ -109,10 +110,6 @@ def propagate_invariant(
         for j in range(3, mean.size):
             covariance[a, j] -= gathered[a, 2] * turned[j]
             covariance[j, a] = covariance[a, j]
-    if controls.shape[0]:
-        shifted_covariance(
-            covariance, pose[0], pose[1], pose_covariances[-1]
-        )  # as `EkfBelief.pose`
     for i in range(3, mean.size):
         turned[i] *= root
     for i in range(3, mean.size):

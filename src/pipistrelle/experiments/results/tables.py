@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.detection.scans import OWN, Scan
-from pipistrelle.estimation.beliefs import Landmarks, Track, placed
+from pipistrelle.estimation.beliefs import Gaussian, Landmarks, Track, placed
 from pipistrelle.evaluation.accuracy import heaviest, pose_error, position_error
 from pipistrelle.evaluation.consistency import track_nees
 from pipistrelle.experiments.drives import LabelledPoints
@@ -94,9 +94,7 @@ def step_table(track: Track, true_path: Float[np.ndarray, "k 3"] | None) -> "pl.
     """
     import polars as pl
 
-    mean, covariance = track.pose.mean, track.pose.covariance
-    std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    columns = {"time_s": track.time, **_pose_columns("{}", mean), **_pose_columns("{}_std", std)}
+    mean = track.pose.mean
     true = np.full_like(mean, np.nan) if true_path is None else true_path
     error = pose_error(mean, true)
     scored = {
@@ -106,7 +104,17 @@ def step_table(track: Track, true_path: Float[np.ndarray, "k 3"] | None) -> "pl.
         "nees": track_nees(track.pose, true),
     }
     truth = pl.DataFrame(scored)
-    return pl.DataFrame(columns).hstack(truth if true_path is not None else truth.clear(len(mean)))
+    estimate = path_table(track.time, track.pose)
+    return estimate.hstack(truth if true_path is not None else truth.clear(len(mean)))
+
+
+def path_table(time: Float[np.ndarray, " k"], path: Gaussian) -> "pl.DataFrame":
+    """Lay out poses and their standard deviations, a row per time."""
+    import polars as pl
+
+    std = np.sqrt(np.diagonal(path.covariance, axis1=1, axis2=2))
+    poses = {**_pose_columns("{}", path.mean), **_pose_columns("{}_std", std)}
+    return pl.DataFrame({"time_s": time, **poses})
 
 
 def _pose_columns(name: str, poses: Float[np.ndarray, "k 3"]) -> dict[str, np.ndarray]:

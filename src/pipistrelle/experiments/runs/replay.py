@@ -248,35 +248,15 @@ def replay(
     >>> trial.track.landmarks.landmark, trial.track.landmarks.mean
     (array([7]), array([[3., 0.]]))
     """
-    drive = Drive(
-        motion=motion_of(log),
-        start=start_of(log),
-        time=log.time,
-        controls=log.controls,
-        truth=truth,
-        known=_known_callers(log),
-        moving={who.landmark: who.name for who in log.callers if who.moves},
-        sensor=log.sensor_pose,
-    )
+    drive = drive_of(log, truth)
     check_filters(filters, drive.motion, config, drive.moving.values())
-    _check_calibrated(log, config)
-    noise, known = noise_of(config.filter), config.association.method == KNOWN
+    check_calibrated(log, config)
+    known = config.association.method == KNOWN
     if known and _is_bare(log):
-        raise refusal(log.name, "rows without labels", LABELS, "add --association.method marginal")
-
-    def taken(scan: Scan) -> Scan:
-        return noise(labelled(scan, scan.landmark)) if known else scan
-
-    scans = [
-        without_hidden(
-            rows if known else without_labels(rows, rows.callers),
-            config.filter,
-            timing=config.listening.timing,
-        )
-        for rows in log.scans
-    ]
+        raise refusal(log.name, "rows without labels", LABELS, UNKNOWN)
+    scans = [without_unused(rows, config) for rows in log.scans]
     heard = {
-        strategy: tuple(map(taken, as_heard_by(scans, strategy, beamwidth)))
+        strategy: tuple(with_noise(s, config) for s in as_heard_by(scans, strategy, beamwidth))
         for strategy in strategies
     }
     causes = {} if known else _log_causes(log, heard)
@@ -286,7 +266,35 @@ def replay(
     return Mission(config=config, drive=drive, trials=trials, beamwidth=beamwidth, log=log)
 
 
-def _check_calibrated(log: Log, config: Config) -> None:
+def drive_of(log: Log, truth: Truth) -> Drive:
+    """Return the drive of a log."""
+    return Drive(
+        motion=motion_of(log),
+        start=start_of(log),
+        time=log.time,
+        controls=log.controls,
+        truth=truth,
+        known=_known_callers(log),
+        moving={who.landmark: who.name for who in log.callers if who.moves},
+        sensor=log.sensor_pose,
+    )
+
+
+def without_unused(scan: Scan, config: Config) -> Scan:
+    """Return a recorded scan without what the settings hide: labels, noise, excess paths."""
+    known = config.association.method == KNOWN
+    rows = scan if known else without_labels(scan, scan.callers)
+    return without_hidden(rows, config.filter, timing=config.listening.timing)
+
+
+def with_noise(scan: Scan, config: Config) -> Scan:
+    """Merge the rows of each landmark and state their noise, where labels are known."""
+    if config.association.method != KNOWN:
+        return scan
+    return noise_of(config.filter)(labelled(scan, scan.landmark))
+
+
+def check_calibrated(log: Log, config: Config) -> None:
     """Refuse to calibrate the odometry of a vehicle whose sensor is elsewhere."""
     asked = [name for name in config.filter.calibrate if name in OF_ODOMETRY]
     if asked and any(log.sensor_pose):
@@ -295,6 +303,8 @@ def _check_calibrated(log: Log, config: Config) -> None:
 
 
 LABELS = "labels of landmarks, or an association"
+UNKNOWN = "add --association.method marginal"
+"""What is expected of rows, and what to do where they have no labels."""
 
 
 def _is_bare(log: Log) -> bool:

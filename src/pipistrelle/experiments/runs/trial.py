@@ -176,7 +176,7 @@ def run_trial(
     strategy, name, heard, estimator = case.strategy, case.filter, tuple(scans), entry(case.filter)
     association = association or association_of(config)
     check_standing(drive.moving.values() if association else ())
-    scans = _with_moving(scans, drive, follows=estimator.follows and config.listening.timing)
+    scans = with_moving(scans, drive, follows=estimator.follows and config.listening.timing)
 
     used: list[Scan] = []
 
@@ -233,7 +233,7 @@ def _scored(
     return with_association(scores, track.landmarks, found, truth), mapped
 
 
-def _with_moving(scans: Sequence[Scan], drive: Drive, *, follows: bool) -> Sequence[Scan]:
+def with_moving(scans: Sequence[Scan], drive: Drive, *, follows: bool) -> Sequence[Scan]:
     """Mark the callers that move in scans, or leave out their rows."""
     if not drive.moving:
         return scans

@@ -1,0 +1,410 @@
+"""A vehicle that drives now: a step and a scan at a time, as the robot has them."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipistrelle.arithmetic.random_stream import stream_key
+from pipistrelle.config import Config
+from pipistrelle.detection.logs.recording import Log, scan_at
+from pipistrelle.detection.logs.vehicle import ODOMETRY, read_vehicle, vehicle_of
+from pipistrelle.detection.noise import noise_of
+from pipistrelle.estimation.association import KNOWN
+from pipistrelle.estimation.beliefs import Gaussian, Landmarks, answer, no_landmarks
+from pipistrelle.estimation.catalogue import entry
+from pipistrelle.estimation.checking import usable_controls
+from pipistrelle.estimation.data_association.methods import association_of
+from pipistrelle.estimation.session import Session
+from pipistrelle.experiments.drives import NO_TRUTH, at_sensor, carried, vehicle_in
+from pipistrelle.experiments.results.tables import landmark_table, path_table
+from pipistrelle.experiments.runs.replay import (
+    check_calibrated,
+    drive_of,
+    with_noise,
+    without_unused,
+)
+from pipistrelle.experiments.runs.trial import with_moving
+from pipistrelle.experiments.runs.validate_filters import check_filters
+from pipistrelle.refusals import refusal, shown
+from pipistrelle.scripting.arguments import Base, base_layer, folder_named, named_filters
+from pipistrelle.scripting.live_rows import (
+    check_now,
+    finite,
+    keys_of,
+    numbers,
+    table_of,
+    times_of,
+)
+from pipistrelle.scripting.log_settings import TIMING, check_open, with_log
+from pipistrelle.scripting.saved_state import read_state, write_state
+from pipistrelle.settings import Given, from_keywords
+
+if TYPE_CHECKING:
+    import polars as pl
+
+Vehicle = Path | str | Mapping[str, Any]
+"""A ``log.toml``, or its keys."""
+OF_ITSELF = {"format": 1, "initial_pose": [0.0, 0.0, 0.0], "initial_pose_std": [0.0, 0.0, 0.0]}
+"""Keys that a table need not have: the frame begins where the vehicle stands."""
+KEPT = 100_000
+"""Of how many of the last steps the poses are kept."""
+OWN_WORDS = ("filter", "config", "time", "kept")
+"""Keywords that are no settings."""
+R = TypeVar("R")
+
+
+class Pose(NamedTuple):
+    """Where the vehicle is."""
+
+    time: float
+    """[s]."""
+    x: float
+    """[m]."""
+    y: float
+    """[m]."""
+    heading: float
+    """From the x axis, counter-clockwise [rad]."""
+    covariance: Float[np.ndarray, "3 3"]
+    """Of x, y and heading [m, m, rad]."""
+
+
+class Slam:
+    """Position and map of a vehicle that drives now.
+
+    What is refused changes nothing, and what `pipistrelle slam` would find of the same steps and
+    rows is found to the bit: both conduct a `Session`.
+
+    Parameters
+    ----------
+    vehicle : Path or mapping
+        How it moves and how surely it measures: a ``log.toml``, or a table of its keys, of which
+        ``format``, ``initial_pose`` and ``initial_pose_std`` may be left out.
+    filter : str or class
+        An estimator by its name, ``module:Class`` or its class. The EKFs need bounded time and
+        memory; the smoother's history grows with the drive unless ``filter__window`` bounds it.
+    config : Config, mapping, or path of a TOML file, optional
+        Settings to start from.
+    time : float [s]
+        Of the start.
+    kept : int
+        Of how many of the last steps the poses are kept, for `path`.
+    **settings
+        As of `pipistrelle.slam`.
+
+    Raises
+    ------
+    InputError
+        For a vehicle, an estimator or a setting that cannot be had.
+
+    Examples
+    --------
+    >>> robot = {"motion": "unicycle", "velocity_std": 0.1, "angular_rate_std": 0.1,
+    ...          "range_std": 0.1, "bearing_std": 0.02, "range_bounds": [0.5, 20.0]}
+    >>> slam = Slam(robot, filter="iekf")
+    >>> slam.move([1.0, 0.0], dt=1.0)
+    >>> slam.hear(landmark=[7], bearing=[0.0], range=[2.0])
+    array([7])
+    >>> slam.pose.x, slam.map["x_m"].to_list()
+    (1.0, [3.0])
+    >>> slam.move([1.0, 0.0], time=0.5)
+    Traceback (most recent call last):
+    pipistrelle.config.InputError: move: found the time 0.5 s, expected one after 1.0 s, where the
+    vehicle is; leave out steps that come late
+    """
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        /,
+        *,
+        filter: str | type = "iekf",  # noqa: A002 - as the command line has it
+        config: Base = None,
+        time: float = 0.0,
+        kept: int = KEPT,
+        **settings: Any,
+    ) -> None:
+        if not isinstance(kept, int) or isinstance(kept, bool) or kept < 1:
+            raise refusal("kept", shown(kept), "a number of steps, 1 or more", "correct it")
+        start, flags = finite(time, "time"), from_keywords(settings, OWN_WORDS)
+        check_open(flags)
+        log, where = _log_of(vehicle, start)
+        layer = {TIMING: Given(True, "Slam")} | base_layer(config) | flags
+        resolved, _ = with_log(layer, log, where)
+        names = named_filters(filter, "filter")
+        if len(names) > 1:
+            raise refusal("filter", ", ".join(names), "one estimator", "make a Slam of each")
+        self._begin(log, resolved, names[0], kept)
+
+    def _begin(self, log: Log, config: Config, name: str, kept: int) -> None:
+        """Build the estimator, at the start."""
+        self._log, self._config, self._name, self._kept = log, config, name, kept
+        drive = drive_of(log, NO_TRUTH)
+        check_filters([name], drive.motion, config, drive.moving.values())
+        check_calibrated(log, config)
+        self._drive, found, sensor = drive, entry(name), at_sensor(drive)
+        self._follows = found.follows and config.listening.timing
+        self._session: Session[Any] = Session(
+            found.build(config, sensor.motion),
+            sensor.start,
+            np.random.default_rng(stream_key(config.seed, 0, name)),
+            known=drive.known,
+            association=association_of(config),
+            noise=noise_of(config.filter),
+            live=True,
+        )
+        self._time = float(log.time[0])
+        self._heard: set[tuple[Any, ...]] = set()
+        self._poses = [(self._time, self._at_vehicle(sensor.start))]
+
+    @property
+    def time(self) -> float:
+        """Where the last step ended [s]."""
+        return self._time
+
+    @property
+    def pose(self) -> Pose:
+        """Where the vehicle is, as it is believed now."""
+        pose = self._at_vehicle(self._session.belief.pose())
+        x, y, heading = pose.mean.tolist()
+        return Pose(self._time, x, y, heading, pose.covariance)
+
+    @property
+    def map(self) -> "pl.DataFrame":
+        """The landmarks, a row for each hypothesis, as ``landmarks.parquet`` has them."""
+        return _map_table(self._session.landmarks())
+
+    @property
+    def moving(self) -> "pl.DataFrame":
+        """The callers that move, as `map` has landmarks."""
+        return _map_table(answer(self._session.belief, "moving") or no_landmarks())
+
+    @property
+    def path(self) -> "pl.DataFrame":
+        """The start and the end of each step: time, pose and standard deviations.
+
+        As the estimator believes them now, of one that revises its path; else as they were believed
+        at their time, the last of them that are kept.
+        """
+        time = np.array([time for time, _ in self._poses])
+        revised = answer(self._session.belief, "path")
+        poses = Gaussian(
+            mean=np.array([pose.mean for _, pose in self._poses]),
+            covariance=np.array([pose.covariance for _, pose in self._poses]),
+        )
+        if revised is not None:
+            whole = self._at_vehicle(revised)
+            poses = Gaussian(
+                mean=whole.mean[-time.size :], covariance=whole.covariance[-time.size :]
+            )
+        return path_table(time, poses)
+
+    def move(
+        self,
+        controls: Sequence[float] | Float[np.ndarray, "k c"],
+        dt: float | Sequence[float] | None = None,
+        *,
+        time: float | Sequence[float] | None = None,
+    ) -> None:
+        """Take in one step, or k of them.
+
+        Parameters
+        ----------
+        controls : (c) or (k, c)
+            Velocity [m/s] and angular rate [rad/s], speed and steering angle [rad], or the motion
+            ahead, to the left [m] and turned [rad], as the vehicle's motion model has them.
+        dt : float or (k) [s], optional
+            How long each took.
+        time : float or (k) [s], optional
+            When each ended, in place of `dt`.
+
+        Raises
+        ------
+        InputError
+            For controls or times that cannot be; nothing has changed then.
+        """
+        ends, lengths = times_of(dt, time, self._time)
+        steps = np.atleast_2d(numbers(controls, "controls"))
+        steps, lengths = usable_controls(self._drive.motion, steps, lengths)
+        gone = self._at_sensor(steps, ends)
+        poses = self._change(lambda: self._session.move(gone, lengths))
+        placed = self._at_vehicle(poses)
+        self._poses += [
+            (end, Gaussian(mean=placed.mean[k], covariance=placed.covariance[k]))
+            for k, end in enumerate(ends.tolist())
+        ]
+        if len(self._poses) > 2 * self._kept:
+            del self._poses[: -self._kept]
+        self._time, self._heard = float(ends[-1]), set()
+
+    def hear(self, *, time: float | None = None, **columns: Any) -> Int[np.ndarray, " m"]:
+        """Take in the rows of a scan, heard where the vehicle is now.
+
+        Parameters
+        ----------
+        time : float [s], optional
+            Checked: that of the vehicle.
+        bearing : (m) [rad]
+            From the heading, counter-clockwise; NaN or None where a row is an excess path alone.
+        landmark : (m), optional
+            Labels; without them an association decides (``association__method``).
+        range, excess_path : (m) [m], optional
+            NaN or None where there is none.
+        caller : (m) of str, optional
+            Whose call it was, by the vehicle's callers; None of its own.
+        bearing_std, range_std, excess_path_std : (m) [rad], [m], [m], optional
+            In place of the vehicle's.
+
+        Returns
+        -------
+        (m)
+            The label of each row, as known or decided; -1 where it is of none.
+
+        Raises
+        ------
+        InputError
+            For rows that cannot be, or were heard already; nothing has changed then.
+        """
+        check_now(time, self._time)
+        known = self._config.association.method == KNOWN
+        table = table_of(columns, self._log.callers, labelled=known)
+        if not table.line.size:
+            return table.column["landmark"]
+        scan = scan_at(self._time, table, self._log.callers)
+        fresh = keys_of(table)
+        if fresh & self._heard:
+            found, fix = f"rows once more at {self._time} s", "leave out what came twice"
+            raise refusal("hear", found, "each once", fix)
+        scan = with_noise(without_unused(scan, self._config), self._config)
+        (scan,) = with_moving([scan], self._drive, follows=self._follows)
+        self._change(lambda: self._session.hear(scan))
+        self._heard |= fresh
+        pose = self._at_vehicle(self._session.belief.pose())
+        self._poses[-1] = (self._time, pose)
+        if not self._session.labels:
+            return table.column["landmark"]
+        order = np.argsort(np.isnan(table.column["bearing"]), kind="stable")
+        labels = np.empty(order.size, dtype=np.int64)
+        labels[order] = self._session.labels[-1]
+        return labels
+
+    def save(self, file: Path | str) -> Path:
+        """Write all that is known into a file, for `load`.
+
+        A file in its place is replaced where `save` wrote it, and refused where it did not.
+        """
+        path = folder_named(file, "file")
+        settings = self._config.model_dump(mode="json")
+        header = {"filter": self._name, "kept": self._kept, "config": settings}
+        times, poses = zip(*self._poses, strict=True)
+        content = {
+            "session": self._session.state(),
+            "log": self._log,
+            "heard": self._heard,
+            "times": np.array(times),
+            "means": np.array([pose.mean for pose in poses]),
+            "covariances": np.array([pose.covariance for pose in poses]),
+        }
+        write_state(path, header, content)
+        return path
+
+    @classmethod
+    def load(cls, file: Path | str, *, filter: str | type | None = None) -> Self:  # noqa: A002
+        """Go on from what `save` wrote, to the bit.
+
+        Parameters
+        ----------
+        file : Path
+        filter : str or class, optional
+            The estimator that it was saved with, where that is one of your own: a file alone makes
+            nobody's module run.
+
+        Raises
+        ------
+        InputError
+            For a file that `save` of this version did not write, or that has changed since.
+        """
+        path = folder_named(file, "file")
+        own = None if filter is None else named_filters(filter, "filter")[0]
+        header, content = read_state(path, own)
+        slam = cls.__new__(cls)
+        config = Config.model_validate(header["config"])
+        slam._begin(content["log"], config, header["filter"], header["kept"])
+        slam._session.go_on_from(content["session"])
+        parts = zip(
+            content["times"].tolist(), content["means"], content["covariances"], strict=True
+        )
+        slam._poses = [(t, Gaussian(mean=m, covariance=P)) for t, m, P in parts]
+        slam._time, slam._heard = slam._poses[-1][0], content["heard"]
+        return slam
+
+    def copy(self) -> Self:
+        """Return another that goes on from here by itself, to the same bits."""
+        other = type(self).__new__(type(self))
+        other._begin(self._log, self._config, self._name, self._kept)
+        other._session.go_on_from(self._session.state())
+        other._poses, other._time, other._heard = [*self._poses], self._time, {*self._heard}
+        return other
+
+    def __repr__(self) -> str:
+        """Say where the vehicle is."""
+        pose, landmarks = self.pose, self._session.landmarks().landmark
+        return (
+            f"Slam by {self._name} at {pose.time:g} s: x {pose.x:.3f} m, y {pose.y:.3f} m, heading "
+            f"{pose.heading:.3f} rad; {np.unique(landmarks).size} landmarks"
+        )
+
+    def _change(self, act: Callable[[], R]) -> R:
+        """Let the session do something; where that fails, it is as it was."""
+        before = self._session.state()
+        try:
+            result = act()
+            pose = self._session.belief.pose()
+            if not (np.isfinite(pose.mean).all() and np.isfinite(pose.covariance).all()):
+                raise refusal(
+                    f"at {self._time:g} s",
+                    "a pose that is no number",
+                    "a finite one",
+                    "this step or scan was not taken in; is it in metres, seconds and radians?",
+                )
+            return result
+        except BaseException:
+            self._session.go_on_from(before)
+            raise
+
+    def _at_vehicle(self, pose: Gaussian) -> Gaussian:
+        """Return where the vehicle is, by where its sensor is."""
+        sensor = self._drive.sensor
+        return carried(pose, vehicle_in(sensor)) if any(sensor) else pose
+
+    def _at_sensor(
+        self, steps: Float[np.ndarray, "k c"], ends: Float[np.ndarray, " k"]
+    ) -> Float[np.ndarray, "k c"]:
+        """Return the steps of the sensor, by those of its vehicle."""
+        time = np.array([self._time, *ends])
+        return at_sensor(replace(self._drive, time=time, controls=steps)).controls
+
+
+def _log_of(vehicle: Vehicle, time: float) -> tuple[Log, Path]:
+    """Return a log of a vehicle that has not moved, and where the vehicle was told."""
+    if isinstance(vehicle, Mapping):
+        where, former = Path("vehicle"), ()
+        told = vehicle_of(OF_ITSELF | dict(vehicle), where)
+    elif isinstance(vehicle, (str, Path)):
+        where = Path(vehicle)
+        told, former = read_vehicle(Path(vehicle))
+    else:
+        fix = "see docs/log_format.md"
+        raise refusal("vehicle", shown(vehicle), "the path of a log.toml, or its keys", fix)
+    none = {"scans": (), "ignored_rows": {}, "dt": np.empty(0), "former_names": former}
+    controls, start = np.empty((0, len(ODOMETRY[told.motion]))), np.array([time])
+    log = Log(name=str(where), time=start, controls=controls, **none, **told.told())
+    return log, where
+
+
+def _map_table(landmarks: Landmarks) -> "pl.DataFrame":
+    """Lay out a map without its truth."""
+    return landmark_table(landmarks, None).drop("true_x_m", "true_y_m", "error_m")

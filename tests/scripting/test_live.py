@@ -1,0 +1,331 @@
+"""A vehicle that drives now ends where its log does, to the bit, and a refusal changes nothing."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+import pipistrelle
+from pipistrelle import InputError, Slam
+from pipistrelle.__main__ import main
+from pipistrelle.estimation.catalogue import CATALOGUE
+from pipistrelle.scripting.saved_state import HEAD
+
+LOG = Path(__file__).parents[1] / "data" / "unicycle_log"
+ROBOT = {
+    "motion": "unicycle",
+    "velocity_std": 0.1,
+    "angular_rate_std": 0.1,
+    "range_std": 0.1,
+    "bearing_std": 0.02,
+    "range_bounds": [0.5, 20.0],
+}
+AS_FOUND = pytest.mark.filterwarnings("ignore::UserWarning")
+"""What looks odd in a log that was made odd is warned of."""
+ONE = {"landmark": [7, 8], "bearing": [0.1, 0.9], "range": [2.0, 3.0]}
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    """Return a log of a mission, and one whose rows have no labels."""
+    folder = tmp_path_factory.mktemp("logs")
+    settings = ["--listening.timing", "true", "--filter.noise", "measured"]
+    run = ["run", "--duration", "20", "--strategy", "fused", "--quiet", *settings]
+    assert main([*run, "--save-log", str(folder / "known"), "-o", str(folder / "a")]) == 0
+    bare = shutil.copytree(folder / "known", folder / "bare")
+    (bare / "SHA256SUMS").unlink()
+    rows = pl.read_csv(bare / "measurements.csv").with_columns(landmark=pl.lit(None))
+    rows.write_csv(bare / "measurements.csv")
+    return {"known": folder / "known", "bare": bare}
+
+
+def driven(log, *, chunk=1, then=lambda slam: slam, **options):
+    """Drive a log step by step; after half of it go on with what `then` returns."""
+    odometry, rows = (pl.read_csv(log / f"{name}.csv") for name in ("odometry", "measurements"))
+    time, controls = odometry["time"].to_numpy(), odometry.drop("time").to_numpy()
+    heard = dict(list(rows.group_by("time", maintain_order=True)))
+    slam = Slam(log / "log.toml", time=time[0], **options)
+    scans = [k for k in range(1, time.size) if (time[k],) in heard]
+    done = 0
+    for number, k in enumerate(sorted({*scans, time.size - 1})):
+        while done < k:
+            last = min(done + chunk, k)
+            slam.move(controls[done:last], time=time[done + 1 : last + 1])
+            done = last
+        if (time[k],) in heard:
+            slam.hear(**heard[time[k],].drop("time").to_dict())
+        if number == len(scans) // 2:
+            slam = then(slam)
+    return slam
+
+
+def same(slam, done):
+    """Tell whether track and map are those of a result, to the bit."""
+    path, there = slam.path, done.landmarks
+    there = there.filter(pl.col("status") != "unseen").select(slam.map.columns)
+    return path.equals(done.tracks.select(path.columns)) and slam.map.equals(there)
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_steps_one_by_one_give_the_track_and_the_map_of_the_log_to_the_bit(logs, name):
+    assert same(driven(logs["known"], filter=name), pipistrelle.slam(logs["known"], filters=name))
+
+
+def test_how_many_steps_come_at_once_changes_no_bit(logs):
+    one, three = (driven(logs["known"], chunk=chunk) for chunk in (1, 3))
+    assert one.map.equals(three.map)
+    assert one.pose.covariance.tobytes() == three.pose.covariance.tobytes()
+
+
+@AS_FOUND
+@pytest.mark.parametrize("name", ["iekf", "smoother"])
+def test_rows_without_labels_are_associated_as_those_of_the_log(logs, name):
+    options = {"association__method": "marginal"}
+    slam = driven(logs["bare"], filter=name, **options)
+    done = pipistrelle.slam(logs["bare"], filters=name, **options)
+    assert slam.map.height > 1
+    there = done.landmarks.filter(pl.col("status") != "unseen").select(slam.map.columns)
+    assert slam.map.equals(there)
+    online = done._mission.trials[0].track.online or done._mission.trials[0].track.pose
+    assert slam.pose.x == online.mean[-1, 0]
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+@pytest.mark.parametrize("kind", ["known", "bare"])
+def test_a_saved_drive_and_a_copy_go_on_to_the_same_bits(logs, tmp_path, name, kind):
+    options = {"filter": name} | ({"association__method": "nearest"} if kind == "bare" else {})
+
+    def through_a_file(slam):
+        return Slam.load(slam.save(tmp_path / "half.slam"))
+
+    whole = driven(logs[kind], **options)
+    for then in (through_a_file, lambda slam: slam.copy()):
+        again = driven(logs[kind], then=then, **options)
+        assert again.path.equals(whole.path)
+        assert again.map.equals(whole.map)
+
+
+def test_a_copy_leaves_the_first_where_it_is():
+    slam = Slam(ROBOT)
+    slam.move([1.0, 0.0], dt=1.0)
+    slam.hear(**ONE)
+    other, before = slam.copy(), (slam.pose.x, slam.map)
+    other.move([1.0, 0.2], dt=1.0)
+    other.hear(**ONE)
+    assert (slam.pose.x, slam.time) == (before[0], 1.0)
+    assert slam.map.equals(before[1])
+    assert other.time == 2.0
+
+
+@AS_FOUND
+def test_a_sensor_beside_the_vehicle_is_driven_as_in_a_log(tmp_path, logs):
+    log = shutil.copytree(logs["known"], tmp_path / "arm")
+    (log / "SHA256SUMS").unlink()
+    text = (log / "log.toml").read_text()
+    (log / "log.toml").write_text(f"sensor_pose = [0.4, -0.1, 0.3]\n{text}")
+    slam, done = driven(log, filter="iekf"), pipistrelle.slam(log, filters="iekf")
+    tracks = done.tracks.select(slam.path.columns)
+    np.testing.assert_allclose(slam.path.to_numpy(), tracks.to_numpy(), rtol=0, atol=1e-9)
+    assert abs(slam.path["x_m"] - driven(logs["known"]).path["x_m"]).max() > 0.01
+
+
+REFUSED = {
+    "a step that is late": (lambda s: s.move([1, 0], time=0.5), "one after 1.0 s, where"),
+    "a step that is repeated": (lambda s: s.move([1, 0], time=1.0), "one after 1.0 s, where"),
+    "steps out of order": (lambda s: s.move([[1, 0]] * 2, time=[3.0, 2.0]), "one after 3.0 s"),
+    "no time": (lambda s: s.move([1, 0]), "neither dt nor time"),
+    "both times": (lambda s: s.move([1, 0], 1.0, time=2.0), "both dt and time"),
+    "a time that is no number": (lambda s: s.move([1, 0], time=np.nan), "one after 1.0 s"),
+    "a step of no length": (lambda s: s.move([1, 0], 0.0), "times above 0"),
+    "a speed that is no number": (lambda s: s.move([np.nan, 0], 1.0), "found the controls"),
+    "words for speeds": (lambda s: s.move(["fast", 0], 1.0), "controls: found"),
+    "three controls for two": (lambda s: s.move([1, 0, 0], 1.0), "a row of 2 controls"),
+    "rows that came already": (lambda s: s.hear(**ONE), "rows once more at 1.0 s"),
+    "a scan that is late": (lambda s: s.hear(time=0.9, **ONE), "the vehicle has moved on"),
+    "a scan to come": (lambda s: s.hear(time=1.1, **ONE), "move to it first"),
+    "a bearing that is no number": (
+        lambda s: s.hear(landmark=[9], bearing=[np.nan], range=[1.0]),
+        "hear, row 1: found bearing ''",
+    ),
+    "an endless range": (
+        lambda s: s.hear(landmark=[9], bearing=[0.1], range=[np.inf]),
+        "hear, row 1: found range inf",
+    ),
+    "columns of several lengths": (
+        lambda s: s.hear(landmark=[9, 10], bearing=[0.1]),
+        "columns of the shapes",
+    ),
+    "a landmark twice": (
+        lambda s: s.hear(landmark=[9, 9], bearing=[0.1, 0.2]),
+        "hear, row 2: found landmark 9",
+    ),
+    "a label that is none": (lambda s: s.hear(landmark=[1.5], bearing=[0.1]), "an integer"),
+    "no labels": (lambda s: s.hear(bearing=[0.1]), "association__method"),
+    "an unknown caller": (
+        lambda s: s.hear(landmark=[9], bearing=[0.1], caller=["bat"]),
+        "the vehicle itself",
+    ),
+    "an unknown column": (
+        lambda s: s.hear(landmark=[9], bearings=[0.1]),
+        "did you mean 'bearing'",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+@pytest.mark.parametrize("name", ["iekf", "smoother"])
+def test_what_cannot_be_is_refused_and_changes_nothing(name, what):
+    act, words = REFUSED[what]
+    slam = Slam(ROBOT, filter=name)
+    slam.move([1.0, 0.1], dt=1.0)
+    slam.hear(**ONE)
+    untouched = slam.copy()
+    with pytest.raises(InputError) as refused:
+        act(slam)
+    assert words in str(refused.value)
+    for one in (slam, untouched):
+        one.move([1.0, 0.1], dt=1.0)
+        one.hear(**ONE)
+    assert slam.path.equals(untouched.path)
+    assert slam.map.equals(untouched.map)
+
+
+def test_an_estimator_that_fails_leaves_all_as_it_was(monkeypatch):
+    slam = Slam(ROBOT)
+    slam.move([1.0, 0.1], dt=1.0)
+    before = slam.copy()
+
+    def fails(*_):
+        raise RuntimeError("no memory")
+
+    monkeypatch.setattr(type(slam._session._estimator), "update", fails)
+    with pytest.raises(RuntimeError):
+        slam.hear(**ONE)
+    monkeypatch.undo()
+    assert slam.path.equals(before.path)
+    assert slam.hear(**ONE).tolist() == before.hear(**ONE).tolist() == [7, 8]
+    assert slam.map.equals(before.map)
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "words"),
+    [
+        ({}, "vehicle: found no key"),
+        (ROBOT | {"range_std": -1.0}, "vehicle, key 'range_std'"),
+        (ROBOT | {"rang_std": 1.0}, "did you mean 'range_std'"),
+        (3, "the path of a log.toml"),
+        ("nowhere/log.toml", "nowhere"),
+    ],
+)
+def test_a_vehicle_that_is_none_is_refused(vehicle, words):
+    with pytest.raises(InputError) as refused:
+        Slam(vehicle)
+    assert words in str(refused.value)
+
+
+def test_settings_are_those_of_slam_and_what_is_none_is_refused():
+    assert Slam(ROBOT, filter="smoother", filter__window=50, seed=3).time == 0.0
+    for options, words in (
+        ({"rays__powr": 2.0}, "did you mean rays__power"),
+        ({"filter__range_std": 1.0}, "the log decides this"),
+        ({"filter": "both"}, "one estimator"),
+        ({"filter": "ikef"}, "did you mean 'iekf'"),
+        ({"kept": 0}, "kept"),
+        ({"time": np.nan}, "a finite number"),
+    ):
+        with pytest.raises(InputError) as refused:
+            Slam(ROBOT, **options)
+        assert words in str(refused.value)
+
+
+def test_poses_of_the_last_steps_are_kept_and_no_more():
+    slam = Slam(ROBOT, kept=10)
+    for _ in range(95):
+        slam.move([1.0, 0.0], dt=0.1)
+    assert 10 <= slam.path.height <= 20
+    assert slam.path["time_s"][-1] == slam.time
+
+
+def test_a_file_of_somebody_is_neither_overwritten_nor_loaded(tmp_path):
+    slam, mine = Slam(ROBOT), tmp_path / "notes.txt"
+    mine.write_text("mine")
+    for act in (slam.save, Slam.load):
+        with pytest.raises(InputError, match=r"notes\.txt: found a file that Slam\.save did not"):
+            act(mine)
+    assert mine.read_text() == "mine"
+    for act in (slam.save, Slam.load):
+        with pytest.raises(InputError, match="folder"):
+            act(tmp_path)
+    saved = slam.save(tmp_path / "one.slam")
+    assert slam.save(saved) == saved, "its own is replaced"
+    link = tmp_path / "link.slam"
+    link.symlink_to(mine)
+    with pytest.raises(InputError):
+        slam.save(link)
+    assert mine.read_text() == "mine"
+
+
+@pytest.mark.parametrize("at", [50, 150, -20])
+def test_a_saved_drive_that_has_changed_is_refused(tmp_path, at):
+    saved = Slam(ROBOT).save(tmp_path / "one.slam")
+    data = bytearray(saved.read_bytes())
+    data[at] ^= 1
+    saved.write_bytes(data)
+    with pytest.raises(InputError, match="has changed since"):
+        Slam.load(saved)
+    saved.write_bytes(data[: len(data) // 2])
+    with pytest.raises(InputError, match="has changed since"):
+        Slam.load(saved)
+
+
+def test_a_file_made_to_run_something_runs_nothing(tmp_path):
+    import pickle
+    from hashlib import sha256
+
+    class Evil:
+        def __reduce__(self):
+            return Path.touch, (tmp_path / "ran",)
+
+    saved = Slam(ROBOT).save(tmp_path / "one.slam")
+    line = saved.read_bytes()[len(HEAD) :].split(b"\n")[1]
+    body = line + b"\n" + pickle.dumps({"session": Evil()})
+    saved.write_bytes(HEAD + sha256(body).hexdigest().encode() + b"\n" + body)
+    with pytest.raises(InputError, match="the saved drive: found"):
+        Slam.load(saved)
+    assert not (tmp_path / "ran").exists()
+
+
+def test_a_caller_is_named_as_the_vehicle_names_it():
+    robot = ROBOT | {"callers": [{"name": "bat", "landmark": 3, "place": [5.0, 1.0]}]}
+    slam = Slam(robot, filter="iekf")
+    slam.move([1.0, 0.0], dt=1.0)
+    slam.hear(landmark=[9], bearing=[0.5], caller=["bat"], excess_path=[4.0], excess_path_std=[0.1])
+    assert slam.map.filter(landmark=9)["status"].to_list() == ["full"]
+
+
+@pytest.mark.slow
+def test_a_million_steps_need_no_more_memory_and_no_more_time():
+    import tracemalloc
+    from time import process_time
+
+    slam, rng = Slam(ROBOT, kept=1000), np.random.default_rng(7)
+    places, spans, sizes = rng.uniform(-8.0, 8.0, (20, 2)), [], []
+    tracemalloc.start()
+    for round_ in range(10):
+        began = process_time()
+        for _ in range(10_000):
+            slam.move(np.tile([0.5, 0.25], (10, 1)), dt=np.full(10, 0.1))
+            pose = slam.pose
+            way = places[rng.choice(20, 3, replace=False)]
+            seen = way - [pose.x, pose.y]
+            label = np.flatnonzero((places[:, None] == way).all(axis=2).any(axis=1))
+            seen = places[label] - [pose.x, pose.y]
+            bearing = np.arctan2(seen[:, 1], seen[:, 0]) - pose.heading
+            slam.hear(landmark=label, bearing=bearing, range=np.hypot(*seen.T))
+        spans.append(process_time() - began)
+        sizes.append(tracemalloc.get_traced_memory()[0])
+        assert round_ == 0 or sizes[-1] < sizes[0] + 1e6
+    tracemalloc.stop()
+    assert spans[-1] < 1.5 * np.median(spans[:3])
