@@ -16,7 +16,7 @@ numbered from 1 in the order of the file.
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -26,8 +26,10 @@ from xml.parsers import expat
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipistrelle.config import SQUARE, InputError, MicrophoneRow
 from pipistrelle.files import check_ordinary, read_text, write_whole
 from pipistrelle.refusals import refusal, shown
+from pipistrelle.settings import ARRAY_KEY, Layer
 
 MAX_MICROPHONES = 256
 """Most microphones of an array."""
@@ -60,9 +62,10 @@ class Microphones:
 
 
 class _Row(NamedTuple):
-    """One microphone and the line that it is from."""
+    """One microphone."""
 
-    line: int
+    place: str
+    """Line of the file, or row of the setting, that it is from."""
     channel: int
     x: float
     y: float
@@ -106,7 +109,42 @@ def read_array(path: Path) -> Microphones:
     text = read_text(path)
     rows = list((_rows_of_xml if text.lstrip()[:1] == "<" else _rows_of_csv)(path, text))
     rows.sort(key=lambda row: row.channel)
-    _check(path, rows)
+    return _checked(str(path), rows)
+
+
+def microphones_of(rows: Sequence[MicrophoneRow], where: str = "receiver.array") -> Microphones:
+    """Return the microphones of a setting's rows: x, y, z [m], gain [dB] and face of each.
+
+    >>> microphones_of([(0.0, 0.1, 0.0, 0.0, ""), (0.0, -0.1, 0.0, 0.0, "")]).channel
+    array([1, 2])
+    """
+    numbered = enumerate(rows, start=1)
+    return _checked(
+        where,
+        [
+            _Row(f"row {n}", n, x=x, y=y, z=z, gain_db=gain_db, face=face)
+            for n, (x, y, z, gain_db, face) in numbered
+        ],
+    )
+
+
+def with_array(layer: Layer) -> Layer:
+    """Replace the name of an array's file by the microphones in it: settings that need no file."""
+    given = layer.get(ARRAY_KEY)
+    if given is None or not isinstance(given.value, str) or given.value in ("", SQUARE):
+        return layer
+    try:
+        found = read_array(Path(given.value))
+    except InputError as error:
+        raise InputError(f"{given.where}: {error}") from None
+    columns = found.position.tolist(), found.gain_db.tolist(), found.face
+    rows = [[*place, gain_db, face] for place, gain_db, face in zip(*columns, strict=True)]
+    return layer | {ARRAY_KEY: given._replace(value=rows)}
+
+
+def _checked(where: str, rows: list[_Row]) -> Microphones:
+    """Return microphones, in the order of their channels; refuse what is no array."""
+    _check(where, rows)
     return Microphones(
         channel=np.array([row.channel for row in rows]),
         position=np.array([(row.x, row.y, row.z) for row in rows]),
@@ -164,7 +202,7 @@ def _rows_of_csv(path: Path, text: str) -> Iterator[_Row]:
         if len(fields) != len(names):
             found = f"{len(fields)} fields in {shown(row)}"
             raise refusal(where, found, f"{len(names)}: {', '.join(names)}", "correct the row")
-        yield _row(where, line, dict(zip(names, fields, strict=True)))
+        yield _row(path, line, dict(zip(names, fields, strict=True)))
 
 
 def _rows_of_xml(path: Path, text: str) -> Iterator[_Row]:
@@ -187,7 +225,7 @@ def _rows_of_xml(path: Path, text: str) -> Iterator[_Row]:
             raise refusal(where, found, "pos with x, y and z", "add the coordinates")
         if tag == "pos":
             number = {"channel": str(len(rows) + 1)}
-            rows.append(_row(where, line, number | {axis: fields[axis] for axis in "xyz"}))
+            rows.append(_row(path, line, number | {axis: fields[axis] for axis in "xyz"}))
 
     parser.StartDoctypeDeclHandler, parser.StartElementHandler = refuse_type, begin
     try:
@@ -200,9 +238,9 @@ def _rows_of_xml(path: Path, text: str) -> Iterator[_Row]:
     return iter(rows)
 
 
-def _row(where: str, line: int, fields: dict[str, str]) -> _Row:
-    """Return the microphone of a row's fields, or refuse one of them."""
-    channel = fields["channel"]
+def _row(path: Path, line: int, fields: dict[str, str]) -> _Row:
+    """Return the microphone of a line's fields, or refuse one of them."""
+    where, channel = f"{path}, line {line}", fields["channel"]
     if not (channel.isdecimal() and channel.isascii() and len(channel) < 10):
         found, expected = f"channel {shown(channel)}", "a whole number, from 0 or 1 on"
         raise refusal(where, found, expected, "number the channels of the recording")
@@ -220,26 +258,26 @@ def _row(where: str, line: int, fields: dict[str, str]) -> _Row:
             unit = "dB" if name == "gain_db" else "m"
             expected = f"a number between -{limit:g} and {limit:g} {unit}"
             raise refusal(where, f"{name} {shown(field)}", expected, "correct the field")
-    return _Row(line=line, channel=int(channel), face=face, **numbers)
+    return _Row(f"line {line}", channel=int(channel), face=face, **numbers)
 
 
-def _check(path: Path, rows: list[_Row]) -> None:
+def _check(path: str, rows: list[_Row]) -> None:
     """Refuse rows, in the order of their channels, that are no array."""
     if not 2 <= len(rows) <= MAX_MICROPHONES:
         found = f"{len(rows)} microphone" + "s" * (len(rows) != 1)
         expected = f"2 to {MAX_MICROPHONES}"
         raise refusal(path, found, expected, "one alone hears no direction; add the others")
     for before, row in pairwise(rows):
-        where = f"{path}, line {row.line}"
+        where = f"{path}, {row.place}"
         if row.channel == before.channel:
-            expected = f"it once, as in line {before.line}"
+            expected = f"it once, as in {before.place}"
             raise refusal(where, f"channel {row.channel} again", expected, "renumber one")
         if row.channel != before.channel + 1:
             found = f"channel {row.channel} after {before.channel}"
             fix = "add the row, or number the channels without gaps"
             raise refusal(where, found, f"channel {before.channel + 1}", fix)
     if rows[0].channel > 1:
-        where = f"{path}, line {rows[0].line}"
+        where = f"{path}, {rows[0].place}"
         found = f"{rows[0].channel} as the first channel"
         raise refusal(where, found, "0 or 1", "add the rows, or number the channels from 1")
     place = np.array([(row.x, row.y, row.z) for row in rows])
@@ -251,6 +289,6 @@ def _check(path: Path, rows: list[_Row]) -> None:
         near = np.flatnonzero(np.linalg.norm(place[:m] - place[m], axis=1) < SAME_PLACE)
         if near.size:
             other = rows[near[0]]
-            found = f"channel {row.channel} where channel {other.channel} is (line {other.line})"
+            found = f"channel {row.channel} where channel {other.channel} is ({other.place})"
             expected = "each microphone in a place of its own"
-            raise refusal(f"{path}, line {row.line}, x, y, z", found, expected, "correct one")
+            raise refusal(f"{path}, {row.place}, x, y, z", found, expected, "correct one")

@@ -12,7 +12,7 @@ from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of, moves
 from pipistrelle.arrays.layout import layout_of
 from pipistrelle.arrays.sampling import sampling
 from pipistrelle.config import Config, InputError
-from pipistrelle.detection.snapshots import detector
+from pipistrelle.detection.front_end import front_end
 from pipistrelle.experiments.hearing.scenario import Scenario, world_of
 from pipistrelle.experiments.hearing.world import ALL_DRAWN, World
 from pipistrelle.experiments.machine import check_length, check_recording
@@ -45,7 +45,7 @@ def checked_scenario(
     scenario = world_of(config, world=world)
     settled = sampling(config, scenario.callers)
     layout = layout_of(config)
-    detector(config, layout, settled.tones)
+    front_end(config, layout, settled.tones)
     check_recording(scenario, config, layout, settled, workers=workers)
     _refuse_supersonic(scenario, config)
     return scenario
