@@ -172,12 +172,12 @@ def trials(layout, snr_db, count, seed=0):
     end = front_end(CONFIG, layout, SETTLED.tones)
     for k in range(count):
         bearing, delay = rng.uniform(-np.pi, np.pi), 6e-3 + rng.uniform(0.0, 5e-4)
-        delay = math.ceil(delay * SETTLED.rate) / SETTLED.rate  # begins with a sample
         key = stream_key(seed, k, "full circle")
         found = find_calls(matched_of(one(delay, bearing, snr_db), layout, key, 50), end, **LAGS)
         if found.delay.size == 1:
-            off = wrap(found.bearing[0] - bearing), found.delay[0] - delay
-            rows.append((*off, found.bearing_std[0], found.delay_std[0]))
+            off = wrap(found.bearing[0] - bearing)
+            late = found.delay[0] - delay - 0.5 / SETTLED.rate  # it begins with the next sample
+            rows.append((off, late, found.bearing_std[0], found.delay_std[0]))
     return np.array(rows).T
 
 
