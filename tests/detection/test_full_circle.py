@@ -15,12 +15,13 @@ from pipistrelle.arithmetic.random_stream import complex_noise, stream_key
 from pipistrelle.arrays.array_file import microphones_of
 from pipistrelle.arrays.beamforming import bearing_bound
 from pipistrelle.arrays.layout import Scattered, scattered, square_of_four
+from pipistrelle.arrays.pattern import spread_towards
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
 from pipistrelle.arrays.sampling import BLOCK, blocks_to_hear, sampling
 from pipistrelle.config import Config, DetectionConfig, InputError
 from pipistrelle.detection.direct import Lags
 from pipistrelle.detection.front_end import find_calls, front_end
-from pipistrelle.detection.full_circle import circle_of, find_around, spread_towards
+from pipistrelle.detection.full_circle import circle_of, find_around
 from pipistrelle.detection.matched import filter_blocks, filter_samples
 from pipistrelle.detection.snapshots import detect, detector
 from pipistrelle.geometry import wrap

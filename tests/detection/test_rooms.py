@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from pipistrelle.arrays.pattern import spread_towards
 from pipistrelle.arrays.sampling import BLOCK
 from pipistrelle.detection.front_end import front_end
-from pipistrelle.detection.full_circle import spread_towards
 from pipistrelle.geometry import wrap
 from reference.rooms import ARRAYS, CONFIG, PULSE, RATE, TONES, C, found_in, heard, noise_for
 
@@ -79,7 +79,7 @@ def test_bearings_are_unbiased_and_within_a_fifth_of_their_bounds(name, snr_db):
     late = abs(delay.mean()) - 4.0 * delay.std() / np.sqrt(delay.size)
     assert late < (0.4 if name == "square" else 0.0)
     if name == "square":  # its fast scan takes a call to reach a whole face at once
-        assert rms(delay) < 1.5
+        assert rms(delay) < 1.7
     elif snr_db >= 20.0:
         assert rms(delay) < 1.2
     else:  # the edges of a tone are jumps: near the threshold no bound of this kind is met

@@ -125,6 +125,22 @@ def scattered(microphones: Microphones) -> Scattered:
     )
 
 
+def square_microphones(receiver: ReceiverConfig) -> Microphones:
+    """Return the square's microphones where a vehicle has them, on four faces around its centre.
+
+    >>> square_microphones(ReceiverConfig()).position.shape
+    (40, 3)
+    """
+    square, rows = square_of_four(receiver), []
+    reach = 0.5 * (np.ptp(square.position) + receiver.spacing)
+    for name, normal in zip(("front", "left", "back", "right"), square.normal, strict=True):
+        ahead, left = np.array([np.cos(normal), np.sin(normal)]), (-np.sin(normal), np.cos(normal))
+        for along in square.position:
+            x, y = reach * ahead + along * np.array(left)
+            rows.append((float(x), float(y), 0.0, 0.0, name))
+    return microphones_of(rows)
+
+
 def along_line(layout: Scattered, g: int) -> tuple[Int[np.ndarray, " k"], Layout]:
     """Return a line's microphones from right to left, and it alone as a layout."""
     members = np.flatnonzero(layout.group == g)

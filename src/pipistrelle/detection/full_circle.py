@@ -46,6 +46,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from pipistrelle.arrays.layout import Scattered
+from pipistrelle.arrays.pattern import spread_towards
 from pipistrelle.config import Config
 from pipistrelle.detection.certainty import bearing_std, delay_std, loudest_noise, over_noise
 from pipistrelle.detection.direct import MIN_EDGE_ENERGY_OF_BEAM, Lags, front_edge
@@ -112,24 +113,6 @@ def circle_of(
         position=position,
         weight=weight,
     )
-
-
-def spread_towards(
-    bearing: Float[np.ndarray, "*n"],
-    position: Float[np.ndarray, "k 2"],
-    weight: Float[np.ndarray, " k"],
-) -> Float[np.ndarray, "*n"]:
-    r"""Return the weighted variance of microphones' places across a direction [m^2].
-
-    Times the wavenumber squared it is :math:`\kappa`: how far the phases turn with the bearing.
-
-    >>> pair, equal = np.array([[0.0, 0.1], [0.0, -0.1]]), np.full(2, 0.5**0.5)
-    >>> spread_towards(np.array([0.0, np.pi / 2]), pair, equal).round(9)
-    array([0.01, 0.  ])
-    """
-    across = np.stack((-np.sin(bearing), np.cos(bearing)), axis=-1) @ position.T
-    share = weight * weight
-    return across**2 @ share - (across @ share) ** 2
 
 
 def loudest_by_chance(chance: float, looks: float, microphones: int) -> float:
