@@ -264,7 +264,8 @@ def test_a_line_away_from_the_vehicles_centre_tells_the_delay_at_the_centre():
 def test_a_face_looks_away_from_the_middle_whatever_the_order_of_its_channels():
     for sign in (1.0, -1.0):
         rows = [(-0.1, sign * y, 0.0, 0.0, "stern") for y in (-0.01, 0.0, 0.01)]
-        layout = scattered(microphones_of([*rows, (0.3, 0.0, 0.0, 0.0, "")]))
+        others = [(0.3, y, 0.0, 0.0, "") for y in (-0.01, 0.01)]
+        layout = scattered(microphones_of([*rows, *others]))
         assert abs(layout.normal[layout.name.index("stern")]) == pytest.approx(np.pi)
 
 
@@ -275,6 +276,18 @@ def test_what_only_lines_can_is_refused(setting, value):
     config = Config(detection=DetectionConfig(**{setting: value}))
     with pytest.raises(InputError, match=f"detection.{setting}: found '{value}'"):
         front_end(config, CIRCLE, SETTLED.tones)
+
+
+def test_microphones_hundreds_of_waves_apart_are_refused_as_millimetres():
+    with pytest.raises(InputError, match=r"5 m, 510 waves, from the next.*millimetres"):
+        front_end(CONFIG, free([(0.0, 0.0), (5.0, 0.0)]), SETTLED.tones)
+
+
+def test_one_microphone_alone_hears_no_direction_and_is_refused():
+    face = [(0.0, 0.005 * i, 0.0, 0.0, "bow") for i in range(3)]
+    for name, words in {"": "that hangs free", "stern": "on face stern"}.items():
+        with pytest.raises(InputError, match=f"one microphone {words}"):
+            scattered(microphones_of([*face, (-0.1, 0.0, 0.0, 0.0, name)]))
 
 
 # Direct calls

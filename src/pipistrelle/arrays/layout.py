@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.arrays.array_file import Microphones, microphones_of, read_array
-from pipistrelle.config import SQUARE, Config, ReceiverConfig
+from pipistrelle.config import SQUARE, Config, InputError, ReceiverConfig
 from pipistrelle.geometry import wrap
 
 LINE_TOLERANCE = 1e-5
@@ -105,12 +105,18 @@ def scattered(microphones: Microphones) -> Scattered:
     last channel is.
 
     >>> front = [(0.03, -0.02, 0, 0, "front"), (0.03, 0.02, 0, 0, "front")]
-    >>> array = scattered(microphones_of([*front, (-0.05, 0, 0, 0, "")]))
+    >>> stern = [(-0.05, 0.0, 0, 0, ""), (-0.05, 0.01, 0, 0, "")]
+    >>> array = scattered(microphones_of([*front, *stern]))
     >>> array.name, abs(array.normal.round(9)), array.group
-    (('', 'front'), array([nan,  0.]), array([1, 1, 0]))
+    (('', 'front'), array([nan,  0.]), array([1, 1, 0, 0]))
     """
     place, names = microphones.position[:, :2], tuple(sorted(set(microphones.face)))
     group = np.array([names.index(face) for face in microphones.face])
+    for name, count in zip(names, np.bincount(group), strict=True):
+        if count < 2:
+            found = "on face " + name if name else "that hangs free"
+            expected = "two or more, as one alone hears no direction; add one, or leave it out"
+            raise InputError(f"receiver.array: found one microphone {found}, expected {expected}")
     middle, gain = place.mean(axis=0), microphones.gain_db
     normal = [
         _normal(place[group == g], middle) if name and np.ptp(gain[group == g]) == 0.0 else np.nan
@@ -157,8 +163,6 @@ def along_line(layout: Scattered, g: int) -> tuple[Int[np.ndarray, " k"], Layout
 
 def _normal(place: Float[np.ndarray, "k 2"], middle: Float[np.ndarray, "2"]) -> float:
     """Return the direction that a line of microphones faces; NaN if they are no such line."""
-    if len(place) < 2:
-        return np.nan
     centre = place.mean(axis=0)
     far = place[np.argmax(np.linalg.norm(place - place[0], axis=1))] - place[0]
     along = far / max(np.linalg.norm(far), LINE_TOLERANCE)

@@ -24,6 +24,7 @@ from pipistrelle.detection.direct import (
 from pipistrelle.detection.full_circle import Circle, circle_of, edge_around, find_around
 from pipistrelle.detection.onset import reach_of
 from pipistrelle.detection.snapshots import (
+    MAX_SPACING,
     Detections,
     Detector,
     detect,
@@ -77,6 +78,9 @@ def front_end(
         if math.isnan(normal):
             members.append(np.flatnonzero(layout.group == g))
             _refuse_lines_own(config)
+            _refuse_far_apart(
+                layout.position[members[-1]], config.assumed_sound_speed / tones.max()
+            )
             finders.append(circle_of(config, layout, g, tones))
             snrs.append((finders[-1].threshold - 1.0) / np.sum(layout.amplitude[members[-1]] ** 2))
         else:
@@ -148,6 +152,17 @@ def _refuse_lines_own(config: Config) -> None:
                 f"detection.{key}: found {found!r}, which only lines on faces have, for the "
                 f"microphones of receiver.array that hear all around; expected {usual!r}"
             )
+
+
+def _refuse_far_apart(place: Float[np.ndarray, "k 2"], wavelength: float) -> None:
+    """Refuse a microphone whose nearest neighbour is too many waves away."""
+    apart = np.linalg.norm(place[:, np.newaxis] - place, axis=-1)
+    np.fill_diagonal(apart, np.inf)
+    if (gap := float(apart.min(axis=1).max())) > MAX_SPACING * wavelength:
+        raise InputError(
+            f"receiver.array: found a microphone {gap:g} m, {gap / wavelength:.0f} waves, from the "
+            f"next; expected at most {MAX_SPACING}; if x, y, z are millimetres, divide by 1000"
+        )
 
 
 def _outputs(
