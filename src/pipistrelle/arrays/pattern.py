@@ -27,6 +27,9 @@ PHASE_STEP = 0.1
 ALIKE_DB = -1.0
 """A lobe as high as this sounds the same [dB]."""
 
+UNKNOWN = math.pi / math.sqrt(3.0)
+"""Deviation of a bearing that is not known at all [rad]."""
+
 
 class Pattern(NamedTuple):
     """What a group can tell at one frequency."""
@@ -80,8 +83,8 @@ def pattern_of(layout: Scattered, g: int, *, frequency: float, speed_of_sound: f
     level, steered, other = max(lobes)
     apart = np.linalg.norm(place[:, None] - place, axis=-1)
     aperture = float(apart.max())
-    power = 100.0 / np.max(share)
-    stds = (2.0 * power * np.maximum(spread, 1e-9)) ** -0.5
+    power = 100.0 * np.sum(layout.amplitude[members] ** 2)
+    stds = np.minimum((2.0 * power * np.maximum(spread, 1e-9)) ** -0.5, UNKNOWN)
     return Pattern(
         microphones=len(place),
         aperture=aperture,
@@ -91,7 +94,7 @@ def pattern_of(layout: Scattered, g: int, *, frequency: float, speed_of_sound: f
         lobe_db=10.0 * math.log10(max(level, 1e-30)),
         worst=(float(steered), float(other)),
         alike=float(np.mean([lobe >= 10.0 ** (ALIKE_DB / 10.0) for lobe, *_ in lobes])),
-        std=(float(stds.min()), min(float(stds.max()), math.pi / math.sqrt(3.0))),
+        std=(float(stds.min()), float(stds.max())),
     )
 
 

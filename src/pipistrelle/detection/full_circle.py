@@ -46,7 +46,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from pipistrelle.arrays.layout import Scattered
-from pipistrelle.arrays.pattern import spread_towards
+from pipistrelle.arrays.pattern import UNKNOWN, spread_towards
 from pipistrelle.config import Config
 from pipistrelle.detection.certainty import bearing_std, delay_std, loudest_noise, over_noise
 from pipistrelle.detection.direct import MIN_EDGE_ENERGY_OF_BEAM, Lags, front_edge
@@ -68,8 +68,6 @@ FINEST = 1e-4
 """Smallest step with which it is sought, in lags."""
 RARE = 40.0
 """Lobes fainter than the loudest by so many times the noise are not asked: odds of 1 to 1e17."""
-WIDEST_STD = math.pi / math.sqrt(3.0)
-"""Of a bearing that is not known at all [rad]."""
 
 
 class Circle(NamedTuple):
@@ -344,7 +342,7 @@ def _write_row(
     spread, slope, off_centre = _geometry(bearing, circle)
     wave = 2.0 * math.pi * circle.tones[p] / circle.speed_of_sound
     std = math.hypot(bearing_std(over, wave, 12.0 * spread), math.sqrt(square / (1.0 + odds)))
-    std = min(std, WIDEST_STD)
+    std = min(std, UNKNOWN)
     row[1], row[2], row[3] = wrap_angle(bearing), top, std
     late = lag.interval * delay_std(over, lag.pulse)
     row[4], row[5] = math.hypot(late, off_centre / circle.speed_of_sound * std), math.atan(slope)
