@@ -11,7 +11,7 @@ from pipistrelle.settings import CALLERS, PREFIX, from_flags, known_settings
 PLACE = "<!-- settings -->"
 CALLER = "<!-- callers -->"
 ALL_DRAWN = "any number"
-WORDS = {"string": "a folder", "boolean": "`true` or `false`"}
+WORDS = {"string": "a folder", "file": "a file", "boolean": "`true` or `false`"}
 """Settings that are no numbers; text that is free is the folder of a world, or names topics."""
 SIGN = re.compile("([≥>≤<]) ")
 UNIT = re.compile(r" ?\[((?!0 to 1)[^]]+)\]")
@@ -101,8 +101,8 @@ def bounds(kind):
         return f"`{kind['const']}`"
     if "enum" in kind:
         return " or ".join(f"`{choice}`" for choice in kind["enum"])
-    if kind["type"] in WORDS:
-        return WORDS[kind["type"]]
+    if (name := kind.get("format", kind["type"])) in WORDS:
+        return WORDS[name]
     if kind.get("items"):
         each = bounds(kind["items"])
         return f"any of {each}" if "enum" in kind["items"] else f"numbers, each {each}"

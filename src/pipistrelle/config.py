@@ -93,9 +93,11 @@ Mark = dict[str, JsonValue]
 FOLDER: Mark = {"is": "folder"}
 BEAM: Mark = {"is": "beam"}
 TABLES: Mark = {"is": "tables"}
+ARRAY: Mark = {"is": "array"}
 """Marks of settings that are treated in their own way, read by `settings.marked`: a folder, in a
-file from where the file lies; what makes the vehicle's beam; and a list of tables. ``derived``
-names the property that has a setting's value where it is not given."""
+file from where the file lies; what makes the vehicle's beam; a list of tables; and an array's file,
+from where the file lies, too. ``derived`` names the property that has a setting's value where it is
+not given."""
 
 
 class ScenarioConfig(Section):
@@ -331,13 +333,46 @@ def caller_names(callers: tuple[CallerConfig, ...]) -> tuple[str, ...]:
     )
 
 
-class ReceiverConfig(Section):
-    """Four line arrays in a square, their sampling and their noise."""
+SQUARE = "square"
+"""Name of the array that needs no file."""
+MicrophoneRow = tuple[float, float, float, float, str]
+"""x, y, z [m], gain [dB] and face of a microphone."""
 
+
+def _array(value: Any) -> Any:
+    """Refuse what names no array and holds no microphones."""
+    if isinstance(value, str) and value:
+        return value
+    rows = value if isinstance(value, list | tuple) else ()
+    sound = tuple(
+        (*map(float, row[:4]), row[4])
+        for row in rows
+        if isinstance(row, list | tuple)
+        and len(row) == 5
+        and isinstance(row[4], str)
+        and all(type(one) in (int, float) and abs(one) <= LARGEST for one in row[:4])
+    )
+    if not sound or len(sound) < len(rows):
+        raise ValueError(f'"{SQUARE}", a file of microphones, or its rows of x, y, z, gain, face')
+    return sound
+
+
+_ArrayFile = Annotated[str, Field(json_schema_extra={"format": "file"})]
+Array = Annotated[
+    Any, PlainValidator(_array, json_schema_input_type=Literal["square"] | _ArrayFile)
+]
+
+
+class ReceiverConfig(Section):
+    """The microphones, four line arrays in a square or a file's, their sampling and their noise."""
+
+    array: Array = Field(SQUARE, json_schema_extra=ARRAY)
+    """The paper's square, or a file of microphones: `channel,x,y`, perhaps `z,face,gain_db`, in the
+    vehicle's frame [m], or Acoular's XML; results hold its rows, x, y, z, gain and face of each."""
     elements: Annotated[int, Field(ge=2, le=64)] = 10
-    """Microphones of one array."""
+    """Microphones of one array of the square."""
     spacing: Positive = 0.0049
-    """Distance between two microphones [m]: half a wavelength at 35 kHz."""
+    """Distance between two microphones of the square [m]: half a wavelength at 35 kHz."""
     sample_rate: Positive = 200e3
     """Samples of a microphone in a second [Hz]."""
     noise_level_db: Level = 0.0

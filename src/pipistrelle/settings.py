@@ -22,9 +22,11 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from pipistrelle.config import (
+    ARRAY,
     BEAM,
     FOLDER,
     MAX_OTHERS,
+    SQUARE,
     TABLES,
     CallerConfig,
     Config,
@@ -77,8 +79,9 @@ def _marked(mark: Mark) -> Key:
     return key
 
 
-WORLD_KEY, RADIUS_KEY, CALLERS = (_marked(mark) for mark in (FOLDER, BEAM, TABLES))
-"""Settings that are treated in their own way: the world's folder, the piston, the callers."""
+WORLD_KEY, RADIUS_KEY, CALLERS, ARRAY_KEY = map(_marked, (FOLDER, BEAM, TABLES, ARRAY))
+"""Settings that are treated in their own way: the world's folder, the piston, the callers, the
+array."""
 
 
 def derived(config: Config) -> dict[Key, Any]:
@@ -105,12 +108,17 @@ def from_file(path: Path) -> Layer:
     ...     from_file(file)["rays", "power"].value
     3.0
     """
-    layer = from_table(read_toml(path), f"{path}: ")
-    if WORLD_KEY in layer and isinstance(layer[WORLD_KEY].value, str):
-        from_there = str(path.parent / layer[WORLD_KEY].value)
-        layer[WORLD_KEY] = layer[WORLD_KEY]._replace(value=from_there)
-    if CALLERS in layer:
-        layer[CALLERS] = layer[CALLERS]._replace(value=beside(path, layer[CALLERS].value))
+    return with_places(path, from_table(read_toml(path), f"{path}: "))
+
+
+def with_places(path: Path, layer: Layer) -> Layer:
+    """Resolve what a file's settings name, world, array and routes, relative to the file."""
+    for key, given in layer.items():
+        if key == CALLERS:
+            layer[key] = given._replace(value=beside(path, given.value))
+        named = key == WORLD_KEY or (key == ARRAY_KEY and given.value != SQUARE)
+        if named and isinstance(given.value, str):
+            layer[key] = given._replace(value=str(path.parent / given.value))
     return layer
 
 

@@ -14,7 +14,13 @@ from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
 from pipistrelle.arrays.sampling import BLOCK, sampling
 from pipistrelle.config import Config, MatchingConfig
 from pipistrelle.detection.certainty import EXCESS_PATH_FLOOR
-from pipistrelle.detection.direct import DirectCalls, direct_calls, front_edge, loudest_first
+from pipistrelle.detection.direct import (
+    MIN_EDGE_ENERGY,
+    DirectCalls,
+    direct_calls,
+    front_edge,
+    loudest_first,
+)
 from pipistrelle.detection.faces import average_faces
 from pipistrelle.detection.matched import filter_blocks
 from pipistrelle.detection.scans import with_columns
@@ -189,7 +195,9 @@ def planted(*sounds, pulse=M, noise_std=0.0, rng=None):
 
 def edge(*sounds, b=BEGIN, **more):
     """Lag and standard deviation of the first edge up to lag b."""
-    return front_edge(planted(*sounds, **more), b, FACE, TONE, more.get("pulse", M))
+    return front_edge(
+        planted(*sounds, **more), b, FACE, TONE, more.get("pulse", M), MIN_EDGE_ENERGY
+    )
 
 
 def told_std(share, amplitude):
@@ -300,7 +308,7 @@ def test_an_edge_needs_two_blocks_behind_it_in_the_record():
     matched = planted((BEGIN, M, 5.0))
     rises = BEGIN - M
     for b in range(rises + 10):
-        lag, _ = front_edge(matched[: b + 1], b, FACE, TONE, M)
+        lag, _ = front_edge(matched[: b + 1], b, FACE, TONE, M, MIN_EDGE_ENERGY)
         assert np.isfinite(lag) == (b >= rises + 3)
 
 
@@ -353,7 +361,7 @@ def test_no_edge_is_sought_of_what_may_have_begun_before_the_record():
         assert delay[TONE] == pytest.approx(START + INTERVAL * expected, abs=1e-12)
 
 
-def test_only_what_is_two_hundredfold_louder_within_a_call_may_leak():
+def test_only_what_is_two_hundredfold_louder_within_a_callmay_leak():
     """A louder call of another tone at another time changes nothing, 10 ms away say."""
     for apart in (-100.0, -M - 0.5, -M + 0.5, 0.0, M - 0.5, M + 0.5, 100.0):
         for times in (190.0, 210.0):

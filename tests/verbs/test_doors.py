@@ -29,6 +29,7 @@ COMMANDS = {
     "study --output": ("study", "tiny.toml", "--workers", "1", "-o", "d"),
     "report --output": ("report", "s", "-o", "d"),
     "compare --output": ("compare", "one", "two", "-o", "d"),
+    "array --output": ("array", "square", "-o", "d/debian.png"),
     "view --output": ("view", "one", "-o", "d/debian.html"),
     "view --rerun": ("view", "one", "--rerun", "d/debian.rrd"),
 }
@@ -44,7 +45,8 @@ CALLS = {
 """What a user of Python calls, with its options."""
 ALWAYS = ("study --output", "report --output", "study", "report")
 """Those that go on with, or replace, their own like without being asked to."""
-BY_NAME = (*ALWAYS, "view --output", "view --rerun")
+NOTES = ("notes.txt", "sub/deep/b.txt")
+BY_NAME = (*ALWAYS, "array --output", "view --output", "view --rerun")
 """Those that have no --overwrite, or are told by it which file to replace."""
 
 
@@ -69,7 +71,7 @@ def users(made, monkeypatch, undrawn):
     monkeypatch.setattr("pipistrelle.figures.player.rerun_file.check_there", lambda: None)
     shutil.copytree(made, ".", dirs_exist_ok=True)
     outside, folder = Path("outside"), Path("d")
-    for name in ("debian.iso", "debian.html", "debian.rrd", "notes.txt", "sub/deep/b.txt"):
+    for name in (*(f"debian.{end}" for end in ("iso", "html", "png", "rrd")), *NOTES):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(f"a user's {name}")
     outside.mkdir()
@@ -99,7 +101,7 @@ def contents(folder):
 def test_each_flag_that_takes_a_path_is_known_to_read_or_to_write():
     found = {
         f"{verb} {argument.names[0]}"
-        for verb in ("run", "slam", "view", "report", "compare", "study")
+        for verb in ("array", "run", "slam", "view", "report", "compare", "study")
         for argument in app[verb].assemble_argument_collection()
         if argument.hint is Path or Path in get_args(argument.hint)
         if not READ & {*argument.names}

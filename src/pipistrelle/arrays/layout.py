@@ -1,11 +1,17 @@
-"""Where the microphones are: line arrays on the faces of a vehicle."""
+"""Where the microphones are: line arrays on the faces of a vehicle, or anywhere."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from pipistrelle.config import Config, ReceiverConfig
+from pipistrelle.arrays.array_file import Microphones, microphones_of, read_array
+from pipistrelle.config import SQUARE, Config, InputError, ReceiverConfig
+from pipistrelle.geometry import wrap
+
+LINE_TOLERANCE = 1e-5
+"""Most that a microphone of a line may be off its place, for the fast scan [m]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -20,6 +26,11 @@ class Layout:
     """Direction of each face's normal, relative to the heading [rad]."""
     position: Float[np.ndarray, " e"]
     """Elements along a face, positive to the left of its normal, centred on 0 [m]."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Faces and elements of each, as a recording has them."""
+        return self.normal.size, self.position.size
 
     def phases(
         self,
@@ -41,9 +52,130 @@ class Layout:
         return 2.0 * np.pi * frequency * lead
 
 
-def layout_of(config: Config) -> Layout:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scattered:
+    """Microphones anywhere on the vehicle, in groups whose outputs are scanned together.
+
+    Each hears a plane wave when it reaches it, earlier than the vehicle's centre by p . u / c, with
+    p its place and u the unit vector to where the wave comes from. Sound travels horizontally:
+    heights do not count.
+    """
+
+    position: Float[np.ndarray, "e 2"]
+    """In the vehicle's frame, x ahead and y to the left [m]."""
+    amplitude: Float[np.ndarray, " e"]
+    """What each makes of a sound of unit amplitude; its noise is that of all others."""
+    group: Int[np.ndarray, " e"]
+    """Number of the group of each."""
+    normal: Float[np.ndarray, " f"]
+    """Direction of each group's normal, of a line on a face, which hears within 90 degrees of it;
+    NaN of any other group, which hears all around [rad]."""
+    name: tuple[str, ...]
+    """Of each group: its face's; empty for those that hang free."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """One row of elements, as a recording has them."""
+        return 1, len(self.position)
+
+    def lead(self, bearing: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n e"]:
+        """Return how far the microphones are on the way of sound from a bearing [rad], in metres.
+
+        >>> pair = scattered(microphones_of([(0.1, 0, 0, 0, ""), (0, 0.2, 0, 0, "")]))
+        >>> pair.lead(np.pi / 2).round(9)
+        array([0. , 0.2])
+        """
+        toward = np.stack((np.cos(bearing), np.sin(bearing)), axis=-1)
+        return toward @ self.position.T
+
+
+def layout_of(config: Config) -> Layout | Scattered:
     """Return the arrays of the settings: the only place that chooses them."""
-    return square_of_four(config.receiver)
+    array = config.receiver.array
+    if array == SQUARE:
+        return square_of_four(config.receiver)
+    return scattered(read_array(Path(array)) if isinstance(array, str) else microphones_of(array))
+
+
+def scattered(microphones: Microphones) -> Scattered:
+    """Group the microphones of an array: by face, and those that hang free.
+
+    A face whose microphones are alike and stand in one equally spaced line hears on one side, the
+    one away from the middle of the array; of a line through the middle, the one on whose left its
+    last channel is.
+
+    >>> front = [(0.03, -0.02, 0, 0, "front"), (0.03, 0.02, 0, 0, "front")]
+    >>> stern = [(-0.05, 0.0, 0, 0, ""), (-0.05, 0.01, 0, 0, "")]
+    >>> array = scattered(microphones_of([*front, *stern]))
+    >>> array.name, abs(array.normal.round(9)), array.group
+    (('', 'front'), array([nan,  0.]), array([1, 1, 0, 0]))
+    """
+    place, names = microphones.position[:, :2], tuple(sorted(set(microphones.face)))
+    group = np.array([names.index(face) for face in microphones.face])
+    for name, count in zip(names, np.bincount(group), strict=True):
+        if count < 2:
+            found = "on face " + name if name else "that hangs free"
+            expected = "two or more, as one alone hears no direction; add one, or leave it out"
+            raise InputError(f"receiver.array: found one microphone {found}, expected {expected}")
+    middle, gain = place.mean(axis=0), microphones.gain_db
+    normal = [
+        _normal(place[group == g], middle) if name and np.ptp(gain[group == g]) == 0.0 else np.nan
+        for g, name in enumerate(names)
+    ]
+    return Scattered(
+        position=place,
+        amplitude=10.0 ** (gain / 20.0),
+        group=group,
+        normal=np.array(normal),
+        name=names,
+    )
+
+
+def square_microphones(receiver: ReceiverConfig) -> Microphones:
+    """Return the square's microphones where a vehicle has them, on four faces around its centre.
+
+    >>> square_microphones(ReceiverConfig()).position.shape
+    (40, 3)
+    """
+    square, rows = square_of_four(receiver), []
+    reach = 0.5 * (np.ptp(square.position) + receiver.spacing)
+    for name, normal in zip(("front", "left", "back", "right"), square.normal, strict=True):
+        ahead, left = np.array([np.cos(normal), np.sin(normal)]), (-np.sin(normal), np.cos(normal))
+        for along in square.position:
+            x, y = reach * ahead + along * np.array(left)
+            rows.append((float(x), float(y), 0.0, 0.0, name))
+    return microphones_of(rows)
+
+
+def along_line(layout: Scattered, g: int) -> tuple[Int[np.ndarray, " k"], Layout]:
+    """Return a line's microphones from right to left, and it alone as a layout."""
+    members = np.flatnonzero(layout.group == g)
+    left = np.array([-np.sin(layout.normal[g]), np.cos(layout.normal[g])])
+    along = layout.position[members] @ left
+    order = np.argsort(along)
+    return members[order], Layout(
+        normal=layout.normal[g : g + 1],
+        position=(np.arange(along.size) - 0.5 * (along.size - 1))
+        * np.ptp(along)
+        / (along.size - 1),
+    )
+
+
+def _normal(place: Float[np.ndarray, "k 2"], middle: Float[np.ndarray, "2"]) -> float:
+    """Return the direction that a line of microphones faces; NaN if they are no such line."""
+    centre = place.mean(axis=0)
+    far = place[np.argmax(np.linalg.norm(place - place[0], axis=1))] - place[0]
+    along = far / max(np.linalg.norm(far), LINE_TOLERANCE)
+    order = np.argsort(place @ along)
+    regular = np.linspace(place[order[0]], place[order[-1]], len(place))
+    if np.abs(place[order] - regular).max() > LINE_TOLERANCE:
+        return np.nan
+    along *= np.sign((place[-1] - place[0]) @ along)
+    normal = np.array([along[1], -along[0]])
+    outward = (centre - middle) @ normal
+    if outward < -LINE_TOLERANCE:
+        normal = -normal
+    return float(wrap(np.arctan2(normal[1], normal[0])))
 
 
 def square_of_four(receiver: ReceiverConfig) -> Layout:

@@ -18,6 +18,12 @@ which are closed-form geometric sums for the arrivals, and for white noise exact
 normals of variance 40 sigma^2, because all tones are whole bins of a 40-sample transform.
 Everything later, the matched filter first, needs no more than these sums: a whole number of
 blocks makes the call.
+
+Microphones anywhere (`Scattered`) each hear a wave when it reaches them, so that in an array that
+is wide beside the call's length every one has an envelope of its own:
+
+.. math:: x_m(t) = g_m A e^{2\pi i f'(t - \tau_m)}, \qquad \tau_m \le t < \tau_m + T f / f',
+          \qquad \tau_m = \tau - p_m \cdot u / c
 """
 
 import math
@@ -29,7 +35,7 @@ from jaxtyping import Complex, Float
 from pipistrelle.acoustics.arrivals import Arrivals
 from pipistrelle.acoustics.call import ToneBurst
 from pipistrelle.arithmetic.random_stream import complex_noise
-from pipistrelle.arrays.layout import Layout
+from pipistrelle.arrays.layout import Layout, Scattered
 from pipistrelle.arrays.sampling import BLOCK, Sampling, block_shape
 from pipistrelle.config import InputError
 from pipistrelle.jit import Whole, kernel, no_alloc
@@ -37,7 +43,7 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 
 def noise_blocks(
     blocks: int,
-    layout: Layout,
+    layout: Layout | Scattered,
     sampling: Sampling,
     key: int,
     out: Complex[np.ndarray, "b f c e"] | None = None,
@@ -52,7 +58,10 @@ def noise_blocks(
 
 
 def add_echo_blocks(
-    signal: Complex[np.ndarray, "b f c e"], arrivals: Arrivals, layout: Layout, sampling: Sampling
+    signal: Complex[np.ndarray, "b f c e"],
+    arrivals: Arrivals,
+    layout: Layout | Scattered,
+    sampling: Sampling,
 ) -> None:
     """Add the block sums of arrivals to a recording, in place.
 
@@ -65,18 +74,30 @@ def add_echo_blocks(
                 f"{type(call).__name__}; expected 'dense'"
             )
     amplitude, duration = 10.0 ** (arrivals.level_db / 20.0), _durations(arrivals, sampling)
-    _add_echo_blocks(
-        signal.view(np.float64),
-        (arrivals.delay, amplitude, arrivals.bearing, arrivals.frequency, duration),
-        (sampling.tones, sampling.rate, sampling.block, sampling.pulse),
-        (layout.normal, layout.position, sampling.speed_of_sound),
-    )
+    sounds = arrivals.delay, amplitude, arrivals.bearing, arrivals.frequency, duration
+    grid = sampling.tones, sampling.rate, sampling.block, sampling.pulse
+    if isinstance(layout, Scattered):
+        each = _heard_by_each(arrivals, layout, sampling.speed_of_sound)
+        _add_scattered_blocks(signal[:, 0], sounds, grid, *each)
+        return
+    ears = layout.normal, layout.position, sampling.speed_of_sound
+    _add_echo_blocks(signal.view(np.float64), sounds, grid, ears)
+
+
+def _heard_by_each(
+    arrivals: Arrivals, layout: Scattered, speed_of_sound: float
+) -> tuple[Float[np.ndarray, "a e"], Float[np.ndarray, "a e"]]:
+    """Return how much earlier than at the centre each microphone hears [s], and how loud."""
+    off = np.cos(arrivals.bearing[:, np.newaxis] - layout.normal[layout.group])
+    ahead = ~(off < 0.0)  # NaN hears all around
+    early = layout.lead(arrivals.bearing) / speed_of_sound
+    return early, np.where(ahead, layout.amplitude, 0.0)
 
 
 def record_samples(
     blocks: int,
     arrivals: Arrivals,
-    layout: Layout,
+    layout: Layout | Scattered,
     sampling: Sampling,
     rng: np.random.Generator | None,
     *,
@@ -89,7 +110,7 @@ def record_samples(
     blocks : int
         Length of the recording; its first sample follows the vehicle's call.
     arrivals : Arrivals
-    layout : Layout
+    layout : Layout or Scattered
     sampling : Sampling
     rng : Generator or None
         Source of the noise; None records without.
@@ -101,7 +122,7 @@ def record_samples(
     (blocks * 40, faces, elements) complex
     """
     first = sampling.pulse * sampling.block
-    shape = (blocks * sampling.block, layout.normal.size, layout.position.size)
+    shape = (blocks * sampling.block, *layout.shape)
     real, whole = (np.float32, np.complex64) if single else (np.float64, np.complex128)
     if rng is None:
         signal = np.zeros(shape, dtype=whole)
@@ -109,6 +130,9 @@ def record_samples(
         signal = rng.standard_normal((*shape, 2), dtype=real).view(whole)[..., 0]
         signal *= real(sampling.noise_std / math.sqrt(2.0))
     duration = _durations(arrivals, sampling)
+    if isinstance(layout, Scattered):
+        _add_scattered_samples(signal[:, 0], arrivals, duration, layout, sampling)
+        return signal
     for a in range(arrivals.delay.size):
         frequency, delay = arrivals.frequency[a], arrivals.delay[a]
         start = max(math.ceil(delay * sampling.rate), first)
@@ -123,6 +147,26 @@ def record_samples(
                 phases = layout.phases(angle, frequency, sampling.speed_of_sound)
                 signal[n - first, f] += np.outer(pulse, np.exp(1j * phases))
     return signal
+
+
+def _add_scattered_samples(
+    signal: Complex[np.ndarray, "t e"],
+    arrivals: Arrivals,
+    duration: Float[np.ndarray, " a"],
+    layout: Scattered,
+    sampling: Sampling,
+) -> None:
+    """Add every sample of arrivals to a recording by microphones anywhere."""
+    first, rate = sampling.pulse * sampling.block, sampling.rate
+    early, gain = _heard_by_each(arrivals, layout, sampling.speed_of_sound)
+    for a, e in np.argwhere(gain > 0.0):
+        delay = arrivals.delay[a] - early[a, e]
+        start = max(math.ceil(delay * rate), first)
+        stop = min(math.ceil((delay + duration[a]) * rate), first + len(signal))
+        n = np.arange(start, max(stop, start))
+        call = sampling.calls[arrivals.caller[a]]
+        sound = call.waveform(n / rate - delay, arrivals.frequency[a])
+        signal[n - first, e] += gain[a, e] * 10.0 ** (arrivals.level_db[a] / 20.0) * sound
 
 
 def _durations(arrivals: Arrivals, sampling: Sampling) -> Float[np.ndarray, " a"]:
@@ -282,3 +326,33 @@ def _add_echo_blocks(
         first = start // block - blank
         touched = signal[first : first + count]
         _add_echo(touched, room, phasor, sound.bearing[a], frequency, array)
+
+
+@kernel
+def _add_scattered_blocks(
+    signal: Complex[np.ndarray, "b c e"],
+    sounds: tuple,
+    grid: tuple,
+    early: Float[np.ndarray, "a e"],
+    gain: Float[np.ndarray, "a e"],
+) -> None:
+    """Add every arrival to each microphone, earlier than at the centre [s], times its gain."""
+    sound, on = _Sounds(*sounds), _Grid(*grid)
+    blocks, tones, elements = signal.shape
+    rate, block, blank = on.rate, on.block, on.blank
+    sums = np.empty((tones, blocks), dtype=np.complex128)
+    for a in range(sound.delay.size):
+        frequency = sound.frequency[a]
+        for e in range(elements):
+            delay = sound.delay[a] - early[a, e]
+            start = max(math.ceil(delay * rate), blank * block)
+            stop = min(math.ceil((delay + sound.duration[a]) * rate), (blank + blocks) * block)
+            if stop <= start or gain[a, e] == 0.0:
+                continue
+            turns = -2.0 * math.pi * frequency * delay
+            phasor = gain[a, e] * sound.amplitude[a] * complex(math.cos(turns), math.sin(turns))
+            first = start // block - blank
+            for p in range(tones):
+                omega = 2.0 * math.pi * (frequency - on.tones[p]) / rate
+                for b in range(_envelope(sums, p, omega, start, stop, block)):
+                    signal[first + b, p, e] += phasor * sums[p, b]

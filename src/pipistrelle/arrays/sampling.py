@@ -11,8 +11,8 @@ from pipistrelle.acoustics.arrivals import Arrivals
 from pipistrelle.acoustics.call import Call, ToneBurst
 from pipistrelle.acoustics.callers import MAX_CALLERS, Caller, check_caller
 from pipistrelle.acoustics.medium import Medium, medium_of
-from pipistrelle.arrays.layout import Layout
-from pipistrelle.config import Config, InputError
+from pipistrelle.arrays.layout import Layout, Scattered
+from pipistrelle.config import SQUARE, Config, InputError
 
 BLOCK = 2e-4
 """Length of a block [s]."""
@@ -110,7 +110,8 @@ def clear_frequency(config: Config) -> float:
     Elements a distance d apart cannot tell the angle :math:`\theta` off their normal from another,
     the grating lobe, :math:`\sin\theta_g = \sin\theta - \lambda / d`: of a longer wave than d times
     :math:`1 + \sin\theta`, with the largest angle that is kept, it lies outside. Half the sampling
-    rate is the highest that real samples hold.
+    rate is the highest that real samples hold, and the only limit here of an array from a file
+    (`pipistrelle.arrays.pattern` tells its lobes).
 
     Returns [Hz].
 
@@ -119,6 +120,8 @@ def clear_frequency(config: Config) -> float:
     >>> round(clear_frequency(Config()))
     35607
     """
+    if config.receiver.array != SQUARE:
+        return config.receiver.sample_rate / 2.0
     limit = math.radians(min(config.detection.angle_limit_deg, config.detection.scan_limit_deg))
     longest = config.air.sound_speed / (config.receiver.spacing * (1.0 + math.sin(limit)))
     return min(longest, config.receiver.sample_rate / 2.0)
@@ -161,7 +164,9 @@ def _refuse_alike(config: Config, callers: Sequence[Caller], keys: Sequence[str]
                 )
 
 
-def blocks_to_hear(arrivals: Arrivals, sampling: Sampling) -> int:
+def blocks_to_hear(
+    arrivals: Arrivals, sampling: Sampling, layout: Layout | Scattered | None = None
+) -> int:
     """Count the blocks from the end of the vehicle's call to the end of the last arrival.
 
     Parameters
@@ -169,16 +174,23 @@ def blocks_to_hear(arrivals: Arrivals, sampling: Sampling) -> int:
     arrivals : Arrivals
         Of the frame, the inaudible ones too: the window must not depend on the beam.
     sampling : Sampling
+    layout : Layout or Scattered, optional
+        Of microphones anywhere the last hears the arrival later than the vehicle's centre.
 
     Returns
     -------
     int
     """
     last = arrivals.delay.max(initial=0.0) / BLOCK + sampling.pulse
+    if isinstance(layout, Scattered):
+        farthest = np.linalg.norm(layout.position, axis=1).max()
+        last += float(farthest) / sampling.speed_of_sound / BLOCK
     return max(math.ceil(last) + 1 - sampling.pulse, 2 * sampling.pulse)
 
 
-def block_shape(blocks: int, layout: Layout, sampling: Sampling) -> tuple[int, int, int, int]:
+def block_shape(
+    blocks: int, layout: Layout | Scattered, sampling: Sampling
+) -> tuple[int, int, int, int]:
     """Return the shape of a recording in block sums.
 
     >>> from pipistrelle.acoustics.callers import callers_of
@@ -188,4 +200,5 @@ def block_shape(blocks: int, layout: Layout, sampling: Sampling) -> tuple[int, i
     >>> block_shape(300, square_of_four(config.receiver), settled)
     (300, 4, 2, 10)
     """
-    return (blocks, layout.normal.size, sampling.tones.size, layout.position.size)
+    faces, elements = layout.shape
+    return (blocks, faces, sampling.tones.size, elements)

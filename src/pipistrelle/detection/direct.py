@@ -36,7 +36,9 @@ MIN_EDGE_AMPLITUDE = 0.3
 MAX_LEAKAGE = 0.005
 """Power, as a share of a detection's of another tone at the same time, that may be its leakage."""
 MIN_EDGE_ENERGY = 3.0
-"""Least energy of its front edge, in means of that of the noise."""
+"""Least energy of its front edge, in means of that of the noise, over a face's elements."""
+MIN_EDGE_ENERGY_OF_BEAM = 16.0
+"""The same of one beam, whose noise varies more: as rare, one in ten million."""
 EDGE_BLOCKS = 2
 """Blocks behind the edge that tell the amplitude: what sets in later does not matter."""
 
@@ -135,13 +137,18 @@ def loudest_first(
 
 @kernel
 def front_edge(
-    matched: Complex[np.ndarray, "l f c e"], b: Whole, f: Whole, p: Whole, pulse: Whole
+    matched: Complex[np.ndarray, "l f c e"],
+    b: Whole,
+    f: Whole,
+    p: Whole,
+    pulse: Whole,
+    least: float,
 ) -> tuple[float, float]:
     """Return the lag at which the first call of a tone begins, and its standard deviation.
 
-    Sought from two calls before lag b to it. NaN where none stands out; and with an infinite
-    deviation where something stood out that did not last: a call that an echo at its heels has all
-    but extinguished.
+    Sought from two calls before lag b to it, among blocks of at least so many means of the noise.
+    NaN where none stands out; and with an infinite deviation where something stood out that did not
+    last: a call that an echo at its heels has all but extinguished.
     """
     stride, elements = max(pulse // 14, 1), matched.shape[3]
     low = max(b - 2 * (pulse + stride), b % stride)
@@ -157,11 +164,11 @@ def front_edge(
             level += y.real**2 + y.imag**2
         loudest = max(loudest, level)
     noise = 2.0 * stride / pulse
-    faintest = MIN_EDGE_ENERGY * noise * elements
-    least, first = max((MIN_EDGE_AMPLITUDE * stride / pulse) ** 2 * loudest, faintest), count
+    faintest = least * noise * elements
+    loud, first = max((MIN_EDGE_AMPLITUDE * stride / pulse) ** 2 * loudest, faintest), count
     for k in range(count - EDGE_BLOCKS):
         first = min(first, k) if energy[k] >= faintest else first
-        if energy[k : k + 1 + EDGE_BLOCKS].min() >= least:
+        if energy[k : k + 1 + EDGE_BLOCKS].min() >= loud:
             if first < k - 1:
                 break
             lag, std = _fitted(gain, k, noise)
@@ -225,12 +232,12 @@ def direct_calls(
     when = np.full((2, tones), np.nan)
     for p in range(1, tones):
         d = loudest_first(whole[1], numbers[0], numbers[2], p)
-        if d < 0 or _may_leak(numbers[0], numbers[2], d, pulse * interval):
+        if d < 0 or may_leak(numbers[0], numbers[2], d, pulse * interval):
             continue
         b = int((numbers[0, d] - start) / interval + 0.5)
         lag, std = math.nan, math.nan
         if b > pulse + reach_of(pulse):
-            lag, std = front_edge(matched, b, whole[0, d], p, pulse)
+            lag, std = front_edge(matched, b, whole[0, d], p, pulse, MIN_EDGE_ENERGY)
         if std != math.inf:
             found[p], when[0, p], when[1, p] = d, start + interval * lag, interval * std
         if math.isnan(std):
@@ -239,7 +246,7 @@ def direct_calls(
 
 
 @no_alloc
-def _may_leak(
+def may_leak(
     delay: Float[np.ndarray, " d"], power: Float[np.ndarray, " d"], d: Whole, within: float
 ) -> bool:
     """Tell whether detection d is faint enough to be the leakage of another at the same time.

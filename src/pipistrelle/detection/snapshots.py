@@ -20,7 +20,7 @@ Bradley & Abaid, Sec. II-D; what the paper leaves open is settled in the setting
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -255,6 +255,16 @@ def detect(
     )
 
 
+def direct_of_faces(
+    matched: Complex[np.ndarray, "l f c e"], found: Detections, lags: Lags
+) -> DirectCalls:
+    """Find the direct calls among detections."""
+    whole = np.stack((found.face, found.caller))
+    stds = found.bearing_std, found.delay_std
+    numbers = np.stack((found.delay, found.angle, found.power, *stds))
+    return _direct(matched, whole, numbers, lags)
+
+
 def _direct(
     matched: Complex[np.ndarray, "l f c e"],
     whole: Int[np.ndarray, "2 m"],
@@ -276,32 +286,6 @@ def detections_at(found: Detections, rows: Bool[np.ndarray, " m"]) -> Detections
         direct = direct._replace(detection=number)
     columns = {name: getattr(found, name)[rows] for name in Columns._fields}
     return Detections(**columns, direct=direct)
-
-
-def call_in(
-    matched: Complex[np.ndarray, "l f c e"],
-    found: Detections,
-    caller: int,
-    stretch: tuple[float, float],
-    *,
-    start: float,
-    interval: float,
-    pulse: int,
-) -> Detections:
-    """Select the detections of one call of a caller with its own clock, and its direct call.
-
-    It is all of the caller's tone in a stretch of the frame [s]; the other arguments are as those
-    of `detect`.
-    """
-    begin, end = stretch
-    inside = (begin <= found.delay) & (found.delay < end)
-    near = detections_at(found, inside | (found.caller != caller))  # others may leak
-    if found.direct is not None:
-        whole = np.stack((near.face, near.caller))
-        numbers = np.stack((near.delay, near.angle, near.power, near.bearing_std, near.delay_std))
-        direct = _direct(matched, whole, numbers, Lags(start, interval, pulse))
-        near = replace(near, direct=direct)
-    return detections_at(near, near.caller == caller)
 
 
 def joined(parts: Sequence[Detections]) -> Detections:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pipistrelle.arrays.layout import Layout
+from pipistrelle.arrays.layout import Layout, Scattered
 from pipistrelle.arrays.sampling import BLOCK, Sampling
 from pipistrelle.config import Config, InputError, ScenarioConfig
 from pipistrelle.estimation.catalogue import COPIES, DOUBLE, entry
@@ -75,7 +75,12 @@ def check_length(
 
 
 def check_recording(
-    scenario: Scenario, config: Config, layout: Layout, settled: Sampling, *, workers: int = 1
+    scenario: Scenario,
+    config: Config,
+    layout: Layout | Scattered,
+    settled: Sampling,
+    *,
+    workers: int = 1,
 ) -> None:
     """Refuse a world of which one frame's recording may need more memory than this machine has.
 
@@ -105,7 +110,7 @@ def check_recording(
         length |= {"scenario.step": max(length.get("scenario.step", 0.0), _period(setup))}
         numbers = (1 + settled.tones.size) * settled.block
     key = max(length, key=length.__getitem__)
-    numbers *= layout.normal.size * layout.position.size
+    numbers *= math.prod(layout.shape)
     need = COPIES * DOUBLE * length[key] / BLOCK * numbers
     _refuse_beyond(f"{key}: a recording of {length[key]:.3g} s", need, workers)
 

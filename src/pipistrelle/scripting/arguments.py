@@ -14,6 +14,7 @@ from pipistrelle.config import STRATEGIES, Config, InputError, Strategy
 from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, check_distinct, check_name, entry
 from pipistrelle.refusals import meant, refusal, shown
 from pipistrelle.settings import (
+    ARRAY_KEY,
     CALLERS,
     RADIUS_KEY,
     WORLD_KEY,
@@ -103,6 +104,10 @@ def mission_settings(
         from pipistrelle.experiments.hearing.caller_paths import with_routes
 
         layer = with_routes(layer)
+    if ARRAY_KEY in layer:
+        from pipistrelle.arrays.array_file import with_array
+
+        layer = with_array(layer)
     if WORLD_KEY in layer:
         from pipistrelle.experiments.hearing.world_folder import named_world, settled
 

@@ -71,6 +71,11 @@ app.command(
     name="compare",
     help="Put results side by side: scores, paths and settings of runs, logs or studies.",
 )
+app.command(
+    "pipistrelle.verbs.array:array",
+    name="array",
+    help="Draw a microphone array, and say what it can tell of a bearing and what it cannot.",
+)
 config = App(name="config", help="Show the settings, or what a file of settings may hold.")
 config.command(
     "pipistrelle.verbs.config:show",

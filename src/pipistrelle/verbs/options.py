@@ -13,6 +13,7 @@ from pipistrelle.config import Config, InputError
 from pipistrelle.estimation.catalogue import CATALOGUE, entry
 from pipistrelle.scripting.arguments import GROUPS, mission_settings, named_filters
 from pipistrelle.settings import (
+    ARRAY_KEY,
     CALLERS,
     WORLD_KEY,
     Given,
@@ -43,6 +44,9 @@ def _as_written(_: Any, tokens: Sequence[Any]) -> Any:
     """Read a value as a file has it, on one line."""
     return from_text(tokens[0].value)
 
+
+_METAVARS = {CALLERS: "TABLES", ARRAY_KEY: "FILE"}
+"""Settings that are given as a file has them, and what stands for them in the help."""
 
 if TYPE_CHECKING:
     from pipistrelle.experiments.hearing.world import World
@@ -77,8 +81,9 @@ def setting_flags(
         words = " ".join(f"{field.description or ''} {settled}".split())
         flag = Parameter(help=words, show=shown(key), negative=(), consume_multiple=True)
         kind: Any = Whole if field.annotation is int else _unbounded(field.annotation)
-        if key == CALLERS:
-            kind = Annotated[Any, Parameter(converter=_as_written, n_tokens=1, metavar="TABLES")]
+        if key in _METAVARS:
+            metavar = _METAVARS[key]
+            kind = Annotated[Any, Parameter(converter=_as_written, n_tokens=1, metavar=metavar)]
         elif field.annotation is bool:
             kind = Annotated[
                 Any, Parameter(converter=_as_written, n_tokens=1, metavar="true|false")

@@ -75,12 +75,12 @@ def view(
 
     read_summary(folder)
     target = folder / PAGE if output is None else output
-    _check_place(target, folder, ".html", "-o", overwrite)
+    check_place(target, folder, ".html", "-o", overwrite)
     if rerun is not None:
         from pipistrelle.figures.player.rerun_file import check_there
 
         check_there()
-        _check_place(rerun, folder, ".rrd", "--rerun", overwrite)
+        check_place(rerun, folder, ".rrd", "--rerun", overwrite)
     from pipistrelle.figures.player.page import page
     from pipistrelle.scripting.arguments import named_filters
     from pipistrelle.verbs.streams import put
@@ -90,8 +90,8 @@ def view(
     if rerun is not None:
         from pipistrelle.figures.player.rerun_file import recording
 
-        _write(rerun, folder, recording(played), overwrite)
-    _write(target, folder, page(played).encode(), overwrite)
+        write_file(rerun, folder, recording(played), overwrite)
+    write_file(target, folder, page(played).encode(), overwrite)
     if rerun is not None and not quiet:
         put(rerun)
     put(target)
@@ -118,14 +118,14 @@ def _play_again(
     return playback(mission, watch.snapshots)
 
 
-def _check_place(path: Path, folder: Path, ending: str, option: str, overwrite: bool) -> None:
+def check_place(path: Path, folder: Path | None, ending: str, option: str, overwrite: bool) -> None:
     """Refuse a place that a file cannot have, before there is anything to write."""
     fix = f"name another with {option} FILE{ending}"
     if path.suffix.lower() != ending:
         raise InputError(f"{option}: found {path}, expected a name that ends in {ending}")
     if path.is_dir():
         raise InputError(f"{path}: found a folder, expected a file; {fix}")
-    if _is_in(path, folder):
+    if folder is not None and _is_in(path, folder):
         try:
             OwnFiles(folder, RESULTS).refuse(path.name)
         except InputError as refused:
@@ -146,9 +146,9 @@ def _is_in(path: Path, folder: Path) -> bool:
     return path.parent.resolve() == folder.resolve()
 
 
-def _write(path: Path, folder: Path, data: bytes, overwrite: bool) -> None:
+def write_file(path: Path, folder: Path | None, data: bytes, overwrite: bool) -> None:
     """Write a file that is whole or not there; in the result folder, as one of its own."""
-    if _is_in(path, folder):
+    if folder is not None and _is_in(path, folder):
         OwnFiles(folder, RESULTS).add(path.name, data)
         return
     try:

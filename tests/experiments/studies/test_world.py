@@ -175,6 +175,7 @@ OTHERS = {
     "emitter.pulse": 2.0e-3,
     "beacon.frequency": 25e3,
     "beacon.level_db": 55.0,
+    "receiver.array": [[x, y, 0.0, 0.0, ""] for x, y in ((0.01, 0.0), (0.0, 0.01), (-0.01, 0.0))],
     "receiver.elements": 8,
     "receiver.spacing": 0.004,
     "receiver.sample_rate": 250e3,

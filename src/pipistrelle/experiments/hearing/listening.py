@@ -23,24 +23,17 @@ from pipistrelle.acoustics.call import Call, ToneBurst
 from pipistrelle.acoustics.callers import VEHICLE
 from pipistrelle.acoustics.medium import Medium
 from pipistrelle.arithmetic.random_stream import stream_key
-from pipistrelle.arrays.layout import Layout, layout_of
+from pipistrelle.arrays.layout import Layout, Scattered, layout_of
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
 from pipistrelle.arrays.sampling import BLOCK, Sampling, block_shape, blocks_to_hear, sampling
 from pipistrelle.config import Config
 from pipistrelle.detection.certainty import DIRECT_FLOOR, EDGE_FLOOR
 from pipistrelle.detection.direct import own_alone, without_calls
 from pipistrelle.detection.faces import FrameMeasurements, average_faces, same_echo
+from pipistrelle.detection.front_end import FrontEnd, Groups, call_in, find_calls, front_end
 from pipistrelle.detection.matched import filter_blocks, filter_samples
 from pipistrelle.detection.scans import BEARING_STD, UNLABELLED, Scan, without_labels
-from pipistrelle.detection.snapshots import (
-    Detections,
-    Detector,
-    call_in,
-    detect,
-    detections_at,
-    detector,
-    joined,
-)
+from pipistrelle.detection.snapshots import Detections, detections_at, joined
 from pipistrelle.experiments.hearing.frames import CallHeard, frames_of
 from pipistrelle.experiments.hearing.oracle import faintest_level_db, label_detections
 from pipistrelle.experiments.hearing.scenario import Scenario, caller_labels
@@ -56,10 +49,10 @@ def listen(
     *,
     iteration: int = 0,
     beam: Callable[..., Arrivals] | None = None,
-    layout: Layout | None = None,
+    layout: Layout | Scattered | None = None,
     call: Callable[[float, float], Call] = ToneBurst,
     medium: Medium | None = None,
-    find: Callable[..., Detections] = detect,
+    find: Callable[..., Detections] = find_calls,
     oracle: Callable[..., Int[np.ndarray, " d"]] = label_detections,
     labels: bool = True,
     progress: Progress | None = None,
@@ -78,7 +71,7 @@ def listen(
     beam : callable, optional
         Gives the vehicle's call its directivity, as `through_piston` does: by default the piston
         with the off-axis loss of the settings.
-    layout : Layout, optional
+    layout : Layout or Scattered, optional
         The arrays; those of the settings by default.
     call : callable
         Makes each caller's `Call` of its frequency [Hz] and duration [s]; other than tone bursts
@@ -87,7 +80,7 @@ def listen(
         What the sound travels through; the air of the settings by default. The front end goes on
         assuming ``assumed.speed_of_sound``.
     find : callable
-        Finds calls in the matched filter's output, as `detect` does.
+        Finds calls in the matched filter's output, as `find_calls` does.
     oracle : callable
         Tells by the truth whose echo each detection is, as `label_detections` does.
     labels : bool
@@ -132,9 +125,9 @@ def listen(
         for timed in frame.calls:
             calls.setdefault(timed.number, (timed, [[] for _ in radii]))
         for r, record in enumerate(engine(frame.aimed, rig, key)):
-            found = rig.find(record.matched, rig.detector, **record.lags)
+            found = rig.find(record.matched, rig.front_end, **record.lags)
             for timed in frame.calls:
-                calls[timed.number][1][r].append(_of_call(timed, frame.time, record, found))
+                calls[timed.number][1][r].append(_of_call(timed, frame.time, record, found, rig))
             if rig.own_clock.any():
                 found = detections_at(found, ~rig.own_clock[found.caller])
             beams[r].append(_heard(frame.time, found, frame.aimed[r], rig))
@@ -184,9 +177,9 @@ class _Rig:
     """Everything that is the same for all frames of a path."""
 
     config: Config
-    layout: Layout
+    layout: Layout | Scattered
     sampling: Sampling
-    detector: Detector
+    front_end: FrontEnd
     find: Callable[..., Detections]
     oracle: Callable[..., Int[np.ndarray, " d"]]
     labels: bool
@@ -200,30 +193,24 @@ class _Rig:
 def _rig(
     config: Config,
     scenario: Scenario,
-    layout: Layout,
+    layout: Layout | Scattered,
     settled: Sampling,
     find: Callable[..., Detections],
     oracle: Callable[..., Int[np.ndarray, " d"]],
     labels: bool,
 ) -> _Rig:
     """Make what is the same for all frames of a path."""
-    finder = detector(config, layout, settled.tones)
+    end = front_end(config, layout, settled.tones)
     own_clock = np.array([caller.calls is not None for caller in scenario.callers])
     return _Rig(
         config=config,
         layout=layout,
         sampling=settled,
-        detector=finder,
+        front_end=end,
         find=find,
         oracle=oracle,
         labels=labels,
-        faintest_db=faintest_level_db(
-            finder.threshold,
-            elements=layout.position.size,
-            samples=settled.pulse * settled.block,
-            noise_std=settled.noise_std,
-            margin_db=config.matching.margin_db,
-        ),
+        faintest_db=_faintest_db(end, layout, settled, config),
         callers=caller_labels(scenario),
         missable=own_clock | [caller.heading is not None for caller in scenario.callers],
         own_clock=own_clock,
@@ -231,11 +218,30 @@ def _rig(
     )
 
 
-def _of_call(call: CallHeard, time: float, record: "_Record", found: Detections) -> Detections:
+def _faintest_db(
+    end: FrontEnd, layout: Layout | Scattered, settled: Sampling, config: Config
+) -> float:
+    """Return the level of the faintest arrival that can be matched [dB]."""
+    if isinstance(end, Groups):
+        threshold, elements = 1.0 + end.least_snr, 1
+    else:
+        threshold, elements = end.threshold, layout.shape[1]
+    return faintest_level_db(
+        threshold,
+        elements=elements,
+        samples=settled.pulse * settled.block,
+        noise_std=settled.noise_std,
+        margin_db=config.matching.margin_db,
+    )
+
+
+def _of_call(
+    call: CallHeard, time: float, record: "_Record", found: Detections, rig: _Rig
+) -> Detections:
     """Return the detections of one call in a frame; delays count from the call."""
     after, early = call.time - time, 0.5 * record.interval * record.pulse
     stretch = after - early, call.until - time - early
-    part = call_in(record.matched, found, call.caller, stretch, **record.lags)
+    part = call_in(record.matched, rig.front_end, found, call.caller, stretch, **record.lags)
     direct = part.direct and part.direct._replace(delay=part.direct.delay - after)
     return replace(part, delay=part.delay - after, direct=direct)
 
@@ -320,7 +326,7 @@ def _blocks(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]
     """Yield the record of each beam's arrivals, from block sums."""
     layout, settled, space, pulse = rig.layout, rig.sampling, rig.workspace, rig.sampling.pulse
     own, others = _parted(aimed[0])
-    shape = block_shape(blocks_to_hear(aimed[0], settled), layout, settled)
+    shape = block_shape(blocks_to_hear(aimed[0], settled, layout), layout, settled)
     shared = noise_blocks(shape[0], layout, settled, key, out=space.array("shared", shape))
     add_echo_blocks(shared, arrivals_at(aimed[0], others), layout, settled)
     lags = (shape[0] - pulse + 1, *shape[1:])
@@ -356,7 +362,7 @@ def _dense(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]:
     period = math.floor(setup.steps_per_frame * setup.step / BLOCK) - settled.pulse
     for arrivals in aimed:
         samples = record_samples(
-            max(period, blocks_to_hear(arrivals, settled)),
+            max(period, blocks_to_hear(arrivals, settled, rig.layout)),
             arrivals,
             rig.layout,
             settled,

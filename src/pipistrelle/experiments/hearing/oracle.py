@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int, Int8
 
 from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.arrays.layout import Layout
+from pipistrelle.arrays.layout import Layout, Scattered
 from pipistrelle.config import MatchingConfig
 from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.detection.snapshots import Columns, Detections, columns_of
@@ -27,7 +27,7 @@ _SAME_TIME = 1e-9
 def label_detections(
     detections: Detections,
     arrivals: Arrivals,
-    layout: Layout,
+    layout: Layout | Scattered,
     gates: MatchingConfig,
     *,
     pulse: float,
@@ -46,7 +46,7 @@ def label_detections(
     detections : Detections
         (d) rows.
     arrivals : Arrivals
-    layout : Layout
+    layout : Layout or Scattered
     gates : MatchingConfig
     pulse : [s]
     faintest_db : [dB]
@@ -144,7 +144,9 @@ def _label(
                 continue
             if true.level_db[a] < gates.faintest_db or taken[face[d], a]:
                 continue
-            if abs(wrap_angle(true.bearing[a] - normal[face[d]])) > 0.5 * np.pi:
+            front = normal[face[d]]
+            one_sided = front == front  # NaN hears all around
+            if one_sided and abs(wrap_angle(true.bearing[a] - front)) > 0.5 * np.pi:
                 continue
             off = abs(wrap_angle(bearing[d] - true.bearing[a])) / gates.bearing
             if off <= 1.0 and late * late + off * off < best + _SAME_TIME:

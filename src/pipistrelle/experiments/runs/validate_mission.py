@@ -9,14 +9,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of, moves
-from pipistrelle.arrays.layout import layout_of
+from pipistrelle.arrays.layout import Scattered, layout_of
+from pipistrelle.arrays.pattern import pattern_of
 from pipistrelle.arrays.sampling import sampling
 from pipistrelle.config import Config, InputError
-from pipistrelle.detection.snapshots import detector
+from pipistrelle.detection.front_end import front_end
 from pipistrelle.experiments.hearing.scenario import Scenario, world_of
 from pipistrelle.experiments.hearing.world import ALL_DRAWN, World
 from pipistrelle.experiments.machine import check_length, check_recording
 from pipistrelle.kernel_clock import judging
+
+MANY_DOUBLES = 0.1
+"""Share of the bearings with a double from which on a warning is given."""
 
 
 @judging()
@@ -45,7 +49,7 @@ def checked_scenario(
     scenario = world_of(config, world=world)
     settled = sampling(config, scenario.callers)
     layout = layout_of(config)
-    detector(config, layout, settled.tones)
+    front_end(config, layout, settled.tones)
     check_recording(scenario, config, layout, settled, workers=workers)
     _refuse_supersonic(scenario, config)
     return scenario
@@ -72,13 +76,16 @@ def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ..
     wave (0.0049 m)
     """
     spacing, rate = config.receiver.spacing, config.receiver.sample_rate
+    layout = layout_of(config)
     limit = min(config.detection.angle_limit_deg, config.detection.scan_limit_deg)
     warnings = []
     for caller in callers or callers_of(config, np.zeros(2)):
         frequency, key = caller.frequency, caller.key or caller.name
         tone, wave = f"{key}.frequency ({frequency:g} Hz)", config.air.sound_speed / frequency
         nearest = wave / spacing - math.sin(math.radians(limit))  # its lobe lies at the limit
-        if nearest < 1.0:
+        if isinstance(layout, Scattered):
+            warnings += _doubles(layout, frequency, tone, config.air.sound_speed)
+        elif nearest < 1.0:
             warnings.append(
                 f"receiver.spacing: {spacing:g} m is {spacing / wave:.2f} of a wave at {tone}: "
                 f"echoes {math.degrees(math.asin(max(nearest, 0.0))):.0f} degrees off a face's "
@@ -91,6 +98,22 @@ def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ..
                 f"hold it as {abs(frequency - rate * round(frequency / rate)):g} Hz; expected more"
             )
     return tuple(warnings)
+
+
+def _doubles(layout: Scattered, frequency: float, tone: str, c: float) -> list[str]:
+    """Warn of groups of microphones to which much of the circle sounds as another part of it."""
+    warnings = []
+    for g, name in enumerate(layout.name):
+        found = pattern_of(layout, g, frequency=frequency, speed_of_sound=c)
+        if found.alike >= MANY_DOUBLES:
+            this, that = (f"{math.degrees(angle):.0f}" for angle in found.worst)
+            whose = f"face {name}" if name else "the microphones that hang free"
+            warnings.append(
+                f"receiver.array: at {tone} {found.alike:.0%} of the bearings sound to {whose} as "
+                f"another, as {this} degrees as {that}; rows state deviations that say so, see "
+                "`pipistrelle array`"
+            )
+    return warnings
 
 
 def _refuse_supersonic(scenario: Scenario, config: Config) -> None:

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PlainValidator, ValidationError
 from pydantic_core import PydanticCustomError
 
+from pipistrelle.arrays.array_file import with_array
 from pipistrelle.config import STRATEGIES, Config, InputError, Section, Strategy
 from pipistrelle.estimation.catalogue import (
     CATALOGUE,
@@ -38,6 +39,7 @@ from pipistrelle.experiments.studies.plan import (
 from pipistrelle.files import check_ordinary
 from pipistrelle.refusals import expectation, meant, shown
 from pipistrelle.settings import (
+    ARRAY_KEY,
     CALLERS,
     WORLD_KEY,
     Given,
@@ -50,6 +52,7 @@ from pipistrelle.settings import (
     leaves,
     read_toml,
     resolve,
+    with_places,
 )
 
 FORMAT = 1
@@ -178,11 +181,7 @@ def _laid(path: Path, table: Mapping[str, Any], over: Layer, worlds: dict[str, W
         key: Given(value, f"{path}: config.{name}")
         for key, name, value in _settings(path, "config", table)
     }
-    if WORLD_KEY in layer and isinstance(layer[WORLD_KEY].value, str):
-        layer[WORLD_KEY] = Given(_beside(path, layer[WORLD_KEY].value), layer[WORLD_KEY].where)
-    if CALLERS in layer:
-        layer[CALLERS] = layer[CALLERS]._replace(value=beside(path, layer[CALLERS].value))
-    layer = with_routes(layer | over)
+    layer = with_array(with_routes(with_places(path, layer) | over))
     world = named_world(layer)
     if world is None:
         return layer
@@ -202,6 +201,10 @@ def _read(path: Path, key: Key, values: Any, worlds: dict[str, World]) -> Any:
     if key == CALLERS and isinstance(values, list):
         where = f"{path}: grid.callers"
         return [routes_read(beside(path, callers), where) for callers in values]
+    if key == ARRAY_KEY and isinstance(values, list):
+        where = f"{path}: grid.{'.'.join(key)}"
+        placed = [with_places(path, {key: Given(value, where)}) for value in values]
+        return [with_array(layer)[key].value for layer in placed]
     return values
 
 

@@ -1,0 +1,87 @@
+"""Print the tables of `arrays.md` anew: `.venv/bin/python docs/rooms.py`.
+
+Errors of bearings and delays from afar, without walls, in units of their bounds. And: a call from
+anywhere in a room of 9 by 8 m reaches a circle of eight microphones, and its walls throw it back
+three times at most. pyroomacoustics says what is heard.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+PLACES, DRAWS, SNR_DB, ORDER = 60, 5, 20.0, 3
+NEAREST, MARGIN, SECONDS = 1.5, 0.3, 0.08
+"""Least distance of the source from array and walls [m]; how long is recorded [s]."""
+WALLS = {"none": None, "soft (take 80 %)": 0.8, "take 40 %": 0.4, "hard (take 10 %)": 0.1}
+GATE_S, GATE = 7e-4, 0.1
+"""A row this near to an image of the source, in time [s] and bearing [rad], is of it."""
+
+
+def anywhere(rng):
+    """Draw bearing and distance of a source in the room."""
+    from reference.rooms import CENTRE, ROOM
+
+    while True:
+        x, y = rng.uniform(MARGIN, ROOM - MARGIN) - CENTRE
+        if np.hypot(x, y) > NEAREST:
+            return np.arctan2(y, x), np.hypot(x, y)
+
+
+def told(absorption):
+    """Return rows in a frame, the share of no image, and errors of the first row, squared."""
+    from pipistrelle.detection.front_end import front_end
+    from pipistrelle.geometry import wrap
+    from reference.rooms import ARRAYS, CONFIG, RATE, TONES, C, found_in, heard, noise_for
+
+    layout, rng = ARRAYS["circle"], np.random.default_rng(5)
+    end, rows = front_end(CONFIG, layout, TONES), []
+    for _ in range(PLACES):
+        bearing, distance = anywhere(rng)
+        quiet, _ = heard(layout, bearing, distance)
+        more = {"absorption": absorption, "order": ORDER, "seconds": SECONDS}
+        samples, images = heard(layout, bearing, distance, **more)
+        x, y = images.T
+        for _ in range(DRAWS):
+            found = found_in(samples, layout, noise_for(quiet, SNR_DB), rng, end)
+            delay = found.delay + 0.5 / RATE
+            late = np.abs(delay[:, None] - np.hypot(x, y) / C) < GATE_S
+            near = np.abs(wrap(found.bearing[:, None] - np.arctan2(y, x))) < GATE
+            none = np.count_nonzero(~(late & near).any(axis=1))
+            first = np.argmin(delay)
+            off = wrap(found.bearing[first] - bearing)
+            std = found.bearing_std[first]
+            after = delay[first] - distance / C
+            rows.append((delay.size, none, off**2, (off / std) ** 2, after**2))
+    return np.mean(rows, axis=0)
+
+
+def in_bounds():
+    """Print how large errors are beside their bounds, by array and level."""
+    from reference.rooms import ARRAYS, errors
+
+    print("| array | dB | bearing, in bounds | as stated | delay, in bounds | as stated |")
+    print("|---|--:|--:|--:|--:|--:|")
+    for name in ARRAYS:
+        for snr_db in (10.0, 20.0, 30.0):
+            found = np.sqrt(np.mean(errors(name, snr_db, 25, 30) ** 2, axis=1))
+            across, late, across_stated, late_stated = (f"{one:.2f}" for one in found)
+            print(f"| {name} | {snr_db:g} | {across} | {across_stated} | {late} | {late_stated} |")
+    print()
+
+
+def among_walls():
+    """Print a row for each kind of walls."""
+    print("| walls | rows | of no image | first row's bearing, rms | in deviations | delay, rms |")
+    print("|---|---|---|---|---|---|")
+    for name, absorption in WALLS.items():
+        rows, none, off, share, after = told(absorption)
+        first = f"{np.degrees(off**0.5):.2f}° | {share**0.5:.1f} | {1e6 * after**0.5:.0f} µs"
+        print(f"| {name} | {rows:.1f} | {none / rows:.0%} | {first} |")
+
+
+if __name__ == "__main__":
+    in_bounds()
+    among_walls()

@@ -1,0 +1,245 @@
+"""The front end: what finds calls in the matched outputs of whatever microphones there are.
+
+Of a `Layout`, equal lines on faces, `snapshots` finds them. Of microphones anywhere (`Scattered`)
+each group is asked alone: a line on a face by `snapshots`, any other on the full circle
+(`full_circle`); bearings and delays are then those at the vehicle's centre.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from pipistrelle.arrays.layout import Layout, Scattered, along_line
+from pipistrelle.config import Config, InputError
+from pipistrelle.detection.direct import (
+    MIN_EDGE_ENERGY,
+    DirectCalls,
+    Lags,
+    front_edge,
+    loudest_first,
+    may_leak,
+)
+from pipistrelle.detection.full_circle import Circle, circle_of, edge_around, find_around
+from pipistrelle.detection.onset import reach_of
+from pipistrelle.detection.snapshots import (
+    MAX_SPACING,
+    Detections,
+    Detector,
+    detect,
+    detections_at,
+    detector,
+    direct_of_faces,
+    joined,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Groups:
+    """Thresholds and tables of microphones anywhere, group by group."""
+
+    members: tuple[Int[np.ndarray, " k"], ...]
+    """The microphones of each."""
+    finders: tuple[Detector | Circle, ...]
+    """Of a line on a face a `Detector`."""
+    centre: Float[np.ndarray, "f 2"]
+    """Of each line, from which its delays count; 0 of other groups [m]."""
+    speed_of_sound: float
+    """Speed of sound [m/s]."""
+    least_snr: float
+    """Power ratio of one output of gain 0 dB that some group is expected to hear."""
+
+
+FrontEnd = Detector | Groups
+
+
+def front_end(
+    config: Config, layout: Layout | Scattered, tones: Float[np.ndarray, " c"]
+) -> FrontEnd:
+    """Settle what finds calls of some tones [Hz] in the outputs of a layout.
+
+    Raises InputError as `detector` does, for microphones too far apart, and for detection settings
+    that lines on faces alone can meet.
+
+    >>> from pipistrelle.arrays.array_file import microphones_of
+    >>> from pipistrelle.arrays.layout import scattered
+    >>> cross = [(0.02, 0.0), (0.0, 0.02), (-0.02, 0.0), (0.0, -0.02)]
+    >>> layout = scattered(microphones_of([(x, y, 0.0, 0.0, "") for x, y in cross]))
+    >>> found = front_end(Config(), layout, np.array([35e3, 30e3]))
+    >>> round(found.finders[0].threshold, 1), found.finders[0].beams
+    (18.8, 143)
+    """
+    if isinstance(layout, Layout):
+        return detector(config, layout, tones)
+    members, finders, snrs = [], [], []
+    centre = np.zeros((layout.normal.size, 2))
+    for g, normal in enumerate(layout.normal):
+        if math.isnan(normal):
+            members.append(np.flatnonzero(layout.group == g))
+            _refuse_lines_own(config)
+            _refuse_far_apart(
+                layout.position[members[-1]], config.assumed_sound_speed / tones.max()
+            )
+            finders.append(circle_of(config, layout, g, tones))
+            snrs.append((finders[-1].threshold - 1.0) / np.sum(layout.amplitude[members[-1]] ** 2))
+        else:
+            line, alone = along_line(layout, g)
+            members.append(line)
+            finders.append(detector(config, alone, tones))
+            centre[g] = layout.position[line].mean(axis=0)
+            gain = np.sum(layout.amplitude[line] ** 2)
+            snrs.append((finders[-1].threshold - line.size) / gain)
+    return Groups(
+        members=tuple(members),
+        finders=tuple(finders),
+        centre=centre,
+        speed_of_sound=config.assumed_sound_speed,
+        least_snr=float(min(snrs)),
+    )
+
+
+def find_calls(
+    matched: Complex[np.ndarray, "l f c e"],
+    end: FrontEnd,
+    *,
+    start: float,
+    interval: float,
+    pulse: int,
+) -> Detections:
+    """Find bearings and delays of everything that stands out of the noise, as `detect` does."""
+    lags = Lags(start, interval, pulse)
+    if isinstance(end, Detector):
+        return detect(matched, end, **lags._asdict())
+    found = joined([_of_group(matched, end, g, lags) for g in range(len(end.finders))])
+    return replace(found, direct=_direct_of_groups(matched, end, found, lags))
+
+
+def call_in(
+    matched: Complex[np.ndarray, "l f c e"],
+    end: FrontEnd,
+    found: Detections,
+    caller: int,
+    stretch: tuple[float, float],
+    *,
+    start: float,
+    interval: float,
+    pulse: int,
+) -> Detections:
+    """Select the detections of one call of a caller with its own clock, and its direct call.
+
+    It is all of the caller's tone in a stretch of the frame [s]; the other arguments are as those
+    of `find_calls`.
+    """
+    begin, until = stretch
+    inside = (begin <= found.delay) & (found.delay < until)
+    near = detections_at(found, inside | (found.caller != caller))  # others may leak
+    if found.direct is not None:
+        lags = Lags(start, interval, pulse)
+        if isinstance(end, Detector):
+            direct = direct_of_faces(matched, near, lags)
+        else:
+            direct = _direct_of_groups(matched, end, near, lags)
+        near = replace(near, direct=direct)
+    return detections_at(near, near.caller == caller)
+
+
+def _refuse_lines_own(config: Config) -> None:
+    """Refuse settings that only line arrays on faces know."""
+    for key, usual in (("snapshots", "maxima"), ("overlaps", "merge")):
+        if (found := getattr(config.detection, key)) != usual:
+            raise InputError(
+                f"detection.{key}: found {found!r}, which only lines on faces have, for the "
+                f"microphones of receiver.array that hear all around; expected {usual!r}"
+            )
+
+
+def _refuse_far_apart(place: Float[np.ndarray, "k 2"], wavelength: float) -> None:
+    """Refuse a microphone whose nearest neighbour is too many waves away."""
+    apart = np.linalg.norm(place[:, np.newaxis] - place, axis=-1)
+    np.fill_diagonal(apart, np.inf)
+    if (gap := float(apart.min(axis=1).max())) > MAX_SPACING * wavelength:
+        raise InputError(
+            f"receiver.array: found a microphone {gap:g} m, {gap / wavelength:.0f} waves, from the "
+            f"next; expected at most {MAX_SPACING}; if x, y, z are millimetres, divide by 1000"
+        )
+
+
+def _outputs(
+    matched: Complex[np.ndarray, "l 1 c e"], end: Groups, g: int
+) -> Complex[np.ndarray, "l c k"]:
+    """Return the outputs of a group."""
+    return np.ascontiguousarray(matched[:, 0, :, end.members[g]].transpose(1, 2, 0))
+
+
+def _of_group(
+    matched: Complex[np.ndarray, "l 1 c e"], end: Groups, g: int, lags: Lags
+) -> Detections:
+    """Find the calls that one group hears."""
+    outputs, finder = _outputs(matched, end, g), end.finders[g]
+    if isinstance(finder, Circle):
+        caller, (delay, bearing, power, bearing_std, delay_std, angle) = find_around(
+            outputs, finder, lags
+        )
+    else:
+        found = detect(outputs[:, np.newaxis], finder, **lags._asdict())
+        caller, bearing, power, angle = found.caller, found.bearing, found.power, found.angle
+        delay, bearing_std = found.delay + _ahead(end, g, bearing), found.bearing_std
+        delay_std = found.delay_std
+    return Detections(
+        face=np.full(caller.size, g),
+        caller=caller,
+        angle=angle,
+        bearing=bearing,
+        delay=delay,
+        power=power,
+        bearing_std=bearing_std,
+        delay_std=delay_std,
+    )
+
+
+def _ahead(
+    end: Groups, g: int, bearing: Float[np.ndarray, "*m"] | float
+) -> Float[np.ndarray, "*m"]:
+    """Return how much earlier than the vehicle's centre a line hears sound from a bearing [s]."""
+    x, y = end.centre[g] / end.speed_of_sound
+    return x * np.cos(bearing) + y * np.sin(bearing)
+
+
+def _direct_of_groups(
+    matched: Complex[np.ndarray, "l 1 c e"], end: Groups, found: Detections, lags: Lags
+) -> DirectCalls:
+    """Find the direct call of every caller but the vehicle, and its edge, as `direct_calls`."""
+    start, interval, pulse = lags
+    tones, length = matched.shape[2], pulse * interval
+    detection, when = np.full(tones, -1), np.full((2, tones), np.nan)
+    for p in range(1, tones):
+        d = int(loudest_first(found.caller, found.delay, found.power, p))
+        if d < 0 or may_leak(found.delay, found.power, d, length):
+            continue
+        g, bearing = int(found.face[d]), float(found.bearing[d])
+        early = float(_ahead(end, g, bearing))
+        b = int((found.delay[d] - early - start) / interval + 0.5)
+        lag, std = math.nan, math.nan
+        if pulse + reach_of(pulse) < b < len(matched):
+            lag, std = _edge(matched, end, g, lags, (b, p, bearing))
+        if std != math.inf:
+            detection[p] = d
+            when[:, p] = start + interval * lag + early, interval * std
+        if math.isnan(std):
+            when[:, p] = found.delay[d], found.delay_std[d]
+    return DirectCalls(detection=detection, delay=when[0], delay_std=when[1], pulse=length)
+
+
+def _edge(
+    matched: Complex[np.ndarray, "l 1 c e"],
+    end: Groups,
+    g: int,
+    lags: Lags,
+    at: tuple[int, int, float],
+) -> tuple[float, float]:
+    """Return the lag at which a group hears the first call of a tone begin, and its deviation."""
+    outputs, finder = _outputs(matched, end, g), end.finders[g]
+    if isinstance(finder, Circle):
+        return edge_around(outputs, finder, lags, at)
+    return front_edge(outputs[:, np.newaxis], at[0], 0, at[1], lags.pulse, MIN_EDGE_ENERGY)
