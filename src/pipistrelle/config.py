@@ -620,7 +620,7 @@ class BagConfig(Section):
     stamps: Literal["header", "received"] = "header"
     """The times of messages: those of their headers, or when they were received."""
     sensor_pose: tuple[Real, Real, Real] | None = None
-    """Of every sensor on the vehicle, x, y [m], heading [rad]; else as the bag says."""
+    """Pose of every sensor on the vehicle: x, y [m], heading [rad]; unless given, the bag's."""
     speed_of_sound: Annotated[float, Field(ge=10, le=10_000)] | None = None
     """Where pings that tell travel times do not say it [m/s]."""
     step: Annotated[NonNegative, Field(le=LONGEST_STEP)] = 0.1

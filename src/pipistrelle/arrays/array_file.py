@@ -40,7 +40,7 @@ MAX_EXTENT = 10.0
 SAME_PLACE = 1e-4
 """Two microphones nearer than this are one [m]."""
 MAX_GAIN_DB = 100.0
-"""Largest gain of a microphone, and the smallest but for its sign [dB]."""
+"""Gains of microphones lie between this and its negative [dB]."""
 REQUIRED = ("channel", "x", "y")
 OPTIONAL = ("z", "face", "gain_db")
 _FACE = re.compile(r"[\w-]{0,40}")

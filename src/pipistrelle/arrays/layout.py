@@ -64,14 +64,14 @@ class Scattered:
     position: Float[np.ndarray, "e 2"]
     """In the vehicle's frame, x ahead and y to the left [m]."""
     amplitude: Float[np.ndarray, " e"]
-    """What each makes of a sound of unit amplitude; its noise is that of all others."""
+    """Gain of each microphone; the noise of all is the same."""
     group: Int[np.ndarray, " e"]
     """Number of the group of each."""
     normal: Float[np.ndarray, " f"]
     """Direction of each group's normal, of a line on a face, which hears within 90 degrees of it;
     NaN of any other group, which hears all around [rad]."""
     name: tuple[str, ...]
-    """Of each group: its face's; empty for those that hang free."""
+    """Name of the face of each group; empty for microphones without a face."""
 
     @property
     def shape(self) -> tuple[int, int]:

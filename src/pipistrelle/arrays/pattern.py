@@ -32,7 +32,7 @@ UNKNOWN = math.pi / math.sqrt(3.0)
 
 
 class Pattern(NamedTuple):
-    """What a group can tell at one frequency."""
+    """Resolution and ambiguities of a group of microphones at one frequency."""
 
     microphones: int
     aperture: float

@@ -42,9 +42,9 @@ class Groups:
     members: tuple[Int[np.ndarray, " k"], ...]
     """The microphones of each."""
     finders: tuple[Detector | Circle, ...]
-    """Of a line on a face a `Detector`."""
+    """The finder of each group; of a line on a face it is a `Detector`."""
     centre: Float[np.ndarray, "f 2"]
-    """Of each line, from which its delays count; 0 of other groups [m]."""
+    """Point of each line at which its delays are told; the origin for other groups [m]."""
     speed_of_sound: float
     """Speed of sound [m/s]."""
     least_snr: float

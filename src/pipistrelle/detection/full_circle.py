@@ -74,7 +74,7 @@ class Circle(NamedTuple):
     """A group of microphones that hear all around, its threshold and its scan."""
 
     threshold: float
-    """Of the loudness of a lag and tone, in units of the noise of one output."""
+    """Least loudness of a call at a lag and tone, in units of the noise of one output."""
     leakage: float
     """Least loudness, as a share of that of another tone nearby."""
     loudest_noise: float
@@ -88,7 +88,7 @@ class Circle(NamedTuple):
     position: Float[np.ndarray, "k 2"]
     """In the vehicle's frame [m]."""
     weight: Float[np.ndarray, " k"]
-    """Of each output, their squares one in sum."""
+    """Weight of each output; the squares of all sum to 1."""
 
 
 def circle_of(

@@ -189,18 +189,12 @@ class Slam:
         As the estimator believes them now, of one that revises its path; else as they were believed
         at their time, the last of them that are kept.
         """
-        time = np.array([time for time, _ in self._poses])
+        time, online = self._online()
         revised = answer(self._session.belief, "path")
-        poses = Gaussian(
-            mean=np.array([pose.mean for _, pose in self._poses]),
-            covariance=np.array([pose.covariance for _, pose in self._poses]),
-        )
-        if revised is not None:
-            whole = self._at_vehicle(revised)
-            poses = Gaussian(
-                mean=whole.mean[-time.size :], covariance=whole.covariance[-time.size :]
-            )
-        return path_table(time, poses)
+        if revised is None:
+            return path_table(time, online)
+        whole, kept = self._at_vehicle(revised), slice(-time.size, None)
+        return path_table(time, Gaussian(mean=whole.mean[kept], covariance=whole.covariance[kept]))
 
     def move(
         self,
@@ -299,14 +293,14 @@ class Slam:
         path = folder_named(file, "file")
         settings = self._config.model_dump(mode="json")
         header = {"filter": self._name, "kept": self._kept, "config": settings}
-        times, poses = zip(*self._poses, strict=True)
+        times, online = self._online()
         content = {
             "session": self._session.state(),
             "log": self._log,
             "heard": self._heard,
-            "times": np.array(times),
-            "means": np.array([pose.mean for pose in poses]),
-            "covariances": np.array([pose.covariance for pose in poses]),
+            "times": times,
+            "means": online.mean,
+            "covariances": online.covariance,
         }
         write_state(path, header, content)
         return path
@@ -356,6 +350,13 @@ class Slam:
             f"Slam by {self._name} at {pose.time:g} s: x {pose.x:.3f} m, y {pose.y:.3f} m, heading "
             f"{pose.heading:.3f} rad; {np.unique(landmarks).size} landmarks"
         )
+
+    def _online(self) -> tuple[Float[np.ndarray, " k"], Gaussian]:
+        """Return the times that are kept, and the poses as they were believed at their time."""
+        times, poses = zip(*self._poses, strict=True)
+        mean = np.array([pose.mean for pose in poses])
+        covariance = np.array([pose.covariance for pose in poses])
+        return np.array(times), Gaussian(mean=mean, covariance=covariance)
 
     def _change(self, act: Callable[[], R]) -> R:
         """Let the session do something; where that fails, it is as it was."""

@@ -41,9 +41,6 @@ _PLAIN = {
 
 def write_state(path: Path, header: Mapping[str, Any], content: Mapping[str, Any]) -> None:
     """Write the file, in place of one that was written here before."""
-    if path.is_dir() or (path.exists() and not _head_of(path).startswith(HEAD)):
-        found = "a folder" if path.is_dir() else "a file that Slam.save did not write"
-        raise refusal(path, found, "a new file, or one to replace", "name another")
     try:
         known = pickle.dumps(dict(content), protocol=5)
     except (pickle.PicklingError, TypeError, AttributeError) as error:
@@ -52,6 +49,9 @@ def write_state(path: Path, header: Mapping[str, Any], content: Mapping[str, Any
     line = json.dumps({"version": find_version(), **header}).encode()
     body = line + b"\n" + known
     try:
+        if path.exists() and not read_file(path).startswith(HEAD):
+            found, expected = "a file that Slam.save did not write", "a new file, or one to replace"
+            raise refusal(path, found, expected, "name another")
         write_whole(path, HEAD + sha256(body).hexdigest().encode() + b"\n" + body)
     except OSError as error:
         fix = "name a file in a folder that is there and can be written"
@@ -85,15 +85,6 @@ def _check_header(path: Path, header: Mapping[str, Any], own: str | None) -> Non
         found = f"a drive by the filter {shown(name)}"
         expected = f"one by {own}" if own else "an estimator of this package"
         raise refusal(path, found, expected, f"if you trust the file, load(..., filter={name!r})")
-
-
-def _head_of(path: Path) -> bytes:
-    """Return the first bytes of a file."""
-    try:
-        with path.open("rb") as file:
-            return file.read(len(HEAD))
-    except OSError:
-        return b""
 
 
 class _Records(pickle.Unpickler):

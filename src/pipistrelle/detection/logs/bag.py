@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 _IDL = "=" * 80 + "\n"
-"""What parts the files of a definition in IDL, each under a line with its name."""
+"""Line between the files of a definition in IDL; the name of the file follows it."""
 
 
 class Message(NamedTuple):

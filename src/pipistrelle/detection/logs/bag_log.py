@@ -31,7 +31,7 @@ _UNKNOWN = 100.0
 _STEEP = 0.1
 """Least level part of an echo's direction that has a bearing."""
 _LATE = 1e-3
-"""A difference between clocks that is told [s]."""
+"""Clocks that differ by more than this are reported [s]."""
 
 
 @dataclass(slots=True)
@@ -167,7 +167,7 @@ def _table(where: str, columns: tuple[str, ...], rows: list[Any], stated: int = 
 def _odometry(
     path: Path, topic: str, rows: list[Any], settings: BagConfig
 ) -> tuple[Table, list[str]]:
-    """Return the table of the odometry, and what is told of it."""
+    """Return the table of the odometry, and notes on it for the user."""
     where, steps = f"{path}, topic {topic}", f"in steps of {settings.step:g} s"
     steps = steps if settings.step else "each a step"
     names = ("time", *POSE, "velocity", "sideways", "angular_rate", *MOTION_COVARIANCE)
