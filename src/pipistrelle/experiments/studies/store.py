@@ -18,6 +18,7 @@ from pipistrelle.experiments.studies.plan_file import changed_settings, plan_tex
 from pipistrelle.experiments.studies.world import world_schemas
 from pipistrelle.experiments.studies.world_files import (
     TABLES,
+    check_world,
     done_worlds,
     scan_tables,
     unusable,
@@ -176,7 +177,12 @@ def load_study(folder: Path) -> StoredStudy:
         for name in TABLES
     }
     # Without an association in the plan, its scores have no columns.
-    there = frames["trials"].collect_schema().names()
+    try:
+        there = frames["trials"].collect_schema().names()
+    except (OSError, pl.exceptions.PolarsError):
+        for world in worlds:
+            check_world(folder, plan, world)
+        raise
     none = [pl.lit(None, pl.Float64).alias(n) for n in OF_ASSOCIATION if n not in there]
     frames["trials"] = frames["trials"].with_columns(none)
     return StoredStudy(plan=plan, **frames)
