@@ -373,7 +373,7 @@ def _layer(
     layer = {}
     for key, value in given:
         where = prefix + spell(key)
-        if key == OWN and isinstance(value, Mapping):
+        if key == OWN and value is not None:
             layer |= _own_layer(value, where)
         elif key in known_settings():
             layer[key] = Given(value, where)
@@ -393,8 +393,11 @@ def _layer(
     return layer
 
 
-def _own_layer(tables: Mapping[str, Any], where: str) -> Layer:
+def _own_layer(tables: Any, where: str) -> Layer:
     """Attach to each setting that is one estimator's alone where it was given."""
+    if not isinstance(tables, Mapping):
+        expected = "a table for each estimator, as {iekf = {rays.power = 8.0}}"
+        raise InputError(f"{where}: found {shown(tables)}, expected {expected}")
     layer: Layer = {}
     for name, table in tables.items():
         if not isinstance(table, Mapping):

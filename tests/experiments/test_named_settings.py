@@ -169,7 +169,7 @@ def test_a_file_may_hold_what_is_one_estimators_alone():
         ("", "odd.toml: found no setting, expected settings"),
         ("# only a remark\n", "odd.toml: found no setting, expected settings"),
         ("rays.power = nan", "odd.toml: rays.power: found nan, expected a finite number"),
-        ("own = 3", "odd.toml: own: found 3"),
+        ("own = 3", "odd.toml: own: found 3, expected a table for each estimator"),
         ("own.iekf = 3", "odd.toml: own.iekf: found 3, expected a table of settings"),
         ("own.iekf.rays.powr = 3", "own.iekf.rays.powr: no such setting; did you mean"),
         ("own.iekf.rays.power = nan", "own.iekf.rays.power: found nan, expected a finite"),
