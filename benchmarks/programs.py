@@ -81,12 +81,20 @@ def _wall(*arguments: str, **changes: str) -> float:
 
 
 def _run(rounds: int) -> float:
-    """Time `./dev run` when everything is set up and compiled [s]."""
+    """Time `./dev run --settings paper` when everything is set up and compiled [s]."""
     took = []
     for _ in range(rounds + 1):
         with TemporaryDirectory() as name:
             folder = str(Path(name) / "run")
-            command = [sys.executable, str(ROOT / "dev"), "run", "-o", folder]
+            command = [
+                sys.executable,
+                str(ROOT / "dev"),
+                "run",
+                "--settings",
+                "paper",
+                "-o",
+                folder,
+            ]
             began = time.perf_counter()
             subprocess.run(command, check=True, capture_output=True)
             took.append(time.perf_counter() - began)
@@ -101,6 +109,6 @@ def _helps(rounds: int) -> tuple[float, float]:
 
 
 def _cold_compile() -> float:
-    """Time the compilation of the kernels of a first `pipistrelle run` [s]."""
+    """Time the compilation of the kernels of a first `pipistrelle run --settings paper` [s]."""
     with TemporaryDirectory() as folder:
         return _wall("-c", COMPILE, NUMBA_CACHE_DIR=folder)

@@ -24,8 +24,15 @@ def made_up(place, seed, steps, share):
     """Write the log of a drive by sound; of a share of its bearings each is off by 0.5 rad."""
     from pipistrelle.verbs.command_line import obey
 
-    words = ["run", "--strategy", "fused", "--quiet", "--seed", str(seed), "-o", str(place / "run")]
-    words += ["--scenario.steps", str(steps), "--filter.noise", "measured"]
+    words = ["run", "--settings", "paper", "--strategy", "fused", "--quiet", "--seed", str(seed)]
+    words += [
+        "-o",
+        str(place / "run"),
+        "--scenario.steps",
+        str(steps),
+        "--filter.noise",
+        "measured",
+    ]
     log = place / "log"
     assert obey([*words, "--save-log", str(log)]) == 0
     settings = (log / "log.toml").read_text().splitlines()

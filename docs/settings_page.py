@@ -6,13 +6,19 @@ import re
 from pydantic import TypeAdapter
 
 from pipistrelle.config import LARGEST, CallerConfig, Config
-from pipistrelle.settings import CALLERS, PREFIX, from_flags, known_settings
+from pipistrelle.settings import CALLERS, OWN, PREFIX, SETTINGS, from_flags, known_settings
 
 PLACE = "<!-- settings -->"
 CALLER = "<!-- callers -->"
 ALL_DRAWN = "any number"
 WORDS = {"string": "a folder", "file": "a file", "boolean": "`true` or `false`"}
 """Settings that are no numbers; text that is free is the folder of a world, or names topics."""
+TABLES = {
+    CALLERS: "tables, see [below](#several-callers)",
+    OWN: "tables, see [below](#one-estimators-alone)",
+    SETTINGS: "a name, see [below](#settings-by-name)",
+}
+"""What settings take that are no single value."""
 SIGN = re.compile("([≥>≤<]) ")
 UNIT = re.compile(r" ?\[((?!0 to 1)[^]]+)\]")
 
@@ -60,7 +66,7 @@ def entry(key):
     if len(units) == 1:
         text = UNIT.sub("", text)
     unit = f" {units[0]}" if len(units) == 1 else ""
-    takes = "tables, see [below](#several-callers)" if key == CALLERS else extent(field)
+    takes = TABLES[key] if key in TABLES else extent(field)
     if field.default is None:
         takes = f"None by default; {takes}{unit}"
     else:

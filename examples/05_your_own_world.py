@@ -44,7 +44,8 @@ with TemporaryDirectory() as folder:
     for name, text in files.items():
         Path(folder, name).write_text(text)
     heard = ["active", "fused"]
-    done = pipistrelle.run(world=folder, strategies=heard, motion__steering_std=0.02)
+    asked = {"settings": "paper", "strategies": heard, "motion__steering_std": 0.02}
+    done = pipistrelle.run(world=folder, **asked)
 figure = done.figure()
 
 # %%

@@ -38,7 +38,8 @@ class BearingsOnly(EkfSlam):
 # Beside the EKF they map the world of :doc:`03_one_mission`, from one and the same recording.
 
 filters = ["ekf", BearingsOnly, DeadReckoning]
-done = pipistrelle.run(seed=7, strategies="active", filters=filters, duration=62.5)
+asked = {"settings": "paper", "seed": 7, "strategies": "active", "duration": 62.5}
+done = pipistrelle.run(filters=filters, **asked)
 figure = done.figure()
 
 # %%

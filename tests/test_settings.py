@@ -11,6 +11,8 @@ from pipistrelle.experiments.studies.plan import cases_of
 from pipistrelle.experiments.studies.plan_file import plan_text, read_plan
 from pipistrelle.settings import (
     CALLERS,
+    OWN,
+    SETTINGS,
     from_environment,
     from_file,
     from_flags,
@@ -47,7 +49,7 @@ def test_every_setting_of_the_configuration_is_known_and_says_what_it_means():
         if isinstance(values, dict)
         for leaf in values
     }
-    assert set(known_settings()) == leaves | {("seed",), CALLERS}
+    assert set(known_settings()) == leaves | {("seed",), SETTINGS, OWN, CALLERS}
     silent = [".".join(key) for key, field in known_settings().items() if not field.description]
     assert silent == []
 

@@ -655,6 +655,10 @@ class Config(Section):
 
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 7
     """Seed of every random stream."""
+    settings: Annotated[str, Field(min_length=1)] | None = None
+    """Name of the settings that these lie over: `paper`, `physics` or `best`."""
+    own: dict[str, dict[str, dict[str, Any]]] | None = None
+    """What is one estimator's alone, over what all have: a table for each, as `own.iekf`."""
     callers: Annotated[tuple[CallerConfig, ...], Field(max_length=MAX_OTHERS)] | None = Field(
         None, json_schema_extra=TABLES
     )

@@ -1,4 +1,4 @@
-"""Settings laid over each other: defaults < file < environment < flags.
+"""Settings laid over each other: defaults < named settings < file < environment < flags.
 
 Each place gives a `Layer`: its settings by their key, each with the words that say where it
 stands. Layers merge as dictionaries do, the right one wins, and whatever `resolve` refuses is
@@ -82,6 +82,10 @@ def _marked(mark: Mark) -> Key:
 WORLD_KEY, RADIUS_KEY, CALLERS, ARRAY_KEY = map(_marked, (FOLDER, BEAM, TABLES, ARRAY))
 """Settings that are treated in their own way: the world's folder, the piston, the callers, the
 array."""
+SETTINGS: Key = ("settings",)
+OWN: Key = ("own",)
+"""Keys of what lies beneath (`experiments.named_settings`), and of what is one estimator's alone:
+``[own.iekf] rays.power`` of a file is ``("own", "iekf", "rays", "power")`` of a layer."""
 
 
 def derived(config: Config) -> dict[Key, Any]:
@@ -273,7 +277,7 @@ def to_toml(config: BaseModel) -> str:
             if leaf == next(iter(type(table).model_fields)):
                 lines += ["", f"# {' '.join((type(table).__doc__ or '').split())}", f"[{section}]"]
         value = getattr(table, leaf)
-        if key == CALLERS and value:
+        if key in (CALLERS, OWN) and value:
             continue  # a table each, at the end
         assignment = f"# {leaf} =" if value is None else f"{leaf} = {json.dumps(value)}"
         lines.append(_remarked(assignment, known_settings()[key]))
@@ -284,6 +288,16 @@ def to_toml(config: BaseModel) -> str:
         lines += [
             _remarked(f"{leaf} = {json.dumps(table[leaf], ensure_ascii=False)}", fields[leaf])
             for leaf in table
+        ]
+    for name, sections in (getattr(config, "own", None) or {}).items():
+        lines += [
+            "",
+            f"# What {name} has alone.",
+            f"[own.{name if name.isidentifier() else json.dumps(name)}]",
+        ]
+        lines += [
+            _remarked(f"{'.'.join(key)} = {json.dumps(value)}", known_settings()[key])
+            for key, value in leaves(sections)
         ]
     return "\n".join(lines) + "\n"
 
@@ -367,7 +381,9 @@ def _layer(
     layer = {}
     for key, value in given:
         where = prefix + spell(key)
-        if key in known_settings():
+        if key == OWN and value is not None:
+            layer |= _own_layer(value, where)
+        elif key in known_settings():
             layer[key] = Given(value, where)
         elif any(key == known[: len(key)] for known in known_settings()):
             if value != {}:
@@ -382,6 +398,21 @@ def _layer(
             fit = " or ".join(same) or (names[near] if near else "")
             fix = f"did you mean {fit}?" if fit else "see `pipistrelle config show`"
             raise InputError(f"{where}: no such setting; {fix}")
+    return layer
+
+
+def _own_layer(tables: Any, where: str) -> Layer:
+    """Attach to each setting that is one estimator's alone where it was given."""
+    if not isinstance(tables, Mapping):
+        expected = "a table for each estimator, as {iekf = {rays.power = 8.0}}"
+        raise InputError(f"{where}: found {shown(tables)}, expected {expected}")
+    layer: Layer = {}
+    for name, table in tables.items():
+        if not isinstance(table, Mapping):
+            found = f"found {shown(table)}, expected a table of settings"
+            raise InputError(f"{where}.{name}: {found}")
+        given = from_table(table, "", f"{where}.{name}.")
+        layer |= {(*OWN, name, *key): one for key, one in given.items()}
     return layer
 
 

@@ -22,7 +22,19 @@ from pipistrelle.experiments.runs.trial import run_mission
 from pipistrelle.experiments.studies.store import load_study
 from reference.studies import SMALL
 
-SHORT = ("--duration", "10", "--seed", "7", "--quiet", "--strategy", "fused", "--filter", "iekf")
+SHORT = (
+    "--settings",
+    "paper",
+    "--duration",
+    "10",
+    "--seed",
+    "7",
+    "--quiet",
+    "--strategy",
+    "fused",
+    "--filter",
+    "iekf",
+)
 JOINT = '''
 from dataclasses import dataclass, field
 

@@ -23,7 +23,7 @@ from reference.studies import SMALL, assert_same, plan_of, results
 from report.drawing import draw_only
 
 RECKONING, SHIFTED = "toy_estimators:DeadReckoning", "toy_estimators:Shifted"
-SHORT = ("--duration", "10", "--seed", "7", "--quiet")
+SHORT = ("--settings", "paper", "--duration", "10", "--seed", "7", "--quiet")
 ONLINE = [
     "online_position_rmse_m",
     "online_heading_rmse_rad",

@@ -13,7 +13,8 @@ from fuzz.judging import Tried, contents, faults_of, lost, unsound_results
 from fuzz.logs import DATA, DRAWN
 from fuzz.mutations import FACTORS, HUGE, NUMBERS, VALUES, WORDS, one_of, short, spoiled
 from fuzz.running import Ending, command, undrawn
-from pipistrelle.settings import CALLERS, Key, known_settings
+from pipistrelle.experiments import named_settings
+from pipistrelle.settings import CALLERS, OWN, SETTINGS, Key, known_settings
 
 COUNTS = ("-1", "0", "1", "2", "3", "1.5", "1e12", "9223372036854775807", "9223372036854775808")
 """Of things that each take time: none that would rightly take long."""
@@ -85,10 +86,17 @@ def odd_setting(rng: Generator) -> Odd:
         return Odd(
             key, f"[{', '.join(_caller(rng) for _ in range(one_of(rng, [0, 1, 2, 2, 3, 8])))}]"
         )
+    if key == SETTINGS:
+        names = map(repr, (*named_settings.NAMES, "bset", ""))
+        return Odd(key, one_of(rng, [*names, "1", "nan", "[]"]))
+    if key == OWN and rng.random() < 0.9:
+        inner = odd_setting(rng)
+        name = one_of(rng, ["ekf", "fastslam", "ikef"])
+        return Odd(key, f"{{{name}.{'.'.join(inner.key)} = {inner.value}}}")
     if isinstance(field.default, str):
         choices = [*map(repr, get_args(field.annotation)), "''", "'x'", "1", "true", "[]"]
         return Odd(key, one_of(rng, choices))
-    if isinstance(field.default, tuple):
+    if isinstance(field.default, tuple) and field.default:
         given = [_number(rng, key, part) for part in field.default]
         sound = [repr(part) for part in field.default]
         at = int(rng.integers(len(sound)))
@@ -99,7 +107,8 @@ def odd_setting(rng: Generator) -> Odd:
         return Odd(
             key, one_of(rng, VALUES if field.annotation is float else VALUES[len(NUMBERS) :])
         )
-    return Odd(key, _number(rng, key, 1.0 if field.default is None else field.default))
+    number = field.default if isinstance(field.default, (int, float)) else 1.0
+    return Odd(key, _number(rng, key, number))
 
 
 def _caller(rng: Generator) -> str:
@@ -123,8 +132,8 @@ def toml(values: dict[Key, str], above: str = "") -> str:
 
 def flags(odd: Odd) -> list[str]:
     """Give a setting as a flag."""
-    if odd.key == CALLERS:
-        return ["--callers", odd.value]
+    if odd.key in (CALLERS, OWN):
+        return [f"--{odd.key[0]}", odd.value]
     words = odd.value.strip("[]").replace(",", " ").split() if odd.value[:1] == "[" else [odd.value]
     words = [word.strip("'\"") for word in words]
     return ["--" + ".".join(odd.key).replace("_", "-"), *words]

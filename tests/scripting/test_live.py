@@ -79,6 +79,12 @@ def test_how_many_steps_come_at_once_changes_no_bit(logs):
     assert one.pose.covariance.tobytes() == three.pose.covariance.tobytes()
 
 
+@pytest.mark.parametrize("name", ["ekf", "iekf"])
+def test_named_settings_are_those_of_the_log_with_what_the_estimator_has_alone(logs, name):
+    best = pipistrelle.slam(logs["known"], filters=name, settings="best")
+    assert same(driven(logs["known"], filter=name, settings="best"), best)
+
+
 @AS_FOUND
 @pytest.mark.parametrize("name", ["iekf", "smoother"])
 def test_rows_without_labels_are_associated_as_those_of_the_log(logs, name):

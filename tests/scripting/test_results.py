@@ -15,7 +15,7 @@ from pipistrelle import Config, InputError
 from pipistrelle.__main__ import main
 from pipistrelle.estimation.ekf.filter import EkfSlam
 
-SHORT = {"duration": 4.0, "landmarks": 10}
+SHORT = {"settings": "paper", "duration": 4.0, "landmarks": 10}
 LOG = Path(__file__).parents[1] / "data" / "unicycle_log"
 
 
@@ -32,7 +32,7 @@ def done():
 
 def test_frames_are_those_of_the_folder_of_the_command_line(capsys, done):
     words = ("--duration", "4", "--landmarks", "10", "--filter", "both", "--particles", "7")
-    assert main(["run", *words, "-o", "one"]) == 0
+    assert main(["run", "--settings", "paper", *words, "-o", "one"]) == 0
     capsys.readouterr()
     for name, mine in (
         ("steps", done.tracks),
@@ -107,7 +107,7 @@ def test_settings_to_start_from_may_be_settings_a_table_or_a_file(done):
         ((), {"rays": {"power": 2.0}, "rays__power__x": 2}, "found power as a value too"),
         (({"ray.power": 3.0},), {}, "config: ray.power: no such setting; did you mean rays.power?"),
         (("nowhere.toml",), {}, "nowhere.toml: found no such file"),
-        ((7,), {}, "config: found 7, expected a Config, a mapping or the path of a TOML file"),
+        ((7,), {}, "config: found 7, expected a Config, a mapping, a name or the path"),
         ((), {"landmarks": [[1, 2], [3, 4]]}, "and name it by world="),
         ((), {"strategies": "activ"}, "strategies: found 'activ', expected 'active', 'fused', 'pa"),
         ((), {"strategies": ["fused", 3]}, "strategies: found 3"),
@@ -186,7 +186,7 @@ def test_what_is_no_path_is_refused_in_words(tmp_path):
     for ask in (pipistrelle.load, pipistrelle.slam):
         with pytest.raises(InputError, match="found 7, expected the path of a folder"):
             ask(7)
-    with pytest.raises(InputError, match="a world of your own is named by world="):
+    with pytest.raises(InputError, match="a world of your own is named by world"):
         pipistrelle.run(str(tmp_path))
 
 
@@ -219,6 +219,7 @@ def test_a_notebook_draws_a_figure_that_is_the_last_line_of_a_cell(done):
 
 def test_numbers_may_be_numpys():
     few = pipistrelle.run(
+        settings="paper",
         seed=np.int64(3),
         duration=np.float32(4.0),
         landmarks=np.int64(10),
@@ -281,7 +282,7 @@ def test_a_class_that_nobody_else_finds_is_refused():
 
     with pytest.raises(InputError, match="define it outside of functions"):
         pipistrelle.run(**SHORT, filters=Hidden)
-    for wrong in (3, None, ["ekf", 3], [Deaf, object()]):
+    for wrong in (3, ["ekf", 3], [Deaf, object()]):
         with pytest.raises(InputError, match="expected an estimator's name or its class"):
             pipistrelle.run(**SHORT, filters=wrong)
     with pytest.raises(InputError, match="lacks init, predict, update"):

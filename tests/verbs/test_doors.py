@@ -18,7 +18,7 @@ from reference.results import loop, mission_folder
 from reference.studies import TINY
 
 LOG = Path(__file__).parents[1] / "data" / "unicycle_log"
-READ = {"--config", "--world", "--log", "LOG", "FOLDER", "--folder", "FOLDERS"}
+READ = {"--world", "--log", "LOG", "FOLDER", "--folder", "FOLDERS"}
 """What names a place that is only read."""
 RUN = ("run", *SHORT, "--strategy", "fused", "-o")
 COMMANDS = {

@@ -79,8 +79,11 @@ def test_the_defaults_that_the_help_names_are_those_of_the_settings(obey):
     assert told["particles"] == str(config.fastslam.particles)
 
 
-@pytest.mark.parametrize(("verb", "default"), [("run", "ekf"), ("slam", "smoother")])
+@pytest.mark.parametrize(
+    ("verb", "default"), [("run", "of best the smoother"), ("slam", "else smoother")]
+)
 def test_the_help_names_the_filters_there_are(obey, verb, default):
     words = " ".join(re.sub("[│╭╮╰╯─]", " ", obey(verb, "--help")[1]).split())
-    assert f"[choices: ekf, fastslam, iekf, smoother, both, all] [default: {default}]" in words
+    choices = "[choices: ekf, fastslam, iekf, smoother, both, all]"
+    assert f"[default: that of the settings, {default}] {choices}" in words
     assert "sets fastslam.particles" in words

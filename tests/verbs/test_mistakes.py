@@ -39,7 +39,10 @@ import pytest
         ("run --filter mine.py:Own", "; write mine:Own"),
         ("run --filter fastslam --particles 0", "--particles: found 0, expected greater than or"),
         ("run --filter fastslam --particles 9.5", "--particles: found '9.5', expected a whole"),
-        ("run --particles 9", "--particles: found 9, but --filter is ekf, which has none; add --f"),
+        (
+            "run --particles 9",
+            "--particles: found 9, but --filter is smoother, which has no",
+        ),
         (
             "run --filter both --particles 3 --fastslam.particles 3",
             "--particles and --fastslam.particles are one setting; give one of them",
@@ -62,7 +65,7 @@ import pytest
         ("slam x --robust huber", "Unknown option: --robust. Did you mean --filter.robust?"),
         ("run --assumed 3", "--assumed: is a section of settings; name one of it, as --assumed."),
         ("run --config none.toml", "none.toml: found no such file"),
-        ("run --config .", "--config: found '.', expected the path of a TOML file"),
+        ("run --config .", "--settings: found '.', a folder, expected a TOML file of settings"),
         ("run --landmarks 9999", "scenario.landmarks: found 9999"),
         ("run --animate=avi", 'Invalid value "avi" for --animate'),
         ("run --animate avi", "--animate: found 'avi', expected gif or mp4"),

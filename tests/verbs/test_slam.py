@@ -60,7 +60,7 @@ def test_a_log_keeps_excess_paths_and_whose_they_are_to_the_bit(obey, noise, und
     settings = {"filter__noise": noise, "filter__gate": 0.99, "rays__spacing": "paper"}
     timing = {"callers": from_text(CHORUS), "listening__timing": True}
     ran = pipistrelle.run(
-        strategies="fused", duration=4, landmarks=10, **settings, **timing
+        strategies="fused", settings="paper", duration=4, landmarks=10, **settings, **timing
     )  # the same again: its scans are in no file
     solved = pipistrelle.slam("log", filters="ekf", **settings)
     (one,), (two,) = ran._mission.trials, solved._mission.trials

@@ -218,8 +218,8 @@ def test_a_study_is_refused_with_what_to_do_instead(obey, refused, undrawn):
          "--scenario.landmarks", "2", "-o", "study")  # fmt: skip
     said = refused("view", "study")
     assert said.startswith("study: found a study, which keeps many worlds and the frames of none")
-    assert "`pipistrelle report` puts it on a page; `pipistrelle run --config study/conf" in said
-    assert main(["run", "--config", "study/config.toml", "--quiet", "-o", "one"]) == 0
+    assert "`pipistrelle report` puts it on a page; `pipistrelle run --settings study/con" in said
+    assert main(["run", "--settings", "study/config.toml", "--quiet", "-o", "one"]) == 0
     assert main(["view", "one", "--quiet"]) == 0
 
 

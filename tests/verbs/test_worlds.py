@@ -61,7 +61,8 @@ def contents_of_files(folder):
 
 
 def test_a_saved_world_is_heard_again_to_the_bit(obey, here):
-    assert obey("run", "--world", here / "drawn", "-o", "two")[0] == 0
+    words = ("--settings", "paper", "--world", here / "drawn")
+    assert obey("run", *words, "-o", "two")[0] == 0
     assert found("two") == found("one")
     assert len(found("two")) == 6
     copy = Path("two/worlds/drawn")
@@ -72,7 +73,8 @@ def test_a_saved_world_is_heard_again_to_the_bit(obey, here):
 
 
 def test_ones_own_world_is_heard_as_its_files_say(obey, here):
-    status, printed, _ = obey("run", "--world", here / "posts [1]", "--strategy", "fused")
+    words = ("--settings", "paper", "--strategy", "fused")
+    status, printed, _ = obey("run", "--world", here / "posts [1]", *words)
     assert status == 0
     (run,) = summary(printed.splitlines()[-1])["runs"]
     assert run["landmarks_total"] == 4
@@ -96,7 +98,8 @@ def test_flags_stand_over_a_world_and_the_file_between(obey, here):
 
 def test_a_world_that_a_file_names_lies_where_the_file_does(obey, here):
     (here / "mine.toml").write_text('scenario.world = "drawn"\n')
-    assert obey("run", "--config", "here/mine.toml", "-o", "two")[0] == 0
+    words = ("--settings", "paper", "--settings", "here/mine.toml")
+    assert obey("run", *words, "-o", "two")[0] == 0
     assert found("two") == found("one")
 
 

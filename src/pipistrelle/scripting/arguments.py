@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from pipistrelle.config import STRATEGIES, Config, InputError, Strategy
 from pipistrelle.estimation.catalogue import CATALOGUE, PAPERS, check_distinct, check_name, entry
+from pipistrelle.experiments.named_settings import check_own, laid, over_named, settings_of
 from pipistrelle.refusals import meant, refusal, shown
 from pipistrelle.settings import (
     ARRAY_KEY,
@@ -21,7 +22,6 @@ from pipistrelle.settings import (
     Given,
     Key,
     Layer,
-    from_file,
     from_flags,
     from_table,
     resolve,
@@ -32,11 +32,15 @@ if TYPE_CHECKING:
     from pipistrelle.experiments.hearing.world import World
 
 Base = Config | Mapping[str, Any] | str | Path | None
-"""Settings to start from: as they were resolved, as a table, or the file that holds it."""
+"""Settings to start from: as they were resolved, as a table, by name, or the file that holds it."""
 Filters = str | type | Sequence[str | type]
 """Estimators: by name, or classes of the user."""
 GROUPS = {"both": PAPERS, "all": tuple(CATALOGUE)}
 """Names that stand for several estimators."""
+RUN_NAMES = "best"
+"""Named settings of `run`, where no others are named."""
+SLAM_TAKES = "smoother"
+"""Estimator of `slam`, where neither it nor settings are named."""
 STEPS: Key = ("scenario", "steps")
 
 
@@ -53,12 +57,9 @@ def base_layer(base: Base) -> Layer:
     if isinstance(base, Mapping):
         return from_table(spread(base, "."), "config: ")
     if not isinstance(base, (str, Path)):
-        expected = "a Config, a mapping or the path of a TOML file"
+        expected = "a Config, a mapping, a name or the path of a TOML file"
         raise refusal("config", shown(base), expected, "give settings by keyword")
-    if Path(base).is_dir():
-        fix = "a world of your own is named by world="
-        raise refusal(base, "a folder", "a TOML file of settings", fix)
-    return from_file(Path(base))
+    return settings_of(str(base), "config")
 
 
 def folder_named(place: object, name: str) -> Path:
@@ -85,20 +86,28 @@ def short_names(short: Layer, flags: Layer) -> Layer:
 
 
 def mission_settings(
-    beneath: Layer, flags: Layer, short: Layer, *, beamwidth: Given, duration: Given
-) -> tuple[Config, "World | None"]:
-    """Resolve the settings of a mission: defaults < world < beneath < flags.
+    beneath: Layer,
+    flags: Layer,
+    short: Layer,
+    *,
+    beamwidth: Given,
+    duration: Given,
+    default: str = RUN_NAMES,
+) -> tuple[Config, "World | None", tuple[str, ...]]:
+    """Resolve the settings of a mission: defaults < named < world < beneath < flags.
 
     The beamwidth is the half-power width of the vehicle's call [deg], the duration in seconds;
-    either may be None. The world is the one that the settings name.
+    either may be None. `default` is the name of the settings where no other is given. The world and
+    the estimators that the settings name are returned, too.
 
     >>> nothing = Given(None, "")
     >>> minute = Given(60.0, "duration")
-    >>> config, _ = mission_settings({}, {}, {}, beamwidth=nothing, duration=minute)
-    >>> config.scenario.steps
-    480
+    >>> config, _, estimators = mission_settings({}, {}, {}, beamwidth=nothing, duration=minute)
+    >>> config.scenario.steps, config.settings, estimators
+    (480, 'best', ('smoother',))
     """
-    layer = beneath | flags | short_names(short, flags)
+    layer = laid(beneath, flags, short_names(short, flags))
+    check_own(layer)
     world = None
     if CALLERS in layer:
         from pipistrelle.experiments.hearing.caller_paths import with_routes
@@ -113,12 +122,13 @@ def mission_settings(
 
         world = named_world(layer)
         layer = layer if world is None else settled(world, layer)
+    layer, estimators = over_named(layer, default=default)
     base, more = resolve(layer), {}
     if duration.value is not None:
         more[STEPS] = Given(_steps(duration, base), f"{duration.where} {duration.value:g}")
     if beamwidth.value is not None:
         more[RADIUS_KEY] = Given(_radius(number(beamwidth), base), beamwidth.where)
-    return resolve(layer | short_names(more, flags)), world
+    return resolve(layer | short_names(more, flags)), world, estimators
 
 
 def number(given: Given) -> float:

@@ -20,6 +20,7 @@ from pipistrelle.estimation.checking import usable_controls
 from pipistrelle.estimation.data_association.methods import association_of
 from pipistrelle.estimation.session import Session
 from pipistrelle.experiments.drives import NO_TRUTH, at_sensor, carried, vehicle_in
+from pipistrelle.experiments.named_settings import check_own, laid, over_named, own_config
 from pipistrelle.experiments.results.tables import landmark_table, path_table
 from pipistrelle.experiments.runs.replay import (
     check_calibrated,
@@ -86,7 +87,7 @@ class Slam:
     filter : str or class
         An estimator by its name, ``module:Class`` or its class. The EKFs need bounded time and
         memory; the smoother's history grows with the drive unless ``filter__window`` bounds it.
-    config : Config, mapping, or path of a TOML file, optional
+    config : Config, mapping, name, or path of a TOML file, optional
         Settings to start from.
     time : float [s]
         Of the start.
@@ -132,12 +133,14 @@ class Slam:
         start, flags = finite(time, "time"), from_keywords(settings, OWN_WORDS)
         check_open(flags)
         log, where = _log_of(vehicle, start)
-        layer = {TIMING: Given(True, "Slam")} | base_layer(config) | flags
+        named, _ = over_named(base_layer(config), flags)
+        layer = laid({TIMING: Given(True, "Slam")}, named)
+        check_own(layer)
         resolved, _ = with_log(layer, log, where)
         names = named_filters(filter, "filter")
         if len(names) > 1:
             raise refusal("filter", ", ".join(names), "one estimator", "make a Slam of each")
-        self._begin(log, resolved, names[0], kept)
+        self._begin(log, own_config(resolved, names[0]), names[0], kept)
 
     def _begin(self, log: Log, config: Config, name: str, kept: int) -> None:
         """Build the estimator, at the start."""

@@ -10,6 +10,7 @@ from pydantic import create_model
 from pipistrelle.config import BagConfig, Config, InputError, Section
 from pipistrelle.detection.logs.readers import reader_of
 from pipistrelle.estimation.catalogue import SECTIONS, gate_of, short_name
+from pipistrelle.experiments.named_settings import each_its_own, laid, own_config
 from pipistrelle.settings import Given, Key, Layer, resolve
 
 if TYPE_CHECKING:
@@ -47,7 +48,8 @@ OF_WORLDS = frozenset({("filter", "first_pose")})
 """Settings of the filter that only mean something where the truth is drawn."""
 
 _REPLAYED: dict[str, Any] = {
-    name: (Config.model_fields[name].annotation, ...) for name in ("seed", *SECTIONS)
+    name: (Config.model_fields[name].annotation, ...)
+    for name in ("seed", "settings", "own", *SECTIONS)
 }
 SlamConfig = create_model("SlamConfig", __base__=Section, **_REPLAYED)
 """All settings on which the solution of a log depends; its folder's ``config.toml`` holds them."""
@@ -93,7 +95,7 @@ def check_bag(flags: Layer, log: Path) -> None:
 
 def with_log(layer: Layer, recorded: "Log", log: Path) -> tuple[Config, list[str]]:
     """Resolve settings with those that a log decides; warn of each that asked for another value."""
-    decided = {key: Given(getattr(recorded, key[1]), f"{log}: {key[1]}") for key in LOGGED}
+    decided: Layer = {key: Given(getattr(recorded, key[1]), f"{log}: {key[1]}") for key in LOGGED}
     own = {key: Given(value, "slam") for key, value in OWN.items()}
     for name, value in recorded.association.items():
         own["association", name] = Given(value, f"{log}: association.{name}")
@@ -107,7 +109,7 @@ def with_log(layer: Layer, recorded: "Log", log: Path) -> tuple[Config, list[str
         )
     if ("rays", "likelihood") in layer:  # another reading of the paper is of the paper's rays
         del own["rays", "spacing"]
-    wished, settled, notes = resolve(layer), resolve(own | layer | decided), []
+    wished, settled, notes = resolve(layer), resolve(laid(own, layer, decided)), []
     for section, name in sorted(LOGGED & layer.keys()):
         value = getattr(getattr(settled, section), name)
         if getattr(getattr(wished, section), name) != value:
@@ -132,7 +134,8 @@ def check_room(recorded: "Log", filters: Sequence[str], config: Config) -> None:
     """Refuse a log whose landmarks may need more memory than there is."""
     from pipistrelle.experiments.machine import check_memory
 
-    check_memory(filters, len(_labels(recorded)), config, passive=True)
+    for own, names in each_its_own(config, filters):
+        check_memory(names, len(_labels(recorded)), own, passive=True)
 
 
 def _labels(recorded: "Log") -> set[int]:
@@ -223,7 +226,7 @@ def fit_warnings(
                     f"are {angles} in radians and {metric} in metres, and all labels right?"
                 )
             elif (
-                MAX_GATED_SHARE + (expected := 1.0 - gate_of(trial.filter, config))
+                MAX_GATED_SHARE + (expected := 1.0 - _gate(trial.filter, config))
             ) * heard < gated:
                 notes.append(
                     f"{log}: the gate rejects {gated / heard:.1%} of the measurements ({who}), "
@@ -236,6 +239,11 @@ def fit_warnings(
     if turned > MAX_IGNORED_SHARE * rows:
         notes.append(f"{log}: {turned} of {rows} bearings are beyond a turn; are they in radians?")
     return notes + _out_of_bounds(recorded, log)
+
+
+def _gate(name: str, config: Config) -> float:
+    """Return the share of a measurement's predicted distribution that an estimator accepts."""
+    return gate_of(name, own_config(config, name))
 
 
 def nis_warning(trial: "TrialResult") -> str:

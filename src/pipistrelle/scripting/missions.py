@@ -12,6 +12,7 @@ from pipistrelle.estimation.catalogue import short_name
 from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.hearing.world import ALL_DRAWN, World
 from pipistrelle.experiments.hearing.world_folder import kept_world
+from pipistrelle.experiments.named_settings import check_own, laid, of_estimators
 from pipistrelle.experiments.results.scores import TrialResult, is_placed
 from pipistrelle.experiments.results.writing import write_results
 from pipistrelle.experiments.runs.mission import Mission
@@ -55,6 +56,7 @@ def simulated(
     watch: Watch | None = None,
 ) -> Mission:
     """Drive through a world by sound and map it, with notes on what looks odd (`run_mission`)."""
+    config = of_estimators(config, filters)
     mission = run_mission(
         config, strategies, filters, world=world or ALL_DRAWN, progress=progress, watch=watch
     )
@@ -99,7 +101,8 @@ def prepare_slam(
     beneath, flags, short = layers
     check_open(flags)
     given = flags | short_names(short, flags)
-    layer = beneath | given
+    layer = laid(beneath, given)
+    check_own(layer)
     asked = resolve(layer)
     if beamwidth.value is not None and not 0 < number(beamwidth) <= 360:
         raise InputError(
@@ -108,6 +111,7 @@ def prepare_slam(
     check_bag(given, place)
     recorded, truth = load(place, robot, bag=asked.bag)
     config, overruled = with_log(layer, recorded, place)
+    config = of_estimators(config, filters)
     check_room(recorded, filters, config)
     beam = None if beamwidth.value is None else radians(beamwidth.value)
 

@@ -8,11 +8,12 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from pipistrelle.config import InputError
+from pipistrelle.config import Config, InputError
 from pipistrelle.detection.logs.readers import Robot
 from pipistrelle.evaluation.scores import shown_in
 from pipistrelle.experiments.hearing.listening import Progress
 from pipistrelle.experiments.machine import keep_freed_memory
+from pipistrelle.experiments.named_settings import over_named
 from pipistrelle.experiments.results.writing import run_entry, tables_of
 from pipistrelle.experiments.runs.mission import Mission
 from pipistrelle.experiments.runs.trial import Watch
@@ -21,6 +22,8 @@ from pipistrelle.kernel_clock import announce
 from pipistrelle.own_files import RESULTS, claim
 from pipistrelle.refusals import refusal, shown
 from pipistrelle.scripting.arguments import (
+    RUN_NAMES,
+    SLAM_TAKES,
     WORLD_KEY,
     Base,
     Filters,
@@ -229,7 +232,7 @@ def run(
     /,
     *,
     strategies: str | Sequence[str] = "all",
-    filters: Filters = "ekf",
+    filters: Filters | None = None,
     world: Path | str | None = None,
     beamwidth: float | None = None,
     landmarks: int | None = None,
@@ -247,11 +250,13 @@ def run(
 
     Parameters
     ----------
-    config : Config, mapping, or path of a TOML file, optional
-        Settings to start from.
+    config : Config, mapping, name, or path of a TOML file, optional
+        Settings to start from. What they leave open is what serves the estimator best,
+        ``settings="best"``, unless they name other settings; a `Config` leaves nothing open.
     strategies : "active", "fused", "passive", several of them, or "all"
-    filters : str or class
-        The name of an estimator or its class, several of them, "both", the paper's two, or "all".
+    filters : str or class, optional
+        The name of an estimator or its class, several of them, "both", the paper's two, or "all";
+        by default that of the named settings: the smoother of "best", the EKF of "paper".
     world : Path, optional
         Folder of a world of one's own.
     beamwidth : [deg], optional
@@ -292,15 +297,16 @@ def run(
         WORLD_KEY: Given(None if world is None else str(world), "world"),
         ("scenario", "landmarks"): Given(landmarks, "landmarks"),
     }
-    resolved, own_world = mission_settings(
+    resolved, own_world, usual = mission_settings(
         base_layer(config),
         from_keywords(settings, run.__kwdefaults__ or ()),
         short,
         beamwidth=Given(beamwidth, "beamwidth"),
         duration=Given(duration, "duration"),
+        default="paper" if isinstance(config, Config) else RUN_NAMES,
     )
-    chosen, ways = named_strategies(strategies), named_filters(filters)
-
+    chosen = named_strategies(strategies)
+    ways = named_filters(usual if filters is None else filters)
     conduct = partial(simulated, resolved, chosen, ways, own_world)
     return _finished(conduct, progress, output, overwrite, "pipistrelle.run(...)")
 
@@ -312,7 +318,7 @@ def slam(
     config: Base = None,
     robot: Robot | None = None,
     strategies: str | Sequence[str] = "fused",
-    filters: Filters = "smoother",
+    filters: Filters | None = None,
     beamwidth: float | None = None,
     gate: float | Literal["auto"] | None = None,
     output: Path | str | None = None,
@@ -328,14 +334,15 @@ def slam(
     ----------
     log : Path
         Its folder, or a ROS bag; ``bag={"odometry": "/odom", "truth": "/pose"}`` names topics.
-    config : Config, mapping, or path of a TOML file, optional
+    config : Config, mapping, name, or path of a TOML file, optional
         Settings to start from.
     robot : int or str, optional
         Whose log, where there are several.
     strategies : "active", "fused", "passive", several of them, or "all"
         What is kept: only what has a range, all as it is, or only bearings.
-    filters : str or class
-        The name of an estimator or its class, several of them, "both", the paper's two, or "all".
+    filters : str or class, optional
+        The name of an estimator or its class, several of them, "both", the paper's two, or "all";
+        by default that of the settings that are named, else the smoother.
     beamwidth : [deg], optional
         Ranges outside a beam of this width about the heading are hidden.
     gate : float or "auto", optional
@@ -355,8 +362,9 @@ def slam(
     """
     place, flags = folder_named(log, "log"), from_keywords(settings, slam.__kwdefaults__ or ())
     short: Layer = {("filter", "gate"): Given(gate, "gate")}
-    layers = base_layer(config), flags, short
-    chosen, ways = named_strategies(strategies), named_filters(filters)
+    beneath, usual = over_named(base_layer(config), flags)
+    layers, chosen = (beneath, flags, short), named_strategies(strategies)
+    ways = named_filters((usual or SLAM_TAKES) if filters is None else filters)
     conduct, notes = prepare_slam(place, layers, robot, chosen, ways, Given(beamwidth, "beamwidth"))
     for line in notes:
         warnings.warn(line, stacklevel=2)

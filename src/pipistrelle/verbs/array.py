@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from pipistrelle.config import SQUARE, Config, InputError
+from pipistrelle.experiments.named_settings import over_named
 from pipistrelle.refusals import shown
+from pipistrelle.verbs.options import NamedSettings, layers
 from pipistrelle.verbs.view import check_place, write_file
 
 if TYPE_CHECKING:
@@ -23,10 +25,7 @@ def array(
         float | None,
         Parameter(metavar="HZ", help="Of the sound [Hz]. [default: that of the vehicle's call]"),
     ] = None,
-    config: Annotated[
-        Path | None,
-        Parameter(metavar="FILE.toml", help="Settings, of which call and air count."),
-    ] = None,
+    named: NamedSettings = None,
     output: Annotated[
         Path | None,
         Parameter(
@@ -47,10 +46,9 @@ def array(
     from pipistrelle.arrays.layout import scattered, square_microphones
     from pipistrelle.arrays.pattern import pattern_of
     from pipistrelle.settings import resolve
-    from pipistrelle.verbs.options import layers
     from pipistrelle.verbs.streams import put
 
-    settled = resolve(layers(config, None))
+    settled = resolve(over_named(layers(named, None))[0])
     frequency = _frequency(frequency, settled)
     square = file == SQUARE
     found = square_microphones(settled.receiver) if square else read_array(Path(file))

@@ -20,7 +20,8 @@ from pipistrelle.version import find_version
 
 SPELLINGS = (
     "A setting is --rays.power 3 as a flag, PIPISTRELLE_RAYS__POWER=3 in the environment and "
-    "power = 3 under [rays] in FILE.toml; flags go before the environment, that before the file."
+    "power = 3 under [rays] in FILE.toml; flags go before the environment, that before the file, "
+    "that before settings by name."
 )
 
 FILMS = ("gif", "mp4")
@@ -80,7 +81,7 @@ config = App(name="config", help="Show the settings, or what a file of settings 
 config.command(
     "pipistrelle.verbs.config:show",
     name="show",
-    help="Print the settings as TOML: defaults < file < environment < flags.",
+    help="Print the settings of `run` as TOML: defaults < named < file < environment < flags.",
     help_epilogue=SPELLINGS,
 )
 config.command(

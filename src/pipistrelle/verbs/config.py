@@ -16,7 +16,7 @@ def show(*, mission: Annotated[MissionOptions | None, Parameter(name="*")] = Non
     from pipistrelle.arrays.sampling import sampling
     from pipistrelle.settings import to_toml
 
-    config, _ = mission_config(mission or MissionOptions())
+    config, _, _ = mission_config(mission or MissionOptions())
     callers = callers_of(config, np.zeros(2))[: 2 if config.callers is None else 1]
     sampling(config, callers)  # it refuses the rates and tones that `run` does
     put(to_toml(config), end="")

@@ -11,16 +11,18 @@ from cyclopts import Group, Parameter
 
 from pipistrelle.config import Config, InputError
 from pipistrelle.estimation.catalogue import CATALOGUE, entry
+from pipistrelle.experiments.named_settings import NAMES, laid, settings_of
 from pipistrelle.scripting.arguments import GROUPS, mission_settings, named_filters
 from pipistrelle.settings import (
     ARRAY_KEY,
     CALLERS,
+    OWN,
+    SETTINGS,
     WORLD_KEY,
     Given,
     Key,
     Layer,
     from_environment,
-    from_file,
     from_flags,
     from_text,
     known_settings,
@@ -45,7 +47,7 @@ def _as_written(_: Any, tokens: Sequence[Any]) -> Any:
     return from_text(tokens[0].value)
 
 
-_METAVARS = {CALLERS: "TABLES", ARRAY_KEY: "FILE"}
+_METAVARS = {CALLERS: "TABLES", OWN: "TABLES", ARRAY_KEY: "FILE"}
 """Settings that are given as a file has them, and what stands for them in the help."""
 
 if TYPE_CHECKING:
@@ -54,6 +56,15 @@ if TYPE_CHECKING:
     ChosenFilter = str
 else:  # the help names those that are listed
     ChosenFilter = Annotated[Literal[(*CATALOGUE, *GROUPS)] | str, Parameter(metavar="CHOICE")]
+NamedSettings = Annotated[
+    list[str] | None,
+    Parameter(
+        name=("--settings", "--config"),
+        metavar="NAME|FILE",
+        help=f"Settings to start from: {', '.join(NAMES)}, or a TOML file as `pipistrelle config "
+        "show` prints it. A name lies beneath a file; give both by two --settings.",
+    ),
+]
 Particles = Annotated[
     Whole | None,
     Parameter(metavar="N", help="Particles of FastSLAM; sets fastslam.particles. [default: 100]"),
@@ -74,6 +85,8 @@ def setting_flags(
     sections: dict[str, dict[str, Any]] = {}
     top: dict[str, Any] = {}
     for key, field in known_settings().items():
+        if key == SETTINGS:
+            continue  # an option that takes files, too
         value = own.get(key, field.default)
         default = value if isinstance(value, tuple) else (value,)
         texts = [str(item).lower() if isinstance(item, bool) else str(item) for item in default]
@@ -149,10 +162,7 @@ class OutputOptions:
 class MissionOptions:
     """Options for the world of a simulated mission."""
 
-    config: Annotated[
-        Path | None,
-        Parameter(metavar="FILE.toml", help="Settings as `pipistrelle config show` prints them."),
-    ] = None
+    named: NamedSettings = None
     beamwidth: Annotated[
         float | None,
         Parameter(
@@ -188,12 +198,14 @@ class MissionOptions:
     settings: Annotated[SettingFlags | None, Parameter(name="*")] = None
 
 
-def mission_config(options: MissionOptions) -> tuple[Config, "World | None"]:
-    """Resolve the settings of a mission: defaults < world < file < environment < flags.
+def mission_config(options: MissionOptions) -> tuple[Config, "World | None", tuple[str, ...]]:
+    """Resolve the settings of a mission: defaults < world < named < file < environment < flags.
 
-    >>> config, _ = mission_config(MissionOptions(duration=60.0))
-    >>> config.scenario.steps
-    480
+    The estimators that the named settings are meant for are returned, too.
+
+    >>> config, _, estimators = mission_config(MissionOptions(duration=60.0))
+    >>> config.scenario.steps, config.settings, estimators
+    (480, 'best', ('smoother',))
     """
     short: Layer = {
         WORLD_KEY: Given(options.world and str(options.world), "--world"),
@@ -202,7 +214,7 @@ def mission_config(options: MissionOptions) -> tuple[Config, "World | None"]:
         ("fastslam", "particles"): Given(options.particles, "--particles"),
     }
     return mission_settings(
-        layers(options.config, None),
+        layers(options.named, None),
         from_flags(options.settings or {}),
         short,
         beamwidth=Given(options.beamwidth, "--beamwidth"),
@@ -210,19 +222,19 @@ def mission_config(options: MissionOptions) -> tuple[Config, "World | None"]:
     )
 
 
-def layers(config: Path | None, settings: SettingFlags | None) -> Layer:
-    """Lay file, environment and flags over each other.
+def layers(named: Sequence[str] | None, settings: SettingFlags | None) -> Layer:
+    """Lay named settings, files, environment and flags over each other.
 
     >>> layers(None, {"seed": 3})["seed",].value
     3
     """
-    if config is not None and not config.name:
-        raise InputError(f"--config: found {str(config)!r}, expected the path of a TOML file")
-    file = {} if config is None else from_file(config)
-    return file | from_environment(os.environ) | from_flags(settings or {})
+    given = [(word, settings_of(word, "--settings")) for word in named or ()]
+    named_here = (layer for word, layer in given if word in NAMES)
+    start, environment = (layer for _, layer in given), from_environment(os.environ)
+    return laid(*start, environment, from_flags(settings or {}), *named_here)
 
 
-def filters(chosen: ChosenFilter, particles: int | None) -> tuple[str, ...]:
+def filters(chosen: str | Sequence[str], particles: int | None) -> tuple[str, ...]:
     """Return the names of the estimators of a choice; refuse particles for filters without them.
 
     >>> filters("both", 300), filters("ekf", None)
@@ -233,7 +245,7 @@ def filters(chosen: ChosenFilter, particles: int | None) -> tuple[str, ...]:
         able = [known.name for known in CATALOGUE.values() if "fastslam" in known.sections]
         others = " or ".join(f"--filter {name}" for name in (*able, *GROUPS))
         raise InputError(
-            f"--particles: found {particles}, but --filter is {chosen}, which has none; "
+            f"--particles: found {particles}, but --filter is {','.join(names)}, which has none; "
             f"add {others}"
         )
     return names

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from pipistrelle.config import InputError
+from pipistrelle.experiments.named_settings import own_config
 from pipistrelle.own_files import LOG, WORLD, Kind, OwnFiles, claim
 from pipistrelle.scripting.arguments import named_strategies
 from pipistrelle.verbs.options import (
@@ -29,12 +30,13 @@ def run(
     *,
     strategy: Annotated[Chosen, Parameter(help="What the vehicle listens to.")] = "all",
     estimator: Annotated[
-        ChosenFilter,
+        ChosenFilter | None,
         Parameter(
             name="--filter",
-            help="What draws the map; several, parted by commas, side by side.",
+            help="What draws the map; several, parted by commas, side by side. "
+            "[default: that of the settings, of best the smoother]",
         ),
-    ] = "ekf",
+    ] = None,
     mission: Annotated[MissionOptions | None, Parameter(name="*")] = None,
     output: Annotated[OutputOptions | None, Parameter(name="*")] = None,
     save_log: Annotated[
@@ -55,8 +57,8 @@ def run(
 ) -> int:
     """Drive through one random world and map it, the three strategies side by side."""
     mission, output = mission or MissionOptions(), output or OutputOptions()
-    config, own_world = mission_config(mission)
-    ways = filters(estimator, mission.particles)
+    config, own_world, usual = mission_config(mission)
+    ways = filters(estimator or usual, mission.particles)
     _check_apart(output=output.output, save_log=save_log, save_world=save_world)
     log = _claimed("--save-log", save_log, LOG, output.overwrite)
     world = _claimed("--save-world", save_world, WORLD, output.overwrite)
@@ -70,7 +72,7 @@ def run(
             world.replace(world_files(mission.scenario, config))
         if log is not None:
             scans = {trial.strategy: trial.heard for trial in mission.trials}
-            log.replace(_log_files(mission, scans.get("fused", mission.trials[0].heard)))
+            log.replace(_log_files(mission, scans.get("fused", mission.trials[-1].heard)))
 
     conduct = partial(simulated, config, named_strategies(strategy), ways, own_world)
     return delivery.conduct(conduct, output, "run", save)
@@ -110,7 +112,7 @@ def _log(mission: "Mission", scans: "Sequence[Scan]") -> "Log":
     from pipistrelle.detection.noise import unstated
     from pipistrelle.experiments.drives import split_at
 
-    config = mission.config
+    config = own_config(mission.config, mission.trials[-1].filter)  # of the scans that are kept
     drive, _ = split_at(mission.drive, [scan.time for scan in scans])
     timing = config.listening.timing
     if config.filter.noise == "constant":  # log.toml says it

@@ -6,12 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from pipistrelle.detection.logs.readers import READERS
-from pipistrelle.scripting.arguments import named_strategies, short_names
+from pipistrelle.experiments.named_settings import over_named
+from pipistrelle.scripting.arguments import SLAM_TAKES, named_strategies, short_names
 from pipistrelle.scripting.log_settings import GATE_KEY, OWN, TIMING, is_open
 from pipistrelle.settings import Given, Layer, from_flags
 from pipistrelle.verbs.options import (
     Chosen,
     ChosenFilter,
+    NamedSettings,
     OutputOptions,
     Particles,
     Whole,
@@ -45,12 +47,13 @@ def slam(
         Parameter(help="What is kept: all as it is, only what has a range, or only bearings."),
     ] = "fused",
     estimator: Annotated[
-        ChosenFilter,
+        ChosenFilter | None,
         Parameter(
             name="--filter",
-            help="What draws the map; several, parted by commas, side by side.",
+            help="What draws the map; several, parted by commas, side by side. "
+            "[default: that of the settings, else smoother]",
         ),
-    ] = "smoother",
+    ] = None,
     particles: Particles = None,
     beamwidth: Annotated[
         float | None,
@@ -68,10 +71,7 @@ def slam(
             "filter.gate. [default: the log's own, else what suits the estimator]",
         ),
     ] = None,
-    config: Annotated[
-        Path | None,
-        Parameter(metavar="FILE.toml", help="Settings as `pipistrelle config show` prints them."),
-    ] = None,
+    named: NamedSettings = None,
     truth: Annotated[
         str | None,
         Parameter(
@@ -92,7 +92,8 @@ def slam(
         ("fastslam", "particles"): Given(particles, "--particles"),
         ("bag", "truth"): Given(truth, "--truth"),
     }
-    beneath, flags = layers(config, None), from_flags(settings or {})
+    beneath, usual = over_named(layers(named, None))
+    flags = from_flags(settings or {})
     if topics:
         from pipistrelle.verbs.bag_topics import list_topics
 
@@ -105,7 +106,7 @@ def slam(
         (beneath, flags, short),
         robot,
         named_strategies(strategy),
-        filters(estimator, particles),
+        filters(estimator or usual or SLAM_TAKES, particles),
         Given(beamwidth, "--beamwidth"),
     )
     warn(*notes)

@@ -1,5 +1,6 @@
 """`pipistrelle study`: all cases of a plan in many worlds."""
 
+import json
 import shlex
 import sys
 from collections.abc import Callable, Iterator
@@ -11,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from pipistrelle.config import InputError
+from pipistrelle.experiments.named_settings import PLANS, parted
 from pipistrelle.settings import Layer
-from pipistrelle.verbs.options import SettingFlags, Whole, layers
+from pipistrelle.verbs.options import NamedSettings, SettingFlags, Whole, layers
 from pipistrelle.verbs.streams import put, say, warn
 
 if TYPE_CHECKING:
@@ -38,8 +40,7 @@ def study(
         str,
         Parameter(
             metavar="PLAN",
-            help="paper, physics, beyond, timing, callers, pair or a FILE.toml, as a study's "
-            "plan.toml.",
+            help=f"{', '.join(PLANS)} or a FILE.toml, as a study's plan.toml.",
         ),
     ] = "paper",
     /,
@@ -78,6 +79,7 @@ def study(
         Parameter(help="Print a job script of shards (N of --shard, else 16) and do nothing else."),
     ] = None,
     quiet: Annotated[bool, Parameter(negative=(), help="Print the study's folder alone.")] = False,
+    named: NamedSettings = None,
     settings: Annotated[SettingFlags | None, Parameter(name="*")] = None,
 ) -> int:
     """Try all cases of a plan in many worlds; continue where an earlier run stopped."""
@@ -89,7 +91,7 @@ def study(
             raise InputError(f"{flag}: found {number}, expected 1 to {MOST_WORLDS}")
     if workers is not None and scheduler not in (None, "local"):
         raise InputError(f"--workers: the cluster at {scheduler} has its own; leave it out")
-    share, layer = _share(shard), layers(None, settings)
+    share, layer = _share(shard), layers(named, settings)
     tried = read_plan(find_plan(plan), layer, iterations)
     folder = output or Path("runs") / tried.name
     from pipistrelle.experiments.machine import cores
@@ -145,13 +147,19 @@ def _share(text: str | None) -> tuple[int, int]:
 
 def _command(word: str, plan: "Plan", layer: Layer) -> str:
     """Return the command line of a plan and of the settings laid over it."""
-    from pipistrelle.experiments.studies.plan_file import PLANS
-
     place = word if word in PLANS else str(Path(word).absolute())
     words = ["pipistrelle", "study", place, "--iterations", str(plan.iterations)]
-    for key, given in layer.items():
+    common, own = parted(layer)
+    for key, given in common.items():
         values = given.value if isinstance(given.value, (list, tuple)) else [given.value]
         words += ["--" + ".".join(key).replace("_", "-"), *map(str, values)]
+    if own:
+        tables = (
+            f"{json.dumps(n)}.{'.'.join(k)} = {json.dumps(one.value)}"
+            for n, layer in own.items()
+            for k, one in layer.items()
+        )
+        words += ["--own", f"{{{', '.join(tables)}}}"]
     return shlex.join(words)
 
 

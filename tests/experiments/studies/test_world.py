@@ -249,14 +249,17 @@ FEW = ("air.spreading", "target.shape", "emitter.radius", "beacon.level_db", "re
 
 
 def test_the_settings_that_are_varied_here_are_all_there_are():
-    # Folders (test_worlds_of_ones_own), associations (estimation/data_association), bags.
+    # Folders (test_worlds_of_ones_own), associations (estimation/data_association), bags, and what
+    # holds other settings (test_named_settings).
     known = {".".join(key) for key in known_settings()}
     elsewhere = {
         "scenario.world",
+        *("settings", "own"),
         *(key for key in known if key.startswith(("association.", "bag."))),
     }
     assert set(OTHERS) == known - elsewhere
-    assert {name.split(".")[0] for name in FEW} == set(Config.model_fields) - {"association", "bag"}
+    others = {"settings", "own", "association", "bag"}
+    assert {name.split(".")[0] for name in FEW} == set(Config.model_fields) - others
 
 
 ROAMING = {"listening": {"timing": True}, "callers": [{"course": "circle", "radius": 5.0}]}

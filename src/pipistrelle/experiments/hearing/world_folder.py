@@ -39,6 +39,8 @@ from pipistrelle.files import read_file, read_text
 from pipistrelle.refusals import expectation, refusal, shown
 from pipistrelle.settings import (
     CALLERS,
+    OWN,
+    SETTINGS,
     WORLD_KEY,
     Given,
     Key,
@@ -245,7 +247,7 @@ def _refuse_misspelt(folder: Path, there: Sequence[str]) -> None:
 def _own_settings(config: Config) -> dict[str, Any]:
     """Return the settings of a world that are not at their defaults."""
     decides = {"world", "landmarks", "steps", "vehicle"}
-    others = {"seed", "bag", *CALLERS, *SECTIONS}
+    others = {"seed", "bag", *SETTINGS, *OWN, *CALLERS, *SECTIONS}
     said = config.model_dump(mode="json", exclude_defaults=True, exclude=others)
     return {
         section: kept

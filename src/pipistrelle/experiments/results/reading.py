@@ -85,7 +85,7 @@ def _no_results(folder: Path) -> InputError:
         return refusal(folder, found, expected, "check the path")
     if any((folder / name).exists() for name in ("plan.toml", "trials")):
         found = "a study, which keeps many worlds and the frames of none"
-        settings = f"`pipistrelle run --config {folder / 'config.toml'} -o DIR`"
+        settings = f"`pipistrelle run --settings {folder / 'config.toml'} -o DIR`"
         fix = f"`pipistrelle report` puts it on a page; {settings} makes a mission of its settings"
         return refusal(folder, found, expected, fix)
     there = OwnFiles(folder, RESULTS).there

@@ -32,8 +32,10 @@ from pipistrelle.estimation.smoother.calibration import OF_ODOMETRY
 from pipistrelle.evaluation.association import Causes, causes_of
 from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.experiments.hearing.listening import Progress
+from pipistrelle.experiments.named_settings import each_its_own
+from pipistrelle.experiments.results.scores import TrialResult
 from pipistrelle.experiments.runs.mission import Mission
-from pipistrelle.experiments.runs.trial import Watch, run_trials
+from pipistrelle.experiments.runs.trial import Watch, in_order, run_trials
 from pipistrelle.experiments.runs.truth_files import TRUTHS, WithTruth, with_files_beside
 from pipistrelle.experiments.runs.validate_filters import check_filters
 from pipistrelle.own_files import LOG, OwnFiles
@@ -249,21 +251,32 @@ def replay(
     (array([7]), array([[3., 0.]]))
     """
     drive = drive_of(log, truth)
-    check_filters(filters, drive.motion, config, drive.moving.values())
-    check_calibrated(log, config)
-    known = config.association.method == KNOWN
-    if known and _is_bare(log):
+    apart = tuple(each_its_own(config, filters))
+    for own, names in apart:
+        check_filters(names, drive.motion, own, drive.moving.values())
+        check_calibrated(log, own)
+    trials: list[TrialResult] = []
+    for own, names in apart:
+        heard = _heard(log, strategies, beamwidth, own)
+        causes = {} if own.association.method == KNOWN else _log_causes(log, heard)
+        trials += run_trials(
+            names, drive, heard, own, causes=causes, progress=progress, watch=watch
+        )
+    done = in_order(trials, strategies, filters)
+    return Mission(config=config, drive=drive, trials=done, beamwidth=beamwidth, log=log)
+
+
+def _heard(
+    log: Log, strategies: Sequence[Strategy], beamwidth: float | None, config: Config
+) -> dict[Strategy, tuple[Scan, ...]]:
+    """Return the scans of each strategy, as settings have them."""
+    if config.association.method == KNOWN and _is_bare(log):
         raise refusal(log.name, "rows without labels", LABELS, UNKNOWN)
     scans = [without_unused(rows, config) for rows in log.scans]
-    heard = {
+    return {
         strategy: tuple(with_noise(s, config) for s in as_heard_by(scans, strategy, beamwidth))
         for strategy in strategies
     }
-    causes = {} if known else _log_causes(log, heard)
-    trials = run_trials(
-        filters, drive, heard, config, causes=causes, progress=progress, watch=watch
-    )
-    return Mission(config=config, drive=drive, trials=trials, beamwidth=beamwidth, log=log)
 
 
 def drive_of(log: Log, truth: Truth) -> Drive:

@@ -6,6 +6,7 @@ Read this file first: each call is a box of the paper's workflow.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 from jaxtyping import Float
@@ -28,6 +29,7 @@ from pipistrelle.experiments.hearing.listening import Progress, listen
 from pipistrelle.experiments.hearing.scenario import standing_landmarks
 from pipistrelle.experiments.hearing.world import ALL_DRAWN, World
 from pipistrelle.experiments.machine import check_memory
+from pipistrelle.experiments.named_settings import each_its_own
 from pipistrelle.experiments.results.scores import (
     Scores,
     TrialResult,
@@ -74,35 +76,44 @@ def run_mission(
     """
     kept = {"strategies": len(strategies), "filters": len(filters)}
     scenario = checked_scenario(config, world=world, **kept)
-    check_memory(
-        filters,
-        len(standing_landmarks(scenario)[0]),
-        config,
-        passive=any(strategy != "active" for strategy in strategies),
-    )
-    drive = drive_of(scenario, config)
-    check_filters(filters, drive.motion, config, drive.moving.values())
-    radius, labels = config.emitter.radius, config.association.method == KNOWN
+    passive, drive = any(one != "active" for one in strategies), drive_of(scenario, config)
+    apart = tuple(each_its_own(config, filters))
+    for own, names in apart:
+        check_memory(names, len(standing_landmarks(scenario)[0]), own, passive=passive)
+        check_filters(names, drive.motion, own, drive.moving.values())
+    labels = all(own.association.method == KNOWN for own, _ in apart)
+    radius = config.emitter.radius
     (heard,) = listen(scenario, config, (radius,), labels=labels, progress=progress)
-    there = HeardWorld(scenario, config, {radius: heard})
-    scans = {strategy: there.scans(config, strategy) for strategy in strategies}
-    causes = {strategy: there.causes(config, strategy) for strategy in strategies}
-    trials = run_trials(
-        filters, drive, scans, config, causes=causes, progress=progress, watch=watch
-    )
-    bounds: dict[str, Float[np.ndarray, "t 3 3"]] = {
-        strategy: there.bound(config, strategy) for strategy in strategies
-    }
+    there, trials = HeardWorld(scenario, config, {radius: heard}), []
+    for own, names in apart:
+        scans = {strategy: there.scans(own, strategy) for strategy in strategies}
+        causes = {strategy: there.causes(own, strategy) for strategy in strategies}
+        bounds: dict[str, Float[np.ndarray, "t 3 3"]] = {
+            strategy: there.bound(own, strategy) for strategy in strategies
+        }
+        done = run_trials(
+            names, drive_of(scenario, own), scans, own, causes=causes, progress=progress,
+            watch=watch,
+        )  # fmt: skip
+        trials += [replace(t, scores=with_bound(t.scores, bounds[t.strategy])) for t in done]
     return Mission(
         config=config,
         drive=drive,
-        trials=tuple(replace(t, scores=with_bound(t.scores, bounds[t.strategy])) for t in trials),
+        trials=in_order(trials, strategies, filters),
         beamwidth=beamwidth_of(config),
         callers=scenario.callers[VEHICLE + 1 :],
         scenario=scenario,
         world=None if world is ALL_DRAWN else world,
         heard=heard,
     )
+
+
+def in_order(
+    trials: Sequence[TrialResult], strategies: Sequence[Strategy], filters: Sequence[str]
+) -> tuple[TrialResult, ...]:
+    """Return trials by strategy, and of each by filter."""
+    done = {(trial.strategy, trial.filter): trial for trial in trials}
+    return tuple(done[pair] for pair in product(strategies, filters))
 
 
 def run_trials(

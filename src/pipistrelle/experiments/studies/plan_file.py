@@ -27,6 +27,7 @@ from pipistrelle.experiments.hearing.world_folder import (
     read_world,
     settled,
 )
+from pipistrelle.experiments.named_settings import PLANS, laid, over_named, parted
 from pipistrelle.experiments.studies.beamwidths import BEAMWIDTH, with_radii
 from pipistrelle.experiments.studies.plan import (
     MOST_CASES,
@@ -41,6 +42,8 @@ from pipistrelle.refusals import expectation, meant, shown
 from pipistrelle.settings import (
     ARRAY_KEY,
     CALLERS,
+    OWN,
+    SETTINGS,
     WORLD_KEY,
     Given,
     Key,
@@ -80,13 +83,6 @@ class _Head(Section):
     filters: Annotated[tuple[Annotated[str, PlainValidator(_named)], ...], Field(min_length=1)] = (
         PAPERS
     )
-
-
-PLANS = ("paper", "physics", "beyond", "timing", "association", "callers", "pair")
-"""Plans that ship with the package: the paper's study as its words may be read, and as physics has
-it where they leave a choice; the same question asked of estimators at their best, and of those who
-hear when, too; of those to whom nobody tells who is who; who calls, and from where; and two
-vehicles that hear each other."""
 
 
 def find_plan(word: str) -> Path:
@@ -134,7 +130,8 @@ def plan_of(
     {'beacon.level_db': (36.8, 42.8)}
     """
     over = over or {}
-    head = _head(path, table, iterations)
+    named, usual = _beneath(path, table, over)
+    head = _head(path, {"filters": usual, **table} if usual else table, iterations)
     within = {"config": table.get("config", {}), "grid": table.get("grid", {})}
     for name, settings in within.items():
         if not isinstance(settings, dict):
@@ -148,17 +145,16 @@ def plan_of(
         (key, name, _read(path, key, values, worlds))
         for key, name, values in _settings(path, "grid", radii)
     ]
+    varied = {key for key, _, _ in asked}
+    named = {k: given for k, given in named.items() if not {k, k[2:]} & varied}
+    layer, own = parted(laid(named, layer))
     lengths = [len(values) for _, _, values in asked if isinstance(values, list)]
     most = prod(lengths) * len(head.strategies) * len(head.filters)
     if most > MOST_CASES:
         raise InputError(f"{path}: grid: found {most} cases, expected at most {MOST_CASES}")
     grid = {name: _values(path, name, key, values, layer) for key, name, values in asked}
-    for key in (key for key in layer if ".".join(key) in grid):
-        # The plan in a study's folder names every setting; a default there says nothing.
-        if key in over or resolve({key: layer[key]}) != Config():
-            name = f" as {BEAMWIDTH}" * (BEAMWIDTH in within["grid"] and ".".join(key) == RADIUS)
-            why = f"the plan varies this setting{name}; take it out of [grid] in {path}"
-            raise InputError(f"{layer[key].where}: {why}")
+    _check_unvaried(path, layer, grid, over, BEAMWIDTH in within["grid"])
+    tables = _with_named(table.get("own", {}), own, head.filters)
     plan = Plan(
         name=head.name,
         iterations=head.iterations,
@@ -167,12 +163,45 @@ def plan_of(
         filters=head.filters,
         config=resolve(layer),
         grid=grid,
-        own=_own(path, table.get("own", {}), head.filters, grid, layer, worlds),
+        own=_own(path, tables, head.filters, grid, layer, worlds),
         worlds=worlds,
     )
     for _ in combinations(layer, grid, f"{path}: grid.", worlds):
         pass
     return plan
+
+
+def _check_unvaried(
+    path: Path, layer: Layer, grid: Mapping[str, Any], over: Layer, in_degrees: bool
+) -> None:
+    """Refuse a setting of which the grid has several values; `in_degrees`: those of the beam."""
+    for key in (key for key in layer if ".".join(key) in grid):
+        # The plan in a study's folder names every setting; a default there says nothing.
+        if key in over or resolve({key: layer[key]}) != Config():
+            name = f" as {BEAMWIDTH}" * (in_degrees and ".".join(key) == RADIUS)
+            why = f"the plan varies this setting{name}; take it out of [grid] in {path}"
+            raise InputError(f"{layer[key].where}: {why}")
+
+
+def _beneath(path: Path, table: Mapping[str, Any], over: Layer) -> tuple[Layer, tuple[str, ...]]:
+    """Return the settings that lie beneath a plan by name, and the estimators that they name."""
+    config = table.get("config")
+    places = (config if isinstance(config, dict) else {}, table)
+    words = [Given(one["settings"], f"{path}: settings") for one in places if "settings" in one]
+    given = [*words, *(one for key, one in over.items() if key == SETTINGS)]
+    return over_named(*({SETTINGS: one} for one in given))
+
+
+def _with_named(own: Any, named: Mapping[str, Layer], filters: Sequence[str]) -> Any:
+    """Lay the settings of a plan that are one filter's own over those that are by name."""
+    if not isinstance(own, dict) or not all(isinstance(one, dict) for one in own.values()):
+        return own  # refused with all else
+    beneath = {
+        name: {".".join(key): given.value for key, given in named[name].items()}
+        for name in filters
+        if name in named
+    }
+    return {name: beneath.get(name, {}) | own.get(name, {}) for name in {**own, **beneath}}
 
 
 def _laid(path: Path, table: Mapping[str, Any], over: Layer, worlds: dict[str, World]) -> Layer:
@@ -324,6 +353,8 @@ def _as_table(plan: Plan) -> dict[str, Any]:
     grid = {name: list(values) for name, values in plan.grid.items()}
     if WORLD in grid:
         grid[WORLD] = [f"worlds/{name}" for name in grid[WORLD]]
+    config = resolve(kept).model_dump(mode="json", exclude_none=True)
+    settings = config.pop("settings", None)
     return {
         "format": FORMAT,
         "name": plan.name,
@@ -331,7 +362,8 @@ def _as_table(plan: Plan) -> dict[str, Any]:
         **({"planned": plan.planned} if plan.planned > plan.iterations else {}),
         "strategies": list(plan.strategies),
         "filters": list(plan.filters),
-        "config": resolve(kept).model_dump(mode="json", exclude_none=True),
+        **({"settings": settings} if settings else {}),
+        "config": config,
         "grid": grid,
         **({"own": own} if own else {}),
     }
@@ -339,7 +371,7 @@ def _as_table(plan: Plan) -> dict[str, Any]:
 
 def _head(path: Path, table: Mapping[str, Any], iterations: int | None) -> _Head:
     """Check the keys of a plan other than its settings and grid."""
-    keys = (*_Head.model_fields, "config", "grid", "own")
+    keys = (*_Head.model_fields, "settings", "config", "grid", "own")
     for name in table:
         if name not in keys:
             raise InputError(f"{path}: {name}: no such key of a plan; {_meant(name, keys)}")
@@ -391,6 +423,8 @@ def _values(path: Path, name: str, key: Key, values: Any, layer: Layer) -> tuple
     where = f"{path}: grid.{name}"
     if key == ("seed",):
         raise InputError(f"{where}: every iteration is another world already; raise iterations")
+    if key in (SETTINGS, OWN):
+        raise InputError(f"{where}: holds for a whole plan; vary settings themselves")
     if not isinstance(values, list) or not values:
         raise InputError(f"{where}: found {shown(values)}, expected a list of values")
     checked = []

@@ -1,0 +1,170 @@
+"""Settings by name, ``settings/NAME.toml``, and settings that are one estimator's alone.
+
+A named file holds settings as a user's file does, and the estimators that it is meant for. It lies
+beneath all that is given. In any file ``[own.iekf]`` holds what one estimator has alone, for what
+serves one harms another: it goes before what stands beneath, or beside it in the same file.
+"""
+
+from collections.abc import Iterator, Sequence
+from importlib.resources import files
+from pathlib import Path
+
+from pipistrelle.config import Config, InputError
+from pipistrelle.estimation.catalogue import SECTIONS, check_name
+from pipistrelle.refusals import meant, refusal, shown
+from pipistrelle.settings import (
+    OWN,
+    SETTINGS,
+    Given,
+    Layer,
+    from_file,
+    from_flags,
+    from_table,
+    read_toml,
+    resolve,
+)
+
+
+def shipped(room: str) -> tuple[str, ...]:
+    """Return the names of the TOML files in a folder of this room, in the order of the alphabet.
+
+    >>> shipped("settings")
+    ('best', 'paper', 'physics')
+    """
+    files_there = (files("pipistrelle.experiments") / room).iterdir()
+    return tuple(sorted(each.name[:-5] for each in files_there if each.name.endswith(".toml")))
+
+
+NAMES = shipped("settings")
+PLANS = tuple(name for name in shipped("studies") if not name.endswith("_calibration"))
+"""Plans of studies that ship with the package."""
+
+
+def settings_of(word: str, where: str) -> Layer:
+    """Return the settings that are given by a name, or by the path of a file; `where` it was given.
+
+    >>> settings_of("best", "--settings")
+    {('settings',): Given(value='best', where='--settings')}
+    >>> settings_of("bset", "--settings")
+    Traceback (most recent call last):
+    pipistrelle.config.InputError: --settings: found 'bset', expected best, paper, physics or the
+    path of a TOML file; did you mean best?
+    """
+    if word in NAMES:
+        return {SETTINGS: Given(word, where)}
+    path = Path(word)
+    if path.is_dir():
+        fix = "a world of your own is named by world"
+        raise refusal(where, f"{word!r}, a folder", "a TOML file of settings", fix)
+    if not (path.suffix or len(path.parts) > 1 or path.exists()):
+        raise _unknown(Given(word, where), " or the path of a TOML file")
+    if layer := from_file(path):
+        return layer
+    raise refusal(path, "no setting", "settings", "add one, or leave the file out")
+
+
+def _unknown(given: Given, other: str = "") -> InputError:
+    """Return the refusal of a name that none of the named settings has."""
+    near = meant(str(given.value), NAMES)
+    fix = f"did you mean {near}?" if near else "choose one"
+    expected = f"{', '.join(NAMES)}{other}"
+    return refusal(given.where, shown(given.value), expected, fix)
+
+
+def over_named(*layers: Layer, default: str | None = None) -> tuple[Layer, tuple[str, ...]]:
+    """Lay settings over those that they name, or over the default's.
+
+    The estimators that the named settings are meant for are returned, too; none without a name.
+
+    >>> layer, estimators = over_named({}, default="paper")
+    >>> resolve(layer) == Config(settings="paper"), estimators
+    (True, ('ekf',))
+    """
+    over = laid(*layers)
+    given = over.get(SETTINGS, Given(default, "settings"))
+    if given.value is None:
+        return over, ()
+    if given.value not in NAMES:
+        raise _unknown(given)
+    path = Path(str(files("pipistrelle.experiments") / "settings" / f"{given.value}.toml"))
+    table = read_toml(path)
+    estimators = tuple(table.pop("filters"))
+    beneath, _ = over_named(from_table(table, f"{path}: "))
+    return laid(beneath, over, {SETTINGS: given}), estimators
+
+
+def laid(*layers: Layer) -> Layer:
+    """Lay settings over each other: the last one counts, over what is an estimator's own, too.
+
+    >>> own, common = ("own", "iekf", "rays", "power"), ("rays", "power")
+    >>> list(laid({own: Given(8.0, "file")}, {common: Given(3.0, "flag")}))
+    [('rays', 'power')]
+    """
+    found: Layer = {}
+    for layer in layers:
+        beneath = {key: one for key, one in found.items() if not (_own(key) and key[2:] in layer)}
+        found = beneath | layer
+    return found
+
+
+def _own(key: tuple[str, ...]) -> bool:
+    """Tell whether a key is of a setting that is one estimator's alone."""
+    return key[:1] == OWN and len(key) > 2
+
+
+def parted(layer: Layer) -> tuple[Layer, dict[str, Layer]]:
+    """Part settings that all estimators have from those of one alone, by its name."""
+    own: dict[str, Layer] = {}
+    for key, given in layer.items():
+        if _own(key):
+            own.setdefault(key[1], {})[key[2:]] = given
+    return {key: given for key, given in layer.items() if not _own(key)}, own
+
+
+def check_own(layer: Layer) -> None:
+    """Refuse what cannot be one estimator's alone, or is no value of its setting."""
+    _, own = parted(layer)
+    for name, settings in own.items():
+        for key, given in settings.items():
+            check_name(name, where=given.where)
+            if key[0] not in SECTIONS:
+                expected = f"one of the sections {', '.join(SECTIONS)}"
+                raise InputError(f"{given.where}: changes what is heard; expected {expected}")
+        resolve(settings)
+
+
+def own_config(config: Config, name: str) -> Config:
+    """Return the settings that an estimator has: those of all, and its own over them.
+
+    >>> own = {"iekf": {"rays": {"power": 8.0}}}
+    >>> [own_config(Config(own=own), name).rays.power for name in ("ekf", "iekf")]
+    [2.0, 8.0]
+    """
+    if config.own is None:
+        return config
+    own = from_flags(config.own.get(name, {}))
+    return resolve(from_flags(config.model_dump(mode="json", exclude={"own"})) | own)
+
+
+def of_estimators(config: Config, names: Sequence[str]) -> Config:
+    """Return the settings of a mission of some estimators: what all have is no one's alone.
+
+    >>> config = Config(own={"iekf": {"rays": {"power": 8.0}}})
+    >>> of_estimators(config, ["iekf"]).rays.power, of_estimators(config, ["ekf"]) == Config()
+    (8.0, True)
+    """
+    first, *others = (own_config(config, name) for name in names)
+    if all(other == first for other in others):
+        return first
+    own = {name: config.own[name] for name in names if config.own and name in config.own}
+    return config.model_copy(update={"own": own})
+
+
+def each_its_own(config: Config, names: Sequence[str]) -> Iterator[tuple[Config, tuple[str, ...]]]:
+    """Yield the settings of some estimators, and the names of those that have them."""
+    left = list(names)
+    while left:
+        own = own_config(config, left[0])
+        alike = tuple(name for name in left if own_config(config, name) == own)
+        left = [name for name in left if name not in alike]
+        yield own, alike
