@@ -7,10 +7,11 @@ True
 """
 
 __version__: str
-__all__ = ["Config", "InputError", "load", "run", "slam", "study"]
+__all__ = ["Config", "InputError", "hear", "load", "run", "slam", "study"]
 _ROOMS = {
     "Config": "config",
     "InputError": "config",
+    "hear": "scripting.hearing",
     "load": "scripting.loading",
     "run": "scripting.results",
     "slam": "scripting.results",

@@ -251,7 +251,9 @@ def test_importing_the_package_loads_no_numpy_and_lists_its_doors():
         " dir(pipistrelle)); pipistrelle.nothing"
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert ran.stdout.startswith("[] ['Config', 'InputError', '__version__', 'load', 'run', 'slam'")
+    assert ran.stdout.startswith(
+        "[] ['Config', 'InputError', '__version__', 'hear', 'load', 'run', 'slam'"
+    )
     assert "module 'pipistrelle' has no attribute 'nothing'" in ran.stderr
 
 

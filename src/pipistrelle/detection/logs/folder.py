@@ -4,6 +4,7 @@ Whatever is wrong with a file is refused by line or key. `recording` says how ro
 measurements scans.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from math import inf, pi
 from pathlib import Path
@@ -35,6 +36,7 @@ from pipistrelle.detection.logs.recording import (
     assemble,
 )
 from pipistrelle.detection.logs.text_tables import FORMER_NAMES, Table, read_table, table_text
+from pipistrelle.detection.scans import OWN, UNLABELLED, Scan
 from pipistrelle.files import read_text
 from pipistrelle.own_files import LOG, OwnFiles
 from pipistrelle.refusals import expectation, meant, refusal, shown, values_expected
@@ -234,8 +236,6 @@ def read_log(folder: Path) -> Log:
     (0.5, array([7]), array([nan]))
     """
     settings, former = _read_settings(folder / "log.toml")
-    columns, stds = ("time", *_ODOMETRY[settings.motion]), _NOISY[settings.motion]
-    optional = MOTION_COVARIANCE if settings.motion == "poses" else ()
     names = tuple(caller.name for caller in settings.callers)
     measured = read_table(
         folder / "measurements.csv",
@@ -245,6 +245,45 @@ def read_log(folder: Path) -> Log:
         words={CALLER: names or ("a name that [[callers]] of log.toml have",)},
     )
     measured.column[CALLER] += 1.0  # the vehicle is number 0
+    return _assembled(folder, settings, measured, (*measured.former, *former))
+
+
+def log_of(
+    folder: Path, about: dict[str, Any], callers: Sequence[Mapping[str, Any]], scans: Sequence[Scan]
+) -> Log:
+    """Return the log of scans without labels that were heard beside a folder's odometry.
+
+    `about`: the keys of ``log.toml``, from the table ``log`` of ``recording.toml``; `callers`: its
+    table of callers.
+    """
+    path = folder / "recording.toml"
+    raw = about | {"format": 1, "callers": list(callers)}
+    settings = _checked_settings(raw, f"{path}, table 'log'")
+    column = {name: np.concatenate([_said(scan, name) for scan in scans]) for name in _HEARD}
+    column["time"] = np.repeat([scan.time for scan in scans], [len(s.bearing) for s in scans])
+    own = column[CALLER] == OWN
+    column[CALLER] = np.where(own, np.nan, column[CALLER])
+    lines = np.arange(1, own.size + 1)
+    measured = Table(path=f"{folder}, echoes", line=lines, unit="row", column=column)
+    return _assembled(folder, settings, measured, ())
+
+
+_HEARD = (*MEASUREMENT[1:], *STATED, CALLER)
+
+
+def _said(scan: Scan, name: str) -> np.ndarray:
+    """Return a column of a scan as a log's row says it."""
+    values = getattr(scan, name)
+    if name == "excess_path" and scan.direct.size:
+        values = values.copy()
+        values[scan.direct[scan.direct >= 0]] = 0.0
+    return values
+
+
+def _assembled(folder: Path, settings: _Settings, measured: Table, former: tuple[str, ...]) -> Log:
+    """Return a log of settings, measurements and the odometry in its folder."""
+    columns, stds = ("time", *_ODOMETRY[settings.motion]), _NOISY[settings.motion]
+    optional = MOTION_COVARIANCE if settings.motion == "poses" else ()
     values = {name: getattr(settings, name) for name in _SHARED}
     values["association"] = settings.association.model_dump(exclude_none=True)
     values["callers"] = tuple(LogCaller(**caller.model_dump()) for caller in settings.callers)
@@ -256,7 +295,7 @@ def read_log(folder: Path) -> Log:
         measured,
         step=settings.step,
         name=folder.resolve().name,
-        former_names=(*measured.former, *former),
+        former_names=former,
         wheelbase=getattr(settings, "wheelbase", 1.0),
         speed_offset=getattr(settings, "speed_offset", 0.0),
         control_std=tuple(getattr(settings, f"{name}_std") for name in stds),
@@ -349,9 +388,14 @@ def _read_settings(path: Path) -> tuple[_Settings, tuple[str, ...]]:
     raw = parse_toml(read_text(path), path)
     former = tuple(key for key in raw if FORMER_NAMES.get(key, key) not in raw)
     raw |= {FORMER_NAMES[key]: raw.pop(key) for key in former}
+    return _checked_settings(raw, path), former
+
+
+def _checked_settings(raw: dict[str, Any], path: Path | str) -> _Settings:
+    """Return settings that are what they should be; `path`: where they stand."""
     model = _SETTINGS.get(str(raw.get("motion")), _UnicycleSettings)
     try:
-        return model.model_validate(raw), former
+        return model.model_validate(raw)
     except ValidationError as error:
         faults = error.errors(include_url=False)
     rank = {"format": 0, "motion": 1}
@@ -360,7 +404,7 @@ def _read_settings(path: Path) -> tuple[_Settings, tuple[str, ...]]:
     raise _key_refusal(path, fault, model)
 
 
-def _key_refusal(path: Path, fault: Any, model: type[_Settings]) -> InputError:
+def _key_refusal(path: Path | str, fault: Any, model: type[_Settings]) -> InputError:
     known, name = model.model_fields, fault["loc"][0]
     if name == "callers" and len(fault["loc"]) > 2:
         return _caller_refusal(path, fault)
@@ -384,7 +428,7 @@ def _key_refusal(path: Path, fault: Any, model: type[_Settings]) -> InputError:
     return refusal(f"{path}, key {key!r}", found, expectation(fault), "correct the value")
 
 
-def _caller_refusal(path: Path, fault: Any) -> InputError:
+def _caller_refusal(path: Path | str, fault: Any) -> InputError:
     """Refuse a caller by its number, from 1 on, and key."""
     _, number, name, *_ = fault["loc"]
     key, known = f"callers.{number + 1}.{name}", _CallerTable.model_fields
@@ -414,7 +458,8 @@ def _odometry_columns(log: Log) -> dict[str, np.ndarray]:
 def _measurement_columns(log: Log) -> dict[str, np.ndarray]:
     """Return the columns of ``measurements.csv``; scans lie spread over their step, in order.
 
-    Of how surely it was measured there are those of which any row says something.
+    Of how surely it was measured there are those of which any row says something; how loud it was
+    stands in logs without labels.
     """
     used = np.array([scan.time for scan in log.scans])
     index = np.searchsorted(log.time, used)
@@ -425,9 +470,10 @@ def _measurement_columns(log: Log) -> dict[str, np.ndarray]:
     sizes = [len(scan.landmark) for scan in log.scans]
     column = {"time": np.repeat(stamp, sizes)}
     for name in (*MEASUREMENT[1:], *STATED):
-        fields = [getattr(scan, name) for scan in log.scans]
+        fields = [_said(scan, name) for scan in log.scans]
         values = np.concatenate(fields) if fields else np.empty(0)
-        if name in MEASUREMENT or not np.isnan(values).all():
+        labelled = name == "level_db" and (column["landmark"] != UNLABELLED).any()
+        if name in MEASUREMENT or not (labelled or np.isnan(values).all()):
             column[name] = values
     whose = np.concatenate([np.empty(0, dtype=np.int64), *(scan.caller for scan in log.scans)])
     if log.callers and whose.any():

@@ -114,7 +114,7 @@ def _refuse_unknown(folder: Path, titles: str) -> None:
     if folder.exists():
         what, _, fix = (recording_of(folder) or "").partition("; ")
         if what:
-            raise refusal(folder, what, titles, f"{fix} (docs/log_format.md)")
+            raise refusal(folder, what, titles, fix)
     if not folder.is_dir():
         found = "a file" if folder.is_file() else "no such folder"
         raise refusal(folder, found, titles, "check the path")
@@ -269,7 +269,7 @@ def replay(
 
     scans = [
         without_hidden(
-            rows if known else without_labels(rows, rows.callers),
+            rows if known or rows.direct.size else without_labels(rows, rows.callers),
             config.filter,
             timing=config.listening.timing,
         )

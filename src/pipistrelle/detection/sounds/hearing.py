@@ -1,0 +1,176 @@
+"""Sound in: a recording is heard call by call, by the front end of the simulation, into a log."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Complex
+
+from pipistrelle.config import Config
+from pipistrelle.detection.echoes import unlabelled_scan, with_edge_floor
+from pipistrelle.detection.logs.folder import log_of
+from pipistrelle.detection.logs.recording import Log
+from pipistrelle.detection.matched import filter_blocks
+from pipistrelle.detection.scans import Scan
+from pipistrelle.detection.snapshots import Detections, Detector, detect, detections_at, detector
+from pipistrelle.detection.sounds.array_csv import FILE as ARRAY
+from pipistrelle.detection.sounds.array_csv import Microphones, read_array
+from pipistrelle.detection.sounds.calls import Calls, find_calls
+from pipistrelle.detection.sounds.description import Description, read_description
+from pipistrelle.detection.sounds.noise_level import set_noise
+from pipistrelle.detection.sounds.sound_file import Sound, open_sound
+from pipistrelle.detection.sounds.tone_sums import Blocks, ToneSums, blocks_of
+from pipistrelle.refusals import refusal
+
+Progress = Callable[[str, int, int], None]
+"""Called with a stage's name, the calls heard and their number."""
+
+
+class Frame(NamedTuple):
+    """What was heard after one call of the vehicle."""
+
+    time: float
+    """Of the call [s]."""
+    matched: Complex[np.ndarray, "l f c e"]
+    """The matched filters' output, in units of the noise; the next frame overwrites it."""
+    start: float
+    """Delay of lag 0 [s]."""
+    interval: float
+    """Between two lags [s]."""
+    detections: Detections
+    scan: Scan
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hearing:
+    """A recording that is open, and all that is the same for each of its calls."""
+
+    folder: Path
+    about: Description
+    sound: Sound
+    microphones: Microphones
+    blocks: Blocks
+    calls: Calls
+    sums: ToneSums
+    config: Config
+    finder: Detector
+    own_clock: Bool[np.ndarray, " c"]
+    """Whether each caller has a clock of its own: its rows are left out."""
+
+    @classmethod
+    def of(cls, folder: Path, sound: Sound, about: Description, config: Config) -> "Hearing":
+        """Look at a recording: its microphones, when its vehicle called, and its noise.
+
+        `config`: sections detection, matching and assumed count; the rest is the recording's.
+        """
+        microphones = read_array(folder / ARRAY)
+        most = int(microphones.channel.max()) + 1
+        if most > sound.channels:
+            found = f"channel {most}, of sound that has {sound.channels}"
+            raise refusal(folder / ARRAY, found, f"1 to {sound.channels}", "correct the channels")
+        tones = np.array([about.call.frequency, *(one.frequency for one in about.callers)])
+        where = str(folder / "recording.toml")
+        blocks = blocks_of(sound.rate, about.call.duration, tones, where, about.call.deaf)
+        calls = find_calls(folder, about, sound, blocks)
+        sums = ToneSums(blocks, microphones.channel, about.scale)
+        set_noise(sums, sound, calls, folder)
+        settled = _settled(config, about)
+        return cls(
+            folder=folder,
+            about=about,
+            sound=sound,
+            microphones=microphones,
+            blocks=blocks,
+            calls=calls,
+            sums=sums,
+            config=settled,
+            finder=detector(settled, microphones.layout, tones),
+            own_clock=np.array([False, *(one.own_clock for one in about.callers)]),
+        )
+
+    def frames(self, numbers: Sequence[int]) -> Iterator[Frame]:
+        """Hear what came after some of the calls, numbered from 0 on."""
+        on, calls = self.blocks, self.calls
+        room = _Room()
+        for k in numbers:
+            first = int(calls.sample[k])
+            samples = self.sound.read(first, int(calls.length[k]))
+            count = max((len(samples) - on.blank) // on.block, 0)
+            blocks = self.sums(samples, room.array("blocks", (count, *self.sums.gain.shape)))
+            if not np.isfinite(blocks).all():
+                self.sound.refuse_odd(first, samples)
+            lags = (max(count - on.pulse + 1, 0), *self.sums.gain.shape)
+            matched = filter_blocks(
+                blocks, pulse=on.pulse, block=1, noise_std=1.0, out=room.array("matched", lags)
+            )
+            yield self._frame(float(calls.time[k]), matched)
+
+    def _frame(self, time: float, matched: Complex[np.ndarray, "l f c e"]) -> Frame:
+        """Detect the echoes of one call."""
+        on = self.blocks
+        start = on.blank / on.rate
+        found = detect(matched, self.finder, start=start, interval=on.interval, pulse=on.pulse)
+        if self.own_clock.any():
+            found = detections_at(found, ~self.own_clock[found.caller])
+        found = with_edge_floor(found, self.config)
+        scan, _ = unlabelled_scan(time, found, self.config, self.own_clock)
+        return Frame(time, matched, start, on.interval, found, scan)
+
+
+class _Room:
+    """Arrays that every frame uses anew."""
+
+    def __init__(self) -> None:
+        self._flat: dict[str, np.ndarray] = {}
+
+    def array(self, name: str, shape: tuple[int, ...]) -> Complex[np.ndarray, "..."]:
+        """Return the array of a name in a shape; its content is undefined."""
+        size = int(np.prod(shape))
+        if name not in self._flat or self._flat[name].size < size:
+            self._flat[name] = np.empty(size, dtype=np.complex128)
+        return self._flat[name][:size].reshape(shape)
+
+
+def hear_recording(
+    folder: Path,
+    config: Config,
+    frames: Callable[[int], range],
+    look: Callable[[Frame], None],
+    progress: Progress | None = None,
+) -> Log:
+    """Hear a recording, and return what was heard as a log without labels.
+
+    `frames`: given the number of calls, which of them are heard; `look`: given each.
+    """
+    about = read_description(folder)
+    with open_sound(folder, about) as sound:
+        hearing = Hearing.of(folder, sound, about, config)
+        numbers, scans = frames(hearing.calls.sample.size), []
+        for done, frame in enumerate(hearing.frames(numbers), start=1):
+            look(frame)
+            scans.append(frame.scan)
+            if progress:
+                progress("hearing", done, len(numbers))
+    return log_of(folder, about.log, _callers(about), scans)
+
+
+def _callers(about: Description) -> list[dict[str, Any]]:
+    """Return the callers, as ``log.toml`` lists them."""
+    return [
+        {"name": one.name, "landmark": number if one.landmark is None else one.landmark}
+        | ({"moves": True} if one.moves else {})
+        for number, one in enumerate(about.callers, start=1)
+    ]
+
+
+def _settled(config: Config, about: Description) -> Config:
+    """Return settings with what the recording says of the call and the speed of sound."""
+    assumed = config.assumed.speed_of_sound or about.speed_of_sound
+    return config.model_copy(
+        update={
+            "emitter": config.emitter.model_copy(update={"pulse": about.call.duration}),
+            "assumed": config.assumed.model_copy(update={"speed_of_sound": assumed}),
+        }
+    )

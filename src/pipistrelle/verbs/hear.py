@@ -1,0 +1,66 @@
+"""`pipistrelle hear`: a sound recording to a log."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from pipistrelle.config import InputError
+from pipistrelle.own_files import LOG, claim
+from pipistrelle.scripting.hearing import heard_of, heard_settings, is_heard, keep
+from pipistrelle.settings import from_flags
+from pipistrelle.verbs.console import progress
+from pipistrelle.verbs.options import setting_flags
+from pipistrelle.verbs.streams import put, warn
+
+if TYPE_CHECKING:
+    HearFlags = dict[str, Any]
+else:
+    HearFlags = setting_flags(is_heard)
+
+
+def hear(
+    recording: Annotated[
+        Path,
+        Parameter(
+            help="A folder of sound files, recording.toml, array.csv and odometry.csv, perhaps "
+            "calls.csv."
+        ),
+    ],
+    /,
+    *,
+    output: Annotated[
+        Path | None,
+        Parameter(name=("--output", "-o"), metavar="LOG", help="The log's folder."),
+    ] = None,
+    overwrite: Annotated[bool, Parameter(negative=(), help="Replace an earlier log in LOG.")] = (
+        False
+    ),
+    frames: Annotated[
+        str | None,
+        Parameter(
+            metavar="A:B",
+            help="Only the calls from number A, counted from 0, to before B. [default: all]",
+        ),
+    ] = None,
+    quiet: Annotated[bool, Parameter(negative=(), help="Print the log's folder alone.")] = False,
+    settings: Annotated[HearFlags | None, Parameter(name="*")] = None,
+) -> int:
+    """Hear a sound recording into a log that `pipistrelle slam` solves."""
+    config = heard_settings(from_flags(settings or {}))
+    if output is None:
+        raise InputError("hear: found no folder for the log; name one with -o LOG")
+    own = claim(output, LOG, overwrite=overwrite, flags=("-o LOG", "--overwrite"))
+    from pipistrelle.kernel_clock import announce
+    from pipistrelle.verbs.streams import say
+
+    announce(None if quiet else say)
+    with progress(quiet) as show:
+        heard = heard_of(recording, config, frames, "--frames", show)
+    keep(heard, recording, own)
+    warn(*heard.log.notes)
+    if not quiet:
+        rows = sum(len(scan.bearing) for scan in heard.log.scans)
+        put(f"{len(heard.log.scans)} calls with echoes, {rows} rows")
+    put(own.folder)
+    return 0
