@@ -28,12 +28,22 @@ def draw_hearing(overview: Overview) -> "Figure":
     with rc_context(STYLE):
         figure = Figure(figsize=(10.0, 0.6 + 3.0 * rows), layout="constrained")
         axes = figure.subplots(rows, 2, squeeze=False, width_ratios=(3, 2))
+        end = _end(overview)
         for number, name in enumerate(overview.names):
             _output(axes[number, 0], overview, number)
             _bearings(axes[number, 1], overview, number)
             axes[number, 0].set_title(f"{name}: matched filter")
             axes[number, 1].set_title(f"{name}: taken for echoes")
+            if end > 0.0:
+                axes[number, 0].set_xlim(0.0, end)
+                axes[number, 1].set_xlim(0.0, end)
     return figure
+
+
+def _end(overview: Overview) -> float:
+    """Return the delay up to which nearly all was heard, and some silence more [ms]."""
+    delays = np.concatenate([np.empty(0), *(found.delay for found in overview.detections)])
+    return 1.25e3 * float(np.quantile(delays, 0.995)) if delays.size else 0.0
 
 
 def _output(axes: "Axes", overview: Overview, number: int) -> None:

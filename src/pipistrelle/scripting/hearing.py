@@ -1,18 +1,19 @@
 """Sound recordings for Python: heard into a log, and drawn."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from os.path import lexists
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipistrelle.config import Config, InputError
-from pipistrelle.detection.logs.folder import log_files
-from pipistrelle.detection.logs.recording import Log
+from pipistrelle.detection.logs.folder import RowsHeard
 from pipistrelle.detection.sounds.description import read_description
-from pipistrelle.detection.sounds.hearing import hear_recording
+from pipistrelle.detection.sounds.hearing import Frame, hear_recording, log_callers
 from pipistrelle.detection.sounds.overview import Overview
 from pipistrelle.experiments.hearing.listening import Progress
-from pipistrelle.files import read_text
-from pipistrelle.own_files import LOG, OwnFiles, claim, drawn_files
+from pipistrelle.files import PiecesFile, read_text
+from pipistrelle.own_files import LOG, OwnFiles, claim, drawn_files, make_folder, remove_empty
 from pipistrelle.refusals import refusal
 from pipistrelle.scripting.arguments import folder_named, frames_named
 from pipistrelle.settings import Key, Layer, from_keywords, resolve
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 SECTIONS = ("detection", "matching")
 """Settings that count where a recording is heard; the speed of sound that is assumed does, too."""
-TRUTH = ("truth.csv", "landmarks.csv")
+TRUTH, MEASURED = ("truth.csv", "landmarks.csv"), "measurements.csv"
 
 
 def is_heard(key: Key) -> bool:
@@ -45,22 +46,29 @@ def heard_settings(layer: Layer) -> Config:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Heard:
-    """What `hear` returns: the echoes of a recording, a log of them, and a figure."""
+    """What `hear` returns: the echoes of a recording, and a figure of them."""
 
-    log: Log
     overview: Overview
     """Of the first calls, for the figure."""
+    log: RowsHeard
+    """How many rows there are; what else a log of them says."""
+    text: str | None
+    """The rows, where they are not kept in a folder."""
     folder: Path | None = None
     """Where the log is kept, if anywhere."""
 
     @property
     def measurements(self) -> "pl.DataFrame":
         """The rows of the log: time, caller, bearing, range or excess path, deviations, level."""
-        import io
+        from io import StringIO
 
         import polars as pl
 
-        return pl.read_csv(io.StringIO(log_files(self.log)["measurements.csv"]))
+        text = self.text
+        if text is None:
+            assert self.folder is not None
+            text = read_text(self.folder / MEASURED)
+        return pl.read_csv(StringIO(text), infer_schema_length=None)
 
     def figure(self) -> "Figure":
         """Draw the matched filter's output over the first calls, and what was taken for echoes."""
@@ -116,45 +124,74 @@ def hear(
     """
     place = folder_named(folder, "hear")
     config = heard_settings(from_keywords(settings))
-    own = None
-    if output is not None:
-        flags = ("output=", "overwrite=True")
-        own = claim(folder_named(output, "output"), LOG, overwrite=overwrite, flags=flags)
-    heard = heard_of(place, config, frames, "frames", progress)
-    return heard if own is None else keep(heard, place, own)
+    asked = place, config, frames, "frames", progress
+    if output is None:
+        parts: list[str] = []
+        return heard_of(*asked, parts.append, lambda: "".join(parts))
+    flags = ("output=", "overwrite=True")
+    own = claim(folder_named(output, "output"), LOG, overwrite=overwrite, flags=flags)
+    return heard_into(own, *asked)
+
+
+def heard_into(
+    own: OwnFiles,
+    folder: Path,
+    config: Config,
+    frames: str | None,
+    where: str,
+    progress: Progress | None,
+) -> Heard:
+    """Hear a recording into a log's folder, row by row; write the figure, and truth that is there.
+
+    `where` its frames were given is said in refusals.
+    """
+    from pipistrelle.figures.style import save_figure
+
+    made = make_folder(own.folder)
+    rows = PiecesFile(own.folder / MEASURED)
+    try:
+        heard = heard_of(
+            folder, config, frames, where, progress, lambda text: rows.write(text.encode())
+        )
+        rows.close()
+        figure = heard.figure()
+
+        def draw(room: Path) -> None:
+            save_figure(figure, room, "hearing")
+
+        picture = {n: data for n, data in drawn_files(draw).items() if n.endswith(".png")}
+        truth = {name: read_text(folder / name) for name in TRUTH if lexists(folder / name)}
+        own.replace(truth | picture | {MEASURED: rows} | heard.log.files())
+    finally:
+        rows.discard()
+        remove_empty(made)
+    return replace(heard, folder=own.folder)
 
 
 def heard_of(
-    folder: Path, config: Config, frames: str | None, where: str, progress: Progress | None
+    folder: Path,
+    config: Config,
+    frames: str | None,
+    where: str,
+    progress: Progress | None,
+    write: Callable[[str], None],
+    text: Callable[[], str | None] = lambda: None,
 ) -> Heard:
-    """Hear a recording; `where` its frames were given is said in refusals."""
+    """Hear a recording; `write` is given the rows as text, and `text` returns them all."""
     if not folder.is_dir():
         found = "a file" if folder.exists() else "no such folder"
         raise refusal(folder, found, "a sound recording's", "check the path")
     about = read_description(folder)
     overview = Overview(names=("vehicle", *(one.name for one in about.callers)))
-    log = hear_recording(
-        folder,
-        config,
-        lambda count: frames_named(frames, count, where),
-        overview.look,
-        progress,
+    log = RowsHeard(folder, about.log, log_callers(about))
+    write(",".join(log.columns) + "\n")
+
+    def look(frame: Frame) -> None:
+        overview.look(frame)
+        write(log.text(frame.scan))
+
+    hear_recording(
+        folder, about, config, lambda count: frames_named(frames, count, where), look, progress
     )
-    return Heard(log=log, overview=overview)
-
-
-def keep(heard: Heard, folder: Path, own: OwnFiles) -> Heard:
-    """Write the log and the figure, with the truth that lies beside the sound."""
-    from dataclasses import replace
-
-    from pipistrelle.figures.style import save_figure
-
-    truth = {name: read_text(folder / name) for name in TRUTH if (folder / name).exists()}
-    figure = heard.figure()
-
-    def draw(room: Path) -> None:
-        save_figure(figure, room, "hearing")
-
-    picture = {name: data for name, data in drawn_files(draw).items() if name.endswith(".png")}
-    own.replace(truth | picture | log_files(heard.log))
-    return replace(heard, folder=own.folder)
+    log.files()  # refuses a log without rows
+    return Heard(overview=overview, log=log, text=text())

@@ -7,7 +7,7 @@ from cyclopts import Parameter
 
 from pipistrelle.config import InputError
 from pipistrelle.own_files import LOG, claim
-from pipistrelle.scripting.hearing import heard_of, heard_settings, is_heard, keep
+from pipistrelle.scripting.hearing import heard_into, heard_settings, is_heard
 from pipistrelle.settings import from_flags
 from pipistrelle.verbs.console import progress
 from pipistrelle.verbs.options import setting_flags
@@ -56,11 +56,11 @@ def hear(
 
     announce(None if quiet else say)
     with progress(quiet) as show:
-        heard = heard_of(recording, config, frames, "--frames", show)
-    keep(heard, recording, own)
-    warn(*heard.log.notes)
+        heard = heard_into(own, recording, config, frames, "--frames", show)
+    outside = heard.log.rows - heard.log.inside
+    if outside:
+        warn(f"{recording}: {outside} rows are before or after the odometry, and left out by slam")
     if not quiet:
-        rows = sum(len(scan.bearing) for scan in heard.log.scans)
-        put(f"{len(heard.log.scans)} calls with echoes, {rows} rows")
+        put(f"{heard.log.rows} rows")
     put(own.folder)
     return 0

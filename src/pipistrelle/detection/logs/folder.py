@@ -4,7 +4,6 @@ Whatever is wrong with a file is refused by line or key. `recording` says how ro
 measurements scans.
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from math import inf, pi
 from pathlib import Path
@@ -36,7 +35,7 @@ from pipistrelle.detection.logs.recording import (
     assemble,
 )
 from pipistrelle.detection.logs.text_tables import FORMER_NAMES, Table, read_table, table_text
-from pipistrelle.detection.scans import OWN, UNLABELLED, Scan
+from pipistrelle.detection.scans import UNLABELLED, Scan
 from pipistrelle.files import read_text
 from pipistrelle.own_files import LOG, OwnFiles
 from pipistrelle.refusals import expectation, meant, refusal, shown, values_expected
@@ -236,6 +235,7 @@ def read_log(folder: Path) -> Log:
     (0.5, array([7]), array([nan]))
     """
     settings, former = _read_settings(folder / "log.toml")
+    stds = _NOISY[settings.motion]
     names = tuple(caller.name for caller in settings.callers)
     measured = read_table(
         folder / "measurements.csv",
@@ -245,62 +245,30 @@ def read_log(folder: Path) -> Log:
         words={CALLER: names or ("a name that [[callers]] of log.toml have",)},
     )
     measured.column[CALLER] += 1.0  # the vehicle is number 0
-    return _assembled(folder, settings, measured, (*measured.former, *former))
-
-
-def log_of(
-    folder: Path, about: dict[str, Any], callers: Sequence[Mapping[str, Any]], scans: Sequence[Scan]
-) -> Log:
-    """Return the log of scans without labels that were heard beside a folder's odometry.
-
-    `about`: the keys of ``log.toml``, from the table ``log`` of ``recording.toml``; `callers`: its
-    table of callers.
-    """
-    path = folder / "recording.toml"
-    raw = about | {"format": 1, "callers": list(callers)}
-    settings = _checked_settings(raw, f"{path}, table 'log'")
-    column = {name: np.concatenate([_said(scan, name) for scan in scans]) for name in _HEARD}
-    column["time"] = np.repeat([scan.time for scan in scans], [len(s.bearing) for s in scans])
-    own = column[CALLER] == OWN
-    column[CALLER] = np.where(own, np.nan, column[CALLER])
-    lines = np.arange(1, own.size + 1)
-    measured = Table(path=f"{folder}, echoes", line=lines, unit="row", column=column)
-    return _assembled(folder, settings, measured, ())
-
-
-_HEARD = (*MEASUREMENT[1:], *STATED, CALLER)
-
-
-def _said(scan: Scan, name: str) -> np.ndarray:
-    """Return a column of a scan as a log's row says it."""
-    values = getattr(scan, name)
-    if name == "excess_path" and scan.direct.size:
-        values = values.copy()
-        values[scan.direct[scan.direct >= 0]] = 0.0
-    return values
-
-
-def _assembled(folder: Path, settings: _Settings, measured: Table, former: tuple[str, ...]) -> Log:
-    """Return a log of settings, measurements and the odometry in its folder."""
-    columns, stds = ("time", *_ODOMETRY[settings.motion]), _NOISY[settings.motion]
-    optional = MOTION_COVARIANCE if settings.motion == "poses" else ()
     values = {name: getattr(settings, name) for name in _SHARED}
     values["association"] = settings.association.model_dump(exclude_none=True)
     values["callers"] = tuple(LogCaller(**caller.model_dump()) for caller in settings.callers)
-    odometry = read_table(folder / "odometry.csv", columns, optional=optional)
-    if settings.motion == "ackermann":
-        _check_steering(odometry)
     return assemble(
-        odometry,
+        read_odometry(folder, settings.motion),
         measured,
         step=settings.step,
         name=folder.resolve().name,
-        former_names=former,
+        former_names=(*measured.former, *former),
         wheelbase=getattr(settings, "wheelbase", 1.0),
         speed_offset=getattr(settings, "speed_offset", 0.0),
         control_std=tuple(getattr(settings, f"{name}_std") for name in stds),
         **values,
     )
+
+
+def read_odometry(folder: Path, motion: str) -> Table:
+    """Read ``odometry.csv`` of a log of a motion model."""
+    optional = MOTION_COVARIANCE if motion == "poses" else ()
+    columns = ("time", *_ODOMETRY[motion])
+    odometry = read_table(folder / "odometry.csv", columns, optional=optional)
+    if motion == "ackermann":
+        _check_steering(odometry)
+    return odometry
 
 
 def _check_steering(odometry: Table) -> None:
@@ -354,8 +322,6 @@ def write_log(folder: Path, log: Log) -> None:
 
 def log_files(log: Log) -> dict[str, str]:
     """Return the files of a log's folder; ``log.toml`` is the last."""
-    import tomli_w
-
     settings: dict[str, Any] = {"format": 1} | {name: getattr(log, name) for name in _SHARED}
     settings["callers"] = [asdict(caller) for caller in log.callers]
     stds = zip(_NOISY[log.motion], log.control_std, strict=True)
@@ -366,7 +332,6 @@ def log_files(log: Log) -> dict[str, str]:
         settings["speed_offset"] = log.speed_offset
     settings["association"] = dict(log.association)
     model = _SETTINGS[log.motion].model_validate(settings)
-    text = tomli_w.dumps(model.model_dump(mode="json", exclude_defaults=True, exclude_none=True))
     driven = _odometry_columns(log)
     measured = _measurement_columns(log)
     columns = {"odometry": ",".join(driven), "measurements": ",".join(measured)}
@@ -376,8 +341,81 @@ def log_files(log: Log) -> dict[str, str]:
         "odometry.csv": table_text(tuple(driven), *driven.values()),
         "measurements.csv": table_text(tuple(measured), *measured.values()),
         "README.md": _README.format(**columns, held=held) + more,
-        "log.toml": text,
+        "log.toml": _settings_text(model),
     }
+
+
+def _settings_text(settings: _Settings) -> str:
+    """Return ``log.toml``."""
+    import tomli_w
+
+    return tomli_w.dumps(settings.model_dump(mode="json", exclude_defaults=True, exclude_none=True))
+
+
+class RowsHeard:
+    """A log of scans without labels, written as they are heard, beside odometry that is there.
+
+    Parameters
+    ----------
+    folder : Path
+        Holds ``odometry.csv``, and a ``recording.toml`` that was read.
+    about : dict
+        Its table ``log``: keys of ``log.toml``.
+    callers : list of dict
+        As ``log.toml`` lists them.
+
+    Raises
+    ------
+    InputError
+        Where the table or the odometry are not as those of a log.
+    """
+
+    columns = ("time", *MEASUREMENT[1:], *STATED, CALLER)
+
+    def __init__(self, folder: Path, about: dict[str, Any], callers: list[dict[str, Any]]) -> None:
+        raw = about | {"format": 1, "callers": callers}
+        self._settings = _checked_settings(raw, f"{folder / 'recording.toml'}, table 'log'")
+        self._names = np.array(["", *(caller.name for caller in self._settings.callers)])
+        odometry = read_odometry(folder, self._settings.motion)
+        self._span = odometry.column["time"][[0, -1]].tolist()
+        self._odometry = folder / "odometry.csv"
+        self.rows = self.inside = 0
+        """Rows that were heard, and those of them that the odometry's times hold."""
+
+    def text(self, scan: Scan) -> str:
+        """Return the rows of a scan, as ``measurements.csv`` has them, without the header."""
+        time = np.full(len(scan.bearing), scan.time)
+        column = [_said(scan, name) for name in self.columns[1:-1]]
+        self.rows += time.size
+        self.inside += time.size * (self._span[0] <= scan.time <= self._span[1])
+        text = table_text(self.columns, time, *column, self._names[scan.caller])
+        return text.split("\n", 1)[1]
+
+    def files(self) -> dict[str, str]:
+        """Return the log's other files; refuse a log of which no row can be used."""
+        if not self.inside:
+            found = f"{self.rows} echoes, none between {self._span[0]!r} s and {self._span[1]!r} s"
+            fix = "use the odometry's clock ('start' of recording.toml), or a lower threshold"
+            raise refusal(self._odometry, found, "echoes while it drives", fix)
+        columns = {
+            "odometry": ",".join(("time", *_ODOMETRY[self._settings.motion])),
+            "measurements": ",".join(self.columns),
+        }
+        held = _FOLLOWED if self._settings.motion == "poses" else _HELD
+        return {
+            "odometry.csv": read_text(self._odometry),
+            "README.md": _README.format(**columns, held=held) + _EXCESS_PATHS,
+            "log.toml": _settings_text(self._settings),
+        }
+
+
+def _said(scan: Scan, name: str) -> np.ndarray:
+    """Return a column of a scan as a log's rows say it."""
+    values = getattr(scan, name)
+    if name == "excess_path" and scan.direct.size:
+        values = values.copy()
+        values[scan.direct[scan.direct >= 0]] = 0.0
+    return values
 
 
 def _read_settings(path: Path) -> tuple[_Settings, tuple[str, ...]]:

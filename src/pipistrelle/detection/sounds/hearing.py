@@ -10,15 +10,13 @@ from jaxtyping import Bool, Complex
 
 from pipistrelle.config import Config
 from pipistrelle.detection.echoes import unlabelled_scan, with_edge_floor
-from pipistrelle.detection.logs.folder import log_of
-from pipistrelle.detection.logs.recording import Log
 from pipistrelle.detection.matched import filter_blocks
 from pipistrelle.detection.scans import Scan
 from pipistrelle.detection.snapshots import Detections, Detector, detect, detections_at, detector
 from pipistrelle.detection.sounds.array_csv import FILE as ARRAY
 from pipistrelle.detection.sounds.array_csv import Microphones, read_array
 from pipistrelle.detection.sounds.calls import Calls, find_calls
-from pipistrelle.detection.sounds.description import Description, read_description
+from pipistrelle.detection.sounds.description import Description
 from pipistrelle.detection.sounds.noise_level import set_noise
 from pipistrelle.detection.sounds.sound_file import Sound, open_sound
 from pipistrelle.detection.sounds.tone_sums import Blocks, ToneSums, blocks_of
@@ -135,28 +133,26 @@ class _Room:
 
 def hear_recording(
     folder: Path,
+    about: Description,
     config: Config,
     frames: Callable[[int], range],
     look: Callable[[Frame], None],
     progress: Progress | None = None,
-) -> Log:
-    """Hear a recording, and return what was heard as a log without labels.
+) -> None:
+    """Hear a recording, call by call.
 
     `frames`: given the number of calls, which of them are heard; `look`: given each.
     """
-    about = read_description(folder)
     with open_sound(folder, about) as sound:
         hearing = Hearing.of(folder, sound, about, config)
-        numbers, scans = frames(hearing.calls.sample.size), []
+        numbers = frames(hearing.calls.sample.size)
         for done, frame in enumerate(hearing.frames(numbers), start=1):
             look(frame)
-            scans.append(frame.scan)
             if progress:
                 progress("hearing", done, len(numbers))
-    return log_of(folder, about.log, _callers(about), scans)
 
 
-def _callers(about: Description) -> list[dict[str, Any]]:
+def log_callers(about: Description) -> list[dict[str, Any]]:
     """Return the callers, as ``log.toml`` lists them."""
     return [
         {"name": one.name, "landmark": number if one.landmark is None else one.landmark}
