@@ -12,6 +12,7 @@ from pipistrelle.detection.sounds.description import read_description
 from pipistrelle.detection.sounds.hearing import Frame, hear_recording, log_callers
 from pipistrelle.detection.sounds.overview import Overview
 from pipistrelle.experiments.hearing.listening import Progress
+from pipistrelle.experiments.runs.truth_files import read_truth
 from pipistrelle.files import PiecesFile, read_text
 from pipistrelle.own_files import LOG, OwnFiles, claim, drawn_files, make_folder, remove_empty
 from pipistrelle.refusals import refusal
@@ -184,6 +185,7 @@ def heard_of(
     about = read_description(folder)
     overview = Overview(names=("vehicle", *(one.name for one in about.callers)))
     log = RowsHeard(folder, about.log, log_callers(about))
+    read_truth(folder, log.time)  # refuses odd truth, which is kept beside the log
     write(",".join(log.columns) + "\n")
 
     def look(frame: Frame) -> None:

@@ -235,7 +235,6 @@ def read_log(folder: Path) -> Log:
     (0.5, array([7]), array([nan]))
     """
     settings, former = _read_settings(folder / "log.toml")
-    stds = _NOISY[settings.motion]
     names = tuple(caller.name for caller in settings.callers)
     measured = read_table(
         folder / "measurements.csv",
@@ -245,15 +244,24 @@ def read_log(folder: Path) -> Log:
         words={CALLER: names or ("a name that [[callers]] of log.toml have",)},
     )
     measured.column[CALLER] += 1.0  # the vehicle is number 0
+    odometry = read_odometry(folder, settings.motion)
+    return _assembled(folder, settings, odometry, measured, (*measured.former, *former))
+
+
+def _assembled(
+    folder: Path, settings: _Settings, odometry: Table, measured: Table, former: tuple[str, ...]
+) -> Log:
+    """Return the log of settings and tables."""
+    stds = _NOISY[settings.motion]
     values = {name: getattr(settings, name) for name in _SHARED}
     values["association"] = settings.association.model_dump(exclude_none=True)
     values["callers"] = tuple(LogCaller(**caller.model_dump()) for caller in settings.callers)
     return assemble(
-        read_odometry(folder, settings.motion),
+        odometry,
         measured,
         step=settings.step,
         name=folder.resolve().name,
-        former_names=(*measured.former, *former),
+        former_names=former,
         wheelbase=getattr(settings, "wheelbase", 1.0),
         speed_offset=getattr(settings, "speed_offset", 0.0),
         control_std=tuple(getattr(settings, f"{name}_std") for name in stds),
@@ -371,14 +379,20 @@ class RowsHeard:
     """
 
     columns = ("time", *MEASUREMENT[1:], *STATED, CALLER)
+    """Of ``measurements.csv``."""
 
     def __init__(self, folder: Path, about: dict[str, Any], callers: list[dict[str, Any]]) -> None:
         raw = about | {"format": 1, "callers": callers}
         self._settings = _checked_settings(raw, f"{folder / 'recording.toml'}, table 'log'")
         self._names = np.array(["", *(caller.name for caller in self._settings.callers)])
-        odometry = read_odometry(folder, self._settings.motion)
-        self._span = odometry.column["time"][[0, -1]].tolist()
         self._odometry = folder / "odometry.csv"
+        odometry = read_odometry(folder, self._settings.motion)
+        begin = {"time": odometry.column["time"][:1], "landmark": np.array([UNLABELLED])}
+        nothing = dict.fromkeys(("range", *STATED, CALLER), np.full(1, np.nan))
+        column = begin | {"bearing": np.zeros(1)} | nothing
+        one = Table(path=self._odometry, line=np.ones(1, dtype=np.int64), column=column)
+        log = _assembled(folder, self._settings, odometry, one, ())  # refuses odd odometry
+        self.time = log.time
         self.rows = self.inside = 0
         """Rows that were heard, and those of them that the odometry's times hold."""
 
@@ -387,14 +401,15 @@ class RowsHeard:
         time = np.full(len(scan.bearing), scan.time)
         column = [_said(scan, name) for name in self.columns[1:-1]]
         self.rows += time.size
-        self.inside += time.size * (self._span[0] <= scan.time <= self._span[1])
+        self.inside += time.size * bool(self.time[0] <= scan.time <= self.time[-1])
         text = table_text(self.columns, time, *column, self._names[scan.caller])
         return text.split("\n", 1)[1]
 
     def files(self) -> dict[str, str]:
         """Return the log's other files; refuse a log of which no row can be used."""
         if not self.inside:
-            found = f"{self.rows} echoes, none between {self._span[0]!r} s and {self._span[1]!r} s"
+            begin, end = self.time[[0, -1]].tolist()
+            found = f"{self.rows} echoes, none between {begin!r} s and {end!r} s"
             fix = "use the odometry's clock ('start' of recording.toml), or a lower threshold"
             raise refusal(self._odometry, found, "echoes while it drives", fix)
         columns = {

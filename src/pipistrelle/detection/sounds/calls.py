@@ -123,7 +123,7 @@ def _trigger(sound: Sound, channel: int, where: str) -> Levels:
 def _leak(sound: Sound, blocks: Blocks) -> Levels:
     """Return the level of all channels at the frequency of the vehicle's call."""
     whole = blocks._replace(blank=0, tones=blocks.tones[:1])
-    sums = ToneSums(whole, np.arange(sound.channels)[np.newaxis], 1.0)
+    sums = ToneSums(whole, np.arange(sound.channels)[np.newaxis])
 
     def level(samples: Float[np.ndarray, "t m"]) -> Float[np.ndarray, " b"]:
         return np.sqrt((np.abs(sums(samples)) ** 2).sum(axis=(1, 2, 3)))

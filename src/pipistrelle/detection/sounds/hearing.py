@@ -10,7 +10,7 @@ from jaxtyping import Bool, Complex
 
 from pipistrelle.config import Config
 from pipistrelle.detection.echoes import unlabelled_scan, with_edge_floor
-from pipistrelle.detection.matched import filter_blocks
+from pipistrelle.detection.matched import Workspace, filter_blocks
 from pipistrelle.detection.scans import Scan
 from pipistrelle.detection.snapshots import Detections, Detector, detect, detections_at, detector
 from pipistrelle.detection.sounds.array_csv import FILE as ARRAY
@@ -72,7 +72,7 @@ class Hearing:
         where = str(folder / "recording.toml")
         blocks = blocks_of(sound.rate, about.call.duration, tones, where, about.call.deaf)
         calls = find_calls(folder, about, sound, blocks)
-        sums = ToneSums(blocks, microphones.channel, about.scale)
+        sums = ToneSums(blocks, microphones.channel)
         set_noise(sums, sound, calls, folder)
         settled = _settled(config, about)
         return cls(
@@ -91,7 +91,7 @@ class Hearing:
     def frames(self, numbers: Sequence[int]) -> Iterator[Frame]:
         """Hear what came after some of the calls, numbered from 0 on."""
         on, calls = self.blocks, self.calls
-        room = _Room()
+        room = Workspace()
         for k in numbers:
             first = int(calls.sample[k])
             samples = self.sound.read(first, int(calls.length[k]))
@@ -115,20 +115,6 @@ class Hearing:
         found = with_edge_floor(found, self.config)
         scan, _ = unlabelled_scan(time, found, self.config, self.own_clock)
         return Frame(time, matched, start, on.interval, found, scan)
-
-
-class _Room:
-    """Arrays that every frame uses anew."""
-
-    def __init__(self) -> None:
-        self._flat: dict[str, np.ndarray] = {}
-
-    def array(self, name: str, shape: tuple[int, ...]) -> Complex[np.ndarray, "..."]:
-        """Return the array of a name in a shape; its content is undefined."""
-        size = int(np.prod(shape))
-        if name not in self._flat or self._flat[name].size < size:
-            self._flat[name] = np.empty(size, dtype=np.complex128)
-        return self._flat[name][:size].reshape(shape)
 
 
 def hear_recording(

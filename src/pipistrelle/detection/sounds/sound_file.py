@@ -20,6 +20,10 @@ ENDINGS = (".wav", ".rf64", ".w64", ".flac", ".aif", ".aiff", ".caf", ".au")
 """Of files that are taken for sound."""
 
 
+LARGEST_SAMPLE = 1e12
+"""No sound is louder, in units of a file's 1."""
+
+
 class Sound:
     """Sound files that follow one another, as one."""
 
@@ -51,15 +55,16 @@ class Sound:
         return samples
 
     def refuse_odd(self, first: int, samples: Float[np.ndarray, "t m"]) -> None:
-        """Refuse samples that are no finite numbers."""
-        odd = ~np.isfinite(samples)
+        """Refuse samples that are no finite numbers, or none of a sound."""
+        odd = ~(np.abs(samples) <= LARGEST_SAMPLE)
         if odd.any():
             row, channel = (int(one[0]) for one in np.nonzero(odd))
             number = int(np.searchsorted(self._begin, first + row, side="right")) - 1
             where = f"{self.paths[number]}, channel {channel + 1}"
             place = first + row - int(self._begin[number])
             found = f"{samples[row, channel]} as sample {place} (from 0)"
-            raise refusal(where, found, "finite numbers", "cut it out, or record anew")
+            expected = f"finite numbers, up to {LARGEST_SAMPLE:g}"
+            raise refusal(where, found, expected, "cut it out, or record anew")
 
 
 @contextmanager

@@ -80,12 +80,12 @@ def blocks_of(
 class ToneSums:
     """Sums samples of the channels of an array, each scaled by its own noise."""
 
-    def __init__(self, blocks: Blocks, channel: Int[np.ndarray, "f e"], scale: float) -> None:
+    def __init__(self, blocks: Blocks, channel: Int[np.ndarray, "f e"]) -> None:
         self.blocks, self.channel = blocks, channel
         turns = np.outer(blocks.tones, np.arange(blocks.block)) / blocks.rate
         wave = np.exp(-2j * np.pi * turns)
         self._table = np.ascontiguousarray(np.stack((wave.real, wave.imag), axis=1))
-        self.gain = np.full((len(channel), blocks.tones.size, channel.shape[1]), 2.0 * scale)
+        self.gain = np.full((len(channel), blocks.tones.size, channel.shape[1]), 2.0)
         """What a sum is multiplied by."""
         self.mean = np.zeros(int(channel.max()) + 1)
         """Of the samples of each channel; taken away."""

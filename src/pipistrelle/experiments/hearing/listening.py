@@ -30,7 +30,7 @@ from pipistrelle.config import BLOCK, Config
 from pipistrelle.detection.direct import own_alone
 from pipistrelle.detection.echoes import unlabelled_scan, with_edge_floor
 from pipistrelle.detection.faces import FrameMeasurements, average_faces
-from pipistrelle.detection.matched import filter_blocks, filter_samples
+from pipistrelle.detection.matched import Workspace, filter_blocks, filter_samples
 from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.detection.snapshots import (
     Detections,
@@ -173,20 +173,6 @@ class _Record(NamedTuple):
     def lags(self) -> dict[str, Any]:
         """The lags as keyword arguments of a detector."""
         return {"start": self.start, "interval": self.interval, "pulse": self.pulse}
-
-
-class Workspace:
-    """Arrays that every frame uses anew: fresh memory costs more than the arithmetic on it."""
-
-    def __init__(self) -> None:
-        self._flat: dict[str, np.ndarray] = {}
-
-    def array(self, name: str, shape: tuple[int, ...]) -> Complex[np.ndarray, "..."]:
-        """Return the array of a name in a shape; its content is undefined."""
-        size = math.prod(shape)
-        if name not in self._flat or self._flat[name].size < size:
-            self._flat[name] = np.empty(size + size // 4, dtype=np.complex128)
-        return self._flat[name][:size].reshape(shape)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
