@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.logs.folder import RowsHeard
-from pipistrelle.detection.sounds.description import read_description
+from pipistrelle.detection.sounds.description import Description, read_description
 from pipistrelle.detection.sounds.hearing import Frame, hear_recording, log_callers
 from pipistrelle.detection.sounds.overview import Overview
 from pipistrelle.experiments.hearing.listening import Progress
@@ -179,10 +179,7 @@ def heard_of(
     text: Callable[[], str | None] = lambda: None,
 ) -> Heard:
     """Hear a recording; `write` is given the rows as text, and `text` returns them all."""
-    if not folder.is_dir():
-        found = "a file" if folder.exists() else "no such folder"
-        raise refusal(folder, found, "a sound recording's", "check the path")
-    about = read_description(folder)
+    about = _described(folder)
     overview = Overview(names=("vehicle", *(one.name for one in about.callers)))
     log = RowsHeard(folder, about.log, log_callers(about))
     read_truth(folder, log.time)  # refuses odd truth, which is kept beside the log
@@ -197,3 +194,18 @@ def heard_of(
     )
     log.files()  # refuses a log without rows
     return Heard(overview=overview, log=log, text=text())
+
+
+def faults_of(folder: Path, config: Config) -> list[str]:
+    """Return what is odd about a recording, a line each."""
+    from pipistrelle.detection.sounds.check import check_recording
+
+    return check_recording(folder, _described(folder), config)
+
+
+def _described(folder: Path) -> Description:
+    """Return what a recording says of itself; refuse what is no folder."""
+    if not folder.is_dir():
+        found = "a file" if folder.exists() else "no such folder"
+        raise refusal(folder, found, "a sound recording's", "check the path")
+    return read_description(folder)

@@ -7,7 +7,7 @@ from cyclopts import Parameter
 
 from pipistrelle.config import InputError
 from pipistrelle.own_files import LOG, claim
-from pipistrelle.scripting.hearing import heard_into, heard_settings, is_heard
+from pipistrelle.scripting.hearing import faults_of, heard_into, heard_settings, is_heard
 from pipistrelle.settings import from_flags
 from pipistrelle.verbs.console import progress
 from pipistrelle.verbs.options import setting_flags
@@ -43,11 +43,25 @@ def hear(
             help="Only the calls from number A, counted from 0, to before B. [default: all]",
         ),
     ] = None,
+    check: Annotated[
+        bool,
+        Parameter(
+            negative=(),
+            help="Look for mistakes instead: dead or clipped channels, a wrong sample rate, calls "
+            "that jump, channels and faces in another order.",
+        ),
+    ] = False,
     quiet: Annotated[bool, Parameter(negative=(), help="Print the log's folder alone.")] = False,
     settings: Annotated[HearFlags | None, Parameter(name="*")] = None,
 ) -> int:
     """Hear a sound recording into a log that `pipistrelle slam` solves."""
     config = heard_settings(from_flags(settings or {}))
+    if check:
+        faults = faults_of(recording, config)
+        put("\n".join(faults) or "nothing odd was found")
+        if faults:
+            warn(f"{recording}: odd in {len(faults)} ways")
+        return 1 if faults else 0
     if output is None:
         raise InputError("hear: found no folder for the log; name one with -o LOG")
     own = claim(output, LOG, overwrite=overwrite, flags=("-o LOG", "--overwrite"))
