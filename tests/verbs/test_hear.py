@@ -99,11 +99,9 @@ def test_a_check_says_nothing_of_a_sound_recording_and_names_a_fault(obey, tmp_p
 def test_what_is_no_recording_is_refused(obey):
     Path("file").touch()
     Path("empty").mkdir()
-    for place, words in (
-        ("file", "found a file"),
-        ("gone", "no such folder"),
-        ("empty", "recording.toml"),
-    ):
+    Path("link").symlink_to("nowhere")
+    kinds = {"file": "found a file", "gone": "no such folder", "empty": "recording.toml"}
+    for place, words in (kinds | {"link": "no such folder"}).items():
         status, printed, said = obey("hear", place, "-o", "log")
         assert (status, printed) == (2, "")
         assert words in said
