@@ -7,11 +7,12 @@ True
 """
 
 __version__: str
-__all__ = ["Config", "InputError", "Slam", "load", "run", "slam", "study"]
+__all__ = ["Config", "InputError", "Slam", "hear", "load", "run", "slam", "study"]
 _ROOMS = {
     "Config": "config",
     "InputError": "config",
     "Slam": "scripting.live",
+    "hear": "scripting.hearing",
     "load": "scripting.loading",
     "run": "scripting.results",
     "slam": "scripting.results",

@@ -32,6 +32,8 @@ STEEPEST = 1.1
 """No car's front wheels steer by more [rad]."""
 LONGEST_STEP = 1e5
 """No control step is longer [s]: more than a day."""
+BLOCK = 2e-4
+"""Length of a block of samples, over which a receiver sums [s]."""
 LEAST_STD = 1e-6
 """No measurement is surer [m] or [rad]: beside the other numbers its variance would be lost."""
 

@@ -7,6 +7,7 @@ new name that no link can have, and renamed when it is whole.
 import contextlib
 import os
 import re
+from hashlib import file_digest, sha256
 from pathlib import Path
 from uuid import uuid4
 
@@ -63,6 +64,53 @@ def _printable(path: Path) -> str:
 def partial_of(path: Path) -> Path:
     """Return a new name beside a file, under which it is written before it is whole."""
     return path.with_name(f"{path.name}.{uuid4().hex[:8]}.partial")
+
+
+def sum_of(path: Path) -> str:
+    """Return the SHA-256 sum of a file, read in pieces."""
+    with path.open("rb") as file:
+        return file_digest(file, "sha256").hexdigest()
+
+
+class PiecesFile:
+    """A new file that is written in pieces, beside the place that it is to have, and summed.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as place:
+    ...     long = PiecesFile(Path(place) / "long.wav")
+    ...     long.write(b"one")
+    ...     long.close()
+    ...     whole_name(long.path.name), long.sum == sum_of(long.path)
+    ('long.wav', True)
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = partial_of(path)
+        self._file = self.path.open("xb")
+        self._sum = sha256()
+
+    @property
+    def sum(self) -> str:
+        """The sum of what was written so far."""
+        return self._sum.hexdigest()
+
+    def write(self, data: bytes) -> None:
+        """Write one more piece."""
+        self._file.write(data)
+        self._sum.update(data)
+
+    def close(self) -> None:
+        """Write all down to the disk."""
+        if not self._file.closed:
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+
+    def discard(self) -> None:
+        """Remove the file where it was not put in its place."""
+        with contextlib.suppress(OSError):
+            self._file.close()
+            self.path.unlink(missing_ok=True)
 
 
 def whole_name(partial: str) -> str | None:

@@ -22,9 +22,11 @@ from typing import get_args
 
 from pipistrelle.config import InputError, Strategy
 from pipistrelle.files import (
+    PiecesFile,
     partial_of,
     put_in_place,
     read_file,
+    sum_of,
     whole_name,
     write_down,
     write_whole,
@@ -79,10 +81,18 @@ REPORT = Kind("a report", ("index.html", "summary.json"), ("figures/*",))
 LOG = Kind(
     "a log",
     ("log.toml", "odometry.csv", "measurements.csv", "truth.csv", "landmarks.csv", "README.md"),
+    ("hearing.png",),
+)
+SOUND = Kind(
+    "a sound recording",
+    (
+        *("recording.toml", "recording.wav", "array.csv", "calls.csv"),
+        *("odometry.csv", "truth.csv", "landmarks.csv", "README.md"),
+    ),
 )
 WORLD = Kind("a world", ("world.toml", "landmarks.csv", "path.csv", "README.md"), ("caller_*.csv",))
 COMPARISON = Kind("a comparison", ("comparison.*", "settings.csv", "README.md"))
-KINDS = (RESULTS, REPORT, LOG, WORLD, COMPARISON)
+KINDS = (RESULTS, REPORT, LOG, SOUND, WORLD, COMPARISON)
 COMMAND_LINE = ("-o DIR", "--overwrite")
 """How a user of the command line names another folder, and allows that results are replaced."""
 
@@ -257,17 +267,18 @@ class OwnFiles:
         if name not in self._sums or path.is_symlink() or not path.is_file():
             return False
         with contextlib.suppress(OSError):
-            return sha256(path.read_bytes()).hexdigest() in self._sums[name]
+            return sum_of(path) in self._sums[name]
         return False
 
-    def replace(self, files: Mapping[str, str | bytes]) -> None:
+    def replace(self, files: Mapping[str, str | bytes | PiecesFile]) -> None:
         """Write files in place of all that we wrote here before: all of them, or none.
 
         Parameters
         ----------
         files : mapping of name to content
             Names are relative to the folder, with slashes. The last is taken away first and put in
-            place last: where it stands, all stand.
+            place last: where it stands, all stand. A file that was written in pieces is beside its
+            place already, and closed.
 
         Raises
         ------
@@ -288,15 +299,18 @@ class OwnFiles:
         self.check_kind()
         self._write({name: content}, keep=True)
 
-    def _write(self, files: Mapping[str, str | bytes], *, keep: bool) -> None:
+    def _write(self, files: Mapping[str, str | bytes | PiecesFile], *, keep: bool) -> None:
         """Write files under other names, list them, and then give them their own."""
         contents = {n: c.encode() if isinstance(c, str) else c for n, c in files.items()}
         for name in contents:
             if not self.kind.writes(name):
                 raise ValueError(f"{name}: is no file of {self.kind.title}")
             self.refuse(name)
-        before, new = self._sums, {n: {sha256(c).hexdigest()} for n, c in contents.items()}
-        partials = {name: partial_of(self.folder / name) for name in contents}
+        before, new = self._sums, {n: {_sum_of(c)} for n, c in contents.items()}
+        partials = {
+            name: c.path if isinstance(c, PiecesFile) else partial_of(self.folder / name)
+            for name, c in contents.items()
+        }
         made: list[Path] = []
         at = self.folder
         try:
@@ -306,7 +320,9 @@ class OwnFiles:
                 for name, partial in partials.items():
                     at = self.folder / name
                     made = [*make_folder(partial.parent), *made]
-                    write_down(partial, contents[name])
+                    content = contents[name]
+                    if isinstance(content, bytes):
+                        write_down(partial, content)
             except BaseException:
                 self._list_again(before, partials.values(), made)
                 raise
@@ -353,6 +369,11 @@ class OwnFiles:
         data = text.encode(errors="surrogateescape")
         write_whole(self.folder / SUMS, data, replace=self._there is not None)
         self._list, self._there, self._sums = data, self.kind.title, dict(sums)
+
+
+def _sum_of(content: bytes | PiecesFile) -> str:
+    """Return the sum of what is to be a file."""
+    return content.sum if isinstance(content, PiecesFile) else sha256(content).hexdigest()
 
 
 def _in_the_way(path: Path, what: str) -> InputError:

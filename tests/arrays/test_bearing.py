@@ -9,8 +9,8 @@ from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.beamforming import bearing_bound
 from pipistrelle.arrays.layout import Layout, square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
-from pipistrelle.arrays.sampling import BLOCK, sampling
-from pipistrelle.config import Config, DetectionConfig
+from pipistrelle.arrays.sampling import sampling
+from pipistrelle.config import BLOCK, Config, DetectionConfig
 from pipistrelle.detection.matched import filter_blocks
 from pipistrelle.detection.snapshots import detect, detector
 from pipistrelle.geometry import wrap

@@ -11,8 +11,8 @@ from pipistrelle.acoustics.callers import callers_of
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.layout import Layout, square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
-from pipistrelle.arrays.sampling import BLOCK, blocks_to_hear, sampling
-from pipistrelle.config import Config, DetectionConfig
+from pipistrelle.arrays.sampling import blocks_to_hear, sampling
+from pipistrelle.config import BLOCK, Config, DetectionConfig
 from pipistrelle.detection.matched import filter_blocks, filter_samples
 from pipistrelle.detection.snapshots import detect, detector
 

@@ -9,8 +9,15 @@ from pipistrelle.acoustics.arrivals import Arrivals, arrivals_of_emission
 from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
-from pipistrelle.arrays.sampling import BLOCK, blocks_to_hear, sampling
-from pipistrelle.config import BeaconConfig, Config, EmitterConfig, InputError, ReceiverConfig
+from pipistrelle.arrays.sampling import blocks_to_hear, sampling
+from pipistrelle.config import (
+    BLOCK,
+    BeaconConfig,
+    Config,
+    EmitterConfig,
+    InputError,
+    ReceiverConfig,
+)
 
 law = settings(deadline=None, max_examples=40)
 CONFIG = Config()

@@ -13,8 +13,8 @@ from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.beamforming import bearing_bound, steering_vector
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
-from pipistrelle.arrays.sampling import BLOCK, sampling
-from pipistrelle.config import Config, DetectionConfig
+from pipistrelle.arrays.sampling import sampling
+from pipistrelle.config import BLOCK, Config, DetectionConfig
 from pipistrelle.detection.certainty import (
     MIN_POWER_OVER_NOISE,
     bearing_std,

@@ -11,8 +11,8 @@ from pipistrelle.acoustics.callers import callers_of
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
-from pipistrelle.arrays.sampling import BLOCK, sampling
-from pipistrelle.config import Config
+from pipistrelle.arrays.sampling import sampling
+from pipistrelle.config import BLOCK, Config
 from pipistrelle.detection.certainty import EXCESS_PATH_FLOOR
 from pipistrelle.detection.faces import average_faces
 from pipistrelle.detection.matched import filter_blocks

@@ -15,8 +15,8 @@ from pipistrelle.acoustics.callers import callers_of
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
-from pipistrelle.arrays.sampling import BLOCK, sampling
-from pipistrelle.config import Config, DetectionConfig, ScenarioConfig
+from pipistrelle.arrays.sampling import sampling
+from pipistrelle.config import BLOCK, Config, DetectionConfig, ScenarioConfig
 from pipistrelle.detection.certainty import EDGE_FLOOR, NOISE_QUANTILE, bearing_std
 from pipistrelle.detection.matched import filter_blocks
 from pipistrelle.detection.overlaps import MOST, deviation, most_left, resolve, room_for

@@ -15,8 +15,8 @@ from pipistrelle.arithmetic.random_stream import complex_noise, stream_key
 from pipistrelle.arrays.beamforming import beamscan
 from pipistrelle.arrays.layout import Layout, square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
-from pipistrelle.arrays.sampling import BLOCK, blocks_to_hear, sampling
-from pipistrelle.config import Config, DetectionConfig
+from pipistrelle.arrays.sampling import blocks_to_hear, sampling
+from pipistrelle.config import BLOCK, Config, DetectionConfig
 from pipistrelle.detection.matched import filter_blocks, filter_samples
 from pipistrelle.detection.snapshots import Detections, _scan_power, detect, detector
 from pipistrelle.geometry import wrap

@@ -20,7 +20,16 @@ app = App(
 @app.default
 def fuzz(
     target: Literal[
-        "logs", "settings", "studies", "kills", "steps", "ownership", "results", "worlds", "bags"
+        "logs",
+        "settings",
+        "studies",
+        "kills",
+        "steps",
+        "ownership",
+        "results",
+        "worlds",
+        "bags",
+        "sounds",
     ],
     /,
     *,

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fuzz import bags, kills, logs, ownership, results, settings, steps, studies, worlds
+from fuzz import bags, kills, logs, ownership, results, settings, sounds, steps, studies, worlds
 from fuzz.judging import Tried
 from fuzz.running import load_all
 
@@ -26,6 +26,7 @@ TARGETS: dict[str, ModuleType] = {
     "results": results,
     "worlds": worlds,
     "bags": bags,
+    "sounds": sounds,
 }
 """Each has `prepare`, for all tries, and `attempt`. A number in the order keys their randomness."""
 EVERY = 30.0

@@ -252,8 +252,8 @@ def test_importing_the_package_loads_no_numpy_and_lists_its_doors():
         " dir(pipistrelle)); pipistrelle.nothing"
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    doors = "[] ['Config', 'InputError', 'Slam', '__version__', 'load', 'run', 'slam', 'study']"
-    assert ran.stdout.startswith(doors)
+    doors = "[] ['Config', 'InputError', 'Slam', '__version__', 'hear', 'load', 'run', 'slam', "
+    assert ran.stdout.startswith(doors + "'study']")
     assert "module 'pipistrelle' has no attribute 'nothing'" in ran.stderr
 
 

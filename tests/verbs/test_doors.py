@@ -15,16 +15,19 @@ from pipistrelle.config import InputError
 from pipistrelle.verbs.command_line import app
 from reference.command_line import SHORT
 from reference.results import loop, mission_folder
+from reference.sounds import record
 from reference.studies import TINY
 
 LOG = Path(__file__).parents[1] / "data" / "unicycle_log"
-READ = {"--world", "--log", "LOG", "FOLDER", "--folder", "FOLDERS"}
+READ = {"--world", "--log", "LOG", "RECORDING", "FOLDER", "--folder", "FOLDERS"}
 """What names a place that is only read."""
 RUN = ("run", *SHORT, "--strategy", "fused", "-o")
 COMMANDS = {
     "run --output": (*RUN, "d"),
     "run --save-log": (*RUN, "new", "--save-log", "d"),
     "run --save-world": (*RUN, "new", "--save-world", "d"),
+    "run --save-sound": (*RUN, "new", "--save-sound", "d"),
+    "hear --output": ("hear", "tape", "-o", "d"),
     "slam --output": ("slam", LOG, "-o", "d"),
     "study --output": ("study", "tiny.toml", "--workers", "1", "-o", "d"),
     "report --output": ("report", "s", "-o", "d"),
@@ -37,6 +40,7 @@ CALLS = {
     "run": lambda o: pipistrelle.run(
         duration=2.0, landmarks=5, strategies="fused", output="d", **o
     ),
+    "hear": lambda o: pipistrelle.hear("tape", output="d", **o),
     "slam": lambda o: pipistrelle.slam(LOG, output="d", **o),
     "save": lambda o: pipistrelle.run(duration=2.0, landmarks=5, strategies="fused").save("d", **o),
     "study": lambda o: pipistrelle.study("tiny.toml", output="d"),
@@ -52,13 +56,14 @@ BY_NAME = (*ALWAYS, "array --output", "view --output", "view --rerun")
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A plan, its study, and two missions."""
+    """A plan, its study, two missions and a recording."""
     here = tmp_path_factory.mktemp("made")
     (here / "tiny.toml").write_text(TINY)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(here)
         patch.setattr(sys, "argv", ["pipistrelle"])
         assert main(["study", "tiny.toml", "--workers", "1", "--quiet", "-o", "s"]) == 0
+    record(here / "tape", "--frames", "0:2", drive=("--receiver.elements", "2", "--duration", "2"))
     for name in ("one", "two"):
         mission_folder(here / name, {("fused", "ekf"): loop()})
     return here
@@ -101,7 +106,7 @@ def contents(folder):
 def test_each_flag_that_takes_a_path_is_known_to_read_or_to_write():
     found = {
         f"{verb} {argument.names[0]}"
-        for verb in ("array", "run", "slam", "view", "report", "compare", "study")
+        for verb in ("array", "run", "hear", "slam", "view", "report", "compare", "study")
         for argument in app[verb].assemble_argument_collection()
         if argument.hint is Path or Path in get_args(argument.hint)
         if not READ & {*argument.names}

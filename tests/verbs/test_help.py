@@ -27,7 +27,9 @@ def test_help_and_version_load_neither_numpy_nor_pydantic():
 def test_help_names_the_verbs(obey):
     status, printed, _ = obey("--help")
     assert status == 0
-    verbs = ["array", "compare", "config", "doctor", "report", "run", "slam", "study", "view"]
+    verbs = [
+        *("array", "compare", "config", "doctor", "hear", "report", "run", "slam", "study", "view")
+    ]
     assert re.findall(r"^│ (\w+) ", printed, re.M) == verbs
     assert obey()[1] == printed
 

@@ -33,7 +33,7 @@ import pytest
         ("study --beamwidth 5", "--beamwidth. Did you mean --emitter.radius?"),
         ("run --receiver.sample-rate 20", "found 20 Hz, expected a multiple of 5000 Hz"),
         ("config show --receiver.sample-rate 20", "found 20 Hz, expected a multiple of 5000 Hz"),
-        ("run walk.wav", "found 'walk.wav', an audio recording, which is not read; detect the ec"),
+        ("run walk.wav", "found 'walk.wav', an audio recording, which is no log; make a log fold"),
         ("report", "FOLDER requires an argument"),
         ("report --folder one", "Unknown option: --folder"),
         ("run --filter mine.py:Own", "; write mine:Own"),

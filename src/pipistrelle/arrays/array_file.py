@@ -74,12 +74,14 @@ class _Row(NamedTuple):
     gain_db: float = 0.0
 
 
-def read_array(path: Path) -> Microphones:
+def read_array(path: Path, *, some: bool = False) -> Microphones:
     r"""Read the microphones of a file, CSV or Acoular's XML.
 
     Parameters
     ----------
     path : Path
+    some : bool
+        Whether the channels are some of a recording's, counted from 1.
 
     Returns
     -------
@@ -109,7 +111,7 @@ def read_array(path: Path) -> Microphones:
     text = read_text(path)
     rows = list((_rows_of_xml if text.lstrip()[:1] == "<" else _rows_of_csv)(path, text))
     rows.sort(key=lambda row: row.channel)
-    return _checked(str(path), rows)
+    return _checked(str(path), rows, some=some)
 
 
 def microphones_of(rows: Sequence[MicrophoneRow], where: str = "receiver.array") -> Microphones:
@@ -142,9 +144,10 @@ def with_array(layer: Layer) -> Layer:
     return layer | {ARRAY_KEY: given._replace(value=rows)}
 
 
-def _checked(where: str, rows: list[_Row]) -> Microphones:
+def _checked(where: str, rows: list[_Row], *, some: bool = False) -> Microphones:
     """Return microphones, in the order of their channels; refuse what is no array."""
-    _check(where, rows)
+    _check_channels(where, rows, some=some)
+    _check_places(where, rows)
     return Microphones(
         channel=np.array([row.channel for row in rows]),
         position=np.array([(row.x, row.y, row.z) for row in rows]),
@@ -261,8 +264,11 @@ def _row(path: Path, line: int, fields: dict[str, str]) -> _Row:
     return _Row(f"line {line}", channel=int(channel), face=face, **numbers)
 
 
-def _check(path: str, rows: list[_Row]) -> None:
-    """Refuse rows, in the order of their channels, that are no array."""
+def _check_channels(path: str, rows: list[_Row], *, some: bool) -> None:
+    """Refuse rows, in the order of their channels, whose channels are not numbered as they should.
+
+    `some`: whether others may be between them.
+    """
     if not 2 <= len(rows) <= MAX_MICROPHONES:
         found = f"{len(rows)} microphone" + "s" * (len(rows) != 1)
         expected = f"2 to {MAX_MICROPHONES}"
@@ -272,14 +278,22 @@ def _check(path: str, rows: list[_Row]) -> None:
         if row.channel == before.channel:
             expected = f"it once, as in {before.place}"
             raise refusal(where, f"channel {row.channel} again", expected, "renumber one")
-        if row.channel != before.channel + 1:
+        if row.channel != before.channel + 1 and not some:
             found = f"channel {row.channel} after {before.channel}"
             fix = "add the row, or number the channels without gaps"
             raise refusal(where, found, f"channel {before.channel + 1}", fix)
-    if rows[0].channel > 1:
+    if some and rows[0].channel == 0:
+        where = f"{path}, {rows[0].place}"
+        fix = "number the recording's channels from 1"
+        raise refusal(where, "channel 0", "1 or more", fix)
+    if rows[0].channel > 1 and not some:
         where = f"{path}, {rows[0].place}"
         found = f"{rows[0].channel} as the first channel"
         raise refusal(where, found, "0 or 1", "add the rows, or number the channels from 1")
+
+
+def _check_places(path: str, rows: list[_Row]) -> None:
+    """Refuse microphones that stand in one place, or implausibly far apart."""
     place = np.array([(row.x, row.y, row.z) for row in rows])
     extent = float(np.ptp(place, axis=0).max())
     if extent > MAX_EXTENT:

@@ -91,18 +91,25 @@ class Scattered:
 
 def layout_of(config: Config) -> Layout | Scattered:
     """Return the arrays of the settings: the only place that chooses them."""
+    if config.receiver.array == SQUARE:
+        return square_of_four(config.receiver)
+    return scattered(microphones_in(config))
+
+
+def microphones_in(config: Config) -> Microphones:
+    """Return the microphones of the settings."""
     array = config.receiver.array
     if array == SQUARE:
-        return square_of_four(config.receiver)
-    return scattered(read_array(Path(array)) if isinstance(array, str) else microphones_of(array))
+        return square_microphones(config.receiver)
+    return read_array(Path(array)) if isinstance(array, str) else microphones_of(array)
 
 
-def scattered(microphones: Microphones) -> Scattered:
+def scattered(microphones: Microphones, where: str = "receiver.array") -> Scattered:
     """Group the microphones of an array: by face, and those that hang free.
 
     A face whose microphones are alike and stand in one equally spaced line hears on one side, the
     one away from the middle of the array; of a line through the middle, the one on whose left its
-    last channel is.
+    last channel is. `where` they are from is said in refusals.
 
     >>> front = [(0.03, -0.02, 0, 0, "front"), (0.03, 0.02, 0, 0, "front")]
     >>> stern = [(-0.05, 0.0, 0, 0, ""), (-0.05, 0.01, 0, 0, "")]
@@ -116,7 +123,7 @@ def scattered(microphones: Microphones) -> Scattered:
         if count < 2:
             found = "on face " + name if name else "that hangs free"
             expected = "two or more, as one alone hears no direction; add one, or leave it out"
-            raise InputError(f"receiver.array: found one microphone {found}, expected {expected}")
+            raise InputError(f"{where}: found one microphone {found}, expected {expected}")
     middle, gain = place.mean(axis=0), microphones.gain_db
     normal = [
         _normal(place[group == g], middle) if name and np.ptp(gain[group == g]) == 0.0 else np.nan
@@ -129,6 +136,37 @@ def scattered(microphones: Microphones) -> Scattered:
         normal=np.array(normal),
         name=names,
     )
+
+
+def at_one_centre(microphones: Microphones, where: str) -> tuple[Layout, Int[np.ndarray, "f e"]]:
+    """Return faces of equal lines as if all stood at the vehicle's point.
+
+    The number of each element's microphone is returned, too. Faces are in the order of their first
+    channels; `where` they are from is said in refusals.
+
+    >>> layout, microphone = at_one_centre(square_microphones(ReceiverConfig(elements=2)), "")
+    >>> layout.shape, microphone.tolist()
+    ((4, 2), [[0, 1], [2, 3], [4, 5], [6, 7]])
+    """
+    array = scattered(microphones, where)
+    if np.isnan(array.normal).any():
+        odd = array.name[int(np.argmax(np.isnan(array.normal)))]
+        found = f"{odd!r}, which is no evenly spaced line of them" if odd else "microphones alone"
+        raise InputError(f"{where}: found {found}, expected lines on faces where one_centre is set")
+    lines = sorted((along_line(array, g) for g in range(array.normal.size)), key=_first)
+    positions = [line.position for _, line in lines]
+    alike = len({place.size for place in positions}) == 1
+    if not alike or np.ptp(positions, axis=0).max() > LINE_TOLERANCE:
+        expected = "lines of one length and spacing where one_centre is set"
+        raise InputError(f"{where}: found faces that are not alike, expected {expected}")
+    normal = np.array([line.normal[0] for _, line in lines])
+    members = np.array([numbers for numbers, _ in lines])
+    return Layout(normal=normal, position=np.mean(positions, axis=0)), members
+
+
+def _first(line: tuple[Int[np.ndarray, " k"], Layout]) -> int:
+    """Return the first of a line's microphones."""
+    return int(line[0].min())
 
 
 def square_microphones(receiver: ReceiverConfig) -> Microphones:

@@ -36,8 +36,8 @@ from pipistrelle.acoustics.arrivals import Arrivals
 from pipistrelle.acoustics.call import ToneBurst
 from pipistrelle.arithmetic.random_stream import complex_noise
 from pipistrelle.arrays.layout import Layout, Scattered
-from pipistrelle.arrays.sampling import BLOCK, Sampling, block_shape
-from pipistrelle.config import InputError
+from pipistrelle.arrays.sampling import Sampling, block_shape
+from pipistrelle.config import BLOCK, InputError
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 

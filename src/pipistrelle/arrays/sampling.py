@@ -12,10 +12,7 @@ from pipistrelle.acoustics.call import Call, ToneBurst
 from pipistrelle.acoustics.callers import MAX_CALLERS, Caller, check_caller
 from pipistrelle.acoustics.medium import Medium, medium_of
 from pipistrelle.arrays.layout import Layout, Scattered
-from pipistrelle.config import SQUARE, Config, InputError
-
-BLOCK = 2e-4
-"""Length of a block [s]."""
+from pipistrelle.config import BLOCK, SQUARE, Config, InputError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -55,12 +55,15 @@ FrontEnd = Detector | Groups
 
 
 def front_end(
-    config: Config, layout: Layout | Scattered, tones: Float[np.ndarray, " c"]
+    config: Config,
+    layout: Layout | Scattered,
+    tones: Float[np.ndarray, " c"],
+    where: str = "receiver.array",
 ) -> FrontEnd:
     """Settle what finds calls of some tones [Hz] in the outputs of a layout.
 
-    Raises InputError as `detector` does, for microphones too far apart, and for detection settings
-    that lines on faces alone can meet.
+    `where` the layout is from is said in refusals. Raises InputError as `detector` does, for
+    microphones too far apart, and for detection settings that lines on faces alone can meet.
 
     >>> from pipistrelle.arrays.array_file import microphones_of
     >>> from pipistrelle.arrays.layout import scattered
@@ -77,10 +80,9 @@ def front_end(
     for g, normal in enumerate(layout.normal):
         if math.isnan(normal):
             members.append(np.flatnonzero(layout.group == g))
-            _refuse_lines_own(config)
-            _refuse_far_apart(
-                layout.position[members[-1]], config.assumed_sound_speed / tones.max()
-            )
+            _refuse_lines_own(config, where)
+            wavelength = config.assumed_sound_speed / tones.max()
+            _refuse_far_apart(layout.position[members[-1]], wavelength, where)
             finders.append(circle_of(config, layout, g, tones))
             snrs.append((finders[-1].threshold - 1.0) / np.sum(layout.amplitude[members[-1]] ** 2))
         else:
@@ -144,23 +146,23 @@ def call_in(
     return detections_at(near, near.caller == caller)
 
 
-def _refuse_lines_own(config: Config) -> None:
+def _refuse_lines_own(config: Config, where: str) -> None:
     """Refuse settings that only line arrays on faces know."""
     for key, usual in (("snapshots", "maxima"), ("overlaps", "merge")):
         if (found := getattr(config.detection, key)) != usual:
             raise InputError(
                 f"detection.{key}: found {found!r}, which only lines on faces have, for the "
-                f"microphones of receiver.array that hear all around; expected {usual!r}"
+                f"microphones of {where} that hear all around; expected {usual!r}"
             )
 
 
-def _refuse_far_apart(place: Float[np.ndarray, "k 2"], wavelength: float) -> None:
+def _refuse_far_apart(place: Float[np.ndarray, "k 2"], wavelength: float, where: str) -> None:
     """Refuse a microphone whose nearest neighbour is too many waves away."""
     apart = np.linalg.norm(place[:, np.newaxis] - place, axis=-1)
     np.fill_diagonal(apart, np.inf)
     if (gap := float(apart.min(axis=1).max())) > MAX_SPACING * wavelength:
         raise InputError(
-            f"receiver.array: found a microphone {gap:g} m, {gap / wavelength:.0f} waves, from the "
+            f"{where}: found a microphone {gap:g} m, {gap / wavelength:.0f} waves, from the "
             f"next; expected at most {MAX_SPACING}; if x, y, z are millimetres, divide by 1000"
         )
 

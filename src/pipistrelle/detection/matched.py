@@ -10,6 +10,20 @@ from pipistrelle.acoustics.call import Call
 from pipistrelle.jit import Whole, kernel
 
 
+class Workspace:
+    """Arrays that every frame uses anew: fresh memory costs more than the arithmetic on it."""
+
+    def __init__(self) -> None:
+        self._flat: dict[str, np.ndarray] = {}
+
+    def array(self, name: str, shape: tuple[int, ...]) -> Complex[np.ndarray, "..."]:
+        """Return the array of a name in a shape; its content is undefined."""
+        size = math.prod(shape)
+        if name not in self._flat or self._flat[name].size < size:
+            self._flat[name] = np.empty(size + size // 4, dtype=np.complex128)
+        return self._flat[name][:size].reshape(shape)
+
+
 def filter_blocks(
     blocks: Complex[np.ndarray, "b f c e"],
     *,

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from pipistrelle.arrays.layout import Layout, Scattered
-from pipistrelle.arrays.sampling import BLOCK, Sampling
-from pipistrelle.config import Config, InputError, ScenarioConfig
+from pipistrelle.arrays.sampling import Sampling
+from pipistrelle.config import BLOCK, Config, InputError, ScenarioConfig
 from pipistrelle.estimation.catalogue import COPIES, DOUBLE, entry
 from pipistrelle.estimation.rays import ray_members
 from pipistrelle.experiments.hearing.scenario import Scenario

@@ -1,7 +1,8 @@
-"""The Python interface: `run`, `slam`, `study`, `load`, and the results that they return.
+"""The Python interface: `run`, `hear`, `slam`, `study`, `load`, and the results that they return.
 
 `arguments` reads settings and names, `log_settings` is what a log decides of them, `missions` runs
-them, `results` and `studies` are what is returned. The command line (`verbs`) calls the same.
+them, `hearing` takes sound to a log, `results` and `studies` are what is returned. The command line
+(`verbs`) calls the same.
 """
 
 from lazy_loader import attach
@@ -9,6 +10,7 @@ from lazy_loader import attach
 __getattr__, __dir__, __all__ = attach(
     __name__,
     submod_attrs={
+        "hearing": ["Heard", "hear"],
         "loading": ["load"],
         "results": ["Results", "run", "slam"],
         "studies": ["StudyResults", "study"],

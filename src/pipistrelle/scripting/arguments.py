@@ -143,6 +143,25 @@ def number(given: Given) -> float:
     return float(given.value)
 
 
+def frames_named(text: str | None, count: int, where: str) -> range:
+    """Return the frames that a slice names, A:B, of so many; all of None.
+
+    >>> frames_named("2:4", 10, "--frames"), frames_named(":3", 10, "--frames")
+    (range(2, 4), range(0, 3))
+    """
+    if text is None:
+        return range(count)
+    parts = text.split(":")
+    if len(parts) == 2 and all(p.isascii() and (p.isdigit() or not p) for p in parts):
+        begin, end = (int(p[:18]) if p else None for p in parts)
+        if frames := range(count)[begin:end]:
+            return frames
+    raise InputError(
+        f"{where}: found {shown(text)}, expected A:B, from A to before B of {count} frames that "
+        "are counted from 0"
+    )
+
+
 def named_strategies(chosen: str | Sequence[str]) -> tuple[Strategy, ...]:
     """Return the strategies of a choice, in their usual order.
 

@@ -9,6 +9,7 @@ from pydantic import create_model
 
 from pipistrelle.config import BagConfig, Config, InputError, Section
 from pipistrelle.detection.logs.readers import reader_of
+from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.estimation.catalogue import SECTIONS, gate_of, short_name
 from pipistrelle.experiments.named_settings import each_its_own, laid, own_config
 from pipistrelle.settings import Given, Key, Layer, resolve
@@ -190,6 +191,8 @@ def _jumps(recorded: "Log", log: Path) -> list[str]:
 def _unheard(recorded: "Log", log: Path) -> list[str]:
     """Warn of timed callers that no row and no position places: their excess paths are useless."""
     heard = _labels(recorded)
+    if heard == {UNLABELLED}:  # nobody tells which row is whose
+        return []
     timed = {
         number
         for scan in recorded.scans

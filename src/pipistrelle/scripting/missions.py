@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from pipistrelle.config import Config, InputError, Strategy
 from pipistrelle.detection.logs.readers import Robot
 from pipistrelle.estimation.catalogue import short_name
-from pipistrelle.experiments.hearing.listening import Progress
+from pipistrelle.experiments.hearing.listening import Keep, Progress
 from pipistrelle.experiments.hearing.world import ALL_DRAWN, World
 from pipistrelle.experiments.hearing.world_folder import kept_world
 from pipistrelle.experiments.named_settings import check_own, laid, of_estimators
@@ -52,13 +52,20 @@ def simulated(
     filters: Sequence[str],
     world: World | None = None,
     *,
+    keep: Keep | None = None,
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> Mission:
     """Drive through a world by sound and map it, with notes on what looks odd (`run_mission`)."""
     config = of_estimators(config, filters)
     mission = run_mission(
-        config, strategies, filters, world=world or ALL_DRAWN, progress=progress, watch=watch
+        config,
+        strategies,
+        filters,
+        world=world or ALL_DRAWN,
+        keep=keep,
+        progress=progress,
+        watch=watch,
     )
     assert mission.scenario is not None
     return replace(

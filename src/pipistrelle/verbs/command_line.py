@@ -51,6 +51,11 @@ app.command(
     help_epilogue=SPELLINGS,
 )
 app.command(
+    "pipistrelle.verbs.hear:hear",
+    name="hear",
+    help="Hear a sound recording of an array of microphones into a log, for slam.",
+)
+app.command(
     "pipistrelle.verbs.view:view",
     name="view",
     help="Play a mission in a browser, frame by frame: one page, which asks for nothing outside.",

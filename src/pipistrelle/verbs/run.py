@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 from pipistrelle.config import InputError
 from pipistrelle.experiments.named_settings import own_config
-from pipistrelle.own_files import LOG, WORLD, Kind, OwnFiles, claim
+from pipistrelle.own_files import LOG, SOUND, WORLD, Kind, OwnFiles, claim
 from pipistrelle.scripting.arguments import named_strategies
 from pipistrelle.verbs.options import (
     Chosen,
@@ -21,8 +21,10 @@ from pipistrelle.verbs.options import (
 )
 
 if TYPE_CHECKING:
+    from pipistrelle.config import Config
     from pipistrelle.detection.logs.recording import Log, LogCaller
     from pipistrelle.detection.scans import Scan
+    from pipistrelle.experiments.hearing.sound_recorder import SoundRecorder
     from pipistrelle.experiments.runs.mission import Mission
 
 
@@ -54,14 +56,36 @@ def run(
             help="Write the world that was drawn as one for --world. [default: no]",
         ),
     ] = None,
+    save_sound: Annotated[
+        Path | None,
+        Parameter(
+            metavar="DIR",
+            help="Write what the microphones heard, as a recording for `pipistrelle hear`. "
+            "[default: no]",
+        ),
+    ] = None,
+    frames: Annotated[
+        str | None,
+        Parameter(
+            metavar="A:B",
+            help="Of the sound, only the frames from number A, counted from 0, to before B. "
+            "[default: all]",
+        ),
+    ] = None,
+    sound_bits: Annotated[
+        Literal["32", "16"],
+        Parameter(help="Samples of the sound: floats of 32 bits, or whole numbers of 16."),
+    ] = "32",
 ) -> int:
     """Drive through one random world and map it, the three strategies side by side."""
     mission, output = mission or MissionOptions(), output or OutputOptions()
     config, own_world, usual = mission_config(mission)
     ways = filters(estimator or usual, mission.particles)
-    _check_apart(output=output.output, save_log=save_log, save_world=save_world)
+    folders = {"save_log": save_log, "save_world": save_world, "save_sound": save_sound}
+    _check_apart(output=output.output, **folders)
     log = _claimed("--save-log", save_log, LOG, output.overwrite)
     world = _claimed("--save-world", save_world, WORLD, output.overwrite)
+    sound = _sound_recorder(config, save_sound, frames, int(sound_bits), output)
     from pipistrelle.experiments.hearing.world_folder import world_files
     from pipistrelle.scripting.missions import simulated
     from pipistrelle.verbs import delivery
@@ -73,9 +97,18 @@ def run(
         if log is not None:
             scans = {trial.strategy: trial.heard for trial in mission.trials}
             log.replace(_log_files(mission, scans.get("fused", mission.trials[-1].heard)))
+        if sound is not None:
+            sound.own.replace(_sound_files(mission, sound))
 
-    conduct = partial(simulated, config, named_strategies(strategy), ways, own_world)
-    return delivery.conduct(conduct, output, "run", save)
+    asked = config, named_strategies(strategy), ways, own_world
+    if sound is None:
+        return delivery.conduct(partial(simulated, *asked), output, "run", save)
+    try:
+        return delivery.conduct(
+            lambda **watched: _recorded(simulated, asked, sound, watched), output, "run", save
+        )
+    finally:
+        sound.discard()
 
 
 def _claimed(flag: str, folder: Path | None, kind: Kind, overwrite: bool) -> OwnFiles | None:
@@ -94,6 +127,68 @@ def _check_apart(**folders: Path | None) -> None:
             continue
         if (other := seen.setdefault(folder.resolve(), flag)) != flag:
             raise InputError(f"{flag}: {folder} is that of {other}; name another")
+
+
+def _sound_recorder(
+    config: "Config", folder: Path | None, frames: str | None, bits: int, output: OutputOptions
+) -> "SoundRecorder | None":
+    """Claim the folder of a recording, and say how large it will be."""
+    if folder is None:
+        if frames is not None:
+            raise InputError(f"--frames: found {frames}, which is of --save-sound; add it")
+        return None
+    from pipistrelle.experiments.hearing.sound_recorder import SoundRecorder
+    from pipistrelle.scripting.arguments import frames_named
+    from pipistrelle.verbs.streams import say
+
+    if config.receiver.engine != "block":
+        raise InputError(
+            f"--save-sound: found receiver.engine {config.receiver.engine!r}, whose samples are "
+            "complex; expected 'block', of which real samples are made"
+        )
+    count = config.scenario.steps // config.scenario.steps_per_frame
+    chosen = frames_named(frames, count, "--frames")
+    own = _claimed("--save-sound", folder, SOUND, output.overwrite)
+    assert own is not None
+    recorder = SoundRecorder(own=own, config=config, frames=chosen, bits=bits)
+    recorder.check_room()
+    if not output.quiet:
+        say(
+            f"{folder}: {len(chosen)} frames of {recorder.channels} channels, "
+            f"{recorder.size / 1e9:.3g} GB"
+        )
+    return recorder
+
+
+def _recorded(
+    simulated: Any, asked: tuple[Any, ...], sound: "SoundRecorder", watched: dict[str, Any]
+) -> "Mission":
+    """Do a mission whose sound is written down."""
+    from dataclasses import replace
+
+    from pipistrelle.experiments.hearing.world import ALL_DRAWN
+    from pipistrelle.experiments.runs.validate_mission import checked_scenario
+
+    config, _, _, own_world = asked
+    sound.begin(checked_scenario(config, world=own_world or ALL_DRAWN))
+    mission = simulated(*asked, keep=sound.keep, **watched)
+    return replace(mission, notes=(*mission.notes, *sound.notes()))
+
+
+def _sound_files(mission: "Mission", sound: "SoundRecorder") -> dict[str, Any]:
+    """Return the files of a recording: the sound, what it is, odometry and truth."""
+    import tomllib
+
+    from pipistrelle.detection.logs.folder import log_files
+    from pipistrelle.experiments.runs.truth_files import truth_files
+
+    log = log_files(_log(mission, ()))
+    about = tomllib.loads(log["log.toml"])
+    kept = {name: value for name, value in about.items() if name not in ("format", "callers")}
+    assert mission.scenario is not None
+    files = sound.files(mission.scenario, kept)
+    last = {"recording.toml": files.pop("recording.toml")}
+    return truth_files(mission.drive.truth) | {"odometry.csv": log["odometry.csv"]} | files | last
 
 
 def _log_files(mission: "Mission", scans: "Sequence[Scan]") -> dict[str, str]:

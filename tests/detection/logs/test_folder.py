@@ -463,7 +463,7 @@ def test_a_wrong_header_is_refused(folder, name, header):
     "more",
     [
         ",bearing_std,bearing_std",
-        ",bearing_std,range_std,level_db",
+        ",bearing_std,range_std,level",
         ",excess_path,range,excess_path_std",
         ",bearing_sdt",
         ";bearing_std",

@@ -16,8 +16,9 @@ from pipistrelle.acoustics.target import Bodies
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.layout import square_of_four
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks
-from pipistrelle.arrays.sampling import BLOCK, blocks_to_hear, sampling
+from pipistrelle.arrays.sampling import blocks_to_hear, sampling
 from pipistrelle.config import (
+    BLOCK,
     AirConfig,
     BeaconConfig,
     Config,

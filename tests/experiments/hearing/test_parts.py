@@ -12,8 +12,9 @@ from pipistrelle.acoustics.medium import Medium
 from pipistrelle.acoustics.target import SHAPES, Bodies, Shape
 from pipistrelle.arrays.layout import Layout, layout_of
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
-from pipistrelle.arrays.sampling import BLOCK, sampling
+from pipistrelle.arrays.sampling import sampling
 from pipistrelle.config import (
+    BLOCK,
     AssumedConfig,
     Config,
     InputError,

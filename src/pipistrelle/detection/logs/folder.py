@@ -4,6 +4,7 @@ Whatever is wrong with a file is refused by line or key. `recording` says how ro
 measurements scans.
 """
 
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,14 @@ from pipistrelle.detection.logs.recording import (
     assemble,
 )
 from pipistrelle.detection.logs.text_tables import Table, read_table, table_text
-from pipistrelle.detection.logs.vehicle import KINDS, NOISY, ODOMETRY, SHARED, read_vehicle
+from pipistrelle.detection.logs.vehicle import (
+    KINDS,
+    NOISY,
+    ODOMETRY,
+    SHARED,
+    read_vehicle,
+)
+from pipistrelle.detection.scans import UNLABELLED, Scan
 from pipistrelle.own_files import LOG, OwnFiles
 from pipistrelle.refusals import refusal
 
@@ -93,8 +101,6 @@ def read_log(folder: Path) -> Log:
     (0.5, array([7]), array([nan]))
     """
     vehicle, former = read_vehicle(folder / "log.toml")
-    columns = ("time", *ODOMETRY[vehicle.motion])
-    optional = MOTION_COVARIANCE if vehicle.motion == "poses" else ()
     names = tuple(caller.name for caller in vehicle.callers)
     measured = read_table(
         folder / "measurements.csv",
@@ -104,9 +110,7 @@ def read_log(folder: Path) -> Log:
         words={CALLER: names or ("a name that [[callers]] of log.toml have",)},
     )
     measured.column[CALLER] += 1.0  # the vehicle is number 0
-    odometry = read_table(folder / "odometry.csv", columns, optional=optional)
-    if vehicle.motion == "ackermann":
-        _check_steering(odometry)
+    odometry = read_odometry(folder, vehicle.motion)
     return assemble(
         odometry,
         measured,
@@ -115,6 +119,16 @@ def read_log(folder: Path) -> Log:
         former_names=(*measured.former, *former),
         **vehicle.told(),
     )
+
+
+def read_odometry(folder: Path, motion: str) -> Table:
+    """Read ``odometry.csv`` of a log of a motion model."""
+    optional = MOTION_COVARIANCE if motion == "poses" else ()
+    columns = ("time", *ODOMETRY[motion])
+    odometry = read_table(folder / "odometry.csv", columns, optional=optional)
+    if motion == "ackermann":
+        _check_steering(odometry)
+    return odometry
 
 
 def _check_steering(odometry: Table) -> None:
@@ -168,8 +182,6 @@ def write_log(folder: Path, log: Log) -> None:
 
 def log_files(log: Log) -> dict[str, str]:
     """Return the files of a log's folder; ``log.toml`` is the last."""
-    import tomli_w
-
     settings: dict[str, Any] = {"format": 1} | {name: getattr(log, name) for name in SHARED}
     settings["callers"] = [asdict(caller) for caller in log.callers]
     stds = zip(NOISY[log.motion], log.control_std, strict=True)
@@ -180,18 +192,32 @@ def log_files(log: Log) -> dict[str, str]:
         settings["speed_offset"] = log.speed_offset
     settings["association"] = dict(log.association)
     model = KINDS[log.motion].model_validate(settings)
-    text = tomli_w.dumps(model.model_dump(mode="json", exclude_defaults=True, exclude_none=True))
     driven = _odometry_columns(log)
     measured = _measurement_columns(log)
-    columns = {"odometry": ",".join(driven), "measurements": ",".join(measured)}
-    held = _FOLLOWED if log.motion == "poses" else _HELD
-    more = _EXCESS_PATHS if "excess_path" in measured else ""
     return {
         "odometry.csv": table_text(tuple(driven), *driven.values()),
         "measurements.csv": table_text(tuple(measured), *measured.values()),
-        "README.md": _README.format(**columns, held=held) + more,
-        "log.toml": text,
+        "README.md": log_readme(driven, measured, log.motion),
+        "log.toml": model.text(),
     }
+
+
+def log_readme(driven: Iterable[str], measured: Iterable[str], motion: str) -> str:
+    """Return what a log's folder says of its files, by the columns of its tables."""
+    measured = tuple(measured)
+    columns = {"odometry": ",".join(driven), "measurements": ",".join(measured)}
+    held = _FOLLOWED if motion == "poses" else _HELD
+    more = _EXCESS_PATHS if "excess_path" in measured else ""
+    return _README.format(**columns, held=held) + more
+
+
+def as_logged(scan: Scan, name: str) -> np.ndarray:
+    """Return a column of a scan as a log's rows have it: a direct call has an excess path of 0."""
+    values = getattr(scan, name)
+    if name == "excess_path" and scan.direct.size:
+        values = values.copy()
+        values[scan.direct[scan.direct >= 0]] = 0.0
+    return values
 
 
 def _odometry_columns(log: Log) -> dict[str, np.ndarray]:
@@ -208,7 +234,8 @@ def _odometry_columns(log: Log) -> dict[str, np.ndarray]:
 def _measurement_columns(log: Log) -> dict[str, np.ndarray]:
     """Return the columns of ``measurements.csv``; scans lie spread over their step, in order.
 
-    Of how surely it was measured there are those of which any row says something.
+    Of how surely it was measured there are those of which any row says something; how loud it was
+    stands in logs without labels.
     """
     used = np.array([scan.time for scan in log.scans])
     index = np.searchsorted(log.time, used)
@@ -219,9 +246,10 @@ def _measurement_columns(log: Log) -> dict[str, np.ndarray]:
     sizes = [len(scan.landmark) for scan in log.scans]
     column = {"time": np.repeat(stamp, sizes)}
     for name in (*MEASUREMENT[1:], *STATED):
-        fields = [getattr(scan, name) for scan in log.scans]
+        fields = [as_logged(scan, name) for scan in log.scans]
         values = np.concatenate(fields) if fields else np.empty(0)
-        if name in MEASUREMENT or not np.isnan(values).all():
+        labelled = name == "level_db" and (column["landmark"] != UNLABELLED).any()
+        if name in MEASUREMENT or not (labelled or np.isnan(values).all()):
             column[name] = values
     whose = np.concatenate([np.empty(0, dtype=np.int64), *(scan.caller for scan in log.scans)])
     if log.callers and whose.any():

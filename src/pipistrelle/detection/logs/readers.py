@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _OTHERS = {
     frozenset({".wav", ".flac", ".aif", ".aiff", ".ogg", ".mp3"}): "an audio recording, which is "
-    "not read; detect the echoes in it, and write their bearings and ranges into a log folder",
+    "no log; make a log folder of it with `pipistrelle hear` (docs/sound.md)",
 }
 """Recordings that have no reader, by the endings of their files."""
 BAGS = (".bag", ".mcap", ".db3")
@@ -70,7 +70,7 @@ def recording_of(path: Path) -> str | None:
 
 
     >>> recording_of(Path("walk.wav"))[:36], recording_of(Path("walk"))
-    ('an audio recording, which is not rea', None)
+    ('an audio recording, which is no log;', None)
     """
     endings = {path.suffix.lower()}
     if path.is_dir():

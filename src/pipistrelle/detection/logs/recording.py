@@ -26,15 +26,23 @@ from pipistrelle.detection.logs.text_tables import (
     place_of,
     rows_kept,
 )
-from pipistrelle.detection.scans import NO_CALLERS, OWN, UNLABELLED, Scan, make_scan
+from pipistrelle.detection.scans import NO_CALLERS, OWN, UNLABELLED, Scan, make_scan, with_columns
 from pipistrelle.geometry import wrap
 from pipistrelle.refusals import refusal
 
 MEASUREMENT = ("time", "landmark", "bearing", "range")
 """What is said of a measurement: when it was made, and the columns of its scan."""
-STATED = ("bearing_std", "range_std", "excess_path", "excess_path_std", "bearing_slope")
+STATED = (
+    "bearing_std",
+    "range_std",
+    "excess_path",
+    "excess_path_std",
+    "bearing_slope",
+    "level_db",
+)
 """What may be said besides: how surely it was measured, how much later than the direct call it
-came, as a way of sound, and how the bearing hangs on the speed of sound."""
+came, as a way of sound, how the bearing hangs on the speed of sound, and how loud it was. Without
+labels an excess path of 0 says that this is the direct call."""
 CALLER = "caller"
 """Whose call it was, where it was not the vehicle's own: a number, from 1 on."""
 
@@ -355,8 +363,16 @@ def _scans(
     cuts = np.flatnonzero(np.diff(stamp)) + 1
     parts = zip(*(np.split(column, cuts) for column in said.values()), strict=True)
     rows = (dict(zip(said, part, strict=True)) for part in parts)
-    return tuple(
-        replace(make_scan(**row | {"time": float(row["time"][0])}), callers=labels)
-        for row in rows
-        if row["time"].size
-    )
+    scans = (make_scan(**row | {"time": float(row["time"][0])}) for row in rows if row["time"].size)
+    if (measured["landmark"] == UNLABELLED).all():
+        return tuple(_with_direct_calls(scan, len(callers)) for scan in scans)
+    return tuple(replace(scan, callers=labels) for scan in scans)
+
+
+def _with_direct_calls(scan: Scan, callers: int) -> Scan:
+    """Return a scan without labels that knows which rows are direct calls: excess paths of 0."""
+    direct, straight = np.full(1 + callers, UNLABELLED), scan.excess_path == 0.0
+    for row in np.flatnonzero(straight)[::-1]:  # the first counts
+        direct[scan.caller[row]] = row
+    excess = np.where(straight, np.nan, scan.excess_path)
+    return replace(with_columns(scan, excess_path=excess), direct=direct)

@@ -124,6 +124,12 @@ class Vehicle(Section):
         values["callers"] = tuple(LogCaller(**caller.model_dump()) for caller in self.callers)
         return values
 
+    def text(self) -> str:
+        """Return ``log.toml``."""
+        import tomli_w
+
+        return tomli_w.dumps(self.model_dump(mode="json", exclude_defaults=True, exclude_none=True))
+
 
 class _Unicycle(Vehicle):
     velocity_std: NonNegative

@@ -25,14 +25,14 @@ from pipistrelle.acoustics.medium import Medium
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.layout import Layout, Scattered, layout_of
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
-from pipistrelle.arrays.sampling import BLOCK, Sampling, block_shape, blocks_to_hear, sampling
-from pipistrelle.config import Config
-from pipistrelle.detection.certainty import DIRECT_FLOOR, EDGE_FLOOR
-from pipistrelle.detection.direct import own_alone, without_calls
-from pipistrelle.detection.faces import FrameMeasurements, average_faces, same_echo
+from pipistrelle.arrays.sampling import Sampling, block_shape, blocks_to_hear, sampling
+from pipistrelle.config import BLOCK, Config
+from pipistrelle.detection.direct import own_alone
+from pipistrelle.detection.echoes import unlabelled_scan, with_edge_floor
+from pipistrelle.detection.faces import FrameMeasurements, average_faces
 from pipistrelle.detection.front_end import FrontEnd, Groups, call_in, find_calls, front_end
-from pipistrelle.detection.matched import filter_blocks, filter_samples
-from pipistrelle.detection.scans import BEARING_STD, UNLABELLED, Scan, without_labels
+from pipistrelle.detection.matched import Workspace, filter_blocks, filter_samples
+from pipistrelle.detection.scans import UNLABELLED
 from pipistrelle.detection.snapshots import Detections, detections_at, joined
 from pipistrelle.experiments.hearing.frames import CallHeard, frames_of
 from pipistrelle.experiments.hearing.oracle import faintest_level_db, label_detections
@@ -40,6 +40,8 @@ from pipistrelle.experiments.hearing.scenario import Scenario, caller_labels
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, the frames done and their number."""
+Keep = Callable[[int, Arrivals, Complex[np.ndarray, "b f c e"]], None]
+"""Called with a frame's number, its arrivals and the block sums that were heard."""
 
 
 def listen(
@@ -55,6 +57,7 @@ def listen(
     find: Callable[..., Detections] = find_calls,
     oracle: Callable[..., Int[np.ndarray, " d"]] = label_detections,
     labels: bool = True,
+    keep: Keep | None = None,
     progress: Progress | None = None,
 ) -> tuple[tuple[FrameMeasurements, ...], ...]:
     """Hear every frame of a path, once for all beamwidths.
@@ -86,6 +89,9 @@ def listen(
     labels : bool
         False: frames also hold their echoes without labels, for a stage of association to find
         them (`pipistrelle.estimation.association`).
+    keep : callable, optional
+        Given each frame's number, from 1 on, its arrivals and the block sums that were heard, which
+        the next frame overwrites; of the engine ``block``.
     progress : callable, optional
 
     Returns
@@ -126,6 +132,8 @@ def listen(
             calls.setdefault(timed.number, (timed, [[] for _ in radii]))
         for r, record in enumerate(engine(frame.aimed, rig, key)):
             found = rig.find(record.matched, rig.front_end, **record.lags)
+            if keep is not None and record.sums is not None:
+                keep(number, frame.aimed[r], record.sums)
             for timed in frame.calls:
                 calls[timed.number][1][r].append(_of_call(timed, frame.time, record, found, rig))
             if rig.own_clock.any():
@@ -151,25 +159,13 @@ class _Record(NamedTuple):
     """Between two lags [s]."""
     pulse: int
     """Lags in which the matched filter's answer falls off to either side."""
+    sums: Complex[np.ndarray, "b f c e"] | None = None
+    """The block sums that were filtered, where there are any."""
 
     @property
     def lags(self) -> dict[str, Any]:
         """The lags as keyword arguments of a detector."""
         return {"start": self.start, "interval": self.interval, "pulse": self.pulse}
-
-
-class Workspace:
-    """Arrays that every frame uses anew: fresh memory costs more than the arithmetic on it."""
-
-    def __init__(self) -> None:
-        self._flat: dict[str, np.ndarray] = {}
-
-    def array(self, name: str, shape: tuple[int, ...]) -> Complex[np.ndarray, "..."]:
-        """Return the array of a name in a shape; its content is undefined."""
-        size = math.prod(shape)
-        if name not in self._flat or self._flat[name].size < size:
-            self._flat[name] = np.empty(size + size // 4, dtype=np.complex128)
-        return self._flat[name][:size].reshape(shape)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -256,11 +252,8 @@ def _heard(time: float, detections: Detections, arrivals: Arrivals, rig: _Rig) -
         pulse=rig.config.emitter.pulse,
         faintest_db=rig.faintest_db,
     )
+    detections = with_edge_floor(detections, rig.config)
     direct = detections.direct
-    if direct is not None and rig.config.detection.overlaps == "resolve":
-        floor = EDGE_FLOOR / rig.config.assumed_sound_speed
-        direct = direct._replace(delay_std=np.hypot(direct.delay_std, floor))
-        detections = replace(detections, direct=direct)
     if direct is not None and rig.missable.any():
         direct = own_alone(direct, label, rig.callers, rig.missable)
     heard = _averaged(time, replace(detections, direct=direct), label, rig)
@@ -288,38 +281,17 @@ def _unlabelled(
     heard: FrameMeasurements,
     rig: _Rig,
 ) -> FrameMeasurements:
-    """Average a frame's detections over the faces, by echo: one call, one time, one direction.
+    """Return a frame whose echoes also stand without labels, with what caused them.
 
     An echo's cause is that of its strongest detection that has one; of a direct call its caller.
-
-    The direct call of a caller with a beam or a clock of its own may not be heard: the first of its
-    tone is then an echo, which labels alone tell. Without them it has no excess paths.
     """
-    gates, direct = rig.config.matching, detections.direct
-    echo = same_echo(
-        detections,
-        delay_gate=gates.delay_gate * rig.config.emitter.pulse,
-        bearing_gate=gates.bearing_gate,
-    )
-    callers = np.full(rig.callers.size, UNLABELLED)
-    if direct is not None:
-        direct = without_calls(direct, rig.missable)
-        detections = replace(detections, direct=direct)
-        callers = np.append(echo, UNLABELLED)[direct.detection]
+    scan, echo = unlabelled_scan(time, detections, rig.config, rig.missable)
     causes = np.full(int(echo.max(initial=-1)) + 1, UNLABELLED)
     for d in np.argsort(detections.power, kind="stable").tolist():
         causes[echo[d]] = causes[echo[d]] if label[d] == UNLABELLED else label[d]
-    scan = without_labels(_averaged(time, detections, echo, rig).rows, callers)
     known = np.flatnonzero(scan.direct >= 0)
     causes[scan.direct[known]] = rig.callers[known]
-    return replace(heard, unlabelled=_with_unsure_calls(scan), causes=causes)
-
-
-def _with_unsure_calls(scan: Scan) -> Scan:
-    """Return a scan whose direct calls have bearings as unsure as they are (`DIRECT_FLOOR`)."""
-    rows, numbers = scan.direct[scan.direct >= 0], scan.numbers.copy()
-    numbers[BEARING_STD, rows] = np.hypot(numbers[BEARING_STD, rows], DIRECT_FLOOR)
-    return replace(scan, numbers=numbers)
+    return replace(heard, unlabelled=scan, causes=causes)
 
 
 def _blocks(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]:
@@ -343,7 +315,7 @@ def _blocks(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]
             noise_std=settled.noise_std,
             out=space.array("matched", lags),
         )
-        yield _Record(matched, start=pulse * BLOCK, interval=BLOCK, pulse=pulse)
+        yield _Record(matched, start=pulse * BLOCK, interval=BLOCK, pulse=pulse, sums=signal)
 
 
 def _parted(arrivals: Arrivals) -> tuple[slice | np.ndarray, slice | np.ndarray]:

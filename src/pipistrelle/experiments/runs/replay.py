@@ -116,7 +116,7 @@ def _refuse_unknown(folder: Path, titles: str) -> None:
     if folder.exists():
         what, _, fix = (recording_of(folder) or "").partition("; ")
         if what:
-            raise refusal(folder, what, titles, f"{fix} (docs/log_format.md)")
+            raise refusal(folder, what, titles, fix)
     if not folder.is_dir():
         found = "a file" if folder.is_file() else "no such folder"
         raise refusal(folder, found, titles, "check the path")
@@ -296,7 +296,7 @@ def drive_of(log: Log, truth: Truth) -> Drive:
 def without_unused(scan: Scan, config: Config) -> Scan:
     """Return a recorded scan without what the settings hide: labels, noise, excess paths."""
     known = config.association.method == KNOWN
-    rows = scan if known else without_labels(scan, scan.callers)
+    rows = scan if known or scan.direct.size else without_labels(scan, scan.callers)
     return without_hidden(rows, config.filter, timing=config.listening.timing)
 
 

@@ -25,7 +25,7 @@ from pipistrelle.estimation.data_association.methods import association_of
 from pipistrelle.evaluation.association import Causes, associated, renamed
 from pipistrelle.experiments.cases import Case
 from pipistrelle.experiments.drives import Drive, Truth, at_sensor, at_vehicle, split_at
-from pipistrelle.experiments.hearing.listening import Progress, listen
+from pipistrelle.experiments.hearing.listening import Keep, Progress, listen
 from pipistrelle.experiments.hearing.scenario import standing_landmarks
 from pipistrelle.experiments.hearing.world import ALL_DRAWN, World
 from pipistrelle.experiments.machine import check_memory
@@ -61,13 +61,15 @@ def run_mission(
     filters: Sequence[str] = ("ekf",),
     *,
     world: World = ALL_DRAWN,
+    keep: Keep | None = None,
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> Mission:
     """Draw a world, listen along its path once, and let each filter map it by each strategy.
 
-    `watch` is given each scan and the belief after it. Settings, filters and worlds that cannot be
-    used, or need more memory than there is, raise `InputError` before anything is heard.
+    `keep` is given the sound of each frame (`listen`), `watch` each scan and the belief after it.
+    Settings, filters and worlds that cannot be used, or need more memory than there is, raise
+    `InputError` before anything is heard.
 
     >>> from pipistrelle.config import ScenarioConfig
     >>> mission = run_mission(Config(scenario=ScenarioConfig(steps=40)), ["fused"])
@@ -83,7 +85,7 @@ def run_mission(
         check_filters(names, drive.motion, own, drive.moving.values())
     labels = all(own.association.method == KNOWN for own, _ in apart)
     radius = config.emitter.radius
-    (heard,) = listen(scenario, config, (radius,), labels=labels, progress=progress)
+    (heard,) = listen(scenario, config, (radius,), labels=labels, keep=keep, progress=progress)
     there, trials = HeardWorld(scenario, config, {radius: heard}), []
     for own, names in apart:
         scans = {strategy: there.scans(own, strategy) for strategy in strategies}

@@ -1,0 +1,184 @@
+"""The array, checked by the loudest sound: orders, signs and mirror images that would fit better.
+
+What of the energy of a loud echo the best beam of a face, or of all microphones without a face,
+misses is their *misfit*; two channels that are swapped, or one whose sign is, raise it. A line
+that is counted from the wrong end fits as well, but says the mirror image of each angle: then two
+faces that hear one echo disagree, as they do where faces are swapped.
+"""
+
+import math
+from collections.abc import Iterator
+from itertools import combinations, permutations
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from pipistrelle.arrays.layout import Layout
+from pipistrelle.detection.sounds.hearing import Frame, Hearing
+from pipistrelle.geometry import wrap
+
+CALLS, SNAPSHOTS = 64, 60
+"""Most calls that are listened to, and snapshots of a face that are kept."""
+MIN_SNAPSHOTS, MIN_PAIRS = 5, 10
+MOST_FACES = 4
+"""Most faces of which all orders are tried."""
+LOUD = 300.0
+"""Least power of an echo over the noise of a steered beam."""
+WIDEST = 0.2
+"""Widest group whose order is looked at, in lengths of a call."""
+MISFIT, BETTER = 0.02, 0.5
+"""Least misfit that asks for another order, and the share of it that one leaves which is named."""
+DISAGREE = 0.15
+"""Least median difference between the bearings of two faces that asks for other faces [rad]."""
+
+
+class _Loudest(NamedTuple):
+    """The loudest echoes that a group of microphones heard."""
+
+    caller: list[int]
+    output: list[Complex[np.ndarray, " e"]]
+    """The matched filters' outputs."""
+
+
+def array_faults(hearing: Hearing) -> Iterator[str]:
+    """Say which other order of the channels would explain the loudest sounds better."""
+    heard = [_Loudest([], []) for _ in hearing.array.face]
+    pairs: list[tuple[int, float, int, float]] = []
+    last = hearing.calls.sample.size - 1
+    for frame in hearing.frames(np.unique(np.linspace(0, last, CALLS).astype(np.int64)).tolist()):
+        _collect(frame, hearing, heard)
+        pairs += _pairs(frame, hearing)
+    for g, loudest in enumerate(heard):
+        if len(loudest.output) >= MIN_SNAPSHOTS:
+            yield from _order(hearing, g, loudest)
+    if len(pairs) >= MIN_PAIRS:
+        yield from _faces(hearing, np.array(pairs))
+
+
+def _collect(frame: Frame, hearing: Hearing, heard: list[_Loudest]) -> None:
+    """Keep the matched filters' outputs of the loudest echo of each group and caller."""
+    found = frame.detections
+    for g, loudest in enumerate(heard):
+        row, members = hearing.array.members(g)
+        for caller in np.unique(found.caller):
+            rows = np.flatnonzero((found.face == g) & (found.caller == caller))
+            if rows.size == 0 or len(loudest.output) >= SNAPSHOTS:
+                continue
+            d = rows[found.power[rows].argmax()]
+            lag = round((found.delay[d] - frame.start) / frame.interval)
+            if found.power[d] >= LOUD and 0 <= lag < len(frame.matched):
+                loudest.caller.append(int(caller))
+                loudest.output.append(frame.matched[lag, row, caller][members])
+
+
+def _pairs(frame: Frame, hearing: Hearing) -> list[tuple[int, float, int, float]]:
+    """Pair detections of one echo by two faces: the loudest of each within a quarter of a call."""
+    found, pairs = frame.detections, []
+    late = 0.25 * hearing.about.call.duration
+    for one, other in combinations(np.flatnonzero(found.power >= LOUD).tolist(), 2):
+        same = found.caller[one] == found.caller[other] and found.face[one] != found.face[other]
+        face, angle = found.face[[one, other]], found.angle[[one, other]].tolist()
+        lines = not np.isnan(hearing.array.layout.normal[face]).any()
+        if same and lines and abs(found.delay[one] - found.delay[other]) < late:
+            pairs.append((int(face[0]), angle[0], int(face[1]), angle[1]))
+    return pairs
+
+
+def _order(hearing: Hearing, g: int, heard: _Loudest) -> Iterator[str]:
+    """Try to swap two channels of a group, or the sign of one."""
+    lead, gain = _directions(hearing, g)
+    if np.ptp(lead, axis=1).max() > WIDEST * hearing.about.call.duration:
+        return  # an echo's edges reach its microphones one by one
+    caller, output = np.array(heard.caller), np.array(heard.output)
+    beams = gain * np.exp(-2j * np.pi * hearing.blocks.tones[:, None, None] * lead)
+    row, members = hearing.array.members(g)
+    count, channel = members.size, hearing.array.channel[row, members] + 1
+
+    def misfit(changed: Complex[np.ndarray, "n e"]) -> float:
+        power = np.array([
+            np.abs(beams[p] @ one).max() ** 2 for p, one in zip(caller, changed, strict=True)
+        ])  # fmt: skip
+        energy = (np.abs(changed) ** 2).sum(axis=1) * (gain**2).sum()
+        return float(np.median(1.0 - power / energy))
+
+    now, tried = misfit(output), []
+    if now < MISFIT:
+        return
+    for i, j in combinations(range(count), 2):
+        order = np.arange(count)
+        order[[i, j]] = j, i
+        tried.append((misfit(output[:, order]), f"swap channels {channel[i]} and {channel[j]}"))
+    for i in range(count):
+        sign = np.where(np.arange(count) == i, -1.0, 1.0)
+        tried.append((misfit(output * sign), f"turn the sign of channel {channel[i]} round"))
+    best, what = min(tried)
+    misses = f"{_named(hearing, g)}: the best beam misses {now:.1%} of the loudest echoes' energy"
+    if best <= BETTER * now:
+        yield f"{misses}, {best:.1%} if you {what} in array.csv"
+    else:
+        yield f"{misses}, and no swap of two channels would help: are places and tone right?"
+
+
+def _directions(
+    hearing: Hearing, g: int
+) -> tuple[Float[np.ndarray, "b e"], Float[np.ndarray, " e"]]:
+    """Return how much earlier a group's microphones hear sound of many directions [s], and gains.
+
+    Directions are so dense that between two the phase turns by some 0.2 rad.
+    """
+    layout, speed = hearing.array.layout, hearing.config.assumed_sound_speed
+    if isinstance(layout, Layout):
+        place, gain = np.column_stack((layout.position * 0.0, layout.position)), layout.position**0
+        normal = 0.0
+    else:
+        members = layout.group == g
+        place, gain = layout.position[members], layout.amplitude[members]
+        place, normal = place - place.mean(axis=0), float(layout.normal[g])
+    reach = np.linalg.norm(place, axis=1).max() * hearing.blocks.tones.max() / speed
+    half = math.pi if math.isnan(normal) else 0.5 * math.pi
+    bearing = 0.0 if math.isnan(normal) else normal
+    bearing += np.linspace(-half, half, 201 + math.ceil(20.0 * math.pi * reach * half))
+    toward = np.stack((np.cos(bearing), np.sin(bearing)), axis=-1)
+    return toward @ place.T / speed, gain
+
+
+def _named(hearing: Hearing, g: int) -> str:
+    """Return what a group of microphones is called."""
+    name = hearing.array.face[g]
+    return name if " " in name else f"face {name}"
+
+
+def _faces(hearing: Hearing, pairs: Float[np.ndarray, "n 4"]) -> Iterator[str]:
+    """Try other orders of the faces, and lines that are counted from the other end."""
+    normal, names = hearing.array.layout.normal, hearing.array.face
+    count = len(names)
+    face, angle = pairs[:, [0, 2]].astype(np.int64), pairs[:, [1, 3]]
+
+    def differ(order: tuple[int, ...], side: float) -> float:
+        bearing = normal[np.array(order)][face] + side * angle
+        return float(np.median(np.abs(wrap(bearing[:, 0] - bearing[:, 1]))))
+
+    as_it_is = tuple(range(count))
+    now = differ(as_it_is, 1.0)
+    if now < DISAGREE:
+        return
+    moved = sorted(permutations(as_it_is), key=lambda o: sum(map(int.__ne__, o, as_it_is)))
+    orders = moved if count <= MOST_FACES else [as_it_is]
+    tried = {(order, side): differ(order, side) for side in (-1.0, 1.0) for order in orders}
+    said, best = f"two faces that hear one echo differ by {now:.2f} rad", min(tried.values())
+    if best > BETTER * now:
+        yield f"{said}, and no order of the faces would help"
+        return
+    fits = [change for change, left in tried.items() if left <= best + 0.02]
+    firsts = [next((f for f in fits if f[1] == side), None) for side in (-1.0, 1.0)]
+    words = " or ".join(_change(names, *first) for first in firsts if first is not None)
+    yield f"{said}, by {best:.2f} rad if in array.csv you {words}"
+
+
+def _change(names: tuple[str, ...], order: tuple[int, ...], side: float) -> str:
+    """Say what makes the faces stand in an order, and their lines turn round."""
+    changes = ["count each face's channels from its other end"] if side < 0 else []
+    moved = [(f, o) for f, o in enumerate(order) if f != o]
+    changes += [f"let face {names[f]} be where face {names[o]} is" for f, o in moved]
+    return " and ".join(changes)

@@ -1,0 +1,139 @@
+"""``recording.toml``: what a sound recording says of itself, and how it was made."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from pipistrelle.config import (
+    MAX_OTHERS,
+    Level,
+    NonNegative,
+    Positive,
+    Real,
+    Section,
+)
+from pipistrelle.files import read_text
+from pipistrelle.refusals import expectation, meant, refusal, shown
+from pipistrelle.settings import parse_toml
+
+FILE = "recording.toml"
+_Name = Annotated[str, Field(pattern=r"^\w[\w-]*$", max_length=40)]
+_FileName = Annotated[str, Field(min_length=1, max_length=200)]
+_Rate = Annotated[float, Field(ge=100, le=1e8)]
+_Channel = Annotated[int, Field(ge=1, le=1024)]
+
+
+class OwnCall(Section):
+    """The vehicle's own call, and when it comes."""
+
+    model_config = ConfigDict(strict=True)
+
+    frequency: Positive
+    """Tone [Hz]."""
+    duration: Annotated[float, Field(ge=1e-5, le=1.0)]
+    """Length [s]."""
+    deaf: Annotated[float, Field(ge=1e-5, le=10.0)] | None = None
+    """How long the microphones hear nothing else from its beginning on; else while it lasts [s]."""
+    window: Literal["rectangular"] = "rectangular"
+    level_db: Level | None = None
+    period: Annotated[float, Field(ge=1e-3, le=1e4)] | None = None
+    """Time from one call to the next [s]."""
+    first: NonNegative = 0.0
+    """When the first begins, after the sound does; beside a period [s]."""
+    trigger: _Channel | None = None
+    """Channel whose level rises when a call begins."""
+
+    @model_validator(mode="after")
+    def _one_way(self) -> "OwnCall":
+        if self.period is not None and self.trigger is not None:
+            raise ValueError("a period or a trigger, not both")
+        if self.deaf is not None and self.deaf < self.duration:
+            raise ValueError("deaf for as long as the duration, or longer")
+        if self.period is not None and self.period <= self.duration:
+            raise ValueError("a period that is longer than the duration")
+        return self
+
+
+class OtherCaller(Section):
+    """Somebody else who calls."""
+
+    model_config = ConfigDict(strict=True)
+
+    name: _Name
+    frequency: Positive
+    """Tone [Hz]."""
+    level_db: Level | None = None
+    landmark: Annotated[int, Field(ge=0, lt=2**53)] | None = None
+    """The label that the truth gives it."""
+    moves: bool = False
+    own_clock: bool = False
+    """Whether it calls when it likes, not when the vehicle does: its rows are then left out."""
+
+
+class Description(Section):
+    """All that ``recording.toml`` says."""
+
+    model_config = ConfigDict(strict=True)
+
+    format: Literal[1]
+    sound: Annotated[tuple[_FileName, ...], Field(strict=False)] = ()
+    """The sound files, in the order of time; else all that are there, by name."""
+    sample_rate: _Rate | None = None
+    """What the files must say, too [Hz]."""
+    samples: Annotated[int, Field(ge=1, lt=2**62)] | None = None
+    """Of each channel, in all files."""
+    start: Real = 0.0
+    """Time of the first sample, by the odometry's clock [s]."""
+    scale: Positive = 1.0
+    """Amplitude of what the files hold as 1."""
+    speed_of_sound: Annotated[float, Field(ge=10, le=10_000)]
+    """By which delays become ranges, and phases bearings [m/s]."""
+    one_centre: bool = False
+    """Whether faces are heard as if all stood at the vehicle's point, as the simulated square."""
+    medium: dict[str, Any] = Field(default_factory=dict)
+    """Of what it was: for the reader."""
+    call: OwnCall
+    callers: Annotated[tuple[OtherCaller, ...], Field(strict=False, max_length=MAX_OTHERS)] = ()
+    log: dict[str, Any]
+    """What ``log.toml`` of the log says that is made: motion, start and noise."""
+
+    @field_validator("sound")
+    @classmethod
+    def _in_the_folder(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if any(Path(name).name != name for name in names) or len({*names}) < len(names):
+            raise ValueError("names of files in the folder, each once")
+        return names
+
+    @model_validator(mode="after")
+    def _apart(self) -> "Description":
+        names = {"vehicle", *(one.name.casefold() for one in self.callers)}
+        if len(names) <= len(self.callers):
+            raise ValueError('a name of its own for each caller, not "vehicle", a or A alike')
+        tones = {self.call.frequency, *(one.frequency for one in self.callers)}
+        if len(tones) <= len(self.callers):
+            raise ValueError("a frequency of its own for each who calls")
+        return self
+
+
+def read_description(folder: Path) -> Description:
+    """Read ``recording.toml`` of a folder, or refuse its first fault."""
+    path = folder / FILE
+    raw = parse_toml(read_text(path), path)
+    try:
+        return Description.model_validate(raw)
+    except ValidationError as error:
+        fault = min(error.errors(include_url=False), key=lambda f: f["loc"][:1] != ("format",))
+    loc = fault["loc"]
+    key = ".".join(str(part + 1) if isinstance(part, int) else part for part in loc)
+    if fault["type"] == "missing":
+        raise refusal(path, f"no key {key!r}", "it", f"add {key!r}")
+    if fault["type"] == "extra_forbidden":
+        known = {"call": OwnCall, "callers": OtherCaller}.get(str(loc[0]), Description)
+        fields = known.model_fields if len(loc) > 1 else Description.model_fields
+        near = meant(str(loc[-1]), fields)
+        fix = f"did you mean {near!r}?" if near else "remove it"
+        raise refusal(path, f"the unknown key {key!r}", f"one of {', '.join(fields)}", fix)
+    where = f"{path}, key {key!r}" if key else str(path)
+    found = shown(fault["input"]) if key else "keys that do not go together"
+    raise refusal(where, found, expectation(fault), "correct the value")

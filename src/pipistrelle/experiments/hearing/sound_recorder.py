@@ -1,0 +1,228 @@
+"""Sound out: the microphones' samples of a mission, written frame by frame into a sound file."""
+
+import math
+import shutil
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Complex
+
+from pipistrelle.acoustics.arrivals import Arrivals
+from pipistrelle.acoustics.callers import VEHICLE, moves
+from pipistrelle.arithmetic.random_stream import stream_key
+from pipistrelle.arrays.array_file import array_text
+from pipistrelle.arrays.layout import layout_of, microphones_in
+from pipistrelle.arrays.sampling import sampling
+from pipistrelle.arrays.waveforms import real_samples
+from pipistrelle.config import SQUARE, Config, InputError
+from pipistrelle.detection.logs.text_tables import table_text
+from pipistrelle.detection.sounds.calls import FILE as CALLS
+from pipistrelle.detection.sounds.description import FILE as DESCRIPTION
+from pipistrelle.detection.sounds.recorded_array import FILE as ARRAY
+from pipistrelle.experiments.hearing.scenario import Scenario, caller_labels
+from pipistrelle.files import PiecesFile
+from pipistrelle.own_files import OwnFiles, make_folder, remove_empty
+
+SOUND_FILE = "recording.wav"
+HEADROOM = 4.0
+"""The largest amplitude that the file holds, in units of the loudest call's at 1 m."""
+_LARGEST_RIFF = 2**32 - 2**16
+"""Bytes of the samples above which sizes of 64 bits are written (RF64)."""
+_README = """A sound recording of Pipistrelle. Make a log of it with: pipistrelle hear FOLDER -o LOG
+
+recording.wav     the microphones' samples, a channel each; times `scale` they are amplitudes
+recording.toml    rate, scale, speed of sound, who calls at which frequency, what the log will say
+array.csv         channel,x,y, perhaps face [m], x ahead and y to the left of the vehicle; a face
+                  looks away from the middle of all; where recording.toml says one_centre, the
+                  faces' own distance from it is not part of any delay
+calls.csv         sample,time [s]: where each call of the vehicle begins; while it lasts, the
+                  microphones hear it alone
+odometry.csv      as in a log
+truth.csv         time,x,y,heading; for scoring only
+landmarks.csv     landmark,x,y; for scoring only
+SHA256SUMS        what was written here: nothing else is ever overwritten
+"""
+
+
+@dataclass(kw_only=True)
+class SoundRecorder:
+    """Writes what each frame's microphones hear; a frame at a time is in memory."""
+
+    own: OwnFiles
+    config: Config
+    frames: range
+    """Numbers of the frames that are kept, from 0 on."""
+    bits: int = 32
+    """32: floats; 16: whole numbers."""
+    clipped: int = 0
+    """Samples that were larger than the file holds."""
+    late: int = 0
+    """Frames in which something was heard after the next call, which is left out."""
+    _file: PiecesFile | None = None
+    _made: list[Path] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Place the frames in the file."""
+        setup = self.config.scenario
+        self.layout = layout_of(self.config)
+        self.channels = math.prod(self.layout.shape)
+        self.period = setup.steps_per_frame * setup.step
+        rate = self.config.receiver.sample_rate
+        numbers = np.arange(len(self.frames) + 1)
+        self.first = np.rint(numbers * self.period * rate).astype(np.int64)
+        """First sample of each frame, and one after the last of all."""
+
+    @property
+    def size(self) -> int:
+        """Bytes of the samples."""
+        return int(self.first[-1]) * self.channels * self.bits // 8
+
+    def check_room(self) -> None:
+        """Refuse a recording for which there is no room on the disk."""
+        places = (self.own.folder, *self.own.folder.absolute().parents)
+        there = next(place for place in places if place.exists())
+        free = shutil.disk_usage(there).free
+        if self.size > free:
+            raise InputError(
+                f"--save-sound: found {free / 1e9:.1f} GB free at {there}, expected "
+                f"{self.size / 1e9:.1f} GB; keep fewer frames (--frames A:B) or 16 bits"
+            )
+
+    def begin(self, scenario: Scenario) -> None:
+        """Begin the file."""
+        settled = sampling(self.config, scenario.callers)
+        for caller, tone in zip(scenario.callers, settled.tones, strict=True):
+            if tone >= settled.rate / 2.0:
+                raise InputError(
+                    f"{caller.key or caller.name}.frequency: found {tone:g} Hz, which real samples "
+                    f"at {settled.rate:g} Hz do not hold; expected less than half of that"
+                )
+        self.sampling = settled
+        loudest = max(10.0 ** (max(one.level_db for one in scenario.callers) / 20.0), 1.0)
+        self.scale = HEADROOM * max(loudest, settled.noise_std)
+        self.leak = 10.0 ** (scenario.callers[VEHICLE].level_db / 20.0)
+        self._made = make_folder(self.own.folder)
+        self._file = PiecesFile(self.own.folder / SOUND_FILE)
+        self._file.write(wav_header(self.size, self.channels, settled.rate, self.bits))
+
+    def keep(self, number: int, arrivals: Arrivals, sums: Complex[np.ndarray, "b f c e"]) -> None:
+        """Write a frame, if it is one of those that are kept; frames are numbered from 1 here."""
+        index = number - 1
+        if index not in self.frames or self._file is None:
+            return
+        place, settled = index - self.frames.start, self.sampling
+        length = int(self.first[place + 1] - self.first[place])
+        self.late += len(sums) > length // settled.block - settled.pulse
+        rng = np.random.default_rng(stream_key(self.config.seed, 0, "other frequencies", number))
+        samples = real_samples(
+            sums, arrivals, self.layout, settled, length, rng, leak=self.leak
+        ) / np.float32(self.scale)
+        if self.bits == 16:
+            self.clipped += int(np.count_nonzero(np.abs(samples) > 1.0))
+            samples = np.rint(samples.clip(-1.0, 1.0) * 32767.0)
+        self._file.write(samples.astype("<f4" if self.bits == 32 else "<i2").tobytes())
+
+    def finish(self) -> PiecesFile:
+        """End the file."""
+        assert self._file is not None
+        self._file.close()
+        return self._file
+
+    def discard(self) -> None:
+        """Remove the file, unless it was put in its place."""
+        if self._file is not None:
+            self._file.discard()
+            remove_empty(self._made)
+
+    def notes(self) -> list[str]:
+        """Return what a user should know of the recording, a line each."""
+        notes = []
+        if self.clipped:
+            notes.append(
+                f"--save-sound: {self.clipped} samples were clipped at 16 bits; keep 32 bits"
+            )
+        if self.late:
+            notes.append(
+                f"--save-sound: in {self.late} frames something was heard after the vehicle's next "
+                "call, which the recording does not hold"
+            )
+        return notes
+
+    def files(self, scenario: Scenario, log: dict[str, Any]) -> dict[str, str | PiecesFile]:
+        """Return the files of the folder but odometry and truth; `log` is what log.toml says."""
+        import tomli_w
+
+        time = (np.arange(len(self.frames)) + self.frames.start + 1) * self.period
+        return {
+            SOUND_FILE: self.finish(),
+            ARRAY: array_text(microphones_in(self.config)),
+            CALLS: table_text(("sample", "time"), self.first[:-1], time),
+            "README.md": _README,
+            DESCRIPTION: tomli_w.dumps(self._description(scenario) | {"log": log}),
+        }
+
+    def _description(self, scenario: Scenario) -> dict[str, Any]:
+        """Return ``recording.toml`` without the log's part."""
+        config, labels = self.config, caller_labels(scenario).tolist()
+        own, *others = scenario.callers
+        air = config.air.model_dump(exclude_none=True) | {"speed_of_sound": config.air.sound_speed}
+        return {
+            "format": 1,
+            "sound": [SOUND_FILE],
+            "sample_rate": self.sampling.rate,
+            "samples": int(self.first[-1]),
+            "start": (self.frames.start + 1) * self.period,
+            "scale": self.scale * (1.0 if self.bits == 32 else 32768.0 / 32767.0),
+            "speed_of_sound": config.assumed_sound_speed,
+            "one_centre": config.receiver.array == SQUARE,
+            "medium": {"name": "air", **air},
+            "call": {
+                "frequency": own.frequency,
+                "duration": config.emitter.pulse,
+                "window": "rectangular",
+                "level_db": own.level_db,
+            },
+            "callers": [
+                {
+                    "name": one.name,
+                    "frequency": one.frequency,
+                    "level_db": one.level_db,
+                    "landmark": label,
+                    "moves": moves(one),
+                    "own_clock": one.calls is not None,
+                }
+                for one, label in zip(others, labels[1:], strict=True)
+            ],
+        }
+
+
+def wav_header(size: int, channels: int, rate: float, bits: int) -> bytes:
+    """Return what stands before the samples of a WAV file, with sizes of 64 bits if need be.
+
+    `size`: bytes of the samples; `rate` [Hz], a whole number in the file; `bits`: 32 for floats, 16
+    for whole numbers.
+
+    Sources: Microsoft, Multiple Channel Audio Data and WAVE Files (2007); EBU Tech 3306 (RF64).
+
+    >>> header = wav_header(800, 40, 200e3, 32)
+    >>> header[:4], header[-8:-4], len(header)
+    (b'RIFF', b'data', 80)
+    """
+    frame, count = channels * bits // 8, size // (channels * bits // 8)
+    kind = 3 if bits == 32 else 1
+    guid = struct.pack("<H", kind) + bytes.fromhex("000000001000800000aa00389b71")
+    fmt = struct.pack("<HHIIHH", 0xFFFE, channels, round(rate), round(rate) * frame, frame, bits)
+    fmt += struct.pack("<HHI", 22, bits, 0) + guid
+    fact = struct.pack("<I", min(count, 2**32 - 1))
+    parts = ((b"fmt ", fmt), (b"fact", fact))
+    chunks = b"".join(name + struct.pack("<I", len(data)) + data for name, data in parts)
+    if size <= _LARGEST_RIFF:
+        head = b"RIFF" + struct.pack("<I", 4 + len(chunks) + 8 + size) + b"WAVE"
+        return head + chunks + b"data" + struct.pack("<I", size)
+    whole = 4 + 36 + len(chunks) + 8 + size
+    sizes = b"ds64" + struct.pack("<IQQQI", 28, whole, size, count, 0)
+    head = b"RF64" + struct.pack("<I", 2**32 - 1) + b"WAVE" + sizes
+    return head + chunks + b"data" + struct.pack("<I", 2**32 - 1)

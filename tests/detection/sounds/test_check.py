@@ -1,0 +1,116 @@
+"""The check of a recording names the mistake that was made, and none where none was."""
+
+import shutil
+
+import numpy as np
+import pytest
+import soundfile
+
+from pipistrelle.config import Config
+from pipistrelle.detection.sounds.check import check_recording
+from pipistrelle.detection.sounds.description import read_description
+from reference.sounds import record
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory):
+    """A small recording of our own."""
+    drive = ("--landmarks", "20", "--duration", "4", "--seed", "7")
+    return record(tmp_path_factory.mktemp("own") / "tape", "--sound-bits", "16", drive=drive)
+
+
+@pytest.fixture
+def tape(sound, tmp_path):
+    """A copy of it, to be spoiled."""
+    shutil.copytree(sound, tmp_path / "tape")
+    return tmp_path / "tape"
+
+
+def checked(folder):
+    return check_recording(folder, read_description(folder), Config())
+
+
+def with_rows(folder, name, change):
+    head, *rows = (folder / name).read_text().splitlines()
+    rows = [row.split(",") for row in rows]
+    change(rows)
+    (folder / name).write_text("\n".join([head, *(",".join(row) for row in rows), ""]))
+
+
+def with_samples(folder, change):
+    samples, rate = soundfile.read(folder / "recording.wav", dtype="float32")
+    change(samples)
+    soundfile.write(folder / "recording.wav", samples, rate, subtype="PCM_16")
+
+
+def exchanged(rows, pairs):
+    for i, j in pairs:
+        rows[i][0], rows[j][0] = rows[j][0], rows[i][0]
+
+
+def test_nothing_is_odd_about_a_recording_of_our_own(sound):
+    assert checked(sound) == []
+
+
+@pytest.mark.parametrize(("i", "j"), [(1, 2), (11, 17)])
+def test_channels_that_are_swapped_are_named(tape, i, j):
+    with_rows(tape, "array.csv", lambda rows: exchanged(rows, [(i, j)]))
+    (fault,) = (one for one in checked(tape) if one.startswith("face"))
+    assert f"face {('front', 'left')[i // 10]}:" in fault
+    named = {f"swap channels {i + 1} and {j + 1}", f"swap channels {j + 1} and {i + 1}"}
+    assert any(one in fault for one in named)
+
+
+def test_lines_that_are_counted_from_the_wrong_end_are_seen(tape):
+    ends = [(10 * f + k, 10 * f + 9 - k) for f in range(4) for k in range(5)]
+    with_rows(tape, "array.csv", lambda rows: exchanged(rows, ends))
+    (fault,) = checked(tape)
+    assert "count each face's channels from its other end" in fault
+
+
+def test_faces_that_are_swapped_are_seen(tape):
+    with_rows(tape, "array.csv", lambda rows: exchanged(rows, [(k, 10 + k) for k in range(10)]))
+    (fault,) = checked(tape)
+    assert "two faces that hear one echo differ" in fault
+    # but for turning the whole, to swap the front with the left is to swap the front with the back
+    assert "let face front be where face back is and let face back be where face front is" in fault
+
+
+def test_a_channel_of_the_other_sign_is_named(tape):
+    with_samples(tape, lambda samples: np.negative(samples[:, 5], out=samples[:, 5]))
+    (fault,) = checked(tape)
+    assert "turn the sign of channel 6 round" in fault
+
+
+def test_channels_that_are_dead_clipped_or_off_zero_are_named(tape):
+    def spoil(samples):
+        samples[:, 2] *= 1e-3
+        samples[:, 6] = samples[:, 6].clip(-2e-3, 2e-3)
+        samples[:, 9] += 0.01
+
+    with_samples(tape, spoil)
+    faults = checked(tape)
+    for words in ("channel 3 is dead", "channel 7 is clipped", "channel 10 is off zero"):
+        assert sum(fault.startswith(words) for fault in faults) == 1
+    assert len(faults) == 4  # and that the order was not looked at
+
+
+def test_a_sample_rate_that_does_not_fit_the_call_is_told_with_the_one_that_would(tape):
+    samples, _ = soundfile.read(tape / "recording.wav", dtype="float32")
+    soundfile.write(tape / "recording.wav", samples, 192_000, subtype="PCM_16")
+    about = (tape / "recording.toml").read_text().replace("200000.0", "192000.0")
+    (tape / "recording.toml").write_text(about)
+    fault = checked(tape)[0]
+    assert "33600 Hz are loudest, not 35000 Hz" in fault
+    assert "as 200000 Hz nearly would" in fault
+
+
+def test_a_clock_that_jumps_is_told_where_it_does(tape):
+    def lose(rows):
+        for row in rows[5:]:
+            row[0] = str(int(row[0]) - 700)
+
+    with_rows(tape, "calls.csv", lose)
+    assert any(
+        "from call 4 to the next" in fault and "0.0035 s" in fault for fault in checked(tape)
+    )

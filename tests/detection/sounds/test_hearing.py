@@ -1,0 +1,322 @@
+"""Sound in: own recordings give the run's own rows, foreign ones what is in them."""
+
+import shutil
+import tracemalloc
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import soundfile
+
+import pipistrelle
+from pipistrelle.config import Config, DetectionConfig, InputError
+from pipistrelle.detection.logs.folder import read_log
+from pipistrelle.detection.logs.heard_rows import RowsHeard
+from pipistrelle.detection.sounds.description import read_description
+from pipistrelle.detection.sounds.hearing import hear_recording, log_callers
+from pipistrelle.experiments.hearing.listening import listen
+from pipistrelle.experiments.hearing.scenario import world_of
+from pipistrelle.verbs.options import MissionOptions, mission_config
+from reference.sounds import FEW, UNLABELLED, foreign, record
+
+
+def heard(folder, config=None):
+    """Hear all of a recording; return the log, its rows alone, and the frames' detections."""
+    found, scans, folder = [], [], Path(folder)
+    about = read_description(folder)
+    rows = RowsHeard(folder, about.log, log_callers(about))
+
+    def look(frame):
+        rows.text(frame.scan)
+        found.append(frame.detections)
+        scans.append(frame.scan)
+
+    hear_recording(folder, about, config or Config(), range, look)
+    rows.files()
+    return SimpleNamespace(scans=scans), found
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory):
+    """A small recording of our own."""
+    return record(tmp_path_factory.mktemp("own") / "tape")
+
+
+def frames_of_run():
+    """Rows without labels of the run that was recorded."""
+    settings = {"receiver": {"elements": 4}}
+    options = MissionOptions(duration=4.0, landmarks=20, settings=settings)
+    config, _, _ = mission_config(options)
+    assert FEW[1] == "4"
+    (frames,) = listen(world_of(config), config, (config.emitter.radius,), labels=False)
+    return [frame.unlabelled for frame in frames]
+
+
+def agreeing(scan, run, bearing, way):
+    """Count the rows of a run that stand in a scan, too."""
+    count = 0
+    for i in range(run.bearing.size):
+        same = scan.caller == run.caller[i]
+        for name, limit in (("bearing", bearing), ("range", way), ("excess_path", way)):
+            mine, his = getattr(scan, name), getattr(run, name)[i]
+            same &= (np.isnan(mine) & np.isnan(his)) | (np.abs(mine - his) < limit)
+        count += bool(same.any())
+    return count
+
+
+def test_what_is_heard_of_a_recording_is_what_the_run_heard(own):
+    log, _ = heard(own)
+    run = frames_of_run()
+    assert [scan.time for scan in log.scans] == [scan.time for scan in run]
+    rows = sum(scan.bearing.size for scan in run)
+    found = sum(agreeing(a, b, 1e-6, 1e-6) for a, b in zip(log.scans, run, strict=True))
+    assert rows > 100
+    assert found >= rows - 2  # next to the threshold the measured noise may decide otherwise
+    for mine, his in zip(log.scans, run, strict=True):
+        for caller, row in enumerate(his.direct.tolist()):
+            assert (mine.direct[caller] < 0) == (row < 0)
+    assert agreeing(log.scans[0], run[1], 1e-6, 1e-6) == 0, "another frame is another"
+
+
+def test_the_log_of_a_recording_is_read_as_it_was_heard(own, tmp_path):
+    done = pipistrelle.hear(own, output=tmp_path / "log")
+    log, scans = read_log(tmp_path / "log"), heard(own)[0].scans
+    assert done.measurements.height == sum(scan.bearing.size for scan in scans)
+    assert {"hearing.png", "truth.csv", "landmarks.csv"} < {p.name for p in done.folder.iterdir()}
+    for mine, his in zip(log.scans, scans, strict=True):
+        np.testing.assert_array_equal(mine.numbers, his.numbers)
+        np.testing.assert_array_equal(mine.direct, his.direct)
+        np.testing.assert_array_equal(mine.caller, his.caller)
+    assert pipistrelle.hear(own).measurements.equals(done.measurements)
+
+
+def test_slam_on_what_was_heard_is_the_run_again(tmp_path):
+    record(tmp_path / "tape", *UNLABELLED, "--filter.noise", "measured", "--filter", "smoother")
+    pipistrelle.hear(tmp_path / "tape", output=tmp_path / "log")
+    asked = {"filters": "smoother", "association__method": "marginal"}
+    again = pipistrelle.slam(tmp_path / "log", gate=1.0, **asked).tracks
+    run = pipistrelle.run(
+        duration=4.0, landmarks=20, strategies="fused", receiver__elements=4,
+        listening__timing=True, filter__noise="measured", **asked,
+    ).tracks  # fmt: skip
+    for name in ("x_m", "y_m", "heading_rad"):
+        assert np.abs(again[name].to_numpy() - run[name].to_numpy()).max() < 0.01
+
+
+def test_sixteen_bits_and_flac_hold_nearly_the_same(tmp_path):
+    record(tmp_path / "short", "--sound-bits", "16")
+    samples, rate = soundfile.read(tmp_path / "short" / "recording.wav", dtype="int16")
+    assert np.abs(samples.astype(int)).max() > 2000
+    run = frames_of_run()
+    rows = sum(scan.bearing.size for scan in run)
+    (tmp_path / "flac").mkdir()
+    for name in ("array.csv", "calls.csv", "odometry.csv", "recording.toml"):
+        shutil.copy(tmp_path / "short" / name, tmp_path / "flac")
+    about = (tmp_path / "flac" / "recording.toml").read_text()
+    (tmp_path / "flac" / "recording.toml").write_text(about.replace(".wav", ".w64"))
+    soundfile.write(tmp_path / "flac" / "recording.w64", samples, rate, subtype="PCM_16")
+    for name in ("short", "flac"):
+        log, _ = heard(tmp_path / name)
+        found = sum(agreeing(a, b, 5e-3, 5e-3) for a, b in zip(log.scans, run, strict=True))
+        assert found > 0.95 * rows
+
+
+@pytest.mark.parametrize("faces", [True, False])
+def test_a_point_is_where_another_program_put_it(tmp_path, faces):
+    log, found = heard(foreign(tmp_path / "tape", place=(1.5, 0.9), faces=faces))
+    assert [scan.time for scan in log.scans] == [10.0 + s / 192e3 for s in (1000, 25e3, 47e3)] or (
+        len(log.scans) == 3
+    )
+    for scan in log.scans:
+        loudest = int(scan.level_db.argmax())
+        assert abs(scan.bearing[loudest] - np.arctan2(0.9, 1.5)) < 0.02
+        assert abs(scan.range[loudest] - np.hypot(1.5, 0.9)) < 0.01
+        assert scan.caller[loudest] == 0
+    assert all(len(one.power) for one in found)
+
+
+def test_gains_and_offsets_of_channels_do_not_matter(tmp_path):
+    rng = np.random.default_rng(4)
+    plain, _ = heard(foreign(tmp_path / "plain"))
+    gain = 10.0 ** rng.uniform(-1.0, 0.5, 16)
+    folder = foreign(tmp_path / "odd", gain=gain)
+    samples, rate = soundfile.read(folder / "tape.wav", dtype="float32")
+    offset = rng.uniform(-0.05, 0.05, 16).astype(np.float32)
+    soundfile.write(folder / "tape.wav", samples + offset, rate, subtype="FLOAT")
+    odd, _ = heard(folder)
+    for one, other in zip(plain.scans, odd.scans, strict=True):
+        a, b = int(one.level_db.argmax()), int(other.level_db.argmax())
+        assert abs(one.bearing[a] - other.bearing[b]) < 3e-3
+        assert abs(one.level_db[a] - other.level_db[b]) < 0.5
+
+
+@pytest.mark.parametrize("way", ["period", "trigger", "leak"])
+def test_calls_are_found_where_calls_csv_would_have_said(tmp_path, way):
+    folder = foreign(tmp_path / "tape", calls=(1013, 25_013, 49_013))
+    told, _ = heard(folder)
+    (folder / "calls.csv").unlink()
+    about = (folder / "recording.toml").read_text()
+    if way == "period":
+        more = f"period = 0.125\nfirst = {1013 / 192e3!r}\n"
+        (folder / "recording.toml").write_text(about.replace("[log]", f"{more}[log]"))
+    if way == "trigger":
+        (folder / "recording.toml").write_text(about.replace("[log]", "trigger = 17\n[log]"))
+        samples, rate = soundfile.read(folder / "tape.wav", dtype="float32")
+        trigger = np.zeros((len(samples), 1), dtype=np.float32)
+        for begin in (1013, 25_013, 49_013):
+            trigger[begin : begin + 121] = 0.8
+        both = np.hstack((samples, trigger))
+        soundfile.write(folder / "tape.wav", both, rate, subtype="FLOAT")
+    found, _ = heard(folder)
+    assert len(found.scans) == len(told.scans) == 3
+    late = 2.0 / 192e3 if way == "leak" else 1e-9
+    for a, b in zip(told.scans, found.scans, strict=True):
+        assert abs(a.time - b.time) <= late
+        i, j = int(a.level_db.argmax()), int(b.level_db.argmax())
+        assert abs(a.range[i] - b.range[j]) <= 170.0 * late + 2e-3
+
+
+def as_one_place(folder):
+    """Have the faces' own places left out: delays are then those of lags."""
+    about = (folder / "recording.toml").read_text()
+    (folder / "recording.toml").write_text(f"one_centre = true\n{about}")
+
+
+def test_noise_alone_passes_as_often_as_it_is_said_to(tmp_path):
+    folder = foreign(
+        tmp_path / "tape", rate=200_000, frequency=40e3, duration=6e-4, amplitude=0.0,
+        calls=tuple(range(1000, 400_000, 20_000)),
+    )  # fmt: skip
+    as_one_place(folder)
+    rate = 1e-3
+    config = Config(detection=DetectionConfig(false_alarm=rate, peak_db=-0.01))
+    _, found = heard(folder, config)
+    # independent tests, one a call's length; of a maximum the neighbours add to the rate
+    lags = sum((20_000 - 120) // 40 for _ in range(20))
+    tests = 4 * lags
+    seen = sum(len(np.unique(one.delay)) for one in found)
+    assert 0.2 * rate * tests < seen < 1.0 * rate * tests + 5.0 * np.sqrt(rate * tests)
+    louder = foreign(
+        tmp_path / "loud", rate=200_000, frequency=40e3, duration=6e-4, amplitude=0.0,
+        calls=tuple(range(1000, 400_000, 20_000)), noise=0.03,
+    )  # fmt: skip
+    as_one_place(louder)
+    _, loud = heard(louder, config)
+    assert abs(sum(len(one.delay) for one in loud) - sum(len(one.delay) for one in found)) < 30
+
+
+def test_memory_does_not_grow_with_the_length(own, tmp_path):
+    shutil.copytree(own, tmp_path / "long")
+    about = (own / "recording.toml").read_text()
+    parts = [f"part{i}.wav" for i in range(6)]
+    for name in parts:
+        (tmp_path / "long" / name).hardlink_to(tmp_path / "long" / "recording.wav")
+    names = ", ".join(f'"{name}"' for name in parts)
+    text = about.replace('"recording.wav"', names).replace("samples = 800000", "samples = 4800000")
+    (tmp_path / "long" / "recording.toml").write_text(text)
+    calls = "".join(f"{100_000 * i}\n" for i in range(48))
+    (tmp_path / "long" / "calls.csv").write_text(f"sample\n{calls}")
+    peaks = []
+    for folder in (own, tmp_path / "long"):
+        heard(own)
+        tracemalloc.start()
+        try:
+            log, _ = heard(folder)
+            peaks.append(tracemalloc.get_traced_memory()[1])
+        finally:
+            tracemalloc.stop()
+    assert len(log.scans) == 48
+    # gaps for the noise are up to 64, of eight in the one and 48 in the other
+    assert peaks[1] < peaks[0] + 40 * 1300 * 2 * 16 * 4 * 2.5
+
+
+def test_a_wide_recording_is_announced_with_sizes_of_64_bits(tmp_path):
+    from pipistrelle.experiments.hearing.sound_recorder import wav_header
+
+    for size in (64, 5_000_000_000 // 64 * 64):
+        path = tmp_path / f"{size}.wav"
+        path.write_bytes(wav_header(size, 16, 200e3, 32))
+        with path.open("ab") as file:
+            file.truncate(path.stat().st_size + size)  # a hole
+        with soundfile.SoundFile(path) as sound:
+            assert (sound.frames, sound.channels, sound.samplerate) == (size // 64, 16, 200_000)
+            assert sound.subtype == "FLOAT"
+            assert "should be 0x" not in sound.extra_info
+
+
+def refused(folder, *words):
+    with pytest.raises(InputError) as error:
+        heard(folder)
+    for word in words:
+        assert word in str(error.value)
+    return str(error.value)
+
+
+def test_what_is_wrong_with_a_recording_is_named(tmp_path):
+    sound = foreign(tmp_path / "sound")
+
+    def spoiled(name, change):
+        folder = tmp_path / "spoiled"
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(sound, folder)
+        path = folder / name
+        if isinstance(change, tuple):
+            path.write_text(path.read_text().replace(*change))
+        else:
+            path.write_bytes(change(path.read_bytes()))
+        return folder
+
+    for name, change, words in (
+        ("tape.wav", lambda data: b"", ["tape.wav"]),
+        ("tape.wav", lambda data: data[: len(data) // 2], ["tape.wav", "header"]),
+        ("tape.wav", lambda data: b"RIFX" + data[4:], ["tape.wav"]),
+        ("tape.wav", lambda data: data[:40], ["tape.wav"]),
+        ("recording.toml", ("340.0", "nan"), ["recording.toml", "speed_of_sound"]),
+        ("recording.toml", ("[log]", "pitch = 3\n[log]"), ["call.pitch", "unknown"]),
+        ("recording.toml", ("start = 10.0", "sample_rate = 96000.0"), ["tape.wav", "96000 Hz"]),
+        ("recording.toml", ("start = 10.0", "samples = 9"), ["'samples'", "9"]),
+        ("recording.toml", ("start = 10.0", 'sound = ["../a"]'), ["'sound'"]),
+        ("recording.toml", ("0.00063", "0.1"), ["calls.csv", "duration"]),
+        ("recording.toml", ("41300.0", "99000.0"), ["99000", "192000"]),
+        ("recording.toml", ("velocity_std = 0.1", ""), ["table 'log'", "velocity_std"]),
+        ("recording.toml", ("[log]", "trigger = 99\n[log]"), ["trigger"]),
+        ("array.csv", ("16,", "17,"), ["array.csv", "channel 17"]),
+        ("array.csv", ("\n2,", "\n1,"), ["array.csv, line 3", "channel 1"]),
+        ("array.csv", ("\n1,", "\n0,"), ["array.csv, line 2", "channel 0"]),
+        ("recording.toml", ("format = 1", "format = 1\none_centre = 1"), ["one_centre"]),
+        ("calls.csv", ("25000", "900"), ["calls.csv, line 3"]),
+        ("calls.csv", ("25000", "1010"), ["calls.csv", "10 samples"]),
+        ("calls.csv", ("47000", "470000000"), ["calls.csv, line 4"]),
+        ("odometry.csv", ("9,0,0\n", ""), ["odometry.csv"]),
+    ):
+        folder = spoiled(name, change)
+        if "trigger" in words:
+            (folder / "calls.csv").unlink()
+        refused(folder, *words)
+
+
+def test_faces_that_share_a_centre_are_lines_that_are_alike(tmp_path):
+    folder = foreign(tmp_path / "sound")
+    as_one_place(folder)
+    heard(folder)
+    rows = (folder / "array.csv").read_text()
+    (folder / "array.csv").write_text(rows.replace("0.002,1", "0.0025,1"))
+    refused(folder, "array.csv", "'1'", "evenly spaced line")
+    (folder / "array.csv").write_text(rows.replace("\n1,0.008", "\n17,0.008"))
+    refused(folder, "array.csv", "channel 17")
+    (folder / "array.csv").write_text("\n".join(rows.splitlines()[:-1]))
+    refused(folder, "array.csv", "alike")
+
+
+def test_samples_that_are_no_numbers_are_named_by_channel_and_place(tmp_path):
+    folder = foreign(tmp_path / "tape")
+    samples, rate = soundfile.read(folder / "tape.wav", dtype="float32")
+    samples[30_000, 4] = np.nan
+    soundfile.write(folder / "tape.wav", samples, rate, subtype="FLOAT")
+    refused(folder, "tape.wav, channel 5", "nan as sample 30000")
+
+
+def test_a_silent_channel_is_named(tmp_path):
+    folder = foreign(tmp_path / "tape", gain=np.array([1.0] * 6 + [0.0] + [1.0] * 9))
+    refused(folder, "channel 7", "no noise")

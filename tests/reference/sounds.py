@@ -1,0 +1,102 @@
+"""Sound recordings that are small: a short drive, heard by few microphones."""
+
+from contextlib import redirect_stdout
+from io import StringIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from pipistrelle.verbs.command_line import obey
+
+FEW = ("--receiver.elements", "4", "--landmarks", "20", "--duration", "4", "--seed", "7")
+"""A drive of eight frames among few landmarks, for sixteen microphones."""
+UNLABELLED = ("--association.method", "marginal", "--listening.timing", "true")
+
+
+def record(folder, *words, drive=FEW):
+    """Write a recording with `pipistrelle run`; return its folder."""
+    with TemporaryDirectory() as place, redirect_stdout(StringIO()):
+        line = ["run", *drive, "--strategy", "fused", "--quiet", "-o", f"{place}/run"]
+        assert obey([*line, "--save-sound", str(folder), *words]) == 0
+    return Path(folder)
+
+
+ABOUT = """format = 1
+speed_of_sound = 340.0
+start = 10.0
+
+[call]
+frequency = {frequency}
+duration = {duration}
+
+[log]
+motion = "unicycle"
+initial_pose = [0.0, 0.0, 0.0]
+initial_pose_std = [0.0, 0.0, 0.0]
+velocity_std = 0.1
+angular_rate_std = 0.1
+range_std = 0.2
+bearing_std = 0.1
+range_bounds = [0.5, 20.0]
+"""
+
+
+def foreign(
+    folder,
+    *,
+    rate=192_000,
+    frequency=41_300.0,
+    duration=6.3e-4,
+    calls=(1000, 25_000, 47_000),
+    place=(1.2, 0.5),
+    amplitude=0.02,
+    noise=1e-3,
+    leak=0.5,
+    gain=None,
+    faces=True,
+    seed=1,
+):
+    """Write a recording as another program would: point source, places, delays, by definition.
+
+    Each of sixteen microphones on four sides hears the call itself, and the echo of one point
+    [m], as real sound at its own distance; behind a face nothing, without faces all around.
+    """
+    import soundfile
+
+    folder.mkdir(exist_ok=True)
+    rows = []
+    for face, turn in enumerate(np.arange(4) * np.pi / 2, start=1):
+        for y in (np.arange(4) - 1.5) * 0.004:
+            x, y = 0.008 * np.cos(turn) - y * np.sin(turn), 0.008 * np.sin(turn) + y * np.cos(turn)
+            rows.append((len(rows) + 1, x, y, face))
+    time = np.arange(calls[-1] + 24_000) / rate
+    sound = noise * np.random.default_rng(seed).standard_normal((time.size, 16))
+    centre = np.hypot(*place)
+    for begin in calls:
+        sound[:, :] += leak * _pulse(time - begin / rate, frequency, duration)[:, None]
+        for number, x, y, face in rows:
+            turn = (face - 1) * np.pi / 2
+            if faces and np.cos(turn) * place[0] + np.sin(turn) * place[1] < 0.0:
+                continue  # behind the face
+            ahead = (x * place[0] + y * place[1]) / centre
+            late = begin / rate + (2.0 * centre - ahead) / 340.0
+            sound[:, number - 1] += amplitude * _pulse(time - late, frequency, duration)
+    sound *= np.ones(16) if gain is None else gain
+    soundfile.write(folder / "tape.wav", sound.astype(np.float32), rate, subtype="FLOAT")
+    about = ABOUT.format(frequency=frequency, duration=duration)
+    (folder / "recording.toml").write_text(about)
+    lines = [f"{channel},{float(x)!r},{float(y)!r},{face}" for channel, x, y, face in rows]
+    if not faces:
+        lines = [line.rpartition(",")[0] for line in lines]
+    header = "channel,x,y,face" if faces else "channel,x,y"
+    (folder / "array.csv").write_text("\n".join([header, *lines, ""]))
+    (folder / "calls.csv").write_text("\n".join(["sample", *map(str, calls), ""]))
+    (folder / "odometry.csv").write_text("time,velocity,angular_rate\n9,0,0\n12,0,0\n")
+    return folder
+
+
+def _pulse(time, frequency, duration):
+    """Return a tone burst at times since its start [s]."""
+    inside = (time >= 0.0) & (time < duration)
+    return np.where(inside, np.cos(2.0 * np.pi * frequency * time), 0.0)

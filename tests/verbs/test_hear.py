@@ -1,0 +1,110 @@
+"""`pipistrelle hear`, and the sound that `run` writes for it."""
+
+from pathlib import Path
+
+import pytest
+import soundfile
+
+from pipistrelle.own_files import SOUND, OwnFiles
+from reference.sounds import FEW, foreign, record
+
+
+@pytest.fixture(scope="module")
+def tape(tmp_path_factory):
+    return record(tmp_path_factory.mktemp("own") / "tape")
+
+
+def test_a_recording_is_heard_into_a_log_that_slam_solves(obey, tape):
+    status, printed, _ = obey("hear", tape, "-o", "log")
+    assert status == 0
+    assert printed.splitlines()[-1] == "log"
+    solved = obey("slam", "log", "--association.method", "marginal", "--quiet", "-o", "map")
+    assert solved[:2] == (0, "map\n")
+    status, _, said = obey("hear", tape, "-o", "log", "--quiet")
+    assert status == 2
+    assert "add --overwrite to replace the log there" in said
+    assert obey("hear", tape, "-o", "log", "--overwrite", "--quiet")[:2] == (0, "log\n")
+
+
+def test_some_frames_are_written_and_some_are_heard(obey, tape):
+    line = ("run", *FEW, "--strategy", "fused", "--quiet", "-o", "run")
+    assert obey(*line, "--save-sound", "some", "--frames", "2:5")[0] == 0
+    some, _ = soundfile.read("some/recording.wav", dtype="float32")
+    whole, _ = soundfile.read(tape / "recording.wav", dtype="float32")
+    assert (some == whole[200_000:500_000]).all()
+    assert obey("hear", "some", "-o", "part", "--quiet", "--frames", "0:2")[0] == 0
+    assert obey("hear", tape, "-o", "same", "--quiet", "--frames", "2:4")[0] == 0
+    part, same = (
+        Path(name, "measurements.csv").read_text().splitlines() for name in ("part", "same")
+    )
+    assert {row.split(",")[0] for row in part[1:]} == {"1.5", "2.0"}
+    assert len(part) == pytest.approx(len(same), abs=2)
+    for frames in ("5:2", "x", "3", "9:", "-1:2", ""):
+        status, _, said = obey("hear", tape, "-o", "none", "--frames", frames)
+        assert status == 2
+        assert "--frames" in said
+    assert not Path("none").exists()
+
+
+def test_the_size_is_told_before_and_a_disk_without_room_is_refused(obey, monkeypatch):
+    line = ("run", *FEW, "--strategy", "fused", "-o", "run", "--save-sound", "tape")
+    monkeypatch.setattr("shutil.disk_usage", lambda _: type("Usage", (), {"free": 1000})())
+    status, _, said = obey(*line)
+    assert status == 2
+    assert "--save-sound: found 0.0 GB free" in said
+    assert not Path("tape").exists()
+    monkeypatch.undo()
+
+
+def test_only_sound_of_our_own_is_replaced(obey):
+    line = ("run", "--receiver.elements", "2", "--duration", "1", "--strategy", "fused", "--quiet")
+    assert obey(*line, "-o", "a", "--save-sound", "tape")[0] == 0
+    first = OwnFiles(Path("tape"), SOUND).read("recording.wav")
+    assert obey(*line, "-o", "b", "--save-sound", "tape")[0] == 2
+    again = (*line, "-o", "c", "--overwrite", "--save-sound", "tape")
+    assert obey(*again)[0] == 0
+    assert OwnFiles(Path("tape"), SOUND).read("recording.wav") == first, "the same bits"
+    Path("tape", "recording.wav").write_bytes(first[:-4])
+    status, _, said = obey(*line, "-o", "d", "--overwrite", "--save-sound", "tape")
+    assert status == 2
+    assert "recording.wav" in said
+    assert Path("tape", "recording.wav").read_bytes() == first[:-4]
+    assert not list(Path("tape").glob("*.partial"))
+
+
+def test_the_dense_engine_and_frames_without_sound_are_refused(obey):
+    line = ("run", *FEW, "--strategy", "fused", "-o", "run")
+    for words, said_of in (
+        (("--engine", "dense", "--save-sound", "tape"), "receiver.engine"),
+        (("--frames", "0:2"), "--frames"),
+        (("--save-sound", "tape", "--frames", "8:9"), "--frames"),
+    ):
+        status, _, said = obey(*line, *words)
+        assert status == 2
+        assert said_of in said
+    assert not Path("tape").exists()
+
+
+def test_a_check_says_nothing_of_a_sound_recording_and_names_a_fault(obey, tmp_path):
+    folder = foreign(tmp_path / "tape")
+    assert obey("hear", folder, "--check")[:2] == (0, "nothing odd was found\n")
+    samples, rate = soundfile.read(folder / "tape.wav", dtype="float32")
+    samples[:, 3] += 0.2
+    soundfile.write(folder / "tape.wav", samples, rate, subtype="FLOAT")
+    status, printed, _ = obey("hear", folder, "--check")
+    assert status == 1
+    assert printed.startswith("channel 4 is off zero by 0.2")
+
+
+def test_what_is_no_recording_is_refused(obey):
+    Path("file").touch()
+    Path("empty").mkdir()
+    Path("link").symlink_to("nowhere")
+    kinds = {"file": "found a file", "gone": "no such folder", "empty": "recording.toml"}
+    for place, words in (kinds | {"link": "no such folder"}).items():
+        status, printed, said = obey("hear", place, "-o", "log")
+        assert (status, printed) == (2, "")
+        assert words in said
+    assert obey("hear", "empty", "--rays.power", "3", "-o", "log")[0] == 2
+    assert "found no folder for the log" in obey("hear", "empty")[2]
+    assert not Path("log").exists()
