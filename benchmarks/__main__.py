@@ -11,7 +11,7 @@ from cyclopts import App, Parameter
 from cyclopts.types import ExistingFile
 from cyclopts.validators import Number
 
-from benchmarks import peer, programs, stages, study
+from benchmarks import callers, peer, programs, stages, study
 from benchmarks.machine import ROOT, facts
 from benchmarks.promises import PROMISES
 from benchmarks.table import Row, grown, read, rows_of, show, write
@@ -20,7 +20,7 @@ LATEST, HISTORY = ROOT / "benchmarks" / "latest.json", ROOT / "benchmarks" / "hi
 WORSE = 1.25
 """A row is named when it grew by more than this factor."""
 
-Part = Literal["stages", "study", "programs", "peer", "growth"]
+Part = Literal["stages", "study", "programs", "peer", "callers", "growth"]
 app = App(
     name="./dev bench",
     help="Time what was promised; targets, ratios, floors.",
@@ -90,6 +90,7 @@ def measured(
         "study": lambda: study.measure(worlds),
         "programs": lambda: programs.measure(rounds),
         "peer": lambda: peer.measure(rounds),
+        "callers": callers.measure,
     }
     if scaling or "growth" in only:
         from benchmarks import growth

@@ -31,6 +31,7 @@ PROMISES: dict[str, tuple[str, float | None, Relation, float | None]] = {
     "isam2_over_batch": ("1", 100.0, ">=", None),
     "gtsam_batch_over_batch": ("1", None, ">=", None),
     "batch_over_ekf": ("1", 1.0, "<=", None),
+    "three_callers_over_one": ("1", 2.0, "<=", None),
     "frame_growth": ("1", 1.1, "<=", None),
     "ekf_growth": ("1", 2.1, "<=", None),
     "fastslam_growth": ("1", None, "<=", None),
