@@ -96,7 +96,6 @@ def test_an_error_within_a_linked_kernel_reaches_python():
 def test_a_kernel_that_is_called_has_no_machine_code_but_within_its_caller():
     mixed(np.ones(3))
     assert not filled.signatures
-    assert filled.linked.signatures
     assert filled(2, 0.5).tolist() == [0.5, 0.5]
     assert filled.signatures
 

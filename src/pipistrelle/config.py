@@ -32,6 +32,8 @@ STEEPEST = 1.1
 """No car's front wheels steer by more [rad]."""
 LONGEST_STEP = 1e5
 """No control step is longer [s]: more than a day."""
+LATEST = 3600.0
+"""No clock of a sensor is later or earlier than the odometry's by more [s]."""
 BLOCK = 2e-4
 """Length of a block of samples, over which a receiver sums [s]."""
 LEAST_STD = 1e-6
@@ -493,6 +495,7 @@ Parameter = Literal[
     "speed_of_sound",
     "sensor_heading",
     "sensor_place",
+    "time_offset",
 ]
 """What the smoother may estimate of the vehicle itself."""
 PARAMETERS: tuple[Parameter, ...] = get_args(Parameter)
@@ -544,6 +547,8 @@ class PriorConfig(Section):
     """Of the sensor's zero bearing from the vehicle's heading [rad]."""
     sensor_place_std: DistanceStd = 0.1
     """Of the sensor, ahead and to the left of the vehicle's point, each [m]."""
+    time_offset_std: Annotated[Positive, Field(le=10)] = 0.1
+    """Of how late the sensor's clock is, by the odometry's [s]."""
 
 
 def _check_rising(near: float, far: float) -> None:
@@ -627,6 +632,8 @@ class BagConfig(Section):
     """Where pings that tell travel times do not say it [m/s]."""
     step: Annotated[NonNegative, Field(le=LONGEST_STEP)] = 0.1
     """Odometry is merged into steps of this length; 0: each message is one [s]."""
+    time_offset: Annotated[Real, Field(ge=-LATEST, le=LATEST)] = 0.0
+    """How late the times of echoes are, by the odometry's clock [s]."""
     initial_pose_std: tuple[NonNegative, NonNegative, NonNegative] = (0.05, 0.05, 0.0436)
     """How unsure the start is: x, y [m], heading [rad]."""
     forward_std: NonNegative = 0.01

@@ -62,14 +62,14 @@ def hear(history, x, k, m, into):
     ends = [slice(3 * k, 3 * k + 3), place_of(history, slot), theta]
 
     def seen(pose, point, parameters):
-        at, heading, scale, leaning = sensor(history.calibration, pose, parameters)
+        at, heading, scale, leaning = sensor(history, k, pose, parameters)
         dx, dy = point - at
         turned = np.arctan2(dy, dx) - heading - np.nan_to_num(lean) * leaning
         off = [wrap(turned - bearing) / across, (np.hypot(dx, dy) / scale - distance) / along]
         return np.array(off)[[np.isfinite(bearing), np.isfinite(bearing) and np.isfinite(distance)]]
 
     def further(pose, point, parameters, call):
-        at, _, scale, _ = sensor(history.calibration, pose, parameters)
+        at, _, scale, _ = sensor(history, k, pose, parameters)
         way = np.hypot(*(call - point)) + np.hypot(*(point - at)) - np.hypot(*(call - at))
         return np.array([(way / scale - excess_path) / sure])
 
@@ -79,17 +79,31 @@ def hear(history, x, k, m, into):
         by_all(further, x, [*ends, place_of(history, caller)], into)
 
 
-def sensor(calibration, pose, parameters):
+def sensor(history, k, pose, parameters):
     """Return place and heading of the sensor, the sound's scale, and what bearings lean by."""
-    (sound, turned, place), (c, s) = calibration.sensor - 1, (np.cos(pose[2]), np.sin(pose[2]))
+    sound, turned, place, clock = history.calibration.sensor - 1
     off, heading, scale, lean = np.zeros(2), pose[2], 1.0, 0.0
+    seconds = history.legs.entries(2)[k]
+    if clock >= 0 and seconds:
+        x, y, turn = history.legs.entries(0)[k]
+        half = 0.5 * turn
+        along = half / np.tan(half) if half else 1.0
+        share = parameters[clock] / seconds
+        chord = np.array([along * x + half * y, along * y - half * x])
+        off = off - share * turning(heading - 0.5 * share * turn) @ chord
+        heading = heading - share * turn
     if place >= 0:
-        off = np.array([[c, -s], [s, c]]) @ parameters[place : place + 2]
+        off = off + turning(heading) @ parameters[place : place + 2]
     if turned >= 0:
         heading = heading + parameters[turned]
     if sound >= 0:
         scale, lean = 1.0 + parameters[sound], parameters[sound] + parameters[sound + 1]
     return pose[:2] + off, heading, scale, lean
+
+
+def turning(angle):
+    """Return the matrix that turns by an angle."""
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
 def by_all(function, x, ends, into):

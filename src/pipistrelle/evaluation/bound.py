@@ -125,6 +125,7 @@ def pose_bound(
     rows = np.searchsorted(step[known], np.arange(len(path) + 1))
     reached = np.maximum.accumulate(np.append(0, index[ends[:, :2]].max(axis=1, initial=0)))
     place = dict(zip(fixed.tolist(), places, strict=True))
+    nowhere = np.zeros(len(moving), np.int64), np.zeros((len(moving), 2))
     points = [np.zeros(1), *(place[one] for one in border.tolist())]
     return _bound(
         _states(time, path, [routes[one] for one in moving]),
@@ -132,7 +133,7 @@ def pose_bound(
         (true_controls(motion, controls, time, path), np.diff(time)),
         motion_numbers(motion),
         wander,
-        (index, np.zeros(len(moving), np.int64), np.zeros((len(moving), 2)), NOTHING.sensor),
+        (index, *nowhere, NOTHING.sensor, np.zeros((0, 3)), np.zeros(0)),
         (ends, np.ascontiguousarray(numbers[:, known].T)),
         np.column_stack([rows[:-1], rows[1:], reached[rows[1:]] + 2]),
     )

@@ -267,6 +267,18 @@ def test_measurements_outside_the_odometry_are_dropped_and_counted(tmp_path):
     assert [scan.time for scan in log.scans] == [0.0, 1.0]
 
 
+@pytest.mark.parametrize(("late", "used"), [(0.05, [0.1, 0.1, 0.3]), (-0.05, [0.1, 0.3, 0.3])])
+def test_a_sensor_whose_clock_is_late_or_early_is_heard_by_the_odometrys(tmp_path, late, used):
+    settings = UNICYCLE.replace("range_std", f"time_offset = {late}\nrange_std", 1)
+    times = (0.04 + max(late, 0.0), 0.1, 0.2)
+    rows = measured(*(f"{time},{label},0,1" for label, time in enumerate(times)))
+    log = read_log(recorded(tmp_path, settings, measurements=rows))
+    assert [scan.time for scan in log.scans] == used
+    write_log(tmp_path / "again", log)
+    again = read_log(tmp_path / "again")
+    assert [scan.time for scan in again.scans] == used
+
+
 def test_of_odometry_rows_with_one_time_the_last_wins_and_the_others_are_counted(tmp_path):
     odometry = "time,velocity,angular_rate\n0,1,0\n0,2,0\n1,3,0\n1,4,0\n1,5,0\n2,0,0\n"
     log = read_log(recorded(tmp_path, odometry=odometry))
@@ -511,6 +523,11 @@ def test_no_column_goes_before_the_four(tmp_path, stated):
         ("[0.5, 20.0]", "[20.0, 0.5]", ("'range_bounds': found [20.0, 0.5]", "below a far one")),
         ("[0.5, 20.0]", "[0.0, 20.0]", ("'range_bounds[0]': found 0.0", "greater than 0")),
         ("range_std = 0.2", "range_std = 0.2\nstep = 0", ("'step': found 0", "greater than 0")),
+        (
+            "range_std = 0.2",
+            "range_std = 0.2\ntime_offset = 4e7",
+            ("'time_offset': found 40000000.0", "3600"),
+        ),
         ("range_std = 0.2", "range_std = 0.2\ngate = 1.5", ("'gate': found 1.5", "equal to 1")),
         ("range_std = 0.2", "range_std = 0.2\nsensor_pose = [1.0, 2.0]", ("2 values, expected 3",)),
         (

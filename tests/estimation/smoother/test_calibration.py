@@ -14,7 +14,7 @@ from pipistrelle.estimation.smoother.chain import converged, relinearised, smoot
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.estimation.smoother.history import in_hindsight
 from pipistrelle.estimation.smoother.preintegration import extended, no_odometry
-from pipistrelle.geometry import wrap
+from pipistrelle.geometry import range_and_bearing, wrap
 from reference import dense_smoothing
 from reference.missions import (
     BICYCLE,
@@ -32,6 +32,7 @@ from reference.missions import (
 from reference.odometry import by_poses
 from reference.timing import timed
 
+STILL = replace(BICYCLE, noise_at_rest=False)
 MOTIONS = [BICYCLE, Motion(model="unicycle", control_std=(0.1, 0.1)), by_poses(BICYCLE)]
 
 
@@ -47,11 +48,12 @@ def smoother(*names, motion=BICYCLE, **changes):
     )
 
 
-def mission_of(strategy, seed=4, frames=30, callers=(13, 45), std=1.0):
+def mission_of(strategy, seed=4, frames=30, callers=(13, 45), std=1.0, controls=None):
     """A drive with excess paths, and bearings that lean with the speed of sound."""
     rng, stds = np.random.default_rng(seed), {"range_std": 0.05 * std, "bearing_std": 0.01 * std}
+    controls = steady(CIRCLE, frames) if controls is None else controls
     mission = draw_mission(
-        rng, BICYCLE, START, scattered(rng, 50), steady(CIRCLE, frames), **SENSING[strategy], **stds
+        rng, BICYCLE, START, scattered(rng, 50), controls, **SENSING[strategy], **stds
     )
     mission = replace(mission, scans=[measured_to(scan, **stds) for scan in mission.scans])
     if callers:
@@ -66,7 +68,7 @@ def mission_of(strategy, seed=4, frames=30, callers=(13, 45), std=1.0):
 @pytest.mark.parametrize("strategy", SENSING)
 @pytest.mark.parametrize(
     "names",
-    [PARAMETERS, ("speed_scale", "speed_of_sound"), ("speed_scale",), ("sensor_place",)],
+    [PARAMETERS, ("speed_scale", "speed_of_sound"), *((name,) for name in PARAMETERS)],
     ids=lambda names: "+".join(names),
 )
 def test_the_optimum_is_that_of_dense_normal_equations(strategy, names):
@@ -132,6 +134,49 @@ def test_a_sensor_that_is_turned_and_stands_aside_is_found(strategy):
     for name in ("sensor_place_x", "sensor_place_y"):
         value, std = found[name]
         assert abs(value) < 3.0 * std
+
+
+def arc(turn):
+    """Return what takes a constant velocity to the chord that it leads along, in unit time."""
+    s, c = (np.sin(turn) / turn, (1.0 - np.cos(turn)) / turn) if turn else (1.0, 0.0)
+    return np.array([[s, -c], [c, s]])
+
+
+def heard_late(mission, late):
+    """Give each frame what was heard so much before its end [s], along the way to it."""
+    scans, share = [], late / mission.dt[0].sum()
+    for before, here, scan in zip(mission.path, mission.path[1:], mission.scans, strict=False):
+        turn = wrap(here[2] - before[2])
+        chord = dense_smoothing.turning(-before[2]) @ (here - before)[:2]
+        back = here - share * np.array([0.0, 0.0, turn])
+        velocity = np.linalg.solve(arc(turn), chord)
+        back[:2] -= dense_smoothing.turning(here[2]) @ arc(-share * turn) @ velocity * share
+        place = mission.landmarks[scan.landmark - 1]
+        (then, turned), (now, seen) = (range_and_bearing(pose, place) for pose in (back, here))
+        bearing = wrap(scan.bearing + turned - seen)
+        scans.append(with_columns(scan, bearing=bearing, range=scan.range + then - now))
+    return replace(mission, scans=scans)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("late", [0.12, -0.05])
+def test_a_clock_that_is_late_or_early_is_found(late, seed):
+    """By a drive now fast, now slow: at one speed, to hear later is to have started elsewhere."""
+    controls = steady(CIRCLE, 100)
+    controls[:, :, 0] *= np.where(np.arange(100) // 5 % 2, 1.6, 0.4)[:, None]
+    drive = mission_of("active", std=0.2, callers=(), controls=controls, seed=seed)
+    *_, (belief, _) = followed(smoother("time_offset"), heard_late(drive, late))
+    value, std = belief.calibration()["time_offset"]
+    assert abs(value - late) < 3.0 * std
+    assert std < 0.02
+
+
+def test_of_a_vehicle_that_stands_nothing_tells_how_late_its_clock_is():
+    mission = mission_of("active", frames=10, callers=())
+    still = replace(mission, controls=0.0 * mission.controls)
+    *_, (belief, _) = followed(smoother("time_offset", motion=STILL), still)
+    value, std = belief.calibration()["time_offset"]
+    assert (value, std) == (pytest.approx(0.0, abs=1e-6), pytest.approx(0.1, rel=1e-3))
 
 
 def test_a_speed_of_sound_is_found_by_odometry_and_by_bearings():

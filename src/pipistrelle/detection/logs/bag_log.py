@@ -93,6 +93,7 @@ def read_bag(
         table,
         _merged(f"{path}, topic {', '.join(heard)}", measured),
         step=settings.step or None,
+        time_offset=settings.time_offset,
         span=span,
         ignored_rows=dict(ignored),
         name=path.resolve().stem,

@@ -115,6 +115,7 @@ def read_log(folder: Path) -> Log:
         odometry,
         measured,
         step=vehicle.step,
+        time_offset=vehicle.time_offset,
         name=folder.resolve().name,
         former_names=(*measured.former, *former),
         **vehicle.told(),

@@ -128,6 +128,7 @@ def assemble(
     measurements: Table,
     *,
     step: float | None = None,
+    time_offset: float = 0.0,
     span: tuple[float, float] = (-math.inf, math.inf),
     ignored_rows: dict[str, int] | None = None,
     **settings: Any,
@@ -144,6 +145,8 @@ def assemble(
         excess path of a landmark.
     step : [s]
         Length of the steps into which rows are merged; None: one step each.
+    time_offset : [s]
+        How late the times of measurements are, by the odometry's clock.
     span : (start, end) [s]
         The log is cut to it.
     ignored_rows : dict of str to int
@@ -173,6 +176,8 @@ def assemble(
     else:
         _, *columns = odometry.column.values()
         controls = _mean_controls(stamp[last], np.column_stack(columns)[last], rows, time)
+    stamps = {"time": measurements.column["time"] - time_offset}
+    measurements = replace(measurements, column=measurements.column | stamps)
     measurements, clutter = _labelled(measurements, settings.get("callers", ()))
     stamp = measurements.column["time"]
     inside = (stamp >= time[0]) & (stamp <= time[-1])

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field, ValidationError, field_validator
 
 from pipistrelle.config import (
+    LATEST,
     LONGEST_STEP,
     MAX_OTHERS,
     AngleStd,
@@ -96,6 +97,7 @@ class Vehicle(Section):
     gate: Probability | None = None
     noise_at_rest: bool = True
     sensor_pose: _Triple = (0.0, 0.0, 0.0)
+    time_offset: Annotated[Real, Field(ge=-LATEST, le=LATEST)] = 0.0
     association: _Association = _Association()
     callers: Annotated[tuple[_Caller, ...], Field(strict=False, max_length=MAX_OTHERS)] = ()
 
@@ -165,7 +167,9 @@ KINDS: dict[str, type[Vehicle]] = {
     "ackermann": _Ackermann,
     "poses": _Poses,
 }
-SHARED = tuple(name for name in Vehicle.model_fields if name not in ("format", "step"))
+OF_FILES = ("format", "step", "time_offset")
+"""The keys that say how the tables are read."""
+SHARED = tuple(name for name in Vehicle.model_fields if name not in OF_FILES)
 """The keys that every log has."""
 TOLD = (*SHARED, "wheelbase", "speed_offset")
 """The keys that are those of a `Log`, where a motion model has them."""

@@ -23,6 +23,7 @@ NUMBERS = {
     "speed_of_sound": ("speed_of_sound", "bearing_lean"),
     "sensor_heading": ("sensor_heading",),
     "sensor_place": ("sensor_place_x", "sensor_place_y"),
+    "time_offset": ("time_offset",),
 }
 """The names of the numbers of each parameter. They stand in the border in this order."""
 LEAN_STD = 0.003
@@ -31,7 +32,7 @@ bearings are off for other reasons grows like them towards its sides. In the sou
 they lean by 0.1 to 0.3 %."""
 OF_ODOMETRY = ("speed_scale", "turn_bias", "wheelbase")
 """Parameters of odometry, by the codes that kernels have for them."""
-OF_SENSOR = ("speed_of_sound", "sensor_heading", "sensor_place")
+OF_SENSOR = ("speed_of_sound", "sensor_heading", "sensor_place", "time_offset")
 """Parameters of the sensor, as `records.Places.sensor` has their columns."""
 
 
@@ -49,7 +50,7 @@ class Calibration:
     """Standard deviation of the prior of each, in the border."""
     odometry: Int[np.ndarray, " q"]
     """Codes of those of odometry (`OF_ODOMETRY`), which stand first."""
-    sensor: Int[np.ndarray, "3"]
+    sensor: Int[np.ndarray, "4"]
     """Columns of those of the sensor (`OF_SENSOR`); 0 where one is not estimated."""
 
     def scale_is_free(self, ranged: bool) -> bool:
@@ -78,7 +79,7 @@ def calibration_of(config: Config, motion: Motion) -> Calibration:
     >>> from pipistrelle.config import FilterConfig
     >>> config = Config(filter=FilterConfig(calibrate=("sensor_place", "speed_of_sound")))
     >>> calibration_of(config, Motion(model="unicycle", control_std=(0.1, 0.1))).sensor
-    array([1, 0, 3])
+    array([1, 0, 3, 0])
     """
     asked, about, sound = (
         set(config.filter.calibrate),

@@ -42,7 +42,7 @@ def entering_places(
     rows, places, front = Rows(*rows), Places(*places), Front(*front)
     k, first, last = span
     view, found = (
-        view_of(estimate[0][k], estimate[1], places.sensor),
+        view_of(estimate[0][k], estimate[1], places, k),
         np.full((last - first, 2), np.nan),
     )
     for m in range(first, last):
@@ -54,7 +54,7 @@ def entering_places(
             heard = m, first, last
             away = place_by_excess_path(rows, heard, view, k, places, estimate, front, R)
         if math.isnan(away) and not moves[slot]:
-            away = range_by_crossing(rows, m, estimate, places.sensor)
+            away = range_by_crossing(rows, m, estimate, places)
         angle = direction_of(view, numbers)
         found[m - first, 0] = view.x + away * math.cos(angle)
         found[m - first, 1] = view.y + away * math.sin(angle)
@@ -62,16 +62,16 @@ def entering_places(
 
 
 @no_alloc
-def range_by_crossing(
-    rows: Rows, m: Whole, estimate: Points, sensor: Int[np.ndarray, "3"]
-) -> float:
+def range_by_crossing(rows: Rows, m: Whole, estimate: Points, places: Places) -> float:
     """Return the range where the bearing of row m clearly crosses an earlier one, or NaN."""
     numbers, (poses, border) = rows.numbers[m], estimate
-    view = view_of(poses[rows.ends[m, 2]], border, sensor)
+    k = rows.ends[m, 2]
+    view = view_of(poses[k], border, places, k)
     angle, best, found = direction_of(view, numbers), math.sin(MIN_CROSSING_ANGLE), math.nan
     earlier = rows.ends[m, 3]
     while earlier >= 0:
-        there = view_of(poses[rows.ends[earlier, 2]], border, sensor)
+        k = rows.ends[earlier, 2]
+        there = view_of(poses[k], border, places, k)
         other = direction_of(there, rows.numbers[earlier])
         sine = math.sin(other - angle)
         if abs(sine) >= best:

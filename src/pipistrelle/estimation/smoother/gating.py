@@ -61,7 +61,7 @@ def drop_outside(
     rows, places, front = Rows(*rows), Places(*places), Front(*front)
     (k, first, last), (dropped, squared, degrees) = span, (0, 0.0, 0.0)
     work = work_of(front.P.shape[0], 1, 0)
-    view = view_of(estimate[0][k], estimate[1], places.sensor)
+    view = view_of(estimate[0][k], estimate[1], places, k)
     for m in range(first, last):
         point = point_of(rows.ends[m, 0], k, places, estimate)
         if point[0] == 0:

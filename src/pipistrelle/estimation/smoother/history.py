@@ -121,7 +121,8 @@ class History:
         index = self.index
         if columns.size:
             index = np.where(index > 0, columns[np.maximum(index - 1, 0)], index)
-        return index, self.first, self.begun, self.calibration.sensor
+        mean, _, seconds, *_ = self.legs.arrays
+        return index, self.first, self.begun, self.calibration.sensor, mean, seconds
 
 
 def begun(pose: Gaussian, calibration: Calibration) -> History:

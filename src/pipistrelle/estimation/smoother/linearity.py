@@ -54,8 +54,8 @@ def nonlinearity(
         border[i] += off[1][i]
     state = points[0][k] + off[0]
     then, now = (
-        view_of(points[0][k], points[1], places.sensor),
-        view_of(state, border, places.sensor),
+        view_of(points[0][k], points[1], places, k),
+        view_of(state, border, places, k),
     )
     for m in range(first, last):
         numbers, there = rows.numbers[m], point_of(rows.ends[m, 0], k, places, points)

@@ -4,7 +4,11 @@ A row of slopes is written to the work's entries: three by the pose, further one
 one that is left for the misfit, and those by the border. What the vehicle does not know of its
 sensor stands there, too: with an offset l and a turn :math:`\delta` in the axes of a pose
 (p, :math:`\theta`), the sensor is at :math:`p + R(\theta) l` and looks along
-:math:`\theta + \delta`. Where the true speed of sound is k times the one that ranges r and excess
+:math:`\theta + \delta`. Where its clock is late by :math:`\tau`, it heard while the vehicle
+where it was :math:`\tau` before, by the velocities v ahead and to the left and :math:`\omega` that
+lead along the way to the node:
+:math:`p - \tau R(\theta - \tfrac12 \tau \omega) v`, :math:`\theta - \tau \omega`; callers count as
+standing meanwhile. Where the true speed of sound is k times the one that ranges r and excess
 paths were computed with, these measure r / k, and a bearing is off by its slope (`Scan`) times
 k - 1 and what else leans on that slope.
 """
@@ -13,7 +17,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from pipistrelle.detection.scans import BEARING, SLOPE
 from pipistrelle.estimation.measurement import excess_path_slopes
@@ -38,26 +42,56 @@ class View(NamedTuple):
     s: float
     away_x: float  # of the sensor from the vehicle, in the world's axes
     away_y: float
+    by_late: tuple[float, float, float]  # slopes of the sensor's pose by how late its clock is
     scale: float  # true speed of sound over the one that was assumed, k
     lean: float  # by which slopes of bearings are multiplied, about k - 1
-    columns: tuple[Whole, Whole, Whole]  # as `Places.sensor`
+    columns: tuple[Whole, Whole, Whole, Whole]  # as `Places.sensor`
+    known: bool  # whether nothing of the sensor is estimated
 
 
 @no_alloc
 def view_of(
-    pose: Float[np.ndarray, " d"], border: Float[np.ndarray, " n"], sensor: Int[np.ndarray, "3"]
+    pose: Float[np.ndarray, " d"], border: Float[np.ndarray, " n"], places: Places, k: Whole
 ) -> View:
-    """Return the view from a pose."""
-    sound, turned, place = sensor[0], sensor[1], sensor[2]
-    c, s, x, y = math.cos(pose[2]), math.sin(pose[2]), 0.0, 0.0
+    """Return the view from a pose of node k."""
+    sensor = places.sensor
+    sound, turned, place, clock = sensor[0], sensor[1], sensor[2], sensor[3]
+    heading, x, y = pose[2], 0.0, 0.0
+    back = (0.0, 0.0, 0.0, 0.0, 0.0)
+    if clock > 0 and places.seconds[k] > 0.0:
+        back = _steps_back(heading, border[clock], places.way[k], places.seconds[k])
+        heading += border[clock] * back[4]
+    c, s = math.cos(heading), math.sin(heading)
     if place > 0:
         x = c * border[place] - s * border[place + 1]
         y = s * border[place] + c * border[place + 1]
-    heading = pose[2] + (border[turned] if turned > 0 else 0.0)
+    by_late = back[2] - back[4] * y, back[3] + back[4] * x, back[4]
+    if clock > 0:
+        x, y = x + back[0], y + back[1]
+    heading += border[turned] if turned > 0 else 0.0
     off = border[sound] if sound > 0 else 0.0
     lean = off + border[sound + 1] if sound > 0 else 0.0
     at = pose[0] + x, pose[1] + y, heading
-    return View(*at, c, s, x, y, 1.0 + off, lean, (sound, turned, place))
+    columns, known = (sound, turned, place, clock), sound + turned + place + clock == 0
+    return View(*at, c, s, x, y, by_late, 1.0 + off, lean, columns, known)
+
+
+@no_alloc
+def _steps_back(
+    heading: float, late: float, way: Float[np.ndarray, " 3"], seconds: float
+) -> tuple[float, float, float, float, float]:
+    """Return how far a vehicle was back along the way to a node, by how late a clock is.
+
+    First in the world's axes, then the slopes of that and of the heading.
+    """
+    half = 0.5 * way[2]
+    along = half / math.tan(half) if abs(half) > 1e-9 else 1.0
+    ahead = (along * way[0] + half * way[1]) / seconds
+    left = (along * way[1] - half * way[0]) / seconds
+    turn = 0.5 * late * way[2] / seconds
+    c, s = math.cos(heading - turn), math.sin(heading - turn)
+    x, y = -(c * ahead - s * left), -(s * ahead + c * left)
+    return late * x, late * y, x + turn * y, y - turn * x, -way[2] / seconds
 
 
 @no_alloc
@@ -133,7 +167,7 @@ def _write_view(
     Returns how many entries there are.
     """
     at, slope, size, (by_x, by_y, by_heading) = work.at, work.slope, MISFIT + 1, by_pose
-    sound, turned, place = view.columns
+    sound, turned, place, clock = view.columns
     for a in range(POSE):
         at[a] = a
     slope[0], slope[1] = by_x, by_y
@@ -151,6 +185,10 @@ def _write_view(
         slope[size] = view.c * by_x + view.s * by_y
         slope[size + 1] = view.c * by_y - view.s * by_x
         size += 2
+    if clock > 0:
+        late_x, late_y, turn = view.by_late
+        at[size], slope[size] = clock, by_x * late_x + by_y * late_y + by_heading * turn
+        size += 1
     return size
 
 

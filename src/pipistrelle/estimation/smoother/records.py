@@ -49,8 +49,11 @@ class Places(NamedTuple):
     index: Int[np.ndarray, " s"]  # column of the border; minus the index in the chain; 0: nowhere
     first: Int[np.ndarray, " v"]  # node at which each moving caller joins the chain
     begun: Float[np.ndarray, "v 2"]  # where it was placed then
-    sensor: Int[np.ndarray, "3"]
-    """Columns of the speed of sound, of the sensor's heading and of its place; 0: not estimated."""
+    sensor: Int[np.ndarray, "4"]
+    """Columns of the speed of sound, of the sensor's heading, of its place and of how late its
+    clock is; 0: not estimated."""
+    way: Float[np.ndarray, "k 3"]  # as `Legs.mean`
+    seconds: Float[np.ndarray, " k"]
 
 
 class Noise(NamedTuple):

@@ -66,7 +66,7 @@ def hear(
     write(front.C, work.C)
     if noise.damping > 0.0:
         _hold(work, front, noise.damping)
-    view = view_of(points[0][k], points[1], places.sensor)
+    view = view_of(points[0][k], points[1], places, k)
     for m in range(begin, end):
         numbers, landmark = rows.numbers[m], point_of(rows.ends[m, 0], k, places, points)
         if landmark[0] == 0:
@@ -99,7 +99,7 @@ def _hear_direction(
     along = 1.0 / max(numbers[RANGE_STD], LEAST_DEVIATION) if ranged else 0.0
     far = (seen[0] / view.scale - numbers[RANGE]) * along if ranged else 0.0
     less, cost = _huber(off * off + far * far, believed)
-    if i > 0 and not work.alone[0] and view.columns[0] + view.columns[1] + view.columns[2] == 0:
+    if i > 0 and not work.alone[0] and view.known:
         slopes = less * across * seen[4], less * along, less * across
         _add_direction(work, front, i, seen[2:4], slopes, (less * off, less * far))
         return cost
