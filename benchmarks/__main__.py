@@ -11,7 +11,7 @@ from cyclopts import App, Parameter
 from cyclopts.types import ExistingFile
 from cyclopts.validators import Number
 
-from benchmarks import callers, peer, programs, stages, study
+from benchmarks import callers, peer, programs, robot, stages, study
 from benchmarks.machine import ROOT, facts
 from benchmarks.promises import PROMISES
 from benchmarks.table import Row, grown, read, rows_of, show, write
@@ -20,7 +20,7 @@ LATEST, HISTORY = ROOT / "benchmarks" / "latest.json", ROOT / "benchmarks" / "hi
 WORSE = 1.25
 """A row is named when it grew by more than this factor."""
 
-Part = Literal["stages", "study", "programs", "peer", "callers", "growth"]
+Part = Literal["stages", "study", "programs", "peer", "callers", "robot", "growth"]
 app = App(
     name="./dev bench",
     help="Time what was promised; targets, ratios, floors.",
@@ -91,6 +91,7 @@ def measured(
         "programs": lambda: programs.measure(rounds),
         "peer": lambda: peer.measure(rounds),
         "callers": callers.measure,
+        "robot": robot.measure,
     }
     if scaling or "growth" in only:
         from benchmarks import growth

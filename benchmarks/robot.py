@@ -1,0 +1,79 @@
+"""How long a robot's own loop takes for a scan, by `pipistrelle.Slam`, when the map is full.
+
+python -m benchmarks.robot     # CPU milliseconds as JSON: by estimator and landmarks
+"""
+
+import json
+import time
+from itertools import product
+
+import numpy as np
+from jaxtyping import Float
+
+from benchmarks.machine import answer
+from benchmarks.promises import row
+from benchmarks.table import Row
+from pipistrelle import Slam
+
+ROBOT = {
+    "motion": "unicycle",
+    "velocity_std": 0.05,
+    "angular_rate_std": 0.05,
+    "range_std": 0.05,
+    "bearing_std": 0.01,
+    "range_bounds": [0.5, 50.0],
+}
+ESTIMATORS, LANDMARKS = ("ekf", "iekf"), (50, 200, 1000)
+HEARD, SCANS, STEP = 25, 1000, 0.1
+"""Rows of a scan, scans that are timed, and the time from one to the next [s]."""
+
+
+def measure() -> tuple[list[Row], list[float]]:
+    """Time the loop in a process of its own: the rows, and no yardstick."""
+    told = answer("-m", "benchmarks.robot")
+    return [
+        row(
+            f"hear_{landmarks}_{name}_ms",
+            told[f"{name} {landmarks}"][1],
+            "./dev bench --only robot",
+            note="the median {:.2f} ms, the worst {:.2f} ms".format(
+                *told[f"{name} {landmarks}"][::2]
+            ),
+        )
+        for landmarks, name in product(LANDMARKS, ESTIMATORS)
+    ], []
+
+
+def latencies(name: str, landmarks: int) -> list[float]:
+    """Return the median, the 99th of a hundred, and the worst time of a scan [ms]."""
+    rng, slam, seconds = np.random.default_rng(0), Slam(ROBOT, filter=name), []
+    places = rng.uniform(-20.0, 20.0, (landmarks, 2))
+    rounds = -(-landmarks // HEARD)
+    for k in range(rounds + SCANS):
+        slam.move([0.5, 0.1], dt=STEP)
+        if k < rounds:
+            heard = np.arange(landmarks)[HEARD * k : HEARD * (k + 1)]
+        else:
+            heard = rng.choice(landmarks, HEARD, replace=False)
+        columns = _measured(slam, places[heard], rng)
+        began = time.thread_time()
+        slam.hear(landmark=heard, **columns)
+        seconds.append(time.thread_time() - began)
+    return (1e3 * np.quantile(seconds[rounds:], [0.5, 0.99, 1.0])).round(4).tolist()
+
+
+def _measured(
+    slam: Slam, places: Float[np.ndarray, "m 2"], rng: np.random.Generator
+) -> dict[str, Float[np.ndarray, " m"]]:
+    """Return bearings and ranges of places, as if the vehicle was where it thinks it is."""
+    x, y = (places - (slam.pose.x, slam.pose.y)).T
+    noise = rng.normal(0.0, 1.0, (2, len(places)))
+    return {
+        "bearing": np.arctan2(y, x) - slam.pose.heading + ROBOT["bearing_std"] * noise[0],
+        "range": np.hypot(x, y) + ROBOT["range_std"] * noise[1],
+    }
+
+
+if __name__ == "__main__":
+    found = {f"{name} {n}": latencies(name, n) for name, n in product(ESTIMATORS, LANDMARKS)}
+    print(json.dumps(found))
