@@ -1,4 +1,4 @@
-"""Labels of which one in twenty is wrong: what Huber's loss makes of them, and what no loss does."""
+"""Labels of which one in twenty is wrong: what Huber's loss makes of them."""
 
 from dataclasses import replace
 
