@@ -371,6 +371,20 @@ def test_messages_that_a_folder_counts_and_its_file_lacks_are_missed(tmp_path):
     refused(path, "topic /odom", "found 5 messages, expected the 9")
 
 
+def test_metadata_that_would_take_minutes_to_read_are_refused(tmp_path):
+    path = write_bag(tmp_path / "walk", sorted([*drive(), seen(0.2)], key=lambda one: one[2]))
+    told = (path / "metadata.yaml").read_text()
+    (path / "metadata.yaml").write_text(told + "\n#" * 600_000)
+    refused(path, "metadata.yaml", "expected at most 1000000")
+
+
+def test_a_bag_without_labels_is_refused_by_its_file(tmp_path):
+    cone = pinged(0.2, field_of_view=0.26, min_range=0.1, max_range=6.0, range=2.0)
+    log = read(tmp_path / "one.mcap", ("/front", RANGE, 0.2, cone))
+    with pytest.raises(InputError, match=r"one\.mcap: found rows without labels"):
+        replay(log, Truth(time=log.time), ["fused"], ["ekf"], None, Config())
+
+
 def test_a_message_whose_bytes_end_early_is_refused_by_its_topic(tmp_path):
     from rosbags.rosbag2 import StoragePlugin, Writer
 

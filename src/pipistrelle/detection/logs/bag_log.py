@@ -95,7 +95,7 @@ def read_bag(
         step=settings.step or None,
         span=span,
         ignored_rows=dict(ignored),
-        name=path.resolve().stem,
+        name=path.resolve().name,
         motion="unicycle" if twist else "poses",
         control_std=tuple(getattr(settings, f"{name}_std") for name in noise),
         initial_pose=tuple(driven[0][2:5]),
