@@ -217,6 +217,62 @@ def test_a_vehicle_that_odometry_does_not_tell_is_refused_at_the_start(started, 
     with pytest.raises(pipistrelle.InputError, match="'bicycle', expected 'poses' or 'unicycle'"):
         started(DATA / "bicycle_log" / "log.toml")
 
+    with pytest.raises(SystemExit, match=r"slam_node: .*found 'bicycle'"):
+        runpy.run_path(str(EXAMPLE / "slam_node.py"), run_name="__main__")
+
+
+NUMBERS = (math.nan, math.inf, -math.inf, 0.0, -1.0, 1e9, -1e9, 1e300, 1e-300, 5e-324, 7.0)
+
+
+def spoil(rng, message):
+    """Put an odd number or name into one of a message's fields, however deep."""
+    while True:
+        name = rng.choice([name for name in vars(message) if name != "_kind"])
+        value = getattr(message, name)
+        if isinstance(value, list) and value:
+            value = value[rng.integers(len(value))]
+        if not isinstance(value, Message):
+            break
+        message = value
+    if isinstance(value, np.ndarray) and value.size:
+        value[rng.integers(value.size)] = rng.choice(NUMBERS[:6])
+    elif isinstance(value, float):
+        setattr(message, name, float(rng.choice(NUMBERS)))
+    elif isinstance(value, int):
+        setattr(message, name, int(rng.choice([-(2**31), -1, 0, 3, 10**9, 2**31 - 1])))
+    elif isinstance(value, str):
+        setattr(message, name, str(rng.choice(["", "odom", "/base_link", "no\0where"])))
+
+
+@pytest.mark.parametrize("drives", [3, pytest.param(60, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("motion", ["mission", "unicycle"])
+@pytest.mark.parametrize("kind", [LABELLED, DETECTIONS])
+def test_no_message_ends_the_node_or_leaves_it_without_a_number(
+    started, logs, motion, kind, drives
+):
+    rng, words = np.random.default_rng(7), {"echoes_type": kind, "association": "nearest"}
+    for _ in range(drives):
+        node = started(logs[motion][0] / "log.toml", **words, speed_of_sound=340.0)
+        for i in range(12):
+            time, x = 0.1 * i, 0.05 * i
+            ping = {"rx_angles": [0.5, -0.2], "two_way_travel_times": [0.02, 0.01]}
+            seen = {
+                LABELLED: labelled(time, [(-1, 0.5 - 0.1 * x, 3.0 - x), (-1, -0.7, 2.0 - x)]),
+                DETECTIONS: ping | {"header": header(time, "base_link"), "flags": [{}, {}]},
+            }
+            for topic, name, fields in (
+                ("/odom", ODOMETRY, odometry(time, x, 0.0, 0.0, 0.5)),
+                ("/seen", kind, seen[kind]),
+                ("/tf_static", TRANSFORMS, static("base_link", "mast", 0.1, 0.0)),
+            ):
+                message = filled(Message(name), fields)
+                if rng.random() < 0.3:
+                    spoil(rng, message)
+                node.takes[topic](message)
+        pose = node.slam.pose
+        assert np.isfinite([*pose[1:4], *pose.covariance.ravel()]).all()
+        assert node.told["~/pose"] or node.warned
+
 
 def test_the_launch_file_hands_over_every_parameter(monkeypatch):
     install(monkeypatch)

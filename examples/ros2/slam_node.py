@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 import rclpy
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rosidl_runtime_py import set_message_fields
@@ -132,6 +133,8 @@ def main():
         rclpy.spin(SlamNode())
     except InputError as error:
         sys.exit(f"slam_node: {error}")
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
     finally:
         rclpy.try_shutdown()
 

@@ -304,6 +304,7 @@ def watched(rng: Generator) -> list[str]:
     """Make calls of a vehicle, and name the faults and what Python or numpy warns of."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
+        warnings.filterwarnings("ignore", "Warning: converting a masked element")  # numpy's word
         warnings.filterwarnings("ignore", module=r".*fuzz\.(steps|live)")
         faults = obey(rng)
     return faults + [

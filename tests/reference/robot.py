@@ -96,6 +96,7 @@ def install(monkeypatch, **parameters):
     of_launch = {"DeclareLaunchArgument": dict, "ExecuteProcess": dict}
     for name, holds in {
         "rclpy": alike,
+        "rclpy.executors": {"ExternalShutdownException": RuntimeError},
         "rclpy.node": {"Node": Node},
         "rclpy.qos": quality,
         "rosidl_runtime_py": {"set_message_fields": filled},

@@ -237,6 +237,15 @@ def test_what_is_handed_out_is_the_callers_to_write_to():
     assert slam.map.equals(before.map)
 
 
+def test_what_is_masked_is_not_measured():
+    masked, none = Slam(ROBOT), Slam(ROBOT)
+    masked.hear(**ONE | {"range": np.ma.masked_array([2.0, 3.0], mask=[False, True])})
+    none.hear(**ONE | {"range": [2.0, None]})
+    assert masked.map.equals(none.map)
+    with pytest.raises(InputError, match="found the controls"):
+        masked.move(np.ma.masked_array([1.0, 0.1], mask=[True, False]), dt=1.0)
+
+
 def test_no_steps_change_nothing():
     slam = Slam(ROBOT)
     before = slam.copy()

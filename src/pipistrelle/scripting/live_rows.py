@@ -24,13 +24,16 @@ Times = tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]
 
 
 def numbers(values: object, where: str) -> Float[np.ndarray, "*n"]:
-    """Return an array of numbers, NaN for None; refuse anything else.
+    """Return an array of numbers, NaN for None and what is masked; refuse anything else.
 
     >>> numbers([1, None], "range")
     array([ 1., nan])
     """
     try:
         given = np.asarray(values)
+        if isinstance(values, np.ma.MaskedArray):
+            given = given.astype(object)
+            given[np.ma.getmaskarray(values)] = None
         if given.dtype.kind not in "iuf":
             if given.dtype.kind != "O" or any(isinstance(v, _NO_NUMBERS) for v in given.flat):
                 raise TypeError

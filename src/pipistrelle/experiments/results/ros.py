@@ -60,8 +60,8 @@ def header(time: float, frame: str) -> Fields:
     {'stamp': {'sec': 1, 'nanosec': 500000000}, 'frame_id': 'map'}
     """
     if not 0.0 <= time < _END:
-        fix = "count the seconds from another zero"
-        raise refusal(f"the time {time} s", "no stamp of ROS", f"0 s or more, below {_END}", fix)
+        found, expected = f"the time {time} s", f"0 s or more, below {_END}, as a stamp can tell"
+        raise refusal("a message of ROS", found, expected, "count from another zero")
     sec, nanosec = divmod(_stamp(time), 10**9)
     return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame}
 
