@@ -150,6 +150,7 @@ REFUSED = {
     "a speed that is no number": (lambda s: s.move([np.nan, 0], 1.0), "found the controls"),
     "words for speeds": (lambda s: s.move(["fast", 0], 1.0), "controls: found"),
     "three controls for two": (lambda s: s.move([1, 0, 0], 1.0), "a row of 2 controls"),
+    "a table of times": (lambda s: s.move([[1, 0]] * 2, time=[[0.5, 2.0]]), "the shape (1, 2)"),
     "complex controls": (lambda s: s.move([1j, 0], 1.0), "controls: found"),
     "a step that the clock cannot tell": (
         lambda s: s.move([1, 0], 1e-300),

@@ -61,6 +61,8 @@ def times_of(dt: object, time: object, now: float) -> Times:
         lengths = np.atleast_1d(numbers(dt, "dt"))
         return now + np.cumsum(lengths), lengths
     ends = np.atleast_1d(numbers(time, "time"))
+    if ends.ndim > 1:
+        raise refusal("move", f"times of the shape {ends.shape}", "one for each step", "correct it")
     lengths = np.diff(ends, prepend=now)
     late = np.flatnonzero(~(lengths > 0.0))
     if late.size:
