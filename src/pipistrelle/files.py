@@ -37,25 +37,32 @@ def read_file(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def read_text(path: Path) -> str:
-    """Read a file as UTF-8 text, without a byte order mark."""
+def read_named(path: Path, expected: str) -> bytes:
+    """Read a file that a user named; refuse one that cannot be read, and say what was expected."""
     try:
-        return read_file(path).decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+        return read_file(path)
     except InputError:
         raise
     except FileNotFoundError:
         found = "a link to no file" if path.is_symlink() else "no such file"
         fix = "add it, or name the folder that holds it"
-        raise refusal(path, found, "a readable text file", fix) from None
+        raise refusal(path, found, expected, fix) from None
+    except (OSError, ValueError) as error:  # a ValueError is of a name that no file can have
+        found, fix = getattr(error, "strerror", error), "check the path and its permissions"
+        raise refusal(printable(path), str(found), expected, fix) from None
+
+
+def read_text(path: Path) -> str:
+    """Read a file as UTF-8 text, without a byte order mark."""
+    data = read_named(path, "a readable text file")
+    try:
+        return data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError as error:
         found = f"byte {error.start}, which is no UTF-8 text"
         raise refusal(path, found, "UTF-8 text", "save it as UTF-8") from None
-    except (OSError, ValueError) as error:  # a ValueError is of a name that no file can have
-        found, fix = getattr(error, "strerror", error), "check the path and its permissions"
-        raise refusal(_printable(path), str(found), "a readable text file", fix) from None
 
 
-def _printable(path: Path) -> str:
+def printable(path: Path) -> str:
     """Return the path as text; shortened or escaped if no file can have such a name."""
     text = str(path)
     return text if text.isprintable() and len(text) < 4096 else shown(text)

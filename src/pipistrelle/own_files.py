@@ -72,7 +72,7 @@ RESULTS = Kind(
         "steps.parquet",
         "landmarks.parquet",
         "measurements.parquet",
-        *(f"mission.{ending}" for ending in ("png", "pdf", "gif", "mp4")),
+        *(f"mission.{ending}" for ending in ("png", "pdf", "gif", "mp4", "mcap")),
         "summary.json",
     ),
     ("worlds/*", "*.html", "*.rrd"),

@@ -30,6 +30,7 @@ def fuzz(
         "worlds",
         "bags",
         "sounds",
+        "live",
     ],
     /,
     *,

@@ -34,6 +34,8 @@ MANNERS = ((), (), ("--truth", "/true"), ("--topics",), ("--bag.motion", "twist"
 WAYS = (*BYTES, *([flipped] * len(BYTES)))
 """Flipped bits are what most bags survive."""
 ODD = (math.nan, math.inf, -math.inf, 0.0, -1.0, 1e-300, 1e12, 1e300, 4.0)
+SINGLE = 3e38
+"""Nearly the largest number of single precision, in which a `Range` is told."""
 
 
 def told(odd: float | None = None, at: int = -1) -> list:
@@ -43,7 +45,8 @@ def told(odd: float | None = None, at: int = -1) -> list:
         time, x = round(0.1 * i, 1), 0.05 * i
         far = odd if odd is not None and i == at else math.hypot(2.0 - x, 1.0)
         ping = {"ping_info": {"sound_speed": 340.0}, "two_way_travel_times": [far / 170.0]}
-        front = {"field_of_view": 0.3, "min_range": 0.1, "max_range": 9.0, "range": far}
+        front = {"field_of_view": 0.3, "min_range": 0.1, "max_range": 9.0}
+        front["range"] = far if abs(far) != 1e300 else SINGLE
         place = odd if odd is not None and i == at + 1 else x
         messages += [
             ("/odom", ODOMETRY, time, odometry(time, place, 0.0, 0.0, 0.5)),

@@ -12,7 +12,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fuzz import bags, kills, logs, ownership, results, settings, sounds, steps, studies, worlds
+from fuzz import (
+    bags,
+    kills,
+    live,
+    logs,
+    ownership,
+    results,
+    settings,
+    sounds,
+    steps,
+    studies,
+    worlds,
+)
 from fuzz.judging import Tried
 from fuzz.running import load_all
 
@@ -27,6 +39,7 @@ TARGETS: dict[str, ModuleType] = {
     "worlds": worlds,
     "bags": bags,
     "sounds": sounds,
+    "live": live,
 }
 """Each has `prepare`, for all tries, and `attempt`. A number in the order keys their randomness."""
 EVERY = 30.0

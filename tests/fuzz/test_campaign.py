@@ -27,6 +27,7 @@ TESTS = Path(__file__).resolve().parents[1]
         ("worlds", 60),
         ("bags", 60),
         ("sounds", 60),
+        ("live", 300),
     ],
 )
 def test_nothing_odd_is_answered_by_a_fault(target, tries):

@@ -1,5 +1,6 @@
 """Bags of ROS 1 and 2, written by rosbags from messages that are told as dictionaries."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,9 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipistrelle.detection.logs.bag_messages import DEFINITIONS
+from pipistrelle.detection.logs.poses import relative_motions
+from pipistrelle.detection.scans import rows_of
+from pipistrelle.estimation.motion import Motion, motion_step
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 RANGE = "sensor_msgs/msg/Range"
@@ -66,12 +70,14 @@ def quaternion(heading):
 def odometry(time, x, y, heading, velocity=0.0, rate=0.0, covariance=None, aside=0.0):
     """Tell where the vehicle is, and how it moves."""
     pose = {"position": {"x": x, "y": y}, "orientation": quaternion(heading)}
-    twist = {"linear": {"x": velocity, "y": aside}, "angular": {"z": rate}}
+    twist = {"twist": {"linear": {"x": velocity, "y": aside}, "angular": {"z": rate}}}
+    if covariance is not None:
+        twist["covariance"] = covariance
     return {
         "header": header(time, "odom"),
         "child_frame_id": "base_link",
         "pose": {"pose": pose},
-        "twist": {"twist": twist, "covariance": covariance},
+        "twist": twist,
     }
 
 
@@ -149,3 +155,20 @@ def of_log(log, *, topic="/odom", poses=None):
         rows = list(zip(scan.landmark.tolist(), scan.bearing, scan.range, strict=True))
         told.append(("/seen", LABELLED, scan.time, labelled(scan.time, rows)))
     return sorted(told, key=lambda one: one[2])
+
+
+def with_ranges(log):
+    """Return a log without the rows of which no range is known, which a `LABELLED` cannot tell."""
+    scans = [rows_of(scan, np.isfinite(scan.range)) for scan in log.scans]
+    return replace(log, scans=tuple(scan for scan in scans if scan.landmark.size), gate=None)
+
+
+def as_poses(log, stds):
+    """Return a log whose odometry is the poses to which its controls lead, and those poses."""
+    motion = Motion(model=log.motion, control_std=log.control_std, wheelbase=log.wheelbase)
+    poses = [np.zeros(3)]
+    for controls, dt in zip(log.controls, log.dt, strict=True):
+        poses.append(motion_step(motion, poses[-1], controls, dt))
+    poses = np.array(poses)
+    steps = relative_motions(poses)
+    return replace(log, motion="poses", controls=steps, control_std=stds), poses

@@ -1,6 +1,8 @@
 """A vehicle that drives now ends where its log does, to the bit, and a refusal changes nothing."""
 
+import pickle
 import shutil
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -148,6 +150,13 @@ REFUSED = {
     "a speed that is no number": (lambda s: s.move([np.nan, 0], 1.0), "found the controls"),
     "words for speeds": (lambda s: s.move(["fast", 0], 1.0), "controls: found"),
     "three controls for two": (lambda s: s.move([1, 0, 0], 1.0), "a row of 2 controls"),
+    "a table of times": (lambda s: s.move([[1, 0]] * 2, time=[[0.5, 2.0]]), "the shape (1, 2)"),
+    "complex controls": (lambda s: s.move([1j, 0], 1.0), "controls: found"),
+    "a step that the clock cannot tell": (
+        lambda s: s.move([1, 0], 1e-300),
+        "too short for a clock",
+    ),
+    "a time of the far future": (lambda s: s.move([1, 0], time=1e300), "found the controls"),
     "rows that came already": (lambda s: s.hear(**ONE), "rows once more at 1.0 s"),
     "a scan that is late": (lambda s: s.hear(time=0.9, **ONE), "the vehicle has moved on"),
     "a scan to come": (lambda s: s.hear(time=1.1, **ONE), "move to it first"),
@@ -215,6 +224,51 @@ def test_an_estimator_that_fails_leaves_all_as_it_was(monkeypatch):
     assert slam.map.equals(before.map)
 
 
+def test_what_is_handed_out_is_the_callers_to_write_to():
+    slam = Slam(ROBOT)
+    slam.move([1.0, 0.1], dt=1.0)
+    labels = slam.hear(**ONE)
+    before = slam.copy()
+    slam.pose.covariance[:] = 7.0
+    labels[:] = 7
+    for one in (slam, before):
+        one.move([1.0, 0.1], dt=1.0)
+        one.hear(**ONE)
+    assert slam.path.equals(before.path)
+    assert slam.map.equals(before.map)
+
+
+def test_what_is_masked_is_not_measured():
+    masked, none = Slam(ROBOT), Slam(ROBOT)
+    masked.hear(**ONE | {"range": np.ma.masked_array([2.0, 3.0], mask=[False, True])})
+    none.hear(**ONE | {"range": [2.0, None]})
+    assert masked.map.equals(none.map)
+    with pytest.raises(InputError, match="found the controls"):
+        masked.move(np.ma.masked_array([1.0, 0.1], mask=[True, False]), dt=1.0)
+
+
+def test_no_steps_change_nothing():
+    slam = Slam(ROBOT)
+    before = slam.copy()
+    slam.move(np.empty((0, 2)), dt=[])
+    assert slam.path.equals(before.path)
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_ways_with_and_without_a_covariance_follow_one_another(name):
+    robot = {"motion": "poses", "forward_std": 0.05, "sideways_std": 0.03, "turn_std": 0.02}
+    robot |= {name: ROBOT[name] for name in ("range_std", "bearing_std", "range_bounds")}
+    way, sure = [0.5, 0.0, 0.1], [1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4]
+    mixed, whole = Slam(robot, filter=name), Slam(robot, filter=name)
+    for said in (True, False, True, False):
+        mixed.move([*way, *sure] if said else way, dt=0.5)
+        whole.move([*way, *(sure if said else [np.nan] * 6)], dt=0.5)
+    for slam in (mixed, whole):
+        slam.hear(**ONE)
+    assert mixed.path.equals(whole.path)
+    assert mixed.map.equals(whole.map)
+
+
 @pytest.mark.parametrize(
     ("vehicle", "words"),
     [
@@ -240,6 +294,8 @@ def test_settings_are_those_of_slam_and_what_is_none_is_refused():
         ({"filter": "ikef"}, "did you mean 'iekf'"),
         ({"kept": 0}, "kept"),
         ({"time": np.nan}, "a finite number"),
+        ({"time": 1e18}, "seconds, up to 1e+11"),
+        ({"filter": np.array(3)}, "an estimator's name"),
     ):
         with pytest.raises(InputError) as refused:
             Slam(ROBOT, **options)
@@ -286,10 +342,34 @@ def test_a_saved_drive_that_has_changed_is_refused(tmp_path, at):
         Slam.load(saved)
 
 
-def test_a_file_made_to_run_something_runs_nothing(tmp_path):
-    import pickle
-    from hashlib import sha256
+@pytest.mark.parametrize("name", ["nowhere.slam", "no/such/folder", "a\0b", "x" * 5000])
+def test_a_name_that_no_file_has_is_refused(tmp_path, name):
+    with pytest.raises(InputError, match=r"expected a file of Slam\.save"):
+        Slam.load(tmp_path / name)
+    if name != "nowhere.slam":
+        with pytest.raises(InputError, match="cannot be written"):
+            Slam(ROBOT).save(tmp_path / name)
 
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda line, known: (line[:-9], known),
+        lambda line, known: (b"{}", known),
+        lambda line, known: (line, b""),
+        lambda line, known: (line, pickle.dumps({"session": 3})),
+    ],
+)
+def test_a_file_that_was_made_and_summed_is_refused(tmp_path, spoil):
+    saved = Slam(ROBOT).save(tmp_path / "one.slam")
+    line, _, known = saved.read_bytes()[len(HEAD) :].partition(b"\n")[2].partition(b"\n")
+    body = b"\n".join(spoil(line, known))
+    saved.write_bytes(HEAD + sha256(body).hexdigest().encode() + b"\n" + body)
+    with pytest.raises(InputError, match=r"one\.slam: found what Slam\.save did not write"):
+        Slam.load(saved)
+
+
+def test_a_file_made_to_run_something_runs_nothing(tmp_path):
     class Evil:
         def __reduce__(self):
             return Path.touch, (tmp_path / "ran",)

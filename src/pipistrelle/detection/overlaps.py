@@ -106,9 +106,9 @@ class Sources(NamedTuple):
     inverse: Float[np.ndarray, "k k"]
     """Of J: half of it is the Cramér-Rao bound of u, at unit noise."""
     beam: Complex[np.ndarray, "k e"]
-    """The beam to each with nulls at the others, as `onset.steer` takes it: w / |w|, conjugate."""
+    """To each with nulls at the others, as `onset.steer` takes it: ``w / |w|``, conjugate."""
     gain: Float[np.ndarray, " k"]
-    """Which share of its power the beam to each takes, |w|^2 / N."""
+    """Which share of its power the beam to each takes, ``|w|^2 / N``."""
     basis: Complex[np.ndarray, "k e"]
     """Of the waves' space, orthonormal."""
     slope: Complex[np.ndarray, "k e"]

@@ -211,7 +211,7 @@ class Session(Generic[B]):
         if self._open:
             self.belief, self._rng.bit_generator.state = self._open
             before, took = self._legs.pop()
-            self._legs.append((np.concatenate((before, controls)), np.concatenate((took, dt))))
+            self._legs.append((_joined_steps(before, controls), np.concatenate((took, dt))))
         else:
             self._open = self.belief, self._rng.bit_generator.state
             self._legs.append((controls, dt))
@@ -325,6 +325,20 @@ class Session(Generic[B]):
         """Predict through what was gone already."""
         for controls, dt in legs:
             self._move(controls, dt)
+
+
+def _joined_steps(
+    one: Float[np.ndarray, "k c"], other: Float[np.ndarray, "n d"]
+) -> Float[np.ndarray, "k+n e"]:
+    """Return steps one after the other; those that say no covariance have NaN where others do."""
+    width = max(one.shape[1], other.shape[1])
+    parts = [
+        np.pad(part, ((0, 0), (0, width - part.shape[1])), constant_values=np.nan)
+        if part.shape[1] < width
+        else part
+        for part in (one, other)
+    ]
+    return np.concatenate(parts)
 
 
 def joined_poses(parts: Sequence[Gaussian]) -> Gaussian:

@@ -180,6 +180,9 @@ def named_strategies(chosen: str | Sequence[str]) -> tuple[Strategy, ...]:
     return tuple(strategy for strategy in STRATEGIES if strategy in chosen)
 
 
+_EXPECTED = "expected an estimator's name or its class"
+
+
 def named_filters(chosen: Filters, where: str = "filters") -> tuple[str, ...]:
     """Return the names of the estimators of a choice; of a class, ``module:Class``.
 
@@ -196,10 +199,12 @@ def named_filters(chosen: Filters, where: str = "filters") -> tuple[str, ...]:
         chosen = GROUPS.get(chosen) or (chosen,)
     elif isinstance(chosen, type) or not isinstance(chosen, Iterable):
         chosen = (chosen,)
+    elif getattr(chosen, "ndim", 1) == 0:  # an array that Python takes for iterable
+        raise InputError(f"{where}: found {shown(chosen)}, {_EXPECTED}")
     parted = (each for choice in chosen for each in _parted(choice))
     names = tuple(dict.fromkeys(_name_of(choice, where) for choice in parted))
     if not names:
-        raise InputError(f"{where}: found none, expected an estimator's name or its class")
+        raise InputError(f"{where}: found none, {_EXPECTED}")
     for name in names:
         if name in GROUPS:
             means = ", ".join(GROUPS[name])
@@ -219,7 +224,7 @@ def _name_of(kind: str | type, where: str) -> str:
     if isinstance(kind, str):
         return kind
     if not isinstance(kind, type):
-        raise InputError(f"{where}: found {shown(kind)}, expected an estimator's name or its class")
+        raise InputError(f"{where}: found {shown(kind)}, {_EXPECTED}")
     module, name = kind.__module__, kind.__qualname__
     if getattr(sys.modules.get(module), name, None) is not kind:
         raise InputError(

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipistrelle.arithmetic.random_stream import stream_key
-from pipistrelle.config import Config
+from pipistrelle.config import Config, InputError
 from pipistrelle.detection.logs.recording import Log, scan_at
 from pipistrelle.detection.logs.vehicle import ODOMETRY, read_vehicle, vehicle_of
 from pipistrelle.detection.noise import noise_of
@@ -33,6 +33,7 @@ from pipistrelle.experiments.runs.validate_filters import check_filters
 from pipistrelle.refusals import refusal, shown
 from pipistrelle.scripting.arguments import Base, base_layer, folder_named, named_filters
 from pipistrelle.scripting.live_rows import (
+    check_clock,
     check_now,
     finite,
     keys_of,
@@ -41,7 +42,7 @@ from pipistrelle.scripting.live_rows import (
     times_of,
 )
 from pipistrelle.scripting.log_settings import TIMING, check_open, with_log
-from pipistrelle.scripting.saved_state import read_state, write_state
+from pipistrelle.scripting.saved_state import not_saved, read_state, write_state
 from pipistrelle.settings import Given, from_keywords
 
 if TYPE_CHECKING:
@@ -131,6 +132,7 @@ class Slam:
         if not isinstance(kept, int) or isinstance(kept, bool) or kept < 1:
             raise refusal("kept", shown(kept), "a number of steps, 1 or more", "correct it")
         start, flags = finite(time, "time"), from_keywords(settings, OWN_WORDS)
+        check_clock(np.array([start]))
         check_open(flags)
         log, where = _log_of(vehicle, start)
         named, _ = over_named(base_layer(config), flags)
@@ -173,7 +175,7 @@ class Slam:
         """Where the vehicle is, as it is believed now."""
         pose = self._at_vehicle(self._session.belief.pose())
         x, y, heading = pose.mean.tolist()
-        return Pose(self._time, x, y, heading, pose.covariance)
+        return Pose(self._time, x, y, heading, pose.covariance.copy())
 
     @property
     def map(self) -> "pl.DataFrame":
@@ -226,6 +228,9 @@ class Slam:
         ends, lengths = times_of(dt, time, self._time)
         steps = np.atleast_2d(numbers(controls, "controls"))
         steps, lengths = usable_controls(self._drive.motion, steps, lengths)
+        if not lengths.size:
+            return
+        check_clock(ends, self._time)
         gone = self._at_sensor(steps, ends)
         poses = self._change(lambda: self._session.move(gone, lengths))
         placed = self._at_vehicle(poses)
@@ -328,15 +333,24 @@ class Slam:
         own = None if filter is None else named_filters(filter, "filter")[0]
         header, content = read_state(path, own)
         slam = cls.__new__(cls)
+        try:
+            slam._go_on_from(header, content)
+        except InputError:
+            raise
+        except Exception as error:  # of a file that somebody made, and summed
+            raise not_saved(path, error) from None
+        return slam
+
+    def _go_on_from(self, header: Mapping[str, Any], content: Mapping[str, Any]) -> None:
+        """Know what a file of `save` says and holds."""
         config = Config.model_validate(header["config"])
-        slam._begin(content["log"], config, header["filter"], header["kept"])
-        slam._session.go_on_from(content["session"])
+        self._begin(content["log"], config, header["filter"], header["kept"])
+        self._session.go_on_from(content["session"])
         parts = zip(
             content["times"].tolist(), content["means"], content["covariances"], strict=True
         )
-        slam._poses = [(t, Gaussian(mean=m, covariance=P)) for t, m, P in parts]
-        slam._time, slam._heard = slam._poses[-1][0], content["heard"]
-        return slam
+        self._poses = [(t, Gaussian(mean=m, covariance=P)) for t, m, P in parts]
+        self._time, self._heard = self._poses[-1][0], content["heard"]
 
     def copy(self) -> Self:
         """Return another that goes on from here by itself, to the same bits."""

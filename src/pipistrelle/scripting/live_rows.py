@@ -1,13 +1,13 @@
 """What a robot hands over at one time, checked: numbers, times, and the rows of a scan."""
 
 from collections.abc import Mapping, Sequence
-from math import nan
+from math import inf, nan
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from pipistrelle.detection.logs.recording import CALLER, STATED, LogCaller
+from pipistrelle.detection.logs.recording import CALLER, MAX_TIME, STATED, LogCaller
 from pipistrelle.detection.logs.text_tables import Table
 from pipistrelle.detection.scans import OWN
 from pipistrelle.experiments.runs.replay import LABELS
@@ -17,20 +17,25 @@ SAME_TIME = 1e-6
 """A scan so near the end of the last step is heard there [s]."""
 COLUMNS = ("landmark", "bearing", "range", CALLER, *STATED)
 """What may be said of a row that is heard."""
+_NO_NUMBERS = (str, bytes, bool, np.bool_, complex, np.complexfloating)
+"""What Python would make a number of, or has half of."""
 Times = tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]
 """When steps end, and how long they take [s]."""
 
 
 def numbers(values: object, where: str) -> Float[np.ndarray, "*n"]:
-    """Return an array of numbers, NaN for None; refuse anything else.
+    """Return an array of numbers, NaN for None and what is masked; refuse anything else.
 
     >>> numbers([1, None], "range")
     array([ 1., nan])
     """
     try:
         given = np.asarray(values)
+        if isinstance(values, np.ma.MaskedArray):
+            given = given.astype(object)
+            given[np.ma.getmaskarray(values)] = None
         if given.dtype.kind not in "iuf":
-            if given.size and any(isinstance(v, (str, bytes, bool, np.bool_)) for v in given.flat):
+            if given.dtype.kind != "O" or any(isinstance(v, _NO_NUMBERS) for v in given.flat):
                 raise TypeError
             given = np.array(given, dtype=float)
     except (TypeError, ValueError, OverflowError):
@@ -56,6 +61,8 @@ def times_of(dt: object, time: object, now: float) -> Times:
         lengths = np.atleast_1d(numbers(dt, "dt"))
         return now + np.cumsum(lengths), lengths
     ends = np.atleast_1d(numbers(time, "time"))
+    if ends.ndim > 1:
+        raise refusal("move", f"times of the shape {ends.shape}", "one for each step", "correct it")
     lengths = np.diff(ends, prepend=now)
     late = np.flatnonzero(~(lengths > 0.0))
     if late.size:
@@ -64,6 +71,16 @@ def times_of(dt: object, time: object, now: float) -> Times:
         found = f"the time {ends[k].item()} s"
         raise refusal("move", found, f"one after {before}", "leave out steps that come late")
     return ends, lengths
+
+
+def check_clock(ends: Float[np.ndarray, " k"], now: float = -inf) -> None:
+    """Refuse times that can be no seconds, or that a clock at `now` [s] cannot tell apart."""
+    if (far := np.abs(ends) > MAX_TIME).any():
+        found = f"the time {ends[far][0].item()} s"
+        raise refusal("time", found, f"seconds, up to {MAX_TIME:g}", "take another zero or unit")
+    if not (np.diff(ends, prepend=now) > 0.0).all():
+        found, expected = f"a step too short for a clock at {now} s", "a later time at its end"
+        raise refusal("move", found, expected, "join it with the next, or take another zero")
 
 
 def check_now(time: object, now: float) -> None:

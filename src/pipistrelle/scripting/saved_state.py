@@ -13,8 +13,9 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+from pipistrelle.config import InputError
 from pipistrelle.estimation.catalogue import CATALOGUE
-from pipistrelle.files import read_file, write_whole
+from pipistrelle.files import printable, read_file, read_named, write_whole
 from pipistrelle.refusals import refusal, shown
 from pipistrelle.version import find_version
 
@@ -53,26 +54,43 @@ def write_state(path: Path, header: Mapping[str, Any], content: Mapping[str, Any
             found, expected = "a file that Slam.save did not write", "a new file, or one to replace"
             raise refusal(path, found, expected, "name another")
         write_whole(path, HEAD + sha256(body).hexdigest().encode() + b"\n" + body)
-    except OSError as error:
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:  # a ValueError is of a name that no file can have
+        found = f"that it cannot be written ({getattr(error, 'strerror', error)})"
         fix = "name a file in a folder that is there and can be written"
-        raise refusal(
-            path, f"that it cannot be written ({error.strerror})", "a file", fix
-        ) from None
+        raise refusal(printable(path), found, "a file", fix) from None
 
 
 def read_state(path: Path, own: str | None) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return what the file says and holds; `own` names an estimator from outside."""
-    data = read_file(path)
+    data = read_named(path, "a file of Slam.save")
     found = "a file that Slam.save did not write"
     if data.startswith(HEAD):
         sum_, _, body = data[len(HEAD) :].partition(b"\n")
         if sum_ == sha256(body).hexdigest().encode():
-            line, _, known = body.partition(b"\n")
-            header = json.loads(line)
-            _check_header(path, header, own)
-            return header, _Records(BytesIO(known), own).load()
+            return _content(path, body, own)
         found = "a file that has changed since Slam.save wrote it"
     raise refusal(path, found, "one of Slam.save, as it was written", "name another")
+
+
+def _content(path: Path, body: bytes, own: str | None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the header and what follows it; bytes that have a sum may still be anybody's."""
+    line, _, known = body.partition(b"\n")
+    try:
+        header = json.loads(line)
+        _check_header(path, header, own)
+        return header, _Records(BytesIO(known), own).load()
+    except InputError:
+        raise
+    except Exception as error:
+        raise not_saved(path, error) from None
+
+
+def not_saved(path: Path, error: Exception) -> InputError:
+    """Return the refusal of a file whose sum is right and whose content is not."""
+    found = f"what Slam.save did not write ({type(error).__name__})"
+    return refusal(path, found, "one of Slam.save, as it was written", "name another")
 
 
 def _check_header(path: Path, header: Mapping[str, Any], own: str | None) -> None:

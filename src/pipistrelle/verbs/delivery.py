@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipistrelle.detection.logs.bag import need_rosbags
 from pipistrelle.experiments.results import folder
 from pipistrelle.experiments.runs.mission import Mission
 from pipistrelle.own_files import OwnFiles
@@ -24,11 +25,13 @@ if TYPE_CHECKING:
 
 @contextmanager
 def result_folder(options: OutputOptions, name: str) -> Iterator[OwnFiles]:
-    """Lend the folder for results (`folder.result_folder`); refuse a film that cannot be made."""
+    """Lend the folder for results (`folder.result_folder`); refuse what cannot be made for it."""
     if options.animate:
         from pipistrelle.figures.film import film_writer
 
         film_writer(Path(f"mission.{options.animate}"))
+    if options.save_bag:
+        need_rosbags("--save-bag")
     with folder.result_folder(options.output, name, overwrite=options.overwrite) as own:
         yield own
 
@@ -77,19 +80,23 @@ def deliver(
     options: OutputOptions,
     watch: "MissionRecorder | None" = None,
 ) -> int:
-    """Write results, figure and film in place of earlier ones, print the table, the folder last.
+    """Write results, pictures and bag in place of earlier ones; print the table, the folder last.
 
     Returns the exit status: 1 if an estimate is not finite or a filter failed, else 0.
     """
 
-    def film(room: Path) -> None:
+    def more(room: Path) -> None:
         if watch is not None and watch.snapshots:
             path = room / f"mission.{options.animate}"
             message = f"Drawing {path.name} ..."
             with contextlib.nullcontext() if options.quiet else announced(message):
                 filmed(mission, watch, path)
+        if options.save_bag:
+            from pipistrelle.experiments.results.ros import BAG, told_of, write_bag
 
-    keep(mission, own, command_line(), film)
+            write_bag(room / BAG, [*told_of(mission.trials)])
+
+    keep(mission, own, command_line(), more)
     if not options.quiet:
         landmarks, log = mission.drive.truth.landmarks, mission.log
         there = None if landmarks is None else len(landmarks[0])

@@ -155,6 +155,9 @@ class OutputOptions:
         Literal["gif", "mp4"] | None,
         Parameter(help="Film the mission; gif unless said otherwise. [default: no]"),
     ] = None
+    save_bag: Annotated[
+        bool, Parameter(negative=(), help="Write tracks and maps as a ROS bag, too: mission.mcap.")
+    ] = False
     quiet: Annotated[bool, Parameter(negative=(), help="Print the result folder alone.")] = False
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipistrelle.__main__ import main
 from pipistrelle.config import BagConfig, Config, InputError
 from pipistrelle.detection.logs.folder import read_log
 from pipistrelle.detection.logs.poses import poses_along
-from pipistrelle.detection.scans import rows_of
 from pipistrelle.experiments.drives import Truth
 from pipistrelle.experiments.runs.replay import load, replay
 from reference.bags import (
@@ -22,12 +22,14 @@ from reference.bags import (
     RANGE,
     RANGES,
     TRANSFORMS,
+    as_poses,
     header,
     labelled,
     odometry,
     of_log,
     quaternion,
     static,
+    with_ranges,
     write_bag,
 )
 
@@ -78,18 +80,34 @@ def refused(path, *parts, bag=PLAIN):
 @pytest.mark.parametrize("name", KINDS)
 @pytest.mark.parametrize("kind", ["unicycle", "poses"])
 def test_a_log_written_as_a_bag_is_solved_as_the_log_is(tmp_path, kind, name):
-    log = read_log(DATA / f"{kind}_log")
-    scans = [rows_of(scan, np.isfinite(scan.range)) for scan in log.scans]
-    log = replace(log, scans=tuple(scan for scan in scans if scan.landmark.size), gate=None)
+    log = with_ranges(read_log(DATA / f"{kind}_log"))
     log = replace(log, controls=log.controls[:, :3], noise_at_rest=True, initial_pose=(0.0,) * 3)
     poses = poses_along(log.controls) if kind == "poses" else None
     assert len(log.scans) > 3
+    check_bag_of(log, poses, tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "seconds", [pytest.param(20, id="short"), pytest.param(187.5, marks=pytest.mark.slow)]
+)
+def test_a_bag_of_the_papers_mission_is_solved_as_its_log_is(tmp_path, seconds):
+    line = ["run", "--settings", "paper", "--strategy", "active", "--quiet", "-o"]
+    more = ["--save-log", str(tmp_path / "log"), "--duration", str(seconds)]
+    assert main([*line, str(tmp_path / "out"), *more]) == 0
+    log, poses = as_poses(with_ranges(read_log(tmp_path / "log")), (0.01, 0.01, 0.01))
+    assert len(log.dt) == 8 * seconds
+    check_bag_of(replace(log, initial_pose=(0.0,) * 3), poses, tmp_path / "walk.mcap")
+
+
+def check_bag_of(log, poses, path):
+    """Write a log as a bag, and check that its track and map are those of the log."""
+    kind = "unicycle" if poses is None else "poses"
     stds = dict(zip(STDS[kind], log.control_std, strict=True)) | {
         name: getattr(log, name)
         for name in ("initial_pose_std", "range_std", "bearing_std", "range_bounds")
     }
     bag = BagConfig(step=0.0, motion="twist" if poses is None else "poses", **stds)
-    again = load(write_bag(tmp_path / name, of_log(log, poses=poses)), bag=bag)[0]
+    again = load(write_bag(path, of_log(log, poses=poses)), bag=bag)[0]
     tracks = [
         replay(one, Truth(time=one.time), ["fused"], ["smoother"], None, Config()).trials[0].track
         for one in (log, again)
@@ -369,6 +387,20 @@ def test_messages_that_a_folder_counts_and_its_file_lacks_are_missed(tmp_path):
     assert told.count("message_count: 5") == 1
     (path / "metadata.yaml").write_text(told.replace("message_count: 5", "message_count: 9"))
     refused(path, "topic /odom", "found 5 messages, expected the 9")
+
+
+def test_metadata_that_would_take_minutes_to_read_are_refused(tmp_path):
+    path = write_bag(tmp_path / "walk", sorted([*drive(), seen(0.2)], key=lambda one: one[2]))
+    told = (path / "metadata.yaml").read_text()
+    (path / "metadata.yaml").write_text(told + "\n#" * 600_000)
+    refused(path, "metadata.yaml", "expected at most 1000000")
+
+
+def test_a_bag_without_labels_is_refused_by_its_file(tmp_path):
+    cone = pinged(0.2, field_of_view=0.26, min_range=0.1, max_range=6.0, range=2.0)
+    log = read(tmp_path / "one.mcap", ("/front", RANGE, 0.2, cone))
+    with pytest.raises(InputError, match=r"one\.mcap: found rows without labels"):
+        replay(log, Truth(time=log.time), ["fused"], ["ekf"], None, Config())
 
 
 def test_a_message_whose_bytes_end_early_is_refused_by_its_topic(tmp_path):

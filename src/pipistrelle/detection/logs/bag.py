@@ -21,6 +21,8 @@ from pipistrelle.refusals import meant, refusal, shown
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
+MOST_METADATA = 1_000_000
+"""Of what a folder says of its files [bytes]; more would take minutes to read."""
 _IDL = "=" * 80 + "\n"
 """Line between the files of a definition in IDL; the name of the file follows it."""
 
@@ -144,19 +146,27 @@ def opened(path: Path) -> Iterator[Bag]:
     path
     """
     whole = _storage(path)
-    try:
-        from rosbags.rosbag1 import Reader as Reader1
-        from rosbags.rosbag2 import Reader as Reader2
-    except ImportError:
-        raise InputError(
-            f"{path}: needs rosbags, which is not installed; "
-            "python -m pip install 'pipistrelle[ros]' installs it"
-        ) from None
+    need_rosbags(str(path))
+    from rosbags.rosbag1 import Reader as Reader1
+    from rosbags.rosbag2 import Reader as Reader2
+
     kind: Any = Reader1 if whole.suffix == ".bag" and whole.is_file() else Reader2
     with ExitStack() as stack:
         with faults_named(str(path)):
             bag = Bag(path, stack.enter_context(kind(whole)))
         yield bag
+
+
+def need_rosbags(where: str) -> None:
+    """Refuse what needs rosbags where it is not installed."""
+    try:
+        import rosbags.rosbag1
+        import rosbags.rosbag2  # noqa: F401
+    except ImportError:
+        raise InputError(
+            f"{where}: needs rosbags, which is not installed; "
+            "python -m pip install 'pipistrelle[ros]' installs it"
+        ) from None
 
 
 def _storage(path: Path) -> Path:
@@ -171,6 +181,9 @@ def _storage(path: Path) -> Path:
     for one in (path / "metadata.yaml", *inside):
         check_ordinary(one)
     if (path / "metadata.yaml").exists():
+        if (size := (path / "metadata.yaml").stat().st_size) > MOST_METADATA:
+            found, expected = f"{size} bytes", f"at most {MOST_METADATA}"
+            raise refusal(path / "metadata.yaml", found, expected, _MEND)
         return path
     if len(inside) > 1:
         fix = "make it with `ros2 bag reindex`, or name one of the files"

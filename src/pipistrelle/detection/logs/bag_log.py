@@ -35,7 +35,7 @@ _LATE = 1e-3
 
 
 @dataclass(slots=True)
-class _Heard:
+class TopicEchoes:
     """The echoes of a topic, message by message."""
 
     type: str
@@ -48,6 +48,7 @@ class _Heard:
     echoes: list[Echoes] = field(default_factory=list)
 
     def add(self, message: Message, settings: BagConfig) -> None:
+        """Take in a message."""
         content = message.content
         time = _time(message, settings)
         with np.errstate(all="ignore"):  # what is no number is left out, or refused
@@ -69,23 +70,23 @@ def read_bag(
     frames, driven, lags, base = Frames(), [], [], ""
     with opened(path) as bag:
         odometry = odometry_of(bag, settings)
-        heard = {name: _Heard(bag.topics[name].type) for name in echoes_of(bag, settings)}
+        heard = {name: TopicEchoes(bag.topics[name].type) for name in echoes_of(bag, settings)}
         for message in bag.messages(dict.fromkeys([odometry, TRANSFORMS, *heard])):
             with faults_named(f"{path}, topic {message.topic}, message {message.number}"):
                 if message.topic == odometry:
-                    driven.append((message.number, *_driven(message, settings)))
+                    driven.append((message.number, *step_row(message, settings)))
                     lags.append(message.received - driven[-1][1])
                     base = base or bare(message.content.child_frame_id)
                 elif message.topic in heard:
                     heard[message.topic].add(message, settings)
                 else:
                     frames.add(message.content)
-    table, notes = _odometry(path, odometry, driven, settings)
+    table, notes = odometry_table(path, odometry, driven, settings)
     notes += _clock(odometry, lags, settings)
     measured, ignored = [], Counter[str]()
     for topic, rows in heard.items():
-        mounts = _mounts(path, topic, rows, frames, base, settings)
-        measured.append(_measured(f"{path}, topic {topic}", rows, mounts, ignored))
+        mounts = mounts_of(path, topic, rows, frames, base, settings)
+        measured.append(rows_of(f"{path}, topic {topic}", rows, mounts, ignored))
         notes += [*_clock(topic, rows.lag, settings), *_converted(topic, rows, mounts, base)]
     twist = settings.motion == "twist"
     noise = ("velocity", "angular_rate") if twist else ("forward", "sideways", "turn")
@@ -96,7 +97,7 @@ def read_bag(
         time_offset=settings.time_offset,
         span=span,
         ignored_rows=dict(ignored),
-        name=path.resolve().stem,
+        name=path.resolve().name,
         motion="unicycle" if twist else "poses",
         control_std=tuple(getattr(settings, f"{name}_std") for name in noise),
         initial_pose=tuple(driven[0][2:5]),
@@ -137,7 +138,7 @@ def _time(message: Message, settings: BagConfig) -> float:
     return stamp.sec + stamp.nanosec / 1e9
 
 
-def _driven(message: Message, settings: BagConfig) -> tuple[float, ...]:
+def step_row(message: Message, settings: BagConfig) -> tuple[float, ...]:
     """Return time, pose, velocities ahead and to the left, angular rate and their covariance."""
     content = message.content
     twist = content.twist.twist
@@ -165,7 +166,7 @@ def _table(where: str, columns: tuple[str, ...], rows: list[Any], stated: int = 
     return table
 
 
-def _odometry(
+def odometry_table(
     path: Path, topic: str, rows: list[Any], settings: BagConfig
 ) -> tuple[Table, list[str]]:
     """Return the table of the odometry, and notes on it for the user."""
@@ -192,8 +193,8 @@ def _odometry(
     return Table(path=where, line=table.line, unit="message", column=kept), notes
 
 
-def _mounts(
-    path: Path, topic: str, rows: _Heard, frames: Frames, base: str, settings: BagConfig
+def mounts_of(
+    path: Path, topic: str, rows: TopicEchoes, frames: Frames, base: str, settings: BagConfig
 ) -> dict[str, Pose]:
     """Return where the sensor is on the vehicle, by the frames of a topic's messages."""
     found: dict[str, Pose] = {}
@@ -215,7 +216,7 @@ def _mounts(
     return found
 
 
-def _measured(where: str, rows: _Heard, mounts: dict[str, Pose], ignored: Counter[str]) -> Table:
+def rows_of(where: str, rows: TopicEchoes, mounts: dict[str, Pose], ignored: Counter[str]) -> Table:
     """Return the echoes of a topic as bearings and ranges from the vehicle.
 
     `ignored`: what is left out is counted in it, by reason.
@@ -274,7 +275,7 @@ def _clock(topic: str, lags: list[float], settings: BagConfig) -> list[str]:
     return [told] if abs(late) > _LATE else []
 
 
-def _converted(topic: str, rows: _Heard, mounts: dict[str, Pose], base: str) -> list[str]:
+def _converted(topic: str, rows: TopicEchoes, mounts: dict[str, Pose], base: str) -> list[str]:
     """Tell what was converted in the echoes of a topic."""
     notes = []
     if rows.type == ANGLES:

@@ -46,9 +46,11 @@ labels an excess path of 0 says that this is the direct call."""
 CALLER = "caller"
 """Whose call it was, where it was not the vehicle's own: a number, from 1 on."""
 
+MAX_TIME = 1e11
+"""Beyond the year 5000, if counted from 1970 [s]."""
+
 _RESOLUTION = 1e-6  # [s], of the boundaries of merged steps
 _MAX_STEPS = 10_000_000
-_MAX_TIME = 1e11  # [s], beyond the year 5000 if counted from 1970
 _MAX_GAP = 10.0  # [s], typically between two rows of odometry, or of the truth
 _UNITS = (1e-3, 1e-6, 1e-9)  # [s], of other clocks
 
@@ -253,10 +255,10 @@ def check_seconds(table: Table, longest_gap: float = _MAX_GAP) -> None:
     gaps = np.diff(time)
     typical = float(np.median(gaps[gaps > 0.0])) if np.any(gaps > 0.0) else 0.0
     latest = float(np.max(np.abs(time), initial=0.0))
-    if typical <= longest_gap and latest <= _MAX_TIME:
+    if typical <= longest_gap and latest <= MAX_TIME:
         return
-    if latest > _MAX_TIME:
-        factor = next((unit for unit in _UNITS if latest * unit <= _MAX_TIME / 10.0), _UNITS[-1])
+    if latest > MAX_TIME:
+        factor = next((unit for unit in _UNITS if latest * unit <= MAX_TIME / 10.0), _UNITS[-1])
     else:  # of 1 ms, 1 us and 1 ns, that which makes it likeliest 0.1 s
         factor = min(_UNITS, key=lambda unit: abs(math.log10(typical * unit / 0.1)))
     found = f"times from {time[0].item():g} to {time[-1].item():g}, typically {typical:g} apart"

@@ -55,7 +55,7 @@ bearings counter-clockwise from the heading. S is the sensing strategy, F the fi
 | landmarks.parquet | every hypothesis of every landmark, beside the true positions |
 | measurements.parquet | what each strategy measured; no range where it was passive; of echoes of \
 another's call the excess path, where it is known |
-| mission.* | pictures |
+| mission.* | pictures; mission.mcap, where asked for: tracks and maps as a ROS bag |
 | worlds/ | the world that was heard, where it was one of your own |
 | view.html | the mission frame by frame, once `pipistrelle view` on this folder has made it |
 | SHA256SUMS | what was written here: `--overwrite` touches nothing else (`sha256sum -c`) |

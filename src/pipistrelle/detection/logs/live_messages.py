@@ -1,0 +1,116 @@
+"""Messages of ROS one at a time, as they come on a robot: what `Slam` is told of each.
+
+A bag's messages are read by the same functions (`bag_log`), so angles, frames and stamps are
+converted in one place.
+"""
+
+from collections import Counter
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.config import BagConfig
+from pipistrelle.detection.logs.bag import Message, faults_named
+from pipistrelle.detection.logs.bag_frames import TRANSFORMS, Frames, bare
+from pipistrelle.detection.logs.bag_log import (
+    TopicEchoes,
+    mounts_of,
+    odometry_table,
+    rows_of,
+    step_row,
+)
+from pipistrelle.detection.logs.poses import motions_between
+from pipistrelle.detection.scans import UNLABELLED
+from pipistrelle.refusals import refusal
+
+_HERE = Path("ROS")
+
+
+class Step(NamedTuple):
+    """What a vehicle did between two messages of its odometry."""
+
+    controls: Float[np.ndarray, "1 c"]
+    """As `Slam.move` takes them."""
+    end: float
+    """[s]."""
+
+
+class Heard(NamedTuple):
+    """The rows of a scan."""
+
+    time: float
+    """[s]."""
+    columns: dict[str, Float[np.ndarray, " m"]]
+    """As `Slam.hear` takes them."""
+
+
+def motion_of(model: str) -> Literal["poses", "twist"]:
+    """Return what odometry's messages are to a vehicle of a motion model: `BagConfig.motion`.
+
+    >>> motion_of("bicycle")
+    Traceback (most recent call last):
+    pipistrelle.config.InputError: the vehicle, key 'motion': found 'bicycle', expected 'poses' or
+    'unicycle', which nav_msgs/Odometry tells; say how surely it knows its poses
+    """
+    if model in ("poses", "unicycle"):
+        return "poses" if model == "poses" else "twist"
+    expected = "'poses' or 'unicycle', which nav_msgs/Odometry tells"
+    fix = "say how surely it knows its poses"
+    raise refusal("the vehicle, key 'motion'", repr(model), expected, fix)
+
+
+def stamp_and_pose(message: Any) -> tuple[float, tuple[float, float, float]]:
+    """Return time [s] and pose [m, m, rad] of a ``nav_msgs/Odometry``, which may be the first."""
+    with faults_named("ROS, odometry"):
+        row = step_row(Message("odometry", 1, 0.0, message), BagConfig())
+    odometry_table(_HERE, "odometry", [(1, *row)], BagConfig())
+    time, x, y, heading, *_ = row
+    return time, (x, y, heading)
+
+
+def step_between(before: Any, now: Any, settings: BagConfig) -> Step:
+    """Return the step from one ``nav_msgs/Odometry`` to the next.
+
+    The way between their poses, or the velocities of the first (`settings.motion`).
+    """
+    with faults_named("ROS, odometry"):
+        messages = [Message("odometry", n, 0.0, one) for n, one in enumerate((before, now), 1)]
+        rows = [(one.number, *step_row(one, settings)) for one in messages]
+    if not rows[1][1] > rows[0][1]:
+        found, expected = f"the time {rows[1][1]} s", f"one after {rows[0][1]} s"
+        raise refusal("ROS, odometry", found, expected, "leave out what comes late or twice")
+    table, _ = odometry_table(_HERE, "odometry", rows, settings)
+    time, *columns = table.column.values()
+    if settings.motion == "twist":
+        return Step(np.column_stack(columns)[:1], float(time[1]))
+    return Step(motions_between(table, time), float(time[1]))
+
+
+def learn_transforms(frames: Frames, message: Any) -> None:
+    """Learn the transforms of a ``tf2_msgs/TFMessage`` that do not change."""
+    with faults_named(f"ROS, {TRANSFORMS}"):
+        frames.add(message)
+
+
+def scans_in(
+    kind: str, message: Any, base: str, frames: Frames, settings: BagConfig
+) -> list[Heard]:
+    """Return the scans of a message of echoes, in order of time; beams may have delays.
+
+    `kind`: its type's name, with ``/msg/``; `base`: the vehicle's frame; `frames`: where sensors
+    are, by static transforms. Rows have no labels where none of the message's has.
+    """
+    rows = TopicEchoes(kind)
+    with faults_named(f"ROS, {kind}"):
+        rows.add(Message(kind, 1, 0.0, message), settings)
+    mounts = mounts_of(_HERE, kind, rows, frames, bare(base), settings)
+    column = rows_of(f"ROS, {kind}", rows, mounts, Counter()).column
+    time = column.pop("time")
+    if (column["landmark"] == UNLABELLED).all():
+        del column["landmark"]
+    return [
+        Heard(float(at), {name: values[time == at] for name, values in column.items()})
+        for at in np.unique(time)
+    ]

@@ -1,0 +1,236 @@
+"""Results as messages of ROS: poses, maps and transforms, and a bag of a mission's.
+
+A message is told as a dictionary of its fields, by the names of ROS's common interfaces. On a robot
+``rosidl_runtime_py.set_message_fields`` makes a message of it, here the package rosbags, of the
+extra ``ros``.
+"""
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from pipistrelle.detection.logs.bag import need_rosbags
+from pipistrelle.detection.logs.bag_frames import after, inverse, planar
+from pipistrelle.estimation.catalogue import short_name
+from pipistrelle.experiments.results.scores import TrialResult
+from pipistrelle.experiments.results.tables import landmark_table
+from pipistrelle.refusals import refusal
+
+if TYPE_CHECKING:
+    import polars as pl
+    from rosbags.typesys.store import Typestore
+
+Fields = dict[str, Any]
+BAG = "mission.mcap"
+"""The bag's name in a result folder."""
+POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+MAP = "visualization_msgs/msg/MarkerArray"
+TRANSFORM = "geometry_msgs/msg/TransformStamped"
+_PLANE = (0, 1, 5)
+"""Where x, y and the turn about z stand among the six of a pose."""
+_SPHERE, _DELETE_ALL = 2, 3
+_HEIGHT = 0.05
+"""Of a landmark's marker [m]."""
+_NUMBERS = ("weight", "x_m", "y_m", "xx_m2", "xy_m2", "yy_m2")
+_COLORS = {"full": {"r": 0.0, "g": 0.6, "b": 0.5}, "partial": {"r": 0.9, "g": 0.6, "b": 0.0}}
+_END = 2**31
+"""Stamps are below it [s]."""
+
+
+class Told(NamedTuple):
+    """A message of a bag."""
+
+    topic: str
+    type: str
+    time: float
+    """[s]."""
+    fields: Fields
+
+
+def header(time: float, frame: str) -> Fields:
+    """Tell the time [s] and the frame of a message.
+
+    >>> header(1.5, "map")
+    {'stamp': {'sec': 1, 'nanosec': 500000000}, 'frame_id': 'map'}
+    """
+    if not 0.0 <= time < _END:
+        found, expected = f"the time {time} s", f"0 s or more, below {_END}, as a stamp can tell"
+        raise refusal("a message of ROS", found, expected, "count from another zero")
+    sec, nanosec = divmod(_stamp(time), 10**9)
+    return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame}
+
+
+def _stamp(time: float) -> int:
+    """Return a time [s] in nanoseconds."""
+    whole = math.floor(time)
+    return whole * 10**9 + round((time - whole) * 1e9)
+
+
+def pose_fields(
+    time: float,
+    frame: str,
+    pose: Float[np.ndarray, "3"],
+    covariance: Float[np.ndarray, "3 3"],
+) -> Fields:
+    """Tell a pose in the plane [m, m, rad] and its covariance, as a `POSE`."""
+    six = np.zeros((6, 6))
+    six[np.ix_(_PLANE, _PLANE)] = covariance
+    x, y, heading = map(float, pose)
+    told = {"position": {"x": x, "y": y}, "orientation": _turn(heading)}
+    return {"header": header(time, frame), "pose": {"pose": told, "covariance": six.ravel()}}
+
+
+def correction_fields(
+    time: float,
+    frames: tuple[str, str],
+    pose: Sequence[float],
+    odometry: Sequence[float],
+) -> Fields:
+    """Tell what takes the frame of the odometry to that of the map, as a `TRANSFORM`.
+
+    `frames`: the map's and the odometry's; `pose`, `odometry` [m, m, rad]: where the vehicle is in
+    either at that time.
+
+    >>> told = correction_fields(0.0, ("map", "odom"), (3.0, 1.0, 0.5), (1.0, 1.0, 0.5))
+    >>> told["transform"]["translation"]
+    {'x': 2.0, 'y': 0.0}
+    """
+    turned, (x, y, _) = after(planar(*pose), inverse(planar(*odometry)))
+    heading = math.atan2(turned[1, 0], turned[0, 0])
+    return {
+        "header": header(time, frames[0]),
+        "child_frame_id": frames[1],
+        "transform": {"translation": {"x": float(x), "y": float(y)}, "rotation": _turn(heading)},
+    }
+
+
+def map_fields(time: float, frame: str, table: "pl.DataFrame") -> Fields:
+    r"""Tell a map, a marker for each hypothesis of each landmark, as a `MAP`.
+
+    A marker is the ellipse of one standard deviation: its axes' lengths are :math:`2\sigma` along
+    ``scale.x`` and ``scale.y``, turned by its orientation. Its name space is the landmark's label,
+    its opacity the hypothesis' weight. The first marker clears those of an earlier map.
+
+    `table`: with the columns of ``landmarks.parquet``; rows that are not finite are left out.
+    """
+    head = header(time, frame)
+    markers: list[Fields] = [{"header": head, "action": _DELETE_ALL}]
+    for number, row in enumerate(table.iter_rows(named=True)):
+        if not all(math.isfinite(row[name]) for name in _NUMBERS):
+            continue
+        along, across, angle = _ellipse(row["xx_m2"], row["xy_m2"], row["yy_m2"])
+        place = {"x": row["x_m"], "y": row["y_m"]}
+        markers.append(
+            {
+                "header": head,
+                "ns": f"landmark {row['landmark']}",
+                "id": number,
+                "type": _SPHERE,
+                "pose": {"position": place, "orientation": _turn(angle)},
+                "scale": {"x": 2.0 * along, "y": 2.0 * across, "z": _HEIGHT},
+                "color": _COLORS[row["status"]] | {"a": row["weight"]},
+                "text": row["status"],
+            }
+        )
+    return {"markers": markers}
+
+
+def _turn(heading: float) -> Fields:
+    """Tell a turn in the plane [rad] as a quaternion."""
+    return {"x": 0.0, "y": 0.0, "z": math.sin(heading / 2.0), "w": math.cos(heading / 2.0)}
+
+
+def _ellipse(xx: float, xy: float, yy: float) -> tuple[float, float, float]:
+    """Return the standard deviations along and across a covariance's main axis, and its angle.
+
+    >>> _ellipse(4.0, 0.0, 1.0)
+    (2.0, 1.0, 0.0)
+    """
+    middle, spread = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
+    least = max(middle - spread, 0.0)
+    return math.sqrt(middle + spread), math.sqrt(least), 0.5 * math.atan2(2.0 * xy, xx - yy)
+
+
+def told_of(trials: Sequence[TrialResult], frame: str = "map") -> Iterator[Told]:
+    """Tell the track and the map of each estimate, on topics of its own.
+
+    Poses that are not finite are left out.
+    """
+    for trial in trials:
+        track, name = trial.track, re.sub(r"\W", "_", short_name(trial.filter))
+        rows = zip(track.time.tolist(), track.pose.mean, track.pose.covariance, strict=True)
+        for time, mean, covariance in rows:
+            if np.isfinite(mean).all() and np.isfinite(covariance).all():
+                fields = pose_fields(time, frame, mean, covariance)
+                yield Told(f"/{trial.strategy}/{name}/pose", POSE, time, fields)
+        end = float(track.time[-1])
+        fields = map_fields(end, frame, landmark_table(track.landmarks, None))
+        yield Told(f"/{trial.strategy}/{name}/map", MAP, end, fields)
+
+
+def write_bag(path: Path, messages: Sequence[Told]) -> None:
+    """Write messages, in order of time, into a new .mcap file; maps are latched."""
+    need_rosbags(str(path))
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store, known = get_typestore(Stores.ROS2_HUMBLE), {}
+    with TemporaryDirectory(dir=path.parent) as room:
+        writer = Writer(Path(room) / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
+        with writer:
+            for topic, kind in dict.fromkeys((one.topic, one.type) for one in messages):
+                qos = [_latched()] if kind == MAP else []
+                told = {"typestore": store, "offered_qos_profiles": qos}
+                known[topic] = writer.add_connection(topic, kind, **told)
+            for one in sorted(messages, key=lambda one: one.time):
+                data = store.serialize_cdr(_made(store, one.type, one.fields), one.type)
+                writer.write(known[one.topic], _stamp(one.time), data)
+        (Path(room) / "bag" / "bag.mcap").replace(path)
+
+
+def _latched() -> Any:
+    """Return the quality of service by which who comes late gets the last message."""
+    from rosbags import interfaces as its
+
+    never = its.QosTime(0, 0)
+    return its.Qos(
+        history=its.QosHistory.KEEP_LAST,
+        depth=1,
+        reliability=its.QosReliability.RELIABLE,
+        durability=its.QosDurability.TRANSIENT_LOCAL,
+        deadline=never,
+        lifespan=never,
+        liveliness=its.QosLiveliness.SYSTEM_DEFAULT,
+        liveliness_lease_duration=never,
+        avoid_ros_namespace_conventions=False,
+    )
+
+
+def _made(store: "Typestore", kind: str, fields: Fields) -> Any:
+    """Make a message of what is told; the rest is zero."""
+    types = store.fielddefs[kind][1]
+    if unknown := fields.keys() - {name for name, _ in types}:
+        raise ValueError(f"{kind}: has no field {', '.join(sorted(unknown))}")
+    return store.types[kind](**{name: _field(store, how, fields.get(name)) for name, how in types})
+
+
+def _field(store: "Typestore", how: Any, value: Any) -> Any:
+    """Make a field of what is told of it, which may be nothing."""
+    from rosbags.interfaces import Nodetype
+
+    node, inner = how
+    if node == Nodetype.NAME:
+        return _made(store, inner, value or {})
+    if node == Nodetype.BASE:
+        return value if value is not None else {"string": "", "bool": False}.get(inner[0], 0)
+    (of, one), size = inner
+    if of == Nodetype.NAME:
+        return [_made(store, one, each) for each in value or ()]
+    numbers = np.zeros(size if node == Nodetype.ARRAY else 0) if value is None else value
+    return np.asarray(numbers, dtype=one[0])
