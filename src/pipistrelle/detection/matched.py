@@ -4,9 +4,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from pipistrelle.acoustics.call import Call
+from pipistrelle.arrays.bands import band_of, lag_step, replica
 from pipistrelle.jit import Whole, kernel
 
 
@@ -87,6 +88,58 @@ def filter_samples(
         mode="valid",
         axes=0,
     )
+
+
+class BandFilters:
+    """Filters real samples by each call, in its band: the matched filter.
+
+    `rate` [Hz]; lags are `step` samples apart, and `length` samples are the longest call's.
+    """
+
+    def __init__(self, calls: Sequence[Call], rate: float) -> None:
+        self.step = lag_step(calls, rate)
+        self._sent = [replica(call, rate) for call in calls]
+        self.length = max(sent.size for sent in self._sent)
+        bands = [band_of(call, rate) for call in calls]
+        self._share = [(band.low / rate, band.high / rate) for band in bands]
+        self._count, self._replicas = 0, []
+
+    def __call__(
+        self, samples: Float[np.ndarray, "t f e"], noise_std: float
+    ) -> Complex[np.ndarray, "l f c e"]:
+        """Return the outputs; lag i is a call that starts with sample i times `step`.
+
+        `noise_std`: of one complex sample, so that real ones have half of it. Noise has unit
+        variance. Of few samples there is no output.
+        """
+        from scipy.fft import ifft, next_fast_len, rfft
+
+        lags = max((len(samples) - self.length) // self.step + 1, 0)
+        if not lags:
+            return np.empty((0, samples.shape[1], len(self._sent), samples.shape[2]), np.complex64)
+        count = self.step * next_fast_len(-(-len(samples) // self.step))
+        if count != self._count:
+            self._count, self._replicas = count, self._in_bands(count)
+        heard = rfft(samples, count, axis=0)
+        outputs = np.empty((lags, samples.shape[1], len(self._sent), samples.shape[2]), heard.dtype)
+        for c, (bins, sent) in enumerate(self._replicas):
+            fewer = np.zeros((count // self.step, *samples.shape[1:]), heard.dtype)
+            weight = (sent / noise_std).astype(heard.dtype)
+            fewer[bins % len(fewer)] = heard[bins] * weight[:, None, None]
+            outputs[:, :, c] = ifft(fewer, axis=0, overwrite_x=True)[:lags]
+        return outputs
+
+    def _in_bands(
+        self, count: int
+    ) -> list[tuple[Int[np.ndarray, " k"], Complex[np.ndarray, " k"]]]:
+        """Return the bins of each call's band, in a transform of so many samples, and its own."""
+        replicas = []
+        for sent, (low, high) in zip(self._sent, self._share, strict=True):
+            bins = np.arange(math.ceil(low * count), math.floor(high * count) + 1)
+            own = np.fft.fft(sent, count)[bins].conj()
+            own *= 2.0 / self.step / math.sqrt(np.sum(np.abs(own) ** 2) / count)
+            replicas.append((bins, own))
+        return replicas
 
 
 @kernel
