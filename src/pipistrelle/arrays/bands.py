@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from pipistrelle.acoustics.call import Call
+from pipistrelle.acoustics.call import Call, Sweep, ToneBurst
 
 ENERGY = 0.995
 """Share of a call's energy that its band holds."""
@@ -52,7 +52,6 @@ def replica(call: Call, rate: float, scale: float = 1.0) -> Complex[np.ndarray, 
 def band_of(call: Call, rate: float) -> Band:
     """Return the band of a call that is sampled at a rate [Hz].
 
-    >>> from pipistrelle.acoustics.call import Sweep
     >>> band = band_of(Sweep(60e3, 35e3, 2.8e-3, taper=0.2), 200e3)
     >>> round(band.low / 1e3), round(band.high / 1e3), round(band.centre / 1e3, 1)
     (35, 60, 47.5)
@@ -71,6 +70,18 @@ def band_of(call: Call, rate: float) -> Band:
     return Band(low * step, high * step, centre * step, spread, energy)
 
 
+def extent_of(call: Call, rate: float) -> tuple[float, float]:
+    """Return the frequencies between which a call lies: of a tone its own, else those of its band.
+
+    A sweep's are those at which it begins and ends, where its samples would alias.
+    """
+    if isinstance(call, ToneBurst):
+        return call.frequency, call.frequency
+    band = band_of(call, rate)
+    ends = (call.start, call.end) if isinstance(call, Sweep) else (call.frequency,)
+    return min(band.low, *ends), max(band.high, *ends)
+
+
 def cross_talk(calls: Sequence[Call], rate: float) -> Float[np.ndarray, "c c"]:
     """Return how much of a call's power the matched filter of another answers, at the worst lag.
 
@@ -86,7 +97,6 @@ def cross_talk(calls: Sequence[Call], rate: float) -> Float[np.ndarray, "c c"]:
 def lag_step(calls: Sequence[Call], rate: float) -> int:
     """Return the samples from one output of the matched filters to the next, at a rate [Hz].
 
-    >>> from pipistrelle.acoustics.call import ToneBurst
     >>> lag_step([ToneBurst(35e3, 2.8e-3)], 200e3)
     6
     """

@@ -11,7 +11,7 @@ from pipistrelle.acoustics.arrivals import Arrivals
 from pipistrelle.acoustics.call import Call, ToneBurst
 from pipistrelle.acoustics.callers import MAX_CALLERS, Caller, check_caller
 from pipistrelle.acoustics.medium import Medium, medium_of
-from pipistrelle.arrays.bands import MAX_CROSS_TALK, band_of, cross_talk
+from pipistrelle.arrays.bands import MAX_CROSS_TALK, cross_talk, extent_of
 from pipistrelle.arrays.layout import Layout, Scattered
 from pipistrelle.config import BLOCK, SQUARE, Config, InputError
 
@@ -170,11 +170,11 @@ def _refuse_undersampled(config: Config, callers: Sequence[Caller], calls: Seque
                 f"emitter.pulse: found {call.duration:g} s, {call.duration * rate:.3g} samples at "
                 f"{rate:g} Hz; expected {LEAST_SAMPLES} or more"
             )
-        band = band_of(call, rate)
-        if not 0.0 < band.low < band.high < rate / 2.0 or caller.frequency >= rate / 2.0:
+        low, high = extent_of(call, rate)
+        if not 0.0 < low <= high < rate / 2.0:
             raise InputError(
-                f"{where}: found a call of {band.low:.0f} to {band.high:.0f} Hz, expected one "
-                f"between 0 and half the receiver.sample_rate of {rate:g} Hz; correct one of them"
+                f"{where}: found a call of {low:.0f} to {high:.0f} Hz, expected one between 0 and "
+                f"half the receiver.sample_rate of {rate:g} Hz; correct one of them"
             )
     share = cross_talk(calls, rate)
     np.fill_diagonal(share, 0.0)

@@ -57,6 +57,8 @@ class Groups:
     """Speed of sound [m/s]."""
     least_snr: float
     """Power ratio of one output of gain 0 dB that some group is expected to hear."""
+    from_start: bool
+    """Whether outputs keep the phase of the record's start, not that of a call at their lag."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,11 +108,7 @@ def front_end(
     """
     if not all(isinstance(call, ToneBurst) for call in calls):
         return _mixed(config, layout, tones, where, calls)
-    if calls:  # tones off the raster leak more
-        talk = cross_talk(calls, config.receiver.sample_rate)
-        np.fill_diagonal(talk, 0.0)
-        level_db = 10.0 * math.log10(MARGIN * max(float(talk.max()), 1e-30))
-        config = with_leakage(config, level_db)
+    config = _leaking(config, calls)
     if isinstance(layout, Layout):
         return detector(config, layout, tones)
     members, finders, snrs = [], [], []
@@ -136,6 +134,7 @@ def front_end(
         centre=centre,
         speed_of_sound=config.assumed_sound_speed,
         least_snr=float(min(snrs)),
+        from_start=bool(calls),
     )
 
 
@@ -182,10 +181,15 @@ def call_in(
     return detections_at(near, near.caller == caller)
 
 
-def with_leakage(config: Config, level_db: float) -> Config:
-    """Return settings by which a tone counts above a level [dB] of another's at least."""
-    most = max(config.detection.leakage_db, level_db)
-    found = config.detection.model_copy(update={"leakage_db": most})
+def _leaking(config: Config, tones: Sequence[Call]) -> Config:
+    """Return settings by which a tone counts where others do not leak as much, off the raster."""
+    if len(tones) < 2:
+        return config
+    talk = cross_talk(tones, config.receiver.sample_rate)
+    np.fill_diagonal(talk, 0.0)
+    most = 10.0 * math.log10(MARGIN * max(float(talk.max()), 1e-30))
+    level_db = max(config.detection.leakage_db, most)
+    found = config.detection.model_copy(update={"leakage_db": level_db})
     return config.model_copy(update={"detection": found})
 
 
@@ -211,8 +215,12 @@ def _mixed(
                 place, row = np.flatnonzero(layout.group == g), [*row, 0]
             wide.append((int(caller), g, place, finder))
             snrs.append((finder.threshold - 1.0) / place.size)
+    config = _leaking(config, [call for call in calls if isinstance(call, ToneBurst)])
+    tones_end = front_end(config, layout, tones[narrow], where)
+    if isinstance(tones_end, Groups):
+        tones_end = replace(tones_end, from_start=True)
     return Mixed(
-        tones=front_end(config, layout, tones[narrow], where),
+        tones=tones_end,
         narrow=narrow,
         silent=not is_tone[0],
         wide=tuple(wide),
@@ -316,17 +324,27 @@ def _refuse_far_apart(place: Float[np.ndarray, "k 2"], wavelength: float, where:
 
 
 def _outputs(
-    matched: Complex[np.ndarray, "l 1 c e"], end: Groups, g: int
+    matched: Complex[np.ndarray, "l 1 c e"], end: Groups, g: int, lags: Lags
 ) -> Complex[np.ndarray, "l c k"]:
-    """Return the outputs of a group."""
-    return np.ascontiguousarray(matched[:, 0, :, end.members[g]].transpose(1, 2, 0))
+    """Return the outputs of a group.
+
+    A circle takes the phase of a call that starts at their lag; where a tone makes whole turns from
+    lag to lag, it is that of the record's start.
+    """
+    outputs, finder = matched[:, 0, :, end.members[g]].transpose(1, 2, 0), end.finders[g]
+    if end.from_start and isinstance(finder, Circle):
+        turns = finder.tones * lags.interval
+        if np.abs(turns - np.rint(turns)).max() > 1e-6:
+            phase = np.exp(2j * np.pi * np.outer(np.arange(len(outputs)), turns))
+            outputs = outputs * phase[:, :, np.newaxis]
+    return np.ascontiguousarray(outputs)
 
 
 def _of_group(
     matched: Complex[np.ndarray, "l 1 c e"], end: Groups, g: int, lags: Lags
 ) -> Detections:
     """Find the calls that one group hears."""
-    outputs, finder = _outputs(matched, end, g), end.finders[g]
+    outputs, finder = _outputs(matched, end, g, lags), end.finders[g]
     if isinstance(finder, Circle):
         caller, (delay, bearing, power, bearing_std, delay_std, angle) = find_around(
             outputs, finder, lags
@@ -389,7 +407,7 @@ def _edge(
     at: tuple[int, int, float],
 ) -> tuple[float, float]:
     """Return the lag at which a group hears the first call of a tone begin, and its deviation."""
-    outputs, finder = _outputs(matched, end, g), end.finders[g]
+    outputs, finder = _outputs(matched, end, g, lags), end.finders[g]
     if isinstance(finder, Circle):
         return edge_around(outputs, finder, lags, at)
     return front_edge(outputs[:, np.newaxis], at[0], 0, at[1], lags.pulse, MIN_EDGE_ENERGY)

@@ -24,8 +24,9 @@ noise of two of them is as alike as the call's autocorrelation is.
 
 **One call, one row.** A loud call leaves lobes at other lags: its autocorrelation's, and those of
 beams to elsewhere, which hear some microphones' peaks too early. A peak counts only where it is
-louder than what any louder one leaves there at most: the scan's own answer to the call alone, as
-the set-up computes it, from several directions and of moving sources, and 3 dB more.
+louder than what all louder ones leave there at most, their amplitudes added up: the scan's own
+answer to the call alone, as the set-up computes it, from several directions and of moving sources,
+and 3 dB more.
 
 **How sure.** With the power over the noise p of the beam (`pipistrelle.detection.certainty`),
 
@@ -310,13 +311,12 @@ def _peaks(
     kept = 0
     found = np.empty(count, dtype=np.int64)
     for i in order:
-        b, alone = peaks[i], True
+        b, left = peaks[i], 0.0
         for k in range(kept):
             away = abs(found[k] - b)
-            if away < lobes.size and loudness[b] <= lobes[away] * loudness[found[k]]:
-                alone = False
-                break
-        if alone:
+            if away < lobes.size:
+                left += math.sqrt(lobes[away] * loudness[found[k]])
+        if loudness[b] > left * left:
             found[kept] = b
             kept += 1
     return found[:kept]

@@ -348,8 +348,7 @@ def _dense(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]:
             single=True,
         )
         if rig.filters is not None:
-            interval = rig.filters.step / settled.rate
-            pulse = round(settled.calls[0].duration / interval)
+            interval, pulse = rig.filters.step / settled.rate, rig.filters.pulse
             matched = rig.filters(samples, settled.noise_std)
             yield _Record(matched, start=start, interval=interval, pulse=pulse, sums=samples)
         else:
