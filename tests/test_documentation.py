@@ -130,7 +130,7 @@ def test_the_guides_shape_call_and_medium_are_heard(guide):
     from pipistrelle.acoustics.arrivals import arrivals_of_emissions
     from pipistrelle.acoustics.callers import callers_of
     from pipistrelle.acoustics.target import SHAPES
-    from pipistrelle.config import Config, ReceiverConfig, ScenarioConfig
+    from pipistrelle.config import BeaconConfig, Config, ScenarioConfig
     from pipistrelle.experiments.hearing.listening import listen
     from pipistrelle.experiments.hearing.scenario import world_of
 
@@ -142,7 +142,7 @@ def test_the_guides_shape_call_and_medium_are_heard(guide):
     own = heard.level_db[heard.caller == 0]
     assert own[1] - own[0] > 20.0 * np.log10(0.05 / 0.02)
     del SHAPES["pebble"]
-    config = Config(scenario=ScenarioConfig(steps=8), receiver=ReceiverConfig(engine="dense"))
+    config = Config(scenario=ScenarioConfig(steps=8), beacon=BeaconConfig(frequency=15e3))
     (frames,) = listen(world_of(config), config, (0.0025,), call=guide["Sweep"])
     assert sum(frame.rows.landmark.size for frame in frames) > 20
 

@@ -34,6 +34,8 @@ LONGEST_STEP = 1e5
 """No control step is longer [s]: more than a day."""
 LATEST = 3600.0
 """No clock of a sensor is later or earlier than the odometry's by more [s]."""
+TONE, SWEEP = "tone", "sweep"
+"""Calls that need no file."""
 BLOCK = 2e-4
 """Length of a block of samples, over which a receiver sums [s]."""
 LEAST_STD = 1e-6
@@ -98,10 +100,11 @@ FOLDER: Mark = {"is": "folder"}
 BEAM: Mark = {"is": "beam"}
 TABLES: Mark = {"is": "tables"}
 ARRAY: Mark = {"is": "array"}
+CALL: Mark = {"is": "call"}
 """Marks of settings that are treated in their own way, read by `settings.marked`: a folder, in a
-file from where the file lies; what makes the vehicle's beam; a list of tables; and an array's file,
-from where the file lies, too. ``derived`` names the property that has a setting's value where it is
-not given."""
+file from where the file lies; what makes the vehicle's beam; a list of tables; and the files of an
+array and of a call, from where the file lies, too. ``derived`` names the property that has a
+setting's value where it is not given."""
 
 
 class ScenarioConfig(Section):
@@ -176,11 +179,36 @@ class TargetConfig(Section):
     """Radius of a landmark [m]."""
 
 
-class EmitterConfig(Section):
+CallName = Annotated[str, Field(min_length=1, max_length=4096)]
+Sweep = Literal["linear", "hyperbolic"]
+Band = tuple[Positive, Positive]
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class CallConfig(Section):
+    """What is sent: a tone, a sweep or a recording."""
+
+    call: CallName = Field(TONE, json_schema_extra=CALL)
+    """A `tone`, a `sweep`, or a WAV file of one's own, as long as the call at most."""
+    sweep: Sweep = "linear"
+    """Of a sweep, what is linear in time: its frequency, or, `hyperbolic`, its period."""
+    band: Band = (60e3, 35e3)
+    """Of a sweep, the frequency at which it begins and that at which it ends [Hz]."""
+    taper: Share = 0.0
+    """Share of the call in which it rises and falls as a cosine does: 0 switches it on and off, 1
+    is Hann's window, between them Tukey's. A file has what it has."""
+    frequency: Positive = 35e3
+    """Tone of the call, or where a file's band lies; a sweep has its band [Hz]."""
+
+    @property
+    def centre(self) -> float:
+        """Where the call's band lies, which beams and absorption go by [Hz]."""
+        return 0.5 * (self.band[0] + self.band[1]) if self.call == SWEEP else self.frequency
+
+
+class EmitterConfig(CallConfig):
     """The vehicle's back-baffled piston and its call."""
 
-    frequency: Positive = 35e3
-    """Tone of the call [Hz]."""
     radius: Positive = Field(0.0088, json_schema_extra=BEAM)
     """Radius of the piston [m]; 8.8 mm makes a half-power beamwidth of 33 degrees."""
     level_db: Level = 49.7
@@ -191,11 +219,13 @@ class EmitterConfig(Section):
     """Length of the call, of the beacon's too [s]; unreported."""
 
 
-class BeaconConfig(Section):
+class BeaconConfig(CallConfig):
     """The omnidirectional beacon's call; where callers are listed, what the first leaves open."""
 
+    band: Band = (28e3, 18e3)
+    """Of a sweep, the frequency at which it begins and that at which it ends [Hz]."""
     frequency: Positive = 30e3
-    """Tone of the call [Hz]."""
+    """Tone of the call, or where a file's band lies; a sweep has its band [Hz]."""
     level_db: Level = 42.8
     """Source level at 1 m [dB]; unreported, fitted. Of every caller that says no other."""
 
@@ -222,6 +252,14 @@ class CallerConfig(Section):
 
     name: Annotated[str, Field(pattern=r"^\w[\w-]*$", max_length=40)] | None = None
     """In messages, figures and files; else `beacon` of the first, `caller2` of the second."""
+    call: CallName | None = None
+    """What it calls, as `emitter.call`; else, of the first, as the beacon, of others a tone."""
+    sweep: Sweep | None = None
+    """As `emitter.sweep`; else the beacon's."""
+    band: Band | None = None
+    """As `emitter.band`, each caller's own; else the beacon's [Hz]."""
+    taper: Share | None = None
+    """As `emitter.taper`; else the beacon's."""
     frequency: Positive | None = None
     """Tone of the call [Hz], each caller's own; else, of the first, the beacon's."""
     level_db: Level | None = None
@@ -272,7 +310,7 @@ class CallerConfig(Section):
 
     @model_validator(mode="after")
     def _one_way(self) -> "CallerConfig":
-        besides = {"name", "frequency", "level_db", *_CLOCK}
+        besides = {"name", "level_db", *CallConfig.model_fields, *_CLOCK}
         given = self.model_dump(exclude_none=True, exclude=besides)
         may, called = _WAYS[self.way]
         for key in given:
@@ -381,8 +419,9 @@ class ReceiverConfig(Section):
     """Samples of a microphone in a second [Hz]."""
     noise_level_db: Level = 0.0
     """Noise of one complex sample [dB], on the scale of the source levels."""
-    engine: Literal["block", "dense"] = "block"
-    """Sums over 0.2 ms blocks (exact, fast) or every sample at the full rate (the reference)."""
+    engine: Literal["auto", "block", "dense"] = "auto"
+    """Sums over 0.2 ms blocks (exact, fast), every sample at the full rate (slow, the reference),
+    or blocks where rate, tones and pulse are whole ones and nobody sweeps, else samples."""
 
 
 class DetectionConfig(Section):

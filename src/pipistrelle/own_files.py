@@ -89,6 +89,7 @@ SOUND = Kind(
         *("recording.toml", "recording.wav", "array.csv", "calls.csv"),
         *("odometry.csv", "truth.csv", "landmarks.csv", "README.md"),
     ),
+    ("call_*.wav",),
 )
 WORLD = Kind("a world", ("world.toml", "landmarks.csv", "path.csv", "README.md"), ("caller_*.csv",))
 COMPARISON = Kind("a comparison", ("comparison.*", "settings.csv", "README.md"))

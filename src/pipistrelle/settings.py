@@ -24,10 +24,13 @@ from pydantic.fields import FieldInfo
 from pipistrelle.config import (
     ARRAY,
     BEAM,
+    CALL,
     FOLDER,
     MAX_OTHERS,
     SQUARE,
+    SWEEP,
     TABLES,
+    TONE,
     CallerConfig,
     Config,
     InputError,
@@ -82,6 +85,8 @@ def _marked(mark: Mark) -> Key:
 WORLD_KEY, RADIUS_KEY, CALLERS, ARRAY_KEY = map(_marked, (FOLDER, BEAM, TABLES, ARRAY))
 """Settings that are treated in their own way: the world's folder, the piston, the callers, the
 array."""
+CALL_KEYS = tuple(key for key, it in known_settings().items() if it.json_schema_extra == CALL)
+"""Settings that may name the file of a call."""
 SETTINGS: Key = ("settings",)
 OWN: Key = ("own",)
 """Keys of what lies beneath (`experiments.named_settings`), and of what is one estimator's alone:
@@ -116,18 +121,19 @@ def from_file(path: Path) -> Layer:
 
 
 def with_places(path: Path, layer: Layer) -> Layer:
-    """Resolve what a file's settings name, world, array and routes, relative to the file."""
+    """Resolve what a file's settings name, world, array, calls and routes, relative to the file."""
     for key, given in layer.items():
         if key == CALLERS:
             layer[key] = given._replace(value=beside(path, given.value))
         named = key == WORLD_KEY or (key == ARRAY_KEY and given.value != SQUARE)
+        named |= key in CALL_KEYS and given.value not in (TONE, SWEEP)
         if named and isinstance(given.value, str):
             layer[key] = given._replace(value=str(path.parent / given.value))
     return layer
 
 
 def beside(path: Path, callers: Any) -> Any:
-    """Resolve the routes of callers relative to a file.
+    """Resolve the routes and calls of callers relative to a file.
 
     `path`: of the file; `callers`: what it gives as callers, sound or not.
 
@@ -137,8 +143,13 @@ def beside(path: Path, callers: Any) -> Any:
     if not isinstance(callers, list):
         return callers
     return [
-        caller | {"route": (path.parent / caller["route"]).as_posix()}
-        if isinstance(caller, dict) and isinstance(caller.get("route"), str)
+        caller
+        | {
+            name: (path.parent / caller[name]).as_posix()
+            for name in ("route", "call")
+            if isinstance(caller.get(name), str) and caller[name] not in (TONE, SWEEP)
+        }
+        if isinstance(caller, dict)
         else caller
         for caller in callers
     ]

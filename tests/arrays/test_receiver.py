@@ -219,11 +219,51 @@ def test_blocks_are_a_fifth_of_a_millisecond_and_the_call_fourteen_of_them():
     ],
 )
 def test_settings_that_blocks_cannot_hold_are_refused_by_name(settings, key):
-    config = Config.model_validate(settings)
+    receiver = settings.get("receiver", {}) | {"engine": "block"}
+    config = Config.model_validate(settings | {"receiver": receiver})
     with pytest.raises(InputError, match=f"^{key}: found .*expected"):
         sampling(config, callers_of(config, np.zeros(2)))
 
 
+@pytest.mark.parametrize(
+    ("settings", "dense"),
+    [
+        ({}, False),
+        ({"receiver": {"sample_rate": 250e3}}, False),
+        ({"emitter": {"frequency": 36e3}}, True),
+        ({"emitter": {"pulse": 2.9e-3}}, True),
+        ({"receiver": {"sample_rate": 192e3}}, True),
+        ({"receiver": {"sample_rate": 1e6}, "beacon": {"frequency": 31234.5}}, True),
+        ({"emitter": {"call": "sweep"}}, True),
+        ({"receiver": {"engine": "dense"}}, True),
+    ],
+)
+def test_every_sample_is_recorded_where_blocks_do_not_hold_the_calls(settings, dense):
+    config = Config.model_validate(settings)
+    settled = sampling(config, callers_of(config, np.zeros(2)))
+    assert settled.dense is dense
+    assert settled.real is (dense and "engine" not in settings.get("receiver", {}))
+    assert settled.pulse * settled.interval >= config.emitter.pulse - 1e-12
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"receiver": {"sample_rate": 2e6, "engine": "auto"}, "emitter": {"pulse": 2.81e-3}},
+         "receiver.sample_rate: found 2e.06 Hz, expected a multiple of 5000 Hz, or 8000 to 1e.06"),
+        ({"receiver": {"sample_rate": 44.1e3}}, "emitter: found a call of .* of 44100 Hz"),
+        ({"emitter": {"call": "sweep", "band": (90e3, 120e3)}}, "emitter: found a call of"),
+        ({"emitter": {"call": "sweep", "band": (31e3, 29e3)}}, "beacon: found a call that is"),
+        ({"beacon": {"frequency": 35.1e3}}, "beacon: found a call that is 77% the vehicle's"),
+    ],
+)  # fmt: skip
+def test_calls_that_samples_do_not_hold_or_tell_apart_are_refused(settings, message):
+    config = Config.model_validate(settings)
+    with pytest.raises(InputError, match=f"^{message}"):
+        sampling(config, callers_of(config, np.zeros(2)))
+
+
+BLOCKS_ALONE = Config.model_validate({"receiver": {"engine": "block"}})
 THREE = (*CALLERS, Caller(name="whistle", frequency=25e3, level_db=40.0, place=np.ones(2)))
 
 
@@ -271,7 +311,7 @@ def test_noise_of_three_tones_has_the_same_variance_in_each():
 )
 def test_a_third_tone_that_cannot_be_told_apart_is_refused_by_the_callers_name(frequency, message):
     with pytest.raises(InputError, match=f"^{message}"):
-        sampling(CONFIG, (*CALLERS, replace(THREE[2], frequency=frequency)))
+        sampling(BLOCKS_ALONE, (*CALLERS, replace(THREE[2], frequency=frequency)))
 
 
 def test_tones_a_sampling_rate_apart_fall_into_one_bin_of_a_block():

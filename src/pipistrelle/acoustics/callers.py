@@ -3,8 +3,8 @@
 Callers are a list. The first is the vehicle, the only one that moves with the ears. Its call is
 given a beam, and so is that of other vehicles, which have a heading; the others call alike in all
 directions, from a place or along a path. All call when the vehicle does, except those that have a
-clock of their own. Each has a tone of its own, by which its call is told from the rest. The paper's
-list is of two: the vehicle and the beacon.
+clock of their own. Each has a tone or a sweep of its own, by which its call is told from the rest.
+The paper's list is of two: the vehicle and the beacon.
 
 A caller other than the vehicle is also a landmark: it reflects the calls of all but itself, and is
 heard directly in its own tone. Landmarks bear the labels 1 to n, caller j the label n + j.
@@ -16,6 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipistrelle.acoustics.call import Call
+from pipistrelle.acoustics.call_settings import sound_of
 from pipistrelle.config import MAX_OTHERS, Config, InputError
 
 VEHICLE = 0
@@ -31,7 +33,7 @@ class Caller:
     name: str
     """Name in messages and figures."""
     frequency: float
-    """Frequency [Hz]."""
+    """Tone, or centre of the band [Hz]."""
     level_db: float
     """Source level at 1 m; of the vehicle, on its axis [dB]."""
     place: Float[np.ndarray, "2"] | Float[np.ndarray, "t 2"] | None = None
@@ -48,6 +50,8 @@ class Caller:
     """Poses [m, m, rad] and assumed controls of a caller that maps the world, too."""
     calls: Float[np.ndarray, " m"] | None = None
     """Rising times of its calls [s]; None of one that calls when the vehicle does."""
+    sound: Call | None = None
+    """What it calls; None is a tone."""
 
 
 def callers_of(config: Config, beacon: Float[np.ndarray, "2"]) -> tuple[Caller, Caller]:
@@ -73,15 +77,22 @@ def callers_of(config: Config, beacon: Float[np.ndarray, "2"]) -> tuple[Caller, 
     >>> [(caller.name, caller.frequency) for caller in callers_of(Config(), np.zeros(2))]
     [('vehicle', 35000.0), ('beacon', 30000.0)]
     """
-    own, other = config.emitter, config.beacon
+    own, other, pulse = config.emitter, config.beacon, config.emitter.pulse
     return (
-        Caller(name="vehicle", frequency=own.frequency, level_db=own.level_db, key="emitter"),
+        Caller(
+            name="vehicle",
+            frequency=own.centre,
+            level_db=own.level_db,
+            key="emitter",
+            sound=sound_of(own, pulse, "emitter"),
+        ),
         Caller(
             name="beacon",
-            frequency=other.frequency,
+            frequency=other.centre,
             level_db=other.level_db,
             place=beacon,
             key="beacon",
+            sound=sound_of(other, pulse, "beacon"),
         ),
     )
 

@@ -37,7 +37,7 @@ from pipistrelle.acoustics.call import ToneBurst
 from pipistrelle.arithmetic.random_stream import complex_noise
 from pipistrelle.arrays.layout import Layout, Scattered
 from pipistrelle.arrays.sampling import Sampling, block_shape
-from pipistrelle.config import BLOCK, InputError
+from pipistrelle.config import InputError
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 
@@ -102,8 +102,13 @@ def record_samples(
     rng: np.random.Generator | None,
     *,
     single: bool = False,
-) -> Complex[np.ndarray, "t f e"]:
+) -> Complex[np.ndarray, "t f e"] | Float[np.ndarray, "t f e"]:
     """Record every sample of a frame at the full rate: the reference engine.
+
+    Of a call that is no tone burst each element hears the wave when it reaches it. Real samples
+    (`Sampling.real`) are the real part of the analytic signal, and white noise of variance
+    a quarter of the complex one's, which has at each frequency the density of the complex noise
+    (`pipistrelle.arrays.waveforms`).
 
     Parameters
     ----------
@@ -119,60 +124,106 @@ def record_samples(
 
     Returns
     -------
-    (blocks * 40, faces, elements) complex
+    (blocks * 40, faces, elements) complex, or real
     """
-    first = sampling.pulse * sampling.block
     shape = (blocks * sampling.block, *layout.shape)
-    real, whole = (np.float32, np.complex64) if single else (np.float64, np.complex128)
-    if rng is None:
-        signal = np.zeros(shape, dtype=whole)
-    else:
-        signal = rng.standard_normal((*shape, 2), dtype=real).view(whole)[..., 0]
-        signal *= real(sampling.noise_std / math.sqrt(2.0))
+    signal = _noise(shape, sampling, rng, single=single)
     duration = _durations(arrivals, sampling)
     if isinstance(layout, Scattered):
         _add_scattered_samples(signal[:, 0], arrivals, duration, layout, sampling)
         return signal
     for a in range(arrivals.delay.size):
-        frequency, delay = arrivals.frequency[a], arrivals.delay[a]
-        start = max(math.ceil(delay * sampling.rate), first)
-        stop = min(math.ceil((delay + duration[a]) * sampling.rate), first + shape[0])
-        n = np.arange(start, max(stop, start))
         call = sampling.calls[arrivals.caller[a]]
-        sound = call.waveform(n / sampling.rate - delay, frequency)
-        pulse = 10.0 ** (arrivals.level_db[a] / 20.0) * sound
         for f in range(layout.normal.size):
             angle = arrivals.bearing[a] - layout.normal[f]
             if math.cos(angle) >= 0.0:
-                phases = layout.phases(angle, frequency, sampling.speed_of_sound)
-                signal[n - first, f] += np.outer(pulse, np.exp(1j * phases))
+                add = _add_tone if isinstance(call, ToneBurst) else _add_wave
+                add(signal[:, f], arrivals, a, duration[a], angle, layout, sampling)
     return signal
 
 
+def _noise(
+    shape: tuple[int, ...], sampling: Sampling, rng: np.random.Generator | None, *, single: bool
+) -> Complex[np.ndarray, "t f e"] | Float[np.ndarray, "t f e"]:
+    """Draw the samples of the microphones' noise."""
+    real, whole = (np.float32, np.complex64) if single else (np.float64, np.complex128)
+    if rng is None:
+        return np.zeros(shape, dtype=real if sampling.real else whole)
+    if sampling.real:
+        return rng.standard_normal(shape, dtype=real) * real(0.5 * sampling.noise_std)
+    signal = rng.standard_normal((*shape, 2), dtype=real).view(whole)[..., 0]
+    signal *= real(sampling.noise_std / math.sqrt(2.0))
+    return signal
+
+
+def _add_tone(
+    heard: Complex[np.ndarray, "t e"] | Float[np.ndarray, "t e"],
+    arrivals: Arrivals,
+    a: int,
+    duration: float,
+    angle: float,
+    layout: Layout,
+    sampling: Sampling,
+) -> None:
+    """Add an arrival whose envelope reaches all elements of a face at once."""
+    n, pulse = _sound(heard, arrivals, a, arrivals.delay[a], duration, sampling)
+    phases = layout.phases(angle, arrivals.frequency[a], sampling.speed_of_sound)
+    wave = np.outer(pulse, np.exp(1j * phases))
+    heard[n] += wave.real if sampling.real else wave
+
+
+def _add_wave(
+    heard: Complex[np.ndarray, "t e"] | Float[np.ndarray, "t e"],
+    arrivals: Arrivals,
+    a: int,
+    duration: float,
+    angle: float,
+    layout: Layout,
+    sampling: Sampling,
+) -> None:
+    """Add an arrival that reaches each element of a face at its own time."""
+    for e, early in enumerate(layout.position * math.sin(angle) / sampling.speed_of_sound):
+        n, pulse = _sound(heard, arrivals, a, arrivals.delay[a] - early, duration, sampling)
+        heard[n, e] += pulse.real if sampling.real else pulse
+
+
+def _sound(
+    heard: Complex[np.ndarray, "t e"] | Float[np.ndarray, "t e"],
+    arrivals: Arrivals,
+    a: int,
+    delay: float,
+    duration: float,
+    sampling: Sampling,
+) -> tuple[slice, Complex[np.ndarray, " n"]]:
+    """Return the samples in which an arrival of a delay [s] is heard, and what it is there."""
+    first, rate = sampling.pulse * sampling.block, sampling.rate
+    start = max(math.ceil(delay * rate), first)
+    stop = max(min(math.ceil((delay + duration) * rate), first + len(heard)), start)
+    call = sampling.calls[arrivals.caller[a]]
+    sound = call.waveform(np.arange(start, stop) / rate - delay, arrivals.frequency[a])
+    return slice(start - first, stop - first), 10.0 ** (arrivals.level_db[a] / 20.0) * sound
+
+
 def _add_scattered_samples(
-    signal: Complex[np.ndarray, "t e"],
+    signal: Complex[np.ndarray, "t e"] | Float[np.ndarray, "t e"],
     arrivals: Arrivals,
     duration: Float[np.ndarray, " a"],
     layout: Scattered,
     sampling: Sampling,
 ) -> None:
     """Add every sample of arrivals to a recording by microphones anywhere."""
-    first, rate = sampling.pulse * sampling.block, sampling.rate
     early, gain = _heard_by_each(arrivals, layout, sampling.speed_of_sound)
     for a, e in np.argwhere(gain > 0.0):
         delay = arrivals.delay[a] - early[a, e]
-        start = max(math.ceil(delay * rate), first)
-        stop = min(math.ceil((delay + duration[a]) * rate), first + len(signal))
-        n = np.arange(start, max(stop, start))
-        call = sampling.calls[arrivals.caller[a]]
-        sound = call.waveform(n / rate - delay, arrivals.frequency[a])
-        signal[n - first, e] += gain[a, e] * 10.0 ** (arrivals.level_db[a] / 20.0) * sound
+        n, pulse = _sound(signal, arrivals, a, delay, duration[a], sampling)
+        pulse = gain[a, e] * pulse
+        signal[n, e] += pulse.real if sampling.real else pulse
 
 
 def _durations(arrivals: Arrivals, sampling: Sampling) -> Float[np.ndarray, " a"]:
     """Return the length of each arrival [s]: the Doppler shift compresses the call."""
-    nominal = sampling.tones[arrivals.caller]
-    return sampling.pulse * BLOCK * nominal / arrivals.frequency
+    nominal, length = sampling.tones[arrivals.caller], [call.duration for call in sampling.calls]
+    return np.array(length)[arrivals.caller] * nominal / arrivals.frequency
 
 
 class _Sounds(NamedTuple):

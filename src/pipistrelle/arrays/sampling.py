@@ -11,8 +11,14 @@ from pipistrelle.acoustics.arrivals import Arrivals
 from pipistrelle.acoustics.call import Call, ToneBurst
 from pipistrelle.acoustics.callers import MAX_CALLERS, Caller, check_caller
 from pipistrelle.acoustics.medium import Medium, medium_of
+from pipistrelle.arrays.bands import MAX_CROSS_TALK, cross_talk, extent_of
 from pipistrelle.arrays.layout import Layout, Scattered
 from pipistrelle.config import BLOCK, SQUARE, Config, InputError
+
+LEAST_RATE, LARGEST_RATE = 8e3, 1e6
+"""Rates of real samples [Hz]."""
+LEAST_SAMPLES = 10
+"""Fewest samples of a call."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,6 +31,11 @@ class Sampling:
     """Samples per block."""
     pulse: int
     """Blocks per call; the first block heard is the one after it."""
+    dense: bool = False
+    """Whether every sample is recorded."""
+    real: bool = False
+    """Whether samples are real ones, matched in each call's band: where somebody sends no tone, or
+    rate, tones or pulse are no whole ones (`off_raster`)."""
     calls: tuple[Call, ...]
     """The call of each caller, the vehicle first."""
     tones: Float[np.ndarray, " c"]
@@ -33,6 +44,11 @@ class Sampling:
     """Of one complex sample."""
     speed_of_sound: float
     """Speed of sound [m/s]."""
+
+    @property
+    def interval(self) -> float:
+        """Length of a block [s]."""
+        return self.block / self.rate
 
 
 def sampling(
@@ -61,8 +77,9 @@ def sampling(
     Raises
     ------
     InputError
-        When a tone is no whole bin of a block or, once it is sampled, the tone of two callers, the
-        call no whole number of blocks, there are too many callers, or as `check_caller`.
+        When two calls cannot be told apart, the rate does not hold one, there are too many callers,
+        or as `check_caller`; with the engine ``block``, when a tone is no whole bin of a block or
+        the call no whole number of blocks.
 
     Examples
     --------
@@ -74,31 +91,101 @@ def sampling(
     rate, pulse = config.receiver.sample_rate, config.emitter.pulse
     for caller in callers:
         check_caller(caller)
-    keys = [f"{caller.key or caller.name}.frequency" for caller in callers]
-    tones = np.array([caller.frequency for caller in callers])
-    for key, value, unit, count in (
-        ("receiver.sample_rate", rate, "Hz", rate * BLOCK),
-        *((key, tone, "Hz", tone * BLOCK) for key, tone in zip(keys, tones, strict=True)),
-        ("emitter.pulse", pulse, "s", pulse / BLOCK),
-    ):
-        if round(count) < 1 or abs(count - round(count)) > 1e-6:
-            step = f"{BLOCK:g} s" if unit == "s" else f"{1 / BLOCK:g} Hz"
-            free = free_tones(config, callers, value) if key in keys else ""
-            raise InputError(f"{key}: found {value:g} {unit}, expected a multiple of {step}{free}")
     if not 1 <= len(callers) <= MAX_CALLERS:
         raise InputError(
             f"callers: found {len(callers)}, expected 1 to {MAX_CALLERS}; leave some out"
         )
-    _refuse_alike(config, callers, keys)
+    whole = _is_whole(rate * BLOCK) and _is_whole(pulse / BLOCK)
+    length = round(pulse / BLOCK) * BLOCK if whole else pulse
+    calls = tuple(caller.sound or call(caller.frequency, length) for caller in callers)
+    tones, odd = all(isinstance(one, ToneBurst) for one in calls), off_raster(config, callers)
+    engine = config.receiver.engine
+    if engine == "block" and odd:
+        raise InputError(odd)
+    real = (odd is not None or not tones) and engine != "block"
+    if real:
+        _refuse_undersampled(config, callers, calls)
+    else:
+        _refuse_alike(config, callers, _keys(callers))
     return Sampling(
         rate=rate,
-        block=round(rate * BLOCK),
-        pulse=round(pulse / BLOCK),
-        calls=tuple(call(caller.frequency, pulse) for caller in callers),
-        tones=tones,
+        block=round(rate * BLOCK) if whole else 1,
+        pulse=round(pulse / BLOCK) if whole else math.ceil(pulse * rate - 1e-6),
+        dense=real or engine == "dense",
+        real=real,
+        calls=calls,
+        tones=np.array([caller.frequency for caller in callers]),
         noise_std=10.0 ** (config.receiver.noise_level_db / 20.0),
         speed_of_sound=(medium or medium_of(config.air)).speed_of_sound,
     )
+
+
+def off_raster(config: Config, callers: Sequence[Caller]) -> str | None:
+    """Return what keeps the sums of tones over 0.2 ms from being all that there is; None: nothing.
+
+    >>> from pipistrelle.acoustics.callers import callers_of
+    >>> from pipistrelle.config import BeaconConfig
+    >>> off_raster(Config(), callers_of(Config(), np.zeros(2)))
+    >>> odd = Config(beacon=BeaconConfig(frequency=26e3))
+    >>> print(off_raster(odd, callers_of(odd, np.zeros(2))))
+    beacon.frequency: found 26000 Hz, expected a multiple of 5000 Hz (the nearest that are free:
+    25000 and 30000 Hz)
+    """
+    rate, pulse, keys = config.receiver.sample_rate, config.emitter.pulse, _keys(callers)
+    tones = [(key, one) for key, one in zip(keys, callers, strict=True) if one.sound is None]
+    for key, value, unit, count in (
+        ("receiver.sample_rate", rate, "Hz", rate * BLOCK),
+        *((key, one.frequency, "Hz", one.frequency * BLOCK) for key, one in tones),
+        ("emitter.pulse", pulse, "s", pulse / BLOCK),
+    ):
+        if not _is_whole(count):
+            step = f"{BLOCK:g} s" if unit == "s" else f"{1 / BLOCK:g} Hz"
+            free = free_tones(config, callers, value) if key in keys else ""
+            return f"{key}: found {value:g} {unit}, expected a multiple of {step}{free}"
+    return None
+
+
+def _is_whole(count: float) -> bool:
+    """Tell whether a number is a whole one from 1 on."""
+    return round(count) >= 1 and abs(count - round(count)) <= 1e-6
+
+
+def _keys(callers: Sequence[Caller]) -> list[str]:
+    """Return the settings of the callers' tones."""
+    return [f"{caller.key or caller.name}.frequency" for caller in callers]
+
+
+def _refuse_undersampled(config: Config, callers: Sequence[Caller], calls: Sequence[Call]) -> None:
+    """Refuse rates that do not hold the calls, and calls that cannot be told apart."""
+    rate = config.receiver.sample_rate
+    if not LEAST_RATE <= rate <= LARGEST_RATE:
+        raise InputError(
+            f"receiver.sample_rate: found {rate:g} Hz, expected a multiple of {1 / BLOCK:g} Hz, or "
+            f"{LEAST_RATE:g} to {LARGEST_RATE:g} Hz"
+        )
+    for caller, call in zip(callers, calls, strict=True):
+        where = caller.key or caller.name
+        if call.duration * rate < LEAST_SAMPLES:
+            raise InputError(
+                f"emitter.pulse: found {call.duration:g} s, {call.duration * rate:.3g} samples at "
+                f"{rate:g} Hz; expected {LEAST_SAMPLES} or more"
+            )
+        low, high = extent_of(call, rate)
+        if not 0.0 < low <= high < rate / 2.0:
+            raise InputError(
+                f"{where}: found a call of {low:.0f} to {high:.0f} Hz, expected one between 0 and "
+                f"half the receiver.sample_rate of {rate:g} Hz; correct one of them"
+            )
+    share = cross_talk(calls, rate)
+    np.fill_diagonal(share, 0.0)
+    j, i = divmod(int(share.argmax()), len(callers))
+    if share[j, i] > MAX_CROSS_TALK:
+        one, other = callers[max(i, j)], callers[min(i, j)]
+        raise InputError(
+            f"{one.key or one.name}: found a call that is {share[j, i]:.0%} the {other.name}'s, at "
+            f"some lag; expected {MAX_CROSS_TALK:.0%} at most, or the two cannot be told apart; "
+            "give it another frequency, or a band or direction of its own"
+        )
 
 
 def clear_frequency(config: Config) -> float:
@@ -178,10 +265,10 @@ def blocks_to_hear(
     -------
     int
     """
-    last = arrivals.delay.max(initial=0.0) / BLOCK + sampling.pulse
+    last = arrivals.delay.max(initial=0.0) / sampling.interval + sampling.pulse
     if isinstance(layout, Scattered):
         farthest = np.linalg.norm(layout.position, axis=1).max()
-        last += float(farthest) / sampling.speed_of_sound / BLOCK
+        last += float(farthest) / sampling.speed_of_sound / sampling.interval
     return max(math.ceil(last) + 1 - sampling.pulse, 2 * sampling.pulse)
 
 

@@ -9,7 +9,8 @@ A microphone's samples are real. Of the call of frequency f a real sound holds h
 The waveforms of the arrivals and white noise are written first, and then in each block what lies at
 the tones is replaced by what the front end heard there, which are whole bins of a block's transform
 (`pipistrelle.arrays.receiver`). So what is heard of the samples is what was heard of the sums, to
-rounding, noise and all.
+rounding, noise and all. Where every sample was recorded as a real one (`Sampling.real`), these are
+what was heard.
 """
 
 import numpy as np
@@ -22,7 +23,7 @@ from pipistrelle.arrays.sampling import Sampling
 
 
 def real_samples(
-    sums: Complex[np.ndarray, "b f c e"],
+    sums: Complex[np.ndarray, "b f c e"] | Float[np.ndarray, "t f e"],
     arrivals: Arrivals,
     layout: Layout | Scattered,
     sampling: Sampling,
@@ -34,8 +35,8 @@ def real_samples(
 
     Parameters
     ----------
-    sums : (blocks, faces, callers, elements) complex
-        As the front end heard them; the first block follows the vehicle's call.
+    sums : (blocks, faces, callers, elements) complex, or (samples, faces, elements) real
+        As the front end heard them; the first follows the vehicle's call.
     arrivals : Arrivals
         That made them, beside the noise.
     layout : Layout or Scattered
@@ -60,6 +61,10 @@ def real_samples(
     time = np.arange(first) / sampling.rate
     own = leak * sampling.calls[0].waveform(time, sampling.calls[0].frequency).real
     samples[:first] += own.astype(np.float32)[:, np.newaxis]
+    if sampling.real:
+        heard = sums.reshape(len(sums), -1)[: length - first]
+        samples[first : first + len(heard)] = heard
+        return samples
     blocks = min(len(sums), (length - first) // sampling.block)
     heard = samples[first : first + blocks * sampling.block]
     sound = record_samples(blocks, arrivals, layout, sampling, None, single=True)

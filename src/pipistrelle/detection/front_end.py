@@ -3,14 +3,21 @@
 Of a `Layout`, equal lines on faces, `snapshots` finds them. Of microphones anywhere (`Scattered`)
 each group is asked alone: a line on a face by `snapshots`, any other on the full circle
 (`full_circle`); bearings and delays are then those at the vehicle's centre.
+
+Calls that are no tone bursts are found over their whole band, each by itself (`wideband`). What one
+call leaves in the matched filter of another is `bands.cross_talk`; what is no more than twice that
+of a louder detection of the other is dropped.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
+from pipistrelle.acoustics.call import Call, ToneBurst
+from pipistrelle.arrays.bands import cross_talk
 from pipistrelle.arrays.layout import Layout, Scattered, along_line
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.direct import (
@@ -33,6 +40,7 @@ from pipistrelle.detection.snapshots import (
     direct_of_faces,
     joined,
 )
+from pipistrelle.detection.wideband import MARGIN, Wide, find_wide, wide_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,9 +57,31 @@ class Groups:
     """Speed of sound [m/s]."""
     least_snr: float
     """Power ratio of one output of gain 0 dB that some group is expected to hear."""
+    from_start: bool
+    """Whether outputs keep the phase of the record's start, not that of a call at their lag."""
 
 
-FrontEnd = Detector | Groups
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mixed:
+    """Thresholds and tables of calls of which some are no tones."""
+
+    tones: "FrontEnd"
+    """Finder of the tones; its caller 0 is the vehicle, be it a tone or not."""
+    narrow: Int[np.ndarray, " n"]
+    """Which callers these are."""
+    silent: bool
+    """Whether the vehicle sends no tone."""
+    wide: tuple[tuple[int, int, Int[np.ndarray, " k"], Wide], ...]
+    """Of each other call and group of microphones: caller, group, the microphones, finder."""
+    row: tuple[int, ...]
+    """Row of the outputs in which the microphones of each of these are."""
+    talk: Float[np.ndarray, "c c"]
+    """Share of a call's power (second) that the filter of another (first) answers; 0 of its own."""
+    least_snr: float
+    """Power ratio of one output of gain 0 dB that some finder is expected to hear."""
+
+
+FrontEnd = Detector | Groups | Mixed
 
 
 def front_end(
@@ -59,11 +89,14 @@ def front_end(
     layout: Layout | Scattered,
     tones: Float[np.ndarray, " c"],
     where: str = "receiver.array",
+    calls: Sequence[Call] = (),
 ) -> FrontEnd:
     """Settle what finds calls of some tones [Hz] in the outputs of a layout.
 
-    `where` the layout is from is said in refusals. Raises InputError as `detector` does, for
-    microphones too far apart, and for detection settings that lines on faces alone can meet.
+    `where` the layout is from is said in refusals; `calls`: where they are no tones, or off the
+    raster, what is sent, in samples of ``receiver.sample_rate``. Raises InputError as `detector`
+    does, for microphones too far apart, and for detection settings that lines on faces alone can
+    meet.
 
     >>> from pipistrelle.arrays.array_file import microphones_of
     >>> from pipistrelle.arrays.layout import scattered
@@ -73,6 +106,9 @@ def front_end(
     >>> round(found.finders[0].threshold, 1), found.finders[0].beams
     (18.8, 143)
     """
+    if not all(isinstance(call, ToneBurst) for call in calls):
+        return _mixed(config, layout, tones, where, calls)
+    config = _leaking(config, calls)
     if isinstance(layout, Layout):
         return detector(config, layout, tones)
     members, finders, snrs = [], [], []
@@ -98,6 +134,7 @@ def front_end(
         centre=centre,
         speed_of_sound=config.assumed_sound_speed,
         least_snr=float(min(snrs)),
+        from_start=bool(calls),
     )
 
 
@@ -113,6 +150,8 @@ def find_calls(
     lags = Lags(start, interval, pulse)
     if isinstance(end, Detector):
         return detect(matched, end, **lags._asdict())
+    if isinstance(end, Mixed):
+        return _of_mixed(matched, end, lags)
     found = joined([_of_group(matched, end, g, lags) for g in range(len(end.finders))])
     return replace(found, direct=_direct_of_groups(matched, end, found, lags))
 
@@ -138,12 +177,129 @@ def call_in(
     near = detections_at(found, inside | (found.caller != caller))  # others may leak
     if found.direct is not None:
         lags = Lags(start, interval, pulse)
-        if isinstance(end, Detector):
-            direct = direct_of_faces(matched, near, lags)
-        else:
-            direct = _direct_of_groups(matched, end, near, lags)
-        near = replace(near, direct=direct)
+        near = replace(near, direct=_direct_of(matched, end, near, lags))
     return detections_at(near, near.caller == caller)
+
+
+def _leaking(config: Config, tones: Sequence[Call]) -> Config:
+    """Return settings by which a tone counts where others do not leak as much, off the raster."""
+    if len(tones) < 2:
+        return config
+    talk = cross_talk(tones, config.receiver.sample_rate)
+    np.fill_diagonal(talk, 0.0)
+    most = 10.0 * math.log10(MARGIN * max(float(talk.max()), 1e-30))
+    level_db = max(config.detection.leakage_db, most)
+    found = config.detection.model_copy(update={"leakage_db": level_db})
+    return config.model_copy(update={"detection": found})
+
+
+def _mixed(
+    config: Config,
+    layout: Layout | Scattered,
+    tones: Float[np.ndarray, " c"],
+    where: str,
+    calls: Sequence[Call],
+) -> Mixed:
+    """Settle what finds calls of which some are no tones."""
+    is_tone = np.array([isinstance(call, ToneBurst) for call in calls])
+    narrow = np.unique(np.append(0, np.flatnonzero(is_tone)))
+    talk = cross_talk(calls, config.receiver.sample_rate)
+    np.fill_diagonal(talk, 0.0)
+    wide, row, snrs = [], [], []
+    for caller in np.flatnonzero(~is_tone):
+        for g in range(layout.normal.size):
+            finder = wide_of(config, layout, g, calls, int(caller))
+            if isinstance(layout, Layout):
+                place, row = np.arange(layout.shape[1]), [*row, g]
+            else:
+                place, row = np.flatnonzero(layout.group == g), [*row, 0]
+            wide.append((int(caller), g, place, finder))
+            snrs.append((finder.threshold - 1.0) / place.size)
+    config = _leaking(config, [call for call in calls if isinstance(call, ToneBurst)])
+    tones_end = front_end(config, layout, tones[narrow], where)
+    if isinstance(tones_end, Groups):
+        tones_end = replace(tones_end, from_start=True)
+    return Mixed(
+        tones=tones_end,
+        narrow=narrow,
+        silent=not is_tone[0],
+        wide=tuple(wide),
+        row=tuple(row),
+        talk=talk,
+        least_snr=float(min(snrs)),
+    )
+
+
+def _tones_of(matched: Complex[np.ndarray, "l f c e"], end: Mixed) -> Complex[np.ndarray, "..."]:
+    """Return the outputs of the tones, and silence of a vehicle that sends none."""
+    outputs = np.ascontiguousarray(matched[:, :, end.narrow])
+    if end.silent:
+        outputs[:, :, 0] = 0.0
+    return outputs
+
+
+def _of_mixed(matched: Complex[np.ndarray, "l f c e"], end: Mixed, lags: Lags) -> Detections:
+    """Find the calls of tones and others."""
+    parts = []
+    if len(end.narrow) > end.silent:
+        found = find_calls(_tones_of(matched, end), end.tones, **lags._asdict())
+        parts.append(replace(found, caller=end.narrow[found.caller]))
+    for (caller, g, place, finder), row in zip(end.wide, end.row, strict=True):
+        outputs = np.ascontiguousarray(matched[:, row, caller, place])
+        delay, bearing, power, across, late, angle = find_wide(outputs, finder, lags)
+        parts.append(
+            Detections(
+                face=np.full(delay.size, g),
+                caller=np.full(delay.size, caller),
+                angle=angle,
+                bearing=bearing,
+                delay=delay,
+                power=power,
+                bearing_std=across,
+                delay_std=late,
+            )
+        )
+    found = joined(parts)
+    found = detections_at(replace(found, direct=None), ~_cross_talk_in(found, end, lags))
+    return replace(found, direct=_direct_of(matched, end, found, lags))
+
+
+def _cross_talk_in(found: Detections, end: Mixed, lags: Lags) -> Bool[np.ndarray, " m"]:
+    """Tell which detections may be what a louder call of another leaves in their filter."""
+    near = np.abs(found.delay[:, np.newaxis] - found.delay) <= lags.pulse * lags.interval
+    share = end.talk[found.caller[:, np.newaxis], found.caller]
+    left = np.where(near, MARGIN * share * found.power, 0.0)
+    return found.power <= left.max(axis=1, initial=0.0)
+
+
+def _direct_of(
+    matched: Complex[np.ndarray, "l f c e"], end: FrontEnd, found: Detections, lags: Lags
+) -> DirectCalls:
+    """Find the direct calls among detections; of a call that is no tone its peak tells when."""
+    if isinstance(end, Detector):
+        return direct_of_faces(matched, found, lags)
+    if isinstance(end, Groups):
+        return _direct_of_groups(matched, end, found, lags)
+    callers, length = len(end.talk), lags.pulse * lags.interval
+    detection, when = np.full(callers, -1), np.full((2, callers), np.nan)
+    rows = np.flatnonzero(np.isin(found.caller, end.narrow))
+    if len(end.narrow) > end.silent:
+        tones = detections_at(replace(found, direct=None), np.isin(found.caller, end.narrow))
+        tones = replace(tones, caller=np.searchsorted(end.narrow, tones.caller))
+        direct = _direct_of(_tones_of(matched, end), end.tones, tones, lags)
+        heard = direct.detection >= 0
+        detection[end.narrow] = np.where(heard, np.append(rows, -1)[direct.detection], -1)
+        when[:, end.narrow] = direct.delay, direct.delay_std
+    for p in range(1, callers):
+        d = -1 if p in end.narrow else int(loudest_first(*_whose(found), p))
+        if d >= 0 and not may_leak(found.delay, found.power, d, length):
+            detection[p], when[0, p], when[1, p] = d, found.delay[d], found.delay_std[d]
+    return DirectCalls(detection=detection, delay=when[0], delay_std=when[1], pulse=length)
+
+
+def _whose(found: Detections) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return caller, delay and power of detections, for `loudest_first`."""
+    return found.caller, found.delay, found.power
 
 
 def _refuse_lines_own(config: Config, where: str) -> None:
@@ -168,17 +324,27 @@ def _refuse_far_apart(place: Float[np.ndarray, "k 2"], wavelength: float, where:
 
 
 def _outputs(
-    matched: Complex[np.ndarray, "l 1 c e"], end: Groups, g: int
+    matched: Complex[np.ndarray, "l 1 c e"], end: Groups, g: int, lags: Lags
 ) -> Complex[np.ndarray, "l c k"]:
-    """Return the outputs of a group."""
-    return np.ascontiguousarray(matched[:, 0, :, end.members[g]].transpose(1, 2, 0))
+    """Return the outputs of a group.
+
+    A circle takes the phase of a call that starts at their lag; where a tone makes whole turns from
+    lag to lag, it is that of the record's start.
+    """
+    outputs, finder = matched[:, 0, :, end.members[g]].transpose(1, 2, 0), end.finders[g]
+    if end.from_start and isinstance(finder, Circle):
+        turns = finder.tones * lags.interval
+        if np.abs(turns - np.rint(turns)).max() > 1e-6:
+            phase = np.exp(2j * np.pi * np.outer(np.arange(len(outputs)), turns))
+            outputs = outputs * phase[:, :, np.newaxis]
+    return np.ascontiguousarray(outputs)
 
 
 def _of_group(
     matched: Complex[np.ndarray, "l 1 c e"], end: Groups, g: int, lags: Lags
 ) -> Detections:
     """Find the calls that one group hears."""
-    outputs, finder = _outputs(matched, end, g), end.finders[g]
+    outputs, finder = _outputs(matched, end, g, lags), end.finders[g]
     if isinstance(finder, Circle):
         caller, (delay, bearing, power, bearing_std, delay_std, angle) = find_around(
             outputs, finder, lags
@@ -241,7 +407,7 @@ def _edge(
     at: tuple[int, int, float],
 ) -> tuple[float, float]:
     """Return the lag at which a group hears the first call of a tone begin, and its deviation."""
-    outputs, finder = _outputs(matched, end, g), end.finders[g]
+    outputs, finder = _outputs(matched, end, g, lags), end.finders[g]
     if isinstance(finder, Circle):
         return edge_around(outputs, finder, lags, at)
     return front_edge(outputs[:, np.newaxis], at[0], 0, at[1], lags.pulse, MIN_EDGE_ENERGY)

@@ -4,9 +4,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
-from pipistrelle.acoustics.call import Call
+from pipistrelle.acoustics.call import Call, ToneBurst
+from pipistrelle.arrays.bands import band_of, lag_step, replica
 from pipistrelle.jit import Whole, kernel
 
 
@@ -87,6 +88,82 @@ def filter_samples(
         mode="valid",
         axes=0,
     )
+
+
+class BandFilters:
+    """Filters real samples by each call: a tone by sums, any other in its band.
+
+    `rate` [Hz]; lags are `step` samples apart, and the longest call has `length`. Of a tone the
+    output keeps the phase of the recording's start, as that of block sums does.
+    """
+
+    def __init__(self, calls: Sequence[Call], rate: float) -> None:
+        self.calls, self.rate, self.step = calls, rate, lag_step(calls, rate)
+        self.pulse = round(calls[0].duration * rate / self.step)
+        """Lags in a call."""
+        longest = max(replica(call, rate).size for call in calls)
+        self.length = max(longest, self.pulse * self.step)
+        self._count: int = 0
+        self._replicas: list[tuple[Int[np.ndarray, " k"], Complex[np.ndarray, " k"]]] = []
+
+    def __call__(
+        self, samples: Float[np.ndarray, "t f e"], noise_std: float = 1.0
+    ) -> Complex[np.ndarray, "l f c e"]:
+        """Return the outputs; lag i is a call that starts with sample i times `step`.
+
+        `noise_std`: of one complex sample, so that real ones have half of it. Noise has unit
+        variance. Of few samples there is no output.
+        """
+        from scipy.fft import next_fast_len, rfft
+
+        lags = max((len(samples) - self.length) // self.step + 1, 0)
+        whole = np.result_type(samples, np.complex64)
+        outputs = np.empty((lags, len(samples[0]), len(self.calls), samples.shape[2]), whole)
+        if not lags:
+            return outputs
+        count, heard = self.step * next_fast_len(-(-len(samples) // self.step)), None
+        if count != self._count:
+            self._count = count
+            self._replicas = [self._in_band(call) for call in self.calls]
+        for c, call in enumerate(self.calls):
+            if isinstance(call, ToneBurst):
+                outputs[:, :, c] = self._summed(samples, call.frequency)[:lags] / noise_std
+            else:
+                heard = rfft(samples, count, axis=0) if heard is None else heard
+                outputs[:, :, c] = self._filtered(heard, c)[:lags] / whole.type(noise_std)
+        return outputs
+
+    def _summed(
+        self, samples: Float[np.ndarray, "t f e"], tone: float
+    ) -> Complex[np.ndarray, "l f e"]:
+        """Return the outputs of a tone [Hz], of unit noise."""
+        blocks = len(samples) // self.step
+        some = samples[: blocks * self.step].reshape(blocks, self.step, -1)
+        wave = 2.0 * np.exp(-2j * np.pi * tone / self.rate * np.arange(self.step))
+        turn = np.exp(-2j * np.pi * tone * self.step / self.rate * np.arange(blocks))
+        sums = np.einsum("bnm,n->bm", some, wave.astype(np.complex64), optimize=True)
+        summed = (sums * turn[:, np.newaxis]).reshape(blocks, 1, 1, -1)
+        each = {"pulse": self.pulse, "block": self.step, "noise_std": 1.0}
+        return filter_blocks(summed, **each).reshape(-1, *samples.shape[1:])
+
+    def _filtered(
+        self, heard: Complex[np.ndarray, "k f e"], c: int
+    ) -> Complex[np.ndarray, "l f e"]:
+        """Return the outputs of another call from the samples' transform, of unit noise."""
+        from scipy.fft import ifft
+
+        bins, sent = self._replicas[c]
+        fewer = np.zeros((self._count // self.step, *heard.shape[1:]), heard.dtype)
+        fewer[bins % len(fewer)] = heard[bins] * sent.astype(heard.dtype)[:, None, None]
+        return ifft(fewer, axis=0, overwrite_x=True)
+
+    def _in_band(self, call: Call) -> tuple[Int[np.ndarray, " k"], Complex[np.ndarray, " k"]]:
+        """Return the bins of a call's band in the samples' transform, and what weighs them."""
+        band, length = band_of(call, self.rate), self._count / self.rate
+        bins = np.arange(math.ceil(band.low * length), math.floor(band.high * length) + 1)
+        own = np.fft.fft(replica(call, self.rate), self._count)[bins].conj()
+        own *= 2.0 / self.step / math.sqrt(np.sum(np.abs(own) ** 2) / self._count)
+        return bins, own
 
 
 @kernel

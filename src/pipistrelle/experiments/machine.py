@@ -11,7 +11,7 @@ import numpy as np
 
 from pipistrelle.arrays.layout import Layout, Scattered
 from pipistrelle.arrays.sampling import Sampling
-from pipistrelle.config import BLOCK, Config, InputError, ScenarioConfig
+from pipistrelle.config import Config, InputError, ScenarioConfig
 from pipistrelle.estimation.catalogue import COPIES, DOUBLE, entry
 from pipistrelle.estimation.rays import ray_members
 from pipistrelle.experiments.hearing.scenario import Scenario
@@ -103,15 +103,15 @@ def check_recording(
     # To a landmark and home: at most twice across the circle around the centre that holds all.
     length = {
         key: 4.0 * reach[key] / settled.speed_of_sound,
-        "emitter.pulse": settled.pulse * BLOCK,
+        "emitter.pulse": settled.pulse * settled.interval,
     }
     numbers = 2 * settled.tones.size  # complex, of each tone's sums
-    if config.receiver.engine == "dense":  # samples and each tone's filter, in single precision
+    if settled.dense:  # samples and each tone's filter, in single precision
         length |= {"scenario.step": max(length.get("scenario.step", 0.0), _period(setup))}
         numbers = (1 + settled.tones.size) * settled.block
     key = max(length, key=length.__getitem__)
     numbers *= math.prod(layout.shape)
-    need = COPIES * DOUBLE * length[key] / BLOCK * numbers
+    need = COPIES * DOUBLE * length[key] / settled.interval * numbers
     _refuse_beyond(f"{key}: a recording of {length[key]:.3g} s", need, workers)
 
 

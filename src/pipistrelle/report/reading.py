@@ -124,7 +124,7 @@ def _truth(setting: str, config: Config) -> float | None:
 
 def _degrees(config: Config) -> float:
     """Return the half-power beamwidth of the vehicle's call [deg]."""
-    tone = {"frequency": config.emitter.frequency, "speed_of_sound": config.air.sound_speed}
+    tone = {"frequency": config.emitter.centre, "speed_of_sound": config.air.sound_speed}
     return degrees(beamwidth(config.emitter.radius, **tone))
 
 

@@ -16,6 +16,7 @@ from pipistrelle.experiments.named_settings import check_own, laid, over_named, 
 from pipistrelle.refusals import meant, refusal, shown
 from pipistrelle.settings import (
     ARRAY_KEY,
+    CALL_KEYS,
     CALLERS,
     RADIUS_KEY,
     WORLD_KEY,
@@ -113,6 +114,10 @@ def mission_settings(
         from pipistrelle.experiments.hearing.caller_paths import with_routes
 
         layer = with_routes(layer)
+    if CALLERS in layer or not layer.keys().isdisjoint(CALL_KEYS):
+        from pipistrelle.acoustics.call_settings import with_calls
+
+        layer = with_calls(layer)
     if ARRAY_KEY in layer:
         from pipistrelle.arrays.array_file import with_array
 
@@ -253,7 +258,7 @@ def _radius(beamwidth: float, config: Config) -> float:
     return float(
         piston_radius(
             radians(beamwidth),
-            frequency=config.emitter.frequency,
+            frequency=config.emitter.centre,
             speed_of_sound=config.air.sound_speed,
         )
     )

@@ -76,7 +76,7 @@ def array(
 def _frequency(asked: float | None, config: Config) -> float:
     """Return the frequency to look at [Hz]."""
     if asked is None:
-        return config.emitter.frequency
+        return config.emitter.centre
     if not 1.0 <= asked <= 1e7:
         raise InputError(f"--frequency: found {shown(asked)}, expected 1 to 1e+07 [Hz]")
     return asked

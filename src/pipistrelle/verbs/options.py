@@ -186,8 +186,8 @@ class MissionOptions:
         ),
     ] = None
     engine: Annotated[
-        Literal["block", "dense"] | None,
-        Parameter(help="Receiver: fast or literal; sets receiver.engine. [default: block]"),
+        Literal["auto", "block", "dense"] | None,
+        Parameter(help="Receiver: fast or literal; sets receiver.engine. [default: auto]"),
     ] = None
     particles: Particles = None
     world: Annotated[

@@ -141,11 +141,6 @@ def _sound_recorder(
     from pipistrelle.scripting.arguments import frames_named
     from pipistrelle.verbs.streams import say
 
-    if config.receiver.engine != "block":
-        raise InputError(
-            f"--save-sound: found receiver.engine {config.receiver.engine!r}, whose samples are "
-            "complex; expected 'block', of which real samples are made"
-        )
     count = config.scenario.steps // config.scenario.steps_per_frame
     chosen = frames_named(frames, count, "--frames")
     own = _claimed("--save-sound", folder, SOUND, output.overwrite)

@@ -168,11 +168,19 @@ OTHERS = {
     "air.spreading": "bistatic",
     "target.shape": "sphere",
     "target.radius": 0.05,
+    "emitter.call": "sweep",
+    "emitter.sweep": "hyperbolic",
+    "emitter.band": [60e3, 45e3],
+    "emitter.taper": 0.5,
     "emitter.frequency": 40e3,
     "emitter.radius": 0.02,
     "emitter.level_db": 60.0,
     "emitter.off_axis": "power",
     "emitter.pulse": 2.0e-3,
+    "beacon.call": "sweep",
+    "beacon.sweep": "hyperbolic",
+    "beacon.band": [28e3, 15e3],
+    "beacon.taper": 0.5,
     "beacon.frequency": 25e3,
     "beacon.level_db": 55.0,
     "receiver.array": [[x, y, 0.0, 0.0, ""] for x, y in ((0.01, 0.0), (0.0, 0.01), (-0.01, 0.0))],
@@ -265,6 +273,8 @@ def test_the_settings_that_are_varied_here_are_all_there_are():
 
 ROAMING = {"listening": {"timing": True}, "callers": [{"course": "circle", "radius": 5.0}]}
 NEEDS = {
+    **{f"emitter.{name}": {"emitter": {"call": "sweep"}} for name in ("sweep", "band")},
+    **{f"beacon.{name}": {"beacon": {"call": "sweep"}} for name in ("sweep", "band")},
     "scenario.vehicle": {"callers": [{"course": "mission"}]},
     "scenario.extent": {"scenario": {"course": "eight"}},
     "scenario.lane": {"scenario": {"field": "rows"}},

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipistrelle.config import TONE
 from pipistrelle.detection.logs.text_tables import place_of, read_table
 from pipistrelle.detection.sounds.description import FILE as ABOUT
 from pipistrelle.detection.sounds.description import Description
@@ -59,6 +60,9 @@ def calls_of(folder: Path, about: Description, sound: Sound, blocks: Blocks) -> 
         where = f"{folder / ABOUT}, key 'call.trigger'"
         each = blocks._replace(block=1, pulse=4)  # an edge, to a sample
         sample = _onsets(sound, each, _trigger(sound, call.trigger - 1, where), blocks.blank)
+    elif call.call != TONE:
+        fix = f"write {FILE}, or call.period or call.trigger in {ABOUT}"
+        raise refusal(folder, f"nothing that tells when the {call.call} comes", "it", fix)
     else:
         where = f"{folder}, the call's leak at {call.frequency:g} Hz"
         sample = _onsets(sound, blocks, _leak(sound, blocks), 2 * blocks.blank)

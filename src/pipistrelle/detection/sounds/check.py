@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int
 
-from pipistrelle.config import Config
+from pipistrelle.config import TONE, Config
 from pipistrelle.detection.sounds.calls import Calls, calls_of
 from pipistrelle.detection.sounds.check_array import array_faults
-from pipistrelle.detection.sounds.description import FILE, Description
-from pipistrelle.detection.sounds.hearing import Hearing
+from pipistrelle.detection.sounds.description import Description
+from pipistrelle.detection.sounds.hearing import Hearing, sums_of
 from pipistrelle.detection.sounds.recorded_array import RecordedArray, recorded_array
 from pipistrelle.detection.sounds.sound_file import Sound, open_sound
-from pipistrelle.detection.sounds.tone_sums import Blocks, blocks_of
+from pipistrelle.detection.sounds.tone_sums import Blocks
 
 GAPS = 16
 """Most gaps that are looked at, spread over the recording."""
@@ -28,14 +28,14 @@ def check_recording(folder: Path, about: Description, config: Config) -> list[st
     """Return what is odd about a recording, a line each."""
     with open_sound(folder, about) as sound:
         array = recorded_array(folder, sound.channels, one_centre=about.one_centre)
-        tones = np.array([about.call.frequency, *(one.frequency for one in about.callers)])
-        where = str(folder / FILE)
-        blocks = blocks_of(sound.rate, about.call.duration, tones, where, about.call.deaf)
+        blocks = sums_of(folder, sound, about, array)[0].blocks
         calls = calls_of(folder, about, sound, blocks)
         gaps = np.unique(np.linspace(0, calls.sample.size - 1, GAPS).round().astype(np.int64))
         dead, faults = _channels(sound, calls, gaps, array)
-        faults += _rate(sound, calls, gaps, blocks)
+        faults += _rate(sound, calls, gaps, blocks) if about.call.call == TONE else []
         faults += _clock(calls, blocks)
+        if about.call.call != TONE:
+            return faults  # the order of channels is told by a tone's phases
         if dead:
             return [*faults, "the order of the channels was not looked at, for some are dead"]
         hearing = Hearing.of(folder, sound, about, config)

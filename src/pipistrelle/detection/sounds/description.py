@@ -5,8 +5,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from pipistrelle.acoustics.call import Call, ToneBurst
+from pipistrelle.acoustics.call_settings import sound_of
 from pipistrelle.config import (
     MAX_OTHERS,
+    SWEEP,
+    TONE,
+    CallConfig,
     Level,
     NonNegative,
     Positive,
@@ -24,13 +29,26 @@ _Rate = Annotated[float, Field(ge=100, le=1e8)]
 _Channel = Annotated[int, Field(ge=1, le=1024)]
 
 
-class OwnCall(Section):
-    """The vehicle's own call, and when it comes."""
+class _Told(CallConfig):
+    """What somebody sends, in the words of the settings; a file lies beside the recording."""
 
     model_config = ConfigDict(strict=True)
 
-    frequency: Positive
-    """Tone [Hz]."""
+    band: Annotated[tuple[Positive, Positive], Field(strict=False)] = (60e3, 35e3)
+    frequency: Positive = 0.0
+    """Tone, or where a file's band lies; a sweep has its band [Hz]."""
+
+    @model_validator(mode="after")
+    def _of_some_frequency(self) -> "_Told":
+        for key in ("band",) if self.call == SWEEP else ("frequency",):
+            if key not in self.model_fields_set:
+                raise ValueError(f"a {key} for a call that is {self.call!r}")
+        return self
+
+
+class OwnCall(_Told):
+    """The vehicle's own call, and when it comes."""
+
     duration: Annotated[float, Field(ge=1e-5, le=1.0)]
     """Length [s]."""
     deaf: Annotated[float, Field(ge=1e-5, le=10.0)] | None = None
@@ -55,14 +73,10 @@ class OwnCall(Section):
         return self
 
 
-class OtherCaller(Section):
+class OtherCaller(_Told):
     """Somebody else who calls."""
 
-    model_config = ConfigDict(strict=True)
-
     name: _Name
-    frequency: Positive
-    """Tone [Hz]."""
     level_db: Level | None = None
     landmark: Annotated[int, Field(ge=0, lt=2**53)] | None = None
     """The label that the truth gives it."""
@@ -110,10 +124,25 @@ class Description(Section):
         names = {"vehicle", *(one.name.casefold() for one in self.callers)}
         if len(names) <= len(self.callers):
             raise ValueError('a name of its own for each caller, not "vehicle", a or A alike')
-        tones = {self.call.frequency, *(one.frequency for one in self.callers)}
+        everyone = (self.call, *self.callers)
+        tones = {(one.call, one.sweep, one.band, one.frequency) for one in everyone}
         if len(tones) <= len(self.callers):
             raise ValueError("a frequency of its own for each who calls")
         return self
+
+    def calls(self, folder: Path) -> tuple[Call, ...]:
+        """Return what everybody sends, the vehicle first; `folder`: of the recording."""
+        duration, calls = self.call.duration, []
+        for key, one in zip(self._keys(), (self.call, *self.callers), strict=True):
+            file = {} if one.call in (TONE, SWEEP) else {"call": str(folder / one.call)}
+            where = f"{folder / FILE}, key '{key}'"
+            sound = sound_of(one.model_copy(update=file), duration, where)
+            calls.append(sound or ToneBurst(one.frequency, duration))
+        return tuple(calls)
+
+    def _keys(self) -> list[str]:
+        """Return the tables of those who call."""
+        return ["call", *(f"callers.{j}" for j in range(1, len(self.callers) + 1))]
 
 
 def read_description(folder: Path) -> Description:

@@ -1,26 +1,31 @@
 """Sound in: a recording is heard call by call, by the front end of the simulation, into a log."""
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Complex
+from jaxtyping import Bool, Complex, Float
 
+from pipistrelle.acoustics.call import Call, ToneBurst
+from pipistrelle.arrays.bands import extent_of
 from pipistrelle.config import Config
 from pipistrelle.detection.echoes import unlabelled_scan, with_edge_floor
 from pipistrelle.detection.front_end import FrontEnd, find_calls, front_end
 from pipistrelle.detection.matched import Workspace, filter_blocks
 from pipistrelle.detection.scans import Scan
 from pipistrelle.detection.snapshots import Detections, detections_at
+from pipistrelle.detection.sounds.call_outputs import CallOutputs
 from pipistrelle.detection.sounds.calls import Calls, calls_of
-from pipistrelle.detection.sounds.description import Description
+from pipistrelle.detection.sounds.description import FILE, Description
 from pipistrelle.detection.sounds.noise_level import set_noise
 from pipistrelle.detection.sounds.recorded_array import FILE as ARRAY
 from pipistrelle.detection.sounds.recorded_array import RecordedArray, recorded_array
 from pipistrelle.detection.sounds.sound_file import Sound, open_sound
 from pipistrelle.detection.sounds.tone_sums import Blocks, ToneSums, blocks_of
+from pipistrelle.refusals import refusal
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, the calls heard and their number."""
@@ -51,7 +56,7 @@ class Hearing:
     array: RecordedArray
     blocks: Blocks
     calls: Calls
-    sums: ToneSums
+    sums: ToneSums | CallOutputs
     config: Config
     end: FrontEnd
     own_clock: Bool[np.ndarray, " c"]
@@ -64,13 +69,11 @@ class Hearing:
         `config`: sections detection, matching and assumed count; the rest is the recording's.
         """
         array = recorded_array(folder, sound.channels, one_centre=about.one_centre)
-        tones = np.array([about.call.frequency, *(one.frequency for one in about.callers)])
-        where = str(folder / "recording.toml")
-        blocks = blocks_of(sound.rate, about.call.duration, tones, where, about.call.deaf)
+        sums, sent = sums_of(folder, sound, about, array)
+        blocks = sums.blocks
         calls = calls_of(folder, about, sound, blocks)
-        sums = ToneSums(blocks, array.channel)
         set_noise(sums, sound, calls, folder)
-        settled = _settled(config, about)
+        settled = _settled(config, about, sound.rate)
         return cls(
             folder=folder,
             about=about,
@@ -80,26 +83,32 @@ class Hearing:
             calls=calls,
             sums=sums,
             config=settled,
-            end=front_end(settled, array.layout, tones, str(folder / ARRAY)),
+            end=front_end(settled, array.layout, blocks.tones, str(folder / ARRAY), sent),
             own_clock=np.array([False, *(one.own_clock for one in about.callers)]),
         )
 
     def frames(self, numbers: Sequence[int]) -> Iterator[Frame]:
         """Hear what came after some of the calls, numbered from 0 on."""
-        on, calls = self.blocks, self.calls
-        room = Workspace()
+        calls, room = self.calls, Workspace()
         for k in numbers:
             first = int(calls.sample[k])
             samples = self.sound.read(first, int(calls.length[k]))
-            count = max((len(samples) - on.blank) // on.block, 0)
-            blocks = self.sums(samples, room.array("blocks", (count, *self.sums.gain.shape)))
-            if not np.isfinite(blocks).all():
-                self.sound.refuse_odd(first, samples)
-            lags = (max(count - on.pulse + 1, 0), *self.sums.gain.shape)
-            matched = filter_blocks(
-                blocks, pulse=on.pulse, block=1, noise_std=1.0, out=room.array("matched", lags)
-            )
-            yield self._frame(float(calls.time[k]), matched)
+            yield self._frame(float(calls.time[k]), self._matched(first, samples, room))
+
+    def _matched(
+        self, first: int, samples: Float[np.ndarray, "t m"], room: Workspace
+    ) -> Complex[np.ndarray, "l f c e"]:
+        """Filter what came after one call, which begins with a sample; refuse no numbers."""
+        on, shape = self.blocks, self.sums.gain.shape
+        if isinstance(self.sums, CallOutputs):
+            self.sound.refuse_odd(first, samples)
+            return self.sums(samples)
+        count = max((len(samples) - on.blank) // on.block, 0)
+        blocks = self.sums(samples, room.array("blocks", (count, *shape)))
+        if not np.isfinite(blocks).all():
+            self.sound.refuse_odd(first, samples)
+        out = room.array("matched", (max(count - on.pulse + 1, 0), *shape))
+        return filter_blocks(blocks, pulse=on.pulse, block=1, noise_std=1.0, out=out)
 
     def _frame(self, time: float, matched: Complex[np.ndarray, "l f c e"]) -> Frame:
         """Detect the echoes of one call."""
@@ -111,6 +120,27 @@ class Hearing:
         found = with_edge_floor(found, self.config)
         scan, _ = unlabelled_scan(time, found, self.config, self.own_clock)
         return Frame(time, matched, start, on.interval, found, scan)
+
+
+def sums_of(
+    folder: Path, sound: Sound, about: Description, array: RecordedArray
+) -> tuple[ToneSums | CallOutputs, tuple[Call, ...]]:
+    """Return what sums the samples at each tone, or filters them by each call, and the calls."""
+    where, calls = str(folder / FILE), about.calls(folder)
+    tones = np.array([call.frequency for call in calls])
+    if all(isinstance(call, ToneBurst) for call in calls):
+        blocks = blocks_of(sound.rate, about.call.duration, tones, where, about.call.deaf)
+        return ToneSums(blocks, array.channel), calls
+    for call in calls:
+        low, high = extent_of(call, sound.rate)
+        if not 0.0 < low <= high < sound.rate / 2.0:
+            found = f"a call of {low:.0f} to {high:.0f} Hz"
+            expected = f"one below half the sample rate of {sound.rate:g} Hz"
+            raise refusal(where, found, expected, "correct the one that is wrong")
+    blank = about.call.deaf or about.call.duration
+    return CallOutputs(
+        calls, sound.rate, math.ceil(blank * sound.rate - 1e-6), array.channel
+    ), calls
 
 
 def hear_recording(
@@ -143,12 +173,13 @@ def log_callers(about: Description) -> list[dict[str, Any]]:
     ]
 
 
-def _settled(config: Config, about: Description) -> Config:
-    """Return settings with what the recording says of the call and the speed of sound."""
+def _settled(config: Config, about: Description, rate: float) -> Config:
+    """Return settings with what the recording says of rate, call and speed of sound."""
     assumed = config.assumed.speed_of_sound or about.speed_of_sound
     return config.model_copy(
         update={
             "emitter": config.emitter.model_copy(update={"pulse": about.call.duration}),
+            "receiver": config.receiver.model_copy(update={"sample_rate": rate}),
             "assumed": config.assumed.model_copy(update={"speed_of_sound": assumed}),
         }
     )

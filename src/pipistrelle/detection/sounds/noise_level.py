@@ -17,14 +17,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipistrelle.detection.sounds.call_outputs import CallOutputs
 from pipistrelle.detection.sounds.calls import Calls
 from pipistrelle.detection.sounds.sound_file import Sound
 from pipistrelle.detection.sounds.tone_sums import ToneSums
 from pipistrelle.refusals import refusal
 
-GAPS, GROUP, FIRST_GAPS = 256, 64, 8
-"""Most gaps that are listened to, spread over the recording; how many of them at a time; and how
-many to find which parts are quiet."""
+GROUP, FIRST_GAPS = 64, 8
+"""How many gaps are listened to at a time; and how many to find which parts are quiet."""
 STRETCHES, QUIET = 8, 3
 """Into how many stretches a gap is parted, and how many count at most."""
 MIN_SUMS = 50
@@ -33,23 +33,23 @@ CHANCE = 5.0
 """Channels whose levels differ by fewer standard deviations have one."""
 
 
-def set_noise(sums: ToneSums, sound: Sound, calls: Calls, folder: Path) -> None:
+def set_noise(sums: ToneSums | CallOutputs, sound: Sound, calls: Calls, folder: Path) -> None:
     """Measure noise and mean of each channel, and have the sums scaled to unit noise."""
     last = calls.sample.size - 1
     first, gaps = (
         np.unique(np.linspace(0, last, most).round().astype(np.int64))
-        for most in (FIRST_GAPS, GAPS)
+        for most in (FIRST_GAPS, sums.gaps)
     )
     means = [
         samples[sums.blocks.blank :].mean(axis=0, dtype=np.float64)
         for samples in _gaps(sound, calls, first)
     ]
     sums.mean = np.mean(means, axis=0)
-    quiet = _quiet([_powers(sums, sound, calls, first, [part]) for part in range(STRETCHES)])
+    quiet = _quiet(_powers(sums, sound, calls, first, range(STRETCHES)))
     groups = np.array_split(gaps, math.ceil(gaps.size / GROUP))
     level, count = np.zeros(sums.gain.shape), 0
     for group in groups:
-        power = _powers(sums, sound, calls, group, quiet)
+        power = np.concatenate(_powers(sums, sound, calls, group, quiet))
         count += len(power)
         if len(power):
             middle = np.median(power, axis=0, overwrite_input=True)
@@ -75,21 +75,21 @@ def _gaps(
 
 
 def _powers(
-    sums: ToneSums,
+    sums: ToneSums | CallOutputs,
     sound: Sound,
     calls: Calls,
     numbers: Int[np.ndarray, " g"],
     stretches: Sequence[int],
-) -> Float[np.ndarray, "b f c e"]:
-    """Return the powers in some stretches of some gaps."""
-    power = []
+) -> list[Float[np.ndarray, "b f c e"]]:
+    """Return the powers in each of some stretches of some gaps."""
+    power: list[list[np.ndarray]] = [[] for _ in stretches]
     for samples in _gaps(sound, calls, numbers):
-        heard = sums(samples)
+        heard = sums(samples)[:: sums.apart]
         edges = np.linspace(0, len(heard), STRETCHES + 1).astype(np.int64)
-        for stretch in stretches:
+        for stretch, part in zip(stretches, power, strict=True):
             some = heard[edges[stretch] : edges[stretch + 1]]
-            power.append((some.real**2 + some.imag**2).astype(np.float32))
-    return np.concatenate(power)
+            part.append((some.real**2 + some.imag**2).astype(np.float32))
+    return [np.concatenate(part) for part in power]
 
 
 def _quiet(power: Sequence[Float[np.ndarray, "b f c e"]]) -> list[int]:

@@ -36,7 +36,9 @@ class Overview:
         if len(self.time) == CALLS:
             return
         lags, faces, tones, elements = frame.matched.shape
-        energy = energy_of(frame.matched.reshape(-1).view(np.float64), elements) / elements
+        energy = (
+            energy_of(frame.matched.reshape(-1).view(frame.matched.real.dtype), elements) / elements
+        )
         loudest = energy.reshape(lags, faces, tones).max(axis=1, initial=0.0)
         edges = np.unique(np.linspace(0, lags, BINS + 1).astype(np.int64))[:-1]
         if edges.size:

@@ -80,6 +80,10 @@ def blocks_of(
 class ToneSums:
     """Sums samples of the channels of an array, each scaled by its own noise."""
 
+    apart, gaps = 1, 256
+    """Sums from one that tells of the noise to the next; most gaps between calls, spread over the
+    recording, in which it is listened to."""
+
     def __init__(self, blocks: Blocks, channel: Int[np.ndarray, "f e"]) -> None:
         self.blocks, self.channel = blocks, channel
         turns = np.outer(blocks.tones, np.arange(blocks.block)) / blocks.rate

@@ -23,9 +23,20 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from pipistrelle.acoustics.call_settings import sound_of
 from pipistrelle.acoustics.callers import Caller, callers_of, moves
 from pipistrelle.arrays.sampling import free_tones
-from pipistrelle.config import CallerConfig, Config, InputError, ScenarioConfig, caller_names
+from pipistrelle.config import (
+    SWEEP,
+    TONE,
+    BeaconConfig,
+    CallConfig,
+    CallerConfig,
+    Config,
+    InputError,
+    ScenarioConfig,
+    caller_names,
+)
 from pipistrelle.detection.logs.text_tables import check_unique, read_table
 from pipistrelle.experiments.hearing.landmark_fields import MAX_DRAWS, nearest
 from pipistrelle.experiments.hearing.trajectories import Course, course_of, driven, motion_of
@@ -135,19 +146,9 @@ def callers_among(
     if first is not None:
         streams[:1] = [first] * len(settings[:1])
     callers: list[Caller] = []
-    names, beacon = caller_names(tuple(settings)), around.config.beacon
+    names = caller_names(tuple(settings))
     for j, (one, name, stream) in enumerate(zip(settings, names, streams, strict=True), start=1):
-        frequency = beacon.frequency if one.frequency is None and j == 1 else one.frequency
-        if frequency is None:
-            known = (*callers_of(around.config, np.zeros(2))[:1], *callers)
-            free = free_tones(around.config, known, beacon.frequency)
-            raise InputError(
-                f"callers.{j}.frequency: found none, expected a tone of its own{free}; give one, "
-                "for only the first may have the beacon's"
-            )
-        usual = around.config.emitter if one.way == "mission" else beacon
-        level_db = usual.level_db if one.level_db is None else one.level_db
-        caller = Caller(name=name, frequency=frequency, level_db=level_db, key=f"callers.{j}")
+        caller = _placeless(one, name, callers, around)
         _check_speed(caller.key, one, around.config)
         is_beacon = first is not None and j == 1 and one.distance is None
         taken = [] if is_beacon and one.way == "stand" else [around.landmarks, _standing(callers)]
@@ -167,6 +168,41 @@ def callers_among(
         file = "" if world is None else f"{Path(world) / 'world.toml'}: "
         _check_apart(callers, around, file + caller.key + ".route" * (one.way == "route"))
     return tuple(callers)
+
+
+def _placeless(
+    one: CallerConfig, name: str, before: Sequence[Caller], around: Surroundings
+) -> Caller:
+    """Return the next caller with all but its place."""
+    config, key = around.config, f"callers.{len(before) + 1}"
+    sent = _call(one, config.beacon, first=not before)
+    if sent is None:
+        known = (*callers_of(config, np.zeros(2))[:1], *before)
+        free = free_tones(config, known, config.beacon.frequency)
+        raise InputError(
+            f"{key}.frequency: found none, expected a tone of its own{free}; give one, for only "
+            "the first may have the beacon's"
+        )
+    usual = config.emitter if one.way == "mission" else config.beacon
+    return Caller(
+        name=name,
+        frequency=sent.centre,
+        level_db=usual.level_db if one.level_db is None else one.level_db,
+        key=key,
+        sound=sound_of(sent, config.emitter.pulse, key),
+    )
+
+
+def _call(one: CallerConfig, beacon: BeaconConfig, *, first: bool) -> CallConfig | None:
+    """Return what a caller calls, with what it leaves open as the beacon has it; None: no tone."""
+    given = one.model_dump(exclude_none=True, include=set(CallConfig.model_fields))
+    usual = beacon.model_dump(include=set(CallConfig.model_fields))
+    if not first:
+        usual |= {"call": TONE, "frequency": None}
+    sent = usual | given
+    if sent["call"] != SWEEP and sent["frequency"] is None:
+        return None
+    return CallConfig.model_validate({key: v for key, v in sent.items() if v is not None})
 
 
 def place_at(

@@ -16,13 +16,14 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Complex, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from pipistrelle.acoustics.arrivals import Arrivals, arrivals_at, through_piston
 from pipistrelle.acoustics.call import Call, ToneBurst
 from pipistrelle.acoustics.callers import VEHICLE
 from pipistrelle.acoustics.medium import Medium
 from pipistrelle.arithmetic.random_stream import stream_key
+from pipistrelle.arrays.bands import band_of
 from pipistrelle.arrays.layout import Layout, Scattered, layout_of
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
 from pipistrelle.arrays.sampling import Sampling, block_shape, blocks_to_hear, sampling
@@ -30,18 +31,18 @@ from pipistrelle.config import BLOCK, Config
 from pipistrelle.detection.direct import own_alone
 from pipistrelle.detection.echoes import unlabelled_scan, with_edge_floor
 from pipistrelle.detection.faces import FrameMeasurements, average_faces
-from pipistrelle.detection.front_end import FrontEnd, Groups, call_in, find_calls, front_end
-from pipistrelle.detection.matched import Workspace, filter_blocks, filter_samples
+from pipistrelle.detection.front_end import FrontEnd, call_in, find_calls, front_end
+from pipistrelle.detection.matched import BandFilters, Workspace, filter_blocks, filter_samples
 from pipistrelle.detection.scans import UNLABELLED
-from pipistrelle.detection.snapshots import Detections, detections_at, joined
+from pipistrelle.detection.snapshots import Detections, Detector, detections_at, joined
 from pipistrelle.experiments.hearing.frames import CallHeard, frames_of
 from pipistrelle.experiments.hearing.oracle import faintest_level_db, label_detections
 from pipistrelle.experiments.hearing.scenario import Scenario, caller_labels
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage's name, the frames done and their number."""
-Keep = Callable[[int, Arrivals, Complex[np.ndarray, "b f c e"]], None]
-"""Called with a frame's number, its arrivals and the block sums that were heard."""
+Keep = Callable[[int, Arrivals, np.ndarray], None]
+"""Called with a frame's number, its arrivals and the block sums or samples that were heard."""
 
 
 def listen(
@@ -77,8 +78,7 @@ def listen(
     layout : Layout or Scattered, optional
         The arrays; those of the settings by default.
     call : callable
-        Makes each caller's `Call` of its frequency [Hz] and duration [s]; other than tone bursts
-        are for the dense engine.
+        Makes the `Call` of each caller that has none, of its frequency [Hz] and duration [s].
     medium : Medium, optional
         What the sound travels through; the air of the settings by default. The front end goes on
         assuming ``assumed.speed_of_sound``.
@@ -90,8 +90,8 @@ def listen(
         False: frames also hold their echoes without labels, for a stage of association to find
         them (`pipistrelle.estimation.association`).
     keep : callable, optional
-        Given each frame's number, from 1 on, its arrivals and the block sums that were heard, which
-        the next frame overwrites; of the engine ``block``.
+        Given each frame's number, from 1 on, its arrivals and the block sums or real samples that
+        were heard, which the next frame overwrites.
     progress : callable, optional
 
     Returns
@@ -122,7 +122,7 @@ def listen(
     settled = sampling(config, scenario.callers, call=call, medium=medium)
     rig = _rig(config, scenario, layout or layout_of(config), settled, find, oracle, labels)
     purpose = "noise" if setup.vehicle == 1 else f"noise of {setup.vehicle}"
-    engine = _dense if config.receiver.engine == "dense" else _blocks
+    engine = _dense if settled.dense else _blocks
     beams: tuple[list[FrameMeasurements], ...] = tuple([] for _ in radii)
     beam = beam or partial(through_piston, off_axis=config.emitter.off_axis)
     calls: dict[int, tuple[CallHeard, list[list[Detections]]]] = {}
@@ -159,8 +159,8 @@ class _Record(NamedTuple):
     """Between two lags [s]."""
     pulse: int
     """Lags in which the matched filter's answer falls off to either side."""
-    sums: Complex[np.ndarray, "b f c e"] | None = None
-    """The block sums that were filtered, where there are any."""
+    sums: Complex[np.ndarray, "b f c e"] | Float[np.ndarray, "t f e"] | None = None
+    """The block sums, or real samples, that were filtered, where there are any."""
 
     @property
     def lags(self) -> dict[str, Any]:
@@ -184,6 +184,8 @@ class _Rig:
     missable: Bool[np.ndarray, " c"]
     own_clock: Bool[np.ndarray, " c"]
     workspace: Workspace
+    filters: BandFilters | None
+    """Of real samples."""
 
 
 def _rig(
@@ -196,7 +198,7 @@ def _rig(
     labels: bool,
 ) -> _Rig:
     """Make what is the same for all frames of a path."""
-    end = front_end(config, layout, settled.tones)
+    end = front_end(config, layout, settled.tones, calls=settled.calls if settled.real else ())
     own_clock = np.array([caller.calls is not None for caller in scenario.callers])
     return _Rig(
         config=config,
@@ -211,6 +213,7 @@ def _rig(
         missable=own_clock | [caller.heading is not None for caller in scenario.callers],
         own_clock=own_clock,
         workspace=Workspace(),
+        filters=BandFilters(settled.calls, settled.rate) if settled.real else None,
     )
 
 
@@ -218,14 +221,17 @@ def _faintest_db(
     end: FrontEnd, layout: Layout | Scattered, settled: Sampling, config: Config
 ) -> float:
     """Return the level of the faintest arrival that can be matched [dB]."""
-    if isinstance(end, Groups):
-        threshold, elements = 1.0 + end.least_snr, 1
-    else:
+    if isinstance(end, Detector):
         threshold, elements = end.threshold, layout.shape[1]
+    else:
+        threshold, elements = 1.0 + end.least_snr, 1
+    samples = settled.pulse * settled.block
+    if settled.real:
+        samples = round(max(band_of(call, settled.rate).energy for call in settled.calls))
     return faintest_level_db(
         threshold,
         elements=elements,
-        samples=settled.pulse * settled.block,
+        samples=samples,
         noise_std=settled.noise_std,
         margin_db=config.matching.margin_db,
     )
@@ -330,8 +336,8 @@ def _parted(arrivals: Arrivals) -> tuple[slice | np.ndarray, slice | np.ndarray]
 def _dense(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]:
     """Yield the record of each beam's arrivals, from every sample, in single precision."""
     settled, setup = rig.sampling, rig.config.scenario
-    width = round(max(call.resolution for call in settled.calls) * settled.rate)
-    period = math.floor(setup.steps_per_frame * setup.step / BLOCK) - settled.pulse
+    period = math.floor(setup.steps_per_frame * setup.step / settled.interval) - settled.pulse
+    start = settled.pulse * settled.interval
     for arrivals in aimed:
         samples = record_samples(
             max(period, blocks_to_hear(arrivals, settled, rig.layout)),
@@ -341,8 +347,13 @@ def _dense(aimed: Sequence[Arrivals], rig: _Rig, key: int) -> Iterator[_Record]:
             np.random.default_rng(key),
             single=True,
         )
-        matched = filter_samples(
-            samples, calls=settled.calls, rate=settled.rate, noise_std=settled.noise_std
-        )
-        start, interval = settled.pulse * BLOCK, 1.0 / settled.rate
-        yield _Record(matched, start=start, interval=interval, pulse=width)
+        if rig.filters is not None:
+            interval, pulse = rig.filters.step / settled.rate, rig.filters.pulse
+            matched = rig.filters(samples, settled.noise_std)
+            yield _Record(matched, start=start, interval=interval, pulse=pulse, sums=samples)
+        else:
+            matched = filter_samples(
+                samples, calls=settled.calls, rate=settled.rate, noise_std=settled.noise_std
+            )
+            pulse = settled.pulse * settled.block
+            yield _Record(matched, start=start, interval=1.0 / settled.rate, pulse=pulse)

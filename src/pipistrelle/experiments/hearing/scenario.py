@@ -134,13 +134,18 @@ def _mission_of(world: Scenario, vehicle: int) -> Scenario:
     path, controls = other.mission or (world.path, world.controls)
     callers = list(world.callers)
     callers[VEHICLE] = replace(
-        one, frequency=other.frequency, level_db=other.level_db, key=other.key
+        one,
+        frequency=other.frequency,
+        level_db=other.level_db,
+        key=other.key,
+        sound=other.sound,
     )
     callers[j] = replace(
         other,
         frequency=one.frequency,
         level_db=one.level_db,
         key=one.key,
+        sound=one.sound,
         place=world.path[:, :2],
         heading=world.path[:, 2],
         mission=(world.path, world.controls),

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Complex
 
 from pipistrelle.acoustics.arrivals import Arrivals
-from pipistrelle.acoustics.callers import VEHICLE, moves
+from pipistrelle.acoustics.call_settings import RecordedCall, settings_of
+from pipistrelle.acoustics.callers import VEHICLE, Caller, moves
 from pipistrelle.arithmetic.random_stream import stream_key
 from pipistrelle.arrays.array_file import array_text
 from pipistrelle.arrays.layout import layout_of, microphones_in
@@ -35,6 +35,7 @@ _README = """A sound recording of Pipistrelle. Make a log of it with: pipistrell
 
 recording.wav     the microphones' samples, a channel each; times `scale` they are amplitudes
 recording.toml    rate, scale, speed of sound, who calls at which frequency, what the log will say
+call_NAME.wav     a caller's call, where it is one of a file; recording.toml names it
 array.csv         channel,x,y, perhaps face [m], x ahead and y to the left of the vehicle; a face
                   looks away from the middle of all; where recording.toml says one_centre, the
                   faces' own distance from it is not part of any delay
@@ -94,6 +95,11 @@ class SoundRecorder:
     def begin(self, scenario: Scenario) -> None:
         """Begin the file."""
         settled = sampling(self.config, scenario.callers)
+        if settled.dense and not settled.real:
+            raise InputError(
+                "--save-sound: found receiver.engine 'dense' for tones whose sums are all that "
+                "there is, whose samples are complex; expected 'auto' or 'block'"
+            )
         for caller, tone in zip(scenario.callers, settled.tones, strict=True):
             if tone >= settled.rate / 2.0:
                 raise InputError(
@@ -108,14 +114,15 @@ class SoundRecorder:
         self._file = PiecesFile(self.own.folder / SOUND_FILE)
         self._file.write(wav_header(self.size, self.channels, settled.rate, self.bits))
 
-    def keep(self, number: int, arrivals: Arrivals, sums: Complex[np.ndarray, "b f c e"]) -> None:
+    def keep(self, number: int, arrivals: Arrivals, sums: np.ndarray) -> None:
         """Write a frame, if it is one of those that are kept; frames are numbered from 1 here."""
         index = number - 1
         if index not in self.frames or self._file is None:
             return
         place, settled = index - self.frames.start, self.sampling
         length = int(self.first[place + 1] - self.first[place])
-        self.late += len(sums) > length // settled.block - settled.pulse
+        heard = len(sums) // settled.block if settled.real else len(sums)
+        self.late += heard > length // settled.block - settled.pulse + (settled.block == 1)
         rng = np.random.default_rng(stream_key(self.config.seed, 0, "other frequencies", number))
         samples = real_samples(
             sums, arrivals, self.layout, settled, length, rng, leak=self.leak
@@ -151,12 +158,17 @@ class SoundRecorder:
             )
         return notes
 
-    def files(self, scenario: Scenario, log: dict[str, Any]) -> dict[str, str | PiecesFile]:
+    def files(self, scenario: Scenario, log: dict[str, Any]) -> dict[str, str | bytes | PiecesFile]:
         """Return the files of the folder but odometry and truth; `log` is what log.toml says."""
         import tomli_w
 
+        calls = {
+            name: wav_header(4 * one.samples.size, 1, one.rate, 32)
+            + (one.samples).astype("<f4").tobytes()
+            for name, one in _call_files(scenario).items()
+        }
         time = (np.arange(len(self.frames)) + self.frames.start + 1) * self.period
-        return {
+        return calls | {
             SOUND_FILE: self.finish(),
             ARRAY: array_text(microphones_in(self.config)),
             CALLS: table_text(("sample", "time"), self.first[:-1], time),
@@ -182,9 +194,9 @@ class SoundRecorder:
             "call": {
                 "frequency": own.frequency,
                 "duration": config.emitter.pulse,
-                "window": "rectangular",
                 "level_db": own.level_db,
-            },
+            }
+            | _told(own),
             "callers": [
                 {
                     "name": one.name,
@@ -194,9 +206,29 @@ class SoundRecorder:
                     "moves": moves(one),
                     "own_clock": one.calls is not None,
                 }
+                | _told(one)
                 for one, label in zip(others, labels[1:], strict=True)
             ],
         }
+
+
+def _call_files(scenario: Scenario) -> dict[str, RecordedCall]:
+    """Return the calls that are kept as files, by their names there."""
+    sounds = {_call_file(caller): caller.sound for caller in scenario.callers}
+    return {name: one for name, one in sounds.items() if isinstance(one, RecordedCall)}
+
+
+def _call_file(caller: Caller) -> str:
+    """Return the name of the file of a caller's call."""
+    return f"call_{caller.name}.wav"
+
+
+def _told(caller: Caller) -> dict[str, Any]:
+    """Return what a recording says of a caller's call beside its frequency."""
+    told = settings_of(caller.sound)
+    if isinstance(caller.sound, RecordedCall):
+        return {"call": _call_file(caller)}
+    return told
 
 
 def wav_header(size: int, channels: int, rate: float, bits: int) -> bytes:

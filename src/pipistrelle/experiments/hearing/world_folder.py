@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import ConfigDict, Field, ValidationError
 
+from pipistrelle.acoustics.call_settings import settings_of
 from pipistrelle.acoustics.callers import VEHICLE, moves
 from pipistrelle.acoustics.target import SHAPES, Bodies
 from pipistrelle.config import CallerConfig, Config, InputError, Section, TargetConfig
@@ -215,6 +216,7 @@ def world_files(scenario: Scenario, config: Config) -> dict[str, str]:
     callers = []
     for caller in scenario.callers[VEHICLE + 1 :]:
         row = {"name": caller.name, "frequency": caller.frequency, "level_db": caller.level_db}
+        row |= settings_of(caller.sound)
         if moves(caller):
             row["route"] = f"caller_{caller.name}.csv"
             way = (scenario.time, *np.asarray(caller.place).T)
@@ -229,6 +231,7 @@ def world_files(scenario: Scenario, config: Config) -> dict[str, str]:
         callers.append(row)
     vehicle = scenario.callers[VEHICLE]
     call = {"frequency": vehicle.frequency, "level_db": vehicle.level_db}
+    call |= settings_of(vehicle.sound)
     emitter = config.emitter.model_copy(update=call)
     own = _own_settings(config.model_copy(update={"emitter": emitter}))
     head = {"format": 1, "config": own, "callers": callers}

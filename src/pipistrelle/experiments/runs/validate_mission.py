@@ -11,7 +11,7 @@ import numpy as np
 from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of, moves
 from pipistrelle.arrays.layout import Scattered, layout_of
 from pipistrelle.arrays.pattern import pattern_of
-from pipistrelle.arrays.sampling import sampling
+from pipistrelle.arrays.sampling import off_raster, sampling
 from pipistrelle.config import Config, InputError
 from pipistrelle.detection.front_end import front_end
 from pipistrelle.experiments.hearing.scenario import Scenario, world_of
@@ -37,10 +37,11 @@ def checked_scenario(
     Memory is estimated for so many strategies and filters, and for so many workers on this machine
     (0 if they are elsewhere).
 
-    >>> from pipistrelle.config import EmitterConfig
+    >>> from pipistrelle.config import EmitterConfig, ReceiverConfig
     >>> len(checked_scenario(Config()).landmarks)
     50
-    >>> checked_scenario(Config(emitter=EmitterConfig(frequency=36e3)))
+    >>> sums = ReceiverConfig(engine="block")
+    >>> checked_scenario(Config(emitter=EmitterConfig(frequency=36e3), receiver=sums))
     Traceback (most recent call last):
     pipistrelle.config.InputError: emitter.frequency: found 36000 Hz, expected a multiple of 5000 Hz
     (the nearest that are free: 25000 and 35000 Hz)
@@ -49,7 +50,7 @@ def checked_scenario(
     scenario = world_of(config, world=world)
     settled = sampling(config, scenario.callers)
     layout = layout_of(config)
-    front_end(config, layout, settled.tones)
+    front_end(config, layout, settled.tones, calls=settled.calls if settled.real else ())
     check_recording(scenario, config, layout, settled, workers=workers)
     _refuse_supersonic(scenario, config)
     return scenario
@@ -78,14 +79,15 @@ def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ..
     spacing, rate = config.receiver.spacing, config.receiver.sample_rate
     layout = layout_of(config)
     limit = min(config.detection.angle_limit_deg, config.detection.scan_limit_deg)
-    warnings = []
-    for caller in callers or callers_of(config, np.zeros(2)):
+    callers = callers or callers_of(config, np.zeros(2))
+    warnings = _cost(config, callers)
+    for caller in callers:
         frequency, key = caller.frequency, caller.key or caller.name
         tone, wave = f"{key}.frequency ({frequency:g} Hz)", config.air.sound_speed / frequency
         nearest = wave / spacing - math.sin(math.radians(limit))  # its lobe lies at the limit
         if isinstance(layout, Scattered):
             warnings += _doubles(layout, frequency, tone, config.air.sound_speed)
-        elif nearest < 1.0:
+        elif nearest < 1.0 and caller.sound is None:  # a band's delays tell the lobe
             warnings.append(
                 f"receiver.spacing: {spacing:g} m is {spacing / wave:.2f} of a wave at {tone}: "
                 f"echoes {math.degrees(math.asin(max(nearest, 0.0))):.0f} degrees off a face's "
@@ -98,6 +100,18 @@ def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ..
                 f"hold it as {abs(frequency - rate * round(frequency / rate)):g} Hz; expected more"
             )
     return tuple(warnings)
+
+
+def _cost(config: Config, callers: Sequence[Caller]) -> list[str]:
+    """Say what it costs to record every sample, where nobody has asked for that."""
+    why = off_raster(config, callers)
+    swept = [caller.key or caller.name for caller in callers if caller.sound is not None]
+    if config.receiver.engine != "auto" or not (why or swept):
+        return []
+    cause = f"{', '.join(swept)}: no plain tone" if swept else str(why)
+    return [
+        f"receiver.engine: every sample is recorded, some 0.3 s a frame in place of 1 ms ({cause})"
+    ]
 
 
 def _doubles(layout: Scattered, frequency: float, tone: str, c: float) -> list[str]:

@@ -15,7 +15,10 @@ from pipistrelle.refusals import refusal, shown
 from pipistrelle.settings import Given, Layer, resolve
 
 BEAMWIDTH = "beamwidth"
-MAKERS = ("emitter.frequency", "air.speed_of_sound", "air.temperature_c")
+MAKERS = (
+    *("emitter.call", "emitter.band", "emitter.frequency"),
+    *("air.speed_of_sound", "air.temperature_c"),
+)
 """Settings that change the beamwidth; the last one unless the speed of sound is set."""
 DIGITS = Context(prec=12, rounding=ROUND_FLOOR)
 """Digits of a radius on which machines agree; rounded down, so that no beam exceeds the widest."""
@@ -58,7 +61,7 @@ def _check_alone(
     if RADIUS in grid or (isinstance(emitter, dict) and "radius" in emitter):
         raise InputError(f"{where}.{BEAMWIDTH}: is {RADIUS} in other words; vary one of them")
     given = ("air", "speed_of_sound") in layer
-    for name in MAKERS[: 2 if given else 3]:
+    for name in MAKERS[: -1 if given else None]:
         section, _, leaf = name.partition(".")
         table = grid.get(section)
         if name in grid or (isinstance(table, dict) and leaf in table):
@@ -77,5 +80,5 @@ def _radius(where: str, width: Any, config: Config) -> float:
     if not number or not isfinite(width) or not 0.0 < width <= 180.0:
         expected = "degrees above 0 and up to 180, the widest beam of a back-baffled piston"
         raise refusal(where, shown(width), expected, "correct the value")
-    tone = {"frequency": config.emitter.frequency, "speed_of_sound": config.air.sound_speed}
+    tone = {"frequency": config.emitter.centre, "speed_of_sound": config.air.sound_speed}
     return float(DIGITS.create_decimal_from_float(float(piston_radius(radians(width), **tone))))

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PlainValidator, ValidationError
 from pydantic_core import PydanticCustomError
 
+from pipistrelle.acoustics.call_settings import with_calls
 from pipistrelle.arrays.array_file import with_array
 from pipistrelle.config import STRATEGIES, Config, InputError, Section, Strategy
 from pipistrelle.estimation.catalogue import (
@@ -210,7 +211,7 @@ def _laid(path: Path, table: Mapping[str, Any], over: Layer, worlds: dict[str, W
         key: Given(value, f"{path}: config.{name}")
         for key, name, value in _settings(path, "config", table)
     }
-    layer = with_array(with_routes(with_places(path, layer) | over))
+    layer = with_array(with_calls(with_routes(with_places(path, layer) | over)))
     world = named_world(layer)
     if world is None:
         return layer

@@ -1,0 +1,124 @@
+"""Draw the picture of `calls.md` anew, and print its numbers: `.venv/bin/python docs/calls.py`.
+
+A tone of 47.5 kHz, and sweeps from 60 to 35 kHz by both laws, all of 2.8 ms, are heard by one face.
+Left: errors of the range of one echo, over the Cramer-Rao bound of the sweep; of a tone the bound
+of a sweep is no bound, but its errors stand beside. Right: how often two echoes of equal loudness
+are told apart, by their distance.
+"""
+
+import sys
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+PICTURE = Path(__file__).parent / "images" / "calls.png"
+SWEEP = {"call": "sweep", "taper": 0.2}
+CALLS = {
+    "tone": {"frequency": 45e3},
+    "linear sweep": SWEEP,
+    "hyperbolic sweep": SWEEP | {"sweep": "hyperbolic"},
+}
+SNR_DB, DRAWS = (8.0, 12.0, 16.0, 20.0, 30.0), 600
+APART_MM, PAIRS, PAIR_DB = np.geomspace(4.0, 600.0, 16), 40, 25.0
+ANGLE, C = 0.3, 343.0
+
+
+class Ear:
+    """One face that hears a call; `apart` parts echoes."""
+
+    def __init__(self, call):
+        """Settle how the call is recorded, matched and found."""
+        from pipistrelle.acoustics.callers import callers_of
+        from pipistrelle.arrays.bands import band_of
+        from pipistrelle.arrays.layout import Layout, layout_of
+        from pipistrelle.arrays.sampling import sampling
+        from pipistrelle.config import Config
+        from pipistrelle.detection.front_end import front_end
+        from pipistrelle.detection.matched import BandFilters
+
+        own = {"emitter": call, "scenario": {"speed": 0.0}, "receiver": {"sample_rate": 200_001}}
+        self.config = Config.model_validate(own)  # a rate that no block has
+        settled = sampling(self.config, callers_of(self.config, np.zeros(2))[:1])
+        self.settled, self.filters = settled, BandFilters(settled.calls, settled.rate)
+        self.face = Layout(normal=np.zeros(1), position=layout_of(self.config).position)
+        self.end = front_end(self.config, self.face, settled.tones, calls=settled.calls)
+        self.band = band_of(settled.calls[0], settled.rate)
+
+    def delays(self, delay, snr_db, rng):
+        """Return the delays found of echoes, and what rows state of their deviation [s]."""
+        from pipistrelle.acoustics.arrivals import Arrivals
+        from pipistrelle.arrays.receiver import record_samples
+        from pipistrelle.detection.front_end import find_calls
+
+        delay, settled = np.atleast_1d(delay), self.settled
+        echoes = Arrivals(
+            delay=delay,
+            level_db=np.full(delay.size, snr_db - 10.0 * np.log10(self.band.energy)),
+            bearing=np.full(delay.size, ANGLE),
+            frequency=np.full(delay.size, settled.tones[0]),
+            caller=np.zeros(delay.size, dtype=np.int8),
+            landmark=1 + np.arange(delay.size),
+        )
+        blocks = round(14e-3 / settled.interval)
+        samples = record_samples(blocks, echoes, self.face, settled, rng)
+        start, interval = settled.pulse * settled.interval, self.filters.step / settled.rate
+        lags = {"start": start, "interval": interval, "pulse": self.filters.pulse}
+        found = find_calls(self.filters(samples), self.end, **lags)
+        strong = found.power > 0.25 * found.power.max(initial=0.0)
+        return found.delay[strong], found.delay_std[strong]
+
+    def errors_mm(self, snr_db):
+        """Return the error of a range, root mean square, what rows state, and the bound [mm]."""
+        rng, off, stated = np.random.default_rng(3), [], []
+        for _ in range(DRAWS):
+            delay = rng.uniform(6e-3, 6.2e-3)
+            found, std = self.delays(delay, snr_db, rng)
+            if found.size:
+                nearest = np.abs(found - delay).argmin()
+                off.append(found[nearest] - delay)
+                stated.append(std[nearest])
+        power = 10.0 ** (snr_db / 10.0) * self.face.position.size
+        bound = 1.0 / np.sqrt(2.0 * power) / self.band.spread
+        off = np.array(off) - np.median(off)  # half a sample, where edges are sampled
+        half = 500.0 * C
+        return np.array([np.sqrt(np.mean(off**2)), np.median(stated), bound]) * half
+
+    def apart(self, millimetres):
+        """Return how often two echoes so far apart in range are two, each where it is."""
+        rng, count, late = np.random.default_rng(5), 0, 2e-3 * millimetres / C
+        for _ in range(PAIRS):
+            first = rng.uniform(6e-3, 6.2e-3)
+            pair = np.array([first, first + late])
+            found, _ = self.delays(pair, PAIR_DB, rng)
+            count += found.size == 2 and np.abs(np.sort(found) - pair).max() < 0.25 * late
+        return count / PAIRS
+
+
+def main():
+    """Measure, print and draw."""
+    from pipistrelle.figures.style import STRATEGY_COLOURS, STYLE
+
+    plt.rcParams.update(STYLE)
+    figure, (left, right) = plt.subplots(1, 2, figsize=(8.0, 3.2), layout="constrained")
+    print("| call | " + " | ".join(f"{snr:g} dB" for snr in SNR_DB) + " | two from |")
+    print("|---|" + "--:|" * (len(SNR_DB) + 1))
+    for (name, call), colour in zip(CALLS.items(), STRATEGY_COLOURS.values(), strict=True):
+        ear = Ear(call)
+        errors = np.array([ear.errors_mm(snr_db) for snr_db in SNR_DB])
+        told = np.array([ear.apart(far) for far in APART_MM])
+        two = APART_MM[told >= 0.9].min(initial=np.inf)
+        cells = [f"{error:.3g} ({error / stated:.2f})" for error, stated, _ in errors]
+        print(f"| {name} | {' | '.join(cells)} | {two:.0f} mm |")
+        left.semilogy(SNR_DB, errors[:, 0], "o-", color=colour, label=name)
+        if name != "tone":
+            left.semilogy(SNR_DB, errors[:, 2], ":", color=colour)
+        right.semilogx(APART_MM, told, "o-", color=colour)
+    left.set(xlabel="SNR of one microphone, matched [dB]", ylabel="error of a range [mm]")
+    right.set(xlabel="distance in range [mm]", ylabel="share of pairs told apart")
+    figure.legend(loc="outside upper center", ncols=3)
+    figure.savefig(PICTURE, dpi=110)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,468 @@
+r"""Wide bands: calls that sweep, found by true delays over the whole band.
+
+What stands between two microphones of an array is, for a sweep, as much a matter of time as of
+phase: over 44 mm, 0.13 ms, the matched output of a band of 25 kHz falls off three times. So beams
+are steered by delays, frequency by frequency. With Y the spectrum of microphone m's matched output
+and :math:`a_m = p_m \cdot u(\phi) / c` what it hears earlier than the group's middle,
+
+.. math:: Z(\phi, f) = \sum_m w_m e^{-2\pi i f a_m(\phi)} Y_m(f) , \qquad
+          w_m = g_m \Big/ \sqrt{\textstyle\sum g^2} ,
+
+and z is its transform back. Near a peak z is interpolated between the outputs, in time and
+direction, whose band a windowed sinc keeps whole.
+
+**Loudness** of a lag is the largest :math:`|z|^2` over the directions of the scan. In noise of unit
+variance it passes h by chance at one lag, whatever the call, with no more than
+
+.. math:: P \le e^{-h} \left(1 + \sqrt{\frac{h}{\pi}} \int \sqrt{\kappa}\, d\phi \right), \qquad
+          \kappa = \left(\frac{2\pi f_{rms}}{c}\right)^2
+                   \sum_m w_m^2 (p_m \cdot u')^2, \qquad f_{rms}^2 = f_c^2 + (\beta / 2\pi)^2 ,
+
+as in `pipistrelle.detection.full_circle`, with the band's own root mean square frequency. That is
+the chance of one lag; lags are half the inverse of the widest band apart (`arrays.bands`), and the
+noise of two of them is as alike as the call's autocorrelation is.
+
+**One call, one row.** A loud call leaves lobes at other lags: its autocorrelation's, and those of
+beams to elsewhere, which hear some microphones' peaks too early. A peak counts only where it is
+louder than what all louder ones leave there at most, their amplitudes added up: the scan's own
+answer to the call alone, as the set-up computes it, from several directions and of moving sources,
+and 3 dB more.
+
+**How sure.** With the power over the noise p of the beam (`pipistrelle.detection.certainty`),
+
+.. math:: \sigma_\phi^2 = \frac{1 + 1/p}{2 p \kappa}, \qquad
+          \sigma_\tau^2 = \frac{1 + 1/p}{2 p \beta^2} + \left(\delta \, \frac{2 v}{c}\right)^2 / 2 ,
+
+the Cramer-Rao bounds of an unknown phase, and what a sweep takes a Doppler shift for: an echo from
+any direction, to a vehicle of the speed v of the settings. That part is noise to it: no delay is
+corrected. The square of the cosine of a direction is a half in the mean.
+
+Sources: Van Trees, Optimum Array Processing (2002), Secs. 6.13 and 8.4; Davies, Biometrika 74
+(1987).
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from pipistrelle.acoustics.call import Call, coupling
+from pipistrelle.arrays.bands import Band, band_of, lag_step, replica
+from pipistrelle.arrays.layout import Layout, Scattered
+from pipistrelle.arrays.pattern import UNKNOWN
+from pipistrelle.config import Config
+from pipistrelle.detection.certainty import bearing_std, loudest_noise, over_noise
+from pipistrelle.detection.direct import Lags
+from pipistrelle.detection.full_circle import BEAM_STEP, RARE, loudest_by_chance
+from pipistrelle.geometry import wrap_angle
+from pipistrelle.jit import Whole, kernel, no_alloc
+
+TAPS, PARTS, BETA = 12, 256, 8.0
+"""Of the windowed sinc: outputs that it takes, places between two of them, Kaiser's shape."""
+BEAMS_AT_ONCE = 32
+"""Beams whose outputs are in memory."""
+MARGIN = 2.0
+"""How much louder than what a louder call leaves at most a peak must be, as a ratio of powers."""
+CLIMBS = 4
+"""Steps towards a peak in time and direction, each by a parabola, a quarter as wide each time."""
+SHIFT = 0.01
+"""Largest Doppler shift of the calls whose lobes the set-up looks at, as a share."""
+_ANGLES = (0.0, 0.7, 1.3)
+"""Directions that it looks at, off a face's normal or the heading [rad]."""
+
+
+class Wide(NamedTuple):
+    """A group of microphones that hear a call of a wide band, its threshold and its scan."""
+
+    threshold: float
+    """Least loudness of a call at a lag, in units of the noise of one output."""
+    loudest_noise: float
+    """See `certainty.loudest_noise`."""
+    sine_limit: float
+    """Sine of the largest angle off the normal that counts; 2 of a group that hears all around."""
+    normal: float
+    """Normal of a line on a face [rad]; NaN of a group that hears all around."""
+    bearing: Float[np.ndarray, " n"]
+    """Directions that are scanned [rad]."""
+    position: Float[np.ndarray, "k 2"]
+    """Of the microphones, from their middle [m]."""
+    middle: Float[np.ndarray, "2"]
+    """Their middle, in the vehicle's frame [m]."""
+    weight: Float[np.ndarray, " k"]
+    """Weight of each output; the squares of all sum to 1."""
+    speed_of_sound: float
+    """Speed of sound [m/s]."""
+    band: Band
+    doppler_std: float
+    """Of a delay, by the call's Doppler shift [s]."""
+    lobes: Float[np.ndarray, " l"]
+    """What a call leaves so many lags away, at most, as a share of its power."""
+
+
+def wide_of(
+    config: Config, layout: Layout | Scattered, group: int, calls: Sequence[Call], caller: int
+) -> Wide:
+    """Settle threshold and scan of one call for a face, or another group."""
+    rate, c = config.receiver.sample_rate, config.assumed_sound_speed
+    normal, position, weight, middle = _microphones(layout, group)
+    band = band_of(calls[caller], rate)
+    around = math.isnan(normal)
+    limit = math.radians(config.detection.scan_limit_deg)
+    fine = np.linspace(-np.pi, np.pi, 3601) if around else normal + np.linspace(-limit, limit, 1801)
+    wave = math.hypot(2.0 * np.pi * band.centre, band.spread) / c
+    slope = wave * np.sqrt(_spread(fine, position, weight))
+    looks = np.concatenate(([0.0], np.cumsum(0.5 * (slope[1:] + slope[:-1]) * np.diff(fine))))
+    count = max(math.ceil(looks[-1] / BEAM_STEP), 8) + (0 if around else 1)
+    even = np.linspace(0.0, looks[-1], count + 1 if around else count)
+    moving = 2.0 * abs(config.scenario.speed) / c / math.sqrt(2.0)
+    wide = Wide(
+        threshold=loudest_by_chance(config.detection.false_alarm, looks[-1], weight.size),
+        loudest_noise=loudest_noise(weight.size),
+        sine_limit=2.0 if around else math.sin(math.radians(config.detection.angle_limit_deg)),
+        normal=normal,
+        bearing=np.interp(even, looks, fine)[: count or None],
+        position=position,
+        middle=middle,
+        weight=weight,
+        speed_of_sound=c,
+        band=band,
+        doppler_std=abs(coupling(calls[caller])) * moving,
+        lobes=np.empty(0),
+    )
+    return wide._replace(lobes=_lobes_of(calls[caller], wide, lag_step(calls, rate), rate))
+
+
+def find_wide(
+    matched: Complex[np.ndarray, "l k"], wide: Wide, lags: Lags
+) -> Float[np.ndarray, "6 m"]:
+    """Find the calls that a group hears, one at each time.
+
+    Returns delay at the vehicle's centre [s], bearing [rad], power, the standard deviations of
+    bearing and delay, and the angle off a face's normal, or for other groups the arctangent of the
+    bearing's slope by the logarithm of the speed of sound.
+    """
+    if not len(matched):
+        return np.empty((6, 0))
+    loudness = _loudness(matched, wide, lags.interval)
+    peaks = _peaks(loudness, wide.threshold, wide.lobes)
+    turn = np.exp(-2j * np.pi * wide.band.centre * lags.interval * np.arange(len(matched)))
+    silence = np.zeros((TAPS + _margin(wide, lags.interval), matched.shape[1]), complex)
+    slow = np.concatenate((silence, matched * turn[:, np.newaxis], silence))
+    numbers = _rows(slow, len(silence), peaks, _Beam(*wide[:-1]), lags.interval, _SINC)
+    delay, bearing = numbers[:2]
+    ahead = wide.middle[0] * np.cos(bearing) + wide.middle[1] * np.sin(bearing)
+    numbers[0] = lags.start + delay + ahead / wide.speed_of_sound
+    if math.isnan(wide.normal):
+        return numbers
+    numbers[5] = (bearing - wide.normal + np.pi) % (2.0 * np.pi) - np.pi
+    return numbers[:, np.abs(np.sin(numbers[5])) <= wide.sine_limit]
+
+
+def _microphones(
+    layout: Layout | Scattered, group: int
+) -> tuple[float, Float[np.ndarray, "k 2"], Float[np.ndarray, " k"], Float[np.ndarray, "2"]]:
+    """Return a group's normal, places about their middle, weights and the middle."""
+    normal = float(layout.normal[group])
+    if isinstance(layout, Layout):
+        left = np.array([-math.sin(normal), math.cos(normal)])
+        place, gain = np.outer(layout.position, left), np.ones(layout.position.size)
+    else:
+        members = layout.group == group
+        place, gain = layout.position[members], layout.amplitude[members]
+    weight = gain / np.linalg.norm(gain)
+    middle = weight**2 @ place
+    return normal, place - middle, weight, middle
+
+
+def _spread(
+    bearing: Float[np.ndarray, " n"],
+    position: Float[np.ndarray, "k 2"],
+    weight: Float[np.ndarray, " k"],
+) -> Float[np.ndarray, " n"]:
+    """Return the weighted mean square of the places across bearings [m^2]."""
+    across = np.stack((-np.sin(bearing), np.cos(bearing))).T @ position.T
+    return across**2 @ weight**2
+
+
+def _margin(wide: Wide, interval: float) -> int:
+    """Return the lags by which the farthest microphone hears earlier or later than the middle."""
+    far = np.linalg.norm(wide.position, axis=1).max() / wide.speed_of_sound
+    return math.ceil(far / interval) + 2
+
+
+def _loudness(
+    matched: Complex[np.ndarray, "l k"], wide: Wide, interval: float
+) -> Float[np.ndarray, " l"]:
+    """Return the loudest beam's power at each lag."""
+    from scipy.fft import fft, ifft, next_fast_len
+
+    lags = len(matched)
+    count = next_fast_len(lags + 2 * _margin(wide, interval))
+    spectrum = np.ascontiguousarray(fft(matched, count, axis=0).T, dtype=np.complex128)
+    length = count * interval
+    first, last = math.ceil(wide.band.low * length), math.floor(wide.band.high * length)
+    early = _early(wide)
+    loudness = np.zeros(lags)
+    for start in range(0, len(early), BEAMS_AT_ONCE):
+        some = early[start : start + BEAMS_AT_ONCE]
+        beams = np.zeros((len(some), count), dtype=np.complex64)
+        _steer(spectrum, some, wide.weight, first, last, 1.0 / length, beams)
+        sound = ifft(beams, axis=1, overwrite_x=True)[:, :lags]
+        np.maximum(loudness, np.max(sound.real**2 + sound.imag**2, axis=0), out=loudness)
+    return loudness
+
+
+def _early(wide: Wide) -> Float[np.ndarray, "n k"]:
+    """Return how much earlier than the middle each microphone hears each beam [s]."""
+    toward = np.stack((np.cos(wide.bearing), np.sin(wide.bearing)))
+    return (wide.position @ toward).T / wide.speed_of_sound
+
+
+def _lobes_of(call: Call, wide: Wide, step: int, rate: float) -> Float[np.ndarray, " l"]:
+    """Return what a call alone leaves in the scan so many lags from its peak, at most."""
+    interval, sent = step / rate, replica(call, rate)
+    reach = math.ceil(sent.size / step) + 2 * _margin(wide, interval)
+    count, most, length = 4 * reach, np.zeros(reach), 4 * reach * interval
+    bins = np.arange(math.ceil(wide.band.low * length), math.floor(wide.band.high * length) + 1)
+    own, place = np.fft.fft(sent, step * count)[bins], (bins / length)[:, np.newaxis]
+    facing = wide.normal if not math.isnan(wide.normal) else 0.0
+    for scale in (1.0 - SHIFT, 1.0, 1.0 + SHIFT):
+        power = np.fft.fft(replica(call, rate, scale), step * count)[bins] * own.conj()
+        for angle in _ANGLES:
+            toward = np.array([math.cos(facing + angle), math.sin(facing + angle)])
+            early = wide.position @ toward / wide.speed_of_sound
+            delayed = np.exp(2j * np.pi * place * (early - 0.5 * length)) * wide.weight
+            heard = np.zeros((count, wide.weight.size), dtype=complex)
+            heard[bins % count] = power[:, np.newaxis] * delayed
+            loudness = _loudness(np.fft.ifft(heard, axis=0), wide, interval)
+            peak = int(loudness.argmax())
+            around = np.maximum(loudness[peak : peak + reach], loudness[peak : peak - reach : -1])
+            most = np.maximum(most, around / loudness[peak])
+    return MARGIN * np.maximum.accumulate(most[::-1])[::-1]
+
+
+class _Beam(NamedTuple):
+    """A `Wide` as kernels take it."""
+
+    threshold: float
+    loudest_noise: float
+    sine_limit: float
+    normal: float
+    bearing: Float[np.ndarray, " n"]
+    position: Float[np.ndarray, "k 2"]
+    middle: Float[np.ndarray, "2"]
+    weight: Float[np.ndarray, " k"]
+    speed_of_sound: float
+    band: Band
+    doppler_std: float
+
+
+def _sinc() -> Float[np.ndarray, "p t"]:
+    """Return the windowed sinc at places between two outputs, a row each."""
+    away = np.arange(TAPS) - (TAPS // 2 - 1) - np.arange(PARTS + 1)[:, np.newaxis] / PARTS
+    window = np.i0(BETA * np.sqrt(np.clip(1.0 - (away / (TAPS // 2)) ** 2, 0.0, None)))
+    return np.sinc(away) * window / np.i0(BETA)
+
+
+_SINC = _sinc()
+
+
+@kernel
+def _steer(
+    spectrum: Complex[np.ndarray, "k n"],
+    early: Float[np.ndarray, "b k"],
+    weight: Float[np.ndarray, " k"],
+    first: Whole,
+    last: Whole,
+    step: float,
+    beams: Complex[np.ndarray, "b n"],
+) -> None:
+    """Write the spectra of beams, from one bin of the band to another, a step [Hz] apart."""
+    count = spectrum.shape[1]
+    total = np.empty(last - first + 1, dtype=np.complex128)
+    for b in range(early.shape[0]):
+        total[:] = 0.0
+        for m in range(weight.size):
+            turn = -2.0 * math.pi * early[b, m] * step
+            phase = weight[m] * complex(math.cos(turn * first), math.sin(turn * first))
+            turned = complex(math.cos(turn), math.sin(turn))
+            for i in range(total.size):
+                total[i] += phase * spectrum[m, (first + i) % count]
+                phase *= turned
+        for i in range(total.size):
+            beams[b, (first + i) % count] = total[i]
+
+
+@kernel
+def _peaks(
+    loudness: Float[np.ndarray, " l"], threshold: float, lobes: Float[np.ndarray, " r"]
+) -> Int[np.ndarray, " m"]:
+    """Return the lags, the loudest first, that are louder than what louder ones leave there."""
+    peaks, count = np.empty(loudness.size, dtype=np.int64), 0
+    for b in range(loudness.size):
+        before = loudness[b - 1] if b > 0 else -1.0
+        after = loudness[b + 1] if b + 1 < loudness.size else -1.0
+        if loudness[b] > threshold and loudness[b] > before and loudness[b] >= after:
+            peaks[count] = b
+            count += 1
+    order = np.argsort(-loudness[peaks[:count]])
+    kept = 0
+    found = np.empty(count, dtype=np.int64)
+    for i in order:
+        b, left = peaks[i], 0.0
+        for k in range(kept):
+            away = abs(found[k] - b)
+            if away < lobes.size:
+                left += math.sqrt(lobes[away] * loudness[found[k]])
+        if loudness[b] > left * left:
+            found[kept] = b
+            kept += 1
+    return found[:kept]
+
+
+@no_alloc
+def _output(
+    slow: Complex[np.ndarray, "l k"],
+    at: float,
+    bearing: float,
+    beam: _Beam,
+    interval: float,
+    sinc: Float[np.ndarray, "p t"],
+) -> tuple[float, float]:
+    """Return the power of the beam to a bearing at a lag, or between two, and what it sums."""
+    ahead, left = math.cos(bearing), math.sin(bearing)
+    total, energy = 0.0j, 0.0
+    parts = sinc.shape[0] - 1
+    for m in range(beam.weight.size):
+        early = (beam.position[m, 0] * ahead + beam.position[m, 1] * left) / beam.speed_of_sound
+        place = at - early / interval
+        k = math.floor(place)
+        part = (place - k) * parts
+        row = min(int(part), parts - 1)
+        share = part - row
+        y = 0.0j
+        for t in range(sinc.shape[1]):
+            weight = (1.0 - share) * sinc[row, t] + share * sinc[row + 1, t]
+            y += weight * slow[k - sinc.shape[1] // 2 + 1 + t, m]
+        turn = -2.0 * math.pi * beam.band.centre * early
+        total += beam.weight[m] * y * complex(math.cos(turn), math.sin(turn))
+        energy += y.real * y.real + y.imag * y.imag
+    return total.real * total.real + total.imag * total.imag, energy
+
+
+@no_alloc
+def _moved(before: float, here: float, after: float) -> float:
+    """Return how many steps away a parabola through three powers peaks, one at most."""
+    bend = 2.0 * here - before - after
+    move = 0.5 * (after - before) / bend if bend > 0.0 else math.copysign(1.0, after - before)
+    return min(max(move, -1.0), 1.0)
+
+
+@no_alloc
+def _climb(
+    slow: Complex[np.ndarray, "l k"],
+    at: float,
+    bearing: float,
+    step: float,
+    beam: _Beam,
+    interval: float,
+    sinc: Float[np.ndarray, "p t"],
+) -> tuple[float, float, float]:
+    """Return lag, bearing and power of the top of a peak near a beam."""
+    late = 0.5
+    for _ in range(CLIMBS):
+        here, _ = _output(slow, at, bearing, beam, interval, sinc)
+        before, _ = _output(slow, at, bearing - step, beam, interval, sinc)
+        after, _ = _output(slow, at, bearing + step, beam, interval, sinc)
+        bearing += step * _moved(before, here, after)
+        here, _ = _output(slow, at, bearing, beam, interval, sinc)
+        before, _ = _output(slow, at - late, bearing, beam, interval, sinc)
+        after, _ = _output(slow, at + late, bearing, beam, interval, sinc)
+        at += late * _moved(before, here, after)
+        step, late = 0.25 * step, 0.25 * late
+    power, _ = _output(slow, at, bearing, beam, interval, sinc)
+    return at, bearing, power
+
+
+@kernel
+def _rows(
+    slow: Complex[np.ndarray, "l k"],
+    margin: Whole,
+    peaks: Int[np.ndarray, " m"],
+    beam: _Beam,
+    interval: float,
+    sinc: Float[np.ndarray, "p t"],
+) -> Float[np.ndarray, "6 m"]:
+    """Return the numbers of each peak, its delay since lag 0 [s]; `slow` has silent margins."""
+    numbers, beams = np.empty((6, peaks.size)), beam.bearing.size
+    power, within = np.empty(beams), (float(margin), float(slow.shape[0] - margin - 1))
+    for i in range(peaks.size):
+        for n in range(beams):
+            lag = float(margin + peaks[i])
+            power[n], _ = _output(slow, lag, beam.bearing[n], beam, interval, sinc)
+        loudest = int(power.argmax())
+        near = loudest + 1 if loudest + 1 < beams else loudest - 1
+        step = 0.5 * abs(wrap_angle(beam.bearing[near] - beam.bearing[loudest]))
+        start = float(margin + peaks[i]), beam.bearing[loudest]
+        at, bearing, top = _climb(slow, *start, step, beam, interval, sinc)
+        at = min(max(at, within[0]), within[1])
+        _, energy = _output(slow, at, bearing, beam, interval, sinc)
+        over = over_noise(top, energy, beam.weight.size, beam.loudest_noise)
+        noise = top / (over + 1.0)
+        square = _doubles(slow, at, bearing, top, noise, step, beam, interval, sinc)
+        spread, slope = _geometry(bearing, beam)
+        wave = math.hypot(2.0 * math.pi * beam.band.centre, beam.band.spread)
+        std = bearing_std(over, wave / beam.speed_of_sound, 12.0 * spread)
+        late = math.sqrt(0.5 * (1.0 + 1.0 / over) / over) / beam.band.spread
+        numbers[0, i], numbers[1, i] = (at - margin) * interval, wrap_angle(bearing)
+        numbers[2, i], numbers[3, i] = top, min(math.hypot(std, math.sqrt(square)), UNKNOWN)
+        numbers[4, i], numbers[5, i] = math.hypot(late, beam.doppler_std), math.atan(slope)
+    return numbers
+
+
+@no_alloc
+def _doubles(
+    slow: Complex[np.ndarray, "l k"],
+    at: float,
+    bearing: float,
+    top: float,
+    noise: float,
+    step: float,
+    beam: _Beam,
+    interval: float,
+    sinc: Float[np.ndarray, "p t"],
+) -> float:
+    """Return the mean square of the bearing about the loudest lobe, by the odds of the others.
+
+    As `full_circle` has it; other lobes are asked at the time of the loudest.
+    """
+    odds, square, beams = 0.0, 0.0, beam.bearing.size
+    last = here = -1.0
+    for n in range(beams + 1):
+        after = -1.0
+        if n < beams:
+            after, _ = _output(slow, at, beam.bearing[n], beam, interval, sinc)
+        if n > 0 and here > last and here >= after and here >= 0.8 * top - RARE * noise:
+            _, other, power = _climb(slow, at, beam.bearing[n - 1], step, beam, interval, sinc)
+            off = wrap_angle(other - bearing)
+            if abs(off) > 4.0 * step:
+                share = math.exp(min(power - top, 0.0) / noise)
+                odds, square = odds + share, square + share * off * off
+        last, here = here, after
+    return square / (1.0 + odds)
+
+
+@no_alloc
+def _geometry(bearing: float, beam: _Beam) -> tuple[float, float]:
+    """Return the places' variance across a bearing [m^2], and how the bearing turns with log c."""
+    cosine, sine = math.cos(bearing), math.sin(bearing)
+    xx = xy = 0.0
+    for m in range(beam.weight.size):
+        share = beam.weight[m] * beam.weight[m]
+        along = beam.position[m, 0] * cosine + beam.position[m, 1] * sine
+        across = beam.position[m, 1] * cosine - beam.position[m, 0] * sine
+        xy, xx = xy + share * along * across, xx + share * across * across
+    spread = max(xx, 1e-12)
+    return spread, xy / spread

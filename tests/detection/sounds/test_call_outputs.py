@@ -1,0 +1,151 @@
+"""Sound of calls that are no tones: own recordings give the run's own rows."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import soundfile
+
+import pipistrelle
+from pipistrelle.acoustics.call import Sweep
+from pipistrelle.config import Config, InputError
+from pipistrelle.detection.logs.heard_rows import RowsHeard
+from pipistrelle.detection.sounds.description import read_description
+from pipistrelle.detection.sounds.hearing import hear_recording, log_callers
+from pipistrelle.experiments.hearing.listening import listen
+from pipistrelle.experiments.hearing.scenario import world_of
+from pipistrelle.verbs.options import MissionOptions, mission_config
+from reference.sounds import UNLABELLED, record
+
+LOUD = {"level_db": 65.0}  # else nothing is near enough for an echo of the vehicle's own
+SWEEP = {"emitter": LOUD | {"call": "sweep", "taper": 0.2}}
+CASES = {
+    "sweep": SWEEP,
+    "hyperbolic at another rate": {
+        "emitter": LOUD | {"call": "sweep", "sweep": "hyperbolic"},
+        "receiver": {"sample_rate": 192e3},
+    },
+    "both sweep": SWEEP | {"beacon": {"call": "sweep", "taper": 0.2}},
+    "file": {"emitter": LOUD | {"call": "own.wav", "frequency": 47.5e3}},
+}
+
+
+@pytest.fixture
+def case(request, tmp_path, monkeypatch):
+    """Return settings of a case; its file stands in the working folder."""
+    monkeypatch.chdir(tmp_path)
+    call = Sweep(60e3, 35e3, 2.4e-3, "hyperbolic", taper=0.3)
+    time = np.arange(round(2.4e-3 * 250e3)) / 250e3
+    soundfile.write("own.wav", call.waveform(time, 47.5e3).real, 250_000, subtype="FLOAT")
+    return CASES[request.param]
+
+
+def words(settings):
+    """Spell settings as flags."""
+    pairs = [
+        (f"--{section}.{key.replace('_', '-')}", str(value))
+        for section, table in settings.items()
+        for key, value in table.items()
+    ]
+    return [word for pair in pairs for word in pair]
+
+
+def heard(folder):
+    """Hear all of a recording; return the scans."""
+    scans, about = [], read_description(folder)
+    rows = RowsHeard(folder, about.log, log_callers(about))
+
+    def look(frame):
+        rows.text(frame.scan)
+        scans.append(frame.scan)
+
+    hear_recording(folder, about, Config(), range, look)
+    return SimpleNamespace(scans=scans).scans
+
+
+def scans_of_run(settings):
+    """Return the rows without labels of the run that was recorded."""
+    receiver = {"elements": 4} | settings.get("receiver", {})
+    given = settings | {"receiver": receiver}
+    config, _, _ = mission_config(MissionOptions(duration=4.0, landmarks=20, settings=given))
+    (frames,) = listen(world_of(config), config, (config.emitter.radius,), labels=False)
+    return [frame.unlabelled for frame in frames]
+
+
+@pytest.mark.parametrize("case", CASES, indirect=True)
+def test_what_is_heard_of_a_call_is_what_the_run_heard(case):
+    tape = record(Path("tape").absolute(), *words(case))
+    log, run = heard(tape), scans_of_run(case)
+    assert [scan.time for scan in log] == [scan.time for scan in run]
+    assert sum(np.count_nonzero(his.caller == 0) for his in run) >= 8
+    rows, found = 0, 0
+    for mine, his in zip(log, run, strict=True):
+        rows += his.bearing.size
+        for i in range(his.bearing.size):
+            same = mine.caller == his.caller[i]
+            for name, limit in (("bearing", 1e-4), ("range", 1e-3), ("excess_path", 1e-3)):
+                one, other = getattr(mine, name), getattr(his, name)[i]
+                same &= (np.isnan(one) & np.isnan(other)) | (np.abs(one - other) < limit)
+            found += bool(same.any())
+    assert rows > 50
+    assert found >= rows - 2  # next to the threshold the measured noise may decide otherwise
+
+
+def test_slam_on_what_was_heard_of_a_sweep_is_the_run_again(tmp_path):
+    sweep = words(SWEEP)
+    record(tmp_path / "tape", *UNLABELLED, "--filter.noise", "measured", *sweep)
+    pipistrelle.hear(tmp_path / "tape", output=tmp_path / "log")
+    asked = {"filters": "smoother", "association__method": "marginal"}
+    again = pipistrelle.slam(tmp_path / "log", gate=1.0, **asked).tracks
+    with pytest.warns(UserWarning, match="every sample is recorded"):
+        run = pipistrelle.run(
+            duration=4.0, landmarks=20, strategies="fused", receiver__elements=4,
+            listening__timing=True, filter__noise="measured", **SWEEP, **asked,
+        ).tracks  # fmt: skip
+    for name in ("x_m", "y_m", "heading_rad"):
+        assert np.abs(again[name].to_numpy() - run[name].to_numpy()).max() < 0.03
+
+
+def test_a_recording_says_what_was_sent_and_keeps_its_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    time = np.arange(500) / 250e3
+    wave = Sweep(60e3, 35e3, 2e-3).waveform(time, 47.5e3).real
+    soundfile.write("own.wav", wave, 250_000, subtype="FLOAT")
+    few = ["--emitter.call", "own.wav", "--emitter.frequency", "47e3", "--frames", "0:2"]
+    tape = record(tmp_path / "tape", *few, "--beacon.call", "sweep")
+    about = read_description(tape)
+    assert (about.call.call, about.callers[0].call) == ("call_vehicle.wav", "sweep")
+    assert about.callers[0].band == (28e3, 18e3)
+    kept, rate = soundfile.read(tape / "call_vehicle.wav")
+    assert rate == 250_000
+    np.testing.assert_allclose(kept, wave, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('call = "sweep"', 'call = "gone.wav"', "gone.wav"),
+        ('call = "sweep"', 'call = "sweep"\ntaper = 2.0', "taper"),
+        ("60000.0", "120000.0", "half the sample rate"),
+        ("band = [", "bend = [", "bend"),
+    ],
+)
+def test_a_call_that_is_told_wrongly_is_refused(tmp_path, old, new, message):
+    tape = record(tmp_path / "tape", "--emitter.call", "sweep", "--frames", "0:2")
+    text = (tape / "recording.toml").read_text()
+    text = text.replace("taper = 0.0\n", "", 1).replace(old, new, 1)
+    (tape / "recording.toml").write_text(text)
+    with pytest.raises(InputError, match=message):
+        heard(tape)
+
+
+def test_a_sweep_that_nobody_says_when_it_comes_is_refused(tmp_path):
+    tape = record(tmp_path / "tape", "--emitter.call", "sweep", "--frames", "0:3")
+    (tape / "calls.csv").unlink()
+    with pytest.raises(InputError, match="nothing that tells when the sweep comes"):
+        heard(tape)
+    (tape / "recording.toml").write_text(
+        (tape / "recording.toml").read_text().replace("[call]", "[call]\nperiod = 0.5", 1)
+    )
+    assert len(heard(tape)) == 3

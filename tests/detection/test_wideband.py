@@ -1,0 +1,314 @@
+"""Calls of wide bands: thresholds, bearings, ranges, and what a loud one leaves."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import binom, chi2
+
+from pipistrelle.acoustics.arrivals import Arrivals
+from pipistrelle.acoustics.call import Sweep, ToneBurst
+from pipistrelle.acoustics.callers import callers_of
+from pipistrelle.arrays.array_file import microphones_of
+from pipistrelle.arrays.bands import band_of, cross_talk, replica
+from pipistrelle.arrays.layout import Layout, scattered, square_of_four
+from pipistrelle.arrays.receiver import record_samples
+from pipistrelle.arrays.sampling import sampling
+from pipistrelle.config import Config
+from pipistrelle.detection.direct import Lags
+from pipistrelle.detection.front_end import find_calls, front_end
+from pipistrelle.detection.matched import BandFilters
+from pipistrelle.detection.wideband import _loudness, wide_of
+from pipistrelle.geometry import wrap
+
+TURN = np.arange(8) * np.pi / 4
+CIRCLE = scattered(
+    microphones_of([(0.012 * math.cos(t), 0.012 * math.sin(t), 0.0, 0.0, "") for t in TURN])
+)
+FACE = Layout(normal=np.zeros(1), position=square_of_four(Config().receiver).position)
+LAYOUTS = {"face": FACE, "circle": CIRCLE}
+SWEEPS = {
+    "linear": {},
+    "hyperbolic": {"sweep": "hyperbolic"},
+    "tapered": {"taper": 0.5},
+    "rising": {"band": (35e3, 60e3)},
+    "wide": {"band": (80e3, 20e3), "taper": 0.2},
+}
+CHANCE = 1e-6
+
+
+@cache
+def setting(name="linear", rate=200e3, false_alarm=1e-6, speed=0.0):
+    """Return settings, sampling and filters of a vehicle alone that sweeps."""
+    config = Config.model_validate({
+        "emitter": {"call": "sweep"} | SWEEPS[name],
+        "receiver": {"sample_rate": rate},
+        "detection": {"false_alarm": false_alarm},
+        "scenario": {"speed": speed},
+    })  # fmt: skip
+    settled = sampling(config, callers_of(config, np.zeros(2))[:1])
+    return config, settled, BandFilters(settled.calls, rate)
+
+
+def sound(delay, bearing, snr_db, settled, shift=1.0):
+    """Return arrivals whose SNR, at one microphone and after the filter, is given."""
+    delay, bearing, snr_db = np.broadcast_arrays(*map(np.atleast_1d, (delay, bearing, snr_db)))
+    energy = band_of(settled.calls[0], settled.rate).energy
+    return Arrivals(
+        delay=delay.astype(float),
+        level_db=snr_db - 10.0 * np.log10(energy),
+        bearing=bearing.astype(float),
+        frequency=np.full(delay.size, settled.tones[0] * shift),
+        caller=np.zeros(delay.size, dtype=np.int8),
+        landmark=np.arange(1, delay.size + 1),
+    )
+
+
+def heard(arrivals, layout, name="linear", rng=None, milliseconds=8.0, **more):
+    """Return the matched outputs of arrivals, the lags and the front end."""
+    config, settled, filters = setting(name, **more)
+    blocks = round(milliseconds * 1e-3 / settled.interval)
+    matched = filters(record_samples(blocks, arrivals, layout, settled, rng), 1.0)
+    start, interval = settled.pulse * settled.interval, filters.step / settled.rate
+    return matched, Lags(start, interval, filters.pulse), config
+
+
+@cache
+def finder(layout, name="linear", **more):
+    """Return the front end of a layout for a sweep."""
+    config, settled, _ = setting(name, **more)
+    return front_end(config, LAYOUTS[layout], settled.tones, calls=settled.calls)
+
+
+def found_in(arrivals, layout, name="linear", rng=None, milliseconds=8.0, **more):
+    matched, lags, _ = heard(arrivals, LAYOUTS[layout], name, rng, milliseconds, **more)
+    return find_calls(matched, finder(layout, name, **more), **lags._asdict())
+
+
+# One call
+
+
+@pytest.mark.parametrize("name", SWEEPS)
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("bearing", [0.0, 0.4, -1.2])
+def test_a_call_without_noise_is_found_where_and_when_it_is(name, layout, bearing):
+    _, settled, _ = setting(name)
+    delay = 5.12345e-3
+    found = found_in(sound(delay, bearing, 40.0, settled), layout, name)
+    assert found.delay.size == 1, "nor are its lobes calls"
+    assert abs(wrap(found.bearing - bearing))[0] < 2e-3
+    assert abs(found.delay - delay)[0] < 3e-7
+    gain_db = 40.0 + 10.0 * math.log10(LAYOUTS[layout].shape[1])
+    assert 10.0 * np.log10(found.power)[0] == pytest.approx(gain_db, abs=0.15)
+
+
+@pytest.mark.parametrize("rate", [150e3, 192e3, 384e3, 1e6])
+def test_any_rate_that_holds_the_band_finds_it(rate):
+    _, settled, _ = setting(rate=rate)
+    found = found_in(sound(5.12345e-3, 0.4, 30.0, settled), "face", rate=rate)
+    assert found.delay.size == 1
+    assert abs(found.delay - 5.12345e-3)[0] < 3e-7
+    assert abs(found.bearing - 0.4)[0] < 2e-3
+
+
+def test_beams_are_steered_by_delays_and_not_by_one_carriers_phase():
+    """Over the face a wave from the side takes 0.12 ms, three times what the output lasts."""
+    _, settled, filters = setting()
+    matched, *_ = heard(sound(5e-3, 1.2, 40.0, settled), FACE)
+    away = np.ptp(np.abs(matched[:, 0, 0]).argmax(axis=0)) * filters.step / settled.rate
+    assert away == pytest.approx(0.0441 * math.sin(1.2) / 343.0, abs=3e-5)
+    at_once = np.sum(np.abs(matched[:, 0, 0]), axis=1).max() ** 2 / 10.0
+    assert 10.0 * np.log10(at_once) < 50.0 - 6.0, "one lag has a quarter of it at most"
+    assert 10.0 * np.log10(found_in(sound(5e-3, 1.2, 40.0, settled), "face").power)[0] > 49.8
+
+
+def errors(layout, name, snr_db, draws, bearing=0.5):
+    """Return errors of bearing and delay in many noises, and what rows state of them."""
+    _, settled, _ = setting(name)
+    rng, rows = np.random.default_rng(11), []
+    for _ in range(draws):
+        delay = rng.uniform(4e-3, 4.1e-3)
+        arrival = sound(delay, bearing, snr_db, settled)
+        found = found_in(arrival, layout, name, rng, milliseconds=5.0)
+        d = int(np.argmin(np.abs(found.delay - delay)))
+        off = wrap(found.bearing[d] - bearing), found.delay[d] - delay
+        rows.append((*off, found.bearing_std[d], found.delay_std[d]))
+    return np.array(rows).T
+
+
+def bounds(layout, name, snr_db, bearing=0.5):
+    """Return the Cramer-Rao bounds, from derivatives of the samples themselves."""
+    _, settled, _ = setting(name)
+    call, array, rate = settled.calls[0], LAYOUTS[layout], 2e6
+    if layout == "face":
+        place = np.column_stack((0.0 * array.position, array.position))
+    else:
+        place = array.position
+
+    def samples(angle, delay):
+        time = np.arange(round(4e-3 * rate)) / rate - 5e-4
+        early = place @ [math.cos(angle), math.sin(angle)] / 343.0
+        return np.concatenate([call.waveform(time - delay + a, call.frequency) for a in early])
+
+    here = samples(bearing, 0.0)
+    slopes = [
+        (samples(bearing + 1e-6, 0.0) - samples(bearing - 1e-6, 0.0)) / 2e-6,
+        (samples(bearing, 1e-9) - samples(bearing, -1e-9)) / 2e-9,
+        1j * here,
+    ]
+    inside = np.abs(samples(bearing, 2e-8) - here) < 0.5  # but for the jumps at its ends
+    slopes = np.array([slope * inside for slope in slopes])
+    power = 10.0 ** (snr_db / 10.0) * len(place) / np.sum(np.abs(here) ** 2)
+    fisher = 2.0 * power * (slopes.conj() @ slopes.T).real
+    return np.sqrt(np.diag(np.linalg.inv(fisher)))[:2]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("name", ["tapered", "hyperbolic"])
+def test_bearings_and_delays_meet_their_bounds_and_rows_state_them(layout, name):
+    draws = 60
+    found = errors(layout, name, 20.0, draws)
+    low, high = np.sqrt(chi2.ppf([CHANCE / 2, 1 - CHANCE / 2], draws) / draws)
+    for k, bound in enumerate(bounds(layout, name, 20.0)):
+        share = math.sqrt(np.mean(found[k] ** 2)) / bound
+        assert 0.93 * low < share < 1.07 * high
+        assert np.median(found[2 + k]) == pytest.approx(bound, rel=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("name", SWEEPS)
+@pytest.mark.parametrize("snr_db", [10.0, 15.0, 25.0])
+def test_bearings_and_delays_meet_their_bounds_whatever_the_sweep(layout, name, snr_db):
+    found = errors(layout, name, snr_db, 1500)
+    for k in range(2):
+        stated = found[k] / found[2 + k]
+        assert 0.85 < math.sqrt(np.mean(stated**2)) < 1.2
+        share = math.sqrt(np.mean(found[k] ** 2)) / bounds(layout, name, snr_db)[k]
+        assert 0.85 < share < 1.25
+
+
+def test_a_row_states_what_the_doppler_shift_of_its_own_motion_may_do():
+    _, settled, _ = setting()
+    arrival = sound(5e-3, 0.0, 50.0, settled, shift=1.0 + 2.0 * 0.75 / 343.0)
+    still, moving = (found_in(arrival, "face", speed=speed) for speed in (0.0, 0.75))
+    late = moving.delay[0] - 5e-3
+    assert late == pytest.approx(3.92e-3 * 2.0 * 0.75 / 343.0, rel=0.05)
+    assert abs(late) < 2.0 * moving.delay_std[0]
+    assert still.delay_std[0] < 0.05 * moving.delay_std[0]
+
+
+# Noise, and other calls
+
+
+def exceeded(layout, chance, name="linear", tests=12_000, threshold=None):
+    """Return in how many lags, too far apart to be alike, noise alone is loud enough."""
+    config, settled, filters = setting(name, false_alarm=chance)
+    nothing, rng = sound([], [], [], settled), np.random.default_rng(3)
+    wide = wide_of(config, LAYOUTS[layout], 0, settled.calls, 0)
+    blocks = round(8 * tests * filters.step / settled.block) + 2 * settled.pulse
+    matched = filters(record_samples(blocks, nothing, LAYOUTS[layout], settled, rng), 1.0)
+    loudness = _loudness(matched[:, 0, 0], wide, filters.step / settled.rate)[100:-100:8]
+    return np.count_nonzero(loudness[:tests] > (threshold or wide.threshold))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("name", ["linear", "wide", "tapered"])
+def test_noise_alone_passes_no_more_often_than_is_asked(layout, name):
+    tests, chance = 12_000, 1e-2
+    count = exceeded(layout, chance, name)
+    assert count <= binom.ppf(1.0 - CHANCE, tests, chance)
+    assert count >= binom.ppf(CHANCE, tests, 0.3 * chance)
+    # A threshold for one direction alone, which a scan of many passes, is found out.
+    assert exceeded(layout, chance, name, threshold=-math.log(chance)) > binom.ppf(
+        1.0 - CHANCE, tests, chance
+    )
+
+
+def test_noise_of_two_lags_is_as_alike_as_the_calls_autocorrelation():
+    _, settled, filters = setting()
+    rng, count = np.random.default_rng(5), 400_000
+    nothing = sound([], [], [], settled)
+    matched = filters(record_samples(count // 40, nothing, FACE, settled, rng), 1.0)[:, 0, 0]
+    sent = replica(settled.calls[0], settled.rate)
+    own = np.correlate(sent, sent, mode="full")[sent.size - 1 :] / np.sum(np.abs(sent) ** 2)
+    assert np.mean(np.abs(matched) ** 2) == pytest.approx(1.0, abs=0.01)
+    for lag in (1, 2, 3, 5, 8):
+        alike = np.mean(matched[lag:] * matched[:-lag].conj())
+        assert abs(alike - own[lag * filters.step]) < 0.02
+
+
+@pytest.mark.parametrize("name", ["linear", "tapered"])
+def test_two_echoes_a_few_lags_apart_are_two_and_lobes_are_none(name):
+    _, settled, _ = setting(name)
+    apart = 1.5e-4
+    pair = sound([4.0e-3, 4.0e-3 + apart], [0.3, 0.3], [30.0, 29.0], settled)
+    found = found_in(pair, "circle", name)
+    assert np.sort(found.delay) == pytest.approx([4.0e-3, 4.0e-3 + apart], abs=3e-6)
+
+
+def test_a_tone_and_a_sweep_are_heard_side_by_side_and_leave_little_in_each_other():
+    config = Config.model_validate({"emitter": {"call": "sweep"}})
+    callers = callers_of(config, np.zeros(2))
+    settled = sampling(config, callers)
+    filters = BandFilters(settled.calls, settled.rate)
+    end = front_end(config, FACE, settled.tones, calls=settled.calls)
+    both = Arrivals(
+        delay=np.array([6e-3, 8e-3]),
+        level_db=np.array([0.0, 40.0]),  # the beacon's own call is as loud as that
+        bearing=np.array([0.3, -0.4]),
+        frequency=settled.tones.copy(),
+        caller=np.array([0, 1], dtype=np.int8),
+        landmark=np.array([1, 2]),
+    )
+    samples = record_samples(60, both, FACE, settled, np.random.default_rng(1))
+    lags = Lags(settled.pulse * settled.interval, filters.step / settled.rate, filters.pulse)
+    found = find_calls(filters(samples, 1.0), end, **lags._asdict())
+    assert found.caller.tolist().count(1) == 1
+    beacon = int(np.flatnonzero(found.caller == 1)[0])
+    assert found.direct.detection.tolist() == [-1, beacon]
+    assert found.direct.delay[1] == pytest.approx(8e-3, abs=2e-5)
+    assert found.bearing[beacon] == pytest.approx(-0.4, abs=2e-3)
+    own = found.caller == 0
+    assert own.sum() <= 1, "what leaks is none"
+
+
+def test_cross_talk_is_what_one_filter_answers_of_anothers_call():
+    up, down, tone = Sweep(30e3, 60e3, 2.8e-3), Sweep(60e3, 30e3, 2.8e-3), ToneBurst(45e3, 2.8e-3)
+    share = cross_talk([up, down, tone], 200e3)
+    np.testing.assert_allclose(np.diag(share), 1.0)
+    np.testing.assert_allclose(share, share.T, rtol=1e-9)
+    assert share[0, 2] == pytest.approx(1.0 / (30e3 * 2.8e-3), rel=0.5)
+    assert share[0, 1] < 0.04
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("rate", [44.1e3, 96e3, 192e3, 1e6])
+def test_tones_off_the_raster_are_found_at_any_rate(layout, rate):
+    config = Config.model_validate({
+        "emitter": {"frequency": 19_234.5}, "beacon": {"frequency": 12_100.0},
+        "receiver": {"sample_rate": rate},
+    })  # fmt: skip
+    settled = sampling(config, callers_of(config, np.zeros(2)))
+    filters = BandFilters(settled.calls, rate)
+    end = front_end(config, LAYOUTS[layout], settled.tones, calls=settled.calls)
+    both = Arrivals(
+        delay=np.array([6.01e-3, 13e-3]),
+        level_db=np.array([-15.0, 0.0]),
+        bearing=np.array([0.3, -0.4]),
+        frequency=settled.tones.copy(),
+        caller=np.array([0, 1], dtype=np.int8),
+        landmark=np.array([1, 2]),
+    )
+    blocks = round(20e-3 / settled.interval)
+    samples = record_samples(blocks, both, LAYOUTS[layout], settled, np.random.default_rng(1))
+    lags = Lags(settled.pulse * settled.interval, filters.step / rate, filters.pulse)
+    found = find_calls(filters(samples), end, **lags._asdict())
+    order = np.argsort(found.delay)
+    assert found.caller[order].tolist() == [0, 1]
+    error = found.delay[order] - both.delay
+    assert (np.abs(error) < 5.0 * found.delay_std[order] + 0.5 / rate + 2e-6).all()
+    off = wrap(found.bearing[order] - both.bearing)
+    assert (np.abs(off) < 5.0 * found.bearing_std[order]).all()
+    assert found.direct.delay[1] == pytest.approx(13e-3, abs=6e-5)
