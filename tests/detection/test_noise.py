@@ -39,8 +39,20 @@ def test_noise_changes_nothing_but_the_standard_deviations():
 def test_the_noise_of_the_settings_is_theirs(stds):
     told = dict(zip(("range_std", "bearing_std", "excess_path_std"), stds, strict=True))
     noise = noise_of(FilterConfig(**told))
-    assert noise == ConstantNoise(**told)
+    assert noise == ConstantNoise(**told, instead=True)
+    assert noise_of(FilterConfig(**told, noise="measured")) == ConstantNoise(**told)
     assert hash(noise) == hash(noise_of(FilterConfig(**told)))
+
+
+def test_what_the_signal_says_is_hidden_and_what_an_association_states_is_not():
+    heard = scan_with([3, 8], [0.1, 0.2], [2.0, NAN], bearing_std=0.02, range_std=0.1)
+    stated = with_columns(heard, range=np.array([2.0, 9.0]), range_std=np.array([0.1, 1.8]))
+    noise = ConstantNoise(range_std=0.2, bearing_std=0.15, excess_path_std=0.3, instead=True)
+    given = noise(noise.hidden(heard, stated))
+    assert given.bearing_std.tolist() == [0.15, 0.15]
+    assert given.range_std.tolist() == [0.2, 1.8]
+    assert given.range.tolist() == [2.0, 9.0]
+    assert replace(noise, instead=False).hidden(heard, stated) is stated
 
 
 def test_an_excess_path_is_told_to_be_off_by_the_way_of_what_a_range_is():

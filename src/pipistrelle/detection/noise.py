@@ -4,7 +4,6 @@ It is stated of the rows that a filter is handed, after those of one landmark we
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,8 +23,6 @@ from pipistrelle.jit import kernel
 
 STDS = BEARING_STD, RANGE_STD, EXCESS_PATH_STD
 """Where the standard deviations stand among the numbers."""
-Noise = Callable[[Scan], Scan]
-"""Gives rows the standard deviations that they do not have."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,12 +41,22 @@ class ConstantNoise:
     bearing_std: float
     excess_path_std: float
     """`range_std`, `bearing_std` and `excess_path_std` [m], [rad], [m]."""
+    instead: bool = False
+    """Whether an estimator is given them in place of what the signal says, too."""
 
     def __call__(self, scan: Scan) -> Scan:
         """Give rows the standard deviations that they do not have."""
         stds = self.bearing_std, self.range_std, self.excess_path_std
         numbers = _filled(np.ascontiguousarray(scan.numbers), *stds)
         return replace(scan, numbers=numbers)
+
+    def hidden(self, heard: Scan, stated: Scan) -> Scan:
+        """Return a scan as an association stated it, without what the signal said of its noise."""
+        if not self.instead:
+            return stated
+        same = (heard.numbers == stated.numbers) | np.isnan(stated.numbers)
+        bare = unstated(stated)
+        return replace(bare, numbers=np.where(same, bare.numbers, stated.numbers))
 
 
 @kernel
@@ -78,7 +85,7 @@ def unstated(scan: Scan) -> Scan:
     return without(scan, *STDS)
 
 
-def without_hidden(scan: Scan, settings: FilterConfig, *, timing: bool) -> Scan:
+def without_hidden(scan: Scan, settings: FilterConfig, *, timing: bool, known: bool = True) -> Scan:
     """Return a scan without the columns that the settings hide from an estimator.
 
     Parameters
@@ -89,17 +96,20 @@ def without_hidden(scan: Scan, settings: FilterConfig, *, timing: bool) -> Scan:
         speed of sound is to be calibrated.
     timing : bool
         False: excess paths are hidden.
+    known : bool
+        Whether labels are; else an association sees all standard deviations, and hides them from
+        the estimator (`ConstantNoise.hidden`).
 
     Returns
     -------
     Scan
     """
     hidden = () if "speed_of_sound" in settings.calibrate else (SLOPE,)
-    hidden += STDS if settings.noise == "constant" else ()
+    hidden += STDS if known and settings.noise == "constant" else ()
     return without(scan, *hidden) if timing else without_excess_paths(scan, *hidden)
 
 
-def noise_of(settings: FilterConfig) -> Noise:
+def noise_of(settings: FilterConfig) -> ConstantNoise:
     """Return the noise model that the settings name.
 
     Parameters
@@ -108,10 +118,11 @@ def noise_of(settings: FilterConfig) -> Noise:
 
     Returns
     -------
-    Noise
+    ConstantNoise
     """
     return ConstantNoise(
         range_std=settings.range_std,
         bearing_std=settings.bearing_std,
         excess_path_std=settings.excess_path_std,
+        instead=settings.noise == "constant",
     )

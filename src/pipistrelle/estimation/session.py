@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from pipistrelle.config import InputError
 from pipistrelle.detection.merging import labelled
-from pipistrelle.detection.noise import Noise
+from pipistrelle.detection.noise import ConstantNoise
 from pipistrelle.detection.scans import UNLABELLED, Scan
 from pipistrelle.estimation.association import Assignment, Association, edited
 from pipistrelle.estimation.beliefs import (
@@ -86,8 +86,9 @@ class Session(Generic[B]):
         What is on the map beforehand, for an estimator that accepts it (`AcceptsMap`).
     association : Association, optional
         Labels the rows of scans; without one they bear labels already.
-    noise : callable, optional
-        States the noise of rows that an association has merged (`pipistrelle.detection.noise`).
+    noise : ConstantNoise, optional
+        The noise of rows that state none, or for the estimator of all that an association has
+        merged.
     live : bool
         Steps come one by one, to the same bits as all of them since a scan at once; labels are kept
         of the last `REMEMBERED` scans alone.
@@ -122,7 +123,7 @@ class Session(Generic[B]):
         *,
         known: Landmarks | None = None,
         association: Association | None = None,
-        noise: Noise | None = None,
+        noise: ConstantNoise | None = None,
         live: bool = False,
     ) -> None:
         self._estimator, self._rng = estimator, rng
@@ -268,7 +269,8 @@ class Session(Generic[B]):
         for kept, gone in heard.merge:
             self.labels = [np.where(label == gone, kept, label) for label in self.labels]
         self.belief = edited(self.belief, merge=heard.merge)
-        merged = labelled(heard.scan, heard.label)
+        scan = self._noise.hidden(heard.came, heard.scan) if self._noise else heard.scan
+        merged = labelled(scan, heard.label)
         return self._correct(self._noise(merged) if self._noise else merged)
 
     def _take_back(self, labels: tuple[int, ...]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipistrelle.config import InputError
-from pipistrelle.detection.noise import Noise
+from pipistrelle.detection.noise import ConstantNoise
 from pipistrelle.detection.scans import Scan
 from pipistrelle.estimation.association import Association
 from pipistrelle.estimation.beliefs import (
@@ -36,7 +36,7 @@ def run_filter(
     rng: np.random.Generator,
     *,
     association: Association | None = None,
-    noise: Noise | None = None,
+    noise: ConstantNoise | None = None,
     progress: Callable[[int, int], None] | None = None,
     watch: Callable[[Scan, B], None] | None = None,
 ) -> Track:

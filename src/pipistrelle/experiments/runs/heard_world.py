@@ -70,6 +70,7 @@ def scans_of(
             frame.rows if known else _unlabelled(frame),
             config.filter,
             timing=config.listening.timing,
+            known=known,
         )
         for frame in heard
     )

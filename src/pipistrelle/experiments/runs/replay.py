@@ -297,7 +297,8 @@ def without_unused(scan: Scan, config: Config) -> Scan:
     """Return a recorded scan without what the settings hide: labels, noise, excess paths."""
     known = config.association.method == KNOWN
     rows = scan if known or scan.direct.size else without_labels(scan, scan.callers)
-    return without_hidden(rows, config.filter, timing=config.listening.timing)
+    timing = config.listening.timing
+    return without_hidden(rows, config.filter, timing=timing, known=known)
 
 
 def with_noise(scan: Scan, config: Config) -> Scan:
