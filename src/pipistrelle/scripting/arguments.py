@@ -254,6 +254,6 @@ def _radius(beamwidth: float, config: Config) -> float:
         piston_radius(
             radians(beamwidth),
             frequency=config.emitter.frequency,
-            speed_of_sound=config.air.sound_speed,
+            speed_of_sound=config.medium.sound_speed,
         )
     )

@@ -80,7 +80,7 @@ def listen(
         Makes each caller's `Call` of its frequency [Hz] and duration [s]; other than tone bursts
         are for the dense engine.
     medium : Medium, optional
-        What the sound travels through; the air of the settings by default. The front end goes on
+        What the sound travels through; that of the settings by default. The front end goes on
         assuming ``assumed.speed_of_sound``.
     find : callable
         Finds calls in the matched filter's output, as `find_calls` does.
