@@ -13,6 +13,8 @@ from scipy.stats import chi2, ttest_rel
 import pipistrelle
 from pipistrelle.acoustics.arrivals import arrivals_of_emission, through_piston
 from pipistrelle.config import Config
+from pipistrelle.verbs.command_line import obey
+from reference.command_line import summary
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 LONGEST = 90
@@ -225,3 +227,32 @@ def test_without_labels_all_posts_are_found_and_nothing_else(play):
     posts, far = done["posts"], np.array([float(row[3]) for row in rows])
     assert len(rows) > 3 * len(posts)
     assert far.max() < 6.5
+
+
+def sonar(folder, *words):
+    """Run the small sonar of the page on water; return its scores by strategy."""
+    harbour = str(EXAMPLES / "harbour.toml")
+    assert obey(["run", "--settings", harbour, "--quiet", "-o", str(folder), *words]) == 0
+    return {run["strategy"]: run for run in summary(folder)["runs"]}
+
+
+def test_the_small_sonar_finds_its_way_in_the_harbour(tmp_path, capsys):
+    runs = sonar(tmp_path / "short", "--duration", "20")
+    assert capsys.readouterr().err == "", "no warning of what suits air"
+    for run in runs.values():
+        assert run["position_rmse_aligned_m"] < 0.1
+    assert runs["fused"]["landmarks_full"] > 20
+    assert runs["fused"]["map_rmse_aligned_m"] < 0.75, "half the length of a call"
+
+
+@pytest.mark.slow
+def test_the_small_sonar_does_what_its_page_says(tmp_path):
+    runs, page = sonar(tmp_path / "whole"), (EXAMPLES.parent / "docs" / "water.md").read_text()
+    columns = [runs[name] for name in ("active", "fused", "passive")]
+    for title, key, digits in (
+        ("position RMSE, aligned", "position_rmse_aligned_m", 3),
+        ("map RMSE, aligned", "map_rmse_aligned_m", 3),
+        ("landmarks placed, of 31", "landmarks_full", 0),
+    ):
+        row = " | ".join(f"{run[key]:.{digits}f}" for run in columns)
+        assert f"| {title} | {row} |" in page

@@ -112,6 +112,8 @@ class ScenarioConfig(Section):
 
     world: Annotated[str, Field(min_length=1)] | None = Field(None, json_schema_extra=FOLDER)
     """Folder of a world of one's own; what it leaves open is drawn as the rest says."""
+    medium: Literal["air", "water"] = "air"
+    """What the sound travels through: as section `air` says, or section `water`."""
     steps: Count = 1500
     """Control steps."""
     step: Annotated[Positive, Field(le=LONGEST_STEP)] = 0.125
@@ -147,7 +149,7 @@ class ScenarioConfig(Section):
 
 
 class AirConfig(Section):
-    """The medium. Humidity is unreported in the paper."""
+    """The medium, unless `scenario.medium` says water. Humidity is unreported in the paper."""
 
     speed_of_sound: Annotated[float, Field(ge=10, le=10_000)] | None = Field(
         None, json_schema_extra={"derived": "sound_speed"}
@@ -168,6 +170,40 @@ class AirConfig(Section):
         if self.speed_of_sound is not None:
             return self.speed_of_sound
         return 343.0 * math.sqrt((self.temperature_c + 273.15) / 293.15)
+
+
+class WaterConfig(Section):
+    """The medium where `scenario.medium` is water, of the sea or fresh."""
+
+    speed_of_sound: Annotated[float, Field(ge=10, le=10_000)] | None = Field(
+        None, json_schema_extra={"derived": "sound_speed"}
+    )
+    """Speed of sound [m/s]; unless given, that of temperature, salinity and depth."""
+    temperature_c: Annotated[float, Field(ge=-2, le=35)] = 10.0
+    """Temperature [degrees Celsius]."""
+    salinity: Annotated[float, Field(ge=0, le=45)] = 35.0
+    """Salinity, in parts per thousand; 0 is fresh water."""
+    depth: Annotated[float, Field(ge=0, le=4000)] = 0.0
+    """Depth at which vehicle, callers and landmarks are [m]."""
+    ph: Annotated[float, Field(ge=5, le=10)] = 8.0
+    """Acidity, pH; it counts below some 10 kHz."""
+    spreading: Literal["bistatic", "paper"] = "bistatic"
+    """Passive echoes lose 20 log10(d1 d2), or 20 log10(d1 + d2), the paper's mirror law [dB]."""
+
+    @property
+    def sound_speed(self) -> float:
+        """The speed of sound [m/s]: as it was given, or by Coppens (1981).
+
+        A. B. Coppens, Simple equations for the speed of sound in Neptunian waters, J. Acoust. Soc.
+        Am. 69 (1981), 862-863: for 0 to 35 degrees, salinities of 0 to 45 and 0 to 4000 m.
+        """
+        if self.speed_of_sound is not None:
+            return self.speed_of_sound
+        t, s, d = self.temperature_c / 10.0, self.salinity - 35.0, self.depth / 1000.0
+        surface = 1449.05 + t * (45.7 - t * (5.21 - 0.23 * t))
+        surface += (1.333 - t * (0.126 - 0.009 * t)) * s
+        deeper = (16.23 + 0.253 * t) * d + (0.213 - 0.1 * t) * d**2
+        return surface + deeper + (0.016 + 0.0002 * s) * s * t * d
 
 
 class TargetConfig(Section):
@@ -713,6 +749,7 @@ class Config(Section):
     """The callers besides the vehicle, a table each; the paper's beacon by default."""
     scenario: ScenarioConfig = ScenarioConfig()
     air: AirConfig = AirConfig()
+    water: WaterConfig = WaterConfig()
     target: TargetConfig = TargetConfig()
     emitter: EmitterConfig = EmitterConfig()
     beacon: BeaconConfig = BeaconConfig()
@@ -740,7 +777,12 @@ class Config(Section):
         return callers
 
     @property
+    def medium(self) -> AirConfig | WaterConfig:
+        """The section of what the sound travels through."""
+        return self.water if self.scenario.medium == "water" else self.air
+
+    @property
     def assumed_sound_speed(self) -> float:
         """The speed of sound that the front end counts with [m/s]."""
         assumed = self.assumed.speed_of_sound
-        return self.air.sound_speed if assumed is None else assumed
+        return self.medium.sound_speed if assumed is None else assumed

@@ -97,7 +97,7 @@ def derived(config: Config) -> dict[Key, Any]:
     """Return the values of the settings that are derived unless given.
 
     >>> derived(Config())
-    {('air', 'speed_of_sound'): 343.0}
+    {('air', 'speed_of_sound'): 343.0, ('water', 'speed_of_sound'): 1489.77}
     """
     sources = {
         key: field.json_schema_extra["derived"]

@@ -10,6 +10,7 @@ from pipistrelle.acoustics.propagation import (
     doppler_frequency,
     passive_spreading_loss_db,
     spreading_loss_db,
+    water_absorption_db_per_m,
 )
 from pipistrelle.config import InputError
 
@@ -137,6 +138,101 @@ def test_humidity_decides_what_a_target_at_20_m_loses():
         for rh in (0.1, 0.5)
     ]
     assert round(loss[1] - loss[0]) == 29
+
+
+SEA = {"salinity": 35.0, "depth": 0.0, "ph": 8.0}
+
+
+@pytest.mark.parametrize(
+    ("frequency", "temperature", "salinity", "printed"),
+    [
+        (0.4e3, 10.0, 30.0, "0.015"),
+        (2e3, 10.0, 35.0, "0.123"),
+        (10e3, 30.0, 35.0, "0.606"),
+        (10e3, -1.8, 35.0, "1.36"),
+        (14e3, 20.0, 35.0, "1.29"),
+        (20e3, -1.8, 35.0, "4.40"),
+        (20e3, 10.0, 35.0, "3.35"),
+        (40e3, 4.0, 35.0, "11.5"),
+        (50e3, 20.0, 35.0, "13.0"),
+        (60e3, -1.8, 30.0, "13.6"),
+        (80e3, 16.0, 35.0, "28.6"),
+        (100e3, 0.0, 30.0, "21.0"),
+        (100e3, 10.0, 35.0, "33.6"),
+        (140e3, 25.0, 35.0, "58.4"),
+        (200e3, 0.0, 35.0, "40.6"),
+        (200e3, 30.0, 30.0, "79.3"),
+        (300e3, 10.0, 35.0, "73.1"),
+        (500e3, 10.0, 35.0, "125"),
+        (700e3, 4.0, 35.0, "228"),
+        (1e6, 0.0, 30.0, "513"),
+        (1e6, 30.0, 35.0, "344"),
+    ],
+)
+def test_absorption_of_the_sea_is_that_of_table_iv_of_francois_and_garrison(
+    frequency, temperature, salinity, printed
+):
+    # J. Acoust. Soc. Am. 72 (1982), part II, Table IV: dB/km at the surface, pH 8; as transcribed
+    # in the tests of github.com/jmrplens/phonometry.
+    water = SEA | {"temperature_c": temperature, "salinity": salinity}
+    digits = len(printed.partition(".")[2])
+    db_per_km = 1e3 * float(water_absorption_db_per_m(frequency, **water))
+    assert abs(db_per_km - float(printed)) <= 0.5 * 10.0**-digits
+
+
+@pytest.mark.parametrize(
+    ("frequency", "other", "printed"),
+    [
+        (200e3, {}, 54.446199),
+        (200e3, {"depth": 4000.0}, 32.836398),
+        (31.23e3, {}, 7.354640),
+        (200e3, {"ph": 7.8}, 54.411284),
+        (200e3, {"salinity": 15.000012}, 31.259585),
+        (200e3, {"temperature_c": 0.2}, 40.702235),
+    ],
+)
+def test_absorption_of_water_agrees_with_mb_system(frequency, other, printed):
+    # What `mbabsorption` prints, by its own tests (github.com/dwcaress/MB-System): dB/km.
+    water = SEA | {"temperature_c": 10.0} | other
+    assert 1e3 * float(water_absorption_db_per_m(frequency, **water)) == pytest.approx(
+        printed, abs=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("temperature", "salinity", "depth", "ph"),
+    [
+        (4.0, 34.0, 1000.0, 7.7),
+        (22.0, 40.0, 200.0, 8.2),
+        (-1.5, 30.0, 0.0, 8.2),
+        (4.0, 8.0, 0.0, 7.9),
+        (4.0, 34.0, 4000.0, 7.7),
+    ],
+)
+def test_absorption_of_four_seas_is_within_a_tenth_of_ainslies_and_mccolms(
+    temperature, salinity, depth, ph
+):
+    # J. Acoust. Soc. Am. 103 (1998), 1671: a formula of their own, with its seas (Table I) and the
+    # tenth by which it differs, from 100 Hz to 1 MHz.
+    f, kilometres = np.logspace(2, 6, 200) / 1e3, depth / 1e3
+    boron = 0.78 * np.sqrt(salinity / 35) * np.exp(temperature / 26)
+    sulphate = 42 * np.exp(temperature / 17)
+    strength = 0.52 * (1 + temperature / 43) * salinity / 35 * np.exp(-kilometres / 6)
+    theirs = 0.106 * boron * f**2 / (boron**2 + f**2) * np.exp((ph - 8) / 0.56)
+    theirs += strength * sulphate * f**2 / (sulphate**2 + f**2)
+    theirs += 0.00049 * f**2 * np.exp(-(temperature / 27 + kilometres / 17))
+    water = {"temperature_c": temperature, "salinity": salinity, "depth": depth, "ph": ph}
+    ours = 1e3 * water_absorption_db_per_m(1e3 * f, **water)
+    assert np.abs(ours / theirs - 1.0).max() < 0.1
+
+
+@given(frequency=st.floats(1e3, 1e6), temperature=st.floats(-2.0, 35.0))
+@law
+def test_fresh_water_absorbs_as_the_square_of_the_frequency(frequency, temperature):
+    lake = SEA | {"salinity": 0.0, "temperature_c": temperature}
+    low, high = water_absorption_db_per_m(np.array([frequency, 2.0 * frequency]), **lake)
+    assert high == pytest.approx(4.0 * low, rel=1e-12)
+    assert 0.0 < low < water_absorption_db_per_m(frequency, **lake | {"salinity": 1.0})
 
 
 @given(speed=SPEEDS)

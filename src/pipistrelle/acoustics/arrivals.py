@@ -144,7 +144,7 @@ def arrivals_of_emissions(
     far-field formula stands. At a distance d from the surface a sphere's own echo would be 20
     log10(1 + radius / d) fainter: 0.6 dB for 0.3 m at 4 m. Arrivals are those of the first
     emission, then those of the second, and so on, each in the order of `arrivals_of_emission`;
-    `count`: how many belong to each emission. `medium`: the air of the settings by default.
+    `count`: how many belong to each emission. `medium`: that of the settings by default.
 
     The vehicle turns round, and its next call meets the beacon instead of the landmark.
 
@@ -156,7 +156,7 @@ def arrivals_of_emissions(
     >>> count, heard.landmark
     (array([3, 3]), array([1, 1, 2, 2, 1, 2]))
     """
-    medium, usual = medium or medium_of(config.air), config.target
+    medium, usual = medium or medium_of(config.medium), config.target
     paths = paths_to_vehicle(poses, velocities, landmarks, callers)
     extent = np.zeros(paths.homeward.shape[1])
     if bodies is not None:

@@ -134,7 +134,7 @@ def beamwidth_of(config: Config) -> float:
     >>> round(float(np.degrees(beamwidth_of(Config()))), 1)
     33.3
     """
-    call = {"frequency": config.emitter.centre, "speed_of_sound": config.air.sound_speed}
+    call = {"frequency": config.emitter.centre, "speed_of_sound": config.medium.sound_speed}
     return float(beamwidth(config.emitter.radius, **call))
 
 

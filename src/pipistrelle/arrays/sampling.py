@@ -68,7 +68,7 @@ def sampling(
     call : callable
         Makes each one's `Call` of its frequency [Hz] and duration [s].
     medium : Medium, optional
-        The air of the settings by default.
+        That of the settings by default.
 
     Returns
     -------
@@ -116,7 +116,7 @@ def sampling(
         calls=calls,
         tones=np.array([caller.frequency for caller in callers]),
         noise_std=10.0 ** (config.receiver.noise_level_db / 20.0),
-        speed_of_sound=(medium or medium_of(config.air)).speed_of_sound,
+        speed_of_sound=(medium or medium_of(config.medium)).speed_of_sound,
     )
 
 
@@ -207,7 +207,7 @@ def clear_frequency(config: Config) -> float:
     if config.receiver.array != SQUARE:
         return config.receiver.sample_rate / 2.0
     limit = math.radians(min(config.detection.angle_limit_deg, config.detection.scan_limit_deg))
-    longest = config.air.sound_speed / (config.receiver.spacing * (1.0 + math.sin(limit)))
+    longest = config.medium.sound_speed / (config.receiver.spacing * (1.0 + math.sin(limit)))
     return min(longest, config.receiver.sample_rate / 2.0)
 
 

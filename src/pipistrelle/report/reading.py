@@ -116,7 +116,7 @@ def _truth(setting: str, config: Config) -> float | None:
     """Return what a setting is where nothing is assumed wrongly, if it is one of those."""
     section, _, name = setting.partition(".")
     if setting == "assumed.speed_of_sound":
-        return config.air.sound_speed
+        return config.medium.sound_speed
     if section == "assumed":
         return float(getattr(config.motion, name))
     return 0.0 if section == "motion" and name.endswith("_bias") else None
@@ -124,7 +124,7 @@ def _truth(setting: str, config: Config) -> float | None:
 
 def _degrees(config: Config) -> float:
     """Return the half-power beamwidth of the vehicle's call [deg]."""
-    tone = {"frequency": config.emitter.centre, "speed_of_sound": config.air.sound_speed}
+    tone = {"frequency": config.emitter.centre, "speed_of_sound": config.medium.sound_speed}
     return degrees(beamwidth(config.emitter.radius, **tone))
 
 

@@ -259,6 +259,6 @@ def _radius(beamwidth: float, config: Config) -> float:
         piston_radius(
             radians(beamwidth),
             frequency=config.emitter.centre,
-            speed_of_sound=config.air.sound_speed,
+            speed_of_sound=config.medium.sound_speed,
         )
     )

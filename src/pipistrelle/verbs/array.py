@@ -52,7 +52,7 @@ def array(
     frequency = _frequency(frequency, settled)
     square = file == SQUARE
     found = square_microphones(settled.receiver) if square else read_array(Path(file))
-    layout, c = scattered(found), settled.air.sound_speed
+    layout, c = scattered(found), settled.medium.sound_speed
     patterns = tuple(
         pattern_of(layout, g, frequency=frequency, speed_of_sound=c)
         for g in range(layout.normal.size)

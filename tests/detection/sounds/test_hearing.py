@@ -43,10 +43,10 @@ def own(tmp_path_factory):
     return record(tmp_path_factory.mktemp("own") / "tape")
 
 
-def frames_of_run():
-    """Rows without labels of the run that was recorded."""
+def frames_of_run(named=None):
+    """Rows without labels of the run that was recorded, perhaps with a file of settings."""
     settings = {"receiver": {"elements": 4}}
-    options = MissionOptions(duration=4.0, landmarks=20, settings=settings)
+    options = MissionOptions(duration=4.0, landmarks=20, named=named, settings=settings)
     config, _, _ = mission_config(options)
     assert FEW[1] == "4"
     (frames,) = listen(world_of(config), config, (config.emitter.radius,), labels=False)
@@ -77,6 +77,18 @@ def test_what_is_heard_of_a_recording_is_what_the_run_heard(own):
         for caller, row in enumerate(his.direct.tolist()):
             assert (mine.direct[caller] < 0) == (row < 0)
     assert agreeing(log.scans[0], run[1], 1e-6, 1e-6) == 0, "another frame is another"
+
+
+def test_what_is_heard_under_water_is_what_the_run_heard(tmp_path):
+    harbour = str(Path(__file__).parents[3] / "examples" / "harbour.toml")
+    folder = record(tmp_path / "tape", "--settings", harbour)
+    medium = read_description(folder).medium
+    assert (medium["name"], medium["salinity"]) == ("water", 30.0)
+    assert medium["speed_of_sound"] == read_description(folder).speed_of_sound > 1400.0
+    log, run = heard(folder)[0], frames_of_run([harbour])
+    rows = sum(scan.bearing.size for scan in run)
+    assert rows > 100
+    assert sum(agreeing(a, b, 1e-6, 1e-6) for a, b in zip(log.scans, run, strict=True)) >= rows - 2
 
 
 def test_the_log_of_a_recording_is_read_as_it_was_heard(own, tmp_path):

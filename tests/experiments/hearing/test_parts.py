@@ -8,7 +8,7 @@ import pytest
 from pipistrelle.acoustics.arrivals import Arrivals, arrivals_of_emissions
 from pipistrelle.acoustics.call import ToneBurst
 from pipistrelle.acoustics.callers import VEHICLE, callers_of
-from pipistrelle.acoustics.medium import Medium
+from pipistrelle.acoustics.medium import Medium, medium_of
 from pipistrelle.acoustics.target import SHAPES, Bodies, Shape
 from pipistrelle.arrays.layout import Layout, layout_of
 from pipistrelle.arrays.receiver import add_echo_blocks, noise_blocks, record_samples
@@ -18,6 +18,7 @@ from pipistrelle.config import (
     AssumedConfig,
     BeaconConfig,
     Config,
+    EmitterConfig,
     InputError,
     ReceiverConfig,
     ScenarioConfig,
@@ -216,6 +217,51 @@ def test_a_mission_in_another_medium_ranges_where_the_front_end_assumes_its_spee
     errors = np.concatenate(errors)
     assert errors.size > 20
     assert np.median(np.abs(errors)) < 0.25, "a tenth of a call, 2 m long"
+
+
+def test_a_data_sheet_in_the_settings_gives_the_echo_of_the_sonar_equation():
+    source, strength, density, length = 170.0, -20.0, 55.0, 1e-3  # dB re 1 uPa and its like [s]
+    rate, tone, still = 500e3, 150e3, np.zeros((1, 2))
+    config = Config(
+        scenario=ScenarioConfig(medium="water"),
+        emitter=EmitterConfig(frequency=tone, pulse=length, level_db=source + strength),
+        receiver=ReceiverConfig(
+            sample_rate=rate, noise_level_db=density + 10.0 * np.log10(rate), spacing=0.005
+        ),
+    )
+    way = 1490.0 * 67 * BLOCK  # its delay is nearly a whole number of blocks
+    post, callers = np.array([[0.5 * way, 0.0]]), callers_of(config, np.zeros(2))[:1]
+    heard, _ = arrivals_of_emissions(np.zeros((1, 3)), still, post, callers, config)
+    settled, layout = sampling(config, callers), layout_of(config)
+    signal = np.zeros((80, 4, 1, 10), dtype=complex)
+    add_echo_blocks(signal, heard, layout, settled)
+    grid = {"pulse": settled.pulse, "block": settled.block, "noise_std": settled.noise_std}
+    above = 20.0 * np.log10(np.abs(filter_blocks(signal, **grid)[:, 0]).max())
+    absorbed = way * medium_of(config.water).absorption_db_per_m(tone)
+    expected = source + strength - 40.0 * np.log10(0.5 * way) - absorbed - density - 30.0
+    assert above == pytest.approx(expected, abs=0.05)
+
+
+def test_a_mission_in_water_ranges_by_the_sound_in_water_and_not_by_that_in_air():
+    setup = ScenarioConfig(medium="water", steps=40)
+    wet = Config(scenario=setup, emitter=EmitterConfig(pulse=6e-4))
+    deceived = wet.model_copy(update={"assumed": AssumedConfig(speed_of_sound=343.0)})
+    world, off = world_of(wet), []
+    for config in (wet, deceived):
+        (heard,) = listen(world, config, (0.0088,))
+        rows = [
+            (frame.rows, world.path[np.searchsorted(world.time, frame.rows.time)])
+            for frame in heard
+        ]
+        errors = [
+            row.range[i] - np.hypot(*(world.landmarks[row.landmark[i] - 1] - place[:2]))
+            for row, place in rows
+            for i in np.flatnonzero((row.caller == VEHICLE) & (row.landmark <= 50))
+        ]
+        assert len(errors) > 20
+        off.append(np.median(np.abs(errors)))
+    assert off[0] < 0.1, "a fifth of a call, 0.45 m long"
+    assert off[1] > 3.0
 
 
 @pytest.fixture

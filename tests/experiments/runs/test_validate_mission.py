@@ -15,6 +15,8 @@ from pipistrelle.config import (
     EmitterConfig,
     InputError,
     ReceiverConfig,
+    ScenarioConfig,
+    WaterConfig,
 )
 from pipistrelle.experiments import machine
 from pipistrelle.experiments.runs import validate_mission
@@ -58,6 +60,21 @@ def test_a_lobe_beyond_what_is_scanned_confuses_nobody():
 def test_cold_air_makes_half_a_wave_shorter():
     (warning,) = warnings_of(Config(air=AirConfig(temperature_c=5.0)))
     assert "0.51 of a wave at emitter.frequency (35000 Hz)" in warning
+
+
+def test_what_is_left_from_air_is_named_in_water():
+    water = ScenarioConfig(medium="water")
+    deaf, close = warnings_of(Config(scenario=water))
+    assert deaf.startswith("emitter.pulse: nothing nearer than 2.1 m is heard")  # c T / 2
+    assert "rays.range_bounds begin at 0.5 m" in deaf
+    assert close.startswith("receiver.spacing: 0.0049 m is 0.12 of a wave in water")
+    assert "4.3 times as coarse as of half a wave (0.021 m)" in close
+    (idle,) = warnings_of(Config(water=WaterConfig(depth=3.0)))
+    assert idle.startswith('water.depth: counts for nothing where scenario.medium is "air"')
+    cold = warnings_of(Config(scenario=water, air=AirConfig(temperature_c=5.0)))
+    assert [line.split(":")[0] for line in cold[:1]] == ["air.temperature_c"]
+    fits = {"emitter": EmitterConfig(pulse=6e-4), "receiver": ReceiverConfig(spacing=0.0212)}
+    assert warnings_of(Config(scenario=water, **fits)) == ()
 
 
 def test_a_tone_that_real_samples_cannot_hold_is_named_with_what_they_hold():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipistrelle.acoustics.emitter import beamwidth
-from pipistrelle.config import Config
+from pipistrelle.config import Config, WaterConfig
 from pipistrelle.detection.scans import with_columns
 from pipistrelle.evaluation.bound import nees_of_exact_start, pose_bound
 from pipistrelle.evaluation.consistency import nees
@@ -146,6 +146,7 @@ OTHERS = {
     "seed": 8,
     "callers": [{}, {"frequency": 25e3}],
     "scenario.vehicle": 2,
+    "scenario.medium": "water",
     "scenario.steps": 24,
     "scenario.step": 0.1,
     "scenario.steps_per_frame": 5,
@@ -166,6 +167,12 @@ OTHERS = {
     "air.relative_humidity": 0.1,
     "air.pressure_kpa": 80.0,
     "air.spreading": "bistatic",
+    "water.speed_of_sound": 1500.0,
+    "water.temperature_c": 20.0,
+    "water.salinity": 0.0,
+    "water.depth": 100.0,
+    "water.ph": 7.0,
+    "water.spreading": "paper",
     "target.shape": "sphere",
     "target.radius": 0.05,
     "emitter.call": "sweep",
@@ -249,7 +256,8 @@ OTHERS = {
     "fastslam.resampled_rays": "restart",
 }
 """Another value of every setting, far enough from its default to be heard or believed."""
-FEW = ("air.spreading", "target.shape", "emitter.radius", "beacon.level_db", "receiver.elements",
+FEW = ("air.spreading", "water.spreading", "target.shape", "emitter.radius", "beacon.level_db",
+       "receiver.elements",
        "detection.peak_db", "matching.bearing_gate", "motion.speed_std", "scenario.landmarks",
        "assumed.wheelbase", "listening.timing", "callers",
        "filter.range_std", "prior.wheelbase_std", "rays.power", "fastslam.particles",
@@ -271,11 +279,13 @@ def test_the_settings_that_are_varied_here_are_all_there_are():
     assert {name.split(".")[0] for name in FEW} == set(Config.model_fields) - others
 
 
+WATER = {"scenario": {"medium": "water"}}
 ROAMING = {"listening": {"timing": True}, "callers": [{"course": "circle", "radius": 5.0}]}
 NEEDS = {
     **{f"emitter.{name}": {"emitter": {"call": "sweep"}} for name in ("sweep", "band")},
     **{f"beacon.{name}": {"beacon": {"call": "sweep"}} for name in ("sweep", "band")},
     "scenario.vehicle": {"callers": [{"course": "mission"}]},
+    **dict.fromkeys((f"water.{name}" for name in WaterConfig.model_fields), WATER),
     "scenario.extent": {"scenario": {"course": "eight"}},
     "scenario.lane": {"scenario": {"field": "rows"}},
     "motion.angular_rate_std": {"motion": {"model": "unicycle"}},

@@ -390,7 +390,7 @@ def _check_apart(callers: Sequence[Caller], around: Surroundings, where: str) ->
 
 def _check_speed(key: str, one: CallerConfig, config: Config) -> None:
     """Refuse a caller that would outrun its own sound."""
-    c = config.air.sound_speed
+    c = config.medium.sound_speed
     for name, most in (("speed", c), ("speed_std", c / 5.0)):
         speed = getattr(one, name)
         if speed is not None and not abs(speed) < most:

@@ -64,9 +64,9 @@ def frames_of(
 ) -> Iterator[Frame]:
     """Yield the arrivals in each frame of a path, for pistons of several radii [m].
 
-    `medium`: the air of the settings by default.
+    `medium`: that of the settings by default.
     """
-    setup, medium = config.scenario, medium or medium_of(config.air)
+    setup, medium = config.scenario, medium or medium_of(config.medium)
     calls = calls_heard(scenario, setup, medium.speed_of_sound)
     begin = scenario.time[setup.steps_per_frame :: setup.steps_per_frame]
     world = with_times(scenario, [call.time for call in calls]) if calls else scenario

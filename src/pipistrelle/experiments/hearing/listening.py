@@ -80,7 +80,7 @@ def listen(
     call : callable
         Makes the `Call` of each caller that has none, of its frequency [Hz] and duration [s].
     medium : Medium, optional
-        What the sound travels through; the air of the settings by default. The front end goes on
+        What the sound travels through; that of the settings by default. The front end goes on
         assuming ``assumed.speed_of_sound``.
     find : callable
         Finds calls in the matched filter's output, as `find_calls` does.

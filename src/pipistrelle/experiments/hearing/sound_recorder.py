@@ -180,7 +180,8 @@ class SoundRecorder:
         """Return ``recording.toml`` without the log's part."""
         config, labels = self.config, caller_labels(scenario).tolist()
         own, *others = scenario.callers
-        air = config.air.model_dump(exclude_none=True) | {"speed_of_sound": config.air.sound_speed}
+        medium = config.medium.model_dump(exclude_none=True)
+        medium |= {"speed_of_sound": config.medium.sound_speed}  # given or not
         return {
             "format": 1,
             "sound": [SOUND_FILE],
@@ -190,7 +191,7 @@ class SoundRecorder:
             "scale": self.scale * (1.0 if self.bits == 32 else 32768.0 / 32767.0),
             "speed_of_sound": config.assumed_sound_speed,
             "one_centre": config.receiver.array == SQUARE,
-            "medium": {"name": "air", **air},
+            "medium": {"name": config.scenario.medium, **medium},
             "call": {
                 "frequency": own.frequency,
                 "duration": config.emitter.pulse,

@@ -12,7 +12,7 @@ from pipistrelle.acoustics.callers import VEHICLE, Caller, callers_of, moves
 from pipistrelle.arrays.layout import Scattered, layout_of
 from pipistrelle.arrays.pattern import pattern_of
 from pipistrelle.arrays.sampling import off_raster, sampling
-from pipistrelle.config import Config, InputError
+from pipistrelle.config import SQUARE, Config, InputError
 from pipistrelle.detection.front_end import front_end
 from pipistrelle.experiments.hearing.scenario import Scenario, world_of
 from pipistrelle.experiments.hearing.world import ALL_DRAWN, World
@@ -21,6 +21,8 @@ from pipistrelle.kernel_clock import judging
 
 MANY_DOUBLES = 0.1
 """Share of the bearings with a double from which on a warning is given."""
+CLOSEST = 0.25
+"""Spacing of hydrophones below which they warn, in waves."""
 
 
 @judging()
@@ -59,6 +61,8 @@ def checked_scenario(
 def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ...]:
     r"""Warn of a receiver whose spacing makes bearings ambiguous, or whose sampling aliases tones.
 
+    In water also of what fits air: a call that is deaf too far, and hydrophones too close.
+
     Elements a distance d apart cannot tell the angle :math:`\theta` off their normal from another,
     the grating lobe,
 
@@ -83,10 +87,10 @@ def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ..
     warnings = _cost(config, callers)
     for caller in callers:
         frequency, key = caller.frequency, caller.key or caller.name
-        tone, wave = f"{key}.frequency ({frequency:g} Hz)", config.air.sound_speed / frequency
+        tone, wave = f"{key}.frequency ({frequency:g} Hz)", config.medium.sound_speed / frequency
         nearest = wave / spacing - math.sin(math.radians(limit))  # its lobe lies at the limit
         if isinstance(layout, Scattered):
-            warnings += _doubles(layout, frequency, tone, config.air.sound_speed)
+            warnings += _doubles(layout, frequency, tone, config.medium.sound_speed)
         elif nearest < 1.0 and caller.sound is None:  # a band's delays tell the lobe
             warnings.append(
                 f"receiver.spacing: {spacing:g} m is {spacing / wave:.2f} of a wave at {tone}: "
@@ -99,7 +103,45 @@ def warnings_of(config: Config, callers: Sequence[Caller] = ()) -> tuple[str, ..
                 f"receiver.sample_rate: {rate:g} Hz is less than twice {tone}: real samples would "
                 f"hold it as {abs(frequency - rate * round(frequency / rate)):g} Hz; expected more"
             )
-    return tuple(warnings)
+    return (*warnings, *_of_the_other_medium(config))
+
+
+def _of_the_other_medium(config: Config) -> list[str]:
+    """Warn of settings that count in the other medium alone, and in water of those that suit air.
+
+    >>> from pipistrelle.config import WaterConfig
+    >>> config = Config(water=WaterConfig(salinity=0.0))
+    >>> print(_of_the_other_medium(config)[0])
+    water.salinity: counts for nothing where scenario.medium is "air"; expected it to be "water"
+    """
+    medium = config.scenario.medium
+    other = "air" if medium == "water" else "water"
+    warnings = [
+        f'{other}.{name}: counts for nothing where scenario.medium is "{medium}"; expected it to '
+        f'be "{other}"'
+        for name in getattr(config, other).model_dump(exclude_defaults=True)
+    ]
+    return warnings + (_left_from_air(config) if medium == "water" else [])
+
+
+def _left_from_air(config: Config) -> list[str]:
+    """Warn of settings that suit sound in air, and not the longer waves and ways of water."""
+    pulse, spacing, c = config.emitter.pulse, config.receiver.spacing, config.medium.sound_speed
+    nearest, deaf = config.rays.range_bounds[0], 0.5 * c * pulse
+    wave, warnings = c / config.emitter.centre, []
+    if deaf > nearest:
+        warnings.append(
+            f"emitter.pulse: nothing nearer than {deaf:.2g} m is heard, for a call of {pulse:g} s "
+            f"is that long in water; rays.range_bounds begin at {nearest:g} m: expected a shorter "
+            "call, or a greater range"
+        )
+    if config.receiver.array == SQUARE and spacing < CLOSEST * wave:
+        warnings.append(
+            f"receiver.spacing: {spacing:g} m is {spacing / wave:.2f} of a wave in water at "
+            f"{config.emitter.centre:g} Hz: bearings are "
+            f"{0.5 * wave / spacing:.1f} times as coarse as of half a wave ({wave / 2.0:.2g} m)"
+        )
+    return warnings
 
 
 def _cost(config: Config, callers: Sequence[Caller]) -> list[str]:
@@ -136,7 +178,7 @@ def _refuse_supersonic(scenario: Scenario, config: Config) -> None:
     def fastest(path: np.ndarray) -> float:
         return np.hypot(*np.diff(path, axis=0).T).max(initial=0.0) / config.scenario.step
 
-    speed, c = fastest(scenario.path[:, :2]), config.air.sound_speed
+    speed, c = fastest(scenario.path[:, :2]), config.medium.sound_speed
     for caller in scenario.callers[VEHICLE + 1 :]:
         if moves(caller) and not (his := fastest(np.asarray(caller.place))) < c:
             raise InputError(

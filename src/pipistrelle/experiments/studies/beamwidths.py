@@ -80,5 +80,5 @@ def _radius(where: str, width: Any, config: Config) -> float:
     if not number or not isfinite(width) or not 0.0 < width <= 180.0:
         expected = "degrees above 0 and up to 180, the widest beam of a back-baffled piston"
         raise refusal(where, shown(width), expected, "correct the value")
-    tone = {"frequency": config.emitter.centre, "speed_of_sound": config.air.sound_speed}
+    tone = {"frequency": config.emitter.centre, "speed_of_sound": config.medium.sound_speed}
     return float(DIGITS.create_decimal_from_float(float(piston_radius(radians(width), **tone))))

@@ -157,11 +157,11 @@ def sweep(folder: Path, iterations: Iterable[int]) -> None:
 def _plan_sum(plan: Plan) -> str:
     """Return the SHA-256 of all on which a plan's worlds depend; defaults are left out."""
     config = plan.config.model_dump(mode="json", exclude_defaults=True)
-    air = config.pop("air", {})
-    air["speed_of_sound"] = plan.config.air.sound_speed  # given or not
+    medium = config.pop(plan.config.scenario.medium, {})
+    medium["speed_of_sound"] = plan.config.medium.sound_speed  # given or not
     grid = {name: list(values) for name, values in plan.grid.items()}
     own = {name: dict(settings) for name, settings in plan.own.items()}
-    parts = [plan.strategies, plan.filters, config, air, grid, *([own] if own else [])]
+    parts = [plan.strategies, plan.filters, config, medium, grid, *([own] if own else [])]
     text = json.dumps(parts, sort_keys=True)
     return sha256(text.encode()).hexdigest()
 

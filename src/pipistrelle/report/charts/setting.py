@@ -94,7 +94,7 @@ def _where(study: Study) -> str:
 
 def _beam(config: Config, width: float, strength: float) -> list[Series]:
     """Return a beam's outline and, where it has half its power, a dot that tells its numbers."""
-    tone = {"frequency": config.emitter.centre, "speed_of_sound": config.air.sound_speed}
+    tone = {"frequency": config.emitter.centre, "speed_of_sound": config.medium.sound_speed}
     half = np.radians(np.array([width])) / 2.0
     radius = float(piston_radius(np.radians(width), **tone))
     name, angle = width_name(width), np.radians(np.linspace(-90.0, 90.0, 361))
