@@ -58,6 +58,7 @@ def test_the_help_of_slam_leaves_out_what_a_log_decides(obey):
         *(f"--filter.{name}" for name in ("calibrate", "window")),
         *(f"--prior.{name}-std" for name in ("speed-scale", "turn-bias", "wheelbase")),
         *(f"--prior.{name}-std" for name in ("speed-of-sound", "sensor-heading", "sensor-place")),
+        "--prior.time-offset-std",
         *(f"--filter.caller-{name}-std" for name in ("speed", "walk")),
         *(f"--rays.{name}" for name in rays),
         *(f"--fastslam.{name}" for name in swarm),

@@ -546,8 +546,8 @@ def test_hearing_more_never_raises_the_bound(bounded):
 def test_twice_the_noise_that_the_signal_tells_raises_the_bound_and_no_constant_does(
     plan, monkeypatch
 ):
-    def doubled(rows, settings, *, timing):
-        rows = without_hidden(rows, settings, timing=timing)
+    def doubled(rows, settings, **options):
+        rows = without_hidden(rows, settings, **options)
         more = {name: 2.0 * getattr(rows, name) for name in ("bearing_std", "range_std")}
         return with_columns(rows, **more)
 
