@@ -226,6 +226,17 @@ def test_absorption_of_four_seas_is_within_a_tenth_of_ainslies_and_mccolms(
     assert np.abs(ours / theirs - 1.0).max() < 0.1
 
 
+@pytest.mark.parametrize(
+    ("temperature", "fitted"),
+    [(0.0, 4.92700598), (10.0, 3.10935008), (20.0, 2.18550989), (30.0, 1.65777741)],
+)
+def test_absorption_of_fresh_water_is_within_a_hundredth_of_pinkertons(temperature, fitted):
+    # Pinkerton, Proc. Phys. Soc. B 62 (1949), 129, of distilled water, as k-Wave fits it: dB/km at
+    # 100 kHz, by the tests of github.com/waltsims/k-wave-python, for 1 MHz and a hundredth of it.
+    lake = SEA | {"salinity": 0.0, "temperature_c": temperature}
+    assert 1e3 * float(water_absorption_db_per_m(100e3, **lake)) == pytest.approx(fitted, rel=0.01)
+
+
 @given(frequency=st.floats(1e3, 1e6), temperature=st.floats(-2.0, 35.0))
 @law
 def test_fresh_water_absorbs_as_the_square_of_the_frequency(frequency, temperature):
