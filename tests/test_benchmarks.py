@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from benchmarks import __main__ as bench
-from benchmarks import growth, peer, programs, stages, study
+from benchmarks import callers, growth, peer, programs, robot, stages, study
 from benchmarks.promises import PROMISES, REQUIRED, row
 from benchmarks.table import HEADINGS, cells, grown, markdown, met, plain, read, rows_of, write
 
@@ -50,6 +50,10 @@ def measured_nothing(monkeypatch, tmp_path):
     monkeypatch.setattr(study, "answer", lambda *_: shares)
     monkeypatch.setattr("benchmarks.machine.yardstick", lambda: 0.002)
     monkeypatch.setattr(peer, "find_spec", lambda name: None)
+    sound = {"ratio": 1.9, "floor": 2.5, "noise": 2.1, "echoes": 4.9}
+    monkeypatch.setattr(callers, "answer", lambda *_: sound)
+    loops = {f"{name} {n}": [1.0, 2.0, 3.0] for name in robot.ESTIMATORS for n in robot.LANDMARKS}
+    monkeypatch.setattr(robot, "answer", lambda *_: loops)
     monkeypatch.setattr(programs, "_wall", lambda *_, **__: 2.0)
     monkeypatch.setattr(programs, "_run", lambda rounds: 4.0)
     monkeypatch.setattr(bench, "ROOT", tmp_path)

@@ -218,7 +218,10 @@ def test_a_length_of_time_is_worded_in_the_unit_that_fits(seconds, words):
             "small.toml --iterations 1000000000000",
             "--iterations: found 1000000000000, expected 1 to",
         ),
-        ("small.toml --emitter.frequency 3", "emitter.frequency: found 3 Hz, expected a multiple"),
+        (
+            "small.toml --receiver.engine block --emitter.frequency 3",
+            "emitter.frequency: found 3 Hz, expected a multiple",
+        ),
         ("small.toml --emit pbs", 'Invalid value "pbs" for --emit'),
         ("small.toml --emitter.radius 0.01", "--emitter.radius: the plan varies this setting"),
         ("small.toml --rays.power 0", "--rays.power: found 0.0, expected greater than 0"),
@@ -247,7 +250,8 @@ def test_every_case_of_a_plan_is_checked_before_the_first_world(obey):
 
 
 def test_no_job_script_is_written_for_a_plan_that_every_job_would_refuse(obey):
-    status, printed, said = obey("small.toml", "--emit", "slurm", "--emitter.frequency", "3")
+    odd = "--receiver.engine", "block", "--emitter.frequency", "3"
+    status, printed, said = obey("small.toml", "--emit", "slurm", *odd)
     assert (status, printed) == (2, "")
     assert "emitter.frequency: found 3 Hz" in said
 

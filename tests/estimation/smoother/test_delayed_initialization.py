@@ -12,7 +12,7 @@ from pipistrelle.estimation.smoother.delayed_initialization import (
     MIN_CROSSING_ANGLE,
     range_by_crossing,
 )
-from pipistrelle.estimation.smoother.elimination import Rows
+from pipistrelle.estimation.smoother.elimination import Places, Rows
 from pipistrelle.estimation.smoother.filter import Smoother
 from pipistrelle.experiments.drives import Drive
 from pipistrelle.experiments.runs.filtering import run_filter
@@ -38,9 +38,10 @@ def crossing(poses, heard):
     ends, numbers = np.zeros((rows, 4), np.int64), np.full((rows, 8), np.nan)
     ends[:, 2], ends[:, 3] = [one.node for one in heard], np.arange(rows) - 1
     numbers[:, 0], numbers[:, 3] = np.array(heard)[:, 1:].T
-    away = range_by_crossing(
-        Rows(ends, numbers), rows - 1, (poses, np.zeros(1)), np.zeros(3, np.int64)
-    )
+    none, known = np.zeros(0, np.int64), np.zeros(4, np.int64)
+    way = np.zeros((len(poses), 3)), np.zeros(len(poses))
+    places = Places(none, none, np.zeros((0, 2)), known, *way)
+    away = range_by_crossing(Rows(ends, numbers), rows - 1, (poses, np.zeros(1)), places)
     x, y, heading = poses[heard[-1].node]
     angle = heading + heard[-1].bearing
     return (
