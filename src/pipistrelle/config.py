@@ -113,7 +113,7 @@ class ScenarioConfig(Section):
     world: Annotated[str, Field(min_length=1)] | None = Field(None, json_schema_extra=FOLDER)
     """Folder of a world of one's own; what it leaves open is drawn as the rest says."""
     medium: Literal["air", "water"] = "air"
-    """What the sound travels through: as section `air` says, or section `water`."""
+    """Medium of the sound; the section of that name describes it."""
     steps: Count = 1500
     """Control steps."""
     step: Annotated[Positive, Field(le=LONGEST_STEP)] = 0.125
@@ -222,14 +222,14 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class CallConfig(Section):
-    """What is sent: a tone, a sweep or a recording."""
+    """The call: a tone, a sweep or a recording."""
 
     call: CallName = Field(TONE, json_schema_extra=CALL)
     """A `tone`, a `sweep`, or a WAV file of one's own, as long as the call at most."""
     sweep: Sweep = "linear"
-    """Of a sweep, what is linear in time: its frequency, or, `hyperbolic`, its period."""
+    """Law of a sweep: its frequency is linear in time, or, `hyperbolic`, its period is."""
     band: Band = (60e3, 35e3)
-    """Of a sweep, the frequency at which it begins and that at which it ends [Hz]."""
+    """First and last frequency of a sweep [Hz]."""
     taper: Share = 0.0
     """Share of the call in which it rises and falls as a cosine does: 0 switches it on and off, 1
     is Hann's window, between them Tukey's. A file has what it has."""
@@ -259,7 +259,7 @@ class BeaconConfig(CallConfig):
     """The omnidirectional beacon's call; where callers are listed, what the first leaves open."""
 
     band: Band = (28e3, 18e3)
-    """Of a sweep, the frequency at which it begins and that at which it ends [Hz]."""
+    """First and last frequency of a sweep [Hz]."""
     frequency: Positive = 30e3
     """Tone of the call, or where a file's band lies; a sweep has its band [Hz]."""
     level_db: Level = 42.8
@@ -289,7 +289,7 @@ class CallerConfig(Section):
     name: Annotated[str, Field(pattern=r"^\w[\w-]*$", max_length=40)] | None = None
     """In messages, figures and files; else `beacon` of the first, `caller2` of the second."""
     call: CallName | None = None
-    """What it calls, as `emitter.call`; else, of the first, as the beacon, of others a tone."""
+    """Its call, as `emitter.call`; else the first calls as the beacon, others send a tone."""
     sweep: Sweep | None = None
     """As `emitter.sweep`; else the beacon's."""
     band: Band | None = None
@@ -623,7 +623,7 @@ class PriorConfig(Section):
     sensor_place_std: DistanceStd = 0.1
     """Of the sensor, ahead and to the left of the vehicle's point, each [m]."""
     time_offset_std: Annotated[Positive, Field(le=10)] = 0.1
-    """Of how late the sensor's clock is, by the odometry's [s]."""
+    """Of the delay of the sensor's clock behind the odometry's [s]."""
 
 
 def _check_rising(near: float, far: float) -> None:

@@ -32,7 +32,7 @@ class RecordedCall:
     duration: float
     """Length, silence included [s]."""
     rate: float
-    """Of the file [Hz]."""
+    """Sample rate of the file [Hz]."""
     samples: Float[np.ndarray, " n"]
     """As the file has them."""
     _envelope: "CubicSpline" = field(init=False, repr=False)

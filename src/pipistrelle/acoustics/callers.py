@@ -51,7 +51,7 @@ class Caller:
     calls: Float[np.ndarray, " m"] | None = None
     """Rising times of its calls [s]; None of one that calls when the vehicle does."""
     sound: Call | None = None
-    """What it calls; None is a tone."""
+    """The call; None is a tone burst."""
 
 
 def callers_of(config: Config, beacon: Float[np.ndarray, "2"]) -> tuple[Caller, Caller]:

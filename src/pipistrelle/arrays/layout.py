@@ -32,6 +32,10 @@ class Layout:
         """Faces and elements of each, as a recording has them."""
         return self.normal.size, self.position.size
 
+    def members(self, g: int) -> tuple[int, Int[np.ndarray, " k"]]:
+        """Return the row of a recording that a face is in, and which microphones of it it has."""
+        return g, np.arange(self.position.size)
+
     def phases(
         self,
         angle: Float[np.ndarray, "*n"] | float,
@@ -77,6 +81,10 @@ class Scattered:
     def shape(self) -> tuple[int, int]:
         """One row of elements, as a recording has them."""
         return 1, len(self.position)
+
+    def members(self, g: int) -> tuple[int, Int[np.ndarray, " k"]]:
+        """Return the row of a recording that a group is in, and which microphones of it it has."""
+        return 0, np.flatnonzero(self.group == g)
 
     def lead(self, bearing: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n e"]:
         """Return how far the microphones are on the way of sound from a bearing [rad], in metres.
@@ -187,7 +195,7 @@ def square_microphones(receiver: ReceiverConfig) -> Microphones:
 
 def along_line(layout: Scattered, g: int) -> tuple[Int[np.ndarray, " k"], Layout]:
     """Return a line's microphones from right to left, and it alone as a layout."""
-    members = np.flatnonzero(layout.group == g)
+    _, members = layout.members(g)
     left = np.array([-np.sin(layout.normal[g]), np.cos(layout.normal[g])])
     along = layout.position[members] @ left
     order = np.argsort(along)

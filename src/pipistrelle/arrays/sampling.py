@@ -156,7 +156,7 @@ def _keys(callers: Sequence[Caller]) -> list[str]:
 
 
 def _refuse_undersampled(config: Config, callers: Sequence[Caller], calls: Sequence[Call]) -> None:
-    """Refuse rates that do not hold the calls, and calls that cannot be told apart."""
+    """Refuse sample rates too low for a call, and calls that cannot be told apart."""
     rate = config.receiver.sample_rate
     if not LEAST_RATE <= rate <= LARGEST_RATE:
         raise InputError(

@@ -52,7 +52,7 @@ class Groups:
     finders: tuple[Detector | Circle, ...]
     """The finder of each group; of a line on a face it is a `Detector`."""
     centre: Float[np.ndarray, "f 2"]
-    """Point of each line at which its delays are told; the origin for other groups [m]."""
+    """Phase centre of each line; the origin for other groups [m]."""
     speed_of_sound: float
     """Speed of sound [m/s]."""
     least_snr: float
@@ -72,7 +72,7 @@ class Mixed:
     silent: bool
     """Whether the vehicle sends no tone."""
     wide: tuple[tuple[int, int, Int[np.ndarray, " k"], Wide], ...]
-    """Of each other call and group of microphones: caller, group, the microphones, finder."""
+    """Finders of the other calls: caller, group, the group's microphones, finder."""
     row: tuple[int, ...]
     """Row of the outputs in which the microphones of each of these are."""
     talk: Float[np.ndarray, "c c"]
@@ -115,7 +115,7 @@ def front_end(
     centre = np.zeros((layout.normal.size, 2))
     for g, normal in enumerate(layout.normal):
         if math.isnan(normal):
-            members.append(np.flatnonzero(layout.group == g))
+            members.append(layout.members(g)[1])
             _refuse_lines_own(config, where)
             wavelength = config.assumed_sound_speed / tones.max()
             _refuse_far_apart(layout.position[members[-1]], wavelength, where)
@@ -205,14 +205,12 @@ def _mixed(
     narrow = np.unique(np.append(0, np.flatnonzero(is_tone)))
     talk = cross_talk(calls, config.receiver.sample_rate)
     np.fill_diagonal(talk, 0.0)
-    wide, row, snrs = [], [], []
+    wide, rows, snrs = [], [], []
     for caller in np.flatnonzero(~is_tone):
         for g in range(layout.normal.size):
             finder = wide_of(config, layout, g, calls, int(caller))
-            if isinstance(layout, Layout):
-                place, row = np.arange(layout.shape[1]), [*row, g]
-            else:
-                place, row = np.flatnonzero(layout.group == g), [*row, 0]
+            row, place = layout.members(g)
+            rows.append(row)
             wide.append((int(caller), g, place, finder))
             snrs.append((finder.threshold - 1.0) / place.size)
     config = _leaking(config, [call for call in calls if isinstance(call, ToneBurst)])
@@ -224,7 +222,7 @@ def _mixed(
         narrow=narrow,
         silent=not is_tone[0],
         wide=tuple(wide),
-        row=tuple(row),
+        row=tuple(rows),
         talk=talk,
         least_snr=float(min(snrs)),
     )

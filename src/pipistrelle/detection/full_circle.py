@@ -95,7 +95,7 @@ def circle_of(
     config: Config, layout: Scattered, group: int, tones: Float[np.ndarray, " c"]
 ) -> Circle:
     """Settle threshold and scan of a group of microphones that hear all around."""
-    members, c = np.flatnonzero(layout.group == group), config.assumed_sound_speed
+    (_, members), c = layout.members(group), config.assumed_sound_speed
     gain = layout.amplitude[members]
     position, weight = layout.position[members], gain / np.linalg.norm(gain)
     bearing = np.linspace(-np.pi, np.pi, 3600, endpoint=False)

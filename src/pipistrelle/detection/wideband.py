@@ -51,12 +51,12 @@ from jaxtyping import Complex, Float, Int
 from pipistrelle.acoustics.call import Call, coupling
 from pipistrelle.arrays.bands import Band, band_of, lag_step, replica
 from pipistrelle.arrays.layout import Layout, Scattered
-from pipistrelle.arrays.pattern import UNKNOWN
+from pipistrelle.arrays.pattern import UNKNOWN, spread_towards
 from pipistrelle.config import Config
 from pipistrelle.detection.certainty import bearing_std, loudest_noise, over_noise
 from pipistrelle.detection.direct import Lags
 from pipistrelle.detection.full_circle import BEAM_STEP, RARE, loudest_by_chance
-from pipistrelle.geometry import wrap_angle
+from pipistrelle.geometry import wrap, wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 TAPS, PARTS, BETA = 12, 256, 8.0
@@ -112,7 +112,7 @@ def wide_of(
     limit = math.radians(config.detection.scan_limit_deg)
     fine = np.linspace(-np.pi, np.pi, 3601) if around else normal + np.linspace(-limit, limit, 1801)
     wave = math.hypot(2.0 * np.pi * band.centre, band.spread) / c
-    slope = wave * np.sqrt(_spread(fine, position, weight))
+    slope = wave * np.sqrt(spread_towards(fine, position, weight))
     looks = np.concatenate(([0.0], np.cumsum(0.5 * (slope[1:] + slope[:-1]) * np.diff(fine))))
     count = max(math.ceil(looks[-1] / BEAM_STEP), 8) + (0 if around else 1)
     even = np.linspace(0.0, looks[-1], count + 1 if around else count)
@@ -150,13 +150,13 @@ def find_wide(
     turn = np.exp(-2j * np.pi * wide.band.centre * lags.interval * np.arange(len(matched)))
     silence = np.zeros((TAPS + _margin(wide, lags.interval), matched.shape[1]), complex)
     slow = np.concatenate((silence, matched * turn[:, np.newaxis], silence))
-    numbers = _rows(slow, len(silence), peaks, _Beam(*wide[:-1]), lags.interval, _SINC)
+    numbers = _rows(slow, len(silence), peaks, wide, lags.interval, _SINC)
     delay, bearing = numbers[:2]
     ahead = wide.middle[0] * np.cos(bearing) + wide.middle[1] * np.sin(bearing)
     numbers[0] = lags.start + delay + ahead / wide.speed_of_sound
     if math.isnan(wide.normal):
         return numbers
-    numbers[5] = (bearing - wide.normal + np.pi) % (2.0 * np.pi) - np.pi
+    numbers[5] = wrap(bearing - wide.normal)
     return numbers[:, np.abs(np.sin(numbers[5])) <= wide.sine_limit]
 
 
@@ -169,21 +169,11 @@ def _microphones(
         left = np.array([-math.sin(normal), math.cos(normal)])
         place, gain = np.outer(layout.position, left), np.ones(layout.position.size)
     else:
-        members = layout.group == group
+        _, members = layout.members(group)
         place, gain = layout.position[members], layout.amplitude[members]
     weight = gain / np.linalg.norm(gain)
     middle = weight**2 @ place
     return normal, place - middle, weight, middle
-
-
-def _spread(
-    bearing: Float[np.ndarray, " n"],
-    position: Float[np.ndarray, "k 2"],
-    weight: Float[np.ndarray, " k"],
-) -> Float[np.ndarray, " n"]:
-    """Return the weighted mean square of the places across bearings [m^2]."""
-    across = np.stack((-np.sin(bearing), np.cos(bearing))).T @ position.T
-    return across**2 @ weight**2
 
 
 def _margin(wide: Wide, interval: float) -> int:
@@ -241,22 +231,6 @@ def _lobes_of(call: Call, wide: Wide, step: int, rate: float) -> Float[np.ndarra
             around = np.maximum(loudness[peak : peak + reach], loudness[peak : peak - reach : -1])
             most = np.maximum(most, around / loudness[peak])
     return MARGIN * np.maximum.accumulate(most[::-1])[::-1]
-
-
-class _Beam(NamedTuple):
-    """A `Wide` as kernels take it."""
-
-    threshold: float
-    loudest_noise: float
-    sine_limit: float
-    normal: float
-    bearing: Float[np.ndarray, " n"]
-    position: Float[np.ndarray, "k 2"]
-    middle: Float[np.ndarray, "2"]
-    weight: Float[np.ndarray, " k"]
-    speed_of_sound: float
-    band: Band
-    doppler_std: float
 
 
 def _sinc() -> Float[np.ndarray, "p t"]:
@@ -327,7 +301,7 @@ def _output(
     slow: Complex[np.ndarray, "l k"],
     at: float,
     bearing: float,
-    beam: _Beam,
+    beam: Wide,
     interval: float,
     sinc: Float[np.ndarray, "p t"],
 ) -> tuple[float, float]:
@@ -366,7 +340,7 @@ def _climb(
     at: float,
     bearing: float,
     step: float,
-    beam: _Beam,
+    beam: Wide,
     interval: float,
     sinc: Float[np.ndarray, "p t"],
 ) -> tuple[float, float, float]:
@@ -391,7 +365,7 @@ def _rows(
     slow: Complex[np.ndarray, "l k"],
     margin: Whole,
     peaks: Int[np.ndarray, " m"],
-    beam: _Beam,
+    beam: Wide,
     interval: float,
     sinc: Float[np.ndarray, "p t"],
 ) -> Float[np.ndarray, "6 m"]:
@@ -430,7 +404,7 @@ def _doubles(
     top: float,
     noise: float,
     step: float,
-    beam: _Beam,
+    beam: Wide,
     interval: float,
     sinc: Float[np.ndarray, "p t"],
 ) -> float:
@@ -455,7 +429,7 @@ def _doubles(
 
 
 @no_alloc
-def _geometry(bearing: float, beam: _Beam) -> tuple[float, float]:
+def _geometry(bearing: float, beam: Wide) -> tuple[float, float]:
     """Return the places' variance across a bearing [m^2], and how the bearing turns with log c."""
     cosine, sine = math.cos(bearing), math.sin(bearing)
     xx = xy = 0.0

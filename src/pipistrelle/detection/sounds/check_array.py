@@ -60,7 +60,7 @@ def _collect(frame: Frame, hearing: Hearing, heard: list[_Loudest]) -> None:
     """Keep the matched filters' outputs of the loudest echo of each group and caller."""
     found = frame.detections
     for g, loudest in enumerate(heard):
-        row, members = hearing.array.members(g)
+        row, members = hearing.array.layout.members(g)
         for caller in np.unique(found.caller):
             rows = np.flatnonzero((found.face == g) & (found.caller == caller))
             if rows.size == 0 or len(loudest.output) >= SNAPSHOTS:
@@ -92,7 +92,7 @@ def _order(hearing: Hearing, g: int, heard: _Loudest) -> Iterator[str]:
         return  # an echo's edges reach its microphones one by one
     caller, output = np.array(heard.caller), np.array(heard.output)
     beams = gain * np.exp(-2j * np.pi * hearing.blocks.tones[:, None, None] * lead)
-    row, members = hearing.array.members(g)
+    row, members = hearing.array.layout.members(g)
     count, channel = members.size, hearing.array.channel[row, members] + 1
 
     def misfit(changed: Complex[np.ndarray, "n e"]) -> float:
@@ -132,7 +132,7 @@ def _directions(
         place, gain = np.column_stack((layout.position * 0.0, layout.position)), layout.position**0
         normal = 0.0
     else:
-        members = layout.group == g
+        _, members = layout.members(g)
         place, gain = layout.position[members], layout.amplitude[members]
         place, normal = place - place.mean(axis=0), float(layout.normal[g])
     reach = np.linalg.norm(place, axis=1).max() * hearing.blocks.tones.max() / speed

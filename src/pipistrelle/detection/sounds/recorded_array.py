@@ -22,12 +22,6 @@ class RecordedArray(NamedTuple):
     face: tuple[str, ...]
     """Names of the groups of microphones that are scanned together."""
 
-    def members(self, g: int) -> tuple[int, Int[np.ndarray, " k"]]:
-        """Return the row of `channel` that a group is in, and which of it are the group's."""
-        if isinstance(self.layout, Layout):
-            return g, np.arange(self.layout.position.size)
-        return 0, np.flatnonzero(self.layout.group == g)
-
 
 def recorded_array(folder: Path, channels: int, *, one_centre: bool) -> RecordedArray:
     """Read ``array.csv`` of a recording that has some channels.
