@@ -30,10 +30,6 @@ def run(*, settings: Settings = Settings()):
 
 app(["--help"])
 """
-COMPILE = (
-    "from pipistrelle.experiments.runs.compiling import compile_kernels;"
-    "compile_kernels(['ekf'], [False])"
-)
 LIBRARIES = "import pipistrelle.experiments.runs.trial, pipistrelle.figures.mission, polars"
 COMMAND = "./dev bench --only programs"
 
@@ -67,7 +63,7 @@ def measure(rounds: int) -> tuple[list[Row], list[float]]:
             compiled,
             COMMAND,
             ratio=compiled / around_compile.seconds,
-            note="the whole process, with an empty kernel cache",
+            note="a whole `pipistrelle run`, with an empty kernel cache",
         ),
     ]
     return rows, [around_run.seconds, around_compile.seconds]
@@ -109,6 +105,7 @@ def _helps(rounds: int) -> tuple[float, float]:
 
 
 def _cold_compile() -> float:
-    """Time the compilation of the kernels of a first `pipistrelle run --settings paper` [s]."""
-    with TemporaryDirectory() as folder:
-        return _wall("-c", COMPILE, NUMBA_CACHE_DIR=folder)
+    """Time a first `pipistrelle run`, which compiles its kernels [s]."""
+    with TemporaryDirectory() as name:
+        command = ("-m", "pipistrelle", "run", "-o", str(Path(name) / "run"))
+        return _wall(*command, NUMBA_CACHE_DIR=str(Path(name) / "kernels"))

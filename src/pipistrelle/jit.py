@@ -32,14 +32,14 @@ Flag = bool | np.bool_
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
-def _compiler(**options: bool | str) -> Callable[[_Function], _Function]:
+def _compiler(*, twice: bool = True, **options: bool | str) -> Callable[[_Function], _Function]:
     """Return a decorator that compiles, and keeps what it compiled in checked files."""
     options |= {"nopython": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
     def compiled(function: Any) -> Any:
         if config.DISABLE_JIT:  # pyrefly: ignore[missing-attribute]
             return function
-        dispatcher = Kernel(function, options)
+        dispatcher = Kernel(function, options, twice=twice)
         dispatcher.enable_caching()
         return checked(dispatcher)
 
@@ -48,6 +48,9 @@ def _compiler(**options: bool | str) -> Callable[[_Function], _Function]:
 
 kernel = _compiler()
 """Compile a kernel."""
+
+optimised_once = _compiler(twice=False)
+"""Compile a large kernel of small matrices, in which little can be vectorised: a fifth faster."""
 
 no_alloc = _compiler(_nrt=False)
 """Compile a kernel that makes no array, calls none that does, and returns none to one that does.

@@ -15,12 +15,22 @@ from typing import Any
 
 from numba.core.caching import IndexDataCacheFile
 
+from pipistrelle.kernel_turns import TURN
+
 _said: set[str] = set()
 """What was said once need not be said for every kernel."""
 
 
 class CheckedFiles(IndexDataCacheFile):
     """A kernel's two files."""
+
+    def load(self, key: Any) -> Any:
+        """Load a kernel; None if it must be compiled, for which it is this process's turn."""
+        found = super().load(key)
+        if found is None:
+            TURN.take(Path(self._index_path))
+            found = super().load(key)  # another process may have kept it meanwhile
+        return found
 
     def save(self, key: Any, data: Any) -> None:
         """Keep what was compiled, if there is room: without it, it is compiled again next time."""

@@ -15,12 +15,15 @@ from numba.core.compiler import Compiler
 from numba.core.environment import lookup_environment
 from numba.core.registry import CPUDispatcher
 
+from pipistrelle.kernel_turns import TURN
+
 
 class Kernel(CPUDispatcher):
     """A compiled function; the kernels that call it see its linked form."""
 
-    def __init__(self, function: Any, options: dict[str, Any]) -> None:
-        super().__init__(function, targetoptions=options, pipeline_class=_Compiling)
+    def __init__(self, function: Any, options: dict[str, Any], *, twice: bool) -> None:
+        pipeline = _Compiling if twice else _CompilingOnce
+        super().__init__(function, targetoptions=options, pipeline_class=pipeline)
 
     @cached_property
     def linked(self) -> CPUDispatcher:
@@ -35,23 +38,19 @@ class Kernel(CPUDispatcher):
         return types.Dispatcher(self.linked)
 
     def compile(self, sig: Any) -> Any:
-        """Compile without collecting garbage, which takes a seventh of the time, or load."""
+        """Load, or compile in turn, without collecting garbage: it takes a seventh of the time."""
         collecting = gc.isenabled()
         gc.disable()
         try:
             return super().compile(sig)
         finally:
+            TURN.end()
             if collecting:
                 gc.enable()
 
 
-class _Code(JITCodeLibrary):
+class _CodeOnce(JITCodeLibrary):
     """The machine code of a kernel with all that it calls."""
-
-    def _optimize_final_module(self) -> None:
-        """Optimise what is called, then what became of it in its callers."""
-        super()._optimize_final_module()
-        super()._optimize_final_module()
 
     def _finalize_specific(self) -> None:
         """Compile, and tell the linked kernels their environments, as Numba does when it loads."""
@@ -59,6 +58,15 @@ class _Code(JITCodeLibrary):
         for variable in self._final_module.global_variables:
             if (environment := lookup_environment(variable.name)) is not None:
                 self._codegen.set_env(variable.name, environment)  # pyrefly: ignore[missing-attribute]
+
+
+class _Code(_CodeOnce):
+    """The same, optimised twice: what is called, then what became of it in its callers."""
+
+    def _optimize_final_module(self) -> None:
+        """Optimise twice."""
+        super()._optimize_final_module()
+        super()._optimize_final_module()
 
 
 class _LinkedCode(JITCodeLibrary):
@@ -96,6 +104,12 @@ class _Compiling(Compiler):
         state.library = self.library(state.targetctx.codegen(), state.func_id.func_qualname)
         state.library.enable_object_caching()
         return super().define_pipelines()
+
+
+class _CompilingOnce(_Compiling):
+    """The same with code that is optimised once."""
+
+    library = _CodeOnce
 
 
 class _Linking(_Compiling):

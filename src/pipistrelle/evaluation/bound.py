@@ -45,7 +45,7 @@ from pipistrelle.estimation.smoother.rows import hear
 from pipistrelle.estimation.smoother.small_matrices import write, write_identity
 from pipistrelle.estimation.smoother.solution import factor, spread, write_lower
 from pipistrelle.estimation.smoother.transition import predicted
-from pipistrelle.jit import Whole, kernel, no_alloc
+from pipistrelle.jit import Whole, no_alloc, optimised_once
 
 IN_ONE_WORLD = (
     "The bound is the least root mean square without bias on a path: in one world luck may beat it."
@@ -208,7 +208,7 @@ def _write_transition(
     work.u[:] = 0.0
 
 
-@kernel
+@optimised_once
 def _bound(
     at: Float[np.ndarray, "t d"],
     border: Float[np.ndarray, " n"],

@@ -5,7 +5,7 @@ import os
 import shlex
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -59,15 +59,16 @@ def conduct(
     options: OutputOptions,
     name: str,
     save: Callable[[Mission], None] = lambda _: None,
+    compiling: AbstractContextManager[None] | None = None,
 ) -> int:
     """Do a mission, watched as the options say, and deliver it; return the exit status.
 
-    `save` writes what else was asked for, before the results.
+    `save` writes what else was asked for, before the results; `compiling` lasts for the mission.
     """
     with result_folder(options, name) as own:
         get_ready(options)
         watch = recorder(options)
-        with progress(options.quiet) as show:
+        with compiling or contextlib.nullcontext(), progress(options.quiet) as show:
             mission = mission_of(progress=show, watch=watch)
         warn(*mission.notes)
         save(mission)

@@ -87,8 +87,10 @@ def run(
     world = _claimed("--save-world", save_world, WORLD, output.overwrite)
     sound = _sound_recorder(config, save_sound, frames, int(sound_bits), output)
     from pipistrelle.experiments.hearing.world_folder import world_files
+    from pipistrelle.experiments.runs.compiling import in_two_processes
     from pipistrelle.scripting.missions import simulated
     from pipistrelle.verbs import delivery
+    from pipistrelle.verbs.streams import say
 
     def save(mission: "Mission") -> None:
         if world is not None:
@@ -101,11 +103,16 @@ def run(
             sound.own.replace(_sound_files(mission, sound))
 
     asked = config, named_strategies(strategy), ways, own_world
+    compiling = in_two_processes((lambda _: None) if output.quiet else say, config, ways)
     if sound is None:
-        return delivery.conduct(partial(simulated, *asked), output, "run", save)
+        return delivery.conduct(partial(simulated, *asked), output, "run", save, compiling)
     try:
         return delivery.conduct(
-            lambda **watched: _recorded(simulated, asked, sound, watched), output, "run", save
+            lambda **watched: _recorded(simulated, asked, sound, watched),
+            output,
+            "run",
+            save,
+            compiling,
         )
     finally:
         sound.discard()

@@ -156,3 +156,69 @@ def test_kernels_are_compiled_for_the_filters_and_timings_that_are_named(monkeyp
     assert tried == [(True, "iekf")]
     compiling.compile_kernels()
     assert tried[1:] == [(timing, *CATALOGUE) for timing in (False, True)]
+
+
+@pytest.fixture
+def second(monkeypatch):
+    """The second processes that are started."""
+    started, popen = [], subprocess.Popen
+
+    def start(*given, **named):
+        started.append(popen(*given, **named))
+        return started[-1]
+
+    monkeypatch.setattr(compiling, "cores", lambda: 2)
+    monkeypatch.setattr(compiling.subprocess, "Popen", start)
+    return started
+
+
+def test_a_second_process_starts_with_the_first_kernel_and_ends_with_the_work(said, second):
+    with compiling.in_two_processes(said.append, TINY, ["ekf"]):
+        assert second == []
+        numba.njit(lambda x: x + 6)(1.0)
+        assert said == [kernel_clock.COMPILING]
+        (process,) = second
+        assert process.poll() is None
+    assert process.poll() is not None
+
+
+@pytest.mark.parametrize("trouble", ["one core", "no interpreter"])
+def test_without_a_second_process_the_first_goes_on_alone(said, second, monkeypatch, trouble):
+    if trouble == "one core":
+        monkeypatch.setattr(compiling, "cores", lambda: 1)
+    else:
+        monkeypatch.setattr(compiling.sys, "executable", os.devnull + "/python")
+    with compiling.in_two_processes(said.append, TINY, ["ekf"]):
+        assert numba.njit(lambda x: x + 7)(1.0) == 8.0
+    assert said == [kernel_clock.COMPILING]
+    assert second == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CATALOGUE)
+@pytest.mark.parametrize("timing", [False, True])
+def test_the_second_process_compiles_what_the_filters_of_a_mission_need(tmp_path, name, timing):
+    """Else it would be of no use: of a filter's kernels, nearly none is left for the mission."""
+    code = """
+import sys
+from numba.core.event import install_recorder
+from pipistrelle.config import Config, ListeningConfig
+from pipistrelle.experiments.runs import compiling, trial
+
+config = Config(listening=ListeningConfig(timing=sys.argv[2] == "True"))
+compiling.compile_filters(config, sys.argv[1:2])
+kept = trial.run_trials
+
+def told(*given, **named):
+    with install_recorder("numba:compile") as recorder:
+        done = kept(*given, **named)
+    print(len({event.data["dispatcher"].py_func.__name__ for _, event in recorder.buffer}))
+    return done
+
+trial.run_trials = told
+trial.run_mission(config, ("fused",), sys.argv[1:2])
+"""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
+    command = [sys.executable, "-c", code, name, str(timing)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert int(done.stdout) <= 2

@@ -25,7 +25,7 @@ from pipistrelle.estimation.smoother.smoothing import (
 from pipistrelle.estimation.smoother.solution import border_covariance
 from pipistrelle.estimation.smoother.stack import Stack
 from pipistrelle.estimation.smoother.sweep import Noise, Points, Solution, Stretch, Sweep
-from pipistrelle.jit import kernel
+from pipistrelle.jit import optimised_once
 
 CONVERGED = 1e-10
 """Change of the cost, absolute and relative, under which the optimum is reached."""
@@ -138,7 +138,7 @@ def _beyond(points: Points, step: Float[np.ndarray, " u"], times: float) -> Poin
     return Points(at=at, spots=points.spots + times * spots, parameters=parameters)
 
 
-@kernel
+@optimised_once
 def share_of(step: Float[np.ndarray, " u"], before: Float[np.ndarray, " u"]) -> float:
     """Return which share of the step before a step is; 0 where going further would not help."""
     along, size = 0.0, 0.0

@@ -16,7 +16,7 @@ from pipistrelle.detection.scans import BEARING, BEARING_STD, RANGE
 from pipistrelle.estimation.smoother.observations import direction_of, view_of
 from pipistrelle.estimation.smoother.records import Arrays, Front, Places, Points, Rows
 from pipistrelle.estimation.smoother.tdoa_initialization import place_by_excess_path
-from pipistrelle.jit import Whole, kernel, no_alloc
+from pipistrelle.jit import Whole, no_alloc, optimised_once
 
 MIN_CROSSING_ANGLE = 0.5
 """Least angle [rad] at which two bearings place a landmark."""
@@ -24,7 +24,7 @@ MAX_RELATIVE_PLACE_STD = 0.5
 """Largest standard deviation of the place, divided by the range."""
 
 
-@kernel
+@optimised_once
 def entering_places(
     rows: Arrays,
     span: tuple[Whole, Whole, Whole],

@@ -59,10 +59,10 @@ from pipistrelle.estimation.smoother.small_matrices import (
     write,
 )
 from pipistrelle.estimation.smoother.transition import predicted, transition, write_start
-from pipistrelle.jit import Whole, kernel, no_alloc
+from pipistrelle.jit import Whole, no_alloc, optimised_once
 
 
-@kernel
+@optimised_once
 def eliminate(
     front: Arrays,
     legs: Arrays,
@@ -91,7 +91,7 @@ def eliminate(
     return cost
 
 
-@kernel
+@optimised_once
 def step_to(
     front: Arrays,
     legs: Arrays,
@@ -112,7 +112,7 @@ def step_to(
     return cost
 
 
-@kernel
+@optimised_once
 def begin(
     front: Arrays, legs: Arrays, at: Float[np.ndarray, "k d"], border: Float[np.ndarray, " n"],
     parameters: Float[np.ndarray, " p"], damping: float,
@@ -134,7 +134,7 @@ def begin(
     return cost
 
 
-@kernel
+@optimised_once
 def enter(
     information: Float[np.ndarray, "n n"],
     column: Int[np.ndarray, " l"],
@@ -158,7 +158,7 @@ def enter(
     return cost
 
 
-@kernel
+@optimised_once
 def leave(
     front: Arrays,
     column: Int[np.ndarray, " g"],

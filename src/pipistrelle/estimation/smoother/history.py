@@ -20,7 +20,7 @@ from pipistrelle.estimation.smoother.calibration import NOTHING, Calibration
 from pipistrelle.estimation.smoother.preintegration import SMALLEST_STD, Led, Odometry
 from pipistrelle.estimation.smoother.records import CALLER, POSE, Arrays
 from pipistrelle.estimation.smoother.stack import Stack
-from pipistrelle.jit import Whole, kernel
+from pipistrelle.jit import Whole, optimised_once
 
 STRETCH = 64
 """Nodes that are eliminated in one go: between stretches landmarks leave the border, and from the
@@ -169,7 +169,7 @@ def heard_more(history: History, odometry: Odometry, scan: Scan) -> History:
     )
 
 
-@kernel
+@optimised_once
 def _write_leg(legs: Arrays, steps: Arrays, led: Led, span: tuple[Whole, Whole, float]) -> None:
     """Write the leg to a node by its control steps; ``span``: the node, the steps then, seconds."""
     (mean, noise, seconds, _, ends, slopes), (k, last, took) = legs, span
@@ -193,7 +193,7 @@ def _write_leg(legs: Arrays, steps: Arrays, led: Led, span: tuple[Whole, Whole, 
             noise[k, a, a] += SMALLEST_STD * SMALLEST_STD
 
 
-@kernel
+@optimised_once
 def _write_rows(
     rows: Arrays,
     scan: tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, "8 m"]],

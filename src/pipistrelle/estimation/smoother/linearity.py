@@ -30,13 +30,13 @@ from pipistrelle.estimation.smoother.observations import (
 )
 from pipistrelle.estimation.smoother.records import Arrays, Places, Points, Rows, Work, work_of
 from pipistrelle.geometry import wrap_angle
-from pipistrelle.jit import Whole, kernel, no_alloc
+from pipistrelle.jit import Whole, no_alloc, optimised_once
 
 Off = tuple[Float[np.ndarray, " d"], Float[np.ndarray, " n"]]
 """How far the state of a node and the border are from their points."""
 
 
-@kernel
+@optimised_once
 def nonlinearity(
     rows: Arrays,
     span: tuple[Whole, Whole, Whole],

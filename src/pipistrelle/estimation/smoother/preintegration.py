@@ -40,7 +40,7 @@ from pipistrelle.estimation.smoother.small_matrices import (
     write_identity,
 )
 from pipistrelle.geometry import wrap_angle
-from pipistrelle.jit import kernel, no_alloc
+from pipistrelle.jit import no_alloc, optimised_once
 
 SMALLEST_STD = 1e-6
 """Added in quadrature to x, y [m] and heading [rad] of the start and of a motion: what is known
@@ -111,7 +111,7 @@ def placed(start: Gaussian, odometry: Odometry, first: int = 0) -> Gaussian:
     return Gaussian(mean=poses, covariance=spreads)
 
 
-@kernel
+@optimised_once
 def _placed(start: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]], steps: Steps) -> Steps:
     """Place all steps from a start in the world."""
     poses, spreads = np.empty(steps[0].shape), np.empty(steps[1].shape)
@@ -120,7 +120,7 @@ def _placed(start: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]], step
     return poses, spreads
 
 
-@kernel
+@optimised_once
 def _extended(
     steps: Led,
     controls: Float[np.ndarray, "k c"],
@@ -209,7 +209,7 @@ def place(
     covariance[2, 0], covariance[2, 1] = covariance[0, 2], covariance[1, 2]
 
 
-@kernel
+@optimised_once
 def poses_between(
     legs: Arrays,
     ends: Float[np.ndarray, "k 2"],

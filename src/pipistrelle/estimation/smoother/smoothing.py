@@ -27,13 +27,13 @@ from pipistrelle.estimation.smoother.small_matrices import (
     write,
     write_image,
 )
-from pipistrelle.jit import Whole, kernel, no_alloc
+from pipistrelle.jit import Whole, no_alloc, optimised_once
 
 Left = tuple[Float[np.ndarray, "g 2 n"], Float[np.ndarray, "g 2 d"], Float[np.ndarray, "g 2 2"]]
 """D, G and S of places that have left the border."""
 
 
-@kernel
+@optimised_once
 def trace_back(
     links: Arrays,
     beta: Float[np.ndarray, " n"],
@@ -51,7 +51,7 @@ def trace_back(
     return states
 
 
-@kernel
+@optimised_once
 def places_left(
     left: Left, column: Int[np.ndarray, " g"], beta: Float[np.ndarray, " n"],
     state: Float[np.ndarray, " d"],
@@ -65,7 +65,7 @@ def places_left(
         beta[column[g]], beta[column[g] + 1] = place[0], place[1]
 
 
-@kernel
+@optimised_once
 def spread_with_border(
     C: Float[np.ndarray, "d n"], border: Float[np.ndarray, "n n"]
 ) -> Float[np.ndarray, "d n"]:
@@ -75,7 +75,7 @@ def spread_with_border(
     return X
 
 
-@kernel
+@optimised_once
 def spread_back(
     links: Arrays,
     covariances: tuple[
@@ -126,7 +126,7 @@ def _make_symmetric(P: Float[np.ndarray, "d d"]) -> None:
             P[a, b] = P[b, a] = 0.5 * (P[a, b] + P[b, a])
 
 
-@kernel
+@optimised_once
 def spread_left(
     left: Left,
     column: Int[np.ndarray, " g"],

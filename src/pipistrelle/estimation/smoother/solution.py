@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from pipistrelle.estimation.smoother.records import Arrays
 from pipistrelle.estimation.smoother.small_matrices import add_image
-from pipistrelle.jit import Whole, kernel, no_alloc
+from pipistrelle.jit import Whole, kernel, no_alloc, optimised_once
 
 
 @no_alloc
@@ -78,7 +78,7 @@ def rooted(R: Float[np.ndarray, "n n"], w: Float[np.ndarray, " n"], n: Whole) ->
     w[0] = 0.0
 
 
-@kernel
+@optimised_once
 def solve(
     front: Arrays, n: Whole, R: Float[np.ndarray, "n n"], beta: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
@@ -159,7 +159,7 @@ def joint(
     return covariance
 
 
-@kernel
+@optimised_once
 def border_covariance(R: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """Return the covariance of the border from its factor; row and column of the constant are 0."""
     n = R.shape[0]

@@ -1,10 +1,34 @@
-"""Compile the kernels before processes start that would each compile them."""
+"""Kernels are compiled before workers start that would each compile them, and in two processes."""
 
-from collections.abc import Iterable
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
 
 from pipistrelle.config import STRATEGIES, Config, ListeningConfig, ScenarioConfig
+from pipistrelle.detection.scans import OWN, UNLABELLED, Scan, make_scan
 from pipistrelle.estimation.catalogue import CATALOGUE
-from pipistrelle.experiments.runs.trial import run_mission
+from pipistrelle.experiments.drives import Drive
+from pipistrelle.experiments.machine import cores
+from pipistrelle.experiments.named_settings import each_its_own
+from pipistrelle.experiments.runs.heard_world import drive_of
+from pipistrelle.experiments.runs.trial import run_mission, run_trials
+from pipistrelle.experiments.runs.validate_mission import checked_scenario
+from pipistrelle.geometry import wrap
+from pipistrelle.kernel_clock import announce
+
+_SECOND = """
+import sys
+from pipistrelle.config import Config
+from pipistrelle.experiments.runs.compiling import compile_filters
+compile_filters(Config.model_validate_json(sys.stdin.read()), sys.argv[1:])
+"""
+_FRAMES, _HEARD = 200, 10
+"""Of the made-up drive, and those in which its first landmark is heard: the smoother's border is
+then left by one."""
 
 
 def compile_kernels(
@@ -21,3 +45,89 @@ def compile_kernels(
         run_mission(
             Config(scenario=tiny, listening=ListeningConfig(timing=timing)), STRATEGIES, there
         )
+
+
+@contextmanager
+def in_two_processes(
+    tell: Callable[[str], object], config: Config, filters: Sequence[str]
+) -> Iterator[None]:
+    """Let a second process compile the kernels of filters, if any kernel must be compiled.
+
+    It begins with the first that this process compiles, which `tell` announces. What both need is
+    compiled by one of them (`pipistrelle.kernel_turns`), so this one goes on as if it were alone.
+    """
+    second = None
+
+    def begin(line: str) -> None:
+        nonlocal second
+        tell(line)
+        second = _second_process(config, filters)
+
+    announce(begin)
+    try:
+        yield
+    finally:
+        announce(tell)
+        if second is not None:
+            second.kill()
+            second.wait()
+
+
+def _second_process(config: Config, filters: Sequence[str]) -> subprocess.Popen[str] | None:
+    """Start a process that compiles the kernels of filters, if one can be had."""
+    if cores() < 2:
+        return None
+    nowhere = subprocess.DEVNULL
+    try:
+        second = subprocess.Popen(
+            [sys.executable or "", "-P", "-c", _SECOND, *filters],
+            stdin=subprocess.PIPE, stdout=nowhere, stderr=nowhere, text=True,
+        )  # fmt: skip
+        assert second.stdin is not None
+        with second.stdin as asked:
+            asked.write(config.model_dump_json())
+    except OSError:
+        return None
+    return second
+
+
+def compile_filters(config: Config, filters: Iterable[str]) -> None:
+    """Compile the kernels of filters alone, by a drive past landmarks that nobody listens to."""
+    each = config.scenario.steps_per_frame
+    tiny = {"steps": each * _FRAMES, "landmarks": 4, "radius": 10.0, "steps_per_frame": each}
+    config = config.model_copy(update={"scenario": ScenarioConfig(**tiny)})
+    for own, names in each_its_own(config, [name for name in filters if name in CATALOGUE]):
+        drive = drive_of(checked_scenario(own), own)
+        scans = [
+            _true_scan(drive, each * k, int(k > _HEARD), timing=own.listening.timing)
+            for k in range(1, _FRAMES + 1)
+        ]
+        run_trials(names, drive, {"fused": scans}, own)
+
+
+def _true_scan(drive: Drive, step: int, first: int, *, timing: bool) -> Scan:
+    """Return true rows of the landmarks from a first one on; the last of them is a caller.
+
+    Every other one has a range, the rest bearings and, with timing, excess paths.
+    """
+    path, landmarks = drive.truth.path, drive.truth.landmarks
+    assert path is not None
+    assert landmarks is not None
+    labels, places = landmarks[0][first:], landmarks[1][first:]
+    x, y = (places - path[step, :2]).T
+    way, caller = np.hypot(x, y), labels[-1]
+    own = (labels % 2 == 1) & (labels != caller)
+    excess = way + np.hypot(*(places - places[-1]).T) - way[-1]
+    detour = np.where(own | (labels == caller) | (not timing), np.nan, excess)
+    scan = make_scan(
+        drive.time[step],
+        labels,
+        wrap(np.arctan2(y, x) - path[step, 2]),
+        range=np.where(own, way, np.nan),
+        excess_path=detour,
+        caller=np.where(own, OWN, 1),
+        bearing_std=0.05,
+        range_std=np.where(own, 0.1, np.nan),
+        excess_path_std=np.where(np.isnan(detour), np.nan, 0.1),
+    )
+    return replace(scan, callers=np.array([UNLABELLED, caller]))
