@@ -101,6 +101,7 @@ AT_THE_DISK = {
     "figures/player/rerun_file.py": {"read_bytes"},  # what it wrote into a temporary folder
     "kernel_cache.py": {"read_bytes", "unlink"},  # our own cache
     "kernel_folder.py": {"read_bytes", "rmtree"},
+    "kernel_turns.py": {"open"},  # a file that is locked, and holds nothing
     "verbs/streams.py": {"open"},  # /dev/null
     "version.py": {"read_text"},  # our own pyproject.toml
 }
