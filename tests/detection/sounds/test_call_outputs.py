@@ -22,7 +22,8 @@ LOUD = {"level_db": 65.0}  # else nothing is near enough for an echo of the vehi
 SWEEP = {"emitter": LOUD | {"call": "sweep", "taper": 0.2}}
 CASES = {
     "sweep": SWEEP,
-    "hyperbolic at another rate": {
+    "hyperbolic at another rate, in water": {
+        "scenario": {"medium": "water"},
         "emitter": LOUD | {"call": "sweep", "sweep": "hyperbolic"},
         "receiver": {"sample_rate": 192e3},
     },
