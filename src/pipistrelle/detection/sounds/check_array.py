@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from pipistrelle.arrays.layout import Layout
 from pipistrelle.detection.sounds.hearing import Frame, Hearing
 from pipistrelle.geometry import wrap
 
@@ -168,13 +167,8 @@ def _directions(
     Directions are so dense that between two the phase turns by some 0.2 rad.
     """
     layout, speed = hearing.array.layout, hearing.config.assumed_sound_speed
-    if isinstance(layout, Layout):
-        place, gain = np.column_stack((layout.position * 0.0, layout.position)), layout.position**0
-        normal = 0.0
-    else:
-        _, members = layout.members(g)
-        place, gain = layout.position[members], layout.amplitude[members]
-        place, normal = place - place.mean(axis=0), float(layout.normal[g])
+    (place, gain), normal = layout.places(g), float(layout.normal[g])
+    place = place - gain**2 @ place / np.sum(gain**2)
     reach = np.linalg.norm(place, axis=1).max() * hearing.blocks.tones.max() / speed
     half = math.pi if math.isnan(normal) else 0.5 * math.pi
     bearing = 0.0 if math.isnan(normal) else normal

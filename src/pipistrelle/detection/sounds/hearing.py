@@ -91,7 +91,7 @@ class Hearing:
     def wide(self, caller: int, group: int) -> Wide | None:
         """Return what finds a call in a group's outputs over its whole band; None of a tone."""
         wide = self.end.wide if isinstance(self.end, Mixed) else ()
-        return next((one for p, g, _, one in wide if (p, g) == (caller, group)), None)
+        return next((one for p, g, one in wide if (p, g) == (caller, group)), None)
 
     def frames(self, numbers: Sequence[int]) -> Iterator[Frame]:
         """Hear what came after some of the calls, numbered from 0 on."""
