@@ -5,6 +5,7 @@ by its own leak into the microphones: nothing answers its matched filter as loud
 passes a share of the level that the loudest has in most stretches.
 """
 
+import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,6 +32,8 @@ ONSET = 0.35
 """Share of the usual amplitude of a leak or a trigger that counts as a call."""
 _STRETCH = 10.0
 """Time in which the vehicle calls at least once, where that is sought in the sound [s]."""
+_LISTEN = 8
+"""Most channels in which a leak is sought."""
 _CHUNK = 1 << 21
 """Numbers that are read at a time where calls are sought."""
 
@@ -143,7 +146,8 @@ def _leaks(sound: Sound, sent: Call, apart: int) -> Float[np.ndarray, " k"]:
     step, loudest = filters.step, []
     some = max(apart // step, 1)
     for first, samples in _pieces(sound, some * step, filters.length + step):
-        outputs = filters((samples - samples.mean(axis=0))[:, np.newaxis])
+        some_channels = samples[:, :: math.ceil(sound.channels / _LISTEN)]
+        outputs = filters((some_channels - some_channels.mean(axis=0))[:, np.newaxis])
         level = np.sqrt((outputs.real**2 + outputs.imag**2).sum(axis=(1, 2, 3)))
         for begin in range(0, len(level), some):
             k = begin + int(level[begin : begin + some].argmax())
