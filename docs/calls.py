@@ -1,6 +1,6 @@
 """Draw the picture of `calls.md` anew, and print its numbers: `.venv/bin/python docs/calls.py`.
 
-A tone of 47.5 kHz, and sweeps from 60 to 35 kHz by both laws, all of 2.8 ms, are heard by one face.
+A tone of 45 kHz, and sweeps from 60 to 35 kHz by both laws, all of 2.8 ms, are heard by one face.
 Left: errors of the range of one echo, over the Cramer-Rao bound of the sweep; of a tone the bound
 of a sweep is no bound, but its errors stand beside. Right: how often two echoes of equal loudness
 are told apart, by their distance.
