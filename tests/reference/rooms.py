@@ -1,34 +1,32 @@
-"""Sound of a point source at microphones in a room, by pyroomacoustics: a second opinion.
+"""Recordings of a point source at microphones in a room, by pyroomacoustics: a second opinion.
 
 Nothing of the package's own propagation is used: spherical waves, images behind the walls, delays
-by windowed sincs, real samples.
+by windowed sincs, real samples; and all that is known of them is a recording, a folder of files.
 """
 
 import numpy as np
 
-from pipistrelle.acoustics.callers import callers_of
-from pipistrelle.arrays.array_file import microphones_of
+import pipistrelle
+from pipistrelle.arrays.array_file import array_text, microphones_of
 from pipistrelle.arrays.layout import scattered
 from pipistrelle.arrays.pattern import spread_towards
-from pipistrelle.arrays.sampling import BLOCK, sampling
-from pipistrelle.config import Config
-from pipistrelle.detection.front_end import find_calls, front_end
-from pipistrelle.detection.matched import filter_blocks
+from pipistrelle.detection.certainty import BEARING_FLOOR, RANGE_FLOOR
 from pipistrelle.geometry import wrap
+from reference.sounds import write_beside
 
-CONFIG = Config()
-SETTLED = sampling(CONFIG, callers_of(CONFIG, np.zeros(2)))
-TONES, RATE, PULSE = SETTLED.tones, SETTLED.rate, SETTLED.pulse
-C = CONFIG.air.sound_speed
+RATE, TONE, LENGTH, C = 200_000, 35e3, 2.8e-3, 343.0
+"""Samples in a second; frequency [Hz] and length [s] of the call; speed of sound [m/s]."""
 ROOM, CENTRE = np.array([9.0, 8.0]), np.array([4.2, 3.9])
 """Size of the room and where the array is in it [m]."""
 TURN = np.arange(8) * np.pi / 4
 ARM = np.array([-5, -3, -1, 1, 3, 5]) * 0.00175
+ANGLE_LIMIT = np.radians(75.0)
+"""From its normal to this a face is asked: `detection.angle_limit_deg`."""
 
 
 def free(places):
     """Return microphones that hang free."""
-    return scattered(microphones_of([(x, y, 0.0, 0.0, "") for x, y in places]))
+    return microphones_of([(x, y, 0.0, 0.0, "") for x, y in places])
 
 
 def square():
@@ -38,7 +36,7 @@ def square():
         ahead = np.array([np.cos(normal * np.pi), np.sin(normal * np.pi)])
         left = np.array([-ahead[1], ahead[0]])
         rows += [(*(0.025 * ahead + a * left), 0.0, 0.0, name) for a in along]
-    return scattered(microphones_of(rows))
+    return microphones_of(rows)
 
 
 ARRAYS = {
@@ -48,22 +46,21 @@ ARRAYS = {
 }
 
 
-def heard(layout, bearing, distance, *, absorption=None, order=0, seconds=8e-3):
+def heard(layout, bearing, distance, *, absorption=None, order=0, seconds=0.0):
     """Return the samples of every microphone of a call from a place, without noise.
 
-    `absorption`: share of the energy that a wall takes; None: there are no walls; `seconds`: how
-    long is recorded after the call has come. And where the images of the source behind the walls
-    are, the source among them, from the array [m].
+    A face hears nothing from behind. `absorption`: share of the energy that a wall takes; None:
+    there are no walls; `seconds`: how long is recorded after the call has come. And where the
+    images of the source behind the walls are, the source among them, from the array [m].
     """
     import pyroomacoustics as pra
 
-    time = np.arange(PULSE * SETTLED.block) / RATE
-    call = np.cos(2.0 * np.pi * TONES[0] * time)
+    call = np.cos(2.0 * np.pi * TONE * np.arange(round(LENGTH * RATE)) / RATE)
     if absorption is None:
-        room, origin = pra.AnechoicRoom(2, fs=int(RATE)), np.zeros(2)
+        room, origin = pra.AnechoicRoom(2, fs=RATE), np.zeros(2)
     else:
         walls = pra.Material(absorption)
-        room = pra.ShoeBox(ROOM, fs=int(RATE), materials=walls, max_order=order)
+        room = pra.ShoeBox(ROOM, fs=RATE, materials=walls, max_order=order)
         origin = CENTRE
     toward = np.array([np.cos(bearing), np.sin(bearing)])
     room.add_source(origin + distance * toward, signal=call)
@@ -72,69 +69,99 @@ def heard(layout, bearing, distance, *, absorption=None, order=0, seconds=8e-3):
     room.simulate()
     late = pra.constants.get("frac_delay_length") // 2
     signals = room.mic_array.signals[:, late:]
-    blocks = round((1.2 * distance / C + seconds) / BLOCK)
-    out = np.zeros((blocks * SETTLED.block, len(layout.position)))
+    out = np.zeros((round((1.2 * distance / C + seconds) * RATE), len(layout.position)))
     out[: signals.shape[1]] = signals.T[: len(out)]
+    out[:, np.cos(bearing - layout.normal[layout.group]) < 0.0] = 0.0
     return out, room.sources[0].images.T - origin
-
-
-def matched_of(samples, noise_std):
-    """Return the matched filter's outputs of real samples."""
-    count = np.arange(len(samples)) / RATE
-    turned = samples[:, None] * np.exp(-2j * np.pi * np.outer(count, TONES))[:, :, None]
-    sums = turned.reshape(-1, SETTLED.block, *turned.shape[1:]).sum(axis=1)[:, np.newaxis]
-    return filter_blocks(sums, pulse=PULSE, block=SETTLED.block, noise_std=noise_std)
 
 
 def noise_for(samples, snr_db):
     """Return the noise with which a microphone has some SNR after the matched filter."""
-    loudest = np.abs(matched_of(samples, 1.0)[:, 0, 0]).max(axis=0)
-    return np.sqrt(np.mean(loudest**2)) / 10.0 ** (snr_db / 20.0)
+    energy = (samples**2).sum(axis=0)
+    return np.sqrt(0.5 * energy[energy > 0.0].mean()) / 10.0 ** (snr_db / 20.0)
 
 
-def found_in(samples, layout, noise_std, rng, end=None):
-    """Return what the front end finds in the samples with noise."""
-    noisy = samples + noise_std * rng.standard_normal(samples.shape)
-    end = end or front_end(CONFIG, layout, TONES)
-    matched = matched_of(noisy, noise_std)
-    return find_calls(matched, end, start=0.0, interval=BLOCK, pulse=PULSE)
+def record(folder, name, sounds, noise_std, rng):
+    """Write a recording by an array: the vehicle calls where each of some sounds begins."""
+    import soundfile
+
+    folder.mkdir(exist_ok=True)
+    begin, calls, microphones = 0, [], ARRAYS[name]
+    form = {"samplerate": RATE, "channels": len(microphones.channel), "subtype": "FLOAT"}
+    with soundfile.SoundFile(folder / "tape.wav", "w", **form) as tape:
+        for samples in sounds:
+            tape.write(samples + noise_std * rng.standard_normal(samples.shape))
+            calls.append(begin)
+            begin += len(samples)
+    write_beside(folder, TONE, LENGTH, C, array_text(microphones), calls, until=11 + begin // RATE)
+    return folder
 
 
-FAR = 40.0
-"""At this distance a face 25 mm from the centre hears from nearly the centre's bearing [m]."""
+def rows_of(folder, calls):
+    """Hear a recording; return the rows, and which of so many calls each came after."""
+    rows = pipistrelle.hear(folder).measurements
+    assert rows["caller"].is_null().all() or (rows["caller"] == "").all()
+    time = np.sort(np.unique(rows["time"]))
+    assert time.size == calls, "after each call something was heard"
+    return rows, np.searchsorted(time, rows["time"])
 
 
-def bounds(layout, members, bearing, snr_db):
-    """Return the Cramer-Rao bounds of bearing [rad] and, of block sums, of delay [s]."""
-    count = np.count_nonzero(members)
-    place, equal = layout.position[members], np.full(count, count**-0.5)
-    power = count * 10.0 ** (snr_db / 10.0)
-    kappa = (2.0 * np.pi * TONES[0] / C) ** 2 * spread_towards(np.array([bearing]), place, equal)[0]
-    return (2.0 * power * kappa) ** -0.5, BLOCK * (PULSE / 4.0 / power) ** 0.5
+FAR, CUT = 40.0, 0.1
+"""At this distance a face 25 mm from the centre hears from nearly the centre's bearing [m]; the
+vehicle calls so long after the source [s]."""
 
 
-def errors(name, snr_db, places, draws, *, order=None):
-    """Return errors of bearing and delay in units of their bounds, and of what the rows state.
+def bounds(layout, bearing, snr_db):
+    """Return the Cramer-Rao bounds of bearing [rad] and, of block sums, of delay [s].
 
-    A face is asked for sources within 60 degrees of its normal: pyroomacoustics knows no baffle.
-    `order`: in which the channels are heard.
+    Of the mean of the faces that hear, which is a row.
     """
-    layout, rng, rows = ARRAYS[name], np.random.default_rng(int(snr_db)), []
-    end = front_end(CONFIG, layout, TONES)
-    for _ in range(places):
-        bearing, distance = rng.uniform(-np.pi, np.pi), FAR + rng.uniform(0.0, 0.07)
-        samples, _ = heard(layout, bearing, distance)
-        noise_std = noise_for(samples, snr_db)
-        samples = samples if order is None else samples[:, order]
-        for _ in range(draws):
-            found = found_in(samples, layout, noise_std, rng, end)
-            for g in np.flatnonzero(~(np.cos(bearing - layout.normal) < 0.5)):
-                across, late = bounds(layout, layout.group == g, bearing, snr_db)
-                power = np.where((found.face == g) & (found.caller == 0), found.power, 0.0)
-                if power.max() > 0.0:  # the loudest row: noise makes others
-                    r = power.argmax()
-                    off = wrap(found.bearing[r] - bearing)
-                    after = found.delay[r] - distance / C + 0.5 / RATE  # a sample's middle
-                    stated = found.bearing_std[r], found.delay_std[r]
-                    rows.append((off / across, after / late, off / stated[0], after / stated[1]))
-    return np.array(rows).T
+    across, late, faces = 0.0, 0.0, 0
+    for g in range(layout.normal.size):
+        if np.cos(bearing - layout.normal[g]) < np.cos(ANGLE_LIMIT):
+            continue
+        place = layout.position[layout.group == g]
+        power = len(place) * 10.0 ** (snr_db / 10.0)
+        spread = spread_towards(np.array([bearing]), place, np.full(len(place), len(place) ** -0.5))
+        across += 0.5 / (power * (2.0 * np.pi * TONE / C) ** 2 * spread[0])
+        late += 0.25 * LENGTH * 2e-4 / power
+        faces += 1
+    return np.sqrt(across) / faces, np.sqrt(late) / faces
+
+
+def anywhere(layout, rng):
+    """Draw a bearing at which chance does not say whether a face is asked."""
+    while True:
+        bearing = rng.uniform(-np.pi, np.pi)
+        angle = np.abs(wrap(bearing - layout.normal))
+        if not (np.abs(angle - ANGLE_LIMIT) < np.radians(7.0)).any():
+            return bearing
+
+
+def errors(folder, name, snr_db, places, draws, *, order=slice(None)):
+    """Record a source far away and hear it; return errors of bearing and delay, a row each.
+
+    In units of their bounds, and of what the rows state, but for the floors. `order`: in which the
+    channels are recorded.
+    """
+    layout, rng, truth = scattered(ARRAYS[name]), np.random.default_rng(int(snr_db)), []
+
+    def sounds():
+        for bearing, distance in truth:
+            samples, _ = heard(layout, bearing, distance)
+            for _ in range(draws):
+                yield samples[round(CUT * RATE) :, order]
+
+    truth = [(anywhere(layout, rng), FAR + rng.uniform(0.0, 0.07)) for _ in range(places)]
+    noise_std = noise_for(heard(layout, *truth[0])[0], snr_db)
+    rows, call = rows_of(record(folder, name, sounds(), noise_std, rng), places * draws)
+    loudest = np.lexsort((-rows["level_db"].to_numpy(), call))  # noise makes others
+    rows = rows[loudest[np.unique(call[loudest], return_index=True)[1]]]
+    bearing, distance = np.repeat(truth, draws, axis=0).T
+    least = np.array([bounds(layout, one, snr_db) for one in bearing]).T
+    off = wrap(rows["bearing"].to_numpy() - bearing)
+    late = 2.0 * rows["range"].to_numpy() / C + 0.5 / RATE  # a sample's middle
+    after = late + CUT - distance / C
+    off_std = np.sqrt(rows["bearing_std"].to_numpy() ** 2 - BEARING_FLOOR[0] ** 2)
+    after_std = np.sqrt(rows["range_std"].to_numpy() ** 2 - RANGE_FLOOR**2) * 2.0 / C
+    return np.array([off / least[0], after / least[1], off / off_std, after / after_std])

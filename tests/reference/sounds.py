@@ -23,7 +23,7 @@ def record(folder, *words, drive=FEW):
 
 
 ABOUT = """format = 1
-speed_of_sound = 340.0
+speed_of_sound = {speed}
 start = 10.0
 
 [call]
@@ -84,16 +84,26 @@ def foreign(
             sound[:, number - 1] += amplitude * _pulse(time - late, frequency, duration)
     sound *= np.ones(16) if gain is None else gain
     soundfile.write(folder / "tape.wav", sound.astype(np.float32), rate, subtype="FLOAT")
-    about = ABOUT.format(frequency=frequency, duration=duration)
-    (folder / "recording.toml").write_text(about)
     lines = [f"{channel},{float(x)!r},{float(y)!r},{face}" for channel, x, y, face in rows]
     if not faces:
         lines = [line.rpartition(",")[0] for line in lines]
     header = "channel,x,y,face" if faces else "channel,x,y"
-    (folder / "array.csv").write_text("\n".join([header, *lines, ""]))
-    (folder / "calls.csv").write_text("\n".join(["sample", *map(str, calls), ""]))
-    (folder / "odometry.csv").write_text("time,velocity,angular_rate\n9,0,0\n12,0,0\n")
+    array = "\n".join([header, *lines, ""])
+    write_beside(folder, frequency, duration, 340.0, array, calls, until=10)
     return folder
+
+
+def write_beside(folder, frequency, duration, speed, array, calls, *, until):
+    """Write what lies beside the sound: what it is, the array's text, the calls, a vehicle at rest.
+
+    `until` [s]: to when the odometry lasts, or somewhat longer; the sound begins at 10 s.
+    """
+    about = ABOUT.format(frequency=frequency, duration=duration, speed=speed)
+    (folder / "recording.toml").write_text(about)
+    (folder / "array.csv").write_text(array)
+    (folder / "calls.csv").write_text("\n".join(["sample", *map(str, calls), ""]))
+    rest = "".join(f"{second},0,0\n" for second in range(9, until + 3, 3))
+    (folder / "odometry.csv").write_text(f"time,velocity,angular_rate\n{rest}")
 
 
 def _pulse(time, frequency, duration):

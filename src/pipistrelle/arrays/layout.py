@@ -36,6 +36,11 @@ class Layout:
         """Return the row of a recording that a face is in, and which microphones of it it has."""
         return g, np.arange(self.position.size)
 
+    def places(self, g: int) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, " k"]]:
+        """Return where a face's microphones are in the vehicle's frame [m], and their gains."""
+        left = np.array([-np.sin(self.normal[g]), np.cos(self.normal[g])])
+        return np.outer(self.position, left), np.ones(self.position.size)
+
     def phases(
         self,
         angle: Float[np.ndarray, "*n"] | float,
@@ -85,6 +90,11 @@ class Scattered:
     def members(self, g: int) -> tuple[int, Int[np.ndarray, " k"]]:
         """Return the row of a recording that a group is in, and which microphones of it it has."""
         return 0, np.flatnonzero(self.group == g)
+
+    def places(self, g: int) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, " k"]]:
+        """Return where a group's microphones are in the vehicle's frame [m], and their gains."""
+        _, members = self.members(g)
+        return self.position[members], self.amplitude[members]
 
     def lead(self, bearing: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n e"]:
         """Return how far the microphones are on the way of sound from a bearing [rad], in metres.

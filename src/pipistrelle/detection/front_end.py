@@ -71,10 +71,9 @@ class Mixed:
     """Which callers these are."""
     silent: bool
     """Whether the vehicle sends no tone."""
-    wide: tuple[tuple[int, int, Int[np.ndarray, " k"], Wide], ...]
-    """Finders of the other calls: caller, group, the group's microphones, finder."""
-    row: tuple[int, ...]
-    """Row of the outputs in which the microphones of each of these are."""
+    wide: tuple[tuple[int, int, Wide], ...]
+    """Finders of the other calls: caller, group, finder."""
+    layout: Layout | Scattered
     talk: Float[np.ndarray, "c c"]
     """Share of a call's power (second) that the filter of another (first) answers; 0 of its own."""
     least_snr: float
@@ -116,11 +115,12 @@ def front_end(
     for g, normal in enumerate(layout.normal):
         if math.isnan(normal):
             members.append(layout.members(g)[1])
+            position, gain = layout.places(g)
             _refuse_lines_own(config, where)
             wavelength = config.assumed_sound_speed / tones.max()
-            _refuse_far_apart(layout.position[members[-1]], wavelength, where)
+            _refuse_far_apart(position, wavelength, where)
             finders.append(circle_of(config, layout, g, tones))
-            snrs.append((finders[-1].threshold - 1.0) / np.sum(layout.amplitude[members[-1]] ** 2))
+            snrs.append((finders[-1].threshold - 1.0) / np.sum(gain**2))
         else:
             line, alone = along_line(layout, g)
             members.append(line)
@@ -205,14 +205,12 @@ def _mixed(
     narrow = np.unique(np.append(0, np.flatnonzero(is_tone)))
     talk = cross_talk(calls, config.receiver.sample_rate)
     np.fill_diagonal(talk, 0.0)
-    wide, rows, snrs = [], [], []
+    wide, snrs = [], []
     for caller in np.flatnonzero(~is_tone):
         for g in range(layout.normal.size):
             finder = wide_of(config, layout, g, calls, int(caller))
-            row, place = layout.members(g)
-            rows.append(row)
-            wide.append((int(caller), g, place, finder))
-            snrs.append((finder.threshold - 1.0) / place.size)
+            wide.append((int(caller), g, finder))
+            snrs.append((finder.threshold - 1.0) / finder.weight.size)
     config = _leaking(config, [call for call in calls if isinstance(call, ToneBurst)])
     tones_end = front_end(config, layout, tones[narrow], where)
     if isinstance(tones_end, Groups):
@@ -222,7 +220,7 @@ def _mixed(
         narrow=narrow,
         silent=not is_tone[0],
         wide=tuple(wide),
-        row=tuple(rows),
+        layout=layout,
         talk=talk,
         least_snr=float(min(snrs)),
     )
@@ -242,8 +240,9 @@ def _of_mixed(matched: Complex[np.ndarray, "l f c e"], end: Mixed, lags: Lags) -
     if len(end.narrow) > end.silent:
         found = find_calls(_tones_of(matched, end), end.tones, **lags._asdict())
         parts.append(replace(found, caller=end.narrow[found.caller]))
-    for (caller, g, place, finder), row in zip(end.wide, end.row, strict=True):
-        outputs = np.ascontiguousarray(matched[:, row, caller, place])
+    for caller, g, finder in end.wide:
+        row, members = end.layout.members(g)
+        outputs = np.ascontiguousarray(matched[:, row, caller, members])
         delay, bearing, power, across, late, angle = find_wide(outputs, finder, lags)
         parts.append(
             Detections(
@@ -289,15 +288,10 @@ def _direct_of(
         detection[end.narrow] = np.where(heard, np.append(rows, -1)[direct.detection], -1)
         when[:, end.narrow] = direct.delay, direct.delay_std
     for p in range(1, callers):
-        d = -1 if p in end.narrow else int(loudest_first(*_whose(found), p))
+        d = -1 if p in end.narrow else int(loudest_first(found.caller, found.delay, found.power, p))
         if d >= 0 and not may_leak(found.delay, found.power, d, length):
             detection[p], when[0, p], when[1, p] = d, found.delay[d], found.delay_std[d]
     return DirectCalls(detection=detection, delay=when[0], delay_std=when[1], pulse=length)
-
-
-def _whose(found: Detections) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return caller, delay and power of detections, for `loudest_first`."""
-    return found.caller, found.delay, found.power
 
 
 def _refuse_lines_own(config: Config, where: str) -> None:

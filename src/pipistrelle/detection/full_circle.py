@@ -95,16 +95,15 @@ def circle_of(
     config: Config, layout: Scattered, group: int, tones: Float[np.ndarray, " c"]
 ) -> Circle:
     """Settle threshold and scan of a group of microphones that hear all around."""
-    (_, members), c = layout.members(group), config.assumed_sound_speed
-    gain = layout.amplitude[members]
-    position, weight = layout.position[members], gain / np.linalg.norm(gain)
+    (position, gain), c = layout.places(group), config.assumed_sound_speed
+    weight = gain / np.linalg.norm(gain)
     bearing = np.linspace(-np.pi, np.pi, 3600, endpoint=False)
     slope = 2.0 * np.pi * tones.max() / c * np.sqrt(spread_towards(bearing, position, weight))
     looks = 2.0 * np.pi * float(slope.mean())
     return Circle(
-        threshold=loudest_by_chance(config.detection.false_alarm, looks, members.size),
+        threshold=loudest_by_chance(config.detection.false_alarm, looks, gain.size),
         leakage=10.0 ** (config.detection.leakage_db / 10.0),
-        loudest_noise=loudest_noise(members.size),
+        loudest_noise=loudest_noise(gain.size),
         beams=max(math.ceil(2.0 * np.pi * float(slope.max()) / BEAM_STEP), 8),
         speed_of_sound=c,
         tones=tones,
@@ -142,7 +141,7 @@ def find_around(
     standard deviations of bearing and delay, and the arctangent of the bearing's slope by the
     logarithm of the speed of sound.
     """
-    margin = _margin(circle, lags)
+    margin = margin_of(circle.position, circle.speed_of_sound * lags.interval)
     return _find(_padded(matched, margin), margin, tuple(circle), lags)
 
 
@@ -157,7 +156,10 @@ def edge_around(
     Sought in the beam to a bearing; `at`: lag, tone and bearing of the detection.
     """
     b, p, bearing = at
-    stride, margin = max(lags.pulse // STRIDES, 1), _margin(circle, lags)
+    stride, margin = (
+        max(lags.pulse // STRIDES, 1),
+        margin_of(circle.position, circle.speed_of_sound * lags.interval),
+    )
     low = max((b - 2 * (lags.pulse + stride)) // stride * stride, 0)
     beam = np.empty(min(b + stride + 1, len(matched)) - low, dtype=np.complex128)
     _beam(_padded(matched, margin), margin + low, p, bearing, circle, lags, beam)
@@ -166,10 +168,12 @@ def edge_around(
     return low + lag, std
 
 
-def _margin(circle: Circle, lags: Lags) -> int:
-    """Return the lags by which the farthest microphone hears earlier or later than the centre."""
-    far = np.linalg.norm(circle.position, axis=1).max() / circle.speed_of_sound
-    return math.ceil(far / lags.interval) + 2
+def margin_of(position: Float[np.ndarray, "k 2"], lag: float) -> int:
+    """Return the lags by which the farthest microphone hears earlier or later than the centre.
+
+    `lag`: way of sound from one to the next [m].
+    """
+    return math.ceil(np.linalg.norm(position, axis=1).max() / lag) + 2
 
 
 def _padded(matched: Complex[np.ndarray, "l c k"], margin: int) -> Complex[np.ndarray, "_ c k"]:
@@ -497,6 +501,14 @@ def _largest_near(
 
 
 @no_alloc
+def moved(before: float, here: float, after: float) -> float:
+    """Return how many steps away a parabola through three powers peaks, one at most."""
+    bend = 2.0 * here - before - after
+    move = 0.5 * (after - before) / bend if bend > 0.0 else math.copysign(1.0, after - before)
+    return min(max(move, -1.0), 1.0)
+
+
+@no_alloc
 def _climb(
     matched: Complex[np.ndarray, "l c k"],
     b: float,
@@ -511,8 +523,6 @@ def _climb(
         before = _power(matched, b, p, bearing - step, circle, lag)
         here = _power(matched, b, p, bearing, circle, lag)
         after = _power(matched, b, p, bearing + step, circle, lag)
-        bend = 2.0 * here - before - after
-        move = 0.5 * (after - before) / bend if bend > 0.0 else math.copysign(1.0, after - before)
-        bearing += step * min(max(move, -1.0), 1.0)
+        bearing += step * moved(before, here, after)
         step *= 0.25
     return bearing, _power(matched, b, p, bearing, circle, lag)

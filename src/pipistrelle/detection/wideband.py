@@ -55,7 +55,14 @@ from pipistrelle.arrays.pattern import UNKNOWN, spread_towards
 from pipistrelle.config import Config
 from pipistrelle.detection.certainty import bearing_std, loudest_noise, over_noise
 from pipistrelle.detection.direct import Lags
-from pipistrelle.detection.full_circle import BEAM_STEP, RARE, loudest_by_chance
+from pipistrelle.detection.full_circle import (
+    BEAM_STEP,
+    CLIMBS,
+    RARE,
+    loudest_by_chance,
+    margin_of,
+    moved,
+)
 from pipistrelle.geometry import wrap, wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
@@ -65,8 +72,6 @@ BEAMS_AT_ONCE = 32
 """Beams whose outputs are in memory."""
 MARGIN = 2.0
 """How much louder than what a louder call leaves at most a peak must be, as a ratio of powers."""
-CLIMBS = 4
-"""Steps towards a peak in time and direction, each by a parabola, a quarter as wide each time."""
 SHIFT = 0.01
 """Largest Doppler shift of the calls whose lobes the set-up looks at, as a share."""
 _ANGLES = (0.0, 0.7, 1.3)
@@ -106,7 +111,10 @@ def wide_of(
 ) -> Wide:
     """Settle threshold and scan of one call for a face, or another group."""
     rate, c = config.receiver.sample_rate, config.assumed_sound_speed
-    normal, position, weight, middle = _microphones(layout, group)
+    normal, (place, gain) = float(layout.normal[group]), layout.places(group)
+    weight = gain / np.linalg.norm(gain)
+    middle = weight**2 @ place
+    position = place - middle
     band = band_of(calls[caller], rate)
     around = math.isnan(normal)
     limit = math.radians(config.detection.scan_limit_deg)
@@ -148,7 +156,10 @@ def find_wide(
     loudness = _loudness(matched, wide, lags.interval)
     peaks = _peaks(loudness, wide.threshold, wide.lobes)
     turn = np.exp(-2j * np.pi * wide.band.centre * lags.interval * np.arange(len(matched)))
-    silence = np.zeros((TAPS + _margin(wide, lags.interval), matched.shape[1]), complex)
+    silence = np.zeros(
+        (TAPS + margin_of(wide.position, wide.speed_of_sound * lags.interval), matched.shape[1]),
+        complex,
+    )
     slow = np.concatenate((silence, matched * turn[:, np.newaxis], silence))
     numbers = _rows(slow, len(silence), peaks, wide, lags.interval, _SINC)
     delay, bearing = numbers[:2]
@@ -160,28 +171,6 @@ def find_wide(
     return numbers[:, np.abs(np.sin(numbers[5])) <= wide.sine_limit]
 
 
-def _microphones(
-    layout: Layout | Scattered, group: int
-) -> tuple[float, Float[np.ndarray, "k 2"], Float[np.ndarray, " k"], Float[np.ndarray, "2"]]:
-    """Return a group's normal, places about their middle, weights and the middle."""
-    normal = float(layout.normal[group])
-    if isinstance(layout, Layout):
-        left = np.array([-math.sin(normal), math.cos(normal)])
-        place, gain = np.outer(layout.position, left), np.ones(layout.position.size)
-    else:
-        _, members = layout.members(group)
-        place, gain = layout.position[members], layout.amplitude[members]
-    weight = gain / np.linalg.norm(gain)
-    middle = weight**2 @ place
-    return normal, place - middle, weight, middle
-
-
-def _margin(wide: Wide, interval: float) -> int:
-    """Return the lags by which the farthest microphone hears earlier or later than the middle."""
-    far = np.linalg.norm(wide.position, axis=1).max() / wide.speed_of_sound
-    return math.ceil(far / interval) + 2
-
-
 def _loudness(
     matched: Complex[np.ndarray, "l k"], wide: Wide, interval: float
 ) -> Float[np.ndarray, " l"]:
@@ -189,7 +178,7 @@ def _loudness(
     from scipy.fft import fft, ifft, next_fast_len
 
     lags = len(matched)
-    count = next_fast_len(lags + 2 * _margin(wide, interval))
+    count = next_fast_len(lags + 2 * margin_of(wide.position, wide.speed_of_sound * interval))
     spectrum = np.ascontiguousarray(fft(matched, count, axis=0).T, dtype=np.complex128)
     length = count * interval
     first, last = math.ceil(wide.band.low * length), math.floor(wide.band.high * length)
@@ -213,7 +202,9 @@ def _early(wide: Wide) -> Float[np.ndarray, "n k"]:
 def _lobes_of(call: Call, wide: Wide, step: int, rate: float) -> Float[np.ndarray, " l"]:
     """Return what a call alone leaves in the scan so many lags from its peak, at most."""
     interval, sent = step / rate, replica(call, rate)
-    reach = math.ceil(sent.size / step) + 2 * _margin(wide, interval)
+    reach = math.ceil(sent.size / step) + 2 * margin_of(
+        wide.position, wide.speed_of_sound * interval
+    )
     count, most, length = 4 * reach, np.zeros(reach), 4 * reach * interval
     bins = np.arange(math.ceil(wide.band.low * length), math.floor(wide.band.high * length) + 1)
     own, place = np.fft.fft(sent, step * count)[bins], (bins / length)[:, np.newaxis]
@@ -327,14 +318,6 @@ def _output(
 
 
 @no_alloc
-def _moved(before: float, here: float, after: float) -> float:
-    """Return how many steps away a parabola through three powers peaks, one at most."""
-    bend = 2.0 * here - before - after
-    move = 0.5 * (after - before) / bend if bend > 0.0 else math.copysign(1.0, after - before)
-    return min(max(move, -1.0), 1.0)
-
-
-@no_alloc
 def _climb(
     slow: Complex[np.ndarray, "l k"],
     at: float,
@@ -350,11 +333,11 @@ def _climb(
         here, _ = _output(slow, at, bearing, beam, interval, sinc)
         before, _ = _output(slow, at, bearing - step, beam, interval, sinc)
         after, _ = _output(slow, at, bearing + step, beam, interval, sinc)
-        bearing += step * _moved(before, here, after)
+        bearing += step * moved(before, here, after)
         here, _ = _output(slow, at, bearing, beam, interval, sinc)
         before, _ = _output(slow, at - late, bearing, beam, interval, sinc)
         after, _ = _output(slow, at + late, bearing, beam, interval, sinc)
-        at += late * _moved(before, here, after)
+        at += late * moved(before, here, after)
         step, late = 0.25 * step, 0.25 * late
     power, _ = _output(slow, at, bearing, beam, interval, sinc)
     return at, bearing, power

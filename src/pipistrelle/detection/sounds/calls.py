@@ -1,24 +1,26 @@
 """When the vehicle called: told by ``calls.csv`` or a period, or found in the sound.
 
 A trigger is a channel whose level rises when a call begins. Where nothing tells, the call is found
-by its own leak into the microphones: nothing at its frequency is as loud, so its front edge stands
-where the level passes a share of what it is in most stretches at its loudest.
+by its own leak into the microphones: nothing answers its matched filter as loudly. Counted is what
+passes a share of the level that the loudest has in most stretches.
 """
 
+import math
 import os
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipistrelle.config import TONE
+from pipistrelle.acoustics.call import Call
 from pipistrelle.detection.logs.text_tables import place_of, read_table
+from pipistrelle.detection.matched import BandFilters
 from pipistrelle.detection.sounds.description import FILE as ABOUT
 from pipistrelle.detection.sounds.description import Description
 from pipistrelle.detection.sounds.sound_file import Sound
-from pipistrelle.detection.sounds.tone_sums import Blocks, ToneSums
+from pipistrelle.detection.sounds.tone_sums import Blocks
 from pipistrelle.refusals import refusal
 
 FILE = "calls.csv"
@@ -27,9 +29,11 @@ LONGEST = 2.0
 MIN_GAP = 2
 """Fewest lengths of a call from the end of one to the beginning of the next."""
 ONSET = 0.35
-"""Share of a leak's, or a trigger's, amplitude at which a call begins."""
+"""Share of the usual amplitude of a leak or a trigger that counts as a call."""
 _STRETCH = 10.0
 """Time in which the vehicle calls at least once, where that is sought in the sound [s]."""
+_LISTEN = 8
+"""Most channels in which a leak is sought."""
 _CHUNK = 1 << 21
 """Numbers that are read at a time where calls are sought."""
 
@@ -45,8 +49,8 @@ class Calls(NamedTuple):
     """Samples that are listened to, from its beginning."""
 
 
-def calls_of(folder: Path, about: Description, sound: Sound, blocks: Blocks) -> Calls:
-    """Return when the vehicle called, as it is told, or else found."""
+def calls_of(folder: Path, about: Description, sound: Sound, blocks: Blocks, sent: Call) -> Calls:
+    """Return when the vehicle called, as it is told, or else found by what it sent."""
     path, call = folder / FILE, about.call
     time = None
     if os.path.lexists(path):
@@ -58,14 +62,10 @@ def calls_of(folder: Path, about: Description, sound: Sound, blocks: Blocks) -> 
         where = f"{folder / ABOUT}, key 'call.period'"
     elif call.trigger is not None:
         where = f"{folder / ABOUT}, key 'call.trigger'"
-        each = blocks._replace(block=1, pulse=4)  # an edge, to a sample
-        sample = _onsets(sound, each, _trigger(sound, call.trigger - 1, where), blocks.blank)
-    elif call.call != TONE:
-        fix = f"write {FILE}, or call.period or call.trigger in {ABOUT}"
-        raise refusal(folder, f"nothing that tells when the {call.call} comes", "it", fix)
+        sample = _triggered(sound, call.trigger - 1, where, blocks.blank)
     else:
-        where = f"{folder}, the call's leak at {call.frequency:g} Hz"
-        sample = _onsets(sound, blocks, _leak(sound, blocks), 2 * blocks.blank)
+        where = f"{folder}, the call's leak into the microphones"
+        sample = _leaks(sound, sent, 2 * blocks.blank)
     sample = sample[sample + blocks.blank < sound.samples].astype(np.int64)
     if not sample.size:
         raise refusal(where, "no call in the sound", "one or more", "say when it calls")
@@ -103,69 +103,67 @@ def _lengths(
         number = int(np.argmin(gap)) + 1
         found = f"{gap.min()} samples from call {number} to the next"
         expected = f"{least} or more: {1 + MIN_GAP} times its duration of {blocks.blank} samples"
-        raise refusal(where, found, expected, "correct the calls, or call.duration")
+        raise refusal(where, found, expected, f"correct call.duration, or say in {FILE} when")
     length = np.append(gap, last).clip(max=round(LONGEST * sound.rate))
     return np.minimum(length, sound.samples - sample)
 
 
-Levels = Callable[[Float[np.ndarray, "t m"]], Float[np.ndarray, " b"]]
-"""Gives the amplitude in each block of samples."""
+def _pieces(sound: Sound, step: int, more: int) -> Iterator[tuple[int, Float[np.ndarray, "t m"]]]:
+    """Yield the sound in pieces of whole steps, each with so many samples more of the next."""
+    size = max(_CHUNK // sound.channels // step, 1) * step
+    for first in range(0, sound.samples, size):
+        samples = sound.read(first, min(size + more, sound.samples - first))
+        sound.refuse_odd(first, samples)
+        yield first, samples
 
 
-def _trigger(sound: Sound, channel: int, where: str) -> Levels:
-    """Return the level of one channel, sample by sample."""
+def _least(sound: Sound, sample: Float[np.ndarray, " k"], level: Float[np.ndarray, " k"]) -> float:
+    """Return the least level of a call, from the loudest of stretches."""
+    stretch = (sample / sound.rate // _STRETCH).astype(np.int64)
+    loudest = [level[stretch == one].max() for one in np.unique(stretch)]
+    return ONSET * float(np.median(loudest))
+
+
+def _triggered(sound: Sound, channel: int, where: str, apart: int) -> Float[np.ndarray, " k"]:
+    """Return where one channel rises, and is as loud at the next sample, so far apart at least."""
     if channel >= sound.channels:
         found, expected = f"channel {channel + 1}", f"1 to {sound.channels}"
         raise refusal(where, found, expected, "correct it")
-
-    def level(samples: Float[np.ndarray, "t m"]) -> Float[np.ndarray, " b"]:
-        return np.abs(samples[:, channel]).astype(np.float64)
-
-    return level
-
-
-def _leak(sound: Sound, blocks: Blocks) -> Levels:
-    """Return the level of all channels at the frequency of the vehicle's call."""
-    whole = blocks._replace(blank=0, tones=blocks.tones[:1])
-    sums = ToneSums(whole, np.arange(sound.channels)[np.newaxis])
-
-    def level(samples: Float[np.ndarray, "t m"]) -> Float[np.ndarray, " b"]:
-        return np.sqrt((np.abs(sums(samples)) ** 2).sum(axis=(1, 2, 3)))
-
-    return level
-
-
-def _onsets(sound: Sound, blocks: Blocks, level: Levels, apart: int) -> Float[np.ndarray, " k"]:
-    """Return where a level rises for as long as a call, to a part of a block.
-
-    `apart`: fewest samples from one to the next.
-    """
-    at_once = max(_CHUNK // sound.channels // blocks.block, 4 * blocks.pulse)
-    starts = range(0, sound.samples // blocks.block, at_once)
-
-    def read(start: int, count: int) -> Float[np.ndarray, " b"]:
-        count = min(count, sound.samples // blocks.block - start)
-        samples = sound.read(start * blocks.block, count * blocks.block)
-        sound.refuse_odd(start * blocks.block, samples)
-        return level(samples)
-
-    loudest = np.array([read(start, at_once).max() for start in starts])
-    parts = max(round(_STRETCH * sound.rate / blocks.block / at_once), 1)
-    stretches = [loudest[i : i + parts].max() for i in range(0, loudest.size, parts)]
-    least, found = ONSET * float(np.median(stretches)), [-np.inf]
-    for start in starts:
-        # two blocks of the piece before, and a call of the one after
-        first = max(start - 2, 0)
-        amplitude = read(first, at_once + start - first + blocks.pulse)
-        above = amplitude >= least
-        for b in np.flatnonzero(above[1:] & ~above[:-1]) + 1:
-            whole = amplitude[b + 1 : b + blocks.pulse - 1]
-            if not start <= first + b < start + at_once or whole.size < blocks.pulse - 2:
-                continue
-            if np.mean(whole >= least) < 0.75:
-                continue
-            share = np.minimum(amplitude[max(b - 1, 0) : b + 1] / np.median(whole), 1.0).sum()
-            sample = blocks.block * max(first + b + 1 - share, 0.0)
+    loudest = [(first, np.abs(some[:, channel]).max()) for first, some in _pieces(sound, 1, 0)]
+    least, found = _least(sound, *np.array(loudest).T), [-np.inf]
+    for begin, samples in _pieces(sound, 1, 2):
+        above = np.abs(samples[:, channel]) >= least
+        rises = np.flatnonzero(above[1:-1] & above[2:] & ~above[:-2]) + 1
+        for sample in begin + rises:
             if sample - found[-1] > apart:
-                found.append(sample)
-    return np.rint(np.array(found[1:]))
+                found.append(float(sample))
+    return np.array(found[1:])
+
+
+def _leaks(sound: Sound, sent: Call, apart: int) -> Float[np.ndarray, " k"]:
+    """Return where a call's matched filter answers the loudest, so many samples apart at least."""
+    filters = BandFilters((sent,), sound.rate)
+    step, loudest = filters.step, []
+    some = max(apart // step, 1)
+    for first, samples in _pieces(sound, some * step, filters.length + step):
+        some_channels = samples[:, :: math.ceil(sound.channels / _LISTEN)]
+        outputs = filters((some_channels - some_channels.mean(axis=0))[:, np.newaxis])
+        level = np.sqrt((outputs.real**2 + outputs.imag**2).sum(axis=(1, 2, 3)))
+        for begin in range(0, len(level), some):
+            k = begin + int(level[begin : begin + some].argmax())
+            loudest.append((first + step * (k + _aside(level[max(k - 1, 0) : k + 2])), level[k]))
+    if not loudest:
+        return np.empty(0)
+    sample, level = np.array(loudest).T
+    loud = level >= _least(sound, sample, level)
+    sample, level = sample[loud], level[loud]
+    alone = [i == np.where(np.abs(sample - sample[i]) <= apart, level, 0.0).argmax()
+             for i in range(sample.size)]  # fmt: skip
+    return np.rint(np.maximum(sample[alone], 0.0))
+
+
+def _aside(level: Float[np.ndarray, " n"]) -> float:
+    """Return how many steps beside the second of three levels a parabola through them peaks."""
+    if level.size < 3 or level[1] <= max(level[0], level[2]):
+        return 0.0
+    return float(0.5 * (level[2] - level[0]) / (2.0 * level[1] - level[0] - level[2]))

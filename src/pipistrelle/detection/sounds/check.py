@@ -6,9 +6,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int
 
-from pipistrelle.config import TONE, Config
+from pipistrelle.acoustics.call import Call, ToneBurst
+from pipistrelle.arrays.bands import extent_of, replica
+from pipistrelle.config import Config
 from pipistrelle.detection.sounds.calls import Calls, calls_of
-from pipistrelle.detection.sounds.check_array import array_faults
+from pipistrelle.detection.sounds.check_array import BETTER, array_faults
 from pipistrelle.detection.sounds.description import Description
 from pipistrelle.detection.sounds.hearing import Hearing, sums_of
 from pipistrelle.detection.sounds.recorded_array import RecordedArray, recorded_array
@@ -22,20 +24,22 @@ RATES = (44_100, 48_000, 88_200, 96_000, 176_400, 192_000, 200_000, 250_000, 256
 """Usual sample rates [Hz]."""
 _FAINT, _FLAT = 10 ** (-30 / 20), 10
 """A dead channel's noise beside the others'; fewest flat tops of a clipped one."""
+LEAKS = 0.5
+"""Least share of the sound while the vehicle calls that is its call at some sample rate."""
 
 
 def check_recording(folder: Path, about: Description, config: Config) -> list[str]:
     """Return what is odd about a recording, a line each."""
     with open_sound(folder, about) as sound:
         array = recorded_array(folder, sound.channels, one_centre=about.one_centre)
-        blocks = sums_of(folder, sound, about, array)[0].blocks
-        calls = calls_of(folder, about, sound, blocks)
+        sums, sent = sums_of(folder, sound, about, array)
+        blocks = sums.blocks
+        calls = calls_of(folder, about, sound, blocks, sent[0])
         gaps = np.unique(np.linspace(0, calls.sample.size - 1, GAPS).round().astype(np.int64))
         dead, faults = _channels(sound, calls, gaps, array)
-        faults += _rate(sound, calls, gaps, blocks) if about.call.call == TONE else []
+        look = _tone_rate if isinstance(sent[0], ToneBurst) else _call_rate
+        faults += look(sound, calls, gaps, sent[0])
         faults += _clock(calls, blocks)
-        if about.call.call != TONE:
-            return faults  # the order of channels is told by a tone's phases
         if dead:
             return [*faults, "the order of the channels was not looked at, for some are dead"]
         hearing = Hearing.of(folder, sound, about, config)
@@ -73,9 +77,11 @@ def _channels(
     return bool(dead), faults
 
 
-def _rate(sound: Sound, calls: Calls, gaps: Int[np.ndarray, " g"], blocks: Blocks) -> Iterator[str]:
-    """Ask whether the call that leaks into the microphones has the frequency that it should."""
-    length = blocks.pulse * blocks.block
+def _tone_rate(
+    sound: Sound, calls: Calls, gaps: Int[np.ndarray, " g"], sent: Call
+) -> Iterator[str]:
+    """Ask whether the tone that leaks into the microphones has the frequency that it should."""
+    length = round(sent.duration * sound.rate)
     power = np.zeros(8 * length // 2 + 1)
     for k in gaps:
         samples = sound.read(int(calls.sample[k]), min(length, int(calls.length[k])))
@@ -86,7 +92,7 @@ def _rate(sound: Sound, calls: Calls, gaps: Int[np.ndarray, " g"], blocks: Block
         return  # nothing leaks
     a, b, c = np.log(power[peak - 1 : peak + 2])
     found = (peak + 0.5 * (a - c) / (a - 2.0 * b + c)) * sound.rate / (8 * length)
-    own = float(blocks.tones[0])
+    own = sent.frequency
     if abs(found - own) <= 0.5 * sound.rate / length:
         return
     fits = sound.rate * own / found
@@ -96,6 +102,34 @@ def _rate(sound: Sound, calls: Calls, gaps: Int[np.ndarray, " g"], blocks: Block
         f"while the vehicle calls, {found:.0f} Hz are loudest, not {own:g} Hz (call.frequency): a "
         f"sample rate of {fits:.0f} Hz in place of {sound.rate:g} Hz would explain it{usual}"
     )
+
+
+def _call_rate(
+    sound: Sound, calls: Calls, gaps: Int[np.ndarray, " g"], sent: Call
+) -> Iterator[str]:
+    """Ask at which sample rate what leaks into the microphones is the call."""
+    share = {}
+    for rate in (sound.rate, *RATES):
+        if extent_of(sent, rate)[1] >= rate / 2.0:
+            continue
+        own, energy, answer = replica(sent, rate), 0.0, 0.0
+        for k in gaps:
+            some = sound.read(int(calls.sample[k]), min(own.size, int(calls.length[k])))
+            some = some - some.mean(axis=0)
+            answers = np.fft.ifft(
+                np.fft.fft(some, 2 * own.size, axis=0)
+                * np.fft.fft(own, 2 * own.size).conj()[:, np.newaxis],
+                axis=0,
+            )
+            answer += float((np.abs(answers) ** 2).max(axis=0).sum())
+            energy += 0.5 * float((some**2).sum() * np.sum(np.abs(own) ** 2))
+        share[rate] = answer / energy
+    best = max(share, key=lambda rate: share[rate])
+    if share[best] > LEAKS and share[sound.rate] < BETTER * share[best]:
+        yield (
+            f"while the vehicle calls, {share[sound.rate]:.0%} of the sound are its call at "
+            f"{sound.rate:g} Hz, and {share[best]:.0%} at a sample rate of {best:g} Hz"
+        )
 
 
 def _clock(calls: Calls, blocks: Blocks) -> Iterator[str]:

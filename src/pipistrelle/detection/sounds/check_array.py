@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from pipistrelle.arrays.layout import Layout
 from pipistrelle.detection.sounds.hearing import Frame, Hearing
 from pipistrelle.geometry import wrap
 
@@ -26,50 +25,78 @@ MOST_FACES = 4
 LOUD = 300.0
 """Least power of an echo over the noise of a steered beam."""
 WIDEST = 0.2
-"""Widest group whose order is looked at, in lengths of a call."""
+"""Widest group whose order a tone tells, in lengths of the call."""
+AROUND, AT_ONCE = 16, 1 << 21
+"""Outputs to both sides of an echo that is no tone; numbers that are in memory at a time."""
 MISFIT, BETTER = 0.02, 0.5
 """Least misfit that asks for another order, and the share of it that one leaves which is named."""
 DISAGREE = 0.15
 """Least median difference between the bearings of two faces that asks for other faces [rad]."""
 
 
-class _Loudest(NamedTuple):
-    """The loudest echoes that a group of microphones heard."""
+class _Echo(NamedTuple):
+    """A loud echo, as a group of microphones heard it at the time of its middle."""
 
-    caller: list[int]
-    output: list[Complex[np.ndarray, " e"]]
-    """The matched filters' outputs."""
+    frequency: Float[np.ndarray, " k"]
+    """Of a tone, or of the parts of a band [Hz]."""
+    output: Complex[np.ndarray, "k e"]
+    """The matched filters' outputs, by frequency."""
 
 
 def array_faults(hearing: Hearing) -> Iterator[str]:
     """Say which other order of the channels would explain the loudest sounds better."""
-    heard = [_Loudest([], []) for _ in hearing.array.face]
+    heard: list[list[_Echo]] = [[] for _ in hearing.array.face]
     pairs: list[tuple[int, float, int, float]] = []
     last = hearing.calls.sample.size - 1
     for frame in hearing.frames(np.unique(np.linspace(0, last, CALLS).astype(np.int64)).tolist()):
         _collect(frame, hearing, heard)
         pairs += _pairs(frame, hearing)
-    for g, loudest in enumerate(heard):
-        if len(loudest.output) >= MIN_SNAPSHOTS:
-            yield from _order(hearing, g, loudest)
+    for g, echoes in enumerate(heard):
+        if len(echoes) >= MIN_SNAPSHOTS:
+            yield from _order(hearing, g, echoes)
     if len(pairs) >= MIN_PAIRS:
         yield from _faces(hearing, np.array(pairs))
 
 
-def _collect(frame: Frame, hearing: Hearing, heard: list[_Loudest]) -> None:
-    """Keep the matched filters' outputs of the loudest echo of each group and caller."""
+def _collect(frame: Frame, hearing: Hearing, heard: list[list[_Echo]]) -> None:
+    """Keep the loudest echo of each group and caller, if it is loud."""
     found = frame.detections
-    for g, loudest in enumerate(heard):
-        row, members = hearing.array.layout.members(g)
+    for g, echoes in enumerate(heard):
         for caller in np.unique(found.caller):
             rows = np.flatnonzero((found.face == g) & (found.caller == caller))
-            if rows.size == 0 or len(loudest.output) >= SNAPSHOTS:
+            if rows.size == 0 or len(echoes) >= SNAPSHOTS:
                 continue
-            d = rows[found.power[rows].argmax()]
-            lag = round((found.delay[d] - frame.start) / frame.interval)
-            if found.power[d] >= LOUD and 0 <= lag < len(frame.matched):
-                loudest.caller.append(int(caller))
-                loudest.output.append(frame.matched[lag, row, caller][members])
+            d = int(rows[found.power[rows].argmax()])
+            echo = _echo(frame, hearing, d) if found.power[d] >= LOUD else None
+            if echo is not None:
+                echoes.append(echo)
+
+
+def _echo(frame: Frame, hearing: Hearing, d: int) -> _Echo | None:
+    """Return what a group heard of a detection; None of one at the record's ends.
+
+    What is no tone is parted into frequencies, for its microphones hear it one by one.
+    """
+    found, caller = frame.detections, int(frame.detections.caller[d])
+    row, members = hearing.array.layout.members(int(found.face[d]))
+    outputs = frame.matched[:, row, caller][:, members]
+    at = (found.delay[d] - frame.start) / frame.interval
+    wide = hearing.wide(caller, int(found.face[d]))
+    if wide is None:
+        if not 0 <= round(at) < len(outputs):
+            return None
+        return _Echo(hearing.blocks.tones[[caller]], outputs[[round(at)]])
+    c, far = wide.speed_of_sound, np.linalg.norm(wide.position, axis=1).max()
+    toward = np.array([np.cos(found.bearing[d]), np.sin(found.bearing[d])])
+    at -= wide.middle @ toward / c / frame.interval
+    reach = AROUND + math.ceil(far / c / frame.interval)
+    first, length = round(at) - reach, 2 * reach * frame.interval
+    if not 0 <= first <= len(outputs) - 2 * reach:
+        return None
+    bins = np.arange(math.ceil(wide.band.low * length), math.floor(wide.band.high * length) + 1)
+    spectrum = np.fft.fft(outputs[first : first + 2 * reach], axis=0)[bins % (2 * reach)]
+    turn = np.exp(2j * np.pi * bins / length * (at - first) * frame.interval)
+    return _Echo(bins / length, spectrum * turn[:, np.newaxis])
 
 
 def _pairs(frame: Frame, hearing: Hearing) -> list[tuple[int, float, int, float]]:
@@ -85,39 +112,51 @@ def _pairs(frame: Frame, hearing: Hearing) -> list[tuple[int, float, int, float]
     return pairs
 
 
-def _order(hearing: Hearing, g: int, heard: _Loudest) -> Iterator[str]:
+def _order(hearing: Hearing, g: int, echoes: list[_Echo]) -> Iterator[str]:
     """Try to swap two channels of a group, or the sign of one."""
     lead, gain = _directions(hearing, g)
-    if np.ptp(lead, axis=1).max() > WIDEST * hearing.about.call.duration:
-        return  # an echo's edges reach its microphones one by one
-    caller, output = np.array(heard.caller), np.array(heard.output)
-    beams = gain * np.exp(-2j * np.pi * hearing.blocks.tones[:, None, None] * lead)
+    if np.ptp(lead, axis=1).max() > WIDEST * hearing.about.call.duration:  # one by one
+        echoes = [echo for echo in echoes if echo.frequency.size > 1]
+    if not echoes:
+        return
     row, members = hearing.array.layout.members(g)
-    count, channel = members.size, hearing.array.channel[row, members] + 1
-
-    def misfit(changed: Complex[np.ndarray, "n e"]) -> float:
-        power = np.array([
-            np.abs(beams[p] @ one).max() ** 2 for p, one in zip(caller, changed, strict=True)
-        ])  # fmt: skip
-        energy = (np.abs(changed) ** 2).sum(axis=1) * (gain**2).sum()
-        return float(np.median(1.0 - power / energy))
-
-    now, tried = misfit(output), []
+    channel = hearing.array.channel[row, members] + 1
+    shares = [_shares(echo, lead, gain) for echo in echoes]
+    now = 1.0 - float(np.median([share for share, _ in shares]))
     if now < MISFIT:
         return
-    for i, j in combinations(range(count), 2):
-        order = np.arange(count)
-        order[[i, j]] = j, i
-        tried.append((misfit(output[:, order]), f"swap channels {channel[i]} and {channel[j]}"))
-    for i in range(count):
-        sign = np.where(np.arange(count) == i, -1.0, 1.0)
-        tried.append((misfit(output * sign), f"turn the sign of channel {channel[i]} round"))
-    best, what = min(tried)
+    changed = 1.0 - np.median([share for _, share in shares], axis=0)
+    i, j = divmod(int(changed.argmin()), members.size)
+    what = f"swap channels {channel[i]} and {channel[j]}"
+    what = what if i != j else f"turn the sign of channel {channel[i]} round"
     misses = f"{_named(hearing, g)}: the best beam misses {now:.1%} of the loudest echoes' energy"
-    if best <= BETTER * now:
-        yield f"{misses}, {best:.1%} if you {what} in array.csv"
+    if changed[i, j] <= BETTER * now:
+        yield f"{misses}, {changed[i, j]:.1%} if you {what} in array.csv"
     else:
         yield f"{misses}, and no swap of two channels would help: are places and tone right?"
+
+
+def _shares(
+    echo: _Echo, lead: Float[np.ndarray, "b e"], gain: Float[np.ndarray, " e"]
+) -> tuple[float, Float[np.ndarray, "e e"]]:
+    """Return the share of an echo's energy that the best beam has, as the microphones are.
+
+    And with two of them swapped, or on the diagonal, with the sign of one turned round.
+    """
+    now, changed = 0.0, np.zeros((gain.size, gain.size))
+    for some in np.array_split(lead, math.ceil(lead.size * gain.size / AT_ONCE)):
+        # of each direction, for each place what each channel would add to a beam
+        heard = np.exp(-2j * np.pi * some[..., np.newaxis] * echo.frequency) @ echo.output
+        energy, added = np.abs(heard) ** 2, gain[:, np.newaxis] * heard
+        own, own_energy = (np.einsum("bii->bi", each) for each in (added, energy))
+        total, whole = own.sum(axis=1), own_energy.sum(axis=1)
+        more, louder = added - own[..., np.newaxis], energy - own_energy[..., np.newaxis]
+        more[:, range(gain.size), range(gain.size)] = -own
+        power = np.abs(total[:, None, None] + more + more.swapaxes(1, 2)) ** 2
+        share = power / (whole[:, None, None] + louder + louder.swapaxes(1, 2))
+        now = max(now, float((np.abs(total) ** 2 / whole).max()))
+        changed = np.maximum(changed, share.max(axis=0))
+    return now / np.sum(gain**2), changed / np.sum(gain**2)
 
 
 def _directions(
@@ -128,13 +167,8 @@ def _directions(
     Directions are so dense that between two the phase turns by some 0.2 rad.
     """
     layout, speed = hearing.array.layout, hearing.config.assumed_sound_speed
-    if isinstance(layout, Layout):
-        place, gain = np.column_stack((layout.position * 0.0, layout.position)), layout.position**0
-        normal = 0.0
-    else:
-        _, members = layout.members(g)
-        place, gain = layout.position[members], layout.amplitude[members]
-        place, normal = place - place.mean(axis=0), float(layout.normal[g])
+    (place, gain), normal = layout.places(g), float(layout.normal[g])
+    place = place - gain**2 @ place / np.sum(gain**2)
     reach = np.linalg.norm(place, axis=1).max() * hearing.blocks.tones.max() / speed
     half = math.pi if math.isnan(normal) else 0.5 * math.pi
     bearing = 0.0 if math.isnan(normal) else normal

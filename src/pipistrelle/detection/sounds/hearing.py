@@ -13,7 +13,7 @@ from pipistrelle.acoustics.call import Call, ToneBurst
 from pipistrelle.arrays.bands import extent_of
 from pipistrelle.config import Config
 from pipistrelle.detection.echoes import unlabelled_scan, with_edge_floor
-from pipistrelle.detection.front_end import FrontEnd, find_calls, front_end
+from pipistrelle.detection.front_end import FrontEnd, Mixed, find_calls, front_end
 from pipistrelle.detection.matched import Workspace, filter_blocks
 from pipistrelle.detection.scans import Scan
 from pipistrelle.detection.snapshots import Detections, detections_at
@@ -25,6 +25,7 @@ from pipistrelle.detection.sounds.recorded_array import FILE as ARRAY
 from pipistrelle.detection.sounds.recorded_array import RecordedArray, recorded_array
 from pipistrelle.detection.sounds.sound_file import Sound, open_sound
 from pipistrelle.detection.sounds.tone_sums import Blocks, ToneSums, blocks_of
+from pipistrelle.detection.wideband import Wide
 from pipistrelle.refusals import refusal
 
 Progress = Callable[[str, int, int], None]
@@ -71,7 +72,7 @@ class Hearing:
         array = recorded_array(folder, sound.channels, one_centre=about.one_centre)
         sums, sent = sums_of(folder, sound, about, array)
         blocks = sums.blocks
-        calls = calls_of(folder, about, sound, blocks)
+        calls = calls_of(folder, about, sound, blocks, sent[0])
         set_noise(sums, sound, calls, folder)
         settled = _settled(config, about, sound.rate)
         return cls(
@@ -86,6 +87,11 @@ class Hearing:
             end=front_end(settled, array.layout, blocks.tones, str(folder / ARRAY), sent),
             own_clock=np.array([False, *(one.own_clock for one in about.callers)]),
         )
+
+    def wide(self, caller: int, group: int) -> Wide | None:
+        """Return what finds a call in a group's outputs over its whole band; None of a tone."""
+        wide = self.end.wide if isinstance(self.end, Mixed) else ()
+        return next((one for p, g, one in wide if (p, g) == (caller, group)), None)
 
     def frames(self, numbers: Sequence[int]) -> Iterator[Frame]:
         """Hear what came after some of the calls, numbered from 0 on."""
