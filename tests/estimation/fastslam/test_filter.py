@@ -152,7 +152,7 @@ def test_rays_that_restart_at_resampling_equal_the_slow_reference():
 def test_every_range_for_a_ray_equals_the_slow_reference(ranged, weights, mixture):
     rays = ray_config(power=2.0, ranged=ranged)
     slam = swarm_filter(4, mixture, weights=weights, rays=rays)
-    assert_equal_to_reference(slam, small_mission("fused", frames=16))
+    assert_equal_to_reference(slam, small_mission("fused", frames=8))
 
 
 @pytest.mark.parametrize("mixture", ["federated", "exact"])
