@@ -158,7 +158,7 @@ def test_every_range_for_a_ray_equals_the_slow_reference(ranged, weights, mixtur
 @pytest.mark.parametrize("mixture", ["federated", "exact"])
 @pytest.mark.parametrize("weights", ["marginal", "sampled"])
 @pytest.mark.parametrize("likelihood", ["normal", "printed"])
-@pytest.mark.parametrize("frames", [20, pytest.param(32, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("frames", [10, pytest.param(32, marks=pytest.mark.slow)])
 def test_every_weight_with_every_likelihood_equals_the_slow_reference(
     frames, likelihood, weights, mixture
 ):

@@ -412,7 +412,7 @@ def test_a_caller_that_moves_is_heard_but_is_no_landmark():
     assert kept == sum(np.count_nonzero(scan.landmark != 52) for scan in scans)
 
 
-@pytest.mark.parametrize("seed", [1000, pytest.param(1001, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [1000, 1001])
 def test_the_smoother_follows_a_caller_that_circles_by_its_sound(seed):
     config = Config(
         seed=seed,
