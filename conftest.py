@@ -23,3 +23,10 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     if not any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbc")):
         compile_all = "from pipistrelle.experiments.runs.compiling import compile_kernels as c; c()"
         subprocess.run([sys.executable, "-c", compile_all], check=False)
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Leave out the picture, which is most of a short mission's time."""
+    monkeypatch.setattr("pipistrelle.figures.mission.draw_mission", lambda *_, **__: None)
+    monkeypatch.setattr("pipistrelle.figures.style.save_figure", lambda *_: None)

@@ -46,7 +46,7 @@ def started(monkeypatch):
 def logs(tmp_path_factory):
     """Return folders of logs, by name, and the poses of their odometry; None where it is twists."""
     place = tmp_path_factory.mktemp("logs")
-    line = ["run", "--settings", "paper", "--strategy", "active", "--quiet", "--duration", "20"]
+    line = ["run", "--settings", "paper", "--strategy", "active", "--quiet", "--duration", "8"]
     assert main([*line, "-o", str(place / "out"), "--save-log", str(place / "run")]) == 0
     mission, along = as_poses(with_ranges(read_log(place / "run")), (0.01, 0.01, 0.01))
     unicycle, poses = (

@@ -15,7 +15,10 @@ def solved(belief, passes=30):
     x = np.concatenate([part.ravel() for part in parts])
     for _ in range(passes):
         r, J = misfits(belief.history, x)
-        x = x - np.linalg.lstsq(J, r, rcond=None)[0]
+        step = np.linalg.lstsq(J, r, rcond=None)[0]
+        x = x - step
+        if (np.abs(step) < 1e-9 * (1.0 + np.abs(x))).all():
+            break
     r, _ = misfits(belief.history, x)
     first, last = 3 * nodes, 3 * nodes + points.spots.size
     return x[:first].reshape(-1, 3), x[first:last].reshape(-1, 2), x[last:], r @ r
@@ -29,14 +32,14 @@ def misfits(history, x):
     theta = slice(first + 2 * len(history.placed), size)
     for k in range(history.nodes):
         at = slice(3 * max(k - 1, 0), 3 * k + 3)
+        root = np.linalg.inv(np.linalg.cholesky(noise[k]))
 
-        def off(ends, parameters, k=k):
+        def off(ends, parameters, k=k, root=root):
             scale = np.ones(3)
             if k and asked.scale_is_free(history.ranged):
                 scale[:2] = 1.0 + parameters[0]
-            root = np.linalg.inv(np.linalg.cholesky(noise[k])) / scale
             led = mean[k] + slopes[k] @ parameters[: asked.odometry.size]
-            return root @ odometry(ends, led, k)
+            return root / scale @ odometry(ends, led, k)
 
         both = x[at], x[theta]
         by = [(at, differences(off, both, 0)), (theta, differences(off, both, 1))]
@@ -58,13 +61,14 @@ def hear(history, x, k, m, into):
     if history.index[slot] == 0:
         return
     bearing, distance, excess_path, across, along, sure, _, lean = numbers
+    lean = np.nan_to_num(lean)
     theta = slice(3 * history.nodes + 2 * len(history.placed), x.size)
     ends = [slice(3 * k, 3 * k + 3), place_of(history, slot), theta]
 
     def seen(pose, point, parameters):
         at, heading, scale, leaning = sensor(history, k, pose, parameters)
         dx, dy = point - at
-        turned = np.arctan2(dy, dx) - heading - np.nan_to_num(lean) * leaning
+        turned = np.arctan2(dy, dx) - heading - lean * leaning
         off = [wrap(turned - bearing) / across, (np.hypot(dx, dy) / scale - distance) / along]
         return np.array(off)[[np.isfinite(bearing), np.isfinite(bearing) and np.isfinite(distance)]]
 

@@ -30,6 +30,7 @@ def done():
     return pipistrelle.run(**SHORT, filters="both", fastslam__particles=7)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_frames_are_those_of_the_folder_of_the_command_line(capsys, done):
     words = ("--duration", "4", "--landmarks", "10", "--filter", "both", "--particles", "7")
     assert main(["run", "--settings", "paper", *words, "-o", "one"]) == 0
@@ -50,6 +51,7 @@ def test_frames_are_those_of_the_folder_of_the_command_line(capsys, done):
     assert loaded.summary.drop("wall_s").equals(done.summary.drop("wall_s"))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_nothing_is_written_unless_a_folder_is_named(done, tmp_path):
     assert done.folder is None
     assert list(tmp_path.iterdir()) == []
@@ -134,6 +136,7 @@ def test_mistakes_are_told_in_the_words_of_the_call(words, asked, said):
     assert said in str(refused.value)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_folder_that_is_not_empty_is_refused_in_pythons_words(done, tmp_path):
     (tmp_path / "mine.txt").write_text("kept")
     for ask in (done.save, lambda folder: pipistrelle.run(duration=4.0, output=folder)):
@@ -149,6 +152,7 @@ def test_a_folder_that_is_not_empty_is_refused_in_pythons_words(done, tmp_path):
         done.save(place)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_log_is_solved_as_by_the_command_line(capsys):
     found = pipistrelle.slam(LOG, strategies="all", beamwidth=90.0, rays__power=4.0)
     words = ("--strategy", "all", "--beamwidth", "90", "--rays.power", "4.0", "-o", "one")
@@ -196,6 +200,7 @@ def test_what_is_no_folder_of_ours_is_refused(tmp_path):
             pipistrelle.load(name)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_table_that_is_cut_or_none_is_refused_by_name(done):
     table = done.save("one") / "steps.parquet"
     table.write_bytes(table.read_bytes()[:100])
@@ -264,6 +269,7 @@ class Deaf(EkfSlam):
         return belief
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_filter_may_be_a_class_and_goes_by_its_name(done):
     found = pipistrelle.run(**SHORT, strategies="fused", filters=["ekf", Deaf], output="one")
     name = f"{Deaf.__module__}:Deaf"
@@ -292,6 +298,7 @@ def test_a_class_that_nobody_else_finds_is_refused():
 CALLERS = ({"name": "bee", "frequency": 25000.0, "course": "circle"},)
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("kind", ["a log", "a caller that moves", "a world of one's own"])
 def test_what_is_loaded_is_saved_as_it_was_kept_first(kind, tmp_path):
     if kind == "a log":

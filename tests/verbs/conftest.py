@@ -28,13 +28,6 @@ def obey(capsys):
 
 
 @pytest.fixture
-def undrawn(monkeypatch):
-    """Leave out the picture, which is most of a short mission's time."""
-    monkeypatch.setattr("pipistrelle.figures.mission.draw_mission", lambda *_, **__: None)
-    monkeypatch.setattr("pipistrelle.figures.style.save_figure", lambda *_: None)
-
-
-@pytest.fixture
 def refused(obey):
     """Run a command line that must be refused; return what is said."""
 

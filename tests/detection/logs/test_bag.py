@@ -438,14 +438,15 @@ def ending(path):
     return "read"
 
 
+@pytest.mark.parametrize("times", [15, pytest.param(100, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", KINDS[:3])
-def test_bytes_that_are_changed_at_random_end_in_a_log_or_a_refusal(tmp_path, name):
+def test_bytes_that_are_changed_at_random_end_in_a_log_or_a_refusal(tmp_path, name, times):
     whole = write_bag(
         tmp_path / name, sorted([*drive(), seen(0.2)], key=lambda one: one[2])
     ).read_bytes()
     rng, ends = np.random.default_rng(5), set()
     path = tmp_path / f"odd{Path(name).suffix}"
-    for _ in range(60):
+    for _ in range(times):
         data = bytearray(whole)
         for at in rng.integers(len(data), size=int(rng.integers(1, 6))):
             data[at] = int(rng.integers(256))

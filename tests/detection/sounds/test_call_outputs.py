@@ -74,7 +74,14 @@ def scans_of_run(settings):
     return [frame.unlabelled for frame in frames]
 
 
-@pytest.mark.parametrize("case", CASES, indirect=True)
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, marks=() if case in ("sweep", "file") else pytest.mark.slow)
+        for case in CASES
+    ],
+    indirect=True,
+)
 def test_what_is_heard_of_a_call_is_what_the_run_heard(case):
     tape = record(Path("tape").absolute(), *words(case))
     log, run = heard(tape), scans_of_run(case)

@@ -237,7 +237,7 @@ def aligned_error(kind, robust, seed, gross):
     return rmse(position_error(moved(path, alignment(path, true)), true))
 
 
-@pytest.mark.parametrize("drives", [12, pytest.param(30, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("drives", [5, pytest.param(30, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", KINDS)
 def test_gross_errors_among_precise_bearings_are_borne(kind, drives):
     calm, calm_robust, plain, robust = (

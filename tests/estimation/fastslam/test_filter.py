@@ -152,13 +152,13 @@ def test_rays_that_restart_at_resampling_equal_the_slow_reference():
 def test_every_range_for_a_ray_equals_the_slow_reference(ranged, weights, mixture):
     rays = ray_config(power=2.0, ranged=ranged)
     slam = swarm_filter(4, mixture, weights=weights, rays=rays)
-    assert_equal_to_reference(slam, small_mission("fused", frames=16))
+    assert_equal_to_reference(slam, small_mission("fused", frames=8))
 
 
 @pytest.mark.parametrize("mixture", ["federated", "exact"])
 @pytest.mark.parametrize("weights", ["marginal", "sampled"])
 @pytest.mark.parametrize("likelihood", ["normal", "printed"])
-@pytest.mark.parametrize("frames", [20, pytest.param(32, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("frames", [10, pytest.param(32, marks=pytest.mark.slow)])
 def test_every_weight_with_every_likelihood_equals_the_slow_reference(
     frames, likelihood, weights, mixture
 ):

@@ -65,15 +65,23 @@ def mission_of(strategy, seed=4, frames=30, callers=(13, 45), std=1.0, controls=
     return replace(mission, scans=scans)
 
 
-@pytest.mark.parametrize("strategy", SENSING)
 @pytest.mark.parametrize(
-    "names",
-    [PARAMETERS, ("speed_scale", "speed_of_sound"), *((name,) for name in PARAMETERS)],
-    ids=lambda names: "+".join(names),
+    ("strategy", "names"),
+    [
+        *((strategy, PARAMETERS) for strategy in SENSING),
+        *(("fused", (name,)) for name in PARAMETERS),
+        *(
+            pytest.param(strategy, names, marks=pytest.mark.slow)
+            for strategy in SENSING
+            for names in (("speed_scale", "speed_of_sound"), *((name,) for name in PARAMETERS))
+            if (strategy, len(names)) != ("fused", 1)
+        ),
+    ],
+    ids=str,
 )
 def test_the_optimum_is_that_of_dense_normal_equations(strategy, names):
     slam = smoother(*names)
-    *_, (belief, _) = followed(slam, mission_of(strategy, frames=20))
+    *_, (belief, _) = followed(slam, mission_of(strategy, frames=10))
     history = in_hindsight(belief.history)
     ours = converged(belief.solution, belief.history, belief.noise)
     for _ in range(30):

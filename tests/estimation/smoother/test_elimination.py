@@ -79,7 +79,7 @@ def test_the_optimum_is_that_of_a_general_solver(strategy, robust):
 @pytest.mark.parametrize("callers", [(), (13, 45)], ids=["without timing", "with timing"])
 def test_the_optimum_is_that_of_dense_normal_equations(strategy, callers):
     """A step that no longer lowers the cost by what can be told is not taken: landmarks show it."""
-    belief = last_belief(strategy, 4, frames=30, callers=callers)
+    belief = last_belief(strategy, 4, frames=20, callers=callers)
     ours = settled(belief)
     poses, places, _, cost = dense_smoothing.solved(belief)
     off = poses_of(ours) - poses

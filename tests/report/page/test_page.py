@@ -88,6 +88,12 @@ def whole(tmp_path_factory):
     return (folder / "index.html").read_text(encoding="utf-8")
 
 
+@pytest.fixture(scope="module")
+def small():
+    """Two worlds at two of their beamwidths: a page that is soon written."""
+    return narrowed(invent(2), [0, 11])
+
+
 @pytest.fixture
 def undrawn(monkeypatch):
     draw_only(monkeypatch)
@@ -103,29 +109,28 @@ def test_everything_is_there(reported):
 
 @pytest.mark.parametrize("name", ["index.html", "summary.json", "figures/gain.csv"])
 def test_a_users_file_in_the_place_of_the_reports_is_refused_by_name(
-    store, tmp_path, undrawn, name
+    small, tmp_path, undrawn, name
 ):
     site = tmp_path / "site"
     (site / name).parent.mkdir(parents=True)
     (site / name).write_text("mine")
     with pytest.raises(InputError, match="site: is not empty and holds no report of Pipistrelle"):
-        write_report(read_study(store), site)
+        write_report(small, site)
     assert [path for path in site.rglob("*") if path.is_file()] == [site / name]
     shutil.rmtree(site)
     OwnFiles(site, REPORT).replace({"figures/other.png": "an earlier report's"})
     (site / name).write_text("mine")
     with pytest.raises(InputError, match=f"{name}: is not Pipistrelle's, so it is not replaced"):
-        write_report(read_study(store), site)
+        write_report(small, site)
     assert (site / name).read_text() == "mine"
     assert (site / "figures" / "other.png").exists()
 
 
-def test_a_report_is_written_anew_in_its_own_place(store, tmp_path, undrawn):
-    studies = read_study(store)
-    write_report(studies, tmp_path / "report")
+def test_a_report_is_written_anew_in_its_own_place(small, tmp_path, undrawn):
+    write_report(small, tmp_path / "report")
     before = sorted((tmp_path / "report").rglob("*"))
     (tmp_path / "report" / "notes.txt").write_text("mine")
-    write_report(studies, tmp_path / "report")
+    write_report(small, tmp_path / "report")
     after = sorted((tmp_path / "report").rglob("*"))
     assert after == sorted([*before, tmp_path / "report" / "notes.txt"])
 
@@ -246,7 +251,7 @@ def test_no_text_of_a_study_becomes_markup(tmp_path, undrawn):
 
 def test_failed_trials_are_counted_over_all_combinations(tmp_path, capsys, undrawn):
     grid = '"air.relative_humidity" = [0.3, 0.7]\n'
-    plan, _, _ = write_store(tmp_path / "store", invent(2), grid=grid)
+    plan, _, _ = write_store(tmp_path / "store", invent(1), grid=grid)
     moist = [c.number for c in cases_of(plan) if c.values["air.relative_humidity"] == 0.7]
     failed = [(0, moist[0]), (1, moist[5]), (1, moist[-1])]
     again = tmp_path / "again"
@@ -324,10 +329,10 @@ def test_a_folder_that_is_no_study_ends_in_a_line(tmp_path, capsys):
     assert "plan.toml" in capsys.readouterr().err
 
 
-def test_a_place_that_cannot_be_written_is_refused(tmp_path, undrawn):
+def test_a_place_that_cannot_be_written_is_refused(small, tmp_path, undrawn):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="file"):
-        write_report(invent(2), tmp_path / "file" / "deep")
+        write_report(small, tmp_path / "file" / "deep")
 
 
 def panels_of(folder, figure):
@@ -369,10 +374,10 @@ def test_a_stored_study_of_a_filter_that_is_not_installed_can_be_read(store, tmp
     assert panels_of(tmp_path / "report", "map_rmse") == ["EKF", "Slam"]
 
 
-def test_a_report_never_takes_the_place_of_results_or_of_a_log(store, tmp_path, undrawn):
+def test_a_report_never_takes_the_place_of_results_or_of_a_log(small, tmp_path, undrawn):
     for kind in (RESULTS, LOG):
         folder, name = tmp_path / kind.title, kind.names[0]
         OwnFiles(folder, kind).replace({name: "precious"})
         with pytest.raises(InputError, match=f"holds {kind.title} of Pipistrelle, which a"):
-            write_report(read_study(store), folder)
+            write_report(small, folder)
         assert (folder / name).read_text() == "precious"

@@ -228,7 +228,15 @@ def test_a_further_filter_beside_the_papers_cases_changes_nothing_of_that(tmp_pa
     assert "Slam" in {row["filter"] for row in page.summary["findings"]}
 
 
-@pytest.mark.parametrize("lacking", ["a filter", "a strategy", "a beam", "nothing but a variable"])
+@pytest.mark.parametrize(
+    "lacking",
+    [
+        "a filter",
+        "a strategy",
+        "a beam",
+        pytest.param("nothing but a variable", marks=pytest.mark.slow),
+    ],
+)
 def test_without_the_papers_cases_its_claims_are_not_judged(tmp_path, lacking):
     study = invent(3)
     if lacking == "nothing but a variable":
