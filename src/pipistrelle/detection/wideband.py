@@ -72,6 +72,8 @@ BEAMS_AT_ONCE = 32
 """Beams whose outputs are in memory."""
 MARGIN = 2.0
 """How much louder than what a louder call leaves at most a peak must be, as a ratio of powers."""
+LOBE = 0.7
+"""A lobe this much as loud as the loudest, half a lag off, may be louder at its own time."""
 SHIFT = 0.01
 """Largest Doppler shift of the calls whose lobes the set-up looks at, as a share."""
 _ANGLES = (0.0, 0.7, 1.3)
@@ -343,6 +345,33 @@ def _climb(
     return at, bearing, power
 
 
+@no_alloc
+def _top(
+    slow: Complex[np.ndarray, "l k"],
+    lag: float,
+    power: Float[np.ndarray, " n"],
+    beam: Wide,
+    interval: float,
+    sinc: Float[np.ndarray, "p t"],
+) -> tuple[float, float, float, float]:
+    """Return lag, bearing and power of the loudest peak near a lag, and half the step of its beams.
+
+    The lag is not yet that of the peak, and of lobes that are nearly as loud another may be louder
+    there: the top of each is asked.
+    """
+    most, beams, best = power[power.argmax()], power.size, (lag, 0.0, -1.0, 0.0)
+    for n in range(beams):
+        before = power[n - 1] if n > 0 else -1.0
+        after = power[n + 1] if n + 1 < beams else -1.0
+        if power[n] >= max(before, after, LOBE * most):
+            near = n + 1 if n + 1 < beams else n - 1
+            step = 0.5 * abs(wrap_angle(beam.bearing[near] - beam.bearing[n]))
+            at, bearing, top = _climb(slow, lag, beam.bearing[n], step, beam, interval, sinc)
+            if top > best[2]:
+                best = at, bearing, top, step
+    return best
+
+
 @kernel
 def _rows(
     slow: Complex[np.ndarray, "l k"],
@@ -356,14 +385,10 @@ def _rows(
     numbers, beams = np.empty((6, peaks.size)), beam.bearing.size
     power, within = np.empty(beams), (float(margin), float(slow.shape[0] - margin - 1))
     for i in range(peaks.size):
+        lag = float(margin + peaks[i])
         for n in range(beams):
-            lag = float(margin + peaks[i])
             power[n], _ = _output(slow, lag, beam.bearing[n], beam, interval, sinc)
-        loudest = int(power.argmax())
-        near = loudest + 1 if loudest + 1 < beams else loudest - 1
-        step = 0.5 * abs(wrap_angle(beam.bearing[near] - beam.bearing[loudest]))
-        start = float(margin + peaks[i]), beam.bearing[loudest]
-        at, bearing, top = _climb(slow, *start, step, beam, interval, sinc)
+        at, bearing, top, step = _top(slow, lag, power, beam, interval, sinc)
         at = min(max(at, within[0]), within[1])
         _, energy = _output(slow, at, bearing, beam, interval, sinc)
         over = over_noise(top, energy, beam.weight.size, beam.loudest_noise)
