@@ -182,13 +182,13 @@ def _compiled_first(plan: "Plan", show: Show, quiet: bool) -> Show:
     def prepare(so_far: "StudyProgress") -> None:
         nonlocal ready
         if not ready and so_far.done < so_far.worlds:
-            from pipistrelle.experiments.runs.compiling import compile_kernels
+            from pipistrelle.experiments.runs.compiling import compile_kernels, in_two_processes
             from pipistrelle.experiments.studies.plan import cases_of
-            from pipistrelle.kernel_clock import announce
 
-            announce(None if quiet else say)
-            timings = {case.config.listening.timing for case in cases_of(plan)}
-            compile_kernels(plan.filters, sorted(timings))
+            cases, tell = cases_of(plan), (lambda _: None) if quiet else say
+            timings = {case.config.listening.timing for case in cases}
+            with in_two_processes(tell, cases[0].config, plan.filters):
+                compile_kernels(plan.filters, sorted(timings))
         ready = True
         show(so_far)
 
