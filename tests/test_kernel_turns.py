@@ -87,4 +87,5 @@ def test_where_files_cannot_be_locked_each_compiles_for_itself(tmp_path, monkeyp
         (tmp_path / "compiling.lock").mkdir()
     turn = Turn()
     turn.take(tmp_path / "one.nbi")
+    assert turn._file is None, "it has a turn that nobody can have"
     turn.end()

@@ -67,7 +67,7 @@ from pipistrelle.geometry import wrap, wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
 
 TAPS, PARTS, BETA = 12, 256, 8.0
-"""Of the windowed sinc: outputs that it takes, places between two of them, Kaiser's shape."""
+"""Windowed sinc: outputs that it takes, places between two of them, shape of its Kaiser window."""
 BEAMS_AT_ONCE = 32
 """Beams whose outputs are in memory."""
 MARGIN = 2.0
@@ -94,7 +94,7 @@ class Wide(NamedTuple):
     bearing: Float[np.ndarray, " n"]
     """Directions that are scanned [rad]."""
     position: Float[np.ndarray, "k 2"]
-    """Of the microphones, from their middle [m]."""
+    """Positions of the microphones, from their middle [m]."""
     middle: Float[np.ndarray, "2"]
     """Their middle, in the vehicle's frame [m]."""
     weight: Float[np.ndarray, " k"]
@@ -103,9 +103,9 @@ class Wide(NamedTuple):
     """Speed of sound [m/s]."""
     band: Band
     doppler_std: float
-    """Of a delay, by the call's Doppler shift [s]."""
+    """Standard deviation of a delay, by the call's Doppler shift [s]."""
     lobes: Float[np.ndarray, " l"]
-    """What a call leaves so many lags away, at most, as a share of its power."""
+    """Largest share of its power that a call leaves so many lags away."""
 
 
 def wide_of(

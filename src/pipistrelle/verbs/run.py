@@ -103,7 +103,7 @@ def run(
             sound.own.replace(_sound_files(mission, sound))
 
     asked = config, named_strategies(strategy), ways, own_world
-    compiling = in_two_processes((lambda _: None) if output.quiet else say, config, ways)
+    compiling = in_two_processes(None if output.quiet else say, config, ways)
     if sound is None:
         return delivery.conduct(partial(simulated, *asked), output, "run", save, compiling)
     try:

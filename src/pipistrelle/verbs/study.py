@@ -185,7 +185,7 @@ def _compiled_first(plan: "Plan", show: Show, quiet: bool) -> Show:
             from pipistrelle.experiments.runs.compiling import compile_kernels, in_two_processes
             from pipistrelle.experiments.studies.plan import cases_of
 
-            cases, tell = cases_of(plan), (lambda _: None) if quiet else say
+            cases, tell = cases_of(plan), None if quiet else say
             timings = {case.config.listening.timing for case in cases}
             with in_two_processes(tell, cases[0].config, plan.filters):
                 compile_kernels(plan.filters, sorted(timings))

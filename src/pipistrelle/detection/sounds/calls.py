@@ -50,7 +50,7 @@ class Calls(NamedTuple):
 
 
 def calls_of(folder: Path, about: Description, sound: Sound, blocks: Blocks, sent: Call) -> Calls:
-    """Return when the vehicle called, as it is told, or else found by what it sent."""
+    """Return when the vehicle called: told by a file or a setting, else found in the sound."""
     path, call = folder / FILE, about.call
     time = None
     if os.path.lexists(path):

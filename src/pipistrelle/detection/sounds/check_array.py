@@ -38,7 +38,7 @@ class _Echo(NamedTuple):
     """A loud echo, as a group of microphones heard it at the time of its middle."""
 
     frequency: Float[np.ndarray, " k"]
-    """Of a tone, or of the parts of a band [Hz]."""
+    """Frequency of a tone, or frequencies of the parts of a band [Hz]."""
     output: Complex[np.ndarray, "k e"]
     """The matched filters' outputs, by frequency."""
 

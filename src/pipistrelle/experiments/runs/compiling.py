@@ -27,8 +27,8 @@ from pipistrelle.experiments.runs.compiling import compile_filters
 compile_filters(Config.model_validate_json(sys.stdin.read()), sys.argv[1:])
 """
 _FRAMES, _HEARD = 200, 10
-"""Of the made-up drive, and those in which its first landmark is heard: the smoother's border is
-then left by one."""
+"""Frames of the made-up drive, and how many of them hear its first landmark: later it leaves the
+smoother's border, whose kernels are then compiled, too."""
 
 
 def compile_kernels(
@@ -49,18 +49,19 @@ def compile_kernels(
 
 @contextmanager
 def in_two_processes(
-    tell: Callable[[str], object], config: Config, filters: Sequence[str]
+    tell: Callable[[str], object] | None, config: Config, filters: Sequence[str]
 ) -> Iterator[None]:
     """Let a second process compile the kernels of filters, if any kernel must be compiled.
 
-    It begins with the first that this process compiles, which `tell` announces. What both need is
-    compiled by one of them (`pipistrelle.kernel_turns`), so this one goes on as if it were alone.
+    It begins with the first that this process compiles, which `tell` announces, where given. What
+    both need is compiled by one of them (`pipistrelle.kernel_turns`).
     """
     second = None
 
     def begin(line: str) -> None:
         nonlocal second
-        tell(line)
+        if tell is not None:
+            tell(line)
         second = _second_process(config, filters)
 
     announce(begin)
