@@ -512,7 +512,7 @@ class AssociationConfig(Section):
     """Assumed probability that a landmark which can be heard is heard."""
     clutter: Positive = 0.06
     """Assumed rows of clutter in a scan, per radian and metre."""
-    bearing_std: Positive = 0.08
+    bearing_std: Positive = 0.05
     """Rows whose bearing is measured less surely than this are left out [rad]."""
     way_std: Positive = 0.35
     """The same of ranges and excess paths [m]."""

@@ -1,11 +1,13 @@
 r"""Whether a landmark exists: by how often it was heard, and was not where it should have been.
 
-Each landmark has log odds. They rise when it is heard. They fall when it is not, though it should
-have been: its level, as it was heard before, is expected at its present distance (spherical
-spreading, there and back of the vehicle's own call) well above what is detected; the vehicle's own
-call was sent towards it as before; and nothing as loud came at the same time. Of a sensor that
-tells no levels, a lidar or a camera, a landmark is expected within its range and field of view, if
-these are known, unless something nearer stands before it.
+Each landmark has log odds. They rise when it is heard, the more the surer the row's bearing: what
+is between two echoes that overlap comes back, too, but seldom as surely as one echo. They fall when
+the landmark is not heard, though it should have been: its level, as it was heard before, is
+expected at its present distance (spherical spreading, there and back of the vehicle's own call)
+well above what is detected; the vehicle's own call was sent towards it as before; and nothing as
+loud came at the same time. Of a sensor that tells no levels, a lidar or a camera, a landmark is
+expected within its range and field of view, if these are known, unless something nearer stands
+before it.
 """
 
 import math
@@ -23,9 +25,9 @@ from pipistrelle.jit import Whole, kernel, no_alloc
 HEARD, MISSED = 2.0, 1.3
 """Rise of the log odds when a landmark is heard, and their fall when it should have been: a
 detection probability of 0.75, and a chance of 0.1 that clutter is where it is."""
-MOST, CONFIRMED, GONE = 8.0, 3.5, -2.0
+MOST, CONFIRMED, GONE = 8.0, 3.0, -2.0
 """Odds rise no further; a landmark is one; a landmark is none."""
-LEAST_SCANS, PATIENCE = 4, 25
+LEAST_SCANS, PATIENCE = 3, 25
 """In how many scans it takes a landmark to be one; scans of silence after which a landmark that is
 not yet one is none."""
 FAINTEST = 18.0
@@ -121,8 +123,9 @@ Heard = tuple[
     Float[np.ndarray, " m"],
     Float[np.ndarray, " m"],
     Float[np.ndarray, " m"],
+    Float[np.ndarray, " m"],
 ]
-"""Label, caller, range or excess path, level and bearing of each row."""
+"""Label, caller, range or excess path, level, bearing and surety (from 0 to 1) of each row."""
 Sight = tuple[float, float]
 """Range [m] and field of view [rad] of a sensor that tells no levels; a range of 0: not known."""
 Place = tuple[Float[np.ndarray, " d"], Int[np.ndarray, " l"], Int[np.ndarray, " c"]]
@@ -156,17 +159,18 @@ def _judge(
     sight: Sight,
 ) -> None:
     """Write odds, counts and levels after a scan."""
-    known, (label, caller, _, level, _), (mean, at, callers) = Known(*columns), rows, there
+    known, (mean, at, callers) = Known(*columns), there
+    label, caller, _, level, _, surety = rows
     place = np.full(label.size, -1)
     for n in range(known.label.size):
-        far, bearing, here = math.nan, math.nan, False
+        far, bearing, rise = math.nan, math.nan, 0.0
         if at[n] >= 0:
             dx, dy = mean[at[n]] - mean[0], mean[at[n] + 1] - mean[1]
             far, bearing = math.hypot(dx, dy), wrap_angle(math.atan2(dy, dx) - mean[2])
         for m in range(label.size):
             if label[m] != known.label[n]:
                 continue
-            here, place[m] = True, n
+            rise, place[m] = max(rise, HEARD * surety[m]), n
             if math.isnan(far) or math.isnan(level[m]):
                 continue
             source, before = level[m] + _spreading(caller[m], far), known.source[n, caller[m]]
@@ -174,8 +178,8 @@ def _judge(
             known.source[n, caller[m]] = source if math.isnan(before) else mean_source
             if caller[m] == OWN:
                 known.aim[n] = bearing
-        if here:
-            known.odds[n] = min(known.odds[n] + HEARD, MOST)
+        if rise > 0.0:
+            known.odds[n] = min(known.odds[n] + rise, MOST)
             known.count[n] += 1
             known.heard[n] = scan
         else:
@@ -222,7 +226,7 @@ def _expected(
     sight: Sight,
 ) -> bool:
     """Tell whether a landmark should have been heard of a caller's call, and nothing hides it."""
-    (_, caller, way, level, _), (mean, at, callers) = rows, place
+    (_, caller, way, level, _, _), (mean, at, callers) = rows, place
     if math.isnan(far):
         return False
     if math.isnan(known.source[n, c]):
@@ -254,7 +258,7 @@ def _expected(
 @no_alloc
 def _in_sight(far: float, bearing: float, rows: Heard, sight: Sight) -> bool:
     """Tell whether a sensor without levels should have seen a landmark, and nothing hides it."""
-    _, caller, way, level, seen = rows
+    _, caller, way, level, seen, _ = rows
     if far > WITHIN * sight[0] or abs(bearing) > 0.5 * sight[1] - BEFORE:
         return False
     for m in range(caller.size):

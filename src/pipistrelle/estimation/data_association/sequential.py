@@ -73,6 +73,8 @@ OVERLAP_STD, OVERLAP_GATE = 0.7, 9.0
 """Deviation of the way of an echo that overlaps with another [m], and largest squared distance."""
 ASKED = frozenset((4, 6, 8, 12, 16, 24, 32, 64))
 """In how many scans a landmark was heard when it is asked whether it is on the map twice."""
+SURE_SHARE = 0.65
+"""A row is as sure as any up to this share of the limit of its bearing's deviation."""
 BOTH = 0.1
 """Two landmarks are two if in more than this share of the scans of either both were heard."""
 News = Mapping[int, tuple[float, float, bool]]
@@ -83,12 +85,12 @@ News = Mapping[int, tuple[float, float, bool]]
 class Limits:
     """How sure a row must be to be used, and to begin a landmark."""
 
-    bearing_std: float = 0.08
+    bearing_std: float = 0.05
     """[rad]"""
     way_std: float = 0.35
     """Of range or excess path [m]."""
-    birth_bearing_std: float = 0.05
     birth_way_std: float = 0.25
+    """Of what begins a landmark [m]."""
     assumed: tuple[float, ...] = ()
     """Deviations that are assumed of rows which state none: they are as sure as any can be."""
     sight: tuple[float, float] = (0.0, 0.0)
@@ -271,7 +273,7 @@ class _Work:
         for number, caller in self.callers.items():
             callers[number] = self._where(caller.label)
         way = np.where(scan.caller == OWN, scan.range, scan.excess_path)
-        heard = self.label, scan.caller, way, scan.level_db, scan.bearing
+        heard = self.label, scan.caller, way, scan.level_db, scan.bearing, self._surety()
         place = self.joint.mean, self._places(known), callers
         near = np.array([label in self.near for label in known.label.tolist()], np.bool_)
         return judged(known, heard, place, near, memory.scan, self.stage.limits.sight)
@@ -325,9 +327,14 @@ class _Work:
 
     def _sure(self, number: int, rows: Int[np.ndarray, " r"]) -> Bool[np.ndarray, " r"]:
         """Return a mask of rows of a caller that are sure enough to begin a landmark."""
-        (_, std), limits = self._ways(number), self.stage.limits
-        sure = self._within(self.scan.bearing_std[rows], limits.birth_bearing_std)
-        return sure & self._within(std[rows], limits.birth_way_std)
+        limit = self.stage.limits.birth_way_std
+        return self._within(self._ways(number)[1][rows], limit)
+
+    def _surety(self) -> Float[np.ndarray, " m"]:
+        """Return how sure rows are, from 0 to 1; those whose deviations are assumed are sure."""
+        std, limit = self.scan.bearing_std, self.stage.limits.bearing_std
+        sure = np.minimum(SURE_SHARE * limit / std, 1.0)
+        return np.where(self._within(std, SURE_SHARE * limit), 1.0, sure)
 
     def _within(self, std: Float[np.ndarray, " r"], limit: float) -> Bool[np.ndarray, " r"]:
         """Return a mask of deviations that are within a limit, or that were only assumed."""
