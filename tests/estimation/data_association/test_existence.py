@@ -14,31 +14,38 @@ from pipistrelle.estimation.data_association.existence import (
     with_new,
 )
 
-NONE = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0), np.empty(0)
+NONE = (*(np.empty(0, np.int64),) * 2, *(np.empty(0),) * 4)
 AHEAD = np.array([0.0, 0.0, 0.0, 4.0, 0.0])
 THERE = (AHEAD, np.array([3]), np.array([-2]))
 
 
-def row(label=1, way=4.0, level=40.0, bearing=0.0):
+def row(label=1, way=4.0, level=40.0, bearing=0.0, surety=1.0):
     """Return one row of the vehicle's own call."""
-    own = np.zeros(1, np.int64)
-    return np.array([label]), own, np.array([way]), np.array([level]), np.array([bearing])
+    numbers = (np.array([number]) for number in (way, level, bearing, surety))
+    return np.array([label]), np.zeros(1, np.int64), *numbers
 
 
-def heard_so_often(times):
+def heard_so_often(times, surety=1.0):
     known = with_new(nobody(1), [1], 0, 1)
     for scan in range(times):
-        known = judged(known, row(), THERE, np.array([False]), scan)
+        known = judged(known, row(surety=surety), THERE, np.array([False]), scan)
     return known
 
 
-def test_odds_rise_with_each_scan_and_confirm_at_the_fourth():
-    for times, confirmed in ((1, False), (3, False), (4, True)):
+def test_odds_rise_with_each_scan_and_confirm_at_the_third():
+    for times, confirmed in ((1, False), (2, False), (3, True)):
         known = heard_so_often(times)
         assert known.odds[0] == min(HEARD * (times - 1), 8.0)
         assert bool(known.confirmed[0]) is confirmed
         assert known.count[0] == times
-    assert HEARD * 3 >= CONFIRMED
+    assert HEARD * 2 >= CONFIRMED
+
+
+def test_what_is_heard_less_surely_takes_more_scans():
+    for times, confirmed in ((3, False), (4, False), (5, True)):
+        known = heard_so_often(times, surety=0.5)
+        assert known.odds[0] == pytest.approx(0.5 * HEARD * times - HEARD)
+        assert bool(known.confirmed[0]) is confirmed
 
 
 def test_a_landmark_that_should_have_been_heard_and_was_not_is_given_up():

@@ -333,7 +333,7 @@ class _Work:
     def _surety(self) -> Float[np.ndarray, " m"]:
         """Return how sure rows are, from 0 to 1; those whose deviations are assumed are sure."""
         std, limit = self.scan.bearing_std, self.stage.limits.bearing_std
-        sure = np.minimum(SURE_SHARE * limit / std, 1.0)
+        sure = np.fmin(SURE_SHARE * limit / std, 1.0)
         return np.where(self._within(std, SURE_SHARE * limit), 1.0, sure)
 
     def _within(self, std: Float[np.ndarray, " r"], limit: float) -> Bool[np.ndarray, " r"]:
