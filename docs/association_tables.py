@@ -1,7 +1,9 @@
 """Print the tables of what it costs that nobody tells who is who, in `association.md`, anew.
 
-pipistrelle study association --iterations 30 -o STUDY
-python docs/association_tables.py STUDY
+pipistrelle study association -o STUDY
+python docs/association_tables.py STUDY [STUDY ...]
+
+Of several folders, each of some methods, the trials are taken together.
 """
 
 import sys
@@ -20,9 +22,9 @@ LOST_M, LOST_TIMES = 0.25, 5.0
 """A world is lost if its aligned error is above this and so many times that with labels."""
 
 
-def trials_of(study):
-    """Return the trials of a study, one row each."""
-    return pl.read_parquet(Path(study) / "trials" / "*.parquet")
+def trials_of(studies):
+    """Return the trials of studies, one row each."""
+    return pl.concat([pl.read_parquet(Path(one) / "trials" / "*.parquet") for one in studies])
 
 
 def chosen(trials, strategy, radius, name, method, timing):
@@ -72,9 +74,9 @@ def print_table(trials, cell):
                 print(f"| {first}{words}, `{method}` | " + " | ".join(cells) + " |")
 
 
-def main(study):
+def main(*studies):
     """Print both tables, and what a trial takes."""
-    trials = trials_of(study)
+    trials = trials_of(studies)
     print(trials["iteration"].n_unique(), "worlds")
     print_table(trials, error_cell)
     print_table(trials, score_cell)

@@ -275,11 +275,12 @@ class Session(Generic[B]):
 
     def _take_back(self, labels: tuple[int, ...]) -> None:
         """Remove landmarks, with all of their rows that are remembered."""
-        past = [replace(one) for one in self._past]
-        self._past = deque(past, maxlen=REMEMBERED)
+        past = [*self._past]
         labels = (*labels, *(gone for one in past for kept, gone in one.merge if kept in labels))
         heard = [n for n, one in enumerate(past) if _names(one, labels)]
-        again = past[heard[0] if heard else len(past) :]
+        first = heard[0] if heard else len(past)
+        again = [replace(one) for one in past[first:]]
+        self._past = deque((*past[:first], *again), maxlen=REMEMBERED)
         before = again[0].belief if again else self.belief
         self._dropped.update(labels)
         if len(heard) == 1 and not _held(before, labels) and _rows(again[0], labels) == len(labels):
@@ -355,7 +356,7 @@ def joined_poses(parts: Sequence[Gaussian]) -> Gaussian:
 
 def _names(heard: _Heard, labels: Sequence[int]) -> bool:
     """Tell whether a scan has rows, or a caller, of some labels."""
-    return any((heard.label == a).any() or (heard.scan.callers == a).any() for a in labels)
+    return not {*heard.label.tolist(), *heard.scan.callers.tolist()}.isdisjoint(labels)
 
 
 def _held(belief: Belief, labels: Sequence[int]) -> list[int]:

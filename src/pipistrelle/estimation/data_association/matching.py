@@ -71,12 +71,22 @@ def marginal(
     >>> marginal(np.array([[-9.0, -9.0], [np.inf, -20.0]]))
     array([0, 1])
     """
-    if not costs.size:
-        return np.full(len(costs), NOTHING)
-    shares = probabilities(costs)
-    best, of_any = shares.argmax(axis=1), shares.sum(axis=1)
-    share = shares[np.arange(len(costs)), best]
-    return np.where((of_any > LIKELY) & (share >= SURE * of_any), best, NOTHING)
+    return _what_is_sure(costs)
+
+
+@kernel
+def _what_is_sure(costs: Float[np.ndarray, "m n"]) -> Int[np.ndarray, " m"]:
+    """Return the landmark of each row where that is sure, or NOTHING."""
+    shares, found = probabilities(costs), np.full(costs.shape[0], NOTHING)
+    for i in range(found.size):
+        best, of_any = NOTHING, 0.0
+        for j in range(costs.shape[1]):
+            of_any += shares[i, j]
+            if best == NOTHING or shares[i, j] > shares[i, best]:
+                best = j
+        if of_any > LIKELY and shares[i, best] >= SURE * of_any:
+            found[i] = best
+    return found
 
 
 @kernel

@@ -170,6 +170,13 @@ class _Work:
         self.label = np.full(scan.landmark.size, UNLABELLED)
         self.labels, self.callers = memory.labels, dict(memory.callers)
         self.numbers, self.named = scan.numbers, np.full(scan.direct.size, UNLABELLED)
+        own, limits = scan.caller == OWN, stage.limits
+        self.way = np.where(own, scan.range, scan.excess_path)
+        self.way_std = np.where(own, scan.range_std, scan.excess_path_std)
+        self.bare = np.isnan(self.way)
+        self.usable = self._within(scan.bearing_std, limits.bearing_std)
+        self.usable &= self.bare | self._within(self.way_std, limits.way_std)
+        self.sure = self._within(self.way_std, limits.birth_way_std)
         self.new: list[int] = []
         self.near: set[int] = set()
 
@@ -197,7 +204,7 @@ class _Work:
 
     def _searched(self, number: int, caller: Caller, row: int) -> News:
         """Follow a caller's rows, and return its place if that is found."""
-        rows = self._rows(number, self._usable(number, with_way=True))
+        rows = self._rows(self.usable & ~self.bare & (self.scan.caller == number))
         direct = self.scan.bearing[row] if row >= 0 else math.nan
         tracks = followed(caller.tracks, self.pose, direct, rows)
         self.callers[number] = replace(caller, tracks=tracks)
@@ -214,16 +221,18 @@ class _Work:
         rows = np.flatnonzero(self.scan.caller == number)
         rows = rows[rows != self._direct(number)]
         there = 3 + 2 * np.arange(self.joint.landmark.size)
-        costs = self._costs(number, rows, there, at, self.stage.chances)
-        gated, usable = np.isfinite(costs), self._usable(number, with_way=at != UNPLACED)[rows]
+        costs = self._costs(rows, there, at, self.stage.chances)
+        gated, usable = np.isfinite(costs), self.usable[rows]
+        if at != UNPLACED:
+            usable &= ~self.bare[rows]
         telling = self.scan.bearing_std[rows] <= 2.0 * self.stage.limits.bearing_std
         self.near |= {*self.joint.landmark[gated[telling].any(axis=0)].tolist()}
-        found = self.stage.match(costs[usable], self._innovate(number, rows[usable], there, at))
-        label = np.append(self.joint.landmark, UNLABELLED)[found]
-        self.label[rows[usable]] = label
-        self._judge_caller(number, rows[usable], label != UNLABELLED)
+        used = rows[usable]
+        found = self.stage.match(costs[usable], self._innovate(used, there, at))
+        self.label[used] = np.append(self.joint.landmark, UNLABELLED)[found]
+        self._judge_caller(number, used)
         if at != UNPLACED:
-            self._bear(number, rows[usable & ~gated.any(axis=1)], at)
+            self._bear(number, used[~gated[usable].any(axis=1)], at)
 
     def _heard_from(self, number: int) -> int | None:
         """Return where a caller stands in the joint mean; None where its rows have to wait."""
@@ -272,8 +281,7 @@ class _Work:
         callers = np.full(size, UNPLACED)
         for number, caller in self.callers.items():
             callers[number] = self._where(caller.label)
-        way = np.where(scan.caller == OWN, scan.range, scan.excess_path)
-        heard = self.label, scan.caller, way, scan.level_db, scan.bearing, self._surety()
+        heard = self.label, scan.caller, self.way, scan.level_db, scan.bearing, self._surety()
         place = self.joint.mean, self._places(known), callers
         near = np.array([label in self.near for label in known.label.tolist()], np.bool_)
         return judged(known, heard, place, near, memory.scan, self.stage.limits.sight)
@@ -311,25 +319,6 @@ class _Work:
         """Return the row of a caller's direct call, or -1."""
         return int(self.scan.direct[number]) if number < self.scan.direct.size else -1
 
-    def _ways(self, number: int) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-        """Return ranges or excess paths, with their deviations."""
-        scan = self.scan
-        if number == OWN:
-            return scan.range, scan.range_std
-        return scan.excess_path, scan.excess_path_std
-
-    def _usable(self, number: int, *, with_way: bool = False) -> Bool[np.ndarray, " m"]:
-        """Return a mask of the rows of a caller that are sure enough."""
-        (way, std), limits = self._ways(number), self.stage.limits
-        bare, rows = np.isnan(way), self.scan.caller == number
-        sure = rows & self._within(self.scan.bearing_std, limits.bearing_std)
-        return sure & (~bare if with_way else True) & (bare | self._within(std, limits.way_std))
-
-    def _sure(self, number: int, rows: Int[np.ndarray, " r"]) -> Bool[np.ndarray, " r"]:
-        """Return a mask of rows of a caller that are sure enough to begin a landmark."""
-        limit = self.stage.limits.birth_way_std
-        return self._within(self._ways(number)[1][rows], limit)
-
     def _surety(self) -> Float[np.ndarray, " m"]:
         """Return how sure rows are, from 0 to 1; those whose deviations are assumed are sure."""
         std, limit = self.scan.bearing_std, self.stage.limits.bearing_std
@@ -343,31 +332,28 @@ class _Work:
             within |= std == assumed
         return within
 
-    def _rows(self, number: int, rows: np.ndarray) -> Rows:
-        """Return rows of a caller."""
-        way, std = self._ways(number)
+    def _rows(self, rows: np.ndarray) -> Rows:
+        """Return some rows."""
         scan = self.scan
-        return Rows(scan.bearing[rows], scan.bearing_std[rows], way[rows], std[rows],
-                    scan.level_db[rows])  # fmt: skip
+        return Rows(scan.bearing[rows], scan.bearing_std[rows], self.way[rows],
+                    self.way_std[rows], scan.level_db[rows])  # fmt: skip
 
     def _costs(
         self,
-        number: int,
         rows: Int[np.ndarray, " r"],
         there: Int[np.ndarray, " n"],
         caller: int,
         chances: tuple[float, float, float, float],
     ) -> Float[np.ndarray, "r n"]:
         """Return the costs of rows of a caller and landmarks (`pair_costs`)."""
-        joint = self.joint
-        columns = tuple(self._rows(number, rows))
+        joint, columns = self.joint, tuple(self._rows(rows))
         return pair_costs(columns, joint.mean, joint.covariance, there, caller, chances)
 
     def _innovate(
-        self, number: int, rows: Int[np.ndarray, " r"], there: Int[np.ndarray, " n"], caller: int
+        self, rows: Int[np.ndarray, " r"], there: Int[np.ndarray, " n"], caller: int
     ) -> Innovate:
         """Return what tells the innovations of pairs of these rows and landmarks."""
-        joint, columns = self.joint, tuple(self._rows(number, rows))
+        joint, columns = self.joint, tuple(self._rows(rows))
         return lambda row, landmark: pair_innovations(
             columns, joint.mean, joint.covariance, there, caller, (row, landmark)
         )
@@ -396,14 +382,14 @@ class _Work:
             return
         if at >= 0:
             chances = (DIRECT_GATE, *self.stage.chances[1:])
-            cost = self._costs(number, np.array([row]), np.array([at]), UNPLACED, chances)
+            cost = self._costs(np.array([row]), np.array([at]), UNPLACED, chances)
             if np.isinf(cost[0, 0]):
                 return
         self.label[row] = label
 
     def _bear(self, number: int, rows: Int[np.ndarray, " r"], at: int) -> None:
         """Begin landmarks with rows that are sure and near no other."""
-        (way, std), scan, rows = self._ways(number), self.scan, rows[self._sure(number, rows)]
+        way, scan, rows = self.way, self.scan, rows[self.sure[rows]]
         rows = rows[~self._overlapped(number, rows, at)] if rows.size else rows
         factor, same = (2.0 if number == OWN else 1.0), scan.caller == number
         for row in sorted(rows.tolist(), key=lambda row: -scan.level_db[row]):
@@ -415,7 +401,7 @@ class _Work:
             self.label[row] = label
             self.new.append(label)
             if number == OWN:
-                stds = scan.bearing_std[row], std[row]
+                stds = scan.bearing_std[row], self.way_std[row]
                 self.place[label] = self.joint.mean.size
                 self.joint = with_point(self.joint, label, scan.bearing[row], way[row], stds)
 
@@ -429,21 +415,19 @@ class _Work:
         known, joint = self.memory.known, self.joint
         silent = known.label[known.confirmed & ~np.isin(known.label, self.label)].tolist()
         there = np.array([self.place[label] for label in silent if label in self.place], np.int64)
-        heard = self._rows(number, rows)
+        heard = self._rows(rows)
         spread = OVERLAP_STD / (2.0 if number == OWN else 1.0)
         columns = tuple(heard._replace(way_std=np.hypot(heard.way_std, spread)))
         chances = (OVERLAP_GATE, *self.stage.chances[1:])
         costs = pair_costs(columns, joint.mean, joint.covariance, there, at, chances)
         return np.any(np.isfinite(costs), axis=1)
 
-    def _judge_caller(
-        self, number: int, rows: Int[np.ndarray, " r"], found: Bool[np.ndarray, " r"]
-    ) -> None:
+    def _judge_caller(self, number: int, rows: Int[np.ndarray, " r"]) -> None:
         """Count how many of a caller's sure rows are of landmarks."""
         if number not in self.callers or self._where(self.callers[number].label) < 0:
             return
-        caller, sure = self.callers[number], self._sure(number, rows)
-        told = (int(found[sure].sum()), int(sure.sum()))
+        caller, sure = self.callers[number], rows[self.sure[rows]]
+        told = (int(np.count_nonzero(self.label[sure] != UNLABELLED)), sure.size)
         self.callers[number] = replace(caller, trial=(*caller.trial[1 - TRIAL :], told))
 
     def _lost(self, known: Known) -> list[int]:

@@ -43,6 +43,7 @@ def rotated_left(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " m"]:
     return (points @ np.array([[0.0, 1.0], [-1.0, 0.0]])).ravel()
 
 
+@kernel
 def linear_covariance(
     rotated: Float[np.ndarray, " m"],
     covariance: Float[np.ndarray, "m m"],
@@ -54,8 +55,12 @@ def linear_covariance(
     `rotated`: of positions as `rotated_left` gives them, 0 of a heading; `with_heading`: the
     covariance of each number with the heading.
     """
-    lever = np.outer(rotated, with_heading)
-    return covariance + (lever + lever.T) + np.outer(rotated, rotated) * heading_variance
+    linear = np.empty(covariance.shape)
+    for i in range(rotated.size):
+        for j in range(rotated.size):
+            lever = rotated[i] * with_heading[j] + rotated[j] * with_heading[i]
+            linear[i, j] = covariance[i, j] + lever + rotated[i] * rotated[j] * heading_variance
+    return linear
 
 
 @no_alloc
