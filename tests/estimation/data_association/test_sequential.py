@@ -239,6 +239,42 @@ def test_a_mission_without_labels_finds_its_caller_and_names_most_rows_rightly()
     assert np.median([np.hypot(*(a - b)) for a, b in lines]) < 1.0, "each to its own landmark"
 
 
+MOVER = {"course": "circle", "radius": 15.0, "speed": 0.75}
+
+
+@pytest.mark.parametrize("name", ["iekf", "smoother"])
+def test_a_caller_that_moves_is_found_and_followed_without_labels(name):
+    config = Config.model_validate(
+        BEST
+        | {"scenario": {"steps": 240}, "seed": 6304, "association": {"method": "marginal"}}
+        | {"callers": [{"distance": 12.0}, MOVER | {"name": "boat", "frequency": 25e3}]}
+    )
+    mission = run_mission(config, ["fused"], [name])
+    (trial,) = mission.trials
+    assert trial.scores.associated_right > 0.95
+    assert trial.scores.position_rmse_aligned_m < 0.1
+    assert {*trial.track.callers} == {*mission.drive.moving}, "by the name of the truth"
+    assert trial.scores.caller_rmse_aligned_m < 0.5
+    named = [{*scan.callers.tolist()} - {UNLABELLED} for scan in trial.scans]
+    moving = {label for scan in trial.scans for label in scan.moving.tolist()}
+    assert len(set().union(*named)) == 2
+    assert len(moving) == 1
+    assert not moving & {*trial.track.landmarks.landmark.tolist()}, "it is no landmark"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [6302, 6306])
+def test_a_caller_that_turns_at_once_does_not_lose_the_world(seed):
+    """Both walks bounce off the edge of the field."""
+    settings = {
+        "seed": seed,
+        "callers": [{"course": "walk"}],
+        "association": {"method": "marginal"},
+    }
+    (trial,) = run_mission(Config.model_validate(BEST | settings), ["fused"], ["iekf"]).trials
+    assert trial.scores.position_rmse_aligned_m < 0.1
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [7001, 7002, 7003])
 def test_no_world_of_four_hundred_landmarks_is_lost(seed):
