@@ -234,17 +234,20 @@ def test_an_answer_that_is_no_assignment_is_refused_by_name(written):
         run_mission(config, ["fused"], ["ekf"])
 
 
-def test_callers_that_move_are_refused_with_an_association(written, capsys):
+def test_callers_that_move_are_refused_with_an_association_of_a_filter_that_follows_none(
+    written, capsys
+):
     method = f"{written(JOINT)}:Joint"
     Path("boat.toml").write_text(
         '[[callers]]\nname = "boat"\nfrequency = 25e3\ncourse = "circle"\n'
-        f'[association]\nmethod = "{method}"\n'
+        f'[association]\nmethod = "{method}"\n[listening]\ntiming = true\n'
     )
-    assert main(["run", *SHORT, "--config", "boat.toml", "-o", "one"]) == 2
+    asked = ["run", "--scenario.steps", "40", "--config", "boat.toml", "-o", "one"]
+    assert main([*asked, "--filter", "fastslam"]) == 2
     error = capsys.readouterr().err
-    assert (
-        "association.method: found callers that move (boat); expected callers that stand" in error
-    )
+    assert "found callers that move (boat) with the filter fastslam, which follows none" in error
+    assert "ekf, iekf, smoother" in error
+    assert main([*asked, "--filter", "iekf"]) == 0
 
 
 def test_a_folder_of_the_packages_own_method_is_done_again_without_being_asked_for_trust(written):

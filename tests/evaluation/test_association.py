@@ -41,6 +41,12 @@ def test_gospa_is_the_least_over_all_sets_of_pairs(seed):
     assert found.missed - found.false == len(true) - len(points)
 
 
+def test_a_caller_that_moves_is_missed_on_no_map():
+    labels, causes = [np.array([1, 2])] * 3, [np.array([7, 52])] * 3
+    assert associated(labels, causes).heard == {7, 52}
+    assert associated(labels, causes, [52]).heard == {7}
+
+
 def test_gospa_is_a_metric():
     rng = np.random.default_rng(1)
     for _ in range(50):

@@ -17,7 +17,6 @@ from pipistrelle.detection.scans import (
     EXCESS_PATH,
     EXCESS_PATH_STD,
     LEVEL,
-    NO_CALLERS,
     NUMBERS,
     OWN,
     RANGE,
@@ -25,6 +24,7 @@ from pipistrelle.detection.scans import (
     UNLABELLED,
     Scan,
     rows_of,
+    with_callers,
 )
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel
@@ -91,8 +91,7 @@ def labelled(scan: Scan, label: Int[np.ndarray, " m"]) -> Scan:
     label = _checked(scan, np.asarray(label))
     named = replace(scan, landmark=label)
     if scan.direct.size:
-        callers = np.append(label, UNLABELLED)[scan.direct]  # -1: not heard
-        named = replace(named, callers=callers, direct=NO_CALLERS)
+        named = with_callers(named, np.append(label, UNLABELLED)[scan.direct])  # -1: not heard
     return _fused(named, own=True, others=True, labels_only=True)
 
 

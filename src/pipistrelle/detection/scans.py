@@ -55,7 +55,7 @@ class Scan:
     """Label of each caller as a landmark, by its number; UNLABELLED for the vehicle and where it is
     not known, as for numbers beyond the array."""
     moving: Int[np.ndarray, " v"] = field(default_factory=lambda: NO_CALLERS)
-    """Labels of the callers that move."""
+    """Labels of the callers that move; in a scan without labels, their numbers."""
     direct: Int[np.ndarray, " c"] = field(default_factory=lambda: NO_CALLERS)
     """Row of each caller's direct call, by the caller's number, in a scan without labels; -1 where
     none was heard. The row's label becomes that of the caller (`merging.labelled`)."""
@@ -239,6 +239,19 @@ def without_labels(scan: Scan, callers: Int[np.ndarray, " c"]) -> Scan:
             direct[number] = rows[0]
     landmark = np.full_like(scan.landmark, UNLABELLED)
     return replace(scan, landmark=landmark, callers=NO_CALLERS, direct=direct)
+
+
+def with_callers(scan: Scan, callers: Int[np.ndarray, " c"]) -> Scan:
+    """Return a scan without labels in which each caller has one, or UNLABELLED, by its number.
+
+    >>> scan = make_scan(0.5, np.full(2, -1), np.zeros(2), caller=1)
+    >>> heard = replace(scan, direct=np.array([-1, 0, 1]), moving=np.array([1, 2]))
+    >>> with_callers(heard, np.array([-1, -1, 9])).moving
+    array([9])
+    """
+    moving = callers[scan.moving]
+    moving = moving[moving != UNLABELLED]
+    return replace(scan, callers=callers, moving=moving, direct=NO_CALLERS)
 
 
 def without_excess_paths(scan: Scan, *numbers: int) -> Scan:

@@ -50,8 +50,12 @@ class Associated:
     """Landmarks that were heard in `OFTEN` scans or more."""
 
 
-def associated(labels: Sequence[Int[np.ndarray, " m"]], causes: Causes) -> Associated:
+def associated(
+    labels: Sequence[Int[np.ndarray, " m"]], causes: Causes, moving: Sequence[int] = ()
+) -> Associated:
     """Compare labels of all scans' rows with what caused them.
+
+    `moving`: callers that move, which are no landmarks.
 
     >>> labels, causes = [np.array([1, 2]), np.array([1, -1])], [np.array([7, 9])] * 2
     >>> found = associated(labels, causes)
@@ -72,7 +76,9 @@ def associated(labels: Sequence[Int[np.ndarray, " m"]], causes: Causes) -> Assoc
         names=names,
         rows=rows,
         right=right / sum(rows.values()) if rows else None,
-        heard=frozenset(cause for cause, count in scans.items() if count >= OFTEN),
+        heard=frozenset(
+            cause for cause, count in scans.items() if count >= OFTEN and cause not in moving
+        ),
     )
 
 

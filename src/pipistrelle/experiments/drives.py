@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipistrelle.detection.scans import NO_CALLERS
 from pipistrelle.estimation.beliefs import Gaussian, Landmarks, Track, no_landmarks
 from pipistrelle.estimation.motion import Motion, relative_motions
 from pipistrelle.geometry import path_at, points_at, wrap
@@ -60,6 +61,8 @@ class Drive:
         At the same times; nothing of it, by default. Its landmarks are those that stand.
     known : Landmarks
         Where landmarks stand that are known beforehand, and how surely.
+    callers : (c)
+        Label of each caller as a landmark, by its number, where there are others than the vehicle.
     moving : dict of label to str
         Names of the callers that move: no landmarks, though heard.
     sensor : (3) [m, m, rad]
@@ -72,6 +75,7 @@ class Drive:
     controls: Float[np.ndarray, "t-1 c"]
     truth: Truth = NO_TRUTH
     known: Landmarks = field(default_factory=no_landmarks)
+    callers: Int[np.ndarray, " c"] = field(default_factory=lambda: NO_CALLERS)
     moving: Mapping[int, str] = field(default_factory=dict)
     sensor: Pose = (0.0, 0.0, 0.0)
 

@@ -281,7 +281,7 @@ class Slam:
             found, fix = f"rows once more at {self._time} s", "leave out what came twice"
             raise refusal("hear", found, "each once", fix)
         scan = with_noise(without_unused(scan, self._config), self._config)
-        (scan,) = with_moving([scan], self._drive, follows=self._follows)
+        (scan,) = with_moving([scan], self._drive, follows=self._follows, known=known)
         self._change(lambda: self._session.hear(scan))
         self._heard |= fresh
         pose = self._at_vehicle(self._session.belief.pose())

@@ -5,7 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from pipistrelle.estimation.data_association.caller_search import find_caller, misfit
+from pipistrelle.estimation.data_association.caller_search import (
+    find_caller,
+    find_moving_caller,
+    misfit,
+)
 from pipistrelle.estimation.data_association.pairs import Rows
 from pipistrelle.estimation.data_association.tracks import Tracks, followed, in_window
 from pipistrelle.estimation.measurement import excess_path_slopes
@@ -13,8 +17,14 @@ from pipistrelle.estimation.measurement import excess_path_slopes
 CALLER = np.array([9.0, -7.0])
 
 
-def heard(seed, *, scans=12, landmarks=20, turn_std=0.0, clutter=0):
-    """Return the tracks of a drive along an arc, and the poses it truly had."""
+def way(time, velocity, acceleration=(0.0, 0.0)):
+    """Return where the caller is that moves, and is at its place after 5.5 s."""
+    t = time - 5.5
+    return CALLER + t * np.array(velocity) + 0.5 * t * t * np.array(acceleration)
+
+
+def heard(seed, *, scans=12, landmarks=20, turn_std=0.0, clutter=0, caller=lambda time: CALLER):
+    """Return the tracks of a drive along an arc, and the poses it was believed to have."""
     rng = np.random.default_rng(seed)
     places = rng.uniform(-10.0, 10.0, (landmarks, 2))
     tracks, poses, lost = Tracks(), [], 0.0
@@ -22,9 +32,9 @@ def heard(seed, *, scans=12, landmarks=20, turn_std=0.0, clutter=0):
         angle = 0.05 * k
         pose = np.array([8.0 * math.sin(angle), 8.0 * (1.0 - math.cos(angle)), angle])
         lost += rng.normal(0.0, turn_std)
-        off = places - pose[:2]
+        off, there = places - pose[:2], caller(0.5 * k)
         bearing = np.arctan2(off[:, 1], off[:, 0]) - pose[2]
-        way = np.array([excess_path_slopes(*pose[:2], *p, *CALLER)[0] for p in places])
+        way = np.array([excess_path_slopes(*pose[:2], *p, *there)[0] for p in places])
         bearing = np.append(bearing, rng.uniform(-math.pi, math.pi, clutter))
         way = np.append(way, rng.uniform(1.0, 25.0, clutter))
         size = bearing.size
@@ -32,10 +42,10 @@ def heard(seed, *, scans=12, landmarks=20, turn_std=0.0, clutter=0):
             bearing + rng.normal(0.0, 0.01, size), np.full(size, 0.01),
             way + rng.normal(0.0, 0.03, size), np.full(size, 0.03), np.full(size, 20.0),
         )  # fmt: skip
-        towards = math.atan2(*(CALLER - pose[:2])[::-1]) - pose[2]
+        towards = math.atan2(*(there - pose[:2])[::-1]) - pose[2]
         believed = pose + np.array([0.0, 0.0, lost])
         direct = towards + rng.normal(0.0, 0.04)
-        tracks = followed(tracks, believed, direct, rows)
+        tracks = followed(tracks, 0.5 * k, believed, direct, rows)
         poses.append(believed)
     return tracks, np.array(poses)
 
@@ -48,7 +58,7 @@ def test_the_caller_is_found_though_headings_are_lost_and_clutter_is_heard():
         if found is None or not found.sure:
             continue
         sure += 1
-        far = math.hypot(found.x - poses[-1, 0], found.y - poses[-1, 1])
+        far = math.hypot(found.place.x - poses[-1, 0], found.place.y - poses[-1, 1])
         assert far == pytest.approx(np.hypot(*(CALLER - poses[-1, :2])), rel=0.4), seed
     assert sure >= 10
 
@@ -56,22 +66,56 @@ def test_the_caller_is_found_though_headings_are_lost_and_clutter_is_heard():
 def test_without_errors_the_misfit_is_least_where_the_caller_is():
     tracks, _ = heard(3)
     table, poses, direct = in_window(tracks, 14, 4)
-    here = misfit(CALLER, poses, table, direct)
+    places = np.tile(CALLER, (len(poses), 1))
+    here = misfit(places, poses, table, direct)
     for step in ([2.0, 0.0], [-2.0, 0.0], [0.0, 2.0], [0.0, -2.0], [5.0, -4.0]):
-        assert misfit(CALLER + step, poses, table, direct) > here + 10.0
+        assert misfit(places + step, poses, table, direct) > here + 10.0
+
+
+WAYS = {
+    "straight": ((0.6, 0.5), (0.0, 0.0)),
+    "off": ((0.9, -0.7), (0.0, 0.0)),
+    "on an arc": ((0.7, 0.5), (-0.1, 0.14)),
+}
+
+
+@pytest.mark.parametrize("how", WAYS)
+def test_a_caller_that_moves_is_found_with_its_velocity(how):
+    sure = 0
+    for seed in range(6):
+        tracks, poses = heard(seed, turn_std=0.01, clutter=3, caller=lambda t: way(t, *WAYS[how]))
+        found = find_moving_caller(tracks)
+        if found is None or not found.sure:
+            continue
+        sure += 1
+        here, velocity = poses[-1, :2], np.array(WAYS[how][0])
+        far = math.hypot(*(np.array(found.place.at(5.5)) - here))
+        assert far == pytest.approx(np.hypot(*(CALLER - here)), rel=0.25), seed
+        assert np.hypot(*(np.array(found.place.way[:2]) - velocity)) < 0.6, seed
+        before = way(found.place.since, *WAYS[how])
+        assert np.hypot(*(np.array(found.place.at(found.place.since)) - before)) < 4.0, seed
+    assert sure >= 4
+
+
+def test_one_that_moves_fits_no_place_and_one_that_stands_is_found_at_rest():
+    tracks, _ = heard(3, caller=lambda t: way(t, (0.9, 0.7)))
+    assert find_caller(tracks).misfit > 2.0 * find_moving_caller(tracks).misfit
+    still = find_moving_caller(heard(3)[0])
+    assert still.sure
+    assert np.hypot(*still.place.way[:2]) < 0.3
 
 
 def test_a_vehicle_that_stands_still_finds_no_caller():
     rng, tracks = np.random.default_rng(0), Tracks()
     bearing, way = rng.uniform(-3.0, 3.0, 15), rng.uniform(2.0, 20.0, 15)
-    for _ in range(12):
+    for k in range(12):
         rows = Rows(
             bearing + rng.normal(0.0, 0.01, 15), np.full(15, 0.01),
             way + rng.normal(0.0, 0.03, 15), np.full(15, 0.03), np.full(15, 20.0),
         )  # fmt: skip
-        tracks = followed(tracks, np.zeros(3), 0.5, rows)
-    found = find_caller(tracks)
-    assert found is None or not found.sure
+        tracks = followed(tracks, 0.5 * k, np.zeros(3), 0.5, rows)
+    for found in (find_caller(tracks), find_moving_caller(tracks)):
+        assert found is None or not found.sure
 
 
 def test_tracks_follow_landmarks_and_break_at_none():
@@ -81,6 +125,6 @@ def test_tracks_follow_landmarks_and_break_at_none():
 
 
 def test_too_few_tracks_or_no_direct_call_say_nothing():
-    assert find_caller(Tracks()) is None
+    assert find_caller(Tracks()) is None is find_moving_caller(Tracks())
     tracks, _ = heard(1, landmarks=5)
     assert find_caller(tracks) is None

@@ -9,8 +9,10 @@ from pipistrelle.config import AssociationConfig, Config
 from pipistrelle.detection.scans import UNLABELLED, make_scan
 from pipistrelle.estimation.beliefs import Gaussian, placed
 from pipistrelle.estimation.catalogue import entry
-from pipistrelle.estimation.data_association.existence import PATIENCE
+from pipistrelle.estimation.data_association.existence import PATIENCE, nobody, with_new
+from pipistrelle.estimation.data_association.memory import Memory
 from pipistrelle.estimation.data_association.methods import association_of
+from pipistrelle.estimation.data_association.sequential import _Work
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.session import Session
 from pipistrelle.experiments.runs.trial import run_mission
@@ -38,6 +40,12 @@ def session_of(name="iekf", method="marginal"):
     return Session(slam, start, np.random.default_rng(7), association=association_of(config))
 
 
+def arc(k):
+    """Return the pose after k + 1 steps of half a second at 0.5 m/s and 0.1 rad/s."""
+    angle = 0.05 * (k + 1)
+    return 5.0 * np.sin(angle), 5.0 * (1.0 - np.cos(angle)), angle
+
+
 def scan_of(places, pose=(0.0, 0.0, 0.0), rng=None, time=0.0, level=40.0):
     """Return what is heard of places, without labels."""
     off = np.atleast_2d(places) - np.array(pose[:2])
@@ -55,9 +63,7 @@ def test_landmarks_that_are_apart_keep_their_labels_while_the_vehicle_drives(nam
     session, rng = session_of(name, method), np.random.default_rng(3)
     for k in range(12):
         session.move(np.array([[0.5, 0.1]]), np.array([0.5]))
-        angle = 0.05 * (k + 1)
-        pose = 5.0 * np.sin(angle), 5.0 * (1.0 - np.cos(angle)), angle
-        session.hear(scan_of(PLACES, pose, rng, time=float(k)))
+        session.hear(scan_of(PLACES, arc(k), rng, time=float(k)))
     labels = np.array(session.labels)
     assert np.all((labels == [1, 2, 3, 4]) | (labels == UNLABELLED))
     assert np.mean(labels == UNLABELLED) < 0.05
@@ -99,6 +105,33 @@ def test_two_landmarks_within_a_call_of_each_other_are_told_apart_once_both_are_
     assert len({tuple(label.tolist()) for label in session.labels[3:]}) == 1
 
 
+@pytest.mark.parametrize("both", [True, False])
+def test_two_landmarks_closer_than_a_call_stay_two_though_now_and_then_one_alone_is_heard(both):
+    near = np.vstack([PLACES, PLACES[0] + [0.0, 0.3]])
+    session, rng = session_of(), np.random.default_rng(5)
+    for k in range(24):
+        silent = [] if both else [(0, 4)[rng.integers(2)]]
+        session.move(np.array([[0.5, 0.1]]), np.array([0.5]))
+        session.hear(scan_of(np.delete(near, silent, axis=0), arc(k), rng, time=float(k)))
+    found = session.landmarks().mean
+    assert len(found) == 5
+    off = np.hypot(*(found[:, np.newaxis] - near).transpose(2, 0, 1))
+    assert off.min(axis=0).max() < 0.05
+
+
+@pytest.mark.parametrize("name", ["iekf", "smoother"])
+def test_a_vehicle_that_starts_among_nothing_maps_what_it_comes_to(name):
+    session, rng, nothing = session_of(name), np.random.default_rng(1), np.empty((0, 2))
+    for k in range(60):
+        session.move(np.array([[0.5, 0.1]]), np.array([0.5]))
+        there = PLACES if k >= 40 else nothing  # 20 s of silence
+        session.hear(scan_of(there, arc(k), rng, time=0.5 * k))
+    assert [label.tolist() for label in session.labels[40:]] == [[1, 2, 3, 4]] * 20
+    off = session.landmarks().mean - PLACES
+    assert np.abs(off).max() < 0.05
+    assert np.sqrt(np.trace(session.belief.pose().covariance[:2, :2])) > 0.1, "it was silent"
+
+
 def test_bearings_about_the_cut_behind_are_one_landmarks():
     session = session_of()
     for y in (-0.05, 0.05, -0.05, 0.05):
@@ -117,6 +150,14 @@ def test_what_is_taken_back_leaves_the_belief_as_if_it_had_never_been_heard():
         beliefs.append(session.belief)
     np.testing.assert_allclose(beliefs[1].mean, beliefs[0].mean, atol=1e-12)
     np.testing.assert_allclose(beliefs[1].covariance, beliefs[0].covariance, atol=1e-14)
+
+
+def test_what_is_known_but_has_no_place_is_not_asked_whether_it_is_on_the_map_twice():
+    known = with_new(nobody(1), [7], 0, 1)
+    known = known._replace(heard=np.array([4]), count=np.array([4]))
+    stage, belief = association_of(Config(association={"method": "nearest"})), session_of().belief
+    work = _Work(stage, Memory(scan=4, labels=7, known=known), belief, scan_of(PLACES))
+    assert work._doubles(known) == ()
 
 
 def test_a_scan_without_rows_is_no_harm():
@@ -196,3 +237,54 @@ def test_a_mission_without_labels_finds_its_caller_and_names_most_rows_rightly()
     lines = _ties(trial, mission.drive.truth.landmarks)
     assert len(lines) > 20
     assert np.median([np.hypot(*(a - b)) for a, b in lines]) < 1.0, "each to its own landmark"
+
+
+MOVER = {"course": "circle", "radius": 15.0, "speed": 0.75}
+
+
+@pytest.mark.parametrize("name", ["iekf", "smoother"])
+def test_a_caller_that_moves_is_found_and_followed_without_labels(name):
+    config = Config.model_validate(
+        BEST
+        | {"scenario": {"steps": 240}, "seed": 6304, "association": {"method": "marginal"}}
+        | {"callers": [{"distance": 12.0}, MOVER | {"name": "boat", "frequency": 25e3}]}
+    )
+    mission = run_mission(config, ["fused"], [name])
+    (trial,) = mission.trials
+    assert trial.scores.associated_right > 0.95
+    assert trial.scores.position_rmse_aligned_m < 0.1
+    assert {*trial.track.callers} == {*mission.drive.moving}, "by the name of the truth"
+    assert trial.scores.caller_rmse_aligned_m < 0.5
+    named = [{*scan.callers.tolist()} - {UNLABELLED} for scan in trial.scans]
+    moving = {label for scan in trial.scans for label in scan.moving.tolist()}
+    assert len(set().union(*named)) == 2
+    assert len(moving) == 1
+    assert not moving & {*trial.track.landmarks.landmark.tolist()}, "it is no landmark"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [6302, 6306])
+def test_a_caller_that_turns_at_once_does_not_lose_the_world(seed):
+    """Both walks bounce off the edge of the field."""
+    settings = {
+        "seed": seed,
+        "callers": [{"course": "walk"}],
+        "association": {"method": "marginal"},
+    }
+    (trial,) = run_mission(Config.model_validate(BEST | settings), ["fused"], ["iekf"]).trials
+    assert trial.scores.position_rmse_aligned_m < 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [7001, 7002, 7003])
+def test_no_world_of_four_hundred_landmarks_is_lost(seed):
+    crowded = {"seed": seed, "scenario": {"landmarks": 400, "spacing": 1.5, "radius": 40.0}}
+    known, found = (
+        run_mission(
+            Config.model_validate(BEST | crowded | {"association": {"method": method}}),
+            ["fused"], ["iekf"],
+        ).trials[0].scores
+        for method in ("known", "marginal")
+    )  # fmt: skip
+    assert found.position_rmse_aligned_m < 3.0 * known.position_rmse_aligned_m
+    assert found.associated_right > 0.94

@@ -47,6 +47,17 @@ def test_one_that_moves_is_no_landmark_and_is_where_it_is(roaming):
     assert np.sqrt(np.trace(now.covariance[0])) < 2.0
 
 
+def test_pose_and_map_together_have_it_where_it_is_after_the_steps_since(roaming):
+    mission, _, beliefs = roaming
+    belief = smoother().predict(beliefs[-1], mission.controls[0], mission.dt[0])[0]
+    joint, now = belief.joint(), belief.moving()
+    i = 3 + 2 * joint.landmark.tolist().index(CALLER)
+    here = slice(i, i + 2)
+    np.testing.assert_allclose(joint.mean[here], now.mean[0], rtol=1e-12)
+    np.testing.assert_allclose(joint.covariance[here, here], now.covariance[0], rtol=1e-9)
+    assert np.hypot(*(joint.mean[here] - beliefs[-1].moving().mean[0])) > 0.05, "it has moved"
+
+
 def test_until_it_is_placed_it_is_a_ray_and_only_when_just_heard():
     mission, _ = roaming_mission(np.random.default_rng(4), frames=3)
     first = mission.scans[0]

@@ -6,14 +6,21 @@ about the direct call, for each place the misfit of all tracks (`misfit`: points
 what their rows say, headings as medians over tracks, residuals that count no more than
 :math:`3 \sigma`), goes downhill from the best, and believes it if what is at another range fits
 clearly worse.
+
+Of a caller that moves the places at the begin, in the middle and at the end of the window are
+looked for, which a parabola joins. A landmark that stands is told by its bearings alone, as the
+vehicle goes by, and its excess path then tells of the caller at each scan: velocity and
+acceleration can be observed, too.
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from pipistrelle.estimation.data_association.memory import Place
 from pipistrelle.estimation.data_association.tracks import TURN, Tracks, in_window
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel, no_alloc
@@ -30,6 +37,8 @@ DIRECT_STD, LEAST_BEARING_STD, LEAST_WAY_STD = 0.05, 0.01, 0.05
 """Least deviations: of the direct call, of other bearings [rad], and of excess paths [m]."""
 FARTHEST, NEAREST = 80.0, 0.05
 """Largest range of a landmark, and least distance from the caller [m]."""
+FASTEST = 2.0
+"""Of a caller that moves [m/s]."""
 CAP = 9.0
 """A row's misfit counts no more."""
 PASSES, WEIGHINGS = 3, 2
@@ -38,8 +47,7 @@ PASSES, WEIGHINGS = 3, 2
 class Found(NamedTuple):
     """A caller's place."""
 
-    x: float
-    y: float
+    place: Place
     misfit: float
     """Per row."""
     ahead: float
@@ -58,59 +66,154 @@ def find_caller(tracks: Tracks) -> Found | None:
     heard = direct[~np.isnan(direct)]
     if len(table) < LEAST_TRACKS or not heard.size:
         return None
-    here, towards = poses[-1, :2], heard[-1]
-    grid = [(r, towards + b) for r in RANGES.tolist() for b in BEARINGS.tolist()]
-    places = [here + r * np.array([math.cos(a), math.sin(a)]) for r, a in grid]
-    misfits = np.array([misfit(place, poses, table, direct) for place in places])
+    seen, still = (poses, table, direct), np.ones((len(poses), 1))
+    grid = [(r, heard[-1] + b) for r in RANGES.tolist() for b in BEARINGS.tolist()]
+    nodes = [_seen_from(poses[-1], r, angle)[np.newaxis] for r, angle in grid]
+    ranges, misfits = np.array([r for r, _ in grid]), _misfits(nodes, still, seen)
     best = int(misfits.argmin())
-    place, least = _downhill(
-        places[best], misfits[best], 0.12 * grid[best][0], (poses, table, direct)
-    )
-    distance = math.hypot(*(place - here))
-    others = np.abs(np.log(np.array([r for r, _ in grid]) / distance)) > ANOTHER
-    rows = int(np.count_nonzero(~np.isnan(table[..., 0])))
+    node, least = _downhill(nodes[best], misfits[best], 0.12 * ranges[best], still, seen)
+    others = _another(ranges, math.hypot(*(node[0] - poses[-1, :2])))
     ahead = float(misfits[others].min(initial=math.inf) - least)
-    return Found(float(place[0]), float(place[1]), least / rows, ahead, len(table))
+    x, y = node[0].tolist()
+    return Found(Place(x, y), least / _rows(table), ahead, len(table))
+
+
+def find_moving_caller(tracks: Tracks) -> Found | None:
+    """Return where a caller is that moves, and how; None as `find_caller`.
+
+    The ends of its way in the window are looked for on a grid of ranges, then its middle, too. What
+    fits best is held against what fits best at another range.
+    """
+    table, poses, direct = in_window(tracks, SCANS, SIGHTINGS)
+    heard, times = np.flatnonzero(~np.isnan(direct)), tracks.times[-len(poses) :]
+    if len(table) < LEAST_TRACKS or heard.size < 2:
+        return None
+    seen, first, last = (poses, table, direct), heard[0], heard[-1]
+    took = float(times[last] - times[first])
+    share = (times - times[first]) / took
+    ends = [(s, r) for r in RANGES.tolist() for s in RANGES.tolist() if abs(r - s) < FASTEST * took]
+    begins, finish = (poses[first], direct[first]), (poses[last], direct[last])
+    nodes = [
+        np.stack([_seen_from(begins[0], s, begins[1]), _seen_from(finish[0], r, finish[1])])
+        for s, r in ends
+    ]
+    ranges = np.array([r for _, r in ends])
+    misfits = _misfits(nodes, np.stack([1.0 - share, share], axis=1), seen)
+
+    def range_of(way: Float[np.ndarray, "n 2"]) -> float:
+        return math.hypot(*(way[-1] - poses[last, :2]))
+
+    best = int(misfits.argmin())
+    one = _bent((nodes[best], misfits[best], 0.12 * ranges[best]), share, seen, lambda way: True)
+    apart = _another(ranges, range_of(one[0]))
+    best = int(np.where(apart, misfits, np.inf).argmin())
+    other = _bent(
+        (nodes[best], misfits[best], 0.12 * ranges[best]), share, seen,
+        lambda way: abs(math.log(range_of(way) / range_of(one[0]))) > ANOTHER,
+    )  # fmt: skip
+    (way, least), (_, next_least) = sorted((one, other), key=lambda found: found[1])
+    place = _at_end(way, float(times[last]), took)._replace(since=float(times[0]))
+    return Found(place, least / _rows(table), next_least - least, len(table))
+
+
+def _bent(
+    begun: tuple[np.ndarray, float, float],
+    share: Float[np.ndarray, " k"],
+    seen: tuple[np.ndarray, ...],
+    within: Callable[[np.ndarray], bool],
+) -> tuple[Float[np.ndarray, "3 2"], float]:
+    """Return begin, middle and end of the way that fits best near a straight one, and its misfit.
+
+    ``begun``: begin and end of that, its misfit, and the first step [m]; ``share``: of it that is
+    gone at each scan.
+    """
+    node, least, step = begun
+    line = np.stack([1.0 - share, share], axis=1)
+    node, least = _downhill(node, least, step, line, seen, within)
+    middle = 4.0 * share * (1.0 - share)
+    curve = np.stack([line[:, 0] - 0.5 * middle, middle, line[:, 1] - 0.5 * middle], axis=1)
+    node = np.stack([node[0], 0.5 * (node[0] + node[1]), node[1]])
+    return _downhill(node, least, step / 3.0, curve, seen, within)
+
+
+def _at_end(node: Float[np.ndarray, "3 2"], time: float, took: float) -> Place:
+    """Return place and motion at the end of a way by its begin, middle and end."""
+    velocity = (node[0] - 4.0 * node[1] + 3.0 * node[2]) / took
+    acceleration = 4.0 * (node[0] - 2.0 * node[1] + node[2]) / took**2
+    (x, y), (vx, vy), (ax, ay) = (of.tolist() for of in (node[2], velocity, acceleration))
+    return Place(x, y, way=(vx, vy, ax, ay), time=time)
+
+
+def _another(ranges: Float[np.ndarray, " n"], distance: float) -> Bool[np.ndarray, " n"]:
+    """Return a mask of ranges that are others than a distance."""
+    return np.abs(np.log(ranges / distance)) > ANOTHER
+
+
+def _seen_from(pose: Float[np.ndarray, "3"], far: float, angle: float) -> Float[np.ndarray, "2"]:
+    """Return the place at a range and a bearing in the world from a pose."""
+    return pose[:2] + far * np.array([math.cos(angle), math.sin(angle)])
+
+
+def _rows(table: Float[np.ndarray, "t k 4"]) -> int:
+    """Return how many rows tracks have."""
+    return int(np.count_nonzero(~np.isnan(table[..., 0])))
+
+
+def _misfits(
+    nodes: list[np.ndarray], weights: Float[np.ndarray, "k n"], seen: tuple[np.ndarray, ...]
+) -> Float[np.ndarray, " g"]:
+    """Return the misfit of each of several ways; arguments as those of `_downhill`."""
+    return np.array([misfit(weights @ node, *seen) for node in nodes])
 
 
 def _downhill(
-    place: Float[np.ndarray, "2"], least: float, step: float, seen: tuple[np.ndarray, ...]
-) -> tuple[Float[np.ndarray, "2"], float]:
-    """Return the place of the least misfit near a place, by a pattern search, and its misfit."""
-    poses, table, direct = seen
-    end = step / 12.0
+    nodes: Float[np.ndarray, "n 2"],
+    least: float,
+    step: float,
+    weights: Float[np.ndarray, "k n"],
+    seen: tuple[np.ndarray, ...],
+    within: Callable[[np.ndarray], bool] = lambda nodes: True,
+) -> tuple[Float[np.ndarray, "n 2"], float]:
+    """Return the nodes of the least misfit near others, by a pattern search, and its misfit.
+
+    ``weights``: of the nodes in the caller's place at each scan; ``within``: which nodes may be.
+    """
+    end, size = step / 12.0, len(nodes)
+    which = [np.ones((size, 1)), *(np.eye(size)[:, :, np.newaxis] if size > 1 else ())]
+    angles = np.arange(8) * np.pi / 4.0
+    moves = [one * np.array([math.cos(a), math.sin(a)]) for one in which for a in angles]
     while step > end:
-        for a in np.arange(8) * np.pi / 4.0:
-            other = place + step * np.array([math.cos(a), math.sin(a)])
-            value = misfit(other, poses, table, direct)
-            if value < least:
-                place, least = other, value
+        for move in moves:
+            other = nodes + step * move
+            value = misfit(weights @ other, *seen)
+            if value < least and within(other):
+                nodes, least = other, value
                 break
         else:
             step *= 0.5
-    return place, least
+    return nodes, least
 
 
 @kernel
 def misfit(
-    place: Float[np.ndarray, "2"],
+    places: Float[np.ndarray, "k 2"],
     poses: Float[np.ndarray, "k 3"],
     table: Float[np.ndarray, "t k 4"],
     direct: Float[np.ndarray, " k"],
 ) -> float:
-    """Return the misfit of all rows, were the caller at a place [squared deviations]."""
+    """Return the misfit of all rows, were the caller at these places [squared deviations]."""
     tracks, scans = table.shape[0], table.shape[1]
     turn, off = np.zeros(scans), np.full((tracks, scans), np.nan)
     points, total = np.empty((scans, 5)), 0.0
     for number in range(PASSES):
         total = 0.0
         for t in range(tracks):
-            total += _of_track(place, poses, table[t], turn, points, off[t])
+            total += _of_track(places, poses, table[t], turn, points, off[t])
         if number < PASSES - 1:
             _correct_headings(off, turn)
     for k in range(scans):
         if not math.isnan(direct[k]):
-            towards = math.atan2(place[1] - poses[k, 1], place[0] - poses[k, 0])
+            towards = math.atan2(places[k, 1] - poses[k, 1], places[k, 0] - poses[k, 0])
             sight = wrap_angle(direct[k] + turn[k] - towards) / DIRECT_STD
             total += min(sight * sight, CAP)
         if k > 0:
@@ -120,7 +223,7 @@ def misfit(
 
 @no_alloc
 def _of_track(
-    place: Float[np.ndarray, "2"],
+    places: Float[np.ndarray, "k 2"],
     poses: Float[np.ndarray, "k 3"],
     rows: Float[np.ndarray, "k 4"],
     turn: Float[np.ndarray, " k"],
@@ -133,13 +236,13 @@ def _of_track(
     """
     x, y, weight = 0.0, 0.0, 0.0
     for k in range(rows.shape[0]):
-        _write_point(place, poses[k], rows[k], turn[k], points[k])
+        _write_point(places[k], poses[k], rows[k], turn[k], points[k])
         if not math.isnan(points[k, 0]):
             share = 1.0 / (points[k, 3] + points[k, 4] + 4e-4)
             x, y, weight = x + share * points[k, 0], y + share * points[k, 1], weight + share
     for number in range(1 + WEIGHINGS if weight > 0.0 else 0):
         x, y = _weighed(points, x, y) if number else (x / weight, y / weight)
-    total, onward = 0.0, math.hypot(x - place[0], y - place[1])
+    total = 0.0
     for k in range(rows.shape[0]):
         if math.isnan(rows[k, 0]):
             continue
@@ -147,7 +250,8 @@ def _of_track(
             total += CAP
             continue
         dx, dy = x - poses[k, 0], y - poses[k, 1]
-        straight = math.hypot(place[0] - poses[k, 0], place[1] - poses[k, 1])
+        straight = math.hypot(places[k, 0] - poses[k, 0], places[k, 1] - poses[k, 1])
+        onward = math.hypot(x - places[k, 0], y - places[k, 1])
         off[k] = wrap_angle(rows[k, 0] + turn[k] - math.atan2(dy, dx))
         path = onward + math.hypot(dx, dy) - straight
         across = off[k] / math.hypot(rows[k, 2], LEAST_BEARING_STD)

@@ -22,16 +22,19 @@ from jaxtyping import Bool, Float, Int
 from pipistrelle.detection.scans import (
     BEARING,
     BEARING_STD,
-    NO_CALLERS,
     OWN,
     RANGE,
     RANGE_STD,
     UNLABELLED,
     Scan,
+    with_callers,
 )
 from pipistrelle.estimation.association import Assignment
 from pipistrelle.estimation.beliefs import Belief, JointGaussian
-from pipistrelle.estimation.data_association.caller_search import find_caller
+from pipistrelle.estimation.data_association.caller_search import (
+    find_caller,
+    find_moving_caller,
+)
 from pipistrelle.estimation.data_association.doubles import doubles
 from pipistrelle.estimation.data_association.existence import (
     GONE,
@@ -42,7 +45,7 @@ from pipistrelle.estimation.data_association.existence import (
     with_new,
 )
 from pipistrelle.estimation.data_association.matching import Innovate, Match
-from pipistrelle.estimation.data_association.memory import Caller, Memory
+from pipistrelle.estimation.data_association.memory import Caller, Memory, Place
 from pipistrelle.estimation.data_association.pairs import (
     OWN_CALL,
     UNPLACED,
@@ -52,10 +55,12 @@ from pipistrelle.estimation.data_association.pairs import (
     with_point,
 )
 from pipistrelle.estimation.data_association.tracks import Tracks, followed
+from pipistrelle.estimation.data_association.turns import turned
 from pipistrelle.geometry import wrap, wrap_angle
 
-FIRST_SEARCH = 8
-"""Scans of a caller after which its place is searched for, at every second one."""
+FIRST_SEARCH = 8, 10
+"""Scans of a caller that stands, and of one that moves, after which its place is searched for, at
+every second one."""
 PLACE_SHARE, PLACE_BEARING_STD = 0.2, 0.03
 """Deviation of a caller's place that was found: of its range, as a share, and of its bearing."""
 REFINED_AFTER, REFINED_SHARE = 24, 0.06
@@ -77,8 +82,6 @@ SURE_SHARE = 0.65
 """A row is as sure as any up to this share of the limit of its bearing's deviation."""
 BOTH = 0.1
 """Two landmarks are two if in more than this share of the scans of either both were heard."""
-News = Mapping[int, tuple[float, float, bool]]
-"""Where callers are, by number: x, y [m], and whether that is from the map."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,14 +138,13 @@ class Sequential:
         """Return the memory before the first scan."""
         return Memory()
 
-    def informed(self, memory: Memory, news: News) -> Memory:
+    def informed(self, memory: Memory, news: Mapping[int, Place]) -> Memory:
         """Return a memory that knows where callers are, by their numbers."""
         known = dict(memory.callers)
         for number, place in news.items():
             label = known[number].label if number in known else memory.labels + 1
             memory = replace(memory, labels=max(memory.labels, label))
-            x, y, refined = place
-            known[number] = Caller(label=label, place=(x, y), refined=refined)
+            known[number] = Caller(label=label, place=place)
         return replace(memory, callers=known)
 
     def tentative(self, memory: Memory) -> list[int]:
@@ -170,6 +172,7 @@ class _Work:
         self.label = np.full(scan.landmark.size, UNLABELLED)
         self.labels, self.callers = memory.labels, dict(memory.callers)
         self.numbers, self.named = scan.numbers, np.full(scan.direct.size, UNLABELLED)
+        self.moving = [c.label for number, c in self.callers.items() if number in scan.moving]
         own, limits = scan.caller == OWN, stage.limits
         self.way = np.where(own, scan.range, scan.excess_path)
         self.way_std = np.where(own, scan.range_std, scan.excess_path_std)
@@ -180,9 +183,9 @@ class _Work:
         self.new: list[int] = []
         self.near: set[int] = set()
 
-    def search_callers(self) -> News:
+    def search_callers(self) -> dict[int, Place]:
         """Follow the rows of callers that are not found, and return where some now are."""
-        news: dict[int, tuple[float, float, bool]] = {}
+        news: dict[int, Place] = {}
         for number, row in enumerate(self.scan.direct.tolist()):
             if number == OWN or (row < 0 and number not in self.callers):
                 continue
@@ -194,24 +197,26 @@ class _Work:
                 news |= self._searched(number, caller, row)
         return news
 
-    def _refined(self, number: int, caller: Caller) -> News:
+    def _refined(self, number: int, caller: Caller) -> dict[int, Place]:
         """Return the place of a caller on the map, once that is worth more than what was found."""
-        at = self._where(caller.label)
-        if caller.refined or self.memory.scan != caller.since + REFINED_AFTER or at < 0:
+        at, done = self._where(caller.label), caller.place is not None and caller.place.refined
+        moves = number in self.scan.moving
+        if moves or done or self.memory.scan != caller.since + REFINED_AFTER or at < 0:
             return {}
         x, y = self.joint.mean[at : at + 2].tolist()
-        return {number: (x, y, True)}
+        return {number: Place(x, y, refined=True)}
 
-    def _searched(self, number: int, caller: Caller, row: int) -> News:
+    def _searched(self, number: int, caller: Caller, row: int) -> dict[int, Place]:
         """Follow a caller's rows, and return its place if that is found."""
         rows = self._rows(self.usable & ~self.bare & (self.scan.caller == number))
         direct = self.scan.bearing[row] if row >= 0 else math.nan
-        tracks = followed(caller.tracks, self.pose, direct, rows)
+        tracks = followed(caller.tracks, self.scan.time, self.pose, direct, rows)
         self.callers[number] = replace(caller, tracks=tracks)
-        if len(tracks.poses) < FIRST_SEARCH or len(tracks.poses) % 2:
+        moves = number in self.scan.moving
+        if len(tracks.poses) < FIRST_SEARCH[moves] or len(tracks.poses) % 2:
             return {}
-        found = find_caller(tracks)
-        return {number: (found.x, found.y, False)} if found is not None and found.sure else {}
+        found = find_moving_caller(tracks) if moves else find_caller(tracks)
+        return {number: found.place} if found is not None and found.sure else {}
 
     def match(self, number: int) -> None:
         """Label the rows of one caller."""
@@ -221,7 +226,11 @@ class _Work:
         rows = np.flatnonzero(self.scan.caller == number)
         rows = rows[rows != self._direct(number)]
         there = 3 + 2 * np.arange(self.joint.landmark.size)
+        if number in self.scan.moving and at >= 0:
+            self._follow_turn(number, rows, at)
         costs = self._costs(rows, there, at, self.stage.chances)
+        if self.moving:
+            costs[:, np.isin(self.joint.landmark, self.moving)] = np.inf
         gated, usable = np.isfinite(costs), self.usable[rows]
         if at != UNPLACED:
             usable &= ~self.bare[rows]
@@ -233,6 +242,19 @@ class _Work:
         self._judge_caller(number, used)
         if at != UNPLACED:
             self._bear(number, used[~gated[usable].any(axis=1)], at)
+
+    def _follow_turn(self, number: int, rows: Int[np.ndarray, " r"], at: int) -> None:
+        """Take a caller that moves for where its rows fit, if they do not where it was expected."""
+        rows, direct = rows[(self.usable & ~self.bare)[rows]], self._direct(number)
+        if direct < 0:
+            return
+        joint, stand = self.joint, ~np.isin(self.joint.landmark, self.moving)
+        there, columns = 3 + 2 * np.flatnonzero(stand), tuple(self._rows(rows))
+
+        def costs(mean: Float[np.ndarray, " d"]) -> Float[np.ndarray, "r n"]:
+            return pair_costs(columns, mean, joint.covariance, there, at, self.stage.chances)
+
+        self.joint = turned(joint, at, float(self.scan.bearing[direct]), costs)
 
     def _heard_from(self, number: int) -> int | None:
         """Return where a caller stands in the joint mean; None where its rows have to wait."""
@@ -264,7 +286,7 @@ class _Work:
             known=merged(known, merge),
             callers=self.callers,
         )
-        stated = replace(scan, numbers=self.numbers, callers=self.named, direct=NO_CALLERS)
+        stated = with_callers(replace(scan, numbers=self.numbers), self.named)
         before = {*memory.known.label.tolist(), *(c.label for c in memory.callers.values())}
         return after, Assignment(
             label=self.label,
@@ -361,15 +383,16 @@ class _Work:
     def _tell(self, number: int, caller: Caller) -> None:
         """State the place of a caller that was found as a range of its direct call."""
         row = self._direct(number)
-        if caller.place is None or row < 0:
+        if caller.place is None or row < 0 or self.scan.time < caller.place.since:
             return
-        dx, dy = caller.place[0] - self.pose[0], caller.place[1] - self.pose[1]
+        x, y = caller.place.at(self.scan.time)
+        dx, dy = x - self.pose[0], y - self.pose[1]
         far = math.hypot(dx, dy)
         self.numbers = self.numbers.copy()
-        if not caller.refined:
+        if not (caller.place.refined or number in self.scan.moving):
             self.numbers[BEARING, row] = wrap_angle(math.atan2(dy, dx) - self.pose[2])
             self.numbers[BEARING_STD, row] = PLACE_BEARING_STD
-        share = REFINED_SHARE if caller.refined else PLACE_SHARE
+        share = REFINED_SHARE if caller.place.refined else PLACE_SHARE
         self.numbers[RANGE, row], self.numbers[RANGE_STD, row] = far, share * far
         self.label[row] = self.named[number] = caller.label
         told = replace(caller, told=True, tracks=Tracks(), since=self.memory.scan)
@@ -380,7 +403,7 @@ class _Work:
         row = self._direct(number)
         if row < 0:
             return
-        if at >= 0:
+        if at >= 0 and number not in self.scan.moving:
             chances = (DIRECT_GATE, *self.stage.chances[1:])
             cost = self._costs(np.array([row]), np.array([at]), UNPLACED, chances)
             if np.isinf(cost[0, 0]):

@@ -33,6 +33,8 @@ class Tracks:
 
     poses: Float[np.ndarray, "k 3"] = field(default_factory=lambda: np.empty((0, 3)))
     """Of the vehicle at each scan, as it was believed then."""
+    times: Float[np.ndarray, " k"] = field(default_factory=lambda: np.empty(0))
+    """[s]"""
     direct: Float[np.ndarray, " k"] = field(default_factory=lambda: np.empty(0))
     """World bearing of the caller itself, or NaN."""
     rows: tuple[Float[np.ndarray, "r 5"], ...] = ()
@@ -41,7 +43,9 @@ class Tracks:
     """Last sightings of each track, the newest first; NaN before the first."""
 
 
-def followed(tracks: Tracks, pose: Float[np.ndarray, "3"], direct: float, rows: Rows) -> Tracks:
+def followed(
+    tracks: Tracks, time: float, pose: Float[np.ndarray, "3"], direct: float, rows: Rows
+) -> Tracks:
     """Return tracks with one scan more.
 
     ``direct``: bearing of the caller's own call, or NaN.
@@ -65,6 +69,7 @@ def followed(tracks: Tracks, pose: Float[np.ndarray, "3"], direct: float, rows: 
     return replace(
         tracks,
         poses=np.vstack([tracks.poses, pose]),
+        times=np.append(tracks.times, time),
         direct=np.append(tracks.direct, direct + heading),
         rows=(*tracks.rows, np.column_stack((track[kept], columns))),
         last=last,

@@ -136,11 +136,15 @@ class SmootherBelief:
         for column in columns[there].tolist():
             by_border[i, column] = by_border[i + 1, column + 1] = 1.0
             mean, i = [*mean, *border[column : column + 2]], i + 2
+        first, guess, seconds = i, self.guess(), self.odometry.seconds
         for label, at in self._callers():
             by_chain[i, at] = by_chain[i + 1, at + 1] = 1.0
-            mean, i, labels = [*mean, *solution.state[at : at + 2]], i + 2, [*labels, label]
+            by_chain[i, at + 2] = by_chain[i + 1, at + 3] = seconds
+            mean, i, labels = [*mean, *guess[at : at + 2]], i + 2, [*labels, label]
         covariance = joint(solution.front, solution.factor, n, by_chain, by_border)
         covariance[:3, :3] = self.ahead.covariance
+        strayed = self.noise[3] ** 2 * seconds**3 / 3.0
+        covariance[range(first, size), range(first, size)] += strayed
         return JointGaussian(
             landmark=np.array(labels, np.int64), mean=np.array(mean), covariance=covariance
         )

@@ -131,7 +131,8 @@ def _move(session: Session[B], drive: Drive, first: int, last: int, path: Gaussi
 
 def _check_known(drive: Drive, scans: Sequence[Scan]) -> None:
     """Refuse landmarks that are known beforehand and move."""
-    moving = {*drive.moving, *(label for scan in scans for label in scan.moving.tolist())}
+    labelled = (scan for scan in scans if not scan.direct.size)
+    moving = {*drive.moving, *(label for scan in labelled for label in scan.moving.tolist())}
     if roving := sorted(moving.intersection(drive.known.landmark.tolist())):
         raise InputError(
             f"landmarks known beforehand: found {roving}, which move; expected some that stand"

@@ -30,6 +30,7 @@ from pipistrelle.experiments.drives import Drive, Truth
 from pipistrelle.experiments.hearing.scenario import (
     Scenario,
     assumed_motion,
+    caller_labels,
     moving_callers,
     standing_landmarks,
 )
@@ -128,6 +129,7 @@ def drive_of(scenario: Scenario, config: Config, iteration: int = 0) -> Drive:
             landmarks=standing_landmarks(scenario),
             callers={label: np.asarray(caller.place) for label, caller in moving.items()},
         ),
+        callers=caller_labels(scenario),
         moving={label: caller.name for label, caller in moving.items()},
     )
 

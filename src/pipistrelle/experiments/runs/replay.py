@@ -288,6 +288,7 @@ def drive_of(log: Log, truth: Truth) -> Drive:
         controls=log.controls,
         truth=truth,
         known=_known_callers(log),
+        callers=np.array([UNLABELLED, *(who.landmark for who in log.callers)]),
         moving={who.landmark: who.name for who in log.callers if who.moves},
         sensor=log.sensor_pose,
     )

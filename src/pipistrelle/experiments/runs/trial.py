@@ -24,7 +24,7 @@ from pipistrelle.estimation.catalogue import CATALOGUE, entry, short_name
 from pipistrelle.estimation.data_association.methods import association_of
 from pipistrelle.evaluation.association import Causes, associated, renamed
 from pipistrelle.experiments.cases import Case
-from pipistrelle.experiments.drives import Drive, Truth, at_sensor, at_vehicle, split_at
+from pipistrelle.experiments.drives import Drive, at_sensor, at_vehicle, split_at
 from pipistrelle.experiments.hearing.listening import Keep, Progress, listen
 from pipistrelle.experiments.hearing.scenario import standing_landmarks
 from pipistrelle.experiments.hearing.world import ALL_DRAWN, World
@@ -42,11 +42,7 @@ from pipistrelle.experiments.results.scores import (
 from pipistrelle.experiments.runs.filtering import run_filter
 from pipistrelle.experiments.runs.heard_world import HeardWorld, drive_of
 from pipistrelle.experiments.runs.mission import Mission
-from pipistrelle.experiments.runs.validate_filters import (
-    check_filters,
-    check_standing,
-    failed_trial,
-)
+from pipistrelle.experiments.runs.validate_filters import check_filters, failed_trial
 from pipistrelle.experiments.runs.validate_mission import checked_scenario
 
 NOT_KNOWN: Mapping[Strategy, None] = {}
@@ -188,8 +184,8 @@ def run_trial(
     """
     strategy, name, heard, estimator = case.strategy, case.filter, tuple(scans), entry(case.filter)
     association = association or association_of(config)
-    check_standing(drive.moving.values() if association else ())
-    scans = with_moving(scans, drive, follows=estimator.follows and config.listening.timing)
+    follows = estimator.follows and config.listening.timing
+    scans = with_moving(scans, drive, follows=follows, known=association is None)
 
     used: list[Scan] = []
 
@@ -212,8 +208,8 @@ def run_trial(
         watch=look,
     )
     wall_s = kernel_clock.wall_s() - began
-    track = at_vehicle(at_steps(whole, steps), drive.sensor)
-    scores, mapped = _scored(track, drive.truth, used, estimator.nees_limit, causes, association)
+    track = _named(at_vehicle(at_steps(whole, steps), drive.sensor), used, drive)
+    scores, mapped = _scored(track, drive, used, estimator.nees_limit, causes, association)
     return TrialResult(
         strategy=strategy,
         filter=name,
@@ -227,30 +223,49 @@ def run_trial(
     )
 
 
+def _named(track: Track, used: Sequence[Scan], drive: Drive) -> Track:
+    """Return a track whose callers have their own labels, not those of an association."""
+    if not track.callers:
+        return track
+    pairs = (zip(scan.callers.tolist(), drive.callers.tolist(), strict=False) for scan in used)
+    own = {name: label for both in pairs for name, label in both}
+    return replace(track, callers={own.get(name, name): of for name, of in track.callers.items()})
+
+
 def _scored(
     track: Track,
-    truth: Truth,
+    drive: Drive,
     used: Sequence[Scan],
     limit: float,
     causes: Causes | None,
     association: Association | None,
 ) -> tuple[Scores, Landmarks | None]:
     """Return the scores of a track, and its map by the names of the truth where it has others."""
+    truth = drive.truth
     if association is None:
         return score(track, truth, used, limit), None
     if causes is None:
         return score(track, replace(truth, landmarks=None), used, limit), None
-    found = associated(track.labels, causes)
+    found = associated(track.labels, causes, [*drive.moving])
     mapped = renamed(track.landmarks, found)
     scores = score(replace(track, landmarks=mapped), truth, used, limit)
     return with_association(scores, track.landmarks, found, truth), mapped
 
 
-def with_moving(scans: Sequence[Scan], drive: Drive, *, follows: bool) -> Sequence[Scan]:
-    """Mark the callers that move in scans, or leave out their rows."""
+def with_moving(
+    scans: Sequence[Scan], drive: Drive, *, follows: bool, known: bool = True
+) -> Sequence[Scan]:
+    """Mark the callers that move in scans, or leave out their rows.
+
+    `known`: whether labels are; if not, callers are marked by their numbers, and nothing is left
+    out.
+    """
     if not drive.moving:
         return scans
     moving = np.array([*drive.moving])
+    if not known:
+        numbers = np.flatnonzero(np.isin(drive.callers, moving))
+        return [replace(scan, moving=numbers) if scan.direct.size else scan for scan in scans]
     if follows:
         return [replace(scan, moving=moving) for scan in scans]
     return [rows_of(scan, ~np.isin(scan.landmark, moving)) for scan in scans]

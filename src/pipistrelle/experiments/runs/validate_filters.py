@@ -30,9 +30,9 @@ def check_filters(
     `moving`: names of the callers that move.
     """
     check_distinct(filters)
-    if association_of(config):
-        check_standing(moving)
+    followed = () if association_of(config) is None or not config.listening.timing else moving
     for name in filters:
+        check_follows(name, followed)
         if name in CATALOGUE:
             check_calibrates(name, config)
             continue
@@ -67,12 +67,16 @@ def check_calibrates(name: str, config: Config) -> None:
         )
 
 
-def check_standing(moving: Iterable[str]) -> None:
-    """Refuse callers that move where an association is to label them: none can yet."""
-    if names := ", ".join(moving):
+def check_follows(name: str, moving: Iterable[str]) -> None:
+    """Refuse callers that move, and that an association is to find, of a filter that follows none.
+
+    >>> check_follows("iekf", ["boat"])
+    """
+    if (names := ", ".join(moving)) and not entry(name).follows:
+        able = ", ".join(known.name for known in CATALOGUE.values() if known.follows)
         raise InputError(
-            f"association.method: found callers that move ({names}); expected callers that stand: "
-            "without labels none is followed yet"
+            f"association.method: found callers that move ({names}) with the filter {name}, which "
+            f"follows none; take {able}, or add --listening.timing false"
         )
 
 
