@@ -20,8 +20,8 @@ class Caller:
     """Rows that were of landmarks, and all, of the scans since it is on the map."""
     since: int = 0
     """Number of the scan in which it was placed."""
-    refined: bool = False
-    """Whether its place is that of a map."""
+    refined: float = 0.0
+    """If its place is that of a map, the share of the range by which it may be off; else 0."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -59,7 +59,8 @@ FIRST_SEARCH = 8
 PLACE_SHARE, PLACE_BEARING_STD = 0.2, 0.03
 """Deviation of a caller's place that was found: of its range, as a share, and of its bearing."""
 REFINED_AFTER, REFINED_SHARE = 24, 0.06
-"""Scans after which the place on the map is taken instead, once, and the share of its range."""
+"""Scans after which the place on the map is taken instead, once, and the least share of its range
+that it may be off."""
 DIRECT_GATE = 9.0
 """Largest squared distance of a caller's direct call."""
 PROBATION = 40
@@ -75,8 +76,9 @@ ASKED = frozenset((4, 6, 8, 12, 16, 24, 32, 64))
 """In how many scans a landmark was heard when it is asked whether it is on the map twice."""
 BOTH = 0.1
 """Two landmarks are two if in more than this share of the scans of either both were heard."""
-News = Mapping[int, tuple[float, float, bool]]
-"""Where callers are, by number: x, y [m], and whether that is from the map."""
+News = Mapping[int, tuple[float, float, float]]
+"""Where callers are, by number: x, y [m], and, if that is from the map, the share of the range by
+which it may be off; else 0."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -173,7 +175,7 @@ class _Work:
 
     def search_callers(self) -> News:
         """Follow the rows of callers that are not found, and return where some now are."""
-        news: dict[int, tuple[float, float, bool]] = {}
+        news: dict[int, tuple[float, float, float]] = {}
         for number, row in enumerate(self.scan.direct.tolist()):
             if number == OWN or (row < 0 and number not in self.callers):
                 continue
@@ -190,8 +192,12 @@ class _Work:
         at = self._where(caller.label)
         if caller.refined or self.memory.scan != caller.since + REFINED_AFTER or at < 0:
             return {}
+        way, P = self.joint.mean[at : at + 2] - self.pose[:2], self.joint.covariance
+        u = np.array([*-way, *way]) / float(way @ way)
+        there = [0, 1, at, at + 1]
+        share = math.sqrt(u @ P[np.ix_(there, there)] @ u)  # of the range, on the map
         x, y = self.joint.mean[at : at + 2].tolist()
-        return {number: (x, y, True)}
+        return {number: (x, y, min(max(share, REFINED_SHARE), PLACE_SHARE))}
 
     def _searched(self, number: int, caller: Caller, row: int) -> News:
         """Follow a caller's rows, and return its place if that is found."""
@@ -202,7 +208,7 @@ class _Work:
         if len(tracks.poses) < FIRST_SEARCH or len(tracks.poses) % 2:
             return {}
         found = find_caller(tracks)
-        return {number: (found.x, found.y, False)} if found is not None and found.sure else {}
+        return {number: (found.x, found.y, 0.0)} if found is not None and found.sure else {}
 
     def match(self, number: int) -> None:
         """Label the rows of one caller."""
@@ -376,7 +382,7 @@ class _Work:
         if not caller.refined:
             self.numbers[BEARING, row] = wrap_angle(math.atan2(dy, dx) - self.pose[2])
             self.numbers[BEARING_STD, row] = PLACE_BEARING_STD
-        share = REFINED_SHARE if caller.refined else PLACE_SHARE
+        share = caller.refined or PLACE_SHARE
         self.numbers[RANGE, row], self.numbers[RANGE_STD, row] = far, share * far
         self.label[row] = self.named[number] = caller.label
         told = replace(caller, told=True, tracks=Tracks(), since=self.memory.scan)
