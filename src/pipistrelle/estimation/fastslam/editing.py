@@ -60,22 +60,22 @@ def _by_parents(
     """
     size, parent = there.size, np.full(belief.landmark.size, -1)
     parent[: belief.parent.size] = belief.parent
-    common = np.zeros((size, 2, size, 2))
+    common = np.zeros((size, size, 2, 2))
     for h in np.intersect1d(parent, there).tolist():
-        children = np.flatnonzero(parent[there] == h)
-        slope = _numbers(belief.slope[:, there[children]], 4)[: len(weight)]
-        B = members[:, np.flatnonzero(there == h)[0]][:, [2, 3, 3, 4]].reshape(-1, 1, 2, 2)
-        A = slope.reshape(*slope.shape[:2], 2, 2)
-        family = np.append(children, np.flatnonzero(there == h))
-        A = np.concatenate([A, np.broadcast_to(np.eye(2), (len(A), 1, 2, 2))], axis=1)
-        some = np.sqrt(weight[:, family, np.newaxis, np.newaxis])
-        AB = some * (A @ B)
-        common[family[:, np.newaxis], :, family] += np.einsum(
-            "pnac,pmbc->nmab", AB, some * A, optimize=True
-        )
-    for n in range(size):
-        common[n, :, n] = 0.0
-    return common.reshape(2 * size, 2 * size)
+        family = np.append(np.flatnonzero(parent[there] == h), np.flatnonzero(there == h))
+        A = np.zeros((len(weight), family.size, 4))
+        A[:, :-1] = _numbers(belief.slope[:, there[family[:-1]]], 4)[: len(weight)]
+        A[:, -1] = 1.0, 0.0, 0.0, 1.0
+        A *= np.sqrt(weight[:, family, np.newaxis])
+        by_x, by_y = A[..., ::2], A[..., 1::2]
+        xx, xy, yy = np.moveaxis(members[:, family[-1:], 2:5, np.newaxis], 2, 0)
+        AB = np.stack([by_x * xx + by_y * xy, by_x * xy + by_y * yy])
+        flat = 2 * len(weight), 2 * family.size
+        both = AB.reshape(flat), np.stack([by_x, by_y]).reshape(flat)
+        ABA = np.einsum("kd,ke->de", *both, optimize=True).reshape(family.size, 2, family.size, 2)
+        common[np.ix_(family, family)] += np.swapaxes(ABA, 1, 2)
+    common[np.arange(size), np.arange(size)] = 0.0
+    return np.swapaxes(common, 1, 2).reshape(2 * size, 2 * size)
 
 
 def _numbers(blocks: np.ndarray, count: int) -> np.ndarray:
