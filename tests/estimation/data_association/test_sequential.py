@@ -1,18 +1,19 @@
 """The stage as a whole: missions without labels against those with, and what is hard for it."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from pipistrelle.config import AssociationConfig, Config
 from pipistrelle.detection.scans import UNLABELLED, make_scan
-from pipistrelle.estimation.beliefs import Gaussian, placed
+from pipistrelle.estimation.beliefs import Gaussian, JointGaussian, placed
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.data_association.existence import PATIENCE, nobody, with_new
-from pipistrelle.estimation.data_association.memory import Memory
+from pipistrelle.estimation.data_association.memory import Caller, Memory, Place
 from pipistrelle.estimation.data_association.methods import association_of
-from pipistrelle.estimation.data_association.sequential import _Work
+from pipistrelle.estimation.data_association.sequential import REFINED_AFTER, _Work
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.session import Session
 from pipistrelle.experiments.runs.trial import run_mission
@@ -197,6 +198,23 @@ def test_associate_changes_nothing_that_it_is_given():
     assert first.label.tolist() == again.label.tolist()
     np.testing.assert_array_equal(scan.numbers, numbers)
     assert (memory.scan, memory.labels, memory.known.label.size) == (0, 0, 0)
+
+
+@pytest.mark.parametrize(("std", "share"), [(0.1, 0.06), (1.0, 0.1), (5.0, 0.2)])
+def test_a_callers_place_on_the_map_is_told_as_surely_as_the_map_has_its_range(std, share):
+    # 10 m ahead; half of the variance is the vehicle's. What is aside of the line tells nothing.
+    along, aside = 0.5 * std**2, 9.0
+    joint = JointGaussian(
+        landmark=np.array([1]), mean=np.array([0.0, 0.0, 0.0, 10.0, 0.0]),
+        covariance=np.diag([along, aside, 0.1, along, aside]),
+    )  # fmt: skip
+    belief = SimpleNamespace(joint=lambda: joint)
+    stage = association_of(Config(association=AssociationConfig(method="marginal")))
+    memory = Memory(scan=REFINED_AFTER, labels=1, callers={1: Caller(label=1, told=True)})
+    heard = make_scan(0.0, np.full(1, UNLABELLED), np.zeros(1), caller=np.ones(1, int), **STDS)
+    news = stage.associate(memory, belief, replace(heard, direct=np.array([-1, 0])))[1].again
+    assert news == {1: Place(10.0, 0.0, refined=pytest.approx(share))}
+    assert stage.informed(Memory(), news).callers[1].place == news[1]
 
 
 @pytest.mark.slow

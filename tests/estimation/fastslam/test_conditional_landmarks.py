@@ -151,6 +151,37 @@ def test_a_star_of_ties_equals_the_joint_gaussian_of_all(
     assert np.abs(belief.slope).max() > 0.1
 
 
+def tied(particle, labels):
+    """Covariance of some landmarks of a particle of the slow reference, (2n, 2n)."""
+    return np.block([
+        [
+            particle.map[one][0].covariance
+            if one == other
+            else particle.cross.get((one, other), np.zeros((2, 2)))
+            for other in labels
+        ]
+        for one in labels
+    ])  # fmt: skip
+
+
+def test_the_joint_gaussian_of_all_particles_has_what_a_callers_landmarks_have_in_common():
+    slam = swarm_filter(5, "federated", rays=ray_config(power=2.0))
+    belief, slow = assert_equal_to_the_joint(slam, timed_mission("fused", [2], 40))
+    joint, particles = belief.joint(), slow.particles
+    placed = [a for a in joint.landmark.tolist() if all(len(p.map[a]) == 1 for p in particles)]
+    weight = np.exp([p.log_weight for p in particles])
+    weight /= weight.sum()
+    places = np.array([np.concatenate([p.map[a][0].mean for a in placed]) for p in particles])
+    within = sum(w * tied(p, placed) for w, p in zip(weight, particles, strict=True))
+    between = np.cov(places.T, aweights=weight, ddof=0)
+    rows = [3 + 2 * joint.landmark.tolist().index(a) + e for a in placed for e in (0, 1)]
+    np.testing.assert_allclose(joint.covariance[np.ix_(rows, rows)], within + between, atol=1e-9)
+    apart = np.kron(np.eye(len(placed)), np.ones((2, 2))) == 0.0
+    stds = np.sqrt(np.diag(within))
+    assert np.abs(within / np.outer(stds, stds))[apart].max() > 0.2, "it is much"
+    assert np.linalg.eigvalsh(joint.covariance)[0] > 0.0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("strategy", "callers", "shares", "mixture", "weights", "gate"), EVERY)
 def test_a_star_of_ties_equals_the_joint_gaussian_of_all_with_every_option(

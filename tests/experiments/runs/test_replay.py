@@ -506,6 +506,19 @@ def test_a_log_without_labels_is_refused_with_the_option_that_solves_it():
     assert trial.scores.associated_right is None, "nobody knows"
 
 
+def test_rows_of_two_scans_at_one_time_are_each_scored_by_their_own_labels():
+    log = looks(*[(0.0, 0.01, 0.1)] * 6)
+    beside = [scan_with([8], [1.0], [3.0], time=scan.time, bearing_std=0.01) for scan in log.scans]
+    pairs = [scan for both in zip(log.scans, beside, strict=True) for scan in both]
+    config = Config(association=AssociationConfig(method="nearest"))
+    (trial,) = replay(
+        replace(log, scans=tuple(pairs)), NO_TRUTH, ["fused"], ["ekf"], None, config
+    ).trials
+    assert len({*np.concatenate(trial.track.labels).tolist()}) == 2
+    assert trial.scores.associated_right == 1.0
+    assert {*trial.mapped.landmark.tolist()} == {7, 8}
+
+
 def test_a_post_stands_where_a_sensor_aside_of_the_vehicle_sees_it():
     # The sensor is 1 m ahead and 2 m to the left and looks to the left: 3 m ahead of it is (1, 5).
     log = replace(a_log(), sensor_pose=(1.0, 2.0, np.pi / 2))

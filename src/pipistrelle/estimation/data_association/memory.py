@@ -15,8 +15,8 @@ class Place(NamedTuple):
     x: float
     y: float
     """[m]"""
-    refined: bool = False
-    """Whether that is from the map, not from its tracks."""
+    refined: float = 0.0
+    """If that is from the map, the share of its range by which it may be off; else 0."""
     way: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """Of one that moves velocity [m/s] and acceleration along x and y [m/s^2]."""
     time: float = 0.0

@@ -64,7 +64,8 @@ every second one."""
 PLACE_SHARE, PLACE_BEARING_STD = 0.2, 0.03
 """Deviation of a caller's place that was found: of its range, as a share, and of its bearing."""
 REFINED_AFTER, REFINED_SHARE = 24, 0.06
-"""Scans after which the place on the map is taken instead, once, and the share of its range."""
+"""Scans after which the place on the map is taken instead, once, and the least share of its range
+that it may be off."""
 DIRECT_GATE = 9.0
 """Largest squared distance of a caller's direct call."""
 PROBATION = 40
@@ -203,8 +204,13 @@ class _Work:
         moves = number in self.scan.moving
         if moves or done or self.memory.scan != caller.since + REFINED_AFTER or at < 0:
             return {}
+        way, P = self.joint.mean[at : at + 2] - self.pose[:2], self.joint.covariance
+        u = np.array([*-way, *way]) / float(way @ way)
+        there = [0, 1, at, at + 1]
+        share = math.sqrt(u @ P[np.ix_(there, there)] @ u)  # of the range, on the map
         x, y = self.joint.mean[at : at + 2].tolist()
-        return {number: Place(x, y, refined=True)}
+        share = min(max(share, REFINED_SHARE), PLACE_SHARE)
+        return {number: Place(x, y, refined=share)}
 
     def _searched(self, number: int, caller: Caller, row: int) -> dict[int, Place]:
         """Follow a caller's rows, and return its place if that is found."""
@@ -392,7 +398,7 @@ class _Work:
         if not (caller.place.refined or number in self.scan.moving):
             self.numbers[BEARING, row] = wrap_angle(math.atan2(dy, dx) - self.pose[2])
             self.numbers[BEARING_STD, row] = PLACE_BEARING_STD
-        share = REFINED_SHARE if caller.place.refined else PLACE_SHARE
+        share = caller.place.refined or PLACE_SHARE
         self.numbers[RANGE, row], self.numbers[RANGE_STD, row] = far, share * far
         self.label[row] = self.named[number] = caller.label
         told = replace(caller, told=True, tracks=Tracks(), since=self.memory.scan)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from pipistrelle.config import InputError
 from pipistrelle.estimation.beliefs import JointGaussian
@@ -21,8 +21,9 @@ def joint_of(belief: "FastSlamBelief") -> JointGaussian:
     .. math:: \bar x = \sum_i w_i x_i, \qquad
               P = \sum_i w_i \left( (x_i - \bar x)(x_i - \bar x)^T + P_i \right)
 
-    with each particle's own covariances :math:`P_i` of its pose and of its landmarks. A landmark
-    counts that most particles have placed; where one has not, it is at the mean.
+    with each particle's own covariances :math:`P_i` of its pose and of its landmarks, of which
+    those of one parent share that parent's error. A landmark counts that most particles have
+    placed; where one has not, it is at the mean.
     """
     particles = belief.log_weight.size
     weight = np.exp(belief.log_weight - belief.log_weight.max())
@@ -31,8 +32,8 @@ def joint_of(belief: "FastSlamBelief") -> JointGaussian:
     there = np.flatnonzero(np.einsum("p,pn->n", weight, placed) > 0.5)
     rows = _numbers(belief.poses, 9)[:particles]
     members = _numbers(belief.member[:, belief.first[there]], 6)[:particles]
-    share = weight[:, np.newaxis] * placed[:, there]
-    share /= share.sum(axis=0)
+    counting = weight[:, np.newaxis] * placed[:, there]
+    share = counting / counting.sum(axis=0)
     spots = np.einsum("pn,pne->ne", share, members[..., :2])
     rows[:, 2] = belief.estimate.mean[2] + wrap(rows[:, 2] - belief.estimate.mean[2])
     mean = np.append(np.einsum("p,pe->e", weight, rows[:, :3]), spots.ravel())
@@ -40,10 +41,41 @@ def joint_of(belief: "FastSlamBelief") -> JointGaussian:
     off = np.hstack([rows[:, :3], points.reshape(particles, 2 * there.size)]) - mean
     covariance = np.einsum("p,pd,pe->de", weight, off, off, optimize=True)
     covariance[:3, :3] += _packed(np.einsum("p,pe->e", weight, rows[:, 3:9]))
+    covariance[3:, 3:] += _by_parents(belief, there, members, counting)
     own = np.einsum("pn,pne->ne", share, members[..., 2:5])
     for n, (xx, xy, yy) in enumerate(own.tolist()):
         covariance[3 + 2 * n : 5 + 2 * n, 3 + 2 * n : 5 + 2 * n] += [[xx, xy], [xy, yy]]
     return JointGaussian(landmark=belief.landmark[there], mean=mean, covariance=covariance)
+
+
+def _by_parents(
+    belief: "FastSlamBelief",
+    there: Int[np.ndarray, " k"],
+    members: Float[np.ndarray, "p k 6"],
+    weight: Float[np.ndarray, "p k"],
+) -> Float[np.ndarray, "d d"]:
+    """Return what landmarks have in common by their parents' errors, in the mean over particles.
+
+    ``weight``: of each particle where it has placed a landmark, else 0.
+    """
+    size, parent = there.size, np.full(belief.landmark.size, -1)
+    parent[: belief.parent.size] = belief.parent
+    common = np.zeros((size, size, 2, 2))
+    for h in np.intersect1d(parent, there).tolist():
+        family = np.append(np.flatnonzero(parent[there] == h), np.flatnonzero(there == h))
+        A = np.zeros((len(weight), family.size, 4))
+        A[:, :-1] = _numbers(belief.slope[:, there[family[:-1]]], 4)[: len(weight)]
+        A[:, -1] = 1.0, 0.0, 0.0, 1.0
+        A *= np.sqrt(weight[:, family, np.newaxis])
+        by_x, by_y = A[..., ::2], A[..., 1::2]
+        xx, xy, yy = np.moveaxis(members[:, family[-1:], 2:5, np.newaxis], 2, 0)
+        AB = np.stack([by_x * xx + by_y * xy, by_x * xy + by_y * yy])
+        flat = 2 * len(weight), 2 * family.size
+        both = AB.reshape(flat), np.stack([by_x, by_y]).reshape(flat)
+        ABA = np.einsum("kd,ke->de", *both, optimize=True).reshape(family.size, 2, family.size, 2)
+        common[np.ix_(family, family)] += np.swapaxes(ABA, 1, 2)
+    common[np.arange(size), np.arange(size)] = 0.0
+    return np.swapaxes(common, 1, 2).reshape(2 * size, 2 * size)
 
 
 def _numbers(blocks: np.ndarray, count: int) -> np.ndarray:

@@ -331,11 +331,10 @@ def _log_causes(
     log: Log, heard: Mapping[Strategy, Sequence[Scan]]
 ) -> dict[Strategy, Causes | None]:
     """Return the labels that a log's rows bear, as what caused them; None where none bears one."""
-    rows = {scan.time: scan for scan in log.scans}
     if _is_bare(log):
         return dict.fromkeys(heard)
     return {
-        strategy: [causes_of(s, rows[s.time], rows[s.time].landmark) for s in scans]
+        strategy: [causes_of(s, r, r.landmark) for s, r in zip(scans, log.scans, strict=True)]
         for strategy, scans in heard.items()
     }
 
