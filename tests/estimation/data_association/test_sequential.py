@@ -10,10 +10,10 @@ from pipistrelle.config import AssociationConfig, Config
 from pipistrelle.detection.scans import UNLABELLED, make_scan
 from pipistrelle.estimation.beliefs import Gaussian, JointGaussian, placed
 from pipistrelle.estimation.catalogue import entry
-from pipistrelle.estimation.data_association.existence import PATIENCE, nobody, with_new
+from pipistrelle.estimation.data_association.existence import PATIENCE
 from pipistrelle.estimation.data_association.memory import Caller, Memory, Place
 from pipistrelle.estimation.data_association.methods import association_of
-from pipistrelle.estimation.data_association.sequential import REFINED_AFTER, _Work
+from pipistrelle.estimation.data_association.sequential import REFINED_AFTER
 from pipistrelle.estimation.motion import Motion
 from pipistrelle.estimation.session import Session
 from pipistrelle.experiments.runs.trial import run_mission
@@ -151,14 +151,6 @@ def test_what_is_taken_back_leaves_the_belief_as_if_it_had_never_been_heard():
         beliefs.append(session.belief)
     np.testing.assert_allclose(beliefs[1].mean, beliefs[0].mean, atol=1e-12)
     np.testing.assert_allclose(beliefs[1].covariance, beliefs[0].covariance, atol=1e-14)
-
-
-def test_what_is_known_but_has_no_place_is_not_asked_whether_it_is_on_the_map_twice():
-    known = with_new(nobody(1), [7], 0, 1)
-    known = known._replace(heard=np.array([4]), count=np.array([4]))
-    stage, belief = association_of(Config(association={"method": "nearest"})), session_of().belief
-    work = _Work(stage, Memory(scan=4, labels=7, known=known), belief, scan_of(PLACES))
-    assert work._doubles(known) == ()
 
 
 def test_a_scan_without_rows_is_no_harm():

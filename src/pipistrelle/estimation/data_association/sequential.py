@@ -319,7 +319,7 @@ class _Work:
         now = self.memory.scan
         heard = (known.heard == now) & (known.born < now)
         counted = zip(known.label[heard].tolist(), known.count[heard].tolist(), strict=True)
-        due = {label for label, count in counted if count in ASKED and self._where(label) >= 0}
+        due = {label for label, count in counted if count in ASKED}
         if not due:
             return ()
         known = some(known, (self._places(known) >= 0) & (known.born < now))
