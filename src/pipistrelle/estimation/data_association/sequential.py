@@ -58,7 +58,7 @@ from pipistrelle.estimation.data_association.tracks import Tracks, followed
 from pipistrelle.estimation.data_association.turns import turned
 from pipistrelle.geometry import wrap, wrap_angle
 
-FIRST_SEARCH = 8, 10
+FIRST_SEARCH, FIRST_SEARCH_MOVING = 8, 10
 """Scans of a caller that stands, and of one that moves, after which its place is searched for, at
 every second one."""
 PLACE_SHARE, PLACE_BEARING_STD = 0.2, 0.03
@@ -207,10 +207,9 @@ class _Work:
         way, P = self.joint.mean[at : at + 2] - self.pose[:2], self.joint.covariance
         u = np.array([*-way, *way]) / float(way @ way)
         there = [0, 1, at, at + 1]
-        share = math.sqrt(u @ P[np.ix_(there, there)] @ u)  # of the range, on the map
+        off = math.sqrt(u @ P[np.ix_(there, there)] @ u)  # share of the range
         x, y = self.joint.mean[at : at + 2].tolist()
-        share = min(max(share, REFINED_SHARE), PLACE_SHARE)
-        return {number: Place(x, y, refined=share)}
+        return {number: Place(x, y, refined=min(max(off, REFINED_SHARE), PLACE_SHARE))}
 
     def _searched(self, number: int, caller: Caller, row: int) -> dict[int, Place]:
         """Follow a caller's rows, and return its place if that is found."""
@@ -219,7 +218,8 @@ class _Work:
         tracks = followed(caller.tracks, self.scan.time, self.pose, direct, rows)
         self.callers[number] = replace(caller, tracks=tracks)
         moves = number in self.scan.moving
-        if len(tracks.poses) < FIRST_SEARCH[moves] or len(tracks.poses) % 2:
+        first = FIRST_SEARCH_MOVING if moves else FIRST_SEARCH
+        if len(tracks.poses) < first or len(tracks.poses) % 2:
             return {}
         found = find_moving_caller(tracks) if moves else find_caller(tracks)
         return {number: found.place} if found is not None and found.sure else {}
