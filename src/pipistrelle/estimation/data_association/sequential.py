@@ -79,8 +79,9 @@ OVERLAP_STD, OVERLAP_GATE = 0.7, 9.0
 """Deviation of the way of an echo that overlaps with another [m], and largest squared distance."""
 ASKED = frozenset((4, 6, 8, 12, 16, 24, 32, 64))
 """In how many scans a landmark was heard when it is asked whether it is on the map twice."""
-SURE_SHARE = 0.65
-"""A row is as sure as any up to this share of the limit of its bearing's deviation."""
+SURE_SHARE, ASSUMED = 0.65, 0.75
+"""A row is as sure as any up to this share of the limit of its bearing's deviation; how sure one is
+whose deviation is only assumed."""
 BOTH = 0.1
 """Two landmarks are two if in more than this share of the scans of either both were heard."""
 
@@ -96,7 +97,7 @@ class Limits:
     birth_way_std: float = 0.25
     """Of what begins a landmark [m]."""
     assumed: tuple[float, ...] = ()
-    """Deviations that are assumed of rows which state none: they are as sure as any can be."""
+    """Deviations that are assumed of rows which state none: no limit holds for these."""
     sight: tuple[float, float] = (0.0, 0.0)
     """`existence.Sight`."""
 
@@ -348,17 +349,21 @@ class _Work:
         return int(self.scan.direct[number]) if number < self.scan.direct.size else -1
 
     def _surety(self) -> Float[np.ndarray, " m"]:
-        """Return how sure rows are, from 0 to 1; those whose deviations are assumed are sure."""
+        """Return how sure rows are, from 0 to 1."""
         std, limit = self.scan.bearing_std, self.stage.limits.bearing_std
         sure = np.fmin(SURE_SHARE * limit / std, 1.0)
-        return np.where(self._within(std, SURE_SHARE * limit), 1.0, sure)
+        return np.where(self._is_assumed(std), ASSUMED, sure)
 
     def _within(self, std: Float[np.ndarray, " r"], limit: float) -> Bool[np.ndarray, " r"]:
         """Return a mask of deviations that are within a limit, or that were only assumed."""
-        within = std <= limit
+        return (std <= limit) | self._is_assumed(std)
+
+    def _is_assumed(self, std: Float[np.ndarray, " r"]) -> Bool[np.ndarray, " r"]:
+        """Return a mask of deviations that were only assumed."""
+        mask = np.zeros(std.shape, np.bool_)
         for assumed in self.stage.limits.assumed:
-            within |= std == assumed
-        return within
+            mask |= std == assumed
+        return mask
 
     def _rows(self, rows: np.ndarray) -> Rows:
         """Return some rows."""
