@@ -31,10 +31,10 @@ BEST = {
 }
 
 
-def session_of(name="iekf", method="marginal"):
+def session_of(name="iekf", method="marginal", **assumed):
     """Return a session of a vehicle at rest at the origin that is told no labels."""
     config = Config.model_validate(
-        {"association": {"method": method}, "filter": {"noise": "measured"}}
+        {"association": {"method": method}, "filter": {"noise": "measured", **assumed}}
     )
     start = Gaussian(mean=np.zeros(3), covariance=1e-8 * np.eye(3))
     slam = entry(name).build(config, MOTION)
@@ -47,7 +47,7 @@ def arc(k):
     return 5.0 * np.sin(angle), 5.0 * (1.0 - np.cos(angle)), angle
 
 
-def scan_of(places, pose=(0.0, 0.0, 0.0), rng=None, time=0.0, level=40.0):
+def scan_of(places, pose=(0.0, 0.0, 0.0), rng=None, time=0.0, level=40.0, **stds):
     """Return what is heard of places, without labels."""
     off = np.atleast_2d(places) - np.array(pose[:2])
     noise = rng.standard_normal((2, len(off))) if rng else np.zeros((2, len(off)))
@@ -55,7 +55,7 @@ def scan_of(places, pose=(0.0, 0.0, 0.0), rng=None, time=0.0, level=40.0):
     far = np.hypot(off[:, 0], off[:, 1]) + 0.02 * noise[1]
     bearing = (bearing + np.pi) % (2.0 * np.pi) - np.pi
     labels = np.full(len(off), UNLABELLED)
-    return make_scan(time, labels, bearing, range=far, level_db=level, **STDS)
+    return make_scan(time, labels, bearing, range=far, level_db=level, **STDS | stds)
 
 
 @pytest.mark.parametrize("method", ["nearest", "joint", "marginal"])
@@ -83,6 +83,20 @@ def test_what_is_heard_once_is_on_no_map_and_is_forgotten():
     assert sorted(session.landmarks().landmark.tolist()) == [1, 2, 3, 4]
     assert 5 not in session.belief.labels()
     assert session.labels[0].tolist() == [1, 2, 3, 4, UNLABELLED], "its row is taken back"
+
+
+@pytest.mark.parametrize(
+    ("std", "scans"), [(0.01, 3), (0.032, 3), (0.045, 4), (0.051, None), (0.07, 4)]
+)
+def test_the_less_sure_bearings_are_the_more_scans_make_a_landmark_and_beyond_a_limit_none(
+    std, scans
+):
+    session = session_of(bearing_std=0.07)  # what is only assumed is beyond no limit
+    counts = []
+    for _ in range(6):
+        session.hear(scan_of(PLACES, bearing_std=std))
+        counts.append(session.landmarks().landmark.size)
+    assert counts == [0 if scans is None or k < scans else 4 for k in range(1, 7)]
 
 
 def test_a_landmark_that_vanishes_is_removed_and_one_that_appears_is_born():
