@@ -91,7 +91,7 @@ def test_a_caller_that_moves_is_found_with_its_velocity(how):
         here, velocity = poses[-1, :2], np.array(WAYS[how][0])
         far = math.hypot(*(np.array(found.place.at(5.5)) - here))
         assert far == pytest.approx(np.hypot(*(CALLER - here)), rel=0.25), seed
-        assert np.hypot(*(np.array(found.place.way[:2]) - velocity)) < 0.6, seed
+        assert np.hypot(*(np.array(found.place.motion[:2]) - velocity)) < 0.6, seed
         before = way(found.place.since, *WAYS[how])
         assert np.hypot(*(np.array(found.place.at(found.place.since)) - before)) < 4.0, seed
     assert sure >= 4
@@ -102,7 +102,7 @@ def test_one_that_moves_fits_no_place_and_one_that_stands_is_found_at_rest():
     assert find_caller(tracks).misfit > 2.0 * find_moving_caller(tracks).misfit
     still = find_moving_caller(heard(3)[0])
     assert still.sure
-    assert np.hypot(*still.place.way[:2]) < 0.3
+    assert np.hypot(*still.place.motion[:2]) < 0.3
 
 
 def test_a_vehicle_that_stands_still_finds_no_caller():

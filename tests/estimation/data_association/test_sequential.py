@@ -11,7 +11,7 @@ from pipistrelle.detection.scans import UNLABELLED, make_scan
 from pipistrelle.estimation.beliefs import Gaussian, JointGaussian, placed
 from pipistrelle.estimation.catalogue import entry
 from pipistrelle.estimation.data_association.existence import PATIENCE
-from pipistrelle.estimation.data_association.memory import Caller, Memory, Place
+from pipistrelle.estimation.data_association.memory import Caller, CallerPlace, Memory
 from pipistrelle.estimation.data_association.methods import association_of
 from pipistrelle.estimation.data_association.sequential import REFINED_AFTER
 from pipistrelle.estimation.motion import Motion
@@ -219,7 +219,7 @@ def test_a_callers_place_on_the_map_is_told_as_surely_as_the_map_has_its_range(s
     memory = Memory(scan=REFINED_AFTER, labels=1, callers={1: Caller(label=1, told=True)})
     heard = make_scan(0.0, np.full(1, UNLABELLED), np.zeros(1), caller=np.ones(1, int), **STDS)
     news = stage.associate(memory, belief, replace(heard, direct=np.array([-1, 0])))[1].again
-    assert news == {1: Place(10.0, 0.0, refined=pytest.approx(share))}
+    assert news == {1: CallerPlace(10.0, 0.0, refined=pytest.approx(share))}
     assert stage.informed(Memory(), news).callers[1].place == news[1]
 
 

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipistrelle.estimation.data_association.memory import Place
+from pipistrelle.estimation.data_association.memory import CallerPlace
 from pipistrelle.estimation.data_association.tracks import TURN, Tracks, in_window
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import kernel, no_alloc
@@ -38,7 +38,7 @@ DIRECT_STD, LEAST_BEARING_STD, LEAST_WAY_STD = 0.05, 0.01, 0.05
 FARTHEST, NEAREST = 80.0, 0.05
 """Largest range of a landmark, and least distance from the caller [m]."""
 FASTEST = 2.0
-"""Of a caller that moves [m/s]."""
+"""Largest speed of a caller that moves [m/s]."""
 CAP = 9.0
 """A row's misfit counts no more."""
 PASSES, WEIGHINGS = 3, 2
@@ -47,7 +47,7 @@ PASSES, WEIGHINGS = 3, 2
 class Found(NamedTuple):
     """A caller's place."""
 
-    place: Place
+    place: CallerPlace
     misfit: float
     """Per row."""
     ahead: float
@@ -68,14 +68,14 @@ def find_caller(tracks: Tracks) -> Found | None:
         return None
     seen, still = (poses, table, direct), np.ones((len(poses), 1))
     grid = [(r, heard[-1] + b) for r in RANGES.tolist() for b in BEARINGS.tolist()]
-    nodes = [_seen_from(poses[-1], r, angle)[np.newaxis] for r, angle in grid]
+    nodes = [seen_from(poses[-1], r, angle)[np.newaxis] for r, angle in grid]
     ranges, misfits = np.array([r for r, _ in grid]), _misfits(nodes, still, seen)
     best = int(misfits.argmin())
     node, least = _downhill(nodes[best], misfits[best], 0.12 * ranges[best], still, seen)
     others = _another(ranges, math.hypot(*(node[0] - poses[-1, :2])))
     ahead = float(misfits[others].min(initial=math.inf) - least)
     x, y = node[0].tolist()
-    return Found(Place(x, y), least / _rows(table), ahead, len(table))
+    return Found(CallerPlace(x, y), least / _rows(table), ahead, len(table))
 
 
 def find_moving_caller(tracks: Tracks) -> Found | None:
@@ -94,7 +94,7 @@ def find_moving_caller(tracks: Tracks) -> Found | None:
     ends = [(s, r) for r in RANGES.tolist() for s in RANGES.tolist() if abs(r - s) < FASTEST * took]
     begins, finish = (poses[first], direct[first]), (poses[last], direct[last])
     nodes = [
-        np.stack([_seen_from(begins[0], s, begins[1]), _seen_from(finish[0], r, finish[1])])
+        np.stack([seen_from(begins[0], s, begins[1]), seen_from(finish[0], r, finish[1])])
         for s, r in ends
     ]
     ranges = np.array([r for _, r in ends])
@@ -103,14 +103,18 @@ def find_moving_caller(tracks: Tracks) -> Found | None:
     def range_of(way: Float[np.ndarray, "n 2"]) -> float:
         return math.hypot(*(way[-1] - poses[last, :2]))
 
-    best = int(misfits.argmin())
-    one = _bent((nodes[best], misfits[best], 0.12 * ranges[best]), share, seen, lambda way: True)
-    apart = _another(ranges, range_of(one[0]))
-    best = int(np.where(apart, misfits, np.inf).argmin())
-    other = _bent(
-        (nodes[best], misfits[best], 0.12 * ranges[best]), share, seen,
-        lambda way: abs(math.log(range_of(way) / range_of(one[0]))) > ANOTHER,
-    )  # fmt: skip
+    def best_of(
+        costs: Float[np.ndarray, " g"], within: Callable[[np.ndarray], bool]
+    ) -> tuple[Float[np.ndarray, "3 2"], float]:
+        best = int(costs.argmin())
+        return _bent((nodes[best], misfits[best], 0.12 * ranges[best]), share, seen, within)
+
+    one = best_of(misfits, lambda way: True)
+    found = range_of(one[0])
+    other = best_of(
+        np.where(_another(ranges, found), misfits, np.inf),
+        lambda way: abs(math.log(range_of(way) / found)) > ANOTHER,
+    )
     (way, least), (_, next_least) = sorted((one, other), key=lambda found: found[1])
     place = _at_end(way, float(times[last]), took)._replace(since=float(times[0]))
     return Found(place, least / _rows(table), next_least - least, len(table))
@@ -136,12 +140,12 @@ def _bent(
     return _downhill(node, least, step / 3.0, curve, seen, within)
 
 
-def _at_end(node: Float[np.ndarray, "3 2"], time: float, took: float) -> Place:
+def _at_end(node: Float[np.ndarray, "3 2"], time: float, took: float) -> CallerPlace:
     """Return place and motion at the end of a way by its begin, middle and end."""
     velocity = (node[0] - 4.0 * node[1] + 3.0 * node[2]) / took
     acceleration = 4.0 * (node[0] - 2.0 * node[1] + node[2]) / took**2
     (x, y), (vx, vy), (ax, ay) = (of.tolist() for of in (node[2], velocity, acceleration))
-    return Place(x, y, way=(vx, vy, ax, ay), time=time)
+    return CallerPlace(x, y, motion=(vx, vy, ax, ay), time=time)
 
 
 def _another(ranges: Float[np.ndarray, " n"], distance: float) -> Bool[np.ndarray, " n"]:
@@ -149,8 +153,8 @@ def _another(ranges: Float[np.ndarray, " n"], distance: float) -> Bool[np.ndarra
     return np.abs(np.log(ranges / distance)) > ANOTHER
 
 
-def _seen_from(pose: Float[np.ndarray, "3"], far: float, angle: float) -> Float[np.ndarray, "2"]:
-    """Return the place at a range and a bearing in the world from a pose."""
+def seen_from(pose: Float[np.ndarray, "3"], far: float, angle: float) -> Float[np.ndarray, "2"]:
+    """Return the point at a range [m] and a bearing in the world [rad] from a pose."""
     return pose[:2] + far * np.array([math.cos(angle), math.sin(angle)])
 
 

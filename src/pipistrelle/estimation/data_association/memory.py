@@ -9,24 +9,24 @@ from pipistrelle.estimation.data_association.existence import Known, nobody
 from pipistrelle.estimation.data_association.tracks import Tracks
 
 
-class Place(NamedTuple):
-    """Where a caller is."""
+class CallerPlace(NamedTuple):
+    """A caller's place and motion."""
 
     x: float
     y: float
-    """[m]"""
+    """Position [m]."""
     refined: float = 0.0
-    """If that is from the map, the share of its range by which it may be off; else 0."""
-    way: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """Of one that moves velocity [m/s] and acceleration along x and y [m/s^2]."""
+    """Standard deviation of the range, as a share of it, if the place is the map's; else 0."""
+    motion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """Velocity [m/s], then acceleration [m/s^2], along x and y; 0 of one that stands."""
     time: float = 0.0
-    """When it was there [s]."""
+    """Time at which the caller is there [s]."""
     since: float = -math.inf
-    """From when on that is known [s]."""
+    """Time from which on place and motion hold [s]."""
 
     def at(self, time: float) -> tuple[float, float]:
-        """Return where it is at a time."""
-        t, (vx, vy, ax, ay) = time - self.time, self.way
+        """Return the position at a time [m]."""
+        t, (vx, vy, ax, ay) = time - self.time, self.motion
         return self.x + t * (vx + 0.5 * t * ax), self.y + t * (vy + 0.5 * t * ay)
 
 
@@ -35,7 +35,7 @@ class Caller:
     """What is known of a caller."""
 
     label: int
-    place: Place | None = None
+    place: CallerPlace | None = None
     """Where it was found."""
     told: bool = False
     tracks: Tracks = field(default_factory=Tracks)

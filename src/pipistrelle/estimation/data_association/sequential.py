@@ -45,7 +45,7 @@ from pipistrelle.estimation.data_association.existence import (
     with_new,
 )
 from pipistrelle.estimation.data_association.matching import Innovate, Match
-from pipistrelle.estimation.data_association.memory import Caller, Memory, Place
+from pipistrelle.estimation.data_association.memory import Caller, CallerPlace, Memory
 from pipistrelle.estimation.data_association.pairs import (
     OWN_CALL,
     UNPLACED,
@@ -95,7 +95,7 @@ class Limits:
     way_std: float = 0.35
     """Of range or excess path [m]."""
     birth_way_std: float = 0.25
-    """Of what begins a landmark [m]."""
+    """The same of a row that begins a landmark [m]."""
     assumed: tuple[float, ...] = ()
     """Deviations that are assumed of rows which state none: no limit holds for these."""
     sight: tuple[float, float] = (0.0, 0.0)
@@ -140,7 +140,7 @@ class Sequential:
         """Return the memory before the first scan."""
         return Memory()
 
-    def informed(self, memory: Memory, news: Mapping[int, Place]) -> Memory:
+    def informed(self, memory: Memory, news: Mapping[int, CallerPlace]) -> Memory:
         """Return a memory that knows where callers are, by their numbers."""
         known = dict(memory.callers)
         for number, place in news.items():
@@ -178,16 +178,16 @@ class _Work:
         own, limits = scan.caller == OWN, stage.limits
         self.way = np.where(own, scan.range, scan.excess_path)
         self.way_std = np.where(own, scan.range_std, scan.excess_path_std)
-        self.bare = np.isnan(self.way)
-        self.usable = self._within(scan.bearing_std, limits.bearing_std)
-        self.usable &= self.bare | self._within(self.way_std, limits.way_std)
+        bare, sure = np.isnan(self.way), self._within(scan.bearing_std, limits.bearing_std)
+        self.usable = sure & (bare | self._within(self.way_std, limits.way_std))
+        self.with_way = self.usable & ~bare
         self.sure = self._within(self.way_std, limits.birth_way_std)
         self.new: list[int] = []
         self.near: set[int] = set()
 
-    def search_callers(self) -> dict[int, Place]:
+    def search_callers(self) -> dict[int, CallerPlace]:
         """Follow the rows of callers that are not found, and return where some now are."""
-        news: dict[int, Place] = {}
+        news: dict[int, CallerPlace] = {}
         for number, row in enumerate(self.scan.direct.tolist()):
             if number == OWN or (row < 0 and number not in self.callers):
                 continue
@@ -199,7 +199,7 @@ class _Work:
                 news |= self._searched(number, caller, row)
         return news
 
-    def _refined(self, number: int, caller: Caller) -> dict[int, Place]:
+    def _refined(self, number: int, caller: Caller) -> dict[int, CallerPlace]:
         """Return the place of a caller on the map, once that is worth more than what was found."""
         at, done = self._where(caller.label), caller.place is not None and caller.place.refined
         moves = number in self.scan.moving
@@ -210,11 +210,11 @@ class _Work:
         there = [0, 1, at, at + 1]
         off = math.sqrt(u @ P[np.ix_(there, there)] @ u)  # share of the range
         x, y = self.joint.mean[at : at + 2].tolist()
-        return {number: Place(x, y, refined=min(max(off, REFINED_SHARE), PLACE_SHARE))}
+        return {number: CallerPlace(x, y, refined=min(max(off, REFINED_SHARE), PLACE_SHARE))}
 
-    def _searched(self, number: int, caller: Caller, row: int) -> dict[int, Place]:
+    def _searched(self, number: int, caller: Caller, row: int) -> dict[int, CallerPlace]:
         """Follow a caller's rows, and return its place if that is found."""
-        rows = self._rows(self.usable & ~self.bare & (self.scan.caller == number))
+        rows = self._rows(self.with_way & (self.scan.caller == number))
         direct = self.scan.bearing[row] if row >= 0 else math.nan
         tracks = followed(caller.tracks, self.scan.time, self.pose, direct, rows)
         self.callers[number] = replace(caller, tracks=tracks)
@@ -238,9 +238,8 @@ class _Work:
         costs = self._costs(rows, there, at, self.stage.chances)
         if self.moving:
             costs[:, np.isin(self.joint.landmark, self.moving)] = np.inf
-        gated, usable = np.isfinite(costs), self.usable[rows]
-        if at != UNPLACED:
-            usable &= ~self.bare[rows]
+        usable = (self.usable if at == UNPLACED else self.with_way)[rows]
+        gated = np.isfinite(costs)
         telling = self.scan.bearing_std[rows] <= 2.0 * self.stage.limits.bearing_std
         self.near |= {*self.joint.landmark[gated[telling].any(axis=0)].tolist()}
         used = rows[usable]
@@ -252,7 +251,7 @@ class _Work:
 
     def _follow_turn(self, number: int, rows: Int[np.ndarray, " r"], at: int) -> None:
         """Take a caller that moves for where its rows fit, if they do not where it was expected."""
-        rows, direct = rows[(self.usable & ~self.bare)[rows]], self._direct(number)
+        rows, direct = rows[self.with_way[rows]], self._direct(number)
         if direct < 0:
             return
         joint, stand = self.joint, ~np.isin(self.joint.landmark, self.moving)
@@ -386,9 +385,9 @@ class _Work:
         self, rows: Int[np.ndarray, " r"], there: Int[np.ndarray, " n"], caller: int
     ) -> Innovate:
         """Return what tells the innovations of pairs of these rows and landmarks."""
-        joint, columns = self.joint, tuple(self._rows(rows))
+        joint = self.joint
         return lambda row, landmark: pair_innovations(
-            columns, joint.mean, joint.covariance, there, caller, (row, landmark)
+            tuple(self._rows(rows)), joint.mean, joint.covariance, there, caller, (row, landmark)
         )
 
     def _tell(self, number: int, caller: Caller) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipistrelle.estimation.beliefs import JointGaussian
+from pipistrelle.estimation.data_association.caller_search import seen_from
 
 FEW, LEAST_ROWS = 0.5, 6
 """A caller may have turned if less than this share of its rows fits, of so many."""
@@ -37,13 +38,13 @@ def turned(joint: JointGaussian, at: int, bearing: float, costs: Costs) -> Joint
     least, fitting = _fit(costs(mean))
     if fitting.size < LEAST_ROWS or fitting.mean() >= FEW:
         return joint
-    here, towards, least = mean[:2], mean[2] + bearing, least - BETTER
-    expected, best = math.hypot(*(mean[at : at + 2] - here)), mean
+    towards, least, best = mean[2] + bearing, least - BETTER, mean
+    expected = math.hypot(*(mean[at : at + 2] - mean[:2]))
     reach = max(LEAST_REACH, REACH * math.sqrt(spread))
     for far in np.maximum(expected + reach * SHARES, NEAREST):
         for angle in towards + BEARINGS:
             other = mean.copy()
-            other[at : at + 2] = here + far * np.array([math.cos(angle), math.sin(angle)])
+            other[at : at + 2] = seen_from(mean[:3], far, angle)
             cost, _ = _fit(costs(other))
             if cost < least:
                 best, least = other, cost
