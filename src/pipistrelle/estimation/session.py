@@ -27,6 +27,7 @@ from pipistrelle.estimation.beliefs import (
     some_of,
 )
 from pipistrelle.estimation.checking import usable_scan
+from pipistrelle.jit import kernel
 
 REMEMBERED = 40
 """How many scans an association may think of again."""
@@ -36,7 +37,7 @@ Leg = tuple[Float[np.ndarray, "k c"], Float[np.ndarray, " k"]]
 """Control steps and how long they take [s]."""
 
 
-@dataclass(slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Heard:
     """A scan that an association may think of again."""
 
@@ -277,29 +278,36 @@ class Session(Generic[B]):
         """Remove landmarks, with all of their rows that are remembered."""
         past = [*self._past]
         labels = (*labels, *(gone for one in past for kept, gone in one.merge if kept in labels))
-        heard = [n for n, one in enumerate(past) if _names(one, labels)]
+        named = np.array(labels)
+        rows = [_rows(one.label, named) for one in past]
+        heard = [n for n, one in enumerate(past) if rows[n] or _rows(one.scan.callers, named)]
         first = heard[0] if heard else len(past)
-        again = [replace(one) for one in past[first:]]
-        self._past = deque((*past[:first], *again), maxlen=REMEMBERED)
-        before = again[0].belief if again else self.belief
+        before = past[first].belief if heard else self.belief
         self._dropped.update(labels)
-        if len(heard) == 1 and not _held(before, labels) and _rows(again[0], labels) == len(labels):
+        for n in heard:
+            past[n] = _without(past[n], labels)
+        if len(heard) == 1 and not _held(before, labels) and rows[first] == len(labels):
             # What was heard once has told nothing of anything else.
             self.belief = edited(self.belief, remove=_held(self.belief, labels))
-            again[0].label = _without(again[0].label, labels)
-            self.labels[again[0].number - self._first] = again[0].label
-            return
-        self.belief = edited(before, remove=_held(before, [*self._dropped]))
-        for one in again:
-            if one is not again[0]:
-                self._go(one.legs)
-            one.belief, one.label = self.belief, _without(one.label, labels)
-            one.scan = replace(one.scan, callers=_without(one.scan.callers, labels))
-            held = _held(self.belief, [label for pair in one.merge for label in pair])
-            one.merge = tuple(pair for pair in one.merge if {*pair} <= {*held})
-            self._use(one)
-        if again:
-            self._go(self._legs)
+            self.labels[past[first].number - self._first] = past[first].label
+        else:
+            self.belief = edited(before, remove=_held(before, [*self._dropped]))
+            for n in range(first, len(past)):
+                if n > first:
+                    self._go(past[n].legs)
+                past[n] = self._as_held(past[n])
+                self._use(past[n])
+            if heard:
+                self._go(self._legs)
+        self._past = deque(past, maxlen=REMEMBERED)
+
+    def _as_held(self, heard: _Heard) -> _Heard:
+        """Return a scan after the present belief, with what the belief can still merge."""
+        held, merge = (), heard.merge
+        if merge:
+            held = _held(self.belief, [label for pair in merge for label in pair])
+            merge = tuple(pair for pair in merge if {*pair} <= {*held})
+        return replace(heard, belief=self.belief, merge=merge)
 
     def _hear_again(self, news: Any) -> None:
         """Associate all scans that are remembered anew, by what has become known."""
@@ -354,28 +362,29 @@ def joined_poses(parts: Sequence[Gaussian]) -> Gaussian:
     )
 
 
-def _names(heard: _Heard, labels: Sequence[int]) -> bool:
-    """Tell whether a scan has rows, or a caller, of some labels."""
-    return not {*heard.label.tolist(), *heard.scan.callers.tolist()}.isdisjoint(labels)
-
-
 def _held(belief: Belief, labels: Sequence[int]) -> list[int]:
     """Return which of some landmarks a belief holds; all, where it does not say."""
     held = {*belief.labels()} if hasattr(belief, "labels") else {*labels}
     return [label for label in labels if label in held]
 
 
-def _rows(heard: _Heard, labels: Sequence[int]) -> int:
-    """Return how many rows of a scan have some labels."""
-    return sum(int(np.count_nonzero(heard.label == label)) for label in labels)
+@kernel
+def _rows(label: Int[np.ndarray, " m"], labels: Int[np.ndarray, " n"]) -> int:
+    """Return how many rows have one of some labels."""
+    count = 0
+    for one in label:
+        if one in labels:
+            count += 1
+    return count
 
 
-def _without(label: Int[np.ndarray, " m"], labels: Sequence[int]) -> Int[np.ndarray, " m"]:
-    """Return labels without some."""
-    left = label.copy()
+def _without(heard: _Heard, labels: Sequence[int]) -> _Heard:
+    """Return a scan without some labels, of its rows and of its callers."""
+    label, callers = heard.label.copy(), heard.scan.callers.copy()
     for one in labels:
-        left[left == one] = UNLABELLED
-    return left
+        label[label == one] = UNLABELLED
+        callers[callers == one] = UNLABELLED
+    return replace(heard, label=label, scan=replace(heard.scan, callers=callers))
 
 
 def check_poses(method: str, poses: Gaussian, size: int) -> None:

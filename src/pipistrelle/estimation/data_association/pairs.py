@@ -197,16 +197,31 @@ def with_point(
     (array([2., 0.]), array([[0.04, 0.  ],
            [0.  , 0.08]]))
     """
-    x, y, heading = joint.mean[:3]
-    c, s = math.cos(heading + bearing), math.sin(heading + bearing)
-    G = np.zeros((2, joint.mean.size))
-    G[0, 0] = G[1, 1] = 1.0
-    G[0, 2], G[1, 2] = -distance * s, distance * c
-    W = np.array([[-distance * s, c], [distance * c, s]]) * np.array(stds)
-    cross = np.einsum("ad,de->ae", G, joint.covariance)
-    own = np.einsum("ad,bd->ab", cross, G) + np.einsum("ae,be->ab", W, W)
-    return JointGaussian(
-        landmark=np.append(joint.landmark, label),
-        mean=np.append(joint.mean, (x + distance * c, y + distance * s)),
-        covariance=np.block([[joint.covariance, cross.T], [cross, own]]),
-    )
+    point = bearing, distance, *stds
+    mean, covariance = _with_point(joint.mean, joint.covariance, point)
+    landmark = np.append(joint.landmark, label)
+    return JointGaussian(landmark=landmark, mean=mean, covariance=covariance)
+
+
+@kernel
+def _with_point(
+    mean: Float[np.ndarray, " d"],
+    covariance: Float[np.ndarray, "d d"],
+    point: tuple[float, float, float, float],
+) -> tuple[Float[np.ndarray, " d+2"], Float[np.ndarray, "d+2 d+2"]]:
+    """Return mean and covariance with a point more: bearing, range and their deviations."""
+    d, (bearing, distance, bearing_std, range_std) = mean.size, point
+    towards = math.cos(mean[2] + bearing), math.sin(mean[2] + bearing)
+    turn = -distance * towards[1], distance * towards[0]
+    more, P = np.empty(d + 2), np.empty((d + 2, d + 2))
+    more[:d], P[:d, :d] = mean, covariance
+    for a in range(2):
+        more[d + a] = mean[a] + distance * towards[a]
+        for i in range(d):
+            P[d + a, i] = P[i, d + a] = covariance[a, i] + turn[a] * covariance[2, i]
+    for a in range(2):
+        for b in range(2):
+            across = (turn[a] * bearing_std) * (turn[b] * bearing_std)
+            along = (towards[a] * range_std) * (towards[b] * range_std)
+            P[d + a, d + b] = P[d + a, b] + P[d + a, 2] * turn[b] + (across + along)
+    return more, P

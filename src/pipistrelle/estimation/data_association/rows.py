@@ -176,6 +176,20 @@ def compared(
 
 
 @kernel
+def fits(
+    rows: tuple[np.ndarray, ...],
+    row: Whole,
+    joint: Joint,
+    at: Whole,
+    chances: tuple[float, float, float, float],
+) -> bool:
+    """Tell whether the bearing of a row may be of the landmark that stands at a place."""
+    (_, mean, covariance), part = joint, _part(ScanRows(*rows), np.full(1, row), 0.0)
+    costs = pair_costs(part, mean, covariance, np.full(1, at), UNPLACED, chances)
+    return math.isfinite(costs[0, 0])
+
+
+@kernel
 def _part(heard: ScanRows, rows: Int[np.ndarray, " r"], spread: float) -> tuple[np.ndarray, ...]:
     """Return columns of some rows (`pairs.Rows`); ``spread``: more deviation of the way."""
     way_std = heard.way_std[rows]

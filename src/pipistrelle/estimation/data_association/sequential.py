@@ -35,7 +35,7 @@ from pipistrelle.estimation.data_association.caller_search import (
     find_caller,
     find_moving_caller,
 )
-from pipistrelle.estimation.data_association.doubles import doubles
+from pipistrelle.estimation.data_association.doubles import asked_of, doubles
 from pipistrelle.estimation.data_association.existence import (
     GONE,
     Known,
@@ -44,7 +44,7 @@ from pipistrelle.estimation.data_association.existence import (
     some,
     with_new,
 )
-from pipistrelle.estimation.data_association.matching import Innovate, Match
+from pipistrelle.estimation.data_association.matching import Innovations, Match
 from pipistrelle.estimation.data_association.memory import Caller, CallerPlace, Memory
 from pipistrelle.estimation.data_association.pairs import (
     OWN_CALL,
@@ -57,6 +57,7 @@ from pipistrelle.estimation.data_association.pairs import (
 from pipistrelle.estimation.data_association.rows import (
     Joint,
     compared,
+    fits,
     place_of,
     places_of,
     rows_of_scan,
@@ -81,10 +82,6 @@ PROBATION = 40
 TRIAL, SETTLING, LEAST_SHARE, LEAST_ROWS = 9, 3, 0.4, 10
 """A caller is where it was found if of the sure rows of so many scans, the first left out, this
 share is of landmarks, new ones not counted; at least so many rows must tell."""
-ASKED = frozenset((4, 6, 8, 12, 16, 24, 32, 64))
-"""In how many scans a landmark was heard when it is asked whether it is on the map twice."""
-BOTH = 0.1
-"""Two landmarks are two if in more than this share of the scans of either both were heard."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -239,7 +236,8 @@ class _Work:
             chances,
             2.0 * self.stage.limits.bearing_std,
         )
-        matched = used, self.stage.match(costs, self._innovate(used, at)), near
+        found = self.stage.match(costs, lambda row, of: self._innovations(used, at, (row, of)))
+        matched = used, found, near
         confirmed = known.label[known.confirmed]
         begun, count = settled(self.label, rows, self._joint(), confirmed, matched, caller, chances)
         self._judge_caller(number, count)
@@ -318,17 +316,11 @@ class _Work:
 
     def _doubles(self, known: Known, at: Int[np.ndarray, " l"]) -> tuple[tuple[int, int], ...]:
         """Return pairs of landmarks that are one, the older first; asked now and then."""
-        now = self.memory.scan
-        counted = zip(known.heard.tolist(), known.born.tolist(), known.count.tolist(), strict=True)
-        due = [heard == now > born and count in ASKED for heard, born, count in counted]
-        if not any(due):
+        old, apart, asked = asked_of(tuple(known), at, self.memory.scan)
+        if not asked.size:
             return ()
-        old = np.flatnonzero((at >= 0) & (known.born < now))
-        label, count, asked = known.label[old].tolist(), known.count[old], np.array(due)[old]
-        rarer = np.minimum(count[:, np.newaxis], count)
-        apart = (known.together[np.ix_(old, old)] > BOTH * rarer) | np.eye(old.size, dtype=bool)
-        pairs = doubles(self.joint, at[old], apart, np.flatnonzero(asked))
-        return tuple((label[a], label[b]) for a, b in pairs)
+        label = known.label[old].tolist()
+        return tuple((label[a], label[b]) for a, b in doubles(self.joint, at[old], apart, asked))
 
     def _another(self) -> int:
         """Return a new label."""
@@ -347,17 +339,20 @@ class _Work:
         """Return what kernels take of the joint Gaussian."""
         return self.joint.landmark, self.joint.mean, self.joint.covariance
 
-    def _some(self, rows: np.ndarray | slice) -> Rows:
+    def _some(self, rows: np.ndarray) -> Rows:
         """Return some rows."""
         return Rows(*(column[rows] for column in self.rows[1:6]))
 
-    def _innovate(self, rows: Int[np.ndarray, " r"], caller: int) -> Innovate:
-        """Return what tells the innovations of pairs of these rows and landmarks."""
-        joint = self.joint
-        there = 3 + 2 * np.arange(joint.landmark.size)
-        return lambda row, landmark: pair_innovations(
-            tuple(self._some(rows)), joint.mean, joint.covariance, there, caller, (row, landmark)
-        )
+    def _innovations(
+        self,
+        rows: Int[np.ndarray, " r"],
+        caller: int,
+        pairs: tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]],
+    ) -> Innovations:
+        """Return the innovations of pairs of these rows and landmarks."""
+        mean, covariance = self.joint.mean, self.joint.covariance
+        there, columns = 3 + 2 * np.arange(self.joint.landmark.size), tuple(self._some(rows))
+        return pair_innovations(columns, mean, covariance, there, caller, pairs)
 
     def _tell(self, number: int, caller: Caller) -> None:
         """State the place of a caller that was found as a range of its direct call."""
@@ -383,13 +378,8 @@ class _Work:
         if row < 0:
             return
         if at >= 0 and number not in self.scan.moving:
-            chances, columns = (
-                (DIRECT_GATE, *self.stage.chances[1:]),
-                self._some(slice(row, row + 1)),
-            )
-            mean, covariance = self.joint.mean, self.joint.covariance
-            there = np.array([at])
-            if np.isinf(pair_costs(tuple(columns), mean, covariance, there, UNPLACED, chances)):
+            gated = (DIRECT_GATE, *self.stage.chances[1:])
+            if not fits(tuple(self.rows), row, self._joint(), at, gated):
                 return
         self.label[row] = label
 
