@@ -16,7 +16,7 @@ from pipistrelle.config import InputError
 from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.noise import ConstantNoise
 from pipistrelle.detection.scans import UNLABELLED, Scan
-from pipistrelle.estimation.association import Assignment, Association, edited
+from pipistrelle.estimation.association import Assignment, Association, edited, is_among
 from pipistrelle.estimation.beliefs import (
     AcceptsMap,
     B,
@@ -27,7 +27,6 @@ from pipistrelle.estimation.beliefs import (
     some_of,
 )
 from pipistrelle.estimation.checking import usable_scan
-from pipistrelle.jit import kernel
 
 REMEMBERED = 40
 """How many scans an association may think of again."""
@@ -173,8 +172,8 @@ class Session(Generic[B]):
         landmarks = self.belief.landmarks()
         if not hasattr(self._association, "tentative"):
             return landmarks
-        tentative = self._association.tentative(self._memory)
-        return some_of(landmarks, ~np.isin(landmarks.landmark, list(tentative)))
+        tentative = np.array([*self._association.tentative(self._memory)], np.int64)
+        return some_of(landmarks, ~is_among(landmarks.landmark, tentative))
 
     def state(self) -> SessionState:
         """Return all that the session knows now; what it hears later does not change it."""
@@ -279,13 +278,14 @@ class Session(Generic[B]):
         past = [*self._past]
         labels = (*labels, *(gone for one in past for kept, gone in one.merge if kept in labels))
         named = np.array(labels)
-        rows = [_rows(one.label, named) for one in past]
-        heard = [n for n, one in enumerate(past) if rows[n] or _rows(one.scan.callers, named)]
+        rows = [np.count_nonzero(is_among(one.label, named)) for one in past]
+        callers = [is_among(one.scan.callers, named).any() for one in past]
+        heard = [n for n in range(len(past)) if rows[n] or callers[n]]
         first = heard[0] if heard else len(past)
         before = past[first].belief if heard else self.belief
         self._dropped.update(labels)
         for n in heard:
-            past[n] = _without(past[n], labels)
+            past[n] = _without(past[n], named)
         if len(heard) == 1 and not _held(before, labels) and rows[first] == len(labels):
             # What was heard once has told nothing of anything else.
             self.belief = edited(self.belief, remove=_held(self.belief, labels))
@@ -368,22 +368,11 @@ def _held(belief: Belief, labels: Sequence[int]) -> list[int]:
     return [label for label in labels if label in held]
 
 
-@kernel
-def _rows(label: Int[np.ndarray, " m"], labels: Int[np.ndarray, " n"]) -> int:
-    """Return how many rows have one of some labels."""
-    count = 0
-    for one in label:
-        if one in labels:
-            count += 1
-    return count
-
-
-def _without(heard: _Heard, labels: Sequence[int]) -> _Heard:
+def _without(heard: _Heard, labels: Int[np.ndarray, " n"]) -> _Heard:
     """Return a scan without some labels, of its rows and of its callers."""
-    label, callers = heard.label.copy(), heard.scan.callers.copy()
-    for one in labels:
-        label[label == one] = UNLABELLED
-        callers[callers == one] = UNLABELLED
+    label, callers = (
+        np.where(is_among(of, labels), UNLABELLED, of) for of in (heard.label, heard.scan.callers)
+    )
     return replace(heard, label=label, scan=replace(heard.scan, callers=callers))
 
 

@@ -209,12 +209,13 @@ def misfit(
     tracks, scans = table.shape[0], table.shape[1]
     turn, off = np.zeros(scans), np.full((tracks, scans), np.nan)
     points, total = np.empty((scans, 6)), 0.0
-    for number in range(PASSES):
-        total = 0.0
+    for _ in range(PASSES - 1):
         for t in range(tracks):
-            total += _of_track(places, poses, table[t], turn, points, off[t])
-        if number < PASSES - 1:
-            _correct_headings(off, turn)
+            _write_off(places, poses, table[t], turn, points, off[t])
+        _correct_headings(off, turn)
+    for t in range(tracks):
+        point = _write_off(places, poses, table[t], turn, points, off[t])
+        total += _of_track(places, poses, table[t], points, off[t], point)
     for k in range(scans):
         if not math.isnan(direct[k]):
             towards = math.atan2(places[k, 1] - poses[k, 1], places[k, 0] - poses[k, 0])
@@ -226,15 +227,15 @@ def misfit(
 
 
 @no_alloc
-def _of_track(
+def _write_off(
     places: Float[np.ndarray, "k 2"],
     poses: Float[np.ndarray, "k 3"],
     rows: Float[np.ndarray, "k 4"],
     turn: Float[np.ndarray, " k"],
     points: Float[np.ndarray, "k 6"],
     off: Float[np.ndarray, " k"],
-) -> float:
-    """Return the misfit of a track; write how far its bearings are off.
+) -> tuple[float, float]:
+    """Return the point of a track; write how far its bearings are off.
 
     ``points``: room for each row's point, its direction and its variances along and across.
     """
@@ -246,18 +247,33 @@ def _of_track(
             x, y, weight = x + share * points[k, 0], y + share * points[k, 1], weight + share
     for number in range(1 + WEIGHINGS if weight > 0.0 else 0):
         x, y = _weighed(points, x, y) if number else (x / weight, y / weight)
-    total = 0.0
+    for k in range(rows.shape[0]):
+        if not math.isnan(points[k, 0]):
+            towards = math.atan2(y - poses[k, 1], x - poses[k, 0])
+            off[k] = wrap_angle(rows[k, 0] + turn[k] - towards)
+    return x, y
+
+
+@no_alloc
+def _of_track(
+    places: Float[np.ndarray, "k 2"],
+    poses: Float[np.ndarray, "k 3"],
+    rows: Float[np.ndarray, "k 4"],
+    points: Float[np.ndarray, "k 6"],
+    off: Float[np.ndarray, " k"],
+    point: tuple[float, float],
+) -> float:
+    """Return the misfit of a track at its point."""
+    total, (x, y) = 0.0, point
     for k in range(rows.shape[0]):
         if math.isnan(rows[k, 0]):
             continue
         if math.isnan(points[k, 0]):
             total += CAP
             continue
-        dx, dy = x - poses[k, 0], y - poses[k, 1]
         straight = math.hypot(places[k, 0] - poses[k, 0], places[k, 1] - poses[k, 1])
         onward = math.hypot(x - places[k, 0], y - places[k, 1])
-        off[k] = wrap_angle(rows[k, 0] + turn[k] - math.atan2(dy, dx))
-        path = onward + math.hypot(dx, dy) - straight
+        path = onward + math.hypot(x - poses[k, 0], y - poses[k, 1]) - straight
         across = off[k] / math.hypot(rows[k, 2], LEAST_BEARING_STD)
         along = (rows[k, 1] - path) / math.hypot(rows[k, 3], LEAST_WAY_STD)
         total += min(across * across + along * along, CAP)

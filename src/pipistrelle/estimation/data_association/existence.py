@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from pipistrelle.detection.scans import OWN
+from pipistrelle.estimation.association import is_among
 from pipistrelle.estimation.measurement import excess_path_slopes
 from pipistrelle.geometry import wrap_angle
 from pipistrelle.jit import Whole, kernel, no_alloc
@@ -123,7 +124,7 @@ def merged(known: Known, pairs: Sequence[tuple[int, int]]) -> Known:
             column[a] = max(column[a], column[b])
         both = np.maximum(after.together[a], after.together[b])
         after.together[a], after.together[:, a] = both, both
-    return some(after, ~np.isin(after.label, [gone for _, gone in pairs]))
+    return some(after, ~is_among(after.label, np.array([gone for _, gone in pairs])))
 
 
 Heard = tuple[

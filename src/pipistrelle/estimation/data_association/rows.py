@@ -24,6 +24,7 @@ from pipistrelle.detection.scans import (
     UNLABELLED,
     Scan,
 )
+from pipistrelle.estimation.association import is_among
 from pipistrelle.estimation.data_association.matching import NOTHING
 from pipistrelle.estimation.data_association.pairs import UNPLACED, pair_costs
 from pipistrelle.geometry import wrap_angle
@@ -157,10 +158,8 @@ def compared(
     used = used[used != direct]
     there, usable = 3 + 2 * np.arange(landmark.size), heard.usable
     costs = pair_costs(_part(heard, used, 0.0), mean, covariance, there, at, chances)
-    for n in range(landmark.size):
-        for label in moving:
-            if landmark[n] == label:
-                costs[:, n] = math.inf
+    for n in np.flatnonzero(is_among(landmark, moving)):
+        costs[:, n] = math.inf
     if at != UNPLACED:
         usable = heard.with_way
     size, fits = 0, np.zeros(used.size, np.bool_)

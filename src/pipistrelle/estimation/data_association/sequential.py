@@ -29,7 +29,7 @@ from pipistrelle.detection.scans import (
     Scan,
     with_callers,
 )
-from pipistrelle.estimation.association import Assignment
+from pipistrelle.estimation.association import Assignment, is_among
 from pipistrelle.estimation.beliefs import Belief, JointGaussian
 from pipistrelle.estimation.data_association.caller_search import (
     find_caller,
@@ -171,7 +171,8 @@ class _Work:
         self.label = np.full(scan.landmark.size, UNLABELLED)
         self.labels, self.callers = memory.labels, dict(memory.callers)
         self.numbers, self.named = scan.numbers, np.full(scan.direct.size, UNLABELLED)
-        moving = [c.label for number, c in self.callers.items() if number in scan.moving]
+        self.moves = {*scan.moving.tolist()}
+        moving = [self.callers[number].label for number in self.moves & self.callers.keys()]
         self.moving = np.array(moving, np.int64)
         most = limits.bearing_std, limits.way_std, limits.birth_way_std
         self.rows = rows_of_scan(scan, most, limits.assumed)
@@ -194,9 +195,11 @@ class _Work:
 
     def _refined(self, number: int, caller: Caller) -> dict[int, CallerPlace]:
         """Return the place of a caller on the map, once that is worth more than what was found."""
-        at, done = self._where(caller.label), caller.place is not None and caller.place.refined
-        moves = number in self.scan.moving
-        if moves or done or self.memory.scan != caller.since + REFINED_AFTER or at < 0:
+        done = caller.place is not None and caller.place.refined
+        if number in self.moves or done or self.memory.scan != caller.since + REFINED_AFTER:
+            return {}
+        at = self._where(caller.label)
+        if at < 0:
             return {}
         way, P = self.joint.mean[at : at + 2] - self.pose[:2], self.joint.covariance
         u = np.array([*-way, *way]) / float(way @ way)
@@ -211,7 +214,7 @@ class _Work:
         direct = self.scan.bearing[row] if row >= 0 else math.nan
         tracks = followed(caller.tracks, self.scan.time, self.pose, direct, rows)
         self.callers[number] = replace(caller, tracks=tracks)
-        moves = number in self.scan.moving
+        moves = number in self.moves
         first = FIRST_SEARCH_MOVING if moves else FIRST_SEARCH
         if len(tracks.poses) < first or len(tracks.poses) % 2:
             return {}
@@ -224,7 +227,7 @@ class _Work:
         if at is None:
             return
         caller = number, self._direct(number), at
-        if number in self.scan.moving and at >= 0:
+        if number in self.moves and at >= 0:
             self._follow_turn(number, at)
         rows, chances, known = tuple(self.rows), self.stage.chances, self.memory.known
         used, costs, near = compared(
@@ -250,7 +253,7 @@ class _Work:
         if direct < 0:
             return
         rows[direct] = False
-        joint, stand = self.joint, ~np.isin(self.joint.landmark, self.moving)
+        joint, stand = self.joint, ~is_among(self.joint.landmark, self.moving)
         there, columns = 3 + 2 * np.flatnonzero(stand), tuple(self._some(rows))
 
         def costs(mean: Float[np.ndarray, " d"]) -> Float[np.ndarray, "r n"]:
@@ -277,10 +280,10 @@ class _Work:
         gone = {*known.label[known.odds < GONE].tolist(), *self._lost(known)}
         remove, merge = (), ()
         if gone:
-            left = [*gone]
-            known = some(known, ~np.isin(known.label, left))
-            self.label[np.isin(self.label, left)] = UNLABELLED
-            self.named[np.isin(self.named, left)] = UNLABELLED
+            left = np.array([*gone])
+            known = some(known, ~is_among(known.label, left))
+            for labels in (self.label, self.named):
+                labels[is_among(labels, left)] = UNLABELLED
             before = {*memory.known.label.tolist(), *(c.label for c in memory.callers.values())}
             remove = tuple(sorted(gone & before))
         else:
@@ -377,7 +380,7 @@ class _Work:
         row = self._direct(number)
         if row < 0:
             return
-        if at >= 0 and number not in self.scan.moving:
+        if at >= 0 and number not in self.moves:
             gated = (DIRECT_GATE, *self.stage.chances[1:])
             if not fits(tuple(self.rows), row, self._joint(), at, gated):
                 return
