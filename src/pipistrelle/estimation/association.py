@@ -169,6 +169,12 @@ def is_among(label: Int[np.ndarray, " m"], labels: Int[np.ndarray, " n"]) -> Boo
     return among
 
 
+@kernel
+def how_many_among(label: Int[np.ndarray, " m"], labels: Int[np.ndarray, " n"]) -> int:
+    """Return how many labels are among some others."""
+    return int(np.count_nonzero(is_among(label, labels)))
+
+
 def edited(belief: B, remove: Sequence[int] = (), merge: Sequence[tuple[int, int]] = ()) -> B:
     """Return a belief without some landmarks, and with the two of each pair as one.
 

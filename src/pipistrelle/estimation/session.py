@@ -16,7 +16,13 @@ from pipistrelle.config import InputError
 from pipistrelle.detection.merging import labelled
 from pipistrelle.detection.noise import ConstantNoise
 from pipistrelle.detection.scans import UNLABELLED, Scan
-from pipistrelle.estimation.association import Assignment, Association, edited, is_among
+from pipistrelle.estimation.association import (
+    Assignment,
+    Association,
+    edited,
+    how_many_among,
+    is_among,
+)
 from pipistrelle.estimation.beliefs import (
     AcceptsMap,
     B,
@@ -278,8 +284,8 @@ class Session(Generic[B]):
         past = [*self._past]
         labels = (*labels, *(gone for one in past for kept, gone in one.merge if kept in labels))
         named = np.array(labels)
-        rows = [np.count_nonzero(is_among(one.label, named)) for one in past]
-        callers = [is_among(one.scan.callers, named).any() for one in past]
+        rows = [how_many_among(one.label, named) for one in past]
+        callers = [how_many_among(one.scan.callers, named) for one in past]
         heard = [n for n in range(len(past)) if rows[n] or callers[n]]
         first = heard[0] if heard else len(past)
         before = past[first].belief if heard else self.belief

@@ -154,8 +154,24 @@ def judged(
 
     ``near``: whether a row may have been of the landmark; then it was not missed.
     """
-    after = Known(*(column.copy() for column in known))
-    _judge(tuple(after), rows, place, near, scan, sight)
+    return Known(*_after(tuple(known), rows, place, near, scan, sight))
+
+
+@kernel
+def _after(
+    columns: tuple[np.ndarray, ...],
+    rows: Heard,
+    there: Place,
+    near: Bool[np.ndarray, " l"],
+    scan: Whole,
+    sight: Sight,
+) -> tuple[np.ndarray, ...]:
+    """Return a copy of the columns of `Known` that is judged."""
+    label, born, heard, count, odds, confirmed, source, aim, together = columns
+    heard, count, odds, confirmed = heard.copy(), count.copy(), odds.copy(), confirmed.copy()
+    changed = source.copy(), aim.copy(), together.copy()
+    after = (label, born, heard, count, odds, confirmed, *changed)
+    _judge(after, rows, there, near, scan, sight)
     return after
 
 

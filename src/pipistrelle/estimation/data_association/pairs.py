@@ -73,23 +73,23 @@ def pair_costs(
     """
     heard, made = Rows(*rows), Chances(*chances)
     costs = np.full((heard.bearing.size, at.size), np.inf)
-    H, index, S = np.zeros((2, 7)), np.zeros(7, np.int64), np.zeros((2, 2))
+    H, index = np.zeros((2, 7)), np.zeros(7, np.int64)
     for n in range(at.size):
         if at[n] == caller:
             continue
         bearing, way = _expected(mean, at[n], caller, H, index)
-        _spread(covariance, H, index, 5 if caller < 0 else 7, S)
-        if caller == OWN_CALL and S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0] > VAGUE * VAGUE:
+        across, b, along = _spread(covariance, H, index, 5 if caller < 0 else 7)
+        if caller == OWN_CALL and across * along - b * b > VAGUE * VAGUE:
             continue
         for m in range(heard.bearing.size):
             nu = wrap_angle(heard.bearing[m] - bearing)
-            a = S[0, 0] + heard.bearing_std[m] ** 2
+            a = across + heard.bearing_std[m] ** 2
             if math.isnan(heard.way[m]) or caller == UNPLACED:
                 squared, size = nu * nu / a, 2.0 * math.pi * a
                 density = made.bearing_clutter
             else:
                 off = heard.way[m] - way
-                b, c = S[0, 1], S[1, 1] + heard.way_std[m] ** 2
+                c = along + heard.way_std[m] ** 2
                 det = a * c - b * b
                 squared = (c * nu * nu - 2.0 * b * nu * off + a * off * off) / det
                 size, density = (2.0 * math.pi) ** 2 * det, made.clutter
@@ -170,17 +170,16 @@ def _spread(
     H: Float[np.ndarray, "2 7"],
     index: Int[np.ndarray, "7"],
     size: Whole,
-    S: Float[np.ndarray, "2 2"],
-) -> None:
-    """Write H P H^T."""
-    S[:] = 0.0
+) -> tuple[float, float, float]:
+    """Return the three numbers of H P H^T."""
+    across, both, along = 0.0, 0.0, 0.0
     for a in range(size):
         for b in range(size):
             covariance = P[index[a], index[b]]
-            S[0, 0] += H[0, a] * covariance * H[0, b]
-            S[0, 1] += H[0, a] * covariance * H[1, b]
-            S[1, 1] += H[1, a] * covariance * H[1, b]
-    S[1, 0] = S[0, 1]
+            across += H[0, a] * covariance * H[0, b]
+            both += H[0, a] * covariance * H[1, b]
+            along += H[1, a] * covariance * H[1, b]
+    return across, both, along
 
 
 def with_point(

@@ -162,20 +162,23 @@ def compared(
         costs[:, n] = math.inf
     if at != UNPLACED:
         usable = heard.with_way
-    size, fits = 0, np.zeros(used.size, np.bool_)
+    size, close = 0, np.zeros(used.size, np.bool_)
     for k in range(used.size):
         m, any_near = used[k], False
+        tells = heard.bearing_std[m] <= telling
         for n in range(landmark.size):
-            if math.isfinite(costs[k, n]):
+            costs[size, n] = costs[k, n]
+            if costs[k, n] < math.inf:
                 any_near = True
-                near[n] |= heard.bearing_std[m] <= telling
+                near[n] |= tells
+        used[size], close[size] = m, any_near
         if usable[m]:
-            used[size], costs[size], fits[size], size = m, costs[k], any_near, size + 1
-    return used[:size], costs[:size], fits[:size]
+            size += 1
+    return used[:size], costs[:size], close[:size]
 
 
 @kernel
-def fits(
+def bearing_fits(
     rows: tuple[np.ndarray, ...],
     row: Whole,
     joint: Joint,

@@ -56,8 +56,8 @@ from pipistrelle.estimation.data_association.pairs import (
 )
 from pipistrelle.estimation.data_association.rows import (
     Joint,
+    bearing_fits,
     compared,
-    fits,
     place_of,
     places_of,
     rows_of_scan,
@@ -382,7 +382,7 @@ class _Work:
             return
         if at >= 0 and number not in self.moves:
             gated = (DIRECT_GATE, *self.stage.chances[1:])
-            if not fits(tuple(self.rows), row, self._joint(), at, gated):
+            if not bearing_fits(tuple(self.rows), row, self._joint(), at, gated):
                 return
         self.label[row] = label
 

@@ -69,9 +69,10 @@ def linear_part(
             rotated[k] = -mean[i + 1] if along_x else mean[i - 1]
     heading, variance = covariance[2][at[:size]], covariance[2, 2]
     for k in range(size):
+        row = covariance[at[k]]
         for j in range(size):
             lever = rotated[k] * heading[j] + rotated[j] * heading[k]
-            linear[k, j] = covariance[at[k], at[j]] + lever + rotated[k] * rotated[j] * variance
+            linear[k, j] = row[at[j]] + lever + rotated[k] * rotated[j] * variance
     return part, linear
 
 
