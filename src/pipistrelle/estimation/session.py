@@ -308,8 +308,8 @@ class Session(Generic[B]):
         self._past = deque(past, maxlen=REMEMBERED)
 
     def _as_held(self, heard: _Heard) -> _Heard:
-        """Return a scan after the present belief, with what the belief can still merge."""
-        held, merge = (), heard.merge
+        """Return a scan to be heard after the present belief; what that lacks is not merged."""
+        merge = heard.merge
         if merge:
             held = _held(self.belief, [label for pair in merge for label in pair])
             merge = tuple(pair for pair in merge if {*pair} <= {*held})
