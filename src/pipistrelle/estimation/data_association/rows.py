@@ -28,7 +28,7 @@ from pipistrelle.estimation.association import is_among
 from pipistrelle.estimation.data_association.matching import NOTHING
 from pipistrelle.estimation.data_association.pairs import UNPLACED, pair_costs
 from pipistrelle.geometry import wrap_angle
-from pipistrelle.jit import Whole, kernel, no_alloc
+from pipistrelle.jit import Flag, Whole, kernel, no_alloc
 
 BESIDE, ASIDE = 0.96, 0.5
 """A row begins no landmark beside a louder one, within such a way [m] and bearing [rad]."""
@@ -102,13 +102,13 @@ def _read(
 
 
 @no_alloc
-def _within(std: float, limit: float, assumed: Float[np.ndarray, " a"]) -> bool:
+def _within(std: float, limit: float, assumed: Float[np.ndarray, " a"]) -> Flag:
     """Tell whether a deviation is within a limit, or was only assumed."""
     return std <= limit or _is_assumed(std, assumed)
 
 
 @no_alloc
-def _is_assumed(std: float, assumed: Float[np.ndarray, " a"]) -> bool:
+def _is_assumed(std: float, assumed: Float[np.ndarray, " a"]) -> Flag:
     """Tell whether a deviation was only assumed."""
     found = False
     for one in assumed:
